@@ -8,7 +8,7 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_tools.simulation.trajectories import DRAG, GRAVITY, STEP, Motion
+from uwb_tdoa_tools.simulation.trajectories import DRAG, GRAVITY, STEP, ExactMotion
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -36,14 +36,14 @@ class Path:
         t = np.arange(-2.0 * KNOT, duration + 2.5 * KNOT, KNOT)
         self._p, self._attitude, self._running = make_interp_spline(t, position(t), k=5), attitude or self._flown, running
 
-    def motion(self, t: ArrayLike) -> Motion:
-        """The Motion at the stamps t, (n,) s."""
+    def motion(self, t: ArrayLike) -> ExactMotion:
+        """The ExactMotion at the stamps t, (n,) s."""
         t = np.asarray(t, dtype=float)
         p, v, a = (self._p(t, k) for k in range(3))
         turn = self._attitude(t)
         rates = (self._attitude(t - APART).inv() * self._attitude(t + APART)).as_rotvec() / (2.0 * APART)
         q = turn.as_quat()
-        return Motion(p, v, a, q, rates, turn.inv().apply(a + [0.0, 0.0, GRAVITY]))
+        return ExactMotion(p, v, a, q, rates, turn.inv().apply(a + [0.0, 0.0, GRAVITY]))
 
     def motors(self, t: ArrayLike) -> np.ndarray:
         """Whether the motors turn at the stamps t: (n,) bool."""

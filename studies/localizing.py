@@ -14,7 +14,7 @@ import numpy as np
 from uwb_tdoa_tools import options, parallel
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.localizing.belief import GOOD, believe
-from uwb_tdoa_tools.localizing.estimate import Estimator
+from uwb_tdoa_tools.localizing.estimate import FlightEstimator
 from uwb_tdoa_tools.scoring.metrics import position_errors
 
 NOTHING, ALIKE = "nothing", 0.95  # no mistake; share of the time
@@ -79,7 +79,7 @@ def _with(flight, name):
 
 def _judged(flight):
     """What is said of a Flight, without its truth, and what is true."""
-    run = Estimator()(flight)
+    run = FlightEstimator()(flight)
     told = believe(replace(flight, truth=None), run)
     t, error, _ = position_errors(run.odometry, flight.truth, flight.truth.t[0], flight.truth.t[-1])
     known = ~np.any([(t >= begin) & (t <= end) for begin, end in told.lost] or [np.zeros(len(t), bool)], axis=0)

@@ -9,7 +9,7 @@ from tqdm import tqdm
 from uwb_tdoa_bias.foundation.flight import Flight, Tdoas
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import without_offset
-from uwb_tdoa_tools.localizing.estimate import Estimator
+from uwb_tdoa_tools.localizing.estimate import FlightEstimator
 from uwb_tdoa_tools.planning.installation import Installation
 from uwb_tdoa_tools.planning.noise import FixedNoise
 from uwb_tdoa_tools.planning.pairing import every_range
@@ -58,7 +58,7 @@ def run(args):
         longer = [without_offset(SETS[what](flight), -OFFSET) for flight in flights]
         for estimate in ("filtered", "smoothed"):
             for std in (0.0, OFFSET_STD):
-                estimator = Estimator(FilterConfig(range_offset_std=std), smoothed=estimate == "smoothed")
+                estimator = FlightEstimator(FilterConfig(range_offset_std=std), smoothed=estimate == "smoothed")
                 rows = [score_of(flight, estimator)[0].row() for flight in tqdm(longer, unit="flight", disable=None)]
                 errors, nees = (np.mean([row[name] for row in rows]) for name in ("rmse_3d", "nees_mean"))
                 print(f"| {what} | {estimate} | {std:g} m | {errors:.3f} m | {nees:.2f} |", flush=True)

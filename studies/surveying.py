@@ -14,7 +14,7 @@ from uwb_tdoa_bias.foundation.flight import AIDS
 from uwb_tdoa_tools import parallel
 from uwb_tdoa_tools.diagnosis import diagnose
 from uwb_tdoa_tools.diagnosis.constraints import Mark
-from uwb_tdoa_tools.diagnosis.references import Odometry, OdometryPath
+from uwb_tdoa_tools.diagnosis.references import OdometryReference, OdometryPath
 from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
 from uwb_tdoa_tools.parallel import whole_number
 from uwb_tdoa_tools.readers import inputs
@@ -82,7 +82,7 @@ def with_known(data, kind, splits, seed):
         rng, bare = np.random.default_rng(seed), [replace(flight, truth=None) for flight in flights]
         if kind == "odometry":
             known = [one for flight in flights for make in (odometry_of, ends_of) for one in make(flight, 1, rng)]
-            effects, positions = diagnose(bare, reference=Odometry(None, known)).effects, flights[0].anchors.positions
+            effects, positions = diagnose(bare, reference=OdometryReference(None, known)).effects, flights[0].anchors.positions
         else:
             known = [one for flight in flights for one in KNOWN[kind](flight, len(flights), rng)]
             result = self_calibrate(bare, Tape(), constraints=known)

@@ -90,7 +90,7 @@ class _Nodes:
 
         from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS
         from uwb_tdoa_msgs.msg import AnchorArray, Tdoa
-        from uwb_tdoa_tools.live.processes import Diagnostics, Processes, own_domain, wait
+        from uwb_tdoa_tools.live.processes import DiagnosticsListener, Processes, own_domain, wait
         from uwb_tdoa_tools.live.session import session
 
         self._stack = ExitStack()
@@ -102,7 +102,7 @@ class _Nodes:
         self._anchors = self._node.create_publisher(AnchorArray, "uwb/anchors", ANCHORS_QOS)
         self._imu = self._node.create_publisher(Imu, "imu/data", QoSProfile(depth=1000))
         self._tdoa = self._node.create_publisher(Tdoa, "uwb/tdoa", QoSProfile(depth=1000))
-        diagnostics = Diagnostics(self._node)
+        diagnostics = DiagnosticsListener(self._node)
         processes.start("uwb_tdoa_bias", "bias_node")
         processes.start("uwb_tdoa_ekf", "ekf_node")
         ends = (self._anchors, self._imu, self._tdoa)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwb_tdoa_tools.flying.path import CLIMB, KNOT, SETTLE, Reference, cruise, smooth
+from uwb_tdoa_tools.flying.path import CLIMB, KNOT, SETTLE, ReferenceTrajectory, cruise, smooth
 from uwb_tdoa_tools.simulation.config import SimulationConfig
 from uwb_tdoa_tools.simulation.room import Room
 from uwb_tdoa_tools.simulation.trajectories import sines
@@ -35,8 +35,8 @@ class Sines:
         """As of Circles."""
         return self.rise + self.seconds + self.fall
 
-    def along(self, place: np.ndarray, ground: float) -> Reference:
-        """The Reference, as of Circles."""
+    def along(self, place: np.ndarray, ground: float) -> ReferenceTrajectory:
+        """The ReferenceTrajectory, as of Circles."""
         knots = np.arange(0.0, self.duration + KNOT, KNOT)
         up = cruise(knots / self.rise, CLIMB)
         down = cruise((knots - self.duration + self.fall) / self.fall, CLIMB)
@@ -44,4 +44,4 @@ class Sines:
         p[:, :2], p[:, 2] = place, ground + self.height * up - (self.height - SETTLE) * down
         away = smooth((knots - self.rise) / AWAY) * smooth((self.duration - self.fall - knots) / AWAY)
         there = sines(knots, SimulationConfig(speed=self.speed), self.room, np.random.default_rng(self.seed))
-        return Reference(p + away[:, None] * (there - p), self.turning)
+        return ReferenceTrajectory(p + away[:, None] * (there - p), self.turning)

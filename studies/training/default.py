@@ -23,7 +23,7 @@ from uwb_tdoa_tools.training import models, structured
 from . import simulated
 
 FLIGHTS, SEED, SPACING = 20, 100, 0.02  # in each constellation; first seed; s between samples
-OPTIONS = structured.Options(centres=10, link_centres=100)
+OPTIONS = structured.StructuredPriors(centres=10, link_centres=100)
 PLACES = simulated.TRAINING + simulated.UNSEEN
 
 

@@ -7,7 +7,7 @@ from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.ground import (
-    ALIKE, BLUR_STD, BLURRED, IN_TIME, KNOWN, MOST_PAIRS, NOT_USED, PAIR, Evidence, Height, blur, explain, find_lateness, find_pairs,
+    ALIKE, BLUR_STD, BLURRED, IN_TIME, KNOWN, MOST_PAIRS, NOT_USED, PAIR, Evidence, KnownHeight, blur, explain, find_lateness, find_pairs,
     in_time, is_still, may_be_late,
 )  # fmt: skip
 from uwb_tdoa_ekf.core.memory import TDOA, new_state, structured
@@ -20,7 +20,7 @@ PARAMETERS = FilterConfig().parameters()
 
 @compiled
 def explained(pairs, anchors, bounds, prior, parameters, z, z_std, lateness, x, covariance):
-    return explain(Evidence(pairs, anchors, bounds, prior, parameters[0]), Height(z, z_std), lateness, x, covariance)
+    return explain(Evidence(pairs, anchors, bounds, prior, parameters[0]), KnownHeight(z, z_std), lateness, x, covariance)
 
 
 @compiled

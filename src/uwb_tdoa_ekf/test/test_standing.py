@@ -3,7 +3,7 @@ import pytest
 from test_ground import LOW, POSITIONS, PARAMETERS, heard
 
 from uwb_tdoa_bias.foundation.compiled import compiled
-from uwb_tdoa_ekf.core.ground import Height
+from uwb_tdoa_ekf.core.ground import KnownHeight
 from uwb_tdoa_ekf.core.memory import new_state
 from uwb_tdoa_ekf.core.standing import weigh
 from uwb_tdoa_ekf.core.workspace import set_bounds
@@ -11,7 +11,7 @@ from uwb_tdoa_ekf.core.workspace import set_bounds
 
 @compiled
 def weighed(ekf, pairs, anchors, parameters, x, covariance):
-    return weigh(ekf[0], pairs, anchors, parameters[0], Height(np.nan, np.nan), x, covariance)
+    return weigh(ekf[0], pairs, anchors, parameters[0], KnownHeight(np.nan, np.nan), x, covariance)
 
 
 def placed(p, elsewhere, late=0.0, seed=0, state=None):

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.core.ground import Height
+from uwb_tdoa_ekf.core.ground import KnownHeight
 from uwb_tdoa_ekf.core.memory import TDOA, new_state, structured
 from uwb_tdoa_ekf.core.startup import APART, INLIER, Places, level, locate, share_of_inliers, split
 from uwb_tdoa_ekf.core.workspace import set_bounds
@@ -44,7 +44,7 @@ def places(tdoas, positions, count=2, std=STD):
     found, workspace = Places(np.empty((count, 6)), np.empty((count, 6, 6)), np.empty(count)), np.empty((2, 3))
     state, parameters = new_state(positions), FilterConfig(tdoa_std=std).parameters()[0]
     set_bounds(state.record.extent, 1.0, workspace)
-    share = locate(window_of(*tdoas), state.anchors, workspace, parameters, Height(np.nan, np.nan), found)
+    share = locate(window_of(*tdoas), state.anchors, workspace, parameters, KnownHeight(np.nan, np.nan), found)
     return *found, share
 
 

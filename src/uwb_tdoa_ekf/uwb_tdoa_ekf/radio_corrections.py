@@ -94,8 +94,9 @@ class RadioCorrections:
             rows, at = rows[at >= 0], at[at >= 0]
             if not len(rows):
                 continue
-            where = (np.repeat(part, len(rows), axis=0) for part in (p, q))
-            samples = KINDS[kind](aids["t"][rows], at, at, *where, anchors, self._start, yaw_std=np.repeat(yaw_std, len(rows)))
+            n = len(rows)
+            ps, qs, stds = np.repeat(p, n, axis=0), np.repeat(q, n, axis=0), np.repeat(yaw_std, n)
+            samples = KINDS[kind](aids["t"][rows], at, at, ps, qs, anchors, self._start, yaw_std=stds)
             bias, std, _, _ = corrector.contribution(samples)
             aids = aids.copy() if aids is measured.aids else aids
             aids["value"][rows, 0] -= bias

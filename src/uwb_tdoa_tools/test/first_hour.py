@@ -19,7 +19,7 @@ from uwb_tdoa_bias.foundation.survey import read_survey
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools import command_lines
 from uwb_tdoa_tools.calibrating.parts import between
-from uwb_tdoa_tools.localizing.estimate import Estimator
+from uwb_tdoa_tools.localizing.estimate import FlightEstimator
 from uwb_tdoa_tools.readers.inputs import Reading
 from uwb_tdoa_tools.scoring.alignment import moved_frame
 from uwb_tdoa_tools.scoring.evaluation import score_of
@@ -57,7 +57,7 @@ class Hall:
         survey = read_survey(there["anchors"]) if "anchors" in there else anchors or self.tape
         effects = EffectSet.from_yaml(there["effects"]) if "effects" in there else None
         config = FilterConfig.from_yaml(there["config"]) if "config" in there else None
-        return score_of(replace(self.judge, anchors=survey), Estimator(config, effects))[0].row()["rmse_3d"]
+        return score_of(replace(self.judge, anchors=survey), FlightEstimator(config, effects))[0].row()["rmse_3d"]
 
 
 def off(positions, seed, exact=()):

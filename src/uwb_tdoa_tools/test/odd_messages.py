@@ -41,7 +41,7 @@ from uwb_tdoa_msgs.srv import GoTo, Land, Takeoff
 from uwb_tdoa_tools.benchmark import nodes
 from uwb_tdoa_tools.benchmark.nodes import READY_LIMIT, ready_at, surroundings
 from uwb_tdoa_tools.benchmark.usage import memory
-from uwb_tdoa_tools.live.processes import Diagnostics, LiveError, wait
+from uwb_tdoa_tools.live.processes import DiagnosticsListener, LiveError, wait
 
 RCLError = rclpy_implementation.RCLError
 CORPUS = Path(__file__).parent / "fuzz" / "corpus"
@@ -162,7 +162,7 @@ def _message(kind, k):
 def ordeal(name, count, folder, seed=1):
     """Account of a node that is sent `count` messages on each topic."""
     with surroundings(folder) as (node, processes):
-        diagnostics, log = Diagnostics(node), processes.file(name)
+        diagnostics, log = DiagnosticsListener(node), processes.file(name)
         told = [part for topic in STREAMS[name] for part in ("-p", f"qos_overrides./{topic}.subscription.reliability:=reliable")]
         told += _told(name, folder)
         processes.start(PACKAGES[name], name, "--ros-args", *told)

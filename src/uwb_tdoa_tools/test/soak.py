@@ -13,7 +13,7 @@ from uwb_tdoa_tools.benchmark import nodes
 from uwb_tdoa_tools.benchmark.flights import make_flight
 from uwb_tdoa_tools.benchmark.source import Source
 from uwb_tdoa_tools.benchmark.usage import memory
-from uwb_tdoa_tools.live.processes import Diagnostics, wait
+from uwb_tdoa_tools.live.processes import DiagnosticsListener, wait
 
 LAP = dict(trajectory="circle", radius=1.5, speed=1.0, start_in_air=True)  # which ends where it begins
 LAPS = 6  # of a flight, which is played again and again
@@ -26,7 +26,7 @@ def soak(minutes, starts, folder):
     rounds = math.ceil(60.0 * minutes / (flight.imu.t[-1] - flight.imu.t[0]))
     nodes.start(folder)  # whoever compiles the filter keeps the memory that took
     with nodes.surroundings(folder) as (node, processes):
-        diagnostics, source, began = Diagnostics(node), Source(node, [""]), time.monotonic()
+        diagnostics, source, began = DiagnosticsListener(node), Source(node, [""]), time.monotonic()
         for title, (name, arguments) in starts.items():
             nodes._start(processes, node, title, name, arguments)
         matched = lambda: nodes._matched(node, source, diagnostics, nodes.NODES)  # noqa: E731

@@ -18,7 +18,7 @@ from uwb_tdoa_tools.calibrating.parts import between, split
 from uwb_tdoa_tools.calibrating.quick import prospect
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.commands import calibrate
-from uwb_tdoa_tools.localizing.estimate import Estimator
+from uwb_tdoa_tools.localizing.estimate import FlightEstimator
 from uwb_tdoa_tools.scoring.evaluation import score_of
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
@@ -61,8 +61,8 @@ def test_without_ground_truth_other_flights_get_better_and_none_is_read(flights)
     made = [without_truth(some[:1], some[1:]) for some in (blind, wrong)]
     assert made[0].why_not is None and made[0].after < 0.8 * made[0].before and made[0].judged_on == "flight2"
     np.testing.assert_array_equal(made[0].anchors.positions, made[1].anchors.positions)
-    before = score_of(other, Estimator())[0].row()["rmse_3d"]
-    after = score_of(replace(other, anchors=made[0].anchors), Estimator(None, made[0].effects))[0].row()["rmse_3d"]
+    before = score_of(other, FlightEstimator())[0].row()["rmse_3d"]
+    after = score_of(replace(other, anchors=made[0].anchors), FlightEstimator(None, made[0].effects))[0].row()["rmse_3d"]
     assert after < 0.8 * before
 
 

@@ -14,7 +14,7 @@ from uwb_tdoa_bias.foundation import ros  # noqa: E402
 from uwb_tdoa_bias.foundation.flight import Imu, Tdoas  # noqa: E402
 from uwb_tdoa_msgs.msg import EstimatorStatus  # noqa: E402
 from uwb_tdoa_tools.flying.over_topics import OverTopics  # noqa: E402
-from uwb_tdoa_tools.flying.simulator import Measured  # noqa: E402
+from uwb_tdoa_tools.flying.simulator import SensorReadings  # noqa: E402
 from uwb_tdoa_tools.flying.vehicle import STATE  # noqa: E402
 from uwb_tdoa_tools.flying.world import HALL  # noqa: E402
 
@@ -39,7 +39,7 @@ def topics():
     node, pace = ros.StreamNode("vehicle"), Pace()
     made = OverTopics(node, HALL, pace, clock=True)
     none = np.empty(0)
-    made.take(Measured(Imu(none, np.empty((0, 3)), np.empty((0, 3))), Tdoas(none, none, none, none, none), {}))
+    made.take(SensorReadings(Imu(none, np.empty((0, 3)), np.empty((0, 3))), Tdoas(none, none, none, none, none), {}))
     made.turned(5.0, np.zeros(STATE))
     made.status = EstimatorStatus(status=EstimatorStatus.STATUS_RUNNING)
     yield made

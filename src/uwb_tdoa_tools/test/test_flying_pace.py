@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_tools.flying.pace import IMPATIENCE, LARGEST_CATCH_UP, PATIENCE, Lockstep, RealTime
-from uwb_tdoa_tools.flying.simulator import Measured
+from uwb_tdoa_tools.flying.simulator import SensorReadings
 
 TURN = 0.01
 
@@ -23,7 +23,7 @@ def stream(*t):
 
 
 def measured(now, tdoa=True):
-    return Measured(stream(now - 0.005, now), stream(*([now - 0.004, now - 0.001] if tdoa else [])), {})
+    return SensorReadings(stream(now - 0.005, now), stream(*([now - 0.004, now - 0.001] if tdoa else [])), {})
 
 
 @pytest.fixture

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_tools.flying.loop import IMU_RATE
-from uwb_tdoa_tools.flying.sensors import AIDS, Inertial, Radio, gusts
-from uwb_tdoa_tools.flying.simulator import Measured
+from uwb_tdoa_tools.flying.sensors import AIDS, InertialErrors, Radio, gusts
+from uwb_tdoa_tools.flying.simulator import SensorReadings
 from uwb_tdoa_tools.flying.transport import Transport
 from uwb_tdoa_tools.flying.world import HALL, WORLDS
 from uwb_tdoa_bias.foundation.flight import Imu, Tdoas
@@ -109,12 +109,12 @@ def test_a_person_blocks_what_passes_through_him_for_a_while():
 
 def test_vibration_is_as_strong_as_asked_for_and_in_its_band():
     world = replace(HALL, vibration=(0.4, 0.5, 0.35), vibration_band=30.0)
-    shaking = Inertial(world, 0, 100.0).shaking
+    shaking = InertialErrors(world, 0, 100.0).shaking
     np.testing.assert_allclose(shaking.std(axis=0), world.vibration, rtol=1e-6)
     power = np.abs(np.fft.rfft(shaking[:, 0])) ** 2
     f = np.fft.rfftfreq(len(shaking), 1.0 / IMU_RATE)
     assert power[f < 30.0].sum() > 0.8 * power.sum()
-    offset = Inertial(replace(world, rectified=1.0), 0, 100.0).shaking.mean(axis=0)
+    offset = InertialErrors(replace(world, rectified=1.0), 0, 100.0).shaking.mean(axis=0)
     np.testing.assert_allclose(np.abs(offset), world.vibration, rtol=0.1)
 
 
@@ -144,7 +144,7 @@ def test_other_sensors_say_what_is_true_but_for_their_noise():
 def test_what_takes_its_time_arrives_in_order_and_whole():
     def sent(k):
         t = 0.01 * k + 0.0025 * np.arange(1, 5)
-        return Measured(Imu(t, np.zeros((4, 3)), np.zeros((4, 3))), Tdoas(t, np.zeros(4, int), np.ones(4, int), t), {})
+        return SensorReadings(Imu(t, np.zeros((4, 3)), np.zeros((4, 3))), Tdoas(t, np.zeros(4, int), np.ones(4, int), t), {})
 
     transport, came = Transport(0.05, 0.01, np.random.default_rng(0)), []
     for k in range(200):

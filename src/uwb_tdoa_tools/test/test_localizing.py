@@ -14,7 +14,7 @@ from uwb_tdoa_ekf.results import Odometry, Residuals
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag
 from uwb_tdoa_tools.commands import evaluate, localize
 from uwb_tdoa_tools.localizing import belief, residuals, zones
-from uwb_tdoa_tools.localizing.estimate import Estimator
+from uwb_tdoa_tools.localizing.estimate import FlightEstimator
 from uwb_tdoa_tools.localizing.localize import check_names, name_of
 from uwb_tdoa_tools.readers.inputs import Reading, find_flights
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
@@ -60,7 +60,7 @@ def test_ground_truth_is_not_read_and_the_trajectory_is_that_of_evaluate_to_the_
 
 def test_what_is_written_says_the_same(bags, flight, tmp_path, capsys):
     run([bags / "none" / "flight.bag", "--out", tmp_path, "--bag", "--residuals", "--json", tmp_path / "all.json", "--no-bias"])
-    odometry = Estimator()(read_bag(bags / "none" / "flight.bag")).odometry
+    odometry = FlightEstimator()(read_bag(bags / "none" / "flight.bag")).odometry
     table = np.genfromtxt(tmp_path / "flight.csv", delimiter=",", names=True)
     np.testing.assert_allclose(np.column_stack([table[name] for name in "xyz"]), odometry.p, atol=1e-6)
     np.testing.assert_allclose(table["std_z"], np.sqrt(odometry.covariance[:, 2, 2]), atol=1e-6)
@@ -99,13 +99,13 @@ def test_a_reading_without_truth_gives_a_flight_without_it(bags):
 
 
 def believed(flight):
-    return belief.believe(flight, Estimator()(flight))
+    return belief.believe(flight, FlightEstimator()(flight))
 
 
 def test_a_clean_flight_is_good_and_within_what_is_stated(flight):
     told = believed(replace(flight, truth=None))
     assert told.level == belief.GOOD and not told.reasons and not told.lost
-    odometry = Estimator()(flight).odometry
+    odometry = FlightEstimator()(flight).odometry
     true = np.stack([np.interp(odometry.t, flight.truth.t, flight.truth.p[:, k]) for k in range(3)], axis=1)
     assert np.mean(np.linalg.norm(odometry.p - true, axis=1) <= told.figures["within"]) >= 0.95
 
@@ -130,7 +130,7 @@ def test_ranges_alone_are_believed_as_tdoas_are(ranged, tmp_path):
 
 
 def test_an_offset_of_ranges_that_was_found_is_told(ranged):
-    estimator = Estimator(FilterConfig(range_offset_std=0.3), smoothed=True)
+    estimator = FlightEstimator(FilterConfig(range_offset_std=0.3), smoothed=True)
     told = belief.believe(ranged, estimator(without_offset(ranged, -0.25)))
     assert told.figures["range_offset"] == pytest.approx(0.25, abs=0.02)
     assert "all ranges are 25 cm too long: that was found, and taken out" in told.sentences()

@@ -16,7 +16,7 @@ from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag  # noqa: 
 from uwb_tdoa_tools.bags.files import messages, new_bag, open_bag  # noqa: E402
 from uwb_tdoa_tools.bags.message_types import typestore  # noqa: E402
 from uwb_tdoa_tools.benchmark.flights import first  # noqa: E402
-from uwb_tdoa_tools.live.processes import Diagnostics, Processes, own_domain, wait  # noqa: E402
+from uwb_tdoa_tools.live.processes import DiagnosticsListener, Processes, own_domain, wait  # noqa: E402
 from uwb_tdoa_tools.live.session import session  # noqa: E402
 from uwb_tdoa_tools.readers import read_flight  # noqa: E402
 from uwb_tdoa_tools.scoring.evaluation import evaluate  # noqa: E402
@@ -45,7 +45,7 @@ def replayed(bag, folder, *options, nodes=(), begin=lambda: None):
     nodes : {node: arguments}; begin() : called when the nodes are there, before the replay."""
     nodes, recorded = {"bias_node": ("--ros-args", "-p", f"model_file:={SHIPPED}"), **dict(nodes)}, folder / "recorded.bag"
     with own_domain(), session("test", []) as (node, stop), Processes(folder, stop) as processes:
-        diagnostics = Diagnostics(node)
+        diagnostics = DiagnosticsListener(node)
         for package, name in (("uwb_tdoa_bias", "bias_node"), ("uwb_tdoa_ekf", "ekf_node")):
             processes.start(package, name, *nodes.get(name, ()))
         wait(READY_LIMIT, "the nodes", processes, node, lambda: all(map(diagnostics.newest, ("bias_node", "ekf_node"))))

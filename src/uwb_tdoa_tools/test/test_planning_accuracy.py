@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 from uwb_tdoa_tools.planning import accuracy
-from uwb_tdoa_tools.planning.accuracy import FEW, Samples, accuracy_map, comparison, fly, together
+from uwb_tdoa_tools.planning.accuracy import FEW, ErrorSamples, accuracy_map, comparison, fly, together
 from uwb_tdoa_tools.planning.installation import Installation
 from uwb_tdoa_tools.planning.maps import Grid
 from uwb_tdoa_tools.planning.noise import FixedNoise
@@ -21,7 +21,7 @@ def samples(n=4000, scale=1.0, seed=0):
     place = rng.uniform([-2, -2, 0.5], [2, 2, 1.5], (n, 3))
     limit = bound(information(place, INSTALLATION))
     noise = np.einsum("nij,nj->ni", np.linalg.cholesky(limit), rng.standard_normal((n, 3)))
-    return Samples(0.01 * np.arange(n), place, scale * noise + BIAS, 4.0 * limit)
+    return ErrorSamples(0.01 * np.arange(n), place, scale * noise + BIAS, 4.0 * limit)
 
 
 def test_a_map_shows_bias_and_scatter_where_they_are():
@@ -54,7 +54,7 @@ def test_ratios_to_the_bound():
 
 def test_flights_pool_without_mixing_their_seconds():
     one, other = samples(seed=1), samples(seed=2)
-    shifted = Samples(other.t, other.place, other.error + 1.0, other.covariance)
+    shifted = ErrorSamples(other.t, other.place, other.error + 1.0, other.covariance)
     pooled = comparison(together([one, shifted]), INSTALLATION)
     assert pooled["samples"] == 8000 and pooled["scatter_over_bound"] == pytest.approx(1.0, abs=0.03)
 

@@ -11,7 +11,7 @@ from uwb_tdoa_tools.planning.descent import descend, errors_and_slopes, failing_
 from uwb_tdoa_tools.planning.goal import UNUSABLE, Goal
 from uwb_tdoa_tools.planning.installation import Installation
 from uwb_tdoa_tools.planning.layout import Layout
-from uwb_tdoa_tools.planning.places import Places, lattice
+from uwb_tdoa_tools.planning.places import AnchorPlaces, lattice
 from uwb_tdoa_tools.simulation.constellations import corners
 
 ROOM = np.array([-4.0, -4.5, 0.0]), np.array([4.0, 4.5, 3.0])
@@ -20,7 +20,7 @@ POINTS = lattice((-3.2, -3.1, 0.5), (2.9, 3.3, 2), 1.6)
 
 def case(pairing="ring", link_std=0.0, dimensions=3, fixed=None, depth=0.0, objective="worst", criterion="pairings"):
     installation = Installation(corners(), link_std=link_std, dimensions=dimensions)
-    count, places = 6 if fixed is None else 2, Places.walls(*ROOM, depth=depth)
+    count, places = 6 if fixed is None else 2, AnchorPlaces.walls(*ROOM, depth=depth)
     layout = Layout(places, count, fixed, np.array([0.0, 0.0, 1.5]))
     x = layout.start(places.nearest(corners().positions[-count:]))
     x += np.random.default_rng(4).uniform(-0.1, 0.1, len(x))
@@ -87,7 +87,7 @@ def test_a_descent_goes_down_and_stays_in_bounds(objective):
 
 def test_anchors_that_locate_nothing_have_no_slopes():
     goal, layout, x = case()
-    low = Layout(Places([[0, 0, 1, 6, 5, 1]]), 6, None, np.zeros(3))  # all in one plane, with the points beside it
+    low = Layout(AnchorPlaces([[0, 0, 1, 6, 5, 1]]), 6, None, np.zeros(3))  # all in one plane, with the points beside it
     x, points = low.start(np.random.default_rng(0).random((6, 2))), POINTS * [1, 1, 0] + [0, 0, 1]
     errors, slopes = errors_and_slopes(goal, low, x, points)
     assert (errors == UNUSABLE).all() and not slopes.any()
@@ -130,6 +130,6 @@ def test_a_descent_does_not_end_where_the_goal_cannot_be_told(objective, monkeyp
 
 def test_a_start_that_no_shaking_helps_is_given_back():
     goal, _, _ = case()
-    low = Layout(Places([[0, 0, 1, 6, 5, 1]]), 6, None, np.zeros(3))
+    low = Layout(AnchorPlaces([[0, 0, 1, 6, 5, 1]]), 6, None, np.zeros(3))
     x = low.start(np.random.default_rng(0).random((6, 2)))
     np.testing.assert_array_equal(descend(goal, low, POINTS, x, 15), x)

@@ -6,7 +6,7 @@ from uwb_tdoa_tools.planning.goal import Goal
 from uwb_tdoa_tools.planning.installation import Installation
 from uwb_tdoa_tools.planning.layout import one_more, optimise
 from uwb_tdoa_tools.planning.noise import FixedNoise
-from uwb_tdoa_tools.planning.places import Places, lattice
+from uwb_tdoa_tools.planning.places import AnchorPlaces, lattice
 from uwb_tdoa_tools.readers import read_survey
 from uwb_tdoa_tools.simulation.constellations import constellation, facing
 
@@ -26,7 +26,7 @@ def bad_anchors():
 @pytest.mark.parametrize("objective", ["worst", "mean"])
 def test_a_layout_gets_better(objective):
     aim = goal(Installation(bad_anchors()), "round", objective)
-    better = optimise(aim, Places.walls(*ROOM), 5, starts=2)
+    better = optimise(aim, AnchorPlaces.walls(*ROOM), 5, starts=2)
     before, after = aim.figures(bad_anchors()), aim.figures(better)
     assert after[objective] < 0.7 * before[objective] and after["failing"] <= before["failing"]
     p = better.positions
@@ -48,7 +48,7 @@ def test_failure_is_avoided_where_the_bound_would_not_mind():
 def test_one_more_anchor():
     fixed = Anchors([4, 0, 9, 2, 1], bad_anchors().positions, bad_anchors().orientations, "hall")
     aim = goal(Installation(fixed), "round")
-    places = Places.walls(*ROOM)
+    places = AnchorPlaces.walls(*ROOM)
     positions, scores = one_more(aim, fixed, places, count=60)
     assert 30 < len(positions) == len(scores) < 120
     start = positions[[np.argmin(scores)]]
@@ -65,7 +65,7 @@ def test_one_more_anchor():
 def test_no_layout_at_all():
     aim = goal(Installation(bad_anchors()))
     with pytest.raises(InputError, match="no layout"):
-        optimise(aim, Places([[0, 0, 1, 6, 5, 1]]), 5, starts=2)
+        optimise(aim, AnchorPlaces([[0, 0, 1, 6, 5, 1]]), 5, starts=2)
 
 
 FLIGHTS = (-1.6, -1.6, 0.3), (1.6, 1.6, 2.1)  # what holds all that was flown higher than 0.3 m on 0422, 0425 and 0426
@@ -82,7 +82,7 @@ def test_the_surveyed_layout_is_beaten_by_a_fifth(where, shared_data):
     flown, depth = (FLIGHTS, 0.0) if where == "shared flights" else ((lower + MARGIN, upper - MARGIN), 0.5)
     step = 0.09 * (np.array(flown[1]) - flown[0]).max()
     aim = Goal(lattice(*flown, step), Installation(survey), criterion="round")
-    better = optimise(aim, Places.walls(lower, upper, depth=depth), 8, starts=8)
+    better = optimise(aim, AnchorPlaces.walls(lower, upper, depth=depth), 8, starts=8)
     fine = Goal(lattice(*flown, 0.6 * step), Installation(survey), criterion="round")
     before, after = fine.figures(survey), fine.figures(better)
     assert after["worst"] < 0.8 * before["worst"] and after["mean"] < before["mean"]

@@ -1,13 +1,13 @@
 import numpy as np
 import pytest
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_tools.planning.places import Places, lattice, spread
+from uwb_tdoa_tools.planning.places import AnchorPlaces, lattice, spread
 
 ROOM = np.array([0.0, 0.0, 0.0]), np.array([6.0, 5.0, 3.0])
 
 
 def test_places_on_walls():
-    places = Places.walls(*ROOM)
+    places = AnchorPlaces.walls(*ROOM)
     assert places.numbers == 2
     p = places.positions(np.random.default_rng(0).random((2000, 2)))
     on_x, on_y = np.isin(p[:, 0], (0.0, 6.0)), np.isin(p[:, 1], (0.0, 5.0))
@@ -17,7 +17,7 @@ def test_places_on_walls():
 
 
 def test_places_along_walls():
-    places = Places.walls(*ROOM, depth=0.5)
+    places = AnchorPlaces.walls(*ROOM, depth=0.5)
     assert places.numbers == 3
     np.testing.assert_allclose(places.lengths, [22.0, 2.8, 0.5])
     p = places.positions(np.random.default_rng(0).random((2000, 3)))
@@ -26,17 +26,17 @@ def test_places_along_walls():
 
 
 def test_places_of_all_shapes():
-    places = Places([[0, 0, 0, 1, 2, 3], [5, 5, 5, 5, 5, 5], [7, 0, 1, 9, 0, 1]])
+    places = AnchorPlaces([[0, 0, 0, 1, 2, 3], [5, 5, 5, 5, 5, 5], [7, 0, 1, 9, 0, 1]])
     assert places.numbers == 3
     p = places.positions(np.random.default_rng(0).random((4000, 3)))
     block, post, rail = (p[:, 0] <= 1, (p == 5).all(axis=1), (p[:, 0] >= 7) & (p[:, 1] == 0) & (p[:, 2] == 1))
     assert (block | post | rail).all() and block.any() and rail.any()
     np.testing.assert_allclose(p[block].max(axis=0), [1, 2, 3], atol=0.05)
-    np.testing.assert_allclose(Places([[5, 5, 5, 5, 5, 5]]).positions(np.array([0.3, 0.9])), [5, 5, 5])
+    np.testing.assert_allclose(AnchorPlaces([[5, 5, 5, 5, 5, 5]]).positions(np.array([0.3, 0.9])), [5, 5, 5])
 
 
 def test_nearest_place():
-    places = Places.walls(*ROOM)
+    places = AnchorPlaces.walls(*ROOM)
     wanted = np.array([[6.3, 2.0, 1.0], [3.0, -0.5, 2.8], [0.0, 5.0, 0.2]])
     got = places.positions(places.nearest(wanted))
     np.testing.assert_allclose(got, [[6, 2, 1], [3, 0, 2.8], [0, 5, 0.2]], atol=0.15)
@@ -57,7 +57,7 @@ def test_nearest_place():
 def test_bad_places(content, tmp_path):
     (tmp_path / "places.yaml").write_text(content)
     with pytest.raises(InputError, match="places"):
-        Places.from_yaml(tmp_path / "places.yaml")
+        AnchorPlaces.from_yaml(tmp_path / "places.yaml")
 
 
 def test_a_lattice_holds_the_corners():

@@ -169,7 +169,7 @@ def status(node, **values):
 
 
 def test_settled_when_every_node_repeats_its_counts():
-    diagnostics = processes.Diagnostics(node := NoNode())
+    diagnostics = processes.DiagnosticsListener(node := NoNode())
     diagnostics._take(status("bias_node", received=5, rate="3.0 Hz"))
     diagnostics._take(status("ekf_node", received=4, rate="3.0 Hz"))
     node.queue.messages += ["said before", "said before, too"]

@@ -12,7 +12,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands import diagnose, evaluate, localize
 from uwb_tdoa_tools.localizing import rerun_file
-from uwb_tdoa_tools.localizing.estimate import Estimator
+from uwb_tdoa_tools.localizing.estimate import FlightEstimator
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 CLEAN = dict(floor_time=1.0, imu_rate=100.0, bias=False, multipath=False, outlier_probability=0.0)
@@ -76,13 +76,13 @@ def test_demo_writes_what_the_nodes_said(flight, viewer, tmp_path):
     pytest.importorskip("rclpy")
     from uwb_tdoa_tools.live.demo import DemoResult
 
-    run = Estimator()(flight)
+    run = FlightEstimator()(flight)
     DemoResult({}, [], run.odometry, run, run.odometry).show(tmp_path / "flight.rrd", flight, ["landed"])
     assert ALWAYS | {"world/truth", "world/before", "error", "error/before"} <= names(viewer) and verdict(viewer) == "landed"
 
 
 def test_errors_are_those_of_each_path(flight, viewer, tmp_path):
-    run = Estimator()(flight)
+    run = FlightEstimator()(flight)
     off = replace(run.odometry, p=run.odometry.p + [0.0, 0.0, 1.0])
     rerun_file.write_rerun(tmp_path / "flight.rrd", flight, run.odometry, None, [], flight.truth, off)
     told = [np.asarray(call.kwargs["scalars"]) for call in viewer.Scalars.columns.call_args_list]
@@ -104,7 +104,7 @@ def test_it_is_left_out_with_a_sentence_where_it_is_not_installed(desk, capsys, 
 
 @pytest.mark.parametrize("residuals", [True, False])
 def test_what_nodes_said_is_written_as_it_was_recorded(desk, flight, viewer, monkeypatch, residuals):
-    run = Estimator()(flight)
+    run = FlightEstimator()(flight)
     said = dict(zip(RESIDUAL_FIELDS, (getattr(run.residuals, name) for name in ("t", "a", "b", "innovation", "variance", "weight", "verdict"))))
 
     def read_fields(bag, topic):

@@ -12,7 +12,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands.survey import main
 from uwb_tdoa_tools.diagnosis.constraints import Distance, Mark
-from uwb_tdoa_tools.diagnosis.references import Odometry, OdometryPath
+from uwb_tdoa_tools.diagnosis.references import OdometryReference, OdometryPath
 from known_effects import clean_flight
 from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
 from uwb_tdoa_tools.surveying.blocked import large, with_blocked
@@ -129,7 +129,7 @@ def test_a_path_laid_beside_the_filters_is_where_the_tag_was_and_takes_its_shift
     wrong = replace(flight, truth=replace(flight.truth, p=flight.truth.p[::-1] + 30.0))
     shifts = []
     for marks in ([], ends(flight)):
-        reference = Odometry(None, [odometry_of(flight, drift=0.005), *marks])
+        reference = OdometryReference(None, [odometry_of(flight, drift=0.005), *marks])
         paths = [reference.prepare(each).truth for each in (replace(flight, truth=None), wrong)]
         np.testing.assert_array_equal(paths[0].p, paths[1].p)  # no truth is read
         path = paths[0]
@@ -179,7 +179,7 @@ def test_what_a_path_may_be_off_by_shrinks_with_marks(flights):
     known, other = ([odometry_of(flights[0]), *some] for some in (ends(flights[0]), []))
     stds = []
     for some in (known, other):
-        reference = Odometry(None, some)
+        reference = OdometryReference(None, some)
         reference.prepare(flights[0])
         stds.append(reference.shift_std(flights[0].name)[0])
     assert 0.02 < stds[0] < 0.1 < 0.2 < stds[1] < 0.4
@@ -187,7 +187,7 @@ def test_what_a_path_may_be_off_by_shrinks_with_marks(flights):
 
 def test_the_frame_of_an_odometry_makes_no_difference(flights):
     flight = replace(flights[0], truth=None)
-    one, other = (Odometry(None, [odometry_of(flights[0], 0.0, yaw)]).prepare(flight).truth for yaw in (0.3, -2.0))
+    one, other = (OdometryReference(None, [odometry_of(flights[0], 0.0, yaw)]).prepare(flight).truth for yaw in (0.3, -2.0))
     assert np.abs(one.p - other.p).max() < 1e-6
 
 

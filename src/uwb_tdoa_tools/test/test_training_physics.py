@@ -5,7 +5,7 @@ from training_flights import flight, without_attitude
 from uwb_tdoa_bias.effects import EFFECTS
 from uwb_tdoa_tools.training import models, physics
 from uwb_tdoa_tools.training.labels import labels
-from uwb_tdoa_tools.training.structured import Options
+from uwb_tdoa_tools.training.structured import StructuredPriors
 
 PLAIN = {"bias": False, "outlier_probability": 0.0, "yaw": "along_track"}
 DELAY = EFFECTS["anchor_delay"]({"2": 0.3})
@@ -52,7 +52,7 @@ def test_does_without_attitude():
 def test_network_learns_what_the_effects_leave(one_place):
     kinds = ("physics", "physics+structured")
     found = physics.find(one_place)
-    options = Options(centres=40)
+    options = StructuredPriors(centres=40)
     alone, both = (models.train(models.Recipe(kind, 0, options), one_place[:2], one_place[2:], kind, found=found) for kind in kinds)
     assert alone.model is None and alone.onnx() is None and both.onnx() is not None
     assert alone.effects == both.effects == found.effects

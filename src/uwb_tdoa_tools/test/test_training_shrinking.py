@@ -10,7 +10,7 @@ from uwb_tdoa_tools import parallel
 from uwb_tdoa_tools.scoring.shrinkage import SHARES, Shrinkage, best_share
 from uwb_tdoa_tools.training import models, shrinking, structured
 
-RECIPE = models.Recipe("structured", 0, structured.Options(centres=10, link_centres=10))
+RECIPE = models.Recipe("structured", 0, structured.StructuredPriors(centres=10, link_centres=10))
 
 
 def errors(*ratios):

@@ -11,7 +11,7 @@ from uwb_tdoa_tools.training import models, structured
 from uwb_tdoa_tools.training.labels import labels, thinned
 
 CIRCLE = {"trajectory": "circle", "yaw_angle": 0.3}
-OPTIONS = structured.Options(centres=40, link_centres=60)
+OPTIONS = structured.StructuredPriors(centres=40, link_centres=60)
 
 
 def trained(flights, path):

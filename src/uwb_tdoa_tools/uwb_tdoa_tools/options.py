@@ -30,7 +30,7 @@ from . import cli
 from .bags.files import STORAGES
 from .diagnosis.self_calibration import Tape
 from .localizing import rerun_file
-from .localizing.estimate import Estimator
+from .localizing.estimate import FlightEstimator
 from .parallel import whole_number
 from .readers import inputs
 from .scoring.alignment import ALIGN, NONE
@@ -115,18 +115,18 @@ def add_model(parser: ArgumentParser) -> None:
     parser.add_argument("--model", metavar="FILE", help=words.replace("%", "%%"))
 
 
-def estimator_of(args: Namespace, say: Callable[[str], object]) -> Estimator:
-    """The Estimator that those options ask for. say(sentence) : told what it lacks. Raises InputError."""
+def estimator_of(args: Namespace, say: Callable[[str], object]) -> FlightEstimator:
+    """The FlightEstimator that those options ask for. say(sentence) : told what it lacks. Raises InputError."""
     config, effects = filter_of(args)
     config = with_parameters(config, args.parameters + [f"use_{aid}:=false" for aid in args.without])
     if args.no_bias:
-        return Estimator(config, smoothed=args.smooth)
+        return FlightEstimator(config, smoothed=args.smooth)
     network = load_network(args.model)
     given = {effect.name for effect in effects.effects} if effects else set()
     if network and (lacking := sorted(set(network.trained_with) - given)):
         say(f"{args.model} was trained with {', '.join(lacking)} taken out, which no --effects gives; give the effects.yaml that was "
             "written beside it.")  # fmt: skip
-    return Estimator(config, effects, network, args.smooth)
+    return FlightEstimator(config, effects, network, args.smooth)
 
 
 def given(args: Namespace, name: str) -> bool:

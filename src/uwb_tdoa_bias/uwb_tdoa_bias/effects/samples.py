@@ -204,7 +204,7 @@ class AidSamples:
         return len(self.t)
 
 
-class Poses(Protocol):
+class PoseColumns(Protocol):
     """t : (m,) s; p : (m, 3) m, world; q : (m, 4) x y z w, body to world, NaN where not known."""
 
     @property
@@ -220,7 +220,7 @@ class Poses(Protocol):
 class Track:
     """Poses, to be asked at any stamp: positions interpolated linearly, attitudes on the great circle."""
 
-    def __init__(self, poses: Poses) -> None:
+    def __init__(self, poses: PoseColumns) -> None:
         """poses : a Truth, say. Beyond its ends the nearest pose counts."""
         self.t, first = np.unique(poses.t, return_index=True)
         self.p, self.q = poses.p[first], poses.q[first]
@@ -252,7 +252,7 @@ class Track:
 
 
 def samples_at(
-    t: np.ndarray, a: np.ndarray, b: np.ndarray, poses: Poses, anchors: Anchors, start: float = 0.0, lag: float | None = POSE_LAG
+    t: np.ndarray, a: np.ndarray, b: np.ndarray, poses: PoseColumns, anchors: Anchors, start: float = 0.0, lag: float | None = POSE_LAG
 ) -> Samples:
     """Samples of TDOAs (t, a, b as in Samples, t in the order of arrival) at poses, as of a Track.
 

@@ -58,7 +58,7 @@ PAIR = np.dtype(
 )  # fmt: skip
 
 
-class Height(NamedTuple):
+class KnownHeight(NamedTuple):
     """A height of the tag that something else than TDOAs tells, and its standard deviation, m; NaN for none."""
 
     z: float
@@ -233,7 +233,7 @@ def is_still(pairs: np.ndarray, anchors: np.ndarray, x: np.ndarray, covariance: 
 
 
 @compiled
-def explain(evidence: Evidence, height: Height, lateness: int, x: np.ndarray, covariance: np.ndarray) -> float:
+def explain(evidence: Evidence, height: KnownHeight, lateness: int, x: np.ndarray, covariance: np.ndarray) -> float:
     """Where a tag at rest is, by the evidence, as far as anchors are alike.
 
     lateness : IN_TIME, ALIKE or KNOWN; x : (3,) m, where to begin, becomes the most probable position; covariance (3, 3) m^2 is filled.
@@ -296,7 +296,7 @@ def heard(pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @compiled
 def _equations(
-    evidence: Evidence, height: Height, places: np.ndarray, late: np.ndarray, errors: np.ndarray, u: np.ndarray, system: np.ndarray
+    evidence: Evidence, height: KnownHeight, places: np.ndarray, late: np.ndarray, errors: np.ndarray, u: np.ndarray, system: np.ndarray
 ) -> float:
     """Normal equations of a step from u (n,): position, error of each anchor heard, what late ones have in common; (n, n + 1) is filled.
     errors : (k, 2) m, expected error of an anchor that is not late, and its standard deviation. Returns the cost."""

@@ -11,7 +11,7 @@ from uwb_tdoa_bias.foundation.compiled import Record, compiled
 from . import auxiliary, ground, height, hypotheses, inertial, standing, systematic, workspace
 from .history import add_reset
 from .memory import HYPOTHESES, PLACES, WINDOW, YAWS
-from .ground import Height
+from .ground import KnownHeight
 from .startup import APART, SPEED, Places, level, locate, room_for, share_of_inliers, split
 from .state import GRAVITY
 
@@ -56,7 +56,7 @@ def is_repeat(ekf: Record, tdoa: Record, anchors: np.ndarray) -> bool:
 
 
 @compiled
-def _height_at_start(ekf: Record, parameters: Record, t: float) -> Height:
+def _height_at_start(ekf: Record, parameters: Record, t: float) -> KnownHeight:
     """What other sensors tell at stamp t, s, of a tag whose attitude only the accelerometer tells."""
     accel = _mean_accel(ekf.imu, parameters)
     return _known_height(ekf, parameters, accel[2] / max(math.sqrt(np.sum(accel**2)), 1e-9), t)
@@ -64,7 +64,7 @@ def _height_at_start(ekf: Record, parameters: Record, t: float) -> Height:
 
 @compiled
 def _look_for_places(
-    ekf: Record, anchors: np.ndarray, parameters: Record, window: np.ndarray, known: Height, places: Places, near: np.ndarray
+    ekf: Record, anchors: np.ndarray, parameters: Record, window: np.ndarray, known: KnownHeight, places: Places, near: np.ndarray
 ) -> float:
     """`locate` in the surroundings of the anchors of a window; the most probable place first. near (2, 3) m: the box about these anchors is
     written to it. Returns the share of TDOAs that agree with the first place."""
@@ -389,11 +389,11 @@ def level_first(ekf: Record, parameters: Record, history: np.ndarray) -> None:
 
 
 @compiled
-def _known_height(ekf: Record, parameters: Record, up: float, t: float) -> Height:
+def _known_height(ekf: Record, parameters: Record, up: float, t: float) -> KnownHeight:
     """Height of a tag with cos(tilt) `up`, as something else than TDOAs tells it."""
     if parameters.fixed_height_std > 0.0:
-        return Height(parameters.fixed_height, parameters.fixed_height_std)
-    return Height(height.at_start(ekf, parameters, up, t), max(parameters.height_std, SMALLEST_STD))
+        return KnownHeight(parameters.fixed_height, parameters.fixed_height_std)
+    return KnownHeight(height.at_start(ekf, parameters, up, t), max(parameters.height_std, SMALLEST_STD))
 
 
 @compiled

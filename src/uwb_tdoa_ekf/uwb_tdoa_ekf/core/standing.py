@@ -16,7 +16,7 @@ from . import auxiliary, ground
 from .history import add_reset, add_update
 from .hypotheses import alive
 from .memory import HYPOTHESES
-from .ground import Evidence, Height
+from .ground import Evidence, KnownHeight
 from .startup import Places, locate, room_for
 from .update import update_state
 from .workspace import surround
@@ -36,7 +36,7 @@ LANDING_STD = 0.2, 0.2, 0.5  # m, by which the filter may be wrong beyond what i
 
 @compiled
 def weigh(
-    ekf: Record, pairs: np.ndarray, anchors: np.ndarray, parameters: Record, height: Height, x: np.ndarray, covariance: np.ndarray
+    ekf: Record, pairs: np.ndarray, anchors: np.ndarray, parameters: Record, height: KnownHeight, x: np.ndarray, covariance: np.ndarray
 ) -> float:
     """Weigh the explanations of (k,) of ground.PAIR by a tag at rest that may be anywhere in its workspace: position x (6,) with its
     covariance (6, 6), and the ground, with each lateness of ground.explain.
@@ -90,11 +90,11 @@ def _absurdity(near: np.ndarray, x: np.ndarray) -> float:
 
 
 @compiled
-def _on_ground(ekf: Record, evidence: Evidence, height: Height, starts: np.ndarray, explained: Places) -> None:
+def _on_ground(ekf: Record, evidence: Evidence, height: KnownHeight, starts: np.ndarray, explained: Places) -> None:
     """Fill in the explanations from 1 on: on the ground, with each lateness, by starts (k, 2) m."""
     position, each, cost = explained.x, explained.covariance, explained.cost
     if math.isnan(height.z):
-        height = Height(evidence.parameters.ground_height + ground.GROUND_HEIGHT, ground.GROUND_STD)
+        height = KnownHeight(evidence.parameters.ground_height + ground.GROUND_HEIGHT, ground.GROUND_STD)
     trial, its = np.empty(3), np.empty((3, 3))
     known = False
     for row in ground.heard(evidence.pairs)[0]:
@@ -170,7 +170,7 @@ def find_landed(
     for k in range(3):
         wide[k, k] += LANDING_STD[k] ** 2
     prior[0], prior[1:] = best.x[:3], _inverse(wide)
-    evidence, nowhere, explained = Evidence(pairs, anchors, ekf.workspace, prior, parameters), Height(np.nan, np.nan), _explanations()
+    evidence, nowhere, explained = Evidence(pairs, anchors, ekf.workspace, prior, parameters), KnownHeight(np.nan, np.nan), _explanations()
     explained.x[0] = best.x[:3]
     explained.cost[0] = ground.explain(evidence, nowhere, ground.IN_TIME, explained.x[0], explained.covariance[0])
     starts = np.empty((1, 2))
@@ -208,7 +208,7 @@ def find_again(
     records: np.ndarray,
 ) -> None:  # fmt: skip
     """A tag lies still at stamp t, s, but inertial samples have told that it moves: they were wrong, and it may be anywhere."""
-    places, nowhere = room_for(1), Height(np.nan, np.nan)
+    places, nowhere = room_for(1), KnownHeight(np.nan, np.nan)
     locate(window, anchors, ekf.workspace, parameters, nowhere, places)
     weigh(ekf, pairs, anchors, parameters, nowhere, places.x[0], places.covariance[0])
     put(ekf, places.x[0, :3], places.covariance[0, :3, :3], t, records)

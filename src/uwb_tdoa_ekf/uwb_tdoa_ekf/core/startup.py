@@ -15,7 +15,7 @@ from uwb_tdoa_bias.foundation.compiled import Record, compiled
 from uwb_tdoa_bias.foundation.geometry import linearized_tdoa
 from uwb_tdoa_bias.foundation.robust_loss import GEMAN_MCCLURE, geman_mcclure_loss, weight
 
-from .ground import Height, solve
+from .ground import KnownHeight, solve
 from .workspace import reflect, rows_heard, configured_side
 
 STARTS = 9  # the middle of the workspace and the corners of the half-size box around it,
@@ -53,7 +53,7 @@ def room_for(count: int) -> Places:
 
 @compiled
 def locate(
-    window: np.ndarray, anchors: np.ndarray, workspace: np.ndarray, parameters: Record, height: Height, places: Places
+    window: np.ndarray, anchors: np.ndarray, workspace: np.ndarray, parameters: Record, height: KnownHeight, places: Places
 ) -> float:
     """Robust multilateration over a window, with constant velocity.
 

@@ -33,7 +33,7 @@ from uwb_tdoa_tools.bags.message_types import typestore
 from uwb_tdoa_tools.bags.messages import tdoa_messages
 from uwb_tdoa_ekf import launching
 from uwb_tdoa_tools.planning.noise import antenna_from_yaml
-from uwb_tdoa_tools.planning.places import Places
+from uwb_tdoa_tools.planning.places import AnchorPlaces
 from uwb_tdoa_tools.readers import read_survey, read_usd_log, read_util_csv
 from uwb_tdoa_tools.readers.columns import parse_columns, read_columns
 from uwb_tdoa_tools.readers.names import Named
@@ -90,7 +90,7 @@ def antenna(data):
 
 
 def places(data):
-    Places.from_yaml(_file(data))
+    AnchorPlaces.from_yaml(_file(data))
 
 
 def survey(data):

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..live.run import accounts
-from ..live.processes import Diagnostics, Processes, own_domain, variables, wait
+from ..live.processes import DiagnosticsListener, Processes, own_domain, variables, wait
 from ..live.session import session
 from .figures import Figure
 from .flights import among, make_flight
@@ -44,7 +44,7 @@ SECTION = "both nodes live at 1 kHz IMU + 400 Hz TDOA, default parameters and Qo
 
 
 @dataclass
-class Measured:
+class NodeFigures:
     """ready : {title: s from its start}; first : s from the anchors to the first odometry, half a second of which passes before the
     first measurement; memory : {title: bytes}; cpu : {title: share of one core in each block};
     latency : one (n,) array of ms per block; lost, late : messages; source_late : (k,) ms, each message of the source;
@@ -135,11 +135,11 @@ def pool(namespaces: Sequence[str], processes: int) -> Starts:
     return {f"{k + 1}/{name}": (name, ["--ros-args", *arguments, *shared]) for k, arguments in enumerate(own)}
 
 
-def fly(flight: Flight, folder: Path, namespaces: Sequence[str], starts: Starts) -> Measured:
-    """Measured of a flight in real time through the nodes of each namespace ("" or "/name"); starts : of `pairs` or `pool`."""
-    out = Measured()
+def fly(flight: Flight, folder: Path, namespaces: Sequence[str], starts: Starts) -> NodeFigures:
+    """NodeFigures of a flight in real time through the nodes of each namespace ("" or "/name"); starts : of `pairs` or `pool`."""
+    out = NodeFigures()
     with surroundings(folder) as (node, processes):
-        diagnostics, source = Diagnostics(node), Source(node, namespaces)
+        diagnostics, source = DiagnosticsListener(node), Source(node, namespaces)
         for title, (name, arguments) in starts.items():
             out.ready[title] = _start(processes, node, title, name, arguments)
         titles = [_title(space, name) for space in namespaces for name in NODES]
@@ -215,7 +215,7 @@ def _title(space: str, name: str) -> str:
     return f"{space}/{name}".strip("/")
 
 
-def _matched(node: Node, source: Source, diagnostics: Diagnostics, titles: Sequence[str]) -> bool:
+def _matched(node: Node, source: Source, diagnostics: DiagnosticsListener, titles: Sequence[str]) -> bool:
     """Whether every node hears what it needs, and we hear every odometry."""
     wanted = {"bias_node": ("uwb/tdoa", "odometry"), "ekf_node": ("imu/data", "uwb/tdoa_corrected")}
     return (
@@ -230,7 +230,7 @@ def _matched(node: Node, source: Source, diagnostics: Diagnostics, titles: Seque
     )
 
 
-def _count(out: Measured, flight: Flight, namespaces: Sequence[str], diagnostics: Diagnostics, source: Source) -> None:
+def _count(out: NodeFigures, flight: Flight, namespaces: Sequence[str], diagnostics: DiagnosticsListener, source: Source) -> None:
     """Fill in what was lost between the processes, and what came too late to be used."""
     out.lost = dict.fromkeys(("TDOAs", "IMU samples", "odometry"), 0)
     for space, received in zip(namespaces, source.received):
@@ -243,9 +243,9 @@ def _count(out: Measured, flight: Flight, namespaces: Sequence[str], diagnostics
 
 
 def _figures(
-    section: str, measured: Measured, target_cpu: float | None = None, target_latency: float | None = None
+    section: str, measured: NodeFigures, target_cpu: float | None = None, target_latency: float | None = None
 ) -> Iterator[Figure]:
-    """Figures of a Measured. CPU and latency: medians and quartiles of blocks; memory: of nodes."""
+    """Figures of a NodeFigures. CPU and latency: medians and quartiles of blocks; memory: of nodes."""
     for name in PACKAGES:
         titles = [title for title in measured.cpu if title.endswith(name)]
         if not titles:

@@ -23,7 +23,7 @@ from ..diagnosis.noise import parameters_of
 from ..diagnosis.self_calibration import Tape, self_calibrate
 from ..diagnosis.self_calibration.equations import measured_noise, slow_innovations
 from ..diagnosis.self_calibration.solve import LEFT
-from ..localizing.estimate import Estimator
+from ..localizing.estimate import FlightEstimator
 from ..scoring.evaluation import score_of
 from ..surveying.report import as_text
 from .parts import split
@@ -152,7 +152,7 @@ def _assessed(calibration: Calibration, something: bool) -> Calibration:
 
 def _rmse(flights: Sequence[Flight], effects: EffectSet, config: FilterConfig | None) -> float:
     """m, 3D RMSE of all Flights together, by an estimate with an EffectSet."""
-    errors = [score_of(flight, Estimator(config, effects))[0].error for flight in flights]
+    errors = [score_of(flight, FlightEstimator(config, effects))[0].error for flight in flights]
     return float(np.sqrt(np.mean(np.sum(np.concatenate(errors) ** 2, axis=1))))
 
 

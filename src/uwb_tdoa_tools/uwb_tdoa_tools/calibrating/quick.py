@@ -12,7 +12,7 @@ from uwb_tdoa_bias.effects.wording import listed
 
 from ..diagnosis.self_calibration import SelfCalibration, Tape, self_calibrate
 from ..diagnosis.self_calibration.solve import IMPROVED
-from ..localizing.estimate import Estimator
+from ..localizing.estimate import FlightEstimator
 from .parts import between
 
 if TYPE_CHECKING:
@@ -83,7 +83,7 @@ def prospect(
     found = self_calibrate([part], tape, base, config, (), progress)
     seconds = found.seconds
     total = max(seconds, sum(map(_duration, flights)) * seconds / max(_duration(part), 1e-9))
-    path = np.quantile(Estimator(config, base)(part).odometry.p, [0.02, 0.98], axis=0)
+    path = np.quantile(FlightEstimator(config, base)(part).odometry.p, [0.02, 0.98], axis=0)
     anchors = longest.anchors
     return Prospect(
         seconds, total, found.given_std, _expected(found, total / seconds), found.before, found.left,

@@ -51,7 +51,7 @@ EXPLAINS = {
 }
 
 
-class Installed(Protocol):
+class NamedAnchors(Protocol):
     """What has a name and Anchors: a Recording, or a Flight."""
 
     @property
@@ -207,7 +207,7 @@ def _facts(recording: Recording, streams: StreamRules) -> dict[str, str]:
     return facts
 
 
-def different_surveys(recordings: Sequence[Installed]) -> Iterator[Finding]:
+def different_surveys(recordings: Sequence[NamedAnchors]) -> Iterator[Finding]:
     """Findings about Recordings whose surveys differ: anchors of one id that are elsewhere. Their flights do not belong
     together."""
     for one, two in zip(recordings, recordings[1:]):

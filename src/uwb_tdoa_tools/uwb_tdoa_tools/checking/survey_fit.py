@@ -12,7 +12,7 @@ import numpy as np
 
 from uwb_tdoa_ekf.core import workspace
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.core.ground import Height
+from uwb_tdoa_ekf.core.ground import KnownHeight
 from uwb_tdoa_ekf.core.memory import TDOA, new_state, structured
 from uwb_tdoa_ekf.core.startup import locate, room_for
 from uwb_tdoa_ekf.streams.explain import SCALE
@@ -46,7 +46,7 @@ class SurveyFit:
             if end - first < FEWEST:
                 continue
             window, places = tuple(column[first:end] for column in (t, a, b, d)), room_for(1)
-            locate(rows[first:end], state.anchors, box, config.parameters()[0], Height(np.nan, np.nan), places)
+            locate(rows[first:end], state.anchors, box, config.parameters()[0], KnownHeight(np.nan, np.nan), places)
             self._windows.append(window)
             self._start.append(places.x[0])
         self.before, _ = self.solve([])  # where the tag fits best: a fast one is not where a start puts it

@@ -49,7 +49,7 @@ SAME = 0.2  # m at most between the places of an anchor in two surveys of one in
 
 
 @dataclass(frozen=True)
-class Trial:
+class MistakeTrial:
     """recording : OrderedRecording with a mistake undone; finding : callable of the ratio, its standard errors -> Finding;
     share : of the TDOAs that it changes."""
 
@@ -88,13 +88,13 @@ def successive(tdoa: Tdoas) -> float:
     return float(np.median(np.abs(np.diff(d))[follows])) if follows.any() else 0.0
 
 
-def sign(recording: OrderedRecording) -> Iterator[Trial]:
+def sign(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     """All signs the other way."""
     line = "message.distance_difference = distance_to_b - distance_to_a  # not a - b"
-    yield Trial(recording.with_tdoa(d=-recording.tdoa.d), _says("tdoa_sign", "the sign of all TDOAs is wrong", line))
+    yield MistakeTrial(recording.with_tdoa(d=-recording.tdoa.d), _says("tdoa_sign", "the sign of all TDOAs is wrong", line))
 
 
-def survey(recording: OrderedRecording, others: Sequence[Survey]) -> Iterator[Trial]:
+def survey(recording: OrderedRecording, others: Sequence[Survey]) -> Iterator[MistakeTrial]:
     """Another survey. others : [(name, Anchors)]. Those of one installation, of different days, count as one."""
     while others:
         (name, anchors), *rest = others
@@ -104,7 +104,7 @@ def survey(recording: OrderedRecording, others: Sequence[Survey]) -> Iterator[Tr
             continue
         names = " or ".join([name, *alike])
         cause = f"the survey is of another room or day: {names} fits"
-        yield Trial(replace(recording, anchors=anchors), _says("survey_other", cause, f"--survey {name}"))
+        yield MistakeTrial(replace(recording, anchors=anchors), _says("survey_other", cause, f"--survey {name}"))
 
 
 def same_place(one: Anchors, other: Anchors) -> bool:
@@ -120,7 +120,7 @@ def furthest(one: Anchors, other: Anchors) -> float:
     return float(off.max()) if len(off) else np.inf
 
 
-def renumbered(recording: OrderedRecording) -> Iterator[Trial]:
+def renumbered(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     """Ids that the survey does not have: the same anchors in the same order, with other numbers?"""
     heard, known = np.unique(np.r_[recording.tdoa.a, recording.tdoa.b]), np.sort(recording.anchors.ids)
     if len(heard) != len(known) or np.isin(heard, known).all():
@@ -130,10 +130,10 @@ def renumbered(recording: OrderedRecording) -> Iterator[Trial]:
     line = f"id -= {shift}" if (heard - known == shift).all() else f"id = {table}[id]"
     cause = f"the ids of the survey are others: what the tag calls {heard[0]} ... {heard[-1]} "
     cause += f"is {known[0]} ... {known[-1]} there"
-    yield Trial(_relabelled(recording, table), _says("ids_renumbered", cause, line))
+    yield MistakeTrial(_relabelled(recording, table), _says("ids_renumbered", cause, line))
 
 
-def swapped(recording: OrderedRecording) -> Iterator[Trial]:
+def swapped(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     """Anchors whose ids were mixed up: the best exchange of two, then of two more, as long as more is explained.
     Not along a line: in a room that is symmetrical about it, anchors differ by their systematic errors alone."""
     if spread(survey_fit(recording).places) < SPREAD:
@@ -160,7 +160,7 @@ def swapped(recording: OrderedRecording) -> Iterator[Trial]:
         return  # a survey of another room is explained better by exchanging many ids, and still does not fit
     names = ", ".join(f"{i} is {k}" for i, k in sorted(table.items()))
     cause = "the ids of two anchors are swapped" if len(table) == 2 else MIXED_UP
-    yield Trial(
+    yield MistakeTrial(
         trial,
         _says(
             "ids_swapped", f"{cause}: what is called {names}", f"id = {table}.get(id, id)  # or swap them in the survey"
@@ -180,7 +180,7 @@ def _far_off(recording: OrderedRecording) -> list[int]:
     return recording.anchors.ids[rows[each > limit]].tolist()
 
 
-def contrary(recording: OrderedRecording) -> Iterator[Trial]:
+def contrary(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     """Single pairs with the other sign: a filter that hardly believes them knows. Or all pairs that name the larger id
     first."""
     tdoa = recording.tdoa
@@ -189,7 +189,7 @@ def contrary(recording: OrderedRecording) -> Iterator[Trial]:
     if 0.2 < backward.mean() < 0.8:
         line = "message.distance_difference = distance_to_b - distance_to_a  # in the order of the message's ids"
         cause = "the sign of the TDOAs does not follow the order of the anchors"
-        yield Trial(_flipped(recording, backward), _says("tdoa_one_sign", cause, line))
+        yield MistakeTrial(_flipped(recording, backward), _says("tdoa_one_sign", cause, line))
     wrong = _contrary(recording.part(LONG), pairs)
     if not 0 < len(wrong) <= MOST_PAIRS:
         return
@@ -201,7 +201,7 @@ def contrary(recording: OrderedRecording) -> Iterator[Trial]:
         return  # of a survey of another room some pairs seem to have the other sign, and still it does not fit
     names = ", ".join(f"({a}, {b})" for a, b in wrong)
     line = f"if (a, b) in {{{names}}}: message.distance_difference *= -1.0  # and find out why"
-    yield Trial(trial, _says("pair_sign", f"the sign of the pairs {names} is wrong", line), flip.mean())
+    yield MistakeTrial(trial, _says("pair_sign", f"the sign of the pairs {names} is wrong", line), flip.mean())
 
 
 def _contrary(recording: OrderedRecording, pairs: np.ndarray) -> list[tuple[int, int]]:
@@ -222,7 +222,7 @@ def _flipped(recording: OrderedRecording, rows: np.ndarray) -> OrderedRecording:
     return recording.with_tdoa(d=np.where(rows, -recording.tdoa.d, recording.tdoa.d))
 
 
-def moved(recording: OrderedRecording) -> Iterator[Trial]:
+def moved(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     """An anchor that is not where the survey has it: there, TDOAs are explained that no motion explains otherwise."""
     fit = survey_fit(recording)
     gain = gained(fit)
@@ -240,7 +240,7 @@ def moved(recording: OrderedRecording) -> Iterator[Trial]:
     cause = f"anchor {number} is not where the survey has it, but about ({where}) m from there"
     line = f"{number}: {{position: [x, y, z]}}  # measure it again; look for exchanged digits and axes"
     anchors = recording.anchors.at(alone[row][1])
-    yield Trial(replace(recording, anchors=anchors), _says("anchor_moved", cause, line))
+    yield MistakeTrial(replace(recording, anchors=anchors), _says("anchor_moved", cause, line))
 
 
 def survey_fit(recording: OrderedRecording) -> SurveyFit:

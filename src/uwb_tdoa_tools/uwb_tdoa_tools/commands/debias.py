@@ -11,7 +11,7 @@ from uwb_tdoa_ekf.debias import INTERPOLATORS, BiasMap
 
 from .. import cli, options, parallel
 from ..debiasing import report
-from ..debiasing.evaluation import Estimator
+from ..debiasing.evaluation import PositionEstimator
 from ..debiasing.mapping import cross_validated, fit_map
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def _fit(args: Namespace) -> None:
         raise InputError("FLIGHT: there is none; give flights with ground truth, or --static points.")
     if not 0.01 <= args.step <= 10.0:
         raise InputError(f"--step: {args.step!r} is outside 0.01 ... 10 m.")
-    estimator = Estimator(options.reading_of(args), *options.filter_of(args), args.align)
+    estimator = PositionEstimator(options.reading_of(args), *options.filter_of(args), args.align)
     recordings, held = (estimator.reading.find(paths, bool(args.dask)) for paths in (args.flights, args.holdout))
     options.check_holdout((path.resolve() for path, _ in recordings), (path.resolve() for path, _ in held))
     fitted = list(parallel.over(estimator, recordings, args.jobs, args.dask))
@@ -88,14 +88,14 @@ def _fit(args: Namespace) -> None:
 
 def _judge(args: Namespace) -> None:
     cli.check_folders(args.json)
-    estimator, made = Estimator(options.reading_of(args), *options.filter_of(args), args.align), BiasMap.load(args.map)
+    estimator, made = PositionEstimator(options.reading_of(args), *options.filter_of(args), args.align), BiasMap.load(args.map)
     rows = _judged(args, estimator, estimator.reading.find(args.flights, bool(args.dask)), made)
     report.say_rows("flight", rows)
     _write(args.json, {"map": report.about_figures(made), "runs": rows})
 
 
 def _judged(
-    args: Namespace, estimator: Estimator, recordings: Sequence[Recording], made: BiasMap
+    args: Namespace, estimator: PositionEstimator, recordings: Sequence[Recording], made: BiasMap
 ) -> list[dict[str, Any]]:
     return report.rows(parallel.over(estimator, recordings, args.jobs, args.dask), made, estimator.effects)
 

@@ -7,7 +7,7 @@ from functools import partial
 import sys
 
 from .. import cli
-from ..live.replay import ACKNOWLEDGE_LIMIT, Options, replay
+from ..live.replay import ACKNOWLEDGE_LIMIT, ReplayOptions, replay
 from ..live.session import PACKAGE
 
 DESCRIPTION = """Replay a bag over ROS topics with its own timing, like `ros2 bag play`.
@@ -44,8 +44,8 @@ def parser() -> argparse.ArgumentParser:
         help="publish the bag's time on /clock (default 40 Hz)",
     )  # fmt: skip
     add(
-        "--wait-matched", type=_positive, default=Options.wait, metavar="SECONDS",
-        help=f"wait at most this long until somebody subscribes, or fail (default {Options.wait:g})",
+        "--wait-matched", type=_positive, default=ReplayOptions.wait, metavar="SECONDS",
+        help=f"wait at most this long until somebody subscribes, or fail (default {ReplayOptions.wait:g})",
     )  # fmt: skip
     add(
         "--wait-topics", nargs="+", default=[], metavar="TOPIC",
@@ -60,7 +60,7 @@ def _replay(args: argparse.Namespace) -> int:
     say = partial(cli.say, "replay")
     done = replay(
         args.bag,
-        Options(args.rate, args.loop, args.clock, args.wait_matched, args.wait_topics, args.follow, args.ros_arguments, args.package),
+        ReplayOptions(args.rate, args.loop, args.clock, args.wait_matched, args.wait_topics, args.follow, args.ros_arguments, args.package),
         say,
     )
     played = done.played

@@ -48,7 +48,7 @@ def fly(
 
 
 @dataclass(frozen=True)
-class Estimator:
+class PositionEstimator:
     """What positions are estimated with; estimator((path, survey)) is what `fly` gives. Can be pickled.
 
     reading : Reading; config : FilterConfig; effects : EffectSet or None, of the TDOAs before the filter; align : as of

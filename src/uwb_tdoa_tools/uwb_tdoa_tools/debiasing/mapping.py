@@ -15,16 +15,16 @@ from .parts import LEAST, part_of, static_parts
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from uwb_tdoa_ekf.debias import BiasMap
-    from .evaluation import Estimator, Scored
+    from .evaluation import PositionEstimator, Scored
 
 FEWEST = 2  # flights; one alone leaves none to judge
 
 
 def fit_map(
-    flown: Iterable[Scored], static: Sequence[str | Path], estimator: Estimator, step: float = 0.35,
+    flown: Iterable[Scored], static: Sequence[str | Path], estimator: PositionEstimator, step: float = 0.35,
     planar: bool = False, interpolator: str = "thin_plate",
 ) -> BiasMap:  # fmt: skip
-    """BiasMap of flights, as an Estimator gave them, and of files of a tag that stood still. Raises InputError.
+    """BiasMap of flights, as an PositionEstimator gave them, and of files of a tag that stood still. Raises InputError.
 
     static : paths, see `static_parts`; step : m; planar, interpolator : see `uwb_tdoa_ekf.debias.fit`.
     """
@@ -41,9 +41,9 @@ def fit_map(
 
 
 def cross_validated(
-    flown: Sequence[Scored], static: Sequence[str | Path], estimator: Estimator, **options: Any
+    flown: Sequence[Scored], static: Sequence[str | Path], estimator: PositionEstimator, **options: Any
 ) -> Shrinkage | None:
-    """Shrinkage of maps, each made without one of the flights that an Estimator gave and judged on it; None for fewer than
+    """Shrinkage of maps, each made without one of the flights that an PositionEstimator gave and judged on it; None for fewer than
     FEWEST. static, options : as of `fit_map`."""
     if len(flown) < FEWEST:
         return None

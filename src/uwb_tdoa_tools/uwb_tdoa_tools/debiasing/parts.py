@@ -16,7 +16,7 @@ from uwb_tdoa_ekf.offline import run_offline
 from ..readers.tables import read_numbers
 from ..scoring.evaluation import corrected_truth
 from ..scoring.metrics import position_at
-from .evaluation import Estimator
+from .evaluation import PositionEstimator
 
 if TYPE_CHECKING:
     from uwb_tdoa_ekf.results import Odometry
@@ -35,7 +35,7 @@ def part_of(score: Score, odometry: Odometry) -> Part:
     return Part(measured, measured - score.error, score.covariance)
 
 
-def static_parts(path: str | Path, estimator: Estimator = Estimator(), planar: bool = False) -> list[Part]:
+def static_parts(path: str | Path, estimator: PositionEstimator = PositionEstimator(), planar: bool = False) -> list[Part]:
     """List of Part of a tag that stood still, one for each place.
 
     path : a CSV file with the columns true_x, true_y, true_z, x, y, z (m; without the z if planar), one row for each

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from .validation import ValidatedSelection
     from .references import Reference
     from .regression.fit import Fit
-    from .regression.table import Table
+    from .regression.table import RegressionTable
     from .channels import ChannelResidual, ChannelResiduals
 
 FOR_MAPS = 3  # flights: a map of fewer is of their paths, and misleads others; two that fly alike bear each other out
@@ -52,7 +52,7 @@ class Attribution:
     """residuals : [{channel: ChannelResidual}] under the base model; selection : Selection;
     detections : (Detection, ...); candidates : all declared Candidates; refused : (Refused, ...); names : of the flights; alone :
     ((name of a flight, Selection), ...) of what one flight shows and the others do not; floor : Selection of what there is near the
-    floor, beside what is found in the air; None if nobody knows; floor_names : of the flights of its Table."""
+    floor, beside what is found in the air; None if nobody knows; floor_names : of the flights of its RegressionTable."""
 
     residuals: list[ChannelResiduals]
     selection: Selection
@@ -150,7 +150,7 @@ def attribute(
     smooth: list[Candidate] = []
     scans: dict[int, Scan] = {}
 
-    def scan_of(table: Table) -> Scan:  # one for each number of rows, which other stamps can change
+    def scan_of(table: RegressionTable) -> Scan:  # one for each number of rows, which other stamps can change
         if len(table.y) not in scans:
             scans[len(table.y)] = Scan(table, _views(table))
         return scans[len(table.y)]
@@ -218,7 +218,7 @@ def residuals_of(
     return out
 
 
-def _search(detectors: Sequence[Detector], table: Table, model: Fit, chosen: Sequence[Candidate]) -> list[Candidate]:
+def _search(detectors: Sequence[Detector], table: RegressionTable, model: Fit, chosen: Sequence[Candidate]) -> list[Candidate]:
     return [candidate for detector in detectors for candidate in detector.search(table, model, chosen)]
 
 
@@ -267,8 +267,8 @@ def _smooth(found: Sequence[ChannelResiduals], installation: tuple[Anchors, np.n
     return out
 
 
-def _views(table: Table) -> dict[str, list[CovariateView]]:
-    """{channel: [CovariateView]} of what a part of each channel of a Table may depend on."""
+def _views(table: RegressionTable) -> dict[str, list[CovariateView]]:
+    """{channel: [CovariateView]} of what a part of each channel of a RegressionTable may depend on."""
     parts: dict[str, list[ChannelResidual]] = {}
     for _, name, _, part in table.parts:
         parts.setdefault(name, []).append(part)

@@ -25,7 +25,7 @@ from .self_calibration.prior import DELAY, FUNCTION_STDS, OF_ANCHORS, POSITION, 
 if TYPE_CHECKING:
     from .regression.fit import Fit
     from .regression.select import Selection
-    from .regression.table import Table
+    from .regression.table import RegressionTable
     from .regression.terms import Column
     from .self_calibration.prior import Solution
 
@@ -48,7 +48,7 @@ def with_deviations(selection: Selection) -> Selection:
     return replace(selection, fit=replace(model, cov=model.cov * np.outer(grow, grow)))
 
 
-def _beside_others(table: Table, model: Fit) -> tuple[np.ndarray, np.ndarray]:
+def _beside_others(table: RegressionTable, model: Fit) -> tuple[np.ndarray, np.ndarray]:
     """(values (k,), standard deviations (k,)) of the columns of a Fit, with what can take the place of anchors integrated out."""
     rows, known, near = table.radio_rows, {column.effect for column in model.columns}, _heard_with(table, model)
     mine = table.matrix(model.columns, rows)
@@ -79,7 +79,7 @@ def _anchor(column: Column) -> str:
     return column.key.partition(".")[0]
 
 
-def _heard_with(table: Table, model: Fit) -> set[str] | None:
+def _heard_with(table: RegressionTable, model: Fit) -> set[str] | None:
     """Ids of the anchors whose positions or delays a Fit tells, and of all that are heard in the same blocks as any of them: set of
     texts. None for all anchors: of few, or of several installations."""
     parts = table.radio_parts

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from .channels import ChannelResiduals
     from .channels.views import CovariateView
     from .regression.select import Search, Selection
-    from .regression.table import Table
+    from .regression.table import RegressionTable
     from .regression.terms import Candidate
 
 TOLD = 0.25  # standard deviation of a share, that a flight must at least tell
@@ -50,7 +50,7 @@ class Share:
 
 
 def shares(selection: Selection, candidate: Candidate, names: Sequence[str]) -> tuple[Share, ...]:
-    """(Share, ...) of a chosen Candidate, one for each flight of its Table, which has `names`: a fit of one factor to the rows of
+    """(Share, ...) of a chosen Candidate, one for each flight of its RegressionTable, which has `names`: a fit of one factor to the rows of
     each."""
     table, model = selection.table, selection.fit
     part = table.matrix(candidate.columns) @ model.values(candidate.columns)
@@ -102,7 +102,7 @@ def in_words(several: Sequence[Share]) -> str:
 
 
 def of_one(
-    remaining: list[ChannelResiduals], inflation: np.ndarray, views: Callable[[Table], dict[str, list[CovariateView]]],
+    remaining: list[ChannelResiduals], inflation: np.ndarray, views: Callable[[RegressionTable], dict[str, list[CovariateView]]],
     search: Search, map_function: MapFunction = map,
 ) -> list[tuple[int, Selection]]:  # fmt: skip
     """[(flight, Selection)] of what each flight alone shows of its own, of [{channel: ChannelResidual}] that a model of all leaves.
@@ -120,7 +120,7 @@ def of_one(
 
 
 def _selection(
-    inflation: np.ndarray, views: Callable[[Table], dict[str, list[CovariateView]]], search: Search,
+    inflation: np.ndarray, views: Callable[[RegressionTable], dict[str, list[CovariateView]]], search: Search,
     residuals: ChannelResiduals,
 ) -> Selection | None:  # fmt: skip
     """Selection of what the residuals of a flight show; None if that is nothing."""

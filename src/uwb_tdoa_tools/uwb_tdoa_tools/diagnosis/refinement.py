@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from .channels import ChannelResiduals
     from .regression.scan import Scan
     from .regression.select import Search, Selection
-    from .regression.table import Table
+    from .regression.table import RegressionTable
 
 ROUNDS = 2  # of linearising about what was found
 LINEARITY_LIMIT = 0.1  # of the channel's scale: root mean square by which a linear model may be off
@@ -59,8 +59,8 @@ def entry_of(effect: Effect) -> Hashable:
     return effect.identity if isinstance(effect, SmoothTerm) else effect.name
 
 
-def linearised(found: Sequence[ChannelResiduals], candidates: Sequence[Candidate], model: Sequence[Effect]) -> Table:
-    """Table with the columns of all candidates about `model`, whose contribution is put back: a fit gives whole values, not
+def linearised(found: Sequence[ChannelResiduals], candidates: Sequence[Candidate], model: Sequence[Effect]) -> RegressionTable:
+    """RegressionTable with the columns of all candidates about `model`, whose contribution is put back: a fit gives whole values, not
     increments."""
     here = {effect.identity: effect for effect in model}
     terms = [term for candidate in candidates for term in candidate.terms]
@@ -70,7 +70,7 @@ def linearised(found: Sequence[ChannelResiduals], candidates: Sequence[Candidate
     return table.with_contribution([(term.effect, term.columns) for term in own])
 
 
-def inflation_of(table: Table, declared: Sequence[Candidate], search: Search) -> np.ndarray:
+def inflation_of(table: RegressionTable, declared: Sequence[Candidate], search: Search) -> np.ndarray:
     """(groups,) loss of independence, on the residual of a fit with all that is declared, and with what `search`, as of `select`, finds."""
     known, model = list(declared), fit(table, columns_of(declared), covariance=False)
     for _ in range(DISGUISED):
@@ -87,8 +87,8 @@ def inflation_of(table: Table, declared: Sequence[Candidate], search: Search) ->
 def relinearised(
     selection: Selection, at: Callable[[Sequence[Effect]], list[ChannelResiduals]], candidates: Sequence[Candidate]
 ) -> Selection:
-    """The selection fitted anew in a Table about its own values, with the columns of `candidates`, where it is not as linear
-    as the Table that it was found in says: positions of anchors that are far off are not."""
+    """The selection fitted anew in a RegressionTable about its own values, with the columns of `candidates`, where it is not as linear
+    as the RegressionTable that it was found in says: positions of anchors that are far off are not."""
     for _ in range(ROUNDS):
         model = effects_of(selection)
         current, table = at(model), selection.table
@@ -102,10 +102,10 @@ def relinearised(
 
 
 def with_smooth(
-    selection: Selection, unmoved: Table, declared: Sequence[Candidate], smooth: Sequence[Candidate], search: Search,
-    scan_of: Callable[[Table], Scan], progress: Callable[[], object],
+    selection: Selection, unmoved: RegressionTable, declared: Sequence[Candidate], smooth: Sequence[Candidate], search: Search,
+    scan_of: Callable[[RegressionTable], Scan], progress: Callable[[], object],
 ) -> Selection:  # fmt: skip
-    """The selection carried on with functions without a name; or begun anew with them in the Table `unmoved`, about nothing, if
+    """The selection carried on with functions without a name; or begun anew with them in the RegressionTable `unmoved`, about nothing, if
     that explains more: the declared effect, or the large group of parameters, was a stopgap."""
     everything = [*smooth, *declared]
     terms = [term for candidate in smooth for term in candidate.terms]

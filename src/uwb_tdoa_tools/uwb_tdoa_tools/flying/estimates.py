@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.anchors import Anchors
     from uwb_tdoa_ekf.core.config import FilterConfig
     from .mission import Pose
-    from .simulator import Measured
+    from .simulator import SensorReadings
 
 NOTHING = Odometry(
     np.empty(0), np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 4)), np.empty((0, 3)), np.empty((0, 3)),
@@ -28,7 +28,7 @@ NOTHING = Odometry(
 )  # fmt: skip
 
 
-class Source(Protocol):
+class EstimateSource(Protocol):
     """Who tells where a vehicle is. why : what keeps it from being flown by, in words, "" for nothing."""
 
     @property
@@ -37,7 +37,7 @@ class Source(Protocol):
     def set_pose(self, t: float, p: np.ndarray, std: float, yaw: float) -> None:
         """Tell that it is at p (3,) m at t, s, to so many m, and points along yaw, to as many rad; NaN: nobody knows."""
 
-    def take(self, measured: Measured) -> None:
+    def take(self, measured: SensorReadings) -> None:
         """Take what arrived."""
 
     @property
@@ -54,7 +54,7 @@ class Source(Protocol):
 
 
 class OurFilter:
-    """`Corrector` and `Estimator`, as in bias_node and ekf_node, behind the calls that a flight needs: a Source."""
+    """`Corrector` and `Estimator`, as in bias_node and ekf_node, behind the calls that a flight needs: a EstimateSource."""
 
     why = ""
 
@@ -76,8 +76,8 @@ class OurFilter:
         """Tell that it is at p (3,) m at t, s, to so many m, and points along yaw, to as many rad; NaN: nobody knows."""
         self._estimator.set_pose(t, p, std**2 * np.eye(3), yaw, std)
 
-    def take(self, measured: Measured) -> None:
-        """Take what arrived: Measured."""
+    def take(self, measured: SensorReadings) -> None:
+        """Take what arrived: SensorReadings."""
         imu, tdoa = measured.imu, measured.tdoa
         if len(imu):
             t, gyro, accel = imu.t - self._offset("imu"), imu.gyro, imu.accel
@@ -132,8 +132,8 @@ class TheirFilter:
         self._states: list[Pose] = []
         self._newest: Pose | None = None
 
-    def take(self, measured: Measured) -> None:
-        """Take what arrived: Measured, of which other sensors are passed over."""
+    def take(self, measured: SensorReadings) -> None:
+        """Take what arrived: SensorReadings, of which other sensors are passed over."""
         both = np.concatenate(events(measured.imu, measured.tdoa, self._anchors))
         if len(both):
             self._peer.run(both[np.argsort(both["t"], kind="stable")])

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.ros_cdr import Template
     from .mission import Pose
     from .pace import Lockstep, RealTime
-    from .simulator import Measured
+    from .simulator import SensorReadings
     from .world import World
 
 FARTHEST, FASTEST = 1e3, 100.0  # m, m/s; what is beyond is no odometry of a hall
@@ -93,8 +93,8 @@ class OverTopics:
         """See OurFilter; is said before what is measured first."""
         self._told = t, p, std, yaw
 
-    def take(self, measured: Measured) -> None:
-        """Publish Measured."""
+    def take(self, measured: SensorReadings) -> None:
+        """Publish SensorReadings."""
         if self._begin is None:
             self._begin = self._node.get_clock().now().nanoseconds
         if self._told:

@@ -13,7 +13,7 @@ from .simulator import DT
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from .simulator import Measured
+    from .simulator import SensorReadings
 
 LARGEST_CATCH_UP = 0.1  # s: a longer delay shifts all that follows
 LONGEST_GAP = 0.3  # s of stamps after which the filter goes on without a stream: more than ekf_node's `lag`
@@ -28,8 +28,8 @@ class RealTime:
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock, self._began, self._now = clock, clock(), 0.0
 
-    def sent(self, now: float, measured: Measured) -> None:
-        """Measured, all up to `now`, s, was published."""
+    def sent(self, now: float, measured: SensorReadings) -> None:
+        """SensorReadings, all up to `now`, s, was published."""
         self._now = now
 
     def heard(self, t: float) -> None:
@@ -54,8 +54,8 @@ class Lockstep:
         self._heard: float | None = None
         self._periods, self._silent = deque([DT], REMEMBERED), True
 
-    def sent(self, now: float, measured: Measured) -> None:
-        """Measured, all up to `now`, s, was published."""
+    def sent(self, now: float, measured: SensorReadings) -> None:
+        """SensorReadings, all up to `now`, s, was published."""
         self._newest |= {stream: part.t[-1] for stream, part in measured.streams.items() if len(part.t)}
         self._first = now if self._first is None else self._first
         settled = 0.0 if now > self._first + TRIAL + UNTRUSTED else UNTRUSTED

@@ -32,9 +32,9 @@ class Circles:
         """s, from the rotors' start to where the slow sinking begins."""
         return self.rise + self.turns * self.turn_time + self.fall
 
-    def along(self, place: np.ndarray, ground: float) -> Reference:
-        """The Reference from `place` (2,) m, where the circle is entered at its point nearest to +x; ground : m, height at which the body
-        stands."""
+    def along(self, place: np.ndarray, ground: float) -> ReferenceTrajectory:
+        """The ReferenceTrajectory from `place` (2,) m, where the circle is entered at its point nearest to +x; ground : m, height at which
+        the body stands."""
         knots = np.arange(0.0, self.duration + KNOT, KNOT)
         up = cruise(knots / self.rise, CLIMB)
         down = cruise((knots - self.duration + self.fall) / self.fall, CLIMB)
@@ -44,10 +44,10 @@ class Circles:
         p[:, 0] = place[0] + self.radius * (np.cos(angle) - 1.0)
         p[:, 1] = place[1] + self.radius * np.sin(angle)
         p[:, 2] = ground + self.height * up - (self.height - SETTLE) * down + self.swing * np.sin(angle)
-        return Reference(p)
+        return ReferenceTrajectory(p)
 
 
-class Reference:
+class ReferenceTrajectory:
     """Position, velocity and acceleration, (n, 3, 3), m and s, wanted since the rotors started; at its end it sinks, and no height is
     wanted.
     duration : s until then; end (2,) m, where."""

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
     from uwb_tdoa_bias.foundation.anchors import Anchors
-    from .trial import Flown
+    from .trial import TrialResult
 
 SPACING = 0.05  # s
 
@@ -32,8 +32,8 @@ class Drawn:
     verdict: dict[str, Any]
 
 
-def drawn(flown: Flown, verdict: dict[str, Any]) -> Drawn:
-    """Drawn, of a Flown."""
+def drawn(flown: TrialResult, verdict: dict[str, Any]) -> Drawn:
+    """Drawn, of a TrialResult."""
     assert flown.flight.truth is not None
     truth, odometry = flown.flight.truth, flown.odometry
     every = max(1, round(SPACING / (truth.t[1] - truth.t[0])))

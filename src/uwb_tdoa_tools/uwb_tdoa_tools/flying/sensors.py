@@ -149,7 +149,7 @@ def _passes(p: np.ndarray, anchor: np.ndarray, person: np.ndarray) -> np.ndarray
     return (np.linalg.norm(nearest[:, :2] - person, axis=1) < PERSON[0]) & (nearest[:, 2] < PERSON[1])
 
 
-class Inertial:
+class InertialErrors:
     """Errors of the inertial sensor at each of its samples: errors (n, 6) rad/s and m/s^2; shaking (n, 3) m/s^2, of turning rotors."""
 
     def __init__(self, world: World, seed: int, duration: float) -> None:
@@ -183,7 +183,7 @@ def gusts(world: World, seed: int, duration: float) -> np.ndarray:
     return world.gust * lfilter([1.0], [1.0, -decay], white, axis=0)
 
 
-class Aid:
+class AidSensor:
     """Another sensor of one flight. t (n,) s."""
 
     rate, width = RATE, 1  # Hz; numbers per measurement
@@ -205,7 +205,7 @@ class Aid:
         raise NotImplementedError
 
 
-class RangeFinder(Aid):
+class RangeFinder(AidSensor):
     """The distance to what is below, along the body's -z, m; inf where it sees nothing."""
 
     def rate_in(self, world: World) -> float:
@@ -219,7 +219,7 @@ class RangeFinder(Aid):
         return (np.where((up > 0.0) & (seen <= self.world.height_range), np.maximum(seen, 0.0), np.inf),)
 
 
-class Barometer(Aid):
+class Barometer(AidSensor):
     """The pressure of the air, Pa."""
 
     def measured(
@@ -228,7 +228,7 @@ class Barometer(Aid):
         return (pressure_at(SITE + p[:, 2] + ALTITUDE_STD * self.noise[rows, 0]),)
 
 
-class Speedometer(Aid):
+class Speedometer(AidSensor):
     """The velocity in the body frame, m/s, and its standard deviation."""
 
     width = 3
@@ -239,7 +239,7 @@ class Speedometer(Aid):
         return v + VELOCITY_STD * self.noise[rows], np.full(v.shape, max(VELOCITY_STD, LEAST_STD))
 
 
-class TwoWayRanging(Aid):
+class TwoWayRanging(AidSensor):
     """Distances to the anchors, each in its turn: ids, m, and a variance of 0, as nobody knows it. Nothing blocks them."""
 
     rate = SENSORS["range"].rate

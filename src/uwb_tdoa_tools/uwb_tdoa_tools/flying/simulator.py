@@ -13,13 +13,13 @@ from uwb_tdoa_bias.foundation.sensors import SENSORS
 from uwb_tdoa_ekf.results import rows_of
 
 from .loop import IMU_RATE, interval, poses_at
-from .sensors import AIDS, Inertial, Radio, gusts, random
+from .sensors import AIDS, InertialErrors, Radio, gusts, random
 from .vehicle import ATTITUDE, GRAVITY, POSITION, STATE, VELOCITY, Vehicle, ground_at
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.sensors.sensor import Stream
     from .controller import Controller
-    from .sensors import Aid
+    from .sensors import AidSensor
     from .world import World
 
 TICK = 4  # samples of the inertial sensor, from one turn of the controller to the next
@@ -32,7 +32,7 @@ RECENT = round(0.3 * IMU_RATE)  # samples of the truth that effects see
 
 
 @dataclass(frozen=True)
-class Measured:
+class SensorReadings:
     """What came in one turn. imu : Imu; tdoa : Tdoas; aids : {name: Stream}, of those that the world has."""
 
     imu: Imu
@@ -60,7 +60,7 @@ class Simulator:
         self.believed = Vehicle(mass=mass * (1.0 + rng.uniform(-WEIGHED, WEIGHED)))
         self.yaw, self.state = yaw, self.vehicle.at_rest(x, y, yaw)
         self._numbers, self._known = self.vehicle.numbers(), self.believed.numbers()
-        self.radio, self._inertial = Radio(world, seed, duration), Inertial(world, seed, duration)
+        self.radio, self._inertial = Radio(world, seed, duration), InertialErrors(world, seed, duration)
         self._aids = {name: AIDS[name](world, seed, duration) for name in world.aids}
         self._wind, self._rng = gusts(world, seed, duration), random(seed, "effects")
         n = len(self._wind)
@@ -86,8 +86,8 @@ class Simulator:
         """Height of what is below it, m."""
         return ground_at(self._numbers, self.state[0], self.state[1])
 
-    def advance(self, controller: Controller) -> Measured:
-        """Fly one turn by what a Controller wants, or be carried on by hands. Returns Measured."""
+    def advance(self, controller: Controller) -> SensorReadings:
+        """Fly one turn by what a Controller wants, or be carried on by hands. Returns SensorReadings."""
         k = self.done
         rows, lately = slice(k + 1, k + TICK + 1), slice(k, k + TICK + 1)
         if self._hands is None:
@@ -106,7 +106,7 @@ class Simulator:
         heard = np.isfinite(d)
         tdoa = Tdoas(radio.t[new][heard], ids[radio.a[new][heard]], ids[radio.b[new][heard]], d[heard])
         aids = {name: self._felt(name, sensor, lately) for name, sensor in self._aids.items()}
-        return self._disturbed(Measured(imu, tdoa, aids))
+        return self._disturbed(SensorReadings(imu, tdoa, aids))
 
     def lift(self, by: np.ndarray, seconds: float) -> None:
         """Be carried by (2,) m, lifted and put down, within so many s, from now on."""
@@ -141,14 +141,14 @@ class Simulator:
         self._heard[stream] = new.stop
         return new, p, q
 
-    def _felt(self, name: str, sensor: Aid, lately: slice) -> Stream:
+    def _felt(self, name: str, sensor: AidSensor, lately: slice) -> Stream:
         new, p, q = self._poses(name, sensor.t, lately)
         v = np.broadcast_to(self.state[VELOCITY], p.shape)
         inside = Rotation.from_quat(q).inv().apply(v) if len(q) else v
         return SENSORS[name].stream(sensor.t[new], *sensor.measured(new, p, q, inside, p[:, 2] - self.ground))
 
-    def _disturbed(self, measured: Measured) -> Measured:
-        """Measured, with the world's effects in it, put there as `inject` does."""
+    def _disturbed(self, measured: SensorReadings) -> SensorReadings:
+        """SensorReadings, with the world's effects in it, put there as `inject` does."""
         if not len(self.world.effects) or not len(measured.tdoa):
             return measured
         tdoa = measured.tdoa

@@ -8,7 +8,7 @@ import numpy as np
 
 from uwb_tdoa_ekf.results import concatenated, rows_of
 
-from .simulator import Measured
+from .simulator import SensorReadings
 
 
 class Transport:
@@ -20,12 +20,12 @@ class Transport:
         # by stream: (what waits, when it arrives (n,) s, the last arrival)
         self._waiting: dict[str, tuple[Any, np.ndarray, float]] = {}
 
-    def arrived(self, measured: Measured, now: float) -> Measured:
-        """Measured that has arrived by `now`, s, after one more Measured was sent."""
+    def arrived(self, measured: SensorReadings, now: float) -> SensorReadings:
+        """SensorReadings that has arrived by `now`, s, after one more SensorReadings was sent."""
         if not self._latency and not self._jitter:
             return measured
         parts = {stream: self._due(stream, part, now) for stream, part in measured.streams.items()}
-        return Measured(parts.pop("imu"), parts.pop("tdoa"), parts)
+        return SensorReadings(parts.pop("imu"), parts.pop("tdoa"), parts)
 
     def _due(self, stream: str, part: Any, now: float) -> Any:
         held, arrival, last = self._waiting.get(stream, (None, np.empty(0), 0.0))

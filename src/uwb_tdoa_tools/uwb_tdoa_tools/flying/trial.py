@@ -26,9 +26,9 @@ from .vehicle import ATTITUDE, POSITION
 from .world import World
 
 if TYPE_CHECKING:
-    from .estimates import Source
+    from .estimates import EstimateSource
     from .mission import Route
-    from .simulator import Measured
+    from .simulator import SensorReadings
 
 REST_AFTER = 3.0  # s of the recording after the rotors have stopped
 PAUSE, CARRIED, CARRY_TIME = 60.0, 2.0, 6.0  # s at rest between two flights, m and s by which it is carried then
@@ -59,7 +59,7 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Flown:
+class TrialResult:
     """What became of it. flight : Flight, all that arrived, its truth at every sample of the inertial sensor; states (n, 17) and
     contact (n,), number of feet on the ground, beside that; odometry : Odometry, all that came out; missions : [Mission], one for each
     take-off; crash : what ended it, text, or ""."""
@@ -75,9 +75,9 @@ class Flown:
 
 class Trial:
     """A Task under way. simulator : Simulator; source : who tells where it is; missions : [Mission], the last one under way; crash : as of
-    Flown."""
+    TrialResult."""
 
-    def __init__(self, task: Task, source: Source | None = None, lasts: float | None = None) -> None:
+    def __init__(self, task: Task, source: EstimateSource | None = None, lasts: float | None = None) -> None:
         """source : something like OurFilter, default: what the Task says; lasts : s, default: as long as it can take."""
         world, seed, rules = task.world, task.seed, task.rules
         longest = rules.rest + rules.patience + task.path.duration + rules.longest_sink + REST_AFTER
@@ -87,14 +87,14 @@ class Trial:
         told = random(seed, "told")
         place, off = self.simulator.state[POSITION] + TOLD_STD * told.standard_normal(3), TOLD_STD * told.standard_normal()
         yaw = self.simulator.yaw + off
-        self.source: Source | TheirFilter = source or _filter_of(task, place, yaw)
+        self.source: EstimateSource | TheirFilter = source or _filter_of(task, place, yaw)
         if task.told == "place" and not isinstance(self.source, TheirFilter):
             self.source.set_pose(TOLD_AT, place, TOLD_STD, yaw if task.yaw == "known" else math.nan)
         self.controller = Controller(task.gains, self.simulator.believed)
         self.transport = Transport(world.latency, world.jitter, random(seed, "transport"))
         self.missions: list[Mission] = []
         self.crash = ""
-        self._arrived: list[Measured] = []
+        self._arrived: list[SensorReadings] = []
 
     def fly(self) -> None:
         """One mission from where it stands, until it has rested for a while after it, or has come to an end."""
@@ -156,8 +156,8 @@ class Trial:
         return attitude
 
     @property
-    def flown(self) -> Flown:
-        """Flown."""
+    def flown(self) -> TrialResult:
+        """TrialResult."""
         simulator, world = self.simulator, self.task.world
         end = simulator.done + 1
         states = simulator.states[:end]
@@ -166,11 +166,11 @@ class Trial:
         truth = Truth(simulator.times[:end], states[:, POSITION], states[:, ATTITUDE])
         meta = {"source": "fly", "format": "simulation", "protocol": world.protocol}
         flight = Flight(f"flown-{self.task.seed}", world.anchors, parts[1], parts[0], truth, meta=meta, **aids)
-        return Flown(self.task, flight, states, simulator.contact[:end], self.source.odometry, self.missions, self.crash)
+        return TrialResult(self.task, flight, states, simulator.contact[:end], self.source.odometry, self.missions, self.crash)
 
 
-def fly(task: Task) -> Flown:
-    """Flown, of a Task."""
+def fly(task: Task) -> TrialResult:
+    """TrialResult, of a Task."""
     trial = Trial(task)
     trial.fly()
     if task.again and not trial.crash and trial.missions[0].state == DONE:

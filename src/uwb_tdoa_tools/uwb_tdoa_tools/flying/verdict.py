@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.flight import Truth
     from uwb_tdoa_ekf.results import Odometry
     from .mission import Mission
-    from .trial import Flown
+    from .trial import TrialResult
 
 AIR = 0.3  # m above the ground, from which on it is in the air
 UPRIGHT = math.radians(30.0)
@@ -30,9 +30,9 @@ SPACING = 0.02  # s between the estimates that are judged
 PHASES = "before", "lift_off", "air", "landing", "after"
 
 
-def verdict_of(flown: Flown) -> dict[str, Any]:
-    """dict for JSON, of a Flown: the verdict and its figures; None where there is nothing to say. Of several flights the last one's; what
-    kept an earlier one from landing counts for all.
+def verdict_of(flown: TrialResult) -> dict[str, Any]:
+    """dict for JSON, of a TrialResult: the verdict and its figures; None where there is nothing to say. Of several flights the last one's;
+    what kept an earlier one from landing counts for all.
 
     landed : took off, and stood upright in the end within NEAR of the wanted place, having touched it at less than SLOW; why : what was
     missing, "" where it landed; safe : it never left the ground, or came down upright at less than GENTLE, wherever; place : m, from the
@@ -52,7 +52,7 @@ def verdict_of(flown: Flown) -> dict[str, Any]:
     return {"seed": flown.task.seed, "landed": not why, **verdicts[-1], "why": why}
 
 
-def _of_mission(flown: Flown, mission: Mission, end: float) -> dict[str, Any]:
+def _of_mission(flown: TrialResult, mission: Mission, end: float) -> dict[str, Any]:
     """Figures of one Mission, until `end`, s."""
     assert flown.flight.truth is not None
     truth = flown.flight.truth

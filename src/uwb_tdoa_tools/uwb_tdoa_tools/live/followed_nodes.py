@@ -12,7 +12,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.sensors import SENSORS
 
 from .follow import AID_SHARE, LAG, STEP
-from .processes import Diagnostics
+from .processes import DiagnosticsListener
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -45,7 +45,7 @@ class Nodes:
     def __init__(self, node: Node) -> None:
         """Raises InputError if their parameters do not allow to wait for what is on its way, or if one says nothing on
         /diagnostics."""
-        self._node, self._diagnostics = node, Diagnostics(node)
+        self._node, self._diagnostics = node, DiagnosticsListener(node)
         space = node.get_namespace()
         self._wait_for_names()
         there = node.get_node_names_and_namespaces()
@@ -76,7 +76,7 @@ class Nodes:
                 wrong[f"{what} lost"] = max(lost, wrong.get(f"{what} lost", 0))
         return {what: count for what, count in wrong.items() if count > 0}
 
-    def _counts(self, is_enough: Callable[[Diagnostics], object]) -> dict[str, dict[str, int]]:
+    def _counts(self, is_enough: Callable[[DiagnosticsListener], object]) -> dict[str, dict[str, int]]:
         """{node: {key: count}} when each has said something and is_enough(diagnostics)."""
         until = time.monotonic() + SETTLE_LIMIT
         self._diagnostics.forget()

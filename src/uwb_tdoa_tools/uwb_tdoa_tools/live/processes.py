@@ -87,7 +87,7 @@ def wait(
     processes.check()
 
 
-class Diagnostics:
+class DiagnosticsListener:
     """The newest status of each node on /diagnostics, and whether it still changes."""
 
     def __init__(self, node: Node) -> None:

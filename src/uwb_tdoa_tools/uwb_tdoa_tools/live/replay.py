@@ -34,7 +34,7 @@ DISCOVERY = 2.0  # s without anybody new after which who listens by now is enoug
 
 
 @dataclass(frozen=True)
-class Options:
+class ReplayOptions:
     """How to replay.
 
     rate : times as fast as recorded; loop : start again at the end; clock_rate : Hz of /clock, None for none;
@@ -66,7 +66,7 @@ class Replayed:
     wrong: dict[str, int] = field(default_factory=dict)
 
 
-def replay(bag: str | Path, options: Options = Options(), say: Callable[[str], object] = print) -> Replayed:
+def replay(bag: str | Path, options: ReplayOptions = ReplayOptions(), say: Callable[[str], object] = print) -> Replayed:
     """Replay a bag. Returns Replayed. Raises InputError. say(sentence) : told what happens."""
     with open_bag(bag) as reader, session("replay", list(options.ros_arguments)) as (node, stop):
         publishers = _publishers(node, bag, reader, say, options.packages)
@@ -121,7 +121,7 @@ def _publishers(
 
 
 def _wait_for_listeners(
-    node: Node, publishers: dict[str, Publisher], options: Options, stop: Stop, say: Callable[[str], object]
+    node: Node, publishers: dict[str, Publisher], options: ReplayOptions, stop: Stop, say: Callable[[str], object]
 ) -> None:
     """Return when somebody subscribes to each wanted topic: those that options name, or else all of the bag, as far as
     they have any subscriber once nobody new has come for DISCOVERY s; and when somebody publishes what is followed.

@@ -12,7 +12,7 @@ from uwb_tdoa_bias.foundation.sensors import SENSORS
 from uwb_tdoa_ekf.results import VERDICTS
 
 from ..bags.files import open_bag
-from .processes import Diagnostics, Processes, own_domain, wait
+from .processes import DiagnosticsListener, Processes, own_domain, wait
 from .session import session
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def run_live(
     if recorded.exists():
         shutil.rmtree(recorded)
     with own_domain(), session("demo", []) as (node, stop), Processes(folder, stop) as processes:
-        diagnostics = Diagnostics(node)
+        diagnostics = DiagnosticsListener(node)
         processes.start("uwb_tdoa_bias", "bias_node", *_parameters("bias_node", bias_parameters))
         processes.start("uwb_tdoa_ekf", "ekf_node", *_parameters("ekf_node", ekf_parameters))
         processes.start("uwb_tdoa_tools", "record", "--output", recorded, "odometry")
@@ -110,13 +110,13 @@ def _parameters(name: str, values: dict[str, Any] | None) -> list[str]:
     return ["--ros-args", *(part for key, value in values.items() for part in ("-p", f"{key}:={json.dumps(value)}"))]
 
 
-def _played(diagnostics: Diagnostics, total: int) -> str:
+def _played(diagnostics: DiagnosticsListener, total: int) -> str:
     """How much of the TDOAs of the bag bias_node has, in words."""
     received = int(diagnostics.newest("bias_node").get("received", 0))
     return f"{100.0 * received / max(total, 1):.0f} % of the flight is through"
 
 
-def _is_ready(node: Node, diagnostics: Diagnostics) -> bool:
+def _is_ready(node: Node, diagnostics: DiagnosticsListener) -> bool:
     found = diagnostics.newest("ekf_node").get("publishers of uwb/tdoa_corrected", "0") != "0"
     return found and bool(diagnostics.newest("bias_node")) and all(
         node.count_publishers(topic) >= publishers and node.count_subscribers(topic) >= subscriptions

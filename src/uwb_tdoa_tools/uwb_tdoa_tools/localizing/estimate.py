@@ -13,7 +13,7 @@ from uwb_tdoa_ekf.smoother import smooth
 
 
 @dataclass(frozen=True)
-class Estimator:
+class FlightEstimator:
     """estimator(flight) is the Run over a Flight; its ground truth is not used. Can be pickled.
 
     config : FilterConfig; effects, network : what the TDOAs are corrected with, or None; smoothed : use what came after each

@@ -13,7 +13,7 @@ from ..readers.inputs import Reading
 from ..scoring.tum import write_tum
 from . import files, pictures, rerun_file, residuals, zones
 from .belief import GOOD, Belief, believe
-from .estimate import Estimator
+from .estimate import FlightEstimator
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -42,12 +42,12 @@ class Located:
 class Localizer:
     """localizer((path, survey)) is the Located of a recording, whose ground truth is not read. Can be pickled.
 
-    reading : Reading; estimator : Estimator; folder : where to write; bag : write a bag, too; left : write residuals, too; rerun :
+    reading : Reading; estimator : FlightEstimator; folder : where to write; bag : write a bag, too; left : write residuals, too; rerun :
     file for Rerun, or None; zones : m, write who is heard in squares of that size, or None. Raises InputError.
     """
 
     reading: Reading
-    estimator: Estimator
+    estimator: FlightEstimator
     folder: Path
     bag: bool = False
     left: bool = False

@@ -16,7 +16,7 @@ from uwb_tdoa_ekf.results import Residuals
 
 from ..bags.bag import read_bag, read_fields, read_odometry
 from ..scoring.metrics import position_at
-from .estimate import Estimator
+from .estimate import FlightEstimator
 from .pictures import SIGMAS
 from .residuals import by_pair
 
@@ -82,7 +82,7 @@ def write_diagnosis(path: Path, result: Diagnosis, base: EffectSet, config: Filt
     """Write the single flight of a Diagnosis: estimates with the EffectSet `base` and with what was found, what that is, and the ground
     truth as it was judged by."""
     (flight,) = result.flights
-    before, after = (Estimator(config, effects)(flight) for effects in (base, result.effects))
+    before, after = (FlightEstimator(config, effects)(flight) for effects in (base, result.effects))
     truth = flight.truth if result.reference.tells_errors else None
     write_rerun(path, flight, after.odometry, after.residuals, result.as_text().splitlines(), truth, before.odometry)
 

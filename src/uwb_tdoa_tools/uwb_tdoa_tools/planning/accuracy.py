@@ -23,7 +23,7 @@ FEW = 20  # estimates in a cell below which it tells nothing
 
 
 @dataclass(frozen=True)
-class Samples:
+class ErrorSamples:
     """Estimates against ground truth. t : (n,) s; place : (n, 3) m, true; error : (n, 3) m;
     covariance : (n, 3, 3) m^2, what the filter claims."""
 
@@ -33,19 +33,19 @@ class Samples:
     covariance: np.ndarray
 
 
-def fly(flight: Flight, aids: Iterable[str] = ()) -> Samples:
-    """Samples of a Flight with ground truth, static or moving, from its TDOAs, IMU and `aids`, names of AIDS, alone. Raises
+def fly(flight: Flight, aids: Iterable[str] = ()) -> ErrorSamples:
+    """ErrorSamples of a Flight with ground truth, static or moving, from its TDOAs, IMU and `aids`, names of AIDS, alone. Raises
     InputError."""
     assert flight.truth is not None
     score, _ = evaluate(flight.without(*(name for name in AIDS if name not in aids)))
-    return Samples(score.t, position_at(score.t, flight.truth), score.error, score.covariance)
+    return ErrorSamples(score.t, position_at(score.t, flight.truth), score.error, score.covariance)
 
 
-def together(samples: Sequence[Samples]) -> Samples:
-    """One Samples of several, their times moved apart."""
+def together(samples: Sequence[ErrorSamples]) -> ErrorSamples:
+    """One ErrorSamples of several, their times moved apart."""
     apart = max(s.t[-1] for s in samples) + 10.0
     times = np.concatenate([s.t + k * apart for k, s in enumerate(samples)])
-    return Samples(
+    return ErrorSamples(
         times, *(np.concatenate([getattr(s, name) for s in samples]) for name in ("place", "error", "covariance"))
     )
 
@@ -66,8 +66,8 @@ class AccuracyMap:
     claimed: np.ndarray
 
 
-def accuracy_map(samples: Samples, installation: Installation, grid: Grid) -> AccuracyMap:
-    """AccuracyMap of Samples. Estimates outside of the grid are left out."""
+def accuracy_map(samples: ErrorSamples, installation: Installation, grid: Grid) -> AccuracyMap:
+    """AccuracyMap of ErrorSamples. Estimates outside of the grid are left out."""
     variances = np.diagonal(promised(samples, installation), axis1=1, axis2=2)
     claimed = np.diagonal(samples.covariance, axis1=1, axis2=2)
     cell = np.floor((samples.place - grid.lower) / grid.step).astype(int)
@@ -85,12 +85,12 @@ def accuracy_map(samples: Samples, installation: Installation, grid: Grid) -> Ac
     )
 
 
-def promised(samples: Samples, installation: Installation) -> np.ndarray:
+def promised(samples: ErrorSamples, installation: Installation) -> np.ndarray:
     """The bound of one round at the place of every sample: (n, 3, 3) m^2. Needs three dimensions."""
     return bound(information(samples.place, installation))
 
 
-def comparison(samples: Samples, installation: Installation) -> dict[str, Any]:
+def comparison(samples: ErrorSamples, installation: Installation) -> dict[str, Any]:
     """Achieved and claimed errors against the bound, over all samples: a dict of m and ratios.
 
     rmse, bound, claimed : roots of the mean squares of the 3D error, of the bound of one round, and of what the filter

@@ -15,7 +15,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from ..simulation.constellations import facing
 from .descent import descend
 from .goal import UNUSABLE
-from .places import Places, spread
+from .places import AnchorPlaces, spread
 
 if TYPE_CHECKING:
     from .check import Wrap
@@ -36,13 +36,13 @@ _STEP = 1e-6  # of x, for derivatives
 @dataclass(frozen=True)
 class Layout:
     """What is free and what is not, as a vector x of numbers that matter alike: for each anchor to place those of
-    Places, times their length over an arm, then a rotation vector, rad.
+    AnchorPlaces, times their length over an arm, then a rotation vector, rad.
 
     count : anchors to place; fixed : Anchors that stay, or None; target : (3,) m, what new antennas face, their axis
     upright, before they are turned; turned : whether they are, or radiate alike in all directions, like anchors whose
     orientation nobody surveyed."""
 
-    places: Places
+    places: AnchorPlaces
     count: int
     fixed: Anchors | None
     target: np.ndarray
@@ -112,12 +112,12 @@ class Layout:
 
 
 def optimise(
-    goal: Goal, places: Places, count: int, fixed: Anchors | None = None, start: np.ndarray | None = None,
+    goal: Goal, places: AnchorPlaces, count: int, fixed: Anchors | None = None, start: np.ndarray | None = None,
     starts: int = 16, progress: Wrap = iter,
 ) -> Anchors:  # fmt: skip
     """Anchors at the `count` best places, turned in the best directions; after those of `fixed`, which stay.
 
-    goal : Goal; places : Places; start : (count, 3) m, a layout to begin with besides the quasi-random ones;
+    goal : Goal; places : AnchorPlaces; start : (count, 3) m, a layout to begin with besides the quasi-random ones;
     progress : wraps the starts. Descents from all starts at a few of the goal's points; the best of what
     they lead to descend again, with the points that turn out to be the worst. The best score at all points wins."""
     layout = Layout(places, count, fixed, goal.points.mean(axis=0), are_turned(goal.installation.anchors))
@@ -139,7 +139,7 @@ def optimise(
     return best
 
 
-def one_more(goal: Goal, anchors: Anchors, places: Places, count: int = 400) -> tuple[np.ndarray, np.ndarray]:
+def one_more(goal: Goal, anchors: Anchors, places: AnchorPlaces, count: int = 400) -> tuple[np.ndarray, np.ndarray]:
     """What one more anchor would give at places all over: (positions (n, 3) m, scores (n,) m), facing the points."""
     layout = Layout(places, 1, anchors, goal.points.mean(axis=0), are_turned(anchors))
     numbers = places.grid(count)

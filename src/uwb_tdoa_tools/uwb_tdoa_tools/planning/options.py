@@ -17,7 +17,7 @@ from .goal import Goal
 from .maps import Grid
 from .noise import FixedNoise, RadioNoise, antenna_from_yaml
 from .pairing import OF_PROTOCOL, PAIRINGS
-from .places import Places, lattice
+from .places import AnchorPlaces, lattice
 
 if TYPE_CHECKING:
     from argparse import Namespace
@@ -30,12 +30,12 @@ SEARCHED = 300  # cells of the flown volume whose corners are looked at while be
 
 @dataclass(frozen=True)
 class Aim:
-    """What --improve asks for. goal : Goal to search with; reported : Goal at more points, to report; places : Places;
+    """What --improve asks for. goal : Goal to search with; reported : Goal at more points, to report; places : AnchorPlaces;
     count : how many anchors."""
 
     goal: Goal
     reported: Goal
-    places: Places
+    places: AnchorPlaces
     count: int
 
 
@@ -119,9 +119,9 @@ def goal_of(args: Namespace, installation: Installation) -> Goal:
     return Goal(np.empty((0, 3)), installation, _pairing(args), criterion=args.flyable)
 
 
-def places_of(args: Namespace, room: Room) -> Places:
-    """Places that --places gives, or the walls of the Room. Raises InputError."""
-    return Places.from_yaml(args.places) if args.places else Places.walls(room.lower, room.upper)
+def places_of(args: Namespace, room: Room) -> AnchorPlaces:
+    """AnchorPlaces that --places gives, or the walls of the Room. Raises InputError."""
+    return AnchorPlaces.from_yaml(args.places) if args.places else AnchorPlaces.walls(room.lower, room.upper)
 
 
 def plain(args: Namespace) -> dict[str, Any]:

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 
-class Places:
+class AnchorPlaces:
     """Where anchors may be: boxes, which may be flat (a wall), thin (a rail) or a point.
 
     Two numbers between 0 and 1 for a place on flat boxes, three where a box has volume: the first runs through all
@@ -40,7 +40,7 @@ class Places:
     @classmethod
     def walls(
         cls, lower: Sequence[float] | np.ndarray, upper: Sequence[float] | np.ndarray, lowest: float = 0.2, depth: float = 0.0
-    ) -> Places:
+    ) -> AnchorPlaces:
         """The four walls of a room from `lowest` m above its floor to its ceiling, and what is within `depth` m of
         them."""
         (x0, y0, z0), (x1, y1, z1) = lower, upper
@@ -55,7 +55,7 @@ class Places:
         )
 
     @classmethod
-    def from_yaml(cls, path: str | Path) -> Places:
+    def from_yaml(cls, path: str | Path) -> AnchorPlaces:
         """Read `places: [[x0, y0, z0, x1, y1, z1], ...]`; raises InputError."""
         content = read_yaml(path)
         try:

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from ..simulation.room import Room
     from .installation import Installation
     from .maps import Chart
-    from .places import Places
+    from .places import AnchorPlaces
 
 ENOUGH = 0.95  # of the room that can be flown: no anchor is proposed
 LOOKED_AT, TRIED = 600, 60  # cells of the room, and places, that are tried for one more anchor, about
@@ -92,13 +92,13 @@ def check(installation: Installation, grid: Grid, out: Path) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Fly:
-    """fly((path, survey)) is the name of a recording and its Samples. reading : Reading; aids : what it may use, as for
+    """fly((path, survey)) is the name of a recording and its ErrorSamples. reading : Reading; aids : what it may use, as for
     accuracy.fly. Can be pickled. Raises InputError."""
 
     reading: Reading
     aids: tuple[str, ...] = ()
 
-    def __call__(self, recording: Recording) -> tuple[str, accuracy.Samples]:
+    def __call__(self, recording: Recording) -> tuple[str, accuracy.ErrorSamples]:
         flight = self.reading.read(recording)
         for name in self.aids:
             if getattr(flight, name) is None:
@@ -107,7 +107,7 @@ class Fly:
 
 
 def evaluate_flights(
-    flown: Iterable[tuple[str, accuracy.Samples]], installation: Installation, room: Room, step: float, out: Path
+    flown: Iterable[tuple[str, accuracy.ErrorSamples]], installation: Installation, room: Room, step: float, out: Path
 ) -> list[dict[str, Any]]:
     """Rows of `accuracy.comparison`, one for each of what a Fly gave, and one for all. step : m, of the picture."""
     samples, rows = [], []
@@ -122,11 +122,11 @@ def evaluate_flights(
 
 
 def addition(
-    found: Chart, anchors: Anchors, installed: Callable[[Anchors], Installation], places: Places, criterion: str
+    found: Chart, anchors: Anchors, installed: Callable[[Anchors], Installation], places: AnchorPlaces, criterion: str
 ) -> dict[str, Any] | None:
     """What the best of some places for one more anchor would add to what is flyable: {"position": (3,) m, "gain": share of the room}, to
     the centimetre; None where nearly all is flyable. found : Chart of Anchors; installed(anchors) : Installation of others; places :
-    Places."""
+    AnchorPlaces."""
     if found.flyable.mean() > ENOUGH:
         return None
     grid = found.grid

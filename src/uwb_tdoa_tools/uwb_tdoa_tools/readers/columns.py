@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.flight import Flight
     from .names import Named
     from .streams import Streams
-    from .tables import Table
+    from .tables import CsvTable
 
 TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 LENGTH = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "ticks": 299792458.0 / (128 * 499.2e6), "ns": 0.299792458}
@@ -115,7 +115,7 @@ def read_columns(
     return make_flight(Path(paths[0]).stem, named.anchors, streams, {}, meta, salvage)
 
 
-def _having(tables: dict[str | Path, Table], mine: dict[str, tuple[str, float]]) -> str | Path:
+def _having(tables: dict[str | Path, CsvTable], mine: dict[str, tuple[str, float]]) -> str | Path:
     """The path of the one table that has all columns."""
     names = {theirs for theirs, _ in mine.values()}
     having = [path for path, table in tables.items() if names <= {*table.names}]
@@ -128,7 +128,7 @@ def _having(tables: dict[str | Path, Table], mine: dict[str, tuple[str, float]])
 
 
 def _values(
-    path: str | Path, table: Table, streams: dict[str, dict[str, tuple[str, float]]], named: Named, remarks: list[str],
+    path: str | Path, table: CsvTable, streams: dict[str, dict[str, tuple[str, float]]], named: Named, remarks: list[str],
     salvage: bool,
 ) -> dict[str, dict[str, np.ndarray]]:  # fmt: skip
     """{stream: {our name: (n,) array}}, in our units, of the rows in which a cell of the stream is filled and all are numbers, or names of

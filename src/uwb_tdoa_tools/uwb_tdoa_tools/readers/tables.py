@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-class Rows:
+class CsvRows:
     """Lists of cells, row by row, of CSV content, bytes. line : how many lines were read. Raises csv.Error for what is no CSV, and
     InputError for what is no text."""
 
@@ -51,14 +51,14 @@ class Rows:
             yield line
 
 
-class Table:
+class CsvTable:
     """(line, {column: text}) of each row of a CSV file. names : the columns of its header."""
 
     def __init__(self, path: str | Path, columns: Sequence[str] | None, most: int, complete: bool = True) -> None:
         self._path, self._most, self._complete = path, most, complete
         content = read_bytes(path, TABLE_BYTES)
         header = content[:ROW_CHARACTERS].lstrip().split(b"\n", 1)[0]
-        self._rows = Rows(path, content, skipinitialspace=True, delimiter=max(",;\t", key=lambda each: header.count(each.encode())))
+        self._rows = CsvRows(path, content, skipinitialspace=True, delimiter=max(",;\t", key=lambda each: header.count(each.encode())))
         self._cells = self._each()
         self.names = [name.strip() for name in next(self._cells, [])]
         self._columns = columns if columns is not None else [name for name in self.names if name]
@@ -86,11 +86,11 @@ class Table:
 
 def read_table(
     path: str | Path, columns: Sequence[str] | None = None, most: int = SMALL_TABLE_CELLS, complete: bool = True
-) -> Table:
-    """The Table of a CSV file that has at least the columns, others passed over; default: of all that it has. It may have `most`
+) -> CsvTable:
+    """The CsvTable of a CSV file that has at least the columns, others passed over; default: of all that it has. It may have `most`
     cells, divided by what the header has most of: commas, semicolons or tabs. complete : a row with fewer cells than the header is refused;
     otherwise those that are missing are empty. Raises InputError, also while it is iterated over."""
-    return Table(path, columns, most, complete)
+    return CsvTable(path, columns, most, complete)
 
 
 def read_numbers(path: str | Path, columns: Sequence[str]) -> np.ndarray:

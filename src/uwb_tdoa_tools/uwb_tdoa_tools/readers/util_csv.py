@@ -15,7 +15,7 @@ from uwb_tdoa_bias.foundation.files import read_bytes
 from uwb_tdoa_bias.foundation.limits import CSV_BYTES, CSV_CELLS, most_unpacked
 
 from .streams import SALVAGE, make_flight
-from .tables import Rows, check_text
+from .tables import CsvRows, check_text
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -141,7 +141,7 @@ def _table(path: str | Path, content: bytes, remarks: list[str], salvage: bool) 
             )
         remarks.append(f"line {line} is cut and left out.")
         content = content[: max(content.rfind(b"\n"), content.rfind(b"\r")) + 1]
-    rows, header, count = Rows(path, content), None, 0
+    rows, header, count = CsvRows(path, content), None, 0
     block: list[list[str]] = []
     columns: dict[str, _Column] = {}
     try:

@@ -25,7 +25,7 @@ from .metrics import ALIGN, judged_part, position_at
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from uwb_tdoa_bias.effects.samples import Poses
+    from uwb_tdoa_bias.effects.samples import PoseColumns
     from uwb_tdoa_bias.foundation.flight import Flight, Truth
     from ..checking.delays import Delays
 
@@ -172,7 +172,7 @@ def apart(path: np.ndarray, other: np.ndarray) -> float:
     return float(np.sqrt(np.median(np.sum((path - other) ** 2, axis=1)))) if len(path) else np.inf
 
 
-def alignment_of(flight: Flight, odometry: Poses) -> Alignment:
+def alignment_of(flight: Flight, odometry: PoseColumns) -> Alignment:
     """Alignment of the ground truth of a Flight beside an Odometry. Raises InputError where it is on another clock, and the
     paths do not tell on which."""
     assert flight.truth is not None
@@ -195,7 +195,7 @@ def alignment_of(flight: Flight, odometry: Poses) -> Alignment:
     return Alignment(epoch + late, told_by, axes, turn, shift, middle, or_turned)
 
 
-def _turned_or_late(flight: Flight, odometry: Poses, late: float, behind: float) -> float:
+def _turned_or_late(flight: Flight, odometry: PoseColumns, late: float, behind: float) -> float:
     """What is left of the distance of the paths if the frame is turned, over what is left if ground truth and TDOAs are apart in time too:
     below 1 the turn is all of it. Infinite where they are not apart, or nobody can tell."""
     assert flight.truth is not None
@@ -272,7 +272,7 @@ def _inertial(flight: Flight) -> Delays | None:
     return found if power.min() < CONTRAST * np.median(power) else None
 
 
-def _other_axes(truth: Truth, odometry: Poses) -> np.ndarray:
+def _other_axes(truth: Truth, odometry: PoseColumns) -> np.ndarray:
     """(3, 3) signed permutation after which the ground truth is much nearer to the estimate; the identity if there is none."""
     true, estimated = paths(truth, odometry)
     if len(true) < FEWEST:
@@ -285,7 +285,7 @@ def _other_axes(truth: Truth, odometry: Poses) -> np.ndarray:
     return best if error(best) < AXES * error(np.eye(3)) else np.eye(3)
 
 
-def paths(truth: Truth, odometry: Poses) -> tuple[np.ndarray, np.ndarray]:
+def paths(truth: Truth, odometry: PoseColumns) -> tuple[np.ndarray, np.ndarray]:
     """(true (n, 3), estimated (n, 3)) m at the same instants, while the tag moves."""
     if len(odometry.t) < 2:
         return np.empty((0, 3)), np.empty((0, 3))
@@ -295,7 +295,7 @@ def paths(truth: Truth, odometry: Poses) -> tuple[np.ndarray, np.ndarray]:
     return position_at(t, truth), position_at(t, odometry)
 
 
-def _epoch(flight: Flight, odometry: Poses) -> float:
+def _epoch(flight: Flight, odometry: PoseColumns) -> float:
     """s by which the stamps of a ground truth on another clock are late: where its path is nearest to that of the estimate, as it is, or
     else, about its middle, with other axes."""
     assert flight.truth is not None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from ..localizing.estimate import Estimator
+from ..localizing.estimate import FlightEstimator
 from .alignment import need_truth
 from .metrics import Score
 
@@ -21,11 +21,11 @@ def evaluate(
     flight: Flight, config: FilterConfig | None = None, effects: EffectSet | None = None, network: Network | None = None
 ) -> tuple[Score, Run]:
     """Run the filter over a Flight with ground truth. Returns (Score, Run). Raises InputError if there is no truth."""
-    return score_of(flight, Estimator(config, effects, network))
+    return score_of(flight, FlightEstimator(config, effects, network))
 
 
-def score_of(flight: Flight, estimator: Estimator) -> tuple[Score, Run]:
-    """(Score, Run) of a Flight with ground truth, by an Estimator. Raises InputError if there is no truth, or one on
+def score_of(flight: Flight, estimator: FlightEstimator) -> tuple[Score, Run]:
+    """(Score, Run) of a Flight with ground truth, by an FlightEstimator. Raises InputError if there is no truth, or one on
     another clock."""
     need_truth(flight)
     run = estimator(flight)

@@ -10,7 +10,7 @@ from .. import parallel
 from ..bags.bag import late_tdoas, read_odometry
 from ..checking.against_truth import of_truth
 from ..checking.remarks import survey_remarks
-from ..localizing.estimate import Estimator
+from ..localizing.estimate import FlightEstimator
 from ..localizing.rerun_file import write_rerun
 from ..readers.inputs import Reading, report_remarks
 from ..results_file import ResultsFile, state_of
@@ -33,14 +33,14 @@ if TYPE_CHECKING:
 class Evaluator:
     """evaluator((path, survey)) is the Result of a recording: of the filter run over it, or of the odometry in a bag.
 
-    reading : Reading; estimator : Estimator; odometry : path of a bag whose odometry is judged instead, or None; picture :
+    reading : Reading; estimator : FlightEstimator; odometry : path of a bag whose odometry is judged instead, or None; picture :
     file to draw the errors to, or None; trajectories : folder for TUM files, or None; rerun : file for Rerun, or None; align : of
     ALIGN, what of the ground truth is moved onto the estimate before it judges.
     Raises InputError. Can be pickled.
     """
 
     reading: Reading = Reading()
-    estimator: Estimator = Estimator()
+    estimator: FlightEstimator = FlightEstimator()
     odometry: str | None = None
     picture: str | None = None
     trajectories: Path | None = None

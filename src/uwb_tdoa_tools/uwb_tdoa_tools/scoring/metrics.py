@@ -10,7 +10,7 @@ from typing import Any, Protocol, TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.effects.samples import Poses
+from uwb_tdoa_bias.effects.samples import PoseColumns
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.verdicts import REJECTED, USED
 from uwb_tdoa_ekf.results import rows_of
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from .by_phase import Spans
 
 
-class Estimate(Poses, Protocol):
+class Estimate(PoseColumns, Protocol):
     """Poses, and how far to trust them: covariance (n, k, k), its first three rows and columns of the position, m^2."""
 
     @property
@@ -59,7 +59,7 @@ def judged_part(truth: Truth) -> tuple[str, float, float]:
     return name, first, last
 
 
-def position_at(t: np.ndarray, truth: Poses) -> np.ndarray:
+def position_at(t: np.ndarray, truth: PoseColumns) -> np.ndarray:
     """True positions at stamps t (n,), s: (n, 3) m, linear in between."""
     return np.stack([np.interp(t, truth.t, truth.p[:, k]) for k in range(3)], axis=1)
 

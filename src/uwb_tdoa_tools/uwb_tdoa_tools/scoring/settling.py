@@ -14,7 +14,7 @@ import numpy as np
 from uwb_tdoa_bias.effects import RADIO, EffectSet, true_samples
 
 from ..checking.repairs import repairs
-from ..localizing.estimate import Estimator
+from ..localizing.estimate import FlightEstimator
 from ..readers.inputs import report_remarks
 from .alignment import FRAME, NONE, TIME, alignment_of, apart, need_truth, on_another_clock, paths
 
@@ -61,14 +61,14 @@ def on_one_clock(flight: Flight, align: str = NONE) -> Flight:
     if flight.truth is None or len(flight.truth) < 2 or not on_another_clock(flight):
         return flight
     need_truth(flight, align == NONE)
-    found = alignment_of(flight, Estimator()(flight).odometry)
+    found = alignment_of(flight, FlightEstimator()(flight).odometry)
     report_remarks(flight.name, [f"{found.of_clock()}: they are moved."])
     return replace(flight, truth=found.applied(flight.truth, TIME))
 
 
 def _alignment(flight: Flight, effects: EffectSet, config: FilterConfig | None) -> Alignment:
     """Alignment of a Flight, or, where wrong ids and signs explain another frame as well, the one without these."""
-    straight, odometry = effects.correct_streams(flight), Estimator(config, effects)(flight).odometry
+    straight, odometry = effects.correct_streams(flight), FlightEstimator(config, effects)(flight).odometry
     assert straight.truth is not None
     found = alignment_of(straight, odometry)
     if found.other_frame and _ranges_fit(straight, effects, found):
@@ -76,7 +76,7 @@ def _alignment(flight: Flight, effects: EffectSet, config: FilterConfig | None) 
     repair = EffectSet(repairs(replace(straight, truth=found.applied(straight.truth, TIME)))) if found.other_frame else EffectSet()
     if not len(repair):
         return found
-    of_labels = Estimator(config, effects)(repair.correct_streams(flight)).odometry
+    of_labels = FlightEstimator(config, effects)(repair.correct_streams(flight)).odometry
     error = apart(*paths(found.applied(straight.truth, TIME), of_labels))
     left = apart(*paths(found.applied(straight.truth, FRAME), odometry))
     return alignment_of(repair.correct_streams(straight), of_labels) if error < AS_WELL * left else found

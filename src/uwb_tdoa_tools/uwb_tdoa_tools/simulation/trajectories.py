@@ -126,7 +126,7 @@ TRAJECTORIES = {
 
 
 @dataclass(frozen=True)
-class Motion:
+class ExactMotion:
     """Exact motion at n instants, body frame x forward, y left, z up in a z-up world.
 
     p, v, a : (n, 3) m, m/s, m/s^2, world; q : (n, 4) x y z w, body to world; body_rates : (n, 3) rad/s, body;
@@ -144,8 +144,8 @@ class Motion:
 class Flyable(Protocol):
     """What `simulate` flies."""
 
-    def motion(self, t: np.ndarray) -> Motion:
-        """The Motion at stamps t, (n,) s."""
+    def motion(self, t: np.ndarray) -> ExactMotion:
+        """The ExactMotion at stamps t, (n,) s."""
 
     def motors(self, t: np.ndarray) -> np.ndarray:
         """Whether the motors turn at stamps t: (n,) bool."""
@@ -203,8 +203,8 @@ class Trajectory:
                 f"more than {MAX_ACCELERATION:g}; fly slower or wider."
             )
 
-    def motion(self, t: ArrayLike) -> Motion:
-        """The Motion at the stamps t, (n,) s; before take-off and after landing it rests exactly.
+    def motion(self, t: ArrayLike) -> ExactMotion:
+        """The ExactMotion at the stamps t, (n,) s; before take-off and after landing it rests exactly.
 
         The thrust, along body z, carries weight, acceleration and rotor drag (differential flatness of a quadrotor,
         after Mellinger and Kumar, ICRA 2011); the body rates are the analytic derivative of that attitude.
@@ -233,7 +233,7 @@ class Trajectory:
         axes = np.stack([x, y, z], axis=2)
         q = Rotation.from_matrix(axes).as_quat()
         q[1:] *= np.cumprod(np.where(np.sum(q[1:] * q[:-1], axis=1) < 0.0, -1.0, 1.0))[:, None]  # no sign flips
-        return Motion(p, v, a, q, body_rates, np.einsum("nij,ni->nj", axes, a + gravity))
+        return ExactMotion(p, v, a, q, body_rates, np.einsum("nij,ni->nj", axes, a + gravity))
 
     def motors(self, t: ArrayLike) -> np.ndarray:
         """Whether the motors turn at the stamps t: (n,) bool."""

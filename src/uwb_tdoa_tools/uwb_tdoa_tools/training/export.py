@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 OPSET, IR_VERSION = 13, 8  # whose operators `graph_size.py` knows
 
 
-class Graph:
+class GraphBuilder:
     """An ONNX graph under construction. Values are the names of its tensors, (n, k) float unless said otherwise."""
 
     def __init__(self) -> None:

@@ -41,7 +41,7 @@ class Recipe(NamedTuple):
 
     kind: str
     seed: int
-    options: structured.Options = structured.Options()
+    options: structured.StructuredPriors = structured.StructuredPriors()
 
 
 @dataclass(frozen=True)
@@ -171,7 +171,7 @@ def _over_flights(curve: Sequence[tuple[int, float, float]]) -> LearningCurve:
 
 
 def fit_structured(
-    some: Sequence[Labels], seed: int, options: structured.Options, free: EffectSet = EffectSet()
+    some: Sequence[Labels], seed: int, options: structured.StructuredPriors, free: EffectSet = EffectSet()
 ) -> tuple[structured.Structured, EffectSet]:
     """(Structured, EffectSet with the values of the linear effects `free`), fitted together to Labels."""
     model = structured.prepare(some, options, seed)

@@ -52,7 +52,7 @@ class Paper:
 
     def onnx(self, meta: Mapping[str, Any]) -> ModelProto:
         """The onnx.ModelProto: bias, standard deviation. meta : further metadata."""
-        graph = export.Graph()
+        graph = export.GraphBuilder()
         x = graph.input
         for k, (weights, biases) in enumerate(self.layers):
             x = graph.op("Gemm", x, weights, biases)

@@ -46,7 +46,7 @@ _END = ("id", "x", "y", "z")
 
 
 @dataclass(frozen=True)
-class Options:
+class StructuredPriors:
     """Priors of the structured model; the defaults were chosen on the validation flights of docs/bias.md.
 
     fine, coarse : m, standard deviation of the short and of the long part of a site map, before the data scale both
@@ -115,7 +115,7 @@ class Structured:
 
     validity_features = ()  # it fades over positions by itself
 
-    def __init__(self, options: Options, site: Map, site_ids: np.ndarray, site_positions: np.ndarray) -> None:
+    def __init__(self, options: StructuredPriors, site: Map, site_ids: np.ndarray, site_positions: np.ndarray) -> None:
         """site : Map over scaled positions; site_ids (s,), site_positions (s, 3) m : the anchors and where they
         stand."""
         self.options, self.site, self.site_ids, self.site_positions = options, site, site_ids, site_positions
@@ -199,7 +199,7 @@ class Structured:
 
     def onnx(self, meta: Mapping[str, Any]) -> ModelProto:
         """The onnx.ModelProto: bias, standard deviation, share of what can be known. meta : further metadata."""
-        graph, names = export.Graph(), self.inputs()
+        graph, names = export.GraphBuilder(), self.inputs()
         end = graph.rows(graph.input, len(names) // 2)  # (2n, ...): what follows is said of one end
         maps = [self._site_graph(graph, end)] if len(self.site_ids) else []
         maps += [self._link_graph(graph, end)] if self.links else []
@@ -213,7 +213,7 @@ class Structured:
         meta = {**meta, "features": names, "offset": [0.0] * len(names), "scale": [1.0] * len(names)}
         return graph.model(len(names), [bias, std, known], meta)
 
-    def _site_graph(self, graph: export.Graph, end: str) -> tuple[str, str]:
+    def _site_graph(self, graph: export.GraphBuilder, end: str) -> tuple[str, str]:
         """(mean, variance explained) by the site maps, each (2n, 1). end : features of one end."""
         place, who, where = (graph.take(end, some) for some in ([0, 1, 2], [3], [4, 5, 6]))
         place = graph.op("Div", place, [self.options.length])
@@ -228,7 +228,7 @@ class Structured:
         known = _power(graph, values, _known_directions(self.site, self.site_covariance))
         return graph.row_sum(graph.op("Mul", weights, values)), graph.op("Mul", at_site, known)
 
-    def _link_graph(self, graph: export.Graph, end: str) -> tuple[str, str]:
+    def _link_graph(self, graph: export.GraphBuilder, end: str) -> tuple[str, str]:
         """(mean, variance explained) by the link maps together, each (2n, 1).
 
         A Gaussian of the distance of x = (log distance, unit vector) from a centre c is an exponential of what is linear
@@ -280,13 +280,13 @@ def _known_directions(of: Map, covariance: np.ndarray) -> np.ndarray:
     return of.whiten @ (vector[:, leading] * np.sqrt(np.maximum(share[leading], 0.0)))
 
 
-def _power(graph: export.Graph, values: str, directions: np.ndarray) -> str:
+def _power(graph: export.GraphBuilder, values: str, directions: np.ndarray) -> str:
     """Sum of the squares of values (n, m) along directions (m, k): (n, 1)."""
     part = graph.op("MatMul", values, directions)
     return graph.row_sum(graph.op("Mul", part, part))
 
 
-def prepare(all_labels: Sequence[Labels], options: Options, seed: int) -> Structured:
+def prepare(all_labels: Sequence[Labels], options: StructuredPriors, seed: int) -> Structured:
     """Structured without weights: sites, centres and kernels for a list of Labels."""
     ids: list[int] = []
     positions: list[np.ndarray] = []

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from ..channels import ChannelResiduals
     from ..regression.fit import Fit
-    from ..regression.table import Table
+    from ..regression.table import RegressionTable
     from ..regression.terms import Candidate
 
 
@@ -35,8 +35,8 @@ class Detector:
     on_floor: ClassVar[bool] = False  # looks at what is near the floor, the others at what is in the air
     disguises: ClassVar[bool] = False  # what it searches for dominates its channel: unless found first, it counts as noise
 
-    def search(self, table: Table, model: Fit, chosen: Sequence[Candidate]) -> list[Candidate]:
-        """[Candidate] for the residual of `model`, a Fit of the chosen Candidates to the Table."""
+    def search(self, table: RegressionTable, model: Fit, chosen: Sequence[Candidate]) -> list[Candidate]:
+        """[Candidate] for the residual of `model`, a Fit of the chosen Candidates to the RegressionTable."""
         return []
 
     def detect(self, residuals: Sequence[ChannelResiduals]) -> Detection | None:

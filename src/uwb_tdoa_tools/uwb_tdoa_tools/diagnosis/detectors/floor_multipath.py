@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from ..channels.tdoa import TdoaResidual
     from ..regression.fit import Fit
-    from ..regression.table import Table
+    from ..regression.table import RegressionTable
 
 NEAR = 0.4  # m above z = 0; higher up nobody has seen it
 HEIGHTS = np.geomspace(0.05, 0.3, 12)  # m, that are tried
@@ -39,7 +39,7 @@ class FloorMultipathDetector(Detector):
     effect = EFFECTS["floor_multipath"]
     on_floor = True
 
-    def search(self, table: Table, model: Fit, chosen: Sequence[Candidate]) -> list[Candidate]:
+    def search(self, table: RegressionTable, model: Fit, chosen: Sequence[Candidate]) -> list[Candidate]:
         parts = table.tdoa_parts
         rows = table.rows_of("tdoa")
         place = table.place[rows]

@@ -12,7 +12,7 @@ from .base import Detector
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from ..regression.fit import Fit
-    from ..regression.table import Table
+    from ..regression.table import RegressionTable
     from uwb_tdoa_bias.effects.interval_error import IntervalEffect
 
 BIN = 1.0  # s
@@ -55,7 +55,7 @@ class IntervalDetector(Detector):
     effect: ClassVar[type[IntervalEffect]]
     disguises = True
 
-    def search(self, table: Table, model: Fit, chosen: Sequence[Candidate]) -> list[Candidate]:
+    def search(self, table: RegressionTable, model: Fit, chosen: Sequence[Candidate]) -> list[Candidate]:
         (channel,) = self.effect.channels
         if table.flights != 1 or channel not in table.present:  # only a flight alone has a time of its own
             return []

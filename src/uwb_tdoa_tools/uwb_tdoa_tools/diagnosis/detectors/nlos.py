@@ -17,7 +17,7 @@ from .intervals import LEAST_GAIN, LONGEST, best_interval
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from ..regression.fit import Fit
-    from ..regression.table import Table
+    from ..regression.table import RegressionTable
 
 RADII = (0.6, 1.0, 1.5)  # m
 CENTRES = 60
@@ -29,7 +29,7 @@ class NlosDetector(Detector):
 
     effect = EFFECTS["nlos"]
 
-    def search(self, table: Table, model: Fit, chosen: Sequence[Candidate]) -> list[Candidate]:
+    def search(self, table: RegressionTable, model: Fit, chosen: Sequence[Candidate]) -> list[Candidate]:
         rows = table.rows_of("tdoa")
         part = table.tdoa_parts[0]
         a, b = part.arrivals(table.series[rows])

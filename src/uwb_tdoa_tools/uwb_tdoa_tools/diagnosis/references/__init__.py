@@ -5,13 +5,13 @@ from .ground_truth import GroundTruth
 from .heights import Heights
 from .marks import Marks
 from .nothing import Nothing
-from .odometry import Odometry
+from .odometry import OdometryReference
 from .path import OdometryPath
 
 # Made of a FilterConfig and constraints
-REFERENCES = {"truth": GroundTruth, "heights": Heights, "marks": Marks, "odometry": Odometry, "nothing": Nothing}
+REFERENCES = {"truth": GroundTruth, "heights": Heights, "marks": Marks, "odometry": OdometryReference, "nothing": Nothing}
 
 __all__ = [
-    "REFERENCES", "GroundTruth", "Heights", "Marks", "Nothing", "Odometry", "OdometryPath", "Reference",
+    "REFERENCES", "GroundTruth", "Heights", "Marks", "Nothing", "OdometryReference", "OdometryPath", "Reference",
     "ReferenceView",
 ]  # fmt: skip

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 FEWEST = 5  # stamps to lay it beside the filter's path
 
 
-class Odometry(GroundTruth):
+class OdometryReference(GroundTruth):
     """The path of the odometry, laid beside that of the filter, and through marks where there are any.
 
     What all of a flight has in common, a shift and a yaw, is the filter's own and cannot be seen, but for marks: where it took off

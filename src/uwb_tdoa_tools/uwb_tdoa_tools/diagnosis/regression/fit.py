@@ -1,4 +1,4 @@
-"""Robust linear fits of a Table, and what one is worth.
+"""Robust linear fits of a RegressionTable, and what one is worth.
 
 Noise is Student's t with NU degrees of freedom, fitted by iteratively re-weighted least squares (Lange, Little and
 Taylor, JASA 1989). Rows are not independent: each axis of a channel has a scale, and the information of every
@@ -18,7 +18,7 @@ from .table import AXES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from .table import Table
+    from .table import RegressionTable
     from .terms import Column
 
 NU = 4.0
@@ -42,11 +42,11 @@ class Fit:
     inflation: np.ndarray
     size: np.ndarray
 
-    def information(self, table: Table) -> np.ndarray:
-        """What each row of the Table counts for, (n,), in independent rows per squared unit."""
+    def information(self, table: RegressionTable) -> np.ndarray:
+        """What each row of the RegressionTable counts for, (n,), in independent rows per squared unit."""
         return self.weight / (self.scale**2 * self.inflation)[table.group]
 
-    def likelihood(self, table: Table) -> float:
+    def likelihood(self, table: RegressionTable) -> float:
         """Twice the log-likelihood of Student's t, in independent rows, less what the prior says of beta."""
         scale = self.scale[table.group]
         rows = 2.0 * np.log(scale) + (NU + 1.0) * np.log1p((self.residual / scale) ** 2 / NU)
@@ -83,10 +83,10 @@ def prior_sizes(columns: Sequence[Column]) -> np.ndarray:
 
 
 def fit(
-    table: Table, columns: Sequence[Column], inflation: np.ndarray | None = None, covariance: bool = True, near: Fit | None = None
+    table: RegressionTable, columns: Sequence[Column], inflation: np.ndarray | None = None, covariance: bool = True, near: Fit | None = None
 ) -> Fit:
-    """Fit of some Columns of a Table. inflation : (groups,), measured on this very fit if None; covariance : whether somebody asks for
-    it; near : Fit of nearly the same Columns, from which that of a sparse Table begins."""
+    """Fit of some Columns of a RegressionTable. inflation : (groups,), measured on this very fit if None; covariance : whether somebody asks
+    for it; near : Fit of nearly the same Columns, from which that of a sparse RegressionTable begins."""
     x, group, sizes = table.matrix(columns), table.group, prior_sizes(columns)
     weight, beta = np.ones(len(table.y)), np.zeros(len(columns))
     residual = table.y.copy() if near is None or not table.sparse else near.residual.copy()
@@ -112,7 +112,7 @@ def fit(
     return Fit(tuple(columns), beta, cov, residual, weight, scale, inflation, np.maximum(size, 1.0))
 
 
-def refit(table: Table, columns: Sequence[Column], model: Fit, rows: np.ndarray | None = None) -> Fit:
+def refit(table: RegressionTable, columns: Sequence[Column], model: Fit, rows: np.ndarray | None = None) -> Fit:
     """Fit of some Columns with the weights and scales of another Fit; rows : (n,) bool, those that it is made to alone, with the
     covariance of the model."""
     x, sizes, root = table.matrix(columns), prior_sizes(columns), model.information(table)
@@ -125,7 +125,7 @@ def refit(table: Table, columns: Sequence[Column], model: Fit, rows: np.ndarray 
     return replace(model, columns=tuple(columns), beta=beta, cov=cov, residual=residual)
 
 
-def _scales(table: Table, residual: np.ndarray) -> np.ndarray:
+def _scales(table: RegressionTable, residual: np.ndarray) -> np.ndarray:
     """Scale of Student's t per group, by the fixed point of its likelihood."""
     out = _one_each(table)
     for k, rows in table.groups:
@@ -133,7 +133,7 @@ def _scales(table: Table, residual: np.ndarray) -> np.ndarray:
     return out
 
 
-def _one_each(table: Table) -> np.ndarray:
+def _one_each(table: RegressionTable) -> np.ndarray:
     """(groups,) of 1, of all channels whether they have rows or not."""
     return np.ones(AXES * len(table.channels))
 
@@ -147,7 +147,7 @@ def student_scale(r: np.ndarray) -> float:
     return scale
 
 
-def _covariance(table: Table, x: np.ndarray, residual: np.ndarray, root: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+def _covariance(table: RegressionTable, x: np.ndarray, residual: np.ndarray, root: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     """Sandwich over blocks, at least the model's own."""
     _, bread, _ = solve(product(weighted(x, root), x), np.zeros(x.shape[1]), sizes)
     blocks = int(table.block.max()) + 1
@@ -162,7 +162,7 @@ def _covariance(table: Table, x: np.ndarray, residual: np.ndarray, root: np.ndar
 
 
 def measure_inflation(
-    table: Table, residual: np.ndarray, weight: np.ndarray, scale: np.ndarray, columns: Sequence[Column]
+    table: RegressionTable, residual: np.ndarray, weight: np.ndarray, scale: np.ndarray, columns: Sequence[Column]
 ) -> np.ndarray:
     """By how much fewer the independent rows of each channel are: (groups,), at least 1. Of its axes the median: what one has that the
     others have not is an effect.
@@ -185,7 +185,7 @@ def measure_inflation(
     return out
 
 
-def _temporal(table: Table, rows: np.ndarray | slice, r: np.ndarray) -> float:
+def _temporal(table: RegressionTable, rows: np.ndarray | slice, r: np.ndarray) -> float:
     key, t = table.flight[rows] * (table.series.max() + 1) + table.series[rows], table.t[rows]
     order, total = np.lexsort((t, key)), 1.0
     for lag in range(1, 13):

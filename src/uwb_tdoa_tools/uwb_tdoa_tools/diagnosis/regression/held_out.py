@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from .fit import Fit
     from .select import Selection
-    from .table import Table
+    from .table import RegressionTable
     from .terms import Column
 
 FOLDS = 4
@@ -53,7 +53,7 @@ def held_out(selection: Selection, by_flight: bool = False) -> list[HeldOut]:
 class _Folds:
     """Normal equations of all columns, fold by fold."""
 
-    def __init__(self, table: Table, model: Fit, columns: Sequence[Column], folds: np.ndarray) -> None:
+    def __init__(self, table: RegressionTable, model: Fit, columns: Sequence[Column], folds: np.ndarray) -> None:
         self.table, self.folds = table, folds
         self._place = {column: k for k, column in enumerate(columns)}
         self._x, self._sizes = table.matrix(columns), prior_sizes(columns)
@@ -77,12 +77,12 @@ class _Folds:
         return out
 
 
-def _loss(table: Table, model: Fit, residual: np.ndarray) -> np.ndarray:
+def _loss(table: RegressionTable, model: Fit, residual: np.ndarray) -> np.ndarray:
     """Minus twice the log-likelihood of Student's t, row by row."""
     return (NU + 1.0) * np.log1p((residual / model.scale[table.group]) ** 2 / NU)
 
 
-def _explained(table: Table, model: Fit, before: np.ndarray, after: np.ndarray, touched: np.ndarray) -> float:
+def _explained(table: RegressionTable, model: Fit, before: np.ndarray, after: np.ndarray, touched: np.ndarray) -> float:
     """Share of the variance, with outliers at CLIP spreads, that goes from `before` to `after` in the group that gains most, over the
     rows (n,) bool that are touched."""
     best = 0.0

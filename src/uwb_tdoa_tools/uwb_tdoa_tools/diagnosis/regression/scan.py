@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
     from ..channels.views import CovariateView
     from .fit import Fit
-    from .table import Table
+    from .table import RegressionTable
 
     _Held = tuple[np.ndarray, np.ndarray, np.ndarray]  # as `_held` gives it
     _Item = tuple[float, "_Shapes", str, tuple[float, ...], int]  # gain, shapes, shape, knots, how many were tried
@@ -48,12 +48,12 @@ ANGLES = ("bearing", "bearing_in_tag", "bearing_in_anchor")
 
 
 class _Shapes:
-    """A CovariateView as columns x (k, columns) at `rows` of a Table; edges (bins + 1,). Of many values: x (levels, columns), of every
-    one of some levels of the covariate, and a sparse matrix `levels` (k, levels), whose product with x are the columns."""
+    """A CovariateView as columns x (k, columns) at `rows` of a RegressionTable; edges (bins + 1,). Of many values: x (levels, columns), of
+    every one of some levels of the covariate, and a sparse matrix `levels` (k, levels), whose product with x are the columns."""
 
     def __init__(self, view: CovariateView, offset: int, edges: np.ndarray, many: bool) -> None:
-        """offset : first row of the channel; many : whether the Table has so many rows that values which are nearly the same count as the
-        same."""
+        """offset : first row of the channel; many : whether the RegressionTable has so many rows that values which are nearly the same
+        count as the same."""
         self.view, self.offset, self.edges, self.many, rows = view, offset, edges, many, view.rows
         self.levels: csr_array | None = None
         if many and len(rows) > MANY_VALUES:
@@ -72,9 +72,9 @@ class _Shapes:
 
 
 class Scan:
-    """All shapes of all views of a Table's channels: called as `search` of `select`."""
+    """All shapes of all views of a RegressionTable's channels: called as `search` of `select`."""
 
-    def __init__(self, table: Table, views: Mapping[str, Sequence[CovariateView]]) -> None:
+    def __init__(self, table: RegressionTable, views: Mapping[str, Sequence[CovariateView]]) -> None:
         """views : {channel: [CovariateView]}, of the rows of each channel."""
         groups: dict[tuple[int, bool, bool], list[_Shapes]] = {}
         for channel, some in views.items():
@@ -86,7 +86,7 @@ class Scan:
         self.even = _noise_of_series(table) ** -2.0  # weights (n,) that are fair to noisy series, and know no outliers
         self._price = SmoothTerm.price + 2.0 * np.log(max(sum(len(several) for several in groups.values()), 1))
 
-    def __call__(self, table: Table, model: Fit, chosen: Sequence[Candidate]) -> list[Candidate]:
+    def __call__(self, table: RegressionTable, model: Fit, chosen: Sequence[Candidate]) -> list[Candidate]:
         """[Candidate], the best of what the residual of a Fit of the chosen Candidates shows. What looks like outliers to
         the fit counts for more: it may be what acts on a few rows alone. Series that are noisier than others count for less."""
         scale = HUBER * model.scale[table.group] / np.sqrt(self.even)
@@ -111,7 +111,7 @@ class Scan:
         best = max(moved, key=lambda each: each[0], default=item)
         return (*best[:4], tried * FINER) if best[0] > gain else item
 
-    def gains(self, table: Table, held: _Held) -> list[_Item]:
+    def gains(self, table: RegressionTable, held: _Held) -> list[_Item]:
         """[(gain, _Shapes, shape, knots, how many were tried)], the best first after what its coefficients and its search cost: what a
         Fit would gain, twice a log-likelihood, with the weights that it has."""
         return _best_first(table, [item for group in self._groups for item in group.best(*held)])
@@ -123,7 +123,7 @@ class Scan:
         return Candidate((Term(effect, keys),), self._price + 2.0 * np.log(tried))
 
 
-def _noise_of_series(table: Table) -> np.ndarray:
+def _noise_of_series(table: RegressionTable) -> np.ndarray:
     """How much noisier the series of each row is than most of its group, (n,), at least 1: by differences of successive rows, of
     which steps and trends are a small part."""
     order = np.lexsort((table.t, table.series, table.flight, table.channel))
@@ -149,7 +149,7 @@ def _various(found: Iterable[_Item]) -> list[_Item]:
     return early + late
 
 
-def _best_first(table: Table, found: Iterable[_Item]) -> list[_Item]:
+def _best_first(table: RegressionTable, found: Iterable[_Item]) -> list[_Item]:
     costs = {shape: count * np.log(len(table.y)) for shape, (_, count) in SHAPES.items()}
     return sorted(found, key=lambda item: costs[item[2]] + 2.0 * np.log(item[4]) - item[0])
 
@@ -251,7 +251,7 @@ def _products(
     return weighted.T @ residual[shapes.rows], weighted.T @ shapes.x - half.T @ half
 
 
-def _held(table: Table, model: Fit, chosen: Sequence[Candidate]) -> _Held:
+def _held(table: RegressionTable, model: Fit, chosen: Sequence[Candidate]) -> _Held:
     """(orthonormal base, weighted, of what the chosen Candidates hold (n, k), information (n,), residual (n,))."""
     information, base = model.information(table), columns_of(chosen)
     b = dense(table.matrix(base))

@@ -18,7 +18,7 @@ from .table import AXES
 if TYPE_CHECKING:
     from collections.abc import Hashable, Sequence
     from .fit import Fit
-    from .table import Table
+    from .table import RegressionTable
     from .terms import Candidate, Column
 
 FEW, NOTHING = 3, 3.0  # columns, and what they gain together, each alone, twice a log-likelihood, that is worth no price
@@ -38,7 +38,7 @@ class Gain:
 class Scorer:
     """Gains of sets of Columns on top of a base, with the weights, scales and inflation of one Fit."""
 
-    def __init__(self, table: Table, base: Sequence[Column], model: Fit, others: Sequence[Column]) -> None:
+    def __init__(self, table: RegressionTable, base: Sequence[Column], model: Fit, others: Sequence[Column]) -> None:
         """base : Columns that are in the model already; model : Fit, whose weights count; others : Columns that may be
         judged."""
         self._place = {column: k for k, column in enumerate(dict.fromkeys([*base, *others]))}
@@ -61,7 +61,7 @@ class Scorer:
         self._penalty = float(np.sum((beta / sizes) ** 2))
         self._alone = self._gains_alone(beta) if table.sparse else None
 
-    def _part(self, table: Table, columns: list[Column], root: np.ndarray, rows: np.ndarray | slice) -> _Part:
+    def _part(self, table: RegressionTable, columns: list[Column], root: np.ndarray, rows: np.ndarray | slice) -> _Part:
         root, y = root[rows], table.y[rows]
         base = weighted(table.matrix([columns[place] for place in self._base.tolist()], rows), root)
         cross, vector = np.empty((len(self._base), len(columns))), np.empty(len(columns))
@@ -117,10 +117,10 @@ class Scorer:
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """One group: its rows in a Table of some columns, with weights root (n,); cross (base, k) and vector (k,): X' W X and X' W y;
+    """One group: its rows in a RegressionTable of some columns, with weights root (n,); cross (base, k) and vector (k,): X' W X and X' W y;
     power : y' W y; products : of columns of one effect, where they are sparse."""
 
-    table: Table
+    table: RegressionTable
     columns: list[Column]
     rows: np.ndarray | slice
     root: np.ndarray
@@ -197,10 +197,10 @@ def _gram(x: Matrix, weights: np.ndarray) -> np.ndarray:
 
 
 def _sparse_part(
-    table: Table, columns: list[Column], effects: Sequence[np.ndarray], base: int, root: np.ndarray, rows: np.ndarray | slice
+    table: RegressionTable, columns: list[Column], effects: Sequence[np.ndarray], base: int, root: np.ndarray, rows: np.ndarray | slice
 ) -> _Part:
-    """The _Part of some rows of a sparse Table, of all columns, the first `base` those of the base. effects : places of the columns of
-    each effect: of those of two effects products are made when they are asked for."""
+    """The _Part of some rows of a sparse RegressionTable, of all columns, the first `base` those of the base. effects : places of the
+    columns of each effect: of those of two effects products are made when they are asked for."""
     root, y, x = root[rows], table.y[rows], table.matrix(columns, rows)
     cross = product(x, weighted(x[:, :base], root)).T  # in this order x is multiplied as it lies in memory
     return _Part(table, columns, rows, root, cross, x.T @ (root * y), float(root @ y**2), _Products.of(x, root, effects))

@@ -15,7 +15,7 @@ import numpy as np
 from ..channels import CHANNELS
 from .fit import Fit, fit, refit
 from .scorer import Scorer
-from .table import Table
+from .table import RegressionTable
 from .terms import columns_of
 
 if TYPE_CHECKING:
@@ -32,9 +32,9 @@ ALIKE = 0.1  # share of the criterion by which a function may be worse than anot
 
 
 class Search(Protocol):
-    """What finds more Candidates for the residual of a Fit of the chosen ones to a Table."""
+    """What finds more Candidates for the residual of a Fit of the chosen ones to a RegressionTable."""
 
-    def __call__(self, table: Table, model: Fit, chosen: Sequence[Candidate], /) -> list[Candidate]:
+    def __call__(self, table: RegressionTable, model: Fit, chosen: Sequence[Candidate], /) -> list[Candidate]:
         """They, none or several."""
         ...
 
@@ -49,10 +49,10 @@ class Rival:
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """table : Table with the columns of all candidates; chosen : (Candidate, ...); fit : Fit of all of them; loss :
+    """table : RegressionTable with the columns of all candidates; chosen : (Candidate, ...); fit : Fit of all of them; loss :
     criterion that each is worth beside the others; rivals : for each, (Rival, ...), once somebody has looked for them."""
 
-    table: Table
+    table: RegressionTable
     chosen: tuple[Candidate, ...]
     fit: Fit
     loss: tuple[float, ...]
@@ -81,10 +81,10 @@ class Selection:
 
 
 def select(
-    table: Table, candidates: list[Candidate], inflation: np.ndarray, search: Search | None = None,
+    table: RegressionTable, candidates: list[Candidate], inflation: np.ndarray, search: Search | None = None,
     scan: Scan | None = None, start: Iterable[Candidate] = (), progress: Callable[[], object] = lambda: None,
 ) -> Selection:  # fmt: skip
-    """Selection among `candidates`, whose columns the Table holds.
+    """Selection among `candidates`, whose columns the RegressionTable holds.
 
     search(table, fit, chosen) -> more Candidates, found for this residual; scan : a Scan, of whose Candidates the first few are fitted,
     because the weights of the present fit, which takes what they explain for outliers, would not do them justice. start :
@@ -121,7 +121,7 @@ def _sparse_first(ranked: list[tuple[float, Candidate]]) -> Candidate:
 
 
 def _fitted(
-    table: Table, chosen: Sequence[Candidate], model: Fit, candidate: Candidate, choices: int, even: np.ndarray
+    table: RegressionTable, chosen: Sequence[Candidate], model: Fit, candidate: Candidate, choices: int, even: np.ndarray
 ) -> float:
     """Criterion of one Candidate more, by the likelihoods of both fits, or by least squares with the weights `even`, (n,), if that
     says less: the one believes what noisy series show by chance, the other what outliers do. Minus infinity for what nobody would
@@ -152,7 +152,7 @@ def worth(selection: Selection, choices: int) -> float:
 
 
 def rank(
-    table: Table, candidates: Sequence[Candidate], chosen: Sequence[Candidate], model: Fit
+    table: RegressionTable, candidates: Sequence[Candidate], chosen: Sequence[Candidate], model: Fit
 ) -> list[tuple[float, Candidate]]:
     """[(criterion, Candidate)], best first; without those that are far from worth it, of negligible or of impossible size."""
     scorer, out = Scorer(table, columns_of(chosen), model, columns_of(candidates)), []
@@ -166,7 +166,7 @@ def rank(
     return sorted(out, key=lambda item: -item[0])
 
 
-def acceptable(table: Table, candidate: Candidate, beta: np.ndarray) -> bool:
+def acceptable(table: RegressionTable, candidate: Candidate, beta: np.ndarray) -> bool:
     """Whether values beta (k,) of a Candidate could be, and move a channel by more than what nobody would model."""
     if not (candidate.sizable(beta) and candidate.plausible(beta)):
         return False
@@ -179,7 +179,7 @@ def acceptable(table: Table, candidate: Candidate, beta: np.ndarray) -> bool:
     return False
 
 
-def _backward(table: Table, chosen: list[Candidate], model: Fit, choices: int) -> tuple[list[Candidate], Fit]:
+def _backward(table: RegressionTable, chosen: list[Candidate], model: Fit, choices: int) -> tuple[list[Candidate], Fit]:
     """Drop what is no longer worth its price, once others are in, or has become negligible or impossible."""
     while len(chosen) > 1:
         losses = _losses(table, chosen, model, choices)
@@ -194,7 +194,7 @@ def _backward(table: Table, chosen: list[Candidate], model: Fit, choices: int) -
     return chosen, model
 
 
-def _losses(table: Table, chosen: list[Candidate], model: Fit, choices: int) -> list[float]:
+def _losses(table: RegressionTable, chosen: list[Candidate], model: Fit, choices: int) -> list[float]:
     """Criterion that each chosen Candidate is worth beside the others."""
     out = []
     for k, candidate in enumerate(chosen):
@@ -207,8 +207,8 @@ def _losses(table: Table, chosen: list[Candidate], model: Fit, choices: int) -> 
     return out
 
 
-def _beside(table: Table, candidate: Candidate, other: Candidate) -> bool:
-    """Whether another Candidate acts on any row that a Candidate acts on; where a Table is not sparse most do."""
+def _beside(table: RegressionTable, candidate: Candidate, other: Candidate) -> bool:
+    """Whether another Candidate acts on any row that a Candidate acts on; where a RegressionTable is not sparse most do."""
     if not table.sparse:
         return True
     touched = np.zeros(len(table.y), bool)

@@ -27,7 +27,7 @@ AT_ONCE = 32  # columns that are made together, where they are sparse
 
 
 @dataclass(frozen=True, eq=False)
-class Table:
+class RegressionTable:
     """n rows of a linear model y = X beta + noise, those of one channel after the other.
 
     channels : names; y (n,); channel (n,) place in `channels`; group (n,) number of an axis of a channel, AXES of each, what is alike
@@ -93,7 +93,7 @@ class Table:
         return slice(*np.searchsorted(self.channel, [place, place + 1]))
 
     def matrix(self, columns: Sequence[Column], rows: slice | np.ndarray = slice(None)) -> Any:
-        """X of some Columns, (n, k), or some of its rows; a sparse one if the Table is."""
+        """X of some Columns, (n, k), or some of its rows; a sparse one if the RegressionTable is."""
         if self.sparse and isinstance(rows, slice) and rows != slice(None):
             edges, several = (rows.start, rows.stop), [self.columns[column] for column in columns]
             parts = [(its, values, *np.searchsorted(its, edges)) for its, values in several]
@@ -106,8 +106,8 @@ class Table:
             out[:, place] = self.columns[column][rows]
         return out
 
-    def with_terms(self, terms: Iterable[Term]) -> Table:
-        """A Table that has the columns of some Terms too, at the values that their effects have."""
+    def with_terms(self, terms: Iterable[Term]) -> RegressionTable:
+        """A RegressionTable that has the columns of some Terms too, at the values that their effects have."""
         wanted: dict[Hashable, tuple[Effect, dict[str, Column]]] = {}
         for term in terms:
             effect, keys = wanted.setdefault(term.effect.identity, (term.effect, {}))
@@ -134,8 +134,8 @@ class Table:
             x[row : row + len(values)] = np.nan_to_num(values)
         return x.T
 
-    def rows(self, chosen: np.ndarray) -> Table:
-        """Table of some rows, (n,) bool, with the columns that it has."""
+    def rows(self, chosen: np.ndarray) -> RegressionTable:
+        """RegressionTable of some rows, (n,) bool, with the columns that it has."""
         each = ("y", "channel", "group", "series", "block", "flight", "t", "count", "place")
         arrays = {name: getattr(self, name)[chosen] for name in each}
         if not self.sparse:
@@ -144,8 +144,8 @@ class Table:
         kept = {column: (place[rows[chosen[rows]]], values[chosen[rows]]) for column, (rows, values) in self.columns.items()}
         return replace(self, **arrays, columns=kept)
 
-    def with_contribution(self, effects: Iterable[tuple[Effect, Sequence[Column]]]) -> Table:
-        """A Table whose y also holds what Effects, at their values, contribute; it has their columns."""
+    def with_contribution(self, effects: Iterable[tuple[Effect, Sequence[Column]]]) -> RegressionTable:
+        """A RegressionTable whose y also holds what Effects, at their values, contribute; it has their columns."""
         y = self.y.copy()
         for effect, columns in effects:
             values = np.array([effect.values[column.key] for column in columns])
@@ -161,8 +161,8 @@ def _joined(parts: Sequence[tuple[int, Any]], k: int) -> Iterator[tuple[np.ndarr
         yield np.concatenate([np.empty(0, np.int64), *rows]), np.concatenate([np.empty(0), *(x.data[its] for _, x, its in some)])
 
 
-def table_of(residuals: Sequence[ChannelResiduals]) -> Table:
-    """Table without columns of [{name of a channel: ChannelResidual}], one dict for each flight."""
+def table_of(residuals: Sequence[ChannelResiduals]) -> RegressionTable:
+    """RegressionTable without columns of [{name of a channel: ChannelResidual}], one dict for each flight."""
     parts, each = [], ("y", "channel", "group", "series", "block", "flight", "t", "count", "place")
     pieces: dict[str, list[np.ndarray]] = {key: [] for key in each}
     rows = [{name: part.rows() for name, part in flight.items()} for flight in residuals]
@@ -186,4 +186,4 @@ def table_of(residuals: Sequence[ChannelResiduals]) -> Table:
                 pieces[key].append(getattr(part, key))
     merged = {key: np.concatenate(several) for key, several in pieces.items()}
     many = any(len(part.samples.anchors) > MANY for *_, part in parts if isinstance(part, RadioResidual))
-    return Table(channels, **merged, parts=tuple(parts), columns={}, sparse=many)
+    return RegressionTable(channels, **merged, parts=tuple(parts), columns={}, sparse=many)

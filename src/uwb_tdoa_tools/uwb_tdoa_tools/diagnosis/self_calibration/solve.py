@@ -39,7 +39,7 @@ NEARER = 0.75  # share of marks, each left out once, at which the estimate must 
 
 
 @dataclass(frozen=True, eq=False)
-class Change:
+class AnchorChange:
     """What is not as the last calibration had it: effect : name; anchor : id; values, std : (m,) m, by how much; rivals : names of
     effects that the flights cannot tell from it."""
 
@@ -66,7 +66,7 @@ class SelfCalibration:
     and then of delays; seconds : s in the air that tell;
     before, left : m, scale of the slow innovations with the anchors as given, and with these;
     tdoa_std : m, for the filter: so that it believes in as many independent TDOAs as there are; None without any;
-    changes : (Change, ...) since the last calibration;
+    changes : (AnchorChange, ...) since the last calibration;
     marks : (before, after, nearer), root mean square of what estimates at marks in the air are off by, m, and share of marks that they
     come nearer to, each after a fit without it; None where there are none;
     grounded : how many marks were left out, because they are on the floor: estimates there are metres off and do not know it;
@@ -85,7 +85,7 @@ class SelfCalibration:
     before: float
     left: float
     tdoa_std: float | None
-    changes: tuple[Change, ...]
+    changes: tuple[AnchorChange, ...]
     marks: tuple[float, float, float] | None
     grounded: int
     shares: dict[str, tuple[Share, ...]]
@@ -140,7 +140,8 @@ class SelfCalibration:
 
     @property
     def tag_delay(self) -> tuple[float, float] | None:
-        """(m, m): what all ranges are too long by, which is in the delays of all anchors, and its standard deviation; None without ranges."""
+        """(m, m): what all ranges are too long by, which is in the delays of all anchors, and its standard deviation. None without
+        ranges."""
         if not self.prior.common:
             return None
         first = self.shifts.size
@@ -250,13 +251,13 @@ def _left_out(equations: Equations, prior: Prior) -> tuple[float, float, float] 
     return float(np.sqrt(before.mean())), float(np.sqrt(after.mean())), float(np.mean(after < before))
 
 
-def _changes(prior: Prior, found: Solution, offset: np.ndarray) -> tuple[Change, ...]:
-    """(Change, ...) of a Solution."""
+def _changes(prior: Prior, found: Solution, offset: np.ndarray) -> tuple[AnchorChange, ...]:
+    """(AnchorChange, ...) of a Solution."""
     std, out = np.sqrt(np.diag(found.covariance)), []
     for (effect, anchor), others in found.changed.items():
         places, _ = prior.changes()[effect, anchor]
         rivals = tuple(other for other, _ in others)
-        out.append(Change(effect, prior.ids[anchor], offset[places], std[places], rivals))
+        out.append(AnchorChange(effect, prior.ids[anchor], offset[places], std[places], rivals))
     return tuple(out)
 
 
