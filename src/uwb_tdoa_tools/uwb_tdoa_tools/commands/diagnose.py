@@ -93,7 +93,7 @@ def _diagnose(args: Namespace) -> None:
     jobs, dask = parallel.asked(args, len(found), FEW)
     flights, holdout = (reading.flights(paths, args.most, jobs, dask) for paths in (args.flights, args.holdout))
     options.check_holdout((flight.name for flight in flights), (flight.name for flight in holdout))
-    if args.reference != "truth":
+    if args.reference in ("heights", "odometry"):
         inputs.need_tdoas([*flights, *holdout], f"--reference {args.reference}")
     for remark in remarks_on([*flights, *holdout]):
         cli.say("diagnose", remark)
