@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
 
-from .. import cli, options, parallel
+from .. import cli, command_lines, options, parallel
 from ..checking.remarks import remarks_on
 from ..diagnosis import diagnose
 from ..diagnosis.noise import write_parameters
 from ..diagnosis.references import REFERENCES
-from ..diagnosis.report.apply import applying
 from ..diagnosis.self_calibration.equations import measured_noise
 from ..localizing.rerun_file import write_diagnosis
 from ..progress import Progress
@@ -114,7 +113,9 @@ def _diagnose(args: Namespace) -> None:
     out.mkdir(parents=True, exist_ok=True)
     (_, its_survey), *_ = found
     truth = all(flight.truth is not None for flight in holdout or flights)
-    result = replace(result, applying=applying(out, args.holdout or args.flights, args.survey, its_survey, tdoa_std is not None, truth))
+    judged_on = args.holdout or args.flights
+    applying = command_lines.applying(out, judged_on, args.survey, its_survey, tdoa_std is not None, truth)
+    result = replace(result, applying=applying)
     cli.write_json(out / "diagnosis.json", result.as_json())
     result.effects.to_yaml(out / "effects.yaml")
     (out / "report.html").write_text(result.as_html())
