@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 from tqdm import tqdm
 
+from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.flight import Flight, Tdoas
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import without_offset
@@ -71,9 +72,9 @@ def run(args):
         print(f"| {words} | {errors.mean():.3f} m | {np.max(errors / without):.2f} |", flush=True)
 
 
-def rmse(flight: Flight) -> float:
-    """m, 3D, in the air, by the filter with its defaults."""
-    return evaluate(flight)[0].row()["rmse_3d"]
+def rmse(flight: Flight, effects: EffectSet | None = None) -> float:
+    """m, 3D, in the air, by the filter with its defaults, and with an EffectSet."""
+    return evaluate(flight, effects=effects)[0].row()["rmse_3d"]
 
 
 def spoiled(flight: Flight, fault, seed: int) -> Flight:

@@ -11,6 +11,7 @@ import numpy as np
 from uwb_tdoa_bias.effects import EFFECTS
 from uwb_tdoa_tools import parallel
 from uwb_tdoa_tools.diagnosis.diagnose import diagnose
+from uwb_tdoa_tools.diagnosis.references import GroundTruth, Nothing
 
 from ..ranges import NONE, flown, rmse
 
@@ -31,6 +32,7 @@ def add_options(add) -> None:
     add("--flights", type=int, default=5, metavar="N", help="pairs of flights of each error (default 5)")
     add("--first", type=int, default=FIRST, metavar="SEED", help=f"seed of the first flight (default {FIRST})")
     add("--only", nargs="+", metavar="TEXT", help="errors whose words hold one of these")
+    add("--no-truth", action="store_true", help="diagnose without ground truth, which judges alone")
     add("--jobs", type=int, metavar="N", help="processes (default: one for each core)")
 
 
@@ -39,7 +41,7 @@ def run(args) -> None:
     print("| measured | put in | found | largest error of a value | 3D RMSE before | after | without the error | flights made worse |")
     print("|---|---|---:|---:|---:|---:|---:|---:|")
     errors = [words for words in ERRORS if not args.only or any(text in words for text in args.only)]
-    items = [(words, what, args.first + 2 * k) for what in SETS for words in errors for k in range(args.flights)]
+    items = [(words, what, args.first + 2 * k, args.no_truth) for what in SETS for words in errors for k in range(args.flights)]
     rows = parallel.over(one, items, args.jobs)
     for what in SETS:
         for words in errors:
@@ -50,14 +52,14 @@ def run(args) -> None:
             print(f"| {what} | {words} | {told} | {cells} |", flush=True)
 
 
-def one(item: tuple[str, str, int]) -> tuple[float, float, float, float, float]:
+def one(item: tuple[str, str, int, bool]) -> tuple[float, float, float, float, float]:
     """(whether it was found and added; largest error of its values; 3D RMSE of another flight before, after, and without the error, m)."""
-    words, what, seed = item
+    words, what, seed, blind = item
     name, values, near = ERRORS[words]
     clean = [SETS[what](flown(seed + k)) for k in range(2)]
     flights = clean if name is None else [EFFECTS[name](values).inject(flight) for flight in clean]
-    result = diagnose(flights[:1], flights[1:])
-    before, after = result.before["pooled"]["rmse_3d"], result.after["pooled"]["rmse_3d"]
+    result = diagnose(flights[:1], flights[1:], reference=Nothing() if blind else GroundTruth())
+    before, after = (rmse(flights[1], effects) for effects in (None, result.effects))
     if name is None:
         return float(len(result.effects) > 0), np.nan, before, after, before
     # delays that only ranges have are those of anchors, where there are ranges alone

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, SmoothTerm
+from uwb_tdoa_ekf.offline import without_offset
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.channels import residuals
 from uwb_tdoa_tools.diagnosis.diagnose import diagnose
@@ -64,8 +65,31 @@ def test_the_residual_is_what_the_model_leaves(both):
     assert {part.place_in_room(series) for series in np.unique(rows.series).tolist()} == {str(i) for i in both.anchors.ids}
 
 
-def test_without_ground_truth_ranges_have_no_channel(both):
-    assert "range" not in residuals(Nothing().prepare(both), Nothing(), EffectSet())
+def test_without_ground_truth_ranges_have_a_channel_where_there_are_no_tdoas(both):
+    shown = [residuals(Nothing().prepare(flight), Nothing(), EffectSet()) for flight in (both, alone(both))]
+    assert ["range" in one for one in shown] == [False, True] and ["tdoa" in one for one in shown] == [True, False]
+    assert np.sqrt(np.mean(shown[1]["range"].residual ** 2)) < 0.15
+
+
+def test_without_ground_truth_the_delay_of_the_tag_bends_no_path(both):
+    longer = without_offset(Nothing().prepare(both), -0.3)
+    one, other = (residuals(flight, Nothing(), EffectSet())["tdoa"].residual for flight in (longer, Nothing().prepare(both)))
+    assert np.sqrt(np.mean(one**2)) < 1.05 * np.sqrt(np.mean(other**2))
+
+
+@pytest.mark.parametrize("taken", [alone, lambda flight: flight], ids=["ranges", "both"])
+def test_without_ground_truth_the_delay_of_the_tag_is_found(both, taken):
+    result = diagnose([taken(without_offset(both, -0.3))], reference=Nothing())
+    values = {effect.name: effect.values for effect in result.effects}["anchor_delay"]
+    assert np.mean(list(values.values())) == pytest.approx(0.3, abs=0.05)
+    assert {finding.effect.name for finding in result.findings if finding.added} == {"anchor_delay", "anchor_position"}
+    assert result.after["pooled"]["nis_mean"] < result.before["pooled"]["nis_mean"]
+    assert ("predicted ranges" in result.as_text().replace("\n", " ")) == (taken is alone)
+
+
+def test_without_ground_truth_nothing_is_added_where_nothing_is_wrong(both):
+    result = diagnose([alone(both)], reference=Nothing())
+    assert not result.effects and not any(finding.added for finding in result.findings)
 
 
 @pytest.mark.slow

@@ -83,7 +83,7 @@ def test_remedies_begin_as_the_user_began(monkeypatch):
 PACKAGES = [ROOT / "src" / name / name for name in ("uwb_tdoa_bias", "uwb_tdoa_ekf", "uwb_tdoa_tools")]
 TOOLS = tuple(path.stem for path in (PACKAGES[2] / "commands").glob("*.py") if path.stem != "__init__")
 # Whose lines tests below, and test_demo.py, run
-PRINT = {"commands/calibrate.py", "commands/survey.py", "diagnosis/report/apply.py", "live/demo.py"}
+PRINT = {"commands/calibrate.py", "commands/diagnose.py", "commands/survey.py", "live/demo.py"}
 
 
 def sources():
@@ -110,7 +110,7 @@ def texts(tree):
 
 def test_whoever_prints_lines_to_copy_is_tested_here():
     made = {name for name, tree in sources() for node in ast.walk(tree) if isinstance(node, ast.Attribute)
-            and getattr(node.value, "id", "") == "command_lines" and node.attr in ("tool", "node", "nodes", "judging")}  # fmt: skip
+            and getattr(node.value, "id", "") == "command_lines" and node.attr in ("tool", "node", "nodes", "judging", "applying")}  # fmt: skip
     assert made == PRINT
 
 

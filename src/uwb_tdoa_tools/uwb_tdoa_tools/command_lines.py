@@ -12,7 +12,7 @@ import shutil
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Mapping
+    from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
 RUN = "UWB_TDOA_RUN"  # variable of the environment in which ./dev says how the user started it
@@ -59,3 +59,19 @@ def nodes(
     """The two lines that start the nodes with the files of a calibration; None for those that there are not."""
     parameters = {name: file for name, file in (("anchors_file", anchors), ("effects_file", effects)) if file}
     return node("bias_node", parameters), node("ekf_node", parameters, [config] if config else ())
+
+
+def applying(
+    folder: Path, recordings: Sequence[str | Path], survey: str | Path | None = None,
+    anchors: str | Path | None = None, parameters: bool = False, truth: bool = True,
+) -> tuple[tuple[str, str], ...]:  # fmt: skip
+    """((command line, what it does), ...): how the effects.yaml in a folder is put to use. recordings : paths to judge on; survey,
+    anchors : files of anchors that were given, for evaluate and for the nodes, or None; parameters : whether there is an ekf_node.yaml;
+    truth : whether the recordings hold ground truth."""
+    effects, config = folder / "effects.yaml", folder / "ekf_node.yaml" if parameters else None
+    bias, ekf = nodes(anchors, effects, config)
+    return (
+        (judging(recordings, survey, effects, config, truth), "judges it"),
+        (bias, "in flight: takes it out of TDOAs"),
+        (ekf, "in flight: takes it out of the IMU, and assumes the noise that is left"),
+    )

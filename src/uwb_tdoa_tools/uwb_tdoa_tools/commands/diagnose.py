@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
 
-from .. import cli, options, parallel
+from .. import cli, command_lines, options, parallel
 from ..checking.remarks import remarks_on
 from ..diagnosis import diagnose
 from ..diagnosis.noise import parameters_of, write_parameters
 from ..diagnosis.references import REFERENCES
-from ..diagnosis.report.apply import applying
 from ..diagnosis.self_calibration.equations import measured_noise
 from ..localizing.rerun_file import write_diagnosis
 from ..progress import Progress
@@ -93,7 +92,7 @@ def _diagnose(args: Namespace) -> None:
     jobs, dask = parallel.asked(args, len(found), FEW)
     flights, holdout = (reading.flights(paths, args.most, jobs, dask) for paths in (args.flights, args.holdout))
     options.check_holdout((flight.name for flight in flights), (flight.name for flight in holdout))
-    if args.reference != "truth":
+    if args.reference in ("heights", "odometry"):
         inputs.need_tdoas([*flights, *holdout], f"--reference {args.reference}")
     for remark in remarks_on([*flights, *holdout]):
         cli.say("diagnose", remark)
@@ -115,7 +114,9 @@ def _diagnose(args: Namespace) -> None:
     (_, its_survey), *_ = found
     parameters = parameters_of(result.flights, tdoa_std)
     truth = all(flight.truth is not None for flight in holdout or flights)
-    result = replace(result, applying=applying(out, args.holdout or args.flights, args.survey, its_survey, bool(parameters), truth))
+    judged_on = args.holdout or args.flights
+    applying = command_lines.applying(out, judged_on, args.survey, its_survey, bool(parameters), truth)
+    result = replace(result, applying=applying)
     cli.write_json(out / "diagnosis.json", result.as_json())
     result.effects.to_yaml(out / "effects.yaml")
     (out / "report.html").write_text(result.as_html())

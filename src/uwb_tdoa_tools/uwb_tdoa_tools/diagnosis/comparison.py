@@ -13,7 +13,8 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.stamp_error import shifted
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.offline import run_offline
-from uwb_tdoa_ekf.results import VERDICTS
+from uwb_tdoa_ekf.results import OF_ROW, VERDICTS
+from uwb_tdoa_ekf.sensitivity import RANGES
 
 from ..scoring.by_phase import EVERYTHING
 from ..scoring.metrics import Score, as_json, pooled
@@ -105,9 +106,8 @@ def innovations(
     for runs in _both_sides(cases, baseline, progress, map_function):
         rows = []
         for case, run in runs:
-            used = run.residuals.verdict == USED
-            nis = run.residuals.innovation[used] ** 2 / run.residuals.variance[used]
-            figures: dict[str, Any] = {"nis_mean": float(np.mean(nis)), "residual_spread": _spread(run)}
+            innovation, variance = _used(run)
+            figures: dict[str, Any] = {"nis_mean": float(np.mean(innovation**2 / variance)), "residual_spread": _scale(innovation)}
             rows.append({"flight": case.flight.name, "rmse_3d": None, **figures})
         means = {key: float(np.mean([row[key] for row in rows])) for key in ("nis_mean", "residual_spread")}
         sides.append({"runs": rows, "pooled": dict(means, rmse_3d=None), "scores": []})
@@ -164,8 +164,20 @@ def _run(config: FilterConfig | None, case: ValidationCase) -> Run:
 
 
 def _spread(run: Run) -> float | None:
-    used = run.residuals.verdict == USED
-    return float(1.4826 * np.median(np.abs(run.residuals.innovation[used]))) if used.any() else None
+    innovation = run.residuals.innovation[run.residuals.verdict == USED]
+    return _scale(innovation) if len(innovation) else None
+
+
+def _scale(innovation: np.ndarray) -> float:
+    return float(1.4826 * np.median(np.abs(innovation)))
+
+
+def _used(run: Run) -> tuple[np.ndarray, np.ndarray]:
+    """Innovations (n,) m of the TDOAs that a Run used, or, without any TDOAs, of its ranges, and their variances (n,) m^2."""
+    residuals, ranges = run.residuals, run.aids.get(RANGES)
+    rows = {name: getattr(residuals, name) for name in OF_ROW} if len(residuals) or ranges is None else ranges
+    used = rows["verdict"] == USED
+    return rows["innovation"][used], rows["variance"][used]
 
 
 def _blocks(judged: Score) -> np.ndarray:

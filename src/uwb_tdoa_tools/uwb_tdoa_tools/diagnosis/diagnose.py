@@ -10,6 +10,8 @@ import numpy as np
 
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.offline import may_have_offset
 
 from ..checking.numbers import numbers
 from ..scoring.metrics import Score
@@ -17,6 +19,7 @@ from . import comparison, output, repairing, validation
 from .attribution import Attribution, attribute, residuals_of
 from .findings import EffectFinding, Refused, usable
 from .health import health
+from .noise import with_offset
 from .references import GroundTruth, Reference
 from .regression.confounding import unobservable
 from .self_calibration import Tape, self_calibrate
@@ -26,7 +29,6 @@ from .self_calibration.solve import same_anchors
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from uwb_tdoa_bias.foundation.flight import Flight
-    from uwb_tdoa_ekf.core.config import FilterConfig
     from uwb_tdoa_ekf.streams.finding import Finding as NumbersFinding
     from ..parallel import MapFunction
     from .channels import ChannelResiduals
@@ -215,7 +217,9 @@ def _by_self_calibration(work: _Work, found: Attribution, flights: tuple[Flights
     refused: list[Refused] = []
     changes: tuple[str, ...] = ()
     chosen, others = found.selection.chosen, found.findings()
-    if chosen or rest.covariance is not None or work.reference.constraints:
+    looking = with_offset(work.config or FilterConfig())
+    ranged = any(may_have_offset(flight, looking) for flight in sound)  # then the delay of the tag was taken out of the innovations
+    if chosen or ranged or rest.covariance is not None or work.reference.constraints:
         calibration = _calibrated(work, sound, rest)
         if isinstance(calibration, str):
             refused = [Refused(" + ".join([candidate.label for candidate in chosen] or OF_ANCHORS), calibration)]

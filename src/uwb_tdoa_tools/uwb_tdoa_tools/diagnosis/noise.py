@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, TYPE_CHECKING
 
 from ..checking.tag_delay import DELAY_STD
@@ -10,6 +11,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
     from pathlib import Path
     from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_ekf.core.config import FilterConfig
 
 HEAD = "/**:\n  ros__parameters:\n"
 LINES = {
@@ -23,6 +25,12 @@ def parameters_of(flights: Iterable[Flight], tdoa_std: float | None) -> dict[str
     ranges."""
     ranged = any(flight.range is not None for flight in flights)
     return ({} if tdoa_std is None else {"tdoa_std": round(tdoa_std, 3)}) | ({"range_offset_std": DELAY_STD} if ranged else {})
+
+
+def with_offset(config: FilterConfig) -> FilterConfig:
+    """The FilterConfig that looks for an offset of all ranges, if it does not yet."""
+    changed: dict[str, Any] = {"range_offset_std": DELAY_STD}
+    return config if config.range_offset_std > 0.0 else replace(config, **changed)  # type: ignore[attr-defined]  # as of SENSORS
 
 
 def write_parameters(path: Path, parameters: Mapping[str, float]) -> Path | None:

@@ -93,7 +93,7 @@ def need_tdoas(flights: Iterable[Flight], what: str) -> None:
     """Raise InputError for one of some Flights that holds no TDOAs. what : words, that needs them."""
     for flight in flights:
         if not len(flight.tdoa):
-            raise InputError(f"{flight.name}: holds no TDOAs, which {what} needs; with ranges alone do check, evaluate, localize, survey, calibrate, and diagnose with ground truth.")
+            raise InputError(f"{flight.name}: holds no TDOAs, which {what} needs; with ranges alone do check, evaluate, localize, survey, calibrate, and diagnose with ground truth or with nothing.")
 
 
 def report_remarks(path: str | Path, remarks: Iterable[str]) -> None:

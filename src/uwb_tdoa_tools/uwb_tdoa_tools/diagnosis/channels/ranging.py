@@ -49,8 +49,7 @@ class Ranging(Channel[RangeResidual]):
         vars(self).update(vars(SENSORS[name].compared))
 
     def residual(self, comparison: Comparison) -> RangeResidual | None:
-        reference = comparison.reference
-        known = all(reference.positions_known) and comparison.view.innovations is None
+        known = all(comparison.reference.positions_known) or comparison.view.innovations is not None
         if getattr(comparison.flight, self.name) is None or not known:
             return None
         return compared(comparison, RADIO[self.name], RangeResidual)
@@ -64,6 +63,8 @@ class Ranging(Channel[RangeResidual]):
         return out
 
     def views(self, residuals: Sequence[RangeResidual]) -> list[CovariateView]:
+        if any(part.innovations is not None for part in residuals):
+            return []  # what the path follows is not left in them
         cells = [part.cells for part in residuals]
         anchor = np.concatenate([part.samples.anchors.ids[part.arrivals(part.cells.pair)[1]] for part in residuals])
         alike, of_each = {}, {}

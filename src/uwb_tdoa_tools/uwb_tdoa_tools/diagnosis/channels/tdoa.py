@@ -159,8 +159,10 @@ class Cells:
 def compared(comparison: Comparison, kind: type[Samples], made: type[Radio]) -> Radio | None:
     """What measurements of a kind in the flight of a Comparison leave of the geometry; None without any in the air."""
     flight, anchors, poses = comparison.flight, comparison.flight.anchors, comparison.poses
-    raw, a, b = kind.measured(flight)
     innovations = comparison.view.innovations
+    if innovations is not None and kind.channel not in innovations.streams:
+        return None
+    raw, a, b = kind.measured(flight)
     if innovations is None:
         inside = (raw.t >= poses.t[0]) & (raw.t <= poses.t[-1])
         usable = np.flatnonzero((a >= 0) & (b >= 0) & np.isfinite(raw.d) & inside)

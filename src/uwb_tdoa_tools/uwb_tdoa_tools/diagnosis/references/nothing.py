@@ -7,15 +7,17 @@ from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.foundation.flight import Truth
-from uwb_tdoa_ekf.sensitivity import TDOAS, record_innovations
+from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.offline import without_unknown_offset
+from uwb_tdoa_ekf.sensitivity import RANGES, TDOAS, record_innovations
 
+from ..noise import with_offset
 from .base import Reference, ReferenceView
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from uwb_tdoa_bias.effects import EffectSet
     from uwb_tdoa_bias.foundation.flight import Flight
-    from uwb_tdoa_ekf.core.config import FilterConfig
     from ..constraints import Constraint
 
 TRUTHS = "_truth"  # how streams are called in which a simulation tells what was true
@@ -28,8 +30,9 @@ def without_truth(flight: Flight) -> Flight:
 
 
 class Nothing(Reference):
-    """Residuals are the innovations of the filter; what the path follows of an effect is taken out of its regressors, with all
-    that the filter knows of the path."""
+    """Residuals are the innovations of the filter, of TDOAs, or of ranges in a flight without any; what the path follows of an effect is
+    taken out of its regressors, with all that the filter knows of the path. An offset of all ranges is taken out before: it would bend the
+    path, and `self_calibrate` tells it."""
 
     positions_known = (False, False, False)
     attitude_known = False
@@ -37,15 +40,20 @@ class Nothing(Reference):
     words = "nothing but the flights themselves"
 
     def __init__(
-        self, config: FilterConfig | None = None, constraints: Sequence[Constraint] = (), streams: Sequence[str] = (TDOAS,)
+        self, config: FilterConfig | None = None, constraints: Sequence[Constraint] = (), streams: Sequence[str] = ()
     ) -> None:
-        """config : FilterConfig; constraints : what is known beside (`diagnosis/constraints`); streams : as of `record_innovations`."""
-        self._config, self.constraints, self._streams = config, tuple(constraints), tuple(streams)
+        """config : FilterConfig; constraints : what is known beside (`diagnosis/constraints`); streams : as of `record_innovations`, then
+        with the offset of ranges, or none for what is said above."""
+        self._config, self.constraints, self._streams = config or FilterConfig(), tuple(constraints), tuple(streams)
 
     def prepare(self, flight: Flight) -> Flight:
         return without_truth(flight)
 
     def view(self, flight: Flight, effects: EffectSet) -> ReferenceView:
-        innovations = record_innovations(flight, self._config, Corrector(flight.anchors, effects), self._streams)
+        streams, by = self._streams, Corrector(flight.anchors, effects)
+        if not streams:
+            flight = without_unknown_offset(flight, with_offset(self._config), by)
+            streams = (TDOAS,) if len(flight.tdoa) else (RANGES,)
+        innovations = record_innovations(flight, self._config, by, streams)
         estimate = innovations.run.odometry
         return ReferenceView(Truth(estimate.t, estimate.p, estimate.q), innovations)

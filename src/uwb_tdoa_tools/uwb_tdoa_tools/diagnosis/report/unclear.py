@@ -79,7 +79,8 @@ def _told_by(item: Unobservable, diagnosis: Diagnosis) -> str:
     if item.direction is None:
         if alone and effect.needs_reference:
             return GROUND_TRUTH
-        return CHANNELS[(effect.witnesses or effect.channels)[0]].needs
+        wanted, shown = (*effect.witnesses, *effect.channels), {name for flight in diagnosis.attribution.residuals for name in flight}
+        return CHANNELS[next((name for name in wanted if name not in shown), wanted[0])].needs
     size, parts = _contribution(item.effect, item.direction, diagnosis)
     if parts > 0.0 and size <= NOTHING * parts:
         return CANCELS

@@ -132,7 +132,8 @@ def _nothing_added(diagnosis: Diagnosis) -> Verdict:
 
 def _without_truth(diagnosis: Diagnosis) -> Verdict:
     before, after = (side["pooled"]["residual_spread"] for side in (diagnosis.before, diagnosis.after))
-    scatter = f"Innovations (measured minus predicted TDOAs) scatter by {centimetres(before)}"
+    measured = "TDOAs" if any(len(flight.tdoa) for flight in diagnosis.flights) else "ranges"
+    scatter = f"Innovations (measured minus predicted {measured}) scatter by {centimetres(before)}"
     if not diagnosis.findings:
         headline = "Nothing was found: what the model leaves of the measurements looks like noise."
         return Verdict(headline, (_UNKNOWN, f"{scatter}."), "nothing")
