@@ -85,8 +85,8 @@ def prior_sizes(columns: Sequence[Column]) -> np.ndarray:
 def fit(
     table: RegressionTable, columns: Sequence[Column], inflation: np.ndarray | None = None, covariance: bool = True, near: Fit | None = None
 ) -> Fit:
-    """Fit of some Columns of a RegressionTable. inflation : (groups,), measured on this very fit if None; covariance : whether somebody asks
-    for it; near : Fit of nearly the same Columns, from which that of a sparse RegressionTable begins."""
+    """Fit of some Columns of a RegressionTable. inflation : (groups,), measured on this very fit if None; covariance : whether
+    somebody asks for it; near : Fit of nearly the same Columns, from which that of a sparse RegressionTable begins."""
     x, group, sizes = table.matrix(columns), table.group, prior_sizes(columns)
     weight, beta = np.ones(len(table.y)), np.zeros(len(columns))
     residual = table.y.copy() if near is None or not table.sparse else near.residual.copy()
