@@ -4,18 +4,25 @@ ros2 launch uwb_tdoa_ekf bag.launch.py bag:=flight.bag
 ros2 launch uwb_tdoa_ekf bag.launch.py bag:=flight.bag rate:=2 anchors_file:=anchors.yaml rviz:=true
 """
 
+from __future__ import annotations
+
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, ExecuteProcess, IncludeLaunchDescription, Shutdown, TimerAction
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration
 
+if TYPE_CHECKING:
+    from launch.events.process import ProcessExited
+    from launch.launch_context import LaunchContext
+
 DELAY = "3"  # s until the nodes have been discovered: what is played before is lost
 REST = 2.0  # s after the end of the bag, in which the nodes publish what they still wait with
 
 
-def generate_launch_description():
+def generate_launch_description() -> LaunchDescription:
     """tdoa.launch.py, whose arguments all work here too, on simulated time, and ros2 bag play; ends when the bag does."""
     tag = PythonLaunchDescriptionSource(str(Path(__file__).with_name("tdoa.launch.py")))
     play = ["ros2", "bag", "play", LaunchConfiguration("bag"), "--clock", "200", "--delay", DELAY]
@@ -34,7 +41,7 @@ def generate_launch_description():
     )
 
 
-def _played(event, context):
+def _played(event: ProcessExited, context: LaunchContext) -> TimerAction | None:
     """What follows when ros2 bag play has ended."""
     if context.is_shutdown:
         return None

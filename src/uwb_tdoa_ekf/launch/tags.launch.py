@@ -12,11 +12,19 @@ ros2 launch uwb_tdoa_ekf tags.launch.py tags:=tags.yaml processes:=auto    # tak
 With `host: NAME` for each tag, the same file is launched on every machine, and each starts the nodes of its tags.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from uwb_tdoa_ekf.launching import FROZEN, NETWORK, RESPAWN, tags, typed
 from uwb_tdoa_ekf.launching_actions import actions
+
+if TYPE_CHECKING:
+    from launch.action import Action
+    from launch.launch_context import LaunchContext
 
 OTHERS = {
     "processes": (
@@ -31,7 +39,7 @@ OTHERS = {
 }
 
 
-def generate_launch_description():
+def generate_launch_description() -> LaunchDescription:
     """Arguments, and what follows from them and the file."""
     arguments = [
         DeclareLaunchArgument(name, default_value=default, description=text) for name, (default, text) in OTHERS.items()
@@ -44,7 +52,7 @@ def generate_launch_description():
     return LaunchDescription([file, *arguments, OpaqueFunction(function=_nodes)])
 
 
-def _nodes(context):
+def _nodes(context: LaunchContext) -> list[Action]:
     given = {name: LaunchConfiguration(name).perform(context) for name in ("tags", *OTHERS, *RESPAWN, *NETWORK)}
     values = typed({name: given[name] for name in ("use_sim_time", "frozen")})
     starts = tags(given["tags"], values, given["log_level"], given["processes"], given["host"])

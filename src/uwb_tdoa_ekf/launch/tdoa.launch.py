@@ -5,11 +5,19 @@ ros2 launch uwb_tdoa_ekf tdoa.launch.py namespace:=tag1 ekf_params:=my_ekf.yaml 
 ros2 launch uwb_tdoa_ekf tdoa.launch.py --show-args
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
 from uwb_tdoa_ekf.launching import FROZEN, NETWORK, RESPAWN, start, tag, typed
 from uwb_tdoa_ekf.launching_actions import actions
+
+if TYPE_CHECKING:
+    from launch.action import Action
+    from launch.launch_context import LaunchContext
 
 VALUES = {  # parameters of the nodes; one that is not given is what the files say, or the node's default
     "anchors_file": "survey of the anchors; without it they come on uwb/anchors",
@@ -32,7 +40,7 @@ OTHERS = {
 }
 
 
-def generate_launch_description():
+def generate_launch_description() -> LaunchDescription:
     """Arguments, and what follows from them."""
     arguments = [DeclareLaunchArgument(name, default_value="", description=text) for name, text in VALUES.items()]
     arguments += [
@@ -45,7 +53,7 @@ def generate_launch_description():
     return LaunchDescription([*arguments, OpaqueFunction(function=_nodes)])
 
 
-def _nodes(context):
+def _nodes(context: LaunchContext) -> list[Action]:
     values = typed({name: LaunchConfiguration(name).perform(context) for name in VALUES})
     given = {name: LaunchConfiguration(name).perform(context) for name in (*OTHERS, *RESPAWN, *NETWORK)}
     files = {node: [given[key]] for node, key in (("bias_node", "bias_params"), ("ekf_node", "ekf_params")) if given[key]}

@@ -5,7 +5,10 @@ ros2 launch uwb_tdoa_tools fly.launch.py mission:=true seed:=7 simulated_time:=t
 ros2 launch uwb_tdoa_tools fly.launch.py --show-args
 """
 
+from __future__ import annotations
+
 import os
+from typing import TYPE_CHECKING
 
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
@@ -13,6 +16,12 @@ from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 from uwb_tdoa_ekf.launching import FROZEN, NETWORK, Start, discovery, tag, typed
 from uwb_tdoa_ekf.launching_actions import actions
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping
+    from launch.action import Action
+    from launch.events.process import ProcessExited
+    from launch.launch_context import LaunchContext
 
 VALUES = {  # parameters of vehicle_node; one that is not given is its default
     "world": "what it flies in (docs/flying.md)",
@@ -32,7 +41,7 @@ OTHERS = {
 NUMBERS = {"seed": int, "duration": float}
 
 
-def generate_launch_description():
+def generate_launch_description() -> LaunchDescription:
     """Arguments, and what follows from them."""
     arguments = [DeclareLaunchArgument(name, default_value="", description=text) for name, text in VALUES.items()]
     arguments += [DeclareLaunchArgument(name, default_value=default, description=text) for name, (default, text) in OTHERS.items()]
@@ -43,7 +52,7 @@ def generate_launch_description():
     return LaunchDescription([*arguments, OpaqueFunction(function=_nodes)])
 
 
-def _nodes(context):
+def _nodes(context: LaunchContext) -> list[Action]:
     values = typed({name: LaunchConfiguration(name).perform(context) for name in VALUES})
     values |= {name: _number(kind, values[name]) for name, kind in NUMBERS.items() if name in values}
     given = {name: LaunchConfiguration(name).perform(context) for name in (*OTHERS, *NETWORK)}
@@ -57,7 +66,7 @@ def _nodes(context):
     ]
 
 
-def _number(kind, text):
+def _number(kind: Callable[[str], float], text: str) -> float | str:
     """A number, or the text where it is none: the node says so."""
     try:
         return kind(text)
@@ -65,7 +74,7 @@ def _number(kind, text):
         return text
 
 
-def _vehicle(start, variables):
+def _vehicle(start: Start, variables: Mapping[str, str]) -> Node:
     """The action of its Start; all ends with it."""
     return Node(
         package=start.package, executable=start.executable, namespace=start.namespace, ros_arguments=start.words,
@@ -73,7 +82,7 @@ def _vehicle(start, variables):
     )  # fmt: skip
 
 
-def _ended(event, context):
+def _ended(event: ProcessExited, context: LaunchContext) -> Shutdown | None:
     if context.is_shutdown:
         return None
     if event.returncode:
