@@ -30,8 +30,8 @@ SAID = 1.5  # s of importing after which it is said that something goes on
 
 def executable(module: str) -> Callable[..., Any]:
     """The entry point of a module with a main(): imports the module when it is called, returns what main returns. Its linear algebra, of
-    small matrices, takes one thread: several would wait for each other by spinning. In the environment, because libraries that are loaded
-    later read it too; a user's own setting stays."""
+    small matrices, takes one thread: several would wait for each other by spinning. That is set in the environment, where libraries that
+    are loaded later read it; a user's own setting stays."""
     return partial(_run, module)
 
 

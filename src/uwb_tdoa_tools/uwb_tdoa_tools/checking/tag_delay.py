@@ -22,8 +22,8 @@ AGREE = 0.8  # share of the windows that say the same sign
 SCALE = 0.2  # m, beyond which a range counts less
 DILUTION = 5.0  # most that an error of the ranges may become in what they have in common
 STEPS, DAMPING = 20, 1e-3
-DELAY_STD = 0.3  # m, of the antenna delay of a tag that nobody has calibrated
-REMEDY = f"calibrate it: survey, or diagnose where there is ground truth; until then let the filter find it: range_offset_std: {DELAY_STD}"
+TAG_DELAY_STD = 0.3  # m, of the antenna delay of a tag that nobody has calibrated
+REMEDY = f"calibrate it: survey, or diagnose where there is ground truth; until then let the filter find it: range_offset_std: {TAG_DELAY_STD}"
 
 
 def tag_delay(recording: Recording) -> Iterator[Finding]:

@@ -24,7 +24,7 @@ def fit_map(
     flown: Iterable[Scored], static: Sequence[str | Path], estimator: PositionEstimator, step: float = 0.35,
     planar: bool = False, interpolator: str = "thin_plate",
 ) -> BiasMap:  # fmt: skip
-    """BiasMap of flights, as an PositionEstimator gave them, and of files of a tag that stood still. Raises InputError.
+    """BiasMap of flights, as a PositionEstimator gave them, and of files of a tag that stood still. Raises InputError.
 
     static : paths, see `static_parts`; step : m; planar, interpolator : see `uwb_tdoa_ekf.debias.fit`.
     """
@@ -43,7 +43,7 @@ def fit_map(
 def cross_validated(
     flown: Sequence[Scored], static: Sequence[str | Path], estimator: PositionEstimator, **options: Any
 ) -> Shrinkage | None:
-    """Shrinkage of maps, each made without one of the flights that an PositionEstimator gave and judged on it; None for fewer than
+    """Shrinkage of maps, each made without one of the flights that a PositionEstimator gave and judged on it; None for fewer than
     FEWEST. static, options : as of `fit_map`."""
     if len(flown) < FEWEST:
         return None

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any, TYPE_CHECKING
 
-from ..checking.tag_delay import DELAY_STD
+from ..checking.tag_delay import TAG_DELAY_STD
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
@@ -24,12 +24,12 @@ def parameters_of(flights: Iterable[Flight], tdoa_std: float | None) -> dict[str
     """{name: value} of parameters of ekf_node: tdoa_std, m, unless it is None, and range_offset_std, m, where one of some Flights has
     ranges."""
     ranged = any(flight.range is not None for flight in flights)
-    return ({} if tdoa_std is None else {"tdoa_std": round(tdoa_std, 3)}) | ({"range_offset_std": DELAY_STD} if ranged else {})
+    return ({} if tdoa_std is None else {"tdoa_std": round(tdoa_std, 3)}) | ({"range_offset_std": TAG_DELAY_STD} if ranged else {})
 
 
 def with_offset(config: FilterConfig) -> FilterConfig:
     """The FilterConfig that looks for an offset of all ranges, if it does not yet."""
-    changed: dict[str, Any] = {"range_offset_std": DELAY_STD}
+    changed: dict[str, Any] = {"range_offset_std": TAG_DELAY_STD}
     return config if config.range_offset_std > 0.0 else replace(config, **changed)  # type: ignore[attr-defined]  # as of SENSORS
 
 

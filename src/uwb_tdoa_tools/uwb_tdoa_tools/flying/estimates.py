@@ -54,7 +54,7 @@ class EstimateSource(Protocol):
 
 
 class OurFilter:
-    """`Corrector` and `Estimator`, as in bias_node and ekf_node, behind the calls that a flight needs: a EstimateSource."""
+    """`Corrector` and `Estimator`, as in bias_node and ekf_node, behind the calls that a flight needs: an EstimateSource."""
 
     why = ""
 

@@ -29,7 +29,7 @@ class RealTime:
         self._clock, self._began, self._now = clock, clock(), 0.0
 
     def sent(self, now: float, measured: SensorReadings) -> None:
-        """SensorReadings, all up to `now`, s, was published."""
+        """SensorReadings, all up to `now`, s, were published."""
         self._now = now
 
     def heard(self, t: float) -> None:
@@ -55,7 +55,7 @@ class Lockstep:
         self._periods, self._silent = deque([DT], REMEMBERED), True
 
     def sent(self, now: float, measured: SensorReadings) -> None:
-        """SensorReadings, all up to `now`, s, was published."""
+        """SensorReadings, all up to `now`, s, were published."""
         self._newest |= {stream: part.t[-1] for stream, part in measured.streams.items() if len(part.t)}
         self._first = now if self._first is None else self._first
         settled = 0.0 if now > self._first + TRIAL + UNTRUSTED else UNTRUSTED

@@ -21,7 +21,7 @@ class Transport:
         self._waiting: dict[str, tuple[Any, np.ndarray, float]] = {}
 
     def arrived(self, measured: SensorReadings, now: float) -> SensorReadings:
-        """SensorReadings that has arrived by `now`, s, after one more SensorReadings was sent."""
+        """SensorReadings that have arrived by `now`, s, after more of them were sent."""
         if not self._latency and not self._jitter:
             return measured
         parts = {stream: self._due(stream, part, now) for stream, part in measured.streams.items()}

@@ -25,7 +25,7 @@ def evaluate(
 
 
 def score_of(flight: Flight, estimator: FlightEstimator) -> tuple[Score, Run]:
-    """(Score, Run) of a Flight with ground truth, by an FlightEstimator. Raises InputError if there is no truth, or one on
+    """(Score, Run) of a Flight with ground truth, by a FlightEstimator. Raises InputError if there is no truth, or one on
     another clock."""
     need_truth(flight)
     run = estimator(flight)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.foundation.flight import Truth
+from uwb_tdoa_ekf.core import auxiliary
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import without_unknown_offset
 from uwb_tdoa_ekf.sensitivity import RANGES, TDOAS, record_innovations
@@ -42,18 +43,19 @@ class Nothing(Reference):
     def __init__(
         self, config: FilterConfig | None = None, constraints: Sequence[Constraint] = (), streams: Sequence[str] = ()
     ) -> None:
-        """config : FilterConfig; constraints : what is known beside (`diagnosis/constraints`); streams : as of `record_innovations`, then
-        with the offset of ranges, or none for what is said above."""
+        """config : FilterConfig; constraints : what is known beside (`diagnosis/constraints`); streams : whose innovations are
+        residuals, as of `record_innovations`; their offset stays in the ranges then. None: as said above."""
         self._config, self.constraints, self._streams = config or FilterConfig(), tuple(constraints), tuple(streams)
 
     def prepare(self, flight: Flight) -> Flight:
         return without_truth(flight)
 
     def view(self, flight: Flight, effects: EffectSet) -> ReferenceView:
-        streams, by = self._streams, Corrector(flight.anchors, effects)
+        config, streams, by = self._config, self._streams, Corrector(flight.anchors, effects)
         if not streams:
-            flight = without_unknown_offset(flight, with_offset(self._config), by)
+            flight = without_unknown_offset(flight, with_offset(config), by)
+            config = replace(config, **auxiliary.NONE)  # it has been found
             streams = (TDOAS,) if len(flight.tdoa) else (RANGES,)
-        innovations = record_innovations(flight, self._config, by, streams)
+        innovations = record_innovations(flight, config, by, streams)
         estimate = innovations.run.odometry
         return ReferenceView(Truth(estimate.t, estimate.p, estimate.q), innovations)
