@@ -19,7 +19,6 @@ from ..checking.ordered import OrderedRecording
 from ..checking.survey_fit import displacement
 from ..checking.tdoa_rules import survey_fit
 from ..diagnosis import diagnose
-from ..diagnosis.noise import parameters_of
 from ..diagnosis.self_calibration import Tape, self_calibrate
 from ..diagnosis.self_calibration.equations import measured_noise, slow_innovations
 from ..diagnosis.self_calibration.solve import LEFT
@@ -93,8 +92,7 @@ def with_truth(
     )  # fmt: skip
     if holdout:
         progress("judging")
-        told = replace(config or FilterConfig(), **parameters_of(flights, std))
-        before, after = (_rmse(holdout, *side) for side in ((base, config), (found.effects, told)))
+        before, after = (_rmse(holdout, *side) for side in ((base, config), (found.effects, _with_noise(config, std))))
         calibration = replace(calibration, before=before, after=after, judged_on=_names(holdout))
     return _assessed(calibration, len(found.effects) > len(base))
 
@@ -113,11 +111,8 @@ def without_truth(
     said = partial(progress, "solving")
     found = self_calibrate(fitted, tape, base, config, (), said)
     progress("judging")
-    before = slow_innovations(judges, base, config)
-    told = replace(config or FilterConfig(), **parameters_of(fitted, found.tdoa_std))  # of the delay of another tag, too
-    by = Corrector(found.anchors, found.effects)
-    judges = [without_unknown_offset(replace(one, anchors=found.anchors), told, by) for one in judges]
-    after = slow_innovations(judges, found.effects, config)
+    before = _slow_innovations(judges, base, config)
+    after = _slow_innovations([replace(one, anchors=found.anchors) for one in judges], found.effects, config)
     if not holdout and found.why_not is None and after <= before:
         found = self_calibrate(flights, tape, base, config, (), said)  # what was judged, of all of it
     calibration = Calibration(
@@ -154,6 +149,19 @@ def _rmse(flights: Sequence[Flight], effects: EffectSet, config: FilterConfig | 
     """m, 3D RMSE of all Flights together, by an estimate with an EffectSet."""
     errors = [score_of(flight, FlightEstimator(config, effects))[0].error for flight in flights]
     return float(np.sqrt(np.mean(np.sum(np.concatenate(errors) ** 2, axis=1))))
+
+
+def _slow_innovations(flights: Sequence[Flight], effects: EffectSet, config: FilterConfig | None) -> float:
+    """m, `slow_innovations` beside the offset of all ranges, which the filter finds in each flight."""
+    config, by = config or FilterConfig(), Corrector(flights[0].anchors, effects)
+    return slow_innovations([without_unknown_offset(flight, config, by) for flight in flights], effects, config)
+
+
+def _with_noise(config: FilterConfig | None, std: float | None) -> FilterConfig:
+    """FilterConfig with tdoa_std, m, unless that is None."""
+    config = config or FilterConfig()
+    changed: dict[str, Any] = {} if std is None else {"tdoa_std": round(std, 3)}
+    return replace(config, **changed)
 
 
 def _names(flights: Sequence[Flight]) -> str:

@@ -19,7 +19,6 @@ from . import comparison, output, repairing, validation
 from .attribution import Attribution, attribute, residuals_of
 from .findings import EffectFinding, Refused, usable
 from .health import health
-from .noise import with_offset
 from .references import GroundTruth, Reference
 from .regression.confounding import unobservable
 from .self_calibration import Tape, self_calibrate
@@ -217,8 +216,8 @@ def _by_self_calibration(work: _Work, found: Attribution, flights: tuple[Flights
     refused: list[Refused] = []
     changes: tuple[str, ...] = ()
     chosen, others = found.selection.chosen, found.findings()
-    looking = with_offset(work.config or FilterConfig())
-    ranged = any(may_have_offset(flight, looking) for flight in sound)  # then the delay of the tag was taken out of the innovations
+    config = work.config or FilterConfig()
+    ranged = any(may_have_offset(flight, config) for flight in sound)  # then the delay of the tag was taken out of the innovations
     if chosen or ranged or rest.covariance is not None or work.reference.constraints:
         calibration = _calibrated(work, sound, rest)
         if isinstance(calibration, str):
