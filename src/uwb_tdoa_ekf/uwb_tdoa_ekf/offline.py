@@ -16,10 +16,11 @@ from .core.config import FilterConfig
 from .core.hypotheses import yaw_offset
 from .core.memory import AID, RESIDUAL, TDOA, joined, structured
 from .core.verdicts import INVALID
+from .frames import poses_of
 from .installed import Installed
 from .pipeline import Pipeline, odometry_of
 from .reorder_buffer import FIRST_AID, IMU_STREAM, TDOA_STREAM, ReorderBuffer
-from .results import VERDICTS, Odometry, Residuals, poses_of
+from .results import VERDICTS, Odometry, Residuals
 from .rows import aid_rows, imu_rows, usable_tdoas
 
 if TYPE_CHECKING:

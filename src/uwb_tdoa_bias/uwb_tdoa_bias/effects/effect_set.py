@@ -18,7 +18,7 @@ from .aid_corrector import AidCorrector
 from .base import Effect
 from .catalogue import EFFECTS
 from .covariance import Covariance
-from .domain import LITTLE, faded, in_words
+from .fading import LITTLE, faded, in_words
 from .imu_corrector import ImuCorrector
 from .label_error import LabelCorrector
 from .samples import RADIO

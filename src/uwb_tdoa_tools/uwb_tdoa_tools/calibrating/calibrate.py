@@ -8,17 +8,15 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.offline import without_unknown_offset
 from uwb_tdoa_ekf.streams import ERROR
 
 from ..checking.ordered import OrderedRecording
 from ..checking.survey_fit import displacement
 from ..checking.tdoa_rules import survey_fit
-from ..diagnosis import diagnose
+from ..diagnosis import diagnose, output
 from ..diagnosis.self_calibration import Tape, self_calibrate
 from ..diagnosis.self_calibration.equations import measured_noise, slow_innovations
 from ..diagnosis.self_calibration.solve import LEFT
@@ -88,7 +86,7 @@ def with_truth(
     std = measured_noise(found.flights, found.effects, config)
     calibration = Calibration(
         flights[0].anchors, found.effects, std, "3D RMSE", found.before["pooled"]["rmse_3d"], found.after["pooled"]["rmse_3d"],
-        found.judged_on, None, found.as_text(),
+        found.judged_on, None, output.as_text(found),
     )  # fmt: skip
     if holdout:
         progress("judging")
@@ -111,8 +109,8 @@ def without_truth(
     said = partial(progress, "solving")
     found = self_calibrate(fitted, tape, base, config, (), said)
     progress("judging")
-    before = _slow_innovations(judges, base, config)
-    after = _slow_innovations([replace(one, anchors=found.anchors) for one in judges], found.effects, config)
+    before = slow_innovations(judges, base, config)
+    after = slow_innovations([replace(one, anchors=found.anchors) for one in judges], found.effects, config)
     if not holdout and found.why_not is None and after <= before:
         found = self_calibrate(flights, tape, base, config, (), said)  # what was judged, of all of it
     calibration = Calibration(
@@ -149,12 +147,6 @@ def _rmse(flights: Sequence[Flight], effects: EffectSet, config: FilterConfig | 
     """m, 3D RMSE of all Flights together, by an estimate with an EffectSet."""
     errors = [score_of(flight, FlightEstimator(config, effects))[0].error for flight in flights]
     return float(np.sqrt(np.mean(np.sum(np.concatenate(errors) ** 2, axis=1))))
-
-
-def _slow_innovations(flights: Sequence[Flight], effects: EffectSet, config: FilterConfig | None) -> float:
-    """m, `slow_innovations` beside the offset of all ranges, which the filter finds in each flight."""
-    config, by = config or FilterConfig(), Corrector(flights[0].anchors, effects)
-    return slow_innovations([without_unknown_offset(flight, config, by) for flight in flights], effects, config)
 
 
 def _with_noise(config: FilterConfig | None, std: float | None) -> FilterConfig:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from ..bags.files import BagReader
     from ..bags.placing import Place
     from ..readers.inputs import Reading
-    from .wiring import End
+    from .ends import End
 
 IMU, TDOA = "imu/data", "uwb/tdoa"
 HEARD = (TDOA, IMU, "uwb/anchors", *(of.topics[0][0] for of in SENSORS.values()), "uwb/tdoa_corrected", "odometry", "uwb/residual")
