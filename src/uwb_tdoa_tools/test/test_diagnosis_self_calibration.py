@@ -8,7 +8,7 @@ import pytest
 from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, Covariance, EffectSet
 from uwb_tdoa_bias.effects.anchor_position import AnchorPosition
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_tools.diagnosis import diagnose
+from uwb_tdoa_tools.diagnosis import diagnose, output
 from uwb_tdoa_tools.diagnosis.diagnose import _calibrated, _Work
 from uwb_tdoa_tools.diagnosis.references import Nothing
 from uwb_tdoa_tools.diagnosis.self_calibration import self_calibrate
@@ -65,7 +65,7 @@ def test_what_is_applied_is_found_with_its_evidence_and_the_same_in_all_flights(
     assert "pair_offset" in [other.effect for other in added[1].alternatives]
     shares = [(one.share, one.std) for one in added[1].shares]
     assert len(shares) == 2 and all(abs(share - 1.0) < 0.3 and std < 0.2 for share, std in shares)
-    assert "The same in all 2 flights" in diagnosis.as_text()
+    assert "The same in all 2 flights" in output.as_text(diagnosis)
 
 
 def test_the_noise_that_the_filter_is_told_asks_for_no_functions_of_the_place():

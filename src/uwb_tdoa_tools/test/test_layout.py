@@ -2,6 +2,7 @@
 
 import ast
 from functools import lru_cache
+from graphlib import TopologicalSorter
 from pathlib import Path
 import re
 import sys
@@ -121,6 +122,11 @@ def test_no_package_imports_one_above():
             package = name.partition(".")[0]
             if package in ORDER:
                 assert ORDER.index(package) <= ORDER.index(module.partition(".")[0]), f"{module} imports {name}"
+
+
+def test_files_are_on_floors():
+    """No file needs itself by others, neither for what it runs nor for its types."""
+    TopologicalSorter({module: ours(module) - {module} for module in modules()}).prepare()  # raises CycleError, which names the circle
 
 
 def test_the_foundation_stands_alone():
