@@ -18,8 +18,9 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.anchors import Anchors
     from uwb_tdoa_bias.foundation.flight import Flight
 
-__all__ = ["read_flight", "read_survey", "read_usd_log", "read_util_csv"]
+__all__ = ["is_bag", "read_flight", "read_survey", "read_usd_log", "read_util_csv"]
 ROS_1 = b"#ROSBAG V2.0"  # what a bag of ROS 1 begins with
+ROS_2 = b"\x89MCAP0\r\n", b"SQLite format 3\0"  # what a file of a bag begins with
 
 
 def read_flight(
@@ -37,7 +38,7 @@ def read_flight(
     truth : read the ground truth, where there is one.
     Raises InputError.
     """
-    from ..bags.bag import is_bag, read_bag  # here, because bags need the rosbags library and the others do not
+    from ..bags.bag import read_bag  # here, because bags need the rosbags library and the others do not
 
     path = Path(path)
     if not path.exists():
@@ -50,6 +51,17 @@ def read_flight(
     if anchors is None:
         raise InputError(f"{path}: does not say where the anchors are; give a survey file (--survey FILE).")
     return reader(path, anchors, salvage, truth)
+
+
+def is_bag(path: str | Path) -> bool:
+    """Whether a path is meant as a bag: a directory with metadata.yaml, .mcap or .db3 files, or such a file."""
+    path = Path(path)
+    if path.is_dir():
+        return any(path.glob("metadata.yaml")) or any(path.glob("*.mcap")) or any(path.glob("*.db3"))
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(16).startswith(ROS_2)
 
 
 def _anchors(survey: str | Path | Anchors | None) -> Anchors | None:
