@@ -22,6 +22,7 @@ from uwb_tdoa_bias import bias_node
 from uwb_tdoa_bias.bias_node import BiasNode
 from uwb_tdoa_bias.foundation import ros
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.ros_diagnostics import Diagnostics
 from uwb_tdoa_bias.foundation.ros_parameters import FROZEN, Parameter, declare_all, files_of, say_unused
 from uwb_tdoa_bias.foundation.ros_streams import Handed, RoundRobin
 
@@ -31,7 +32,7 @@ from .ekf_parameters import names_of_parameters
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
-    from uwb_tdoa_bias.foundation.ros import Report
+    from uwb_tdoa_bias.foundation.ros_diagnostics import Report
 
 PARAMETERS = {
     "tags": Parameter([""], 'namespaces of the tags, below that of this node, e.g. ["tag1", "tag2"]; "" is its own'),
@@ -62,7 +63,7 @@ class LocalizationNode(ros.StreamNode):
         self.members = [node for tag in self._tags for node in tag.members]
         say_unused([self, *self.members], files_of(arguments))
         self.turns = RoundRobin(self._tags)
-        self._diagnostics = ros.Diagnostics(self, self._report)
+        self._diagnostics = Diagnostics(self, self._report)
         self.ready = f"ready; tags: {', '.join(tags) or 'one'}"
 
     def _report(self) -> Report:

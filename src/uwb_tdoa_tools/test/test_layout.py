@@ -15,9 +15,10 @@ PACKAGES = ORDER[1:]
 # Who talks ROS. Everything else can be imported and tested without it.
 ROS = """
     uwb_tdoa_bias.anchors_node uwb_tdoa_bias.bias_node
-    uwb_tdoa_bias.foundation.ros uwb_tdoa_bias.foundation.ros_anchors uwb_tdoa_bias.foundation.ros_frames
-    uwb_tdoa_bias.foundation.ros_parameters uwb_tdoa_bias.foundation.ros_spinning
-    uwb_tdoa_bias.foundation.ros_streams uwb_tdoa_bias.foundation.ros_cdr
+    uwb_tdoa_bias.foundation.ros uwb_tdoa_bias.foundation.ros_anchors uwb_tdoa_bias.foundation.ros_cdr
+    uwb_tdoa_bias.foundation.ros_diagnostics uwb_tdoa_bias.foundation.ros_frames uwb_tdoa_bias.foundation.ros_parameters
+    uwb_tdoa_bias.foundation.ros_spinning uwb_tdoa_bias.foundation.ros_stamps uwb_tdoa_bias.foundation.ros_streams
+    uwb_tdoa_bias.foundation.ros_topics
     uwb_tdoa_ekf.debias_node uwb_tdoa_ekf.ekf_node uwb_tdoa_ekf.ekf_parameters
     uwb_tdoa_ekf.launching
     uwb_tdoa_ekf.launching_actions uwb_tdoa_ekf.localization_node uwb_tdoa_ekf.outputs

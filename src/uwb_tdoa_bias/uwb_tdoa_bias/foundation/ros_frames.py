@@ -13,6 +13,7 @@ from . import ros
 from .errors import InputError
 from .ros_parameters import LONGEST_NAME
 from .ros_cdr import ENCAPSULATION, LENGTH, MOST_ELEMENTS, Unreadable, aligned, check_length, decode, read_text
+from .ros_topics import Input
 from .transforms import Frames
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ Transform = tuple[int, int, str, str, tuple[float, ...], tuple[float, ...]]  # s
 
 class FramesInput:
     """Frames of /tf_static, and of /tf if they may move: its messages wait until `catch_up`. Of a node that is frozen, the first
-    constant transform of a frame counts. trouble : a transform that is none, or None; refusals : ros.Refusals."""
+    constant transform of a frame counts. trouble : a transform that is none, or None; refusals : Refusals."""
 
     def __init__(
         self, node: ros.StreamNode, seconds: Callable[[Time], float], on_new: Callable[[], None], moving: bool = False
@@ -40,8 +41,8 @@ class FramesInput:
         self.frames = Frames()
         self.trouble: str | None = None
         self._node, self._seconds, self._on_new = node, seconds, on_new
-        static = ros.Input(node, TFMessage, "/tf_static", self._on_static, TF_STATIC_QOS, read_transforms)
-        self._moving = [ros.Input(node, TFMessage, "/tf", self._on_moving, MOVING_QOS, read_transforms, served=False)] if moving else []
+        static = Input(node, TFMessage, "/tf_static", self._on_static, TF_STATIC_QOS, read_transforms)
+        self._moving = [Input(node, TFMessage, "/tf", self._on_moving, MOVING_QOS, read_transforms, served=False)] if moving else []
         self.refusals = [end.refusals for end in (static, *self._moving)]
 
     def catch_up(self) -> None:
