@@ -14,13 +14,13 @@ from uwb_tdoa_bias.effects import EffectSet
 from .core.aids import STREAMS as AIDS
 from .core.config import FilterConfig
 from .core.hypotheses import yaw_offset
+from .core.measurements import aid_rows, imu_rows, usable_tdoas
 from .core.memory import AID, RESIDUAL, TDOA, joined, structured
 from .core.verdicts import INVALID
 from .installed import Installed
 from .pipeline import Pipeline, odometry_of
 from .reorder_buffer import FIRST_AID, IMU_STREAM, TDOA_STREAM, ReorderBuffer
 from .results import VERDICTS, Odometry, Residuals, poses_of
-from .rows import aid_rows, imu_rows, usable_tdoas
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
