@@ -8,7 +8,8 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_tools.simulation.trajectories import DRAG, GRAVITY, STEP, ExactMotion
+from uwb_tdoa_tools.simulation.motion import ExactMotion
+from uwb_tdoa_tools.simulation.trajectories import DRAG, GRAVITY, STEP
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -1,12 +1,15 @@
 """ranges: simulated flights with distances to anchors, alone and beside TDOAs, against the bound of `plan` for one round;
 and what faulty ranges do beside TDOAs."""
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
 from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.flight import Flight, Tdoas
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import without_offset
@@ -20,9 +23,18 @@ from uwb_tdoa_tools.scoring.metrics import airborne, position_at
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 STD = 0.1  # m, of a range and of a TDOA, white
-OFFSET, OFFSET_STD = 0.25, 0.3  # m, by which all ranges are too long, and what the filter is told of that
+FRESH = 300  # the first seed of flights among other anchors
+OFFSET = 0.25  # m, by which all ranges are too long
 PATHS = "sines", "circle", "square", "rising_circle", "sines"
-KNOWN = FilterConfig(tdoa_std=STD, range_std=STD, tdoa_correlation_length=1.0)  # of what is simulated
+KNOWN = FilterConfig(tdoa_std=STD, range_std=STD, tdoa_correlation_length=1.0, range_offset_std=0.0)  # of what is simulated
+HIGH = 2.9  # m, of a ceiling
+CEILING = [(x, y, HIGH) for x, y in ((-3.5, -4.0), (3.5, -4.0), (3.5, 4.0), (-3.5, 4.0))]
+WALLS = {  # m, positions of few anchors, or of anchors in a plane
+    "eight in the corners": None,
+    "six at the ceiling": [*CEILING, (0.0, -4.0, HIGH), (0.0, 4.0, HIGH)],
+    "four at the ceiling": CEILING,
+    "four, high and low": [(x, y, z) for (x, y, _), z in zip(CEILING, (0.2, HIGH, 0.2, HIGH))],
+}
 NONE = Tdoas(*(np.empty(0, kind) for kind in (float, int, int, float)))
 SETS = {
     "ranges": lambda flight: replace(flight, tdoa=NONE),
@@ -58,11 +70,19 @@ def run(args):
     for what in ("ranges", "both"):
         longer = [without_offset(SETS[what](flight), -OFFSET) for flight in flights]
         for estimate in ("filtered", "smoothed"):
-            for std in (0.0, OFFSET_STD):
+            for std in (0.0, FilterConfig().range_offset_std):
                 estimator = FlightEstimator(FilterConfig(range_offset_std=std), smoothed=estimate == "smoothed")
                 rows = [score_of(flight, estimator)[0].row() for flight in tqdm(longer, unit="flight", disable=None)]
                 errors, nees = (np.mean([row[name] for row in rows]) for name in ("rmse_3d", "nees_mean"))
                 print(f"| {what} | {estimate} | {std:g} m | {errors:.3f} m | {nees:.2f} |", flush=True)
+    print("\n| anchors, ranges alone | offset | range_offset_std | mean 3D RMSE | NEES |\n|---|---:|---:|---:|---:|")
+    for words, positions in WALLS.items():
+        flights = [SETS["ranges"](flown(FRESH + seed, positions=positions)) for seed in range(args.flights)]
+        for offset in (0.0, OFFSET):
+            for std in (0.0, FilterConfig().range_offset_std):
+                rows = [evaluate(without_offset(one, -offset), FilterConfig(range_offset_std=std))[0].row() for one in flights]
+                errors, nees = (np.mean([row[name] for row in rows]) for name in ("rmse_3d", "nees_mean"))
+                print(f"| {words} | {offset:g} m | {std:g} m | {errors:.3f} m | {nees:.2f} |", flush=True)
     print("\n| ranges beside TDOAs | mean 3D RMSE | largest over that without |\n|---|---:|---:|")
     flights = [flown(seed, persistent=True) for seed in range(args.flights)]
     without = np.array([rmse(flight.without("range")) for flight in flights])
@@ -82,9 +102,11 @@ def spoiled(flight: Flight, fault, seed: int) -> Flight:
     return replace(flight, range=fault(flight.range, np.random.default_rng(seed)))
 
 
-def flown(seed: int, persistent: bool = False) -> Flight:
-    """A simulated flight with both. persistent : its TDOAs have errors that persist, too."""
-    noise = dict(noise_std=STD, range_noise=STD, bias=persistent, multipath=persistent)
+def flown(seed: int, persistent: bool = False, positions: Sequence[tuple[float, float, float]] | None = None) -> Flight:
+    """A simulated flight with both. persistent : its TDOAs have errors that persist, too; positions : m, of anchors, or eight in corners."""
+    noise: dict[str, Any] = dict(noise_std=STD, range_noise=STD, bias=persistent, multipath=persistent)
+    if positions is not None:
+        noise["anchors"] = Anchors.from_positions(np.array(positions))
     return simulate(
         SimulationConfig(
             seed=seed, trajectory=PATHS[seed % len(PATHS)], duration=40.0, imu_rate=500.0, truth_rate=100.0, **noise

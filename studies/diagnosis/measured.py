@@ -8,10 +8,11 @@ from known_effects import RANGED, SIZES, effect_of
 import numpy as np
 
 from uwb_tdoa_bias.foundation.flight import AIDS
-from uwb_tdoa_tools.diagnosis import diagnose
+from uwb_tdoa_tools.diagnosis import diagnose, output
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.findings import usable
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
+from uwb_tdoa_tools.diagnosis.report.page import html
 from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.scoring.phases import NEAR_THE_FLOOR
 
@@ -97,9 +98,9 @@ def run(data, name, out, aids=()):
     result = diagnose(load(data, fit, aids), load(data, judge, aids))
     folder = out / folder_of(name)
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "report.html").write_text(result.as_html())
+    (folder / "report.html").write_text(html(result))
     result.effects.to_yaml(folder / "effects.yaml")
-    content = result.as_json()
+    content = output.as_json(result)
     (folder / "diagnosis.json").write_text(json.dumps(content, indent=1, allow_nan=False))
     sides = {side: [row["rmse_3d"] for row in content[side]["runs"]] for side in ("before", "after")}
     summary = {

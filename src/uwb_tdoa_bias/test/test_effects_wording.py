@@ -6,7 +6,7 @@ import pytest
 
 from uwb_tdoa_bias.effects import EFFECTS, LabelEffect
 from uwb_tdoa_bias.effects.covariates import OF_ARRIVAL, OF_IMU, OF_TDOA, UNITS
-from uwb_tdoa_bias.effects.wording import counted, listed, measured, significant
+from uwb_tdoa_bias.effects.wording import counted, listed, measured
 from uwb_tdoa_bias.foundation.anchors import Anchors
 
 ANCHORS = Anchors.from_positions([[0, 0, 0], [8, 0, 3], [0, 7, 0], [8, 7, 3]], ids=[0, 1, 3, 7])
@@ -40,7 +40,7 @@ def test_values_are_rounded_to_their_standard_deviation(value, std, text):
 
 def test_a_value_without_spread_comes_last():
     late = EFFECTS["anchor_delay"]({"0": 0.3, "1": 0.2, "3": 0.4}, {"0": 0.0, "1": 0.01})
-    assert list(significant(late)) == ["1", "0", "3"]
+    assert list(late.significant()) == ["1", "0", "3"]
 
 
 @given(st.floats(-100, 100), st.floats(1e-6, 10))
@@ -56,7 +56,7 @@ def test_lists():
 
 def test_significant_values_come_in_the_order_of_their_significance():
     effect = EFFECTS["anchor_delay"]({0: 0.1, 1: -0.3, 3: 0.02}, {0: 0.05, 1: 0.02, 3: 0.011})
-    assert list(significant(effect)) == ["1", "0"]
+    assert list(effect.significant()) == ["1", "0"]
 
 
 @pytest.mark.parametrize("effect", WITH_ADVICE)

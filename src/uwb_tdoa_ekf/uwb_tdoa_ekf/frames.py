@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.correction.poses import known_yaw_std
 from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.sensors.sensor import UNKNOWN_VARIANCE
 
@@ -81,6 +82,12 @@ def _rotation_std(q: np.ndarray, covariance: np.ndarray, out: np.ndarray) -> Non
                 for j in range(3):
                     variance += R[axis, i] * covariance[n, 6 + i, 6 + j] * R[axis, j]
             out[n, axis] = math.sqrt(variance)
+
+
+def poses_of(odometry: Odometry) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """What a Corrector takes of an Odometry, as bias_node gets it: (t (n,) s, p (n, 3) m, q (n, 4), v (n, 3) m/s, yaw_std
+    (n,) rad)."""
+    return odometry.t, odometry.p, odometry.q, odometry.v, known_yaw_std(rotation_std(odometry.q, odometry.covariance))
 
 
 def pose_and_twist(odometry: Odometry, rates: np.ndarray, rate_variances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -17,10 +17,11 @@ from .core.hypotheses import yaw_offset
 from .core.measurements import aid_rows, imu_rows, usable_tdoas
 from .core.memory import AID, RESIDUAL, TDOA, joined, structured
 from .core.verdicts import INVALID
+from .frames import poses_of
 from .installed import Installed
 from .pipeline import Pipeline, odometry_of
 from .reorder_buffer import FIRST_AID, IMU_STREAM, TDOA_STREAM, ReorderBuffer
-from .results import VERDICTS, Odometry, Residuals, poses_of
+from .results import VERDICTS, Odometry, Residuals
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

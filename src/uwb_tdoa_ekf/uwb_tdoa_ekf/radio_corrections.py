@@ -12,7 +12,8 @@ from uwb_tdoa_bias.effects.samples import RADIO
 
 from .core.aids import STREAMS
 from .core.memory import ODOMETRY, Measurements
-from .results import Odometry, poses_of
+from .frames import poses_of
+from .results import Odometry
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -9,9 +9,6 @@ from typing import TypeVar
 
 import numpy as np
 
-from uwb_tdoa_bias.correction.poses import known_yaw_std
-
-from .frames import rotation_std
 from .core.verdicts import COMPENSATED, INVALID, LATE, REJECTED, REPEATED, STARTUP, USED
 
 VERDICTS = {
@@ -73,12 +70,6 @@ class Odometry:
 
     def __len__(self) -> int:
         return len(self.t)
-
-
-def poses_of(odometry: Odometry) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """What a Corrector takes of an Odometry, as bias_node gets it: (t (n,) s, p (n, 3) m, q (n, 4), v (n, 3) m/s, yaw_std
-    (n,) rad)."""
-    return odometry.t, odometry.p, odometry.q, odometry.v, known_yaw_std(rotation_std(odometry.q, odometry.covariance))
 
 
 Arrays = TypeVar("Arrays", bound=Sized)  # a dataclass of arrays of one length: Odometry, Residuals, a stream of a Flight

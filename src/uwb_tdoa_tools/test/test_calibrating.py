@@ -68,14 +68,14 @@ def test_without_ground_truth_other_flights_get_better_and_none_is_read(flights)
 
 @pytest.mark.slow
 def test_ranges_of_another_tag_judge():
-    """Another tag has a delay of its own, which the filter finds: anchors are not to blame for that."""
+    """Another tag has a delay of its own, which the filter finds: anchors are not to blame for that, and nothing need be calibrated."""
     flown = dict(CLEAN, range_noise=0.1)
     ranged = [simulate(SimulationConfig(seed=seed, trajectory=path, **flown)) for seed, path in ((500, "sines"), (501, "circle"))]
     ranged = [
         without_offset(replace(flight, truth=None, tdoa=Tdoas(*np.empty((4, 0)))), -delay) for flight, delay in zip(ranged, (0.25, 0.4))
     ]
     made = without_truth(ranged[:1], ranged[1:])
-    assert made.why_not is None and made.after < 0.05 and made.before > 0.2
+    assert max(made.before, made.after) < 0.05 and made.why_not is not None
 
 
 @pytest.mark.slow

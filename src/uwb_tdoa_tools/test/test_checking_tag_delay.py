@@ -28,7 +28,7 @@ def longer(flight, by):
 @pytest.mark.parametrize("by", [0.25, -0.2])
 def test_what_all_ranges_are_wrong_by_is_told(ranged, by):
     (found,) = tag_delay(of_flight(longer(ranged, by)))
-    assert found.severity == "warning" and found.value == pytest.approx(by, abs=0.03)
+    assert found.severity == "note" and found.value == pytest.approx(by, abs=0.03)
     assert ("too long" if by > 0.0 else "too short") in found.cause
     report = check(of_flight(longer(ranged, by)))
     assert not report.faulty and "tag_delay" in {finding.rule for finding in report.findings}

@@ -9,7 +9,7 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands.diagnose import main
-from uwb_tdoa_tools.diagnosis import diagnose
+from uwb_tdoa_tools.diagnosis import diagnose, output
 from uwb_tdoa_tools.diagnosis.references import Nothing
 from known_effects import clean_flight, effect_of
 
@@ -89,8 +89,8 @@ def test_a_late_ground_truth_is_no_fault_of_the_robot(inertial):
     assert not {"tdoa_time_offset", "truth_frame"} & {effect.name for effect in result.effects}
     assert result.after["pooled"]["rmse_3d"] <= 1.05 * result.before["pooled"]["rmse_3d"]
     (said,) = result.of_truth[fitted.name]
-    assert ("gyroscope" in said) == inertial and said in result.as_text().replace("\n          ", " ")
-    assert list(result.as_json()["ground_truth"]) == [fitted.name]
+    assert ("gyroscope" in said) == inertial and said in output.as_text(result).replace("\n          ", " ")
+    assert list(output.as_json(result)["ground_truth"]) == [fitted.name]
 
 
 @pytest.mark.slow

@@ -3,10 +3,11 @@ from dataclasses import replace
 import pytest
 
 from uwb_tdoa_bias.effects import EffectSet, SmoothTerm
-from uwb_tdoa_tools.diagnosis import diagnose
+from uwb_tdoa_tools.diagnosis import diagnose, output
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.over_flights import ALL, ALONE, DIFFERS, GROWS, Share, course, in_words, shares
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
+from uwb_tdoa_tools.diagnosis.report.page import html
 from known_effects import clean_flight, effect_of
 
 
@@ -63,5 +64,5 @@ def test_what_came_in_one_flight_is_said_of_that_flight_and_not_applied():
     (finding,) = (finding for finding in result.findings if finding.flight)
     assert finding.flight == flights[1].name and not finding.added and result.effects == EffectSet()
     assert any(key.startswith("3.") for key in finding.effect.values)
-    assert f"belongs to {flights[1].name} alone" in result.as_text()
-    assert f"belongs to {flights[1].name} alone" in result.as_html()
+    assert f"belongs to {flights[1].name} alone" in output.as_text(result)
+    assert f"belongs to {flights[1].name} alone" in html(result)

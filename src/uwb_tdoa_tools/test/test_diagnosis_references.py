@@ -6,7 +6,7 @@ import pytest
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_bias.effects.truth_time_offset import TruthTimeOffset
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_tools.diagnosis import diagnose
+from uwb_tdoa_tools.diagnosis import diagnose, output
 from uwb_tdoa_tools.diagnosis.references import REFERENCES, GroundTruth, Heights, Marks, Nothing
 from uwb_tdoa_tools.scoring.evaluation import evaluate
 from known_effects import clean_flight, effect_of, marks_of
@@ -41,7 +41,7 @@ def test_without_truth_a_wrong_one_changes_nothing(flight):
         diagnose([with_wrong_truth(flight)], [with_wrong_truth(other)], reference=Nothing()),
         diagnose([replace(flight, truth=None)], [replace(other, truth=None)], reference=Nothing()),
     ]
-    contents = [case.as_json() for case in cases]
+    contents = [output.as_json(case) for case in cases]
     assert contents[0] == contents[1]
     assert contents[0]["after"]["pooled"]["rmse_3d"] is None
 
@@ -74,7 +74,7 @@ def test_marks_tell_which_anchor_is_late_without_the_truth():
     flight = effect_of("anchor_delay", True, 4).inject(clean_flight(100, 40.0))
     marks = marks_of(flight, 6, np.random.default_rng(0))
     found = [diagnose([each], reference=Marks(None, marks)) for each in (replace(flight, truth=None), with_wrong_truth(flight))]
-    assert found[0].as_json() == found[1].as_json() and found[0].as_json()["rests_on"].startswith("places measured")
+    assert output.as_json(found[0]) == output.as_json(found[1]) and output.as_json(found[0])["rests_on"].startswith("places measured")
     assert {"anchor_position", "anchor_delay"} == {effect.name for effect in found[0].effects.effects}
     assert found[0].effects.covariance.matrix.shape == (32, 32)
     after, before = (evaluate(flight, effects=effects)[0].row()["rmse_3d"] for effects in (found[0].effects, EffectSet()))

@@ -3,7 +3,7 @@
 import pytest
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
-from uwb_tdoa_tools.diagnosis import diagnose, repairing
+from uwb_tdoa_tools.diagnosis import diagnose, output, repairing
 from known_effects import clean_flight, effect_of
 
 IDS, SIGN = EFFECTS["anchor_ids"]({"1": 4, "4": 1}), EFFECTS["pair_sign"]({"2-3": -1.0, "5-6": -1.0})
@@ -61,5 +61,5 @@ def test_diagnose_offers_it_beside_physics_and_judges_both():
     worth = next(finding.worth for finding in result.findings if finding.effect.name == IDS.name)
     before, after = (figures["pooled"]["rmse_3d"] for figures in (result.before, result.after))
     assert worth > 2.0 * after and after < 0.3 * before  # without it three times the error is left
-    assert "anchor_ids" in result.as_text() and "ids_exchanged" in str(result.as_json()["numbers"])
+    assert "anchor_ids" in output.as_text(result) and "ids_exchanged" in str(output.as_json(result)["numbers"])
     assert repairing.repaired(flights[:1], result.effects) == {}

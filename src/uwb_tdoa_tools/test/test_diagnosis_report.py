@@ -11,7 +11,7 @@ from reports import Tags, delay, finding, judged, keys_of, said
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, SmoothTerm
 from uwb_tdoa_bias.effects.wording import measured
 from uwb_tdoa_tools.command_lines import applying
-from uwb_tdoa_tools.diagnosis import diagnose
+from uwb_tdoa_tools.diagnosis import diagnose, output
 from uwb_tdoa_tools.diagnosis.findings import EffectFinding, Refused
 from uwb_tdoa_tools.diagnosis.references import Heights, Nothing
 from uwb_tdoa_tools.diagnosis.regression.confounding import Alternative, Unobservable
@@ -47,7 +47,7 @@ def without_truth():
 
 @pytest.fixture(scope="module")
 def page(result):
-    return result.as_html()
+    return html(result)
 
 
 # ---------------------------------------------------------------------------------------------------------- verdict
@@ -75,7 +75,7 @@ def test_the_report_tells_every_phase_of_the_judged_flights(result, page):
     assert f"first 3 s {100 * before:.1f} cm (NEES " in sentence and f" to {100 * after:.1f} cm (NEES " in sentence
     text = said(page)
     assert "From the floor to the floor" in text and f"{100 * before:.1f} → {100 * after:.1f}; NEES" in text
-    flat = " ".join(result.as_text().split())
+    flat = " ".join(output.as_text(result).split())
     assert sentence in flat
 
 
@@ -250,7 +250,7 @@ def test_without_truth_ground_truth_would_tell(without_truth):
 def test_the_numbers_of_findings_are_those_of_effects_yaml(result, page, tmp_path):
     result.effects.to_yaml(tmp_path / "effects.yaml")
     written = {effect.name: effect for effect in EffectSet.from_yaml(tmp_path / "effects.yaml").effects}
-    content, screen, text = result.as_json(), " ".join(result.as_text().split()), said(page)
+    content, screen, text = output.as_json(result), " ".join(output.as_text(result).split()), said(page)
     added = [item for item in content["findings"] if item["added"]]
     assert {item["effect"] for item in added} == set(written) >= {"anchor_delay", "anchor_position"}
     for item in added:
@@ -264,7 +264,7 @@ def test_the_numbers_of_findings_are_those_of_effects_yaml(result, page, tmp_pat
 
 
 def test_all_outputs_say_the_same(result, page):
-    content, screen, text = result.as_json(), " ".join(result.as_text().split()), said(page)
+    content, screen, text = output.as_json(result), " ".join(output.as_text(result).split()), said(page)
     for sentence in content["verdict"]:
         assert sentence in screen and sentence in text
     for entry in entries(result):
@@ -288,7 +288,7 @@ def test_all_outputs_say_the_same(result, page):
 
 def test_findings_and_alternatives_in_json(result):
     doubtful = finding(delay(), alternatives=(AS_WELL, ELSEWHERE))
-    content = replace(result, findings=[doubtful]).as_json()
+    content = output.as_json(replace(result, findings=[doubtful]))
     (item,) = content["findings"]
     assert item["alternatives"][0] == {
         "effect": "anchor_position", "share": 1.0, "criterion_gap": 2.0, "tell_apart": "a flight on several sides",
@@ -301,7 +301,7 @@ def test_every_key_of_json_is_in_the_document(result, without_truth):
     text = (DOCS / "diagnosis.md").read_text()
     term = SmoothTerm({"c0": 0.1}, {}, knots=(0.0, 1.0))
     shown = replace(result, findings=[*result.findings, finding(term)], refused=[Refused("a", "b")])
-    keys = keys_of(shown.as_json()) | keys_of(without_truth.as_json())
+    keys = keys_of(output.as_json(shown)) | keys_of(output.as_json(without_truth))
     assert {key for key in keys if f"`{key}`" not in text} == set()
 
 
@@ -311,7 +311,7 @@ def test_every_key_of_json_is_in_the_document(result, without_truth):
 @pytest.fixture(scope="module")
 def all_pages(page, result, without_truth):
     none = judged(result, {"one": 0.1}, {"one": 0.1}, [0.0, 0.0], findings=[], effects=EffectSet())
-    return [page, none.as_html(), without_truth.as_html()]
+    return [page, html(none), html(without_truth)]
 
 
 def test_a_page_holds_everything_itself_and_is_light(all_pages):
@@ -324,7 +324,7 @@ def test_names_of_others_are_text(result):
     name = """</title><script>alert('"')</script>"""
     flights = tuple(replace(flight, name=name) for flight in result.flights)
     sides = [{**side, "runs": [{**run, "flight": name} for run in side["runs"]]} for side in (result.before, result.after)]
-    page = replace(result, flights=flights, before=sides[0], after=sides[1], applying=((name, name),)).as_html()
+    page = html(replace(result, flights=flights, before=sides[0], after=sides[1], applying=((name, name),)))
     assert "<script" not in page and Tags(page).open == []
     assert name in said(page)
     assert any(name in attributes["alt"] for tag, attributes, _ in Tags(page).seen if tag == "img")
@@ -396,7 +396,7 @@ def test_what_gains_less_than_half_a_centimetre_is_asked_of_nobody_unless_it_is_
         todo, _, rest = said(html(changed, "to_do")).partition("Seen too, not worth a visit")
         (sentence,) = effect.advice()
         assert (sentence in todo, sentence in rest) == (asked, not asked)
-        assert any(line.startswith("do ") for line in changed.as_text().splitlines()) == asked
+        assert any(line.startswith("do ") for line in output.as_text(changed).splitlines()) == asked
 
 
 def test_values_of_many_anchors_are_a_table(result):
@@ -420,7 +420,7 @@ def test_angles_are_in_degrees(result):
     changed = replace(result, findings=[finding(effect)], effects=EffectSet((effect,)))
     (entry,) = entries(changed)
     assert entry.values == "z = 4.3 ± 0.6 (degrees)"
-    assert "imu_misalignment z 4.3 0.6 degrees yes" in said(changed.as_html())
+    assert "imu_misalignment z 4.3 0.6 degrees yes" in said(html(changed))
 
 
 def test_labels_of_anchors_lie_on_nothing(result, monkeypatch):

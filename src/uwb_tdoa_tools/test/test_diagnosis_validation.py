@@ -10,7 +10,7 @@ from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, EffectSet, SmoothTerm, T
 from uwb_tdoa_bias.effects.samples import Track
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.offline import run_offline
-from uwb_tdoa_ekf.results import poses_of
+from uwb_tdoa_ekf.frames import poses_of
 from uwb_tdoa_tools.diagnosis import validation
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.comparison import Baseline, ValidationCase, _gain_interval, compare, score, why_not

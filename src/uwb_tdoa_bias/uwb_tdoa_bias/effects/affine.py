@@ -8,9 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from .base import Effect
-    from .samples import AidSamples, ImuSamples
+    from collections.abc import Callable, Sequence
 
 
 @dataclass(frozen=True)
@@ -36,15 +34,14 @@ class Affine:
 IDENTITY = Affine(np.eye(3), np.zeros(3))
 
 
-def regressors(effect: Effect, samples: ImuSamples | AidSamples, keys: Sequence[str]) -> np.ndarray:
-    """Derivative of what the `sensor_model` of an Effect makes of `samples.reading` (n, k) by the parameters `keys`:
+def regressors(
+    model: Callable[[dict[str, float]], Affine], values: dict[str, float], reading: np.ndarray, keys: Sequence[str]
+) -> np.ndarray:
+    """Derivative of what `model`, the Affine of parameters, makes at `values` of a `reading` (n, k), by the parameters `keys`:
     (n, k, len(keys)); numerical."""
-    step, out = 1e-6, np.empty((*samples.reading.shape, len(keys)))
+    step, out = 1e-6, np.empty((*reading.shape, len(keys)))
     for column, key in enumerate(keys):
-        here = effect.values.get(key, 0.0)
-        ends = [
-            type(effect)({**effect.values, key: here + s}).sensor_model(samples.channel)(samples.reading)
-            for s in (-step, step)
-        ]
+        here = values.get(key, 0.0)
+        ends = [model({**values, key: here + s})(reading) for s in (-step, step)]
         out[:, :, column] = (ends[1] - ends[0]) / (2.0 * step)
     return out

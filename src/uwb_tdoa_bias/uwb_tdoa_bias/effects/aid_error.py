@@ -36,7 +36,7 @@ class AidEffect(Effect):
         return self.aid() if channel in self.channels else IDENTITY
 
     def regressors(self, samples: AidSamples, keys: Sequence[str]) -> np.ndarray:
-        return regressors(self, samples, keys)
+        return regressors(lambda values: type(self)(values).sensor_model(samples.channel), self.values, samples.reading, keys)
 
     def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
         (stream,) = self.channels

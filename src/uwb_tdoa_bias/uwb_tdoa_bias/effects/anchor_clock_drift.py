@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from .base import AnchorEffect
-from .wording import counted, listed, significant, size
+from .wording import counted, listed
 
 if TYPE_CHECKING:
     import numpy as np
@@ -36,10 +36,10 @@ class AnchorClockDrift(AnchorEffect):
 
     def advice(self) -> tuple[str, ...]:
         drifts = [
-            f"anchor {key} by {size(self, key, 'm')} a second {'later' if value > 0.0 else 'earlier'}"
-            for key, value in significant(self).items()
+            f"anchor {key} by {self.size(key, 'm')} a second {'later' if value > 0.0 else 'earlier'}"
+            for key, value in self.significant().items()
         ]
         if not drifts:
             return ()
-        which = counted(sorted(significant(self), key=int), "anchor")
+        which = counted(sorted(self.significant(), key=int), "anchor")
         return (f"Let {which} warm up before flights, or check the clock: heard {listed(drifts)}.",)

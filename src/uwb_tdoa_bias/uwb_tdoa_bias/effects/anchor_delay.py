@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from .base import AnchorEffect
-from .wording import counted, listed, significant, size
+from .wording import counted, listed
 
 
 class AnchorDelay(AnchorEffect):
@@ -28,7 +28,7 @@ class AnchorDelay(AnchorEffect):
 
     def advice(self) -> tuple[str, ...]:
         late = {
-            key: f"{size(self, key)} {'late' if value > 0.0 else 'early'}" for key, value in significant(self).items()
+            key: f"{self.size(key)} {'late' if value > 0.0 else 'early'}" for key, value in self.significant().items()
         }
         if not late:
             return ()

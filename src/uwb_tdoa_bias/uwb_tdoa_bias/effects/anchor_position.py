@@ -11,7 +11,7 @@ from ..foundation.geometry import ranges
 from .base import Effect, check_anchor, known_anchors, once_per_anchors
 from .marks import Shift
 from .samples import RADIO, tile
-from .wording import counted, listed, significant, size
+from .wording import counted, listed
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -77,9 +77,9 @@ class AnchorPosition(Effect):
 
     def advice(self) -> tuple[str, ...]:
         shifts: dict[str, dict[str, str]] = {}
-        for key, value in significant(self).items():
+        for key, value in self.significant().items():
             anchor, axis = key.split(".")
-            shifts.setdefault(anchor, {})[axis] = f"{size(self, key)} towards {'+' if value > 0.0 else '-'}{axis}"
+            shifts.setdefault(anchor, {})[axis] = f"{self.size(key)} towards {'+' if value > 0.0 else '-'}{axis}"
         if not shifts:
             return ()
         moved = {anchor: listed(by[axis] for axis in sorted(by)) for anchor, by in shifts.items()}

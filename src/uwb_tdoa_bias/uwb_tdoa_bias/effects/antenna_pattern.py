@@ -10,7 +10,7 @@ from ..foundation.antenna import Antenna
 from ..foundation.radio import FLAT_MOUNT, into_frame
 from .base import ArrivalEffect
 from .samples import tile
-from .wording import listed, significant, size
+from .wording import listed
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -56,8 +56,8 @@ class AntennaPattern(ArrivalEffect):
 
     def advice(self) -> tuple[str, ...]:
         spans = [
-            f"{size(self, key)} {'later' if value > 0.0 else 'earlier'} in the nulls of the {key}'s antenna"
-            for key, value in significant(self).items()
+            f"{self.size(key)} {'later' if value > 0.0 else 'earlier'} in the nulls of the {key}'s antenna"
+            for key, value in self.significant().items()
         ]
         if not spans:
             return ()

@@ -8,7 +8,6 @@ import numpy as np
 
 from .aid_error import need_stream
 from .base import Effect
-from .wording import significant, size
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -44,10 +43,10 @@ class BarometerDrift(Effect):
         return flight.replaced(pressure=part.sensed(part.values + extra[:, None]))
 
     def advice(self) -> tuple[str, ...]:
-        if not significant(self):
+        if not self.significant():
             return ()
         way = "upwards" if self.values["rate"] > 0.0 else "downwards"
         return (
             f"Let the barometer warm up, and shield it from wind and light: it drifts {way} by "
-            f"{size(self, 'rate', 'm a minute', 60.0)}.",
+            f"{self.size('rate', 'm a minute', 60.0)}.",
         )

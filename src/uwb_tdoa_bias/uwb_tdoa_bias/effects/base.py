@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import wraps
+import math
 from typing import Any, ClassVar, TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -12,7 +13,7 @@ from ..foundation.errors import InputError
 from .affine import IDENTITY
 from .domain import checked
 from .samples import RADIO, Samples, true_samples
-from .wording import LARGEST, listed, measured, significant
+from .wording import LARGEST, listed, measured
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterable, Sequence
@@ -23,6 +24,8 @@ if TYPE_CHECKING:
     from .sensor_function import SensorFunction
 
 __all__ = ["ArrivalEffect", "Effect", "Samples"]
+
+SIGNIFICANT = 2.0  # standard deviations; a smaller value is not told by the data
 
 Made = TypeVar("Made")
 
@@ -184,11 +187,29 @@ class Effect:
     def advice(self) -> tuple[str, ...]:
         """What a person can do about it in the hall: imperative sentences, the most important first; () if nothing but
         taking it out of the measurements helps. They name `significant` values alone."""
-        largest = list(significant(self).items())[:LARGEST]
+        largest = list(self.significant().items())[:LARGEST]
         if not largest:
             return ()
         values = listed(f"{key} = {measured(value, self.std.get(key))}" for key, value in largest)
         return (f"Look for the cause of {self.name}: {self.physics} (found: {values}, in {self.unit}).",)
+
+    def significant(self) -> dict[str, float]:
+        """{parameter: value} of those values that the data tell, the largest first in standard deviations; values without a standard
+        deviation, or with none but 0, were set, not estimated, and come last."""
+        std = self.std
+        known = {key: value for key, value in self.values.items() if not abs(value) < SIGNIFICANT * std.get(key, 0.0)}
+        return dict(sorted(known.items(), key=lambda item: -abs(item[1]) / (std.get(item[0]) or math.inf)))
+
+    def size(self, key: str, unit: str | None = None, factor: float = 1.0) -> str:
+        """Magnitude of a parameter with its standard deviation, times `factor`, in `unit`."""
+        unit = self.unit if unit is None else unit
+        return measured(abs(self.values[key]) * factor, self.std.get(key, 0.0) * abs(factor), unit)
+
+    def directed(self, key: str, above: str, below: str, unit: str | None = None, factor: float = 1.0) -> str:
+        """The `size` of a significant parameter, and which way it is off: "12.0 ± 0.3 ms late"; "" if the data do not tell it."""
+        if key not in self.significant():
+            return ""
+        return f"{self.size(key, unit, factor)} {above if self.values[key] > 0.0 else below}"
 
     def on_floor(self, anchors: Anchors) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """What the filter is told of an effect that is `weighed`, as of `FloorMultipath.on_floor`."""

@@ -16,7 +16,7 @@ from ..foundation.version import written_by
 from .base import Effect
 from .catalogue import EFFECTS
 from .covariance import Covariance
-from .domain import LITTLE, faded, in_words
+from .fading import LITTLE, faded, in_words
 from .samples import RADIO
 from .smooth_term import SmoothTerm
 from .stream_corrector import STREAMS, StreamCorrector

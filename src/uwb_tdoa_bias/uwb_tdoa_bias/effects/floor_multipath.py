@@ -9,7 +9,7 @@ import numpy as np
 from ..foundation.errors import InputError
 from .base import ArrivalEffect, check_anchor, once_per_anchors
 from .samples import tile
-from .wording import counted, measured, significant
+from .wording import counted, measured
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Sequence
@@ -109,7 +109,7 @@ class FloorMultipath(ArrivalEffect):
         return np.sqrt(np.nan_to_num(np.maximum(power, 0.0)).reshape(2, -1).sum(axis=0))
 
     def advice(self) -> tuple[str, ...]:
-        late = {key: value for key, value in significant(self).items() if key.endswith(".delay")}
+        late = {key: value for key, value in self.significant().items() if key.endswith(".delay")}
         if not late:
             return ()
         most = max(late, key=late.__getitem__)

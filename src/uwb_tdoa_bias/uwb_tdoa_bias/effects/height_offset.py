@@ -6,7 +6,6 @@ import numpy as np
 
 from .affine import Affine
 from .aid_error import AidEffect
-from .wording import directed
 
 
 class HeightOffset(AidEffect):
@@ -29,5 +28,5 @@ class HeightOffset(AidEffect):
         return Affine(np.eye(1), np.array([self.values.get("offset", 0.0)]))
 
     def advice(self) -> tuple[str, ...]:
-        off = directed(self, "offset", "too long", "too short")
+        off = self.directed("offset", "too long", "too short")
         return (f"Check where the range finder is mounted, and its offset: it reads {off}.",) if off else ()

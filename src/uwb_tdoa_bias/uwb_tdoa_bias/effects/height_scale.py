@@ -6,7 +6,6 @@ import numpy as np
 
 from .affine import Affine
 from .aid_error import AidEffect
-from .wording import directed
 
 
 class HeightScale(AidEffect):
@@ -28,5 +27,5 @@ class HeightScale(AidEffect):
         return Affine((1.0 + self.values.get("scale", 0.0)) * np.eye(1), np.zeros(1))
 
     def advice(self) -> tuple[str, ...]:
-        off = directed(self, "scale", "too long", "too short", "%", 100.0)
+        off = self.directed("scale", "too long", "too short", "%", 100.0)
         return (f"Check the unit and the calibration of the range finder: it reads {off}.",) if off else ()

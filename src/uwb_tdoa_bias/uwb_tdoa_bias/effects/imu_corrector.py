@@ -8,7 +8,8 @@ import numpy as np
 
 from .affine import IDENTITY
 from .covariates import OF_IMU, ImuFeatures
-from .domain import LITTLE, in_words, share
+from .domain import share
+from .fading import LITTLE, in_words
 
 if TYPE_CHECKING:
     from collections.abc import Collection

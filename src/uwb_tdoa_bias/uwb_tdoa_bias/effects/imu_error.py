@@ -10,7 +10,7 @@ import numpy as np
 from ..foundation.errors import InputError
 from .affine import IDENTITY, regressors
 from .base import Effect
-from .wording import listed, significant, size
+from .wording import listed
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -43,7 +43,7 @@ class ImuEffect(Effect):
         return {"gyro": self.gyro, "accel": self.accel}.get(channel, lambda: IDENTITY)()
 
     def regressors(self, samples: ImuSamples, keys: Sequence[str]) -> np.ndarray:
-        return regressors(self, samples, keys)
+        return regressors(lambda values: type(self)(values).sensor_model(samples.channel), self.values, samples.reading, keys)
 
     def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
         imu = need_imu(self, flight)
@@ -54,8 +54,8 @@ def readings(effect: ImuEffect, along: str, unit: str | None = None, factor: flo
     """Significant values of an ImuEffect that adds to what a sensor reads: "0.20 ± 0.01 m/s^2 too much along x"; ""
     without any. along : "along" or "about" the axes."""
     parts = {
-        key: f"{size(effect, key, unit, factor)} too {'much' if value > 0.0 else 'little'} {along} {key}"
-        for key, value in significant(effect).items()
+        key: f"{effect.size(key, unit, factor)} too {'much' if value > 0.0 else 'little'} {along} {key}"
+        for key, value in effect.significant().items()
     }
     return listed(parts[key] for key in sorted(parts)) if parts else ""
 

@@ -12,7 +12,6 @@ from .base import need_truth
 from .affine import Affine
 from .imu_error import ImuEffect, need_imu
 from .samples import Track
-from .wording import directed
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -69,5 +68,5 @@ class ImuGravity(ImuEffect):
         return replace(flight, imu=replace(imu, accel=imu.accel + up))
 
     def advice(self) -> tuple[str, ...]:
-        off = directed(self, "excess", "too much", "too little")
+        off = self.directed("excess", "too much", "too little")
         return (f"Check the accelerometer's factor from g to m/s^2, and local gravity: it reads {off} upwards.",) if off else ()

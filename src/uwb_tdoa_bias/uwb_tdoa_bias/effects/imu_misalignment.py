@@ -7,7 +7,7 @@ import numpy as np
 from ..foundation.later import rotations
 from .affine import Affine
 from .imu_error import ImuEffect
-from .wording import listed, measured, significant
+from .wording import listed, measured
 
 
 class ImuMisalignment(ImuEffect):
@@ -40,7 +40,7 @@ class ImuMisalignment(ImuEffect):
     def advice(self) -> tuple[str, ...]:
         turns = {
             key: f"{measured(-np.degrees(value), np.degrees(self.std.get(key, 0.0)), 'degrees')} about {key}"
-            for key, value in significant(self).items()
+            for key, value in self.significant().items()
         }
         if not turns:
             return ()

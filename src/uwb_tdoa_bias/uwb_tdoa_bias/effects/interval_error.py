@@ -10,7 +10,7 @@ from ..foundation.errors import InputError
 from .aid_error import need_stream
 from .base import Effect, need_truth
 from .samples import Track, aid_samples
-from .wording import measured, significant
+from .wording import measured
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Sequence
@@ -84,7 +84,7 @@ class IntervalEffect(Effect):
     def told(self, unit: str, factor: float = 1.0) -> list[tuple[float, str, str]]:
         """[(signed size, its words, when, in words)] of those sizes that the data tell, the most certain first."""
         out = []
-        for key, value in significant(self).items():
+        for key, value in self.significant().items():
             if key in self.sizes:
                 number, std = key.partition(".")[0], self.std.get(key, 0.0)
                 start, end = (self.values.get(f"{number}.{limit}") for limit in LIMITS)

@@ -10,7 +10,7 @@ from ..foundation.errors import InputError
 from .base import ArrivalEffect, check_anchor
 from .samples import tile
 from .marks import Region
-from .wording import measured, significant
+from .wording import measured
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Sequence
@@ -109,7 +109,7 @@ class Nlos(ArrivalEffect):
 
     def _significant_delays(self) -> dict[str, float]:
         """{anchor: delay}, m."""
-        delays = {key: value for key, value in significant(self).items() if key.endswith(".delay")}
+        delays = {key: value for key, value in self.significant().items() if key.endswith(".delay")}
         return {key.partition(".")[0]: value for key, value in delays.items()}
 
     def _centre(self, anchor: str) -> np.ndarray:

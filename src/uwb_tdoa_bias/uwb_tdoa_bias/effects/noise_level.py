@@ -9,7 +9,7 @@ import numpy as np
 
 from .base import Effect
 from .pair_offset import PairOffset, check_pair
-from .wording import listed, significant, size
+from .wording import listed
 
 if TYPE_CHECKING:
     from ..foundation.flight import Flight
@@ -55,10 +55,10 @@ class NoiseLevel(Effect):
         return replace(flight, tdoa=replace(tdoa, d=tdoa.d + self.noise_std(samples) * rng.standard_normal(n)))
 
     def advice(self) -> tuple[str, ...]:
-        noisy = [f"those of {key} by {size(self, key)}" for key in significant(self)]
+        noisy = [f"those of {key} by {self.size(key)}" for key in self.significant()]
         if not noisy:
             return ()
-        links = listed(key.replace("-", " and ") for key in significant(self))
+        links = listed(key.replace("-", " and ") for key in self.significant())
         return (
             f"Check the antennas of anchors {links} and the sight between them: TDOAs scatter more, {listed(noisy)}.",
         )

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .base import Effect
-from .wording import significant, size
 
 if TYPE_CHECKING:
     from ..foundation.flight import Flight
@@ -38,7 +37,7 @@ class OutlierRate(Effect):
         return replace(flight, tdoa=replace(tdoa, d=tdoa.d + np.where(hit, size, 0.0)))
 
     def advice(self) -> tuple[str, ...]:
-        if not significant(self):
+        if not self.significant():
             return ()
-        share = size(self, "share", "%", 100.0)
+        share = self.size("share", "%", 100.0)
         return (f"Look for lost or mixed-up packets and for reflections: {share} of the TDOAs are plainly wrong.",)

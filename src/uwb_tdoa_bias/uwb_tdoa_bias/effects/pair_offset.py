@@ -8,7 +8,7 @@ import numpy as np
 
 from ..foundation.errors import InputError
 from .base import Effect
-from .wording import listed, significant, size
+from .wording import listed
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -63,12 +63,12 @@ class PairOffset(Effect):
 
     def advice(self) -> tuple[str, ...]:
         off = [
-            f"the TDOA of {key} is {size(self, key)} too {'large' if value > 0.0 else 'small'}"
-            for key, value in significant(self).items()
+            f"the TDOA of {key} is {self.size(key)} too {'large' if value > 0.0 else 'small'}"
+            for key, value in self.significant().items()
         ]
         if not off:
             return ()
-        links = listed(f"{key.replace('-', ' and ')}" for key in significant(self))
+        links = listed(f"{key.replace('-', ' and ')}" for key in self.significant())
         return (f"Let anchors {links} measure the time of flight between them again: {listed(off)}.",)
 
 

@@ -8,7 +8,6 @@ import numpy as np
 
 from .base import ArrivalEffect
 from .samples import tile
-from .wording import significant, size
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -40,8 +39,8 @@ class RangeBias(ArrivalEffect):
         return np.repeat(np.sum(to_anchor**2, axis=1)[:, None], len(keys), axis=1)
 
     def advice(self) -> tuple[str, ...]:
-        if not significant(self):
+        if not self.significant():
             return ()
         sign = "far" if self.values["quadratic"] > 0.0 else "near"
-        near, far = (f"{size(self, 'quadratic', 'm', r * r)} at {r:g} m" for r in EXAMPLES)
+        near, far = (f"{self.size('quadratic', 'm', r * r)} at {r:g} m" for r in EXAMPLES)
         return (f"Calibrate ranges over distance: an anchor seems too {sign} by {near} and by {far}.",)

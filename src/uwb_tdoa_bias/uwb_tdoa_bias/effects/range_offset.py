@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from .base import AnchorEffect
-from .wording import counted, listed, significant, size
+from .wording import counted, listed
 
 
 class RangeOffset(AnchorEffect):
@@ -22,9 +22,9 @@ class RangeOffset(AnchorEffect):
     witnesses = ("tdoa",)  # without TDOAs it is an anchor_delay
 
     def advice(self) -> tuple[str, ...]:
-        off = significant(self)
+        off = self.significant()
         if not off:
             return ()
-        each = listed(f"to anchor {key} {size(self, key)} too {'long' if value > 0.0 else 'short'}" for key, value in off.items())
+        each = listed(f"to anchor {key} {self.size(key)} too {'long' if value > 0.0 else 'short'}" for key, value in off.items())
         which = counted(sorted(off, key=int), "anchor")
         return (f"Calibrate the antenna delay of two-way ranging with {which}: ranges are {each}, and TDOAs are not.",)

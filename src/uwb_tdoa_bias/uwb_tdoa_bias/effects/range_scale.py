@@ -8,7 +8,6 @@ import numpy as np
 
 from .base import Effect
 from .samples import RADIO
-from .wording import directed
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -39,5 +38,5 @@ class RangeScale(Effect):
         return np.repeat(samples.true()[:, None], len(keys), axis=1)
 
     def advice(self) -> tuple[str, ...]:
-        off = directed(self, "scale", "too large", "too small", "%", 100.0)
+        off = self.directed("scale", "too large", "too small", "%", 100.0)
         return (f"Check how the tag turns ticks into metres: everything is {off}.",) if off else ()

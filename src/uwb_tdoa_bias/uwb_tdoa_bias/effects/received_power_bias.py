@@ -9,7 +9,7 @@ import numpy as np
 from ..foundation.radio import NOMINAL_GAIN, RadioLink, power_bias, received_power_dbm
 from .base import ArrivalEffect
 from .samples import tile
-from .wording import measured, significant
+from .wording import measured
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -53,7 +53,7 @@ class ReceivedPowerBias(ArrivalEffect):
         return np.repeat(late[:, None], len(keys), axis=1)
 
     def advice(self) -> tuple[str, ...]:
-        if not significant(self):
+        if not self.significant():
             return ()
         scale = measured(self.values["scale"], self.std.get("scale"))
         return (

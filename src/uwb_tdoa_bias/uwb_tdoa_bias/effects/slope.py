@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .domain import faded
+from .fading import faded
 from .motion import Motion
 
 if TYPE_CHECKING:

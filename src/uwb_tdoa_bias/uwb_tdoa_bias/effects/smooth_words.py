@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
 from .covariates import EXTRA, UNITS
 from .wording import listed, measured, rounded
-
-if TYPE_CHECKING:
-    from .smooth_term import SmoothTerm
 
 AXES = {"gyro": "the gyroscope reads {} about {}", "accel": "the accelerometer reads {} along {}"}
 SENSOR_UNITS = {"gyro": "rad/s", "accel": "m/s^2"}
@@ -49,7 +46,24 @@ _SENSOR_CAUSES = {
 }  # fmt: skip
 
 
-def described(term: SmoothTerm, part: str = "") -> str:
+class Function(Protocol):
+    """What words need of a SmoothTerm."""
+
+    channel: str
+    covariate: str
+    form: str
+    shape: str
+    knots: tuple[float, ...]
+    values: dict[str, float]
+    std: dict[str, float]
+
+    @property
+    def count(self) -> int: ...
+
+    def curve(self, values: np.ndarray, prefix: str = "") -> np.ndarray: ...
+
+
+def described(term: Function, part: str = "") -> str:
     """The function of an anchor "3", a pair "0-1" or of all, "", as a sentence without its end."""
     prefix = f"{part}." if part else ""
     name, unit = _named(term.covariate), UNITS.get(term.covariate, "")
@@ -80,7 +94,7 @@ def described(term: SmoothTerm, part: str = "") -> str:
     return _off(term, part, swing, None, f"{where}{seen}")
 
 
-def causes(term: SmoothTerm) -> tuple[str, str]:
+def causes(term: Function) -> tuple[str, str]:
     """(what could do such a thing, which trial tells)."""
     sensor = term.channel.partition(".")[0]
     if term.covariate.startswith(EXTRA):
@@ -93,7 +107,7 @@ def causes(term: SmoothTerm) -> tuple[str, str]:
     raise AssertionError
 
 
-def sentences(term: SmoothTerm) -> tuple[str, ...]:
+def sentences(term: Function) -> tuple[str, ...]:
     """What a person should look for: (sentence, ...)."""
     parts = list(dict.fromkeys(key.rpartition(".")[0] for key in term.values))
     if len(parts) > 3 or not parts:
@@ -119,7 +133,7 @@ def _kind(covariate: str) -> str:
     return "force" if covariate.startswith("accel") and covariate != "acceleration" else "motion"
 
 
-def _off(term: SmoothTerm, part: str, value: float, std: float | None, how: str) -> str:
+def _off(term: Function, part: str, value: float, std: float | None, how: str) -> str:
     sensor, _, axis = term.channel.partition(".")
     if sensor in SENSOR_UNITS:
         amount = f"{measured(abs(value), std, SENSOR_UNITS[sensor])} too {'much' if value > 0.0 else 'little'}"

@@ -9,7 +9,6 @@ import numpy as np
 
 from .aid_error import need_stream
 from .base import Effect
-from .wording import directed
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -39,7 +38,7 @@ class StampEffect(Effect):
         return shifted(flight, self.stream, self.stamp_offset(self.stream))
 
     def advice(self) -> tuple[str, ...]:
-        off = directed(self, "offset", "late", "early", "ms", 1e3)
+        off = self.directed("offset", "late", "early", "ms", 1e3)
         return (self.remedy.format(off),) if off else ()
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from ..foundation.geometry import rotate_each
 from .base import Effect
 from .samples import RADIO
-from .wording import listed, significant, size
+from .wording import listed
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -51,7 +51,7 @@ class TagLeverArm(Effect):
         return np.stack([np.sum(jacobian * _rotate(samples.q, axis), axis=1) for axis in axes], axis=1)
 
     def advice(self) -> tuple[str, ...]:
-        arm = {key: f"{size(self, key)} towards {'+' if v > 0.0 else '-'}{key}" for key, v in significant(self).items()}
+        arm = {key: f"{self.size(key)} towards {'+' if v > 0.0 else '-'}{key}" for key, v in self.significant().items()}
         if not arm:
             return ()
         parts = listed(arm[key] for key in sorted(arm))

@@ -10,7 +10,7 @@ from ..foundation.later import rotations
 from .base import Effect
 from .marks import Shift
 from .samples import RADIO
-from .wording import listed, measured, significant
+from .wording import listed, measured
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -70,7 +70,7 @@ class TruthFrame(Effect):
 
     def advice(self) -> tuple[str, ...]:
         parts = []
-        for key in (key for key in KEYS if key in significant(self)):
+        for key in (key for key in KEYS if key in self.significant()):
             factor, unit = (1.0, "m") if key in "xyz" else (DEGREES, "degrees")
             parts.append(f"{key} {measured(self.values[key] * factor, self.std.get(key, 0.0) * factor, unit)}")
         if not parts:

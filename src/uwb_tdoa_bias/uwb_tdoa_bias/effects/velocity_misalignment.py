@@ -7,7 +7,6 @@ import numpy as np
 
 from .affine import Affine
 from .aid_error import AidEffect
-from .wording import significant, size
 
 
 class VelocityMisalignment(AidEffect):
@@ -30,8 +29,8 @@ class VelocityMisalignment(AidEffect):
         return Affine(np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
 
     def advice(self) -> tuple[str, ...]:
-        if not significant(self):
+        if not self.significant():
             return ()
         way = "counterclockwise" if self.values["yaw"] > 0.0 else "clockwise"
-        angle = size(self, "yaw", "degrees", math.degrees(1.0))
+        angle = self.size("yaw", "degrees", math.degrees(1.0))
         return (f"Turn the velocity sensor, or its frame: seen from above it is turned {way} by {angle}.",)

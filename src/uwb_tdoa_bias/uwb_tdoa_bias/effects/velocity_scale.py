@@ -6,7 +6,6 @@ import numpy as np
 
 from .affine import Affine
 from .aid_error import AidEffect
-from .wording import directed
 
 
 class VelocityScale(AidEffect):
@@ -28,5 +27,5 @@ class VelocityScale(AidEffect):
         return Affine((1.0 + self.values.get("scale", 0.0)) * np.eye(3), np.zeros(3))
 
     def advice(self) -> tuple[str, ...]:
-        off = directed(self, "scale", "too fast", "too slow", "%", 100.0)
+        off = self.directed("scale", "too fast", "too slow", "%", 100.0)
         return (f"Calibrate the velocity over a known distance (radius of the wheels, focal length): it is {off}.",) if off else ()

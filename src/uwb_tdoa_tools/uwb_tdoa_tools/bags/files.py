@@ -17,7 +17,7 @@ from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.limits import READ_BYTES, most_unpacked
 
-from ..readers import is_bag
+from ..readers.kind import is_bag
 from ..readers.streams import SALVAGE
 from .integrity import NO_SUM, SUM_KEY, check as check_whole, is_packed, metadata, seal, unpack
 from .mcap import Damaged

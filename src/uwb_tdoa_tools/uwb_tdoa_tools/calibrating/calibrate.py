@@ -8,18 +8,15 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.offline import without_unknown_offset
 from uwb_tdoa_ekf.streams import ERROR
 
 from ..checking.ordered import OrderedRecording
 from ..checking.survey_fit import displacement
 from ..checking.tdoa_rules import survey_fit
-from ..diagnosis import diagnose
-from ..diagnosis.noise import parameters_of
+from ..diagnosis import diagnose, output
 from ..diagnosis.self_calibration import Tape, self_calibrate
 from ..diagnosis.self_calibration.equations import measured_noise, slow_innovations
 from ..diagnosis.self_calibration.solve import LEFT
@@ -89,12 +86,11 @@ def with_truth(
     std = measured_noise(found.flights, found.effects, config)
     calibration = Calibration(
         flights[0].anchors, found.effects, std, "3D RMSE", found.before["pooled"]["rmse_3d"], found.after["pooled"]["rmse_3d"],
-        found.judged_on, None, found.as_text(),
+        found.judged_on, None, output.as_text(found),
     )  # fmt: skip
     if holdout:
         progress("judging")
-        told = replace(config or FilterConfig(), **parameters_of(flights, std))
-        before, after = (_rmse(holdout, *side) for side in ((base, config), (found.effects, told)))
+        before, after = (_rmse(holdout, *side) for side in ((base, config), (found.effects, _with_noise(config, std))))
         calibration = replace(calibration, before=before, after=after, judged_on=_names(holdout))
     return _assessed(calibration, len(found.effects) > len(base))
 
@@ -114,10 +110,7 @@ def without_truth(
     found = self_calibrate(fitted, tape, base, config, (), said)
     progress("judging")
     before = slow_innovations(judges, base, config)
-    told = replace(config or FilterConfig(), **parameters_of(fitted, found.tdoa_std))  # of the delay of another tag, too
-    by = Corrector(found.anchors, found.effects)
-    judges = [without_unknown_offset(replace(one, anchors=found.anchors), told, by) for one in judges]
-    after = slow_innovations(judges, found.effects, config)
+    after = slow_innovations([replace(one, anchors=found.anchors) for one in judges], found.effects, config)
     if not holdout and found.why_not is None and after <= before:
         found = self_calibrate(flights, tape, base, config, (), said)  # what was judged, of all of it
     calibration = Calibration(
@@ -154,6 +147,13 @@ def _rmse(flights: Sequence[Flight], effects: EffectSet, config: FilterConfig | 
     """m, 3D RMSE of all Flights together, by an estimate with an EffectSet."""
     errors = [score_of(flight, FlightEstimator(config, effects))[0].error for flight in flights]
     return float(np.sqrt(np.mean(np.sum(np.concatenate(errors) ** 2, axis=1))))
+
+
+def _with_noise(config: FilterConfig | None, std: float | None) -> FilterConfig:
+    """FilterConfig with tdoa_std, m, unless that is None."""
+    config = config or FilterConfig()
+    changed: dict[str, Any] = {} if std is None else {"tdoa_std": round(std, 3)}
+    return replace(config, **changed)
 
 
 def _names(flights: Sequence[Flight]) -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.foundation.sensors import Ranges
-from uwb_tdoa_ekf.streams import WARNING, Finding
+from uwb_tdoa_ekf.streams import NOTE, Finding
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -22,12 +22,11 @@ AGREE = 0.8  # share of the windows that say the same sign
 SCALE = 0.2  # m, beyond which a range counts less
 DILUTION = 5.0  # most that an error of the ranges may become in what they have in common
 STEPS, DAMPING = 20, 1e-3
-TAG_DELAY_STD = 0.3  # m, of the antenna delay of a tag that nobody has calibrated
-REMEDY = f"calibrate it: survey, or diagnose where there is ground truth; until then let the filter find it: range_offset_std: {TAG_DELAY_STD}"
+REMEDY = "calibrate it: survey, or diagnose where there is ground truth; until then leave range_offset_std above 0.0: the filter finds it after each start"
 
 
 def tag_delay(recording: Recording) -> Iterator[Finding]:
-    """All ranges are wrong by about as much: the position is off by more than that where anchors are on one side, or at few heights."""
+    """All ranges are wrong by about as much: without `range_offset_std` the position is off by more than that where anchors are on one side."""
     ranges = recording.sensors.get("range")
     offsets = window_offsets(ranges, recording.anchors) if isinstance(ranges, Ranges) else np.empty(0)
     if len(offsets) < FEWEST_WINDOWS:
@@ -37,7 +36,7 @@ def tag_delay(recording: Recording) -> Iterator[Finding]:
         cause = f"all ranges are too {'long' if offset > 0.0 else 'short'} by about as much: the antenna delay of the tag"
         low, high = np.quantile(offsets, [0.25, 0.75])
         evidence = f"{offset:.2f} m in the median of {len(offsets)} windows of {WINDOW:g} s, {low:.2f} to {high:.2f} m in half of them"
-        yield Finding("tag_delay", WARNING, cause, evidence, REMEDY, offset)
+        yield Finding("tag_delay", NOTE, cause, evidence, REMEDY, offset)
 
 
 def window_offsets(ranges: Ranges, anchors: Anchors) -> np.ndarray:

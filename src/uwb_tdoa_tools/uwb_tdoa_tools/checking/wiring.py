@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import product
 from typing import TYPE_CHECKING
 
@@ -12,29 +11,8 @@ from uwb_tdoa_ekf.streams import ERROR, WARNING, Finding
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+    from .ends import End
     from .recording import Recording
-
-
-@dataclass(frozen=True)
-class End:
-    """A publisher or a subscription. topic, node : absolute names; kind : type of its messages; reliable, latched : its
-    QoS, best effort and volatile otherwise."""
-
-    topic: str
-    node: str
-    kind: str
-    publishes: bool
-    reliable: bool
-    latched: bool
-
-    @property
-    def qos(self) -> str:
-        """In words."""
-        return f"{'reliable' if self.reliable else 'best effort'}, {'transient local' if self.latched else 'volatile'}"
-
-    def gets(self, publisher: End) -> bool:
-        """Whether a subscription gets what a publisher of its topic sends (DDS: it may not ask for more than is offered)."""
-        return publisher.reliable >= self.reliable and publisher.latched >= self.latched
 
 
 def _by_topic(recording: Recording) -> Iterator[tuple[str, list[End], list[End]]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
@@ -14,7 +14,7 @@ from ..calibrating.quick import prospect
 from ..checking import report
 from ..checking.check import check, different_surveys
 from ..checking.recording import read_recording
-from ..diagnosis.noise import parameters_of, write_parameters
+from ..diagnosis.noise import write_parameters
 from ..progress import Progress
 
 if TYPE_CHECKING:
@@ -91,9 +91,7 @@ def _calibrate(args: Namespace) -> int:
     out.mkdir(parents=True, exist_ok=True)
     cli.write_json(out / "calibration.json", {"flights": [flight.name for flight in flights], **made.as_dict()})
     judges = args.holdout or [path for path, _ in found[-1:]]
-    if made.why_not is not None:
-        return _stop(made.why_not)
-    return _write(made, out, parameters_of(flights, made.tdoa_std), judges, all(known))
+    return _stop(made.why_not) if made.why_not is not None else _write(made, out, judges, all(known))
 
 
 def _checked(reading: Reading, recordings: Sequence[Recording], std: float) -> bool:
@@ -117,11 +115,11 @@ def _stop(why: str) -> int:
     return 1
 
 
-def _write(made: Calibration, out: Path, parameters: dict[str, Any], recordings: Sequence[str | Path], truth: bool) -> int:
+def _write(made: Calibration, out: Path, recordings: Sequence[str | Path], truth: bool) -> int:
     files = anchors, effects, config = out / "anchors.yaml", out / "effects.yaml", out / "ekf_node.yaml"
     made.anchors.to_yaml(anchors)
     made.effects.to_yaml(effects)
-    write_parameters(config, parameters)
+    write_parameters(config, made.tdoa_std)
     survey, corrected, tuned = (file if file.exists() else None for file in files)
     cli.show(f"wrote {', '.join(file.name for file in files if file.exists())} and calibration.json to {out}")
     cli.show(f"judge it:   {command_lines.judging(recordings, survey, corrected, tuned, truth)}")

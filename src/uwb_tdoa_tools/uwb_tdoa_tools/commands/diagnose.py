@@ -12,8 +12,8 @@ from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, command_lines, options, parallel
 from ..checking.remarks import remarks_on
-from ..diagnosis import diagnose
-from ..diagnosis.noise import parameters_of, write_parameters
+from ..diagnosis import diagnose, output
+from ..diagnosis.noise import write_parameters
 from ..diagnosis.references import REFERENCES
 from ..diagnosis.self_calibration.equations import measured_noise
 from ..localizing.rerun_file import write_diagnosis
@@ -110,21 +110,22 @@ def _diagnose(args: Namespace) -> None:
         tdoa_std = None  # of no TDOAs
         if all(len(flight.tdoa) for flight in result.flights):
             tdoa_std = measured_noise(result.flights, result.effects, config, over, partial(cli.say, "diagnose"))
+    from ..diagnosis.report.page import html  # here, because drawing takes a second to import
+
     out.mkdir(parents=True, exist_ok=True)
     (_, its_survey), *_ = found
-    parameters = parameters_of(result.flights, tdoa_std)
     truth = all(flight.truth is not None for flight in holdout or flights)
     judged_on = args.holdout or args.flights
-    applying = command_lines.applying(out, judged_on, args.survey, its_survey, bool(parameters), truth)
+    applying = command_lines.applying(out, judged_on, args.survey, its_survey, tdoa_std is not None, truth)
     result = replace(result, applying=applying)
-    cli.write_json(out / "diagnosis.json", result.as_json())
+    cli.write_json(out / "diagnosis.json", output.as_json(result))
     result.effects.to_yaml(out / "effects.yaml")
-    (out / "report.html").write_text(result.as_html())
-    write_parameters(out / "ekf_node.yaml", parameters)
+    (out / "report.html").write_text(html(result))
+    write_parameters(out / "ekf_node.yaml", tdoa_std)
     if rerun is not None:
         write_diagnosis(rerun, result, effects or EffectSet(), config)
-    cli.show(result.as_text())
-    cli.show(f"wrote diagnosis.json, effects.yaml, {'ekf_node.yaml ' if parameters else ''}and report.html to {out}")
+    cli.show(output.as_text(result))
+    cli.show(f"wrote diagnosis.json, effects.yaml, {'ekf_node.yaml ' if tdoa_std is not None else ''}and report.html to {out}")
 
 
 main = cli.executable(_diagnose, parser)

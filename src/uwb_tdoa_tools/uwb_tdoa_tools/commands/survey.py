@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from uwb_tdoa_bias.effects import EffectSet
 
 from .. import cli, command_lines, options
-from ..diagnosis.noise import parameters_of, write_parameters
+from ..diagnosis.noise import write_parameters
 from ..diagnosis.self_calibration import self_calibrate
 from ..progress import Progress
 from ..surveying.blocked import with_blocked
@@ -27,8 +27,8 @@ With the anchors.yaml and effects.yaml (--effects) of last week it starts from w
 since, and makes the rest better.
 
 Writes anchors.yaml and anchors.csv (for --survey, anchors_file and the rest), effects.yaml (delays of the
-anchors, and how well all is known), ekf_node.yaml (noise of TDOAs that the filter should assume with them; of ranges, that the
-tag may have a delay of its own), survey.json (covariance) and survey.png (before and after) to --out.
+anchors, and how well all is known), ekf_node.yaml (noise of TDOAs that the filter should assume with them), survey.json
+(covariance) and survey.png (before and after) to --out.
 
 Exit code: 0 done; 1 something else is wrong and other anchors might do harm: they stay as given; 2 bad input."""
 
@@ -68,7 +68,7 @@ def _survey(args: Namespace) -> int:
     rows = (f"{i},{x:.4f},{y:.4f},{z:.4f}" for i, (x, y, z) in zip(anchors.ids, anchors.positions))
     (out / "anchors.csv").write_text("\n".join(["id,x,y,z", *rows, ""]))
     result.effects.to_yaml(out / "effects.yaml")
-    config_file = write_parameters(out / "ekf_node.yaml", parameters_of(flights, result.tdoa_std))
+    config_file = write_parameters(out / "ekf_node.yaml", result.tdoa_std)
     cli.write_json(out / "survey.json", as_dict(result))
     picture(result, out / "survey.png")
     cli.show(as_text(result))

@@ -8,6 +8,7 @@ kind of measurement, with its residual; an *effect* (uwb_tdoa_bias.effects) is w
 searches for an effect that no regression finds. The rest knows none of them by name.
 """
 
-from .diagnose import Diagnosis, diagnose
+from .diagnose import diagnose
+from .result import Diagnosis
 
 __all__ = ["Diagnosis", "diagnose"]

@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     from ..parallel import MapFunction
     from .channels.views import CovariateView
     from .detectors import Detection, Detector
-    from .validation import ValidatedSelection
     from .references import Reference
     from .regression.fit import Fit
     from .regression.table import RegressionTable
@@ -88,10 +87,6 @@ class Attribution:
             return None
         places = [self.selection.fit.columns.index(column) for column in columns]
         return to_keep(tuple((str(column.effect[0]), column.key) for column in columns), self.selection.fit.cov[np.ix_(places, places)])
-
-    def of(self, validated: ValidatedSelection) -> Attribution:
-        """The Attribution of a ValidatedSelection."""
-        return replace(self, selection=with_deviations(validated.selection), detections=validated.detections, alone=())
 
     def findings(self) -> list[EffectFinding]:
         """[EffectFinding], those by regression first, those of one flight alone last."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple, TYPE_CHECKING
 
@@ -15,13 +15,13 @@ from uwb_tdoa_ekf.offline import may_have_offset
 
 from ..checking.numbers import numbers
 from ..scoring.metrics import Score
-from . import comparison, output, repairing, validation
+from . import comparison, repairing, validation
 from .attribution import Attribution, attribute, residuals_of
 from .findings import EffectFinding, Refused, usable
 from .health import health
-from .noise import with_offset
 from .references import GroundTruth, Reference
 from .regression.confounding import unobservable
+from .result import Diagnosis
 from .self_calibration import Tape, self_calibrate
 from .self_calibration.prior import OF_ANCHORS, with_calibration
 from .self_calibration.solve import same_anchors
@@ -29,12 +29,8 @@ from .self_calibration.solve import same_anchors
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from uwb_tdoa_bias.foundation.flight import Flight
-    from uwb_tdoa_ekf.streams.finding import Finding as NumbersFinding
     from ..parallel import MapFunction
-    from .channels import ChannelResiduals
-    from .channels.base import Figures
     from .detectors import Detection
-    from .regression.confounding import Unobservable
     from .regression.terms import Candidate
     from .self_calibration import SelfCalibration
 
@@ -42,51 +38,6 @@ if TYPE_CHECKING:
 
 EXPLAINED = 0.1  # share of the slow innovations that a self-calibration must explain, to be a finding
 NOT_TOLD = "without ground truth nobody can tell whether taking it out helps the position"
-
-
-@dataclass(frozen=True, eq=False)
-class Diagnosis:
-    """What was found in some flights, and what it is worth.
-
-    flights : (Flight, ...), as the reference leaves them; reference : Reference; findings : [EffectFinding]; effects :
-    EffectSet, the base and what is added; refused : [Refused]; unobservable : [Unobservable]; before, after : dicts of
-    `comparison.compare`; judged_on : sentence; health : dict; attribution : Attribution; remaining : [{channel:
-    ChannelResidual}] under `effects`; numbers : {name of a flight: [Finding of checking]}, what is wrong with its numbers; changes :
-    sentences, what is not as in the last calibration;
-    applying : ((command line, what it does), ...), how the effects are put to use;
-    of_truth : {name of a flight: sentences}, what was wrong with the clock or the frame of its ground truth.
-    """
-
-    flights: tuple[Flight, ...]
-    reference: Reference
-    findings: list[EffectFinding]
-    effects: EffectSet
-    refused: list[Refused]
-    unobservable: list[Unobservable]
-    before: dict[str, Any]
-    after: dict[str, Any]
-    judged_on: str
-    health: Figures
-    attribution: Attribution
-    remaining: list[ChannelResiduals]
-    numbers: dict[str, list[NumbersFinding]]
-    changes: tuple[str, ...] = ()
-    applying: tuple[tuple[str, str], ...] = ()
-    of_truth: dict[str, tuple[str, ...]] = field(default_factory=dict)
-
-    def as_json(self) -> dict[str, Any]:
-        """What diagnosis.json holds."""
-        return output.as_json(self)
-
-    def as_text(self) -> str:
-        """A few lines for the screen."""
-        return output.as_text(self)
-
-    def as_html(self) -> str:
-        """One self-contained page."""
-        from .report.page import html  # here, because drawing takes a second to import
-
-        return html(self)
 
 
 def diagnose(
@@ -189,7 +140,7 @@ def _by_error(
     # A finding stays one even if the filter does without it; it is only not added.
     selected = validation.select_by_error(found, sound, comparison.Baseline(rest, config), trying, map_function)
     attribution, selected = repairing.before_others(found, selected, repairs)
-    model = attribution.of(selected)
+    model = selected.applied(attribution)
     effects, baseline = with_calibration(base, usable(model.effects).effects, model.covariance), comparison.Baseline(base, config)
     work.progress("judging")
     cases, judged_on = validation.validation_cases(model, fitted, held_out, base, effects)
@@ -200,7 +151,7 @@ def _by_error(
     if why_not and len(effects) > len(base) + len(attribution.of_floor):  # of those it tells nothing
         refused.append(Refused("all", why_not))
         selected = validation.ValidatedSelection(attribution.selection.only(()), (), (), selected.worth)
-        model, after = attribution.of(selected), before
+        model, after = selected.applied(attribution), before
         effects = with_calibration(base, attribution.of_floor, None)
     findings = _findings(model.findings(), attribution.findings(), attribution.detections, selected.worth)
     return _Outcome(findings, effects, refused, (before, after), judged_on, attribution, baseline)
@@ -217,8 +168,8 @@ def _by_self_calibration(work: _Work, found: Attribution, flights: tuple[Flights
     refused: list[Refused] = []
     changes: tuple[str, ...] = ()
     chosen, others = found.selection.chosen, found.findings()
-    looking = with_offset(work.config or FilterConfig())
-    ranged = any(may_have_offset(flight, looking) for flight in sound)  # then the delay of the tag was taken out of the innovations
+    config = work.config or FilterConfig()
+    ranged = any(may_have_offset(flight, config) for flight in sound)  # then the delay of the tag was taken out of the innovations
     if chosen or ranged or rest.covariance is not None or work.reference.constraints:
         calibration = _calibrated(work, sound, rest)
         if isinstance(calibration, str):

@@ -17,7 +17,7 @@ from .report.unclear import by_remedy, untold
 from .report.verdict import faults_in_words, truth_in_words, verdict
 
 if TYPE_CHECKING:
-    from .diagnose import Diagnosis
+    from .result import Diagnosis
     from .findings import EffectFinding
     from uwb_tdoa_bias.effects import SmoothTerm
 

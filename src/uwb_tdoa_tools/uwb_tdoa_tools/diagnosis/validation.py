@@ -13,10 +13,11 @@ from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.correction.rehearsal import RehearsedCorrector
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf.offline import run_offline
-from uwb_tdoa_ekf.results import poses_of
+from uwb_tdoa_ekf.frames import poses_of
 
 from ..scoring.by_phase import EVERYTHING
 from .comparison import Baseline, ValidationCase, score
+from .deviations import with_deviations
 from .findings import Refused, usable
 from .refinement import effects_of, recurs
 from .regression.fit import refit
@@ -57,6 +58,10 @@ class ValidatedSelection:
     detections: tuple[Detection, ...]
     refused: tuple[Refused, ...]
     worth: dict[Candidate | Detection, float]
+
+    def applied(self, attribution: Attribution) -> Attribution:
+        """The Attribution with what was selected alone."""
+        return replace(attribution, selection=with_deviations(self.selection), detections=self.detections, alone=())
 
 
 def cross_fitted(

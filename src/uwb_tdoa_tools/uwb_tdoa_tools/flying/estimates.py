@@ -10,7 +10,8 @@ import numpy as np
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet, StreamCorrector
 from uwb_tdoa_ekf.estimator import Estimator
-from uwb_tdoa_ekf.results import Odometry, concatenated, poses_of
+from uwb_tdoa_ekf.frames import poses_of
+from uwb_tdoa_ekf.results import Odometry, concatenated
 
 from ..benchmark.peer import Peer, events
 

@@ -29,6 +29,7 @@ GAP = 1.0  # s without an estimate, as long as which the tag is lost
 LONG = 0.05  # share of the time that the tag may be lost in an estimate that is good
 FEW = 0.9  # share of TDOAs that are explained, below which an estimate is not good
 TALL = 1.5  # times the deviations of x and y, beyond which the height is what is known worst
+OFFSET = 0.03  # m, of all ranges, from which on it is said: what the filter finds of ranges that have none is up to some 2 cm
 LASTING = 0.5  # share of the variance that errors which last make, above which a calibration is what helps
 
 
@@ -52,7 +53,7 @@ class Belief:
         within = f"standard deviation {100 * told['std']:.0f} cm ({spread}): the position is within {100 * told['within']:.0f} cm for 95 % of the time"
         fits = f"{told['explained']:.1%} of {_counted(told)} fit it within three standard deviations (NIS {told['nis']:.2f}, 1 or less is sound)"
         off = told.get("range_offset")
-        offset = [] if off is None else [f"all ranges are {100 * abs(off):.0f} cm too {'long' if off > 0.0 else 'short'}: that was found, and taken out"]
+        offset = [] if off is None or abs(off) < OFFSET else [f"all ranges are {100 * abs(off):.0f} cm too {'long' if off > 0.0 else 'short'}: that was found, and taken out"]
         return [f"{self.level}: {within}; {fits}", *offset, *self.reasons, *self.remedies]
 
 

@@ -15,6 +15,7 @@ from uwb_tdoa_bias.foundation.flight import Flight, Truth
 from uwb_tdoa_ekf.results import Residuals
 
 from ..bags.bag import read_bag, read_fields, read_odometry
+from ..diagnosis.output import as_text
 from ..scoring.metrics import position_at
 from .estimate import FlightEstimator
 from .pictures import SIGMAS
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_ekf.core.config import FilterConfig
     from uwb_tdoa_ekf.results import Odometry
     from ..bags.bag import RecordedOdometry
-    from ..diagnosis.diagnose import Diagnosis
+    from ..diagnosis.result import Diagnosis
 
 HELP = "write a recording for the viewer Rerun, too (.rrd; of one flight; needs pip install rerun-sdk)"
 RATE = 20.0  # Hz, of poses that are written
@@ -84,7 +85,7 @@ def write_diagnosis(path: Path, result: Diagnosis, base: EffectSet, config: Filt
     (flight,) = result.flights
     before, after = (FlightEstimator(config, effects)(flight) for effects in (base, result.effects))
     truth = flight.truth if result.reference.tells_errors else None
-    write_rerun(path, flight, after.odometry, after.residuals, result.as_text().splitlines(), truth, before.odometry)
+    write_rerun(path, flight, after.odometry, after.residuals, as_text(result).splitlines(), truth, before.odometry)
 
 
 def write_recorded(path: Path, bag: str) -> None:

@@ -16,7 +16,7 @@ from ..checking.sides import sides_of, to_copy
 from ..scoring.plots import plt
 from ..simulation.walls import heard_at
 from .bifurcation import Subsets
-from .layout import with_one
+from .optimisation import with_one
 from .maps import Chart
 from .precision import bound, dilution, information, position_error
 from .report import quantiles

@@ -14,7 +14,7 @@ from .. import cli
 from ..progress import Progress
 from ..readers.inputs import Reading
 from ..simulation.walls import Walls
-from . import accuracy, hall, layout, messages, options, plots, report
+from . import accuracy, hall, messages, optimisation, options, plots, report
 from .check import brute_force
 from .maps import Grid, chart, flyable
 
@@ -140,7 +140,7 @@ def addition(
     before, best = flyable(installed(anchors), points, criterion)[2].mean(), (0.0, None)
     for position in np.unique(places.positions(places.grid(TRIED)).round(2), axis=0):
         try:
-            more = installed(layout.with_one(anchors, position))
+            more = installed(optimisation.with_one(anchors, position))
         except InputError:  # where there is one already
             continue
         best = max(best, (flyable(more, points, criterion)[2].mean() - before, position.tolist()), key=lambda one: one[0])
@@ -160,20 +160,20 @@ def improve(before: Chart, aim: options.Aim, how: str, starts: int, criterion: s
     with Progress("plan") as progress:
         search: dict[str, Any] = {"starts": starts, "progress": partial(progress.over, what="layouts")}
         if how == "add":
-            candidates = layout.one_more(goal, anchors, places)
+            candidates = optimisation.one_more(goal, anchors, places)
             start: np.ndarray | None = candidates[0][[np.argmin(candidates[1])]]
-            better = layout.optimise(goal, places, 1, anchors, start, **search)
+            better = optimisation.optimise(goal, places, 1, anchors, start, **search)
         else:
             start = anchors.positions if aim.count == len(anchors) else None
-            better = layout.named(layout.optimise(goal, places, aim.count, None, start, **search), anchors)
-        better = layout.rounded(better, anchors)
+            better = optimisation.named(optimisation.optimise(goal, places, aim.count, None, start, **search), anchors)
+        better = optimisation.rounded(better, anchors)
         better.to_yaml(out / "improved.yaml")
         after = goal.installed(better)
         charted = chart(after, before.grid, criterion)
         charts = [("before, ", installation, before), ("after, ", after, charted)]
-    plots.plot_layouts(charts, out / "layout.png", candidates)
+    plots.plot_layouts(charts, out / "optimisation.png", candidates)
     judged = {
         when: {"flyable_share": float(one.flyable.mean()), **aim.reported.figures(those)}
         for when, one, those in (("before", before, anchors), ("after", charted, better))
     }
-    return {"points": len(aim.reported.points), **judged, "placed": layout.placed(better, anchors)}
+    return {"points": len(aim.reported.points), **judged, "placed": optimisation.placed(better, anchors)}

@@ -18,7 +18,7 @@ from .imu import NO_IMU_ERRORS, ImuErrors
 from .trajectories import Trajectory
 
 if TYPE_CHECKING:
-    from .trajectories import Flyable
+    from .motion import Flyable
 
 __all__ = ["NO_IMU_ERRORS", "ImuErrors", "SimulationConfig", "simulate"]
 

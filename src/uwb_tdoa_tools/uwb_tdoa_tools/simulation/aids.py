@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.sensors import Stream
     from .config import SimulationConfig
     from .room import Room
-    from .trajectories import Flyable
+    from .motion import Flyable
 
 
 def measure(config: SimulationConfig, room: Room, trajectory: Flyable) -> dict[str, Stream]:

@@ -15,7 +15,6 @@ from .constellations import constellation
 from .imu import ImuErrors
 from .room import room_of
 from .schedule import PROTOCOLS
-from .trajectories import TRAJECTORIES
 from .walls import Walls
 
 if TYPE_CHECKING:
@@ -116,7 +115,7 @@ class SimulationConfig(_Noises):
     outlier_probability: float = 0.01
 
     def __post_init__(self) -> None:
-        for name, choices in (("trajectory", TRAJECTORIES), ("yaw", YAW_PROFILES), ("protocol", PROTOCOLS)):
+        for name, choices in (("yaw", YAW_PROFILES), ("protocol", PROTOCOLS)):
             if getattr(self, name) not in choices:
                 raise InputError(f"{name}: {getattr(self, name)!r} is not known; choose {', '.join(choices)}.")
         for name in ("seed", "tag_unit"):

@@ -12,7 +12,7 @@ from uwb_tdoa_bias.foundation.flight import Imu
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from .trajectories import Flyable
+    from .motion import Flyable
 
 
 @dataclass(frozen=True)

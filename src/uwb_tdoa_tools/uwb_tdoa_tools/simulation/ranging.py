@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from .config import SimulationConfig
     from .room import Room
     from .schedule import Schedule
-    from .trajectories import Flyable
+    from .motion import Flyable
 
 UNIT_GAIN_SPREAD = 0.7  # dB, tag to tag
 UNIT_MOUNT_SPREAD = np.deg2rad(2.0)  # rad, tag to tag

@@ -6,8 +6,7 @@ up, slowing down and landing, and fits one spline through it all, whose derivati
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Protocol, TYPE_CHECKING
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.polynomial import Polynomial
@@ -16,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
+from .motion import ExactMotion
 from .room import REST_HEIGHT
 
 if TYPE_CHECKING:
@@ -125,32 +125,6 @@ TRAJECTORIES = {
 }
 
 
-@dataclass(frozen=True)
-class ExactMotion:
-    """Exact motion at n instants, body frame x forward, y left, z up in a z-up world.
-
-    p, v, a : (n, 3) m, m/s, m/s^2, world; q : (n, 4) x y z w, body to world; body_rates : (n, 3) rad/s, body;
-    specific_force : (n, 3) m/s^2, body.
-    """
-
-    p: np.ndarray
-    v: np.ndarray
-    a: np.ndarray
-    q: np.ndarray
-    body_rates: np.ndarray
-    specific_force: np.ndarray
-
-
-class Flyable(Protocol):
-    """What `simulate` flies."""
-
-    def motion(self, t: np.ndarray) -> ExactMotion:
-        """The ExactMotion at stamps t, (n,) s."""
-
-    def motors(self, t: np.ndarray) -> np.ndarray:
-        """Whether the motors turn at stamps t: (n,) bool."""
-
-
 class Trajectory:
     """One flight over 0 ... config.duration: position and yaw as splines, attitude and rates from them.
 
@@ -161,6 +135,8 @@ class Trajectory:
 
     def __init__(self, config: SimulationConfig, room: Room, rng: np.random.Generator) -> None:
         assert config.height is not None  # complete
+        if config.trajectory not in TRAJECTORIES:
+            raise InputError(f"trajectory: {config.trajectory!r} is not known; choose {', '.join(TRAJECTORIES)}.")
         self.take_off = self.landing = None
         start, end, clamp = 0.0, config.duration, None
         if not config.start_in_air:

@@ -88,5 +88,5 @@ def find(flights: Sequence[Flight], progress: Callable[[], object] = lambda: Non
     kinds = PORTABLE if len(constellations(flights)) > 1 else None
     attribution = attribute(flights, reference, kinds=kinds, undeclared=False, progress=progress)
     validated = select_by_error(attribution, flights, Baseline(EffectSet()), progress)
-    model = attribution.of(validated)
+    model = validated.applied(attribution)
     return Physics(usable(model.effects), model)

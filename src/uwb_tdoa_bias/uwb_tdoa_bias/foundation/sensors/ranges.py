@@ -102,7 +102,7 @@ SENSOR = Sensor(
         "use_range": parameter(True, "use distances to anchors, as of two-way ranging, if there are any", fixed=True),
         "range_std": parameter(0.1, "m; of a distance to an anchor, uncorrected systematic part included", high=100.0),
         "range_offset_std": parameter(
-            0.0, "m; standard deviation of an unknown offset common to all ranges; 0.0: they are calibrated", high=100.0, with_low=True
+            0.3, "m; standard deviation of the offset common to all ranges, which the filter finds; 0.0: there is none", high=100.0, with_low=True
         ),
     },
     invalid="give ids of uwb/anchors, and distances in metres, 0 or more",

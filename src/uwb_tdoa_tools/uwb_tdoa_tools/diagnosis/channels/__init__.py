@@ -11,7 +11,8 @@ from .aid import Aid
 from .base import Channel, ChannelResidual, ChannelResiduals, Comparison, Rows
 from .gyro import Gyro
 from .ranging import Ranging
-from .tdoa import RadioResidual, Tdoa, TdoaResidual
+from .radio import RadioResidual
+from .tdoa import Tdoa, TdoaResidual
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.effects import EffectSet

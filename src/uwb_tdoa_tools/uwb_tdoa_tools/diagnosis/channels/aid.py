@@ -12,10 +12,9 @@ from uwb_tdoa_bias.effects.covariates import OF_AIDS, sensor_covariate
 from uwb_tdoa_bias.foundation.sensors import SENSORS
 
 from .base import Channel, ChannelResidual, Rows
-from .figures import figures
+from .figures import APART, figures
 from .inertial import CELL, vibration_at
 from .knots import knots_of
-from .pairs import APART
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

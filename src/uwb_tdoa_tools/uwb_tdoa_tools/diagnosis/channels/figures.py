@@ -9,6 +9,7 @@ import numpy as np
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+APART = 1e4  # s between the stamps of two flights: nothing of one is near the other
 LAG_TIMES = (0.1, 0.5, 1.0, 2.0)  # s
 TAIL = 4.0  # spreads
 FEWEST = 20  # pairs of samples that a correlation is told of

@@ -13,9 +13,8 @@ from uwb_tdoa_bias.effects.covariates import OF_IMU, ImuFeatures, sensor_covaria
 
 from .base import Channel, ChannelResidual, Rows
 from .extra import extra_at, extra_names
-from .figures import figures
+from .figures import APART, figures
 from .knots import knots_of
-from .pairs import APART
 from .views import views_of_axes
 
 if TYPE_CHECKING:

@@ -7,19 +7,18 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 from scipy.sparse import csr_array
 
-from .figures import FEWEST, figures, rows_by_value
+from .figures import APART, FEWEST, figures, rows_by_value
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from .base import Figures
-    from .tdoa import TdoaResidual
+    from .radio import RadioResidual
 
-APART = 1e4  # s between the stamps of two flights: nothing of one is near the other
 STRONGEST = 10
 
 
-def health(parts: Sequence[TdoaResidual]) -> Figures:
-    """{"pairs", "anchors", "cross_correlation"} of the TdoaResiduals of some flights in the air."""
+def health(parts: Sequence[RadioResidual]) -> Figures:
+    """{"pairs", "anchors", "cross_correlation"} of the residuals of TDOAs of some flights in the air."""
     ids = parts[0].samples.anchors.ids
     t, r, a, b = (np.concatenate(column) for column in zip(*map(_columns, enumerate(parts))))
     pairs, each = [], []
@@ -38,7 +37,7 @@ def _name(label: int, ids: np.ndarray) -> str:
     return "-".join(str(ids[row]) for row in divmod(label, len(ids)))
 
 
-def _columns(numbered: tuple[int, TdoaResidual]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _columns(numbered: tuple[int, RadioResidual]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     number, part = numbered
     rows, samples = part.airborne, part.samples
     return samples.t[rows] + APART * number, part.residual[rows], samples.a[rows], samples.b[rows]

@@ -13,10 +13,9 @@ from uwb_tdoa_bias.foundation.sensors import SENSORS
 
 from .base import Channel
 from .extra import extra_names
-from .figures import figures
+from .figures import APART, figures
 from .knots import knots_of
-from .pairs import APART
-from .tdoa import RadioResidual, are_many, compared, covariate_at, of_arrivals
+from .radio import RadioResidual, are_many, compared, covariate_at, of_arrivals
 from .views import views_of_anchors
 
 if TYPE_CHECKING:

@@ -12,7 +12,6 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import without_unknown_offset
 from uwb_tdoa_ekf.sensitivity import RANGES, TDOAS, record_innovations
 
-from ..noise import with_offset
 from .base import Reference, ReferenceView
 
 if TYPE_CHECKING:
@@ -53,7 +52,7 @@ class Nothing(Reference):
     def view(self, flight: Flight, effects: EffectSet) -> ReferenceView:
         config, streams, by = self._config, self._streams, Corrector(flight.anchors, effects)
         if not streams:
-            flight = without_unknown_offset(flight, with_offset(config), by)
+            flight = without_unknown_offset(flight, config, by)
             config = replace(config, **auxiliary.NONE)  # it has been found
             streams = (TDOAS,) if len(flight.tdoa) else (RANGES,)
         innovations = record_innovations(flight, config, by, streams)

@@ -10,7 +10,7 @@ from ..self_calibration.prior import DELAY, POSITION
 from .tables import Table
 
 if TYPE_CHECKING:
-    from ..diagnose import Diagnosis
+    from ..result import Diagnosis
 
 TITLE = "Values that make these data fit; measure again before you move an anchor"
 HEAD = ("anchor", "x, cm", "y, cm", "z, cm", "late by, cm")

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from uwb_tdoa_bias.effects import SmoothTerm
     from ..channels import ChannelResiduals
-    from ..diagnose import Diagnosis
+    from ..result import Diagnosis
     from .room import Flown
 
     _Curve = tuple[str, str, Flown]  # title, colour

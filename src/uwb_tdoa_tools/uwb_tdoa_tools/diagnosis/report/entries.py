@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.effects import LabelEffect
-from uwb_tdoa_bias.effects.wording import listed, measured, significant
+from uwb_tdoa_bias.effects.wording import listed, measured
 
 from ..over_flights import in_words
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Iterable, Sequence
     from uwb_tdoa_bias.effects import Effect
-    from ..diagnose import Diagnosis
+    from ..result import Diagnosis
     from ..findings import EffectFinding, Refused
     from ..regression.confounding import Alternative
 
@@ -164,7 +164,7 @@ def by_anchor(effect: Effect) -> dict[int, dict[str, tuple[float, float | None]]
     """{anchor: {"x", "y", "z" or "": (value, std or None)}} of those values of an Effect that are significant, where each is of one anchor,
     in the order of anchors; {} of other effects."""
     out: dict[int, dict[str, tuple[float, float | None]]] = {}
-    for key in significant(effect):
+    for key in effect.significant():
         parts = re.fullmatch(r"(\d+)(?:\.([xyz]))?", key)
         if not parts:
             return {}
@@ -193,7 +193,7 @@ def _values(finding: EffectFinding) -> str:
     effect = finding.effect
     if finding.function:
         return f"a function without a name ({finding.function.shape})"
-    told = significant(effect)
+    told = effect.significant()
     fitted_first = sorted(effect.values.items(), key=lambda item: not effect.std.get(item[0]))
     unit, factors = effect.unit.replace("rad", "degrees"), {key: for_people(effect.unit, key)[1] for key in effect.values}
     vague = len(effect.values) - len(told)

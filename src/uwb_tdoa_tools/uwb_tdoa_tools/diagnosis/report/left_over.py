@@ -11,7 +11,7 @@ from ..regression.table import BLOCK
 if TYPE_CHECKING:
     from collections.abc import Iterator
     from ..channels import ChannelResidual
-    from ..diagnose import Diagnosis
+    from ..result import Diagnosis
 
 LARGE, ABOVE = 0.15, 3.0  # m, and times the root mean square of all, that a pair may be off for BLOCK s before it is named
 NAMED = 3

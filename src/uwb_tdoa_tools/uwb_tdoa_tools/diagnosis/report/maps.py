@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from matplotlib.axes import Axes
     from matplotlib.quiver import Quiver
-    from ..diagnose import Diagnosis
+    from ..result import Diagnosis
     from .room import Flown
 
 POINTS = 1500  # of all paths

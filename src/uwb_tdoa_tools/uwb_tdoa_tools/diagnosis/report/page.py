@@ -9,7 +9,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from . import anchors, curves, entries, maps, tables, verdict, words
 
 if TYPE_CHECKING:
-    from ..diagnose import Diagnosis
+    from ..result import Diagnosis
 
 # Names and texts of a recording are a stranger's: everything that is not markup of a template is escaped.
 _TEMPLATES = Environment(

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
     from ...scoring.metrics import Score
     from ..channels import ChannelResiduals
-    from ..diagnose import Diagnosis
+    from ..result import Diagnosis
 
 VIEWS = ([0, 1], [0, 2])  # x and y from above, x and z from the side
 CELL = 1.0  # m

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from ..diagnose import Diagnosis
+    from ..result import Diagnosis
 
 CM = 100.0  # in a metre
 

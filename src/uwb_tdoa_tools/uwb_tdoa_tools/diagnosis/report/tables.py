@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple, TYPE_CHECKING
 
-from uwb_tdoa_bias.effects.wording import listed, measured, rounded, significant
+from uwb_tdoa_bias.effects.wording import listed, measured, rounded
 
 from ...scoring.phases import TITLES
 from ..channels import CHANNELS
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
     from uwb_tdoa_bias.effects import Effect
     from ..channels.base import Figures
-    from ..diagnose import Diagnosis
+    from ..result import Diagnosis
     from .entries import Entry
 
 UNITS = ", ".join(f"{channel.unit} for {name}" for name, channel in CHANNELS.items())
@@ -85,7 +85,7 @@ def values(diagnosis: Diagnosis) -> Table:
     """Of effects.yaml."""
     rows = []
     for effect in (effect for effect in diagnosis.effects.effects if not effect.settings):
-        known = significant(effect)
+        known = effect.significant()
         for key, value in effect.values.items():
             std, (unit, factor) = effect.std.get(key), for_people(effect.unit, key)
             sure = "" if std is None else ("yes" if key in known else "no")

@@ -14,7 +14,7 @@ from ..channels import CHANNELS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
-    from ..diagnose import Diagnosis
+    from ..result import Diagnosis
     from ..regression.confounding import Unobservable
 
 NOTHING = 1e-9  # largest contribution, relative to those of its parts, of a combination that cancels

@@ -13,7 +13,7 @@ from .left_over import left_over
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from ..diagnose import Diagnosis
+    from ..result import Diagnosis
     from uwb_tdoa_ekf.streams.finding import Finding as NumbersFinding
 
 CM = 100.0  # in a metre

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.sparse import csr_array, hstack
 
+from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
 from uwb_tdoa_bias.effects.anchor_position import AnchorPosition
 from uwb_tdoa_bias.effects.samples import RADIO
@@ -23,13 +24,15 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.offline import without_unknown_offset
 from uwb_tdoa_ekf.sensitivity import TDOAS
 
 from ...checking.known_path import MANY
 from ...scoring.metrics import AIRBORNE
 from ..channels import Comparison, RadioResidual
+from ..channels.radio import compared, of_rows
 from ..channels.ranging import RangeResidual
-from ..channels.tdoa import TdoaResidual, compared, of_rows
+from ..channels.tdoa import TdoaResidual
 from ..constraints import Distance, Mark
 from ..references.nothing import Nothing
 from ..regression.fit import NU, student_scale
@@ -123,7 +126,7 @@ class Runs:
         constraints: Sequence[Constraint] = (), streams: Sequence[str] = tuple(RADIO),
     ) -> None:  # fmt: skip
         """base : EffectSet that is in the model; config : FilterConfig; constraints : what else is known; streams : of RADIO, that tell."""
-        self._base, self._reference = base, Nothing(config, streams=streams)
+        self._base, self._config, self._reference = base, config or FilterConfig(), Nothing(config, streams=streams)
         self.spans: dict[str, tuple[float, float]] = {}
         self.flights = [self._reference.prepare(flight) for flight in flights]
         self._of_anchors = [one for one in constraints if isinstance(one, Distance)]
@@ -132,9 +135,11 @@ class Runs:
         self.grounded = len(marks) - len(self._marks)
 
     def slow_innovations(self, anchors: Anchors, delays: np.ndarray) -> float:
-        """m, scale of the slow innovations of all flights with Anchors that are late by delays (N,) m."""
-        about = self._base, self._reference, anchors, delays
-        return _scale([_slow(_residuals(*about, one, self.spans.get(one.name))[0]) for one in self.flights])
+        """m, scale of the slow innovations of all flights with Anchors that are late by delays (N,) m; beside the offset of all ranges,
+        which the filter finds itself: nobody gains by it."""
+        about, by = (self._base, self._reference, anchors, delays), Corrector(anchors, _with_delays(self._base, anchors, delays))
+        found = [without_unknown_offset(replace(one, anchors=anchors), self._config, by) for one in self.flights]
+        return _scale([_slow(_residuals(*about, one, self.spans.get(one.name))[0]) for one in found])
 
     def equations(
         self, anchors: Anchors, delays: np.ndarray, loose: np.ndarray, progress: Callable[[], object] = lambda: None,
@@ -177,8 +182,7 @@ def _residuals(
 ) -> tuple[list[RadioResidual], tuple[float, float]]:  # fmt: skip
     """([RadioResidual] of each stream in the air, span) of a Flight: the innovations of a run with Anchors that are late by delays (N,)
     m."""
-    effects = EffectSet((*base.effects, delay_effect(anchors, delays))) if delays.any() else base
-    comparison = Comparison.of(replace(flight, anchors=anchors), reference, effects, span)
+    comparison = Comparison.of(replace(flight, anchors=anchors), reference, _with_delays(base, anchors, delays), span)
     innovations = comparison.view.innovations
     assert innovations is not None  # as of a Reference that does not know the path
     found = [compared(comparison, RADIO[name], RESIDUALS[name]) for name in innovations.streams]
@@ -201,6 +205,11 @@ def _of_flight(
     inflation = _inflation(gram[:n, :n], vector[:n], blocks, loose)
     less = SYSTEMATIC * inflation
     return FlightEquations(gram / less, vector / less, known, _slow(parts), inflation, BLOCK * len(blocks)), span
+
+
+def _with_delays(base: EffectSet, anchors: Anchors, delays: np.ndarray) -> EffectSet:
+    """The EffectSet `base` and delays (N,) m of Anchors, if there are any."""
+    return EffectSet((*base.effects, delay_effect(anchors, delays))) if delays.any() else base
 
 
 def delay_effect(anchors: Anchors, delays: np.ndarray) -> Effect:

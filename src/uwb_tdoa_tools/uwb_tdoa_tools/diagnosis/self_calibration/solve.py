@@ -64,7 +64,7 @@ class SelfCalibration:
     given : Anchors; prior : Prior of them; flights : names; base : EffectSet that was in the model;
     surveyed : Anchors where the flights put them; delays (N,) m; solution : Solution, whose covariance is of positions, anchor by anchor,
     and then of delays; seconds : s in the air that tell;
-    before, left : m, scale of the slow innovations with the anchors as given, and with these;
+    before, left : m, scale of the slow innovations with the anchors as given, and with these, beside the offset of all ranges;
     tdoa_std : m, for the filter: so that it believes in as many independent TDOAs as there are; None without any;
     changes : (AnchorChange, ...) since the last calibration;
     marks : (before, after, nearer), root mean square of what estimates at marks in the air are off by, m, and share of marks that they
@@ -216,8 +216,9 @@ def self_calibrate(
     shares = _shares(last, best - mean, found, names) if n <= MANY else {}
     best = best + found.step
     moved, delays, tdoa_std = given.at(best[: 3 * n].reshape(n, 3)), best[3 * n :], last.tdoa_std(config) if tdoas else None
+    before = runs.slow_innovations(start, np.zeros(n)) if ranged else first.slow
     return SelfCalibration(
-        given, Prior.of(given, std, base.covariance, common), names, base, moved, delays, found, last.seconds, first.slow,
+        given, Prior.of(given, std, base.covariance, common), names, base, moved, delays, found, last.seconds, before,
         runs.slow_innovations(moved, delays), tdoa_std, _changes(prior, found, best - mean), _left_out(first, prior),
         runs.grounded, shares,
     )  # fmt: skip

@@ -4,7 +4,7 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.planning.goal import Goal
 from uwb_tdoa_tools.planning.installation import Installation
-from uwb_tdoa_tools.planning.layout import one_more, optimise
+from uwb_tdoa_tools.planning.optimisation import one_more, optimise
 from uwb_tdoa_tools.planning.noise import FixedNoise
 from uwb_tdoa_tools.planning.places import AnchorPlaces, lattice
 from uwb_tdoa_tools.readers import read_survey
