@@ -12,8 +12,9 @@ from rclpy.task import Future  # noqa: E402
 from rcl_interfaces.srv import GetParameters  # noqa: E402
 from rosgraph_msgs.msg import Clock  # noqa: E402
 from sensor_msgs.msg import FluidPressure  # noqa: E402
-from uwb_tdoa_bias.foundation import ros, ros_spinning  # noqa: E402
+from uwb_tdoa_bias.foundation import ros_spinning  # noqa: E402
 from uwb_tdoa_bias.foundation.ros_cdr import CdrCodec  # noqa: E402
+from uwb_tdoa_bias.foundation.ros_node import StreamNode  # noqa: E402
 from uwb_tdoa_bias.foundation.ros_parameters import MOST_ASKED, MOST_REQUESTS  # noqa: E402
 from uwb_tdoa_bias.foundation.ros_spinning import Spinner  # noqa: E402
 from uwb_tdoa_bias.foundation.ros_stamps import Epoch  # noqa: E402
@@ -31,7 +32,7 @@ def surroundings(request, monkeypatch):
     elif ros_spinning.EventsExecutor is None:
         pytest.skip("this rclpy has no EventsExecutor")
     rclpy.init()
-    node, other = ros.StreamNode("ours"), rclpy.create_node("other")
+    node, other = StreamNode("ours"), rclpy.create_node("other")
     yield node, other
     for each in (node, other):
         each.destroy_node()

@@ -28,6 +28,7 @@ from .effects import EffectSet, LabelCorrector
 from .effects.tag_lever_arm import TagLeverArm
 from .foundation.ros_diagnostics import Diagnostics, Rate, Report
 from .foundation.ros_frames import FramesInput, unknown_frame
+from .foundation.ros_node import StreamNode
 from .foundation.ros_parameters import FROZEN, Parameter, declare_all, files_of, refuse_unknown, say_unused
 from .foundation.ros_stamps import Epoch
 from .foundation.ros_streams import RoundRobin, StreamOutput, Streams
@@ -67,7 +68,7 @@ Item = tuple[Any, ...]  # of a TDOA: frame, sec, nanosec, and MEASURED
 STATUS = {PASSED: "passed", EFFECTS: "effects", NETWORK: "network", FADED: "faded"}
 
 
-class BiasNode(ros.StreamNode):
+class BiasNode(StreamNode):
     """Converts messages for a Corrector and keeps the accounts: received = published + waiting + dropped."""
 
     NAME = "bias_node"

@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.foundation import ros
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.ros_diagnostics import Diagnostics, Rate
+from uwb_tdoa_bias.foundation.ros_node import StreamNode
 from uwb_tdoa_bias.foundation.ros_parameters import FROZEN, Parameter, declare_all, files_of, refuse_unknown, say_unused
 from uwb_tdoa_bias.foundation.ros_stamps import Epoch, orientation_of
 from uwb_tdoa_bias.foundation.ros_topics import Input, OVERRIDES, STREAM_QOS, publish_stream
@@ -48,7 +49,7 @@ PARAMETERS = {  # in the order of config/debias_node.yaml; the layers are those 
 }
 
 
-class DebiasNode(ros.StreamNode):
+class DebiasNode(StreamNode):
     """Converts messages for a BiasMap and keeps the accounts: received = corrected + faded + outside + invalid."""
 
     NAME = "debias_node"

@@ -30,6 +30,7 @@ from uwb_tdoa_bias.foundation.ros_anchors import AnchorsInput
 from uwb_tdoa_bias.foundation.ros_cdr import CdrCodec, message_class
 from uwb_tdoa_bias.foundation.ros_diagnostics import Diagnostics
 from uwb_tdoa_bias.foundation.ros_frames import FramesInput, unknown_frame
+from uwb_tdoa_bias.foundation.ros_node import StreamNode
 from uwb_tdoa_bias.foundation.ros_parameters import files_of, refuse_unknown, say_unused
 from uwb_tdoa_bias.foundation.ros_stamps import Epoch
 from uwb_tdoa_bias.foundation.ros_streams import RoundRobin, Streams
@@ -79,7 +80,7 @@ MOST_NAMED = 3  # of them in a sentence
 EARLY = 5000  # messages kept while there are no anchors
 
 
-class EkfNode(ros.StreamNode):
+class EkfNode(StreamNode):
     """Converts messages for an Estimator and publishes what it says. The filter is all in there."""
 
     NAME = "ekf_node"

@@ -21,7 +21,7 @@ from .ekf_parameters import NONE, ODOM
 from .frames import pose_and_twist
 
 if TYPE_CHECKING:
-    from uwb_tdoa_bias.foundation.ros import StreamNode
+    from uwb_tdoa_bias.foundation.ros_node import StreamNode
     from uwb_tdoa_bias.foundation.ros_stamps import Epoch
     from uwb_tdoa_bias.foundation.transforms import Frames
     from .monitoring.status import Status

@@ -24,7 +24,7 @@ from rclpy.experimental import EventsExecutor
 from rclpy.serialization import serialize_message
 from rclpy.task import Future
 from sensor_msgs.msg import FluidPressure, Imu, Range
-from uwb_tdoa_bias.foundation import ros
+from uwb_tdoa_bias.foundation.ros_node import StreamNode
 from uwb_tdoa_bias.foundation.ros_spinning import Spinner
 from uwb_tdoa_bias.foundation.ros_topics import OUTPUT_QOS, STREAM_QOS, unserved, waiting
 from uwb_tdoa_tools.live.processes import own_domain
@@ -90,7 +90,7 @@ class Counted:
 def receive(way, seconds, queue):
     """Receive in one way, and put a line of the table into the queue."""
     rclpy.init()
-    node, late, rest = ros.StreamNode("receiver"), [], [0]
+    node, late, rest = StreamNode("receiver"), [], [0]
 
     def handle(data):
         second, nanosecond = STAMP.unpack_from(data, 4)

@@ -16,7 +16,8 @@ PACKAGES = ORDER[1:]
 ROS = """
     uwb_tdoa_bias.anchors_node uwb_tdoa_bias.bias_node
     uwb_tdoa_bias.foundation.ros uwb_tdoa_bias.foundation.ros_anchors uwb_tdoa_bias.foundation.ros_cdr
-    uwb_tdoa_bias.foundation.ros_diagnostics uwb_tdoa_bias.foundation.ros_frames uwb_tdoa_bias.foundation.ros_parameters
+    uwb_tdoa_bias.foundation.ros_diagnostics uwb_tdoa_bias.foundation.ros_frames uwb_tdoa_bias.foundation.ros_node
+    uwb_tdoa_bias.foundation.ros_parameters
     uwb_tdoa_bias.foundation.ros_spinning uwb_tdoa_bias.foundation.ros_stamps uwb_tdoa_bias.foundation.ros_streams
     uwb_tdoa_bias.foundation.ros_topics
     uwb_tdoa_ekf.debias_node uwb_tdoa_ekf.ekf_node uwb_tdoa_ekf.ekf_parameters

@@ -19,7 +19,7 @@ from .survey import read_survey
 if TYPE_CHECKING:
     from collections.abc import Callable
     from rclpy.event_handler import QoSRequestedIncompatibleQoSInfo
-    from .ros import StreamNode
+    from .ros_node import StreamNode
 
 ANCHORS_QOS = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL

@@ -9,7 +9,6 @@ from builtin_interfaces.msg import Time
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from tf2_msgs.msg import TFMessage
 
-from . import ros
 from .errors import InputError
 from .ros_parameters import LONGEST_NAME
 from .ros_cdr import ENCAPSULATION, LENGTH, MOST_ELEMENTS, Unreadable, aligned, check_length, decode, read_text
@@ -19,6 +18,7 @@ from .transforms import Frames
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from geometry_msgs.msg import TransformStamped
+    from .ros_node import StreamNode
 
 TF_QOS = QoSProfile(depth=100)  # what tf2 uses
 MOVING_QOS = QoSProfile(depth=1000)  # 2 s of a robot that publishes it at 500 Hz
@@ -35,7 +35,7 @@ class FramesInput:
     constant transform of a frame counts. trouble : a transform that is none, or None; refusals : Refusals."""
 
     def __init__(
-        self, node: ros.StreamNode, seconds: Callable[[Time], float], on_new: Callable[[], None], moving: bool = False
+        self, node: StreamNode, seconds: Callable[[Time], float], on_new: Callable[[], None], moving: bool = False
     ) -> None:
         """seconds(stamp) : s of a builtin_interfaces/Time; on_new() is called when a constant transform is new."""
         self.frames = Frames()

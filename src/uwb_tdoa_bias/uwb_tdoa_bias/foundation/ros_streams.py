@@ -12,7 +12,7 @@ from .stamps import LARGEST_STEP_BACK
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
-    from .ros import StreamNode
+    from .ros_node import StreamNode
     from .ros_cdr import Template, CdrCodec
     from .ros_stamps import Epoch
 
@@ -49,7 +49,7 @@ class RoundRobin:
 
 
 class Streams:
-    """Streams of a ros.StreamNode: they hold what arrives until it is taken."""
+    """Streams of a StreamNode: they hold what arrives until it is taken."""
 
     def __init__(self, node: StreamNode, epoch: Epoch, on_taken: Callable[[], None]) -> None:
         """epoch : Epoch; on_taken() is called after anything was given to those that take it."""

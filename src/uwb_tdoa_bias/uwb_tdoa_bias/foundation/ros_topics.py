@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rclpy.publisher import Publisher
     from rclpy.subscription import Subscription
     from rclpy.topic_endpoint_info import TopicEndpointInfo
-    from .ros import StreamNode
+    from .ros_parameters import ParameterNode
     from .ros_cdr import CdrCodec
 
 # What comes in is sensor data: best effort, which hears every publisher. Deep, because a node that was not scheduled for a
@@ -51,7 +51,7 @@ def waiting(subscription: Subscription) -> Iterator[tuple[bytes, dict[str, Any]]
 class Refusals:
     """Messages of a topic that could not be read. count : of them; reason : of the last; topic : its name."""
 
-    def __init__(self, node: StreamNode, topic: str, kind: type) -> None:
+    def __init__(self, node: ParameterNode, topic: str, kind: type) -> None:
         self.count, self.reason = 0, ""
         self.topic, self._node, self._kind, self._before = topic, node, kind, 0
 
@@ -89,7 +89,7 @@ class Input:
     """
 
     def __init__(
-        self, node: StreamNode, kind: type, topic: str, callback: Callable[[Any], None], qos: int | QoSProfile,
+        self, node: ParameterNode, kind: type, topic: str, callback: Callable[[Any], None], qos: int | QoSProfile,
         read: Callable[[bytes], Any] | None = None, served: bool = True, **options: Any,
     ) -> None:  # fmt: skip
         """read(bytes) : what is given to the callback; default the message; raises Unreadable."""
@@ -118,7 +118,7 @@ class StreamInput:
     lost : messages that were sent and that DDS did not deliver, as far as it knows; refusals : Refusals.
     """
 
-    def __init__(self, node: StreamNode, kind: type, topic: str) -> None:
+    def __init__(self, node: ParameterNode, kind: type, topic: str) -> None:
         self.lost, self._before = 0, 0
         self.refusals = Refusals(node, topic, kind)
         self._node, self._topic = node, topic
@@ -162,7 +162,7 @@ class StreamInput:
         return None
 
 
-def several_publishers(node: StreamNode, topic: str) -> str | None:
+def several_publishers(node: ParameterNode, topic: str) -> str | None:
     """The sentence for a topic on which more than one publishes, or None."""
     ends = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
     if len(ends) < 2:

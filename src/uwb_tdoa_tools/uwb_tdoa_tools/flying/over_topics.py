@@ -15,7 +15,6 @@ from rosgraph_msgs.msg import Clock
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu
 from uwb_tdoa_bias.anchors_node import markers, transforms
-from uwb_tdoa_bias.foundation import ros
 from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS, anchors_to_message
 from uwb_tdoa_bias.foundation.ros_cdr import CdrCodec, message_class
 from uwb_tdoa_bias.foundation.ros_frames import TF_STATIC_QOS
@@ -32,6 +31,7 @@ from .vehicle import ATTITUDE, POSITION
 if TYPE_CHECKING:
     from collections.abc import Callable
     from uwb_tdoa_bias.foundation.ros_cdr import Template
+    from uwb_tdoa_bias.foundation.ros_node import StreamNode
     from .mission import Pose
     from .pace import Lockstep, RealTime
     from .simulator import SensorReadings
@@ -55,8 +55,8 @@ class OverTopics:
     """See `estimates.OurFilter`. deviation : m, as there; inf unless the filter says that it is running; status : EstimatorStatus, the
     newest, or None."""
 
-    def __init__(self, node: ros.StreamNode, world: World, pace: RealTime | Lockstep, clock: bool) -> None:
-        """node : ros.StreamNode; world : World; pace : of `pace`, which is told what goes and comes; clock : publish /clock, and count
+    def __init__(self, node: StreamNode, world: World, pace: RealTime | Lockstep, clock: bool) -> None:
+        """node : StreamNode; world : World; pace : of `pace`, which is told what goes and comes; clock : publish /clock, and count
         stamps from 0, not from now."""
         self._node, self._pace, self._anchors = node, pace, world.anchors
         self._begin = 0 if clock else None  # ns, stamp of the start; of now without /clock
@@ -191,7 +191,7 @@ class _Output:
     """A stream of which only some fields are not 0. subscribers : how many hear it."""
 
     def __init__(
-        self, node: ros.StreamNode, topic: str, kind: type, content: Callable[[Any], dict[str, np.ndarray]],
+        self, node: StreamNode, topic: str, kind: type, content: Callable[[Any], dict[str, np.ndarray]],
         frame: str = BODY_FRAME,
     ) -> None:  # fmt: skip
         self._content, self._kind, self._frame = content, kind, frame
