@@ -128,7 +128,7 @@ def test_is_declared_in_full(effect):
     for wrong in (np.nan, np.inf, 1.01 * bound, -1.01 * bound, "much", None, [0.1]):
         with pytest.raises(InputError, match="values"):
             effect({effect.example: wrong})
-    with pytest.raises(InputError, match="parameter 'sideways'"):
+    with pytest.raises(InputError, match=f"effects: {effect.name}: parameter 'sideways'"):
         effect({"sideways": 0.1})
 
 

@@ -4,6 +4,7 @@ import pytest
 
 rclpy = pytest.importorskip("rclpy")
 
+from builtin_interfaces.msg import Time  # noqa: E402
 from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
 from rclpy.impl.implementation_singleton import rclpy_implementation  # noqa: E402
 from rclpy.qos import QoSProfile  # noqa: E402
@@ -11,10 +12,12 @@ from rclpy.task import Future  # noqa: E402
 from rcl_interfaces.srv import GetParameters  # noqa: E402
 from rosgraph_msgs.msg import Clock  # noqa: E402
 from sensor_msgs.msg import FluidPressure  # noqa: E402
-from uwb_tdoa_bias.foundation import ros, ros_spinning  # noqa: E402
+from uwb_tdoa_bias.foundation import ros_spinning  # noqa: E402
 from uwb_tdoa_bias.foundation.ros_cdr import CdrCodec  # noqa: E402
+from uwb_tdoa_bias.foundation.ros_node import StreamNode  # noqa: E402
 from uwb_tdoa_bias.foundation.ros_parameters import MOST_ASKED, MOST_REQUESTS  # noqa: E402
 from uwb_tdoa_bias.foundation.ros_spinning import Spinner  # noqa: E402
+from uwb_tdoa_bias.foundation.ros_stamps import Epoch  # noqa: E402
 from uwb_tdoa_bias.foundation.ros_streams import PERIOD, Streams, RoundRobin  # noqa: E402
 
 MANY = 300
@@ -29,7 +32,7 @@ def surroundings(request, monkeypatch):
     elif ros_spinning.EventsExecutor is None:
         pytest.skip("this rclpy has no EventsExecutor")
     rclpy.init()
-    node, other = ros.StreamNode("ours"), rclpy.create_node("other")
+    node, other = StreamNode("ours"), rclpy.create_node("other")
     yield node, other
     for each in (node, other):
         each.destroy_node()
@@ -98,7 +101,7 @@ def test_what_waits_is_measured(surroundings):
 def test_streams_are_taken_together_and_the_newest_of_the_clock(surroundings):
     node, other = surroundings
     node.set_parameters([rclpy.Parameter("use_sim_time", value=True)])
-    taken, epoch, stop = [], ros.Epoch(), Future()
+    taken, epoch, stop = [], Epoch(), Future()
 
     def take(frame, t, rows, arrival):
         taken.append(len(t))
@@ -114,7 +117,7 @@ def test_streams_are_taken_together_and_the_newest_of_the_clock(surroundings):
     spinner._serve()
     for second in range(1, MANY + 1):
         publisher.publish(FluidPressure())
-        clock.publish(Clock(clock=ros.Time(sec=second)))
+        clock.publish(Clock(clock=Time(sec=second)))
     spinner.spin(stop)
     assert sum(taken) == MANY and len(taken) < MANY / 3
 
@@ -134,7 +137,7 @@ def test_a_stream_that_begins_after_a_silence_is_taken(surroundings):
         heard.append(time.time() - arrival[0])
         stop.set_result(None)
 
-    streams = Streams(node, ros.Epoch(), lambda: None)
+    streams = Streams(node, Epoch(), lambda: None)
     streams.add(CdrCodec(FluidPressure, "fluid_pressure"), "pressure", take)
     publisher = other.create_publisher(FluidPressure, "pressure", DEEP)
     until(publisher.get_subscription_count)

@@ -18,6 +18,7 @@ from .foundation import ros
 from .foundation.errors import InputError
 from .foundation.ros_anchors import ANCHORS_FILE, ANCHORS_QOS, anchors_to_message
 from .foundation.ros_frames import TF_STATIC_QOS
+from .foundation.ros_node import StreamNode
 from .foundation.ros_parameters import FROZEN, Parameter, declare_all, files_of, refuse_unknown, say_unused
 from .foundation.survey import read_survey
 
@@ -33,7 +34,7 @@ PARAMETERS = {  # in the order of config/anchors_node.yaml
 LEVEL = Quaternion(w=1.0)  # of an anchor whose orientation was not surveyed
 
 
-class AnchorsNode(ros.StreamNode):
+class AnchorsNode(StreamNode):
     """Publishes once, and stays for who comes later."""
 
     NAME = "anchors_node"

@@ -21,17 +21,21 @@ from uwb_tdoa_msgs.msg import Tdoa, TdoaCorrected
 
 from .foundation import ros
 from .foundation.errors import InputError
+from .foundation.ros_anchors import ANCHORS_FILE, AnchorsInput
+from .foundation.ros_cdr import CdrCodec
 from .correction.corrector import EFFECTS, FADED, NETWORK, PASSED, Correction, Corrector, warm_up
 from .effects import EffectSet, LabelCorrector
 from .effects.tag_lever_arm import TagLeverArm
-from .foundation.ros_anchors import ANCHORS_FILE, AnchorsInput
-from .foundation.ros_cdr import CdrCodec
+from .foundation.ros_diagnostics import Diagnostics, Rate, Report
 from .foundation.ros_frames import FramesInput, unknown_frame
+from .foundation.ros_node import StreamNode
 from .foundation.ros_parameters import FROZEN, Parameter, declare_all, files_of, refuse_unknown, say_unused
+from .foundation.ros_stamps import Epoch
 from .foundation.ros_streams import RoundRobin, StreamOutput, Streams
 from .correction.pose_queue import PoseQueue
 from .correction.network import load_network
 from .correction.poses import parts_of
+from .foundation.ros_topics import several_publishers
 from .foundation.stamps import StampGate
 
 if TYPE_CHECKING:
@@ -64,7 +68,7 @@ Item = tuple[Any, ...]  # of a TDOA: frame, sec, nanosec, and MEASURED
 STATUS = {PASSED: "passed", EFFECTS: "effects", NETWORK: "network", FADED: "faded"}
 
 
-class BiasNode(ros.StreamNode):
+class BiasNode(StreamNode):
     """Converts messages for a Corrector and keeps the accounts: received = published + waiting + dropped."""
 
     NAME = "bias_node"
@@ -84,7 +88,7 @@ class BiasNode(ros.StreamNode):
         self._model = self._warm_up()
         self._idle = self._model[NETWORK] == "none"
         self._corrector: Corrector = None  # type: ignore[assignment]  # until there are anchors
-        self._epoch, self._rate = ros.Epoch(), ros.Rate()
+        self._epoch, self._rate = Epoch(), Rate()
         self._counts: Counter[str] = Counter()
         self._early: deque[Item] = deque()
         self._early_poses: deque[tuple[str, np.ndarray, np.ndarray]] = deque()  # as of `_take_poses`
@@ -103,7 +107,7 @@ class BiasNode(ros.StreamNode):
         self.streams = Streams(self, self._epoch, self._release)
         self.streams.add(CdrCodec(Odometry, *POSE), "odometry", self._on_odometry, handed=member is not None)
         self.streams.add(CdrCodec(Tdoa, *MEASURED), "uwb/tdoa", self._on_tdoa)
-        self._diagnostics = ros.Diagnostics(self, self._report)
+        self._diagnostics = Diagnostics(self, self._report)
         self._anchors.start()
         if member is None:
             say_unused([self], files_of(arguments))
@@ -304,14 +308,14 @@ class BiasNode(ros.StreamNode):
             self._templates[frame, model] = self._wire.template(message)
         return self._templates[frame, model]
 
-    def _report(self) -> ros.Report:
+    def _report(self) -> Report:
         counts = self._counts
         rate = self._rate.of(counts["received"])
         received, self._reported_received = counts["received"] - self._reported_received, counts["received"]
         poses, self._reported_poses = counts["poses"] - self._reported_poses, counts["poses"]
         recent = {"uwb/tdoa": received, "odometry": poses}
         wiring = [end.trouble(recent[name]) for name, end in self.streams.inputs.items()]
-        wiring.append(ros.several_publishers(self, "uwb/tdoa_corrected"))
+        wiring.append(several_publishers(self, "uwb/tdoa_corrected"))
         others = [*self._anchors.refusals, *self._frames.refusals]
         wiring += [*(refusals.trouble() for refusals in others), self._frames.trouble]
         unready, self._reported_unready = counts["unready"] - self._reported_unready, counts["unready"]

@@ -1,5 +1,6 @@
 """The real nodes as processes of their own, and a node of the test that plays their surroundings and listens."""
 
+from builtin_interfaces.msg import Time
 from copy import copy
 from dataclasses import dataclass, replace
 import os
@@ -21,8 +22,9 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import ReliabilityPolicy
 from sensor_msgs.msg import FluidPressure, Imu, Range
 from tf2_msgs.msg import TFMessage
-from uwb_tdoa_bias.foundation import ros
 from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS, anchors_to_message
+from uwb_tdoa_bias.foundation.ros_diagnostics import DIAGNOSTICS_QOS
+from uwb_tdoa_bias.foundation.ros_topics import STREAM_QOS
 from uwb_tdoa_ekf.results import VERDICTS
 from uwb_tdoa_msgs.msg import AnchorArray, Tdoa, TdoaCorrected, TdoaResidual
 
@@ -88,7 +90,7 @@ def recording(seconds=4.0, imu_rate=200.0, tdoa_rate=100.0):
 def stamp(t, epoch=EPOCH):
     """Stamp of t s after the epoch."""
     second, nanosecond = divmod(round(t * 1e9), 10**9)
-    return ros.Time(sec=epoch + second, nanosec=nanosecond)
+    return Time(sec=epoch + second, nanosec=nanosecond)
 
 
 def seconds_of(stamp, epoch=EPOCH):
@@ -127,7 +129,7 @@ class Rig:
         latched : have a latched publisher of anchors."""
         self.namespace = namespace
         self.node = rclpy.create_node("rig", namespace=namespace)
-        self._reliable, self._qos = reliable, copy(ros.STREAM_QOS)
+        self._reliable, self._qos = reliable, copy(STREAM_QOS)
         if reliable:
             self._qos.reliability = ReliabilityPolicy.RELIABLE
         self.received = {topic: [] for topic in listen}
@@ -139,7 +141,7 @@ class Rig:
             topic: self.node.create_subscription(STREAMS.get(topic, TFMessage), topic, store.append, self._qos)
             for topic, store in self.received.items()
         }
-        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, ros.DIAGNOSTICS_QOS)
+        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, DIAGNOSTICS_QOS)
 
     @property
     def odometry(self):

@@ -21,7 +21,8 @@ import numpy as np
 import rclpy
 from rig import STREAMS, Rig
 from std_srvs.srv import Trigger
-from uwb_tdoa_bias.foundation import ros
+from uwb_tdoa_bias.foundation.ros_diagnostics import DIAGNOSTICS_QOS
+from uwb_tdoa_bias.foundation.ros_topics import OUTPUT_QOS, STREAM_QOS
 
 PAUSE = 0.3  # s between two flights
 NODES = {  # faults that are not of a stream, and what is said
@@ -57,9 +58,9 @@ def lanes_of(make_rig, count):
         def hear(message, lane=lane, name=name):
             lane.heard += [(time.time(), status) for status in message.status if status.name == name]
 
-        rig.node.create_subscription(DiagnosticArray, "/diagnostics", hear, ros.DIAGNOSTICS_QOS)
+        rig.node.create_subscription(DiagnosticArray, "/diagnostics", hear, DIAGNOSTICS_QOS)
         if count == 1:
-            rig.node.create_subscription(Odometry, "odometry", lambda m: lane.poses.append((time.time(), m)), ros.STREAM_QOS)
+            rig.node.create_subscription(Odometry, "odometry", lambda m: lane.poses.append((time.time(), m)), STREAM_QOS)
         rig.send_anchors(FLIGHT.anchors)
         lanes.append(lane)
     return lanes
@@ -150,7 +151,7 @@ def _relative(t, epoch):
 def publish_twice(lane, name):
     """Another publisher on a topic; returns it."""
     topic = PUBLISHERS[name]
-    return lane.rig.node.create_publisher(STREAMS[topic], topic, ros.OUTPUT_QOS)
+    return lane.rig.node.create_publisher(STREAMS[topic], topic, OUTPUT_QOS)
 
 
 def errors_of(lane, begin, low, high):

@@ -10,7 +10,7 @@ pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from flights import fly  # noqa: E402
 from rclpy.impl.rcutils_logger import RcutilsLogger  # noqa: E402
-from uwb_tdoa_ekf.core import engine, validity  # noqa: E402
+from uwb_tdoa_ekf.core import engine, measurements  # noqa: E402
 from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 from uwb_tdoa_ekf.ekf_node import EkfNode  # noqa: E402
 from uwb_tdoa_ekf.estimator import Estimator  # noqa: E402
@@ -54,7 +54,7 @@ def test_parameters_under_old_names_count_with_a_warning(monkeypatch):
 
 @pytest.mark.parametrize("batch", [1, 3, 200])
 def test_a_node_that_is_ready_has_nothing_left_to_compile(node, batch):
-    before = [set(function.signatures) for function in (engine.run, validity.usable)]
+    before = [set(function.signatures) for function in (engine.run, measurements.usable)]
     flight = fly(duration=1.0)
     estimator = Estimator(flight.anchors)
     for i in range(len(flight.imu)):
@@ -64,4 +64,4 @@ def test_a_node_that_is_ready_has_nothing_left_to_compile(node, batch):
         if i % batch == 0:
             estimator.advance()
     estimator.finish()
-    assert [set(function.signatures) for function in (engine.run, validity.usable)] == before
+    assert [set(function.signatures) for function in (engine.run, measurements.usable)] == before

@@ -6,9 +6,10 @@ import pytest
 pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
+from builtin_interfaces.msg import Time  # noqa: E402
 from geometry_msgs.msg import PoseWithCovarianceStamped  # noqa: E402
-from uwb_tdoa_bias.foundation import ros  # noqa: E402
 from uwb_tdoa_bias.foundation.errors import InputError  # noqa: E402
+from uwb_tdoa_bias.foundation.ros_stamps import Epoch  # noqa: E402
 from uwb_tdoa_ekf.pose_message import pose_from_message  # noqa: E402
 
 
@@ -23,8 +24,8 @@ def message(variances=(0.25, 0.25, 0.0, 0.0, 0.0, 0.07), frame="map", second=5):
 
 
 def read(content, newest=3.0):
-    epoch = ros.Epoch()
-    epoch.seconds(ros.Time(sec=2))
+    epoch = Epoch()
+    epoch.seconds(Time(sec=2))
     return pose_from_message(content, "map", epoch, newest)
 
 

@@ -13,7 +13,7 @@ from geometry_msgs.msg import TransformStamped  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
 from rig import make_rig, recording  # noqa: E402, F401
 from tf2_msgs.msg import TFMessage  # noqa: E402
-from uwb_tdoa_bias.foundation import ros  # noqa: E402
+from uwb_tdoa_bias.foundation.ros_diagnostics import AGAIN  # noqa: E402
 from uwb_tdoa_bias.foundation.ros_frames import TF_STATIC_QOS  # noqa: E402
 from uwb_tdoa_msgs.msg import EstimatorStatus  # noqa: E402
 
@@ -57,7 +57,7 @@ def test_frames_that_alternate_are_warned_of_once(make_rig):  # noqa: F811
         return [line for line in ekf.lines if f"frame '{frame}', which /tf_static does not connect" in line]
 
     rig.wait(lambda: warned("left") and warned("right"), "both frames to be warned of")
-    again = 1 + int((time.monotonic() - began) / ros.AGAIN)  # how often the log says what it has said before
+    again = 1 + int((time.monotonic() - began) / AGAIN)  # how often the log says what it has said before
     assert max(len(warned("left")), len(warned("right"))) <= 1 + 2 * again  # once, and with /diagnostics when its text is of another kind
 
 

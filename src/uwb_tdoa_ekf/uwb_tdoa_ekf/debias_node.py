@@ -20,7 +20,11 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.foundation import ros
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.ros_diagnostics import Diagnostics, Rate
+from uwb_tdoa_bias.foundation.ros_node import StreamNode
 from uwb_tdoa_bias.foundation.ros_parameters import FROZEN, Parameter, declare_all, files_of, refuse_unknown, say_unused
+from uwb_tdoa_bias.foundation.ros_stamps import Epoch, orientation_of
+from uwb_tdoa_bias.foundation.ros_topics import Input, OVERRIDES, STREAM_QOS, publish_stream
 
 from .debias import BiasMap, LayerConfig, Layers
 
@@ -45,7 +49,7 @@ PARAMETERS = {  # in the order of config/debias_node.yaml; the layers are those 
 }
 
 
-class DebiasNode(ros.StreamNode):
+class DebiasNode(StreamNode):
     """Converts messages for a BiasMap and keeps the accounts: received = corrected + faded + outside + invalid."""
 
     NAME = "debias_node"
@@ -60,17 +64,17 @@ class DebiasNode(ros.StreamNode):
         if not file:
             raise InputError("map: is empty; give a file that `debias` wrote.")
         self._map, self._layers = BiasMap.load(file), Layers(LayerConfig(**layers))
-        self._epoch, self._rate = ros.Epoch(), ros.Rate()
+        self._epoch, self._rate = Epoch(), Rate()
         self._counts: Counter[str] = Counter()
         self._counts_before: Counter[str] = Counter()
         self._newest = -math.inf
         self._map.correct(np.zeros((1, 3)), np.zeros((1, 3, 3)))  # what the first call prepares
-        self._publisher = ros.publish_stream(self, Odometry, "odometry/debiased")
-        self._input = ros.Input(
-            self, Odometry, "odometry", self._on_odometry, copy(ros.STREAM_QOS), qos_overriding_options=ros.OVERRIDES
+        self._publisher = publish_stream(self, Odometry, "odometry/debiased")
+        self._input = Input(
+            self, Odometry, "odometry", self._on_odometry, copy(STREAM_QOS), qos_overriding_options=OVERRIDES
         )
         say_unused([self], files_of(arguments))
-        self._diagnostics = ros.Diagnostics(self, self._report)
+        self._diagnostics = Diagnostics(self, self._report)
         self.ready = f"ready; {len(self._map.at)} markers, {self._map.interpolator}"
 
     def _on_odometry(self, message: Odometry) -> None:
@@ -94,7 +98,7 @@ class DebiasNode(ros.StreamNode):
         """The position after the layers, which also need the velocity, in the world frame; NaN where one is not
         known."""
         u = message.twist.twist.linear
-        state = np.array([*p, u.x, u.y, u.z, *ros.orientation_of(message.pose.pose.orientation)])
+        state = np.array([*p, u.x, u.y, u.z, *orientation_of(message.pose.pose.orientation)])
         if not np.isfinite(state).all():
             return np.full(3, math.nan)
         t = self._epoch.seconds(message.header.stamp)

@@ -28,9 +28,13 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flyable import FlyableVolume
 from uwb_tdoa_bias.foundation.ros_anchors import AnchorsInput
 from uwb_tdoa_bias.foundation.ros_cdr import CdrCodec, message_class
+from uwb_tdoa_bias.foundation.ros_diagnostics import Diagnostics
 from uwb_tdoa_bias.foundation.ros_frames import FramesInput, unknown_frame
+from uwb_tdoa_bias.foundation.ros_node import StreamNode
 from uwb_tdoa_bias.foundation.ros_parameters import files_of, refuse_unknown, say_unused
+from uwb_tdoa_bias.foundation.ros_stamps import Epoch
 from uwb_tdoa_bias.foundation.ros_streams import RoundRobin, Streams
+from uwb_tdoa_bias.foundation.ros_topics import Input, Refusals, several_publishers
 from uwb_tdoa_bias.foundation.sensors import LOCATING, SENSORS
 from uwb_tdoa_msgs.msg import TdoaCorrected
 
@@ -54,7 +58,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
     from rclpy.clock import ROSClock
     from uwb_tdoa_bias.foundation.anchors import Anchors
-    from uwb_tdoa_bias.foundation.ros import Refusals, Report
+    from uwb_tdoa_bias.foundation.ros_diagnostics import Report
     from .core.config import FilterConfig
     from .results import Odometry
     from .streams.finding import Finding
@@ -76,7 +80,7 @@ MOST_NAMED = 3  # of them in a sentence
 EARLY = 5000  # messages kept while there are no anchors
 
 
-class EkfNode(ros.StreamNode):
+class EkfNode(StreamNode):
     """Converts messages for an Estimator and publishes what it says. The filter is all in there."""
 
     NAME = "ekf_node"
@@ -95,7 +99,7 @@ class EkfNode(ros.StreamNode):
         self._effects = EffectSet.from_yaml(effects_file) if effects_file else EffectSet()
         self._aid_corrector = AidCorrector(self._effects.effects)
         self._estimator: Estimator = None  # type: ignore[assignment]  # until there are anchors
-        self._epoch, self._ros_clock = ros.Epoch(), cast("ROSClock", self.get_clock())
+        self._epoch, self._ros_clock = Epoch(), cast("ROSClock", self.get_clock())
         self._attitude: tuple[np.ndarray, np.ndarray] | None = None  # quaternion and covariance of the newest odometry
         self._last_tdoa = -math.inf  # of a TDOA or range, time.monotonic(), s
         self._received_before: dict[str, int] = {}  # messages by topic, by the last report
@@ -116,11 +120,11 @@ class EkfNode(ros.StreamNode):
         self.outputs = Outputs(self, self._epoch, self._frames.frames, self._body, own["publish_tf"], own["odom_frame"])
         self._anchors = AnchorsInput(self, self._on_anchors, own["anchors_file"])
         self.streams = self._subscribe({"uwb/tdoa_corrected"} if member is not None else ())
-        self._pose = ros.Input(self, PoseWithCovarianceStamped, "initialpose", self._on_pose, 10)
+        self._pose = Input(self, PoseWithCovarianceStamped, "initialpose", self._on_pose, 10)
         self._reset = self.create_service(Trigger, "~/reset", self._on_reset)
         follow_changes(self, lambda: self._config, self._on_config)
         self._status = StatusOutput(self)
-        self._diagnostics = ros.Diagnostics(self, self._report, self._tell_status)
+        self._diagnostics = Diagnostics(self, self._report, self._tell_status)
         self._anchors.start()
         if member is None:
             say_unused([self], files_of(arguments))
@@ -317,11 +321,11 @@ class EkfNode(ros.StreamNode):
             troubles.append(end.trouble(total - self._received_before.get(topic, 0)))
         self._received_before = received
         troubles += [refusals.trouble() for refusals in self._single]
-        return [*filter(None, [*troubles, ros.several_publishers(self, "odometry")])]
+        return [*filter(None, [*troubles, several_publishers(self, "odometry")])]
 
     @property
     def _single(self) -> list[Refusals]:
-        """ros.Refusals of what comes one at a time."""
+        """Refusals of what comes one at a time."""
         return [self._pose.refusals, *self._anchors.refusals, *self._frames.refusals]
 
     def _behind(self) -> float | None:

@@ -16,6 +16,7 @@ from .core import aids
 from .core.config import FilterConfig
 from .core.engine import LOST_TIME
 from .core.height import LONGEST_GAP
+from .core.measurements import aid_rows, imu_rows, usable_tdoas
 from .core.memory import IMU_SAMPLE, ODOMETRY, POSE, TDOA, YAWS, joined, structured
 from .core.startup import APART
 from .core.verdicts import INVALID
@@ -24,7 +25,6 @@ from .monitoring.implausible import implausible
 from .pipeline import Pipeline, odometry_of
 from .reorder_buffer import IMU_STREAM, STREAMS, TDOA_STREAM, ReorderBuffer
 from .results import VERDICTS, Odometry, Residuals, concatenated
-from .rows import aid_rows, imu_rows, usable_tdoas
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike

@@ -13,6 +13,7 @@ import numpy as np
 
 from uwb_tdoa_bias.correction.poses import known_yaw_std
 from uwb_tdoa_bias.foundation.compiled import compiled
+from uwb_tdoa_bias.foundation.sensors.sensor import UNKNOWN_VARIANCE
 
 from .core.state import rotation
 
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
     from .results import Odometry
 
 POSE, TWIST = 3 + 4 + 36, 3 + 3 + 36  # numbers in a PoseWithCovariance and in a TwistWithCovariance
-UNKNOWN_RATE = 1e6  # (rad/s)^2, variance of an angular velocity that nothing measured
 
 
 def to_odometry(q: np.ndarray, v: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -110,6 +110,6 @@ def _fill(
                 pose[n, 7 + 6 * i + j] = covariance[n, i, j]
         for i in range(3):
             twist[n, 3 + i] = rates[n, i] if known else 0.0
-            twist[n, 6 + 7 * (3 + i)] = rate_variances[n] if known else UNKNOWN_RATE
+            twist[n, 6 + 7 * (3 + i)] = rate_variances[n] if known else UNKNOWN_VARIANCE
             for j in range(3):
                 twist[n, 6 + 6 * i + j] = covariance[n, 6 + i, 6 + j]

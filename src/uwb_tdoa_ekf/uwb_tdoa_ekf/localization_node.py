@@ -22,6 +22,8 @@ from uwb_tdoa_bias import bias_node
 from uwb_tdoa_bias.bias_node import BiasNode
 from uwb_tdoa_bias.foundation import ros
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.ros_diagnostics import Diagnostics
+from uwb_tdoa_bias.foundation.ros_node import StreamNode
 from uwb_tdoa_bias.foundation.ros_parameters import FROZEN, Parameter, declare_all, files_of, say_unused
 from uwb_tdoa_bias.foundation.ros_streams import Handed, RoundRobin
 
@@ -31,7 +33,7 @@ from .ekf_parameters import names_of_parameters
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
-    from uwb_tdoa_bias.foundation.ros import Report
+    from uwb_tdoa_bias.foundation.ros_diagnostics import Report
 
 PARAMETERS = {
     "tags": Parameter([""], 'namespaces of the tags, below that of this node, e.g. ["tag1", "tag2"]; "" is its own'),
@@ -42,7 +44,7 @@ FIRST, LONGEST = 1.0, 30.0  # s, until the nodes of a tag that have failed are s
 SOUND = 60.0  # s; nodes that lived for so long have failed for the first time again
 
 
-class LocalizationNode(ros.StreamNode):
+class LocalizationNode(StreamNode):
     """Starts the nodes of the tags, and has them take their turns."""
 
     NAME = "localization_node"
@@ -62,7 +64,7 @@ class LocalizationNode(ros.StreamNode):
         self.members = [node for tag in self._tags for node in tag.members]
         say_unused([self, *self.members], files_of(arguments))
         self.turns = RoundRobin(self._tags)
-        self._diagnostics = ros.Diagnostics(self, self._report)
+        self._diagnostics = Diagnostics(self, self._report)
         self.ready = f"ready; tags: {', '.join(tags) or 'one'}"
 
     def _report(self) -> Report:
@@ -98,7 +100,7 @@ class Tag:
         self._began, self._due, self._wait = 0.0, math.inf, 0.0  # s of time.monotonic(); s
 
     @property
-    def members(self) -> list[ros.StreamNode]:
+    def members(self) -> list[StreamNode]:
         """Nodes that are there."""
         return [] if self._pair is None else [self._pair.bias, self._pair.ekf]
 
@@ -147,7 +149,7 @@ class Tag:
         for node in gone:
             node.destroy_node()
 
-    def _replace(self, gone: list[ros.StreamNode]) -> None:
+    def _replace(self, gone: list[StreamNode]) -> None:
         """Have those nodes served that are there, instead of others."""
         assert self._node.spinner is not None  # who takes a turn is spun
         self._node.spinner.replace(gone, self.members)

@@ -14,6 +14,7 @@ from uwb_tdoa_bias.effects import EffectSet
 from .core.aids import STREAMS as AIDS
 from .core.config import FilterConfig
 from .core.hypotheses import yaw_offset
+from .core.measurements import aid_rows, imu_rows, usable_tdoas
 from .core.memory import AID, RESIDUAL, TDOA, joined, structured
 from .core.verdicts import INVALID
 from .frames import poses_of
@@ -21,7 +22,6 @@ from .installed import Installed
 from .pipeline import Pipeline, odometry_of
 from .reorder_buffer import FIRST_AID, IMU_STREAM, TDOA_STREAM, ReorderBuffer
 from .results import VERDICTS, Odometry, Residuals
-from .rows import aid_rows, imu_rows, usable_tdoas
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -21,7 +21,8 @@ from .ekf_parameters import NONE, ODOM
 from .frames import pose_and_twist
 
 if TYPE_CHECKING:
-    from uwb_tdoa_bias.foundation.ros import Epoch, StreamNode
+    from uwb_tdoa_bias.foundation.ros_node import StreamNode
+    from uwb_tdoa_bias.foundation.ros_stamps import Epoch
     from uwb_tdoa_bias.foundation.transforms import Frames
     from .monitoring.status import Status
     from .results import Residuals
@@ -58,7 +59,7 @@ class Outputs:
     StreamOutputs."""
 
     def __init__(self, node: StreamNode, epoch: Epoch, frames: Frames, body: str, publish_tf: str, odom: str) -> None:
-        """epoch : ros.Epoch; frames : transforms.Frames; body, odom : names of frames; publish_tf : of PUBLISH_TF."""
+        """epoch : Epoch; frames : transforms.Frames; body, odom : names of frames; publish_tf : of PUBLISH_TF."""
         self._epoch, self._frames, self._body = epoch, frames, body
         self._odom = odom if publish_tf == ODOM else None
         self.published = self._unplaced = 0  # messages; those in a row for which /tf had no odom -> body

@@ -11,7 +11,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 
 if TYPE_CHECKING:
     from geometry_msgs.msg import PoseWithCovarianceStamped
-    from uwb_tdoa_bias.foundation.ros import Epoch
+    from uwb_tdoa_bias.foundation.ros_stamps import Epoch
 
 LARGEST = 1e16  # the square of what is far for an anchor, m^2
 
@@ -21,7 +21,7 @@ def pose_from_message(
 ) -> tuple[float, np.ndarray, np.ndarray, float, float]:
     """(t s, p (3,) m, covariance (3, 3) m^2, yaw rad, its standard deviation rad) of a PoseWithCovarianceStamped.
 
-    world : name of the world frame; epoch : ros.Epoch; newest : s, stamp of the newest measurement, which a pose without
+    world : name of the world frame; epoch : Epoch; newest : s, stamp of the newest measurement, which a pose without
     stamp has. A coordinate, or the yaw, whose variance is 0 is not told and NaN. Raises InputError.
     """
     frame = message.header.frame_id

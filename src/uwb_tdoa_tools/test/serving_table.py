@@ -24,8 +24,9 @@ from rclpy.experimental import EventsExecutor
 from rclpy.serialization import serialize_message
 from rclpy.task import Future
 from sensor_msgs.msg import FluidPressure, Imu, Range
-from uwb_tdoa_bias.foundation import ros
+from uwb_tdoa_bias.foundation.ros_node import StreamNode
 from uwb_tdoa_bias.foundation.ros_spinning import Spinner
+from uwb_tdoa_bias.foundation.ros_topics import OUTPUT_QOS, STREAM_QOS, unserved, waiting
 from uwb_tdoa_tools.live.processes import own_domain
 
 STREAMS = {Imu: "imu", Range: "tdoa"}
@@ -55,7 +56,7 @@ def publish(stop):
     """1 kHz, 400 Hz and 1 kHz, until told to stop."""
     rclpy.init()
     node = rclpy.create_node("source")
-    publishers = [node.create_publisher(kind, topic, ros.OUTPUT_QOS) for kind, topic in STREAMS.items()]
+    publishers = [node.create_publisher(kind, topic, OUTPUT_QOS) for kind, topic in STREAMS.items()]
     rest = node.create_publisher(FluidPressure, "rest", 10)
     imu, tdoa, pressure = (bytearray(serialize_message(kind())) for kind in (Imu, Range, FluidPressure))
     due, k = time.monotonic(), 0
@@ -89,7 +90,7 @@ class Counted:
 def receive(way, seconds, queue):
     """Receive in one way, and put a line of the table into the queue."""
     rclpy.init()
-    node, late, rest = ros.StreamNode("receiver"), [], [0]
+    node, late, rest = StreamNode("receiver"), [], [0]
 
     def handle(data):
         second, nanosecond = STAMP.unpack_from(data, 4)
@@ -98,31 +99,31 @@ def receive(way, seconds, queue):
     def count(_):
         rest[0] += 1
 
-    def waiting():
-        return [data for each in streams for data, _ in ros.waiting(each)]
+    def arrived():
+        return [data for each in streams for data, _ in waiting(each)]
 
     def fetch():
         some, kept[:] = kept[:], []
         return some
 
     kept = []
-    callback = {"kept": kept.append, "beside": ros.unserved, "spinner": ros.unserved}.get(way, handle)
-    streams = [node.create_subscription(kind, topic, callback, ros.STREAM_QOS, raw=True) for kind, topic in STREAMS.items()]
+    callback = {"kept": kept.append, "beside": unserved, "spinner": unserved}.get(way, handle)
+    streams = [node.create_subscription(kind, topic, callback, STREAM_QOS, raw=True) for kind, topic in STREAMS.items()]
     node.create_subscription(FluidPressure, "rest", count, 10, raw=True)
     stop = Future()
     signal.signal(signal.SIGALRM, lambda *_: stop.set_result(None))
     while node.count_publishers("imu") == 0:
         time.sleep(0.05)
     time.sleep(SETTLE)
-    waiting()
+    arrived()
     cpu, began = time.process_time(), time.monotonic()
     signal.setitimer(signal.ITIMER_REAL, seconds)
     if way == "spinner":
-        Spinner([node], Counted(waiting, handle)).spin(stop)
+        Spinner([node], Counted(arrived, handle)).spin(stop)
     else:
         executor = SingleThreadedExecutor() if way == "single" else EventsExecutor()
         executor.add_node(node)
-        served, turns = 0.0, Counted(waiting if way == "beside" else fetch, handle)
+        served, turns = 0.0, Counted(arrived if way == "beside" else fetch, handle)
         while not stop.done():
             if way in ("single", "events"):
                 executor.spin_until_future_complete(stop, timeout_sec=0.2)

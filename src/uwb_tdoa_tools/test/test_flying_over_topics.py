@@ -10,8 +10,8 @@ pytest.importorskip("uwb_tdoa_msgs.msg", reason="needs the built workspace: ./de
 
 from nav_msgs.msg import Odometry  # noqa: E402
 from rclpy.serialization import serialize_message  # noqa: E402
-from uwb_tdoa_bias.foundation import ros  # noqa: E402
 from uwb_tdoa_bias.foundation.flight import Imu, Tdoas  # noqa: E402
+from uwb_tdoa_bias.foundation.ros_node import StreamNode  # noqa: E402
 from uwb_tdoa_msgs.msg import EstimatorStatus  # noqa: E402
 from uwb_tdoa_tools.flying.over_topics import OverTopics  # noqa: E402
 from uwb_tdoa_tools.flying.simulator import SensorReadings  # noqa: E402
@@ -36,7 +36,7 @@ class Pace:
 def topics():
     """OverTopics at 5 s of simulated time, which knows of a filter that runs, with its pace."""
     rclpy.init()
-    node, pace = ros.StreamNode("vehicle"), Pace()
+    node, pace = StreamNode("vehicle"), Pace()
     made = OverTopics(node, HALL, pace, clock=True)
     none = np.empty(0)
     made.take(SensorReadings(Imu(none, np.empty((0, 3)), np.empty((0, 3))), Tdoas(none, none, none, none, none), {}))

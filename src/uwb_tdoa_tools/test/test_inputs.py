@@ -73,13 +73,15 @@ def test_folders_are_searched_in_order_and_hidden_files_left_out(tmp_path):
 
 
 def test_a_bag_that_no_survey_of_a_folder_fits_keeps_its_own_anchors_and_says_so(tmp_path, surveys, capsys):
-    make(tmp_path / "flights", "bag1/metadata.yaml", "bag1/bag1_0.mcap", "loose.mcap", "old.db3", "0422-log")
+    make(tmp_path / "flights", "bag1/metadata.yaml", "bag1/bag1_0.mcap", "0422-log")
+    for name, magic in (("loose.mcap", b"\x89MCAP0\r\n"), ("old", b"SQLite format 3\0")):  # a bag by what is in it, not by its name
+        (tmp_path / "flights" / name).write_bytes(magic)
     found = find_flights([str(tmp_path / "flights")], surveys)
     assert [(path.name, survey and survey.name) for path, survey in found] == [
         ("0422-log", "anchor_0422.txt"),
         ("bag1", None),
         ("loose.mcap", None),
-        ("old.db3", None),
+        ("old", None),
     ]
     assert find_flights([tmp_path / "flights" / "bag1"]) == [(tmp_path / "flights" / "bag1", None)]
     said = capsys.readouterr().err
@@ -180,6 +182,12 @@ def test_topics_of_bags_are_refused_where_there_is_no_bag(tmp_path, given):
     for read in (reading.one, lambda path: reading.find([path])):
         with pytest.raises(InputError, match="says where topics are in bags, and .*log is none; leave it out"):
             read(tmp_path / "log")
+
+
+def test_a_bag_that_was_not_closed_is_one(tmp_path):
+    make(tmp_path, "bag/bag_0.mcap")
+    with pytest.raises(InputError, match="was not closed"):
+        Reading(namespace="tag1").one(tmp_path / "bag")
 
 
 @pytest.mark.parametrize("kind", ["log", "bag"])

@@ -16,9 +16,11 @@ PACKAGES = ORDER[1:]
 # Who talks ROS. Everything else can be imported and tested without it.
 ROS = """
     uwb_tdoa_bias.anchors_node uwb_tdoa_bias.bias_node
-    uwb_tdoa_bias.foundation.ros uwb_tdoa_bias.foundation.ros_anchors uwb_tdoa_bias.foundation.ros_frames
-    uwb_tdoa_bias.foundation.ros_parameters uwb_tdoa_bias.foundation.ros_spinning
-    uwb_tdoa_bias.foundation.ros_streams uwb_tdoa_bias.foundation.ros_cdr
+    uwb_tdoa_bias.foundation.ros uwb_tdoa_bias.foundation.ros_anchors uwb_tdoa_bias.foundation.ros_cdr
+    uwb_tdoa_bias.foundation.ros_diagnostics uwb_tdoa_bias.foundation.ros_frames uwb_tdoa_bias.foundation.ros_node
+    uwb_tdoa_bias.foundation.ros_parameters
+    uwb_tdoa_bias.foundation.ros_spinning uwb_tdoa_bias.foundation.ros_stamps uwb_tdoa_bias.foundation.ros_streams
+    uwb_tdoa_bias.foundation.ros_topics
     uwb_tdoa_ekf.debias_node uwb_tdoa_ekf.ekf_node uwb_tdoa_ekf.ekf_parameters
     uwb_tdoa_ekf.launching
     uwb_tdoa_ekf.launching_actions uwb_tdoa_ekf.localization_node uwb_tdoa_ekf.outputs
@@ -255,3 +257,18 @@ def test_commands_are_thin(module):
     ]
     assert len(text.splitlines()) - sum(node.end_lineno - node.lineno + 1 for node in imported) <= 118
     assert not re.search(r"(?<!\w)print\(|tqdm\.write", text)  # cli.show and cli.say make text of others printable
+
+
+def test_the_way_of_a_tdoa_is_as_documented():
+    """Files and functions in the table of architecture.md are there."""
+    text = (SRC.parent / "docs/architecture.md").read_text()
+    section = text.split("## One TDOA, from topic to odometry")[1].split("\n## ")[0]
+    rows = re.findall(r"^\|.*\| `([\w/]+\.py)` \| (.*) \|$", section, re.MULTILINE)
+    for file, names in rows:
+        (path,) = (path for package in PACKAGES[:2] if (path := SRC / package / package / file).exists())
+        source = path.read_text()
+        for name in re.findall(r"`(\w+)(?:\.(\w+))?`", names):
+            kind = "class" if name[1] else "def"
+            assert re.search(rf"^\s*{kind} {name[0]}\b", source, re.MULTILINE), (file, name)
+            assert not name[1] or re.search(rf"^    def {name[1]}\b", source, re.MULTILINE), (file, name)
+    assert len(rows) > 20

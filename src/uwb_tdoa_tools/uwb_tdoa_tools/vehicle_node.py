@@ -20,6 +20,7 @@ from std_msgs.msg import String
 from uwb_tdoa_bias.foundation import ros
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS
+from uwb_tdoa_bias.foundation.ros_node import StreamNode
 from uwb_tdoa_bias.foundation.ros_parameters import FROZEN, Parameter, declare_all, files_of, refuse_unknown, say_unused
 from uwb_tdoa_bias.foundation.ros_streams import RoundRobin
 from uwb_tdoa_msgs.srv import GoTo, Land, Takeoff
@@ -51,7 +52,7 @@ PARAMETERS = {  # in the order of config/vehicle_node.yaml
 SETTLE = 1.0  # s from when somebody listens until what they say to each other is heard, too
 
 
-class VehicleNode(ros.StreamNode):
+class VehicleNode(StreamNode):
     """A Trial on topics, and services for who flies it."""
 
     NAME = "vehicle_node"

@@ -8,6 +8,7 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 
 from ..foundation.flight import AIDS
+from ..foundation.sensors.sensor import UNKNOWN_STD, UNKNOWN_VARIANCE
 from .affine import IDENTITY
 
 if TYPE_CHECKING:
@@ -15,8 +16,6 @@ if TYPE_CHECKING:
     from ..foundation.sensors.sensor import Stream
     from .affine import Affine
     from .base import Effect
-
-UNKNOWN = 1e6  # standard deviation at which and above nothing was measured
 
 
 class AidCorrector:
@@ -48,7 +47,7 @@ class AidCorrector:
         if std is None:
             return stream.with_values(undo(stream.values))
         known = np.isfinite(std)  # what was not measured may be anything
-        variance = np.where(known, std, UNKNOWN) ** 2 @ undo.matrix.T**2
-        std = np.where(variance < UNKNOWN, np.sqrt(variance), np.inf)
+        variance = np.where(known, std, UNKNOWN_STD) ** 2 @ undo.matrix.T**2
+        std = np.where(variance < UNKNOWN_VARIANCE, np.sqrt(variance), np.inf)
         corrected: Any = stream.with_values(undo(np.where(known, stream.values, 0.0)))  # its class has a std, as `stream` has
         return replace(corrected, std=std)

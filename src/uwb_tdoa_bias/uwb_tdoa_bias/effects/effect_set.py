@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
@@ -11,19 +11,15 @@ import numpy as np
 import yaml
 
 from ..foundation.errors import InputError
-from ..foundation.flight import AIDS
 from ..foundation.safe_yaml import read_yaml
 from ..foundation.version import written_by
-from .aid_corrector import AidCorrector
 from .base import Effect
 from .catalogue import EFFECTS
 from .covariance import Covariance
 from .fading import LITTLE, faded, in_words
-from .imu_corrector import ImuCorrector
-from .label_error import LabelCorrector
 from .samples import RADIO
 from .smooth_term import SmoothTerm
-from .stamp_error import shifted
+from .stream_corrector import STREAMS, StreamCorrector
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -33,7 +29,6 @@ if TYPE_CHECKING:
     from .sensor_function import SensorFunction
 
 ENTRY = ("values", "std", "source", "domain")
-STREAMS = ("tdoa", "imu", "truth")  # whose stamps are moved, beside those of AIDS
 
 
 @dataclass(frozen=True)
@@ -129,29 +124,10 @@ class EffectSet:
         return sum(effect.stamp_offset(stream) for effect in self.effects)
 
     def correct_streams(self, flight: Flight) -> Flight:
-        """The Flight without the effects' part in ids, signs, stamps, inertial samples, heights and velocities. TDOA biases are
-        the Corrector's."""
-        labels, of = LabelCorrector(self.effects), flight.tdoa
-        if not labels.idle:
-            a, b, d = labels.correct(of.a, of.b, of.d)
-            flight = replace(flight, tdoa=replace(of, a=a, b=b, d=d))
-        for stream in STREAMS:
-            flight = shifted(flight, stream, -self.stamp_offset(stream))
-        flight = self._correct_aids(flight)
-        corrector = ImuCorrector(self.effects)
-        if flight.imu is None or corrector.idle:
-            return flight
-        imu = flight.imu
-        gyro, accel = corrector.correct(imu.t, imu.gyro, imu.accel)
-        return replace(flight, imu=replace(imu, gyro=gyro, accel=accel))
-
-    def _correct_aids(self, flight: Flight) -> Flight:
-        corrector = AidCorrector(self.effects)
-        for stream in AIDS if not corrector.idle else ():
-            part = getattr(flight, stream)
-            if part is not None:
-                flight = flight.replaced(**{stream: corrector.correct(stream, part)})
-        return flight
+        """The Flight without the effects' part in its streams, see StreamCorrector."""
+        corrector = StreamCorrector(self.effects)
+        parts = {name: part for name in STREAMS if (part := getattr(flight, name)) is not None}
+        return flight.replaced(**{name: corrector.correct(name, part) for name, part in parts.items()})
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> EffectSet:

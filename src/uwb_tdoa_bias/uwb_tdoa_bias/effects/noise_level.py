@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .base import Effect
-from .pair_offset import PairOffset
+from .pair_offset import PairOffset, check_pair
 from .wording import listed
 
 if TYPE_CHECKING:
@@ -31,8 +31,11 @@ class NoiseLevel(Effect):
     portable = False
     fitted = False
 
-    check_key = PairOffset.check_key
     groups = PairOffset.groups
+
+    @classmethod
+    def check_key(cls, key: str) -> None:
+        check_pair(cls.name, key)
 
     def noise_std(self, samples: Samples) -> np.ndarray:
         a, b = samples.anchors.ids[samples.a], samples.anchors.ids[samples.b]

@@ -36,8 +36,7 @@ class PairOffset(Effect):
 
     @classmethod
     def check_key(cls, key: str) -> None:
-        if len(key.split("-")) != 2 or not all(part.isdigit() for part in key.split("-")):
-            raise InputError(f"effects: {cls.name}: parameter {key!r} is not a pair of anchors; write '0-1: 0.05'.")
+        check_pair(cls.name, key)
 
     @classmethod
     def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
@@ -71,6 +70,12 @@ class PairOffset(Effect):
             return ()
         links = listed(f"{key.replace('-', ' and ')}" for key in self.significant())
         return (f"Let anchors {links} measure the time of flight between them again: {listed(off)}.",)
+
+
+def check_pair(name: str, key: str) -> None:
+    """Raise InputError for a key of the effect of a name that is no pair of anchors, "a-b"."""
+    if len(key.split("-")) != 2 or not all(part.isdigit() for part in key.split("-")):
+        raise InputError(f"effects: {name}: parameter {key!r} is not a pair of anchors; write for example '0-1'.")
 
 
 def link_keys(pairs: ArrayLike | None) -> tuple[str, ...]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from .label_error import LabelEffect
-from .pair_offset import PairOffset
+from .pair_offset import check_pair
 from .wording import listed
 
 
@@ -23,7 +23,9 @@ class PairSign(LabelEffect):
     reference = "Tdoa.msg: d_ab = |p - b| - |p - a|"
     expected = "-1 for the other sign, or 1"
 
-    check_key = PairOffset.check_key
+    @classmethod
+    def check_key(cls, key: str) -> None:
+        check_pair(cls.name, key)
 
     @staticmethod
     def possible(value: float) -> bool:

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 _FIELDS = {  # of the file, and the kinds of their numbers
     "frame": "U", "lower": "f", "step": "f", "flyable": "b", "bound": "f", "ids": "i", "positions": "f", "planar": "b",
 }  # fmt: skip
+SAME_PLACE = 0.1  # m within which an anchor has not moved
 _REMEDY = "make one with `plan ... --volume`"
 
 
@@ -80,12 +81,12 @@ class FlyableVolume:
         inside = ((cell >= 0) & (cell < self.flyable.shape)).all(axis=-1)
         return inside, tuple(np.moveaxis(np.where(inside[..., None], cell, 0), -1, 0))
 
-    def belongs_to(self, anchors: Anchors, tolerance: float = 0.1) -> bool:
-        """Whether it was computed for these Anchors: the same ids in the same frame, each within `tolerance`, m."""
+    def belongs_to(self, anchors: Anchors) -> bool:
+        """Whether it was computed for these Anchors: the same ids in the same frame, each within SAME_PLACE."""
         rows = anchors.index(self.ids)
         if anchors.frame != self.frame or len(anchors) != len(self.ids) or (rows < 0).any():
             return False
-        return bool((np.linalg.norm(anchors.positions[rows] - self.positions, axis=1) <= tolerance).all())
+        return bool((np.linalg.norm(anchors.positions[rows] - self.positions, axis=1) <= SAME_PLACE).all())
 
     def save(self, path: str | Path) -> None:
         """Write what `load` reads: a numpy .npz file."""

@@ -10,16 +10,16 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from uwb_tdoa_msgs.msg import Anchor, AnchorArray
 
-from . import ros
 from .anchors import Anchors
 from .errors import InputError
 from .ros_parameters import Parameter
+from .ros_topics import Input, Refusals
 from .survey import read_survey
 
 if TYPE_CHECKING:
     from collections.abc import Callable
     from rclpy.event_handler import QoSRequestedIncompatibleQoSInfo
-    from .ros import StreamNode
+    from .ros_node import StreamNode
 
 ANCHORS_QOS = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
@@ -80,9 +80,9 @@ class AnchorsInput:
         self.refused: str | None = None
         self._node, self._on_change, self._file = node, on_change, file
         self._of_file = read_survey(file) if file else None
-        self._repeated: ros.Input | None = None  # the subscription to volatile ones
+        self._repeated: Input | None = None  # the subscription to volatile ones
         events = SubscriptionEventCallbacks(incompatible_qos=self._on_incompatible)
-        self._latched = ros.Input(node, AnchorArray, "uwb/anchors", self._on_message, ANCHORS_QOS, event_callbacks=events)
+        self._latched = Input(node, AnchorArray, "uwb/anchors", self._on_message, ANCHORS_QOS, event_callbacks=events)
 
     def start(self) -> None:
         """Give the anchors of the file, if there is one."""
@@ -91,7 +91,7 @@ class AnchorsInput:
             self._on_change(self.anchors)
 
     @property
-    def refusals(self) -> list[ros.Refusals]:
+    def refusals(self) -> list[Refusals]:
         """Those of each subscription."""
         return [end.refusals for end in (self._latched, self._repeated) if end is not None]
 
@@ -100,7 +100,7 @@ class AnchorsInput:
             self._node.get_logger().warning(
                 "uwb/anchors is not published reliable and transient local: taken when it is repeated"
             )
-            self._repeated = ros.Input(self._node, AnchorArray, "uwb/anchors", self._on_message, ANY_QOS)
+            self._repeated = Input(self._node, AnchorArray, "uwb/anchors", self._on_message, ANY_QOS)
 
     def _on_message(self, message: AnchorArray) -> None:
         try:

@@ -9,15 +9,16 @@ from builtin_interfaces.msg import Time
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from tf2_msgs.msg import TFMessage
 
-from . import ros
 from .errors import InputError
 from .ros_parameters import LONGEST_NAME
 from .ros_cdr import ENCAPSULATION, LENGTH, MOST_ELEMENTS, Unreadable, aligned, check_length, decode, read_text
+from .ros_topics import Input
 from .transforms import Frames
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from geometry_msgs.msg import TransformStamped
+    from .ros_node import StreamNode
 
 TF_QOS = QoSProfile(depth=100)  # what tf2 uses
 MOVING_QOS = QoSProfile(depth=1000)  # 2 s of a robot that publishes it at 500 Hz
@@ -31,17 +32,17 @@ Transform = tuple[int, int, str, str, tuple[float, ...], tuple[float, ...]]  # s
 
 class FramesInput:
     """Frames of /tf_static, and of /tf if they may move: its messages wait until `catch_up`. Of a node that is frozen, the first
-    constant transform of a frame counts. trouble : a transform that is none, or None; refusals : ros.Refusals."""
+    constant transform of a frame counts. trouble : a transform that is none, or None; refusals : Refusals."""
 
     def __init__(
-        self, node: ros.StreamNode, seconds: Callable[[Time], float], on_new: Callable[[], None], moving: bool = False
+        self, node: StreamNode, seconds: Callable[[Time], float], on_new: Callable[[], None], moving: bool = False
     ) -> None:
         """seconds(stamp) : s of a builtin_interfaces/Time; on_new() is called when a constant transform is new."""
         self.frames = Frames()
         self.trouble: str | None = None
         self._node, self._seconds, self._on_new = node, seconds, on_new
-        static = ros.Input(node, TFMessage, "/tf_static", self._on_static, TF_STATIC_QOS, read_transforms)
-        self._moving = [ros.Input(node, TFMessage, "/tf", self._on_moving, MOVING_QOS, read_transforms, served=False)] if moving else []
+        static = Input(node, TFMessage, "/tf_static", self._on_static, TF_STATIC_QOS, read_transforms)
+        self._moving = [Input(node, TFMessage, "/tf", self._on_moving, MOVING_QOS, read_transforms, served=False)] if moving else []
         self.refusals = [end.refusals for end in (static, *self._moving)]
 
     def catch_up(self) -> None:

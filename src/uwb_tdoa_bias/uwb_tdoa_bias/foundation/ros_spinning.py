@@ -12,7 +12,7 @@ from rclpy.impl.implementation_singleton import rclpy_implementation as implemen
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
     from rclpy import Future
-    from .ros import StreamNode
+    from .ros_node import StreamNode
     from .ros_streams import RoundRobin
 
 try:  # not in rclpy before 7.1.4; a message costs a quarter

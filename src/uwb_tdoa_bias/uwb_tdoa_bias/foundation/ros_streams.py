@@ -7,13 +7,14 @@ from typing import Any, Protocol, TYPE_CHECKING
 
 import numpy as np
 
-from . import ros
+from .ros_topics import Refusals, StreamInput, publish_stream, several_publishers
 from .stamps import LARGEST_STEP_BACK
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
-    from .ros import Epoch, Refusals, StreamInput, StreamNode
+    from .ros_node import StreamNode
     from .ros_cdr import Template, CdrCodec
+    from .ros_stamps import Epoch
 
     Take = Callable[[str, np.ndarray, np.ndarray, np.ndarray], None]  # frame, stamps, rows and arrivals
 
@@ -48,10 +49,10 @@ class RoundRobin:
 
 
 class Streams:
-    """Streams of a ros.StreamNode: they hold what arrives until it is taken."""
+    """Streams of a StreamNode: they hold what arrives until it is taken."""
 
     def __init__(self, node: StreamNode, epoch: Epoch, on_taken: Callable[[], None]) -> None:
-        """epoch : ros.Epoch; on_taken() is called after anything was given to those that take it."""
+        """epoch : Epoch; on_taken() is called after anything was given to those that take it."""
         self.inputs: dict[str, StreamInput | Handed] = {}  # by topic, in the order in which they are taken
         self._node, self._epoch, self._on_taken = node, epoch, on_taken
         self._streams: list[_Stream] = []
@@ -73,7 +74,7 @@ class Streams:
     def add(self, wire: CdrCodec, topic: str, take: Take, handed: bool = False) -> None:
         """Subscribe. wire : CdrCodec; take(frame, t, rows, arrival) gets successive messages of one frame: their stamps (n,) s,
         rows (n,) of the CdrCodec, and when they arrived, (n,) s since 1970. handed : a node of this process hands them over."""
-        kind = Handed if handed else ros.StreamInput
+        kind = Handed if handed else StreamInput
         self.inputs[topic] = kind(self._node, wire.kind, topic)
         stream = self._by_topic[topic] = _Stream(wire, take, self.inputs[topic])
         self._streams.append(stream)
@@ -103,7 +104,7 @@ class StreamOutput:
     """Publisher of a stream of messages that templates make."""
 
     def __init__(self, node: StreamNode, kind: type, topic: str) -> None:
-        self.publisher = ros.publish_stream(node, kind, topic)
+        self.publisher = publish_stream(node, kind, topic)
         self._receiver: Handed | None = None
 
     def hand_to(self, receiver: Handed) -> None:
@@ -125,7 +126,7 @@ class Handed:
     lost = 0
 
     def __init__(self, node: StreamNode, kind: type, topic: str) -> None:
-        self.refusals = ros.Refusals(node, topic, kind)  # of none
+        self.refusals = Refusals(node, topic, kind)  # of none
         self._node, self._topic = node, topic
         self._parts: list[Part] = []
 
@@ -148,7 +149,7 @@ class Handed:
 
     def trouble(self, received: int) -> str | None:
         """What is wrong with the stream as ROS sees it, or None."""
-        return ros.several_publishers(self._node, self._topic)
+        return several_publishers(self._node, self._topic)
 
 
 class _Stream:

@@ -120,10 +120,10 @@ class FilterConfig(_SensorParameters):
                 object.__setattr__(self, name, _number(each, value))
 
     @classmethod
-    def from_parameters(cls, parameters: dict[str, Any], warn: Callable[[str], object] | None = None) -> "FilterConfig":
+    def from_parameters(cls, parameters: dict[str, Any]) -> "FilterConfig":
         """Of a dict by name; names that are no parameter of the filter are passed over, old ones taken with a warning
         (see `current_names`). Raises InputError."""
-        parameters = current_names(parameters, warn)
+        parameters = current_names(parameters)
         return cls(**{f.name: parameters[f.name] for f in fields(cls) if f.name in parameters})
 
     @classmethod

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 
-from uwb_tdoa_bias.foundation.ros import Rate
+from uwb_tdoa_bias.foundation.ros_diagnostics import Rate
 from uwb_tdoa_bias.foundation.sensors import LOCATING, SENSORS
 
 from ..streams import ERROR as SEVERE
@@ -18,7 +18,7 @@ from .volume import VolumeCheck
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
     from uwb_tdoa_bias.foundation.flyable import FlyableVolume
-    from uwb_tdoa_bias.foundation.ros import Report
+    from uwb_tdoa_bias.foundation.ros_diagnostics import Report
     from ..core.config import FilterConfig
     from ..estimator import Estimator
     from ..streams.finding import Finding

@@ -14,8 +14,8 @@ import numpy as np
 
 from ..core.config import FilterConfig
 from ..core.engine import feed
+from ..core.measurements import usable_all
 from ..core.memory import IMU_SAMPLE, TDOA, Measurements, new_state, structured
-from ..core.validity import usable_all
 
 if TYPE_CHECKING:
     from ..core.memory import FilterState

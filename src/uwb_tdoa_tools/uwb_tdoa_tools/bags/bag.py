@@ -33,7 +33,7 @@ from uwb_tdoa_bias.foundation.sensors.sensor import LARGEST_NUMBER
 from uwb_tdoa_bias.foundation.version import written_by
 
 from . import messages as bag_messages, placing
-from .files import check_output, is_bag, new_bag, open_bag, readable, remarks_of
+from .files import check_output, new_bag, open_bag, readable, remarks_of
 from .integrity import metadata
 from .mcap import Damaged
 from .message_types import check_type, typestore
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     Topics = dict[str, tuple[str, Qos, Iterable[tuple[int, Any]]]]  # {topic: (type, QoS, (stamp ns, message) in order)}
 
 __all__ = [
-    "Names", "RecordedOdometry", "check_output", "is_bag", "late_tdoas", "read_bag", "read_fields", "read_odometry",
+    "Names", "RecordedOdometry", "check_output", "late_tdoas", "read_bag", "read_fields", "read_odometry",
     "write_bag", "write_odometry",
 ]  # fmt: skip
 

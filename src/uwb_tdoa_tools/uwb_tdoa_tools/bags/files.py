@@ -17,6 +17,7 @@ from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.limits import READ_BYTES, most_unpacked
 
+from ..readers.kind import is_bag
 from ..readers.streams import SALVAGE
 from .integrity import NO_SUM, SUM_KEY, check as check_whole, is_packed, metadata, seal, unpack
 from .mcap import Damaged
@@ -27,7 +28,6 @@ if TYPE_CHECKING:
     from rosbags.interfaces import Connection
 
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
-_FILE_MAGIC = (b"\x89MCAP0\r\n", b"SQLite format 3\0")
 
 
 class BagReader(Reader):
@@ -76,17 +76,6 @@ def check_output(out: str | Path, force: bool = False) -> None:
         raise InputError(f"{out}: exists already; choose another name, or --force to replace it.")
     if out.is_symlink() or not (out / "metadata.yaml").is_file():
         raise InputError(f"{out}: exists and is not a bag, so --force does not replace it; choose another name.")
-
-
-def is_bag(path: str | Path) -> bool:
-    """Whether a path is meant as a bag: a directory with metadata.yaml, .mcap or .db3 files, or such a file."""
-    path = Path(path)
-    if path.is_dir():
-        return any(path.glob("metadata.yaml")) or any(path.glob("*.mcap")) or any(path.glob("*.db3"))
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return file.read(16).startswith(_FILE_MAGIC)
 
 
 @contextmanager

@@ -17,7 +17,7 @@ from rosbags.interfaces import Nodetype
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Imu, Tdoas, Truth
 from uwb_tdoa_bias.foundation.sensors import Sensor, Stream
-from uwb_tdoa_bias.foundation.sensors.sensor import LARGEST_NUMBER, UNKNOWN_VARIANCE
+from uwb_tdoa_bias.foundation.sensors.sensor import LARGEST_NUMBER
 from uwb_tdoa_ekf.frames import pose_and_twist
 
 if TYPE_CHECKING:
@@ -209,7 +209,7 @@ def odometry_messages(odometry: Odometry, frame: str, store: Typestore) -> Itera
     Message, Vector3 = types["nav_msgs/msg/Odometry"], types["geometry_msgs/msg/Vector3"]
     Pose, Twist = types["geometry_msgs/msg/PoseWithCovariance"], types["geometry_msgs/msg/TwistWithCovariance"]
     n = len(odometry)
-    numbers = pose_and_twist(odometry, np.zeros((n, 3)), np.full(n, UNKNOWN_VARIANCE))
+    numbers = pose_and_twist(odometry, np.full((n, 3), np.nan), np.full(n, np.nan))
     for stamp, of_pose, of_twist in zip(nanoseconds("odometry", odometry.t).tolist(), *numbers):
         twist = types["geometry_msgs/msg/Twist"](Vector3(*of_twist[:3]), Vector3(*of_twist[3:6]))
         pose = Pose(pose_of(store, of_pose[:3], of_pose[3:7]), of_pose[7:])

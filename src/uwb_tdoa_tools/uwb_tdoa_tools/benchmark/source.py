@@ -12,8 +12,8 @@ from builtin_interfaces.msg import Time
 from nav_msgs.msg import Odometry
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Imu
-from uwb_tdoa_bias.foundation import ros
 from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS, anchors_to_message
+from uwb_tdoa_bias.foundation.ros_topics import OUTPUT_QOS, publish_stream
 from uwb_tdoa_msgs.msg import AnchorArray, Tdoa
 
 if TYPE_CHECKING:
@@ -36,13 +36,13 @@ class Source:
 
     def __init__(self, node: Node, namespaces: Sequence[str]) -> None:
         self.publishers = {
-            kind: ros.publish_stream(node, kind, topic) for kind, topic in ((Imu, "/imu/data"), (Tdoa, "/uwb/tdoa"))
+            kind: publish_stream(node, kind, topic) for kind, topic in ((Imu, "/imu/data"), (Tdoa, "/uwb/tdoa"))
         }
         self.anchors_sent = 0  # ns since 1970
         self._anchors = node.create_publisher(AnchorArray, "/uwb/anchors", ANCHORS_QOS)
         self.received: list[list[tuple[int, int]]] = [[] for _ in namespaces]  # (arrival, stamp), ns
         self.subscriptions = [  # whose callbacks only run while somebody waits, before and after `play`
-            node.create_subscription(Odometry, f"{space}/odometry", partial(_keep, received), ros.OUTPUT_QOS, raw=True)
+            node.create_subscription(Odometry, f"{space}/odometry", partial(_keep, received), OUTPUT_QOS, raw=True)
             for space, received in zip(namespaces, self.received)
         ]
 

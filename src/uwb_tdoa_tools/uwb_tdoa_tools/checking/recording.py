@@ -15,10 +15,11 @@ from uwb_tdoa_bias.foundation.flight import Imu, Tdoas
 from uwb_tdoa_bias.foundation.sensors import LOCATING, SENSORS
 
 from ..bags import messages as bag_messages, placing
-from ..bags.bag import Names, is_bag, read_anchors, read_topic
+from ..bags.bag import Names, read_anchors, read_topic
 from ..bags.files import open_bag, remarks_of
 from ..bags.placing import TF_STATIC
 from ..readers import read_survey
+from ..readers.kind import is_bag
 
 if TYPE_CHECKING:
     from collections.abc import Callable

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import Protocol, TYPE_CHECKING
+from typing import Any, Protocol, TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_bias.effects import AidCorrector, EffectSet, ImuCorrector, LabelCorrector
+from uwb_tdoa_bias.effects import EffectSet, StreamCorrector
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.frames import poses_of
 from uwb_tdoa_ekf.results import Odometry, concatenated
@@ -65,10 +65,7 @@ class OurFilter:
         """anchors : Anchors; config : FilterConfig; effects : EffectSet, and network : Network, to correct what was measured with, or
         None."""
         effects = effects or EffectSet()
-        self._anchors, self._corrector = anchors, Corrector(anchors, effects, network)
-        self._labels, self._of_imu = LabelCorrector(effects.effects), ImuCorrector(effects.effects)
-        self._of_aids = AidCorrector(effects.effects)
-        self._offset = effects.stamp_offset
+        self._anchors, self._streams, self._corrector = anchors, StreamCorrector(effects.effects), Corrector(anchors, effects, network)
         self._estimator = Estimator(anchors, config, effects=effects)
         self._parts = [NOTHING]
         self._newest: Odometry | None = None
@@ -79,24 +76,25 @@ class OurFilter:
 
     def take(self, measured: SensorReadings) -> None:
         """Take what arrived: SensorReadings."""
-        imu, tdoa = measured.imu, measured.tdoa
-        if len(imu):
-            t, gyro, accel = imu.t - self._offset("imu"), imu.gyro, imu.accel
-            gyro, accel = (gyro, accel) if self._of_imu.idle else self._of_imu.correct(t, gyro, accel)
-            self._estimator.add_imu(t, gyro, accel)
-        if len(tdoa):
-            t, (a, b, d) = tdoa.t - self._offset("tdoa"), self._labels.correct(tdoa.a, tdoa.b, tdoa.d)
-            known = self._corrector.correct(t, self._anchors.index(a), self._anchors.index(b), d)
-            self._estimator.add_tdoa(t, a, b, known.corrected, known.std**2 + tdoa.variance, known.slope, known.state)
-        for stream, part in measured.aids.items():
+        for name, part in measured.streams.items():
             if len(part.t):
-                self._estimator.add(stream, self._of_aids.correct(stream, part))
+                self._add(name, self._streams.correct(name, part))
         odometry, _ = self._estimator.advance()
         if len(odometry):
             self._parts.append(odometry)
             self._newest = odometry
             if not self._corrector.idle:
                 self._corrector.add_pose(*poses_of(odometry))
+
+    def _add(self, name: str, part: Any) -> None:
+        """Give the filter a part of a stream that is corrected, but for the bias of TDOAs."""
+        if name == "imu":
+            self._estimator.add_imu(part.t, part.gyro, part.accel)
+        elif name == "tdoa":
+            known = self._corrector.correct(part.t, self._anchors.index(part.a), self._anchors.index(part.b), part.d)
+            self._estimator.add_tdoa(part.t, part.a, part.b, known.corrected, known.std**2 + part.variance, known.slope, known.state)
+        else:
+            self._estimator.add(name, part)
 
     @property
     def pose(self) -> Pose | None:

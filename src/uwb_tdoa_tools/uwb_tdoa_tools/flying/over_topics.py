@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from builtin_interfaces.msg import Time
 from types import SimpleNamespace
 from typing import Any, TYPE_CHECKING
 
@@ -14,11 +15,11 @@ from rosgraph_msgs.msg import Clock
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu
 from uwb_tdoa_bias.anchors_node import markers, transforms
-from uwb_tdoa_bias.foundation import ros
 from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS, anchors_to_message
 from uwb_tdoa_bias.foundation.ros_cdr import CdrCodec, message_class
 from uwb_tdoa_bias.foundation.ros_frames import TF_STATIC_QOS
 from uwb_tdoa_bias.foundation.ros_streams import StreamOutput
+from uwb_tdoa_bias.foundation.ros_topics import Input, OUTPUT_QOS, StreamInput
 from uwb_tdoa_bias.foundation.sensors import SENSORS
 from uwb_tdoa_ekf.results import Odometry
 from uwb_tdoa_msgs.msg import EstimatorStatus, Tdoa
@@ -29,8 +30,8 @@ from .vehicle import ATTITUDE, POSITION
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from builtin_interfaces.msg import Time
     from uwb_tdoa_bias.foundation.ros_cdr import Template
+    from uwb_tdoa_bias.foundation.ros_node import StreamNode
     from .mission import Pose
     from .pace import Lockstep, RealTime
     from .simulator import SensorReadings
@@ -54,8 +55,8 @@ class OverTopics:
     """See `estimates.OurFilter`. deviation : m, as there; inf unless the filter says that it is running; status : EstimatorStatus, the
     newest, or None."""
 
-    def __init__(self, node: ros.StreamNode, world: World, pace: RealTime | Lockstep, clock: bool) -> None:
-        """node : ros.StreamNode; world : World; pace : of `pace`, which is told what goes and comes; clock : publish /clock, and count
+    def __init__(self, node: StreamNode, world: World, pace: RealTime | Lockstep, clock: bool) -> None:
+        """node : StreamNode; world : World; pace : of `pace`, which is told what goes and comes; clock : publish /clock, and count
         stamps from 0, not from now."""
         self._node, self._pace, self._anchors = node, pace, world.anchors
         self._begin = 0 if clock else None  # ns, stamp of the start; of now without /clock
@@ -65,10 +66,10 @@ class OverTopics:
         self._outputs = {name: _Output(node, *STREAMS[name]) for name in ("imu", "tdoa", *world.aids)}
         self._truth = _Output(node, *STREAMS["truth"], frame=self._anchors.frame)
         self._clock = node.create_publisher(Clock, "/clock", 10) if clock else None
-        self._pose = node.create_publisher(PoseWithCovarianceStamped, "initialpose", ros.OUTPUT_QOS)
+        self._pose = node.create_publisher(PoseWithCovarianceStamped, "initialpose", OUTPUT_QOS)
         self._wire = CdrCodec(OdometryMessage, "pose", "twist")
-        self._odometry = ros.StreamInput(node, OdometryMessage, "odometry")
-        self._status = ros.Input(node, EstimatorStatus, "status", self._on_status, ANCHORS_QOS)
+        self._odometry = StreamInput(node, OdometryMessage, "odometry")
+        self._status = Input(node, EstimatorStatus, "status", self._on_status, ANCHORS_QOS)
         anchors = anchors_to_message(self._anchors)
         for topic, qos, content in (
             ("/tf_static", TF_STATIC_QOS, transforms(anchors)),
@@ -183,14 +184,14 @@ class OverTopics:
 
     def _stamp(self, t: float) -> Time:
         second, nanosecond = self._parts(np.array([t]))
-        return ros.Time(sec=int(second[0]), nanosec=int(nanosecond[0]))
+        return Time(sec=int(second[0]), nanosec=int(nanosecond[0]))
 
 
 class _Output:
     """A stream of which only some fields are not 0. subscribers : how many hear it."""
 
     def __init__(
-        self, node: ros.StreamNode, topic: str, kind: type, content: Callable[[Any], dict[str, np.ndarray]],
+        self, node: StreamNode, topic: str, kind: type, content: Callable[[Any], dict[str, np.ndarray]],
         frame: str = BODY_FRAME,
     ) -> None:  # fmt: skip
         self._content, self._kind, self._frame = content, kind, frame

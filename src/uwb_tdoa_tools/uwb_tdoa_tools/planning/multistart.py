@@ -9,17 +9,18 @@ from uwb_tdoa_bias.foundation.geometry import ranges
 SWEEPS = 40
 SOLVED = 1e-9  # m, residual of a solution
 APART = 3e-4  # of the anchors' extent: two solutions nearer than this are one
+DIRECTIONS = 12  # of the starts in a plane; in space three times as many
 RADII = (0.03, 0.1, 0.3, 0.7, 1.5, 4.0, 12.0, 40.0, 150.0)  # of the starts, over the anchors' extent
 
 
-def solutions(points: np.ndarray, corners: np.ndarray, dimensions: int, directions: int = 12) -> np.ndarray:
+def solutions(points: np.ndarray, corners: np.ndarray, dimensions: int) -> np.ndarray:
     """All positions that a solver finds with the TDOAs that k + 1 anchors have at each point.
 
     points : (n, 3) m; corners : (k + 1, 3) anchors, m; dimensions : k. Levenberg-Marquardt on the k TDOAs from starts
     in many directions and distances. Returns (n, s, k), a row per start, NaN where it did not end in a solution."""
     centre = corners[:, :dimensions].mean(axis=0)
     extent = np.linalg.norm(corners - corners.mean(axis=0), axis=1).max()
-    rays = _directions(directions, dimensions)
+    rays = _directions(dimensions)
     starts = centre + extent * np.concatenate([radius * rays for radius in RADII])
     x: np.ndarray = np.tile(starts, (len(points), 1))
     heights = np.repeat(points[:, 2:], len(starts), axis=0)[:, : 3 - dimensions]
@@ -70,11 +71,11 @@ def _tdoas(x: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return distance[:, 1:] - distance[:, :1], unit[:, 1:] - unit[:, :1]
 
 
-def _directions(count: int, dimensions: int) -> np.ndarray:
-    """Unit vectors spread evenly: (count, 2) in the plane, or a Fibonacci sphere of (3 count, 3)."""
+def _directions(dimensions: int) -> np.ndarray:
+    """Unit vectors spread evenly: (DIRECTIONS, 2) in the plane, or a Fibonacci sphere of (3 DIRECTIONS, 3)."""
     if dimensions == 2:
-        angle = 2.0 * np.pi * (np.arange(count) + 0.31) / count
+        angle = 2.0 * np.pi * (np.arange(DIRECTIONS) + 0.31) / DIRECTIONS
         return np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    k = np.arange(3 * count) + 0.5
-    z, angle = 1.0 - 2.0 * k / (3 * count), np.pi * (1.0 + np.sqrt(5.0)) * k
+    k = np.arange(3 * DIRECTIONS) + 0.5
+    z, angle = 1.0 - 2.0 * k / (3 * DIRECTIONS), np.pi * (1.0 + np.sqrt(5.0)) * k
     return np.column_stack([np.sqrt(1.0 - z**2) * np.cos(angle), np.sqrt(1.0 - z**2) * np.sin(angle), z])

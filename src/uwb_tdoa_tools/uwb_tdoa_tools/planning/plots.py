@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 HULL, ENVELOPE, FLYABLE = "magenta", "tab:green", "#ffe680"
 _MOST_LAYERS = 3
+ACROSS = 9  # ellipses along the longer side of a map
 TITLE: dict[str, Any] = {"fontsize": 9, "pad": 12.0}  # above anchors on the upper edge, and their labels
 
 
@@ -215,9 +216,9 @@ def _anchors(ax: Axes, anchors: Anchors) -> None:
         ax.annotate(names, place, xytext=(3, 3), textcoords="offset points", fontsize=7, color="r")
 
 
-def _ellipses(ax: Axes, chart: Chart, k: int, across: int = 9) -> int:
+def _ellipses(ax: Axes, chart: Chart, k: int) -> int:
     """99 % ellipses of some cells inside the hull, enlarged so that they can be seen. Returns by how much."""
-    every = max(1, max(chart.grid.shape[:2]) // across)
+    every = max(1, max(chart.grid.shape[:2]) // ACROSS)
     rows = np.zeros(chart.grid.shape, bool)
     rows[every // 2 :: every, every // 2 :: every, k] = True
     rows = rows.ravel() & chart.hull & np.isfinite(chart.error)

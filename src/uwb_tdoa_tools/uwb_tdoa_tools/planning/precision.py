@@ -127,9 +127,9 @@ def dilution(points: np.ndarray, installation: Installation) -> np.ndarray:
     return np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
 
 
-def ellipses(covariance: np.ndarray, share: float = 0.99) -> tuple[np.ndarray, np.ndarray]:
-    """Ellipses that hold `share` of the estimates in the xy plane: (semi-axes (n, 2) m, the longer first; angle (n,)
+def ellipses(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Ellipses that hold 99 % of the estimates in the xy plane: (semi-axes (n, 2) m, the longer first; angle (n,)
     rad of the longer one from x)."""
     values, vectors = np.linalg.eigh(covariance[:, :2, :2])
-    axes = np.sqrt(-2.0 * np.log(1.0 - share) * values[:, ::-1])
+    axes = np.sqrt(-2.0 * np.log(1.0 - 0.99) * values[:, ::-1])
     return axes, np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.files import read_head
 
+from .kind import is_bag, reader_of
 from .names import read_survey
-from .usd_log import MAGIC, read_usd_log
-from .util_csv import GZIP_MAGIC, is_util_csv, read_util_csv
+from .usd_log import read_usd_log
+from .util_csv import read_util_csv
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from uwb_tdoa_bias.foundation.anchors import Anchors
     from uwb_tdoa_bias.foundation.flight import Flight
 
 __all__ = ["read_flight", "read_survey", "read_usd_log", "read_util_csv"]
-ROS_1 = b"#ROSBAG V2.0"  # what a bag of ROS 1 begins with
 
 
 def read_flight(
@@ -37,7 +34,7 @@ def read_flight(
     truth : read the ground truth, where there is one.
     Raises InputError.
     """
-    from ..bags.bag import is_bag, read_bag  # here, because bags need the rosbags library and the others do not
+    from ..bags.bag import read_bag  # here, because bags need the rosbags library and the others do not
 
     path = Path(path)
     if not path.exists():
@@ -46,7 +43,7 @@ def read_flight(
         return read_bag(path, namespace, _anchors(survey), salvage, topics, truth)
     if path.is_dir():
         raise InputError(f"{path}: is a directory without metadata.yaml; give a bag directory or a file.")
-    reader, anchors = _reader(path), _anchors(survey)
+    reader, anchors = reader_of(path), _anchors(survey)
     if anchors is None:
         raise InputError(f"{path}: does not say where the anchors are; give a survey file (--survey FILE).")
     return reader(path, anchors, salvage, truth)
@@ -54,26 +51,3 @@ def read_flight(
 
 def _anchors(survey: str | Path | Anchors | None) -> Anchors | None:
     return read_survey(survey) if isinstance(survey, (str, Path)) else survey
-
-
-def _reader(path: Path) -> Callable[[Path, Anchors, bool, bool], Flight]:
-    head = read_head(path, 1 << 16)
-    if head[0] == MAGIC:
-        return read_usd_log
-    if head.startswith(GZIP_MAGIC):
-        try:
-            head = zlib.decompressobj(zlib.MAX_WBITS | 16).decompress(head, 1 << 16)
-        except zlib.error as error:
-            raise InputError(f"{path}: the gzip data is damaged ({error}); copy the file again.") from error
-    first = head.split(b"\n", 1)[0]
-    if is_util_csv(first.decode("utf-8", "replace")):
-        return read_util_csv
-    if head.startswith(ROS_1):
-        raise InputError(
-            f"{path}: is a bag of ROS 1: make a ROS 2 bag of it, rosbags-convert --src {path} --dst NAME, or of messages that only their makers "
-            "have CSV files for convert --columns."
-        )
-    raise InputError(
-        f"{path}: is of no known kind (it starts with {head[:16]!r}); a micro-SD log starts with byte 0xBC, a UTIL CSV "
-        "file with a header line with t_tdoa, and a bag is a directory with metadata.yaml."
-    )

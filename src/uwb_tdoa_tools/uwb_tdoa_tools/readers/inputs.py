@@ -16,6 +16,7 @@ from uwb_tdoa_bias.foundation.sensors import LOCATING
 
 from .. import parallel
 from . import read_flight
+from .kind import is_bag
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -57,7 +58,7 @@ def find_flights(
 
 def _survey_of(path: Path, survey: str | Path | None) -> str | Path | None:
     """The survey of a recording, or None for a bag whose own anchors count; what counts for a bag is told once."""
-    if survey is None or not _is_bag(path):
+    if survey is None or not is_bag(path):
         return survey_for(path, survey)
     try:
         its_survey = survey_for(path, survey)
@@ -121,7 +122,7 @@ class Reading:
         """Pairs (recording, survey or None), see `find_flights`; none of no paths. Raises InputError where topics of bags are named, and
         there is no bag."""
         found = find_flights(paths, self.survey, absolute)
-        if found and not any(_is_bag(path) for path, _ in found):
+        if found and not any(is_bag(path) for path, _ in found):
             self._refuse_topics(found[0][0])
         return found
 
@@ -140,7 +141,7 @@ class Reading:
     def one(self, path: str | Path) -> Flight:
         """Flight of one recording."""
         path = Path(path)
-        if not _is_bag(path):
+        if path.exists() and not is_bag(path):
             self._refuse_topics(path)
         return self.read((path, _survey_of(path, self.survey)))
 
@@ -167,12 +168,9 @@ class Reading:
         return [read[number] for number in sorted(read)]
 
 
-def _is_bag(path: Path) -> bool:
-    return path.suffix in (".mcap", ".db3") or (path / "metadata.yaml").exists()
-
-
 def _recordings(path: Path) -> Iterator[Path]:
-    if path.is_file() or _is_bag(path):
+    """Recordings in a folder, at any depth, or a path that is one. Bags that are files may lie in a folder, as other files do."""
+    if path.is_file() or (path / "metadata.yaml").exists():
         yield path
         return
     for inside in sorted(path.iterdir()):

@@ -8,11 +8,9 @@ from typing import Any
 import numpy as np
 
 from ..later import rotations
-from .sensor import UNKNOWN_VARIANCE, Compared, Sensor, Stream, finite, parameter
+from .sensor import UNKNOWN_STD, UNKNOWN_VARIANCE, Compared, Sensor, Stream, finite, parameter
 
 FASTEST = 100.0  # m/s
-UNKNOWN = 1e6  # m/s, standard deviation of a component that is not measured, for the filter
-UNMEASURED = 1e6  # (m/s)^2, variance in a message at which and above nothing was measured
 LEAST_STD = 0.01  # m/s, that a simulated velocity says of itself
 
 
@@ -35,7 +33,7 @@ class Velocity(Stream):
 
 def _columns(fields: dict) -> tuple:
     variance = fields["twist.covariance"][:, [0, 7, 14]]
-    known = (variance >= 0.0) & (variance < UNMEASURED)
+    known = (variance >= 0.0) & (variance < UNKNOWN_VARIANCE)
     return fields["twist.twist.linear"], np.sqrt(np.where(known, variance, np.inf))
 
 
@@ -56,7 +54,7 @@ def _measured(velocity: Velocity) -> tuple[dict, np.ndarray]:
     v, std = velocity.v, velocity.std
     known = np.isfinite(std)
     sane = np.where(known, (np.abs(v) < FASTEST) & (std > 0.0), True).all(axis=1)
-    rows = {"value": np.where(known, v, 0.0), "std": np.where(known, std, UNKNOWN)}
+    rows = {"value": np.where(known, v, 0.0), "std": np.where(known, std, UNKNOWN_STD)}
     return rows, sane & known.any(axis=1) & ~np.isnan(std).any(axis=1)
 
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from uwb_tdoa_ekf.core.validity import FARTHEST, LARGEST_ERROR, STEEPEST, usable, usable_all, usable_slopes
+from uwb_tdoa_ekf.core.measurements import FARTHEST, LARGEST_ERROR, STEEPEST, usable, usable_all, usable_slopes
 
 POSITIONS = np.array([[0.0, 0.0, 0.0], [3.0, 4.0, 0.0], [0.0, 0.0, 2.0]])
 CASES = [

@@ -1,16 +1,52 @@
-"""Which measurements cannot be any."""
+"""Measurements as the core takes them, and which of them cannot be any."""
 
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_bias.foundation.compiled import compiled
+from uwb_tdoa_bias.foundation.sensors import SENSORS
+
+from .aids import STREAMS
+from .memory import AID, IMU_SAMPLE, structured
+
+if TYPE_CHECKING:
+    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from uwb_tdoa_bias.foundation.sensors import Stream
+    from ..installed import Installed
 
 MAX_RATE, MAX_ACCEL = 100.0, 1000.0  # rad/s, m/s^2: beyond what any inertial sensor reads
 STEEPEST, FARTHEST = 1e3, 1e6  # m per m or m/s, and m or m/s, of what a bias changes with
 LARGEST_ERROR = 1.0  # m by which |d_ab| may exceed the distance between a and b
+
+
+def imu_rows(t: np.ndarray, gyro: np.ndarray, accel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(n,) of IMU_SAMPLE, and (n,) bool: usable; of t (n,) s, gyro (n, 3) rad/s, accel (n, 3) m/s^2, body."""
+    rows = structured(IMU_SAMPLE, t, gyro, accel)
+    return rows, usable_imu(rows["t"], rows["gyro"], rows["accel"])
+
+
+def usable_tdoas(rows: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    """(n,) bool: which of (n,) of TDOA can be measurements among anchors at (N, 3) m."""
+    usable = usable_all(rows["a"], rows["b"], rows["d"], rows["variance"], positions) & np.isfinite(rows["t"])
+    return usable & usable_slopes(rows["slope"], rows["state"])
+
+
+def aid_rows(name: str, stream: Stream, anchors: Anchors | Installed) -> tuple[np.ndarray, np.ndarray]:
+    """(n,) of AID, and (n,) bool: usable; of the Stream of a sensor among Anchors."""
+    columns, usable = SENSORS[name].measured(stream)
+    rows = np.zeros(len(stream), AID)
+    rows["t"], rows["kind"] = stream.t, STREAMS.index(name)
+    if "anchor" in columns:
+        columns["anchor"] = anchors.index(columns["anchor"])
+        usable &= columns["anchor"] >= 0
+    for field, values in columns.items():
+        target = rows[field]
+        target[(slice(None), *map(slice, values.shape[1:]))] = values
+    return rows, usable & np.isfinite(stream.t)
 
 
 @compiled
