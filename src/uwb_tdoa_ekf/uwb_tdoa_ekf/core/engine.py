@@ -150,10 +150,8 @@ def _on_tdoa(
         residual.verdict = REPEATED
         return
     initialization.remember(ekf, tdoa, anchors)
-    t, was_running = tdoa.t, ekf.running
-    if not was_running or not _advance(ekf, parameters, t, records):
-        if not was_running:
-            _wait_for_start(ekf, anchors, parameters, t, records)
+    t = tdoa.t
+    if not _reach(ekf, anchors, parameters, t, records):
         return
     before = ekf.unsure_until
     _before_update(ekf, anchors, parameters, t, records)
@@ -177,10 +175,8 @@ def _on_range(
         return
     if ranges.pair(ekf, aid):
         initialization.remember(ekf, ekf.paired[0], anchors)
-    t, was_running = aid.t, ekf.running
-    if not was_running or not _advance(ekf, parameters, t, records):
-        if not was_running:
-            _wait_for_start(ekf, anchors, parameters, t, records)
+    t = aid.t
+    if not _reach(ekf, anchors, parameters, t, records):
         return
     _before_update(ekf, anchors, parameters, t, records)
     anchor, innovation = anchors[aid.anchor], ekf.innovation
@@ -249,6 +245,15 @@ def _on_aid(
         aids.observe(ekf, parameters, aid, residual, records)
     else:
         aids.record(ekf, aid)
+
+
+@compiled
+def _reach(ekf: Record, anchors: np.ndarray, parameters: Record, t: float, records: np.ndarray) -> bool:
+    """A TDOA or range stamped t, s, has come: predict a filter that runs, or wait for its start. Returns whether it runs at t."""
+    if not ekf.running:
+        _wait_for_start(ekf, anchors, parameters, t, records)
+        return False
+    return _advance(ekf, parameters, t, records)
 
 
 @compiled
