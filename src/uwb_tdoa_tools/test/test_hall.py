@@ -126,7 +126,7 @@ def test_an_anchor_that_stands_apart_from_the_others_is_named_even_if_the_tape_a
 def test_check_tries_few_exchanges_of_ids_in_a_hall(sound, monkeypatch):
     runs, whole = [], OrderedRecording.of(of_flight(sound))
     brief, judged = whole.part(SHORT), OrderedRecording.unexplained
-    monkeypatch.setattr(OrderedRecording, "unexplained", lambda recording: runs.append(recording) or judged(recording))
+    monkeypatch.setattr(OrderedRecording, "unexplained", lambda recording, *limit: runs.append(recording) or judged(recording, *limit))
     assert not list(tdoa_rules.swapped(whole)) and not runs
     ids, times = np.unique(np.concatenate([brief.tdoa.a, brief.tdoa.b]), return_counts=True)
     one, two = ids[np.argsort(-times)][[0, 5]].tolist()

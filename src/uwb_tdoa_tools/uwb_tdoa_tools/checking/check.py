@@ -181,7 +181,7 @@ def _misfit(fit: SurveyFit) -> Iterator[Finding]:
     """A survey that fits much better with its anchors elsewhere, and not with one of them alone."""
     gain = tdoa_rules.gained(fit)
     if gain is not None:
-        heard, (_, anchors) = fit.heard, fit.solve()
+        heard, (_, anchors) = fit.heard, fit.all_moved
         evidence = f"{100.0 * gain / fit.before:.0f} % less stays unexplained with the anchors elsewhere, "
         evidence += f"by {np.median(displacement(fit.positions[heard], anchors[heard])):.1f} m in the median"
         cause = "the survey does not fit: of another room, or anchors have been moved"
