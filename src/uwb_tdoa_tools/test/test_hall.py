@@ -43,7 +43,7 @@ def sound():
             radio_reach=18.0,
             bias=False,
             protocol="tdoa3",
-            duration=180.0,
+            duration=120.0,
             speed=3.0,
             imu_rate=100.0,
             truth_rate=50.0,
@@ -73,7 +73,7 @@ def test_an_anchor_that_is_late_and_one_that_was_moved_are_named_and_nothing_els
 
 def test_columns_of_some_anchors_are_made_of_their_tdoas_alone(sound):
     part = residuals(sound, GroundTruth(), EffectSet())["tdoa"]
-    knots = (0.0, 60.0, 180.0)
+    knots = (0.0, 40.0, 120.0)
     for effect, keys in (
         (EFFECTS["anchor_delay"](), ("38", "40")),
         (EFFECTS["anchor_position"](), ("38.x", "50.z")),
