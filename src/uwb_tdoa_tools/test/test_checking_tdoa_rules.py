@@ -84,7 +84,7 @@ def test_the_part_that_is_tried_is_where_the_tag_moves():
 
 def test_ids_are_not_tried_where_the_tag_stands():
     hovering = OrderedRecording.of(recording(10, trajectory="hover"))
-    assert spread(tdoa_rules.survey_fit(hovering).places) < SPREAD
+    assert spread(hovering.survey_fit.places) < SPREAD
     assert list(tdoa_rules.swapped(hovering)) == []
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..core.memory import new_state
+from ..core.memory import TDOA, new_state, structured
 from ..streams import ERROR, Finding
 from ..streams.explain import Unexplained, compare, innovations
 
@@ -49,7 +49,7 @@ class SignWatch:
         t, a, b, d = t[rows], self._anchors.index(a[rows]), self._anchors.index(b[rows]), d[rows]
         self._stamps.append(t)
         for state, kept, sign in zip(self._states, self._innovations, (1.0, -1.0)):
-            kept.append(innovations(state, t, a, b, sign * d, self._anchors.positions))
+            kept.append(innovations(state, structured(TDOA, t, a, b, sign * d), self._anchors.positions))
         self._test()
 
     def _test(self) -> None:

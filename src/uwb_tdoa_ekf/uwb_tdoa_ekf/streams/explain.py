@@ -14,8 +14,8 @@ import numpy as np
 
 from ..core.config import FilterConfig
 from ..core.engine import feed
-from ..core.measurements import usable_all
-from ..core.memory import IMU_SAMPLE, TDOA, Measurements, new_state, structured
+from ..core.measurements import usable_tdoas
+from ..core.memory import IMU_SAMPLE, Measurements, new_state
 
 if TYPE_CHECKING:
     from ..core.memory import FilterState
@@ -25,7 +25,7 @@ BLOCK = 2.0  # s
 SETTLE = 2.0  # s from the first TDOA on that do not count: the start is being found
 FEW, LEAST = 10, 4  # TDOAs of a block that say nothing, and blocks that do
 CONFIG = FilterConfig(use_imu=False)
-_NO_IMU = np.empty(0, IMU_SAMPLE)
+NO_IMU = np.empty(0, IMU_SAMPLE)
 
 
 @dataclass(frozen=True)
@@ -39,9 +39,7 @@ class Unexplained:
         """t (n,) s, rising; innovation (n,) m, not finite where the TDOA was of no use: that explains nothing."""
         if not len(t):
             return cls({})
-        square = np.where(np.isfinite(innovation), innovation, np.inf) ** 2
-        loss = 1.0 - SCALE**2 / (SCALE**2 + square)
-        number = np.floor((t - t[0] - SETTLE) / BLOCK).astype(np.int64)
+        loss, number = _loss(innovation), _numbers(t)
         counted = number >= 0
         numbers, rows = np.unique(number[counted], return_inverse=True)
         count = np.bincount(rows, minlength=len(numbers))
@@ -65,17 +63,41 @@ def compare(one: Unexplained, other: Unexplained) -> tuple[float, float]:
     return float(np.mean(b) / max(np.mean(a), 1e-9)), float(np.mean(a - b) / max(error, 1e-9))
 
 
-def unexplained(t: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray, positions: np.ndarray) -> Unexplained:
-    """Unexplained of TDOAs in order of their stamps: t (n,) s; a, b (n,) rows of positions (N, 3) m; d (n,) m."""
-    return Unexplained.of(t, innovations(new_state(positions), t, a, b, d, positions))
+def unexplained(
+    tdoa: np.ndarray, positions: np.ndarray, imu: np.ndarray = NO_IMU, config: FilterConfig = CONFIG, limit: float = math.inf
+) -> Unexplained:
+    """Unexplained of (n,) of TDOA between anchors at (N, 3) m, by a filter with a FilterConfig. imu : (m,) of IMU_SAMPLE that it uses,
+    too. Both in the order of their stamps. limit : as soon as it is certain that the mean loss is above it, Unexplained without a block."""
+    t, state, parameters = tdoa["t"], new_state(positions), config.parameters()
+    number = _numbers(t)
+    edges = np.append(np.unique(number, return_index=True)[1], len(t))  # of blocks, and of what is before the first one
+    counted = (np.diff(edges) > FEW) & (number[edges[:-1]] >= 0)
+    of_imu = 0, *imu["t"].searchsorted(t[edges[1:-1]]), len(imu)  # those before the first TDOA of each
+    most, loss, out = limit * (1.0 + 1e-9) * np.count_nonzero(counted), 0.0, np.empty(len(t))
+    for k, (first, end) in enumerate(zip(edges, edges[1:])):
+        out[first:end] = innovations(state, tdoa[first:end], positions, imu[of_imu[k] : of_imu[k + 1]], parameters)
+        loss += float(np.mean(_loss(out[first:end]))) if counted[k] else 0.0
+        if loss > most:
+            return Unexplained({})
+    return Unexplained.of(t, out)
 
 
 def innovations(
-    state: FilterState, t: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray, positions: np.ndarray
+    state: FilterState, tdoa: np.ndarray, positions: np.ndarray, imu: np.ndarray = NO_IMU, parameters: np.ndarray = CONFIG.parameters()
 ) -> np.ndarray:
-    """(n,) m of TDOAs as for `unexplained`, NaN where one is of no use, by the filter of a FilterState, which goes on from there."""
-    out, no_variance = np.full(len(t), np.nan), np.zeros(len(t))
-    good = usable_all(a, b, d, no_variance, positions)
-    measured = Measurements(_NO_IMU, structured(TDOA, t, a, b, d, no_variance)[good])
-    out[good] = feed(state, CONFIG.parameters(), measured)[1]["innovation"]
+    """(n,) m of TDOAs as for `unexplained`, NaN where one is of no use, by the filter of a FilterState, which goes on from there.
+    parameters : (1,) of config.PARAMETERS."""
+    out, good = np.full(len(tdoa), np.nan), usable_tdoas(tdoa, positions)
+    out[good] = feed(state, parameters, Measurements(imu, tdoa[good]))[1]["innovation"]
     return out
+
+
+def _numbers(t: np.ndarray) -> np.ndarray:
+    """(n,) numbers of the blocks in which stamps t (n,) s, rising, are; negative before the first one."""
+    return np.floor((t - t[:1] - SETTLE) / BLOCK).astype(np.int64)
+
+
+def _loss(innovation: np.ndarray) -> np.ndarray:
+    """(n,), 0 to 1, of innovations (n,) m; not finite: 1."""
+    square = np.where(np.isfinite(innovation), innovation, np.inf) ** 2
+    return 1.0 - SCALE**2 / (SCALE**2 + square)

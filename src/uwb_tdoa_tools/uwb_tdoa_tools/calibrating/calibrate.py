@@ -15,7 +15,6 @@ from uwb_tdoa_ekf.streams import ERROR
 
 from ..checking.ordered import OrderedRecording
 from ..checking.survey_fit import displacement
-from ..checking.tdoa_rules import survey_fit
 from ..diagnosis import diagnose, output
 from ..diagnosis.self_calibration import Tape, self_calibrate
 from ..diagnosis.self_calibration.equations import measured_noise, slow_innovations
@@ -70,7 +69,7 @@ def stopping(recording: Recording, findings: Iterable[Finding], std: float) -> l
     as much as a tape may be off. std : m, of a coordinate."""
     errors = [finding for finding in findings if finding.severity == ERROR]
     if any(finding.rule == MISFIT for finding in errors):
-        fit = survey_fit(OrderedRecording.of(recording))
+        fit = OrderedRecording.of(recording).survey_fit
         if np.median(displacement(fit.positions, fit.solve()[1])) <= OFF * std:
             errors = [finding for finding in errors if finding.rule != MISFIT]
     return errors

@@ -154,13 +154,13 @@ def _tried(ordered: OrderedRecording, names: set[str], others: Sequence[Survey])
         if finding is None:
             break
         found.append(finding)
-    fit = tdoa_rules.survey_fit(ordered)
+    fit = ordered.survey_fit
     blamed = [finding for finding in found if finding.rule in BLAMED]
     if not found:
         found += _misfit(fit)
     elif blamed and tdoa_rules.gained(fit) is not None:  # what was put right did not make it fit
         found = [finding for finding in found if finding not in blamed]
-        found += [*_misfit(tdoa_rules.survey_fit(given))] or [*_misfit(fit)]
+        found += [*_misfit(given.survey_fit)] or [*_misfit(fit)]
     if ordered.imu is not None and not names & WITHOUT_IMU and not any(f.rule == "survey_misfit" for f in found):
         finding = imu_rules.fit(ordered)
         found += [finding] if finding else []
@@ -181,7 +181,7 @@ def _misfit(fit: SurveyFit) -> Iterator[Finding]:
     """A survey that fits much better with its anchors elsewhere, and not with one of them alone."""
     gain = tdoa_rules.gained(fit)
     if gain is not None:
-        heard, (_, anchors) = fit.heard, fit.solve()
+        heard, (_, anchors) = fit.heard, fit.all_moved
         evidence = f"{100.0 * gain / fit.before:.0f} % less stays unexplained with the anchors elsewhere, "
         evidence += f"by {np.median(displacement(fit.positions[heard], anchors[heard])):.1f} m in the median"
         cause = "the survey does not fit: of another room, or anchors have been moved"

@@ -15,10 +15,10 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.flight import Imu
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.offline import run_offline
+from uwb_tdoa_ekf.core.measurements import imu_rows
+from uwb_tdoa_ekf.core.memory import TDOA, structured
 from uwb_tdoa_ekf.streams import ERROR, Finding
-
-from uwb_tdoa_ekf.streams.explain import Unexplained, compare
+from uwb_tdoa_ekf.streams.explain import Unexplained, compare, unexplained
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -48,7 +48,7 @@ def fit(recording: OrderedRecording) -> Finding | None:
     if brief.imu is None or len(brief.imu) < SLOWEST * PART / 2.0:
         return None
     base = _unexplained(brief)
-    trials = [(*compare(base, _unexplained(_arranged(brief, a, g))), a, g) for a, g in _usual()]
+    trials = [_tried(base, brief, accel, gyro) for accel, gyro in _usual()]
     if not min(ratio for ratio, _, _, _ in trials) < RATIO:
         return None
     scale = _scaled(trials)
@@ -102,13 +102,20 @@ def _all(recording: OrderedRecording, base: Unexplained) -> list[Arrangement]:
     anyway."""
     short = recording.part(BRIEF)
     of_short = _unexplained(short)
-    arrangements = []
-    for accel in (UPRIGHT, MIRROR):
-        for gyro in ARRANGEMENTS:
-            ratio, _ = compare(of_short, _unexplained(_arranged(short, accel, gyro)))
-            arrangements.append((ratio, accel, gyro))
-    arrangements.sort(key=lambda entry: entry[0] if np.isfinite(entry[0]) else np.inf)
-    return [(*compare(base, _unexplained(_arranged(recording, a, g))), a, g) for _, a, g in arrangements[:CHOSEN]]
+    ratios: list[float] = []
+    arrangements = list(product((UPRIGHT, MIRROR), ARRANGEMENTS))
+    for accel, gyro in arrangements:
+        chosen = sorted(ratios)[CHOSEN - 1] if len(ratios) >= CHOSEN else np.inf  # of those so far
+        ratio, _ = compare(of_short, _unexplained(_arranged(short, accel, gyro), chosen * of_short.mean))
+        ratios.append(ratio if np.isfinite(ratio) else np.inf)
+    return [_tried(base, recording, *arrangements[k]) for k in np.argsort(ratios, kind="stable")[:CHOSEN]]
+
+
+def _tried(base: Unexplained, recording: OrderedRecording, accel: np.ndarray, gyro: np.ndarray) -> Arrangement:
+    """What an arrangement leaves of `base`; an infinite ratio if that is so much that it is neither taken nor says the same as one that
+    is."""
+    ratio, z = compare(base, _unexplained(_arranged(recording, accel, gyro), (RATIO + TIE) * base.mean))
+    return ratio if np.isfinite(ratio) else np.inf, z, accel, gyro
 
 
 def _arranged(recording: OrderedRecording, accel: np.ndarray, gyro: np.ndarray) -> OrderedRecording:
@@ -118,9 +125,13 @@ def _arranged(recording: OrderedRecording, accel: np.ndarray, gyro: np.ndarray) 
     return recording.with_imu(accel=np.ascontiguousarray(forces), gyro=np.ascontiguousarray(rates))
 
 
-def _unexplained(recording: OrderedRecording) -> Unexplained:
-    residuals = run_offline(recording.flight(), LEANING).residuals
-    return Unexplained.of(residuals.t, residuals.innovation)
+def _unexplained(recording: OrderedRecording, limit: float = np.inf) -> Unexplained:
+    """Unexplained of the TDOAs by a filter that leans on the IMU. limit : see streams.explain."""
+    tdoa, imu, (a, b) = recording.tdoa, recording.imu, recording.rows()
+    assert imu is not None
+    rows = structured(TDOA, tdoa.t, a, b, tdoa.d, tdoa.variance)[np.lexsort((tdoa.d, b, a, tdoa.t))]
+    samples, usable = imu_rows(imu.t, imu.gyro, imu.accel)
+    return unexplained(rows, recording.anchors.positions, samples[usable], LEANING, limit)
 
 
 def _complexity(accel: np.ndarray, gyro: np.ndarray) -> float:

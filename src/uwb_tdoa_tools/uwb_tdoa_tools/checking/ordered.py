@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas
+from uwb_tdoa_ekf.core.memory import TDOA, structured
 from uwb_tdoa_ekf.results import rows_of
 from uwb_tdoa_ekf.streams.explain import unexplained
+
+from .survey_fit import SurveyFit
 
 if TYPE_CHECKING:
     from uwb_tdoa_ekf.streams.explain import Unexplained
@@ -66,9 +71,17 @@ class OrderedRecording:
         """Rows of the anchors of each TDOA: two (n,) arrays, -1 where an id is unknown."""
         return self.anchors.index(self.tdoa.a), self.anchors.index(self.tdoa.b)
 
-    def unexplained(self) -> Unexplained:
-        """Unexplained of the TDOAs alone."""
-        return unexplained(self.tdoa.t, *self.rows(), self.tdoa.d, self.anchors.positions)
+    def unexplained(self, limit: float = math.inf) -> Unexplained:
+        """Unexplained of the TDOAs alone. limit : mean loss from which on it is of no interest (see streams.explain)."""
+        rows = structured(TDOA, self.tdoa.t, *self.rows(), self.tdoa.d)
+        return unexplained(rows, self.anchors.positions, limit=limit)
+
+    @cached_property
+    def survey_fit(self) -> SurveyFit:
+        """SurveyFit of the TDOAs between known anchors."""
+        a, b = self.rows()
+        known = (a >= 0) & (b >= 0) & (a != b)
+        return SurveyFit(self.tdoa.t[known], a[known], b[known], self.tdoa.d[known], self.anchors.positions)
 
     def flight(self) -> Flight:
         """Flight without ground truth."""

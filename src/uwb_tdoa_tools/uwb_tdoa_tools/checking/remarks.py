@@ -11,7 +11,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from .ordered import OrderedRecording
 from .check import different_surveys
 from .recording import of_flight
-from .tdoa_rules import gained, survey_fit
+from .tdoa_rules import gained
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -37,7 +37,7 @@ def survey_remarks(flight: Flight) -> Iterator[str]:
         yield f"the survey has no anchor {_listed(lacking)}: {share:.0f} % of the TDOAs are not used; survey it, too."
     if not (len(tdoa) and np.ptp(tdoa.t) > SHORTEST):
         return
-    if gained(survey_fit(OrderedRecording.of(of_flight(flight)))) is not None:
+    if gained(OrderedRecording.of(of_flight(flight)).survey_fit) is not None:
         yield "the survey does not fit the TDOAs: of another room, or anchors have been moved; `check` says more."
 
 

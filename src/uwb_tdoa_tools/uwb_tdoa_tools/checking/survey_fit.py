@@ -6,6 +6,7 @@ survey.
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -65,6 +66,11 @@ class SurveyFit:
     def places(self) -> np.ndarray:
         """(k, 3) m: where the tag was located in the windows."""
         return np.array([x[:3] for x in self._start]).reshape(-1, 3)
+
+    @cached_property
+    def all_moved(self) -> tuple[float, np.ndarray]:
+        """`solve` with all anchors moved."""
+        return self.solve()
 
     def solve(self, free: Sequence[int] | None = None) -> tuple[float, np.ndarray]:
         """(loss that is left, 0 to 1; anchor positions (N, 3) m) with the anchors in `free` (rows; None for all)

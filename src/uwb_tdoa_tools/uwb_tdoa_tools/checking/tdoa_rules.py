@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.core.memory import new_state
+from uwb_tdoa_ekf.core.memory import TDOA, new_state, structured
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.streams import ERROR, Finding
 from uwb_tdoa_ekf.streams.explain import SCALE, compare, innovations
@@ -21,12 +21,13 @@ from uwb_tdoa_ekf.streams.explain import SCALE, compare, innovations
 from .known_path import MANY
 from .ordered import LONG, SHORT, OrderedRecording
 from .pair_rules import OFF
-from .survey_fit import SPREAD, SurveyFit, spread
+from .survey_fit import SPREAD, spread
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from uwb_tdoa_bias.foundation.anchors import Anchors
     from uwb_tdoa_bias.foundation.flight import Tdoas
+    from .survey_fit import SurveyFit
 
     Survey = tuple[str, Anchors]  # its name, and what it says
 
@@ -67,12 +68,12 @@ def units(recording: OrderedRecording) -> Iterator[tuple[Finding, OrderedRecordi
     """In metres? The noise of the radio is known, and that a motion explains most of it. Yields (Finding,
     OrderedRecording)."""
     noise = successive(recording.tdoa)
-    if not noise > 0.0 or (in_metres(recording) and recording.part(LONG).unexplained().mean < WELL):
+    if not noise > 0.0 or (in_metres(recording) and recording.part(LONG).unexplained(WELL).mean < WELL):
         return
     near = sorted(UNITS.items(), key=lambda unit: abs(np.log(unit[1] * noise / USUAL)))[:2]
     (name, scale), (other, its) = near
     trial = recording.with_tdoa(d=recording.tdoa.d * scale)
-    if not NOISE[0] <= scale * noise <= NOISE[1] or not trial.part(LONG).unexplained().mean < WELL:
+    if not NOISE[0] <= scale * noise <= NOISE[1] or not trial.part(LONG).unexplained(WELL).mean < WELL:
         return
     evidence = f"successive TDOAs of a pair differ by {noise:.3g}: {scale * noise:.2f} m as {name}, "
     evidence += f"{its * noise:.2g} m as {other}; radios have 0.05 - 0.1 m"
@@ -136,7 +137,7 @@ def renumbered(recording: OrderedRecording) -> Iterator[MistakeTrial]:
 def swapped(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     """Anchors whose ids were mixed up: the best exchange of two, then of two more, as long as more is explained.
     Not along a line: in a room that is symmetrical about it, anchors differ by their systematic errors alone."""
-    if spread(survey_fit(recording).places) < SPREAD:
+    if spread(recording.survey_fit.places) < SPREAD:
         return
     table: dict[int, int] = {}
     trial, brief = recording, recording.part(SHORT)
@@ -145,18 +146,18 @@ def swapped(recording: OrderedRecording) -> Iterator[MistakeTrial]:
         doubtful = ids if len(recording.anchors) <= MANY else _far_off(brief)
         if not doubtful:
             break
-        base = brief.unexplained()
-        ratios = []
+        base, least, best_swap = brief.unexplained(), 1.0 - 0.02 * (1 + len(table)), {}
         for one, two in ((one, two) for one, two in combinations(ids, 2) if one in doubtful or two in doubtful):
             swap = {one: two, two: one}
-            ratios.append((compare(base, _relabelled(brief, swap).unexplained())[0], swap))
-        ratio, swap = min(ratios, key=lambda entry: entry[0] if np.isfinite(entry[0]) else np.inf)
-        if not ratio < 1.0 - 0.02 * (1 + len(table)):
+            ratio, _ = compare(base, _relabelled(brief, swap).unexplained(least * base.mean))
+            if ratio < least:
+                least, best_swap = ratio, swap
+        if not best_swap:
             break
-        table = {i: swap.get(table.get(i, i), table.get(i, i)) for i in ids}
+        table = {i: best_swap.get(table.get(i, i), table.get(i, i)) for i in ids}
         table = {i: k for i, k in table.items() if i != k}
-        brief, trial = _relabelled(brief, swap), _relabelled(trial, swap)
-    if not table or (len(table) > 2 and gained(survey_fit(trial)) is not None):
+        brief, trial = _relabelled(brief, best_swap), _relabelled(trial, best_swap)
+    if not table or (len(table) > 2 and gained(trial.survey_fit) is not None):
         return  # a survey of another room is explained better by exchanging many ids, and still does not fit
     names = ", ".join(f"{i} is {k}" for i, k in sorted(table.items()))
     cause = "the ids of two anchors are swapped" if len(table) == 2 else MIXED_UP
@@ -172,7 +173,7 @@ def _far_off(recording: OrderedRecording) -> list[int]:
     """Ids of the anchors whose TDOAs are far from what the filter expects, in comparison with those of most anchors: what is called by
     the id of another anchor of a hall is."""
     (a, b), tdoa, positions = recording.rows(), recording.tdoa, recording.anchors.positions
-    off = np.abs(innovations(new_state(positions), tdoa.t, a, b, tdoa.d, positions))
+    off = np.abs(innovations(new_state(positions), structured(TDOA, tdoa.t, a, b, tdoa.d), positions))
     rows = np.unique(np.concatenate([a, b])[np.tile(np.isfinite(off), 2)])  # of known anchors
     mine = [off[((a == row) | (b == row)) & np.isfinite(off)] for row in rows.tolist()]
     each = np.array([np.median(some) if len(some) >= FEWEST else 0.0 for some in mine])
@@ -197,7 +198,7 @@ def contrary(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     for a, b in wrong:
         flip |= (tdoa.a == a) & (tdoa.b == b)
     trial = _flipped(recording, flip)
-    if gained(survey_fit(trial)) is not None:
+    if gained(trial.survey_fit) is not None:
         return  # of a survey of another room some pairs seem to have the other sign, and still it does not fit
     names = ", ".join(f"({a}, {b})" for a, b in wrong)
     line = f"if (a, b) in {{{names}}}: message.distance_difference *= -1.0  # and find out why"
@@ -224,7 +225,7 @@ def _flipped(recording: OrderedRecording, rows: np.ndarray) -> OrderedRecording:
 
 def moved(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     """An anchor that is not where the survey has it: there, TDOAs are explained that no motion explains otherwise."""
-    fit = survey_fit(recording)
+    fit = recording.survey_fit
     gain = gained(fit)
     if gain is None:
         return
@@ -243,18 +244,11 @@ def moved(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     yield MistakeTrial(replace(recording, anchors=anchors), _says("anchor_moved", cause, line))
 
 
-def survey_fit(recording: OrderedRecording) -> SurveyFit:
-    """SurveyFit of the TDOAs between known anchors."""
-    a, b = recording.rows()
-    known = (a >= 0) & (b >= 0) & (a != b)
-    return SurveyFit(recording.tdoa.t[known], a[known], b[known], recording.tdoa.d[known], recording.anchors.positions)
-
-
 def gained(fit: SurveyFit) -> float | None:
     """How much less stays unexplained with all anchors moved; None if that is no more than in a healthy recording."""
     if len(fit) < FEWEST:
         return None
-    gain = fit.before - fit.solve()[0]
+    gain = fit.before - fit.all_moved[0]
     return gain if gain > GAIN else None
 
 
@@ -271,9 +265,10 @@ def best(recording: OrderedRecording, others: Sequence[Survey] = ()) -> tuple[Fi
     base, trials = recording.part(LONG).unexplained(), []
     for rule in (sign, renumbered, swapped, contrary, moved, lambda c: survey(c, others)):
         for trial in rule(recording):
-            other = trial.recording.part(LONG).unexplained()
+            most = min(RATIO * base.mean, base.mean - BY_ERRORS * trial.share)
+            other = trial.recording.part(LONG).unexplained(most)
             ratio, z = compare(base, other)
-            if ratio < RATIO and z > DEVIATIONS and base.mean - other.mean > BY_ERRORS * trial.share:
+            if ratio < RATIO and z > DEVIATIONS and other.mean < most:
                 trials.append((ratio, z, trial))
     if trials:
         ratio, z, trial = min(trials, key=lambda entry: entry[0])

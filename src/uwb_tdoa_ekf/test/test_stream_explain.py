@@ -1,0 +1,54 @@
+"""What a filter leaves unexplained: fed block by block as at once, and left out from where on it is certain to be too much."""
+
+from dataclasses import replace
+
+from flights import fly
+import numpy as np
+import pytest
+from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.core.measurements import imu_rows
+from uwb_tdoa_ekf.core.memory import TDOA, structured
+from uwb_tdoa_ekf.offline import run_offline
+from uwb_tdoa_ekf.streams import explain
+from uwb_tdoa_ekf.streams.explain import BLOCK, Unexplained, unexplained
+
+FLIGHT = fly(0, 14.0)
+
+
+def rows_of(flight, sign=1.0):
+    tdoa, anchors = flight.tdoa, flight.anchors
+    return structured(TDOA, tdoa.t, anchors.index(tdoa.a), anchors.index(tdoa.b), sign * tdoa.d)
+
+
+@pytest.mark.parametrize("use_imu", [False, True])
+def test_it_is_what_a_run_leaves_to_the_bit(use_imu):
+    config = FilterConfig(use_imu=use_imu)
+    samples, usable = imu_rows(FLIGHT.imu.t, FLIGHT.imu.gyro, FLIGHT.imu.accel)
+    given = (samples[usable], config) if use_imu else ()
+    run = run_offline(FLIGHT, config).residuals
+    found = unexplained(rows_of(FLIGHT), FLIGHT.anchors.positions, *given)
+    assert found == Unexplained.of(run.t, run.innovation) and len(found.blocks) == 6
+
+
+def test_nothing_is_left_out_up_to_the_limit():
+    rows, positions = rows_of(FLIGHT, -1.0), FLIGHT.anchors.positions
+    whole = unexplained(rows, positions)
+    assert unexplained(rows, positions, limit=whole.mean) == whole
+    assert unexplained(rows, positions, limit=0.999 * whole.mean) == Unexplained({})
+
+
+def test_the_rest_is_left_out_once_it_is_certain(monkeypatch):
+    """Of 6 blocks that each leave about as much, the limit is passed in the third."""
+    rows, positions, fed = rows_of(FLIGHT, -1.0), FLIGHT.anchors.positions, []
+    limit, innovations = 0.4 * unexplained(rows, positions).mean, explain.innovations
+    monkeypatch.setattr(explain, "innovations", lambda state, tdoa, *more: fed.append(tdoa["t"][-1]) or innovations(state, tdoa, *more))
+    unexplained(rows, positions, limit=limit)
+    assert fed[-1] - rows["t"][0] < 5.0 * BLOCK
+
+
+def test_no_tdoas_and_few_leave_no_block():
+    none = replace(FLIGHT, tdoa=type(FLIGHT.tdoa)(*(column[:0] for column in vars(FLIGHT.tdoa).values())))
+    few = rows_of(FLIGHT)[:: len(FLIGHT.tdoa) // 20]
+    for rows in (rows_of(none), few):
+        for limit in (0.0, np.inf, np.nan):
+            assert unexplained(rows, FLIGHT.anchors.positions, limit=limit) == Unexplained({})
