@@ -70,7 +70,7 @@ def stopping(recording: Recording, findings: Iterable[Finding], std: float) -> l
     errors = [finding for finding in findings if finding.severity == ERROR]
     if any(finding.rule == MISFIT for finding in errors):
         fit = OrderedRecording.of(recording).survey_fit
-        if np.median(displacement(fit.positions, fit.solve()[1])) <= OFF * std:
+        if np.median(displacement(fit.positions, fit.all_moved[1])) <= OFF * std:
             errors = [finding for finding in errors if finding.rule != MISFIT]
     return errors
 

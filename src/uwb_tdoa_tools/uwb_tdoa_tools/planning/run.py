@@ -171,7 +171,7 @@ def improve(before: Chart, aim: options.Aim, how: str, starts: int, criterion: s
         after = goal.installed(better)
         charted = chart(after, before.grid, criterion)
         charts = [("before, ", installation, before), ("after, ", after, charted)]
-    plots.plot_layouts(charts, out / "optimisation.png", candidates)
+    plots.plot_layouts(charts, out / "layout.png", candidates)
     judged = {
         when: {"flyable_share": float(one.flyable.mean()), **aim.reported.figures(those)}
         for when, one, those in (("before", before, anchors), ("after", charted, better))
