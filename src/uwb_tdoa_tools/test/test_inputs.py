@@ -9,6 +9,7 @@ from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.bags.files import messages, new_bag, open_bag
 from uwb_tdoa_tools.bags.message_types import typestore
+from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.readers.inputs import Reading, find_flights, need_tdoas, survey_for
 
 
@@ -72,7 +73,8 @@ def test_folders_are_searched_in_order_and_hidden_files_left_out(tmp_path):
     assert [survey for _, survey in found] == [None] * 4
 
 
-def test_a_bag_that_no_survey_of_a_folder_fits_keeps_its_own_anchors_and_says_so(tmp_path, surveys, capsys):
+def test_a_bag_that_no_survey_of_a_folder_fits_keeps_its_own_anchors_and_says_so(tmp_path, surveys, capsys, monkeypatch):
+    monkeypatch.setattr(inputs, "_REPORTED", set())  # of what ran before in this process
     make(tmp_path / "flights", "bag1/metadata.yaml", "bag1/bag1_0.mcap", "0422-log")
     for name, magic in (("loose.mcap", b"\x89MCAP0\r\n"), ("old", b"SQLite format 3\0")):  # a bag by what is in it, not by its name
         (tmp_path / "flights" / name).write_bytes(magic)

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from .session import Stop
 
 GLOBAL = ("/tf", "/tf_static", "/clock", "/diagnostics", "/rosout", "/parameter_events")  # in no robot's namespace
-SETTLE = 0.2  # s from the last match to the first message: a subscription learns of a match a little later than we do
+SETTLE = 0.2  # s from the last match to the first message, and from the last message to the end: others are a little later than we are
 DISCOVERY = 2.0  # s without anybody new after which who listens by now is enough
 
 
@@ -171,4 +171,5 @@ def _wait_acknowledged(publishers: Iterable[Publisher], stop: Stop) -> bool:
         while not publisher.wait_for_all_acked(Duration(seconds=LONGEST_SLEEP)):
             if stop or time.monotonic() > until:
                 return False
+    time.sleep(SETTLE)  # who listens by best effort acknowledges nothing, and may read the last messages from the memory of this process
     return True
