@@ -14,7 +14,7 @@ import numpy as np
 from uwb_tdoa_tools import options, parallel
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.localizing.belief import GOOD, believe
-from uwb_tdoa_tools.localizing.estimate import FlightEstimator
+from uwb_tdoa_tools.estimate import FlightEstimator
 from uwb_tdoa_tools.scoring.metrics import position_errors
 
 NOTHING, ALIKE = "nothing", 0.95  # no mistake; share of the time

@@ -13,7 +13,7 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.flight import Flight, Tdoas
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import without_offset
-from uwb_tdoa_tools.localizing.estimate import FlightEstimator
+from uwb_tdoa_tools.estimate import FlightEstimator
 from uwb_tdoa_tools.planning.installation import Installation
 from uwb_tdoa_tools.planning.noise import FixedNoise
 from uwb_tdoa_tools.planning.pairing import every_range

@@ -18,7 +18,7 @@ from uwb_tdoa_tools.bags.files import messages, open_bag
 from uwb_tdoa_tools.bags.message_types import typestore
 from uwb_tdoa_tools.checking.recording import read_recording
 from uwb_tdoa_tools.readers.inputs import Reading
-from uwb_tdoa_tools.localizing.estimate import with_antenna
+from uwb_tdoa_tools.estimate import with_antenna
 import yaml
 
 BOTH = pytest.mark.parametrize("storage", ["mcap", "sqlite3"])

@@ -7,7 +7,7 @@ from hand_made import flown, truth_of
 from uwb_tdoa_tools.scoring.by_phase import PooledErrors
 from uwb_tdoa_tools.scoring.metrics import Pool, Score
 from uwb_tdoa_tools.scoring.phases import phases
-from uwb_tdoa_tools.scoring.table import lines_of_phases, markdown_of
+from uwb_tdoa_tools.evaluating.table import lines_of_phases, markdown_of
 
 STD = 0.5
 

@@ -18,7 +18,7 @@ from uwb_tdoa_tools.calibrating.parts import between, split
 from uwb_tdoa_tools.calibrating.quick import prospect
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.commands import calibrate
-from uwb_tdoa_tools.localizing.estimate import FlightEstimator
+from uwb_tdoa_tools.estimate import FlightEstimator
 from uwb_tdoa_tools.scoring.evaluation import score_of
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 

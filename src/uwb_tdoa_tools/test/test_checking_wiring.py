@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.checking.recording import of_flight, read_live, read_recording
-from uwb_tdoa_tools.checking.ends import End
+from uwb_tdoa_tools.live.ends import End
 from uwb_tdoa_tools.checking.wiring import RULES
 from uwb_tdoa_tools.commands.check import main
 from uwb_tdoa_tools.readers.inputs import Reading

@@ -27,7 +27,7 @@ ROS = """
     uwb_tdoa_ekf.monitoring.health
     uwb_tdoa_tools.benchmark.graph uwb_tdoa_tools.benchmark.load uwb_tdoa_tools.benchmark.nodes uwb_tdoa_tools.benchmark.rates
     uwb_tdoa_tools.benchmark.source uwb_tdoa_tools.benchmark.suite uwb_tdoa_tools.commands.bench uwb_tdoa_tools.commands.demo
-    uwb_tdoa_tools.commands.record uwb_tdoa_tools.commands.replay uwb_tdoa_tools.live.demo uwb_tdoa_tools.live.follow
+    uwb_tdoa_tools.commands.record uwb_tdoa_tools.commands.replay uwb_tdoa_tools.flying.demo uwb_tdoa_tools.live.follow
     uwb_tdoa_tools.live.followed_nodes uwb_tdoa_tools.live.listen
     uwb_tdoa_tools.live.player uwb_tdoa_tools.live.processes uwb_tdoa_tools.live.record uwb_tdoa_tools.live.replay
     uwb_tdoa_tools.flying.over_topics uwb_tdoa_tools.live.run uwb_tdoa_tools.live.session uwb_tdoa_tools.vehicle_node
@@ -129,6 +129,22 @@ def test_no_package_imports_one_above():
 def test_files_are_on_floors():
     """No file needs itself by others, neither for what it runs nor for its types."""
     TopologicalSorter({module: ours(module) - {module} for module in modules()}).prepare()  # raises CycleError, which names the circle
+
+
+def test_folders_are_on_floors():
+    """Nor does a folder."""
+    needs = {}
+    for module in modules():
+        folder = folder_of(module)
+        needs.setdefault(folder, set()).update(map(folder_of, ours(module)))
+    needs.pop("")
+    TopologicalSorter({folder: others - {folder, ""} for folder, others in needs.items()}).prepare()
+
+
+def folder_of(module):
+    """package.folder of a module or package in it, whatever lies below; "" for what is in none."""
+    parts = module.split(".")
+    return ".".join(parts[:2]) if (SRC / parts[0] / Path(*parts[:2])).is_dir() else ""
 
 
 def test_the_foundation_stands_alone():

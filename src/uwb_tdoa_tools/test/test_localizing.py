@@ -13,7 +13,7 @@ from uwb_tdoa_ekf.results import Odometry, Residuals
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag
 from uwb_tdoa_tools.commands import evaluate, localize
 from uwb_tdoa_tools.localizing import belief, residuals, zones
-from uwb_tdoa_tools.localizing.estimate import FlightEstimator
+from uwb_tdoa_tools.estimate import FlightEstimator
 from uwb_tdoa_tools.localizing.localize import check_names, name_of
 from uwb_tdoa_tools.readers.inputs import Reading, find_flights
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate

@@ -8,7 +8,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Truth
 from uwb_tdoa_ekf.core.verdicts import INVALID, LATE, REJECTED, STARTUP, USED
 from uwb_tdoa_tools.scoring.metrics import Pool, Result, Score, airborne, coverage, nees, nis, pooled, position_errors, summary
-from uwb_tdoa_tools.scoring.table import line
+from uwb_tdoa_tools.evaluating.table import line
 
 UPRIGHT = [0.0, 0.0, 0.0, 1.0]
 

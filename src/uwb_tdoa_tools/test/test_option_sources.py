@@ -13,8 +13,8 @@ from uwb_tdoa_bias.foundation.survey import read_survey  # noqa: E402
 from uwb_tdoa_tools.bags.bag import read_bag, write_bag  # noqa: E402
 from uwb_tdoa_tools.commands import check, convert, debias, demo, diagnose, evaluate, inject, localize, survey  # noqa: E402
 from uwb_tdoa_tools.diagnosis.references import REFERENCES  # noqa: E402
-from uwb_tdoa_tools.localizing.estimate import with_antenna  # noqa: E402
-from uwb_tdoa_tools.scoring.evaluator import Evaluator  # noqa: E402
+from uwb_tdoa_tools.estimate import with_antenna  # noqa: E402
+from uwb_tdoa_tools.evaluating.evaluator import Evaluator  # noqa: E402
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate  # noqa: E402
 
 CLEAN = dict(duration=14.0, floor_time=1.0, imu_rate=100.0, bias=False, multipath=False, outlier_probability=0.0)

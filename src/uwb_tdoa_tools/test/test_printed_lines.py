@@ -21,7 +21,7 @@ from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.checking import report
 from uwb_tdoa_tools.commands import calibrate, diagnose, evaluate, survey
 from uwb_tdoa_tools.readers.inputs import Reading
-from uwb_tdoa_tools.scoring.evaluator import Evaluator
+from uwb_tdoa_tools.evaluating.evaluator import Evaluator
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 READS = {"anchors_file": read_survey, "effects_file": EffectSet.from_yaml, "--params-file": FilterConfig.from_yaml}
@@ -83,7 +83,7 @@ def test_remedies_begin_as_the_user_began(monkeypatch):
 PACKAGES = [ROOT / "src" / name / name for name in ("uwb_tdoa_bias", "uwb_tdoa_ekf", "uwb_tdoa_tools")]
 TOOLS = tuple(path.stem for path in (PACKAGES[2] / "commands").glob("*.py") if path.stem != "__init__")
 # Whose lines tests below, and test_demo.py, run
-PRINT = {"commands/calibrate.py", "commands/diagnose.py", "commands/survey.py", "live/demo.py"}
+PRINT = {"commands/calibrate.py", "commands/diagnose.py", "commands/survey.py", "flying/demo.py"}
 
 
 def sources():

@@ -12,7 +12,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands import diagnose, evaluate, localize
 from uwb_tdoa_tools.localizing import rerun_file
-from uwb_tdoa_tools.localizing.estimate import FlightEstimator
+from uwb_tdoa_tools.estimate import FlightEstimator
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 CLEAN = dict(floor_time=1.0, imu_rate=100.0, bias=False, multipath=False, outlier_probability=0.0)
@@ -74,7 +74,7 @@ def test_diagnose_writes_before_and_after_and_what_was_found(desk, viewer):
 
 def test_demo_writes_what_the_nodes_said(flight, viewer, tmp_path):
     pytest.importorskip("rclpy")
-    from uwb_tdoa_tools.live.demo import DemoResult
+    from uwb_tdoa_tools.flying.demo import DemoResult
 
     run = FlightEstimator()(flight)
     DemoResult({}, [], run.odometry, run, run.odometry).show(tmp_path / "flight.rrd", flight, ["landed"])

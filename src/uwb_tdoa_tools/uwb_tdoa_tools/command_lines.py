@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
     from pathlib import Path
 
+SALVAGE = "read what is sound of it with --salvage"
 RUN = "UWB_TDOA_RUN"  # variable of the environment in which ./dev says how the user started it
 PACKAGES = {"bias_node": "uwb_tdoa_bias", "ekf_node": "uwb_tdoa_ekf", "debias_node": "uwb_tdoa_ekf", "compile_nodes": "uwb_tdoa_ekf"}
 

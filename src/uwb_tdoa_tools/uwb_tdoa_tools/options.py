@@ -30,7 +30,7 @@ from . import cli
 from .bags.files import STORAGES
 from .diagnosis.self_calibration import Tape
 from .localizing import rerun_file
-from .localizing.estimate import FlightEstimator
+from .estimate import FlightEstimator
 from .parallel import whole_number
 from .readers import inputs
 from .scoring.alignment import ALIGN, NONE

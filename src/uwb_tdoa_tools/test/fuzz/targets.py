@@ -39,7 +39,7 @@ from uwb_tdoa_tools.readers.columns import parse_columns, read_columns
 from uwb_tdoa_tools.readers.names import Named
 from uwb_tdoa_tools.readers.tables import number, read_table
 from uwb_tdoa_tools.results_file import ResultsFile
-from uwb_tdoa_tools.scoring.table import read_others
+from uwb_tdoa_tools.evaluating.table import read_others
 from uwb_tdoa_tools.surveying.distances import read_distances
 from uwb_tdoa_tools.surveying.marks import read_marks
 

@@ -17,9 +17,9 @@ from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.limits import READ_BYTES, most_unpacked
 
-from ..readers.kind import is_bag
-from ..readers.streams import SALVAGE
+from ..command_lines import SALVAGE
 from .integrity import NO_SUM, SUM_KEY, check as check_whole, is_packed, metadata, seal, unpack
+from .kind import is_bag
 from .mcap import Damaged
 from .message_types import earlier_types, typestore, upgraded
 from .salvage import salvage as write_sound_part

@@ -7,7 +7,7 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from ..scoring import metrics
+from .. import json_values
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -63,7 +63,7 @@ def table(figures: Iterable[Figure]) -> list[str]:
 
 def as_json(figures: Iterable[Figure]) -> list[dict[str, Any]]:
     """List of dicts; JSON has no NaN: null."""
-    return [metrics.as_json(asdict(figure) | {"met": figure.met}) for figure in figures]
+    return [json_values.as_json(asdict(figure) | {"met": figure.met}) for figure in figures]
 
 
 def _cells(figure: Figure) -> tuple[str, ...]:

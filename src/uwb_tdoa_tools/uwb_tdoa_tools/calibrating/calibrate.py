@@ -19,7 +19,7 @@ from ..diagnosis import diagnose, output
 from ..diagnosis.self_calibration import Tape, self_calibrate
 from ..diagnosis.self_calibration.equations import measured_noise, slow_innovations
 from ..diagnosis.self_calibration.solve import LEFT
-from ..localizing.estimate import FlightEstimator
+from ..estimate import FlightEstimator
 from ..scoring.evaluation import score_of
 from ..surveying.report import as_text
 from .parts import split

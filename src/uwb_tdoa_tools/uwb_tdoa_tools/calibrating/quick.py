@@ -12,7 +12,7 @@ from uwb_tdoa_bias.effects.wording import listed
 
 from ..diagnosis.self_calibration import SelfCalibration, Tape, self_calibrate
 from ..diagnosis.self_calibration.solve import IMPROVED
-from ..localizing.estimate import FlightEstimator
+from ..estimate import FlightEstimator
 from .parts import between
 
 if TYPE_CHECKING:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from .recording import Recording
     from .survey_fit import SurveyFit
     from .tdoa_rules import Survey
-    from .ends import End
+    from ..live.ends import End
 
 ROUNDS = 3  # mistakes that are undone one after the other
 # Where one of these stands, nothing, or not the IMU, can be tried.

@@ -19,7 +19,7 @@ from ..bags.bag import Names, read_anchors, read_topic
 from ..bags.files import open_bag, remarks_of
 from ..bags.placing import TF_STATIC
 from ..readers import read_survey
-from ..readers.kind import is_bag
+from ..bags.kind import is_bag
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from ..bags.files import BagReader
     from ..bags.placing import Place
     from ..readers.inputs import Reading
-    from .ends import End
+    from ..live.ends import End
 
 IMU, TDOA = "imu/data", "uwb/tdoa"
 HEARD = (TDOA, IMU, "uwb/anchors", *(of.topics[0][0] for of in SENSORS.values()), "uwb/tdoa_corrected", "odometry", "uwb/residual")

@@ -6,7 +6,7 @@ from dataclasses import asdict
 from typing import Any, TYPE_CHECKING
 
 from .. import command_lines
-from ..scoring.metrics import as_json
+from ..json_values import as_json
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence

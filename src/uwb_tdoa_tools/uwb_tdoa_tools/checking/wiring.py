@@ -11,7 +11,7 @@ from uwb_tdoa_ekf.streams import ERROR, WARNING, Finding
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
-    from .ends import End
+    from ..live.ends import End
     from .recording import Recording
 
 

@@ -12,9 +12,10 @@ from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, options, parallel
 from ..results_file import asked_of
-from ..scoring import table
-from ..scoring.evaluator import Evaluator, results
-from ..scoring.metrics import FIGURES, Pool, as_json
+from ..evaluating import table
+from ..evaluating.evaluator import Evaluator, results
+from ..json_values import as_json
+from ..scoring.metrics import FIGURES, Pool
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace

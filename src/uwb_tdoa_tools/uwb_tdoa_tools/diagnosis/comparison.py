@@ -17,7 +17,8 @@ from uwb_tdoa_ekf.results import OF_ROW, VERDICTS
 from uwb_tdoa_ekf.sensitivity import RANGES
 
 from ..scoring.by_phase import EVERYTHING
-from ..scoring.metrics import Score, as_json, pooled
+from ..json_values import as_json
+from ..scoring.metrics import Score, pooled
 from .regression.table import BLOCK
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from ..bags.files import new_bag
-from ..checking.ends import End
+from .ends import End
 from .record import Recorder
 from .session import session
 

@@ -13,7 +13,7 @@ from ..readers.inputs import Reading
 from ..scoring.tum import write_tum
 from . import files, pictures, rerun_file, residuals, zones
 from .belief import GOOD, Belief, believe
-from .estimate import FlightEstimator
+from ..estimate import FlightEstimator
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

@@ -17,7 +17,7 @@ from uwb_tdoa_ekf.results import Residuals
 from ..bags.bag import read_bag, read_fields, read_odometry
 from ..diagnosis.output import as_text
 from ..scoring.metrics import position_at
-from .estimate import FlightEstimator
+from ..estimate import FlightEstimator
 from .pictures import SIGMAS
 from .residuals import by_pair
 

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
-from .kind import is_bag, reader_of
+from ..bags.kind import is_bag
+from .kind import reader_of
 from .names import read_survey
 from .usd_log import read_usd_log
 from .util_csv import read_util_csv

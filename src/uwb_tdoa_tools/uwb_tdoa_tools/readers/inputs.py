@@ -15,8 +15,8 @@ from uwb_tdoa_bias.foundation.foreign_text import printable
 from uwb_tdoa_bias.foundation.sensors import LOCATING
 
 from .. import parallel
+from ..bags.kind import is_bag
 from . import read_flight
-from .kind import is_bag
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator

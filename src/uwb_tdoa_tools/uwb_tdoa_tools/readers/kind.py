@@ -1,4 +1,4 @@
-"""Which kind of recording a file or directory is, told by what is in it, not by its name."""
+"""Which kind of recording a file is that is no bag, told by what is in it, not by its name."""
 
 from __future__ import annotations
 
@@ -18,18 +18,6 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.flight import Flight
 
 ROS_1 = b"#ROSBAG V2.0"  # what a bag of ROS 1 begins with
-ROS_2 = b"\x89MCAP0\r\n", b"SQLite format 3\0"  # what a file of a bag begins with
-
-
-def is_bag(path: str | Path) -> bool:
-    """Whether a path is meant as a bag: a directory with metadata.yaml, .mcap or .db3 files, or such a file."""
-    path = Path(path)
-    if path.is_dir():
-        return any(path.glob("metadata.yaml")) or any(path.glob("*.mcap")) or any(path.glob("*.db3"))
-    if not path.is_file():
-        return False
-    with path.open("rb") as file:
-        return file.read(16).startswith(ROS_2)
 
 
 def reader_of(path: Path) -> Callable[[Path, Anchors, bool, bool], Flight]:

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
 GRAVITY = 9.81  # m/s^2 in one g of the Crazyflie's accelerometer, as in its firmware and in the UTIL scripts
 NO_TARGET = 32.0  # m; the range finder writes 32.767 or more where it sees nothing, and sees 4 m at most
 LARGEST = {"tof": 1e9, "baro": 4e4}  # mm, and m: the formula of the standard atmosphere ends at 44 km
-SALVAGE = "read what is sound of it with --salvage"
 DAY = 86400.0  # s
 REFERENCE = 0.95  # of the TDOAs: an anchor that is in so many is what all others are compared with
 

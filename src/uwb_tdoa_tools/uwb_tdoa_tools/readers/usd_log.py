@@ -12,7 +12,8 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.files import read_bytes
 from uwb_tdoa_bias.foundation.foreign_text import harmless
 
-from .streams import SALVAGE, make_flight
+from ..command_lines import SALVAGE
+from .streams import make_flight
 from .usd_scan import scan
 
 if TYPE_CHECKING:

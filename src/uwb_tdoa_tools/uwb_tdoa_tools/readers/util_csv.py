@@ -14,7 +14,8 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.files import read_bytes
 from uwb_tdoa_bias.foundation.limits import CSV_BYTES, CSV_CELLS, most_unpacked
 
-from .streams import SALVAGE, make_flight
+from ..command_lines import SALVAGE
+from .streams import make_flight
 from .tables import CsvRows, check_text
 
 if TYPE_CHECKING:

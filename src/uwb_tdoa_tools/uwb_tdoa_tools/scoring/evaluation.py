@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from ..localizing.estimate import FlightEstimator
+from ..estimate import FlightEstimator
 from .alignment import need_truth
 from .metrics import Score
 

@@ -15,6 +15,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.verdicts import REJECTED, USED
 from uwb_tdoa_ekf.results import rows_of
 
+from ..json_values import as_json
 from .by_phase import EVERYTHING, ErrorSeries, PooledErrors, or_nan, rms
 from .distribution import Distribution
 from .phases import AIRBORNE, TITLES, in_the_air, motion, phases
@@ -311,21 +312,6 @@ def pooled(scores: Iterable[Score]) -> dict[str, Any]:
     for score in scores:
         pool.add(score.result())
     return pool.figures()
-
-
-def as_json(value: Any) -> Any:
-    """A value, or dicts and sequences of values, as JSON has them: NaN and infinity are null, arrays lists."""
-    if isinstance(value, dict):
-        return {str(key): as_json(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple, np.ndarray)):
-        return [as_json(item) for item in value]
-    if isinstance(value, (bool, np.bool_)):
-        return bool(value)
-    if isinstance(value, (int, np.integer)):
-        return int(value)
-    if isinstance(value, (float, np.floating)):
-        return float(value) if np.isfinite(value) else None
-    return value
 
 
 def _as_texts(numbers: dict[str, Any]) -> dict[str, Any]:

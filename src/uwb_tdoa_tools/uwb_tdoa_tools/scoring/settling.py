@@ -14,7 +14,7 @@ import numpy as np
 from uwb_tdoa_bias.effects import RADIO, EffectSet, true_samples
 
 from ..checking.repairs import repairs
-from ..localizing.estimate import FlightEstimator
+from ..estimate import FlightEstimator
 from ..readers.inputs import report_remarks
 from .alignment import FRAME, NONE, TIME, alignment_of, apart, need_truth, on_another_clock, paths
 

@@ -16,14 +16,14 @@ from uwb_tdoa_ekf.offline import Run, run_offline
 
 from .. import command_lines
 from ..bags.bag import read_odometry, write_bag
-from ..flying import trial
-from ..flying.report import sentence
-from ..flying.sensors import Radio
-from ..flying.verdict import verdict_of
-from ..flying.world import HALL
+from ..live.run import accounts, run_live
 from ..localizing.rerun_file import write_rerun
 from ..scoring.metrics import Score, airborne
-from .run import accounts, run_live
+from . import trial
+from .report import sentence
+from .sensors import Radio
+from .verdict import verdict_of
+from .world import HALL
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -10,15 +10,15 @@ from .. import parallel
 from ..bags.bag import late_tdoas, read_odometry
 from ..checking.against_truth import of_truth
 from ..checking.remarks import survey_remarks
-from ..localizing.estimate import FlightEstimator
+from ..estimate import FlightEstimator
 from ..localizing.rerun_file import write_rerun
 from ..readers.inputs import Reading, report_remarks
 from ..results_file import ResultsFile, state_of
 from . import table
-from .alignment import ALIGN, NONE, alignment_of, need_truth
-from .evaluation import corrected_truth
-from .metrics import Pool, Result, Score
-from .tum import write_tum
+from ..scoring.alignment import ALIGN, NONE, alignment_of, need_truth
+from ..scoring.evaluation import corrected_truth
+from ..scoring.metrics import Pool, Result, Score
+from ..scoring.tum import write_tum
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_ekf.results import Odometry, Residuals
     from ..bags.bag import RecordedOdometry
     from ..readers.inputs import Recording
-    from .alignment import Alignment
+    from ..scoring.alignment import Alignment
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Evaluator:
         scores = {how: Score(flight.name, odometry, one, residuals, flight.tdoa.t) for how, one in truths.items()}
         score, truth = scores[self.align], truths[self.align]
         if self.picture:
-            from .plots import plot_error  # takes a second to import
+            from ..scoring.plots import plot_error  # takes a second to import
 
             plot_error(score, odometry, truth, self.picture)
         if self.trajectories:

@@ -10,12 +10,12 @@ import numpy as np
 from uwb_tdoa_bias.foundation.foreign_text import harmless
 
 from ..readers.tables import number, read_table
-from .phases import NEAR_THE_FLOOR, TITLES
+from ..scoring.phases import NEAR_THE_FLOOR, TITLES
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
     from pathlib import Path
-    from .metrics import Pool, Result, Score
+    from ..scoring.metrics import Pool, Result, Score
 
 COLUMNS = {
     "rmse_x": "x", "rmse_y": "y", "rmse_z": "z", "rmse_3d": "3D", "median_3d": "median", "max_3d": "max",

@@ -1,0 +1,1 @@
+"""Recordings judged by their ground truth: one after the other, and as a table."""
