@@ -66,7 +66,7 @@ def test_one_flight_to_train_on_is_too_few(tmp_path, capsys):
 
 @pytest.mark.slow
 def test_what_it_trains_takes_the_bias_of_antennas_out(tmp_path, monkeypatch):
-    monkeypatch.setattr(experiment, "FLOWN", 20.0)
+    monkeypatch.setattr(experiment, "FLOWN", 10.0)
     folder = experiment.train(2, tmp_path / "trained", 1)
     anchors = experiment.world_of(KNOWN).anchors
     for name in experiment.NETWORKS:

@@ -386,7 +386,8 @@ def felt(seed, n=400):
     p = np.stack([np.sin(0.7 * t + phase[0]), np.cos(0.5 * t + phase[1]), 1.5 + 0.5 * np.sin(0.9 * t + phase[2])], axis=1)
     angles = np.stack([0.1 * np.sin(t + phase[3]), 0.1 * np.cos(t + phase[4]), 0.3 * t], axis=1)
     truth = Truth(t, p, Rotation.from_euler("xyz", angles).as_quat())
-    samples = {stream: aid_samples(stream, t, Track(truth), t[0]) for stream in BY_POSE}
+    track = Track(truth)
+    samples = {stream: aid_samples(stream, t, track, t[0]) for stream in BY_POSE}
     streams = {
         "height": Height(t, samples["height"].reading[:, 0]),
         "pressure": Pressure(t, pressure_at(samples["pressure"].reading[:, 0])),

@@ -95,6 +95,7 @@ class Launch:
         os.killpg(self.process.pid, signal.SIGINT)
         code = self.ended()
         assert code == 0 or code == 1 and FAULT_OF_LAUNCH in self.said, self.said
+        assert not any("Traceback" in line for line in self.lines if line.startswith("[")), self.said  # of a node; launch has no such mark
         assert self.said.count("process has finished cleanly") + self.said.count("process has died") == started, self.said
 
     def pid_of(self, node):

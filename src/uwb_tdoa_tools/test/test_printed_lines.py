@@ -2,6 +2,7 @@
 
 import ast
 from dataclasses import replace
+from functools import cache
 from importlib import import_module
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
@@ -86,6 +87,7 @@ TOOLS = tuple(path.stem for path in (PACKAGES[2] / "commands").glob("*.py") if p
 PRINT = {"commands/calibrate.py", "commands/diagnose.py", "commands/survey.py", "flying/demo.py"}
 
 
+@cache
 def sources():
     """[(name, syntax tree)] of all modules that are installed."""
     paths = [(path.relative_to(package).as_posix(), path) for package in PACKAGES for path in package.rglob("*.py")]

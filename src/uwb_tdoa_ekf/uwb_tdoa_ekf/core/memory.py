@@ -193,6 +193,9 @@ ODOMETRY = _record(
 RESIDUAL = _record(("innovation", float), ("variance", float), ("weight", float), ("verdict", np.uint8))
 
 
+_EKF_BY_ATTRIBUTE = np.dtype((np.record, EKF))
+
+
 class FilterState(NamedTuple):
     """State of one filter. ekf : (1,) of EKF; anchors : (N,) of ANCHOR; functions : (k,) of SENSOR_FUNCTION, errors of the inertial
     sensor that are known."""
@@ -204,7 +207,7 @@ class FilterState(NamedTuple):
     @property
     def record(self) -> Record:
         """The fields of EKF as attributes: a view."""
-        return self.ekf.view(np.recarray)[0]
+        return self.ekf.view(_EKF_BY_ATTRIBUTE)[0]
 
     def copy(self) -> FilterState:
         """Another filter that remembers the same."""

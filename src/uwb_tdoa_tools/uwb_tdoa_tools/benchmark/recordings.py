@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 import time
 from typing import Any, TYPE_CHECKING
 
@@ -79,8 +80,11 @@ def _per_prediction(flight: Flight, network: Network, repeats: int) -> np.ndarra
     assert flight.truth is not None
     truth, tdoa = flight.truth, flight.tdoa
     a, b = flight.anchors.index(tdoa.a), flight.anchors.index(tdoa.b)
-    rows = [slice(k, k + 1) for k in range(400)]
-    alone = [samples_at(tdoa.t[k], a[k], b[k], truth, flight.anchors, lag=None) for k in rows]
+    some = slice(400)
+    samples = samples_at(tdoa.t[some], a[some], b[some], truth, flight.anchors, lag=None)
+    alone = [
+        replace(samples, **{name: getattr(samples, name)[k : k + 1] for name in ("t", "a", "b", "p", "q")}) for k in range(len(samples))
+    ]
 
     def predict() -> None:
         for samples in alone:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 import math
 from typing import Any, TYPE_CHECKING
 
@@ -95,7 +96,7 @@ class World:
     height_noise: float = 0.01
     height_range: float = 4.0
 
-    @property
+    @cached_property
     def anchors(self) -> Anchors:
         """Where they are."""
         if self.layout is not None:

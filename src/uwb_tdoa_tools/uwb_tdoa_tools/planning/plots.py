@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import EllipseCollection
 from matplotlib.colors import ListedColormap
 from PIL import Image
@@ -238,8 +239,9 @@ def _ellipses(ax: Axes, chart: Chart, k: int) -> int:
 
 def _save(figure: Figure, title: str, path: str | Path) -> None:
     figure.suptitle(title, fontsize=10)
-    figure.savefig(path, dpi=80)
-    plt.close(figure)
-    with Image.open(path) as image:  # 256 colours are enough, and a third of the size
-        small = image.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
-    small.save(path, optimize=True)
+    figure.set_dpi(80)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    image = Image.frombuffer("RGBA", canvas.get_width_height(), canvas.buffer_rgba())
+    plt.close(figure)  # 256 colours are enough, and a third of the size
+    image.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(path, "PNG", optimize=True)

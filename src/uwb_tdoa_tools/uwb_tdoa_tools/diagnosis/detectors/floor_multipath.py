@@ -82,6 +82,7 @@ class _Trials:
 
     def __init__(self, columns: np.ndarray, residual: np.ndarray, count: np.ndarray) -> None:
         self._columns, self._y, self._count = columns, residual, np.minimum(count, ENOUGH)
+        self._fits: dict[bytes, tuple[float, np.ndarray]] = {}  # by places: a search comes to the same ones again
 
     def best(self) -> tuple[np.ndarray, np.ndarray]:
         """(delays (anchors,) m, places of the heights (anchors,))."""
@@ -106,6 +107,12 @@ class _Trials:
 
     def _fit(self, at: np.ndarray) -> tuple[float, np.ndarray]:
         """(loss, delays) of robust least squares. None is early: else those that are on time could be, and the others not late."""
+        key = at.tobytes()
+        if key not in self._fits:
+            self._fits[key] = self._fitted(at)
+        return self._fits[key]
+
+    def _fitted(self, at: np.ndarray) -> tuple[float, np.ndarray]:
         x, weight = self._columns[at, :, np.arange(len(at))].T, self._count
         for _ in range(ITERATIONS):
             root = np.linalg.cholesky((x * weight[:, None]).T @ x + LITTLE * np.eye(x.shape[1])).T

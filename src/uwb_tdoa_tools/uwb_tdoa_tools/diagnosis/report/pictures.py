@@ -7,8 +7,12 @@ import io
 from dataclasses import dataclass
 from typing import Any, TYPE_CHECKING
 
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_svg import FigureCanvasSVG
+
 from ...scoring.plots import plt
 if TYPE_CHECKING:
+    from collections.abc import Callable
     from matplotlib.figure import Figure
 
 # Told apart by colour-blind eyes (Okabe and Ito); the purple and the yellow are darker than theirs.
@@ -51,18 +55,22 @@ def embedded(figure: Figure, alt: str, caption: str = "", narrow: Figure | None 
 def _source(figure: Figure) -> tuple[str, int]:
     """(data URL, pixels of width) of a Figure, which is closed."""
     with plt.rc_context(_FONT):
-        figure.draw_without_rendering()
+        layout = figure.get_layout_engine()
+        assert layout is not None  # of `drawing`
+        layout.execute(figure)
         figure.set_layout_engine("none")  # is laid out now, once for both kinds
-        kinds = {"svg+xml": _saved(figure, "svg", metadata={"Date": None})}
+        kinds = {"svg+xml": _drawn(figure, FigureCanvasSVG(figure).print_svg, metadata={"Date": None})}
         if len(kinds["svg+xml"]) > LIGHT:
-            kinds["png"] = _saved(figure, "png")
+            kinds["png"] = _drawn(figure, FigureCanvasAgg(figure).print_png)
     width = round(figure.get_figwidth() * PIXELS)
     plt.close(figure)
     kind = min(kinds, key=lambda name: len(kinds[name]))
     return f"data:image/{kind};base64,{base64.b64encode(kinds[kind]).decode()}", width
 
 
-def _saved(figure: Figure, kind: str, **options: Any) -> bytes:
+def _drawn(figure: Figure, draw: Callable[..., object], **options: Any) -> bytes:
+    """What `draw` of a canvas writes; Figure.savefig would draw all of it once before, for nothing."""
     buffer = io.BytesIO()
-    figure.savefig(buffer, format=kind, dpi=SHARP, **options)
+    figure.set_dpi(SHARP)
+    draw(buffer, **options)
     return buffer.getvalue()
