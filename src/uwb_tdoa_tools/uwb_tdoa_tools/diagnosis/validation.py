@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_bias.correction.rehearsal import RehearsedCorrector
+from uwb_tdoa_bias.correction.fixed_pose import FixedPoseCorrector
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.frames import poses_of
@@ -241,7 +241,7 @@ def _judged(config: FilterConfig | None, trial: tuple[ValidationCase, Poses | No
     """(3D RMSE, m, Run) of a trial."""
     case, poses = trial
     anchors, effects = case.flight.anchors, case.effects
-    corrector = Corrector(anchors, effects) if poses is None else RehearsedCorrector(anchors, effects, poses)
+    corrector = Corrector(anchors, effects) if poses is None else FixedPoseCorrector(anchors, effects, poses)
     run = run_offline(case.flight, config, corrector)
     return score(case, run).rmse_3d, run
 
