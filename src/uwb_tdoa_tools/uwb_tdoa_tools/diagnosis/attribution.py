@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from .regression.table import RegressionTable
     from .channels import ChannelResidual, ChannelResiduals
 
-FOR_MAPS = 3  # flights: a map of fewer is of their paths, and misleads others; two that fly alike bear each other out
+FOR_MAPS = 3  # flights: a map of fewer is of their paths, and misleads others; two with like paths validate each other
 ON_FLOOR = 0.5  # m by which a function of UPWARDS changes at least near the floor, to be told
 RANGED = tuple(name for name, kind in RADIO.items() if kind.ends == 1)  # streams of distances to anchors
 
