@@ -122,8 +122,8 @@ def dilution(points: np.ndarray, installation: Installation) -> np.ndarray:
 
     Its squares add up: of x and y to the horizontal, of all to the position dilution (PDOP).
     """
-    alike = replace(installation, noise=FixedNoise(1.0), link_std=0.0, dimensions=installation.unknowns, height_std=np.inf)
-    covariance = bound(information(points, alike, correction=False))
+    unit_noise = replace(installation, noise=FixedNoise(1.0), link_std=0.0, dimensions=installation.unknowns, height_std=np.inf)
+    covariance = bound(information(points, unit_noise, correction=False))
     return np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
 
 
