@@ -61,5 +61,5 @@ def _node(start: Start, lives: Lives, variables: Mapping[str, str]) -> Node:
 def _rviz(use_sim_time: str) -> Node:
     """RViz with our layout."""
     layout = f"{get_package_share_directory('uwb_tdoa_ekf')}/rviz/tdoa.rviz"
-    told = ["-p", f"use_sim_time:={str(use_sim_time).lower()}"]
-    return Node(package="rviz2", executable="rviz2", arguments=["-d", layout], ros_arguments=told)
+    parameters = ["-p", f"use_sim_time:={str(use_sim_time).lower()}"]
+    return Node(package="rviz2", executable="rviz2", arguments=["-d", layout], ros_arguments=parameters)

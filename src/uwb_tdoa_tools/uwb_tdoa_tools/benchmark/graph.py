@@ -94,11 +94,11 @@ def ask(
     loops that take all of a core; arguments : more of the ekf_node."""
     with ExitStack() as stack:
         node, processes = stack.enter_context(surroundings(folder))
-        told = ["--ros-args", "-p", f"publish_tf:={'odom' if tf else 'base'}", *arguments]
+        options = ["--ros-args", "-p", f"publish_tf:={'odom' if tf else 'base'}", *arguments]
         if clock:
-            told += ["-p", "use_sim_time:=true"]
+            options += ["-p", "use_sim_time:=true"]
         log = processes.file(NODE)
-        processes.start(PACKAGES[NODE], NODE, *told)
+        processes.start(PACKAGES[NODE], NODE, *options)
         if streams:
             processes.start(PACKAGES["bias_node"], "bias_node", *(["--ros-args", "-p", "use_sim_time:=true"] if clock else []))
             _wait(node, READY_LIMIT, lambda: ready_at("bias_node", processes.file("bias_node").read_text(errors="replace")))
@@ -169,11 +169,11 @@ class _Asking:
         _end(clock)
         stopped = time.monotonic()
 
-        def told() -> bool:
+        def reported() -> bool:
             paused = any(a > stopped and "paused" in text for a, text in self._reports)
             return paused or time.monotonic() > stopped + SILENCE
 
-        _wait(self._node, SILENCE + 1.0, told)
+        _wait(self._node, SILENCE + 1.0, reported)
         arrivals = [a for a, text in self._reports if a > stopped and "paused" in text]
         return arrivals[0] - stopped if arrivals else SILENCE
 
