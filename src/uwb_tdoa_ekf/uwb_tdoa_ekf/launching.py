@@ -80,7 +80,7 @@ class Start:
 
     @property
     def words(self) -> list[str]:
-        """What it is told, as arguments after --ros-args."""
+        """Its parameters and log level, as arguments after --ros-args."""
         words = ["--log-level", self.log_level]
         for part in self.parameters:
             if isinstance(part, dict):

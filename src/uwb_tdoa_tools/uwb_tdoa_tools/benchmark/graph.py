@@ -1,4 +1,4 @@
-"""How fast nodes answer the rest of the graph, parameters, poses that are told, a clock that stops, while messages flow."""
+"""How fast nodes answer the rest of the graph, parameters, poses that are given, a clock that stops, while messages flow."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ TARGET_IDLE = 1.0  # % of a core
 @dataclass
 class Answers:
     """answers, poses : s that each get_parameters, each initialpose took, SILENCE without an answer; periods : s between reports;
-    pause : s until a clock that stopped was told, None without one; cpu : share of one core."""
+    pause : s until a clock that stopped was reported, None without one; cpu : share of one core."""
 
     answers: list[float] = field(default_factory=list)
     poses: list[float] = field(default_factory=list)

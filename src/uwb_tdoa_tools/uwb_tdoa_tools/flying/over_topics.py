@@ -56,7 +56,7 @@ class OverTopics:
     newest, or None."""
 
     def __init__(self, node: StreamNode, world: World, pace: RealTime | Lockstep, clock: bool) -> None:
-        """node : StreamNode; world : World; pace : of `pace`, which is told what goes and comes; clock : publish /clock, and count
+        """node : StreamNode; world : World; pace : of `pace`, which hears of all that goes and comes; clock : publish /clock, and count
         stamps from 0, not from now."""
         self._node, self._pace, self._anchors = node, pace, world.anchors
         self._begin = 0 if clock else None  # ns, stamp of the start; of now without /clock

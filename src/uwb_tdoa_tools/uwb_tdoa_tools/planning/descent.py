@@ -28,7 +28,7 @@ Result = TypeVar("Result")
 SOFT = 0.05  # of |q|^2 - 1, over which failure sets in where derivatives are needed
 EDGE = 0.05  # m over which the hull ends, likewise
 FAILED = 10.0  # of the objective, a logarithm
-SHAKEN = 0.0, 1e-3, 1e-2, 0.1  # of what is allowed, by which a start is moved that tells nothing
+SHAKEN = 0.0, 1e-3, 1e-2, 0.1  # of what is allowed, by which a start is moved where the goal is not defined
 CLOSE = 1e-4  # of the objective: a step that gains less is the last
 _CHUNK = 1_000_000  # numbers in the largest array of one step
 

@@ -118,7 +118,7 @@ def position_error(covariance: np.ndarray) -> np.ndarray:
 
 def dilution(points: np.ndarray, installation: Installation) -> np.ndarray:
     """Dilution of precision: (n, k), error along x, y (and z) over that of one reception, if all are alike; k the
-    coordinates that TDOAs must tell.
+    coordinates that TDOAs must determine.
 
     Its squares add up: of x and y to the horizontal, of all to the position dilution (PDOP).
     """

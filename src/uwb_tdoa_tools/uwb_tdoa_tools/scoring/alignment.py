@@ -4,7 +4,7 @@ What is looked for, in this order, because one hides the next: other axes (z dow
 another epoch, and a frame that is turned and shifted. Nothing is moved unless somebody asks for it.
 
 Stamps that are late by what the gyroscope and the accelerometer say are the fault of the ground truth. Where no inertial sensor
-tells, only the difference of two clocks is known, that of the ground truth and that of the TDOAs.
+shows it, only the difference of two clocks is known, that of the ground truth and that of the TDOAs.
 """
 
 from __future__ import annotations
@@ -232,20 +232,20 @@ def rigid(path: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _late(flight: Flight, exact: bool) -> tuple[float, str | None]:
-    """(s, who tells) by which the ground truth of a Flight is late: by the inertial sensor if it tells, else against the TDOAs; (0, None)
-    where nobody tells. exact : whether the least counts."""
+    """(s, source) by which the ground truth of a Flight is late: by the inertial sensor if that shows it, else against the TDOAs; (0, None)
+    where neither does. exact : whether the least counts."""
     assert flight.truth is not None
-    found, teller = _inertial(flight), "inertial"
+    found, source = _inertial(flight), "inertial"
     if found is None:
-        found, teller = of_tdoas(KnownPath(flight)), "tdoa"
+        found, source = of_tdoas(KnownPath(flight)), "tdoa"
     if found is None:
         return 0.0, None
     if not exact and not _is_late(*found.constant()):
-        return 0.0, teller
+        return 0.0, source
     late = -found.exact()
     moved = replace(flight, truth=_earlier(flight.truth, late))  # once more from there: a parabola is off between what is tried
-    again = _inertial(moved) if teller == "inertial" else of_tdoas(KnownPath(moved))
-    return late - (again.exact() if again else 0.0), teller
+    again = _inertial(moved) if source == "inertial" else of_tdoas(KnownPath(moved))
+    return late - (again.exact() if again else 0.0), source
 
 
 def _behind(flight: Flight, late: float) -> float:

@@ -60,8 +60,8 @@ class Fit:
 
 def solve(gram: np.ndarray, vector: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     """Solution of normal equations with a Gaussian prior of standard deviations `sizes`: (beta, covariance, number of
-    parameters that the data tell: each counts by how little the prior says of it). What the data do not tell stays
-    0."""
+    parameters that the data determine: each counts by how little the prior says of it). What the data do not determine
+    stays 0."""
     if len(vector) == 0:
         return vector, np.zeros((0, 0)), 0.0
     scaled = gram * np.outer(sizes, sizes) + np.eye(len(vector))

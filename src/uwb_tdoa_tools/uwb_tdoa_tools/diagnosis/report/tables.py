@@ -1,4 +1,4 @@
-"""The tables of the page: values, errors, health, and what could not be told."""
+"""The tables of the page: values, errors, health, and what was not determined."""
 
 from __future__ import annotations
 
