@@ -80,7 +80,7 @@ class Start:
 
     @property
     def words(self) -> list[str]:
-        """What it is told, as arguments after --ros-args."""
+        """Its parameters and log level, as arguments after --ros-args."""
         words = ["--log-level", self.log_level]
         for part in self.parameters:
             if isinstance(part, dict):
@@ -240,7 +240,7 @@ def tags(path: str, values: Mapping, log_level: str = "info", processes: str = "
 
 
 def pooled(starts: list[Start], processes: int | str) -> list[Start]:
-    """The same of `tags` with so many localization_nodes instead of bias_nodes and ekf_nodes; what these are told is in a file that
+    """The same of `tags` with so many localization_nodes instead of bias_nodes and ekf_nodes; their parameters are in a file that
     is written for them. processes : number, or its text, or "auto": one for each core. Raises InputError if it is none, or a tag has a
     parameter file of its own."""
     if processes == AUTO:
@@ -250,11 +250,11 @@ def pooled(starts: list[Start], processes: int | str) -> list[Start]:
     members = [each for each in starts if each.executable in ("bias_node", "ekf_node")]
     if any(isinstance(part, str) for each in members for part in each.parameters):
         raise InputError("params_file: does not go with processes; write its values into the file of the tags.")
-    told = {f"/**/{each.label}": {"ros__parameters": each.parameters[-1]} for each in members if each.parameters}  # in any namespace
+    by_node = {f"/**/{each.label}": {"ros__parameters": each.parameters[-1]} for each in members if each.parameters}  # in any namespace
     folder = Path(tempfile.mkdtemp(prefix="uwb_tdoa_tags_"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)  # a node that is started again reads it again
     file = folder / "tags.yaml"
-    file.write_text(yaml.safe_dump(told, allow_unicode=True), encoding="utf-8")
+    file.write_text(yaml.safe_dump(by_node, allow_unicode=True), encoding="utf-8")
     frozen = all(each.parameters and each.parameters[-1].get("frozen") for each in members)
     namespaces, out = list(dict.fromkeys(each.namespace for each in members)), [each for each in starts if each not in members]
     for k in range(min(int(processes), len(namespaces))):

@@ -25,14 +25,14 @@ if TYPE_CHECKING:
 def actions(
     starts: Iterable[Start], respawn: str, on_exit: str, discovery_range: str, rviz: str, use_sim_time: str = "false"
 ) -> list[Action]:
-    """Of [Start]s, as texts of launch arguments say: what is told of the network, the nodes, and RViz if rviz is "true"."""
+    """Of [Start]s, as texts of launch arguments say: what is printed of the network, the nodes, and RViz if rviz is "true"."""
     of_nodes = discovery(os.environ, discovery_range)
     nodes = [_node(each, Lives(each.label, respawn == "true", on_exit), of_nodes) for each in starts]
     return [LogInfo(msg=network({**os.environ, **of_nodes})), *nodes, *([_rviz(use_sim_time)] if rviz == "true" else [])]
 
 
 def _node(start: Start, lives: Lives, variables: Mapping[str, str]) -> Node:
-    """The action of a Start, which its Lives may have started again. Nothing is told to it by a file that launch_ros would leave."""
+    """The action of a Start, which its Lives may have started again. Nothing is given to it by a file that launch_ros would leave."""
     began = time.monotonic()
 
     def on_exit(event: ProcessExited, context: LaunchContext) -> Action | None:
@@ -61,5 +61,5 @@ def _node(start: Start, lives: Lives, variables: Mapping[str, str]) -> Node:
 def _rviz(use_sim_time: str) -> Node:
     """RViz with our layout."""
     layout = f"{get_package_share_directory('uwb_tdoa_ekf')}/rviz/tdoa.rviz"
-    told = ["-p", f"use_sim_time:={str(use_sim_time).lower()}"]
-    return Node(package="rviz2", executable="rviz2", arguments=["-d", layout], ros_arguments=told)
+    parameters = ["-p", f"use_sim_time:={str(use_sim_time).lower()}"]
+    return Node(package="rviz2", executable="rviz2", arguments=["-d", layout], ros_arguments=parameters)

@@ -1,4 +1,4 @@
-"""A pose that somebody tells, as RViz does, in the terms of the filter."""
+"""A pose that somebody gives, as RViz does, in the terms of the filter."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def pose_from_message(
     """(t s, p (3,) m, covariance (3, 3) m^2, yaw rad, its standard deviation rad) of a PoseWithCovarianceStamped.
 
     world : name of the world frame; epoch : Epoch; newest : s, stamp of the newest measurement, which a pose without
-    stamp has. A coordinate, or the yaw, whose variance is 0 is not told and NaN. Raises InputError.
+    stamp has. A coordinate, or the yaw, whose variance is 0 is not given, and NaN. Raises InputError.
     """
     frame = message.header.frame_id
     if frame not in ("", world):

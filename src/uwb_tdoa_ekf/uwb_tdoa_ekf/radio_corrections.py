@@ -53,7 +53,7 @@ class RadioCorrections:
         self._latest, self._together = rows[-1:], False
 
     def slices(self, measured: Measurements) -> Iterator[Measurements]:
-        """Measurements in parts, corrected. What comes of each is to be told by `add_odometry` before the next is asked for. What
+        """Measurements in parts, corrected. What comes of each is to be given to `add_odometry` before the next is asked for. What
         holds no distances, as all of a recording without any, is one part."""
         if not len(measured.aids) or not self._ranged(measured.aids).any():
             yield self._unchanged(measured)

@@ -169,7 +169,7 @@ def test_no_healthy_recording_is_moved_and_every_late_one_is(shared_data):
         assert found.late == 0.0 and not found.other_frame, one.name
         late = alignment_of(shifted(one, "truth", 0.4), path)
         assert abs(late.late - 0.4) < (0.03 if one.imu is None else 0.02), one.name
-        assert late.told_by == ("tdoa" if one.imu is None else "inertial"), one.name
+        assert late.source == ("tdoa" if one.imu is None else "inertial"), one.name
         down = alignment_of(in_frame(one, np.diag([1, 1, -1])), path)
         assert down.other_axes and np.array_equal(down.axes, np.diag([1, 1, -1])), one.name
         epoch = alignment_of(shifted(one, "truth", EPOCH), path)

@@ -32,7 +32,7 @@ def test_the_next_commands_are_commands(given):
         assert args.flights == [given[0]] and args.survey == (given[1] if len(given) > 1 else None)
 
 
-class Told:
+class ErrorOnly:
     """A Score with nothing but its error."""
 
     def __init__(self, error):
@@ -57,8 +57,8 @@ def test_it_says_what_corrects_and_that_nothing_does_unless_it_is_asked_for(tmp_
     ],
 )
 def test_a_correction_that_does_harm_is_called_that(errors, said):
-    told = demo._told([Told(error) for error in errors])
-    assert said in told and ("does not fit" in told) == (errors[1] > errors[0])
+    text = demo._change_in_words([ErrorOnly(error) for error in errors])
+    assert said in text and ("does not fit" in text) == (errors[1] > errors[0])
 
 
 def figures(line):

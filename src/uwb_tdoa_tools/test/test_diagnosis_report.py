@@ -19,7 +19,7 @@ from uwb_tdoa_tools.diagnosis.regression.terms import Candidate, Term
 from uwb_tdoa_tools.diagnosis.report import curves, maps, pictures, room
 from uwb_tdoa_tools.diagnosis.report.entries import doubt_in_words, entries, worth_in_words
 from uwb_tdoa_tools.diagnosis.report.page import html
-from uwb_tdoa_tools.diagnosis.report.unclear import by_remedy, untold
+from uwb_tdoa_tools.diagnosis.report.unclear import by_remedy, undetermined
 from uwb_tdoa_tools.diagnosis.report.verdict import _flights, verdict
 from uwb_tdoa_tools.diagnosis.report.words import TERMS
 from known_effects import clean_flight
@@ -228,11 +228,11 @@ def test_what_could_not_be_told_comes_with_what_would_tell(result):
         Unobservable("accel_scale", {"x": 1.0}),
     ]
     items.append(Unobservable("pair_offset", {"0-1": 0.7, "1-2": -0.7}))
-    found = {item.effect: item for item in untold(replace(result, unobservable=items))}
+    found = {item.effect: item for item in undetermined(replace(result, unobservable=items))}
     assert found["anchor_delay"].harmless and found["anchor_delay"].what == "0, 1, 2, 3, 4, 5, 6 and 7 together"
-    assert "gyroscope" in found["gyro_bias"].told_by and found["pair_offset"].what == "0-1 against 1-2"
-    assert "other places" in found["accel_scale"].told_by
-    assert by_remedy(found.values())[found["accel_scale"].told_by] == [
+    assert "gyroscope" in found["gyro_bias"].remedy and found["pair_offset"].what == "0-1 against 1-2"
+    assert "other places" in found["accel_scale"].remedy
+    assert by_remedy(found.values())[found["accel_scale"].remedy] == [
         "accel_scale (x)",
         "pair_offset (0-1 against 1-2)",
     ]
@@ -240,7 +240,7 @@ def test_what_could_not_be_told_comes_with_what_would_tell(result):
 
 
 def test_without_truth_ground_truth_would_tell(without_truth):
-    remedies = {item.effect: item.told_by for item in untold(without_truth)}
+    remedies = {item.effect: item.remedy for item in undetermined(without_truth)}
     assert "ground truth" in remedies["truth_frame"] and "accelerometer" in remedies["accel_bias"]
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_bias.correction.rehearsal import RehearsedCorrector
+from uwb_tdoa_bias.correction.fixed_pose import FixedPoseCorrector
 from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, EffectSet, SmoothTerm, TagLeverArm
 from uwb_tdoa_bias.effects.samples import Track
 from uwb_tdoa_bias.foundation.errors import InputError
@@ -128,19 +128,19 @@ def test_a_trial_is_judged_by_the_figure_of_the_whole_row(flights):
     assert judged.rmse_3d == judged.row()["rmse_3d"] > 0.0
 
 
-def test_a_rehearsal_at_the_poses_of_the_run_itself_is_that_run(flights):
+def test_a_run_corrected_at_the_poses_of_the_run_itself_is_that_run(flights):
     effects = EffectSet((AnchorDelay({"1": 0.3}), TagLeverArm({"x": 0.1, "z": 0.1})))
     run = run_offline(flights[0], None, Corrector(flights[0].anchors, effects))
-    again = run_offline(flights[0], None, RehearsedCorrector(flights[0].anchors, effects, poses_of(run.odometry)))
+    again = run_offline(flights[0], None, FixedPoseCorrector(flights[0].anchors, effects, poses_of(run.odometry)))
     np.testing.assert_allclose(again.odometry.p, run.odometry.p, atol=1e-9)
 
 
-def test_a_rehearsal_at_the_poses_of_another_model_is_nearly_the_run(flights):
+def test_a_run_corrected_at_the_poses_of_another_model_is_nearly_the_run(flights):
     moved, anchors = EffectSet((EFFECTS["anchor_position"]({"3.x": 0.3, "5.z": -0.3}),)), flights[0].anchors
     without = run_offline(flights[0], None, Corrector(anchors))
     run = run_offline(flights[0], None, Corrector(anchors, moved))
-    rehearsed = run_offline(flights[0], None, RehearsedCorrector(anchors, moved, poses_of(without.odometry)))
-    away, apart = (np.mean(np.abs(other.odometry.p - run.odometry.p)) for other in (rehearsed, without))
+    at_poses = run_offline(flights[0], None, FixedPoseCorrector(anchors, moved, poses_of(without.odometry)))
+    away, apart = (np.mean(np.abs(other.odometry.p - run.odometry.p)) for other in (at_poses, without))
     assert away < 0.1 * apart
 
 

@@ -1,4 +1,4 @@
-"""What the mains of all executables share: the look of --help, and how a failure is told and counted.
+"""What the mains of all executables share: the look of --help, and how a failure is reported and counted.
 
     def parser():
         made = cli.parser("convert", "Convert a log to a bag.", "convert flight.log --survey s.txt --out flight.bag")
@@ -60,7 +60,7 @@ def run(
 ) -> int:  # fmt: skip
     """Parse argv (default: sys.argv[1:]), call command(args), and return the exit code of the process.
 
-    0 or what command returned; 1 for a Failure; 2 for bad usage, an InputError or a file that cannot be used, each told
+    0 or what command returned; 1 for a Failure; 2 for bad usage, an InputError or a file that cannot be used, each reported
     in one sentence on stderr; 130 after Ctrl-C; 141 when whoever read our output has gone.
     ros : --ros-args are for rclpy and not parsed; args.ros_arguments is the whole command line, with them.
     """

@@ -1,4 +1,4 @@
-"""Command lines that are told to be copied, as they run where the user is.
+"""Command lines that are printed to be copied, as they run where the user is.
 
     tool("check", "flight.bag")                          # ./dev run uwb_tdoa_tools check flight.bag, or ros2 run ...
     node("ekf_node", {"effects_file": "effects.yaml"})

@@ -37,7 +37,7 @@ class FlightEstimator:
 
 
 def with_antenna(effects: EffectSet | None, flight: Flight) -> EffectSet | None:
-    """An EffectSet, or None, and the lever arm of the antenna that the recording of a Flight has told, unless it holds one."""
+    """An EffectSet, or None, and the lever arm of the antenna that the recording of a Flight gives, unless it holds one."""
     arm, known = flight.meta.get("antenna"), effects.effects if effects else ()
     if not arm or not any(arm) or any(effect.name == TagLeverArm.name for effect in known):
         return effects

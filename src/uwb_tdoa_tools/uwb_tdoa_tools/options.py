@@ -116,7 +116,7 @@ def add_model(parser: ArgumentParser) -> None:
 
 
 def estimator_of(args: Namespace, say: Callable[[str], object]) -> FlightEstimator:
-    """The FlightEstimator that those options ask for. say(sentence) : told what it lacks. Raises InputError."""
+    """The FlightEstimator that those options ask for. say(sentence) : called with what it lacks. Raises InputError."""
     config, effects = filter_of(args)
     config = with_parameters(config, args.parameters + [f"use_{aid}:=false" for aid in args.without])
     if args.no_bias:
@@ -206,7 +206,7 @@ def add_rerun(parser: ArgumentParser) -> None:
 
 
 def rerun_of(args: Namespace, count: int, say: Callable[[str], object]) -> Path | None:
-    """Path of the file that --rerun asks for; None without it, or without the library, of which say(sentence) is told. count : of
+    """Path of the file that --rerun asks for; None without it, or without the library, which say(sentence) reports. count : of
     flights, of which it shows one. Raises InputError."""
     if not args.rerun:
         return None

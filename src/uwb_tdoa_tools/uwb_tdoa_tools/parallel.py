@@ -63,10 +63,10 @@ def over(
     function: Callable[[Item], Made], items: Iterable[Item], jobs: int | None = None, dask: str | None = None,
     unit: str | None = "flight",
 ) -> Iterator[Made]:  # fmt: skip
-    """Generator of function(item) for every item, in order; tells meanwhile how many are done.
+    """Generator of function(item) for every item, in order; prints meanwhile how many are done.
 
     To be called in the main thread. function, items, results : what pickle takes; jobs : processes, default one per
-    core, and no more than items; dask : address of a scheduler; unit : of what is told, None to tell nothing.
+    core, and no more than items; dask : address of a scheduler; unit : of what is printed, None to print nothing.
     The first item runs in this process, so that what has to be compiled is compiled once, and is in numba's cache when
     the others start. What the function raises is raised here. Raises InputError where there is no Dask.
     """

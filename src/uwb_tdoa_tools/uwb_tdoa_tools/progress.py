@@ -1,6 +1,6 @@
 """Telling that long work goes on: on a terminal in one line, by tqdm; elsewhere in a line every few seconds, which tqdm cannot.
 
-    with Progress("diagnose") as progress:                       # what is done is told by a thread of its own
+    with Progress("diagnose") as progress:                       # what is done is printed by a thread of its own
         progress("looking at ids")
     with Progress("evaluate", total=22, unit="flight") as progress:
         progress.update()                                        # one more is done

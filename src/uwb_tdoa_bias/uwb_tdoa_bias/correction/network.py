@@ -10,8 +10,8 @@ Metadata of the model (all values JSON text):
     fade_std  number, metres, with validity: standard deviation of the bias where the network is not believed
     largest_yaw_std  optional: number, radians; where the yaw is less certain, the bias is not taken out, but counts as
               uncertainty
-    share     optional: number 0 ... 1: how much of the prediction is taken out, as flights left out of the training bear
-              out; the rest counts as uncertainty
+    share     optional: number 0 ... 1: how much of the prediction is taken out, found by cross-validation over the
+              flights of the training; the rest counts as uncertainty
 Input: one float tensor (n, number of features), of any name. Output: one float tensor (n, 1), bias in metres; (n, 2),
 bias and its standard deviation in metres; or (n, 3), with the share 0 ... 1 of what can be known that the network knows
 there: it has already faded bias and deviation itself.

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 VARINT, BYTES, FOUR_BYTES = 0, 2, 5  # wire types; in those of eight bytes nothing is that is read here
 Shape = list[int | None]  # of a value; None for what is not fixed
-Told = TypeVar("Told")
+Value = TypeVar("Value")
 KINDS = {1: np.float32, 7: np.int64}  # of tensors, by TensorProto.DataType
 
 
@@ -146,7 +146,7 @@ def _floats(values: list[float | bytes]) -> np.ndarray:
     return np.concatenate([np.array([v], "f4") if isinstance(v, float) else np.frombuffer(v, "<f4") for v in values])
 
 
-def _unique(pairs: Iterable[tuple[str, Told]]) -> dict[str, Told]:
+def _unique(pairs: Iterable[tuple[str, Value]]) -> dict[str, Value]:
     """{name: value}: a name that comes twice is refused."""
     pairs = list(pairs)
     if len(out := dict(pairs)) < len(pairs):

@@ -19,7 +19,7 @@ class Session:
         size = size_of(graph)
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
-        options.log_severity_level = 4  # what goes wrong is told by who calls
+        options.log_severity_level = 4  # what goes wrong is reported by who calls
         self._rows, self._most = (1, 1) if size.alone else (PACKED, BATCH)
         ((self._name, _),), self._width, self._outputs = graph.inputs, size.width, size.outputs
         try:

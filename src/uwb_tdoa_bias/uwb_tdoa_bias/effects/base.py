@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 __all__ = ["ArrivalEffect", "Effect", "Samples"]
 
-SIGNIFICANT = 2.0  # standard deviations; a smaller value is not told by the data
+SIGNIFICANT = 2.0  # standard deviations; a smaller value is not determined by the data
 
 Made = TypeVar("Made")
 
@@ -83,7 +83,7 @@ class Effect:
     # channels, one of which must be there too: else what it is compared with may be as wrong
     witnesses: ClassVar[tuple[str, ...]] = ()
     weighed: ClassVar[bool] = False  # may be there or not: the filter weighs that, and no Corrector takes it out
-    needs_reference: ClassVar[bool] = False  # cannot be told from the filter's innovations alone
+    needs_reference: ClassVar[bool] = False  # not observable in the filter's innovations alone
     needs_motion: ClassVar[bool] = False  # looks at more than the pose of the tag
     uses_attitude: ClassVar[bool] = False  # its part of a TDOA changes with the attitude of the tag
 
@@ -152,7 +152,7 @@ class Effect:
 
     def bias(self, samples: Samples) -> np.ndarray:
         """Contribution to what `samples.channel` measures, (n,) metres: of Samples to d_ab, of RangeSamples to the distance; NaN where it
-        cannot be told (unknown pose)."""
+        is not known (unknown pose)."""
         return np.zeros(len(samples))
 
     @property
@@ -194,7 +194,7 @@ class Effect:
         return (f"Look for the cause of {self.name}: {self.physics} (found: {values}, in {self.unit}).",)
 
     def significant(self) -> dict[str, float]:
-        """{parameter: value} of those values that the data tell, the largest first in standard deviations; values without a standard
+        """{parameter: value} of those values that the data determine, the largest first in standard deviations; values without a standard
         deviation, or with none but 0, were set, not estimated, and come last."""
         std = self.std
         known = {key: value for key, value in self.values.items() if not abs(value) < SIGNIFICANT * std.get(key, 0.0)}
@@ -206,13 +206,13 @@ class Effect:
         return measured(abs(self.values[key]) * factor, self.std.get(key, 0.0) * abs(factor), unit)
 
     def directed(self, key: str, above: str, below: str, unit: str | None = None, factor: float = 1.0) -> str:
-        """The `size` of a significant parameter, and which way it is off: "12.0 ± 0.3 ms late"; "" if the data do not tell it."""
+        """The `size` of a significant parameter, and which way it is off: "12.0 ± 0.3 ms late"; "" if the data do not determine it."""
         if key not in self.significant():
             return ""
         return f"{self.size(key, unit, factor)} {above if self.values[key] > 0.0 else below}"
 
     def on_floor(self, anchors: Anchors) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What the filter is told of an effect that is `weighed`, as of `FloorMultipath.on_floor`."""
+        """What is given to the filter of an effect that is `weighed`, as of `FloorMultipath.on_floor`."""
         raise NotImplementedError
 
     def marks(self, anchors: Anchors) -> tuple[Shift | Region, ...]:

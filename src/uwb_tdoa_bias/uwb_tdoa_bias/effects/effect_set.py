@@ -51,8 +51,8 @@ class EffectSet:
         return iter(self.effects)
 
     def bias(self, samples: Samples) -> np.ndarray:
-        """Sum of all contributions to what `samples.channel` measures, (n,) metres, faded where they were not seen. An effect that cannot
-        tell (unknown attitude) adds nothing."""
+        """Sum of all contributions to what `samples.channel` measures, (n,) metres, faded where they were not seen. An effect that is
+        not known (unknown attitude) adds nothing."""
         total = np.zeros(len(samples))
         for effect in (effect for effect in self.effects if samples.channel in effect.channels):
             part = faded(effect, samples)[0]
@@ -116,7 +116,7 @@ class EffectSet:
         return tuple(function for effect in self.effects for function in effect.sensor_functions())
 
     def on_floor(self, anchors: Anchors) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """What the filter is told of some Anchors at a tag on the floor, as of `FloorMultipath.on_floor`; None if no effect knows."""
+        """What is given to the filter of some Anchors at a tag on the floor, as of `FloorMultipath.on_floor`; None if no effect knows."""
         return next((effect.on_floor(anchors) for effect in self.effects if effect.weighed), None)
 
     def stamp_offset(self, stream: str) -> float:

@@ -21,7 +21,7 @@ LITTLE = 0.5  # share of an effect; where less is taken out, nodes say so
 
 
 def faded(effect: Effect, samples: Samples) -> tuple[np.ndarray, np.ndarray | float, np.ndarray | float]:
-    """(bias of an Effect in Samples, (n,) m, NaN where it cannot tell; standard deviation of what of it is not taken out, (n,) m;
+    """(bias of an Effect in Samples, (n,) m, NaN where it is not known; standard deviation of what of it is not taken out, (n,) m;
     share that is taken out, (n,)); the last two are 0.0 and 1.0 without a domain. The time goes on to its end only:
     what grows with it is not known to grow further."""
     if not effect.domain:

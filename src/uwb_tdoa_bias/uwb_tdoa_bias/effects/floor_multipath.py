@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from .samples import Samples
 
 PARTS, PLACE = ("delay", "height", "noise"), ("x", "y")
-HEIGHT = 0.12  # m, where no other one is told
+HEIGHT = 0.12  # m, where no other one is given
 SWITCH = 1.5  # times the height, and 1 over it, between which an anchor is late at times
 REACH = 1.0  # m from the place where it was seen, over which the echo becomes another one
 

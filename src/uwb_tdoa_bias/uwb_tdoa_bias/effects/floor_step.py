@@ -33,5 +33,5 @@ class FloorStep(IntervalEffect):
     def advice(self) -> tuple[str, ...]:
         return tuple(
             f"Look what lay below the tag{when}: the ground was {size} {'higher' if value > 0.0 else 'lower'}."
-            for value, size, when in self.told("m")
+            for value, size, when in self.significant_sizes("m")
         )

@@ -81,8 +81,8 @@ class IntervalEffect(Effect):
             raise InputError(f"{flight.name}: has no attitude in its ground truth, which {self.name} needs.")
         return flight.replaced(**{stream: part.sensed(part.values + extra)})
 
-    def told(self, unit: str, factor: float = 1.0) -> list[tuple[float, str, str]]:
-        """[(signed size, its words, when, in words)] of those sizes that the data tell, the most certain first."""
+    def significant_sizes(self, unit: str, factor: float = 1.0) -> list[tuple[float, str, str]]:
+        """[(signed size, its words, when, in words)] of those sizes that are significant, the most certain first."""
         out = []
         for key, value in self.significant().items():
             if key in self.sizes:

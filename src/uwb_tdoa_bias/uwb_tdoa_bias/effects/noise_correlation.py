@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 class NoiseCorrelation(Effect):
     """Each anchor's arrivals carry a random error of standard deviation `std` (m) that is forgotten over `time` (s,
-    exponentially). It cannot be removed: the filter is told that it is there, as spread."""
+    exponentially). It cannot be removed: the filter gets it as spread."""
 
     name = "noise_correlation"
     unit = "m, s"
@@ -55,4 +55,4 @@ class NoiseCorrelation(Effect):
         return replace(flight, tdoa=replace(tdoa, d=tdoa.d + error))
 
     def advice(self) -> tuple[str, ...]:
-        return ()  # multipath is everywhere; the filter is told
+        return ()  # multipath is everywhere; the filter gets it as spread

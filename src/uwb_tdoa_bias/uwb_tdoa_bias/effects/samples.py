@@ -26,7 +26,7 @@ class Samples:
 
     t : (n,) s; a, b : (n,) rows of `anchors`; p : (n, 3) m, world; q : (n, 4) x y z w, body to world, NaN if unknown.
     start : s, stamp of the first TDOA of the recording, from which slow changes count.
-    velocity : (n, 3) m/s, world, of the body at that very instant, where the truth tells; motion : Motion up to the pose that
+    velocity : (n, 3) m/s, world, of the body at that very instant, where the truth gives it; motion : Motion up to the pose that
     a node corrects at; each None if nobody asked.
     interval : (n,) s since the TDOA before; previous : (n,) id of the later anchor of that; vibration : (n,) m/s^2,
     root of the power of the high-passed accelerometer; None if unknown.

@@ -26,16 +26,16 @@ N_STATES = 6  # position and velocity of the tag, world axes
 
 def slope_of(effects: Iterable[Effect], samples: Samples) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(bias (n,) m, slope (n, 6), m per m of position and per m/s of velocity, deviation from it (n,) m) of the sum of those Effects
-    that have `states`, at Samples; 0 where it cannot be told."""
+    that have `states`, at Samples; 0 where it is not known."""
     groups: dict[tuple[int, ...], list[Effect]] = {}
     n = len(samples)
     bias, slope, power = np.zeros(n), np.zeros((n, N_STATES)), np.zeros(n)
     for effect in effects:
         if effect.states:
             groups.setdefault(effect.states, []).append(effect)
-    for states, alike in groups.items():
+    for states, group in groups.items():
         moved = _moved(samples, states)
-        here, *sides = sum((_known(faded(effect, moved)[0]) for effect in alike), np.zeros(len(moved))).reshape(-1, n)
+        here, *sides = sum((_known(faded(effect, moved)[0]) for effect in group), np.zeros(len(moved))).reshape(-1, n)
         bias += here
         for k, (down, up) in zip(states, zip(sides[::2], sides[1::2])):
             slope[:, k] += (up - down) / (2.0 * REACH)

@@ -23,7 +23,7 @@ DEGREES = 180.0 / np.pi
 
 class TruthFrame(Effect):
     """In the frame of the truth, an anchor surveyed at A stands at R A + (x, y, z), R of the rotation vector (roll,
-    pitch, yaw). Which of the two frames is right nobody can tell, so that nodes are not given it. Where effects.yaml has it,
+    pitch, yaw). Which of the two frames is right is not observable, so that nodes are not given it. Where effects.yaml has it,
     correcting it moves the anchors, so that estimates come out in the frame of the truth."""
 
     name = "truth_frame"

@@ -34,5 +34,5 @@ class VelocitySlip(IntervalEffect):
         return tuple(
             f"Look for slip of the wheels or lost features{when}: the velocity was {size} too "
             f"{'small' if value > 0.0 else 'large'}."
-            for value, size, when in self.told("%", 100.0)
+            for value, size, when in self.significant_sizes("%", 100.0)
         )

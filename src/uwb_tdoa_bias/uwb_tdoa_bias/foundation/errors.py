@@ -1,4 +1,4 @@
-"""The two exceptions that are told to the user in one sentence; every other one is a defect and keeps its traceback."""
+"""The two exceptions that are reported to the user in one sentence; every other one is a defect and keeps its traceback."""
 
 
 class InputError(ValueError):

@@ -43,8 +43,8 @@ def node_executable(module: str) -> Callable[..., Any]:
 def interrupt(number: int, frame: FrameType | None) -> None:
     """Signal handler: raises KeyboardInterrupt, for good.
 
-    What C code calls back cannot raise, and a destructor cannot either: Python tells such an exception on stderr and
-    goes on (the compiler of numba has both). From now on nothing of that kind is told, objects that are half made
+    What C code calls back cannot raise, and a destructor cannot either: Python prints such an exception on stderr and
+    goes on (the compiler of numba has both). From now on nothing of that kind is printed, objects that are half made
     included, and where it was the KeyboardInterrupt that was lost, SIGINT comes again in a moment.
     """
 

@@ -244,7 +244,7 @@ def read_text(data: bytes, place: int, what: str) -> tuple[str, int]:
 
 
 def check_length(data: bytes, length: int, kind: type, exactly: bool = True) -> None:
-    """Raise Unreadable for a message that is shorter than so many bytes, or, if told, longer."""
+    """Raise Unreadable for a message that is shorter than so many bytes, or, with `exactly`, longer."""
     if length > len(data):
         raise Unreadable(f"{len(data)} bytes are {length - len(data)} too few for {name_of(kind)}: cut off, or of {ANOTHER}")
     if exactly and length < len(data) - PADDING:

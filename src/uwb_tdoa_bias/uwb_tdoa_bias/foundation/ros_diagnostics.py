@@ -21,7 +21,7 @@ BEHIND = 0.5  # s that something may wait until this process serves it
 AGAIN = 30.0  # s after which the log says what it has said before
 # Of what is measured: with a sign, a decimal point or a unit. The id of an anchor has none of these.
 NUMBER = re.compile(r"[-+]\d+(\.\d+)?|\d+\.\d+|\d+(?=\s*(%|s\b|ms\b|m\b|Hz|messages|samples|TDOAs|times))")
-REPORT_PERIOD, LOOKS = 1.0, 5  # s from one report to the next, and looks in between at what is to be told at once
+REPORT_PERIOD, LOOKS = 1.0, 5  # s from one report to the next, and looks in between at what is to be reported at once
 PAUSED, SLOWEST_CLOCK = 0.5, 2.0  # s without a new time on /clock; s from one time to the next of a clock that runs
 DIAGNOSTICS_QOS = QoSProfile(depth=10)
 

@@ -213,7 +213,7 @@ def _after_update(
     records: np.ndarray,
 ) -> None:  # fmt: skip
     """After an update stamped t, s: what holds anyway, which hypothesis is best, and whether the tag is elsewhere. counts :
-    what was measured tells that; agrees : with the best hypothesis."""
+    what was measured shows that; agrees : with the best hypothesis."""
     _stay_in_workspace(ekf, t, records)
     if parameters.fixed_height_std > 0.0 and t >= ekf.next_floor:
         ekf.next_floor = t + rest.PERIOD
@@ -276,7 +276,7 @@ def _wait_for_start(
 @compiled
 def _advance(ekf: Record, parameters: Record, t: float, records: np.ndarray) -> bool:
     """Predict every hypothesis to stamp t, with the inertial sample at hand or, if it is too old, without one. Returns
-    False if the filter has stopped, because nothing has told for too long where the tag is."""
+    False if the filter has stopped, because nothing has shown for too long where the tag is."""
     if t - ekf.t > LOST_TIME:
         return _stop(ekf, t)
     sensed = parameters.use_imu and t - ekf.imu.t < parameters.imu_timeout and not ekf.distrusted and t >= ekf.levelled
@@ -366,7 +366,7 @@ def _compare(
     hypothesis: Record, a: Record, b: Record, tdoa: Record, known: float, innovation: Record
 ) -> None:
     """Fill in what a TDOA between two of ANCHOR, `known` (m) too long, says to a HYPOTHESIS; its Jacobian is that of the position, and
-    of what its bias changes with, where the state is about as it was when the bias was told."""
+    of what its bias changes with, where the state is about as it was when the bias was given."""
     innovation.value = tdoa.d - known - linearized_tdoa(hypothesis.x, a.position, b.position, innovation.row)
     innovation.entries = 3
     for k in range(N_STATES):
@@ -416,7 +416,7 @@ def _stay_in_workspace(ekf: Record, t: float, records: np.ndarray) -> None:
 
 @compiled
 def _stay_on_floor(ekf: Record, parameters: Record, t: float, records: np.ndarray) -> None:
-    """The fixed height, where a hypothesis knows less of it: what is told once is not told better by being repeated."""
+    """The fixed height, where a hypothesis knows less of it: what is given once is not known better by being repeated."""
     for h in range(HYPOTHESES):
         hypothesis = ekf.hypotheses[h]
         if hypotheses.alive(hypothesis) and hypothesis.P[2, 2] > parameters.fixed_height_std**2:

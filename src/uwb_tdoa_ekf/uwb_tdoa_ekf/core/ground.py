@@ -21,7 +21,7 @@ HIGHEST = 1.0  # m above the ground; above, no anchor near the ground can be lat
 LATEST = 6.0  # m, lateness of an anchor is up to that, the more probable, the larger: the way by what reflects is a detour
 FARTHER = 1e-3  # 1/m, density of what is later still, and of outliers of any kind
 RARE = 0.02  # probability that an anchor is late, and that it is not, at least,
-USUAL = 0.1  # and that it is late where nothing tells
+USUAL = 0.1  # and that it is late where nothing is known
 CHANGE_TIME = 2.0  # s after which what an anchor was does not tell what it is
 DEVIATIONS = 3.0  # standard deviations that a tag may be lower than the filter has it
 BLURRED, BLUR_STD = 0.8, 0.25  # m above the ground below which what it reflects blurs what arrives, and by how much at the ground
@@ -59,7 +59,7 @@ PAIR = np.dtype(
 
 
 class KnownHeight(NamedTuple):
-    """A height of the tag that something else than TDOAs tells, and its standard deviation, m; NaN for none."""
+    """A height of the tag that something else than TDOAs gives, and its standard deviation, m; NaN for none."""
 
     z: float
     std: float
@@ -120,7 +120,7 @@ def in_time(a: Record, b: Record, innovation: Record) -> float:
     """Probability that a TDOA between two of ANCHOR, an INNOVATION after `project` of the best HYPOTHESIS, is of two anchors in time.
 
     After `find_lateness`; what is known of each anchor becomes what it is after that TDOA (a filter of four modes, Bar-Shalom et al.,
-    Estimation with Applications to Tracking and Navigation, 2001, section 11.6, without an exchange of states: being late tells no place).
+    Estimation with Applications to Tracking and Navigation, 2001, section 11.6, without an exchange of states: lateness shows no place).
     """
     late_a, late_b = a.late, b.late
     r, variance = innovation.value, innovation.prior_variance + innovation.noise_variance

@@ -1,8 +1,9 @@
 """Several yaws and places at once, while nobody knows which is right.
 
-A tag that starts anywhere cannot see its yaw: only motion that its accelerometer feels and its TDOAs see tells. Anchors in a plane do
-not tell on which side of it a tag is. One filter per direction and place runs until the TDOAs have decided (multiple model estimation, e.g.
-Bar-Shalom et al., Estimation with Applications to Tracking and Navigation, 2001, section 11.6.2, static case).
+A tag that starts anywhere cannot see its yaw: only motion that its accelerometer feels and its TDOAs see makes it observable. Anchors
+in a plane do not determine on which side of it a tag is. One filter per direction and place runs until the TDOAs have decided (multiple
+model estimation, e.g. Bar-Shalom et al., Estimation with Applications to Tracking and Navigation, 2001, section 11.6.2, static
+case).
 """
 
 from __future__ import annotations

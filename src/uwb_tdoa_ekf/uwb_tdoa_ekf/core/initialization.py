@@ -57,7 +57,7 @@ def is_repeat(ekf: Record, tdoa: Record, anchors: np.ndarray) -> bool:
 
 @compiled
 def _height_at_start(ekf: Record, parameters: Record, t: float) -> KnownHeight:
-    """What other sensors tell at stamp t, s, of a tag whose attitude only the accelerometer tells."""
+    """The height that other sensors give at stamp t, s, of a tag whose attitude only the accelerometer gives."""
     accel = _mean_accel(ekf.imu, parameters)
     return _known_height(ekf, parameters, accel[2] / max(math.sqrt(np.sum(accel**2)), 1e-9), t)
 
@@ -80,7 +80,7 @@ def _look_for_places(
 def start(
     ekf: Record, anchors: np.ndarray, parameters: Record, t: float, anyhow: bool, history: np.ndarray
 ) -> None:
-    """Begin if the window tells one position, or `anyhow` with the covariance that its contradictions leave."""
+    """Begin if the window determines one position, or `anyhow` with the covariance that its contradictions leave."""
     window = recent(ekf, parameters.start_window)
     if len(window) < MINIMUM:
         return
@@ -113,8 +113,8 @@ def start(
 
 @compiled
 def start_slowly(ekf: Record, anchors: np.ndarray, parameters: Record, t: float, history: np.ndarray) -> None:
-    """The same where few TDOAs come: from the last SLOW_TDOAS or SLOW_STAMPS of them, if these tell one position, and in any case when
-    there are so many."""
+    """The same where few TDOAs come: from the last SLOW_TDOAS or SLOW_STAMPS of them, if these determine one position, and in any case
+    when there are so many."""
     window, stamps = _last(ekf, t)
     enough = len(window) >= SLOW_TDOAS or (stamps >= SLOW_STAMPS and len(window) > 2 * stamps)
     span, gap = t - window[0].t, 0.0
@@ -162,8 +162,8 @@ def waits(ekf: Record, anchors: np.ndarray, parameters: Record, t: float, silent
 
 @compiled
 def relocate(ekf: Record, anchors: np.ndarray, parameters: Record, t: float, history: np.ndarray) -> None:
-    """Of a tag that few TDOAs come from, and whose place is hardly known by now: go where its last TDOAs tell it is, if they tell that
-    better than the filter. So far from where the TDOAs are linearized these do together what each of them does not alone."""
+    """Of a tag that few TDOAs come from, and whose place is hardly known by now: go to the place that its last TDOAs determine, if better
+    than the filter. So far from where the TDOAs are linearized these do together what each of them does not alone."""
     if not is_unsure(ekf) or len(recent(ekf, parameters.start_window)) >= MINIMUM:
         return
     best, window = ekf.hypotheses[ekf.best], _last(ekf, t)[0]
@@ -216,10 +216,10 @@ def look_around(ekf: Record, anchors: np.ndarray, parameters: Record, t: float) 
 def place(
     ekf: Record, anchors: np.ndarray, parameters: Record, t: float, pose: Record, history: np.ndarray
 ) -> None:
-    """Go to the pose that one of POSE tells; begin there, if the filter does not run.
+    """Go to the pose that one of POSE gives; begin there, if the filter does not run.
 
-    What is not told stays as it is; before the filter runs, it is anywhere in the workspace. Tilt, velocity and biases
-    stay as they are too: gravity and TDOAs know them better than who tells a pose.
+    What is not given stays as it is; before the filter runs, it is anywhere in the workspace. Tilt, velocity and biases
+    stay as they are too: gravity and TDOAs know them better than who gives a pose.
     """
     x, covariance = np.zeros(6), np.zeros((6, 6))
     if ekf.running:
@@ -339,7 +339,7 @@ def recover(
         hypothesis.P[:6, :] = 0.0
         hypothesis.P[:, :6] = 0.0
         _put(hypothesis, x[place], covariance[place])
-    if anywhere:  # what anchors told before the silence, they told of another place
+    if anywhere:  # what the anchors determined before the silence was another place
         systematic.begin(ekf.information, ekf.hypotheses[ekf.best].P)
     ekf.consistency, ekf.late_as_known = 1.0, False
     ekf.rest_since = t
@@ -390,7 +390,7 @@ def level_first(ekf: Record, parameters: Record, history: np.ndarray) -> None:
 
 @compiled
 def _known_height(ekf: Record, parameters: Record, up: float, t: float) -> KnownHeight:
-    """Height of a tag with cos(tilt) `up`, as something else than TDOAs tells it."""
+    """Height of a tag with cos(tilt) `up`, as something else than TDOAs gives it."""
     if parameters.fixed_height_std > 0.0:
         return KnownHeight(parameters.fixed_height, parameters.fixed_height_std)
     return KnownHeight(height.at_start(ekf, parameters, up, t), max(parameters.height_std, SMALLEST_STD))

@@ -76,7 +76,7 @@ PLAUSIBILITY = _record(
     ("size", float),  # and how large
 )
 
-# A pose that is told. NaN for what is not.
+# A pose that is given from outside. NaN for what is not.
 POSE = _record(
     ("t", float),  # s
     ("p", float, 3),  # m, of the body in the world,
@@ -120,7 +120,7 @@ HEIGHT = _record(
 BAROMETER = _record(
     ("heard", float),  # s, stamps: of the last altitude,
     ("agreed", float),  # and of the last one that was used
-    ("nis", float),  # mean normalised innovation squared of late, on the scale that is told
+    ("nis", float),  # mean normalised innovation squared of late, on the scale that is reported
 )
 
 VELOCITY = _record(
@@ -159,7 +159,7 @@ EKF = _record(
     ("within", float, (2, 3)),  # of the reach of those that were heard lately,
     ("workspace", float, (2, 3)),  # and of where the tag is expected, see workspace.py
     ("side", float, 3),  # on which the tag is of anchors in a plane, see workspace.configured_side
-    ("flat", float, 3),  # 1.0 for axes along which these are at one coordinate, while nobody tells on which side of that the tag is
+    ("flat", float, 3),  # 1.0 for axes along which these are at one coordinate, while it is not known on which side of that the tag is
     ("middle", float, 3),  # m, of the anchors heard lately
     ("next_bounds", float),  # s, stamp before which not to look anew who is heard
     ("information", float, (3, 3)),  # 1/m^2, of the place, that one arrival from each anchor heard lately gives, see systematic.py

@@ -39,7 +39,7 @@ SAME_ERROR = 0.01  # s; TDOAs of a tag at rest have the same errors: those of ea
 
 @compiled
 def repetition(ekf: Record, t: float) -> float:
-    """Factor on the variance of a TDOA stamped t, s: how many times over the TDOAs of this rest have told the same, errors included."""
+    """Factor on the variance of a TDOA stamped t, s: how many times over the TDOAs of this rest have measured the same, errors included."""
     return 1.0 + (t - ekf.rest_since) / SAME_ERROR if ekf.resting else 1.0
 
 

@@ -131,7 +131,7 @@ def _mix(explained: Places) -> int:
 @compiled
 def stop(x: np.ndarray, covariance: np.ndarray, of_velocity: np.ndarray) -> None:
     """Position and velocity x (6,) and their covariance (6, 6) become those of a tag at rest, as far as of_velocity (3, 3) m^2/s^2
-    tells."""
+    determines them."""
     x[3:] = 0.0
     covariance[:, 3:] = 0.0
     covariance[3:, :] = 0.0
@@ -194,7 +194,7 @@ def hover(ekf: Record, place: np.ndarray, still: bool, t: float, records: np.nda
             value, std = 0.0, HOVER_STD
             if state < 3:
                 value, P = place[state], ekf.hypotheses[h].P
-                P[state, state] = max(P[state, state], HOVER_STD**2)  # a place that is told again tells nothing new
+                P[state, state] = max(P[state, state], HOVER_STD**2)  # a place that is measured again adds nothing new
             else:
                 std = math.sqrt(ekf.still_covariance[state - 3, state - 3] + SPEED_STD**2)
             update_state(ekf.hypotheses[h], ekf.innovation, state, value, std)
@@ -207,7 +207,7 @@ def find_again(
     ekf: Record, pairs: np.ndarray, window: np.ndarray, anchors: np.ndarray, parameters: Record, t: float,
     records: np.ndarray,
 ) -> None:  # fmt: skip
-    """A tag lies still at stamp t, s, but inertial samples have told that it moves: they were wrong, and it may be anywhere."""
+    """A tag lies still at stamp t, s, but inertial samples have shown that it moves: they were wrong, and it may be anywhere."""
     places, nowhere = room_for(1), KnownHeight(np.nan, np.nan)
     locate(window, anchors, ekf.workspace, parameters, nowhere, places)
     weigh(ekf, pairs, anchors, parameters, nowhere, places.x[0], places.covariance[0])

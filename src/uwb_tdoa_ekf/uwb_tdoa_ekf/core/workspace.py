@@ -34,7 +34,7 @@ def set_bounds(extent: np.ndarray, margin: float, bounds: np.ndarray) -> None:
 
 @compiled
 def surround(ekf: Record, margin: float, bounds: np.ndarray) -> None:
-    """The same, as far as it is within the reach of the anchors heard lately, and on the side of them that is told."""
+    """The same, as far as it is within the reach of the anchors heard lately, and on the side of them that is configured."""
     set_bounds(ekf.extent, margin, bounds)
     for k in range(3):
         bounds[0, k], bounds[1, k] = max(bounds[0, k], ekf.within[0, k]), min(bounds[1, k], ekf.within[1, k])
@@ -48,7 +48,7 @@ def surround(ekf: Record, margin: float, bounds: np.ndarray) -> None:
 @compiled
 def configured_side(rows: np.ndarray, anchors: np.ndarray, tag_side: int) -> tuple[float, float, float]:
     """On which side of which plane a tag is that hears the anchors in rows (k,): the axis across the plane, 1.0 or -1.0 for the side along
-    that, 0.0 where nobody tells or the anchors are in no such plane, and its coordinate, m."""
+    that, 0.0 where none is configured or the anchors are in no such plane, and its coordinate, m."""
     if tag_side == 0 or len(rows) == 0:
         return 2.0, 0.0, 0.0
     axis, sign = 2, -1.0 if tag_side == BELOW else 1.0
@@ -113,7 +113,7 @@ def listen(ekf: Record, window: np.ndarray, anchors: np.ndarray, reach: float, t
 @compiled
 def add_circle(ekf: Record, height_known: bool, x: np.ndarray, covariance: np.ndarray) -> None:
     """Add to the (9, 9) covariance of a position x (3,), m, what anchors along one axis of the world leave open: the tag may be anywhere on
-    a circle about them. height_known : whether something else tells z."""
+    a circle about them. height_known : whether something else determines z."""
     square, across = 0.0, 0
     for k in range(3):
         if ekf.flat[k] > 0.0:
@@ -174,7 +174,7 @@ def constrain(hypothesis: Record, innovation: Record, bounds: np.ndarray, axis: 
     """Soft constraint of one axis: pull a tag that is outside towards its workspace, and one of which less is known than that. Returns
     whether there was anything to do.
 
-    Only while less is known of the axis: what is told once is not told better by being repeated, and TDOAs that agree on a place
+    Only while less is known of the axis: what is given once is not known better by being repeated, and TDOAs that agree on a place
     outside are right.
     """
     x, size = hypothesis.x[axis], bounds[1, axis] - bounds[0, axis]

@@ -55,7 +55,7 @@ def pace_of(windows: list[StampWindow]) -> float:
 
 
 def orderly(windows: list[StampWindow]) -> bool:
-    """False for stamps with which nothing else can be told: of 0, standing still, leaping, or of another unit."""
+    """False for stamps with which nothing else can be determined: of 0, standing still, leaping, or of another unit."""
     count, ratio = total(windows, "count"), pace_of(windows)
     broken = total(windows, "zeros") > 0.01 * count or total(windows, "same") > 0.98 * count or total(windows, "jumps")
     return not broken and not abs(ratio - 1.0) > PACE

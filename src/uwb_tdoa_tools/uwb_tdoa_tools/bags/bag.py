@@ -56,7 +56,7 @@ __all__ = [
 Made = TypeVar("Made")  # a stream of a Flight
 
 _FLIGHT_KEY = "uwb_tdoa_tools.flight"  # in the bag's custom data: name and meta of the flight, as JSON
-_TOLD = "source", "format", "protocol"  # of that meta: texts that are read again, to be told; nothing is computed with them
+_PRINTED = "source", "format", "protocol"  # of that meta: texts that are read again, to be printed; nothing is computed with them
 
 
 def _qos(durability: QosDurability, depth: int) -> Qos:
@@ -296,7 +296,7 @@ def read_fields(path: str | Path, topic: str) -> dict[str, np.ndarray]:
 
 
 def _about(path: str | Path) -> dict[str, Any]:
-    """{"name", "meta"} of the flight, as `write_bag` left them in the bag's custom data, what is _TOLD of it; of bags of others, and
+    """{"name", "meta"} of the flight, as `write_bag` left them in the bag's custom data, what is _PRINTED of it; of bags of others, and
     where they cannot be read, the name of the file and nothing."""
     out = {"name": Path(path).stem, "meta": {}}
     try:
@@ -308,7 +308,7 @@ def _about(path: str | Path) -> dict[str, Any]:
         if isinstance(name, str) and name:
             out["name"] = name
         if isinstance(meta, dict):
-            out["meta"] = {key: printable(meta[key])[:1000] for key in _TOLD if isinstance(meta.get(key), str)}
+            out["meta"] = {key: printable(meta[key])[:1000] for key in _PRINTED if isinstance(meta.get(key), str)}
     return out
 
 

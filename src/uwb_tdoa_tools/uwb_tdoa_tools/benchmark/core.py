@@ -31,7 +31,7 @@ SECTION = "compiled core, one core"
 
 
 def measure(progress: Callable[[str], object], quick: bool = False) -> Iterator[Figure]:
-    """Generator of Figures. progress(text) is told what comes next.
+    """Generator of Figures. progress(text) : called with what comes next.
 
     Each pair of figures comes from the same stretch of a flight, run from the same state: with its inertial samples
     alone, and with TDOAs at the stamps of inertial samples, so that the difference is their updates and nothing else.

@@ -1,4 +1,4 @@
-"""Measured figures, and how they are told: a table, and JSON."""
+"""Measured figures, and how they are printed: a table, and JSON."""
 
 from __future__ import annotations
 

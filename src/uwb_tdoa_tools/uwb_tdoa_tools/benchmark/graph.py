@@ -1,4 +1,4 @@
-"""How fast nodes answer the rest of the graph, parameters, poses that are told, a clock that stops, while messages flow."""
+"""How fast nodes answer the rest of the graph, parameters, poses that are given, a clock that stops, while messages flow."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ TARGET_IDLE = 1.0  # % of a core
 @dataclass
 class Answers:
     """answers, poses : s that each get_parameters, each initialpose took, SILENCE without an answer; periods : s between reports;
-    pause : s until a clock that stopped was told, None without one; cpu : share of one core."""
+    pause : s until a clock that stopped was reported, None without one; cpu : share of one core."""
 
     answers: list[float] = field(default_factory=list)
     poses: list[float] = field(default_factory=list)
@@ -94,11 +94,11 @@ def ask(
     loops that take all of a core; arguments : more of the ekf_node."""
     with ExitStack() as stack:
         node, processes = stack.enter_context(surroundings(folder))
-        told = ["--ros-args", "-p", f"publish_tf:={'odom' if tf else 'base'}", *arguments]
+        options = ["--ros-args", "-p", f"publish_tf:={'odom' if tf else 'base'}", *arguments]
         if clock:
-            told += ["-p", "use_sim_time:=true"]
+            options += ["-p", "use_sim_time:=true"]
         log = processes.file(NODE)
-        processes.start(PACKAGES[NODE], NODE, *told)
+        processes.start(PACKAGES[NODE], NODE, *options)
         if streams:
             processes.start(PACKAGES["bias_node"], "bias_node", *(["--ros-args", "-p", "use_sim_time:=true"] if clock else []))
             _wait(node, READY_LIMIT, lambda: ready_at("bias_node", processes.file("bias_node").read_text(errors="replace")))
@@ -169,11 +169,11 @@ class _Asking:
         _end(clock)
         stopped = time.monotonic()
 
-        def told() -> bool:
+        def reported() -> bool:
             paused = any(a > stopped and "paused" in text for a, text in self._reports)
             return paused or time.monotonic() > stopped + SILENCE
 
-        _wait(self._node, SILENCE + 1.0, told)
+        _wait(self._node, SILENCE + 1.0, reported)
         arrivals = [a for a, text in self._reports if a > stopped and "paused" in text]
         return arrivals[0] - stopped if arrivals else SILENCE
 

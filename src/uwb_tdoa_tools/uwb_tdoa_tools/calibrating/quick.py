@@ -54,22 +54,22 @@ class Prospect:
 
     def sentences(self) -> list[str]:
         """For people."""
-        told = [
+        lines = [
             f"from {self.seconds:.0f} s of {self.total:.0f} s in the air: of the innovations {100 * self.before:.1f} cm are slow with the anchors as "
             f"given, and {100 * self.left:.1f} cm with others",
             f"all flights are likely to tell {int(self.better.sum())} of {self.better.size} coordinates better: "
             f"{100 * np.median(self.expected):.0f} cm in the median instead of {100 * np.median(self.given):.0f} cm",
         ]
         if self.why_not:
-            told.append(f"so far nothing would be applied: {self.why_not}")
+            lines.append(f"so far nothing would be applied: {self.why_not}")
         unseen = [str(i) for i, row in zip(self.ids, self.better) if not row.any()]
         if unseen:
-            told.append(f"nothing is told of anchors {listed(unseen)}: fly closer to them, on all sides, high and low")
+            lines.append(f"nothing is told of anchors {listed(unseen)}: fly closer to them, on all sides, high and low")
         for axis, size, room in zip("xyz", self.path, self.hall):
             if size < MOVES * room:
-                told.append(f"along {axis} the tag moves by {size:.1f} m among anchors that are {room:.1f} m apart: fly more of it")
-        told.append("the flights are exciting enough" if self.exciting else "the flights are not exciting enough: fly more, and elsewhere")
-        return told
+                lines.append(f"along {axis} the tag moves by {size:.1f} m among anchors that are {room:.1f} m apart: fly more of it")
+        lines.append("the flights are exciting enough" if self.exciting else "the flights are not exciting enough: fly more, and elsewhere")
+        return lines
 
 
 def prospect(
@@ -100,6 +100,6 @@ def _expected(found: SelfCalibration, more: float) -> np.ndarray:
     """(N, 3) m: standard deviations after `more` times what was looked at for a SelfCalibration, as its information adds up."""
     prior = np.linalg.inv(found.prior.covariance)
     values, vectors = np.linalg.eigh(np.linalg.inv(found.solution.covariance) - prior)
-    told = (vectors * np.maximum(values, 0.0)) @ vectors.T
-    covariance = np.linalg.inv(prior + more * told)
+    information = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    covariance = np.linalg.inv(prior + more * information)
     return np.sqrt(np.diag(covariance))[: 3 * len(found.given)].reshape(-1, 3)

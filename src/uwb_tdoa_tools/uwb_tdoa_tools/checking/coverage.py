@@ -25,7 +25,7 @@ OUTSIDE, MARGIN = 0.5, 0.5  # share of the places of the tag, and m beyond the b
 SHORT = 10.0  # s
 FEWEST = 3  # anchors that tell no plane
 SAID = 5  # anchors of many that are named
-PART = 0.2  # of the seconds in which the side is not told, beyond which that is said
+PART = 0.2  # of the seconds in which the side is not known, beyond which that is said
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,7 @@ def _size_and_thickness(positions: np.ndarray) -> tuple[float, float]:
 
 def side(view: CoverageView) -> Iterator[Finding]:
     """Anchors in a plane across an axis of the world, all or those that are heard at once: the side of it that the tag is on must be
-    told."""
+    given."""
     heard = [view.anchors.positions[window.heard > 0] for window in view.windows]
     sides = [sides_of(positions) for positions in heard or [view.anchors.positions] if len(positions) > FEWEST]
     needed = [one for one in sides if one]

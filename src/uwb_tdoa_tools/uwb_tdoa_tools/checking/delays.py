@@ -23,7 +23,7 @@ LONGEST, STEP = 1.5, 0.05  # s that are tried to both sides, and between them
 DELAYS = np.arange(-LONGEST, LONGEST + 0.5 * STEP, STEP)
 NONE = len(DELAYS) // 2  # place of the delay 0
 BLOCK, FEWEST = 5.0, 5  # s, and samples that a series must have in one
-TELLING = 30.0  # samples, about, of which a series has that many in a block, that it must have to be told anything of
+TELLING = 30.0  # samples, about, of which a series has that many in a block, that it must have for anything to be said of it
 MOST = 15000  # TDOAs that are looked at, evenly taken
 LIMIT = 2.0  # standard deviations of a series, robust, beyond which an error counts no more: what is behind obstacles is many
 

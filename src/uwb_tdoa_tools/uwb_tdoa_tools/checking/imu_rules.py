@@ -1,7 +1,7 @@
 """Does the inertial sensor fit the TDOAs? Its axes are tried in every arrangement, its rates in other units: a filter
 that leans on the sensor says by its innovations what fits.
 
-What turns both sensors about the vertical cannot be seen, for nobody told the yaw; nor can a sign about an axis about
+What turns both sensors about the vertical cannot be seen, for the yaw is not known; nor can a sign about an axis about
 which the tag did not turn.
 """
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 def numbers(flight: Flight) -> list[Finding]:
     """[Finding] of a Flight, most severe first: of its streams by themselves, and against its ground truth if it has one. What several
-    rules name by the same name is told once."""
+    rules name by the same name is reported once."""
     streams, imu = fed(of_flight(flight)), flight.imu
     found = streams.findings()
     found += coverage.missing(coverage.CoverageView(flight.anchors, list(streams.tdoa), np.empty((0, 3))))

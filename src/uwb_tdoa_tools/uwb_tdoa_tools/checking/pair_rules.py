@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 # Of the median error that is left with the other sign, or with the ids exchanged: healthy 2.1 and 0.68 at least.
 CONTRARY = 0.4
-MOVED = 0.3  # m by which what a pair should measure varies, at least, for its sign to be told
+MOVED = 0.3  # m by which what a pair should measure varies, at least, for its sign to be determined
 GRID, ON_GRID = 0.03, 1e-4  # m: least step of what counts as rounded, healthy 0.014 at most, and how near to it values are
 BETWEEN = 0.2  # share of TDOAs on the line between their neighbours; healthy 0.04
 REPEATED, FROZEN = 0.2, 8  # share of TDOAs that equal the one before, healthy 0.06; how many together with one value, healthy 5

@@ -79,7 +79,7 @@ def read_recording(reading: Reading, path: str | Path, survey: str | Path | None
 def read_live(
     reading: Reading, seconds: float, survey: str | Path | None = None, say: Callable[[str], object] = print
 ) -> Recording:
-    """Recording of live topics, named as a Reading says, for so many seconds. say(sentence) : told what happens. Raises
+    """Recording of live topics, named as a Reading says, for so many seconds. say(sentence) : called with what happens. Raises
     InputError."""
     from ..live.listen import listen  # needs ROS
 

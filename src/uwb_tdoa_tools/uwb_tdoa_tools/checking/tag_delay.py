@@ -55,7 +55,7 @@ def window_offsets(ranges: Ranges, anchors: Anchors) -> np.ndarray:
 
 
 def _offset(positions: np.ndarray, d: np.ndarray) -> float | None:
-    """m, of ranges d (n,) m to anchors at positions (n, 3) m, by Gauss-Newton with Huber's weights; None where they do not tell."""
+    """m, of ranges d (n,) m to anchors at positions (n, 3) m, by Gauss-Newton with Huber's weights; None where they do not determine it."""
     x = np.append(positions.mean(axis=0), 0.0)
     for _ in range(STEPS):
         away = x[:3] - positions
@@ -65,8 +65,8 @@ def _offset(positions: np.ndarray, d: np.ndarray) -> float | None:
         jacobian = np.column_stack([away / distance[:, None], np.ones(len(d))])
         gram = jacobian.T @ (weight[:, None] * jacobian) + DAMPING * np.eye(4)
         x = x + np.linalg.solve(gram, jacobian.T @ (weight * error))
-    told = float(np.sqrt(np.linalg.inv(gram)[3, 3])) < DILUTION and bool(np.isfinite(x).all())
-    return float(x[3]) if told else None
+    determined = float(np.sqrt(np.linalg.inv(gram)[3, 3])) < DILUTION and bool(np.isfinite(x).all())
+    return float(x[3]) if determined else None
 
 
 RULES = (tag_delay,)

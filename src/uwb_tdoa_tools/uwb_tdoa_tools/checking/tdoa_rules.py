@@ -99,11 +99,11 @@ def survey(recording: OrderedRecording, others: Sequence[Survey]) -> Iterator[Mi
     """Another survey. others : [(name, Anchors)]. Those of one installation, of different days, count as one."""
     while others:
         (name, anchors), *rest = others
-        alike = [other for other, its in rest if same_place(anchors, its)]
-        others = [(other, its) for other, its in rest if other not in alike]
+        duplicates = [other for other, its in rest if same_place(anchors, its)]
+        others = [(other, its) for other, its in rest if other not in duplicates]
         if same_place(anchors, recording.anchors):
             continue
-        names = " or ".join([name, *alike])
+        names = " or ".join([name, *duplicates])
         cause = f"the survey is of another room or day: {names} fits"
         yield MistakeTrial(replace(recording, anchors=anchors), _says("survey_other", cause, f"--survey {name}"))
 

@@ -75,9 +75,9 @@ def _calibrate(args: Namespace) -> int:
         raise InputError(f"{(flights + holdout)[known.index(False)].name}: holds no ground truth, and others do; leave it out, or give --no-truth.")
     if args.quick:
         with Progress("calibrate") as progress:
-            told = prospect(flights, tape, base, config, lambda: progress("looking at a part of the flights"))
-        cli.show(*told.sentences())
-        return int(not told.exciting)
+            expected = prospect(flights, tape, base, config, lambda: progress("looking at a part of the flights"))
+        cli.show(*expected.sentences())
+        return int(not expected.exciting)
     if not holdout and len(flights) > 1:
         flights, holdout = flights[:-1], flights[-1:]
     with Progress("calibrate") as progress:
@@ -100,9 +100,9 @@ def _checked(reading: Reading, recordings: Sequence[Recording], std: float) -> b
     with Progress("calibrate", len(recordings), "recording") as progress:
         for path, survey in recordings:
             checked.append(read_recording(reading, path, survey))
-            told = check(checked[-1])
-            cli.show(report.text(told))
-            sound = sound and not stopping(checked[-1], told.findings, std)
+            result = check(checked[-1])
+            cli.show(report.text(result))
+            sound = sound and not stopping(checked[-1], result.findings, std)
             progress.update()
     for finding in different_surveys(checked):
         cli.show(*report.lines(finding))

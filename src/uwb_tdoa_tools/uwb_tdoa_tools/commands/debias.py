@@ -71,14 +71,14 @@ def _fit(args: Namespace) -> None:
     options.check_holdout((path.resolve() for path, _ in recordings), (path.resolve() for path, _ in held))
     fitted = list(parallel.over(estimator, recordings, args.jobs, args.dask))
     settings = {"step": args.step, "planar": args.planar, "interpolator": args.interpolator}
-    borne_out = cross_validated(fitted, args.static, estimator, **settings)
+    shrinkage = cross_validated(fitted, args.static, estimator, **settings)
     made = fit_map(fitted, args.static, estimator, **settings)
-    made = made.scaled(borne_out.share) if borne_out else made
+    made = made.scaled(shrinkage.share) if shrinkage else made
     made.save(args.out)
     cli.show(f"wrote {args.out}: {report.about(made)}")
-    cli.show(borne_out.as_text() if borne_out else "how much of it flights to come bear out is not known: give several flights")
+    cli.show(shrinkage.as_text() if shrinkage else "how much of it flights to come bear out is not known: give several flights")
     figures: dict[str, Any] = {"map": report.about_figures(made), "fitted": report.rows(fitted, made, estimator.effects)}
-    figures["borne_out"] = borne_out.as_dict() if borne_out else None
+    figures["borne_out"] = shrinkage.as_dict() if shrinkage else None
     report.say_rows("in sample", figures["fitted"])
     if held:
         figures["held out"] = _judged(args, estimator, held, made)

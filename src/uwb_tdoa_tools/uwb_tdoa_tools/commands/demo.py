@@ -77,20 +77,20 @@ def _demo(args: Namespace) -> int:
     if not in_time:
         cli.say("demo", f"messages lost or late: too much load for --rate {args.rate:g}; try less.")
     cli.show(*lines_of_errors(scores))
-    cli.show(_told(scores))
+    cli.show(_change_in_words(scores))
     from ..scoring.plots import plot_comparison  # takes a second to import
 
     plot_comparison(flight, scores[:-1], args.out / "error.png")
     cli.show(f"plot       {args.out / 'error.png'}")
     if rerun is not None:
-        flown.show(rerun, flight, [chosen.became, _told(scores)])
+        flown.show(rerun, flight, [chosen.became, _change_in_words(scores)])
         cli.show(f"rerun      {rerun}")
     cli.show(f"took {time.monotonic() - started:.0f} s")
     cli.show("next       " + "\n           ".join(demo.next_steps(args.flight or args.out / "flight.bag", args.survey)))
     return int(scores[-2].row()["diverged"] or not in_time)  # of the nodes
 
 
-def _told(scores: Sequence[Score]) -> str:
+def _change_in_words(scores: Sequence[Score]) -> str:
     """What correction did to the error, in words."""
     before, after = (score.row()["rmse_3d"] for score in scores[:2])
     if len(scores) == 2:
@@ -102,8 +102,8 @@ def _told(scores: Sequence[Score]) -> str:
 
 def _all_in_time(flight: Flight, became: dict[str, int]) -> bool:
     """Print what became of every message. Returns whether all were there in time."""
-    told = ", ".join(f"{count} {name}" for name, count in became.items() if not name.startswith("imu_"))
-    cli.show(f"nodes      TDOAs {len(flight.tdoa)}: {told}")
+    counts = ", ".join(f"{count} {name}" for name, count in became.items() if not name.startswith("imu_"))
+    cli.show(f"nodes      TDOAs {len(flight.tdoa)}: {counts}")
     samples = 0 if flight.imu is None else len(flight.imu)
     cli.show(f"nodes      IMU samples {samples}: {became['imu_late']} late, {became['imu_lost']} lost")
     return not any(became[name] for name in ("lost", "late", "imu_late", "imu_lost"))

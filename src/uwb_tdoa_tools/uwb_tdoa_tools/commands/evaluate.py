@@ -80,11 +80,11 @@ def _evaluate(args: Namespace) -> int:
     if not args.odometry:
         cli.show(f"correcting with: {estimator.correction}")
     cli.show(table.head())
-    told, pool = [], Pool()
+    kept, pool = [], Pool()
     asked = asked_of(args, NO_MATTER, ("effects", "config", "model")) | {"version of the figures": FIGURES}
     for result in results(evaluator, found, args.resume, asked, args.jobs, args.dask):
         pool.add(result)
-        told += [result] if args.json or args.markdown else []  # else nothing grows with the number of flights
+        kept += [result] if args.json or args.markdown else []  # else nothing grows with the number of flights
         cli.show(table.line(result.row))
     together = pool.figures()
     if len(found) > 1:
@@ -94,10 +94,10 @@ def _evaluate(args: Namespace) -> int:
     cli.show("", *table.lines_of_phases(together["phases"] if len(found) > 1 else result.phases))
     cli.show("", *table.lines_of_alignment(result.aligned if len(found) == 1 else {}, pool.aligned))
     if args.json:
-        cli.write_json(args.json, {"runs": [one.as_json() for one in told], "pooled": as_json(together)})
+        cli.write_json(args.json, {"runs": [one.as_json() for one in kept], "pooled": as_json(together)})
     if args.markdown:
         others = table.read_others(args.beside) if args.beside else {}
-        Path(args.markdown).write_text(table.markdown_of(told, pool, others))
+        Path(args.markdown).write_text(table.markdown_of(kept, pool, others))
     if late := evaluator.late_tdoas():
         cli.say("evaluate", f"{args.odometry}: {late} TDOAs came too late for that filter: this is not what it can do; "
                 "replay it in step with the odometry (replay --follow odometry).")  # fmt: skip

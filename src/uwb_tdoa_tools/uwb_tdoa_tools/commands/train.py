@@ -95,7 +95,7 @@ def _write(args: Namespace, several: Sequence[Flight], over: MapFunction, progre
     name = args.name or args.model
     progress(f"training on {len(training)} flights, then without each")
     recipe = models.Recipe(args.model, args.seed)
-    result, borne_out = shrinking.train(recipe, training, validation, name, progress=cli.show, map_function=over)
+    result, shrinkage = shrinking.train(recipe, training, validation, name, progress=cli.show, map_function=over)
     args.out.mkdir(parents=True, exist_ok=True)
     models.save(result, args.out)
     label, x, of_training, of_validation = result.curve
@@ -105,8 +105,8 @@ def _write(args: Namespace, several: Sequence[Flight], over: MapFunction, progre
     for name, (before, after) in result.errors.items():
         cli.show(f"{name:26s} error of the TDOAs {before:.3f} m, after correction {after:.3f} m (root mean square)")
     curve = {label: x, "training": of_training, "validation": of_validation}
-    cli.show(borne_out.as_text())
-    content = {**result.meta, "curve": curve, "validation": result.errors, "borne_out": borne_out.as_dict()}
+    cli.show(shrinkage.as_text())
+    content = {**result.meta, "curve": curve, "validation": result.errors, "borne_out": shrinkage.as_dict()}
     cli.write_json(args.out / "training.json", content)
     cli.show(f"wrote {', '.join(sorted(path.name for path in args.out.iterdir()))} in {args.out}")
 

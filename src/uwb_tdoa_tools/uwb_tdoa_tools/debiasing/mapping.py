@@ -1,4 +1,4 @@
-"""A bias map from flights and from places where a tag stood still, and as much of it as flights left out of it bear out."""
+"""A bias map from flights and from places where a tag stood still, scaled to the share that cross-validation over flights supports."""
 
 from __future__ import annotations
 

@@ -41,8 +41,8 @@ if TYPE_CHECKING:
     from .regression.table import RegressionTable
     from .channels import ChannelResidual, ChannelResiduals
 
-FOR_MAPS = 3  # flights: a map of fewer is of their paths, and misleads others; two that fly alike bear each other out
-ON_FLOOR = 0.5  # m by which a function of UPWARDS changes at least near the floor, to be told
+FOR_MAPS = 3  # flights: a map of fewer is of their paths, and misleads others; two with like paths validate each other
+ON_FLOOR = 0.5  # m by which a function of UPWARDS changes at least near the floor, to be reported
 RANGED = tuple(name for name, kind in RADIO.items() if kind.ends == 1)  # streams of distances to anchors
 
 
@@ -76,7 +76,7 @@ class Attribution:
 
     @property
     def of_floor(self) -> tuple[Effect, ...]:
-        """Effects found near the floor that the filter may be told: tuple. Functions without a name would go on in the air."""
+        """Effects found near the floor that the filter may get: tuple. Functions without a name would go on in the air."""
         return tuple(effect for effect in effects_of(self.floor) if effect.weighed) if self.floor else ()
 
     @property
@@ -239,7 +239,7 @@ def _declared(
     found: Sequence[ChannelResiduals], reference: Reference, kinds: Collection[str] | None,
     installation: tuple[Anchors, np.ndarray],
 ) -> list[Candidate]:  # fmt: skip
-    """[Candidate] of the catalogue, of effects that a channel shows, and that the reference can tell."""
+    """[Candidate] of the catalogue, of effects that a channel shows, and that are observable with the reference."""
     shown = {name for flight in found for name in flight}
     effects = [effect for effect in EFFECTS.values() if effect.fitted and shown & set(effect.channels)]
     chosen = [

@@ -1,6 +1,6 @@
 """How far anchors may be from where a fit with ground truth puts them: deviations that hold.
 
-A fit states how well the data tell its values, if its model is the right one. Positions and delays of anchors take what other
+A fit states how well the data determine its values, if its model is the right one. Positions and delays of anchors take what other
 systematic errors leave unexplained, in the same way at every place, so that no scatter between blocks of time shows it. So they
 are fitted once more, with the information that errors leave which last as long as the flight, beside what can take their place: a
 smooth function of the place for every anchor, as large as the evidence says, as what an antenna adds in each direction is; and
@@ -80,7 +80,7 @@ def _anchor(column: Column) -> str:
 
 
 def _heard_with(table: RegressionTable, model: Fit) -> set[str] | None:
-    """Ids of the anchors whose positions or delays a Fit tells, and of all that are heard in the same blocks as any of them: set of
+    """Ids of the anchors whose positions or delays a Fit determines, and of all that are heard in the same blocks as any of them: set of
     texts. None for all anchors: of few, or of several installations."""
     parts = table.radio_parts
     ids = parts[0].samples.anchors.ids

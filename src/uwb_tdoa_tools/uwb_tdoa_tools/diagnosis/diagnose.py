@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     Flights = tuple[Flight, ...]
 
 EXPLAINED = 0.1  # share of the slow innovations that a self-calibration must explain, to be a finding
-NOT_TOLD = "without ground truth nobody can tell whether taking it out helps the position"
+CANNOT_JUDGE = "without ground truth nobody can tell whether taking it out helps the position"
 
 
 def diagnose(
@@ -187,7 +187,7 @@ def _by_self_calibration(work: _Work, found: Attribution, flights: tuple[Flights
                 for effect in several
             ]  # fmt: skip
             labels = [candidate.label for candidate in chosen if candidate.name not in OF_ANCHORS]
-            refused = [Refused(label, NOT_TOLD) for label in (*labels, *(one.effect.label for one in found.detections))]
+            refused = [Refused(label, CANNOT_JUDGE) for label in (*labels, *(one.effect.label for one in found.detections))]
             changes = tuple(change.as_text() for change in calibration.changes)
     judged_on = validation.HELD_OUT if held_out else "the flights that were fitted, by their innovations alone"
     work.progress("judging")

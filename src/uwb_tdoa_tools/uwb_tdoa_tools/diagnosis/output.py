@@ -13,7 +13,7 @@ from .. import json_values
 from .over_flights import course
 from .report import anchors
 from .report.entries import doubt_in_words, entries, worth_in_words
-from .report.unclear import by_remedy, untold
+from .report.unclear import by_remedy, undetermined
 from .report.verdict import faults_in_words, truth_in_words, verdict
 
 if TYPE_CHECKING:
@@ -40,9 +40,9 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
                 {
                     "effect": item.effect,
                     "direction": item.direction or "the flights lack the channel, or the reference, that shows it",
-                    "told_by": words.told_by,
+                    "told_by": words.remedy,
                 }
-                for item, words in zip(diagnosis.unobservable, untold(diagnosis))
+                for item, words in zip(diagnosis.unobservable, undetermined(diagnosis))
             ],
             "changes": list(diagnosis.changes),
             "refused": [{"what": item.what, "why": item.why} for item in diagnosis.refused],
@@ -55,7 +55,7 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
 
 
 def as_text(diagnosis: Diagnosis) -> str:
-    """Lines for the screen: verdict, what to do, what was found and its worth, what could not be told, what to run."""
+    """Lines for the screen: verdict, what to do, what was found and its worth, what was not determined, what to run."""
     found = entries(diagnosis)
     lines = [("" if k else "verdict", sentence) for k, sentence in enumerate(verdict(diagnosis).sentences)]
     lines += [("truth", sentence) for sentence in truth_in_words(diagnosis)]
@@ -67,8 +67,8 @@ def as_text(diagnosis: Diagnosis) -> str:
         what = f"{entry.title}: {entry.values}; {judged}." if entry.findings[0].declared else f"{entry.title}; {judged}."
         lines.append(("found" if entry.findings[0].declared else "no name", what))
         lines += [("", sentence) for sentence in [entry.over_flights, *doubt_in_words(entry)] if sentence]
-    for told_by, several in by_remedy(untold(diagnosis)).items():
-        lines.append(("not told", f"{listed(several)}; what would tell: {told_by}."))
+    for remedy, several in by_remedy(undetermined(diagnosis)).items():
+        lines.append(("not told", f"{listed(several)}; what would tell: {remedy}."))
     if any(entry.added for entry in found):
         lines += [("apply", command) for command, _ in diagnosis.applying]
     return "\n".join([*(_wrapped(*line) for line in lines), *anchors.lines(diagnosis)])

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from .regression.table import RegressionTable
     from .regression.terms import Candidate
 
-TOLD = 0.25  # standard deviation of a share, that a flight must at least tell
+DETERMINED = 0.25  # standard deviation of a share, below which the flight determines it
 SURE = 4.0  # standard deviations
 ALIKE = 0.3  # share by which flights may differ and count as the same: models are never right to less
 GROWN = 0.5  # share by which the last flight must be beyond the first, to call it growing
@@ -31,8 +31,8 @@ ALL, ALONE, GROWS, DIFFERS = "all", "alone", "grows", "differs"
 
 @dataclass(frozen=True)
 class Share:
-    """How much of a finding a flight shows. flight : its name; share, std : 1 is what all flights together have told; std is
-    infinite where it tells nothing."""
+    """How much of a finding a flight shows. flight : its name; share, std : 1 is what all flights together show; std is
+    infinite where it shows nothing."""
 
     flight: str
     share: float
@@ -45,8 +45,8 @@ class Share:
 
     @property
     def determined(self) -> bool:
-        """Whether the flight tells it."""
-        return self.std < TOLD
+        """Whether the flight determines it."""
+        return self.std < DETERMINED
 
 
 def shares(selection: Selection, candidate: Candidate, names: Sequence[str]) -> tuple[Share, ...]:
@@ -66,38 +66,38 @@ def _shares(part: np.ndarray, y: np.ndarray, information: np.ndarray, flight: np
 
 
 def course(several: Sequence[Share]) -> str | None:
-    """ALL, ALONE, GROWS or DIFFERS of (Share, ...) in the order of the flights; None where fewer than two tell it."""
-    told = [each for each in several if each.determined]
-    if len(told) < 2:
+    """ALL, ALONE, GROWS or DIFFERS of (Share, ...) in the order of the flights; None where fewer than two determine it."""
+    determined = [each for each in several if each.determined]
+    if len(determined) < 2:
         return None
-    share, std = (np.array([getattr(each, name) for each in told]) for name in ("share", "std"))
+    share, std = (np.array([getattr(each, name) for each in determined]) for name in ("share", "std"))
     largest = int(np.argmax(np.abs(share)))
-    others = np.arange(len(told)) != largest
+    others = np.arange(len(determined)) != largest
     apart = np.abs(share[largest] - share[others]) > SURE * np.hypot(std[largest], std[others])
     if (np.abs(share[others]) < ALIKE * abs(share[largest])).all() and apart.all():
         return ALONE
     spread = np.maximum(ALIKE, SURE * std)
     if (np.abs(share - np.average(share, weights=std**-2)) < spread).all():
         return ALL
-    order = np.arange(len(told)) - 0.5 * (len(told) - 1)
+    order = np.arange(len(determined)) - 0.5 * (len(determined) - 1)
     steps = np.diff(share) * np.sign(share[-1] - share[0])
     slope, sure = order @ share / (order @ order), np.sqrt(order**2 @ std**2) / (order @ order)
     rising = (steps > -2.0 * np.hypot(std[1:], std[:-1])).all()
-    if len(told) > 2 and rising and abs(slope) > SURE * sure and abs(share[-1] - share[0]) > GROWN:
+    if len(determined) > 2 and rising and abs(slope) > SURE * sure and abs(share[-1] - share[0]) > GROWN:
         return GROWS
     return DIFFERS
 
 
 def in_words(several: Sequence[Share]) -> str:
-    """A sentence on (Share, ...); "" where flights do not tell."""
-    kind, told = course(several), [each for each in several if each.determined]
+    """A sentence on (Share, ...); "" where flights do not determine it."""
+    kind, determined = course(several), [each for each in several if each.determined]
     if kind is None:
         return ""
     if kind == ALL:
-        return f"The same in all {len(told)} flights that show it."
+        return f"The same in all {len(determined)} flights that show it."
     if kind == ALONE:
-        return f"Belongs to {max(told, key=lambda each: abs(each.share)).flight} alone."
-    listed = ", ".join(f"{each.share:.1f} in {each.flight}" for each in told)
+        return f"Belongs to {max(determined, key=lambda each: abs(each.share)).flight} alone."
+    listed = ", ".join(f"{each.share:.1f} in {each.flight}" for each in determined)
     return f"{'Grows' if kind == GROWS else 'Differs'} from flight to flight: {listed} of it."
 
 

@@ -74,8 +74,8 @@ def inflation_of(table: RegressionTable, declared: Sequence[Candidate], search: 
     """(groups,) loss of independence, on the residual of a fit with all that is declared, and with what `search`, as of `select`, finds."""
     known, model = list(declared), fit(table, columns_of(declared), covariance=False)
     for _ in range(DISGUISED):
-        alike = replace(model, inflation=np.ones_like(model.inflation))
-        found = search(table, alike, known)
+        uninflated = replace(model, inflation=np.ones_like(model.inflation))
+        found = search(table, uninflated, known)
         if not found:
             break
         known += found

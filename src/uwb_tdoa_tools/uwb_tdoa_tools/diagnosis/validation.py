@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, TypeVar
 import numpy as np
 
 from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_bias.correction.rehearsal import RehearsedCorrector
+from uwb_tdoa_bias.correction.fixed_pose import FixedPoseCorrector
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.frames import poses_of
@@ -202,9 +202,9 @@ class _Trials:
 
     def start(self, candidates: Sequence[Candidate], detections: Sequence[Detection]) -> float:
         """The error of a model; later trials take the poses of its runs."""
-        (told,) = self._tried(_error_and_poses, [(candidates, detections)])
-        self._poses = [poses for _, poses in told]
-        return float(np.mean([error for error, _ in told]))
+        (results,) = self._tried(_error_and_poses, [(candidates, detections)])
+        self._poses = [poses for _, poses in results]
+        return float(np.mean([error for error, _ in results]))
 
     def errors(self, models: Sequence[Model]) -> list[float]:
         """The errors of other models, [(candidates, detections)]: [m]."""
@@ -217,12 +217,12 @@ class _Trials:
         """[[function of each trial] of each model], all at once."""
         attribution, flights, base = self._attribution, self._flights, self._baseline.base
         fitted = [cross_fitted(attribution, flights, base, candidates, detections, TRIAL_FLIGHTS) for candidates, detections in models]
-        told = []
+        results = []
         trials = zip(sum(fitted, []), cycle(self._poses))
         for of_case in self._map_function(partial(function, self._baseline.config), trials):
-            told.append(of_case)
+            results.append(of_case)
             self._progress()
-        return [told[k : k + len(fitted[0])] for k in range(0, len(told), len(fitted[0]))]
+        return [results[k : k + len(fitted[0])] for k in range(0, len(results), len(fitted[0]))]
 
 
 def error_of(config: FilterConfig | None, trial: tuple[ValidationCase, Poses | None]) -> float:
@@ -241,7 +241,7 @@ def _judged(config: FilterConfig | None, trial: tuple[ValidationCase, Poses | No
     """(3D RMSE, m, Run) of a trial."""
     case, poses = trial
     anchors, effects = case.flight.anchors, case.effects
-    corrector = Corrector(anchors, effects) if poses is None else RehearsedCorrector(anchors, effects, poses)
+    corrector = Corrector(anchors, effects) if poses is None else FixedPoseCorrector(anchors, effects, poses)
     run = run_offline(case.flight, config, corrector)
     return score(case, run).rmse_3d, run
 

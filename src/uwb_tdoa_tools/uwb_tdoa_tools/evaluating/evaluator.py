@@ -76,8 +76,8 @@ class Evaluator:
             write_tum(folder / f"{flight.name}.tum", odometry.t, odometry.p, odometry.q)
             write_tum(folder / f"{flight.name}_truth.tum", truth.t, truth.p, truth.q)
         if self.rerun:
-            told = [f"{name}: {value}" for name, value in score.row().items()]
-            write_rerun(self.rerun, flight, odometry, residuals, told, truth)
+            lines = [f"{name}: {value}" for name, value in score.row().items()]
+            write_rerun(self.rerun, flight, odometry, residuals, lines, truth)
         aligned = {**found.as_dict(), "align": self.align, "words": found.frame_in_words()}
         return replace(score.result(), aligned=aligned | {f"rmse_3d_{how}": one.row()["rmse_3d"] for how, one in scores.items()})
 

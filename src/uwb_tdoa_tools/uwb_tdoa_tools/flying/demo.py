@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from ..readers.inputs import Reading
     from ..scoring.metrics import Estimate
 
-SIMULATED = trial.Task(HALL, seed=1, yaw="unknown")  # told nothing, as the nodes are
+SIMULATED = trial.Task(HALL, seed=1, yaw="unknown")  # place and yaw are not given, as to the nodes
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ def fly(planned: DemoFlight, folder: Path, rate: float = 1.0, say: Callable[[str
     """Write the flight of a DemoFlight as a bag, play it to both nodes, and run the filter without ROS beside them:
     DemoResult.
 
-    The bags and the output of the nodes go to the folder. Raises InputError, LiveError. say(text) : told what happens.
+    The bags and the output of the nodes go to the folder. Raises InputError, LiveError. say(text) : called with what happens.
     """
     flight, bag, correction = planned.flight, folder / "flight.bag", planned.corrector()
     assert flight.truth is not None

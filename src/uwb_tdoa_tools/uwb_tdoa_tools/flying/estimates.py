@@ -118,7 +118,7 @@ class OurFilter:
 
 
 class TheirFilter:
-    """A Peer behind the same calls. It is told place and yaw at the start, knows no effects, and says nothing of its covariance."""
+    """A Peer behind the same calls. It gets place and yaw at the start, knows no effects, and says nothing of its covariance."""
 
     deviation = 0.0  # m; nobody knows
     why = ""

@@ -62,7 +62,7 @@ USUAL = 2.0  # s over which it learns what support it feels in the air, where th
 
 class Mission:
     """One flight along a path. state : of WAITING ...; started, ended : s, when the rotors started and stopped, or None; lost : s, when
-    its estimate first said that it was lost, or None: then it stops, sinks, and goes on with its path only if it is told where it is while
+    its estimate first said that it was lost, or None: then it stops, sinks, and goes on with its path only if its place is given while
     it is still in the air; yaw : rad, wanted now."""
 
     def __init__(

@@ -56,12 +56,12 @@ class OverTopics:
     newest, or None."""
 
     def __init__(self, node: StreamNode, world: World, pace: RealTime | Lockstep, clock: bool) -> None:
-        """node : StreamNode; world : World; pace : of `pace`, which is told what goes and comes; clock : publish /clock, and count
+        """node : StreamNode; world : World; pace : of `pace`, which hears of all that goes and comes; clock : publish /clock, and count
         stamps from 0, not from now."""
         self._node, self._pace, self._anchors = node, pace, world.anchors
         self._begin = 0 if clock else None  # ns, stamp of the start; of now without /clock
         self._now = 0.0
-        self._told: tuple[float, np.ndarray, float, float] | None = None
+        self._pending_pose: tuple[float, np.ndarray, float, float] | None = None
         self.status: EstimatorStatus | None = None
         self._outputs = {name: _Output(node, *STREAMS[name]) for name in ("imu", "tdoa", *world.aids)}
         self._truth = _Output(node, *STREAMS["truth"], frame=self._anchors.frame)
@@ -92,15 +92,15 @@ class OverTopics:
 
     def set_pose(self, t: float, p: np.ndarray, std: float, yaw: float) -> None:
         """See OurFilter; is said before what is measured first."""
-        self._told = t, p, std, yaw
+        self._pending_pose = t, p, std, yaw
 
     def take(self, measured: SensorReadings) -> None:
         """Publish SensorReadings."""
         if self._begin is None:
             self._begin = self._node.get_clock().now().nanoseconds
-        if self._told:
-            self._pose.publish(self._pose_of(*self._told))
-            self._told = None
+        if self._pending_pose:
+            self._pose.publish(self._pose_of(*self._pending_pose))
+            self._pending_pose = None
         self._measured = measured
         for name, part in measured.streams.items():
             self._outputs[name].publish(*self._parts(part.t), part)

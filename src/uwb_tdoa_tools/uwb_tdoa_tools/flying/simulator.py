@@ -46,8 +46,8 @@ class SensorReadings:
 
 
 class Simulator:
-    """One vehicle for so many seconds. state (17,), as of `vehicle`; vehicle : the true Vehicle; believed : the one that its controller is
-    told; times (n,) s, states (n, 17), contact (n,) number of feet on the ground: at each sample of the inertial sensor, up to `done`."""
+    """One vehicle for so many seconds. state (17,), as of `vehicle`; vehicle : the true Vehicle; believed : the one that its controller
+    knows; times (n,) s, states (n, 17), contact (n,) number of feet on the ground: at each sample of the inertial sensor, up to `done`."""
 
     def __init__(self, world: World, seed: int, duration: float, radius: float = 0.0) -> None:
         """world : World; duration : s; radius : m, of the circle whose point nearest to +x it starts from."""

@@ -34,7 +34,7 @@ REST_AFTER = 3.0  # s of the recording after the rotors have stopped
 PAUSE, CARRIED, CARRY_TIME = 60.0, 2.0, 6.0  # s at rest between two flights, m and s by which it is carried then
 OUTSIDE = 0.5  # m beyond the hall, where a flight ends
 TIPPED = math.radians(75.0)  # tilt of a vehicle that touches something, and does not get up again
-TOLD_AT, TOLD_STD = 0.3, 0.1  # s after switching on; m and rad, standard deviation of what is told
+GIVEN_AT, GIVEN_STD = 0.3, 0.1  # s after switching on; m and rad, standard deviation of the place and yaw that are given
 
 
 @dataclass(frozen=True)
@@ -84,12 +84,12 @@ class Trial:
         duration = lasts or longest * (2 if task.again else 1) + (PAUSE + CARRY_TIME if task.again else 0.0)
         self.task, self.simulator = task, Simulator(world, seed, duration, task.path.radius)
         self._rng = random(seed, "task")
-        told = random(seed, "told")
-        place, off = self.simulator.state[POSITION] + TOLD_STD * told.standard_normal(3), TOLD_STD * told.standard_normal()
+        rng = random(seed, "told")
+        place, off = self.simulator.state[POSITION] + GIVEN_STD * rng.standard_normal(3), GIVEN_STD * rng.standard_normal()
         yaw = self.simulator.yaw + off
         self.source: EstimateSource | TheirFilter = source or _filter_of(task, place, yaw)
         if task.told == "place" and not isinstance(self.source, TheirFilter):
-            self.source.set_pose(TOLD_AT, place, TOLD_STD, yaw if task.yaw == "known" else math.nan)
+            self.source.set_pose(GIVEN_AT, place, GIVEN_STD, yaw if task.yaw == "known" else math.nan)
         self.controller = Controller(task.gains, self.simulator.believed)
         self.transport = Transport(world.latency, world.jitter, random(seed, "transport"))
         self.missions: list[Mission] = []
@@ -183,11 +183,11 @@ def fly(task: Task) -> TrialResult:
 
 
 def _filter_of(task: Task, place: np.ndarray, yaw: float) -> OurFilter | TheirFilter:
-    """Who tells where it is, of a Task; place (3,) m and yaw, rad: what is told at the start, if it is."""
+    """Who tells where it is, of a Task; place (3,) m and yaw, rad: what is given at the start, if it is."""
     anchors = task.world.anchors
     if task.peer is not None:
         return TheirFilter(task.peer, anchors, yaw, place if task.told == "place" else None)
-    known: dict[str, Any] = {"initial_yaw": yaw, "initial_yaw_std": TOLD_STD} if task.yaw == "known" else {}
+    known: dict[str, Any] = {"initial_yaw": yaw, "initial_yaw_std": GIVEN_STD} if task.yaw == "known" else {}
     return OurFilter(anchors, replace(task.config, **known), task.effects, load_network(task.model))
 
 

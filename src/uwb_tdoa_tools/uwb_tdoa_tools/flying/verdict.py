@@ -136,7 +136,7 @@ def _estimation(
         return {"lost": None, "estimation": None, "phases": {}}
     stamps = np.arange(odometry.t[0], odometry.t[-1], SPACING)
     rows = np.unique(np.searchsorted(odometry.t, stamps))
-    rows = rows[np.isfinite(odometry.p[rows]).all(axis=1)]  # a peer's may be no numbers: then it told nothing
+    rows = rows[np.isfinite(odometry.p[rows]).all(axis=1)]  # a peer's may be no numbers: then it gave nothing
     t = odometry.t[rows]
     error = odometry.p[rows] - position_at(t, truth)
     distance, covariance = np.linalg.norm(error, axis=1), odometry.covariance[rows, :3, :3]

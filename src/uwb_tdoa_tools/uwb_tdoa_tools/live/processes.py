@@ -66,7 +66,7 @@ def wait(
     """Serve the node until condition(). Raises LiveError if a process has ended that should not, or after `limit` s in which nothing
     went on: what goes_on() gives stayed the same, and no process that is still starting worked, as a node that compiles does.
 
-    limit : s, or None; say(text) : told every few seconds for what it waits and what the processes do."""
+    limit : s, or None; say(text) : called every few seconds with what it waits and what the processes do."""
     looked = moved = time.monotonic()
     worked, sign = processes.worked(), goes_on()
     while not condition():

@@ -44,7 +44,7 @@ def record(
 ) -> Recorded:  # fmt: skip
     """Record topics, or all that are not hidden if the list is empty, until SIGINT or SIGTERM. Returns Recorded.
 
-    output : path of the bag, which appears when the recording ends; say(sentence) : told what happens; packages : of message types,
+    output : path of the bag, which appears when the recording ends; say(sentence) : called with what happens; packages : of message types,
         beside those that are known, that may be imported.
     Raises InputError, and Failure if no message came at all: then there is no bag.
     """
@@ -92,7 +92,7 @@ class Recorder:
                 self._subscribe(topic, msgtype, [each.qos_profile for each in publishers if each.topic_type == msgtype])
 
     def run(self, enough: Callable[[], object], taken: Callable[[int], object] = lambda count: None) -> None:
-        """Discover topics and take messages until enough(). taken(count) : told how many came."""
+        """Discover topics and take messages until enough(). taken(count) : called with how many came."""
         look_again = 0.0
         while not enough():
             if time.monotonic() >= look_again:

@@ -67,7 +67,7 @@ class Replayed:
 
 
 def replay(bag: str | Path, options: ReplayOptions = ReplayOptions(), say: Callable[[str], object] = print) -> Replayed:
-    """Replay a bag. Returns Replayed. Raises InputError. say(sentence) : told what happens."""
+    """Replay a bag. Returns Replayed. Raises InputError. say(sentence) : called with what happens."""
     with open_bag(bag) as reader, session("replay", list(options.ros_arguments)) as (node, stop):
         publishers = _publishers(node, bag, reader, say, options.packages)
         connections = [connection for connection in reader.connections if connection.topic in publishers]

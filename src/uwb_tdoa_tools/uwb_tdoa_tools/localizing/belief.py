@@ -46,13 +46,13 @@ class Belief:
 
     def sentences(self) -> list[str]:
         """The verdict for people."""
-        told = self.figures
-        if not told["estimates"]:
+        figures = self.figures
+        if not figures["estimates"]:
             return [f"{self.level}: there is no estimate", *self.reasons, *self.remedies]
-        spread = ", ".join(f"{axis} {100 * told[f'std_{axis}']:.0f}" for axis in "xyz")
-        within = f"standard deviation {100 * told['std']:.0f} cm ({spread}): the position is within {100 * told['within']:.0f} cm for 95 % of the time"
-        fits = f"{told['explained']:.1%} of {_counted(told)} fit it within three standard deviations (NIS {told['nis']:.2f}, 1 or less is sound)"
-        off = told.get("range_offset")
+        spread = ", ".join(f"{axis} {100 * figures[f'std_{axis}']:.0f}" for axis in "xyz")
+        within = f"standard deviation {100 * figures['std']:.0f} cm ({spread}): the position is within {100 * figures['within']:.0f} cm for 95 % of the time"
+        fits = f"{figures['explained']:.1%} of {_counted(figures)} fit it within three standard deviations (NIS {figures['nis']:.2f}, 1 or less is sound)"
+        off = figures.get("range_offset")
         offset = [] if off is None or abs(off) < OFFSET else [f"all ranges are {100 * abs(off):.0f} cm too {'long' if off > 0.0 else 'short'}: that was found, and taken out"]
         return [f"{self.level}: {within}; {fits}", *offset, *self.reasons, *self.remedies]
 

@@ -31,10 +31,10 @@ class Located:
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
-        told = self.belief
+        belief = self.belief
         return {
-            "flight": self.flight, "verdict": told.level, **told.figures, "lost_spans": told.lost, "reasons": list(told.reasons),
-            "remedies": list(told.remedies), "files": [str(path) for path in self.written],
+            "flight": self.flight, "verdict": belief.level, **belief.figures, "lost_spans": belief.lost, "reasons": list(belief.reasons),
+            "remedies": list(belief.remedies), "files": [str(path) for path in self.written],
         }  # fmt: skip
 
 

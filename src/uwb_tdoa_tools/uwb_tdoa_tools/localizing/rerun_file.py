@@ -36,7 +36,7 @@ BLUE, RED, GREY, BLACK, ORANGE = (31, 119, 180), (214, 39, 40), (120, 120, 120),
 
 
 def is_there(say: Callable[[str], object]) -> bool:
-    """Whether the library is installed; say(sentence) is told if not."""
+    """Whether the library is installed; say(sentence) : called if not."""
     if find_spec("rerun") is not None:
         return True
     say("--rerun is left out: the viewer's library is not installed; pip install rerun-sdk (it needs numpy 2).")

@@ -115,8 +115,8 @@ def picture(path: Path, residuals: Residuals, title: str) -> None:
         ax.set(ylim=(-limit, limit), yticks=(-tick, 0.0, tick))
         ax.set_yticklabels([f"{-100 * tick:.0f}", "0", f"{100 * tick:.0f}"], fontsize=7)
         ax.set_ylabel(one.name, rotation=0, ha="right", va="center", fontsize=9)
-        told = f"{100 * np.median(one.value):+.0f} cm, {one.explained.mean():.0%} explained"
-        ax.text(1.005, 0.5, told, transform=ax.transAxes, fontsize=8, va="center")
+        summary = f"{100 * np.median(one.value):+.0f} cm, {one.explained.mean():.0%} explained"
+        ax.text(1.005, 0.5, summary, transform=ax.transAxes, fontsize=8, va="center")
     axes[-1].set_xlabel("time of the recording [s]")
     left_out = f"; {len(found) - len(pairs)} pairs with fewer TDOAs are not shown" if len(pairs) < len(found) else ""
     figure.suptitle(f"{title}: residuals of each pair of anchors [cm]; red: more than three standard deviations{left_out}", fontsize=10)

@@ -23,12 +23,12 @@ if TYPE_CHECKING:
     from .goal import Goal
     from .layout import Layout
 
-Told = TypeVar("Told")
+Result = TypeVar("Result")
 
 SOFT = 0.05  # of |q|^2 - 1, over which failure sets in where derivatives are needed
 EDGE = 0.05  # m over which the hull ends, likewise
 FAILED = 10.0  # of the objective, a logarithm
-SHAKEN = 0.0, 1e-3, 1e-2, 0.1  # of what is allowed, by which a start is moved that tells nothing
+SHAKEN = 0.0, 1e-3, 1e-2, 0.1  # of what is allowed, by which a start is moved where the goal is not defined
 CLOSE = 1e-4  # of the objective: a step that gains less is the last
 _CHUNK = 1_000_000  # numbers in the largest array of one step
 
@@ -70,7 +70,7 @@ def failing_and_slopes(goal: Goal, layout: Layout, x: np.ndarray, points: np.nda
     """A smooth stand-in for the share of points (n, 3) that are not flyable, and its derivatives along x: (len(x),).
 
     Outside of the anchors' hull or, for the criterion "pairings", where one of them has two solutions. Raises InputError where that
-    cannot be told: two anchors have met, or all are in a plane."""
+    is not defined: two anchors have met, or all are in a plane."""
     anchors = layout.anchors(x)
     try:
         good, along = _inside(anchors.positions, points, goal.installation.unknowns)
@@ -117,15 +117,15 @@ def descend(goal: Goal, layout: Layout, points: np.ndarray, x: np.ndarray, sweep
     """x after at most `sweeps` steps of SLSQP (scipy.optimize) towards the goal at points (n, 3).
 
     The worst case is not smooth, but the smallest s that no point's log error exceeds is, with a constraint per point. Where the goal
-    cannot be told there is no slope, and none is made up: such a step is taken back, being FAILED worse than any other; where SLSQP
-    would go on from there, the best x so far is returned. A start there is shaken until the goal can be told, and returned if it never is.
+    is not defined there is no slope, and none is made up: such a step is taken back, being FAILED worse than any other; where SLSQP
+    would go on from there, the best x so far is returned. A start there is shaken until the goal is defined, and returned if it never is.
     """
     size, (low, high) = len(x), np.transpose(layout.bounds)
     seen: dict[bytes, tuple[np.ndarray, np.ndarray, float, np.ndarray]] = {}  # of the last x
     best: list[Any] = [np.inf, x]
 
     def at(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
-        """(errors, slopes, failing, slopes of that) at x. Raises InputError where they cannot be told."""
+        """(errors, slopes, failing, slopes of that) at x. Raises InputError where they are not defined."""
         if not np.isfinite(x).all():
             raise InputError("layout: no numbers")  # SLSQP has been seen to ask for NaN
         x = np.clip(x, low, high)
@@ -138,8 +138,8 @@ def descend(goal: Goal, layout: Layout, points: np.ndarray, x: np.ndarray, sweep
                 best[:] = value, x
         return seen[key]
 
-    def tried(function: Callable[[np.ndarray], Told], otherwise: Told) -> Callable[[np.ndarray], Told]:
-        def value(z: np.ndarray) -> Told:
+    def tried(function: Callable[[np.ndarray], Result], otherwise: Result) -> Callable[[np.ndarray], Result]:
+        def value(z: np.ndarray) -> Result:
             try:
                 return function(z)
             except InputError:
@@ -161,7 +161,7 @@ def descend(goal: Goal, layout: Layout, points: np.ndarray, x: np.ndarray, sweep
 
     options = {"method": "SLSQP", "options": {"maxiter": sweeps, "ftol": CLOSE}}
     try:
-        x = _told_near(at, np.clip(x, low, high), low, high)
+        x = _defined_near(at, np.clip(x, low, high), low, high)
         if goal.objective == "mean":
             found = minimize(tried(mean, FAILED), x, jac=mean_slopes, bounds=layout.bounds, **options)
         else:
@@ -179,8 +179,8 @@ def descend(goal: Goal, layout: Layout, points: np.ndarray, x: np.ndarray, sweep
     return np.clip(found.x[:size], low, high)
 
 
-def _told_near(at: Callable[[np.ndarray], object], x: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """x, or an x near it where `at` can tell the goal; moved at random by more and more of what is allowed. Raises InputError."""
+def _defined_near(at: Callable[[np.ndarray], object], x: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """x, or an x near it where `at` raises no InputError; moved at random by more and more of what is allowed. Raises InputError."""
     rng = np.random.default_rng(0)
     for share in SHAKEN:
         shaken = np.clip(x + share * (high - low) * rng.uniform(-1.0, 1.0, len(x)), low, high)

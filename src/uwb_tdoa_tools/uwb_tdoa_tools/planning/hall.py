@@ -94,7 +94,7 @@ class Hall:
 
     def side(self, points: np.ndarray) -> dict[str, Any] | None:
         """{"share": of points (n, 3) m, "tag_side": values}: where those that are heard lie in a plane, so that the side of it must be
-        told; None where nowhere, or where the height is known and they have one height."""
+        given; None where nowhere, or where the height is known and they have one height."""
         sides = [
             sides_of(self.anchors.positions[rows[:MOST_HEARD]])
             for rows in self.heard(points)

@@ -57,7 +57,7 @@ class Installation:
 
     @property
     def unknowns(self) -> int:
-        """Coordinates that TDOAs alone must tell: 2 where a height is known or measured, else 3."""
+        """Coordinates that TDOAs alone must determine: 2 where a height is known or measured, else 3."""
         return 2 if self.height_std < np.inf else self.dimensions
 
     def with_height(self, information: np.ndarray) -> np.ndarray:

@@ -79,7 +79,7 @@ class Chart:
     covariance : (n, k, k) m^2, the Cramer-Rao bound of one round of TDOAs
     error : (n,) m, root of its trace; dop : (n,), position dilution of precision
     hull : (n,) inside the anchors' convex hull
-    ambiguous : (n,) share of the pairings, each of one anchor more than TDOAs must tell coordinates, with two solutions
+    ambiguous : (n,) share of the pairings, each of one anchor more than TDOAs must determine coordinates, with two solutions
     flyable : (n,) inside the hull and with one solution, by the criterion that was asked for
     """
 

@@ -118,12 +118,12 @@ def position_error(covariance: np.ndarray) -> np.ndarray:
 
 def dilution(points: np.ndarray, installation: Installation) -> np.ndarray:
     """Dilution of precision: (n, k), error along x, y (and z) over that of one reception, if all are alike; k the
-    coordinates that TDOAs must tell.
+    coordinates that TDOAs must determine.
 
     Its squares add up: of x and y to the horizontal, of all to the position dilution (PDOP).
     """
-    alike = replace(installation, noise=FixedNoise(1.0), link_std=0.0, dimensions=installation.unknowns, height_std=np.inf)
-    covariance = bound(information(points, alike, correction=False))
+    unit_noise = replace(installation, noise=FixedNoise(1.0), link_std=0.0, dimensions=installation.unknowns, height_std=np.inf)
+    covariance = bound(information(points, unit_noise, correction=False))
     return np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
 
 

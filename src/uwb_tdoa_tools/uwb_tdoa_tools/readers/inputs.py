@@ -30,7 +30,7 @@ SURVEY_HELP = (
     "the recordings whose path contains KEY; counts in place of the anchors that bags hold, which keep their own where no KEY fits"
 )
 
-_REPORTED: set[str | Path | None] = set()  # surveys of which has been told that they count for bags
+_REPORTED: set[str | Path | None] = set()  # surveys of which was printed that they count for bags
 
 
 def find_flights(
@@ -57,7 +57,7 @@ def find_flights(
 
 
 def _survey_of(path: Path, survey: str | Path | None) -> str | Path | None:
-    """The survey of a recording, or None for a bag whose own anchors count; what counts for a bag is told once."""
+    """The survey of a recording, or None for a bag whose own anchors count; what counts for a bag is printed once."""
     if survey is None or not is_bag(path):
         return survey_for(path, survey)
     try:

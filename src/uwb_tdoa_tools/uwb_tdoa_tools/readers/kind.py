@@ -1,4 +1,4 @@
-"""Which kind of recording a file is that is no bag, told by what is in it, not by its name."""
+"""Which kind of recording a file is that is no bag, recognised by what is in it, not by its name."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.flight import Imu
     from uwb_tdoa_bias.foundation.sensors.height import Height
 
-COUNTS = 4.7  # of one reading for 1 rad/s, median over 0425/TDOA2; 30 to 35 pixels in 41 degrees, told in tenths: 4.2 to 4.9
+COUNTS = 4.7  # of one reading for 1 rad/s, median over 0425/TDOA2; 30 to 35 pixels in 41 degrees, given in tenths: 4.2 to 4.9
 READING_TIME = 0.01  # s that one reading counts over
 WILD = 40.0  # counts, beyond which a reading is clipped
 RATE = 25.0  # Hz of the velocities, each of the mean of some readings

@@ -4,7 +4,7 @@ What is looked for, in this order, because one hides the next: other axes (z dow
 another epoch, and a frame that is turned and shifted. Nothing is moved unless somebody asks for it.
 
 Stamps that are late by what the gyroscope and the accelerometer say are the fault of the ground truth. Where no inertial sensor
-tells, only the difference of two clocks is known, that of the ground truth and that of the TDOAs.
+shows it, only the difference of two clocks is known, that of the ground truth and that of the TDOAs.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ EPOCH_STEP = 0.1  # s between epochs that are tried
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """Where a ground truth is beside an estimate. late : s, by which its stamps are late; told_by : who says so, "inertial" or
-    "tdoa", None where nobody tells; axes (3, 3) : what makes its axes those of the survey; turn (3, 3), shift (3,) m : rotation and
-    translation that bring it, its axes put right, onto the estimate; middle (3,) m : of the path, by where a shift is told; or_turned :
+    """Where a ground truth is beside an estimate. late : s, by which its stamps are late; source : what shows that, "inertial" or
+    "tdoa", None where nothing does; axes (3, 3) : what makes its axes those of the survey; turn (3, 3), shift (3,) m : rotation and
+    translation that bring it, its axes put right, onto the estimate; middle (3,) m : of the path, at which a shift is given; or_turned :
     whether a frame that is turned would explain as much as stamps that are late, as on circles."""
 
     late: float
-    told_by: str | None
+    source: str | None
     axes: np.ndarray
     turn: np.ndarray
     shift: np.ndarray
@@ -110,7 +110,7 @@ class Alignment:
         """For JSON: s, degrees, m."""
         return {
             "late": self.late,
-            "told_by": self.told_by,
+            "told_by": self.source,
             "axes": self.axes.astype(int).tolist(),
             "yaw": float(np.rad2deg(self.yaw)),
             "tilt": float(np.rad2deg(self.tilt)),
@@ -124,7 +124,7 @@ class Alignment:
         if abs(self.late) > LONGEST:
             return f"the ground truth is on another clock: its stamps are {self.late:.2f} s ahead of those of the TDOAs"
         by = f"{abs(self.late):.2f} s {'late' if self.late > 0.0 else 'early'}"
-        if self.told_by == "inertial":
+        if self.source == "inertial":
             return f"the stamps of the ground truth are {by}, as the gyroscope and the accelerometer tell"
         turned = ", or the frame of the truth is turned: along this path one looks like the other" * self.or_turned
         apart_by = f"ground truth or TDOAs are {abs(self.late):.2f} s apart"
@@ -181,18 +181,18 @@ def alignment_of(flight: Flight, odometry: PoseColumns) -> Alignment:
     axes = _other_axes(truth, odometry)
     truth = moved_frame(truth, axes, np.zeros(3))
     flight = replace(flight, truth=truth)
-    late, told_by = _late(flight, exact=epoch != 0.0)
-    behind = _behind(flight, late) if told_by == "inertial" else 0.0
+    late, source = _late(flight, exact=epoch != 0.0)
+    behind = _behind(flight, late) if source == "inertial" else 0.0
     ratio = _turned_or_late(flight, odometry, late, behind)
-    if ratio < 1.0 - AS_WELL and told_by == "tdoa" and not epoch:
+    if ratio < 1.0 - AS_WELL and source == "tdoa" and not epoch:
         late = 0.0
     if ratio < 1.0:
         behind = 0.0
     true, estimated = paths(_earlier(truth, late + behind), odometry)
     turn, shift = rigid(true, estimated) if len(true) >= FEWEST else (np.eye(3), np.zeros(3))
     middle = true.mean(axis=0) if len(true) else np.zeros(3)
-    or_turned = bool(late and told_by == "tdoa" and ratio < 1.0 + AS_WELL)
-    return Alignment(epoch + late, told_by, axes, turn, shift, middle, or_turned)
+    or_turned = bool(late and source == "tdoa" and ratio < 1.0 + AS_WELL)
+    return Alignment(epoch + late, source, axes, turn, shift, middle, or_turned)
 
 
 def _turned_or_late(flight: Flight, odometry: PoseColumns, late: float, behind: float) -> float:
@@ -232,20 +232,20 @@ def rigid(path: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _late(flight: Flight, exact: bool) -> tuple[float, str | None]:
-    """(s, who tells) by which the ground truth of a Flight is late: by the inertial sensor if it tells, else against the TDOAs; (0, None)
-    where nobody tells. exact : whether the least counts."""
+    """(s, source) by which the ground truth of a Flight is late: by the inertial sensor if that shows it, else against the TDOAs; (0, None)
+    where neither does. exact : whether the least counts."""
     assert flight.truth is not None
-    found, teller = _inertial(flight), "inertial"
+    found, source = _inertial(flight), "inertial"
     if found is None:
-        found, teller = of_tdoas(KnownPath(flight)), "tdoa"
+        found, source = of_tdoas(KnownPath(flight)), "tdoa"
     if found is None:
         return 0.0, None
     if not exact and not _is_late(*found.constant()):
-        return 0.0, teller
+        return 0.0, source
     late = -found.exact()
     moved = replace(flight, truth=_earlier(flight.truth, late))  # once more from there: a parabola is off between what is tried
-    again = _inertial(moved) if teller == "inertial" else of_tdoas(KnownPath(moved))
-    return late - (again.exact() if again else 0.0), teller
+    again = _inertial(moved) if source == "inertial" else of_tdoas(KnownPath(moved))
+    return late - (again.exact() if again else 0.0), source
 
 
 def _behind(flight: Flight, late: float) -> float:
@@ -303,17 +303,17 @@ def _epoch(flight: Flight, odometry: PoseColumns) -> float:
     if len(odometry.t) < 2:
         raise InputError(f"{flight.name}: the ground truth is on another clock than the TDOAs, and there is no estimate to find it by.")
     ours, theirs = (position_at(np.arange(one.t[0], one.t[-1], EPOCH_STEP), one) for one in (odometry, truth))
-    lags, size, told = np.arange(-len(theirs) + 1, len(ours)), np.sqrt(np.sum(ours.var(axis=0))), []
+    lags, size, tried = np.arange(-len(theirs) + 1, len(ours)), np.sqrt(np.sum(ours.var(axis=0))), []
     for pair, arrangements in (((ours, theirs), (np.eye(3),)), ((ours - ours.mean(axis=0), theirs - theirs.mean(axis=0)), ARRANGEMENTS)):
         error = _apart_by_lag(pair[0], pair[1], lags, arrangements)
         best = int(np.argmin(error))
         others = np.min(error[np.abs(lags - lags[best]) > APART / EPOCH_STEP], initial=np.inf)
         if error[best] < FITS * size and others >= ALIKE * error[best]:
             return float(truth.t[0] - odometry.t[0] - lags[best] * EPOCH_STEP)
-        told.append(f"the nearest is {error[best]:.2f} m off, another one {others:.2f} m")
+        tried.append(f"the nearest is {error[best]:.2f} m off, another one {others:.2f} m")
     raise InputError(
-        f"{flight.name}: the ground truth is on another clock than the TDOAs, and its path does not tell on which ({told[0]}; with other axes "
-        f"{told[1]}): write both on one clock."
+        f"{flight.name}: the ground truth is on another clock than the TDOAs, and its path does not tell on which ({tried[0]}; with other axes "
+        f"{tried[1]}): write both on one clock."
     )
 
 

@@ -16,7 +16,7 @@ vehicle is. So a tag that rests below 0.3 m in a recording that exceeds that dep
 raw logs of the UTIL data, where that is 0.03 m, at z = 0.1 m; in their constellations, where it is 0.08 m, at 0.15 m, which is up to a
 second after z = 0.1 m. Any other tag, a rover that never leaves the floor, a person's, one that starts on a table, is away when it is 0.1 m
 from its place; one that gets there within a second began, or ended, in motion, and has no phase of rest there. A phase
-that a recording does not have is not told; one that never moves is `at_rest_before` all the time.
+that a recording does not have is not reported; one that never moves is `at_rest_before` all the time.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ TITLES = {
     "at_rest_after": "at rest after",
     "whole": "whole recording",
 }
-NEAR_THE_FLOOR = "at_rest_before", "first_3_s", "last_3_s", "at_rest_after"  # told of each run where several are
+NEAR_THE_FLOOR = "at_rest_before", "first_3_s", "last_3_s", "at_rest_after"  # reported of each run where several are
 
 
 def in_the_air(truth: Truth) -> Span | None:

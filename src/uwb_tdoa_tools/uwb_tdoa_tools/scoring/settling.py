@@ -49,7 +49,7 @@ def settled(
 def with_settled_truth(
     flight: Flight, effects: EffectSet | None = None, config: FilterConfig | None = None, align: str = NONE
 ) -> Flight:
-    """The Flight of `settled`; what was found is told on stderr. Can be handed to other processes."""
+    """The Flight of `settled`; what was found is printed on stderr. Can be handed to other processes."""
     flight, said = settled(flight, effects, config, align)
     report_remarks(flight.name, (f"{sentence}." for sentence in said))
     return flight

@@ -1,4 +1,4 @@
-"""How much of a correction flights left out of its making bear out, and what gain can be expected of it."""
+"""Shrinkage of a correction: the share of it that cross-validation over flights supports, and the gain that can be expected."""
 
 from __future__ import annotations
 

@@ -23,9 +23,9 @@ def apart(found: SelfCalibration) -> list[int]:
     were."""
     if len(found.given) <= MANY:
         return []
-    off, told = np.abs(found.shifts), found.improved
-    others = np.array([1.4826 * np.median(column[known]) if known.any() else np.inf for column, known in zip(off.T, told.T)])
-    return np.flatnonzero((told & (off > SURE * found.position_std) & (off > SURE * others)).any(axis=1)).tolist()
+    off, improved = np.abs(found.shifts), found.improved
+    others = np.array([1.4826 * np.median(column[known]) if known.any() else np.inf for column, known in zip(off.T, improved.T)])
+    return np.flatnonzero((improved & (off > SURE * found.position_std) & (off > SURE * others)).any(axis=1)).tolist()
 
 
 def as_dict(found: SelfCalibration) -> dict[str, Any]:

@@ -5,7 +5,7 @@ models     the kinds of models, all trained by one call
 paper      the network of Zhao et al. (RA-L 2021)
 structured the error of a pair as the difference of two one-anchor errors
 physics    the effects that diagnose can name
-shrinking  as much of a model as flights left out bear out
+shrinking  the share of a model that cross-validation over flights supports
 linear     robust Bayesian regression on sparse designs: what structured is fitted with
 export     ONNX files with metadata
 plots      the learning curve

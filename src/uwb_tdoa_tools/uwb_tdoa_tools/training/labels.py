@@ -157,12 +157,12 @@ def constellations(some: Iterable[Flight | Labels]) -> list[dict[str, list[float
     found: list[dict[str, list[float]]] = []
     for one in some:
         layout = dict(zip(map(str, one.anchors.ids.tolist()), one.anchors.positions.round(2).tolist()))
-        if not any(_alike(layout, known) for known in found):
+        if not any(_same_place(layout, known) for known in found):
             found.append(layout)
     return found
 
 
-def _alike(one: Mapping[str, list[float]], other: Mapping[str, list[float]]) -> bool:
+def _same_place(one: Mapping[str, list[float]], other: Mapping[str, list[float]]) -> bool:
     return set(one) == set(other) and all(np.linalg.norm(np.subtract(one[i], other[i])) < SAME_PLACE for i in one)
 
 

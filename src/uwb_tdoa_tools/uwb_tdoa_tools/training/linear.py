@@ -72,8 +72,8 @@ def fit(design: Design, sites: int, noise: float, known_std: Sequence[float] | n
         if iteration < ITERATIONS - 1:
             variance = _inverse_diagonal(factor)
             for block in blocks:
-                told = np.sum(1.0 - prior[block] * variance[block])  # number of weights the data determine
-                prior[block] = np.clip(told / max(np.sum(solution[block] ** 2), 1e-12), *PRECISION)
+                determined = np.sum(1.0 - prior[block] * variance[block])  # number of weights the data determine
+                prior[block] = np.clip(determined / max(np.sum(solution[block] ** 2), 1e-12), *PRECISION)
     covariance, _ = dpotri(factor, overwrite_c=True)  # its upper triangle
     covariance = np.triu(covariance) + np.triu(covariance, 1).T
     site_covariance = np.zeros((m, m))

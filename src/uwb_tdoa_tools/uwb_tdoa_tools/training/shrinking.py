@@ -1,4 +1,4 @@
-"""As much of a correction as flights left out of its training bear out, and the gain that can be expected of it.
+"""The share of a correction that cross-validation over flights supports, and the gain that can be expected of it.
 
 The flights are dealt to FOLDS; for each, a model is trained on the others, and the filter judges it there with several shares
 of its prediction. Whole flights: samples of one are too alike. The effects are those that were found in all flights, with
@@ -46,8 +46,8 @@ def cross_validated(
     folds = [order[k :: min(FOLDS, len(flights))].tolist() for k in range(min(FOLDS, len(flights)))]
     rest = [[k for k in range(len(flights)) if k not in fold] for fold in folds]
     known = [found and physics.Physics(found.fitted_to(others)) for others in rest]
-    for told in map_function(partial(_left_out, recipe, flights, plain), list(zip(folds, rest, known))):
-        of_fold = {name: dict(pairs) for name, pairs in told.items()}
+    for result in map_function(partial(_left_out, recipe, flights, plain), list(zip(folds, rest, known))):
+        of_fold = {name: dict(pairs) for name, pairs in result.items()}
         for name, of in of_fold.items():
             progress("{} left out: {:.3f} m without, {:.3f} m with all".format(name, of[None], of[1.0]))
         errors |= of_fold
@@ -79,7 +79,7 @@ def train(
     recipe: Recipe, training: Sequence[Flight], validation: Sequence[Flight], name: str,
     progress: Callable[[str], object] = lambda text: None, map_function: MapFunction = map,
 ) -> tuple[models.Trained, Shrinkage]:  # fmt: skip
-    """(Trained, Shrinkage): `models.train`, and as much of it as is borne out. map_function : as of `cross_validated`."""
+    """(Trained, Shrinkage): `models.train`, scaled to the share that cross-validation supports. map_function : as of `cross_validated`."""
     flights = [*training, *validation]
     found = None
     if recipe.kind.startswith("physics"):
@@ -87,10 +87,10 @@ def train(
         found = physics.find(flights)
     trained = models.train(recipe, training, validation, name, progress, found)
     plain = uncorrected(flights, map_function)
-    borne_out = cross_validated(recipe, flights, plain, found, progress, map_function)
+    shrinkage = cross_validated(recipe, flights, plain, found, progress, map_function)
     if trained.model:
-        trained = replace(trained, meta={**trained.meta, "share": borne_out.share})
-    return trained, borne_out
+        trained = replace(trained, meta={**trained.meta, "share": shrinkage.share})
+    return trained, shrinkage
 
 
 def _left_out(

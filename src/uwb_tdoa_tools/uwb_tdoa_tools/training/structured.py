@@ -273,7 +273,7 @@ def link_inputs(samples: Samples, side: str, viewer: str) -> np.ndarray:
 
 
 def _known_directions(of: Map, covariance: np.ndarray) -> np.ndarray:
-    """Of the kernel values of a Map (m,), the RANK directions that the data told most of, as large as what they told:
+    """Of the kernel values of a Map (m,), the RANK directions that the data determine best, as large as what they determine:
     (m, RANK)."""
     share, vector = np.linalg.eigh(np.eye(len(covariance)) - covariance)
     leading = np.argsort(share)[::-1][:RANK]

@@ -52,7 +52,7 @@ class Comparison:
 
     @property
     def attitude_known(self) -> bool:
-        """Whether the reference tells attitudes, and of more than a few poses."""
+        """Whether the reference knows attitudes, and of more than a few poses."""
         return bool(self.reference.attitude_known and np.isfinite(self.poses.q).all(axis=1).sum() > FEWEST_ATTITUDES)
 
     @cached_property

@@ -17,7 +17,7 @@ FEWEST = 10  # samples of a stream
 
 
 def extra_at(flight: Flight, t: np.ndarray) -> dict[str, np.ndarray]:
-    """Values of the other streams of a Flight at the stamps t (n,) s: {"stream.column": (n,)}. What a simulation tells of itself is
+    """Values of the other streams of a Flight at the stamps t (n,) s: {"stream.column": (n,)}. What a simulation reports of itself is
     no log."""
     out = {}
     for name, columns in flight.extra.items():

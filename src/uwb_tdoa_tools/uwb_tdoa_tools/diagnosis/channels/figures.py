@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 APART = 1e4  # s between the stamps of two flights: nothing of one is near the other
 LAG_TIMES = (0.1, 0.5, 1.0, 2.0)  # s
 TAIL = 4.0  # spreads
-FEWEST = 20  # pairs of samples that a correlation is told of
+FEWEST = 20  # pairs of samples that a correlation is computed of
 
 
 def rows_by_value(values: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:

@@ -48,7 +48,7 @@ def _crossed(t: np.ndarray, r: np.ndarray, label: np.ndarray, anchors: np.ndarra
     cell = np.unique((t * 2.0).astype(int), return_inverse=True)[1]
     together = np.unique(np.stack([label, cell]), axis=1)[0]  # once for every cell in which a pair was heard
     often, times = np.unique(together, return_counts=True)
-    rows = np.isin(label, often[times > FEWEST])  # nothing is told of the others
+    rows = np.isin(label, often[times > FEWEST])  # nothing is said of the others
     r, cell = r[rows], cell[rows]
     if not len(r):
         return []

@@ -66,14 +66,14 @@ class Ranging(Channel[RangeResidual]):
             return []  # what the path follows is not left in them
         cells = [part.cells for part in residuals]
         anchor = np.concatenate([part.samples.anchors.ids[part.arrivals(part.cells.pair)[1]] for part in residuals])
-        alike, of_each = {}, {}
+        common, of_each = {}, {}
         for name in (*COVARIATES, *extra_names([part.samples for part in residuals])):
             known = [v for v in (covariate_at(name, part.samples) for part in residuals) if v is not None]
             if len(known) == len(residuals):
-                alike[name] = np.concatenate([cell.mean(v) for cell, v in zip(cells, known)])
+                common[name] = np.concatenate([cell.mean(v) for cell, v in zip(cells, known)])
         for name, function in OF_ARRIVAL.items():
             of_each[name] = np.concatenate([cell.mean(of_arrivals(function, part.samples)[0]) for cell, part in zip(cells, residuals)])
-        return views_of_anchors(self.name, anchor, alike, of_each, are_many(residuals))
+        return views_of_anchors(self.name, anchor, common, of_each, are_many(residuals))
 
     def health(self, residuals: Sequence[RangeResidual]) -> Figures:
         flown = [part.airborne for part in residuals]

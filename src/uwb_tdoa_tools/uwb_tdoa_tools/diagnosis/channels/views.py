@@ -45,13 +45,13 @@ def views_of_axes(
 
 
 def views_of_anchors(
-    channel: str, anchor: np.ndarray, alike: Mapping[str, np.ndarray], of_each: Mapping[str, np.ndarray], many: bool = False
+    channel: str, anchor: np.ndarray, common: Mapping[str, np.ndarray], of_each: Mapping[str, np.ndarray], many: bool = False
 ) -> list[CovariateView]:
-    """[CovariateView] of distances to anchors of ids `anchor` (n,). alike, of_each : {name: (n,)}, of the tag, and of the anchor; many : as
-    of `views_of_pairs`."""
-    everywhere, ones, both = np.arange(len(anchor)), np.ones(len(anchor)), {**alike, **of_each}
+    """[CovariateView] of distances to anchors of ids `anchor` (n,). common, of_each : {name: (n,)}, of the tag, and of the anchor; many :
+    as of `views_of_pairs`."""
+    everywhere, ones, both = np.arange(len(anchor)), np.ones(len(anchor)), {**common, **of_each}
     out = [
-        CovariateView(channel, "common" if name in alike else "arrival", "", name, ((ones, values),), everywhere)
+        CovariateView(channel, "common" if name in common else "arrival", "", name, ((ones, values),), everywhere)
         for name, values in both.items()
     ]
     for i in np.unique(anchor).tolist():

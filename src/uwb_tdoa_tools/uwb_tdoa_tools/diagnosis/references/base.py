@@ -41,7 +41,7 @@ class Reference:
     positions_known: ClassVar[tuple] = (True, True, True)  # x, y, z, world
     attitude_known: ClassVar[bool] = True
     knows_floor: ClassVar[bool] = False  # positions before lift-off and after landing, where an estimate may be metres off
-    tells_errors: ClassVar[bool] = True  # errors of the filter's positions can be told with it
+    tells_errors: ClassVar[bool] = True  # errors of the filter's positions are known with it
     constraints: tuple[Constraint, ...] = ()  # what is known beside (`diagnosis/constraints`)
     words: str  # what a report says the figures rest on
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 class Heights(GroundTruth):
     """The path of the filter, smoothed, that uses the height; what is diagnosed and judged does without it.
 
-    Most of the error of anchors at walls is in z, so that most of it can be told so. x and y of the path are what the
+    Most of the error of anchors at walls is in z, so that most of it is observable so. x and y of the path are what the
     filter makes of the uncorrected TDOAs: an error that is in them is not seen.
     """
 

@@ -32,7 +32,7 @@ def without_truth(flight: Flight) -> Flight:
 class Nothing(Reference):
     """Residuals are the innovations of the filter, of TDOAs, or of ranges in a flight without any; what the path follows of an effect is
     taken out of its regressors, with all that the filter knows of the path. An offset of all ranges is taken out before: it would bend the
-    path, and `self_calibrate` tells it."""
+    path, and `self_calibrate` estimates it."""
 
     positions_known = (False, False, False)
     attitude_known = False

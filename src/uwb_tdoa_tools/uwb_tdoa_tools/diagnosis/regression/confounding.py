@@ -1,4 +1,4 @@
-"""What a finding could be mistaken for in these very flights, and what the flights cannot tell at all."""
+"""What a finding could be mistaken for in these very flights, and what is not observable in the flights at all."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def _whole(candidates: Sequence[Candidate]) -> dict[str, Sequence[Column]]:
 
 
 def unobservable(selection: Selection, candidates: Sequence[Candidate]) -> list[Unobservable]:
-    """[Unobservable]: combinations of parameters of a declared effect of which the flights tell less than plausibility
+    """[Unobservable]: combinations of parameters of a declared effect that the flights determine less than plausibility
     does, by the eigenvectors of the information of a fit of that effect alone."""
     table, out = selection.table, []
     root, whole = selection.fit.information(table), _whole(candidates)

@@ -60,8 +60,8 @@ class Fit:
 
 def solve(gram: np.ndarray, vector: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     """Solution of normal equations with a Gaussian prior of standard deviations `sizes`: (beta, covariance, number of
-    parameters that the data tell: each counts by how little the prior says of it). What the data do not tell stays
-    0."""
+    parameters that the data determine: each counts by how little the prior says of it). What the data do not determine
+    stays 0."""
     if len(vector) == 0:
         return vector, np.zeros((0, 0)), 0.0
     scaled = gram * np.outer(sizes, sizes) + np.eye(len(vector))
@@ -156,9 +156,9 @@ def _covariance(table: RegressionTable, x: np.ndarray, residual: np.ndarray, roo
     sums = sums_by(table.block, weighted(x, root * residual), blocks)
     half = sums @ bread * np.sqrt(blocks / max(blocks - min(x.shape[1], blocks // 2), 1))
     sandwich = half.T @ half  # squares, so that none of its diagonal is below zero
-    told = np.diag(sandwich) > 1e-300
-    grow = np.sqrt(np.maximum(np.diag(bread) / np.where(told, np.diag(sandwich), np.inf), 1.0))
-    return np.where(np.diag(~told), bread, sandwich * np.outer(grow, grow))
+    informed = np.diag(sandwich) > 1e-300
+    grow = np.sqrt(np.maximum(np.diag(bread) / np.where(informed, np.diag(sandwich), np.inf), 1.0))
+    return np.where(np.diag(~informed), bread, sandwich * np.outer(grow, grow))
 
 
 def measure_inflation(

@@ -188,11 +188,11 @@ class _Products:
 
 def _gram(x: Matrix, weights: np.ndarray) -> np.ndarray:
     """X' W X of a sparse matrix (n, k), (k, k)."""
-    told = np.flatnonzero(np.diff(x.indptr))  # most columns are of TDOAs, or of an axis of another sensor
+    filled = np.flatnonzero(np.diff(x.indptr))  # most columns are of TDOAs, or of an axis of another sensor
     out = np.zeros((x.shape[1], x.shape[1]))
-    if len(told):
-        some = x[:, told]
-        out[np.ix_(told, told)] = product(some, weighted(some, weights))
+    if len(filled):
+        some = x[:, filled]
+        out[np.ix_(filled, filled)] = product(some, weighted(some, weights))
     return out
 
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 MAX_STEPS = 14
 FITTED = 6  # of what a scan proposes
 FEW, LARGE, GOOD_PART = 3, 6, 0.5  # columns of one and of a group, and the share of its criterion that the one must reach
-LEAST_DETERMINED = 0.3  # parameters that the data must tell of a candidate
+LEAST_DETERMINED = 0.3  # parameters that the data must determine of a candidate
 AMBIGUOUS = 10.0  # less difference in the criterion is no decision
 ALIKE = 0.1  # share of the criterion by which a function may be worse than another one that it is much like
 

@@ -27,8 +27,8 @@ def rows(diagnosis: Diagnosis) -> list[list[str]]:
                 anchor, _, axis = key.partition(".")
                 found.setdefault(anchor, {})[axis] = value, finding.effect.std.get(key, np.nan)
     cells = [[anchor, *(_cell(found[anchor].get(axis)) for axis in ("x", "y", "z", ""))] for anchor in sorted(found, key=int)]
-    told = [column for column in zip(HEAD, *cells) if any(column[1:])]
-    return [list(row) for row in zip(*told)]
+    filled = [column for column in zip(HEAD, *cells) if any(column[1:])]
+    return [list(row) for row in zip(*filled)]
 
 
 def _cell(known: tuple[float, float] | None) -> str:

@@ -91,7 +91,7 @@ class Entry:
 
 
 def entries(diagnosis: Diagnosis) -> list[Entry]:
-    """[Entry] of a Diagnosis, the most prominent first; what all anchors share over the room after what is told of some."""
+    """[Entry] of a Diagnosis, the most prominent first; what all anchors share over the room after what is known of some."""
     groups: dict[Hashable, list[EffectFinding]] = {}
     for finding in diagnosis.findings:
         key = finding.key if finding.declared or not finding.candidates else finding.candidates[0]
@@ -193,13 +193,13 @@ def _values(finding: EffectFinding) -> str:
     effect = finding.effect
     if finding.function:
         return f"a function without a name ({finding.function.shape})"
-    told = effect.significant()
+    significant = effect.significant()
     fitted_first = sorted(effect.values.items(), key=lambda item: not effect.std.get(item[0]))
     unit, factors = effect.unit.replace("rad", "degrees"), {key: for_people(effect.unit, key)[1] for key in effect.values}
-    vague = len(effect.values) - len(told)
-    if not told and vague > SHOWN:
+    vague = len(effect.values) - len(significant)
+    if not significant and vague > SHOWN:
         return f"{vague} values, none twice its standard deviation"
-    named = told or effect.values  # a few values are named, however uncertain they are
+    named = significant or effect.values  # a few values are named, however uncertain they are
     shown = [
         f"{key} = {measured(value * factors[key], (effect.std.get(key) or 0.0) * factors[key])}"
         for key, value in fitted_first
@@ -207,7 +207,7 @@ def _values(finding: EffectFinding) -> str:
     ]
     rest = shown[SHOWN:]
     words = ", ".join(shown[:SHOWN] + ([f"{len(rest)} more"] if rest else []))
-    if not told:
+    if not significant:
         return f"{words} ({unit}); not twice the standard deviation"
     return f"{words} ({unit})" + (f"; {vague} not significant" if vague else "")
 

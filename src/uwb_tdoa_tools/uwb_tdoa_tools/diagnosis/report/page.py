@@ -21,7 +21,7 @@ _TEMPLATES.globals |= {
 
 
 def html(diagnosis: Diagnosis, template: str = "page") -> str:
-    """The page of a Diagnosis: verdict, what to do, what each effect is worth, map, errors, what could not be told, and folded details.
+    """The page of a Diagnosis: verdict, what to do, what each effect is worth, map, errors, what was not determined, and folded details.
 
     template : of the folder `templates`, the page or one of its parts.
     """

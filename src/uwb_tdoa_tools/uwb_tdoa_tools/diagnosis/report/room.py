@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 VIEWS = ([0, 1], [0, 2])  # x and y from above, x and z from the side
 CELL = 1.0  # m
-FEWEST = 0.5  # s in a cell whose mean error is told
+FEWEST = 0.5  # s in a cell whose mean error is shown
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The tables of the page: values, errors, health, and what could not be told."""
+"""The tables of the page: values, errors, health, and what was not determined."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from ...scoring.phases import TITLES
 from ..channels import CHANNELS
 from .entries import by_anchor, for_people
 from .runs import CM, labels
-from .unclear import by_remedy, untold
+from .unclear import by_remedy, undetermined
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -70,14 +70,14 @@ def _signed(found: tuple[float, float | None] | None, factor: float) -> str:
 
 
 def remedies(diagnosis: Diagnosis) -> Table:
-    """What would tell what could not be told."""
-    rows = [(told_by, listed(what)) for told_by, what in by_remedy(untold(diagnosis)).items()]
+    """What would determine what these data do not."""
+    rows = [(remedy, listed(what)) for remedy, what in by_remedy(undetermined(diagnosis)).items()]
     return Table(("what would tell", "effects that could be there unseen"), rows)
 
 
 def untraced(diagnosis: Diagnosis) -> Table:
     """Every combination of parameters that leaves too little trace."""
-    rows = [(item.effect, item.what or "all of it", item.told_by) for item in untold(diagnosis) if item.what or not item.harmless]
+    rows = [(item.effect, item.what or "all of it", item.remedy) for item in undetermined(diagnosis) if item.what or not item.harmless]
     return Table(("effect", "parameters", "what would tell"), rows)
 
 

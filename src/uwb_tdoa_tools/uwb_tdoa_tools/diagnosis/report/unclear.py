@@ -1,4 +1,4 @@
-"""What could not be told, and what would tell."""
+"""What the data do not determine, and what would."""
 
 from __future__ import annotations
 
@@ -24,32 +24,32 @@ CANCELS = "nothing: it cancels in every measurement, and hence does no harm"
 
 
 @dataclass(frozen=True)
-class Untold:
-    """effect : name; what : of it, in words, "" for all of it; told_by : which flight, mark or sensor would tell, in
-    words; harmless : whether it cancels in every measurement."""
+class Undetermined:
+    """effect : name; what : of it, in words, "" for all of it; remedy : which flight, mark or sensor would determine it,
+    in words; harmless : whether it cancels in every measurement."""
 
     effect: str
     what: str
-    told_by: str
+    remedy: str
     harmless: bool
 
 
-def untold(diagnosis: Diagnosis) -> list[Untold]:
-    """[Untold], one for each of diagnosis.unobservable."""
+def undetermined(diagnosis: Diagnosis) -> list[Undetermined]:
+    """[Undetermined], one for each of diagnosis.unobservable."""
     out = []
     for item in diagnosis.unobservable:
-        told_by = _told_by(item, diagnosis)
-        out.append(Untold(item.effect, _what(item), told_by, told_by is CANCELS))
+        remedy = _remedy(item, diagnosis)
+        out.append(Undetermined(item.effect, _what(item), remedy, remedy is CANCELS))
     return out
 
 
-def by_remedy(items: Iterable[Untold]) -> dict[str, list[str]]:
-    """{what would tell: [effect and what of it, in words]} of Untolds that could do harm."""
+def by_remedy(items: Iterable[Undetermined]) -> dict[str, list[str]]:
+    """{remedy: [effect and what of it, in words]} of those of [Undetermined] that could do harm."""
     groups: dict[str, dict[str, list[str]]] = {}
     for item in items:
         if not item.harmless:
-            groups.setdefault(item.told_by, {}).setdefault(item.effect, []).append(item.what)
-    return {told_by: [_few(*each) for each in effects.items()] for told_by, effects in groups.items()}
+            groups.setdefault(item.remedy, {}).setdefault(item.effect, []).append(item.what)
+    return {remedy: [_few(*each) for each in effects.items()] for remedy, effects in groups.items()}
 
 
 def _few(effect: str, whats: list[str]) -> str:
@@ -73,7 +73,7 @@ def _what(item: Unobservable) -> str:
     return f"{together} against {listed(second)}" if second else together
 
 
-def _told_by(item: Unobservable, diagnosis: Diagnosis) -> str:
+def _remedy(item: Unobservable, diagnosis: Diagnosis) -> str:
     effect = EFFECTS[item.effect]
     alone = not all(diagnosis.reference.positions_known)
     if item.direction is None:

@@ -145,12 +145,12 @@ def _without_truth(diagnosis: Diagnosis) -> Verdict:
         why = tuple(f"Not added, {item.what}: {item.why}." for item in decided)
         return Verdict(headline, (_UNKNOWN, *why, f"{scatter}."), "unknown")
     headline = "What was found makes measurements agree better; what that is worth for the position is unknown."
-    borne_out = (
+    validated = (
         "It is added because what is slow in the innovations becomes small: what it leaves is not above "
         f"{100 * LEFT:.1f} cm, or {CLEARLY:g} times smaller than it was, limits that were set on measured flights."
     )
     change = f"{scatter} before and {centimetres(after)} after, on {diagnosis.judged_on}."
-    return Verdict(headline, (_UNKNOWN, borne_out, change), "unknown")
+    return Verdict(headline, (_UNKNOWN, validated, change), "unknown")
 
 
 _UNKNOWN = "Without ground truth nobody knows the position error, neither before nor after."

@@ -153,8 +153,8 @@ class Runs:
         several: list[FlightEquations] = []
         here = [[one for one in self._marks if one.flight == flight.name] for flight in self.flights]
         items = [(flight, self.spans.get(flight.name), some) for flight, some in zip(self.flights, here)]
-        told = map_function(partial(_of_flight, self._base, self._reference, (anchors, delays), loose, functions), items)
-        for (one, span), flight in zip(told, self.flights):
+        results = map_function(partial(_of_flight, self._base, self._reference, (anchors, delays), loose, functions), items)
+        for (one, span), flight in zip(results, self.flights):
             self.spans[flight.name] = span
             marks += one.marks
             several.append(one)
@@ -225,8 +225,8 @@ def _slow(parts: Sequence[RadioResidual]) -> np.ndarray:
 
 def _equations(
     parts: Sequence[RadioResidual], flight: Flight, constraints: Sequence[Mark], functions: bool
-) -> tuple[np.ndarray, np.ndarray, list[_Told], list[_Mark]]:
-    """(gram (k, k), vector (k,), [_Told] of each block) of the normal equations that the RadioResiduals of a Flight give, and [_Mark] of
+) -> tuple[np.ndarray, np.ndarray, list[_BlockEquations], list[_Mark]]:
+    """(gram (k, k), vector (k,), [_BlockEquations]) of the normal equations that the RadioResiduals of a Flight give, and [_Mark] of
     constraints of it. functions : as of `Runs.equations`."""
     innovations = parts[0].innovations
     assert innovations is not None  # as of a Reference that does not know the path
@@ -253,7 +253,7 @@ def _equations(
         _add(gram, columns, more)
         vector[columns] += right
         last = np.searchsorted(columns, n)
-        blocks.append(_Told(columns[:last], more[:last, :last].copy(), right[:last]))  # the whole of `more` takes megabytes
+        blocks.append(_BlockEquations(columns[:last], more[:last, :last].copy(), right[:last]))  # the whole of `more` takes megabytes
     return gram, vector, blocks, _known(constraints, stamps, moved, innovations.run.odometry)
 
 
@@ -308,7 +308,7 @@ def _sparse(effect: Effect, samples: Samples, keys: list[str]) -> csr_array:
 
 
 @dataclass(frozen=True, eq=False)
-class _Told:
+class _BlockEquations:
     """Normal equations of a block of TDOAs, of those coordinates and delays that matter there: columns (c,); gram (c, c); vector (c,)."""
 
     columns: np.ndarray
@@ -342,16 +342,16 @@ def _known(constraints: Sequence[Mark], stamps: Sequence[np.ndarray], moved: np.
     return out
 
 
-def _inflation(gram: np.ndarray, vector: np.ndarray, blocks: Sequence[_Told], sizes: np.ndarray) -> float:
-    """By how much sums of scores over blocks, [_Told], whose sums are gram (k, k) and vector (k,), are larger than those of independent
-    errors, averaged over the directions that the data tell. sizes (k,): prior standard deviations."""
+def _inflation(gram: np.ndarray, vector: np.ndarray, blocks: Sequence[_BlockEquations], sizes: np.ndarray) -> float:
+    """By how much sums of scores over blocks, [_BlockEquations], whose sums are gram (k, k) and vector (k,), are larger than those of
+    independent errors, averaged over the directions that the data determine. sizes (k,): prior standard deviations."""
     step = np.linalg.solve(gram / PRELIMINARY + np.diag(sizes**-2.0), vector / PRELIMINARY)
     scores = np.zeros((len(blocks), len(vector)))
     for score, block in zip(scores, blocks):
         score[block.columns] = block.vector - block.gram @ step[block.columns]
     values, directions = np.linalg.eigh(gram)
-    told = values > DETERMINED * values[-1]
-    return float(np.mean(np.sum((scores @ directions[:, told]) ** 2, axis=0) / values[told]))
+    determined = values > DETERMINED * values[-1]
+    return float(np.mean(np.sum((scores @ directions[:, determined]) ** 2, axis=0) / values[determined]))
 
 
 def features(p: np.ndarray, length: float = LENGTH) -> np.ndarray:

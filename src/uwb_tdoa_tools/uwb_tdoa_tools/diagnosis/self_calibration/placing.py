@@ -29,7 +29,7 @@ def place(flights: Sequence[Flight], rows: Sequence[int], config: FilterConfig |
     """Anchors of Flights with those of some rows placed, one after the other.
 
     Each TDOA between the anchor and one of the others is a hyperboloid about where the tag was; robust least squares over
-    all of them, started from the corners of the room. Raises InputError where too few tell of it.
+    all of them, started from the corners of the room. Raises InputError where too few determine it.
     """
     anchors = flights[0].anchors
     known = np.setdiff1d(np.arange(len(anchors)), rows)

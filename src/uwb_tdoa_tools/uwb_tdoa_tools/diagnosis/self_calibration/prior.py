@@ -177,10 +177,10 @@ def _parts(gram: np.ndarray, vector: np.ndarray, prior: Prior, offset: np.ndarra
 def eliminated(gram: np.ndarray, vector: np.ndarray, n: int, sizes: ArrayLike) -> tuple[np.ndarray, np.ndarray, float]:
     """(gram (n, n), vector (n,), logarithm of the evidence of the rest): normal equations with what comes after the first n unknowns
     integrated out, whose standard deviations are `sizes`, a number or one for each."""
-    told = n + np.flatnonzero(np.diagonal(gram)[n:] > 0.0)  # the others add nothing
-    sizes, cross = np.broadcast_to(sizes, len(gram) - n)[told - n], gram[:n, told]
-    root = np.linalg.cholesky(gram[np.ix_(told, told)] + np.diag(sizes**-2.0))
-    solved = solve_triangular(root, np.column_stack([cross.T, vector[told]]), lower=True, check_finite=False)
+    informed = n + np.flatnonzero(np.diagonal(gram)[n:] > 0.0)  # the others add nothing
+    sizes, cross = np.broadcast_to(sizes, len(gram) - n)[informed - n], gram[:n, informed]
+    root = np.linalg.cholesky(gram[np.ix_(informed, informed)] + np.diag(sizes**-2.0))
+    solved = solve_triangular(root, np.column_stack([cross.T, vector[informed]]), lower=True, check_finite=False)
     evidence = solved[:, -1] @ solved[:, -1] - 2.0 * np.sum(np.log(np.diagonal(root))) - 2.0 * np.sum(np.log(sizes))
     less = solved[:, :-1].T @ solved
     return gram[:n, :n] - less[:, :-1], vector[:n] - less[:, -1], 0.5 * evidence
@@ -215,9 +215,9 @@ def _with_each_change(
     for gram, vector, rest, _ in parts:
         evidence, inverse = _evidence(gram, vector, rest, prior, size, offset), np.linalg.inv(gram + prior)
         slope = prior @ (offset + inverse @ (vector - prior @ offset))
-        told = prior - prior @ inverse @ prior
+        information = prior - prior @ inverse @ prior
         for key, (places, std) in changes.items():
-            some = told[np.ix_(places, places)]
+            some = information[np.ix_(places, places)]
             more = slope[places] @ np.linalg.solve(some + np.eye(len(places)) / std**2, slope[places])
             more -= np.linalg.slogdet(np.eye(len(places)) + std**2 * some)[1]
             out[key] = max(out[key], evidence + 0.5 * more)

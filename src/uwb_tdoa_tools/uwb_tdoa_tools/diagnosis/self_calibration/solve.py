@@ -266,12 +266,12 @@ def _shares(equations: Equations, offset: np.ndarray, found: Solution, names: Se
     """SelfCalibration.shares: a fit of one factor to what each flight alone tells in Equations that were made an offset (4N,) from the
     mean of the prior; with the information of `over_flights`, which errors that last do not make less."""
     n, whole, out = len(offset), offset + found.step, {}
-    told = [eliminated(SYSTEMATIC * one.gram, SYSTEMATIC * one.vector, n, found.function_std)[:2] for one in equations.flights]
+    reduced = [eliminated(SYSTEMATIC * one.gram, SYSTEMATIC * one.vector, n, found.function_std)[:2] for one in equations.flights]
     for name, columns in ((POSITION, slice(3 * n // 4)), (DELAY, slice(3 * n // 4, n))):
         part = np.zeros(n)
         part[columns] = whole[columns]
         out[name] = tuple(
             Share.fitted(flight, part @ gram @ part, part @ (vector + gram @ (offset - whole + part)))
-            for flight, (gram, vector) in zip(names, told)
+            for flight, (gram, vector) in zip(names, reduced)
         )
     return out

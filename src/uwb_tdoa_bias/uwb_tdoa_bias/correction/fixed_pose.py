@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from ..foundation.anchors import Anchors
 
 
-class RehearsedCorrector(Corrector):
+class FixedPoseCorrector(Corrector):
     """Corrects a recording at the poses that a run with another model has had."""
 
     idle = True  # nothing of this run is waited for
