@@ -78,14 +78,14 @@ class Estimator:
     @property
     def running(self) -> bool:
         """True once a start position was found."""
-        return bool(self._ekf.running)
+        return bool(self._ekf["running"])
 
     @property
     def lost(self) -> str | None:
         """Why there is no odometry any more, a sentence, until the tag is found anew; None while it is not lost, and before it was
         found. Depends on stamps alone."""
         ekf = self._ekf
-        if ekf.running or ekf.t == -math.inf:
+        if ekf["running"] or ekf["t"] == -math.inf:
             return None
         return (
             f"the tag is lost: for more than {LOST_TIME:g} s no TDOA came, and nothing else tells where it is by now; there is no odometry "
@@ -115,7 +115,7 @@ class Estimator:
     @property
     def next_odometry(self) -> float:
         """Stamp, s, up to which no odometry will come."""
-        return float(self._ekf.next_odometry)
+        return float(self._ekf["next_odometry"])
 
     @property
     def recoveries(self) -> int:

@@ -184,6 +184,7 @@ EKF = _record(
     ("pairs", PAIR, MOST_PAIRS),
     ("still_covariance", float, (3, 3)),
 )
+EKF = np.dtype((np.record, EKF))  # whose fields Python reads as attributes
 
 # What comes out.
 ODOMETRY = _record(
@@ -191,9 +192,6 @@ ODOMETRY = _record(
     ("persistent", float, (3, 3)),  # what of it errors that persist make, see systematic.py
 )  # fmt: skip
 RESIDUAL = _record(("innovation", float), ("variance", float), ("weight", float), ("verdict", np.uint8))
-
-
-_EKF_BY_ATTRIBUTE = np.dtype((np.record, EKF))
 
 
 class FilterState(NamedTuple):
@@ -207,7 +205,7 @@ class FilterState(NamedTuple):
     @property
     def record(self) -> Record:
         """The fields of EKF as attributes: a view."""
-        return self.ekf.view(_EKF_BY_ATTRIBUTE)[0]
+        return self.ekf[0]
 
     def copy(self) -> FilterState:
         """Another filter that remembers the same."""
