@@ -30,6 +30,7 @@ from uwb_tdoa_msgs.msg import AnchorArray, Tdoa, TdoaCorrected, TdoaResidual
 
 EPOCH = 1_700_000_000  # s; stamps of today's size
 PATIENCE = 180.0  # s for anything that must happen; the very first start of ekf_node compiles the filter
+AGAIN = 10.0  # s after which a node that has not answered is asked once more
 MODULES = {
     "bias_node": "uwb_tdoa_bias.bias_node",
     "ekf_node": "uwb_tdoa_ekf.ekf_node",
@@ -263,6 +264,19 @@ class Rig:
                 said = "".join(line for process in self._processes.values() for line in process.lines)
                 accounts = {name: self.values(name) for name in self._processes}
                 raise AssertionError(f"waited {PATIENCE} s for {what}; {accounts}; {said}")
+
+    def answer(self, ask, what):
+        """The result of the Future of ask(). It asks again after AGAIN: the middleware drops an answer to a client that it has not met
+        yet, and a node that was killed seems to be there for some time."""
+        asked = []
+
+        def answered():
+            if not asked or time.monotonic() > asked[-1][0] + AGAIN:
+                asked.append((time.monotonic(), ask()))
+            return any(future.done() for _, future in asked)
+
+        self.wait(answered, f"an answer of {what}")
+        return next(future.result() for _, future in asked if future.done())
 
     def values(self, name):
         """{key: text} of the last diagnostics of a node; empty before."""

@@ -69,16 +69,10 @@ def ends_well(launched):
 
 
 def values_of(rig, node, *names):
-    """The values of parameters of a node, by its absolute name. Asked again, as one that was killed seems to be there for some time."""
-    client, asked = AsyncParameterClient(rig.node, node), []
-
-    def answered():
-        if client.services_are_ready() and (not asked or time.monotonic() > asked[-1][0] + 5.0):
-            asked.append((time.monotonic(), client.get_parameters(names)))
-        return any(future.done() for _, future in asked)
-
-    rig.wait(answered, f"{node} to answer")
-    (values, *_) = (future.result().values for _, future in asked if future.done())
+    """The values of parameters of a node, by its absolute name."""
+    client = AsyncParameterClient(rig.node, node)
+    rig.wait(client.services_are_ready, f"the services of {node}")
+    values = rig.answer(lambda: client.get_parameters(names), node).values
     return [parameter_value_to_python(value) for value in values]
 
 

@@ -43,9 +43,7 @@ def transform(parent, child, p=(0.0, 0.0, 0.0), q=(0.0, 0.0, 0.0, 1.0), t=None):
 def call(rig, kind, service, request):
     client = rig.node.create_client(kind, service)
     rig.wait(client.service_is_ready, f"{service} to be there")
-    future = client.call_async(request)
-    rig.wait(future.done, f"{service} to answer")
-    return future.result()
+    return rig.answer(lambda: client.call_async(request), service)
 
 
 def positions(messages):

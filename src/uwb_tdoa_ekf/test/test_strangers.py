@@ -44,9 +44,7 @@ class Stranger:
         """The response of a service of a node, which it must give."""
         client = self._rig.node.create_client(kind, f"/{self._rig.namespace}/{service}")
         self._rig.wait(client.service_is_ready, f"{service} to be offered")
-        future = client.call_async(kind.Request(**request))
-        self._rig.wait(future.done, f"an answer of {service}")
-        return future.result()
+        return self._rig.answer(lambda: client.call_async(kind.Request(**request)), service)
 
     def set(self, node, name, **value):
         """SetParametersResult of a parameter, whose value has these fields."""

@@ -10,6 +10,7 @@ parameters too, with values that are odd: each is answered. With them come odd m
 import argparse
 from collections import Counter
 from dataclasses import dataclass
+from functools import partial
 import json
 from pathlib import Path
 import re
@@ -42,6 +43,7 @@ from uwb_tdoa_tools.benchmark import nodes
 from uwb_tdoa_tools.benchmark.nodes import READY_LIMIT, ready_at, surroundings
 from uwb_tdoa_tools.benchmark.usage import memory
 from uwb_tdoa_tools.live.processes import DiagnosticsListener, LiveError, wait
+from uwb_tdoa_tools.live.session import answer_of
 
 RCLError = rclpy_implementation.RCLError
 CORPUS = Path(__file__).parent / "fuzz" / "corpus"
@@ -212,7 +214,7 @@ def _send(node, processes, publishers, name, count, rng):
             if single:
                 out.expected[topic] += not is_readable(data, kind)
             publisher.publish(data)
-        wait(PATIENCE, "an answer", processes, node, client.call_async(GetParameters.Request(names=["use_sim_time"])).done)
+        wait(PATIENCE, "an answer", processes, node, answer_of(partial(client.call_async, GetParameters.Request(names=["use_sim_time"]))))
         if k % max(1, count // 10) == 0:
             out.memory.append(memory(processes.pid(name)))
     return out
@@ -280,7 +282,8 @@ def request_ordeal(name, count, folder, seed=1):
                         message = whole(publisher.msg_type, k, (lambda one: odd(one, rng)) if rng.random() < 0.5 else (lambda one: one))
                         publisher.publish(changed(message, rng))
                     for service, client in clients.items():
-                        wait(PATIENCE, f"an answer of {service}", processes, node, client.call_async(_request(services[service], rng)).done)
+                        ask = partial(client.call_async, _request(services[service], rng))
+                        wait(PATIENCE, f"an answer of {service}", processes, node, answer_of(ask))
                         answered[service] += 1
                     if k % max(1, count // 10) == 0:
                         used.append(memory(processes.pid(name)))
@@ -325,8 +328,8 @@ def clock_ordeal(count, folder, seed=1):
             except RCLError:  # the middleware sends none that is longer than any Clock
                 continue
             time.sleep(0.001)  # the newest is taken 50 times a second
-        answered = client.call_async(GetParameters.Request(names=["use_sim_time"]))
-        wait(PATIENCE, "ekf_node to answer", processes, node, answered.done)
+        ask = partial(client.call_async, GetParameters.Request(names=["use_sim_time"]))
+        wait(PATIENCE, "ekf_node to answer", processes, node, answer_of(ask))
         processes.stop("ekf_node")
         return "Traceback" not in log.read_text(errors="replace")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 import time
 from typing import TYPE_CHECKING
 
@@ -13,6 +14,7 @@ from uwb_tdoa_bias.foundation.sensors import SENSORS
 
 from .follow import AID_SHARE, LAG, STEP
 from .processes import DiagnosticsListener
+from .session import answer_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -112,9 +114,11 @@ class Nodes:
 
     def _parameter(self, name: str, parameter: str) -> float:
         client = AsyncParameterClient(self._node, self._names[name])
-        future = client.get_parameters([parameter]) if client.wait_for_services(ANSWER_LIMIT) else None
-        if future is not None:
-            rclpy.spin_until_future_complete(self._node, future, timeout_sec=ANSWER_LIMIT)
+        answered, future = answer_of(partial(client.get_parameters, [parameter])), None
+        if client.wait_for_services(ANSWER_LIMIT):
+            until = time.monotonic() + ANSWER_LIMIT
+            while (future := answered()) is None and time.monotonic() < until:
+                rclpy.spin_once(self._node, timeout_sec=SPIN)
         if future is None or future.result() is None:
             raise InputError(f"--follow: {self._names[name]} does not answer for {ANSWER_LIMIT:g} s; start it again.")
         return future.result().values[0].double_value

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import signal
+import time
 from contextlib import contextmanager
 from importlib import import_module
 from typing import Any, TYPE_CHECKING
@@ -16,9 +18,10 @@ from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, Qo
 from uwb_tdoa_bias.foundation.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Callable, Iterator, Sequence
     from rclpy.duration import Duration
     from rclpy.node import Node
+    from rclpy.task import Future
 
 KNOWN = frozenset(  # packages of message types: those of ROS that robots speak, and ours
     """actionlib_msgs action_msgs builtin_interfaces diagnostic_msgs geometry_msgs lifecycle_msgs nav_msgs rcl_interfaces rosgraph_msgs
@@ -29,6 +32,7 @@ PACKAGE: dict[str, Any] = {  # the option by which others are allowed
     "action": "append", "default": [], "metavar": "NAME",
     "help": "import message types of this package, too; those of ROS that robots speak, and ours, are known; may be repeated",
 }  # fmt: skip
+AGAIN = 4.0  # s after which a node that has not answered is asked once more
 READER_DEPTH = 10_000  # messages that a subscription holds until they are taken: 10 s of a 1 kHz stream
 
 
@@ -69,6 +73,22 @@ def session(name: str, arguments: Sequence[str]) -> Iterator[tuple[Node, Stop]]:
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
+
+
+def answer_of(ask: Callable[[], Future]) -> Callable[[], Future | None]:
+    """A function that returns the first Future of ask() that is done, or None so far. When it is called AGAIN s after the last time, it
+    asks again: the middleware drops an answer to a client that it has not met yet ("failed to send response (timeout)")."""
+    asked: list[Future] = []
+    due = -math.inf
+
+    def answered() -> Future | None:
+        nonlocal due
+        if time.monotonic() > due:
+            asked.append(ask())
+            due = time.monotonic() + AGAIN
+        return next((future for future in asked if future.done()), None)
+
+    return answered
 
 
 def message_class(msgtype: str, packages: Sequence[str] = ()) -> type | None:
