@@ -51,8 +51,8 @@ class EffectSet:
         return iter(self.effects)
 
     def bias(self, samples: Samples) -> np.ndarray:
-        """Sum of all contributions to what `samples.channel` measures, (n,) metres, faded where they were not seen. An effect that is
-        not known (unknown attitude) adds nothing."""
+        """Sum of all contributions to what `samples.channel` measures, (n,) metres, faded where they were not seen. An effect whose
+        size is not known there (unknown attitude) adds nothing."""
         total = np.zeros(len(samples))
         for effect in (effect for effect in self.effects if samples.channel in effect.channels):
             part = faded(effect, samples)[0]

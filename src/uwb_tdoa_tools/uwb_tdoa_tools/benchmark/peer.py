@@ -14,7 +14,7 @@ rows a and b of `anchors` (count, 3), m. The filter starts at p, m, with the att
 
     void tdoa_peer_state(double *p, double *v, double *q);
 
-There p is NaN at the start if no place was given, and what is given is so to 0.1 m; q is level, and its yaw so to 0.1 rad.
+There p is NaN at the start if no place was given, and what is given is right to 0.1 m; q is level, and its yaw is right to 0.1 rad.
 """
 
 from __future__ import annotations

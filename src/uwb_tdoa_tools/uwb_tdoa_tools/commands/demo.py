@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, options
-from ..flying import demo
 from ..evaluating.table import lines_of_errors
+from ..flying import demo
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace

@@ -243,5 +243,6 @@ def _save(figure: Figure, title: str, path: str | Path) -> None:
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     image = Image.frombuffer("RGBA", canvas.get_width_height(), canvas.buffer_rgba())
-    plt.close(figure)  # 256 colours are enough, and a third of the size
+    plt.close(figure)
+    # 256 colours are enough, and a third of the size
     image.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(path, "PNG", optimize=True)

@@ -11,6 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 
 from ...scoring.plots import plt
+
 if TYPE_CHECKING:
     from collections.abc import Callable
     from matplotlib.figure import Figure
