@@ -3,14 +3,14 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uwb_tdoa_bias.foundation.stamps import LARGEST_STEP_AHEAD, LARGEST_STEP_BACK, StampGate
+from uwb_tdoa_bias.foundation.stamps import CONFIRMED, LARGEST_STEP_AHEAD, LARGEST_STEP_BACK, MOST_HELD, STEP_AHEAD, StampGate
 
 
-def through(stamps):
+def through(stamps, reached=()):
     """(accepted, outliers, places at which the stream jumped back) of stamps fed one after the other."""
     gate, accepted, outliers, back = StampGate(), [], [], []
     for place, t in enumerate(stamps):
-        good, bad, jumped_back = gate.take(t, place)
+        good, bad, jumped_back = gate.take(t, place, reached)
         accepted += good
         outliers += bad
         back += [place] * jumped_back
@@ -19,7 +19,7 @@ def through(stamps):
 
 def test_a_stream_that_goes_on_is_accepted_at_once():
     gate = StampGate()
-    for t in (5.0, 5.1, 5.05, 5.1 - LARGEST_STEP_BACK, 5.1 + LARGEST_STEP_AHEAD):
+    for t in (5.0, 5.1, 5.05, 5.1 - LARGEST_STEP_BACK, 5.1 + STEP_AHEAD):
         assert gate.take(t, "x") == ([(t, "x")], [], False) and len(gate) == 0
 
 
@@ -28,9 +28,40 @@ def test_one_wrong_stamp_is_an_outlier():
         assert through([0.0, 0.1, wrong, 0.2]) == ([(0.0, 0), (0.1, 1), (0.2, 3)], [(wrong, 2)], [])
 
 
-def test_two_that_agree_are_another_time():
-    assert through([50.0, 1.0, 1.1, 1.2]) == ([(50.0, 0), (1.0, 1), (1.1, 2), (1.2, 3)], [], [2])
-    assert through([0.0, 60.0, 60.1]) == ([(0.0, 0), (60.0, 1), (60.1, 2)], [], [])
+def test_a_jump_that_persists_is_another_time():
+    assert through([50.0, 1.0, 1.1, 1.2, 1.3]) == ([(50.0, 0), (1.0, 1), (1.1, 2), (1.2, 3), (1.3, 4)], [], [4])
+    assert through([0.0, 60.0, 60.1, 60.4]) == ([(0.0, 0), (60.0, 1), (60.1, 2), (60.4, 3)], [], [])
+
+
+def test_a_jump_that_another_stream_has_made_is_another_time_at_once():
+    assert through([0.0, 60.0], [60.1]) == ([(0.0, 0), (60.0, 1)], [], [])
+    assert through([50.0, 1.0, 1.1], [1.0]) == ([(50.0, 0), (1.0, 1), (1.1, 2)], [], [2])
+
+
+@given(st.floats(0.6, 1e6) | st.floats(-1e6, -1.3), st.integers(1, 25))
+def test_a_burst_of_wrong_stamps_shorter_than_a_jump_costs_its_messages_alone(off, count):
+    """At 100 Hz. Thirty in a row would be a jump."""
+    stamps = [0.01 * k for k in range(200)]
+    wrong = [t + off for t in stamps[100 : 100 + count]]
+    accepted, outliers, back = through([*stamps[:100], *wrong, *stamps[100 + count :]])
+    assert [place for place, _ in enumerate(stamps) if not 100 <= place < 100 + count] == [place for _, place in accepted]
+    assert [t for t, _ in outliers] == wrong and not back
+
+
+def test_a_stream_that_stands_still_at_another_time_never_jumps_and_does_not_grow():
+    gate = StampGate()
+    gate.take(100.0, "x")
+    for _ in range(2 * MOST_HELD):
+        assert not gate.take(50.0, "x")[2] and len(gate) <= MOST_HELD
+    assert gate.newest == 100.0
+
+
+def test_a_slow_stream_goes_on_at_once_and_a_fast_one_makes_no_step_of_a_second():
+    slow, fast = StampGate(), StampGate()
+    for k in range(100):
+        assert slow.take(0.45 * k, "x")[0] and fast.take(0.01 * k, "x")[0]
+    assert slow.newest + 3.9 * 0.45 < slow.limit < slow.newest + LARGEST_STEP_AHEAD
+    assert fast.limit == fast.newest + STEP_AHEAD and CONFIRMED > STEP_AHEAD
 
 
 def test_the_time_of_useless_items_is_noted():

@@ -99,6 +99,7 @@ class EkfNode(StreamNode):
         self._effects = EffectSet.from_yaml(effects_file) if effects_file else EffectSet()
         self._aid_corrector = AidCorrector(self._effects.effects)
         self._estimator: Estimator = None  # type: ignore[assignment]  # until there are anchors
+        self._said_restart: Finding | None = None
         self._epoch, self._ros_clock = Epoch(), cast("ROSClock", self.get_clock())
         self._attitude: tuple[np.ndarray, np.ndarray] | None = None  # quaternion and covariance of the newest odometry
         self._last_tdoa = -math.inf  # of a TDOA or range, time.monotonic(), s
@@ -255,6 +256,7 @@ class EkfNode(StreamNode):
         self._frames.catch_up()
         if self._estimator is not None:
             self._publish(*self._estimator.advance())
+            self._say_restart()
 
     def _take_imu(self, frame: str, t: np.ndarray, rows: np.ndarray, arrival: np.ndarray) -> None:
         mount = self._place_imu(frame)
@@ -287,6 +289,13 @@ class EkfNode(StreamNode):
         sensor = SENSORS[name]
         self._estimator.add(name, self._aid_corrector.correct(name, sensor.read(t, {field: rows[field] for field in sensor.fields})))
 
+    def _say_restart(self) -> None:
+        """Log why the filter has started anew, once for each time."""
+        restarted = self._estimator.restarted
+        if restarted != self._said_restart and restarted is not None:
+            self.warn_at_times("restarted", restarted.sentence)
+        self._said_restart = restarted
+
     def _publish(self, odometry: Odometry, residuals: Residuals) -> None:
         if len(odometry.t):
             rates, variances = self._estimator.rates_at(odometry.t)
@@ -307,10 +316,11 @@ class EkfNode(StreamNode):
         """What the rules over streams find; [] without anchors."""
         if self._estimator is None:
             return []
-        restarts, self._restarts = self._restarts, self._estimator.counts["restarts"]
+        estimator = self._estimator
+        restarts, self._restarts = self._restarts, estimator.counts["restarts"]
         if self._restarts != restarts:
             self._watch.restart()
-        return most_severe_first([*self._watch.findings(), *filter(None, [self._estimator.without_imu])])
+        return most_severe_first([*self._watch.findings(), *estimator.clocks, *filter(None, [estimator.restarted, estimator.without_imu])])
 
     def _wiring(self) -> list[str]:
         """What is wrong with who publishes what to whom, a list of sentences."""

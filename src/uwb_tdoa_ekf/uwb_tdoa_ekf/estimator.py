@@ -10,7 +10,7 @@ import numpy as np
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.compiled import Record, compiled
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.stamps import LARGEST_STEP_AHEAD, LARGEST_STEP_BACK
+from uwb_tdoa_bias.foundation.stamps import LARGEST_STEP_BACK
 
 from .core import aids
 from .core.config import FilterConfig
@@ -21,6 +21,7 @@ from .core.memory import IMU_SAMPLE, ODOMETRY, POSE, TDOA, YAWS, joined, structu
 from .core.startup import APART
 from .core.verdicts import INVALID
 from .installed import MOST_ROWS, Installed
+from .monitoring.clocks import clock_ahead, restarted
 from .monitoring.implausible import implausible
 from .pipeline import Pipeline, odometry_of
 from .reorder_buffer import IMU_STREAM, STREAMS, TDOA_STREAM, ReorderBuffer
@@ -31,9 +32,12 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.anchors import Anchors
     from uwb_tdoa_bias.foundation.sensors import Stream
     from .pipeline import Fed
+    from .reorder_buffer import Restart
     from .streams.finding import Finding
 
 RATE_SAMPLES = 10  # inertial samples from whose stamps their rate is known
+LARGEST_POSE_AHEAD = 10.0  # s of a pose that is set, from the newest measurement
+RESTART_NAMED = 10.0  # s of stamps for which a restart is named
 MOST_POSES = 100  # that were set and wait for their time
 NOTHING = Odometry.from_rows(np.empty(0, ODOMETRY)), Residuals.refused(np.empty(0), np.empty(0), np.empty(0), INVALID)
 
@@ -58,6 +62,7 @@ class Estimator:
         self._refused: list[Residuals] = []
         self._sensed = np.empty(0, IMU_SAMPLE)  # the inertial samples that were used last, and RATE_SAMPLES before them
         self._buffer = ReorderBuffer(reorder, lag, self.config.use_imu, self._refuse, self._start_anew)
+        self._restart: Restart | None = None  # the last one
         self._clear()
 
     def _clear(self) -> None:
@@ -109,7 +114,7 @@ class Estimator:
 
     @property
     def newest(self) -> float:
-        """Stamp of the newest measurement, s; -inf before the first."""
+        """Stamp that the time of the streams has reached, s; -inf before the first TDOA, range or inertial sample."""
         return self._buffer.newest
 
     @property
@@ -132,6 +137,18 @@ class Estimator:
         """Finding by which the filter goes without inertial samples, because they cannot be right; None while it uses them."""
         ekf = self._ekf
         return implausible(ekf.plausibility) if ekf.distrusted else None
+
+    @property
+    def restarted(self) -> Finding | None:
+        """Finding on why the filter started anew, for RESTART_NAMED seconds of stamps after it did."""
+        cause = self._restart
+        return restarted(cause) if cause is not None and self.newest < cause.at + RESTART_NAMED else None
+
+    @property
+    def clocks(self) -> list[Finding]:
+        """Findings on streams whose clocks are wrong at present."""
+        of_streams = zip(STREAMS, self._buffer.leads)
+        return [clock_ahead(name, lead, self.counts["invalid" if name == "tdoa" else f"{name}_invalid"]) for name, lead in of_streams if lead]
 
     @property
     def waiting(self) -> tuple[int, ...]:
@@ -176,10 +193,10 @@ class Estimator:
         """
         self.refused_pose = None
         newest = self.newest
-        if newest > -math.inf and not newest - LARGEST_STEP_BACK <= t <= newest + LARGEST_STEP_AHEAD:
+        if newest > -math.inf and not newest - LARGEST_STEP_BACK <= t <= newest + LARGEST_POSE_AHEAD:
             raise InputError(
                 f"pose: its stamp is {t - newest:+.3f} s from that of the newest measurement; give one from "
-                f"-{LARGEST_STEP_BACK:g} to {LARGEST_STEP_AHEAD:g} s."
+                f"-{LARGEST_STEP_BACK:g} to {LARGEST_POSE_AHEAD:g} s."
             )
         if len(self._poses) >= MOST_POSES:
             raise InputError(f"pose: {MOST_POSES} wait for their time already; give fewer.")
@@ -207,7 +224,8 @@ class Estimator:
         out = self.finish()
         self._buffer.clear()
         self._installed = Installed(self.anchors)  # no row waits any more
-        self._start_anew()
+        self.counts["restarts"] += 1
+        self._clear()
         return out
 
     def advance(self) -> tuple[Odometry, Residuals]:
@@ -235,9 +253,10 @@ class Estimator:
         else:
             self.counts[f"{STREAMS[stream]}_{VERDICTS[verdict]}"] += len(rows)
 
-    def _start_anew(self) -> None:
-        """A stream has fallen back in time."""
+    def _start_anew(self, cause: Restart) -> None:
+        """Go on in the time to which the streams have fallen back."""
         self.counts["restarts"] += 1
+        self._restart = cause
         self._clear()
 
     def _use(self, until: float) -> tuple[Odometry, Residuals]:
@@ -271,20 +290,20 @@ class Estimator:
         if self._begun or not self._has_begun():
             return
         self._begun = True
-        first = self._buffer.first
+        first = self._buffer.began
         early, self._poses = self._poses, []
         for pose in early:
             ahead = float(pose["t"][0]) - first
-            if -LOST_TIME <= ahead <= LARGEST_STEP_AHEAD:
+            if -LOST_TIME <= ahead <= LARGEST_POSE_AHEAD:
                 self._poses.append(pose)
             else:
                 self.refused_pose = (
                     f"the pose that was told is not used: its stamp is {ahead:+.3f} s from that of the first measurement; give one from "
-                    f"-{LOST_TIME:g} to {LARGEST_STEP_AHEAD:g} s, on the clock of the measurements"
+                    f"-{LOST_TIME:g} to {LARGEST_POSE_AHEAD:g} s, on the clock of the measurements"
                 )
 
     def _has_begun(self) -> bool:
-        return len(self._buffer) > 0 or self._buffer.used_until > -math.inf
+        return self._buffer.began < math.inf
 
 
 @compiled

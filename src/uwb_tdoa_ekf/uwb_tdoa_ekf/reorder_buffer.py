@@ -1,15 +1,15 @@
-"""What has arrived of each stream, put in the order of its stamps, until nothing older is to be expected."""
+"""Put what arrives of all streams in order of stamps, and judge the clock of each stream on entry."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import NamedTuple, TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.sensors import LOCATING
-from uwb_tdoa_bias.foundation.stamps import LARGEST_STEP_AHEAD, StampGate
+from uwb_tdoa_bias.foundation.stamps import CONFIRMED, LARGEST_STEP_BACK, StampGate, allowed_step, usual_step
 
 from .core import aids
 from .core.memory import AID, IMU_SAMPLE, TDOA, Measurements, joined
@@ -21,29 +21,47 @@ if TYPE_CHECKING:
 STREAMS = "imu", "tdoa", *aids.STREAMS
 KINDS = IMU_SAMPLE, TDOA, *[AID] * len(aids.STREAMS)
 IMU_STREAM, TDOA_STREAM, FIRST_AID = range(3)  # places in STREAMS
-LEADING = IMU_STREAM, TDOA_STREAM, *map(STREAMS.index, LOCATING)  # by whose stamps time goes on
+LOCATING_STREAMS = TDOA_STREAM, *map(STREAMS.index, LOCATING)  # one of these is the reference: its stamps are the time
+LEADING = IMU_STREAM, *LOCATING_STREAMS  # by whose stamps time goes on
 ROOM = 256  # rows of a stream, to begin with
-MOST_WAITING = 2000  # messages of a stream: 2 s at 1 kHz; those of one stamp for ever, or a nanosecond apart, would never be passed
-SILENT = 1.0  # s of stamps after which a sensor is not waited for any more, until it is back
-OF_AIDS = 0.5  # share of `lag` for which they are waited for: bias_node's `hold` must outlast that by far
+MOST_WAITING = 2000  # messages of a stream: 2 s at 1 kHz; of one that stands still the first ones leave
+LATELY = 2.0  # s of stamps for which a stream counts as ahead after a row of it was refused for that
+SILENT = 1.0  # s of stamps after which a stream is not waited for any more, until it is back
+OF_AIDS = 0.5  # share of `lag` for which sensors are waited for: bias_node's `hold` must outlast that by far
 TRIAL = 2.0  # s of stamps in order, after which a stream is trusted to go on so
+# s by which a stream may be ahead of the others. TDOAs that arrive so much after the inertial samples of their time are still used.
+AHEAD_OF_REFERENCE, AHEAD_OF_LEADING = 2.0, 0.5  # of inertial samples and ranges, and of all others
 NO_AIDS = np.empty(0, AID)
 
 
+class Restart(NamedTuple):
+    """Why the filter starts anew. stream : name of the stream whose stamps fell back; step : s, by how much, below 0; at : s, stamp with
+    which the new time begins; overtaken : another stream had moved the time ahead, and the stream itself did not jump."""
+
+    stream: str
+    step: float
+    at: float
+    overtaken: bool = False
+
+
 class ReorderBuffer:
-    """The streams of STREAMS. Rows, (n,) of their type in KINDS, come in any order and leave in the order of their stamps.
+    """Streams of STREAMS. Rows, (n,) of their type in KINDS, come in any order and leave in the order of their stamps.
 
     Live, rows wait until every stream has passed them. A stream that is silent is waited for for `lag` seconds of stamps, one of the
-    SENSORS for half of that, and only if it was there a second ago; `reorder` more for late siblings, unless they have come in order so far
-    (LatenessPolicy). What is older than what was used is refused as late. A stream that falls back in time starts all anew; a single
-    stamp far from its neighbours is refused as late, or as invalid if it lies ahead. A recording is there as a whole: `load`.
+    SENSORS for half of that, and after SILENT seconds not at all. `reorder` is waited for late siblings, unless they have come in order so
+    far (LatenessPolicy). A row that is older than what was used is refused as late.
+
+    The reference is the stream that locates the tag: TDOAs, or ranges without them. Its stamps are the time. Only it can start the filter
+    anew: when its clock falls back, or when another stream has moved the time ahead of it. Any other stream is judged by its lead over
+    the reference: one that is too far ahead is refused as invalid, one that is behind as late, and neither moves the time. A recording is
+    there as a whole: `load`.
     """
 
     def __init__(
-        self, reorder: float, lag: float, use_imu: bool, refuse: Callable[[int, np.ndarray, int], None], restart: Callable[[], None]
+        self, reorder: float, lag: float, use_imu: bool, refuse: Callable[[int, np.ndarray, int], None], restart: Callable[[Restart], None]
     ) -> None:
         """reorder, lag : s; use_imu : inertial samples are waited for; refuse(stream, rows, verdict) is called with what will not be used,
-        restart() when a stream has fallen back in time."""
+        restart(cause) when the filter has to start anew."""
         self.reorder, self.lag = reorder, lag
         self._awaited = TDOA_STREAM, *([IMU_STREAM] if use_imu else [])
         self._refuse, self._restart = refuse, restart
@@ -52,11 +70,14 @@ class ReorderBuffer:
     @classmethod
     def of_recording(cls) -> ReorderBuffer:
         """For what is there as a whole: nothing is late."""
-        return cls(0.0, 0.0, False, lambda stream, rows, verdict: None, lambda: None)
+        return cls(0.0, 0.0, False, lambda stream, rows, verdict: None, lambda cause: None)
 
     def clear(self) -> None:
         """Forget everything."""
         self._streams = [_Stream(kind) for kind in KINDS]
+        self._reference = TDOA_STREAM
+        self.began = math.inf  # s, stamp of the first row of a leading stream
+        self._overtaken: tuple[float, float] | None = None  # s: stamps of the first reference row that is overtaken, and of the IMU then
         self.used_until = -math.inf  # s, stamp of the last row that was taken
 
     def __len__(self) -> int:
@@ -69,9 +90,16 @@ class ReorderBuffer:
         return tuple(len(stream) + len(stream.gate) for stream in self._streams)
 
     @property
+    def leads(self) -> tuple[float, ...]:
+        """s by which each stream is ahead of the others, if rows of it have been refused for that lately; else 0."""
+        newest = self.newest
+        return tuple(stream.lead if newest < stream.refused + LATELY else 0.0 for stream in self._streams)
+
+    @property
     def newest(self) -> float:
-        """Stamp of the newest row, s; -inf before the first."""
-        return max(stream.gate.newest for stream in self._streams)
+        """Stamp that the time has reached, s; -inf before the first row of a leading stream."""
+        imu = self._streams[IMU_STREAM]
+        return max(self._streams[self._reference].gate.newest, imu.gate.newest - (imu.lead if imu.lead > self.lag else 0.0))
 
     @property
     def first(self) -> float:
@@ -80,25 +108,42 @@ class ReorderBuffer:
 
     @property
     def watermark(self) -> float:
-        """Stamp, s, up to which no row is to be expected any more; of more than MOST_WAITING of a stream the first may leave anyway."""
-        newest = max(self._streams[place].gate.newest for place in LEADING)
-        passed = [self._streams[place].watermark(self.reorder) for place in self._awaited]
-        for stream in self._streams[FIRST_AID:]:
+        """Stamp, s, up to which no row is to be expected any more; of more than MOST_WAITING of a leading stream the first may leave anyway."""
+        newest, passed = self.newest, []
+        for place in self._awaited:
+            stream = self._streams[place]
+            silent = stream.gate.newest < newest - SILENT and newest > self.began + SILENT
+            if not silent:
+                passed.append(max(stream.watermark(self.reorder), newest - self.lag))
+        for place, stream in enumerate(self._streams[FIRST_AID:], FIRST_AID):
             if newest - SILENT < stream.gate.newest < newest:
                 passed.append(max(stream.watermark(self.reorder), newest - OF_AIDS * self.lag))
-        too_many = (float(stream.rows["t"][-MOST_WAITING]) for stream in self._streams if len(stream) > MOST_WAITING)
-        return max(min(passed), newest - self.lag, *too_many)
+            elif place in LEADING and stream.gate.newest >= newest:
+                passed.append(stream.watermark(self.reorder))
+        too_many = (float(self._streams[place].rows["t"][-MOST_WAITING]) for place in LEADING if len(self._streams[place]) > MOST_WAITING)
+        return max(min(passed, default=newest), *too_many, -math.inf)
 
     def add(self, place: int, rows: np.ndarray, usable: np.ndarray) -> None:
         """Take rows (n,) of a stream in the order of their arrival; usable (n,) bool: of the others only the stamps
         count, and whoever adds them accounts for them."""
-        if len(rows) and usable.all() and self._streams[place].append(rows, self.used_until):
+        if not len(rows):
             return
-        for k, (t, good) in enumerate(zip(rows["t"].tolist(), usable.tolist())):
-            if good:
-                self._take_in(place, t, rows[k : k + 1])
-            else:
-                self._streams[place].gate.pass_time(t)  # or whoever waits for our pose of this time waits for the next one
+        if place in LEADING and self.began == math.inf:
+            self.began = float(rows["t"][0])
+        self._streams[place].seen = float(rows["t"][-1])
+        if usable.all() and self._streams[place].append(rows, self.used_until, self._limit(place)):
+            if place == self._reference:
+                self._overtaken = None
+        else:
+            for k, (t, good) in enumerate(zip(rows["t"].tolist(), usable.tolist())):
+                if good:
+                    self._take_in(place, t, rows[k : k + 1])
+                elif t <= self._limit(place):
+                    self._streams[place].gate.pass_time(t, self._reached(place))  # or whoever waits for our pose of this time waits for the next one
+        if place in LEADING:
+            self._judge(place)
+        else:
+            self._refuse_too_many(place)
 
     def load(self, place: int, rows: np.ndarray) -> None:
         """Take rows (n,) of a stream of a recording, in the order of their stamps and not before those that came before. Those of all
@@ -121,37 +166,140 @@ class ReorderBuffer:
         for place, stream in enumerate(self._streams):
             self._refuse_outliers(place, stream.gate.finish())
 
-    def _take_in(self, place: int, t: float, row: np.ndarray) -> None:
-        """Keep a row stamped t, s, and one that was held because of its stamp, if their stamps are accepted."""
+    def _limit(self, place: int) -> float:
+        """Stamp, s, up to which rows of a stream are taken. It is infinite for a stream that agrees with the others: when these are silent,
+        it goes on."""
         stream = self._streams[place]
-        newest = stream.gate.newest
-        accepted, outliers, jumped_back = stream.gate.take(t, row)
-        if jumped_back:
-            self._start_anew(place)
+        if place in (TDOA_STREAM, self._reference) or not (stream.ahead or stream.gate.newest == -math.inf):
+            return math.inf
+        compared = self._compared(place)
+        return math.inf if compared == -math.inf else compared + (AHEAD_OF_REFERENCE if place in LEADING else AHEAD_OF_LEADING)
+
+    def _compared(self, place: int) -> float:
+        """Stamp, s, of those streams by which another one is judged: the reference, for sensors the inertial samples, too."""
+        times = [self._streams[self._reference].gate.newest]
+        imu = self._streams[IMU_STREAM]
+        if place not in LEADING and not imu.ahead:
+            times.append(imu.gate.newest)
+        return max(times)
+
+    def _judge(self, place: int) -> None:
+        """Compare the other streams with a leading one, of which rows were added."""
+        if place in LOCATING_STREAMS and place != self._reference:
+            stream, reference = self._streams[place], self._streams[self._reference]
+            if place == TDOA_STREAM or stream.gate.newest - max(stream.lead, 0.0) > reference.gate.newest + SILENT:
+                self._reference = place
+                stream.ahead, stream.lead = False, 0.0
+        for other, stream in enumerate(self._streams):
+            leads = other in LEADING
+            if other == self._reference or stream.gate.newest == -math.inf or leads and place != self._reference:
+                continue
+            compared = self._compared(other)
+            stream.lead = stream.gate.newest - compared
+            limit = AHEAD_OF_REFERENCE if leads else AHEAD_OF_LEADING
+            if stream.lead > limit:
+                stream.ahead, stream.refused = True, compared
+                self._refuse(other, stream.drop_after(compared + limit), INVALID)
+
+    def _refuse_too_many(self, place: int) -> None:
+        """Bound what waits of a sensor while the streams that lead are silent."""
+        stream = self._streams[place]
+        if len(stream) > MOST_WAITING:
+            self._refuse(place, stream.take_first(len(stream) - MOST_WAITING), LATE)
+
+    def _take_in(self, place: int, t: float, row: np.ndarray) -> None:
+        """Keep a row stamped t, s, and those that were held because of their stamps, if their stamps are accepted."""
+        stream, limit = self._streams[place], self._limit(place)
+        if t > limit:
+            self._refuse_ahead(place, t, row)
+            return
+        stream.ahead = False
+        newest, before = stream.gate.newest, self.newest
+        accepted, outliers, jumped_back = stream.gate.take(t, row, self._reached(place))
+        if len(accepted) > 1 and place != self._reference and self._is_heard(newest):
+            self._refuse_outliers(place, outliers)
+            self._jump(place, accepted, newest)
+            return
+        if jumped_back and place == self._reference:
+            self._start_anew(place, Restart(STREAMS[place], accepted[0][0] - newest, accepted[0][0]))
             newest = -math.inf
             stream = self._streams[place]
         self._refuse_outliers(place, outliers)
+        if accepted and self._is_overtaken(place, accepted[-1][0]):
+            cause = Restart(STREAMS[place], accepted[0][0] - before, accepted[0][0], overtaken=True)
+            self._start_anew(place, cause)
+            newest = -math.inf
+            stream = self._streams[place]
         for t, row in accepted:
-            if stream.policy.is_late(t, newest) or t < self.used_until:
-                self._refuse(place, row, LATE)
-            else:
-                stream.merge(row)
+            self._merge(place, t, row, newest)
             newest = max(newest, t)
+
+    def _refuse_ahead(self, place: int, t: float, row: np.ndarray) -> None:
+        """Refuse a row stamped t, s, of a stream that is too far ahead."""
+        stream, compared = self._streams[place], self._compared(place)
+        stream.ahead, stream.lead, stream.refused = True, t - compared, compared
+        self._refuse(place, row, INVALID)
+
+    def _is_heard(self, newest: float) -> bool:
+        """Whether the reference goes on at a stamp that another stream has reached, s."""
+        return self._streams[self._reference].gate.newest > newest - SILENT
+
+    def _jump(self, place: int, accepted: list[tuple[float, np.ndarray]], newest: float) -> None:
+        """Go on with a stream whose clock has jumped while that of the reference has not. newest : its newest stamp before, s. The time is
+        that of the reference: a stream that is ahead does not move it."""
+        stream, compared = self._streams[place], self._compared(place)
+        limit = compared + (AHEAD_OF_REFERENCE if place in LEADING else AHEAD_OF_LEADING)
+        stream.lead = max(0.0, accepted[-1][0] - compared)
+        if accepted[-1][0] > limit:
+            stream.gate.newest = newest
+            for t, row in accepted:
+                self._refuse_ahead(place, t, row)
+            return
+        for t, row in accepted:
+            self._merge(place, t, row, newest)
+            newest = max(newest, t)
+
+    def _merge(self, place: int, t: float, row: np.ndarray, newest: float) -> None:
+        """Put a row stamped t, s, among those that wait, unless it is late. newest : stamp of its stream before it, s."""
+        stream = self._streams[place]
+        if stream.policy.is_late(t, newest) or t < self.used_until:
+            self._refuse(place, row, LATE)
+        else:
+            stream.merge(row)
+
+    def _reached(self, place: int) -> list[float]:
+        """Stamps, s, that other leading streams have reached, or are about to jump to."""
+        others = [self._streams[other].gate for other in LEADING if other != place]
+        return [t for gate in others for t in (gate.newest, gate.held) if math.isfinite(t)]
+
+    def _is_overtaken(self, place: int, t: float) -> bool:
+        """Whether rows of the reference, of which the last is stamped t, s, have been far behind what was used for a while. Rows that were
+        kept back and come all at once are not: time has not gone on meanwhile."""
+        if place != self._reference or t >= self.used_until - LARGEST_STEP_BACK:
+            if place == self._reference:
+                self._overtaken = None
+            return False
+        seen = self._streams[IMU_STREAM].seen
+        if self._overtaken is None or t < self._overtaken[0]:
+            self._overtaken = t, seen
+        since, then = self._overtaken
+        return t - since >= CONFIRMED and (seen - then >= CONFIRMED or seen == then)
 
     def _refuse_outliers(self, place: int, outliers: Sequence[tuple[float, np.ndarray]]) -> None:
         """Refuse rows whose stamps are far from those of their neighbours."""
         for t, row in outliers:
             self._refuse(place, row, INVALID if t > self._streams[place].gate.newest else LATE)
 
-    def _start_anew(self, place: int) -> None:
+    def _start_anew(self, place: int, cause: Restart) -> None:
         """Forget everything but the time that a stream has fallen back to."""
         for k, stream in enumerate(self._streams):
-            self._refuse(k, stream.rows, LATE)
+            if len(stream):
+                self._refuse(k, stream.rows, LATE)
         held = [(k, *outlier) for k, stream in enumerate(self._streams) if k != place for outlier in stream.gate.finish()]
         gate = self._streams[place].gate
         self.clear()
-        self._streams[place].gate = gate
-        self._restart()
+        self._streams[place].gate, self._reference = gate, place
+        self._restart(cause)
         for k, t, row in held:  # was not plausible in the time that is over
             self._take_in(k, t, row)
 
@@ -196,10 +344,13 @@ class LatenessPolicy:
 
 class _Stream:
     """Rows of one structured type with a field t, in the order of their stamps. They come a few at a time, nearly always in order: then
-    they are appended. gate : StampGate; policy : LatenessPolicy."""
+    they are appended. gate : StampGate; policy : LatenessPolicy; lead : s, by which it was ahead of the streams it is compared with when
+    these went on last; ahead : the last row was refused for that; refused : s, stamp of the others when that was;
+    seen : s, stamp of the last row that came, whatever became of it."""
 
     def __init__(self, kind: np.dtype) -> None:
         self.gate, self.policy = StampGate(), LatenessPolicy()
+        self.lead, self.ahead, self.refused, self.seen = 0.0, False, -math.inf, -math.inf
         self._room, self._first, self._end = np.empty(ROOM, kind), 0, 0
         self._none = np.empty(0, kind)
 
@@ -215,17 +366,17 @@ class _Stream:
         """Stamp, s, up to which nothing is to be expected any more."""
         return self.policy.watermark(self.gate.newest, reorder)
 
-    def append(self, rows: np.ndarray, after: float) -> bool:
-        """Append rows (k,), k > 0, if their stamps rise, are not before `after`, s, but after the newest stamp of the stream, and plausible
-        for it (see StampGate). Returns whether they were appended."""
-        if self.gate:
+    def append(self, rows: np.ndarray, after: float, limit: float) -> bool:
+        """Append rows (k,), k > 0, if their stamps rise, are not before `after`, s, nor after `limit`, s, but after the newest stamp of the
+        stream, and plausible for it (see StampGate). Returns whether they were appended."""
+        if len(self.gate) or self.ahead:
             return False
         self._make_room(len(rows))
-        newest = _append(self._room, self._first, self._end, rows, self.gate.newest, after)
+        newest, usual = _append(self._room, self._first, self._end, rows, (self.gate.newest, self.gate.usual), after, limit)
         if newest != newest:
             return False
         self._end += len(rows)
-        self.gate.newest = newest
+        self.gate.newest, self.gate.usual = newest, usual
         self.policy.begin(rows["t"][0])
         return True
 
@@ -258,6 +409,19 @@ class _Stream:
         self._first += n
         return self._room[self._first - n : self._first]  # nothing is written there any more
 
+    def take_first(self, n: int) -> np.ndarray:
+        """Remove and return the first n rows."""
+        self._first += n
+        return self._room[self._first - n : self._first]
+
+    def drop_after(self, t: float) -> np.ndarray:
+        """Remove and return the rows stamped after t, s, and those that are held. The stream goes on from the last row that is left."""
+        kept = int(self.rows["t"].searchsorted(t, side="right"))
+        dropped = np.concatenate([self.rows[kept:], *(row for _, row in self.gate.finish())])
+        self._end = self._first + kept
+        self.gate.newest = float(self.rows["t"][-1]) if kept else -math.inf
+        return dropped
+
     def _make_room(self, n: int) -> None:
         if self._end + n > len(self._room):
             kept = self.rows
@@ -267,15 +431,19 @@ class _Stream:
 
 
 @compiled
-def _append(room: np.ndarray, first: int, end: int, rows: np.ndarray, newest: float, after: float) -> float:
+def _append(
+    room: np.ndarray, first: int, end: int, rows: np.ndarray, clock: tuple[float, float], after: float, limit: float
+) -> tuple[float, float]:  # fmt: skip
+    newest, usual = clock
     last = max(newest, room[end - 1].t) if end > first else newest
     if newest == -np.inf:
         newest = rows[0].t
     for k in range(len(rows)):
         t = rows[k].t
-        if not last < t <= newest + LARGEST_STEP_AHEAD or t < after:
-            return np.nan
+        if not last < t <= min(newest + allowed_step(usual), limit) or t < after:
+            return np.nan, usual
+        usual = usual_step(usual, t - newest)
         newest = last = t
     for k in range(len(rows)):
         room[end + k] = rows[k]
-    return newest
+    return newest, usual

@@ -1,60 +1,91 @@
-"""Whether a stamp is plausible: one far from its neighbours is an outlier, two in a row that agree are another time."""
+"""Decide whether the stamps of one stream are plausible, and when its clock has jumped."""
 
 from __future__ import annotations
 
 import math
 from typing import Any, TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
+from .compiled import compiled
 
-LARGEST_STEP_BACK, LARGEST_STEP_AHEAD = 1.0, 10.0  # s from the newest stamp of a stream, within which one is plausible
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+LARGEST_STEP_BACK = 1.0  # s behind the newest stamp of a stream; messages of one clock are not out of order by more
+STEP_AHEAD, LARGEST_STEP_AHEAD = 0.25, 2.0  # s ahead of the newest stamp, that any stream and that a slow one may go at once
+USUAL = 4.0  # times the usual step of a stream, that it may go at once; one lost message is twice, three are four times
+FORGETTING = 0.1  # share of the usual step that the latest one makes
+NEAR = 0.25  # s between stamps of two streams that confirm each other
+CONFIRMED, FEWEST = 0.3, 3  # s and messages over which a jump must persist where no other stream confirms it
+MOST_HELD = 1000  # messages of a stream that stands still at another time
 
 
 class StampGate:
-    """Lets through the items of one stream. One whose stamp is not plausible is held until the next one of the stream
-    tells whether it is an outlier or the beginning of another time."""
+    """Let through the items of one stream whose stamps are plausible.
+
+    An item with another stamp is held. If the next stamp is plausible again, the held item is an outlier. If the following stamps
+    agree with it, the clock has jumped: the items are accepted. They agree when they have gone on for CONFIRMED seconds, or at once
+    when another stream has reached the same time. A gap in a stream looks like a jump ahead and is treated alike.
+    """
 
     def __init__(self) -> None:
         self.newest = -math.inf  # s, of the stamps accepted
+        self.usual = LARGEST_STEP_AHEAD / USUAL  # s, the usual step from one stamp to a later one
         self._held: list[tuple[float, Any]] = []
 
     def __len__(self) -> int:
-        """Items held: 0 or 1."""
+        """Items held."""
         return len(self._held)
 
-    def take(self, t: float, item: Any) -> tuple[list[tuple[float, Any]], list[tuple[float, Any]], bool]:
-        """Take an item stamped t, s. Returns (accepted, outliers, jumped_back): lists of (t, item), and whether the
-        accepted ones are the first of an earlier time: the stream has started anew."""
-        if not self._held and (self._is_plausible(t) or self.newest == -math.inf):
-            self.newest = max(self.newest, t)
-            return [(t, item)], [], False
-        held, self._held = self._held, []
-        if held and -LARGEST_STEP_BACK <= t - held[0][0] <= LARGEST_STEP_AHEAD:
-            jumped_back = t < self.newest
-            self.newest = max(t, held[0][0])
-            return [*held, (t, item)], [], jumped_back
-        if self._is_plausible(t):
-            self.newest = max(self.newest, t)
-            return [(t, item)], held, False
-        self._held = [(t, item)]
-        return [], held, False
+    @property
+    def held(self) -> float:
+        """Stamp of the last of two or more items that are held, s; NaN if there are fewer."""
+        return self._held[-1][0] if len(self._held) > 1 else math.nan
+
+    @property
+    def limit(self) -> float:
+        """Stamp, s, up to which the stream may go at once."""
+        return self.newest + allowed_step(self.usual)
+
+    def take(
+        self, t: float, item: Any, reached: Iterable[float] = ()
+    ) -> tuple[list[tuple[float, Any]], list[tuple[float, Any]], bool]:
+        """Take an item stamped t, s. reached : stamps, s, that other streams have reached. Returns (accepted, outliers, jumped_back): lists
+        of (t, item), and whether the accepted ones are the first of an earlier time."""
+        if self.newest == -math.inf or self._is_plausible(t):
+            outliers, self._held = self._held, []
+            self._go_on(t)
+            return [(t, item)], outliers, False
+        outliers = []
+        if self._held and not abs(t - self._held[-1][0]) <= LARGEST_STEP_BACK:
+            outliers, self._held = self._held, []
+        self._held.append((t, item))
+        if len(self._held) > MOST_HELD:
+            outliers.append(self._held.pop(0))
+        if not self._is_confirmed(reached):
+            return [], outliers, False
+        accepted, self._held = self._held, []
+        jumped_back = accepted[0][0] < self.newest
+        self.newest = -math.inf
+        for stamp, _ in accepted:
+            self._go_on(stamp)
+        return accepted, outliers, jumped_back
 
     def take_all(self, stamps: Sequence[float]) -> bool:
         """Whether items stamped so, a list of s in the order of their arrival, are all plausible; then they are accepted."""
-        newest = self.newest if self.newest > -math.inf else stamps[0]
+        if self._held:
+            return False
+        newest, usual = self.newest, self.usual
         for t in stamps:
-            if not newest - LARGEST_STEP_BACK <= t <= newest + LARGEST_STEP_AHEAD:
+            if not (self.newest == -math.inf or self._is_plausible(t)):
+                self.newest, self.usual = newest, usual
                 return False
-            newest = max(newest, t)
-        if not self._held:
-            self.newest = newest
-        return not self._held
+            self._go_on(t)
+        return True
 
-    def pass_time(self, t: float) -> None:
-        """Note the time t, s, of an item that is good for nothing else."""
-        if self._is_plausible(t):
-            self.newest = max(self.newest, t)
+    def pass_time(self, t: float, reached: Iterable[float] = ()) -> None:
+        """Note the time t, s, of an item that is good for nothing else. reached : as of `take`."""
+        if self._is_plausible(t) or t > self.newest and any(abs(t - other) <= NEAR for other in reached):
+            self._go_on(t)
 
     def finish(self) -> list[tuple[float, Any]]:
         """What is held when nothing follows, a list of (t, item): outliers."""
@@ -62,4 +93,29 @@ class StampGate:
         return held
 
     def _is_plausible(self, t: float) -> bool:
-        return self.newest - LARGEST_STEP_BACK <= t <= self.newest + LARGEST_STEP_AHEAD
+        return self.newest - LARGEST_STEP_BACK <= t <= self.limit
+
+    def _go_on(self, t: float) -> None:
+        if self.newest > -math.inf:
+            self.usual = usual_step(self.usual, t - self.newest)
+        self.newest = max(self.newest, t)
+
+    def _is_confirmed(self, reached: Iterable[float]) -> bool:
+        first, last = self._held[0][0], self._held[-1][0]
+        if (last > self.newest or len(self._held) > 1) and any(abs(last - t) <= NEAR for t in reached):
+            return True
+        return len(self._held) >= FEWEST and last - first >= CONFIRMED
+
+
+@compiled
+def allowed_step(usual: float) -> float:
+    """Return by how much, s, the next stamp may be ahead of the newest one of a stream with this usual step, s."""
+    return min(max(STEP_AHEAD, USUAL * usual), LARGEST_STEP_AHEAD)
+
+
+@compiled
+def usual_step(usual: float, step: float) -> float:
+    """Return the usual step after another step, both in s. Only steps ahead count."""
+    if not step > 0.0:
+        return usual
+    return usual + FORGETTING * (min(step, LARGEST_STEP_AHEAD) - usual)
