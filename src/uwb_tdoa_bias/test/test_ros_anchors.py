@@ -36,12 +36,12 @@ def test_what_has_changed_is_said_in_words():
     assert in_words(before, many) == "new: 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, ...; going on with the 4 that stay"
 
 
-def test_same_anchors_notices_every_difference():
+def test_same_anchors_notices_every_difference_but_jitter():
     anchors = Anchors([7, 3], [[1, 2, 3], [4, 5, 6]], [[0, 0, 0.6, 0.8], [np.nan] * 4], frame="hall")
     ids, positions, orientations = anchors.ids, anchors.positions, anchors.orientations
     for other in (
         Anchors([7, 4], positions, orientations, "hall"),
-        Anchors(ids, positions + [0, 0, 1e-6], orientations, "hall"),
+        Anchors(ids, positions + [[0, 0, 0], [0, 0, 0.02]], orientations, "hall"),
         Anchors(ids, positions, orientations[::-1], "hall"),
         Anchors(ids, positions, orientations, "map"),
         Anchors(ids[:1], positions[:1], orientations[:1], "hall"),

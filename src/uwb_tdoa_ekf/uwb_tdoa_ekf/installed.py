@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.anchors import SAME_PLACE, Anchors
 
 from .core.memory import FilterState, Floor, new_state
 
@@ -43,9 +43,9 @@ class Installed:
         return places if len(self._rows) == len(self.ids) else np.where(places >= 0, self._rows[places], -1)
 
     def stay(self, anchors: Anchors) -> np.ndarray:
-        """Which of other Anchors are there already, at the same place: (n,) bool."""
+        """Which of other Anchors are there already, within SAME_PLACE: (n,) bool."""
         places = self.anchors.index(anchors.ids)
-        return (places >= 0) & (self.anchors.positions[places] == anchors.positions).all(axis=1)
+        return (places >= 0) & (np.linalg.norm(self.positions[self._rows[places]] - anchors.positions, axis=1) <= SAME_PLACE)
 
     def change(self, anchors: Anchors) -> np.ndarray:
         """Go on with other Anchors; returns the rows of those that are gone, or stand elsewhere."""

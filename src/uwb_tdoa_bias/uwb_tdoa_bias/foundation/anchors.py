@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from geometry_msgs.msg import Point, Quaternion
     from numpy.typing import ArrayLike
 
+SAME_PLACE = 0.01  # m; an anchor that is sent again with less of a change is at the same place
 MOST = 10_000  # anchors, as many as a message holds
 FARTHEST = 1e8  # m along each axis: grid coordinates of a country fit, and their squares do not overflow
 

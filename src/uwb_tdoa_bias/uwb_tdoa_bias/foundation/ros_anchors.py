@@ -10,7 +10,7 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from uwb_tdoa_msgs.msg import Anchor, AnchorArray
 
-from .anchors import Anchors
+from .anchors import SAME_PLACE, Anchors
 from .errors import InputError
 from .ros_parameters import Parameter
 from .ros_topics import Input, Refusals
@@ -25,6 +25,7 @@ ANCHORS_QOS = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
 MOST_NAMED = 10  # anchors that a sentence names
+SAME_TURN = 1e-3  # of a quaternion, by which orientations of the same anchor may differ
 ANY_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)  # gets from every publisher what is repeated
 ANCHORS_FILE = Parameter(
     "", 'survey of the anchors, as the tools read it (YAML, CSV, total station); "" for those of uwb/anchors'
@@ -43,12 +44,12 @@ def anchors_to_message(anchors: Anchors) -> AnchorArray:
 
 
 def same_anchors(one: Anchors, other: Anchors) -> bool:
-    """True if two Anchors are equal in everything."""
+    """Return whether two Anchors are the same but for jitter: each anchor within SAME_PLACE and SAME_TURN."""
     return (
         one.frame == other.frame
         and np.array_equal(one.ids, other.ids)
-        and np.array_equal(one.positions, other.positions)
-        and np.array_equal(one.orientations, other.orientations, equal_nan=True)
+        and bool((np.linalg.norm(one.positions - other.positions, axis=1) <= SAME_PLACE).all())
+        and np.allclose(one.orientations, other.orientations, rtol=0.0, atol=SAME_TURN, equal_nan=True)
     )
 
 
@@ -57,7 +58,7 @@ def in_words(before: Anchors, after: Anchors) -> str:
     if before.frame != after.frame:
         return f"they are in frame '{after.frame}', and were in '{before.frame}': starting over"
     places = before.index(after.ids)
-    stay = (places >= 0) & (before.positions[places] == after.positions).all(axis=1)
+    stay = (places >= 0) & (np.linalg.norm(before.positions[places] - after.positions, axis=1) <= SAME_PLACE)
     named = {"new": after.ids[places < 0], "gone": before.ids[after.index(before.ids) < 0], "elsewhere": after.ids[(places >= 0) & ~stay]}
     parts = [
         f"{word}: {', '.join(map(str, ids[:MOST_NAMED]))}{', ...' if len(ids) > MOST_NAMED else ''}"

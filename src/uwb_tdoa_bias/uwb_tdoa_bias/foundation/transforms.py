@@ -21,6 +21,7 @@ HELD = 0.5  # s for which the last transform of a frame that moves holds
 DEEPEST = 100  # frames between a frame and its root
 MOST, MOST_MOVING = 1000, 200  # frames that do not move, and that do
 SHORTEST, LONGEST = 1e-3, 1e3  # of a quaternion, which should be 1
+SAME_PLACE, SAME_TURN = 1e-3, 1e-3  # m and rad; a constant transform that is sent again with less of a change is the same
 FARTHEST = 1e8  # m; squares of what is off by more, and is turned by a gyroscope, may overflow
 
 _Moved = tuple[float, tuple[float, ...], tuple[float, ...]]  # t, q and p
@@ -34,10 +35,11 @@ class Frames:
         self._moving: dict[str, tuple[str, deque[_Moved]]] = {}  # parent, and the last transforms
 
     def set(self, parent: str, child: str, q: Sequence[float], p: Sequence[float]) -> bool:
-        """A constant transform: x_parent = R(q) x_child + p; q (4,) x y z w, p (3,) m. Returns whether it is new. Raises
-        InputError for what is no transform."""
+        """Set a constant transform, unless that is known: x_parent = R(q) x_child + p; q (4,) x y z w, p (3,) m. Returns whether it is
+        new. Raises InputError for what is no transform."""
         new = self.differs(parent, child, q, p)
-        self._static[child] = parent, rotations.Rotation.from_quat(q), np.array(p, dtype=float)
+        if new:
+            self._static[child] = parent, rotations.Rotation.from_quat(q), np.array(p, dtype=float)
         return new
 
     def knows(self, child: str) -> bool:
@@ -45,12 +47,13 @@ class Frames:
         return child in self._static
 
     def differs(self, parent: str, child: str, q: Sequence[float], p: Sequence[float]) -> bool:
-        """Whether this is another transform than the constant one of that frame, or its first. Raises InputError as `set` does."""
+        """Whether this is the first constant transform of that frame, or differs from it by more than SAME_PLACE or SAME_TURN. Raises
+        InputError as `set` does."""
         self._check(self._static, MOST, parent, child, q, p)
         known = self._static.get(child)
-        if known is None or known[0] != parent or not np.array_equal(known[2], np.array(p, dtype=float)):
+        if known is None or known[0] != parent or np.linalg.norm(known[2] - p) > SAME_PLACE:
             return True
-        return (known[1].inv() * rotations.Rotation.from_quat(q)).magnitude() > 1e-9
+        return bool((known[1].inv() * rotations.Rotation.from_quat(q)).magnitude() > SAME_TURN)
 
     def move(self, parent: str, child: str, q: Sequence[float], p: Sequence[float], t: float) -> None:
         """The transform at stamp t, s. One that is not later than the last is passed over; another parent starts anew. Raises
