@@ -81,7 +81,7 @@ class LocalizationNode(StreamNode):
         bias = BiasNode(member=names, **options)
         try:
             return Pair(bias, EkfNode(member=names, **options))
-        except InputError:
+        except Exception:
             bias.destroy_node()
             raise
 
@@ -105,11 +105,11 @@ class Tag:
         return [] if self._pair is None else [self._pair.bias, self._pair.ekf]
 
     def begin(self) -> None:
-        """Start its nodes. What they refuse at their first start is not tried again."""
+        """Start its nodes. What they refuse at their first start is not tried again. Whatever else is raised concerns this tag alone."""
         try:
             self._pair = self._start()
-        except InputError as error:
-            if not self._wait:
+        except Exception as error:
+            if isinstance(error, InputError) and not self._wait:
                 self.refused = error
             self._again(error)
             return
