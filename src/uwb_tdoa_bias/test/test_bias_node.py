@@ -36,7 +36,7 @@ def test_every_parameter_is_described_and_fixed(node):
 def test_an_antenna_that_would_be_too_far_from_the_body_is_said_and_taken_as_the_body(node):
     assert not node._report()[1].startswith("uwb/tdoa:")
     node._frames.frames.set("base_link", "mast", (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 3.0))
-    node._place_antenna("mast")
+    node._antenna("mast").heard = 1
     _, text, values = node._report()
     assert text.startswith("uwb/tdoa: the place of 'mast' on 'base_link' in /tf_static is not taken: ") and "z is 3" in text
     assert "lever_arm" not in values["model"]

@@ -1,4 +1,5 @@
 from dataclasses import fields
+from functools import partial
 
 from hypothesis import given, strategies as st
 import numpy as np
@@ -7,11 +8,12 @@ from random_samples import random_samples
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.correction.corrector import EFFECTS, FADED, NETWORK, PASSED, Correction, Corrector
+from uwb_tdoa_bias.correction.corrector import EFFECTS, FADED, NETWORK, PASSED, START, Correction, Corrector as LateCorrector
 from uwb_tdoa_bias.effects import EFFECTS as CATALOGUE, AnchorDelay, EffectSet, TagLeverArm
 from uwb_tdoa_bias.correction.poses import known_yaw_std, parts_of, rotated_in_yaw
 
 ANCHORS = Anchors.from_positions([[0, 0, 0], [8, 0, 0], [0, 8, 0], [0, 0, 3]], ids=[4, 5, 6, 7])
+Corrector = partial(LateCorrector, start=0.0)  # uses the first pose at once
 DELAYS = EffectSet((AnchorDelay({4: 0.1, 6: -0.2}),))
 ARM = EffectSet((TagLeverArm({"z": 0.3}),))
 
@@ -227,3 +229,19 @@ def test_parts_of_odometry_hold_the_velocity_in_the_world(seed):
     np.testing.assert_array_equal(p, poses[:, :3])
     np.testing.assert_allclose(v[:2], Rotation.from_quat(q[:2]).apply(twists[:2, :3]), atol=1e-12)
     assert np.isnan(v[2]).all() and np.isnan(q[2]).all()
+
+
+@given(st.floats(0.0, 0.999 * START))
+def test_the_first_pose_may_be_late_and_changes_nothing(late):
+    """TDOAs at 100 Hz; the pose of 0 s arrives later than its stamp, those after it do not. Where a pose is needed, it is waited for."""
+    stamps, told = np.arange(0.0, 1.5, 0.01), []
+    for arrival in (0.0, late):
+        corrector, before, told_now = LateCorrector(ANCHORS, ARM), 0.0, []
+        for t in stamps:
+            if t >= arrival:
+                climbing(corrector, [p for p in np.arange(0.0, t + 0.005, 0.01) if p > corrector._poses.newest])
+            assert t < arrival or corrector.ready(before)  # before the first pose nothing is waited for
+            told_now.append(correct(corrector, t).bias[0])
+            before = t
+        told.append(told_now)
+    assert told[0] == told[1] and not any(told[0][: int(START / 0.01)]) and all(told[0][int(START / 0.01) + 2 :])

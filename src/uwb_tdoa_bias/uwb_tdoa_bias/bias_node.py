@@ -8,6 +8,7 @@ Every parameter is documented in config/bias_node.yaml.
 from __future__ import annotations
 
 from collections import Counter, deque
+from dataclasses import dataclass
 from itertools import groupby
 import math
 import sys
@@ -68,6 +69,20 @@ Item = tuple[Any, ...]  # of a TDOA: frame, sec, nanosec, and MEASURED
 STATUS = {PASSED: "passed", EFFECTS: "effects", NETWORK: "network", FADED: "faded"}
 
 
+@dataclass
+class Antenna:
+    """What is known of the antenna of a frame. effects : EffectSet, with its place on the body; models : what to call each status's bias;
+    trouble : why its place is not known, or None; corrector : Corrector, once there are anchors; heard, reported : TDOAs so far, and by
+    the last report."""
+
+    effects: EffectSet
+    models: dict[int, str]
+    trouble: str | None = None
+    corrector: Corrector | None = None
+    heard: int = 0
+    reported: int = 0
+
+
 class BiasNode(StreamNode):
     """Converts messages for a Corrector and keeps the accounts: received = published + waiting + dropped."""
 
@@ -85,9 +100,9 @@ class BiasNode(StreamNode):
         self._late = self._effects.stamp_offset("tdoa")  # s
         self._labels = LabelCorrector(self._effects.effects)
         self._network = load_network(model_file)
-        self._model = self._warm_up()
-        self._idle = self._model[NETWORK] == "none"
-        self._corrector: Corrector = None  # type: ignore[assignment]  # until there are anchors
+        self._corrector: Corrector = None  # type: ignore[assignment]  # of the body, with the poses of all; until there are anchors
+        self._antennas: dict[str, Antenna] = {}  # by frame of the TDOAs
+        self._body_antenna = Antenna(self._effects, self._models(self._effects))
         self._epoch, self._rate = Epoch(), Rate()
         self._counts: Counter[str] = Counter()
         self._early: deque[Item] = deque()
@@ -97,10 +112,7 @@ class BiasNode(StreamNode):
         self._reported_unready = self._reported_received = self._reported_poses = 0
         self._wire = CdrCodec(TdoaCorrected, *CORRECTED)
         self._templates: dict[tuple[str, str], Template] = {}  # by frame and model, the latest
-        self._frame = self._body  # of the TDOAs
-        self._frame_trouble: str | None = None
         self._frames_said: set[str] = set()
-        self._declared = self._effects  # without the arm of the antenna
         self.output = StreamOutput(self, TdoaCorrected, "uwb/tdoa_corrected")
         self._frames = FramesInput(self, self._epoch.seconds, self._on_frames)
         self._anchors = AnchorsInput(self, self._on_anchors, own["anchors_file"])
@@ -112,28 +124,50 @@ class BiasNode(StreamNode):
         if member is None:
             say_unused([self], files_of(arguments))
             self.turns = RoundRobin([self.streams])
-        self.ready = f"ready; correcting with: {self._model[NETWORK]}"
+        self.ready = f"ready; correcting with: {self._model}"
 
     @property
     def holds(self) -> int:
         """How many TDOAs wait for their pose."""
         return len(self._hold)
 
-    def _warm_up(self) -> dict[int, str]:
-        """Returns what to call each status's bias."""
-        name = warm_up(self._effects, self._network, self._lag).model
-        return {PASSED: "none", EFFECTS: self._effects.name, NETWORK: name, FADED: name}
+    @property
+    def _model(self) -> str:
+        """What TDOAs are corrected with."""
+        return next(iter((*self._antennas.values(), self._body_antenna))).models[NETWORK]
+
+    @property
+    def _idle(self) -> bool:
+        return all(antenna.models[NETWORK] == "none" for antenna in (self._body_antenna, *self._antennas.values()))
+
+    def _models(self, effects: EffectSet) -> dict[int, str]:
+        """Compile what an EffectSet needs, and return what to call each status's bias."""
+        name = warm_up(effects, self._network, self._lag).model
+        return {PASSED: "none", EFFECTS: effects.name, NETWORK: name, FADED: name}
 
     def _start_over(self) -> None:
         """Forget poses and whatever waits for one."""
         self._counts["dropped"] += len(self._hold)
         self._hold = PoseQueue(self._limit)
+        self._corrector = self._body_antenna.corrector = self._new_corrector(self._effects)
+        for antenna in self._antennas.values():
+            self._give_corrector(antenna)
+
+    def _new_corrector(self, effects: EffectSet) -> Corrector:
         anchors: Any = self._anchors.anchors  # there are some when this is called
-        self._corrector = Corrector(anchors, self._effects, self._network, self._lag)
+        return Corrector(anchors, effects, self._network, self._lag)
+
+    def _give_corrector(self, antenna: Antenna) -> None:
+        """Have the TDOAs of an Antenna corrected at the poses that are known."""
+        if antenna is not self._body_antenna and self._corrector is not None:
+            antenna.corrector = self._new_corrector(antenna.effects)
+            antenna.corrector.share_poses(self._corrector)
 
     def _on_anchors(self, anchors: Anchors) -> None:
         if self._corrector is not None and self._corrector.anchors.frame == anchors.frame:
-            self._corrector.change_anchors(anchors)
+            for antenna in (self._body_antenna, *self._antennas.values()):
+                if antenna.corrector is not None:
+                    antenna.corrector.change_anchors(anchors)
             return
         self._start_over()
         while self._early_poses:
@@ -144,34 +178,43 @@ class BiasNode(StreamNode):
 
     def _on_frames(self) -> None:
         """A constant transform is new, or another."""
-        if self._frame != self._body:
-            self._place_antenna(self._frame)
+        for frame in [*self._antennas]:
+            self._place_antenna(frame)
+
+    def _antenna(self, frame: str) -> Antenna:
+        """Antenna of TDOAs of this frame."""
+        if frame in ("", self._body) or frame not in self._antennas and len(self._antennas) >= MOST_FRAMES:
+            return self._body_antenna
+        if frame not in self._antennas:
+            self._place_antenna(frame)
+        return self._antennas[frame]
 
     def _place_antenna(self, frame: str) -> None:
         """Find out where the antenna of this frame is on the body, and take out what that does to TDOAs."""
-        self._frame, self._frame_trouble, effects = frame, None, self._declared
+        trouble, effects, known = None, self._effects, self._antennas.get(frame)
         if frame not in ("", self._body):
             between = self._frames.frames.between(self._body, frame)
             if any(effect.name == TagLeverArm.name for effect in effects.effects):
                 self.get_logger().info(f"{TagLeverArm.name} of effects_file counts, not the transform of '{frame}'")
             elif between is None:
-                self._frame_trouble = unknown_frame("uwb/tdoa", frame, self._body)
+                trouble = unknown_frame("uwb/tdoa", frame, self._body)
             elif between[1].any():
                 try:
                     effects = EffectSet((*effects.effects, TagLeverArm(values=dict(zip("xyz", between[1].tolist())))))
                 except InputError as error:
-                    self._frame_trouble = f"uwb/tdoa: the place of '{frame}' on '{self._body}' in /tf_static is not taken: {error}"
-        if self._frame_trouble and frame not in self._frames_said and len(self._frames_said) < MOST_FRAMES:
+                    trouble = f"uwb/tdoa: the place of '{frame}' on '{self._body}' in /tf_static is not taken: {error}"
+        if trouble and frame not in self._frames_said:
             self._frames_said.add(frame)
-            self.get_logger().warning(self._frame_trouble)
-        if effects.effects == self._effects.effects:
+            self.get_logger().warning(trouble)
+        if known is not None and effects.effects == known.effects.effects:
+            known.trouble = trouble
             return
-        self._effects = effects
-        self._model = self._warm_up()
-        self._idle = self._model[NETWORK] == "none"
-        self.get_logger().info(f"'{frame}' is placed by /tf_static; correcting with: {self._model[NETWORK]}")
-        if self._anchors.anchors is not None:
-            self._start_over()
+        elsewhere = effects.effects != self._effects.effects
+        models = self._models(effects) if elsewhere else self._body_antenna.models
+        antenna = self._antennas[frame] = Antenna(effects, models, trouble)
+        self._give_corrector(antenna)
+        if elsewhere:
+            self.get_logger().info(f"'{frame}' is placed by /tf_static; correcting with: {antenna.models[NETWORK]}")
 
     def _on_odometry(self, frame: str, t: np.ndarray, rows: np.ndarray, arrival: np.ndarray) -> None:
         self._counts["poses"] += len(t)
@@ -213,8 +256,8 @@ class BiasNode(StreamNode):
 
     def _on_tdoa(self, frame: str, t: np.ndarray, rows: np.ndarray, arrival: np.ndarray) -> None:
         self._counts["received"] += len(t)
-        if frame != self._frame:
-            self._place_antenna(frame)
+        antenna = self._antenna(frame)
+        antenna.heard += len(t)
         if not self._labels.idle:
             rows = self._relabelled(rows)
         items = [(frame, *row) for row in rows.tolist()]
@@ -264,11 +307,19 @@ class BiasNode(StreamNode):
         released = self._hold.take(self._is_ready) if self._corrector is not None else []
         if not released:
             return
-        stamps, items, ready = zip(*released)
+        for _, same in groupby(released, lambda one: one[1][0]):  # by frame
+            self._release_alike(*zip(*same))
+
+    def _is_ready(self, before: float) -> bool:
+        return self._poses.newest == -math.inf or self._corrector.ready(before)
+
+    def _release_alike(self, stamps: Sequence[float], items: Sequence[Item], ready: Sequence[bool]) -> None:
+        """Correct and publish TDOAs of one frame."""
+        corrector: Any = self._antenna(items[0][0]).corrector  # there is one as soon as there are anchors
         t, d = np.array(stamps), np.array([item[5] for item in items])
-        a, b = (self._corrector.anchors.index([item[side] for item in items]) for side in (3, 4))
+        a, b = (corrector.anchors.index([item[side] for item in items]) for side in (3, 4))
         valid = (a >= 0) & (b >= 0) & (a != b) & np.isfinite(d)
-        correction = self._corrector.correct(t[valid], a[valid], b[valid], d[valid])
+        correction = corrector.correct(t[valid], a[valid], b[valid], d[valid])
         if not valid.all():
             found, correction = correction, Correction.none(d)
             for name, values in vars(found).items():
@@ -276,9 +327,6 @@ class BiasNode(StreamNode):
         self._counts["invalid"] += len(t) - int(valid.sum())
         self._counts["unready"] += len(t) - sum(ready)
         self._publish(items, correction, self._epoch.parts(t) if self._late else None)
-
-    def _is_ready(self, before: float) -> bool:
-        return self._poses.newest == -math.inf or self._corrector.ready(before)
 
     def _publish(
         self, items: Sequence[Item], correction: Correction, stamps: tuple[np.ndarray, np.ndarray] | None = None
@@ -289,7 +337,7 @@ class BiasNode(StreamNode):
         measured = columns if stamps is None else (*stamps, *columns[2:])  # up to the variance
         values = *measured, *vars(correction).values()
         status = correction.status.tolist()
-        kinds, first = [(item[0], self._model[one]) for item, one in zip(items, status)], 0
+        kinds, first = [(item[0], self._antenna(item[0]).models[one]) for item, one in zip(items, status)], 0
         for kind, same in groupby(kinds):
             some = slice(first, first := first + len(list(same)))
             rows = self._template(*kind).rows(some.stop - some.start)
@@ -319,11 +367,12 @@ class BiasNode(StreamNode):
         others = [*self._anchors.refusals, *self._frames.refusals]
         wiring += [*(refusals.trouble() for refusals in others), self._frames.trouble]
         unready, self._reported_unready = counts["unready"] - self._reported_unready, counts["unready"]
-        values = {"model": self._model[NETWORK], "received": counts["received"], "published": counts["published"]}
+        values = {"model": self._model, "received": counts["received"], "published": counts["published"]}
         values |= {"waiting": len(self._hold) + len(self._tdoas) + len(self._early), "dropped": counts["dropped"]}
         values |= {name: counts[name] for name in STATUS.values()}
         values |= {"released before their pose": counts["unready"], "invalid": counts["invalid"]}
-        outside = self._corrector.outside if self._corrector is not None else []
+        correctors = [antenna.corrector for antenna in (self._body_antenna, *self._antennas.values())]
+        outside = [phrase for corrector in correctors if corrector is not None for phrase in corrector.outside]
         values |= {"beyond where effects were seen": "; ".join(outside) or "nothing"}
         values |= {"poses": counts["poses"], "TDOA rate": f"{rate:.1f} Hz"}
         values |= {f"publishers of {name}": end.get_publisher_count() for name, end in self.streams.inputs.items()}
@@ -336,8 +385,10 @@ class BiasNode(StreamNode):
         return level, text, values
 
     def _health(self, rate: float, unready: int) -> tuple[bytes, str]:
-        if self._frame_trouble:
-            return DiagnosticStatus.WARN, self._frame_trouble
+        for antenna in self._antennas.values():
+            heard, antenna.reported = antenna.heard - antenna.reported, antenna.heard
+            if antenna.trouble and heard:
+                return DiagnosticStatus.WARN, antenna.trouble
         if self._idle:
             return DiagnosticStatus.OK, "passing TDOAs on: neither effects_file nor model_file is set"
         if self._anchors.refused:
@@ -350,7 +401,7 @@ class BiasNode(StreamNode):
             return DiagnosticStatus.WARN, "no poses on odometry yet: what needs one is not corrected; start ekf_node"
         if unready:
             return DiagnosticStatus.WARN, "odometry is late: TDOAs leave before their pose; check the load of ekf_node"
-        return DiagnosticStatus.OK, f"correcting with {self._model[NETWORK]}"
+        return DiagnosticStatus.OK, f"correcting with {self._model}"
 
 
 def main(argv: Sequence[str] | None = None) -> int:

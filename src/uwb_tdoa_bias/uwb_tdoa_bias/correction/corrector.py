@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 # status of one correction; the values of TdoaCorrected.STATUS_*
 PASSED, EFFECTS, NETWORK, FADED = range(4)
+START = 0.5  # s after the first pose, before which no TDOA is corrected; start and take-off are slower than that
 LARGEST_YAW_STD = 1.0  # rad; a yaw that is less certain is unknown: the filter follows four, 90 degrees apart
 FADED_BELOW = 0.5  # share of what can be known that a network's prediction has at least, or it counts as faded
 
@@ -54,28 +55,29 @@ class Corrector:
 
     The pose used for a measurement is the newest one stamped no later than `lag` before the measurement that preceded it.
     It depends on stamps alone, so that a recording gives the same result at any speed; it leaves the filter `lag` seconds to
-    report that pose; and the filter can: it needs nothing later than the preceding measurement, after a gap neither.
+    report that pose; and the filter can: it needs nothing later than the preceding measurement, after a gap neither. In the first `start`
+    seconds after the first pose no pose is used: it may arrive so much later than it is stamped, and changes nothing.
     """
 
     def __init__(
         self, anchors: Anchors, effects: EffectSet | None = None, network: Network | None = None, lag: float = POSE_LAG,
-        history: int = 4096,
+        history: int = 4096, start: float = START,
     ) -> None:  # fmt: skip
         """anchors : Anchors; effects : EffectSet or None, of which those that the filter weighs stay in, as `weighed`; network : Network or
         None;
-        lag : s; history : poses kept."""
+        lag : s; history : poses kept; start : s."""
         self.anchors = anchors
         self.effects, self.weighed = (EffectSet(tuple(e for e in effects or () if e.weighed == weighed)) for weighed in (False, True))
         self.network = network
         self.lag = lag
         parts = [self.effects.name] if len(self.effects) else []
         self.model = "+".join(parts + ([network.name] if network else [])) or "none"
-        self._history = history
+        self._history, self._start = history, start
         self.reset()
 
     def reset(self) -> None:
         """Forget all poses."""
-        self._poses = Poses(self._history)
+        self._poses = Poses(self._history, self._start)
         self._latest: Samples | None = None  # of the latest TDOAs
         self._newest: float = None  # type: ignore[assignment]  # latest stamp of a TDOA, once there is one
         self._first = math.nan  # stamp of the first TDOA, once there is one
@@ -106,7 +108,11 @@ class Corrector:
 
     def ready(self, before: float) -> bool:
         """True if no pose that is still to come can change the correction of a measurement that follows one stamped so."""
-        return self.idle or self._poses.newest > before - self.lag
+        return self.idle or self._poses.newest > before - self.lag or before < self._poses.begin < math.inf
+
+    def share_poses(self, other: Corrector) -> None:
+        """Use the poses of another Corrector, which alone is given them from now on."""
+        self._poses = other._poses
 
     def correct(self, t: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray) -> Correction:
         """Correct a batch.

@@ -29,10 +29,11 @@ class Columns(NamedTuple):
 
 
 class Poses:
-    """Poses in the order of their stamps, of which at least the last `history` are kept."""
+    """Poses in the order of their stamps, of which at least the last `history` are kept. begin : stamp, s, of the first pose and `start`
+    later, from which on poses are used; inf before there is one."""
 
-    def __init__(self, history: int) -> None:
-        self._history, self._count = history, 0
+    def __init__(self, history: int, start: float) -> None:
+        self._history, self._count, self._start, self.begin = history, 0, start, math.inf
         self._columns = Columns(*(np.empty((2 * history, *shape)) for shape in ((), (3,), (4,), (3,), ())))
 
     @property
@@ -66,13 +67,15 @@ class Poses:
         parts: Any = (t, p, q, v, yaw_std) if np.ndim(t) else ([t], [p], [q], [v], [yaw_std])
         new = Columns(*(np.ascontiguousarray(part, dtype=float) for part in parts))
         self._count = _append(self._count, self._columns, new)
+        if self._count and self.begin == math.inf:
+            self.begin = float(self._columns.t[0]) + self._start
 
     def before(self, t: np.ndarray, newest: float, lag: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Of the newest poses stamped no later than `lag` s before the TDOA that precedes each of t (n,) s, as `preceding`
-        says: numbers (n,), p (n, 3), q (n, 4), yaw_std (n,); -1 and NaN where there is none."""
+        says: numbers (n,), p (n, 3), q (n, 4), yaw_std (n,); -1 and NaN where there is none, and before `begin`."""
         n = len(t)
         out = np.empty(n, dtype=np.int64), np.empty((n, 3)), np.empty((n, 4)), np.empty(n)
-        _look_up(t, newest, lag, self._count, self._columns, out)
+        _look_up(t, newest, (lag, self.begin), self._count, self._columns, out)
         return out
 
 
@@ -95,13 +98,14 @@ def _append(count: int, kept: Columns, new: Columns) -> int:
 
 @compiled
 def _look_up(
-    t: np.ndarray, newest: float, lag: float, count: int, kept: Columns,
+    t: np.ndarray, newest: float, limits: tuple[float, float], count: int, kept: Columns,
     out: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
 ) -> None:  # fmt: skip
     places, p, q, yaw_std = out[0], out[1], out[2], out[3]
+    lag, begin = limits
     precede(t, newest, yaw_std)
     for i in range(len(t)):
-        place = np.searchsorted(kept.t[:count], yaw_std[i] - lag, side="right") - 1
+        place = np.searchsorted(kept.t[:count], yaw_std[i] - lag, side="right") - 1 if yaw_std[i] >= begin else -1
         places[i] = place
         if place >= 0:
             p[i], q[i], yaw_std[i] = kept.p[place], kept.q[place], kept.yaw_std[place]
