@@ -123,7 +123,7 @@ def late_anchor(anchor: int, metres: float) -> OfOne:
 
     def of_one(event: Event, _: Scene) -> Iterable[Event]:
         a, b, d = (event.values[key] for key in "abd")
-        return (event._replace(values=event.values | {"d": d + metres * ((b == anchor) - (a == anchor))}),)
+        return (event._replace(values=event.values | {"d": d + metres * (int(b == anchor) - int(a == anchor))}),)
 
     return of_one
 

@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> None:
             args.json.write_text(json.dumps(rows, indent=1), encoding="utf-8")
         if args.out:
             args.out.write_text("\n".join([*lines, ""]), encoding="utf-8")
-    print(f"{sum(row['verdict'] == 'ok' for row in rows)} of {len(rows)} ok")
+    print(f"{sum(row['verdict'].startswith('ok') for row in rows)} of {len(rows)} ok")
 
 
 def row_of(name: str, data: Path) -> dict[str, Any]:

@@ -8,6 +8,7 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.foundation.flight import AIDS
 from uwb_tdoa_tools.scoring.metrics import position_at
 
 from .events import Scene, yaws_at
@@ -18,11 +19,12 @@ if TYPE_CHECKING:
 
 RUNNING = 2  # EstimatorStatus
 STEP = 0.02  # s between two looks
-FRESH = 0.5  # s for which an odometry counts as new
+FRESH, FRESH_STATUS = 0.5, 2.5  # s for which an odometry, and a status, count as new; the latter comes each second
 OTHER_CLOCK = 1.0  # s between stamp and arrival, from which on the stamp is of another clock
 WRONG, SIGMAS, WRONG_LIMIT = 1.0, 3.0, 2.0  # m; stated deviations; s for which both may be exceeded while nothing is said
 WRONG_YAW, YAW_LIMIT = math.radians(20.0), 5.0  # rad, s: the same for a yaw that is said to be known
 RECOVERED_LIMIT, STOP_LIMIT = 3.0, 5.0  # s
+LATE = 0.2  # s by which events may be sent late before the row says that the machine was too busy for it
 LEAST = 5.0  # s that are judged of a fault that is over at once
 SETTLED = 6.0  # s from the first message on that do not count of a fault of the whole flight: nothing can be found so fast
 CUT = 60  # characters of a sentence in the table
@@ -34,7 +36,8 @@ HEAD = (
 @dataclass(frozen=True)
 class Looks:
     """What somebody sees who flies by odometry and status, each STEP. t : (n,) s; error : (n,) m, NaN before the first odometry; std : (n,) m,
-    stated; yaw_error, yaw_std : (n,) rad; fresh : (n,) bool, odometry has come lately; clean : (n,) bool, running and an empty `why`."""
+    stated; yaw_error, yaw_std : (n,) rad; fresh : (n,) bool, odometry has come lately; running, clean : (n,) bool, so says a status that came
+    lately; clean with an empty `why`."""
 
     t: np.ndarray
     error: np.ndarray
@@ -42,6 +45,7 @@ class Looks:
     yaw_error: np.ndarray
     yaw_std: np.ndarray
     fresh: np.ndarray
+    running: np.ndarray
     clean: np.ndarray
 
     @property
@@ -64,7 +68,7 @@ def looks_at(heard: Heard, scene: Scene, seconds: float) -> Looks:
     there = newest >= 0
     if not there.any():
         nothing = np.full(len(t), math.nan)
-        return Looks(t, nothing, nothing, nothing, nothing, there, _clean(heard, t))
+        return Looks(t, nothing, nothing, nothing, nothing, there, *_status(heard, t))
     messages = [message for _, message in heard.odometry]
     stamp = np.array([m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec for m in messages]) - heard.begin
     stamp = np.where(np.abs(stamp - arrival) > OTHER_CLOCK, arrival, stamp)
@@ -83,13 +87,17 @@ def looks_at(heard: Heard, scene: Scene, seconds: float) -> Looks:
     def known(values: np.ndarray) -> np.ndarray:
         return np.where(there, values, math.nan)
 
-    return Looks(t, known(error), known(std), known(np.abs(turn)), known(np.sqrt(covariance[k, 35])), fresh, _clean(heard, t))
+    return Looks(t, known(error), known(std), known(np.abs(turn)), known(np.sqrt(covariance[k, 35])), fresh, *_status(heard, t))
 
 
-def _clean(heard: Heard, t: np.ndarray) -> np.ndarray:
-    """(n,) bool, by the newest status at (n,) s."""
+def _status(heard: Heard, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(running, clean), each (n,) bool, by the newest status at (n,) s, if it came lately."""
+    arrival = np.array([-math.inf, *(at for at, _ in heard.status)])
+    newest = np.searchsorted(arrival, t, side="right") - 1
+    fresh = t - arrival[newest] < FRESH_STATUS
+    running = np.array([False, *(of.status == RUNNING for _, of in heard.status)])
     clean = np.array([False, *(is_clean(of) for _, of in heard.status)])
-    return clean[np.searchsorted([at for at, _ in heard.status], t, side="right")]
+    return running[newest] & fresh, clean[newest] & fresh
 
 
 def is_clean(status: Any) -> bool:
@@ -137,11 +145,13 @@ def verdict(row: dict[str, Any]) -> str:
             "wrong and certain": row["wrong"] > WRONG_LIMIT,
             "yaw wrong and certain": row["yaw wrong"] > YAW_LIMIT,
             "not recovered": row["recovered"] is not None and row["recovered"] > RECOVERED_LIMIT,
+            "odometry stops": row["gap"] > FRESH and row["fault"].partition(":")[0] in AIDS,  # it can do without them
             "does not end": max(row["stop"].values(), default=0.0) > STOP_LIMIT,
         }.items()
         if is_missed
     ]
-    return f"MISS: {', '.join(missed)}" if missed else "ok"
+    late = f" (sent up to {row['late']:.1f} s late)" if row["late"] > LATE else ""
+    return (f"MISS: {', '.join(missed)}" if missed else "ok") + late
 
 
 def line(row: dict[str, Any]) -> str:
@@ -178,8 +188,9 @@ def _said(sentences: list[tuple[float, str]], begin: float) -> list[tuple[float,
 
 
 def _recovered(looks: Looks, fault: Fault) -> float:
-    """s from the end of the fault until odometry flows, is right, and status says so, and all this lasts; inf if it never does."""
-    well = looks.fresh & looks.clean & (looks.error < WRONG)
+    """s from the end of the fault until odometry flows, is right, and status says so, and all this lasts; inf if it never does. A filter that was
+    started anew by request may say that the yaw is not known."""
+    well = looks.fresh & (looks.running if fault.anew else looks.clean) & (looks.error < WRONG)
     after = np.flatnonzero((looks.t >= fault.end) & ~well)
     if not len(after):
         return 0.0

@@ -26,7 +26,7 @@ ALL = " ".join(STREAMS)
 @dataclass(frozen=True)
 class Fault:
     """text : what is wrong; change : of the events; plays : sensors beside TDOAs and the IMU; begin, lasts, after : s, see `BEGIN`;
-    parameters : {node: {name: value}}."""
+    parameters : {node: {name: value}}; anew : the filter is started anew by request."""
 
     text: str
     change: Change = nothing
@@ -35,6 +35,7 @@ class Fault:
     lasts: float = LASTS
     after: float = AFTER
     parameters: dict[str, dict[str, Any]] = field(default_factory=dict)
+    anew: bool = False
 
     @property
     def end(self) -> float:
@@ -207,11 +208,11 @@ FAULTS: dict[str, Fault] = {
     # Nodes and what they are asked
     "ekf_node restarts": Fault("ekf_node is killed and started again after 1 s", chain(
         done("kill", node="ekf_node"), done("start", 1.0, node="ekf_node")
-    )),
+    ), anew=True),
     "bias_node restarts": Fault("bias_node is killed and started again after 1 s", chain(
         done("kill", node="bias_node"), done("start", 1.0, node="bias_node")
     )),
-    "reset": jump("~/reset is called in flight", done("reset")),
+    "reset": jump("~/reset is called in flight", done("reset"), anew=True),
     "initialpose: right": jump("the right pose on initialpose", pose_given()),
     "initialpose: 3 m off": jump("a pose on initialpose that is 3 m off", pose_given(offset=3.0)),
     "initialpose: yaw 90 degrees off": jump("a yaw on initialpose that is 90 degrees off", pose_given(yaw=math.pi / 2)),
