@@ -1,2 +1,2 @@
-"""Faults put into a flight that real nodes hear over topics: `events` is what is sent, `faults` changes it, `play` sends it, `judge` compares
-what the nodes publish with ground truth."""
+"""Faults over topics. `events` makes what is sent of a flight, `changes` and `table` put faults into it, `play` sends it to real nodes, and
+`judge` compares what these publish with ground truth."""

@@ -53,7 +53,10 @@ def first(count: int, stream: str, of_one: OfOne) -> Change:
     def change(events: list[Event], scene: Scene) -> list[Event]:
         times = [event.at for event in events if event.stream == stream]
         chosen = {min((at for at in times if at >= scene.begin + 0.1 * k), default=None) for k in range(count)}
-        return in_order([new for event in events for new in (of_one(event, scene) if event.stream == stream and event.at in chosen else (event,))])
+        out: list[Event] = []
+        for event in events:
+            out.extend(of_one(event, scene) if event.stream == stream and event.at in chosen else (event,))
+        return in_order(out)
 
     return change
 
@@ -108,6 +111,11 @@ def frozen(streams: str) -> Change:
     return change
 
 
+def for_good(change: Change) -> Change:
+    """A change that does not end with the fault."""
+    return lambda events, scene: change(events, replace(scene, end=math.inf))
+
+
 def only_from(seconds: float, change: Change) -> Change:
     """A change that begins `seconds` after the fault."""
     return lambda events, scene: change(events, replace(scene, begin=scene.begin + seconds))
@@ -115,7 +123,12 @@ def only_from(seconds: float, change: Change) -> Change:
 
 def relabelled(labels: dict[int, int]) -> OfOne:
     """Other ids of anchors."""
-    return lambda event, _: (event._replace(values=event.values | {key: labels.get(int(event.values[key]), event.values[key]) for key in "ab"}),)
+
+    def of_one(event: Event, _: Scene) -> Iterable[Event]:
+        new = {key: labels.get(int(event.values[key]), event.values[key]) for key in "ab"}
+        return (event._replace(values=event.values | new),)
+
+    return of_one
 
 
 def late_anchor(anchor: int, metres: float) -> OfOne:

@@ -29,9 +29,11 @@ FLIGHT = "flights/0426/0426-traj5"
 
 def add_options(add: Callable[..., object]) -> None:
     """add : add_argument of a parser."""
-    add("--data", metavar="DIR", type=Path, default=DATA, help="measured flights; a flight is simulated where there are none (default: %(default)s)")
+    data = "measured flights; without them a flight is simulated (default: %(default)s)"
+    add("--data", metavar="DIR", type=Path, default=DATA, help=data)
     add("--only", metavar="PATTERN", default="", help="faults whose names this regular expression finds")
-    add("--jobs", metavar="N", type=parallel.whole_number, default=1, help="faults at once, each in a ROS domain of its own (default %(default)s)")
+    jobs = "faults at once, each in a ROS domain of its own (default %(default)s)"
+    add("--jobs", metavar="N", type=parallel.whole_number, default=1, help=jobs)
     add("--json", metavar="FILE", type=Path, help="write all figures, and all that was said")
     add("--out", metavar="FILE", type=Path, help="write the table")
     add("--list", action="store_true", help="print the faults and end")

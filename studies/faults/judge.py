@@ -35,9 +35,11 @@ HEAD = (
 
 @dataclass(frozen=True)
 class Looks:
-    """What somebody sees who flies by odometry and status, each STEP. t : (n,) s; error : (n,) m, NaN before the first odometry; std : (n,) m,
-    stated; yaw_error, yaw_std : (n,) rad; fresh : (n,) bool, odometry has come lately; running, clean : (n,) bool, so says a status that came
-    lately; clean with an empty `why`."""
+    """What a vehicle sees that flies by odometry and status, each STEP.
+
+    t : (n,) s; error, std : (n,) m, of the position, true and stated, NaN before the first odometry; yaw_error, yaw_std : (n,) rad;
+    fresh : (n,) bool, an odometry came lately; running, clean : (n,) bool, a status came lately that says so, clean with an empty `why`.
+    """
 
     t: np.ndarray
     error: np.ndarray
@@ -60,8 +62,8 @@ class Looks:
 
 
 def looks_at(heard: Heard, scene: Scene, seconds: float) -> Looks:
-    """Looks of what was heard. An odometry is compared with the truth at its stamp, or at its arrival if the stamp is of another clock; one that
-    is not fresh with the truth of now."""
+    """Looks of what was heard. An odometry is compared with the truth at its stamp, or at its arrival if the stamp is of another clock. The
+    last one before a gap is compared with the truth of each look."""
     t = np.arange(0.0, seconds, STEP)
     arrival = np.array([at for at, _ in heard.odometry])
     newest = np.searchsorted(arrival, t, side="right") - 1
@@ -106,14 +108,16 @@ def is_clean(status: Any) -> bool:
 
 
 def judged(name: str, fault: Fault, heard: Heard, scene: Scene) -> dict[str, Any]:
-    """The figures of a fault, by name, and its verdict. Times count from the begin of the fault, or of its end if they say so."""
+    """The figures of a fault, by name, and its verdict. Times count from the begin of the fault, that of the recovery from its end."""
     if heard.failed:
         return {"fault": name, "text": fault.text, "failed": heard.failed, "verdict": "MISS: the nodes did not start"}
     looks = looks_at(heard, scene, fault.seconds)
     begin, end = fault.begin, max(fault.end, fault.begin + LEAST)
-    inside = (looks.t >= (SETTLED if begin == 0.0 else begin)) & (looks.t < end) & ~np.isnan(looks.error)
+    inside = (looks.t >= (begin or SETTLED)) & (looks.t < end) & ~np.isnan(looks.error)
+    judged_from = begin or SETTLED
     arrivals = np.array([at for at, _ in heard.odometry])
-    edges = np.concatenate(([begin if begin else SETTLED], arrivals[(arrivals > (begin or SETTLED)) & (arrivals < fault.seconds)], [fault.seconds]))
+    inner = arrivals[(arrivals > judged_from) & (arrivals < fault.seconds)]
+    edges = np.concatenate(([judged_from], inner, [fault.seconds]))
     error, std = looks.error[inside], looks.std[inside]
     worst = int(np.argmax(error)) if len(error) else -1
     row = {
@@ -128,10 +132,8 @@ def judged(name: str, fault: Fault, heard: Heard, scene: Scene) -> dict[str, Any
         "yaw wrong": STEP * int((looks.yaw_wrong & (looks.t >= begin)).sum()),
         "recovered": _recovered(looks, fault) if fault.ends else None,
         "status": _said([(at, "" if is_clean(of) else f"{of.status}: {of.why}") for at, of in heard.status], begin),
-        "diagnostics": _said(
-            [(at, f"{node}: {text}" if level else "") for at, node, level, text in heard.diagnostics if node == "ekf_node"], begin
-        ),
-        "diagnostics of bias_node": _said([(at, text if level else "") for at, node, level, text in heard.diagnostics if node == "bias_node"], begin),
+        "diagnostics": _said(_warnings(heard, "ekf_node"), begin),
+        "diagnostics of bias_node": _said(_warnings(heard, "bias_node"), begin),
         "stop": heard.stop, "late": heard.late, "latency": _latency(heard),
     }  # fmt: skip
     return row | {"verdict": verdict(row)}
@@ -167,6 +169,11 @@ def line(row: dict[str, Any]) -> str:
     return f"| {' | '.join(cells)} |"
 
 
+def _warnings(heard: Heard, name: str) -> list[tuple[float, str]]:
+    """[(s, text)] of the diagnostics of a node, "" where it has nothing to warn of."""
+    return [(at, f"{node}: {text}" if level else "") for at, node, level, text in heard.diagnostics if node == name]
+
+
 def _words(said: list[tuple[float, str]]) -> str:
     """The first of what was said, with its time."""
     if not said:
@@ -176,7 +183,7 @@ def _words(said: list[tuple[float, str]]) -> str:
 
 
 def _said(sentences: list[tuple[float, str]], begin: float) -> list[tuple[float, str]]:
-    """[(s since the begin of the fault, text)] of sentences that are not empty and new: neither said just before, nor before a fault in flight."""
+    """[(s since the begin of the fault, text)] of sentences, (s, text), that are not empty and differ from the one before."""
     out: list[tuple[float, str]] = []
     last = next((text for at, text in reversed(sentences) if at < begin), "")
     for at, text in sentences:
@@ -188,8 +195,10 @@ def _said(sentences: list[tuple[float, str]], begin: float) -> list[tuple[float,
 
 
 def _recovered(looks: Looks, fault: Fault) -> float:
-    """s from the end of the fault until odometry flows, is right, and status says so, and all this lasts; inf if it never does. A filter that was
-    started anew by request may say that the yaw is not known."""
+    """s from the end of the fault until odometry flows, is right, and status says so, and all this lasts; inf if it never does.
+
+    A filter that is started anew by request may say that the yaw is not known.
+    """
     well = looks.fresh & (looks.running if fault.anew else looks.clean) & (looks.error < WRONG)
     after = np.flatnonzero((looks.t >= fault.end) & ~well)
     if not len(after):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import reduce
 import json
@@ -49,6 +51,8 @@ READY, LEAD = 180.0, 0.5  # s: the very first start compiles the filter; from re
 FETCH = 0.02  # s between two looks at what has arrived
 STAMP, HEADER = struct.Struct("<iI"), 4  # of a message that begins with a header, behind the bytes that say how it is encoded
 RELIABLE = QoSProfile(depth=1000)
+KEPT = 3  # runs for which a domain stays reserved after its own
+_taken: deque[ExitStack] = deque()  # their reservations
 POSE_STD, YAW_STD = 0.3, 0.1  # m, rad: what a pose on initialpose states
 KINDS: dict[str, tuple[type, str, QoSProfile]] = {  # of what is sent
     "imu": (Imu, "imu/data", RELIABLE),
@@ -57,14 +61,21 @@ KINDS: dict[str, tuple[type, str, QoSProfile]] = {  # of what is sent
     "frames": (TFMessage, "/tf_static", TF_STATIC_QOS),
     "initialpose": (PoseWithCovarianceStamped, "initialpose", RELIABLE),
 } | {name: (message_class(of.message), of.topics[0][0], RELIABLE) for name, of in SENSORS.items()}
-HEARD: dict[str, tuple[type, QoSProfile]] = {"odometry": (Odometry, RELIABLE), "status": (EstimatorStatus, ANCHORS_QOS), "/diagnostics": (DiagnosticArray, RELIABLE)}
+HEARD: dict[str, tuple[type, QoSProfile]] = {
+    "odometry": (Odometry, RELIABLE),
+    "status": (EstimatorStatus, ANCHORS_QOS),
+    "/diagnostics": (DiagnosticArray, RELIABLE),
+}
 
 
 @dataclass
 class Heard:
-    """What nodes published, on the clock of the events. odometry : (arrival s, Odometry); status : (arrival s, EstimatorStatus);
-    diagnostics : (arrival s, node, level, text); begin : s since 1970 of 0; late : s, the latest that an event was sent;
-    stop : {node: s that it took to end, inf if it did not end well}; failed : why the nodes did not start, or ""."""
+    """What nodes published, on the clock of the events.
+
+    odometry : (arrival s, Odometry); status : (arrival s, EstimatorStatus); diagnostics : (arrival s, node, level, text); begin : s since
+    1970 of 0; late : s, by which an event was sent late at most; stop : {node: s that it took to end, inf if it did not end well};
+    failed : why the nodes did not start, or "".
+    """
 
     odometry: list[tuple[float, Any]] = field(default_factory=list)
     status: list[tuple[float, Any]] = field(default_factory=list)
@@ -77,7 +88,7 @@ class Heard:
     def add(self, topic: str, arrival: float, message: Any) -> None:
         """Take a message of one of `HEARD`."""
         if topic == "/diagnostics":
-            self.diagnostics += [(arrival, of.name.strip("/"), int.from_bytes(of.level, "little"), of.message) for of in message.status]
+            self.diagnostics += [(arrival, of.name.strip("/"), ord(of.level), of.message) for of in message.status]
         else:
             getattr(self, topic).append((arrival, message))
 
@@ -87,7 +98,7 @@ def played(events: list[Event], seconds: float, parameters: dict[str, dict[str, 
 
     parameters : {node: {name: value}}; folder : where their output goes. Returns Heard.
     """
-    with own_domain(), session("faults", []) as (node, stop), Processes(folder, stop) as processes:
+    with _fresh_domain(), session("faults", []) as (node, stop), Processes(folder, stop) as processes:
         stage = _Stage(node, processes, parameters, {event.stream for event in events})
         try:
             stage.wait()
@@ -97,6 +108,16 @@ def played(events: list[Event], seconds: float, parameters: dict[str, dict[str, 
             return Heard(failed=str(error))
         finally:
             stage.close()
+
+
+@contextmanager
+def _fresh_domain() -> Iterator[None]:
+    """As `own_domain`, which others may have only some runs later: for seconds DDS lists nodes that were killed."""
+    while len(_taken) > KEPT:
+        _taken.popleft().close()
+    _taken.append(ExitStack())
+    _taken[-1].enter_context(own_domain())
+    yield
 
 
 class _Stage:

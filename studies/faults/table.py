@@ -11,8 +11,8 @@ import numpy as np
 from uwb_tdoa_bias.foundation.flight import AIDS
 
 from .changes import (
-    Change, chain, delayed, done, during, first, framed, frozen, in_bursts, jittered_frames, late_anchor, lost, moved, nothing, only_from,
-    placed, pose_given, relabelled, repeated, republished, restamped, scaled, second_sender, survey, valued,
+    Change, chain, delayed, done, during, first, for_good, framed, frozen, in_bursts, jittered_frames, late_anchor, lost, moved, nothing,
+    only_from, placed, pose_given, relabelled, repeated, republished, restamped, scaled, second_sender, valued,
 )  # fmt: skip
 
 BEGIN, LASTS, AFTER = 14.0, 6.0, 7.0  # s: from the first message to a fault, how long it lasts, and what follows
@@ -137,8 +137,8 @@ FAULTS: dict[str, Fault] = {
     "nothing, all sensors": Fault("nothing; with height, pressure, velocity and ranges", plays=AIDS),
     **{key: row for name in STREAMS for key, row in of_stream(name).items()},
     # Several streams
-    "all: jump +5 s": jump("all clocks jump by 5 s ahead", lambda e, s: during(ALL, restamped(5.0))(e, replace(s, end=math.inf)), plays=AIDS),
-    "all: jump -5 s": jump("all clocks jump by 5 s back", lambda e, s: during(ALL, restamped(-5.0))(e, replace(s, end=math.inf)), plays=AIDS),
+    "all: jump +5 s": jump("all clocks jump by 5 s ahead and stay there", for_good(during(ALL, restamped(5.0))), plays=AIDS),
+    "all: jump -5 s": jump("all clocks jump by 5 s back and stay there", for_good(during(ALL, restamped(-5.0))), plays=AIDS),
     "all: bursts": Fault("all messages come together, each half a second", during(ALL, in_bursts(0.5)), plays=AIDS),
     "all: silent 1 s": Fault("no message at all for 1 s", during(ALL, lost), plays=AIDS, lasts=1.0),
     "all: silent 5 s": Fault("no message at all for 5 s", during(ALL, lost), plays=AIDS, lasts=5.0),
@@ -174,7 +174,8 @@ FAULTS: dict[str, Fault] = {
     "imu: upside down": standing("the IMU is upside down", during("imu", valued(lambda v: v * UPSIDE_DOWN))),
     "imu: turned by 90 degrees": standing("the IMU is turned by 90 degrees about z", during("imu", valued(lambda v: _rotated(90.0, v)))),
     "imu: gyroscope off": Fault(
-        "the gyroscope is off by 0.5 rad/s about z for 3 s", during("imu", valued(lambda v: v + [0.0, 0.0, 0.5], "gyro")), lasts=3.0, after=10.0
+        "the gyroscope is off by 0.5 rad/s about z for 3 s", during("imu", valued(lambda v: v + [0.0, 0.0, 0.5], "gyro")),
+        lasts=3.0, after=10.0,
     ),
     "imu: frozen": Fault("the values of the IMU freeze", frozen("imu")),
     # Other sensors
@@ -202,7 +203,9 @@ FAULTS: dict[str, Fault] = {
     "anchors: jitter": Fault("anchors are published each second with 2 mm of jitter", republished(
         1.0, lambda anchors, rng: replace(anchors, positions=anchors.positions + 2e-3 * rng.standard_normal(anchors.positions.shape))
     )),
-    "anchors: one removed": Fault("one anchor is removed for 6 s", republished(6.0, lambda anchors, _: anchors.only(np.arange(len(anchors) - 1)))),
+    "anchors: one removed": Fault("one anchor is removed for 6 s", republished(
+        LASTS, lambda anchors, _: anchors.only(np.arange(len(anchors) - 1))
+    )),
     "anchors: repeated": Fault("anchors are published ten times a second", republished(0.1, lambda anchors, _: anchors)),
     "tf_static: jitter": Fault("/tf_static turns by 1e-6 rad each second", chain(framed("imu", "imu_link"), jittered_frames(1.0, 1e-6))),
     # Nodes and what they are asked

@@ -21,7 +21,8 @@ from uwb_tdoa_tools.simulation import SimulationConfig, simulate  # noqa: E402
 from studies.__main__ import main  # noqa: E402
 from studies.faults import judge  # noqa: E402
 from studies.faults.changes import (  # noqa: E402
-    delayed, during, first, frozen, in_bursts, late_anchor, lost, pose_given, relabelled, repeated, republished, restamped, scaled, second_sender,
+    delayed, during, first, frozen, in_bursts, late_anchor, lost, pose_given, relabelled, repeated, republished, restamped, scaled,
+    second_sender,
 )
 from studies.faults.events import NUMBERS, Event, Scene, events_of, part_of  # noqa: E402
 from studies.faults.play import Heard, message_of  # noqa: E402
@@ -135,9 +136,9 @@ def test_anchors_and_poses(part):
     assert pose.values["p"] == [7.0, 0.0, 1.0] and pose.values["yaw"] == pytest.approx(1.0)
 
 
-def heard(error=0.0, std=0.1, yaw=0.0, why="", status=EstimatorStatus.STATUS_RUNNING, shift=0.0, until=20.0, begin=4.0):
-    """Heard of a tag that is `error` m off from `begin` on, and what it says."""
-    out = Heard(begin=1000.0)
+def heard(error=0.0, std=0.1, yaw=0.0, why="", status=EstimatorStatus.STATUS_RUNNING, shift=0.0, until=20.0):
+    """Heard of a tag that is `error` m off from 4 s on, and what it says."""
+    begin, out = 4.0, Heard(begin=1000.0)
     for t in np.arange(0.0, until, 0.02).tolist():
         message = Odometry()
         stamp = 1000.0 + t + (shift if t >= begin else 0.0)
@@ -190,7 +191,8 @@ def test_list(capsys):
 @pytest.mark.slow
 def test_one_fault_over_topics(tmp_path, capsys):
     file = tmp_path / "rows.json"
-    assert main(["faults", "--data", str(tmp_path), "--only", "^tdoa: silent 1 s$", "--json", str(file), "--out", str(tmp_path / "table.md")]) == 0
+    out = ["--json", str(file), "--out", str(tmp_path / "table.md")]
+    assert main(["faults", "--data", str(tmp_path), "--only", "^tdoa: silent 1 s$", *out]) == 0
     (row,) = json.loads(file.read_text())
     assert row["rmse"] < 0.5 and row["wrong"] == 0.0 and row["recovered"] <= judge.RECOVERED_LIMIT and row["verdict"] == "ok"
     assert (tmp_path / "table.md").read_text().splitlines() == capsys.readouterr().out.splitlines()[:3]
