@@ -13,6 +13,7 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 
 from .events import NUMBERS, Event, Scene, in_order
 
+APART = 0.02  # m
 Change = Callable[[list[Event], Scene], list[Event]]
 OfOne = Callable[[Event, Scene], Iterable[Event]]  # what is sent instead of one event
 
@@ -178,10 +179,11 @@ def republished(period: float, change: Callable[[Anchors, np.random.Generator], 
 
 
 def framed(stream: str, *frames: str) -> Change:
-    """Messages of a stream come in these frames, one after the other; each is that of the body, as /tf_static says."""
+    """Messages of a stream come in these frames, one after the other. By /tf_static the first is that of the body, each other is APART above
+    the one before."""
 
     def changed(events: list[Event], scene: Scene) -> list[Event]:
-        transforms = [(frame, [0.0, 0.0, 0.0]) for frame in frames]
+        transforms = [(frame, [0.0, 0.0, APART * k], [0.0, 0.0, 0.0]) for k, frame in enumerate(frames)]
         rows = [k for k, event in enumerate(events) if event.stream == stream]
         out = list(events)
         for turn, k in enumerate(rows):
@@ -197,7 +199,7 @@ def jittered_frames(period: float, rad: float) -> Change:
     def changed(events: list[Event], scene: Scene) -> list[Event]:
         true, rng = next(e for e in events if e.stream == "frames").values["transforms"], np.random.default_rng(0)
         times = np.arange(scene.begin, scene.end, period).tolist()
-        turned = [[(frame, (rad * rng.standard_normal(3)).tolist()) for frame, _ in true] for _ in times]
+        turned = [[(frame, p, (rad * rng.standard_normal(3)).tolist()) for frame, p, _ in true] for _ in times]
         return in_order(events + [Event(at, "frames", at, {"transforms": new}) for at, new in zip(times, turned)])
 
     return changed

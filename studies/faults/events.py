@@ -7,8 +7,9 @@ import math
 from typing import Any, NamedTuple, TYPE_CHECKING
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.foundation.flight import AIDS
+from uwb_tdoa_bias.foundation.flight import AIDS, Truth
 from uwb_tdoa_bias.foundation.sensors import Height, Pressure, Ranges
 from uwb_tdoa_bias.foundation.sensors.pressure import SITE, pressure_at
 from uwb_tdoa_tools.scoring.metrics import airborne, position_at
@@ -16,7 +17,7 @@ from uwb_tdoa_tools.scoring.metrics import airborne, position_at
 from ..aids import with_velocity
 
 if TYPE_CHECKING:
-    from uwb_tdoa_bias.foundation.flight import Flight, Truth
+    from uwb_tdoa_bias.foundation.flight import Flight
 
 BEFORE = 1.5  # s on the floor before take-off
 IMU_EVERY = 4  # of the inertial samples one is sent, so that the computer is not busy
@@ -103,6 +104,12 @@ def events_of(flight: Flight, streams: tuple[str, ...]) -> list[Event]:
 def in_order(events: list[Event]) -> list[Event]:
     """The events by the time at which they are sent."""
     return sorted(events, key=lambda event: event.at)
+
+
+def turned(truth: Truth, degrees: float) -> Truth:
+    """The truth in a world whose axes are turned about z, so that everything in it turns by `degrees`."""
+    turn = Rotation.from_euler("z", degrees, degrees=True)
+    return Truth(truth.t, turn.apply(truth.p), (turn * Rotation.from_quat(truth.q)).as_quat())
 
 
 def yaws_at(t: np.ndarray, truth: Truth) -> np.ndarray:

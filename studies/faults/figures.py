@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache, partial
 import json
 from pathlib import Path
@@ -15,7 +16,7 @@ from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 from . import judge
-from .events import Scene, events_of, part_of
+from .events import Scene, events_of, part_of, turned
 from .table import FAULTS
 
 if TYPE_CHECKING:
@@ -69,8 +70,9 @@ def row_of(name: str, data: Path) -> dict[str, Any]:
     part = part_of(flight_of(data), fault.seconds)
     scene = Scene(fault.begin, fault.end, part.truth)
     events = fault.change(events_of(part, ("imu", "tdoa", *fault.plays)), scene)
+    judged_by = replace(scene, truth=turned(scene.truth, fault.turned))
     with tempfile.TemporaryDirectory() as folder:
-        return judge.judged(name, fault, played(events, fault.seconds, fault.parameters, folder), scene)
+        return judge.judged(name, fault, played(events, fault.seconds, fault.parameters, folder), judged_by)
 
 
 @lru_cache(maxsize=1)

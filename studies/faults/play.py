@@ -263,8 +263,10 @@ def _set_vector(vector: Any, values: Any) -> None:
     vector.x, vector.y, vector.z = (float(value) for value in values)
 
 
-def _transform(frame: str, turn: list[float]) -> TransformStamped:
+def _transform(frame: str, p: list[float], turn: list[float]) -> TransformStamped:
+    """Of a frame in the body: its place, m, and rotation vector, rad."""
     transform = TransformStamped(child_frame_id=frame)
+    _set_vector(transform.transform.translation, p)
     transform.header.frame_id = "base_link"
     x, y, z, w = Rotation.from_rotvec(turn).as_quat().tolist()
     transform.transform.rotation = Quaternion(x=x, y=y, z=z, w=w)

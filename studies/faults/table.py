@@ -26,7 +26,8 @@ ALL = " ".join(STREAMS)
 @dataclass(frozen=True)
 class Fault:
     """text : what is wrong; change : of the events; plays : sensors beside TDOAs and the IMU; begin, lasts, after : s, see `BEGIN`;
-    parameters : {node: {name: value}}; anew : the filter is started anew by request."""
+    parameters : {node: {name: value}}; anew : the filter is started anew by request; turned : degrees by which the world is
+    turned about z, which nothing that is measured shows: the estimate is right if it is turned, too."""
 
     text: str
     change: Change = nothing
@@ -36,6 +37,7 @@ class Fault:
     after: float = AFTER
     parameters: dict[str, dict[str, Any]] = field(default_factory=dict)
     anew: bool = False
+    turned: float = 0.0
 
     @property
     def end(self) -> float:
@@ -172,7 +174,9 @@ FAULTS: dict[str, Fault] = {
     "imu: in degrees/s": standing("the gyroscope is in degrees/s", during("imu", scaled(math.degrees(1.0), "gyro"))),
     "imu: y and z exchanged": standing("the axes y and z are exchanged", during("imu", valued(lambda v: v[LYING]))),
     "imu: upside down": standing("the IMU is upside down", during("imu", valued(lambda v: v * UPSIDE_DOWN))),
-    "imu: turned by 90 degrees": standing("the IMU is turned by 90 degrees about z", during("imu", valued(lambda v: _rotated(90.0, v)))),
+    "imu: turned by 90 degrees": standing(
+        "the IMU is turned by 90 degrees about z", during("imu", valued(lambda v: _rotated(90.0, v))), plays=("velocity",)
+    ),
     "imu: gyroscope off": Fault(
         "the gyroscope is off by 0.5 rad/s about z for 3 s", during("imu", valued(lambda v: v + [0.0, 0.0, 0.5], "gyro")),
         lasts=3.0, after=10.0,
@@ -196,7 +200,7 @@ FAULTS: dict[str, Fault] = {
     "survey: one in mm": standing("one anchor is in millimetres", placed(_one_in_millimetres)),
     "survey: zeros": standing("all positions are zero", placed(lambda p: 0.0 * p)),
     "survey: mirrored": standing("the survey is mirrored", placed(lambda p: p * MIRRORED)),
-    "survey: rotated": standing("the survey is turned by 90 degrees about z", placed(lambda p: _rotated(90.0, p))),
+    "survey: rotated": standing("the survey is turned by 90 degrees about z", placed(lambda p: _rotated(90.0, p)), turned=90.0),
     "survey: two at one place": standing("two anchors are at one place", placed(_two_at_one_place)),
     "survey: another room": standing("the survey is of another room", placed(_another_room)),
     "survey: one moved": standing("one anchor is elsewhere by 1 m", moved(2, [1.0, 0.0, 0.0])),

@@ -24,7 +24,7 @@ from studies.faults.changes import (  # noqa: E402
     delayed, during, first, frozen, in_bursts, late_anchor, lost, pose_given, relabelled, repeated, republished, restamped, scaled,
     second_sender,
 )
-from studies.faults.events import NUMBERS, Event, Scene, events_of, part_of  # noqa: E402
+from studies.faults.events import NUMBERS, Event, Scene, events_of, part_of, turned, yaws_at  # noqa: E402
 from studies.faults.play import Heard, message_of  # noqa: E402
 from studies.faults.table import FAULTS, STREAMS, Fault  # noqa: E402
 
@@ -134,6 +134,16 @@ def test_anchors_and_poses(part):
     assert [(e.at, len(e.values["anchors"])) for e in removed] == [(-1.0, 8), (4.0, 7), (6.0, 8)]
     (pose,) = pose_given(offset=3.0, yaw=1.0)([], SCENE)
     assert pose.values["p"] == [7.0, 0.0, 1.0] and pose.values["yaw"] == pytest.approx(1.0)
+
+
+def test_a_turned_world_turns_everything(part):
+    there = turned(part.truth, 90.0)
+    np.testing.assert_allclose(there.p, np.column_stack([-part.truth.p[:, 1], part.truth.p[:, 0], part.truth.p[:, 2]]), atol=1e-9)
+    turn = yaws_at(there.t, there) - yaws_at(part.truth.t, part.truth)
+    np.testing.assert_allclose(np.cos(turn - math.pi / 2), 1.0)
+    anchors = FAULTS["survey: rotated"].change(events_of(part, ()), SCENE)[0].values["anchors"]
+    d = np.linalg.norm(there.p[:, None] - anchors.positions, axis=2)
+    np.testing.assert_allclose(d, np.linalg.norm(part.truth.p[:, None] - part.anchors.positions, axis=2))
 
 
 def heard(error=0.0, std=0.1, yaw=0.0, why="", status=EstimatorStatus.STATUS_RUNNING, shift=0.0, until=20.0):
