@@ -186,10 +186,11 @@ class _Stage:
         return heard
 
     def close(self) -> None:
-        """End what keeps the cores busy."""
+        """End what keeps the cores busy, and what publishes: whoever gets the domain next would hear of it until it is collected."""
         for process in self._busy:
             process.kill()
             process.wait()
+        self._node.destroy_node()
 
     def _publisher(self, name: str, sender: int = 0) -> Publisher:
         if (name, sender) not in self._publishers:

@@ -226,7 +226,7 @@ FAULTS: dict[str, Fault] = {
     "initial_yaw: wrong": standing(
         "initial_yaw is 90 degrees off, stated 0.1 rad", parameters=ekf(initial_yaw=math.pi / 2, initial_yaw_std=0.1)
     ),
-    "fixed_height: flying": standing("fixed_height on a tag that flies", parameters=ekf(fixed_height=0.1, fixed_height_std=0.05)),
+    "fixed_height: flying": standing("fixed_height on a tag that flies", parameters=ekf(fixed_height=0.1, fixed_height_std=0.02)),
     "parameter: legal": jump("tdoa_std is set to 0.3 m", done("parameter", name="tdoa_std", value=0.3)),
     "parameter: misspelt": jump("a parameter that is misspelt is set", done("parameter", name="tdoa_stdd", value=0.3)),
     "busy": Fault("two loops keep the cores busy", done("busy", seconds=LASTS)),
