@@ -147,7 +147,7 @@ def verdict(row: dict[str, Any]) -> str:
             "wrong and certain": row["wrong"] > WRONG_LIMIT,
             "yaw wrong and certain": row["yaw wrong"] > YAW_LIMIT,
             "not recovered": row["recovered"] is not None and row["recovered"] > RECOVERED_LIMIT,
-            "odometry stops": row["gap"] > FRESH and row["fault"].partition(":")[0] in AIDS,  # it can do without them
+            "a sensor disturbs": (row["gap"] > FRESH or row["status"]) and row["fault"].partition(":")[0] in AIDS,  # it can do without
             "does not end": max(row["stop"].values(), default=0.0) > STOP_LIMIT,
         }.items()
         if is_missed

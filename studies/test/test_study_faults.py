@@ -184,7 +184,7 @@ def test_wrong_and_certain_is_missed_unless_it_is_said():
 def test_odometry_that_stops_is_wrong_once_the_tag_has_gone_on():
     row = judge.judged("velocity: x", FAULT, heard(until=12.0), Scene(4.0, 10.0, TRUTH))
     assert row["gap"] == pytest.approx(8.0, abs=0.1) and row["recovered"] == math.inf
-    assert row["verdict"] == "MISS: wrong and certain, not recovered, odometry stops"
+    assert row["verdict"] == "MISS: wrong and certain, not recovered, a sensor disturbs"
 
 
 def test_stamps_of_another_clock_are_judged_by_arrival():
