@@ -12,6 +12,7 @@ from studies.closed_loop import experiment
 from studies.debiasing import measured, set_up
 from studies.diagnosis import figures
 from studies.diagnosis import ranges as diagnosed_ranges
+from studies.faults import figures as faults
 from studies.training import compare, default, spin, splits
 
 STUDIES = {
@@ -26,6 +27,7 @@ STUDIES = {
     "default-model": default,
     "diagnose-ranges": diagnosed_ranges,
     "diagnosis": figures,
+    "faults": faults,
     "in-flight": in_flight,
     "localizing": localizing,
     "noise": noise,
@@ -51,6 +53,7 @@ of measured flights: flights/, util/, surveys/.
   default-model    the model that bias_node ships
   diagnose-ranges  errors put into simulated distances to anchors, and what diagnose makes of them (docs/sensors.md)
   diagnosis        effects put into flights, and found again (docs/diagnosis.md)
+  faults           faults of streams, surveys, nodes and clocks, played to the real nodes over topics (docs/reliability.md)
   in-flight        the same mistakes played to ekf_node, and what it says of them (docs/connect.md)
   localizing       what localize says of flights, against their ground truth (docs/localizing.md)
   noise            whether covariances are honest after a calibration (docs/calibration.md)
@@ -88,6 +91,7 @@ def parser():
         "./dev study diagnosis bank --out bench/",
         "./dev study diagnosis measured --data DATA --out bench/",
         "./dev study diagnosis undeclared --cases src/uwb_tdoa_tools/test/undeclared.py --out bench/",
+        "./dev study faults --only '^velocity' --json faults.json --out faults.md",
         "./dev study in-flight DATA/flights/0426/0426-traj5 --survey DATA/surveys --only nothing sign",
         "./dev study localizing DATA/flights DATA/util --survey DATA/surveys --mistakes",
         "./dev study noise --data DATA --split const1",

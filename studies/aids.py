@@ -49,12 +49,12 @@ def run(args):
     {"worth": worth, "faults": faults, "velocity": velocity}[args.table](flights, config)
 
 
-def with_velocity(flight):
-    """The flight with a velocity in the body frame, made of its ground truth and noise where none was recorded."""
+def with_velocity(flight, rate=VELOCITY_RATE):
+    """The flight with a velocity in the body frame, made of its ground truth and noise, at a rate, Hz, where none was recorded."""
     if flight.velocity is not None:
         return flight
     truth = flight.truth
-    t = np.arange(truth.t[0] + 0.1, truth.t[-1] - 0.1, 1.0 / VELOCITY_RATE)
+    t = np.arange(truth.t[0] + 0.1, truth.t[-1] - 0.1, 1.0 / rate)
     ends = [np.stack([np.interp(t + s, truth.t, truth.p[:, k]) for k in range(3)], axis=1) for s in (-0.05, 0.05)]
     near = truth.q[np.clip(np.searchsorted(truth.t, t), 0, len(truth) - 1)]
     v = Rotation.from_quat(near).inv().apply((ends[1] - ends[0]) / 0.1)

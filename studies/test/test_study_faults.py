@@ -1,43 +1,208 @@
-"""Faults that are put into flights, and what is counted of them."""
+"""The study of faults over topics: what its changes do to events, how it judges, and one fault played to real nodes."""
 
-from known_effects import clean_flight
+from dataclasses import replace
+import json
+import math
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
-from studies.diagnosis import faults
-from studies.diagnosis.faults import FAULTS
+pytest.importorskip("rclpy")
+pytest.importorskip("uwb_tdoa_msgs.msg")
 
-STREAMS = ("tdoa", "imu", "truth")
+from hypothesis import given, settings, strategies as st  # noqa: E402
+from nav_msgs.msg import Odometry  # noqa: E402
+
+from uwb_tdoa_bias.foundation.flight import AIDS, Truth  # noqa: E402
+from uwb_tdoa_msgs.msg import EstimatorStatus  # noqa: E402
+from uwb_tdoa_tools.simulation import SimulationConfig, simulate  # noqa: E402
+
+from studies.__main__ import main  # noqa: E402
+from studies.faults import judge  # noqa: E402
+from studies.faults.changes import (  # noqa: E402
+    delayed, during, first, frozen, in_bursts, late_anchor, lost, pose_given, relabelled, repeated, republished, restamped, scaled,
+    second_sender,
+)
+from studies.faults.events import NUMBERS, Event, Scene, events_of, part_of, turned, yaws_at  # noqa: E402
+from studies.faults.play import Heard, message_of  # noqa: E402
+from studies.faults.table import FAULTS, STREAMS, Fault  # noqa: E402
+
+TRUTH = Truth(np.array([0.0, 100.0]), np.array([[0.0, 0.0, 1.0], [100.0, 0.0, 1.0]]), np.array([[0.0, 0.0, 0.0, 1.0]] * 2))
+SCENE = Scene(4.0, 6.0, TRUTH)
 
 
 @pytest.fixture(scope="module")
-def flight():
-    return clean_flight(100, 20.0)
+def part():
+    return part_of(simulate(SimulationConfig(seed=1, duration=60.0, protocol="tdoa3", imu_rate=400.0, truth_rate=100.0)), 40.0)
+
+
+@pytest.fixture(scope="module")
+def few(part):
+    """Every twentieth event of all streams: a tenth of a second and more apart."""
+    anchors, *rest = events_of(part, STREAMS)
+    return [anchors, *rest[::20]]
+
+
+def tdoas(times):
+    return [Event(t, "tdoa", t, {"a": 1, "b": 2, "d": 0.5, "variance": 0.0}) for t in times]
+
+
+TIMES = [0.25 * k for k in range(40)]
+INSIDE = [t for t in TIMES if 4.0 <= t < 6.0]
+
+
+def test_all_sensors_are_made_of_the_ground_truth(part):
+    assert part.tdoa.t[0] >= 0.0 and part.tdoa.t[-1] < 40.0
+    true = np.interp(part.pressure.t, part.truth.t, part.truth.p[:, 2])
+    altitude = part.pressure.values[:, 0]
+    assert np.std(altitude - true) == pytest.approx(0.1, rel=0.2)
+    for name in AIDS:
+        assert len(getattr(part, name)) > 500, name
+
+
+def test_events_are_in_order_and_are_all_messages(part):
+    events = events_of(part, STREAMS)
+    assert [event.at for event in events] == sorted(event.at for event in events)
+    for name in STREAMS:
+        sent = [event for event in events if event.stream == name]
+        assert len(sent) == len(getattr(part, name)) and all(set(NUMBERS[name]) <= set(event.values) for event in sent)
+    assert events[0].stream == "anchors" and events[0].at < 0.0
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_a_fault_changes_the_stream_that_it_is_of_and_no_stamp_falls(flight, name):
-    changed = FAULTS[name].put_in(flight, np.random.default_rng(2))
-    again = FAULTS[name].put_in(flight, np.random.default_rng(2))
-    touched = []
-    for stream in STREAMS:
-        before, after, twin = (vars(getattr(one, stream)) for one in (flight, changed, again))
-        assert all(np.array_equal(after[key], twin[key]) for key in after)
-        assert (np.diff(after["t"]) >= 0.0).all() and len({len(column) for column in after.values()}) == 1
-        if not all(np.array_equal(after[key], before[key]) for key in after):
-            touched.append(stream)
-    assert touched == ["truth" if FAULTS[name].of_truth else "imu" if FAULTS[name].inertial else "tdoa"]
+def test_every_fault_changes_something_while_it_lasts_and_nothing_before(part, few, name):
+    fault = FAULTS[name]
+    kept = str(few)
+    after = fault.change(few, Scene(fault.begin, fault.end, part.truth))
+    assert str(few) == kept  # what it was given stays
+    assert [event.at for event in after] == sorted(event.at for event in after)
+    assert (str(after) != kept) == (not name.startswith("nothing") and not fault.parameters)
+    assert sum(e.at < fault.begin for e in after if e.stream in STREAMS) == sum(e.at < fault.begin for e in few if e.stream in STREAMS)
+    assert fault.seconds < 40.0
+    for event in {event.stream: event for event in after}.values():
+        if event.stream not in ("kill", "start", "reset", "parameter", "busy"):
+            message_of(event)
 
 
-def test_faults_of_one_pair_leave_the_others(flight):
-    changed = FAULTS["pair_clipped"].put_in(flight, np.random.default_rng(2)).tdoa
-    hit = changed.d != flight.tdoa.d
-    assert hit.any() and len(set(zip(changed.a[hit], changed.b[hit]))) == 1
+def test_there_are_enough_faults_and_each_stream_has_its_own():
+    assert len(FAULTS) >= 60
+    for name in STREAMS:
+        assert sum(key.startswith(f"{name}: ") for key in FAULTS) >= 18
 
 
-def test_figures_count_what_costs_or_spoils_the_truth():
-    rows = [("tdoa_sign", True, 2.0), ("tdoa_sign", False, 0.03), ("tdoa_sign", False, 0.01), ("truth_hole", True, None)]
-    found = faults.figures([{"fault": name, "named": named, "cost": cost} for name, named, cost in rows])
-    assert (found["draws"], found["that cost 2 cm, or are of the truth"]) == (4, 3)
-    assert found["of these named"] == pytest.approx(2 / 3, abs=1e-3)
-    assert found["by fault"]["tdoa_sign"] == "1 of 3, costly 1 of 2, cost 1.0 to 200.0 cm"
+@given(seconds=st.floats(-100.0, 3600.0), rate=st.floats(-0.01, 0.01))
+@settings(deadline=None, max_examples=30)
+def test_stamps_shift_only_during_the_fault(seconds, rate):
+    out = during("tdoa", restamped(seconds, rate))(tdoas(TIMES), SCENE)
+    assert [event.at for event in out] == TIMES
+    for event in out:
+        shift = seconds + rate * (event.at - 4.0) if event.at in INSIDE else 0.0
+        assert event.t == pytest.approx(event.at + shift)
+
+
+def test_lost_repeated_late_and_bursts():
+    assert [e.at for e in during("tdoa", lost)(tdoas(TIMES), SCENE)] == [t for t in TIMES if t not in INSIDE]
+    assert len(during("tdoa", repeated(10))(tdoas(TIMES), SCENE)) == len(TIMES) + 9 * len(INSIDE)
+    late = during("tdoa", delayed(0.6))(tdoas(TIMES), SCENE)
+    assert {round(e.at - e.t, 6) for e in late} == {0.0, 0.6} and [e.at for e in late] == sorted(e.at for e in late)
+    assert all(e.at == e.t for e in during("tdoa", delayed(1.2, restamp=True))(tdoas(TIMES), SCENE))
+    bursts = during("tdoa", in_bursts(0.5))(tdoas(TIMES), SCENE)
+    assert {e.at for e in bursts if 4.0 < e.at < 6.0} == {4.5, 5.0, 5.5}
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_single_stamps(count):
+    out = first(count, "tdoa", restamped(-5.0))(tdoas(TIMES), SCENE)
+    assert sum(e.t != e.at for e in out) == count and min(e.at for e in out if e.t != e.at) == 4.0
+
+
+def test_values():
+    assert {e.values["d"] for e in during("tdoa", scaled(-1.0))(tdoas(TIMES), SCENE)} == {0.5, -0.5}
+    assert any(math.isnan(e.values["d"]) for e in during("tdoa", scaled(math.nan))(tdoas(TIMES), SCENE))
+    assert {(e.values["a"], e.values["b"]) for e in during("tdoa", relabelled({1: 2, 2: 1}))(tdoas(TIMES), SCENE)} == {(1, 2), (2, 1)}
+    assert {e.values["d"] for e in during("tdoa", late_anchor(1, 1.0))(tdoas(TIMES), SCENE)} == {0.5, -0.5}
+    ramp = [event._replace(values=event.values | {"d": event.t}) for event in tdoas(TIMES)]
+    assert {e.values["d"] for e in frozen("tdoa")(ramp, SCENE) if e.at in INSIDE} == {4.0}
+    both = during("tdoa", second_sender(scaled(2.0)))(tdoas(TIMES), SCENE)
+    assert [e.values["d"] for e in both if e.sender == 1] == [1.0] * len(INSIDE)
+
+
+def test_anchors_and_poses(part):
+    events = [Event(-1.0, "anchors", 0.0, {"anchors": part.anchors})]
+    removed = republished(6.0, lambda anchors, _: anchors.only(np.arange(len(anchors) - 1)))(events, SCENE)
+    assert [(e.at, len(e.values["anchors"])) for e in removed] == [(-1.0, 8), (4.0, 7), (6.0, 8)]
+    (pose,) = pose_given(offset=3.0, yaw=1.0)([], SCENE)
+    assert pose.values["p"] == [7.0, 0.0, 1.0] and pose.values["yaw"] == pytest.approx(1.0)
+
+
+def test_a_turned_world_turns_everything(part):
+    there = turned(part.truth, 90.0)
+    np.testing.assert_allclose(there.p, np.column_stack([-part.truth.p[:, 1], part.truth.p[:, 0], part.truth.p[:, 2]]), atol=1e-9)
+    turn = yaws_at(there.t, there) - yaws_at(part.truth.t, part.truth)
+    np.testing.assert_allclose(np.cos(turn - math.pi / 2), 1.0)
+    anchors = FAULTS["survey: rotated"].change(events_of(part, ()), SCENE)[0].values["anchors"]
+    d = np.linalg.norm(there.p[:, None] - anchors.positions, axis=2)
+    np.testing.assert_allclose(d, np.linalg.norm(part.truth.p[:, None] - part.anchors.positions, axis=2))
+
+
+def heard(error=0.0, std=0.1, yaw=0.0, why="", status=EstimatorStatus.STATUS_RUNNING, shift=0.0, until=20.0):
+    """Heard of a tag that is `error` m off from 4 s on, and what it says."""
+    begin, out = 4.0, Heard(begin=1000.0)
+    for t in np.arange(0.0, until, 0.02).tolist():
+        message = Odometry()
+        stamp = 1000.0 + t + (shift if t >= begin else 0.0)
+        message.header.stamp.sec, message.header.stamp.nanosec = int(stamp), int(stamp % 1.0 * 1e9)
+        message.pose.pose.position.x, message.pose.pose.position.z = t + (error if t >= begin else 0.0), 1.0
+        angle = yaw if t >= begin else 0.0
+        message.pose.pose.orientation.z, message.pose.pose.orientation.w = math.sin(angle / 2.0), math.cos(angle / 2.0)
+        message.pose.covariance = np.diag([std**2 / 3.0] * 3 + [0.01] * 3).ravel()
+        out.odometry.append((t, message))
+    for t in range(20):
+        out.status.append((float(t), SimpleNamespace(status=status, why=why if t >= begin else "")))
+    return out
+
+
+FAULT = Fault("", begin=4.0, lasts=6.0, after=10.0)
+
+
+def verdict(fault=FAULT, **kinds):
+    return judge.judged("tdoa: x", fault, heard(**kinds), Scene(fault.begin, fault.end, TRUTH))["verdict"]
+
+
+def test_wrong_and_certain_is_missed_unless_it_is_said():
+    assert verdict() == "ok" and verdict(error=0.9, std=0.01, until=20.0) == "ok"
+    lasting = replace(FAULT, lasts=16.0, after=0.0)
+    assert verdict(lasting, error=1.5) == "MISS: wrong and certain"
+    assert verdict(lasting, error=1.5, std=0.6) == "ok"  # three stated deviations cover it
+    assert verdict(lasting, error=1.5, why="a reason") == "ok"
+    assert verdict(lasting, error=1.5, status=EstimatorStatus.STATUS_LOST) == "ok"
+    assert verdict(lasting, yaw=1.5) == "MISS: yaw wrong and certain"
+    assert verdict(error=1.5, why="a reason") == "MISS: not recovered"
+
+
+def test_odometry_that_stops_is_wrong_once_the_tag_has_gone_on():
+    row = judge.judged("velocity: x", FAULT, heard(until=12.0), Scene(4.0, 10.0, TRUTH))
+    assert row["gap"] == pytest.approx(8.0, abs=0.1) and row["recovered"] == math.inf
+    assert row["verdict"] == "MISS: wrong and certain, not recovered, a sensor disturbs"
+
+
+def test_stamps_of_another_clock_are_judged_by_arrival():
+    assert verdict(shift=5.0) == "ok" and verdict(shift=-5.0) == "ok"
+    assert verdict(replace(FAULT, lasts=16.0, after=0.0), shift=0.9, std=0.01) == "ok"  # below 1 s the stamp counts: 0.9 m off
+
+
+def test_list(capsys):
+    assert main(["faults", "--list", "--only", "^survey"]) == 0
+    assert all(line.startswith("survey: ") for line in capsys.readouterr().out.splitlines())
+    assert main(["faults", "--only", "no such fault"]) == 2
+
+
+@pytest.mark.slow
+def test_one_fault_over_topics(tmp_path, capsys):
+    file = tmp_path / "rows.json"
+    out = ["--json", str(file), "--out", str(tmp_path / "table.md")]
+    assert main(["faults", "--data", str(tmp_path), "--only", "^tdoa: silent 1 s$", *out]) == 0
+    (row,) = json.loads(file.read_text())
+    assert row["rmse"] < 0.5 and row["wrong"] == 0.0 and row["recovered"] <= judge.RECOVERED_LIMIT and row["verdict"] == "ok"
+    assert (tmp_path / "table.md").read_text().splitlines() == capsys.readouterr().out.splitlines()[:3]

@@ -1,0 +1,83 @@
+"""Faults put into a flight that real nodes hear over topics: how wrong they get, what they say, and whether they recover."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache, partial
+import json
+from pathlib import Path
+import re
+import tempfile
+from typing import Any, TYPE_CHECKING
+
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_tools import parallel
+from uwb_tdoa_tools.readers import inputs
+from uwb_tdoa_tools.simulation import SimulationConfig, simulate
+
+from . import judge
+from .events import Scene, events_of, part_of, turned
+from .table import FAULTS
+
+if TYPE_CHECKING:
+    import argparse
+    from collections.abc import Callable
+    from uwb_tdoa_bias.foundation.flight import Flight
+
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
+FLIGHT = "flights/0426/0426-traj5"
+
+
+def add_options(add: Callable[..., object]) -> None:
+    """add : add_argument of a parser."""
+    data = "measured flights; without them a flight is simulated (default: %(default)s)"
+    add("--data", metavar="DIR", type=Path, default=DATA, help=data)
+    add("--only", metavar="PATTERN", default="", help="faults whose names this regular expression finds")
+    jobs = "faults at once, each in a ROS domain of its own (default %(default)s)"
+    add("--jobs", metavar="N", type=parallel.whole_number, default=1, help=jobs)
+    add("--json", metavar="FILE", type=Path, help="write all figures, and all that was said")
+    add("--out", metavar="FILE", type=Path, help="write the table")
+    add("--list", action="store_true", help="print the faults and end")
+
+
+def run(args: argparse.Namespace) -> None:
+    """Print the table."""
+    names = [name for name in FAULTS if re.search(args.only, name)]
+    if not names:
+        raise InputError(f"--only: no fault is called like {args.only!r}; --list prints them all.")
+    if args.list:
+        print("\n".join(f"{name:32} {FAULTS[name].text}" for name in names))
+        return
+    rows = []
+    lines = [f"| {' | '.join(judge.HEAD)} |", f"|---|{4 * '---:|'}---|---|{3 * '---:|'}---|"]
+    print("\n".join(lines), flush=True)
+    for row in parallel.over(partial(row_of, data=args.data), names, args.jobs, unit=None):
+        rows.append(row)
+        lines.append(judge.line(row))
+        print(lines[-1], flush=True)
+        if args.json:
+            args.json.write_text(json.dumps(rows, indent=1), encoding="utf-8")
+        if args.out:
+            args.out.write_text("\n".join([*lines, ""]), encoding="utf-8")
+    print(f"{sum(row['verdict'].startswith('ok') for row in rows)} of {len(rows)} ok")
+
+
+def row_of(name: str, data: Path) -> dict[str, Any]:
+    """The figures of one fault, see `judge.judged`. data : folder of measured flights."""
+    from .play import played
+
+    fault = FAULTS[name]
+    part = part_of(flight_of(data), fault.seconds)
+    scene = Scene(fault.begin, fault.end, part.truth)
+    events = fault.change(events_of(part, ("imu", "tdoa", *fault.plays)), scene)
+    judged_by = replace(scene, truth=turned(scene.truth, fault.turned))
+    with tempfile.TemporaryDirectory() as folder:
+        return judge.judged(name, fault, played(events, fault.seconds, fault.parameters, folder), judged_by)
+
+
+@lru_cache(maxsize=1)
+def flight_of(data: Path) -> Flight:
+    """A measured flight out of the folder, or a simulated one."""
+    if (data / FLIGHT).exists():
+        return inputs.Reading(data / "surveys").one(data / FLIGHT)
+    return simulate(SimulationConfig(seed=1, protocol="tdoa3"))
