@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uwb_tdoa_bias.foundation.stamps import CONFIRMED, LARGEST_STEP_AHEAD, LARGEST_STEP_BACK, MOST_HELD, STEP_AHEAD, StampGate
+from uwb_tdoa_bias.foundation.stamps import CONTRADICTED, LARGEST_STEP_AHEAD, LARGEST_STEP_BACK, MOST_HELD, STEP_AHEAD, UNCONTRADICTED, StampGate
 
 
 def through(stamps, reached=()):
@@ -29,8 +29,13 @@ def test_one_wrong_stamp_is_an_outlier():
 
 
 def test_a_jump_that_persists_is_another_time():
-    assert through([50.0, 1.0, 1.1, 1.2, 1.3]) == ([(50.0, 0), (1.0, 1), (1.1, 2), (1.2, 3), (1.3, 4)], [], [4])
-    assert through([0.0, 60.0, 60.1, 60.4]) == ([(0.0, 0), (60.0, 1), (60.1, 2), (60.4, 3)], [], [])
+    assert through([50.0, 1.0, 1.1]) == ([(50.0, 0), (1.0, 1), (1.1, 2)], [], [2])
+    assert through([0.0, 60.0, 60.0, 60.1]) == ([(0.0, 0), (60.0, 1), (60.0, 2), (60.1, 3)], [], [])
+
+
+def test_a_jump_must_persist_for_longer_where_another_stream_goes_on():
+    assert through([50.0, 1.0, 1.1, 1.2, 1.3], [50.1]) == ([(50.0, 0), (1.0, 1), (1.1, 2), (1.2, 3), (1.3, 4)], [], [4])
+    assert through([50.0, 1.0, 1.1, 1.2, 50.1], [50.1]) == ([(50.0, 0), (50.1, 4)], [(1.0, 1), (1.1, 2), (1.2, 3)], [])
 
 
 def test_a_jump_that_another_stream_has_made_is_another_time_at_once():
@@ -43,7 +48,7 @@ def test_a_burst_of_wrong_stamps_shorter_than_a_jump_costs_its_messages_alone(of
     """At 100 Hz. Thirty in a row would be a jump."""
     stamps = [0.01 * k for k in range(200)]
     wrong = [t + off for t in stamps[100 : 100 + count]]
-    accepted, outliers, back = through([*stamps[:100], *wrong, *stamps[100 + count :]])
+    accepted, outliers, back = through([*stamps[:100], *wrong, *stamps[100 + count :]], [1.0])
     assert [place for place, _ in enumerate(stamps) if not 100 <= place < 100 + count] == [place for _, place in accepted]
     assert [t for t, _ in outliers] == wrong and not back
 
@@ -61,7 +66,7 @@ def test_a_slow_stream_goes_on_at_once_and_a_fast_one_makes_no_step_of_a_second(
     for k in range(100):
         assert slow.take(0.45 * k, "x")[0] and fast.take(0.01 * k, "x")[0]
     assert slow.newest + 3.9 * 0.45 < slow.limit < slow.newest + LARGEST_STEP_AHEAD
-    assert fast.limit == fast.newest + STEP_AHEAD and CONFIRMED > STEP_AHEAD
+    assert fast.limit == fast.newest + STEP_AHEAD and UNCONTRADICTED < CONTRADICTED < 1.0
 
 
 def test_the_time_of_useless_items_is_noted():

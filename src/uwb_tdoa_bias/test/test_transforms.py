@@ -95,3 +95,13 @@ def test_frames_are_bounded(monkeypatch):
     with pytest.raises(InputError, match="3 frames already"):
         frames.set("a", "c", (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0))
     frames.set("a", "b1", (0.0, 0.0, 0.0, 1.0), (1.0, 0.0, 0.0))  # one that is known may move
+
+
+def test_a_transform_that_is_sent_again_with_jitter_is_no_other():
+    frames = Frames()
+    assert frames.set("base_link", "imu", (0.0, 0.0, 0.0, 1.0), (0.1, 0.0, 0.0))
+    for k in range(1, 50):  # it does not creep
+        assert not frames.set("base_link", "imu", (0.0, 0.0, 1e-6, 1.0), (0.1 + 1e-4 * min(k, 9), 0.0, 0.0))
+    assert frames.between("base_link", "imu")[1].tolist() == [0.1, 0.0, 0.0]
+    assert frames.set("base_link", "imu", (0.0, 0.0, 1e-3, 1.0), (0.1, 0.0, 0.0))
+    assert frames.set("base_link", "imu", (0.0, 0.0, 1e-3, 1.0), (0.102, 0.0, 0.0))

@@ -37,7 +37,7 @@ from .correction.pose_queue import PoseQueue
 from .correction.network import load_network
 from .correction.poses import parts_of
 from .foundation.ros_topics import several_publishers
-from .foundation.stamps import StampGate
+from .foundation.stamps import LARGEST_STEP_BACK, StampGate
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Sequence
@@ -242,12 +242,13 @@ class BiasNode(StreamNode):
 
     def _take_pose(self, t: float, row: np.ndarray) -> None:
         """One pose, after the gate has judged its stamp."""
-        accepted, _, jumped_back = self._poses.take(t, row)
+        accepted, _, jumped_back = self._poses.take(t, row, [self._tdoas.newest, self._tdoas.held])
         if jumped_back:
             self._start_over()
             held, self._tdoas = self._tdoas.finish(), StampGate()
             for stamp, item in held:
-                self._take([stamp], [item])
+                if item is not None:  # else it was published as it came
+                    self._take([stamp], [item])
         for stamp, row in accepted:
             self._add_poses(np.array([stamp]), row)
 
@@ -282,7 +283,7 @@ class BiasNode(StreamNode):
         _, sec, nanosec, *_ = item
         return self._epoch.seconds(Time(sec=sec, nanosec=nanosec))
 
-    def _take(self, stamps: Sequence[float], items: Iterable[Item]) -> None:
+    def _take(self, stamps: Sequence[float], items: Iterable[Item | None]) -> None:
         """Have TDOAs wait for their poses: stamps, s, as received; items : (frame, sec, nanosec, a, b, d, variance)."""
         stamps = [t - self._late for t in stamps]
         if stamps and self._tdoas.take_all(stamps):
@@ -290,9 +291,12 @@ class BiasNode(StreamNode):
                 self._hold.add(t, item)
             return
         for t, item in zip(stamps, items):
-            accepted, outliers, jumped_back = self._tdoas.take(t, item)
+            if t < self._tdoas.newest - LARGEST_STEP_BACK:  # it needs no pose; ekf_node decides whether another time begins with it
+                self._pass(item)
+                item = None
+            accepted, outliers, jumped_back = self._tdoas.take(t, item, [self._poses.newest])
             for _, outlier in outliers:  # ekf_node says of it that its stamp is wrong
-                self._publish([outlier], Correction.none(np.array(outlier[5:6])))
+                self._pass(outlier)
             if jumped_back:
                 self.get_logger().info("time has gone back: starting over")
                 self._start_over()
@@ -300,7 +304,13 @@ class BiasNode(StreamNode):
                 for stamp, row in held:
                     self._take_pose(stamp, row)
             for stamp, kept in accepted:
-                self._hold.add(stamp, kept)
+                if kept is not None:
+                    self._hold.add(stamp, kept)
+
+    def _pass(self, item: Item | None) -> None:
+        """Publish a TDOA as it came, unless that was done."""
+        if item is not None:
+            self._publish([item], Correction.none(np.array(item[5:6])))
 
     def _release(self) -> None:
         """Publish what need not wait any longer."""

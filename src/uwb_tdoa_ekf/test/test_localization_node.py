@@ -15,6 +15,7 @@ from nav_msgs.msg import Odometry  # noqa: E402
 from rclpy.serialization import serialize_message  # noqa: E402
 from rig import make_rig, recording  # noqa: E402, F401
 from uwb_tdoa_bias.foundation.ros_spinning import Spinner  # noqa: E402
+from uwb_tdoa_ekf import localization_node  # noqa: E402
 from uwb_tdoa_ekf.localization_node import LocalizationNode, _for_all  # noqa: E402
 from uwb_tdoa_msgs.msg import AnchorArray  # noqa: E402
 
@@ -108,3 +109,23 @@ def test_a_tag_that_fails_in_flight_does_not_take_the_others_along(started, monk
     node.turns.take()
     assert served(node) == {f"/{tag}/{name}_node" for tag in "ab" for name in ("bias", "ekf")}
     assert node._report()[0] == DiagnosticStatus.OK and node._tags[1].members == others
+
+
+@pytest.mark.parametrize("error", [OSError("no space left on device"), RuntimeError("failed to create subscription")])
+def test_whatever_is_raised_at_the_start_of_one_tag_concerns_that_tag_alone(started, monkeypatch, error):
+    """As an OSError of a file, or an RCLError of the middleware."""
+    real, failing = localization_node.EkfNode, [True]
+
+    def node_of(*arguments, namespace, **options):
+        if namespace == "/a" and failing.pop():
+            raise error
+        return real(*arguments, namespace=namespace, **options)
+
+    monkeypatch.setattr(localization_node, "EkfNode", node_of)
+    node = started("-p", "tags:=[a, b]")
+    assert served(node) == {"/b/bias_node", "/b/ekf_node"}
+    assert f"tag 'a' has failed and is started again in 1 s: {error}" in node._report()[1]
+    failing.append(False)
+    monkeypatch.setattr(node._tags[0], "_due", 0.0)
+    node.turns.take()
+    assert served(node) == {f"/{tag}/{name}_node" for tag in "ab" for name in ("bias", "ekf")}

@@ -149,11 +149,12 @@ def test_a_stamp_that_is_no_measurement_counts_and_a_lone_one_far_away_is_refuse
 
 def test_a_stream_that_falls_back_starts_anew_and_what_waited_is_late():
     buffer, refused, restarts = buffer_of()
-    buffer.add(IMU_STREAM, *rows(IMU_SAMPLE, 50.0))
+    buffer.add(IMU_STREAM, *rows(IMU_SAMPLE, 50.0, 50.1))
     buffer.add(TDOA_STREAM, *rows(TDOA_ROW, 50.0, 10.0, 10.1))
     assert not refused and not restarts  # it may be a few wrong stamps
     buffer.add(TDOA_STREAM, *rows(TDOA_ROW, 10.2, 10.3))
-    assert sorted(refused) == [(IMU_STREAM, 50.0, LATE), (TDOA_STREAM, 50.0, LATE)] and restarts == [("tdoa", -40.0, False)]
+    assert sorted(refused) == [(IMU_STREAM, 50.0, LATE), (IMU_STREAM, 50.1, LATE), (TDOA_STREAM, 50.0, LATE)]
+    assert restarts == [("tdoa", -40.0, False)]
     assert buffer.take(math.inf).tdoa["t"].tolist() == [10.0, 10.1, 10.2, 10.3]
 
 

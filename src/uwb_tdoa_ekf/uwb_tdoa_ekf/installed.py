@@ -54,7 +54,7 @@ class Installed:
         rows[~stay] = len(self.ids) + np.arange(np.count_nonzero(~stay))
         self.ids = np.append(self.ids, anchors.ids[~stay])
         self.positions = np.concatenate([self.positions, anchors.positions[~stay]])
-        self.anchors, self._rows = anchors, rows
+        self.anchors, self._rows = anchors.at(self.positions[rows]), rows
         return np.setdiff1d(before, rows)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.sensors import LOCATING
-from uwb_tdoa_bias.foundation.stamps import CONFIRMED, LARGEST_STEP_BACK, StampGate, allowed_step, usual_step
+from uwb_tdoa_bias.foundation.stamps import CONTRADICTED, LARGEST_STEP_BACK, StampGate, allowed_step, usual_step
 
 from .core import aids
 from .core.memory import AID, IMU_SAMPLE, TDOA, Measurements, joined
@@ -283,7 +283,7 @@ class ReorderBuffer:
         if self._overtaken is None or t < self._overtaken[0]:
             self._overtaken = t, seen
         since, then = self._overtaken
-        return t - since >= CONFIRMED and (seen - then >= CONFIRMED or seen == then)
+        return t - since >= CONTRADICTED and (seen - then >= CONTRADICTED or seen == then)
 
     def _refuse_outliers(self, place: int, outliers: Sequence[tuple[float, np.ndarray]]) -> None:
         """Refuse rows whose stamps are far from those of their neighbours."""

@@ -15,7 +15,8 @@ STEP_AHEAD, LARGEST_STEP_AHEAD = 0.25, 2.0  # s ahead of the newest stamp, that 
 USUAL = 4.0  # times the usual step of a stream, that it may go at once; one lost message is twice, three are four times
 FORGETTING = 0.1  # share of the usual step that the latest one makes
 NEAR = 0.25  # s between stamps of two streams that confirm each other
-CONFIRMED, FEWEST = 0.3, 3  # s and messages over which a jump must persist where no other stream confirms it
+# s over which a jump must persist that no other stream confirms: where another one goes on in the time before, and where none does
+CONTRADICTED, UNCONTRADICTED = 0.3, 0.05
 MOST_HELD = 1000  # messages of a stream that stands still at another time
 
 
@@ -23,8 +24,8 @@ class StampGate:
     """Let through the items of one stream whose stamps are plausible.
 
     An item with another stamp is held. If the next stamp is plausible again, the held item is an outlier. If the following stamps
-    agree with it, the clock has jumped: the items are accepted. They agree when they have gone on for CONFIRMED seconds, or at once
-    when another stream has reached the same time. A gap in a stream looks like a jump ahead and is treated alike.
+    agree with it, the clock has jumped: the items are accepted. They agree at once when another stream has reached the same time, else
+    when they have gone on for a while. A gap in a stream looks like a jump ahead and is treated alike.
     """
 
     def __init__(self) -> None:
@@ -104,7 +105,8 @@ class StampGate:
         first, last = self._held[0][0], self._held[-1][0]
         if (last > self.newest or len(self._held) > 1) and any(abs(last - t) <= NEAR for t in reached):
             return True
-        return len(self._held) >= FEWEST and last - first >= CONFIRMED
+        contradicted = any(self.newest < t < self.newest + LARGEST_STEP_BACK for t in reached)
+        return last - first >= (CONTRADICTED if contradicted else UNCONTRADICTED)
 
 
 @compiled
