@@ -18,6 +18,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.limits import READ_BYTES, most_unpacked
 
 from ..command_lines import SALVAGE
+from . import write_ahead
 from .integrity import NO_SUM, SUM_KEY, check as check_whole, is_packed, metadata, seal, unpack
 from .kind import is_bag
 from .mcap import Damaged
@@ -101,12 +102,18 @@ def open_bag(path: str | Path, salvage: bool = False) -> Iterator[BagReader]:
 
 
 def _opened(path: Path, folder: Path, salvage: bool) -> BagReader:
-    remarks, readable = [], path
+    given, remarks = path, list[str]()
     try:
+        if files := write_ahead.unclosed(path):
+            path = _with_log(path, folder, salvage, remarks)
+            names = " and ".join(file.name for file in files)
+            remarks.append(f"the recorder did not close {names}: what it left in the -wal file beside it is read as well.")
+        readable = path
         if salvage:
             readable = folder / "sound"
-            remarks = write_sound_part(path, readable)
+            remarks += write_sound_part(path, readable)
         else:
+            write_ahead.check_no_journal(path)
             check_whole(path)
             if path.is_dir() and is_packed(metadata(path)):
                 readable = folder
@@ -124,8 +131,18 @@ def _opened(path: Path, folder: Path, salvage: bool) -> BagReader:
     except InputError:
         raise
     except Exception as error:  # rosbags raises whatever its parsers run into
-        raise _damaged(path, error) from error
+        raise _damaged(given, error) from error
     return reader
+
+
+def _with_log(path: Path, folder: Path, salvage: bool, remarks: list[str]) -> Path:
+    """The bag with what its logs hold, in a folder. Raises Damaged where a log cannot be read, or tells in remarks."""
+    (folder / "closed").mkdir()
+    whole, lost = write_ahead.closed(path, folder / "closed")
+    if lost and not salvage:
+        raise Damaged(lost)
+    remarks += [f"{lost}: read up to there."] if lost else []
+    return whole
 
 
 @contextmanager

@@ -16,6 +16,7 @@ from uwb_tdoa_bias.foundation.sensors import LOCATING
 
 from .. import parallel
 from ..bags.kind import is_bag
+from ..bags.write_ahead import BESIDE
 from . import read_flight
 
 if TYPE_CHECKING:
@@ -169,10 +170,11 @@ class Reading:
 
 
 def _recordings(path: Path) -> Iterator[Path]:
-    """Recordings in a folder, at any depth, or a path that is one. Bags that are files may lie in a folder, as other files do."""
+    """Recordings in a folder, at any depth, or a path that is one. Bags that are files may lie in a folder, as other files do; what SQLite
+    leaves beside them is none."""
     if path.is_file() or (path / "metadata.yaml").exists():
         yield path
         return
     for inside in sorted(path.iterdir()):
-        if not inside.name.startswith("."):
+        if not inside.name.startswith(".") and not inside.name.endswith(BESIDE):
             yield from _recordings(inside)
