@@ -23,7 +23,7 @@ PAUSE = 3600.0  # s for which a recorder may pause, where no arrival times tell
 FEW = 10  # messages that agree with each other and not with those before: another time; fewer are outliers
 NEAR = 20  # messages on both sides of a jump by whose arrivals its size is known
 TOGETHER = 5.0  # s by which a jump may differ between streams of one clock
-MOST = 0.01  # jumps per message; where there are more, no clock is at work, but several tags or a faulty driver
+MOST = 0.01  # jumps per message, or ten; where there are more, no clock is at work, but several tags or a faulty driver
 WRAPS = {  # what counters of drivers hold: s
     "2^40 ticks of 15.65 ps": 2**40 / (128 * 499.2e6),
     "2^32 microseconds": 2**32 * 1e-6,
@@ -121,7 +121,8 @@ class _Break:
 
 
 class _Stream:
-    """Stamps t (n,) s of one stream, in the order of the file; arrived : (n,) s or None."""
+    """Stamps t (n,) s of one stream, in the order of the file; arrived : (n,) s or None; steady : whether they are of one time, without a
+    pause."""
 
     def __init__(self, name: str, t: np.ndarray, arrived: np.ndarray | None) -> None:
         self.name, self.t = name, t
@@ -134,16 +135,9 @@ class _Stream:
         self.usual = float(np.median(rising)) if len(rising) else 0.0  # s
         self.limit = max(AHEAD, SLOW * self.usual)
         self.arrived = arrived if arrived is not None and _sound(arrived) else None
-        far = (steps < -LARGEST_STEP_BACK) | (steps > self.limit)
-        if self.arrived is not None and len(steps):
-            waited = np.diff(self.arrived[self.finite])
-            far |= (steps > LARGEST_STEP_BACK) & (steps - waited > LARGEST_STEP_BACK)
+        far = (steps < -LARGEST_STEP_BACK) | (steps > max(LARGEST_STEP_BACK, 1.5 * self.usual))  # also back from where a stamp was wild
         self._edges = np.concatenate([[0], np.flatnonzero(far) + 1, [len(self.finite)]])
-
-    @property
-    def steady(self) -> bool:
-        """Whether all stamps are of one time, or nearly."""
-        return len(self._edges) == 2 and len(self.finite) > 0
+        self.steady = bool(len(self.finite) and (steps >= -LARGEST_STEP_BACK).all() and (steps <= self.limit).all())
 
     @property
     def end(self) -> float:
@@ -158,23 +152,40 @@ class _Stream:
         for number, (begin, end) in enumerate(pieces):
             first = int(self.finite[begin])
             following = pieces[number + 1][0] if number + 1 < len(pieces) else None
+            many = self._lasts(pieces[number:], few, last)
             if last < 0:
-                accepted = end - begin >= few
-            elif self._continues(last, first, following, ends, end - begin >= few):
+                accepted = many or any(self._follows(end - 1, piece[0]) for piece in pieces[number + 1 : number + 4])
+            elif self._continues(last, first, following, ends, many):
                 accepted = True
-            elif end - begin >= few:
-                accepted = True
-                breaks.append(_Break(first, last, self._size(last, first), self._sure(last, first, following, ends)))
             else:
-                accepted = False
+                accepted = many
+                if many:
+                    breaks.append(_Break(first, last, self._size(last, first), self._sure(last, first, following, ends)))
             if accepted:
                 last = int(self.finite[end - 1])
             else:
                 kept[self.finite[begin:end]] = False
         wild = np.count_nonzero(~kept)
-        if last < 0 or len(breaks) > max(3, MOST * len(self.t)) or wild > 0.1 * len(self.t):
+        if last < 0 or len(breaks) > max(10, MOST * len(self.t)) or wild > 0.1 * len(self.t):
             return  # no clock: as it is
         self.breaks, self.kept = breaks, kept
+
+    def _follows(self, before: int, after: int) -> bool:
+        """Whether the message at one place of `finite` may follow that at another."""
+        return bool(-LARGEST_STEP_BACK <= self.t[self.finite[after]] - self.t[self.finite[before]] <= self.limit)
+
+    def _lasts(self, pieces: Sequence[tuple[int, int]], few: int, last: int) -> bool:
+        """Whether the first of some pieces, with those that follow it and are not of the time of the message at `last`, is of many."""
+        count, behind = 0, pieces[0][1] - 1
+        for begin, end in pieces:
+            if count and not self._follows(behind, begin):
+                break
+            if count and last >= 0 and self.t[self.finite[pieces[0][0]]] < self.t[last] <= self.t[self.finite[begin]]:
+                break  # back in time
+            count, behind = count + end - begin, end - 1
+            if count >= few:
+                return True
+        return False
 
     def _continues(self, last: int, first: int, following: int | None, ends: Sequence[float], many: bool) -> bool:
         """Whether the message at `first` is of the time of the one at `last`, after a pause or none."""
@@ -190,7 +201,7 @@ class _Stream:
             return others and not self._sure(last, first, following, ends)
         if following is None:
             return any(end + self.limit > t[first] for end in ends)
-        return step <= PAUSE and not self._falls(first, following)
+        return step <= PAUSE and -LARGEST_STEP_BACK <= float(self.t[self.finite[following]] - self.t[first]) <= PAUSE
 
     def _falls(self, first: int, following: int | None) -> bool:
         return following is not None and bool(self.t[self.finite[following]] < self.t[first] - LARGEST_STEP_BACK)
@@ -246,10 +257,11 @@ def _groups(streams: list[_Stream]) -> Iterator[list[tuple[_Stream, _Break]]]:
     """Breaks of several streams that are one jump of their clock, each with its stream; the quickest stream comes first."""
     left = {stream.name: list(stream.breaks) for stream in streams}
     for stream in sorted(streams, key=lambda stream: (stream.name not in LEADING, stream.usual)):
-        for one in list(left[stream.name]):
+        while left[stream.name]:
+            one = left[stream.name][0]
             group = [(stream, one)]
             left[stream.name].remove(one)
-            for other in streams:
+            for other in (other for other in streams if other is not stream):
                 for its in left[other.name]:
                     near = abs(its.by - one.by) < TOGETHER and abs(other.t[its.last] - stream.t[one.last]) < TOGETHER + other.usual
                     if near:
@@ -327,3 +339,29 @@ def _long(seconds: float) -> str:
         if seconds > 2.0 * size:
             return f"{seconds:.3f} s ({seconds / size:.1f} {unit})"
     return f"{seconds:.3f} s"
+
+
+def apart(stamps: Mapping[str, np.ndarray]) -> Iterator[tuple[str, float, int]]:
+    """(stream, s by which its stamps are ahead, messages) of those of which no message is stamped within the time of the TDOAs, or which
+    begins and ends as much later, or earlier, than these. stamps : {stream: (n,) s}; "tdoa" is one of them."""
+    tdoa = stamps["tdoa"][np.isfinite(stamps["tdoa"])]
+    if not len(tdoa):
+        return
+    first, last = float(tdoa.min()), float(tdoa.max())
+    for name, t in stamps.items():
+        t = t[np.isfinite(t)]
+        if name == "tdoa" or not len(t):
+            continue
+        begin, end = float(t.min()) - first, float(t.max()) - last
+        outside = t.min() > last or t.max() < first
+        alike = begin * end > 0.0 and min(abs(begin), abs(end)) > LARGEST_STEP_BACK and abs(end - begin) < 0.3 * abs(begin + end) / 2.0
+        if outside or (alike and name == "imu"):
+            yield name, 0.5 * (begin + end), len(t)
+
+
+def sentence_on(name: str, ahead: float, count: int, first: str = "TDOAs") -> str:
+    """What is to be said of a stream that is `apart`."""
+    return (
+        f"the stamps of {WORDS.get(name, name)} are {abs(ahead):.3f} s {'ahead of' if ahead > 0.0 else 'behind'} those of the {first}: "
+        f"none of its {count} messages can be used as they are; check names the remedy"
+    )

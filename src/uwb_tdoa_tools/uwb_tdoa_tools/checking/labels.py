@@ -11,7 +11,7 @@ from uwb_tdoa_ekf.streams import ERROR, NOTE, WARNING, Finding
 
 from ..bags.messages import BODY_FRAME
 from ..bags.placing import is_body
-from ..clock import RESTART, SET, SILENCE, WORDS, WRAP, in_words
+from ..clock import RESTART, SET, SILENCE, WORDS, WRAP, apart, in_words
 from .recording import IMU
 from .tdoa_rules import furthest, same_place
 
@@ -127,10 +127,19 @@ def clock(recording: Recording) -> Iterator[Finding]:
         yield Finding("stamps_wild", WARNING, cause, "they are left out here, and by the nodes", remedy, float(count))
 
 
+def other_time(recording: Recording) -> Iterator[Finding]:
+    """A sensor of which no message is stamped within the time of the TDOAs; what is about the IMU, stream rules say, unless it is alone."""
+    for name, ahead, count in apart({"tdoa": recording.tdoa.t, **{name: of.t for name, of in recording.sensors.items()}}):
+        topic = WORDS.get(name, name)
+        cause = f"the stamps of {topic} are {abs(ahead):.3f} s {'ahead of' if ahead > 0.0 else 'behind'} those of uwb/tdoa"
+        evidence = f"none of its {count} messages is stamped within the time of the TDOAs: none can be used"
+        yield Finding("sensor_apart", ERROR, cause, evidence, "stamp all sensors with the clock of one machine", ahead)
+
+
 CLOCK_REMEDY = {
     RESTART: "record each start of the tag by itself; live, ekf_node starts anew there",
     WRAP: "count the wraps in the driver: live, ekf_node starts anew at each of them",
     SET: "set the clock before the recording begins (chronyc waitsync), or stamp with a clock that nobody sets",
     SILENCE: "record with ros2 bag record, whose arrival times tell one from the other",
 }
-RULES = (frames, senders, no_imu, anchors, sorted_file, clock)
+RULES = (frames, senders, no_imu, anchors, sorted_file, clock, other_time)

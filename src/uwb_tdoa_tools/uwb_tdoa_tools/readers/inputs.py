@@ -11,12 +11,14 @@ import numpy as np
 from tqdm import tqdm
 
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.flight import AIDS
 from uwb_tdoa_bias.foundation.foreign_text import printable
 from uwb_tdoa_bias.foundation.sensors import LOCATING
 
 from .. import parallel
 from ..bags.kind import is_bag
 from ..bags.write_ahead import BESIDE
+from ..clock import apart, sentence_on
 from . import read_flight
 
 if TYPE_CHECKING:
@@ -137,6 +139,8 @@ class Reading:
         path, survey = recording
         flight = read_flight(path, survey, self.namespace, self.salvage, self.topics, self.truth)
         report_remarks(path, flight.meta.get("remarks", ()))
+        beside = {name: stream.t for name in ("tdoa", "imu", *AIDS) if (stream := getattr(flight, name)) is not None}
+        report_remarks(path, (f"{sentence_on(*one)}." for one in apart(beside)))
         return flight
 
     def one(self, path: str | Path) -> Flight:
