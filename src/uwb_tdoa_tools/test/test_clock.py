@@ -14,7 +14,8 @@ RATES = {"imu": 100.0, "tdoa": 50.0, "height": 10.0}
 def stamps_of(duration=20.0, rates=RATES, start=3.0, seed=0):
     rng = np.random.default_rng(seed)
     return {
-        name: start + (np.arange(int(duration * rate)) + rng.uniform(-0.2, 0.2, int(duration * rate))) / rate for name, rate in rates.items()
+        name: start + (np.arange(int(duration * rate)) + rng.uniform(-0.2, 0.2, int(duration * rate))) / rate
+        for name, rate in rates.items()
     }
 
 

@@ -53,7 +53,8 @@ def test_nothing_is_written_but_by_the_functions_for_it():
 
 
 @pytest.mark.parametrize(
-    "line", ["open(p, 'w')", "p.open('wb')", "p.write_text('a')", "p.write_bytes(b'')", "figure.savefig(p)", "np.savetxt(p, a)", "json.dump(a, p)"]
+    "line",
+    ["open(p, 'w')", "p.open('wb')", "p.write_text('a')", "p.write_bytes(b'')", "figure.savefig(p)", "np.savetxt(p, a)", "json.dump(a, p)"],
 )
 def test_a_direct_write_is_found(tmp_path, line):
     (tmp_path / "a.py").write_text(line)

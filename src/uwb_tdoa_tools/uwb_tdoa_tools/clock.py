@@ -37,6 +37,7 @@ WRAPS = {  # what counters of drivers hold: s
     "a day": 86400.0,
     "a week": 604800.0,
 }  # fmt: skip
+SPARSE = 50.0  # times of a grid for each message; where there are more, most are far from any
 WRAP_TOLERANCE = 0.1  # s
 WORDS = {"tdoa": "uwb/tdoa", "gyro": "imu/data", "acc": "imu/data", "imu": "imu/data", "pose": "ground_truth/pose"} | {
     name: sensor.topics[0][0] for name, sensor in SENSORS.items()
@@ -193,7 +194,8 @@ class _Stream:
         if step < -LARGEST_STEP_BACK:
             return False
         if self.arrived is not None:
-            return bool(self._by_arrival(last, first) < LARGEST_STEP_BACK) if many else bool(step - self._waited(last, first) < LARGEST_STEP_BACK)
+            ahead = self._by_arrival(last, first) if many else step - float(self.arrived[first] - self.arrived[last])
+            return bool(ahead < LARGEST_STEP_BACK)
         if step <= self.limit:
             return True
         if many:
@@ -214,10 +216,6 @@ class _Stream:
             return True
         without = any(abs(self.end - step - end) < TOGETHER for end in ends)
         return without and not any(abs(self.end - end) < 0.5 * step for end in ends)
-
-    def _waited(self, last: int, first: int) -> float:
-        assert self.arrived is not None
-        return float(self.arrived[first] - self.arrived[last])
 
     def _by_arrival(self, last: int, first: int) -> float:
         """By how much the clock jumped, s, by the arrivals of the messages on both sides."""
@@ -316,7 +314,8 @@ def sentences(clock: Straightened) -> Iterator[str]:
         cause, done = in_words(jump)
         yield f"{cause}: {done}."
     for name, count in clock.outliers.items():
-        yield f"{WORDS.get(name, name)}: {count} of {len(clock.kept[name])} messages left out, their stamps are far from those of their neighbours."
+        of = f"{count} of {len(clock.kept[name])} messages"
+        yield f"{WORDS.get(name, name)}: {of} left out, their stamps are far from those of their neighbours."
 
 
 def in_words(jump: Jump) -> tuple[str, str]:
@@ -365,3 +364,21 @@ def sentence_on(name: str, ahead: float, count: int, first: str = "TDOAs") -> st
         f"the stamps of {WORDS.get(name, name)} are {abs(ahead):.3f} s {'ahead of' if ahead > 0.0 else 'behind'} those of the {first}: "
         f"none of its {count} messages can be used as they are; check names the remedy"
     )
+
+
+def numbered(t: np.ndarray, length: float) -> np.ndarray:
+    """(n,) number of the stretch of `length`, s, in which each of t (n,) s is, from 0: without the empty ones where most would be empty, so
+    that an array with a place for each takes no more room than t."""
+    number = ((t - np.min(t, initial=np.inf)) / length).astype(np.int64) if len(t) else np.zeros(0, np.int64)
+    if len(t) and number.max() >= len(t):
+        number = np.unique(number, return_inverse=True)[1].reshape(-1)
+    return number
+
+
+def grid(begin: float, end: float, step: float, t: np.ndarray) -> np.ndarray:
+    """Times from `begin` to before `end`, every `step`, s; only those up to `step` before one of t (n,) s where they would be far more
+    than these."""
+    if end - begin <= step * SPARSE * max(len(t), 1000):
+        return np.arange(begin, max(begin, end), step)
+    inside = t[(t >= begin) & (t < end)]
+    return begin + step * np.unique(np.floor((inside - begin) / step))

@@ -61,8 +61,8 @@ _PRINTED = "source", "format", "protocol"  # of that meta: texts that are read a
 
 
 class _Kind(NamedTuple):
-    """Of a stream of a Flight: our topic, the type of its messages, row(message) as for `read_topic`, make(stamps s, rows) : the stream, and
-    sound(rows) : whether its numbers can be used."""
+    """Of a stream of a Flight: our topic, the type of its messages, row(message) as for `read_topic`, make(stamps s, rows) : the stream,
+    and sound(rows) : whether its numbers can be used."""
 
     topic: str
     message: str
@@ -373,15 +373,16 @@ class TopicMessages:
         order = np.argsort(self.stamps, kind="stable")
         return self.stamps[order] / 1e9, self.rows[order], int((np.diff(self.stamps) < 0).sum())
 
-    def arrival(self) -> np.ndarray:
-        """(n,) s at which they were recorded; NaN of a bag whose times are the stamps themselves: they tell no arrivals."""
-        known = bool((self.stamps != self.arrived).any())
-        return self.arrived / 1e9 if known else np.full(len(self.arrived), np.nan)
+
+def arrivals(found: Mapping[str, TopicMessages]) -> dict[str, np.ndarray]:
+    """{stream: (n,) s at which its messages were recorded}; NaN of a bag all of whose times are the stamps themselves: they tell none."""
+    known = any(bool((of.stamps != of.arrived).any()) for of in found.values())
+    return {name: of.arrived / 1e9 if known else np.full(len(of.arrived), np.nan) for name, of in found.items()}
 
 
 def on_one_clock(found: Mapping[str, TopicMessages]) -> tuple[dict[str, TopicMessages], Straightened]:
     """The TopicMessages of a recording, by the names of their streams, on one continuous time and without outliers, and what was done."""
-    clock = straightened({name: of.stamps / 1e9 for name, of in found.items()}, {name: of.arrival() for name, of in found.items()})
+    clock = straightened({name: of.stamps / 1e9 for name, of in found.items()}, arrivals(found))
     out = dict(found)
     for name in {*clock.shifts, *clock.kept}:
         of, kept = found[name], clock.kept.get(name, slice(None))

@@ -11,7 +11,7 @@ from uwb_tdoa_ekf.streams import ERROR, NOTE, WARNING, Finding
 
 from ..bags.messages import BODY_FRAME
 from ..bags.placing import is_body
-from ..clock import RESTART, SET, SILENCE, WORDS, WRAP, apart, in_words
+from ..clock import SET, SILENCE, WORDS, WRAP, apart, in_words
 from .recording import IMU
 from .tdoa_rules import furthest, same_place
 
@@ -119,8 +119,18 @@ def clock(recording: Recording) -> Iterator[Finding]:
     """A clock that started again, wrapped or was set while it was recorded, and single stamps of no time at all."""
     for jump in recording.jumps:
         cause, done = in_words(jump)
-        severity = WARNING if jump.kind == SILENCE else ERROR
-        yield Finding(f"clock_{jump.kind}", severity, cause, done, CLOCK_REMEDY[jump.kind], jump.by)
+        if jump.kind == SILENCE:
+            remedy = "record with ros2 bag record, whose arrival times tell one from the other"
+            yield Finding("clock_silence", WARNING, cause, done, remedy, jump.by)
+        elif jump.kind == WRAP:
+            remedy = "count the wraps in the driver: live, ekf_node starts anew at each of them"
+            yield Finding("clock_wrap", ERROR, cause, done, remedy, jump.by)
+        elif jump.kind == SET:
+            remedy = "set the clock before the recording begins (chronyc waitsync), or stamp with a clock that nobody sets"
+            yield Finding("clock_set", ERROR, cause, done, remedy, jump.by)
+        else:
+            remedy = "record each start of the tag by itself; live, ekf_node starts anew there"
+            yield Finding("clock_restart", ERROR, cause, done, remedy, jump.by)
     for name, count in recording.outliers.items():
         cause = f"{count} messages of {WORDS.get(name, name)} have stamps far from those of their neighbours"
         remedy = "stamp when the sample is measured; look for a field that is not initialised, or a transfer that is not checked"
@@ -136,10 +146,4 @@ def other_time(recording: Recording) -> Iterator[Finding]:
         yield Finding("sensor_apart", ERROR, cause, evidence, "stamp all sensors with the clock of one machine", ahead)
 
 
-CLOCK_REMEDY = {
-    RESTART: "record each start of the tag by itself; live, ekf_node starts anew there",
-    WRAP: "count the wraps in the driver: live, ekf_node starts anew at each of them",
-    SET: "set the clock before the recording begins (chronyc waitsync), or stamp with a clock that nobody sets",
-    SILENCE: "record with ros2 bag record, whose arrival times tell one from the other",
-}
 RULES = (frames, senders, no_imu, anchors, sorted_file, clock, other_time)

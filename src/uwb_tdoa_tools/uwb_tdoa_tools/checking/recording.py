@@ -15,7 +15,7 @@ from uwb_tdoa_bias.foundation.flight import Imu, Tdoas
 from uwb_tdoa_bias.foundation.sensors import LOCATING, SENSORS
 
 from ..bags import messages as bag_messages, placing
-from ..bags.bag import Names, on_one_clock, read_anchors, read_topic
+from ..bags.bag import Names, arrivals, on_one_clock, read_anchors, read_topic
 from ..bags.files import open_bag, remarks_of
 from ..bags.placing import TF_STATIC
 from ..readers import read_survey
@@ -49,8 +49,8 @@ class Recording:
     with the body, where the samples are those of an IMU in its origin;
     topics : {topic: type} of a bag, or of all that are live; recorded : Anchors that the bag itself holds, or None; falls :
     how often the stamps fell in a file whose reader has sorted them; remarks : sentences on what could not be read of a
-    damaged one; ends : [End] of live topics; sensors : {name: Stream} of those of the SENSORS that there are; jumps : of the clock, which is
-    continuous here, and outliers : {stream: messages left out because of their stamps}.
+    damaged one; ends : [End] of live topics; sensors : {name: Stream} of those of the SENSORS that there are; jumps : of the clock, which
+    is continuous here, and outliers : {stream: messages left out because of their stamps}.
     """
 
     name: str
@@ -118,10 +118,10 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
         kinds = {"tdoa": (TDOA, *_ROWS[TDOA]), "imu": (IMU, *_ROWS[IMU])}
         kinds |= {name: (of.topics[0][0], of.message, bag_messages.of_sensor(of)[0]) for name, of in SENSORS.items()}
         found = {name: read_topic(path, reader, name_of(topic), kind, row) for name, (topic, kind, row) in kinds.items()}
-        arrival = {name: found[name].arrival() for name in ("tdoa", "imu")}
+        arrival = arrivals(found)
         found, clock = on_one_clock(found)
         tdoa, imu = found["tdoa"], found["imu"]
-        arrival = {name: times[clock.kept.get(name, slice(None))] for name, times in arrival.items()}
+        arrival = {name: arrival[name][clock.kept.get(name, slice(None))] for name in ("tdoa", "imu")}
         sensors = {name: _stream_of(found[name], sensor) for name, sensor in SENSORS.items() if len(found[name].stamps)}
         recorded = read_anchors(path, reader, name_of("uwb/anchors"))
         tree = placing.read_frames(path, reader)
