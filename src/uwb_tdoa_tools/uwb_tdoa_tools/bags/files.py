@@ -250,8 +250,10 @@ def messages(
 def readable(
     path: str | Path, reader: BagReader, connections: list[Connection]
 ) -> Iterator[tuple[Connection, int, Any]]:
-    """The same as (connection, stamp ns, message): what are no such messages, as a faulty publisher sends them, is counted too. Where the times of a bag fall back, in the order in which
-    they were written."""
+    """The same as (connection, stamp ns, message): what are no such messages, as a faulty publisher sends them, is counted too.
+
+    Where the times of a bag fall back, in the order in which they were written.
+    """
     for connection, stamp, data in messages(path, reader, connections, written=True):
         try:
             if len(data) > READ_BYTES:
