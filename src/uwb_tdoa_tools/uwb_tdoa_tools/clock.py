@@ -100,9 +100,9 @@ def straightened(stamps: Mapping[str, np.ndarray], arrived: Mapping[str, np.ndar
     whole = {name: t + shifts.get(name, 0.0) for name, t in stamps.items()} if jumps else {}
     begin = min((float(np.min(t[found[name].kept], initial=np.inf)) for name, t in whole.items()), default=0.0)
     done = []
-    for jump, members in jumps:
+    for named, members in jumps:
         at = min(float(whole[stream.name][of.first]) for stream, of in members)
-        done.append(jump._replace(at=at, after=at - begin))
+        done.append(named._replace(at=at, after=at - begin))
     done.sort(key=lambda jump: jump.at)
     restarts = [jump.at for jump in done if jump.kind == RESTART and not set(jump.streams).isdisjoint(LEADING)]
     kept = {name: stream.kept for name, stream in found.items() if not stream.kept.all()}

@@ -207,7 +207,7 @@ def read_bag(
     with open_bag(path, salvage) as reader:
         about = _about(path)
         meta = {**about["meta"], "bag": str(path)}
-        remarks, name_of = [], Names(namespace, topics)
+        remarks, name_of = list[str](), Names(namespace, topics)
         kinds = _STREAMS if truth else {name: kind for name, kind in _STREAMS.items() if name != "pose"}
         found = {name: read_topic(path, reader, name_of(kind.topic), kind.message, kind.row) for name, kind in kinds.items()}
         found, clock = on_one_clock(found)

@@ -96,8 +96,10 @@ def make_flight(
         velocity = velocity if len(velocity.t) else None
     if not meta["remarks"]:
         del meta["remarks"]
-    aids = {"height": height, "pressure": pressure, "velocity": velocity, "range": distances}
-    return Flight(name, anchors, tdoas, imu, poses, extra, meta, clock.restarts, **aids)
+    return Flight(
+        name, anchors, tdoas, imu, poses, extra, meta, clock.restarts,
+        height=height, pressure=pressure, velocity=velocity, range=distances,
+    )  # fmt: skip
 
 
 def _measured(columns: Columns, *ids: str) -> tuple[np.ndarray, ...]:
