@@ -2,7 +2,6 @@
 
 Ratios of the 3D RMSE of the tag after and before; 1 where nothing is offered."""
 
-import argparse
 from dataclasses import replace
 import json
 from pathlib import Path
@@ -11,6 +10,7 @@ import numpy as np
 from tqdm import tqdm
 
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
+from uwb_tdoa_bias.foundation.files import write_text
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools.calibrating.calibrate import without_truth
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
@@ -36,7 +36,7 @@ def add_options(add):
     add("--first", type=int, default=200, metavar="SEED", help="of the first draw (default 200)")
     add("--std", type=float, default=0.1, metavar="M", help="of each coordinate of an anchor (default 0.1)")
     add("--only", choices=(*SETS, SIMULATED), help="one set")
-    add("--json", type=argparse.FileType("w"), metavar="FILE", help="write every draw")
+    add("--json", metavar="FILE", help="write every draw")
 
 
 def run(args):
@@ -51,7 +51,7 @@ def run(args):
         every[name] = [draw(flights, holdout, others, args.std, seed) for seed in tqdm(seeds, desc=name, disable=None)]
         print(f"| {name} | {len(every[name])} | {summary(every[name])} |", flush=True)
     if args.json:
-        json.dump(every, args.json, indent=1)
+        write_text(args.json, json.dumps(every, indent=1))
 
 
 def flights_of(name, data):

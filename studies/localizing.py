@@ -6,11 +6,11 @@ was not lost."""
 from dataclasses import replace
 from functools import partial
 import json
-from pathlib import Path
 
 from mistakes import MISTAKES
 import numpy as np
 
+from uwb_tdoa_bias.foundation.files import write_text
 from uwb_tdoa_tools import options, parallel
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.localizing.belief import GOOD, believe
@@ -34,7 +34,7 @@ def run(args):
     for told in parallel.over(partial(judge, reading=reading, mistakes=args.mistakes), reading.find(args.flights), args.jobs):
         rows += told
         if args.json:
-            Path(args.json).write_text(json.dumps(rows, indent=1))
+            write_text(args.json, json.dumps(rows, indent=1))
     print("| recordings | number | good | of these within what is stated | not good | of these within |\n|---|" + 5 * "---:|")
     for what, some in (
         ("as they are", [r for r in rows if r["mistake"] == NOTHING]),

@@ -1,6 +1,5 @@
 """Surveys of measured flights, shaken and made better from the flights alone; the tag is judged on other flights."""
 
-import argparse
 from dataclasses import replace
 from functools import partial
 import json
@@ -10,6 +9,7 @@ from known_effects import clean_flight, marks_of
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from uwb_tdoa_bias.foundation.files import write_text
 from uwb_tdoa_bias.foundation.flight import AIDS
 from uwb_tdoa_tools import parallel
 from uwb_tdoa_tools.diagnosis import diagnose
@@ -50,7 +50,7 @@ def add_options(add):
     add("--jobs", type=whole_number, default=1, metavar="N", help="draws at once (default 1)")
     add("--known", choices=(*KNOWN, "odometry"), help="instead: flights of every split with this known beside, judged on others")
     add("--split", choices=tuple(SPLITS), help="with --known: one of these alone")
-    add("--json", type=argparse.FileType("w"), metavar="FILE", help="write every draw")
+    add("--json", metavar="FILE", help="write every draw")
 
 
 def run(args):
@@ -70,7 +70,7 @@ def run(args):
             every[f"{name} {std}"] = draws
             print(f"| {name} | {std} | {_summary(draws)} |", flush=True)
     if args.json:
-        json.dump(every, args.json, indent=1)
+        write_text(args.json, json.dumps(every, indent=1))
 
 
 def with_known(data, kind, splits, seed):

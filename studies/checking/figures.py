@@ -8,6 +8,7 @@ from pathlib import Path
 from mistakes import MISTAKES, arriving
 import numpy as np
 
+from uwb_tdoa_bias.foundation.files import write_text
 from uwb_tdoa_ekf.streams import ERROR
 from uwb_tdoa_tools import parallel
 from uwb_tdoa_tools.checking.check import check
@@ -46,7 +47,7 @@ def run(args):
     for said in parallel.over(judge, tasks, args.jobs):
         rows += said
         if args.json:
-            Path(args.json).write_text(json.dumps(rows, indent=1))
+            write_text(args.json, json.dumps(rows, indent=1))
     print(table(rows))
 
 

@@ -11,6 +11,7 @@ import time
 from mistakes import MISTAKES, arriving
 import numpy as np
 
+from uwb_tdoa_bias.foundation.files import write_text
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.checking.tdoa_rules import furthest
 from uwb_tdoa_tools.readers import inputs, read_survey
@@ -53,7 +54,7 @@ def run(args):
             rows.append({"mistake": name, **nodes.said(made)})
             print(line(rows[-1]), flush=True)
             if args.json:
-                Path(args.json).write_text(json.dumps(rows, indent=1))
+                write_text(args.json, json.dumps(rows, indent=1))
 
 
 def line(row):

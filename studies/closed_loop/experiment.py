@@ -17,6 +17,7 @@ from tqdm import tqdm
 
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.files import write_text
 from uwb_tdoa_bias.foundation.flight import Flight
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools import cli, parallel
@@ -86,7 +87,7 @@ def run(args: Namespace) -> None:
     told = [dict(zip(("by", "constellation", "trajectory", "flights"), (*kind, some))) for kind, some in verdicts.items()]
     cli.write_json(out / "flights.json", {"kinds": told})
     lines = "\n".join(table(verdicts))
-    (out / "table.md").write_text(lines + "\n")
+    write_text(out / "table.md", lines + "\n")
     print(lines)
     shown = {by: [drawn for _, drawn in of_kind[by, UNSEEN[0], "A"]] for by in ESTIMATORS}
     pictures.draw_errors_by_kind(verdicts, out / "rmse.png")

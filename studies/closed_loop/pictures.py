@@ -1,10 +1,12 @@
 """Counterparts of figures 7 to 9 of Zhao et al. (RA-L 2021)."""
 
+from functools import partial
 from pathlib import Path
 
 from matplotlib.figure import Figure
 import numpy as np
 
+from uwb_tdoa_bias.foundation.files import write_filled
 from uwb_tdoa_tools.scoring.plots import plt
 
 COLOURS = "0.55", "tab:red", "tab:cyan", "tab:olive", "tab:green"
@@ -77,5 +79,5 @@ def draw_errors(shown: dict[str, list], path: Path) -> None:
 
 
 def _save(figure: Figure, path: Path) -> None:
-    figure.savefig(path, dpi=110)
+    write_filled(path, partial(figure.savefig, dpi=110))
     plt.close(figure)

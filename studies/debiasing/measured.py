@@ -8,6 +8,7 @@ import numpy as np
 
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.files import write_text
 from uwb_tdoa_bias.foundation.flight import AIDS
 from uwb_tdoa_ekf.debias import fit
 from uwb_tdoa_tools import parallel
@@ -40,8 +41,8 @@ def run(args):
     """Write measured.md and measured.json, and print the tables."""
     args.out.mkdir(parents=True, exist_ok=True)
     figures = judged(args.data, args.diagnosed, args.jobs)
-    (args.out / "measured.md").write_text(measured_tables(figures))
-    (args.out / "measured.json").write_text(json.dumps(figures, indent=1, allow_nan=False) + "\n")
+    write_text(args.out / "measured.md", measured_tables(figures))
+    write_text(args.out / "measured.json", json.dumps(figures, indent=1, allow_nan=False) + "\n")
     print(measured_tables(figures))
 
 

@@ -1,7 +1,10 @@
 """Tables and a picture of docs/debiasing.md."""
 
+from functools import partial
+
 import numpy as np
 
+from uwb_tdoa_bias.foundation.files import write_filled
 from uwb_tdoa_tools.scoring.plots import plt
 
 
@@ -86,7 +89,7 @@ def plot_set_up(found, maps, path):
     axes[0].set_ylabel("y, m")
     axes[0].legend(loc="upper right", fontsize="small")
     figure.suptitle("Bias of the position, arrows five times as long as the bias")
-    figure.savefig(path, dpi=80)
+    write_filled(path, partial(figure.savefig, dpi=80))
     plt.close(figure)
 
 

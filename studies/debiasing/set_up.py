@@ -11,6 +11,7 @@ import numpy as np
 
 from uwb_tdoa_bias.effects import EFFECTS
 from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.files import write_text
 from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.debias import INTERPOLATORS, LayerConfig, Layers, Part, fit
@@ -65,8 +66,8 @@ def run(args):
     """Write set_up.md, set_up.json and set_up.png, and print the tables."""
     args.out.mkdir(parents=True, exist_ok=True)
     figures, found, maps = copied(args.seed, args.jobs)
-    (args.out / "set_up.md").write_text(set_up_tables(figures))
-    (args.out / "set_up.json").write_text(json.dumps(figures, indent=1, allow_nan=False) + "\n")
+    write_text(args.out / "set_up.md", set_up_tables(figures))
+    write_text(args.out / "set_up.json", json.dumps(figures, indent=1, allow_nan=False) + "\n")
     plot_set_up(found, maps, args.out / "set_up.png")
     print(set_up_tables(figures))
 

@@ -11,6 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.files import write_filled, write_text
 from uwb_tdoa_bias.foundation.flight import AIDS
 from uwb_tdoa_tools.diagnosis import diagnose
 from uwb_tdoa_tools.diagnosis.references import Heights, Nothing
@@ -75,7 +76,7 @@ def run(args):
         "speed": _speed,
     }[args.part](args)
     result["seconds"] = round(time.monotonic() - started, 1)
-    (args.out / f"{args.part}.json").write_text(json.dumps(result, indent=1, default=float))
+    write_text(args.out / f"{args.part}.json", json.dumps(result, indent=1, default=float))
     print(json.dumps(result["figures"], indent=1, default=float))
 
 
@@ -228,7 +229,7 @@ def _confusions(results, path):
             count[rows.index(one), columns.index(other)] += 1
         _matrix(ax, count, rows, columns)
         ax.set_title(key)
-    figure.savefig(path, dpi=80)
+    write_filled(path, partial(figure.savefig, dpi=80))
     plt.close(figure)
 
 
@@ -257,5 +258,5 @@ def _confusion(results, path):
         count[row, columns.index(first) if first in columns else len(names)] += 1
     figure, ax = plt.subplots(figsize=(11, 10), layout="constrained")
     _matrix(ax, count, [*names, "nothing"], columns)
-    figure.savefig(path, dpi=80)
+    write_filled(path, partial(figure.savefig, dpi=80))
     plt.close(figure)

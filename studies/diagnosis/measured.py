@@ -7,6 +7,7 @@ from known_effects import AIDED as ON_AIDS
 from known_effects import RANGED, SIZES, effect_of
 import numpy as np
 
+from uwb_tdoa_bias.foundation.files import write_text
 from uwb_tdoa_bias.foundation.flight import AIDS
 from uwb_tdoa_tools.diagnosis import diagnose, output
 from uwb_tdoa_tools.diagnosis.attribution import attribute
@@ -98,10 +99,10 @@ def run(data, name, out, aids=()):
     result = diagnose(load(data, fit, aids), load(data, judge, aids))
     folder = out / folder_of(name)
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "report.html").write_text(html(result))
+    write_text(folder / "report.html", html(result))
     result.effects.to_yaml(folder / "effects.yaml")
     content = output.as_json(result)
-    (folder / "diagnosis.json").write_text(json.dumps(content, indent=1, allow_nan=False))
+    write_text(folder / "diagnosis.json", json.dumps(content, indent=1, allow_nan=False))
     sides = {side: [row["rmse_3d"] for row in content[side]["runs"]] for side in ("before", "after")}
     summary = {
         "mean 3D before": round(float(np.mean(sides["before"])), 3),

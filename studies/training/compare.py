@@ -10,6 +10,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.files import write_text
 from uwb_tdoa_bias.foundation.flight import AIDS
 from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.training import models
@@ -41,8 +42,8 @@ def run(args):
     report = compare(train, tests, args.models, args.out, args.seed, args.validation, args.bound)
     table = markdown(report)
     print(table)
-    (args.out / "table.md").write_text(table)
-    (args.out / "comparison.json").write_text(json.dumps(report, indent=1) + "\n")
+    write_text(args.out / "table.md", table)
+    write_text(args.out / "comparison.json", json.dumps(report, indent=1) + "\n")
 
 
 def _simulated(args):

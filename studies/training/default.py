@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from uwb_tdoa_bias.correction.corrector import LARGEST_YAW_STD
 from uwb_tdoa_bias.correction.network import Network
+from uwb_tdoa_bias.foundation.files import write_bytes
 from uwb_tdoa_bias.foundation.flight import AIDS
 from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.scoring.evaluation import evaluate
@@ -85,5 +86,5 @@ def scaled(model, measured):
 
 def write(model, meta, path):
     """Write the model; returns it as a Network."""
-    path.write_bytes(model.onnx(meta).SerializeToString(deterministic=True))
+    write_bytes(path, model.onnx(meta).SerializeToString(deterministic=True))
     return Network(path)

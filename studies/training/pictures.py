@@ -1,11 +1,13 @@
 """Pictures of comparisons of bias models."""
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from scipy.stats import norm
 
+from uwb_tdoa_bias.foundation.files import write_filled
 from uwb_tdoa_tools.scoring.plots import plt
 
 COLOURS = {
@@ -28,7 +30,7 @@ def plot_histograms(errors: Mapping[str, np.ndarray], path: Path) -> None:
         ax.plot(bins, norm.pdf(bins, mean, std), "k--", lw=1)
         ax.set_title(f"{name}: mean {100 * mean:.1f} cm, deviation {100 * std:.1f} cm", fontsize="small")
     axes[-1, 0].set_xlabel("error of a TDOA [m]")
-    figure.savefig(path, dpi=110)
+    write_filled(path, partial(figure.savefig, dpi=110))
     plt.close(figure)
 
 
@@ -43,5 +45,5 @@ def plot_bars(groups: Mapping[str, Mapping[str, float]], path: Path) -> None:
     ax.set_ylabel("3D RMSE [m]")
     ax.grid(axis="y", alpha=0.3)
     figure.legend(loc="outside upper center", ncols=3, fontsize="small")
-    figure.savefig(path, dpi=110)
+    write_filled(path, partial(figure.savefig, dpi=110))
     plt.close(figure)

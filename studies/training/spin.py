@@ -1,6 +1,7 @@
 """spin: simulate a tag that spins between two anchors, and draw the error of their TDOA over its yaw, for several
 orientations of anchor 0 and for five specimens of the tag. Counterpart of figure 4 of Zhao et al. (2021)."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.effects import true_samples
 from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.files import write_filled
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_tools.scoring.plots import plt
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
@@ -42,7 +44,7 @@ def run(args):
         ax.grid(alpha=0.3)
         ax.legend(fontsize="small")
     axes[0].set_ylabel("error of d_01, median of 10 deg [cm]")
-    figure.savefig(args.out, dpi=110)
+    write_filled(args.out, partial(figure.savefig, dpi=110))
     plt.close(figure)
     print(f"wrote {args.out}")
 

@@ -17,6 +17,7 @@ import tempfile
 import yaml
 from uwb_tdoa_bias import anchors_node, bias_node
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.files import write_text
 from uwb_tdoa_bias.foundation.safe_yaml import read_yaml
 
 from . import debias_node
@@ -254,7 +255,7 @@ def pooled(starts: list[Start], processes: int | str) -> list[Start]:
     folder = Path(tempfile.mkdtemp(prefix="uwb_tdoa_tags_"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)  # a node that is started again reads it again
     file = folder / "tags.yaml"
-    file.write_text(yaml.safe_dump(by_node, allow_unicode=True), encoding="utf-8")
+    write_text(file, yaml.safe_dump(by_node, allow_unicode=True))
     frozen = all(each.parameters and each.parameters[-1].get("frozen") for each in members)
     namespaces, out = list(dict.fromkeys(each.namespace for each in members)), [each for each in starts if each not in members]
     for k in range(min(int(processes), len(namespaces))):

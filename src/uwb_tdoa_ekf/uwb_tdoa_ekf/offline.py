@@ -24,7 +24,7 @@ from .reorder_buffer import FIRST_AID, IMU_STREAM, TDOA_STREAM, ReorderBuffer
 from .results import VERDICTS, Odometry, Residuals
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from uwb_tdoa_bias.foundation.flight import Flight
     from .pipeline import Fed
@@ -62,7 +62,7 @@ def run_offline(
 
     flight : Flight; config : FilterConfig; corrector : Corrector, whose poses are forgotten first, or None for no
     correction; records : list to which the history of the run is appended (see engine.feed), or None. Returns a Run. A
-    measurement uses only what was stamped before it, as on line.
+    measurement uses only what was stamped before it, as on line. The filter starts anew at each of the restarts of the Flight.
     """
     config = config or FilterConfig()
     corrector = corrector or Corrector(flight.anchors)
@@ -71,12 +71,18 @@ def run_offline(
     tdoa, anchors = flight.tdoa, flight.anchors
     raw = tdoa.t, anchors.index(tdoa.a), anchors.index(tdoa.b), tdoa.d
     effects = EffectSet((*corrector.effects, *corrector.weighed))
-    pipeline = Pipeline(Installed(anchors), config, effects, watched=False, records=records)
+    installed = Installed(anchors)
+    pipeline = Pipeline(installed, config, effects, watched=False, records=records)
     buffer, places = loaded(flight, config)
     bias, std = np.zeros((2, len(tdoa)))
     parts: list[Fed] = []
     of_tdoas: list[np.ndarray] = []  # places in the flight of those that can be measurements, in the order of their stamps
-    for batch, until in _batches(*raw, corrector, len(tdoa) if records is None else RECORDED_AT_ONCE):
+    recoveries = 0
+    for batch, until, anew in _batches(*raw, corrector, len(tdoa) if records is None else RECORDED_AT_ONCE, flight.restarts):
+        if anew:  # as on line, when the stamps fall back
+            recoveries += int(pipeline.state.record.recoveries)
+            pipeline = Pipeline(installed, config, effects, watched=False, records=records)
+            corrector.reset()
         t, a, b, d = (column[batch] for column in raw)
         correction = corrector.correct(t, a, b, d)
         bias[batch], std[batch] = correction.bias, correction.std
@@ -96,7 +102,7 @@ def run_offline(
     ekf = pipeline.state.record
     offset, variance = ekf.range_offset.tolist()
     found = (offset, math.sqrt(variance)) if variance < math.inf else None
-    return Run(odometry_of(parts), residuals, bias, std, int(ekf.recoveries), yaw_offset(int(ekf.best)), aids, found)
+    return Run(odometry_of(parts), residuals, bias, std, recoveries + int(ekf.recoveries), yaw_offset(int(ekf.best)), aids, found)
 
 
 def may_have_offset(flight: Flight, config: FilterConfig) -> bool:
@@ -149,10 +155,10 @@ def _became(n: int, places: np.ndarray, outcomes: list[np.ndarray]) -> np.ndarra
 
 
 def _batches(
-    t: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray, corrector: Corrector, longest: int
-) -> Iterator[tuple[np.ndarray, float]]:
-    """What can be corrected and used together, at most `longest` TDOAs: (their places, in the order of their stamps, and the stamp, s, up
-    to which everything may be used then), at least one.
+    t: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray, corrector: Corrector, longest: int, restarts: Sequence[float]
+) -> Iterator[tuple[np.ndarray, float, bool]]:
+    """What can be corrected and used together, at most `longest` TDOAs: (their places, in the order of their stamps, the stamp, s, up to
+    which everything may be used then, and whether the clock began anew before them), at least one for each time of the clock.
 
     Corrections need poses that are `lag` old: measurements less than that apart can be corrected as one batch.
     """
@@ -160,7 +166,12 @@ def _batches(
     if not (np.diff(t[known]) > 0.0).all():
         known = known[np.lexsort((d[known], b[known], a[known], t[known]))]  # siblings of one stamp as on line
     stamps, lag, first = t[known], math.inf if corrector.idle else corrector.lag, 0
-    while first < len(known) or not first:
-        end = min(int(np.searchsorted(stamps, stamps[first] + lag)), first + longest) if len(known) else 1
-        yield known[first:end], math.nextafter(stamps[end], -math.inf) if end < len(known) else math.inf
-        first = end
+    for number, bound in enumerate([*sorted(restarts), math.inf]):
+        last, anew = int(np.searchsorted(stamps, bound)), number > 0
+        while first < last or anew or not number:
+            end = min(int(np.searchsorted(stamps, stamps[first] + lag)), first + longest, last) if first < last else last
+            before = stamps[end] if end < last else bound
+            yield known[first:end], math.nextafter(before, -math.inf) if before < math.inf else before, anew
+            first, anew = end, False
+            if first >= last:
+                break

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import errno
+import io
 import json
 import os
 from pathlib import Path
@@ -23,6 +24,7 @@ from typing import Any, TYPE_CHECKING
 from tqdm import tqdm
 
 from uwb_tdoa_bias.foundation.errors import Failure, InputError
+from uwb_tdoa_bias.foundation.files import write_text
 from uwb_tdoa_bias.foundation.foreign_text import printable
 from uwb_tdoa_bias.foundation.version import written_by
 
@@ -65,6 +67,8 @@ def run(
     ros : --ros-args are for rclpy and not parsed; args.ros_arguments is the whole command line, with them.
     """
     arguments = sys.argv[1:] if argv is None else list(argv)
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a result must not end in an error because the locale has no letter for it
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         args = parser.parse_args(without_ros_arguments(arguments) if ros else arguments)
         if ros:
@@ -149,7 +153,7 @@ def _check_writable(path: Path, folder: Path) -> None:
 def write_json(path: str | Path, content: dict[str, Any]) -> None:
     """Write a dict as JSON, with the version of the suite; NaN must be None by now (ValueError otherwise)."""
     text = json.dumps({"written_by": written_by(), **content}, indent=1, allow_nan=False)
-    Path(path).write_text(text + "\n")
+    write_text(path, text + "\n")
 
 
 def say(name: str, sentence: object) -> None:

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..foundation.files import write_bytes
+
 if TYPE_CHECKING:
     from onnx import ModelProto
 
@@ -50,5 +52,4 @@ def make() -> ModelProto:
 
 
 if __name__ == "__main__":
-    with open(sys.argv[1], "wb") as file:
-        file.write(make().SerializeToString())
+    write_bytes(sys.argv[1], make().SerializeToString())

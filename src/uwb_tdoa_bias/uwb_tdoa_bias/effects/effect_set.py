@@ -11,6 +11,7 @@ import numpy as np
 import yaml
 
 from ..foundation.errors import InputError
+from ..foundation.files import write_text
 from ..foundation.safe_yaml import read_yaml
 from ..foundation.version import written_by
 from .base import Effect
@@ -167,7 +168,7 @@ class EffectSet:
         text = yaml.safe_dump({"effects": entries}, sort_keys=False)
         if self.covariance is not None:
             text += yaml.safe_dump({"covariance": self.covariance.as_dict()}, sort_keys=False, default_flow_style=None, width=1000)
-        Path(path).write_text(f"# {written_by()}\n{text}")
+        write_text(path, f"# {written_by()}\n{text}")
 
 
 def _plain(value: Any) -> Any:

@@ -10,6 +10,7 @@ import numpy as np
 import yaml
 
 from .errors import InputError
+from .files import write_text
 from .safe_yaml import read_yaml
 from .version import written_by
 
@@ -150,7 +151,7 @@ class Anchors:
         for i, p, q in zip(self.ids.tolist(), self.positions.tolist(), self.orientations.tolist()):
             entries[i] = {"position": p, **({"orientation": q} if np.isfinite(q).all() else {})}
         text = yaml.safe_dump({"frame": self.frame, "anchors": entries}, sort_keys=False, default_flow_style=None)
-        Path(path).write_text(f"# {written_by()}\n{text}")
+        write_text(path, f"# {written_by()}\n{text}")
 
 
 def _whole(ids: ArrayLike) -> np.ndarray:

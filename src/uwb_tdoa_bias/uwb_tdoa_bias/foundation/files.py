@@ -1,15 +1,18 @@
-"""Reading files whole, or their beginning, with a limit."""
+"""Read files whole, or their beginning, with a limit; write files whole or not at all."""
 
 from __future__ import annotations
 
+import io
+import os
+from pathlib import Path
+import secrets
 from typing import BinaryIO, TYPE_CHECKING
 
 from .errors import InputError
 from .limits import RECORDING_BYTES
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
+    from collections.abc import Callable, Iterator
 
 
 def read_bytes(path: str | Path, most: int = RECORDING_BYTES) -> bytes:
@@ -30,6 +33,52 @@ def read_head(path: str | Path, size: int) -> bytes:
     if not content:
         raise InputError(f"{path}: is empty (0 bytes); copy the recording again.")
     return content
+
+
+def write_text(path: str | Path, text: str) -> None:
+    """Write a text file in UTF-8, whatever the locale, as `write_bytes` does.
+
+    Bytes that Python could not decode in an argument or a file name are written as they were, or as U+FFFD if they are no UTF-8.
+    """
+    try:
+        content = text.encode("utf-8", "surrogateescape")
+    except UnicodeEncodeError:  # halves of characters that come from no file name
+        content = text.encode("utf-8", "replace")
+    write_bytes(path, content.decode("utf-8", "replace").encode("utf-8"))
+
+
+def write_filled(path: str | Path, fill: Callable[[BinaryIO], object]) -> None:
+    """Write what `fill` writes to the binary file that it is given, as `write_bytes` does."""
+    buffer = io.BytesIO()
+    fill(buffer)
+    write_bytes(path, buffer.getvalue())
+
+
+def write_bytes(path: str | Path, content: bytes) -> None:
+    """Write a file whole: readers see the old content or the new one, never a part. Raises OSError.
+
+    The content goes to a temporary sibling, which then takes the name. A file that is replaced passes on its permissions, and a
+    symbolic link stays one. What is no regular file, as /dev/stdout, and a file whose folder takes no other, are written in place.
+    """
+    path = Path(os.path.realpath(path))
+    if path.exists() and not (path.is_file() and os.access(path.parent, os.W_OK)):
+        _write_in_place(path, content)
+        return
+    sibling = path.with_name(f".{secrets.token_hex(8)}.partial")
+    try:
+        with open(sibling, "xb") as file:
+            file.write(content)
+        if path.exists():
+            sibling.chmod(path.stat().st_mode & 0o7777)
+        sibling.replace(path)
+    except BaseException:
+        sibling.unlink(missing_ok=True)
+        raise
+
+
+def _write_in_place(path: Path, content: bytes) -> None:
+    with open(path, "wb") as file:
+        file.write(content)
 
 
 def _blocks(file: BinaryIO, size: int) -> Iterator[bytes]:

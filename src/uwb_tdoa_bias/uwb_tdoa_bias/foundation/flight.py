@@ -76,6 +76,7 @@ class Flight(_SensorStreams):
     truth : Truth or None
     extra : other streams of the log by name, each a dict of column name to (n,) array with a "t" among them, file units
     meta : where it came from: source file, format, protocol ("tdoa2", "tdoa3"), ...
+    restarts : stamps, s, at which the clock of the recording began anew: nothing before tells where the tag is after it
     for each of SENSORS, by name : its Stream or None
     """
 
@@ -86,6 +87,7 @@ class Flight(_SensorStreams):
     truth: Truth | None = None
     extra: dict = field(default_factory=dict)
     meta: dict = field(default_factory=dict)
+    restarts: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "name", harmless(self.name))

@@ -9,6 +9,7 @@ import numpy as np
 
 from .arrays_file import read_arrays
 from .errors import InputError
+from .files import write_filled
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -90,8 +91,8 @@ class FlyableVolume:
 
     def save(self, path: str | Path) -> None:
         """Write what `load` reads: a numpy .npz file."""
-        with open(path, "wb") as file:
-            np.savez_compressed(file, **{name: getattr(self, name) for name in _FIELDS})
+        fields = {name: getattr(self, name) for name in _FIELDS}
+        write_filled(path, lambda file: np.savez_compressed(file, **fields))
 
     @classmethod
     def load(cls, path: str | Path) -> FlyableVolume:

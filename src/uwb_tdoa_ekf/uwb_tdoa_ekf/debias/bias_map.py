@@ -12,6 +12,7 @@ from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from uwb_tdoa_bias.foundation.arrays_file import read_arrays
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.files import write_filled
 from uwb_tdoa_bias.foundation.limits import MAP_MARKERS
 
 from .network import AngularNetwork
@@ -144,8 +145,7 @@ class BiasMap:
             "interpolator": self.interpolator,
             **{name: getattr(self, name) for name in _ARRAYS},
         }
-        with open(path, "wb") as file:
-            np.savez_compressed(file, **{**about, **content})
+        write_filled(path, lambda file: np.savez_compressed(file, **{**about, **content}))
 
     @classmethod
     def load(cls, path: str | Path) -> BiasMap:

@@ -213,7 +213,9 @@ def offset(imu: list[StampWindow], tdoa: list[StampWindow]) -> Finding | None:
         begin, end = imu[0].begin - tdoa[0].begin, imu[-1].end - tdoa[-1].end
         ahead = 0.5 * (begin + end)
         evidence = f"the IMU begins {begin:+.3f} s and ends {end:+.3f} s after the TDOAs"
-        if min(abs(begin), abs(end)) < APART or begin * end < 0.0 or abs(end - begin) > 0.3 * abs(ahead):
+        outside = imu[0].begin > tdoa[-1].end or imu[-1].end < tdoa[0].begin  # no sample is of the time of the TDOAs
+        alike = min(abs(begin), abs(end)) >= APART and begin * end > 0.0 and abs(end - begin) <= 0.3 * abs(ahead)
+        if not (outside or alike):
             return None
     if abs(ahead) < APART:
         return None

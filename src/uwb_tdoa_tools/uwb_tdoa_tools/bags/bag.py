@@ -14,11 +14,12 @@ The time of a message is its header stamp. `Flight.extra` has no message type an
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable, Mapping
 import heapq
 import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TYPE_CHECKING, TypeVar
+from typing import Any, NamedTuple, TYPE_CHECKING
 
 import numpy as np
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
@@ -32,6 +33,7 @@ from uwb_tdoa_bias.foundation.sensors import LOCATING, SENSORS
 from uwb_tdoa_bias.foundation.sensors.sensor import LARGEST_NUMBER
 from uwb_tdoa_bias.foundation.version import written_by
 
+from ..clock import sentences, straightened
 from . import messages as bag_messages, placing
 from .files import check_output, new_bag, open_bag, readable, remarks_of
 from .integrity import metadata
@@ -39,11 +41,12 @@ from .mcap import Damaged
 from .message_types import check_type, typestore
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
     from rosbags.interfaces import Connection
     from rosbags.rosbag2 import Writer
     from rosbags.typesys.store import Typestore
     from uwb_tdoa_ekf.results import Odometry
+    from ..clock import Straightened
     from .files import BagReader
 
     Topics = dict[str, tuple[str, Qos, Iterable[tuple[int, Any]]]]  # {topic: (type, QoS, (stamp ns, message) in order)}
@@ -53,10 +56,27 @@ __all__ = [
     "write_bag", "write_odometry",
 ]  # fmt: skip
 
-Made = TypeVar("Made")  # a stream of a Flight
-
 _FLIGHT_KEY = "uwb_tdoa_tools.flight"  # in the bag's custom data: name and meta of the flight, as JSON
 _PRINTED = "source", "format", "protocol"  # of that meta: texts that are read again, to be printed; nothing is computed with them
+
+
+class _Kind(NamedTuple):
+    """Of a stream of a Flight: our topic, the type of its messages, row(message) as for `read_topic`, make(stamps s, rows) : the stream,
+    and sound(rows) : whether its numbers can be used."""
+
+    topic: str
+    message: str
+    row: Callable[[Any], tuple[float, ...]]
+    make: Callable[[np.ndarray, np.ndarray], Any]
+    sound: Callable[[np.ndarray], np.ndarray] = bag_messages.sound
+
+
+_STREAMS = {
+    "tdoa": _Kind("uwb/tdoa", "uwb_tdoa_msgs/msg/Tdoa", bag_messages.tdoa_row, bag_messages.tdoas_of),
+    "imu": _Kind("imu/data", "sensor_msgs/msg/Imu", bag_messages.imu_row, bag_messages.imu_of),
+    **{name: _Kind(of.topics[0][0], of.message, *bag_messages.of_sensor(of)) for name, of in SENSORS.items()},
+    "pose": _Kind("ground_truth/pose", "geometry_msgs/msg/PoseStamped", bag_messages.pose_row, bag_messages.truth_of),
+}
 
 
 def _qos(durability: QosDurability, depth: int) -> Qos:
@@ -178,7 +198,8 @@ def read_bag(
     anchors : Anchors to use instead of the recorded uwb/anchors, or None.
     salvage : read a cut or damaged bag up to there, and without messages that are no numbers; `meta["remarks"]` tells.
     truth : read ground_truth/pose, where it is.
-    Stamps are header stamps; messages that were recorded out of their order are sorted (`meta["reordered"]`). An IMU in
+    Stamps are header stamps, on one continuous time (`meta["clock"]`: [Jump] and {stream: outliers}, see `clock.straightened`); messages
+    that were recorded out of their order are sorted (`meta["reordered"]`). An IMU in
     a frame of its own is taken to the body as /tf_static says; `meta["antenna"]` is the place of an antenna on it, (3,) m.
     Raises InputError for a bag that is damaged, has no uwb/tdoa, or neither anchors nor uwb/anchors, and for messages
     with numbers that are not finite.
@@ -186,15 +207,19 @@ def read_bag(
     with open_bag(path, salvage) as reader:
         about = _about(path)
         meta = {**about["meta"], "bag": str(path)}
-        remarks, name_of, frames = [], Names(namespace, topics), {}
+        remarks, name_of = list[str](), Names(namespace, topics)
+        kinds = _STREAMS if truth else {name: kind for name, kind in _STREAMS.items() if name != "pose"}
+        found = {name: read_topic(path, reader, name_of(kind.topic), kind.message, kind.row) for name, kind in kinds.items()}
+        found, clock = on_one_clock(found)
+        if clock.jumps or clock.kept:
+            meta["clock"] = clock.jumps, clock.outliers
+            remarks += sentences(clock)
 
-        def stream(
-            topic: str, msgtype: str, row: Callable[[Any], tuple[float, ...]],
-            make: Callable[[np.ndarray, np.ndarray], Made],
-            sound: Callable[[np.ndarray], np.ndarray] = bag_messages.sound,
-        ) -> Made | None:  # fmt: skip
-            found = read_topic(path, reader, name_of(topic), msgtype, row)
-            (stamps, rows, falls), frames[topic] = found.in_order(), found.frames
+        def stream(name: str) -> Any:
+            if name not in found:
+                return None
+            topic, make, sound = kinds[name].topic, kinds[name].make, kinds[name].sound
+            stamps, rows, falls = found[name].in_order()
             if falls:
                 meta.setdefault("reordered", {})[topic] = falls
             if not len(stamps):
@@ -207,10 +232,8 @@ def read_bag(
                 stamps, rows = stamps[whole], rows[whole]
             return make(stamps, rows) if len(stamps) else None
 
-        tdoa = stream("uwb/tdoa", "uwb_tdoa_msgs/msg/Tdoa", bag_messages.tdoa_row, bag_messages.tdoas_of)
-        sensors: dict[str, Any] = {
-            name: stream(sensor.topics[0][0], sensor.message, *bag_messages.of_sensor(sensor)) for name, sensor in SENSORS.items()
-        }
+        tdoa = stream("tdoa")
+        sensors: dict[str, Any] = {name: stream(name) for name in SENSORS}
         if tdoa is None and any(sensors[name] is not None for name in LOCATING):
             tdoa = bag_messages.tdoas_of(np.empty(0), np.empty((0, 4)))
         if tdoa is None:
@@ -221,20 +244,19 @@ def read_bag(
             anchors = read_anchors(path, reader, name_of("uwb/anchors"))
         if anchors is None:
             raise InputError(f"{path}: has no message on {name_of('uwb/anchors')}; give a survey file (--survey FILE).")
-        imu = stream("imu/data", "sensor_msgs/msg/Imu", bag_messages.imu_row, bag_messages.imu_of)
+        imu = stream("imu")
         tree = placing.read_frames(path, reader)
-        places = {topic: placing.placed(tree, topic, frames[topic]) for topic in ("imu/data", "uwb/tdoa")}
+        places = {kinds[name].topic: placing.placed(tree, kinds[name].topic, found[name].frames) for name in ("imu", "tdoa")}
         remarks += [remark for _, remark in places.values() if remark]
         remarks = [*remarks_of(reader), *remarks]
-        pose = "geometry_msgs/msg/PoseStamped"
-        poses = stream("ground_truth/pose", pose, bag_messages.pose_row, bag_messages.truth_of) if truth else None
+        poses = stream("pose")
     if imu is not None and (place := places["imu/data"][0]):
         imu = placing.imu_in_body(imu, place)
     if place := places["uwb/tdoa"][0]:
         meta["antenna"] = place[1].tolist()
     if remarks:
         meta["remarks"] = remarks
-    return Flight(about["name"], anchors, tdoa, imu, poses, {}, meta, **sensors)
+    return Flight(about["name"], anchors, tdoa, imu, poses, {}, meta, clock.restarts, **sensors)
 
 
 def read_odometry(
@@ -350,6 +372,23 @@ class TopicMessages:
         """(stamps (n,) s, rows (n, k)) in order of the stamps, and how often these fell."""
         order = np.argsort(self.stamps, kind="stable")
         return self.stamps[order] / 1e9, self.rows[order], int((np.diff(self.stamps) < 0).sum())
+
+
+def arrivals(found: Mapping[str, TopicMessages]) -> dict[str, np.ndarray]:
+    """{stream: (n,) s at which its messages were recorded}; NaN of a bag all of whose times are the stamps themselves: they tell none."""
+    known = any(bool((of.stamps != of.arrived).any()) for of in found.values())
+    return {name: of.arrived / 1e9 if known else np.full(len(of.arrived), np.nan) for name, of in found.items()}
+
+
+def on_one_clock(found: Mapping[str, TopicMessages]) -> tuple[dict[str, TopicMessages], Straightened]:
+    """The TopicMessages of a recording, by the names of their streams, on one continuous time and without outliers, and what was done."""
+    clock = straightened({name: of.stamps / 1e9 for name, of in found.items()}, arrivals(found))
+    out = dict(found)
+    for name in {*clock.shifts, *clock.kept}:
+        of, kept = found[name], clock.kept.get(name, slice(None))
+        stamps = of.stamps + np.round(1e9 * clock.shifts.get(name, np.zeros(1))).astype(np.int64)
+        out[name] = TopicMessages(stamps[kept], of.arrived[kept], of.rows[kept], of.frames)
+    return out, clock
 
 
 def read_topic(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+import math
 from pathlib import Path
 import re
 import shutil
@@ -16,13 +17,15 @@ from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.limits import READ_BYTES, most_unpacked
+from uwb_tdoa_bias.foundation.stamps import LARGEST_STEP_BACK
 
 from ..command_lines import SALVAGE
-from .integrity import NO_SUM, SUM_KEY, check as check_whole, is_packed, metadata, seal, unpack
+from . import mcap, write_ahead
+from .integrity import NO_SUM, SUM_KEY, check as check_whole, data_files, is_mcap, is_packed, metadata, seal, sqlite_messages, unpack
 from .kind import is_bag
-from .mcap import Damaged
+from .mcap import Damaged, zstd
 from .message_types import earlier_types, typestore, upgraded
-from .salvage import salvage as write_sound_part
+from .salvage import as_written, salvage as write_sound_part
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -34,10 +37,14 @@ class BagReader(Reader):
     """A Reader that knows what of a bag cannot be read.
 
     remarks : sentences on what is missing in a damaged one; unreadable : {topic: messages that are none of its type};
-    most : bytes that its messages may hold together.
+    most : bytes that its messages may hold together; data : its files; packed : whether each message is compressed; falls_back : whether
+    the times of its messages do, in the order in which they were written.
     """
 
     remarks: list[str]
+    data: list[Path]
+    packed: bool
+    falls_back: bool
     unreadable: Counter[str]
     most: int
 
@@ -101,12 +108,18 @@ def open_bag(path: str | Path, salvage: bool = False) -> Iterator[BagReader]:
 
 
 def _opened(path: Path, folder: Path, salvage: bool) -> BagReader:
-    remarks, readable = [], path
+    given, remarks = path, list[str]()
     try:
+        if files := write_ahead.unclosed(path):
+            path = _with_log(path, folder, salvage, remarks)
+            names = " and ".join(file.name for file in files)
+            remarks.append(f"the recorder did not close {names}: what it left in the -wal file beside it is read as well.")
+        readable = path
         if salvage:
             readable = folder / "sound"
-            remarks = write_sound_part(path, readable)
+            remarks += write_sound_part(path, readable)
         else:
+            write_ahead.check_no_journal(path)
             check_whole(path)
             if path.is_dir() and is_packed(metadata(path)):
                 readable = folder
@@ -116,6 +129,10 @@ def _opened(path: Path, folder: Path, salvage: bool) -> BagReader:
         with _closing_second_connections(reader):
             reader.open()
         _take_qos_of_metadata(reader)
+        information = metadata(readable) if readable.is_dir() else {"compression_mode": ""}
+        reader.data = data_files(readable, information) if readable.is_dir() else [readable]
+        reader.packed = information["compression_mode"] == "message"
+        reader.falls_back = any(_falls_back(file) for file in reader.data)
         reader.remarks, reader.unreadable = remarks, Counter()
         reader.most = most_unpacked(sum(file.stat().st_size for file in (path, *path.glob("*")) if file.is_file()))
         for connection in reader.connections:
@@ -124,8 +141,18 @@ def _opened(path: Path, folder: Path, salvage: bool) -> BagReader:
     except InputError:
         raise
     except Exception as error:  # rosbags raises whatever its parsers run into
-        raise _damaged(path, error) from error
+        raise _damaged(given, error) from error
     return reader
+
+
+def _with_log(path: Path, folder: Path, salvage: bool, remarks: list[str]) -> Path:
+    """The bag with what its logs hold, in a folder. Raises Damaged where a log cannot be read, or tells in remarks."""
+    (folder / "closed").mkdir()
+    whole, lost = write_ahead.closed(path, folder / "closed")
+    if lost and not salvage:
+        raise Damaged(lost)
+    remarks += [f"{lost}: read up to there."] if lost else []
+    return whole
 
 
 @contextmanager
@@ -156,13 +183,42 @@ def _take_qos_of_metadata(reader: Reader) -> None:
             file.connections[k] = one._replace(ext=one.ext._replace(offered_qos_profiles=qos))
 
 
+def _as_written(reader: BagReader, connections: list[Connection]) -> Iterator[tuple[Connection, int, bytes]]:
+    """(connection, stamp ns, bytes) of the given connections in the order in which they were written."""
+    wanted = {(connection.topic, connection.msgtype): connection for connection in connections}
+    for file in reader.data:
+        for written, stamp, data in as_written(file, Counter()):
+            if (connection := wanted.get((written.topic, written.msgtype))) is not None:
+                yield connection, stamp, zstd.decompress(data) if reader.packed else data
+
+
+def _falls_back(file: Path) -> bool:
+    """Whether the times of the messages of a data file fall by more than a message can be late: the clock of the recorder, or of what is
+    recorded, was set."""
+    newest = -math.inf
+    if is_mcap(file):
+        times: Iterator[int] = (
+            int.from_bytes(content[6:14], "little") for kind, content in mcap.sound(file) if kind == mcap.MESSAGE and len(content) >= 14
+        )
+    else:
+        times = (stamp for _, _, stamp, _ in sqlite_messages(file))
+    for stamp in times:
+        if stamp < newest - 1e9 * LARGEST_STEP_BACK:
+            return True
+        newest = max(newest, stamp)
+    return False
+
+
 def messages(
-    path: str | Path, reader: BagReader, connections: list[Connection]
+    path: str | Path, reader: BagReader, connections: list[Connection], written: bool = False
 ) -> Iterator[tuple[Connection, int, bytes]]:
-    """Yield (connection, stamp ns, bytes) of the given connections in the bag's order, as their types are now, without those that
+    """Yield (connection, stamp ns, bytes) of the given connections in the bag's order (written : if its times fall back, in the order in
+    which they were written), as their types are now, without those that
     cannot be read as such, which are counted in `reader.unreadable`; raises InputError, also if there are more or fewer than the bag
     says, or they hold more bytes than its files."""
-    found = reader.messages(connections=connections) if connections else iter(())
+    found: Iterator[tuple[Connection, int, bytes]] = iter(())
+    if connections:
+        found = _as_written(reader, connections) if written and reader.falls_back else reader.messages(connections=connections)
     left = {(connection.topic, connection.msgtype): 0 for connection in connections}
     for connection in connections:
         left[connection.topic, connection.msgtype] += connection.msgcount
@@ -194,8 +250,11 @@ def messages(
 def readable(
     path: str | Path, reader: BagReader, connections: list[Connection]
 ) -> Iterator[tuple[Connection, int, Any]]:
-    """The same as (connection, stamp ns, message): what are no such messages, as a faulty publisher sends them, is counted too."""
-    for connection, stamp, data in messages(path, reader, connections):
+    """The same as (connection, stamp ns, message): what are no such messages, as a faulty publisher sends them, is counted too.
+
+    Where the times of a bag fall back, in the order in which they were written.
+    """
+    for connection, stamp, data in messages(path, reader, connections, written=True):
         try:
             if len(data) > READ_BYTES:
                 raise ValueError

@@ -11,6 +11,7 @@ import zlib
 
 import yaml
 
+from uwb_tdoa_bias.foundation.files import write_text
 from uwb_tdoa_bias.foundation.limits import MESSAGE_BYTES, most_unpacked
 from uwb_tdoa_bias.foundation.safe_yaml import read_yaml
 
@@ -79,7 +80,7 @@ def unpack(path: Path, folder: Path) -> None:
     information |= {"relative_file_paths": names, "compression_mode": "", "compression_format": "", "files": []}
     information["custom_data"].pop(SUM_KEY, None)
     content = yaml.safe_dump({"rosbag2_bagfile_information": information}, sort_keys=False)
-    (folder / "metadata.yaml").write_text(content)
+    write_text(folder / "metadata.yaml", content)
 
 
 def metadata(path: Path) -> dict[str, Any]:
@@ -122,10 +123,10 @@ def seal(path: str | Path) -> None:
     if data.suffix == ".mcap":
         mcap.set_sums(data)
     file = Path(path) / "metadata.yaml"
-    text = file.read_text()
+    text = file.read_text(encoding="utf-8")
     sealed = re.sub(rf"({re.escape(SUM_KEY)}: *['\"]?){NO_SUM}", rf"\g<1>{_sum(data)}", text)
     assert sealed != text
-    file.write_text(sealed)
+    write_text(file, sealed)
 
 
 def open_sqlite(file: str | Path) -> sqlite3.Connection:

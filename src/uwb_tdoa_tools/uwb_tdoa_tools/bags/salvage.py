@@ -60,7 +60,7 @@ def _copy(
     count = 0
     lost: Counter[str] = Counter()
     try:
-        for connection, stamp, data in (_from_mcap if integrity.is_mcap(file) else _from_sqlite)(file, lost):
+        for connection, stamp, data in as_written(file, lost):
             key = connection.topic, connection.msgtype
             if key not in connections:
                 connections[key] = _added(path, connection, writer)
@@ -77,6 +77,12 @@ def _copy(
     except Damaged as damage:
         return count, lost, str(damage)
     return count, lost, None
+
+
+def as_written(file: Path, lost: Counter[str]) -> Iterator[tuple[Connection, int, bytes]]:
+    """Yield (connection, stamp ns, bytes) of the messages of a data file in the order in which they were written; lost : {what cannot be
+    read: how often}, counted. Raises Damaged where they end."""
+    return (_from_mcap if integrity.is_mcap(file) else _from_sqlite)(file, lost)
 
 
 def _added(path: Path, connection: Connection, writer: Writer) -> Connection | None:

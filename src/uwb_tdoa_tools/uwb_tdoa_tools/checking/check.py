@@ -83,6 +83,8 @@ def check(recording: Recording, others: Sequence[Survey] = ()) -> Report:
     found = [*streams.findings(), *sensors(recording)]
     for rule in (*labels.RULES, *wiring.RULES, *tag_delay.RULES):
         found += rule(recording)
+    if any(finding.rule == "clock_silence" for finding in found):  # which says the same of all streams
+        found = [finding for finding in found if finding.rule != "gap"]
     if not len(recording.tdoa):  # of ranges alone: nothing else is there to be tried
         return Report(recording.name, most_severe_first(found), _facts(recording, streams), recording.ends)
     names = {finding.rule for finding in found}

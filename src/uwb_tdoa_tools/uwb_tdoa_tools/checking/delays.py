@@ -13,6 +13,7 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.geometry import tdoa
 
+from ..clock import numbered
 from .known_path import MANY
 
 if TYPE_CHECKING:
@@ -99,7 +100,7 @@ class Delays:
 def delays(series: np.ndarray, t: np.ndarray, error: Callable[[float], np.ndarray], count_of_series: int | None = None) -> Delays:
     """Delays of (n,) samples at t, s, of series numbered from 0; error(delay) -> (n,), what is left of each. count_of_series :
     how many there are, where samples of the last may be missing."""
-    block = ((t - t.min()) / BLOCK).astype(int)
+    block = numbered(t, BLOCK)
     blocks = block.max() + 1
     group = series * blocks + block
     size = (count_of_series or series.max() + 1) * blocks

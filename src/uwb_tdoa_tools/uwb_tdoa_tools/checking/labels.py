@@ -11,6 +11,7 @@ from uwb_tdoa_ekf.streams import ERROR, NOTE, WARNING, Finding
 
 from ..bags.messages import BODY_FRAME
 from ..bags.placing import is_body
+from ..clock import SET, SILENCE, WORDS, WRAP, apart, in_words
 from .recording import IMU
 from .tdoa_rules import furthest, same_place
 
@@ -114,4 +115,35 @@ def sorted_file(recording: Recording) -> Iterator[Finding]:
         )
 
 
-RULES = (frames, senders, no_imu, anchors, sorted_file)
+def clock(recording: Recording) -> Iterator[Finding]:
+    """A clock that started again, wrapped or was set while it was recorded, and single stamps of no time at all."""
+    for jump in recording.jumps:
+        cause, done = in_words(jump)
+        if jump.kind == SILENCE:
+            remedy = "record with ros2 bag record, whose arrival times tell one from the other"
+            yield Finding("clock_silence", WARNING, cause, done, remedy, jump.by)
+        elif jump.kind == WRAP:
+            remedy = "count the wraps in the driver: live, ekf_node starts anew at each of them"
+            yield Finding("clock_wrap", ERROR, cause, done, remedy, jump.by)
+        elif jump.kind == SET:
+            remedy = "set the clock before the recording begins (chronyc waitsync), or stamp with a clock that nobody sets"
+            yield Finding("clock_set", ERROR, cause, done, remedy, jump.by)
+        else:
+            remedy = "record each start of the tag by itself; live, ekf_node starts anew there"
+            yield Finding("clock_restart", ERROR, cause, done, remedy, jump.by)
+    for name, count in recording.outliers.items():
+        cause = f"{count} messages of {WORDS.get(name, name)} have stamps far from those of their neighbours"
+        remedy = "stamp when the sample is measured; look for a field that is not initialised, or a transfer that is not checked"
+        yield Finding("stamps_wild", WARNING, cause, "they are left out here, and by the nodes", remedy, float(count))
+
+
+def other_time(recording: Recording) -> Iterator[Finding]:
+    """A sensor of which no message is stamped within the time of the TDOAs; what is about the IMU, stream rules say, unless it is alone."""
+    for name, ahead, count in apart({"tdoa": recording.tdoa.t, **{name: of.t for name, of in recording.sensors.items()}}):
+        topic = WORDS.get(name, name)
+        cause = f"the stamps of {topic} are {abs(ahead):.3f} s {'ahead of' if ahead > 0.0 else 'behind'} those of uwb/tdoa"
+        evidence = f"none of its {count} messages is stamped within the time of the TDOAs: none can be used"
+        yield Finding("sensor_apart", ERROR, cause, evidence, "stamp all sensors with the clock of one machine", ahead)
+
+
+RULES = (frames, senders, no_imu, anchors, sorted_file, clock, other_time)

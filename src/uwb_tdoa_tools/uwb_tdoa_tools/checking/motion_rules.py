@@ -58,7 +58,8 @@ class TrueMotion:
         flown = self._t[above] if above.any() else self._t  # a rover
         margin = LONGEST + 0.5
         start, end = max(flown[0], imu.t[0], self._t[0]) + margin, min(flown[-1], imu.t[-1], self._t[-1]) - margin
-        self.t = start + CELL * np.arange(max(int((end - start) / CELL), 0))
+        cells = min(max(int((end - start) / CELL), 0), len(imu))  # of a pause of days, the time before it
+        self.t = start + CELL * np.arange(cells)
         self.block = (CELL * np.arange(len(self.t)) / BLOCK).astype(int)
         if len(self) < FEWEST:
             return

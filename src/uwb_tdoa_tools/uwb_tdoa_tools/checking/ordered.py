@@ -91,13 +91,16 @@ class OrderedRecording:
 def _busiest(recording: OrderedRecording, length: float) -> float:
     """Stamp at which the `length` s begin in which the TDOAs of each pair change most from second to second."""
     t, d = recording.tdoa.t, recording.tdoa.d
-    pair = recording.tdoa.a * 65536 + recording.tdoa.b
+    pair = np.unique(recording.tdoa.a * 65536 + recording.tdoa.b, return_inverse=True)[1].reshape(-1)
     second = np.floor((t - t[0]) / PERIOD).astype(np.int64)
-    seconds = second[-1] + 2
-    keys, inverse = np.unique(np.unique(pair, return_inverse=True)[1].reshape(-1) * seconds + second, return_inverse=True)
-    mean = np.bincount(inverse.reshape(-1), d) / np.bincount(inverse.reshape(-1))
-    following = np.diff(keys) == 1  # of one pair: no pair has TDOAs in the last second of `seconds`
-    motion = np.bincount(keys[1:][following] % seconds, np.minimum(np.abs(np.diff(mean))[following], 1.0), minlength=seconds)
+    order = np.lexsort((second, pair))
+    begins = np.flatnonzero(np.diff(pair[order], prepend=-1) | np.diff(second[order], prepend=-1))
+    mean = np.add.reduceat(d[order], begins) / np.diff(begins, append=len(order))
+    pair, second = pair[order][begins], second[order][begins]  # a row for each pair and each second in which it has TDOAs
+    following = (np.diff(pair) == 0) & (np.diff(second) == 1)
+    seconds, place = np.unique(second, return_inverse=True)  # those with TDOAs: a pause takes no room
+    motion = np.bincount(place[1:][following], np.minimum(np.abs(np.diff(mean))[following], 1.0), minlength=len(seconds))
     total, n = np.concatenate([[0.0], np.cumsum(motion)]), int(length / PERIOD)
-    best = int(np.argmax(total[n:] - total[:-n]))
+    until = np.searchsorted(seconds, seconds + n)
+    best = int(seconds[np.argmax(total[until] - total[:-1])])
     return t[0] + min(best * PERIOD, t[-1] - t[0] - length)

@@ -15,7 +15,7 @@ from uwb_tdoa_bias.foundation.flight import Imu, Tdoas
 from uwb_tdoa_bias.foundation.sensors import LOCATING, SENSORS
 
 from ..bags import messages as bag_messages, placing
-from ..bags.bag import Names, read_anchors, read_topic
+from ..bags.bag import Names, arrivals, on_one_clock, read_anchors, read_topic
 from ..bags.files import open_bag, remarks_of
 from ..bags.placing import TF_STATIC
 from ..readers import read_survey
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.flight import Flight
     from uwb_tdoa_bias.foundation.sensors.sensor import Sensor, Stream
     from ..bags.bag import TopicMessages
-    from ..bags.files import BagReader
     from ..bags.placing import Place
+    from ..clock import Jump
     from ..readers.inputs import Reading
     from ..live.ends import End
 
@@ -41,7 +41,7 @@ _ROWS = {
 
 @dataclass(frozen=True)
 class Recording:
-    """Nothing here is sorted, and ground truth is not read.
+    """Nothing here is sorted, and ground truth is not read. Stamps are on one continuous time (see `clock.straightened`).
 
     name : short; anchors : Anchors to check against; tdoa : Tdoas; imu : Imu or None;
     tdoa_arrival, imu_arrival : (n,) s, when the recorder received them, NaN where that is not known;
@@ -49,7 +49,8 @@ class Recording:
     with the body, where the samples are those of an IMU in its origin;
     topics : {topic: type} of a bag, or of all that are live; recorded : Anchors that the bag itself holds, or None; falls :
     how often the stamps fell in a file whose reader has sorted them; remarks : sentences on what could not be read of a
-    damaged one; ends : [End] of live topics; sensors : {name: Stream} of those of the SENSORS that there are.
+    damaged one; ends : [End] of live topics; sensors : {name: Stream} of those of the SENSORS that there are; jumps : of the clock, which
+    is continuous here, and outliers : {stream: messages left out because of their stamps}.
     """
 
     name: str
@@ -66,6 +67,8 @@ class Recording:
     remarks: tuple[str, ...] = ()
     ends: tuple[End, ...] = ()
     sensors: dict[str, Stream] = field(default_factory=dict)
+    jumps: tuple[Jump, ...] = ()
+    outliers: dict[str, int] = field(default_factory=dict)
 
 
 def read_recording(reading: Reading, path: str | Path, survey: str | Path | None = None) -> Recording:
@@ -103,16 +106,23 @@ def of_flight(flight: Flight) -> Recording:
     tdoa, imu = (np.full(len(stream) if stream is not None else 0, np.nan) for stream in (flight.tdoa, flight.imu))
     falls = sum(flight.meta.get("reordered", {}).values())
     sensors = {name: stream for name in SENSORS if (stream := getattr(flight, name)) is not None}
-    return Recording(flight.name, flight.anchors, flight.tdoa, flight.imu, tdoa, imu, falls=falls, sensors=sensors)
+    jumps, outliers = flight.meta.get("clock", ((), {}))
+    streams = flight.tdoa, flight.imu, tdoa, imu
+    return Recording(flight.name, flight.anchors, *streams, falls=falls, sensors=sensors, jumps=jumps, outliers=outliers)
 
 
 def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Recording:
     name_of = Names(reading.namespace, reading.topics)
     with open_bag(path, reading.salvage) as reader:
         topics = {connection.topic: connection.msgtype for connection in reader.connections}
-        tdoa, imu = (read_topic(path, reader, name_of(topic), *_ROWS[topic]) for topic in (TDOA, IMU))
-        sensors = {name: _stream_of(path, reader, name_of(sensor.topics[0][0]), sensor) for name, sensor in SENSORS.items()}
-        sensors = {name: stream for name, stream in sensors.items() if len(stream)}
+        kinds = {"tdoa": (TDOA, *_ROWS[TDOA]), "imu": (IMU, *_ROWS[IMU])}
+        kinds |= {name: (of.topics[0][0], of.message, bag_messages.of_sensor(of)[0]) for name, of in SENSORS.items()}
+        found = {name: read_topic(path, reader, name_of(topic), kind, row) for name, (topic, kind, row) in kinds.items()}
+        arrival = arrivals(found)
+        found, clock = on_one_clock(found)
+        tdoa, imu = found["tdoa"], found["imu"]
+        arrival = {name: arrival[name][clock.kept.get(name, slice(None))] for name in ("tdoa", "imu")}
+        sensors = {name: _stream_of(found[name], sensor) for name, sensor in SENSORS.items() if len(found[name].stamps)}
         recorded = read_anchors(path, reader, name_of("uwb/anchors"))
         tree = placing.read_frames(path, reader)
         remarks = tuple(remarks_of(reader))
@@ -132,25 +142,20 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
         anchors=anchors,
         tdoa=bag_messages.tdoas_of(tdoa.stamps / 1e9, tdoa.rows.reshape(len(tdoa.stamps), 4)),
         imu=samples,
-        tdoa_arrival=_arrival(tdoa),
-        imu_arrival=_arrival(imu),
+        tdoa_arrival=arrival["tdoa"],
+        imu_arrival=arrival["imu"],
         frames={topic: dict(stream.frames) for topic, stream in ((TDOA, tdoa), (IMU, imu)) if len(stream.stamps)},
         places={frame: place for frame in {*tdoa.frames, *imu.frames} if (place := placing.place_of(tree, frame))},
         topics=topics,
         recorded=recorded,
         remarks=remarks,
         sensors=sensors,
+        jumps=clock.jumps,
+        outliers=clock.outliers,
     )
 
 
-def _arrival(messages: TopicMessages) -> np.ndarray:
-    """(n,) s at which messages were recorded; NaN of a bag whose times are the stamps themselves: they tell no arrivals."""
-    known = bool((messages.stamps != messages.arrived).any())
-    return messages.arrived / 1e9 if known else np.full(len(messages.arrived), np.nan)
-
-
-def _stream_of(path: Path, reader: BagReader, topic: str, sensor: Sensor) -> Stream:
+def _stream_of(found: TopicMessages, sensor: Sensor) -> Stream:
     """Stream of a Sensor."""
-    row, make, _ = bag_messages.of_sensor(sensor)
-    found = read_topic(path, reader, topic, sensor.message, row)
+    make = bag_messages.of_sensor(sensor)[1]
     return make(found.stamps / 1e9, found.rows.reshape(len(found.stamps), sum(sensor.fields.values())))

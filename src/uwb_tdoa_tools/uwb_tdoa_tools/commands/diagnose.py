@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.files import write_text
 
 from .. import cli, command_lines, options, parallel
 from ..checking.remarks import remarks_on
@@ -120,7 +121,7 @@ def _diagnose(args: Namespace) -> None:
     result = replace(result, applying=applying)
     cli.write_json(out / "diagnosis.json", output.as_json(result))
     result.effects.to_yaml(out / "effects.yaml")
-    (out / "report.html").write_text(html(result))
+    write_text(out / "report.html", html(result))
     write_parameters(out / "ekf_node.yaml", tdoa_std)
     if rerun is not None:
         write_diagnosis(rerun, result, effects or EffectSet(), config)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 import sys
 from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.files import write_text
 
 from .. import cli, options, parallel
 from ..results_file import asked_of
@@ -97,7 +97,7 @@ def _evaluate(args: Namespace) -> int:
         cli.write_json(args.json, {"runs": [one.as_json() for one in kept], "pooled": as_json(together)})
     if args.markdown:
         others = table.read_others(args.beside) if args.beside else {}
-        Path(args.markdown).write_text(table.markdown_of(kept, pool, others))
+        write_text(args.markdown, table.markdown_of(kept, pool, others))
     if late := evaluator.late_tdoas():
         cli.say("evaluate", f"{args.odometry}: {late} TDOAs came too late for that filter: this is not what it can do; "
                 "replay it in step with the odometry (replay --follow odometry).")  # fmt: skip

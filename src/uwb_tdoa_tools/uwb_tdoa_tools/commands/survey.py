@@ -6,6 +6,7 @@ import sys
 from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_bias.foundation.files import write_text
 
 from .. import cli, command_lines, options
 from ..diagnosis.noise import write_parameters
@@ -66,7 +67,7 @@ def _survey(args: Namespace) -> int:
     anchors = result.anchors
     anchors.to_yaml(out / "anchors.yaml")
     rows = (f"{i},{x:.4f},{y:.4f},{z:.4f}" for i, (x, y, z) in zip(anchors.ids, anchors.positions))
-    (out / "anchors.csv").write_text("\n".join(["id,x,y,z", *rows, ""]))
+    write_text(out / "anchors.csv", "\n".join(["id,x,y,z", *rows, ""]))
     result.effects.to_yaml(out / "effects.yaml")
     config_file = write_parameters(out / "ekf_node.yaml", result.tdoa_std)
     cli.write_json(out / "survey.json", as_dict(result))

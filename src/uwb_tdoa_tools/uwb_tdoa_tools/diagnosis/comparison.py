@@ -16,6 +16,7 @@ from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.results import OF_ROW, VERDICTS
 from uwb_tdoa_ekf.sensitivity import RANGES
 
+from ..clock import numbered
 from ..scoring.by_phase import EVERYTHING
 from ..json_values import as_json
 from ..scoring.metrics import Score, pooled
@@ -185,7 +186,7 @@ def _blocks(judged: Score) -> np.ndarray:
     """(b, 5) per block of 5 s: sums of squared 3D errors, counts, sums of errors."""
     if not len(judged.t):
         return np.zeros((1, 5))
-    block = ((judged.t - judged.t[0]) / BLOCK).astype(int)
+    block = numbered(judged.t, BLOCK)
     power = np.sum(judged.error**2, axis=1)
     return np.stack([np.bincount(block, power), np.bincount(block), *(np.bincount(block, e) for e in judged.error.T)], axis=1)
 

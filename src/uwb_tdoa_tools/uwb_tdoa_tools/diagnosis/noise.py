@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from uwb_tdoa_bias.foundation.files import write_text
+
 if TYPE_CHECKING:
     from pathlib import Path
 
@@ -19,5 +21,5 @@ def write_parameters(path: Path, tdoa_std: float | None) -> Path | None:
     if tdoa_std is None:
         path.unlink(missing_ok=True)
         return None
-    path.write_text(PARAMETERS.format(tdoa_std))
+    write_text(path, PARAMETERS.format(tdoa_std))
     return path

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
+
+from uwb_tdoa_bias.foundation.files import write_filled
 
 from ..scoring.metrics import position_at
 
@@ -77,7 +80,7 @@ def plot(flights: Sequence[Drawn], anchors: Anchors, path: str | Path) -> None:
         axes.set(ylabel=f"{axis}, m")
     axes.set(xlabel="t, s")
     axes.legend()
-    figure.savefig(path, dpi=120)
+    write_filled(path, partial(figure.savefig, dpi=120))
 
 
 def _badness(one: Drawn) -> tuple[bool, float]:

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from uwb_tdoa_bias.foundation.files import write_filled
 from uwb_tdoa_ekf.results import Odometry
 from uwb_tdoa_ekf.frames import rotation_std
 
@@ -18,4 +19,5 @@ def write_csv(path: Path, odometry: Odometry) -> None:
     std = np.sqrt(np.einsum("nii->ni", odometry.covariance))
     yaw = rotation_std(odometry.q, odometry.covariance)[:, 2]
     rows = np.column_stack([odometry.t, odometry.p, odometry.q, odometry.v, std[:, :6], yaw])
-    np.savetxt(path, rows, fmt=["%.9f"] + ["%.6f"] * (len(COLUMNS) - 1), delimiter=",", header=",".join(COLUMNS), comments="")
+    kinds = ["%.9f"] + ["%.6f"] * (len(COLUMNS) - 1)
+    write_filled(path, lambda file: np.savetxt(file, rows, fmt=kinds, delimiter=",", header=",".join(COLUMNS), comments=""))

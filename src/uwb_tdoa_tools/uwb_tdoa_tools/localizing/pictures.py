@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.files import write_filled
 from uwb_tdoa_ekf.results import Odometry
 
 from ..scoring.labels import labels
@@ -47,7 +49,7 @@ def draw(path: Path, odometry: Odometry, anchors: Anchors, spans: Sequence[tuple
         ax.grid(alpha=0.25)
     ax.set_xlabel("time of the estimate [s]")
     figure.suptitle(title, fontsize=11)
-    figure.savefig(path, dpi=110)
+    write_filled(path, partial(figure.savefig, dpi=110))
 
 
 def _plane(ax: Axes, odometry: Odometry, anchors: Anchors, lost: np.ndarray, plane: tuple[int, int, str]) -> None:

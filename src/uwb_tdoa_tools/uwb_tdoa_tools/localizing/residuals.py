@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.foundation.files import write_filled, write_text
 from uwb_tdoa_bias.foundation.sensors import LOCATING
 from uwb_tdoa_ekf.core.verdicts import COMPENSATED, REJECTED, USED
 from uwb_tdoa_ekf.results import VERDICTS, Residuals, concatenated
@@ -84,13 +86,12 @@ def by_pair(residuals: Residuals) -> list[OfPair]:
 
 def write_csv(path: Path, residuals: Residuals) -> None:
     """Write a line for each TDOA: s, ids of the anchors, m, m, 0 to 1, and what became of it. Empty where the filter had no residual."""
-    with open(path, "w") as file:
-        file.write(",".join(COLUMNS) + "\n")
-        std = np.sqrt(residuals.variance)
-        rows = zip(residuals.t, residuals.a, residuals.b, residuals.innovation, std, residuals.weight, residuals.verdict)
-        for t, a, b, value, its_std, weight, verdict in rows:
-            numbers = f"{value:.4f},{its_std:.4f},{weight:.3f}" if np.isfinite(value) else ",,"
-            file.write(f"{t:.6f},{int(a)},{int(b)},{numbers},{VERDICTS[int(verdict)]}\n")
+    lines, std = [",".join(COLUMNS)], np.sqrt(residuals.variance)
+    rows = zip(residuals.t, residuals.a, residuals.b, residuals.innovation, std, residuals.weight, residuals.verdict)
+    for t, a, b, value, its_std, weight, verdict in rows:
+        numbers = f"{value:.4f},{its_std:.4f},{weight:.3f}" if np.isfinite(value) else ",,"
+        lines.append(f"{t:.6f},{int(a)},{int(b)},{numbers},{VERDICTS[int(verdict)]}")
+    write_text(path, "\n".join([*lines, ""]))
 
 
 def picture(path: Path, residuals: Residuals, title: str) -> None:
@@ -120,4 +121,4 @@ def picture(path: Path, residuals: Residuals, title: str) -> None:
     axes[-1].set_xlabel("time of the recording [s]")
     left_out = f"; {len(found) - len(pairs)} pairs with fewer TDOAs are not shown" if len(pairs) < len(found) else ""
     figure.suptitle(f"{title}: residuals of each pair of anchors [cm]; red: more than three standard deviations{left_out}", fontsize=10)
-    figure.savefig(path, dpi=110)
+    write_filled(path, partial(figure.savefig, dpi=110))

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.files import write_filled, write_text
 from uwb_tdoa_ekf.results import Odometry, Residuals
 from uwb_tdoa_ekf.core.verdicts import USED
 
@@ -76,7 +78,7 @@ def write_csv(path: Path, zones: list[Zone]) -> None:
     for zone in zones:
         numbers = [f"{getattr(zone, name):.3f}" for name in COLUMNS[:-1]]
         lines.append(",".join([*numbers, " ".join(f"{anchor}:{share:.2f}" for anchor, share in zone.anchors)]))
-    path.write_text("\n".join([*lines, ""]))
+    write_text(path, "\n".join([*lines, ""]))
 
 
 def draw(path: Path, zones: list[Zone], anchors: Anchors, size: float, title: str) -> None:
@@ -101,5 +103,5 @@ def draw(path: Path, zones: list[Zone], anchors: Anchors, size: float, title: st
         figure.colorbar(mesh, ax=ax, label=label)
     axes[0].legend(loc="best")
     figure.suptitle(title, fontsize=10)
-    figure.savefig(path, dpi=110)
+    write_filled(path, partial(figure.savefig, dpi=110))
     plt.close(figure)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
@@ -10,6 +11,7 @@ from matplotlib.colors import BoundaryNorm
 from scipy.spatial import Delaunay, QhullError, cKDTree
 
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.files import write_filled
 
 from .. import parallel
 from ..checking.sides import sides_of, to_copy
@@ -184,5 +186,5 @@ def plot(hall: Hall, chart: Chart, heard: np.ndarray, path: str | Path) -> None:
         ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
         figure.colorbar(mesh, ax=ax, label=label, shrink=0.85)
     figure.suptitle(f"{len(anchors)} anchors, z = {z[k]:.2f} m: {100.0 * chart.flyable.mean():.0f} % can be flown", fontsize=11)
-    figure.savefig(path, dpi=110)
+    write_filled(path, partial(figure.savefig, dpi=110))
     plt.close(figure)

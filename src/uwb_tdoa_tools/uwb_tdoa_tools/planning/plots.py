@@ -11,6 +11,8 @@ from matplotlib.colors import ListedColormap
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from uwb_tdoa_bias.foundation.files import write_filled
+
 from ..scoring.labels import labels
 from ..scoring.plots import plt
 from .bifurcation import Subsets
@@ -245,4 +247,5 @@ def _save(figure: Figure, title: str, path: str | Path) -> None:
     image = Image.frombuffer("RGBA", canvas.get_width_height(), canvas.buffer_rgba())
     plt.close(figure)
     # 256 colours are enough, and a third of the size
-    image.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(path, "PNG", optimize=True)
+    few = image.convert("RGB").quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
+    write_filled(path, lambda file: few.save(file, "PNG", optimize=True))

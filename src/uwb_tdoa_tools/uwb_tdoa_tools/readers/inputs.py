@@ -11,11 +11,14 @@ import numpy as np
 from tqdm import tqdm
 
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.flight import AIDS
 from uwb_tdoa_bias.foundation.foreign_text import printable
 from uwb_tdoa_bias.foundation.sensors import LOCATING
 
 from .. import parallel
 from ..bags.kind import is_bag
+from ..bags.write_ahead import BESIDE
+from ..clock import apart, sentence_on
 from . import read_flight
 
 if TYPE_CHECKING:
@@ -136,6 +139,8 @@ class Reading:
         path, survey = recording
         flight = read_flight(path, survey, self.namespace, self.salvage, self.topics, self.truth)
         report_remarks(path, flight.meta.get("remarks", ()))
+        beside = {name: stream.t for name in ("tdoa", "imu", *AIDS) if (stream := getattr(flight, name)) is not None}
+        report_remarks(path, (f"{sentence_on(*one)}." for one in apart(beside)))
         return flight
 
     def one(self, path: str | Path) -> Flight:
@@ -169,10 +174,11 @@ class Reading:
 
 
 def _recordings(path: Path) -> Iterator[Path]:
-    """Recordings in a folder, at any depth, or a path that is one. Bags that are files may lie in a folder, as other files do."""
+    """Recordings in a folder, at any depth, or a path that is one. Bags that are files may lie in a folder, as other files do; what SQLite
+    leaves beside them is none."""
     if path.is_file() or (path / "metadata.yaml").exists():
         yield path
         return
     for inside in sorted(path.iterdir()):
-        if not inside.name.startswith("."):
+        if not inside.name.startswith(".") and not inside.name.endswith(BESIDE):
             yield from _recordings(inside)

@@ -15,6 +15,7 @@ from uwb_tdoa_bias.foundation.sensors.ranges import Ranges
 from uwb_tdoa_bias.foundation.sensors.sensor import LARGEST_NUMBER
 from uwb_tdoa_bias.foundation.sensors.pressure import pressure_at
 
+from ..clock import sentences, straightened
 from .optical_flow import velocity_of
 
 if TYPE_CHECKING:
@@ -41,14 +42,19 @@ def make_flight(
         (g); "pose": x, y, z (m), qx, qy, qz, qw. "tof": tof (mm); "baro": baro (m above the sea, from the pressure of the standard atmosphere). "flow": x, y (pixel counts),
         which become a velocity where "tof" and IMU are.
     extra : the same of everything else, for `Flight.extra`.
-    meta : dict, completed here with "protocol" and, where there is something to tell, "reordered" (how often the stamps
-        of each stream fell before they were sorted), "imu_accel_interpolated" and "remarks" (list of sentences).
+    meta : dict, completed here with "protocol" and, where there is something to tell, "clock" ([Jump] and {stream: outliers}, see
+        `clock.straightened`), "reordered" (how often the stamps of each stream fell before they were sorted), "imu_accel_interpolated" and "remarks" (list of sentences).
     salvage : leave out records that are not finite, or whose stamps are a day away from the others, with a remark.
     truth : take "pose" as the ground truth; it is not looked at otherwise.
     Raises InputError; without salvage for such records too.
     """
     meta = {"remarks": [], **meta}
     wanted = {key: columns for key, columns in streams.items() if len(columns["t"]) and (truth or key != "pose")}
+    clock = straightened({key: columns["t"] for key, columns in (extra | wanted).items()})
+    wanted, extra = ({key: clock.columns(key, columns) for key, columns in group.items()} for group in (wanted, extra))
+    meta["remarks"] += sentences(clock)
+    if clock.jumps or clock.kept:
+        meta["clock"] = clock.jumps, clock.outliers
     streams = {key: _sound(key, columns, meta, salvage) for key, columns in wanted.items()}
     streams = {key: columns for key, columns in streams.items() if len(columns["t"])}
     extra = {key: columns for key, columns in extra.items() if len(columns["t"])}
@@ -90,7 +96,10 @@ def make_flight(
         velocity = velocity if len(velocity.t) else None
     if not meta["remarks"]:
         del meta["remarks"]
-    return Flight(name, anchors, tdoas, imu, poses, extra, meta, height=height, pressure=pressure, velocity=velocity, range=distances)
+    return Flight(
+        name, anchors, tdoas, imu, poses, extra, meta, clock.restarts,
+        height=height, pressure=pressure, velocity=velocity, range=distances,
+    )  # fmt: skip
 
 
 def _measured(columns: Columns, *ids: str) -> tuple[np.ndarray, ...]:

@@ -21,6 +21,7 @@ from ..checking.delays import of_tdoas
 from ..checking.known_path import KnownPath
 from ..checking.imu_rules import ARRANGEMENTS, signed_axis
 from ..checking.motion_rules import FEWEST, TrueMotion
+from ..clock import grid
 from .metrics import ALIGN, judged_part, position_at
 
 if TYPE_CHECKING:
@@ -291,7 +292,7 @@ def paths(truth: Truth, odometry: PoseColumns) -> tuple[np.ndarray, np.ndarray]:
         return np.empty((0, 3)), np.empty((0, 3))
     _, first, last = judged_part(truth)
     begin, end = max(first, odometry.t[0]) + LONGEST, min(last, odometry.t[-1]) - LONGEST
-    t = np.arange(begin, max(begin, end), 1.0 / RATE)
+    t = grid(begin, end, 1.0 / RATE, odometry.t)
     return position_at(t, truth), position_at(t, odometry)
 
 
@@ -302,7 +303,7 @@ def _epoch(flight: Flight, odometry: PoseColumns) -> float:
     truth = flight.truth
     if len(odometry.t) < 2:
         raise InputError(f"{flight.name}: the ground truth is on another clock than the TDOAs, and there is no estimate to find it by.")
-    ours, theirs = (position_at(np.arange(one.t[0], one.t[-1], EPOCH_STEP), one) for one in (odometry, truth))
+    ours, theirs = (position_at(grid(one.t[0], one.t[-1], EPOCH_STEP, one.t), one) for one in (odometry, truth))
     lags, size, tried = np.arange(-len(theirs) + 1, len(ours)), np.sqrt(np.sum(ours.var(axis=0))), []
     for pair, arrangements in (((ours, theirs), (np.eye(3),)), ((ours - ours.mean(axis=0), theirs - theirs.mean(axis=0)), ARRANGEMENTS)):
         error = _apart_by_lag(pair[0], pair[1], lags, arrangements)

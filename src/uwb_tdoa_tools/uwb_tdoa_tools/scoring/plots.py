@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 import matplotlib
@@ -9,6 +10,8 @@ import matplotlib
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
+
+from uwb_tdoa_bias.foundation.files import write_filled  # noqa: E402
 
 from .metrics import position_at  # noqa: E402
 from .phases import TITLES  # noqa: E402
@@ -54,7 +57,7 @@ def plot_error(score: Score, odometry: Estimate, truth: Truth, path: str | Path)
     row = score.row()
     where = TITLES[score.part].removesuffix(" recording")
     figure.suptitle(f"{row['flight']}: 3D RMSE {row['rmse_3d']:.3f} m {where}, {found['whole']['rmse_3d']:.3f} m of all")
-    figure.savefig(path, dpi=110)
+    write_filled(path, partial(figure.savefig, dpi=110))
     plt.close(figure)
 
 
@@ -74,5 +77,5 @@ def plot_comparison(flight: Flight, scores: Sequence[Score], path: str | Path) -
         axes.grid(alpha=0.3)
         axes.legend()
     figure.suptitle(flight.name)
-    figure.savefig(path, dpi=110)
+    write_filled(path, partial(figure.savefig, dpi=110))
     plt.close(figure)

@@ -62,5 +62,4 @@ def simulate(config: SimulationConfig, trajectory: Flyable | None = None) -> Fli
             "config": filled.as_dict(),
             "parameters": parameters,
         },
-        **aids.measure(filled, room, flown),
-    )
+    ).replaced(**aids.measure(filled, room, flown))

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.files import write_filled
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -49,4 +51,4 @@ def plot(flight: Flight, path: str | Path) -> None:
     total = parts["bias"] + parts["multipath"] + parts["noise"] + parts["outlier"]
     error.plot(parts["t"], total, ".", markersize=1)
     error.set(xlabel="t, s", ylabel="error of TDOA, m", ylim=(-1, 1))
-    figure.savefig(path, dpi=120)
+    write_filled(path, partial(figure.savefig, dpi=120))

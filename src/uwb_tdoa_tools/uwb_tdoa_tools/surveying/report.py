@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_bias.foundation.elsewhere import elsewhere
+from uwb_tdoa_bias.foundation.files import write_filled
 
 from ..checking.known_path import MANY
 
@@ -126,4 +128,4 @@ def picture(found: SelfCalibration, path: str | Path) -> None:
         ax.set_aspect("equal", adjustable="datalim")
         ax.grid(alpha=0.25)
     figure.axes[0].legend()
-    figure.savefig(path, dpi=110)
+    write_filled(path, partial(figure.savefig, dpi=110))

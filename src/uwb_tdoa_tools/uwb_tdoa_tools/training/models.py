@@ -11,6 +11,7 @@ from uwb_tdoa_bias.correction.corrector import LARGEST_YAW_STD
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.correction.features import columns
+from uwb_tdoa_bias.foundation.files import write_bytes
 
 from . import labels as labelling, linear, paper, physics, structured
 
@@ -241,7 +242,7 @@ def save(result: Trained, folder: Path) -> tuple[Path | None, Path | None]:
         if content is None:
             path.unlink(missing_ok=True)  # or an earlier training's would be taken for ours
     if made is not None:
-        model.write_bytes(made.SerializeToString(deterministic=True))
+        write_bytes(model, made.SerializeToString(deterministic=True))
     if result.effects is not None:
         result.effects.to_yaml(effects)
     return (model if made is not None else None), (effects if result.effects is not None else None)

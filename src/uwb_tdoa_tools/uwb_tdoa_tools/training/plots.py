@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING
+
+from uwb_tdoa_bias.foundation.files import write_filled
 
 from ..scoring.plots import plt
 
@@ -21,5 +24,5 @@ def plot_curve(
     ax.set(xlabel=label, ylabel="error of the TDOAs, RMS [m]")
     ax.grid(alpha=0.3)
     ax.legend()
-    figure.savefig(path, dpi=110)
+    write_filled(path, partial(figure.savefig, dpi=110))
     plt.close(figure)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ...clock import numbered
 from ..channels import tdoa_parts
 from ..regression.table import BLOCK
 
@@ -34,7 +35,7 @@ class Series:
         pair = samples.a * 100000 + samples.b
         order = rows[np.lexsort((samples.t[rows], pair[rows]))]
         t = samples.t[order]
-        block = ((t - t.min()) / BLOCK).astype(int)
+        block = numbered(t, BLOCK)
         return cls(t, part.residual[order], samples.a[order], samples.b[order], pair[order], block)
 
     def steps(self, lag: int = 1) -> tuple[np.ndarray, np.ndarray]:

@@ -12,6 +12,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Truth
 from uwb_tdoa_ekf.smoother import smooth
 
+from ...clock import grid
 from .ground_truth import GroundTruth
 from .nothing import without_truth
 from .path import SPACING, OdometryPath
@@ -51,7 +52,7 @@ class OdometryReference(GroundTruth):
         own = smooth(alone, self._config, Corrector(flight.anchors)).odometry
         first, last = path.aloft or (0.0, 0.0)  # by itself: laid a little too high, the time on the floor would count as in the air
         chosen = (own.t >= first) & (own.t <= last)
-        t = np.arange(own.t[chosen][0], own.t[chosen][-1], SPACING) if chosen.any() else np.empty(0)
+        t = grid(own.t[chosen][0], own.t[chosen][-1], SPACING, own.t[chosen]) if chosen.any() else np.empty(0)
         if len(t) < FEWEST:
             raise InputError(f"{flight.name}: its odometry is above the floor for {len(t)} stamps only; fly for half a minute.")
         estimate = np.stack([np.interp(t, own.t, column) for column in own.p.T], axis=1)

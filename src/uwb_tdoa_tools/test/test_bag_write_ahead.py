@@ -1,0 +1,121 @@
+"""SQLite bags of a recorder that was killed: what is in the -wal file counts, or the bag is refused."""
+
+from pathlib import Path
+import shutil
+import sqlite3
+
+import pytest
+from recordings import differences, small_flight
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_tools.bags.bag import read_bag, write_bag
+from uwb_tdoa_tools.bags.files import messages, open_bag
+from uwb_tdoa_tools.readers import inputs
+
+FLIGHT = small_flight(0.3)
+BATCHES = 12  # transactions in the log
+
+
+@pytest.fixture(params=["file", "directory"])
+def unclosed(request, tmp_path):
+    """A bag whose last two thirds are in the log of its file, as a recorder leaves it that is killed."""
+    write_bag(FLIGHT, tmp_path / "written", "sqlite3")
+    (written,) = (tmp_path / "written").glob("*.db3")
+    connection = sqlite3.connect(written, isolation_level=None)
+    connection.execute("PRAGMA journal_mode=WAL")
+    connection.execute("PRAGMA wal_autocheckpoint=0")
+    rows = connection.execute("SELECT id, topic_id, timestamp, data FROM messages ORDER BY id").fetchall()
+    first = len(rows) // 3
+    connection.execute("DELETE FROM messages WHERE id > ?", (rows[first - 1][0],))
+    connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+    size = (len(rows) - first) // BATCHES + 1
+    for begin in range(first, len(rows), size):
+        connection.execute("BEGIN")
+        connection.executemany("INSERT INTO messages(id, topic_id, timestamp, data) VALUES (?, ?, ?, ?)", rows[begin : begin + size])
+        connection.execute("COMMIT")
+    killed = tmp_path / "killed"
+    killed.mkdir()
+    for file in (tmp_path / "written").iterdir():
+        if request.param == "directory" or file.suffix != ".yaml":
+            shutil.copy(file, killed)
+            (killed / file.name).chmod(0o444)
+    if request.param == "directory":  # without our checksum of the file
+        text = (killed / "metadata.yaml").read_text()
+        (killed / "metadata.yaml").chmod(0o644)
+        (killed / "metadata.yaml").write_text("\n".join(line for line in text.splitlines() if "crc32" not in line))
+    connection.close()
+    return killed if request.param == "directory" else killed / written.name
+
+
+def log_of(bag):
+    (log,) = (bag if bag.is_dir() else bag.parent).glob("*-wal")
+    log.chmod(0o644)
+    return log
+
+
+def test_all_messages_are_read_and_nothing_is_changed(unclosed):
+    folder = unclosed if unclosed.is_dir() else unclosed.parent
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+    flight = read_bag(unclosed)
+    assert differences(FLIGHT, flight) == []
+    assert "did not close" in flight.meta["remarks"][0]
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_without_the_log_of_its_file_less_is_there(unclosed):
+    if unclosed.is_dir():
+        return
+    log_of(unclosed).unlink()
+    assert len(read_bag(unclosed).tdoa) < 0.6 * len(FLIGHT.tdoa)
+
+
+def test_a_damaged_log_is_refused_or_read_up_to_there(unclosed):
+    log = log_of(unclosed)
+    content = bytearray(log.read_bytes())
+    content[len(content) // 2] ^= 0xFF
+    log.write_bytes(content)
+    with pytest.raises(InputError, match=r"-wal: \d+ of \d+ transactions cannot be read.*--salvage"):
+        read_bag(unclosed)
+    flight = read_bag(unclosed, salvage=True)
+    assert 0.3 * len(FLIGHT.tdoa) < len(flight.tdoa) < len(FLIGHT.tdoa)
+    assert any("transactions cannot be read: read up to there" in remark for remark in flight.meta["remarks"])
+
+
+def test_a_log_without_its_head_is_refused(unclosed):
+    log = log_of(unclosed)
+    log.write_bytes(bytes(8) + log.read_bytes()[8:])
+    with pytest.raises(InputError, match="cannot be read"):
+        read_bag(unclosed)
+
+
+def test_a_transaction_that_was_not_finished_costs_that_transaction(unclosed):
+    if unclosed.is_dir():
+        return  # metadata.yaml tells how many messages there are
+    log = log_of(unclosed)
+    log.write_bytes(log.read_bytes()[:-100])
+    assert 0.8 * len(FLIGHT.tdoa) < len(read_bag(unclosed).tdoa) < len(FLIGHT.tdoa)
+
+
+def test_a_journal_of_an_unfinished_transaction_is_refused(tmp_path):
+    write_bag(FLIGHT, tmp_path / "bag", "sqlite3")
+    (file,) = (tmp_path / "bag").glob("*.db3")
+    Path(f"{file}-journal").write_bytes(bytes.fromhex("d9d505f920a163d7") + bytes(504))
+    with pytest.raises(InputError, match="-journal holds a transaction that was not finished"):
+        read_bag(tmp_path / "bag")
+    Path(f"{file}-journal").write_bytes(bytes(512))  # of one that was
+    assert differences(FLIGHT, read_bag(tmp_path / "bag")) == []
+
+
+def test_what_sqlite_leaves_beside_a_file_is_no_recording(unclosed):
+    folder = unclosed if unclosed.is_dir() else unclosed.parent
+    assert [path for path, _ in inputs.find_flights([folder])] == [unclosed]
+
+
+def test_messages_are_as_many_as_sqlite_counts(unclosed, tmp_path):
+    (file,) = [unclosed] if unclosed.is_file() else unclosed.glob("*.db3")
+    for path in file.parent.glob("*.db3*"):
+        shutil.copyfile(path, tmp_path / path.name)
+    connection = sqlite3.connect(tmp_path / file.name)
+    (count,) = connection.execute("SELECT count(*) FROM messages").fetchone()
+    connection.close()
+    with open_bag(unclosed) as reader:
+        assert sum(1 for _ in messages(unclosed, reader, reader.connections)) == count
