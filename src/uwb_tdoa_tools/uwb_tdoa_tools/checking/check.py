@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, TYPE_CHECKING
 
 import numpy as np
@@ -35,6 +35,7 @@ NOTHING_TO_TRY = {
     "few_anchors",
     "senders",
     "tdoa_clipped",
+    "anchor_scale",
 }
 WITHOUT_IMU = {"imu_silent", "imu_no_gravity", "imu_axis_dead", "imu_tilted", "imu_clipped"}
 OTHER_SURVEY = "give --survey a folder of all surveys: check says which one fits; or survey the anchors again"
@@ -48,6 +49,7 @@ EXPLAINS = {
     "survey_other": {"tdoa_large", "tdoa_outliers"},
     "survey_misfit": {"tdoa_large", "tdoa_outliers"},
     "tdoa_one_sign": {"tdoa_one_sign"},
+    "survey_scale": {"tdoa_large", "tdoa_outliers"},
 }
 
 
@@ -124,8 +126,12 @@ def sensors(recording: Recording) -> Iterator[Finding]:
 def _undone(ordered: OrderedRecording, found: list[Finding]) -> OrderedRecording:
     """The OrderedRecording without the mistakes that the streams show themselves, so that it can be tried."""
     for finding in found:
+        if finding.rule == "survey_scale":
+            ordered = replace(ordered, anchors=ordered.anchors.at(ordered.anchors.positions / finding.value))
+        elif finding.rule == "tdoa_wraps":
+            ordered = ordered.possible()
         if (imu := ordered.imu) is None:
-            break
+            continue
         if finding.rule == "imu_force_unit":
             ordered = ordered.with_imu(accel=imu.accel * finding.value)
         elif finding.rule == "imu_rate_unit":

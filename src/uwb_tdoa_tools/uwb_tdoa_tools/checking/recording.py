@@ -13,6 +13,7 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Imu, Tdoas
 from uwb_tdoa_bias.foundation.sensors import LOCATING, SENSORS
+from uwb_tdoa_bias.foundation.survey_faults import refuse_faulty
 
 from ..bags import messages as bag_messages, placing
 from ..bags.bag import Names, read_anchors, read_topic
@@ -124,6 +125,7 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
     anchors = read_survey(survey) if survey else recorded
     if anchors is None:
         raise InputError(f"{path}: has no message on {name_of('uwb/anchors')}; give a survey file (--survey FILE).")
+    refuse_faulty(anchors, str(survey) if survey else f"{path}: {name_of('uwb/anchors')}")
     samples = bag_messages.imu_of(imu.stamps / 1e9, imu.rows) if len(imu.stamps) else None
     if samples is not None and (place := placing.placed(tree, IMU, imu.frames)[0]):
         samples = placing.imu_in_body(samples, place)

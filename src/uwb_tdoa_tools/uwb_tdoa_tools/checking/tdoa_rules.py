@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.foundation.survey_faults import UNITS as SURVEY_UNITS
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.memory import TDOA, new_state, structured
 from uwb_tdoa_ekf.offline import run_offline
@@ -93,6 +94,15 @@ def sign(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     """All signs the other way."""
     line = "message.distance_difference = distance_to_b - distance_to_a  # not a - b"
     yield MistakeTrial(recording.with_tdoa(d=-recording.tdoa.d), _says("tdoa_sign", "the sign of all TDOAs is wrong", line))
+
+
+def scaled(recording: OrderedRecording) -> Iterator[MistakeTrial]:
+    """The survey in another unit. (Where TDOAs show it at a glance, the streams have said so before.)"""
+    for name, factor in SURVEY_UNITS.items():
+        cause = f"the survey is in {name}, not in metres: its positions are {factor:,.5g} times too large"
+        line = f"x, y, z = x / {factor:.6g}, y / {factor:.6g}, z / {factor:.6g}  # of every anchor"
+        anchors = recording.anchors.at(recording.anchors.positions / factor)
+        yield MistakeTrial(replace(recording, anchors=anchors), _says("survey_scale", cause, line))
 
 
 def survey(recording: OrderedRecording, others: Sequence[Survey]) -> Iterator[MistakeTrial]:
@@ -263,7 +273,7 @@ def best(recording: OrderedRecording, others: Sequence[Survey] = ()) -> tuple[Fi
         for found in units(recording):
             return found
     base, trials = recording.part(LONG).unexplained(), []
-    for rule in (sign, renumbered, swapped, contrary, moved, lambda c: survey(c, others)):
+    for rule in (sign, scaled, renumbered, swapped, contrary, moved, lambda c: survey(c, others)):
         for trial in rule(recording):
             most = min(RATIO * base.mean, base.mean - BY_ERRORS * trial.share)
             other = trial.recording.part(LONG).unexplained(most)
