@@ -66,7 +66,8 @@ class SurveyScale:
         mean, kind = losses.mean(axis=0), self._table[:, 0]
         chosen = np.flatnonzero((kind == SCALED) | (kind == ALONE))
         best = int(chosen[np.argmin(mean[chosen])])
-        rival = int(np.flatnonzero(np.isin(kind, (AS_IT_IS, SIGN, EXCHANGED)))[np.argmin(mean[np.isin(kind, (AS_IT_IS, SIGN, EXCHANGED))])])
+        others = np.flatnonzero((kind == AS_IT_IS) | (kind == SIGN) | (kind == EXCHANGED))
+        rival = int(others[np.argmin(mean[others])])
         left, z = _compared(losses[:, rival], losses[:, best])
         if left > LEFT or z < DEVIATIONS or mean[best] > GOOD:
             return None
@@ -125,10 +126,12 @@ def _spread(places: np.ndarray) -> float:
 def locate(
     positions: np.ndarray, hypothesis: np.ndarray, rows: np.ndarray, d: np.ndarray, starts: np.ndarray, place: np.ndarray
 ) -> float:
-    """Return the mean Geman-McClure loss, 0 to 1, of TDOAs d (k,) m of anchors in rows (k, 2) of positions (N, 3) m, where the tag fits best;
-    write that to place (3,) m.
+    """Return the mean Geman-McClure loss, 0 to 1, of TDOAs d (k,) m where the tag fits them best; write that to place (3,) m.
 
-    hypothesis : (5,), see `_hypotheses`. A robust Gauss-Newton search from starts (s, 3), in units of half the room, while the loss narrows.
+    positions : (N, 3) m, of anchors; rows : (k, 2), of both anchors of each TDOA.
+
+    hypothesis : (5,), see `_hypotheses`. A robust Gauss-Newton search from starts (s, 3), in units of half the room, while
+    the loss narrows.
     """
     n = len(d)
     ends, low, high = np.empty((n, 2, 3)), np.full(3, np.inf), np.full(3, -np.inf)

@@ -120,7 +120,7 @@ def sensors(recording: Recording) -> Iterator[Finding]:
     for name, stream in recording.sensors.items():
         for rule in SENSORS[name].rules:
             if (found := rule(stream, recording.anchors)) is not None:
-                yield Finding(found.rule, ERROR, found.cause, found.evidence, found.remedy, found.value)
+                yield Finding(found.rule, ERROR if found.severe else WARNING, found.cause, found.evidence, found.remedy, found.value)
 
 
 def _undone(ordered: OrderedRecording, found: list[Finding]) -> OrderedRecording:
@@ -186,6 +186,11 @@ def _other_room(mixed: Finding) -> Finding:
 def _misfit(fit: SurveyFit) -> Iterator[Finding]:
     """A survey that fits much better with its anchors elsewhere, and not with one of them alone."""
     gain = tdoa_rules.gained(fit)
+    if gain is None and tdoa_rules.apparent_gain(fit) > tdoa_rules.GAIN:
+        evidence = "with the anchors elsewhere each half of the recording fits better, and not the other half"
+        cause = "the TDOAs fit the survey less well than usual, and this recording does not determine why"
+        remedy = "record a minute in which the tag is carried through the whole room, and check again"
+        yield Finding("misfit_unclear", NOTE, cause, evidence, remedy, tdoa_rules.apparent_gain(fit))
     if gain is not None:
         heard, (_, anchors) = fit.heard, fit.all_moved
         evidence = f"{100.0 * gain / fit.before:.0f} % less stays unexplained with the anchors elsewhere, "

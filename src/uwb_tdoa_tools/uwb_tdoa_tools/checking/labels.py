@@ -114,4 +114,10 @@ def sorted_file(recording: Recording) -> Iterator[Finding]:
         )
 
 
-RULES = (frames, senders, no_imu, anchors, sorted_file)
+def losses(recording: Recording) -> Iterator[Finding]:
+    """What the reader of the recording has not used."""
+    for rule, cause, evidence, remedy in recording.losses:
+        yield Finding(rule, WARNING, cause, evidence, remedy, np.nan)
+
+
+RULES = (frames, senders, no_imu, anchors, sorted_file, losses)

@@ -41,6 +41,7 @@ NOISE, USUAL = (0.02, 0.2), 0.063  # m, median difference of successive TDOAs of
 WELL = 0.4  # of the loss; healthy 0.31 at most
 BY_ERRORS = 0.1**2 / (0.1**2 + SCALE**2)  # of the loss: what systematic errors of 0.1 m leave unexplained
 GAIN = 0.065  # of the loss by moving all anchors; healthy 0.056 at most, of measured flights
+HELD = 0.5  # share of GAIN that must be left where the other half of the recording has moved the anchors
 ALONE = 0.85  # share of the gain that one anchor explains
 FEWEST = 10  # windows in which the tag was located; TDOAs of an anchor that may be called by the id of another
 APART = 1.0  # m, by which TDOAs of such an anchor are off at least: anchors of a hall are farther from each other
@@ -255,11 +256,15 @@ def moved(recording: OrderedRecording) -> Iterator[MistakeTrial]:
 
 
 def gained(fit: SurveyFit) -> float | None:
-    """How much less stays unexplained with all anchors moved; None if that is no more than in a healthy recording."""
-    if len(fit) < FEWEST:
-        return None
-    gain = fit.before - fit.all_moved[0]
-    return gain if gain > GAIN else None
+    """How much less stays unexplained with all anchors moved; None if that is no more than in a healthy recording, or if anchors that one
+    half of the recording has moved do not fit the other half."""
+    gain = apparent_gain(fit)
+    return gain if gain > GAIN and fit.held_out_gain > HELD * GAIN else None
+
+
+def apparent_gain(fit: SurveyFit) -> float:
+    """The same without a look at both halves; 0.0 of too few windows."""
+    return fit.before - fit.all_moved[0] if len(fit) >= FEWEST else 0.0
 
 
 def best(recording: OrderedRecording, others: Sequence[Survey] = ()) -> tuple[Finding | None, OrderedRecording]:
