@@ -112,7 +112,7 @@ def flown(seconds=20.0, rate=300.0, seed=0, place=None, errors=(0.0, 0.0), ancho
     a = np.arange(len(t)) % 8
     b = (a + 1) % 8
     p = BOX.mean(axis=0) + np.sin(np.outer(t, [0.9, 1.1, 0.7])) * [2.0, 2.5, 1.0] if place is None else np.array(place)
-    of_halves = np.stack([error * rng.normal(size=8) for error in errors])
+    of_halves = np.array(errors)[:, None] * rng.normal(size=8)
     slow = of_halves[(t > 0.5 * t[-1]).astype(int), a]
     d = tdoa(p, BOX[a], BOX[b]) + slow + 0.07 * rng.normal(size=len(t))
     return OrderedRecording(anchors, Tdoas(t, a, b, d, np.zeros(len(t))), None)
@@ -120,8 +120,8 @@ def flown(seconds=20.0, rate=300.0, seed=0, place=None, errors=(0.0, 0.0), ancho
 
 def test_errors_that_change_are_no_errors_of_the_survey():
     """Anchors elsewhere explain much of each half, and nothing of the other."""
-    fits = [flown(seed=seed, errors=(0.5, 0.5)).survey_fit for seed in range(6)]
-    assert sum(apparent_gain(fit) > GAIN for fit in fits) >= 3
+    fits = [flown(seed=seed, errors=(0.6, -0.3)).survey_fit for seed in range(6)]
+    assert sum(apparent_gain(fit) > GAIN for fit in fits) >= 2
     assert [gained(fit) for fit in fits] == [None] * 6
 
 
