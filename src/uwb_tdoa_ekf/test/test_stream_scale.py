@@ -25,7 +25,8 @@ def flown(positions, seconds=25.0, rate=300.0, moving=1.0, sign=1.0, unit=1.0, s
     t = 100.0 + np.arange(int(seconds * rate)) / rate
     a = np.arange(len(t)) % 8
     b = (a + 1) % 8
-    p = ANCHORS.positions.mean(axis=0) + (1.0 - moving) * np.array([1.5, -2.0, -1.2]) + moving * np.sin(np.outer(t, [0.5, 0.7, 0.3])) * [2.5, 2.5, 1.0]
+    path = moving * np.sin(np.outer(t, [0.5, 0.7, 0.3])) * [2.5, 2.5, 1.0]
+    p = ANCHORS.positions.mean(axis=0) + (1.0 - moving) * np.array([1.5, -2.0, -1.2]) + path
     d = tdoa(p, ANCHORS.positions[a], ANCHORS.positions[b]) + SYSTEMATIC * rng.normal(size=8)[a] + RADIO * rng.normal(size=len(t))
     rules = StreamRules(ANCHORS.at(positions))
     rules.feed_tdoa(t, t + 0.002, ANCHORS.ids[a], ANCHORS.ids[b], sign * d / unit)

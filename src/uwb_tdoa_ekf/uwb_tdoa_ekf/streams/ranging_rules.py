@@ -21,7 +21,7 @@ RETURNS = 0.08  # share of TDOAs that leap by more than 0.5 m and back; healthy 
 EVEN = 0.6  # share of the pairs, heard in both orders, that have one sign; healthy 0.1
 ON_GRID = 0.95  # share; healthy 0.005
 CLIPPED = 0.02  # share at the largest value
-STEP, ALIKE, NEAR, FEWEST = 2.0, 0.6, 0.5, 10  # m, median leap; share of the leaps within NEAR, m, of that; leaps
+STEP, ALIKE, NEAR, FEWEST = 5.0, 0.6, 0.5, 10  # m, median leap; share of the leaps within NEAR, m, of that; leaps
 TICK = 299792458.0 / (128 * 499.2e6)  # m, of the clock of a DW1000
 WRAPS = {f"2^{bits} ticks of a DW1000": 2.0**bits * TICK for bits in (8, 16, 24, 31, 32, 39, 40)} | {
     f"2^{bits} ns": 2.0**bits * 0.299792458 for bits in (16, 31, 32)
@@ -41,10 +41,9 @@ def fixed_step(windows: list[TdoaWindow]) -> Finding | None:
     if step < STEP:
         return None
     alike = float(np.mean(np.abs(steps - step) < NEAR))
-    share = 0.5 * share_of(windows, "leaps", "successive")
+    share = share_of(windows, "impossible")
     if alike < ALIKE or share < 0.5 * OUTLIERS:
         return None
-    share = max(share, share_of(windows, "impossible"))
     known = next((name for name, size in WRAPS.items() if abs(size - step) < max(NEAR, 1e-5 * size)), None)
     cause = f"TDOAs are off by a fixed step of {step:.8g} m"
     cause += f": a time stamp wraps at {known}" if known else ": a time stamp wraps or loses its upper bits"

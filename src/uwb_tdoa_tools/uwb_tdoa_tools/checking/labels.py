@@ -116,8 +116,8 @@ def sorted_file(recording: Recording) -> Iterator[Finding]:
 
 def losses(recording: Recording) -> Iterator[Finding]:
     """What the reader of the recording has not used."""
-    for rule, cause, evidence, remedy in recording.losses:
-        yield Finding(rule, WARNING, cause, evidence, remedy, np.nan)
+    for cause, evidence, remedy in recording.losses:
+        yield Finding("imu_lost", WARNING, cause, evidence, remedy, np.nan)
 
 
 RULES = (frames, senders, no_imu, anchors, sorted_file, losses)

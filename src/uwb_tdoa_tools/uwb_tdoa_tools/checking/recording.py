@@ -51,7 +51,7 @@ class Recording:
     topics : {topic: type} of a bag, or of all that are live; recorded : Anchors that the bag itself holds, or None; falls :
     how often the stamps fell in a file whose reader has sorted them; remarks : sentences on what could not be read of a
     damaged one; ends : [End] of live topics; sensors : {name: Stream} of those of the SENSORS that there are;
-    losses : ((rule, cause, evidence, remedy), ...) of what a reader has not used.
+    losses : ((cause, evidence, remedy), ...) of what a reader has not used.
     """
 
     name: str
@@ -68,7 +68,7 @@ class Recording:
     remarks: tuple[str, ...] = ()
     ends: tuple[End, ...] = ()
     sensors: dict[str, Stream] = field(default_factory=dict)
-    losses: tuple[tuple[str, str, str, str], ...] = ()
+    losses: tuple[tuple[str, str, str], ...] = ()
 
 
 def read_recording(reading: Reading, path: str | Path, survey: str | Path | None = None) -> Recording:
@@ -106,7 +106,7 @@ def of_flight(flight: Flight) -> Recording:
     tdoa, imu = (np.full(len(stream) if stream is not None else 0, np.nan) for stream in (flight.tdoa, flight.imu))
     falls = sum(flight.meta.get("reordered", {}).values())
     sensors = {name: stream for name in SENSORS if (stream := getattr(flight, name)) is not None}
-    losses = tuple((rule, cause, evidence, remedy) for rule, cause, evidence, remedy in flight.meta.get("losses", ()))
+    losses = tuple((cause, evidence, remedy) for cause, evidence, remedy in flight.meta.get("losses", ()))
     return Recording(flight.name, flight.anchors, flight.tdoa, flight.imu, tdoa, imu, falls=falls, sensors=sensors, losses=losses)
 
 

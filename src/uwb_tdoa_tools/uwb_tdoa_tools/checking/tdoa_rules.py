@@ -41,6 +41,7 @@ NOISE, USUAL = (0.02, 0.2), 0.063  # m, median difference of successive TDOAs of
 WELL = 0.4  # of the loss; healthy 0.31 at most
 BY_ERRORS = 0.1**2 / (0.1**2 + SCALE**2)  # of the loss: what systematic errors of 0.1 m leave unexplained
 GAIN = 0.065  # of the loss by moving all anchors; healthy 0.056 at most, of measured flights
+POOR = 0.33  # of the loss, as surveyed: beyond what the errors of any healthy recording leave; 0.28 at most
 HELD = 0.5  # share of GAIN that must be left where the other half of the recording has moved the anchors
 ALONE = 0.85  # share of the gain that one anchor explains
 FEWEST = 10  # windows in which the tag was located; TDOAs of an anchor that may be called by the id of another
@@ -257,9 +258,9 @@ def moved(recording: OrderedRecording) -> Iterator[MistakeTrial]:
 
 def gained(fit: SurveyFit) -> float | None:
     """How much less stays unexplained with all anchors moved; None if that is no more than in a healthy recording, or if anchors that one
-    half of the recording has moved do not fit the other half."""
+    half of the recording has moved do not fit the other half, and errors of the TDOAs can explain it as well."""
     gain = apparent_gain(fit)
-    return gain if gain > GAIN and fit.held_out_gain > HELD * GAIN else None
+    return gain if gain > GAIN and (fit.before > POOR or fit.held_out_gain > HELD * GAIN) else None
 
 
 def apparent_gain(fit: SurveyFit) -> float:

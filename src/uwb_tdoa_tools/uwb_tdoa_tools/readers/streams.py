@@ -43,7 +43,7 @@ def make_flight(
         which become a velocity where "tof" and IMU are.
     extra : the same of everything else, for `Flight.extra`.
     meta : dict, completed here with "protocol" and, where there is something to tell, "reordered" (how often the stamps
-        of each stream fell before they were sorted), "imu_accel_interpolated", "losses" ([(rule, cause, evidence, remedy)],
+        of each stream fell before they were sorted), "imu_accel_interpolated", "losses" ([(cause, evidence, remedy)],
         what is not used) and "remarks" (list of sentences).
     salvage : leave out records that are not finite, or whose stamps are a day away from the others, with a remark.
     truth : take "pose" as the ground truth; it is not looked at otherwise.
@@ -78,7 +78,7 @@ def make_flight(
     elif alone := streams.keys() & {"gyro", "acc"}:
         name, missing = ("gyroscope", "accelerometer") if alone == {"gyro"} else ("accelerometer", "gyroscope")
         evidence, remedy = f"there is no {missing}", f"record the {missing} too"
-        meta["losses"] = [("imu_half", f"the {name} is not used: the filter needs both inertial sensors", evidence, remedy)]
+        meta["losses"] = [(f"the {name} is not used: the filter needs both inertial sensors", evidence, remedy)]
     if "pose" in streams:
         pose = streams["pose"]
         poses = Truth(pose["t"], _stack(pose, "x", "y", "z"), _stack(pose, "qx", "qy", "qz", "qw"))
@@ -192,18 +192,18 @@ def _imu(gyro: Columns, acc: Columns, meta: dict[str, Any]) -> Imu:
     return Imu(t, np.deg2rad(rate), force * GRAVITY)
 
 
-def _losses_of(gyro: np.ndarray, acc: np.ndarray, inside: np.ndarray) -> list[tuple[str, str, str, str]]:
-    """[(rule, cause, evidence, remedy)] of what is lost of sensors with stamps gyro (n,) and acc (m,) s; inside (n,) : whether a sample of
+def _losses_of(gyro: np.ndarray, acc: np.ndarray, inside: np.ndarray) -> list[tuple[str, str, str]]:
+    """[(cause, evidence, remedy)] of what is lost of sensors with stamps gyro (n,) and acc (m,) s; inside (n,) : whether a sample of
     the gyroscope counts."""
     out = []
     rates = [1.0 / max(float(np.median(np.diff(t))), 1e-9) if len(t) > 1 else 0.0 for t in (gyro, acc)]
     evidence = f"gyroscope {rates[0]:.0f} Hz, accelerometer {rates[1]:.0f} Hz"
     if max(rates) > UNEQUAL * min(rates):
         cause = "gyroscope and accelerometer have different rates: only the stamps of the gyroscope are used"
-        out.append(("imu_rates", cause, evidence, "log both at one rate, e.g. in one block of the log"))
+        out.append((cause, evidence, "log both at one rate, e.g. in one block of the log"))
     if (lost := float(np.mean(~inside))) > LOST:
         cause = "samples of the gyroscope are left out: the accelerometer was not recorded then"
-        out.append(("imu_cut", cause, f"{100.0 * lost:.0f} % of them; {evidence}", "start and stop both together"))
+        out.append((cause, f"{100.0 * lost:.0f} % of them; {evidence}", "start and stop both together"))
     return out
 
 
