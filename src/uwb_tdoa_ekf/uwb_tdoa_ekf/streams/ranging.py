@@ -34,8 +34,9 @@ GRID = 15
 
 
 class TdoaCounters(NamedTuple):
-    """stamps : see stamps.py; counts; heard (N,) per anchor; steps (STEPS,) m : sizes of the latest leaps;
-    pair, d, before, t (PAIRS,) : of each pair of anchors heard lately the number, last value, the one before and the last stamp, which outlive a window; positions (N, 3) : m."""
+    """stamps : see stamps.py; counts; heard (N,) per anchor; steps (STEPS,) m : sizes of the latest leaps; pair, d, before, t (PAIRS,) : of
+    each pair of anchors heard lately the number, last value, the one before and the last stamp, which outlive a window; positions
+    (N, 3) : m."""
 
     stamps: np.ndarray
     counts: np.ndarray
