@@ -33,7 +33,7 @@ def test_anchors_that_are_certainly_wrong_give_no_odometry(make_rig, name):  # n
     assert not rig.odometry
     for process in processes:
         code, taken = process.stop()
-        assert code == 0 and taken < 1.0
+        assert code == 0 and taken < 4.0  # as without a fault, see test_nodes.py
 
 
 def test_a_survey_that_is_too_wide_does_not_keep_the_node_busy(make_rig):  # noqa: F811
@@ -44,4 +44,4 @@ def test_a_survey_that_is_too_wide_does_not_keep_the_node_busy(make_rig):  # noq
     assert int(rig.fresh_status("ekf_node") and rig.values("ekf_node")["TDOAs received"]) > 0
     for process in processes[::-1]:
         code, taken = process.stop()
-        assert code == 0 and taken < 1.0
+        assert code == 0 and taken < 4.0  # as without a fault, see test_nodes.py
