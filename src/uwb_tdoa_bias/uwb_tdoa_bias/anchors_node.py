@@ -21,6 +21,7 @@ from .foundation.ros_frames import TF_STATIC_QOS
 from .foundation.ros_node import StreamNode
 from .foundation.ros_parameters import FROZEN, Parameter, declare_all, files_of, refuse_unknown, say_unused
 from .foundation.survey import read_survey
+from .foundation.survey_faults import refuse_faulty
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -46,7 +47,7 @@ class AnchorsNode(StreamNode):
         refuse_unknown(self)
         if not own["anchors_file"]:
             raise InputError("anchors_file: is empty; give a survey of the anchors, e.g. anchors.yaml.")
-        anchors = read_survey(own["anchors_file"])
+        anchors = refuse_faulty(read_survey(own["anchors_file"]), own["anchors_file"])
         message = anchors_to_message(anchors)
         for topic, qos, content in (
             ("uwb/anchors", ANCHORS_QOS, message),

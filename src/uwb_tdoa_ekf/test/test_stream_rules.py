@@ -143,6 +143,38 @@ def test_a_fault_of_the_tdoas_is_named(rule):
     _is_whole(found[rule])
 
 
+TICKS = 2.0**32 * 299792458.0 / (128 * 499.2e6)  # m, after which 32 bits of the clock of a DW1000 begin anew
+
+
+@pytest.mark.parametrize("step", [10.0, 299792.458, TICKS])
+@pytest.mark.parametrize("share", [0.08, 0.2, 0.3])
+@pytest.mark.parametrize("signs", [(1.0, 1.0), (1.0, -1.0)])
+def test_a_fixed_step_is_named_with_its_size_and_nothing_else(step, share, signs):
+    imu, tdoa = streams()
+    rng = np.random.default_rng(2)
+    off = np.where(rng.random(len(tdoa[D])) < share, step * np.array(signs)[tdoa[A] % 2], 0.0)
+    found = judged(imu, put(tdoa, D, tdoa[D] + off))
+    assert found.keys() == {"tdoa_wraps"}, found
+    assert found["tdoa_wraps"].value == pytest.approx(step, abs=0.5)
+    assert ("2^32 ticks" in found["tdoa_wraps"].cause) == (step == TICKS)
+
+
+def at_rest(imu, bias):
+    """The samples of a tag that stands still, with a bias of the gyroscope, in the unit of its message."""
+    rng = np.random.default_rng(5)
+    n = len(imu[T])
+    still = put(imu, GYRO, bias + 0.01 * rng.normal(size=(n, 3)))
+    return put(still, FORCE, [0.1, -0.2, GRAVITY] + 0.03 * rng.normal(size=(n, 3)))
+
+
+@pytest.mark.parametrize("bias", [(0.0, 0.0, 0.0), (0.02, -0.03, 0.01), (0.6, 0.0, 0.1), (1.5, -2.0, 0.7)])
+def test_at_rest_no_unit_of_the_gyroscope_is_alleged(bias):
+    imu, tdoa = streams()
+    found = judged(at_rest(imu, np.array(bias)), tdoa)
+    assert not any(finding.severity == "error" for finding in found.values()), found
+    assert found.keys() == ({"imu_rate_offset"} if np.hypot(*bias[:2]) > 0.35 else set())
+
+
 def _is_whole(finding):
     assert finding.severity in SEVERITIES
     assert finding.cause and finding.evidence and finding.remedy

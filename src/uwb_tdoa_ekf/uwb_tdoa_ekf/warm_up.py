@@ -13,6 +13,7 @@ from .frames import pose_and_twist, rotation_std
 from .monitoring.change import YOUNGEST, ChangeDetector
 from .monitoring.slices import LENGTH, Slice
 from .monitoring.stream_watch import StreamWatch
+from .streams.scale import SurveyScale
 
 
 @cache
@@ -34,6 +35,7 @@ def warm_up() -> None:
     pose_and_twist(odometry, *estimator.rates_at(odometry.t))
     rotation_std(odometry.q[-1:], odometry.covariance[-1:])
     watch.findings()
+    SurveyScale(Anchors.from_positions(np.eye(5, 3))).add(np.array([(k, (k + 1) % 5, 1.0) for k in range(5)]))
     detector = ChangeDetector()
     for k in range(YOUNGEST + 2):
         detector.add(Slice(LENGTH * k, np.zeros(3), np.zeros(1, int), np.zeros(1), np.eye(1)))

@@ -15,6 +15,7 @@ from .errors import InputError
 from .ros_parameters import Parameter
 from .ros_topics import Input, Refusals
 from .survey import read_survey
+from .survey_faults import refuse_faulty
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -80,7 +81,7 @@ class AnchorsInput:
         self.anchors: Anchors | None = None
         self.refused: str | None = None
         self._node, self._on_change, self._file = node, on_change, file
-        self._of_file = read_survey(file) if file else None
+        self._of_file = refuse_faulty(read_survey(file), file) if file else None
         self._repeated: Input | None = None  # the subscription to volatile ones
         events = SubscriptionEventCallbacks(incompatible_qos=self._on_incompatible)
         self._latched = Input(node, AnchorArray, "uwb/anchors", self._on_message, ANCHORS_QOS, event_callbacks=events)
@@ -105,7 +106,7 @@ class AnchorsInput:
 
     def _on_message(self, message: AnchorArray) -> None:
         try:
-            anchors, self.refused = Anchors.from_message(message), None
+            anchors, self.refused = refuse_faulty(Anchors.from_message(message)), None
         except InputError as error:
             self.refused = str(error)
             return

@@ -23,6 +23,7 @@ GRID_STARTS = 7  # and the best places of a grid over one that is larger than
 LARGE = 20.0  # m, along x or y
 # m, between its places at least; how many at a height at most; m between heights at most
 GRID_STEP, GRID_POINTS, GRID_LEVEL = 2.0, 600, 4.0
+GRID_LEVELS = 20  # heights at most: the work has a bound, however far the anchors are apart
 GRID_TDOAS = 60  # of the window, that it looks at
 GRID_LOSS, GRID_APART = 1.5, 2.5  # grid steps: scale of the loss, and between two of the best places
 SWEEPS = 14  # Gauss-Newton steps per start
@@ -150,10 +151,11 @@ def _best_of_grid(
 ) -> int:  # fmt: skip
     """Fill in places (k, 6), at rest, of a grid over `mean` +- `prior_std` (6,) that explain a window best, apart from each other. Returns
     how many."""
-    step = max(GRID_STEP, math.sqrt(4.0 * prior_std[0] * prior_std[1] / GRID_POINTS))
+    step = max(GRID_STEP, math.sqrt(4.0 * prior_std[0] * prior_std[1] / GRID_POINTS), 2.0 * max(prior_std[0], prior_std[1]) / GRID_POINTS)
     counts, origin, steps = np.empty(3, np.int64), np.empty(3), np.empty(3)
     for k in range(3):
-        counts[k] = max(2 if k == 2 else 1, int(math.ceil(2.0 * prior_std[k] / (GRID_LEVEL if k == 2 else step))))
+        wanted = math.ceil(2.0 * prior_std[k] / (GRID_LEVEL if k == 2 else step))
+        counts[k] = int(max(2.0, min(wanted, GRID_LEVELS))) if k == 2 else int(max(1.0, wanted))
         steps[k] = 2.0 * prior_std[k] / counts[k]
         origin[k] = mean[k] - prior_std[k] + 0.5 * steps[k]
     losses, p, row = np.empty(counts[0] * counts[1] * counts[2]), np.empty(3), np.empty(3)

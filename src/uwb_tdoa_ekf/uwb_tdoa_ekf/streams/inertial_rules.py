@@ -19,6 +19,7 @@ WEIGHTLESS = 0.65  # of the deviation over the mean, m/s^2 over m/s^2: no gravit
 STEADY = 0.8  # length of the mean specific force over the mean of its lengths; healthy 0.96 at least
 # Without gravity 29 measured and simulated flights deviate by 0.74 at least, or are steady to 0.64 at most.
 TURN_EXCESS = 0.35  # rad/s of turning that gravity does not follow; healthy 0.02 at most, in degrees/s 0.7 at least
+REST_SHAKES, REST_TURNS = 0.02, 0.02  # of the specific force: its deviation in a window, and rad of its direction, of a tag at rest
 UPRIGHT, AXIS = np.cos(np.deg2rad(35.0)), np.cos(np.deg2rad(25.0))  # healthy: 22 degrees, from vibration, at most
 SHAKING = 1.0  # m/s^2 rms of what is faster than 50 ms; healthy 0.6; where the accelerometer rectifies 1.4 at least
 REPEATS, DEAD = 0.2, 0.95  # shares; healthy 0
@@ -119,8 +120,19 @@ def rate_unit(windows: list[ImuWindow]) -> Finding | None:
     if not excess > TURN_EXCESS:
         return None
     evidence = f"{excess:.2f} rad/s of turning that gravity does not follow"
+    if resting(windows):
+        cause = "the gyroscope turns at rest: its bias is large, or it is not in rad/s; a tag at rest does not determine which"
+        remedy = "calibrate the gyroscope at rest, look at its unit in the data sheet, and check a recording in motion"
+        return Finding("imu_rate_offset", WARNING, cause, evidence, remedy, excess)
     line = "for axis in 'xyz': setattr(w, axis, math.radians(getattr(w, axis)))  # w = message.angular_velocity"
     return Finding("imu_rate_unit", ERROR, "the gyroscope is in degrees/s, not in rad/s", evidence, line, excess)
+
+
+def resting(windows: list[ImuWindow]) -> bool:
+    """Whether the specific force neither changes nor turns: nothing of a gyroscope but its bias can be judged."""
+    shakes = median(float(np.linalg.norm(window.deviation[3:])) for window in windows)
+    ups = np.array([window.mean[3:] / max(np.linalg.norm(window.mean[3:]), 1e-9) for window in windows])
+    return shakes < REST_SHAKES * weight(windows) and bool(np.linalg.norm(ups - np.median(ups, axis=0), axis=1).max() < REST_TURNS)
 
 
 def turn_excess(windows: list[ImuWindow]) -> float:

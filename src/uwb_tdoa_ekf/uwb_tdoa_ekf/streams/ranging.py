@@ -9,7 +9,7 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.compiled import compiled
 
-from .stamps import StampWindow, complete, count_stamp, new_stamps, restart_stamps, stamp_window
+from .stamps import LAST, StampWindow, complete, count_stamp, new_stamps, restart_stamps, stamp_window
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.anchors import Anchors
@@ -24,6 +24,8 @@ GRIDS = np.array(
 ON_GRID = 1e-6  # m
 # Pairs that are remembered, of all that a tag hears in a minute; places that one may have, of which it takes the oldest
 PAIRS, PROBES = 4096, 16
+FRESH = 0.3  # s before the end of a window, whose TDOAs belong together: no tag gets far in that time
+STEPS = 64  # leaps of a window whose size is kept
 
 # places in the counters; those of the grids come after
 (KNOWN, UNKNOWN, SELF, INVALID, IMPOSSIBLE, DUPLICATES, SUCCESSIVE, REPEATED, LEAPS, RETURNS, OPPOSED, EVEN, SUM, HIGH,
@@ -32,12 +34,14 @@ GRID = 15
 
 
 class TdoaCounters(NamedTuple):
-    """stamps : see stamps.py; counts; heard (N,) per anchor; pair, d, before, t (PAIRS,) : of each pair of anchors heard lately the
-    number, last value, the one before and the last stamp, which outlive a window; positions (N, 3) : m."""
+    """stamps : see stamps.py; counts; heard (N,) per anchor; steps (STEPS,) m : sizes of the latest leaps; pair, d, before, t (PAIRS,) : of
+    each pair of anchors heard lately the number, last value, the one before and the last stamp, which outlive a window; positions
+    (N, 3) : m."""
 
     stamps: np.ndarray
     counts: np.ndarray
     heard: np.ndarray
+    steps: np.ndarray
     pair: np.ndarray
     d: np.ndarray
     before: np.ndarray
@@ -54,7 +58,8 @@ class TdoaWindow(NamedTuple):
     : of those, with the same value; leaps : of those, by more than LEAP; returns : leaps that go back to the value
     before; opposed : pairs that came in both orders, one soon after the other; even : of those, with the same sign in
     both; size : mean |d|, m; ceiling, hits : largest |d|, m, and how many have it; grids (7,) : share of the values on
-    multiples of GRIDS; heard (N,) : TDOAs in which an anchor takes part.
+    multiples of GRIDS; heard (N,) : TDOAs in which an anchor takes part; steps (k,) : m, sizes of leaps; latest (k, 3) : rows of the
+    anchors and value, m, of the last TDOA of each pair, FRESH at most before the end.
     """
 
     stamps: StampWindow
@@ -75,13 +80,15 @@ class TdoaWindow(NamedTuple):
     hits: int
     grids: np.ndarray
     heard: np.ndarray
+    steps: np.ndarray
+    latest: np.ndarray
 
 
 def new_tdoa(anchors: Anchors) -> TdoaCounters:
     """TdoaCounters of a stream of which nothing was received; anchors : Anchors."""
     d, before, t = np.full((3, PAIRS), np.nan)
     counts, heard = np.zeros(GRID + len(GRIDS)), np.zeros(len(anchors))
-    return TdoaCounters(new_stamps(), counts, heard, np.full(PAIRS, -1), d, before, t, np.array(anchors.positions))
+    return TdoaCounters(new_stamps(), counts, heard, np.zeros(STEPS), np.full(PAIRS, -1), d, before, t, np.array(anchors.positions))
 
 
 @compiled
@@ -145,6 +152,7 @@ def _compare(counters: TdoaCounters, t: float, a: int, b: int, d: float) -> None
         if d == counters.d[pair]:
             c[REPEATED] += 1.0
         if abs(d - counters.d[pair]) > LEAP:
+            counters.steps[int(c[LEAPS]) % STEPS] = abs(d - counters.d[pair])
             c[LEAPS] += 1.0
             if abs(d - counters.before[pair]) < 0.5 * LEAP:
                 c[RETURNS] += 1.0
@@ -216,4 +224,12 @@ def tdoa_window(counters: TdoaCounters) -> TdoaWindow:
         hits=int(c[HIGH_HITS]),
         grids=c[GRID:] / known,
         heard=counters.heard.copy(),
+        steps=counters.steps[: min(int(c[LEAPS]), STEPS)].copy(),
+        latest=_latest(counters),
     )
+
+
+def _latest(counters: TdoaCounters) -> np.ndarray:
+    kept = np.flatnonzero((counters.pair >= 0) & (np.abs(counters.stamps[LAST] - counters.t) < FRESH))
+    a, b = np.divmod(counters.pair[kept], len(counters.heard))
+    return np.column_stack([a, b, counters.d[kept]])

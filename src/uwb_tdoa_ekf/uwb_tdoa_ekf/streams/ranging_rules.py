@@ -21,6 +21,11 @@ RETURNS = 0.08  # share of TDOAs that leap by more than 0.5 m and back; healthy 
 EVEN = 0.6  # share of the pairs, heard in both orders, that have one sign; healthy 0.1
 ON_GRID = 0.95  # share; healthy 0.005
 CLIPPED = 0.02  # share at the largest value
+STEP, ALIKE, NEAR, FEWEST = 5.0, 0.6, 0.5, 10  # m, median leap; share of the leaps within NEAR, m, of that; leaps
+TICK = 299792458.0 / (128 * 499.2e6)  # m, of the clock of a DW1000
+WRAPS = {f"2^{bits} ticks of a DW1000": 2.0**bits * TICK for bits in (8, 16, 24, 31, 32, 39, 40)} | {
+    f"2^{bits} ns": 2.0**bits * 0.299792458 for bits in (16, 31, 32)
+}
 FEW = 3.9  # anchors heard in a second, below which there is no position
 
 
@@ -29,7 +34,27 @@ def share_of(windows: list[TdoaWindow], field: str, among: str = "known") -> flo
     return sum(getattr(w, field) for w in windows) / max(sum(getattr(w, among) for w in windows), 1)
 
 
+def fixed_step(windows: list[TdoaWindow]) -> Finding | None:
+    """Leaps of one size: a time stamp that wraps, or is truncated."""
+    steps = np.concatenate([w.steps for w in windows])
+    step = float(np.median(steps)) if len(steps) >= FEWEST else 0.0
+    if step < STEP:
+        return None
+    alike = float(np.mean(np.abs(steps - step) < NEAR))
+    share = share_of(windows, "impossible")
+    if alike < ALIKE or share < 0.5 * OUTLIERS:
+        return None
+    known = next((name for name, size in WRAPS.items() if abs(size - step) < max(NEAR, 1e-5 * size)), None)
+    cause = f"TDOAs are off by a fixed step of {step:.8g} m"
+    cause += f": a time stamp wraps at {known}" if known else ": a time stamp wraps or loses its upper bits"
+    evidence = f"{100.0 * share:.0f} % of the TDOAs; {100.0 * alike:.0f} % of the leaps have this size"
+    remedy = "d = (d + step / 2) % step - step / 2  # step as above; or subtract the time stamps with all their bits, modulo their range"
+    return Finding("tdoa_wraps", WARNING, cause, evidence, remedy, step)
+
+
 def impossible(windows: list[TdoaWindow]) -> Finding | None:
+    if fixed_step(windows):
+        return None
     share = share_of(windows, "impossible")
     size = median(w.size for w in windows)
     evidence = f"{100.0 * share:.1f} % are longer than their anchors are apart, mean size {size:.3g}"
@@ -87,7 +112,7 @@ def repeated(windows: list[TdoaWindow]) -> Finding | None:
 
 def two_tags(windows: list[TdoaWindow]) -> Finding | None:
     share = share_of(windows, "returns", "successive")
-    if share > RETURNS:
+    if share > RETURNS and fixed_step(windows) is None:
         evidence = f"{100.0 * share:.0f} % leap by more than 0.5 m and back within 0.1 s"
         remedy = "give each tag a namespace of its own: start its driver with --ros-args -r __ns:=/tag2"
         return Finding("two_tags", ERROR, "two tags share uwb/tdoa", evidence, remedy, share)
@@ -142,4 +167,4 @@ def heard(windows: list[TdoaWindow]) -> Finding | None:
     return None
 
 
-RULES = (impossible, of_one, invalid, duplicates, repeated, two_tags, one_sign, rounded, clipped, heard)
+RULES = (fixed_step, impossible, of_one, invalid, duplicates, repeated, two_tags, one_sign, rounded, clipped, heard)

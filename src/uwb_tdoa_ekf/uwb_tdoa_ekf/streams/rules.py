@@ -9,6 +9,7 @@ import numpy as np
 
 from . import inertial, inertial_rules, ranging, ranging_rules, stamp_rules, stamps
 from .finding import ERROR, Finding, most_severe_first
+from .scale import KEPT, SurveyScale
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.anchors import Anchors
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
 Window = TypeVar("Window", "ImuWindow", "TdoaWindow")
 
+LOOKS_LIKE = {"tdoa_large", "tdoa_outliers"}
 FULL = 20  # messages without which a window says little of values
 
 
@@ -34,6 +36,7 @@ class StreamRules:
         self.tdoa: list[TdoaWindow] = []
         self.unknown: Counter[int] = Counter()  # ids that the survey does not have
         self._imu, self._tdoa = inertial.new_imu(), ranging.new_tdoa(anchors)
+        self._scale = SurveyScale(anchors, kept and KEPT)
 
     def feed_imu(self, t: np.ndarray, arrival: np.ndarray, gyro: np.ndarray, force: np.ndarray) -> None:
         """Take many samples in the order of their arrival: t, arrival (n,), gyro, force (n, 3)."""
@@ -74,6 +77,8 @@ class StreamRules:
             found += [rule("uwb/tdoa", of_tdoa) for rule in stamp_rules.OF_ONE] + [rule(tdoa) for rule in ranging_rules.RULES]
         if imu and tdoa:
             found += [rule(of_imu, of_tdoa) for rule in stamp_rules.OF_BOTH]
+        if (scale := self._scale.finding) is not None:  # of which impossible TDOAs are what it looks like
+            found = [scale, *(finding for finding in found if finding is None or finding.rule not in LOOKS_LIKE)]
         found.append(self._unknown(tdoa))
         return most_severe_first(finding for finding in found if finding is not None)
 
@@ -96,7 +101,9 @@ class StreamRules:
         inertial.restart_imu(self._imu)
 
     def _close_tdoa(self) -> None:
-        self._keep(self.tdoa, ranging.tdoa_window(self._tdoa))
+        window = ranging.tdoa_window(self._tdoa)
+        self._keep(self.tdoa, window)
+        self._scale.add(window.latest)
         ranging.restart_tdoa(self._tdoa)
 
     def _keep(self, windows: list[Window], window: Window) -> None:

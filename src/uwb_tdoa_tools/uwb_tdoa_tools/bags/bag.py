@@ -31,6 +31,7 @@ from uwb_tdoa_bias.foundation.flight import Flight
 from uwb_tdoa_bias.foundation.foreign_text import printable
 from uwb_tdoa_bias.foundation.sensors import LOCATING, SENSORS
 from uwb_tdoa_bias.foundation.sensors.sensor import LARGEST_NUMBER
+from uwb_tdoa_bias.foundation.survey_faults import refuse_faulty
 from uwb_tdoa_bias.foundation.version import written_by
 
 from ..clock import sentences, straightened
@@ -242,8 +243,9 @@ def read_bag(
             raise InputError(f"{path}: has no message on {name_of('uwb/tdoa')}; {why}.")
         if anchors is None:
             anchors = read_anchors(path, reader, name_of("uwb/anchors"))
-        if anchors is None:
-            raise InputError(f"{path}: has no message on {name_of('uwb/anchors')}; give a survey file (--survey FILE).")
+            if anchors is None:
+                raise InputError(f"{path}: has no message on {name_of('uwb/anchors')}; give a survey file (--survey FILE).")
+            refuse_faulty(anchors, f"{path}: {name_of('uwb/anchors')}")
         imu = stream("imu")
         tree = placing.read_frames(path, reader)
         places = {kinds[name].topic: placing.placed(tree, kinds[name].topic, found[name].frames) for name in ("imu", "tdoa")}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, TYPE_CHECKING
 
 import numpy as np
@@ -35,6 +35,7 @@ NOTHING_TO_TRY = {
     "few_anchors",
     "senders",
     "tdoa_clipped",
+    "anchor_scale",
 }
 WITHOUT_IMU = {"imu_silent", "imu_no_gravity", "imu_axis_dead", "imu_tilted", "imu_clipped"}
 OTHER_SURVEY = "give --survey a folder of all surveys: check says which one fits; or survey the anchors again"
@@ -48,6 +49,7 @@ EXPLAINS = {
     "survey_other": {"tdoa_large", "tdoa_outliers"},
     "survey_misfit": {"tdoa_large", "tdoa_outliers"},
     "tdoa_one_sign": {"tdoa_one_sign"},
+    "survey_scale": {"tdoa_large", "tdoa_outliers"},
 }
 
 
@@ -99,6 +101,8 @@ def check(recording: Recording, others: Sequence[Survey] = ()) -> Report:
         tried, places = _tried(_undone(OrderedRecording.of(recording), found), names, others)
         explained = set().union(*(EXPLAINS.get(finding.rule, ()) for finding in tried))
         found = [finding for finding in found if finding.rule not in explained] + tried
+    if "survey_scale" in names:  # of a room of another size
+        places = np.empty((0, 3))
     view = coverage.CoverageView(recording.anchors, list(streams.tdoa), places, "height" in recording.sensors)
     for covered in coverage.RULES:
         found += (finding for finding in covered(view) if finding.rule not in explained)
@@ -120,14 +124,18 @@ def sensors(recording: Recording) -> Iterator[Finding]:
     for name, stream in recording.sensors.items():
         for rule in SENSORS[name].rules:
             if (found := rule(stream, recording.anchors)) is not None:
-                yield Finding(found.rule, ERROR, found.cause, found.evidence, found.remedy, found.value)
+                yield Finding(found.rule, ERROR if found.severe else WARNING, found.cause, found.evidence, found.remedy, found.value)
 
 
 def _undone(ordered: OrderedRecording, found: list[Finding]) -> OrderedRecording:
     """The OrderedRecording without the mistakes that the streams show themselves, so that it can be tried."""
     for finding in found:
+        if finding.rule == "survey_scale":
+            ordered = replace(ordered, anchors=ordered.anchors.at(ordered.anchors.positions / finding.value))
+        elif finding.rule == "tdoa_wraps":
+            ordered = ordered.possible()
         if (imu := ordered.imu) is None:
-            break
+            continue
         if finding.rule == "imu_force_unit":
             ordered = ordered.with_imu(accel=imu.accel * finding.value)
         elif finding.rule == "imu_rate_unit":
@@ -182,6 +190,11 @@ def _other_room(mixed: Finding) -> Finding:
 def _misfit(fit: SurveyFit) -> Iterator[Finding]:
     """A survey that fits much better with its anchors elsewhere, and not with one of them alone."""
     gain = tdoa_rules.gained(fit)
+    if gain is None and tdoa_rules.apparent_gain(fit) > tdoa_rules.GAIN:
+        evidence = "with the anchors elsewhere each half of the recording fits better, and not the other half"
+        cause = "the TDOAs fit the survey less well than usual, and this recording does not determine why"
+        remedy = "record a minute in which the tag is carried through the whole room, and check again"
+        yield Finding("misfit_unclear", NOTE, cause, evidence, remedy, tdoa_rules.apparent_gain(fit))
     if gain is not None:
         heard, (_, anchors) = fit.heard, fit.all_moved
         evidence = f"{100.0 * gain / fit.before:.0f} % less stays unexplained with the anchors elsewhere, "

@@ -33,6 +33,8 @@ SLOWEST = 50.0  # Hz; of fewer samples nothing is alleged
 # The filter leans on the IMU: TDOAs count for little, and the bias of the accelerometer may be large.
 LEANING = FilterConfig(tdoa_correlation_length=100.0, initial_accel_bias_std=0.5)
 RATIO, DEVIATIONS = 0.9, 2.5  # of what stays unexplained; healthy flights: 0.98 at least for anything that is tried
+MOVED = 0.3  # m, standard deviation of the places of a tag that moves; measured flights 1.2 at least
+STEADY, TURNED = 0.02, 0.3  # share of the specific force by which it varies at rest; rad that a sensor in motion turns at least
 TIE = 0.03  # ratios this close say the same: the simplest arrangement is taken
 CHOSEN = 8  # arrangements that are tried on the longer part
 UPRIGHT, MIRROR = np.eye(3), np.diag([1.0, -1.0, 1.0])
@@ -45,7 +47,7 @@ SCALES = {180.0 / np.pi: "rad/s, divided by 57.3 once too often", 2.0 * np.pi: "
 def fit(recording: OrderedRecording) -> Finding | None:
     """What does not fit about the IMU: Finding or None. recording : OrderedRecording whose TDOAs are right."""
     brief = replace(recording, imu=averaged(recording.imu)).part(PART)
-    if brief.imu is None or len(brief.imu) < SLOWEST * PART / 2.0:
+    if brief.imu is None or len(brief.imu) < SLOWEST * PART / 2.0 or stands(brief.imu) or not moved(recording.survey_fit.places):
         return None
     base = _unexplained(brief)
     trials = [_tried(base, brief, accel, gyro) for accel, gyro in _usual()]
@@ -63,6 +65,18 @@ def fit(recording: OrderedRecording) -> Finding | None:
     if len(near) > 1:
         evidence += f"; {len(near) - 1} other arrangements fit about as well"
     return _finding(accel, gyro, evidence, ratio)
+
+
+def moved(places: np.ndarray) -> bool:
+    """Whether a tag that was at places (k, 3) m has moved: of one that stands, TDOAs tell nothing about the inertial sensor."""
+    return len(places) > 0 and bool(np.sqrt(np.sum(np.var(places, axis=0))) > MOVED)
+
+
+def stands(imu: Imu) -> bool:
+    """Whether an inertial sensor neither shakes nor turns, in whatever unit its rates are: nothing determines that unit then."""
+    turned = np.cumsum(imu.gyro - imu.gyro.mean(axis=0), axis=0) * float(np.median(np.diff(imu.t)))
+    steady = np.linalg.norm(np.std(imu.accel, axis=0)) < STEADY * np.linalg.norm(imu.accel.mean(axis=0))
+    return bool(steady and np.ptp(turned, axis=0).max() * max(SCALES) < TURNED)
 
 
 def averaged(imu: Imu | None) -> Imu | None:

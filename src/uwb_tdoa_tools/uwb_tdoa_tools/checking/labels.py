@@ -146,4 +146,10 @@ def other_time(recording: Recording) -> Iterator[Finding]:
         yield Finding("sensor_apart", ERROR, cause, evidence, "stamp all sensors with the clock of one machine", ahead)
 
 
-RULES = (frames, senders, no_imu, anchors, sorted_file, clock, other_time)
+def losses(recording: Recording) -> Iterator[Finding]:
+    """What the reader of the recording has not used."""
+    for cause, evidence, remedy in recording.losses:
+        yield Finding("imu_lost", WARNING, cause, evidence, remedy, np.nan)
+
+
+RULES = (frames, senders, no_imu, anchors, sorted_file, clock, other_time, losses)

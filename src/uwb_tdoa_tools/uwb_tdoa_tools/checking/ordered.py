@@ -14,6 +14,7 @@ from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas
 from uwb_tdoa_ekf.core.memory import TDOA, structured
 from uwb_tdoa_ekf.results import rows_of
 from uwb_tdoa_ekf.streams.explain import unexplained
+from uwb_tdoa_ekf.streams.ranging import BEYOND
 
 from .survey_fit import SurveyFit
 
@@ -66,6 +67,13 @@ class OrderedRecording:
         """The same with other columns of the inertial samples."""
         assert self.imu is not None
         return replace(self, imu=replace(self.imu, **columns))
+
+    def possible(self) -> OrderedRecording:
+        """The same without TDOAs that are longer than their anchors are apart."""
+        a, b = self.rows()
+        apart = np.linalg.norm(self.anchors.positions[a] - self.anchors.positions[b], axis=1)
+        kept = (a < 0) | (b < 0) | (np.abs(self.tdoa.d) <= apart + BEYOND)
+        return replace(self, tdoa=rows_of(self.tdoa, np.flatnonzero(kept)))
 
     def rows(self) -> tuple[np.ndarray, np.ndarray]:
         """Rows of the anchors of each TDOA: two (n,) arrays, -1 where an id is unknown."""

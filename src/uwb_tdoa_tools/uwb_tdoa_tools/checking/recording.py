@@ -13,6 +13,7 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Imu, Tdoas
 from uwb_tdoa_bias.foundation.sensors import LOCATING, SENSORS
+from uwb_tdoa_bias.foundation.survey_faults import refuse_faulty
 
 from ..bags import messages as bag_messages, placing
 from ..bags.bag import Names, arrivals, on_one_clock, read_anchors, read_topic
@@ -50,7 +51,8 @@ class Recording:
     topics : {topic: type} of a bag, or of all that are live; recorded : Anchors that the bag itself holds, or None; falls :
     how often the stamps fell in a file whose reader has sorted them; remarks : sentences on what could not be read of a
     damaged one; ends : [End] of live topics; sensors : {name: Stream} of those of the SENSORS that there are; jumps : of the clock, which
-    is continuous here, and outliers : {stream: messages left out because of their stamps}.
+    is continuous here, and outliers : {stream: messages left out because of their stamps};
+    losses : ((cause, evidence, remedy), ...) of what a reader has not used.
     """
 
     name: str
@@ -69,6 +71,7 @@ class Recording:
     sensors: dict[str, Stream] = field(default_factory=dict)
     jumps: tuple[Jump, ...] = ()
     outliers: dict[str, int] = field(default_factory=dict)
+    losses: tuple[tuple[str, str, str], ...] = ()
 
 
 def read_recording(reading: Reading, path: str | Path, survey: str | Path | None = None) -> Recording:
@@ -107,8 +110,11 @@ def of_flight(flight: Flight) -> Recording:
     falls = sum(flight.meta.get("reordered", {}).values())
     sensors = {name: stream for name in SENSORS if (stream := getattr(flight, name)) is not None}
     jumps, outliers = flight.meta.get("clock", ((), {}))
+    losses = tuple((cause, evidence, remedy) for cause, evidence, remedy in flight.meta.get("losses", ()))
     streams = flight.tdoa, flight.imu, tdoa, imu
-    return Recording(flight.name, flight.anchors, *streams, falls=falls, sensors=sensors, jumps=jumps, outliers=outliers)
+    return Recording(
+        flight.name, flight.anchors, *streams, falls=falls, sensors=sensors, jumps=jumps, outliers=outliers, losses=losses
+    )
 
 
 def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Recording:
@@ -134,6 +140,7 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
     anchors = read_survey(survey) if survey else recorded
     if anchors is None:
         raise InputError(f"{path}: has no message on {name_of('uwb/anchors')}; give a survey file (--survey FILE).")
+    refuse_faulty(anchors, str(survey) if survey else f"{path}: {name_of('uwb/anchors')}")
     samples = bag_messages.imu_of(imu.stamps / 1e9, imu.rows) if len(imu.stamps) else None
     if samples is not None and (place := placing.placed(tree, IMU, imu.frames)[0]):
         samples = placing.imu_in_body(samples, place)

@@ -6,6 +6,7 @@ survey.
 
 from __future__ import annotations
 
+from copy import copy
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -71,6 +72,28 @@ class SurveyFit:
     def all_moved(self) -> tuple[float, np.ndarray]:
         """`solve` with all anchors moved."""
         return self.solve()
+
+    @cached_property
+    def held_out_gain(self) -> float:
+        """Loss that anchors moved as one half of the windows says leave less in the other half, the mean of both halves: errors of places
+        where the tag is for a while are no errors of the survey."""
+        half = len(self) // 2
+        parts = [self._part(slice(None, half)), self._part(slice(half, None))]
+        return float(np.mean([test.before - test._at(fitted.all_moved[1]) for fitted, test in (parts, parts[::-1])]))
+
+    def _part(self, windows: slice) -> SurveyFit:
+        """The same of some of the windows."""
+        part = copy(self)
+        part.__dict__.pop("all_moved", None)
+        part._windows, part._start = self._windows[windows], self._start[windows]
+        part.before, _ = part.solve([])
+        return part
+
+    def _at(self, positions: np.ndarray) -> float:
+        """Loss with the anchors at positions (N, 3) m."""
+        elsewhere = copy(self)
+        elsewhere.positions = positions
+        return elsewhere.solve([])[0]
 
     def solve(self, free: Sequence[int] | None = None) -> tuple[float, np.ndarray]:
         """(loss that is left, 0 to 1; anchor positions (N, 3) m) with the anchors in `free` (rows; None for all)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.foundation.survey_faults import UNITS as SURVEY_UNITS
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.memory import TDOA, new_state, structured
 from uwb_tdoa_ekf.offline import run_offline
@@ -40,6 +41,8 @@ NOISE, USUAL = (0.02, 0.2), 0.063  # m, median difference of successive TDOAs of
 WELL = 0.4  # of the loss; healthy 0.31 at most
 BY_ERRORS = 0.1**2 / (0.1**2 + SCALE**2)  # of the loss: what systematic errors of 0.1 m leave unexplained
 GAIN = 0.065  # of the loss by moving all anchors; healthy 0.056 at most, of measured flights
+POOR = 0.33  # of the loss, as surveyed: beyond what the errors of any healthy recording leave; 0.28 at most
+HELD = 0.5  # share of GAIN that must be left where the other half of the recording has moved the anchors
 ALONE = 0.85  # share of the gain that one anchor explains
 FEWEST = 10  # windows in which the tag was located; TDOAs of an anchor that may be called by the id of another
 APART = 1.0  # m, by which TDOAs of such an anchor are off at least: anchors of a hall are farther from each other
@@ -93,6 +96,15 @@ def sign(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     """All signs the other way."""
     line = "message.distance_difference = distance_to_b - distance_to_a  # not a - b"
     yield MistakeTrial(recording.with_tdoa(d=-recording.tdoa.d), _says("tdoa_sign", "the sign of all TDOAs is wrong", line))
+
+
+def scaled(recording: OrderedRecording) -> Iterator[MistakeTrial]:
+    """The survey in another unit. (Where TDOAs show it at a glance, the streams have said so before.)"""
+    for name, factor in SURVEY_UNITS.items():
+        cause = f"the survey is in {name}, not in metres: its positions are {factor:,.5g} times too large"
+        line = f"x, y, z = x / {factor:.6g}, y / {factor:.6g}, z / {factor:.6g}  # of every anchor"
+        anchors = recording.anchors.at(recording.anchors.positions / factor)
+        yield MistakeTrial(replace(recording, anchors=anchors), _says("survey_scale", cause, line))
 
 
 def survey(recording: OrderedRecording, others: Sequence[Survey]) -> Iterator[MistakeTrial]:
@@ -245,11 +257,15 @@ def moved(recording: OrderedRecording) -> Iterator[MistakeTrial]:
 
 
 def gained(fit: SurveyFit) -> float | None:
-    """How much less stays unexplained with all anchors moved; None if that is no more than in a healthy recording."""
-    if len(fit) < FEWEST:
-        return None
-    gain = fit.before - fit.all_moved[0]
-    return gain if gain > GAIN else None
+    """How much less stays unexplained with all anchors moved; None if that is no more than in a healthy recording, or if anchors that one
+    half of the recording has moved do not fit the other half, and errors of the TDOAs can explain it as well."""
+    gain = apparent_gain(fit)
+    return gain if gain > GAIN and (fit.before > POOR or fit.held_out_gain > HELD * GAIN) else None
+
+
+def apparent_gain(fit: SurveyFit) -> float:
+    """The same without a look at both halves; 0.0 of too few windows."""
+    return fit.before - fit.all_moved[0] if len(fit) >= FEWEST else 0.0
 
 
 def best(recording: OrderedRecording, others: Sequence[Survey] = ()) -> tuple[Finding | None, OrderedRecording]:
@@ -263,7 +279,7 @@ def best(recording: OrderedRecording, others: Sequence[Survey] = ()) -> tuple[Fi
         for found in units(recording):
             return found
     base, trials = recording.part(LONG).unexplained(), []
-    for rule in (sign, renumbered, swapped, contrary, moved, lambda c: survey(c, others)):
+    for rule in (sign, scaled, renumbered, swapped, contrary, moved, lambda c: survey(c, others)):
         for trial in rule(recording):
             most = min(RATIO * base.mean, base.mean - BY_ERRORS * trial.share)
             other = trial.recording.part(LONG).unexplained(most)

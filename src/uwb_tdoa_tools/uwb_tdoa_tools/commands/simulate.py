@@ -9,6 +9,7 @@ from typing import Any, TYPE_CHECKING
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.sensors import SENSORS
+from uwb_tdoa_bias.foundation.survey_faults import refuse_faulty
 
 from .. import cli
 from ..bags.bag import check_output, write_bag
@@ -123,7 +124,7 @@ def _config(args: Namespace) -> SimulationConfig:
     """SimulationConfig of the options, most of which have the names of its fields."""
     values = {field.name: getattr(args, field.name) for field in fields(SimulationConfig) if hasattr(args, field.name)}
     values["walls"] = None if args.walls is None else Walls.from_yaml(args.walls)
-    values["anchors"] = None if args.anchors is None else Anchors.from_yaml(args.anchors)
+    values["anchors"] = None if args.anchors is None else refuse_faulty(Anchors.from_yaml(args.anchors), str(args.anchors))
     values["imu_errors"] = NO_IMU_ERRORS if args.perfect_imu else ImuErrors(vibration=args.vibration)
     return SimulationConfig(**values)
 

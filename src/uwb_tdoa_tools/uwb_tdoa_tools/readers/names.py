@@ -12,6 +12,7 @@ from uwb_tdoa_bias.foundation import survey
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.safe_yaml import read_yaml
+from uwb_tdoa_bias.foundation.survey_faults import refuse_faulty
 
 from .tables import number, read_table
 
@@ -41,7 +42,13 @@ class Named:
 def read_named(path: str | Path) -> Named:
     """Named of a survey file that `read_survey` reads, or one like it with names of any text in place of the ids: a CSV file name,x,y,z or
     id,x,y,z, or YAML. The id is the number that a name ends with, if all end with different ones; else the line of the survey, from 0 on.
-    Raises InputError."""
+    Raises InputError, also for a survey that is certainly wrong."""
+    named = _read_named(path)
+    refuse_faulty(named.anchors, str(path))
+    return named
+
+
+def _read_named(path: str | Path) -> Named:
     try:
         return Named(survey.read_survey(path))
     except InputError as refused:

@@ -28,6 +28,7 @@ GRAVITY = 9.81  # m/s^2 in one g of the Crazyflie's accelerometer, as in its fir
 NO_TARGET = 32.0  # m; the range finder writes 32.767 or more where it sees nothing, and sees 4 m at most
 LARGEST = {"tof": 1e9, "baro": 4e4}  # mm, and m: the formula of the standard atmosphere ends at 44 km
 DAY = 86400.0  # s
+UNEQUAL, LOST = 1.1, 0.02  # ratio of two rates, and share of samples left out, that are told
 REFERENCE = 0.95  # of the TDOAs: an anchor that is in so many is what all others are compared with
 
 
@@ -43,7 +44,8 @@ def make_flight(
         which become a velocity where "tof" and IMU are.
     extra : the same of everything else, for `Flight.extra`.
     meta : dict, completed here with "protocol" and, where there is something to tell, "clock" ([Jump] and {stream: outliers}, see
-        `clock.straightened`), "reordered" (how often the stamps of each stream fell before they were sorted), "imu_accel_interpolated" and "remarks" (list of sentences).
+        `clock.straightened`), "reordered" (how often the stamps of each stream fell before they were sorted), "imu_accel_interpolated",
+        "losses" ([(cause, evidence, remedy)], what is not used) and "remarks" (list of sentences).
     salvage : leave out records that are not finite, or whose stamps are a day away from the others, with a remark.
     truth : take "pose" as the ground truth; it is not looked at otherwise.
     Raises InputError; without salvage for such records too.
@@ -79,6 +81,10 @@ def make_flight(
     imu = poses = None
     if "gyro" in streams and "acc" in streams:
         imu = _imu(streams["gyro"], streams["acc"], meta)
+    elif alone := streams.keys() & {"gyro", "acc"}:
+        name, missing = ("gyroscope", "accelerometer") if alone == {"gyro"} else ("accelerometer", "gyroscope")
+        evidence, remedy = f"there is no {missing}", f"record the {missing} too"
+        meta["losses"] = [(f"the {name} is not used: the filter needs both inertial sensors", evidence, remedy)]
     if "pose" in streams:
         pose = streams["pose"]
         poses = Truth(pose["t"], _stack(pose, "x", "y", "z"), _stack(pose, "qx", "qy", "qz", "qw"))
@@ -183,6 +189,8 @@ def _imu(gyro: Columns, acc: Columns, meta: dict[str, Any]) -> Imu:
     if len(t) != len(acc["t"]) or (np.abs(t - acc["t"]) > half_period).any():
         meta["imu_accel_interpolated"] = True
         inside = (t >= acc["t"][0]) & (t <= acc["t"][-1])
+        if losses := _losses_of(t, acc["t"], inside):
+            meta["losses"] = losses
         t, rate = t[inside], rate[inside]
         if not len(t):
             raise InputError(
@@ -191,6 +199,21 @@ def _imu(gyro: Columns, acc: Columns, meta: dict[str, Any]) -> Imu:
             )
         force = np.stack([np.interp(t, acc["t"], column) for column in force.T], axis=1)
     return Imu(t, np.deg2rad(rate), force * GRAVITY)
+
+
+def _losses_of(gyro: np.ndarray, acc: np.ndarray, inside: np.ndarray) -> list[tuple[str, str, str]]:
+    """[(cause, evidence, remedy)] of what is lost of sensors with stamps gyro (n,) and acc (m,) s; inside (n,) : whether a sample of
+    the gyroscope counts."""
+    out = []
+    rates = [1.0 / max(float(np.median(np.diff(t))), 1e-9) if len(t) > 1 else 0.0 for t in (gyro, acc)]
+    evidence = f"gyroscope {rates[0]:.0f} Hz, accelerometer {rates[1]:.0f} Hz"
+    if max(rates) > UNEQUAL * min(rates):
+        cause = "gyroscope and accelerometer have different rates: only the stamps of the gyroscope are used"
+        out.append((cause, evidence, "log both at one rate, e.g. in one block of the log"))
+    if (lost := float(np.mean(~inside))) > LOST:
+        cause = "samples of the gyroscope are left out: the accelerometer was not recorded then"
+        out.append((cause, f"{100.0 * lost:.0f} % of them; {evidence}", "start and stop both together"))
+    return out
 
 
 def _stack(columns: Columns, *names: str) -> np.ndarray:

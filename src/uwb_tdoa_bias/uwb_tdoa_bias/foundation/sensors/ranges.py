@@ -12,7 +12,7 @@ from .sensor import Compared, Mistake, Sensor, Stream, finite, parameter
 
 FARTHEST = 1000.0  # m
 BEYOND = 5.0  # times the extent of the anchors that most distances are at most
-MOST = 0.5  # share of the distances
+MOST, SOME = 0.5, 0.01  # share of the distances
 MOST_NAMED = 8  # anchors in a sentence
 
 
@@ -77,12 +77,12 @@ def _unit(ranges: Ranges, anchors: Anchors) -> Mistake | None:
 
 def _impossible(ranges: Ranges, anchors: Anchors) -> Mistake | None:
     """Values that are no distances."""
-    share = float(np.mean(~_measured(ranges)[1]))
-    if share > MOST:
-        evidence = f"{100.0 * share:.0f} % of the ranges are less than 0, no numbers, or more than {FARTHEST:g} m"
-        return Mistake(
-            "range_invalid", "most ranges cannot be distances", evidence, "publish |p - a| in metres, 0 or more", share
-        )
+    share = float(np.mean(~_measured(ranges)[1] | (ranges.d == 0.0)))
+    if share > SOME:
+        evidence = f"{100.0 * share:.1f} % of the ranges are 0 or less, no numbers, or more than {FARTHEST:g} m"
+        cause = "most ranges cannot be distances" if share > MOST else "some ranges cannot be distances: they are lost"
+        remedy = "publish |p - a| in metres, and nothing where the exchange has failed"
+        return Mistake("range_invalid", cause, evidence, remedy, share, share > MOST)
     return None
 
 

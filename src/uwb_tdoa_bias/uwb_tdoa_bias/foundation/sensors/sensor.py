@@ -75,6 +75,7 @@ class Mistake:
     evidence: str
     remedy: str
     value: float
+    severe: bool = True  # or a warning
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,201 @@
+"""Is the survey in another unit, or one anchor of it? The TDOAs that are heard together are located in surveys of every scale.
+
+TDOAs in metres have a scale of their own: where the tag is among more than four anchors, one scale of the survey fits, and no other.
+The same measurements are located with other mistakes undone. The scale is named only if it explains more than each of these.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from itertools import combinations
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from uwb_tdoa_bias.foundation.compiled import compiled
+from uwb_tdoa_bias.foundation.survey_faults import UNITS
+
+from .finding import ERROR, Finding
+
+if TYPE_CHECKING:
+    from uwb_tdoa_bias.foundation.anchors import Anchors
+
+PAIRS, HEARD = 32, 5  # pairs of a snapshot at most; anchors at least: three coordinates and a scale take four differences
+SMALL = 0.05  # m, median size of TDOAs below which they are not in metres themselves
+FEWEST, MANY, KEPT = 4, 20, 60  # snapshots that say something clear, and anything, and that are kept in flight
+SINGLE = 12  # anchors at most, of which each by itself, and any two, are tried: the work has a bound
+SMALLEST, RATIO, LARGEST = 1.5, 1.25, 1500.0  # least factor that counts, ratio of successive ones, and the largest
+LOSS, STEPS, NEAR = 0.5, 8, 0.3  # m, scale of the Geman-McClure loss; Gauss-Newton steps; of the size of the room, the longest of them
+STARTS = np.array([[0.0, 0.0, 0.0], [0.6, 0.6, 0.6], [-0.6, -0.6, 0.6], [0.6, -0.6, -0.6], [-0.6, 0.6, -0.6]])
+LEFT, DEVIATIONS = 0.85, 3.5  # share of the loss that may be left, and standard errors by which it is less than that of the survey as it is
+LEFT_ALONE = 0.65  # the same of one anchor in another unit: one of many explains some of any mistake; measured, in feet 0.50
+GOOD = 0.35  # loss of a survey that fits; healthy flights of three days have 0.10 to 0.25
+MOVED, CLEARLY = 0.3, 0.5  # m by which the tag must have moved; share of the loss that shows it after few seconds and at rest, too
+NANOSECONDS = 0.299792458  # TDOAs in this unit look like a survey that is too small by this factor
+AS_IT_IS, SCALED, SIGN, EXCHANGED, ALONE = range(5)  # kinds of hypotheses
+
+
+class SurveyScale:
+    """Losses of the hypotheses about the scale of Anchors, snapshot by snapshot."""
+
+    def __init__(self, anchors: Anchors, kept: int | None = KEPT) -> None:
+        """anchors : Anchors; kept : snapshots that are kept, the latest; None: all."""
+        self._anchors = anchors
+        self._names, self._factors, self._table = _hypotheses(len(anchors))
+        self._losses: deque[np.ndarray] = deque(maxlen=kept)  # (h,) of each
+        self._places: deque[np.ndarray] = deque(maxlen=kept)  # (h, 3) m
+
+    def add(self, snapshot: np.ndarray) -> None:
+        """Take TDOAs that were heard together, (k, 3): rows of both anchors, and m."""
+        if len(np.unique(snapshot[:, :2])) < HEARD or not np.median(np.abs(snapshot[:, 2])) > SMALL:
+            return
+        some = snapshot[np.linspace(0, len(snapshot) - 1, min(PAIRS, len(snapshot))).round().astype(int)]
+        losses, places = np.empty(len(self._table)), np.empty((len(self._table), 3))
+        rows = np.ascontiguousarray(some[:, :2].astype(np.int64))
+        for k, hypothesis in enumerate(self._table):
+            losses[k] = locate(self._anchors.positions, hypothesis, rows, np.ascontiguousarray(some[:, 2]), STARTS, places[k])
+        self._losses.append(losses)
+        self._places.append(places)
+
+    @property
+    def finding(self) -> Finding | None:
+        """Finding, or None."""
+        if len(self._losses) < FEWEST:
+            return None
+        losses = np.array(self._losses)
+        mean, kind = losses.mean(axis=0), self._table[:, 0]
+        chosen = np.flatnonzero((kind == SCALED) | (kind == ALONE))
+        best = int(chosen[np.argmin(mean[chosen])])
+        others = np.flatnonzero((kind == AS_IT_IS) | (kind == SIGN) | (kind == EXCHANGED))
+        rival = int(others[np.argmin(mean[others])])
+        left, z = _compared(losses[:, rival], losses[:, best])
+        if left > (LEFT if kind[best] == SCALED else LEFT_ALONE) or z < DEVIATIONS or mean[best] > GOOD:
+            return None
+        if left > CLEARLY and (len(losses) < MANY or _spread(np.array([places[best] for places in self._places])) < MOVED):
+            return None
+        evidence = f"{100.0 * (1.0 - left):.0f} % less stays unexplained then, {z:.1f} standard errors, in {len(losses)} snapshots"
+        near = [k for k in chosen.tolist() if self._names[k] and kind[k] == SCALED == kind[best] and self._near(k, best)]
+        named = min(near, key=lambda k: mean[k], default=best)
+        return self._found(named, self._factors[named], evidence)
+
+    def _near(self, one: int, other: int) -> bool:
+        """Whether two hypotheses are as near in scale as can be told."""
+        return abs(math.log(self._factors[one] / self._factors[other])) < 0.7 * math.log(RATIO)
+
+    def _found(self, k: int, factor: float, evidence: str) -> Finding | None:
+        if self._table[k, 0] == ALONE:
+            number = int(self._anchors.ids[int(self._table[k, 3])])
+            line = f"{number}: {{position: [x, y, z]}}  # what is there now, divided by {factor:.6g}"
+            cause = f"the position of anchor {number} is in {self._names[k]}, not in metres"
+            return Finding("anchor_scale", ERROR, cause, evidence, line, factor)
+        if abs(math.log(factor / NANOSECONDS)) < math.log(RATIO):
+            return None  # rather of the TDOAs
+        line = f"x, y, z = x / {factor:.6g}, y / {factor:.6g}, z / {factor:.6g}  # of every anchor"
+        size = f"about {factor:.3g} times too large" if factor > 1.0 else f"about {1.0 / factor:.3g} times too small"
+        cause = f"the survey is not in metres: its positions are {size}"
+        if self._names[k]:
+            cause = f"the survey is in {self._names[k]}, not in metres: its positions are {factor:,.5g} times too large"
+        return Finding("survey_scale", ERROR, cause, evidence, line, factor)
+
+
+def _hypotheses(count: int) -> tuple[list[str], list[float], np.ndarray]:
+    """(names of units or "", factors, (h, 5): kind, factor of all, sign, and two rows) of what is tried with so many anchors."""
+    out: list[tuple[str, float, tuple[float, ...]]] = [("", 1.0, (AS_IT_IS, 1.0, 1.0, 0, 0)), ("", 1.0, (SIGN, 1.0, -1.0, 0, 0))]
+    scales = SMALLEST * RATIO ** np.arange(math.floor(math.log(LARGEST / SMALLEST) / math.log(RATIO)) + 1)
+    out += [("", factor, (SCALED, factor, 1.0, 0, 0)) for factor in [*scales.tolist(), *(1.0 / scales).tolist()]]
+    out += [(name, factor, (SCALED, factor, 1.0, 0, 0)) for name, factor in UNITS.items()]
+    if count <= SINGLE:
+        out += [(name, factor, (ALONE, factor, 1.0, row, 0)) for row in range(count) for name, factor in UNITS.items()]
+        out += [("", 1.0, (EXCHANGED, 1.0, 1.0, one, two)) for one, two in combinations(range(count), 2)]
+    names, factors, rows = zip(*out)
+    return [*names], [*factors], np.array(rows, dtype=float)
+
+
+def _compared(one: np.ndarray, other: np.ndarray) -> tuple[float, float]:
+    """(mean of `other` over that of `one`, standard errors by which it is less), of losses (n,) of the same snapshots."""
+    error = float(np.std(one - other, ddof=1)) / math.sqrt(len(one))
+    return float(np.mean(other) / max(np.mean(one), 1e-9)), float(np.mean(one - other)) / max(error, 1e-9)
+
+
+def _spread(places: np.ndarray) -> float:
+    """m, root mean square distance of places (n, 3) from their median."""
+    return float(np.sqrt(np.mean(np.sum((places - np.median(places, axis=0)) ** 2, axis=1))))
+
+
+@compiled
+def locate(
+    positions: np.ndarray, hypothesis: np.ndarray, rows: np.ndarray, d: np.ndarray, starts: np.ndarray, place: np.ndarray
+) -> float:
+    """Return the mean Geman-McClure loss, 0 to 1, of TDOAs d (k,) m where the tag fits them best; write that to place (3,) m.
+
+    positions : (N, 3) m, of anchors; rows : (k, 2), of both anchors of each TDOA.
+
+    hypothesis : (5,), see `_hypotheses`. A robust Gauss-Newton search from starts (s, 3), in units of half the room, while
+    the loss narrows.
+    """
+    n = len(d)
+    ends, low, high = np.empty((n, 2, 3)), np.full(3, np.inf), np.full(3, -np.inf)
+    for i in range(n):
+        for side in range(2):
+            row, factor = rows[i, side], hypothesis[1]
+            if hypothesis[0] == EXCHANGED:
+                row = int(hypothesis[4]) if row == hypothesis[3] else int(hypothesis[3]) if row == hypothesis[4] else row
+            elif hypothesis[0] == ALONE and row != hypothesis[3]:
+                factor = 1.0
+            for j in range(3):
+                ends[i, side, j] = positions[row, j] / factor
+                low[j], high[j] = min(low[j], ends[i, side, j]), max(high[j], ends[i, side, j])
+    size, least, p, g, system = math.sqrt(np.sum((high - low) ** 2)), np.inf, np.empty(3), np.empty(3), np.empty((3, 4))
+    for start in range(len(starts)):
+        for j in range(3):
+            p[j] = 0.5 * (low[j] + high[j]) + 0.5 * starts[start, j] * (high[j] - low[j])
+        for step in range(STEPS + 1):
+            scale, loss = max(0.3 * size * 0.5**step, LOSS) if step < STEPS else LOSS, 0.0
+            system[:, :] = 0.0
+            for i in range(n):
+                r = hypothesis[2] * d[i]
+                for side in range(2):
+                    length = 1e-18
+                    for j in range(3):
+                        length += (p[j] - ends[i, side, j]) ** 2
+                    length = math.sqrt(length)
+                    r += length if side == 0 else -length
+                    for j in range(3):
+                        unit = (p[j] - ends[i, side, j]) / length
+                        g[j] = -unit if side == 0 else g[j] + unit
+                square = (r / scale) ** 2
+                loss += square / (1.0 + square)
+                weight = 1.0 / (1.0 + square) ** 2
+                for j in range(3):
+                    for k in range(3):
+                        system[j, k] += weight * g[j] * g[k]
+                    system[j, 3] += weight * g[j] * r
+            if step == STEPS:
+                if loss / n < least:
+                    least = loss / n
+                    place[:] = p
+                break
+            _go(p, system, NEAR * size)
+    return least
+
+
+@compiled
+def _go(p: np.ndarray, system: np.ndarray, longest: float) -> None:
+    """One step of p (3,) by normal equations (3, 4), which are overwritten, no longer than `longest`, m."""
+    for j in range(3):
+        system[j, j] += 1e-6
+    for j in range(3):
+        for k in range(j + 1, 3):
+            share = system[k, j] / system[j, j]
+            for m in range(j, 4):
+                system[k, m] -= share * system[j, m]
+    length = 0.0
+    for j in range(2, -1, -1):
+        for m in range(j + 1, 3):
+            system[j, 3] -= system[j, m] * system[m, 3]
+        system[j, 3] /= system[j, j]
+        length += system[j, 3] ** 2
+    share = min(1.0, longest / max(math.sqrt(length), 1e-12))
+    for j in range(3):
+        p[j] += share * system[j, 3]
