@@ -13,8 +13,7 @@ import numpy as np
 from uwb_tdoa_bias.foundation.compiled import Record, compiled
 
 from . import ground, hypotheses, standing
-from .auxiliary import RANGE
-from .history import add_update
+from .history import add_update, replace_velocity
 from .memory import HYPOTHESES
 from .state import GRAVITY, rotation
 from .update import update_state
@@ -22,7 +21,8 @@ from .update import update_state
 PERIOD = 0.05  # s between zero-velocity updates
 QUIET_STD, SHAKING_STD = 0.02, 0.15  # m/s, standard deviation of such an update: of a quiet inertial sensor, and of one that shakes
 SPEED = 0.05  # m/s; a quiet tag that is known to be slower stands, a faster one may glide
-LOOK_PERIOD, LOOK_WINDOW = 0.1, 0.4  # s between two looks at the TDOAs, and s of TDOAs in each
+LOOK_PERIOD, LOOK_WINDOW = 0.1, 0.4  # s between two looks at the TDOAs, and s of TDOAs in each, or twice that where few come
+LONGEST_WINDOW = 1.0  # s of TDOAs that must show no motion before a tag counts as at rest that is not known to stand on the ground
 MOST_DOUBTS = 3  # looks in a row with changed TDOAs that end a rest: one look in twenty shows a change by chance
 UNFELT = 0.06  # m/s; where the inertial sensor has felt more lift than that, one such look ends the rest
 LONG = 10  # looks in a row without a change that begin the rest of a quiet tag: fewer may be a turning point
@@ -44,7 +44,7 @@ def repetition(ekf: Record, t: float) -> float:
 
 
 @compiled
-def feel(ekf: Record, sample: Record, dt: float) -> None:
+def feel(ekf: Record, sample: Record, dt: float, records: np.ndarray) -> None:
     """Take an IMU_SAMPLE of a tag that is at rest, dt s after the one before: if it is lifted, it moves as fast as that has made it."""
     if not ekf.resting:
         ekf.shaking += min(1.0, dt / SHAKING_MEMORY) * (np.sum(ekf.imu.vibration) - ekf.shaking)
@@ -66,7 +66,8 @@ def feel(ekf: Record, sample: Record, dt: float) -> None:
             hypothesis.P[k, :] = 0.0
             hypothesis.P[:, k] = 0.0
             hypothesis.P[k, k] = LIFT**2
-            hypothesis.offset_cross[RANGE, k] = 0.0  # as P; that of the barometer stays as it was
+            hypothesis.offset_cross[:, k] = 0.0
+    replace_velocity(ekf, records)
     ekf.resting, ekf.next_look = False, sample.t + AWAY
 
 
@@ -80,15 +81,23 @@ def look(
     calm = ekf.quiet or np.sum(ekf.imu.vibration) < CALM * ekf.shaking
     if not (ekf.resting or calm or standing.is_near_ground(best, parameters)):
         return
-    count = ground.find_pairs(window, ekf.pairs)
-    still = ground.is_still(ekf.pairs[:count], anchors, best.x, ekf.still_covariance)
+    motion, count = _judge(ekf, anchors, window, LOOK_WINDOW)
+    if motion == ground.UNKNOWN:
+        motion, count = _judge(ekf, anchors, window, 2.0 * LOOK_WINDOW)
+    still = motion == ground.STILL
     if ekf.resting:
-        ekf.doubts = 0 if still else ekf.doubts + 1
+        if motion == ground.MOVES or not (still or ekf.quiet):  # a tag that shakes is at rest only while TDOAs show that
+            ekf.doubts += 1
+        elif still:
+            ekf.doubts = 0
         ekf.resting = ekf.doubts < (MOST_DOUBTS if np.abs(ekf.lift).max() < UNFELT else 1)
     else:
         ekf.lift[:] = 0.0
         ekf.doubts = 0
-        ekf.stills = ekf.stills + 1 if still and ekf.quiet else 0
+        if motion == ground.MOVES or not ekf.quiet:
+            ekf.stills = 0
+        elif still:
+            ekf.stills += 1
         stands = calm and (still or ekf.quiet)
         place, covariance = np.empty(3), np.empty((3, 3))
         lateness = standing.find_landed(ekf, ekf.pairs[:count], anchors, parameters, still, place, covariance)
@@ -98,16 +107,30 @@ def look(
             standing.put(ekf, place, covariance, t, records)
         elif landed:
             standing.hover(ekf, place, still, t, records)
-        long = ekf.stills >= (LONG if t - ekf.rest_since > EARLY else LONG_ENOUGH)
         ekf.resting = stands and landed
-        if not landed and long and not _moves(best, QUIET_STD):
-            ekf.resting, ekf.late_as_known = True, False
-        elif not landed and ekf.stills >= LONG:
-            standing.find_again(ekf, ekf.pairs[:count], window, anchors, parameters, t, records)
+        moves = _moves(best, QUIET_STD)
+        long = still and ekf.stills >= (LONG if moves or t - ekf.rest_since > EARLY else LONG_ENOUGH)
+        if long and not landed:
+            motion, count = _judge(ekf, anchors, window, LONGEST_WINDOW)  # in which a slow glide shows
+            if motion == ground.STILL and moves:
+                standing.find_again(ekf, ekf.pairs[:count], window, anchors, parameters, t, records)
+            elif motion == ground.STILL:
+                ekf.resting, ekf.late_as_known = True, False
         if ekf.resting:
             ekf.rest_since = t
         if landed and not stands:
             ekf.next_look = t + AGAIN
+
+
+@compiled
+def _judge(ekf: Record, anchors: np.ndarray, window: np.ndarray, seconds: float) -> tuple[int, int]:
+    """What the TDOAs in the last seconds of a window (n,) show of the motion, as of ground.judge_motion, and how many pairs there are, which
+    are filled in."""
+    first, since = len(window) - 1, window[len(window) - 1].t - seconds
+    while first > 0 and window[first - 1].t > since:
+        first -= 1
+    count = ground.find_pairs(window[first:], ekf.pairs)
+    return ground.judge_motion(ekf.pairs[:count], anchors, ekf.hypotheses[ekf.best].x, ekf.still_covariance), count
 
 
 @compiled
