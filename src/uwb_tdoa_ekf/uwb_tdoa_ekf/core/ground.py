@@ -34,7 +34,7 @@ SMALLEST_SPREAD = 0.02  # m, of the values of a pair
 STILL_SPEED = 0.3  # m/s; a horizontal velocity that is not known better than that may be any
 LIKELY_SPEED = 1.0  # m/s, of a tag of which nothing is known
 STILL_SCALE, STILL_SWEEPS = 2.5, 5  # standard deviations of a change from which on it is the lateness that has changed
-MOVING = 12.0  # normalised square of a velocity that is not zero
+MOVING, GLIDING = 12.0, 16.0  # normalised square of a velocity that is not zero: of a look, and of a long window
 STILL, UNKNOWN, MOVES = range(3)  # what the TDOAs of a window show of the motion of a tag
 # Median normalised square of the changes at rest, and by how much one of n is larger, times sqrt(n)
 EXPECTED_RATIO, LARGEST_RATIO = 0.45, 3.5
@@ -204,26 +204,59 @@ def judge_motion(pairs: np.ndarray, anchors: np.ndarray, x: np.ndarray, covarian
     change, and UNKNOWN if they are too few, or too noisy, to show either.
 
     x : (3,) m, about where it is; covariance (3, 3) m^2/s^2 of the velocity that they would have shown is filled, large where that is not
-    known. Least squares of the changes, robust against anchors whose lateness has changed.
+    known.
     """
-    n, changes, ratios = 0, np.empty((len(pairs), 5)), np.empty(len(pairs))
+    changes, n = _changes(pairs, anchors, x)
+    if n < FEWEST_PAIRS:
+        return UNKNOWN
+    if np.median(changes[:n, 3] ** 2 / changes[:n, 4]) > EXPECTED_RATIO + LARGEST_RATIO / math.sqrt(n):
+        return MOVES
+    if _velocity(changes[:n], np.empty(3), covariance) >= MOVING:
+        return MOVES
+    return STILL if covariance[0, 0] + covariance[1, 1] < STILL_SPEED**2 else UNKNOWN
+
+
+@compiled
+def is_gliding(pairs: np.ndarray, anchors: np.ndarray, x: np.ndarray) -> bool:
+    """Whether the changes of (k,) of PAIR of a long window are those of one velocity, by more than what that leaves of them: those of
+    anchors whose lateness changes at rest are not. x : (3,) m, about where the tag is."""
+    changes, n = _changes(pairs, anchors, x)
+    if n <= FEWEST_PAIRS:
+        return False
+    v, covariance = np.empty(3), np.empty((3, 3))
+    size = _velocity(changes[:n], v, covariance)
+    for k in range(n):
+        row = changes[k]
+        row[3] -= row[0] * v[0] + row[1] * v[1] + row[2] * v[2]
+    left = np.median(changes[:n, 3] ** 2 / changes[:n, 4]) / EXPECTED_RATIO * n / (n - 3.0)
+    return size > GLIDING * max(1.0, left)
+
+
+@compiled
+def _changes(pairs: np.ndarray, anchors: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, int]:
+    """(m, 5) and n, how many rows of it are filled: of each of (k,) of PAIR that is heard in both halves of its window the Jacobian, the rate,
+    m/s, at which it changes, and the variance of that."""
+    n, changes = 0, np.empty((len(pairs), 5))
     for k in range(len(pairs)):
         pair = pairs[k]
         if pair.change_variance < np.inf:
             linearized_tdoa(x, anchors[pair.a].position, anchors[pair.b].position, changes[n, :3])
             changes[n, 3], changes[n, 4] = pair.change / pair.apart, pair.change_variance / pair.apart**2
-            ratios[n] = pair.change**2 / pair.change_variance
             n += 1
-    if n < FEWEST_PAIRS:
-        return UNKNOWN
-    if np.median(ratios[:n]) > EXPECTED_RATIO + LARGEST_RATIO / math.sqrt(n):
-        return MOVES
-    both, v = np.empty((3, 7)), np.zeros(3)
+    return changes, n
+
+
+@compiled
+def _velocity(changes: np.ndarray, v: np.ndarray, covariance: np.ndarray) -> float:
+    """Fill in the velocity v (3,), m/s, of (n, 5) of `_changes`, and its covariance (3, 3). Returns its normalised square. Least squares,
+    robust against anchors whose lateness has changed."""
+    both, size = np.empty((3, 7)), 0.0
+    v[:] = 0.0
     for sweep in range(STILL_SWEEPS):
         both[:, :] = 0.0
         for k in range(3):
             both[k, k], both[k, 3 + k] = 1.0 / LIKELY_SPEED**2, 1.0
-        for k in range(n):
+        for k in range(len(changes)):
             row = changes[k]
             r = row[3] - row[0] * v[0] - row[1] * v[1] - row[2] * v[2]
             weight = 1.0 / (row[4] * (1.0 + r * r / (STILL_SCALE**2 * row[4])))
@@ -235,13 +268,10 @@ def judge_motion(pairs: np.ndarray, anchors: np.ndarray, x: np.ndarray, covarian
         solve(both)
         v[:] = both[:, 6]
     covariance[:, :] = both[:, 3:6]
-    size = 0.0
     for i in range(3):
         for j in range(3):
             size += v[i] * information[i, j] * v[j]
-    if size >= MOVING:
-        return MOVES
-    return STILL if covariance[0, 0] + covariance[1, 1] < STILL_SPEED**2 else UNKNOWN
+    return size
 
 
 @compiled

@@ -22,7 +22,7 @@ PERIOD = 0.05  # s between zero-velocity updates
 QUIET_STD, SHAKING_STD = 0.02, 0.15  # m/s, standard deviation of such an update: of a quiet inertial sensor, and of one that shakes
 SPEED = 0.05  # m/s; a quiet tag that is known to be slower stands, a faster one may glide
 LOOK_PERIOD, LOOK_WINDOW = 0.1, 0.4  # s between two looks at the TDOAs, and s of TDOAs in each, or twice that where few come
-LONGEST_WINDOW = 1.0  # s of TDOAs that must show no motion before a tag counts as at rest that is not known to stand on the ground
+LONGEST_WINDOW = 2.0  # s of TDOAs, as far as they are kept, in which a glide shows that is too slow for a look
 MOST_DOUBTS = 3  # looks in a row with changed TDOAs that end a rest: one look in twenty shows a change by chance
 UNFELT = 0.06  # m/s; where the inertial sensor has felt more lift than that, one such look ends the rest
 LONG = 10  # looks in a row without a change that begin the rest of a quiet tag: fewer may be a turning point
@@ -81,12 +81,15 @@ def look(
     calm = ekf.quiet or np.sum(ekf.imu.vibration) < CALM * ekf.shaking
     if not (ekf.resting or calm or standing.is_near_ground(best, parameters)):
         return
-    motion, count = _judge(ekf, anchors, window, LOOK_WINDOW)
-    if motion == ground.UNKNOWN:
-        motion, count = _judge(ekf, anchors, window, 2.0 * LOOK_WINDOW)
+    motion, count = ground.UNKNOWN, 0
+    for seconds in (LOOK_WINDOW, 2.0 * LOOK_WINDOW):
+        if motion == ground.UNKNOWN:
+            count = ground.find_pairs(_since(window, t - seconds), ekf.pairs)
+            motion = ground.judge_motion(ekf.pairs[:count], anchors, best.x, ekf.still_covariance)
     still = motion == ground.STILL
     if ekf.resting:
-        if motion == ground.MOVES or not (still or ekf.quiet):  # a tag that shakes is at rest only while TDOAs show that
+        glides = _glides(ekf, anchors, window, max(t - LONGEST_WINDOW, ekf.rest_since))
+        if motion == ground.MOVES or glides or not (still or ekf.quiet):  # a tag that shakes is at rest only while TDOAs show that
             ekf.doubts += 1
         elif still:
             ekf.doubts = 0
@@ -110,11 +113,11 @@ def look(
         ekf.resting = stands and landed
         moves = _moves(best, QUIET_STD)
         long = still and ekf.stills >= (LONG if moves or t - ekf.rest_since > EARLY else LONG_ENOUGH)
-        if long and not landed:
-            motion, count = _judge(ekf, anchors, window, LONGEST_WINDOW)  # in which a slow glide shows
-            if motion == ground.STILL and moves:
+        if long and not landed and not _glides(ekf, anchors, window, t - LONGEST_WINDOW):
+            if moves:
+                count = ground.find_pairs(window, ekf.pairs)
                 standing.find_again(ekf, ekf.pairs[:count], window, anchors, parameters, t, records)
-            elif motion == ground.STILL:
+            else:
                 ekf.resting, ekf.late_as_known = True, False
         if ekf.resting:
             ekf.rest_since = t
@@ -123,14 +126,19 @@ def look(
 
 
 @compiled
-def _judge(ekf: Record, anchors: np.ndarray, window: np.ndarray, seconds: float) -> tuple[int, int]:
-    """What the TDOAs in the last seconds of a window (n,) show of the motion, as of ground.judge_motion, and how many pairs there are, which
-    are filled in."""
-    first, since = len(window) - 1, window[len(window) - 1].t - seconds
+def _glides(ekf: Record, anchors: np.ndarray, window: np.ndarray, since: float) -> bool:
+    """Whether those of a window (n,) of TDOA since a stamp, s, show a velocity, however slow. Fills in ekf.pairs."""
+    count = ground.find_pairs(_since(window, since), ekf.pairs)
+    return ground.is_gliding(ekf.pairs[:count], anchors, ekf.hypotheses[ekf.best].x)
+
+
+@compiled
+def _since(window: np.ndarray, since: float) -> np.ndarray:
+    """Those of a window (n,) of TDOA, n > 0, that are later than a stamp, s, or the last one."""
+    first = len(window) - 1
     while first > 0 and window[first - 1].t > since:
         first -= 1
-    count = ground.find_pairs(window[first:], ekf.pairs)
-    return ground.judge_motion(ekf.pairs[:count], anchors, ekf.hypotheses[ekf.best].x, ekf.still_covariance), count
+    return window[first:]
 
 
 @compiled

@@ -18,7 +18,7 @@ from .verdicts import REJECTED, USED
 GATE = 3.0  # standard deviations beyond which a component is not used
 CORRELATION_TIME = 1.0  # s over which its error stays alike
 LONGEST_STD = 1e3  # m/s; a component that is less precise is not measured
-STUCK_TIME, STUCK_COUNT = 0.5, 5  # s, and velocities, that are all the same: a sensor of a tag that shakes is stuck, unless it stands
+STUCK_TIME, STUCK_COUNT = 0.5, 5  # s, and velocities, all the same, after which the sensor of a tag that shakes is stuck
 AVERAGE = 0.5  # s of innovations that tell whether it agrees with everything else
 DISAGREES, AGREES = 4.0, 2.0  # mean normalised innovation squared above which it is not used any more, below which again
 
@@ -61,8 +61,8 @@ def _repeats(state: Record, aid: Record) -> bool:
     """Remember a velocity, one of AID; returns whether it has been the same for as long as a sensor that works repeats none."""
     since = aid.t - state.heard
     for k in range(3):
-        if aid.value[k] != state.value[k]:
-            state.value[:], state.changed = aid.value, aid.t
+        if aid.std[k] <= LONGEST_STD and aid.value[k] != state.value[k]:
+            state.value[k], state.changed = aid.value[k], aid.t
     return aid.t - state.changed > max(STUCK_TIME, STUCK_COUNT * since)
 
 
