@@ -234,8 +234,8 @@ def is_gliding(pairs: np.ndarray, anchors: np.ndarray, x: np.ndarray) -> bool:
 
 @compiled
 def _changes(pairs: np.ndarray, anchors: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, int]:
-    """(m, 5) and n, how many rows of it are filled: of each of (k,) of PAIR that is heard in both halves of its window the Jacobian, the rate,
-    m/s, at which it changes, and the variance of that."""
+    """Jacobian, rate of change, m/s, and its variance, of each of (k,) of PAIR that is heard in both halves of its window: (k, 5), and how
+    many rows of that are filled. x : (3,) m, about where the tag is."""
     n, changes = 0, np.empty((len(pairs), 5))
     for k in range(len(pairs)):
         pair = pairs[k]

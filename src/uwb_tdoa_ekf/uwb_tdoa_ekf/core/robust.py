@@ -146,11 +146,14 @@ def _weigh_prior(hypothesis: Record, innovation: Record, rows: int, columns: int
     """Make the prior the weighted one, P + S (1/W - 1) S', with what it says of the INNOVATION in cross_covariance."""
     P, cross, of_offset = hypothesis.P, hypothesis.offset_cross, hypothesis.offset_P
     S, y, w, covariance = innovation.factor, innovation.scaled_row, innovation.prior_weights, innovation.cross_covariance
+    scaled = innovation.scaled_error  # is not needed any more
     for i in range(rows):
+        for k in range(columns):
+            scaled[k] = (1.0 / w[k] - 1.0) * S[i, k]
         for j in range(i, rows):
             more = 0.0
             for k in range(columns):
-                more += (1.0 / w[k] - 1.0) * S[i, k] * S[j, k]
+                more += scaled[k] * S[j, k]
             if j < ERROR_STATES:
                 P[i, j] += more
                 P[j, i] = P[i, j]
