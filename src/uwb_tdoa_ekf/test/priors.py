@@ -50,3 +50,15 @@ def kalman(P, h, innovation, noise):
     """Error (15,) and covariance of the textbook update, by matrices."""
     gain = P @ h / (h @ P @ h + noise)
     return gain * innovation, (np.eye(15) - np.outer(gain, h)) @ P
+
+
+def with_offset(prior):
+    """Random offset states for a prior; the joint covariance (18, 18)."""
+    joint = np.zeros((18, 18))
+    joint[:15, :15] = prior.hypothesis.P
+    link = 0.1 * prior.rng.standard_normal((3, 15)) @ np.linalg.cholesky(prior.hypothesis.P).T
+    joint[15:, :15], joint[:15, 15:] = link, link.T
+    joint[15:, 15:] = [[2.0, 0.1, 0.2], [0.1, 1.0, -0.1], [0.2, -0.1, 1.5]]
+    prior.hypothesis.offset_cross[:], prior.hypothesis.offset_P[:] = link, joint[15:, 15:]
+    prior.hypothesis.offset[:] = [3.0, -0.2, 0.4]
+    return joint

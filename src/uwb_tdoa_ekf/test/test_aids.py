@@ -2,16 +2,22 @@
 
 from dataclasses import replace
 
-from flights import fly, position_at, with_aids
+from covariances import assert_covariance
+from flights import corners, fly, measurements, position_at, with_aids, with_ranges
 from hypothesis import given, settings, strategies as st
 import numpy as np
-from priors import Prior
+from priors import Prior, with_offset
 import pytest
 from scipy.spatial.transform import Rotation
 
+from uwb_tdoa_bias.foundation.robust_loss import LOSSES
 from uwb_tdoa_ekf.core import auxiliary, height, update, velocity
-from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.core.memory import AID
+from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
+from uwb_tdoa_ekf.core.engine import feed
+from uwb_tdoa_ekf.core.history import NOTHING
+from uwb_tdoa_ekf.core.hypotheses import PRUNED_BELOW
+from uwb_tdoa_ekf.core.measurements import aid_rows
+from uwb_tdoa_ekf.core.memory import AID, RESIDUAL, YAWS, new_state
 from uwb_tdoa_ekf.core.state import TRANSITION, inject
 from uwb_tdoa_ekf.core.verdicts import USED
 from uwb_tdoa_ekf.offline import run_offline
@@ -59,18 +65,6 @@ def test_a_velocity_depends_on_velocity_and_attitude(seed, axis):
     assert_row_is_the_derivative(
         prior, lambda: velocity.compare(prior.hypothesis, aid, axis, R, prior.innovation)
     )
-
-
-def with_offset(prior):
-    """Random offset states for a prior; the joint covariance (18, 18)."""
-    joint = np.zeros((18, 18))
-    joint[:15, :15] = prior.hypothesis.P
-    link = 0.1 * prior.rng.standard_normal((3, 15)) @ np.linalg.cholesky(prior.hypothesis.P).T
-    joint[15:, :15], joint[:15, 15:] = link, link.T
-    joint[15:, 15:] = [[2.0, 0.1, 0.2], [0.1, 1.0, -0.1], [0.2, -0.1, 1.5]]
-    prior.hypothesis.offset_cross[:], prior.hypothesis.offset_P[:] = link, joint[15:, 15:]
-    prior.hypothesis.offset[:] = [3.0, -0.2, 0.4]
-    return joint
 
 
 @given(seeds, st.sampled_from([None, auxiliary.PRESSURE, auxiliary.RANGE]))
@@ -196,3 +190,84 @@ def test_the_filter_is_never_locked_out_by_a_wrong_start(seed):
     error = odometry.p[:, 2] - position_at(late, odometry.t)[:, 2]
     assert np.abs(error[odometry.t > 4.0]).max() < 0.15
     assert np.mean(run.aids["height"]["verdict"] == USED) > 0.8
+
+
+AIDS = "height", "pressure", "velocity", "range"
+
+
+@settings(max_examples=25, deadline=None)
+@given(seeds, st.sampled_from(ROBUST), st.sampled_from(LOSSES), st.sets(st.sampled_from(AIDS)), st.booleans(), st.booleans())
+def test_any_sensors_in_any_mode_leave_covariances(seed, robust, loss, names, slopes, wrong):
+    """slopes : the TDOAs have biases that change with position and velocity; wrong : each sensor has outliers."""
+    rng = np.random.default_rng(seed)
+    flight = with_ranges(with_aids(fly(seed % 1000, 3.0, accel_noise=0.05, outliers=0.05)))
+    fed, aids = measurements(flight), []
+    if slopes:
+        fed.tdoa["slope"], fed.tdoa["state"] = 0.3 * rng.standard_normal((len(fed.tdoa), 6)), 0.3 * rng.standard_normal((len(fed.tdoa), 6))
+    for name in names:
+        rows, usable = aid_rows(name, getattr(flight, name), flight.anchors)
+        rows["value"][:, 0] += np.where(wrong & (rng.random(len(rows)) < 0.1), 2.0, 0.0)
+        aids.append(rows[usable])
+    together = np.concatenate([np.empty(0, AID), *aids])
+    fed = fed._replace(aids=together[np.argsort(together["t"], kind="stable")])
+    state = new_state(flight.anchors.positions)
+    odometry, _, of_aids = feed(state, FilterConfig(robust=robust, loss=loss).parameters(), fed)
+    assert len(odometry) and all(np.isfinite(odometry[name]).all() for name in ("x", "covariance"))
+    assert np.isfinite(state.record.barometer.nis) and (of_aids["variance"][~np.isnan(of_aids["variance"])] > 0.0).all()
+    for hypothesis in state.record.hypotheses:
+        if hypothesis["log_weight"] > -np.inf:
+            there = np.flatnonzero(np.append(np.ones(15), np.diag(hypothesis["offset_P"]) > 0.0))
+            joint = np.block([[hypothesis["P"], hypothesis["offset_cross"].T], [hypothesis["offset_cross"], hypothesis["offset_P"]]])
+            assert_covariance(joint[np.ix_(there, there)], tolerance=1e-6)
+
+
+@pytest.mark.parametrize("followed", [0, 1])
+def test_a_range_finder_decides_between_mirrored_places(followed):
+    """Two hypotheses are 1.4 m below and above anchors in a plane, and equally probable; the tag is at the lower one."""
+    state, parameters = new_state(np.array(corners().positions)), FilterConfig().parameters()[0]
+    ekf, aid, residual, places = state.record, np.zeros(1, AID)[0], np.zeros(1, RESIDUAL)[0], (0, YAWS)
+    ekf.workspace[:], ekf.running, ekf.best = [[-1.0, -1.0, -1.0], [8.0, 9.0, 4.0]], True, places[followed]
+    ekf.hypotheses["log_weight"] = -np.inf
+    for h, z in zip(places, (1.1, 2.5)):
+        ekf.hypotheses["log_weight"][h], ekf.hypotheses["x"][h, [2, 9]], ekf.hypotheses["P"][h] = 0.0, [z, 1.0], 0.01 * np.eye(15)
+    for t in np.arange(0.0, 3.0, 0.04):
+        aid["t"], aid["value"] = t, [1.1 + 0.01 * np.sin(40.0 * t), 0.0, 0.0]
+        height.observe(ekf, parameters, aid, residual, NOTHING)
+        if t < 0.04:
+            assert ekf.hypotheses["log_weight"][places[1]] - ekf.hypotheses["log_weight"][0] > PRUNED_BELOW
+    right, mirrored = ekf.hypotheses["log_weight"][list(places)]
+    assert right - mirrored > 5.0  # the mirrored one is 150 times less probable; if it was followed, it gives way then
+
+
+def test_a_velocity_that_does_not_change_any_more_is_not_used(flight):
+    """It freezes while the tag moves, and later TDOAs end."""
+    t, v = flight.velocity.t, flight.velocity.v.copy()
+    v[t > 8.0] = v[t > 8.0][0]
+    heard = flight.tdoa.t < 10.0
+    cut = replace(flight.tdoa, **{name: column[heard] for name, column in vars(flight.tdoa).items()})
+    noise = 0.2 * np.random.default_rng(1).standard_normal(flight.imu.accel.shape)  # of motors
+    imu = replace(flight.imu, accel=flight.imu.accel + noise)
+    run = run_offline(replace(only(flight, "velocity"), velocity=replace(flight.velocity, v=v), tdoa=cut, imu=imu))
+    verdict, odometry = run.aids["velocity"]["verdict"], run.odometry
+    assert (verdict[t > 8.8] != USED).all() and (verdict[(t > 2.0) & (t < 8.0)] == USED).mean() > 0.9
+    error = np.linalg.norm(odometry.p - position_at(flight, odometry.t), axis=1)
+    stated = np.sqrt(np.trace(odometry.covariance[:, :3, :3], axis1=1, axis2=2))
+    assert (error < 3.0 * stated + 0.1).all()
+
+
+def test_wheels_that_stand_may_repeat_zero():
+    still = with_aids(fly(2, 8.0, hover=True, accel_noise=0.02))
+    zero = replace(only(still, "velocity"), velocity=replace(still.velocity, v=np.zeros_like(still.velocity.v)))
+    t = zero.velocity.t
+    assert (run_offline(zero).aids["velocity"]["verdict"][t > 2.0] == USED).mean() > 0.9
+
+
+def test_a_fixed_height_of_a_tag_that_flies_is_contradicted_by_tdoas_and_the_deviation_covers_that():
+    flight = fly(4, 12.0, hover=True, tdoa_std=0.15)
+    z = flight.truth.p[0, 2]
+    for off, covered in ((1.4, True), (0.0, False)):
+        odometry = run_offline(flight, FilterConfig(fixed_height=float(z - off), fixed_height_std=0.05)).odometry
+        late = odometry.t > 4.0
+        error = np.abs(odometry.p[late, 2] - position_at(flight, odometry.t[late])[:, 2])
+        stated = np.sqrt(odometry.covariance[late, 2, 2])
+        assert (error < 3.0 * stated + 0.01).all() and (stated.max() > 0.4) == covered

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 from flights import fly, leaving, measurements
 from hypothesis import given, settings, strategies as st
 import numpy as np
@@ -40,6 +42,33 @@ def test_a_record_leads_to_the_next():
         gain, row = record["gain"], record["row"]
         np.testing.assert_allclose(record["P"], (np.eye(15) - np.outer(gain, row)) @ prior, atol=1e-9)
         assert record["variance"] * gain == pytest.approx(prior @ row, abs=1e-9)
+
+
+def test_what_a_record_does_not_lead_to_is_noise():
+    """A tag is lifted from its rest: of what was known of its velocity nothing carries over. Q = P before the update - Phi P Phi' >= 0."""
+    flight = lifted(np.random.default_rng(1))
+    records, _ = recorded(flight, FilterConfig(initial_yaw_std=0.5))
+    assert (records["t"] > 5.5).any()
+    updates = 0
+    for before, record in zip(records[5:], records[6:]):
+        if record["kind"] == RESET:
+            continue
+        phi, gain = np.eye(15), record["gain"]
+        phi[:9] = record["transition"]
+        prior = record["P"] + record["variance"] * np.outer(gain, gain)
+        std = np.sqrt(np.diag(prior))
+        noise = (prior - phi @ before["P"] @ phi.T) / np.outer(std, std)
+        assert np.linalg.eigvalsh(0.5 * (noise + noise.T)).min() > -1e-6
+        updates += 1
+    assert updates > 100
+
+
+def lifted(rng):
+    """A Flight that lies still for 4 s, and is lifted then: with 0.5 m/s^2 for a second."""
+    flight = fly(2, 6.0, hover=True, tdoa_std=0.05)
+    accel = flight.imu.accel + np.where((flight.imu.t > 4.0) & (flight.imu.t < 5.0), 0.5, 0.0)[:, None] * [0.0, 0.0, 1.0]
+    accel = accel + 0.001 * rng.standard_normal(accel.shape)
+    return replace(flight, imu=replace(flight.imu, accel=accel))
 
 
 def test_a_history_that_is_full_is_an_error_and_no_silence():

@@ -1,10 +1,11 @@
 from covariances import assert_covariance
 from hypothesis import given, strategies as st
 import numpy as np
-from priors import Prior, kalman
+from priors import Prior, kalman, with_offset
 import pytest
 
 from uwb_tdoa_bias.foundation.robust_loss import LOSSES, weight
+from uwb_tdoa_ekf.core.auxiliary import PRESSURE, RANGE, depend
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
 from uwb_tdoa_ekf.core.robust import (
     NEGLIGIBLE, SMALLEST_WEIGHT, update, update_gate, update_innovation, update_m_estimation,
@@ -113,6 +114,56 @@ def test_m_estimation_follows_an_outlier_less_than_the_textbook(loss):
     update_m_estimation(prior.hypothesis, prior.innovation, parameters)
     assert 0.0 < prior.innovation.weight < 0.2
     assert np.linalg.norm(prior.hypothesis.x - before) < 0.5 * np.linalg.norm(textbook - before)
+
+
+def joint_m_estimation(prior, joint, h, noise, parameters):
+    """`m_estimation` of a joint state of any size: its error, its covariance."""
+    S, error, value = np.linalg.cholesky(joint), np.zeros(len(h)), prior.innovation.value
+    loss, state_scale, scale = (parameters[name] for name in ("loss", "state_scale", "measurement_scale"))
+    for _ in range(parameters["iterations"]):
+        scaled = np.linalg.solve(S, error)
+        rescaled = S @ np.diag([1.0 / weight(loss, e, state_scale) for e in scaled]) @ S.T
+        w = max(weight(loss, (value - h @ error) / np.sqrt(noise), scale), SMALLEST_WEIGHT)
+        gain = rescaled @ h / (h @ rescaled @ h + noise / w)
+        error, posterior = gain * value, rescaled - np.outer(gain, h @ rescaled)
+    return error, posterior
+
+
+MEASURED = {  # error states that a measurement depends on, and the auxiliary one
+    "tdoa": ((0, 1, 2), None),
+    "tdoa, slope on velocity": ((0, 1, 2, 3, 4, 5), None),
+    "height": ((2, 6, 7), None),
+    "velocity": ((3, 4, 5, 7, 8), None),
+    "barometer": ((2,), PRESSURE),
+    "range with an offset": ((0, 1, 2), RANGE),
+    "attitude": ((6, 7, 8), None),
+}
+
+
+@given(seeds, st.sampled_from(sorted(MEASURED)), st.sampled_from(ROBUST), losses, st.integers(1, 4), st.floats(0.0, 5.0))
+def test_whatever_is_measured_the_joint_covariance_stays_one(seed, name, robust, loss, iterations, surprise):
+    states, offset = MEASURED[name]
+    prior = Prior(seed, states, surprise)
+    joint, innovation = with_offset(prior), prior.innovation
+    if offset is not None:
+        depend(prior.hypothesis, innovation, offset)
+    h = np.zeros(18)
+    h[list(states)] = prior.h[list(states)]
+    if offset is not None:
+        h[15 + offset] = 1.0
+    parameters = tuned(robust=robust, loss=loss, iterations=iterations, tdoa_correlation_length=1.0)
+    x = prior.hypothesis.offset.copy()
+    if robust == "m_estimation":
+        error, expected = joint_m_estimation(prior, joint, h, innovation.noise_variance, parameters)
+    update(prior.hypothesis, innovation, parameters)
+    after = np.zeros((18, 18))
+    after[:15, :15], after[15:, :15], after[15:, 15:] = prior.hypothesis.P, prior.hypothesis.offset_cross, prior.hypothesis.offset_P
+    after[:15, 15:] = after[15:, :15].T
+    assert_covariance(after, tolerance=1e-8)
+    if robust == "m_estimation":
+        std = np.sqrt(np.diag(expected))
+        np.testing.assert_allclose(after / np.outer(std, std), expected / np.outer(std, std), atol=1e-6)
+        np.testing.assert_allclose((prior.hypothesis.offset - x) / std[15:], error[15:] / std[15:], atol=1e-6)
 
 
 @given(seeds, st.sampled_from(ROBUST), losses, st.floats(0.0, 5.0), st.integers(1, 5))

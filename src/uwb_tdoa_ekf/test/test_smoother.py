@@ -160,6 +160,15 @@ def test_the_unknown_yaw_is_known_from_the_beginning():
     assert np.abs(yaw).max() < np.radians(10.0)
 
 
+@pytest.mark.parametrize("yaw", [-6.9, -3.2, 3.0, 4.5, 6.0, 7.0])
+def test_any_yaw_that_can_be_given_is_smoothed(yaw):
+    """The direction that the filter followed is a multiple of 90 degrees from the given one: their sum may be more than a yaw may be."""
+    flight = fly(4, 6.0, **NOISE)
+    given, same = (smooth(flight, FilterConfig(initial_yaw=each)).odometry for each in (yaw, np.remainder(yaw, 2.0 * np.pi) - np.pi))
+    assert len(given) and np.isfinite(given.p).all()
+    assert rmse(flight, given) < 1.5 * rmse(flight, same) + 0.01
+
+
 def test_a_tag_outside_of_its_workspace_is_smoothed_to_the_end():
     """Its inertial sensor feels nothing of that: it must not have one."""
     flight = leaving(fly(6, 4.0, hover=True, tdoa_rate=400.0))

@@ -138,6 +138,23 @@ def test_a_place_that_is_hardly_known_is_split_and_its_mean_and_covariance_stay(
     assert (np.linalg.eigvalsh(covariance[0]) > 0.0).all()
 
 
+@given(st.integers(0, 2**32 - 1), st.booleans())
+def test_a_place_is_split_along_its_principal_axis_whichever_that_is(seed, normal):
+    """normal : the axis is normal to (1, 1, 1), where a power iteration may have begun."""
+    rng = np.random.default_rng(seed)
+    axis = rng.standard_normal(3)
+    axis -= normal * axis.mean()
+    basis, _ = np.linalg.qr(np.column_stack([axis, rng.standard_normal((3, 2))]))
+    whole = np.eye(6)
+    whole[:3, :3] = basis @ np.diag([9.0, 0.5, 0.3]) @ basis.T
+    x, covariance, cost = np.zeros((2, 6)), np.array([whole, whole]), np.array([0.0, np.inf])
+    split(Places(x, covariance, cost))
+    apart = x[1, :3] - x[0, :3]
+    assert abs(apart @ basis[:, 0]) == pytest.approx(np.linalg.norm(apart), rel=1e-6) and np.linalg.norm(apart) > 3.0
+    for each in covariance:
+        assert_covariance(each)
+
+
 def test_a_place_that_is_known_is_not_split():
     x, covariance, cost = np.zeros((2, 6)), np.array([np.eye(6) * 0.5] * 2), np.array([0.0, np.inf])
     split(Places(x, covariance, cost))

@@ -44,7 +44,8 @@ def smooth(flight: Flight, config: FilterConfig | None = None, corrector: Correc
         first = run_offline(flight, config, corrector)
         offset = first.range_offset
         if unknown_yaw:
-            config = replace(config, initial_yaw=config.initial_yaw + first.yaw_offset, initial_yaw_std=YAW_STD)
+            yaw = math.remainder(config.initial_yaw + first.yaw_offset, 2.0 * math.pi)
+            config = replace(config, initial_yaw=yaw, initial_yaw_std=YAW_STD)
     config = replace(config, **auxiliary.NONE)
     if offset is None:
         return _smoothed_run(flight, config, corrector)

@@ -124,7 +124,7 @@ def _on_imu(ekf: Record, parameters: Record, sample: Record, records: np.ndarray
         if averaged and not ekf.distrusted:
             initialization.level_first(ekf, parameters, records)
         if continuous and not ekf.distrusted:
-            rest.feel(ekf, sample, sample.t - ekf.imu.t)
+            rest.feel(ekf, sample, sample.t - ekf.imu.t, records)
         ekf.quiet = parameters.zero_velocity and continuous and not ekf.distrusted and inertial.is_quiet(ekf.imu)
         rest.update_zero_velocity(ekf, sample.t, records)
     inertial.store(ekf.imu, sample)
@@ -198,7 +198,7 @@ def _before_update(ekf: Record, anchors: np.ndarray, parameters: Record, t: floa
     """Before an update stamped t, s: whether the tag is at rest, which anchors are heard, and whether a silence left the place open."""
     if parameters.zero_velocity:
         if t >= ekf.next_look:
-            rest.look(ekf, anchors, parameters, initialization.recent(ekf, rest.LOOK_WINDOW), t, records)
+            rest.look(ekf, anchors, parameters, initialization.recent(ekf, rest.LONGEST_WINDOW), t, records)
         if not parameters.use_imu or t - ekf.imu.t > parameters.imu_timeout:
             rest.update_zero_velocity(ekf, t, records)
     if t >= ekf.next_bounds:
@@ -434,6 +434,7 @@ def _report(ekf: Record, parameters: Record, t: float, row: Record) -> None:
     row.covariance[:] = best.P[:9, :9]
     hypotheses.add_spread_of_means(ekf, row.covariance)
     workspace.add_circle(ekf, parameters.fixed_height_std > 0.0 or t - ekf.height.used < height.LONGEST_GAP, best.x, row.covariance)
+    row.covariance[2, 2] += height.contradiction(ekf.height, parameters) ** 2
     systematic.fill(ekf.information, best.P, parameters.tdoa_correlation_length, row.persistent)
     row.covariance[:3, :3] += row.persistent
 

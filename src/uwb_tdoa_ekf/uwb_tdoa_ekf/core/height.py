@@ -16,8 +16,9 @@ import numpy as np
 from uwb_tdoa_bias.foundation.compiled import Record, compiled
 from uwb_tdoa_bias.foundation.robust_loss import GEMAN_MCCLURE, weight
 
-from .hypotheses import alive
+from .hypotheses import LARGEST_NIS, alive
 from .history import add_reset, add_update
+from .memory import YAWS
 from .state import rotation
 from .update import kalman, project
 from .verdicts import REJECTED, USED
@@ -40,7 +41,7 @@ IGNORE_TIME, LONGEST_IGNORED = 3.0, 60.0  # s for which a range finder is not us
 @compiled
 def observe(ekf: Record, parameters: Record, aid: Record, residual: Record, records: np.ndarray) -> None:
     """Take a range, one of AID, into a running filter at its stamp; fills one of RESIDUAL."""
-    height = ekf.height
+    height, share = ekf.height, min(max(aid.t - ekf.height.heard, 0.0) / (2.0 * CORRELATION_TIME), 1.0)
     record(ekf, aid)
     residual.weight, residual.verdict = 0.0, REJECTED
     innovation, distance = ekf.innovation, aid.value[0] + parameters.height_arm
@@ -53,6 +54,8 @@ def observe(ekf: Record, parameters: Record, aid: Record, residual: Record, reco
     if (not ekf.quiet and aid.t - height.changed > STUCK_TIME) or aid.t < height.ignored_until:
         height.agreed = 0.0
         return
+    if _weigh_places(ekf, parameters, distance, share):
+        compare(ekf.hypotheses[ekf.best], height.level, distance, parameters, ekf.transition.rotation, innovation)
     if aid.t - height.used > LONGEST_GAP:
         height.agreed = 0.0
     base_innovation = z - ekf.hypotheses[ekf.best].x[2]
@@ -106,6 +109,22 @@ def compare(
 
 
 @compiled
+def _weigh_places(ekf: Record, parameters: Record, distance: float, share: float) -> bool:
+    """Weigh hypotheses at several places, where there are any, by a distance (m) to the ground without steps. It counts as a share (0 to 1)
+    of a distance with an error of its own. Returns whether there are several places; then ekf.innovation is another."""
+    several = False
+    for h in range(len(ekf.hypotheses)):
+        several = several or (h // YAWS != ekf.best // YAWS and alive(ekf.hypotheses[h]))
+    for h in range(len(ekf.hypotheses) if several else 0):
+        hypothesis, innovation = ekf.hypotheses[h], ekf.innovation
+        if alive(hypothesis):
+            compare(hypothesis, parameters.ground_height, distance, parameters, ekf.transition.rotation, innovation)
+            variance = innovation.prior_variance + innovation.noise_variance
+            hypothesis.log_weight -= 0.5 * share * (min(innovation.value**2 / variance, LARGEST_NIS) + math.log(variance))
+    return several
+
+
+@compiled
 def _is_alike(height: Record, value: float) -> bool:
     """Whether an innovation (m) is that of the ranges before it that disagreed."""
     return height.disagreeing > 0 and abs(value - height.disagreement) < ALIKE
@@ -148,8 +167,9 @@ def _settle(
 
 @compiled
 def update_pull(height: Record, parameters: Record, innovation: Record, t: float) -> None:
-    """What one TDOA (INNOVATION of the best hypothesis) says of z beyond the filter, while a range finder holds that."""
-    if t - height.used > LONGEST_GAP or t < height.ignored_until:
+    """What one TDOA (INNOVATION of the best hypothesis) says of z beyond the filter, while a range finder or a fixed height holds that."""
+    ranged = t - height.used < LONGEST_GAP and t >= height.ignored_until
+    if not (ranged or parameters.fixed_height_std > 0.0):
         height.pulls_since = t
         return
     step = min(1.0, max(0.0, t - height.compared) / PULL_TIME)
@@ -160,10 +180,18 @@ def update_pull(height: Record, parameters: Record, innovation: Record, t: float
     height.pull_information += step * (w * row * row - height.pull_information)
     if abs(height.pull) < PULL_LIMIT * height.pull_information:
         height.pulls_since = t
-    elif t - height.pulls_since > PULL_DELAY:
+    elif ranged and t - height.pulls_since > PULL_DELAY:
         height.ignore_time = min(max(IGNORE_TIME, 2.0 * height.ignore_time), LONGEST_IGNORED)
         height.ignored_until = t + height.ignore_time
         height.agreed = 0.0
+
+
+@compiled
+def contradiction(height: Record, parameters: Record) -> float:
+    """By how much, m, TDOAs say that the tag is above its fixed height; 0 if it has none, or if TDOAs alone could be off by that."""
+    if parameters.fixed_height_std == 0.0 or abs(height.pull) <= PULL_LIMIT * height.pull_information:
+        return 0.0
+    return height.pull / height.pull_information
 
 
 @compiled

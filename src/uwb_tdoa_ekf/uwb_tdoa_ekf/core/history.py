@@ -46,6 +46,13 @@ def add_coasting(ekf: Record, dt: float, history: np.ndarray) -> None:
 
 
 @compiled
+def replace_velocity(ekf: Record, history: np.ndarray) -> None:
+    """After the velocity of the best hypothesis was replaced by one of which nothing before says anything."""
+    if len(history) > 0:
+        ekf.since_record[3:6, :] = 0.0
+
+
+@compiled
 def add_update(ekf: Record, t: float, history: np.ndarray) -> None:
     """After a Kalman update of the best hypothesis with ekf.innovation."""
     if len(history) > 0:

@@ -124,7 +124,9 @@ BAROMETER = _record(
 )
 
 VELOCITY = _record(
-    ("heard", float),  # s, stamp of the last one
+    ("heard", float),  # s, stamps: of the last one,
+    ("changed", float),  # and of the last one that differed from the one before;
+    ("value", float, 3),  # m/s, the last one
     ("nis", float),  # mean normalised innovation squared of late, of the worst component
     ("refused", bool),  # it disagrees with everything else
 )
@@ -259,7 +261,7 @@ def new_state(positions: np.ndarray, functions: Sequence[SensorFunction] = (), f
     ekf.imu.t = ekf.plausibility.contradicted = -np.inf
     for stamp in ("heard", "changed", "used", "compared", "pulls_since", "ignored_until"):
         ekf.height[stamp] = -np.inf
-    ekf.barometer.heard = ekf.barometer.agreed = ekf.velocity.heard = ekf.ranged["t"][0] = ekf.next_floor = -np.inf
+    ekf.barometer.heard = ekf.barometer.agreed = ekf.velocity.heard = ekf.velocity.changed = ekf.ranged["t"][0] = ekf.next_floor = -np.inf
     for name in ("accel", "slow_accel", "mean_accel"):
         ekf.imu[name][2] = GRAVITY
     ekf.hypotheses["log_weight"][1:] = -np.inf

@@ -12,10 +12,8 @@ import numpy as np
 from uwb_tdoa_bias.foundation.compiled import Record, compiled
 
 from .auxiliary import RANGE, depend
-from .config import ROBUST
 from .update import project
 
-M_ESTIMATION = ROBUST.index("m_estimation")
 APART = 0.2  # s; two ranges that are further apart are no TDOA
 
 
@@ -52,7 +50,7 @@ def compare(
     innovation.value = aid.value[0] - distance
     innovation.noise_variance = parameters.range_std**2 + aid.std[0] ** 2
     project(hypothesis.P, innovation)
-    if parameters.range_offset_std > 0.0 and parameters.robust != M_ESTIMATION:  # which knows of the position alone
+    if parameters.range_offset_std > 0.0:
         P = hypothesis.offset_P
         if P[RANGE, RANGE] == 0.0:
             hypothesis.offset[RANGE], P[RANGE, RANGE] = 0.0, parameters.range_offset_std**2

@@ -2,7 +2,8 @@
 
 All work on a HYPOTHESIS and an INNOVATION after `update.project`, whose noise_variance is that of one measurement. The
 errors of successive ones are alike: as many as `correlation_length` tell as much as one independent of the others. The
-update therefore takes noise_variance times that, while the weight is judged with noise_variance itself.
+update therefore takes noise_variance times that. `innovation` and `gate` judge the weight with noise_variance itself, `m_estimation`
+with the variance that its update takes.
 """
 
 from __future__ import annotations
@@ -14,6 +15,8 @@ import numpy as np
 from uwb_tdoa_bias.foundation.compiled import Record, compiled
 from uwb_tdoa_bias.foundation.robust_loss import weight
 
+from . import auxiliary
+from .auxiliary import OFFSET_STATES
 from .config import ROBUST
 from .state import ERROR_STATES
 from .update import kalman
@@ -65,47 +68,60 @@ def update_gate(hypothesis: Record, innovation: Record, parameters: Record) -> N
 def update_m_estimation(hypothesis: Record, innovation: Record, parameters: Record) -> None:
     """M-estimation update, Zhao et al. (RA-L 2021), eqs. 8 - 13; cross_covariance becomes that of the weighted prior.
 
-    The error state is scaled by the Cholesky factor S of the prior (eq. 9), prior and measurement are re-weighted
-    `iterations` times (eq. 10), and the posterior follows from the weighted gain (eqs. 11 - 13). For measurements of
-    the position alone, the first three states: they move only the first three elements of the scaled error, so three
-    columns of S suffice. The Jacobian is kept at the prior mean: over the centimetres of one update it does not change.
+    The error state, with the auxiliary states behind it, is scaled by the Cholesky factor S of the prior (eq. 9). Prior and measurement
+    are re-weighted `iterations` times (eq. 10), and the posterior follows from the weighted gain (eqs. 11 - 13). A measurement moves only
+    those elements of the scaled error that come before its last state, so as many columns of S suffice: three for one of the position.
+    The Jacobian is kept at the prior mean: over the centimetres of one update it does not change.
     """
-    P, S, covariance = hypothesis.P, innovation.factor, innovation.cross_covariance
-    _factorize(P, S)
-    g0, g1, g2 = _position_row(innovation)
-    y0 = S[0, 0] * g0 + S[1, 0] * g1 + S[2, 0] * g2  # S' h'; its other elements are zero
-    y1 = S[1, 1] * g1 + S[2, 1] * g2
-    y2 = S[2, 2] * g2
+    S, y, e, w = innovation.factor, innovation.scaled_row, innovation.scaled_error, innovation.prior_weights
+    rows = ERROR_STATES + (OFFSET_STATES if auxiliary.present(hypothesis) else 0)
+    columns = _columns(innovation)
+    _factorize(hypothesis, S, rows, columns)
+    _scale(innovation, columns)
     noise = innovation.noise_variance * parameters.tdoa_correlation_length * innovation.repeated
     loss = parameters.loss
-    e0 = e1 = e2 = 0.0  # scaled error of the state, eq. 9
+    e[:] = 0.0  # scaled error of the state, eq. 9
     for _ in range(parameters.iterations):
-        left = innovation.value - y0 * e0 - y1 * e1 - y2 * e2
-        w = max(weight(loss, left / math.sqrt(noise), parameters.measurement_scale), SMALLEST_WEIGHT)
-        w0, w1, w2 = (
-            weight(loss, e0, parameters.state_scale),
-            weight(loss, e1, parameters.state_scale),
-            weight(loss, e2, parameters.state_scale),
-        )
-        total = y0 * y0 / w0 + y1 * y1 / w1 + y2 * y2 / w2 + noise / w
-        step = innovation.value / total
-        e0, e1, e2 = y0 / w0 * step, y1 / w1 * step, y2 / w2 * step
-    for i in range(ERROR_STATES):  # the weighted prior: P + S (1/W - 1) S'
-        s0, s1, s2 = (1.0 / w0 - 1.0) * S[i, 0], (1.0 / w1 - 1.0) * S[i, 1], (1.0 / w2 - 1.0) * S[i, 2]
-        for j in range(i, ERROR_STATES):
-            P[i, j] += s0 * S[j, 0] + s1 * S[j, 1] + s2 * S[j, 2]
-            P[j, i] = P[i, j]
-        covariance[i] = S[i, 0] * y0 / w0 + S[i, 1] * y1 / w1 + S[i, 2] * y2 / w2
-    innovation.weight, innovation.total_variance = w, total
+        left, total = innovation.value, 0.0
+        for k in range(columns):
+            left -= y[k] * e[k]
+            w[k] = weight(loss, e[k], parameters.state_scale)
+            total += y[k] * y[k] / w[k]
+        of_noise = max(weight(loss, left / math.sqrt(noise), parameters.measurement_scale), SMALLEST_WEIGHT)
+        total += noise / of_noise + innovation.curvature
+        for k in range(columns):
+            e[k] = y[k] / w[k] * (innovation.value / total)
+    _weigh_prior(hypothesis, innovation, rows, columns)
+    innovation.weight, innovation.total_variance = of_noise, total
     kalman(hypothesis, innovation)
 
 
 @compiled
-def _factorize(P: np.ndarray, S: np.ndarray) -> None:
-    """S (15, 3) <- the first three columns of the Cholesky factor of P."""
-    for i in range(3):
-        for j in range(i, ERROR_STATES):
-            value = P[j, i]
+def _columns(innovation: Record) -> int:
+    """How many states, in the order of the error state and then of the auxiliary ones, come up to the last one that an INNOVATION
+    depends on."""
+    columns = 0
+    for n in range(innovation.entries):
+        if innovation.row[n] != 0.0:
+            columns = max(columns, innovation.states[n] + 1)
+    for m in range(OFFSET_STATES):
+        if innovation.on_offset[m] != 0.0:
+            columns = ERROR_STATES + m + 1
+    return columns
+
+
+@compiled
+def _factorize(hypothesis: Record, S: np.ndarray, rows: int, columns: int) -> None:
+    """S (rows, columns) <- the first columns of the Cholesky factor of the joint covariance of error state and auxiliary states."""
+    P, cross, of_offset = hypothesis.P, hypothesis.offset_cross, hypothesis.offset_P
+    for i in range(columns):
+        for j in range(i, rows):
+            if j < ERROR_STATES:
+                value = P[j, i]
+            elif i < ERROR_STATES:
+                value = cross[j - ERROR_STATES, i]
+            else:
+                value = of_offset[j - ERROR_STATES, i - ERROR_STATES]
             for k in range(i):
                 value -= S[j, k] * S[i, k]
             S[j, i] = math.sqrt(max(value, 1e-18)) if j == i else value / S[i, i]
@@ -114,12 +130,39 @@ def _factorize(P: np.ndarray, S: np.ndarray) -> None:
 
 
 @compiled
-def _position_row(innovation: Record) -> tuple[float, float, float]:
-    """The entries of the Jacobian row for the position."""
-    g0 = g1 = g2 = 0.0
-    for n in range(innovation.entries):
-        state, entry = innovation.states[n], innovation.row[n]
-        g0 += entry if state == 0 else 0.0
-        g1 += entry if state == 1 else 0.0
-        g2 += entry if state == 2 else 0.0
-    return g0, g1, g2
+def _scale(innovation: Record, columns: int) -> None:
+    """scaled_row <- S' h', whose other elements are zero."""
+    S, y = innovation.factor, innovation.scaled_row
+    for k in range(columns):
+        y[k] = 0.0
+        for n in range(innovation.entries):
+            y[k] += S[innovation.states[n], k] * innovation.row[n]
+        for m in range(max(0, columns - ERROR_STATES)):
+            y[k] += S[ERROR_STATES + m, k] * innovation.on_offset[m]
+
+
+@compiled
+def _weigh_prior(hypothesis: Record, innovation: Record, rows: int, columns: int) -> None:
+    """Make the prior the weighted one, P + S (1/W - 1) S', with what it says of the INNOVATION in cross_covariance."""
+    P, cross, of_offset = hypothesis.P, hypothesis.offset_cross, hypothesis.offset_P
+    S, y, w, covariance = innovation.factor, innovation.scaled_row, innovation.prior_weights, innovation.cross_covariance
+    scaled = innovation.scaled_error  # is not needed any more
+    for i in range(rows):
+        for k in range(columns):
+            scaled[k] = (1.0 / w[k] - 1.0) * S[i, k]
+        for j in range(i, rows):
+            more = 0.0
+            for k in range(columns):
+                more += scaled[k] * S[j, k]
+            if j < ERROR_STATES:
+                P[i, j] += more
+                P[j, i] = P[i, j]
+            elif i < ERROR_STATES:
+                cross[j - ERROR_STATES, i] += more
+            else:
+                of_offset[i - ERROR_STATES, j - ERROR_STATES] += more
+                of_offset[j - ERROR_STATES, i - ERROR_STATES] = of_offset[i - ERROR_STATES, j - ERROR_STATES]
+    for i in range(ERROR_STATES):
+        covariance[i] = 0.0
+        for k in range(columns):
+            covariance[i] += S[i, k] * y[k] / w[k]

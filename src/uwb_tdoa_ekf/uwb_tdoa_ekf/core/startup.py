@@ -34,6 +34,7 @@ INLIER = 0.75  # m, a residual below this does not contradict a position
 NO_SCALE = 1e6  # m, of a loss that is quadratic
 APART = 1.0  # m between two places, and standard deviation of a place that becomes two
 IMPROBABLE = 8.0  # minus the logarithm of the probability of a place beside another, beyond which it is none
+SMALLEST = 1e-300  # m^2, in place of a variance of 0
 SPLIT = 0.8  # standard deviations from the middle of a place to each of two that it becomes
 
 
@@ -188,11 +189,16 @@ def split(places: Places) -> None:
     """Where there is a single one of two places, and it is less known than APART along any direction, fill in two of equal probability that
     have the same mean and covariance together: TDOAs are as curved there as the anchors are far."""
     x, covariance, cost = places.x, places.covariance, places.cost
-    axis, variance = np.ones(3), 0.0
-    for _ in range(30):  # power iteration
-        axis[:] = np.array([np.sum(covariance[0, i, :3] * axis) for i in range(3)])
-        variance = math.sqrt(np.sum(axis**2))
-        axis /= variance
+    axis, variance = np.empty(3), 0.0
+    for start in range(3):  # power iteration; the principal axis is not normal to all axes of the world
+        trial, its = np.zeros(3), 0.0
+        trial[start] = 1.0
+        for _ in range(30):
+            trial[:] = np.array([np.sum(covariance[0, i, :3] * trial) for i in range(3)])
+            its = math.sqrt(np.sum(trial**2))
+            trial /= max(its, SMALLEST)
+        if its > variance:
+            axis[:], variance = trial, its
     if cost[1] < np.inf or variance < APART**2:
         return
     step, cost[1] = np.empty(6), cost[0]

@@ -15,6 +15,7 @@ from . import auxiliary
 from .state import ERROR_STATES, inject
 
 LONGEST_ROW = 6  # error states that one measurement may depend on
+JOINT_STATES = ERROR_STATES + auxiliary.OFFSET_STATES
 
 INNOVATION = np.dtype(
     [
@@ -35,7 +36,10 @@ INNOVATION = np.dtype(
         ("repeated", float),  # how often the same error is met, in tdoa_correlation_length: 1, but for a tag that does not move
         ("weight", float),  # 0 to 1, given by robust.update
         ("total_variance", float),  # of the value, as the update took it
-        ("factor", float, (ERROR_STATES, 3)),  # scratch of the M-estimation
+        ("factor", float, (JOINT_STATES, JOINT_STATES)),  # scratch of the M-estimation: S,
+        ("scaled_row", float, JOINT_STATES),  # S' h',
+        ("scaled_error", float, JOINT_STATES),  # and of the state scaled by S the error
+        ("prior_weights", float, JOINT_STATES),  # and its weights
     ],
     align=True,
 )

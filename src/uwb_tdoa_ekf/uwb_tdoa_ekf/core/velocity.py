@@ -18,6 +18,7 @@ from .verdicts import REJECTED, USED
 GATE = 3.0  # standard deviations beyond which a component is not used
 CORRELATION_TIME = 1.0  # s over which its error stays alike
 LONGEST_STD = 1e3  # m/s; a component that is less precise is not measured
+STUCK_TIME, STUCK_COUNT = 0.5, 5  # s, and velocities, all the same, after which the sensor of a tag that shakes is stuck
 AVERAGE = 0.5  # s of innovations that tell whether it agrees with everything else
 DISAGREES, AGREES = 4.0, 2.0  # mean normalised innovation squared above which it is not used any more, below which again
 
@@ -27,11 +28,12 @@ def observe(ekf: Record, parameters: Record, aid: Record, residual: Record, reco
     """Take a velocity, one of AID, into a running filter; fills one of RESIDUAL with its worst component."""
     state, innovation = ekf.velocity, ekf.innovation
     dt = min(max(aid.t - state.heard, 1e-3), AVERAGE)
+    frozen = _repeats(state, aid) and not ekf.quiet
     state.heard = aid.t
     inflation = max(1.0, 2.0 * CORRELATION_TIME / dt)
     worst = _worst(ekf, aid, residual)
     state.nis += min(1.0, dt / AVERAGE) * (min(worst, GATE**4) - state.nis)
-    state.refused = state.nis > (AGREES if state.refused else DISAGREES)
+    state.refused = state.nis > (AGREES if state.refused else DISAGREES) or (frozen and (state.refused or np.any(state.value != 0.0)))
     residual.weight, residual.verdict = 0.0, REJECTED
     if state.refused or worst > GATE**2:
         return
@@ -52,6 +54,16 @@ def observe(ekf: Record, parameters: Record, aid: Record, residual: Record, reco
             if h == ekf.best:
                 residual.weight = min(residual.weight, w)
                 add_update(ekf, aid.t, records)
+
+
+@compiled
+def _repeats(state: Record, aid: Record) -> bool:
+    """Remember a velocity, one of AID; returns whether it has been the same for as long as a sensor that works repeats none."""
+    since = aid.t - state.heard
+    for k in range(3):
+        if aid.std[k] <= LONGEST_STD and aid.value[k] != state.value[k]:
+            state.value[k], state.changed = aid.value[k], aid.t
+    return aid.t - state.changed > max(STUCK_TIME, STUCK_COUNT * since)
 
 
 @compiled
