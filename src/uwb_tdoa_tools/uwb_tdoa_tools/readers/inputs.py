@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.foreign_text import printable
+from uwb_tdoa_bias.foundation.limits import Budget, FOLDER_DEPTH, FOLDER_ENTRIES
 from uwb_tdoa_bias.foundation.sensors import LOCATING
 
 from .. import parallel
@@ -19,7 +20,7 @@ from ..bags.kind import is_bag
 from . import read_flight
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable
     from uwb_tdoa_bias.foundation.flight import Flight
 
     Recording = tuple[Path, str | Path | None]  # and its survey
@@ -46,7 +47,7 @@ def find_flights(
     for path in map(Path, paths):
         if not path.exists():
             raise InputError(f"{path}: does not exist; give a recording or a folder that holds recordings.")
-        inside = list(_recordings(path))
+        inside = _recordings(path)
         if not inside:
             raise InputError(f"{path}: holds no recording; expected logs, CSV files or bags.")
         found += inside
@@ -168,11 +169,21 @@ class Reading:
         return [read[number] for number in sorted(read)]
 
 
-def _recordings(path: Path) -> Iterator[Path]:
-    """Recordings in a folder, at any depth, or a path that is one. Bags that are files may lie in a folder, as other files do."""
-    if path.is_file() or (path / "metadata.yaml").exists():
-        yield path
-        return
-    for inside in sorted(path.iterdir()):
-        if not inside.name.startswith("."):
-            yield from _recordings(inside)
+def _recordings(path: Path) -> list[Path]:
+    """Recordings in a folder, at any depth, or a path that is one. Bags that are files may lie in a folder, as other files do. A folder to
+    which several links lead is looked through once."""
+    budget, seen, found = Budget(path), set(), []
+
+    def look(path: Path, depth: int) -> None:
+        if path.is_file() or (path / "metadata.yaml").exists():
+            found.append(path)
+        elif path.is_dir() and (place := path.stat()[1:3]) not in seen:
+            seen.add(place)
+            budget.spend(f"folders within {FOLDER_DEPTH} others", depth > FOLDER_DEPTH, 0)
+            for inside in sorted(path.iterdir()):
+                budget.spend("entries", 1, FOLDER_ENTRIES)
+                if not inside.name.startswith("."):
+                    look(inside, depth + 1)
+
+    look(path, 0)
+    return found
