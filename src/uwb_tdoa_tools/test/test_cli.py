@@ -124,6 +124,8 @@ def test_no_output_is_an_input_a_link_or_a_part_of_a_bag(tmp_path):
         cli.check_outputs(given(tmp_path / "hard.json"), "json")
     cli.check_outputs(given(tmp_path / "new.json"), "json")
     cli.check_outputs(given("/dev/stdout"), "json")
+    with pytest.raises(InputError, match="bag: is read by this command"):  # with --force, it would be replaced
+        cli.refuse_inputs(given(None, out=str(bag)), "out")
     assert survey.read_text() == (bag / "metadata.yaml").read_text() == "precious"
 
 

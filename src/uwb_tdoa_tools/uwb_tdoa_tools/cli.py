@@ -112,12 +112,16 @@ def without_ros_arguments(arguments: Iterable[str]) -> list[str]:
 
 
 def check_outputs(args: argparse.Namespace, *names: str) -> None:
-    """Raise InputError, before the work, unless the files that some options name can be written, and are none of the inputs that the other
-    options and arguments name."""
+    """Raise InputError, before the work, unless the files that some options name can be written, and are no inputs."""
+    check_folders(*(getattr(args, name) for name in names))
+    refuse_inputs(args, *names)
+
+
+def refuse_inputs(args: argparse.Namespace, *names: str) -> None:
+    """Raise InputError if what some options name, a file or a bag, is an input that the other options and arguments name."""
     given = [value for name, value in vars(args).items() if name not in names]
     inputs = [Path(each) for value in given for each in (value if isinstance(value, (list, tuple)) else [value]) if _is_there(each)]
     for path in [Path(value) for name in names if (value := getattr(args, name))]:
-        check_folders(path)
         if path.exists() and any(path.samefile(each) for each in inputs):
             raise InputError(f"{path}: is read by this command, and would be overwritten; give another name.")
 

@@ -58,9 +58,12 @@ class StreamNode(ParameterNode):
         """The event callbacks of a topic, which warn of peers with another QoS or type at times: rclpy writes a line for each peer."""
         for event in ("incompatible_qos", "incompatible_type"):
             if getattr(events, event) is None:
-                text = f"{topic}: somebody has an {event.replace('_', ' ')} there, and does not hear or is not heard"
-                setattr(events, event, lambda _, kind=f"{topic} {event}", text=text: self.warn_at_times(kind, text))
+                text = f"{topic}: a peer has an {event.replace('_', ' ')}, so its messages, or ours, do not arrive; correct the peer"
+                setattr(events, event, self._warning(f"{topic} {event}", text))
         return events
+
+    def _warning(self, kind: str, text: str) -> Callable[[Any], None]:
+        return lambda _: self.warn_at_times(kind, text)
 
     def create_timer(  # type: ignore[override]  # its further arguments are handed on by their names
         self, timer_period_sec: float, callback: Callable[[], None], **options: Any

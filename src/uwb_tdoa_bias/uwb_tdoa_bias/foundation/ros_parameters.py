@@ -81,7 +81,7 @@ class ParameterNode(Node):
         self._warned: dict[str, float] = {}  # {kind: s of time.monotonic() from which on it may be said again}
         super().__init__(*arguments, **options)
 
-    def get_logger(self) -> Log:  # type: ignore[override]  # it has what is used of one
+    def get_logger(self) -> Log:
         """Of rclpy; a Log."""
         if self._log is None:
             self._log = Log(super().get_logger())

@@ -179,7 +179,8 @@ def _recordings(path: Path) -> list[Path]:
             found.append(path)
         elif path.is_dir() and (place := path.stat()[1:3]) not in seen:
             seen.add(place)
-            budget.spend(f"folders within {FOLDER_DEPTH} others", depth > FOLDER_DEPTH, 0)
+            if depth > FOLDER_DEPTH:
+                budget.spend("levels of folders", depth, FOLDER_DEPTH)
             for inside in sorted(path.iterdir()):
                 budget.spend("entries", 1, FOLDER_ENTRIES)
                 if not inside.name.startswith("."):
