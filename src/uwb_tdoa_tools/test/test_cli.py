@@ -111,8 +111,8 @@ def test_no_output_is_an_input_a_link_or_a_part_of_a_bag(tmp_path):
     (bag / "metadata.yaml").write_text("precious")
     link.symlink_to(tmp_path / "bashrc")
 
-    def given(out, **more):
-        return Namespace(**{"flights": [str(bag)], "survey": str(survey), "namespace": "", "json": str(out), **more})
+    def given(json, **more):
+        return Namespace(**{"flights": [str(bag)], "survey": str(survey), "namespace": "", "json": str(json), **more})
 
     cases = [(survey, "is read by this command"), (tmp_path / "bag" / ".." / "survey.txt", "is read by this command")]
     cases += [(bag / "metadata.yaml", "is a part of a bag"), (link, "is a link to .*bashrc")]

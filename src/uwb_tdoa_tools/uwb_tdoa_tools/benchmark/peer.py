@@ -55,7 +55,7 @@ class Peer:
         self.name = Path(path).name
         try:
             with temporary_folder() as folder:
-                library = ctypes.CDLL(shutil.copy(path, folder) if own else str(Path(path).absolute()))
+                library = ctypes.CDLL(str(shutil.copy(path, folder) if own else Path(path).absolute()))
         except OSError as error:
             raise InputError(f"--peer: {path} cannot be loaded as a shared library ({error}); build it anew on this machine.") from error
         functions: dict[str, Any] = {name: getattr(library, f"tdoa_peer_{name}", None) for name in SYMBOLS}
