@@ -127,7 +127,7 @@ def refuse_inputs(args: argparse.Namespace, *names: str) -> None:
 
 
 def _is_there(value: object) -> bool:
-    return isinstance(value, (str, Path)) and bool(str(value)) and len(str(value)) < 4096 and "\0" not in str(value) and os.path.exists(value)
+    return isinstance(value, (str, Path)) and len(str(value)) < 4096 and os.path.exists(value)
 
 
 def check_folders(*paths: str | Path | None) -> None:
