@@ -76,7 +76,8 @@ def prepare(compiled):
 
 def environment():
     """Digest of all that .venv depends on."""
-    return digest([ROOT / "requirements.txt", LOCK, ROOT / ".dev" / "wheels.py"], str(ROOT), BASE_PYTHON, VERSION, str(OWN_ROS))
+    files = [ROOT / "requirements.txt", LOCK, *(ROOT / ".dev" / name for name in ("wheels.py", "paths.sh"))]
+    return digest(files, str(ROOT), BASE_PYTHON, VERSION, str(OWN_ROS))
 
 
 def check_machine():

@@ -11,6 +11,7 @@ from rcl_interfaces.msg import Parameter
 import yaml
 
 from uwb_tdoa_bias.foundation.errors import Failure
+from uwb_tdoa_bias.foundation.foreign_text import printable
 from uwb_tdoa_tools import cli
 from uwb_tdoa_tools.live.session import message_class, session, subscription_qos
 
@@ -67,26 +68,31 @@ def parser():
     return made
 
 
+def show(text):
+    """Print a line that holds what others have named or written: a terminal shows all of it, and obeys nothing."""
+    print(printable(text), flush=True)
+
+
 # --- topics ---
 
 
 def topic_list(node, stop, args):
     for topic, types in _settled(node.get_topic_names_and_types, lambda topics: {*dict(topics)} - OF_EVERY_NODE, stop):
-        print(f"{topic} [{', '.join(types)}]" if args.show_types else topic)
+        show(f"{topic} [{', '.join(types)}]" if args.show_types else topic)
 
 
 def topic_info(node, stop, args):
     topic = _topic(node, stop, args.topic, needs_publisher=False)
     _settled(lambda: (node.count_publishers(topic), node.count_subscribers(topic)), lambda counts: counts[0] > 0, stop)
     ends = {"Publisher": node.get_publishers_info_by_topic, "Subscription": node.get_subscriptions_info_by_topic}
-    print(f"Type: {', '.join(dict(node.get_topic_names_and_types())[topic])}")
+    show(f"Type: {', '.join(dict(node.get_topic_names_and_types())[topic])}")
     for kind, infos in ends.items():
         infos = infos(topic)
-        print(f"{kind} count: {len(infos)}")
+        show(f"{kind} count: {len(infos)}")
         for info in infos if args.verbose else ():
             qos = info.qos_profile
             name = f"{info.node_namespace.rstrip('/')}/{info.node_name}"
-            print(f"  {name} [{info.topic_type}]: {qos.reliability.name.lower()}, {qos.durability.name.lower()}")
+            show(f"  {name} [{info.topic_type}]: {qos.reliability.name.lower()}, {qos.durability.name.lower()}")
 
 
 def topic_hz(node, stop, args):
@@ -96,7 +102,7 @@ def topic_hz(node, stop, args):
         rclpy.spin_once(node, timeout_sec=0.1)
         if time.monotonic() > shown + 1.0:
             shown = time.monotonic()
-            print(_rate(list(stamps)), flush=True)
+            show(_rate(list(stamps)))
             while stamps and stamps[0] < shown - 10.0:
                 stamps.popleft()
 
@@ -114,7 +120,7 @@ def topic_echo(node, stop, args):
     while not stop:
         rclpy.spin_once(node, timeout_sec=0.1)
         while received:
-            print(yaml.safe_dump(_plain(received.popleft()), sort_keys=False, default_flow_style=None), end="---\n", flush=True)
+            cli.show(f"{yaml.safe_dump(_plain(received.popleft()), sort_keys=False, default_flow_style=None)}---")
             if args.once:
                 return
 
@@ -156,7 +162,7 @@ def _topic(node, stop, name, needs_publisher):
 
 def node_list(node, stop, args):
     for name in _nodes(node, stop):
-        print(name)
+        show(name)
 
 
 def param_list(node, stop, args):
@@ -164,14 +170,15 @@ def param_list(node, stop, args):
         client = _client(node, stop, name, missing_ok=not args.node)
         if client is None:  # a node without parameters
             continue
-        print(f"{name}:" if not args.node else "", end="\n" if not args.node else "")
+        if not args.node:
+            show(f"{name}:")
         for parameter in sorted(_answer(node, stop, client.list_parameters()).result.names):
-            print(parameter if args.node else f"  {parameter}")
+            show(parameter if args.node else f"  {parameter}")
 
 
 def param_get(node, stop, args):
     values = _answer(node, stop, _client(node, stop, args.node).get_parameters([args.name])).values
-    print(parameter_value_to_python(_the_one(values, args)))
+    show(parameter_value_to_python(_the_one(values, args)))
 
 
 def param_set(node, stop, args):
@@ -179,18 +186,18 @@ def param_set(node, stop, args):
     (result,) = _answer(node, stop, _client(node, stop, args.node).set_parameters([parameter])).results
     if not result.successful:
         raise Failure(f"{args.name}: not set: {result.reason}")
-    print("Set parameter successful")
+    show("Set parameter successful")
 
 
 def param_describe(node, stop, args):
     descriptors = _answer(node, stop, _client(node, stop, args.node).describe_parameters([args.name])).descriptors
     found = _the_one(descriptors, args)
-    print(f"{found.name}: {found.description}")
+    show(f"{found.name}: {found.description}")
     for bounds in (*found.floating_point_range, *found.integer_range):
-        print(f"  from {bounds.from_value:g} to {bounds.to_value:g}")
+        show(f"  from {bounds.from_value:g} to {bounds.to_value:g}")
     if found.additional_constraints:
-        print(f"  {found.additional_constraints}")
-    print("  read only" if found.read_only else "  can be set in flight")
+        show(f"  {found.additional_constraints}")
+    show("  read only" if found.read_only else "  can be set in flight")
 
 
 def _the_one(answers, args):

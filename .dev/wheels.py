@@ -1,7 +1,9 @@
-"""The two repairs without which the ROS wheels in a virtual environment build no message package. Run by its Python.
+"""Three repairs of the ROS wheels in a virtual environment. Run by its Python.
 
 1. Their CMake files name the paths of the machine they were built on: put ours in.
 2. Their prefix has no local_setup.*: with one, install/setup.bash chains back to it in a clean shell.
+3. Their bootstrap sets LD_LIBRARY_PATH in the Python of colcon that writes the setup. Then colcon leaves a `:` at its end, and the loader
+   takes libraries of the present folder.
 """
 
 import re
@@ -18,6 +20,7 @@ PATHS = {
     rf"{BUILD_PYTHON}/include/python3\.\d+": sysconfig.get_paths()["include"],
 }
 LOCAL_SETUP = f"""\
+{(Path(__file__).parent / "paths.sh").read_text(encoding="utf-8")}
 # Puts this virtual environment in front, as a ROS prefix and as the Python to use.
 case ":$AMENT_PREFIX_PATH:" in *":{PREFIX}:"*) ;; *)
   export AMENT_PREFIX_PATH="{PREFIX}${{AMENT_PREFIX_PATH:+:$AMENT_PREFIX_PATH}}" ;;
@@ -41,6 +44,17 @@ def write_local_setup():
         (PREFIX / f"local_setup.{shell}").write_text(LOCAL_SETUP, encoding="utf-8")
 
 
+def repair_bootstrap():
+    file = Path(sysconfig.get_paths()["purelib"]) / "ros_wheels_bootstrapper" / "__init__.py"
+    old = "if not os.environ.get('_ROS_WHEELS_BOOTSTRAP_COMPLETE'):"
+    text = file.read_text(encoding="utf-8")
+    if text.count(old) != 1:
+        raise SystemExit(f"{file} is another than it was: see repair 3 of .dev/wheels.py")
+    new = old.replace(":", " and not any(word.endswith('_local_setup_util_sh.py') for word in sys.orig_argv):")
+    file.write_text(text.replace(old, new), encoding="utf-8")
+
+
 if __name__ == "__main__":
     repair_cmake_files()
     write_local_setup()
+    repair_bootstrap()

@@ -3,11 +3,11 @@
 import ast
 import os
 from pathlib import Path
-import shutil
 
 import pytest
 
 from uwb_tdoa_bias.foundation import compiled
+from uwb_tdoa_bias.foundation.files import TEMPORARY
 
 SOURCES = Path(__file__).resolve().parents[2]
 NAME = "0123"  # of a state of the sources
@@ -23,21 +23,23 @@ def named(tmp_path, monkeypatch):
 
 
 def place():
-    for function in (compiled._place, compiled._say):
-        function.cache_clear()
+    compiled._place.cache_clear()
     return compiled._place(NAME)
+
+
+def is_temporary(folder):
+    return folder.name.startswith(TEMPORARY) and folder.stat().st_mode & 0o777 == 0o700
 
 
 def foreign(monkeypatch, *paths):
     """Files that seem to belong to somebody else."""
-    for name in ("stat", "lstat"):
-        plain = getattr(os, name)
-        of_another = lambda found: os.stat_result((*found[:4], os.getuid() + 1, *found[5:]))  # noqa: E731
+    plain = os.stat
 
-        def changed(path, *a, plain=plain, **k):
-            return of_another(plain(path)) if str(path) in map(str, paths) else plain(path, *a, **k)
+    def changed(path, *a, **k):
+        found = plain(path, *a, **k)
+        return os.stat_result((*found[:4], os.getuid() + 1, *found[5:])) if str(path) in map(str, paths) else found
 
-        monkeypatch.setattr(os, name, changed)
+    monkeypatch.setattr(os, "stat", changed)
 
 
 def test_the_named_folder_is_used_and_made_for_the_user_alone(named):
@@ -47,42 +49,34 @@ def test_the_named_folder_is_used_and_made_for_the_user_alone(named):
     assert place() == named / NAME
 
 
-@pytest.mark.parametrize("mode", [0o777, 0o1777, 0o757])
-@pytest.mark.parametrize("which", ["", NAME, f"{NAME}/module", f"{NAME}/module/planted.nbi"])
-def test_what_others_may_write_to_is_not_used(named, capsys, mode, which):
-    (named / NAME / "module").mkdir(parents=True)
-    (named / NAME / "module" / "planted.nbi").write_bytes(b"")
-    (named / which).chmod(mode)
-    if which == "" and mode & 0o1000:  # as in /tmp: what is there and ours stays ours
-        assert place() == named / NAME
-        return
-    own = named.parents[1] / "uwb_tdoa"
-    assert place() == own / NAME
-    assert f"others may write to {named}; {own} is used" in capsys.readouterr().err
-
-
-def test_what_leads_to_a_folder_counts(named):
-    named.parent.chmod(0o777)  # anybody may put another folder there
+def test_by_default_it_is_in_the_cache_of_the_user(named, monkeypatch):
+    monkeypatch.delenv("NUMBA_CACHE_DIR")
     assert place() == named.parents[1] / "uwb_tdoa" / NAME
-    named.parent.chmod(0o1777)
-    assert place() == named / NAME
 
 
-def test_a_group_of_several_may_not_write_there(named, monkeypatch):
-    named.mkdir()
-    named.chmod(0o775)
-    monkeypatch.setattr(compiled, "_is_alone", lambda _: False)
-    assert place() == named.parents[1] / "uwb_tdoa" / NAME
-    monkeypatch.setattr(compiled, "_is_alone", lambda _: True)
-    assert place() == named / NAME
-
-
-@pytest.mark.parametrize("which", ["", NAME, f"{NAME}/planted.nbi"])
-def test_what_belongs_to_somebody_else_is_not_used(named, monkeypatch, which):
+@pytest.mark.parametrize("mode", [0o777, 0o1777, 0o757, 0o775, 0o755])
+def test_a_folder_into_which_others_get_is_not_used(named, capsys, mode):
+    """Whatever is in it: somebody else may have put it there."""
     (named / NAME).mkdir(parents=True)
-    (named / NAME / "planted.nbi").write_bytes(b"")
-    foreign(monkeypatch, named / which)
-    assert place() == named.parents[1] / "uwb_tdoa" / NAME
+    (named / NAME).chmod(mode)
+    assert is_temporary(place())
+    assert f"others may write to {named / NAME}; a temporary folder is used" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("which", [".", ".."])
+def test_a_folder_that_anybody_can_replace_is_not_used(named, which):
+    named.mkdir()
+    (named / which).resolve().chmod(0o777)
+    assert is_temporary(place())
+    (named / which).resolve().chmod(0o1777)  # as in /tmp: what is ours stays ours
+    assert place() == named / NAME
+
+
+@pytest.mark.parametrize("which", ["..", ".", NAME])
+def test_what_belongs_to_somebody_else_is_not_used(named, monkeypatch, which):
+    (named / NAME).mkdir(parents=True, mode=0o700)
+    foreign(monkeypatch, (named / which).resolve())
+    assert is_temporary(place())
 
 
 def test_a_link_is_followed_once(named):
@@ -92,17 +86,9 @@ def test_a_link_is_followed_once(named):
     assert place() == true / NAME
 
 
-def test_without_any_folder_of_ones_own_there_is_a_temporary_one(named, monkeypatch, capsys):
-    monkeypatch.delenv("NUMBA_CACHE_DIR")
-    own = named.parents[1] / "uwb_tdoa"
-    own.mkdir()
-    own.chmod(0o777)
-    found = place()
-    assert found.is_relative_to(compiled._temporary()) and os.stat(found.parent).st_mode & 0o777 == 0o700
-    assert f"others may write to {own}; a temporary folder is used" in capsys.readouterr().err
-    shutil.rmtree(own)
-    own.write_text("no folder")
-    assert place() == found and "nothing can be kept" in capsys.readouterr().err
+def test_where_nothing_can_be_kept_there_is_a_temporary_folder(named, capsys):
+    named.write_text("no folder")
+    assert is_temporary(place()) and "nothing can be kept" in capsys.readouterr().err
 
 
 def test_no_compiled_function_unpacks_an_argument_by_a_bare_name():

@@ -59,8 +59,8 @@ def test_an_empty_file_is_nothing(text):
         ("a: [1, 2", "line 1: is no YAML"),
         ("a: \t- b", "is no YAML"),
         ("a: \x07", "is no YAML"),
-        ("[" * 30 + "]" * 30, "deeper than 20 levels"),
-        ("[" * 5000, "deeper than 20 levels"),
+        ("[" * 30 + "]" * 30, "more than 20 levels"),
+        ("[" * 5000, "more than 20 levels"),
         ("[" + "1," * 200_001 + "1]", "more than 200000 entries"),
         (b"a: \xff", "byte 3 is not UTF-8"),
         ("a: 1".encode("utf-16"), "byte 0 is not UTF-8"),
@@ -85,9 +85,9 @@ def test_files(tmp_path):
     path.write_bytes("\ufeffa: ü\n".encode())
     assert read_yaml(path) == {"a": "ü"}
     path.write_text("a" * (YAML_BYTES + 1))
-    with pytest.raises(InputError, match="has 2000001 bytes"):
+    with pytest.raises(InputError, match="has more than 2000000 bytes"):
         read_yaml(path)
-    with pytest.raises(InputError, match=r"f.yaml: cannot be read as YAML \(Is a directory|cannot be read"):
+    with pytest.raises(InputError, match="cannot be read|a pipe, a device or a folder"):
         read_yaml(tmp_path)
     with pytest.raises(InputError, match="nowhere.yaml: cannot be read as YAML"):
         read_yaml(tmp_path / "nowhere.yaml")
@@ -116,3 +116,11 @@ def assert_plain(content):
     else:
         assert content is None or isinstance(content, (str, bool, int, float))
         assert not isinstance(content, float) or math.isfinite(content)
+
+
+@pytest.mark.parametrize("number", ["9" * 1_000_000, "-" + "9" * 1_000_000 + ".0", "1e" + "9" * 1_000_000])
+def test_a_long_number_is_refused_at_once_and_not_repeated(number):
+    began = time.process_time()
+    with pytest.raises(InputError) as refused:
+        parse_yaml(f"a: {number}", "f")
+    assert len(str(refused.value)) < 200 and time.process_time() - began < 2.0

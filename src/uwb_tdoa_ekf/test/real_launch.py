@@ -18,10 +18,11 @@ WITH = "psutil", "argcomplete", "packaging"  # that it imports
 PATIENCE = 180.0  # s for anything that must happen
 # What asyncio says when SIGINT comes between two statements of the loop of launch, which then ends with 1, however well its nodes end.
 FAULT_OF_LAUNCH = "Task was destroyed but it is pending!"
+OURS = FOLDER.is_dir() and FOLDER.stat().st_uid in (os.getuid(), 0) and not FOLDER.stat().st_mode & 0o022  # what is in it is run
 WHY_NOT = (
-    None if shutil.which("ros2") or FOLDER.is_dir() and all(map(find_spec, WITH))
-    else f"no ros2 command: .venv/bin/python -m pip install {' '.join(WITH)}" if FOLDER.is_dir()
-    else "no ros2 command, and no ../shared/ros2cli beside the checkout"
+    None if shutil.which("ros2") or OURS and all(map(find_spec, WITH))
+    else f"no ros2 command: .venv/bin/python -m pip install {' '.join(WITH)}" if OURS
+    else "no ros2 command, and no ../shared/ros2cli of yours alone beside the checkout"
 )  # fmt: skip
 
 

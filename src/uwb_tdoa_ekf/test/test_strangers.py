@@ -179,3 +179,24 @@ def test_what_a_frozen_node_refuses_is_a_warning_once(make_rig, tmp_path):
     rig.wait(lambda: any("refused, because this node is frozen" in line for line in process.lines), "a warning")
     rig.send_tdoa(0.2, 10, 14, 1.0)
     rig.wait(lambda: rig.fresh_status("bias_node").level == DiagnosticStatus.OK, "the warning to be over")
+
+
+@pytest.mark.parametrize("frozen", [False, True])
+def test_no_peer_fills_the_log(make_rig, frozen):
+    """IMU messages, each in a frame with another name of 4 kB, made 298 MB of log in 10 s."""
+    rig = make_rig()
+    (process,) = rig.start("ekf_node", ekf_node=["-p", f"frozen:={str(frozen).lower()}"])
+    stranger = Stranger(rig)
+    rig.send_anchors(corners())
+    count = 3000
+    for k in range(count):
+        message = Imu()
+        message.header.frame_id, message.header.stamp.sec = f"{k}{'x' * 4000}", 1_700_000_000
+        message.header.stamp.nanosec = 1_000_000 * (k % 1000)
+        stranger.publish("imu/data", message)
+        if k % 100 == 0:
+            assert stranger.alive("ekf_node")
+    rig.wait(lambda: rig.values("ekf_node").get("IMU samples received", "0") != "0", "them to be heard")
+    assert stranger.alive("ekf_node")
+    lines = list(process.lines)
+    assert sum(map(len, lines)) < 1_000_000 and max(map(len, lines)) < 3000

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import atexit
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 import json
 import os
 from pathlib import Path
-import shutil
 import signal
 import socket
-import tempfile
 
 import yaml
 from uwb_tdoa_bias import anchors_node, bias_node
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.files import write_text
+from uwb_tdoa_bias.foundation.files import folder_of_process, write_text
 from uwb_tdoa_bias.foundation.safe_yaml import read_yaml
 
 from . import debias_node
@@ -252,9 +249,7 @@ def pooled(starts: list[Start], processes: int | str) -> list[Start]:
     if any(isinstance(part, str) for each in members for part in each.parameters):
         raise InputError("params_file: does not go with processes; write its values into the file of the tags.")
     by_node = {f"/**/{each.label}": {"ros__parameters": each.parameters[-1]} for each in members if each.parameters}  # in any namespace
-    folder = Path(tempfile.mkdtemp(prefix="uwb_tdoa_tags_"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)  # a node that is started again reads it again
-    file = folder / "tags.yaml"
+    file = folder_of_process() / "tags.yaml"  # a node that is started again reads it again
     write_text(file, yaml.safe_dump(by_node, allow_unicode=True))
     frozen = all(each.parameters and each.parameters[-1].get("frozen") for each in members)
     namespaces, out = list(dict.fromkeys(each.namespace for each in members)), [each for each in starts if each not in members]

@@ -11,6 +11,7 @@ from launch.actions import LogInfo, OpaqueFunction, TimerAction
 import launch.logging
 from launch_ros.actions import Node
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.executable import leave_present_folder_out
 
 from .launching import Lives, discovery, network
 
@@ -26,6 +27,7 @@ def actions(
     starts: Iterable[Start], respawn: str, on_exit: str, discovery_range: str, rviz: str, use_sim_time: str = "false"
 ) -> list[Action]:
     """Of [Start]s, as texts of launch arguments say: what is printed of the network, the nodes, and RViz if rviz is "true"."""
+    leave_present_folder_out()  # what is launched inherits it
     of_nodes = discovery(os.environ, discovery_range)
     nodes = [_node(each, Lives(each.label, respawn == "true", on_exit), of_nodes) for each in starts]
     return [LogInfo(msg=network({**os.environ, **of_nodes})), *nodes, *([_rviz(use_sim_time)] if rviz == "true" else [])]

@@ -141,7 +141,8 @@ class Tag:
 
     def _end(self, error: Exception) -> None:
         gone, self._failure, self._pair = self.members, None, None
-        self._node.get_logger().error("".join(traceback.format_exception(error)))
+        for line in "".join(traceback.format_exception(error)).splitlines():
+            self._node.get_logger().error(line)
         if time.monotonic() > self._began + SOUND:
             self._wait = 0.0
         self._again(error)

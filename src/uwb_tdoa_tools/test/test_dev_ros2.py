@@ -8,12 +8,14 @@ import signal
 import subprocess
 import sys
 import time
+from types import SimpleNamespace
 
 import pytest
 
 rclpy = pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
+from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, ParameterType, ParameterValue  # noqa: E402
 from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
 from uwb_tdoa_bias.foundation.ros_parameters import Parameter, declare_all  # noqa: E402
 from uwb_tdoa_msgs.msg import Tdoa, TdoaResidual  # noqa: E402
@@ -115,6 +117,49 @@ def test_any_message_is_yaml():
     plain = runpy.run_path(str(SCRIPT))["_plain"]
     residual = plain(TdoaResidual(verdict=3, weight=0.5))
     assert residual["header"] == {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""} and residual["verdict"] == 3
+
+
+HOSTILE = "x\x1b]52;c;ZXZpbA==\x07\u202e\nforged"
+
+
+@pytest.mark.parametrize("command", ["param get", "param describe", "param list", "node list", "topic list -t", "topic info -v t"])
+def test_a_terminal_obeys_nothing_that_others_have_written(monkeypatch, capsys, command):
+    """`param get` of a text with escape sequences wrote to the clipboard."""
+    script = runpy.run_path(str(SCRIPT))
+    function = script[command.replace(" -t", "").replace(" -v t", "").replace(" ", "_")]
+    value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=HOSTILE)
+    bounds = [FloatingPointRange(from_value=0.0, to_value=1.0)]
+    described = ParameterDescriptor(
+        name=HOSTILE, type=4, description=HOSTILE, additional_constraints=HOSTILE, floating_point_range=bounds
+    )
+    end = SimpleNamespace(
+        node_namespace=HOSTILE, node_name=HOSTILE, topic_type=HOSTILE,
+        qos_profile=SimpleNamespace(reliability=ReliabilityPolicy.RELIABLE, durability=ReliabilityPolicy.RELIABLE),
+    )  # fmt: skip
+    node = SimpleNamespace(
+        get_topic_names_and_types=lambda: [(HOSTILE, [HOSTILE])], get_publishers_info_by_topic=lambda _: [end],
+        get_subscriptions_info_by_topic=lambda _: [end], count_publishers=lambda _: 1, count_subscribers=lambda _: 1,
+    )  # fmt: skip
+    answers = {
+        "param get": SimpleNamespace(values=[value]), "param describe": SimpleNamespace(descriptors=[described]),
+        "param list": SimpleNamespace(result=SimpleNamespace(names=[HOSTILE])),
+    }  # fmt: skip
+    fakes = {
+        "_answer": lambda *_: answers[command], "_client": lambda *_, **__: Any_(), "_nodes": lambda *_: [HOSTILE],
+        "_settled": lambda look, *_: look(), "_topic": lambda *_, **__: HOSTILE,
+    }  # fmt: skip
+    function.__globals__.update(fakes)
+    for of in ([HOSTILE, None] if command == "param list" else [HOSTILE]):
+        function(node, [], argparse.Namespace(node=of, name="n", topic=HOSTILE, show_types=True, verbose=True))
+    said = capsys.readouterr().out
+    assert r"\x1b]52" in said and r"\nforged" in said and all(line.isprintable() for line in said.split("\n"))
+
+
+class Any_:
+    """Has every method, which does nothing."""
+
+    def __getattr__(self, name):
+        return lambda *_, **__: None
 
 
 def test_its_examples_are_command_lines():

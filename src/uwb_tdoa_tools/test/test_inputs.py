@@ -1,15 +1,26 @@
 from dataclasses import replace
+import os
+from pathlib import Path
+import subprocess
+import sys
+import tempfile
+import time
 
 import numpy as np
 import pytest
 from recordings import ANCHORS, ROWS, SURVEY, log_bytes, small_flight
 
+from uwb_tdoa_bias.foundation.arrays_file import read_arrays
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.files import read_bytes, temporary_folder
 from uwb_tdoa_bias.foundation.flight import Tdoas
+from uwb_tdoa_bias.foundation.limits import FOLDER_DEPTH, TooMuch
+from uwb_tdoa_bias.foundation.safe_yaml import read_yaml
+from uwb_tdoa_bias.foundation.survey import read_survey
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.bags.files import messages, new_bag, open_bag
 from uwb_tdoa_tools.bags.message_types import typestore
-from uwb_tdoa_tools.readers import inputs
+from uwb_tdoa_tools.readers import inputs, read_flight
 from uwb_tdoa_tools.readers.inputs import Reading, find_flights, need_tdoas, survey_for
 
 
@@ -214,3 +225,58 @@ def test_a_recording_without_tdoas_is_refused_where_they_are_needed():
     need_tdoas([flight], "survey")
     with pytest.raises(InputError, match=f"{flight.name}: holds no TDOAs, which survey needs"):
         need_tdoas([flight, replace(flight, tdoa=Tdoas(*np.empty((4, 0))))], "survey")
+
+
+def test_folders_that_link_to_each_other_are_looked_through_once(tmp_path):
+    """Twelve folders with links to all twelve have 12^n paths."""
+    for k in range(12):
+        (tmp_path / f"{k}").mkdir()
+    for k in range(12):
+        for other in range(12):
+            (tmp_path / f"{k}" / f"to{other}").symlink_to(tmp_path / f"{other}")
+    (tmp_path / "3" / "flight").write_text("")
+    os.mkfifo(tmp_path / "4" / "pipe")
+    assert [path.name for path, _ in find_flights([tmp_path], "survey.txt")] == ["flight"]
+
+
+def test_folders_within_folders_have_a_limit(tmp_path):
+    deep = tmp_path
+    for _ in range(FOLDER_DEPTH + 2):
+        deep = deep / "d"
+    deep.mkdir(parents=True)
+    with pytest.raises(TooMuch, match="more than 20 levels of folders"):
+        find_flights([tmp_path], "survey.txt")
+
+
+@pytest.mark.parametrize("read", [read_survey, read_yaml, read_bytes, lambda path: read_arrays(path, {}, "map", "make it anew")])
+@pytest.mark.parametrize("what", ["pipe", "device"])
+def test_a_pipe_is_refused_at_once(tmp_path, read, what):
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(InputError, match="is a pipe, a device or a folder; give a file"):
+        read(tmp_path / "pipe" if what == "pipe" else Path("/dev/zero"))
+
+
+def test_a_pipe_among_surveys_is_no_survey(tmp_path):
+    (tmp_path / "flight_a").write_bytes(log_bytes())
+    os.mkfifo(tmp_path / "anchor_a.txt")
+    with pytest.raises(InputError, match="is a pipe, a device or a folder"):
+        read_flight(tmp_path / "flight_a", survey_for(tmp_path / "flight_a", tmp_path))
+
+
+def test_a_folder_that_a_killed_process_left_is_removed_by_the_next(tmp_path, monkeypatch):
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    code = (
+        "import tempfile, sys; tempfile.tempdir = sys.argv[1]\n"
+        "from uwb_tdoa_bias.foundation.files import temporary_folder\n"
+        "with temporary_folder() as folder: print(folder, flush=True); sys.stdin.read()"
+    )
+    killed = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    left = Path(killed.stdout.readline().strip())
+    old = time.time() - 3600.0
+    os.utime(left, (old, old))
+    with temporary_folder():
+        assert left.is_dir()  # it is in use
+    killed.kill()
+    killed.communicate()
+    with temporary_folder() as own:
+        assert not left.exists() and own.is_dir()

@@ -1,4 +1,6 @@
 import gzip
+import re
+import shlex
 
 import numpy as np
 import pytest
@@ -58,6 +60,15 @@ def test_foreign_files(tmp_path, survey, content, sentence):
     file.write_bytes(content)
     with pytest.raises(InputError, match=sentence):
         read_flight(file, survey)
+
+
+@pytest.mark.parametrize("name", ["r1;touch x;.bag", "r1 $(touch x).bag", "r1'`touch x`.bag", "r1\n touch x.bag"])
+def test_a_line_that_is_printed_to_be_copied_runs_nothing_else(tmp_path, survey, name):
+    (tmp_path / name).write_bytes(b"#ROSBAG V2.0\n")
+    with pytest.raises(InputError) as refused:
+        read_flight(tmp_path / name, survey)
+    line = re.search(r"rosbags-convert .* --dst NAME", str(refused.value), re.DOTALL)[0]
+    assert shlex.split(line) == ["rosbags-convert", "--src", str(tmp_path / name), "--dst", "NAME"]
 
 
 def test_missing_and_directory(tmp_path, survey):

@@ -1,9 +1,11 @@
 import gzip
+import time
 import tracemalloc
 
 import numpy as np
 import pytest
 from recordings import ANCHORS, FULL_HEADER, FULL_ROWS, csv_text
+from uwb_tdoa_bias.foundation import limits
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.readers import read_util_csv, util_csv
 
@@ -199,3 +201,21 @@ def test_cells_of_all_blocks_count(read, monkeypatch):
         read(csv_text(TDOA + ",t_baro,baro", [*rows[:6], "6,0,1,6,,9"]))
     with pytest.raises(InputError, match="line 8: tdoa_meas is 'x'; it must be a number"):
         read(csv_text(TDOA + ",t_baro,baro", [*rows[:6], "6,0,1,x,,"]))
+
+
+def test_a_million_empty_members_of_gzip_take_no_time(read):
+    """20 MB of them were not finished in 60 s: the time must grow as the file does, or end with the limit of seconds."""
+    empty, packed = gzip.compress(b""), gzip.compress(csv_text(TDOA, ["1,0,1,1"]).encode())
+    took = []
+    for count in (20_000, 80_000):
+        began = time.process_time()
+        assert len(read(packed + count * empty).tdoa) == 1
+        took.append(time.process_time() - began)
+    assert took[1] < 8.0 * took[0]  # 16 times as long, where each member copies the rest
+
+
+def test_the_limit_of_seconds_holds_within_gzip(read, monkeypatch):
+    monkeypatch.setattr(limits, "SECONDS", 0.0)
+    monkeypatch.setattr(limits, "SECONDS_PER_BYTE", 0.0)
+    with pytest.raises(limits.TooMuch, match="takes more than 0.0 s of processor time to read"):
+        read(gzip.compress(csv_text(TDOA, ["1,0,1,1"]).encode()))

@@ -25,7 +25,7 @@ from tqdm import tqdm
 
 from uwb_tdoa_bias.foundation.errors import Failure, InputError
 from uwb_tdoa_bias.foundation.files import write_text
-from uwb_tdoa_bias.foundation.foreign_text import printable
+from uwb_tdoa_bias.foundation.foreign_text import line_of, printable
 from uwb_tdoa_bias.foundation.version import written_by
 
 from . import command_lines
@@ -115,10 +115,33 @@ def without_ros_arguments(arguments: Iterable[str]) -> list[str]:
     return own
 
 
+def check_outputs(args: argparse.Namespace, *names: str) -> None:
+    """Raise InputError, before the work, unless the files that some options name can be written, and are no inputs."""
+    check_folders(*(getattr(args, name) for name in names))
+    refuse_inputs(args, *names)
+
+
+def refuse_inputs(args: argparse.Namespace, *names: str) -> None:
+    """Raise InputError if what some options name, a file or a bag, is an input that the other options and arguments name."""
+    given = [value for name, value in vars(args).items() if name not in names]
+    inputs = [Path(each) for value in given for each in (value if isinstance(value, (list, tuple)) else [value]) if _is_there(each)]
+    for path in [Path(value) for name in names if (value := getattr(args, name))]:
+        if path.exists() and any(path.samefile(each) for each in inputs):
+            raise InputError(f"{path}: is read by this command, and would be overwritten; give another name.")
+
+
+def _is_there(value: object) -> bool:
+    return isinstance(value, (str, Path)) and len(str(value)) < 4096 and os.path.exists(value)
+
+
 def check_folders(*paths: str | Path | None) -> None:
-    """Raise InputError, before the work, unless the folder of each file to write is there, and can be written to; None is passed
-    over."""
+    """Raise InputError, before the work, unless the folder of each file to write is there, and can be written to; also for a link, which
+    may lead to any file, and for a part of a bag. None is passed over."""
     for path in [Path(path) for path in paths if path]:
+        if path.is_symlink() and not path.absolute().is_relative_to("/dev"):
+            raise InputError(f"{path}: is a link to {os.readlink(path)}; give the file itself, or another name.")
+        if (path.absolute().parent / "metadata.yaml").exists() and path.suffix in (".yaml", ".mcap", ".db3", ".zstd"):
+            raise InputError(f"{path}: is a part of a bag; give another name.")
         if not path.absolute().parent.is_dir():
             raise InputError(f"{path}: its directory does not exist; make it first.")
         if path.is_dir():
@@ -157,8 +180,8 @@ def write_json(path: str | Path, content: dict[str, Any]) -> None:
 
 
 def say(name: str, sentence: object) -> None:
-    """Tell what happens, on stderr: `name: sentence`, made `printable`."""
-    print(f"{name}: {printable(sentence)}", file=sys.stderr, flush=True)
+    """Tell what happens, on stderr: `name: sentence`, as a `line_of` text."""
+    print(f"{name}: {line_of(sentence)}", file=sys.stderr, flush=True)
 
 
 def show(*lines: str) -> None:

@@ -210,7 +210,7 @@ def rerun_of(args: Namespace, count: int, say: Callable[[str], object]) -> Path 
     flights, of which it shows one. Raises InputError."""
     if not args.rerun:
         return None
-    cli.check_folders(args.rerun)
+    cli.check_outputs(args, "rerun")
     if count != 1:
         raise InputError(f"--rerun: needs exactly one flight, got {count}.")
     return Path(args.rerun) if rerun_file.is_there(say) else None

@@ -19,7 +19,7 @@ from typing import Any, Protocol, TYPE_CHECKING, TypeVar
 
 from joblib import Parallel, cpu_count, delayed, parallel_config
 
-from uwb_tdoa_bias.foundation.elsewhere import elsewhere
+from uwb_tdoa_bias.foundation.executable import elsewhere
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .progress import Progress

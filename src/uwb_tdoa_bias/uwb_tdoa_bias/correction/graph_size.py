@@ -35,6 +35,11 @@ class Unplayable(ValueError):
     """The graph has an operator, or a use of one, that is not played here, or is too large."""
 
 
+def _refuse_if(wrong: object, why: str) -> None:
+    if wrong:
+        raise Unplayable(why)
+
+
 @dataclass(frozen=True)
 class Size:
     """width : columns of the input; outputs : of the output; alone : whether each row has to be played by itself to get the same bits
@@ -47,8 +52,7 @@ class Size:
 
 def size_of(graph: Graph) -> Size:
     """The Size of a graph. Raises Unplayable."""
-    if len(graph.inputs) != 1 or len(graph.outputs) != 1 or len(graph.inputs[0][1]) != 2:
-        raise Unplayable("more than one input or output")
+    _refuse_if(len(graph.inputs) != 1 or len(graph.outputs) != 1 or len(graph.inputs[0][1]) != 2, "more than one input or output")
     (name, (rows, width)) = graph.inputs[0]
     if not width:
         raise Unplayable("an input of unknown width")
@@ -62,8 +66,7 @@ def size_of(graph: Graph) -> Size:
             raise Unplayable(f"{node.kind[:40]!r} cannot be used so, {error!r}") from error
     walk.compare(graph.shapes, rows)
     outputs, of_one = walk.value(graph.outputs[0])
-    if of_one != 1:
-        raise Unplayable("an output with other rows than the input")
+    _refuse_if(of_one != 1, "an output with other rows than the input")
     return Size(width, outputs, walk.alone or rows == 1)
 
 
@@ -79,8 +82,7 @@ class _Walk:
 
     def value(self, name: str) -> tuple[int, int]:
         """(columns, rows for each row of the input)."""
-        if name not in self._values:
-            raise Unplayable(f"{name[:40]!r} is no value")
+        _refuse_if(name not in self._values, f"{name[:40]!r} is no value")
         return self._values[name]
 
     def compare(self, shapes: list[tuple[str, Shape]], rows: int | None) -> None:
@@ -89,18 +91,20 @@ class _Walk:
         for name, shape in shapes:
             columns, of_one = self._values.get(name, (None, None))
             known = None if rows is None or of_one is None else rows * of_one, columns
-            if columns and (len(shape) != 2 or any(said not in (None, true) for said, true in zip(shape, known))):
-                raise Unplayable(f"{name[:40]!r} has another shape than the file says")
+            _refuse_if(
+                columns and (len(shape) != 2 or any(said not in (None, true) for said, true in zip(shape, known))),
+                f"{name[:40]!r} has another shape than the file says",
+            )
 
     def pass_over(self, node: Node) -> None:
         """Add what a node makes."""
         kind, (name,) = node.kind, node.outputs
-        if kind not in ATTRIBUTES:
-            raise Unplayable(f"operator {kind[:40]!r} is none of {', '.join(ATTRIBUTES)}")
-        if not {*node.attributes} <= {*ATTRIBUTES[kind]}:
-            raise Unplayable(f"{kind!r} has an attribute that is none of {', '.join(ATTRIBUTES[kind]) or 'none'}")
-        if not name or name in self._values or name in self._constants:
-            raise Unplayable(f"{name[:40]!r} is made twice")
+        _refuse_if(kind not in ATTRIBUTES, f"operator {kind[:40]!r} is none of {', '.join(ATTRIBUTES)}")
+        _refuse_if(
+            not {*node.attributes} <= {*ATTRIBUTES[kind]},
+            f"{kind!r} has an attribute that is none of {', '.join(ATTRIBUTES[kind]) or 'none'}",
+        )
+        _refuse_if(not name or name in self._values or name in self._constants, f"{name[:40]!r} is made twice")
         if kind == "Constant":
             self._constants[name] = np.asarray(node.attributes["value"])
             return
@@ -111,29 +115,30 @@ class _Walk:
 
     def _put(self, name: str, columns: int, rows: int, work: int) -> None:
         self._numbers, self._work = self._numbers + columns * rows, self._work + work
-        if columns < 1 or self._numbers > MODEL_NUMBERS:
-            raise Unplayable(f"no column, or more than {MODEL_NUMBERS} numbers for each row")
-        if self._work > MODEL_WORK or self._operations > MODEL_NODES:
-            raise Unplayable(f"more than {MODEL_WORK} additions and multiplications for each row, or {MODEL_NODES} operations")
+        _refuse_if(columns < 1 or self._numbers > MODEL_NUMBERS, f"no column, or more than {MODEL_NUMBERS} numbers for each row")
+        _refuse_if(
+            self._work > MODEL_WORK or self._operations > MODEL_NODES,
+            f"more than {MODEL_WORK} additions and multiplications for each row, or {MODEL_NODES} operations",
+        )
         self._values[name] = columns, rows
 
     def _constant(self, name: str) -> np.ndarray:
-        if name not in self._constants:
-            raise Unplayable(f"{name[:40]!r} is no constant")
+        _refuse_if(name not in self._constants, f"{name[:40]!r} is no constant")
         return self._constants[name]
 
     def _fits(self, name: str, columns: int) -> None:
         """Raises Unplayable unless a constant is the same for all rows, of so many columns or one."""
         array = self._constant(name)
-        if array.dtype != np.float32 or array.size not in (1, columns) or array.shape[:-1] not in ((), (1,)):
-            raise Unplayable("a constant that differs between rows")
+        _refuse_if(
+            array.dtype != np.float32 or array.size not in (1, columns) or array.shape[:-1] not in ((), (1,)),
+            "a constant that differs between rows",
+        )
 
     # Each rule: (columns, rows for each row of the input, additions or multiplications for each number that comes out).
 
     def _of_unary(self, node: Node) -> tuple[int, int, int]:
         (name,) = node.inputs
-        if node.attributes.get("axis", -1) not in (-1, 1):
-            raise Unplayable("rows of the input that mix")
+        _refuse_if(node.attributes.get("axis", -1) not in (-1, 1), "rows of the input that mix")
         return *self.value(name), 1
 
     def _of_clip(self, node: Node) -> tuple[int, int, int]:
@@ -143,15 +148,12 @@ class _Walk:
         return *self.value(name), 2
 
     def _of_elementwise(self, node: Node) -> tuple[int, int, int]:
-        if len(node.inputs) < 2:
-            raise Unplayable("less than two operands")
+        _refuse_if(len(node.inputs) < 2, "less than two operands")
         values = [self._values[name] for name in node.inputs if name in self._values]
-        if len({rows for _, rows in values}) != 1:
-            raise Unplayable("rows that do not fit")
+        _refuse_if(len({rows for _, rows in values}) != 1, "rows that do not fit")
         constants = [name for name in node.inputs if name not in self._values]
         columns = max(max(own for own, _ in values), *(self._constant(name).size for name in constants), 1)
-        if any(own not in (1, columns) for own, _ in values):
-            raise Unplayable("columns that do not fit")
+        _refuse_if(any(own not in (1, columns) for own, _ in values), "columns that do not fit")
         for name in constants:
             self._fits(name, columns)
         return columns, values[0][1], len(node.inputs) - 1
@@ -162,8 +164,7 @@ class _Walk:
 
     def _of_gemm(self, node: Node) -> tuple[int, int, int]:
         name, of_weights, *added = node.inputs
-        if node.attributes.get("transA", 0) != 0:
-            raise Unplayable("rows of the input that mix")
+        _refuse_if(node.attributes.get("transA", 0) != 0, "rows of the input that mix")
         weights = self._constant(of_weights)
         columns, rows, inner = self._product(name, weights.T if node.attributes.get("transB", 0) else weights)
         for one in filter(None, added):
@@ -172,29 +173,28 @@ class _Walk:
 
     def _product(self, name: str, weights: np.ndarray) -> tuple[int, int, int]:
         inner, rows = self.value(name)
-        if weights.dtype != np.float32 or weights.ndim != 2 or len(weights) != inner:
-            raise Unplayable("a product that does not fit")
+        _refuse_if(weights.dtype != np.float32 or weights.ndim != 2 or len(weights) != inner, "a product that does not fit")
         return weights.shape[1], rows, inner
 
     def _of_gather(self, node: Node) -> tuple[int, int, int]:
         name, of_taken = node.inputs
         (own, rows), taken = self.value(name), self._constant(of_taken)
-        if node.attributes.get("axis", 0) != 1 or taken.ndim != 1 or not ((0 <= taken) & (taken < own)).all():
-            raise Unplayable("other than columns taken")
+        _refuse_if(
+            node.attributes.get("axis", 0) != 1 or taken.ndim != 1 or not ((0 <= taken) & (taken < own)).all(),
+            "other than columns taken",
+        )
         return len(taken), rows, 1
 
     def _of_reshape(self, node: Node) -> tuple[int, int, int]:
         name, shape = node.inputs
         (own, rows), shape = self.value(name), self._constant(shape).tolist()
-        if len(shape) != 2 or shape[0] != -1 or shape[1] < 1 or own * rows % shape[1]:
-            raise Unplayable("a shape in which rows of the input mix")
+        _refuse_if(len(shape) != 2 or shape[0] != -1 or shape[1] < 1 or own * rows % shape[1], "a shape in which rows of the input mix")
         return shape[1], own * rows // shape[1], 1
 
     def _of_concat(self, node: Node) -> tuple[int, int, int]:
         parts = [self.value(name) for name in node.inputs]
         rows = {rows for _, rows in parts}
-        if node.attributes.get("axis") not in (1, -1) or len(rows) != 1:
-            raise Unplayable("rows that do not fit")
+        _refuse_if(node.attributes.get("axis") not in (1, -1) or len(rows) != 1, "rows that do not fit")
         return sum(columns for columns, _ in parts), rows.pop(), 1
 
     def _of_reducesum(self, node: Node) -> tuple[int, int, int]:
@@ -206,7 +206,6 @@ class _Walk:
     def _of_reducemax(self, node: Node) -> tuple[int, int, int]:
         name, *given = node.inputs
         axes = node.attributes.get("axes") or (self._constant(given[0]).tolist() if given else None)
-        if axes not in ([1], [-1]) or node.attributes.get("keepdims", 1) != 1:
-            raise Unplayable("other than rows reduced")
+        _refuse_if(axes not in ([1], [-1]) or node.attributes.get("keepdims", 1) != 1, "other than rows reduced")
         own, rows = self.value(name)
         return 1, rows, own

@@ -32,6 +32,11 @@ class Unreadable(ValueError):
     """The file is none, or holds what is not read here."""
 
 
+def _refuse_if(wrong: object, why: str) -> None:
+    if wrong:
+        raise Unreadable(why)
+
+
 @dataclass(frozen=True)
 class Node:
     """kind : name of the operator; inputs, outputs : names of values; attributes : {name: number, (n,) ints, bytes or array}."""
@@ -64,10 +69,8 @@ def read_graph(path: str | Path) -> Graph:
         model = _message(content, 8, 14, 20, 25, 26)
         graph = _message(model[7][0], 1, 5, 11, 12, 13, 14, 15, 16)
         for part, where in (("nodes", graph[1]), ("constants", graph[5]), ("entries of metadata", model[14])):
-            if len(where) > MODEL_NODES:
-                raise Unreadable(f"more than {MODEL_NODES} {part}")
-        if model[25] or graph[15]:
-            raise Unreadable("functions or sparse constants")
+            _refuse_if(len(where) > MODEL_NODES, f"more than {MODEL_NODES} {part}")
+        _refuse_if(model[25] or graph[15], "functions or sparse constants")
         constants = _unique(map(_tensor, graph[5]))
         inputs, outputs, others = ([_value(data) for data in graph[k]] for k in (11, 12, 13))
         said = [(name, shape) for name, kind, shape in (*outputs, *others) if name not in constants and _is_float(kind, name)]
@@ -95,22 +98,19 @@ def _message(data: bytes, *repeated: int) -> dict[int, list[Any]]:
     place = 0
     while place < len(data):
         key, place = _varint(data, place)
-        if not 0 < key < 1 << 32:
-            raise Unreadable("no protocol buffer")
+        _refuse_if(not 0 < key < 1 << 32, "no protocol buffer")
         if key & 7 == VARINT:
             value, place = _varint(data, place)
         else:
             size = {BYTES: None, FOUR_BYTES: 4}.get(key & 7, -1)
             if size is None:
                 size, place = _varint(data, place)
-            if not 0 <= size <= len(data) - place:
-                raise Unreadable("no protocol buffer")
+            _refuse_if(not 0 <= size <= len(data) - place, "no protocol buffer")
             value, place = data[place : place + size], place + size
             if key & 7 == FOUR_BYTES:
                 (value,) = struct.unpack("<f", value)
         out[key >> 3].append(value)
-    if any(len(values) > 1 and field not in repeated for field, values in out.items()):
-        raise Unreadable("a field twice")
+    _refuse_if(any(len(values) > 1 and field not in repeated for field, values in out.items()), "a field twice")
     return out
 
 
@@ -149,8 +149,7 @@ def _floats(values: list[float | bytes]) -> np.ndarray:
 def _unique(pairs: Iterable[tuple[str, Value]]) -> dict[str, Value]:
     """{name: value}: a name that comes twice is refused."""
     pairs = list(pairs)
-    if len(out := dict(pairs)) < len(pairs):
-        raise Unreadable("a name twice")
+    _refuse_if(len(out := dict(pairs)) < len(pairs), "a name twice")
     return out
 
 
@@ -160,8 +159,7 @@ def _tensor(data: bytes) -> tuple[str, np.ndarray]:
     kind = KINDS[fields[2][0]]
     own = 4 if kind is np.float32 else 7
     there = [number for number in (4, 5, 6, 7, 9, 10, 11) if fields[number]]
-    if fields[13] or fields[14] or there not in ([own], [9]):
-        raise Unreadable("a tensor whose numbers are elsewhere")
+    _refuse_if(fields[13] or fields[14] or there not in ([own], [9]), "a tensor whose numbers are elsewhere")
     if fields[9]:
         values = np.frombuffer(fields[9][0], np.dtype(kind).newbyteorder("<"))
     else:
@@ -172,16 +170,14 @@ def _tensor(data: bytes) -> tuple[str, np.ndarray]:
 
 def _node(data: bytes) -> Node:
     fields = _message(data, 1, 2, 5, 9)
-    if fields[7] and fields[7][0] not in (b"", b"ai.onnx"):
-        raise Unreadable("an operator that is none of ONNX")
+    _refuse_if(fields[7] and fields[7][0] not in (b"", b"ai.onnx"), "an operator that is none of ONNX")
     inputs, outputs = ([name.decode() for name in fields[k]] for k in (1, 2))
     return Node(fields[4][0].decode(), inputs, outputs, _unique(map(_attribute, fields[5])))
 
 
 def _attribute(data: bytes) -> tuple[str, float | list[int] | bytes | np.ndarray]:
     fields = _message(data, 7, 8, 9, 10, 11, 15, 23)
-    if any(fields[k] for k in (6, 10, 11, 22, 23)):
-        raise Unreadable("a graph within a graph, or a constant of another kind")
+    _refuse_if(any(fields[k] for k in (6, 10, 11, 22, 23)), "a graph within a graph, or a constant of another kind")
     value: float | list[int] | bytes | np.ndarray
     if fields[5]:
         value = _tensor(fields[5][0])[1]
@@ -207,6 +203,5 @@ def _value(data: bytes) -> tuple[str, list[int], Shape | None]:
 
 
 def _is_float(kind: list[int], name: str) -> bool:
-    if kind != [1]:
-        raise Unreadable(f"{name[:40]!r} is no float32")
+    _refuse_if(kind != [1], f"{name[:40]!r} is no float32")
     return True

@@ -11,7 +11,8 @@ import zlib
 import numpy as np
 
 from .errors import InputError
-from .limits import ARRAYS_BYTES
+from .files import open_file
+from .limits import ARRAYS_BYTES, Budget
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -25,11 +26,12 @@ def read_arrays(path: str | Path, kinds: dict[str, str], what: str, remedy: str)
     Raises InputError, also for floating-point numbers that are NaN.
     """
     try:
-        with ZipFile(path) as file:
+        with open_file(path) as opened, ZipFile(opened) as file:
             members = {name: _member(file, f"{name}.npy") for name in kinds}
-            if sum(member.file_size for member in members.values()) > ARRAYS_BYTES:
-                raise ValueError(f"its arrays take more than {ARRAYS_BYTES} bytes")
+            Budget(path).spend("bytes of arrays", sum(member.file_size for member in members.values()), ARRAYS_BYTES)
             return {name: _array(name, file, member, kinds[name]) for name, member in members.items()}
+    except InputError:
+        raise
     except OSError as error:
         reason = error.strerror or str(error)
     except (BadZipFile, EOFError, KeyError, NotImplementedError, RuntimeError, ValueError, zlib.error) as error:

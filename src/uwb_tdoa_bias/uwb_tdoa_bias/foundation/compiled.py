@@ -6,26 +6,21 @@ Here every state of the sources has a cache folder of its own.
 
 from __future__ import annotations
 
-import atexit
 from contextlib import contextmanager
 from functools import lru_cache
-import grp
 import hashlib
 import os
 from pathlib import Path
-import pwd
-import shutil
 import stat
 import sys
-import tempfile
 import time
 from typing import Any, TYPE_CHECKING, TypeVar
 
-from .elsewhere import elsewhere
+from .executable import elsewhere
+from .files import folder_of_process
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
-    from os import stat_result
     from numba.core.event import Event
 
 
@@ -97,58 +92,28 @@ event.register("numba:compile", _Listener())
 
 @lru_cache(maxsize=None)
 def _place(name: str) -> Path:
-    """The folder `name` in NUMBA_CACHE_DIR if set, else in the user's cache folder: the first in which nobody else may have put
-    compiled code, which would be run; else a temporary one."""
-    home, named = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", os.environ.get("NUMBA_CACHE_DIR")
-    own = str(Path(home) / "uwb_tdoa")
-    for base, instead in ((named, own), (own, "a temporary folder")):
-        if base:
-            try:
-                os.makedirs(Path(base) / name, mode=0o700, exist_ok=True)
-                if _is_ours(found := (Path(base) / name).resolve()):
-                    return found
-                why = "others may write to"
-            except OSError as error:
-                why = f"nothing can be kept ({error.strerror}) in"
-            _say(f"{'NUMBA_CACHE_DIR: ' * (base == named)}{why} {base}; {instead} is used; name a folder of your own.")
-    return Path(_temporary()) / name
-
-
-def _is_ours(folder: Path) -> bool:
-    """Whether nobody else may write, or have written, to an absolute folder, to what is in it, or to what leads to it."""
-    own, above = os.stat(folder), [os.stat(parent) for parent in folder.parents]
-    within = [os.lstat(os.path.join(at, name)) for at, *names in os.walk(folder) for name in (*names[0], *names[1])]
-    if {found.st_uid for found in (own, *above, *within)} - {os.getuid(), 0}:
-        return False
-    writable = [own, *(found for found in above if not found.st_mode & stat.S_ISVTX)]
-    writable += within if own.st_mode & (stat.S_IXGRP | stat.S_IXOTH) else []  # else nobody gets there
-    return not any(map(_others_may_write, writable))
-
-
-def _others_may_write(found: stat_result) -> bool:
-    """By the mode of a file or folder, where a group that the user alone is in does not count."""
-    return bool(found.st_mode & stat.S_IWOTH or found.st_mode & stat.S_IWGRP and not _is_alone(found.st_gid))
-
-
-@lru_cache(maxsize=None)
-def _is_alone(gid: int) -> bool:
+    """The folder `name` in NUMBA_CACHE_DIR, by default in the user's cache folder; a temporary one where others may have put compiled code
+    there, which would be run."""
+    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    place = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(home, "uwb_tdoa")) / name
     try:
-        user, group = pwd.getpwuid(os.getuid()), grp.getgrgid(gid)
-    except KeyError:
-        return False
-    return user.pw_gid == gid and group.gr_name == user.pw_name and not {*group.gr_mem} - {user.pw_name}
+        place.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if _is_ours_alone(place.resolve()):
+            return place.resolve()
+        why = "others may write to"
+    except OSError as error:
+        why = f"nothing can be kept ({error.strerror}) in"
+    print(f"{why} {place}; a temporary folder is used: set NUMBA_CACHE_DIR to a folder of your own.", file=sys.stderr)
+    return folder_of_process()
 
 
-@lru_cache(maxsize=None)
-def _temporary() -> str:
-    folder = tempfile.mkdtemp(prefix="uwb_tdoa_")
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return folder
-
-
-@lru_cache(maxsize=None)
-def _say(text: str) -> None:
-    print(text, file=sys.stderr)
+def _is_ours_alone(folder: Path) -> bool:
+    """Whether the user alone gets into an absolute folder, and no stranger can put another one in its place. Members of the user's group
+    are no strangers."""
+    own, above = folder.stat(), [parent.stat() for parent in folder.parents]
+    open_to_all = [found for found in above if found.st_mode & stat.S_IWOTH and not found.st_mode & stat.S_ISVTX]
+    owners = {found.st_uid for found in (own, *above)}
+    return owners <= {os.getuid(), 0} and own.st_uid == os.getuid() and not own.st_mode & 0o077 and not open_to_all
 
 
 @lru_cache(maxsize=None)

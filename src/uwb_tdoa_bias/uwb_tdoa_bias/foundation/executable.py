@@ -1,4 +1,4 @@
-"""How every executable starts: Ctrl-C ends it quietly, whenever it comes.
+"""How every executable starts: Ctrl-C ends it quietly, whenever it comes, and the present folder has no say in what it does.
 
     evaluate = executable("uwb_tdoa_tools.commands.evaluate")        # an entry point; the module has a main()
     ekf_node = node_executable("uwb_tdoa_ekf.ekf_node")
@@ -8,6 +8,7 @@ Nothing but the standard library is imported here.
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 from functools import partial
 import gc
 from importlib import import_module
@@ -17,15 +18,15 @@ import sys
 from threading import Timer
 from typing import Any, TYPE_CHECKING
 
-from .elsewhere import elsewhere
-
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Iterator
     from types import FrameType, ModuleType
 
 INTERRUPTED = 130  # exit code, as a shell gives it: 128 + SIGINT
 SOON = 0.05  # s, until an interrupt that was lost comes again
 SAID = 1.5  # s of importing after which it is said that something goes on
+# Paths in which an empty entry is the present folder. `.dev/paths.sh` has the same list, for what a shell starts.
+PATHS = "PATH LD_LIBRARY_PATH PYTHONPATH AMENT_PREFIX_PATH CMAKE_PREFIX_PATH COLCON_PREFIX_PATH PKG_CONFIG_PATH".split()
 
 
 def executable(module: str) -> Callable[..., Any]:
@@ -38,6 +39,34 @@ def executable(module: str) -> Callable[..., Any]:
 def node_executable(module: str) -> Callable[..., Any]:
     """The same of a node."""
     return partial(_run_node, module)
+
+
+def leave_present_folder_out() -> None:
+    """Change the environment of this process, and of those that it starts, so that a file of the present folder is no library, module,
+    program or setting of any. To be called before rclpy is imported. A folder of recordings may hold anything."""
+    os.environ["SKIP_DEFAULT_XML_FILE"] = "1"  # or Fast DDS reads DEFAULT_FASTRTPS_PROFILES.xml there
+    for name in PATHS:
+        entries = os.environ.get(name, "").split(os.pathsep)
+        if "" in entries and name == "PYTHONPATH":
+            sys.path[:] = [entry for entry in sys.path if entry != os.getcwd()]
+        kept = os.pathsep.join(filter(None, entries))
+        if kept:
+            os.environ[name] = kept
+        else:
+            os.environ.pop(name, None)
+
+
+@contextmanager
+def elsewhere() -> Iterator[None]:
+    """In the root folder while the block lasts. matplotlib and numba read settings of the present folder when they are imported, and Python
+    looks for modules there where it is started by -m."""
+    here = os.open(".", os.O_PATH | os.O_DIRECTORY)  # also where its name is gone
+    try:
+        os.chdir("/")
+        yield
+    finally:
+        os.fchdir(here)
+        os.close(here)
 
 
 def interrupt(number: int, frame: FrameType | None) -> None:
@@ -58,6 +87,7 @@ def interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def _run(module: str, *arguments: Any) -> Any:
+    leave_present_folder_out()
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     name = module.rpartition(".")[2]
     try:
@@ -90,7 +120,7 @@ def _imported(module: str) -> ModuleType:
     slow.daemon = True
     slow.start()
     try:
-        with elsewhere():  # matplotlib takes settings of the present folder
+        with elsewhere():
             return import_module(module)
     finally:
         slow.cancel()

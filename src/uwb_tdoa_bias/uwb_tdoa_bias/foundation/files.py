@@ -1,32 +1,41 @@
-"""Read files whole, or their beginning, with a limit; write files whole or not at all."""
+"""Read files whole, or their beginning, with a limit; write files whole or not at all; temporary folders."""
 
 from __future__ import annotations
 
+import atexit
+from contextlib import contextmanager, ExitStack, suppress
+import fcntl
 import io
 import os
 from pathlib import Path
 import secrets
+import shutil
+import stat
+import tempfile
+import time
 from typing import BinaryIO, TYPE_CHECKING
 
 from .errors import InputError
-from .limits import RECORDING_BYTES
+from .limits import Budget, RECORDING_BYTES
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+
+TEMPORARY = "uwb_tdoa_temporary_"  # what the names of our temporary folders begin with
+SETTLED = 60.0  # s after which a temporary folder that nobody holds is no longer needed
 
 
 def read_bytes(path: str | Path, most: int = RECORDING_BYTES) -> bytes:
     """The content of a file; raises InputError if it cannot be read, is empty or has more than `most` bytes."""
     content = read_head(path, most + 1)
-    if len(content) > most:
-        raise InputError(f"{path}: has more than {most} bytes, more than are read of such a file; is it the right file?")
+    Budget(path).spend("bytes", len(content), most)
     return content
 
 
 def read_head(path: str | Path, size: int) -> bytes:
     """The first bytes of a file; raises InputError as `read_bytes`."""
     try:
-        with open(path, "rb") as file:
+        with open_file(path) as file:
             content = b"".join(_blocks(file, size))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); give the path of a recording.") from error
@@ -79,6 +88,45 @@ def write_bytes(path: str | Path, content: bytes) -> None:
 def _write_in_place(path: Path, content: bytes) -> None:
     with open(path, "wb") as file:
         file.write(content)
+def open_file(path: str | Path) -> BinaryIO:
+    """An open file, to be read. Raises InputError for a pipe or a device, at which reading would wait for ever, and OSError."""
+    file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise InputError(f"{path}: is a pipe, a device or a folder; give a file.")
+    return file
+
+
+@contextmanager
+def temporary_folder() -> Iterator[Path]:
+    """A folder that is removed when the block ends. If this process is killed, the next one of ours removes it."""
+    for old in Path(tempfile.gettempdir()).glob(f"{TEMPORARY}*"):
+        with suppress(OSError):  # of another user, in use, or gone
+            if time.time() - old.lstat().st_mtime > SETTLED:
+                with _held(old, fcntl.LOCK_EX):
+                    shutil.rmtree(old)
+    with tempfile.TemporaryDirectory(prefix=TEMPORARY) as name, _held(Path(name), fcntl.LOCK_SH):
+        yield Path(name)
+
+
+def folder_of_process() -> Path:
+    """Such a folder that is removed when this process ends."""
+    stack = ExitStack()
+    atexit.register(stack.close)
+    return stack.enter_context(temporary_folder())
+
+
+@contextmanager
+def _held(folder: Path, kind: int) -> Iterator[None]:
+    """A lock on a folder of the user while the block lasts. Raises OSError."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    try:
+        if os.fstat(descriptor).st_uid != os.getuid():
+            raise PermissionError
+        fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def _blocks(file: BinaryIO, size: int) -> Iterator[bytes]:

@@ -2,7 +2,7 @@
 
 import re
 
-from .limits import NAME_LENGTH
+from .limits import LINE_LENGTH, NAME_LENGTH
 
 # Other characters may be a command to Markdown, HTML, a shell, a file system or the mathematics of matplotlib.
 _OTHERS = re.compile(r"[^\w .,:;+=()#-]")
@@ -12,6 +12,13 @@ def printable(text: object) -> str:
     r"""The text with what is no character to see (line ends, escape sequences, marks that turn the direction of writing, halves of
     characters) written out, as \x1b: a terminal shows it and does nothing else."""
     return "".join(one if one.isprintable() else one.encode("unicode_escape", "surrogatepass").decode() for one in str(text))
+
+
+def line_of(text: object) -> str:
+    """One printable line of a bounded length: the middle of a longer text is left out."""
+    whole, half = str(text), LINE_LENGTH // 2
+    line = printable(whole[:LINE_LENGTH] + whole[-LINE_LENGTH:] if len(whole) > 2 * LINE_LENGTH else whole)
+    return line if len(line) <= LINE_LENGTH else f"{line[:half]} ... {line[-half:]}"
 
 
 def harmless(text: object) -> str:

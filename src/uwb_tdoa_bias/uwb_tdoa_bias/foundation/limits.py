@@ -1,8 +1,22 @@
-"""How much of a file is read at most, whoever wrote it: every limit of every reader.
+"""How much of a file is read at most, whoever wrote it: every limit of every reader, and the one exception that names the limit.
 
-What a header claims is compared with these, and with the file, before memory is taken or work is done for it. Limits are far above
+A reader compares what a header claims with these limits, and with the file, before it takes memory or does work. Limits are far above
 what is needed: a flight of an hour has 300 MB as a log, our YAML files have some kB, the model that is shipped 60 kB.
 """
+
+from __future__ import annotations
+
+from collections import Counter
+import time
+from typing import TYPE_CHECKING
+
+from .errors import InputError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+# Processor time for one file: enough for the slowest reader on a machine that is four times slower than ours.
+SECONDS, SECONDS_PER_BYTE = 4.0, 2e-6
 
 # Whole files, bytes.
 RECORDING_BYTES = 1 << 30  # micro-SD log, or CSV as it lies on the disc
@@ -19,6 +33,10 @@ ARRAYS_BYTES = 100_000_000  # of all arrays of an .npz file, unpacked; four mill
 MAP_MARKERS = 5_000  # of a position bias map: memory takes their number squared, time cubed
 
 NAME_LENGTH = 100  # characters of a flight, a model, ...
+LINE_LENGTH = 2_000  # characters of a sentence that is printed or logged
+
+USD_TYPES, USD_VARIABLES = 1_000, 10_000  # of a micro-SD log: event types, and variables of all of them; the firmware has some 20 and 100
+FOLDER_ENTRIES, FOLDER_DEPTH = 100_000, 20  # that are looked at for recordings
 
 # YAML.
 YAML_NODES, YAML_DEPTH = 200_000, 20
@@ -35,6 +53,43 @@ READ_BYTES = 2 << 20  # of a message that is taken apart: 10 000 anchors
 DEFINITION_BYTES = 64 << 10  # of the text that defines a message type; those of ROS have up to 15 kB
 FILE_BYTES = 8 << 30  # of all data files that are unpacked
 UNPACKED_FREE, UNPACKED_RATIO = 16 << 20, 100  # see `most_unpacked`
+
+
+class TooMuch(InputError):
+    """A file, or a folder, holds more than is read of it. The message names the limit."""
+
+
+class Budget:
+    """What may still be spent on one file, or folder.
+
+    budget = Budget(path)
+    budget.spend("cells", len(row), TABLE_CELLS)        # raises TooMuch, also when the time is up
+    """
+
+    def __init__(self, path: str | Path, size: int = 0) -> None:
+        """path : for messages; size : bytes of the file, which give more time."""
+        self._path, self._spent, self._seconds = path, Counter[str](), SECONDS + SECONDS_PER_BYTE * size
+        self.restart()
+
+    def restart(self) -> None:
+        """Give all of the time again."""
+        self._until = time.thread_time() + self._seconds
+
+    def spend(self, what: str, count: int, most: int) -> None:
+        """Count some more of what there may be `most` of. Raises TooMuch."""
+        self._spent[what] += count
+        if self._spent[what] > most:
+            raise TooMuch(f"{self._path}: has more than {most} {what}; give another file, or split it.")
+        self.check_time()
+
+    def check_time(self) -> None:
+        """Raise TooMuch when the time is up."""
+        if self.is_late():
+            raise TooMuch(f"{self._path}: takes more than {self._seconds:.1f} s of processor time to read; give another file, or split it.")
+
+    def is_late(self) -> bool:
+        """Whether the time is up."""
+        return time.thread_time() > self._until
 
 
 def most_unpacked(packed: int, most: int = FILE_BYTES) -> int:

@@ -17,6 +17,7 @@ from rclpy.utilities import remove_ros_args
 
 from .errors import InputError
 from .executable import interrupt
+from .foreign_text import line_of
 from .ros_spinning import Spinner
 
 if TYPE_CHECKING:
@@ -68,7 +69,7 @@ def run(node_class: type[StreamNode], description: str | None, argv: Sequence[st
     except SystemExit as ended:  # argparse has said it already
         return ended.code or 0  # type: ignore[return-value]  # argparse ends with a number
     except InputError as error:
-        print(f"{name}: error: {error}", file=sys.stderr)
+        print(f"{name}: error: {line_of(error)}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         return 128 + stop.result()

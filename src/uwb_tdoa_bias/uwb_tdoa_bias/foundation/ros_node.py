@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from functools import wraps
-from typing import Any, Protocol, TYPE_CHECKING
+from typing import Any, Protocol, TYPE_CHECKING, TypeVar
 
+from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rosgraph_msgs.msg import Clock
 
 from .ros_cdr import decode
@@ -13,9 +14,12 @@ from .ros_topics import unserved, waiting
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
+    from rclpy.publisher import Publisher
     from rclpy.qos import QoSProfile
     from rclpy.subscription import Subscription
     from rclpy.timer import Timer
+
+Events = TypeVar("Events", SubscriptionEventCallbacks, PublisherEventCallbacks)
 
 
 class Serving(Protocol):
@@ -42,7 +46,24 @@ class StreamNode(ParameterNode):
     ) -> Subscription:
         """Of rclpy."""
         callback = callback if callback is unserved else self._contained(callback)
+        options["event_callbacks"] = self._quiet(topic, options.get("event_callbacks") or SubscriptionEventCallbacks())
         return super().create_subscription(msg_type, topic, callback, qos_profile, **options)
+
+    def create_publisher(self, msg_type: type, topic: str, qos_profile: QoSProfile | int, **options: Any) -> Publisher:
+        """Of rclpy."""
+        options["event_callbacks"] = self._quiet(topic, options.get("event_callbacks") or PublisherEventCallbacks())
+        return super().create_publisher(msg_type, topic, qos_profile, **options)
+
+    def _quiet(self, topic: str, events: Events) -> Events:
+        """The event callbacks of a topic, which warn of peers with another QoS or type at times: rclpy writes a line for each peer."""
+        for event in ("incompatible_qos", "incompatible_type"):
+            if getattr(events, event) is None:
+                text = f"{topic}: a peer has an {event.replace('_', ' ')}, so its messages, or ours, do not arrive; correct the peer"
+                setattr(events, event, self._warning(f"{topic} {event}", text))
+        return events
+
+    def _warning(self, kind: str, text: str) -> Callable[[Any], None]:
+        return lambda _: self.warn_at_times(kind, text)
 
     def create_timer(  # type: ignore[override]  # its further arguments are handed on by their names
         self, timer_period_sec: float, callback: Callable[[], None], **options: Any

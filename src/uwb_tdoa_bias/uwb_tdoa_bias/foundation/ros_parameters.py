@@ -20,6 +20,7 @@ from rclpy.qos import QoSProfile
 import yaml
 
 from .errors import InputError
+from .ros_log import Log
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
@@ -73,11 +74,18 @@ class ParameterNode(Node):
     """
 
     refused, _refused_before, _refusal = 0, 0, ""
+    _log: Log | None = None
     NAME: ClassVar[str]  # of the executable
 
     def __init__(self, *arguments: Any, **options: Any) -> None:
         self._warned: dict[str, float] = {}  # {kind: s of time.monotonic() from which on it may be said again}
         super().__init__(*arguments, **options)
+
+    def get_logger(self) -> Log:
+        """Of rclpy; a Log."""
+        if self._log is None:
+            self._log = Log(super().get_logger())
+        return self._log
 
     def warn_at_times(self, kind: str, text: str) -> None:
         """Log a warning, unless one of this kind was logged less than SAY_AGAIN ago. (rclpy's own throttle takes half a millisecond to

@@ -17,7 +17,8 @@ from yaml.constructor import SafeConstructor
 from yaml.resolver import Resolver
 
 from .errors import InputError
-from .limits import YAML_BYTES, YAML_DEPTH, YAML_NODES
+from .files import open_file
+from .limits import Budget, YAML_BYTES, YAML_DEPTH, YAML_NODES
 
 if TYPE_CHECKING:
     from yaml import CollectionNode, MappingNode, Mark, Node, ScalarNode
@@ -26,13 +27,11 @@ if TYPE_CHECKING:
 def read_yaml(path: str | Path) -> Any:
     """What a YAML file holds: dict, list, str, int, float, bool or None. Raises InputError that names file and line."""
     try:
-        with open(path, "rb") as file:
+        with open_file(path) as file:
             data = file.read(YAML_BYTES + 1)
     except OSError as error:
         raise InputError(f"{path}: cannot be read as YAML ({error.strerror}); give the path of a YAML file.") from error
-    if len(data) > YAML_BYTES:
-        size = Path(path).stat().st_size
-        raise InputError(f"{path}: has {size} bytes, at most {YAML_BYTES} are read as YAML; is it the right file?")
+    Budget(path).spend("bytes", len(data), YAML_BYTES)
     return parse_yaml(data, path)
 
 
@@ -43,7 +42,7 @@ def parse_yaml(data: bytes | str, name: str | Path) -> Any:
     except UnicodeDecodeError as error:
         raise InputError(f"{name}: byte {error.start} is not UTF-8; save the file as UTF-8 text.") from error
     try:
-        loader = _Loader(text)
+        loader = _Loader(text, Budget(name, len(text)))
         try:
             return loader.get_single_data()
         finally:
@@ -85,21 +84,20 @@ _Base: Any = _WithLibyaml if yaml.__with_libyaml__ else yaml.SafeLoader
 class _Loader(_Base):
     yaml_implicit_resolvers: dict = {}  # those of YAML 1.1 take 1:30 for 90, and 1e-3 for a text
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text: str, budget: Budget) -> None:
         super().__init__(text)
-        self._nodes = self._depth = 0
+        self._budget, self._depth = budget, 0
 
     def compose_node(self, parent: CollectionNode | None, index: int | ScalarNode | None) -> Node:
         event = self.peek_event()
-        self._nodes += 1
+        self._budget.spend("entries", 1, YAML_NODES)
         self._depth += 1
         if isinstance(event, yaml.AliasEvent):
             raise _Refused(event.start_mark, f"*{event.anchor} is an alias; write the value itself.")
         if event.tag is not None:
             raise _Refused(event.start_mark, f"{event.tag} is a tag; leave it out.")
-        if self._depth > YAML_DEPTH or self._nodes > YAML_NODES:
-            limit = f"deeper than {YAML_DEPTH} levels" if self._depth > YAML_DEPTH else f"more than {YAML_NODES} entries"
-            raise _Refused(event.start_mark, f"it has {limit}; is it the right file?")
+        if self._depth > YAML_DEPTH:
+            self._budget.spend("levels", self._depth, YAML_DEPTH)
         node = super().compose_node(parent, index)
         self._depth -= 1
         return node
@@ -124,7 +122,7 @@ class _Loader(_Base):
     def construct_yaml_float(self, node: ScalarNode) -> float:
         value = float(re.sub(r"\.(nan|inf)$", r"\1", node.value.lower()))
         if not math.isfinite(value):
-            raise _Refused(node.start_mark, f"{node.value} is not finite; give a number.")
+            raise _Refused(node.start_mark, f"{node.value[:40]} is not finite; give a number.")
         return value
 
 

@@ -16,7 +16,8 @@ from typing import Any, TYPE_CHECKING
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.limits import READ_BYTES, most_unpacked
+from uwb_tdoa_bias.foundation.files import temporary_folder
+from uwb_tdoa_bias.foundation.limits import READ_BYTES, TooMuch, most_unpacked
 from uwb_tdoa_bias.foundation.stamps import LARGEST_STEP_BACK
 
 from ..command_lines import SALVAGE
@@ -98,8 +99,8 @@ def open_bag(path: str | Path, salvage: bool = False) -> Iterator[BagReader]:
         raise InputError(
             f"{path}: has no metadata.yaml: the recording was not closed; run `ros2 bag reindex` on it, or {SALVAGE}."
         )
-    with tempfile.TemporaryDirectory(prefix="uwb_tdoa_") as folder:
-        reader = _opened(path, Path(folder), salvage)
+    with temporary_folder() as folder:
+        reader = _opened(path, folder, salvage)
         try:
             yield reader
         finally:
@@ -233,7 +234,7 @@ def messages(
         left[connection.topic, connection.msgtype] -= 1
         room -= len(data)
         if room < 0:
-            raise _damaged(path, f"its messages hold more than {reader.most} bytes")
+            raise TooMuch(f"{path}: has more than {reader.most} bytes of messages; give another file, or split it.")
         if store := earlier[connection.id]:
             try:
                 data = upgraded(data, connection.msgtype, store)

@@ -12,7 +12,7 @@ import zlib
 import yaml
 
 from uwb_tdoa_bias.foundation.files import write_text
-from uwb_tdoa_bias.foundation.limits import MESSAGE_BYTES, most_unpacked
+from uwb_tdoa_bias.foundation.limits import MESSAGE_BYTES, Budget, most_unpacked
 from uwb_tdoa_bias.foundation.safe_yaml import read_yaml
 
 from . import mcap
@@ -24,7 +24,9 @@ if TYPE_CHECKING:
 SUM_KEY = "uwb_tdoa_tools.crc32"  # in the bag's custom data: CRC-32 of its data file, 8 hexadecimal digits
 NO_SUM = "--------"
 _BLOCK = 1 << 20  # bytes that are read at once
+_STEPS = 20_000  # instructions of SQLite from one look at the time to the next: some milliseconds
 _PLAIN = re.compile(r"CREATE\s+(TABLE|INDEX)\s[^()]*\([\w\s,\"'`\[\]]*\)\s*", re.IGNORECASE)  # no bracket within: nothing is computed
+sqlite3.enable_callback_tracebacks(True)  # or Ctrl-C that comes while SQLite asks for the time is lost (foundation/executable.py)
 _TYPES = (  # columns of an SQLite bag and what they hold
     ("messages", {"timestamp": "integer", "topic_id": "integer", "data": "blob"}),
     ("topics", {"id": "integer", "name": "text", "type": "text", "serialization_format": "text"}),
@@ -64,16 +66,15 @@ def is_packed(information: dict[str, Any]) -> bool:
 def unpack(path: Path, folder: Path) -> None:
     """Write a bag whose files are compressed as a whole to an empty folder, unpacked. Raises Damaged, InputError."""
     information = metadata(path)
-    names, size, files = [], 0, data_files(path, information)
-    most = most_unpacked(sum(file.stat().st_size for file in files))
+    names, files = [], data_files(path, information)
+    packed = sum(file.stat().st_size for file in files)
+    budget, most = Budget(path, packed), most_unpacked(packed)
     for file in files:
         names.append(file.stem)
         try:
             with zstd.open(file, "rb") as source, open(folder / file.stem, "wb") as target:
                 while block := source.read(_BLOCK):
-                    size += len(block)
-                    if size > most:
-                        raise Damaged(f"its files unpack to more than {most} bytes")
+                    budget.spend("bytes when its files are unpacked", len(block), most)
                     target.write(block)
         except (zstd.ZstdError, EOFError) as error:
             raise Damaged(f"{file.name} cannot be unpacked ({error})") from error
@@ -131,8 +132,10 @@ def seal(path: str | Path) -> None:
 
 def open_sqlite(file: str | Path) -> sqlite3.Connection:
     """A connection that only reads, a file that is cut as well, in which nothing is but tables and indexes of columns: what is
-    computed (views, virtual tables, checks, expressions) may take for ever. Raises Damaged."""
+    computed (views, virtual tables, checks, expressions) may take for ever. So may pages that share their children: each query ends when
+    the time of the file is up. Raises Damaged."""
     connection = sqlite3.connect(f"file:{quote(str(Path(file).absolute()))}?mode=ro&immutable=1", uri=True)
+    connection.set_progress_handler(Budget(file, Path(file).stat().st_size).is_late, _STEPS)
     try:
         connection.execute("PRAGMA writable_schema=ON")  # else not one page of a file that has fewer than it says
         for name, text in connection.execute("SELECT name, sql FROM sqlite_master WHERE sql IS NOT NULL"):
@@ -140,7 +143,7 @@ def open_sqlite(file: str | Path) -> sqlite3.Connection:
                 raise Damaged(f"{name} in it is no table and no index of columns")
         return connection
     except (sqlite3.Error, UnicodeDecodeError, TypeError) as error:
-        raise Damaged(str(error)) from error
+        raise damage(error) from error
 
 
 def is_mcap(file: Path) -> bool:
@@ -171,6 +174,8 @@ def _check_data(file: Path, packed_messages: bool = False) -> None:
 def sqlite_messages(file: Path) -> Iterator[tuple[int, int, int, bytes]]:
     """Yields (id, topic id, stamp, data) of an SQLite file in the order of the ids. Raises Damaged where it is."""
     connection, last = open_sqlite(file), None
+    budget = Budget(file, file.stat().st_size)
+    connection.set_progress_handler(budget.is_late, _STEPS)
     query = f"SELECT id, topic_id, timestamp, iif(length(data) <= {MESSAGE_BYTES}, data, NULL) FROM messages ORDER BY id"
     try:
         for row in connection.execute(query):
@@ -178,8 +183,9 @@ def sqlite_messages(file: Path) -> Iterator[tuple[int, int, int, bytes]]:
                 raise Damaged("its messages go round in a circle")
             last = row[0]
             yield row
+            budget.restart()  # what was done with it is no affair of the file
     except (sqlite3.Error, UnicodeDecodeError, TypeError) as error:
-        raise Damaged(str(error)) from error
+        raise damage(error) from error
     finally:
         connection.close()
 
@@ -198,9 +204,14 @@ def _check_sqlite(file: Path) -> None:
             if count:
                 raise Damaged(f"{count} rows of {table} hold text where numbers belong, or the other way round, or are too long")
     except (sqlite3.Error, UnicodeDecodeError) as error:
-        raise Damaged(str(error)) from error
+        raise damage(error) from error
     finally:
         connection.close()
+
+
+def damage(error: Exception) -> Damaged:
+    """Of an error of SQLite, which calls a query whose time is up interrupted."""
+    return Damaged("it takes longer to read than a file of its size may" if "interrupted" in str(error) else str(error))
 
 
 def _sum(file: Path) -> str:

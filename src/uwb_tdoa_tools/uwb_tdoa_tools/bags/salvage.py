@@ -127,7 +127,7 @@ def _from_sqlite(file: Path, lost: Counter[str]) -> Iterator[tuple[Connection, i
         for number, topic, msgtype in connection.execute("SELECT id, name, type FROM topics"):
             topics[number] = _channel(number, str(topic), str(msgtype), *definitions.get(msgtype, ("", "")))
     except (sqlite3.Error, UnicodeDecodeError) as error:
-        raise Damaged(str(error)) from error
+        raise integrity.damage(error) from error
     finally:
         connection.close()
     for _, topic, stamp, data in integrity.sqlite_messages(file):

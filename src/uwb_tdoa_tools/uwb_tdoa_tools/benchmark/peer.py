@@ -22,13 +22,13 @@ from __future__ import annotations
 import ctypes
 from pathlib import Path
 import shutil
-from tempfile import TemporaryDirectory
 import time
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.files import temporary_folder
 from uwb_tdoa_ekf.core.config import FilterConfig
 
 from .core import BEFORE, MEASURED, RARELY, Core, sample_before
@@ -54,8 +54,8 @@ class Peer:
         """own : load a copy, whose static variables are as they are when a program starts, whatever was done with the library before."""
         self.name = Path(path).name
         try:
-            with TemporaryDirectory() as folder:
-                library = ctypes.CDLL(shutil.copy(path, folder) if own else str(Path(path).absolute()))
+            with temporary_folder() as folder:
+                library = ctypes.CDLL(str(shutil.copy(path, folder) if own else Path(path).absolute()))
         except OSError as error:
             raise InputError(f"--peer: {path} cannot be loaded as a shared library ({error}); build it anew on this machine.") from error
         functions: dict[str, Any] = {name: getattr(library, f"tdoa_peer_{name}", None) for name in SYMBOLS}

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-import tempfile
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.files import temporary_folder
 from uwb_tdoa_bias.foundation.flight import Imu, Tdoas
 from uwb_tdoa_bias.foundation.sensors import LOCATING, SENSORS
 from uwb_tdoa_bias.foundation.survey_faults import refuse_faulty
@@ -90,8 +90,8 @@ def read_live(
     from ..live.listen import listen  # needs ROS
 
     name_of = Names(reading.namespace, reading.topics)
-    with tempfile.TemporaryDirectory(prefix="uwb_tdoa_") as folder:
-        bag = Path(folder) / "live"
+    with temporary_folder() as folder:
+        bag = folder / "live"
         topics, ends = listen([*map(name_of, HEARD), TF_STATIC], bag, seconds, say)
         try:
             recording = _read_bag(reading, bag, survey)

@@ -61,7 +61,7 @@ def parser() -> ArgumentParser:
 
 
 def _bench(args: Namespace) -> None:
-    cli.check_folders(args.json)
+    cli.check_outputs(args, "json")
     other = None if args.peer is None else Peer(args.peer)
     machine, figures = measure(args.only, args.out, args.quick, args.model, other)
     cli.show(f"{machine['cpu']}, {machine['cores']} cores, Python {machine['python']}, numpy {machine['numpy']}")

@@ -54,7 +54,7 @@ def parser() -> ArgumentParser:
 
 
 def _check(args: Namespace) -> int:
-    cli.check_folders(args.json)
+    cli.check_outputs(args, "json")
     if bool(args.flights) == (args.live is not None):
         raise InputError("FLIGHT, --live: give recordings, or --live SECONDS, and not both.")
     if args.live is not None and not 0.0 < args.live < math.inf:

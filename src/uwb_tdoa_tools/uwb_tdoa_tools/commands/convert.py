@@ -62,6 +62,7 @@ def parser() -> ArgumentParser:
 
 
 def _convert(args: Namespace) -> None:
+    cli.refuse_inputs(args, "out")
     offsets = _offsets(args.offsets)
     named = _named(args)
     with Progress("convert", what="reading and writing"):

@@ -61,7 +61,7 @@ def parser() -> ArgumentParser:
 
 
 def _fit(args: Namespace) -> None:
-    cli.check_folders(args.out, args.json)
+    cli.check_outputs(args, "out", "json")
     if not (args.flights or args.static):
         raise InputError("FLIGHT: there is none; give flights with ground truth, or --static points.")
     if not 0.01 <= args.step <= 10.0:
@@ -87,7 +87,7 @@ def _fit(args: Namespace) -> None:
 
 
 def _judge(args: Namespace) -> None:
-    cli.check_folders(args.json)
+    cli.check_outputs(args, "json")
     estimator, made = PositionEstimator(options.reading_of(args), *options.filter_of(args), args.align), BiasMap.load(args.map)
     rows = _judged(args, estimator, estimator.reading.find(args.flights, bool(args.dask)), made)
     report.say_rows("flight", rows)

@@ -65,7 +65,7 @@ def parser() -> ArgumentParser:
 
 
 def _evaluate(args: Namespace) -> int:
-    cli.check_folders(args.json, args.markdown, args.plot)
+    cli.check_outputs(args, "json", "markdown", "plot")
     if args.odometry:
         options.refuse(args, NOT_OF_ODOMETRY, "has no part in an odometry that was recorded, which is judged as it is (--odometry)")
     estimator = options.estimator_of(args, partial(cli.say, "evaluate"))

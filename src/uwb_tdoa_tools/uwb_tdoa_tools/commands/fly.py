@@ -69,7 +69,7 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _fly(args: argparse.Namespace) -> int:
-    cli.check_folders(args.json, args.plot)
+    cli.check_outputs(args, "json", "plot")
     if args.record is not None:
         cli.output_folder(args.record).mkdir(parents=True, exist_ok=True)
     if args.resume and (args.plot or args.record):

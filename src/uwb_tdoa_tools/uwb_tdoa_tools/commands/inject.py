@@ -51,6 +51,7 @@ def _inject(args: Namespace) -> None:
     for option in ("flight", "effect", "value", "out"):
         if not getattr(args, option):
             raise InputError(f"{option}: is missing; see inject --help.")
+    cli.refuse_inputs(args, "out")
     effect = parse_effect(args.effect, args.value)
     with Progress("inject", what="reading and writing"):
         name = inject(effect, args.flight, options.reading_of(args), args.out, args.seed, args.storage, args.force)

@@ -54,7 +54,7 @@ def parser() -> ArgumentParser:
 
 def _localize(args: Namespace) -> int:
     out = cli.output_folder(args.out)
-    cli.check_folders(args.json)
+    cli.check_outputs(args, "json")
     if args.zones is not None and not args.zones > 0.0:
         raise InputError(f"--zones: {args.zones:g} m is no size of a square; give one above 0, e.g. 20.")
     say = partial(cli.say, "localize")

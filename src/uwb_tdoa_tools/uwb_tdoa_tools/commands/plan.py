@@ -87,7 +87,7 @@ def parser() -> ArgumentParser:
 
 
 def _plan(args: Namespace) -> None:
-    cli.check_folders(args.json)
+    cli.check_outputs(args, "json")
     anchors = read_survey(args.anchors)
     if args.walls is not None and args.radio_reach is None:
         raise InputError("walls: are for a hall of which a tag hears a part; give --radio-reach too.")

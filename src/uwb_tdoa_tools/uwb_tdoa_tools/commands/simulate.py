@@ -96,7 +96,7 @@ def _simulate(args: Namespace) -> None:
     if args.out is not None:
         check_output(args.out, args.force)  # before the work, not after it
     check_image(args.plot)
-    cli.check_folders(args.json, args.plot)
+    cli.check_outputs(args, "json", "plot")
     with Progress("simulate") as progress:
         progress("flying")
         flight = simulate(_config(args))

@@ -13,6 +13,7 @@ from tqdm import tqdm
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import AIDS
 from uwb_tdoa_bias.foundation.foreign_text import printable
+from uwb_tdoa_bias.foundation.limits import Budget, FOLDER_DEPTH, FOLDER_ENTRIES
 from uwb_tdoa_bias.foundation.sensors import LOCATING
 
 from .. import parallel
@@ -22,7 +23,7 @@ from ..clock import apart, sentence_on
 from . import read_flight
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Iterator
+    from collections.abc import Iterable
     from uwb_tdoa_bias.foundation.flight import Flight
 
     Recording = tuple[Path, str | Path | None]  # and its survey
@@ -49,7 +50,7 @@ def find_flights(
     for path in map(Path, paths):
         if not path.exists():
             raise InputError(f"{path}: does not exist; give a recording or a folder that holds recordings.")
-        inside = list(_recordings(path))
+        inside = _recordings(path)
         if not inside:
             raise InputError(f"{path}: holds no recording; expected logs, CSV files or bags.")
         found += inside
@@ -173,12 +174,22 @@ class Reading:
         return [read[number] for number in sorted(read)]
 
 
-def _recordings(path: Path) -> Iterator[Path]:
-    """Recordings in a folder, at any depth, or a path that is one. Bags that are files may lie in a folder, as other files do; what SQLite
-    leaves beside them is none."""
-    if path.is_file() or (path / "metadata.yaml").exists():
-        yield path
-        return
-    for inside in sorted(path.iterdir()):
-        if not inside.name.startswith(".") and not inside.name.endswith(BESIDE):
-            yield from _recordings(inside)
+def _recordings(path: Path) -> list[Path]:
+    """Recordings in a folder, at any depth, or a path that is one. Bags that are files may lie in a folder, as other files do; what
+    SQLite leaves beside them is none. A folder to which several links lead is looked through once."""
+    budget, seen, found = Budget(path), set(), []
+
+    def look(path: Path, depth: int) -> None:
+        if path.is_file() or (path / "metadata.yaml").exists():
+            found.append(path)
+        elif path.is_dir() and (place := path.stat()[1:3]) not in seen:
+            seen.add(place)
+            if depth > FOLDER_DEPTH:
+                budget.spend("levels of folders", depth, FOLDER_DEPTH)
+            for inside in sorted(path.iterdir()):
+                budget.spend("entries", 1, FOLDER_ENTRIES)
+                if not inside.name.startswith(".") and not inside.name.endswith(BESIDE):
+                    look(inside, depth + 1)
+
+    look(path, 0)
+    return found

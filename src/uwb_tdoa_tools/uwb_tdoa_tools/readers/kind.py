@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+import shlex
 from typing import TYPE_CHECKING
 import zlib
 
@@ -35,7 +36,7 @@ def reader_of(path: Path) -> Callable[[Path, Anchors, bool, bool], Flight]:
         return read_util_csv
     if head.startswith(ROS_1):
         raise InputError(
-            f"{path}: is a bag of ROS 1: make a ROS 2 bag of it, rosbags-convert --src {path} --dst NAME, or of messages that only their makers "
+            f"{path}: is a bag of ROS 1: make a ROS 2 bag of it, rosbags-convert --src {shlex.quote(str(path))} --dst NAME, or of messages that only their makers "
             "have CSV files for convert --columns."
         )
     raise InputError(

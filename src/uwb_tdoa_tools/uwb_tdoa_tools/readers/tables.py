@@ -13,7 +13,7 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.files import read_bytes
-from uwb_tdoa_bias.foundation.limits import ROW_CHARACTERS, SMALL_TABLE_CELLS, TABLE_BYTES, TABLE_CELLS
+from uwb_tdoa_bias.foundation.limits import Budget, ROW_CHARACTERS, SMALL_TABLE_CELLS, TABLE_BYTES, TABLE_CELLS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -66,11 +66,9 @@ class CsvTable:
             raise InputError(f"{path}: has no column {missing[0]}; it needs columns {', '.join(self._columns)}.")
 
     def __iter__(self) -> Iterator[tuple[int, dict[str, str]]]:
-        names, count = {name: self.names.index(name) for name in self._columns}, 0
+        names, budget = {name: self.names.index(name) for name in self._columns}, Budget(self._path, TABLE_BYTES)
         for cells in self._cells:
-            count += len(cells)
-            if count > self._most:
-                raise InputError(f"{self._path}: has more than {self._most} cells; split it.")
+            budget.spend("cells", len(cells), self._most)
             short = len(cells) <= max(names.values(), default=0)
             if short and self._complete:
                 raise InputError(f"{self._path}: line {self._rows.line}: has fewer cells than the header; complete it.")

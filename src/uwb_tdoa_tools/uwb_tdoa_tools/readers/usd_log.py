@@ -11,6 +11,7 @@ import numpy as np
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.files import read_bytes
 from uwb_tdoa_bias.foundation.foreign_text import harmless
+from uwb_tdoa_bias.foundation.limits import Budget, USD_TYPES, USD_VARIABLES
 
 from ..command_lines import SALVAGE
 from .streams import make_flight
@@ -153,19 +154,21 @@ def _read_header(path: str | Path, data: bytes) -> tuple[int, dict[int, tuple[st
         content = take((end if end >= 0 else len(data)) + 1 - at, what)[:-1]
         if not content or not content.isascii() or harmless(content.decode()) != content.decode():
             raise InputError(
-                f"{path}: byte {at - len(content) - 1}: expected {what}, found {content!r}; the file is damaged."
+                f"{path}: byte {at - len(content) - 1}: expected {what}, found {content[:40]!r}; the file is damaged."
             )
         return content.decode("ascii")
 
     version = number("the version")
     if version not in _STAMP:
         raise InputError(f"{path}: is an event log of version {version}; versions 1 and 2 can be read.")
-    events, names = {}, set()
+    events, names, budget = {}, set(), Budget(path)
     for _ in range(number("the number of event types")):
+        budget.spend("event types", 1, USD_TYPES)
         where, event = at, number("the id of an event type")
         name = string("the name of an event type")
         fields, known = [], set()
         for _ in range(number(f"the number of variables of {name}")):
+            budget.spend("variables", 1, USD_VARIABLES)
             variable = string(f"a variable of {name}")
             field, code = variable[:-3], variable[-2:-1]
             if variable[-3:] != f"({code})" or code not in _NUMPY_OF_STRUCT or not field or field in known:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from gzip import GzipFile
 import io
 import zlib
 from pathlib import Path
@@ -12,7 +13,7 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.files import read_bytes
-from uwb_tdoa_bias.foundation.limits import CSV_BYTES, CSV_CELLS, most_unpacked
+from uwb_tdoa_bias.foundation.limits import Budget, CSV_BYTES, CSV_CELLS, most_unpacked
 
 from ..command_lines import SALVAGE
 from .streams import make_flight
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from .streams import Columns
 
 GZIP_MAGIC = b"\x1f\x8b"
-_BLOCK = 1 << 24  # bytes that are unpacked at once
+_BLOCK = 1 << 20  # bytes that are unpacked at once
 # Each sensor has its own time column and its own length: they are only set side by side, a row is not one instant.
 # Units: the authors' converter writes the columns as the micro-SD log has them, so acc is in g and gyro in deg/s
 # (utiasDSL/util-uwb-dataset, scripts/flight-dataset/sdcard_scripts/log_to_csv.py); stamps are in s from the start.
@@ -96,8 +97,7 @@ def _text(path: str | Path, remarks: list[str], salvage: bool) -> bytes:
     if content.startswith(GZIP_MAGIC):
         most = most_unpacked(len(content), CSV_BYTES)
         content = _unpacked(path, content, most, remarks, salvage)
-    if len(content) > most:
-        raise InputError(f"{path}: has more than {most} bytes of text, too many for one flight; split it.")
+    Budget(path).spend("bytes of text", len(content), most)
     if b"\0" in content:
         raise InputError(f"{path}: byte {content.index(0)} is 0, not text; a UTIL CSV file was expected: copy it again.")
     if content.isspace():
@@ -107,20 +107,14 @@ def _text(path: str | Path, remarks: list[str], salvage: bool) -> bytes:
 
 def _unpacked(path: str | Path, content: bytes, most: int, remarks: list[str], salvage: bool) -> bytes:
     """What gzip holds, somewhat more than `most` bytes at most: its header does not tell how much that is."""
-    out = io.BytesIO()
-    problem: str | None = "it ends early"
-    try:
-        while content and out.tell() <= most:  # a file may have several members
-            unpacker = zlib.decompressobj(zlib.MAX_WBITS | 16)
-            while content and not unpacker.eof and out.tell() <= most:
-                out.write(unpacker.decompress(content, _BLOCK))
-                content = unpacker.unconsumed_tail
-            if not unpacker.eof:
-                break
-            content = unpacker.unused_data.lstrip(b"\0")  # as gzip itself does
-            problem = None if not content else problem
-    except zlib.error as error:
-        problem = str(error)
+    out, budget, problem = io.BytesIO(), Budget(path, len(content)), ""
+    with GzipFile(fileobj=io.BytesIO(content)) as unpacked:  # a file may have a million members: no copy of the rest for each
+        try:
+            while out.tell() <= most and (block := unpacked.read1(_BLOCK)):
+                out.write(block)
+                budget.check_time()
+        except (EOFError, OSError, zlib.error) as error:
+            problem = str(error)
     if problem and out.tell() <= most:
         if not salvage:
             raise InputError(
@@ -142,7 +136,7 @@ def _table(path: str | Path, content: bytes, remarks: list[str], salvage: bool) 
             )
         remarks.append(f"line {line} is cut and left out.")
         content = content[: max(content.rfind(b"\n"), content.rfind(b"\r")) + 1]
-    rows, header, count = CsvRows(path, content), None, 0
+    rows, header, budget = CsvRows(path, content), None, Budget(path, len(content))
     block: list[list[str]] = []
     columns: dict[str, _Column] = {}
     try:
@@ -157,9 +151,7 @@ def _table(path: str | Path, content: bytes, remarks: list[str], salvage: bool) 
                 block.append(row)
             if len(block) == _ROWS:
                 _add(block, header, columns)
-                count += _ROWS
-            if count * len(header) > CSV_CELLS:
-                raise InputError(f"{path}: has more than {CSV_CELLS} cells, too many for one flight; split it.")
+            budget.spend("cells", len(row), CSV_CELLS)
     except csv.Error as error:
         if header is None or not salvage:
             raise InputError(f"{path}: line {rows.line} {error}; copy the file again, or {SALVAGE}.") from error
@@ -245,10 +237,10 @@ def _numbers(path: str | Path, names: Iterable[str], cells: dict[str, _Column], 
             )
         row, text, is_number = column.odd or (length, "", False)
         if row < length and not is_number:
-            raise InputError(f"{path}: line {row + 2}: {name} is {text!r}; it must be a number.")
+            raise InputError(f"{path}: line {row + 2}: {name} is {text[:40]!r}; it must be a number.")
         if row < length:
             raise InputError(
-                f"{path}: line {row + 2}: {name} is {text!r}; it must be finite: leave the cells after "
+                f"{path}: line {row + 2}: {name} is {text[:40]!r}; it must be finite: leave the cells after "
                 "the end of a sensor empty, and delete broken measurements."
             )
     return {name: column.values(length) for name, column in columns.items()}

@@ -7,7 +7,7 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.elsewhere import elsewhere
+from uwb_tdoa_bias.foundation.executable import elsewhere
 from uwb_tdoa_bias.foundation.files import write_filled
 
 from ..checking.known_path import MANY

@@ -9,13 +9,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_bias.correction.network import Network
+from uwb_tdoa_bias.foundation.files import temporary_folder
 from uwb_tdoa_bias.foundation.flight import AIDS
 
 from ..scoring.shrinkage import SHARES, Shrinkage, best_share
@@ -100,10 +99,10 @@ def _left_out(
     """{flight: [(share, 3D RMSE), ...]}, JSON, of a fold: (numbers of the flights left out, of the others, Physics fitted to those or
     None)."""
     left_out, others, known = fold
-    with TemporaryDirectory() as folder:
+    with temporary_folder() as folder:
         some = [flights[k] for k in others]
         trained = models.train(recipe, some[:-1] or some, some[-1:], recipe.kind, found=known, curve=False)
-        model, _ = models.save(trained, Path(folder))
+        model, _ = models.save(trained, folder)
         network = Network(model) if model else None
     errors = {flights[k].name: errors_by_share(flights[k], plain, trained.effects, network) for k in left_out}
     return {name: list(of_flight.items()) for name, of_flight in errors.items()}

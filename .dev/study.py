@@ -1,0 +1,7 @@
+"""`./dev study`. Python looks for modules beside this file, and not in the present folder as `python -m studies` would."""
+
+import sys
+
+from uwb_tdoa_bias.foundation.executable import executable
+
+sys.exit(executable("studies.__main__")())
