@@ -108,6 +108,12 @@ class Estimator:
         return None
 
     @property
+    def workspace(self) -> np.ndarray:
+        """Size of the box in which the tag is expected, (3,) m."""
+        low, high = self._ekf["workspace"]
+        return np.asarray(high - low)
+
+    @property
     def newest(self) -> float:
         """Stamp of the newest measurement, s; -inf before the first."""
         return self._buffer.newest
@@ -126,6 +132,23 @@ class Estimator:
     def alarms(self) -> list[str]:
         """Sentences on what has changed since the flight began."""
         return self._pipeline.alarms
+
+    @property
+    def sign_turns(self) -> int:
+        """How often the signs of all TDOAs have turned since the filter began."""
+        monitor = self._pipeline.monitor
+        return 0 if monitor is None else monitor.turns
+
+    @property
+    def findings(self) -> list[Finding]:
+        """What the filter, and who watches its residuals, have found: Findings."""
+        monitor = self._pipeline.monitor
+        return [*filter(None, [self.without_imu, monitor and monitor.exchanged])]
+
+    @property
+    def yaw_doubts(self) -> int:
+        """How often the yaw was found to be wrong, and opened again."""
+        return int(self._ekf.yaw_doubt["count"])
 
     @property
     def without_imu(self) -> Finding | None:

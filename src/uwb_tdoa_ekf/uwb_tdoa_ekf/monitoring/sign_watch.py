@@ -21,7 +21,8 @@ LONGEST = 40.0  # s of stamps, after which it begins anew
 
 
 class SignWatch:
-    """Until it is certain that the signs are right; of wrong ones it goes on to see when they are right again.
+    """Compares until it is certain that the signs are right, and again once they are doubted; of wrong ones it goes on to see when they
+    are right again.
 
     finding : Finding, or None."""
 
@@ -30,6 +31,20 @@ class SignWatch:
         self._anchors = anchors
         self.finding: Finding | None = None
         self._certain = False
+        self._begin()
+
+    def doubt(self) -> None:
+        """Compare again, from the next TDOA on, where it was certain."""
+        if self._certain:
+            self._certain = False
+            self._begin()
+
+    def turn(self) -> None:
+        """The signs of all TDOAs have turned in flight: name them, or take the name back, at once. The comparison begins again."""
+        line = "message.distance_difference = distance_to_b - distance_to_a  # always, not only in the beginning"
+        evidence = "from one moment on, each TDOA is the negative of what the place of the tag makes it"
+        turned = Finding("tdoa_sign", ERROR, "the sign of all TDOAs has changed in flight", evidence, line, -1.0)
+        self.finding, self._certain = turned if self.finding is None else None, False
         self._begin()
 
     def _begin(self) -> None:

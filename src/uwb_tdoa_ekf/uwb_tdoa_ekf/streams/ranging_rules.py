@@ -29,6 +29,12 @@ def share_of(windows: list[TdoaWindow], field: str, among: str = "known") -> flo
     return sum(getattr(w, field) for w in windows) / max(sum(getattr(w, among) for w in windows), 1)
 
 
+def share_beside_known(windows: list[TdoaWindow], field: str) -> float:
+    """Share of TDOAs that `field` counts because they cannot be used, among these and the known ones, 0 to 1."""
+    count = sum(getattr(w, field) for w in windows)
+    return count / max(count + sum(w.known for w in windows), 1)
+
+
 def impossible(windows: list[TdoaWindow]) -> Finding | None:
     share = share_of(windows, "impossible")
     size = median(w.size for w in windows)
@@ -50,7 +56,7 @@ def impossible(windows: list[TdoaWindow]) -> Finding | None:
 
 
 def of_one(windows: list[TdoaWindow]) -> Finding | None:
-    share = share_of(windows, "of_one")
+    share = share_beside_known(windows, "of_one")
     if share > 1e-3:
         remedy = "message.anchor_a, message.anchor_b = ...  # the two anchors of the difference"
         return Finding("tdoa_of_one", ERROR, "TDOAs name one anchor twice", f"{100.0 * share:.1f} %", remedy, share)
@@ -58,7 +64,7 @@ def of_one(windows: list[TdoaWindow]) -> Finding | None:
 
 
 def invalid(windows: list[TdoaWindow]) -> Finding | None:
-    share = share_of(windows, "invalid")
+    share = share_beside_known(windows, "invalid")
     if share > 1e-3:
         remedy = "do not publish what is not finite"
         return Finding("tdoa_invalid", WARNING, "TDOAs are not finite", f"{100.0 * share:.1f} %", remedy, share)
