@@ -45,7 +45,7 @@ AVERAGED = 0.25  # s of inertial samples that tell how a sensor is mounted which
 STALE_TURN_PSD = 0.25  # (rad/s)^2/Hz while there is no gyroscope
 LINEAR_RANGE = 1.0  # m or m/s of the state, within which the slope of a bias tells what it is elsewhere
 
-# In a history, at most: its update, workspace, fixed height, a place at rest, another hypothesis, starts or recoveries, a yaw that is opened again
+# In a history, at most: its update, workspace, fixed height, a place at rest, another hypothesis, starts or recoveries, a yaw opened again
 RECORDS_OF_TDOA = 1 + 4 + 1 + 6 + 1 + 2 + 2
 RECORDS_OF_REST = 3  # one per axis
 RECORDS_OF_AID = RECORDS_OF_TDOA  # a range has as many, a velocity one per component
