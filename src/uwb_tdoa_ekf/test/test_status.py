@@ -10,12 +10,13 @@ from uwb_tdoa_ekf.monitoring.use import Use
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.streams import ERROR, WARNING, Finding
 
-STARTS = SimpleNamespace(running=False, lost=None, without_imu=None)
-RUNS = SimpleNamespace(running=True, lost=None, without_imu=None)
-IS_LOST = SimpleNamespace(running=False, lost="the tag is lost", without_imu=None)
+STARTS = SimpleNamespace(running=False, lost=None, without_imu=None, yaw_doubts=0)
+RUNS = SimpleNamespace(running=True, lost=None, without_imu=None, yaw_doubts=0)
+IS_LOST = SimpleNamespace(running=False, lost="the tag is lost", without_imu=None, yaw_doubts=0)
 KNOWN, UNKNOWN = math.radians(6.0), math.radians(100.0)
 LEFT_OUT = Finding("imu_left_out", ERROR, "what the accelerometer reads is not gravity", "1 m/s^2", "in m/s^2", 1.0)
-GOES_WITHOUT = SimpleNamespace(running=True, lost=None, without_imu=LEFT_OUT)
+GOES_WITHOUT = SimpleNamespace(running=True, lost=None, without_imu=LEFT_OUT, yaw_doubts=0)
+DOUBTS = SimpleNamespace(running=True, lost=None, without_imu=None, yaw_doubts=1)
 
 
 def found(rule, severity=ERROR, value=1.0):
@@ -50,6 +51,7 @@ NEVER = used(received=False, imu=False)
         (RUNS, KNOWN, used(tdoa="rejected"), RUNNING, True, "contradict the filter"),
         (IS_LOST, math.nan, NEVER, LOST, False, "the tag is lost"), (IS_LOST, math.nan, used(), LOST, False, "the tag is lost"),
         (RUNS, math.nan, used(), RUNNING, False, "yaw is not known"),
+        (DOUBTS, UNKNOWN, used(), RUNNING, False, "the yaw was wrong"), (DOUBTS, KNOWN, used(), RUNNING, True, ""),
         (GOES_WITHOUT, UNKNOWN, used(imu=False), RUNNING, False, "goes without the IMU: what the accelerometer reads"),
     ],
 )  # fmt: skip

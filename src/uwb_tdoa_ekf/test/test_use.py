@@ -3,8 +3,11 @@
 from collections import Counter
 
 from hypothesis import given, strategies as st
+import numpy as np
 import pytest
 from uwb_tdoa_ekf.monitoring.use import Use
+from uwb_tdoa_ekf.offline import run_offline
+from uwb_tdoa_ekf.results import VERDICTS
 
 LOOK = 0.2  # s
 
@@ -67,6 +70,21 @@ def test_silence_and_restarts_have_an_age():
     looked.counts["restarts"] += 1
     looked.go(1.0, rejected=1.0)
     assert looked.use.restart_age == pytest.approx(0.8)
+
+
+def test_nothing_is_said_of_measured_flights(shared_data):
+    """From their start on the floor to their landing, whenever it is looked."""
+    flights = pytest.importorskip("test_stream_watch").flights
+    for name, flight in flights(shared_data):
+        run = run_offline(flight)
+        t, verdict = run.residuals.t, run.residuals.verdict
+        for phase in (0.0, 0.07, 0.13):
+            use = Use(0.25)
+            for now in np.arange(t[0] + phase, t[-1], LOOK):
+                so_far = verdict[: np.searchsorted(t, now)]
+                counts = Counter({word: int(np.sum(so_far == value)) for value, word in VERDICTS.items()})
+                use.look(now, Counter(tdoa=len(so_far)), counts, bool(now > run.odometry.t[0]))
+                assert use.trouble is None, (name, now - t[0], use.trouble)
 
 
 @given(st.lists(st.tuples(*[st.integers(0, 50)] * 4), min_size=20, max_size=60))

@@ -143,7 +143,7 @@ class Estimator:
     def findings(self) -> list[Finding]:
         """What the filter, and who watches its residuals, have found: Findings."""
         monitor = self._pipeline.monitor
-        return [*filter(None, [self.without_imu, monitor and monitor.exchanged])]
+        return [*filter(None, [self.without_imu, None if monitor is None else monitor.exchanged])]
 
     @property
     def yaw_doubts(self) -> int:

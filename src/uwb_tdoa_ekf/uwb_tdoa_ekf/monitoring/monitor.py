@@ -43,6 +43,7 @@ FORGET = 60  # slices between two looks at which of the anchors were passed long
 NEARER = 0.8  # share of the distance of the farthest anchor that is heard, within which another must be
 TOGETHER = 4  # slices in which a swap is looked for
 NAMED, HELD = 4, 8  # slices in a row that must say so until a swap is named, and something else until it is no longer
+TURN_APART = 3.0  # s of stamps between two turns of all signs
 CALIBRATE = 15.0  # s in motion that count as calibration of the IMU
 BIAS_LIMITS = {"gyroscope": 0.03, "accelerometer": 0.6}  # rad/s and m/s^2, by which an estimated bias must have moved
 
@@ -64,7 +65,7 @@ class Monitor:
     def __init__(self, anchors: Anchors | Installed) -> None:
         """anchors : Anchors, or Installed, of which others may be there later."""
         self._anchors = anchors
-        self.turns = 0  # of the signs of all TDOAs in flight
+        self.turns, self._turned = 0, -math.inf  # of the signs of all TDOAs in flight, and the stamp of the last, s
         self._forget()
 
     def _forget(self) -> None:
@@ -160,8 +161,9 @@ class Monitor:
         a, b = self._anchors.index(a), self._anchors.index(b)
         t, p, v, gyro_bias, accel_bias = odometry
         self._listen(a, b, p.mean(axis=0) if len(t) else None)
-        if len(t) and len(a):
-            self.turns += turned(innovation, tdoa(p.mean(axis=0), self._anchors.positions[a], self._anchors.positions[b]))
+        if len(t) and len(a) and end > self._turned + TURN_APART:
+            if turned(innovation, tdoa(p.mean(axis=0), self._anchors.positions[a], self._anchors.positions[b])):
+                self.turns, self._turned = self.turns + 1, end
         if math.isnan(self._moving_since) and (np.linalg.norm(v, axis=1) > MOVING).any():
             self._moving_since = end
         if math.isnan(self._moving_since) or not (len(t) and len(a)):

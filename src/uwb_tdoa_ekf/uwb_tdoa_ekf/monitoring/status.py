@@ -70,11 +70,12 @@ def status_of(estimator: Estimator | None, yaw_std: float, odometry_age: float, 
     if odometry_age > SILENT:
         why = "neither TDOAs nor inertial samples are used: there is no odometry; see /diagnostics"
         return Status(WAITING, False, why)
-    return Status(RUNNING, known, _why(use, known, left_out, findings))
+    return Status(RUNNING, known, _why(estimator, use, known, findings))
 
 
-def _why(use: Use, known: bool, left_out: Finding | None, findings: Sequence[Finding]) -> str:
+def _why(estimator: Estimator, use: Use, known: bool, findings: Sequence[Finding]) -> str:
     """What keeps a filter that runs, and has no fault, from being flown by."""
+    left_out = estimator.without_imu
     if use.tdoa_age > SILENT:
         said = use.trouble or f"no TDOA was used for more than {SILENT:g} s"
         alone = "by the IMU alone" if use.imu_used and left_out is None else "without TDOAs and without the IMU"
@@ -83,6 +84,8 @@ def _why(use: Use, known: bool, left_out: Finding | None, findings: Sequence[Fin
         return use.trouble
     if not known and left_out is not None:
         return f"the yaw is not known, because the filter goes without the IMU: {left_out.sentence}"
+    if not known and estimator.yaw_doubts:
+        return "the yaw was wrong, and is looked for again: do not steer by it; it is known once the tag has moved"
     if not known:
         return "the yaw is not known yet: do not steer by it; it is once the tag has moved, or if it is told (initialpose)"
     return findings[0].sentence if findings and findings[0].severity == "error" else ""
