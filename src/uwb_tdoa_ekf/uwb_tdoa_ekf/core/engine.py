@@ -29,7 +29,7 @@ from . import (
     workspace,
     yaw_doubt,
 )
-from .memory import HYPOTHESES, ODOMETRY, RESIDUAL, YAWS, FilterState, Measurements, Output
+from .memory import HYPOTHESES, ODOMETRY, RESIDUAL, FilterState, Measurements, Output
 from .sensor_functions import subtract
 from .startup import INLIER
 from .state import coast, predict
@@ -221,7 +221,7 @@ def _after_update(
         _stay_on_floor(ekf, parameters, t, records)
     followed = ekf.best
     alone = hypotheses.select(ekf, t) and parameters.use_imu and not (ekf.quiet or ekf.resting)
-    if ekf.best // YAWS != followed // YAWS:  # at another place
+    if ekf.best != followed:  # at another place, or with another yaw
         history.add_reset(ekf, t, records)
     if alone and yaw_doubt.contradicts(ekf, t):
         initialization.open_yaw(ekf, parameters, records)

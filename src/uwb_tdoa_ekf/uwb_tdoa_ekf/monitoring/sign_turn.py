@@ -6,7 +6,7 @@ import numpy as np
 
 LARGE = 0.75  # m, an innovation that shows something
 GAIN = 0.35  # share of it that is left with the other sign
-SHARE = 0.9  # of the large innovations, that must become so small
+SHARE = 0.65  # of the large innovations, that must become so small; after a turn 0.68 to 0.99 in simulated flights
 FEWEST = 10  # large innovations
 
 
