@@ -5,6 +5,7 @@ from dataclasses import replace
 from flights import fly
 import numpy as np
 import pytest
+from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.monitoring.sign_turn import turned
 from uwb_tdoa_ekf.monitoring.sign_watch import SignWatch
@@ -99,11 +100,13 @@ def test_large_innovations_alone_are_no_turn():
 def test_no_measured_flight_turns_its_signs_or_opens_its_yaw(shared_data):
     flights = pytest.importorskip("test_stream_watch").flights
     for name, flight in flights(shared_data):
-        estimator, imu, tdoa = Estimator(flight.anchors), flight.imu, flight.tdoa
+        estimator, imu, tdoa, corrector = Estimator(flight.anchors), flight.imu, flight.tdoa, Corrector(flight.anchors)
         for now in np.arange(min(imu.t[0], tdoa.t[0]), max(imu.t[-1], tdoa.t[-1]), 1.0):
             of_imu, of_tdoa = (slice(*np.searchsorted(t, [now, now + 1.0])) for t in (imu.t, tdoa.t))
             estimator.add_imu(imu.t[of_imu], imu.gyro[of_imu], imu.accel[of_imu])
-            estimator.add_tdoa(tdoa.t[of_tdoa], tdoa.a[of_tdoa], tdoa.b[of_tdoa], tdoa.d[of_tdoa])
+            t, a, b, d = (column[of_tdoa] for column in (tdoa.t, tdoa.a, tdoa.b, tdoa.d))
+            known = corrector.correct(t, flight.anchors.index(a), flight.anchors.index(b), d)  # as bias_node hands them over
+            estimator.add_tdoa(t, a, b, known.corrected, known.std**2)
             estimator.advance()
         assert estimator.sign_turns == 0, name
         assert estimator.yaw_doubts == 0, name
