@@ -1,9 +1,15 @@
 """The sign of all TDOAs in flight: certain, either way, on simulated flights and on measured ones."""
 
+from dataclasses import replace
+
 from flights import fly
 import numpy as np
 import pytest
+from uwb_tdoa_bias.correction.corrector import Corrector
+from uwb_tdoa_ekf.estimator import Estimator
+from uwb_tdoa_ekf.monitoring.sign_turn import turned
 from uwb_tdoa_ekf.monitoring.sign_watch import SignWatch
+from uwb_tdoa_ekf.monitoring.stream_watch import StreamWatch
 
 
 def watched(flight, sign):
@@ -44,3 +50,63 @@ def test_disorder_and_nonsense():
         watch.feed(t, np.where(rows % 7, flight.tdoa.a[rows], 999), flight.tdoa.b[rows], flight.tdoa.d[rows] * 1e9)
     watch.feed(*(np.empty(0) for _ in range(4)))
     assert watch.finding is None
+
+
+def test_doubts_make_it_compare_again():
+    flight = fly(0, 40.0)
+    watch, tdoa, said = SignWatch(flight.anchors), flight.tdoa, []
+    for k in range(40):
+        rows = (tdoa.t >= k) & (tdoa.t < k + 1.0)
+        sign = -1.0 if k >= 16 else 1.0
+        if k >= 17:
+            watch.doubt()
+        watch.feed(tdoa.t[rows], tdoa.a[rows], tdoa.b[rows], sign * tdoa.d[rows])
+        said.append(watch.finding)
+    assert not any(said[:17]) and said[-1].rule == "tdoa_sign"
+
+
+def flown(flight, sign, seconds):
+    """[(s, rules)] of what an Estimator and a StreamWatch find, each second of a Flight with such a sign: callable of the stamps."""
+    flight = replace(flight, tdoa=replace(flight.tdoa, d=flight.tdoa.d * sign(flight.tdoa.t)))
+    estimator, watch, said = Estimator(flight.anchors), StreamWatch(flight.anchors, 0.25), []
+    for now in np.arange(0.1, seconds, 0.1):
+        for stream, add, keep in ((flight.imu, estimator.add_imu, watch.add_imu), (flight.tdoa, estimator.add_tdoa, watch.add_tdoa)):
+            inside = (stream.t >= now - 0.1) & (stream.t < now)
+            t, *columns = (column[inside] for column in list(vars(stream).values())[:4] if column is not None)
+            add(t, *columns)
+            keep(t, t + 0.002, *columns)
+        estimator.advance()
+        if abs(now - round(now)) < 1e-6:
+            said.append((now, {finding.rule for finding in watch.findings(estimator.sign_turns)}))
+    return said
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_sign_that_changes_in_flight_is_named_within_two_seconds_and_later_its_end(seed):
+    said = flown(fly(seed, 45.0), lambda t: np.where((t > 18.3) & (t < 24.0), -1.0, 1.0), 45.0)
+    assert not any(rules for at, rules in said if at < 18.3)
+    assert all("tdoa_sign" in rules for at, rules in said if 20.3 < at < 24.0)
+    assert not any("tdoa_sign" in rules for at, rules in said if at > 44.0)
+
+
+def test_large_innovations_alone_are_no_turn():
+    rng = np.random.default_rng(0)
+    predicted = rng.normal(0.0, 3.0, 200)
+    late = rng.uniform(0.8, 3.0, 200)  # as on a floor
+    assert not turned(late, predicted) and not turned(np.zeros(200), predicted) and turned(-2.0 * predicted, predicted)
+    assert not turned(np.empty(0), np.empty(0))
+
+
+def test_no_measured_flight_turns_its_signs_or_opens_its_yaw(shared_data):
+    flights = pytest.importorskip("test_stream_watch").flights
+    for name, flight in flights(shared_data):
+        estimator, imu, tdoa, corrector = Estimator(flight.anchors), flight.imu, flight.tdoa, Corrector(flight.anchors)
+        for now in np.arange(min(imu.t[0], tdoa.t[0]), max(imu.t[-1], tdoa.t[-1]), 1.0):
+            of_imu, of_tdoa = (slice(*np.searchsorted(t, [now, now + 1.0])) for t in (imu.t, tdoa.t))
+            estimator.add_imu(imu.t[of_imu], imu.gyro[of_imu], imu.accel[of_imu])
+            t, a, b, d = (column[of_tdoa] for column in (tdoa.t, tdoa.a, tdoa.b, tdoa.d))
+            known = corrector.correct(t, flight.anchors.index(a), flight.anchors.index(b), d)  # as bias_node hands them over
+            estimator.add_tdoa(t, a, b, known.corrected, known.std**2)
+            estimator.advance()
+        assert estimator.sign_turns == 0, name
+        assert estimator.yaw_doubts == 0, name

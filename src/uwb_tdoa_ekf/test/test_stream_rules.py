@@ -229,3 +229,20 @@ def test_nothing_that_arrives_breaks_it(tdoas, samples):
     rules.finish()
     for finding in rules.findings():
         assert finding.severity in SEVERITIES and finding.cause
+
+
+def test_tdoas_that_come_late_are_late_and_the_imu_is_not_blamed():
+    imu, tdoa = streams()
+    found = judged(imu, put(tdoa, ARRIVAL, tdoa[ARRIVAL] + 0.6))["stamps_apart"]
+    assert "TDOAs arrive 0.6" in found.cause and "-p lag:=0.9" in found.remedy and "t_imu" not in found.remedy
+    ahead = judged(put(imu, T, imu[T] + 0.6), tdoa)["stamps_apart"]
+    assert "imu/data" in ahead.cause and "t_imu" in ahead.remedy
+
+
+@pytest.mark.parametrize("share", [0.3, 0.9, 1.0])
+@pytest.mark.parametrize(("rule", "spoil"), [("tdoa_invalid", lambda c, bad: put(c, D, np.where(bad, np.nan, c[D]))),
+                                             ("tdoa_of_one", lambda c, bad: put(c, A, np.where(bad, c[B], c[A])))])  # fmt: skip
+def test_no_share_is_above_all(rule, spoil, share):
+    imu, tdoa = streams()
+    bad = np.random.default_rng(0).random(len(tdoa[T])) < share
+    assert judged(imu, spoil(tdoa, bad))[rule].value == pytest.approx(share, abs=0.05)

@@ -35,7 +35,7 @@ from uwb_tdoa_bias.foundation.ros_parameters import files_of, refuse_unknown, sa
 from uwb_tdoa_bias.foundation.ros_stamps import Epoch
 from uwb_tdoa_bias.foundation.ros_streams import RoundRobin, Streams
 from uwb_tdoa_bias.foundation.ros_topics import Input, Refusals, several_publishers
-from uwb_tdoa_bias.foundation.sensors import LOCATING, SENSORS
+from uwb_tdoa_bias.foundation.sensors import SENSORS
 from uwb_tdoa_msgs.msg import TdoaCorrected
 
 from .core.config import RENAMED
@@ -45,7 +45,7 @@ from .estimator import Estimator
 from .frames import rotation_std
 from .imu_mount import ImuMount
 from .monitoring.health import OK, WARN, Health, together
-from .monitoring.status import status_of, yaw_in_words
+from .monitoring.status import FAULT, Status, doubted, status_of, yaw_in_words
 from .monitoring.stream_watch import FEW_ANCHORS, StreamWatch
 from .outputs import Outputs, StatusOutput
 from .streams import most_severe_first
@@ -102,7 +102,8 @@ class EkfNode(StreamNode):
         self._said_restart: Finding | None = None
         self._epoch, self._ros_clock = Epoch(), cast("ROSClock", self.get_clock())
         self._attitude: tuple[np.ndarray, np.ndarray] | None = None  # quaternion and covariance of the newest odometry
-        self._last_tdoa = -math.inf  # of a TDOA or range, time.monotonic(), s
+        self._findings: list[Finding] = []  # of the last report
+        self._fault = False  # one of these, or the use of TDOAs, makes the position wrong
         self._received_before: dict[str, int] = {}  # messages by topic, by the last report
         self._early: deque[tuple[str, tuple[Any, ...]]] = (
             deque()
@@ -239,8 +240,6 @@ class EkfNode(StreamNode):
         """Messages of a stream, see Streams."""
         n = len(part[1])
         self._health.received[stream] += n
-        if stream in ("tdoa", *LOCATING):
-            self._last_tdoa = time.monotonic()
         if self._estimator is not None:
             self._takers[stream](*part)
             return
@@ -298,6 +297,8 @@ class EkfNode(StreamNode):
 
     def _publish(self, odometry: Odometry, residuals: Residuals) -> None:
         if len(odometry.t):
+            if self._fault:
+                odometry = doubted(odometry, self._estimator.workspace)
             rates, variances = self._estimator.rates_at(odometry.t)
             self.outputs.publish_odometry(odometry, rates - odometry.gyro_bias, variances)
             self._health.last_odometry = time.monotonic()
@@ -320,7 +321,8 @@ class EkfNode(StreamNode):
         restarts, self._restarts = self._restarts, estimator.counts["restarts"]
         if self._restarts != restarts:
             self._watch.restart()
-        return most_severe_first([*self._watch.findings(), *estimator.clocks, *filter(None, [estimator.restarted, estimator.without_imu])])
+        found = self._watch.findings(estimator.sign_turns, self._health.use.contradicted)
+        return most_severe_first([*found, *estimator.findings])
 
     def _wiring(self) -> list[str]:
         """What is wrong with who publishes what to whom, a list of sentences."""
@@ -348,9 +350,25 @@ class EkfNode(StreamNode):
         """Say on `status` whether the odometry may be flown by; not while simulated time stands still: then nothing can come."""
         if self._diagnostics.paused:
             return
-        yaw_std, age = self._yaw_std(), time.monotonic() - self._last_tdoa
+        self._health.look(self._estimator, self._counts())
+        status, yaw_std = self._judge(), self._yaw_std()
         stamp = self.outputs.stamp if self.outputs.published else self.get_clock().now().to_msg()
-        self._status.publish(status_of(self._estimator, yaw_std, age), yaw_std, age, stamp, self.outputs.world)
+        self._status.publish(status, yaw_std, self._health.use.tdoa_age, stamp, self.outputs.world)
+
+    def _judge(self) -> Status:
+        """Whether the odometry may be flown by, from what is known now."""
+        last = self._health.last_odometry
+        age = math.inf if last is None else time.monotonic() - last
+        status = status_of(self._estimator, self._yaw_std(), age, self._health.use, self._findings)
+        self._fault = status.status == FAULT
+        return status
+
+    def _counts(self) -> Counter[str]:
+        """Totals of all estimators so far, by what became of messages."""
+        counts = Counter(self._past)
+        if self._estimator is not None:
+            counts.update(self._estimator.counts, recoveries=self._estimator.recoveries, yaw_doubts=self._estimator.yaw_doubts)
+        return counts
 
     def _yaw_std(self) -> float:
         """Standard deviation of the rotation about the world's z axis, rad; NaN unless there is odometry."""
@@ -360,14 +378,13 @@ class EkfNode(StreamNode):
 
     def _report(self) -> Report:
         self._frames.catch_up()  # where there is no odometry
-        counts, estimator = Counter(self._past), self._estimator
+        counts, estimator = self._counts(), self._estimator
         waiting = Counter(stream for stream, _ in self._early)
         if estimator is not None:
-            counts.update(estimator.counts, recoveries=estimator.recoveries)
             waiting = Counter(dict(zip(STREAMS, estimator.waiting)))
         self._health.behind = self._behind()
-        troubles = self._wiring(), self._stream_findings()
-        level, text, values = self._health.report(self._anchors.refused, estimator, counts, *troubles)
+        self._findings = self._stream_findings()
+        level, text, values = self._health.report(self._anchors.refused, estimator, counts, self._wiring(), self._findings)
         alarms: list[str] = estimator.alarms if estimator is not None else []
         refused = estimator.refused_pose if estimator is not None else None
         heard = ", ".join(self._lately[:MOST_NAMED])
@@ -375,6 +392,7 @@ class EkfNode(StreamNode):
         others = [*filter(None, [*frames, self.outputs.trouble, refused, *alarms])]
         if level == OK and others:
             level, text = WARN, together(others)
+        values |= {"not to be flown by": self._judge().why or "nothing"}
         values |= {"yaw": yaw_in_words(self._yaw_std()), "frames of imu/data": heard or "none yet"}
         values |= {"changed since the start": "; ".join(alarms) or "nothing"}
         outside: list[str] = self._imu_corrector.outside if estimator is not None else []
@@ -383,7 +401,7 @@ class EkfNode(StreamNode):
         values |= {"waiting": waiting["tdoa"], "IMU samples received": self._health.received["imu"]}
         values |= {name: counts[name] for name in ("imu_used", "imu_late", "imu_invalid")}
         values |= {"imu_waiting": waiting["imu"], "odometry published": self.outputs.published}
-        values |= {name: counts[name] for name in ("recoveries", "restarts")}
+        values |= {name: counts[name] for name in ("recoveries", "restarts", "yaw_doubts")}
         for aid in SENSORS:
             values |= {f"{aid}_received": self._health.received[aid], f"{aid}_waiting": waiting[aid]}
             values |= {f"{aid}_{verdict}": counts[f"{aid}_{verdict}"] for verdict in VERDICTS.values()}

@@ -113,6 +113,12 @@ class Estimator:
         return None
 
     @property
+    def workspace(self) -> np.ndarray:
+        """Size of the box in which the tag is expected, (3,) m."""
+        low, high = self._ekf["workspace"]
+        return np.asarray(high - low)
+
+    @property
     def newest(self) -> float:
         """Stamp that the time of the streams has reached, s; -inf before the first TDOA, range or inertial sample."""
         return self._buffer.newest
@@ -131,6 +137,24 @@ class Estimator:
     def alarms(self) -> list[str]:
         """Sentences on what has changed since the flight began."""
         return self._pipeline.alarms
+
+    @property
+    def sign_turns(self) -> int:
+        """How often the signs of all TDOAs have turned since the filter began."""
+        monitor = self._pipeline.monitor
+        return 0 if monitor is None else monitor.turns
+
+    @property
+    def findings(self) -> list[Finding]:
+        """What the filter, the clocks of its streams, and who watches its residuals, have found: Findings."""
+        monitor = self._pipeline.monitor
+        exchanged = None if monitor is None else monitor.exchanged
+        return [*filter(None, [self.without_imu, exchanged, self.restarted]), *self.clocks]
+
+    @property
+    def yaw_doubts(self) -> int:
+        """How often the yaw was found to be wrong, and opened again."""
+        return int(self._ekf.yaw_doubt["count"])
 
     @property
     def without_imu(self) -> Finding | None:

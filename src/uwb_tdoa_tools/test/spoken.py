@@ -12,6 +12,7 @@ SAYING = {
     "unknown_frame",
     "several_publishers",
     "_sentence",
+    "_no_start",
     "_silence",
     "_swap",
     "_axis_alarms",

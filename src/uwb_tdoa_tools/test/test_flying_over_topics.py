@@ -102,6 +102,14 @@ def test_what_is_none_is_passed_over(topics, bad):
     assert topics.pose[0] == pytest.approx(4.96)
 
 
+@pytest.mark.parametrize("status", [EstimatorStatus.STATUS_WAITING, EstimatorStatus.STATUS_STARTING, EstimatorStatus.STATUS_FAULT])
+def test_by_a_status_that_is_not_running_it_neither_starts_nor_goes_on(topics, status):
+    hear(topics, odometry(5.0))
+    assert topics.deviation == pytest.approx(0.2)
+    topics.status = EstimatorStatus(status=status, yaw_known=True, why="the sign of all TDOAs is wrong")
+    assert topics.deviation == np.inf and topics.why == "the sign of all TDOAs is wrong"
+
+
 def test_where_the_filter_does_not_run_it_knows_nothing_and_says_why(topics):
     hear(topics, odometry(4.9))
     topics.status = EstimatorStatus(status=EstimatorStatus.STATUS_LOST, lost=True, why="the tag is lost")

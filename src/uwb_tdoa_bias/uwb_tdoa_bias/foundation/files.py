@@ -88,6 +88,8 @@ def write_bytes(path: str | Path, content: bytes) -> None:
 def _write_in_place(path: Path, content: bytes) -> None:
     with open(path, "wb") as file:
         file.write(content)
+
+
 def open_file(path: str | Path) -> BinaryIO:
     """An open file, to be read. Raises InputError for a pipe or a device, at which reading would wait for ever, and OSError."""
     file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))

@@ -27,8 +27,9 @@ from . import (
     robust,
     systematic,
     workspace,
+    yaw_doubt,
 )
-from .memory import HYPOTHESES, ODOMETRY, RESIDUAL, YAWS, FilterState, Measurements, Output
+from .memory import HYPOTHESES, ODOMETRY, RESIDUAL, FilterState, Measurements, Output
 from .sensor_functions import subtract
 from .startup import INLIER
 from .state import coast, predict
@@ -44,8 +45,8 @@ AVERAGED = 0.25  # s of inertial samples that tell how a sensor is mounted which
 STALE_TURN_PSD = 0.25  # (rad/s)^2/Hz while there is no gyroscope
 LINEAR_RANGE = 1.0  # m or m/s of the state, within which the slope of a bias tells what it is elsewhere
 
-# In a history, at most: its update, workspace, fixed height, a place at rest, another hypothesis, starts or recoveries
-RECORDS_OF_TDOA = 1 + 4 + 1 + 6 + 1 + 2
+# In a history, at most: its update, workspace, fixed height, a place at rest, another hypothesis, starts or recoveries, a yaw opened again
+RECORDS_OF_TDOA = 1 + 4 + 1 + 6 + 1 + 2 + 2
 RECORDS_OF_REST = 3  # one per axis
 RECORDS_OF_AID = RECORDS_OF_TDOA  # a range has as many, a velocity one per component
 
@@ -219,9 +220,15 @@ def _after_update(
         ekf.next_floor = t + rest.PERIOD
         _stay_on_floor(ekf, parameters, t, records)
     followed = ekf.best
-    hypotheses.select(ekf, t)
-    if ekf.best // YAWS != followed // YAWS:  # at another place
+    alone = hypotheses.select(ekf, t) and parameters.use_imu and not (ekf.quiet or ekf.resting)
+    if ekf.best != followed:  # at another place, or with another yaw
         history.add_reset(ekf, t, records)
+    if alone and yaw_doubt.contradicts(ekf, t):
+        initialization.open_yaw(ekf, parameters, records)
+        alone = False
+    if not alone:
+        yaw_doubt.clear(ekf.yaw_doubt)
+    ekf.yaw_doubt.alone = alone
     if counts:
         ekf.consistency += min(1.0, (t - ekf.last_tdoa) / CONSISTENCY_TIME) * ((1.0 if agrees else 0.0) - ekf.consistency)
     ekf.last_tdoa = t
@@ -289,17 +296,21 @@ def _advance(ekf: Record, parameters: Record, t: float, records: np.ndarray) -> 
             if not hypotheses.alive(hypothesis):
                 continue
             if sensed:
+                vx, vy = hypothesis.x[3], hypothesis.x[4]
                 predict(hypothesis, ekf.imu, parameters, dt, ekf.transition)
                 if auxiliary.present(hypothesis):
                     auxiliary.predict(hypothesis, ekf.transition)
                 if h == ekf.best:
                     history.add_prediction(ekf, records)
+                    if ekf.yaw_doubt.alone:
+                        yaw_doubt.predict(ekf, vx, vy)
             else:
                 coast(hypothesis, dt, parameters.motion_noise**2, STALE_TURN_PSD if parameters.use_imu else 0.0)
                 if auxiliary.present(hypothesis):
                     auxiliary.coast(hypothesis, dt)
                 if h == ekf.best:
                     history.add_coasting(ekf, dt, records)
+                    yaw_doubt.clear(ekf.yaw_doubt)
         ekf.t = t if t - ekf.t <= MAX_STEP else ekf.t + dt
     if t - ekf.last_tdoa > LOST_TIME and workspace.is_filled(ekf.workspace, ekf.hypotheses[ekf.best].P):
         return _stop(ekf, t)
@@ -396,6 +407,8 @@ def _assimilate(
         residual.variance = innovation.prior_variance + innovation.noise_variance
         residual.weight = innovation.weight
         residual.verdict = USED if innovation.weight > 0.0 else REJECTED
+        if ekf.yaw_doubt.alone:
+            yaw_doubt.observe(ekf, parameters.tdoa_correlation_length * innovation.repeated, t)
         if residual.verdict == USED:
             history.add_update(ekf, t, records)
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.compiled import Record, compiled
 
+from . import yaw_doubt
 from .state import ERROR_STATES, MOVING_STATES, NOMINAL_STATES, propagate
 
 UPDATE, RESET = 0, 1  # kinds of records: a Kalman update, or another state was put in place of the one before
@@ -67,7 +68,8 @@ def add_update(ekf: Record, t: float, history: np.ndarray) -> None:
 
 @compiled
 def add_reset(ekf: Record, t: float, history: np.ndarray) -> None:
-    """After the state of the best hypothesis was replaced: nothing carries over."""
+    """After the state of the best hypothesis was replaced: nothing carries over, and no evidence against its yaw."""
+    yaw_doubt.clear(ekf.yaw_doubt)
     if len(history) > 0:
         record = _next(ekf, t, RESET, history)
         record.innovation, record.variance = 0.0, 1.0

@@ -45,9 +45,10 @@ def add_log_likelihood(hypothesis: Record, innovation: Record, correlation_lengt
 
 
 @compiled
-def select(ekf: Record, t: float) -> None:
-    """Follow the most probable hypothesis at stamp t; prune those that are improbable, or have become the same."""
-    best = 0
+def select(ekf: Record, t: float) -> bool:
+    """Follow the most probable hypothesis at stamp t; prune those that are improbable, or have become the same. Returns whether one is
+    left."""
+    best = followed = 0
     for h in range(HYPOTHESES):
         if ekf.hypotheses[h].log_weight > ekf.hypotheses[best].log_weight:
             best = h
@@ -57,9 +58,10 @@ def select(ekf: Record, t: float) -> None:
         hypothesis.log_weight -= highest
         if hypothesis.log_weight < PRUNED_BELOW:
             hypothesis.log_weight = -np.inf
+        followed += alive(hypothesis)
     ekf.best = best
     if t < ekf.next_merge:
-        return
+        return followed == 1
     ekf.next_merge = t + MERGE_PERIOD
     for h in range(HYPOTHESES):
         for other in range(HYPOTHESES):
@@ -70,6 +72,7 @@ def select(ekf: Record, t: float) -> None:
             turned, away = apart[6] ** 2 + apart[7] ** 2 + apart[8] ** 2, apart[0] ** 2 + apart[1] ** 2 + apart[2] ** 2
             if turned < MERGED_BELOW**2 and away < MERGED_WITHIN**2:
                 one.log_weight = -np.inf
+    return followed == 1
 
 
 @compiled

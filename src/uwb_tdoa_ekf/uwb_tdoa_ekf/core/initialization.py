@@ -380,6 +380,14 @@ def level_anew(ekf: Record, parameters: Record, yaw_std: float, history: np.ndar
 
 
 @compiled
+def open_yaw(ekf: Record, parameters: Record, history: np.ndarray) -> None:
+    """The yaw was wrong, and with it what was integrated lately: follow four yaws again, from a place that is less certain."""
+    ekf.yaw_doubt.count += 1
+    widen(ekf, history)
+    level_anew(ekf, parameters, 2.0 * math.pi, history)
+
+
+@compiled
 def level_first(ekf: Record, parameters: Record, history: np.ndarray) -> None:
     """`level_anew` when inertial samples have come for the first time: the yaw is known as well as it was before."""
     alive = 0

@@ -131,6 +131,19 @@ VELOCITY = _record(
     ("refused", bool),  # it disagrees with everything else
 )
 
+YAW_DOUBT = _record(
+    ("response", float, (ERROR_STATES, 2)),  # of the error state to cos(psi) - 1 and sin(psi), for a yaw that is wrong by psi
+    ("vector", float, 2),  # of the least squares of late innovations by these two,
+    ("information", float, (2, 2)),  # and its matrix
+    ("turned", float),  # rad, by which updates have turned the yaw of late,
+    ("variance", float),  # rad^2, and the largest variance that it had
+    ("alone", bool),  # one hypothesis is followed
+    ("evidence", float),  # at the last look,
+    ("t", float),  # s, stamps: of the last innovation,
+    ("next_look", float),  # and before which not to look again
+    ("count", int),  # how often the yaw was opened again
+)
+
 EKF = _record(
     ("t", float),  # s, stamp of the hypotheses
     ("running", bool),
@@ -145,6 +158,7 @@ EKF = _record(
     ("next_floor", float),  # s, stamp before which not to say again that the tag is at its fixed height
     ("plausibility", PLAUSIBILITY),  # of the inertial samples,
     ("distrusted", bool),  # which are not used, because they cannot be right
+    ("yaw_doubt", YAW_DOUBT),  # see yaw_doubt.py
     ("levelled", float),  # s, stamp until which they are averaged, where the filter ran before there were any; -inf: they are used
     ("quiet", bool),  # the inertial sensor neither shakes nor turns
     ("resting", bool),  # the tag does not move, see rest.py,
@@ -269,7 +283,7 @@ def new_state(positions: np.ndarray, functions: Sequence[SensorFunction] = (), f
     ekf.hypotheses["P"][:] = np.eye(ERROR_STATES)
     ekf.since_record[:] = np.eye(ERROR_STATES)
     ekf.consistency, ekf.range_offset[1] = 1.0, np.inf
-    ekf.levelled = -np.inf
+    ekf.levelled = ekf.yaw_doubt.t = ekf.yaw_doubt.next_look = -np.inf
     return state
 
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.foundation.sensors import SENSORS
 
-from ..streams import ERROR, WARNING, Finding
+from ..streams import WARNING, Finding
 
 if TYPE_CHECKING:
     from ..reorder_buffer import Restart
@@ -30,4 +30,4 @@ def restarted(cause: Restart) -> Finding:
         what = f"the stamps of {topic} fell back by {-cause.step:.3g} s"
     evidence = f"the new time begins at {cause.at:.3f} s after the first stamp"
     remedy = "keep the clocks of all drivers in step (chronyc tracking); a recording that is played again does this, too"
-    return Finding("restarted", ERROR, f"{what}: the filter has started anew", evidence, remedy, cause.step)
+    return Finding("restarted", WARNING, f"{what}: the filter has started anew", evidence, remedy, cause.step)

@@ -13,6 +13,7 @@ from uwb_tdoa_bias.foundation.ros_diagnostics import Rate
 from uwb_tdoa_bias.foundation.sensors import LOCATING, SENSORS
 
 from ..streams import ERROR as SEVERE
+from .use import LARGEST_UNUSED, Use
 from .volume import VolumeCheck
 
 if TYPE_CHECKING:
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
 START_TIMEOUT = 5.0  # s of data without a start position before it becomes a warning
 BEHIND = 1.0, 60.0  # s that the newest odometry is old: less is good, and more is of another time
 STOPPED = 2.0  # s without a message of an aid that was there, before it becomes a warning
-LARGEST_UNUSED = 0.5  # share of TDOAs that are not used for one reason, before it becomes a warning
 MOST_SAID = 3  # sentences in one text; all of them are among the values
 REPEATS = 2  # reports in a row in which that is so of an aid; optical flow contradicts everything else for a second at times
 
@@ -49,7 +49,11 @@ class Health:
         self._aids_bad: dict[tuple[str, str], int] = {}  # reports in a row in which most messages of an aid were not used for a reason
         self._aids_heard: dict[str, tuple[int, float]] = {}  # messages of each so far, and since when no more of them, time.monotonic(), s
         self._starting: float | None = None  # time.monotonic(), s
-        self._counts: dict[str, int] = {}
+        self.use = Use(lag)
+
+    def look(self, estimator: Estimator | None, counts: Mapping[str, int]) -> None:
+        """See what became of what was received. Call it several times a second with totals by verdict."""
+        self.use.look(time.monotonic(), self.received, counts, estimator is not None and estimator.running)
 
     def report(
         self, refused: str | None, estimator: Estimator | None, counts: Mapping[str, int], wiring: Sequence[str] = (),
@@ -62,6 +66,7 @@ class Health:
         rules over streams. What is wrong with the streams is said before what comes of it.
         """
         now = time.monotonic()
+        self.look(estimator, counts)
         imu_rate, tdoa_rate = self._imu_rate.of(self.received["imu"]), self._tdoa_rate.of(self.received["tdoa"])
         located = self._located_rate.of(self.received["tdoa"] + sum(self.received[name] for name in LOCATING))
         running = estimator is not None and estimator.running
@@ -81,11 +86,11 @@ class Health:
         elif wiring or findings:
             status = _worst(wiring, findings)
         elif running:
-            status = self._status_of_use(counts)
+            status = (WARN, self.use.trouble) if self.use.trouble else (OK, "running")
         elif estimator.lost:
             status = WARN, estimator.lost
         elif self._starting is not None and now - self._starting > START_TIMEOUT:
-            status = WARN, "no start position found: check ids and positions of the anchors, and that four are heard"
+            status = WARN, self.use.trouble or self._no_start()
         else:
             status = OK, "looking for the start position"
         if status == (OK, "running"):
@@ -140,22 +145,11 @@ class Health:
                     status = WARN, f"more than half of the messages on {sensor.topics[0][0]} {words}"
         return status
 
-    def _status_of_use(self, counts: Mapping[str, int]) -> tuple[bytes, str]:
-        """What became of the TDOAs since the last time."""
-        reasons = {
-            "late": (
-                "are late: check the load of this machine; raise reorder if they come out of order, or lag (now "
-                f"{self._lag} s)"
-            ),
-            "invalid": "are invalid: check that uwb/anchors lists the anchors that the tag hears, in metres",
-            "rejected": "contradict the filter: check the anchors' positions, and tdoa_std",
-        }
-        recent = {name: counts[name] - self._counts.get(name, 0) for name in ("used", *reasons)}
-        self._counts = dict(counts)
-        for name, reason in reasons.items():
-            if recent[name] > LARGEST_UNUSED * sum(recent.values()):
-                return WARN, f"more than half of the TDOAs {reason}"
-        return OK, "running"
+    def _no_start(self) -> str:
+        """Why no start position is found."""
+        if self.use.restart_age < START_TIMEOUT:
+            return "the filter starts anew again and again, because stamps of a stream fall back: see restarts, and correct its clock"
+        return "no start position found: check ids and positions of the anchors, and that four are heard"
 
 
 def _worst(wiring: Sequence[str], findings: Sequence[Finding]) -> tuple[bytes, str]:

@@ -16,8 +16,10 @@ import numpy as np
 from uwb_tdoa_bias.foundation.geometry import tdoa
 
 from ..core.verdicts import REJECTED
+from ..streams import ERROR, Finding
 from .change import ChangeDetector
 from .slices import LENGTH, reduced
+from .sign_turn import turned
 from .swap import swapped
 
 if TYPE_CHECKING:
@@ -41,6 +43,7 @@ FORGET = 60  # slices between two looks at which of the anchors were passed long
 NEARER = 0.8  # share of the distance of the farthest anchor that is heard, within which another must be
 TOGETHER = 4  # slices in which a swap is looked for
 NAMED, HELD = 4, 8  # slices in a row that must say so until a swap is named, and something else until it is no longer
+TURN_APART = 3.0  # s of stamps between two turns of all signs
 CALIBRATE = 15.0  # s in motion that count as calibration of the IMU
 BIAS_LIMITS = {"gyroscope": 0.03, "accelerometer": 0.6}  # rad/s and m/s^2, by which an estimated bias must have moved
 
@@ -62,6 +65,7 @@ class Monitor:
     def __init__(self, anchors: Anchors | Installed) -> None:
         """anchors : Anchors, or Installed, of which others may be there later."""
         self._anchors = anchors
+        self.turns, self._turned = 0, -math.inf  # of the signs of all TDOAs in flight, and the stamp of the last, s
         self._forget()
 
     def _forget(self) -> None:
@@ -157,6 +161,9 @@ class Monitor:
         a, b = self._anchors.index(a), self._anchors.index(b)
         t, p, v, gyro_bias, accel_bias = odometry
         self._listen(a, b, p.mean(axis=0) if len(t) else None)
+        if len(t) and len(a) and end > self._turned + TURN_APART:
+            if turned(innovation, tdoa(p.mean(axis=0), self._anchors.positions[a], self._anchors.positions[b])):
+                self.turns, self._turned = self.turns + 1, end
         if math.isnan(self._moving_since) and (np.linalg.norm(v, axis=1) > MOVING).any():
             self._moving_since = end
         if math.isnan(self._moving_since) or not (len(t) and len(a)):
@@ -228,6 +235,16 @@ class Monitor:
         """Sentences on what has changed; empty while nothing has."""
         swaps = [self._swap(*self._anchors.ids[[*self._swapped]])] if self._swapped else []
         return [*swaps, *starmap(self._sentence, self._changes.items()), *self._silence(), *self._axis_alarms()]
+
+    @property
+    def exchanged(self) -> Finding | None:
+        """Finding on two anchors that were exchanged, or None."""
+        if not self._swapped:
+            return None
+        one, other = self._anchors.ids[[*self._swapped]].tolist()
+        evidence = "each TDOA with one of them fits the place of the other"
+        remedy = "correct their ids, or their positions on uwb/anchors"
+        return Finding("ids_exchanged", ERROR, f"two anchors are exchanged, {one} and {other}", evidence, remedy, float(one))
 
     def _swap(self, one: int, other: int) -> str:
         return f"two anchors are exchanged, {one} and {other}: correct their ids, or their positions on uwb/anchors"

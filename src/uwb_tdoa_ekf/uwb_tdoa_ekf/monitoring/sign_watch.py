@@ -17,11 +17,13 @@ if TYPE_CHECKING:
 # What must stay unexplained less, and by how many standard errors. On 37 measured flights, of any 10 to 40 s from the start or
 # in the air: healthy ones 0.98 and 0.2, those with the other sign 0.81 and 2.5 after 30 s in the air, most after 12.
 RATIO, DEVIATIONS = 0.85, 3.0
+TURNED = -1.0  # value of a Finding on signs that have turned in flight
 LONGEST = 40.0  # s of stamps, after which it begins anew
 
 
 class SignWatch:
-    """Until it is certain that the signs are right; of wrong ones it goes on to see when they are right again.
+    """Compares until it is certain that the signs are right, and again once they are doubted; of wrong ones it goes on to see when they
+    are right again.
 
     finding : Finding, or None."""
 
@@ -29,6 +31,24 @@ class SignWatch:
         """anchors : Anchors."""
         self._anchors = anchors
         self.finding: Finding | None = None
+        self._certain = False
+        self._begin()
+
+    def doubt(self) -> None:
+        """Compare again, from the next TDOA on, where it was certain."""
+        if self._certain:
+            self._certain = False
+            self._begin()
+
+    def turn(self) -> None:
+        """The signs of all TDOAs have turned in flight: name that at once, or its end. The comparison begins again, and decides."""
+        line = "message.distance_difference = distance_to_b - distance_to_a  # always, not only in the beginning"
+        evidence = "from one moment on, each TDOA is the negative of what the place of the tag makes it"
+        turned = Finding("tdoa_sign", ERROR, "the sign of all TDOAs has changed in flight", evidence, line, TURNED)
+        if self.finding is None:
+            self.finding = turned
+        elif self.finding.value == turned.value:
+            self.finding = None
         self._certain = False
         self._begin()
 

@@ -1,17 +1,25 @@
-"""Whether the odometry may be flown by, for who does: one decision, from what the Estimator says of itself."""
+"""Whether the odometry may be flown by, for who does: one decision, from what the Estimator says of itself, and from what is found."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 import math
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from ..results import Odometry
+from .use import SILENT
+
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from ..estimator import Estimator
+    from ..streams.finding import Finding
+    from .use import Use
 
 YAW_KNOWN = math.radians(20.0)  # rad; while four yaws are followed it is 100 degrees, with one left below 20: docs/reliability.md
-SILENT = 1.0  # s without TDOAs that are said: the position then goes by the IMU alone
-WAITING, STARTING, RUNNING, LOST = range(4)  # as in EstimatorStatus
+ANY_YAW, ANY_SPEED = math.pi, 2.0  # rad and m/s, stated while a fault makes everything wrong
+WAITING, STARTING, RUNNING, LOST, FAULT = range(5)  # as in EstimatorStatus
 
 
 @dataclass(frozen=True)
@@ -35,22 +43,61 @@ def yaw_in_words(std: float) -> str:
     return f"{'known' if std <= YAW_KNOWN else 'not known yet'}: +-{math.degrees(std):.0f} degrees"
 
 
-def status_of(estimator: Estimator | None, yaw_std: float, tdoa_age: float) -> Status:
-    """Status of an Estimator, None without anchors. yaw_std : rad, NaN without odometry; tdoa_age : s since a TDOA arrived, inf
-    before the first."""
+def fault_of(findings: Sequence[Finding], use: Use, left_out: Finding | None) -> Finding | None:
+    """The most severe of Findings that makes the position wrong, or None. left_out : by which the filter goes without the IMU, or None."""
+    imu_used = use.imu_used and left_out is None
+    return next((finding for finding in findings if finding.position_wrong(imu_used)), None)
+
+
+def status_of(estimator: Estimator | None, yaw_std: float, odometry_age: float, use: Use, findings: Sequence[Finding] = ()) -> Status:
+    """Status of an Estimator, None without anchors. yaw_std : rad, NaN without odometry; odometry_age : s since there was one; findings :
+    what stands, most severe first."""
     if estimator is None:
         return Status(WAITING, False, "there are no anchors yet: publish them on uwb/anchors, or set anchors_file")
     if estimator.lost:
         return Status(LOST, False, estimator.lost)
+    left_out = estimator.without_imu
+    fault = fault_of(findings, use, left_out)
     if not estimator.running:
-        if tdoa_age > SILENT:
+        if fault is not None:
+            return Status(FAULT, False, fault.sentence)
+        if use.arrival_age > SILENT:
             return Status(WAITING, False, "there are no TDOAs: see /diagnostics")
-        return Status(STARTING, False, "the start position is looked for")
+        restarted = estimator.restarted
+        return Status(STARTING, False, use.trouble or (restarted.sentence if restarted else "the start position is looked for"))
     known = yaw_std <= YAW_KNOWN
-    if tdoa_age > SILENT:
-        return Status(RUNNING, known, f"no TDOA has come for more than {SILENT:g} s: the position goes by the IMU alone and drifts")
+    if fault is not None:
+        return Status(FAULT, False, fault.sentence)
+    if odometry_age > SILENT:
+        why = "neither TDOAs nor inertial samples are used: there is no odometry; see /diagnostics"
+        return Status(WAITING, False, why)
+    return Status(RUNNING, known, _why(estimator, use, known, findings))
+
+
+def _why(estimator: Estimator, use: Use, known: bool, findings: Sequence[Finding]) -> str:
+    """What keeps a filter that runs, and has no fault, from being flown by."""
+    left_out = estimator.without_imu
+    if use.tdoa_age > SILENT:
+        said = use.trouble or f"no TDOA was used for more than {SILENT:g} s"
+        alone = "by the IMU alone" if use.imu_used and left_out is None else "without TDOAs and without the IMU"
+        return f"{said}: the position goes {alone} and drifts"
+    if use.trouble:
+        return use.trouble
+    if not known and left_out is not None:
+        return f"the yaw is not known, because the filter goes without the IMU: {left_out.sentence}"
+    if not known and estimator.yaw_doubts:
+        return "the yaw was wrong, and is looked for again: do not steer by it; it is known once the tag has moved"
     if not known:
-        return Status(
-            RUNNING, False, "the yaw is not known yet: do not steer by it; it is once the tag has moved, or if it is told (initialpose)"
-        )
-    return Status(RUNNING, True, "")
+        return "the yaw is not known yet: do not steer by it; it is once the tag has moved, or if it is told (initialpose)"
+    return findings[0].sentence if findings and findings[0].severity == "error" else ""
+
+
+def doubted(odometry: Odometry, size: np.ndarray) -> Odometry:
+    """Return Odometry with a covariance of a tag that may be anywhere in its workspace and have any yaw. size : (3,) m, of that."""
+    covariance = odometry.covariance.copy()
+    x, y, z, w = odometry.q.T
+    up = np.stack([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x**2 + y**2)], axis=1)  # of the world, in the body
+    covariance[:, :3, :3] += np.diag(size**2)
+    covariance[:, 3:6, 3:6] += ANY_SPEED**2 * np.eye(3)
+    covariance[:, 6:, 6:] += ANY_YAW**2 * up[:, :, None] * up[:, None, :]
+    return replace(odometry, covariance=covariance)

@@ -39,6 +39,7 @@ class StreamWatch:
         self._imu: list[tuple[np.ndarray, ...]] = []
         self._tdoa: list[tuple[np.ndarray, ...]] = []
         self._sign = SignWatch(self._anchors)
+        self._turns: int | None = None  # as of Monitor, at the last look
 
     def add_imu(self, t: np.ndarray, arrival: np.ndarray, gyro: np.ndarray, accel: np.ndarray) -> None:
         """Take samples: stamps and arrivals, (n,) s, of one clock if possible; gyro (n, 3) rad/s; accel (n, 3) m/s^2."""
@@ -48,10 +49,16 @@ class StreamWatch:
         """Take raw TDOAs: stamps and arrivals, (n,) s; a, b (n,) ids; d (n,) m."""
         self._tdoa.append((t, arrival, a, b, d))
 
-    def findings(self) -> list[Finding]:
-        """What stands: a list of Finding, most severe first."""
+    def findings(self, turns: int = 0, doubted: bool = False) -> list[Finding]:
+        """What stands: a list of Finding, most severe first. turns : of the signs of all TDOAs so far, as of Monitor; doubted : most TDOAs
+        contradict the filter."""
         imu, self._imu = self._imu, []
         tdoa, self._tdoa = self._tdoa, []
+        if self._turns is not None and turns > self._turns:
+            self._sign.turn()
+        elif doubted:
+            self._sign.doubt()
+        self._turns = turns
         rules = self._rules
         if imu:
             rules.feed_imu(*map(np.concatenate, zip(*imu)))

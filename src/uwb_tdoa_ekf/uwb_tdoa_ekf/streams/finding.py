@@ -11,6 +11,16 @@ if TYPE_CHECKING:
 # the estimate is wrong; it may be worse than it could be; good to know
 ERROR, WARNING, NOTE = "error", "warning", "note"
 SEVERITIES = (ERROR, WARNING, NOTE)
+# ERRORs by which the position is wrong, and its stated deviation too small; rules over a survey are among them whatever they are called
+POSITION_WRONG = frozenset(
+    ["tdoa_sign", "tdoa_one_sign", "tdoa_large", "tdoa_unit", "two_tags", "ids_unknown", "ids_exchanged", "tdoa_clipped", "stamps_unit",
+     "stamps_coarse"]
+)
+SURVEY = "survey"
+WRONG_WITH_IMU = frozenset(  # the same while the filter uses the IMU
+    ["imu_force_unit", "imu_no_gravity", "imu_rate_unit", "imu_turned", "imu_axes", "imu_silent", "imu_axis_dead", "stamps_apart"]
+)
+FEW_UNKNOWN = 0.5  # share of TDOAs with unknown ids, which are not used: below it the others determine the position
 
 
 @dataclass(frozen=True)
@@ -29,6 +39,12 @@ class Finding:
     def sentence(self) -> str:
         """All of it in one line, for /diagnostics."""
         return f"{self.cause} ({self.evidence}): {' '.join(self.remedy.split())}"
+
+    def position_wrong(self, imu_used: bool = True) -> bool:
+        """Return whether it makes the position wrong. imu_used : whether the filter uses the IMU."""
+        if self.severity != ERROR or (self.rule == "ids_unknown" and self.value < FEW_UNKNOWN):
+            return False
+        return self.rule in POSITION_WRONG or self.rule.startswith(SURVEY) or (imu_used and self.rule in WRONG_WITH_IMU)
 
 
 def most_severe_first(findings: Iterable[Finding]) -> list[Finding]:

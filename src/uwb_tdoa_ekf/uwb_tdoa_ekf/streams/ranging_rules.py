@@ -52,6 +52,12 @@ def fixed_step(windows: list[TdoaWindow]) -> Finding | None:
     return Finding("tdoa_wraps", WARNING, cause, evidence, remedy, step)
 
 
+def share_beside_known(windows: list[TdoaWindow], field: str) -> float:
+    """Share of TDOAs that `field` counts because they cannot be used, among these and the known ones, 0 to 1."""
+    count = sum(getattr(w, field) for w in windows)
+    return count / max(count + sum(w.known for w in windows), 1)
+
+
 def impossible(windows: list[TdoaWindow]) -> Finding | None:
     if fixed_step(windows):
         return None
@@ -75,7 +81,7 @@ def impossible(windows: list[TdoaWindow]) -> Finding | None:
 
 
 def of_one(windows: list[TdoaWindow]) -> Finding | None:
-    share = share_of(windows, "of_one")
+    share = share_beside_known(windows, "of_one")
     if share > 1e-3:
         remedy = "message.anchor_a, message.anchor_b = ...  # the two anchors of the difference"
         return Finding("tdoa_of_one", ERROR, "TDOAs name one anchor twice", f"{100.0 * share:.1f} %", remedy, share)
@@ -83,7 +89,7 @@ def of_one(windows: list[TdoaWindow]) -> Finding | None:
 
 
 def invalid(windows: list[TdoaWindow]) -> Finding | None:
-    share = share_of(windows, "invalid")
+    share = share_beside_known(windows, "invalid")
     if share > 1e-3:
         remedy = "do not publish what is not finite"
         return Finding("tdoa_invalid", WARNING, "TDOAs are not finite", f"{100.0 * share:.1f} %", remedy, share)

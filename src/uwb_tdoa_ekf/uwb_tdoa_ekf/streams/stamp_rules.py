@@ -25,6 +25,7 @@ REPEATED, LEAP = 0.3, 0.01  # share of stamps that equal the one before, healthy
 PACE = 0.05  # by which the pace of the stamps may differ from that of the clock
 BLOCK = 0.1  # s between the soonest and the latest arrival of a window, beyond the lag of the first
 APART = 0.1  # s between two streams
+LATEST = 5.0  # s that TDOAs may come late; what is more is another clock
 DRIFT, DRIFTED = 3e-4, 0.03  # s/s, and s over the recording
 LAG, REORDER = 0.25, 0.003  # s: what ekf_node waits for, as its parameters of these names say by default
 UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
@@ -220,9 +221,18 @@ def offset(imu: list[StampWindow], tdoa: list[StampWindow]) -> Finding | None:
     if abs(ahead) < APART:
         return None
     severity = ERROR if abs(ahead) > LAG else WARNING
+    if _late(by_arrival, usual(tdoa, "latency"), usual(imu, "latency")):
+        cause = f"the TDOAs arrive {usual(tdoa, 'latency'):.3f} s after their stamps, the IMU's samples in time"
+        line = f"-p lag:={1.5 * by_arrival:.2f}  # of ekf_node, if the TDOAs are stamped when they are measured; else stamp them so"
+        return Finding("stamps_apart", severity, cause, evidence, line, ahead)
     cause = f"the stamps of imu/data are {abs(ahead):.3f} s {'ahead of' if ahead > 0.0 else 'behind'} those of uwb/tdoa"
     line = f"t_imu {'-' if ahead > 0.0 else '+'}= {abs(ahead):.3f}  # s; or stamp both with the clock of one machine"
     return Finding("stamps_apart", severity, cause, evidence, line, ahead)
+
+
+def _late(by_arrival: float, tdoa: float, imu: float) -> bool:
+    """Whether TDOAs come late, by latencies, s, of streams that have the clock of the arrivals: no stamp is ahead of that."""
+    return math.isfinite(by_arrival) and by_arrival > APART and -APART < imu < APART and tdoa < LATEST
 
 
 def other_clock(imu: list[StampWindow], tdoa: list[StampWindow]) -> Finding | None:

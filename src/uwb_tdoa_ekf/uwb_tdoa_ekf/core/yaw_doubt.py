@@ -1,0 +1,123 @@
+"""Is the yaw that the filter follows the right one? Innovations and the inertial sensor decide, as they do at a start.
+
+A yaw that is wrong by psi turns each predicted change of velocity. The error of the state is linear in cos(psi) - 1 and sin(psi), and the
+filter's own predictions and updates carry it on: two responses of the error state. A generalized likelihood ratio (Willsky and Jones, IEEE
+Trans. Automatic Control 1976) tests the innovations of late against them, for any psi. If the updates have turned the yaw by more than its
+deviation allows, that is evidence too. Nothing here changes the filter before the evidence suffices.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from uwb_tdoa_bias.foundation.compiled import Record, compiled
+
+from .state import ERROR_STATES
+
+MEMORY, TURN_MEMORY = 6.0, 4.0  # s over which innovations, and turns by updates, count
+LARGEST = 3.0  # standard deviations that an innovation counts as at most
+KNOWN = 0.35**2  # rad^2, variance of a yaw that is said to be known: 20 degrees
+PERIOD = 0.1  # s between two tests
+# Log likelihood ratio above which the yaw is opened again. Of 22 measured flights 3.5 at most; in the worst of them 8.7 without its range
+# finder. See docs/reliability.md
+EVIDENCE = 12.0
+TRIED = 24  # angles
+
+
+@compiled
+def clear(doubt: Record) -> None:
+    """Forget all evidence of a YAW_DOUBT: another state was put in place of the one before."""
+    doubt.response[:] = 0.0
+    doubt.vector[:] = 0.0
+    doubt.information[:] = 0.0
+    doubt.turned = doubt.variance = 0.0
+
+
+@compiled
+def predict(ekf: Record, vx: float, vy: float) -> None:
+    """Carry the responses on after `state.predict` of the best hypothesis; vx, vy : m/s, its velocity before."""
+    response, transition, x = ekf.yaw_doubt.response, ekf.transition, ekf.hypotheses[ekf.best].x
+    A, B, E, dt = transition.velocity_attitude, transition.velocity_accel_bias, transition.attitude_attitude, transition.dt
+    along, across = x[3] - vx, x[4] - vy
+    for c in range(2):
+        t0, t1, t2 = response[6, c], response[7, c], response[8, c]
+        b0, b1, b2 = response[9, c], response[10, c], response[11, c]
+        for r in range(3):
+            response[r, c] += dt * response[3 + r, c]
+            response[3 + r, c] += A[r, 0] * t0 + A[r, 1] * t1 + A[r, 2] * t2 + B[r, 0] * b0 + B[r, 1] * b1 + B[r, 2] * b2
+            response[6 + r, c] = E[r, 0] * t0 + E[r, 1] * t1 + E[r, 2] * t2 - dt * response[12 + r, c]
+        dx, dy = (along, across) if c == 0 else (-across, along)
+        response[0, c] += 0.5 * dt * dx
+        response[1, c] += 0.5 * dt * dy
+        response[3, c] += dx
+        response[4, c] += dy
+
+
+@compiled
+def observe(ekf: Record, correlation_length: float, t: float) -> None:
+    """Take the INNOVATION stamped t, s, of the best hypothesis, after its update; correlation_length as in robust.py."""
+    doubt, innovation, best = ekf.yaw_doubt, ekf.innovation, ekf.hypotheses[ekf.best]
+    response, information, vector = doubt.response, doubt.information, doubt.vector
+    variance = innovation.prior_variance + innovation.noise_variance * correlation_length
+    largest = LARGEST * math.sqrt(variance)
+    value = min(max(innovation.value, -largest), largest)
+    expected = np.zeros(2)
+    for n in range(innovation.entries):
+        for c in range(2):
+            expected[c] += innovation.row[n] * response[innovation.states[n], c]
+    dt = max(t - doubt.t, 0.0) if doubt.t > -np.inf else 0.0
+    doubt.t = t
+    kept, kept_turn = math.exp(-dt / MEMORY), math.exp(-dt / TURN_MEMORY)
+    for i in range(2):
+        vector[i] = kept * vector[i] + expected[i] * value / variance
+        for j in range(2):
+            information[i, j] = kept * information[i, j] + expected[i] * expected[j] / variance
+    doubt.turned *= kept_turn
+    of_yaw = _yaw_variance(best)
+    doubt.variance = max(of_yaw, of_yaw + (doubt.variance - of_yaw) * kept_turn)
+    if innovation.weight > 0.0:
+        gain, total = innovation.cross_covariance, innovation.total_variance
+        for c in range(2):
+            for i in range(ERROR_STATES):
+                response[i, c] -= gain[i] / total * expected[c]
+        u0, u1, u2 = _up(best.x)
+        doubt.turned += (u0 * gain[6] + u1 * gain[7] + u2 * gain[8]) / total * innovation.value
+
+
+@compiled
+def evidence(doubt: Record) -> float:
+    """Log likelihood ratio of the best other yaw, and what the turns by updates add."""
+    v, J = doubt.vector, doubt.information
+    best = 0.0
+    for k in range(1, TRIED):
+        psi = 2.0 * math.pi * k / TRIED
+        c, s = math.cos(psi) - 1.0, math.sin(psi)
+        best = max(best, c * v[0] + s * v[1] - 0.5 * (c * c * J[0, 0] + 2.0 * c * s * J[0, 1] + s * s * J[1, 1]))
+    return best + 0.5 * doubt.turned**2 / max(doubt.variance, 1e-9)
+
+
+@compiled
+def contradicts(ekf: Record, t: float) -> bool:
+    """Whether the yaw is said to be known, and the evidence at stamp t, s, is against it. Looks once in PERIOD."""
+    doubt = ekf.yaw_doubt
+    if t < doubt.next_look:
+        return False
+    doubt.next_look = t + PERIOD
+    doubt.evidence = evidence(doubt)
+    return doubt.evidence > EVIDENCE and _yaw_variance(ekf.hypotheses[ekf.best]) < KNOWN
+
+
+@compiled
+def _up(x: np.ndarray) -> tuple[float, float, float]:
+    """The vertical of the world in the body frame, of a nominal state."""
+    return 2.0 * (x[6] * x[8] - x[9] * x[7]), 2.0 * (x[7] * x[8] + x[9] * x[6]), 1.0 - 2.0 * (x[6] ** 2 + x[7] ** 2)
+
+
+@compiled
+def _yaw_variance(hypothesis: Record) -> float:
+    """rad^2, of the rotation about the vertical."""
+    P, (u0, u1, u2) = hypothesis.P, _up(hypothesis.x)
+    square = u0 * u0 * P[6, 6] + u1 * u1 * P[7, 7] + u2 * u2 * P[8, 8]
+    return square + 2.0 * (u0 * u1 * P[6, 7] + u0 * u2 * P[6, 8] + u1 * u2 * P[7, 8])
