@@ -13,7 +13,7 @@ ERROR, WARNING, NOTE = "error", "warning", "note"
 SEVERITIES = (ERROR, WARNING, NOTE)
 # ERRORs by which the position is wrong, and its stated deviation too small; rules over a survey are among them whatever they are called
 POSITION_WRONG = frozenset(
-    ["tdoa_sign", "tdoa_one_sign", "tdoa_large", "tdoa_unit", "two_tags", "ids_unknown", "ids_exchanged", "tdoa_clipped", "stamps_unit",
+    ["tdoa_sign", "tdoa_one_sign", "tdoa_large", "tdoa_unit", "two_tags", "ids_unknown", "ids_exchanged", "anchor_scale", "tdoa_clipped", "stamps_unit",
      "stamps_coarse"]
 )
 SURVEY = "survey"
