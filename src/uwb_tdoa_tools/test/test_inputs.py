@@ -21,6 +21,7 @@ from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.bags.files import messages, new_bag, open_bag
 from uwb_tdoa_tools.bags.message_types import typestore
 from uwb_tdoa_tools.readers import inputs, read_flight
+from uwb_tdoa_tools.readers.names import read_named
 from uwb_tdoa_tools.readers.inputs import Reading, find_flights, need_tdoas, survey_for
 
 
@@ -280,3 +281,11 @@ def test_a_folder_that_a_killed_process_left_is_removed_by_the_next(tmp_path, mo
     killed.communicate()
     with temporary_folder() as own:
         assert not left.exists() and own.is_dir()
+
+
+@pytest.mark.parametrize("position", ["[1, 2an, 3]", "[1, [2], 3]", "[1, {a: 1}, 3]", "x", "~", "{x: 1}", "[]"])
+@pytest.mark.parametrize("name", ["0", "NE corner"])
+def test_a_position_that_is_no_numbers_is_refused(tmp_path, name, position):
+    (tmp_path / "survey.yaml").write_text(f"anchors: {{{name}: {{position: {position}}}}}\n")
+    with pytest.raises(InputError, match="survey.yaml: "):
+        read_named(tmp_path / "survey.yaml")

@@ -11,6 +11,7 @@ import numpy as np
 from uwb_tdoa_bias.foundation import survey
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.limits import TooMuch
 from uwb_tdoa_bias.foundation.safe_yaml import read_yaml
 from uwb_tdoa_bias.foundation.survey_faults import refuse_faulty
 
@@ -51,10 +52,13 @@ def read_named(path: str | Path) -> Named:
 def _read_named(path: str | Path) -> Named:
     try:
         return Named(survey.read_survey(path))
-    except InputError as refused:
+    except TooMuch:
+        raise
+    except InputError as error:
+        refused = error
         names, positions, orientations, frame = _entries(path)
         if not names:
-            raise refused
+            raise
     if len(set(names)) < len(names):
         raise InputError(
             f"{path}: anchor {next(name for name in names if names.count(name) > 1)!r} is there twice; every anchor needs its own name."
@@ -63,7 +67,12 @@ def _read_named(path: str | Path) -> Named:
     ids = [int(end[1]) for end in ends if end]
     if len(set(ids)) < len(names) or max(ids) > LARGEST_ID:
         ids = list(range(len(names)))
-    return Named(Anchors(np.array(ids), positions, orientations, frame), dict(zip(names, ids)))
+    try:
+        return Named(Anchors(np.array(ids), positions, orientations, frame), dict(zip(names, ids)))
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    except (TypeError, ValueError) as error:  # a text, or a list, in place of a number
+        raise refused from error
 
 
 def read_survey(path: str | Path) -> Anchors:
