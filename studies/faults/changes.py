@@ -179,7 +179,7 @@ def republished(period: float, change: Callable[[Anchors, np.random.Generator], 
 
 
 def framed(stream: str, *frames: str) -> Change:
-    """Messages of a stream come in these frames, one after the other. By /tf_static the first is that of the body, each other is APART above
+    """Messages of a stream come in these frames, in turn. By /tf_static the first is that of the body, each other is APART above
     the one before."""
 
     def changed(events: list[Event], scene: Scene) -> list[Event]:

@@ -3,7 +3,8 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uwb_tdoa_bias.foundation.stamps import CONTRADICTED, LARGEST_STEP_AHEAD, LARGEST_STEP_BACK, MOST_HELD, STEP_AHEAD, UNCONTRADICTED, StampGate
+from uwb_tdoa_bias.foundation.stamps import CONTRADICTED, LARGEST_STEP_AHEAD, LARGEST_STEP_BACK, MOST_HELD, STEP_AHEAD, UNCONTRADICTED
+from uwb_tdoa_bias.foundation.stamps import StampGate
 
 
 def through(stamps, reached=()):

@@ -139,7 +139,8 @@ class ReorderBuffer:
                 if good:
                     self._take_in(place, t, rows[k : k + 1])
                 elif t <= self._limit(place):
-                    self._streams[place].gate.pass_time(t, self._reached(place))  # or whoever waits for our pose of this time waits for the next one
+                    # or whoever waits for our pose of this time waits for the next one
+                    self._streams[place].gate.pass_time(t, self._reached(place))
         if place in LEADING:
             self._judge(place)
         else:

@@ -63,10 +63,11 @@ def observe(ekf: Record, correlation_length: float, t: float) -> None:
     variance = innovation.prior_variance + innovation.noise_variance * correlation_length
     largest = LARGEST * math.sqrt(variance)
     value = min(max(innovation.value, -largest), largest)
-    expected = np.zeros(2)
+    cosine = sine = 0.0
     for n in range(innovation.entries):
-        for c in range(2):
-            expected[c] += innovation.row[n] * response[innovation.states[n], c]
+        cosine += innovation.row[n] * response[innovation.states[n], 0]
+        sine += innovation.row[n] * response[innovation.states[n], 1]
+    expected = cosine, sine
     dt = max(t - doubt.t, 0.0) if doubt.t > -np.inf else 0.0
     doubt.t = t
     kept, kept_turn = math.exp(-dt / MEMORY), math.exp(-dt / TURN_MEMORY)

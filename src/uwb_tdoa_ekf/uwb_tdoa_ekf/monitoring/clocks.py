@@ -17,17 +17,15 @@ STAMP_LINE = "message.header.stamp = ...  # when the sample was measured, by the
 
 def clock_ahead(stream: str, lead: float, count: int) -> Finding:
     """Return the finding for a stream of STREAMS that is ahead of the others by `lead`, s; count : its invalid messages so far."""
-    cause = f"the stamps of {TOPICS[stream]} are {lead:.3g} s ahead of those of the other streams; its messages are not used"
-    return Finding("clock_ahead", WARNING, cause, f"{count} invalid messages so far", STAMP_LINE, lead)
+    what = f"the stamps of {TOPICS[stream]} are {lead:.3g} s ahead of those of the other streams; its messages are not used"
+    return Finding("clock_ahead", WARNING, what, f"{count} invalid messages so far", STAMP_LINE, lead)
 
 
 def restarted(cause: Restart) -> Finding:
     """Return the finding for a Restart of the filter."""
     topic = TOPICS[cause.stream]
-    if cause.overtaken:
-        what = f"{topic} is stamped {-cause.step:.3g} s before the time of the other streams"
-    else:
-        what = f"the stamps of {topic} fell back by {-cause.step:.3g} s"
+    how = "are before the time of the other streams" if cause.overtaken else "fell back"
     evidence = f"the new time begins at {cause.at:.3f} s after the first stamp"
     remedy = "keep the clocks of all drivers in step (chronyc tracking); a recording that is played again does this, too"
-    return Finding("restarted", WARNING, f"{what}: the filter has started anew", evidence, remedy, cause.step)
+    what = f"the filter has started anew, because the stamps of {topic} {how} by {-cause.step:.3g} s"
+    return Finding("restarted", WARNING, what, evidence, remedy, cause.step)

@@ -13,8 +13,8 @@ ERROR, WARNING, NOTE = "error", "warning", "note"
 SEVERITIES = (ERROR, WARNING, NOTE)
 # ERRORs by which the position is wrong, and its stated deviation too small; rules over a survey are among them whatever they are called
 POSITION_WRONG = frozenset(
-    ["tdoa_sign", "tdoa_one_sign", "tdoa_large", "tdoa_unit", "two_tags", "ids_unknown", "ids_exchanged", "anchor_scale", "tdoa_clipped", "stamps_unit",
-     "stamps_coarse"]
+    ["tdoa_sign", "tdoa_one_sign", "tdoa_large", "tdoa_unit", "two_tags", "ids_unknown", "ids_exchanged", "anchor_scale", "tdoa_clipped",
+     "stamps_unit", "stamps_coarse"]
 )
 SURVEY = "survey"
 WRONG_WITH_IMU = frozenset(  # the same while the filter uses the IMU
