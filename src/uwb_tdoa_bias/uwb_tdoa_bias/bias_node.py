@@ -229,10 +229,10 @@ class BiasNode(StreamNode):
 
     def _take_poses(self, frame: str, t: np.ndarray, rows: np.ndarray) -> None:
         if frame != self._corrector.anchors.frame:
-            self.get_logger().warning(
+            self.warn_at_times(
+                "frame of odometry",
                 f"odometry is in frame '{frame}', the anchors in '{self._corrector.anchors.frame}': "
                 "taken as the same frame",
-                once=True,
             )
         if self._poses.take_all(t.tolist()):
             self._add_poses(t, rows)

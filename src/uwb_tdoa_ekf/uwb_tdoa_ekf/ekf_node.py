@@ -264,10 +264,10 @@ class EkfNode(StreamNode):
         gyro, accel = rows["angular_velocity"].copy(), rows["linear_acceleration"].copy()  # the specific force, says REP 145
         unmeasured = (rows["angular_velocity_covariance"][:, 0] == -1.0) | (rows["linear_acceleration_covariance"][:, 0] == -1.0)
         if unmeasured.any():
-            self.get_logger().warning(
+            self.warn_at_times(
+                "unmeasured",
                 "imu/data says with a covariance of -1 that it has no angular velocity or no acceleration: such "
                 "samples are not used; without a whole IMU set use_imu to false",
-                once=True,
             )
             gyro[unmeasured] = math.nan
         if mount is not None:  # first: effects are of axes of the body, as diagnose sees them
