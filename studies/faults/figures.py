@@ -11,6 +11,7 @@ import tempfile
 from typing import Any, TYPE_CHECKING
 
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.files import write_text
 from uwb_tdoa_tools import parallel
 from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
@@ -56,9 +57,9 @@ def run(args: argparse.Namespace) -> None:
         lines.append(judge.line(row))
         print(lines[-1], flush=True)
         if args.json:
-            args.json.write_text(json.dumps(rows, indent=1), encoding="utf-8")
+            write_text(args.json, json.dumps(rows, indent=1))
         if args.out:
-            args.out.write_text("\n".join([*lines, ""]), encoding="utf-8")
+            write_text(args.out, "\n".join([*lines, ""]))
     print(f"{sum(row['verdict'].startswith('ok') for row in rows)} of {len(rows)} ok")
 
 

@@ -140,7 +140,7 @@ def judged(name: str, fault: Fault, heard: Heard, scene: Scene) -> dict[str, Any
 
 
 def verdict(row: dict[str, Any]) -> str:
-    """"ok", or MISS and what was missed."""
+    """Return "ok", or MISS and what was missed."""
     missed = [
         text
         for text, is_missed in {

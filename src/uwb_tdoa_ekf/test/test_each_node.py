@@ -61,8 +61,9 @@ def test_a_measurement_waits_for_its_pose(make_rig, delays):
     assert rig.corrected[0].status == TdoaCorrected.STATUS_EFFECTS and rig.corrected[0].model == "anchor_delay"
     assert rig.corrected[0].bias == pytest.approx(-0.15) and rig.corrected[0].corrected == pytest.approx(1.15)
 
+    rig.send_pose(0.2)  # the first: nothing is corrected in the next 0.2 s
     rig.send_pose(0.5)
-    rig.counts("bias_node", poses=1)
+    rig.counts("bias_node", poses=2)
     for t in (0.56, 0.6, 0.64, 0.68):
         rig.send_tdoa(t, 14, 10, 1.0)
     counts = rig.counts("bias_node", received=5)

@@ -10,7 +10,7 @@ from uwb_tdoa_ekf.monitoring.use import Use
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.streams import ERROR, WARNING, Finding
 
-STARTS = SimpleNamespace(running=False, lost=None, without_imu=None, yaw_doubts=0)
+STARTS = SimpleNamespace(running=False, lost=None, without_imu=None, yaw_doubts=0, restarted=None)
 RUNS = SimpleNamespace(running=True, lost=None, without_imu=None, yaw_doubts=0)
 IS_LOST = SimpleNamespace(running=False, lost="the tag is lost", without_imu=None, yaw_doubts=0)
 KNOWN, UNKNOWN = math.radians(6.0), math.radians(100.0)

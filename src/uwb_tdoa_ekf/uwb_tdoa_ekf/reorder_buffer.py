@@ -435,7 +435,7 @@ class _Stream:
 def _append(
     room: np.ndarray, first: int, end: int, rows: np.ndarray, clock: tuple[float, float], after: float, limit: float
 ) -> tuple[float, float]:  # fmt: skip
-    newest, usual = clock
+    newest, usual = clock[0], clock[1]
     last = max(newest, room[end - 1].t) if end > first else newest
     if newest == -np.inf:
         newest = rows[0].t

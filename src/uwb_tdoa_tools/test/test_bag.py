@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from recordings import ANCHORS, differences, small_flight
@@ -19,6 +19,7 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
 from uwb_tdoa_bias.foundation.sensors import Height, Pressure, Velocity
+from uwb_tdoa_bias.foundation.survey_faults import survey_faults
 from uwb_tdoa_tools.bags.bag import read_bag, read_fields, read_odometry, write_bag
 from uwb_tdoa_tools.bags.files import messages, new_bag, open_bag
 from uwb_tdoa_tools.bags.messages import tdoa_messages
@@ -79,9 +80,9 @@ def flights(draw):
     ids = draw(st.lists(st.integers(0, 65535), min_size=1, max_size=4, unique=True))
     unit = st.sampled_from([[0.0, 0.0, 0.0, 1.0], [0.6, 0.0, -0.8, 0.0], [np.nan] * 4])
     n = len(ids)
-    anchors = Anchors(
-        ids, np.clip(values(n, 3), -1e8, 1e8), draw(st.lists(unit, min_size=n, max_size=n))
-    )
+    positions = draw(arrays(float, (n, 3), elements=st.floats(-100.0, 100.0)))
+    anchors = Anchors(ids, positions, draw(st.lists(unit, min_size=n, max_size=n)))
+    assume(not survey_faults(anchors))  # or the bag is refused
     t = stamps(1)
     a, variance = draw(arrays(np.int64, len(t), elements=st.sampled_from(ids))), np.abs(values(len(t)))
     tdoas = Tdoas(t, a, np.full(len(t), 65535), values(len(t)), variance)

@@ -1,6 +1,7 @@
 """Recordings whose clock is set, starts again or wraps: read on one continuous time, named by check, and of no more memory."""
 
 from dataclasses import replace
+import os
 import resource
 import subprocess
 import sys
@@ -134,7 +135,9 @@ def test_a_gap_of_any_length_takes_no_more_memory(by):
     def bound():
         resource.setrlimit(resource.RLIMIT_AS, (6 << 30, 6 << 30))  # of addresses: libraries reserve many
 
+    there = {name: value for name, value in os.environ.items() if name != "PYTHONSAFEPATH"}  # other tests set it
     done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, str(by)], cwd=Path(__file__).parent, preexec_fn=bound, capture_output=True, text=True, timeout=300
-    )
+        [sys.executable, "-c", PROGRAM, str(by)], cwd=Path(__file__).parent, env=there, preexec_fn=bound, capture_output=True, text=True,
+        timeout=300,
+    )  # fmt: skip
     assert done.returncode == 0, done.stderr[-2000:]

@@ -101,6 +101,7 @@ def test_the_middleware_obeys_no_profiles_there(tmp_path, protected):
     (tmp_path / "start.py").write_text(code)
     kept = {name: value for name, value in os.environ.items() if name != "SKIP_DEFAULT_XML_FILE"}
     kept["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
+    kept.pop("PYTHONSAFEPATH", None)  # a user's own shell does not set it
     done = subprocess.run([sys.executable, "start.py"], cwd=tmp_path, env=kept, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     assert (victim.read_text() == "precious\n") == protected  # or the attack would be none

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 # status of one correction; the values of TdoaCorrected.STATUS_*
 PASSED, EFFECTS, NETWORK, FADED = range(4)
-START = 0.5  # s after the first pose, before which no TDOA is corrected; start and take-off are slower than that
+START = 0.2  # s after the first pose, before which no TDOA is corrected: what is not corrected there costs accuracy
 LARGEST_YAW_STD = 1.0  # rad; a yaw that is less certain is unknown: the filter follows four, 90 degrees apart
 FADED_BELOW = 0.5  # share of what can be known that a network's prediction has at least, or it counts as faded
 

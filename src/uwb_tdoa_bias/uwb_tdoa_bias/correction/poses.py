@@ -102,7 +102,7 @@ def _look_up(
     out: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
 ) -> None:  # fmt: skip
     places, p, q, yaw_std = out[0], out[1], out[2], out[3]
-    lag, begin = limits
+    lag, begin = limits[0], limits[1]
     precede(t, newest, yaw_std)
     for i in range(len(t)):
         place = np.searchsorted(kept.t[:count], yaw_std[i] - lag, side="right") - 1 if yaw_std[i] >= begin else -1
