@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import numpy as np
 
-LARGE = 0.75  # m, an innovation that shows something
-GAIN = 0.35  # share of it that is left with the other sign
-SHARE = 0.65  # of the large innovations, that must become so small; after a turn 0.68 to 0.99 in simulated flights
-FEWEST = 10  # large innovations
+LARGE = 0.75  # m, by which a TDOA changes with its sign, below which it shows nothing
+GAIN = 0.35  # share of that change that may be left with the other sign
+SHARE = 0.5  # of the TDOAs that show something, which the other sign must explain
+FEWEST = 10  # TDOAs that show something
 
 
 def turned(innovation: np.ndarray, predicted: np.ndarray) -> bool:
-    """Return whether the other sign explains what is large of the innovations (n,), m; predicted : (n,) m, at the place of the filter."""
-    large = np.abs(innovation) > LARGE
-    if np.count_nonzero(large) < FEWEST:
+    """Return whether the other sign explains the innovations (n,), m; predicted : (n,) m, at the place of the filter.
+
+    All TDOAs that are far from zero are asked, those that the filter explains, too. Where a few anchors are late, as near a floor, most
+    TDOAs contradict a turn.
+    """
+    change = np.abs(2.0 * predicted)
+    asked = change > LARGE
+    if np.count_nonzero(asked) < FEWEST:
         return False
-    left = np.abs(2.0 * predicted[large] + innovation[large])  # -d - predicted, of a measured d
-    return bool(np.mean(left < GAIN * np.abs(innovation[large])) > SHARE)
+    left = np.abs(2.0 * predicted[asked] + innovation[asked])  # -d - predicted, of a measured d
+    return bool(np.mean(left < GAIN * change[asked]) > SHARE)
