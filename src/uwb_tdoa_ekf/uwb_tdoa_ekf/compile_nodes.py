@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from uwb_tdoa_bias.correction import corrector
 from uwb_tdoa_bias.correction.network import SHIPPED, load_network
 from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_bias.effects.tag_lever_arm import TagLeverArm
 
 from .warm_up import warm_up
 
@@ -38,6 +39,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     began = time.monotonic()
     warm_up()
     corrector.warm_up(EffectSet(), load_network(SHIPPED))
+    corrector.warm_up(EffectSet((TagLeverArm(values={"z": 0.1}),)), None)  # a frame on /tf_static brings one, while the node runs
     print(f"both nodes are compiled; {time.monotonic() - began:.0f} s")
     return 0
 

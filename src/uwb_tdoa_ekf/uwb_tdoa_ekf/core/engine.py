@@ -29,7 +29,7 @@ from . import (
     workspace,
     yaw_doubt,
 )
-from .memory import HYPOTHESES, ODOMETRY, RESIDUAL, FilterState, Measurements, Output
+from .memory import HYPOTHESES, ODOMETRY, RESIDUAL, YAWS, FilterState, Measurements, Output
 from .sensor_functions import subtract
 from .startup import INLIER
 from .state import coast, predict
@@ -187,7 +187,7 @@ def _on_range(
             continue
         ranges.compare(hypothesis, anchor.position, aid, parameters, innovation)
         innovation.repeated, innovation.curvature = rest.repetition(ekf, t), 0.0
-        _assimilate(ekf, h, parameters, t, residual, records)
+        _assimilate(ekf, h, parameters, t, residual, records, False)
         if h == ekf.best:
             ranges.keep_offset(ekf, hypothesis)
             systematic.observe(ekf.information, anchor, anchor, innovation, t, ekf.last_tdoa)
@@ -221,7 +221,8 @@ def _after_update(
         _stay_on_floor(ekf, parameters, t, records)
     followed = ekf.best
     alone = hypotheses.select(ekf, t) and parameters.use_imu and not (ekf.quiet or ekf.resting)
-    if ekf.best != followed:  # at another place, or with another yaw
+    # At another place. Or with another yaw, after one was opened again: the yaws of a start share the history before the choice.
+    if ekf.best // YAWS != followed // YAWS or (ekf.best != followed and ekf.yaw_doubt.count > 0):
         history.add_reset(ekf, t, records)
     if alone and yaw_doubt.contradicts(ekf, t):
         initialization.open_yaw(ekf, parameters, records)
@@ -359,7 +360,7 @@ def _update(
             continue
         _compare(hypothesis, a, b, tdoa, known, innovation)
         innovation.repeated = rest.repetition(ekf, tdoa.t)
-        _assimilate(ekf, h, parameters, tdoa.t, residual, records)
+        _assimilate(ekf, h, parameters, tdoa.t, residual, records, True)
         if h == ekf.best:
             systematic.observe(ekf.information, a, b, innovation, tdoa.t, ekf.last_tdoa)
             height.update_pull(ekf.height, parameters, innovation, tdoa.t)
@@ -396,9 +397,10 @@ def _compare(
 
 @compiled
 def _assimilate(
-    ekf: Record, h: int, parameters: Record, t: float, residual: Record, records: np.ndarray
+    ekf: Record, h: int, parameters: Record, t: float, residual: Record, records: np.ndarray, of_tdoa: bool
 ) -> None:
-    """Hypothesis h with ekf.innovation, of whatever kind; that of the best one becomes the RESIDUAL."""
+    """Hypothesis h with ekf.innovation, of whatever kind; that of the best one becomes the RESIDUAL. of_tdoa : it shows whether the yaw is
+    right; ranges may be off by an offset, which looks alike."""
     hypothesis, innovation = ekf.hypotheses[h], ekf.innovation
     hypotheses.add_log_likelihood(hypothesis, innovation, parameters.tdoa_correlation_length * innovation.repeated)
     robust.update(hypothesis, innovation, parameters)
@@ -408,7 +410,7 @@ def _assimilate(
         residual.weight = innovation.weight
         residual.verdict = USED if innovation.weight > 0.0 else REJECTED
         if ekf.yaw_doubt.alone:
-            yaw_doubt.observe(ekf, parameters.tdoa_correlation_length * innovation.repeated, t)
+            yaw_doubt.observe(ekf, parameters.tdoa_correlation_length * innovation.repeated, t, of_tdoa)
         if residual.verdict == USED:
             history.add_update(ekf, t, records)
 

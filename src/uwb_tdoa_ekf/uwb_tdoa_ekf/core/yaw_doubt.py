@@ -56,8 +56,9 @@ def predict(ekf: Record, vx: float, vy: float) -> None:
 
 
 @compiled
-def observe(ekf: Record, correlation_length: float, t: float) -> None:
-    """Take the INNOVATION stamped t, s, of the best hypothesis, after its update; correlation_length as in robust.py."""
+def observe(ekf: Record, correlation_length: float, t: float, shows: bool) -> None:
+    """Take the INNOVATION stamped t, s, of the best hypothesis, after its update; correlation_length as in robust.py. shows : it is evidence;
+    else the responses follow its update, and nothing more."""
     doubt, innovation, best = ekf.yaw_doubt, ekf.innovation, ekf.hypotheses[ekf.best]
     response, information, vector = doubt.response, doubt.information, doubt.vector
     variance = innovation.prior_variance + innovation.noise_variance * correlation_length
@@ -68,23 +69,25 @@ def observe(ekf: Record, correlation_length: float, t: float) -> None:
         cosine += innovation.row[n] * response[innovation.states[n], 0]
         sine += innovation.row[n] * response[innovation.states[n], 1]
     expected = cosine, sine
-    dt = max(t - doubt.t, 0.0) if doubt.t > -np.inf else 0.0
-    doubt.t = t
-    kept, kept_turn = math.exp(-dt / MEMORY), math.exp(-dt / TURN_MEMORY)
-    for i in range(2):
-        vector[i] = kept * vector[i] + expected[i] * value / variance
-        for j in range(2):
-            information[i, j] = kept * information[i, j] + expected[i] * expected[j] / variance
-    doubt.turned *= kept_turn
-    of_yaw = _yaw_variance(best)
-    doubt.variance = max(of_yaw, of_yaw + (doubt.variance - of_yaw) * kept_turn)
+    if shows:
+        dt = max(t - doubt.t, 0.0) if doubt.t > -np.inf else 0.0
+        doubt.t = t
+        kept, kept_turn = math.exp(-dt / MEMORY), math.exp(-dt / TURN_MEMORY)
+        for i in range(2):
+            vector[i] = kept * vector[i] + expected[i] * value / variance
+            for j in range(2):
+                information[i, j] = kept * information[i, j] + expected[i] * expected[j] / variance
+        doubt.turned *= kept_turn
+        of_yaw = _yaw_variance(best)
+        doubt.variance = max(of_yaw, of_yaw + (doubt.variance - of_yaw) * kept_turn)
     if innovation.weight > 0.0:
         gain, total = innovation.cross_covariance, innovation.total_variance
         for c in range(2):
             for i in range(ERROR_STATES):
                 response[i, c] -= gain[i] / total * expected[c]
-        u0, u1, u2 = _up(best.x)
-        doubt.turned += (u0 * gain[6] + u1 * gain[7] + u2 * gain[8]) / total * innovation.value
+        if shows:
+            u0, u1, u2 = _up(best.x)
+            doubt.turned += (u0 * gain[6] + u1 * gain[7] + u2 * gain[8]) / total * innovation.value
 
 
 @compiled

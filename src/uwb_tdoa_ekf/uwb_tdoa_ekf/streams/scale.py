@@ -25,11 +25,12 @@ PAIRS, HEARD = 32, 5  # pairs of a snapshot at most; anchors at least: three coo
 SMALL = 0.05  # m, median size of TDOAs below which they are not in metres themselves
 FEWEST, MANY, KEPT = 4, 20, 60  # snapshots that say something clear, and anything, and that are kept in flight
 SINGLE = 12  # anchors at most, of which each by itself, and any two, are tried: the work has a bound
-SMALLEST, RATIO, LARGEST = 1.5, 1.25, 1500.0  # least factor that counts, ratio of successive ones, and the largest
+SMALLEST, RATIO, LARGEST = 2.0, 1.25, 1500.0  # least factor that counts, ratio of successive ones, and the largest
 LOSS, STEPS, NEAR = 0.5, 8, 0.3  # m, scale of the Geman-McClure loss; Gauss-Newton steps; of the size of the room, the longest of them
 STARTS = np.array([[0.0, 0.0, 0.0], [0.6, 0.6, 0.6], [-0.6, -0.6, 0.6], [0.6, -0.6, -0.6], [-0.6, 0.6, -0.6]])
-LEFT, DEVIATIONS = 0.85, 3.5  # share of the loss that may be left, and standard errors by which it is less than that of the survey as it is
-LEFT_ALONE = 0.65  # the same of one anchor in another unit: one of many explains some of any mistake; measured, in feet 0.50
+# Share of the loss that may be left, and standard errors by which it is less than that of the survey as it is. Another scale, or another
+# place of one anchor, explains some of any mistake: 0.84 of a tape with errors of 0.1 m. In feet 0.50 is left on measured flights.
+LEFT, DEVIATIONS = 0.65, 3.5
 GOOD = 0.35  # loss of a survey that fits; healthy flights of three days have 0.10 to 0.25
 MOVED, CLEARLY = 0.3, 0.5  # m by which the tag must have moved; share of the loss that shows it after few seconds and at rest, too
 NANOSECONDS = 0.299792458  # TDOAs in this unit look like a survey that is too small by this factor
@@ -70,7 +71,7 @@ class SurveyScale:
         others = np.flatnonzero((kind == AS_IT_IS) | (kind == SIGN) | (kind == EXCHANGED))
         rival = int(others[np.argmin(mean[others])])
         left, z = _compared(losses[:, rival], losses[:, best])
-        if left > (LEFT if kind[best] == SCALED else LEFT_ALONE) or z < DEVIATIONS or mean[best] > GOOD:
+        if left > LEFT or z < DEVIATIONS or mean[best] > GOOD:
             return None
         if left > CLEARLY and (len(losses) < MANY or _spread(np.array([places[best] for places in self._places])) < MOVED):
             return None
