@@ -77,7 +77,7 @@ class Played:
             arrival = np.maximum.accumulate(measured + delays + LATENCY * rng.random(len(measured)))
             arrivals += [(a, place, t, m) for a, t, m, k in zip(arrival, stamps, measured, kept) if k]
             self.sent[place] = int(kept.sum())
-        self.most_waiting, self._measured = 0, {}
+        self.most_waiting, self.lowest_lead, self._measured = 0, 0.0, {}
         for self.now, place, t, measured in sorted(arrivals):
             rows = np.zeros(1, KIND.get(place, AID))
             rows["t"] = t
@@ -87,6 +87,7 @@ class Played:
             self.buffer.add(place, rows, np.ones(1, bool))
             self._take(self.buffer.watermark)
             self.most_waiting = max(self.most_waiting, *self.buffer.waiting)
+            self.lowest_lead = min(self.lowest_lead, *self.buffer.leads)
         self.buffer.finish()
         self._take(np.inf)
 
@@ -173,7 +174,7 @@ def test_a_clock_that_is_ahead_is_named_while_it_is(place, most):
     for end in (LENGTH, END):
         played = Played({IMU_STREAM: HEALTHY, TDOA_STREAM: HEALTHY, place: Fault("offset", most, 0.0, end)}, 1)
         leads.append(played.buffer.leads[place])
-    assert leads == [pytest.approx(most, abs=0.1), 0.0]
+    assert leads == [pytest.approx(most, abs=0.1), 0.0] and played.lowest_lead == 0.0
     assert f"{most:.3g} s ahead" in clock_ahead(STREAMS[place], most, 7).sentence
 
 

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 
-from flights import corners, fly, measurements
+from flights import corners, fly
 from live import assert_same
 import numpy as np
 import pytest
@@ -12,8 +12,6 @@ from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_bias.foundation.flight import Imu, Tdoas
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.core.engine import feed
-from uwb_tdoa_ekf.core.memory import Measurements, new_state
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.offline import run_offline
 
@@ -130,51 +128,3 @@ def test_without_an_imu_it_stands_too():
         flight = replace(on_floor(seed, 5.0), imu=None)
         _, error, nees = run(flight, use_imu=False)
         assert np.linalg.norm(error, axis=1).max() < 0.6 and nees.mean() < 9.0
-
-
-def simulated(protocol, seed, share, speed=0.0, duration=16.0):
-    """A flight of a tag at rest, or on a slow circle, whose inertial sensor neither shakes nor turns; a share of its TDOAs is received."""
-    anchors, rng = corners(), np.random.default_rng(seed)
-    rate, n = (475.0, len(anchors)) if protocol == "tdoa2" else (240.0, len(anchors))
-    flight = fly(seed, duration, hover=True, imu_rate=100.0, tdoa_rate=rate)
-    t = flight.tdoa.t
-    b = np.arange(len(t)) % n if protocol == "tdoa2" else rng.integers(0, n, len(t))
-    a = (b - 1) % n if protocol == "tdoa2" else (b + rng.integers(1, n, len(t))) % n
-
-    def at(t):
-        turned = speed / 2.0 * np.asarray(t)
-        return np.array([3.5, 4.0, 1.2]) + 2.0 * np.stack([np.cos(turned), np.sin(turned), 0.0 * turned], axis=1)
-
-    d = tdoa(at(t), anchors.positions[a], anchors.positions[b]) + 0.06 * rng.standard_normal(len(t))
-    received = rng.random(len(t)) < share
-    tdoas = Tdoas(*(column[received] for column in (t, anchors.ids[a], anchors.ids[b], d)))
-    turned = speed / 2.0 * flight.imu.t
-    inward = -(speed**2) / 2.0 * np.stack([np.cos(turned), np.sin(turned), 0.0 * turned], axis=1)
-    accel = flight.imu.accel + inward + 0.01 * rng.standard_normal(flight.imu.accel.shape)
-    return replace(flight, tdoa=tdoas, imu=replace(flight.imu, accel=accel), truth=replace(flight.truth, p=at(flight.truth.t)))
-
-
-def share_at_rest(flight):
-    """Share of the time from 3 s on in which the filter takes the tag for one at rest."""
-    state, parameters = new_state(flight.anchors.positions), FilterConfig(initial_yaw_std=0.1).parameters()
-    fed, found = measurements(flight), []
-    for begin in np.arange(0.0, flight.truth.t[-1] - 0.1, 0.1):
-        of_imu, of_tdoa = (rows[(rows["t"] >= begin) & (rows["t"] < begin + 0.1)] for rows in (fed.imu, fed.tdoa))
-        feed(state, parameters, Measurements(of_imu, of_tdoa))
-        if begin > 3.0:
-            found.append(bool(state.record.resting))
-    return np.mean(found)
-
-
-RECEPTION = [(protocol, share) for protocol in ("tdoa2", "tdoa3") for share in (1.0, 0.75, 0.5)]
-
-
-@pytest.mark.parametrize("protocol, share", RECEPTION)
-def test_a_tag_at_rest_is_at_rest_however_few_tdoas_come(protocol, share):
-    assert np.mean([share_at_rest(simulated(protocol, seed, share)) for seed in range(4)]) > 0.8
-
-
-@pytest.mark.parametrize("speed, largest", [(0.1, 0.2), (0.2, 0.1)])
-@pytest.mark.parametrize("protocol, share", RECEPTION)
-def test_a_slow_glide_is_no_rest_however_few_tdoas_come(protocol, share, speed, largest):
-    assert np.mean([share_at_rest(simulated(protocol, seed, share, speed)) for seed in range(4)]) < largest

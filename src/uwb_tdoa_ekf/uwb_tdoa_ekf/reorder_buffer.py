@@ -93,7 +93,7 @@ class ReorderBuffer:
     def leads(self) -> tuple[float, ...]:
         """s by which each stream is ahead of the others, if rows of it have been refused for that lately; else 0."""
         newest = self.newest
-        return tuple(stream.lead if newest < stream.refused + LATELY else 0.0 for stream in self._streams)
+        return tuple(stream.lead if stream.ahead and newest < stream.refused + LATELY else 0.0 for stream in self._streams)
 
     @property
     def newest(self) -> float:
@@ -195,6 +195,8 @@ class ReorderBuffer:
             leads = other in LEADING
             if other == self._reference or stream.gate.newest == -math.inf or leads and place != self._reference:
                 continue
+            if stream.ahead:
+                continue  # its lead is that of the last row that was refused
             compared = self._compared(other)
             stream.lead = stream.gate.newest - compared
             limit = AHEAD_OF_REFERENCE if leads else AHEAD_OF_LEADING

@@ -199,7 +199,7 @@ def _before_update(ekf: Record, anchors: np.ndarray, parameters: Record, t: floa
     """Before an update stamped t, s: whether the tag is at rest, which anchors are heard, and whether a silence left the place open."""
     if parameters.zero_velocity:
         if t >= ekf.next_look:
-            rest.look(ekf, anchors, parameters, initialization.recent(ekf, rest.LONGEST_WINDOW), t, records)
+            rest.look(ekf, anchors, parameters, initialization.recent(ekf, rest.LOOK_WINDOW), t, records)
         if not parameters.use_imu or t - ekf.imu.t > parameters.imu_timeout:
             rest.update_zero_velocity(ekf, t, records)
     if t >= ekf.next_bounds:

@@ -29,13 +29,12 @@ NOT_USED = 0.2  # probability that both anchors of a TDOA are in time, below whi
 
 MOST_PAIRS, MOST_ANCHORS = 64, 24  # of a window that are looked at, those heard first
 FEWEST_PAIRS = 3
-MEDIAN_VARIANCE = 1.57  # of the median of many, times their number, in variances of one; of one or two it is that of their mean
+STILL_TDOAS = 2  # of a pair in each half of the window, at least
 SMALLEST_SPREAD = 0.02  # m, of the values of a pair
-STILL_SPEED = 0.3  # m/s; a horizontal velocity that is not known better than that may be any
+STILL_SPEED = 0.3  # m/s; a velocity that is not known better than that may be none
 LIKELY_SPEED = 1.0  # m/s, of a tag of which nothing is known
 STILL_SCALE, STILL_SWEEPS = 2.5, 5  # standard deviations of a change from which on it is the lateness that has changed
-MOVING, GLIDING = 12.0, 16.0  # normalised square of a velocity that is not zero: of a look, and of a long window
-STILL, UNKNOWN, MOVES = range(3)  # what the TDOAs of a window show of the motion of a tag
+MOVES = 12.0  # normalised square of a velocity that is not zero
 # Median normalised square of the changes at rest, and by how much one of n is larger, times sqrt(n)
 EXPECTED_RATIO, LARGEST_RATIO = 0.45, 3.5
 
@@ -145,8 +144,7 @@ def _lateness(r: float) -> float:
 def find_pairs(window: np.ndarray, pairs: np.ndarray) -> int:
     """Fill in (k,) of PAIR what each pair of anchors, in either order, says in a window (n,) of TDOA, n > 0. Returns how many there are.
 
-    The spread of one TDOA is that of all pairs, by the differences from each TDOA to the next one of its pair: a tag that moves hardly
-    shows there.
+    The scatter within halves of the window is that of all pairs.
     """
     n, count = len(window), 0
     middle = 0.5 * (window[0].t + window[n - 1].t)
@@ -159,24 +157,25 @@ def find_pairs(window: np.ndarray, pairs: np.ndarray) -> int:
         if k < count or count == len(pairs):
             continue
         m0 = m1 = 0
-        t0 = t1 = last = 0.0
+        t0 = t1 = 0.0
         for j in range(i, n):
             tdoa = window[j]
             if _is_of(tdoa, a, b):
                 d = tdoa.d if tdoa.a == a else -tdoa.d
-                if m0 + m1 > 0:
-                    deviations[known] = math.sqrt(0.5) * abs(d - last)
-                    known += 1
-                last = d
                 if tdoa.t < middle:
                     values[0, m0], t0, m0 = d, t0 + tdoa.t, m0 + 1
                 else:
                     values[1, m1], t1, m1 = d, t1 + tdoa.t, m1 + 1
         pair = pairs[count]
         pair.a, pair.b, pair.change_variance = a, b, np.inf
-        if m0 > 0 and m1 > 0:
-            pair.change, pair.apart = np.median(values[1, :m1]) - np.median(values[0, :m0]), t1 / m1 - t0 / m0
-            pair.change_variance = _median_variance(m0) + _median_variance(m1)
+        if m0 >= STILL_TDOAS and m1 >= STILL_TDOAS:
+            first, second = np.median(values[0, :m0]), np.median(values[1, :m1])
+            for half, m, value in ((0, m0, first), (1, m1, second)):
+                for j in range(m):
+                    deviations[known] = abs(values[half, j] - value) * math.sqrt(m / (m - 1.0))
+                    known += 1
+            pair.change, pair.apart = second - first, t1 / m1 - t0 / m0
+            pair.change_variance = 1.57 * (1.0 / m0 + 1.0 / m1)
         for j in range(m1):
             values[0, m0 + j] = values[1, j]
         pair.value = np.median(values[0, : m0 + m1])
@@ -188,75 +187,33 @@ def find_pairs(window: np.ndarray, pairs: np.ndarray) -> int:
 
 
 @compiled
-def _median_variance(n: int) -> float:
-    """Variance of the median of n, in variances of one."""
-    return (MEDIAN_VARIANCE if n > 2 else 1.0) / n
-
-
-@compiled
 def _is_of(tdoa: Record, a: int, b: int) -> bool:
     return (tdoa.a == a and tdoa.b == b) or (tdoa.a == b and tdoa.b == a)
 
 
 @compiled
-def judge_motion(pairs: np.ndarray, anchors: np.ndarray, x: np.ndarray, covariance: np.ndarray) -> int:
-    """STILL if the TDOAs of most (k,) of PAIR stay what they are: whatever their anchors are late by, the tag does not move. MOVES if they
-    change, and UNKNOWN if they are too few, or too noisy, to show either.
+def is_still(pairs: np.ndarray, anchors: np.ndarray, x: np.ndarray, covariance: np.ndarray) -> bool:
+    """True if the TDOAs of most (k,) of PAIR stay what they are: whatever their anchors are late by, the tag does not move.
 
     x : (3,) m, about where it is; covariance (3, 3) m^2/s^2 of the velocity that they would have shown is filled, large where that is not
-    known.
+    known. Least squares of the changes, robust against anchors whose lateness has changed.
     """
-    changes, n = _changes(pairs, anchors, x)
-    if n < FEWEST_PAIRS:
-        return UNKNOWN
-    if np.median(changes[:n, 3] ** 2 / changes[:n, 4]) > EXPECTED_RATIO + LARGEST_RATIO / math.sqrt(n):
-        return MOVES
-    if _velocity(changes[:n], np.empty(3), covariance) >= MOVING:
-        return MOVES
-    return STILL if covariance[0, 0] + covariance[1, 1] < STILL_SPEED**2 else UNKNOWN
-
-
-@compiled
-def is_gliding(pairs: np.ndarray, anchors: np.ndarray, x: np.ndarray) -> bool:
-    """Whether the changes of (k,) of PAIR of a long window are those of one velocity, by more than what that leaves of them: those of
-    anchors whose lateness changes at rest are not. x : (3,) m, about where the tag is."""
-    changes, n = _changes(pairs, anchors, x)
-    if n <= FEWEST_PAIRS:
-        return False
-    v, covariance = np.empty(3), np.empty((3, 3))
-    size = _velocity(changes[:n], v, covariance)
-    for k in range(n):
-        row = changes[k]
-        row[3] -= row[0] * v[0] + row[1] * v[1] + row[2] * v[2]
-    left = np.median(changes[:n, 3] ** 2 / changes[:n, 4]) / EXPECTED_RATIO * n / (n - 3.0)
-    return size > GLIDING * max(1.0, left)
-
-
-@compiled
-def _changes(pairs: np.ndarray, anchors: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, int]:
-    """Jacobian, rate of change, m/s, and its variance, of each of (k,) of PAIR that is heard in both halves of its window: (k, 5), and how
-    many rows of that are filled. x : (3,) m, about where the tag is."""
-    n, changes = 0, np.empty((len(pairs), 5))
+    n, changes, ratios = 0, np.empty((len(pairs), 5)), np.empty(len(pairs))
     for k in range(len(pairs)):
         pair = pairs[k]
         if pair.change_variance < np.inf:
             linearized_tdoa(x, anchors[pair.a].position, anchors[pair.b].position, changes[n, :3])
             changes[n, 3], changes[n, 4] = pair.change / pair.apart, pair.change_variance / pair.apart**2
+            ratios[n] = pair.change**2 / pair.change_variance
             n += 1
-    return changes, n
-
-
-@compiled
-def _velocity(changes: np.ndarray, v: np.ndarray, covariance: np.ndarray) -> float:
-    """Fill in the velocity v (3,), m/s, of (n, 5) of `_changes`, and its covariance (3, 3). Returns its normalised square. Least squares,
-    robust against anchors whose lateness has changed."""
-    both, size = np.empty((3, 7)), 0.0
-    v[:] = 0.0
+    if n < FEWEST_PAIRS or np.median(ratios[:n]) > EXPECTED_RATIO + LARGEST_RATIO / math.sqrt(n):
+        return False
+    both, v = np.empty((3, 7)), np.zeros(3)
     for sweep in range(STILL_SWEEPS):
         both[:, :] = 0.0
         for k in range(3):
             both[k, k], both[k, 3 + k] = 1.0 / LIKELY_SPEED**2, 1.0
-        for k in range(len(changes)):
+        for k in range(n):
             row = changes[k]
             r = row[3] - row[0] * v[0] - row[1] * v[1] - row[2] * v[2]
             weight = 1.0 / (row[4] * (1.0 + r * r / (STILL_SCALE**2 * row[4])))
@@ -268,10 +225,11 @@ def _velocity(changes: np.ndarray, v: np.ndarray, covariance: np.ndarray) -> flo
         solve(both)
         v[:] = both[:, 6]
     covariance[:, :] = both[:, 3:6]
+    size = 0.0
     for i in range(3):
         for j in range(3):
             size += v[i] * information[i, j] * v[j]
-    return size
+    return size < MOVES and covariance[0, 0] + covariance[1, 1] < STILL_SPEED**2
 
 
 @compiled

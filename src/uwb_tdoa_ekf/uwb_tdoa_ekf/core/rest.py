@@ -21,8 +21,7 @@ from .update import update_state
 PERIOD = 0.05  # s between zero-velocity updates
 QUIET_STD, SHAKING_STD = 0.02, 0.15  # m/s, standard deviation of such an update: of a quiet inertial sensor, and of one that shakes
 SPEED = 0.05  # m/s; a quiet tag that is known to be slower stands, a faster one may glide
-LOOK_PERIOD, LOOK_WINDOW = 0.1, 0.4  # s between two looks at the TDOAs, and s of TDOAs in each, or twice that where few come
-LONGEST_WINDOW = 2.0  # s of TDOAs, as far as they are kept, in which a glide shows that is too slow for a look
+LOOK_PERIOD, LOOK_WINDOW = 0.1, 0.4  # s between two looks at the TDOAs, and s of TDOAs in each
 MOST_DOUBTS = 3  # looks in a row with changed TDOAs that end a rest: one look in twenty shows a change by chance
 UNFELT = 0.06  # m/s; where the inertial sensor has felt more lift than that, one such look ends the rest
 LONG = 10  # looks in a row without a change that begin the rest of a quiet tag: fewer may be a turning point
@@ -81,26 +80,15 @@ def look(
     calm = ekf.quiet or np.sum(ekf.imu.vibration) < CALM * ekf.shaking
     if not (ekf.resting or calm or standing.is_near_ground(best, parameters)):
         return
-    motion, count = ground.UNKNOWN, 0
-    for seconds in (LOOK_WINDOW, 2.0 * LOOK_WINDOW):
-        if motion == ground.UNKNOWN:
-            count = ground.find_pairs(_since(window, t - seconds), ekf.pairs)
-            motion = ground.judge_motion(ekf.pairs[:count], anchors, best.x, ekf.still_covariance)
-    still = motion == ground.STILL
+    count = ground.find_pairs(window, ekf.pairs)
+    still = ground.is_still(ekf.pairs[:count], anchors, best.x, ekf.still_covariance)
     if ekf.resting:
-        glides = _glides(ekf, anchors, window, max(t - LONGEST_WINDOW, ekf.rest_since))
-        if motion == ground.MOVES or glides or not (still or ekf.quiet):  # a tag that shakes is at rest only while TDOAs show that
-            ekf.doubts += 1
-        elif still:
-            ekf.doubts = 0
+        ekf.doubts = 0 if still else ekf.doubts + 1
         ekf.resting = ekf.doubts < (MOST_DOUBTS if np.abs(ekf.lift).max() < UNFELT else 1)
     else:
         ekf.lift[:] = 0.0
         ekf.doubts = 0
-        if motion == ground.MOVES or not ekf.quiet:
-            ekf.stills = 0
-        elif still:
-            ekf.stills += 1
+        ekf.stills = ekf.stills + 1 if still and ekf.quiet else 0
         stands = calm and (still or ekf.quiet)
         place, covariance = np.empty(3), np.empty((3, 3))
         lateness = standing.find_landed(ekf, ekf.pairs[:count], anchors, parameters, still, place, covariance)
@@ -110,35 +98,16 @@ def look(
             standing.put(ekf, place, covariance, t, records)
         elif landed:
             standing.hover(ekf, place, still, t, records)
+        long = ekf.stills >= (LONG if t - ekf.rest_since > EARLY else LONG_ENOUGH)
         ekf.resting = stands and landed
-        moves = _moves(best, QUIET_STD)
-        long = still and ekf.stills >= (LONG if moves or t - ekf.rest_since > EARLY else LONG_ENOUGH)
-        if long and not landed and not _glides(ekf, anchors, window, t - LONGEST_WINDOW):
-            if moves:
-                count = ground.find_pairs(window, ekf.pairs)
-                standing.find_again(ekf, ekf.pairs[:count], window, anchors, parameters, t, records)
-            else:
-                ekf.resting, ekf.late_as_known = True, False
+        if not landed and long and not _moves(best, QUIET_STD):
+            ekf.resting, ekf.late_as_known = True, False
+        elif not landed and ekf.stills >= LONG:
+            standing.find_again(ekf, ekf.pairs[:count], window, anchors, parameters, t, records)
         if ekf.resting:
             ekf.rest_since = t
         if landed and not stands:
             ekf.next_look = t + AGAIN
-
-
-@compiled
-def _glides(ekf: Record, anchors: np.ndarray, window: np.ndarray, since: float) -> bool:
-    """Whether those of a window (n,) of TDOA since a stamp, s, show a velocity, however slow. Fills in ekf.pairs."""
-    count = ground.find_pairs(_since(window, since), ekf.pairs)
-    return ground.is_gliding(ekf.pairs[:count], anchors, ekf.hypotheses[ekf.best].x)
-
-
-@compiled
-def _since(window: np.ndarray, since: float) -> np.ndarray:
-    """Those of a window (n,) of TDOA, n > 0, that are later than a stamp, s, or the last one."""
-    first = len(window) - 1
-    while first > 0 and window[first - 1].t > since:
-        first -= 1
-    return window[first:]
 
 
 @compiled
