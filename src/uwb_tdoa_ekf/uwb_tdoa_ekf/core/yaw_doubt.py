@@ -57,8 +57,8 @@ def predict(ekf: Record, vx: float, vy: float) -> None:
 
 @compiled
 def observe(ekf: Record, correlation_length: float, t: float, shows: bool) -> None:
-    """Take the INNOVATION stamped t, s, of the best hypothesis, after its update; correlation_length as in robust.py. shows : it is evidence;
-    else the responses follow its update, and nothing more."""
+    """Take the INNOVATION stamped t, s, of the best hypothesis, after its update. correlation_length as in robust.py; shows : it is
+    evidence; else the responses follow its update, and nothing more."""
     doubt, innovation, best = ekf.yaw_doubt, ekf.innovation, ekf.hypotheses[ekf.best]
     response, information, vector = doubt.response, doubt.information, doubt.vector
     variance = innovation.prior_variance + innovation.noise_variance * correlation_length
