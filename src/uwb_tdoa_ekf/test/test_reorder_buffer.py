@@ -136,6 +136,14 @@ def test_a_silent_stream_is_waited_for_no_longer_than_lag_and_a_sensor_only_wher
     assert buffer.watermark == 3.0
 
 
+def test_a_stamp_that_is_no_number_begins_nothing():
+    buffer, *_ = buffer_of(lag=0.4)
+    buffer.add(IMU_STREAM, rows(IMU_SAMPLE, math.nan)[0], np.array([False]))
+    assert buffer.began == math.inf and buffer.newest == -math.inf
+    buffer.add(TDOA_STREAM, *rows(TDOA_ROW, 0.0, 0.5, 1.0, 1.5, 2.0))
+    assert buffer.began == 0.0 and buffer.watermark == 2.0  # nothing waits for an IMU of which no sample has come
+
+
 def test_a_stamp_that_is_no_measurement_counts_and_a_lone_one_far_away_is_refused():
     buffer, refused, restarts = buffer_of()
     buffer.add(TDOA_STREAM, rows(TDOA_ROW, 1.0, 2.0)[0], np.array([True, False]))

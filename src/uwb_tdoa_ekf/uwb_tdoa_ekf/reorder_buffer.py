@@ -128,8 +128,8 @@ class ReorderBuffer:
         count, and whoever adds them accounts for them."""
         if not len(rows):
             return
-        if place in LEADING and self.began == math.inf:
-            self.began = float(rows["t"][0])
+        if place in LEADING and self.began == math.inf and usable.any():
+            self.began = float(rows["t"][usable][0])
         self._streams[place].seen = float(rows["t"][-1])
         if usable.all() and self._streams[place].append(rows, self.used_until, self._limit(place)):
             if place == self._reference:
