@@ -23,7 +23,7 @@ class FixedPoseCorrector(Corrector):
     def __init__(self, anchors: Anchors, effects: EffectSet | None, poses: Sequence[np.ndarray]) -> None:
         """poses : (t (k,) s, p (k, 3) m, q (k, 4), v (k, 3) m/s, yaw_std (k,) rad) of the other run, as `add_pose` takes them."""
         self._known = poses
-        super().__init__(anchors, effects, history=max(len(poses[0]), 1), start=0.0)
+        super().__init__(anchors, effects, history=max(len(poses[0]), 1))
 
     def reset(self) -> None:
         super().reset()

@@ -25,7 +25,7 @@ PAIRS, HEARD = 32, 5  # pairs of a snapshot at most; anchors at least: three coo
 SMALL = 0.05  # m, median size of TDOAs below which they are not in metres themselves
 FEWEST, MANY, KEPT = 4, 20, 60  # snapshots that say something clear, and anything, and that are kept in flight
 SINGLE = 12  # anchors at most, of which each by itself, and any two, are tried: the work has a bound
-SMALLEST, RATIO, LARGEST = 2.0, 1.25, 1500.0  # least factor that counts, ratio of successive ones, and the largest
+SMALLEST, RATIO, LARGEST = 1.5, 1.25, 1500.0  # least factor that counts, ratio of successive ones, and the largest
 LOSS, STEPS, NEAR = 0.5, 8, 0.3  # m, scale of the Geman-McClure loss; Gauss-Newton steps; of the size of the room, the longest of them
 STARTS = np.array([[0.0, 0.0, 0.0], [0.6, 0.6, 0.6], [-0.6, -0.6, 0.6], [0.6, -0.6, -0.6], [-0.6, 0.6, -0.6]])
 # Share of the loss that may be left, and standard errors by which it is less than that of the survey as it is. Another scale, or another
