@@ -159,7 +159,7 @@ class BiasNode(StreamNode):
 
     def _give_corrector(self, antenna: Antenna) -> None:
         """Have the TDOAs of an Antenna corrected at the poses that are known."""
-        if antenna is not self._body_antenna and self._corrector is not None:
+        if self._corrector is not None:
             antenna.corrector = self._new_corrector(antenna.effects)
             antenna.corrector.share_poses(self._corrector)
 
@@ -190,19 +190,18 @@ class BiasNode(StreamNode):
         return self._antennas[frame]
 
     def _place_antenna(self, frame: str) -> None:
-        """Find out where the antenna of this frame is on the body, and take out what that does to TDOAs."""
+        """Find where the antenna of this frame, another than the body's, is on the body, and remove what that does to its TDOAs."""
         trouble, effects, known = None, self._effects, self._antennas.get(frame)
-        if frame not in ("", self._body):
-            between = self._frames.frames.between(self._body, frame)
-            if any(effect.name == TagLeverArm.name for effect in effects.effects):
-                self.get_logger().info(f"{TagLeverArm.name} of effects_file counts, not the transform of '{frame}'")
-            elif between is None:
-                trouble = unknown_frame("uwb/tdoa", frame, self._body)
-            elif between[1].any():
-                try:
-                    effects = EffectSet((*effects.effects, TagLeverArm(values=dict(zip("xyz", between[1].tolist())))))
-                except InputError as error:
-                    trouble = f"uwb/tdoa: the place of '{frame}' on '{self._body}' in /tf_static is not taken: {error}"
+        between = self._frames.frames.between(self._body, frame)
+        if any(effect.name == TagLeverArm.name for effect in effects.effects):
+            self.get_logger().info(f"{TagLeverArm.name} of effects_file counts, not the transform of '{frame}'")
+        elif between is None:
+            trouble = unknown_frame("uwb/tdoa", frame, self._body)
+        elif between[1].any():
+            try:
+                effects = EffectSet((*effects.effects, TagLeverArm(values=dict(zip("xyz", between[1].tolist())))))
+            except InputError as error:
+                trouble = f"uwb/tdoa: the place of '{frame}' on '{self._body}' in /tf_static is not taken: {error}"
         if trouble and frame not in self._frames_said:
             self._frames_said.add(frame)
             self.get_logger().warning(trouble)

@@ -29,8 +29,9 @@ LATELY = 2.0  # s of stamps for which a stream counts as ahead after a row of it
 SILENT = 1.0  # s of stamps after which a stream is not waited for any more, until it is back
 OF_AIDS = 0.5  # share of `lag` for which sensors are waited for: bias_node's `hold` must outlast that by far
 TRIAL = 2.0  # s of stamps in order, after which a stream is trusted to go on so
-# s by which a stream may be ahead of the others. TDOAs that arrive so much after the inertial samples of their time are still used.
-AHEAD_OF_REFERENCE, AHEAD_OF_LEADING = 2.0, 0.5  # of inertial samples and ranges, and of all others
+# s by which each stream may be ahead of those that it is compared with. TDOAs that arrive 2 s after the inertial samples of their time are
+# still used; other sensors are compared with the inertial samples, too.
+LARGEST_LEADS = tuple(2.0 if place in LEADING else 0.5 for place in range(len(STREAMS)))
 NO_AIDS = np.empty(0, AID)
 
 
@@ -174,7 +175,7 @@ class ReorderBuffer:
         if place in (TDOA_STREAM, self._reference) or not (stream.ahead or stream.gate.newest == -math.inf):
             return math.inf
         compared = self._compared(place)
-        return math.inf if compared == -math.inf else compared + (AHEAD_OF_REFERENCE if place in LEADING else AHEAD_OF_LEADING)
+        return math.inf if compared == -math.inf else compared + LARGEST_LEADS[place]
 
     def _compared(self, place: int) -> float:
         """Stamp, s, of those streams by which another one is judged: the reference, for sensors the inertial samples, too."""
@@ -192,17 +193,15 @@ class ReorderBuffer:
                 self._reference = place
                 stream.ahead, stream.lead = False, 0.0
         for other, stream in enumerate(self._streams):
-            leads = other in LEADING
-            if other == self._reference or stream.gate.newest == -math.inf or leads and place != self._reference:
+            if other == self._reference or stream.gate.newest == -math.inf or other in LEADING and place != self._reference:
                 continue
             if stream.ahead:
                 continue  # its lead is that of the last row that was refused
             compared = self._compared(other)
             stream.lead = stream.gate.newest - compared
-            limit = AHEAD_OF_REFERENCE if leads else AHEAD_OF_LEADING
-            if stream.lead > limit:
+            if stream.lead > LARGEST_LEADS[other]:
                 stream.ahead, stream.refused = True, compared
-                self._refuse(other, stream.drop_after(compared + limit), INVALID)
+                self._refuse(other, stream.drop_after(compared + LARGEST_LEADS[other]), INVALID)
 
     def _refuse_too_many(self, place: int) -> None:
         """Bound what waits of a sensor while the streams that lead are silent."""
@@ -251,9 +250,8 @@ class ReorderBuffer:
         """Go on with a stream whose clock has jumped while that of the reference has not. newest : its newest stamp before, s. The time is
         that of the reference: a stream that is ahead does not move it."""
         stream, compared = self._streams[place], self._compared(place)
-        limit = compared + (AHEAD_OF_REFERENCE if place in LEADING else AHEAD_OF_LEADING)
         stream.lead = max(0.0, accepted[-1][0] - compared)
-        if accepted[-1][0] > limit:
+        if stream.lead > LARGEST_LEADS[place]:
             stream.gate.newest = newest
             for t, row in accepted:
                 self._refuse_ahead(place, t, row)

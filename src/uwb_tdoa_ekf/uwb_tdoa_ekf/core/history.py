@@ -48,7 +48,7 @@ def add_coasting(ekf: Record, dt: float, history: np.ndarray) -> None:
 
 @compiled
 def replace_velocity(ekf: Record, history: np.ndarray) -> None:
-    """After the velocity of the best hypothesis was replaced by one of which nothing before says anything."""
+    """Record that the velocity of the best hypothesis was replaced. The new one does not depend on what came before."""
     if len(history) > 0:
         ekf.since_record[3:6, :] = 0.0
 
