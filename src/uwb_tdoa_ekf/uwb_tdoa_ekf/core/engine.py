@@ -410,7 +410,7 @@ def _assimilate(
         residual.weight = innovation.weight
         residual.verdict = USED if innovation.weight > 0.0 else REJECTED
         if ekf.yaw_doubt.alone:
-            yaw_doubt.observe(ekf, parameters.tdoa_correlation_length * innovation.repeated, t, of_tdoa)
+            yaw_doubt.observe(ekf, parameters.tdoa_correlation_length * innovation.repeated, of_tdoa)
         if residual.verdict == USED:
             history.add_update(ekf, t, records)
 

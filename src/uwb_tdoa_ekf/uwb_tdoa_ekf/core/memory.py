@@ -132,14 +132,14 @@ VELOCITY = _record(
 )
 
 YAW_DOUBT = _record(
-    ("response", float, (ERROR_STATES, 2)),  # of the error state to cos(psi) - 1 and sin(psi), for a yaw that is wrong by psi
+    ("response", float, (2, ERROR_STATES)),  # of the error state to cos(psi) - 1 and sin(psi), for a yaw that is wrong by psi
     ("vector", float, 2),  # of the least squares of late innovations by these two,
-    ("information", float, (2, 2)),  # and its matrix
+    ("information", float, (2, 2)),  # and the upper triangle of its matrix
     ("turned", float),  # rad, by which updates have turned the yaw of late,
     ("variance", float),  # rad^2, and the largest variance that it had
     ("alone", bool),  # one hypothesis is followed
     ("evidence", float),  # at the last look,
-    ("t", float),  # s, stamps: of the last innovation,
+    ("t", float),  # s, stamps: of the last look,
     ("next_look", float),  # and before which not to look again
     ("count", int),  # how often the yaw was opened again
 )

@@ -73,10 +73,10 @@ def update_m_estimation(hypothesis: Record, innovation: Record, parameters: Reco
     those elements of the scaled error that come before its last state, so as many columns of S suffice: three for one of the position.
     The Jacobian is kept at the prior mean: over the centimetres of one update it does not change.
     """
-    S, y, e, w = innovation.factor, innovation.scaled_row, innovation.scaled_error, innovation.prior_weights
+    y, e, w = innovation.scaled_row, innovation.scaled_error, innovation.prior_weights
     rows = ERROR_STATES + (OFFSET_STATES if auxiliary.present(hypothesis) else 0)
     columns = _columns(innovation)
-    _factorize(hypothesis, S, rows, columns)
+    _factorize(hypothesis, innovation.factor, rows, columns)
     _scale(innovation, columns)
     noise = innovation.noise_variance * parameters.tdoa_correlation_length * innovation.repeated
     loss = parameters.loss
@@ -111,58 +111,56 @@ def _columns(innovation: Record) -> int:
 
 
 @compiled
-def _factorize(hypothesis: Record, S: np.ndarray, rows: int, columns: int) -> None:
-    """S (rows, columns) <- the first columns of the Cholesky factor of the joint covariance of error state and auxiliary states."""
+def _factorize(hypothesis: Record, factor: np.ndarray, rows: int, columns: int) -> None:
+    """factor (columns, rows) <- the first columns of the Cholesky factor S of the joint covariance of error state and auxiliary states,
+    each as a row: what is then done to it is contiguous."""
     P, cross, of_offset = hypothesis.P, hypothesis.offset_cross, hypothesis.offset_P
-    for i in range(columns):
-        for j in range(i, rows):
-            if j < ERROR_STATES:
-                value = P[j, i]
-            elif i < ERROR_STATES:
-                value = cross[j - ERROR_STATES, i]
-            else:
-                value = of_offset[j - ERROR_STATES, i - ERROR_STATES]
-            for k in range(i):
-                value -= S[j, k] * S[i, k]
-            S[j, i] = math.sqrt(max(value, 1e-18)) if j == i else value / S[i, i]
-        for j in range(i):
-            S[j, i] = 0.0
+    for k in range(columns):
+        column = factor[k]
+        for i in range(ERROR_STATES):
+            column[i] = P[k, i] if k < ERROR_STATES else cross[k - ERROR_STATES, i]
+        for i in range(ERROR_STATES, rows):
+            column[i] = cross[i - ERROR_STATES, k] if k < ERROR_STATES else of_offset[k - ERROR_STATES, i - ERROR_STATES]
+        for m in range(k):
+            entry = factor[m, k]
+            for i in range(rows):
+                column[i] -= entry * factor[m, i]
+        deviation = math.sqrt(max(column[k], 1e-18))
+        for i in range(rows):
+            column[i] /= deviation
+        column[:k] = 0.0
+        column[k] = deviation
 
 
 @compiled
 def _scale(innovation: Record, columns: int) -> None:
     """scaled_row <- S' h', whose other elements are zero."""
-    S, y = innovation.factor, innovation.scaled_row
+    factor, y = innovation.factor, innovation.scaled_row
     for k in range(columns):
         y[k] = 0.0
         for n in range(innovation.entries):
-            y[k] += S[innovation.states[n], k] * innovation.row[n]
+            y[k] += factor[k, innovation.states[n]] * innovation.row[n]
         for m in range(max(0, columns - ERROR_STATES)):
-            y[k] += S[ERROR_STATES + m, k] * innovation.on_offset[m]
+            y[k] += factor[k, ERROR_STATES + m] * innovation.on_offset[m]
 
 
 @compiled
 def _weigh_prior(hypothesis: Record, innovation: Record, rows: int, columns: int) -> None:
-    """Make the prior the weighted one, P + S (1/W - 1) S', with what it says of the INNOVATION in cross_covariance."""
+    """Make the prior the weighted one, P + S (1/W - 1) S', with what it says of the INNOVATION in cross_covariance. Of P the upper
+    triangle: `update.kalman` mirrors it."""
     P, cross, of_offset = hypothesis.P, hypothesis.offset_cross, hypothesis.offset_P
-    S, y, w, covariance = innovation.factor, innovation.scaled_row, innovation.prior_weights, innovation.cross_covariance
-    scaled = innovation.scaled_error  # is not needed any more
-    for i in range(rows):
-        for k in range(columns):
-            scaled[k] = (1.0 / w[k] - 1.0) * S[i, k]
-        for j in range(i, rows):
-            more = 0.0
-            for k in range(columns):
-                more += scaled[k] * S[j, k]
-            if j < ERROR_STATES:
-                P[i, j] += more
-                P[j, i] = P[i, j]
-            elif i < ERROR_STATES:
-                cross[j - ERROR_STATES, i] += more
-            else:
-                of_offset[i - ERROR_STATES, j - ERROR_STATES] += more
-                of_offset[j - ERROR_STATES, i - ERROR_STATES] = of_offset[i - ERROR_STATES, j - ERROR_STATES]
-    for i in range(ERROR_STATES):
-        covariance[i] = 0.0
-        for k in range(columns):
-            covariance[i] += S[i, k] * y[k] / w[k]
+    y, w, covariance = innovation.scaled_row, innovation.prior_weights, innovation.cross_covariance
+    covariance[:] = 0.0
+    for k in range(columns):
+        column, more, told = innovation.factor[k], 1.0 / w[k] - 1.0, y[k] / w[k]
+        for i in range(ERROR_STATES):
+            covariance[i] += column[i] * told
+            entry = more * column[i]
+            for j in range(i, ERROR_STATES):
+                P[i, j] += entry * column[j]
+        for m in range(rows - ERROR_STATES):
+            entry = more * column[ERROR_STATES + m]
+            for i in range(ERROR_STATES):
+                cross[m, i] += entry * column[i]
+            for n in range(rows - ERROR_STATES):
+                of_offset[m, n] += entry * column[ERROR_STATES + n]

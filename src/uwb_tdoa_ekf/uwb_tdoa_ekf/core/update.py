@@ -36,7 +36,7 @@ INNOVATION = np.dtype(
         ("repeated", float),  # how often the same error is met, in tdoa_correlation_length: 1, but for a tag that does not move
         ("weight", float),  # 0 to 1, given by robust.update
         ("total_variance", float),  # of the value, as the update took it
-        ("factor", float, (JOINT_STATES, JOINT_STATES)),  # scratch of the M-estimation: S,
+        ("factor", float, (JOINT_STATES, JOINT_STATES)),  # scratch of the M-estimation: S', by rows the columns of S,
         ("scaled_row", float, JOINT_STATES),  # S' h',
         ("scaled_error", float, JOINT_STATES),  # and of the state scaled by S the error
         ("prior_weights", float, JOINT_STATES),  # and its weights

@@ -23,7 +23,8 @@ PERIOD = 0.1  # s between two tests
 # Log likelihood ratio above which the yaw is opened again. Of 22 measured flights 3.5 at most; in the worst of them 9.9 without its range
 # finder. See docs/reliability.md
 EVIDENCE = 12.0
-TRIED = 24  # angles
+ANGLES = 2.0 * math.pi * np.arange(1, 24) / 24.0  # rad, by which the yaw may be wrong: those that are tried,
+COSINES, SINES = np.cos(ANGLES) - 1.0, np.sin(ANGLES)  # and what the error of the state is linear in
 
 
 @compiled
@@ -38,56 +39,69 @@ def clear(doubt: Record) -> None:
 @compiled
 def predict(ekf: Record, vx: float, vy: float) -> None:
     """Carry the responses on after `state.predict` of the best hypothesis; vx, vy : m/s, its velocity before."""
-    response, transition, x = ekf.yaw_doubt.response, ekf.transition, ekf.hypotheses[ekf.best].x
+    transition, x = ekf.transition, ekf.hypotheses[ekf.best].x
     A, B, E, dt = transition.velocity_attitude, transition.velocity_accel_bias, transition.attitude_attitude, transition.dt
     along, across = x[3] - vx, x[4] - vy
     for c in range(2):
-        t0, t1, t2 = response[6, c], response[7, c], response[8, c]
-        b0, b1, b2 = response[9, c], response[10, c], response[11, c]
+        response = ekf.yaw_doubt.response[c]
+        t0, t1, t2 = response[6], response[7], response[8]
+        b0, b1, b2 = response[9], response[10], response[11]
         for r in range(3):
-            response[r, c] += dt * response[3 + r, c]
-            response[3 + r, c] += A[r, 0] * t0 + A[r, 1] * t1 + A[r, 2] * t2 + B[r, 0] * b0 + B[r, 1] * b1 + B[r, 2] * b2
-            response[6 + r, c] = E[r, 0] * t0 + E[r, 1] * t1 + E[r, 2] * t2 - dt * response[12 + r, c]
+            response[r] += dt * response[3 + r]
+            response[3 + r] += A[r, 0] * t0 + A[r, 1] * t1 + A[r, 2] * t2 + B[r, 0] * b0 + B[r, 1] * b1 + B[r, 2] * b2
+            response[6 + r] = E[r, 0] * t0 + E[r, 1] * t1 + E[r, 2] * t2 - dt * response[12 + r]
         dx, dy = (along, across) if c == 0 else (-across, along)
-        response[0, c] += 0.5 * dt * dx
-        response[1, c] += 0.5 * dt * dy
-        response[3, c] += dx
-        response[4, c] += dy
+        response[0] += 0.5 * dt * dx
+        response[1] += 0.5 * dt * dy
+        response[3] += dx
+        response[4] += dy
 
 
 @compiled
-def observe(ekf: Record, correlation_length: float, t: float, shows: bool) -> None:
-    """Take the INNOVATION stamped t, s, of the best hypothesis, after its update. correlation_length as in robust.py; shows : it is
-    evidence; else the responses follow its update, and nothing more."""
-    doubt, innovation, best = ekf.yaw_doubt, ekf.innovation, ekf.hypotheses[ekf.best]
-    response, information, vector = doubt.response, doubt.information, doubt.vector
-    variance = innovation.prior_variance + innovation.noise_variance * correlation_length
-    largest = LARGEST * math.sqrt(variance)
-    value = min(max(innovation.value, -largest), largest)
+def observe(ekf: Record, correlation_length: float, shows: bool) -> None:
+    """Take the INNOVATION of the best hypothesis, after its update. correlation_length as in robust.py; shows : it is evidence; else the
+    responses follow its update, and nothing more."""
+    doubt, innovation = ekf.yaw_doubt, ekf.innovation
+    to_cosine, to_sine = doubt.response[0], doubt.response[1]
     cosine = sine = 0.0
     for n in range(innovation.entries):
-        cosine += innovation.row[n] * response[innovation.states[n], 0]
-        sine += innovation.row[n] * response[innovation.states[n], 1]
-    expected = cosine, sine
+        cosine += innovation.row[n] * to_cosine[innovation.states[n]]
+        sine += innovation.row[n] * to_sine[innovation.states[n]]
     if shows:
-        dt = max(t - doubt.t, 0.0) if doubt.t > -np.inf else 0.0
-        doubt.t = t
-        kept, kept_turn = math.exp(-dt / MEMORY), math.exp(-dt / TURN_MEMORY)
-        for i in range(2):
-            vector[i] = kept * vector[i] + expected[i] * value / variance
-            for j in range(2):
-                information[i, j] = kept * information[i, j] + expected[i] * expected[j] / variance
-        doubt.turned *= kept_turn
-        of_yaw = _yaw_variance(best)
-        doubt.variance = max(of_yaw, of_yaw + (doubt.variance - of_yaw) * kept_turn)
+        variance = innovation.prior_variance + innovation.noise_variance * correlation_length
+        largest = LARGEST * math.sqrt(variance)
+        value = min(max(innovation.value, -largest), largest)
+        per_variance = 1.0 / variance
+        doubt.vector[0] += cosine * value * per_variance
+        doubt.vector[1] += sine * value * per_variance
+        doubt.information[0, 0] += cosine * cosine * per_variance
+        doubt.information[0, 1] += cosine * sine * per_variance
+        doubt.information[1, 1] += sine * sine * per_variance
     if innovation.weight > 0.0:
-        gain, total = innovation.cross_covariance, innovation.total_variance
-        for c in range(2):
-            for i in range(ERROR_STATES):
-                response[i, c] -= gain[i] / total * expected[c]
+        gain, per_total = innovation.cross_covariance, 1.0 / innovation.total_variance
+        cosine *= per_total
+        sine *= per_total
+        for i in range(ERROR_STATES):
+            to_cosine[i] -= gain[i] * cosine
+            to_sine[i] -= gain[i] * sine
         if shows:
+            best = ekf.hypotheses[ekf.best]
+            if doubt.variance == 0.0:
+                doubt.variance = _yaw_variance(best)
             u0, u1, u2 = _up(best.x)
-            doubt.turned += (u0 * gain[6] + u1 * gain[7] + u2 * gain[8]) / total * innovation.value
+            doubt.turned += (u0 * gain[6] + u1 * gain[7] + u2 * gain[8]) * per_total * innovation.value
+
+
+@compiled
+def _forget(doubt: Record, variance: float, dt: float) -> None:
+    """Let the evidence of a YAW_DOUBT age by dt, s. variance : rad^2, that of the yaw now."""
+    kept, kept_turn = math.exp(-dt / MEMORY), math.exp(-dt / TURN_MEMORY)
+    for i in range(2):
+        doubt.vector[i] *= kept
+        for j in range(i, 2):
+            doubt.information[i, j] *= kept
+    doubt.turned *= kept_turn
+    doubt.variance = max(variance, variance + (doubt.variance - variance) * kept_turn)
 
 
 @compiled
@@ -95,9 +109,8 @@ def evidence(doubt: Record) -> float:
     """Log likelihood ratio of the best other yaw, and what the turns by updates add."""
     v, J = doubt.vector, doubt.information
     best = 0.0
-    for k in range(1, TRIED):
-        psi = 2.0 * math.pi * k / TRIED
-        c, s = math.cos(psi) - 1.0, math.sin(psi)
+    for k in range(len(ANGLES)):
+        c, s = COSINES[k], SINES[k]
         best = max(best, c * v[0] + s * v[1] - 0.5 * (c * c * J[0, 0] + 2.0 * c * s * J[0, 1] + s * s * J[1, 1]))
     return best + 0.5 * doubt.turned**2 / max(doubt.variance, 1e-9)
 
@@ -108,9 +121,11 @@ def contradicts(ekf: Record, t: float) -> bool:
     doubt = ekf.yaw_doubt
     if t < doubt.next_look:
         return False
-    doubt.next_look = t + PERIOD
+    variance = _yaw_variance(ekf.hypotheses[ekf.best])
+    _forget(doubt, variance, max(t - doubt.t, 0.0))
+    doubt.t, doubt.next_look = t, t + PERIOD
     doubt.evidence = evidence(doubt)
-    return doubt.evidence > EVIDENCE and _yaw_variance(ekf.hypotheses[ekf.best]) < KNOWN
+    return doubt.evidence > EVIDENCE and variance < KNOWN
 
 
 @compiled
