@@ -88,6 +88,13 @@ def test_mistakes_of_the_tdoas_are_not_blamed_on_the_survey(mistake):
     assert "survey_scale" not in found and "anchor_scale" not in found
 
 
+@pytest.mark.parametrize("unit", [0.299792458, 0.3048])
+def test_tdoas_in_nanoseconds_or_feet_are_named(unit):
+    found = flown(scaled(1.0), unit=unit)
+    assert "nanoseconds or in feet" in found["tdoa_unit"].cause and found["tdoa_unit"].position_wrong()
+    assert not found.keys() & {"tdoa_large", "tdoa_outliers"}
+
+
 @pytest.mark.parametrize("name", ["exchanged", "mirrored", "turned", "planar", "another room"])
 def test_other_mistakes_of_the_survey_are_not_called_a_scale(name):
     positions = scaled(1.0)

@@ -33,7 +33,7 @@ STARTS = np.array([[0.0, 0.0, 0.0], [0.6, 0.6, 0.6], [-0.6, -0.6, 0.6], [0.6, -0
 LEFT, DEVIATIONS = 0.65, 3.5
 GOOD = 0.35  # loss of a survey that fits; healthy flights of three days have 0.10 to 0.25
 MOVED, CLEARLY = 0.3, 0.5  # m by which the tag must have moved; share of the loss that shows it after few seconds and at rest, too
-NANOSECONDS = 0.299792458  # TDOAs in this unit look like a survey that is too small by this factor
+NANOSECONDS = 0.299792458  # m; TDOAs in this unit, and in feet, look like a survey that is too small by this factor
 AS_IT_IS, SCALED, SIGN, EXCHANGED, ALONE = range(5)  # kinds of hypotheses
 
 
@@ -91,7 +91,8 @@ class SurveyScale:
             cause = f"the position of anchor {number} is in {self._names[k]}, not in metres"
             return Finding("anchor_scale", ERROR, cause, evidence, line, factor)
         if abs(math.log(factor / NANOSECONDS)) < math.log(RATIO):
-            return None  # rather of the TDOAs
+            line = f"message.distance_difference *= {NANOSECONDS}  # of nanoseconds; of feet 0.3048"
+            return Finding("tdoa_unit", ERROR, "TDOAs are in nanoseconds or in feet, not in metres", evidence, line, NANOSECONDS)
         line = f"x, y, z = x / {factor:.6g}, y / {factor:.6g}, z / {factor:.6g}  # of every anchor"
         size = f"about {factor:.3g} times too large" if factor > 1.0 else f"about {1.0 / factor:.3g} times too small"
         cause = f"the survey is not in metres: its positions are {size}"

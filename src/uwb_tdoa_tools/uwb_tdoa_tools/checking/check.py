@@ -43,7 +43,7 @@ OTHER_SURVEY = "give --survey a folder of all surveys: check says which one fits
 BLAMED = {"tdoa_sign", "ids_swapped", "pair_sign", "tdoa_one_sign", "anchor_moved"}
 # What a finding explains that the stream itself only shows.
 EXPLAINS = {
-    "tdoa_unit": {"tdoa_large", "tdoa_outliers", "tdoa_rounded"},
+    "tdoa_unit": {"tdoa_unit", "tdoa_large", "tdoa_outliers", "tdoa_rounded"},
     "ids_renumbered": {"ids_unknown", "anchor_missing"},
     "ids_swapped": {"tdoa_large", "tdoa_outliers"},
     "survey_other": {"tdoa_large", "tdoa_outliers"},
