@@ -37,6 +37,8 @@ class Fault:
             stamps[at] += 1e-3 * self.size * (t[at] - self.begin)
         elif self.kind == "lone":
             stamps[np.flatnonzero(at)[:1]] += self.size
+        elif self.kind == "each":
+            stamps[np.flatnonzero(at)[:: int(np.sum(at) / (self.end - self.begin))]] += self.size  # one in a second
         elif self.kind == "few":
             stamps[np.flatnonzero(at)[: 1 + int(0.1 * np.sum(at) / (self.end - self.begin))]] += self.size  # 0.1 s of them
         elif self.kind == "standing":
@@ -54,7 +56,7 @@ class Fault:
 
 HEALTHY = Fault("healthy")
 sizes = st.floats(0.6, 3600.0) | st.floats(-3600.0, -0.6) | st.sampled_from([-5.0, 5.0, 60.0, 2.5, -1.5])
-kinds = st.sampled_from(["offset", "drift", "lone", "few", "standing", "scattered", "silent", "wrap", "burst"])
+kinds = st.sampled_from(["offset", "drift", "lone", "each", "few", "standing", "scattered", "silent", "wrap", "burst"])
 faults = st.builds(Fault, kinds, sizes) | st.builds(Fault, kinds, sizes, st.just(0.0), st.just(LENGTH))
 seeds = st.integers(0, 2**32 - 1)
 
@@ -150,10 +152,20 @@ def test_a_clock_of_the_tdoas_costs_them_no_more_than_the_fault_and_a_second(kin
     played.check_accounts()
     after = [measured for measured, _ in played.used[TDOA_STREAM] if measured >= END + DECIDED]
     assert len(after) >= (LENGTH - END - DECIDED) * RATE[TDOA_STREAM] - 1.0
-    if kind in ("lone", "few"):
+    if kind in ("lone", "each", "few"):
         assert not played.restarts and played.refused[TDOA_STREAM] <= 10 and played.refused[IMU_STREAM] == 0
     elif kind == "offset":
         assert len(played.restarts) <= 2 and played.gap(TDOA_STREAM) < DECIDED  # there and back
+
+
+@settings(max_examples=20, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))
+@given(st.sampled_from([IMU_STREAM, TDOA_STREAM]), sizes, seeds)
+def test_a_wrong_stamp_each_second_costs_its_own_message_only(place, size, seed):
+    streams = {IMU_STREAM: HEALTHY, TDOA_STREAM: HEALTHY} | {place: Fault("each", size, 1.0, LENGTH)}
+    played = Played(streams, seed)
+    played.check_accounts()
+    other = TDOA_STREAM if place == IMU_STREAM else IMU_STREAM
+    assert not played.restarts and played.refused[place] <= LENGTH + 1 and played.refused[other] == 0
 
 
 @settings(max_examples=20, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))
