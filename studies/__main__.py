@@ -13,6 +13,7 @@ from studies.debiasing import measured, set_up
 from studies.diagnosis import figures
 from studies.diagnosis import ranges as diagnosed_ranges
 from studies.faults import figures as faults
+from studies.faults import flown
 from studies.training import compare, default, spin, splits
 
 STUDIES = {
@@ -28,6 +29,7 @@ STUDIES = {
     "diagnose-ranges": diagnosed_ranges,
     "diagnosis": figures,
     "faults": faults,
+    "fly-faults": flown,
     "in-flight": in_flight,
     "localizing": localizing,
     "noise": noise,
@@ -54,6 +56,7 @@ of measured flights: flights/, util/, surveys/.
   diagnose-ranges  errors put into simulated distances to anchors, and what diagnose makes of them (docs/sensors.md)
   diagnosis        effects put into flights, and found again (docs/diagnosis.md)
   faults           faults of streams, surveys, nodes and clocks, played to the real nodes over topics (docs/reliability.md)
+  fly-faults       faults of streams while a simulated vehicle flies by the estimate (docs/reliability.md)
   in-flight        the same mistakes played to ekf_node, and what it says of them (docs/connect.md)
   localizing       what localize says of flights, against their ground truth (docs/localizing.md)
   noise            whether covariances are honest after a calibration (docs/calibration.md)

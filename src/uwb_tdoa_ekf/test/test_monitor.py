@@ -13,7 +13,13 @@ IDS, RATE = ANCHORS.ids, 100  # Hz
 def watch(delays_at, gyro=lambda t: 0.0, noise=0.06, seconds=60, seed=1, moving=True, heard=lambda t, a, b: t == t, rejected=lambda t: 0.0):
     """[(s, alarms)] of a flight in which the anchors have delays_at(t, p) (6,) m; 100 TDOAs a second in a ring. The tag flies
     rounds of 10 s; the filter knows where it is, and rejects that share of the TDOAs."""
-    rng, monitor, said = np.random.default_rng(seed), Monitor(ANCHORS), []
+    return played(Monitor(ANCHORS), delays_at, gyro, noise, seconds, seed, moving, heard, rejected)
+
+
+def played(monitor, delays_at, gyro=lambda t: 0.0, noise=0.06, seconds=60, seed=1, moving=True, heard=lambda t, a, b: t == t,
+           rejected=lambda t: 0.0):  # fmt: skip
+    """What `watch` gives, of a Monitor."""
+    rng, said = np.random.default_rng(seed), []
     for second in range(seconds):
         t = second + np.arange(RATE) / RATE
         a = np.arange(RATE) % 6
@@ -37,6 +43,21 @@ def watch(delays_at, gyro=lambda t: 0.0, noise=0.06, seconds=60, seed=1, moving=
 
 def only(row, size):
     return size * (np.arange(6) == row)
+
+
+def negated(t, place):
+    """Delays that make each TDOA the negative of itself."""
+    return -2.0 * np.linalg.norm(place - ANCHORS.positions, axis=1)
+
+
+def test_signs_turn_from_a_moment_in_which_the_filter_was_right():
+    """What contradicts the filter all the time, as late anchors do on a floor, is no event."""
+    monitor = Monitor(ANCHORS)
+    played(monitor, negated, rejected=lambda t: 0.9, moving=False, seconds=20)
+    assert monitor.turns == 0
+    monitor = Monitor(ANCHORS)
+    played(monitor, lambda t, place: negated(t, place) * (t > 12.3), rejected=lambda t: 0.9 * (t > 12.3), seconds=20)
+    assert monitor.turns == 1
 
 
 @pytest.mark.parametrize("seed", range(3))

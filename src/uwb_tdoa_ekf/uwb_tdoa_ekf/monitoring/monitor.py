@@ -44,6 +44,9 @@ NEARER = 0.8  # share of the distance of the farthest anchor that is heard, with
 TOGETHER = 4  # slices in which a swap is looked for
 NAMED, HELD = 4, 8  # slices in a row that must say so until a swap is named, and something else until it is no longer
 TURN_APART = 3.0  # s of stamps between two turns of all signs
+# Share of the TDOAs of a slice that the filter accepts where it is right, and s since then, within which signs turn: it is an event. Near a
+# floor, TDOAs that are metres too long may all the time look as if they had the other sign.
+MOST, AGREED = 0.5, 1.1
 CALIBRATE = 15.0  # s in motion that count as calibration of the IMU
 BIAS_LIMITS = {"gyroscope": 0.03, "accelerometer": 0.6}  # rad/s and m/s^2, by which an estimated bias must have moved
 
@@ -66,6 +69,7 @@ class Monitor:
         """anchors : Anchors, or Installed, of which others may be there later."""
         self._anchors = anchors
         self.turns, self._turned = 0, -math.inf  # of the signs of all TDOAs in flight, and the stamp of the last, s
+        self._agreed = -math.inf  # s, end of the last slice in which the filter accepted most TDOAs
         self._forget()
 
     def _forget(self) -> None:
@@ -161,9 +165,12 @@ class Monitor:
         a, b = self._anchors.index(a), self._anchors.index(b)
         t, p, v, gyro_bias, accel_bias = odometry
         self._listen(a, b, p.mean(axis=0) if len(t) else None)
-        if len(t) and len(a) and end > self._turned + TURN_APART:
-            if turned(innovation, tdoa(p.mean(axis=0), self._anchors.positions[a], self._anchors.positions[b])):
+        if len(t) and len(a):
+            recent = end <= self._agreed + AGREED and end > self._turned + TURN_APART
+            if recent and turned(innovation, tdoa(p.mean(axis=0), self._anchors.positions[a], self._anchors.positions[b])):
                 self.turns, self._turned = self.turns + 1, end
+            if np.mean(accepted) > MOST:
+                self._agreed = end
         if math.isnan(self._moving_since) and (np.linalg.norm(v, axis=1) > MOVING).any():
             self._moving_since = end
         if math.isnan(self._moving_since) or not (len(t) and len(a)):

@@ -55,7 +55,8 @@ class EstimateSource(Protocol):
 
 
 class OurFilter:
-    """`Corrector` and `Estimator`, as in bias_node and ekf_node, behind the calls that a flight needs: an EstimateSource."""
+    """`Corrector` and `Estimator`, as in bias_node and ekf_node, behind the calls that a flight needs: an EstimateSource. estimator :
+    Estimator; newest : Odometry, the last that came out, or None."""
 
     why = ""
 
@@ -66,49 +67,49 @@ class OurFilter:
         None."""
         effects = effects or EffectSet()
         self._anchors, self._streams, self._corrector = anchors, StreamCorrector(effects.effects), Corrector(anchors, effects, network)
-        self._estimator = Estimator(anchors, config, effects=effects)
+        self.estimator = Estimator(anchors, config, effects=effects)
         self._parts = [NOTHING]
-        self._newest: Odometry | None = None
+        self.newest: Odometry | None = None
 
     def set_pose(self, t: float, p: np.ndarray, std: float, yaw: float) -> None:
         """Tell that it is at p (3,) m at t, s, to so many m, and points along yaw, to as many rad; NaN: nobody knows."""
-        self._estimator.set_pose(t, p, std**2 * np.eye(3), yaw, std)
+        self.estimator.set_pose(t, p, std**2 * np.eye(3), yaw, std)
 
     def take(self, measured: SensorReadings) -> None:
         """Take what arrived: SensorReadings."""
         for name, part in measured.streams.items():
             if len(part.t):
                 self._add(name, self._streams.correct(name, part))
-        odometry, _ = self._estimator.advance()
+        odometry, _ = self.estimator.advance()
         if len(odometry):
             self._parts.append(odometry)
-            self._newest = odometry
+            self.newest = odometry
             if not self._corrector.idle:
                 self._corrector.add_pose(*poses_of(odometry))
 
     def _add(self, name: str, part: Any) -> None:
         """Give the filter a part of a stream that is corrected, but for the bias of TDOAs."""
         if name == "imu":
-            self._estimator.add_imu(part.t, part.gyro, part.accel)
+            self.estimator.add_imu(part.t, part.gyro, part.accel)
         elif name == "tdoa":
             known = self._corrector.correct(part.t, self._anchors.index(part.a), self._anchors.index(part.b), part.d)
-            self._estimator.add_tdoa(part.t, part.a, part.b, known.corrected, known.std**2 + part.variance, known.slope, known.state)
+            self.estimator.add_tdoa(part.t, part.a, part.b, known.corrected, known.std**2 + part.variance, known.slope, known.state)
         else:
-            self._estimator.add(name, part)
+            self.estimator.add(name, part)
 
     @property
     def pose(self) -> Pose | None:
         """(t s, p (3,) m, v (3,) m/s, q (4,)) of the newest estimate, or None."""
-        if self._newest is None:
+        if self.newest is None:
             return None
-        return self._newest.t[-1], self._newest.p[-1], self._newest.v[-1], self._newest.q[-1]
+        return self.newest.t[-1], self.newest.p[-1], self.newest.v[-1], self.newest.q[-1]
 
     @property
     def deviation(self) -> float:
         """Largest standard deviation of a coordinate of the newest estimate, m; inf without one."""
-        if self._newest is None:
+        if self.newest is None:
             return math.inf
-        P = self._newest.covariance[-1]
+        P = self.newest.covariance[-1]
         return math.sqrt(max(P[0, 0], P[1, 1], P[2, 2]))
 
     @property

@@ -1,0 +1,225 @@
+"""fly-faults: the vehicle of `fly` takes off, flies and lands by the estimate while a fault is put into its streams, and obeys what `status`
+would say: it sinks where that is not "running". Lockstep, without ROS; a fault lasts from 12 to 15 s after switching on, in the first circle."""
+
+from argparse import Namespace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from tqdm import tqdm
+
+from uwb_tdoa_bias.foundation.files import write_text
+from uwb_tdoa_bias.foundation.sensors import SENSORS
+from uwb_tdoa_ekf.frames import rotation_std
+from uwb_tdoa_ekf.monitoring.status import RUNNING, status_of
+from uwb_tdoa_ekf.monitoring.stream_watch import StreamWatch
+from uwb_tdoa_ekf.monitoring.use import Use
+from uwb_tdoa_ekf.results import concatenated, rows_of
+from uwb_tdoa_ekf.streams import most_severe_first
+from uwb_tdoa_tools import parallel
+from uwb_tdoa_tools.flying.estimates import OurFilter
+from uwb_tdoa_tools.flying.simulator import SensorReadings
+from uwb_tdoa_tools.flying.trial import Task, Trial
+from uwb_tdoa_tools.flying.verdict import verdict_of
+from uwb_tdoa_tools.flying.world import world_of
+
+BEGIN, END = 12.0, 15.0  # s
+LOOK, REPORT = 0.2, 1.0  # s between two looks at the status, and two at the streams, as in ekf_node
+LAG = 0.25  # s
+AIDS = "height", "velocity"
+
+Change = Callable[[Any], Any]  # of the part of a stream that came in one turn: Imu, Tdoas or another
+
+
+@dataclass(frozen=True)
+class FlownFault:
+    """stream : name; change : of what it measures; once : of the first message only; lasts : s."""
+
+    stream: str
+    change: Change
+    once: bool = False
+    lasts: float = END - BEGIN
+
+    @property
+    def aids(self) -> tuple[str, ...]:
+        """Sensors that it needs beside TDOAs and the IMU."""
+        return (self.stream,) if self.stream in AIDS else ()
+
+
+def _put(**columns: Callable[[Any], np.ndarray]) -> Change:
+    """New columns of a part."""
+    return lambda part: replace(part, **{name: make(part) for name, make in columns.items()})
+
+
+def _late(part: Any, anchors: dict[int, float]) -> np.ndarray:
+    delays = np.array([anchors.get(int(b), 0.0) - anchors.get(int(a), 0.0) for a, b in zip(part.a, part.b)])
+    return part.d + delays.reshape(part.d.shape)
+
+
+def _swapped(ids: np.ndarray) -> np.ndarray:
+    return np.where(ids == 2, 5, np.where(ids == 5, 2, ids))
+
+
+def _none(part: Any) -> Any:
+    return rows_of(part, slice(0, 0))
+
+
+def _twice(part: Any) -> Any:
+    return concatenated([part, part])
+
+
+def _outliers(part: Any) -> np.ndarray:
+    hit = (np.arange(len(part.t)) + np.floor(1e3 * part.t)).astype(int) % 2 == 0
+    return part.d + np.where(hit, 3.0 * np.sin(1e4 * part.t), 0.0)
+
+
+def _ahead(seconds: float) -> Change:
+    return _put(t=lambda part: part.t + seconds)
+
+
+FAULTS = {
+    "nothing": FlownFault("tdoa", lambda part: part),
+    "tdoa: one stamp 5 s ahead": FlownFault("tdoa", _ahead(5.0), once=True),
+    "tdoa: one stamp 5 s behind": FlownFault("tdoa", _ahead(-5.0), once=True),
+    "tdoa: stamps 0.3 s behind": FlownFault("tdoa", _ahead(-0.3)),
+    "tdoa: silent": FlownFault("tdoa", _none),
+    "tdoa: silent, 1 s": FlownFault("tdoa", _none, lasts=1.0),
+    "tdoa: NaN": FlownFault("tdoa", _put(d=lambda part: np.full(len(part.t), np.nan))),
+    "tdoa: twice": FlownFault("tdoa", _twice),
+    "tdoa: sign": FlownFault("tdoa", _put(d=lambda part: -part.d)),
+    "tdoa: in cm": FlownFault("tdoa", _put(d=lambda part: 100.0 * part.d)),
+    "tdoa: half are outliers": FlownFault("tdoa", _put(d=_outliers)),
+    "tdoa: an anchor 1 m late": FlownFault("tdoa", _put(d=lambda part: _late(part, {2: 1.0}))),
+    "tdoa: two anchors 1.5 m late": FlownFault("tdoa", _put(d=lambda part: _late(part, {2: 1.5, 5: 1.5}))),
+    "tdoa: two ids exchanged": FlownFault("tdoa", _put(a=lambda part: _swapped(part.a), b=lambda part: _swapped(part.b)), lasts=math.inf),
+    "tdoa: ids unknown": FlownFault("tdoa", _put(a=lambda part: part.a + 100)),
+    "imu: one stamp 5 s ahead": FlownFault("imu", _ahead(5.0), once=True),
+    "imu: one stamp 5 s behind": FlownFault("imu", _ahead(-5.0), once=True),
+    "imu: silent": FlownFault("imu", _none),
+    "imu: NaN": FlownFault("imu", _put(gyro=lambda part: np.full(part.gyro.shape, np.nan))),
+    "imu: in g": FlownFault("imu", _put(accel=lambda part: part.accel / 9.80665)),
+    "imu: gyroscope 0.5 rad/s off": FlownFault("imu", _put(gyro=lambda part: part.gyro + [0.0, 0.0, 0.5])),
+    "height: 60 s ahead": FlownFault("height", _ahead(60.0)),
+    "height: 1 m too large": FlownFault("height", _put(range=lambda part: part.range + 1.0)),
+    "velocity: 60 s ahead": FlownFault("velocity", _ahead(60.0)),
+    "velocity: sign": FlownFault("velocity", _put(v=lambda part: -part.v)),
+}
+
+
+class FaultyFilter:
+    """An EstimateSource: OurFilter, whose streams have a fault, and that obeys what `status` would say."""
+
+    def __init__(self, ours: OurFilter, fault: FlownFault) -> None:
+        """ours : OurFilter; fault : FlownFault."""
+        self._ours, self._fault, self._begun = ours, fault, False
+        self._use, self._watch, self._findings = Use(LAG), StreamWatch(ours.estimator.anchors, LAG), []
+        self._received = dict.fromkeys(("imu", "tdoa", *SENSORS), 0)
+        self._now = self._looked = self._reported = self._last = 0.0
+        self._restarts, self.why, self.said = 0, "", ""
+
+    def set_pose(self, t: float, p: np.ndarray, std: float, yaw: float) -> None:
+        """As of OurFilter."""
+        self._ours.set_pose(t, p, std, yaw)
+
+    def take(self, measured: SensorReadings) -> None:
+        """Take what arrived, and look at it as ekf_node does."""
+        if len(measured.imu.t):
+            self._now = float(measured.imu.t[-1])
+        streams = {name: self._changed(name, part) for name, part in measured.streams.items()}
+        for name, part in streams.items():
+            self._received[name] += len(part.t)
+        imu, tdoa = streams.pop("imu"), streams.pop("tdoa")
+        self._watch.add_imu(imu.t, np.full(len(imu.t), self._now), imu.gyro, imu.accel)
+        self._watch.add_tdoa(tdoa.t, np.full(len(tdoa.t), self._now), tdoa.a, tdoa.b, tdoa.d)
+        before = self._ours.newest
+        self._ours.take(SensorReadings(imu, tdoa, streams))
+        if self._ours.newest is not before:
+            self._last = self._now
+        if self._now >= self._looked + LOOK:
+            self._look()
+
+    def _changed(self, name: str, part: Any) -> Any:
+        fault = self._fault
+        if name != fault.stream or not len(part.t) or not BEGIN <= self._now < BEGIN + fault.lasts:
+            return part
+        if not fault.once:
+            return fault.change(part)
+        if self._begun:
+            return part
+        self._begun = True
+        return concatenated([fault.change(rows_of(part, slice(0, 1))), rows_of(part, slice(1, None))])
+
+    def _look(self) -> None:
+        estimator, newest = self._ours.estimator, self._ours.newest
+        self._looked = self._now
+        self._use.look(self._now, self._received, estimator.counts, estimator.running)
+        if self._now >= self._reported + REPORT:
+            self._reported = self._now
+            if self._restarts != estimator.counts["restarts"]:
+                self._restarts = estimator.counts["restarts"]
+                self._watch.restart()
+            found = self._watch.findings(estimator.sign_turns, self._use.contradicted)
+            self._findings = most_severe_first([*found, *estimator.findings])
+        yaw_std = math.nan if newest is None else rotation_std(newest.q[-1:], newest.covariance[-1:])[0, 2]
+        status = status_of(estimator, yaw_std, self._now - self._last, self._use, self._findings)
+        self.why = "" if status.status == RUNNING else status.why
+        self.said = self.said or (self.why if self._now > BEGIN else "")
+
+    @property
+    def pose(self) -> Any:
+        """As of OurFilter."""
+        return self._ours.pose
+
+    @property
+    def deviation(self) -> float:
+        """m, inf where `status` is not "running"."""
+        return math.inf if self.why else self._ours.deviation
+
+    @property
+    def odometry(self) -> Any:
+        """As of OurFilter."""
+        return self._ours.odometry
+
+
+def flown(task: tuple[str, int]) -> dict[str, Any]:
+    """What becomes of one flight: (name of a fault, seed)."""
+    name, seed = task
+    fault = FAULTS[name]
+    trial = Trial(Task(world_of("hall", aids=fault.aids), seed))
+    assert isinstance(trial.source, OurFilter)
+    trial.source = source = FaultyFilter(trial.source, fault)
+    trial.fly()
+    verdict = verdict_of(trial.flown)
+    return {key: verdict[key] for key in ("landed", "safe", "why", "said_lost", "tracking")} | {"fault": name, "seed": seed, "said": source.said}
+
+
+def add_options(add: Callable) -> None:
+    """add : add_argument of a parser."""
+    add("--flights", type=parallel.whole_number, default=10, metavar="N", help="of each fault (default: 10)")
+    add("--seed", type=parallel.whole_number, default=5001, metavar="S", help="of the first (default: 5001)")
+    add("--jobs", type=parallel.whole_number, metavar="N", help="flights at once (default: as many as there are cores)")
+    add("--json", type=Path, metavar="FILE", help="write all figures")
+
+
+def run(args: Namespace) -> None:
+    """Fly, and print the table."""
+    tasks = [(name, args.seed + k) for name in FAULTS for k in range(args.flights)]
+    rows = list(tqdm(parallel.over(partial(flown), tasks, args.jobs), total=len(tasks), disable=None))
+    print("\n".join(table(rows)))
+    if args.json:
+        write_text(args.json, json.dumps(rows, indent=1))
+
+
+def table(rows: list[dict[str, Any]]) -> list[str]:
+    """Lines of Markdown: of each fault how many landed at their place, came down safely, and the largest part of what was said."""
+    lines = ["| fault | flights | landed | safe | what `status` said first |", "|---|---:|---:|---:|---|"]
+    for name in dict.fromkeys(row["fault"] for row in rows):
+        mine = [row for row in rows if row["fault"] == name]
+        said = next((row["said"] for row in mine if row["said"]), "nothing")
+        lines.append(f"| {name} | {len(mine)} | {sum(r['landed'] for r in mine)} | {sum(r['safe'] for r in mine)} | {said[:90]} |")
+    return lines
