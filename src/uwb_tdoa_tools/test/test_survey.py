@@ -75,7 +75,7 @@ def test_yaml(tmp_path):
         ("hello\n", "line 1: 'hello' is not 'name,x,y,z'"),
         ("landmark,1,2,3\n", "no survey that can be read"),
         ("id,x,y,z\n", "holds no anchor"),
-        ("id,x,y,z\n0,1,2\n", "line 2: '0,1,2' is not"),
+        ("id,x,y,z\n0,1,2\n", "line 2: '0,1,2' has 3 cells, the header 4"),
         ("id,x,y,z\none,1,2,3\n", "line 2: id is 'one'"),
         ("id,x,y,z\n0,1,2,3\n0,1,2,3\n", "id 0 is given twice"),
         ("anchorAnt0,1,2,nan\n", "line 1: 'anchorAnt0,1,2,nan' is not"),
@@ -83,7 +83,7 @@ def test_yaml(tmp_path):
         ("anchorAnt0,1,2,3\nanchor1_1,1,2,3\n", "anchor 1 has arm tips but no line"),
         ("anchorAnt0,1,2,3\nanchor0_1,1,2,3\n", "1 of 3 arm tips"),
         ("\n".join(survey_lines(noise=0.03)[0]), "miss the stand's shape by"),
-        ("anchors: {}\n", "expected a mapping"),
+        ("anchors: {}\n", "no anchor is recognized; write"),
     ],
 )
 def test_refused_with_the_line(read, text, sentence):

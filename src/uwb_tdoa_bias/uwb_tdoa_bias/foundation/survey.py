@@ -1,4 +1,4 @@
-"""Anchor surveys: total-station text files, CSV files of positions, and our own YAML."""
+"""Anchor surveys: text files of a total station, tables, YAML and JSON."""
 
 from __future__ import annotations
 
@@ -7,13 +7,16 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
+from . import survey_forms
 from .anchors import FARTHEST, Anchors
 from .errors import InputError
 from .files import read_bytes
 from .later import rotations
 from .limits import SURVEY_BYTES
+from .survey_forms import Entry, Lines
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from pathlib import Path
 
 # The tips of the three marker arms of a stand in the stand's own frame, metres. Arm 1 points up (z), arm 3 forward (x).
@@ -26,37 +29,61 @@ MAX_TIP_RESIDUAL = 0.010  # metres RMS; measured: 0.5 ... 2.2 mm
 
 _ANTENNA = re.compile(r"anchorAnt_?([0-9]{1,9})$")
 _TIP = re.compile(r"anchor_?([0-9]{1,9})_([123])$")
-_OURS = re.compile(r"[{\s]*[\"']?anchors[\"']?\s*:")
-Lines = list[tuple[int, list[str]]]  # numbers and cells
 
 
 def read_survey(path: str | Path) -> Anchors:
-    """Anchors of a survey file of any of three kinds, told apart by content.
+    """Anchors of a survey file: of a total station, or of any form of `read_entries` whose anchors are called by numbers.
+
+    Positions stay in the frame of the survey. Raises InputError with line or key, value and remedy.
+    """
+    entries, frame = read_entries(path)
+    for entry in entries:
+        if not is_id(entry.name):
+            raise InputError(f"{path}: {entry.where}: id is {entry.name[:40]!r}; it must be a whole number.")
+    return anchors_of(path, entries, [int(entry.name) for entry in entries], frame)
+
+
+def anchors_of(path: str | Path, entries: Sequence[Entry], ids: Sequence[int], frame: str) -> Anchors:
+    """Return Anchors of entries of a file, under these ids. Raises InputError."""
+    positions, orientations = np.array([entry.position for entry in entries]), np.array([entry.orientation for entry in entries])
+    try:
+        return Anchors(np.array(ids), positions, orientations, frame)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def is_id(name: str) -> bool:
+    """Return whether a name is a whole number, as messages have it."""
+    return re.fullmatch("[0-9]{1,9}", name) is not None
+
+
+def read_entries(path: str | Path) -> tuple[list[Entry], str]:
+    """Anchors of a survey file as they stand there, and the name of the world frame. The form is told by content:
 
     - total station: lines `name,x,y,z` in metres; `anchorAntN` is the antenna of anchor N, `anchorN_1/_2/_3` the arm
       tips of its stand (up, left, forward), from which the orientation follows; other names are ignored;
-    - `id,x,y,z` with that header line, or `,x,y,z`: positions only;
-    - YAML, see `Anchors.from_yaml`.
+    - a table: commas, semicolons, tabs or blanks between its cells; a header names id, x, y and z in any usual way, with or without
+      units; without a header each line is an id and three numbers;
+    - YAML or JSON: `anchors: {0: {position: [x, y, z], orientation: [x, y, z, w]}}`, that as a list, `0: {x:, y:, z:}` of the Crazyflie
+      client, `anchor0_pos: [x, y, z]` of lps-ros, parameter files of ROS, an OpenCV matrix of a row for each anchor.
 
-    Orientation: antenna stand to world; x forward, z up the stand, y completes a right-handed frame. NaN without tips.
-    Positions stay in the frame of the survey. Raises InputError with the line.
+    Orientation: antenna stand to world; x forward, z up the stand, y completes a right-handed frame. NaN if not surveyed. Raises
+    InputError.
     """
     try:
         text = read_bytes(path, SURVEY_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(
-            f"{path}: byte {error.start} is not text; give a survey file (.txt, .csv or .yaml)."
+            f"{path}: byte {error.start} is not text; give a survey file (.txt, .csv, .yaml or .json)."
         ) from error
-    texts = [(number, line.strip()) for number, line in enumerate(text.splitlines(), start=1) if line.strip()]
-    if any(_OURS.match(line) for _, line in texts):
-        return Anchors.from_yaml(path)
-    lines = [(number, [cell.strip() for cell in line.split(",")]) for number, line in texts]
-    if not lines:
-        raise InputError(f"{path}: is empty; give a survey file (.txt, .csv or .yaml).")
+    if not text.strip():
+        raise InputError(f"{path}: is empty; give a survey file (.txt, .csv, .yaml or .json).")
+    if not survey_forms.is_table(text):
+        return survey_forms.read_tree(text, path)
+    lines = survey_forms.lines_of(text)
     try:
-        if lines[0][1] in (["id", "x", "y", "z"], ["", "x", "y", "z"]):  # the second as pandas writes it
-            return _positions(path, lines[1:])
-        return _total_station(path, lines)
+        entries = survey_forms.read_table(lines)
+        return (_total_station(path, lines) if entries is None else entries), "map"
     except InputError as error:
         message = str(error)
         raise InputError(message if message.startswith(f"{path}: ") else f"{path}: {message}") from error
@@ -73,19 +100,7 @@ def orientation_from_tips(tips: np.ndarray) -> tuple[np.ndarray, float]:
     return rotation.as_quat(), float(np.sqrt(((rotation.apply(nominal) - surveyed) ** 2).sum(axis=1).mean()))
 
 
-def _positions(path: str | Path, lines: Lines) -> Anchors:
-    ids, positions = [], []
-    for number, cells in lines:
-        if not re.fullmatch("[0-9]{1,9}", cells[0]):
-            raise InputError(f"{path}: line {number}: id is {cells[0]!r}; it must be a whole number.")
-        ids.append(int(cells[0]))
-        positions.append(_point(path, number, cells))
-    if not ids:
-        raise InputError(f"{path}: holds no anchor; add lines 'id,x,y,z' in metres.")
-    return Anchors.from_positions(positions, ids)
-
-
-def _total_station(path: str | Path, lines: Lines) -> Anchors:
+def _total_station(path: str | Path, lines: Lines) -> list[Entry]:
     antennas: dict[Any, list[float]] = {}
     tips: dict[Any, list[float]] = {}
     for number, cells in lines:
@@ -101,21 +116,19 @@ def _total_station(path: str | Path, lines: Lines) -> Anchors:
         points[key] = point
     if not antennas:
         raise InputError(
-            f"{path}: is no survey that can be read: expected lines 'anchorAnt0,x,y,z' of a total station, a header "
-            "line 'id,x,y,z', or YAML with 'anchors:'."
+            f"{path}: is no survey that can be read: line {lines[0][0]}, {','.join(lines[0][1])[:60]!r}, is neither a header with id, x, y "
+            "and z, nor a line 'anchorAnt0,x,y,z' of a total station; put 'id,x,y,z' in the first line, or write YAML with 'anchors:'."
         )
     for anchor, _ in tips:
         if anchor not in antennas:
             raise InputError(f"{path}: anchor {anchor} has arm tips but no line 'anchorAnt{anchor},x,y,z'; add it.")
-    ids = sorted(antennas)
-    orientations = np.array([_orientation(path, i, tips) for i in ids])
-    return Anchors(np.array(ids), np.array([antennas[i] for i in ids]), orientations)
+    return [Entry(str(i), antennas[i], _orientation(path, i, tips), f"anchorAnt{i}") for i in sorted(antennas)]
 
 
-def _orientation(path: str | Path, anchor: int, tips: dict[tuple[int, int], list[float]]) -> np.ndarray:
+def _orientation(path: str | Path, anchor: int, tips: dict[tuple[int, int], list[float]]) -> list[float]:
     found = [tips[anchor, k] for k in (1, 2, 3) if (anchor, k) in tips]
     if not found:
-        return np.full(4, np.nan)
+        return survey_forms.NOT_SURVEYED
     if len(found) < 3:
         raise InputError(f"{path}: anchor {anchor} has {len(found)} of 3 arm tips; survey all three or delete them.")
     quaternion, residual = orientation_from_tips(np.array(found))
@@ -124,7 +137,7 @@ def _orientation(path: str | Path, anchor: int, tips: dict[tuple[int, int], list
             f"{path}: the arm tips of anchor {anchor} miss the stand's shape by {1e3 * residual:.0f} mm (at most "
             f"{1e3 * MAX_TIP_RESIDUAL:.0f} mm expected); check lines anchor{anchor}_1, _2 and _3."
         )
-    return quaternion
+    return quaternion.tolist()
 
 
 def _point(path: str | Path, number: int, cells: list[str]) -> list[float]:

@@ -4,18 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 import re
-from typing import Any, TYPE_CHECKING
-
-import numpy as np
+from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.foundation import survey
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.limits import TooMuch
-from uwb_tdoa_bias.foundation.safe_yaml import read_yaml
 from uwb_tdoa_bias.foundation.survey_faults import refuse_faulty
-
-from .tables import number, read_table
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -41,8 +35,7 @@ class Named:
 
 
 def read_named(path: str | Path) -> Named:
-    """Named of a survey file that `read_survey` reads, or one like it with names of any text in place of the ids: a CSV file name,x,y,z or
-    id,x,y,z, or YAML. The id is the number that a name ends with, if all end with different ones; else the line of the survey, from 0 on.
+    """Named of a survey file of any form of `survey.read_entries`, with ids or names of any text. The id is the number that a name ends with, if all end with different ones; else the line of the survey, from 0 on.
     Raises InputError, also for a survey that is certainly wrong."""
     named = _read_named(path)
     refuse_faulty(named.anchors, str(path))
@@ -50,15 +43,10 @@ def read_named(path: str | Path) -> Named:
 
 
 def _read_named(path: str | Path) -> Named:
-    try:
-        return Named(survey.read_survey(path))
-    except TooMuch:
-        raise
-    except InputError as error:
-        refused = error
-        names, positions, orientations, frame = _entries(path)
-        if not names:
-            raise
+    entries, frame = survey.read_entries(path)
+    names = [entry.name for entry in entries]
+    if all(map(survey.is_id, names)):
+        return Named(survey.anchors_of(path, entries, [int(name) for name in names], frame))
     if len(set(names)) < len(names):
         raise InputError(
             f"{path}: anchor {next(name for name in names if names.count(name) > 1)!r} is there twice; every anchor needs its own name."
@@ -67,39 +55,12 @@ def _read_named(path: str | Path) -> Named:
     ids = [int(end[1]) for end in ends if end]
     if len(set(ids)) < len(names) or max(ids) > LARGEST_ID:
         ids = list(range(len(names)))
-    try:
-        return Named(Anchors(np.array(ids), positions, orientations, frame), dict(zip(names, ids)))
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-    except (TypeError, ValueError) as error:  # a text, or a list, in place of a number
-        raise refused from error
+    return Named(survey.anchors_of(path, entries, ids, frame), dict(zip(names, ids)))
 
 
 def read_survey(path: str | Path) -> Anchors:
     """Anchors of a survey file, see `read_named`: of those with names, under the ids that these get."""
     return read_named(path).anchors
-
-
-def _entries(path: str | Path) -> tuple[list[str], Any, Any, Any]:
-    """(names, positions, orientations, frame) of a survey with names, as they stand there; no names if it is none."""
-    unknown = [float("nan")] * 4
-    none: tuple[list[str], Any, Any, Any] = ([], [], [], "map")
-    try:
-        rows = list(read_table(path))
-    except InputError:
-        rows = []
-    first = next((name for name in ("name", "anchor", "id") if rows and {name, "x", "y", "z"} <= rows[0][1].keys()), None)
-    if first:
-        positions = [[number(path, line, row, axis) for axis in "xyz"] for line, row in rows]
-        return [row[first].strip() for _, row in rows], positions, [unknown] * len(rows), "map"
-    try:
-        content = read_yaml(path)
-        anchors = content["anchors"]
-        names = [str(name) for name in anchors]
-        positions = [one["position"] for one in anchors.values()]
-        return names, positions, [one.get("orientation", unknown) for one in anchors.values()], content.get("frame", "map")
-    except (InputError, KeyError, TypeError, AttributeError):
-        return none
 
 
 def _whole(text: str) -> int | None:
