@@ -128,3 +128,23 @@ def test_without_an_imu_it_stands_too():
         flight = replace(on_floor(seed, 5.0), imu=None)
         _, error, nees = run(flight, use_imu=False)
         assert np.linalg.norm(error, axis=1).max() < 0.6 and nees.mean() < 9.0
+
+
+def share_at_rest(flight):
+    """Share of the time, from 1 s on, in which a filter takes the tag for one at rest."""
+    estimator, resting = Estimator(flight.anchors, FilterConfig()), []
+    for now in np.arange(0.1, flight.imu.t[-1], 0.1):
+        for stream, add in ((flight.imu, estimator.add_imu), (flight.tdoa, estimator.add_tdoa)):
+            rows = (stream.t >= now - 0.1) & (stream.t < now)
+            add(*(column[rows] for column in list(vars(stream).values())[:4]))
+        estimator.advance()
+        if now > 1.0:
+            resting.append(estimator._ekf.resting)
+    return np.mean(resting)
+
+
+def test_too_few_tdoas_are_no_evidence_of_motion():
+    """Pairs at random, as TDoA3 has them: in many looks no pair is heard often enough. Counted as motion, such looks left 0.15 of the time."""
+    at_rest = [fly(seed, 20.0, hover=True, tdoa_rate=240.0, accel_noise=0.003, gyro_noise=0.0005) for seed in range(3)]
+    assert np.mean([share_at_rest(flight) for flight in at_rest]) > 0.6
+    assert share_at_rest(fly(0, 20.0, tdoa_rate=240.0, accel_noise=0.003, gyro_noise=0.0005)) == 0.0  # it flies

@@ -34,7 +34,8 @@ SMALLEST_SPREAD = 0.02  # m, of the values of a pair
 STILL_SPEED = 0.3  # m/s; a velocity that is not known better than that may be none
 LIKELY_SPEED = 1.0  # m/s, of a tag of which nothing is known
 STILL_SCALE, STILL_SWEEPS = 2.5, 5  # standard deviations of a change from which on it is the lateness that has changed
-MOVES = 12.0  # normalised square of a velocity that is not zero
+MOVING = 12.0  # normalised square of a velocity that is not zero
+STILL, UNKNOWN, MOVES = range(3)  # what the TDOAs of a window show of the motion of a tag
 # Median normalised square of the changes at rest, and by how much one of n is larger, times sqrt(n)
 EXPECTED_RATIO, LARGEST_RATIO = 0.45, 3.5
 
@@ -192,8 +193,9 @@ def _is_of(tdoa: Record, a: int, b: int) -> bool:
 
 
 @compiled
-def is_still(pairs: np.ndarray, anchors: np.ndarray, x: np.ndarray, covariance: np.ndarray) -> bool:
-    """True if the TDOAs of most (k,) of PAIR stay what they are: whatever their anchors are late by, the tag does not move.
+def judge_motion(pairs: np.ndarray, anchors: np.ndarray, x: np.ndarray, covariance: np.ndarray) -> int:
+    """STILL if the TDOAs of most (k,) of PAIR stay what they are: whatever their anchors are late by, the tag does not move. MOVES if they
+    change, and UNKNOWN if they are too few, or too noisy, to show either.
 
     x : (3,) m, about where it is; covariance (3, 3) m^2/s^2 of the velocity that they would have shown is filled, large where that is not
     known. Least squares of the changes, robust against anchors whose lateness has changed.
@@ -206,8 +208,10 @@ def is_still(pairs: np.ndarray, anchors: np.ndarray, x: np.ndarray, covariance: 
             changes[n, 3], changes[n, 4] = pair.change / pair.apart, pair.change_variance / pair.apart**2
             ratios[n] = pair.change**2 / pair.change_variance
             n += 1
-    if n < FEWEST_PAIRS or np.median(ratios[:n]) > EXPECTED_RATIO + LARGEST_RATIO / math.sqrt(n):
-        return False
+    if n < FEWEST_PAIRS:
+        return UNKNOWN
+    if np.median(ratios[:n]) > EXPECTED_RATIO + LARGEST_RATIO / math.sqrt(n):
+        return MOVES
     both, v = np.empty((3, 7)), np.zeros(3)
     for sweep in range(STILL_SWEEPS):
         both[:, :] = 0.0
@@ -229,7 +233,9 @@ def is_still(pairs: np.ndarray, anchors: np.ndarray, x: np.ndarray, covariance: 
     for i in range(3):
         for j in range(3):
             size += v[i] * information[i, j] * v[j]
-    return size < MOVES and covariance[0, 0] + covariance[1, 1] < STILL_SPEED**2
+    if size >= MOVING:
+        return MOVES
+    return STILL if covariance[0, 0] + covariance[1, 1] < STILL_SPEED**2 else UNKNOWN
 
 
 @compiled

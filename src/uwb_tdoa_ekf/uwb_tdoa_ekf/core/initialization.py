@@ -92,7 +92,7 @@ def start(
     at_rest, its = x[0].copy(), covariance[0].copy()
     wide = np.trace(its[:3, :3]) > APART**2  # before it holds other explanations
     lead = standing.weigh(ekf, pairs, anchors, parameters, known, at_rest, its)
-    still = ground.is_still(pairs, anchors, at_rest, ekf.still_covariance)
+    still = ground.judge_motion(pairs, anchors, at_rest, ekf.still_covariance) == ground.STILL
     on_ground = lead > (0.0 if still else standing.DECISIVE)
     good = still if on_ground else share >= AGREE and workspace.contains(ekf.workspace, x[0])
     if not (good or anyhow):

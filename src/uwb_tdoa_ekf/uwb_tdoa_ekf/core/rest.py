@@ -81,14 +81,18 @@ def look(
     if not (ekf.resting or calm or standing.is_near_ground(best, parameters)):
         return
     count = ground.find_pairs(window, ekf.pairs)
-    still = ground.is_still(ekf.pairs[:count], anchors, best.x, ekf.still_covariance)
+    motion = ground.judge_motion(ekf.pairs[:count], anchors, best.x, ekf.still_covariance)
+    still = motion == ground.STILL
+    unshown = motion == ground.UNKNOWN and ekf.quiet  # too few TDOAs: no evidence, and neither has the inertial sensor any
     if ekf.resting:
-        ekf.doubts = 0 if still else ekf.doubts + 1
+        if not unshown:
+            ekf.doubts = 0 if still else ekf.doubts + 1
         ekf.resting = ekf.doubts < (MOST_DOUBTS if np.abs(ekf.lift).max() < UNFELT else 1)
     else:
         ekf.lift[:] = 0.0
         ekf.doubts = 0
-        ekf.stills = ekf.stills + 1 if still and ekf.quiet else 0
+        if not unshown:
+            ekf.stills = ekf.stills + 1 if still and ekf.quiet else 0
         stands = calm and (still or ekf.quiet)
         place, covariance = np.empty(3), np.empty((3, 3))
         lateness = standing.find_landed(ekf, ekf.pairs[:count], anchors, parameters, still, place, covariance)
