@@ -7,7 +7,7 @@ import pytest
 import yaml
 
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_ekf.core.config import CHOICES, RENAMED, PARAMETERS, FilterConfig, current_names
+from uwb_tdoa_ekf.core.config import CHOICES, PARAMETERS, FilterConfig
 
 CONFIG = Path(__file__).resolve().parents[1] / "config" / "ekf_node.yaml"
 SWITCHES = ("use_imu", "adapt_noise", "zero_velocity", "recover", "use_height", "use_pressure", "use_velocity")
@@ -39,31 +39,6 @@ def test_the_parameter_file_has_every_parameter_in_order_with_its_default_unit_a
     (node,) = yaml.safe_load(CONFIG.read_text()).values()
     for field in fields(FilterConfig):
         assert type(node["ros__parameters"][field.name]) is field.type, field.name
-
-
-def test_old_names_are_taken_with_a_warning():
-    old = {"reach": 2.0, "vibration_trust": 0.5, "tdoa_correlation": 3.0, "start_patience": 4.0}
-    assert old.keys() == RENAMED.keys() and set(RENAMED.values()) <= {field.name for field in fields(FilterConfig)}
-    with pytest.warns(FutureWarning) as said:
-        config = FilterConfig.from_parameters(old | {"gate": 5.0, "reorder": 1.0})
-    assert len(said) == len(old) and all(name in str(w.message) for name, w in zip(RENAMED, said))
-    expected = dict(workspace_margin=2.0, accel_prior_std=0.5, tdoa_correlation_length=3.0, start_timeout=4.0, gate=5.0)
-    assert config == FilterConfig(**expected)
-
-
-def test_old_names_in_a_parameter_file_are_taken_with_a_warning(tmp_path):
-    with pytest.warns(FutureWarning, match="reach: is called workspace_margin now"):
-        config = FilterConfig.from_yaml(write(tmp_path, "ekf_node: {ros__parameters: {reach: 2.0}}"))
-    assert config == FilterConfig(workspace_margin=2.0)
-
-
-def test_a_parameter_under_both_names_is_bad_input(tmp_path):
-    with pytest.raises(InputError, match="reach: is the old name of workspace_margin"):
-        FilterConfig.from_yaml(write(tmp_path, "a: {ros__parameters: {reach: 2.0, workspace_margin: 2.0}}"))
-
-
-def test_present_names_are_left_alone():
-    assert current_names({"workspace_margin": 1, "else": 2}, warn=pytest.fail) == {"workspace_margin": 1, "else": 2}
 
 
 @pytest.mark.parametrize("value", [0.0, -1.0, float("nan"), float("inf"), "fast", None])

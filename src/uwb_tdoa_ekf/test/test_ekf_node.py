@@ -9,7 +9,6 @@ rclpy = pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from flights import fly  # noqa: E402
-from rclpy.impl.rcutils_logger import RcutilsLogger  # noqa: E402
 from uwb_tdoa_ekf.core import engine, measurements  # noqa: E402
 from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 from uwb_tdoa_ekf.ekf_node import EkfNode  # noqa: E402
@@ -36,20 +35,6 @@ def test_every_parameter_is_in_the_parameter_file_with_its_default(node):
     assert FilterConfig.from_yaml(CONFIG) == FilterConfig()
     comments = dict(re.findall(r"^    (\w+): .*?  # (.*)$", CONFIG.read_text(), re.MULTILINE))
     assert comments == {name: node.describe_parameter(name).description for name in declared}
-
-
-def test_parameters_under_old_names_count_with_a_warning(monkeypatch):
-    said = []
-    monkeypatch.setattr(RcutilsLogger, "warning", lambda self, text, **_: said.append(text))
-    rclpy.init(args=["--ros-args", "-p", "reach:=2.5", "-p", "vibration_trust:=0.5"])
-    try:
-        node = EkfNode()
-        assert node.get_parameter("workspace_margin").value == 2.5 and not node.has_parameter("reach")
-        assert node.get_parameter("accel_prior_std").value == 0.5
-        assert [text.split(":")[0] for text in said] == ["vibration_trust", "reach"]
-        node.destroy_node()
-    finally:
-        rclpy.shutdown()
 
 
 @pytest.mark.parametrize("batch", [1, 3, 200])

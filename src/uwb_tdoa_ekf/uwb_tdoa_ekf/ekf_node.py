@@ -38,7 +38,6 @@ from uwb_tdoa_bias.foundation.ros_topics import Input, Refusals, several_publish
 from uwb_tdoa_bias.foundation.sensors import SENSORS
 from uwb_tdoa_msgs.msg import TdoaCorrected
 
-from .core.config import RENAMED
 from .ekf_parameters import ODOM, declare_parameters, follow_changes
 from .core.verdicts import INVALID
 from .estimator import Estimator
@@ -114,7 +113,7 @@ class EkfNode(StreamNode):
             str, tuple[ImuMount | None, str | None]
         ] = {}  # (ImuMount, or None for the body, and what is wrong) by frame of the IMU, in the order of coming
         self._health = Health(self._config, self._lag, FlyableVolume.load(volume) if volume else None)
-        refuse_unknown(self, {*RENAMED, *(member or ())})
+        refuse_unknown(self, member or ())
         self.get_logger().info("loading the filter; the first time it is compiled, which takes a minute, unless compile_nodes has done so")
         warm_up()
         moving = own["publish_tf"] == ODOM

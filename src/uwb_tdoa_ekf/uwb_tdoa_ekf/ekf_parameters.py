@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import fields, replace
 from typing import Any, TYPE_CHECKING
 
-from rcl_interfaces.msg import ParameterDescriptor, SetParametersResult
+from rcl_interfaces.msg import SetParametersResult
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_FILE
 from uwb_tdoa_bias.foundation.ros_parameters import FROZEN, Parameter, declare, declare_all
 
-from .core.config import CHOICES, RENAMED, FilterConfig, current_names
+from .core.config import CHOICES, FilterConfig
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -57,16 +57,12 @@ def names_of_parameters() -> set[str]:
 
 
 def declare_parameters(node: ParameterNode) -> tuple[FilterConfig, dict[str, Any]]:
-    """Declare all; returns (FilterConfig, {name: value} of the others). What was given under an old name counts, with a
-    warning."""
-    old = {name: _value_of_old(node, name) for name in RENAMED}
-    given = {name: value for name, value in old.items() if value is not None}
-    current = current_names(given, node.get_logger().warning)
+    """Declare all; returns (FilterConfig, {name: value} of the others)."""
     values = {}
     for field in fields(FilterConfig):
-        limits, default = field.metadata, current.get(field.name, field.default)
+        limits = field.metadata
         parameter = Parameter(
-            default, limits["text"], limits["low"], limits["high"], CHOICES.get(field.name, ()), settable=not limits["fixed"]
+            field.default, limits["text"], limits["low"], limits["high"], CHOICES.get(field.name, ()), settable=not limits["fixed"]
         )
         values[field.name] = declare(node, field.name, parameter)
     return FilterConfig(**values), declare_all(node, PARAMETERS)
@@ -89,10 +85,3 @@ def follow_changes(node: Node, config: Callable[[], FilterConfig], on_change: Ca
 
     node.add_on_set_parameters_callback(validate)
     node.add_post_set_parameters_callback(lambda parameters: on_change(changed(parameters)))
-
-
-def _value_of_old(node: Node, name: str) -> float | None:
-    """What was given for a parameter that the node does not have any more, or None."""
-    value = node.declare_parameter(name, None, ParameterDescriptor(dynamic_typing=True)).value
-    node.undeclare_parameter(name)
-    return value

@@ -27,7 +27,6 @@ from uwb_tdoa_bias.foundation.ros_node import StreamNode
 from uwb_tdoa_bias.foundation.ros_parameters import FROZEN, Parameter, declare_all, files_of, say_unused
 from uwb_tdoa_bias.foundation.ros_streams import Handed, RoundRobin
 
-from .core.config import RENAMED
 from .ekf_node import EkfNode
 from .ekf_parameters import names_of_parameters
 
@@ -77,7 +76,7 @@ class LocalizationNode(StreamNode):
         namespace = f"{self.get_namespace().rstrip('/')}/{tag}".rstrip("/") or "/"
         given = ["--ros-args", *(["-p", f"body_frame:={tag}/base_link"] if tag else []), "--", *_for_all(arguments)]
         options: dict[str, Any] = {"namespace": namespace, "cli_args": given, "use_global_arguments": False}
-        names = {*bias_node.PARAMETERS, *names_of_parameters(), *RENAMED, *PARAMETERS}
+        names = {*bias_node.PARAMETERS, *names_of_parameters(), *PARAMETERS}
         bias = BiasNode(member=names, **options)
         try:
             return Pair(bias, EkfNode(member=names, **options))

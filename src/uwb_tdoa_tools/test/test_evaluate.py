@@ -382,12 +382,6 @@ def test_parameters_on_the_command_line_are_those_of_a_file(bag, tmp_path):
     assert one["runs"][0] == other["runs"][0] != report([bag], tmp_path)["runs"][0]
 
 
-def test_a_parameter_under_its_old_name_counts_with_a_warning(bag, tmp_path):
-    with pytest.warns(FutureWarning, match="tdoa_correlation: is called tdoa_correlation_length now"):
-        old = report([bag, "-p", "tdoa_correlation:=1"], tmp_path)
-    assert old["runs"][0] == report([bag, "-p", "tdoa_correlation_length:=1.0"], tmp_path)["runs"][0]
-
-
 @pytest.mark.parametrize("text", ["tdoa_std=0.1", "sdt:=0.1", "tdoa_std:=[", "tdoa_std:=much", "adapt_noise:=1", ":=", ""])
 def test_a_bad_parameter_is_told(bag, text, capsys):
     assert main([str(bag), "-p", text]) == 2

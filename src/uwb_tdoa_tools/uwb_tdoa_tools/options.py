@@ -24,7 +24,7 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.safe_yaml import parse_yaml
 from uwb_tdoa_bias.foundation.sensors import SENSORS
-from uwb_tdoa_ekf.core.config import RENAMED, FilterConfig, current_names
+from uwb_tdoa_ekf.core.config import FilterConfig
 
 from . import cli
 from .bags.files import STORAGES
@@ -233,13 +233,13 @@ def known_of(args: Namespace, flights: Sequence[Flight]) -> tuple[Mark | Distanc
 
 def with_parameters(config: FilterConfig, texts: Iterable[str]) -> FilterConfig:
     """A FilterConfig with the values of texts "name:=value". Raises InputError."""
-    return replace(config, **current_names(dict(map(_parameter, texts))))
+    return replace(config, **dict(map(_parameter, texts)))
 
 
 def _parameter(text: str) -> tuple[str, Any]:
     """(name, value) of "name:=value"."""
     name, assigned, value = text.partition(":=")
     names = [field.name for field in fields(FilterConfig)]
-    if not assigned or name not in (*names, *RENAMED):
+    if not assigned or name not in names:
         raise InputError(f"-p {text}: write NAME:=VALUE, where NAME is one of {', '.join(names)}.")
     return name, parse_yaml(value, f"-p {text}")

@@ -177,7 +177,7 @@ def declare_all(node: ParameterNode, parameters: dict[str, Parameter]) -> dict[s
 
 def refuse_unknown(node: ParameterNode, others: Collection[str] = ()) -> None:
     """Raise InputError for a parameter that was given and that the node, which has declared its own, does not have.
-    others : names that are for somebody else, or old ones that were taken."""
+    others : names that are for somebody else."""
     for name in sorted(node._parameter_overrides):
         if name.startswith(QOS) or name in others or node.has_parameter(name):
             continue

@@ -1,11 +1,9 @@
 """Every number that tunes the filter, with its unit and why it is what it is."""
 
-from collections.abc import Callable
 from dataclasses import Field, dataclass, fields, make_dataclass
 import math
 from pathlib import Path
 from typing import Any, TYPE_CHECKING
-import warnings
 
 import numpy as np
 
@@ -18,12 +16,6 @@ from uwb_tdoa_bias.foundation.sensors.sensor import parameter
 ROBUST = ("innovation", "gate", "m_estimation")
 SIDES = "unknown", "below", "above", "-x", "+x", "-y", "+y"
 CHOICES = {"robust": ROBUST, "loss": LOSSES, "tag_side": SIDES}  # parameters that are one of a few names
-RENAMED = {  # old name: present name; the old ones work until the release after 0.1
-    "tdoa_correlation": "tdoa_correlation_length",
-    "vibration_trust": "accel_prior_std",
-    "reach": "workspace_margin",
-    "start_patience": "start_timeout",
-}
 
 
 @dataclass(frozen=True)
@@ -121,9 +113,7 @@ class FilterConfig(_SensorParameters):
 
     @classmethod
     def from_parameters(cls, parameters: dict[str, Any]) -> "FilterConfig":
-        """Of a dict by name; names that are no parameter of the filter are passed over, old ones taken with a warning
-        (see `current_names`). Raises InputError."""
-        parameters = current_names(parameters)
+        """Of a dict by name; names that are no parameter of the filter are passed over. Raises InputError."""
         return cls(**{f.name: parameters[f.name] for f in fields(cls) if f.name in parameters})
 
     @classmethod
@@ -146,23 +136,6 @@ class FilterConfig(_SensorParameters):
 
 
 PARAMETERS = np.dtype([(f.name, np.int64 if f.name in CHOICES else f.type) for f in fields(FilterConfig)], align=True)
-
-
-def current_names(parameters: dict[str, Any], warn: Callable[[str], object] | None = None) -> dict[str, Any]:
-    """A dict of parameters with old names (RENAMED) replaced by the present ones.
-
-    warn : is called with one sentence for each that had an old name; default: a FutureWarning. Raises InputError for a
-    parameter given under both.
-    """
-    out = dict(parameters)
-    for old, new in RENAMED.items():
-        if old in out:
-            if new in out:
-                raise InputError(f"{old}: is the old name of {new}, which is given too; give {new} alone.")
-            out[new] = out.pop(old)
-            sentence = f"{old}: is called {new} now; the old name will not be understood for long."
-            warnings.warn(sentence, FutureWarning, stacklevel=2) if warn is None else warn(sentence)
-    return out
 
 
 def _number(parameter: Field[Any], value: Any) -> float:
