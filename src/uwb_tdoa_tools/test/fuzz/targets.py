@@ -5,6 +5,7 @@ past it otherwise.
 """
 
 from functools import lru_cache
+import gzip
 import io
 import os
 from pathlib import Path
@@ -39,6 +40,7 @@ from uwb_tdoa_tools.readers.columns import parse_columns, read_columns
 from uwb_tdoa_tools.readers.names import Named
 from uwb_tdoa_tools.readers.tables import number, read_table
 from uwb_tdoa_tools.results_file import ResultsFile
+from uwb_tdoa_tools.simulation.walls import Walls
 from uwb_tdoa_tools.evaluating.table import read_others
 from uwb_tdoa_tools.surveying.distances import read_distances
 from uwb_tdoa_tools.surveying.marks import read_marks
@@ -93,6 +95,10 @@ def places(data):
     AnchorPlaces.from_yaml(_file(data))
 
 
+def walls(data):
+    Walls.from_yaml(_file(data)).between(np.zeros((1, 3)), np.ones((1, 3)))
+
+
 def survey(data):
     read_survey(_file(data))
 
@@ -121,6 +127,12 @@ def csv(data):
 
 def csv_salvaged(data):
     _finite(read_util_csv(_file(data), ANCHORS, salvage=True))
+
+
+def csv_gzip(data):
+    """What is in it is changed, and packed anew."""
+    packed = data if data.startswith(b"\x1f\x8b") else gzip.compress(data, 1, mtime=0)
+    _finite(read_util_csv(_file(packed), ANCHORS))
 
 
 def bag_mcap(data):
@@ -293,14 +305,14 @@ def bag_of(topic, msgtype, data):
 TARGETS = {
     function.__name__: function
     for function in (
-        yaml, anchors, effects, config, antenna, places, survey, table, log, log_sealed, log_salvaged, csv,
-        csv_salvaged, bag_mcap, bag_mcap_sealed, bag_mcap_salvaged, bag_sqlite, bag_sqlite_salvaged, bag_metadata, bag_message,
+        yaml, anchors, effects, config, antenna, places, walls, survey, table, log, log_sealed, log_salvaged, csv,
+        csv_salvaged, csv_gzip, bag_mcap, bag_mcap_sealed, bag_mcap_salvaged, bag_sqlite, bag_sqlite_salvaged, bag_metadata, bag_message,
         bag_packed, columns, marks, distances, tags, peers, results,
         flyable, flyable_sealed, bias_map, bias_map_sealed, model,
     )
 }  # fmt: skip
 SEEDS = {  # whose corpus a target starts from, if not its own
-    "log_sealed": "log", "log_salvaged": "log", "csv_salvaged": "csv", "bag_mcap_sealed": "bag_mcap",
+    "log_sealed": "log", "log_salvaged": "log", "csv_salvaged": "csv", "csv_gzip": "csv", "bag_mcap_sealed": "bag_mcap",
     "bag_mcap_salvaged": "bag_mcap", "bag_sqlite_salvaged": "bag_sqlite",
 }  # fmt: skip
 
