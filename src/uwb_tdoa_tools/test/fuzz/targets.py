@@ -7,6 +7,7 @@ past it otherwise.
 from functools import lru_cache
 import gzip
 import io
+import json
 import os
 from pathlib import Path
 import re
@@ -18,6 +19,7 @@ import zlib
 
 import numpy as np
 
+from uwb_tdoa_bias.correction import trial
 from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.anchors import Anchors
@@ -235,6 +237,26 @@ def bias_map_sealed(data):
 
 def model(data):
     Network(_file(data))
+
+
+def _judged_by_a_copy(content):
+    """As `trial.tried_out`, by a copy of this process: to start Python anew would take 0.3 s each time."""
+    ours, theirs = os.pipe()
+    if not (child := os.fork()):
+        os.chdir(FOLDER)
+        os.write(theirs, json.dumps(trial.judge(content)).encode())
+        os._exit(0)
+    os.close(theirs)
+    with open(ours, "rb") as answer:
+        said = answer.read()
+    os.waitpid(child, 0)
+    alone, why = json.loads(said or '[false, "it was ended"]')
+    if why:
+        raise trial.Unplayable(why)
+    return alone
+
+
+trial.tried_out = _judged_by_a_copy
 
 
 def _finite(flight):
