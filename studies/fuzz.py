@@ -21,6 +21,7 @@ from tqdm import tqdm
 
 from uwb_tdoa_bias.foundation.errors import Failure, InputError
 from uwb_tdoa_bias.foundation.files import write_bytes
+from uwb_tdoa_tools.outputs import OutputFolder
 
 SECONDS, MEGABYTES = 5.0, 500  # processor time and memory of one file
 
@@ -31,7 +32,7 @@ def add_options(add):
     add("--count", type=int, default=1000, metavar="N", help="files of each kind (default: 1000)")
     add("--first", type=int, default=0, metavar="N", help="number of the first (default: 0)")
     add("--seed", type=int, default=0, metavar="N", help="of the changes (default: 0)")
-    add("--out", type=Path, default=Path("out/fuzz"), metavar="DIR", help="for the files of findings (default: out/fuzz)")
+    add("--out", type=OutputFolder, default="out/fuzz", metavar="DIR", help="for the files of findings (default: out/fuzz)")
 
 
 def run(args):

@@ -22,6 +22,7 @@ from typing import Any, TYPE_CHECKING, TypeVar
 from tqdm import tqdm
 
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.files import read_bytes, refuse_output
 from uwb_tdoa_bias.foundation.version import written_by
 
 if TYPE_CHECKING:
@@ -47,6 +48,7 @@ class ResultsFile:
         asked = json.loads(json.dumps({"written_by": written_by(), **asked}))
         if not self._path.absolute().parent.is_dir():
             raise InputError(f"{path}: its directory does not exist; make it first.")
+        refuse_output(path)
         self._file = open(self._path, "a+b")
         try:
             self._begin(asked)
@@ -166,6 +168,7 @@ def state_of(path: str | Path | None) -> str:
 def asked_of(args: Namespace, besides: Iterable[str] = (), files: Iterable[str] = ()) -> dict[str, Any]:
     """What was asked of a command: {option: value}, JSON. besides : names of options that do not matter; files : of those that name
     files, whose content counts. Raises OSError."""
-    asked = {name: value for name, value in vars(args).items() if name not in besides}
+    given = {name: value for name, value in vars(args).items() if name not in besides}
+    asked = {name: str(value) if isinstance(value, Path) else value for name, value in given.items()}
     named = {name: Path(asked[name]) for name in files if asked[name] and Path(asked[name]).is_file()}
-    return asked | {name: hashlib.sha256(path.read_bytes()).hexdigest()[:16] for name, path in named.items()}
+    return asked | {name: hashlib.sha256(read_bytes(path)).hexdigest()[:16] for name, path in named.items()}

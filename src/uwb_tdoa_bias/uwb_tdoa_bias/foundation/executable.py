@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from functools import partial
 import gc
 from importlib import import_module
+from importlib.machinery import PathFinder
 import os
 import signal
 import sys
@@ -20,6 +21,7 @@ from typing import Any, TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+    from importlib.machinery import ModuleSpec
     from types import FrameType, ModuleType
 
 INTERRUPTED = 130  # exit code, as a shell gives it: 128 + SIGINT
@@ -58,8 +60,7 @@ def leave_present_folder_out() -> None:
 
 @contextmanager
 def elsewhere() -> Iterator[None]:
-    """In the root folder while the block lasts. matplotlib and numba read settings of the present folder when they are imported, and Python
-    looks for modules there where it is started by -m."""
+    """In the root folder while the block lasts: the present folder may hold modules for `python -m`, and settings."""
     here = os.open(".", os.O_PATH | os.O_DIRECTORY)  # also where its name is gone
     try:
         os.chdir("/")
@@ -67,6 +68,22 @@ def elsewhere() -> Iterator[None]:
     finally:
         os.fchdir(here)
         os.close(here)
+
+
+class _ImportedElsewhere:
+    """Finder of modules that read settings of the present folder (matplotlibrc, .numba_config.yaml) when they are imported, wherever that is:
+    they are imported in the root folder."""
+
+    @staticmethod
+    def find_spec(name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
+        """The ModuleSpec of such a module; None for all others."""
+        spec = PathFinder.find_spec(name, path) if name in ("matplotlib", "numba") else None
+        if spec is not None and spec.loader is not None:
+            spec.loader.exec_module = elsewhere()(spec.loader.exec_module)  # type: ignore[method-assign]  # of this one loader
+        return spec
+
+
+sys.meta_path.insert(0, _ImportedElsewhere)
 
 
 def interrupt(number: int, frame: FrameType | None) -> None:
