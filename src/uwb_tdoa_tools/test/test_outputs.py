@@ -111,6 +111,8 @@ ATTACKS = {  # [(output, what is read, what is said)]
         ("flights/one.log", "flights", "lies in {0}/flights, which is read"),
     ],
 }  # fmt: skip
+
+
 def line(words, attacked, out, read):
     """A command line with an output and, where there is an option for it, what is read; None where there is none."""
     parser, line, reads = PARSERS[words], [], read is None

@@ -26,7 +26,6 @@ from uwb_tdoa_bias.foundation.safe_yaml import parse_yaml
 from uwb_tdoa_bias.foundation.sensors import SENSORS
 from uwb_tdoa_ekf.core.config import RENAMED, FilterConfig, current_names
 
-from . import cli
 from .bags.files import STORAGES
 from .diagnosis.self_calibration import Tape
 from .localizing import rerun_file

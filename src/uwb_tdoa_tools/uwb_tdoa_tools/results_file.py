@@ -23,6 +23,7 @@ from tqdm import tqdm
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.files import read_bytes, refuse_output
+from uwb_tdoa_bias.foundation.limits import Budget, FOLDER_ENTRIES
 from uwb_tdoa_bias.foundation.version import written_by
 
 if TYPE_CHECKING:
@@ -73,7 +74,9 @@ class ResultsFile:
             raise InputError(
                 f"{self._path}: its results were made with another {' and '.join(different)}; ask for the same, or name another file."
             )
+        budget = Budget(self._path, os.fstat(self._file.fileno()).st_size)
         while line := self._file.readline(LINE):
+            budget.check_time()
             place = self._file.tell() - len(line)
             if len(line) == LINE:
                 raise self._foreign()
@@ -157,11 +160,14 @@ def resumed(over: MapFunction, done: ResultsFile) -> MapFunction:
 
 
 def state_of(path: str | Path | None) -> str:
-    """What changes when a file or a folder of files does: a text; of None "None". Raises OSError."""
+    """What changes when a file or a folder of files does: a text; of None "None". Raises OSError and InputError."""
     if path is None:
         return "None"
     path = Path(path).absolute()
-    files = [path, *(inside for inside in sorted(path.rglob("*")) if path.is_dir())]
+    files, budget = [path], Budget(path)
+    for inside in path.iterdir() if path.is_dir() else ():
+        budget.spend("entries", 1, FOLDER_ENTRIES)
+        files.append(inside)
     return f"{path} {sum(file.stat().st_size for file in files if file.is_file())} {max(file.stat().st_mtime_ns for file in files)}"
 
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 INTERRUPTED = 130  # exit code, as a shell gives it: 128 + SIGINT
 SOON = 0.05  # s, until an interrupt that was lost comes again
 SAID = 1.5  # s of importing after which it is said that something goes on
-# Paths in which an empty entry is the present folder. `.dev/paths.sh` has the same list, for what a shell starts.
+# Paths in which an empty entry, as a dot, is the present folder. `.dev/paths.sh` has the same list, for what a shell starts.
 PATHS = "PATH LD_LIBRARY_PATH PYTHONPATH AMENT_PREFIX_PATH CMAKE_PREFIX_PATH COLCON_PREFIX_PATH PKG_CONFIG_PATH".split()
 
 
@@ -49,9 +49,10 @@ def leave_present_folder_out() -> None:
     os.environ["SKIP_DEFAULT_XML_FILE"] = "1"  # or Fast DDS reads DEFAULT_FASTRTPS_PROFILES.xml there
     for name in PATHS:
         entries = os.environ.get(name, "").split(os.pathsep)
-        if "" in entries and name == "PYTHONPATH":
+        others = [entry for entry in entries if entry not in ("", ".")]
+        if len(others) < len(entries) and name == "PYTHONPATH":
             sys.path[:] = [entry for entry in sys.path if entry != os.getcwd()]
-        kept = os.pathsep.join(filter(None, entries))
+        kept = os.pathsep.join(others)
         if kept:
             os.environ[name] = kept
         else:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 TEMPORARY = "uwb_tdoa_temporary_"  # what the names of our temporary folders begin with
 STREAMS = "/dev/stdout", "/dev/stderr"  # links to what the user has chosen
 SETTLED = 60.0  # s after which a temporary folder that nobody holds is no longer needed
-_KEPT: list[Path] = []  # see `keeping`
+_KEPT: list[tuple[Path, Path, os.stat_result, bool]] = []  # see `keeping`: path, the same without links, state, whether it is a bag
 
 
 def read_bytes(path: str | Path, most: int = RECORDING_BYTES) -> bytes:
@@ -92,7 +92,7 @@ def write_bytes(path: str | Path, content: bytes) -> None:
 def keeping(inputs: Iterable[Path]) -> Iterator[None]:
     """While the block lasts, `refuse_output` refuses these files and folders, and what is in them."""
     before = _KEPT[:]
-    _KEPT.extend(inputs)
+    _KEPT.extend((path, path.resolve(), path.stat(), (path / "metadata.yaml").exists()) for path in inputs)
     try:
         yield
     finally:
@@ -104,11 +104,11 @@ def refuse_output(path: str | Path) -> None:
     path = Path(path)
     if path.is_symlink() and str(path) not in STREAMS:
         raise InputError(f"{path}: is a link to {os.readlink(path)}; give the path it leads to, or another name.")
-    there = path.exists()
-    for kept in filter(Path.exists, _KEPT):
-        if there and path.samefile(kept):
+    where, state = path.resolve(), path.stat() if path.exists() else None
+    for kept, its_place, its_state, is_bag in _KEPT:
+        if state is not None and os.path.samestat(state, its_state):
             raise InputError(f"{path}: is {kept}, which is read, and would be overwritten; give another name.")
-        if path.resolve().is_relative_to(kept.resolve()) and (there or (kept / "metadata.yaml").exists()):
+        if where.is_relative_to(its_place) and (state is not None or is_bag):
             raise InputError(f"{path}: lies in {kept}, which is read; give another place.")
 
 

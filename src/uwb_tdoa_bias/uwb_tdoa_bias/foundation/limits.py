@@ -41,7 +41,7 @@ FOLDER_ENTRIES, FOLDER_DEPTH = 100_000, 20  # that are looked at for recordings
 # YAML.
 YAML_NODES, YAML_DEPTH = 200_000, 20
 
-# ONNX: of the process that tries a model out, beside what its libraries take. That has memory for a thousand times the largest model we know.
+# ONNX: of the process that tries a model out, beside what its libraries take. The shipped model takes 0.02 s and 3 MB.
 MODEL_SECONDS, MODEL_MEMORY = 3, 256 << 20  # processor time; bytes
 MODEL_WAIT = 60.0  # s until its end, on a busy machine too
 MODEL_ROW_SECONDS = 0.005  # of processor time for a row that comes alone
