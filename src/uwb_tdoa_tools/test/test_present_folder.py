@@ -108,37 +108,6 @@ def test_the_middleware_obeys_no_profiles_there(tmp_path, protected):
     assert (victim.read_text() == "precious\n") == protected  # or the attack would be none
 
 
-LAUNCHES = """import sys
-from launch import LaunchDescription, LaunchService
-from launch.actions import ExecuteProcess
-{prepares}
-stock = ExecuteProcess(cmd=[sys.executable, "starts_ros.py"])
-service = LaunchService()
-service.include_launch_description(LaunchDescription([*actions([], "false", "shutdown", "LOCALHOST", "false"), stock]))
-sys.exit(service.run())
-"""
-PREPARES = {  # whether launched as our launch files do
-    True: "from uwb_tdoa_ekf.launching_actions import actions",
-    False: "actions = lambda *_: []",
-}
-
-
-@pytest.mark.parametrize("protected", [False, True])
-def test_what_a_launch_file_starts_obeys_no_profiles_there(tmp_path, protected):
-    """Programs of others, too, as rviz2. They are started beside our actions."""
-    pytest.importorskip("launch_ros")
-    victim = tmp_path / "bashrc"
-    victim.write_text("precious\n")
-    (tmp_path / "DEFAULT_FASTRTPS_PROFILES.xml").write_text(PROFILES.format(file=victim, profile=PROFILE))
-    (tmp_path / "starts_ros.py").write_text(f"{STARTS_ROS}main()\n")
-    (tmp_path / "launches.py").write_text(LAUNCHES.format(prepares=PREPARES[protected]))
-    kept = {name: value for name, value in os.environ.items() if name not in ("SKIP_DEFAULT_XML_FILE", "PYTHONSAFEPATH")}
-    kept |= {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "ROS_LOG_DIR": str(tmp_path / "log")}
-    done = subprocess.run([sys.executable, "launches.py"], cwd=tmp_path, env=kept, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0 and "process has finished cleanly" in done.stdout + done.stderr, done.stderr
-    assert (victim.read_text() == "precious\n") == protected  # or the attack would be none
-
-
 @built
 def test_the_start_file_of_the_user_brings_no_empty_entry(tmp_path):
     (tmp_path / ".bashrc").write_text("".join(f"export {name}=:${name}:/mine:.\n" for name in PATHS))

@@ -56,7 +56,7 @@ def tried_out(content: bytes) -> bool:
 
 def main() -> None:
     """Judge the model on the standard input, and write the judgement to the standard output."""
-    json.dump(judge(sys.stdin.buffer.read()), sys.stdout)
+    print(json.dumps(judge(sys.stdin.buffer.read())))
 
 
 def judge(content: bytes) -> tuple[bool, str]:
