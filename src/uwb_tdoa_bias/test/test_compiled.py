@@ -69,6 +69,18 @@ def test_what_belongs_to_somebody_else_is_not_used(named, monkeypatch):
     assert is_temporary(place())
 
 
+@pytest.mark.parametrize("variables", [{"NUMBA_CACHE_DIR": "cache"}, {"XDG_CACHE_HOME": "cache"}])
+def test_no_folder_of_the_present_folder_is_used(named, monkeypatch, capsys, variables):
+    """An archive that is unpacked keeps its modes, and belongs to the user: compiled code may be planted in it."""
+    for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.chdir(named.parent)
+    assert is_temporary(place()) and not any(named.parent.iterdir())
+    assert "the present folder may be another's, and holds" in capsys.readouterr().err
+
+
 def test_a_link_is_followed_once(named):
     true = named.parents[1] / "true"
     true.mkdir()

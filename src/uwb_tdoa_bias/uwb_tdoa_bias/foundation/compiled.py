@@ -96,10 +96,11 @@ def _place(name: str) -> Path:
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     place = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(home, "uwb_tdoa")) / name
     try:
-        place.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if _is_ours_alone(place.resolve()):
-            return place.resolve()
-        why = "others may write to"
+        if place.is_absolute():
+            place.mkdir(mode=0o700, parents=True, exist_ok=True)
+            if _is_ours_alone(place.resolve()):
+                return place.resolve()
+        why = "others may write to" if place.is_absolute() else "the present folder may be another's, and holds"
     except OSError as error:
         why = f"nothing can be kept ({error.strerror}) in"
     print(f"{why} {place}; a temporary folder is used: set NUMBA_CACHE_DIR to a folder of your own.", file=sys.stderr)

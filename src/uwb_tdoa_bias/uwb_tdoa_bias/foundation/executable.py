@@ -72,8 +72,8 @@ def elsewhere() -> Iterator[None]:
 
 
 class _ImportedElsewhere:
-    """Finder of modules that read settings of the present folder (matplotlibrc, .numba_config.yaml) when they are imported, wherever that is:
-    they are imported in the root folder."""
+    """Finder of modules that read settings of the present folder (matplotlibrc, .numba_config.yaml) when they are imported. They are
+    imported in the root folder, whoever imports them."""
 
     @staticmethod
     def find_spec(name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
