@@ -158,7 +158,7 @@ def build(done, compiled):
         write_steps(done)
     if compiled and done.get("compiled") != sources["packages"]:  # or the first start would; and several tests at once
         (site,) = INSTALL.glob("lib/python3*/site-packages")
-        path = os.pathsep.join([str(site), os.environ.get("PYTHONPATH", "")])
+        path = os.pathsep.join(filter(None, [str(site), os.environ.get("PYTHONPATH")]))
         running.append(start("compile the nodes", "compile", [PYTHON, "-m", "uwb_tdoa_ekf.compile_nodes"], PYTHONPATH=path))
     if done.get("messages") != sources["messages"]:
         running.append(colcon(([] if OWN_ROS else ["tf2_msgs"]) + MESSAGES))  # the wheels lack tf2_msgs

@@ -5,7 +5,7 @@ import sys
 
 from uwb_tdoa_tools import cli
 
-from studies import aids, calibrating, crazyflie, localizing, noise, ranges, recalibrating, scale, situations, surveying
+from studies import aids, calibrating, crazyflie, fuzz, localizing, noise, ranges, recalibrating, scale, situations, surveying
 from studies.checking import figures as checking
 from studies.checking import in_flight
 from studies.closed_loop import experiment
@@ -30,6 +30,7 @@ STUDIES = {
     "diagnosis": figures,
     "faults": faults,
     "fly-faults": flown,
+    "fuzz": fuzz,
     "in-flight": in_flight,
     "localizing": localizing,
     "noise": noise,
@@ -57,6 +58,7 @@ of measured flights: flights/, util/, surveys/.
   diagnosis        effects put into flights, and found again (docs/diagnosis.md)
   faults           faults of streams, surveys, nodes and clocks, played to the real nodes over topics (docs/reliability.md)
   fly-faults       faults of streams while a simulated vehicle flies by the estimate (docs/reliability.md)
+  fuzz             changed files of every kind, given to every reader (docs/reliability.md)
   in-flight        the same mistakes played to ekf_node, and what it says of them (docs/connect.md)
   localizing       what localize says of flights, against their ground truth (docs/localizing.md)
   noise            whether covariances are honest after a calibration (docs/calibration.md)
@@ -95,6 +97,7 @@ def parser():
         "./dev study diagnosis measured --data DATA --out bench/",
         "./dev study diagnosis undeclared --cases src/uwb_tdoa_tools/test/undeclared.py --out bench/",
         "./dev study faults --only '^velocity' --json faults.json --out faults.md",
+        "./dev study fuzz --count 20000",
         "./dev study in-flight DATA/flights/0426/0426-traj5 --survey DATA/surveys --only nothing sign",
         "./dev study localizing DATA/flights DATA/util --survey DATA/surveys --mistakes",
         "./dev study noise --data DATA --split const1",

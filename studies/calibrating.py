@@ -15,6 +15,7 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools.calibrating.calibrate import without_truth
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.diagnosis.self_calibration import Tape
+from uwb_tdoa_tools.outputs import OutputFile
 
 from .surveying import at, measured_flights, rmse
 
@@ -36,7 +37,7 @@ def add_options(add):
     add("--first", type=int, default=200, metavar="SEED", help="of the first draw (default 200)")
     add("--std", type=float, default=0.1, metavar="M", help="of each coordinate of an anchor (default 0.1)")
     add("--only", choices=(*SETS, SIMULATED), help="one set")
-    add("--json", metavar="FILE", help="write every draw")
+    add("--json", metavar="FILE", type=OutputFile, help="write every draw")
 
 
 def run(args):

@@ -16,6 +16,7 @@ from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.localizing.belief import GOOD, believe
 from uwb_tdoa_tools.estimate import FlightEstimator
 from uwb_tdoa_tools.scoring.metrics import position_errors
+from uwb_tdoa_tools.outputs import OutputFile
 
 NOTHING, ALIKE = "nothing", 0.95  # no mistake; share of the time
 
@@ -24,7 +25,7 @@ def add_options(add):
     """add : add_argument of a parser."""
     options.add_recordings(type("", (), {"add_argument": staticmethod(add)}))
     add("--mistakes", action="store_true", help="with the mistakes of `study checking`, too")
-    add("--json", metavar="FILE", help="write what was said of each")
+    add("--json", metavar="FILE", type=OutputFile, help="write what was said of each")
     add("--jobs", type=int, metavar="N", help="flights at once")
 
 

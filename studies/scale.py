@@ -5,15 +5,16 @@ Flights are simulated, 10 s in the air, 240 TDOAs a second. The tool runs as a u
 
 from dataclasses import dataclass
 import os
-from pathlib import Path
 import subprocess
 import sys
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_bias.foundation.errors import Failure
+from uwb_tdoa_bias.foundation.files import refuse_output
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.results_file import ResultsFile
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
+from uwb_tdoa_tools.outputs import OutputFolder
 
 FLYING = dict(duration=10.0, start_in_air=True, imu_rate=100.0, truth_rate=50.0, protocol="tdoa3")
 FLIGHTS = 1, 10, 100, 1000
@@ -51,7 +52,7 @@ class Case:
 
 def add_options(add):
     """The options of the study."""
-    add("--out", metavar="DIR", type=Path, required=True, help="for flights, 0.1 MB each, and results")
+    add("--out", metavar="DIR", type=OutputFolder, required=True, help="for flights, 0.1 MB each, and results")
     add("--only", choices=tuple(TOOLS), nargs="+", default=list(TOOLS), help="(default: all)")
     add("--most", type=int, default=FLIGHTS[-1], metavar="N", help="flights of a case (default: %(default)s)")
 
@@ -89,6 +90,7 @@ def measure(case, folder):
         some = [EFFECTS[name](values) for name, values in list(BESIDE.items())[: case.effects]]
         EffectSet(tuple(some)).to_yaml(folder / "effects.yaml")
         command = [*[word for word in command if word != "--no-bias"], "--effects", "effects.yaml"]
+    refuse_output(folder / "said.txt")
     with open(folder / "said.txt", "w") as said:
         process = subprocess.Popen(command, stdout=said, stderr=subprocess.STDOUT, cwd=folder)
         _, status, usage = os.wait4(process.pid, 0)

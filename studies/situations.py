@@ -23,6 +23,7 @@ from uwb_tdoa_tools.scoring.by_phase import PooledErrors
 from uwb_tdoa_tools.scoring.metrics import READY, Score
 from uwb_tdoa_tools.simulation import ImuErrors, SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.constellations import corners, facing
+from uwb_tdoa_tools.outputs import OutputFile
 
 from .any_path import Path, between
 
@@ -52,8 +53,8 @@ def add_options(add):
     add("--seeds", type=parallel.whole_number, default=20, metavar="N", help="of each situation (default: %(default)s)")
     add("--only", nargs="+", metavar="WORD", default=[""], help="situations that have one of these in their name (default: all)")
     add("--jobs", metavar="N", type=parallel.whole_number, help="simulations at once (default: as many as there are cores)")
-    add("--resume", metavar="FILE", help="keep what each simulation gave there, and go on with what is missing")
-    add("--json", metavar="FILE", help="write all figures, of each situation and of each seed")
+    add("--resume", metavar="FILE", type=OutputFile, help="keep what each simulation gave there, and go on with what is missing")
+    add("--json", metavar="FILE", type=OutputFile, help="write all figures, of each situation and of each seed")
 
 
 def run(args):

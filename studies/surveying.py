@@ -20,6 +20,7 @@ from uwb_tdoa_tools.parallel import whole_number
 from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.scoring.evaluation import evaluate
 from uwb_tdoa_tools.surveying.paths import DRIFT
+from uwb_tdoa_tools.outputs import OutputFile
 
 from .diagnosis.measured import SPLITS
 
@@ -50,7 +51,7 @@ def add_options(add):
     add("--jobs", type=whole_number, default=1, metavar="N", help="draws at once (default 1)")
     add("--known", choices=(*KNOWN, "odometry"), help="instead: flights of every split with this known beside, judged on others")
     add("--split", choices=tuple(SPLITS), help="with --known: one of these alone")
-    add("--json", metavar="FILE", help="write every draw")
+    add("--json", metavar="FILE", type=OutputFile, help="write every draw")
 
 
 def run(args):

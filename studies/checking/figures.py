@@ -16,6 +16,7 @@ from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.checking.tdoa_rules import furthest
 from uwb_tdoa_tools.readers import inputs, read_survey
 from uwb_tdoa_tools.readers.streams import protocol
+from uwb_tdoa_tools.outputs import OutputFile
 
 ANOTHER = 0.3  # m that an anchor of another room is elsewhere at least
 
@@ -31,7 +32,7 @@ def add_options(add):
         choices=[*MISTAKES, "nothing"],
         help=f"of {', '.join(MISTAKES)}, nothing",
     )
-    add("--json", metavar="FILE", help="write what was said of each")
+    add("--json", metavar="FILE", type=OutputFile, help="write what was said of each")
     add("--jobs", type=int, metavar="N", help="flights at once")
 
 

@@ -15,6 +15,7 @@ from uwb_tdoa_bias.foundation.files import write_text
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.checking.tdoa_rules import furthest
 from uwb_tdoa_tools.readers import inputs, read_survey
+from uwb_tdoa_tools.outputs import OutputFile
 
 from .figures import ANOTHER, possible
 
@@ -31,7 +32,7 @@ def add_options(add):
     add("--survey", required=True, metavar="DIR", help="folder of all surveys")
     add("--seconds", type=float, default=12.0, metavar="S", help="of the middle of the flight (default %(default)s)")
     add("--only", nargs="+", metavar="MISTAKE", choices=[*MISTAKES, "nothing"], help="of those of the study checking")
-    add("--json", metavar="FILE", help="write what was said of each")
+    add("--json", metavar="FILE", type=OutputFile, help="write what was said of each")
 
 
 def run(args):

@@ -28,6 +28,7 @@ from uwb_tdoa_tools.flying.world import World
 from uwb_tdoa_tools.simulation.constellations import constellation
 from uwb_tdoa_tools.simulation.room import room_of
 from uwb_tdoa_tools.training import labels, models, physics
+from uwb_tdoa_tools.outputs import OutputFolder
 
 from . import pictures
 from .sines import Sines
@@ -70,7 +71,7 @@ def add_options(add: Callable) -> None:
     add("--training", type=parallel.whole_number, default=8, metavar="N", help="flights in each of three constellations (default: 8)")
     add("--trained", type=Path, metavar="DIR", help="what an earlier run wrote to trained/ (default: train anew)")
     add("--jobs", type=parallel.whole_number, metavar="N", help="flights at once (default: as many as there are cores)")
-    add("--out", type=Path, required=True, metavar="DIR", help="where to write; made if it is not there")
+    add("--out", type=OutputFolder, required=True, metavar="DIR", help="where to write; made if it is not there")
 
 
 def run(args: Namespace) -> None:

@@ -16,6 +16,7 @@ from uwb_tdoa_tools.debiasing.evaluation import evaluate_map, fly
 from uwb_tdoa_tools.debiasing.parts import LEAST, part_of
 from uwb_tdoa_tools.debiasing.report import about_figures
 from uwb_tdoa_tools.readers import inputs
+from uwb_tdoa_tools.outputs import OutputFolder
 
 from ..diagnosis.measured import SPLITS
 from .report import measured_tables
@@ -33,7 +34,7 @@ def add_options(add):
     """The options of the study."""
     add("--data", metavar="DIR", type=Path, required=True, help="the measured flights: flights/, util/, surveys/")
     add("--diagnosed", metavar="DIR", type=Path, help="what `study diagnosis measured` wrote: its effects are compared")
-    add("--out", metavar="DIR", type=Path, required=True, help="where to write tables, figures and pictures")
+    add("--out", metavar="DIR", type=OutputFolder, required=True, help="where to write tables, figures and pictures")
     add("--jobs", metavar="N", type=int, help="cases at once (default: as many as there are cores)")
 
 

@@ -5,7 +5,6 @@ and a square path."""
 from dataclasses import dataclass, replace
 from functools import partial
 import json
-from pathlib import Path
 
 import numpy as np
 
@@ -19,6 +18,7 @@ from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools import parallel
 from uwb_tdoa_tools.scoring.metrics import position_at
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
+from uwb_tdoa_tools.outputs import OutputFolder
 
 from .report import plot_set_up, set_up_tables
 
@@ -58,7 +58,7 @@ AVERAGING = FilterConfig(zero_velocity=False)  # a stay is measured: its noise i
 def add_options(add):
     """The options of the study."""
     add("--seed", metavar="N", type=int, default=0, help="of everything random (default: 0)")
-    add("--out", metavar="DIR", type=Path, required=True, help="where to write tables, figures and pictures")
+    add("--out", metavar="DIR", type=OutputFolder, required=True, help="where to write tables, figures and pictures")
     add("--jobs", metavar="N", type=int, help="runs at once (default: as many as there are cores)")
 
 

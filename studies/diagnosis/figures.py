@@ -20,6 +20,7 @@ from uwb_tdoa_tools.parallel import over, whole_number
 from uwb_tdoa_tools.results_file import ResultsFile
 from uwb_tdoa_tools.scoring.plots import plt
 from uwb_tdoa_tools.surveying.blocked import with_blocked
+from uwb_tdoa_tools.outputs import OutputFolder
 
 from . import bank, blind, faults, floor, measured, referenced, undeclared
 
@@ -32,7 +33,7 @@ SEVERAL_MEASURED, SEVERAL_SIMULATED = 3, 4  # flights with the same effect: no m
 def add_options(add):
     """The options of the study."""
     add("part", choices=PARTS, help="what to run")
-    add("--out", metavar="DIR", type=Path, required=True, help="where to write")
+    add("--out", metavar="DIR", type=OutputFolder, required=True, help="where to write")
     add(
         "--seeds",
         metavar="N",

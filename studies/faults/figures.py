@@ -15,6 +15,7 @@ from uwb_tdoa_bias.foundation.files import write_text
 from uwb_tdoa_tools import parallel
 from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
+from uwb_tdoa_tools.outputs import OutputFile
 
 from . import judge
 from .events import Scene, events_of, part_of, turned
@@ -36,8 +37,8 @@ def add_options(add: Callable[..., object]) -> None:
     add("--only", metavar="PATTERN", default="", help="faults whose names this regular expression finds")
     jobs = "faults at once, each in a ROS domain of its own (default %(default)s)"
     add("--jobs", metavar="N", type=parallel.whole_number, default=1, help=jobs)
-    add("--json", metavar="FILE", type=Path, help="write all figures, and all that was said")
-    add("--out", metavar="FILE", type=Path, help="write the table")
+    add("--json", metavar="FILE", type=OutputFile, help="write all figures, and all that was said")
+    add("--out", metavar="FILE", type=OutputFile, help="write the table")
     add("--list", action="store_true", help="print the faults and end")
 
 

@@ -5,7 +5,6 @@ Writes to --out: table.md, comparison.json, histograms.png, rmse.png, and each m
 
 from functools import partial
 import json
-from pathlib import Path
 
 from tqdm import tqdm
 
@@ -14,6 +13,7 @@ from uwb_tdoa_bias.foundation.files import write_text
 from uwb_tdoa_bias.foundation.flight import AIDS
 from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.training import models
+from uwb_tdoa_tools.outputs import OutputFolder
 
 from . import simulated
 from .comparison import compare
@@ -32,7 +32,7 @@ def add_options(add):
     add("--models", nargs="+", choices=models.KINDS, default=list(models.KINDS), help="(default: all)")
     add("--validation", metavar="NAME", nargs="+", help="flights to validate on (default: one in five)")
     add("--bound", action="store_true", help="with bounds, and how alike flights are, place by place")
-    add("--out", metavar="DIR", type=Path, required=True, help="where to write")
+    add("--out", metavar="DIR", type=OutputFolder, required=True, help="where to write")
     add("--seed", metavar="N", type=int, default=0, help="of everything random (default: 0)")
 
 

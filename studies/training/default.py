@@ -20,6 +20,7 @@ from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.scoring.evaluation import evaluate
 from uwb_tdoa_tools.training import labels as labelling
 from uwb_tdoa_tools.training import models, structured
+from uwb_tdoa_tools.outputs import OutputFile
 
 from . import simulated
 
@@ -32,7 +33,7 @@ def add_options(add):
     """The options of the study."""
     add("flights", nargs="+", metavar="FLIGHT", help=inputs.HELP)
     add("--survey", metavar="S", help=inputs.SURVEY_HELP)
-    add("--out", metavar="FILE", type=Path, required=True, help="where to write the model")
+    add("--out", metavar="FILE", type=OutputFile, required=True, help="where to write the model")
 
 
 def run(args):

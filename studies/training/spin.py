@@ -2,7 +2,6 @@
 orientations of anchor 0 and for five specimens of the tag. Counterpart of figure 4 of Zhao et al. (2021)."""
 
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -13,6 +12,7 @@ from uwb_tdoa_bias.foundation.files import write_filled
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_tools.scoring.plots import plt
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
+from uwb_tdoa_tools.outputs import OutputFile
 
 POSITIONS = ((0.0, 0.0, 1.2), (5.0, 0.0, 1.2))  # m, of the anchors 0 and 1
 PLACE, HEIGHT = (2.2, 1.5), 1.3  # m, of the tag
@@ -23,7 +23,7 @@ BIN = 10.0  # degrees
 
 def add_options(add):
     """The options of the study."""
-    add("--out", metavar="FILE", type=Path, required=True, help="picture to write")
+    add("--out", metavar="FILE", type=OutputFile, required=True, help="picture to write")
     add("--seed", metavar="N", type=int, default=0, help="of the noise (default: 0)")
 
 

@@ -15,6 +15,7 @@ from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.results_file import ResultsFile
 from uwb_tdoa_tools.scoring.shrinkage import best_share
 from uwb_tdoa_tools.training import models, physics, shrinking
+from uwb_tdoa_tools.outputs import OutputFile
 
 WORSE = 1.05  # ratio of errors beyond which a judged flight counts as harmed
 
@@ -23,7 +24,7 @@ def add_options(add):
     """The options of the study."""
     add("flights", nargs="+", metavar="FLIGHT", help=inputs.HELP)
     add("--survey", metavar="S", help=inputs.SURVEY_HELP)
-    add("--out", metavar="FILE", type=Path, required=True, help="lines of JSON, one for each split and kind")
+    add("--out", metavar="FILE", type=OutputFile, required=True, help="lines of JSON, one for each split and kind")
     add("--models", nargs="+", choices=models.KINDS, default=list(models.KINDS), help="(default: all)")
     add("--splits", type=int, default=20, metavar="N", help="(default: 20)")
     add("--first", type=int, default=0, metavar="SEED", help="of the first split (default: 0)")

@@ -63,20 +63,22 @@ def test_a_folder_into_which_others_get_is_not_used(named, capsys, mode):
     assert f"others may write to {named / NAME}; a temporary folder is used" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("which", [".", ".."])
-def test_a_folder_that_anybody_can_replace_is_not_used(named, which):
-    named.mkdir()
-    (named / which).resolve().chmod(0o777)
-    assert is_temporary(place())
-    (named / which).resolve().chmod(0o1777)  # as in /tmp: what is ours stays ours
-    assert place() == named / NAME
-
-
-@pytest.mark.parametrize("which", ["..", ".", NAME])
-def test_what_belongs_to_somebody_else_is_not_used(named, monkeypatch, which):
+def test_what_belongs_to_somebody_else_is_not_used(named, monkeypatch):
     (named / NAME).mkdir(parents=True, mode=0o700)
-    foreign(monkeypatch, (named / which).resolve())
+    foreign(monkeypatch, (named / NAME).resolve())
     assert is_temporary(place())
+
+
+@pytest.mark.parametrize("variables", [{"NUMBA_CACHE_DIR": "cache"}, {"XDG_CACHE_HOME": "cache"}])
+def test_no_folder_of_the_present_folder_is_used(named, monkeypatch, capsys, variables):
+    """An archive that is unpacked keeps its modes, and belongs to the user: compiled code may be planted in it."""
+    for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.chdir(named.parent)
+    assert is_temporary(place()) and not any(named.parent.iterdir())
+    assert "the present folder may be another's, and holds" in capsys.readouterr().err
 
 
 def test_a_link_is_followed_once(named):

@@ -1,5 +1,6 @@
 """How executables start, and how they end when they are interrupted before they have begun."""
 
+import os
 import subprocess
 import sys
 from signal import SIGINT
@@ -122,12 +123,17 @@ def test_linear_algebra_takes_one_thread_unless_the_user_says_more(write, monkey
     assert start(name)() == kept  # before anything is imported
 
 
-def test_a_folder_of_recordings_does_not_say_how_libraries_behave(write, tmp_path, monkeypatch):
-    """matplotlib takes the settings of the folder in which it is imported: of its memory, and of LaTeX."""
+@pytest.mark.parametrize("late", [False, True])
+def test_a_folder_of_recordings_does_not_say_how_libraries_behave(write, tmp_path, monkeypatch, late):
+    """matplotlib takes the settings of the folder in which it is imported: of its memory, and of LaTeX. numba takes its cache, and modules,
+    from there. Most commands import matplotlib when they draw, which is in the folder of the user."""
     pytest.importorskip("matplotlib")
     (tmp_path / "matplotlibrc").write_text("savefig.dpi: 100000\ntext.usetex: True\n")
+    (tmp_path / ".numba_config.yaml").write_text("disable_jit: 1\n")
     monkeypatch.chdir(tmp_path)
-    write("draws", "import os, matplotlib\ndef main(): print(matplotlib.rcParams['savefig.dpi'], os.getcwd())")
-    code = START.format("draws")
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.stdout == f"figure {tmp_path}\n", done.stderr
+    imports = "import os, matplotlib, numba"
+    write("draws", ("" if late else f"{imports}\n") + f"def main():\n    {imports}\n"
+          "    print(matplotlib.rcParams['savefig.dpi'], numba.config.DISABLE_JIT, os.getcwd())")  # fmt: skip
+    kept = {name: value for name, value in os.environ.items() if name != "NUMBA_DISABLE_JIT"}
+    done = subprocess.run([sys.executable, "-c", START.format("draws")], capture_output=True, text=True, env=kept)
+    assert done.stdout == f"figure 0 {tmp_path}\n", done.stderr

@@ -1,11 +1,14 @@
 import os
 from pathlib import Path
 import stat
+import subprocess
+import sys
 import threading
 
 import pytest
 
-from uwb_tdoa_bias.foundation.files import write_bytes, write_filled, write_text
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.files import keeping, write_bytes, write_filled, write_text
 
 
 def test_text_is_utf8_whatever_the_locale(tmp_path):
@@ -36,14 +39,48 @@ def test_a_new_file_has_the_permissions_of_the_umask(tmp_path):
     assert stat.S_IMODE((tmp_path / "a").stat().st_mode) == 0o640
 
 
-def test_a_file_that_is_replaced_keeps_its_permissions_and_its_link(tmp_path):
+def test_a_file_that_is_replaced_keeps_its_permissions(tmp_path):
     (tmp_path / "there").write_bytes(b"old")
     (tmp_path / "there").chmod(0o604)
-    (tmp_path / "link").symlink_to("there")
-    write_bytes(tmp_path / "link", b"new")
-    assert (tmp_path / "link").is_symlink() and (tmp_path / "there").read_bytes() == b"new"
-    assert stat.S_IMODE((tmp_path / "there").stat().st_mode) == 0o604
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["link", "there"]
+    write_bytes(tmp_path / "there", b"new")
+    assert (tmp_path / "there").read_bytes() == b"new" and stat.S_IMODE((tmp_path / "there").stat().st_mode) == 0o604
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["there"]
+
+
+def test_no_link_is_followed(tmp_path):
+    (tmp_path / "bashrc").write_bytes(b"precious")
+    (tmp_path / "link").symlink_to("bashrc")
+    (tmp_path / "to nothing").symlink_to("new")
+    for name in ("link", "to nothing"):
+        with pytest.raises(InputError, match=f"{name}: is a link to (bashrc|new)"):
+            write_bytes(tmp_path / name, b"new")
+    assert (tmp_path / "bashrc").read_bytes() == b"precious" and not (tmp_path / "new").exists()
+
+
+def test_nothing_is_written_over_what_is_kept(tmp_path):
+    survey, bag, flights = tmp_path / "survey", tmp_path / "bag", tmp_path / "flights"
+    survey.write_bytes(b"precious")
+    (tmp_path / "hard").hardlink_to(survey)
+    for folder in (bag, flights):
+        folder.mkdir()
+        (folder / "one").write_bytes(b"precious")
+    (bag / "metadata.yaml").write_bytes(b"precious")
+    refused = [survey, tmp_path / "bag" / ".." / "survey", tmp_path / "hard", bag / "one", bag / "new", flights / "one"]
+    with keeping([survey, bag, flights]):
+        for path in refused:
+            with pytest.raises(InputError, match=f"{tmp_path}.*(is|lies in) {tmp_path}/.*, which is read"):
+                write_bytes(path, b"new")
+        for path in (tmp_path / "new", flights / "new"):
+            write_bytes(path, b"new")
+    write_bytes(survey, b"new")
+    assert (tmp_path / "hard").read_bytes() == (bag / "one").read_bytes() == b"precious"
+
+
+def test_what_standard_output_goes_to_is_written_in_place(tmp_path):
+    code = "from uwb_tdoa_bias.foundation.files import write_text; write_text('/dev/stdout', 'said')"
+    with open(tmp_path / "said", "wb") as said:
+        subprocess.run([sys.executable, "-c", code], stdout=said, check=True)
+    assert (tmp_path / "said").read_text() == "said" and os.path.islink("/dev/stdout")
 
 
 def test_what_fails_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):

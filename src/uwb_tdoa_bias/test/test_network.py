@@ -213,8 +213,8 @@ WIDE = ("weight", np.ones((2, 4), np.float32))
     ("nodes", "constants", "named"),
     [
         ([("MatMul", ["features", "weight"], ["bias"])], [WIDE], "gives (n, 4)"),
-        ([("ReduceSum", ["features"], ["bias"], {"keepdims": 0})], [], "other than rows reduced"),
-        ([("Reshape", ["features", "shape"], ["bias"])], [("shape", np.array([7, 2], np.int64))], "a shape in which rows of the input mix"),
+        ([("ReduceSum", ["features"], ["bias"], {"keepdims": 0})], [], "an output with other rows"),
+        ([("Reshape", ["features", "shape"], ["bias"])], [("shape", np.array([7, 2], np.int64))], "cannot be played"),
         ([("Div", ["features", "zero"], ["bias"])], [("zero", np.zeros(2, np.float32))], "no finite numbers"),
     ],
 )

@@ -1,19 +1,21 @@
 """Models that were made to run, hang or fill: each is refused at once, with the reason."""
 
 import json
-import time
-import tracemalloc
+import os
+import resource
 
 import numpy as np
 import pytest
+from uwb_tdoa_bias.correction import trial
 from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.limits import MODEL_BYTES
+from uwb_tdoa_bias.foundation.limits import MODEL_BYTES, MODEL_MEMORY, MODEL_SECONDS
 
 onnx = pytest.importorskip("onnx")
 from onnx import TensorProto, helper, numpy_helper  # noqa: E402
 
-AT_ONCE = 2.0  # s of processor time
+START = 2.0  # s of processor time and
+LIBRARIES = 150 << 20  # bytes, that the process of a trial takes before it loads the model
 META = {"features": ["dx_a", "dy_a"], "offset": [0, 0], "scale": [1, 1], "clip": 1, "name": "attack"}
 NODE = helper.make_node
 SAME = NODE("Identity", ["x"], ["y"])
@@ -38,7 +40,7 @@ def doubling(count=30, *before):
 
 def looping():
     kinds = {"i": TensorProto.INT64, "go": TensorProto.BOOL, "last": TensorProto.FLOAT}
-    inputs = [helper.make_tensor_value_info(name, kind, None) for name, kind in kinds.items()]
+    inputs = [helper.make_tensor_value_info(name, kind, None if name == "last" else []) for name, kind in kinds.items()]
     outputs = [helper.make_tensor_value_info(name, kind, None) for name, kind in (("go", TensorProto.BOOL), ("next", TensorProto.FLOAT))]
     body = helper.make_graph([NODE("Add", ["last", "last"], ["next"])], "body", inputs, outputs)
     count = numpy_helper.from_array(np.array(2**62), "count")
@@ -66,7 +68,9 @@ def recursive():
     function = helper.make_function(
         "own", "Twice", ["x"], ["y"], [NODE("Twice", ["x"], ["y"], domain="own")], [helper.make_opsetid("own", 1)]
     )
-    return model(NODE("Twice", ["x"], ["y"], domain="own"), functions=[function])
+    made = model(NODE("Twice", ["x"], ["y"], domain="own"), functions=[function])
+    made.opset_import.add(domain="own", version=1)
+    return made
 
 
 def sparse():
@@ -95,87 +99,124 @@ def gathering(index):
     return model(NODE("Gather", ["x", "i"], ["y"], axis=1), constants=[numpy_helper.from_array(np.array([index]), "i")])
 
 
+def branching_seldom():
+    """It branches, and loops, only for other numbers than those of the trial."""
+    far, text = numpy_helper.from_array(np.float32(1e6), "far"), helper.make_tensor_value_info("z", TensorProto.FLOAT, None)
+    then, other = (helper.make_graph([NODE(kind, ["x"], ["z"])], kind, [], [text]) for kind in ("Exp", "Identity"))
+    nodes = NODE("ReduceMax", ["x"], ["most"], keepdims=0), NODE("Greater", ["most", "far"], ["is"])
+    return model(*nodes, NODE("If", ["is"], ["y"], then_branch=then, else_branch=other), constants=[far])
+
+
+def unfolding_seldom():
+    """Its width follows from the numbers of the input."""
+    nodes = NODE("ReduceMax", ["x"], ["most"], keepdims=1), NODE("Exp", ["most"], ["e"]), NODE("Cast", ["e"], ["n"], to=TensorProto.INT64)
+    return model(*nodes, NODE("Reshape", ["n", "one"], ["m"]), NODE("Expand", ["x", "m"], ["y"]), constants=[numpy_helper.from_array(np.array([1]), "one")])
+
+
+def spent():
+    """(s, bytes at most) of the processes that have ended."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime, used.ru_maxrss << 10
+
+
+TOO_MUCH = "it takes more than 3 s or 256 MB|onnxruntime: .*(alloc|[Mm]emory|bfc_arena)|MemoryError"
+
+
 @pytest.mark.parametrize(
     ("made", "said"),
     [
-        (doubling(), "more than 100000 numbers for each row"),
-        (doubling(24, NODE("Elu", ["x"], ["v0"])), "more than 100000 numbers for each row"),
-        (model(NODE("Elu", ["x"], ["h"]), *looping().graph.node, constants=looping().graph.initializer), "a graph within a graph"),
-        (model(NODE("Elu", ["x"], ["h"]), NODE("Expand", ["h", "shape"], ["y"])), "operator 'Expand' is none of"),
-        (model(NODE("Elu", ["x"], ["h"]), read_elsewhere().graph.node[0], constants=read_elsewhere().graph.initializer), "numbers are elsewhere"),
-        (model(NODE("Softmax", ["x"], ["y"], axis=0)), "rows of the input that mix"),
-        (model(NODE("Elu", ["x"], ["y"], alpha="x")), "onnxruntime: "),
-        (looping(), "a graph within a graph"),
-        (branching(), "a graph within a graph"),
-        (read_elsewhere(), "a tensor whose numbers are elsewhere"),
-        (read_elsewhere_in_a_node(), "a tensor whose numbers are elsewhere"),
-        (recursive(), "functions or sparse constants"),
-        (sparse(), "functions or sparse constants"),
-        (model(NODE("Inverse", ["x"], ["y"], domain="com.microsoft")), "an operator that is none of ONNX"),
-        (model(NODE("Expand", ["x", "shape"], ["y"])), "operator 'Expand' is none of Identity, Abs, .*Concat"),
-        (model(NODE("Tile", ["x", "shape"], ["y"])), "operator 'Tile' is none of"),
-        (model(NODE("Pad", ["x", "shape"], ["y"])), "operator 'Pad' is none of"),
-        (model(NODE("ConstantOfShape", ["shape"], ["y"])), "operator 'ConstantOfShape' is none of"),
-        (model(NODE("\x1b[2J", ["x"], ["y"])), r"operator .\\x1b\[2J. is none of"),
-        (model(NODE("__class__", ["x"], ["y"])), "operator '__class__' is none of"),
-        (claiming(2**31, 2**31), "numbers are elsewhere|cannot reshape"),
-        (claiming(2, 0), "cannot be played"),
-        (claiming(0, 2**62), "cannot be played"),
-        (busy(), "more than 2000000 additions and multiplications"),
-        (long(), "more than 2000 nodes"),
-        (model(SAME, width=2**40), "more than 100000 numbers"),
-        (model(SAME, width=-1), "no column"),
-        (model(NODE("Add", [], ["y"])), "less than two operands"),
-        (model(NODE("Exp", [], ["y"])), "'Exp' cannot be used so"),
-        (model(NODE("Constant", [], ["y"])), "'Constant' cannot be used so"),
+        (doubling(), TOO_MUCH),
+        (doubling(22), TOO_MUCH),
+        (doubling(1000, NODE("Elu", ["x"], ["v0"])), "onnxruntime: |" + TOO_MUCH),
+        (looping(), "operator 'Loop' is none of|" + TOO_MUCH),
+        (branching(), "onnxruntime: .*attribute"),
+        (branching_seldom(), "operator '(If|Greater)' is none of"),
+        (unfolding_seldom(), "operator '(Cast|Expand)' is none of"),
+        (read_elsewhere(), "onnxruntime: "),
+        (read_elsewhere_in_a_node(), "onnxruntime: "),
+        (recursive(), "onnxruntime: |" + TOO_MUCH),
+        (sparse(), "onnxruntime: |" + TOO_MUCH),
+        (model(NODE("Inverse", ["x"], ["y"], domain="com.microsoft")), "onnxruntime: |operator 'Inverse' is none of"),
+        (model(NODE("Dropout", ["x"], ["y"])), "operator 'Dropout' is none of Abs, Add, .*Concat"),
+        (model(NODE("\x1b[2J", ["x"], ["y"])), r"onnxruntime: "),
+        (claiming(2**31, 2**31), "onnxruntime: "),
+        (claiming(0, 2**62), "onnxruntime: |gives no"),
+        (busy(), "a row takes .* ms, more than 5 ms|" + TOO_MUCH),
+        (long(), "more than 2000 operators|" + TOO_MUCH),
+        (model(SAME, width=2**40), TOO_MUCH),
+        (model(SAME, width=-1), "unknown width|onnxruntime: "),
+        (model(NODE("Add", [], ["y"])), "onnxruntime: "),
         (model(NODE("LeakyRelu", ["x"], ["y"], alpha="x")), "onnxruntime: "),
-        (gathering(-1), "other than columns taken"),
-        (gathering(2), "other than columns taken"),
-        (model(NODE("Sum", ["x"] * 20_000, ["y"])), "or 2000 operations"),
+        (gathering(2), "onnxruntime: .*out of"),
     ],
 )  # fmt: skip
 def test_refused_at_once(tmp_path, made, said):
     path = tmp_path / "model.onnx"
     path.write_bytes(made.SerializeToString())
-    tracemalloc.start()
-    began = time.process_time()
-    with pytest.raises(InputError, match=said):
+    before, _ = spent()
+    with pytest.raises(InputError, match=said) as refused:
         Network(path)
-    assert time.process_time() - began < AT_ONCE and tracemalloc.get_traced_memory()[1] < 50e6
-    tracemalloc.stop()
+    seconds, memory = spent()
+    assert seconds - before < START + MODEL_SECONDS + 1 and memory < LIBRARIES + MODEL_MEMORY
+    assert len(str(refused.value)) < 1000 and str(refused.value).isprintable()
 
 
-@pytest.mark.parametrize(
-    ("content", "said"),
-    [
-        (b"\xff" * 1_000_000, "a number of more than 64 bits"),
-        (b"\x3a\x80\x80\x80\x80" + b"\xff" * 1_000_000, "a number of more than 64 bits"),
-        (b"\x08\x01" * (MODEL_BYTES // 2), "a field twice"),
-        (bytes(MODEL_BYTES + 1), "more than 4000000 bytes"),
-        (b"\x0a" + b"\xf5" + 8 * b"\xff" + b"\x01", "no protocol buffer"),  # a length of -11: backwards to itself
-    ],
-)
-def test_bytes_without_end(tmp_path, content, said):
+@pytest.mark.parametrize("content", [b"\xff" * 1_000_000, b"\x3a\x80\x80\x80\x80" + b"\xff" * 1_000_000, b"\x08\x01" * (MODEL_BYTES // 2), b"", b"a"])
+def test_bytes_that_are_no_model(tmp_path, content):
     (tmp_path / "model.onnx").write_bytes(content)
-    began = time.process_time()
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match="onnxruntime: |is empty|no table|more than one input"):
         Network(tmp_path / "model.onnx")
-    assert time.process_time() - began < AT_ONCE
 
 
-def test_what_one_reader_takes_for_another_operator_than_the_next_is_refused(tmp_path):
-    """Of a field that comes twice protobuf takes the last, and others the first: what is checked is not what is played."""
-    content = model(NODE("Elu", ["x"], ["y"])).SerializeToString()
-    node = NODE("Elu", ["x"], ["y"]).SerializeToString()
-    twice = node + NODE("Exp", [], []).SerializeToString()
-    graph = onnx.load_model_from_string(content).graph.SerializeToString()
-    forged = graph.replace(bytes([10, len(node)]) + node, bytes([10, len(twice)]) + twice)
-    size = lambda n: bytes([n & 127 | 128, n >> 7]) if n > 127 else bytes([n])  # noqa: E731
-    forged = content.replace(b"\x3a" + size(len(graph)) + graph, b"\x3a" + size(len(forged)) + forged)
-    assert onnx.load_model_from_string(forged).graph.node[0].op_type == "Exp"
-    (tmp_path / "model.onnx").write_bytes(forged)
-    with pytest.raises(InputError, match="a field twice"):
+def test_a_file_that_is_too_large_is_not_tried(tmp_path, monkeypatch):
+    monkeypatch.setattr(trial, "tried_out", None)
+    (tmp_path / "model.onnx").write_bytes(bytes(MODEL_BYTES + 1))
+    with pytest.raises(InputError, match="more than 4000000 bytes"):
         Network(tmp_path / "model.onnx")
+
+
+def test_a_model_opens_no_file_in_its_trial(tmp_path, monkeypatch):
+    """Weights in another file are bytes of a file of the user; a pipe in its place would hang. Here the file is there, and fits."""
+    (tmp_path / "weights").write_bytes(np.ones(2, np.float32).tobytes())
+    weights = onnx.TensorProto(name="column", data_type=TensorProto.FLOAT, dims=[2, 1], data_location=TensorProto.EXTERNAL)
+    weights.external_data.add(key="location", value="weights")
+    made = model(NODE("MatMul", ["x", "column"], ["y"]), constants=[weights]).SerializeToString()
+    monkeypatch.chdir(tmp_path)
+    options = trial.onnxruntime.SessionOptions()
+    options.graph_optimization_level = trial.onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
+    assert trial.Session(made, options=options).run(np.ones((1, 2))) == 2.0  # the attack: bytes of the present folder are weights
+    for place in (tmp_path, "/"):
+        monkeypatch.chdir(place)
+        with pytest.raises(trial.Unplayable, match="onnxruntime: "):
+            trial.tried_out(made)
+            trial.tried_out.cache_clear()
+
+
+def test_a_trial_takes_no_module_of_the_present_folder(tmp_path, monkeypatch):
+    for name in ("numpy", "json", "onnxruntime", "uwb_tdoa_bias", "sitecustomize", "usercustomize"):
+        (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'w')")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend("")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep)
+    trial.tried_out.cache_clear()
+    assert trial.tried_out(model(NODE("Elu", ["x"], ["y"])).SerializeToString()) is False
+    assert not (tmp_path / "ran").exists()
+
+
+def test_a_trial_without_an_end(monkeypatch):
+    """On a machine that is busy, or a process that is stopped."""
+    monkeypatch.setattr(trial, "MODEL_WAIT", 0.3)
+    monkeypatch.setattr(trial, "START", "import time; time.sleep(60)")
+    trial.tried_out.cache_clear()
+    with pytest.raises(trial.Unplayable, match="no end of its trial after 0.3 s"):
+        trial.tried_out(b"any")
+
+
+def test_a_model_is_tried_once(monkeypatch):
+    made = model(NODE("Elu", ["x"], ["h"]), NODE("Elu", ["h"], ["y"])).SerializeToString()
+    trial.tried_out(made)
+    monkeypatch.setattr(trial.subprocess, "run", None)
+    assert trial.tried_out(made) is False
 
 
 def test_a_name_goes_into_messages_and_tables(tmp_path):

@@ -38,6 +38,23 @@ def generate_launch_description():
 """
 
 
+STOCK = """
+from launch import LaunchDescription
+from launch.actions import ExecuteProcess, LogInfo
+{actions}
+
+def generate_launch_description():
+    code = "import rclpy; rclpy.init(); rclpy.create_node('stock'); rclpy.shutdown()"
+    return LaunchDescription([*actions([], "false", "shutdown", "LOCALHOST", "false"), ExecuteProcess(cmd=["python3", "-c", code])])
+"""
+PROFILES = """<?xml version="1.0" encoding="UTF-8" ?>
+<dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles">
+  <log><use_default>FALSE</use_default><consumer><class>FileConsumer</class>
+    <property><name>filename</name><value>{}</value></property><property><name>append</name><value>FALSE</value></property>
+  </consumer></log>
+</dds>"""
+
+
 @pytest.fixture
 def launch(tmp_path):
     """launch(*words, rig=None, path=()) gives a Launch, which ends with the test; rig : a Rig that waits for nodes of it."""
@@ -257,3 +274,17 @@ def test_a_dump_of_parameters_goes_back_into_the_node_and_into_its_launch_file(m
 def values_below(part):
     """All values in nested mappings."""
     return [value for each in part.values() for value in (values_below(each) if isinstance(each, dict) else [each])]
+
+
+@pytest.mark.parametrize("ours", [False, True])
+def test_what_is_launched_obeys_no_profiles_of_the_present_folder(launch, tmp_path, monkeypatch, ours):
+    """Programs of others, too, as rviz2. Fast DDS would empty the file that is named as its log."""
+    (tmp_path / "bashrc").write_text("precious\n")
+    (tmp_path / "DEFAULT_FASTRTPS_PROFILES.xml").write_text(PROFILES.format(tmp_path / "bashrc"))
+    line = "from uwb_tdoa_ekf.launching_actions import actions" if ours else "def actions(*_): return []"
+    (tmp_path / "stock.launch.py").write_text(STOCK.format(actions=line))
+    monkeypatch.delenv("SKIP_DEFAULT_XML_FILE", raising=False)
+    monkeypatch.chdir(tmp_path)
+    launched = launch(tmp_path / "stock.launch.py")
+    assert launched.ended() == 0 and "process has finished cleanly" in launched.said, launched.said
+    assert (tmp_path / "bashrc").read_text() == ("precious\n" if ours else "")  # or the attack would be none

@@ -1,6 +1,4 @@
-from argparse import Namespace
 import errno
-from importlib import import_module
 import sqlite3
 import subprocess
 import sys
@@ -87,55 +85,6 @@ def test_a_full_disk_is_one_sentence(error, capsys):
     assert (
         capsys.readouterr().err == "weigh: error: the disk is full: what was being written is not whole; make room, or write elsewhere.\n"
     )
-
-
-def test_a_folder_that_cannot_be_written_to_is_refused_before_the_work(tmp_path):
-    for check in (cli.output_folder, cli.check_folders):
-        with pytest.raises(InputError, match="cannot be written .*: /proc"):  # for root, too
-            check("/proc/out")
-    (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="file is a file, so that .* cannot be made"):
-        cli.output_folder(tmp_path / "file" / "out")
-    with pytest.raises(InputError, match="is a directory; give a file"):
-        cli.check_folders(tmp_path)
-    assert cli.output_folder(tmp_path / "new" / "deep") == tmp_path / "new" / "deep" and not (tmp_path / "new").exists()
-    cli.check_folders(None, tmp_path / "new.json", str(tmp_path / "file"))
-    assert [path.name for path in tmp_path.iterdir()] == ["file"]
-
-
-def test_no_output_is_an_input_a_link_or_a_part_of_a_bag(tmp_path):
-    """`--json` over the survey, or over metadata.yaml of the bag; and through a link, which leads to any file of the user."""
-    survey, bag, link = tmp_path / "survey.txt", tmp_path / "bag", tmp_path / "result.json"
-    survey.write_text("precious")
-    bag.mkdir()
-    (bag / "metadata.yaml").write_text("precious")
-    link.symlink_to(tmp_path / "bashrc")
-
-    def given(json, **more):
-        return Namespace(**{"flights": [str(bag)], "survey": str(survey), "namespace": "", "json": str(json), **more})
-
-    cases = [(survey, "is read by this command"), (tmp_path / "bag" / ".." / "survey.txt", "is read by this command")]
-    cases += [(bag / "metadata.yaml", "is a part of a bag"), (link, "is a link to .*bashrc")]
-    for out, said in cases:
-        with pytest.raises(InputError, match=said):
-            cli.check_outputs(given(out), "json")
-    (tmp_path / "hard.json").hardlink_to(survey)
-    with pytest.raises(InputError, match="is read by this command"):
-        cli.check_outputs(given(tmp_path / "hard.json"), "json")
-    cli.check_outputs(given(tmp_path / "new.json"), "json")
-    cli.check_outputs(given("/dev/stdout"), "json")
-    with pytest.raises(InputError, match="bag: is read by this command"):  # with --force, it would be replaced
-        cli.refuse_inputs(given(None, out=str(bag)), "out")
-    assert survey.read_text() == (bag / "metadata.yaml").read_text() == "precious"
-
-
-@pytest.mark.parametrize("words", [["check", "{survey}", "--survey", "{survey}", "--json", "{survey}"]])
-def test_a_command_refuses_to_overwrite_its_survey(tmp_path, words, capsys):
-    survey = tmp_path / "survey.txt"
-    survey.write_text("precious")
-    name, *words = [word.format(survey=survey) for word in words]
-    assert import_module(f"uwb_tdoa_tools.commands.{name}").main(words) == 2
-    assert "is read by this command, and would be overwritten" in capsys.readouterr().err and survey.read_text() == "precious"
 
 
 def test_a_long_sentence_is_cut(capsys):

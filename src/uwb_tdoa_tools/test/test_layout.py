@@ -36,7 +36,6 @@ IS_ROS = re.compile(r"rclpy|\w+_msgs|\w+_interfaces|domain_coordinator|ament_ind
 # import name: (rosdep key, name on the Python package index); ROS packages are imported under their own name
 KEYS = {
     "PIL": ("python3-pil", "Pillow"),
-    "atheris": (None, "atheris"),  # for who wants to fuzz
     "backports": (None, "backports.zstd"),  # comes with rosbags, as lz4 does
     "dask": (None, "distributed"),
     "distributed": (None, "distributed"),

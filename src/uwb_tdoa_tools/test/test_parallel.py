@@ -28,6 +28,13 @@ def refuse_three(number):
     return number
 
 
+def resolution(_):
+    """Of pictures, as matplotlib is set where it is imported."""
+    import matplotlib
+
+    return matplotlib.rcParams["savefig.dpi"]
+
+
 @pytest.fixture
 def importable(monkeypatch):
     """This module can be imported in processes that are started now."""
@@ -43,6 +50,12 @@ def test_results_come_in_the_order_of_the_items(importable, count, jobs):
 def test_the_first_is_done_here_and_the_others_elsewhere(importable):
     here, *others = parallel.over(process, range(6), 2)
     assert here == os.getpid() and here not in others and 1 <= len(set(others)) <= 2
+
+
+def test_what_draws_in_other_processes_takes_no_settings_of_the_present_folder(importable, tmp_path, monkeypatch):
+    (tmp_path / "matplotlibrc").write_text("savefig.dpi: 100000\n")
+    monkeypatch.chdir(tmp_path)
+    assert list(parallel.over(resolution, range(4), 2))[1:] == ["figure"] * 3
 
 
 def test_one_item_and_one_job_need_no_other_process():

@@ -47,7 +47,7 @@ def variables_of(text):
 
 
 def empty_entries(variables):
-    return [f"{name}={variables[name]}" for name in PATHS if name in variables and "" in variables[name].split(":")]
+    return [f"{name}={variables[name]}" for name in PATHS if name in variables and {"", "."} & {*variables[name].split(":")}]
 
 
 def test_libraries_there_would_be_loaded_by_an_empty_entry(libraries):
@@ -58,7 +58,7 @@ def test_libraries_there_would_be_loaded_by_an_empty_entry(libraries):
 @pytest.mark.parametrize("shell", SHELLS)
 @pytest.mark.parametrize("given", ["unset", "empty", "entries"])
 def test_no_entry_is_empty_after_the_setup_was_sourced(libraries, shell, given):
-    own = {"unset": "unset {}", "empty": "export {}=", "entries": "export {0}=:/a::/b:${0}:"}[given]
+    own = {"unset": "unset {}", "empty": "export {}=", "entries": "export {0}=:/a::/b:.:${0}:.:.:"}[given]
     lines = [own.format(name) for name in PATHS if name != "PATH" or given == "entries"]
     done = run([shell, "-c", "; ".join([*lines, f"source {ROOT}/install/setup.{shell}", "env", "ls >&2"])], libraries)
     after = variables_of(done.stdout)
@@ -77,10 +77,11 @@ def test_no_entry_is_empty_after_dev(libraries, words):
     assert done.returncode == 0 and "usage: check" in done.stdout or empty_entries(variables_of(done.stdout)) == [], done.stderr
 
 
-def test_no_entry_is_empty_after_an_executable_has_begun(tmp_path):
+@pytest.mark.parametrize("empty", ["", "."])
+def test_no_entry_is_empty_after_an_executable_has_begun(tmp_path, empty):
     (tmp_path / "numpy.py").write_text("print('numpy.py of the present folder')")
     (tmp_path / "tells.py").write_text("import os, subprocess\ndef main(): import numpy; subprocess.run('env')")
-    given = {name: f":{os.environ.get(name, '')}::" for name in PATHS} | {"PYTHONPATH": ":".join(["", *sys.path[1:], "", ""])}
+    given = {name: f":{os.environ.get(name, '')}::" for name in PATHS} | {"PYTHONPATH": ":".join([empty, *sys.path[1:], empty, empty])}
     (tmp_path / "modules").mkdir()
     (tmp_path / "tells.py").rename(tmp_path / "modules" / "tells.py")
     (tmp_path / "modules" / "start.py").write_text(START.format("tells"))
@@ -105,6 +106,28 @@ def test_the_middleware_obeys_no_profiles_there(tmp_path, protected):
     done = subprocess.run([sys.executable, "start.py"], cwd=tmp_path, env=kept, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
     assert (victim.read_text() == "precious\n") == protected  # or the attack would be none
+
+
+@built
+def test_the_start_file_of_the_user_brings_no_empty_entry(tmp_path):
+    (tmp_path / ".bashrc").write_text("".join(f"export {name}=:${name}:/mine:.\n" for name in PATHS))
+    done = run([ROOT / "dev", "shell", "-i", "-c", "env"], tmp_path, HOME=str(tmp_path))
+    after = variables_of(done.stdout)
+    assert after["PKG_CONFIG_PATH"] == "/mine" and empty_entries(after) == [], done.stderr
+
+
+def test_the_entry_point_of_the_container_leaves_no_empty_entry(tmp_path):
+    """The setup of ROS leaves one, as colcon does. The image itself is not built here."""
+    changed = next(line for line in (ROOT / "Containerfile").read_text().splitlines() if line.startswith("RUN sed"))
+    (tmp_path / "setup.bash").write_text("export LD_LIBRARY_PATH=/opt/ros/lib: PYTHONPATH=:/opt/ros\n")
+    (tmp_path / "ros_entrypoint.sh").write_text(f'#!/bin/bash\nset -e\nsource "{tmp_path}/setup.bash" --\nexec "$@"\n')
+    words = changed.removeprefix("RUN ").replace("/ros_entrypoint.sh", str(tmp_path / "ros_entrypoint.sh"))
+    words = words.replace("/opt/uwb_tdoa/install/setup.bash", str(tmp_path / "setup.bash")).replace("/opt/uwb_tdoa", str(ROOT))
+    subprocess.run(["bash", "-c", words], check=True)
+    done = run(["bash", tmp_path / "ros_entrypoint.sh", "env"], tmp_path)
+    after = variables_of(done.stdout)
+    assert after["LD_LIBRARY_PATH"] == "/opt/ros/lib" and after["PYTHONPATH"] == "/opt/ros", done.stderr
+    assert after["SKIP_DEFAULT_XML_FILE"] == "1" and empty_entries(after) == []
 
 
 @built

@@ -94,6 +94,14 @@ def test_the_state_of_a_recording_changes_with_it(tmp_path):
     assert state_of(tmp_path / "bag") != before and state_of(None) == "None"
 
 
+def test_a_recording_of_too_many_files_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(results_file, "FOLDER_ENTRIES", 3)
+    for number in range(4):
+        (tmp_path / str(number)).touch()
+    with pytest.raises(InputError, match="more than 3 entries"):
+        state_of(tmp_path)
+
+
 def test_what_was_asked_is_every_option_that_matters_and_what_stands_in_its_files(tmp_path):
     file = tmp_path / "effects.yaml"
     file.write_text("one")

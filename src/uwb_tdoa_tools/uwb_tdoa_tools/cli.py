@@ -18,7 +18,6 @@ import os
 from pathlib import Path
 import sqlite3
 import sys
-import tempfile
 from typing import Any, TYPE_CHECKING
 
 from tqdm import tqdm
@@ -28,7 +27,7 @@ from uwb_tdoa_bias.foundation.files import write_text
 from uwb_tdoa_bias.foundation.foreign_text import line_of, printable
 from uwb_tdoa_bias.foundation.version import written_by
 
-from . import command_lines
+from . import command_lines, outputs
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -73,7 +72,8 @@ def run(
         args = parser.parse_args(without_ros_arguments(arguments) if ros else arguments)
         if ros:
             args.ros_arguments = arguments
-        code = command(args) or 0
+        with outputs.checked(args):
+            code = command(args) or 0
         sys.stdout.flush()
         return code
     except SystemExit as stop:  # argparse has said it already: usage and error, or the help
@@ -113,64 +113,6 @@ def without_ros_arguments(arguments: Iterable[str]) -> list[str]:
         elif argument == "--":
             ours = True
     return own
-
-
-def check_outputs(args: argparse.Namespace, *names: str) -> None:
-    """Raise InputError, before the work, unless the files that some options name can be written, and are no inputs."""
-    check_folders(*(getattr(args, name) for name in names))
-    refuse_inputs(args, *names)
-
-
-def refuse_inputs(args: argparse.Namespace, *names: str) -> None:
-    """Raise InputError if what some options name, a file or a bag, is an input that the other options and arguments name."""
-    given = [value for name, value in vars(args).items() if name not in names]
-    inputs = [Path(each) for value in given for each in (value if isinstance(value, (list, tuple)) else [value]) if _is_there(each)]
-    for path in [Path(value) for name in names if (value := getattr(args, name))]:
-        if path.exists() and any(path.samefile(each) for each in inputs):
-            raise InputError(f"{path}: is read by this command, and would be overwritten; give another name.")
-
-
-def _is_there(value: object) -> bool:
-    return isinstance(value, (str, Path)) and len(str(value)) < 4096 and os.path.exists(value)
-
-
-def check_folders(*paths: str | Path | None) -> None:
-    """Raise InputError, before the work, unless the folder of each file to write is there, and can be written to; also for a link, which
-    may lead to any file, and for a part of a bag. None is passed over."""
-    for path in [Path(path) for path in paths if path]:
-        if path.is_symlink() and not path.absolute().is_relative_to("/dev"):
-            raise InputError(f"{path}: is a link to {os.readlink(path)}; give the file itself, or another name.")
-        if (path.absolute().parent / "metadata.yaml").exists() and path.suffix in (".yaml", ".mcap", ".db3", ".zstd"):
-            raise InputError(f"{path}: is a part of a bag; give another name.")
-        if not path.absolute().parent.is_dir():
-            raise InputError(f"{path}: its directory does not exist; make it first.")
-        if path.is_dir():
-            raise InputError(f"{path}: is a directory; give a file.")
-        if not path.exists() or not os.access(path, os.W_OK):
-            _check_writable(path, path.absolute().parent)
-
-
-def output_folder(text: str | Path, option: str = "--out") -> Path:
-    """Path of a folder to write to. Raises InputError, before the work, if it is a file, or cannot be made or written to."""
-    out = Path(text)
-    if out.exists() and not out.is_dir():
-        raise InputError(f"{option}: {out} is a file; give a directory.")
-    there = out.absolute()
-    while not there.exists():
-        there = there.parent
-    if not there.is_dir():
-        raise InputError(f"{option}: {there} is a file, so that {out} cannot be made; give another directory.")
-    _check_writable(out, there)
-    return out
-
-
-def _check_writable(path: Path, folder: Path) -> None:
-    """Raise InputError unless a file can be made in the folder, for the sake of path; leaves none."""
-    try:
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}: {folder}); give another place.") from error
 
 
 def write_json(path: str | Path, content: dict[str, Any]) -> None:

@@ -26,11 +26,11 @@ from uwb_tdoa_bias.foundation.safe_yaml import parse_yaml
 from uwb_tdoa_bias.foundation.sensors import SENSORS
 from uwb_tdoa_ekf.core.config import FilterConfig
 
-from . import cli
 from .bags.files import STORAGES
 from .diagnosis.self_calibration import Tape
 from .localizing import rerun_file
 from .estimate import FlightEstimator
+from .outputs import OutputFile
 from .parallel import whole_number
 from .readers import inputs
 from .scoring.alignment import ALIGN, NONE
@@ -202,7 +202,7 @@ def add_align(parser: ArgumentParser, judges: bool = False) -> None:
 
 def add_rerun(parser: ArgumentParser) -> None:
     """--rerun: a recording for the viewer Rerun."""
-    parser.add_argument("--rerun", metavar="FILE", help=rerun_file.HELP)
+    parser.add_argument("--rerun", metavar="FILE", type=OutputFile, help=rerun_file.HELP)
 
 
 def rerun_of(args: Namespace, count: int, say: Callable[[str], object]) -> Path | None:
@@ -210,10 +210,9 @@ def rerun_of(args: Namespace, count: int, say: Callable[[str], object]) -> Path 
     flights, of which it shows one. Raises InputError."""
     if not args.rerun:
         return None
-    cli.check_outputs(args, "rerun")
     if count != 1:
         raise InputError(f"--rerun: needs exactly one flight, got {count}.")
-    return Path(args.rerun) if rerun_file.is_there(say) else None
+    return args.rerun if rerun_file.is_there(say) else None
 
 
 def add_known(parser: ArgumentParser) -> None:

@@ -22,6 +22,8 @@ from typing import Any, TYPE_CHECKING, TypeVar
 from tqdm import tqdm
 
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.files import read_bytes, refuse_output
+from uwb_tdoa_bias.foundation.limits import Budget, FOLDER_ENTRIES
 from uwb_tdoa_bias.foundation.version import written_by
 
 if TYPE_CHECKING:
@@ -47,6 +49,7 @@ class ResultsFile:
         asked = json.loads(json.dumps({"written_by": written_by(), **asked}))
         if not self._path.absolute().parent.is_dir():
             raise InputError(f"{path}: its directory does not exist; make it first.")
+        refuse_output(path)
         self._file = open(self._path, "a+b")
         try:
             self._begin(asked)
@@ -71,7 +74,9 @@ class ResultsFile:
             raise InputError(
                 f"{self._path}: its results were made with another {' and '.join(different)}; ask for the same, or name another file."
             )
+        budget = Budget(self._path, os.fstat(self._file.fileno()).st_size)
         while line := self._file.readline(LINE):
+            budget.check_time()
             place = self._file.tell() - len(line)
             if len(line) == LINE:
                 raise self._foreign()
@@ -155,17 +160,21 @@ def resumed(over: MapFunction, done: ResultsFile) -> MapFunction:
 
 
 def state_of(path: str | Path | None) -> str:
-    """What changes when a file or a folder of files does: a text; of None "None". Raises OSError."""
+    """What changes when a file or a folder of files does: a text; of None "None". Raises OSError and InputError."""
     if path is None:
         return "None"
     path = Path(path).absolute()
-    files = [path, *(inside for inside in sorted(path.rglob("*")) if path.is_dir())]
+    files, budget = [path], Budget(path)
+    for inside in path.iterdir() if path.is_dir() else ():
+        budget.spend("entries", 1, FOLDER_ENTRIES)
+        files.append(inside)
     return f"{path} {sum(file.stat().st_size for file in files if file.is_file())} {max(file.stat().st_mtime_ns for file in files)}"
 
 
 def asked_of(args: Namespace, besides: Iterable[str] = (), files: Iterable[str] = ()) -> dict[str, Any]:
     """What was asked of a command: {option: value}, JSON. besides : names of options that do not matter; files : of those that name
     files, whose content counts. Raises OSError."""
-    asked = {name: value for name, value in vars(args).items() if name not in besides}
+    given = {name: value for name, value in vars(args).items() if name not in besides}
+    asked = {name: str(value) if isinstance(value, Path) else value for name, value in given.items()}
     named = {name: Path(asked[name]) for name in files if asked[name] and Path(asked[name]).is_file()}
-    return asked | {name: hashlib.sha256(path.read_bytes()).hexdigest()[:16] for name, path in named.items()}
+    return asked | {name: hashlib.sha256(read_bytes(path)).hexdigest()[:16] for name, path in named.items()}

@@ -28,14 +28,13 @@ import numpy as np
 
 from ..foundation.compiled import compiled
 from ..foundation.errors import InputError
-from ..foundation.foreign_text import harmless
+from ..foundation.files import read_bytes
+from ..foundation.foreign_text import harmless, printable
+from ..foundation.limits import MODEL_BYTES
 from .features import NAMES, everything
-from .graph_size import Unplayable
-from .onnx_file import Unreadable, read_graph
 
 if TYPE_CHECKING:
     from ..effects.samples import Samples
-    from .onnx_file import Graph
     from .session import Session
 
 MODELS = Path(__file__).parent / "models"
@@ -74,14 +73,8 @@ class Network:
         self._path = Path(path).absolute()
         if not Path(path).is_file():
             raise InputError(f"model: {path} does not exist; give an .onnx file or leave the model empty.")
-        try:
-            graph = read_graph(path)
-            self._model = _session(graph)
-        except (Unreadable, Unplayable) as error:
-            raise InputError(
-                f"model: {path} cannot be played as an ONNX model of dense layers ({error}); export it again, without what it names."
-            ) from error
-        self.meta, inputs = graph.meta, graph.inputs
+        self._model = _session(path)
+        self.meta = self._model.meta
         try:
             self._read(self.meta)
         except (KeyError, ValueError, TypeError, AttributeError, OverflowError, RecursionError) as error:
@@ -89,10 +82,10 @@ class Network:
                 f"model: {path}: its metadata must hold features (names out of {', '.join(NAMES)}), offset, scale, "
                 f"clip and name, and may hold validity with fade_std, as JSON; the problem is {error!r}."
             ) from error
-        (name, (_, width)), n = inputs[0], len(self._inputs)
+        width, n = self._model.width, len(self._inputs)
         if not (n == len(self._offset) == len(self._scale) == width) or (self._scale == 0).any():
             raise InputError(
-                f"model: {path}: input {name!r} has {width} columns, the metadata name {n} features, "
+                f"model: {path}: the input has {width} columns, the metadata name {n} features, "
                 f"{len(self._offset)} offsets and {len(self._scale)} scales; they must agree, and no scale may be 0."
             )
         self._ask(path)
@@ -142,10 +135,17 @@ class Network:
         return found[0], found[1], found[2]
 
 
-def _session(graph: Graph) -> Session:
-    from .session import Session  # imports onnxruntime
+def _session(path: str | Path) -> Session:
+    """The Session of a file whose content has stood its trial. Raises InputError."""
+    content = read_bytes(path, MODEL_BYTES)
+    from .trial import Session, tried_out, Unplayable  # imports onnxruntime
 
-    return Session(graph)
+    try:
+        return Session(content, alone=tried_out(content))
+    except Unplayable as error:
+        raise InputError(
+            f"model: {path} cannot be played as an ONNX model of dense layers ({printable(str(error))}); export it again, without what it names."
+        ) from error
 
 
 @compiled

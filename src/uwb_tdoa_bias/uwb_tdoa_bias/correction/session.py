@@ -5,45 +5,59 @@ from __future__ import annotations
 import numpy as np
 import onnxruntime
 
-from .graph_size import PACKED, Unplayable, size_of
-from .onnx_file import Graph
-
+PACKED = 4  # rows to whose multiples a batch is filled up
 BATCH = 64  # rows at most that are played together: what they hold stays in the cache
 
 
-class Session:
-    """A model on one thread, which gives each row of the input the same bits, whatever comes with it."""
+class Unplayable(ValueError):
+    """The file is no model, has an operator that is not played here, or is too large."""
 
-    def __init__(self, graph: Graph) -> None:
-        """Plays the bytes of the file that were read. Raises Unplayable where they are too large, or onnxruntime does not take them."""
-        size = size_of(graph)
-        options = onnxruntime.SessionOptions()
+
+class Session:
+    """A model on one thread, which gives each row of the input the same bits, whatever comes with it.
+
+    width, outputs : columns of the input and of the output; meta : {key: text} of the file; alone : whether each row is played by itself.
+    """
+
+    def __init__(self, content: bytes, alone: bool = False, options: onnxruntime.SessionOptions | None = None) -> None:
+        """Load the content of an ONNX file, as `options` say. Raises Unplayable where onnxruntime does not take it, or it has not one
+        input (n, width) and one output (n, outputs)."""
+        options = options or onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.log_severity_level = 4  # what goes wrong is reported by who calls
-        self._rows, self._most = (1, 1) if size.alone else (PACKED, BATCH)
-        ((self._name, _),), self._width, self._outputs = graph.inputs, size.width, size.outputs
         try:
-            self._session = onnxruntime.InferenceSession(graph.content, options, providers=["CPUExecutionProvider"], enable_fallback=0)
-            self._try_out()
+            self._session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"], enable_fallback=0)
         except Exception as error:  # of its own family, with no common public base
             raise Unplayable(f"onnxruntime: {str(error).splitlines()[0][:200]}") from error
+        inputs = self._session.get_inputs()
+        if len(inputs) != 1 or len(self._session.get_outputs()) != 1 or len(inputs[0].shape) != 2:
+            raise Unplayable("more than one input or output, or an input that is no table")
+        self._name, (rows, self.width) = inputs[0].name, inputs[0].shape
+        if not isinstance(self.width, int):
+            raise Unplayable("an input of unknown width")
+        self.alone, self.meta = alone or rows == 1, dict(self._session.get_modelmeta().custom_metadata_map)
+        self.outputs = self._play(np.zeros((1, self.width), np.float32)).shape[1]
 
     def run(self, x: np.ndarray) -> np.ndarray:
         """x (n, width) float -> (n, outputs) float. Rows are filled up to whole packets: other kernels play the rest of one, and
         a single row. Each batch begins at an address of its own, which is a multiple of 16 bytes."""
-        out = np.empty((len(x), self._outputs))
-        for first in range(0, len(x), self._most):
-            some = x[first : first + self._most]
-            padded = np.zeros((len(some) + -len(some) % self._rows, self._width), np.float32)
-            padded[: len(some)] = some
-            (made,) = self._session.run(None, {self._name: padded})
-            if made.shape != (len(padded), self._outputs):
-                raise ValueError(f"{made.shape} comes out of {padded.shape}")
-            out[first : first + len(some)] = made[: len(some)]
+        out, most = np.empty((len(x), self.outputs)), 1 if self.alone else BATCH
+        for first in range(0, len(x), most):
+            out[first : first + most] = self._play(x[first : first + most])
         return out
 
-    def _try_out(self) -> None:
-        """Raises ValueError unless each row comes out as from its own."""
-        x = np.random.default_rng(0).normal(size=(2 * PACKED, self._width))
-        if not np.array_equal(self.run(x)[:PACKED], self.run(x[:PACKED]), equal_nan=True):
-            raise ValueError("rows of the input that mix")
+    def end_profiling(self) -> str:
+        """Name of the file that says what was executed, where the options ask for it."""
+        return str(self._session.end_profiling())
+
+    def _play(self, some: np.ndarray) -> np.ndarray:
+        """One batch. Raises Unplayable."""
+        padded = np.zeros((len(some) + (0 if self.alone else -len(some) % PACKED), self.width), np.float32)
+        padded[: len(some)] = some
+        try:
+            (made,) = self._session.run(None, {self._name: padded})
+        except Exception as error:  # as above
+            raise Unplayable(f"onnxruntime: {str(error).splitlines()[0][:200]}") from error
+        if made.ndim != 2 or len(made) != len(padded):
+            raise Unplayable(f"{made.shape} comes out of {padded.shape}: an output with other rows than the input")
+        return made[: len(some)]

@@ -11,12 +11,11 @@ from functools import lru_cache
 import hashlib
 import os
 from pathlib import Path
-import stat
 import sys
 import time
 from typing import Any, TYPE_CHECKING, TypeVar
 
-from .executable import elsewhere
+from . import executable  # noqa: F401  # imports numba in another folder
 from .files import folder_of_process
 
 if TYPE_CHECKING:
@@ -38,7 +37,7 @@ def _hidden(*names: str) -> Iterator[None]:
 
 # numba imports these only to see whether they are there, which takes a fifth of a second of a node's start: for products of matrices
 # in compiled code, of which there are none here, and for coverage of it.
-with _hidden("scipy", "coverage"), elsewhere():
+with _hidden("scipy", "coverage"):
     from numba import config, njit
     from numba.core import event
     import numba.np.arraymath  # noqa: F401
@@ -97,10 +96,11 @@ def _place(name: str) -> Path:
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     place = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(home, "uwb_tdoa")) / name
     try:
-        place.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if _is_ours_alone(place.resolve()):
-            return place.resolve()
-        why = "others may write to"
+        if place.is_absolute():
+            place.mkdir(mode=0o700, parents=True, exist_ok=True)
+            if _is_ours_alone(place.resolve()):
+                return place.resolve()
+        why = "others may write to" if place.is_absolute() else "the present folder may be another's, and holds"
     except OSError as error:
         why = f"nothing can be kept ({error.strerror}) in"
     print(f"{why} {place}; a temporary folder is used: set NUMBA_CACHE_DIR to a folder of your own.", file=sys.stderr)
@@ -108,12 +108,9 @@ def _place(name: str) -> Path:
 
 
 def _is_ours_alone(folder: Path) -> bool:
-    """Whether the user alone gets into an absolute folder, and no stranger can put another one in its place. Members of the user's group
-    are no strangers."""
-    own, above = folder.stat(), [parent.stat() for parent in folder.parents]
-    open_to_all = [found for found in above if found.st_mode & stat.S_IWOTH and not found.st_mode & stat.S_ISVTX]
-    owners = {found.st_uid for found in (own, *above)}
-    return owners <= {os.getuid(), 0} and own.st_uid == os.getuid() and not own.st_mode & 0o077 and not open_to_all
+    """Whether a folder belongs to the user, who alone gets into it."""
+    found = folder.stat()
+    return found.st_uid == os.getuid() and not found.st_mode & 0o077
 
 
 @lru_cache(maxsize=None)

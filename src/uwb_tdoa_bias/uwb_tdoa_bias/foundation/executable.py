@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from functools import partial
 import gc
 from importlib import import_module
+from importlib.machinery import PathFinder
 import os
 import signal
 import sys
@@ -20,12 +21,13 @@ from typing import Any, TYPE_CHECKING
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+    from importlib.machinery import ModuleSpec
     from types import FrameType, ModuleType
 
 INTERRUPTED = 130  # exit code, as a shell gives it: 128 + SIGINT
 SOON = 0.05  # s, until an interrupt that was lost comes again
 SAID = 1.5  # s of importing after which it is said that something goes on
-# Paths in which an empty entry is the present folder. `.dev/paths.sh` has the same list, for what a shell starts.
+# Paths in which an empty entry, as a dot, is the present folder. `.dev/paths.sh` has the same list, for what a shell starts.
 PATHS = "PATH LD_LIBRARY_PATH PYTHONPATH AMENT_PREFIX_PATH CMAKE_PREFIX_PATH COLCON_PREFIX_PATH PKG_CONFIG_PATH".split()
 
 
@@ -47,9 +49,10 @@ def leave_present_folder_out() -> None:
     os.environ["SKIP_DEFAULT_XML_FILE"] = "1"  # or Fast DDS reads DEFAULT_FASTRTPS_PROFILES.xml there
     for name in PATHS:
         entries = os.environ.get(name, "").split(os.pathsep)
-        if "" in entries and name == "PYTHONPATH":
+        others = [entry for entry in entries if entry not in ("", ".")]
+        if len(others) < len(entries) and name == "PYTHONPATH":
             sys.path[:] = [entry for entry in sys.path if entry != os.getcwd()]
-        kept = os.pathsep.join(filter(None, entries))
+        kept = os.pathsep.join(others)
         if kept:
             os.environ[name] = kept
         else:
@@ -58,8 +61,7 @@ def leave_present_folder_out() -> None:
 
 @contextmanager
 def elsewhere() -> Iterator[None]:
-    """In the root folder while the block lasts. matplotlib and numba read settings of the present folder when they are imported, and Python
-    looks for modules there where it is started by -m."""
+    """In the root folder while the block lasts: the present folder may hold modules for `python -m`, and settings."""
     here = os.open(".", os.O_PATH | os.O_DIRECTORY)  # also where its name is gone
     try:
         os.chdir("/")
@@ -67,6 +69,22 @@ def elsewhere() -> Iterator[None]:
     finally:
         os.fchdir(here)
         os.close(here)
+
+
+class _ImportedElsewhere:
+    """Finder of modules that read settings of the present folder (matplotlibrc, .numba_config.yaml) when they are imported. They are
+    imported in the root folder, whoever imports them."""
+
+    @staticmethod
+    def find_spec(name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
+        """The ModuleSpec of such a module; None for all others."""
+        spec = PathFinder.find_spec(name, path) if name in ("matplotlib", "numba") else None
+        if spec is not None and spec.loader is not None:
+            spec.loader.exec_module = elsewhere()(spec.loader.exec_module)  # type: ignore[method-assign]  # of this one loader
+        return spec
+
+
+sys.meta_path.insert(0, _ImportedElsewhere)
 
 
 def interrupt(number: int, frame: FrameType | None) -> None:

@@ -1,4 +1,4 @@
-"""Read files whole, or their beginning, with a limit; write files whole or not at all; temporary folders."""
+"""Read files whole, or their beginning, with a limit; write files whole or not at all, and over no input; temporary folders."""
 
 from __future__ import annotations
 
@@ -19,10 +19,12 @@ from .errors import InputError
 from .limits import Budget, RECORDING_BYTES
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
+    from collections.abc import Callable, Iterable, Iterator
 
 TEMPORARY = "uwb_tdoa_temporary_"  # what the names of our temporary folders begin with
+STREAMS = "/dev/stdout", "/dev/stderr"  # links to what the user has chosen
 SETTLED = 60.0  # s after which a temporary folder that nobody holds is no longer needed
+_KEPT: list[tuple[Path, Path, os.stat_result, bool]] = []  # see `keeping`: path, the same without links, state, whether it is a bag
 
 
 def read_bytes(path: str | Path, most: int = RECORDING_BYTES) -> bytes:
@@ -66,11 +68,12 @@ def write_filled(path: str | Path, fill: Callable[[BinaryIO], object]) -> None:
 def write_bytes(path: str | Path, content: bytes) -> None:
     """Write a file whole: readers see the old content or the new one, never a part. Raises OSError.
 
-    The content goes to a temporary sibling, which then takes the name. A file that is replaced passes on its permissions, and a
-    symbolic link stays one. What is no regular file, as /dev/stdout, and a file whose folder takes no other, are written in place.
+    The content goes to a temporary sibling, which then takes the name. A file that is replaced passes on its permissions. What is no
+    regular file, as /dev/stdout, and a file whose folder takes no other, are written in place. Raises InputError as `refuse_output`.
     """
-    path = Path(os.path.realpath(path))
-    if path.exists() and not (path.is_file() and os.access(path.parent, os.W_OK)):
+    refuse_output(path)
+    path = Path(path)
+    if path.exists() and (path.is_symlink() or not (path.is_file() and os.access(path.parent, os.W_OK))):
         _write_in_place(path, content)
         return
     sibling = path.with_name(f".{secrets.token_hex(8)}.partial")
@@ -83,6 +86,30 @@ def write_bytes(path: str | Path, content: bytes) -> None:
     except BaseException:
         sibling.unlink(missing_ok=True)
         raise
+
+
+@contextmanager
+def keeping(inputs: Iterable[Path]) -> Iterator[None]:
+    """While the block lasts, `refuse_output` refuses these files and folders, and what is in them."""
+    before = _KEPT[:]
+    _KEPT.extend((path, path.resolve(), path.stat(), (path / "metadata.yaml").exists()) for path in inputs)
+    try:
+        yield
+    finally:
+        _KEPT[:] = before
+
+
+def refuse_output(path: str | Path) -> None:
+    """Raise InputError where writing to a path would follow a link, which may lead to any file, or change what is read or a bag."""
+    path = Path(path)
+    if path.is_symlink() and str(path) not in STREAMS:
+        raise InputError(f"{path}: is a link to {os.readlink(path)}; give the path it leads to, or another name.")
+    where, state = path.resolve(), path.stat() if path.exists() else None
+    for kept, its_place, its_state, is_bag in _KEPT:
+        if state is not None and os.path.samestat(state, its_state):
+            raise InputError(f"{path}: is {kept}, which is read, and would be overwritten; give another name.")
+        if where.is_relative_to(its_place) and (state is not None or is_bag):
+            raise InputError(f"{path}: lies in {kept}, which is read; give another place.")
 
 
 def _write_in_place(path: Path, content: bytes) -> None:

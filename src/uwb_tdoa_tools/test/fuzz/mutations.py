@@ -266,8 +266,8 @@ def of_sqlite(data, chance):
 
 
 STRUCTURES = {
-    **dict.fromkeys(("csv", "csv_salvaged", "survey", "table", "columns", "distances", "peers", "results"), of_text),
-    **dict.fromkeys(("yaml", "anchors", "effects", "config", "places", "antenna", "bag_metadata", "marks", "tags"), of_yaml),
+    **dict.fromkeys(("csv", "csv_salvaged", "csv_gzip", "survey", "table", "columns", "distances", "peers", "results"), of_text),
+    **dict.fromkeys(("yaml", "anchors", "effects", "config", "places", "walls", "antenna", "bag_metadata", "marks", "tags"), of_yaml),
     "model": of_protobuf,
     **dict.fromkeys(("bag_mcap", "bag_mcap_sealed", "bag_mcap_salvaged", "bag_packed"), of_mcap),
     **dict.fromkeys(("bag_sqlite", "bag_sqlite_salvaged"), of_sqlite),

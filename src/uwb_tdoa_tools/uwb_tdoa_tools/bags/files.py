@@ -16,7 +16,7 @@ from typing import Any, TYPE_CHECKING
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.files import temporary_folder
+from uwb_tdoa_bias.foundation.files import refuse_output, temporary_folder
 from uwb_tdoa_bias.foundation.limits import READ_BYTES, TooMuch, most_unpacked
 from uwb_tdoa_bias.foundation.stamps import LARGEST_STEP_BACK
 
@@ -78,11 +78,12 @@ def check_output(out: str | Path, force: bool = False) -> None:
     out = Path(out)
     if not out.name:
         raise InputError(f"{out}: is no name for a bag; give the path of a new directory.")
-    if not out.exists() and not out.is_symlink():
+    refuse_output(out)
+    if not out.exists():
         return
     if not force:
         raise InputError(f"{out}: exists already; choose another name, or --force to replace it.")
-    if out.is_symlink() or not (out / "metadata.yaml").is_file():
+    if not (out / "metadata.yaml").is_file():
         raise InputError(f"{out}: exists and is not a bag, so --force does not replace it; choose another name.")
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 import sys
 from typing import TYPE_CHECKING
 
@@ -10,6 +9,7 @@ from .. import cli
 from ..benchmark.figures import as_json, table
 from ..benchmark.peer import Peer
 from ..benchmark.suite import PARTS, measure
+from ..outputs import OutputFile, OutputFolder
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
@@ -53,15 +53,14 @@ def parser() -> ArgumentParser:
         help="measure this shared library of another filter beside ours, event by event (what it exports: docs/speed.md)",
     )  # fmt: skip
     add(
-        "--out", metavar="DIR", type=Path, default=Path("out/bench"),
+        "--out", metavar="DIR", type=OutputFolder, default="out/bench",
         help="for the bags and the output of the nodes (default: out/bench)",
     )  # fmt: skip
-    add("--json", metavar="FILE", type=Path, help="write the machine and all figures")
+    add("--json", metavar="FILE", type=OutputFile, help="write the machine and all figures")
     return made
 
 
 def _bench(args: Namespace) -> None:
-    cli.check_outputs(args, "json")
     other = None if args.peer is None else Peer(args.peer)
     machine, figures = measure(args.only, args.out, args.quick, args.model, other)
     cli.show(f"{machine['cpu']}, {machine['cores']} cores, Python {machine['python']}, numpy {machine['numpy']}")

@@ -15,6 +15,7 @@ from ..checking import report
 from ..checking.check import check, different_surveys
 from ..checking.recording import read_recording
 from ..diagnosis.noise import write_parameters
+from ..outputs import OutputFolder
 from ..progress import Progress
 
 if TYPE_CHECKING:
@@ -54,14 +55,13 @@ def parser() -> ArgumentParser:
     add("--no-truth", action="store_true", help="do without ground truth, and leave it unread")
     options.add_tape(made)
     add("--quick", action="store_true", help="say within a minute what to expect, and whether the flights are exciting enough")
-    add("--out", metavar="DIR", help="where to write; made if it is not there")
+    add("--out", metavar="DIR", type=OutputFolder, help="where to write; made if it is not there")
     return made
 
 
 def _calibrate(args: Namespace) -> int:
     if not (args.out or args.quick):
         raise InputError("--out: is missing; say where to write, or ask for --quick.")
-    out = cli.output_folder(args.out) if args.out else None
     config, effects = options.filter_of(args)
     base, tape = effects or EffectSet(), options.tape_of(args, effects)
     reading = options.reading_of(args, truth=not args.no_truth)
@@ -87,7 +87,7 @@ def _calibrate(args: Namespace) -> int:
         else:
             made = without_truth(flights, holdout, tape, base, config, progress)
     cli.show(made.text, made.as_text())
-    assert out is not None  # only --quick does without
+    out = args.out  # only --quick does without
     out.mkdir(parents=True, exist_ok=True)
     cli.write_json(out / "calibration.json", {"flights": [flight.name for flight in flights], **made.as_dict()})
     judges = args.holdout or [path for path, _ in found[-1:]]

@@ -14,6 +14,7 @@ from .. import cli, options
 from ..checking import report
 from ..checking.check import check, different_surveys
 from ..checking.recording import read_live, read_recording
+from ..outputs import OutputFile
 from ..progress import Progress
 from ..readers import read_survey
 
@@ -49,12 +50,11 @@ def parser() -> ArgumentParser:
     )
     options.add_recordings(made, nargs="*")
     made.add_argument("--live", metavar="S", type=float, help="listen to live topics for S seconds instead")
-    made.add_argument("--json", metavar="FILE", help="write all findings")
+    made.add_argument("--json", metavar="FILE", type=OutputFile, help="write all findings")
     return made
 
 
 def _check(args: Namespace) -> int:
-    cli.check_outputs(args, "json")
     if bool(args.flights) == (args.live is not None):
         raise InputError("FLIGHT, --live: give recordings, or --live SECONDS, and not both.")
     if args.live is not None and not 0.0 < args.live < math.inf:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, options
+from ..outputs import OutputBag
 from ..bags.convert import SENSORS, convert, shifted
 from ..progress import Progress
 from ..readers import columns
@@ -55,14 +56,13 @@ def parser() -> ArgumentParser:
         "--time-offset", dest="offsets", action="append", default=[], metavar="SENSOR=SECONDS",
         help=f"add this to the stamps of a sensor with a clock of its own: {', '.join(SENSORS)}; may be repeated",
     )  # fmt: skip
-    made.add_argument("--out", metavar="BAG", required=True, help="the bag to write, a new directory")
+    made.add_argument("--out", metavar="BAG", type=OutputBag, required=True, help="the bag to write, a new directory")
     options.add_bag(made)
     made.add_argument("--json", action="store_true", help="print the summary as JSON")
     return made
 
 
 def _convert(args: Namespace) -> None:
-    cli.refuse_inputs(args, "out")
     offsets = _offsets(args.offsets)
     named = _named(args)
     with Progress("convert", what="reading and writing"):

@@ -10,6 +10,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.debias import INTERPOLATORS, BiasMap
 
 from .. import cli, options, parallel
+from ..outputs import OutputFile
 from ..debiasing import report
 from ..debiasing.evaluation import PositionEstimator
 from ..debiasing.mapping import cross_validated, fit_map
@@ -45,7 +46,7 @@ def parser() -> ArgumentParser:
         options.add_recordings(one, nargs)
         options.add_filter(one)
         options.add_align(one)
-        one.add_argument("--json", metavar="FILE", type=Path, help="write all figures")
+        one.add_argument("--json", metavar="FILE", type=OutputFile, help="write all figures")
         parallel.add_options(one)
     add = fitting.add_argument
     add(
@@ -53,7 +54,7 @@ def parser() -> ArgumentParser:
         help="of a tag that stood still: CSV with true_x, true_y, true_z, x, y, z in metres, or recordings with truth",
     )  # fmt: skip
     options.add_holdout(fitting)
-    add("--out", metavar="FILE", type=Path, required=True, help="the map to write (.npz)")
+    add("--out", metavar="FILE", type=OutputFile, required=True, help="the map to write (.npz)")
     add("--step", metavar="M", type=float, default=0.35, help="of the grid of markers, m (default: 0.35)")
     add("--planar", action="store_true", help="map x and y only, whatever the height")
     add("--interpolator", choices=INTERPOLATORS, default="thin_plate", help="(default: thin_plate)")
@@ -61,7 +62,6 @@ def parser() -> ArgumentParser:
 
 
 def _fit(args: Namespace) -> None:
-    cli.check_outputs(args, "out", "json")
     if not (args.flights or args.static):
         raise InputError("FLIGHT: there is none; give flights with ground truth, or --static points.")
     if not 0.01 <= args.step <= 10.0:
@@ -87,7 +87,6 @@ def _fit(args: Namespace) -> None:
 
 
 def _judge(args: Namespace) -> None:
-    cli.check_outputs(args, "json")
     estimator, made = PositionEstimator(options.reading_of(args), *options.filter_of(args), args.align), BiasMap.load(args.map)
     rows = _judged(args, estimator, estimator.reading.find(args.flights, bool(args.dask)), made)
     report.say_rows("flight", rows)

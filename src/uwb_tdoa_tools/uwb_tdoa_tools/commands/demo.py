@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from functools import partial
-from pathlib import Path
 import sys
 import time
 from typing import TYPE_CHECKING
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, options
+from ..outputs import OutputFolder
 from ..evaluating.table import lines_of_errors
 from ..flying import demo
 
@@ -45,7 +45,7 @@ def parser() -> ArgumentParser:
     add("--flight", metavar="LOG", help="a recording: micro-SD log, UTIL CSV or bag (default: simulate one)")
     options.add_reading(made)
     add("--rate", metavar="R", type=float, default=1.0, help="replay R times as fast as flown (default 1)")
-    add("--out", metavar="DIR", type=Path, default=Path("out/demo"), help="for all files (default out/demo)")
+    add("--out", metavar="DIR", type=OutputFolder, default="out/demo", help="for all files (default out/demo)")
     add("--effects", metavar="FILE", help="effects.yaml to correct with")
     options.add_model(made)
     options.add_rerun(made)

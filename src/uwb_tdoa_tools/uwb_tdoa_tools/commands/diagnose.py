@@ -12,6 +12,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.files import write_text
 
 from .. import cli, command_lines, options, parallel
+from ..outputs import OutputFolder
 from ..checking.remarks import remarks_on
 from ..diagnosis import diagnose, output
 from ..diagnosis.noise import write_parameters
@@ -79,12 +80,12 @@ def parser() -> ArgumentParser:
     options.add_align(made)
     options.add_rerun(made)
     parallel.add_options(made)
-    add("--out", metavar="DIR", required=True, help="where to write; made if it is not there")
+    add("--out", metavar="DIR", type=OutputFolder, required=True, help="where to write; made if it is not there")
     return made
 
 
 def _diagnose(args: Namespace) -> None:
-    out = cli.output_folder(args.out)
+    out = args.out
     options.refuse(args, UNUSED[args.reference], f"no part of it is used with --reference {args.reference}")
     config, effects = options.filter_of(args)
     reading = options.reading_of(args)

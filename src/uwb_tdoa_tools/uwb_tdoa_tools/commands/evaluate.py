@@ -11,6 +11,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.files import write_text
 
 from .. import cli, options, parallel
+from ..outputs import OutputFile, OutputFolder
 from ..results_file import asked_of
 from ..evaluating import table
 from ..evaluating.evaluator import Evaluator, results
@@ -47,17 +48,17 @@ def parser() -> ArgumentParser:
     options.add_estimator(made)
     options.add_align(made, judges=True)
     add("--odometry", metavar="BAG", help="judge the odometry of this bag; needs exactly one FLIGHT")
-    add("--json", metavar="FILE", help="write all figures: runs, pooled")
-    add("--markdown", metavar="FILE", help="write the table as Markdown")
+    add("--json", metavar="FILE", type=OutputFile, help="write all figures: runs, pooled")
+    add("--markdown", metavar="FILE", type=OutputFile, help="write the table as Markdown")
     add(
         "--beside", metavar="CSV",
         help="add the 3D RMSE that others reach to that table: columns flight, peer, mode, rmse_3d, diverged",
     )  # fmt: skip
-    add("--plot", metavar="FILE", help="picture of the errors over time (one FLIGHT)")
-    add("--tum", metavar="DIR", help="write estimates and truths as TUM trajectories, e.g. for evo")
+    add("--plot", metavar="FILE", type=OutputFile, help="picture of the errors over time (one FLIGHT)")
+    add("--tum", metavar="DIR", type=OutputFolder, help="write estimates and truths as TUM trajectories, e.g. for evo")
     options.add_rerun(made)
     add(
-        "--resume", metavar="FILE",
+        "--resume", metavar="FILE", type=OutputFile,
         help="keep each flight's figures there as soon as it is judged, a line of JSON each; what is there is not judged again",
     )  # fmt: skip
     parallel.add_options(made)
@@ -65,7 +66,6 @@ def parser() -> ArgumentParser:
 
 
 def _evaluate(args: Namespace) -> int:
-    cli.check_outputs(args, "json", "markdown", "plot")
     if args.odometry:
         options.refuse(args, NOT_OF_ODOMETRY, "has no part in an odometry that was recorded, which is judged as it is (--odometry)")
     estimator = options.estimator_of(args, partial(cli.say, "evaluate"))
@@ -74,7 +74,7 @@ def _evaluate(args: Namespace) -> int:
     for option in ("odometry", "plot"):
         if getattr(args, option) and len(found) != 1:
             raise InputError(f"--{option}: needs exactly one flight, got {len(found)}.")
-    trajectories = cli.output_folder(args.tum, "--tum").absolute() if args.tum else None
+    trajectories = args.tum.absolute() if args.tum else None
     rerun = options.rerun_of(args, len(found), partial(cli.say, "evaluate"))
     evaluator = Evaluator(reading, estimator, args.odometry, args.plot, trajectories, rerun, args.align)
     if not args.odometry:

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
 import sys
 
 from uwb_tdoa_bias.correction.network import load_network
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, options, parallel
+from ..outputs import OutputFile, OutputFolder
 from ..flying import fleet
 from ..flying.path import Circles
 from ..flying.plots import plot
@@ -61,17 +61,16 @@ def parser() -> argparse.ArgumentParser:
     add("--peer", metavar="LIBRARY", help="fly by this shared library of another filter (docs/flying.md), which is told its yaw")
     parallel.add_options(made)
     add("--at-least", metavar="N", type=int, default=0, help="flights that are to land (default: 0)")
-    add("--record", metavar="DIR", help="write every flight as a bag, DIR/flown-SEED, e.g. for diagnose")
-    add("--resume", metavar="FILE", help="keep the verdict of each flight in this file, and go on from what is there")
-    add("--json", metavar="FILE", type=Path, help="write the summary and every verdict")
-    add("--plot", metavar="FILE", type=Path, help="draw a map of all flights, and the errors of the worst with three sigma")
+    add("--record", metavar="DIR", type=OutputFolder, help="write every flight as a bag, DIR/flown-SEED, e.g. for diagnose")
+    add("--resume", metavar="FILE", type=OutputFile, help="keep the verdict of each flight in this file, and go on from what is there")
+    add("--json", metavar="FILE", type=OutputFile, help="write the summary and every verdict")
+    add("--plot", metavar="FILE", type=OutputFile, help="draw a map of all flights, and the errors of the worst with three sigma")
     return made
 
 
 def _fly(args: argparse.Namespace) -> int:
-    cli.check_outputs(args, "json", "plot")
     if args.record is not None:
-        cli.output_folder(args.record).mkdir(parents=True, exist_ok=True)
+        args.record.mkdir(parents=True, exist_ok=True)
     if args.resume and (args.plot or args.record):
         raise InputError("--resume: keeps verdicts alone; leave it out with --plot and --record, which need the flights themselves.")
     config, effects = options.filter_of(args)

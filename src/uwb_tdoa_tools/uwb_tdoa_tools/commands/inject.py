@@ -9,6 +9,7 @@ from uwb_tdoa_bias.effects import EFFECTS
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, options
+from ..outputs import OutputBag
 from ..progress import Progress
 from ..simulation.inject import catalogue, inject, parse_effect
 
@@ -39,7 +40,7 @@ def parser() -> ArgumentParser:
     add("--effect", metavar="NAME", choices=EFFECTS, help="the effect to add")
     add("--value", metavar="KEY=NUMBER", nargs="+", default=[], help="its parameters")
     add("--seed", metavar="N", type=int, default=0, help="of effects that are random (default: 0)")
-    add("--out", metavar="BAG", help="the bag to write: a new directory")
+    add("--out", metavar="BAG", type=OutputBag, help="the bag to write: a new directory")
     options.add_bag(made)
     return made
 
@@ -51,7 +52,6 @@ def _inject(args: Namespace) -> None:
     for option in ("flight", "effect", "value", "out"):
         if not getattr(args, option):
             raise InputError(f"{option}: is missing; see inject --help.")
-    cli.refuse_inputs(args, "out")
     effect = parse_effect(args.effect, args.value)
     with Progress("inject", what="reading and writing"):
         name = inject(effect, args.flight, options.reading_of(args), args.out, args.seed, args.storage, args.force)

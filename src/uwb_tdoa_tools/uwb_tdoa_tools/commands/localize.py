@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, options, parallel
+from ..outputs import OutputFile, OutputFolder
 from ..localizing.localize import Localizer, all_good, check_names
 
 if TYPE_CHECKING:
@@ -46,15 +47,14 @@ def parser() -> ArgumentParser:
     add("--residuals", action="store_true", help="write what is left of each TDOA, too: a table, and a picture")
     add("--zones", metavar="M", type=float, help="write who is heard in squares of that size, and how well, too: a table, and a map")
     options.add_rerun(made)
-    add("--json", metavar="FILE", help="write all figures")
+    add("--json", metavar="FILE", type=OutputFile, help="write all figures")
     parallel.add_options(made)
-    add("--out", metavar="DIR", required=True, help="where to write; made if it is not there")
+    add("--out", metavar="DIR", type=OutputFolder, required=True, help="where to write; made if it is not there")
     return made
 
 
 def _localize(args: Namespace) -> int:
-    out = cli.output_folder(args.out)
-    cli.check_outputs(args, "json")
+    out = args.out
     if args.zones is not None and not args.zones > 0.0:
         raise InputError(f"--zones: {args.zones:g} m is no size of a square; give one above 0, e.g. 20.")
     say = partial(cli.say, "localize")

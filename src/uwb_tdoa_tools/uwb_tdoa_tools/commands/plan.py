@@ -12,6 +12,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
 
 from .. import cli, parallel
+from ..outputs import OutputFile, OutputFolder
 from ..planning import options, report, run
 from ..planning.goal import OBJECTIVES
 from ..planning.maps import FLYABLE, chart
@@ -43,8 +44,8 @@ def parser() -> ArgumentParser:
     path: dict[str, Any] = {"type": Path}
     add, default = made.add_argument, "(default: %(default)s)"
     add("anchors", metavar="ANCHORS", help="anchors .yaml or survey (.txt, .csv)")
-    add("--out", metavar="DIR", **path, required=True, help="where to write; replaces what an earlier plan left there")
-    add("--json", metavar="FILE", **path, help="write the figures here too")
+    add("--out", metavar="DIR", type=OutputFolder, required=True, help="where to write; replaces what an earlier plan left there")
+    add("--json", metavar="FILE", type=OutputFile, help="write the figures here too")
     add("--publish", action="store_true", help="publish the maps on ROS topics plan/... until Ctrl-C")
 
     where = made.add_argument_group("where")
@@ -87,7 +88,6 @@ def parser() -> ArgumentParser:
 
 
 def _plan(args: Namespace) -> None:
-    cli.check_outputs(args, "json")
     anchors = read_survey(args.anchors)
     if args.walls is not None and args.radio_reach is None:
         raise InputError("walls: are for a hall of which a tag hears a part; give --radio-reach too.")
@@ -106,7 +106,7 @@ def _plan(args: Namespace) -> None:
     if not np.isfinite(anchors.orientations).all():
         cli.show("anchors without orientation are taken to radiate alike in all directions")
     report.say_room(room, args.room is not None)
-    cli.output_folder(args.out).mkdir(parents=True, exist_ok=True)
+    args.out.mkdir(parents=True, exist_ok=True)
     with Progress("plan") as progress:
         progress("mapping")
         found = chart(installation, grid, args.flyable)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli
+from ..outputs import OutputBag, OutputFile
 from ..bags.files import STORAGES
 from ..live.record import record
 from ..live.session import PACKAGE
@@ -37,10 +38,10 @@ def parser() -> ArgumentParser:
     )
     made.add_argument("topics", nargs="*", metavar="TOPIC", help="topics to record")
     made.add_argument("-a", "--all", action="store_true", help="record all topics, except hidden ones")
-    made.add_argument("-o", "--output", required=True, metavar="BAG", help="the bag to write, a new directory")
+    made.add_argument("-o", "--output", required=True, metavar="BAG", type=OutputBag, help="the bag to write, a new directory")
     made.add_argument("--package", **PACKAGE)
     made.add_argument("-s", "--storage", choices=STORAGES, default="mcap", help="default: mcap")
-    made.add_argument("--rerun", metavar="FILE", help="write a recording for the viewer Rerun, too (.rrd; needs pip install rerun-sdk)")
+    made.add_argument("--rerun", metavar="FILE", type=OutputFile, help="write a recording for the viewer Rerun, too (.rrd; needs pip install rerun-sdk)")
     return made
 
 

@@ -12,6 +12,7 @@ from uwb_tdoa_bias.foundation.sensors import SENSORS
 from uwb_tdoa_bias.foundation.survey_faults import refuse_faulty
 
 from .. import cli
+from ..outputs import OutputBag, OutputFile
 from ..bags.bag import check_output, write_bag
 from ..bags.files import STORAGES
 from ..progress import Progress
@@ -43,11 +44,11 @@ def parser() -> ArgumentParser:
     )
     add = made.add_argument
     add("--list", action="store_true", help="list trajectories and constellations, and do nothing else")
-    add("--out", metavar="BAG", type=Path, help="the bag to write: a new directory; without it, nothing is written")
+    add("--out", metavar="BAG", type=OutputBag, help="the bag to write: a new directory; without it, nothing is written")
     add("--storage", choices=STORAGES, default="mcap", help="kind of bag (default: mcap)")
     add("--force", action="store_true", help="replace an existing bag")
-    add("--json", metavar="FILE", type=Path, help="write the configuration, the true parameters and the counts")
-    add("--plot", metavar="FILE", type=Path, help="draw the path and the errors of the TDOAs")
+    add("--json", metavar="FILE", type=OutputFile, help="write the configuration, the true parameters and the counts")
+    add("--plot", metavar="FILE", type=OutputFile, help="draw the path and the errors of the TDOAs")
 
     add = made.add_argument_group("flight").add_argument
     add("--trajectory", choices=TRAJECTORIES, default=default.trajectory, help=f"(default: {default.trajectory})")
@@ -96,7 +97,6 @@ def _simulate(args: Namespace) -> None:
     if args.out is not None:
         check_output(args.out, args.force)  # before the work, not after it
     check_image(args.plot)
-    cli.check_outputs(args, "json", "plot")
     with Progress("simulate") as progress:
         progress("flying")
         flight = simulate(_config(args))

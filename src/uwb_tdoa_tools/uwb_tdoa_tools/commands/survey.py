@@ -11,6 +11,7 @@ from uwb_tdoa_bias.foundation.files import write_text
 from .. import cli, command_lines, options
 from ..diagnosis.noise import write_parameters
 from ..diagnosis.self_calibration import self_calibrate
+from ..outputs import OutputFolder
 from ..progress import Progress
 from ..surveying.blocked import with_blocked
 from ..surveying.report import as_dict, as_text, picture
@@ -50,12 +51,12 @@ def parser() -> ArgumentParser:
     add = made.add_argument
     options.add_tape(made)
     options.add_known(made)
-    add("--out", metavar="DIR", required=True, help="where to write; made if it is not there")
+    add("--out", metavar="DIR", type=OutputFolder, required=True, help="where to write; made if it is not there")
     return made
 
 
 def _survey(args: Namespace) -> int:
-    out = cli.output_folder(args.out)
+    out = args.out
     config, effects = options.filter_of(args)
     base, tape = effects or EffectSet(), options.tape_of(args, effects)
     flights = options.reading_of(args).flights(args.flights)

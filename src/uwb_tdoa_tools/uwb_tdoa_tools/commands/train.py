@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from contextlib import nullcontext
 from functools import partial
-from pathlib import Path
 import sys
 from typing import TYPE_CHECKING
 
 from .. import cli, options, parallel
+from ..outputs import OutputFile, OutputFolder
 from ..progress import Progress
 from ..readers import inputs
 from ..results_file import ResultsFile, asked_of, resumed, state_of
@@ -52,12 +52,12 @@ def parser() -> ArgumentParser:
     add("--model", choices=models.KINDS, required=True, help="what to train")
     options.add_most(made, MOST)
     options.add_align(made)
-    add("--out", metavar="DIR", type=Path, required=True, help="where to write")
+    add("--out", metavar="DIR", type=OutputFolder, required=True, help="where to write")
     add("--validation", metavar="NAME", nargs="+", help="flights to validate on (default: one in five)")
     add("--name", help="of the model, goes into every corrected message (default: the kind)")
     add("--seed", metavar="N", type=int, default=0, help="of everything random (default: 0)")
     add(
-        "--resume", metavar="FILE",
+        "--resume", metavar="FILE", type=OutputFile,
         help="keep there, a line of JSON each, what is found of flights left out; what is there is not done again",
     )  # fmt: skip
     parallel.add_options(made)
@@ -65,7 +65,6 @@ def parser() -> ArgumentParser:
 
 
 def _train(args: Namespace) -> None:
-    cli.output_folder(args.out)
     reading = options.reading_of(args)
     jobs, dask = parallel.asked(args, len(reading.find(args.flights)), 2)  # as many for folds as for flights: else all start anew
     with _kept(args, reading) as done:

@@ -18,6 +18,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from domain_coordinator import domain_id
 
 from uwb_tdoa_bias.foundation.errors import Failure
+from uwb_tdoa_bias.foundation.files import refuse_output
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -156,6 +157,7 @@ class Processes:
         except PackageNotFoundError as error:
             raise LiveError(f"{package} is not installed; build and source the workspace.") from error
         title = title or name
+        refuse_output(self.file(title))
         with open(self.file(title), "wb") as log:
             self._running[title] = subprocess.Popen(
                 [str(part) for part in (program, *arguments)],

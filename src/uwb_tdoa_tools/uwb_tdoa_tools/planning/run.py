@@ -44,7 +44,7 @@ def plan_hall(
     if not args.radio_reach > 0.0:
         raise InputError(f"radio reach: {args.radio_reach:g} m is none; give one above 0, e.g. 18.")
     report.say_room(room, args.room is not None)
-    cli.output_folder(args.out).mkdir(parents=True, exist_ok=True)
+    args.out.mkdir(parents=True, exist_ok=True)
     walls = None if args.walls is None else Walls.from_yaml(args.walls)
     whole = hall.Hall(options.goal_of(args, installation), anchors, args.radio_reach, walls)
     found, heard = whole.chart(grid, args.jobs, args.dask)

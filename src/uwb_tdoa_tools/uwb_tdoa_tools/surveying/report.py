@@ -7,7 +7,6 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.executable import elsewhere
 from uwb_tdoa_bias.foundation.files import write_filled
 
 from ..checking.known_path import MANY
@@ -111,8 +110,7 @@ def as_text(found: SelfCalibration) -> str:
 
 def picture(found: SelfCalibration, path: str | Path) -> None:
     """Plan and elevation, before and after, with 95 % intervals."""
-    with elsewhere():  # where no settings of others are
-        from matplotlib.figure import Figure  # takes a second to import
+    from matplotlib.figure import Figure  # takes a second to import
 
     figure = Figure(figsize=(11.0, 5.0), layout="constrained")
     surveyed = found.surveyed.positions

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
     from onnx import ModelProto
 
-OPSET, IR_VERSION = 13, 8  # whose operators `graph_size.py` knows
+OPSET, IR_VERSION = 13, 8  # whose operators `trial.py` lists
 
 
 class GraphBuilder:

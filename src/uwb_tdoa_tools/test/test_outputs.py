@@ -1,0 +1,65 @@
+"""No command writes through a link, or over what it reads. The commands are those of setup.py, so that a new one is among them."""
+
+from importlib import import_module
+import re
+
+from documented import ROOT
+from output_attacks import attack, content, outputs, parsers, place, unknown  # noqa: F401
+import pytest
+from uwb_tdoa_tools import cli
+from uwb_tdoa_tools.outputs import OutputBag, OutputFile, OutputFolder
+
+NAMES = sorted(re.findall(r"uwb_tdoa_tools\.executables:(\w+)", (ROOT / "src" / "uwb_tdoa_tools" / "setup.py").read_text()))
+COMMANDS = [name for name in NAMES if not name.endswith("_node")]  # a node writes no file
+PARSERS = {}
+for _name in COMMANDS:
+    PARSERS |= parsers((_name,), import_module(f"uwb_tdoa_tools.commands.{_name}").parser())
+OUTPUTS = [(words, action) for words, parser in PARSERS.items() for action in outputs(parser)]
+
+
+@pytest.mark.parametrize("words", PARSERS, ids=" ".join)
+def test_every_option_that_takes_a_path_is_an_output_or_read(words):
+    assert unknown(PARSERS[words]) == []
+
+
+def test_all_that_write_are_there():
+    assert len(OUTPUTS) > 25 and {words[0] for words, _ in OUTPUTS} == {*COMMANDS} - {"replay"}
+    assert {action.type for _, action in OUTPUTS} == {OutputFile, OutputFolder, OutputBag}
+
+
+@pytest.mark.parametrize(("words", "action"), OUTPUTS, ids=[f"{' '.join(words)} {action.dest}" for words, action in OUTPUTS])
+def test_no_command_writes_through_a_link_or_over_what_it_reads(place, capsys, words, action):
+    attack(import_module(f"uwb_tdoa_tools.commands.{words[0]}").main, words, PARSERS[words], action, place, capsys)
+
+
+@pytest.mark.parametrize("kind", [OutputFile, OutputFolder, OutputBag])
+def test_other_places_are_no_inputs(place, kind):
+    inputs = [str(place / "bag"), str(place / "flights" / "one.log"), "x" * 5000, 3, None]
+    for out in ("new", "flights/new", "home/new"):
+        parser = cli.parser("write", "Write.")
+        parser.add_argument("--out", type=kind)
+        parser.set_defaults(inputs=inputs)
+        assert cli.run(lambda args: 0, parser, ["--out", str(place / out)]) == 0
+
+
+def test_standard_output_is_a_file():
+    parser = cli.parser("write", "Write.")
+    parser.add_argument("--json", type=OutputFile)
+    assert cli.run(lambda args: 0, parser, ["--json", "/dev/stdout"]) == 0
+
+
+@pytest.mark.parametrize(
+    ("kind", "out", "said"),
+    [
+        (OutputFile, "/proc/out", "cannot be written .*: /proc"),  # for root, too
+        (OutputFolder, "/proc/out", "cannot be written .*: /proc"),
+        (OutputFolder, "file/out", "cannot be made, as .*file is a file"),
+        (OutputFile, "home", "is a directory; give a file"),
+        (OutputFile, "no/file", "its directory does not exist"),
+    ],
+)
+def test_a_place_that_cannot_be_written_to_is_refused_before_the_work(place, capsys, kind, out, said):
+    before, parser = content(place), cli.parser("write", "Write.")
+    parser.add_argument("--out", type=kind)
+    assert cli.run(None, parser, ["--out", str(place / out)]) == 2
+    assert re.search(said, capsys.readouterr().err) and content(place) == before

@@ -1,0 +1,107 @@
+"""What a command writes: its options have one of these types, and are checked before the work. No output follows a link, or changes an
+input or a bag.
+
+    add("--json", metavar="FILE", type=OutputFile)
+    add("--out", metavar="DIR", type=OutputFolder)
+    add("--out", metavar="BAG", type=OutputBag)
+    with checked(args):             # as `cli.run` does
+        ...
+"""
+
+from __future__ import annotations
+
+from contextlib import AbstractContextManager
+import os
+from pathlib import Path, PosixPath
+import tempfile
+from typing import Any, TYPE_CHECKING
+
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.files import keeping, refuse_output
+
+if TYPE_CHECKING:
+    from argparse import Namespace
+    from collections.abc import Iterator
+
+
+class Output(PosixPath):
+    """Path of what a command writes."""
+
+
+class OutputFile(Output):
+    """A file; its folder is there."""
+
+
+class OutputFolder(Output):
+    """A folder that is made where it is not there."""
+
+
+class OutputBag(Output):
+    """A bag, which `bags.files.check_output` looks at, too."""
+
+
+def checked(args: Namespace) -> AbstractContextManager[None]:
+    """A context in which nothing is written over what the other options name. Raises InputError for an output that cannot be written, is
+    reached over a link, or would change what is read or a bag."""
+    values = list(_flat(vars(args).values()))
+    outputs = [value for value in values if isinstance(value, Output)]
+    inputs = [Path(value) for value in values if not isinstance(value, Output) and _is_there(value)]
+    with keeping(inputs):
+        for output in outputs:
+            refuse_output(output)
+            if isinstance(output, OutputFolder):
+                _check_folder(output)
+            elif isinstance(output, OutputFile):
+                _check_file(output)
+    return keeping(inputs)
+
+
+def _flat(values: Any) -> Iterator[Any]:
+    for value in values:
+        if isinstance(value, (list, tuple)):
+            yield from _flat(value)
+        else:
+            yield value
+
+
+def _is_there(value: object) -> bool:
+    return isinstance(value, (str, Path)) and len(str(value)) < 4096 and os.path.exists(value)
+
+
+def _check_file(path: Path) -> None:
+    folder = path.absolute().parent
+    if not folder.is_dir():
+        raise InputError(f"{path}: its directory does not exist; make it first.")
+    if path.is_dir():
+        raise InputError(f"{path}: is a directory; give a file.")
+    _refuse_bag(path, folder)
+    if not path.exists() or not os.access(path, os.W_OK):
+        _check_writable(path, folder)
+
+
+def _check_folder(out: Path) -> None:
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out}: is a file; give a directory.")
+    there = out.absolute()
+    while not there.exists():
+        there = there.parent
+    if not there.is_dir():
+        raise InputError(f"{out}: cannot be made, as {there} is a file; give another directory.")
+    _refuse_bag(out, there)
+    for inside in sorted(out.iterdir()) if out.exists() else ():
+        refuse_output(inside)
+    _check_writable(out, there)
+
+
+def _refuse_bag(path: Path, folder: Path) -> None:
+    if (folder / "metadata.yaml").exists():
+        raise InputError(f"{path}: would change the bag {folder}; give another place.")
+
+
+def _check_writable(path: Path, folder: Path) -> None:
+    """Raise InputError unless a file can be made in the folder, for the sake of path; leaves none."""
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror}: {folder}); give another place.") from error
