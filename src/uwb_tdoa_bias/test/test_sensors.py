@@ -14,7 +14,7 @@ T = np.arange(N) / 25.0
 STREAMS = {  # measurements that are possible
     "height": Height(T, np.linspace(0.5, 2.0, N)),
     "pressure": SENSORS["pressure"].stream(T, np.linspace(98e3, 99e3, N)),
-    "velocity": Velocity(T, np.ones((N, 3)), np.full((N, 3), 0.5)),
+    "velocity": Velocity(T, np.ones((N, 3)), np.full((N, 3), 0.5), np.linspace(-1.0, 1.0, N), np.full(N, 0.25)),
     "range": Ranges(T, np.array([7, 2, 7, 2, 7]), np.linspace(1.0, 4.0, N), np.full(N, 0.01)),
 }
 
@@ -75,6 +75,62 @@ def test_its_parameters_begin_with_the_switch(name):
 def test_registries_of_a_part():
     assert LOCATING == ("range",) and set(BY_POSE) == {"height", "pressure", "velocity"}
     assert set(DIAGNOSED) - set(BY_POSE) == RADIO.keys() - {"tdoa"}  # distances to anchors, of which effects on arrivals know
+
+
+# --- velocities and yaw rates ---
+
+
+def of_twist(linear, rate, variances):
+    """The Velocity of one message: its linear velocity (3,), yaw rate and variances (4,)."""
+    covariance = np.zeros((1, 36))
+    covariance[0, [0, 7, 14, 35]] = variances
+    angular = np.array([[np.nan, 5.0, rate]])  # rates about x and y may be anything
+    return SENSORS["velocity"].read(T[:1], {"twist.twist.linear": np.array([linear]), "twist.twist.angular": angular, "twist.covariance": covariance})
+
+
+@pytest.mark.parametrize(
+    "rate, variances, yaw_rate, yaw_rate_std",
+    [
+        (0.5, (0.01, 0.01, 1e6, 0.04), 0.5, 0.2),
+        (0.5, (0.0, 0.0, 0.0, 0.0), 0.5, 0.0),  # most drivers of wheels
+        (0.0, (0.0, 0.0, 0.0, 0.0), 0.0, 0.0),
+        (0.5, (0.01, 0.01, 0.01, 0.0), 0.5, 0.0),
+        (0.0, (0.01, 0.01, 1e6, 0.0), np.nan, np.inf),  # optical flow: nothing is said of the rate
+        (0.5, (0.01, 0.01, 0.01, 1e6), np.nan, np.inf),
+        (0.5, (0.01, 0.01, 0.01, -1.0), np.nan, np.inf),
+    ],
+)
+def test_what_a_message_says_of_the_yaw_rate(rate, variances, yaw_rate, yaw_rate_std):
+    read = of_twist([1.0, 0.0, 0.0], rate, variances)
+    np.testing.assert_array_equal(read.yaw_rate, [yaw_rate])
+    np.testing.assert_array_equal(read.yaw_rate_std, [yaw_rate_std])
+    rows, usable = SENSORS["velocity"].measured(read)
+    assert usable.all() and np.isfinite(rows["value"]).all()
+    assert rows["value"][0, 3] == (yaw_rate if np.isfinite(yaw_rate) else 0.0)
+
+
+@pytest.mark.parametrize(
+    "linear, rate, variances, usable",
+    [
+        ([1.0, 0.0, 0.0], np.nan, (0.01, 0.01, 0.01, 0.01), False),
+        ([1.0, np.inf, 0.0], 0.0, (0.01, 0.01, 0.01, 0.01), False),
+        ([1.0, 0.0, 0.0], 200.0, (0.01, 0.01, 0.01, 0.01), False),
+        ([1.0, 0.0, 0.0], 0.5, (1e6, 1e6, 1e6, 1e6), False),
+        ([1.0, 0.0, 0.0], 0.5, (1e6, 1e6, 1e6, 0.01), True),  # a gyroscope in a twist
+    ],
+)
+def test_which_velocities_are_measurements(linear, rate, variances, usable):
+    assert SENSORS["velocity"].measured(of_twist(linear, rate, variances))[1].tolist() == [usable]
+
+
+def test_a_stream_without_yaw_rates_is_what_it_was():
+    old, sensor = Velocity(T, np.ones((N, 3)), np.full((N, 3), 0.5)), SENSORS["velocity"]
+    assert np.isnan(old.yaw_rate).all() and np.isinf(old.yaw_rate_std).all()
+    written = of_message(sensor, old)
+    np.testing.assert_array_equal(written["twist.twist.angular"], 0.0)
+    np.testing.assert_array_equal(written["twist.covariance"].reshape(N, 6, 6)[:, 5, 5], 1e6)
+    for one, other in zip(sensor.read(T, written).columns, old.columns):
+        np.testing.assert_array_equal(one, other)
 
 
 # --- two-way ranging ---

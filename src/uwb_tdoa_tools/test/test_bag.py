@@ -98,7 +98,8 @@ def flights(draw):
     pressure = draw(st.sampled_from([None, Pressure(t, values(len(t)))]))
     t = stamps(1)
     std = draw(arrays(float, (len(t), 3), elements=st.sampled_from([0.5, 2.0, np.inf])))
-    velocity = draw(st.sampled_from([None, Velocity(t, values(len(t), 3), std)]))
+    turns = draw(st.sampled_from([(), (values(len(t)), np.full(len(t), 0.5))]))
+    velocity = draw(st.sampled_from([None, Velocity(t, values(len(t), 3), std, *turns)]))
     aids = dict(height=height, pressure=pressure, velocity=velocity)
     return Flight(name, anchors, tdoas, imu, truth, **aids)
 

@@ -39,7 +39,7 @@ TDOA = _record(
     ("t", float), ("a", int), ("b", int), ("d", float), ("variance", float),  # s, rows, m (corrected), m^2 (beyond tdoa_std)
     ("slope", float, N_STATES), ("state", float, N_STATES),  # of the bias taken out, with position and velocity, about a state; m, m/s
 )  # fmt: skip
-AID = _record(("t", float), ("kind", int), ("value", float, 3), ("std", float, 3), ("anchor", int))  # see aids.py
+AID = _record(("t", float), ("kind", int), ("value", float, 4), ("std", float, 4), ("anchor", int))  # see aids.py
 
 # One estimate of the state, for one direction that the tag may have started in.
 HYPOTHESIS = _record(

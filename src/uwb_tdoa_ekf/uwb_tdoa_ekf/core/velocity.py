@@ -31,6 +31,7 @@ def observe(ekf: Record, parameters: Record, aid: Record, residual: Record, reco
     frozen = _repeats(state, aid) and not ekf.quiet
     state.heard = aid.t
     inflation = max(1.0, 2.0 * CORRELATION_TIME / dt)
+    _complete(aid, parameters)
     worst = _worst(ekf, aid, residual)
     state.nis += min(1.0, dt / AVERAGE) * (min(worst, GATE**4) - state.nis)
     state.refused = state.nis > (AGREES if state.refused else DISAGREES) or (frozen and (state.refused or np.any(state.value != 0.0)))
@@ -54,6 +55,14 @@ def observe(ekf: Record, parameters: Record, aid: Record, residual: Record, reco
             if h == ekf.best:
                 residual.weight = min(residual.weight, w)
                 add_update(ekf, aid.t, records)
+
+
+@compiled
+def _complete(aid: Record, parameters: Record) -> None:
+    """Give the components of AID the configured deviation, where the message states none."""
+    for axis in range(3):
+        if aid.std[axis] == 0.0:
+            aid.std[axis] = parameters.velocity_std
 
 
 @compiled

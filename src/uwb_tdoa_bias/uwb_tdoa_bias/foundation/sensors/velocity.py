@@ -10,18 +10,30 @@ import numpy as np
 from ..later import rotations
 from .sensor import UNKNOWN_STD, UNKNOWN_VARIANCE, Compared, Sensor, Stream, finite, parameter
 
-FASTEST = 100.0  # m/s
+FASTEST = 100.0  # m/s, and rad/s
 LEAST_STD = 0.01  # m/s, that a simulated velocity says of itself
 
 
 @dataclass(frozen=True)
 class Velocity(Stream):
-    """Velocities in the body frame. t : (n,) s; v : (n, 3) m/s; std : (n, 3) m/s, inf for a component that is not
-    measured."""
+    """Velocities in the body frame.
+
+    t : (n,) s; v : (n, 3) m/s; std : (n, 3) m/s, inf for a component that is not measured, 0 where the driver states none.
+    yaw_rate : (n,) rad/s about the body's z, as of wheels, NaN where it is not measured, which is everywhere unless it is given;
+    yaw_rate_std : (n,) rad/s, inf and 0 as in std.
+    """
 
     t: np.ndarray
     v: np.ndarray
     std: np.ndarray
+    yaw_rate: np.ndarray = None  # type: ignore[assignment]  # __post_init__ puts NaN there,
+    yaw_rate_std: np.ndarray = None  # type: ignore[assignment]  # and inf there
+
+    def __post_init__(self) -> None:
+        if self.yaw_rate is None:
+            object.__setattr__(self, "yaw_rate", np.full(len(self.t), np.nan))
+        if self.yaw_rate_std is None:
+            object.__setattr__(self, "yaw_rate_std", np.where(np.isnan(self.yaw_rate), np.inf, 0.0))
 
     @property
     def values(self) -> np.ndarray:
@@ -32,28 +44,41 @@ class Velocity(Stream):
 
 
 def _columns(fields: dict) -> tuple:
-    variance = fields["twist.covariance"][:, [0, 7, 14]]
-    known = (variance >= 0.0) & (variance < UNKNOWN_VARIANCE)
-    return fields["twist.twist.linear"], np.sqrt(np.where(known, variance, np.inf))
+    """Variances of 0 are those of a driver that states none; the yaw rate of one that states some for the velocity alone, and turns
+    nowhere, is not measured."""
+    variance, rate = fields["twist.covariance"][:, [0, 7, 14, 35]], fields["twist.twist.angular"][:, 2]
+    std = np.sqrt(np.where((variance >= 0.0) & (variance < UNKNOWN_VARIANCE), variance, np.inf))
+    linear = std[:, :3]
+    silent = (variance[:, 3] == 0.0) & (rate == 0.0) & (np.isfinite(linear) & (linear > 0.0)).any(axis=1)
+    rate_std = np.where(silent, np.inf, std[:, 3])
+    return fields["twist.twist.linear"], linear, np.where(np.isinf(rate_std), np.nan, rate), rate_std
 
 
 def _content(velocity: Velocity) -> dict:
-    variance = np.full((len(velocity), 6), UNKNOWN_VARIANCE)  # rates are not measured
+    variance = np.full((len(velocity), 6), UNKNOWN_VARIANCE)  # rates about x and y are not measured
     variance[:, :3] = np.minimum(velocity.std**2, UNKNOWN_VARIANCE)
-    return {"twist.twist.linear": velocity.v, "twist.covariance": (variance[:, :, None] * np.eye(6)).reshape(-1, 36)}
+    variance[:, 5] = np.minimum(velocity.yaw_rate_std**2, UNKNOWN_VARIANCE)
+    angular = np.zeros((len(velocity), 3))
+    angular[:, 2] = np.where(variance[:, 5] < UNKNOWN_VARIANCE, velocity.yaw_rate, 0.0)
+    return {
+        "twist.twist.linear": velocity.v,
+        "twist.twist.angular": angular,
+        "twist.covariance": (variance[:, :, None] * np.eye(6)).reshape(-1, 36),
+    }
 
 
 def _sound(fields: dict) -> dict:
-    _, std = _columns(fields)
-    sound = finite(fields)
-    linear, covariance = sound
-    return {linear: sound[linear] | np.isinf(std), covariance: np.ones(sound[covariance].shape, dtype=bool)}
+    _, std, _, rate_std = _columns(fields)
+    linear, angular, covariance = sound = finite(fields)
+    of_rates = np.ones(sound[angular].shape, dtype=bool)  # those about x and y are not read
+    of_rates[:, 2] = sound[angular][:, 2] | np.isinf(rate_std)
+    return {linear: sound[linear] | np.isinf(std), angular: of_rates, covariance: np.ones(sound[covariance].shape, dtype=bool)}
 
 
 def _measured(velocity: Velocity) -> tuple[dict, np.ndarray]:
-    v, std = velocity.v, velocity.std
+    v, std = np.column_stack([velocity.v, velocity.yaw_rate]), np.column_stack([velocity.std, velocity.yaw_rate_std])
     known = np.isfinite(std)
-    sane = np.where(known, (np.abs(v) < FASTEST) & (std > 0.0), True).all(axis=1)
+    sane = np.where(known, (np.abs(v) < FASTEST) & (std >= 0.0), True).all(axis=1)
     rows = {"value": np.where(known, v, 0.0), "std": np.where(known, std, UNKNOWN_STD)}
     return rows, sane & known.any(axis=1) & ~np.isnan(std).any(axis=1)
 
@@ -68,15 +93,23 @@ SENSOR = Sensor(
     plural="velocities",
     stream=Velocity,
     message="geometry_msgs/msg/TwistWithCovarianceStamped",
-    fields={"twist.twist.linear": 3, "twist.covariance": 36},
+    fields={"twist.twist.linear": 3, "twist.twist.angular": 3, "twist.covariance": 36},
     columns=_columns,
     content=_content,
     sound=_sound,
     measured=_measured,
     simulated=_simulated,
     noise=("M/S", "write velocities in the body frame"),
-    parameters={"use_velocity": parameter(True, "use velocities in the body frame, if there are any", fixed=True)},
-    invalid="give m/s and a covariance that is neither 0 nor unknown for all components",
+    parameters={
+        "use_velocity": parameter(True, "use velocities in the body frame, if there are any", fixed=True),
+        "velocity_std": parameter(
+            0.05, "m/s; of a component of the velocity whose variance in the message is 0: the driver states none", high=100.0
+        ),
+        "yaw_rate_std": parameter(
+            0.05, "rad/s; the same of the yaw rate in such a message; 0.0: yaw rates without a variance are not used", high=100.0, with_low=True
+        ),
+    },
+    invalid="give m/s, rad/s, and a covariance that is not unknown for all components",
     remedy="its unit and how it is turned (velocity_misalignment in effects_file), and look for slip",
     compared=Compared(
         lambda track, t: rotations.Rotation.from_quat(track.attitudes(t)).inv().apply(track.velocities(t)),
