@@ -60,6 +60,11 @@ def test_wheels_say_too_much_and_slip():
     np.testing.assert_allclose(ratio[~slips], 1.02)
     np.testing.assert_allclose(ratio[slips], 1.02 * 1.2)
     assert 0.01 < slips.mean() < 0.15
+    np.testing.assert_array_equal(flight.velocity.v[:, 1:], 0.0)
+    standing = true == 0.0
+    assert np.std(flight.velocity.yaw_rate[standing]) == pytest.approx(0.02, rel=0.2)
+    turn = np.polyfit(motion.body_rates[true > 0.1, 2], flight.velocity.yaw_rate[true > 0.1], 1)[0]
+    assert 1.015 < turn < 1.1
 
 
 def test_a_person_walks_at_the_height_of_a_hand():

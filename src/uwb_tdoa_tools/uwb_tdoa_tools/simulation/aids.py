@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.foundation.sensors import SENSORS
+from uwb_tdoa_bias.foundation.sensors import SENSORS, Velocity
 
 from .config import WHEELS_RATE
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     from .room import Room
     from .motion import Flyable
 
+YAW_RATE_STD = 0.02  # rad/s
 SLIP_EVERY, SLIP_TIME = 10.0, 0.5  # s
 
 
@@ -34,11 +36,19 @@ def measure(config: SimulationConfig, room: Room, trajectory: Flyable) -> dict[s
             config, room, motion, Rotation.from_quat(motion.q), lambda *shape: random.standard_normal((len(t), *shape))
         )
         stream = sensor.stream(t, *columns)
-        if wheels:
-            too_fast = (1.0 + config.wheel_scale) * (1.0 + config.wheel_slip * _slips(t, config.random("slip")))
-            stream = stream.with_values(stream.values * too_fast[:, None])
-        out[name] = stream
+        out[name] = _of_wheels(stream, config, motion.body_rates[:, 2]) if wheels else stream
     return out
+
+
+def _of_wheels(velocity: Stream, config: SimulationConfig, turning: np.ndarray) -> Velocity:
+    """What two wheels make of a Velocity, and of the true turning rate (n,) rad/s."""
+    assert isinstance(velocity, Velocity)
+    n, t = len(velocity), velocity.t
+    too_fast = (1.0 + config.wheel_scale) * (1.0 + config.wheel_slip * _slips(t, config.random("slip")))
+    ahead = np.zeros((n, 3))
+    ahead[:, 0] = too_fast * velocity.v[:, 0]
+    yaw_rate = too_fast * turning + YAW_RATE_STD * config.random("yaw rate noise").standard_normal(n)
+    return replace(velocity, v=ahead, yaw_rate=yaw_rate, yaw_rate_std=np.full(n, YAW_RATE_STD))
 
 
 def _slips(t: np.ndarray, random: np.random.Generator) -> np.ndarray:

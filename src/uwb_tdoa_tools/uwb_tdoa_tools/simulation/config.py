@@ -98,7 +98,7 @@ class SimulationConfig(_Noises):
     What else the vehicle feels
     ---------------------------
     <name>_noise : of each of SENSORS, standard deviation in its unit (default None: there is none)
-    wheel_scale : of a rover, by which share its velocities are too large (default 0)
+    wheel_scale : of a rover, by which share its velocities and yaw rates are too large (default 0)
     wheel_slip : of a rover, by which share its wheels turn faster than the floor passes, for half a second every ten (default 0)
     """
 
