@@ -63,7 +63,7 @@ def test_the_verdict_has_the_error_before_and_after_its_interval_and_how_many_fl
 
 def test_a_flight_of_which_each_half_was_judged_was_flown_once():
     parts = ("one", 2.0, 55.0), ("one", 7.0, 60.0), ("two", 1.0, 31.0)
-    scores = [SimpleNamespace(name=name, first=first, last=last) for name, first, last in parts]
+    scores = [SimpleNamespace(name=name, first=first, last=last, part="in_the_air") for name, first, last in parts]
     before = {"runs": [{"flight": name} for name, _, _ in parts], "scores": scores}
     assert _flights(SimpleNamespace(before=before)) == "2 flights, 88 s in the air"
 

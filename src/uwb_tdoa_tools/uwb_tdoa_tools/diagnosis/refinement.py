@@ -54,6 +54,12 @@ def effects_of(selection: Selection) -> tuple[Effect, ...]:
     return tuple(replace(effect, values=values[identity], std=std[identity], source="diagnose") for identity, effect in effects.items())
 
 
+def is_written(effect: Effect) -> bool:
+    """Whether the model that goes to effects.yaml holds an Effect: all but functions of what no node has. Errors of the ground truth, and
+    what the filter judges itself, are part of it: no node meets them."""
+    return effect.usable or not isinstance(effect, SmoothTerm)
+
+
 def entry_of(effect: Effect) -> Hashable:
     """Equal for Effects that are one entry of effects.yaml."""
     return effect.identity if isinstance(effect, SmoothTerm) else effect.name

@@ -57,6 +57,11 @@ def in_the_air(truth: Truth) -> Span | None:
     return (float(truth.t[above[0]]), float(truth.t[above[-1]])) if len(above) else None
 
 
+def least_height(truth: Truth) -> float:
+    """z, m, above which what is measured beside a Truth counts: 0.3, or minus infinity for a vehicle that never leaves the floor."""
+    return -np.inf if in_the_air(truth) is None else AIRBORNE
+
+
 def motion(truth: Truth) -> Span | None:
     """(departure, arrival) of a Truth, s, its first and last stamp where it begins or ends in motion; None if it never moves."""
     t, p = truth.t, truth.p
