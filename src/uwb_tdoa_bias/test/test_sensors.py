@@ -123,6 +123,13 @@ def test_which_velocities_are_measurements(linear, rate, variances, usable):
     assert SENSORS["velocity"].measured(of_twist(linear, rate, variances))[1].tolist() == [usable]
 
 
+def test_which_parameters_stand_in_for_deviations():
+    said = SENSORS["velocity"].assumed
+    assert said(of_twist([1.0, 0.0, 0.0], 0.5, (0.0, 0.0, 0.0, 0.0))) == ("velocity_std", "yaw_rate_std")
+    assert said(of_twist([1.0, 0.0, 0.0], 0.5, (0.01, 0.01, 0.01, 0.0))) == ("yaw_rate_std",)
+    assert said(of_twist([1.0, 0.0, 0.0], 0.0, (0.01, 0.01, 1e6, 0.0))) == ()
+
+
 def test_a_stream_without_yaw_rates_is_what_it_was():
     old, sensor = Velocity(T, np.ones((N, 3)), np.full((N, 3), 0.5)), SENSORS["velocity"]
     assert np.isnan(old.yaw_rate).all() and np.isinf(old.yaw_rate_std).all()

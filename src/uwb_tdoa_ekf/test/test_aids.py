@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.robust_loss import LOSSES
-from uwb_tdoa_ekf.core import auxiliary, height, update, velocity
+from uwb_tdoa_ekf.core import auxiliary, height, plane, update, velocity
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
 from uwb_tdoa_ekf.core.engine import feed
 from uwb_tdoa_ekf.core.history import NOTHING
@@ -59,12 +59,29 @@ def test_a_range_depends_on_z_and_tilt(seed):
 
 @given(seeds, st.integers(0, 2))
 def test_a_velocity_depends_on_velocity_and_attitude(seed, axis):
-    prior, aid = tilted(seed), np.zeros(1, AID)[0]
-    aid["value"], aid["std"] = [1.0, -2.0, 0.5], 0.1
-    R = np.empty((3, 3))
+    prior, value, R = tilted(seed), (1.0, -2.0, 0.5)[axis], np.empty((3, 3))
     assert_row_is_the_derivative(
-        prior, lambda: velocity.compare(prior.hypothesis, aid, axis, R, prior.innovation)
+        prior, lambda: velocity.compare(prior.hypothesis, value, 0.1, axis, R, prior.innovation)
     )
+
+
+@given(seeds, st.integers(0, 1))
+def test_a_tilt_depends_on_the_attitude(seed, axis):
+    prior, R = tilted(seed), np.empty((3, 3))
+    assert_row_is_the_derivative(prior, lambda: plane._is_tilted(prior.hypothesis, axis, 0.02, R, prior.innovation))
+    plane._is_tilted(prior.hypothesis, axis, 0.02, R, prior.innovation)
+    x, y, z, w = prior.hypothesis.x[6:10]
+    up = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x)
+    assert prior.innovation.value == pytest.approx(-up[axis])
+
+
+@given(seeds)
+def test_a_yaw_rate_depends_on_the_bias_of_the_gyroscope(seed):
+    prior, aid, imu = tilted(seed), np.zeros(1, AID)[0], new_state(np.eye(3)).record.imu
+    aid["value"], aid["std"], imu.gyro[:] = [0.0, 0.0, 0.0, 0.7], 0.1, [0.1, 0.2, 0.5]
+    assert_row_is_the_derivative(prior, lambda: velocity._compare_yaw_rate(prior.hypothesis, aid, imu, prior.innovation))
+    velocity._compare_yaw_rate(prior.hypothesis, aid, imu, prior.innovation)
+    assert prior.innovation.value == pytest.approx(0.7 - (0.5 - prior.hypothesis.x[15]))
 
 
 @given(seeds, st.sampled_from([None, auxiliary.PRESSURE, auxiliary.RANGE]))
@@ -231,7 +248,7 @@ def test_a_range_finder_decides_between_mirrored_places(followed):
     for h, z in zip(places, (1.1, 2.5)):
         ekf.hypotheses["log_weight"][h], ekf.hypotheses["x"][h, [2, 9]], ekf.hypotheses["P"][h] = 0.0, [z, 1.0], 0.01 * np.eye(15)
     for t in np.arange(0.0, 3.0, 0.04):
-        aid["t"], aid["value"] = t, [1.1 + 0.01 * np.sin(40.0 * t), 0.0, 0.0]
+        aid["t"], aid["value"] = t, [1.1 + 0.01 * np.sin(40.0 * t), 0.0, 0.0, 0.0]
         height.observe(ekf, parameters, aid, residual, NOTHING)
         if t < 0.04:
             assert ekf.hypotheses["log_weight"][places[1]] - ekf.hypotheses["log_weight"][0] > PRUNED_BELOW

@@ -10,7 +10,8 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import CHOICES, RENAMED, PARAMETERS, FilterConfig, current_names
 
 CONFIG = Path(__file__).resolve().parents[1] / "config" / "ekf_node.yaml"
-SWITCHES = ("use_imu", "adapt_noise", "zero_velocity", "recover", "use_height", "use_pressure", "use_velocity")
+WITHOUT = ["vibration_gain", "yaw_rate_std", "range_offset_std", "fixed_height_std", "non_holonomic_std"]  # 0: there is no such thing
+SWITCHES = ("use_imu", "adapt_noise", "zero_velocity", "recover", "use_height", "use_pressure", "use_velocity", "planar")
 SIGNED = "initial_yaw", "height_arm", "ground_height", "fixed_height"
 OTHERS = (*CHOICES, *SIGNED, *SWITCHES)
 NUMBERS = [field.name for field in fields(FilterConfig) if field.name not in OTHERS]
@@ -75,7 +76,7 @@ def test_a_number_must_be_above_zero(value):
             accepted.append(name)
         except InputError as error:
             assert name in str(error)
-    assert accepted == (["vibration_gain", "range_offset_std", "fixed_height_std"] if value == 0.0 else [])  # 0: there is no such thing
+    assert accepted == (WITHOUT if value == 0.0 else [])
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), "north"])

@@ -213,7 +213,7 @@ def test_a_spin_about_the_vertical_leaves_the_uncertainty_of_the_tilt_as_it_was(
 
 def coasted(x, P, dt, accel_psd, turn_psd):
     hypotheses = ekf_with(x, P).hypotheses
-    coast(hypotheses[0], dt, accel_psd, turn_psd)
+    coast(hypotheses[0], dt, accel_psd, turn_psd, turn_psd)
     return hypotheses["x"][0], hypotheses["P"][0]
 
 

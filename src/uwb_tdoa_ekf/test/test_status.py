@@ -10,20 +10,21 @@ from uwb_tdoa_ekf.monitoring.use import Use
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.streams import ERROR, WARNING, Finding
 
-STARTS = SimpleNamespace(running=False, lost=None, without_imu=None, yaw_doubts=0, restarted=None)
-RUNS = SimpleNamespace(running=True, lost=None, without_imu=None, yaw_doubts=0)
-IS_LOST = SimpleNamespace(running=False, lost="the tag is lost", without_imu=None, yaw_doubts=0)
+STARTS = SimpleNamespace(running=False, lost=None, without_imu=None, yaw_doubts=0, unsure=None, restarted=None)
+RUNS = SimpleNamespace(running=True, lost=None, without_imu=None, yaw_doubts=0, unsure=None)
+IS_LOST = SimpleNamespace(running=False, lost="the tag is lost", without_imu=None, yaw_doubts=0, unsure=None)
 KNOWN, UNKNOWN = math.radians(6.0), math.radians(100.0)
 LEFT_OUT = Finding("imu_left_out", ERROR, "what the accelerometer reads is not gravity", "1 m/s^2", "in m/s^2", 1.0)
-GOES_WITHOUT = SimpleNamespace(running=True, lost=None, without_imu=LEFT_OUT, yaw_doubts=0)
-DOUBTS = SimpleNamespace(running=True, lost=None, without_imu=None, yaw_doubts=1)
+GOES_WITHOUT = SimpleNamespace(running=True, lost=None, without_imu=LEFT_OUT, yaw_doubts=0, unsure=None)
+UNSURE = SimpleNamespace(running=True, lost=None, without_imu=None, yaw_doubts=0, unsure="TDOAs agree on another place")
+DOUBTS = SimpleNamespace(running=True, lost=None, without_imu=None, yaw_doubts=1, unsure=None)
 
 
 def found(rule, severity=ERROR, value=1.0):
     return Finding(rule, severity, f"cause of {rule}", "evidence", "remedy", value)
 
 
-def used(seconds=8.0, running=True, tdoa="used", imu=True, received=True, silent=0.0):
+def used(seconds=8.0, running=True, tdoa="used", imu=True, received=True, silent=0.0, velocity=False):
     """Use, looked at five times a second for so many seconds, of which in the last `silent` nothing came."""
     use, counts, arrived = Use(0.25), Counter(), Counter()
     for k in range(int(5 * seconds)):
@@ -31,6 +32,7 @@ def used(seconds=8.0, running=True, tdoa="used", imu=True, received=True, silent
             arrived["tdoa"] += 80 if received else 0
             counts[tdoa] += 80 if received else 0
             counts["imu_used"] += 200 if imu else 0
+            counts["velocity_used"] += 10 if velocity else 0
         use.look(1000.0 + 0.2 * k, arrived, counts, running)
     return use
 
@@ -45,8 +47,14 @@ NEVER = used(received=False, imu=False)
         (STARTS, math.nan, used(running=False, tdoa="startup"), STARTING, False, "start position"),
         (RUNS, UNKNOWN, used(), RUNNING, False, "yaw is not known"), (RUNS, KNOWN, used(), RUNNING, True, ""),
         (RUNS, KNOWN, used(received=False), RUNNING, True, "IMU alone"),
-        (RUNS, KNOWN, used(received=False, imu=False), RUNNING, True, "without TDOAs and without the IMU"),
+        (RUNS, KNOWN, used(received=False, imu=False), RUNNING, True, "on as the tag moved last, without the IMU"),
         (RUNS, UNKNOWN, used(received=False), RUNNING, False, "IMU alone"),
+        (RUNS, KNOWN, used(received=False, velocity=True), RUNNING, True, "by the IMU and the velocities alone"),
+        (RUNS, KNOWN, used(received=False, imu=False, velocity=True), RUNNING, True, "by the velocities alone"),
+        (GOES_WITHOUT, KNOWN, used(received=False, velocity=True), RUNNING, True, "by the velocities alone"),
+        (RUNS, UNKNOWN, used(imu=False), RUNNING, False, "neither an IMU nor velocities"),
+        (RUNS, UNKNOWN, used(imu=False, velocity=True), RUNNING, False, "is once the tag has moved"),
+        (UNSURE, KNOWN, used(), RUNNING, True, "another place"), (UNSURE, KNOWN, used(tdoa="rejected"), RUNNING, True, "another place"),
         (RUNS, KNOWN, used(tdoa="late"), RUNNING, True, "-p lag"), (RUNS, KNOWN, used(tdoa="invalid"), RUNNING, True, "are invalid"),
         (RUNS, KNOWN, used(tdoa="rejected"), RUNNING, True, "contradict the filter"),
         (IS_LOST, math.nan, NEVER, LOST, False, "the tag is lost"), (IS_LOST, math.nan, used(), LOST, False, "the tag is lost"),

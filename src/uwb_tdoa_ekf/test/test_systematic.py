@@ -29,11 +29,11 @@ def informed(p, seconds=5.0, rate=400.0, heard=range(8), state=None, begin=0.0):
     return state
 
 
-def stated(state, P, correlation_length=np.inf):
+def stated(state, P, correlation_length=np.inf, height_std=0.0):
     covariance = np.full((3, 3), np.nan)
     whole = np.zeros((15, 15))
     whole[:3, :3] = P
-    systematic.fill(state.record.information, whole, correlation_length, covariance)
+    systematic.fill(state.record.information, whole, correlation_length, height_std, covariance)
     return covariance
 
 
@@ -75,3 +75,15 @@ def test_it_is_bounded_by_what_the_filter_knows():
     state = new_state(ANCHORS)
     np.testing.assert_allclose(stated(state, P), systematic.MOST * P, rtol=1e-9)
     assert not stated(state, np.zeros((3, 3))).any()
+
+
+@pytest.mark.parametrize("p", [[3.0, 4.0, 0.2], [1.0, 6.0, 0.5]])
+def test_a_height_that_is_held_does_not_follow_errors_that_persist(p):
+    """Held exactly, only x and y follow: the covariance of a problem in two dimensions."""
+    state, P = informed(p), 1e6 * np.eye(3)
+    plain, held, loose = (stated(state, P, height_std=std) for std in (0.0, 1e-4, 1e4))
+    information = np.linalg.inv(plain)
+    np.testing.assert_allclose(held[:2, :2], np.linalg.inv(information[:2, :2]), rtol=1e-4)
+    assert held[2, 2] < 1e-8 < 0.01 < plain[2, 2]
+    np.testing.assert_allclose(loose, plain, rtol=1e-4)
+    assert np.linalg.eigvalsh(held).min() >= -1e-12

@@ -23,6 +23,7 @@ from rclpy.time import Time
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 from uwb_tdoa_bias.effects import AidCorrector, EffectSet, ImuCorrector
+from uwb_tdoa_bias.effects.tag_lever_arm import TagLeverArm
 from uwb_tdoa_bias.foundation import ros
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flyable import FlyableVolume
@@ -77,6 +78,7 @@ TOPICS = {
 }  # fmt: skip
 MOST_FRAMES = 100  # of the IMU that are remembered: names on a topic may be anything
 MOST_NAMED = 3  # of them in a sentence
+MAST = 0.1  # m, of an antenna over the body, from which on its height is not that of the body
 EARLY = 5000  # messages kept while there are no anchors
 
 
@@ -103,6 +105,7 @@ class EkfNode(StreamNode):
         self._epoch, self._ros_clock = Epoch(), cast("ROSClock", self.get_clock())
         self._attitude: tuple[np.ndarray, np.ndarray] | None = None  # quaternion and covariance of the newest odometry
         self._findings: list[Finding] = []  # of the last report
+        self._assumed: dict[str, tuple[str, ...]] = {}  # parameters that count for deviations which messages do not state, by sensor
         self._fault = False  # one of these, or the use of TDOAs, makes the position wrong
         self._received_before: dict[str, int] = {}  # messages by topic, by the last report
         self._early: deque[tuple[str, tuple[Any, ...]]] = (
@@ -113,13 +116,15 @@ class EkfNode(StreamNode):
         self._placed: dict[
             str, tuple[ImuMount | None, str | None]
         ] = {}  # (ImuMount, or None for the body, and what is wrong) by frame of the IMU, in the order of coming
+        self._remark_height()
         self._health = Health(self._config, self._lag, FlyableVolume.load(volume) if volume else None)
         refuse_unknown(self, {*RENAMED, *(member or ())})
         self.get_logger().info("loading the filter; the first time it is compiled, which takes a minute, unless compile_nodes has done so")
         warm_up()
         moving = own["publish_tf"] == ODOM
         self._frames = FramesInput(self, self._epoch.seconds, self._on_frames, moving)
-        self.outputs = Outputs(self, self._epoch, self._frames.frames, self._body, own["publish_tf"], own["odom_frame"])
+        frames = self._frames.frames
+        self.outputs = Outputs(self, self._epoch, frames, self._body, own["publish_tf"], own["odom_frame"], self._config.planar)
         self._anchors = AnchorsInput(self, self._on_anchors, own["anchors_file"])
         self.streams = self._subscribe({"uwb/tdoa_corrected"} if member is not None else ())
         self._pose = Input(self, PoseWithCovarianceStamped, "initialpose", self._on_pose, 10)
@@ -132,6 +137,15 @@ class EkfNode(StreamNode):
             say_unused([self], files_of(arguments))
             self.turns = RoundRobin([self.streams])
         self.ready = "ready"
+
+    def _remark_height(self) -> None:
+        """Log that fixed_height seems to be that of the antenna."""
+        arm = sum(effect.values.get("z", 0.0) for effect in self._effects.effects if isinstance(effect, TagLeverArm))
+        if self._config.fixed_height_std > 0.0 and abs(arm) > MAST and abs(self._config.fixed_height - arm) < 0.5 * MAST:
+            self.get_logger().warning(
+                f"fixed_height is that of {self._body}, and equals the height of the antenna over it ({TagLeverArm.name} of effects_file): "
+                f"give 0.0 for a {self._body} on the floor"
+            )
 
     def _subscribe(self, handed: Collection[str]) -> Streams:
         """Streams of everything that the filter takes. handed : topics that a node of this process hands over."""
@@ -286,7 +300,10 @@ class EkfNode(StreamNode):
     def _take_sensor(self, name: str, frame: str, t: np.ndarray, rows: np.ndarray, arrival: np.ndarray) -> None:
         """Messages of one of the SENSORS."""
         sensor = SENSORS[name]
-        self._estimator.add(name, self._aid_corrector.correct(name, sensor.read(t, {field: rows[field] for field in sensor.fields})))
+        stream = sensor.read(t, {field: rows[field] for field in sensor.fields})
+        if sensor.assumed is not None:
+            self._assumed[name] = sensor.assumed(stream)
+        self._estimator.add(name, self._aid_corrector.correct(name, stream))
 
     def _say_restart(self) -> None:
         """Log why the filter has started anew, once for each time."""
@@ -300,7 +317,8 @@ class EkfNode(StreamNode):
             if self._fault:
                 odometry = doubted(odometry, self._estimator.workspace)
             rates, variances = self._estimator.rates_at(odometry.t)
-            self.outputs.publish_odometry(odometry, rates - odometry.gyro_bias, variances)
+            held = self._estimator.unsure is not None
+            self.outputs.publish_odometry(odometry, rates - odometry.gyro_bias, variances, held)
             self._health.last_odometry = time.monotonic()
             self._health.last_position = odometry.p[-1], odometry.covariance[-1, :3, :3]
             self._attitude = odometry.q[-1:], odometry.covariance[-1:]
@@ -386,10 +404,10 @@ class EkfNode(StreamNode):
         self._findings = self._stream_findings()
         level, text, values = self._health.report(self._anchors.refused, estimator, counts, self._wiring(), self._findings)
         alarms: list[str] = estimator.alarms if estimator is not None else []
-        refused = estimator.refused_pose if estimator is not None else None
+        refused, unsure = (None, None) if estimator is None else (estimator.refused_pose, estimator.unsure)
         heard = ", ".join(self._lately[:MOST_NAMED])
         frames = [*self._frame_troubles(), self._frames.trouble]
-        others = [*filter(None, [*frames, self.outputs.trouble, refused, *alarms])]
+        others = [*filter(None, [*frames, self.outputs.trouble, refused, unsure, *alarms])]
         if level == OK and others:
             level, text = WARN, together(others)
         values |= {"not to be flown by": self._judge().why or "nothing"}
@@ -405,6 +423,7 @@ class EkfNode(StreamNode):
         for aid in SENSORS:
             values |= {f"{aid}_received": self._health.received[aid], f"{aid}_waiting": waiting[aid]}
             values |= {f"{aid}_{verdict}": counts[f"{aid}_{verdict}"] for verdict in VERDICTS.values()}
+        values |= {f"{aid} deviations of": ", ".join(names) or "the messages" for aid, names in self._assumed.items()}
         values |= {f"lost on {name}": end.lost for name, end in self.streams.inputs.items()}
         values |= {f"unreadable on {refusals.topic}": refusals.count for refusals in (*self.streams.refusals, *self._single)}
         values |= {f"publishers of {name}": end.get_publisher_count() for name, end in self.streams.inputs.items()}

@@ -113,6 +113,17 @@ class Estimator:
         return None
 
     @property
+    def unsure(self) -> str | None:
+        """Why the tag may be elsewhere, a sentence; None while nothing says so. Depends on stamps alone."""
+        ekf = self._ekf
+        if not ekf.running or ekf.t >= ekf.rival_until:
+            return None
+        return (
+            "TDOAs agree on another place than the wheels have gone to: the position is unsure, and follows the wheels; look for anchors that "
+            "are late or blocked"
+        )
+
+    @property
     def workspace(self) -> np.ndarray:
         """Size of the box in which the tag is expected, (3,) m."""
         low, high = self._ekf["workspace"]

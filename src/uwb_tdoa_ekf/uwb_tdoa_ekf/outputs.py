@@ -58,11 +58,13 @@ class Outputs:
     """published : number of messages on odometry; stamp : of the newest; world : name of its frame; odometry, residual :
     StreamOutputs."""
 
-    def __init__(self, node: StreamNode, epoch: Epoch, frames: Frames, body: str, publish_tf: str, odom: str) -> None:
-        """epoch : Epoch; frames : transforms.Frames; body, odom : names of frames; publish_tf : of PUBLISH_TF."""
-        self._epoch, self._frames, self._body = epoch, frames, body
+    def __init__(self, node: StreamNode, epoch: Epoch, frames: Frames, body: str, publish_tf: str, odom: str, planar: bool = False) -> None:
+        """epoch : Epoch; frames : transforms.Frames; body, odom : names of frames; publish_tf : of PUBLISH_TF; planar : world -> odom is
+        to turn about the vertical alone."""
+        self._epoch, self._frames, self._body, self._planar = epoch, frames, body, planar
         self._odom = odom if publish_tf == ODOM else None
         self.published = self._unplaced = 0  # messages; those in a row for which /tf had no odom -> body
+        self._placed = False  # a transform was published
         self._wires = CdrCodec(Odometry, *ODOMETRY), CdrCodec(TdoaResidual, *RESIDUAL)
         self._transform = TransformStamped(child_frame_id=self._odom or body)
         self._tf = TFMessage(transforms=[self._transform])  # one for all: what is published is copied
@@ -103,8 +105,9 @@ class Outputs:
             rows[name] = column
         self.residual.publish(self.world, self._residual, rows)
 
-    def publish_odometry(self, odometry: Odometry, rates: np.ndarray, rate_variances: np.ndarray) -> None:
-        """Publish Odometry. rates (n, 3) rad/s and their variances (n,) rad^2/s^2, NaN where not known."""
+    def publish_odometry(self, odometry: Odometry, rates: np.ndarray, rate_variances: np.ndarray, held: bool = False) -> None:
+        """Publish Odometry. rates (n, 3) rad/s and their variances (n,) rad^2/s^2, NaN where not known; held : world -> odom stays what it
+        was last."""
         n = len(odometry)
         rows = self._odometry.rows(n)
         rows["sec"], rows["nanosec"] = self._epoch.parts(odometry.t)
@@ -113,23 +116,27 @@ class Outputs:
         self.odometry.publish(self.world, self._odometry, rows)
         for k in range(n) if transformed else ():
             self.stamp = self._epoch.stamp(odometry.t[k].item())
-            self._publish_transform(odometry.t[k], odometry.p[k].tolist(), odometry.q[k].tolist())
+            self._publish_transform(odometry.t[k], odometry.p[k].tolist(), odometry.q[k].tolist(), held)
         if n:
             self.stamp = self._epoch.stamp(odometry.t[-1].item())
         self.published += n
 
-    def _publish_transform(self, t: float, p: np.ndarray, q: np.ndarray) -> None:
-        """World -> body, or world -> odom such that odom -> body of /tf leads to the same."""
-        if self._odom:
+    def _publish_transform(self, t: float, p: np.ndarray, q: np.ndarray, held: bool) -> None:
+        """World -> body, or world -> odom such that odom -> body of /tf leads to the same; or, held, world -> odom as it was last."""
+        if self._odom and not (held and self._placed):
             between = self._frames.between(self._odom, self._body, t)
             self._unplaced = self._unplaced + 1 if between is None else 0
             if between is None:
                 return
             turn = rotations.Rotation.from_quat(q) * between[0].inv()
+            if self._planar:
+                turn = rotations.Rotation.from_euler("Z", turn.as_euler("ZYX")[0])
             p, q = (p - turn.apply(between[1])).tolist(), turn.as_quat().tolist()
         out = self._transform.transform
         self._transform.header.stamp = self.stamp
-        out.translation.x, out.translation.y, out.translation.z = p
-        out.rotation.x, out.rotation.y, out.rotation.z, out.rotation.w = q
+        if not (self._odom and held and self._placed):
+            out.translation.x, out.translation.y, out.translation.z = p
+            out.rotation.x, out.rotation.y, out.rotation.z, out.rotation.w = q
+        self._placed = True
         assert self._tf_publisher is not None  # or nobody calls this
         self._tf_publisher.publish(self._tf)

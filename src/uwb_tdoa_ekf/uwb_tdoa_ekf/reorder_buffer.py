@@ -22,7 +22,7 @@ STREAMS = "imu", "tdoa", *aids.STREAMS
 KINDS = IMU_SAMPLE, TDOA, *[AID] * len(aids.STREAMS)
 IMU_STREAM, TDOA_STREAM, FIRST_AID = range(3)  # places in STREAMS
 LOCATING_STREAMS = TDOA_STREAM, *map(STREAMS.index, LOCATING)  # one of these is the reference: its stamps are the time
-LEADING = IMU_STREAM, *LOCATING_STREAMS  # by whose stamps time goes on
+VELOCITY_STREAM = STREAMS.index("velocity")
 ROOM = 256  # rows of a stream, to begin with
 MOST_WAITING = 2000  # messages of a stream: 2 s at 1 kHz; of one that stands still the first ones leave
 LATELY = 2.0  # s of stamps for which a stream counts as ahead after a row of it was refused for that
@@ -31,7 +31,7 @@ OF_AIDS = 0.5  # share of `lag` for which sensors are waited for: bias_node's `h
 TRIAL = 2.0  # s of stamps in order, after which a stream is trusted to go on so
 # s by which each stream may be ahead of those that it is compared with. TDOAs that arrive 2 s after the inertial samples of their time are
 # still used; other sensors are compared with the inertial samples, too.
-LARGEST_LEADS = tuple(2.0 if place in LEADING else 0.5 for place in range(len(STREAMS)))
+LARGEST_LEADS = tuple(2.0 if place in (IMU_STREAM, *LOCATING_STREAMS) else 0.5 for place in range(len(STREAMS)))
 NO_AIDS = np.empty(0, AID)
 
 
@@ -52,7 +52,8 @@ class ReorderBuffer:
     SENSORS for half of that, and after SILENT seconds not at all. `reorder` is waited for late siblings, unless they have come in order so
     far (LatenessPolicy). A row that is older than what was used is refused as late.
 
-    The reference is the stream that locates the tag: TDOAs, or ranges without them. Its stamps are the time. Only it can start the filter
+    The reference is the stream that locates the tag: TDOAs, or ranges without them. Its stamps are the time; while it is silent, those of
+    inertial samples are, or without an IMU those of velocities. Only the reference can start the filter
     anew: when its clock falls back, or when another stream has moved the time ahead of it. Any other stream is judged by its lead over
     the reference: one that is too far ahead is refused as invalid, one that is behind as late, and neither moves the time. A recording is
     there as a whole: `load`.
@@ -65,6 +66,8 @@ class ReorderBuffer:
         restart(cause) when the filter has to start anew."""
         self.reorder, self.lag = reorder, lag
         self._awaited = TDOA_STREAM, *([IMU_STREAM] if use_imu else [])
+        self._moving = IMU_STREAM if use_imu else VELOCITY_STREAM  # by which time goes on while nothing locates
+        self._leading = self._moving, *LOCATING_STREAMS
         self._refuse, self._restart = refuse, restart
         self.clear()
 
@@ -99,8 +102,8 @@ class ReorderBuffer:
     @property
     def newest(self) -> float:
         """Stamp that the time has reached, s; -inf before the first row of a leading stream."""
-        imu = self._streams[IMU_STREAM]
-        return max(self._streams[self._reference].gate.newest, imu.gate.newest - (imu.lead if imu.lead > self.lag else 0.0))
+        moving = self._streams[self._moving]
+        return max(self._streams[self._reference].gate.newest, moving.gate.newest - (moving.lead if moving.lead > self.lag else 0.0))
 
     @property
     def first(self) -> float:
@@ -119,9 +122,9 @@ class ReorderBuffer:
         for place, stream in enumerate(self._streams[FIRST_AID:], FIRST_AID):
             if newest - SILENT < stream.gate.newest < newest:
                 passed.append(max(stream.watermark(self.reorder), newest - OF_AIDS * self.lag))
-            elif place in LEADING and stream.gate.newest >= newest:
+            elif place in self._leading and stream.gate.newest >= newest:
                 passed.append(stream.watermark(self.reorder))
-        too_many = (float(self._streams[place].rows["t"][-MOST_WAITING]) for place in LEADING if len(self._streams[place]) > MOST_WAITING)
+        too_many = (float(self._streams[place].rows["t"][-MOST_WAITING]) for place in self._leading if len(self._streams[place]) > MOST_WAITING)
         return max(min(passed, default=newest), *too_many, -math.inf)
 
     def add(self, place: int, rows: np.ndarray, usable: np.ndarray) -> None:
@@ -129,7 +132,7 @@ class ReorderBuffer:
         count, and whoever adds them accounts for them."""
         if not len(rows):
             return
-        if place in LEADING and self.began == math.inf and usable.any():
+        if place in self._leading and self.began == math.inf and usable.any():
             self.began = float(rows["t"][usable][0])
         self._streams[place].seen = float(rows["t"][-1])
         if usable.all() and self._streams[place].append(rows, self.used_until, self._limit(place)):
@@ -142,7 +145,7 @@ class ReorderBuffer:
                 elif t <= self._limit(place):
                     # or whoever waits for our pose of this time waits for the next one
                     self._streams[place].gate.pass_time(t, self._reached(place))
-        if place in LEADING:
+        if place in self._leading:
             self._judge(place)
         else:
             self._refuse_too_many(place)
@@ -180,9 +183,9 @@ class ReorderBuffer:
     def _compared(self, place: int) -> float:
         """Stamp, s, of those streams by which another one is judged: the reference, for sensors the inertial samples, too."""
         times = [self._streams[self._reference].gate.newest]
-        imu = self._streams[IMU_STREAM]
-        if place not in LEADING and not imu.ahead:
-            times.append(imu.gate.newest)
+        moving = self._streams[self._moving]
+        if place not in self._leading and not moving.ahead:
+            times.append(moving.gate.newest)
         return max(times)
 
     def _judge(self, place: int) -> None:
@@ -193,7 +196,7 @@ class ReorderBuffer:
                 self._reference = place
                 stream.ahead, stream.lead = False, 0.0
         for other, stream in enumerate(self._streams):
-            if other == self._reference or stream.gate.newest == -math.inf or other in LEADING and place != self._reference:
+            if other == self._reference or stream.gate.newest == -math.inf or other in self._leading and place != self._reference:
                 continue
             if stream.ahead:
                 continue  # its lead is that of the last row that was refused
@@ -270,7 +273,7 @@ class ReorderBuffer:
 
     def _reached(self, place: int) -> list[float]:
         """Stamps, s, that other leading streams have reached, or are about to jump to."""
-        others = [self._streams[other].gate for other in LEADING if other != place]
+        others = [self._streams[other].gate for other in self._leading if other != place]
         return [t for gate in others for t in (gate.newest, gate.held) if math.isfinite(t)]
 
     def _is_overtaken(self, place: int, t: float) -> bool:
@@ -280,7 +283,7 @@ class ReorderBuffer:
             if place == self._reference:
                 self._overtaken = None
             return False
-        seen = self._streams[IMU_STREAM].seen
+        seen = self._streams[self._moving].seen
         if self._overtaken is None or t < self._overtaken[0]:
             self._overtaken = t, seen
         since, then = self._overtaken

@@ -14,7 +14,7 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.compiled import compiled
 
-from .core import auxiliary
+from .core import auxiliary, plane
 from .core.config import FilterConfig
 from .core.history import RESET
 from .core.hypotheses import YAW_STD
@@ -66,7 +66,10 @@ def _smoothed_run(flight: Flight, config: FilterConfig, corrector: Corrector | N
         room = np.zeros(len(records[k]), ODOMETRY)
         count = _backward(records[k], before[k], config.odometry_rate, adjoint, information, room)
         rows.append(room[len(room) - count :])
-    return replace(result, odometry=_with_persistent(Odometry.from_rows(np.concatenate(rows[::-1])), result.odometry))
+    smoothed = np.concatenate(rows[::-1])
+    if config.planar:
+        plane.flatten_all(smoothed, config.parameters())
+    return replace(result, odometry=_with_persistent(Odometry.from_rows(smoothed), result.odometry))
 
 
 def _with_persistent(smoothed: Odometry, online: Odometry) -> Odometry:

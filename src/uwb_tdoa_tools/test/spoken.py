@@ -19,6 +19,7 @@ SAYING = {
     "trouble_at",
     "lost",
     "side_unknown",
+    "unsure",
 }
 LEAST = 7  # characters that tell one sentence from another
 

@@ -18,6 +18,7 @@ from uwb_tdoa_bias.foundation.sensors.sensor import parameter
 ROBUST = ("innovation", "gate", "m_estimation")
 SIDES = "unknown", "below", "above", "-x", "+x", "-y", "+y"
 CHOICES = {"robust": ROBUST, "loss": LOSSES, "tag_side": SIDES}  # parameters that are one of a few names
+PLANAR_HEIGHT_STD = 0.02  # m
 RENAMED = {  # old name: present name; the old ones work until the release after 0.1
     "tdoa_correlation": "tdoa_correlation_length",
     "vibration_trust": "accel_prior_std",
@@ -49,7 +50,7 @@ class _FilterParameters:
     gate: float = parameter(3.0, "standard deviations beyond which gate rejects", high=1e8)
 
     # The motion
-    use_imu: bool = parameter(True, "false: constant velocity, for a tag without an IMU", fixed=True)
+    use_imu: bool = parameter(True, "false: a tag without an IMU goes on as wheels turn, or at constant velocity", fixed=True)
     motion_noise: float = parameter(1.5, "m/s^2/sqrt(Hz); random acceleration of the tag while no IMU says better", high=1000.0)
     imu_timeout: float = parameter(0.1, "s without an IMU sample after which motion_noise takes over", high=10.0)
     accel_noise: float = parameter(0.1, "m/s^2/sqrt(Hz); accelerometer, motors running", high=100.0)
@@ -101,8 +102,18 @@ else:
 class FilterConfig(_SensorParameters):
     """Tuning of the filter. The node's parameters have the same names."""
 
-    fixed_height: float = parameter(0.0, "m; height of a tag that stays on its floor", high=10000.0, low=-10000.0)
-    fixed_height_std: float = parameter(0.0, "m; its standard deviation; 0.0: the tag does not stay there", high=10.0, with_low=True)
+    # The floor
+    fixed_height: float = parameter(0.0, "m; height of body_frame in the world, of what stays on its floor", high=10000.0, low=-10000.0)
+    fixed_height_std: float = parameter(
+        0.0, "m; its standard deviation; 0.0: the tag does not stay there, or, if it is planar, 0.02", high=10.0, with_low=True
+    )
+    planar: bool = parameter(
+        False, "a vehicle on a level floor: height, roll and pitch of the odometry are fixed_height, 0 and 0", fixed=True
+    )
+    tilt_std: float = parameter(0.02, "rad; of roll and pitch of a planar vehicle about 0", high=1.0)
+    non_holonomic_std: float = parameter(
+        0.0, "m/s; of velocities across the body's x, of a vehicle that cannot move sideways; 0.0: it can", high=100.0, with_low=True
+    )
 
     # The output
     odometry_rate: float = parameter(200.0, "Hz of stamps; at most this often", high=1e6)
@@ -118,6 +129,8 @@ class FilterConfig(_SensorParameters):
                     raise InputError(f"{name}: {value!r} must be true or false.")
             else:
                 object.__setattr__(self, name, _number(each, value))
+        if self.planar and self.fixed_height_std == 0.0:
+            object.__setattr__(self, "fixed_height_std", PLANAR_HEIGHT_STD)
 
     @classmethod
     def from_parameters(cls, parameters: dict[str, Any]) -> "FilterConfig":

@@ -21,18 +21,20 @@ from . import (
     inertial,
     initialization,
     noise,
+    plane,
     plausibility,
     ranges,
     rest,
     robust,
     systematic,
+    velocity,
     workspace,
     yaw_doubt,
 )
 from .memory import HYPOTHESES, ODOMETRY, RESIDUAL, YAWS, FilterState, Measurements, Output
 from .sensor_functions import subtract
 from .startup import INLIER
-from .state import coast, predict
+from .state import coast, predict, turn_about_vertical
 from .update import project, update_state
 from .verdicts import COMPENSATED, REJECTED, REPEATED, STARTUP, USED
 
@@ -42,13 +44,13 @@ UNSURE_TIME = 0.5  # s of TDOAs, after a silence in which a tag got lost, in whi
 LOST_TIME = 30.0  # s without a TDOA after which a tag that may be anywhere in its workspace is lost: the filter starts anew
 MAX_STEP = 0.05  # s, longest single prediction
 AVERAGED = 0.25  # s of inertial samples that tell how a sensor is mounted which comes when the filter runs
-STALE_TURN_PSD = 0.25  # (rad/s)^2/Hz while there is no gyroscope
+STALE_TURN_PSD = 0.25  # (rad/s)^2/Hz while nothing measures how the tag turns
 LINEAR_RANGE = 1.0  # m or m/s of the state, within which the slope of a bias tells what it is elsewhere
 
-# In a history, at most: its update, workspace, fixed height, a place at rest, another hypothesis, starts or recoveries, a yaw opened again
-RECORDS_OF_TDOA = 1 + 4 + 1 + 6 + 1 + 2 + 2
+# In a history, at most: its update, workspace, a place at rest, another hypothesis, starts or recoveries, a yaw opened again
+RECORDS_OF_TDOA = 1 + 4 + 6 + 1 + 2 + 2
 RECORDS_OF_REST = 3  # one per axis
-RECORDS_OF_AID = RECORDS_OF_TDOA  # a range has as many, a velocity one per component
+RECORDS_OF_AID = RECORDS_OF_TDOA  # a range has as many, a velocity one per component, and a yaw opened again
 
 
 @compiled
@@ -101,12 +103,12 @@ def set_pose(state: FilterState, parameters: np.ndarray, pose: np.ndarray) -> No
 def most_records(measurements: Measurements) -> int:
     """Room that a history needs for Measurements that are fed at once."""
     imu, tdoa, aid = measurements
-    seconds = imu["t"][-1] - imu["t"][0] if len(imu) else 0.0
-    if len(tdoa):
-        seconds = max(seconds, tdoa["t"][-1] - tdoa["t"][0])
-    most = len(imu) + len(tdoa)
-    rests, switches = (min(most, 2 + int(seconds / period)) for period in (rest.PERIOD, 0.5 * plausibility.CLEARED))
-    return RECORDS_OF_TDOA * len(tdoa) + RECORDS_OF_REST * rests + switches + RECORDS_OF_AID * len(aid)
+    spans = [part["t"][-1] - part["t"][0] for part in measurements if len(part)]
+    most, seconds = len(imu) + len(tdoa) + len(aid), max(spans, default=0.0)
+    periods = rest.PERIOD, plane.PERIOD, 0.5 * plausibility.CLEARED
+    rests, floors, switches = (min(most, 2 + int(seconds / period)) for period in periods)
+    of_events = RECORDS_OF_TDOA * len(tdoa) + RECORDS_OF_AID * len(aid)
+    return of_events + RECORDS_OF_REST * rests + plane.RECORDS * floors + switches
 
 
 @compiled
@@ -216,13 +218,11 @@ def _after_update(
     """After an update stamped t, s: what holds anyway, which hypothesis is best, and whether the tag is elsewhere. counts :
     what was measured shows that; agrees : with the best hypothesis."""
     _stay_in_workspace(ekf, t, records)
-    if parameters.fixed_height_std > 0.0 and t >= ekf.next_floor:
-        ekf.next_floor = t + rest.PERIOD
-        _stay_on_floor(ekf, parameters, t, records)
     followed = ekf.best
     alone = hypotheses.select(ekf, t) and parameters.use_imu and not (ekf.quiet or ekf.resting)
     # At another place. Or with another yaw, after one was opened again: the yaws of a start share the history before the choice.
-    if ekf.best // YAWS != followed // YAWS or (ekf.best != followed and ekf.yaw_doubt.count > 0):
+    opened = ekf.yaw_doubt.count > 0 or not parameters.use_imu
+    if ekf.best // YAWS != followed // YAWS or (ekf.best != followed and opened):
         history.add_reset(ekf, t, records)
     if alone and yaw_doubt.contradicts(ekf, t):
         initialization.open_yaw(ekf, parameters, records)
@@ -250,6 +250,8 @@ def _on_aid(
     if aid.kind == aids.RANGE:
         _on_range(ekf, anchors, parameters, aid, residual, records)
     elif ekf.running and _advance(ekf, parameters, aid.t, records):
+        if aid.kind == aids.VELOCITY and not parameters.use_imu:
+            initialization.open_unknown_yaw(ekf, parameters, records)
         aids.observe(ekf, parameters, aid, residual, records)
     else:
         aids.record(ekf, aid)
@@ -283,11 +285,12 @@ def _wait_for_start(
 
 @compiled
 def _advance(ekf: Record, parameters: Record, t: float, records: np.ndarray) -> bool:
-    """Predict every hypothesis to stamp t, with the inertial sample at hand or, if it is too old, without one. Returns
-    False if the filter has stopped, because nothing has shown for too long where the tag is."""
+    """Predict every hypothesis to stamp t, with the inertial sample at hand or, if it is too old, with the last velocity of wheels, or
+    without either. Returns False if the filter has stopped, because nothing has shown for too long where the tag is."""
     if t - ekf.t > LOST_TIME:
         return _stop(ekf, t)
     sensed = parameters.use_imu and t - ekf.imu.t < parameters.imu_timeout and not ekf.distrusted and t >= ekf.levelled
+    ekf.sensed = sensed
     if sensed and ekf.t < t:
         inertial.weigh(ekf.imu, ekf.quiet, parameters)
     while ekf.t < t:
@@ -306,16 +309,35 @@ def _advance(ekf: Record, parameters: Record, t: float, records: np.ndarray) -> 
                     if ekf.yaw_doubt.alone:
                         yaw_doubt.predict(ekf, vx, vy)
             else:
-                coast(hypothesis, dt, parameters.motion_noise**2, STALE_TURN_PSD if parameters.use_imu else 0.0)
+                _coast(ekf, hypothesis, parameters, dt)
                 if auxiliary.present(hypothesis):
                     auxiliary.coast(hypothesis, dt)
                 if h == ekf.best:
                     history.add_coasting(ekf, dt, records)
                     yaw_doubt.clear(ekf.yaw_doubt)
         ekf.t = t if t - ekf.t <= MAX_STEP else ekf.t + dt
+    if t >= ekf.next_floor and plane.is_given(parameters):
+        plane.hold(ekf, parameters, t, records)
     if t - ekf.last_tdoa > LOST_TIME and workspace.is_filled(ekf.workspace, ekf.hypotheses[ekf.best].P):
         return _stop(ekf, t)
     return True
+
+
+@compiled
+def _coast(ekf: Record, hypothesis: Record, parameters: Record, dt: float) -> None:
+    """Advance a HYPOTHESIS by dt seconds without inertial samples: as wheels tell, or as it was. Nothing measures a tilt where no IMU is
+    used; then the tag is taken to be level."""
+    wheels = ekf.velocity
+    driven = velocity.drives(wheels, ekf.t)
+    alike = 2.0 * velocity.CORRELATION_TIME
+    yaw_psd = alike * wheels.yaw_rate_variance if driven else STALE_TURN_PSD
+    if not parameters.use_imu and hypothesis.P[8, 8] > initialization.ANY_YAW**2:
+        yaw_psd = 0.0
+    coast(hypothesis, dt, parameters.motion_noise**2, STALE_TURN_PSD if parameters.use_imu else 0.0, yaw_psd)
+    if driven:
+        turn_about_vertical(hypothesis.x, wheels.yaw_rate * dt)
+        for k in range(2):
+            hypothesis.P[k, k] += dt * alike * wheels.speed_variance
 
 
 @compiled
@@ -354,6 +376,9 @@ def _update(
             residual.verdict = REJECTED
             return True
         innovation.noise_variance /= in_time
+    if tdoa.t < ekf.rival_until and _is_of_rival(ekf, a, b, tdoa, known, residual):
+        residual.innovation += change
+        return False
     for h in range(HYPOTHESES):
         hypothesis = ekf.hypotheses[h]
         if not hypotheses.alive(hypothesis):
@@ -371,6 +396,18 @@ def _update(
         if residual.verdict == USED:
             residual.verdict = COMPENSATED
     return False
+
+
+@compiled
+def _is_of_rival(ekf: Record, a: Record, b: Record, tdoa: Record, known: float, residual: Record) -> bool:
+    """Whether a TDOA contradicts the place that wheels have gone to, while they outweigh those that agree on another one; fills one of
+    RESIDUAL. A robust weight would leave it some, and many pull."""
+    innovation = ekf.innovation
+    noise_variance = innovation.noise_variance
+    _compare(ekf.hypotheses[ekf.best], a, b, tdoa, known, innovation)
+    residual.innovation, residual.variance = innovation.value, innovation.prior_variance + noise_variance
+    residual.weight, residual.verdict = 0.0, REJECTED
+    return abs(innovation.value) > INLIER
 
 
 @compiled
@@ -430,17 +467,6 @@ def _stay_in_workspace(ekf: Record, t: float, records: np.ndarray) -> None:
 
 
 @compiled
-def _stay_on_floor(ekf: Record, parameters: Record, t: float, records: np.ndarray) -> None:
-    """The fixed height, where a hypothesis knows less of it: what is given once is not known better by being repeated."""
-    for h in range(HYPOTHESES):
-        hypothesis = ekf.hypotheses[h]
-        if hypotheses.alive(hypothesis) and hypothesis.P[2, 2] > parameters.fixed_height_std**2:
-            update_state(hypothesis, ekf.innovation, 2, parameters.fixed_height, parameters.fixed_height_std)
-            if h == ekf.best:
-                history.add_update(ekf, t, records)
-
-
-@compiled
 def _report(ekf: Record, parameters: Record, t: float, row: Record) -> None:
     """Write the best hypothesis to one of ODOMETRY."""
     best = ekf.hypotheses[ekf.best]
@@ -449,9 +475,24 @@ def _report(ekf: Record, parameters: Record, t: float, row: Record) -> None:
     row.covariance[:] = best.P[:9, :9]
     hypotheses.add_spread_of_means(ekf, row.covariance)
     workspace.add_circle(ekf, parameters.fixed_height_std > 0.0 or t - ekf.height.used < height.LONGEST_GAP, best.x, row.covariance)
-    row.covariance[2, 2] += height.contradiction(ekf.height, parameters) ** 2
-    systematic.fill(ekf.information, best.P, parameters.tdoa_correlation_length, row.persistent)
+    wrong = height.contradiction(ekf.height, parameters, t)
+    row.covariance[2, 2] += wrong**2
+    systematic.fill(ekf.information, best.P, parameters.tdoa_correlation_length, parameters.fixed_height_std, row.persistent)
     row.covariance[:3, :3] += row.persistent
+    if t < ekf.rival_until:
+        _widen(ekf, best.x, row.covariance)
+    if parameters.planar:
+        plane.flatten(row, parameters, wrong)
+
+
+@compiled
+def _widen(ekf: Record, x: np.ndarray, covariance: np.ndarray) -> None:
+    """Add to the (9, 9) covariance of a position x (3,), m, how far away the place is that TDOAs agree on."""
+    square = 0.0
+    for k in range(3):
+        square += (ekf.rival[k] - x[k]) ** 2
+    for k in range(3):
+        covariance[k, k] += square
 
 
 def feed(

@@ -187,9 +187,11 @@ def update_pull(height: Record, parameters: Record, innovation: Record, t: float
 
 
 @compiled
-def contradiction(height: Record, parameters: Record) -> float:
-    """By how much, m, TDOAs say that the tag is above its fixed height; 0 if it has none, or if TDOAs alone could be off by that."""
-    if parameters.fixed_height_std == 0.0 or abs(height.pull) <= PULL_LIMIT * height.pull_information:
+def contradiction(height: Record, parameters: Record, t: float) -> float:
+    """By how much, m, TDOAs say that the tag is above its fixed height at stamp t, s; 0 if it has none, or if TDOAs alone could be off by
+    that. Low among anchors, noise alone makes them say so for a moment."""
+    moment = t - height.pulls_since < PULL_TIME
+    if parameters.fixed_height_std == 0.0 or moment or abs(height.pull) <= PULL_LIMIT * height.pull_information:
         return 0.0
     return height.pull / height.pull_information
 

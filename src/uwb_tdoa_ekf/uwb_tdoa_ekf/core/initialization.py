@@ -8,11 +8,11 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.compiled import Record, compiled
 
-from . import auxiliary, ground, height, hypotheses, inertial, standing, systematic, workspace
+from . import auxiliary, ground, height, hypotheses, inertial, standing, systematic, velocity, workspace
 from .history import add_reset
 from .memory import HYPOTHESES, PLACES, WINDOW, YAWS
 from .ground import KnownHeight
-from .startup import APART, SPEED, Places, level, locate, room_for, share_of_inliers, split
+from .startup import APART, SPEED, Places, inliers, level, locate, room_for, share_of_inliers, split
 from .state import GRAVITY
 
 MINIMUM = 12  # TDOAs a search needs
@@ -25,9 +25,13 @@ LONGEST_GAP = 0.6  # share of the time of these within which none came: beyond, 
 LISTEN_PERIOD = 1.0  # s between two looks at who is heard
 SEARCH_PERIOD = 0.1  # s between two searches
 TILT_STD = 0.1  # rad, at the start
+ANY_YAW = math.pi / math.sqrt(3.0)  # rad, deviation of a yaw that may be any
 WRONG_POSITION = 1.0  # m, that inertial samples which are wrong have made
 SMALLEST_STD = 0.03  # m, of a height that is known at the start
 REACH, REACH_SPEED, REACH_ACCELERATION = 0.5, 0.5, 0.5  # m, m/s, m/s^2: how far from where it was right a filter may be found, by time
+LATE_ANCHORS = 2  # that TDOAs which contradict wheels may be explained by: two that are late are as probable as a rover that jumps
+AMONG_OTHERS = 6, 3  # TDOAs and anchors, at least, that agree with wheels without these
+RIVAL_TIME, RIVAL_HELD = 1.0, 0.5  # s for which TDOAs must agree on another place than wheels; s for which the tag may be there
 
 
 @compiled
@@ -106,7 +110,7 @@ def start(
         standing.sort(places, near)
     for place in range(PLACES if still else 0):
         standing.stop(x[place], covariance[place], ekf.still_covariance)
-    _begin(ekf, parameters, t, places, parameters.initial_yaw, parameters.initial_yaw_std)
+    _begin(ekf, parameters, t, places, parameters.initial_yaw, parameters.initial_yaw_std, parameters.use_imu)
     ekf.resting, ekf.rest_since = still and parameters.zero_velocity, t
     add_reset(ekf, t, history)
 
@@ -129,7 +133,7 @@ def start_slowly(ekf: Record, anchors: np.ndarray, parameters: Record, t: float,
     if np.trace(places.covariance[0, :3, :3]) > APART**2:
         split(places)
         standing.sort(places, near)
-    _begin(ekf, parameters, t, places, parameters.initial_yaw, parameters.initial_yaw_std)
+    _begin(ekf, parameters, t, places, parameters.initial_yaw, parameters.initial_yaw_std, parameters.use_imu)
     ekf.resting, ekf.rest_since = False, t
     add_reset(ekf, t, history)
 
@@ -244,7 +248,7 @@ def place(
     has_yaw = not math.isnan(pose.yaw)
     if not ekf.running:
         yaw, std = (pose.yaw, pose.yaw_std) if has_yaw else (parameters.initial_yaw, parameters.initial_yaw_std)
-        _begin(ekf, parameters, t, Places(x.reshape(1, 6), covariance.reshape(1, 6, 6), np.zeros(1)), yaw, std)
+        _begin(ekf, parameters, t, Places(x.reshape(1, 6), covariance.reshape(1, 6, 6), np.zeros(1)), yaw, std, parameters.use_imu)
     else:
         for h in range(HYPOTHESES):
             hypothesis = ekf.hypotheses[h]
@@ -260,11 +264,12 @@ def place(
 
 
 @compiled
-def _begin(ekf: Record, parameters: Record, t: float, places: Places, yaw: float, yaw_std: float) -> None:
-    """Start hypotheses at places, level, with the yaws that are possible."""
+def _begin(ekf: Record, parameters: Record, t: float, places: Places, yaw: float, yaw_std: float, steered: bool) -> None:
+    """Start hypotheses at places, level, with the yaws that are possible. steered : something measures motion in the body frame, so that
+    these can be told apart."""
     x, covariance, cost = places.x, places.covariance, places.cost
     accel = _mean_accel(ekf.imu, parameters)
-    unknown = parameters.use_imu and yaw_std > hypotheses.YAW_STD
+    unknown = steered and yaw_std > hypotheses.YAW_STD
     for h in range(HYPOTHESES):
         hypothesis, offset = ekf.hypotheses[h], hypotheses.yaw_offset(h)
         nearest = min(offset, 2.0 * math.pi - offset)
@@ -278,7 +283,7 @@ def _begin(ekf: Record, parameters: Record, t: float, places: Places, yaw: float
         hypothesis.x[10:] = 0.0
         hypothesis.P[:] = 0.0
         _put(hypothesis, x[place], covariance[place])
-        _spread_attitude(hypothesis.P, parameters, yaw_std)
+        _spread_attitude(hypothesis.P, parameters, min(yaw_std, hypotheses.YAW_STD if steered else ANY_YAW))
     ekf.best = 0
     systematic.begin(ekf.information, ekf.hypotheses[0].P)
     ekf.t = ekf.last_tdoa = ekf.sure = t
@@ -326,7 +331,11 @@ def recover(
         _reopen(ekf, cost)
     elif share < CLEARLY_MORE + explained:
         return
-    if not anywhere and parameters.use_imu and not ekf.distrusted and t - ekf.imu.t < parameters.imu_timeout:
+    wheels = velocity.agrees(ekf.velocity, t)
+    felt = parameters.use_imu and not ekf.distrusted and t - ekf.imu.t < parameters.imu_timeout
+    if not anywhere and wheels and _outweighs(ekf, anchors, window, x[0], t):
+        return
+    if not anywhere and (felt or wheels):
         since, away = t - ekf.sure, 0.0
         for k in range(3):
             away += (x[0, k] - ekf.hypotheses[ekf.best].x[k]) ** 2
@@ -339,12 +348,49 @@ def recover(
         hypothesis.P[:6, :] = 0.0
         hypothesis.P[:, :6] = 0.0
         _put(hypothesis, x[place], covariance[place])
+        if not parameters.use_imu:  # wheels have led to another place: by a wrong yaw, as likely as not
+            hypothesis.P[8, :] = 0.0
+            hypothesis.P[:, 8] = 0.0
+            hypothesis.P[8, 8] = ANY_YAW**2
+    ekf.rival_since = -np.inf
     if anywhere:  # what the anchors determined before the silence was another place
         systematic.begin(ekf.information, ekf.hypotheses[ekf.best].P)
     ekf.consistency, ekf.late_as_known = 1.0, False
     ekf.rest_since = t
     ekf.recoveries += 1
     add_reset(ekf, t, history)
+
+
+@compiled
+def _outweighs(ekf: Record, anchors: np.ndarray, window: np.ndarray, rival: np.ndarray, t: float) -> bool:
+    """Whether the motion that wheels measure outweighs a window (n,) of TDOA that agree on a rival place (3,), m, at stamp t, s: until they
+    have agreed on it for a while, and no few late anchors have explained them in that time. Until then the tag may be at either."""
+    if t > ekf.rival_until or _are_late(window, anchors, ekf.hypotheses[ekf.best].x[:6]):
+        ekf.rival_since = t
+    ekf.rival_until = t + RIVAL_HELD
+    for k in range(3):
+        ekf.rival[k] = rival[k]
+    return t - ekf.rival_since < RIVAL_TIME
+
+
+@compiled
+def _are_late(window: np.ndarray, anchors: np.ndarray, x: np.ndarray) -> bool:
+    """Whether the TDOAs of a window (n,) agree with position and velocity x (6,) at its end, but for those of LATE_ANCHORS anchors."""
+    agree, rows = inliers(window, anchors, x), workspace.rows_heard(window)
+    fewest, others = AMONG_OTHERS
+    if len(rows) < LATE_ANCHORS + others:
+        return False
+    for i in range(len(rows)):
+        for j in range(i):
+            count = agreeing = 0
+            for k in range(len(window)):
+                a, b = window[k].a, window[k].b
+                if a != rows[i] and a != rows[j] and b != rows[i] and b != rows[j]:
+                    count += 1
+                    agreeing += agree[k]
+            if count >= fewest and agreeing >= AGREE * count:
+                return True
+    return False
 
 
 @compiled
@@ -375,7 +421,7 @@ def level_anew(ekf: Record, parameters: Record, yaw_std: float, history: np.ndar
     x, y, z, w = best.x[6], best.x[7], best.x[8], best.x[9]
     yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     x, covariance = best.x[:6].copy().reshape(1, 6), best.P[:6, :6].copy().reshape(1, 6, 6)
-    _begin(ekf, parameters, ekf.t, Places(x, covariance, np.zeros(1)), yaw, yaw_std)
+    _begin(ekf, parameters, ekf.t, Places(x, covariance, np.zeros(1)), yaw, yaw_std, True)
     add_reset(ekf, ekf.t, history)
 
 
@@ -385,6 +431,16 @@ def open_yaw(ekf: Record, parameters: Record, history: np.ndarray) -> None:
     ekf.yaw_doubt.count += 1
     widen(ekf, history)
     level_anew(ekf, parameters, 2.0 * math.pi, history)
+
+
+@compiled
+def open_unknown_yaw(ekf: Record, parameters: Record, history: np.ndarray) -> None:
+    """Of a tag without an IMU, before a velocity: follow four yaws if it may have any. From now on motion can show it."""
+    alive = 0
+    for h in range(HYPOTHESES):
+        alive += hypotheses.alive(ekf.hypotheses[h])
+    if alive == 1 and ekf.hypotheses[ekf.best].P[8, 8] > hypotheses.YAW_STD**2:
+        level_anew(ekf, parameters, 2.0 * math.pi, history)
 
 
 @compiled
@@ -437,7 +493,7 @@ def _put(hypothesis: Record, x: np.ndarray, covariance: np.ndarray) -> None:
 def _spread_attitude(P: np.ndarray, parameters: Record, yaw_std: float) -> None:
     """The variances of attitude and biases at the start."""
     P[6, 6] = P[7, 7] = TILT_STD**2
-    P[8, 8] = min(yaw_std, hypotheses.YAW_STD) ** 2
+    P[8, 8] = yaw_std**2
     for k in range(3):
         P[9 + k, 9 + k] = parameters.initial_accel_bias_std**2
         P[12 + k, 12 + k] = parameters.initial_gyro_bias_std**2

@@ -126,9 +126,14 @@ BAROMETER = _record(
 VELOCITY = _record(
     ("heard", float),  # s, stamps: of the last one,
     ("changed", float),  # and of the last one that differed from the one before;
-    ("value", float, 3),  # m/s, the last one
+    ("value", float, 4),  # m/s and rad/s, the last one
     ("nis", float),  # mean normalised innovation squared of late, of the worst component
     ("refused", bool),  # it disagrees with everything else
+    ("of_wheels", bool),  # it came with a yaw rate
+    ("agreed", float),  # s, stamp of the last one that was used,
+    ("yaw_rate", float),  # rad/s, its yaw rate,
+    ("yaw_rate_variance", float),  # rad^2/s^2, the variance of that,
+    ("speed_variance", float),  # and m^2/s^2, that of its velocity
 )
 
 YAW_DOUBT = _record(
@@ -155,7 +160,11 @@ EKF = _record(
     ("velocity", VELOCITY),
     ("ranged", AID, 1),  # the last distance to an anchor
     ("range_offset", float, 2),  # m, of all distances, when it was known best, and its variance, m^2; inf: it was not looked for
-    ("next_floor", float),  # s, stamp before which not to say again that the tag is at its fixed height
+    ("next_floor", float),  # s, stamp before which not to hold the tag on its floor again
+    ("sensed", bool),  # inertial samples drive the prediction
+    ("rival", float, 3),  # m, another place that late TDOAs agree on, and the motion that sensors feel does not lead to;
+    ("rival_since", float),  # s, stamps: since when they do,
+    ("rival_until", float),  # and until when the tag may be there
     ("plausibility", PLAUSIBILITY),  # of the inertial samples,
     ("distrusted", bool),  # which are not used, because they cannot be right
     ("yaw_doubt", YAW_DOUBT),  # see yaw_doubt.py
@@ -270,12 +279,16 @@ def new_state(positions: np.ndarray, functions: Sequence[SensorFunction] = (), f
         "sure",
         "unsure_until",
         "waits_until",
+        "rival_since",
+        "rival_until",
     ):
         ekf[stamp] = -np.inf
     ekf.imu.t = ekf.plausibility.contradicted = -np.inf
     for stamp in ("heard", "changed", "used", "compared", "pulls_since", "ignored_until"):
         ekf.height[stamp] = -np.inf
-    ekf.barometer.heard = ekf.barometer.agreed = ekf.velocity.heard = ekf.velocity.changed = ekf.ranged["t"][0] = ekf.next_floor = -np.inf
+    for stamp in ("heard", "changed", "agreed"):
+        ekf.velocity[stamp] = -np.inf
+    ekf.barometer.heard = ekf.barometer.agreed = ekf.ranged["t"][0] = ekf.next_floor = -np.inf
     for name in ("accel", "slow_accel", "mean_accel"):
         ekf.imu[name][2] = GRAVITY
     ekf.hypotheses["log_weight"][1:] = -np.inf

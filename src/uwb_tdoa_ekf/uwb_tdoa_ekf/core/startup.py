@@ -215,9 +215,15 @@ def split(places: Places) -> None:
 @compiled
 def share_of_inliers(window: np.ndarray, anchors: np.ndarray, x: np.ndarray) -> float:
     """Share of the window's TDOAs that agree with position and velocity x (6,) at its end, 0 to 1."""
+    return float(np.mean(inliers(window, anchors, x)))
+
+
+@compiled
+def inliers(window: np.ndarray, anchors: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """(n,) bool, which of the window's TDOAs agree with position and velocity x (6,) at its end."""
     residuals = np.empty(len(window))
     _normal_equations(window, anchors, x, np.zeros(len(window)), NO_SCALE, np.empty((6, 7)), residuals)
-    return float(np.mean(np.abs(residuals) < INLIER))
+    return np.abs(residuals) < INLIER
 
 
 @compiled

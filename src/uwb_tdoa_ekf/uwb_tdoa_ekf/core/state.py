@@ -160,10 +160,10 @@ def _add_noise(P: np.ndarray, R: np.ndarray, accel_psd: np.ndarray, parameters: 
 
 
 @compiled
-def coast(hypothesis: Record, dt: float, accel_psd: float, turn_psd: float) -> None:
+def coast(hypothesis: Record, dt: float, accel_psd: float, tilt_psd: float, yaw_psd: float) -> None:
     """Advance by dt seconds with no inertial sample: constant velocity with random acceleration, attitude held.
 
-    accel_psd (m/s^2)^2/Hz; turn_psd (rad/s)^2/Hz, growth of the attitude's uncertainty.
+    accel_psd (m/s^2)^2/Hz; tilt_psd, yaw_psd (rad/s)^2/Hz, growth of the attitude's uncertainty.
     """
     x, P = hypothesis.x, hypothesis.P
     for i in range(3):
@@ -177,7 +177,16 @@ def coast(hypothesis: Record, dt: float, accel_psd: float, turn_psd: float) -> N
             P[j, i] = P[i, j]
     for i in range(3):
         P[3 + i, 3 + i] += dt * accel_psd
-        P[6 + i, 6 + i] += dt * turn_psd
+        P[6 + i, 6 + i] += dt * (yaw_psd if i == 2 else tilt_psd)
+
+
+@compiled
+def turn_about_vertical(x: np.ndarray, angle: float) -> None:
+    """Turn the attitude of a nominal state by an angle, rad, about the world's z. The attitude error, which is of the body, stays."""
+    sine, cosine = math.sin(0.5 * angle), math.cos(0.5 * angle)
+    qx, qy, qz, qw = x[6], x[7], x[8], x[9]
+    x[6], x[7] = cosine * qx - sine * qy, cosine * qy + sine * qx
+    x[8], x[9] = cosine * qz + sine * qw, cosine * qw - sine * qz
 
 
 @compiled

@@ -40,15 +40,23 @@ def observe(information: np.ndarray, a: Record, b: Record, innovation: Record, t
 
 
 @compiled
-def fill(information: np.ndarray, P: np.ndarray, correlation_length: float, covariance: np.ndarray) -> None:
+def fill(information: np.ndarray, P: np.ndarray, correlation_length: float, height_std: float, covariance: np.ndarray) -> None:
     """Fill in the covariance (3, 3), m^2, that errors which persist make of a position whose covariance in the filter is P (15, 15). Of
-    white noise, of correlation_length 1, nothing persists."""
+    white noise, of correlation_length 1, nothing persists. height_std : m, of a height that is held, 0: none is; what is held does not
+    follow these errors."""
     covariance[:, :] = 0.0
     share = SHARE * (1.0 - 1.0 / max(correlation_length, 1.0))
     both = np.concatenate((P[:3, :3], np.eye(3)), axis=1)
     if share == 0.0 or not solve(both):
         return
     both[:, :3] = information / share + both[:, 3:] / MOST
+    if height_std > 0.0:
+        both[2, 2] += 1.0 / height_std**2
     both[:, 3:] = np.eye(3)
     if solve(both):
         covariance[:, :] = both[:, 3:]
+    if height_std > 0.0:  # what the height adds to the information has no part in the error
+        share = 1.0 / height_std**2
+        for i in range(3):
+            for j in range(3):
+                covariance[i, j] -= both[i, 5] * share * both[2, 3 + j]

@@ -77,16 +77,21 @@ def status_of(estimator: Estimator | None, yaw_std: float, odometry_age: float, 
 def _why(estimator: Estimator, use: Use, known: bool, findings: Sequence[Finding]) -> str:
     """What keeps a filter that runs, and has no fault, from being flown by."""
     left_out = estimator.without_imu
+    if estimator.unsure:
+        return estimator.unsure
     if use.tdoa_age > SILENT:
         said = use.trouble or f"no TDOA was used for more than {SILENT:g} s"
-        alone = "by the IMU alone" if use.imu_used and left_out is None else "without TDOAs and without the IMU"
-        return f"{said}: the position goes {alone} and drifts"
+        sources = [*(["the IMU"] if use.imu_used and left_out is None else []), *(["the velocities"] if use.velocity_used else [])]
+        way = f"by {' and '.join(sources)} alone" if sources else "on as the tag moved last, without the IMU and without velocities,"
+        return f"{said}: the position goes {way} and drifts"
     if use.trouble:
         return use.trouble
     if not known and left_out is not None:
         return f"the yaw is not known, because the filter goes without the IMU: {left_out.sentence}"
     if not known and estimator.yaw_doubts:
         return "the yaw was wrong, and is looked for again: do not steer by it; it is known once the tag has moved"
+    if not known and not (use.imu_used or use.velocity_used):
+        return "the yaw is not known, because neither an IMU nor velocities are used: do not steer by it; give imu/data, or odometry of wheels"
     if not known:
         return "the yaw is not known yet: do not steer by it; it is once the tag has moved, or if it is told (initialpose)"
     return findings[0].sentence if findings and findings[0].severity == "error" else ""

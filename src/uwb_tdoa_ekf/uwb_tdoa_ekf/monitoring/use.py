@@ -43,12 +43,13 @@ class Use:
             "arrival": received["tdoa"] + sum(received[name] for name in LOCATING),
             "tdoa": sum(counts[name] for name in USED),
             "imu": counts["imu_used"],
+            "velocity": counts["velocity_used"],
             "restarts": counts["restarts"],
             "counted": counts["used"] + counts["compensated"],
             **{reason: counts[reason] for reason in REASONS},
         }
         before = self._looks[-1][1] if self._looks else dict.fromkeys(totals, 0)
-        self._since |= {kind: now for kind in ("arrival", "tdoa", "imu", "restarts") if totals[kind] > before[kind]}
+        self._since |= {kind: now for kind in ("arrival", "tdoa", "imu", "velocity", "restarts") if totals[kind] > before[kind]}
         if not running or totals["restarts"] > before["restarts"]:
             self._running_since = math.inf
         if running and self._running_since == math.inf:
@@ -82,6 +83,11 @@ class Use:
     def imu_used(self) -> bool:
         """Whether inertial samples were used lately."""
         return self.imu_age < SILENT
+
+    @property
+    def velocity_used(self) -> bool:
+        """Whether velocities were used lately."""
+        return self._age("velocity") < SILENT
 
     def _shares(self, window: float) -> dict[str, float]:
         """Shares of the TDOAs of the last `window`, s, by what became of them, 0 to 1; empty for too few."""

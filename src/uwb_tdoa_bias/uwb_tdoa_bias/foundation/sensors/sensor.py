@@ -100,6 +100,7 @@ class Sensor:
     topic : "" for its name; rate : Hz, when it is simulated; locates : the filter can start from it alone
     rules : of `check`: callables of (Stream, Anchors) -> Mistake or None
     others : ((topic, message), ...) with the same fields that serve as well
+    assumed : callable of a Stream -> names of the parameters that count where its messages state no deviation; None: all state theirs
     """
 
     name: str
@@ -122,6 +123,7 @@ class Sensor:
     locates: bool = False
     rules: tuple = ()
     others: tuple = ()
+    assumed: Callable | None = None
 
     @property
     def topics(self) -> tuple:

@@ -83,6 +83,11 @@ def _measured(velocity: Velocity) -> tuple[dict, np.ndarray]:
     return rows, sane & known.any(axis=1) & ~np.isnan(std).any(axis=1)
 
 
+def _assumed(velocity: Velocity) -> tuple[str, ...]:
+    of_parameters = {"velocity_std": velocity.std, "yaw_rate_std": velocity.yaw_rate_std}
+    return tuple(name for name, std in of_parameters.items() if (std == 0.0).any())
+
+
 def _simulated(config: Any, room: Any, motion: Any, turn: Any, noise: Any) -> tuple:
     v = turn.inv().apply(motion.v) + config.velocity_noise * noise(3)
     return v, np.full(v.shape, max(config.velocity_noise, LEAST_STD))
@@ -103,10 +108,11 @@ SENSOR = Sensor(
     parameters={
         "use_velocity": parameter(True, "use velocities in the body frame, if there are any", fixed=True),
         "velocity_std": parameter(
-            0.05, "m/s; of a component of the velocity whose variance in the message is 0: the driver states none", high=100.0
+            0.03, "m/s; of a component of the velocity whose variance in the message is 0: the driver states none", high=100.0
         ),
         "yaw_rate_std": parameter(
-            0.05, "rad/s; the same of the yaw rate in such a message; 0.0: yaw rates without a variance are not used", high=100.0, with_low=True
+            0.05, "rad/s; the same of the yaw rate in such a message; 0.0: yaw rates without a variance are not used",
+            high=100.0, with_low=True,
         ),
     },
     invalid="give m/s, rad/s, and a covariance that is not unknown for all components",
@@ -117,4 +123,5 @@ SENSOR = Sensor(
         negligible=0.003, unit="m/s", axes=(".x", ".y", ".z"), positions=(0, 1, 2),
     ),
     others=(("velocity/odometry", "nav_msgs/msg/Odometry"),),
+    assumed=_assumed,
 )  # fmt: skip
