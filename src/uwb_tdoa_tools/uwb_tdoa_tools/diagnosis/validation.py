@@ -19,7 +19,7 @@ from ..scoring.by_phase import EVERYTHING
 from .comparison import Baseline, ValidationCase, score
 from .deviations import with_deviations
 from .findings import Refused, usable
-from .refinement import effects_of, is_written, recurs
+from .refinement import effects_of, recurs
 from .regression.fit import refit
 from .regression.select import Selection
 from .regression.table import BLOCK
@@ -61,8 +61,7 @@ class ValidatedSelection:
 
     def applied(self, attribution: Attribution) -> Attribution:
         """The Attribution with what was selected alone."""
-        selection = with_deviations(self.selection.where(is_written))
-        return replace(attribution, selection=selection, detections=self.detections, alone=())
+        return replace(attribution, selection=with_deviations(self.selection), detections=self.detections, alone=())
 
 
 def cross_fitted(
@@ -85,7 +84,6 @@ def cross_fitted(
         reach = [(-np.inf, spans[0][1]), *spans[1:-1], (spans[-1][0], np.inf)] if len(spans) > 1 else EVERYTHING
         halves = [ValidationCase(flights[0], base, tuple(spans[k::2]), tuple(reach[k::2])) for k in range(2)]
         parts = [(half, 0, number % 2 != k) for k, half in enumerate(halves)]
-    candidates = [part for candidate in candidates if (part := candidate.where(is_written)) is not None]
     out, columns = [], columns_of(candidates)
     for case, k, rows in parts[:: -(-len(parts) // (most or len(parts)))]:
         others = replace(selection, chosen=tuple(candidates), fit=refit(table, columns, selection.fit, rows))
