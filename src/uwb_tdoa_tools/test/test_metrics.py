@@ -4,7 +4,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Truth
 from uwb_tdoa_ekf.core.verdicts import INVALID, LATE, REJECTED, STARTUP, USED
 from uwb_tdoa_tools.scoring.metrics import Pool, Result, Score, coverage, judged_part, nees, nis, pooled, position_errors, summary

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..streams import NOTE, StreamRules, most_severe_first
+from ..streams import NOTE, Steady, StreamRules, most_severe_first
 from .sign_watch import SignWatch
 from ..streams.stamp_rules import usual
 
@@ -22,7 +22,6 @@ LATEST = 2  # of them, which must say it too, or it is over
 NOT_IN_FLIGHT = {"imu_shaking"}
 FEW_ANCHORS = "few_anchors"  # a tag with a fixed height needs three
 SMALLEST_UNIT = 100.0  # of another unit of stamps: what is less is the pace of a replay
-SAME = 0.3  # share by which the number that decided may change until a finding that goes on is said anew
 ALIKE = 0.5  # share of the swing of one stream's latency that the other has too, when it is we who are not scheduled
 
 
@@ -41,7 +40,7 @@ class StreamWatch:
         self._tdoa: list[tuple[np.ndarray, ...]] = []
         self._sign = SignWatch(self._anchors)
         self._turns: int | None = None  # as of Monitor, at the last look
-        self._said: dict[tuple[str, str], Finding] = {}  # by rule and severity, as it was found first
+        self._steady = Steady()
 
     def add_imu(self, t: np.ndarray, arrival: np.ndarray, gyro: np.ndarray, accel: np.ndarray) -> None:
         """Take samples: stamps and arrivals, (n,) s, of one clock if possible; gyro (n, 3) rad/s; accel (n, 3) m/s^2."""
@@ -73,14 +72,7 @@ class StreamWatch:
         still, found = {finding.rule for finding in rules.findings(LATEST)}, []
         if still:
             found = [finding for finding in rules.findings() if finding.rule in still and self._counts(finding)]
-        found = [self._as_said(finding) for finding in [*found, *filter(None, [self._sign.finding])]]
-        self._said = {(finding.rule, finding.severity): finding for finding in found}
-        return most_severe_first(found)
-
-    def _as_said(self, finding: Finding) -> Finding:
-        """The Finding as it was first said, as long as it goes on and the number that decided is much the same: its text stays."""
-        said = self._said.get((finding.rule, finding.severity))
-        return finding if said is None or not _much_alike(said.value, finding.value) else said
+        return most_severe_first(self._steady([*found, *filter(None, [self._sign.finding])]))
 
     def _counts(self, finding: Finding) -> bool:
         if finding.severity == NOTE or finding.rule in self._ignored:
@@ -99,8 +91,3 @@ class StreamWatch:
             if windows
         ]
         return len(spreads) == 2 and min(spreads) > ALIKE * max(spreads)
-
-
-def _much_alike(one: float, other: float) -> bool:
-    """Whether two numbers are nearly equal, or both NaN."""
-    return one == other or abs(one - other) <= SAME * max(abs(one), abs(other)) or (np.isnan(one) and np.isnan(other))

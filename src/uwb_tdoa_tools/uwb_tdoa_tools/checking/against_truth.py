@@ -12,9 +12,8 @@ import numpy as np
 from uwb_tdoa_bias.effects.anchor_ids import AnchorIds
 from uwb_tdoa_ekf.streams import WARNING, Finding
 
-from ..scoring.phases import least_height
 from . import motion_rules, pair_rules, time_rules
-from .known_path import KnownPath
+from .known_path import KnownPath, least_height
 from .motion_rules import TrueMotion
 from .repairs import repairs_of
 

@@ -9,14 +9,18 @@ import numpy as np
 from uwb_tdoa_bias.effects import EffectSet, Track, true_samples
 from uwb_tdoa_bias.foundation.geometry import tdoa
 
-from ..scoring.phases import least_height
-
 if TYPE_CHECKING:
     from uwb_tdoa_bias.effects import LabelEffect
-    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_bias.foundation.flight import Flight, Truth
 
+AIRBORNE = 0.3  # m of z
 MANY = 64  # anchors, beyond which a tag hears a small part of them: a hall, most of which has nothing to do with any of them
 FEWEST = 40  # TDOAs of a pair in the air, or of a vehicle that never is, of which something is said
+
+
+def least_height(truth: Truth) -> float:
+    """z, m, above which what is measured beside a Truth counts: 0.3, or minus infinity for a vehicle that never leaves the floor."""
+    return AIRBORNE if (truth.p[:, 2] > AIRBORNE).any() else -np.inf
 
 
 class KnownPath:

@@ -88,18 +88,13 @@ def no_imu(recording: Recording) -> Iterator[Finding]:
 
 def odometry_unread(recording: Recording) -> Iterator[Finding]:
     """Odometry, as of wheels, under a name that nothing reads. What a filter of ours gave, for whatever tag, is none."""
-    ours = {topic.removesuffix("uwb/tdoa") for topic in recording.topics if topic.endswith("/uwb/tdoa")}
-    there = sorted(
-        topic
-        for topic, kind in recording.topics.items()
-        if kind == "nav_msgs/msg/Odometry" and topic not in recording.read and not any(topic in (f"{of}odometry", f"{of}odometry/debiased") for of in ours)
-    )
+    tags = [topic.removesuffix("uwb/tdoa") for topic in recording.topics if topic.endswith("/uwb/tdoa")]
+    known = {*recording.read, *(f"{tag}{ours}" for tag in tags for ours in ("odometry", "odometry/debiased"))}
+    there = sorted(topic for topic, kind in recording.topics.items() if kind == "nav_msgs/msg/Odometry" and topic not in known)
     if there and "velocity" not in recording.sensors:
-        line = f"give --topic {WHEELS}={there[0]} to tools that read the bag, and -r {WHEELS}:={there[0]} to ekf_node, if it is of wheels or a camera"
-        yield Finding(
-            "odometry_unread", WARNING, f"the odometry on {', '.join(there)} is not used", f"velocities are read from velocity and {WHEELS}", line,
-            float(len(there)),
-        )  # fmt: skip
+        line = f"if it is of wheels or a camera: --topic {WHEELS}={there[0]} for tools, and -r {WHEELS}:={there[0]} for ekf_node"
+        cause, evidence = f"the odometry on {', '.join(there)} is not used", f"velocities are read from velocity and {WHEELS}"
+        yield Finding("odometry_unread", WARNING, cause, evidence, line, float(len(there)))
 
 
 def anchors(recording: Recording) -> Iterator[Finding]:

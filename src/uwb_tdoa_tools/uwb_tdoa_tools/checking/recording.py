@@ -51,7 +51,8 @@ class Recording:
     with the body, where the samples are those of an IMU in its origin;
     topics : {topic: type} of a bag, or of all that are live; read : names of those that were read, or are our own;
     recorded : Anchors that the bag itself holds, or None; falls : how often the stamps fell in a file whose reader has sorted them;
-    remarks : sentences on what could not be read of a damaged one; ends : [End] of live topics; sensors : {name: Stream} of those of the SENSORS that there are; jumps : of the clock, which
+    remarks : sentences on what could not be read of a damaged one; ends : [End] of live topics;
+    sensors : {name: Stream} of those of the SENSORS that there are; jumps : of the clock, which
     is continuous here, and outliers : {stream: messages left out because of their stamps};
     losses : ((cause, evidence, remedy), ...) of what a reader has not used.
     """

@@ -60,8 +60,8 @@ def stated(table: RegressionTable, columns: Sequence[Column], cov: np.ndarray) -
 
 
 def apart_from_common(table: RegressionTable, columns: Sequence[Column]) -> np.ndarray:
-    """(k, k), what takes from delays of anchors among some Columns the mean of all, where it cancels in every row: that of all TDOAs does. A fit
-    leaves it at 0, and its deviation would be that of the prior."""
+    """(k, k), what takes from delays of anchors among some Columns the mean of all, where it cancels in every row, as it does in TDOAs. A
+    fit leaves it at 0, and its deviation would be that of the prior."""
     out, places = np.eye(len(columns)), [k for k, column in enumerate(columns) if column.effect == (DELAY,)]
     if len(places) > 1 and np.abs(table.matrix([columns[k] for k in places]).sum(axis=1)).max() < CANCELS:
         out[np.ix_(places, places)] -= 1.0 / len(places)

@@ -56,8 +56,8 @@ def effects_of(selection: Selection) -> tuple[Effect, ...]:
 
 
 def written(selection: Selection, declared: Sequence[Candidate]) -> Selection:
-    """The Selection that effects.yaml can hold: without functions of what no node has, with the Candidates of the catalogue that are worth it
-    in their place, and fitted anew, so that each value is that of this model. Errors of the ground truth, and what the filter judges
+    """The Selection that effects.yaml can hold: without functions of what no node has, with the Candidates of the catalogue that are worth
+    it in their place, and fitted anew, so that each value is that of this model. Errors of the ground truth, and what the filter judges
     itself, stay: no node meets them."""
     kept = selection.where(lambda effect: effect.usable or not isinstance(effect, SmoothTerm))
     if kept is selection:

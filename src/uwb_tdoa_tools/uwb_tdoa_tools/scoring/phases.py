@@ -25,12 +25,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..checking.known_path import AIRBORNE
+
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.flight import Truth
 
     Span = tuple[float, float]  # from when to when, s
 
-AIRBORNE = 0.3  # m of z
 RISE = 0.07  # m above its height at rest: away from the floor
 MOVED = 0.1  # m from its place at rest: away, where height tells nothing
 SETTLED = 0.5  # s at either end, whose median is the place at rest
@@ -55,11 +56,6 @@ def in_the_air(truth: Truth) -> Span | None:
     """(first, last) stamp of a Truth, s, with z above 0.3 m; None if there is none."""
     above = np.flatnonzero(truth.p[:, 2] > AIRBORNE)
     return (float(truth.t[above[0]]), float(truth.t[above[-1]])) if len(above) else None
-
-
-def least_height(truth: Truth) -> float:
-    """z, m, above which what is measured beside a Truth counts: 0.3, or minus infinity for a vehicle that never leaves the floor."""
-    return -np.inf if in_the_air(truth) is None else AIRBORNE
 
 
 def motion(truth: Truth) -> Span | None:

@@ -167,7 +167,9 @@ class Carried:
 def _check_time(config: SimulationConfig) -> None:
     shortest = 2.0 * (config.floor_time + SPEED_UP)
     if config.duration < shortest:
-        raise InputError(f"duration: {config.duration:g} s is too short to start and stop; give {shortest:g} s or more, or a shorter floor_time.")
+        raise InputError(
+            f"duration: {config.duration:g} s is too short to start and stop; give {shortest:g} s or more, or a shorter floor_time."
+        )
 
 
 VEHICLES: dict[str, Callable[[SimulationConfig, Room, np.random.Generator], Flyable]] = {

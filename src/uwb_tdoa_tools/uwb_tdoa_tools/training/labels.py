@@ -12,8 +12,8 @@ from uwb_tdoa_bias.effects import EffectSet, Samples, samples_at
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.geometry import tdoa
 
+from ..checking.known_path import least_height
 from ..scoring.metrics import judged_part
-from ..scoring.phases import least_height
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
