@@ -25,7 +25,8 @@ from tf2_msgs.msg import TFMessage
 from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS, anchors_to_message
 from uwb_tdoa_bias.foundation.ros_diagnostics import DIAGNOSTICS_QOS
 from uwb_tdoa_bias.foundation.ros_topics import STREAM_QOS
-from uwb_tdoa_ekf.results import VERDICTS
+from uwb_tdoa_bias.foundation.sensors import SENSORS
+from uwb_tdoa_ekf.results import VERDICTS, rows_of
 from uwb_tdoa_msgs.msg import AnchorArray, Tdoa, TdoaCorrected, TdoaResidual
 
 EPOCH = 1_700_000_000  # s; stamps of today's size
@@ -359,7 +360,9 @@ class Rig:
         else:
             linear = message.twist.twist.linear
             linear.x, linear.y, linear.z = part.v[i].tolist()
-            message.twist.covariance = np.diag([*part.std[i] ** 2, 0.0, 0.0, 0.0]).ravel()
+            content = SENSORS["velocity"].content(rows_of(part, slice(i, i + 1)))
+            message.twist.twist.angular.z = float(content["twist.twist.angular"][0, 2])
+            message.twist.covariance = content["twist.covariance"][0]
         self.send(topic, message, part.t[i], epoch=epoch)
 
     def play(self, flight, epoch=EPOCH, ahead=0.025, send_tdoa=None, aids=()):

@@ -10,6 +10,8 @@ import pytest
 pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
+from dataclasses import replace  # noqa: E402
+
 from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
 from flights import corners, position_at, with_aids  # noqa: E402
 from rig import MODULES, make_rig, recording, seconds_of, stamp  # noqa: E402, F401
@@ -198,6 +200,10 @@ def test_height_pressure_and_velocity_are_used_where_they_are_there(make_rig, tm
     effects, flight = EffectSet.from_yaml(file), with_aids(recording(3.0), rate=50.0)
     for effect in effects.effects:
         flight = effect.inject(flight)
+    if topic == "velocity/odometry":  # wheels whose driver states no variance
+        n, gyro = len(flight.velocity), np.interp(flight.velocity.t, flight.imu.t, flight.imu.gyro[:, 2])
+        wheels = replace(flight.velocity, std=np.zeros((n, 3)), yaw_rate=gyro, yaw_rate_std=np.zeros(n))
+        flight = replace(flight, velocity=wheels)
     flight.height.range[:] = np.float32(flight.height.range)  # a sensor_msgs/Range is not more precise
     flight.height.range[20] = np.inf
     topics = ["height", "pressure", topic]
@@ -211,6 +217,9 @@ def test_height_pressure_and_velocity_are_used_where_they_are_there(make_rig, tm
         assert sum(counts[f"{aid}_{verdict}"] for verdict in verdicts) == counts[f"{aid}_received"] > 100
         assert counts[f"{aid}_used"] > 50
     assert counts["height_invalid"] == 1
+    values = {entry.key: entry.value for entry in rig.fresh_status("ekf_node").values}
+    said = {"velocity": "the messages", "velocity/odometry": "velocity_std, yaw_rate_std"}
+    assert values["velocity deviations of"] == said[topic]
     expected = run_offline(flight, None, Corrector(flight.anchors, effects)).odometry
     place = np.searchsorted(expected.t, [seconds_of(m.header.stamp) for m in rig.odometry])
     p = [(m.pose.pose.position.x, m.pose.pose.position.y, m.pose.pose.position.z) for m in rig.odometry]

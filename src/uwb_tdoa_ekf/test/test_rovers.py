@@ -90,13 +90,36 @@ def test_a_planar_vehicle_is_flat_and_says_how_well_that_is_known(rover, config)
 
 def test_a_fixed_height_alone_is_held_and_stated(rover):
     found = errors(rover, FilterConfig(fixed_height=HEIGHT, fixed_height_std=HEIGHT_STD))
-    assert np.abs(found.position[:, 2]).max() < 3.0 * HEIGHT_STD and found.z_std.max() < 1.5 * HEIGHT_STD and found.z_std.min() > 0.5 * HEIGHT_STD
+    assert np.abs(found.position[:, 2]).max() < 3.0 * HEIGHT_STD
+    assert 0.5 * HEIGHT_STD < found.z_std.min() and found.z_std.max() < 1.5 * HEIGHT_STD
     assert errors(rover, FilterConfig()).z_std.max() > 0.2
 
 
 def test_planar_without_a_deviation_has_one():
     assert FilterConfig(planar=True).fixed_height_std == PLANAR_HEIGHT_STD and FilterConfig().fixed_height_std == 0.0
     assert FilterConfig(planar=True, fixed_height_std=0.1).fixed_height_std == 0.1
+
+
+def test_a_yaw_rate_alone_shows_no_yaw(rover):
+    """A gyroscope in a twist, and no IMU: where the rover is stays as good as with TDOAs alone."""
+    n = len(rover.velocity)
+    alone = rover.replaced(velocity=replace(rover.velocity, v=np.full((n, 3), np.nan), std=np.full((n, 3), np.inf)))
+    found, without = errors(alone, WHEELS), errors(rover.without("velocity"), WHEELS)
+    assert (found.yaw_std > YAW_KNOWN).all() and rms(found.xy) == pytest.approx(rms(without.xy), rel=0.05)
+
+
+def test_two_sources_of_velocity_do_not_disturb_each_other(rover):
+    """Between two messages of wheels, one of optical flow, without a yaw rate."""
+    wheels = rover.velocity
+    n = len(wheels)
+    parts = [
+        (wheels.t, wheels.t + 0.01), (wheels.v, wheels.v), (wheels.std, np.tile([0.1, 0.1, np.inf], (n, 1))),
+        (wheels.yaw_rate, np.full(n, np.nan)), (wheels.yaw_rate_std, np.full(n, np.inf)),
+    ]  # fmt: skip
+    order = np.argsort(np.concatenate(parts[0]))
+    both = Velocity(*(np.concatenate(part)[order] for part in parts))
+    found, one = errors(rover.replaced(velocity=both), WHEELS), errors(rover, WHEELS)
+    assert rms(found.yaw) < 1.5 * rms(one.yaw) and rms(found.xy) < 1.2 * rms(one.xy)
 
 
 def test_what_cannot_move_sideways(rover):

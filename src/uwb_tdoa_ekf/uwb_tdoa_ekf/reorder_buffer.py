@@ -124,7 +124,8 @@ class ReorderBuffer:
                 passed.append(max(stream.watermark(self.reorder), newest - OF_AIDS * self.lag))
             elif place in self._leading and stream.gate.newest >= newest:
                 passed.append(stream.watermark(self.reorder))
-        too_many = (float(self._streams[place].rows["t"][-MOST_WAITING]) for place in self._leading if len(self._streams[place]) > MOST_WAITING)
+        leading = (self._streams[place] for place in self._leading)
+        too_many = (float(stream.rows["t"][-MOST_WAITING]) for stream in leading if len(stream) > MOST_WAITING)
         return max(min(passed, default=newest), *too_many, -math.inf)
 
     def add(self, place: int, rows: np.ndarray, usable: np.ndarray) -> None:

@@ -172,6 +172,8 @@ def update_pull(height: Record, parameters: Record, innovation: Record, t: float
     if not (ranged or parameters.fixed_height_std > 0.0):
         height.pulls_since = t
         return
+    if height.compared == -np.inf and not ranged:
+        height.pulls_since = t
     step = min(1.0, max(0.0, t - height.compared) / PULL_TIME)
     height.compared = t
     row = innovation.row[2]

@@ -129,8 +129,7 @@ VELOCITY = _record(
     ("value", float, 4),  # m/s and rad/s, the last one
     ("nis", float),  # mean normalised innovation squared of late, of the worst component
     ("refused", bool),  # it disagrees with everything else
-    ("of_wheels", bool),  # it came with a yaw rate
-    ("agreed", float),  # s, stamp of the last one that was used,
+    ("agreed", float),  # s, stamp of the last one of wheels that was used,
     ("yaw_rate", float),  # rad/s, its yaw rate,
     ("yaw_rate_variance", float),  # rad^2/s^2, the variance of that,
     ("speed_variance", float),  # and m^2/s^2, that of its velocity

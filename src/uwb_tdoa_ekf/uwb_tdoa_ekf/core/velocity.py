@@ -39,21 +39,22 @@ def observe(ekf: Record, parameters: Record, aid: Record, residual: Record, reco
     state, innovation = ekf.velocity, ekf.innovation
     dt = min(max(aid.t - state.heard, 1e-3), AVERAGE)
     _complete(aid, parameters)
-    state.of_wheels = aid.std[YAW_RATE] <= LONGEST_STD
+    of_wheels = aid.std[YAW_RATE] <= LONGEST_STD
     frozen = _repeats(state, aid) and not ekf.quiet
     state.heard = aid.t
-    leads = state.of_wheels and not ekf.sensed
+    leads = of_wheels and not ekf.sensed
     inflation = max(1.0, 2.0 * CORRELATION_TIME / dt)
     worst = _worst(ekf, aid, residual)
     state.nis += min(1.0, dt / AVERAGE) * (min(worst, GATE**4) - state.nis)
-    stuck = frozen and (state.refused or (np.any(state.value != 0.0) and not state.of_wheels))  # simulated wheels turn evenly
+    stuck = frozen and (state.refused or (np.any(state.value != 0.0) and not of_wheels))  # simulated wheels turn evenly
     state.refused = state.nis > (AGREES if state.refused else DISAGREES) or stuck
     residual.weight, residual.verdict = 0.0, REJECTED
     if state.refused or worst > GATE**2:
         return
     residual.weight, residual.verdict = 1.0, USED
-    state.agreed, state.yaw_rate = aid.t, aid.value[YAW_RATE]
-    state.yaw_rate_variance, state.speed_variance = aid.std[YAW_RATE] ** 2, aid.std[0] ** 2
+    if of_wheels:
+        state.agreed, state.yaw_rate, state.yaw_rate_variance = aid.t, aid.value[YAW_RATE], aid.std[YAW_RATE] ** 2
+        state.speed_variance = aid.std[0] ** 2 if aid.std[0] <= LONGEST_STD else 0.0
     for h in range(len(ekf.hypotheses)):
         hypothesis = ekf.hypotheses[h]
         if not alive(hypothesis):
@@ -71,7 +72,7 @@ def observe(ekf: Record, parameters: Record, aid: Record, residual: Record, reco
             if h == ekf.best:
                 residual.weight = min(residual.weight, w)
                 add_update(ekf, aid.t, records)
-        if state.of_wheels and ekf.sensed:
+        if of_wheels and ekf.sensed:
             _compare_yaw_rate(hypothesis, aid, ekf.imu, innovation)
             white = innovation.prior_variance + GYRO_RATE * parameters.gyro_noise**2
             w = weight(GEMAN_MCCLURE, innovation.value / math.sqrt(white + innovation.noise_variance), GATE)
@@ -84,13 +85,13 @@ def observe(ekf: Record, parameters: Record, aid: Record, residual: Record, reco
 @compiled
 def drives(state: Record, t: float) -> bool:
     """Whether wheels, by the state of a VELOCITY, tell the motion up to stamp t, s."""
-    return state.of_wheels and not state.refused and t - state.heard < HELD
+    return not state.refused and t - state.agreed < HELD
 
 
 @compiled
 def agrees(state: Record, t: float) -> bool:
     """Whether wheels, by the state of a VELOCITY, have agreed with everything else until lately, at stamp t, s: slip ends soon."""
-    return state.of_wheels and t - state.agreed < SLIP
+    return t - state.agreed < SLIP
 
 
 @compiled
