@@ -1,7 +1,7 @@
 """rover: simulated drives over a floor, each judged by its truth: how well the filter does, and whether what diagnose writes is true.
 
 A rover drives for 90 s among six anchors in 12 x 8 m, with wheels (50 Hz, 2 % too fast, slip), an IMU (100 Hz) and 100 TDOAs a second with
-a noise of 0.1 m and delays of the anchors of 5 cm. Its antenna is on a mast 0.4 m above base_link, which is on the floor."""
+a noise of 0.1 m and delays of the anchors of 5 cm, which make up `tdoa_std`. Its antenna is on a mast 0.4 m above base_link, which is on the floor."""
 
 from dataclasses import replace
 from functools import partial
@@ -23,7 +23,7 @@ from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 SEEDS, DURATION, NOISE, DELAY_STD = 20, 90.0, 0.1, 0.05  # s, m, m
 SETTLED = 15.0  # s after which it is judged: the yaw is known
 LATE_ANCHORS, LATE_FROM, LATE_FOR, LATE_BY = (0, 3), 40.0, 5.0, 1.5  # s, s, m
-PLANAR = FilterConfig(planar=True, fixed_height=0.0)
+PLANAR = FilterConfig(planar=True, fixed_height=0.0, tdoa_std=float(np.hypot(NOISE, DELAY_STD * np.sqrt(2.0))))
 ROWS = {
     "wheels, IMU": (("imu", "velocity"), PLANAR, False),
     "wheels alone": (("velocity",), replace(PLANAR, use_imu=False), False),

@@ -22,7 +22,7 @@ class Room:
 
     lower: np.ndarray
     upper: np.ndarray
-    area: tuple[tuple[float, float], tuple[float, float]] | None = None
+    area: tuple[tuple[float, ...], ...] | None = None
 
     @property
     def centre(self) -> np.ndarray:

@@ -94,7 +94,8 @@ def _going(tau: np.ndarray, config: SimulationConfig, rng: np.random.Generator) 
     out = np.zeros(len(tau))
     for begin, end in zip(ends[1::2], ends[2::2]):
         end = min(end, last)
-        out += STEP(np.clip((tau - begin) / SPEED_UP, 0.0, 1.0)) * STEP(np.clip((end - tau) / SPEED_UP, 0.0, 1.0))
+        since, until = ((tau - begin) / SPEED_UP, (end - tau) / SPEED_UP)
+        out += np.asarray(STEP(np.clip(since, 0.0, 1.0)) * STEP(np.clip(until, 0.0, 1.0)), dtype=float)
     return out
 
 
