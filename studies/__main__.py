@@ -5,7 +5,7 @@ import sys
 
 from uwb_tdoa_tools import cli
 
-from studies import aids, calibrating, crazyflie, fuzz, localizing, noise, ranges, recalibrating, scale, situations, surveying
+from studies import aids, calibrating, crazyflie, fuzz, localizing, noise, ranges, recalibrating, rover, scale, situations, surveying
 from studies.checking import figures as checking
 from studies.checking import in_flight
 from studies.closed_loop import experiment
@@ -37,6 +37,7 @@ STUDIES = {
     "random-splits": splits,
     "ranges": ranges,
     "recalibrating": recalibrating,
+    "rover": rover,
     "scale": scale,
     "situations": situations,
     "spin": spin,
@@ -65,6 +66,7 @@ of measured flights: flights/, util/, surveys/.
   random-splits    bias models trained on flights drawn at random, and judged on the others (docs/bias.md)
   ranges           simulated distances to anchors against the bound of plan (docs/sensors.md)
   recalibrating    surveys that start from the last one, after something changed (docs/calibration.md)
+  rover            a simulated rover on wheels, and what diagnose finds on it (docs/rover.md)
   scale            processor time and memory over flights, anchors and effects (docs/speed.md)
   situations       where a tag can be and what can happen to it, simulated (docs/reliability.md)
   spin             the error of a TDOA over the yaw of the tag (docs/bias.md)
@@ -104,6 +106,8 @@ def parser():
         "./dev study random-splits DATA/flights/0426 --survey DATA/surveys --out splits.jsonl",
         "./dev study ranges --flights 5",
         "./dev study recalibrating --data DATA --only const1",
+        "./dev study rover --seeds 20",
+        "./dev study rover --diagnose 4",
         "./dev study scale --out scale/",
         "./dev study situations --resume situations.jsonl",
         "./dev study spin --out spin.png",

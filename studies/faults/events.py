@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.foundation.flight import AIDS, Truth
 from uwb_tdoa_bias.foundation.sensors import Height, Pressure, Ranges
 from uwb_tdoa_bias.foundation.sensors.pressure import SITE, pressure_at
-from uwb_tdoa_tools.scoring.metrics import airborne, position_at
+from uwb_tdoa_tools.scoring.metrics import judged_part, position_at
 
 from ..aids import with_velocity
 
@@ -56,7 +56,7 @@ class Scene:
 
 def part_of(flight: Flight, seconds: float) -> Flight:
     """The first `seconds` of a flight from shortly before take-off on, on a clock that begins with them, with all sensors."""
-    begin = airborne(flight.truth)[0] - BEFORE
+    begin = judged_part(flight.truth)[1] - BEFORE
     flight = with_sensors(flight)
 
     def cut(stream: Any, every: int = 1) -> Any:

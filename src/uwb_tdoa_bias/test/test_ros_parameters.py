@@ -2,7 +2,6 @@ import pytest
 
 rclpy = pytest.importorskip("rclpy")
 
-from rclpy.exceptions import ParameterNotDeclaredException  # noqa: E402
 from rclpy.impl.implementation_singleton import rclpy_implementation  # noqa: E402
 from rclpy.impl.rcutils_logger import RcutilsLogger  # noqa: E402
 from rclpy.parameter import Parameter as Value  # noqa: E402
@@ -160,5 +159,12 @@ def test_a_read_only_parameter_may_be_set_to_what_it_is(node_with):
         result = node.set_parameters_atomically([so[0], Value("gate", value=6.0), other])
         assert not result.successful and "read-only" in result.reason
     assert node.get_parameter("gate").value == 5.0
-    with pytest.raises(ParameterNotDeclaredException):
-        node.set_parameters_atomically([Value("unknown", value=1)])
+
+
+def test_a_misspelt_parameter_is_refused_by_name(node_with):
+    node = node_with()
+    declare_all(node, PARAMETERS)
+    result = node.set_parameters_atomically([Value("gaet", value=1.0)])
+    assert not result.successful and "no parameter 'gaet'; set gate" in result.reason
+    result = node.set_parameters_atomically([Value("nothing_like_it", value=1.0)])
+    assert not result.successful and "no parameter 'nothing_like_it'" in result.reason

@@ -1,7 +1,9 @@
-"""Which findings make the position wrong is a property of a Finding."""
+"""Which findings make the position wrong is a property of a Finding; the text of one that goes on stays."""
+
+from dataclasses import replace
 
 import pytest
-from uwb_tdoa_ekf.streams import ERROR, NOTE, WARNING, Finding
+from uwb_tdoa_ekf.streams import ERROR, NOTE, WARNING, Finding, Steady
 
 
 def finding(rule, severity=ERROR, value=1.0):
@@ -26,3 +28,14 @@ def test_unknown_ids_do_where_they_are_most(share, wrong):
 
 def test_what_is_dropped_or_slow_does_not():
     assert not any(finding(rule).position_wrong() for rule in ("tdoa_twice", "gap", "rate", "blocks", "few_anchors", "tdoa_of_one"))
+
+
+def test_the_text_of_what_goes_on_stays_until_it_is_over_or_much_else():
+    steady = Steady()
+    first, next_one = finding("imu_turned", value=2.0), replace(finding("imu_turned", value=2.1), evidence="a little else")
+    assert steady([first]) == [first] and steady([next_one]) == [first]
+    worse = replace(next_one, value=4.0)
+    assert steady([worse]) == [worse] and steady([replace(worse, severity=WARNING)])[0].severity == WARNING
+    assert steady([]) == [] and steady([next_one]) == [next_one]
+    nothing = finding("dead", value=float("nan"))
+    assert steady([nothing]) == [nothing] and steady([replace(nothing, evidence="else")]) == [nothing]

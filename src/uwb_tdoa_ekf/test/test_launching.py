@@ -116,6 +116,7 @@ def test_tags_of_a_file(tmp_path):
         ("{}", "expected a mapping 'tags'"), ("tags: {a: 1}", "a: 1 must be a mapping"), ("tags: {a: {gaet: 1}}", "gaet: .* write gate"),
         ("tags: {a: {gate: }}", "gate: None is no value"), ("tags: {a: {gate: {b: 1}}}", "gate: .* is no value"),
         ("tags: {a: {host: x}, b: {}}", "b: names no host"), ("tags: {a: {host: 3}}", "3 is no name of a machine"),
+        ("tags: {a: {remaps: odom}}", "remaps: 'odom' must be"), ("remaps: {velocity: 3}\ntags: {a: }", "remaps: .* must be"),
         ("anchors_file: []\ntags: {a: {}}", ".. is no path"), ("tags: {a: {params_file: 3}}", "3 is no path"),
     ],
 )
@@ -124,6 +125,16 @@ def test_a_bad_file_is_refused(tmp_path, text, named):
     file.write_text(text)
     with pytest.raises(InputError, match=f"{file}: .*{named}"):
         tags(file, {})
+
+
+def test_topics_of_tags_have_other_names(tmp_path):
+    file = tmp_path / "tags.yaml"
+    file.write_text("remaps: {velocity/odometry: odom}\ntags: {tag1: , tag2: {remaps: {imu/data: /imu2, velocity/odometry: wheels}}}")
+    first, second = (node for node in tags(file, {}) if node.executable == "ekf_node")
+    assert first.words[2:4] == ["-r", "velocity/odometry:=odom"]
+    assert second.words[2:6] == ["-r", "velocity/odometry:=wheels", "-r", "imu/data:=/imu2"]
+    with pytest.raises(InputError, match="remaps: do not go with processes"):
+        tags(file, {}, processes="1")
 
 
 def test_each_host_starts_its_tags_and_the_first_the_anchors(tmp_path):

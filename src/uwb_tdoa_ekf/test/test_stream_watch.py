@@ -54,6 +54,13 @@ def test_a_fault_is_named_within_five_seconds_and_forgotten_when_it_ends(fault, 
     assert not any(words for at, words in said if at > 15.0), said
 
 
+def test_the_text_of_a_finding_stays_as_long_as_it_goes_on():
+    imu, tdoa = streams(16.0)
+    turned = (*imu[:-1], imu[-1] * [1.0, -1.0, -1.0] + np.array([0.0, 0.0, 0.3]) * np.sin(0.7 * imu[0])[:, None])
+    said = [found["imu_turned"].sentence for found in watched(turned, tdoa, 16.0) if "imu_turned" in found]
+    assert len(said) > 8 and len(set(said)) == 1
+
+
 def test_a_replay_at_another_speed_is_none():
     imu, tdoa = streams(8.0)
     fast = [shifted(columns, columns[1][0] + (columns[1] - columns[1][0]) / 4.0) for columns in (imu, tdoa)]

@@ -26,6 +26,7 @@ from .monitoring.implausible import implausible
 from .pipeline import Pipeline, odometry_of
 from .reorder_buffer import IMU_STREAM, STREAMS, TDOA_STREAM, ReorderBuffer
 from .results import VERDICTS, Odometry, Residuals, concatenated
+from .streams import Steady
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.sensors import Stream
     from .pipeline import Fed
     from .reorder_buffer import Restart
-    from .streams.finding import Finding
+    from .streams import Finding
 
 RATE_SAMPLES = 10  # inertial samples from whose stamps their rate is known
 LARGEST_POSE_AHEAD = 10.0  # s of a pose that is set, from the newest measurement
@@ -63,6 +64,7 @@ class Estimator:
         self._sensed = np.empty(0, IMU_SAMPLE)  # the inertial samples that were used last, and RATE_SAMPLES before them
         self._buffer = ReorderBuffer(reorder, lag, self.config.use_imu, self._refuse, self._start_anew)
         self._restart: Restart | None = None  # the last one
+        self._steady = Steady()
         self._clear()
 
     def _clear(self) -> None:
@@ -171,7 +173,7 @@ class Estimator:
     def without_imu(self) -> Finding | None:
         """Finding by which the filter goes without inertial samples, because they cannot be right; None while it uses them."""
         ekf = self._ekf
-        return implausible(ekf.plausibility) if ekf.distrusted else None
+        return next(iter(self._steady([implausible(ekf.plausibility)] if ekf.distrusted else [])), None)
 
     @property
     def restarted(self) -> Finding | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
 import json
 import os
@@ -62,7 +62,7 @@ IN_ORDER = 0, *(-number for number in ENDING), *(128 + number for number in ENDI
 @dataclass(frozen=True)
 class Start:
     """One node. parameters : paths of files and {name: value}, of which later ones count; name : of the node, if it is another than
-    the executable's."""
+    the executable's; remaps : {name of a topic: the name it has here}."""
 
     package: str
     executable: str
@@ -70,6 +70,7 @@ class Start:
     parameters: list
     log_level: str = "info"
     name: str | None = None
+    remaps: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def label(self) -> str:
@@ -78,8 +79,8 @@ class Start:
 
     @property
     def words(self) -> list[str]:
-        """Its parameters and log level, as arguments after --ros-args."""
-        words = ["--log-level", self.log_level]
+        """Its parameters, remaps and log level, as arguments after --ros-args."""
+        words = ["--log-level", self.log_level, *(word for name, new in self.remaps.items() for word in ("-r", f"{name}:={new}"))]
         for part in self.parameters:
             if isinstance(part, dict):
                 words += [word for name, value in part.items() for word in ("-p", f"{name}:={json.dumps(value, ensure_ascii=False)}")]
@@ -161,15 +162,17 @@ def tag(
 
 @dataclass(frozen=True)
 class Fleet:
-    """What a YAML file of tags says: `tags: {NAMESPACE: {parameter: value, host: HOST}}`, and beside `tags` what all of them share.
+    """What a YAML file of tags says: `tags: {NAMESPACE: {parameter: value, host: HOST, remaps: {topic: name}}}`, and beside `tags` what all
+    of them share.
 
     path : of the file; tags : {namespace: {parameter: value}}; hosts : {namespace: name of the machine that runs its nodes, None where the
-    file names none}; processes : text, "" where the file does not say.
+    file names none}; remaps : {namespace: {topic: name}}; processes : text, "" where the file does not say.
     """
 
     path: str
     tags: dict[str, dict]
     hosts: dict[str, str | None]
+    remaps: dict[str, dict[str, str]]
     processes: str
 
     @classmethod
@@ -179,19 +182,21 @@ class Fleet:
         listed = content.pop("tags", None) if isinstance(content, dict) else None
         if not isinstance(listed, dict) or not listed:
             raise InputError(f"{path}: expected a mapping 'tags' of namespace to parameters, e.g. 'tags: {{tag1: {{}}}}'.")
-        merged, hosts, processes = {}, {}, content.pop("processes", "")
+        merged, hosts, remaps, processes = {}, {}, {}, content.pop("processes", "")
+        shared = content.pop("remaps", None)
         for namespace, own in listed.items():
             if not isinstance(own or {}, dict):
                 raise InputError(f"{path}: tags: {namespace}: {own!r} must be a mapping of parameters, or {{}}.")
             parameters = {"body_frame": f"{namespace}/base_link", **content, **(own or {})}
-            host = parameters.pop("host", None)
+            host, renamed = parameters.pop("host", None), parameters.pop("remaps", None)
+            remaps[str(namespace)] = {**_remaps(path, shared), **_remaps(path, renamed)}
             if not isinstance(host, str | None):
                 raise InputError(f"{path}: tags: {namespace}: host: {host!r} is no name of a machine; write a text.")
             merged[str(namespace)], hosts[str(namespace)] = parameters, host
         if None in hosts.values() and set(hosts.values()) != {None}:
             lacks = next(namespace for namespace, name in hosts.items() if name is None)
             raise InputError(f"{path}: tags: {lacks}: names no host, and other tags do; name it, or a host for all beside 'tags'.")
-        return cls(str(path), merged, hosts, str(processes))
+        return cls(str(path), merged, hosts, remaps, str(processes))
 
     def at(self, host: str) -> Fleet:
         """The tags whose nodes this machine runs: all, where the file names no host. Raises InputError if there is none."""
@@ -201,7 +206,8 @@ class Fleet:
         if not here:
             known = ", ".join(dict.fromkeys(str(name) for name in self.hosts.values()))
             raise InputError(f"{self.path}: no tag has the host {host}; those named are {known}: correct the file, or give host:=NAME.")
-        return Fleet(self.path, {name: self.tags[name] for name in here}, {name: self.hosts[name] for name in here}, self.processes)
+        tags, hosts, remaps = ({name: of[name] for name in here} for of in (self.tags, self.hosts, self.remaps))
+        return Fleet(self.path, tags, hosts, remaps, self.processes)
 
     def starts(self, values: Mapping, log_level: str = "info") -> list[Start]:
         """bias_node and ekf_node of each tag, each with a frame of its own, NAMESPACE/base_link, unless it names another; values : override
@@ -213,7 +219,7 @@ class Fleet:
                 file = merged.pop("params_file", None)
                 files = {name: [_beside(self.path, file)] for name in ("bias_node", "ekf_node")} if file not in (None, "") else {}
                 merged |= {name: _beside(self.path, merged[name]) for name in PATHS if merged.get(name) not in (None, "")}
-                starts += tag(namespace, merged, files, log_level)
+                starts += [replace(each, remaps=self.remaps[namespace]) for each in tag(namespace, merged, files, log_level)]
         except InputError as error:
             raise InputError(f"{self.path}: {error}") from error
         return starts
@@ -248,6 +254,8 @@ def pooled(starts: list[Start], processes: int | str) -> list[Start]:
     members = [each for each in starts if each.executable in ("bias_node", "ekf_node")]
     if any(isinstance(part, str) for each in members for part in each.parameters):
         raise InputError("params_file: does not go with processes; write its values into the file of the tags.")
+    if any(each.remaps for each in members):
+        raise InputError("remaps: do not go with processes; leave processes out, or remap the drivers.")
     by_node = {f"/**/{each.label}": {"ros__parameters": each.parameters[-1]} for each in members if each.parameters}  # in any namespace
     file = folder_of_process() / "tags.yaml"  # a node that is started again reads it again
     write_text(file, yaml.safe_dump(by_node, allow_unicode=True))
@@ -275,6 +283,15 @@ def typed(texts: dict[str, str]) -> dict[str, bool | str]:
     """{name: value} of {name: text} as they come on a command line; empty ones are left out."""
     kinds = {"true": True, "false": False}
     return {name: kinds.get(text, text) for name, text in texts.items() if text != ""}
+
+
+def _remaps(path: str, given: object) -> dict[str, str]:
+    """{topic: name} of what a file of tags says. Raises InputError."""
+    entries: Any = {} if given is None else given
+    texts = [text for pair in entries.items() for text in pair] if isinstance(entries, dict) else [None]
+    if not all(isinstance(text, str) and text and ":=" not in text for text in texts):
+        raise InputError(f"{path}: remaps: {given!r} must be a mapping of topics to names, e.g. {{velocity/odometry: odom}}.")
+    return entries
 
 
 def _beside(path: str | Path, file: object) -> str:

@@ -47,6 +47,17 @@ def test_an_imu_on_another_topic():
     assert said(imu=None) == {}  # a CSV file has no topics
 
 
+ODOMETRY = "nav_msgs/msg/Odometry"
+
+
+def test_odometry_that_nothing_reads():
+    topics = {"/uwb/tdoa": "", "/tag1/uwb/tdoa": "", "/odometry": ODOMETRY, "/tag1/odometry": ODOMETRY, "/odometry/debiased": ODOMETRY}
+    assert said(topics=topics) == {}  # of filters of ours
+    found = said(topics={**topics, "/odom": ODOMETRY})
+    assert "--topic velocity/odometry=/odom" in found["odometry_unread"].remedy
+    assert said(topics={**topics, "/odom": ODOMETRY}, read=frozenset({"/odom"})) == {}
+
+
 def test_other_anchors_in_the_bag():
     moved = replace(ANCHORS, positions=ANCHORS.positions + [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
     assert said(recorded=moved)["survey_differs"].value == pytest.approx(1.0)

@@ -1,11 +1,14 @@
 """Deviations of positions of anchors that are found beside ground truth: whether errors are as large as they say."""
 
 from deviations_table import normalised, root
+import numpy as np
 import pytest
 
+from uwb_tdoa_bias.effects import EFFECTS
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.deviations import with_deviations
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
+from uwb_tdoa_tools.diagnosis.refinement import effects_of
 from uwb_tdoa_tools.readers import inputs
 from known_effects import clean_flight
 
@@ -41,3 +44,14 @@ def test_deviations_hold_on_measured_flights(shared_data):
 def test_what_is_no_anchor_keeps_its_deviation():
     found = attribute([clean_flight(300, 30.0)], GroundTruth(), undeclared=False)
     assert with_deviations(found.selection) is found.selection
+
+
+def test_delays_are_stated_apart_from_what_all_have_in_common():
+    """No TDOA shows what is common to all delays: a fit leaves it at 0, and no deviation of a value holds it."""
+    delays = 0.05 * np.random.default_rng(5).standard_normal(8)
+    flight = EFFECTS["anchor_delay"](dict(zip("01234567", delays.tolist()))).inject(clean_flight(301, 30.0))
+    found = attribute([flight], GroundTruth(), kinds=("anchor_delay",), undeclared=False)
+    (effect,) = effects_of(found.selection)
+    errors = np.array([effect.values[key] for key in "01234567"]) - (delays - delays.mean())
+    std = np.array([effect.std[key] for key in "01234567"])
+    assert std.max() < 0.03 and (np.abs(errors) < 3.0 * std).all()

@@ -63,7 +63,7 @@ def test_the_verdict_has_the_error_before_and_after_its_interval_and_how_many_fl
 
 def test_a_flight_of_which_each_half_was_judged_was_flown_once():
     parts = ("one", 2.0, 55.0), ("one", 7.0, 60.0), ("two", 1.0, 31.0)
-    scores = [SimpleNamespace(name=name, first=first, last=last) for name, first, last in parts]
+    scores = [SimpleNamespace(name=name, first=first, last=last, part="in_the_air") for name, first, last in parts]
     before = {"runs": [{"flight": name} for name, _, _ in parts], "scores": scores}
     assert _flights(SimpleNamespace(before=before)) == "2 flights, 88 s in the air"
 
@@ -237,6 +237,15 @@ def test_what_could_not_be_told_comes_with_what_would_tell(result):
         "pair_offset (0-1 against 1-2)",
     ]
     assert "anchor_delay" not in str(by_remedy(found.values()))
+
+
+def test_what_the_flights_have_is_not_asked_for(result):
+    """Of a flight with attitudes, but with neither IMU nor wheels nor orientations of anchors."""
+    (flight, *_) = result.flights
+    assert flight.imu is None and np.isfinite(flight.truth.q).all()
+    items = [Unobservable("gyro_bias", None), Unobservable("velocity_scale", None)]
+    asked = [item.remedy for item in undetermined(replace(result, unobservable=items))]
+    assert asked == ["a gyroscope", "a velocity (wheels, optical flow, visual odometry)"]
 
 
 def test_without_truth_ground_truth_would_tell(without_truth):

@@ -12,7 +12,7 @@ from uwb_tdoa_ekf.core.engine import feed
 from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, TDOA, Measurements, new_state, structured
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.readers.inputs import Reading
-from uwb_tdoa_tools.scoring.metrics import airborne
+from uwb_tdoa_tools.scoring.metrics import judged_part
 
 FLIGHTS = (
     "0422-log00", "0425-traj13", "0425-traj2", "0426-traj1", "0426-traj15", "0426-traj9", "tdoa2-obs-log1",
@@ -62,7 +62,7 @@ def test_a_filter_put_aside_or_started_in_flight_is_back_within_three_seconds(fl
     print(f"\n{'flight':16s}{'RMSE':>8s}" + "".join(f"{kind}@{at:.0f}s".rjust(14) for at in TIMES for kind in kinds))
     for flight in flights:
         usual = run_offline(flight).odometry
-        first, last = airborne(flight.truth)
+        _, first, last = judged_part(flight.truth)
         steady = rms(flight, usual.t, usual.p, first + 3.0, last)
         cells = []
         for at in TIMES:
@@ -85,7 +85,7 @@ def test_a_wrong_yaw_is_mended_or_honestly_doubted(flights):
     for flight in flights:
         cells = []
         for wrong in (0.5 * np.pi, -0.5 * np.pi):
-            first, _ = airborne(flight.truth)
+            _, first, _ = judged_part(flight.truth)
             true = Rotation.from_quat(flight.truth.q[np.searchsorted(flight.truth.t, first)]).as_euler("ZYX")[0]
             odometry = run_offline(flight, FilterConfig(initial_yaw=true + wrong)).odometry
             at = np.minimum(np.searchsorted(flight.truth.t, odometry.t), len(flight.truth) - 1)

@@ -4,10 +4,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Truth
 from uwb_tdoa_ekf.core.verdicts import INVALID, LATE, REJECTED, STARTUP, USED
-from uwb_tdoa_tools.scoring.metrics import Pool, Result, Score, airborne, coverage, nees, nis, pooled, position_errors, summary
+from uwb_tdoa_tools.scoring.metrics import Pool, Result, Score, coverage, judged_part, nees, nis, pooled, position_errors, summary
 from uwb_tdoa_tools.evaluating.table import line
 
 UPRIGHT = [0.0, 0.0, 0.0, 1.0]
@@ -36,20 +35,19 @@ def residuals(innovation, variance, verdict):
     return SimpleNamespace(innovation=np.array(innovation), variance=np.array(variance), verdict=np.array(verdict))
 
 
-def test_airborne_is_from_the_first_to_the_last_instant_above_the_limit():
+def test_what_is_judged_is_from_the_first_to_the_last_instant_above_the_limit():
     truth = straight()
-    assert airborne(truth) == (1.0, 9.0)
+    assert judged_part(truth) == ("in_the_air", 1.0, 9.0)
     truth.p[200:220, 2] = 0.1  # a touch of the floor in between counts
-    assert airborne(truth) == (1.0, 9.0)
+    assert judged_part(truth)[1:] == (1.0, 9.0)
     truth.p[:, 2] = np.where(truth.p[:, 2] > 0.5, 0.3, 0.0)  # at the limit is not above it
-    with pytest.raises(InputError, match="0.3 m"):
-        airborne(truth)
+    assert judged_part(truth)[0] == "moving"  # which never leaves the floor
 
 
 def test_errors_are_against_the_truth_interpolated_to_the_estimate():
     truth = straight(rate=2.0)  # much coarser than the estimate, which is off its grid
     odometry = estimate(truth, constant(0.1, -0.2, 0.3))
-    t, error, covariance = position_errors(odometry, truth, *airborne(truth))
+    t, error, covariance = position_errors(odometry, truth, *judged_part(truth)[1:])
     assert t[0] >= 1.0 and t[-1] <= 9.0 and len(t) == 801
     np.testing.assert_allclose(error, np.tile([0.1, -0.2, 0.3], (801, 1)), atol=1e-9)
     assert covariance.shape == (801, 3, 3)
@@ -60,7 +58,7 @@ def test_what_lies_in_a_hole_of_the_truth_has_no_error():
     odometry = estimate(truth, constant(0.1, -0.2, 0.3))
     known = (truth.t < 4.0) | (truth.t > 6.0)
     truth = Truth(truth.t[known], truth.p[known] ** 2, truth.q[known])  # nothing to be interpolated
-    t, _, _ = position_errors(odometry, truth, *airborne(truth))
+    t, _, _ = position_errors(odometry, truth, *judged_part(truth)[1:])
     assert np.sum(t <= 4.0) > 100 and np.sum(t >= 6.0) > 100 and not np.any((t > 4.02) & (t < 5.98))
 
 

@@ -8,7 +8,7 @@ import pytest
 from uwb_tdoa_bias.effects import Track, aid_samples
 from uwb_tdoa_bias.foundation.sensors import Height
 from uwb_tdoa_tools.readers.optical_flow import COUNTS, NEAREST_RANGE, velocity_of
-from uwb_tdoa_tools.scoring.metrics import airborne
+from uwb_tdoa_tools.scoring.metrics import judged_part
 from known_effects import clean_flight
 
 
@@ -31,7 +31,7 @@ def pixel_counts(flight):
 
 def test_pixel_counts_become_the_velocity_that_made_them(flight):
     made = velocity_of(*pixel_counts(flight), flight.height, flight.imu)
-    first, last = airborne(flight.truth)
+    _, first, last = judged_part(flight.truth)
     air = (made.t > first + 0.5) & (made.t < last - 0.5)
     true = aid_samples("velocity", made.t[air], Track(flight.truth)).reading
     assert np.isinf(made.std[:, 2]).all() and np.isfinite(made.std[:, :2]).all()

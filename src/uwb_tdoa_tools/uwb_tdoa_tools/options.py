@@ -45,7 +45,8 @@ if TYPE_CHECKING:
     from .diagnosis.constraints.mark import Mark
 
 TOPICS = (  # that are read from bags
-    "uwb/tdoa", "uwb/anchors", "imu/data", *(sensor.topics[0][0] for sensor in SENSORS.values()), "ground_truth/pose", "odometry",
+    "uwb/tdoa", "uwb/anchors", "imu/data", *(topic for sensor in SENSORS.values() for topic, _ in sensor.topics),
+    "ground_truth/pose", "odometry",
 )  # fmt: skip
 
 

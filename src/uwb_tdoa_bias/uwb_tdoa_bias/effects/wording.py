@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+ROUNDED = 0.1  # share by which a standard deviation may be rounded
 LARGEST = 3  # values that a sentence names
 
 
 def rounded(value: float, std: float | None = None) -> str:
-    """A number to the first digit of its standard deviation, or to three digits without one."""
+    """A number to the first digit of its standard deviation, or to the second where the first is off by more than ROUNDED; to three digits
+    without one."""
     if not std:
         return f"{value:.3g}"
     return f"{value:.{_decimals(std)}f}"
@@ -37,4 +39,5 @@ def counted(words: Iterable[str], noun: str) -> str:
 
 
 def _decimals(std: float) -> int:
-    return max(0, -math.floor(math.log10(std)))
+    decimals = -math.floor(math.log10(std))
+    return max(0, decimals + (abs(round(std, decimals) - std) > ROUNDED * std))

@@ -142,7 +142,15 @@ class ParameterNode(Node):
             return SetParametersResult(successful=True)
         if others and self.frozen:
             return SetParametersResult(successful=False, reason=self.refuse(f"parameter {others[0].name!r:.{LONGEST_NAME}}"))
+        unknown = [each.name for each in others if not self.has_parameter(each.name)]
+        if unknown:  # rclpy says of which only [], for lack of a copy
+            return SetParametersResult(successful=False, reason=self._unknown(unknown[0]))
         return super().set_parameters_atomically(others)
+
+    def _unknown(self, name: str) -> str:
+        """That there is no such parameter, and which one was probably meant."""
+        near = get_close_matches(name, self._parameters, n=1, cutoff=0.5)
+        return f"{self.get_name()} has no parameter {name!r:.{LONGEST_NAME}}; " + (f"set {near[0]}." if near else "see `ros2 param list`.")
 
     def _is_so_for_good(self, parameter: RosParameter) -> bool:
         name = parameter.name

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..streams import NOTE, StreamRules, most_severe_first
+from ..streams import NOTE, Steady, StreamRules, most_severe_first
 from .sign_watch import SignWatch
 from ..streams.stamp_rules import usual
 
@@ -40,6 +40,7 @@ class StreamWatch:
         self._tdoa: list[tuple[np.ndarray, ...]] = []
         self._sign = SignWatch(self._anchors)
         self._turns: int | None = None  # as of Monitor, at the last look
+        self._steady = Steady()
 
     def add_imu(self, t: np.ndarray, arrival: np.ndarray, gyro: np.ndarray, accel: np.ndarray) -> None:
         """Take samples: stamps and arrivals, (n,) s, of one clock if possible; gyro (n, 3) rad/s; accel (n, 3) m/s^2."""
@@ -71,7 +72,7 @@ class StreamWatch:
         still, found = {finding.rule for finding in rules.findings(LATEST)}, []
         if still:
             found = [finding for finding in rules.findings() if finding.rule in still and self._counts(finding)]
-        return most_severe_first([*found, *filter(None, [self._sign.finding])])
+        return most_severe_first(self._steady([*found, *filter(None, [self._sign.finding])]))
 
     def _counts(self, finding: Finding) -> bool:
         if finding.severity == NOTE or finding.rule in self._ignored:

@@ -8,7 +8,7 @@ for finding in streams.findings():
     print(finding.cause, finding.evidence, finding.remedy)
 """
 
-from .finding import ERROR, NOTE, SEVERITIES, WARNING, Finding, most_severe_first
+from .finding import ERROR, NOTE, SEVERITIES, WARNING, Finding, Steady, most_severe_first
 from .rules import StreamRules
 
-__all__ = ["ERROR", "NOTE", "SEVERITIES", "WARNING", "Finding", "StreamRules", "most_severe_first"]
+__all__ = ["ERROR", "NOTE", "SEVERITIES", "WARNING", "Finding", "Steady", "StreamRules", "most_severe_first"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+import math
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
@@ -20,6 +21,7 @@ SURVEY = "survey"
 WRONG_WITH_IMU = frozenset(  # the same while the filter uses the IMU
     ["imu_force_unit", "imu_no_gravity", "imu_rate_unit", "imu_turned", "imu_axes", "imu_silent", "imu_axis_dead", "stamps_apart"]
 )
+SAME = 0.3  # share by which the number that decided may change until a finding that goes on is said anew
 FEW_UNKNOWN = 0.5  # share of TDOAs with unknown ids, which are not used: below it the others determine the position
 
 
@@ -50,3 +52,23 @@ class Finding:
 def most_severe_first(findings: Iterable[Finding]) -> list[Finding]:
     """The findings in order of severity; within one in the order in which they came."""
     return sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity))
+
+
+class Steady:
+    """Keeps the text of each finding that goes on: numbers in it would be others each second."""
+
+    def __init__(self) -> None:
+        self._said: dict[tuple[str, str], Finding] = {}  # by rule and severity, as it was found first
+
+    def __call__(self, findings: Iterable[Finding]) -> list[Finding]:
+        """The findings, each as it was first said, as long as it goes on and the number that decided is much the same."""
+        out = []
+        for finding in findings:
+            said = self._said.get((finding.rule, finding.severity), finding)
+            out.append(said if _much_alike(said.value, finding.value) else finding)
+        self._said = {(finding.rule, finding.severity): finding for finding in out}
+        return out
+
+
+def _much_alike(one: float, other: float) -> bool:
+    return abs(one - other) <= SAME * max(abs(one), abs(other)) or (math.isnan(one) and math.isnan(other))

@@ -5,6 +5,7 @@ Topic (in a bag always absolute)   type                              what
 /uwb/tdoa                          uwb_tdoa_msgs/msg/Tdoa            Flight.tdoa
 /uwb/anchors                       uwb_tdoa_msgs/msg/AnchorArray     Flight.anchors, once, transient local
 /height, /pressure, ...            those of SENSORS                  Flight.height, Flight.pressure, ..., frame base_link
+/velocity/odometry, ...            others of SENSORS                 read into the same stream; not written
 /ground_truth/pose                 geometry_msgs/msg/PoseStamped     Flight.truth
 /tf_static                         tf2_msgs/msg/TFMessage            frames anchor_<id>, once, transient local; of sensors, if there are
 
@@ -46,6 +47,7 @@ if TYPE_CHECKING:
     from rosbags.interfaces import Connection
     from rosbags.rosbag2 import Writer
     from rosbags.typesys.store import Typestore
+    from uwb_tdoa_bias.foundation.sensors import Sensor
     from uwb_tdoa_ekf.results import Odometry
     from ..clock import Straightened
     from .files import BagReader
@@ -210,7 +212,9 @@ def read_bag(
         meta = {**about["meta"], "bag": str(path)}
         remarks, name_of = list[str](), Names(namespace, topics)
         kinds = _STREAMS if truth else {name: kind for name, kind in _STREAMS.items() if name != "pose"}
-        found = {name: read_topic(path, reader, name_of(kind.topic), kind.message, kind.row) for name, kind in kinds.items()}
+        own = {name: kind for name, kind in kinds.items() if name not in SENSORS}
+        found = {name: read_topic(path, reader, name_of(kind.topic), kind.message, kind.row) for name, kind in own.items()}
+        found |= {name: read_sensor(path, reader, sensor, name_of) for name, sensor in SENSORS.items()}
         found, clock = on_one_clock(found)
         if clock.jumps or clock.kept:
             meta["clock"] = clock.jumps, clock.outliers
@@ -228,7 +232,7 @@ def read_bag(
             whole = sound(rows).all(axis=1)
             if not whole.all():
                 if not salvage:
-                    raise _not_finite(path, name_of(topic), stamps, rows, sound)
+                    raise _not_finite(path, " and ".join(name_of(each) for each, _ in topics_of(name)), stamps, rows, sound)
                 remarks.append(f"{topic}: {np.count_nonzero(~whole)} messages left out, they are no numbers.")
                 stamps, rows = stamps[whole], rows[whole]
             return make(stamps, rows) if len(stamps) else None
@@ -405,6 +409,24 @@ def read_topic(
         frames[message.header.frame_id] += 1
     stamps, table = np.array([values[0] for values in rows], dtype=np.int64), np.array([values[1:] for values in rows], dtype=float)
     return TopicMessages(stamps, np.array(arrived, dtype=np.int64), table, frames)
+
+
+def topics_of(name: str) -> tuple[tuple[str, str], ...]:
+    """((topic, type of its messages), ...) of a stream of a Flight, by our names."""
+    return SENSORS[name].topics if name in SENSORS else ((_STREAMS[name].topic, _STREAMS[name].message),)
+
+
+def read_sensor(path: str | Path, reader: BagReader, sensor: Sensor, name_of: Names) -> TopicMessages:
+    """TopicMessages of all topics of a Sensor, as the node hears them: in the order in which they came. Raises InputError as `read_topic`
+    does."""
+    row, _, _ = bag_messages.of_sensor(sensor)
+    parts = [read_topic(path, reader, name_of(topic), kind, row) for topic, kind in sensor.topics]
+    filled = [part for part in parts if len(part.stamps)]
+    if len(filled) < 2:
+        return filled[0] if filled else parts[0]
+    order = np.argsort(np.concatenate([part.arrived for part in filled]), kind="stable")
+    stamps, arrived, rows = (np.concatenate([getattr(part, name) for part in filled])[order] for name in ("stamps", "arrived", "rows"))
+    return TopicMessages(stamps, arrived, rows, sum((part.frames for part in filled), Counter()))
 
 
 def read_anchors(path: str | Path, reader: BagReader, topic: str) -> Anchors | None:

@@ -13,7 +13,7 @@ from uwb_tdoa_bias.effects.anchor_ids import AnchorIds
 from uwb_tdoa_ekf.streams import WARNING, Finding
 
 from . import motion_rules, pair_rules, time_rules
-from .known_path import AIRBORNE, KnownPath
+from .known_path import KnownPath, least_height
 from .motion_rules import TrueMotion
 from .repairs import repairs_of
 
@@ -55,7 +55,7 @@ def of_truth(flight: Flight) -> Iterator[Finding]:
     """Holes and leaps of the ground truth in the air."""
     assert flight.truth is not None
     of = flight.truth
-    up = np.flatnonzero(of.p[:, 2] > AIRBORNE)
+    up = np.flatnonzero(of.p[:, 2] > least_height(of))
     if len(up) < 2:
         return
     t, p = of.t[up[0] : up[-1] + 1], of.p[up[0] : up[-1] + 1]

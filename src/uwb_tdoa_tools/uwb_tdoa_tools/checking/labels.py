@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from ..bags.placing import Place
     from .recording import Recording
 
+WHEELS = "velocity/odometry"
 TURNED, SHIFTED = np.deg2rad(2.0), 0.02  # rad and m that a frame may be off the body frame
 
 
@@ -83,6 +84,17 @@ def no_imu(recording: Recording) -> Iterator[Finding]:
             "-p use_imu:=false  # of ekf_node, if there is no IMU",
             0.0,
         )
+
+
+def odometry_unread(recording: Recording) -> Iterator[Finding]:
+    """Odometry, as of wheels, under a name that nothing reads. What a filter of ours gave, for whatever tag, is none."""
+    tags = [topic.removesuffix("uwb/tdoa") for topic in recording.topics if topic.endswith("/uwb/tdoa")]
+    known = {*recording.read, *(f"{tag}{ours}" for tag in tags for ours in ("odometry", "odometry/debiased"))}
+    there = sorted(topic for topic, kind in recording.topics.items() if kind == "nav_msgs/msg/Odometry" and topic not in known)
+    if there and "velocity" not in recording.sensors:
+        line = f"if it is of wheels or a camera: --topic {WHEELS}={there[0]} for tools, and -r {WHEELS}:={there[0]} for ekf_node"
+        cause, evidence = f"the odometry on {', '.join(there)} is not used", f"velocities are read from velocity and {WHEELS}"
+        yield Finding("odometry_unread", WARNING, cause, evidence, line, float(len(there)))
 
 
 def anchors(recording: Recording) -> Iterator[Finding]:
@@ -152,4 +164,4 @@ def losses(recording: Recording) -> Iterator[Finding]:
         yield Finding("imu_lost", WARNING, cause, evidence, remedy, np.nan)
 
 
-RULES = (frames, senders, no_imu, anchors, sorted_file, clock, other_time, losses)
+RULES = (frames, senders, no_imu, odometry_unread, anchors, sorted_file, clock, other_time, losses)

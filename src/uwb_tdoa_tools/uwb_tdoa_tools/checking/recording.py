@@ -16,7 +16,7 @@ from uwb_tdoa_bias.foundation.sensors import LOCATING, SENSORS
 from uwb_tdoa_bias.foundation.survey_faults import refuse_faulty
 
 from ..bags import messages as bag_messages, placing
-from ..bags.bag import Names, arrivals, on_one_clock, read_anchors, read_topic
+from ..bags.bag import Names, arrivals, on_one_clock, read_anchors, read_sensor, read_topic
 from ..bags.files import open_bag, remarks_of
 from ..bags.placing import TF_STATIC
 from ..readers import read_survey
@@ -33,7 +33,8 @@ if TYPE_CHECKING:
     from ..live.ends import End
 
 IMU, TDOA = "imu/data", "uwb/tdoa"
-HEARD = (TDOA, IMU, "uwb/anchors", *(of.topics[0][0] for of in SENSORS.values()), "uwb/tdoa_corrected", "odometry", "uwb/residual")
+OF_SENSORS = tuple(topic for sensor in SENSORS.values() for topic, _ in sensor.topics)
+HEARD = (TDOA, IMU, "uwb/anchors", *OF_SENSORS, "uwb/tdoa_corrected", "odometry", "uwb/residual")
 _ROWS = {
     IMU: ("sensor_msgs/msg/Imu", bag_messages.imu_row),
     TDOA: ("uwb_tdoa_msgs/msg/Tdoa", bag_messages.tdoa_row),
@@ -48,9 +49,10 @@ class Recording:
     tdoa_arrival, imu_arrival : (n,) s, when the recorder received them, NaN where that is not known;
     frames : {topic: {frame_id: messages}}; places : {frame_id: (Rotation, arm (3,) m)} of those that /tf_static connects
     with the body, where the samples are those of an IMU in its origin;
-    topics : {topic: type} of a bag, or of all that are live; recorded : Anchors that the bag itself holds, or None; falls :
-    how often the stamps fell in a file whose reader has sorted them; remarks : sentences on what could not be read of a
-    damaged one; ends : [End] of live topics; sensors : {name: Stream} of those of the SENSORS that there are; jumps : of the clock, which
+    topics : {topic: type} of a bag, or of all that are live; read : names of those that were read, or are our own;
+    recorded : Anchors that the bag itself holds, or None; falls : how often the stamps fell in a file whose reader has sorted them;
+    remarks : sentences on what could not be read of a damaged one; ends : [End] of live topics;
+    sensors : {name: Stream} of those of the SENSORS that there are; jumps : of the clock, which
     is continuous here, and outliers : {stream: messages left out because of their stamps};
     losses : ((cause, evidence, remedy), ...) of what a reader has not used.
     """
@@ -65,6 +67,7 @@ class Recording:
     places: dict[str, Place] = field(default_factory=dict)
     topics: dict[str, str] = field(default_factory=dict)
     recorded: Anchors | None = None
+    read: frozenset[str] = frozenset()
     falls: int = 0
     remarks: tuple[str, ...] = ()
     ends: tuple[End, ...] = ()
@@ -122,8 +125,8 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
     with open_bag(path, reading.salvage) as reader:
         topics = {connection.topic: connection.msgtype for connection in reader.connections}
         kinds = {"tdoa": (TDOA, *_ROWS[TDOA]), "imu": (IMU, *_ROWS[IMU])}
-        kinds |= {name: (of.topics[0][0], of.message, bag_messages.of_sensor(of)[0]) for name, of in SENSORS.items()}
         found = {name: read_topic(path, reader, name_of(topic), kind, row) for name, (topic, kind, row) in kinds.items()}
+        found |= {name: read_sensor(path, reader, sensor, name_of) for name, sensor in SENSORS.items()}
         arrival = arrivals(found)
         found, clock = on_one_clock(found)
         tdoa, imu = found["tdoa"], found["imu"]
@@ -154,6 +157,7 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
         frames={topic: dict(stream.frames) for topic, stream in ((TDOA, tdoa), (IMU, imu)) if len(stream.stamps)},
         places={frame: place for frame in {*tdoa.frames, *imu.frames} if (place := placing.place_of(tree, frame))},
         topics=topics,
+        read=frozenset(map(name_of, HEARD)),
         recorded=recorded,
         remarks=remarks,
         sensors=sensors,

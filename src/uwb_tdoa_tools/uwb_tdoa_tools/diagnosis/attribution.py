@@ -77,7 +77,7 @@ class Attribution:
     @property
     def of_floor(self) -> tuple[Effect, ...]:
         """Effects found near the floor that the filter may get: tuple. Functions without a name would go on in the air."""
-        return tuple(effect for effect in effects_of(self.floor) if effect.weighed) if self.floor else ()
+        return effects_of(self.floor.where(lambda effect: effect.weighed)) if self.floor else ()
 
     @property
     def covariance(self) -> Covariance | None:
@@ -93,7 +93,9 @@ class Attribution:
         out = _findings(self.selection, self.candidates, self.names)
         out += map(_of_detection, self.detections)
         if self.floor:
-            out += [replace(finding, on_floor=True) for finding in _findings(self.floor, [], self.floor_names)]
+            written = {entry_of(effect): effect for effect in self.of_floor}
+            near = _findings(self.floor, [], self.floor_names)
+            out += [replace(one, effect=written.get(entry_of(one.effect), one.effect), on_floor=True) for one in near]
         for name, selection in self.alone:
             out += [replace(finding, flight=name) for finding in _findings(selection, [], (name,))]
         return out

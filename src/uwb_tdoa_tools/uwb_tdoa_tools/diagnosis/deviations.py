@@ -23,6 +23,7 @@ from .self_calibration.equations import features
 from .self_calibration.prior import DELAY, FUNCTION_STDS, OF_ANCHORS, POSITION, eliminated, posterior
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from .regression.fit import Fit
     from .regression.select import Selection
     from .regression.table import RegressionTable
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
 
 LENGTH = 4.0  # m over which functions of the place change; the shift of an anchor makes errors that change as slowly
 UNSAID = 0.03  # m, that coordinates and delays may be off by, of which no anchor has any in the fit
+CANCELS = 1e-9  # regressor of delays together, which is nothing
 LASTING = 14.0  # by which errors that are alike for a while are alike for longer than blocks tell
 
 
@@ -41,15 +43,34 @@ def with_deviations(selection: Selection) -> Selection:
     places = [k for k, column in enumerate(model.columns) if column.effect[0] in OF_ANCHORS]
     if not places or any(part.innovations is not None for part in table.radio_parts):
         return selection
-    values, std = _beside_others(table, model)
-    fitted = np.sqrt(np.diag(model.cov))
+    away, covariance = _beside_others(table, model)
+    apart = apart_from_common(table, model.columns)
+    shown, fitted = apart @ model.cov @ apart, stated(table, model.columns, model.cov)
+    std = stated(table, model.columns, covariance)
     grow = np.ones(len(fitted))
-    grow[places] = (np.maximum(fitted, np.hypot(std, values - model.beta)) / fitted)[places]
-    return replace(selection, fit=replace(model, cov=model.cov * np.outer(grow, grow)))
+    grow[places] = (np.maximum(fitted, np.hypot(std, apart @ away)) / fitted)[places]
+    return replace(selection, fit=replace(model, cov=model.cov - shown + shown * np.outer(grow, grow)))
+
+
+def stated(table: RegressionTable, columns: Sequence[Column], cov: np.ndarray) -> np.ndarray:
+    """Standard deviations (k,) of the values of some Columns with a covariance (k, k): of delays apart from what all have in common."""
+    apart = apart_from_common(table, columns)
+    deviations: np.ndarray = np.sqrt(np.maximum(np.diag(apart @ cov @ apart), 0.0))
+    return deviations
+
+
+def apart_from_common(table: RegressionTable, columns: Sequence[Column]) -> np.ndarray:
+    """(k, k), what takes from delays of anchors among some Columns the mean of all, where it cancels in every row, as it does in TDOAs. A
+    fit leaves it at 0, and its deviation would be that of the prior."""
+    out, places = np.eye(len(columns)), [k for k, column in enumerate(columns) if column.effect == (DELAY,)]
+    if len(places) > 1 and np.abs(table.matrix([columns[k] for k in places]).sum(axis=1)).max() < CANCELS:
+        out[np.ix_(places, places)] -= 1.0 / len(places)
+    return out
 
 
 def _beside_others(table: RegressionTable, model: Fit) -> tuple[np.ndarray, np.ndarray]:
-    """(values (k,), standard deviations (k,)) of the columns of a Fit, with what can take the place of anchors integrated out."""
+    """(by how much the values are others (k,), their covariance (k, k)) of the columns of a Fit, with what can take the place of anchors
+    integrated out."""
     rows, known, near = table.radio_rows, {column.effect for column in model.columns}, _heard_with(table, model)
     mine = table.matrix(model.columns, rows)
     beside = [column for column in table.columns if column.effect in ((POSITION,), (DELAY,)) and (near is None or _anchor(column) in near)]
@@ -71,7 +92,7 @@ def _beside_others(table: RegressionTable, model: Fit) -> tuple[np.ndarray, np.n
         return posterior(*eliminated(gram, vector, n, np.append(sizes, np.full(functions.shape[1], size))), prior, np.zeros(n))
 
     best = max(map(solution, FUNCTION_STDS), key=lambda one: one.evidence)
-    return best.step, np.sqrt(np.diag(best.covariance))
+    return best.step - model.beta, best.covariance
 
 
 def _anchor(column: Column) -> str:

@@ -20,6 +20,7 @@ from .attribution import Attribution, attribute, residuals_of
 from .findings import EffectFinding, Refused, usable
 from .health import health
 from .references import GroundTruth, Reference
+from .refinement import written
 from .regression.confounding import unobservable
 from .result import Diagnosis
 from .self_calibration import Tape, self_calibrate
@@ -138,7 +139,8 @@ def _by_error(
     (fitted, sound), base, config, map_function = flights, work.base, work.config, work.map_function
     trying = work.saying("running the filter without each")
     # A finding stays one even if the filter does without it; it is only not added.
-    selected = validation.select_by_error(found, sound, comparison.Baseline(rest, config), trying, map_function)
+    model = replace(found, selection=written(found.selection, found.candidates))
+    selected = validation.select_by_error(model, sound, comparison.Baseline(rest, config), trying, map_function)
     attribution, selected = repairing.before_others(found, selected, repairs)
     model = selected.applied(attribution)
     effects, baseline = with_calibration(base, usable(model.effects).effects, model.covariance), comparison.Baseline(base, config)

@@ -10,6 +10,7 @@ import numpy as np
 from uwb_tdoa_bias.effects import SmoothTerm
 
 from .channels import CHANNELS
+from .deviations import stated
 from .findings import Refused
 from .regression.fit import fit
 from .regression.held_out import held_out
@@ -39,7 +40,7 @@ def effects_of(selection: Selection) -> tuple[Effect, ...]:
     values: dict[Hashable, dict[str, float]] = {}
     std: dict[Hashable, dict[str, float]] = {}
     effects: dict[Hashable, Effect] = {}
-    error = np.sqrt(np.diag(selection.fit.cov))
+    error = stated(selection.table, selection.fit.columns, selection.fit.cov)
     fitted = dict(zip(selection.fit.columns, zip(selection.fit.beta.tolist(), error.tolist())))
     for term in (term for candidate in selection.chosen for term in candidate.terms):
         effect = term.effect
@@ -52,6 +53,16 @@ def effects_of(selection: Selection) -> tuple[Effect, ...]:
             values[identity][column.key] = min(max(value, -bound), bound)
             std.setdefault(identity, {})[column.key] = min(deviation, bound)
     return tuple(replace(effect, values=values[identity], std=std[identity], source="diagnose") for identity, effect in effects.items())
+
+
+def written(selection: Selection, declared: Sequence[Candidate]) -> Selection:
+    """The Selection that effects.yaml can hold: without functions of what no node has, with the Candidates of the catalogue that are worth
+    it in their place, and fitted anew, so that each value is that of this model. Errors of the ground truth, and what the filter judges
+    itself, stay: no node meets them."""
+    kept = selection.where(lambda effect: effect.usable or not isinstance(effect, SmoothTerm))
+    if kept is selection:
+        return selection
+    return select(selection.table, list(declared), selection.fit.inflation, start=kept.chosen)
 
 
 def entry_of(effect: Effect) -> Hashable:

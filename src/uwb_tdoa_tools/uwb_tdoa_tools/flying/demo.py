@@ -18,7 +18,7 @@ from .. import command_lines
 from ..bags.bag import read_odometry, write_bag
 from ..live.run import accounts, run_live
 from ..localizing.rerun_file import write_rerun
-from ..scoring.metrics import Score, airborne
+from ..scoring.metrics import Score
 from . import trial
 from .report import sentence
 from .sensors import Radio
@@ -81,7 +81,6 @@ def measured(
     flight = reading.one(path)
     if flight.truth is None:
         raise InputError(f"{path}: holds no ground truth to compare with; take a flight that has it.")
-    airborne(flight.truth)
     return DemoFlight(flight, effects_file, model)
 
 

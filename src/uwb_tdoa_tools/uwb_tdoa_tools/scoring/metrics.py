@@ -11,14 +11,13 @@ from typing import Any, Protocol, TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.effects.samples import PoseColumns
-from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.verdicts import REJECTED, USED
 from uwb_tdoa_ekf.results import rows_of
 
 from ..json_values import as_json
 from .by_phase import EVERYTHING, ErrorSeries, PooledErrors, or_nan, rms
 from .distribution import Distribution
-from .phases import AIRBORNE, TITLES, in_the_air, motion, phases
+from .phases import TITLES, in_the_air, motion, phases
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -42,14 +41,6 @@ SPARSE = 4.0
 START_GRACE = 1.0  # s into the airborne part by which the first estimate must have come
 FIGURES = 3  # version of what a Result holds
 READY = 100  # TDOAs that a filter may take to begin with
-
-
-def airborne(truth: Truth) -> tuple[float, float]:
-    """(first, last) stamp of the truth, s, with z above 0.3 m. Raises InputError if it never is."""
-    found = in_the_air(truth)
-    if found is None:
-        raise InputError(f"truth: z never exceeds {AIRBORNE} m, so that no part of this flight counts; is it a flight?")
-    return found
 
 
 def judged_part(truth: Truth) -> tuple[str, float, float]:

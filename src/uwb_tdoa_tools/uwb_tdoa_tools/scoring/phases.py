@@ -25,12 +25,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ..checking.known_path import AIRBORNE
+
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.flight import Truth
 
     Span = tuple[float, float]  # from when to when, s
 
-AIRBORNE = 0.3  # m of z
 RISE = 0.07  # m above its height at rest: away from the floor
 MOVED = 0.1  # m from its place at rest: away, where height tells nothing
 SETTLED = 0.5  # s at either end, whose median is the place at rest

@@ -15,7 +15,7 @@ from uwb_tdoa_bias.foundation.flight import Flight, Truth
 from . import aids, imu, ranging
 from .config import SimulationConfig
 from .imu import NO_IMU_ERRORS, ImuErrors
-from .trajectories import Trajectory
+from .vehicles import VEHICLES
 
 if TYPE_CHECKING:
     from .motion import Flyable
@@ -24,7 +24,7 @@ __all__ = ["NO_IMU_ERRORS", "ImuErrors", "SimulationConfig", "simulate"]
 
 
 def simulate(config: SimulationConfig, trajectory: Flyable | None = None) -> Flight:
-    """Fly `config`, a SimulationConfig, and return the Flight. Raises InputError where it does not fit together.
+    """Fly, drive or carry `config`, a SimulationConfig, and return the Flight. Raises InputError where it does not fit together.
 
     trajectory : what has motion(t) and motors(t) of a Trajectory, to fly instead of the config's own.
     truth : exact poses.
@@ -35,7 +35,7 @@ def simulate(config: SimulationConfig, trajectory: Flyable | None = None) -> Fli
     """
     filled, room = config.complete()
     assert filled.anchors is not None
-    flown: Flyable = trajectory or Trajectory(filled, room, filled.random("trajectory"))
+    flown: Flyable = trajectory or VEHICLES[filled.vehicle](filled, room, filled.random("trajectory"))
     t_imu = np.arange(1, int(filled.duration * filled.imu_rate) + 1) / filled.imu_rate
     samples, gyro_bias, accel_bias = imu.measure(t_imu, flown, filled.imu_errors, filled.random)
     t_truth = np.arange(1, int(filled.duration * filled.truth_rate) + 1) / filled.truth_rate
@@ -47,9 +47,10 @@ def simulate(config: SimulationConfig, trajectory: Flyable | None = None) -> Fli
     for name, values in (("v", motion.v), ("gyro_bias_", gyro_bias[newest]), ("accel_bias_", accel_bias[newest])):
         state.update({name + axis: values[:, k] for k, axis in enumerate("xyz")})
     parameters |= {name: getattr(flown, name, None) for name in ("take_off", "landing")}
+    kind = "" if config.vehicle == "quadrotor" else f"{config.vehicle}-"
     room_name = config.constellation if config.anchors is None else "anchors"
     return Flight(
-        name=f"sim-{config.trajectory}-{config.protocol}-{room_name}-{config.seed}",
+        name=f"sim-{kind}{config.trajectory if config.path is None else 'path'}-{config.protocol}-{room_name}-{config.seed}",
         anchors=filled.anchors,
         tdoa=tdoa,
         imu=samples,

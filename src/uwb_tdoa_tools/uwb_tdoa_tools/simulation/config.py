@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, make_dataclass, replace
+from types import MappingProxyType
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
@@ -22,6 +23,17 @@ if TYPE_CHECKING:
 
 MOST_HEARD = 64  # anchors that a tag hears at once
 YAW_PROFILES = ("fixed", "along_track", "rotating")
+WHEELS_RATE = 50.0  # Hz
+FARTHEST = 1e5  # m, of a point of a path
+
+OF_VEHICLE = MappingProxyType({  # what the configuration of each is, unless it is given
+    "quadrotor": {},
+    "rover": {
+        "constellation": "six_wide", "speed": 0.8, "protocol": "tdoa3", "tdoa_rate": 100.0, "imu_rate": 100.0, "truth_rate": 50.0,
+        "tag_lever_arm": (0.1, 0.0, 0.4), "velocity_noise": 0.02, "wheel_scale": 0.02, "wheel_slip": 0.2,
+    },
+    "hand": {"height": 1.1, "imu_rate": 100.0, "truth_rate": 50.0, "yaw": "along_track"},
+})  # fmt: skip
 
 
 NOISES = tuple(f"{name}_noise" for name in SENSORS)
@@ -38,15 +50,19 @@ class SimulationConfig(_Noises):
     The room and the path
     ---------------------
     seed : of all random streams, 0 or more (default 0)
+    vehicle : "quadrotor" takes off, flies and lands; "rover" drives on the floor, x ahead, and stops now and then; "hand": a person
+        carries the tag, and stands still before and after. `of` gives each its usual sensors (default "quadrotor")
+    path : ((x, y), ...) or ((x, y, z), ...) m, waypoints, instead of a trajectory (default None)
+    area : ((x, y), (x, y)) m, lower and upper corner of where trajectories lie (default None: the room less a clearance)
     constellation : name of an anchor constellation, or random-SEED[-COUNT] (default "corners": 8 in 7 x 8 x 3 m)
     anchors : Anchors to use instead of a named constellation (default None)
     trajectory : "circle", "rising_circle", "sines", "square", "line_x", "line_y", "hover" or "spin" (default "sines")
     duration : of the recording, s (default 60)
     speed : along the path at cruise, m/s; root mean square for sines (default 1)
-    place : (x, y) of the middle of the path, m (default None: the middle of the room)
-    height : of the path, m; not used by sines (default None: half the height that is flyable)
+    place : (x, y) of the middle of the path, m (default None: the middle of the room or the area)
+    height : of the path, m; not used by sines of a quadrotor (default None: half the height that is flyable)
     radius : of the circle, or half the side of the square or the line, m (default None: 70 % of what fits)
-    yaw : "fixed", "along_track" or "rotating"; spin always rotates (default "fixed")
+    yaw : "fixed", "along_track" or "rotating"; spin always rotates; a rover has no choice (default "fixed")
     yaw_angle : yaw at the start, or added to the track, rad (default 0)
     yaw_rate : while rotating, rad/s (default 0.5)
     floor_time : at rest on the floor before take-off and after landing, s (default 3)
@@ -61,6 +77,7 @@ class SimulationConfig(_Noises):
     The TDOA measurements
     ---------------------
     protocol : "tdoa2" (ring, about 475 per second) or "tdoa3" (any pair, about 240 per second) (default "tdoa2")
+    tdoa_rate : TDOAs per second (default None: that of the protocol)
     radio_reach : m; anchors farther from the tag than that are not heard (default None: all are)
     walls : Walls that no signal comes through, with radio_reach (default None)
     cell_ids : anchors of one cell, which have a clock of their own, have ids with the same id // cell_ids; TDOAs are of two anchors of one
@@ -81,9 +98,14 @@ class SimulationConfig(_Noises):
     What else the vehicle feels
     ---------------------------
     <name>_noise : of each of SENSORS, standard deviation in its unit (default None: there is none)
+    wheel_scale : of a rover, by which share its velocities and yaw rates are too large (default 0)
+    wheel_slip : of a rover, by which share its wheels turn faster than the floor passes, for half a second every ten (default 0)
     """
 
     seed: int = 0
+    vehicle: str = "quadrotor"
+    path: tuple[tuple[float, ...], ...] | None = None
+    area: tuple[tuple[float, ...], ...] | None = None
     constellation: str = "corners"
     anchors: Anchors | None = None
     trajectory: str = "sines"
@@ -101,6 +123,7 @@ class SimulationConfig(_Noises):
     imu_errors: ImuErrors = field(default_factory=ImuErrors)
     truth_rate: float = 250.0
     protocol: str = "tdoa2"
+    tdoa_rate: float | None = None
     radio_reach: float | None = None
     walls: Walls | None = None
     cell_ids: int | None = None
@@ -113,9 +136,16 @@ class SimulationConfig(_Noises):
     tag_lever_arm: tuple[float, float, float] = (0.0, 0.0, 0.0)
     multipath: bool = True
     outlier_probability: float = 0.01
+    wheel_scale: float = 0.0
+    wheel_slip: float = 0.0
+
+    @classmethod
+    def of(cls, vehicle: str, **given: Any) -> SimulationConfig:
+        """The usual config of a vehicle, with what is given instead."""
+        return cls(vehicle=vehicle, **{**OF_VEHICLE.get(vehicle, {}), **given})
 
     def __post_init__(self) -> None:
-        for name, choices in (("yaw", YAW_PROFILES), ("protocol", PROTOCOLS)):
+        for name, choices in (("vehicle", tuple(OF_VEHICLE)), ("yaw", YAW_PROFILES), ("protocol", PROTOCOLS)):
             if getattr(self, name) not in choices:
                 raise InputError(f"{name}: {getattr(self, name)!r} is not known; choose {', '.join(choices)}.")
         for name in ("seed", "tag_unit"):
@@ -137,10 +167,13 @@ class SimulationConfig(_Noises):
             ("floor_time", 0.0, 3600.0),
             ("imu_rate", 50.0, 10000.0),
             ("truth_rate", 1.0, 10000.0),
+            ("tdoa_rate", 1.0, 500.0),
             ("radio_reach", 0.1, 10000.0),
             ("noise_std", 0.0, 100.0),
             ("anchor_delay_std", 0.0, 100.0),
             ("outlier_probability", 0.0, 1.0),
+            ("wheel_scale", -0.5, 0.5),
+            ("wheel_slip", 0.0, 10.0),
             *((noise, 0.0, 100.0) for noise in NOISES),
         ):
             value = getattr(self, name)
@@ -150,6 +183,12 @@ class SimulationConfig(_Noises):
             value = getattr(self, name)
             if value is not None and not (np.shape(value) == (length,) and np.isfinite(value).all()):
                 raise InputError(f"{name}: {value!r} is not {length} finite numbers of metres.")
+        if self.path is not None and not (_are_points(self.path, (2, 3)) and len({*self.path}) >= 2):
+            raise InputError(f"path: {self.path!r} is not two different points or more, each x, y or x, y, z in metres.")
+        if self.area is not None:
+            good = _are_points(self.area, (2,)) and len(self.area) == 2
+            if not good or not all(low < high for low, high in zip(*self.area)):
+                raise InputError(f"area: {self.area!r} is not a lower and an upper corner, each x, y in metres.")
 
     def complete(self) -> tuple[SimulationConfig, Room]:
         """(config, Room): this config with anchors, place, height, radius and anchor_noise_std filled in."""
@@ -172,6 +211,12 @@ class SimulationConfig(_Noises):
                 f"anchor_noise_std: {self.anchor_noise_std!r} is not {len(anchors)} numbers of at least 0, in metres."
             )
         room = room_of(anchors)
+        if self.area is not None:
+            room = replace(room.around(np.array(self.area)), area=self.area)
+        height = self.height
+        if self.path is not None:
+            room = room.around(np.array(self.path))
+            height = self.path[0][2] if height is None and len(self.path[0]) == 3 else height
         low, high = room.flyable
         x, y = room.centre[:2] if self.place is None else self.place
         place = float(x), float(y)
@@ -180,7 +225,7 @@ class SimulationConfig(_Noises):
             self,
             anchors=anchors,
             place=place,
-            height=float(0.5 * (low[2] + high[2])) if self.height is None else self.height,
+            height=float(0.5 * (low[2] + high[2])) if height is None else height,
             radius=float(max(0.7 * reach, 0.05)) if self.radius is None else self.radius,
             anchor_noise_std=tuple(std.tolist()),
         )
@@ -196,3 +241,12 @@ class SimulationConfig(_Noises):
         content["anchors"] = None if self.anchors is None else self.anchors.ids.tolist()
         content["walls"] = None if self.walls is None else [[x for x in wall if x < np.inf] for wall in self.walls.segments]
         return content
+
+
+def _are_points(points: Any, lengths: tuple[int, ...]) -> bool:
+    """Whether these are points of so many finite coordinates each, all of them as many."""
+    try:
+        array = np.array(points, dtype=float)
+    except (TypeError, ValueError):
+        return False
+    return array.ndim == 2 and array.shape[1] in lengths and bool((np.abs(array) < FARTHEST).all())

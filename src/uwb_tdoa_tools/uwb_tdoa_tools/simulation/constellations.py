@@ -77,6 +77,12 @@ def six() -> Anchors:
     return facing(np.column_stack([3 * np.cos(angle), 3 * np.sin(angle), z]), (0.0, 0.0, 1.4), inverted=z > 1)
 
 
+def six_wide() -> Anchors:
+    """Six anchors on the walls of 12 x 8 m, at 0.8 and 2.8 m in turn: for what drives."""
+    x, y, z = np.array([-6.0, 0.0, 6.0, 6.0, 0.0, -6.0]), np.repeat([-4.0, 4.0], 3), np.tile([0.8, 2.8], 3)
+    return facing(np.column_stack([x, y, z]), (0.0, 0.0, 1.0), inverted=z > 1)
+
+
 def hall() -> Anchors:
     """Sixteen along the walls of a hall of 14 x 20 x 5 m, low and high in turn."""
     rim = [(-7, -10), (-7, -5), (-7, 0), (-7, 5), (-7, 10), (-3.5, 10), (0, 10), (3.5, 10)]
@@ -126,6 +132,7 @@ CONSTELLATIONS = {
     "staircase": staircase,
     "pillars": pillars,
     "six": six,
+    "six_wide": six_wide,
     "hall": hall,
     "planar": planar,
     "pair": pair,

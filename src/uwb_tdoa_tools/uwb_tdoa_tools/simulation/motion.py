@@ -26,7 +26,7 @@ class ExactMotion:
 
 
 class Flyable(Protocol):
-    """What `simulate` flies."""
+    """What `simulate` moves."""
 
     def motion(self, t: np.ndarray) -> ExactMotion:
         """The ExactMotion at stamps t, (n,) s."""

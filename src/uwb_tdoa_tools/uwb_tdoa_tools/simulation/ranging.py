@@ -55,7 +55,7 @@ def measure(
     """
     assert config.anchors is not None  # complete
     anchors, random = config.anchors, config.random
-    schedule = make_schedule(config.protocol, len(anchors), config.duration, random("schedule"))
+    schedule = make_schedule(config.protocol, len(anchors), config.duration, random("schedule"), config.tdoa_rate)
     if config.radio_reach is not None:
         heard = heard_at(trajectory.motion(schedule.t).p, anchors.positions, config.radio_reach, config.walls)
         cells = None if config.cell_ids is None else anchors.ids // config.cell_ids

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,21 +17,35 @@ REST_HEIGHT = 0.03  # m, height of the body frame when the vehicle stands on the
 
 @dataclass(frozen=True)
 class Room:
-    """A box. lower, upper : (3,) corners in the world frame, metres; the floor is at lower[2]."""
+    """A box. lower, upper : (3,) corners in the world frame, metres; the floor is at lower[2]. area : ((x, y), (x, y)) m, lower and upper
+    corner of the part that paths are sized to; None for all but a clearance."""
 
     lower: np.ndarray
     upper: np.ndarray
+    area: tuple[tuple[float, ...], ...] | None = None
 
     @property
     def centre(self) -> np.ndarray:
-        """(3,) metres."""
-        return 0.5 * (self.lower + self.upper)
+        """(3,) metres: of the area, if there is one."""
+        if self.area is None:
+            return 0.5 * (self.lower + self.upper)
+        return 0.5 * np.sum(self.flyable, axis=0)
 
     @property
     def flyable(self) -> tuple[np.ndarray, np.ndarray]:
-        """The box that paths are sized to by default, (lower, upper), each (3,) metres: the room less a clearance."""
+        """The box that paths are sized to, (lower, upper), each (3,) metres: the area, or else the room less a clearance."""
         margin = np.minimum([CLEARANCE, CLEARANCE, FLOOR_CLEARANCE], 0.25 * (self.upper - self.lower))
-        return self.lower + margin, self.upper - margin
+        low, high = self.lower + margin, self.upper - margin
+        if self.area is not None:
+            low[:2], high[:2] = self.area
+        return low, high
+
+    def around(self, points: np.ndarray) -> Room:
+        """The Room, grown to hold points (n, 2 or 3), m."""
+        k = points.shape[1]
+        lower, upper = self.lower.copy(), self.upper.copy()
+        lower[:k], upper[:k] = np.minimum(lower[:k], points.min(axis=0)), np.maximum(upper[:k], points.max(axis=0))
+        return replace(self, lower=lower, upper=upper)
 
 
 def room_of(anchors: Anchors) -> Room:

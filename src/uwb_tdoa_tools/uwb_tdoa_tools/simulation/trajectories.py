@@ -94,17 +94,32 @@ def line_y(s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.G
     return _laps(s, config, [[0, -1], [0, 1], [0, -1]], 0.0)
 
 
+def waypoints(s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator) -> np.ndarray:
+    """Through the points of `path` and back to the first, again and again, at constant speed, with rounded corners."""
+    assert config.path is not None and config.height is not None  # complete
+    points = np.array([(*point, config.height)[:3] for point in config.path])
+    around = np.vstack([points, points[:1]])
+    ends = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(around, axis=0), axis=1))])
+    return _round(s, config.speed, around, ends, 0.0)
+
+
 def _laps(s: np.ndarray, config: SimulationConfig, corners: Sequence[Sequence[float]], ahead: float) -> np.ndarray:
     """Round the corners, (n, 2) in units of the radius and as far apart each, level, `ahead` m further at the start."""
     assert config.radius is not None and config.place is not None and config.height is not None  # complete
-    edge, n = 2.0 * config.radius, len(corners) - 1
+    ends = 2.0 * config.radius * np.arange(len(corners))
+    rounded = _round(s, config.speed, config.radius * np.asarray(corners), ends, ahead)
+    return np.column_stack([rounded + config.place, np.full(len(s), config.height)])
+
+
+def _round(s: np.ndarray, speed: float, around: np.ndarray, ends: np.ndarray, ahead: float) -> np.ndarray:
+    """Positions at s along a closed line through the corners around (n, k) m, which are reached after ends (n,) m, `ahead` m further at
+    the start, with rounded corners."""
     dt = 0.01
     s_fine = np.arange(-CORNER_TIME, s[-1] + CORNER_TIME + dt, dt)
-    along = np.mod(config.speed * s_fine + ahead, n * edge)
-    path = config.radius * np.transpose(corners)
-    sharp = np.column_stack([np.interp(along, edge * np.arange(n + 1), coordinate) for coordinate in path])
-    rounded = CubicSpline(s_fine, _smoothed(sharp, int(CORNER_TIME / dt) | 1))(s)
-    return np.column_stack([rounded + config.place, np.full(len(s), config.height)])
+    along = np.mod(speed * s_fine + ahead, ends[-1])
+    sharp = np.column_stack([np.interp(along, ends, coordinate) for coordinate in around.T])
+    rounded: np.ndarray = CubicSpline(s_fine, _smoothed(sharp, int(CORNER_TIME / dt) | 1))(s)
+    return rounded
 
 
 def hover(s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator) -> np.ndarray:
@@ -125,6 +140,23 @@ TRAJECTORIES = {
 }
 
 
+def path_of(s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator) -> np.ndarray:
+    """Positions (n, 3) m at path times s (n,), s, of the waypoints of a config, or else of its family. Raises InputError."""
+    if config.trajectory not in TRAJECTORIES:
+        raise InputError(f"trajectory: {config.trajectory!r} is not known; choose {', '.join(TRAJECTORIES)}.")
+    family, name = (TRAJECTORIES[config.trajectory], config.trajectory) if config.path is None else (waypoints, "the path")
+    p = family(s, config, room, rng)
+    outside = (p < room.lower).any(axis=0) | (p > room.upper).any(axis=0)
+    if outside.any():
+        axis = int(np.argmax(outside))
+        reach = f"{p[:, axis].min():.2f} ... {p[:, axis].max():.2f} m"
+        walls = f"{room.lower[axis]:.2f} ... {room.upper[axis]:.2f} m"
+        raise InputError(
+            f"trajectory: {name} reaches {reach} in {'xyz'[axis]}, outside the room's {walls}; change place, height or radius."
+        )
+    return p
+
+
 class Trajectory:
     """One flight over 0 ... config.duration: position and yaw as splines, attitude and rates from them.
 
@@ -135,8 +167,6 @@ class Trajectory:
 
     def __init__(self, config: SimulationConfig, room: Room, rng: np.random.Generator) -> None:
         assert config.height is not None  # complete
-        if config.trajectory not in TRAJECTORIES:
-            raise InputError(f"trajectory: {config.trajectory!r} is not known; choose {', '.join(TRAJECTORIES)}.")
         self.take_off = self.landing = None
         start, end, clamp = 0.0, config.duration, None
         if not config.start_in_air:
@@ -152,22 +182,13 @@ class Trajectory:
             clamp = ([(k, np.zeros(3)) for k in (1, 2, 3)],) * 2  # at rest, smoothly, at both ends
         air = end - start
         tau = np.linspace(0.0, air, max(int(np.ceil(air / KNOT)), 8) + 1)
-        s = tau if config.start_in_air else _path_time(tau, rise, air)
-        p = TRAJECTORIES[config.trajectory](s, config, room, rng)
-        outside = (p < room.lower).any(axis=0) | (p > room.upper).any(axis=0)
-        if outside.any():
-            axis = int(np.argmax(outside))
-            reach = f"{p[:, axis].min():.2f} ... {p[:, axis].max():.2f} m"
-            walls = f"{room.lower[axis]:.2f} ... {room.upper[axis]:.2f} m"
-            raise InputError(
-                f"trajectory: {config.trajectory} reaches {reach} in {'xyz'[axis]}, outside the room's {walls}; "
-                "change place, height or radius."
-            )
+        s = tau if config.start_in_air else path_time(tau, rise, air)
+        p = path_of(s, config, room, rng)
         if not config.start_in_air:
             lift = STEP(np.clip(tau / rise, 0.0, 1.0)) * STEP(np.clip((air - tau) / rise, 0.0, 1.0))
             ground = room.lower[2] + REST_HEIGHT
             p[:, 2] = ground + lift * (p[:, 2] - ground)
-        yaw = _yaw(s, p, config)
+        yaw = yaw_along(s, p, config)
         self._start, self._end, self._clamped = start, end, clamp is not None
         self._p = make_interp_spline(start + tau, p, k=7, bc_type=clamp)
         scalar = ([(k, 0.0) for k in (1, 2, 3)],) * 2 if clamp else None
@@ -217,7 +238,7 @@ class Trajectory:
         return (t >= self._start - SPIN_UP) & (t <= self._end + SPIN_UP) if self._clamped else np.ones(len(t), bool)
 
 
-def _path_time(tau: np.ndarray, rise: float, air: float) -> np.ndarray:
+def path_time(tau: np.ndarray, rise: float, air: float) -> np.ndarray:
     """Path time after tau seconds in the air: still during rise and descent, with the clock in between, smoothly."""
 
     def since(x: np.ndarray) -> np.ndarray:  # integral of the smooth step, in units of SPEED_UP
@@ -226,7 +247,7 @@ def _path_time(tau: np.ndarray, rise: float, air: float) -> np.ndarray:
     return SPEED_UP * (since((tau - rise) / SPEED_UP) - since((tau - (air - rise - SPEED_UP)) / SPEED_UP))
 
 
-def _yaw(s: np.ndarray, p: np.ndarray, config: SimulationConfig) -> np.ndarray:
+def yaw_along(s: np.ndarray, p: np.ndarray, config: SimulationConfig) -> np.ndarray:
     """Yaw at every knot, rad: "fixed", "along_track" or "rotating", from config.yaw_angle on."""
     if config.trajectory == "spin" or config.yaw == "rotating":
         return config.yaw_angle + config.yaw_rate * s

@@ -12,7 +12,8 @@ from uwb_tdoa_bias.effects import EffectSet, Samples, samples_at
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.geometry import tdoa
 
-from ..scoring.metrics import AIRBORNE, airborne
+from ..checking.known_path import least_height
+from ..scoring.metrics import judged_part
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -62,7 +63,7 @@ def labels(flight: Flight, effects: EffectSet = EffectSet()) -> Labels:
     where it cannot teach anything."""
     flight = effects.correct_streams(replace(level(flight), imu=None))
     truth, data, anchors = known_truth(flight), flight.tdoa, flight.anchors
-    first, last = airborne(truth)
+    _, first, last = judged_part(truth)
     first, last = first + MARGIN, last - MARGIN
     chosen = (data.t > first) & (data.t < last)
     unknown = np.setdiff1d(np.concatenate([data.a[chosen], data.b[chosen]]), anchors.ids)
@@ -76,10 +77,10 @@ def labels(flight: Flight, effects: EffectSet = EffectSet()) -> Labels:
     a, b = anchors.index(data.a[chosen]), anchors.index(data.b[chosen])
     samples = samples_at(data.t[chosen], a, b, truth, anchors, float(data.t[0]), lag=None)
     error = data.d[chosen] - tdoa(samples.p, samples.position_a, samples.position_b) - effects.bias(samples)
-    kept = (np.abs(error) <= LARGEST) & (samples.p[:, 2] > AIRBORNE) & (a != b)
+    kept = (np.abs(error) <= LARGEST) & (samples.p[:, 2] > least_height(truth)) & (a != b)
     if kept.sum() < FEWEST:
         raise InputError(
-            f"{flight.name}: only {kept.sum()} TDOAs in the air are right to {LARGEST:g} m; check that survey and "
+            f"{flight.name}: only {kept.sum()} TDOAs are right to {LARGEST:g} m; check that survey and "
             "ground truth are in one frame."
         )
     if np.max(np.abs(error[kept])) < ZERO:

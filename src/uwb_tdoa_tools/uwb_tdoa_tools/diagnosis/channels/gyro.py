@@ -19,7 +19,9 @@ SHIFT = 0.05  # s, for derivatives by time, of what was measured: noise of the t
 STILL_FORCE, STILL_RATE = 0.3, 0.1  # m/s^2 of vibration and rad/s, below which the vehicle stands
 STILL_CHANGE = 0.02  # rad/s, the same of what is measured less what was measured at the start
 BEGINNING = 2  # cells before, in which it may begin to turn
-TURNING = [column for column, name in enumerate(OF_IMU) if name == "turning_rate" or name.startswith("rate_")]
+RATES = [column for column, name in enumerate(OF_IMU) if name.startswith("rate_")]
+TURNING = [OF_IMU.index("turning_rate"), *RATES]
+TRUE_SHARE = 0.5  # of the variance of a measured rate, that must be true turns: of a rover none of roll and pitch is
 FEWEST_CELLS = 4
 
 
@@ -45,7 +47,12 @@ class Gyro(Inertial):
         before, after = (means(imu.t, imu.gyro, edges + shift) for shift in (-SHIFT, SHIFT))
         middles = 0.5 * (edges[:-1] + edges[1:])
         features, change = means(imu.t, features_of(imu), edges), (after - before) / (2.0 * SHIFT)
-        samples = self._samples(comparison, middles, measured, features, change)
+        still = ~_turns(measured, true)
+        reading = np.where(still, 0.0, measured)  # where it does not turn, what it measures is the residual: a function of itself
+        features[:, RATES], change[:, still] = np.where(still, 0.0, features[:, RATES]), 0.0
+        if not _turns(*(np.linalg.norm(rates, axis=1, keepdims=True) for rates in (measured, true)))[0]:
+            features[:, OF_IMU.index("turning_rate")] = 0.0
+        samples = self._samples(comparison, middles, reading, features, change)
         return ImuResidual(samples, measured - true - comparison.effects.uncorrected(samples), self.unit)
 
     def _at_rest(self, comparison: Comparison, imu: Imu) -> ImuResidual | None:
@@ -62,6 +69,13 @@ class Gyro(Inertial):
         nothing = np.zeros_like(measured)
         samples = self._samples(comparison, middles, nothing, features, nothing)
         return ImuResidual(samples, measured - comparison.effects.uncorrected(samples), self.unit)
+
+
+def _turns(measured: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """(k,) bool: whether measured rates (n, k) change because true ones, (n, k), do."""
+    one, other = measured - measured.mean(axis=0), true - true.mean(axis=0)
+    turns: np.ndarray = np.sum(one * other, axis=0) > TRUE_SHARE * np.sum(one**2, axis=0)
+    return turns
 
 
 def _true_rates(truth: Truth, edges: np.ndarray) -> np.ndarray:

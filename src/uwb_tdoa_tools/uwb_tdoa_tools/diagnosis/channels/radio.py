@@ -20,6 +20,7 @@ from uwb_tdoa_bias.effects.smooth_term import OF_LINKS
 from uwb_tdoa_ekf.sensitivity import Innovations
 
 from ...checking.known_path import MANY
+from ...scoring.phases import in_the_air
 from ..regression.algebra import Matrix
 from .base import ChannelResidual, Rows
 from .extra import extra_at
@@ -170,7 +171,8 @@ def compared(comparison: Comparison, kind: type[Samples], made: type[Radio]) -> 
         residual = raw.d[usable] - samples.true() - comparison.effects.bias(samples)
     else:
         residual = innovations.value[places]
-    return made(samples, residual, airborne, airborne, comparison.reference.knows_floor, innovations)
+    floor_known = comparison.reference.knows_floor and in_the_air(poses) is not None  # what never leaves it has no time there apart
+    return made(samples, residual, airborne, airborne, floor_known, innovations)
 
 
 def of_rows(samples: Samples, rows: np.ndarray) -> Samples:

@@ -10,7 +10,8 @@ import numpy as np
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Truth
 
-from ...scoring.metrics import airborne
+from ...scoring.metrics import judged_part
+from ...scoring.phases import TITLES
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.effects import EffectSet
@@ -19,8 +20,8 @@ if TYPE_CHECKING:
     from uwb_tdoa_ekf.sensitivity import Innovations
     from ..constraints import Constraint
 
-MARGIN = 0.5  # s left out at both ends of the airborne part
-SHORTEST = 5.0  # s in the air that can be diagnosed
+MARGIN = 0.5  # s left out at both ends
+SHORTEST = 5.0  # s that can be diagnosed
 
 
 @dataclass(frozen=True)
@@ -63,9 +64,10 @@ class Reference:
         return np.zeros(3)
 
     def span(self, flight: Flight, poses: Truth) -> tuple[float, float]:
-        """(first, last) stamp, s, of what is diagnosed: in the air, without its ends. Raises InputError if that is short."""
-        first, last = airborne(poses)
+        """(first, last) stamp, s, of what is diagnosed: in the air, or in motion on the floor, without its ends. Raises InputError if that
+        is short."""
+        part, first, last = judged_part(poses)
         first, last = first + MARGIN, last - MARGIN
         if last - first < SHORTEST:
-            raise InputError(f"{flight.name}: only {last - first:.1f} s of it are in the air; {SHORTEST:g} s are needed.")
+            raise InputError(f"{flight.name}: only {last - first:.1f} s of it are {TITLES[part]}; {SHORTEST:g} s are needed.")
         return first, last

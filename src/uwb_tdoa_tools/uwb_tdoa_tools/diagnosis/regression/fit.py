@@ -194,7 +194,8 @@ def _temporal(table: RegressionTable, rows: np.ndarray | slice, r: np.ndarray) -
         first, second = first[near], second[near]
         if len(first) < 30:
             break
-        rho = np.mean(r[first] * r[second]) / np.mean(r**2)
+        power = np.mean(r**2)
+        rho = np.mean(r[first] * r[second]) / power if power else 0.0
         if rho < 2.0 / np.sqrt(len(first)):
             break
         total += 2.0 * rho

@@ -20,6 +20,7 @@ from .terms import columns_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Sequence
+    from uwb_tdoa_bias.effects import Effect
     from .scan import Scan
     from .terms import Candidate
 
@@ -68,6 +69,16 @@ class Selection:
         outliers."""
         chosen = self._chosen_of(candidates)
         return replace(self, **chosen, fit=refit(self.table, columns_of(chosen["chosen"]), self.fit))
+
+    def where(self, keeps: Callable[[Effect], bool]) -> Selection:
+        """Selection of the terms alone whose Effects a function keeps, fitted with the present weights: what is written without the others
+        has the values of a model without them."""
+        parts = [candidate.where(keeps) for candidate in self.chosen]
+        if parts == list(self.chosen):
+            return self
+        of = self._chosen_of([candidate for candidate, part in zip(self.chosen, parts) if part is not None])
+        chosen = tuple(part for part in parts if part is not None)
+        return replace(self, **{**of, "chosen": chosen}, fit=refit(self.table, columns_of(chosen), self.fit))
 
     def _chosen_of(self, candidates: Collection[Candidate]) -> dict[str, Any]:
         places = [k for k, candidate in enumerate(self.chosen) if candidate in candidates]

@@ -9,7 +9,7 @@ from typing import NamedTuple, TYPE_CHECKING
 from uwb_tdoa_bias.effects import Effect, SmoothTerm
 
 if TYPE_CHECKING:
-    from collections.abc import Hashable, Iterable
+    from collections.abc import Callable, Hashable, Iterable
     import numpy as np
     from uwb_tdoa_bias.foundation.anchors import Anchors
 
@@ -79,6 +79,11 @@ class Candidate:
         """How it is called in reports."""
         more = (f" + {term.function.covariate}" for term in self.terms[1:] if term.function)
         return "".join((self.terms[0].effect.label_of(self.terms[0].keys), *more))
+
+    def where(self, keeps: Callable[[Effect], bool]) -> Candidate | None:
+        """The Candidate with those of its terms alone whose Effects a function keeps; None if that is none."""
+        terms = tuple(term for term in self.terms if keeps(term.effect))
+        return self if terms == self.terms else Candidate(terms, self.price) if terms else None
 
     def plausible(self, beta: np.ndarray) -> bool:
         """Whether values of its columns, (k,), could be."""

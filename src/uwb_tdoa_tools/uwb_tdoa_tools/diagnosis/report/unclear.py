@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 NOTHING = 1e-9  # largest contribution, relative to those of its parts, of a combination that cancels
 NAMED = 6  # parameters of a combination that are named
 GROUND_TRUTH = "ground truth, from motion capture for example"
+ATTITUDE = "ground truth of the attitude"
+ORIENTATIONS = "orientations of the anchors in the survey"
+AND = ", and "  # between the sensor and the ground truth that a channel needs
 CANCELS = "nothing: it cancels in every measurement, and hence does no harm"
 
 
@@ -80,15 +83,32 @@ def _remedy(item: Unobservable, diagnosis: Diagnosis) -> str:
         if alone and effect.needs_reference:
             return GROUND_TRUTH
         wanted, shown = (*effect.witnesses, *effect.channels), {name for flight in diagnosis.attribution.residuals for name in flight}
-        return CHANNELS[next((name for name in wanted if name not in shown), wanted[0])].needs
+        return _lacking(next((name for name in wanted if name not in shown), wanted[0]), diagnosis)
     size, parts = _contribution(item.effect, item.direction, diagnosis)
     if parts > 0.0 and size <= NOTHING * parts:
         return CANCELS
     if parts == 0.0 and effect.uses_attitude:
-        return "ground truth of the attitude"
+        return ORIENTATIONS if _knows_attitude(diagnosis) else ATTITUDE
     if alone:
         return GROUND_TRUTH
     return "a flight through other places, headings, heights and speeds"
+
+
+def _knows_attitude(diagnosis: Diagnosis) -> bool:
+    """Whether the reference has attitudes of each flight."""
+    truths = [flight.truth for flight in diagnosis.flights]
+    return diagnosis.reference.attitude_known and all(truth is not None and np.isfinite(truth.q).any() for truth in truths)
+
+
+def _lacking(channel: str, diagnosis: Diagnosis) -> str:
+    """What the flights lack of what a channel needs: its sensor, the ground truth for it, or both."""
+    sensor, _, truth = CHANNELS[channel].needs.partition(AND)
+    stream = "imu" if channel in ("gyro", "accel") else channel
+    if truth and _knows_attitude(diagnosis) and all(diagnosis.reference.positions_known):
+        return sensor
+    if truth and any(getattr(flight, stream) is not None for flight in diagnosis.flights):
+        return truth
+    return CHANNELS[channel].needs
 
 
 def _contribution(effect: str, direction: dict[str, float], diagnosis: Diagnosis) -> tuple[float, float]:

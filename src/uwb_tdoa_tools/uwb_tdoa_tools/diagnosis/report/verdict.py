@@ -166,7 +166,8 @@ def _flights(diagnosis: Diagnosis) -> str:
     for score in diagnosis.before["scores"]:
         ends.setdefault(score.name, []).extend([score.first, score.last])
     count, seconds = len(_names(diagnosis)), sum(max(of) - min(of) for of in ends.values())
-    return f"{count} flight{'s' if count > 1 else ''}, {seconds:.0f} s in the air"
+    parts = " or ".join(sorted({TITLES[score.part] for score in diagnosis.before["scores"]}))
+    return f"{count} flight{'s' if count > 1 else ''}, {seconds:.0f} s {parts}"
 
 
 def _over_phases(diagnosis: Diagnosis) -> list[str]:

@@ -28,7 +28,7 @@ from uwb_tdoa_ekf.offline import without_unknown_offset
 from uwb_tdoa_ekf.sensitivity import TDOAS
 
 from ...checking.known_path import MANY
-from ...scoring.metrics import AIRBORNE
+from ...scoring.phases import AIRBORNE
 from ..channels import Comparison, RadioResidual
 from ..channels.radio import compared, of_rows
 from ..channels.ranging import RangeResidual

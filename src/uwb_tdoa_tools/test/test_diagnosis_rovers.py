@@ -1,0 +1,73 @@
+"""What `diagnose` finds on a vehicle that never leaves the floor, whose truth is known; and values that are those of the written model."""
+
+import numpy as np
+import pytest
+
+from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_bias.foundation.flight import Tdoas
+from uwb_tdoa_tools.diagnosis.attribution import attribute
+from uwb_tdoa_tools.diagnosis.channels.gyro import _turns
+from uwb_tdoa_tools.diagnosis.references import GroundTruth
+from uwb_tdoa_tools.diagnosis.refinement import effects_of, written
+from uwb_tdoa_tools.diagnosis.regression.fit import refit
+from uwb_tdoa_tools.diagnosis.regression.terms import columns_of
+from uwb_tdoa_tools.simulation import ImuErrors, SimulationConfig, simulate
+
+SCALE = 0.02
+NO_TDOAS = Tdoas(*(np.empty(0, kind) for kind in (float, int, int, float)))
+ERRORS = ImuErrors(gyro_bias=0.01)
+
+
+def rover(seed, **changes):
+    return simulate(SimulationConfig.of("rover", seed=seed, wheel_scale=SCALE, imu_errors=ERRORS, duration=90.0, **changes))
+
+
+def traced(flight, *streams):
+    """Attribution of some streams of a flight alone."""
+    others = {"tdoa": NO_TDOAS, "imu": None, "velocity": None}
+    kept = flight.replaced(**{name: nothing for name, nothing in others.items() if name not in streams})
+    reference = GroundTruth()
+    return attribute([reference.settled(reference.prepare(kept), EffectSet())[0]], reference)
+
+
+@pytest.fixture(scope="module")
+def of_wheels():
+    return traced(rover(1), "velocity")
+
+
+def test_a_rover_is_diagnosed_from_where_it_starts_to_where_it_stops():
+    flight = rover(2)
+    first, last = GroundTruth().span(flight, flight.truth)
+    assert 2.0 < first < 6.0 and 80.0 < last < 88.0
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_biases_of_a_gyroscope_that_turns_about_one_axis_have_their_signs(seed):
+    flight = rover(seed)
+    (found,) = [effect for effect in effects_of(traced(flight, "imu").selection) if effect.name == "gyro_bias"]
+    state = flight.extra["state_truth"]
+    for axis in "xyz":
+        true = np.mean(state[f"gyro_bias_{axis}"])
+        assert abs(found.values[axis] - true) < 3.0 * np.hypot(found.std[axis], 2e-5), axis  # and it walks
+
+
+def test_a_rate_that_is_noise_explains_nothing():
+    rng = np.random.default_rng(1)
+    turning = np.column_stack([np.zeros(300), 0.3 * np.sin(np.linspace(0.0, 20.0, 300))])
+    measured = turning + 0.01 + 1e-3 * rng.standard_normal(turning.shape)
+    assert _turns(measured, turning).tolist() == [False, True]
+    noisy = turning + 0.02 * rng.standard_normal(turning.shape)  # the ground truth is worse than the sensor
+    assert _turns(measured, noisy).tolist() == [False, True]
+
+
+def test_what_is_written_has_the_values_of_the_written_model(of_wheels):
+    chosen = written(of_wheels.selection, of_wheels.candidates)
+    effects = effects_of(chosen)
+    assert all(effect.usable for effect in effects)
+    again = refit(chosen.table, columns_of(chosen.chosen), chosen.fit)
+    values = {(column.effect[0], column.key): value for column, value in zip(again.columns, again.beta)}
+    for effect in effects:
+        for key, value in effect.values.items():
+            assert value == pytest.approx(values[effect.name, key], rel=1e-2)
+    (scale,) = [effect for effect in effects if effect.name == "velocity_scale"]
+    assert abs(scale.values["scale"] - SCALE) < 3.0 * scale.std["scale"]

@@ -1,0 +1,138 @@
+"""What carries a tag in a simulation: a rover on wheels, a person on foot; waypoints and areas for all of them."""
+
+from dataclasses import replace
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_tools.commands import simulate as command
+from uwb_tdoa_tools.simulation import NO_IMU_ERRORS, SimulationConfig, simulate
+from uwb_tdoa_tools.simulation.config import OF_VEHICLE
+from uwb_tdoa_tools.simulation.trajectories import GRAVITY, TRAJECTORIES
+from uwb_tdoa_tools.simulation.vehicles import VEHICLES
+
+ON_FOOT_OR_WHEELS = [name for name in OF_VEHICLE if name != "quadrotor"]
+SQUARE = ((-2.0, -1.5), (2.0, -1.5), (2.0, 1.5), (-2.0, 1.5))
+
+
+def moved(config):
+    filled, room = config.complete()
+    return VEHICLES[filled.vehicle](filled, room, filled.random("trajectory"))
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.sampled_from(ON_FOOT_OR_WHEELS), st.sampled_from(list(TRAJECTORIES)), st.integers(0, 2**32 - 1), st.floats(0.2, 1.0))
+def test_rates_and_forces_are_those_of_the_motion(vehicle, trajectory, seed, speed):
+    motion = moved(SimulationConfig.of(vehicle, trajectory=trajectory, seed=seed, speed=speed, duration=40.0)).motion
+    t, h = np.linspace(0.1, 39.9, 2003), 1e-3
+    before, here, after = (motion(t + k * h) for k in (-1, 0, 1))
+    np.testing.assert_allclose((after.p - before.p) / (2 * h), here.v, atol=1e-4)
+    np.testing.assert_allclose((after.v - before.v) / (2 * h), here.a, atol=2e-2)  # of a cubic, whose second derivative has corners
+    turned = (Rotation.from_quat(before.q).inv() * Rotation.from_quat(after.q)).as_rotvec() / (2 * h)
+    np.testing.assert_allclose(turned, here.body_rates, atol=2e-3)
+    np.testing.assert_allclose(Rotation.from_quat(here.q).apply(here.specific_force), here.a + [0.0, 0.0, GRAVITY], atol=1e-9)
+
+
+def test_a_rover_drives_ahead_on_the_floor_and_stops():
+    flight = simulate(SimulationConfig.of("rover", seed=3, duration=90.0))
+    velocity = np.column_stack([flight.extra["state_truth"][f"v{axis}"] for axis in "xyz"])
+    body = Rotation.from_quat(flight.truth.q).inv().apply(velocity)
+    np.testing.assert_allclose(body[:, 1:], 0.0, atol=1e-12)
+    assert body[:, 0].min() >= 0.0 and 0.4 < body[:, 0].max() < 1.3
+    np.testing.assert_array_equal(flight.truth.p[:, 2], 0.0)
+    still = (body[:, 0] == 0.0) & (flight.truth.t > 4.0) & (flight.truth.t < 86.0)
+    assert 0.05 < still.mean() < 0.5
+    assert (np.ptp(flight.truth.p[:, :2], axis=0) > [5.0, 3.0]).all()
+    assert [len(stream) for stream in (flight.imu, flight.velocity)] == [9000, 4500] and 8500 < len(flight.tdoa) < 9500
+
+
+def test_wheels_say_too_much_and_slip():
+    config = SimulationConfig.of("rover", seed=3, velocity_noise=0.0)
+    flight = simulate(config)
+    motion = moved(config).motion(flight.velocity.t)
+    true = Rotation.from_quat(motion.q).inv().apply(motion.v)[:, 0]
+    ratio = flight.velocity.v[true > 0.1, 0] / true[true > 0.1]
+    slips = ratio > 1.1
+    np.testing.assert_allclose(ratio[~slips], 1.02)
+    np.testing.assert_allclose(ratio[slips], 1.02 * 1.2)
+    assert 0.01 < slips.mean() < 0.15
+    np.testing.assert_array_equal(flight.velocity.v[:, 1:], 0.0)
+    standing = true == 0.0
+    assert np.std(flight.velocity.yaw_rate[standing]) == pytest.approx(0.02, rel=0.2)
+    turn = np.polyfit(motion.body_rates[true > 0.1, 2], flight.velocity.yaw_rate[true > 0.1], 1)[0]
+    assert 1.015 < turn < 1.1
+
+
+def test_a_person_walks_at_the_height_of_a_hand():
+    flight = simulate(SimulationConfig.of("hand", seed=1, imu_errors=NO_IMU_ERRORS))
+    assert 1.0 < flight.truth.p[:, 2].min() < flight.truth.p[:, 2].max() < 1.2
+    assert np.abs(np.linalg.norm(flight.imu.accel, axis=1) - GRAVITY).max() > 1.0  # its steps are felt
+    assert flight.velocity is None
+
+
+@pytest.mark.parametrize("vehicle", OF_VEHICLE)
+def test_waypoints_are_passed_in_turn(vehicle):
+    flight = simulate(SimulationConfig.of(vehicle, path=SQUARE, duration=80.0))
+    away = np.linalg.norm(flight.truth.p[:, None, :2] - np.array(SQUARE), axis=2)
+    assert (away.min(axis=0) < 0.45).all()
+    first = np.argmax(away < 0.5, axis=0)
+    assert (np.diff(first) > 0).all()
+    assert flight.name.endswith("path-tdoa3-six_wide-0" if vehicle == "rover" else "path-tdoa2-corners-0")
+
+
+def test_waypoints_have_heights():
+    flight = simulate(SimulationConfig(path=((-1.0, -1.0, 0.6), (1.0, 1.0, 2.4)), duration=40.0))
+    assert np.ptp(flight.truth.p[(flight.truth.t > 8.0) & (flight.truth.t < 32.0), 2]) > 1.3
+
+
+@pytest.mark.parametrize("vehicle", OF_VEHICLE)
+def test_a_trajectory_lies_in_its_area_even_beside_the_anchors(vehicle):
+    area = ((-8.0, -3.0), (-5.0, 3.0))
+    flight = simulate(SimulationConfig.of(vehicle, area=area, duration=60.0, speed=0.5))
+    low, high = flight.truth.p[:, :2].min(axis=0), flight.truth.p[:, :2].max(axis=0)
+    assert (low > np.subtract(area[0], 0.3)).all() and (high < np.add(area[1], 0.3)).all()
+    assert (high - low > [1.0, 2.0]).all()
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"vehicle": "submarine"}, "vehicle: 'submarine'"),
+        ({"path": ((0.0, 0.0),)}, "path: "),
+        ({"path": ((0.0, 0.0), (1.0, float("nan")))}, "path: "),
+        ({"path": ((0.0, 0.0), (1.0, 1.0, 1.0))}, "path: "),
+        ({"area": ((1.0, 0.0), (0.0, 1.0))}, "area: "),
+        ({"tdoa_rate": 0.0}, "tdoa_rate: "),
+        ({"wheel_slip": -1.0}, "wheel_slip: "),
+    ],
+)
+def test_what_cannot_be_is_refused(changes, says):
+    with pytest.raises(InputError, match=f"^{says}"):
+        replace(SimulationConfig(), **changes)
+
+
+@pytest.mark.parametrize("vehicle", ON_FOOT_OR_WHEELS)
+def test_too_short_is_refused(vehicle):
+    with pytest.raises(InputError, match="^duration: "):
+        simulate(SimulationConfig.of(vehicle, duration=5.0))
+
+
+def test_what_is_given_counts_more_than_what_is_usual(tmp_path, monkeypatch):
+    made = []
+    monkeypatch.setattr(command, "simulate", lambda config: made.append(config) or simulate(config))
+    given = ["--path", "-2,-1 2,1", "--tdoa-rate", "50", "--tag-lever-arm", "0,0,0.2"]
+    assert command.main(["--vehicle", "rover", "--duration", "12", *given]) == 0
+    assert command.main(["--duration", "20", "--area", "-1,-1 1,1"]) == 0
+    rover, quadrotor = made
+    changes = {"path": ((-2.0, -1.0), (2.0, 1.0)), "tdoa_rate": 50.0, "tag_lever_arm": (0.0, 0.0, 0.2)}
+    assert rover == SimulationConfig.of("rover", duration=12.0, **changes)
+    assert quadrotor == SimulationConfig(duration=20.0, area=((-1.0, -1.0), (1.0, 1.0)))
+
+
+def test_points_that_are_none_are_told(capsys):
+    assert command.main(["--path", "0,0 1;1"]) == 2
+    assert "is not X,Y" in capsys.readouterr().err

@@ -1,0 +1,181 @@
+"""What moves the tag along a path: a quadrotor, a rover on wheels, a person on foot."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.interpolate import BSpline, CubicHermiteSpline, CubicSpline, make_interp_spline
+from scipy.spatial.transform import Rotation
+
+from uwb_tdoa_bias.foundation.errors import InputError
+
+from .config import OF_VEHICLE
+from .motion import ExactMotion, Flyable
+from .trajectories import GRAVITY, KNOT, SPEED_UP, STEP, Trajectory, path_of, path_time, yaw_along
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+    from .config import SimulationConfig
+    from .room import Room
+
+PULL = 1.5  # 1/s, speed of the rover by its distance to the point that it follows
+TURN = 2.5  # 1/s, turning rate by the direction to that point
+SLACK = 0.03  # m, within which it stands still
+SLOWEST = 0.05  # m/s, so that it gets there
+HARDEST, HARDEST_TURN = 1.0, 4.0  # m/s^2, rad/s^2
+FASTEST_TURN = 1.5  # rad/s
+DRIVES, STANDS = (8.0, 20.0), (6.0, 9.0)  # s, between stops and of a stop
+FINE = 0.01  # s, steps in which the position of the rover is summed up
+STEPS = 1.9  # Hz, of a person who walks
+BOB, SWAY, TILT = 0.02, 0.01, np.deg2rad(6.0)  # m, m, rad: of a hand, by steps and otherwise
+
+
+class Rover:
+    """A rover with two driven wheels: it follows a point that moves along the path of a config, and stops where the point stops.
+
+    Base on the floor, x ahead. Parameters: as of Trajectory; the path may have any heights. It stands still for config.floor_time
+    before and after.
+    """
+
+    def __init__(self, config: SimulationConfig, room: Room, rng: np.random.Generator) -> None:
+        _check_time(config)
+        self._floor = float(room.lower[2])
+        tau = np.arange(0.0, config.duration + KNOT, KNOT)
+        goes = _going(tau, config, rng)
+        target = path_of(np.concatenate([[0.0], np.cumsum(KNOT * goes)[:-1]]), config, room, rng)[:, :2]
+        start, heading, speed, turning = _followed(target, config.speed)
+        knots = KNOT * np.arange(-2, len(tau) + 2)
+        self._speed, self._turning = BSpline(knots, speed, 3), BSpline(knots, turning, 3)
+        turned = self._turning.antiderivative()
+        self._yaw: Callable[[np.ndarray], np.ndarray] = lambda t: heading + turned(t) - turned(0.0)
+        fine = np.arange(0.0, config.duration + FINE, FINE)
+        velocity, between = self._velocity(fine), self._velocity(fine[:-1] + 0.5 * FINE)
+        step = FINE / 6.0 * (velocity[:-1] + 4.0 * between + velocity[1:])  # Simpson
+        self._p = CubicHermiteSpline(fine, start + np.vstack([np.zeros((1, 2)), np.cumsum(step, axis=0)]), velocity)
+        self._last = fine[-1]
+
+    def _velocity(self, t: np.ndarray) -> np.ndarray:
+        yaw = self._yaw(t)
+        velocity: np.ndarray = self._speed(t)[:, None] * np.column_stack([np.cos(yaw), np.sin(yaw)])
+        return velocity
+
+    def motion(self, t: ArrayLike) -> ExactMotion:
+        """The ExactMotion at the stamps t, (n,) s."""
+        t = np.clip(np.asarray(t, dtype=float), 0.0, self._last)
+        zero, yaw = np.zeros(len(t)), self._yaw(t)
+        speed, turning = self._speed(t), self._turning(t)
+        ahead, aside = self._speed.derivative()(t), speed * turning
+        cos, sin = np.cos(yaw), np.sin(yaw)
+        return ExactMotion(
+            p=np.column_stack([self._p(t), np.full(len(t), self._floor)]),
+            v=np.column_stack([speed * cos, speed * sin, zero]),
+            a=np.column_stack([ahead * cos - aside * sin, ahead * sin + aside * cos, zero]),
+            q=np.column_stack([zero, zero, np.sin(0.5 * yaw), np.cos(0.5 * yaw)]),
+            body_rates=np.column_stack([zero, zero, turning]),
+            specific_force=np.column_stack([ahead, aside, np.full(len(t), GRAVITY)]),
+        )
+
+    def motors(self, t: ArrayLike) -> np.ndarray:
+        """Whether the wheels turn at the stamps t: (n,) bool."""
+        t = np.clip(np.asarray(t, dtype=float), 0.0, self._last)
+        turns: np.ndarray = (self._speed(t) != 0.0) | (self._turning(t) != 0.0)
+        return turns
+
+
+def _going(tau: np.ndarray, config: SimulationConfig, rng: np.random.Generator) -> np.ndarray:
+    """How fast path time goes at tau (n,) s: 0 before and after the drive and at stops, 1 between them, with smooth changes."""
+    ends = [0.0, config.floor_time]
+    last = config.duration - config.floor_time - SPEED_UP
+    while ends[-1] < last:
+        ends += [ends[-1] + rng.uniform(*DRIVES)]
+        ends += [ends[-1] + rng.uniform(*STANDS)]
+    out = np.zeros(len(tau))
+    for begin, end in zip(ends[1::2], ends[2::2]):
+        end = min(end, last)
+        since, until = ((tau - begin) / SPEED_UP, (end - tau) / SPEED_UP)
+        out += np.asarray(STEP(np.clip(since, 0.0, 1.0)) * STEP(np.clip(until, 0.0, 1.0)), dtype=float)
+    return out
+
+
+def _followed(target: np.ndarray, speed: float) -> tuple[np.ndarray, float, np.ndarray, np.ndarray]:
+    """(place (2,) m and heading, rad, at the start; forward speed (n,) m/s and turning rate (n,) rad/s) of a rover that follows a target
+    (n, 2) m, which moves at `speed` m/s, at steps of KNOT."""
+    away = target - target[0]
+    ahead = away[np.argmax(np.hypot(*away.T) > 0.3)]  # of the path's beginning; east if it goes nowhere
+    heading = yaw = float(np.arctan2(ahead[1], ahead[0]))
+    x, y = map(float, target[0])
+    v = w = 0.0
+    speeds, turnings = [], []
+    for goal_x, goal_y in target.tolist():
+        distance = np.hypot(goal_x - x, goal_y - y)
+        bearing = (np.arctan2(goal_y - y, goal_x - x) - yaw + np.pi) % (2.0 * np.pi) - np.pi
+        outside = distance > SLACK
+        wanted = min(PULL * (distance - SLACK) + SLOWEST, 1.5 * speed) * max(np.cos(bearing), 0.0) if outside else 0.0
+        turn = float(np.clip(TURN * bearing, -FASTEST_TURN, FASTEST_TURN)) * min(5.0 * (distance - SLACK), 1.0) if outside else 0.0
+        v += float(np.clip(wanted - v, -HARDEST * KNOT, HARDEST * KNOT))
+        w += float(np.clip(turn - w, -HARDEST_TURN * KNOT, HARDEST_TURN * KNOT))
+        middle = yaw + 0.5 * w * KNOT
+        x, y, yaw = x + v * KNOT * np.cos(middle), y + v * KNOT * np.sin(middle), yaw + w * KNOT
+        speeds.append(v)
+        turnings.append(w)
+    return target[0], heading, np.array(speeds), np.array(turnings)
+
+
+class Carried:
+    """A tag in the hand of a person who walks along the path of a config: it bobs with the steps, sways and tilts. Parameters: as of
+    Trajectory; the person stands for config.floor_time before and after."""
+
+    def __init__(self, config: SimulationConfig, room: Room, rng: np.random.Generator) -> None:
+        _check_time(config)
+        tau = np.linspace(0.0, config.duration, max(int(np.ceil(config.duration / KNOT)), 8) + 1)
+        s = path_time(tau, config.floor_time, config.duration)
+        p = path_of(s, config, room, rng)
+        if config.path is None:
+            assert config.height is not None  # complete
+            p[:, 2] = config.height
+        yaw = yaw_along(s, p, config)
+        pace = np.gradient(s, tau)
+        phase, period = rng.uniform(0.0, 2.0 * np.pi, (5, 2)), rng.uniform(2.0, 7.0, (5, 2))
+        slow = np.sin(2.0 * np.pi * tau[:, None, None] / period + phase).mean(axis=2)  # (n, 5)
+        p += SWAY * slow[:, :3]
+        p[:, 2] += BOB * pace * np.sin(2.0 * np.pi * STEPS * tau)
+        self._p = make_interp_spline(tau, p, k=7)
+        self._angles = CubicSpline(tau, np.column_stack([TILT * slow[:, 3:], yaw]))  # roll, pitch, yaw
+
+    def motion(self, t: ArrayLike) -> ExactMotion:
+        """The ExactMotion at the stamps t, (n,) s."""
+        t = np.asarray(t, dtype=float)
+        a = self._p.derivative(2)(t)
+        roll, pitch, yaw = self._angles(t).T
+        d_roll, d_pitch, d_yaw = self._angles.derivative()(t).T
+        turn = Rotation.from_euler("ZYX", np.column_stack([yaw, pitch, roll]))
+        rates = np.column_stack([
+            d_roll - d_yaw * np.sin(pitch),
+            d_pitch * np.cos(roll) + d_yaw * np.sin(roll) * np.cos(pitch),
+            d_yaw * np.cos(roll) * np.cos(pitch) - d_pitch * np.sin(roll),
+        ])  # fmt: skip
+        q = turn.as_quat()
+        q[1:] *= np.cumprod(np.where(np.sum(q[1:] * q[:-1], axis=1) < 0.0, -1.0, 1.0))[:, None]  # no sign flips
+        return ExactMotion(self._p(t), self._p.derivative()(t), a, q, rates, turn.inv().apply(a + [0.0, 0.0, GRAVITY]))
+
+    def motors(self, t: ArrayLike) -> np.ndarray:
+        """No motor turns at any of the stamps t: (n,) bool."""
+        return np.zeros(len(np.asarray(t)), bool)
+
+
+def _check_time(config: SimulationConfig) -> None:
+    shortest = 2.0 * (config.floor_time + SPEED_UP)
+    if config.duration < shortest:
+        raise InputError(
+            f"duration: {config.duration:g} s is too short to start and stop; give {shortest:g} s or more, or a shorter floor_time."
+        )
+
+
+VEHICLES: dict[str, Callable[[SimulationConfig, Room, np.random.Generator], Flyable]] = {
+    "quadrotor": Trajectory,
+    "rover": Rover,
+    "hand": Carried,
+}
+assert VEHICLES.keys() == OF_VEHICLE.keys()
