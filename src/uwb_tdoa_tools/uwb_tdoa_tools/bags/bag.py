@@ -37,10 +37,11 @@ from uwb_tdoa_bias.foundation.version import written_by
 
 from ..clock import sentences, straightened
 from . import messages as bag_messages, placing
-from .files import check_output, new_bag, open_bag, readable, remarks_of
+from .anchor_sources import recorded_anchors
+from .files import connections_of, check_output, new_bag, open_bag, readable, remarks_of
 from .integrity import metadata
 from .mcap import Damaged
-from .message_types import check_type, typestore
+from .message_types import typestore
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -246,10 +247,11 @@ def read_bag(
             why = f"{count} that are there cannot be read" if count else _others(reader, namespace)
             raise InputError(f"{path}: has no message on {name_of('uwb/tdoa')}; {why}.")
         if anchors is None:
-            anchors = read_anchors(path, reader, name_of("uwb/anchors"))
-            if anchors is None:
+            recorded = recorded_anchors(path, reader, name_of("uwb/anchors"))
+            if recorded is None:
                 raise InputError(f"{path}: has no message on {name_of('uwb/anchors')}; give a survey file (--survey FILE).")
-            refuse_faulty(anchors, f"{path}: {name_of('uwb/anchors')}")
+            anchors = refuse_faulty(recorded.anchors, f"{path}: {recorded.source}")
+            remarks += recorded.remarks(name_of("uwb/anchors"))
         imu = stream("imu")
         tree = placing.read_frames(path, reader)
         places = {kinds[name].topic: placing.placed(tree, kinds[name].topic, found[name].frames) for name in ("imu", "tdoa")}
@@ -296,7 +298,7 @@ def late_tdoas(
     0 where that was not recorded. Arguments as of `read_odometry`. Raises InputError."""
     beside = Names(namespace, topics)("odometry").rpartition("/")[0]
     with open_bag(path, salvage) as reader:
-        found = _connections(path, reader, f"{beside}/uwb/residual", "uwb_tdoa_msgs/msg/TdoaResidual")
+        found = connections_of(path, reader, f"{beside}/uwb/residual", "uwb_tdoa_msgs/msg/TdoaResidual")
         return sum(residual.verdict == residual.VERDICT_LATE for _, _, residual in readable(path, reader, found))
 
 
@@ -308,7 +310,7 @@ def read_fields(path: str | Path, topic: str) -> dict[str, np.ndarray]:
     """
     with open_bag(path) as reader:
         topic = Names()(topic)
-        found = _connections(path, reader, topic)
+        found = connections_of(path, reader, topic)
         if not found:
             raise InputError(f"{path}: has no topic {topic}; record it.")
         recorded = [message for _, _, message in readable(path, reader, found)]
@@ -403,7 +405,7 @@ def read_topic(
     """TopicMessages of a topic, none if it is not there. row(message) : its stamp, ns, and k other numbers. Raises InputError if its type
     is another than msgtype."""
     arrived, rows, frames = [], [], Counter[str]()
-    for _, received, message in readable(path, reader, _connections(path, reader, topic, msgtype)):
+    for _, received, message in readable(path, reader, connections_of(path, reader, topic, msgtype)):
         arrived.append(received)
         rows.append(row(message))
         frames[message.header.frame_id] += 1
@@ -427,27 +429,6 @@ def read_sensor(path: str | Path, reader: BagReader, sensor: Sensor, name_of: Na
     order = np.argsort(np.concatenate([part.arrived for part in filled]), kind="stable")
     stamps, arrived, rows = (np.concatenate([getattr(part, name) for part in filled])[order] for name in ("stamps", "arrived", "rows"))
     return TopicMessages(stamps, arrived, rows, sum((part.frames for part in filled), Counter()))
-
-
-def read_anchors(path: str | Path, reader: BagReader, topic: str) -> Anchors | None:
-    """The last Anchors of a topic, or None. Raises InputError."""
-    last = None
-    for _, _, last in readable(path, reader, _connections(path, reader, topic, "uwb_tdoa_msgs/msg/AnchorArray")):
-        pass
-    try:
-        return None if last is None else Anchors.from_message(last)
-    except InputError as error:
-        raise InputError(f"{path}: {topic}: {error}") from error
-
-
-def _connections(path: str | Path, reader: BagReader, topic: str, msgtype: str | None = None) -> list[Connection]:
-    """The connections of a topic; raises InputError if their type is another, or not known."""
-    found = [connection for connection in reader.connections if connection.topic == topic]
-    for connection in found:
-        if msgtype is not None and connection.msgtype != msgtype:
-            raise InputError(f"{path}: {connection.topic} is {connection.msgtype}; {msgtype} is needed there.")
-        check_type(path, connection)
-    return found
 
 
 def _others(reader: BagReader, namespace: str) -> str:

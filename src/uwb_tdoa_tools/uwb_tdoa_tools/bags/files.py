@@ -25,7 +25,7 @@ from . import mcap, write_ahead
 from .integrity import NO_SUM, SUM_KEY, check as check_whole, data_files, is_mcap, is_packed, metadata, seal, sqlite_messages, unpack
 from .kind import is_bag
 from .mcap import Damaged, zstd
-from .message_types import earlier_types, typestore, upgraded
+from .message_types import check_type, earlier_types, typestore, upgraded
 from .salvage import as_written, salvage as write_sound_part
 
 if TYPE_CHECKING:
@@ -265,6 +265,16 @@ def readable(
             reader.unreadable[connection.topic] += 1
             continue
         yield connection, stamp, message
+
+
+def connections_of(path: str | Path, reader: BagReader, topic: str, msgtype: str | None = None) -> list[Connection]:
+    """The connections of a topic; raises InputError if their type is another, or not known."""
+    found = [connection for connection in reader.connections if connection.topic == topic]
+    for connection in found:
+        if msgtype is not None and connection.msgtype != msgtype:
+            raise InputError(f"{path}: {connection.topic} is {connection.msgtype}; {msgtype} is needed there.")
+        check_type(path, connection)
+    return found
 
 
 def remarks_of(reader: BagReader) -> list[str]:

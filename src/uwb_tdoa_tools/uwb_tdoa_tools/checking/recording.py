@@ -16,7 +16,8 @@ from uwb_tdoa_bias.foundation.sensors import LOCATING, SENSORS
 from uwb_tdoa_bias.foundation.survey_faults import refuse_faulty
 
 from ..bags import messages as bag_messages, placing
-from ..bags.bag import Names, arrivals, on_one_clock, read_anchors, read_sensor, read_topic
+from ..bags.anchor_sources import recorded_anchors
+from ..bags.bag import Names, arrivals, on_one_clock, read_sensor, read_topic
 from ..bags.files import open_bag, remarks_of
 from ..bags.placing import TF_STATIC
 from ..readers import read_survey
@@ -132,7 +133,7 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
         tdoa, imu = found["tdoa"], found["imu"]
         arrival = {name: arrival[name][clock.kept.get(name, slice(None))] for name in ("tdoa", "imu")}
         sensors = {name: _stream_of(found[name], sensor) for name, sensor in SENSORS.items() if len(found[name].stamps)}
-        recorded = read_anchors(path, reader, name_of("uwb/anchors"))
+        recorded = recorded_anchors(path, reader, name_of("uwb/anchors"))
         tree = placing.read_frames(path, reader)
         remarks = tuple(remarks_of(reader))
     if not len(tdoa.stamps) and not sensors.keys() & set(LOCATING):
@@ -140,10 +141,10 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
         places = " or ".join(f"--topic {TDOA}={topic}" for topic in there)
         hint = f"say where they are ({places})" if there else "record the TDOAs of the tag"
         raise InputError(f"{path}: has no message on {name_of(TDOA)}; {hint}.")
-    anchors = read_survey(survey) if survey else recorded
+    anchors = read_survey(survey) if survey else recorded and recorded.anchors
     if anchors is None:
         raise InputError(f"{path}: has no message on {name_of('uwb/anchors')}; give a survey file (--survey FILE).")
-    refuse_faulty(anchors, str(survey) if survey else f"{path}: {name_of('uwb/anchors')}")
+    refuse_faulty(anchors, str(survey) if survey or recorded is None else f"{path}: {recorded.source}")
     samples = bag_messages.imu_of(imu.stamps / 1e9, imu.rows) if len(imu.stamps) else None
     if samples is not None and (place := placing.placed(tree, IMU, imu.frames)[0]):
         samples = placing.imu_in_body(samples, place)
@@ -158,7 +159,7 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
         places={frame: place for frame in {*tdoa.frames, *imu.frames} if (place := placing.place_of(tree, frame))},
         topics=topics,
         read=frozenset(map(name_of, HEARD)),
-        recorded=recorded,
+        recorded=recorded and recorded.anchors,
         remarks=remarks,
         sensors=sensors,
         jumps=clock.jumps,
