@@ -99,6 +99,7 @@ def parser():
         "./dev study diagnosis measured --data DATA --out bench/",
         "./dev study diagnosis undeclared --cases src/uwb_tdoa_tools/test/undeclared.py --out bench/",
         "./dev study faults --only '^velocity' --json faults.json --out faults.md",
+        "./dev study fly-faults --flights 6",
         "./dev study fuzz --count 20000",
         "./dev study in-flight DATA/flights/0426/0426-traj5 --survey DATA/surveys --only nothing sign",
         "./dev study localizing DATA/flights DATA/util --survey DATA/surveys --mistakes",

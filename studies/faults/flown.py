@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 import json
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -27,6 +26,7 @@ from uwb_tdoa_tools.flying.simulator import SensorReadings
 from uwb_tdoa_tools.flying.trial import Task, Trial
 from uwb_tdoa_tools.flying.verdict import verdict_of
 from uwb_tdoa_tools.flying.world import world_of
+from uwb_tdoa_tools.outputs import OutputFile
 
 BEGIN, END = 12.0, 15.0  # s
 LOOK, REPORT = 0.2, 1.0  # s between two looks at the status, and two at the streams, as in ekf_node
@@ -204,7 +204,7 @@ def add_options(add: Callable) -> None:
     add("--flights", type=parallel.whole_number, default=10, metavar="N", help="of each fault (default: 10)")
     add("--seed", type=parallel.whole_number, default=5001, metavar="S", help="of the first (default: 5001)")
     add("--jobs", type=parallel.whole_number, metavar="N", help="flights at once (default: as many as there are cores)")
-    add("--json", type=Path, metavar="FILE", help="write all figures")
+    add("--json", type=OutputFile, metavar="FILE", help="write all figures")
 
 
 def run(args: Namespace) -> None:
