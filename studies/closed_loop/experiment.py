@@ -76,7 +76,7 @@ def add_options(add: Callable) -> None:
 
 def run(args: Namespace) -> None:
     """Train, fly, print the table, and draw."""
-    out = cli.output_folder(args.out)
+    out = args.out
     out.mkdir(parents=True, exist_ok=True)
     trained = args.trained or train(args.training, out / "trained", args.jobs)
     kinds = [(by, where, path) for where in (KNOWN, *UNSEEN) for path in TRAJECTORIES for by in ESTIMATORS]

@@ -20,7 +20,7 @@ def grows(data):
 
 
 def holds(data):
-    bytearray(20 << 20)
+    b"x" * (20 << 20)
 
 
 def refuses(data):

@@ -94,6 +94,15 @@ def test_the_state_of_a_recording_changes_with_it(tmp_path):
     assert state_of(tmp_path / "bag") != before and state_of(None) == "None"
 
 
+def test_a_pipe_and_a_link_hold_no_results(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to(tmp_path / "bashrc")
+    for name, said in (("pipe", "holds something else"), ("link", "is a link to .*bashrc")):
+        with pytest.raises(InputError, match=said):
+            ResultsFile(tmp_path / name, {})
+    assert not (tmp_path / "bashrc").exists()
+
+
 def test_a_recording_of_too_many_files_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(results_file, "FOLDER_ENTRIES", 3)
     for number in range(4):

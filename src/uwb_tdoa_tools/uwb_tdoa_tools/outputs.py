@@ -89,7 +89,8 @@ def _check_folder(out: Path) -> None:
         raise InputError(f"{out}: cannot be made, as {there} is a file; give another directory.")
     _refuse_bag(out, there)
     for inside in sorted(out.iterdir()) if out.exists() else ():
-        refuse_output(inside)
+        if inside.is_symlink() or not inside.is_dir():
+            refuse_output(inside)
     _check_writable(out, there)
 
 

@@ -50,6 +50,8 @@ class ResultsFile:
         if not self._path.absolute().parent.is_dir():
             raise InputError(f"{path}: its directory does not exist; make it first.")
         refuse_output(path)
+        if self._path.exists() and not self._path.is_file():
+            raise self._foreign()
         self._file = open(self._path, "a+b")
         try:
             self._begin(asked)
