@@ -123,6 +123,9 @@ def refit(table: RegressionTable, columns: Sequence[Column], model: Fit, rows: n
     residual = table.y - x @ beta
     if rows is None and columns:
         cov = _covariance(table, columns, residual, root)
+    elif columns:
+        apart = np.eye(len(columns)) - in_common(table, columns)
+        cov = apart @ cov @ apart
     return replace(model, columns=tuple(columns), beta=beta, cov=cov, residual=residual)
 
 
