@@ -149,7 +149,7 @@ class Corrector:
             noise = np.where(unknown, np.hypot(noise, np.std(each, axis=0)), noise)
         if len(steep) and unknown.any():
             level = slope_of([effect for effect in steep.effects if not effect.uses_attitude], samples)[1]
-            slope = np.where(unknown[:, None], level, slope)
+            slope[unknown] = level[unknown]
         return bias, noise, slope, state
 
     def samples(self, t: np.ndarray, a: np.ndarray, b: np.ndarray) -> Samples:
