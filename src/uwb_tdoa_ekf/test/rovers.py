@@ -151,12 +151,13 @@ def main():
         "TDOA alone": (bare, ("velocity",), False), "two late anchors: wheels, IMU, planar": (planar, (), True),
         "two late anchors: wheels, planar": (planar | bare, (), True),
     }  # fmt: skip
-    rows |= {f"{name}; noise as it is": (rows[name][0] | matched, *rows[name][1:]) for name in list(rows)[:6]}
+    rows |= {f"{name}; noise as it is": (rows[name][0] | matched, *rows[name][1:]) for name in list(rows)[:2]}
+    flights = [drive(seed) for seed in range(100, 120)]
     print("| | xy, m | largest, m | yaw, degrees | stated, degrees | NEES of xy, of height, of yaw | largest step, m |")
     for name, (parameters, without, lies) in rows.items():
         found = []
-        for seed in range(100, 120):
-            flight, rng = drive(seed), np.random.default_rng(seed)
+        for seed, flight in enumerate(flights):
+            rng = np.random.default_rng(seed)
             flight = late(flight, rng.choice(6, 2, replace=False), rng.uniform(30.0, 50.0)) if lies else flight
             errors = Errors(flight, run_offline(flight.without(*without), FilterConfig(**parameters)).odometry, 15.0)
             nees = [np.mean(some) for some in (errors.nees_xy, errors.nees_z, errors.nees_yaw)]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.core.engine import feed, most_records, run
+from uwb_tdoa_ekf.core.engine import STALE_TURN_PSD, feed, most_records, run
 from uwb_tdoa_ekf.core.history import RECORD, RESET, UPDATE
 from uwb_tdoa_ekf.core.memory import ODOMETRY, RESIDUAL, Output, new_state
 from uwb_tdoa_ekf.core.verdicts import USED
@@ -32,13 +32,14 @@ def test_every_tdoa_that_is_used_has_its_record_and_none_is_without_room(seed, o
 
 
 def test_a_record_leads_to_the_next():
-    """P after an update is (I - K h) (Phi P Phi' + Q), with no Q for what no noise drives."""
+    """P after an update is (I - K h) (Phi P Phi' + Q), with no Q for what no noise drives: of a tag without an IMU all but the yaw."""
     flight = fly(3, 2.0)
     records, _ = recorded(flight, FilterConfig(initial_yaw_std=0.5, motion_noise=1e-6, use_imu=False))
     for before, record in zip(records[5:60], records[6:61]):
         phi = np.eye(15)
         phi[:9] = record["transition"]
         prior = phi @ before["P"] @ phi.T
+        prior[8, 8] += STALE_TURN_PSD * (record["t"] - before["t"])
         gain, row = record["gain"], record["row"]
         np.testing.assert_allclose(record["P"], (np.eye(15) - np.outer(gain, row)) @ prior, atol=1e-9)
         assert record["variance"] * gain == pytest.approx(prior @ row, abs=1e-9)

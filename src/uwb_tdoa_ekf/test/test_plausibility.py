@@ -1,6 +1,8 @@
 """Inertial samples that cannot be right are left out at once, and used again; healthy ones never are (those of measured flights:
 test_stream_watch.py)."""
 
+import re
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -10,6 +12,7 @@ from uwb_tdoa_ekf.core.engine import feed
 from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, TDOA, Measurements, new_state, structured
 from uwb_tdoa_ekf.core.plausibility import CLEARED, RATE, TILT, TURN, WEIGHT
 from uwb_tdoa_ekf.core.state import GRAVITY
+from uwb_tdoa_ekf.monitoring.implausible import implausible
 
 T = np.arange(3000) / 200.0
 BEGIN, END = 5.0, 9.0  # s, of a fault
@@ -87,3 +90,13 @@ def test_what_a_tag_may_do_is_no_fault():
 def test_a_tag_that_lies_on_its_back_goes_without_after_some_seconds():
     said = left_out(*sensed(Rotation.from_euler("X", np.interp(T, [3.0, 4.0], [0.0, np.pi]))))
     assert 6.0 < said[0][0] < 7.2 and said[0][1] == TILT and said[-1][0] == T[-1]
+
+
+@pytest.mark.parametrize(("turn", "says"), [([1.0, -1.0, -1.0], r"-9\.\d m/s\^2"), ([0.0, 0.0, 0.0], r"of 0 m/s\^2")])
+def test_what_is_said_has_the_number_of_the_sensor(turn, says):
+    """It once was 1.0, whatever the sensor read: the field `size` of a numpy record is hidden by how many it is."""
+    gyro, accel = (values * turn for values in swaying())
+    state, parameters = new_state(np.zeros((4, 3))), FilterConfig().parameters()
+    feed(state, parameters, Measurements(structured(IMU_SAMPLE, T, gyro, accel), np.empty(0, TDOA)))
+    found = implausible(state.record.plausibility)
+    assert re.search(says, found.evidence), found.evidence

@@ -206,8 +206,8 @@ class Fleet:
         if not here:
             known = ", ".join(dict.fromkeys(str(name) for name in self.hosts.values()))
             raise InputError(f"{self.path}: no tag has the host {host}; those named are {known}: correct the file, or give host:=NAME.")
-        tags, hosts, remaps = ({name: of[name] for name in here} for of in (self.tags, self.hosts, self.remaps))
-        return Fleet(self.path, tags, hosts, remaps, self.processes)
+        tags, hosts = {name: self.tags[name] for name in here}, {name: self.hosts[name] for name in here}
+        return Fleet(self.path, tags, hosts, {name: self.remaps[name] for name in here}, self.processes)
 
     def starts(self, values: Mapping, log_level: str = "info") -> list[Start]:
         """bias_node and ekf_node of each tag, each with a frame of its own, NAMESPACE/base_link, unless it names another; values : override
@@ -287,9 +287,9 @@ def typed(texts: dict[str, str]) -> dict[str, bool | str]:
 
 def _remaps(path: str, given: object) -> dict[str, str]:
     """{topic: name} of what a file of tags says. Raises InputError."""
-    entries: Any = {} if given is None else given
+    entries = {} if given is None else given
     texts = [text for pair in entries.items() for text in pair] if isinstance(entries, dict) else [None]
-    if not all(isinstance(text, str) and text and ":=" not in text for text in texts):
+    if not isinstance(entries, dict) or not all(isinstance(text, str) and text and ":=" not in text for text in texts):
         raise InputError(f"{path}: remaps: {given!r} must be a mapping of topics to names, e.g. {{velocity/odometry: odom}}.")
     return entries
 

@@ -131,7 +131,7 @@ class Corrector:
 
     def contribution(self, samples: Samples) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """(bias (n,) m, its standard deviation (n,) m, slope (n, 6), state (n, 6)), as of a Correction, of the effects in Samples; while
-        the yaw is unknown the mean over four headings, and its scatter, without a slope."""
+        the yaw is unknown the mean over four headings, and its scatter, without the slope of those that depend on it."""
         slope = state = np.zeros((len(samples), N_STATES))
         if not len(self.effects):
             return np.zeros(len(samples)), np.zeros(len(samples)), slope, state
@@ -147,8 +147,9 @@ class Corrector:
             known, *each = turning.bias(replace(samples.repeated(5), q=headings)).reshape(5, -1)
             bias = np.where(unknown, bias - known + np.mean(each, axis=0), bias)
             noise = np.where(unknown, np.hypot(noise, np.std(each, axis=0)), noise)
-        if len(steep):
-            slope[unknown] = 0.0
+        if len(steep) and unknown.any():
+            level = slope_of([effect for effect in steep.effects if not effect.uses_attitude], samples)[1]
+            slope[unknown] = level[unknown]
         return bias, noise, slope, state
 
     def samples(self, t: np.ndarray, a: np.ndarray, b: np.ndarray) -> Samples:

@@ -32,4 +32,5 @@ def implausible(check: Record) -> Finding:
     """The Finding of a PLAUSIBILITY by which inertial samples are left out."""
     cause, evidence, remedy = SAID[int(check.reason)]
     cause = f"{cause}: the filter goes without the IMU"
-    return Finding("imu_left_out", ERROR, cause, evidence.format(float(check.size)), remedy, float(check.size))
+    size = float(check["size"])  # of a numpy record, `.size` is how many it is
+    return Finding("imu_left_out", ERROR, cause, evidence.format(size), remedy, size)

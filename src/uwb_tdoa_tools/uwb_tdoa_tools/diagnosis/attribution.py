@@ -22,6 +22,7 @@ from .findings import EffectFinding, Refused
 from .over_flights import of_one, shares
 from .refinement import ROUNDS, cross_validated, effects_of, entry_of, inflation_of, linearised, relinearised, with_maps, with_smooth
 from .regression.confounding import alternatives
+from .regression.fit import in_common, prior_sizes
 from .regression.held_out import held_out
 from .regression.scan import Scan
 from .regression.select import Selection, select, with_rivals
@@ -86,7 +87,9 @@ class Attribution:
         if not columns:
             return None
         places = [self.selection.fit.columns.index(column) for column in columns]
-        return to_keep(tuple((str(column.effect[0]), column.key) for column in columns), self.selection.fit.cov[np.ix_(places, places)])
+        covariance = self.selection.fit.cov[np.ix_(places, places)]
+        covariance = covariance + in_common(self.selection.table, columns) * prior_sizes(columns) ** 2.0  # nothing is known of that
+        return to_keep(tuple((str(column.effect[0]), column.key) for column in columns), covariance)
 
     def findings(self) -> list[EffectFinding]:
         """[EffectFinding], those by regression first, those of one flight alone last."""

@@ -18,12 +18,11 @@ import numpy as np
 from uwb_tdoa_bias.effects.samples import RADIO
 
 from .regression.algebra import beside_each_other, counts, each_times, product, weighted
-from .regression.fit import prior_sizes
+from .regression.fit import in_common, prior_sizes
 from .self_calibration.equations import features
 from .self_calibration.prior import DELAY, FUNCTION_STDS, OF_ANCHORS, POSITION, eliminated, posterior
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
     from .regression.fit import Fit
     from .regression.select import Selection
     from .regression.table import RegressionTable
@@ -32,40 +31,23 @@ if TYPE_CHECKING:
 
 LENGTH = 4.0  # m over which functions of the place change; the shift of an anchor makes errors that change as slowly
 UNSAID = 0.03  # m, that coordinates and delays may be off by, of which no anchor has any in the fit
-CANCELS = 1e-9  # regressor of delays together, which is nothing
+LASTS = (*OF_ANCHORS, "tag_lever_arm")  # take what other errors leave that last as long as the flight
 LASTING = 14.0  # by which errors that are alike for a while are alike for longer than blocks tell
 
 
 def with_deviations(selection: Selection) -> Selection:
-    """The Selection with standard deviations of positions and delays of anchors that hold; as it is where there are none, or where
-    the path is not known."""
+    """The Selection with standard deviations of positions and delays of anchors, and of the place of the antenna, that hold; as it is where
+    there are none, or where the path is not known."""
     table, model = selection.table, selection.fit
-    places = [k for k, column in enumerate(model.columns) if column.effect[0] in OF_ANCHORS]
+    places = [k for k, column in enumerate(model.columns) if column.effect[0] in LASTS]
     if not places or any(part.innovations is not None for part in table.radio_parts):
         return selection
     away, covariance = _beside_others(table, model)
-    apart = apart_from_common(table, model.columns)
-    shown, fitted = apart @ model.cov @ apart, stated(table, model.columns, model.cov)
-    std = stated(table, model.columns, covariance)
+    apart = np.eye(len(away)) - in_common(table, model.columns)
+    fitted, std = np.sqrt(np.diag(model.cov)), np.sqrt(np.diag(apart @ covariance @ apart))
     grow = np.ones(len(fitted))
     grow[places] = (np.maximum(fitted, np.hypot(std, apart @ away)) / fitted)[places]
-    return replace(selection, fit=replace(model, cov=model.cov - shown + shown * np.outer(grow, grow)))
-
-
-def stated(table: RegressionTable, columns: Sequence[Column], cov: np.ndarray) -> np.ndarray:
-    """Standard deviations (k,) of the values of some Columns with a covariance (k, k): of delays apart from what all have in common."""
-    apart = apart_from_common(table, columns)
-    deviations: np.ndarray = np.sqrt(np.maximum(np.diag(apart @ cov @ apart), 0.0))
-    return deviations
-
-
-def apart_from_common(table: RegressionTable, columns: Sequence[Column]) -> np.ndarray:
-    """(k, k), what takes from delays of anchors among some Columns the mean of all, where it cancels in every row, as it does in TDOAs. A
-    fit leaves it at 0, and its deviation would be that of the prior."""
-    out, places = np.eye(len(columns)), [k for k, column in enumerate(columns) if column.effect == (DELAY,)]
-    if len(places) > 1 and np.abs(table.matrix([columns[k] for k in places]).sum(axis=1)).max() < CANCELS:
-        out[np.ix_(places, places)] -= 1.0 / len(places)
-    return out
+    return replace(selection, fit=replace(model, cov=model.cov * np.outer(grow, grow)))
 
 
 def _beside_others(table: RegressionTable, model: Fit) -> tuple[np.ndarray, np.ndarray]:

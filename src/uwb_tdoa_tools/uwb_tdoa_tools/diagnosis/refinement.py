@@ -10,7 +10,6 @@ import numpy as np
 from uwb_tdoa_bias.effects import SmoothTerm
 
 from .channels import CHANNELS
-from .deviations import stated
 from .findings import Refused
 from .regression.fit import fit
 from .regression.held_out import held_out
@@ -40,7 +39,7 @@ def effects_of(selection: Selection) -> tuple[Effect, ...]:
     values: dict[Hashable, dict[str, float]] = {}
     std: dict[Hashable, dict[str, float]] = {}
     effects: dict[Hashable, Effect] = {}
-    error = stated(selection.table, selection.fit.columns, selection.fit.cov)
+    error = np.sqrt(np.diag(selection.fit.cov))
     fitted = dict(zip(selection.fit.columns, zip(selection.fit.beta.tolist(), error.tolist())))
     for term in (term for candidate in selection.chosen for term in candidate.terms):
         effect = term.effect

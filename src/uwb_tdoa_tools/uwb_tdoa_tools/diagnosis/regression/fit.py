@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from .table import RegressionTable
     from .terms import Column
 
+DELAY, CANCELS = "anchor_delay", 1e-9  # and the sum of their regressors, which is nothing
 NU = 4.0
 ITERATIONS = 12
 MIN_BLOCKS = 6
@@ -107,7 +108,7 @@ def fit(
     if inflation is None:
         inflation = measure_inflation(table, residual, weight, scale, columns)
     root = weight / (scale[group] ** 2 * inflation[group])
-    cov = _covariance(table, x, residual, root, sizes) if columns and covariance else np.zeros((0, 0))
+    cov = _covariance(table, columns, residual, root) if columns and covariance else np.zeros((0, 0))
     size = np.bincount(group, minlength=len(scale)) / inflation
     return Fit(tuple(columns), beta, cov, residual, weight, scale, inflation, np.maximum(size, 1.0))
 
@@ -121,7 +122,10 @@ def refit(table: RegressionTable, columns: Sequence[Column], model: Fit, rows: n
     beta, cov, _ = solve(product(xw, x[some]), xw.T @ table.y[some], sizes)
     residual = table.y - x @ beta
     if rows is None and columns:
-        cov = _covariance(table, x, residual, root, sizes)
+        cov = _covariance(table, columns, residual, root)
+    elif columns:
+        apart = np.eye(len(columns)) - in_common(table, columns)
+        cov = apart @ cov @ apart
     return replace(model, columns=tuple(columns), beta=beta, cov=cov, residual=residual)
 
 
@@ -147,9 +151,21 @@ def student_scale(r: np.ndarray) -> float:
     return scale
 
 
-def _covariance(table: RegressionTable, x: np.ndarray, residual: np.ndarray, root: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """Sandwich over blocks, at least the model's own."""
+def in_common(table: RegressionTable, columns: Sequence[Column]) -> np.ndarray:
+    """(k, k), what makes of the delays of anchors among some Columns the mean of all, where that cancels in every row, as in TDOAs; 0
+    elsewhere. A fit leaves that mean at 0, and its deviation would be that of the prior."""
+    out, places = np.zeros((len(columns), len(columns))), [k for k, column in enumerate(columns) if column.effect == (DELAY,)]
+    if len(places) > 1 and np.abs(table.matrix([columns[k] for k in places]).sum(axis=1)).max() < CANCELS:
+        out[np.ix_(places, places)] = 1.0 / len(places)
+    return out
+
+
+def _covariance(table: RegressionTable, columns: Sequence[Column], residual: np.ndarray, root: np.ndarray) -> np.ndarray:
+    """Sandwich over blocks, at least the model's own; of delays apart from what all have `in_common`."""
+    x, sizes = table.matrix(columns), prior_sizes(columns)
     _, bread, _ = solve(product(weighted(x, root), x), np.zeros(x.shape[1]), sizes)
+    apart = np.eye(len(columns)) - in_common(table, columns)
+    bread = apart @ bread @ apart
     blocks = int(table.block.max()) + 1
     if blocks < MIN_BLOCKS:
         return bread
