@@ -134,7 +134,7 @@ def _plan(args: Namespace) -> int | None:
     report.say_in_hull(about)
     report.say_flyable(about, demand.accuracy)
     if demand.criterion == "round":
-        figures["addition"] = run.one_more(found, anchors, options.goal_of(args, installation, demand), options.places_of(args, room))
+        figures["addition"] = run.room_advice(found, anchors, options.goal_of(args, installation, demand), options.places_of(args, room))
         report.say_addition(figures["addition"], about["flyable_share"])
     outgoing = run.draw_map(found, installation, args.out, pairings=demand.criterion == "pairings")
     if args.check:

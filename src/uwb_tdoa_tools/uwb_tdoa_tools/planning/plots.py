@@ -46,7 +46,7 @@ ANCHOR, HULL = "#1f3a93", "#8e44ad"
 HEARD_COLOURS = [0, 1, 2, 3, 4, 5, 6, 8, 10, 13, 17, 25]  # bounds of the colours of the picture
 COLOURS = "viridis_r"
 _MOST_LAYERS = 3
-ACROSS = 9  # ellipses along the longer side of a map
+ACROSS = 7  # ellipses along the longer side of a map
 
 
 def plot_precision(anchors: Anchors, chart: Chart, path: str | Path, walls: Walls | None = None) -> None:
@@ -55,12 +55,15 @@ def plot_precision(anchors: Anchors, chart: Chart, path: str | Path, walls: Wall
     figure, axes = _panels(chart.grid, len(layers))
     flown = chart.error[chart.flyable] if chart.flyable.any() else chart.error[np.isfinite(chart.error)]
     scale = _scale(100.0 * flown)
+    times = _enlarged(chart)
     for ax, k in zip(axes, layers):
-        _field(ax, chart.grid, 100.0 * chart.error, k, "bound of one round (root of the summed variances), cm", scale)
+        mesh = _field(ax, chart.grid, 100.0 * chart.error, k, scale)
         _room(ax, anchors, chart.grid, k, walls)
-        times = _ellipses(ax, chart, k)
-        ax.set_title(_height(chart.grid, k) + f"ellipses hold 99 % of the estimates, drawn {times} times as large", fontsize=10)
-    _legend(figure, [_hull_line(), _anchor_mark(anchors)])
+        _ellipses(ax, chart, k, times)
+        ax.set_title(_height(chart.grid, k), fontsize=10)
+    _bar(axes, mesh, "bound of one round (root of the summed variances), cm", _beyond(100.0 * chart.error, scale))
+    ellipse = Line2D([], [], color="0.3", marker="o", mfc="none", ls="", label=f"holds 99 % of the estimates, drawn {times} times as large")
+    _legend(figure, [_hull_line(), _anchor_mark(anchors), ellipse])
     _save(figure, "How precise one round is", path)
 
 
@@ -82,7 +85,7 @@ def plot_flyable(
             for q in range(discriminant.shape[2]):
                 ax.contour(x, y, discriminant[:, :, q], levels=[0.0], colors="0.45", linewidths=0.6)
         _room(ax, anchors, chart.grid, k, walls)
-        ax.set_title(_height(chart.grid, k) + f"{np.mean(status == FLYABLE):.0%} can be flown".replace("%", " %"), fontsize=10)
+        ax.set_title(_height(chart.grid, k) + f": {np.mean(status == FLYABLE):.0%} can be flown".replace("%", " %"), fontsize=10)
     shares = [(STATES[code], np.mean(chart.status == code)) for code in codes]
     marks: list[Any] = [Patch(facecolor=colour, label=f"{name}: {100.0 * share:.0f} %") for (name, colour), share in shares]
     marks += [_hull_line(), _anchor_mark(anchors)]
@@ -100,9 +103,9 @@ def plot_heard(anchors: Anchors, chart: Chart, path: str | Path, walls: Walls | 
     x, y, _ = chart.grid.axes
     norm = BoundaryNorm(HEARD_COLOURS, 256, extend="max")
     mesh = ax.pcolormesh(x, y, chart.grid.layer(chart.heard.astype(float), k), cmap="viridis", norm=norm, shading="nearest", rasterized=True)
-    _bar(ax, mesh, "anchors heard", "max", HEARD_COLOURS)
+    _bar([ax], mesh, "anchors heard", "max", HEARD_COLOURS)
     _room(ax, anchors, chart.grid, k, walls)
-    ax.set_title(_height(chart.grid, k) + f"{100.0 * np.mean(chart.heard >= 4):.0f} % hear 4 or more", fontsize=10)
+    ax.set_title(_height(chart.grid, k) + f": {100.0 * np.mean(chart.heard >= 4):.0f} % hear 4 or more", fontsize=10)
     _legend(figure, [_hull_line(), _anchor_mark(anchors)])
     _save(figure, f"How many of {len(anchors)} anchors are heard", path)
 
@@ -163,16 +166,17 @@ def plot_layouts(charts: Sequence[tuple[str, Installation, Chart]], path: str | 
     scale = _scale(100.0 * finite)
     blocked = any((~chart.grid.layer(chart.flyable, k)).any() for _, _, chart in charts)
     for ax, (title, installation, chart) in zip(axes, charts):
-        _field(ax, grid, 100.0 * chart.error, k, "bound of one round, cm", scale)
+        mesh = _field(ax, grid, 100.0 * chart.error, k, scale)
         _hatch(ax, chart, k)
         _room(ax, installation.anchors, grid, k)
         share, median = 100.0 * chart.flyable.mean(), 100.0 * np.median(chart.error[chart.flyable]) if chart.flyable.any() else np.nan
         ax.set_title(f"{title}: {share:.0f} % can be flown, median bound there {median:.1f} cm", fontsize=10)
+    _bar(axes, mesh, "bound of one round, cm", _beyond(100.0 * np.concatenate([chart.error for _, _, chart in charts]), scale))
     marks: list[Any] = [_hull_line(), _anchor_mark(charts[0][1].anchors)]
     if blocked:
         marks.append(Patch(facecolor="white", edgecolor="k", hatch="////", label="cannot be flown"))
     _legend(figure, marks)
-    _save(figure, f"Before and after, {_height(grid, k).rstrip(': ')}" + ("; hatched: cannot be flown" if blocked else "; all can be flown"), path)
+    _save(figure, f"Before and after, {_height(grid, k)}" + ("; hatched: cannot be flown" if blocked else "; all can be flown"), path)
 
 
 def plot_places(places: AnchorPlaces, numbers: np.ndarray, scores: np.ndarray, path: str | Path) -> None:
@@ -183,7 +187,7 @@ def plot_places(places: AnchorPlaces, numbers: np.ndarray, scores: np.ndarray, p
     along, height = numbers[:, 0] * places.ends[-1], at[:, 2]
     scale = _scale(100.0 * scores[np.isfinite(scores)])
     dots = ax.scatter(along, height, c=100.0 * scores, cmap=COLOURS, s=60, vmin=scale[0], vmax=scale[1], edgecolors="0.4", linewidths=0.3)
-    _bar(ax, dots, "worst bound that is flown, cm", _beyond(100.0 * scores, scale))
+    _bar([ax], dots, "worst bound that is flown, cm", _beyond(100.0 * scores, scale))
     for number, (start, end) in enumerate(zip(places.starts, places.ends)):
         ax.axvline(end, color="0.6", lw=0.8)
         ax.text(0.5 * (start + end), ax.get_ylim()[1], f"place {number + 1}", ha="center", va="bottom", fontsize=9)
@@ -201,7 +205,7 @@ def _layers(grid: Grid) -> list[int]:
 
 
 def _height(grid: Grid, k: int) -> str:
-    return f"z = {grid.axes[2][k]:.2f} m: "
+    return f"z = {grid.axes[2][k]:.2f} m"
 
 
 def _panels(grid: Grid, count: int) -> tuple[Figure, np.ndarray]:
@@ -219,20 +223,22 @@ def _scale(values: np.ndarray) -> tuple[float, float]:
 
 def _beyond(values: np.ndarray, scale: tuple[float, float]) -> str:
     """Which ends of the colours values (n,) go beyond, as matplotlib calls it."""
-    return {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[int(np.nanmin(values) < scale[0]), int(np.nanmax(values) > scale[1])]
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return "neither"
+    return {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[int(values.min() < scale[0]), int(values.max() > scale[1])]
 
 
-def _field(ax: Axes, grid: Grid, values: np.ndarray, k: int, label: str, scale: tuple[float, float]) -> None:
+def _field(ax: Axes, grid: Grid, values: np.ndarray, k: int, scale: tuple[float, float]) -> Any:
     """Colours of the layer k of values (n,) between the ends of a scale; white where there is none."""
     x, y, _ = grid.axes
     layer = grid.layer(np.where(np.isfinite(values), values, np.nan), k)
-    mesh = ax.pcolormesh(x, y, layer, cmap=COLOURS, vmin=scale[0], vmax=scale[1], shading="nearest", rasterized=True)
-    _bar(ax, mesh, label, _beyond(values[np.isfinite(values)], scale) if np.isfinite(values).any() else "neither")
+    return ax.pcolormesh(x, y, layer, cmap=COLOURS, vmin=scale[0], vmax=scale[1], shading="nearest", rasterized=True)
 
 
-def _bar(ax: Axes, drawn: Any, label: str, extend: str, ticks: Sequence[float] | None = None) -> None:
+def _bar(axes: Sequence[Axes] | np.ndarray, drawn: Any, label: str, extend: str, ticks: Sequence[float] | None = None) -> None:
     """A scale whose arrows say at which ends there is more."""
-    bar = ax.figure.colorbar(drawn, ax=ax, extend=extend, shrink=0.9, pad=0.02, aspect=25)
+    bar = axes[0].figure.colorbar(drawn, ax=list(axes), extend=extend, shrink=0.9 / len(axes) ** 0.5, pad=0.02, aspect=25)
     if ticks is None:
         low, high = drawn.get_clim()
         ticks = np.linspace(low, high, 5)
@@ -277,8 +283,11 @@ def _anchors(ax: Axes, anchors: Anchors, label: bool = True) -> None:
     if turned.any():
         front = Rotation.from_quat(anchors.orientations[turned]).apply([1.0, 0.0, 0.0])
         ax.quiver(*p[turned, :2].T, *front[:, :2].T, color=ANCHOR, width=0.004, scale=25, zorder=5)
+        tips = p[turned, :2] + front[:, :2] * np.ptp(ax.get_xlim()) / 30.0
+    else:
+        tips = np.empty((0, 2))
     if label:
-        put_labels(ax, anchors.ids.tolist(), p[:, :2], 8.0, ANCHOR)
+        put_labels(ax, anchors.ids.tolist(), p[:, :2], tips, ANCHOR)
 
 
 def _hull_line() -> Line2D:
@@ -295,24 +304,34 @@ def _legend(figure: Figure, marks: Sequence[Any]) -> None:
     figure.legend(handles=marks, loc="outside lower center", ncols=min(3, len(marks)), frameon=False, fontsize=9)
 
 
-def _ellipses(ax: Axes, chart: Chart, k: int) -> int:
-    """99 % ellipses of some cells that can be flown, enlarged so that they can be seen. Returns by how much."""
+def _some_cells(chart: Chart, k: int) -> np.ndarray:
+    """Which cells of the layer k have an ellipse: (n,) bool."""
     every = max(1, max(chart.grid.shape[:2]) // ACROSS)
     rows = np.zeros(chart.grid.shape, bool)
     rows[every // 2 :: every, every // 2 :: every, k] = True
-    rows = rows.ravel() & chart.flyable
+    return rows.ravel() & chart.flyable
+
+
+def _enlarged(chart: Chart) -> int:
+    """By how much ellipses are drawn larger, so that they can be seen and hardly cover each other."""
+    rows = np.any([_some_cells(chart, k) for k in _layers(chart.grid)], axis=0)
     if not rows.any():
         return 1
-    semi, angle = ellipses(chart.covariance[rows])
-    enlarged = max(1, round(0.4 * every * chart.grid.step / np.median(semi[:, 0])))
-    ax.add_collection(
-        EllipseCollection(
-            2 * enlarged * semi[:, 0], 2 * enlarged * semi[:, 1], np.rad2deg(angle), units="xy",
-            offsets=chart.grid.points[rows, :2], offset_transform=ax.transData, facecolors="none", edgecolors="w",
-            linewidths=1.2,
-        )
-    )  # fmt: skip
-    return enlarged
+    every = max(1, max(chart.grid.shape[:2]) // ACROSS)
+    return max(1, round(0.35 * every * chart.grid.step / np.median(ellipses(chart.covariance[rows])[0][:, 0])))
+
+
+def _ellipses(ax: Axes, chart: Chart, k: int, times: int) -> None:
+    """99 % ellipses of some cells that can be flown."""
+    rows = _some_cells(chart, k)
+    if rows.any():
+        semi, angle = ellipses(chart.covariance[rows])
+        ax.add_collection(
+            EllipseCollection(
+                2 * times * semi[:, 0], 2 * times * semi[:, 1], np.rad2deg(angle), units="xy", offsets=chart.grid.points[rows, :2],
+                offset_transform=ax.transData, facecolors="none", edgecolors="w", linewidths=1.2,
+            )
+        )  # fmt: skip
 
 
 def _save(figure: Figure, title: str, path: str | Path) -> None:

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 SHARES = {
     "flyable": FLYABLE, "two_solutions": TWO_SOLUTIONS, "imprecise": IMPRECISE, "too_few": TOO_FEW, "outside": OUTSIDE,
 }  # fmt: skip
+LISTED = 20  # anchors of a design that are printed one by one; more are in hall.yaml alone
 _COLUMNS = {
     "rmse": "RMSE", "scatter": "scatter", "claimed": "claimed", "bound": "bound", "achieved_over_bound": "/ bound",
     "efficiency_claimed": "eff. cl.", "efficiency_achieved": "eff. ach.",
@@ -116,7 +117,7 @@ def say_design(steps: Sequence[dict[str, Any]], chosen: dict[str, Any], placed: 
         print(f"{step['count']:8d}{step['spacing'] ** 2:5.0f} m^2{step['spacing']:7.1f} m{100.0 * step['share']:7.1f} %{bound}{mark}")
     heights = np.array([anchor["position"][2] for anchor in placed])
     print(f"heights: {heights.min():.1f} to {heights.max():.1f} m, {np.sum(heights < heights.mean())} low and {np.sum(heights >= heights.mean())} high")
-    for anchor in placed:
+    for anchor in placed if len(placed) <= LISTED else ():
         at = ", ".join(f"{x:.1f}" for x in anchor["position"])
         print(f"anchor {anchor['id']}: at ({at}), upright, its front turned {anchor['yaw']:.0f} deg from x towards y")
 

@@ -61,8 +61,7 @@ def plan_hall(
     report.say_heard(figures["map"])
     report.say_flyable(figures["map"], demand.accuracy)
     report.say_side(figures["side"])
-    with Progress("plan") as progress:
-        figures["addition"] = advice.one_more(found, anchors, _places(room, min(reach, options.FARTHEST)), _in_hall(whole), progress)
+    figures["addition"] = hall_advice(whole, found)
     report.say_addition(figures["addition"], figures["map"]["flyable_share"])
     plots.plot_heard(anchors, found, args.out / "heard.png", walls)
     return figures, draw_map(found, installation.of(anchors), args.out, walls), bool(found.flyable.mean() >= args.share or not args.hall)
@@ -90,21 +89,22 @@ def _places(room: Room, reach: float) -> np.ndarray:
     return np.unique(np.vstack([np.column_stack([across, np.full(len(across), height)]) for height in z]).round(1), axis=0)
 
 
-def _in_hall(whole: hall.Hall) -> advice.Judge:
-    """What `advice.one_more` asks of a Hall."""
-    return lambda before, points, anchors, place: whole.changed(before, points, anchors, place[None])
+def hall_advice(whole: hall.Hall, found: Chart) -> dict[str, Any] | None:
+    """What `advice.one_more` finds in a Hall. found : Chart of it."""
+    places = _places(whole.goal.demand.room, min(whole.reach, options.FARTHEST))
+    with Progress("plan") as progress:
+        return advice.one_more(
+            found, whole.anchors, places, lambda before, points, anchors, place: whole.changed(before, points, anchors, place[None]), progress
+        )
 
 
-def in_room(goal: Goal) -> advice.Judge:
-    """What `advice.one_more` asks of a room in which all anchors are heard."""
-    return lambda before, points, anchors, place: judge(points, goal.installed(anchors), goal.demand)
-
-
-def one_more(found: Chart, anchors: Anchors, goal: Goal, places: AnchorPlaces) -> dict[str, Any] | None:
-    """What `advice.one_more` finds on AnchorPlaces of a room, to the centimetre."""
+def room_advice(found: Chart, anchors: Anchors, goal: Goal, places: AnchorPlaces) -> dict[str, Any] | None:
+    """What `advice.one_more` finds on AnchorPlaces of a room in which all is heard, to the centimetre. found : Chart of Anchors."""
     tried = np.unique(places.positions(places.grid(TRIED)).round(2), axis=0)
     with Progress("plan") as progress:
-        return advice.one_more(found, anchors, tried, in_room(goal), progress)
+        return advice.one_more(
+            found, anchors, tried, lambda before, points, more, place: judge(points, goal.installed(more), goal.demand), progress
+        )
 
 
 def end(args: Namespace, figures: dict[str, Any], outgoing: dict[str, Any]) -> None:

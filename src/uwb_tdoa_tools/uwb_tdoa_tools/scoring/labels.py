@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from matplotlib.patheffects import withStroke
 import numpy as np
 
 if TYPE_CHECKING:
@@ -11,6 +12,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 TOGETHER = 0.35  # m; anchors that are nearer to each other in a picture have one label
+SIZE, FEW = 10.0, 20  # points, of the letters of so many labels at most; of more they are smaller
 MOST = 80  # anchors that have labels: more could not be read
 AROUND = ((1, 1), (-1, 1), (1, -1), (-1, -1), (0, 1), (0, -1), (1, 0), (-1, 0))  # where a label may be, as seen from its anchor
 _WIDE, _HIGH = 0.62, 1.15  # of the size of the letters: a letter, and a line
@@ -25,14 +27,15 @@ def labels(ids: Sequence[int], places: np.ndarray) -> Iterator[tuple[str, np.nda
         left = [k for k in left if k not in here]
 
 
-def put_labels(ax: Axes, ids: Sequence[int], places: np.ndarray, size: float = 8.0, colour: str = "k") -> None:
-    """Write ids beside places (n, 2) m: each label where it covers no place, no other label and no edge of the axes, as far as there is room.
-    The limits of the axes must be set. size : of the letters, points."""
+def put_labels(ax: Axes, ids: Sequence[int], places: np.ndarray, avoided: np.ndarray, colour: str = "k") -> None:
+    """Write ids beside places (n, 2) m: each label where it covers no place, none of the avoided (m, 2) m, no other label and no edge of the
+    axes, as far as there is room. The limits of the axes must be set."""
     if len(ids) > MOST:
         return
     ax.figure.draw_without_rendering()  # type: ignore[union-attr]  # the transforms are those of the layout that is drawn
     pixel, frame = ax.figure.dpi / 72.0, ax.get_window_extent()
-    dots, taken = ax.transData.transform(places), np.empty((0, 4))
+    dots, taken = ax.transData.transform(np.vstack([places, avoided])), np.empty((0, 4))
+    size = SIZE if len(ids) <= FEW else 0.75 * SIZE
     for text, at in labels(ids, places):
         x, y = ax.transData.transform(at)
         half = 0.5 * pixel * size * np.array([_WIDE * len(text), _HIGH])
@@ -48,4 +51,7 @@ def put_labels(ax: Axes, ids: Sequence[int], places: np.ndarray, size: float = 8
                 best, chosen, placed = cost, side, box
         taken = np.vstack([taken, placed])
         shift = np.array(chosen) * (half / pixel + 4.0)
-        ax.annotate(text, at, xytext=tuple(shift), textcoords="offset points", fontsize=size, color=colour, ha="center", va="center")
+        ax.annotate(
+            text, at, xytext=tuple(shift), textcoords="offset points", fontsize=size, color=colour, ha="center", va="center", zorder=6,
+            path_effects=[withStroke(linewidth=2.5, foreground="w")],
+        )  # fmt: skip
