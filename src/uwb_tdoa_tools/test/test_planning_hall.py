@@ -71,11 +71,11 @@ def test_where_all_are_heard_it_is_the_chart_of_a_room():
 
 def test_one_more_anchor_is_proposed_near_the_hole_and_gains_what_is_promised():
     anchors = anchors_of(8, 8, hole=(28.0, 28.0))
-    hall = hall_of(anchors)
+    hall = hall_of(anchors, accuracy=0.4)
     grid = Grid.slice((4.0, 52.0), (4.0, 52.0), 1.2, 4.0)
     found = hall.chart(grid, jobs=1)
     added = hall_advice(hall, found)
-    assert added["gain"] > 0.05 and np.hypot(*(np.array(added["position"][:2]) - 28.0)) < 2.0 * REACH
+    assert added["gain"] > 0.02 and np.hypot(*(np.array(added["position"][:2]) - 28.0)) < 2.0 * REACH
     assert np.linalg.norm(anchors.positions - added["position"], axis=1).min() >= 1.0
     again = hall.of(with_one(anchors, np.array(added["position"]))).chart(grid, jobs=1)
     assert again.flyable.mean() == pytest.approx(added["flyable_share"], abs=1e-12)

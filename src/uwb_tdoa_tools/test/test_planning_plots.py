@@ -17,6 +17,9 @@ from uwb_tdoa_tools.scoring.plots import plt
 from uwb_tdoa_tools.simulation.constellations import corners
 
 
+FLOWN = lattice((-1, -1, 0.5), (1, 1, 2), 1.0)
+
+
 @pytest.fixture
 def figures(monkeypatch):
     """[(figure, title)] of all pictures that would be written."""
@@ -33,7 +36,7 @@ def found():
 @pytest.mark.parametrize("flyable", [True, False])
 def test_what_the_title_calls_hatched_is_hatched(found, flyable, figures):
     one = replace(found, status=np.where(np.arange(len(found.status)) % 3 == 0, IMPRECISE, found.status)) if not flyable else found
-    plots.plot_layouts([("before", Installation(corners()), one), ("after", Installation(corners()), one)], None)
+    plots.plot_layouts([("before", Installation(corners()), one), ("after", Installation(corners()), one)], FLOWN, None)
     (figure, title) = figures[0]
     hatched = figure.findobj(lambda artist: any(getattr(artist, "hatches", ())))
     assert bool(hatched) == ("hatched" in title) == (not flyable)
@@ -60,11 +63,11 @@ def test_the_legend_states_the_share_of_each_state_that_there_is(found, figures)
 
 def test_every_picture_is_700_pixels_wide(found, tmp_path):
     anchors, places = corners(), AnchorPlaces.walls((-3.5, -4, 0), (3.5, 4, 3))
-    goal = Goal(lattice((-1, -1, 0.5), (1, 1, 2), 1.0), Installation(anchors))
+    goal = Goal(FLOWN, Installation(anchors))
     plots.plot_precision(anchors, found, tmp_path / "precision.png")
     plots.plot_flyable(anchors, found, tmp_path / "flyable.png", pairings=Installation(anchors))
     plots.plot_heard(anchors, found, tmp_path / "heard.png")
-    plots.plot_layouts([("before", Installation(anchors), found)] * 2, tmp_path / "layout.png")
+    plots.plot_layouts([("before", Installation(anchors), found)] * 2, FLOWN, tmp_path / "layout.png")
     plots.plot_places(places, *one_more(goal, anchors, places, 40), tmp_path / "places.png")
     for path in tmp_path.iterdir():
         assert Image.open(path).width == 700, path.name
@@ -75,6 +78,7 @@ def test_labels_cover_neither_each_other_nor_anchors():
     figure, ax = plt.subplots(figsize=(7, 5))
     ax.set(xlim=(0, 20), ylim=(0, 14))
     places = np.vstack([[0, 0], [20, 0], [20, 14], [0, 14], rng.uniform([1, 1], [19, 13], (16, 2))])
+    figure.draw_without_rendering()
     put_labels(ax, list(range(20)), places, np.empty((0, 2)))
     figure.canvas.draw()
     boxes = [text.get_window_extent() for text in ax.texts]

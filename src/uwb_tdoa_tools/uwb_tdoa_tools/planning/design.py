@@ -1,7 +1,7 @@
 """Anchors for a hall in which none hang yet: how many, how far apart, how high, and which way they face.
 
-Regular patterns, from sparse to dense, whose margins, stagger and heights `scipy.optimize.direct` chooses, until the wanted share of the hall
-can be flown. Then anchors are taken away one by one while it still can, the neighbours of each being moved by `scipy.optimize.minimize`.
+Regular patterns, from sparse to dense, whose margins, stagger and heights `scipy.optimize.minimize` chooses, until the wanted share of the hall
+can be flown. Then anchors are taken away one by one while it still can, the neighbours of each being moved likewise.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any, TYPE_CHECKING
 
 import numpy as np
-from scipy.optimize import direct, minimize, minimize_scalar
+from scipy.optimize import minimize, minimize_scalar
 from scipy.spatial.transform import Rotation
 from scipy.special import expit
 
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from .hall import Hall
     from .judging import Judged
 
+FIRST = 0.4, 0.4, 0.1, 0.1, 0.85  # of the first pattern: margins, stagger and heights, see `_pattern`
 LOWEST = 0.5  # m above the floor, of an anchor
 SPACINGS = 1.2, 0.25, 0.88  # of the reach: the first pattern, the densest, and each over the one before
 MOST = 400  # anchors of a pattern that is tried
@@ -61,10 +62,11 @@ def design(hall: Hall, room: Room, points: np.ndarray, share: float, progress: P
     tried. hall : Hall, whose anchors are not used. Raises InputError where no pattern gives that."""
     points = points[np.sort(np.random.default_rng(0).permutation(len(points))[:SEARCHED])]
     rough = replace(hall, goal=replace(hall.goal, demand=replace(hall.goal.demand, quick=True)))
-    steps, anchors = [], None
+    steps, anchors, x = [], None, np.array(FIRST)
     for columns, rows in _patterns(room, hall.reach):
         progress(f"layouts of {columns} x {rows} anchors")
-        found = _best_pattern(rough, room, points, columns, rows)
+        x = _best_pattern(rough, room, points, columns, rows, x)
+        found = _pattern(room, columns, rows, x)
         judged = _judged(hall.of(found), points)
         steps.append(step_of(judged, found, room))
         if anchors is not None:
@@ -79,7 +81,16 @@ def design(hall: Hall, room: Room, points: np.ndarray, share: float, progress: P
         )
     layouts = _pruned(hall, rough, room, points, share, anchors, steps, progress)
     progress("directions of the anchors")
-    return [_turned(rough, points, each) for each in layouts[:2]] + layouts[2:], sorted(steps, key=lambda step: step.count)
+    return [_turned(rough, points, each) for each in layouts[:2]] + layouts[2:], _worth(steps)
+
+
+def _worth(steps: list[Step]) -> list[Step]:
+    """The Steps of which more of the hall can be flown than of any with fewer anchors, the fewest first."""
+    out: list[Step] = []
+    for step in sorted(steps, key=lambda step: (step.count, -step.share)):
+        if not out or step.share > out[-1].share:
+            out.append(step)
+    return out
 
 
 def _patterns(room: Room, reach: float) -> list[tuple[int, int]]:
@@ -109,9 +120,14 @@ def _facing(positions: np.ndarray, room: Room) -> Anchors:
     return facing(positions.round(1), room.centre)
 
 
-def _best_pattern(rough: Hall, room: Room, points: np.ndarray, columns: int, rows: int) -> Anchors:
-    found = direct(lambda x: _cost(rough, points, _pattern(room, columns, rows, x)), [(0.0, 1.0)] * 5, maxfun=TRIALS)
-    return _pattern(room, columns, rows, found.x)
+def _best_pattern(rough: Hall, room: Room, points: np.ndarray, columns: int, rows: int, start: np.ndarray) -> np.ndarray:
+    """x of the best `_pattern`, from a start."""
+    simplex = np.vstack([start, start + np.where(start < 0.5, 0.3, -0.3) * np.eye(len(start))])
+    found = minimize(
+        lambda x: _cost(rough, points, _pattern(room, columns, rows, np.clip(x, 0.0, 1.0))), start, method="Nelder-Mead",
+        bounds=[(0.0, 1.0)] * len(start), options={"maxfev": TRIALS, "initial_simplex": simplex},
+    )  # fmt: skip
+    return np.clip(found.x, 0.0, 1.0)
 
 
 def _judged(hall: Hall, points: np.ndarray) -> Judged:

@@ -9,7 +9,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import EllipseCollection
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
+from matplotlib.patches import Patch, Rectangle
 from PIL import Image
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
@@ -46,7 +46,7 @@ ANCHOR, HULL = "#1f3a93", "#8e44ad"
 HEARD_COLOURS = [0, 1, 2, 3, 4, 5, 6, 8, 10, 13, 17, 25]  # bounds of the colours of the picture
 COLOURS = "viridis_r"
 _MOST_LAYERS = 3
-ACROSS = 7  # ellipses along the longer side of a map
+ACROSS = 9  # ellipses along the longer side of a map
 
 
 def plot_precision(anchors: Anchors, chart: Chart, path: str | Path, walls: Walls | None = None) -> None:
@@ -61,10 +61,9 @@ def plot_precision(anchors: Anchors, chart: Chart, path: str | Path, walls: Wall
         _room(ax, anchors, chart.grid, k, walls)
         _ellipses(ax, chart, k, times)
         ax.set_title(_height(chart.grid, k), fontsize=10)
-    _bar(axes, mesh, "bound of one round (root of the summed variances), cm", _beyond(100.0 * chart.error, scale))
-    ellipse = Line2D([], [], color="0.3", marker="o", mfc="none", ls="", label=f"holds 99 % of the estimates, drawn {times} times as large")
-    _legend(figure, [_hull_line(), _anchor_mark(anchors), ellipse])
-    _save(figure, "How precise one round is", path)
+    _bar(axes, mesh, "bound of one round, cm", _beyond(100.0 * chart.error, scale))
+    ellipse = Line2D([], [], color="0.3", marker="o", mfc="none", ls="", label=f"99 % of the estimates, {times} times as large")
+    _finish(figure, "How precise one round is", [_hull_line(), _anchor_mark(anchors), ellipse], [(ax, anchors) for ax in axes], path)
 
 
 def plot_flyable(
@@ -91,9 +90,9 @@ def plot_flyable(
     marks += [_hull_line(), _anchor_mark(anchors)]
     if pairings is not None:
         marks.append(Line2D([], [], color="0.45", lw=0.8, label="bifurcation curve of a choice of anchors"))
-    _legend(figure, marks)
     whole = "this slice" if chart.grid.shape[2] == 1 else "the room"
-    _save(figure, f"Where it can be flown: {100.0 * chart.flyable.mean():.0f} % of {whole}", path)
+    title = f"Where it can be flown: {100.0 * chart.flyable.mean():.0f} % of {whole}"
+    _finish(figure, title, marks, [(ax, anchors) for ax in axes], path)
 
 
 def plot_heard(anchors: Anchors, chart: Chart, path: str | Path, walls: Walls | None = None) -> None:
@@ -106,8 +105,7 @@ def plot_heard(anchors: Anchors, chart: Chart, path: str | Path, walls: Walls | 
     _bar([ax], mesh, "anchors heard", "max", HEARD_COLOURS)
     _room(ax, anchors, chart.grid, k, walls)
     ax.set_title(_height(chart.grid, k) + f": {100.0 * np.mean(chart.heard >= 4):.0f} % hear 4 or more", fontsize=10)
-    _legend(figure, [_hull_line(), _anchor_mark(anchors)])
-    _save(figure, f"How many of {len(anchors)} anchors are heard", path)
+    _finish(figure, f"How many of {len(anchors)} anchors are heard", [_hull_line(), _anchor_mark(anchors)], [(ax, anchors)], path)
 
 
 def plot_flips(
@@ -127,8 +125,8 @@ def plot_flips(
     ax.set(xlabel="x, m", ylabel="y, m", aspect="equal")
     _hull(ax, installation.anchors)
     _anchors(ax, installation.anchors)
-    _legend(figure, [*ax.get_legend_handles_labels()[0], _hull_line(), _anchor_mark(installation.anchors)])
-    _save(figure, "Solved from many starts; arrows lead to the other solution", path)
+    marks = [*ax.get_legend_handles_labels()[0], _hull_line(), _anchor_mark(installation.anchors)]
+    _finish(figure, "Solved from many starts; arrows lead to the other solution", marks, [(ax, installation.anchors)], path)
 
 
 def plot_accuracy(installation: Installation, found: AccuracyMap, path: str | Path) -> None:
@@ -148,35 +146,39 @@ def plot_accuracy(installation: Installation, found: AccuracyMap, path: str | Pa
     for ax, (label, _), values in zip(axes.ravel(), columns, flat):
         mesh = ax.pcolormesh(x, y, values, cmap=COLOURS, vmin=scale[0], vmax=scale[1], shading="nearest", rasterized=True)
         ax.set_title(label, fontsize=10)
-        _room(ax, installation.anchors, found.grid, None, label=False)
+        _room(ax, installation.anchors, found.grid, None)
     for ax in axes[0]:
         ax.set_xlabel("")
     for ax in axes[:, 1]:
         ax.set_ylabel("")
     figure.colorbar(mesh, ax=axes.ravel().tolist(), label="3D, cm", shrink=0.8, extend=_beyond(every, scale))
-    _save(figure, "Measured error beside what is claimed and what is possible", path)
+    _finish(figure, "Measured error beside what is claimed and what is possible", [_hull_line(), _anchor_mark(installation.anchors)], [], path)
 
 
-def plot_layouts(charts: Sequence[tuple[str, Installation, Chart]], path: str | Path) -> None:
-    """Bound before and after at one scale, of the middle layer. charts : [(title, Installation, Chart)]."""
+def plot_layouts(charts: Sequence[tuple[str, Installation, Chart]], flown: np.ndarray, path: str | Path) -> None:
+    """Bound before and after, of the middle layer, at one scale: that of where it is flown. charts : [(title, Installation, Chart)]; flown :
+    (n, 3) m, places that are flown."""
     grid = charts[0][2].grid
     k = grid.shape[2] // 2
     figure, axes = _panels(grid, len(charts))
-    finite = np.concatenate([chart.error[chart.flyable] for _, _, chart in charts])
+    low, high = flown.min(axis=0)[:2], flown.max(axis=0)[:2]
+    inside = ((grid.points[:, :2] >= low) & (grid.points[:, :2] <= high)).all(axis=1)
+    finite = np.concatenate([chart.error[inside & np.isfinite(chart.error)] for _, _, chart in charts])
     scale = _scale(100.0 * finite)
     blocked = any((~chart.grid.layer(chart.flyable, k)).any() for _, _, chart in charts)
     for ax, (title, installation, chart) in zip(axes, charts):
         mesh = _field(ax, grid, 100.0 * chart.error, k, scale)
         _hatch(ax, chart, k)
         _room(ax, installation.anchors, grid, k)
-        share, median = 100.0 * chart.flyable.mean(), 100.0 * np.median(chart.error[chart.flyable]) if chart.flyable.any() else np.nan
-        ax.set_title(f"{title}: {share:.0f} % can be flown, median bound there {median:.1f} cm", fontsize=10)
+        ax.add_patch(Rectangle(tuple(low), *(high - low).tolist(), fill=False, ec="r", lw=1.5))
+        share, median = 100.0 * chart.flyable.mean(), 100.0 * np.median(chart.error[inside]) if inside.any() else np.nan
+        ax.set_title(f"{title}: {share:.0f} % can be flown; median bound where it is flown {median:.1f} cm", fontsize=10)
     _bar(axes, mesh, "bound of one round, cm", _beyond(100.0 * np.concatenate([chart.error for _, _, chart in charts]), scale))
-    marks: list[Any] = [_hull_line(), _anchor_mark(charts[0][1].anchors)]
+    marks: list[Any] = [_hull_line(), _anchor_mark(charts[0][1].anchors), Patch(fill=False, ec="r", label="where it is flown")]
     if blocked:
         marks.append(Patch(facecolor="white", edgecolor="k", hatch="////", label="cannot be flown"))
-    _legend(figure, marks)
-    _save(figure, f"Before and after, {_height(grid, k)}" + ("; hatched: cannot be flown" if blocked else "; all can be flown"), path)
+    title = f"Before and after, {_height(grid, k)}" + ("; hatched: cannot be flown" if blocked else "; all can be flown")
+    _finish(figure, title, marks, [(ax, installation.anchors) for ax, (_, installation, _) in zip(axes, charts)], path)
 
 
 def plot_places(places: AnchorPlaces, numbers: np.ndarray, scores: np.ndarray, path: str | Path) -> None:
@@ -194,8 +196,8 @@ def plot_places(places: AnchorPlaces, numbers: np.ndarray, scores: np.ndarray, p
     best = int(np.argmin(scores))
     ax.plot(along[best], height[best], "o", mfc="none", mec="r", ms=13, mew=1.6, label=f"best: ({', '.join(f'{v:.2f}' for v in at[best])})")
     ax.set(xlabel="along the walls, one after the other, m", ylabel="z, m")
-    _legend(figure, ax.get_legend_handles_labels()[0])
-    _save(figure, "What one more anchor gives (more by the share that cannot be flown, up to twice)", path)
+    title = "One more anchor, tried all over (times 1 to 2 for the share that cannot be flown)"
+    _finish(figure, title, ax.get_legend_handles_labels()[0], [], path)
 
 
 def _layers(grid: Grid) -> list[int]:
@@ -256,7 +258,7 @@ def _hatch(ax: Axes, chart: Chart, k: int) -> None:
         ax.contourf(x, y, blocked.filled(0).astype(float), levels=[0.5, 1.5], colors="none", hatches=["////"])
 
 
-def _room(ax: Axes, anchors: Anchors, grid: Grid, k: int | None, walls: Walls | None = None, label: bool = True) -> None:
+def _room(ax: Axes, anchors: Anchors, grid: Grid, k: int | None, walls: Walls | None = None) -> None:
     """Axes of a map, with walls, hull and anchors; a margin keeps anchors on its edge inside."""
     x, y, _ = grid.axes
     margin = 0.5 * grid.step + 0.03 * max(np.ptp(x), np.ptp(y), grid.step)
@@ -265,7 +267,7 @@ def _room(ax: Axes, anchors: Anchors, grid: Grid, k: int | None, walls: Walls | 
     ax.set(xlabel="x, m", ylabel="y, m", aspect="equal")
     ax.set(xlim=(x[0] - margin, x[-1] + margin), ylim=(y[0] - margin, y[-1] + margin))
     _hull(ax, anchors)
-    _anchors(ax, anchors, label)
+    _anchors(ax, anchors)
 
 
 def _hull(ax: Axes, anchors: Anchors) -> None:
@@ -275,19 +277,29 @@ def _hull(ax: Axes, anchors: Anchors) -> None:
         ax.plot(*above[np.append(corners, corners[0])].T, color=HULL, lw=1.2, ls="--", scalex=False, scaley=False)
 
 
-def _anchors(ax: Axes, anchors: Anchors, label: bool = True) -> None:
+def _anchors(ax: Axes, anchors: Anchors) -> None:
     p = anchors.positions
     size = float(np.clip(60.0 / np.sqrt(len(anchors)), 4.0, 8.0))
     ax.plot(p[:, 0], p[:, 1], "^", color=ANCHOR, mec="w", mew=0.6, ms=size, zorder=5, scalex=False, scaley=False)
     turned = np.isfinite(anchors.orientations).all(axis=1)
     if turned.any():
-        front = Rotation.from_quat(anchors.orientations[turned]).apply([1.0, 0.0, 0.0])
-        ax.quiver(*p[turned, :2].T, *front[:, :2].T, color=ANCHOR, width=0.004, scale=25, zorder=5)
-        tips = p[turned, :2] + front[:, :2] * np.ptp(ax.get_xlim()) / 30.0
-    else:
-        tips = np.empty((0, 2))
-    if label:
-        put_labels(ax, anchors.ids.tolist(), p[:, :2], tips, ANCHOR)
+        front = _directions(anchors)[turned]
+        ax.quiver(*p[turned, :2].T, *front.T, color=ANCHOR, width=0.004, scale=25, zorder=5)
+
+
+def _directions(anchors: Anchors) -> np.ndarray:
+    """(n, 2) from above, of the fronts of anchors; 0 of those whose orientation is not known."""
+    out = np.zeros((len(anchors), 2))
+    turned = np.isfinite(anchors.orientations).all(axis=1)
+    if turned.any():
+        out[turned] = Rotation.from_quat(anchors.orientations[turned]).apply([1.0, 0.0, 0.0])[:, :2]
+    return out
+
+
+def _fronts(ax: Axes, anchors: Anchors) -> np.ndarray:
+    """(2 n, 2) m, middles and tips of the arrows that show the fronts of anchors."""
+    arrow = _directions(anchors) * np.ptp(ax.get_xlim()) / 25.0
+    return np.vstack([anchors.positions[:, :2] + share * arrow for share in (0.5, 1.0)])
 
 
 def _hull_line() -> Line2D:
@@ -297,11 +309,6 @@ def _hull_line() -> Line2D:
 def _anchor_mark(anchors: Anchors) -> Line2D:
     turned = ", arrow: its front" if np.isfinite(anchors.orientations).all(axis=1).any() else ""
     return Line2D([], [], color=ANCHOR, marker="^", ls="", label=f"anchor{turned}")
-
-
-def _legend(figure: Figure, marks: Sequence[Any]) -> None:
-    """A legend below the maps, where it covers nothing."""
-    figure.legend(handles=marks, loc="outside lower center", ncols=min(3, len(marks)), frameon=False, fontsize=9)
 
 
 def _some_cells(chart: Chart, k: int) -> np.ndarray:
@@ -334,9 +341,20 @@ def _ellipses(ax: Axes, chart: Chart, k: int, times: int) -> None:
         )  # fmt: skip
 
 
-def _save(figure: Figure, title: str, path: str | Path) -> None:
+def _finish(figure: Figure, title: str, marks: Sequence[Any], labelled: Sequence[tuple[Axes, Anchors]], path: str | Path) -> None:
+    """Title and legend, then the ids of anchors, once nothing else moves."""
     figure.suptitle(title, fontsize=12)
+    if marks:
+        wide = max(len(str(mark.get_label())) for mark in marks)
+        figure.legend(handles=marks, loc="outside lower center", ncols=3 if wide < 28 else 2, frameon=False, fontsize=9)
     figure.set_dpi(DPI)
+    figure.draw_without_rendering()
+    for ax, anchors in labelled:
+        put_labels(ax, anchors.ids.tolist(), anchors.positions[:, :2], _fronts(ax, anchors), ANCHOR)
+    _save(figure, title, path)
+
+
+def _save(figure: Figure, title: str, path: str | Path) -> None:
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     image = Image.frombuffer("RGBA", canvas.get_width_height(), canvas.buffer_rgba())

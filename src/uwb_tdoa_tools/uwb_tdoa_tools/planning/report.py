@@ -104,7 +104,7 @@ def say_addition(told: dict[str, Any] | None, before: float) -> None:
     at = ", ".join(f"{x:.2f}" for x in told["position"])
     finer = ""
     if told["bound_before"]:
-        finer = f"; the bound where it can be flown now goes from {told['bound_before']:.2f} to {told['bound_after']:.2f} m (median)"
+        finer = f"; the bound where it can be flown now goes from {100.0 * told['bound_before']:.1f} to {100.0 * told['bound_after']:.1f} cm (median)"
     print(f"add an anchor at ({at}): {100.0 * before:.1f} -> {100.0 * told['flyable_share']:.1f} % can be flown{finer}")
 
 

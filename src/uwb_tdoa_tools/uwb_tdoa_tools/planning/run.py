@@ -187,7 +187,7 @@ def improve(before: Chart, aim: options.Aim, how: str, starts: int, out: Path) -
         better.to_yaml(out / "improved.yaml")
         after = goal.installed(better)
         charted = chart(after, before.grid, goal.demand)
-        plots.plot_layouts([("before", installation, before), ("after", after, charted)], out / "layout.png")
+        plots.plot_layouts([("before", installation, before), ("after", after, charted)], goal.points, out / "layout.png")
     judged = {
         when: {"flyable_share": float(one.flyable.mean()), **aim.reported.figures(those)}
         for when, one, those in (("before", before, anchors), ("after", charted, better))

@@ -29,10 +29,9 @@ def labels(ids: Sequence[int], places: np.ndarray) -> Iterator[tuple[str, np.nda
 
 def put_labels(ax: Axes, ids: Sequence[int], places: np.ndarray, avoided: np.ndarray, colour: str = "k") -> None:
     """Write ids beside places (n, 2) m: each label where it covers no place, none of the avoided (m, 2) m, no other label and no edge of the
-    axes, as far as there is room. The limits of the axes must be set."""
+    axes, as far as there is room. The figure must have its layout."""
     if len(ids) > MOST:
         return
-    ax.figure.draw_without_rendering()  # type: ignore[union-attr]  # the transforms are those of the layout that is drawn
     pixel, frame = ax.figure.dpi / 72.0, ax.get_window_extent()
     dots, taken = ax.transData.transform(np.vstack([places, avoided])), np.empty((0, 4))
     size = SIZE if len(ids) <= FEW else 0.75 * SIZE
