@@ -85,7 +85,8 @@ def wrong_map(path, bias, anchors):
     cell = np.stack(np.meshgrid(*[np.arange(-5, 6)] * 2, np.arange(4), indexing="ij"), axis=-1).reshape(-1, 3)
     whole = np.tile(bias, (len(cell), 1))
     zero = np.zeros_like(whole)
-    BiasMap(cell, 1.0 * cell, whole, zero, np.full(len(cell), 9), np.zeros((3, 3)), 1.0, ids=anchors.ids, positions=anchors.positions).save(path)
+    own = {"ids": anchors.ids, "positions": anchors.positions}
+    BiasMap(cell, 1.0 * cell, whole, zero, np.full(len(cell), 9), np.zeros((3, 3)), 1.0, **own).save(path)
 
 
 def test_harm_is_said_and_counts_as_failure(tmp_path, flights, capsys):

@@ -123,8 +123,8 @@ def random_room(seed):
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 10**6))
 def test_one_more_anchor_never_lowers_a_share(seed):
-    """A place that explains a round with it explained one at least as well without. Still 1 place in 1000 is lost: a long valley comes apart in
-    two minima, or a minimum beyond a wall moves into the room."""
+    """A place that explains a round with it explained one at least as well without. Still 1 place in 1000 is lost: a long valley comes
+    apart in two minima, or a minimum beyond a wall moves into the room."""
     _, room, positions, noise, points = random_room(seed)
     few, more = (Installation(Anchors.from_positions(p), noise, hall=True) for p in (positions[:-1], positions))
     before, after = (judge(points, one, Demand(room)) for one in (few, more))

@@ -9,17 +9,14 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
 
 from .. import cli, parallel
-from ..planning import options, report, run
+from ..planning import options, run
 from ..planning.goal import OBJECTIVES
 from ..planning.judging import ACCURACY, CRITERIA
-from ..planning.maps import chart
 from ..planning.noise import RadioNoise
 from ..planning.pairing import OF_PROTOCOL, PAIRINGS
-from ..progress import Progress
 from ..readers import inputs, read_survey
 
 if TYPE_CHECKING:
@@ -98,57 +95,23 @@ def parser() -> ArgumentParser:
     return made
 
 
-def _plan(args: Namespace) -> int | None:
+def _plan(args: Namespace) -> int:
     cli.check_outputs(args, "json")
-    if args.hall == (args.anchors is not None):
-        raise InputError("ANCHORS: give a file of the anchors that there are, or --hall where they are asked for.")
-    if not 0.0 < args.share <= 1.0:
-        raise InputError(f"share: {args.share:g} is none; give more than 0 and at most 1, e.g. 0.95.")
-    if args.walls is not None and args.radio_reach is None:
-        raise InputError("walls: are for a hall of which a tag hears a part; give --radio-reach too.")
+    options.check(args)
     anchors = None if args.hall else read_survey(args.anchors)
     room = options.room_for(args, anchors)
     reach = options.reach_of(args, room)
     installation = options.installation_of(args, Anchors.from_positions([room.centre] * 2) if anchors is None else anchors)
     demand = options.demand_of(args, installation, room)
     grid = options.grid_of(args, room)
-    if args.flights and args.planar:
-        raise InputError("flights: are judged in three dimensions; leave out --planar.")
     reading = inputs.Reading(args.anchors)
     recordings = reading.find(args.flights or [], bool(args.dask))
     if anchors is None or reach < np.inf:
-        *written, good = run.plan_hall(args, anchors, installation, demand, grid)
-        run.end(args, *written)
+        figures, outgoing, good = run.plan_hall(args, anchors, installation, demand, grid)
+        run.end(args, figures, outgoing)
         return 0 if good else 1
-    aim = options.aim_of(args, installation, demand, grid.axes[2][0]) if args.improve else None
-
-    if not np.isfinite(anchors.orientations).all():
-        cli.show("anchors without orientation are taken to radiate alike in all directions")
-    report.say_room(room, args.room is not None)
-    cli.output_folder(args.out).mkdir(parents=True, exist_ok=True)
-    with Progress("plan") as progress:
-        progress("mapping")
-        found = chart(installation, grid, demand)
-    about = {**report.summary(found), **report.in_hull(found, installation)}
-    figures: dict[str, Any] = {"anchors": len(anchors), "arguments": options.plain(args), "map": about}
-    report.say_in_hull(about)
-    report.say_flyable(about, demand.accuracy)
-    if demand.criterion == "round":
-        figures["addition"] = run.room_advice(found, anchors, options.goal_of(args, installation, demand), options.places_of(args, room))
-        report.say_addition(figures["addition"], about["flyable_share"])
-    outgoing = run.draw_map(found, installation, args.out, pairings=demand.criterion == "pairings")
-    if args.check:
-        figures["check"] = run.check(installation, grid, args.out)
-        report.say_check(figures["check"])
-    if recordings:
-        flown = parallel.over(run.Fly(reading, tuple(args.aids)), recordings, args.jobs, args.dask)
-        figures["flights"] = run.evaluate_flights(flown, installation, room, args.step or 0.4, args.out)
-        report.say_flights(figures["flights"])
-    if aim:
-        figures["improve"] = run.improve(found, aim, args.improve, args.starts, args.out)
-        report.say_improvement(figures["improve"])
-    run.end(args, figures, outgoing)
-    return None
+    run.end(args, *run.plan_room(args, anchors, installation, demand, grid, reading, recordings))
+    return 0
 
 
 main = cli.executable(_plan, parser)

@@ -30,11 +30,13 @@ class Judge(Protocol):
     def __call__(self, before: Judged, points: np.ndarray, anchors: Anchors, place: np.ndarray) -> Judged: ...
 
 
-def one_more(found: Chart, anchors: Anchors, places: np.ndarray, judge: Judge, progress: Progress) -> dict[str, Any] | None:
+def one_more(
+    found: Chart, anchors: Anchors, places: np.ndarray, judge: Judge, progress: Progress
+) -> dict[str, Any] | None:  # fmt: skip
     """What one more anchor gains at the best of some places (m, 3) m; None where none gains WORTH or FINER.
 
-    Returns {"position" (3,) m, "flyable_share", "bound_flyable": quantiles, m, as of a plan with it; "gain": share of the cells; "bound_before",
-    "bound_after": m, median where it can be flown without it}. found : Chart of Anchors.
+    Returns {"position" (3,) m, "flyable_share", "bound_flyable": quantiles, m, as of a plan with it; "gain": share of the cells;
+    "bound_before", "bound_after": m, median where it can be flown without it}. found : Chart of Anchors.
     """
     points = found.grid.points
     away = np.linalg.norm(places[:, None] - anchors.positions, axis=2).min(axis=1)

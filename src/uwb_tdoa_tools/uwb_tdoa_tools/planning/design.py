@@ -1,7 +1,7 @@
 """Anchors for a hall in which none hang yet: how many, how far apart, how high, and which way they face.
 
-Regular patterns, from sparse to dense, whose margins, stagger and heights `scipy.optimize.minimize` chooses, until the wanted share of the hall
-can be flown. Then anchors are taken away one by one while it still can, the neighbours of each being moved likewise.
+Regular patterns, from sparse to dense, whose margins, stagger and heights `scipy.optimize.minimize` chooses, until the wanted share of
+the hall can be flown. Then anchors are taken away one by one while it still can, the neighbours of each being moved likewise.
 """
 
 from __future__ import annotations
@@ -58,11 +58,10 @@ def step_of(found: Judged, anchors: Anchors, room: Room) -> Step:
 
 
 def design(hall: Hall, room: Room, points: np.ndarray, share: float, progress: Progress) -> tuple[list[Anchors], list[Step]]:
-    """(layouts, steps) for a Room of which a share of the points (n, 3) m is to be flown: Anchors, the fewest first, and all Steps that were
-    tried. hall : Hall, whose anchors are not used. Raises InputError where no pattern gives that."""
+    """(layouts, steps) for a Room of which a share of the points (n, 3) m is to be flown: Anchors, the fewest first, and Steps.
+    hall : Hall, whose anchors are not used. Raises InputError where no pattern gives that."""
     points = points[np.sort(np.random.default_rng(0).permutation(len(points))[:SEARCHED])]
-    rough = replace(hall, goal=replace(hall.goal, demand=replace(hall.goal.demand, quick=True)))
-    steps, anchors, x = [], None, np.array(FIRST)
+    rough, steps, anchors, x = _roughly(hall), [], None, np.array(FIRST)
     for columns, rows in _patterns(room, hall.reach):
         progress(f"layouts of {columns} x {rows} anchors")
         x = _best_pattern(rough, room, points, columns, rows, x)
@@ -76,12 +75,12 @@ def design(hall: Hall, room: Room, points: np.ndarray, share: float, progress: P
     if anchors is None:
         most = max(steps, key=lambda step: step.share)
         raise InputError(
-            f"share: {100.0 * share:.0f} % of the hall cannot be flown at an accuracy of {hall.goal.demand.accuracy:g} m; {most.count} anchors give "
-            f"{100.0 * most.share:.0f} %. Give a larger --accuracy, a smaller --share, or a known height (--planar, --with height)."
+            f"share: {100.0 * share:.0f} % of the hall cannot be flown at an accuracy of {hall.goal.demand.accuracy:g} m; {most.count} "
+            f"anchors give {100.0 * most.share:.0f} %. Give a larger --accuracy, a smaller --share, or a known height (--planar, --with height)."
         )
-    layouts = _pruned(hall, rough, room, points, share, anchors, steps, progress)
+    layouts, more = _pruned(hall, room, points, share, anchors, progress)
     progress("directions of the anchors")
-    return [_turned(rough, points, each) for each in layouts[:2]] + layouts[2:], _worth(steps)
+    return [_turned(rough, points, each) for each in layouts[:2]] + layouts[2:], _worth(steps + more)
 
 
 def _worth(steps: list[Step]) -> list[Step]:
@@ -147,11 +146,11 @@ def _cost_of(found: Judged, rough: Hall) -> float:
 
 
 def _pruned(
-    hall: Hall, rough: Hall, room: Room, points: np.ndarray, share: float, anchors: Anchors, steps: list[Step], progress: Progress
-) -> list[Anchors]:  # fmt: skip
-    """Anchors less more and more of those without which the share can still be flown, the fewest first; a Step for each is added to
-    `steps`."""
-    layouts = [anchors]
+    hall: Hall, room: Room, points: np.ndarray, share: float, anchors: Anchors, progress: Progress
+) -> tuple[list[Anchors], list[Step]]:  # fmt: skip
+    """Anchors less more and more of those without which the share can still be flown, the fewest first; and a Step for each that was
+    tried."""
+    layouts, steps, rough = [anchors], [], _roughly(hall)
     while len(anchors) > hall.goal.installation.unknowns + 1:
         progress(f"layouts of {len(anchors) - 1} anchors")
         now = _judged(rough.of(anchors), points)
@@ -169,7 +168,12 @@ def _pruned(
             break
         anchors = fewer
         layouts.insert(0, anchors)
-    return layouts
+    return layouts, steps
+
+
+def _roughly(hall: Hall) -> Hall:
+    """The same Hall, judged as quickly as a search needs."""
+    return replace(hall, goal=replace(hall.goal, demand=replace(hall.goal.demand, quick=True)))
 
 
 def _moved(rough: Hall, room: Room, points: np.ndarray, anchors: Anchors, row: int) -> Anchors:
@@ -185,7 +189,8 @@ def _moved(rough: Hall, room: Room, points: np.ndarray, anchors: Anchors, row: i
     def cost(place: np.ndarray) -> float:
         return _cost_of(rough.changed(before, points, at(place), np.stack([start, place])), rough)
 
-    found = minimize(cost, start, method="Nelder-Mead", bounds=list(zip(low, high)), options={"maxfev": MOVES, "initial_simplex": _simplex(start, low, high)})
+    options = {"maxfev": MOVES, "initial_simplex": _simplex(start, low, high)}
+    found = minimize(cost, start, method="Nelder-Mead", bounds=list(zip(low, high)), options=options)
     return at(found.x) if found.fun < cost(start) else anchors
 
 

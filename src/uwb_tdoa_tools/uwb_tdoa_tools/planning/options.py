@@ -41,6 +41,18 @@ class Aim:
     count: int
 
 
+def check(args: Namespace) -> None:
+    """Raise InputError for options that do not go together."""
+    if args.hall == (args.anchors is not None):
+        raise InputError("ANCHORS: give a file of the anchors that there are, or --hall where they are asked for.")
+    if not 0.0 < args.share <= 1.0:
+        raise InputError(f"share: {args.share:g} is none; give more than 0 and at most 1, e.g. 0.95.")
+    if args.walls is not None and args.radio_reach is None:
+        raise InputError("walls: are for a hall of which a tag hears a part; give --radio-reach too.")
+    if args.flights and args.planar:
+        raise InputError("flights: are judged in three dimensions; leave out --planar.")
+
+
 def installation_of(args: Namespace, anchors: Anchors) -> Installation:
     """Installation of Anchors and the options; with a reach one of a hall, whose places hear a part of them. Raises InputError."""
     noise: RadioNoise | FixedNoise
@@ -62,7 +74,9 @@ def demand_of(args: Namespace, installation: Installation, room: Room) -> Demand
     if installation.pairing is not None and installation.pairing.one_solution:
         for name, asked in (("flyable", args.flyable == "pairings"), ("check", args.check)):
             if asked:
-                raise InputError(f"{name}: looks for a second solution of TDOAs, and ranges have none; leave it out, or plan for --protocol tdoa2.")
+                raise InputError(
+                    f"{name}: looks for a second solution of TDOAs, and ranges have none; leave it out, or plan for --protocol tdoa2."
+                )
     if installation.hall and args.flyable == "pairings":
         raise InputError("flyable: pairings are of a room in which every anchor is heard; leave out --flyable, or --radio-reach.")
     return Demand(room, args.accuracy, args.flyable)

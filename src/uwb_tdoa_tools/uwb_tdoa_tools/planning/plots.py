@@ -101,7 +101,8 @@ def plot_heard(anchors: Anchors, chart: Chart, path: str | Path, walls: Walls | 
     k = chart.grid.shape[2] // 2
     x, y, _ = chart.grid.axes
     norm = BoundaryNorm(HEARD_COLOURS, 256, extend="max")
-    mesh = ax.pcolormesh(x, y, chart.grid.layer(chart.heard.astype(float), k), cmap="viridis", norm=norm, shading="nearest", rasterized=True)
+    layer = chart.grid.layer(chart.heard.astype(float), k)
+    mesh = ax.pcolormesh(x, y, layer, cmap="viridis", norm=norm, shading="nearest", rasterized=True)
     _bar([ax], mesh, "anchors heard", "max", HEARD_COLOURS)
     _room(ax, anchors, chart.grid, k, walls)
     ax.set_title(_height(chart.grid, k) + f": {100.0 * np.mean(chart.heard >= 4):.0f} % hear 4 or more", fontsize=10)
@@ -117,7 +118,8 @@ def plot_flips(
     points (n, 3); unique, agrees (n,) bool; mirrors : (from (m, 2), to (m, 2)), flips to draw as arrows.
     """
     figure, ax = plt.subplots(figsize=(WIDTH, WIDTH), layout="constrained")
-    for chosen, colour, label in ((unique, STATES[FLYABLE][1], "one solution"), (~unique, STATES[TWO_SOLUTIONS][1], "two solutions of a choice of anchors")):
+    for chosen, state, label in ((unique, FLYABLE, "one solution"), (~unique, TWO_SOLUTIONS, "two solutions of a choice of anchors")):
+        colour = STATES[state][1]
         ax.plot(*points[chosen, :2].T, "s", color=colour, ms=4, label=f"{label}: {100.0 * np.mean(chosen):.0f} %")
     ax.plot(*points[~agrees, :2].T, "kx", ms=6, label=f"not as predicted: {100.0 * np.mean(~agrees):.1f} %")
     for (x0, y0), (x1, y1) in zip(*mirrors):
@@ -131,7 +133,12 @@ def plot_flips(
 
 def plot_accuracy(installation: Installation, found: AccuracyMap, path: str | Path) -> None:
     """Measured error beside what the filter claims and the bound, 3D, one colour scale; seen from above."""
-    columns = (("measured error (RMSE)", found.rmse), ("of it bias", found.bias), ("the filter claims", found.claimed), ("bound of one round", found.bound))
+    columns = (
+        ("measured error (RMSE)", found.rmse),
+        ("of it bias", found.bias),
+        ("the filter claims", found.claimed),
+        ("bound of one round", found.bound),
+    )
     flat = []
     for _, values in columns:
         weight = np.where(np.isfinite(values[:, 0]), found.count, 0)
@@ -152,12 +159,13 @@ def plot_accuracy(installation: Installation, found: AccuracyMap, path: str | Pa
     for ax in axes[:, 1]:
         ax.set_ylabel("")
     figure.colorbar(mesh, ax=axes.ravel().tolist(), label="3D, cm", shrink=0.8, extend=_beyond(every, scale))
-    _finish(figure, "Measured error beside what is claimed and what is possible", [_hull_line(), _anchor_mark(installation.anchors)], [], path)
+    marks = [_hull_line(), _anchor_mark(installation.anchors)]
+    _finish(figure, "Measured error beside what is claimed and what is possible", marks, [], path)
 
 
 def plot_layouts(charts: Sequence[tuple[str, Installation, Chart]], flown: np.ndarray, path: str | Path) -> None:
-    """Bound before and after, of the middle layer, at one scale: that of where it is flown. charts : [(title, Installation, Chart)]; flown :
-    (n, 3) m, places that are flown."""
+    """Bound before and after, of the middle layer, at one scale: that of where it is flown. charts : [(title, Installation, Chart)];
+    flown : (n, 3) m, places that are flown."""
     grid = charts[0][2].grid
     k = grid.shape[2] // 2
     figure, axes = _panels(grid, len(charts))
@@ -182,8 +190,8 @@ def plot_layouts(charts: Sequence[tuple[str, Installation, Chart]], flown: np.nd
 
 
 def plot_places(places: AnchorPlaces, numbers: np.ndarray, scores: np.ndarray, path: str | Path) -> None:
-    """What one more anchor gives at places all over, the walls side by side. numbers : (n, places.numbers) of AnchorPlaces; scores : (n,) m,
-    of `Goal.score`."""
+    """What one more anchor gives at places all over, the walls side by side. numbers : (n, places.numbers) of AnchorPlaces; scores : (n,)
+    m, of `Goal.score`."""
     figure, ax = plt.subplots(figsize=(WIDTH, 3.6), layout="constrained")
     at = places.positions(numbers)
     along, height = numbers[:, 0] * places.ends[-1], at[:, 2]

@@ -109,7 +109,8 @@ def say_addition(told: dict[str, Any] | None, before: float) -> None:
 
 
 def say_design(steps: Sequence[dict[str, Any]], chosen: dict[str, Any], placed: Sequence[dict[str, Any]], share: float) -> None:
-    """Print what layouts give, the one that was chosen, and where its anchors are put. steps, chosen : design.Step; placed : of design.about."""
+    """Print what layouts give, the one that was chosen, and where its anchors are put. steps, chosen : of design.Step; placed : of
+    design.about."""
     print(f"{'anchors':>8s}{'one for':>9s}{'spacing':>9s}{'flyable':>9s}  bound there, m: median, 95 %")
     for step in [*steps, chosen]:
         bound = "       -" if step["median"] is None else f"{step['median']:8.2f}{step['most']:8.2f}"

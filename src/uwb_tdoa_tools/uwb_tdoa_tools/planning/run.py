@@ -10,7 +10,7 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
-from .. import cli
+from .. import cli, parallel
 from ..progress import Progress
 from ..readers.inputs import Reading
 from ..simulation.walls import Walls
@@ -22,7 +22,7 @@ from .places import lattice
 
 if TYPE_CHECKING:
     from argparse import Namespace
-    from collections.abc import Iterable
+    from collections.abc import Iterable, Sequence
     from pathlib import Path
     from uwb_tdoa_bias.foundation.anchors import Anchors
     from ..readers.inputs import Recording
@@ -64,7 +64,8 @@ def plan_hall(
     figures["addition"] = hall_advice(whole, found)
     report.say_addition(figures["addition"], figures["map"]["flyable_share"])
     plots.plot_heard(anchors, found, args.out / "heard.png", walls)
-    return figures, draw_map(found, installation.of(anchors), args.out, walls), bool(found.flyable.mean() >= args.share or not args.hall)
+    outgoing = draw_map(found, installation.of(anchors), args.out, walls)
+    return figures, outgoing, bool(found.flyable.mean() >= args.share or not args.hall)
 
 
 def _designed(args: Namespace, whole: hall.Hall, grid: Grid) -> tuple[Anchors, Chart, list[dict[str, Any]]]:
@@ -89,12 +90,48 @@ def _places(room: Room, reach: float) -> np.ndarray:
     return np.unique(np.vstack([np.column_stack([across, np.full(len(across), height)]) for height in z]).round(1), axis=0)
 
 
+def plan_room(
+    args: Namespace, anchors: Anchors, installation: Installation, demand: Demand, grid: Grid, reading: Reading,
+    recordings: Sequence[Recording],
+) -> tuple[dict[str, Any], dict[str, Any]]:  # fmt: skip
+    """All of plan of a room in which every anchor is heard: (figures, messages). args : the options; recordings : of --flights, which
+    Reading found. Raises InputError."""
+    aim = options.aim_of(args, installation, demand, grid.axes[2][0]) if args.improve else None
+    if not np.isfinite(anchors.orientations).all():
+        cli.show("anchors without orientation are taken to radiate alike in all directions")
+    report.say_room(demand.room, args.room is not None)
+    cli.output_folder(args.out).mkdir(parents=True, exist_ok=True)
+    with Progress("plan") as progress:
+        progress("mapping")
+        found = chart(installation, grid, demand)
+    about = {**report.summary(found), **report.in_hull(found, installation)}
+    figures: dict[str, Any] = {"anchors": len(anchors), "arguments": options.plain(args), "map": about}
+    report.say_in_hull(about)
+    report.say_flyable(about, demand.accuracy)
+    if demand.criterion == "round":
+        goal, places = options.goal_of(args, installation, demand), options.places_of(args, demand.room)
+        figures["addition"] = room_advice(found, anchors, goal, places)
+        report.say_addition(figures["addition"], about["flyable_share"])
+    outgoing = draw_map(found, installation, args.out, pairings=demand.criterion == "pairings")
+    if args.check:
+        figures["check"] = check(installation, grid, args.out)
+        report.say_check(figures["check"])
+    if recordings:
+        flown = parallel.over(Fly(reading, tuple(args.aids)), recordings, args.jobs, args.dask)
+        figures["flights"] = evaluate_flights(flown, installation, demand.room, args.step or 0.4, args.out)
+        report.say_flights(figures["flights"])
+    if aim:
+        figures["improve"] = improve(found, aim, args.improve, args.starts, args.out)
+        report.say_improvement(figures["improve"])
+    return figures, outgoing
+
+
 def hall_advice(whole: hall.Hall, found: Chart) -> dict[str, Any] | None:
     """What `advice.one_more` finds in a Hall. found : Chart of it."""
     places = _places(whole.goal.demand.room, min(whole.reach, options.FARTHEST))
     with Progress("plan") as progress:
         return advice.one_more(
-            found, whole.anchors, places, lambda before, points, anchors, place: whole.changed(before, points, anchors, place[None]), progress
+            found, whole.anchors, places, lambda before, points, more, place: whole.changed(before, points, more, place[None]), progress
         )
 
 

@@ -42,16 +42,16 @@ def second_minima(
     """
     choices = np.array(list(combinations(range(min(NEAREST, columns.shape[1])), unknowns + 1)))
     out = np.empty((len(points), 4))
-    _search(points, positions, columns, weights, room.lower, room.upper, choices, out)
+    _search(points, positions, columns, weights, np.stack([room.lower, room.upper]), choices, out)
     return np.sqrt(out[:, 0]), out[:, 1:]
 
 
 @compiled
 def _search(
-    points: np.ndarray, positions: np.ndarray, columns: np.ndarray, weights: np.ndarray, lower: np.ndarray, upper: np.ndarray,
-    choices: np.ndarray, out: np.ndarray,
+    points: np.ndarray, positions: np.ndarray, columns: np.ndarray, weights: np.ndarray, room: np.ndarray, choices: np.ndarray,
+    out: np.ndarray,
 ) -> None:  # fmt: skip
-    """Fill out (n, 4): misfit squared and place. choices : (C, k + 1) of the nearest anchors."""
+    """Fill out (n, 4): misfit squared and place. room : (2, 3) m, its corners; choices : (C, k + 1) of the nearest anchors."""
     heard, unknowns = columns.shape[1], choices.shape[1] - 1
     anchors, true, end = np.empty((heard, 3)), np.empty(heard), np.empty(3)
     starts, values = np.empty((len(choices), 3)), np.empty(len(choices))
@@ -67,7 +67,7 @@ def _search(
             values[c] = np.inf
             if _mirror(point, anchors, true, nearest[choices[c]], starts[c]):
                 for k in range(unknowns):
-                    starts[c, k] = min(max(starts[c, k], lower[k] - AROUND), upper[k] + AROUND)
+                    starts[c, k] = min(max(starts[c, k], room[0, k] - AROUND), room[1, k] + AROUND)
                 values[c] = _misfit(starts[c], anchors, true, weights[n])
         best = np.argsort(values)
         for c in range(min(DESCENTS, len(choices))):
@@ -78,7 +78,7 @@ def _search(
                 continue
             f = _descend(starts[best[c]], point, anchors, true, weights[n], unknowns, end)
             for axis in range(unknowns):
-                f = f if lower[axis] <= end[axis] <= upper[axis] else np.inf
+                f = f if room[0, axis] <= end[axis] <= room[1, axis] else np.inf
             if f < out[n, 0] and _distance(end, point) > FLIP:
                 out[n, 0] = f
                 out[n, 1:] = end

@@ -28,8 +28,8 @@ def labels(ids: Sequence[int], places: np.ndarray) -> Iterator[tuple[str, np.nda
 
 
 def put_labels(ax: Axes, ids: Sequence[int], places: np.ndarray, avoided: np.ndarray, colour: str = "k") -> None:
-    """Write ids beside places (n, 2) m: each label where it covers no place, none of the avoided (m, 2) m, no other label and no edge of the
-    axes, as far as there is room. The figure must have its layout."""
+    """Write ids beside places (n, 2) m: each label where it covers no place, none of the avoided (m, 2) m, no other label and no edge of
+    the axes, as far as there is room. The figure must have its layout."""
     if len(ids) > MOST:
         return
     pixel, frame = ax.figure.dpi / 72.0, ax.get_window_extent()
