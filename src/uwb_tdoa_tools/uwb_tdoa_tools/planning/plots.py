@@ -251,8 +251,8 @@ def _bar(axes: Sequence[Axes] | np.ndarray, drawn: Any, label: str, extend: str,
     bar = axes[0].figure.colorbar(drawn, ax=list(axes), extend=extend, shrink=0.9 / len(axes) ** 0.5, pad=0.02, aspect=25)
     if ticks is None:
         low, high = drawn.get_clim()
-        ticks = np.linspace(low, high, 5)
-        bar.set_ticks(ticks, labels=[f"{tick:.3g}" for tick in ticks])
+        even = np.linspace(low, high, 5).tolist()
+        bar.set_ticks(even, labels=[f"{tick:.3g}" for tick in even])
     bar.set_label(label, fontsize=9)
 
 

@@ -51,6 +51,6 @@ def put_labels(ax: Axes, ids: Sequence[int], places: np.ndarray, avoided: np.nda
         taken = np.vstack([taken, placed])
         shift = np.array(chosen) * (half / pixel + 4.0)
         ax.annotate(
-            text, at, xytext=tuple(shift), textcoords="offset points", fontsize=size, color=colour, ha="center", va="center", zorder=6,
+            text, (float(at[0]), float(at[1])), xytext=tuple(shift), textcoords="offset points", fontsize=size, color=colour, ha="center", va="center", zorder=6,
             path_effects=[withStroke(linewidth=2.5, foreground="w")],
         )  # fmt: skip
