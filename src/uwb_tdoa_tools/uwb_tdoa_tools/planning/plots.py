@@ -158,7 +158,7 @@ def plot_accuracy(installation: Installation, found: AccuracyMap, path: str | Pa
         ax.set_xlabel("")
     for ax in axes[:, 1]:
         ax.set_ylabel("")
-    figure.colorbar(mesh, ax=axes.ravel().tolist(), label="3D, cm", shrink=0.8, extend=_beyond(every, scale))
+    _bar(axes.ravel(), mesh, "3D, cm", _beyond(every, scale))
     marks = [_hull_line(), _anchor_mark(installation.anchors)]
     _finish(figure, "Measured error beside what is claimed and what is possible", marks, [], path)
 
