@@ -2,6 +2,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from uwb_tdoa_ekf.debias import BiasMap
@@ -71,14 +72,20 @@ def test_a_planar_map_leaves_z(tmp_path):
 
 @pytest.mark.parametrize("interpolator", INTERPOLATORS)
 def test_file(tmp_path, interpolator):
-    one = make_map(interpolator=interpolator, frame="hall", source="traj1")
+    anchors = Anchors.from_positions(np.arange(12.0).reshape(4, 3), [7, 3, 5, 9], "hall")
+    one = make_map(interpolator=interpolator, frame="hall", source="traj1", ids=anchors.ids, positions=anchors.positions)
     one.save(tmp_path / "map.npz")
     again = BiasMap.load(tmp_path / "map.npz")
     p = np.random.default_rng(3).uniform(-1.0, 3.0, (100, 3))
     np.testing.assert_array_equal(again.bias_at(p), one.bias_at(p))
     assert (again.frame, again.source, again.interpolator, again.step) == ("hall", "traj1", interpolator, 0.5)
+    moved, order = anchors.positions + [0.0, 0.0, 0.2], [2, 0, 3, 1]
+    assert again.belongs_to(anchors.only(order)) and again.belongs_to(anchors.at(anchors.positions + 0.05))
+    for other in (anchors.at(moved), anchors.only([0, 1, 2]), Anchors.from_positions(anchors.positions, [7, 3, 5, 8], "hall")):
+        assert not again.belongs_to(other)
+    assert not again.belongs_to(Anchors.from_positions(anchors.positions, anchors.ids)) and not make_map().belongs_to(anchors)
     with np.load(tmp_path / "map.npz") as content:
-        assert int(content["version"]) == 1 and "metres" in str(content["units"])
+        assert int(content["version"]) == 2 and "metres" in str(content["units"])
 
 
 def test_what_is_no_map_is_refused(tmp_path):
@@ -92,8 +99,8 @@ def test_what_is_no_map_is_refused(tmp_path):
     make_map().save(file)
     with np.load(file) as content:
         fields = dict(content)
-    np.savez(file, **{**fields, "version": 2})
-    with pytest.raises(InputError, match="version 2"):
+    np.savez(file, **{**fields, "version": 1})
+    with pytest.raises(InputError, match="version 1"):
         BiasMap.load(file)
 
 
@@ -101,6 +108,7 @@ def test_what_is_no_map_is_refused(tmp_path):
     ("change", "named"),
     [
         ({"bias": np.zeros((3, 3))}, "do not fit together"),
+        ({"ids": np.arange(3)}, "ids and positions"),
         ({"step": 0.0}, "step"),
         ({"added": np.full((3, 3), np.nan)}, "not finite"),
         ({"added": -np.eye(3)}, "variance below 0"),

@@ -1,6 +1,6 @@
 """debias_node: odometry in, odometry with the bias of its position taken out.
 
-odometry (nav_msgs/Odometry)
+odometry (nav_msgs/Odometry), uwb/anchors (AnchorArray)
   -> odometry/debiased (nav_msgs/Odometry: one for each, same stamp and frames),
      /diagnostics (diagnostic_msgs/DiagnosticArray).
 Every parameter is documented in config/debias_node.yaml.
@@ -19,6 +19,7 @@ from nav_msgs.msg import Odometry
 import numpy as np
 from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.foundation import ros
+from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_FILE, AnchorsInput
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.ros_diagnostics import Diagnostics, Rate
 from uwb_tdoa_bias.foundation.ros_node import StreamNode
@@ -30,11 +31,13 @@ from .debias import BiasMap, LayerConfig, Layers
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from uwb_tdoa_bias.foundation.anchors import Anchors
 
 GAP = 1.0  # s; after a longer silence, or when time goes back, the layers start anew
 LARGEST_OUTSIDE = 0.5  # share of positions outside of the map, before it becomes a warning
 PARAMETERS = {  # in the order of config/debias_node.yaml; the layers are those of Grasso et al., appendix C
     "map": Parameter("", "file that `debias` wrote; must be given"),
+    "anchors_file": ANCHORS_FILE,
     "saturate": Parameter(False, "limit the steps of velocity and position"),
     "max_speed": Parameter([3.0, 3.0, 3.0], "m/s along x, y, z", constraint="three numbers above 0"),
     "max_acceleration": Parameter(10.0, "m/s^2", 0.0, 1e6),
@@ -50,7 +53,7 @@ PARAMETERS = {  # in the order of config/debias_node.yaml; the layers are those 
 
 
 class DebiasNode(StreamNode):
-    """Converts messages for a BiasMap and keeps the accounts: received = corrected + faded + outside + invalid."""
+    """Converts messages for a BiasMap and keeps the accounts: received = corrected + faded + outside + refused + invalid."""
 
     NAME = "debias_node"
 
@@ -59,7 +62,7 @@ class DebiasNode(StreamNode):
         super().__init__(self.NAME)
         own = declare_all(self, PARAMETERS)
         refuse_unknown(self)
-        layers = {name: value for name, value in own.items() if name not in ("map", "frozen")}
+        layers = {name: value for name, value in own.items() if name not in ("map", "anchors_file", "frozen")}
         file = own["map"]
         if not file:
             raise InputError("map: is empty; give a file that `debias` wrote.")
@@ -73,9 +76,15 @@ class DebiasNode(StreamNode):
         self._input = Input(
             self, Odometry, "odometry", self._on_odometry, copy(STREAM_QOS), qos_overriding_options=OVERRIDES
         )
+        self._belongs: bool | None = None  # until there are anchors
+        self._anchors = AnchorsInput(self, self._on_anchors, own["anchors_file"])
+        self._anchors.start()
         say_unused([self], files_of(arguments))
         self._diagnostics = Diagnostics(self, self._report)
         self.ready = f"ready; {len(self._map.at)} markers, {self._map.interpolator}"
+
+    def _on_anchors(self, anchors: Anchors) -> None:
+        self._belongs = self._map.belongs_to(anchors)
 
     def _on_odometry(self, message: Odometry) -> None:
         self._counts["received"] += 1
@@ -85,6 +94,8 @@ class DebiasNode(StreamNode):
             p = self._layered(message, p)
         if message.header.frame_id != self._map.frame or not np.isfinite(p).all():
             kind = "invalid"
+        elif not self._belongs:
+            kind = "refused"
         else:
             covariance = np.array(message.pose.covariance).reshape(6, 6)
             (p,), (covariance[:3, :3],), (validity,) = self._map.correct(p[None], covariance[None, :3, :3])
@@ -108,7 +119,7 @@ class DebiasNode(StreamNode):
         return self._layers.filter(t, p, Rotation.from_quat(state[6:]).apply(state[3:6]))
 
     def _report(self) -> tuple[bytes, str, dict[str, str | int]]:
-        kinds = ("corrected", "faded", "outside", "invalid")
+        kinds = ("corrected", "faded", "outside", "refused", "invalid")
         recent = {name: self._counts[name] - self._counts_before[name] for name in kinds}
         self._counts_before = Counter(self._counts)
         rate = self._rate.of(self._counts["received"])
@@ -118,7 +129,7 @@ class DebiasNode(StreamNode):
         values |= {"subscribers of odometry/debiased": self._publisher.get_subscription_count()}
         values |= {"unreadable on odometry": self._input.refusals.count}
         level, text = self._status(recent, sum(recent.values()))
-        unreadable = self._input.refusals.trouble()
+        unreadable = self._input.refusals.trouble() or self._anchors.refused
         if unreadable and level != DiagnosticStatus.ERROR:
             level, text = DiagnosticStatus.WARN, unreadable
         return level, text, values
@@ -129,6 +140,11 @@ class DebiasNode(StreamNode):
         if recent["invalid"]:
             what = f"odometry is not finite, or not in the map's frame '{self._map.frame}', and is passed on as it is"
             return DiagnosticStatus.ERROR, f"{what}: correct world_frame of ekf_node, or make a map in its frame"
+        if recent["refused"] and self._belongs is None:
+            return DiagnosticStatus.WARN, "no anchors, so positions pass uncorrected: start anchors_node, or give anchors_file"
+        if recent["refused"]:
+            what = "the map was made for other anchors, so positions pass uncorrected"
+            return DiagnosticStatus.ERROR, f"{what}: make one for these with debias fit"
         if recent["outside"] > LARGEST_OUTSIDE * total:
             return DiagnosticStatus.WARN, "most positions are outside of the map, not corrected: map more of the room"
         return DiagnosticStatus.OK, "debiasing"

@@ -89,7 +89,7 @@ def test_what_makes_it_worse_where_it_took_no_part_is_not_to_be_used(flights, mo
     told = iter([0.01, 0.02])
     monkeypatch.setattr(library, "slow_innovations", lambda *_: next(told))
     made = without_truth([replace(flight, truth=None) for flight in flights[:1]], [replace(flights[1], truth=None)])
-    assert "it makes things worse where it took no part: slow innovations 1.0 -> 2.0 cm (+100%) on flight2" in made.why_not
+    assert "it makes things worse where it took no part: slow innovations 1.0 -> 2.0 cm (it rises by 100 %) on flight2" in made.why_not
 
 
 @pytest.mark.parametrize(

@@ -1,3 +1,4 @@
+from dataclasses import replace
 import json
 import re
 
@@ -6,10 +7,18 @@ import pytest
 from uwb_tdoa_ekf.debias import BiasMap
 
 from uwb_tdoa_tools.bags.bag import write_bag
+from uwb_tdoa_tools.commands import debias as command
 from uwb_tdoa_tools.commands.debias import main
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
+from uwb_tdoa_tools.simulation.constellations import corners
 
 BIAS = np.array([0.1, -0.2, 0.05])
+
+
+@pytest.fixture
+def survey(tmp_path):
+    corners().to_yaml(tmp_path / "anchors.yaml")
+    return ["--survey", str(tmp_path / "anchors.yaml")]
 
 
 @pytest.fixture
@@ -22,21 +31,22 @@ def points(tmp_path):
     return tmp_path / "points.csv"
 
 
-def test_points_become_a_map(tmp_path, points, capsys):
-    assert main(["fit", "--static", str(points), "--step", "0.5", "--out", str(tmp_path / "m.npz")]) == 0
+def test_points_become_a_map(tmp_path, points, survey, capsys):
+    assert main(["fit", "--static", str(points), "--step", "0.5", *survey, "--out", str(tmp_path / "m.npz")]) == 0
     found = BiasMap.load(tmp_path / "m.npz")
     assert len(found.at) == 48 and (found.count == 5).all() and found.source == "points.csv" and not found.planar
     np.testing.assert_allclose(found.bias_at(np.array([[0.8, 0.6, 0.6]])), BIAS[None], atol=1e-6)
+    assert found.belongs_to(corners()) and not found.belongs_to(corners(8.0))
     assert "48 markers 0.5 m apart" in capsys.readouterr().out
 
 
-def test_a_planar_network_needs_no_heights(tmp_path, points):
+def test_a_planar_network_needs_no_heights(tmp_path, points, survey):
     flat = tmp_path / "flat.csv"
     flat.write_text(
         "".join(",".join(np.array(line.split(","))[[0, 1, 3, 4]]) + "\n" for line in points.read_text().split())
     )
     options = ["--planar", "--interpolator", "network", "--step", "0.5", "--out", str(tmp_path / "m.npz")]
-    assert main(["fit", "--static", str(flat), *options]) == 0
+    assert main(["fit", "--static", str(flat), *survey, *options]) == 0
     found = BiasMap.load(tmp_path / "m.npz")
     assert found.planar and found.interpolator == "network" and (found.count == 15).all()
     np.testing.assert_allclose(found.bias, np.tile(BIAS[:2], (16, 1)), atol=1e-6)
@@ -65,7 +75,44 @@ def test_flights_make_a_map_and_are_judged_by_it(tmp_path, flights, capsys):
     assert "held out" in capsys.readouterr().out
 
     assert main(["judge", out, two, "--json", str(tmp_path / "judge.json")]) == 0
-    assert json.loads((tmp_path / "judge.json").read_text())["runs"] == [row]
+    judged = json.loads((tmp_path / "judge.json").read_text())
+    assert judged["runs"] == [row] and judged["gain"] == pytest.approx(1.0 - row["after"]["rmse_3d"] / row["before"]["rmse_3d"])
+    assert f"better: the 3D RMSE falls by {100 * judged['gain']:.0f} % on these flights" in capsys.readouterr().out
+
+
+def wrong_map(path, bias, anchors):
+    """A map of one bias all over the room."""
+    cell = np.stack(np.meshgrid(*[np.arange(-5, 6)] * 2, np.arange(4), indexing="ij"), axis=-1).reshape(-1, 3)
+    whole = np.tile(bias, (len(cell), 1))
+    zero = np.zeros_like(whole)
+    own = {"ids": anchors.ids, "positions": anchors.positions}
+    BiasMap(cell, 1.0 * cell, whole, zero, np.full(len(cell), 9), np.zeros((3, 3)), 1.0, **own).save(path)
+
+
+def test_harm_is_said_and_counts_as_failure(tmp_path, flights, capsys):
+    wrong_map(tmp_path / "m.npz", [1.0, -1.0, 0.5], corners())
+    assert main(["judge", str(tmp_path / "m.npz"), str(flights / "one.bag")]) == 1
+    said = capsys.readouterr().out
+    assert re.search(r"harm: the 3D RMSE rises by \d+ % on these flights; do not use", said) and re.search(r"after: it rises by \d+ %", said)
+
+
+def test_a_map_that_does_harm_where_it_took_no_part_is_not_written(tmp_path, flights, monkeypatch, capsys):
+    one, two, out = str(flights / "one.bag"), str(flights / "two.bag"), tmp_path / "m.npz"
+    made = command.fit_map
+    monkeypatch.setattr(command, "fit_map", lambda *args, **options: (m := made(*args, **options)) and replace(m, bias=-5.0 * m.bias))
+    assert main(["fit", one, "--holdout", two, "--out", str(out), "--json", str(tmp_path / "fit.json"), "--jobs", "1"]) == 1
+    assert not out.exists() and json.loads((tmp_path / "fit.json").read_text())["written"] is False
+    assert "m.npz is not written: harm: the 3D RMSE rises by" in capsys.readouterr().out
+
+
+def test_a_map_is_refused_among_other_anchors(tmp_path, flights, capsys):
+    wrong_map(tmp_path / "m.npz", [0.1, 0.0, 0.0], corners(8.0))
+    assert main(["judge", str(tmp_path / "m.npz"), str(flights / "one.bag")]) == 2
+    assert "its anchors are not those that the map was made for" in capsys.readouterr().err
+    moved = corners().at(corners().positions + [0.05, 0.0, 0.0])
+    wrong_map(tmp_path / "m.npz", [0.0, 0.0, 0.0], moved)
+    assert main(["judge", str(tmp_path / "m.npz"), str(flights / "one.bag")]) == 0
+    assert "no gain: the 3D RMSE stays on these flights" in capsys.readouterr().out
 
 
 def test_as_much_of_a_map_is_taken_as_flights_left_out_bear_out(tmp_path, flights, capsys):
@@ -87,6 +134,7 @@ def test_as_much_of_a_map_is_taken_as_flights_left_out_bear_out(tmp_path, flight
         (["fit", "--out", "m.npz"], "FLIGHT: there is none"),
         (["fit", "--static", "POINTS", "--step", "0", "--out", "m.npz"], "--step: 0.0"),
         (["fit", "--static", "nowhere.csv", "--out", "m.npz"], "nowhere.csv: cannot be read .No such file"),
+        (["fit", "--static", "POINTS", "--out", "m.npz"], "--survey: .* holds no anchors"),
         (["fit", "--static", "SHORT", "--out", "m.npz"], "has no column true_z"),
         (["fit", "--static", "TEXT", "--planar", "--out", "m.npz"], "line 3: x is .one.; it must be"),
         (["fit", "--static", "EMPTY", "--planar", "--out", "m.npz"], "holds no positions"),

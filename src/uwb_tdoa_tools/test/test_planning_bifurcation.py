@@ -2,16 +2,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import norm
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_tools.planning.bifurcation import CLEAR, MOST_SUBSETS, Subsets
+from uwb_tdoa_tools.planning.bifurcation import MOST_SUBSETS, Subsets
 from uwb_tdoa_tools.planning.check import brute_force
 from uwb_tdoa_tools.planning.installation import Installation
 from uwb_tdoa_tools.planning.maps import Grid
 from uwb_tdoa_tools.planning.multistart import same_place, solutions
-from uwb_tdoa_tools.planning.noise import FixedNoise
-from uwb_tdoa_tools.planning.pairing import all_pairs
 from uwb_tdoa_tools.simulation.constellations import constellation, corners
 
 SQUARE = Anchors.from_positions([[0, 0, 0.2], [4, 0, 0.2], [4, 4, 0.2], [0, 4, 0.2]])
@@ -153,40 +150,3 @@ def test_of_many_anchors_those_that_are_heard_together_are_chosen():
     assert (np.minimum(span, 64 - span) < 32).all()
     assert len({tuple(sorted(row)) for row in subsets.rows}) == len(subsets.rows)
     assert subsets.ambiguous(np.zeros((10, 3))).shape == (10,)
-
-
-def test_separation_predicts_how_often_an_estimator_flips():
-    """Phi(-separation / 2) of noisy rounds are explained better by the mirrored position than by the true one."""
-    anchors = constellation("random-3-5")
-    rng = np.random.default_rng(4)
-    for pairing, noise in ((None, 0.05), (all_pairs(5), 0.05)):
-        installation = Installation(anchors, FixedNoise(noise), pairing)
-        subsets = Subsets(anchors, 3)
-        points = rng.uniform(anchors.positions.min(axis=0), anchors.positions.max(axis=0), (400, 3))
-        separation = subsets.separation(points, installation)
-        k = np.argmin(np.abs(separation - 2.0))
-        point, clear = points[k], separation[k]
-        row, _, mirrors = subsets.mirrors(points[k : k + 1])
-        mirrors = mirrors[np.linalg.norm(mirrors - point, axis=1) > 0.5]
-        d = installation.pairing.incidence()[: 4 if pairing is None else None]
-        root = np.linalg.cholesky(0.05**2 * (d @ d.T)) if pairing is None else np.sqrt(2) * noise * np.eye(len(d))
-        h_true, h_other = (
-            d @ np.linalg.norm(p[:, None] - anchors.positions, axis=-1).T for p in (point[None], mirrors)
-        )
-        weight = installation.pairing.times
-        shift = np.linalg.solve(root, h_other - h_true) * np.sqrt(weight)
-        closest = np.argmin(np.linalg.norm(shift, axis=0))
-        assert np.linalg.norm(shift[:, closest]) == pytest.approx(clear, rel=1e-6)
-        draws = rng.standard_normal((40_000, len(d)))
-        flips = np.mean(np.sum((draws - shift[:, closest]) ** 2, axis=1) < np.sum(draws**2, axis=1))
-        assert flips == pytest.approx(norm.cdf(-0.5 * clear), abs=0.01)
-    assert norm.cdf(-0.5 * CLEAR) == pytest.approx(0.01, abs=2e-4)
-
-
-def test_more_anchors_leave_a_round_less_doubt():
-    installation = [Installation(constellation(f"random-3-{n}")) for n in (5, 8)]
-    doubtful = []
-    for each in installation:
-        points = np.random.default_rng(0).uniform([-2, -2, 0.3], [2, 2, 2], (500, 3))
-        doubtful.append(np.mean(Subsets(each.anchors, 3).separation(points, each) < CLEAR))
-    assert doubtful[0] > 0.03 > doubtful[1]

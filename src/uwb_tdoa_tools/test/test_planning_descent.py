@@ -9,6 +9,7 @@ from uwb_tdoa_tools.planning import descent
 from uwb_tdoa_tools.planning.bifurcation import Subsets
 from uwb_tdoa_tools.planning.descent import descend, errors_and_slopes, failing_and_slopes
 from uwb_tdoa_tools.planning.goal import UNUSABLE, Goal
+from uwb_tdoa_tools.planning.judging import Demand
 from uwb_tdoa_tools.planning.installation import Installation
 from uwb_tdoa_tools.planning.layout import Layout
 from uwb_tdoa_tools.planning.places import AnchorPlaces, lattice
@@ -24,7 +25,7 @@ def case(pairing="ring", link_std=0.0, dimensions=3, fixed=None, depth=0.0, obje
     layout = Layout(places, count, fixed, np.array([0.0, 0.0, 1.5]))
     x = layout.start(places.nearest(corners().positions[-count:]))
     x += np.random.default_rng(4).uniform(-0.1, 0.1, len(x))
-    return Goal(POINTS, installation, pairing, objective, criterion), layout, np.clip(x, *np.transpose(layout.bounds))
+    return Goal(POINTS, installation, pairing, objective, Demand(criterion=criterion)), layout, np.clip(x, *np.transpose(layout.bounds))
 
 
 CASES = [

@@ -5,8 +5,10 @@ import pytest
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.planning.bifurcation import Subsets
 from uwb_tdoa_tools.planning.installation import Installation
+from uwb_tdoa_tools.planning.judging import OUTSIDE, TWO_SOLUTIONS, Demand
 from uwb_tdoa_tools.planning.maps import MOST_CELLS, Grid, chart
 from uwb_tdoa_tools.planning.pairing import PAIRINGS
+from uwb_tdoa_tools.simulation.room import Room
 from uwb_tdoa_tools.simulation.constellations import constellation, corners
 
 
@@ -34,13 +36,14 @@ def test_impossible_grids(upper, step, says):
 
 def test_a_chart_says_the_same_as_its_parts():
     installation = Installation(corners())
-    found = chart(installation, Grid.box((-4, -4, 0), (4, 4, 3), 0.8))
+    found = chart(installation, Grid.box((-4, -4, 0), (4, 4, 3), 0.8), Demand(criterion="pairings"))
     points = found.grid.points
-    np.testing.assert_array_equal(found.hull, installation.inside_hull(points))
-    np.testing.assert_array_equal(found.ambiguous, Subsets(corners(), 3).ambiguous(points))
+    hull, ambiguous = installation.inside_hull(points), Subsets(corners(), 3).ambiguous(points)
+    np.testing.assert_array_equal(found.status == OUTSIDE, ~hull)
+    np.testing.assert_array_equal(found.status == TWO_SOLUTIONS, hull & (ambiguous > 0.0))
     np.testing.assert_allclose(found.error, np.linalg.norm(found.std, axis=1))
-    np.testing.assert_array_equal(found.flyable, found.hull & (found.ambiguous == 0))
-    assert 0 < found.flyable.sum() < found.hull.sum() < len(points)
+    np.testing.assert_array_equal(found.flyable, hull & (ambiguous == 0))
+    assert 0 < found.flyable.sum() < hull.sum() < len(points) and (found.heard == 8).all()
     volume = found.volume(installation.anchors, installation.dimensions)
     np.testing.assert_array_equal(volume.contains(points), found.flyable)
     assert volume.belongs_to(corners())
@@ -48,7 +51,7 @@ def test_a_chart_says_the_same_as_its_parts():
 
 def test_a_whole_round_leaves_more_flyable_than_every_pairing_alone():
     grid = Grid.box((-4, -4, 0), (4, 4, 3), 0.8)
-    alone, whole = (chart(Installation(corners()), grid, criterion) for criterion in ("pairings", "round"))
+    alone, whole = (chart(Installation(corners()), grid, Demand(criterion=criterion)) for criterion in ("pairings", "round"))
     assert (whole.flyable | ~alone.flyable).all() and whole.flyable.sum() > 1.2 * alone.flyable.sum()
 
 
@@ -58,7 +61,7 @@ def cpu_seconds(anchors, shape, pairing):
     grid = Grid(anchors.positions.min(axis=0) + [0, 0, 0.3 * step], step, shape)
     installation = Installation(anchors, pairing=PAIRINGS[pairing](len(anchors)))
     began = time.process_time()
-    found = chart(installation, grid)
+    found = chart(installation, grid, Demand(Room(grid.lower, grid.lower + grid.step * np.array(shape))))
     assert np.isfinite(found.error).mean() > 0.9
     return time.process_time() - began
 

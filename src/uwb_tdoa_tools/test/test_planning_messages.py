@@ -3,12 +3,13 @@ import pytest
 from uwb_tdoa_tools.bags.files import open_bag
 from uwb_tdoa_tools.bags.message_types import typestore
 from uwb_tdoa_tools.planning.installation import Installation
+from uwb_tdoa_tools.planning.judging import Demand
 from uwb_tdoa_tools.planning.maps import Grid, chart
 from uwb_tdoa_tools.planning.messages import TOPICS, messages, write
 from uwb_tdoa_tools.simulation.constellations import corners
 
 INSTALLATION = Installation(corners())
-CHART = chart(INSTALLATION, Grid.box((-4, -4.5, 0), (4, 4.5, 3), 0.5))
+CHART = chart(INSTALLATION, Grid.box((-4, -4.5, 0), (4, 4.5, 3), 0.5), Demand(criterion="pairings"))
 
 
 def test_the_flyable_slice():
@@ -42,7 +43,7 @@ def test_markers_show_the_surface_and_the_anchors():
 
 
 def test_nothing_flyable_is_no_error():
-    outside = chart(INSTALLATION, Grid.box((10, 10, 0), (11, 11, 1), 0.5))
+    outside = chart(INSTALLATION, Grid.box((10, 10, 0), (11, 11, 1), 0.5), Demand(criterion="pairings"))
     assert messages(outside, INSTALLATION.anchors)["plan/markers"].markers[0].points == []
 
 

@@ -3,8 +3,9 @@ import pytest
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.planning.goal import Goal
+from uwb_tdoa_tools.planning.judging import Demand
 from uwb_tdoa_tools.planning.installation import Installation
-from uwb_tdoa_tools.planning.optimisation import one_more, optimise
+from uwb_tdoa_tools.planning.optimisation import BESIDE, one_more, optimise
 from uwb_tdoa_tools.planning.noise import FixedNoise
 from uwb_tdoa_tools.planning.places import AnchorPlaces, lattice
 from uwb_tdoa_tools.readers import read_survey
@@ -15,7 +16,7 @@ MARGIN = np.array([0.8, 0.8, 0.6])  # m of a room that are not flown
 
 
 def goal(installation, criterion="pairings", objective="worst"):
-    return Goal(lattice((1, 1, 0.5), (5, 4, 2), 1.5), installation, "ring", objective, criterion)
+    return Goal(lattice((1, 1, 0.5), (5, 4, 2), 1.5), installation, "ring", objective, Demand(criterion=criterion))
 
 
 def bad_anchors():
@@ -49,8 +50,10 @@ def test_one_more_anchor():
     fixed = Anchors([4, 0, 9, 2, 1], bad_anchors().positions, bad_anchors().orientations, "hall")
     aim = goal(Installation(fixed), "round")
     places = AnchorPlaces.walls(*ROOM)
-    positions, scores = one_more(aim, fixed, places, count=60)
+    numbers, scores = one_more(aim, fixed, places, count=60)
+    positions = places.positions(numbers)
     assert 30 < len(positions) == len(scores) < 120
+    assert np.linalg.norm(positions[:, None] - fixed.positions, axis=2).min() >= BESIDE
     start = positions[[np.argmin(scores)]]
     better, again = (optimise(aim, places, 1, fixed, start, starts=2) for _ in range(2))
     np.testing.assert_array_equal(again.positions, better.positions)
@@ -81,9 +84,9 @@ def test_the_surveyed_layout_is_beaten_by_a_fifth(where, shared_data):
     lower, upper = np.array([-3.05, -4.2, 0.0]), np.array([3.95, 3.8, 3.0])
     flown, depth = (FLIGHTS, 0.0) if where == "shared flights" else ((lower + MARGIN, upper - MARGIN), 0.5)
     step = 0.09 * (np.array(flown[1]) - flown[0]).max()
-    aim = Goal(lattice(*flown, step), Installation(survey), criterion="round")
+    aim = Goal(lattice(*flown, step), Installation(survey), demand=Demand())
     better = optimise(aim, AnchorPlaces.walls(lower, upper, depth=depth), 8, starts=8)
-    fine = Goal(lattice(*flown, 0.6 * step), Installation(survey), criterion="round")
+    fine = Goal(lattice(*flown, 0.6 * step), Installation(survey), demand=Demand())
     before, after = fine.figures(survey), fine.figures(better)
     assert after["worst"] < 0.8 * before["worst"] and after["mean"] < before["mean"]
     assert after["failing"] <= before["failing"] + 0.02

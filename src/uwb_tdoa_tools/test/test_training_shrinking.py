@@ -32,7 +32,7 @@ def test_takes_what_gains_without_harm(ratios, share):
 
 def test_effects_alone_are_taken_as_they_are():
     told = Shrinkage(best_share({"a": {None: 0.4, 1.0: 0.3}}), {"a": {None: 0.4, 1.0: 0.3}})
-    assert told.share == 1.0 and "falls by 25% +- 0% (of 1 flights, each left out; the worst +25%)" in told.as_text()
+    assert told.share == 1.0 and "falls by 25 % +- 0 % (of 1 flights, each left out; on the worst it falls by 25 %)" in told.as_text()
 
 
 def test_a_flight_is_judged_by_what_it_took_no_part_in():

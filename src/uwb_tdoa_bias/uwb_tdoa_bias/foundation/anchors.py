@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 SAME_PLACE = 0.01  # m; an anchor that is sent again with less of a change is at the same place
+CONSTELLATION = 0.1  # m within which each anchor must stand, for what was made for others to hold for these
 MOST = 10_000  # anchors, as many as a message holds
 FARTHEST = 1e8  # m along each axis: grid coordinates of a country fit, and their squares do not overflow
 
@@ -90,6 +91,13 @@ class Anchors:
         """Rows of the given ids: int array of the shape of `ids`, -1 where an id is unknown."""
         rows = self._rows  # type: ignore[attr-defined]  # __post_init__ puts it there: it is no field
         return rows.take(np.asarray(ids, dtype=np.int64) + 1, mode="clip")
+
+    def stand_at(self, ids: np.ndarray, positions: np.ndarray, frame: str) -> bool:
+        """Return whether these are the anchors with such ids (n,), positions (n, 3) m and frame, each within CONSTELLATION."""
+        rows = self.index(ids)
+        if frame != self.frame or len(ids) != len(self) or (rows < 0).any():
+            return False
+        return bool((np.linalg.norm(self.positions[rows] - positions, axis=1) <= CONSTELLATION).all())
 
     def at(self, positions: np.ndarray) -> Anchors:
         """The same Anchors at other positions, (N, 3) m."""

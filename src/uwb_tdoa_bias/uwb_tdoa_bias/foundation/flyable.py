@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 _FIELDS = {  # of the file, and the kinds of their numbers
     "frame": "U", "lower": "f", "step": "f", "flyable": "b", "bound": "f", "ids": "i", "positions": "f", "planar": "b",
 }  # fmt: skip
-SAME_PLACE = 0.1  # m within which an anchor has not moved
 _REMEDY = "make one with `plan ... --volume`"
 
 
@@ -83,11 +82,8 @@ class FlyableVolume:
         return inside, tuple(np.moveaxis(np.where(inside[..., None], cell, 0), -1, 0))
 
     def belongs_to(self, anchors: Anchors) -> bool:
-        """Whether it was computed for these Anchors: the same ids in the same frame, each within SAME_PLACE."""
-        rows = anchors.index(self.ids)
-        if anchors.frame != self.frame or len(anchors) != len(self.ids) or (rows < 0).any():
-            return False
-        return bool((np.linalg.norm(anchors.positions[rows] - self.positions, axis=1) <= SAME_PLACE).all())
+        """Whether it was computed for these Anchors."""
+        return anchors.stand_at(self.ids, self.positions, self.frame)
 
     def save(self, path: str | Path) -> None:
         """Write what `load` reads: a numpy .npz file."""

@@ -20,14 +20,17 @@ from .network import AngularNetwork
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
+    from uwb_tdoa_bias.foundation.anchors import Anchors
 
-FORMAT, VERSION = "uwb_tdoa position bias map", 1
+FORMAT, VERSION = "uwb_tdoa position bias map", 2
 UNITS = "metres, square metres for added, in the world frame named by frame; bias is measured minus true"
 INTERPOLATORS = ("thin_plate", "network")
 SMOOTHING = 0.3  # of the thin plate, at a marker of median count; see docs/debiasing.md
 FADE = 1.0  # m beyond the known region over which the correction goes to nothing; see docs/debiasing.md
 LARGEST = 1e5  # m; more is a mistake
-_ARRAYS = {"cell": int, "at": float, "bias": float, "std": float, "count": int, "added": float}
+_ARRAYS = {
+    "cell": int, "at": float, "bias": float, "std": float, "count": int, "added": float, "ids": int, "positions": float,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,7 @@ class BiasMap:
     interpolator : "thin_plate" (scipy's RBFInterpolator: passes near all markers, the nearer the more was measured
         there) or "network" (Grasso et al., appendix A)
     frame : name of the world frame; source : where it came from, free text
+    ids : (N,), positions : (N, 3) m of the anchors that it was made for; without any it belongs to none
 
     A position is known inside the convex hull of the markers and no further than one step from the next of them.
     Beyond, the correction fades to nothing over FADE.
@@ -55,6 +59,8 @@ class BiasMap:
     interpolator: str = "thin_plate"
     frame: str = "map"
     source: str = ""
+    ids: np.ndarray = field(default_factory=lambda: np.empty(0, int))
+    positions: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
     _hull: tuple[np.ndarray, np.ndarray] = field(init=False, repr=False, compare=False)
     _tree: cKDTree = field(init=False, repr=False, compare=False)
     _surface: Callable[[np.ndarray], np.ndarray] = field(init=False, repr=False, compare=False)
@@ -67,6 +73,8 @@ class BiasMap:
         shapes = (self.cell.shape, self.bias.shape, self.std.shape, self.count.shape, self.added.shape)
         if d not in (2, 3) or shapes != ((n, d), (n, d), (n, d), (n,), (d, d)):
             raise InputError("bias map: cell, at, bias, std, count and added do not fit together.")
+        if self.ids.ndim != 1 or self.positions.shape != (len(self.ids), 3) or not np.isfinite(self.positions).all():
+            raise InputError("bias map: ids and positions of its anchors do not fit together.")
         if n > MAP_MARKERS:
             raise InputError(f"bias map: {n} markers are more than {MAP_MARKERS}; map with a larger step.")
         arrays = (self.at, self.bias, self.std, self.added)
@@ -99,6 +107,10 @@ class BiasMap:
     def planar(self) -> bool:
         """Whether it knows x and y only; z is then left as it is."""
         return self.at.shape[1] == 2
+
+    def belongs_to(self, anchors: Anchors) -> bool:
+        """Whether it was made for these Anchors."""
+        return bool(len(self.ids)) and anchors.stand_at(self.ids, self.positions, self.frame)
 
     def scaled(self, share: float) -> BiasMap:
         """The BiasMap of a share, 0 ... 1, of all biases; the rest, which is not taken out, is in `added`."""

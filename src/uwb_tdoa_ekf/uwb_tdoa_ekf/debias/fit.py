@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple, TYPE_CHECKING
 
 import numpy as np
@@ -13,6 +14,7 @@ from .bias_map import BiasMap
 from .markers import collect, corrected_bias, measured_places
 
 if TYPE_CHECKING:
+    from uwb_tdoa_bias.foundation.anchors import Anchors
     from .markers import Markers
 
 FOLDS = 5  # into which parts are shared out, if there are more
@@ -43,23 +45,24 @@ class _Options(NamedTuple):
     least: int
     planar: bool
     interpolator: str
-    frame: str
+    anchors: Anchors | None
     source: str
 
 
 def fit(
     parts: list[Part], step: float, least: int = 1, planar: bool = False, interpolator: str = "thin_plate",
-    frame: str = "map", source: str = "",
+    anchors: Anchors | None = None, source: str = "",
 ) -> BiasMap:  # fmt: skip
     """BiasMap of a list of Part. Raises InputError where they hold too little.
 
-    step : m, of the grid; least : measurements that make a marker; planar : map x and y only.
+    step : m, of the grid; least : measurements that make a marker; planar : map x and y only; anchors : Anchors that
+    the map is for.
     `added` comes from maps that were fitted without some of the parts and asked about them (without stretches of it, if
     there is one part only): their mean squared error at markers. If the covariances of the measured positions are
     known, as much of it is added as makes the normalised squared error of the corrected positions d on average there,
     nothing if they are honest as they are; else all of it.
     """
-    options = _Options(step, least, planar, interpolator, frame, source)
+    options = _Options(step, least, planar, interpolator, anchors, source)
     whole = _fit(parts, options, np.zeros((2, 2) if planar else (3, 3)))
     folds = _folds(parts)
     bias_errors, errors, covariances = [np.empty((0, whole.at.shape[1]))], [], []
@@ -117,8 +120,11 @@ def _fit(parts: list[Part], options: _Options, added: np.ndarray) -> BiasMap:
     markers = _markers(parts, options)
     bias = corrected_bias(markers)
     at = measured_places(markers, bias)
-    step, _, _, *about = options
-    return BiasMap(markers.cell, at, bias, markers.std, markers.count, added, step, *about)
+    made = BiasMap(
+        markers.cell, at, bias, markers.std, markers.count, added, options.step, options.interpolator, source=options.source
+    )
+    anchors = options.anchors
+    return replace(made, frame=anchors.frame, ids=anchors.ids, positions=anchors.positions) if anchors is not None else made
 
 
 def _markers(parts: list[Part], options: _Options) -> Markers:

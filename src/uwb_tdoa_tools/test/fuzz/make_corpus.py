@@ -104,7 +104,8 @@ def _maps(folder):
     FlyableVolume([0, 0, 0], [1, 1, 1], cells, np.ones(cells.shape), anchors.ids, anchors.positions).save(folder / "v.npz")
     _write_map("flyable", folder / "v.npz")
     cell = np.stack(np.meshgrid(*[np.arange(2)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    BiasMap(cell, 0.5 * cell, 0.1 + 0.0 * cell, 0.1 + 0.0 * cell, np.full(8, 9), np.eye(3), 0.5).save(folder / "m.npz")
+    bias, own = 0.1 + 0.0 * cell, {"ids": anchors.ids, "positions": anchors.positions}
+    BiasMap(cell, 0.5 * cell, bias, bias, np.full(8, 9), np.eye(3), 0.5, **own).save(folder / "m.npz")
     _write_map("bias_map", folder / "m.npz")
 
 

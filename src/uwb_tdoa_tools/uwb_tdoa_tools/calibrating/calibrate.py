@@ -21,6 +21,7 @@ from ..diagnosis.self_calibration.equations import measured_noise, slow_innovati
 from ..diagnosis.self_calibration.solve import LEFT
 from ..estimate import FlightEstimator
 from ..scoring.evaluation import score_of
+from ..scoring.gains import change_of
 from ..surveying.report import as_text
 from .parts import split
 
@@ -60,8 +61,8 @@ class Calibration:
 
     def as_text(self) -> str:
         """What it is worth, in a line."""
-        ratio = self.after / self.before if self.before else np.nan
-        return f"{self.measure} {100 * self.before:.1f} -> {100 * self.after:.1f} cm ({ratio - 1.0:+.0%}) on {self.judged_on}"
+        change = f" (it {change_of(self.before, self.after)})" if self.before else ""
+        return f"{self.measure} {100 * self.before:.1f} -> {100 * self.after:.1f} cm{change} on {self.judged_on}"
 
 
 def stopping(recording: Recording, findings: Iterable[Finding], std: float) -> list[Finding]:

@@ -12,7 +12,7 @@ from uwb_tdoa_ekf.debias import INTERPOLATORS, BiasMap
 from .. import cli, options, parallel
 from ..outputs import OutputFile
 from ..debiasing import report
-from ..debiasing.evaluation import PositionEstimator
+from ..debiasing.evaluation import PositionEstimator, of_its_anchors
 from ..debiasing.mapping import cross_validated, fit_map
 
 if TYPE_CHECKING:
@@ -26,7 +26,8 @@ take it out.
   fit       make a map from flights with ground truth, or from places where a tag stood still
   judge     errors of flights before and after a map
 
-A map belongs to one room, one anchor constellation and one estimator. debias_node applies it on line."""
+A map belongs to one room, one anchor constellation and one estimator: other anchors are refused. A map that does harm to
+flights that took no part is not written. Exit code 1: harm. debias_node applies a map on line."""
 
 
 def parser() -> ArgumentParser:
@@ -35,7 +36,7 @@ def parser() -> ArgumentParser:
         "debias",
         DESCRIPTION,
         "debias fit 0425-traj1 0425-traj2 --survey anchor_0425.txt --holdout 0425-traj3 --out map.npz",
-        "debias fit --static points.csv --planar --step 0.5 --interpolator network --out map.npz",
+        "debias fit --static points.csv --survey anchors.yaml --planar --step 0.5 --interpolator network --out map.npz",
         "debias judge map.npz 0426-traj1 --survey surveys/ --json errors.json",
     )
     commands = made.add_subparsers(dest="command", required=True, metavar="COMMAND")
@@ -61,7 +62,7 @@ def parser() -> ArgumentParser:
     return made
 
 
-def _fit(args: Namespace) -> None:
+def _fit(args: Namespace) -> int:
     if not (args.flights or args.static):
         raise InputError("FLIGHT: there is none; give flights with ground truth, or --static points.")
     if not 0.01 <= args.step <= 10.0:
@@ -74,29 +75,45 @@ def _fit(args: Namespace) -> None:
     shrinkage = cross_validated(fitted, args.static, estimator, **settings)
     made = fit_map(fitted, args.static, estimator, **settings)
     made = made.scaled(shrinkage.share) if shrinkage else made
-    made.save(args.out)
-    cli.show(f"wrote {args.out}: {report.about(made)}")
+    cli.show(report.about(made))
     cli.show(shrinkage.as_text() if shrinkage else "how much of it flights to come bear out is not known: give several flights")
     figures: dict[str, Any] = {"map": report.about_figures(made), "fitted": report.rows(fitted, made, estimator.effects)}
     figures["borne_out"] = shrinkage.as_dict() if shrinkage else None
     report.say_rows("in sample", figures["fitted"])
+    refusals = []
+    if shrinkage and not shrinkage.gains.mean() >= report.WORTH:
+        refusals.append(report.verdict(float(shrinkage.gains.mean()), "flights left out"))
     if held:
         figures["held out"] = _judged(args, estimator, held, made)
         report.say_rows("held out", figures["held out"])
+        gained = report.gain_of(figures["held out"])
+        cli.show(report.verdict(gained, "flights held out"))
+        refusals += [report.verdict(gained, "flights held out")] * report.does_harm(gained)
+    figures["written"] = not refusals
     _write(args.json, figures)
+    if refusals:
+        cli.show(f"{args.out} is not written: {refusals[0]}")
+        return 1
+    made.save(args.out)
+    cli.show(f"wrote {args.out}")
+    return 0
 
 
-def _judge(args: Namespace) -> None:
+def _judge(args: Namespace) -> int:
     estimator, made = PositionEstimator(options.reading_of(args), *options.filter_of(args), args.align), BiasMap.load(args.map)
     rows = _judged(args, estimator, estimator.reading.find(args.flights, bool(args.dask)), made)
     report.say_rows("flight", rows)
-    _write(args.json, {"map": report.about_figures(made), "runs": rows})
+    gained = report.gain_of(rows)
+    cli.show(report.verdict(gained, "these flights"))
+    _write(args.json, {"map": report.about_figures(made), "runs": rows, "gain": gained})
+    return int(report.does_harm(gained))
 
 
 def _judged(
     args: Namespace, estimator: PositionEstimator, recordings: Sequence[Recording], made: BiasMap
 ) -> list[dict[str, Any]]:
-    return report.rows(parallel.over(estimator, recordings, args.jobs, args.dask), made, estimator.effects)
+    flown = parallel.over(estimator, recordings, args.jobs, args.dask)
+    return report.rows(of_its_anchors(flown, made), made, estimator.effects)
 
 
 def _write(path: str | Path | None, figures: dict[str, Any]) -> None:

@@ -8,21 +8,26 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_ekf.core.config import FilterConfig
 
 from .. import cli, parallel
 from ..outputs import OutputFile, OutputFolder
-from ..planning import options, report, run
+from ..planning import options, run
 from ..planning.goal import OBJECTIVES
-from ..planning.maps import FLYABLE, chart
+from ..planning.judging import ACCURACY, CRITERIA
 from ..planning.noise import RadioNoise
 from ..planning.pairing import OF_PROTOCOL, PAIRINGS
-from ..progress import Progress
 from ..readers import inputs, read_survey
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
+
+
+ROUND = (
+    "what a round holds: N TDOAs in a ring (tdoa2), TDOAs between any two of N anchors, each with an error of its own and all together "
+    "weighted like N (tdoa3), N two-way ranges, or both (default: tdoa2)"
+)
 
 
 def parser() -> ArgumentParser:
@@ -38,12 +43,14 @@ def parser() -> ArgumentParser:
         "plan survey.txt --volume --with height --flights flights/0425 --out plan/",
         "plan survey.txt --volume --improve add --out plan/",
         "plan survey.txt --volume --protocol tdoa2+ranges --noise 0.1 --out plan/",
+        "plan --hall --room 0 120 0 60 0 8 --height 1.2 --radio-reach 25 --accuracy 0.5 --share 0.95 --out plan/",
         "plan hall.yaml --radio-reach 18 --height 1.2 --walls walls.yaml --out plan/",
     )
     number: dict[str, Any] = {"type": float}
     path: dict[str, Any] = {"type": Path}
     add, default = made.add_argument, "(default: %(default)s)"
-    add("anchors", metavar="ANCHORS", help="anchors .yaml or survey (.txt, .csv)")
+    add("anchors", metavar="ANCHORS", nargs="?", help="anchors .yaml or survey (.txt, .csv)")
+    add("--hall", action="store_true", help="without ANCHORS: how many a hall needs, and where; needs --room X0 X1 Y0 Y1 Z0 Z1")
     add("--out", metavar="DIR", type=OutputFolder, required=True, help="where to write; replaces what an earlier plan left there")
     add("--json", metavar="FILE", type=OutputFile, help="write the figures here too")
     add("--publish", action="store_true", help="publish the maps on ROS topics plan/... until Ctrl-C")
@@ -57,7 +64,7 @@ def parser() -> ArgumentParser:
     add("--planar", action="store_true", help="the height of the tag is known: x and y only")
 
     add, radio = made.add_argument_group("measurements").add_argument, RadioNoise
-    add("--protocol", choices=OF_PROTOCOL, default="tdoa2", help="TDOAs, ranges (two-way), or both, that a round holds (default: tdoa2)")
+    add("--protocol", choices=OF_PROTOCOL, default="tdoa2", help=ROUND)
     add("--covariance", choices=PAIRINGS, help="what a round holds, and what its TDOAs share (default: as --protocol says)")
     add("--antenna", metavar="FILE", help="pattern, YAML: azimuth, elevation_1, elevation_2, gain_offset, in dBi")
     add("--tx-power", metavar="DBM", **number, default=radio.tx_power_dbm, help=f"at 25 C, 3.3 V {default}")
@@ -68,9 +75,11 @@ def parser() -> ArgumentParser:
     add("--with", dest="aids", action="append", default=[], choices=["height"], help="what the tag measures besides: a range finder that looks down")
     height_std = FilterConfig().height_std  # type: ignore[attr-defined]  # parameters of SENSORS are known at run time
     add("--height-std", metavar="M", **number, default=height_std, help=f"of that height {default}")
-    unique = "one solution by every pairing alone or by a whole round (default: pairings; with --radio-reach or ranges: round)"
-    add("--flyable", choices=FLYABLE, help=unique)
-    add("--radio-reach", metavar="M", **number, help="a hall: the tag hears the anchors within that, not all; many more anchors are possible")
+    add("--accuracy", metavar="M", **number, default=ACCURACY, help=f"where the bound of one round is larger, a place cannot be flown {default}")
+    add("--share", metavar="S", **number, default=0.95, help=f"of the room that is to be flown, with --hall {default}")
+    add("--flyable", choices=CRITERIA, default="round", help="one solution by a whole round, or by every choice of anchors alone (default: round)")
+    reach = "a hall: the tag hears the anchors within that, not all; must be given where the room is larger than 30 m"
+    add("--radio-reach", metavar="M", **number, help=reach)
     add("--walls", metavar="FILE", **path, help="with --radio-reach: no signal comes through these, YAML, walls: [[x0, y0, x1, y1], ...]")
 
     more = made.add_argument_group("more")
@@ -87,46 +96,22 @@ def parser() -> ArgumentParser:
     return made
 
 
-def _plan(args: Namespace) -> None:
-    anchors = read_survey(args.anchors)
-    if args.walls is not None and args.radio_reach is None:
-        raise InputError("walls: are for a hall of which a tag hears a part; give --radio-reach too.")
-    installation = options.installation_of(args, anchors)
-    args.flyable = options.criterion_of(args, installation)
+def _plan(args: Namespace) -> int:
+    options.check(args)
+    anchors = None if args.hall else read_survey(args.anchors)
     room = options.room_for(args, anchors)
+    reach = options.reach_of(args, room)
+    installation = options.installation_of(args, Anchors.from_positions([room.centre] * 2) if anchors is None else anchors)
+    demand = options.demand_of(args, installation, room)
     grid = options.grid_of(args, room)
-    if args.flights and args.planar:
-        raise InputError("flights: are judged in three dimensions; leave out --planar.")
     reading = inputs.Reading(args.anchors)
     recordings = reading.find(args.flights or [], bool(args.dask))
-    if args.radio_reach is not None:
-        return run.end(args, *run.plan_hall(args, anchors, installation, room, grid))
-    aim = options.aim_of(args, installation, room, grid.axes[2][0]) if args.improve else None
-
-    if not np.isfinite(anchors.orientations).all():
-        cli.show("anchors without orientation are taken to radiate alike in all directions")
-    report.say_room(room, args.room is not None)
-    args.out.mkdir(parents=True, exist_ok=True)
-    with Progress("plan") as progress:
-        progress("mapping")
-        found = chart(installation, grid, args.flyable)
-    figures: dict[str, Any] = {"anchors": len(anchors), "arguments": options.plain(args), "map": report.summary(found)}
-    report.say_summary(figures["map"])
-    installed, places = options.goal_of(args, installation).installed, options.places_of(args, room)
-    figures["addition"] = run.addition(found, anchors, installed, places, args.flyable)
-    report.say_flyable(figures["map"], figures["addition"], args.flyable)
-    outgoing = run.draw_map(found, installation, args.out)
-    if args.check:
-        figures["check"] = run.check(installation, grid, args.out)
-        report.say_check(figures["check"])
-    if recordings:
-        flown = parallel.over(run.Fly(reading, tuple(args.aids)), recordings, args.jobs, args.dask)
-        figures["flights"] = run.evaluate_flights(flown, installation, room, args.step or 0.4, args.out)
-        report.say_flights(figures["flights"])
-    if aim:
-        figures["improve"] = run.improve(found, aim, args.improve, args.starts, args.flyable, args.out)
-        report.say_improvement(figures["improve"])
-    run.end(args, figures, outgoing)
+    if anchors is None or reach < np.inf:
+        figures, outgoing, good = run.plan_hall(args, anchors, installation, demand, grid)
+        run.end(args, figures, outgoing)
+        return 0 if good else 1
+    run.end(args, *run.plan_room(args, anchors, installation, demand, grid, reading, recordings))
+    return 0
 
 
 main = cli.executable(_plan, parser)

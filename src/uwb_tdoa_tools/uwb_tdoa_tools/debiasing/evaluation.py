@@ -18,6 +18,7 @@ from ..scoring.metrics import Score
 from ..scoring.settling import with_settled_truth
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator
     from pathlib import Path
     from uwb_tdoa_ekf.debias import BiasMap
 
@@ -62,6 +63,16 @@ class PositionEstimator:
 
     def __call__(self, recording: tuple[Path, str | Path | None]) -> Scored:
         return fly(self.reading.read(recording), self.config, self.effects, self.align)
+
+
+def of_its_anchors(flown: Iterable[Scored], bias_map: BiasMap) -> Iterator[Scored]:
+    """Yield what `fly` gave; raises InputError for a flight among other anchors than those of a BiasMap."""
+    for one in flown:
+        if not bias_map.belongs_to(one[0].anchors):
+            raise InputError(
+                f"{one[0].name}: its anchors are not those that the map was made for, and elsewhere it does harm; make one for them with debias fit."
+            )
+        yield one
 
 
 def evaluate_map(flown: Scored, bias_map: BiasMap, effects: EffectSet | None = None) -> Score:

@@ -8,12 +8,14 @@ from typing import Any, TYPE_CHECKING
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.debias import fit
 
+from ..readers import read_survey
 from ..scoring.shrinkage import SHARES, Shrinkage, best_share
 from .evaluation import evaluate_map
-from .parts import LEAST, part_of, static_parts
+from .parts import LEAST, is_table, part_of, static_parts
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
+    from uwb_tdoa_bias.foundation.anchors import Anchors
     from uwb_tdoa_ekf.debias import BiasMap
     from .evaluation import PositionEstimator, Scored
 
@@ -31,13 +33,26 @@ def fit_map(
     parts = [part for path in static for part in static_parts(path, estimator, planar)]
     flown = list(flown)
     parts += [part_of(score, odometry) for _, score, odometry in flown]
-    frames = {flight.anchors.frame for flight, _, _ in flown} or {"map"}
-    if len(frames) > 1:
-        raise InputError(
-            f"FLIGHT: the flights are in different frames, {', '.join(sorted(frames))}; map them one by one."
-        )
+    anchors = _anchors([flight.anchors for flight, _, _ in flown], static, estimator)
     source = ", ".join([flight.name for flight, _, _ in flown] + [Path(path).name for path in static])
-    return fit(parts, step, LEAST if flown else 1, planar, interpolator, frames.pop(), source)
+    return fit(parts, step, LEAST if flown else 1, planar, interpolator, anchors, source)
+
+
+def _anchors(of_flights: Sequence[Anchors], static: Sequence[str | Path], estimator: PositionEstimator) -> Anchors:
+    """The Anchors of all flights and recordings. Raises InputError where they differ, or a table comes without."""
+    found = list(of_flights)
+    found += [estimator.reading.one(path).anchors for path in static if not is_table(path)]
+    if not found:
+        survey = estimator.reading.survey
+        if survey is None or Path(survey).is_dir():
+            raise InputError(
+                f"--survey: {', '.join(map(str, static))} holds no anchors, and a map holds for one constellation; give the file of their survey."
+            )
+        found = [read_survey(survey)]
+    first = found[0]
+    if not all(other.stand_at(first.ids, first.positions, first.frame) for other in found):
+        raise InputError("FLIGHT: the flights are of different anchors or frames, and a map holds for one constellation; map them one by one.")
+    return first
 
 
 def cross_validated(

@@ -42,7 +42,7 @@ def static_parts(path: str | Path, estimator: PositionEstimator = PositionEstima
         measured position; or any recording with ground truth, through which the filter is run, and of which the time at
         rest counts, but for the first SETTLE s at each place. Raises InputError.
     """
-    if not Path(path).is_dir() and b"true_x" in read_head(path, 1000):
+    if is_table(path):
         return _from_table(path, planar)
     flight = estimator.reading.one(path)
     if flight.truth is None:
@@ -57,6 +57,11 @@ def static_parts(path: str | Path, estimator: PositionEstimator = PositionEstima
     if not stays:
         raise InputError(f"{path}: the tag never stands still for long enough; give it as a flight, not with --static.")
     return [Part(odometry.p[rows], true[rows], odometry.covariance[rows, :3, :3]) for rows in stays]
+
+
+def is_table(path: str | Path) -> bool:
+    """Whether a file is a CSV of positions, not a recording."""
+    return not Path(path).is_dir() and b"true_x" in read_head(path, 1000)
 
 
 def _from_table(path: str | Path, planar: bool) -> list[Part]:

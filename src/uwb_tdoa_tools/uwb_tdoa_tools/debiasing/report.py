@@ -6,6 +6,7 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
+from ..scoring.gains import by, change_of, gain
 from .evaluation import evaluate_map
 
 if TYPE_CHECKING:
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_ekf.debias import BiasMap
     from .evaluation import Scored
 
+WORTH = 0.01  # of the 3D RMSE: less is neither gain nor harm
 _RUN = ("rmse_x", "rmse_y", "rmse_z", "rmse_3d", "max_3d", "nees_mean")
 
 
@@ -36,6 +38,7 @@ def about_figures(bias_map: BiasMap) -> dict[str, Any]:
         "interpolator": bias_map.interpolator,
         "planar": bias_map.planar,
         "frame": bias_map.frame,
+        "anchors": bias_map.ids.tolist(),
         "source": bias_map.source,
         "bias_rms": float(np.sqrt(np.mean(np.sum(bias_map.bias**2, axis=1)))),
         "added_std": np.sqrt(np.diag(bias_map.added)).tolist(),
@@ -65,7 +68,24 @@ def say_rows(title: str, found: Sequence[Mapping[str, Any]]) -> None:
             f"{row['flight']:24s}" + "".join(_side(row[side]) for side in ("before", "after")) + f"{row['known']:8.0%}"
         )
     before, after = (np.mean([row[side]["rmse_3d"] for row in found]) for side in ("before", "after"))
-    print(f"mean 3D RMSE {before:.3f} m before, {after:.3f} m after ({after / before - 1:+.0%})")
+    print(f"mean 3D RMSE {before:.3f} m before, {after:.3f} m after: it {change_of(before, after)}")
+
+
+def gain_of(found: Sequence[Mapping[str, Any]]) -> float:
+    """The `gain` of rows, of their mean 3D RMSE."""
+    return gain(*(float(np.mean([row[side]["rmse_3d"] for row in found])) for side in ("before", "after")))
+
+
+def verdict(gained: float, on: str) -> str:
+    """One sentence on a `gain`. on : what it was judged on."""
+    if does_harm(gained):
+        return f"harm: the 3D RMSE {by(gained)} on {on}; do not use this map there"
+    return f"{'better' if gained >= WORTH else 'no gain'}: the 3D RMSE {by(gained)} on {on}"
+
+
+def does_harm(gained: float) -> bool:
+    """Whether a `gain` is a loss, or no number."""
+    return not gained > -WORTH
 
 
 def _side(figures: Mapping[str, float]) -> str:

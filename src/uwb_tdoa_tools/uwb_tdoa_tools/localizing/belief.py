@@ -17,7 +17,7 @@ from uwb_tdoa_ekf.streams import ERROR
 
 from ..checking.check import check
 from ..checking.recording import of_flight
-from ..scoring.metrics import LOST
+from ..scoring.metrics import LOST, nis, reached
 from . import residuals
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ class Belief:
             return [f"{self.level}: there is no estimate", *self.reasons, *self.remedies]
         spread = ", ".join(f"{axis} {100 * figures[f'std_{axis}']:.0f}" for axis in "xyz")
         within = f"standard deviation {100 * figures['std']:.0f} cm ({spread}): the position is within {100 * figures['within']:.0f} cm for 95 % of the time"
-        fits = f"{figures['explained']:.1%} of {_counted(figures)} fit it within three standard deviations (NIS {figures['nis']:.2f}, 1 or less is sound)"
+        fits = f"{figures['explained']:.1%} of {_counted(figures)} fit it within three standard deviations (NIS {figures['nis']:.2f}: with outliers in full, 1 if there were none)"
         off = figures.get("range_offset")
         offset = [] if off is None or abs(off) < OFFSET else [f"all ranges are {100 * abs(off):.0f} cm too {'long' if off > 0.0 else 'short'}: that was found, and taken out"]
         return [f"{self.level}: {within}; {fits}", *offset, *self.reasons, *self.remedies]
@@ -60,7 +60,7 @@ class Belief:
 def believe(flight: Flight, run: Run, corrected: bool = False) -> Belief:
     """Belief in a Run over a Flight, whose ground truth is not used. corrected : by effects that somebody calibrated."""
     odometry, left = run.odometry, residuals.of_run(flight, run)
-    there = residuals.reached(left)
+    there = reached(left)
     figures = {"seconds": _length(left), "estimates": len(odometry), "tdoas": len(flight.tdoa), "recoveries": run.recoveries}
     if ranges := len(left) - len(flight.tdoa):
         figures["ranges"] = ranges
@@ -73,9 +73,8 @@ def believe(flight: Flight, run: Run, corrected: bool = False) -> Belief:
         reasons.append(f"the filter found no place that explains the {_measured(figures)}")
         return Belief(BAD, figures, [], tuple(reasons), tuple(remedies))
     figures |= _deviation(odometry)
-    normalised = (left.innovation**2 / left.variance)[there]
     figures["explained"] = float(residuals.explained(left)[there].mean())
-    figures["nis"] = float(np.mean(np.minimum(normalised, 9.0)))
+    figures["nis"] = float(nis(left).mean())
     lost = lost_spans(left.t, odometry)
     figures["lost"] = float(sum(end - begin for begin, end in lost))
     worse = BAD if faults or figures["lost"] > 0.5 * figures["seconds"] else GOOD

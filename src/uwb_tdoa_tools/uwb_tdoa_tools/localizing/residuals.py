@@ -11,8 +11,9 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.files import write_filled, write_text
 from uwb_tdoa_bias.foundation.sensors import LOCATING
-from uwb_tdoa_ekf.core.verdicts import COMPENSATED, REJECTED, USED
 from uwb_tdoa_ekf.results import VERDICTS, Residuals, concatenated
+
+from ..scoring.metrics import reached
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.flight import Flight
@@ -56,11 +57,6 @@ def of_run(flight: Flight, run: Run) -> Residuals:
             stream = getattr(flight, name)
             parts.append(Residuals.from_rows(stream.t, stream.anchor, stream.anchor, run.aids[name]))
     return concatenated(parts)
-
-
-def reached(residuals: Residuals) -> np.ndarray:
-    """Which TDOAs had a residual in the filter: (n,) bool."""
-    return np.isin(residuals.verdict, (USED, REJECTED, COMPENSATED))
 
 
 def explained(residuals: Residuals) -> np.ndarray:

@@ -24,16 +24,12 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.geometry import ranges
 
 from .installation import principal_extents
-from .precision import weigh
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.anchors import Anchors
-    from .installation import Installation
 
 FLAT_SUBSET = 0.05  # thickness over length; anchors so close to a line (plane) mirror every position in it
 MOST_SUBSETS = 2000
-FLIP = 0.5  # m; a mirrored position nearer than this is no failure, but imprecision
-CLEAR = 4.65  # standard deviations apart: at most 1 % of the estimates flip
 _CHUNK = 500_000  # numbers in the largest array of one step
 
 
@@ -115,32 +111,6 @@ class Subsets:
         squared = np.einsum("mk,mk->m", p, p) + np.einsum("mk,mk->m", away[:, k:], away[:, k:])
         other = squared / ((np.einsum("mk,mk->m", q, q) - 1.0) * np.maximum(r, 1e-12))
         return row, subset, np.hstack([reference[:, :k] + p + q * other[:, None], points[row, k:]])
-
-    def unique(self, points: np.ndarray, installation: Installation, criterion: str, ambiguous: np.ndarray | None = None) -> np.ndarray:
-        """(n,) bool: whether a tag at points (n, 3) m has one position, by a criterion of maps.FLYABLE. ambiguous : what `ambiguous` gives
-        there, if it is known."""
-        if criterion == "pairings":
-            return (self.ambiguous(points) if ambiguous is None else ambiguous) == 0.0
-        return self.separation(points, installation) > CLEAR
-
-    def separation(self, points: np.ndarray, installation: Installation) -> np.ndarray:
-        """How clearly a whole round tells each point from its nearest mirrored position: (n,) standard deviations.
-
-        inf where no pairing has one farther than FLIP. An estimator that weighs all TDOAs takes a mirrored position for
-        the right one with probability Phi(-separation / 2).
-        """
-        clear = np.full(len(points), np.inf)
-        variance = installation.noise.variance(points, self.anchors)
-        at = 0
-        for chunk in np.array_split(points, max(1, len(points) * len(self.rows) // _CHUNK)):
-            row, _, mirror = self.mirrors(chunk)
-            far = np.linalg.norm(mirror - chunk[row], axis=1) > FLIP
-            row, mirror = row[far], mirror[far]
-            change = _distances(mirror, self.anchors.positions) - _distances(chunk[row], self.anchors.positions)
-            misfit = weigh(change[..., None], variance[at + row], installation.pairing, installation.link_std)[:, 0, 0]
-            np.minimum.at(clear, at + row, np.sqrt(misfit))
-            at += len(chunk)
-        return clear
 
 
 def _distances(points: np.ndarray, anchors: np.ndarray) -> np.ndarray:

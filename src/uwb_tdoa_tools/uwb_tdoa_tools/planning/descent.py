@@ -77,7 +77,7 @@ def failing_and_slopes(goal: Goal, layout: Layout, x: np.ndarray, points: np.nda
     except QhullError as error:
         raise InputError("anchors: they span no hull; take some of them out of the plane of the others.") from error
     more: np.ndarray | float
-    if goal.criterion == "pairings":
+    if goal.demand.criterion == "pairings":
         subsets = Subsets(anchors, goal.installation.unknowns)
         excess = subsets.discriminant(points) / SOFT
         single = expit(-excess).prod(axis=1)

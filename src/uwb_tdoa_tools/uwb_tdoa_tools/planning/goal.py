@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
-from .bifurcation import Subsets
+from .judging import Demand, judge
 from .pairing import PAIRINGS
 from .precision import bound, information, position_error
 
@@ -27,18 +27,18 @@ class Goal:
 
     points : (n, 3) m, where the tag is to be located; installation : what is not the anchors; pairing : name of
     PAIRINGS
-    objective : "worst" or "mean" bound over the points; criterion : of maps.FLYABLE, what counts as failure
+    objective : "worst" or "mean" bound over the points; demand : Demand, what counts as failure
     """
 
     points: np.ndarray
     installation: Installation
     pairing: str = "ring"
     objective: str = "worst"
-    criterion: str = "pairings"
+    demand: Demand = field(default_factory=Demand)
 
-    def installed(self, anchors: Anchors) -> Installation:
-        """The Installation with other Anchors. Raises InputError for anchors that locate nothing."""
-        return replace(self.installation, anchors=anchors, pairing=PAIRINGS[self.pairing](len(anchors)))
+    def installed(self, anchors: Anchors, heard: int | None = None) -> Installation:
+        """The Installation with other Anchors, of which so many are heard in a hall. Raises InputError for anchors that locate nothing."""
+        return replace(self.installation, anchors=anchors, pairing=PAIRINGS[self.pairing](heard or len(anchors)))
 
     def errors(self, anchors: Anchors) -> np.ndarray:
         """Bound at the points, without the small second term of eq. 1: (n,) m. Raises InputError for useless
@@ -48,9 +48,8 @@ class Goal:
 
     def figures(self, anchors: Anchors) -> dict[str, float]:
         """{"worst", "mean": m, bound over the points; "failing": share of the points that are not flyable}."""
-        errors, installation = self.errors(anchors), self.installed(anchors)
-        unique = Subsets(anchors, installation.unknowns).unique(self.points, installation, self.criterion)
-        failing = 1.0 - np.mean(unique & installation.inside_hull(self.points))
+        errors = self.errors(anchors)
+        failing = 1.0 - np.mean(judge(self.points, self.installed(anchors), self.demand).flyable)
         return {"worst": float(errors.max()), "mean": float(errors.mean()), "failing": float(failing)}
 
     def score(self, anchors: Anchors) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -34,6 +34,7 @@ class Installation:
     link_std : m, error that every TDOA has of its own, besides those of the tag's receptions (default 0)
     dimensions : 3, or 2 for a tag whose height is known
     height_std : m, of a height sensor on the tag beside every round of TDOAs; inf for none (default)
+    hall : each place hears a part of the anchors, which may be few, or in a plane; `pairing` is then of those (default False)
     """
 
     anchors: Anchors
@@ -42,6 +43,7 @@ class Installation:
     link_std: float = 0.0
     dimensions: int = 3
     height_std: float = np.inf
+    hall: bool = False
 
     def __post_init__(self) -> None:
         if not self.height_std > 0.0 or (self.dimensions == 2 and self.height_std < np.inf):
@@ -49,11 +51,16 @@ class Installation:
                 f"height std: {self.height_std!r} m is not the standard deviation of a height sensor; give one above 0, "
                 "e.g. 0.02, and none for a tag of known height."
             )
-        check_anchors(self.anchors, self.unknowns)
+        if not self.hall:
+            check_anchors(self.anchors, self.unknowns)
         if self.pairing is None:
             object.__setattr__(self, "pairing", ring(len(self.anchors)))
         if not 0.0 <= self.link_std < 100.0:
             raise InputError(f"link noise: {self.link_std!r} m is not a standard deviation; give 0 or more, e.g. 0.05.")
+
+    def of(self, anchors: Anchors) -> Installation:
+        """The same with other Anchors, of which each place hears a part."""
+        return replace(self, anchors=anchors, hall=True)
 
     @property
     def unknowns(self) -> int:

@@ -10,20 +10,16 @@ import numpy as np
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flyable import FlyableVolume
 
-from .bifurcation import Subsets
-from .precision import bound, dilution, information, position_error
+from .judging import Judged, judge
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from numpy.typing import ArrayLike
     from uwb_tdoa_bias.foundation.anchors import Anchors
     from .installation import Installation
+    from .judging import Demand
 
 MOST_CELLS = 4_000_000
-FLYABLE = {  # criteria for what is flyable inside the hull
-    "pairings": "every pairing of k + 1 anchors alone has one solution (Grasso et al., sec. 2.3.2)",
-    "round": "all TDOAs of a round together tell the tag from every mirrored position",
-}
 
 
 @dataclass(frozen=True)
@@ -72,24 +68,11 @@ class Grid:
 
 
 @dataclass(frozen=True)
-class Chart:
-    """What is true at every cell of a grid. n is the number of cells, k the dimensions of the installation.
-
-    grid : Grid
-    covariance : (n, k, k) m^2, the Cramer-Rao bound of one round of TDOAs
-    error : (n,) m, root of its trace; dop : (n,), position dilution of precision
-    hull : (n,) inside the anchors' convex hull
-    ambiguous : (n,) share of the pairings, each of one anchor more than TDOAs must determine coordinates, with two solutions
-    flyable : (n,) inside the hull and with one solution, by the criterion that was asked for
-    """
+class Chart(Judged):
+    """What is true at every cell of a grid: Judged of n cells, k the dimensions of the installation. grid : Grid; heard : (n,) anchors."""
 
     grid: Grid
-    covariance: np.ndarray
-    error: np.ndarray
-    dop: np.ndarray
-    hull: np.ndarray
-    ambiguous: np.ndarray
-    flyable: np.ndarray
+    heard: np.ndarray
 
     @property
     def std(self) -> np.ndarray:
@@ -110,18 +93,8 @@ class Chart:
         )
 
 
-def chart(installation: Installation, grid: Grid, criterion: str = "pairings") -> Chart:
-    """Chart of an Installation over a Grid. criterion : of FLYABLE."""
+def chart(installation: Installation, grid: Grid, demand: Demand) -> Chart:
+    """Chart of an Installation all of whose anchors are heard, over a Grid."""
     points = grid.points
-    covariance = bound(information(points, installation))
-    dop = np.linalg.norm(dilution(points, installation), axis=1)
-    return Chart(grid, covariance, position_error(covariance), dop, *flyable(installation, points, criterion))
-
-
-def flyable(
-    installation: Installation, points: np.ndarray, criterion: str
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """hull, ambiguous, flyable of a Chart, (n,) each, at points (n, 3) m."""
-    subsets = Subsets(installation.anchors, installation.unknowns)
-    hull, ambiguous = installation.inside_hull(points), subsets.ambiguous(points)
-    return hull, ambiguous, hull & subsets.unique(points, installation, criterion, ambiguous)
+    found = judge(points, installation, demand)
+    return Chart(found.covariance, found.error, found.status, grid, np.full(len(points), len(installation.anchors)))

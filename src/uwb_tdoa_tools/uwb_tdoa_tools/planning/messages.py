@@ -11,6 +11,7 @@ from ..bags.bag import LATCHED_QOS
 from ..bags.files import new_bag
 from ..bags.messages import anchors_message, header_of, pose_of
 from ..bags.message_types import typestore
+from .judging import FLYABLE, IMPRECISE, OUTSIDE, TOO_FEW, TWO_SOLUTIONS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -25,19 +26,20 @@ TOPICS = {
     "plan/markers": "visualization_msgs/msg/MarkerArray",
     "uwb/anchors": "uwb_tdoa_msgs/msg/AnchorArray",
 }
+OCCUPIED = {FLYABLE: 0, TWO_SOLUTIONS: 50, IMPRECISE: 75, TOO_FEW: 100, OUTSIDE: 100}
 _CUBES, _SPHERES, _TEXT = 6, 7, 9  # visualization_msgs/msg/Marker
 
 
 def messages(chart: Chart, anchors: Anchors, stamp: int = 0) -> dict[str, Any]:
     """{topic: rosbags message} of TOPICS. stamp : ns.
 
-    plan/flyable : one slice (the middle layer), 0 flyable, 50 ambiguous inside the hull, 100 outside
+    plan/flyable : one slice (the middle layer), values of OCCUPIED
     plan/precision : the same slice, the bound (root of its trace) in cm, at most 100; -1 where there is none
     plan/markers : the surface of the flyable cells, coloured from green (best bound) to red (worst), and the anchors
     """
     store = typestore()
     k = chart.grid.shape[2] // 2
-    status = np.where(chart.flyable, 0, np.where(chart.hull, 50, 100))
+    status = np.array([OCCUPIED[one] for one in range(len(OCCUPIED))])[chart.status]
     cm = np.where(np.isfinite(chart.error), np.minimum(np.rint(100.0 * np.minimum(chart.error, 1e3)), 100), -1)
     return {
         "plan/flyable": _occupancy(store, chart.grid, status, k, anchors.frame, stamp),

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from .check import Wrap
     from .goal import Goal
 
+BESIDE = 1.0  # m; no anchor is proposed nearer to another
 SEED = 0  # of the starts, and of the points at which they are judged
 ROUGH = 80  # points that the starts are judged at
 DRAWN = 16  # layouts drawn for every start; the best are taken
@@ -53,17 +54,21 @@ def optimise(
     ends = [descend(goal, layout, looked_at.points, x, SWEEPS) for x in progress(begin)]
     ends.sort(key=lambda x: goal.score(layout.anchors(x)))
     ends = [_refined(goal, layout, x, rows) for x in ends[:FINALISTS]]
-    best = min((layout.anchors(x) for x in ends), key=goal.score)
+    found = [layout.anchors(x) for x in ends]
+    best = min([each for each in found if not _beside(each, count)] or found, key=goal.score)
     if goal.score(best) >= UNUSABLE:
         raise InputError("places: no layout of these anchors locates a tag; allow more places.")
     return best
 
 
 def one_more(goal: Goal, anchors: Anchors, places: AnchorPlaces, count: int = 400) -> tuple[np.ndarray, np.ndarray]:
-    """What one more anchor would give at places all over: (positions (n, 3) m, scores (n,) m), facing the points."""
+    """What one more anchor would give at places all over that are not beside another: (numbers (n, places.numbers), scores (n,) m), facing
+    the points."""
     layout = Layout(places, 1, anchors, goal.points.mean(axis=0), are_turned(anchors))
     numbers = places.grid(count)
-    return places.positions(numbers), np.array([goal.score(layout.anchors(layout.start(x))) for x in numbers])
+    away = np.linalg.norm(places.positions(numbers)[:, None] - anchors.positions, axis=2).min(axis=1)
+    numbers = numbers[away >= BESIDE]
+    return numbers, np.array([goal.score(layout.anchors(layout.start(x))) for x in numbers])
 
 
 def are_turned(anchors: Anchors) -> bool:
@@ -126,6 +131,12 @@ def _moved(better: Anchors, before: Anchors) -> np.ndarray:
     """Which of the Anchors are new, or more than a millimetre from where they are `before`: (n,) bool."""
     rows = before.index(better.ids)
     return (rows < 0) | (np.linalg.norm(better.positions - before.positions[rows], axis=1) > 1e-3)
+
+
+def _beside(anchors: Anchors, count: int) -> bool:
+    """Whether any of the last `count` Anchors is beside another."""
+    away = np.linalg.norm(anchors.positions[:, None] - anchors.positions, axis=2) + 2.0 * BESIDE * np.eye(len(anchors))
+    return bool((away[-count:] < BESIDE).any())
 
 
 def _some(goal: Goal, count: int) -> np.ndarray:

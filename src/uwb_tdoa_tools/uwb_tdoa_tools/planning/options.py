@@ -14,6 +14,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from ..simulation.room import Room, room_of
 from .installation import Installation
 from .goal import Goal
+from .judging import Demand
 from .maps import Grid
 from .noise import FixedNoise, RadioNoise, antenna_from_yaml
 from .pairing import OF_PROTOCOL, PAIRINGS
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from uwb_tdoa_bias.foundation.anchors import Anchors
 
+FARTHEST = 30.0  # m, size of a room from which on the radio's reach must be given
 ACROSS = {"slice": 100, "volume": 50}  # cells along the longest side, unless --step says otherwise
 SEARCHED = 300  # cells of the flown volume whose corners are looked at while better anchors are searched
 
@@ -39,10 +41,20 @@ class Aim:
     count: int
 
 
+def check(args: Namespace) -> None:
+    """Raise InputError for options that do not go together."""
+    if args.hall == (args.anchors is not None):
+        raise InputError("ANCHORS: give a file of the anchors that there are, or --hall where they are asked for.")
+    if not 0.0 < args.share <= 1.0:
+        raise InputError(f"share: {args.share:g} is none; give more than 0 and at most 1, e.g. 0.95.")
+    if args.walls is not None and args.radio_reach is None:
+        raise InputError("walls: are for a hall of which a tag hears a part; give --radio-reach too.")
+    if args.flights and args.planar:
+        raise InputError("flights: are judged in three dimensions; leave out --planar.")
+
+
 def installation_of(args: Namespace, anchors: Anchors) -> Installation:
-    """Installation of Anchors and the options. With --radio-reach that of the first few, as each place has its own. Raises InputError."""
-    if args.radio_reach is not None:
-        anchors = _some(anchors, 3 if args.planar or "height" in args.aids else 4)
+    """Installation of Anchors and the options; with a reach one of a hall, whose places hear a part of them. Raises InputError."""
     noise: RadioNoise | FixedNoise
     if args.noise is not None:
         noise = FixedNoise(args.noise)
@@ -52,31 +64,44 @@ def installation_of(args: Namespace, anchors: Anchors) -> Installation:
     # of a single anchor there is none, and Installation refuses it
     pairing: Any = PAIRINGS[_pairing(args)](len(anchors)) if len(anchors) > 1 else None
     height_std = args.height_std if "height" in args.aids else np.inf
-    return Installation(anchors, noise, pairing, args.link_noise, 2 if args.planar else 3, height_std)
+    return Installation(
+        anchors, noise, pairing, args.link_noise, 2 if args.planar else 3, height_std, args.hall or args.radio_reach is not None
+    )
 
 
-def criterion_of(args: Namespace, installation: Installation) -> str:
-    """Of FLYABLE, what is asked for. Raises InputError for what ranges do not tell."""
-    if installation.pairing.one_solution:
+def demand_of(args: Namespace, installation: Installation, room: Room) -> Demand:
+    """Demand of the options in a Room. Raises InputError for what ranges do not tell, or a hall does not have."""
+    if installation.pairing is not None and installation.pairing.one_solution:
         for name, asked in (("flyable", args.flyable == "pairings"), ("check", args.check)):
             if asked:
-                raise InputError(f"{name}: looks for a second solution of TDOAs, and ranges have none; leave it out, or plan for --protocol tdoa2.")
-        return "round"
-    return args.flyable or ("pairings" if args.radio_reach is None else "round")
+                raise InputError(
+                    f"{name}: looks for a second solution of TDOAs, and ranges have none; leave it out, or plan for --protocol tdoa2."
+                )
+    if installation.hall and args.flyable == "pairings":
+        raise InputError("flyable: pairings are of a room in which every anchor is heard; leave out --flyable, or --radio-reach.")
+    return Demand(room, args.accuracy, args.flyable)
 
 
-def _some(anchors: Anchors, count: int) -> Anchors:
-    """So many Anchors that are not in one plane, if there are."""
-    far = [0]
-    while len(far) < min(count, len(anchors)):
-        away = anchors.positions - anchors.positions[far[0]]
-        basis = np.linalg.qr(away[far[1:]].T)[0] if len(far) > 1 else np.zeros((3, 0))
-        far.append(int(np.argmax(np.linalg.norm(away - away @ basis @ basis.T, axis=1))))
-    return anchors.only(np.array(far))
+def reach_of(args: Namespace, room: Room) -> float:
+    """The radio's reach, m. Raises InputError where the Room is so large that it must be given."""
+    if args.radio_reach is not None:
+        if not args.radio_reach > 0.0:
+            raise InputError(f"radio reach: {args.radio_reach:g} m is none; give one above 0, e.g. 18.")
+        return float(args.radio_reach)
+    longest = (room.upper - room.lower).max()
+    if longest > FARTHEST:
+        raise InputError(
+            f"room: is {longest:.0f} m long, and a tag does not hear all of its anchors; give what your radios reach, e.g. --radio-reach 25."
+        )
+    return np.inf
 
 
-def room_for(args: Namespace, anchors: Anchors) -> Room:
-    """Room that --room gives, or that the anchors stand in. Raises InputError."""
+def room_for(args: Namespace, anchors: Anchors | None) -> Room:
+    """Room that --room gives, or that the anchors stand in, None where they are asked for. Raises InputError."""
+    if anchors is None:
+        if args.room is None or len(args.room) != 6:
+            raise InputError("room: --hall needs all of it, in metres; give --room X0 X1 Y0 Y1 Z0 Z1.")
+        return _box("room", args.room)
     room = room_of(anchors)
     if args.room is None:
         return room
@@ -97,26 +122,26 @@ def grid_of(args: Namespace, room: Room) -> Grid:
     return Grid.slice((room.lower[0], room.upper[0]), (room.lower[1], room.upper[1]), height, step)
 
 
-def aim_of(args: Namespace, installation: Installation, room: Room, height: float) -> Aim:
+def aim_of(args: Namespace, installation: Installation, demand: Demand, height: float) -> Aim:
     """Aim of --improve. height : m, of the flown slice if the tag's height is known. Raises InputError."""
     count = len(installation.anchors) if args.count is None else args.count
     for name, value, least in (("count", count, installation.unknowns + 1), ("starts", args.starts, 1)):
         if value < least:
             raise InputError(f"{name}: {value} is too few; give at least {least}.")
-    fly = _box("fly", args.fly) if args.fly else Room(*room.flyable)
+    fly = _box("fly", args.fly) if args.fly else Room(*demand.room.flyable)
     lower, upper, k = fly.lower.copy(), fly.upper.copy(), installation.dimensions
     lower[k:] = upper[k:] = height
     step = max(0.1, (np.prod((upper - lower)[:k]) / SEARCHED) ** (1.0 / k))
 
     def goal(step: float) -> Goal:
-        return Goal(lattice(lower, upper, step), installation, _pairing(args), args.objective, args.flyable)
+        return Goal(lattice(lower, upper, step), installation, _pairing(args), args.objective, demand)
 
-    return Aim(goal(step), goal(0.4 * step), places_of(args, room), count)
+    return Aim(goal(step), goal(0.4 * step), places_of(args, demand.room), count)
 
 
-def goal_of(args: Namespace, installation: Installation) -> Goal:
+def goal_of(args: Namespace, installation: Installation, demand: Demand) -> Goal:
     """Goal of no points, whose `installed` gives the Installation of other Anchors."""
-    return Goal(np.empty((0, 3)), installation, _pairing(args), criterion=args.flyable)
+    return Goal(np.empty((0, 3)), installation, _pairing(args), demand=demand)
 
 
 def places_of(args: Namespace, room: Room) -> AnchorPlaces:

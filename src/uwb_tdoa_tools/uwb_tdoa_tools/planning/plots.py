@@ -1,4 +1,4 @@
-"""Pictures of charts: precision, failure, accuracy, layouts."""
+"""Pictures of charts, each with one message, to be read at 700 pixels: precision, where it can be flown, accuracy, layouts."""
 
 from __future__ import annotations
 
@@ -7,16 +7,20 @@ from typing import Any, TYPE_CHECKING
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import EllipseCollection
-from matplotlib.colors import ListedColormap
+from matplotlib.colors import BoundaryNorm, ListedColormap
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Rectangle
 from PIL import Image
+from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.files import write_filled
 
-from ..scoring.labels import labels
+from ..scoring.labels import put_labels
 from ..scoring.plots import plt
 from .bifurcation import Subsets
-from .precision import NORMAL_99, ellipses
+from .judging import FLYABLE, IMPRECISE, OUTSIDE, TOO_FEW, TWO_SOLUTIONS
+from .precision import ellipses
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -24,57 +28,85 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from uwb_tdoa_bias.foundation.anchors import Anchors
+    from ..simulation.walls import Walls
     from .accuracy import AccuracyMap
     from .installation import Installation
     from .maps import Chart, Grid
+    from .places import AnchorPlaces
 
-HULL, ENVELOPE, FLYABLE = "magenta", "tab:green", "#ffe680"
+WIDTH, DPI = 7.0, 100  # inches, pixels an inch
+STATES = {  # of a cell: what it is called, and its colour
+    FLYABLE: ("can be flown", "#7fc97f"),
+    TWO_SOLUTIONS: ("two solutions", "#e34a33"),
+    IMPRECISE: ("imprecise", "#fdcc8a"),
+    TOO_FEW: ("too few anchors heard", "#bdbdbd"),
+    OUTSIDE: ("outside of the hull", "#e8e8e8"),
+}
+ANCHOR, HULL = "#1f3a93", "#8e44ad"
+HEARD_COLOURS = [0, 1, 2, 3, 4, 5, 6, 8, 10, 13, 17, 25]  # bounds of the colours of the picture
+COLOURS = "viridis_r"
 _MOST_LAYERS = 3
 ACROSS = 9  # ellipses along the longer side of a map
-TITLE: dict[str, Any] = {"fontsize": 9, "pad": 12.0}  # above anchors on the upper edge, and their labels
 
 
-def plot_precision(installation: Installation, chart: Chart, path: str | Path) -> None:
-    """The bound at 99 % (2.58 times the root mean square of its axes) with ellipses, and the dilution of precision."""
+def plot_precision(anchors: Anchors, chart: Chart, path: str | Path, walls: Walls | None = None) -> None:
+    """The bound of one round, with 99 % ellipses."""
     layers = _layers(chart.grid)
-    figure, axes = _panels(2 * len(layers), 2)
-    per_axis = NORMAL_99 * chart.error / np.sqrt(installation.dimensions)
-    for row, k in zip(axes, layers):
-        for ax, values, label in (
-            (row[0], 100.0 * per_axis, "99 % of one axis within +- cm"),
-            (row[1], chart.dop, "PDOP"),
-        ):
-            _field(ax, chart, values, k, label)
-            _room(ax, installation, chart.grid, k)
-        row[0].set_title(f"{row[0].get_title()}, 99 % ellipses times {_ellipses(row[0], chart, k)}", **TITLE)
-    _save(figure, "Precision of one round", path)
+    figure, axes = _panels(chart.grid, len(layers))
+    flown = chart.error[chart.flyable] if chart.flyable.any() else chart.error[np.isfinite(chart.error)]
+    scale = _scale(100.0 * flown)
+    times = _enlarged(chart)
+    for ax, k in zip(axes, layers):
+        mesh = _field(ax, chart.grid, 100.0 * chart.error, k, scale)
+        _room(ax, anchors, chart.grid, k, walls)
+        _ellipses(ax, chart, k, times)
+        ax.set_title(_height(chart.grid, k), fontsize=10)
+    _bar(axes, mesh, "bound of one round, cm", _beyond(100.0 * chart.error, scale))
+    ellipse = Line2D([], [], color="0.3", marker="o", mfc="none", ls="", label=f"99 % of the estimates, {times} times as large")
+    _finish(figure, "How precise one round is", [_hull_line(), _anchor_mark(anchors), ellipse], [(ax, anchors) for ax in axes], path)
 
 
-def plot_failure(installation: Installation, chart: Chart, path: str | Path) -> None:
-    """Where pairings have two solutions: their share, each bifurcation curve, the envelope, hull and flyable area."""
-    layers = _layers(chart.grid)
-    figure, axes = _panels(2 * len(layers), 2)
-    subsets = Subsets(installation.anchors, installation.unknowns)
+def plot_flyable(
+    anchors: Anchors, chart: Chart, path: str | Path, walls: Walls | None = None, pairings: Installation | None = None
+) -> None:  # fmt: skip
+    """Where it can be flown, and why not elsewhere. pairings : Installation whose bifurcation curves are drawn, each choice of anchors by
+    itself, or None."""
+    layers, codes = _layers(chart.grid), [code for code in STATES if (chart.status == code).any()]
+    figure, axes = _panels(chart.grid, len(layers))
     x, y, _ = chart.grid.axes
-    share = (0.0, max(10.0, 100.0 * np.quantile(chart.ambiguous[chart.hull], 0.98) if chart.hull.any() else 0.0))  # %
-    for row, k in zip(axes, layers):
-        points = chart.grid.layer(chart.grid.points, k).reshape(-1, 3)
-        discriminant = subsets.discriminant(points).reshape(len(y), len(x), -1)
-        _field(row[0], chart, 100.0 * chart.ambiguous, k, "pairings with two solutions, %", levels=False, scale=share)
-        row[1].contourf(x, y, chart.grid.layer(chart.flyable, k).astype(float), levels=[0.5, 1.5], colors=[FLYABLE])
-        for q in range(discriminant.shape[2]):
-            row[1].contour(x, y, discriminant[:, :, q], levels=[0.0], colors="0.55", linewidths=0.5)
-        if min(len(x), len(y)) > 1:
-            worst = discriminant.max(axis=2)
-            row[1].contour(x, y, worst, levels=[0.0], colors=ENVELOPE, linewidths=1.8)
-        for ax in row:
-            _room(ax, installation, chart.grid, k)
-    title = "Left: ambiguity. Right: flyable (yellow), curves (grey), envelope (green), hull of the anchors (magenta)"
-    _save(
-        figure,
-        f"{title}\n{100.0 * chart.flyable.mean():.0f} % of {'the slice' if chart.grid.shape[2] == 1 else 'the room'} is flyable",
-        path,
-    )
+    for ax, k in zip(axes, layers):
+        status = chart.grid.layer(chart.status, k)
+        colours = ListedColormap([colour for _, colour in STATES.values()])
+        ax.pcolormesh(x, y, status, cmap=colours, vmin=-0.5, vmax=len(STATES) - 0.5, shading="nearest", rasterized=True)
+        if pairings is not None and min(len(x), len(y)) > 1:
+            points = chart.grid.layer(chart.grid.points, k).reshape(-1, 3)
+            discriminant = Subsets(pairings.anchors, pairings.unknowns).discriminant(points).reshape(len(y), len(x), -1)
+            for q in range(discriminant.shape[2]):
+                ax.contour(x, y, discriminant[:, :, q], levels=[0.0], colors="0.45", linewidths=0.6)
+        _room(ax, anchors, chart.grid, k, walls)
+        ax.set_title(_height(chart.grid, k) + f": {np.mean(status == FLYABLE):.0%} can be flown".replace("%", " %"), fontsize=10)
+    shares = [(STATES[code], np.mean(chart.status == code)) for code in codes]
+    marks: list[Any] = [Patch(facecolor=colour, label=f"{name}: {100.0 * share:.0f} %") for (name, colour), share in shares]
+    marks += [_hull_line(), _anchor_mark(anchors)]
+    if pairings is not None:
+        marks.append(Line2D([], [], color="0.45", lw=0.8, label="bifurcation curve of a choice of anchors"))
+    whole = "this slice" if chart.grid.shape[2] == 1 else "the room"
+    title = f"Where it can be flown: {100.0 * chart.flyable.mean():.0f} % of {whole}"
+    _finish(figure, title, marks, [(ax, anchors) for ax in axes], path)
+
+
+def plot_heard(anchors: Anchors, chart: Chart, path: str | Path, walls: Walls | None = None) -> None:
+    """How many anchors are heard, of the middle layer."""
+    figure, (ax,) = _panels(chart.grid, 1)
+    k = chart.grid.shape[2] // 2
+    x, y, _ = chart.grid.axes
+    norm = BoundaryNorm(HEARD_COLOURS, 256, extend="max")
+    layer = chart.grid.layer(chart.heard.astype(float), k)
+    mesh = ax.pcolormesh(x, y, layer, cmap="viridis", norm=norm, shading="nearest", rasterized=True)
+    _bar([ax], mesh, "anchors heard", "max", HEARD_COLOURS)
+    _room(ax, anchors, chart.grid, k, walls)
+    ax.set_title(_height(chart.grid, k) + f": {100.0 * np.mean(chart.heard >= 4):.0f} % hear 4 or more", fontsize=10)
+    _finish(figure, f"How many of {len(anchors)} anchors are heard", [_hull_line(), _anchor_mark(anchors)], [(ax, anchors)], path)
 
 
 def plot_flips(
@@ -85,75 +117,95 @@ def plot_flips(
 
     points (n, 3); unique, agrees (n,) bool; mirrors : (from (m, 2), to (m, 2)), flips to draw as arrows.
     """
-    figure, ax = plt.subplots(figsize=(7, 6), layout="constrained")
-    for chosen, colour, label in ((unique, "tab:blue", "one solution"), (~unique, "tab:red", "flips for a pairing")):
-        ax.plot(*points[chosen, :2].T, "s", color=colour, ms=3, label=f"{label}: {np.mean(chosen):.0%}")
-    ax.plot(*points[~agrees, :2].T, "kx", ms=6, label=f"not as predicted: {np.mean(~agrees):.1%}")
+    figure, ax = plt.subplots(figsize=(WIDTH, WIDTH), layout="constrained")
+    for chosen, state, label in ((unique, FLYABLE, "one solution"), (~unique, TWO_SOLUTIONS, "two solutions of a choice of anchors")):
+        colour = STATES[state][1]
+        ax.plot(*points[chosen, :2].T, "s", color=colour, ms=4, label=f"{label}: {100.0 * np.mean(chosen):.0f} %")
+    ax.plot(*points[~agrees, :2].T, "kx", ms=6, label=f"not as predicted: {100.0 * np.mean(~agrees):.1f} %")
     for (x0, y0), (x1, y1) in zip(*mirrors):
-        ax.annotate("", (x1, y1), (x0, y0), arrowprops={"arrowstyle": "->", "color": "0.3", "lw": 0.7})
+        ax.annotate("", (x1, y1), (x0, y0), arrowprops={"arrowstyle": "->", "color": "0.3", "lw": 0.9})
+    ax.set(xlabel="x, m", ylabel="y, m", aspect="equal")
+    _hull(ax, installation.anchors)
     _anchors(ax, installation.anchors)
-    ax.plot(*installation.hull_outline().T, color=HULL, lw=1.2)
-    ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
-    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=3, frameon=False)
-    _save(figure, "Solved from many starts; arrows lead to the other solution", path)
+    marks = [*ax.get_legend_handles_labels()[0], _hull_line(), _anchor_mark(installation.anchors)]
+    _finish(figure, "Solved from many starts; arrows lead to the other solution", marks, [(ax, installation.anchors)], path)
 
 
 def plot_accuracy(installation: Installation, found: AccuracyMap, path: str | Path) -> None:
-    """Measured bias and RMSE beside the bound and what the filter claims, 3D, one colour scale; seen from above."""
-    figure, axes = _panels(4, 2)
+    """Measured error beside what the filter claims and the bound, 3D, one colour scale; seen from above."""
     columns = (
-        ("bias", found.bias),
-        ("RMSE", found.rmse),
-        ("filter claims", found.claimed),
-        ("bound, one round", found.bound),
+        ("measured error (RMSE)", found.rmse),
+        ("of it bias", found.bias),
+        ("the filter claims", found.claimed),
+        ("bound of one round", found.bound),
     )
     flat = []
     for _, values in columns:
         weight = np.where(np.isfinite(values[:, 0]), found.count, 0)
-        squared = found.grid.shape, np.where(weight > 0, np.nan_to_num(np.sum(values**2, axis=1)) * weight, 0.0)
-        summed, counted = squared[1].reshape(squared[0]).sum(axis=2), weight.reshape(squared[0]).sum(axis=2)
-        flat.append(100.0 * np.sqrt(np.where(counted > 0, summed, np.nan) / np.maximum(counted, 1)).T)
-    top = np.nanquantile(np.concatenate([values.ravel() for values in flat]), 0.98)
+        squared = np.where(weight > 0, np.nan_to_num(np.sum(values**2, axis=1)) * weight, 0.0).reshape(found.grid.shape).sum(axis=2)
+        counted = weight.reshape(found.grid.shape).sum(axis=2)
+        flat.append(100.0 * np.sqrt(np.where(counted > 0, squared, np.nan) / np.maximum(counted, 1)).T)
+    every = np.concatenate([values.ravel() for values in flat])
+    scale = _scale(every[np.isfinite(every)])
     x, y, _ = found.grid.axes
+    ratio = np.ptp(y) / max(np.ptp(x), 1e-9)
+    figure, axes = plt.subplots(2, 2, figsize=(WIDTH, 1.2 + 0.85 * WIDTH * ratio), layout="constrained", sharex=True, sharey=True)
     for ax, (label, _), values in zip(axes.ravel(), columns, flat):
-        mesh = ax.pcolormesh(x, y, values, cmap="viridis_r", vmin=0.0, vmax=top, shading="nearest", rasterized=True)
-        ax.set_title(label)
-        _room(ax, installation, found.grid, None)
-    figure.colorbar(mesh, ax=axes.ravel().tolist(), label="3D, cm", shrink=0.8)
-    _save(figure, "Achieved, claimed and possible error at each place", path)
+        mesh = ax.pcolormesh(x, y, values, cmap=COLOURS, vmin=scale[0], vmax=scale[1], shading="nearest", rasterized=True)
+        ax.set_title(label, fontsize=10)
+        _room(ax, installation.anchors, found.grid, None)
+    for ax in axes[0]:
+        ax.set_xlabel("")
+    for ax in axes[:, 1]:
+        ax.set_ylabel("")
+    _bar(axes.ravel(), mesh, "3D, cm", _beyond(every, scale))
+    marks = [_hull_line(), _anchor_mark(installation.anchors)]
+    _finish(figure, "Measured error beside what is claimed and what is possible", marks, [], path)
 
 
-def plot_layouts(
-    charts: Sequence[tuple[str, Installation, Chart]], path: str | Path,
-    candidates: tuple[np.ndarray, np.ndarray] | None = None,
-) -> None:  # fmt: skip
-    """Bound before and after, side by side at one scale. charts : [(title, Installation, Chart)].
+def plot_layouts(charts: Sequence[tuple[str, Installation, Chart]], flown: np.ndarray, path: str | Path) -> None:
+    """Bound before and after, of the middle layer, at one scale: that of where it is flown. charts : [(title, Installation, Chart)];
+    flown : (n, 3) m, places that are flown."""
+    grid = charts[0][2].grid
+    k = grid.shape[2] // 2
+    figure, axes = _panels(grid, len(charts))
+    low, high = flown.min(axis=0)[:2], flown.max(axis=0)[:2]
+    inside = ((grid.points[:, :2] >= low) & (grid.points[:, :2] <= high)).all(axis=1)
+    finite = np.concatenate([chart.error[inside & np.isfinite(chart.error)] for _, _, chart in charts])
+    scale = _scale(100.0 * finite)
+    blocked = any((~chart.grid.layer(chart.flyable, k)).any() for _, _, chart in charts)
+    for ax, (title, installation, chart) in zip(axes, charts):
+        mesh = _field(ax, grid, 100.0 * chart.error, k, scale)
+        _hatch(ax, chart, k)
+        _room(ax, installation.anchors, grid, k)
+        ax.add_patch(Rectangle(tuple(low), *(high - low).tolist(), fill=False, ec="r", lw=1.5))
+        share, median = 100.0 * chart.flyable.mean(), 100.0 * np.median(chart.error[inside]) if inside.any() else np.nan
+        ax.set_title(f"{title}: {share:.0f} % can be flown; median bound where it is flown {median:.1f} cm", fontsize=10)
+    _bar(axes, mesh, "bound of one round, cm", _beyond(100.0 * np.concatenate([chart.error for _, _, chart in charts]), scale))
+    marks: list[Any] = [_hull_line(), _anchor_mark(charts[0][1].anchors), Patch(fill=False, ec="r", label="where it is flown")]
+    if blocked:
+        marks.append(Patch(facecolor="white", edgecolor="k", hatch="////", label="cannot be flown"))
+    title = f"Before and after, {_height(grid, k)}" + ("; hatched: cannot be flown" if blocked else "; all can be flown")
+    _finish(figure, title, marks, [(ax, installation.anchors) for ax, (_, installation, _) in zip(axes, charts)], path)
 
-    candidates : (positions (n, 3) m, scores (n,) m) of one more anchor, drawn from above and from the side, or None.
-    """
-    layers = _layers(charts[0][2].grid)
-    wide = len(charts) + (candidates is not None)
-    figure, axes = _panels(wide * len(layers), wide)
-    finite = np.concatenate([chart.error[np.isfinite(chart.error) & chart.hull] for _, _, chart in charts])
-    scale = (100.0 * finite.min(), 100.0 * np.quantile(finite, 0.99))
-    for row, k in zip(axes, layers):
-        for ax, (title, installation, chart) in zip(row, charts):
-            _field(ax, chart, 100.0 * chart.error, k, "bound, 3D rms, cm", scale=scale)
-            x, y, _ = chart.grid.axes
-            _hatch(ax, chart, k)
-            _room(ax, installation, chart.grid, k)
-            flown = chart.grid.layer(chart.flyable, k).mean()
-            ax.set_title(f"{title}{ax.get_title()}: {100.0 * flown:.0f} % flyable", **TITLE)
-    if candidates is not None:
-        worst_first = np.argsort(-candidates[1])
-        positions, scores = candidates[0][worst_first], candidates[1][worst_first]
-        for row, (i, j) in zip(axes, ((0, 1), (0, 2), (1, 2))):
-            dots = row[-1].scatter(positions[:, i], positions[:, j], c=100.0 * scores, cmap="viridis_r", s=14)
-            row[-1].set(xlabel=f"{'xyz'[i]} [m]", ylabel=f"{'xyz'[j]} [m]", aspect="equal")
-            row[-1].set_title("score with one more anchor there", **TITLE)
-            figure.colorbar(dots, ax=row[-1], label="cm", shrink=0.8)
-    hatched = any(not chart.flyable.all() for _, _, chart in charts)
-    _save(figure, "Before and after; hatched: not flyable" if hatched else "Before and after; all is flyable", path)
+
+def plot_places(places: AnchorPlaces, numbers: np.ndarray, scores: np.ndarray, path: str | Path) -> None:
+    """What one more anchor gives at places all over, the walls side by side. numbers : (n, places.numbers) of AnchorPlaces; scores : (n,)
+    m, of `Goal.score`."""
+    figure, ax = plt.subplots(figsize=(WIDTH, 3.6), layout="constrained")
+    at = places.positions(numbers)
+    along, height = numbers[:, 0] * places.ends[-1], at[:, 2]
+    scale = _scale(100.0 * scores[np.isfinite(scores)])
+    dots = ax.scatter(along, height, c=100.0 * scores, cmap=COLOURS, s=60, vmin=scale[0], vmax=scale[1], edgecolors="0.4", linewidths=0.3)
+    _bar([ax], dots, "worst bound that is flown, cm", _beyond(100.0 * scores, scale))
+    for number, (start, end) in enumerate(zip(places.starts, places.ends)):
+        ax.axvline(end, color="0.6", lw=0.8)
+        ax.text(0.5 * (start + end), ax.get_ylim()[1], f"place {number + 1}", ha="center", va="bottom", fontsize=9)
+    best = int(np.argmin(scores))
+    ax.plot(along[best], height[best], "o", mfc="none", mec="r", ms=13, mew=1.6, label=f"best: ({', '.join(f'{v:.2f}' for v in at[best])})")
+    ax.set(xlabel="along the walls, one after the other, m", ylabel="z, m")
+    title = "One more anchor, tried all over (times 1 to 2 for the share that cannot be flown)"
+    _finish(figure, title, ax.get_legend_handles_labels()[0], [], path)
 
 
 def _layers(grid: Grid) -> list[int]:
@@ -162,28 +214,46 @@ def _layers(grid: Grid) -> list[int]:
     return list(range(n)) if n <= _MOST_LAYERS else [round(share * (n - 1)) for share in (0.2, 0.5, 0.8)]
 
 
-def _panels(count: int, wide: int) -> tuple[Figure, np.ndarray]:
-    high = -(-count // wide)
-    figure, axes = plt.subplots(high, wide, figsize=(4.4 * wide + 0.8, 3.9 * high), squeeze=False, layout="constrained")
-    return figure, axes
+def _height(grid: Grid, k: int) -> str:
+    return f"z = {grid.axes[2][k]:.2f} m"
 
 
-def _field(
-    ax: Axes, chart: Chart, values: np.ndarray, k: int, label: str, levels: bool = True,
-    scale: tuple[float, float] | None = None,
-) -> None:  # fmt: skip
-    """Colours scaled to what lies inside the hull, or to `scale`; contour lines over them."""
-    x, y, _ = chart.grid.axes
-    inside = values[chart.hull & np.isfinite(values)]
-    inside = inside if len(inside) else np.array([0.0, 1.0])
-    low, high = scale or (inside.min(), np.quantile(inside, 0.98))
-    high = high if high > low else low + 1.0  # all the same
-    layer = chart.grid.layer(np.where(np.isfinite(values), values, np.nan), k)
-    mesh = ax.pcolormesh(x, y, layer, cmap="viridis_r", vmin=low, vmax=high, shading="nearest", rasterized=True)
-    if levels and min(layer.shape) > 1:
-        lines = ax.contour(x, y, layer, levels=np.linspace(low, high, 7)[1:-1], colors="k", linewidths=0.4)
-        ax.clabel(lines, fontsize=6, fmt="%.1f")
-    ax.figure.colorbar(mesh, ax=ax, label=label, shrink=0.85)
+def _panels(grid: Grid, count: int) -> tuple[Figure, np.ndarray]:
+    """Maps one above the other, each as wide as the picture, or as high as wide where the room is longer along y."""
+    ratio = min(1.0, grid.shape[1] / grid.shape[0])
+    figure, axes = plt.subplots(count, 1, figsize=(WIDTH, 1.0 + count * (0.75 * WIDTH * ratio + 0.7)), squeeze=False, layout="constrained")
+    return figure, axes[:, 0]
+
+
+def _scale(values: np.ndarray) -> tuple[float, float]:
+    """Ends of the colours for values (n,): what 98 % of them lie between."""
+    low, high = np.quantile(values, [0.01, 0.99]) if len(values) else (0.0, 1.0)
+    return float(low), float(high if high > low else low + 1.0)
+
+
+def _beyond(values: np.ndarray, scale: tuple[float, float]) -> str:
+    """Which ends of the colours values (n,) go beyond, as matplotlib calls it."""
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return "neither"
+    return {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[int(values.min() < scale[0]), int(values.max() > scale[1])]
+
+
+def _field(ax: Axes, grid: Grid, values: np.ndarray, k: int, scale: tuple[float, float]) -> Any:
+    """Colours of the layer k of values (n,) between the ends of a scale; white where there is none."""
+    x, y, _ = grid.axes
+    layer = grid.layer(np.where(np.isfinite(values), values, np.nan), k)
+    return ax.pcolormesh(x, y, layer, cmap=COLOURS, vmin=scale[0], vmax=scale[1], shading="nearest", rasterized=True)
+
+
+def _bar(axes: Sequence[Axes] | np.ndarray, drawn: Any, label: str, extend: str, ticks: Sequence[float] | None = None) -> None:
+    """A scale whose arrows say at which ends there is more."""
+    bar = axes[0].figure.colorbar(drawn, ax=list(axes), extend=extend, shrink=0.9 / len(axes) ** 0.5, pad=0.02, aspect=25)
+    if ticks is None:
+        low, high = drawn.get_clim()
+        even = np.linspace(low, high, 5).tolist()
+        bar.set_ticks(even, labels=[f"{tick:.3g}" for tick in even])
+    bar.set_label(label, fontsize=9)
 
 
 def _hatch(ax: Axes, chart: Chart, k: int) -> None:
@@ -191,57 +261,108 @@ def _hatch(ax: Axes, chart: Chart, k: int) -> None:
     x, y, _ = chart.grid.axes
     edges = [np.append(axis - 0.5 * chart.grid.step, axis[-1] + 0.5 * chart.grid.step) for axis in (x, y)]
     blocked = np.ma.masked_equal(~chart.grid.layer(chart.flyable, k), False)
-    ax.pcolormesh(*edges, blocked.astype(float), cmap=ListedColormap(["white"]), alpha=0.5, lw=0)
+    ax.pcolormesh(*edges, blocked.astype(float), cmap=ListedColormap(["white"]), alpha=0.6, lw=0)
     if min(blocked.shape) > 1 and blocked.any():
         ax.contourf(x, y, blocked.filled(0).astype(float), levels=[0.5, 1.5], colors="none", hatches=["////"])
 
 
-def _room(ax: Axes, installation: Installation, grid: Grid, k: int | None) -> None:
-    ax.plot(*installation.hull_outline().T, color=HULL, lw=1.2)
-    _anchors(ax, installation.anchors)
-    x, y, z = grid.axes
-    half = 0.5 * grid.step
-    ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
-    ax.set(xlim=(x[0] - half, x[-1] + half), ylim=(y[0] - half, y[-1] + half))
-    if k is not None:
-        ax.set_title(f"z = {z[k]:.2f} m", **TITLE)
+def _room(ax: Axes, anchors: Anchors, grid: Grid, k: int | None, walls: Walls | None = None) -> None:
+    """Axes of a map, with walls, hull and anchors; a margin keeps anchors on its edge inside."""
+    x, y, _ = grid.axes
+    margin = 0.5 * grid.step + 0.03 * max(np.ptp(x), np.ptp(y), grid.step)
+    for x0, y0, x1, y1, _ in walls.segments if walls else ():
+        ax.plot([x0, x1], [y0, y1], "k-", lw=2.5)
+    ax.set(xlabel="x, m", ylabel="y, m", aspect="equal")
+    ax.set(xlim=(x[0] - margin, x[-1] + margin), ylim=(y[0] - margin, y[-1] + margin))
+    _hull(ax, anchors)
+    _anchors(ax, anchors)
+
+
+def _hull(ax: Axes, anchors: Anchors) -> None:
+    above = anchors.positions[:, :2]
+    if len(anchors) > 2 and np.linalg.matrix_rank(above - above[0], 1e-6) == 2:
+        corners = ConvexHull(above).vertices
+        ax.plot(*above[np.append(corners, corners[0])].T, color=HULL, lw=1.2, ls="--", scalex=False, scaley=False)
 
 
 def _anchors(ax: Axes, anchors: Anchors) -> None:
     p = anchors.positions
-    ax.plot(p[:, 0], p[:, 1], "r^", ms=6, clip_on=False)
+    size = float(np.clip(60.0 / np.sqrt(len(anchors)), 4.0, 8.0))
+    ax.plot(p[:, 0], p[:, 1], "^", color=ANCHOR, mec="w", mew=0.6, ms=size, zorder=5, scalex=False, scaley=False)
     turned = np.isfinite(anchors.orientations).all(axis=1)
     if turned.any():
-        front = Rotation.from_quat(anchors.orientations[turned]).apply([1.0, 0.0, 0.0])
-        ax.quiver(*p[turned, :2].T, *front[:, :2].T, color="r", width=0.005, scale=18)
-    for names, at in labels(anchors.ids.tolist(), p[:, :2]):
-        place = float(at[0]), float(at[1])
-        ax.annotate(names, place, xytext=(3, 3), textcoords="offset points", fontsize=7, color="r")
+        front = _directions(anchors)[turned]
+        ax.quiver(*p[turned, :2].T, *front.T, color=ANCHOR, width=0.004, scale=25, zorder=5)
 
 
-def _ellipses(ax: Axes, chart: Chart, k: int) -> int:
-    """99 % ellipses of some cells inside the hull, enlarged so that they can be seen. Returns by how much."""
+def _directions(anchors: Anchors) -> np.ndarray:
+    """(n, 2) from above, of the fronts of anchors; 0 of those whose orientation is not known."""
+    out = np.zeros((len(anchors), 2))
+    turned = np.isfinite(anchors.orientations).all(axis=1)
+    if turned.any():
+        out[turned] = Rotation.from_quat(anchors.orientations[turned]).apply([1.0, 0.0, 0.0])[:, :2]
+    return out
+
+
+def _fronts(ax: Axes, anchors: Anchors) -> np.ndarray:
+    """(2 n, 2) m, middles and tips of the arrows that show the fronts of anchors."""
+    arrow = _directions(anchors) * np.ptp(ax.get_xlim()) / 25.0
+    return np.vstack([anchors.positions[:, :2] + share * arrow for share in (0.5, 1.0)])
+
+
+def _hull_line() -> Line2D:
+    return Line2D([], [], color=HULL, lw=1.2, ls="--", label="hull of the anchors")
+
+
+def _anchor_mark(anchors: Anchors) -> Line2D:
+    turned = ", arrow: its front" if np.isfinite(anchors.orientations).all(axis=1).any() else ""
+    return Line2D([], [], color=ANCHOR, marker="^", ls="", label=f"anchor{turned}")
+
+
+def _some_cells(chart: Chart, k: int) -> np.ndarray:
+    """Which cells of the layer k have an ellipse: (n,) bool."""
     every = max(1, max(chart.grid.shape[:2]) // ACROSS)
     rows = np.zeros(chart.grid.shape, bool)
     rows[every // 2 :: every, every // 2 :: every, k] = True
-    rows = rows.ravel() & chart.hull & np.isfinite(chart.error)
+    return rows.ravel() & chart.flyable
+
+
+def _enlarged(chart: Chart) -> int:
+    """By how much ellipses are drawn larger, so that they can be seen and hardly cover each other."""
+    rows = np.any([_some_cells(chart, k) for k in _layers(chart.grid)], axis=0)
     if not rows.any():
         return 1
-    semi, angle = ellipses(chart.covariance[rows])
-    enlarged = max(1, round(0.4 * every * chart.grid.step / np.median(semi[:, 0])))
-    ax.add_collection(
-        EllipseCollection(
-            2 * enlarged * semi[:, 0], 2 * enlarged * semi[:, 1], np.rad2deg(angle), units="xy",
-            offsets=chart.grid.points[rows, :2], offset_transform=ax.transData, facecolors="none", edgecolors="w",
-            linewidths=0.8,
-        )
-    )  # fmt: skip
-    return enlarged
+    every = max(1, max(chart.grid.shape[:2]) // ACROSS)
+    return max(1, round(0.35 * every * chart.grid.step / np.median(ellipses(chart.covariance[rows])[0][:, 0])))
+
+
+def _ellipses(ax: Axes, chart: Chart, k: int, times: int) -> None:
+    """99 % ellipses of some cells that can be flown."""
+    rows = _some_cells(chart, k)
+    if rows.any():
+        semi, angle = ellipses(chart.covariance[rows])
+        ax.add_collection(
+            EllipseCollection(
+                2 * times * semi[:, 0], 2 * times * semi[:, 1], np.rad2deg(angle), units="xy", offsets=chart.grid.points[rows, :2],
+                offset_transform=ax.transData, facecolors="none", edgecolors="w", linewidths=1.2,
+            )
+        )  # fmt: skip
+
+
+def _finish(figure: Figure, title: str, marks: Sequence[Any], labelled: Sequence[tuple[Axes, Anchors]], path: str | Path) -> None:
+    """Title and legend, then the ids of anchors, once nothing else moves."""
+    figure.suptitle(title, fontsize=12)
+    if marks:
+        wide = max(len(str(mark.get_label())) for mark in marks)
+        figure.legend(handles=marks, loc="outside lower center", ncols=3 if wide < 28 else 2, frameon=False, fontsize=9)
+    figure.set_dpi(DPI)
+    figure.draw_without_rendering()
+    for ax, anchors in labelled:
+        put_labels(ax, anchors.ids.tolist(), anchors.positions[:, :2], _fronts(ax, anchors), ANCHOR)
+    _save(figure, title, path)
 
 
 def _save(figure: Figure, title: str, path: str | Path) -> None:
-    figure.suptitle(title, fontsize=10)
-    figure.set_dpi(80)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     image = Image.frombuffer("RGBA", canvas.get_width_height(), canvas.buffer_rgba())

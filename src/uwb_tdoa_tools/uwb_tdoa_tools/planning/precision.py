@@ -19,27 +19,35 @@ NORMAL_99 = 2.58  # standard deviations of a normal variable that hold 99 %, as 
 _CHUNK = 200_000  # numbers in the largest array of one step: what a processor cache holds
 
 
-def information(points: np.ndarray, installation: Installation, correction: bool = True) -> np.ndarray:
+def information(
+    points: np.ndarray, installation: Installation, correction: bool = True, columns: np.ndarray | None = None
+) -> np.ndarray:
     """Fisher information about the position from one round of TDOAs or ranges and, where the tag measures it, a height: (n, k, k)
     1/m^2, k the installation's dimensions.
 
-    points : (n, 3) m. correction : with the second term of eq. 1, the information that lies in the size of the errors.
+    points : (n, 3) m. correction : with the second term of eq. 1, the information that lies in the size of the errors. columns : (n, K)
+    rows of the anchors that are heard at each point, None for all; the installation's pairing is of so many.
     Source: eq. 1 of Grasso et al. (Sensors 2022, 22, 9136).
     """
     anchors, pairing = len(installation.anchors), installation.pairing
     width = len(pairing.a) * (anchors if pairing.shared and installation.link_std else 3) + 9 * anchors
-    chunks = np.array_split(points, max(1, len(points) * width // _CHUNK))
-    parts = [_information(chunk, installation, correction) for chunk in chunks]
+    chunks = np.array_split(np.arange(len(points)), max(1, len(points) * width // _CHUNK))
+    parts = [_information(points[rows], installation, correction, None if columns is None else columns[rows]) for rows in chunks]
     return installation.with_height(np.concatenate(parts))
 
 
-def _information(points: np.ndarray, installation: Installation, correction: bool) -> np.ndarray:
+def _information(
+    points: np.ndarray, installation: Installation, correction: bool, columns: np.ndarray | None
+) -> np.ndarray:
     anchors, k = installation.anchors, installation.dimensions
     unit = ranges(points[:, None, :], anchors.positions)[1]
     variance = installation.noise.variance(points, anchors)
+    gradient = variance_gradient(installation.noise, points, anchors, variance, k) if correction else np.empty(0)
+    if columns is not None:
+        unit, variance = np.take_along_axis(unit, columns[..., None], axis=1), np.take_along_axis(variance, columns, axis=1)
+        gradient = np.take_along_axis(gradient, columns[..., None], axis=1) if correction else gradient
     total = weigh(unit[..., :k], variance, installation.pairing, installation.link_std)
     if correction:
-        gradient = variance_gradient(installation.noise, points, anchors, variance, k)
         for part in installation.pairing.parts:
             total += _from_sizes(gradient, variance, part, installation.link_std)
     return total

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any, TYPE_CHECKING
 
@@ -10,54 +10,138 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
-from .. import cli
+from .. import cli, parallel
 from ..progress import Progress
 from ..readers.inputs import Reading
 from ..simulation.walls import Walls
-from . import accuracy, hall, messages, optimisation, options, plots, report
+from . import accuracy, advice, design, hall, messages, optimisation, options, plots, report
 from .check import brute_force
-from .maps import Grid, chart, flyable
+from .judging import judge
+from .maps import Grid, chart
+from .places import lattice
 
 if TYPE_CHECKING:
     from argparse import Namespace
-    from collections.abc import Callable, Iterable
+    from collections.abc import Iterable, Sequence
     from pathlib import Path
     from uwb_tdoa_bias.foundation.anchors import Anchors
     from ..readers.inputs import Recording
     from ..simulation.room import Room
+    from .goal import Goal
     from .installation import Installation
+    from .judging import Demand
     from .maps import Chart
     from .places import AnchorPlaces
 
-ENOUGH = 0.95  # of the room that can be flown: no anchor is proposed
-LOOKED_AT, TRIED = 600, 60  # cells of the room, and places, that are tried for one more anchor, about
+TRIED = 60  # places on the walls of a room that are tried for one more anchor, about
+IN_HALL = 0.35, (1.0, 4.0)  # of the reach, between places that are tried in a hall; m above the floor
 
 
 def plan_hall(
-    args: Namespace, anchors: Anchors, installation: Installation, room: Room, grid: Grid
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """All of plan with --radio-reach: (figures, messages). args : the options; anchors : Anchors of the hall; installation : Installation
-    of some of them; room : Room; grid : Grid. Raises InputError."""
+    args: Namespace, anchors: Anchors | None, installation: Installation, demand: Demand, grid: Grid
+) -> tuple[dict[str, Any], dict[str, Any], bool]:
+    """All of plan with --radio-reach or --hall: (figures, messages, whether the wanted share can be flown). args : the options; anchors :
+    Anchors of the hall, None where they are asked for. Raises InputError."""
     for name in ("check", "flights", "improve"):
         if getattr(args, name):
             raise InputError(f"{name}: is for a room in which every anchor is heard; leave out --{name}, or --radio-reach.")
-    if not args.radio_reach > 0.0:
-        raise InputError(f"radio reach: {args.radio_reach:g} m is none; give one above 0, e.g. 18.")
-    report.say_room(room, args.room is not None)
+    room, walls = demand.room, None if args.walls is None else Walls.from_yaml(args.walls)
+    goal, reach = options.goal_of(args, installation, demand), options.reach_of(args, demand.room)
+    whole = hall.Hall(goal, installation.anchors, reach, walls)
     args.out.mkdir(parents=True, exist_ok=True)
-    walls = None if args.walls is None else Walls.from_yaml(args.walls)
-    whole = hall.Hall(options.goal_of(args, installation), anchors, args.radio_reach, walls)
-    found, heard = whole.chart(grid, args.jobs, args.dask)
-    figures: dict[str, Any] = {"anchors": len(anchors), "arguments": options.plain(args)}
-    figures["map"] = hall.summary(found, heard)
-    figures["addition"] = whole.addition(found, room.lower[2])
-    figures["side"] = whole.side(grid.points)
-    hall.say(figures["map"], figures["addition"], figures["side"])
-    hall.plot(whole, found, heard, args.out / "hall.png")
-    found.volume(anchors, installation.dimensions).save(args.out / "flyable.npz")
-    outgoing = messages.messages(found, anchors)
-    messages.write(outgoing, args.out / "plan.bag")
+    report.say_room(room, args.room is not None)
+    figures: dict[str, Any] = {"arguments": options.plain(args)}
+    if anchors is None:
+        anchors, found, figures["design"] = _designed(args, whole, grid)
+        anchors.to_yaml(args.out / "hall.yaml")
+    else:
+        found = whole.chart(grid, args.jobs, args.dask)
+    whole = whole.of(anchors)
+    figures |= {"anchors": len(anchors), "map": report.summary(found), "side": whole.side(grid.points)}
+    report.say_heard(figures["map"])
+    report.say_flyable(figures["map"], demand.accuracy)
+    report.say_side(figures["side"])
+    figures["addition"] = hall_advice(whole, found)
+    report.say_addition(figures["addition"], figures["map"]["flyable_share"])
+    plots.plot_heard(anchors, found, args.out / "heard.png", walls)
+    outgoing = draw_map(found, installation.of(anchors), args.out, walls)
+    return figures, outgoing, bool(found.flyable.mean() >= args.share or not args.hall)
+
+
+def _designed(args: Namespace, whole: hall.Hall, grid: Grid) -> tuple[Anchors, Chart, list[dict[str, Any]]]:
+    """(Anchors, Chart, rows of the table) of --hall: the fewest of which the wanted share can be flown on all of the Grid."""
+    room = whole.goal.demand.room
+    with Progress("plan") as progress:
+        layouts, steps = design.design(whole, room, grid.points, args.share, progress)
+    for anchors in layouts:
+        found = whole.of(anchors).chart(grid, args.jobs, args.dask)
+        if found.flyable.mean() >= args.share:
+            break
+    rows = [asdict(step) for step in steps]
+    report.say_design(rows, asdict(design.step_of(found, anchors, room)), design.about(anchors), args.share)
+    return anchors, found, rows
+
+
+def _places(room: Room, reach: float) -> np.ndarray:
+    """Places (n, 3) m all over a hall that are tried for one more anchor."""
+    step, heights = IN_HALL
+    z = [min(room.lower[2] + height, room.upper[2]) for height in heights]
+    across = lattice([*room.lower[:2], 0.0], [*room.upper[:2], 0.0], step * reach)[:, :2]
+    return np.unique(np.vstack([np.column_stack([across, np.full(len(across), height)]) for height in z]).round(1), axis=0)
+
+
+def plan_room(
+    args: Namespace, anchors: Anchors, installation: Installation, demand: Demand, grid: Grid, reading: Reading,
+    recordings: Sequence[Recording],
+) -> tuple[dict[str, Any], dict[str, Any]]:  # fmt: skip
+    """All of plan of a room in which every anchor is heard: (figures, messages). args : the options; recordings : of --flights, which
+    Reading found. Raises InputError."""
+    aim = options.aim_of(args, installation, demand, grid.axes[2][0]) if args.improve else None
+    if not np.isfinite(anchors.orientations).all():
+        cli.show("anchors without orientation are taken to radiate alike in all directions")
+    report.say_room(demand.room, args.room is not None)
+    args.out.mkdir(parents=True, exist_ok=True)
+    with Progress("plan") as progress:
+        progress("mapping")
+        found = chart(installation, grid, demand)
+    about = {**report.summary(found), **report.in_hull(found, installation)}
+    figures: dict[str, Any] = {"anchors": len(anchors), "arguments": options.plain(args), "map": about}
+    report.say_in_hull(about)
+    report.say_flyable(about, demand.accuracy)
+    if demand.criterion == "round":
+        goal, places = options.goal_of(args, installation, demand), options.places_of(args, demand.room)
+        figures["addition"] = room_advice(found, anchors, goal, places)
+        report.say_addition(figures["addition"], about["flyable_share"])
+    outgoing = draw_map(found, installation, args.out, pairings=demand.criterion == "pairings")
+    if args.check:
+        figures["check"] = check(installation, grid, args.out)
+        report.say_check(figures["check"])
+    if recordings:
+        flown = parallel.over(Fly(reading, tuple(args.aids)), recordings, args.jobs, args.dask)
+        figures["flights"] = evaluate_flights(flown, installation, demand.room, args.step or 0.4, args.out)
+        report.say_flights(figures["flights"])
+    if aim:
+        figures["improve"] = improve(found, aim, args.improve, args.starts, args.out)
+        report.say_improvement(figures["improve"])
     return figures, outgoing
+
+
+def hall_advice(whole: hall.Hall, found: Chart) -> dict[str, Any] | None:
+    """What `advice.one_more` finds in a Hall. found : Chart of it."""
+    places = _places(whole.goal.demand.room, min(whole.reach, options.FARTHEST))
+    with Progress("plan") as progress:
+        return advice.one_more(
+            found, whole.anchors, places, lambda before, points, more, place: whole.changed(before, points, more, place[None]), progress
+        )
+
+
+def room_advice(found: Chart, anchors: Anchors, goal: Goal, places: AnchorPlaces) -> dict[str, Any] | None:
+    """What `advice.one_more` finds on AnchorPlaces of a room in which all is heard, to the centimetre. found : Chart of Anchors."""
+    tried = np.unique(places.positions(places.grid(TRIED)).round(2), axis=0)
+    with Progress("plan") as progress:
+        return advice.one_more(
+            found, anchors, tried, lambda before, points, more, place: judge(points, goal.installed(more), goal.demand), progress
+        )
 
 
 def end(args: Namespace, figures: dict[str, Any], outgoing: dict[str, Any]) -> None:
@@ -71,13 +155,14 @@ def end(args: Namespace, figures: dict[str, Any], outgoing: dict[str, Any]) -> N
         messages.publish(outgoing)
 
 
-def draw_map(found: Chart, installation: Installation, out: Path) -> dict[str, Any]:
-    """Pictures, flyable volume and bag of a Chart. Returns {topic: message}, see `messages.messages`."""
-    plots.plot_precision(installation, found, out / "precision.png")
-    if not installation.pairing.one_solution:
-        plots.plot_failure(installation, found, out / "failure.png")
-    found.volume(installation.anchors, installation.dimensions).save(out / "flyable.npz")
-    outgoing = messages.messages(found, installation.anchors)
+def draw_map(found: Chart, installation: Installation, out: Path, walls: Walls | None = None, pairings: bool = False) -> dict[str, Any]:
+    """Pictures, flyable volume and bag of a Chart. Returns {topic: message}, see `messages.messages`. pairings : with the curves of every
+    choice of anchors."""
+    anchors = installation.anchors
+    plots.plot_precision(anchors, found, out / "precision.png", walls)
+    plots.plot_flyable(anchors, found, out / "flyable.png", walls, installation if pairings else None)
+    found.volume(anchors, installation.dimensions).save(out / "flyable.npz")
+    outgoing = messages.messages(found, anchors)
     messages.write(outgoing, out / "plan.bag")
     return outgoing
 
@@ -121,47 +206,16 @@ def evaluate_flights(
     return rows
 
 
-def addition(
-    found: Chart, anchors: Anchors, installed: Callable[[Anchors], Installation], places: AnchorPlaces, criterion: str
-) -> dict[str, Any] | None:
-    """What the best of some places for one more anchor would add to what is flyable: {"position": (3,) m, "gain": share of the room}, to
-    the centimetre; None where nearly all is flyable. found : Chart of Anchors; installed(anchors) : Installation of others; places :
-    AnchorPlaces."""
-    if found.flyable.mean() > ENOUGH:
-        return None
-    grid = found.grid
-    coarse = Grid.box(
-        grid.lower, grid.lower + grid.step * np.array(grid.shape), grid.step * (found.flyable.size / LOOKED_AT) ** (1.0 / _across(grid))
-    )
-    if grid.shape[2] == 1:
-        x, y, z = grid.axes
-        coarse = Grid.slice((x[0], x[-1]), (y[0], y[-1]), z[0], coarse.step)
-    points = coarse.points
-    before, best = flyable(installed(anchors), points, criterion)[2].mean(), (0.0, None)
-    for position in np.unique(places.positions(places.grid(TRIED)).round(2), axis=0):
-        try:
-            more = installed(optimisation.with_one(anchors, position))
-        except InputError:  # where there is one already
-            continue
-        best = max(best, (flyable(more, points, criterion)[2].mean() - before, position.tolist()), key=lambda one: one[0])
-    return {"position": best[1], "gain": float(best[0])}
-
-
-def _across(grid: Grid) -> int:
-    """Dimensions of a grid."""
-    return 2 if grid.shape[2] == 1 else 3
-
-
-def improve(before: Chart, aim: options.Aim, how: str, starts: int, criterion: str, out: Path) -> dict[str, Any]:
-    """Better places for the anchors, improved.yaml. before : Chart as it is; aim : options.Aim; how : "move" or "add";
-    criterion : of what is flyable."""
-    goal, places, installation, candidates = aim.goal, aim.places, aim.goal.installation, None
+def improve(before: Chart, aim: options.Aim, how: str, starts: int, out: Path) -> dict[str, Any]:
+    """Better places for the anchors, improved.yaml. before : Chart as it is; aim : options.Aim; how : "move" or "add"."""
+    goal, places, installation = aim.goal, aim.places, aim.goal.installation
     anchors = installation.anchors
     with Progress("plan") as progress:
         search: dict[str, Any] = {"starts": starts, "progress": partial(progress.over, what="layouts")}
         if how == "add":
-            candidates = optimisation.one_more(goal, anchors, places)
-            start: np.ndarray | None = candidates[0][[np.argmin(candidates[1])]]
+            numbers, scores = optimisation.one_more(goal, anchors, places)
+            plots.plot_places(places, numbers, scores, out / "places.png")
+            start: np.ndarray | None = places.positions(numbers[[np.argmin(scores)]])
             better = optimisation.optimise(goal, places, 1, anchors, start, **search)
         else:
             start = anchors.positions if aim.count == len(anchors) else None
@@ -169,9 +223,8 @@ def improve(before: Chart, aim: options.Aim, how: str, starts: int, criterion: s
         better = optimisation.rounded(better, anchors)
         better.to_yaml(out / "improved.yaml")
         after = goal.installed(better)
-        charted = chart(after, before.grid, criterion)
-        charts = [("before, ", installation, before), ("after, ", after, charted)]
-    plots.plot_layouts(charts, out / "layout.png", candidates)
+        charted = chart(after, before.grid, goal.demand)
+        plots.plot_layouts([("before", installation, before), ("after", after, charted)], goal.points, out / "layout.png")
     judged = {
         when: {"flyable_share": float(one.flyable.mean()), **aim.reported.figures(those)}
         for when, one, those in (("before", before, anchors), ("after", charted, better))

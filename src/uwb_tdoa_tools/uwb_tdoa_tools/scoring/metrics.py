@@ -11,7 +11,8 @@ from typing import Any, Protocol, TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.effects.samples import PoseColumns
-from uwb_tdoa_ekf.core.verdicts import REJECTED, USED
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_ekf.core.verdicts import COMPENSATED, REJECTED, USED
 from uwb_tdoa_ekf.results import rows_of
 
 from ..json_values import as_json
@@ -109,9 +110,14 @@ def nees(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
 
 def nis(residuals: Residuals) -> np.ndarray:
-    """Normalised innovation squared of every TDOA that reached the filter: (n,), expected 1."""
-    reached = (residuals.verdict == USED) | (residuals.verdict == REJECTED)
-    return residuals.innovation[reached] ** 2 / residuals.variance[reached]
+    """Normalised innovation squared of every measurement that reached the filter, outliers in full: (n,), expected 1."""
+    there = reached(residuals)
+    return residuals.innovation[there] ** 2 / residuals.variance[there]
+
+
+def reached(residuals: Residuals) -> np.ndarray:
+    """Which measurements had a residual in the filter: (n,) bool."""
+    return np.isin(residuals.verdict, (USED, REJECTED, COMPENSATED))
 
 
 def summary(errors: np.ndarray, normalised: np.ndarray, innovations: np.ndarray) -> dict[str, Any]:

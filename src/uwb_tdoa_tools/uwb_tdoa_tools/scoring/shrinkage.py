@@ -7,6 +7,8 @@ from typing import Any, TYPE_CHECKING
 
 import numpy as np
 
+from .gains import by, gain
+
 if TYPE_CHECKING:
     Errors = dict[str, dict[float | None, float]]  # {flight: {share, None for no correction: 3D RMSE of the filter, m}}
 
@@ -24,14 +26,14 @@ class Shrinkage:
     @property
     def gains(self) -> np.ndarray:
         """(n,): by how much the error of each flight gets smaller with the share, relative to that without correction."""
-        return np.array([1.0 - of[self.share] / of[None] for of in self.errors.values()])
+        return np.array([gain(of[None], of[self.share]) for of in self.errors.values()])
 
     def as_text(self) -> str:
         """One sentence."""
         gains = self.gains
         return (
-            f"expected of flights like these: the 3D RMSE falls by {gains.mean():.0%} +- {_spread(gains):.0%} "
-            f"(of {len(gains)} flights, each left out; the worst {gains.min():+.0%}), with {self.share:g} of what is predicted taken out"
+            f"expected of flights like these: the 3D RMSE {by(gains.mean())} +- {100.0 * _spread(gains):.0f} % "
+            f"(of {len(gains)} flights, each left out; on the worst it {by(gains.min())}), with {self.share:g} of what is predicted taken out"
         )
 
     def as_dict(self) -> dict[str, Any]:

@@ -1,0 +1,248 @@
+"""Where a round of TDOAs has two solutions: a second minimum of its misfit, of all that is heard together.
+
+With d(x) the distances from x to the N anchors that are heard at p, and Q = D' F^-1 D the weight of their errors in a round (`weigh`),
+    f(x) = (d(x) - d(p))' Q (d(x) - d(p))
+is the squared misfit, in standard deviations, of a tag at x with what a tag at p measures. Its smallest minimum is p, with 0. A second one
+is searched by Levenberg-Marquardt, from the mirrored places of choices of k + 1 anchors (`bifurcation`). An estimator that weighs all TDOAs
+takes it for the right one with probability Phi(-sqrt(f) / 2).
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from uwb_tdoa_bias.foundation.compiled import compiled
+
+if TYPE_CHECKING:
+    from ..simulation.room import Room
+
+FLIP = 0.5  # m; a minimum nearer than this is no failure, but imprecision
+CLEAR = 4.65  # standard deviations of misfit from which on at most 1 % of the estimates flip
+NEAREST = 8  # anchors whose choices of k + 1 are mirrored; what all explain these explain as well
+DESCENTS = 12  # from mirrored places, those of the smallest misfit
+SWEEPS = 60  # steps of a descent
+SETTLED = 0.01  # of f, that another step would gain at most where a descent has come to its end
+LONGEST = 5.0  # m, of a step
+AROUND = 2.0  # m about the room, inside which descents start
+_FLAT = 1e-6  # of the volume of a cube; k + 1 anchors of less are in one plane (line)
+
+
+def second_minima(
+    points: np.ndarray, positions: np.ndarray, columns: np.ndarray, weights: np.ndarray, room: Room, unknowns: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the second minimum of least misfit inside a room: (misfit (n,) standard deviations, place (n, 3) m); inf and NaN where no
+    descent finds one that is more than FLIP away.
+
+    points : (n, 3) m; positions : (N, 3) m of anchors; columns : (n, K) rows of those that are heard; weights : (n, K, K) 1/m^2, Q; room :
+    Room; unknowns : 2 where the height is known, else 3.
+    """
+    choices = np.array(list(combinations(range(min(NEAREST, columns.shape[1])), unknowns + 1)))
+    out = np.empty((len(points), 4))
+    _search(points, positions, columns, weights, np.stack([room.lower, room.upper]), choices, out)
+    return np.sqrt(out[:, 0]), out[:, 1:]
+
+
+@compiled
+def _search(
+    points: np.ndarray, positions: np.ndarray, columns: np.ndarray, weights: np.ndarray, room: np.ndarray, choices: np.ndarray,
+    out: np.ndarray,
+) -> None:  # fmt: skip
+    """Fill out (n, 4): misfit squared and place. room : (2, 3) m, its corners; choices : (C, k + 1) of the nearest anchors."""
+    heard, unknowns = columns.shape[1], choices.shape[1] - 1
+    anchors, true, end = np.empty((heard, 3)), np.empty(heard), np.empty(3)
+    starts, values = np.empty((len(choices), 3)), np.empty(len(choices))
+    for n in range(len(points)):
+        point = points[n]
+        out[n, 0] = np.inf
+        out[n, 1:] = np.nan
+        for i in range(heard):
+            anchors[i] = positions[columns[n, i]]
+            true[i] = _distance(point, anchors[i])
+        nearest = np.argsort(true)
+        for c in range(len(choices)):
+            values[c] = np.inf
+            if _mirror(point, anchors, true, nearest[choices[c]], starts[c]):
+                for k in range(unknowns):
+                    starts[c, k] = min(max(starts[c, k], room[0, k] - AROUND), room[1, k] + AROUND)
+                values[c] = _misfit(starts[c], anchors, true, weights[n])
+        best = np.argsort(values)
+        for c in range(min(DESCENTS, len(choices))):
+            known = not values[best[c]] < np.inf or _distance(starts[best[c]], point) < 0.5 * FLIP
+            for before in range(c):
+                known = known or _distance(starts[best[c]], starts[best[before]]) < 0.5 * FLIP
+            if known:
+                continue
+            f = _descend(starts[best[c]], point, anchors, true, weights[n], unknowns, end)
+            for axis in range(unknowns):
+                f = f if room[0, axis] <= end[axis] <= room[1, axis] else np.inf
+            if f < out[n, 0] and _distance(end, point) > FLIP:
+                out[n, 0] = f
+                out[n, 1:] = end
+
+
+@compiled
+def _mirror(point: np.ndarray, anchors: np.ndarray, true: np.ndarray, rows: np.ndarray, out: np.ndarray) -> bool:
+    """Put into `out` the other place with the TDOAs of these k + 1 anchors, see `bifurcation`; of anchors in a plane (line) that on its
+    other side. Whether there is one."""
+    k, first = len(rows) - 1, anchors[rows[0]]
+    matrix, q, p = np.zeros((3, 3)), np.zeros(3), np.zeros(3)
+    size = 1e-9
+    for i in range(k):
+        for j in range(k):
+            matrix[i, j] = anchors[rows[i + 1], j] - first[j]
+            size = max(size, abs(matrix[i, j]))
+    out[:] = point
+    if k == 2:
+        matrix[2, 2] = 1.0
+    volume = _determinant(matrix)
+    if abs(volume) < _FLAT * size**k:
+        normal = np.cross(matrix[0], matrix[1]) if k == 3 else np.array([matrix[0, 1], -matrix[0, 0], 0.0])
+        length = math.sqrt(np.sum(normal**2))
+        if length < _FLAT * size**2 if k == 3 else length < _FLAT * size:
+            return False
+        away = 0.0
+        for j in range(k):
+            away += (point[j] - first[j]) * normal[j] / length
+        for j in range(k):
+            out[j] -= 2.0 * away * normal[j] / length
+        return True
+    r, squared, product = true[rows[0]], 0.0, 0.0
+    column = matrix.copy()
+    for j in range(k):  # by Cramer's rule
+        column[:] = matrix
+        for i in range(k):
+            column[i, j] = r - true[rows[i + 1]]
+        q[j] = _determinant(column) / volume
+    for j in range(k):
+        p[j] = point[j] - first[j] - q[j] * r
+        squared += q[j] ** 2
+        product += p[j] ** 2
+    if k == 2:
+        product += (point[2] - first[2]) ** 2
+    if squared <= 1.0:
+        return False
+    other = product / ((squared - 1.0) * max(r, 1e-12))
+    for j in range(k):
+        out[j] = first[j] + p[j] + q[j] * other
+    return True
+
+
+@compiled
+def _determinant(m: np.ndarray) -> float:
+    return (
+        m[0, 0] * (m[1, 1] * m[2, 2] - m[1, 2] * m[2, 1])
+        - m[0, 1] * (m[1, 0] * m[2, 2] - m[1, 2] * m[2, 0])
+        + m[0, 2] * (m[1, 0] * m[2, 1] - m[1, 1] * m[2, 0])
+    )
+
+
+@compiled
+def _distance(p: np.ndarray, q: np.ndarray) -> float:
+    return math.sqrt((p[0] - q[0]) ** 2 + (p[1] - q[1]) ** 2 + (p[2] - q[2]) ** 2)
+
+
+@compiled
+def _misfit(x: np.ndarray, anchors: np.ndarray, true: np.ndarray, weight: np.ndarray) -> float:
+    """f at x."""
+    change, total = np.empty(len(anchors)), 0.0
+    for i in range(len(anchors)):
+        change[i] = _distance(x, anchors[i]) - true[i]
+        row = 0.0
+        for j in range(i):
+            row += weight[i, j] * change[j]
+        total += change[i] * (2.0 * row + weight[i, i] * change[i])
+    return max(total, 0.0)
+
+
+@compiled
+def _descend(
+    start: np.ndarray, point: np.ndarray, anchors: np.ndarray, true: np.ndarray, weight: np.ndarray, unknowns: int, end: np.ndarray
+) -> float:  # fmt: skip
+    """f at the end of a descent, whose place is put into `end`; inf where it did not come to an end, or came to the point itself."""
+    x, step, right = start.copy(), np.zeros(3), np.zeros(3)
+    unit, change, weighed = np.empty((len(anchors), 3)), np.empty(len(anchors)), np.empty((len(anchors), 4))
+    normal, damped = np.zeros((3, 3)), np.zeros((3, 3))
+    f, damping = _misfit(x, anchors, true, weight), 1e-2
+    for _ in range(SWEEPS):
+        for i in range(len(anchors)):
+            r = _distance(x, anchors[i])
+            change[i] = r - true[i]
+            for k in range(3):
+                unit[i, k] = (x[k] - anchors[i, k]) / max(r, 1e-9)
+        for i in range(len(anchors)):
+            weighed[i] = 0.0
+            for j in range(len(anchors)):
+                for k in range(unknowns):
+                    weighed[i, k] += weight[i, j] * unit[j, k]
+                weighed[i, 3] += weight[i, j] * change[j]
+        for a in range(unknowns):
+            right[a] = 0.0
+            for i in range(len(anchors)):
+                right[a] -= unit[i, a] * weighed[i, 3]
+            for b in range(unknowns):
+                normal[a, b] = 0.0
+                for i in range(len(anchors)):
+                    normal[a, b] += unit[i, a] * weighed[i, b]
+        lower = False
+        for _ in range(12):  # until a step leads down
+            for a in range(unknowns):
+                for b in range(unknowns):
+                    damped[a, b] = normal[a, b]
+                damped[a, a] += damping * normal[a, a] + 1e-12
+            gain = _solve(damped, right, unknowns, step)
+            length = math.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
+            if gain < SETTLED and damping <= 1e-2 and length < 0.5 * FLIP:
+                end[:] = x
+                return f
+            for a in range(unknowns):
+                end[a] = x[a] + step[a] * min(1.0, LONGEST / max(length, 1e-12))
+            for a in range(unknowns, 3):
+                end[a] = x[a]
+            new = _misfit(end, anchors, true, weight)
+            if new < f:
+                lower = True
+                x[:], f = end, new
+                damping = max(0.2 * damping, 1e-6)
+                break
+            damping *= 6.0
+        if not lower:  # a corner of f, at an anchor: it is lower there than around
+            end[:] = x
+            return f
+        if _distance(x, point) < FLIP:
+            return np.inf
+    return np.inf
+
+
+@compiled
+def _solve(matrix: np.ndarray, right: np.ndarray, size: int, out: np.ndarray) -> float:
+    """Solve matrix out = right, of 2 or 3 rows, positive definite, by Cholesky in place; return right . out, inf where it is not."""
+    for i in range(size):
+        for j in range(i + 1):
+            total = matrix[i, j]
+            for k in range(j):
+                total -= matrix[i, k] * matrix[j, k]
+            if i == j:
+                if total <= 0.0:
+                    out[:] = 0.0
+                    return np.inf
+                matrix[i, i] = math.sqrt(total)
+            else:
+                matrix[i, j] = total / matrix[j, j]
+    for i in range(size):
+        total = right[i]
+        for k in range(i):
+            total -= matrix[i, k] * out[k]
+        out[i] = total / matrix[i, i]
+    for i in range(size - 1, -1, -1):
+        total = out[i]
+        for k in range(i + 1, size):
+            total -= matrix[k, i] * out[k]
+        out[i] = total / matrix[i, i]
+    product = 0.0
+    for i in range(size):
+        product += right[i] * out[i]
+    return product
