@@ -5,7 +5,7 @@ import sys
 
 from uwb_tdoa_tools import cli
 
-from studies import aids, calibrating, crazyflie, localizing, noise, ranges, recalibrating, scale, situations, surveying
+from studies import aids, calibrating, crazyflie, localizing, moved_anchors, noise, ranges, recalibrating, scale, situations, surveying
 from studies.checking import figures as checking
 from studies.checking import in_flight
 from studies.closed_loop import experiment
@@ -30,6 +30,7 @@ STUDIES = {
     "faults": faults,
     "in-flight": in_flight,
     "localizing": localizing,
+    "moved-anchors": moved_anchors,
     "noise": noise,
     "random-splits": splits,
     "ranges": ranges,
@@ -56,6 +57,7 @@ of measured flights: flights/, util/, surveys/.
   faults           faults of streams, surveys, nodes and clocks, played to the real nodes over topics (docs/reliability.md)
   in-flight        the same mistakes played to ekf_node, and what it says of them (docs/connect.md)
   localizing       what localize says of flights, against their ground truth (docs/localizing.md)
+  moved-anchors    anchors that were moved or exchanged, and who names them (docs/localizing.md)
   noise            whether covariances are honest after a calibration (docs/calibration.md)
   random-splits    bias models trained on flights drawn at random, and judged on the others (docs/bias.md)
   ranges           simulated distances to anchors against the bound of plan (docs/sensors.md)
@@ -94,6 +96,7 @@ def parser():
         "./dev study faults --only '^velocity' --json faults.json --out faults.md",
         "./dev study in-flight DATA/flights/0426/0426-traj5 --survey DATA/surveys --only nothing sign",
         "./dev study localizing DATA/flights DATA/util --survey DATA/surveys --mistakes",
+        "./dev study moved-anchors DATA/flights --survey DATA/surveys --draws 10 --json moved.json",
         "./dev study noise --data DATA --split const1",
         "./dev study random-splits DATA/flights/0426 --survey DATA/surveys --out splits.jsonl",
         "./dev study ranges --flights 5",

@@ -48,7 +48,7 @@ FORGET = 60  # slices between two looks at which of the anchors were passed long
 NEARER = 0.8  # share of the distance of the farthest anchor that is heard, within which another must be
 TOGETHER = 4  # slices in which a swap is looked for
 NAMED, HELD = 4, 8  # slices or comparisons in a row that must say so until it is named, and something else until a swap is no longer
-LOOK = 4  # slices between two comparisons with the survey
+LOOK, YOUNG = 4, 40  # slices between two comparisons with the survey; and of a comparison with the latest, at least
 SURE = 2.0  # standard deviations by which an anchor must be off the survey, beside SMALLEST_CHANGE
 TURN_APART = 3.0  # s of stamps between two turns of all signs
 MOST_EVENTS = 1000  # that are remembered
@@ -96,10 +96,10 @@ class Monitor:
         self._standing = {}
         self._end: float | None = None  # s, stamps: at which the present slice ends,
         self._last = -math.inf  # and of what was added last
-        self._detector, self._comparison = ChangeDetector(), SurveyComparison(self._anchors, self._calibrated)
+        self._detector = ChangeDetector()
         self._displaced: dict[int, Displaced] = {}  # of anchors that are not as surveyed and calibrated, by row,
         self._suspected: dict[int, int] = {}  # and comparisons in a row that say so
-        self._compared = 0  # slices
+        self._compare_anew()
         self._changes: dict[int, list[Change]] = {}  # row: Changes of an anchor that is not what it was
         self._ever_changed: set[int] = set()  # rows
         self._latest_change: Change | None = None  # while its size is still found out
@@ -124,7 +124,8 @@ class Monitor:
         self._changes = {row: found for row, found in self._changes.items() if row not in rows}
         self._silent = tuple(row for row in self._silent if row not in rows)
         self._displaced = {row: one for row, one in self._displaced.items() if row not in rows}
-        self._comparison.forget(rows)
+        for comparison in self._comparisons:
+            comparison.forget(rows)
         if self._latest_change is not None and self._latest_change.row in rows:
             self._latest_change = None
         if rows & {*self._swapped, *self._instead[0]}:
@@ -214,11 +215,17 @@ class Monitor:
     def _compare(self, piece: Slice) -> None:
         """Compare the flight, with a Slice more, with the survey; an anchor that has changed in flight is named by that alone."""
         delays = self._detector.delays_at(piece.t, piece.rows)
-        self._comparison.add(piece if not delays.any() else replace(piece, vector=piece.vector - piece.information @ delays))
+        if delays.any():
+            piece = replace(piece, vector=piece.vector - piece.information @ delays)
+        if self._compared % YOUNG == 0 and self._calibrated is not None:  # what moved on the way stood right for long
+            self._comparisons = [self._comparisons[0], *self._comparisons[1:][-1:], self._new_comparison()]
+        for comparison in self._comparisons:
+            comparison.add(piece)
         self._compared += 1
         if self._compared % LOOK:
             return
-        found = {one.row: one for one in self._comparison.find() if one.row not in self._ever_changed and _matters(one)}
+        displaced = [one for comparison in reversed(self._comparisons[:2]) for one in comparison.find() if _matters(one)]
+        found = {one.row: one for one in displaced if one.row not in self._ever_changed}
         self._suspected = {row: self._suspected.get(row, 0) + 1 for row in found}
         self._displaced = {row: one for row, one in found.items() if self._suspected[row] >= NAMED}
 
@@ -237,8 +244,11 @@ class Monitor:
 
     def _compare_anew(self) -> None:
         """What was not as it is now says nothing of the survey."""
-        self._comparison = SurveyComparison(self._anchors, self._calibrated)
-        self._displaced, self._suspected = {}, {}
+        self._comparisons = [self._new_comparison()]  # with all slices, and with the last YOUNG to 2 YOUNG, and YOUNG at most
+        self._displaced, self._suspected, self._compared = {}, {}, 0
+
+    def _new_comparison(self) -> SurveyComparison:
+        return SurveyComparison(self._anchors, self._calibrated)
 
     def _look_for_swap(self, a: np.ndarray, b: np.ndarray, innovation: np.ndarray, place: np.ndarray) -> bool:
         """Whether this slice looks like one: it is named once several do, and until others say in a row that it is not."""
