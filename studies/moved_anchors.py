@@ -1,8 +1,8 @@
 """moved_anchors: recordings in which an anchor was moved by 0.3 to 1 m, or two were exchanged, before the start or in the middle.
 
-A tag is calibrated by a flight of last week, without ground truth; the anchors change; another flight is recorded. Each recording is judged with
-the calibration of last week, and as if there were none. A change costs what it adds to the 3D RMSE from 5 s after it on. Measured flights have
-no change: whatever is named there is false."""
+A tag is calibrated by a flight of last week, without ground truth; the anchors change; another flight is recorded. Each recording is
+judged with the calibration of last week, and as if there were none. A change costs what it adds to the 3D RMSE from 5 s after it on.
+Measured flights have no change: whatever is named there is false."""
 
 from dataclasses import replace
 from functools import partial
@@ -12,13 +12,10 @@ import re
 import numpy as np
 
 from uwb_tdoa_bias.foundation.files import write_text
-from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.estimator import Estimator
+from uwb_tdoa_ekf.results import concatenated, rows_of
 from uwb_tdoa_tools import options, parallel
-from uwb_tdoa_tools.checking.check import check
-from uwb_tdoa_tools.checking.recording import of_flight
-from uwb_tdoa_tools.checking.watch import CHANGED, DISPLACED, EXCHANGED
 from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
 from uwb_tdoa_tools.estimate import FlightEstimator
 from uwb_tdoa_tools.localizing.belief import GOOD, believe
@@ -33,7 +30,6 @@ MIDDLE = 0.4, 0.6  # of the recording, between which it happens on the way
 SECONDS = 60.0  # of a flight
 MATTERS = 0.05  # m, by which a change must make the position worse
 SETTLED, LANDING = 8.0, 5.0  # s after the start, and before the end, that are not judged
-NAMING = CHANGED, EXCHANGED, DISPLACED, "anchor_moved", "ids_swapped"
 TAPE = 0.05  # m
 STEP = 0.5  # s between two looks at what is said live
 _NAMED = re.compile(r"two anchors are exchanged, \d+ and \d+|anchor \d+(?=: | is not where| does not stand| is later)|the ids of two")
@@ -43,23 +39,26 @@ def add_options(add):
     """add : add_argument of a parser."""
     add("measured", nargs="*", metavar="FLIGHT", help="measured flights, in which nothing was moved")
     options.add_reading(type("", (), {"add_argument": staticmethod(add)}))
-    add("--draws", type=whole_number, default=10, metavar="N", help="recordings of each kind, and twice as many without a change (default 10)")
+    words = "recordings of each kind, and twice as many without a change (default 10)"
+    add("--draws", type=whole_number, default=10, metavar="N", help=words)
     add("--first", type=int, default=1000, metavar="SEED", help="of the first draw (default 1000; limits were set on draws below 100)")
     add("--json", metavar="FILE", help="write what was said of each")
-    parallel.add_options(type("", (), {"add_argument": staticmethod(add)}))
+    add("--jobs", type=whole_number, default=1, metavar="N", help="recordings at once (default 1)")
 
 
 def run(args):
     """Print two tables, of what is named, and of where moved anchors are found."""
     seeds = range(args.first, args.first + args.draws)
-    cases = [(kind, seed) for kind in KINDS for seed in (seeds if kind != KINDS[-1] else range(args.first, args.first + 2 * args.draws))]
+    cases = [(kind, seed) for kind in KINDS[:-1] for seed in seeds]
+    cases += [(KINDS[-1], seed) for seed in range(args.first, args.first + 2 * args.draws)]
     rows = [row for told in parallel.over(judge, cases, args.jobs, unit="recording") for row in told]
     reading = options.reading_of(args)
     found = reading.find(args.measured) if args.measured else []
     rows += parallel.over(partial(measured, reading), found, args.jobs, unit="flight")
     if args.json:
         write_text(args.json, json.dumps(rows, indent=1))
-    print("| change | survey | recordings | it costs more than 5 cm | named then: check | localize | live | the right one alone: check | localize | live |")
+    print("| change | survey | recordings | it costs more than 5 cm | named then: check | localize | live ", end="")
+    print("| the right one alone: check | localize | live |")
     print("|---|---|" + 8 * "---:|")
     for kind, calibrated in dict.fromkeys((row["kind"], row["calibrated"]) for row in rows):
         some = [row for row in rows if (row["kind"], row["calibrated"]) == (kind, calibrated)]
@@ -69,7 +68,8 @@ def run(args):
         right = ["" if none else sum(row[how] == row["ids"] for row in asked) for how in ("check", "localize", "live")]
         cells = [kind, "calibrated" if calibrated else "tape", len(some), "" if none else len(asked), *named, *right]
         print(f"| {' | '.join(map(str, cells))} |")
-    print("\n| surveyed from | moved anchors | named | within 8 cm | off by, median [m] | another by more than its deviation |\n|---|" + 5 * "---:|")
+    print("\n| surveyed from | moved anchors | named | within 8 cm | off by, median [m] | another by more than its deviation |")
+    print("|---|" + 5 * "---:|")
     for calibrated in (True, False):
         some = [row["surveyed"] for row in rows if "surveyed" in row and row["calibrated"] == calibrated]
         if some:
@@ -126,8 +126,8 @@ def recorded(kind, seed):
         changed = replace(sound, tdoa=replace(sound.tdoa, a=a, b=b))
     if kind.endswith("on the way"):
         since = float(sound.tdoa.t[0] + rng.uniform(*MIDDLE) * np.ptp(sound.tdoa.t))
-        parts = [(part, part.t < since if part is sound.tdoa else part.t >= since) for part in (sound.tdoa, changed.tdoa)]
-        changed = replace(sound, tdoa=Tdoas(*(np.concatenate(both) for both in zip(*([c[rows] for c in vars(part).values()] for part, rows in parts)))))
+        first, last = (rows_of(part, rows) for part, rows in ((sound.tdoa, sound.tdoa.t < since), (changed.tdoa, changed.tdoa.t >= since)))
+        changed = replace(sound, tdoa=concatenated([first, last]))
     return week, sound, changed, ids, shift, since
 
 
@@ -141,14 +141,10 @@ def _flown(seed, path, room, anchors=None):
 def said(flight, estimator):
     """{"check", "localize", "live": ids of the anchors that are named, and "verdict" of localize}."""
     flight = replace(flight, truth=None)
-    findings = check(of_flight(flight), (), estimator).findings
-    belief = believe(flight, estimator(flight), estimator)
-    sentences = [] if belief.level == GOOD else belief.reasons
-    return {
-        "check": _ids([finding.cause for finding in findings if finding.rule in NAMING]),
-        "localize": _ids([sentence.removeprefix("check: ") for sentence in sentences if _NAMED.match(sentence.removeprefix("check: "))]),
-        "live": _ids(live(flight, estimator)), "verdict": belief.level,
-    }  # fmt: skip
+    belief = believe(flight, estimator(flight), estimator)  # its reasons are the findings of `check`
+    named = _ids([sentence.removeprefix("check: ") for sentence in belief.reasons if _NAMED.match(sentence.removeprefix("check: "))])
+    localized = [] if belief.level == GOOD else named
+    return {"check": named, "localize": localized, "live": _ids(live(flight, estimator)), "verdict": belief.level}
 
 
 def live(flight, estimator):

@@ -362,8 +362,9 @@ class Monitor:
         by, std = (", ".join(f"{value:{form}}" for value in values) for values, form in ((one.shift, "+.2f"), (one.std, ".2f")))
         what = f"anchor {number} does not stand where the survey has it, but about ({by}) m from there"
         if one.later and off < SMALLEST_CHANGE:
-            what = f"anchor {number} is later than it was calibrated, by {one.later:+.2f} m, or was moved"
+            what = f"anchor {number} is later than it was calibrated, by {one.later:+.2f} m"
         evidence = f"standard deviations {std} m; {one.odds / math.log(10.0):.0f} powers of ten more probable than that it is not"
+        evidence += "; or it is later than it was calibrated" * one.either
         effects = " --effects effects.yaml" if self._calibrated is not None else ""
         remedy = f"{SURVEYING} --survey anchors.yaml{effects} --out surveyed/  # or measure it again"
         return Finding("anchor_displaced", WARNING, what, evidence, remedy, off)

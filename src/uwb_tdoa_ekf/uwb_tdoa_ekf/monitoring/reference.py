@@ -39,13 +39,14 @@ MORE = TDOA_VARIANCE / TDOA_STD**2
 @dataclass(frozen=True)
 class Displaced:
     """row : of an anchor; shift, std : (3,) m, by how much it stands elsewhere than surveyed; later : m, by how much it is later than
-    calibrated; odds : logarithm of those of the change."""
+    calibrated; odds : logarithm of those of the change; either : whether its being later explains as much as its standing elsewhere."""
 
     row: int
     shift: np.ndarray
     std: np.ndarray
     later: float
     odds: float
+    either: bool
 
 
 class _Cell:
@@ -115,14 +116,20 @@ class SurveyComparison:
         changes = most_likely_changes(parts, covariance, np.zeros(4 * n), possible, ODDS)
         if not changes.found:
             return []
-        part, prior = parts[changes.number], np.linalg.inv(changes.covariance)
+        named = {
+            (POSITION if (POSITION, k) in rivals else what, k): (odds, bool(rivals))
+            for (what, k), (odds, rivals) in changes.found.items()
+        }
+        for places, std in (possible[key] for key in named):  # who cannot be told from a late anchor has rather been moved
+            covariance[places, places] += std**2
+        part, prior = parts[changes.number], np.linalg.inv(covariance)
         inverse = np.linalg.inv(part.gram + prior)
         step, std = inverse @ part.vector, np.sqrt(np.diag(inverse))
         out: dict[int, Displaced] = {}
-        for (what, k), (odds, rivals) in changes.found.items():
+        for (what, k), (odds, either) in named.items():
             places = slice(3 * k, 3 * k + 3)
             later = float(step[3 * n + k]) if what == DELAY else 0.0
-            out.setdefault(k, Displaced(int(rows[k]), step[places], std[places], later, odds))
+            out.setdefault(k, Displaced(int(rows[k]), step[places], std[places], later, odds, either))
         return list(out.values())
 
     def _latest(self) -> tuple[np.ndarray, list[_Cell]]:

@@ -108,7 +108,8 @@ def check(
         flight = ordered.flight().replaced(**recording.sensors)
         run = replace(estimator, smoothed=False)(flight)
         track = run.odometry.t, run.odometry.p
-        tried = together(tried, found_by_monitor(flight, run, estimator), (flight.start, flight.end), line)
+        events = found_by_monitor(flight, run, estimator)
+        tried = together(ordered, tried, events, line)
         explained = set().union(*(EXPLAINS.get(finding.rule, ()) for finding in tried))
         found = [finding for finding in found if finding.rule not in explained] + tried
     if "survey_scale" in names:  # of a room of another size

@@ -58,8 +58,9 @@ def missing(view: CoverageView) -> Iterator[Finding]:
     heard = np.array([window.heard for window in view.windows])
     counts = heard.sum(axis=0)
     near = view.within_reach(heard)
-    lost = view.anchors.ids[(counts == 0) & near.any(axis=0)].tolist()
-    if len(counts) > MANY:  # a tag leaves most of them behind
+    many = len(counts) > MANY  # a tag leaves most of them behind
+    lost = view.anchors.ids[(counts == 0) & (many | near.any(axis=0))].tolist()
+    if many:
         if lost:
             cause = f"the tag never hears {len(lost)} of {len(counts)} anchors, such as {', '.join(map(str, lost[:SAID]))}"
             remedy = "look whether they are on, if the tag was near them: localize --zones says who was heard where"

@@ -53,7 +53,8 @@ class Evaluator:
     def __call__(self, recording: Recording) -> Result:
         flight = self.reading.read(recording)
         need_truth(flight, self.align == NONE)
-        report_remarks(flight.name, () if self.odometry else survey_remarks(flight))
+        told = [] if self.odometry else list(survey_remarks(flight))
+        report_remarks(flight.name, told)
         odometry: Odometry | RecordedOdometry
         residuals: Residuals | None
         if self.odometry:
@@ -71,7 +72,8 @@ class Evaluator:
         scores = {how: Score(flight.name, odometry, one, residuals, flight.tdoa.t) for how, one in truths.items()}
         score, truth = scores[self.align], truths[self.align]
         if found_wrong or (score.row()["diverged"] and not score.row()["late_start"]):
-            report_remarks(flight.name, self._of_anchors(flight) or found_wrong)  # ids and anchors first: the truth is measured better
+            causes = self._of_anchors(flight)  # ids and anchors first: the truth is measured better
+            report_remarks(flight.name, [one for one in causes or found_wrong if one not in told])
         if self.picture:
             from ..scoring.plots import plot_error  # takes a second to import
 

@@ -28,6 +28,7 @@ DELAY_STDS = 0.02, 0.05, 0.1, 0.2, 0.4  # m, that the evidence chooses from wher
 DELAY_STD = 0.1  # m, of the delay of an anchor that the last calibration did not have
 TAG_DELAY = 0.5  # m, of what all ranges are too long by, the antenna delay of the tag: a TDOA does not know of it
 FUNCTION_STDS = 0.003, 0.03, 0.06, 0.1, 0.15, 0.22, 0.3  # m, the same of functions of the place
+ANYWHERE = 1.0  # m, standard deviation of a coordinate of an anchor that has moved, once that is plain
 LOOSE = 0.05  # m, standard deviation of delays in a preliminary solution
 
 
@@ -119,8 +120,11 @@ def solve(gram: np.ndarray, vector: np.ndarray, prior: Prior, offset: np.ndarray
         evidences = [most_probable(parts, prior.with_delays(std), offset)[0] for std in DELAY_STDS]
         delay_std = next(std for std, evidence in zip(DELAY_STDS, evidences) if evidence >= max(evidences) - np.log(ODDS))
         unchanged = prior.with_delays(delay_std)
-    changes = most_likely_changes(parts, unchanged, offset, prior.changes())
-    found = posterior(parts[changes.number], changes.covariance, offset)
+    changes, possible = most_likely_changes(parts, unchanged, offset, prior.changes()), prior.changes()
+    covariance = changes.covariance.copy()
+    for places in (possible[key][0] for key in changes.found if key[0] == POSITION):
+        covariance[places, places] += ANYWHERE**2
+    found = posterior(parts[changes.number], covariance, offset)
     return replace(found, delay_std=delay_std, changed={key: rivals for key, (_, rivals) in changes.found.items()})
 
 
