@@ -5,7 +5,9 @@ import sys
 
 from uwb_tdoa_tools import cli
 
-from studies import aids, calibrating, crazyflie, fuzz, localizing, noise, ranges, recalibrating, rover, scale, situations, surveying
+from studies import (
+    aids, calibrating, crazyflie, fuzz, localizing, moved_anchors, noise, ranges, recalibrating, rover, scale, situations, surveying,
+)  # fmt: skip
 from studies.checking import figures as checking
 from studies.checking import in_flight
 from studies.closed_loop import experiment
@@ -33,6 +35,7 @@ STUDIES = {
     "fuzz": fuzz,
     "in-flight": in_flight,
     "localizing": localizing,
+    "moved-anchors": moved_anchors,
     "noise": noise,
     "random-splits": splits,
     "ranges": ranges,
@@ -62,6 +65,7 @@ of measured flights: flights/, util/, surveys/.
   fuzz             changed files of every kind, given to every reader (docs/reliability.md)
   in-flight        the same mistakes played to ekf_node, and what it says of them (docs/connect.md)
   localizing       what localize says of flights, against their ground truth (docs/localizing.md)
+  moved-anchors    anchors that were moved or exchanged, and who names them (docs/localizing.md)
   noise            whether covariances are honest after a calibration (docs/calibration.md)
   random-splits    bias models trained on flights drawn at random, and judged on the others (docs/bias.md)
   ranges           simulated distances to anchors against the bound of plan (docs/sensors.md)
@@ -103,6 +107,7 @@ def parser():
         "./dev study fuzz --count 20000",
         "./dev study in-flight DATA/flights/0426/0426-traj5 --survey DATA/surveys --only nothing sign",
         "./dev study localizing DATA/flights DATA/util --survey DATA/surveys --mistakes",
+        "./dev study moved-anchors DATA/flights --survey DATA/surveys --draws 10 --json moved.json",
         "./dev study noise --data DATA --split const1",
         "./dev study random-splits DATA/flights/0426 --survey DATA/surveys --out splits.jsonl",
         "./dev study ranges --flights 5",

@@ -1,19 +1,23 @@
 import numpy as np
 import pytest
 
+from uwb_tdoa_bias.effects import Covariance
 from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_ekf.evidence import keys_of
 from uwb_tdoa_ekf.core.verdicts import INVALID, REJECTED, USED
 from uwb_tdoa_ekf.monitoring.monitor import Monitor
 from uwb_tdoa_ekf.results import Odometry, Residuals
 
 ANCHORS = Anchors.from_positions(np.random.default_rng(0).uniform(-4, 4, (6, 3)), ids=[3, 5, 7, 9, 11, 13])
 IDS, RATE = ANCHORS.ids, 100  # Hz
+CALIBRATED = Covariance(keys_of(IDS), np.diag(np.repeat([0.03**2, 0.02**2], [18, 6])))  # coordinates within 3 cm, delays within 2
 
 
-def watch(delays_at, gyro=lambda t: 0.0, noise=0.06, seconds=60, seed=1, moving=True, heard=lambda t, a, b: t == t, rejected=lambda t: 0.0):
+def watch(delays_at, gyro=lambda t: 0.0, noise=0.06, seconds=60, seed=1, moving=True, heard=lambda t, a, b: t == t, rejected=lambda t: 0.0,
+          calibrated=None):  # fmt: skip
     """[(s, alarms)] of a flight in which the anchors have delays_at(t, p) (6,) m; 100 TDOAs a second in a ring. The tag flies
     rounds of 10 s; the filter knows where it is, and rejects that share of the TDOAs."""
-    return played(Monitor(ANCHORS), delays_at, gyro, noise, seconds, seed, moving, heard, rejected)
+    return played(Monitor(ANCHORS, calibrated), delays_at, gyro, noise, seconds, seed, moving, heard, rejected)
 
 
 def played(monitor, delays_at, gyro=lambda t: 0.0, noise=0.06, seconds=60, seed=1, moving=True, heard=lambda t, a, b: t == t,
@@ -38,6 +42,7 @@ def played(monitor, delays_at, gyro=lambda t: 0.0, noise=0.06, seconds=60, seed=
         monitor.add(odometry, Residuals(t[kept], IDS[a][kept], IDS[b][kept], innovation[kept], noise**2 * one, one, verdict))
         monitor.update(second + 1.0)
         said.append((second + 1.0, monitor.alarms))
+    watch.history = monitor.history
     return said
 
 
@@ -181,11 +186,51 @@ def test_does_not_depend_on_when_it_is_asked():
 
 def test_a_swap_is_named_until_something_else_has_been_true_for_a_while(monkeypatch):
     """Text flipped between two pairs and "running" from one half second to the next."""
-    answers = iter([(), (3, 4), *5 * [(1, 2)], (), (3, 4), (1, 2), (), (3, 4), *12 * [()], *20 * [(3, 4)]])
-    monkeypatch.setattr("uwb_tdoa_ekf.monitoring.monitor.swapped", lambda *_: next(answers, (3, 4)))
+    odd = [(), (3, 4), (1, 2), (), (1, 2)]
+    answers = iter([*odd, *8 * [(1, 2)], *odd, *6 * [(1, 2)], *16 * [()], *16 * [(3, 4)]])
+
+    def left(*_):
+        best = next(answers)
+        return {key: 0.1 if key == best else 1.0 for key in ((), (1, 2), (3, 4))}
+
+    monkeypatch.setattr("uwb_tdoa_ekf.monitoring.monitor.residuals_of", left)
     monitor, named = Monitor(ANCHORS), []
-    for _ in range(44):
+    for _ in range(56):
         monitor._look_for_swap(np.zeros(1, int), np.ones(1, int), np.zeros(1), np.zeros(3))
         named.append(monitor._swapped)
     kept = [pair for k, pair in enumerate(named) if k == 0 or pair != named[k - 1]]
     assert kept == [(), (1, 2), (), (3, 4)] and named.count((1, 2)) > 12
+
+
+@pytest.mark.parametrize("row", [1, 4])
+def test_names_an_anchor_that_was_moved_before_the_start_and_where_it_stands(row):
+    """Nothing was said of it for as long as the flight lasted: nothing changed in flight."""
+    shift = np.array([0.4, -0.5, 0.3])
+
+    def delays(t, p):
+        true = ANCHORS.positions + shift * only(row, 1.0)[:, None]
+        return np.linalg.norm(p - true, axis=1) - np.linalg.norm(p - ANCHORS.positions, axis=1)
+
+    said = watch(delays, seconds=60, calibrated=CALIBRATED)
+    assert said[-1][1]
+    for _, alarms in said:
+        assert all(alarm.startswith(f"anchor {IDS[row]} does not stand where the survey has it") for alarm in alarms)
+    assert "survey RECORDING --survey anchors.yaml --effects effects.yaml" in said[-1][1][0]
+    found = [float(number) for number in said[-1][1][0].partition("(")[2].partition(")")[0].split(",")]
+    assert np.linalg.norm(found - shift) < 0.3
+
+
+def test_an_anchor_that_is_late_for_the_last_calibration_is_named_and_what_the_calibration_knows_counts():
+    unknown, known = (watch(lambda t, p: only(3, 0.35), seconds=50, calibrated=of)[-1][1] for of in (None, CALIBRATED))
+    assert unknown == [] and len(known) == 1 and known[0].startswith("anchor 9 ") and "--effects effects.yaml" in known[0]
+
+
+def test_history_says_when_each_finding_stood():
+    said = watch(lambda t, p: only(0, 0.5 * (25.0 < t < 35.0)))
+    (event,) = watch.history
+    assert said[32][1] and event.finding.rule == "anchor_changed" and 25.0 < event.since < 33.0 and 34.0 < event.until < 42.0
+
+
+def test_who_is_moved_in_flight_is_not_said_to_have_been_elsewhere_before():
+    said = watch(lambda t, p: only(2, 0.5 * (t > 30.0)))
+    assert not any("does not stand" in alarm for _, alarms in said for alarm in alarms)

@@ -47,7 +47,7 @@ class Pipeline:
         self._anchors, self._effects, self._records = anchors, effects, records
         self.state = self._new_state()
         self._corrections = RadioCorrections(effects, anchors)
-        self.monitor = Monitor(anchors) if watched or config.compensate_changes else None
+        self.monitor = Monitor(anchors, effects.covariance) if watched or config.compensate_changes else None
         self.configure(config)
 
     def configure(self, config: FilterConfig) -> None:

@@ -38,7 +38,7 @@ def warm_up() -> None:
     SurveyScale(Anchors.from_positions(np.eye(5, 3))).add(np.array([(k, (k + 1) % 5, 1.0) for k in range(5)]))
     detector = ChangeDetector()
     for k in range(YOUNGEST + 2):
-        detector.add(Slice(LENGTH * k, np.zeros(3), np.zeros(1, int), np.zeros(1), np.eye(1)))
+        detector.add(Slice(LENGTH * k, np.zeros(3), np.zeros(1, int), np.zeros(1), np.eye(1), np.eye(1), np.zeros(1)))
     detector.find(0.0)
     estimator.set_pose(4.0, (1.0, 1.0, 1.0), np.eye(3), 0.0, 0.1)
     estimator.finish()

@@ -42,7 +42,7 @@ def test_a_unit_is_undone(healthy, scale, unit):
 @pytest.mark.slow
 def test_swapped_ids_are_undone(healthy):
     one, two = healthy.anchors.ids[[2, 5]].tolist()
-    swapped = tdoa_rules._relabelled(healthy, {one: two, two: one})
+    swapped = tdoa_rules.relabelled(healthy, {one: two, two: one})
     finding, undone = tdoa_rules.best(swapped)
     assert finding.rule == "ids_swapped" and finding.severity == "error"
     assert np.array_equal(undone.tdoa.a, healthy.tdoa.a) and np.array_equal(undone.tdoa.b, healthy.tdoa.b)
@@ -62,8 +62,8 @@ def test_surveys_of_one_room_are_named_together(healthy):
 @pytest.mark.parametrize("table", [{1: 2, 2: 1}, {0: 3, 3: 5, 5: 0}])
 def test_ids_are_replaced_all_at_once(healthy, table):
     back = {new: old for old, new in table.items()}
-    there = tdoa_rules._relabelled(healthy, table)
-    again = tdoa_rules._relabelled(there, back)
+    there = tdoa_rules.relabelled(healthy, table)
+    again = tdoa_rules.relabelled(there, back)
     assert np.array_equal(again.tdoa.a, healthy.tdoa.a) and not np.array_equal(there.tdoa.a, healthy.tdoa.a)
 
 

@@ -9,7 +9,8 @@ from test_diagnosis_regression import named, table_with
 from known_effects import clean_flight, effect_of
 from uwb_tdoa_bias.effects import EFFECTS
 from uwb_tdoa_tools.diagnosis import deviations
-from uwb_tdoa_tools.diagnosis.self_calibration.prior import MOVED, POSITION, Prior, _with_each_change, eliminated, posterior, solve
+from uwb_tdoa_ekf.evidence import MOVED, POSITION, Part, eliminated, with_each_change
+from uwb_tdoa_tools.diagnosis.self_calibration.prior import Prior, posterior, solve
 from uwb_tdoa_tools.diagnosis.regression.confounding import alternatives, unobservable
 from uwb_tdoa_tools.diagnosis.regression.fit import fit
 from uwb_tdoa_tools.diagnosis.regression.held_out import held_out
@@ -76,14 +77,14 @@ def test_what_is_eliminated_is_integrated_out():
 
 def test_what_a_change_would_bring_is_what_a_prior_with_it_says():
     gram, vector = equations(3)
-    part, rng = eliminated(gram, vector, 12, 0.2), np.random.default_rng(2)
+    part, rng = Part(*eliminated(gram, vector, 12, 0.2), 0.2), np.random.default_rng(2)
     root = 0.02 * rng.standard_normal((12, 12))
     covariance, offset = root @ root.T + 1e-4 * np.eye(12), 0.01 * rng.standard_normal(12)
     places = np.array([3, 4, 5])
-    found = _with_each_change([(*part, 0.2)], covariance, offset, {"moved": (places, MOVED)})["moved"]
+    found = with_each_change([part], covariance, offset, {"moved": (places, MOVED)})["moved"]
     wider = covariance.copy()
     wider[places, places] += MOVED**2
-    assert found == pytest.approx(posterior(*part, wider, offset).evidence)
+    assert found == pytest.approx(posterior(part, wider, offset).evidence)
 
 
 def test_among_many_anchors_one_that_is_not_where_the_tape_says_is_named():

@@ -54,6 +54,13 @@ def judging(
     return tool("evaluate", *words) if truth else tool("localize", *words, "--out", "localized/")
 
 
+def surveying(recording: str | Path, survey: str | Path | None = None, effects: str | Path | None = None) -> str:
+    """The line that surveys the anchors with a recording, with the files of a calibration; None for those that there are not."""
+    options = {"--survey": survey, "--effects": effects}
+    words = [recording, *(word for option, file in options.items() if file for word in (option, file))]
+    return tool("survey", *words, "--out", "surveyed/")
+
+
 def nodes(
     anchors: str | Path | None = None, effects: str | Path | None = None, config: str | Path | None = None
 ) -> tuple[str, str]:

@@ -1,13 +1,14 @@
-"""Watches the residuals in flight: what has changed since the flight began? An anchor that is late or early, whose clock
-drifts, that is silent or was exchanged with another; an axis of the IMU.
+"""Watches the residuals, live and of recordings: what is not as it was when the flight began, or as the survey has it? An anchor that is
+late or early, whose clock drifts, that is silent, was exchanged with another or moved; an axis of the IMU.
 
-The innovations of half a second become a Slice, and a ChangeDetector tests the slices. What it finds is named until it has
-gone.
+The innovations of half a second become a Slice. A ChangeDetector compares slices with those before, a SurveyComparison with the survey and
+the calibration. What they find is named until it has gone, and stays in the history.
 """
 
 from __future__ import annotations
 
-from itertools import starmap
+from collections import deque
+from dataclasses import replace
 import math
 from typing import NamedTuple, TYPE_CHECKING
 
@@ -16,17 +17,21 @@ import numpy as np
 from uwb_tdoa_bias.foundation.geometry import tdoa
 
 from ..core.verdicts import REJECTED
-from ..streams import ERROR, Finding
+from ..streams import ERROR, WARNING, Finding
 from .change import ChangeDetector
-from .slices import LENGTH, reduced
+from .reference import Displaced, SurveyComparison
 from .sign_turn import turned
-from .swap import swapped
+from .slices import LENGTH, reduced
+from .swap import clear_exchange, mean_of, residuals as residuals_of
 
 if TYPE_CHECKING:
+    from uwb_tdoa_bias.effects.covariance import Covariance
     from uwb_tdoa_bias.foundation.anchors import Anchors
     from ..installed import Installed
     from ..results import Odometry, Residuals
     from .change import Change
+    from .slices import Slice
+    from .swap import Residuals as SwapResiduals
 
 MOVING = 0.3  # m/s; on the floor, residuals are not those of the air
 SETTLE = 8.0  # s in motion before an onset is looked for
@@ -42,13 +47,18 @@ OFTEN = 0.5  # share of the slices in which it was heard before
 FORGET = 60  # slices between two looks at which of the anchors were passed long ago
 NEARER = 0.8  # share of the distance of the farthest anchor that is heard, within which another must be
 TOGETHER = 4  # slices in which a swap is looked for
-NAMED, HELD = 4, 8  # slices in a row that must say so until a swap is named, and something else until it is no longer
+NAMED, HELD = 4, 8  # slices or comparisons in a row that must say so until it is named, and something else until a swap is no longer
+LOOK, YOUNG = 4, 40  # slices between two comparisons with the survey; and of a comparison with the latest, at least
+SURE = 2.0  # standard deviations by which an anchor must be off the survey, beside SMALLEST_CHANGE
 TURN_APART = 3.0  # s of stamps between two turns of all signs
 # Share of the TDOAs of a slice that the filter accepts where it is right, and s since then, within which signs turn: it is an event. Near a
 # floor, TDOAs that are metres too long may all the time look as if they had the other sign.
 MOST, AGREED = 0.5, 1.1
+MOST_EVENTS = 1000  # that are remembered
 CALIBRATE = 15.0  # s in motion that count as calibration of the IMU
 BIAS_LIMITS = {"gyroscope": 0.03, "accelerometer": 0.6}  # rad/s and m/s^2, by which an estimated bias must have moved
+
+SURVEYING = "survey RECORDING"  # the command that says where it stands
 
 NO_ODOMETRY = [np.empty(0), *[np.empty((0, 3))] * 4]  # t, p, v, gyro_bias, accel_bias
 NO_RESIDUALS = [np.empty(0), *[np.empty(0, int)] * 2, np.empty(0), np.empty(0, bool)]  # t, a, b, innovation, whether it was accepted
@@ -62,12 +72,23 @@ class Heard(NamedTuple):
     farthest: float = 0.0
 
 
+class Event(NamedTuple):
+    """finding : Finding, as it was last; since, until : s, stamps between which it stood."""
+
+    finding: Finding
+    since: float
+    until: float
+
+
 class Monitor:
     """Feed it odometry and residuals, say until which stamp they are complete, ask for `alarms` and `delays`."""
 
-    def __init__(self, anchors: Anchors | Installed) -> None:
-        """anchors : Anchors, or Installed, of which others may be there later."""
-        self._anchors = anchors
+    def __init__(self, anchors: Anchors | Installed, calibrated: Covariance | None = None) -> None:
+        """anchors : Anchors, or Installed, of which others may be there later; calibrated : Covariance of their positions and delays, as
+        of their last calibration, or None."""
+        self._anchors, self._calibrated = anchors, calibrated
+        self._past: deque[Event] = deque(maxlen=MOST_EVENTS)
+        self._standing: dict[str, Event] = {}  # what stands at present, by its key
         self.turns, self._turned = 0, -math.inf  # of the signs of all TDOAs in flight, and the stamp of the last, s
         self._agreed = -math.inf  # s, end of the last slice in which the filter accepted most TDOAs
         self._forget()
@@ -75,12 +96,18 @@ class Monitor:
     def _forget(self) -> None:
         self._odometry: list[list[np.ndarray]] = [NO_ODOMETRY]  # of the present slice and later
         self._residuals: list[list[np.ndarray]] = [NO_RESIDUALS]
+        self._past += self._standing.values()
+        self._standing = {}
         self._end: float | None = None  # s, stamps: at which the present slice ends,
         self._last = -math.inf  # and of what was added last
         self._detector = ChangeDetector()
+        self._displaced: dict[int, Displaced] = {}  # of anchors that are not as surveyed and calibrated, by row,
+        self._suspected: dict[int, int] = {}  # and comparisons in a row that say so
+        self._compare_anew()
         self._changes: dict[int, list[Change]] = {}  # row: Changes of an anchor that is not what it was
+        self._ever_changed: set[int] = set()  # rows
         self._latest_change: Change | None = None  # while its size is still found out
-        self._latest: list[tuple[np.ndarray, ...]] = []  # of the last slices: rows a, b (n,), measured d (n,) m, place (3,) m
+        self._latest: list[SwapResiduals] = []  # of the last slices in which something was far off
         self._slices = 0  # of all
         self._heard: dict[int, Heard] = {}  # by row
         self._counts: list[int] = []  # TDOAs of the last slices
@@ -100,6 +127,9 @@ class Monitor:
         self._heard = {row: was for row, was in self._heard.items() if row not in rows}
         self._changes = {row: found for row, found in self._changes.items() if row not in rows}
         self._silent = tuple(row for row in self._silent if row not in rows)
+        self._displaced = {row: one for row, one in self._displaced.items() if row not in rows}
+        for comparison in self._comparisons:
+            comparison.forget(rows)
         if self._latest_change is not None and self._latest_change.row in rows:
             self._latest_change = None
         if rows & {*self._swapped, *self._instead[0]}:
@@ -161,6 +191,10 @@ class Monitor:
 
     def _test(self, end: float, residuals: list[np.ndarray], odometry: list[np.ndarray]) -> None:
         """One slice that ends at `end`, s: its columns."""
+        self._judge(end, residuals, odometry)
+        self._keep_history(end)
+
+    def _judge(self, end: float, residuals: list[np.ndarray], odometry: list[np.ndarray]) -> None:
         _, a, b, innovation, accepted = residuals
         a, b = self._anchors.index(a), self._anchors.index(b)
         t, p, v, gyro_bias, accel_bias = odometry
@@ -179,8 +213,28 @@ class Monitor:
         place = p.mean(axis=0)
         swap = self._look_for_swap(a, b, innovation, place) or self._swapped
         if not swap and accepted.mean() >= FEWEST_ACCEPTED:
-            self._detector.add(reduced(end - 0.5 * LENGTH, place, self._anchors.positions, a, b, innovation))
+            piece = reduced(end - 0.5 * LENGTH, place, self._anchors.positions, a, b, innovation)
+            self._detector.add(piece)
             self._look_for_change(end)
+            if np.linalg.norm(v, axis=1).max() > MOVING:
+                self._compare(piece)
+
+    def _compare(self, piece: Slice) -> None:
+        """Compare the flight, with a Slice more, with the survey; an anchor that has changed in flight is named by that alone."""
+        delays = self._detector.delays_at(piece.t, piece.rows)
+        if delays.any():
+            piece = replace(piece, vector=piece.vector - piece.information @ delays)
+        if self._compared % YOUNG == 0 and self._calibrated is not None:  # what moved on the way stood right for long
+            self._comparisons = [self._comparisons[0], *self._comparisons[1:][-1:], self._new_comparison()]
+        for comparison in self._comparisons:
+            comparison.add(piece)
+        self._compared += 1
+        if self._compared % LOOK:
+            return
+        displaced = [one for comparison in reversed(self._comparisons[:2]) for one in comparison.find() if _matters(one)]
+        found = {one.row: one for one in displaced if one.row not in self._ever_changed}
+        self._suspected = {row: self._suspected.get(row, 0) + 1 for row in found}
+        self._displaced = {row: one for row, one in found.items() if self._suspected[row] >= NAMED}
 
     def _look_for_change(self, end: float) -> None:
         change = self._detector.find(self._moving_since + SETTLE)
@@ -188,21 +242,40 @@ class Monitor:
             self._detector.compensate(change)
             self._changes[change.row] = [*self._changes.get(change.row, ()), change]
             self._latest_change = change
+            self._ever_changed.add(change.row)
+            self._compare_anew()
         elif self._latest_change is not None:
             self._latest_change = self._detector.refined(self._latest_change)
         delays = self._detector.delays_at(end, [*self._changes])
         self._changes = {row: found for (row, found), delay in zip(self._changes.items(), delays) if abs(delay) > SMALLEST_CHANGE}
 
+    def _compare_anew(self) -> None:
+        """What was not as it is now says nothing of the survey."""
+        self._comparisons = [self._new_comparison()]  # with all slices, and with the last YOUNG to 2 YOUNG, and YOUNG at most
+        self._displaced, self._suspected, self._compared = {}, {}, 0
+
+    def _new_comparison(self) -> SurveyComparison:
+        return SurveyComparison(self._anchors, self._calibrated)
+
     def _look_for_swap(self, a: np.ndarray, b: np.ndarray, innovation: np.ndarray, place: np.ndarray) -> bool:
-        """Whether this slice looks like one: it is named once several do."""
-        positions = self._anchors.positions
-        measured = innovation + tdoa(place, positions[a], positions[b])
-        self._latest = [*self._latest[1 - TOGETHER :], (a, b, measured, np.broadcast_to(place, (len(a), 3)))]
-        found = swapped(positions, *map(np.concatenate, zip(*self._latest)))
+        """Whether this slice looks like one: it is named once several do, and until others say in a row that it is not."""
+        positions, named = self._anchors.positions, self._swapped
+        left = residuals_of(positions, a, b, innovation + tdoa(place, positions[a], positions[b]), place, named)
+        if not left:
+            return False
+        self._latest = [*self._latest[1 - TOGETHER :], left]
+        mean = mean_of(self._latest)
+        found = clear_exchange(mean) if len(self._latest) == TOGETHER else ()
+        if found == named or (named and not found and mean.get(named, 0.0) < mean[()]):
+            self._instead = (), 0
+            return bool(found)
         other, count = self._instead
         self._instead = found, count + 1 if found == other else 1
-        if self._instead[1] >= (HELD if self._swapped else NAMED):
-            self._swapped = found
+        if self._instead[1] >= (HELD if named else NAMED):
+            self._swapped, self._instead = found, ((), 0)
+            self._changes = {row: changes for row, changes in self._changes.items() if row not in found}
+            self._ever_changed |= set(found)
+            self._compare_anew()
         return bool(found)
 
     def _listen(self, a: np.ndarray, b: np.ndarray, place: np.ndarray | None) -> None:
@@ -238,29 +311,46 @@ class Monitor:
         self._bias_now = bias
 
     @property
-    def alarms(self) -> list:
-        """Sentences on what has changed; empty while nothing has."""
-        swaps = [self._swap(*self._anchors.ids[[*self._swapped]])] if self._swapped else []
-        return [*swaps, *starmap(self._sentence, self._changes.items()), *self._silence(), *self._axis_alarms()]
+    def alarms(self) -> list[str]:
+        """Sentences on what has changed, and on what is not as surveyed; empty while nothing is."""
+        return [*(finding.brief for finding in self._found().values()), *self._axis_alarms()]
 
     @property
     def exchanged(self) -> Finding | None:
         """Finding on two anchors that were exchanged, or None."""
-        if not self._swapped:
-            return None
+        return self._swap() if self._swapped else None
+
+    def _found(self) -> dict[str, Finding]:
+        """{key: Finding} of anchors, of what stands at present."""
+        found = {f"exchanged {self._swapped}": self._swap()} if self._swapped else {}
+        found |= {f"changed {row}": self._change(row, changes) for row, changes in self._changes.items()}
+        found |= {f"silent {row}": self._silence(row) for row in self._silent}
+        return found | {f"displaced {row}": self._displacement(one) for row, one in self._displaced.items()}
+
+    @property
+    def history(self) -> list[Event]:
+        """All Events of anchors, in the order in which they began."""
+        return sorted([*self._past, *self._standing.values()], key=lambda event: event.since)
+
+    def _keep_history(self, end: float) -> None:
+        """Enter what stands at a stamp, s."""
+        before, found = self._standing, self._found()
+        self._past += [event for key, event in before.items() if key not in found]
+        self._standing = {key: Event(finding, before[key].since if key in before else end, end) for key, finding in found.items()}
+
+    def _swap(self) -> Finding:
         one, other = self._anchors.ids[[*self._swapped]].tolist()
-        evidence = "each TDOA with one of them fits the place of the other"
-        remedy = "correct their ids, or their positions on uwb/anchors"
-        return Finding("ids_exchanged", ERROR, f"two anchors are exchanged, {one} and {other}", evidence, remedy, float(one))
+        what = f"two anchors are exchanged, {one} and {other}"
+        evidence, remedy = "each TDOA with one of them fits the place of the other", "correct their ids, or their positions on uwb/anchors"
+        return Finding("ids_exchanged", ERROR, what, evidence, remedy, float(one))
 
-    def _swap(self, one: int, other: int) -> str:
-        return f"two anchors are exchanged, {one} and {other}: correct their ids, or their positions on uwb/anchors"
+    def _silence(self, row: int) -> Finding:
+        number = self._anchors.ids[row]
+        what = f"anchor {number} is not heard any more"
+        return Finding("anchor_silent", WARNING, what, "others as far away are heard", "check its power and sight", float(number))
 
-    def _silence(self) -> list:
-        return [f"anchor {self._anchors.ids[row]} is not heard any more: check its power and sight" for row in self._silent]
-
-    def _sentence(self, row: int, found: list[Change]) -> str:
-        end = self.end
+    def _change(self, row: int, found: list[Change]) -> Finding:
+        end, number = self.end, self._anchors.ids[row]
         size = float(self._detector.delays_at(end, [row])[0])
         again = [change for change in found if change.at(end) * size > 0.0]  # further in the same direction
         if found[-1].slope or len(again) > 1:
@@ -269,7 +359,22 @@ class Monitor:
             what = "it is late: blocked (NLOS), moved, or its delay has changed"
         else:
             what = "it is early: moved, or its delay has changed"
-        return f"anchor {self._anchors.ids[row]}: {size:+.2f} m since the start of the flight: {what}"
+        cause = f"anchor {number}: {size:+.2f} m since the start of the flight: {what}"
+        remedy = "look at it; survey it again if it was moved"
+        return Finding("anchor_changed", WARNING, cause, "no error of the position explains that", remedy, size)
+
+    def _displacement(self, one: Displaced) -> Finding:
+        number = self._anchors.ids[one.row]
+        off = float(np.linalg.norm(one.shift))
+        by, std = (", ".join(f"{value:{form}}" for value in values) for values, form in ((one.shift, "+.2f"), (one.std, ".2f")))
+        what = f"anchor {number} does not stand where the survey has it, but about ({by}) m from there"
+        if one.later and off < SMALLEST_CHANGE:
+            what = f"anchor {number} is later than it was calibrated, by {one.later:+.2f} m"
+        evidence = f"standard deviations {std} m; {one.odds / math.log(10.0):.0f} powers of ten more probable than that it is not"
+        evidence += "; or it is later than it was calibrated" * one.either
+        effects = " --effects effects.yaml" if self._calibrated is not None else ""
+        remedy = f"{SURVEYING} --survey anchors.yaml{effects} --out surveyed/  # or measure it again"
+        return Finding("anchor_displaced", WARNING, what, evidence, remedy, off)
 
     def _axis_alarms(self) -> list:
         if self._bias is None or self._bias_now is None:
@@ -281,6 +386,12 @@ class Monitor:
                     unit = "rad/s" if name == "gyroscope" else "m/s^2"
                     out.append(f"{name} {axis}: bias moved by {value:+.3f} {unit} since the start of the flight")
         return out
+
+
+def _matters(one: Displaced) -> bool:
+    """Whether an anchor is off by more than does not matter, and more than by chance."""
+    off = float(np.linalg.norm(one.shift))
+    return max(off, abs(one.later)) > SMALLEST_CHANGE and (bool(one.later) or off > SURE * float(np.linalg.norm(one.std)) / math.sqrt(3.0))
 
 
 def _is_clear(change: Change) -> bool:

@@ -25,13 +25,16 @@ MOST = 100  # anchors of a slice; where more are heard, those that are heard lea
 class Slice:
     """t : s, its middle; p : (3,) m, where the filter had the tag; rows : (H,) of the anchors that were heard, MOST at most;
     delays : (H,) m, their least mean square estimate; response : (H, H), what a metre of delay of each anchor (column) makes of
-    the estimate. An anchor that was not heard has neither."""
+    the estimate. An anchor that was not heard has neither. information (H, H) 1/m^2, vector (H,) 1/m : what the TDOAs alone tell of the
+    delays, at whatever place."""
 
     t: float
     p: np.ndarray
     rows: np.ndarray
     delays: np.ndarray
     response: np.ndarray
+    information: np.ndarray
+    vector: np.ndarray
 
 
 def reduced(
@@ -51,7 +54,7 @@ def reduced(
     information = information - of_place @ gain
     vector = vector - gain.T @ (direction.T @ vector)
     both = np.linalg.solve(information + np.eye(n) / DELAY_STD**2, np.column_stack([vector, information]))
-    return Slice(t, p, rows, both[:, 0], both[:, 1:])
+    return Slice(t, p, rows, both[:, 0], both[:, 1:], information, vector)
 
 
 def _heard_most(

@@ -42,6 +42,11 @@ class Finding:
         """All of it in one line, for /diagnostics."""
         return f"{self.cause} ({self.evidence}): {' '.join(self.remedy.split())}"
 
+    @property
+    def brief(self) -> str:
+        """The same without the evidence."""
+        return f"{self.cause}: {' '.join(self.remedy.split())}"
+
     def position_wrong(self, imu_used: bool = True) -> bool:
         """Return whether it makes the position wrong. imu_used : whether the filter uses the IMU."""
         if self.severity != ERROR or (self.rule == "ids_unknown" and self.value < FEW_UNKNOWN):

@@ -10,11 +10,13 @@ import numpy as np
 from uwb_tdoa_bias.foundation.sensors import SENSORS
 from uwb_tdoa_ekf.streams import ERROR, NOTE, WARNING, Finding, StreamRules, most_severe_first
 
+from ..estimate import FlightEstimator
 from ..readers.streams import protocol
 from . import coverage, imu_rules, labels, tag_delay, tdoa_rules, wiring
 from .ordered import OrderedRecording
 from .survey_fit import displacement
 from .tdoa_rules import SAME, furthest
+from .watch import found_by_monitor, together
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -79,8 +81,11 @@ class Report:
         return any(finding.severity == ERROR for finding in self.findings)
 
 
-def check(recording: Recording, others: Sequence[Survey] = ()) -> Report:
-    """Report of a Recording. others : [(name, Anchors)] of other surveys that might be the right one."""
+def check(
+    recording: Recording, others: Sequence[Survey] = (), estimator: FlightEstimator = FlightEstimator(), line: str | None = None
+) -> Report:
+    """Report of a Recording. others : [(name, Anchors)] of other surveys that might be the right one; estimator : FlightEstimator, with
+    what is calibrated; line : command that surveys the anchors with the recording, or None."""
     streams = fed(recording)
     found = [*streams.findings(), *sensors(recording)]
     for rule in (*labels.RULES, *wiring.RULES, *tag_delay.RULES):
@@ -90,7 +95,7 @@ def check(recording: Recording, others: Sequence[Survey] = ()) -> Report:
     if not len(recording.tdoa):  # of ranges alone: nothing else is there to be tried
         return Report(recording.name, most_severe_first(found), _facts(recording, streams), recording.ends)
     names = {finding.rule for finding in found}
-    places, explained = np.empty((0, 3)), set()
+    places, explained, track = np.empty((0, 3)), set(), None
     if names & NOTHING_TO_TRY:
         cause, remedy = (
             "sign, ids, survey and axes were not tried",
@@ -98,12 +103,18 @@ def check(recording: Recording, others: Sequence[Survey] = ()) -> Report:
         )
         found.append(Finding("not_tried", NOTE, cause, "the streams are of no use for that", remedy, np.nan))
     else:
-        tried, places = _tried(_undone(OrderedRecording.of(recording), found), names, others)
+        ordered = _undone(OrderedRecording.of(recording), found)
+        tried, places = _tried(ordered, names, others)
+        flight = ordered.flight().replaced(**recording.sensors)
+        run = replace(estimator, smoothed=False)(flight)
+        track = run.odometry.t, run.odometry.p
+        events = found_by_monitor(flight, run, estimator)
+        tried = together(ordered, tried, events, line)
         explained = set().union(*(EXPLAINS.get(finding.rule, ()) for finding in tried))
         found = [finding for finding in found if finding.rule not in explained] + tried
     if "survey_scale" in names:  # of a room of another size
         places = np.empty((0, 3))
-    view = coverage.CoverageView(recording.anchors, list(streams.tdoa), places, "height" in recording.sensors)
+    view = coverage.CoverageView(recording.anchors, list(streams.tdoa), places, "height" in recording.sensors, track)
     for covered in coverage.RULES:
         found += (finding for finding in covered(view) if finding.rule not in explained)
     return Report(recording.name, most_severe_first(found), _facts(recording, streams), recording.ends)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_ekf.monitoring.monitor import NEARER
 from uwb_tdoa_ekf.streams import NOTE, WARNING, Finding
 
 from .known_path import MANY
@@ -31,12 +32,23 @@ PART = 0.2  # of the seconds in which the side is not known, beyond which that i
 @dataclass(frozen=True)
 class CoverageView:
     """anchors : Anchors; windows : [TdoaWindow]; places (k, 3) m, where the tag was located, none if that was not
-    tried; height_known : whether something measures its height."""
+    tried; height_known : whether something measures its height; track : (t (k,) s, p (k, 3) m) of the tag, or None."""
 
     anchors: Anchors
     windows: list[TdoaWindow]
     places: np.ndarray
     height_known: bool = False
+    track: tuple[np.ndarray, np.ndarray] | None = None
+
+    def within_reach(self, heard: np.ndarray) -> np.ndarray:
+        """(W, N) bool: windows in which the tag is near enough to an anchor to hear it, by how far away it hears others. heard (W, N) :
+        TDOAs. All of them if the track is not known."""
+        if self.track is None or len(self.track[0]) < 2:
+            return np.ones(heard.shape, bool)
+        t = np.array([0.5 * (window.stamps.begin + window.stamps.end) for window in self.windows])
+        place = np.column_stack([np.interp(t, self.track[0], column) for column in self.track[1].T])
+        away = np.linalg.norm(place[:, None] - self.anchors.positions, axis=2)
+        return away <= NEARER * np.max(away, where=heard > 0, initial=0.0)
 
 
 def missing(view: CoverageView) -> Iterator[Finding]:
@@ -45,8 +57,10 @@ def missing(view: CoverageView) -> Iterator[Finding]:
         return
     heard = np.array([window.heard for window in view.windows])
     counts = heard.sum(axis=0)
-    lost = view.anchors.ids[counts == 0].tolist()
-    if len(counts) > MANY:  # a tag leaves most of them behind
+    near = view.within_reach(heard)
+    many = len(counts) > MANY  # a tag leaves most of them behind
+    lost = view.anchors.ids[(counts == 0) & (many | near.any(axis=0))].tolist()
+    if many:
         if lost:
             cause = f"the tag never hears {len(lost)} of {len(counts)} anchors, such as {', '.join(map(str, lost[:SAID]))}"
             remedy = "look whether they are on, if the tag was near them: localize --zones says who was heard where"
@@ -56,11 +70,12 @@ def missing(view: CoverageView) -> Iterator[Finding]:
         cause = f"anchors of the survey that the tag never hears: {', '.join(map(str, lost))}"
         remedy = "switch them on, or take them out of the survey"
         yield Finding("anchor_missing", WARNING, cause, f"{len(lost)} of {len(counts)}", remedy, float(len(lost)))
-    for row in np.flatnonzero(counts > 0):
-        share = counts[row] / np.median(counts[counts > 0])
+    rates = counts / np.maximum(near.sum(axis=0), 1)
+    for row in np.flatnonzero((counts > 0) & near.any(axis=0)):
+        share = rates[row] / np.median(rates[counts > 0])
         number = int(view.anchors.ids[row])
         remedy = f"look at anchor {number}: power, line of sight"
-        since, until = _silence(view.windows, heard[:, row])
+        since, until = _silence(view.windows, (heard[:, row] > 0) | ~near[:, row])
         if until - since > SILENT:
             evidence = f"{until - since:.0f} s from {since:.1f} s on"
             yield Finding("anchor_silent", WARNING, f"anchor {number} falls silent", evidence, remedy, until - since)
@@ -70,10 +85,10 @@ def missing(view: CoverageView) -> Iterator[Finding]:
 
 
 def _silence(windows: Sequence[TdoaWindow], heard: np.ndarray) -> tuple[float, float]:
-    """(first, last stamp or arrival) of the longest run of windows without the anchor; (0, 0) if there is none."""
+    """(first, last stamp or arrival) of the longest run of windows that are not `heard`, (W,) bool; (0, 0) if there is none."""
     longest, begin = (0.0, 0.0), None
-    for window, count in zip(windows, heard):
-        if count:
+    for window, there in zip(windows, heard):
+        if there:
             begin = None
             continue
         begin = window.stamps.begin if begin is None else begin

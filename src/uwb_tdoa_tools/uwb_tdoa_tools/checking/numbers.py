@@ -23,7 +23,8 @@ def numbers(flight: Flight) -> list[Finding]:
     rules name by the same name is reported once."""
     streams, imu = fed(of_flight(flight)), flight.imu
     found = streams.findings()
-    found += coverage.missing(coverage.CoverageView(flight.anchors, list(streams.tdoa), np.empty((0, 3))))
+    track = None if flight.truth is None else (flight.truth.t, flight.truth.p)
+    found += coverage.missing(coverage.CoverageView(flight.anchors, list(streams.tdoa), np.empty((0, 3)), track=track))
     if imu is not None and not any(finding.rule == "imu_clipped" for finding in found):
         found += inertial_values.saturated(flight)
     found = [finding for finding in found if finding.severity != NOTE]

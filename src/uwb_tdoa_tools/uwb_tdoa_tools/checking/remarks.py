@@ -9,9 +9,10 @@ import numpy as np
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .ordered import OrderedRecording
-from .check import different_surveys
+from .check import check, different_surveys
 from .recording import of_flight
 from .tdoa_rules import gained
+from .watch import BEFORE_TRUTH
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
@@ -37,8 +38,10 @@ def survey_remarks(flight: Flight) -> Iterator[str]:
         yield f"the survey has no anchor {_listed(lacking)}: {share:.0f} % of the TDOAs are not used; survey it, too."
     if not (len(tdoa) and np.ptp(tdoa.t) > SHORTEST):
         return
-    if gained(OrderedRecording.of(of_flight(flight)).survey_fit) is not None:
-        yield "the survey does not fit the TDOAs: of another room, or anchors have been moved; `check` says more."
+    recording = of_flight(flight)
+    if gained(OrderedRecording.of(recording).survey_fit) is not None:
+        causes = [f"{one.cause}: {one.evidence}; {one.remedy}." for one in check(recording).findings if one.rule in BEFORE_TRUTH]
+        yield from causes or ["the survey does not fit the TDOAs: of another room, or anchors have been moved; `check` says more."]
 
 
 def _listed(ids: Iterable[int]) -> str:

@@ -143,7 +143,7 @@ def renumbered(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     line = f"id -= {shift}" if (heard - known == shift).all() else f"id = {table}[id]"
     cause = f"the ids of the survey are others: what the tag calls {heard[0]} ... {heard[-1]} "
     cause += f"is {known[0]} ... {known[-1]} there"
-    yield MistakeTrial(_relabelled(recording, table), _says("ids_renumbered", cause, line))
+    yield MistakeTrial(relabelled(recording, table), _says("ids_renumbered", cause, line))
 
 
 def swapped(recording: OrderedRecording) -> Iterator[MistakeTrial]:
@@ -161,14 +161,14 @@ def swapped(recording: OrderedRecording) -> Iterator[MistakeTrial]:
         base, least, best_swap = brief.unexplained(), 1.0 - 0.02 * (1 + len(table)), {}
         for one, two in ((one, two) for one, two in combinations(ids, 2) if one in doubtful or two in doubtful):
             swap = {one: two, two: one}
-            ratio, _ = compare(base, _relabelled(brief, swap).unexplained(least * base.mean))
+            ratio, _ = compare(base, relabelled(brief, swap).unexplained(least * base.mean))
             if ratio < least:
                 least, best_swap = ratio, swap
         if not best_swap:
             break
         table = {i: best_swap.get(table.get(i, i), table.get(i, i)) for i in ids}
         table = {i: k for i, k in table.items() if i != k}
-        brief, trial = _relabelled(brief, best_swap), _relabelled(trial, best_swap)
+        brief, trial = relabelled(brief, best_swap), relabelled(trial, best_swap)
     if not table or (len(table) > 2 and gained(trial.survey_fit) is not None):
         return  # a survey of another room is explained better by exchanging many ids, and still does not fit
     names = ", ".join(f"{i} is {k}" for i, k in sorted(table.items()))
@@ -300,7 +300,7 @@ def _says(rule: str, cause: str, line: str) -> Callable[[float, float], Finding]
     return finding
 
 
-def _relabelled(recording: OrderedRecording, table: dict[int, int]) -> OrderedRecording:
+def relabelled(recording: OrderedRecording, table: dict[int, int]) -> OrderedRecording:
     """Ids replaced as the dict `table` says, all at once."""
     columns = {}
     for name, ids in (("a", recording.tdoa.a), ("b", recording.tdoa.b)):

@@ -15,6 +15,7 @@ from ..checking import report
 from ..checking.check import check, different_surveys
 from ..checking.recording import read_recording
 from ..diagnosis.noise import write_parameters
+from ..estimate import FlightEstimator
 from ..outputs import OutputFolder
 from ..progress import Progress
 
@@ -67,7 +68,7 @@ def _calibrate(args: Namespace) -> int:
     reading = options.reading_of(args, truth=not args.no_truth)
     found, held = reading.find(args.flights), reading.find(args.holdout)
     options.check_holdout((path.resolve() for path, _ in found), (path.resolve() for path, _ in held))
-    if not _checked(reading, found + held, tape.std):
+    if not _checked(reading, found + held, tape.std, FlightEstimator(config, base), args.effects):
         return _stop("check finds an error: put it right first, as said above")
     flights, holdout = reading.flights(args.flights), reading.flights(args.holdout)
     known = [flight.truth is not None for flight in flights + holdout]
@@ -94,13 +95,14 @@ def _calibrate(args: Namespace) -> int:
     return _stop(made.why_not) if made.why_not is not None else _write(made, out, judges, all(known))
 
 
-def _checked(reading: Reading, recordings: Sequence[Recording], std: float) -> bool:
-    """Whether check finds no error in recordings that stops a calibration; says what it finds. std : m, of a coordinate of an anchor."""
+def _checked(reading: Reading, recordings: Sequence[Recording], std: float, estimator: FlightEstimator, effects: str | None) -> bool:
+    """Whether check finds no error in recordings that stops a calibration; says what it finds. std : m, of a coordinate of an anchor;
+    effects : file of those of the FlightEstimator, or None."""
     checked, sound = [], True
     with Progress("calibrate", len(recordings), "recording") as progress:
         for path, survey in recordings:
             checked.append(read_recording(reading, path, survey))
-            result = check(checked[-1])
+            result = check(checked[-1], (), estimator, command_lines.surveying(path, survey, effects))
             cli.show(report.text(result))
             sound = sound and not stopping(checked[-1], result.findings, std)
             progress.update()

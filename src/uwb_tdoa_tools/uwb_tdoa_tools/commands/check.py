@@ -10,10 +10,11 @@ from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
-from .. import cli, options
+from .. import cli, command_lines, options
 from ..checking import report
 from ..checking.check import check, different_surveys
 from ..checking.recording import read_live, read_recording
+from ..estimate import FlightEstimator
 from ..outputs import OutputFile
 from ..progress import Progress
 from ..readers import read_survey
@@ -28,9 +29,11 @@ if TYPE_CHECKING:
 DESCRIPTION = """Check recordings, or live topics, against a survey, before anything else.
 
 Finds what a driver, a survey or a clock may have got wrong: sign and unit of the TDOAs, ids of the anchors, the survey
-of another room, units and axes of the IMU, stamps, rates, repeats, two senders, frames. Each finding has its evidence,
-and a line to copy. Where --survey is a folder, the survey that fits is named, too. Ground truth is not needed, and not
-used. With --live it listens to the topics themselves, and also says who publishes and hears them, and with which QoS.
+of another room, units and axes of the IMU, stamps, rates, repeats, two senders, frames. The monitor of ekf_node runs over
+the recording, too: it names anchors that were moved or exchanged, before it or on the way, by the survey, and with
+--effects by the last calibration. Each finding has its evidence, and a line to copy. Where --survey is a folder, the survey
+that fits is named, too. Ground truth is not needed, and not used. With --live it listens to the topics themselves, and also
+says who publishes and hears them, and with which QoS.
 
 Exit code: 0 nothing is wrong (there may be warnings), 1 there are errors, 2 bad input."""
 
@@ -44,11 +47,13 @@ def parser() -> ArgumentParser:
         "check 0425-traj2 --survey anchor_0425.txt",
         "check flights/ --survey surveys/",
         "check flight.bag --survey surveyed_again.yaml --json findings.json",
+        "check today.bag --survey surveyed/anchors.yaml --effects surveyed/effects.yaml",
         "check --live 60",
         "check --live 60 --namespace tag1 --survey anchors.yaml",
         "check tags.bag --topic uwb/tdoa=/tag1/tdoa --topic imu/data=/tag1/imu",
     )
     options.add_recordings(made, nargs="*")
+    options.add_filter(made, "effects.yaml: what is calibrated; its covariance says how well anchors are known")
     made.add_argument("--live", metavar="S", type=float, help="listen to live topics for S seconds instead")
     made.add_argument("--json", metavar="FILE", type=OutputFile, help="write all findings")
     return made
@@ -59,14 +64,15 @@ def _check(args: Namespace) -> int:
         raise InputError("FLIGHT, --live: give recordings, or --live SECONDS, and not both.")
     if args.live is not None and not 0.0 < args.live < math.inf:
         raise InputError(f"--live: {args.live:g} must be a number of seconds above 0, e.g. 60.")
-    reading = options.reading_of(args)
+    reading, estimator = options.reading_of(args), FlightEstimator(*options.filter_of(args))
     surveys = Path(args.survey) if args.survey else None
     others = _surveys(surveys) if surveys and surveys.is_dir() else []
     alone = None if others else surveys
     reports, recordings = [], []
-    for recording in _recordings(args, reading, alone):
+    for recording, path, survey in _recordings(args, reading, alone):
         recordings.append(recording)
-        reports.append(check(recording, others))
+        line = command_lines.surveying(path, survey, args.effects) if path else None
+        reports.append(check(recording, others, estimator, line))
         cli.show(report.text(reports[-1]))
     together = list(different_surveys(recordings))
     for finding in together:
@@ -76,17 +82,20 @@ def _check(args: Namespace) -> int:
     return int(any(one.faulty for one in reports))
 
 
-def _recordings(args: Namespace, reading: Reading, survey: str | Path | None) -> Iterator[Recording]:
-    """Yield the Recording of each, or of what is live. survey : path of the one survey, or None."""
+def _recordings(
+    args: Namespace, reading: Reading, survey: str | Path | None
+) -> Iterator[tuple[Recording, Path | None, str | Path | None]]:
+    """Yield (Recording, its path, that of its survey) of each, or (Recording, None, None) of what is live. survey : path of the one
+    survey, or None."""
     if args.live is not None:
-        yield read_live(reading, args.live, survey, partial(cli.say, "check"))
+        yield read_live(reading, args.live, survey, partial(cli.say, "check")), None, None
     found = reading.find(args.flights)
     with Progress("check", len(found), "flight") as progress:
         for path, its_survey in found:
             recording = read_recording(reading, path, its_survey)
             for remark in recording.remarks:
                 cli.say("check", f"{path}: {remark}")
-            yield recording
+            yield recording, path, its_survey
             progress.update()
 
 

@@ -31,8 +31,9 @@ def parser() -> ArgumentParser:
         "evaluate",
         "Errors of the estimate against ground truth, in metres: in the air (truth z > 0.3 m), and in each phase of the recording,\n"
         "at rest before and after too (without: s with no estimate; step: the largest jump of the error between two estimates).\n"
-        "Runs bias correction and filter here, as the nodes would, or takes a recorded odometry (exit code 1 if TDOAs were\n"
-        "late for it, as far as uwb/residual was recorded too).",
+        "Runs bias correction and filter here, as the nodes would, or takes a recorded odometry.\n\n"
+        "Exit code: 0 done, 1 a run DIVERGED, or TDOAs were late for a recorded odometry (as far as uwb/residual was recorded too),\n"
+        "2 bad input.",
         "evaluate flight.bag",
         "evaluate 0425-traj2 --survey anchor_0425.txt --plot error.png",
         "evaluate flights/ --survey surveys/ --no-bias --json errors.json",
@@ -101,7 +102,7 @@ def _evaluate(args: Namespace) -> int:
     if late := evaluator.late_tdoas():
         cli.say("evaluate", f"{args.odometry}: {late} TDOAs came too late for that filter: this is not what it can do; "
                 "replay it in step with the odometry (replay --follow odometry).")  # fmt: skip
-    return int(late > 0)
+    return int(late > 0 or together["diverged"] > together["late_start"])
 
 
 main = cli.executable(_evaluate, parser)

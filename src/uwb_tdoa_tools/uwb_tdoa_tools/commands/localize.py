@@ -66,7 +66,7 @@ def _localize(args: Namespace) -> int:
     out.mkdir(parents=True, exist_ok=True)
     cli.show(f"correcting with: {estimator.correction}")
     folder, located = out.absolute() if args.dask else out, []
-    localizer = Localizer(reading, estimator, folder, args.bag, args.residuals, rerun, args.zones)
+    localizer = Localizer(reading, estimator, folder, args.bag, args.residuals, rerun, args.zones, args.effects)
     for one in parallel.over(localizer, found, args.jobs, args.dask):
         located.append(one)
         first, *others = one.belief.sentences()

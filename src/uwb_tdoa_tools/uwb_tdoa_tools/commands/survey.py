@@ -9,8 +9,13 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.files import write_text
 
 from .. import cli, command_lines, options
+from ..checking import report
+from ..checking.check import check
+from ..checking.recording import read_recording
+from ..checking.watch import EXCHANGED, FIRST
 from ..diagnosis.noise import write_parameters
 from ..diagnosis.self_calibration import self_calibrate
+from ..estimate import FlightEstimator
 from ..outputs import OutputFolder
 from ..progress import Progress
 from ..surveying.blocked import with_blocked
@@ -18,6 +23,8 @@ from ..surveying.report import as_dict, as_text, picture
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
+    from collections.abc import Sequence
+    from ..readers.inputs import Reading
 
 DESCRIPTION = """Make a tape-measured survey better, from flights alone.
 
@@ -32,7 +39,8 @@ Writes anchors.yaml and anchors.csv (for --survey, anchors_file and the rest), e
 anchors, and how well all is known), ekf_node.yaml (noise of TDOAs that the filter should assume with them), survey.json
 (covariance) and survey.png (before and after) to --out.
 
-Exit code: 0 done; 1 something else is wrong and other anchors might do harm: they stay as given; 2 bad input."""
+Exit code: 0 done; 1 ids, signs or units are wrong, or something else that other anchors might make worse: they stay as given; 2 bad
+input."""
 
 
 def parser() -> ArgumentParser:
@@ -59,7 +67,11 @@ def _survey(args: Namespace) -> int:
     out = args.out
     config, effects = options.filter_of(args)
     base, tape = effects or EffectSet(), options.tape_of(args, effects)
-    flights = options.reading_of(args).flights(args.flights)
+    reading = options.reading_of(args)
+    if not args.unknown and not _ids_are_right(reading, args.flights, FlightEstimator(config, base)):
+        cli.say("survey", "stopped, and nothing is written: ids, signs and units first, as said above; then anchors.")
+        return 1
+    flights = reading.flights(args.flights)
     known = options.known_of(args, flights)
     with Progress("survey") as progress:
         result = self_calibrate(flights, tape, base, config, known, lambda: progress("solving"))
@@ -79,6 +91,17 @@ def _survey(args: Namespace) -> int:
         files = out / "anchors.yaml", out / "effects.yaml", config_file
         cli.show(f"next: {command_lines.judging(args.flights, *files, all(flight.truth is not None for flight in flights))}")
     return 0 if result.why_not is None else 1
+
+
+def _ids_are_right(reading: Reading, paths: Sequence[str], estimator: FlightEstimator) -> bool:
+    """Whether `check` finds none of the mistakes in recordings that look like anchors elsewhere; says which it finds."""
+    found = []
+    for path, survey in reading.find(paths):
+        findings = check(read_recording(reading, path, survey), (), estimator).findings
+        found += [finding for finding in findings if finding.rule in (*FIRST, EXCHANGED)]
+    for finding in found:
+        cli.show(*report.lines(finding))
+    return not found
 
 
 main = cli.executable(_survey, parser)

@@ -12,6 +12,7 @@ from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_bias.effects.covariates import UPWARDS
 from uwb_tdoa_bias.effects.samples import RADIO
 from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_ekf.evidence import OF_ANCHORS
 
 from .channels import CHANNELS, residuals
 from .channels.views import MOST_LINKS
@@ -28,7 +29,7 @@ from .regression.scan import Scan
 from .regression.select import Selection, select, with_rivals
 from .regression.table import table_of
 from .regression.terms import Candidate, candidates_of
-from .self_calibration.prior import OF_ANCHORS, to_keep
+from .self_calibration.prior import to_keep
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Hashable, Sequence

@@ -16,11 +16,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.effects.samples import RADIO
+from uwb_tdoa_ekf.evidence import DELAY, OF_ANCHORS, POSITION, Part, eliminated
 
 from .regression.algebra import beside_each_other, counts, each_times, product, weighted
 from .regression.fit import in_common, prior_sizes
 from .self_calibration.equations import features
-from .self_calibration.prior import DELAY, FUNCTION_STDS, OF_ANCHORS, POSITION, eliminated, posterior
+from .self_calibration.prior import FUNCTION_STDS, posterior
 
 if TYPE_CHECKING:
     from .regression.fit import Fit
@@ -71,7 +72,8 @@ def _beside_others(table: RegressionTable, model: Fit) -> tuple[np.ndarray, np.n
     prior = np.diag(prior_sizes(model.columns) ** 2.0)
 
     def solution(size: float) -> Solution:
-        return posterior(*eliminated(gram, vector, n, np.append(sizes, np.full(functions.shape[1], size))), prior, np.zeros(n))
+        part = Part(*eliminated(gram, vector, n, np.append(sizes, np.full(functions.shape[1], size))), size)
+        return posterior(part, prior, np.zeros(n))
 
     best = max(map(solution, FUNCTION_STDS), key=lambda one: one.evidence)
     return best.step - model.beta, best.covariance

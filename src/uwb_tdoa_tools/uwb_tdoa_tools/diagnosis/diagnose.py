@@ -11,6 +11,7 @@ import numpy as np
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.evidence import OF_ANCHORS
 from uwb_tdoa_ekf.offline import may_have_offset
 
 from ..checking.numbers import numbers
@@ -24,7 +25,7 @@ from .refinement import written
 from .regression.confounding import unobservable
 from .result import Diagnosis
 from .self_calibration import Tape, self_calibrate
-from .self_calibration.prior import OF_ANCHORS, with_calibration
+from .self_calibration.prior import with_calibration
 from .self_calibration.solve import same_anchors
 
 if TYPE_CHECKING:

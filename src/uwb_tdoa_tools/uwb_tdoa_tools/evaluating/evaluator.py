@@ -9,7 +9,10 @@ from typing import Any, TYPE_CHECKING
 from .. import parallel
 from ..bags.bag import late_tdoas, read_odometry
 from ..checking.against_truth import of_truth
+from ..checking.check import check
+from ..checking.recording import of_flight
 from ..checking.remarks import survey_remarks
+from ..checking.watch import BEFORE_TRUTH
 from ..estimate import FlightEstimator
 from ..localizing.rerun_file import write_rerun
 from ..readers.inputs import Reading, report_remarks
@@ -50,7 +53,8 @@ class Evaluator:
     def __call__(self, recording: Recording) -> Result:
         flight = self.reading.read(recording)
         need_truth(flight, self.align == NONE)
-        report_remarks(flight.name, () if self.odometry else survey_remarks(flight))
+        told = [] if self.odometry else list(survey_remarks(flight))
+        report_remarks(flight.name, told)
         odometry: Odometry | RecordedOdometry
         residuals: Residuals | None
         if self.odometry:
@@ -63,10 +67,13 @@ class Evaluator:
             flight = replace(flight, truth=corrected_truth(flight, self.estimator.effects))
         assert flight.truth is not None  # need_truth
         found = alignment_of(flight, odometry)
-        report_remarks(flight.name, self._of_truth(flight, found))
+        found_wrong = list(self._of_truth(flight, found))
         truths = {how: found.applied(flight.truth, how) for how in ALIGN}
         scores = {how: Score(flight.name, odometry, one, residuals, flight.tdoa.t) for how, one in truths.items()}
         score, truth = scores[self.align], truths[self.align]
+        if found_wrong or (score.row()["diverged"] and not score.row()["late_start"]):
+            causes = self._of_anchors(flight)  # ids and anchors first: the truth is measured better
+            report_remarks(flight.name, [one for one in causes or found_wrong if one not in told])
         if self.picture:
             from ..scoring.plots import plot_error  # takes a second to import
 
@@ -80,6 +87,13 @@ class Evaluator:
             write_rerun(self.rerun, flight, odometry, residuals, lines, truth)
         aligned = {**found.as_dict(), "align": self.align, "words": found.frame_in_words()}
         return replace(score.result(), aligned=aligned | {f"rmse_3d_{how}": one.row()["rmse_3d"] for how, one in scores.items()})
+
+    def _of_anchors(self, flight: Flight) -> list[str]:
+        """Sentences on ids, signs, units and anchors that are wrong in a Flight; of a recorded odometry nobody can tell."""
+        if self.odometry:
+            return []
+        found = check(of_flight(flight), (), self.estimator).findings
+        return [f"{one.cause}: {one.evidence}; {one.remedy}." for one in found if one.rule in BEFORE_TRUTH]
 
     def _of_truth(self, flight: Flight, found: Alignment) -> Iterator[str]:
         """Sentences on the ground truth of a Flight, by its Alignment and by itself."""

@@ -17,6 +17,8 @@ from uwb_tdoa_ekf.streams import ERROR
 
 from ..checking.check import check
 from ..checking.recording import of_flight
+from ..checking.watch import OF_ANCHORS
+from ..estimate import FlightEstimator
 from ..scoring.metrics import LOST, nis, reached
 from . import residuals
 
@@ -57,8 +59,8 @@ class Belief:
         return [f"{self.level}: {within}; {fits}", *offset, *self.reasons, *self.remedies]
 
 
-def believe(flight: Flight, run: Run, corrected: bool = False) -> Belief:
-    """Belief in a Run over a Flight, whose ground truth is not used. corrected : by effects that somebody calibrated."""
+def believe(flight: Flight, run: Run, estimator: FlightEstimator = FlightEstimator(), line: str | None = None) -> Belief:
+    """Belief in a Run of a FlightEstimator over a Flight, whose ground truth is not used. line : as of `check`."""
     odometry, left = run.odometry, residuals.of_run(flight, run)
     there = reached(left)
     figures = {"seconds": _length(left), "estimates": len(odometry), "tdoas": len(flight.tdoa), "recoveries": run.recoveries}
@@ -66,9 +68,11 @@ def believe(flight: Flight, run: Run, corrected: bool = False) -> Belief:
         figures["ranges"] = ranges
     if run.range_offset is not None:
         figures["range_offset"] = run.range_offset[0]
-    faults = [finding for finding in check(of_flight(flight)).findings if finding.severity == ERROR]
-    reasons = [f"check: {finding.cause} ({finding.evidence})" for finding in faults]
-    remedies = [f"{finding.cause}: {finding.remedy}" for finding in faults]
+    found = check(of_flight(flight), (), estimator, line).findings
+    faults = [finding for finding in found if finding.severity == ERROR]
+    moved = [finding for finding in found if finding.severity != ERROR and finding.rule in OF_ANCHORS]
+    reasons = [f"check: {finding.cause} ({finding.evidence})" for finding in faults + moved]
+    remedies = [f"{finding.cause}: {finding.remedy}" for finding in faults + moved]
     if not len(odometry) or not there.any():
         reasons.append(f"the filter found no place that explains the {_measured(figures)}")
         return Belief(BAD, figures, [], tuple(reasons), tuple(remedies))
@@ -77,11 +81,12 @@ def believe(flight: Flight, run: Run, corrected: bool = False) -> Belief:
     figures["nis"] = float(nis(left).mean())
     lost = lost_spans(left.t, odometry)
     figures["lost"] = float(sum(end - begin for begin, end in lost))
-    worse = BAD if faults or figures["lost"] > 0.5 * figures["seconds"] else GOOD
+    worse = BAD if faults or figures["lost"] > 0.5 * figures["seconds"] else DOUBTFUL if moved else GOOD
     for reason in _doubts(flight, left, figures, lost):
         reasons.append(reason)
         worse = BAD if worse == BAD else DOUBTFUL
-    return Belief(worse, figures, lost, tuple(reasons), tuple([*remedies, *_remedies(flight, left, figures, corrected)]))
+    remedies += _remedies(flight, left, figures, estimator.effects is not None)
+    return Belief(worse, figures, lost, tuple(reasons), tuple(remedies))
 
 
 def _measured(figures: Mapping[str, Any]) -> str:

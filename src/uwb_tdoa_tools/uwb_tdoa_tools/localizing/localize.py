@@ -8,6 +8,7 @@ from typing import Any, TYPE_CHECKING
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
+from .. import command_lines
 from ..bags.bag import write_odometry
 from ..readers.inputs import Reading
 from ..scoring.tum import write_tum
@@ -43,7 +44,8 @@ class Localizer:
     """localizer((path, survey)) is the Located of a recording, whose ground truth is not read. Can be pickled.
 
     reading : Reading; estimator : FlightEstimator; folder : where to write; bag : write a bag, too; left : write residuals, too; rerun :
-    file for Rerun, or None; zones : m, write who is heard in squares of that size, or None. Raises InputError.
+    file for Rerun, or None; zones : m, write who is heard in squares of that size, or None; effects : file of those of the estimator, or
+    None. Raises InputError.
     """
 
     reading: Reading
@@ -53,11 +55,13 @@ class Localizer:
     left: bool = False
     rerun: Path | None = None
     zones: float | None = None
+    effects: str | None = None
 
     def __call__(self, recording: tuple[Path, str | Path | None]) -> Located:
         flight, name = self.reading.read(recording), name_of(recording[0])
         run = self.estimator(flight)
-        belief = believe(flight, run, self.estimator.effects is not None)
+        line = command_lines.surveying(*recording, self.effects)
+        belief = believe(flight, run, self.estimator, line)
         written = []
 
         def path(end: str) -> Path:

@@ -78,7 +78,10 @@ def as_text(found: SelfCalibration) -> str:
     if not found.why_not:
         lines.append(f"{count} of {found.improved.size} coordinates are known better than before")
     rough = found.given_std.max(axis=1) > KNOWN_WELL
-    unseen = [str(i) for row, i in enumerate(found.given.ids) if rough[row] and not found.improved[row].any()]
+    moved = {change.anchor for change in found.changes}
+    unseen = [
+        str(i) for row, i in enumerate(found.given.ids) if rough[row] and not found.improved[row].any() and str(i) not in moved
+    ]  # fmt: skip
     if unseen:
         lines.append(f"nothing new is told of anchors {', '.join(unseen)}: fly closer to them, on all sides, high and low")
     since = "since the last calibration" if found.base.covariance is not None else "beyond what the tape may be off by"

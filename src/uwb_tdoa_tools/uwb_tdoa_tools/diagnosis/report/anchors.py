@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..self_calibration.prior import DELAY, POSITION
+from uwb_tdoa_ekf.evidence import DELAY, POSITION
+
 from .tables import Table
 
 if TYPE_CHECKING:

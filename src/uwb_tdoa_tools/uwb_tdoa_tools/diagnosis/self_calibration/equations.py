@@ -24,6 +24,7 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.evidence import MOVED
 from uwb_tdoa_ekf.offline import without_unknown_offset
 from uwb_tdoa_ekf.sensitivity import TDOAS
 
@@ -36,7 +37,7 @@ from ..channels.tdoa import TdoaResidual
 from ..constraints import Distance, Mark
 from ..references.nothing import Nothing
 from ..regression.fit import NU, student_scale
-from .prior import MOVED, Prior
+from .prior import Prior
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -11,12 +11,13 @@ from uwb_tdoa_bias.effects import AnchorDelay, Covariance, EffectSet
 from uwb_tdoa_bias.effects.anchor_position import AnchorPosition
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.evidence import DELAY, POSITION, eliminated, keys_of
 
 from ...checking.known_path import MANY
 from ..over_flights import Share
 from .equations import SYSTEMATIC, Runs
 from .placing import PLACED_STD, place
-from .prior import DELAY, POSITION, TAG_DELAY, Prior, eliminated, keys_of, solve, to_keep, with_calibration
+from .prior import TAG_DELAY, Prior, solve, to_keep, with_calibration
 from .tape import Tape
 
 if TYPE_CHECKING:
