@@ -23,6 +23,7 @@ from uwb_tdoa_tools.parallel import whole_number
 from uwb_tdoa_tools.scoring.metrics import position_errors
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.trajectories import Trajectory
+from uwb_tdoa_tools.outputs import OutputFile
 
 KINDS = "moved before", "moved on the way", "exchanged before", "exchanged on the way", "nothing"
 MOVED = 0.3, 1.0  # m
@@ -42,7 +43,7 @@ def add_options(add):
     words = "recordings of each kind, and twice as many without a change (default 10)"
     add("--draws", type=whole_number, default=10, metavar="N", help=words)
     add("--first", type=int, default=1000, metavar="SEED", help="of the first draw (default 1000; limits were set on draws below 100)")
-    add("--json", metavar="FILE", help="write what was said of each")
+    add("--json", metavar="FILE", type=OutputFile, help="write what was said of each")
     add("--jobs", type=whole_number, default=1, metavar="N", help="recordings at once (default 1)")
 
 
