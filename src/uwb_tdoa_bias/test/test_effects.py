@@ -440,11 +440,16 @@ def test_aids_are_corrected_the_same_at_once_and_one_by_one_whatever_was_not_mea
     corrector = AidCorrector([EFFECTS[name](each) for name, each in values.items()])
     t, v, std = np.arange(n) / 25.0, rng.standard_normal((n, 3)), rng.uniform(0.1, 0.2, (n, 3))
     v[:, 2], std[:, 2] = np.nan, np.inf
-    late, turned, wider = corrector.correct("velocity", Velocity(t, v, std)).columns
+    rates = rng.standard_normal(n), np.where(rng.random(n) < 0.5, 0.0, 0.1)
+    late, turned, wider, *kept = corrector.correct("velocity", Velocity(t, v, std, *rates)).columns
+    for column, rate in zip(kept, rates):
+        np.testing.assert_array_equal(column, rate)
     expected = Rotation.from_euler("z", 1.5).apply(np.where(np.isfinite(v), v, 0.0)) / 1.1
     np.testing.assert_allclose(turned[:, :2], expected[:, :2], atol=1e-12)
     np.testing.assert_allclose(late, t - 0.02)
     assert np.isinf(wider[:, 2]).all() and (wider[:, :2] < 0.2).all()
+    unstated = corrector.correct("velocity", Velocity(t, v, np.where(np.isinf(std), std, 0.0))).columns[2]
+    np.testing.assert_array_equal(unstated, np.where(np.isinf(std), std, 0.0))  # the driver still states none
     single = [corrector.correct("velocity", Velocity(*(column[k : k + 1] for column in (t, v, std)))).columns for k in range(n)]
     for column, whole in enumerate((late, turned, wider)):
         np.testing.assert_allclose(np.concatenate([each[column] for each in single]), whole, atol=1e-12)
