@@ -52,7 +52,7 @@ def test_without_attitude_the_vehicle_is_level(one):
         (lambda one: replace(one, truth=None), "holds no ground truth"),
         (lambda one: changed(one, a=np.where(one.tdoa.a == 2, 99, one.tdoa.a)), "anchor 99 is heard but not in"),
         (lambda one: changed(one, d=np.where(one.tdoa.a == 2, np.nan, one.tdoa.d)), r"\d+ TDOAs are not finite"),
-        (lambda one: changed(one, d=one.tdoa.d + 30.0), "only 0 TDOAs in the air are right to 1 m"),
+        (lambda one: changed(one, d=one.tdoa.d + 30.0), "only 0 TDOAs are right to 1 m"),
         (lambda one: replace(one, truth=replace(one.truth, p=one.truth.p * np.nan)), "truth"),
     ],
 )
