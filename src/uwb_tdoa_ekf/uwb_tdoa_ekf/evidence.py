@@ -119,7 +119,8 @@ def most_likely_changes(
 ) -> Changes:
     """Changes, one after the other, as long as each makes the data `odds` times as probable. unchanged (n, n) m^2 : covariance without any;
     possible : {key: Change}."""
-    covariance, found = unchanged, {}
+    covariance = unchanged
+    found: dict[ChangeKey, tuple[float, list[ChangeKey]]] = {}
     evidence, number = most_probable(parts, covariance, offset)
     while len(found) < len(possible):
         trials = with_each_change(parts, covariance, offset, {key: possible[key] for key in possible if key not in found})

@@ -103,6 +103,8 @@ class Monitor:
         self._detector = ChangeDetector()
         self._displaced: dict[int, Displaced] = {}  # of anchors that are not as surveyed and calibrated, by row,
         self._suspected: dict[int, int] = {}  # and comparisons in a row that say so
+        self._comparisons: list[SurveyComparison] = []
+        self._compared = 0  # slices
         self._compare_anew()
         self._changes: dict[int, list[Change]] = {}  # row: Changes of an anchor that is not what it was
         self._ever_changed: set[int] = set()  # rows

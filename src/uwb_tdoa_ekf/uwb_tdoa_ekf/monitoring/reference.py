@@ -55,7 +55,8 @@ class _Cell:
 
     def __init__(self) -> None:
         self.rows: np.ndarray = np.empty(0, int)
-        self._information, self._vector = np.zeros((0, 0)), np.zeros(0)
+        self._information: np.ndarray = np.zeros((0, 0))
+        self._vector: np.ndarray = np.zeros(0)
         self.place, self.slices = np.zeros(3), 0
         self._parts: list[Part] = []
 
@@ -120,8 +121,8 @@ class SurveyComparison:
             (POSITION if (POSITION, k) in rivals else what, k): (odds, bool(rivals))
             for (what, k), (odds, rivals) in changes.found.items()
         }
-        for places, std in (possible[key] for key in named):  # who cannot be told from a late anchor has rather been moved
-            covariance[places, places] += std**2
+        for some, size in (possible[key] for key in named):  # who cannot be told from a late anchor has rather been moved
+            covariance[some, some] += size**2
         part, prior = parts[changes.number], np.linalg.inv(covariance)
         inverse = np.linalg.inv(part.gram + prior)
         step, std = inverse @ part.vector, np.sqrt(np.diag(inverse))

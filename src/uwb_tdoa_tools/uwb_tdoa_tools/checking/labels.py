@@ -103,11 +103,11 @@ def anchors(recording: Recording) -> Iterator[Finding]:
         return
     off = furthest(recording.anchors, recording.recorded)
     evidence = f"the same ids are up to {off:.2f} m apart" if np.isfinite(off) else "no id in common"
-    line = "replay a bag that `convert --survey` has made of this bag: it holds the anchors of the survey"
+    line = "give both nodes the survey as anchors_file, or replay a bag that `convert --survey` has made of this bag"
     yield Finding(
         "survey_differs",
-        WARNING,
-        "the bag brings other anchors than the survey has, and the nodes take those",
+        NOTE,
+        "the bag holds other anchors than the survey, which counts here; nodes without an anchors_file take those of the bag",
         evidence,
         line,
         off,

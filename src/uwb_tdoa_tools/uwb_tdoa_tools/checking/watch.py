@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 CHANGED, EXCHANGED, DISPLACED = "anchor_changed", "ids_exchanged", "anchor_displaced"
 OF_ANCHORS = CHANGED, EXCHANGED, DISPLACED
 STANDS = 5.0  # s before the end of the recording, until which a displaced anchor must be named: the monitor may think better of it
+LASTS = 8.0  # s for which another must: what passes, as at an obstacle, is no fault of an anchor
 LONG_ENOUGH = 15.0  # s of a recording that show whether the survey fits
 # Mistakes by which no anchor is where it seems to be: they are put right first.
 FIRST = {"tdoa_sign", "tdoa_one_sign", "tdoa_unit", "survey_scale", "survey_other", "ids_renumbered", "ids_swapped"}
@@ -37,12 +38,15 @@ def found_by_monitor(flight: Flight, run: Run, estimator: FlightEstimator) -> li
     calibrated = estimator.effects.covariance if estimator.effects else None
     events = watched(flight.anchors, run.odometry, run.residuals, calibrated, flight.restarts)
     end = float(run.odometry.t[-1]) if len(run.odometry) else 0.0
-    superseded = [event.since for event in events if event.finding.rule in (CHANGED, EXCHANGED)]
-    lasting = [end, *superseded]
-    return [
-        event for event in events if event.finding.rule in (CHANGED, EXCHANGED)
-        or (event.finding.rule == DISPLACED and any(at - STANDS <= event.until <= at + STANDS for at in lasting))
-    ]  # fmt: skip
+    lasting = [end, *(event.since for event in events if event.finding.rule in (CHANGED, EXCHANGED))]
+    kept = []
+    for event in events:
+        rule, stands = event.finding.rule, event.until > end - STANDS
+        if rule == DISPLACED:
+            stands = any(at - STANDS <= event.until <= at + STANDS for at in lasting)
+        if rule in OF_ANCHORS and (stands or (rule != DISPLACED and event.until - event.since > LASTS)):
+            kept.append(event)
+    return kept
 
 
 def together(ordered: OrderedRecording, found: Sequence[Finding], events: Sequence[Event], line: str | None) -> list[Finding]:
