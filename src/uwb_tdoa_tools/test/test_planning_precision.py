@@ -13,7 +13,7 @@ from uwb_tdoa_tools.planning.installation import Installation
 from uwb_tdoa_tools.planning.maps import Grid
 from uwb_tdoa_tools.planning.noise import FixedNoise, RadioNoise
 from uwb_tdoa_tools.planning.pairing import PAIRINGS, Pairing, all_pairs, common_reference, every_range, ring
-from uwb_tdoa_tools.planning.precision import NORMAL_99, bound, dilution, ellipses, information, position_error
+from uwb_tdoa_tools.planning.precision import NORMAL_99, bound, dilution, ellipses, information, position_error, range_weights, weigh
 from uwb_tdoa_tools.readers import read_flight
 from uwb_tdoa_tools.simulation.constellations import constellation, corners, facing
 from uwb_tdoa_tools.simulation.schedule import make_schedule
@@ -304,3 +304,11 @@ def test_a_perfect_height_sensor_leaves_the_bound_at_known_height():
     np.testing.assert_allclose(measured[:, :2, :2], known, rtol=1e-6, atol=1e-6)
     np.testing.assert_allclose(dilution(PLACES, Installation(anchors, height_std=0.1)),
                                dilution(PLACES, Installation(anchors, dimensions=2)))  # fmt: skip
+
+
+@pytest.mark.parametrize("pairing", PAIRINGS)
+@pytest.mark.parametrize("link_std", [0.0, 0.05])
+def test_weights_of_ranges_are_those_that_weigh_gives(pairing, link_std):
+    variance, made = np.random.default_rng(0).uniform(0.01, 0.1, (5, 8)), PAIRINGS[pairing](8)
+    each = np.broadcast_to(np.eye(8), (5, 8, 8))
+    np.testing.assert_allclose(range_weights(variance, made, link_std), weigh(each, variance, made, link_std), atol=1e-12)

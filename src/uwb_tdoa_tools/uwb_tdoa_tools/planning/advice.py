@@ -51,6 +51,8 @@ def one_more(
             values.append(-np.inf)
     best: tuple[float, dict[str, Any]] | None = None
     for number in np.argsort(-np.array(values), kind="stable")[:VERIFIED]:
+        if best is not None and values[number] <= best[0]:  # the others promise no more than this one gives
+            break
         if not np.isfinite(values[number]):
             continue
         progress("judging the best place on the whole map")

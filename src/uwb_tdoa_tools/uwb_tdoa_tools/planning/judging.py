@@ -11,7 +11,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 
 from ..simulation.room import Room
 from .bifurcation import Subsets
-from .precision import bound, information, position_error, weigh
+from .precision import bound, information, position_error, range_weights
 from .second_minimum import CLEAR, second_minima
 
 if TYPE_CHECKING:
@@ -96,8 +96,7 @@ def other_solutions(
     misfits, places = [np.empty(0)], [np.empty((0, 3))]
     for rows in np.array_split(np.arange(len(points)), max(1, len(points) * max(heard**2, len(anchors)) // _CHUNK)):
         variance = np.take_along_axis(installation.noise.variance(points[rows], anchors), columns[rows], axis=1)
-        each = np.broadcast_to(np.eye(heard), (len(rows), heard, heard))
-        weights = np.ascontiguousarray(weigh(each, variance, installation.pairing, installation.link_std))
+        weights = np.ascontiguousarray(range_weights(variance, installation.pairing, installation.link_std))
         misfit, place = second_minima(
             points[rows], anchors.positions, np.ascontiguousarray(columns[rows]), weights, room, installation.unknowns
         )

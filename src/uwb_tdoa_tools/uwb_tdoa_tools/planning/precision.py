@@ -78,6 +78,21 @@ def weigh(ranges: np.ndarray, variance: np.ndarray, pairing: Pairing, link_std: 
     return _product(centred, w * centred)
 
 
+def range_weights(variance: np.ndarray, pairing: Pairing, link_std: float = 0.0) -> np.ndarray:
+    """`weigh` of the ranges themselves: (n, N, N) 1/m^2. variance : (n, N) m^2."""
+    n, anchors = variance.shape
+    if pairing.beside or pairing.shared or pairing.ranges:
+        if pairing.beside:
+            return np.sum([range_weights(variance, part, link_std) for part in pairing.parts], axis=0)
+        return weigh(np.broadcast_to(np.eye(anchors), (n, anchors, anchors)), variance, pairing, link_std)
+    weight = pairing.times / (variance[:, pairing.a] + variance[:, pairing.b] + link_std**2)
+    out = np.zeros((anchors, anchors, n))
+    for one, other in ((pairing.a, pairing.b), (pairing.b, pairing.a)):
+        np.add.at(out, (one, one), weight.T)
+        np.add.at(out, (one, other), -weight.T)
+    return np.ascontiguousarray(out.transpose(2, 0, 1))
+
+
 def _from_sizes(gradient: np.ndarray, variance: np.ndarray, pairing: Pairing, link_std: float) -> np.ndarray:
     """Second term of eq. 1, for the derivatives (n, N, k) of the variances.
 
