@@ -38,7 +38,7 @@ _NAMED = re.compile(r"two anchors are exchanged, \d+ and \d+|anchor \d+(?=: | is
 
 def add_options(add):
     """add : add_argument of a parser."""
-    add("measured", nargs="*", metavar="FLIGHT", help="measured flights, in which nothing was moved")
+    add("flights", nargs="*", metavar="FLIGHT", help="measured flights, in which nothing was moved")
     options.add_reading(type("", (), {"add_argument": staticmethod(add)}))
     words = "recordings of each kind, and twice as many without a change (default 10)"
     add("--draws", type=whole_number, default=10, metavar="N", help=words)
@@ -54,7 +54,7 @@ def run(args):
     cases += [(KINDS[-1], seed) for seed in range(args.first, args.first + 2 * args.draws)]
     rows = [row for told in parallel.over(judge, cases, args.jobs, unit="recording") for row in told]
     reading = options.reading_of(args)
-    found = reading.find(args.measured) if args.measured else []
+    found = reading.find(args.flights) if args.flights else []
     rows += parallel.over(partial(measured, reading), found, args.jobs, unit="flight")
     if args.json:
         write_text(args.json, json.dumps(rows, indent=1))

@@ -1,5 +1,7 @@
-"""fly-faults: the vehicle of `fly` takes off, flies and lands by the estimate while a fault is put into its streams, and obeys what `status`
-would say: it sinks where that is not "running". Lockstep, without ROS; a fault lasts from 12 to 15 s after switching on, in the first circle."""
+"""fly-faults: the vehicle of `fly` takes off, flies and lands by the estimate while a fault is put into its streams.
+
+It obeys what `status` would say: it sinks where that is not "running". Lockstep, without ROS; a fault lasts from 12 to 15 s after switching
+on, in the first circle."""
 
 from argparse import Namespace
 from collections.abc import Callable

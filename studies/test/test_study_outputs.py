@@ -15,6 +15,6 @@ def test_every_option_that_takes_a_path_is_an_output_or_read():
 
 
 @pytest.mark.parametrize(("words", "action"), OUTPUTS, ids=[f"{' '.join(words[1:])} {action.dest}" for words, action in OUTPUTS])
-def test_no_study_writes_through_a_link_or_over_what_it_reads(place, capsys, monkeypatch, words, action):
+def test_no_study_writes_through_a_link_or_over_what_it_reads(place, capsys, monkeypatch, words, action):  # noqa: F811
     monkeypatch.setattr(studies, "parser", lambda: PARSER)  # made once
     attack(studies.main, words, PARSERS[words], action, place, capsys)

@@ -56,7 +56,7 @@ def test_a_scale_has_an_arrow_at_each_end_beyond_which_there_is_more(found, figu
 def test_the_legend_states_the_share_of_each_state_that_there_is(found, figures):
     one = replace(found, status=np.where(np.arange(len(found.status)) % 4 == 0, IMPRECISE, 0))
     plots.plot_flyable(corners(), one, None)
-    (figure, title), texts = figures[0], [text.get_text() for text in figures[0][0].legends[0].get_texts()]
+    (_, title), texts = figures[0], [text.get_text() for text in figures[0][0].legends[0].get_texts()]
     assert "can be flown: 75 %" in texts and "imprecise: 25 %" in texts and not any("two solutions" in text for text in texts)
     assert "75 % of the room" in title
 

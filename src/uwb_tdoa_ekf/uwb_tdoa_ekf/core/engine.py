@@ -35,7 +35,7 @@ from .memory import HYPOTHESES, ODOMETRY, RESIDUAL, YAWS, FilterState, Measureme
 from .sensor_functions import subtract
 from .startup import INLIER
 from .state import coast, predict, turn_about_vertical
-from .update import project, update_state
+from .update import project
 from .verdicts import COMPENSATED, REJECTED, REPEATED, STARTUP, USED
 
 CONSISTENCY_TIME = 0.3  # s over which the share of TDOAs that the filter explains is averaged

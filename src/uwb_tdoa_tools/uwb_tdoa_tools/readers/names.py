@@ -35,8 +35,8 @@ class Named:
 
 
 def read_named(path: str | Path) -> Named:
-    """Named of a survey file of any form of `survey.read_entries`, with ids or names of any text. The id is the number that a name ends with, if all end with different ones; else the line of the survey, from 0 on.
-    Raises InputError, also for a survey that is certainly wrong."""
+    """Named of a survey file of any form of `survey.read_entries`, with ids or names of any text. The id is the number that a name ends
+    with, if all end with different ones; else the line of the survey, from 0 on. Raises InputError, also for a survey that is certainly wrong."""
     named = _read_named(path)
     refuse_faulty(named.anchors, str(path))
     return named

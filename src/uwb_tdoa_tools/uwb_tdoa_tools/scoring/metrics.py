@@ -11,7 +11,6 @@ from typing import Any, Protocol, TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.effects.samples import PoseColumns
-from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.verdicts import COMPENSATED, REJECTED, USED
 from uwb_tdoa_ekf.results import rows_of
 

@@ -19,7 +19,7 @@ from uwb_tdoa_ekf.evidence import (
 from ...checking.known_path import MANY
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
+    from collections.abc import Iterable
     from uwb_tdoa_bias.effects import Effect
     from uwb_tdoa_bias.foundation.anchors import Anchors
     from uwb_tdoa_ekf.evidence import Change, ChangeKey
