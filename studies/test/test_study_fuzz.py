@@ -20,7 +20,7 @@ def grows(data):
 
 
 def holds(data):
-    b"x" * (20 << 20)
+    bytes(20 << 20)
 
 
 def refuses(data):
