@@ -57,14 +57,16 @@ class _Cell:
         self.rows: np.ndarray = np.empty(0, int)
         self._information: np.ndarray = np.zeros((0, 0))
         self._vector: np.ndarray = np.zeros(0)
-        self.place, self.slices = np.zeros(3), 0
+        self.place: np.ndarray = np.zeros(3)
+        self.slices = 0
         self._parts: list[Part] = []
 
     def add(self, piece: Slice) -> None:
         """Take a Slice."""
         rows = np.union1d(self.rows, piece.rows)
         if len(rows) > len(self.rows):
-            old, information, vector = np.searchsorted(rows, self.rows), np.zeros((len(rows),) * 2), np.zeros(len(rows))
+            old, information = np.searchsorted(rows, self.rows), np.zeros((len(rows),) * 2)
+            vector: np.ndarray = np.zeros(len(rows))
             information[np.ix_(old, old)], vector[old] = self._information, self._vector
             self.rows, self._information, self._vector = rows, information, vector
         new = np.searchsorted(rows, piece.rows)

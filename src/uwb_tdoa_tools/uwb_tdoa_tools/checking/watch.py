@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from uwb_tdoa_ekf.monitoring.monitor import SURVEYING
 from uwb_tdoa_ekf.monitoring.recorded import watched
 
-from .tdoa_rules import FEWEST, gained, relabelled
+from .tdoa_rules import FEWEST, POOR, gained, relabelled
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -90,7 +90,8 @@ def _explains(ordered: OrderedRecording, event: Event) -> bool:
         part = relabelled(ordered, {one: two, two: one})
     else:
         return False
-    return len(part.survey_fit) >= FEWEST and gained(part.survey_fit) is None
+    fit = part.survey_fit
+    return len(fit) >= FEWEST and fit.before < POOR and gained(fit) is None
 
 
 def _with_times(event: Event, begin: float, end: float, line: str | None) -> Finding:
