@@ -1,5 +1,7 @@
 """Who fuzzes notices what is no InputError, takes too long or takes too much, and goes on behind it."""
 
+from mmap import mmap
+
 from fuzz import targets
 import pytest
 
@@ -20,7 +22,8 @@ def grows(data):
 
 
 def holds(data):
-    len(b"x" * (20 << 20))
+    with mmap(-1, 20 << 20) as memory:  # memory that this process had not before
+        memory.write(b"x" * (20 << 20))
 
 
 def refuses(data):

@@ -8,7 +8,7 @@ from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.ground import (
     ALIKE, BLUR_STD, BLURRED, IN_TIME, KNOWN, MOST_PAIRS, NOT_USED, PAIR, Evidence, KnownHeight, blur, explain, find_lateness, find_pairs,
-    in_time, is_still, may_be_late,
+    STILL, in_time, judge_motion, may_be_late,
 )  # fmt: skip
 from uwb_tdoa_ekf.core.memory import TDOA, new_state, structured
 from uwb_tdoa_ekf.core.workspace import set_bounds
@@ -48,7 +48,7 @@ def heard(p, v=(0.0, 0.0, 0.0), late=0.0, std=0.08, seed=0, seconds=0.5, n=180):
 
 
 def still(pairs, p):
-    return is_still(pairs, new_state(POSITIONS).anchors, np.array(p), np.empty((3, 3)))
+    return judge_motion(pairs, new_state(POSITIONS).anchors, np.array(p), np.empty((3, 3))) == STILL
 
 
 def test_anchors_may_be_late_where_both_antennas_are_low_and_far_apart():

@@ -6,7 +6,8 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_ekf.evidence import keys_of
 from uwb_tdoa_ekf.core.verdicts import INVALID, REJECTED, USED
 from uwb_tdoa_ekf.monitoring.monitor import Monitor
-from uwb_tdoa_ekf.results import Odometry, Residuals
+from uwb_tdoa_ekf.monitoring.recorded import watched
+from uwb_tdoa_ekf.results import Odometry, Residuals, concatenated
 
 ANCHORS = Anchors.from_positions(np.random.default_rng(0).uniform(-4, 4, (6, 3)), ids=[3, 5, 7, 9, 11, 13])
 IDS, RATE = ANCHORS.ids, 100  # Hz
@@ -234,3 +235,20 @@ def test_history_says_when_each_finding_stood():
 def test_who_is_moved_in_flight_is_not_said_to_have_been_elsewhere_before():
     said = watch(lambda t, p: only(2, 0.5 * (t > 30.0)))
     assert not any("does not stand" in alarm for _, alarms in said for alarm in alarms)
+
+
+def test_a_gap_of_any_length_is_passed_at_once():
+    """A clock that is set: no slice is tested for each half second of 54 years."""
+    monitor, rng = Monitor(ANCHORS), np.random.default_rng(0)
+    parts = []
+    for begin in (0.0, 1.7e9):
+        t, one = begin + np.arange(3 * RATE) / RATE, np.ones(3 * RATE)
+        a = np.arange(3 * RATE) % 6
+        zeros = np.zeros((len(t), 3))
+        odometry = Odometry(t, zeros, zeros, np.tile([0, 0, 0, 1.0], (len(t), 1)), zeros, zeros, np.zeros((len(t), 9, 9)), np.zeros((len(t), 3, 3)))
+        residuals = Residuals(t, IDS[a], IDS[(a + 1) % 6], 0.05 * rng.standard_normal(len(t)), 0.05**2 * one, one, np.full(len(t), USED))
+        parts.append((odometry, residuals))
+        monitor.add(odometry, residuals)
+        monitor.update(float(t[-1]))
+    assert monitor.alarms == []
+    assert watched(ANCHORS, *map(concatenated, zip(*parts))) == []

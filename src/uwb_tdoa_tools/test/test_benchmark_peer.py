@@ -73,7 +73,7 @@ def test_libraries_that_are_none(tmp_path, capsys):
     with pytest.raises(InputError, match="nowhere.so cannot be loaded as a shared library .*; build it anew"):
         peer.Peer(tmp_path / "nowhere.so")
     (tmp_path / "text.so").write_text("no library")
-    assert bench.main(["--peer", str(tmp_path / "text.so"), "--only", "core", "--out", str(tmp_path)]) == 2
+    assert bench.main(["--peer", str(tmp_path / "text.so"), "--only", "core", "--out", str(tmp_path / "out")]) == 2
     assert "text.so cannot be loaded" in capsys.readouterr().err
     with pytest.raises(InputError, match="is of version 7 of the interface, this is 1"):
         peer.Peer(built(tmp_path, version=7))

@@ -60,4 +60,4 @@ def test_another_survey_than_the_bag_brings(checked, tmp_path, capsys):
     (tmp_path / "wrong.csv").write_text("id,x,y,z\n" + lines)
     assert main([str(checked[0] / "good.bag"), "--survey", str(tmp_path / "wrong.csv")]) == 1
     out = capsys.readouterr().out
-    assert "the bag brings other anchors" in out and "survey" in out
+    assert "the bag holds other anchors than the survey" in out and "survey" in out

@@ -43,7 +43,7 @@ class OutputBag(Output):
 def checked(args: Namespace) -> AbstractContextManager[None]:
     """A context in which nothing is written over what the other options name. Raises InputError for an output that cannot be written, is
     reached over a link, or would change what is read or a bag."""
-    values = list(_flat(vars(args).values()))
+    values = list(_flat(value for name, value in vars(args).items() if name != "ros_arguments"))  # which hold the whole command line
     outputs = [value for value in values if isinstance(value, Output)]
     inputs = [Path(value) for value in values if not isinstance(value, Output) and _is_there(value)]
     with keeping(inputs):

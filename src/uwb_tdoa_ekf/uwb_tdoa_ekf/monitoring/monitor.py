@@ -153,6 +153,8 @@ class Monitor:
 
     def add(self, odometry: Odometry, residuals: Residuals) -> None:
         """Take Odometry and the Residuals that came with it."""
+        if self._end is not None and len(residuals.t) and residuals.t[0] > self._last + GAP:
+            self.update(math.inf)  # of the flight before; no slice is tested for each half second of a gap
         if len(odometry):
             self._odometry.append([odometry.t, odometry.p, odometry.v, odometry.gyro_bias, odometry.accel_bias])
         began, reached = self._end is not None, np.isfinite(residuals.innovation)  # the filter

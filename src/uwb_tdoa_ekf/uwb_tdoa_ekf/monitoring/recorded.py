@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..results import rows_of
-from .monitor import Event, Monitor
+from .monitor import GAP, Event, Monitor
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -27,10 +27,11 @@ def watched(
     """
     events: list[Event] = []
     for low, high in pairwise([-math.inf, *restarts, math.inf]):
-        monitor = Monitor(anchors, calibrated)
-        heard = rows_of(residuals, _between(residuals.t, low, high))
-        monitor.add(rows_of(odometry, _between(odometry.t, low, high)), heard)
-        monitor.update(float(heard.t[-1]) if len(heard) else low)
+        monitor, t = Monitor(anchors, calibrated), np.sort(residuals.t[(residuals.t >= low) & (residuals.t < high)])
+        for begin, end in pairwise([low, *t[1:][np.diff(t) > GAP].tolist(), high]):
+            heard = rows_of(residuals, _between(residuals.t, begin, end))
+            monitor.add(rows_of(odometry, _between(odometry.t, begin, end)), heard)
+            monitor.update(float(heard.t[-1]) if len(heard) else low)
         events += monitor.history
     return events
 

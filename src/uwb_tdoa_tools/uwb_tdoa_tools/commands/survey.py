@@ -96,9 +96,10 @@ def _survey(args: Namespace) -> int:
 def _ids_are_right(reading: Reading, paths: Sequence[str], estimator: FlightEstimator) -> bool:
     """Whether `check` finds none of the mistakes in recordings that look like anchors elsewhere; says which it finds."""
     found = []
-    for path, survey in reading.find(paths):
-        findings = check(read_recording(reading, path, survey), (), estimator).findings
-        found += [finding for finding in findings if finding.rule in (*FIRST, EXCHANGED)]
+    with Progress("survey") as progress:
+        for path, survey in progress.over(reading.find(paths), "checking recordings"):
+            findings = check(read_recording(reading, path, survey), (), estimator).findings
+            found += [finding for finding in findings if finding.rule in (*FIRST, EXCHANGED)]
     for finding in found:
         cli.show(*report.lines(finding))
     return not found

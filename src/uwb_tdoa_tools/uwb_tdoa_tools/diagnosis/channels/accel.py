@@ -24,6 +24,7 @@ class Accel(Inertial):
     name = "accel"
     unit = "m/s^2"
     needs = "an accelerometer, and ground truth of position and attitude"
+    stream = "imu"
     negligible = 0.01
 
     def residual(self, comparison: Comparison) -> ImuResidual | None:

@@ -125,6 +125,7 @@ class Channel(Generic[Own]):
     unit: str
     negligible: float  # root mean square, in `unit`, of a contribution that is not worth a term
     needs: str  # what a recording must hold for it, in words
+    stream: str = ""  # attribute of a Flight that it is of; "" for its name
     maps: ClassVar[tuple[str, ...]] = ()  # covariates whose functions, each too weak alone, are tried together
 
     def residual(self, comparison: Comparison) -> Own | None:

@@ -32,6 +32,7 @@ class Gyro(Inertial):
     name = "gyro"
     unit = "rad/s"
     needs = "a gyroscope, and ground truth of the attitude or some seconds at rest before take-off"
+    stream = "imu"
     negligible = 5e-4
 
     def residual(self, comparison: Comparison) -> ImuResidual | None:

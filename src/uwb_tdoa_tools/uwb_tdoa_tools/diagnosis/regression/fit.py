@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from .table import RegressionTable
     from .terms import Column
 
-DELAY, CANCELS = "anchor_delay", 1e-9  # and the sum of their regressors, which is nothing
+CANCELS = 1e-9  # sum of regressors of one effect, in the unit of a row, which is nothing
 NU = 4.0
 ITERATIONS = 12
 MIN_BLOCKS = 6
@@ -152,11 +152,13 @@ def student_scale(r: np.ndarray) -> float:
 
 
 def in_common(table: RegressionTable, columns: Sequence[Column]) -> np.ndarray:
-    """(k, k), what makes of the delays of anchors among some Columns the mean of all, where that cancels in every row, as in TDOAs; 0
-    elsewhere. A fit leaves that mean at 0, and its deviation would be that of the prior."""
-    out, places = np.zeros((len(columns), len(columns))), [k for k, column in enumerate(columns) if column.effect == (DELAY,)]
-    if len(places) > 1 and np.abs(table.matrix([columns[k] for k in places]).sum(axis=1)).max() < CANCELS:
-        out[np.ix_(places, places)] = 1.0 / len(places)
+    """(k, k), what makes of the values of one effect among some Columns the mean of all, where that cancels in every row, as that of the
+    delays of all anchors does in TDOAs; 0 elsewhere. A fit leaves that mean at 0, and its deviation would be that of the prior."""
+    out = np.zeros((len(columns), len(columns)))
+    for effect in dict.fromkeys(column.effect for column in columns):
+        places = [k for k, column in enumerate(columns) if column.effect == effect]
+        if len(places) > 1 and np.abs(table.matrix([columns[k] for k in places]).sum(axis=1)).max() < CANCELS:
+            out[np.ix_(places, places)] = 1.0 / len(places)
     return out
 
 

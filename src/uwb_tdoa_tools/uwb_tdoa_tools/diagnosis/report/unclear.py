@@ -103,7 +103,7 @@ def _knows_attitude(diagnosis: Diagnosis) -> bool:
 def _lacking(channel: str, diagnosis: Diagnosis) -> str:
     """What the flights lack of what a channel needs: its sensor, the ground truth for it, or both."""
     sensor, _, truth = CHANNELS[channel].needs.partition(AND)
-    stream = "imu" if channel in ("gyro", "accel") else channel
+    stream = CHANNELS[channel].stream or channel
     if truth and _knows_attitude(diagnosis) and all(diagnosis.reference.positions_known):
         return sensor
     if truth and any(getattr(flight, stream) is not None for flight in diagnosis.flights):
