@@ -245,7 +245,8 @@ def test_a_gap_of_any_length_is_passed_at_once():
         t, one = begin + np.arange(3 * RATE) / RATE, np.ones(3 * RATE)
         a = np.arange(3 * RATE) % 6
         zeros = np.zeros((len(t), 3))
-        odometry = Odometry(t, zeros, zeros, np.tile([0, 0, 0, 1.0], (len(t), 1)), zeros, zeros, np.zeros((len(t), 9, 9)), np.zeros((len(t), 3, 3)))
+        covariances = np.zeros((len(t), 9, 9)), np.zeros((len(t), 3, 3))
+        odometry = Odometry(t, zeros, zeros, np.tile([0, 0, 0, 1.0], (len(t), 1)), zeros, zeros, *covariances)
         residuals = Residuals(t, IDS[a], IDS[(a + 1) % 6], 0.05 * rng.standard_normal(len(t)), 0.05**2 * one, one, np.full(len(t), USED))
         parts.append((odometry, residuals))
         monitor.add(odometry, residuals)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 CHANGED, EXCHANGED, DISPLACED = "anchor_changed", "ids_exchanged", "anchor_displaced"
 OF_ANCHORS = CHANGED, EXCHANGED, DISPLACED
 STANDS = 5.0  # s before the end of the recording, until which a displaced anchor must be named: the monitor may think better of it
-LASTS = 8.0  # s for which another must: what passes, as at an obstacle, is no fault of an anchor
+LASTS = 8.0  # s for which another must last, and one that has changed until the end, too: what passes, as at an obstacle, is no fault
 LONG_ENOUGH = 15.0  # s of a recording that show whether the survey fits
 # Mistakes by which no anchor is where it seems to be: they are put right first.
 FIRST = {"tdoa_sign", "tdoa_one_sign", "tdoa_unit", "survey_scale", "survey_other", "ids_renumbered", "ids_swapped"}
@@ -44,9 +44,22 @@ def found_by_monitor(flight: Flight, run: Run, estimator: FlightEstimator) -> li
         rule, stands = event.finding.rule, event.until > end - STANDS
         if rule == DISPLACED:
             stands = any(at - STANDS <= event.until <= at + STANDS for at in lasting)
-        if rule in OF_ANCHORS and (stands or (rule != DISPLACED and event.until - event.since > LASTS)):
+        lasts = event.until - event.since > LASTS
+        if rule == CHANGED:
+            stands = stands and lasts and not any(_came_and_went(other, event) for other in events)
+        elif rule == EXCHANGED:
+            stands = stands or lasts
+        if rule in OF_ANCHORS and stands:
             kept.append(event)
     return kept
+
+
+def _came_and_went(event: Event, later: Event) -> bool:
+    """Whether the same anchor had changed by as much before a `later` Event, and had come back: what passes, as at an obstacle or with the
+    attitude, shows that the other will, too."""
+    one, other = event.finding, later.finding
+    alike = one.rule == other.rule == CHANGED and one.cause.split(":")[0] == other.cause.split(":")[0]
+    return alike and event.until < later.since and abs(one.value) >= abs(other.value)
 
 
 def together(ordered: OrderedRecording, found: Sequence[Finding], events: Sequence[Event], line: str | None) -> list[Finding]:
