@@ -6,7 +6,6 @@ on, in the first circle."""
 from argparse import Namespace
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 import json
 import math
 from typing import Any
@@ -212,7 +211,7 @@ def add_options(add: Callable) -> None:
 def run(args: Namespace) -> None:
     """Fly, and print the table."""
     tasks = [(name, args.seed + k) for name in FAULTS for k in range(args.flights)]
-    rows = list(tqdm(parallel.over(partial(flown), tasks, args.jobs), total=len(tasks), disable=None))
+    rows = list(tqdm(parallel.over(flown, tasks, args.jobs), total=len(tasks), disable=None))
     print("\n".join(table(rows)))
     if args.json:
         write_text(args.json, json.dumps(rows, indent=1))

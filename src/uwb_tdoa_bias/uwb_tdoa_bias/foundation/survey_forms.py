@@ -83,7 +83,10 @@ def _role(cell: str) -> tuple[str, float]:
 def is_table(text: str) -> bool:
     """Return whether a text is a table: no YAML and no JSON."""
     lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
-    return not lines or not (lines[0].lstrip()[0] in "{[%-" and not _is_number(cells_of(lines[0])[0]) or any(map(_KEY.match, lines)))
+    if not lines:
+        return True
+    begins_tree = lines[0].lstrip()[0] in "{[%-" and not _is_number(cells_of(lines[0])[0])  # a table may begin with -3.1
+    return not begins_tree and not any(map(_KEY.match, lines))
 
 
 _KEY = re.compile(r"^\s*(?:- *)?[{\s]*[\"']?[\w /*.-]+[\"']?\s*:(?:\s|$)")

@@ -12,6 +12,7 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .files import connections_of, readable
+from .message_types import check_type
 from .placing import TF_STATIC
 
 if TYPE_CHECKING:
@@ -55,6 +56,8 @@ def recorded_anchors(path: str | Path, reader: BagReader, topic: str) -> Recorde
 def _of_frames(path: str | Path, reader: BagReader) -> Recorded | None:
     by_parent: dict[str, dict[int, list[float]]] = defaultdict(dict)
     connections = [one for one in reader.connections if one.topic == TF_STATIC and one.msgtype == TRANSFORMS]
+    for connection in connections:
+        check_type(path, connection)
     for _, _, message in readable(path, reader, connections):
         for each in message.transforms:
             if found := _FRAME.match(each.child_frame_id):
@@ -69,6 +72,7 @@ def _of_frames(path: str | Path, reader: BagReader) -> Recorded | None:
 
 def _of_markers(path: str | Path, reader: BagReader) -> Recorded | None:
     for connection in [one for one in reader.connections if one.msgtype == MARKERS]:
+        check_type(path, connection)
         by_frame: dict[str, dict[int, list[float]]] = defaultdict(dict)
         for _, _, message in readable(path, reader, [connection]):
             for marker in message.markers:
