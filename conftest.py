@@ -3,9 +3,9 @@
 from collections import deque
 from functools import cache
 import os
+from pathlib import Path
 import random
 import signal
-from pathlib import Path
 
 import pytest
 
@@ -13,12 +13,16 @@ import pytest
 signal.signal(signal.SIGINT, signal.default_int_handler)
 # Before anything imports rclpy: this session talks to itself only, beside others on the same machine.
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # before anything imports numpy, as executables do: threads of BLAS only wait for each other
+os.environ.setdefault(
+    "OMP_NUM_THREADS", "1"
+)  # before anything imports numpy, as executables do: threads of BLAS only wait for each other
 try:
     from domain_coordinator import domain_id
 except ImportError:  # no ROS: the tests of the cores need none
     domain_id = None
-_taken = deque()  # reservations of domains, oldest first; taken until this process ends, or KEPT others came
+_taken = (
+    deque()
+)  # reservations of domains, oldest first; taken until this process ends, or KEPT others came
 LONGEST = """waiting checking_check lockstep first_hour diagnosis_diagnose launch_files hall first_hour_without_truth each_node bench
     types flying_trial train surveying_known demo nodes packaging evaluate diagnosis_self_calibration measured_path printed_lines lint
     study_closed_loop study_radio_link replay_record surveying rerun diagnosis_attribution diagnosis_references localizing
@@ -32,7 +36,9 @@ def _take_domain():
     while len(_taken) > KEPT:
         _taken.popleft().__exit__(None, None, None)
     while True:
-        reservation = domain_id(lambda: random.randint(1, 100))  # by chance none of the last seconds
+        reservation = domain_id(
+            lambda: random.randint(1, 100)
+        )  # by chance none of the last seconds
         try:
             os.environ["ROS_DOMAIN_ID"] = str(reservation.__enter__())
         except RuntimeError:  # other sessions have those that are left

@@ -1,8 +1,9 @@
-"""Bring the workspace up to date: environment, message package, Python packages. What is up to date is not touched.
+"""Bring the workspace up to date: environment, message package, Python packages. What is up to date
+is not touched.
 
-Called by ./dev with a Python 3.10 - 3.12 of the system; uses nothing but its standard library. Each step is remembered
-by a hash of what it depends on, in .venv/steps.json, so that doing nothing takes milliseconds. Two calls at once wait
-for each other, if there is anything to do.
+Called by ./dev with a Python 3.10 - 3.12 of the system; uses nothing but its standard library. Each
+step is remembered by a hash of what it depends on, in .venv/steps.json, so that doing nothing takes
+milliseconds. Two calls at once wait for each other, if there is anything to do.
 """
 
 import fcntl
@@ -10,6 +11,7 @@ import hashlib
 import importlib.util
 import json
 import os
+from pathlib import Path
 import platform
 import re
 import shutil
@@ -17,28 +19,44 @@ import subprocess
 import sys
 import sysconfig
 import time
-from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 VENV, BUILD, INSTALL, LOG = (ROOT / name for name in (".venv", "build", "install", "log"))
 PYTHON = VENV / "bin" / "python"
 STEPS = VENV / "steps.json"
-LOCK = ROOT / ".dev" / "requirements.lock"  # requirements.txt and what they need in turn, with hashes
-AS_LOCKED = "--only-binary", ":all:", "--no-binary", "empy", "--require-hashes", "-r"  # empy has no wheel; of the rest nothing is run
+LOCK = (
+    ROOT / ".dev" / "requirements.lock"
+)  # requirements.txt and what they need in turn, with hashes
+AS_LOCKED = (
+    "--only-binary",
+    ":all:",
+    "--no-binary",
+    "empy",
+    "--require-hashes",
+    "-r",
+)  # empy has no wheel; of the rest nothing is run
 MESSAGES = ["uwb_tdoa_msgs"]
 PACKAGES = ["uwb_tdoa_bias", "uwb_tdoa_ekf", "uwb_tdoa_tools"]
 VERSION = f"{sys.version_info.major}.{sys.version_info.minor}"
 BASE_PYTHON = os.path.realpath(sys.executable)  # never the one of a virtual environment
-OWN_ROS = os.environ.get("ROS_DISTRO") == "jazzy"  # the user has sourced one; else ROS comes from wheels
+OWN_ROS = (
+    os.environ.get("ROS_DISTRO") == "jazzy"
+)  # the user has sourced one; else ROS comes from wheels
 # What a ROS installation may lack: the name to import, and the one in requirements.txt.
-MODULES = {name: name for name in "hypothesis joblib matplotlib numba onnx onnxruntime rosbags scipy tqdm".split()}
+MODULES = {
+    name: name
+    for name in "hypothesis joblib matplotlib numba onnx onnxruntime rosbags scipy tqdm".split()
+}
 MODULES |= {"PIL": "pillow", "jinja2": "Jinja2", "sklearn": "scikit-learn", "yaml": "PyYAML"}
 # Jazzy is built for numpy 1.26, and a pytest plugin of its launch_testing breaks newer pytests.
 LIMITS = ["numpy<2", "pytest<8"]
 
 
 class Failure(Exception):
-    """The set-up cannot go on. The message is one sentence that says what is missing and what to do."""
+    """The set-up cannot go on.
+
+    The message is one sentence that says what is missing and what to do.
+    """
 
 
 def main(command):
@@ -58,7 +76,11 @@ def main(command):
 def is_ready(compiled):
     """Whether nothing is to be done. compiled : the nodes shall be, too."""
     done, sources = read_steps(), digests()
-    wanted = {"environment": environment(), **sources, **({"compiled": sources["packages"]} if compiled else {})}
+    wanted = {
+        "environment": environment(),
+        **sources,
+        **({"compiled": sources["packages"]} if compiled else {}),
+    }
     return (INSTALL / "setup.bash").exists() and wanted.items() <= done.items()
 
 
@@ -76,7 +98,11 @@ def prepare(compiled):
 
 def environment():
     """Digest of all that .venv depends on."""
-    files = [ROOT / "requirements.txt", LOCK, *(ROOT / ".dev" / name for name in ("wheels.py", "paths.sh"))]
+    files = [
+        ROOT / "requirements.txt",
+        LOCK,
+        *(ROOT / ".dev" / name for name in ("wheels.py", "paths.sh")),
+    ]
     return digest(files, str(ROOT), BASE_PYTHON, VERSION, str(OWN_ROS))
 
 
@@ -87,15 +113,28 @@ def check_machine():
             f"ROS 2 from the Python package index needs Linux on x86_64, this is {sys.platform} on "
             f"{platform.machine()}; source a ROS 2 Jazzy installation."
         )
-    if OWN_ROS and subprocess.run([BASE_PYTHON, "-c", "import rclpy"], stderr=subprocess.DEVNULL, cwd=ROOT).returncode != 0:
+    if (
+        OWN_ROS
+        and subprocess.run(
+            [BASE_PYTHON, "-c", "import rclpy"], stderr=subprocess.DEVNULL, cwd=ROOT
+        ).returncode
+        != 0
+    ):
         raise Failure(
-            f"ROS_DISTRO is jazzy, but {BASE_PYTHON} cannot import rclpy; source /opt/ros/jazzy/setup.bash in this "
+            f"ROS_DISTRO is jazzy, but {BASE_PYTHON} cannot import rclpy; source "
+            "/opt/ros/jazzy/setup.bash in this "
             "shell, or unset ROS_DISTRO to use the wheels."
         )
     if importlib.util.find_spec("ensurepip") is None or importlib.util.find_spec("venv") is None:
-        raise Failure(f"Python {VERSION} has no venv module; install it, e.g. sudo apt install python{VERSION}-venv")
+        raise Failure(
+            f"Python {VERSION} has no venv module; install it, e.g. sudo apt install "
+            f"python{VERSION}-venv"
+        )
     if not any(map(shutil.which, [os.environ.get("CXX") or "c++", "g++", "clang++"])):
-        raise Failure("no C++ compiler found, which the message package needs; install one, e.g. sudo apt install g++")
+        raise Failure(
+            "no C++ compiler found, which the message package needs; install one, e.g. sudo "
+            "apt install g++"
+        )
     if not (Path(sysconfig.get_paths()["include"]) / "Python.h").exists():
         raise Failure(
             f"Python.h of Python {VERSION} is missing, which the message package needs; "
@@ -112,14 +151,21 @@ def make_environment():
     try:
         if OWN_ROS:
             missing = missing_requirements()
-            install(f"install what ROS 2 Jazzy lacks ({len(missing)} packages)", [*missing, *LIMITS])
+            install(
+                f"install what ROS 2 Jazzy lacks ({len(missing)} packages)", [*missing, *LIMITS]
+            )
         else:
-            install("install ROS 2 Jazzy and the Python packages", ["--no-compile", *AS_LOCKED, LOCK])
+            install(
+                "install ROS 2 Jazzy and the Python packages", ["--no-compile", *AS_LOCKED, LOCK]
+            )
     except Failure as failure:
         output = (LOG / "dev_pip.log").read_text(errors="replace")
-        if re.search(r"NewConnectionError|NameResolution|Timeout|ProxyError|from versions: none", output):
+        if re.search(
+            r"NewConnectionError|NameResolution|Timeout|ProxyError|from versions: none", output
+        ):
             raise Failure(
-                "pip reaches no package index that has these; check the network, or name a mirror: PIP_INDEX_URL=..."
+                "pip reaches no package index that has these; check the network, or name a "
+                "mirror: PIP_INDEX_URL=..."
             ) from failure
         raise
     if not OWN_ROS:
@@ -132,7 +178,10 @@ def install(title, arguments):
 
 def missing_requirements():
     """The pins of those MODULES that the new environment cannot import."""
-    code = f"import importlib.util as u; print(*(n for m, n in {MODULES}.items() if u.find_spec(m) is None))"
+    code = (
+        f"import importlib.util as u; print(*(n for m, n in {MODULES}.items() if u.find_spec(m) "
+        "is None))"
+    )
     names = subprocess.check_output([PYTHON, "-c", code], text=True, cwd=ROOT).split()
     pins = (ROOT / "requirements.txt").read_text().splitlines()
     return [pin for pin in pins if pin.split("==")[0] in names]
@@ -141,42 +190,75 @@ def missing_requirements():
 def digests():
     """{step: digest of its sources}."""
     return {
-        "messages": digest([ROOT / "colcon.meta", ROOT / ".dev" / "tf2_msgs", ROOT / "src" / "uwb_tdoa_msgs"]),
+        "messages": digest(
+            [ROOT / "colcon.meta", ROOT / ".dev" / "tf2_msgs", ROOT / "src" / "uwb_tdoa_msgs"]
+        ),
         "packages": digest([ROOT / "src" / name for name in PACKAGES]),
     }
 
 
 def build(done, compiled):
-    """Python packages first, which takes seconds: then the nodes can be compiled, for which they need no messages, beside the messages."""
+    """Python packages first, which takes seconds: then the nodes can be compiled, for which they
+    need no messages, beside the messages.
+    """
     sources, running = digests(), []
     if done.get("packages") != sources["packages"]:
         for name in PACKAGES:  # setuptools would copy what is newer only, and keep what was deleted
-            for copy in (BUILD / name / "build", *INSTALL.glob(f"lib/python3*/site-packages/{name}")):
+            for copy in (
+                BUILD / name / "build",
+                *INSTALL.glob(f"lib/python3*/site-packages/{name}"),
+            ):
                 shutil.rmtree(copy, ignore_errors=True)
         finish(colcon(PACKAGES))
         done = {**done, "packages": sources["packages"]}
         write_steps(done)
-    if compiled and done.get("compiled") != sources["packages"]:  # or the first start would; and several tests at once
+    if (
+        compiled and done.get("compiled") != sources["packages"]
+    ):  # or the first start would; and several tests at once
         (site,) = INSTALL.glob("lib/python3*/site-packages")
         path = os.pathsep.join(filter(None, [str(site), os.environ.get("PYTHONPATH")]))
-        running.append(start("compile the nodes", "compile", [PYTHON, "-m", "uwb_tdoa_ekf.compile_nodes"], PYTHONPATH=path))
+        running.append(
+            start(
+                "compile the nodes",
+                "compile",
+                [PYTHON, "-m", "uwb_tdoa_ekf.compile_nodes"],
+                PYTHONPATH=path,
+            )
+        )
     if done.get("messages") != sources["messages"]:
-        running.append(colcon(([] if OWN_ROS else ["tf2_msgs"]) + MESSAGES))  # the wheels lack tf2_msgs
+        running.append(
+            colcon(([] if OWN_ROS else ["tf2_msgs"]) + MESSAGES)
+        )  # the wheels lack tf2_msgs
     finish(*running)
     write_steps({**done, **sources, **({"compiled": sources["packages"]} if compiled else {})})
 
 
 def colcon(selected):
     """The step that builds some packages; it runs."""
-    paths = [f"src/{name}" for name in selected if (ROOT / "src" / name).exists()]  # of others colcon would ask that they are built
+    paths = [
+        f"src/{name}" for name in selected if (ROOT / "src" / name).exists()
+    ]  # of others colcon would ask that they are built
     options, variables = [], {}
     if not OWN_ROS:
-        paths, options = [*paths, ".dev/tf2_msgs"] if "tf2_msgs" in selected else paths, ["-G", "Ninja"]
+        paths, options = (
+            [*paths, ".dev/tf2_msgs"] if "tf2_msgs" in selected else paths,
+            ["-G", "Ninja"],
+        )
         variables = {"AMENT_PREFIX_PATH": str(VENV), "CMAKE_PREFIX_PATH": str(VENV)}
     return start(
         f"build {', '.join(selected)}",
         "build" if selected == PACKAGES else "build_messages",
-        [PYTHON, "-m", "colcon", "build", "--merge-install", "--base-paths", *paths, "--packages-select", *selected]
+        [
+            PYTHON,
+            "-m",
+            "colcon",
+            "build",
+            "--merge-install",
+            "--base-paths",
+            *paths,
+            "--packages-select",
+            *selected,
+        ]
         + ["--event-handlers", "console_direct+", "console_cohesion-", "console_stderr-"]
         + ["--cmake-args", *options, f"-DPython3_EXECUTABLE={PYTHON}"],
         PATH=f"{VENV / 'bin'}{os.pathsep}{os.environ['PATH']}",
@@ -188,7 +270,9 @@ def digest(paths, *words):
     """Hash of the words and of every file under the paths: names and contents."""
     total = hashlib.sha256("\0".join(words).encode())
     for path in paths:
-        files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
+        files = (
+            [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
+        )
         for file in files:
             if not {"test", "__pycache__"} & set(file.relative_to(path).parts):
                 total.update(f"\0{file.relative_to(ROOT)}\0".encode())
@@ -219,14 +303,19 @@ def start(title, log_name, command, **variables):
     with open(log, "wb") as output:
         process = subprocess.Popen(
             list(map(str, command)),
-            cwd=ROOT, env={**os.environ, **variables}, stdin=subprocess.DEVNULL, stdout=output, stderr=output,
-        )  # fmt: skip
+            cwd=ROOT,
+            env={**os.environ, **variables},
+            stdin=subprocess.DEVNULL,
+            stdout=output,
+            stderr=output,
+        )
     return title, log, process, time.monotonic()
 
 
 def finish(*steps):
-    """Wait for steps that run, and say how far they are; the first that fails shows the end of its output, ends the others, and raises
-    Failure."""
+    """Wait for steps that run, and say how far they are; the first that fails shows the end of its
+    output, ends the others, and raises Failure.
+    """
     running, live = list(steps), sys.stderr.isatty()
     said = time.monotonic()
     try:
@@ -236,13 +325,25 @@ def finish(*steps):
                 running.remove(step)
                 title, log, process, started = step
                 if process.returncode != 0:
-                    tail = "".join(f"  | {line}\n" for line in log.read_text(errors="replace").splitlines()[-15:])
+                    tail = "".join(
+                        f"  | {line}\n"
+                        for line in log.read_text(errors="replace").splitlines()[-15:]
+                    )
                     print(tail, end="", file=sys.stderr)
-                    raise Failure(f"the step '{title}' failed; all of its output is in {log.relative_to(ROOT)}.")
+                    raise Failure(
+                        f"the step '{title}' failed; all of its output is in "
+                        f"{log.relative_to(ROOT)}."
+                    )
                 say(f"{title} ... {time.monotonic() - started:.0f} s")
             if running and time.monotonic() - said > (1.0 if live else 5.0):
                 said = time.monotonic()
-                say("; ".join(f"{title} ... {said - began:.0f} s{share(log)}" for title, log, _, began in running), "\r" if live else "\n")
+                say(
+                    "; ".join(
+                        f"{title} ... {said - began:.0f} s{share(log)}"
+                        for title, log, _, began in running
+                    ),
+                    "\r" if live else "\n",
+                )
     finally:
         for *_, process, _ in running:
             process.terminate()
@@ -253,7 +354,11 @@ def share(log):
     """How much of a step is done, as far as its output tells: ", 40 %"."""
     text = log.read_text(errors="replace")
     if log.name == "dev_pip.log":
-        return f", package {text.count('Collecting ')} of {LOCK.read_text().count('==')}" if "Installing" not in text else ", unpacking"
+        return (
+            f", package {text.count('Collecting ')} of {LOCK.read_text().count('==')}"
+            if "Installing" not in text
+            else ", unpacking"
+        )
     for done, total, percent in re.findall(r"\[(\d+)/(\d+)\]|\b(\d+) ?%", text)[-1:]:
         return f", {percent or round(100 * int(done) / int(total))} %"
     return ""

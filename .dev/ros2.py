@@ -1,13 +1,16 @@
-"""What is most needed of the `ros2` command, for those without ROS: `./dev ros2 ...`. Where ROS 2 is sourced, that one runs."""
+"""What is most needed of the `ros2` command, for those without ROS: `./dev ros2 ...`.
+
+Where ROS 2 is sourced, that one runs.
+"""
 
 from collections import deque
 import sys
 import time
 
+from rcl_interfaces.msg import Parameter
 import rclpy
 from rclpy.parameter import get_parameter_value, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
-from rcl_interfaces.msg import Parameter
 import yaml
 
 from uwb_tdoa_bias.foundation.errors import Failure
@@ -52,24 +55,40 @@ def parser():
     some = ("node",), {"nargs": "?", "help": "of this node; default: of all"}
     types = ("-t", "--show-types"), {"action": "store_true"}
     verbose = ("-v", "--verbose"), {"action": "store_true", "help": "nodes and QoS of both ends"}
-    commands("topic", "what is published", [
-        ("list", topic_list, "all topics", types),
-        ("info", topic_info, "type, and who publishes and hears it", topic, verbose),
-        ("hz", topic_hz, "how often a message comes, each second", topic),
-        ("echo", topic_echo, "messages as YAML", topic, (("--once",), {"action": "store_true", "help": "only one"})),
-    ])  # fmt: skip
+    commands(
+        "topic",
+        "what is published",
+        [
+            ("list", topic_list, "all topics", types),
+            ("info", topic_info, "type, and who publishes and hears it", topic, verbose),
+            ("hz", topic_hz, "how often a message comes, each second", topic),
+            (
+                "echo",
+                topic_echo,
+                "messages as YAML",
+                topic,
+                (("--once",), {"action": "store_true", "help": "only one"}),
+            ),
+        ],
+    )
     commands("node", "who is there", [("list", node_list, "all nodes")])
-    commands("param", "parameters of nodes", [
-        ("list", param_list, "names", some),
-        ("get", param_get, "a value", node, name),
-        ("set", param_set, "another value, as in YAML", node, name, (("value",), {})),
-        ("describe", param_describe, "text, unit and range", node, name),
-    ])  # fmt: skip
+    commands(
+        "param",
+        "parameters of nodes",
+        [
+            ("list", param_list, "names", some),
+            ("get", param_get, "a value", node, name),
+            ("set", param_set, "another value, as in YAML", node, name, (("value",), {})),
+            ("describe", param_describe, "text, unit and range", node, name),
+        ],
+    )
     return made
 
 
 def show(text):
-    """Print a line that holds what others have named or written: a terminal shows all of it, and obeys nothing."""
+    """Print a line that holds what others have named or written: a terminal shows all of it, and
+    obeys nothing.
+    """
     print(printable(text), flush=True)
 
 
@@ -77,14 +96,23 @@ def show(text):
 
 
 def topic_list(node, stop, args):
-    for topic, types in _settled(node.get_topic_names_and_types, lambda topics: {*dict(topics)} - OF_EVERY_NODE, stop):
+    for topic, types in _settled(
+        node.get_topic_names_and_types, lambda topics: {*dict(topics)} - OF_EVERY_NODE, stop
+    ):
         show(f"{topic} [{', '.join(types)}]" if args.show_types else topic)
 
 
 def topic_info(node, stop, args):
     topic = _topic(node, stop, args.topic, needs_publisher=False)
-    _settled(lambda: (node.count_publishers(topic), node.count_subscribers(topic)), lambda counts: counts[0] > 0, stop)
-    ends = {"Publisher": node.get_publishers_info_by_topic, "Subscription": node.get_subscriptions_info_by_topic}
+    _settled(
+        lambda: (node.count_publishers(topic), node.count_subscribers(topic)),
+        lambda counts: counts[0] > 0,
+        stop,
+    )
+    ends = {
+        "Publisher": node.get_publishers_info_by_topic,
+        "Subscription": node.get_subscriptions_info_by_topic,
+    }
     show(f"Type: {', '.join(dict(node.get_topic_names_and_types())[topic])}")
     for kind, infos in ends.items():
         infos = infos(topic)
@@ -92,7 +120,10 @@ def topic_info(node, stop, args):
         for info in infos if args.verbose else ():
             qos = info.qos_profile
             name = f"{info.node_namespace.rstrip('/')}/{info.node_name}"
-            show(f"  {name} [{info.topic_type}]: {qos.reliability.name.lower()}, {qos.durability.name.lower()}")
+            show(
+                f"  {name} [{info.topic_type}]: {qos.reliability.name.lower()}, "
+                f"{qos.durability.name.lower()}"
+            )
 
 
 def topic_hz(node, stop, args):
@@ -111,7 +142,10 @@ def _rate(stamps):
     steps = [after - before for before, after in zip(stamps, stamps[1:])]
     if not steps:
         return "no new messages"
-    return f"average rate: {len(steps) / sum(steps):.3f}  min: {min(steps):.4f}s max: {max(steps):.4f}s window: {len(stamps)}"
+    return (
+        f"average rate: {len(steps) / sum(steps):.3f}  min: {min(steps):.4f}s max: "
+        f"{max(steps):.4f}s window: {len(stamps)}"
+    )
 
 
 def topic_echo(node, stop, args):
@@ -120,7 +154,9 @@ def topic_echo(node, stop, args):
     while not stop:
         rclpy.spin_once(node, timeout_sec=0.1)
         while received:
-            cli.show(f"{yaml.safe_dump(_plain(received.popleft()), sort_keys=False, default_flow_style=None)}---")
+            cli.show(
+                f"{yaml.safe_dump(_plain(received.popleft()), sort_keys=False, default_flow_style=None)}---"
+            )
             if args.once:
                 return
 
@@ -142,7 +178,9 @@ def _subscribe(node, stop, name, callback, raw=False):
     kind = message_class(offered[0].topic_type)
     if kind is None:
         raise Failure(f"{topic} is {offered[0].topic_type}, which is not installed here")
-    node.create_subscription(kind, topic, callback, subscription_qos([info.qos_profile for info in offered]), raw=raw)
+    node.create_subscription(
+        kind, topic, callback, subscription_qos([info.qos_profile for info in offered]), raw=raw
+    )
 
 
 def _topic(node, stop, name, needs_publisher):
@@ -152,7 +190,10 @@ def _topic(node, stop, name, needs_publisher):
         if node.count_publishers(topic) or not needs_publisher and node.count_subscribers(topic):
             return topic
         if time.monotonic() > until:
-            raise Failure(f"{topic}: nobody {'publishes' if needs_publisher else 'publishes or hears'} it; see ros2 topic list")
+            raise Failure(
+                f"{topic}: nobody {'publishes' if needs_publisher else 'publishes or hears'} "
+                "it; see ros2 topic list"
+            )
         rclpy.spin_once(node, timeout_sec=0.05)
     raise KeyboardInterrupt
 
@@ -183,14 +224,18 @@ def param_get(node, stop, args):
 
 def param_set(node, stop, args):
     parameter = Parameter(name=args.name, value=get_parameter_value(args.value))
-    (result,) = _answer(node, stop, _client(node, stop, args.node).set_parameters([parameter])).results
+    (result,) = _answer(
+        node, stop, _client(node, stop, args.node).set_parameters([parameter])
+    ).results
     if not result.successful:
         raise Failure(f"{args.name}: not set: {result.reason}")
     show("Set parameter successful")
 
 
 def param_describe(node, stop, args):
-    descriptors = _answer(node, stop, _client(node, stop, args.node).describe_parameters([args.name])).descriptors
+    descriptors = _answer(
+        node, stop, _client(node, stop, args.node).describe_parameters([args.name])
+    ).descriptors
     found = _the_one(descriptors, args)
     show(f"{found.name}: {found.description}")
     for bounds in (*found.floating_point_range, *found.integer_range):
@@ -211,7 +256,10 @@ def _nodes(node, stop):
     """Absolute names of all other nodes."""
 
     def others():
-        names = {f"{namespace.rstrip('/')}/{name}" for name, namespace in node.get_node_names_and_namespaces()}
+        names = {
+            f"{namespace.rstrip('/')}/{name}"
+            for name, namespace in node.get_node_names_and_namespaces()
+        }
         return sorted(names - {node.get_fully_qualified_name()})
 
     return _settled(others, bool, stop)
@@ -243,7 +291,9 @@ def _answer(node, stop, future):
 
 
 def _settled(look, found, stop):
-    """What look() gives when it has not changed for a while; what is not found(it) yet is waited for longer."""
+    """What look() gives when it has not changed for a while; what is not found(it) yet is waited
+    for longer.
+    """
     seen, changed = look(), time.monotonic()
     while not stop and time.monotonic() < changed + (SETTLED if found(seen) else PATIENCE):
         time.sleep(0.05)

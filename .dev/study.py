@@ -1,4 +1,8 @@
-"""`./dev study`. Python looks for modules beside this file, and not in the present folder as `python -m studies` would."""
+"""`./dev study`.
+
+Python looks for modules beside this file, and not in the present folder as `python -m studies`
+would.
+"""
 
 import sys
 

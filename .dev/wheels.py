@@ -1,15 +1,17 @@
 """Three repairs of the ROS wheels in a virtual environment. Run by its Python.
 
 1. Their CMake files name the paths of the machine they were built on: put ours in.
-2. Their prefix has no local_setup.*: with one, install/setup.bash chains back to it in a clean shell.
-3. Their bootstrap sets LD_LIBRARY_PATH in the Python of colcon that writes the setup. Then colcon leaves a `:` at its end, and the loader
+2. Their prefix has no local_setup.*: with one, install/setup.bash chains back to it in a clean
+   shell.
+3. Their bootstrap sets LD_LIBRARY_PATH in the Python of colcon that writes the setup. Then colcon
+   leaves a `:` at its end, and the loader
    takes libraries of the present folder.
 """
 
+from pathlib import Path
 import re
 import sys
 import sysconfig
-from pathlib import Path
 
 import numpy
 
@@ -50,7 +52,9 @@ def repair_bootstrap():
     text = file.read_text(encoding="utf-8")
     if text.count(old) != 1:
         raise SystemExit(f"{file} is another than it was: see repair 3 of .dev/wheels.py")
-    new = old.replace(":", " and not any(word.endswith('_local_setup_util_sh.py') for word in sys.orig_argv):")
+    new = old.replace(
+        ":", " and not any(word.endswith('_local_setup_util_sh.py') for word in sys.orig_argv):"
+    )
     file.write_text(text.replace(old, new), encoding="utf-8")
 
 

@@ -1,4 +1,7 @@
-"""What re-makes the figures of the documentation. Not installed: `./dev study NAME` runs it from the repository."""
+"""What re-makes the figures of the documentation.
+
+Not installed: `./dev study NAME` runs it from the repository.
+"""
 
 from pathlib import Path
 import sys

@@ -3,11 +3,21 @@
 import argparse
 import sys
 
-from uwb_tdoa_tools import cli
-
 from studies import (
-    aids, calibrating, crazyflie, fuzz, localizing, moved_anchors, noise, ranges, recalibrating, rover, scale, situations, surveying,
-)  # fmt: skip
+    aids,
+    calibrating,
+    crazyflie,
+    fuzz,
+    localizing,
+    moved_anchors,
+    noise,
+    ranges,
+    recalibrating,
+    rover,
+    scale,
+    situations,
+    surveying,
+)
 from studies.checking import figures as checking
 from studies.checking import in_flight
 from studies.closed_loop import experiment
@@ -17,6 +27,7 @@ from studies.diagnosis import ranges as diagnosed_ranges
 from studies.faults import figures as faults
 from studies.faults import flown
 from studies.training import compare, default, spin, splits
+from uwb_tdoa_tools import cli
 
 STUDIES = {
     "aids": aids,
@@ -92,7 +103,10 @@ def parser():
         "./dev study calibrating --data DATA --draws 3",
         "./dev study checking DATA/flights DATA/util --survey DATA/surveys --only nothing",
         "./dev study closed-loop --out paper/",
-        "./dev study compare-models --train DATA/flights/0425 --test 0426 DATA/flights/0426 --survey DATA/surveys --out out/",
+        (
+            "./dev study compare-models --train DATA/flights/0425 --test 0426 DATA/flights/0426 "
+            "--survey DATA/surveys --out out/"
+        ),
         "./dev study compare-models --simulated 20 --out out/",
         "./dev study crazyflie DATA/flights/0425/TDOA2 DATA/flights/0422 --survey DATA/surveys",
         "./dev study debias-measured --data DATA --diagnosed bench/ --out measured/",
@@ -101,11 +115,17 @@ def parser():
         "./dev study diagnose-ranges --flights 5",
         "./dev study diagnosis bank --out bench/",
         "./dev study diagnosis measured --data DATA --out bench/",
-        "./dev study diagnosis undeclared --cases src/uwb_tdoa_tools/test/undeclared.py --out bench/",
+        (
+            "./dev study diagnosis undeclared --cases src/uwb_tdoa_tools/test/undeclared.py --out "
+            "bench/"
+        ),
         "./dev study faults --only '^velocity' --json faults.json --out faults.md",
         "./dev study fly-faults --flights 6",
         "./dev study fuzz --count 20000",
-        "./dev study in-flight DATA/flights/0426/0426-traj5 --survey DATA/surveys --only nothing sign",
+        (
+            "./dev study in-flight DATA/flights/0426/0426-traj5 --survey DATA/surveys --only "
+            "nothing sign"
+        ),
         "./dev study localizing DATA/flights DATA/util --survey DATA/surveys --mistakes",
         "./dev study moved-anchors DATA/flights --survey DATA/surveys --draws 10 --json moved.json",
         "./dev study noise --data DATA --split const1",
@@ -122,7 +142,9 @@ def parser():
     names = made.add_subparsers(dest="study", required=True, metavar="NAME")
     for name, study in STUDIES.items():
         form = argparse.RawDescriptionHelpFormatter
-        study.add_options(names.add_parser(name, description=study.__doc__, formatter_class=form).add_argument)
+        study.add_options(
+            names.add_parser(name, description=study.__doc__, formatter_class=form).add_argument
+        )
     return made
 
 

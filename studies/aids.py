@@ -1,4 +1,6 @@
-"""Height, pressure and velocity on measured flights: what each is worth, and what faults put into them do."""
+"""Height, pressure and velocity on measured flights: what each is worth, and what faults put into
+them do.
+"""
 
 from dataclasses import replace
 
@@ -23,39 +25,60 @@ from uwb_tdoa_tools.scoring.metrics import judged_part, pooled, position_at
 from uwb_tdoa_tools.scoring.phases import NEAR_THE_FLOOR, TITLES
 
 SETS = (), ("height",), ("pressure",), ("height", "pressure"), ("velocity",), ("height", "velocity")
-VELOCITY_RATE, VELOCITY_STD = 25.0, 0.1  # Hz, m/s: of a velocity made of the ground truth, where none was recorded
+VELOCITY_RATE, VELOCITY_STD = (
+    25.0,
+    0.1,
+)  # Hz, m/s: of a velocity made of the ground truth, where none was recorded
 TAKE_OFF = 0.2  # s into the airborne part, whose largest error is told
 GRACE = 3.0  # s after the beginning of a fault that do not count
 ONSET = 8.0  # s into the airborne part at which a fault begins that is not there from the start
 STEPS = 0.3, -0.5, 0.8  # m, of the ground below, one after the other,
-LARGEST_UNUSED = 0.5  # share of the messages of each of two seconds, as the status of ekf_node judges them
+LARGEST_UNUSED = (
+    0.5  # share of the messages of each of two seconds, as the status of ekf_node judges them
+)
 NAMED = tuple(value for value, name in VERDICTS.items() if name in ("rejected", "invalid"))
 STEP_PERIOD, STEP_LENGTH = 6.0, 3.0  # s between their beginnings, and of each
 
 
 def add_options(add):
     """add : add_argument of a parser."""
-    tables = "what each aid is worth, what faults put into them do, or what is wrong with the velocity"
+    tables = (
+        "what each aid is worth, what faults put into them do, or what is wrong with the velocity"
+    )
     add("table", choices=("worth", "faults", "velocity"), help=tables)
     add("flights", nargs="+", metavar="FLIGHT", help=inputs.HELP)
     add("--survey", metavar="S", help=inputs.SURVEY_HELP)
-    add("-p", dest="parameters", metavar="NAME:=VALUE", action="append", default=[], help="one filter parameter")
+    add(
+        "-p",
+        dest="parameters",
+        metavar="NAME:=VALUE",
+        action="append",
+        default=[],
+        help="one filter parameter",
+    )
 
 
 def run(args):
     """Print one of the tables."""
     config = options.with_parameters(FilterConfig(), args.parameters)
-    flights = [with_velocity(flight) for flight in inputs.Reading(args.survey).flights(args.flights)]
+    flights = [
+        with_velocity(flight) for flight in inputs.Reading(args.survey).flights(args.flights)
+    ]
     {"worth": worth, "faults": faults, "velocity": velocity}[args.table](flights, config)
 
 
 def with_velocity(flight, rate=VELOCITY_RATE):
-    """The flight with a velocity in the body frame, made of its ground truth and noise, at a rate, Hz, where none was recorded."""
+    """The flight with a velocity in the body frame, made of its ground truth and noise, at a rate,
+    Hz, where none was recorded.
+    """
     if flight.velocity is not None:
         return flight
     truth = flight.truth
     t = np.arange(truth.t[0] + 0.1, truth.t[-1] - 0.1, 1.0 / rate)
-    ends = [np.stack([np.interp(t + s, truth.t, truth.p[:, k]) for k in range(3)], axis=1) for s in (-0.05, 0.05)]
+    ends = [
+        np.stack([np.interp(t + s, truth.t, truth.p[:, k]) for k in range(3)], axis=1)
+        for s in (-0.05, 0.05)
+    ]
     near = truth.q[np.clip(np.searchsorted(truth.t, t), 0, len(truth) - 1)]
     v = Rotation.from_quat(near).inv().apply((ends[1] - ends[0]) / 0.1)
     noise = VELOCITY_STD * np.random.default_rng(0).standard_normal(v.shape)
@@ -75,13 +98,17 @@ def velocity(flights, config):
         spread = 1.4826 * np.median(np.abs(error[:, :2] - np.median(error[:, :2], axis=0)), axis=0)
         kinds = [name for name, effect in EFFECTS.items() if effect.channels == ("velocity",)]
         found = attribute([flight], GroundTruth(), kinds=kinds, undeclared=False).effects
-        words = "; ".join(f"{e.name} {', '.join(f'{k} {v:.3g}' for k, v in e.values.items())}" for e in found)
+        words = "; ".join(
+            f"{e.name} {', '.join(f'{k} {v:.3g}' for k, v in e.values.items())}" for e in found
+        )
         print(f"| {flight.name} | {spread[0]:.3f}, {spread[1]:.3f} | {words or 'nothing'} |")
 
 
 def worth(flights, config):
-    """Tables of the errors with each set of aids: with all anchors and the IMU, without IMU, and with TDOAs of four anchors
-    only; and the bound of `plan` beside them, of one round of TDOAs and a height."""
+    """Tables of the errors with each set of aids: with all anchors and the IMU, without IMU, and
+    with TDOAs of four anchors only; and the bound of `plan` beside them, of one round of TDOAs and
+    a height.
+    """
     for words, change, setting in (
         ("all anchors", lambda flight: flight, config),
         ("without IMU", lambda flight: flight, replace(config, use_imu=False)),
@@ -98,8 +125,10 @@ def of_four(flight):
 
 
 def bounds(flights, height_std):
-    """(4,) m, along x, y, z and in space: the bound of `plan` for one round of TDOAs, and a height if height_std, m, is
-    finite, at the places that were flown; roots of means over each flight, averaged over the flights."""
+    """(4,) m, along x, y, z and in space: the bound of `plan` for one round of TDOAs, and a height
+    if height_std, m, is finite, at the places that were flown; roots of means over each flight,
+    averaged over the flights.
+    """
     rows = []
     for flight in flights:
         _, first, last = judged_part(flight.truth)
@@ -112,28 +141,44 @@ def bounds(flights, height_std):
 
 def _worth(flights, config, sets):
     titles = " | ".join(TITLES[name] for name in NEAR_THE_FLOOR)
-    print(f"| aids | x | y | z | 3D | largest 3D | at take-off | NEES | coverage | {titles} |\n|---|" + (8 + len(NEAR_THE_FLOOR)) * "---:|")
+    print(
+        f"| aids | x | y | z | 3D | largest 3D | at take-off | NEES | coverage | {titles} |\n|---|"
+        + (8 + len(NEAR_THE_FLOOR)) * "---:|"
+    )
     for names in sets:
         scores = [evaluate(only(flight, names), config)[0] for flight in flights]
         rows = [score.row() for score in scores]
-        take_off = max(np.linalg.norm(s.error[s.t < s.first + TAKE_OFF], axis=1).max() for s in scores)
+        take_off = max(
+            np.linalg.norm(s.error[s.t < s.first + TAKE_OFF], axis=1).max() for s in scores
+        )
         means = [np.mean([row[f"rmse_{axis}"] for row in rows]) for axis in ("x", "y", "z", "3d")]
         nees = [row["nees_mean"] for row in rows]
         least = min(row[f"coverage_3sigma_{axis}"] for row in rows for axis in "xyz")
-        cells = [f"{value:.3f}" for value in (*means, max(row["rmse_3d"] for row in rows), take_off)]
+        cells = [
+            f"{value:.3f}" for value in (*means, max(row["rmse_3d"] for row in rows), take_off)
+        ]
         cells += [f"{min(nees):.1f} - {max(nees):.1f}", f"{least:.3f}"]
         phases = pooled(scores)["phases"]
-        cells += [f"{phases[name]['rmse_3d']:.3f}" if name in phases else "" for name in NEAR_THE_FLOOR]
+        cells += [
+            f"{phases[name]['rmse_3d']:.3f}" if name in phases else "" for name in NEAR_THE_FLOOR
+        ]
         print(f"| {', '.join(names) or 'none'} | {' | '.join(cells)} |")
     for words, std in (("", np.inf), (", with a height", config.height_std)):
         cells = [f"{value:.3f}" for value in bounds(flights, std)]
-        print(f"| *bound of one round{words}* | {' | '.join(cells)} |{(4 + len(NEAR_THE_FLOOR)) * ' |'}")
+        print(
+            f"| *bound of one round{words}* | {' | '.join(cells)} "
+            f"|{(4 + len(NEAR_THE_FLOOR)) * ' |'}"
+        )
 
 
 def faults(flights, config):
-    """Table of the 3D RMSE with a faulty aid over that without the aid, and of the flights in which the status of ekf_node
-    would name the aid: one row per fault."""
-    print("| fault | mean 3D without | sound | faulty | largest faulty / without | named | sound, named |")
+    """Table of the 3D RMSE with a faulty aid over that without the aid, and of the flights in which
+    the status of ekf_node would name the aid: one row per fault.
+    """
+    print(
+        "| fault | mean 3D without | sound | faulty | largest faulty / without | named | "
+        "sound, named |"
+    )
     print("|---|---:|---:|---:|---:|---:|---:|")
     plain = [evaluate(only(flight, ()), config)[0] for flight in flights]
     for name, (aid, from_start, change) in FAULTS.items():
@@ -151,11 +196,16 @@ def faults(flights, config):
         ratio = rows[worst, 2] / rows[worst, 0]
         calm, told = np.sum(named, axis=0)
         means = f"{without:.3f} | {with_sound:.3f} | {with_faulty:.3f}"
-        print(f"| {name} | {means} | {ratio:.2f} ({flights[worst].name}) | {told} of {len(named)} | {calm} |")
+        print(
+            f"| {name} | {means} | {ratio:.2f} ({flights[worst].name}) | {told} of "
+            f"{len(named)} | {calm} |"
+        )
 
 
 def is_named(flight, aid, run):
-    """Whether, for two seconds of a Run, most messages of an aid contradict everything else or are invalid."""
+    """Whether, for two seconds of a Run, most messages of an aid contradict everything else or are
+    invalid.
+    """
     second = (getattr(flight, aid).t - flight.tdoa.t[0]).astype(int)
     unused = np.isin(run.aids[aid]["verdict"], NAMED)
     first = second.min()
@@ -201,20 +251,30 @@ def _turned(velocity, begin):
 FAULTS = {  # name: aid, whether it is there from the start, and what it makes of the stream
     "height: steps of 0.3 to 0.8 m": ("height", False, _range(_steps)),
     "height: out of range for 5 s": (
-        "height", False, _range(lambda since, r: np.where((since > 0.0) & (since < 5.0), np.inf, r)),
+        "height",
+        False,
+        _range(lambda since, r: np.where((since > 0.0) & (since < 5.0), np.inf, r)),
     ),
     "height: stuck": ("height", False, _range(_stuck)),
     "height: stuck on the floor": ("height", True, _range(lambda since, r: np.full(len(r), r[0]))),
-    "height: stuck at 1 m from the start": ("height", True, _range(lambda since, r: np.ones(len(r)))),
+    "height: stuck at 1 m from the start": (
+        "height",
+        True,
+        _range(lambda since, r: np.ones(len(r))),
+    ),
     "height: near 0 with noise, from the start": (
-        "height", True, _range(lambda since, r: 0.02 + 0.005 * np.random.default_rng(0).random(len(r))),
+        "height",
+        True,
+        _range(lambda since, r: 0.02 + 0.005 * np.random.default_rng(0).random(len(r))),
     ),
     "height: mm for m": ("height", True, _range(lambda since, r: 1000.0 * r)),
     "height: sign": ("height", True, _range(lambda since, r: -r)),
     "height: one in five 1 m too long": (
-        "height", True, _range(lambda since, r: r + (np.random.default_rng(0).random(len(r)) < 0.2)),
+        "height",
+        True,
+        _range(lambda since, r: r + (np.random.default_rng(0).random(len(r)) < 0.2)),
     ),
     "pressure: drifts 1 m per minute": ("pressure", True, _drifting),
     "velocity: slips for 2 s of 10": ("velocity", False, _slipping),
     "velocity: turned by 90 degrees": ("velocity", True, _turned),
-}  # fmt: skip
+}

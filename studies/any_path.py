@@ -1,4 +1,6 @@
-"""Motion along any path, for what the families of trajectories do not do: tags that are carried, driven, thrown, or far away."""
+"""Motion along any path, for what the families of trajectories do not do: tags that are carried,
+driven, thrown, or far away.
+"""
 
 from __future__ import annotations
 
@@ -13,6 +15,7 @@ from uwb_tdoa_tools.simulation.trajectories import DRAG, GRAVITY, STEP
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
+
     from numpy.typing import ArrayLike
 
     Position = Callable[[np.ndarray], np.ndarray]  # of stamps (n,) s: (n, 3) m
@@ -25,31 +28,45 @@ APART = 1e-4  # s, over which attitudes are differentiated
 class Path:
     """What simulate() takes as a trajectory.
 
-    duration : s; position : function of stamps (n,) s, 0 to duration, that gives (n, 3) m, with four derivatives; attitude :
-    function of stamps that gives a Rotation, body to world, or None for that of a multirotor, whose thrust carries it; running : (begin,
-    end) s, of its motors, or None.
+    duration : s; position : function of stamps (n,) s, 0 to duration, that gives (n, 3) m, with
+        four derivatives; attitude :
+    function of stamps that gives a Rotation, body to world, or None for that of a multirotor, whose
+    thrust carries it; running : (begin, end) s, of its motors, or None.
     """
 
     def __init__(
-        self, duration: float, position: Position, attitude: Attitude | None = None,
+        self,
+        duration: float,
+        position: Position,
+        attitude: Attitude | None = None,
         running: tuple[float, float] | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         t = np.arange(-2.0 * KNOT, duration + 2.5 * KNOT, KNOT)
-        self._p, self._attitude, self._running = make_interp_spline(t, position(t), k=5), attitude or self._flown, running
+        self._p, self._attitude, self._running = (
+            make_interp_spline(t, position(t), k=5),
+            attitude or self._flown,
+            running,
+        )
 
     def motion(self, t: ArrayLike) -> ExactMotion:
         """The ExactMotion at the stamps t, (n,) s."""
         t = np.asarray(t, dtype=float)
         p, v, a = (self._p(t, k) for k in range(3))
         turn = self._attitude(t)
-        rates = (self._attitude(t - APART).inv() * self._attitude(t + APART)).as_rotvec() / (2.0 * APART)
+        rates = (self._attitude(t - APART).inv() * self._attitude(t + APART)).as_rotvec() / (
+            2.0 * APART
+        )
         q = turn.as_quat()
         return ExactMotion(p, v, a, q, rates, turn.inv().apply(a + [0.0, 0.0, GRAVITY]))
 
     def motors(self, t: ArrayLike) -> np.ndarray:
         """Whether the motors turn at the stamps t: (n,) bool."""
         t = np.asarray(t)
-        return (t >= self._running[0]) & (t <= self._running[1]) if self._running else np.zeros(len(t), bool)
+        return (
+            (t >= self._running[0]) & (t <= self._running[1])
+            if self._running
+            else np.zeros(len(t), bool)
+        )
 
     def _flown(self, t: np.ndarray) -> Rotation:
         """Thrust along body z, as of a Trajectory, yaw 0."""
@@ -62,7 +79,10 @@ class Path:
 
 def between(*stops: Sequence[float]) -> Position:
     """A position for Path: from one stop (stamp s, x, y, z m) to the next, at rest at each."""
-    stamps, places = np.array([stop[0] for stop in stops]), np.array([stop[1:] for stop in stops], dtype=float)
+    stamps, places = (
+        np.array([stop[0] for stop in stops]),
+        np.array([stop[1:] for stop in stops], dtype=float),
+    )
 
     def position(t: np.ndarray) -> np.ndarray:
         t = np.clip(t, stamps[0], stamps[-1])

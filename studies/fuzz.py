@@ -1,8 +1,11 @@
-"""fuzz: changed files of every kind, given to every reader. A reader returns, or raises InputError, within 5 s and 500 MB.
+"""fuzz: changed files of every kind, given to every reader. A reader returns, or raises InputError,
+within 5 s and 500 MB.
 
-The small files of the fuzz corpus are changed by their structure. Seed and number determine each file, so that --seed and --first repeat
-it. One process reads the files of a kind, one after the other. A file that takes too long ends the process, and the next process goes on
-behind it. Memory is what a file adds to the process at its peak. Findings are kept in --out: the file, named by kind, seed and number.
+The small files of the fuzz corpus are changed by their structure. Seed and number determine each
+file, so that --seed and --first repeat it. One process reads the files of a kind, one after the
+other. A file that takes too long ends the process, and the next process goes on behind it. Memory
+is what a file adds to the process at its peak. Findings are kept in --out: the file, named by kind,
+seed and number.
 """
 
 from collections import Counter
@@ -32,7 +35,13 @@ def add_options(add):
     add("--count", type=int, default=1000, metavar="N", help="files of each kind (default: 1000)")
     add("--first", type=int, default=0, metavar="N", help="number of the first (default: 0)")
     add("--seed", type=int, default=0, metavar="N", help="of the changes (default: 0)")
-    add("--out", type=OutputFolder, default="out/fuzz", metavar="DIR", help="for the files of findings (default: out/fuzz)")
+    add(
+        "--out",
+        type=OutputFolder,
+        default="out/fuzz",
+        metavar="DIR",
+        help="for the files of findings (default: out/fuzz)",
+    )
 
 
 def run(args):
@@ -41,11 +50,18 @@ def run(args):
     if unknown:
         raise InputError(f"KIND: {', '.join(unknown)} is none of {', '.join(targets.TARGETS)}.")
     found = 0
-    print("| kind | files | read | refused | slowest, s | largest, MB | findings |\n|---|---:|---:|---:|---:|---:|---:|")
+    print(
+        "| kind | files | read | refused | slowest, s | largest, MB | findings "
+        "|\n|---|---:|---:|---:|---:|---:|---:|"
+    )
     for kind in args.kinds or targets.TARGETS:
-        outcomes, slowest, largest, findings = fuzz(kind, args.seed, args.first, args.first + args.count)
+        outcomes, slowest, largest, findings = fuzz(
+            kind, args.seed, args.first, args.first + args.count
+        )
         counts = f"{outcomes.total()} | {outcomes['read']} | {outcomes['refused']}"
-        print(f"| {kind} | {counts} | {slowest:.2f} | {largest:.0f} | {len(findings)} |", flush=True)
+        print(
+            f"| {kind} | {counts} | {slowest:.2f} | {largest:.0f} | {len(findings)} |", flush=True
+        )
         for number, what in findings.items():
             name = f"{kind}-{args.seed}-{number}"
             args.out.mkdir(parents=True, exist_ok=True)
@@ -62,13 +78,16 @@ def changed(kind, seed, number):
 
 
 def fuzz(kind, seed, first, end):
-    """(Counter of outcomes, slowest in s, largest in MB, {number: what was found}) of some files. Of findings at one place of the code, the
-    first is kept."""
+    """(Counter of outcomes, slowest in s, largest in MB, {number: what was found}) of some files.
+    Of findings at one place of the code, the first is kept.
+    """
     outcomes, slowest, largest, findings, number = Counter(), 0.0, 0.0, {}, first
     with tqdm(total=end - first, desc=kind, leave=False) as bar:
         while number < end:
             ours, theirs = multiprocessing.get_context("fork").Pipe(duplex=False)
-            reader = multiprocessing.get_context("fork").Process(target=_read, args=(theirs, kind, seed, number, end))
+            reader = multiprocessing.get_context("fork").Process(
+                target=_read, args=(theirs, kind, seed, number, end)
+            )
             reader.start()
             theirs.close()
             try:
@@ -86,19 +105,28 @@ def fuzz(kind, seed, first, end):
                 raise Failure(f"{kind}: its corpus cannot be read; see above.")
             if number < end:
                 outcome = f"ended by {signal.Signals(-reader.exitcode).name}"
-                findings[number], slowest = outcome, max(slowest, SECONDS if reader.exitcode == -signal.SIGPROF else 0.0)
+                findings[number], slowest = (
+                    outcome,
+                    max(slowest, SECONDS if reader.exitcode == -signal.SIGPROF else 0.0),
+                )
                 outcomes[outcome] += 1
                 number += 1
     return outcomes, slowest, largest, findings
 
 
 def _read(pipe, kind, seed, first, end):
-    """Read files, and send (outcome, s, MB) of each. Ends this process where one takes too long, even within a library."""
+    """Read files, and send (outcome, s, MB) of each.
+
+    Ends this process where one takes too long, even within a library.
+    """
     tempfile.tempdir = str(targets.FOLDER)  # of the readers, too
     for path in targets.seeds(kind):
         targets.TARGETS[kind](path.read_bytes())  # what is imported and compiled does not count
     signal.signal(signal.SIGPROF, signal.SIG_DFL)
-    resource.setrlimit(resource.RLIMIT_DATA, (_kilobytes("VmData") + (MEGABYTES << 10) << 10, resource.RLIM_INFINITY))
+    resource.setrlimit(
+        resource.RLIMIT_DATA,
+        (_kilobytes("VmData") + (MEGABYTES << 10) << 10, resource.RLIM_INFINITY),
+    )
     for number in range(first, end):
         data = changed(kind, seed, number)
         Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew
@@ -113,7 +141,9 @@ def _read(pipe, kind, seed, first, end):
             last = traceback.extract_tb(error.__traceback__)[-1]
             outcome = f"{type(error).__name__} in {last.name}, {last.filename}, line {last.lineno}"
         signal.setitimer(signal.ITIMER_PROF, 0.0)
-        pipe.send((outcome, time.process_time() - began, max(0.0, _kilobytes("VmHWM") - before) / 1024.0))
+        pipe.send(
+            (outcome, time.process_time() - began, max(0.0, _kilobytes("VmHWM") - before) / 1024.0)
+        )
 
 
 def _kilobytes(name):

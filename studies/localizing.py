@@ -1,7 +1,9 @@
-"""localizing: what localize says of recordings, as they are and with mistakes put into them, against their ground truth.
+"""localizing: what localize says of recordings, as they are and with mistakes put into them,
+against their ground truth.
 
-A flight is within what is stated if its position is within twice the stated standard deviation for 95 % of the time, where the tag
-was not lost."""
+A flight is within what is stated if its position is within twice the stated standard deviation for
+95 % of the time, where the tag was not lost.
+"""
 
 from dataclasses import replace
 from functools import partial
@@ -13,10 +15,10 @@ import numpy as np
 from uwb_tdoa_bias.foundation.files import write_text
 from uwb_tdoa_tools import options, parallel
 from uwb_tdoa_tools.checking.recording import of_flight
-from uwb_tdoa_tools.localizing.belief import GOOD, believe
 from uwb_tdoa_tools.estimate import FlightEstimator
-from uwb_tdoa_tools.scoring.metrics import position_errors
+from uwb_tdoa_tools.localizing.belief import GOOD, believe
 from uwb_tdoa_tools.outputs import OutputFile
+from uwb_tdoa_tools.scoring.metrics import position_errors
 
 NOTHING, ALIKE = "nothing", 0.95  # no mistake; share of the time
 
@@ -32,11 +34,21 @@ def add_options(add):
 def run(args):
     """Print a table: a row for recordings as they are, and one for those with mistakes."""
     reading, rows = options.reading_of(args), []
-    for told in parallel.over(partial(judge, reading=reading, mistakes=args.mistakes), reading.find(args.flights), args.jobs):
+    for told in parallel.over(
+        partial(judge, reading=reading, mistakes=args.mistakes),
+        reading.find(args.flights),
+        args.jobs,
+    ):
         rows += told
         if args.json:
             write_text(args.json, json.dumps(rows, indent=1))
-    print("| recordings | number | good | of these within what is stated | not good | of these within |\n|---|" + 5 * "---:|")
+    print(
+        (
+            "| recordings | number | good | of these within what is stated | not good | of these "
+            "within |\n|---|"
+        )
+        + 5 * "---:|"
+    )
     for what, some in (
         ("as they are", [r for r in rows if r["mistake"] == NOTHING]),
         ("with a mistake", [r for r in rows if r["mistake"] != NOTHING]),
@@ -45,13 +57,22 @@ def run(args):
             print(f"| {what} | {len(some)} | {summary(some)} |")
     for row in rows:
         if row["verdict"] == GOOD and not row["within"]:
-            print(f"{row['flight']}, {row['mistake']}: called good, off by {row['rmse']:.2f} m at a stated {row['std']:.2f} m")
+            print(
+                f"{row['flight']}, {row['mistake']}: called good, off by {row['rmse']:.2f} m "
+                f"at a stated {row['std']:.2f} m"
+            )
 
 
 def summary(rows):
     """Cells of the table."""
-    good, others = ([row for row in rows if (row["verdict"] == GOOD) is what] for what in (True, False))
-    return " | ".join(str(number) for some in (good, others) for number in (len(some), sum(row["within"] for row in some)))
+    good, others = (
+        [row for row in rows if (row["verdict"] == GOOD) is what] for what in (True, False)
+    )
+    return " | ".join(
+        str(number)
+        for some in (good, others)
+        for number in (len(some), sum(row["within"] for row in some))
+    )
 
 
 def judge(recording, reading, mistakes=False):
@@ -83,9 +104,16 @@ def _judged(flight):
     run = FlightEstimator()(flight)
     told = believe(replace(flight, truth=None), run)
     t, error, _ = position_errors(run.odometry, flight.truth, flight.truth.t[0], flight.truth.t[-1])
-    known = ~np.any([(t >= begin) & (t <= end) for begin, end in told.lost] or [np.zeros(len(t), bool)], axis=0)
+    known = ~np.any(
+        [(t >= begin) & (t <= end) for begin, end in told.lost] or [np.zeros(len(t), bool)], axis=0
+    )
     off = np.linalg.norm(error[known], axis=1)
     if not len(off):
         return {"verdict": told.level, "within": False, "rmse": None, "std": None}
     within = bool(np.mean(off <= told.figures["within"]) >= ALIKE)
-    return {"verdict": told.level, "within": within, "rmse": float(np.sqrt(np.mean(off**2))), "std": told.figures["std"]}
+    return {
+        "verdict": told.level,
+        "within": within,
+        "rmse": float(np.sqrt(np.mean(off**2))),
+        "std": told.figures["std"],
+    }

@@ -1,8 +1,11 @@
-"""moved_anchors: recordings in which an anchor was moved by 0.3 to 1 m, or two were exchanged, before the start or in the middle.
+"""moved_anchors: recordings in which an anchor was moved by 0.3 to 1 m, or two were exchanged,
+before the start or in the middle.
 
-A tag is calibrated by a flight of last week, without ground truth; the anchors change; another flight is recorded. Each recording is
-judged with the calibration of last week, and as if there were none. A change costs what it adds to the 3D RMSE from 5 s after it on.
-Measured flights have no change: whatever is named there is false."""
+A tag is calibrated by a flight of last week, without ground truth; the anchors change; another
+flight is recorded. Each recording is judged with the calibration of last week, and as if there were
+none. A change costs what it adds to the 3D RMSE from 5 s after it on. Measured flights have no
+change: whatever is named there is false.
+"""
 
 from dataclasses import replace
 from functools import partial
@@ -19,11 +22,11 @@ from uwb_tdoa_tools import options, parallel
 from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
 from uwb_tdoa_tools.estimate import FlightEstimator
 from uwb_tdoa_tools.localizing.belief import GOOD, believe
+from uwb_tdoa_tools.outputs import OutputFile
 from uwb_tdoa_tools.parallel import whole_number
 from uwb_tdoa_tools.scoring.metrics import position_errors
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.trajectories import Trajectory
-from uwb_tdoa_tools.outputs import OutputFile
 
 KINDS = "moved before", "moved on the way", "exchanged before", "exchanged on the way", "nothing"
 MOVED = 0.3, 1.0  # m
@@ -33,7 +36,10 @@ MATTERS = 0.05  # m, by which a change must make the position worse
 SETTLED, LANDING = 8.0, 5.0  # s after the start, and before the end, that are not judged
 TAPE = 0.05  # m
 STEP = 0.5  # s between two looks at what is said live
-_NAMED = re.compile(r"two anchors are exchanged, \d+ and \d+|anchor \d+(?=: | is not where| does not stand| is later)|the ids of two")
+_NAMED = re.compile(
+    r"two anchors are exchanged, \d+ and \d+|anchor \d+(?=: | is not where| does not stand| "
+    r"is later)|the ids of two"
+)
 
 
 def add_options(add):
@@ -42,7 +48,13 @@ def add_options(add):
     options.add_reading(type("", (), {"add_argument": staticmethod(add)}))
     words = "recordings of each kind, and twice as many without a change (default 10)"
     add("--draws", type=whole_number, default=10, metavar="N", help=words)
-    add("--first", type=int, default=1000, metavar="SEED", help="of the first draw (default 1000; limits were set on draws below 100)")
+    add(
+        "--first",
+        type=int,
+        default=1000,
+        metavar="SEED",
+        help="of the first draw (default 1000; limits were set on draws below 100)",
+    )
     add("--json", metavar="FILE", type=OutputFile, help="write what was said of each")
     add("--jobs", type=whole_number, default=1, metavar="N", help="recordings at once (default 1)")
 
@@ -52,13 +64,21 @@ def run(args):
     seeds = range(args.first, args.first + args.draws)
     cases = [(kind, seed) for kind in KINDS[:-1] for seed in seeds]
     cases += [(KINDS[-1], seed) for seed in range(args.first, args.first + 2 * args.draws)]
-    rows = [row for told in parallel.over(judge, cases, args.jobs, unit="recording") for row in told]
+    rows = [
+        row for told in parallel.over(judge, cases, args.jobs, unit="recording") for row in told
+    ]
     reading = options.reading_of(args)
     found = reading.find(args.flights) if args.flights else []
     rows += parallel.over(partial(measured, reading), found, args.jobs, unit="flight")
     if args.json:
         write_text(args.json, json.dumps(rows, indent=1))
-    print("| change | survey | recordings | it costs more than 5 cm | named then: check | localize | live ", end="")
+    print(
+        (
+            "| change | survey | recordings | it costs more than 5 cm | named then: check | "
+            "localize | live "
+        ),
+        end="",
+    )
     print("| the right one alone: check | localize | live |")
     print("|---|---|" + 8 * "---:|")
     for kind, calibrated in dict.fromkeys((row["kind"], row["calibrated"]) for row in rows):
@@ -66,17 +86,38 @@ def run(args):
         none = kind not in KINDS[:-1]
         asked = some if none else [row for row in some if row["cost"] > MATTERS]
         named = [sum(bool(row[how]) for row in asked) for how in ("check", "localize", "live")]
-        right = ["" if none else sum(row[how] == row["ids"] for row in asked) for how in ("check", "localize", "live")]
-        cells = [kind, "calibrated" if calibrated else "tape", len(some), "" if none else len(asked), *named, *right]
+        right = [
+            "" if none else sum(row[how] == row["ids"] for row in asked)
+            for how in ("check", "localize", "live")
+        ]
+        cells = [
+            kind,
+            "calibrated" if calibrated else "tape",
+            len(some),
+            "" if none else len(asked),
+            *named,
+            *right,
+        ]
         print(f"| {' | '.join(map(str, cells))} |")
-    print("\n| surveyed from | moved anchors | named | within 8 cm | off by, median [m] | another by more than its deviation |")
+    print(
+        "\n| surveyed from | moved anchors | named | within 8 cm | off by, median [m] | "
+        "another by more than its deviation |"
+    )
     print("|---|" + 5 * "---:|")
     for calibrated in (True, False):
-        some = [row["surveyed"] for row in rows if "surveyed" in row and row["calibrated"] == calibrated]
+        some = [
+            row["surveyed"] for row in rows if "surveyed" in row and row["calibrated"] == calibrated
+        ]
         if some:
             named, near = sum(one["named"] for one in some), sum(one["off"] < 0.08 for one in some)
-            off, others = np.median([one["off"] for one in some]), sum(one["others"] > 1.0 for one in some)
-            print(f"| {'the last calibration' if calibrated else 'a tape'} | {len(some)} | {named} | {near} | {off:.3f} | {others} |")
+            off, others = (
+                np.median([one["off"] for one in some]),
+                sum(one["others"] > 1.0 for one in some),
+            )
+            print(
+                f"| {'the last calibration' if calibrated else 'a tape'} | {len(some)} | "
+                f"{named} | {near} | {off:.3f} | {others} |"
+            )
 
 
 def judge(case):
@@ -90,7 +131,16 @@ def judge(case):
         estimator = FlightEstimator(None, last.effects if calibrated else None)
         flight, other = (replace(one, anchors=anchors) for one in (changed, sound))
         cost = _rmse(flight, estimator, since) - _rmse(other, estimator, since)
-        rows.append({"kind": kind, "seed": seed, "calibrated": calibrated, "ids": ids, "cost": cost, **said(flight, estimator)})
+        rows.append(
+            {
+                "kind": kind,
+                "seed": seed,
+                "calibrated": calibrated,
+                "ids": ids,
+                "cost": cost,
+                **said(flight, estimator),
+            }
+        )
         if kind == "moved before":
             base = last.effects if calibrated else type(last.effects)()
             found = self_calibrate([replace(flight, truth=None)], Tape(std=TAPE), base)
@@ -98,18 +148,29 @@ def judge(case):
             off = found.surveyed.positions[row] - week.anchors.positions[row] - shift
             others = np.delete(np.abs(found.shifts) / found.position_std, row, axis=0)
             named = [change.anchor for change in found.changes] == [str(ids[0])]
-            rows[-1]["surveyed"] = {"off": float(np.linalg.norm(off)), "others": float(others.max()), "named": named}
+            rows[-1]["surveyed"] = {
+                "off": float(np.linalg.norm(off)),
+                "others": float(others.max()),
+                "named": named,
+            }
     return rows
 
 
 def measured(reading, recording):
     """Figures of a measured flight."""
     flight = replace(reading.read(recording), truth=None)
-    return {"kind": f"none, measured {flight.name[:4]}", "calibrated": False, "name": flight.name, **said(flight, FlightEstimator())}
+    return {
+        "kind": f"none, measured {flight.name[:4]}",
+        "calibrated": False,
+        "name": flight.name,
+        **said(flight, FlightEstimator()),
+    }
 
 
 def recorded(kind, seed):
-    """(Flight of last week, today's without a change and with it, ids of the anchors that changed, shift (3,) m, stamp of the change, s)."""
+    """(Flight of last week, today's without a change and with it, ids of the anchors that changed,
+    shift (3,) m, stamp of the change, s).
+    """
     rng = np.random.default_rng([seed, 7])
     room = "corners" if seed % 2 else f"random-{seed}-8"
     week, sound = (_flown(seed, path, room) for path in (0, 1))
@@ -120,20 +181,34 @@ def recorded(kind, seed):
         shift = rng.uniform(*MOVED) * direction / np.linalg.norm(direction)
         positions = anchors.positions.copy()
         positions[row] += shift
-        ids, changed = [int(anchors.ids[row])], replace(_flown(seed, 1, room, anchors.at(positions)), anchors=anchors)
+        ids, changed = (
+            [int(anchors.ids[row])],
+            replace(_flown(seed, 1, room, anchors.at(positions)), anchors=anchors),
+        )
     elif kind.startswith("exchanged"):
         one, two = ids = sorted(int(i) for i in rng.choice(anchors.ids, 2, replace=False))
-        a, b = (np.select([column == one, column == two], [two, one], column) for column in (sound.tdoa.a, sound.tdoa.b))
+        a, b = (
+            np.select([column == one, column == two], [two, one], column)
+            for column in (sound.tdoa.a, sound.tdoa.b)
+        )
         changed = replace(sound, tdoa=replace(sound.tdoa, a=a, b=b))
     if kind.endswith("on the way"):
         since = float(sound.tdoa.t[0] + rng.uniform(*MIDDLE) * np.ptp(sound.tdoa.t))
-        first, last = (rows_of(part, rows) for part, rows in ((sound.tdoa, sound.tdoa.t < since), (changed.tdoa, changed.tdoa.t >= since)))
+        first, last = (
+            rows_of(part, rows)
+            for part, rows in (
+                (sound.tdoa, sound.tdoa.t < since),
+                (changed.tdoa, changed.tdoa.t >= since),
+            )
+        )
         changed = replace(sound, tdoa=concatenated([first, last]))
     return week, sound, changed, ids, shift, since
 
 
 def _flown(seed, path, room, anchors=None):
-    """A simulated Flight among the anchors of a room, or others, along the same path in either case."""
+    """A simulated Flight among the anchors of a room, or others, along the same path in either
+    case.
+    """
     config = SimulationConfig(seed=seed, constellation=room, anchors=anchors, duration=SECONDS)
     filled, of_path = SimulationConfig(seed=seed, constellation=room, duration=SECONDS).complete()
     return simulate(config, Trajectory(filled, of_path, np.random.default_rng([seed, path])))
@@ -142,16 +217,37 @@ def _flown(seed, path, room, anchors=None):
 def said(flight, estimator):
     """{"check", "localize", "live": ids of the anchors that are named, and "verdict" of localize}."""
     flight = replace(flight, truth=None)
-    belief = believe(flight, estimator(flight), estimator)  # its reasons are the findings of `check`
-    named = _ids([sentence.removeprefix("check: ") for sentence in belief.reasons if _NAMED.match(sentence.removeprefix("check: "))])
+    belief = believe(
+        flight, estimator(flight), estimator
+    )  # its reasons are the findings of `check`
+    named = _ids(
+        [
+            sentence.removeprefix("check: ")
+            for sentence in belief.reasons
+            if _NAMED.match(sentence.removeprefix("check: "))
+        ]
+    )
     localized = [] if belief.level == GOOD else named
-    return {"check": named, "localize": localized, "live": _ids(live(flight, estimator)), "verdict": belief.level}
+    return {
+        "check": named,
+        "localize": localized,
+        "live": _ids(live(flight, estimator)),
+        "verdict": belief.level,
+    }
 
 
 def live(flight, estimator):
-    """Sentences of the monitor that stand at the end, or stood for LANDING s, of a Flight fed to an Estimator as ekf_node feeds it."""
+    """Sentences of the monitor that stand at the end, or stood for LANDING s, of a Flight fed to an
+    Estimator as ekf_node feeds it.
+    """
     run, tdoa, imu = estimator(flight), flight.tdoa, flight.imu
-    node = Estimator(flight.anchors, FilterConfig(), 0.0, 0.1, *([estimator.effects] if estimator.effects else []))
+    node = Estimator(
+        flight.anchors,
+        FilterConfig(),
+        0.0,
+        0.1,
+        *([estimator.effects] if estimator.effects else []),
+    )
     stood = {}
     for begin in np.arange(tdoa.t[0], tdoa.t[-1], STEP):
         for stream, add in ((imu, node.add_imu), (tdoa, None)):
@@ -159,7 +255,13 @@ def live(flight, estimator):
             if add is not None:
                 add(stream.t[rows], stream.gyro[rows], stream.accel[rows])
             else:
-                node.add_tdoa(tdoa.t[rows], tdoa.a[rows], tdoa.b[rows], tdoa.d[rows] - run.bias[rows], run.bias_std[rows] ** 2)
+                node.add_tdoa(
+                    tdoa.t[rows],
+                    tdoa.a[rows],
+                    tdoa.b[rows],
+                    tdoa.d[rows] - run.bias[rows],
+                    run.bias_std[rows] ** 2,
+                )
         node.advance()
         for key in {_about(sentence) for sentence in node.alarms}:
             stood[key] = stood.get(key, 0.0) + STEP
@@ -168,7 +270,9 @@ def live(flight, estimator):
 
 
 def _about(sentence):
-    """The beginning of a sentence on an anchor that was moved or exchanged, which names it; "" of others."""
+    """The beginning of a sentence on an anchor that was moved or exchanged, which names it; "" of
+    others.
+    """
     found = _NAMED.match(sentence)
     return found.group() if found else ""
 
@@ -178,12 +282,19 @@ def _ids(sentences):
     ids = set()
     for sentence in sentences:
         numbers = re.findall(r"\d+", sentence.partition(" (")[0])
-        ids |= set(map(int, numbers if "exchanged" in sentence or "swapped" in sentence else numbers[:1]))
+        ids |= set(
+            map(int, numbers if "exchanged" in sentence or "swapped" in sentence else numbers[:1])
+        )
     return sorted(ids)
 
 
 def _rmse(flight, estimator, since):
     """m, 3D, of an estimate from a while after a stamp on."""
     t = flight.truth.t
-    error = position_errors(estimator(flight).odometry, flight.truth, max(since + LANDING, t[0] + SETTLED), t[-1] - LANDING)[1]
+    error = position_errors(
+        estimator(flight).odometry,
+        flight.truth,
+        max(since + LANDING, t[0] + SETTLED),
+        t[-1] - LANDING,
+    )[1]
     return float(np.sqrt(np.nanmean(np.sum(error**2, axis=1))))

@@ -1,4 +1,6 @@
-"""A recorded flight as it would have come over the radio link: sampled, rounded, repeated, lost and late."""
+"""A recorded flight as it would have come over the radio link: sampled, rounded, repeated, lost and
+late.
+"""
 
 from __future__ import annotations
 
@@ -8,7 +10,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.foundation.flight import Imu, Tdoas
-from uwb_tdoa_tools.crazyflie.log_blocks import FORCES, GRAVITY, PERIOD, RATES, LogBlock, VehicleClock
+from uwb_tdoa_tools.crazyflie.log_blocks import (
+    FORCES,
+    GRAVITY,
+    PERIOD,
+    RATES,
+    LogBlock,
+    VehicleClock,
+)
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.flight import Flight
@@ -20,8 +29,9 @@ BOOTED = 12.3  # s on our clock at which the vehicle was switched on
 
 @dataclass(frozen=True)
 class Link:
-    """half : TDOAs as half floats; lost : share of messages; latency, jitter : s, of a message, the least, and the mean
-    of what comes on top."""
+    """half : TDOAs as half floats; lost : share of messages; latency, jitter : s, of a message, the
+    least, and the mean of what comes on top.
+    """
 
     half: bool = False
     lost: float = 0.0
@@ -29,8 +39,12 @@ class Link:
     jitter: float = 0.004
 
 
-def messages(flight: Flight, link: Link, rng: np.random.Generator) -> list[tuple[float, int, float, np.ndarray]]:
-    """[(arrival s, block, timestamp ms, values)] of a TDoA2 Flight, as they arrive. block : place in BLOCKS."""
+def messages(
+    flight: Flight, link: Link, rng: np.random.Generator
+) -> list[tuple[float, int, float, np.ndarray]]:
+    """[(arrival s, block, timestamp ms, values)] of a TDoA2 Flight, as they arrive. block : place
+    in BLOCKS.
+    """
     tdoa, imu = flight.tdoa, flight.imu
     assert imu is not None, "its inertial samples are sent too"
     sent: list[tuple[float, int, float, np.ndarray]] = []
@@ -58,7 +72,12 @@ def messages(flight: Flight, link: Link, rng: np.random.Generator) -> list[tuple
 
 def streamed(flight: Flight, link: Link, seed: int = 0) -> Flight:
     """The Flight that `LogBlock` and `VehicleClock` make of these messages."""
-    blocks, clock, tdoas, samples = [LogBlock(variables) for variables in BLOCKS], VehicleClock(), [], []
+    blocks, clock, tdoas, samples = (
+        [LogBlock(variables) for variables in BLOCKS],
+        VehicleClock(),
+        [],
+        [],
+    )
     for arrival, number, timestamp, values in messages(flight, link, np.random.default_rng(seed)):
         pairs, sample = blocks[number].take(timestamp, values)
         tdoas += [(clock.stamp(t, arrival), a, b, d) for t, a, b, d in pairs]
@@ -80,7 +99,9 @@ def as_received(flight: Flight, link: Link, seed: int = 0) -> Flight:
 
 
 def _flight(
-    flight: Flight, tdoas: list[tuple[float, int, int, float]], samples: list[tuple[float, np.ndarray, np.ndarray]]
+    flight: Flight,
+    tdoas: list[tuple[float, int, int, float]],
+    samples: list[tuple[float, np.ndarray, np.ndarray]],
 ) -> Flight:
     """The Flight with other streams, in order of their stamps."""
     t, a, b, d = (np.array(column) for column in zip(*sorted(tdoas, key=lambda row: row[0])))

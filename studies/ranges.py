@@ -1,5 +1,6 @@
-"""ranges: simulated flights with distances to anchors, alone and beside TDOAs, against the bound of `plan` for one round;
-and what faulty ranges do beside TDOAs."""
+"""ranges: simulated flights with distances to anchors, alone and beside TDOAs, against the bound of
+`plan` for one round; and what faulty ranges do beside TDOAs.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -26,7 +27,9 @@ STD = 0.1  # m, of a range and of a TDOA, white
 FRESH = 300  # the first seed of flights among other anchors
 OFFSET = 0.25  # m, by which all ranges are too long
 PATHS = "sines", "circle", "square", "rising_circle", "sines"
-KNOWN = FilterConfig(tdoa_std=STD, range_std=STD, tdoa_correlation_length=1.0, range_offset_std=0.0)  # of what is simulated
+KNOWN = FilterConfig(
+    tdoa_std=STD, range_std=STD, tdoa_correlation_length=1.0, range_offset_std=0.0
+)  # of what is simulated
 HIGH = 2.9  # m, of a ceiling
 CEILING = [(x, y, HIGH) for x, y in ((-3.5, -4.0), (3.5, -4.0), (3.5, 4.0), (-3.5, 4.0))]
 WALLS = {  # m, positions of few anchors, or of anchors in a plane
@@ -48,47 +51,90 @@ FAULTS = {  # what becomes of Ranges, beside TDOAs with errors that persist
     "3 m too long": lambda ranges, rng: replace(ranges, d=ranges.d + 3.0),
     "twice as long": lambda ranges, rng: replace(ranges, d=2.0 * ranges.d),
     "millimetres": lambda ranges, rng: replace(ranges, d=1000.0 * ranges.d),
-    "anything from 0 to 10 m": lambda ranges, rng: replace(ranges, d=rng.uniform(0.0, 10.0, len(ranges))),
+    "anything from 0 to 10 m": lambda ranges, rng: replace(
+        ranges, d=rng.uniform(0.0, 10.0, len(ranges))
+    ),
     "ids shuffled": lambda ranges, rng: replace(ranges, anchor=rng.permutation(ranges.anchor)),
 }
 
 
 def add_options(add):
     """add : add_argument of a parser."""
-    add("--flights", type=int, default=5, metavar="N", help="simulated flights of each set (default 5)")
+    add(
+        "--flights",
+        type=int,
+        default=5,
+        metavar="N",
+        help="simulated flights of each set (default 5)",
+    )
 
 
 def run(args):
     """Print the table."""
-    print("| what | filter | mean 3D RMSE | bound of one round | largest ratio | NEES |\n|---|---|---:|---:|---:|---:|")
+    print(
+        "| what | filter | mean 3D RMSE | bound of one round | largest ratio | NEES "
+        "|\n|---|---|---:|---:|---:|---:|"
+    )
     flights = [flown(seed) for seed in range(args.flights)]
     for what, taken in SETS.items():
         for words, config in (("defaults", FilterConfig()), ("told the noise", KNOWN)):
-            rows = [evaluate(taken(flight), config)[0].row() for flight in tqdm(flights, unit="flight", disable=None)]
+            rows = [
+                evaluate(taken(flight), config)[0].row()
+                for flight in tqdm(flights, unit="flight", disable=None)
+            ]
             print(line(what, words, rows, [bound_of(flight) for flight in flights]), flush=True)
-    print("\n| ranges, 0.25 m too long | estimate | range_offset_std | mean 3D RMSE | NEES |\n|---|---|---:|---:|---:|")
+    print(
+        "\n| ranges, 0.25 m too long | estimate | range_offset_std | mean 3D RMSE | NEES "
+        "|\n|---|---|---:|---:|---:|"
+    )
     for what in ("ranges", "both"):
         longer = [without_offset(SETS[what](flight), -OFFSET) for flight in flights]
         for estimate in ("filtered", "smoothed"):
             for std in (0.0, FilterConfig().range_offset_std):
-                estimator = FlightEstimator(FilterConfig(range_offset_std=std), smoothed=estimate == "smoothed")
-                rows = [score_of(flight, estimator)[0].row() for flight in tqdm(longer, unit="flight", disable=None)]
-                errors, nees = (np.mean([row[name] for row in rows]) for name in ("rmse_3d", "nees_mean"))
-                print(f"| {what} | {estimate} | {std:g} m | {errors:.3f} m | {nees:.2f} |", flush=True)
-    print("\n| anchors, ranges alone | offset | range_offset_std | mean 3D RMSE | NEES |\n|---|---:|---:|---:|---:|")
+                estimator = FlightEstimator(
+                    FilterConfig(range_offset_std=std), smoothed=estimate == "smoothed"
+                )
+                rows = [
+                    score_of(flight, estimator)[0].row()
+                    for flight in tqdm(longer, unit="flight", disable=None)
+                ]
+                errors, nees = (
+                    np.mean([row[name] for row in rows]) for name in ("rmse_3d", "nees_mean")
+                )
+                print(
+                    f"| {what} | {estimate} | {std:g} m | {errors:.3f} m | {nees:.2f} |", flush=True
+                )
+    print(
+        "\n| anchors, ranges alone | offset | range_offset_std | mean 3D RMSE | NEES "
+        "|\n|---|---:|---:|---:|---:|"
+    )
     for words, positions in WALLS.items():
-        flights = [SETS["ranges"](flown(FRESH + seed, positions=positions)) for seed in range(args.flights)]
+        flights = [
+            SETS["ranges"](flown(FRESH + seed, positions=positions)) for seed in range(args.flights)
+        ]
         for offset in (0.0, OFFSET):
             for std in (0.0, FilterConfig().range_offset_std):
-                rows = [evaluate(without_offset(one, -offset), FilterConfig(range_offset_std=std))[0].row() for one in flights]
-                errors, nees = (np.mean([row[name] for row in rows]) for name in ("rmse_3d", "nees_mean"))
-                print(f"| {words} | {offset:g} m | {std:g} m | {errors:.3f} m | {nees:.2f} |", flush=True)
+                rows = [
+                    evaluate(without_offset(one, -offset), FilterConfig(range_offset_std=std))[
+                        0
+                    ].row()
+                    for one in flights
+                ]
+                errors, nees = (
+                    np.mean([row[name] for row in rows]) for name in ("rmse_3d", "nees_mean")
+                )
+                print(
+                    f"| {words} | {offset:g} m | {std:g} m | {errors:.3f} m | {nees:.2f} |",
+                    flush=True,
+                )
     print("\n| ranges beside TDOAs | mean 3D RMSE | largest over that without |\n|---|---:|---:|")
     flights = [flown(seed, persistent=True) for seed in range(args.flights)]
     without = np.array([rmse(flight.without("range")) for flight in flights])
     print(f"| none | {without.mean():.3f} m | 1.00 |")
     for words, fault in FAULTS.items():
-        errors = np.array([rmse(spoiled(flight, fault, seed)) for seed, flight in enumerate(flights)])
+        errors = np.array(
+            [rmse(spoiled(flight, fault, seed)) for seed, flight in enumerate(flights)]
+        )
         print(f"| {words} | {errors.mean():.3f} m | {np.max(errors / without):.2f} |", flush=True)
 
 
@@ -102,20 +148,35 @@ def spoiled(flight: Flight, fault, seed: int) -> Flight:
     return replace(flight, range=fault(flight.range, np.random.default_rng(seed)))
 
 
-def flown(seed: int, persistent: bool = False, positions: Sequence[tuple[float, float, float]] | None = None) -> Flight:
-    """A simulated flight with both. persistent : its TDOAs have errors that persist, too; positions : m, of anchors, or eight in corners."""
-    noise: dict[str, Any] = dict(noise_std=STD, range_noise=STD, bias=persistent, multipath=persistent)
+def flown(
+    seed: int,
+    persistent: bool = False,
+    positions: Sequence[tuple[float, float, float]] | None = None,
+) -> Flight:
+    """A simulated flight with both. persistent : its TDOAs have errors that persist, too; positions
+    : m, of anchors, or eight in corners.
+    """
+    noise: dict[str, Any] = dict(
+        noise_std=STD, range_noise=STD, bias=persistent, multipath=persistent
+    )
     if positions is not None:
         noise["anchors"] = Anchors.from_positions(np.array(positions))
     return simulate(
         SimulationConfig(
-            seed=seed, trajectory=PATHS[seed % len(PATHS)], duration=40.0, imu_rate=500.0, truth_rate=100.0, **noise
+            seed=seed,
+            trajectory=PATHS[seed % len(PATHS)],
+            duration=40.0,
+            imu_rate=500.0,
+            truth_rate=100.0,
+            **noise,
         )
     )
 
 
 def bound_of(flight: Flight) -> float:
-    """m: root mean square of the bound of `plan` for one range to each anchor, over the airborne part."""
+    """m: root mean square of the bound of `plan` for one range to each anchor, over the airborne
+    part.
+    """
     _, first, last = judged_part(flight.truth)
     places = position_at(np.arange(first, last, 0.5), flight.truth)
     installation = Installation(flight.anchors, FixedNoise(STD), every_range(len(flight.anchors)))
@@ -126,4 +187,7 @@ def line(what: str, words: str, rows: list, bounds: list) -> str:
     """A row of the table, of rows of scores, and bounds, m, of the flights."""
     errors, nees = (np.array([row[name] for row in rows]) for name in ("rmse_3d", "nees_mean"))
     ratio = np.max(errors / bounds)
-    return f"| {what} | {words} | {errors.mean():.3f} m | {np.mean(bounds):.3f} m | {ratio:.2f} | {nees.mean():.2f} |"
+    return (
+        f"| {what} | {words} | {errors.mean():.3f} m | {np.mean(bounds):.3f} m | {ratio:.2f} | "
+        f"{nees.mean():.2f} |"
+    )

@@ -1,7 +1,10 @@
-"""recalibrating: a survey with one flight, something changed, and a survey with another that starts from the first.
+"""recalibrating: a survey with one flight, something changed, and a survey with another that starts
+from the first.
 
-What changes is an anchor that is moved, or late; the survey that came with the flights takes the change, so that nothing is
-simulated but that. Judged on a third flight, with last week's calibration and with the new one."""
+What changes is an anchor that is moved, or late; the survey that came with the flights takes the
+change, so that nothing is simulated but that. Judged on a third flight, with last week's
+calibration and with the new one.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +19,10 @@ from uwb_tdoa_tools.surveying.blocked import with_blocked
 from .surveying import at, measured_flights, rmse
 
 _CONST1, _CONST4 = "util/const1-trial{}-tdoa2.csv.gz", "util/const4-trial1-tdoa2-traj{}.csv.gz"
-SETS = {"const1": [_CONST1.format(k) for k in (1, 2, 3)], "const4": [_CONST4.format(k) for k in (1, 2, 3)]}
+SETS = {
+    "const1": [_CONST1.format(k) for k in (1, 2, 3)],
+    "const4": [_CONST4.format(k) for k in (1, 2, 3)],
+}
 TRUSTED = "0", "6"
 CHANGES = {  # in words: effect of what changed
     "nothing": EFFECTS["anchor_delay"]({}),
@@ -38,15 +44,23 @@ def add_options(add):
 
 def run(args):
     """Print a table, a row for each set and change."""
-    print("| set | what changed | last week's | surveyed anew | what it says |\n|---|---|---:|---:|---|")
+    print(
+        "| set | what changed | last week's | surveyed anew | what it says "
+        "|\n|---|---|---:|---:|---|"
+    )
     for name in [args.only] if args.only else SETS:
         first, second, judged = (measured_flights(args.data, [path])[0] for path in SETS[name])
         week = self_calibrate([first], Tape(trusted=TRUSTED))
         known, anchors = taken(week, week.base), week.surveyed
         for words, change in CHANGES.items():
             flown = [at(change.inject(flight), anchors.positions) for flight in (second, judged)]
-            today = with_blocked(self_calibrate([replace(flown[0], truth=None)], Tape(), known), flown[:1])
-            errors = rmse(flown[1:], known), rmse([at(flown[1], today.surveyed.positions)], taken(today, known))
+            today = with_blocked(
+                self_calibrate([replace(flown[0], truth=None)], Tape(), known), flown[:1]
+            )
+            errors = (
+                rmse(flown[1:], known),
+                rmse([at(flown[1], today.surveyed.positions)], taken(today, known)),
+            )
             said = "; ".join(one.as_text() for one in today.changes) or "no anchor has changed"
             said = " ".join([said + ".", *today.blocked])
             print(f"| {name} | {words} | {errors[0]:.3f} | {errors[1]:.3f} | {said} |", flush=True)

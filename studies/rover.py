@@ -1,7 +1,10 @@
-"""rover: simulated drives over a floor, each judged by its truth: how well the filter does, and whether what diagnose writes is true.
+"""rover: simulated drives over a floor, each judged by its truth: how well the filter does, and
+whether what diagnose writes is true.
 
-A rover drives for 90 s among six anchors in 12 x 8 m, with wheels (50 Hz, 2 % too fast, slip), an IMU (100 Hz) and 100 TDOAs a second with
-a noise of 0.1 m and delays of the anchors of 5 cm, which make up `tdoa_std`. Its antenna is on a mast 0.4 m above base_link, which is on the floor."""
+A rover drives for 90 s among six anchors in 12 x 8 m, with wheels (50 Hz, 2 % too fast, slip), an
+IMU (100 Hz) and 100 TDOAs a second with a noise of 0.1 m and delays of the anchors of 5 cm, which
+make up `tdoa_std`. Its antenna is on a mast 0.4 m above base_link, which is on the floor.
+"""
 
 from dataclasses import replace
 from functools import partial
@@ -24,23 +27,48 @@ SEEDS, DURATION, NOISE, DELAY_STD = 20, 90.0, 0.1, 0.05  # s, m, m
 HEIGHT_STD = 0.02  # m, by which the height of the floor is not known
 SETTLED = 15.0  # s after which it is judged: the yaw is known
 LATE_ANCHORS, LATE_FROM, LATE_FOR, LATE_BY = (0, 3), 40.0, 5.0, 1.5  # s, s, m
-PLANAR = FilterConfig(planar=True, fixed_height=0.0, tdoa_std=float(np.hypot(NOISE, DELAY_STD * np.sqrt(2.0))))
+PLANAR = FilterConfig(
+    planar=True, fixed_height=0.0, tdoa_std=float(np.hypot(NOISE, DELAY_STD * np.sqrt(2.0)))
+)
 ROWS = {
     "wheels, IMU": (("imu", "velocity"), PLANAR, False),
     "wheels alone": (("velocity",), replace(PLANAR, use_imu=False), False),
     "TDOAs alone": ((), replace(PLANAR, use_imu=False), False),
     "wheels, IMU; two anchors late": (("imu", "velocity"), PLANAR, True),
 }
-HEAD = "xy RMSE m", "yaw degrees", "NEES xy", "NEES z", "NEES yaw", "largest error m", "largest step m"
+HEAD = (
+    "xy RMSE m",
+    "yaw degrees",
+    "NEES xy",
+    "NEES z",
+    "NEES yaw",
+    "largest error m",
+    "largest step m",
+)
 VALUES = {  # that a diagnosis is to find
-    "gyro_bias": "xyz", "accel_bias": "xyz", "velocity_scale": ("scale",), "tag_lever_arm": "xyz",
-}  # fmt: skip
+    "gyro_bias": "xyz",
+    "accel_bias": "xyz",
+    "velocity_scale": ("scale",),
+    "tag_lever_arm": "xyz",
+}
 
 
 def add_options(add):
     """The options of the study."""
-    add("--seeds", type=int, default=SEEDS, metavar="N", help="drives of each row (default: %(default)s)")
-    add("--diagnose", type=int, default=0, metavar="N", help="diagnose so many drives and flights instead")
+    add(
+        "--seeds",
+        type=int,
+        default=SEEDS,
+        metavar="N",
+        help="drives of each row (default: %(default)s)",
+    )
+    add(
+        "--diagnose",
+        type=int,
+        default=0,
+        metavar="N",
+        help="diagnose so many drives and flights instead",
+    )
     add("--jobs", type=int, default=1, metavar="N", help="at once (default: %(default)s)")
 
 
@@ -48,21 +76,40 @@ def run(args):
     """Print the table."""
     if args.diagnose:
         for kind in ("planar", "flown"):
-            found = list(parallel.over(partial(deviations, kind), range(args.diagnose), jobs=args.jobs, dask=None, unit=None))
+            found = list(
+                parallel.over(
+                    partial(deviations, kind),
+                    range(args.diagnose),
+                    jobs=args.jobs,
+                    dask=None,
+                    unit=None,
+                )
+            )
             print(f"{kind}:", *told(found), sep="\n")
         return
     print(f"| | {' | '.join(HEAD)} |", "| --- |" + " ---: |" * len(HEAD), sep="\n")
     results = list(parallel.over(judged, range(args.seeds), jobs=args.jobs, dask=None, unit=None))
     for name in ROWS:
         columns = np.array([result[name] for result in results])
-        means = np.sqrt(np.mean(columns[:, :2] ** 2, axis=0)), columns[:, 2:5].mean(axis=0), columns[:, 5:].max(axis=0)
+        means = (
+            np.sqrt(np.mean(columns[:, :2] ** 2, axis=0)),
+            columns[:, 2:5].mean(axis=0),
+            columns[:, 5:].max(axis=0),
+        )
         print(f"| {name} | {' | '.join(f'{value:.2f}' for value in np.concatenate(means))} |")
 
 
 def drive(seed):
     """(Flight, delays of its anchors (N,) m) of a rover."""
     config = SimulationConfig.of(
-        "rover", seed=seed, duration=DURATION, noise_std=NOISE, bias=False, multipath=False, outlier_probability=0.01, floor_time=5.0
+        "rover",
+        seed=seed,
+        duration=DURATION,
+        noise_std=NOISE,
+        bias=False,
+        multipath=False,
+        outlier_probability=0.01,
+        floor_time=5.0,
     )
     return _delayed(simulate(config), seed)
 
@@ -70,16 +117,27 @@ def drive(seed):
 def flown(seed):
     """The same of a quadrotor, with an antenna beside its middle."""
     config = SimulationConfig(
-        seed=seed, duration=DURATION, noise_std=NOISE, bias=False, multipath=False, protocol="tdoa3", imu_rate=100.0, truth_rate=50.0,
-        yaw="rotating", tag_lever_arm=(0.05, 0.02, 0.1), velocity_noise=0.02,
-    )  # fmt: skip
+        seed=seed,
+        duration=DURATION,
+        noise_std=NOISE,
+        bias=False,
+        multipath=False,
+        protocol="tdoa3",
+        imu_rate=100.0,
+        truth_rate=50.0,
+        yaw="rotating",
+        tag_lever_arm=(0.05, 0.02, 0.1),
+        velocity_noise=0.02,
+    )
     flight, delays = _delayed(simulate(config), seed)
     return EFFECTS["velocity_scale"]({"scale": 0.02}).inject(flight), delays
 
 
 def _delayed(flight, seed):
     delays = DELAY_STD * np.random.default_rng([seed, 48]).standard_normal(len(flight.anchors))
-    return EFFECTS["anchor_delay"](dict(zip(map(str, flight.anchors.ids.tolist()), delays.tolist()))).inject(flight), delays
+    return EFFECTS["anchor_delay"](
+        dict(zip(map(str, flight.anchors.ids.tolist()), delays.tolist()))
+    ).inject(flight), delays
 
 
 def late(flight):
@@ -91,16 +149,23 @@ def late(flight):
 
 
 def judged(seed):
-    """{row: figures as in HEAD} of one drive. The filter knows where the antenna is, as /tf_static says it."""
+    """{row: figures as in HEAD} of one drive.
+
+    The filter knows where the antenna is, as /tf_static says it.
+    """
     flight, _ = drive(seed)
     arm = dict(zip("xyz", flight.meta["config"]["tag_lever_arm"]))
     corrector = Corrector(flight.anchors, EffectSet((EFFECTS["tag_lever_arm"](arm),)))
-    height = HEIGHT_STD * np.random.default_rng([seed, 49]).standard_normal()  # as somebody has measured it
+    height = (
+        HEIGHT_STD * np.random.default_rng([seed, 49]).standard_normal()
+    )  # as somebody has measured it
     out = {}
     for name, (streams, config, is_late) in ROWS.items():
         others = [stream for stream in ("imu", "velocity") if stream not in streams]
         given = (late(flight) if is_late else flight).without(*others)
-        out[name] = figures(flight, run_offline(given, replace(config, fixed_height=height), corrector).odometry)
+        out[name] = figures(
+            flight, run_offline(given, replace(config, fixed_height=height), corrector).odometry
+        )
     return out
 
 
@@ -114,12 +179,20 @@ def figures(flight, odometry):
     turn = Rotation.from_quat(q).as_matrix()
     yaw_variance = (turn @ covariance[:, 6:9, 6:9] @ np.swapaxes(turn, 1, 2))[:, 2, 2]
     xy = error[:, :2]
-    nees = np.einsum("ni,ni->n", xy, np.linalg.solve(covariance[:, :2, :2], xy[:, :, None])[:, :, 0]) / 2.0
+    nees = (
+        np.einsum("ni,ni->n", xy, np.linalg.solve(covariance[:, :2, :2], xy[:, :, None])[:, :, 0])
+        / 2.0
+    )
     steps = np.linalg.norm(np.diff(xy, axis=0), axis=1)
     return [
-        np.sqrt(np.mean(np.sum(xy**2, axis=1))), np.degrees(np.sqrt(np.mean(off**2))), nees.mean(),
-        np.mean(error[:, 2] ** 2 / covariance[:, 2, 2]), np.mean(off**2 / yaw_variance), np.linalg.norm(xy, axis=1).max(), steps.max(),
-    ]  # fmt: skip
+        np.sqrt(np.mean(np.sum(xy**2, axis=1))),
+        np.degrees(np.sqrt(np.mean(off**2))),
+        nees.mean(),
+        np.mean(error[:, 2] ** 2 / covariance[:, 2, 2]),
+        np.mean(off**2 / yaw_variance),
+        np.linalg.norm(xy, axis=1).max(),
+        steps.max(),
+    ]
 
 
 def yaw_of(q):
@@ -129,30 +202,57 @@ def yaw_of(q):
 
 
 def deviations(kind, seed):
-    """{value: (error, stated deviation), or None where diagnose finds none} of one drive or flight, which is diagnosed by its ground truth
-    for effects of the catalogue."""
+    """{value: (error, stated deviation), or None where diagnose finds none} of one drive or flight,
+    which is diagnosed by its ground truth for effects of the catalogue.
+    """
     flight, delays = (drive if kind == "planar" else flown)(seed)
     reference = GroundTruth()
     (prepared, _) = reference.settled(reference.prepare(flight), EffectSet())
-    found = {effect.name: effect for effect in effects_of(attribute([prepared], reference, undeclared=False).selection)}
+    found = {
+        effect.name: effect
+        for effect in effects_of(attribute([prepared], reference, undeclared=False).selection)
+    }
     state, arm = flight.extra["state_truth"], flight.meta["config"]["tag_lever_arm"]
-    true = {("velocity_scale", "scale"): 0.02} | {("tag_lever_arm", axis): arm[k] for k, axis in enumerate("xyz")}
-    true |= {(f"{name}_bias", axis): float(np.mean(state[f"{name}_bias_{axis}"])) for name in ("gyro", "accel") for axis in "xyz"}
-    true |= {("anchor_delay", str(i)): d for i, d in zip(flight.anchors.ids.tolist(), (delays - delays.mean()).tolist())}
+    true = {("velocity_scale", "scale"): 0.02} | {
+        ("tag_lever_arm", axis): arm[k] for k, axis in enumerate("xyz")
+    }
+    true |= {
+        (f"{name}_bias", axis): float(np.mean(state[f"{name}_bias_{axis}"]))
+        for name in ("gyro", "accel")
+        for axis in "xyz"
+    }
+    true |= {
+        ("anchor_delay", str(i)): d
+        for i, d in zip(flight.anchors.ids.tolist(), (delays - delays.mean()).tolist())
+    }
     out = {}
     for (name, key), value in true.items():
         one = found.get(name)
-        out[f"{name}.{key}"] = (one.values[key] - value, one.std[key]) if one is not None and key in one.values else None
+        out[f"{name}.{key}"] = (
+            (one.values[key] - value, one.std[key])
+            if one is not None and key in one.values
+            else None
+        )
     return out
 
 
 def told(results):
-    """Lines: of each effect how many values were written, the share within three stated deviations, errors and deviations."""
-    lines = ["| effect | written | within 3 deviations | error, rms | stated, rms |", "| --- | ---: | ---: | ---: | ---: |"]
+    """Lines: of each effect how many values were written, the share within three stated deviations,
+    errors and deviations.
+    """
+    lines = [
+        "| effect | written | within 3 deviations | error, rms | stated, rms |",
+        "| --- | ---: | ---: | ---: | ---: |",
+    ]
     for name in (*VALUES, "anchor_delay"):
-        every = [pair for result in results for key, pair in result.items() if key.startswith(f"{name}.")]
+        every = [
+            pair for result in results for key, pair in result.items() if key.startswith(f"{name}.")
+        ]
         errors, std = np.array([pair for pair in every if pair is not None]).reshape(-1, 2).T
         within = np.mean(np.abs(errors) <= 3.0 * std) if len(std) else np.nan
         root = [np.sqrt(np.mean(column**2)) if len(column) else np.nan for column in (errors, std)]
-        lines.append(f"| {name} | {len(std)} of {len(every)} | {within:.0%} | {root[0]:.5f} | {root[1]:.5f} |")
+        lines.append(
+            f"| {name} | {len(std)} of {len(every)} | {within:.0%} | {root[0]:.5f} | "
+            f"{root[1]:.5f} |"
+        )
     return lines

@@ -1,7 +1,10 @@
-"""scale: how processor time and memory of the tools grow with flights, anchors and effects, each case in a process of its own.
+"""scale: how processor time and memory of the tools grow with flights, anchors and effects, each
+case in a process of its own.
 
-Flights are simulated, 10 s in the air, 240 TDOAs a second. The tool runs as a user would run it, with one job. Each case goes to
---out as soon as it is done; what is there already is not done again."""
+Flights are simulated, 10 s in the air, 240 TDOAs a second. The tool runs as a user would run it,
+with one job. Each case goes to --out as soon as it is done; what is there already is not done
+again.
+"""
 
 from dataclasses import dataclass
 import os
@@ -12,9 +15,9 @@ from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_bias.foundation.errors import Failure
 from uwb_tdoa_bias.foundation.files import refuse_output
 from uwb_tdoa_tools.bags.bag import write_bag
+from uwb_tdoa_tools.outputs import OutputFolder
 from uwb_tdoa_tools.results_file import ResultsFile
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.outputs import OutputFolder
 
 FLYING = dict(duration=10.0, start_in_air=True, imu_rate=100.0, truth_rate=50.0, protocol="tdoa3")
 FLIGHTS = 1, 10, 100, 1000
@@ -47,14 +50,28 @@ class Case:
     @property
     def key(self):
         """Of its line in the file."""
-        return f"{self.tool}, {self.flights} flights, {self.anchors} anchors, {self.effects} effects"
+        return (
+            f"{self.tool}, {self.flights} flights, {self.anchors} anchors, {self.effects} effects"
+        )
 
 
 def add_options(add):
     """The options of the study."""
-    add("--out", metavar="DIR", type=OutputFolder, required=True, help="for flights, 0.1 MB each, and results")
+    add(
+        "--out",
+        metavar="DIR",
+        type=OutputFolder,
+        required=True,
+        help="for flights, 0.1 MB each, and results",
+    )
     add("--only", choices=tuple(TOOLS), nargs="+", default=list(TOOLS), help="(default: all)")
-    add("--most", type=int, default=FLIGHTS[-1], metavar="N", help="flights of a case (default: %(default)s)")
+    add(
+        "--most",
+        type=int,
+        default=FLIGHTS[-1],
+        metavar="N",
+        help="flights of a case (default: %(default)s)",
+    )
 
 
 def run(args):
@@ -67,9 +84,15 @@ def run(args):
             measure(Case(tool, FEWEST[tool]), args.out)  # compiles, which is not to count
         for case in missing:
             done[case.key] = measure(case, args.out)
-            print(f"{case.key}: {done[case.key]['cpu']:.1f} s, {done[case.key]['memory']:.0f} MB", file=sys.stderr, flush=True)
+            print(
+                f"{case.key}: {done[case.key]['cpu']:.1f} s, {done[case.key]['memory']:.0f} MB",
+                file=sys.stderr,
+                flush=True,
+            )
         order = list(TOOLS)
-        cases.sort(key=lambda case: (order.index(case.tool), case.anchors, case.effects, case.flights))
+        cases.sort(
+            key=lambda case: (order.index(case.tool), case.anchors, case.effects, case.flights)
+        )
         print(table({case: done[case.key] for case in cases}))
 
 
@@ -82,10 +105,18 @@ def all_cases():
 
 
 def measure(case, folder):
-    """{"cpu": s of processor time, user and system, of the tool's process and those that it started, "memory": MB, the most that
-    one of them held} of a Case. Raises Failure where the tool fails."""
+    """{"cpu": s of processor time, user and system, of the tool's process and those that it
+    started, "memory": MB, the most that one of them held} of a Case. Raises Failure where the tool
+    fails.
+    """
     flights = make_flights(case.flights, case.anchors, folder)
-    command = [sys.executable, "-m", f"uwb_tdoa_tools.commands.{case.tool}", *map(str, flights), *TOOLS[case.tool]]
+    command = [
+        sys.executable,
+        "-m",
+        f"uwb_tdoa_tools.commands.{case.tool}",
+        *map(str, flights),
+        *TOOLS[case.tool],
+    ]
     if case.effects:
         some = [EFFECTS[name](values) for name, values in list(BESIDE.items())[: case.effects]]
         EffectSet(tuple(some)).to_yaml(folder / "effects.yaml")
@@ -95,12 +126,17 @@ def measure(case, folder):
         process = subprocess.Popen(command, stdout=said, stderr=subprocess.STDOUT, cwd=folder)
         _, status, usage = os.wait4(process.pid, 0)
     if status:
-        raise Failure(f"{case.key}: ended with code {os.waitstatus_to_exitcode(status)}; see {folder / 'said.txt'}.")
+        raise Failure(
+            f"{case.key}: ended with code {os.waitstatus_to_exitcode(status)}; see "
+            f"{folder / 'said.txt'}."
+        )
     return {"cpu": usage.ru_utime + usage.ru_stime, "memory": usage.ru_maxrss / 1024}
 
 
 def make_flights(count, anchors, folder):
-    """Paths of so many bags of simulated flights among so many anchors, made where they are missing."""
+    """Paths of so many bags of simulated flights among so many anchors, made where they are
+    missing.
+    """
     room, out = ("corners" if anchors == 8 else f"random-1-{anchors}"), []
     for number in range(count):
         path = folder.absolute() / f"flights-{anchors}" / f"{number:04d}"
@@ -112,22 +148,37 @@ def make_flights(count, anchors, folder):
 
 
 def table(results):
-    """Markdown of {Case: figures}: a row for each case, with what each flight more costs beside the case with fewer."""
+    """Markdown of {Case: figures}: a row for each case, with what each flight more costs beside the
+    case with fewer.
+    """
     lines = [
-        "| tool | flights | anchors | effects | CPU, s | s per flight more | peak memory, MB | MB per flight more |",
+        (
+            "| tool | flights | anchors | effects | CPU, s | s per flight more | peak memory, MB "
+            "| MB per flight more |"
+        ),
         "|---|" + 7 * "---:|",
     ]
     for case, of in results.items():
-        fewer = [(other.flights, each) for other, each in results.items() if _same_but_fewer(other, case)]
+        fewer = [
+            (other.flights, each) for other, each in results.items() if _same_but_fewer(other, case)
+        ]
         slopes = ["", ""]
         if fewer:
             count, before = max(fewer, key=lambda pair: pair[0])
-            slopes = [f"{(of[name] - before[name]) / (case.flights - count):.3f}" for name in ("cpu", "memory")]
+            slopes = [
+                f"{(of[name] - before[name]) / (case.flights - count):.3f}"
+                for name in ("cpu", "memory")
+            ]
         lines.append(
-            f"| {case.tool} | {case.flights} | {case.anchors} | {case.effects} | {of['cpu']:.1f} | {slopes[0]} | {of['memory']:.0f} | {slopes[1]} |"
+            f"| {case.tool} | {case.flights} | {case.anchors} | {case.effects} | "
+            f"{of['cpu']:.1f} | {slopes[0]} | {of['memory']:.0f} | {slopes[1]} |"
         )
     return "\n".join(lines)
 
 
 def _same_but_fewer(other, case):
-    return (other.tool, other.anchors, other.effects) == (case.tool, case.anchors, case.effects) and other.flights < case.flights
+    return (other.tool, other.anchors, other.effects) == (
+        case.tool,
+        case.anchors,
+        case.effects,
+    ) and other.flights < case.flights

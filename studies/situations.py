@@ -1,8 +1,11 @@
-"""situations: where a tag can be and what can happen to it, simulated over many seeds, and how right and how honest the filter is there.
+"""situations: where a tag can be and what can happen to it, simulated over many seeds, and how
+right and how honest the filter is there.
 
-The filter is that of a user who configures nothing, switched on where the recording begins, without corrections. Anchors, if nothing else
-is said, are 8 in 7 x 8 x 3 m; noise, outliers, delays of anchors, received power and late arrivals near the floor are those of `simulate`.
-Half of the seeds use TDOA2, half TDOA3. Each row judges one stretch of its recordings, all seeds together."""
+The filter is that of a user who configures nothing, switched on where the recording begins, without
+corrections. Anchors, if nothing else is said, are 8 in 7 x 8 x 3 m; noise, outliers, delays of
+anchors, received power and late arrivals near the floor are those of `simulate`. Half of the seeds
+use TDOA2, half TDOA3. Each row judges one stretch of its recordings, all seeds together.
+"""
 
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -18,19 +21,26 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools import cli, parallel
+from uwb_tdoa_tools.outputs import OutputFile
 from uwb_tdoa_tools.results_file import ResultsFile
 from uwb_tdoa_tools.scoring.by_phase import PooledErrors
 from uwb_tdoa_tools.scoring.metrics import READY, Score
 from uwb_tdoa_tools.simulation import ImuErrors, SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.constellations import corners, facing
-from uwb_tdoa_tools.outputs import OutputFile
 
 from .any_path import Path, between
 
-RIGHT, FOR = 0.5, 2.0  # m: an estimate that is off by less for so many seconds, or to the end, is right again
+RIGHT, FOR = (
+    0.5,
+    2.0,
+)  # m: an estimate that is off by less for so many seconds, or to the end, is right again
 FLYING = ImuErrors(vibration=1.0)
 REST = 0.03  # m, of a tag on its vehicle on the floor
-LATE, LOW, FADES = 3.2, 0.5, (0.06, 0.2)  # m later are anchors below LOW for a tag on the floor, all of it below, none above these heights
+LATE, LOW, FADES = (
+    3.2,
+    0.5,
+    (0.06, 0.2),
+)  # m later are anchors below LOW for a tag on the floor, all of it below, none above these heights
 SHADOW, BEHIND = 0.4, 0.5  # m later is an anchor behind a person; cosine beyond which it is
 WALL = 3.5  # m, x of the wall of the room
 MARGIN = FilterConfig().workspace_margin
@@ -38,8 +48,10 @@ MARGIN = FilterConfig().workspace_margin
 
 @dataclass(frozen=True)
 class Situation:
-    """One row. make : function of a Generator and a dict for SimulationConfig that gives a Flight; judged : (begin, end) s; over : s
-    at which what happens is over, from which the time to be right again counts, None: from the 100th TDOA on; config : of the filter."""
+    """One row. make : function of a Generator and a dict for SimulationConfig that gives a Flight;
+    judged : (begin, end) s; over : s at which what happens is over, from which the time to be right
+    again counts, None: from the 100th TDOA on; config : of the filter.
+    """
 
     name: str
     make: object
@@ -50,11 +62,38 @@ class Situation:
 
 def add_options(add):
     """The options of the study."""
-    add("--seeds", type=parallel.whole_number, default=20, metavar="N", help="of each situation (default: %(default)s)")
-    add("--only", nargs="+", metavar="WORD", default=[""], help="situations that have one of these in their name (default: all)")
-    add("--jobs", metavar="N", type=parallel.whole_number, help="simulations at once (default: as many as there are cores)")
-    add("--resume", metavar="FILE", type=OutputFile, help="keep what each simulation gave there, and go on with what is missing")
-    add("--json", metavar="FILE", type=OutputFile, help="write all figures, of each situation and of each seed")
+    add(
+        "--seeds",
+        type=parallel.whole_number,
+        default=20,
+        metavar="N",
+        help="of each situation (default: %(default)s)",
+    )
+    add(
+        "--only",
+        nargs="+",
+        metavar="WORD",
+        default=[""],
+        help="situations that have one of these in their name (default: all)",
+    )
+    add(
+        "--jobs",
+        metavar="N",
+        type=parallel.whole_number,
+        help="simulations at once (default: as many as there are cores)",
+    )
+    add(
+        "--resume",
+        metavar="FILE",
+        type=OutputFile,
+        help="keep what each simulation gave there, and go on with what is missing",
+    )
+    add(
+        "--json",
+        metavar="FILE",
+        type=OutputFile,
+        help="write all figures, of each situation and of each seed",
+    )
 
 
 def run(args):
@@ -62,15 +101,21 @@ def run(args):
     chosen = [one for one in SITUATIONS if any(word in one.name for word in args.only)]
     if not chosen:
         raise InputError(
-            f"--only: no situation has {' or '.join(args.only)} in its name; they are: {'; '.join(one.name for one in SITUATIONS)}."
+            f"--only: no situation has {' or '.join(args.only)} in its name; they are: "
+            f"{'; '.join(one.name for one in SITUATIONS)}."
         )
     items = [(one.name, seed) for one in chosen for seed in range(args.seeds)]
     found = dict(zip(items, _results(items, args.resume, args.jobs)))
-    together = {one.name: figures([found[one.name, seed] for seed in range(args.seeds)]) for one in chosen}
+    together = {
+        one.name: figures([found[one.name, seed] for seed in range(args.seeds)]) for one in chosen
+    }
     print(table(together))
     if args.json:
         of_seeds = {name: [found[name, seed] for seed in range(args.seeds)] for name in together}
-        cli.write_json(args.json, {"situations": {name: _plain(of) for name, of in together.items()}, "seeds": of_seeds})
+        cli.write_json(
+            args.json,
+            {"situations": {name: _plain(of) for name, of in together.items()}, "seeds": of_seeds},
+        )
 
 
 def _results(items, path, jobs):
@@ -82,7 +127,13 @@ def _results(items, path, jobs):
     with ResultsFile(File(path), {"study": "situations"}) as done:
         missing = {key: item for key, item in zip(keys, items) if key not in done}
         if len(missing) < len(items):
-            tqdm.write(f"{path} holds {len(items) - len(missing)} of {len(items)} simulations; going on with the others", sys.stderr)
+            tqdm.write(
+                (
+                    f"{path} holds {len(items) - len(missing)} of {len(items)} simulations; going "
+                    "on with the others"
+                ),
+                sys.stderr,
+            )
         made = parallel.over(measure, missing.values(), jobs, unit="simulation")
         for key in keys:
             if key not in done:
@@ -92,51 +143,87 @@ def _results(items, path, jobs):
 
 
 def measure(item):
-    """{"figures": of the judged stretch, as of `scoring.by_phase.ErrorSeries`, null where there are none; "again": s, null for never} of (name,
-    seed)."""
+    """{"figures": of the judged stretch, as of `scoring.by_phase.ErrorSeries`, null where there are
+    none; "again": s, null for never} of (name, seed).
+    """
     name, seed = item
     (situation,) = [one for one in SITUATIONS if one.name == name]
-    common = {"seed": seed, "imu_rate": 500.0, "truth_rate": 100.0, "protocol": "tdoa2" if seed % 2 else "tdoa3", "anchors": corners()}
+    common = {
+        "seed": seed,
+        "imu_rate": 500.0,
+        "truth_rate": 100.0,
+        "protocol": "tdoa2" if seed % 2 else "tdoa3",
+        "anchors": corners(),
+    }
     flight = situation.make(np.random.default_rng([seed, 28]), common)
-    judged = Score(name, run_offline(flight, FilterConfig(**situation.config)).odometry, flight.truth).series
+    judged = Score(
+        name, run_offline(flight, FilterConfig(**situation.config)).odometry, flight.truth
+    ).series
     begin, end = situation.judged
     since = flight.tdoa.t[READY - 1] if situation.over is None else situation.over
     return {"figures": _plain(judged.figures(begin, end)), "again": again(judged, since)}
 
 
 def again(judged, since):
-    """s from `since` until the estimates of an ErrorSeries are right for FOR seconds, or to their end; None if they never are."""
+    """s from `since` until the estimates of an ErrorSeries are right for FOR seconds, or to their
+    end; None if they never are.
+    """
     after = judged.t >= since
     t, wrong = judged.t[after], ~(np.linalg.norm(judged.error[after], axis=1) <= RIGHT)
     if not len(t):
         return None
     begins = np.append(t[0], t[1:][wrong[:-1]])  # stretches in which they are right begin there
     ends = np.append(t[wrong], np.inf)
-    right = [begin for begin in begins if (end := ends[np.searchsorted(ends, begin)]) - begin >= FOR and (end < np.inf or t[-1] > begin)]
+    right = [
+        begin
+        for begin in begins
+        if (end := ends[np.searchsorted(ends, begin)]) - begin >= FOR
+        and (end < np.inf or t[-1] > begin)
+    ]
     return max(0.0, float(right[0] - since)) if right else None
 
 
 def figures(results):
-    """Of the `measure` of several seeds: a dict as of `PooledErrors.figures`, besides again_median, again_max, s, and never, how many."""
+    """Of the `measure` of several seeds: a dict as of `PooledErrors.figures`, besides again_median,
+    again_max, s, and never, how many.
+    """
     pool = PooledErrors()
     for result in results:
-        pool.add({name: math.nan if value is None else value for name, value in result["figures"].items()})
+        pool.add(
+            {
+                name: math.nan if value is None else value
+                for name, value in result["figures"].items()
+            }
+        )
     times = [result["again"] for result in results if result["again"] is not None]
-    more = {"again_median": float(np.median(times)) if times else math.nan, "again_max": max(times, default=math.nan)}
+    more = {
+        "again_median": float(np.median(times)) if times else math.nan,
+        "again_max": max(times, default=math.nan),
+    }
     return {**pool.figures(), **more, "never": len(results) - len(times)}
 
 
 COLUMNS = {
-    "rmse_3d": "error (RMSE), m", "rmse_3d_max_of_runs": "of the worst seed", "max_3d": "largest", "std_3d": "stated, m", "nees_mean": "NEES",
-    "without_estimate": "without an estimate", "again_median": "right again, s", "again_max": "at the latest", "never": "never",
-}  # fmt: skip
+    "rmse_3d": "error (RMSE), m",
+    "rmse_3d_max_of_runs": "of the worst seed",
+    "max_3d": "largest",
+    "std_3d": "stated, m",
+    "nees_mean": "NEES",
+    "without_estimate": "without an estimate",
+    "again_median": "right again, s",
+    "again_max": "at the latest",
+    "never": "never",
+}
 
 
 def table(together):
     """Markdown of {name: figures}."""
     lines = [f"| situation | {' | '.join(COLUMNS.values())} |", f"|---|{len(COLUMNS) * '---:|'}"]
     for name, of in together.items():
-        cells = {key: f"{of[key]:.2f}" for key in COLUMNS} | {"nees_mean": f"{of['nees_mean']:.1f}", "never": str(of["never"])}
+        cells = {key: f"{of[key]:.2f}" for key in COLUMNS} | {
+            "nees_mean": f"{of['nees_mean']:.1f}",
+            "never": str(of["never"]),
+        }
         cells["without_estimate"] = f"{of['without_estimate'] / of['duration']:.0%}"
         lines.append(f"| {name} | {' | '.join(cells[key].replace('nan', '') for key in COLUMNS)} |")
     return "\n".join(lines)
@@ -144,10 +231,14 @@ def table(together):
 
 def _plain(of):
     """As JSON takes it: null for what is no number."""
-    return {name: None if isinstance(value, float) and not math.isfinite(value) else value for name, value in of.items()}
+    return {
+        name: None if isinstance(value, float) and not math.isfinite(value) else value
+        for name, value in of.items()
+    }
 
 
-# ------------------------------------------------------------------------------------------------------- what happens
+# -------------------------------------------------------------------------------------------------------
+# what happens
 
 
 def _at(rng, height, reach=1.2):
@@ -160,7 +251,9 @@ def _round(centre, radius=1.0, speed=1.0, swing=0.2):
 
     def position(t):
         angle = speed * t / radius
-        return np.array(centre) + np.stack([radius * np.cos(angle), radius * np.sin(angle), swing * np.sin(0.7 * angle)], axis=1)
+        return np.array(centre) + np.stack(
+            [radius * np.cos(angle), radius * np.sin(angle), swing * np.sin(0.7 * angle)], axis=1
+        )
 
     return position
 
@@ -168,7 +261,9 @@ def _round(centre, radius=1.0, speed=1.0, swing=0.2):
 def _flown(duration, position, common, **more):
     """A flight of a multirotor whose motors turn all the time."""
     path = Path(duration, position, running=(-1.0, duration + 1.0))
-    return simulate(SimulationConfig(**{**common, "duration": duration, "imu_errors": FLYING, **more}), path)
+    return simulate(
+        SimulationConfig(**{**common, "duration": duration, "imu_errors": FLYING, **more}), path
+    )
 
 
 def _level(t):
@@ -177,7 +272,10 @@ def _level(t):
 
 def _carried(duration, position, common, attitude=_level, **more):
     """A recording of a tag without motors."""
-    return simulate(SimulationConfig(**{**common, "duration": duration, **more}), Path(duration, position, attitude))
+    return simulate(
+        SimulationConfig(**{**common, "duration": duration, **more}),
+        Path(duration, position, attitude),
+    )
 
 
 def _still(duration, height, rng, common):
@@ -195,7 +293,9 @@ def _hop(rng, common):
 
 
 def _low_late(make, rng, common):
-    """What `make` gives, with the low anchors late for a tag on the floor, as on the measured flights."""
+    """What `make` gives, with the low anchors late for a tag on the floor, as on the measured
+    flights.
+    """
     flight = make(rng, common)
     low = np.flatnonzero(flight.anchors.positions[:, 2] < LOW)
     height = np.interp(flight.tdoa.t, flight.truth.t, flight.truth.p[:, 2])
@@ -210,7 +310,9 @@ def _later(flight, size, each):
     a, b = flight.anchors.index(flight.tdoa.a), flight.anchors.index(flight.tdoa.b)
     each = np.broadcast_to(each, (len(flight.tdoa), len(flight.anchors)))
     rows = np.arange(len(flight.tdoa))
-    return replace(flight, tdoa=replace(flight.tdoa, d=flight.tdoa.d + size * (each[rows, b] - each[rows, a])))
+    return replace(
+        flight, tdoa=replace(flight.tdoa, d=flight.tdoa.d + size * (each[rows, b] - each[rows, a]))
+    )
 
 
 def _without(streams, begin, end, make, rng, common):
@@ -219,7 +321,14 @@ def _without(streams, begin, end, make, rng, common):
     for name in streams:
         stream = getattr(flight, name)
         kept = (stream.t < begin) | (stream.t > end)
-        flight = replace(flight, **{name: replace(stream, **{column: values[kept] for column, values in vars(stream).items()})})
+        flight = replace(
+            flight,
+            **{
+                name: replace(
+                    stream, **{column: values[kept] for column, values in vars(stream).items()}
+                )
+            },
+        )
     return flight
 
 
@@ -228,7 +337,12 @@ def _few(count, make, rng, common):
     flight = make(rng, common)
     heard = rng.permutation(flight.anchors.ids)[:count]
     kept = (flight.tdoa.t < 10.0) | (np.isin(flight.tdoa.a, heard) & np.isin(flight.tdoa.b, heard))
-    return replace(flight, tdoa=replace(flight.tdoa, **{column: values[kept] for column, values in vars(flight.tdoa).items()}))
+    return replace(
+        flight,
+        tdoa=replace(
+            flight.tdoa, **{column: values[kept] for column, values in vars(flight.tdoa).items()}
+        ),
+    )
 
 
 def _flying(duration, rng, common):
@@ -242,8 +356,12 @@ def _tumbling(rng, common):
 
     def attitude(t):
         inside = np.clip(t, 10.0, 15.0) - 10.0
-        about = inside - np.sin(2.0 * np.pi * inside / 5.0) * 5.0 / (2.0 * np.pi)  # begins and ends without a jerk
-        return Rotation.from_euler("zyx", np.column_stack([np.zeros(len(t)), axes[1] * about, axes[0] * about]))
+        about = inside - np.sin(2.0 * np.pi * inside / 5.0) * 5.0 / (
+            2.0 * np.pi
+        )  # begins and ends without a jerk
+        return Rotation.from_euler(
+            "zyx", np.column_stack([np.zeros(len(t)), axes[1] * about, axes[0] * about])
+        )
 
     return _carried(22.0, place, common, attitude)
 
@@ -251,11 +369,15 @@ def _tumbling(rng, common):
 def _outside(far, rng, common):
     """5 s inside, 5 s through the wall to `far` m beyond the workspace, and round there for 10 s."""
     begin, x = _at(rng, 1.3), WALL + MARGIN + far
-    way = between((0.0, *begin), (5.0, *begin), (10.0 + 0.3 * far, x, 0.0, 1.3), (40.0, x, 0.0, 1.3))
+    way = between(
+        (0.0, *begin), (5.0, *begin), (10.0 + 0.3 * far, x, 0.0, 1.3), (40.0, x, 0.0, 1.3)
+    )
 
     def position(t):
         since = np.maximum(t - 10.0 - 0.3 * far, 0.0)
-        return way(t) + 0.3 * np.stack([np.zeros(len(t)), 1.0 - np.cos(since), 0.3 * (1.0 - np.cos(2.0 * since))], axis=1)
+        return way(t) + 0.3 * np.stack(
+            [np.zeros(len(t)), 1.0 - np.cos(since), 0.3 * (1.0 - np.cos(2.0 * since))], axis=1
+        )
 
     return _flown(20.0 + 0.3 * far, position, common)
 
@@ -264,20 +386,32 @@ def _one_side(rng, common):
     """All eight anchors on one wall, the tag 2 to 5 m in front of it."""
     y, z = np.meshgrid([-3.0, -1.0, 1.0, 3.0], [0.3, 2.8])
     wall = np.column_stack([np.full(8, -WALL), y.ravel(), z.ravel()])[rng.permutation(8)]
-    return _flown(20.0, _round((0.0, 0.0, 1.4), 1.4), {**common, "anchors": facing(wall, (0.0, 0.0, 1.5))})
+    return _flown(
+        20.0, _round((0.0, 0.0, 1.4), 1.4), {**common, "anchors": facing(wall, (0.0, 0.0, 1.5))}
+    )
 
 
 def _in_a_plane(rng, common):
     """Eight anchors 2.8 m high, the tag below."""
     angle = 0.25 * np.pi * np.arange(8)
-    ceiling = np.column_stack([WALL * np.cos(angle), 4.0 * np.sin(angle), np.full(8, 2.8)])[[0, 3, 6, 1, 4, 7, 2, 5]]
-    return _flown(20.0, _round(_at(rng, 1.2, 0.5)), {**common, "anchors": facing(ceiling, (0.0, 0.0, 1.0))})
+    ceiling = np.column_stack([WALL * np.cos(angle), 4.0 * np.sin(angle), np.full(8, 2.8)])[
+        [0, 3, 6, 1, 4, 7, 2, 5]
+    ]
+    return _flown(
+        20.0, _round(_at(rng, 1.2, 0.5)), {**common, "anchors": facing(ceiling, (0.0, 0.0, 1.0))}
+    )
 
 
 def _in_a_line(rng, common):
-    """Six anchors along a line 1.5 m high, the tag 2 m beside it: where about that line no TDOA tells."""
-    line = np.column_stack([np.zeros(6), np.linspace(-4.0, 4.0, 6)[[0, 3, 5, 1, 4, 2]], np.full(6, 1.5)])
-    return _flown(20.0, _round((2.0, 0.0, 1.3), 0.8), {**common, "anchors": facing(line, (3.0, 0.0, 1.5))})
+    """Six anchors along a line 1.5 m high, the tag 2 m beside it: where about that line no TDOA
+    tells.
+    """
+    line = np.column_stack(
+        [np.zeros(6), np.linspace(-4.0, 4.0, 6)[[0, 3, 5, 1, 4, 2]], np.full(6, 1.5)]
+    )
+    return _flown(
+        20.0, _round((2.0, 0.0, 1.3), 0.8), {**common, "anchors": facing(line, (3.0, 0.0, 1.5))}
+    )
 
 
 def _fast(rng, common):
@@ -285,7 +419,9 @@ def _fast(rng, common):
     slow = 4.0
 
     def position(t):
-        along = np.where(t < 2.0 * slow, t**2 / (4.0 * slow), t - slow)  # of full speed, reached after 8 s
+        along = np.where(
+            t < 2.0 * slow, t**2 / (4.0 * slow), t - slow
+        )  # of full speed, reached after 8 s
         return np.array([0.0, 0.0, 1.4]) + 0.85 * np.stack(
             [np.cos(5.0 / 0.85 * along), np.sin(5.0 / 0.85 * along), np.zeros(len(t))], axis=1
         )
@@ -302,15 +438,21 @@ def _rover(rng, common):
 
 
 def _pocket(rng, common):
-    """In a person's pocket at 0.9 m: 1.2 m/s, bobbing, swinging; anchors behind are late through the body."""
+    """In a person's pocket at 0.9 m: 1.2 m/s, bobbing, swinging; anchors behind are late through
+    the body.
+    """
     walk = _round((0.0, 0.0, 0.9), 1.8, 1.2, 0.0)
 
     def position(t):
-        return walk(t) + np.column_stack([np.zeros((len(t), 2)), 0.03 * np.sin(2.0 * np.pi * 1.9 * t)])
+        return walk(t) + np.column_stack(
+            [np.zeros((len(t), 2)), 0.03 * np.sin(2.0 * np.pi * 1.9 * t)]
+        )
 
     def attitude(t):
         swing = 0.4 * np.sin(2.0 * np.pi * 0.95 * t)
-        return Rotation.from_euler("zyx", np.column_stack([1.2 / 1.8 * t + 0.5 * np.pi, 0.3 + swing, 0.2 * swing]))
+        return Rotation.from_euler(
+            "zyx", np.column_stack([1.2 / 1.8 * t + 0.5 * np.pi, 0.3 + swing, 0.2 * swing])
+        )
 
     flight = _carried(25.0, position, common, attitude)
     p = position(flight.tdoa.t)
@@ -328,7 +470,13 @@ def _moving(rng, common):
 def _table(rng, common):
     """4 s on a table of 0.75 m, then up and about."""
     place = _at(rng, 0.78)
-    stops = (0.0, *place), (4.0, *place), (6.0, *place[:2], 1.6), (10.0, *_at(rng, 1.6)), (16.0, *_at(rng, 1.2))
+    stops = (
+        (0.0, *place),
+        (4.0, *place),
+        (6.0, *place[:2], 1.6),
+        (10.0, *_at(rng, 1.6)),
+        (16.0, *_at(rng, 1.2)),
+    )
     path = Path(16.0, between(*stops), running=(3.0, 17.0))
     return simulate(SimulationConfig(**{**common, "duration": 16.0, "imu_errors": FLYING}), path)
 
@@ -347,21 +495,38 @@ SITUATIONS = (
     Situation("on the floor, low anchors 3.2 m late", partial(_low_late, _LAID), (2.0, 12.0)),
     Situation("at rest, 1 m high", partial(_still, 12.0, 1.0), (2.0, 12.0)),
     Situation(
-        "at rest, TDOAs for 1 s, then none for 10 s", partial(_without, ("tdoa",), 1.0, 12.0, partial(_still, 12.0, 1.0)), (2.0, 11.0)
+        "at rest, TDOAs for 1 s, then none for 10 s",
+        partial(_without, ("tdoa",), 1.0, 12.0, partial(_still, 12.0, 1.0)),
+        (2.0, 11.0),
     ),
     Situation("lift-off, 3 s", _hop, (4.0, 7.0)),
-    Situation("lift-off, low anchors 3.2 m late on the floor", partial(_low_late, _hop), (4.0, 7.0)),
+    Situation(
+        "lift-off, low anchors 3.2 m late on the floor", partial(_low_late, _hop), (4.0, 7.0)
+    ),
     Situation("landing, 3 s, and 4 s at rest", _hop, (11.0, 18.0), 14.0),
-    Situation("landing, low anchors 3.2 m late on the floor", partial(_low_late, _hop), (11.0, 18.0), 14.0),
+    Situation(
+        "landing, low anchors 3.2 m late on the floor", partial(_low_late, _hop), (11.0, 18.0), 14.0
+    ),
     Situation("tumbling for 5 s", _tumbling, (10.0, 15.0), 15.0),
     *(
         Situation(
-            f"outside, {far:g} m beyond the workspace", partial(_outside, far), (10.0 + 0.3 * far, 20.0 + 0.3 * far), 10.0 + 0.3 * far
+            f"outside, {far:g} m beyond the workspace",
+            partial(_outside, far),
+            (10.0 + 0.3 * far, 20.0 + 0.3 * far),
+            10.0 + 0.3 * far,
         )
         for far in (1.0, 3.0, 10.0)
     ),
     Situation("all anchors on one side", _one_side, (5.0, 20.0)),
-    *(Situation(f"{count} anchors heard for 10 s", partial(_few, count, partial(_flying, 20.0)), (10.0, 20.0), 10.0) for count in (3, 4)),
+    *(
+        Situation(
+            f"{count} anchors heard for 10 s",
+            partial(_few, count, partial(_flying, 20.0)),
+            (10.0, 20.0),
+            10.0,
+        )
+        for count in (3, 4)
+    ),
     Situation("all anchors in a plane", _in_a_plane, (5.0, 20.0)),
     Situation("all anchors in a line", _in_a_line, (5.0, 20.0)),
     *_gaps(),

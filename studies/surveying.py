@@ -1,4 +1,6 @@
-"""Surveys of measured flights, shaken and made better from the flights alone; the tag is judged on other flights."""
+"""Surveys of measured flights, shaken and made better from the flights alone; the tag is judged on
+other flights.
+"""
 
 from dataclasses import replace
 from functools import partial
@@ -14,24 +16,40 @@ from uwb_tdoa_bias.foundation.flight import AIDS
 from uwb_tdoa_tools import parallel
 from uwb_tdoa_tools.diagnosis import diagnose
 from uwb_tdoa_tools.diagnosis.constraints import Mark
-from uwb_tdoa_tools.diagnosis.references import OdometryReference, OdometryPath
+from uwb_tdoa_tools.diagnosis.references import OdometryPath, OdometryReference
 from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
+from uwb_tdoa_tools.outputs import OutputFile
 from uwb_tdoa_tools.parallel import whole_number
 from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.scoring.evaluation import evaluate
 from uwb_tdoa_tools.surveying.paths import DRIFT
-from uwb_tdoa_tools.outputs import OutputFile
 
 from .diagnosis.measured import SPLITS
 
 SHAKES = 0.1, 0.3  # m, unless others are asked for
-_UTIL, _CONST4, _0425 = "util/const{}-trial{}.csv.gz", "util/const4-trial1-tdoa2-traj{}.csv.gz", "flights/0425/TDOA2/0425-traj{}"
+_UTIL, _CONST4, _0425 = (
+    "util/const{}-trial{}.csv.gz",
+    "util/const4-trial1-tdoa2-traj{}.csv.gz",
+    "flights/0425/TDOA2/0425-traj{}",
+)
 SETS = {  # name: (paths to survey with, paths to judge on, aids that are used)
-    "const1": ([_UTIL.format(1, k) for k in ("1-tdoa2", "1-tdoa3")], [_UTIL.format(1, k) for k in ("2-tdoa2", "3-tdoa2")], ()),
-    "const3": ([_UTIL.format(3, k) for k in ("1-tdoa2", "2-tdoa2")], [_UTIL.format(3, k) for k in ("3-tdoa2", "4-tdoa2")], ()),
+    "const1": (
+        [_UTIL.format(1, k) for k in ("1-tdoa2", "1-tdoa3")],
+        [_UTIL.format(1, k) for k in ("2-tdoa2", "3-tdoa2")],
+        (),
+    ),
+    "const3": (
+        [_UTIL.format(3, k) for k in ("1-tdoa2", "2-tdoa2")],
+        [_UTIL.format(3, k) for k in ("3-tdoa2", "4-tdoa2")],
+        (),
+    ),
     "const4": ([_CONST4.format(k) for k in (1, 2)], [_CONST4.format(3)], ()),
     "0425": ([_0425.format(k) for k in (1, 2, 6)], [_0425.format(k) for k in (3, 7, 10)], ()),
-    "0425 with its range finder": ([_0425.format(k) for k in (1, 2, 6)], [_0425.format(k) for k in (3, 7, 10)], AIDS),
+    "0425 with its range finder": (
+        [_0425.format(k) for k in (1, 2, 6)],
+        [_0425.format(k) for k in (3, 7, 10)],
+        AIDS,
+    ),
 }
 MARKS = 6  # of each split at least
 END_TIME, END_STD = 2.0, 0.1  # s, m
@@ -43,13 +61,40 @@ SECONDS = 60.0
 def add_options(add):
     """add : add_argument of a parser."""
     add("--data", type=Path, required=True, metavar="DATA", help="folder of measured flights")
-    add("--draws", type=int, default=20, metavar="N", help="of each set and each size of the errors (default 20)")
-    add("--first", type=int, default=0, metavar="SEED", help="of the first draw, or of what is known (default 0)")
+    add(
+        "--draws",
+        type=int,
+        default=20,
+        metavar="N",
+        help="of each set and each size of the errors (default 20)",
+    )
+    add(
+        "--first",
+        type=int,
+        default=0,
+        metavar="SEED",
+        help="of the first draw, or of what is known (default 0)",
+    )
     add("--only", choices=(*SETS, "simulated"), help="one set")
-    add("--tape", nargs="+", type=float, default=SHAKES, metavar="M", help="standard deviations of the tape, m (default 0.1 0.3)")
-    add("--plain", action="store_true", help="trust no coordinate more than others, as somebody with a tape measure alone")
+    add(
+        "--tape",
+        nargs="+",
+        type=float,
+        default=SHAKES,
+        metavar="M",
+        help="standard deviations of the tape, m (default 0.1 0.3)",
+    )
+    add(
+        "--plain",
+        action="store_true",
+        help="trust no coordinate more than others, as somebody with a tape measure alone",
+    )
     add("--jobs", type=whole_number, default=1, metavar="N", help="draws at once (default 1)")
-    add("--known", choices=(*KNOWN, "odometry"), help="instead: flights of every split with this known beside, judged on others")
+    add(
+        "--known",
+        choices=(*KNOWN, "odometry"),
+        help="instead: flights of every split with this known beside, judged on others",
+    )
     add("--split", choices=tuple(SPLITS), help="with --known: one of these alone")
     add("--json", metavar="FILE", type=OutputFile, help="write every draw")
 
@@ -58,15 +103,28 @@ def run(args):
     """Print a table, a row for each set and size."""
     if args.known:
         return with_known(args.data, args.known, [args.split] if args.split else SPLITS, args.first)
-    print("| set | tape off by [m] | applied | tag, true survey | shaken | surveyed | surveyed / shaken, median (worst) | ", end="")
-    print("worse than shaken | anchors shaken | surveyed | normalised error |\n|---|" + 10 * "---:|")
+    print(
+        (
+            "| set | tape off by [m] | applied | tag, true survey | shaken | surveyed | surveyed "
+            "/ shaken, median (worst) | "
+        ),
+        end="",
+    )
+    print(
+        "worse than shaken | anchors shaken | surveyed | normalised error |\n|---|" + 10 * "---:|"
+    )
     every = {}
     for name in [args.only] if args.only else [*SETS, "simulated"]:
         flights, judged = _simulated() if name == "simulated" else _measured(args.data, *SETS[name])
         for std in args.tape:
             seeds = range(args.first, args.first + args.draws)
             draws = list(
-                parallel.over(partial(draw, flights, judged, std, plain=args.plain), seeds, args.jobs, unit=f"draw of {name} {std}")
+                parallel.over(
+                    partial(draw, flights, judged, std, plain=args.plain),
+                    seeds,
+                    args.jobs,
+                    unit=f"draw of {name} {std}",
+                )
             )
             every[f"{name} {std}"] = draws
             print(f"| {name} | {std} | {_summary(draws)} |", flush=True)
@@ -75,27 +133,44 @@ def run(args):
 
 
 def with_known(data, kind, splits, seed):
-    """Print a table: surveys as they came, within 0.1 m, made better with what KNOWN of a kind says; or diagnosed beside an odometry
-    that took off and landed at known places."""
-    print("| fitted to | judged on | mean 3D RMSE before | after | worst ratio | known |\n|---|---|---:|---:|---:|---:|")
+    """Print a table: surveys as they came, within 0.1 m, made better with what KNOWN of a kind
+    says; or diagnosed beside an odometry that took off and landed at known places.
+    """
+    print(
+        "| fitted to | judged on | mean 3D RMSE before | after | worst ratio | known "
+        "|\n|---|---|---:|---:|---:|---:|"
+    )
     for name in (name for name in splits if SPLITS[name][1]):
         flights, judged = _measured(data, *SPLITS[name], ())
         rng, bare = np.random.default_rng(seed), [replace(flight, truth=None) for flight in flights]
         if kind == "odometry":
-            known = [one for flight in flights for make in (odometry_of, ends_of) for one in make(flight, 1, rng)]
-            effects, positions = diagnose(bare, reference=OdometryReference(None, known)).effects, flights[0].anchors.positions
+            known = [
+                one
+                for flight in flights
+                for make in (odometry_of, ends_of)
+                for one in make(flight, 1, rng)
+            ]
+            effects, positions = (
+                diagnose(bare, reference=OdometryReference(None, known)).effects,
+                flights[0].anchors.positions,
+            )
         else:
             known = [one for flight in flights for one in KNOWN[kind](flight, len(flights), rng)]
             result = self_calibrate(bare, Tape(), constraints=known)
             effects, positions = result.effects, result.anchors.positions
         before = np.array([rmse([flight]) for flight in judged])
         after = np.array([rmse([at(flight, positions)], effects) for flight in judged])
-        cells = f"{before.mean():.3f} | {after.mean():.3f} | {(after / before).max():.2f} | {len(known)}"
+        cells = (
+            f"{before.mean():.3f} | {after.mean():.3f} | {(after / before).max():.2f} | "
+            f"{len(known)}"
+        )
         print(f"| {name} | {len(judged)} flights | {cells} |", flush=True)
 
 
 def ends_of(flight, several, rng):
-    """[Mark]: where the tag stood before it took off and after it landed, END_TIME each, END_STD off."""
+    """[Mark]: where the tag stood before it took off and after it landed, END_TIME each, END_STD
+    off.
+    """
     truth, out = flight.truth, []
     last = flight.tdoa.t[-1] - flight.tdoa.t[0]
     for since in (0.0, last - END_TIME):
@@ -124,9 +199,11 @@ KNOWN = {  # kind: function of (Flight, how many there are, Generator) that give
 
 
 def draw(flights, judged, std, seed, plain=False):
-    """dict of figures of one draw: mean 3D RMSE, m, of the judged Flights with the true, shaken and surveyed anchors; root
-    mean square errors, m, of the coordinates that are not trusted, shaken and surveyed, and of what was found, applied or not, over
-    its std. plain : trust none more than others."""
+    """dict of figures of one draw: mean 3D RMSE, m, of the judged Flights with the true, shaken and
+    surveyed anchors; root mean square errors, m, of the coordinates that are not trusted, shaken
+    and surveyed, and of what was found, applied or not, over its std. plain : trust none more than
+    others.
+    """
     true = flights[0].anchors
     tape = Tape(std, trusted=() if plain else third(true))
     free = tape.position_std(true) > tape.trusted_std
@@ -137,7 +214,9 @@ def draw(flights, judged, std, seed, plain=False):
     return {
         "true": rmse(judged),
         "shaken": rmse([at(flight, rough) for flight in judged]),
-        "surveyed": rmse([at(flight, result.anchors.positions) for flight in judged], result.effects),
+        "surveyed": rmse(
+            [at(flight, result.anchors.positions) for flight in judged], result.effects
+        ),
         "applied": result.why_not is None,
         "slow_before": result.before,
         "slow_left": result.left,
@@ -149,7 +228,9 @@ def draw(flights, judged, std, seed, plain=False):
 
 
 def third(anchors):
-    """Names of a third of the coordinates of eight Anchors: all of two at opposite ends, the heights of two more."""
+    """Names of a third of the coordinates of eight Anchors: all of two at opposite ends, the
+    heights of two more.
+    """
     far = int(np.argmax(np.linalg.norm(anchors.positions - anchors.positions[0], axis=1)))
     others = [row for row in range(1, len(anchors)) if row != far][:2]
     ids = [str(i) for i in anchors.ids]
@@ -169,7 +250,9 @@ def measured_flights(data, paths, aids=()):
     """Flights below a folder, with these of AIDS alone."""
     unused = [aid for aid in AIDS if aid not in aids]
     reading = inputs.Reading(str(data / "surveys"))
-    return [flight.without(*unused) for path in paths for flight in reading.flights([str(data / path)])]
+    return [
+        flight.without(*unused) for path in paths for flight in reading.flights([str(data / path)])
+    ]
 
 
 def _simulated():
@@ -179,7 +262,9 @@ def _simulated():
 
 def rmse(flights, effects=None, config=None):
     """Mean 3D RMSE of the filter on Flights, m."""
-    return float(np.mean([evaluate(flight, config, effects)[0].row()["rmse_3d"] for flight in flights]))
+    return float(
+        np.mean([evaluate(flight, config, effects)[0].row()["rmse_3d"] for flight in flights])
+    )
 
 
 def _root(values):

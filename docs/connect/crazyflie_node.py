@@ -20,13 +20,17 @@ import rclpy
 from rclpy.executors import ExternalShutdownException
 from rclpy.time import Time
 from sensor_msgs.msg import Imu
+
 from uwb_tdoa_msgs.msg import Tdoa
 from uwb_tdoa_tools.crazyflie.log_blocks import LogBlock, VehicleClock
 
 try:
     from crazyflie_interfaces.msg import LogDataGeneric
 except ImportError:
-    sys.exit("crazyflie_node: error: crazyflie_interfaces is not installed; install crazyswarm2 and source it.")
+    sys.exit(
+        "crazyflie_node: error: crazyflie_interfaces is not installed; install crazyswarm2 "
+        "and source it."
+    )
 
 BLOCKS = {
     "tdoa_a": ["tdoa2.d7-0", "tdoa2.d0-1", "tdoa2.d1-2", "tdoa2.d2-3", "tdoa2.d3-4", "tdoa2.d4-5"],
@@ -38,7 +42,10 @@ BLOCKS = {
 def main():
     rclpy.init()
     node = rclpy.create_node("crazyflie_node")
-    tdoas, samples = node.create_publisher(Tdoa, "uwb/tdoa", 100), node.create_publisher(Imu, "imu/data", 100)
+    tdoas, samples = (
+        node.create_publisher(Tdoa, "uwb/tdoa", 100),
+        node.create_publisher(Imu, "imu/data", 100),
+    )
     clock = VehicleClock()
 
     def stamp(message, t, arrival):
@@ -55,12 +62,16 @@ def main():
             t, gyro, accel = sample
             imu = stamp(Imu(), t, arrival)
             imu.angular_velocity.x, imu.angular_velocity.y, imu.angular_velocity.z = gyro.tolist()
-            imu.linear_acceleration.x, imu.linear_acceleration.y, imu.linear_acceleration.z = accel.tolist()
+            imu.linear_acceleration.x, imu.linear_acceleration.y, imu.linear_acceleration.z = (
+                accel.tolist()
+            )
             samples.publish(imu)
 
     for topic, variables in BLOCKS.items():
         block = LogBlock(variables)
-        node.create_subscription(LogDataGeneric, topic, lambda message, block=block: on_block(message, block), 100)
+        node.create_subscription(
+            LogDataGeneric, topic, lambda message, block=block: on_block(message, block), 100
+        )
     try:
         rclpy.spin(node)
     except (KeyboardInterrupt, ExternalShutdownException):

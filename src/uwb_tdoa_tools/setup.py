@@ -9,7 +9,10 @@ NAME = "uwb_tdoa_tools"
 setup(
     name=NAME,
     version="0.1.0",
-    description="Reads, converts, simulates, replays, records and evaluates flights of UWB TDOA measurements",
+    description=(
+        "Reads, converts, simulates, replays, records and evaluates flights of UWB TDOA "
+        "measurements"
+    ),
     maintainer="uwb_tdoa maintainers",
     maintainer_email="maintainers@uwb-tdoa.invalid",
     license="Apache-2.0",

@@ -1,5 +1,6 @@
-"""Mistakes of drivers, surveys and clocks put into flights, and what `check` says of them; and of the flights as they
-are."""
+"""Mistakes of drivers, surveys and clocks put into flights, and what `check` says of them; and of
+the flights as they are.
+"""
 
 from functools import partial
 import json
@@ -14,9 +15,9 @@ from uwb_tdoa_tools import parallel
 from uwb_tdoa_tools.checking.check import check
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.checking.tdoa_rules import furthest
+from uwb_tdoa_tools.outputs import OutputFile
 from uwb_tdoa_tools.readers import inputs, read_survey
 from uwb_tdoa_tools.readers.streams import protocol
-from uwb_tdoa_tools.outputs import OutputFile
 
 ANOTHER = 0.3  # m that an anchor of another room is elsewhere at least
 
@@ -40,9 +41,14 @@ def run(args):
     """Print the table."""
     reading = inputs.Reading(args.survey)
     found = reading.find(args.flights)
-    surveys = [(path.name, read_survey(path)) for path in sorted(Path(args.survey).glob("anchor_?*"))]
+    surveys = [
+        (path.name, read_survey(path)) for path in sorted(Path(args.survey).glob("anchor_?*"))
+    ]
     kinds = [(survey, protocol(reading.read((path, survey)).tdoa)) for path, survey in found]
-    tasks = [(number, recording, _partner(number, found, kinds)) for number, recording in enumerate(found)]
+    tasks = [
+        (number, recording, _partner(number, found, kinds))
+        for number, recording in enumerate(found)
+    ]
     judge = partial(judge_flight, reading=reading, surveys=surveys, only=args.only)
     rows = []
     for said in parallel.over(judge, tasks, args.jobs):
@@ -53,17 +59,22 @@ def run(args):
 
 
 def _partner(number, found, kinds):
-    """(path, survey) of another flight with the same survey and protocol, or None: whose tag may fly along."""
-    same = [recording for k, recording in enumerate(found) if k != number and kinds[k] == kinds[number]]
+    """(path, survey) of another flight with the same survey and protocol, or None: whose tag may
+    fly along.
+    """
+    same = [
+        recording for k, recording in enumerate(found) if k != number and kinds[k] == kinds[number]
+    ]
     return same[number % len(same)] if same else None
 
 
 def judge_flight(task, reading, surveys, only=None):
-    """[{"flight", "live", "mistake", "said": {rule: severity}, "named": bool}] of one flight: (number, recording,
-    partner).
+    """[{"flight", "live", "mistake", "said": {rule: severity}, "named": bool}] of one flight:
+    (number, recording, partner).
 
-    Every other flight is judged as a bag recorded live, with the times at which its messages arrived, the others as a
-    log that knows nothing but stamps."""
+    Every other flight is judged as a bag recorded live, with the times at which its messages
+    arrived, the others as a log that knows nothing but stamps.
+    """
     number, recording, partner = task
     flight = of_flight(reading.read(recording))
     other = of_flight(reading.read(partner)) if partner else None
@@ -82,8 +93,12 @@ def judge_flight(task, reading, surveys, only=None):
             made = mistake.make(made, rng, second)
         report = check(made, [] if mistake and mistake.alone else surveys)
         said = {finding.rule: finding.severity for finding in report.findings}
-        named = any(rule in said for rule in mistake.named) if mistake else ERROR not in said.values()
-        rows.append({"flight": flight.name, "live": arrives, "mistake": name, "said": said, "named": named})
+        named = (
+            any(rule in said for rule in mistake.named) if mistake else ERROR not in said.values()
+        )
+        rows.append(
+            {"flight": flight.name, "live": arrives, "mistake": name, "said": said, "named": named}
+        )
     return rows
 
 
@@ -98,8 +113,9 @@ def possible(mistake, flight, other, rooms):
 
 
 def table(rows):
-    """Markdown: a line for each mistake, with how often it was named, and what was said besides that is not said
-    without it."""
+    """Markdown: a line for each mistake, with how often it was named, and what was said besides
+    that is not said without it.
+    """
     lines = ["| mistake | named | flights | what else was said |", "| --- | ---: | ---: | --- |"]
     for name in dict.fromkeys(row["mistake"] for row in rows):
         mine = [row for row in rows if row["mistake"] == name]
@@ -110,7 +126,9 @@ def table(rows):
             for rule in row["said"].keys() - expected - usual.get(row["flight"], set()):
                 besides[rule] = besides.get(rule, 0) + 1
         text = MISTAKES[name].text if name in MISTAKES else "nothing: no error is said"
-        said = ", ".join(f"{rule} {count}" for rule, count in sorted(besides.items(), key=lambda item: -item[1]))
+        said = ", ".join(
+            f"{rule} {count}" for rule, count in sorted(besides.items(), key=lambda item: -item[1])
+        )
         lines.append(f"| {text} | {sum(row['named'] for row in mine)} | {len(mine)} | {said} |")
     return "\n".join(lines)
 

@@ -1,5 +1,6 @@
-"""What ekf_node says in flight of the mistakes that `check` finds in recordings: a part of a flight, with each, played to both
-nodes as it would have arrived."""
+"""What ekf_node says in flight of the mistakes that `check` finds in recordings: a part of a
+flight, with each, played to both nodes as it would have arrived.
+"""
 
 from collections import Counter
 from dataclasses import replace
@@ -14,12 +15,14 @@ import numpy as np
 from uwb_tdoa_bias.foundation.files import write_text
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.checking.tdoa_rules import furthest
-from uwb_tdoa_tools.readers import inputs, read_survey
 from uwb_tdoa_tools.outputs import OutputFile
+from uwb_tdoa_tools.readers import inputs, read_survey
 
 from .figures import ANOTHER, possible
 
-BOOT = 100.0  # s on the clock of the robot at which a part begins: no mistake makes a stamp negative
+BOOT = (
+    100.0  # s on the clock of the robot at which a part begins: no mistake makes a stamp negative
+)
 EVERY = 4  # of the inertial samples one is played, so that a busy computer is none of the mistakes
 SETTLED = 3.0  # s of flight before what is said counts
 NOT_PLAYED = {"turned_frame"}  # speaks of /tf_static
@@ -30,8 +33,20 @@ def add_options(add):
     """add : add_argument of a parser."""
     add("flight", metavar="FLIGHT", help=inputs.HELP)
     add("--survey", required=True, metavar="DIR", help="folder of all surveys")
-    add("--seconds", type=float, default=12.0, metavar="S", help="of the middle of the flight (default %(default)s)")
-    add("--only", nargs="+", metavar="MISTAKE", choices=[*MISTAKES, "nothing"], help="of those of the study checking")
+    add(
+        "--seconds",
+        type=float,
+        default=12.0,
+        metavar="S",
+        help="of the middle of the flight (default %(default)s)",
+    )
+    add(
+        "--only",
+        nargs="+",
+        metavar="MISTAKE",
+        choices=[*MISTAKES, "nothing"],
+        help="of those of the study checking",
+    )
     add("--json", metavar="FILE", type=OutputFile, help="write what was said of each")
 
 
@@ -50,7 +65,11 @@ def run(args):
             if name in NOT_PLAYED or (mistake and not possible(mistake, part, None, rooms)):
                 continue
             rng = np.random.default_rng([0, *name.encode()])
-            other = rooms[int(rng.integers(len(rooms)))] if mistake and mistake.needs == "rooms" else None
+            other = (
+                rooms[int(rng.integers(len(rooms)))]
+                if mistake and mistake.needs == "rooms"
+                else None
+            )
             made = mistake.make(arriving(part, 0), rng, other) if mistake else arriving(part, 0)
             rows.append({"mistake": name, **nodes.said(made)})
             print(line(rows[-1]), flush=True)
@@ -59,10 +78,15 @@ def run(args):
 
 
 def line(row):
-    """A row of the table: the mistake, what `check` calls it, and what the node found, or said most of the time."""
+    """A row of the table: the mistake, what `check` calls it, and what the node found, or said most
+    of the time.
+    """
     mistake = MISTAKES.get(row["mistake"])
     text = max(row["texts"], key=row["texts"].get) if row["texts"] else "nothing at all"
-    said = ", ".join(f"`{rule}`" for rule in sorted(row["rules"])) or text.partition(":")[0].partition(" (")[0]
+    said = (
+        ", ".join(f"`{rule}`" for rule in sorted(row["rules"]))
+        or text.partition(":")[0].partition(" (")[0]
+    )
     named = " or ".join(f"`{rule}`" for rule in mistake.named) if mistake else ""
     return f"| {mistake.text if mistake else 'nothing'} | {named} | {said} |"
 
@@ -108,11 +132,18 @@ class _Nodes:
         processes.start("uwb_tdoa_bias", "bias_node")
         processes.start("uwb_tdoa_ekf", "ekf_node")
         ends = (self._anchors, self._imu, self._tdoa)
-        wait(READY, "the nodes", processes, self._node, lambda: (
-            diagnostics.newest("ekf_node").get("publishers of uwb/tdoa_corrected") == "1"
-            and diagnostics.newest("bias_node").get("publishers of uwb/tdoa") == "1"
-            and all(end.get_subscription_count() for end in ends) and self._reset.service_is_ready()
-        ))  # fmt: skip
+        wait(
+            READY,
+            "the nodes",
+            processes,
+            self._node,
+            lambda: (
+                diagnostics.newest("ekf_node").get("publishers of uwb/tdoa_corrected") == "1"
+                and diagnostics.newest("bias_node").get("publishers of uwb/tdoa") == "1"
+                and all(end.get_subscription_count() for end in ends)
+                and self._reset.service_is_ready()
+            ),
+        )
         self._statuses = []
         self._listen()
         return self
@@ -129,7 +160,9 @@ class _Nodes:
         self._node.create_subscription(DiagnosticArray, "/diagnostics", take, 10)
 
     def said(self, recording):
-        """{"texts": {what was said: seconds}, "rules": {what was found: seconds}} of a Recording with arrivals."""
+        """{"texts": {what was said: seconds}, "rules": {what was found: seconds}} of a Recording
+        with arrivals.
+        """
         from std_srvs.srv import Trigger
 
         from uwb_tdoa_bias.foundation.ros_anchors import anchors_to_message
@@ -176,13 +209,32 @@ class _Nodes:
 
         def header(topic, t):
             frames = recording.frames.get(topic, {"base_link": 1})
-            return Header(stamp=Time(sec=int(t // 1.0), nanosec=int(t % 1.0 * 1e9)), frame_id=next(iter(frames)))
+            return Header(
+                stamp=Time(sec=int(t // 1.0), nanosec=int(t % 1.0 * 1e9)),
+                frame_id=next(iter(frames)),
+            )
 
         imu, tdoa = recording.imu, recording.tdoa
         if imu is not None:
-            for arrival, t, gyro, accel in zip(recording.imu_arrival, *(c.tolist() for c in (imu.t, imu.gyro, imu.accel))):
+            for arrival, t, gyro, accel in zip(
+                recording.imu_arrival, *(c.tolist() for c in (imu.t, imu.gyro, imu.accel))
+            ):
                 vectors = (Vector3(x=v[0], y=v[1], z=v[2]) for v in (gyro, accel))
                 rate, force = vectors
-                yield arrival, self._imu, Imu(header=header("imu/data", t), angular_velocity=rate, linear_acceleration=force)
-        for arrival, t, a, b, d in zip(recording.tdoa_arrival, *(c.tolist() for c in (tdoa.t, tdoa.a, tdoa.b, tdoa.d))):
-            yield arrival, self._tdoa, Tdoa(header=header("uwb/tdoa", t), anchor_a=a, anchor_b=b, distance_difference=d)
+                yield (
+                    arrival,
+                    self._imu,
+                    Imu(
+                        header=header("imu/data", t),
+                        angular_velocity=rate,
+                        linear_acceleration=force,
+                    ),
+                )
+        for arrival, t, a, b, d in zip(
+            recording.tdoa_arrival, *(c.tolist() for c in (tdoa.t, tdoa.a, tdoa.b, tdoa.d))
+        ):
+            yield (
+                arrival,
+                self._tdoa,
+                Tdoa(header=header("uwb/tdoa", t), anchor_a=a, anchor_b=b, distance_difference=d),
+            )

@@ -1,9 +1,13 @@
-"""closed-loop: the flights of Zhao et al. (RA-L 2021, section V) made anew in the loop of `fly`: trajectories A (a level circle) and B (a
-circle that rises and falls), in a constellation of anchors that took part in training and in three that did not, by the M-estimation EKF
-alone, with the paper's network without and with the orientations of the anchors, and by ours alone and with diagnosed effects.
+"""closed-loop: the flights of Zhao et al. (RA-L 2021, section V) made anew in the loop of `fly`:
+trajectories A (a level circle) and B (a circle that rises and falls), in a constellation of anchors
+that took part in training and in three that did not, by the M-estimation EKF alone, with the
+paper's network without and with the orientations of the anchors, and by ours alone and with
+diagnosed effects.
 
-The networks are trained on flights in three constellations, the effects are diagnosed from three of these flights, one of each. Writes to
---out: trained/, flights.json, table.md, and the counterparts of figures 7 to 9: rmse.png, paths.png, errors.png."""
+The networks are trained on flights in three constellations, the effects are diagnosed from three of
+these flights, one of each. Writes to --out: trained/, flights.json, table.md, and the counterparts
+of figures 7 to 9: rmse.png, paths.png, errors.png.
+"""
 
 from argparse import Namespace
 from collections.abc import Callable, Iterable, Iterator
@@ -25,10 +29,10 @@ from uwb_tdoa_tools.flying import fleet
 from uwb_tdoa_tools.flying.path import Circles
 from uwb_tdoa_tools.flying.trial import Task, fly
 from uwb_tdoa_tools.flying.world import World
+from uwb_tdoa_tools.outputs import OutputFolder
 from uwb_tdoa_tools.simulation.constellations import constellation
 from uwb_tdoa_tools.simulation.room import room_of
 from uwb_tdoa_tools.training import labels, models, physics
-from uwb_tdoa_tools.outputs import OutputFolder
 
 from . import pictures
 from .sines import Sines
@@ -41,13 +45,23 @@ DELAY, INSTALLATION = 0.05, 1  # m, of the modules, as in `simulate`; always the
 FIRST_TRAINING, FLOWN = 101, 60.0  # seed of the first flight to train on; s in the air of each
 NETWORKS = "paper_no_orientation", "paper"
 EFFECTS = "effects.yaml"
-BASELINE, WITHOUT, WITH, OURS = "M-estimation", "network without orientations", "network", "ours, diagnosed effects"
-PUBLISHED = {BASELINE: 0.4208, WITHOUT: 0.2032}  # by which WITH reduces the error of each, in constellations not seen before
+BASELINE, WITHOUT, WITH, OURS = (
+    "M-estimation",
+    "network without orientations",
+    "network",
+    "ours, diagnosed effects",
+)
+PUBLISHED = {
+    BASELINE: 0.4208,
+    WITHOUT: 0.2032,
+}  # by which WITH reduces the error of each, in constellations not seen before
 
 
 @dataclass(frozen=True)
 class Estimator:
-    """What a controller flies by. config : FilterConfig; model : of NETWORKS, or None; diagnosed : with the effects."""
+    """What a controller flies by. config : FilterConfig; model : of NETWORKS, or None; diagnosed :
+    with the effects.
+    """
 
     config: FilterConfig
     model: str | None = None
@@ -66,12 +80,46 @@ ESTIMATORS = {
 
 def add_options(add: Callable) -> None:
     """add : add_argument of a parser."""
-    add("--flights", type=parallel.whole_number, default=10, metavar="N", help="of each kind (default: 10)")
-    add("--seed", type=parallel.whole_number, default=1001, metavar="S", help="of the first; the others have the next ones (default: 1001)")
-    add("--training", type=parallel.whole_number, default=8, metavar="N", help="flights in each of three constellations (default: 8)")
-    add("--trained", type=Path, metavar="DIR", help="what an earlier run wrote to trained/ (default: train anew)")
-    add("--jobs", type=parallel.whole_number, metavar="N", help="flights at once (default: as many as there are cores)")
-    add("--out", type=OutputFolder, required=True, metavar="DIR", help="where to write; made if it is not there")
+    add(
+        "--flights",
+        type=parallel.whole_number,
+        default=10,
+        metavar="N",
+        help="of each kind (default: 10)",
+    )
+    add(
+        "--seed",
+        type=parallel.whole_number,
+        default=1001,
+        metavar="S",
+        help="of the first; the others have the next ones (default: 1001)",
+    )
+    add(
+        "--training",
+        type=parallel.whole_number,
+        default=8,
+        metavar="N",
+        help="flights in each of three constellations (default: 8)",
+    )
+    add(
+        "--trained",
+        type=Path,
+        metavar="DIR",
+        help="what an earlier run wrote to trained/ (default: train anew)",
+    )
+    add(
+        "--jobs",
+        type=parallel.whole_number,
+        metavar="N",
+        help="flights at once (default: as many as there are cores)",
+    )
+    add(
+        "--out",
+        type=OutputFolder,
+        required=True,
+        metavar="DIR",
+        help="where to write; made if it is not there",
+    )
 
 
 def run(args: Namespace) -> None:
@@ -79,13 +127,21 @@ def run(args: Namespace) -> None:
     out = args.out
     out.mkdir(parents=True, exist_ok=True)
     trained = args.trained or train(args.training, out / "trained", args.jobs)
-    kinds = [(by, where, path) for where in (KNOWN, *UNSEEN) for path in TRAJECTORIES for by in ESTIMATORS]
+    kinds = [
+        (by, where, path)
+        for where in (KNOWN, *UNSEEN)
+        for path in TRAJECTORIES
+        for by in ESTIMATORS
+    ]
     seeds = range(args.seed, args.seed + args.flights)
     tasks = [task(kind, seed, trained) for kind in kinds for seed in seeds]
     flown = list(parallel.over(partial(fleet.fly_one, None, True), tasks, args.jobs))
     of_kind = {kind: flown[k * len(seeds) : (k + 1) * len(seeds)] for k, kind in enumerate(kinds)}
     verdicts = {kind: [verdict for verdict, _ in some] for kind, some in of_kind.items()}
-    told = [dict(zip(("by", "constellation", "trajectory", "flights"), (*kind, some))) for kind, some in verdicts.items()]
+    told = [
+        dict(zip(("by", "constellation", "trajectory", "flights"), (*kind, some)))
+        for kind, some in verdicts.items()
+    ]
     cli.write_json(out / "flights.json", {"kinds": told})
     lines = "\n".join(table(verdicts))
     write_text(out / "table.md", lines + "\n")
@@ -98,14 +154,24 @@ def run(args: Namespace) -> None:
 
 
 def world_of(name: str) -> World:
-    """World with the anchors of a named constellation, each turned about the vertical by any angle and tilted a little: where an anchor
-    stands then does not tell how it is turned."""
+    """World with the anchors of a named constellation, each turned about the vertical by any angle
+    and tilted a little: where an anchor stands then does not tell how it is turned.
+    """
     anchors, rng = constellation(name), np.random.default_rng(list(name.encode()))
     turn = Rotation.from_euler("z", rng.uniform(-np.pi, np.pi, len(anchors)))
     turn = Rotation.from_rotvec(TILT * rng.standard_normal((len(anchors), 3))) * turn
-    anchors = replace(anchors, orientations=(turn * Rotation.from_quat(anchors.orientations)).as_quat())
+    anchors = replace(
+        anchors, orientations=(turn * Rotation.from_quat(anchors.orientations)).as_quat()
+    )
     x, y, z = np.abs(anchors.positions).max(axis=0).tolist()
-    return World((2.0 * x, 2.0 * y, z), anchors, delay=DELAY, bearing_bias=0.0, antennas=True, installation=INSTALLATION)
+    return World(
+        (2.0 * x, 2.0 * y, z),
+        anchors,
+        delay=DELAY,
+        bearing_bias=0.0,
+        antennas=True,
+        installation=INSTALLATION,
+    )
 
 
 def task(kind: tuple[str, str, str], seed: int, trained: Path) -> Task:
@@ -114,23 +180,42 @@ def task(kind: tuple[str, str, str], seed: int, trained: Path) -> Task:
     estimator = ESTIMATORS[by]
     effects = EffectSet.from_yaml(trained / EFFECTS) if estimator.diagnosed else None
     model = str(trained / estimator.model / "model.onnx") if estimator.model else None
-    return Task(world_of(where), seed, "place", config=estimator.config, effects=effects, model=model, path=TRAJECTORIES[path])
+    return Task(
+        world_of(where),
+        seed,
+        "place",
+        config=estimator.config,
+        effects=effects,
+        model=model,
+        path=TRAJECTORIES[path],
+    )
 
 
 def train(count: int, folder: Path, jobs: int | None = None) -> Path:
-    """Fly to train, `count` times in each of TRAINING, told their place; train the networks, and find the effects. Returns the folder,
-    Path, to which they are written. Raises InputError."""
+    """Fly to train, `count` times in each of TRAINING, told their place; train the networks, and
+    find the effects. Returns the folder, Path, to which they are written. Raises InputError.
+    """
     if count < 2:
-        raise InputError(f"training: {count} flight in each constellation leaves none to validate on; give at least 2.")
+        raise InputError(
+            f"training: {count} flight in each constellation leaves none to validate on; give "
+            "at least 2."
+        )
     worlds = [world_of(name) for name in TRAINING]
     tasks = [
-        Task(worlds[k % 3], seed, "place", path=Sines(room_of(worlds[k % 3].anchors), seed, seconds=FLOWN))
+        Task(
+            worlds[k % 3],
+            seed,
+            "place",
+            path=Sines(room_of(worlds[k % 3].anchors), seed, seconds=FLOWN),
+        )
         for k, seed in enumerate(range(FIRST_TRAINING, FIRST_TRAINING + 3 * count))
     ]
     flights = {flight.name: flight for flight in parallel.over(_flight, tasks, jobs)}
     parts = [[flights[name] for name in names] for names in labels.split(list(flights), 0)]
     some = list(flights.values())[:3]
-    for name in parallel.over(partial(_train, parts, some, folder), (EFFECTS, *NETWORKS), jobs, unit="model"):
+    for name in parallel.over(
+        partial(_train, parts, some, folder), (EFFECTS, *NETWORKS), jobs, unit="model"
+    ):
         tqdm.write(f"wrote {folder / name}")
     return folder
 
@@ -141,7 +226,9 @@ def _flight(task: Task) -> Flight:
 
 
 def _train(parts: list[list[Flight]], some: list[Flight], folder: Path, name: str) -> str:
-    """Write one of NETWORKS, trained and validated on parts, or EFFECTS, found in some flights, to a folder. Returns the name."""
+    """Write one of NETWORKS, trained and validated on parts, or EFFECTS, found in some flights, to
+    a folder. Returns the name.
+    """
     (folder / name if name in NETWORKS else folder).mkdir(parents=True, exist_ok=True)
     if name in NETWORKS:
         models.save(models.train(models.Recipe(name, 0), *parts, name), folder / name)
@@ -157,23 +244,45 @@ def table(verdicts: dict[tuple[str, str, str], list[dict]]) -> Iterator[str]:
     for where in (KNOWN, *UNSEEN):
         for path in TRAJECTORIES:
             yield _row(
-                f"{where}{', trained in' if where == KNOWN else ''}, {path}", [mean(verdicts, by, [where], [path]) for by in ESTIMATORS]
+                f"{where}{', trained in' if where == KNOWN else ''}, {path}",
+                [mean(verdicts, by, [where], [path]) for by in ESTIMATORS],
             )
     yield _row("not trained in, mean", [mean(verdicts, by, UNSEEN) for by in ESTIMATORS])
-    yield _row("the same, off the path, m", [mean(verdicts, by, UNSEEN, figure="tracking") for by in ESTIMATORS])
-    yield _row("NEES (3 is honest)", [mean(verdicts, by, UNSEEN, figure="nees") for by in ESTIMATORS], 1)
+    yield _row(
+        "the same, off the path, m",
+        [mean(verdicts, by, UNSEEN, figure="tracking") for by in ESTIMATORS],
+    )
+    yield _row(
+        "NEES (3 is honest)", [mean(verdicts, by, UNSEEN, figure="nees") for by in ESTIMATORS], 1
+    )
     for word in ("landed", "safe"):
-        counts = {by: [one[word] for (who, _, _), some in verdicts.items() if who == by for one in some] for by in ESTIMATORS}
+        counts = {
+            by: [one[word] for (who, _, _), some in verdicts.items() if who == by for one in some]
+            for by in ESTIMATORS
+        }
         title = {"landed": "landed, all constellations", "safe": "without a crash"}[word]
-        yield f"| {title} | " + " | ".join(f"{sum(some)} of {len(some)}" for some in counts.values()) + " |"
+        yield (
+            f"| {title} | "
+            + " | ".join(f"{sum(some)} of {len(some)}" for some in counts.values())
+            + " |"
+        )
     yield ""
-    yield "| less error than | where it was trained | elsewhere | elsewhere, of flights that landed by both | published |"
+    yield (
+        "| less error than | where it was trained | elsewhere | elsewhere, of flights that landed "
+        "by both | published |"
+    )
     yield "|---|---:|---:|---:|---:|"
     for by, than in ((WITH, BASELINE), (WITH, WITHOUT), ("ours", BASELINE), (OURS, BASELINE)):
-        gains = [1.0 - mean(verdicts, by, places) / mean(verdicts, than, places) for places in ([KNOWN], UNSEEN)]
+        gains = [
+            1.0 - mean(verdicts, by, places) / mean(verdicts, than, places)
+            for places in ([KNOWN], UNSEEN)
+        ]
         both, count = gain_of_landed(verdicts, by, than)
         published = f"{PUBLISHED[than]:.0%}" if by == WITH else ""
-        yield f"| {by}: than {than} | {gains[0]:.0%} | {gains[1]:.0%} | {both:.0%} ({count}) | {published} |"
+        yield (
+            f"| {by}: than {than} | {gains[0]:.0%} | {gains[1]:.0%} | {both:.0%} ({count}) | "
+            f"{published} |"
+        )
 
 
 def _row(title: str, values: Iterable[float], digits: int = 3) -> str:
@@ -181,22 +290,38 @@ def _row(title: str, values: Iterable[float], digits: int = 3) -> str:
 
 
 def gain_of_landed(verdicts: dict, by: str, than: str) -> tuple[float, int]:
-    """(Share by which the mean error is smaller by an estimator than by another one, number of flights): of those in UNSEEN that landed by
-    both."""
+    """(Share by which the mean error is smaller by an estimator than by another one, number of
+    flights): of those in UNSEEN that landed by both.
+    """
     both = [
         (one["estimation"], other["estimation"])
-        for where in UNSEEN for path in TRAJECTORIES
+        for where in UNSEEN
+        for path in TRAJECTORIES
         for one, other in zip(verdicts[by, where, path], verdicts[than, where, path])
         if one["landed"] and other["landed"]
-    ]  # fmt: skip
+    ]
     if not both:
         return float("nan"), 0
     ours, theirs = np.mean(both, axis=0)
     return float(1.0 - ours / theirs), len(both)
 
 
-def mean(verdicts: dict, by: str, places: Iterable[str], paths: Iterable[str] = tuple(TRAJECTORIES), figure: str = "estimation") -> float:
-    """Mean of a figure over all flights by an estimator, in constellations and on trajectories, that took off."""
-    some = [one for where in places for path in paths for one in verdicts[by, where, path] if one["took_off"]]
+def mean(
+    verdicts: dict,
+    by: str,
+    places: Iterable[str],
+    paths: Iterable[str] = tuple(TRAJECTORIES),
+    figure: str = "estimation",
+) -> float:
+    """Mean of a figure over all flights by an estimator, in constellations and on trajectories,
+    that took off.
+    """
+    some = [
+        one
+        for where in places
+        for path in paths
+        for one in verdicts[by, where, path]
+        if one["took_off"]
+    ]
     values = [one["phases"]["air"]["nees"] if figure == "nees" else one[figure] for one in some]
     return float(np.mean(values)) if values else float("nan")

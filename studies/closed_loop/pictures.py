@@ -14,15 +14,26 @@ LONG = 35.0  # s of a flight that are drawn at most
 
 
 def draw_errors_by_kind(verdicts: dict[tuple[str, str, str], list[dict]], path: Path) -> None:
-    """Figure 7: RMSE of the estimate in the air of each flight, and their mean as a bar. verdicts : {(estimator, constellation,
-    trajectory): [verdict]}."""
+    """Figure 7: RMSE of the estimate in the air of each flight, and their mean as a bar. verdicts :
+    {(estimator, constellation, trajectory): [verdict]}.
+    """
     by = list(dict.fromkeys(kind[0] for kind in verdicts))
     groups = list(dict.fromkeys(kind[1:] for kind in verdicts))
     figure, axes = plt.subplots(figsize=(12, 4), layout="constrained")
     for k, (name, colour) in enumerate(zip(by, COLOURS)):
         at = np.arange(len(groups)) + (k - 0.5 * (len(by) - 1)) * 0.8 / len(by)
-        some = [[one["estimation"] for one in verdicts[name, *group] if one["took_off"]] for group in groups]
-        axes.bar(at, [np.mean(values) for values in some], 0.75 / len(by), color=colour, alpha=0.6, label=name)
+        some = [
+            [one["estimation"] for one in verdicts[(name, *group)] if one["took_off"]]
+            for group in groups
+        ]
+        axes.bar(
+            at,
+            [np.mean(values) for values in some],
+            0.75 / len(by),
+            color=colour,
+            alpha=0.6,
+            label=name,
+        )
         for x, values in zip(at, some):
             axes.plot(np.full(len(values), x), values, ".", color="k", ms=3)
     axes.set_xticks(range(len(groups)), [f"{where}\n{trajectory}" for where, trajectory in groups])
@@ -33,10 +44,17 @@ def draw_errors_by_kind(verdicts: dict[tuple[str, str, str], list[dict]], path: 
 
 
 def draw_paths(shown: dict[str, list], path: Path) -> None:
-    """Figure 8: where flights went from their start, from above and from the side, beside where they were to go. shown : {estimator:
-    [Drawn]}."""
+    """Figure 8: where flights went from their start, from above and from the side, beside where
+    they were to go. shown : {estimator: [Drawn]}.
+    """
     figure, axes = plt.subplots(
-        2, len(shown), figsize=(3.2 * len(shown), 5.4), sharex=True, sharey="row", layout="constrained", height_ratios=(3, 1)
+        2,
+        len(shown),
+        figsize=(3.2 * len(shown), 5.4),
+        sharex=True,
+        sharey="row",
+        layout="constrained",
+        height_ratios=(3, 1),
     )
     for column, (name, flights), colour in zip(axes.T, shown.items(), COLOURS):
         for one in flights:
@@ -60,9 +78,17 @@ def draw_paths(shown: dict[str, list], path: Path) -> None:
 
 
 def draw_errors(shown: dict[str, list], path: Path) -> None:
-    """Figure 9: errors of the estimate of the first flight by each estimator, with three of its deviations. shown : {estimator:
-    [Drawn]}."""
-    figure, axes = plt.subplots(3, len(shown), figsize=(3.2 * len(shown), 5.4), sharex=True, sharey=True, layout="constrained")
+    """Figure 9: errors of the estimate of the first flight by each estimator, with three of its
+    deviations. shown : {estimator: [Drawn]}.
+    """
+    figure, axes = plt.subplots(
+        3,
+        len(shown),
+        figsize=(3.2 * len(shown), 5.4),
+        sharex=True,
+        sharey=True,
+        layout="constrained",
+    )
     for column, (name, flights) in zip(axes.T, shown.items()):
         one = flights[0]
         for k, ax in enumerate(column):

@@ -16,9 +16,12 @@ AWAY = 6.0  # s, from the middle to the sines and back
 
 @dataclass(frozen=True)
 class Sines:
-    """Up, through a whole room in products of sines (`simulate`'s, those of the training flights of Zhao et al. 2021), back, and down.
-    room : Room; seed : of the sines; height, rise, fall : as of Circles; seconds : in the air; speed : m/s, root mean square; turning :
-    rad/s, all the while."""
+    """Up, through a whole room in products of sines (`simulate`'s, those of the training flights of
+    Zhao et al. 2021), back, and down.
+    room : Room; seed : of the sines; height, rise, fall : as of Circles; seconds : in the air;
+        speed : m/s, root mean square; turning :
+    rad/s, all the while.
+    """
 
     room: Room
     seed: int
@@ -42,6 +45,10 @@ class Sines:
         down = cruise((knots - self.duration + self.fall) / self.fall, CLIMB)
         p = np.empty((len(knots), 3))
         p[:, :2], p[:, 2] = place, ground + self.height * up - (self.height - SETTLE) * down
-        away = smooth((knots - self.rise) / AWAY) * smooth((self.duration - self.fall - knots) / AWAY)
-        there = sines(knots, SimulationConfig(speed=self.speed), self.room, np.random.default_rng(self.seed))
+        away = smooth((knots - self.rise) / AWAY) * smooth(
+            (self.duration - self.fall - knots) / AWAY
+        )
+        there = sines(
+            knots, SimulationConfig(speed=self.speed), self.room, np.random.default_rng(self.seed)
+        )
         return ReferenceTrajectory(p + away[:, None] * (there - p), self.turning)

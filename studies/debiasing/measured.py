@@ -1,4 +1,6 @@
-"""debias-measured: a map fitted to some measured flights, judged on others, beside what `diagnose` reaches on them."""
+"""debias-measured: a map fitted to some measured flights, judged on others, beside what `diagnose`
+reaches on them.
+"""
 
 from functools import partial
 import json
@@ -15,8 +17,8 @@ from uwb_tdoa_tools import parallel
 from uwb_tdoa_tools.debiasing.evaluation import evaluate_map, fly
 from uwb_tdoa_tools.debiasing.parts import LEAST, part_of
 from uwb_tdoa_tools.debiasing.report import about_figures
-from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.outputs import OutputFolder
+from uwb_tdoa_tools.readers import inputs
 
 from ..diagnosis.measured import SPLITS
 from .report import measured_tables
@@ -32,9 +34,26 @@ MAPS = {  # name: (interpolator, step in m, planar)
 
 def add_options(add):
     """The options of the study."""
-    add("--data", metavar="DIR", type=Path, required=True, help="the measured flights: flights/, util/, surveys/")
-    add("--diagnosed", metavar="DIR", type=Path, help="what `study diagnosis measured` wrote: its effects are compared")
-    add("--out", metavar="DIR", type=OutputFolder, required=True, help="where to write tables, figures and pictures")
+    add(
+        "--data",
+        metavar="DIR",
+        type=Path,
+        required=True,
+        help="the measured flights: flights/, util/, surveys/",
+    )
+    add(
+        "--diagnosed",
+        metavar="DIR",
+        type=Path,
+        help="what `study diagnosis measured` wrote: its effects are compared",
+    )
+    add(
+        "--out",
+        metavar="DIR",
+        type=OutputFolder,
+        required=True,
+        help="where to write tables, figures and pictures",
+    )
     add("--jobs", metavar="N", type=int, help="cases at once (default: as many as there are cores)")
 
 
@@ -48,8 +67,9 @@ def run(args):
 
 
 def cases():
-    """{name: (split whose effects to compare with or None, flights to fit, flights to judge)}; flights are paths in the
-    data."""
+    """{name: (split whose effects to compare with or None, flights to fit, flights to judge)};
+    flights are paths in the data.
+    """
     a25, b25 = SPLITS["0425 a"]
     a26, b26 = SPLITS["0426 a"]
     found = {name: (name, *split) for name, split in SPLITS.items() if split[1]}
@@ -59,33 +79,47 @@ def cases():
         None,
         *([path for path in a25 + b25 if kind in path] for kind in ("TDOA2", "TDOA3")),
     )
-    found["const3, another constellation"] = ("const3", SPLITS["const3"][0], SPLITS["const4 trial 1"][1])
+    found["const3, another constellation"] = (
+        "const3",
+        SPLITS["const3"][0],
+        SPLITS["const4 trial 1"][1],
+    )
     return found
 
 
 def judged(data, diagnosed=None, jobs=None):
-    """[{"case", "fitted", "maps", "runs": [{"flight", name of the estimate: {"rmse": m, "rmse_xy": m, "nees": mean}}]}]
-    of all cases.
+    """[{"case", "fitted", "maps", "runs": [{"flight", name of the estimate: {"rmse": m, "rmse_xy":
+    m, "nees": mean}}]}] of all cases.
 
     data : folder of the flights; diagnosed : folder that `study diagnosis measured` wrote, or None.
     """
-    if diagnosed is not None and not any(_effects_file(diagnosed, name).is_file() for name in SPLITS):
+    if diagnosed is not None and not any(
+        _effects_file(diagnosed, name).is_file() for name in SPLITS
+    ):
         raise InputError(
-            f"--diagnosed: {diagnosed} holds no */effects.yaml; run `study diagnosis measured --out {diagnosed}`."
+            f"--diagnosed: {diagnosed} holds no */effects.yaml; run `study diagnosis measured "
+            f"--out {diagnosed}`."
         )
     tasks = [(name, *case) for name, case in cases().items()]
-    return list(parallel.over(partial(_case, data=data, diagnosed=diagnosed), tasks, jobs, unit="case"))
+    return list(
+        parallel.over(partial(_case, data=data, diagnosed=diagnosed), tasks, jobs, unit="case")
+    )
 
 
 def _case(task, data, diagnosed):
     case, split, to_fit, to_judge = task
     rows, about = {}, {}
     for words, effects in _corrections(split, diagnosed).items():
-        fitted, judging = ([flown(data, path, effects) for path in paths] for paths in (to_fit, to_judge))
+        fitted, judging = (
+            [flown(data, path, effects) for path in paths] for paths in (to_fit, to_judge)
+        )
         parts = [part_of(score, odometry) for _, score, odometry in fitted]
         kinds = MAPS if effects is None else {"thin plate": MAPS["thin plate"]}
         prefix = f"{words} + " if words else ""
-        maps = {prefix + name: fit(parts, step, LEAST, planar, how) for name, (how, step, planar) in kinds.items()}
+        maps = {
+            prefix + name: fit(parts, step, LEAST, planar, how)
+            for name, (how, step, planar) in kinds.items()
+        }
         for run in judging:
             row = rows.setdefault(run[1].name, {})
             row[words or "before"] = _figures(run[1])
@@ -120,4 +154,9 @@ def flown(data, path, effects=None):
 def _figures(score):
     row = score.row()
     horizontal = float(np.hypot(row["rmse_x"], row["rmse_y"]))
-    return {"rmse": row["rmse_3d"], "rmse_xy": horizontal, "nees": row["nees_mean"], "diverged": row["diverged"]}
+    return {
+        "rmse": row["rmse_3d"],
+        "rmse_xy": horizontal,
+        "nees": row["nees_mean"],
+        "diverged": row["diverged"],
+    }

@@ -9,7 +9,9 @@ from uwb_tdoa_tools.scoring.plots import plt
 
 
 def set_up_tables(figures):
-    """Markdown of what set_up.copied found, in centimetres, coordinates as in the paper: from the corner."""
+    """Markdown of what set_up.copied found, in centimetres, coordinates as in the paper: from the
+    corner.
+    """
     names = [name for name in figures["static"]["validation"] if name != "places"]
     lines = ["Mean of |bias| over the places: x / y / both, and the largest, cm.", ""]
     lines += _head(["", "places", *names])
@@ -23,37 +25,58 @@ def set_up_tables(figures):
         lines.append(_line([row["direction"], f"{row['at']:g}", f"{row['speed']:.2f}", *cells]))
     lines += ["", "Square path, RMSE, cm (as Table 2).", ""]
     lines += _head(["edge", *names])
-    lines += [_line([edge, *(f"{100 * row[name]:.1f}" for name in names)]) for edge, row in figures["square"].items()]
+    lines += [
+        _line([edge, *(f"{100 * row[name]:.1f}" for name in names)])
+        for edge, row in figures["square"].items()
+    ]
     lines += [
         "",
-        "Layers of appendix C before the map, square path: RMSE, and change of the error between positions, cm.",
+        (
+            "Layers of appendix C before the map, square path: RMSE, and change of the error "
+            "between positions, cm."
+        ),
         "",
     ]
     lines += _head(["layers", "RMSE", "change"])
     lines += [
-        _line([name, f"{100 * row['rmse']:.2f}", f"{100 * row['step']:.3f}"]) for name, row in figures["layers"].items()
+        _line([name, f"{100 * row['rmse']:.2f}", f"{100 * row['step']:.3f}"])
+        for name, row in figures["layers"].items()
     ]
     return "\n".join(lines) + "\n"
 
 
 def measured_tables(figures):
     """Markdown of what measured.judged found: means of the runs, m, and beneath them every run."""
-    names = list(dict.fromkeys(name for case in figures for row in case["runs"] for name in row if name != "flight"))
+    names = list(
+        dict.fromkeys(
+            name for case in figures for row in case["runs"] for name in row if name != "flight"
+        )
+    )
     lines = []
-    for title, key in (("3D RMSE, m", "rmse"), ("Horizontal RMSE, m", "rmse_xy"), ("NEES (3 is honest)", "nees")):
+    for title, key in (
+        ("3D RMSE, m", "rmse"),
+        ("Horizontal RMSE, m", "rmse_xy"),
+        ("NEES (3 is honest)", "nees"),
+    ):
         lines += [f"{title}, mean of the runs.", "", *_head(["fitted to", "runs", *names])]
-        lines += [_line([case["case"], len(case["runs"]), *_means(case["runs"], names, key)]) for case in figures] + [
-            ""
-        ]
+        lines += [
+            _line([case["case"], len(case["runs"]), *_means(case["runs"], names, key)])
+            for case in figures
+        ] + [""]
     lines += ["3D RMSE of every run, m.", "", *_head(["fitted to", "flight", *names])]
     lines += [
-        _line([case["case"], row["flight"], *_means([row], names, "rmse")]) for case in figures for row in case["runs"]
+        _line([case["case"], row["flight"], *_means([row], names, "rmse")])
+        for case in figures
+        for row in case["runs"]
     ]
     return "\n".join(lines) + "\n"
 
 
 def _means(runs, names, key):
-    return [f"{np.mean([row[name][key] for row in runs]):.3f}" if name in runs[0] else "" for name in names]
+    return [
+        f"{np.mean([row[name][key] for row in runs]):.3f}" if name in runs[0] else ""
+        for name in names
+    ]
 
 
 def _cm(values, *keys):
@@ -70,13 +93,26 @@ def _line(cells):
 
 def plot_set_up(found, maps, path):
     """Bias before and after the static maps, as arrows from the true place, five times as long."""
-    sides = {"before": None, "network": maps["static, network"], "thin plate": maps["static, thin_plate"]}
+    sides = {
+        "before": None,
+        "network": maps["static, network"],
+        "thin plate": maps["static, thin_plate"],
+    }
     figure, axes = plt.subplots(1, 3, figsize=(13, 5.7), layout="constrained", sharey=True)
     for ax, (title, one) in zip(axes, sides.items()):
         for name, colour in (("calibration", "tab:gray"), ("validation", "tab:red")):
             true = np.array([stay.true[0, :2] for stay in found[name]])
             bias = np.array([_mean_error(stay, one) for stay in found[name]])
-            ax.quiver(*true.T, *bias.T, angles="xy", scale_units="xy", scale=0.2, color=colour, width=0.004, label=name)
+            ax.quiver(
+                *true.T,
+                *bias.T,
+                angles="xy",
+                scale_units="xy",
+                scale=0.2,
+                color=colour,
+                width=0.004,
+                label=name,
+            )
         size = np.mean([np.hypot(*_mean_error(stay, one)) for stay in found["validation"]])
         ax.set(
             title=f"{title}: {100 * size:.1f} cm at the validation points",

@@ -1,6 +1,7 @@
-"""debias-set-up: a simulated copy of the set-up of Grasso et al. (Sensors 2022, 22, 9136), sections 4 and 5. 4 x 4 m,
-four anchors at the height of the tag, 0.2 m, a calibration grid of 50 cm, a validation grid of 25 cm beside it, rails,
-and a square path."""
+"""debias-set-up: a simulated copy of the set-up of Grasso et al. (Sensors 2022, 22, 9136), sections
+4 and 5. 4 x 4 m, four anchors at the height of the tag, 0.2 m, a calibration grid of 50 cm, a
+validation grid of 25 cm beside it, rails, and a square path.
+"""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -16,9 +17,9 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.debias import INTERPOLATORS, LayerConfig, Layers, Part, fit
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools import parallel
+from uwb_tdoa_tools.outputs import OutputFolder
 from uwb_tdoa_tools.scoring.metrics import position_at
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.outputs import OutputFolder
 
 from .report import plot_set_up, set_up_tables
 
@@ -28,18 +29,31 @@ HALF = 2.0  # m; we count from the middle, the paper from the corner (0, 0)
 KEEP_OFF = 0.5  # m from an anchor, where the paper had no positions
 SETTLE, STAY = 2.0, 7.0  # s; 700 positions at 100 Hz in the paper
 RAILS = (  # Table 1: direction, the other coordinate (m, from the middle), cruising speed (m/s)
-    ("x", -1.0, 0.58), ("x", 0.0, 0.44), ("x", 1.0, 0.43), ("y", -1.0, 0.58), ("y", 0.0, 0.51), ("y", 1.0, 0.42),
-)  # fmt: skip
+    ("x", -1.0, 0.58),
+    ("x", 0.0, 0.44),
+    ("x", 1.0, 0.43),
+    ("y", -1.0, 0.58),
+    ("y", 0.0, 0.51),
+    ("y", 1.0, 0.42),
+)
 PASSES = 10
-EDGES = {"bottom": (1, -1.5), "right": (0, 1.5), "top": (1, 1.5), "left": (0, -1.5)}  # Table 2: fixed axis, its value
-LAYERS = LayerConfig(saturate=True, max_speed=(1.0, 1.0, 1.0), max_acceleration=10.0, smooth=0.8, adams_moulton=True)
+EDGES = {
+    "bottom": (1, -1.5),
+    "right": (0, 1.5),
+    "top": (1, 1.5),
+    "left": (0, -1.5),
+}  # Table 2: fixed axis, its value
+LAYERS = LayerConfig(
+    saturate=True, max_speed=(1.0, 1.0, 1.0), max_acceleration=10.0, smooth=0.8, adams_moulton=True
+)
 FAR = 10.0  # m, of the anchors that hold the height
 
 
 @dataclass(frozen=True)
 class Measured:
-    """Estimates of one run and the truth at their stamps. t (n,) s; p, v, true (n, 3) m, m/s; covariance (n, 3, 3)
-    m^2."""
+    """Estimates of one run and the truth at their stamps. t (n,) s; p, v, true (n, 3) m, m/s;
+    covariance (n, 3, 3) m^2.
+    """
 
     t: np.ndarray
     p: np.ndarray
@@ -52,13 +66,21 @@ class Measured:
         return Part(self.p, self.true, self.covariance)
 
 
-AVERAGING = FilterConfig(zero_velocity=False)  # a stay is measured: its noise is averaged, as that of a tag that may move
+AVERAGING = FilterConfig(
+    zero_velocity=False
+)  # a stay is measured: its noise is averaged, as that of a tag that may move
 
 
 def add_options(add):
     """The options of the study."""
     add("--seed", metavar="N", type=int, default=0, help="of everything random (default: 0)")
-    add("--out", metavar="DIR", type=OutputFolder, required=True, help="where to write tables, figures and pictures")
+    add(
+        "--out",
+        metavar="DIR",
+        type=OutputFolder,
+        required=True,
+        help="where to write tables, figures and pictures",
+    )
     add("--jobs", metavar="N", type=int, help="runs at once (default: as many as there are cores)")
 
 
@@ -80,16 +102,28 @@ def grid(first, last, step):
 
 
 def measure(task, seed):
-    """Measured of one run. task : (number, fields of SimulationConfig); the anchors' delays are those of the seed, all
-    else random is the run's own."""
+    """Measured of one run. task : (number, fields of SimulationConfig); the anchors' delays are
+    those of the seed, all else random is the run's own.
+    """
     number, fields = task
     config = SimulationConfig(
-        seed=1000 * seed + number, constellation="planar", height=HEIGHT, start_in_air=True, imu_rate=100.0,
-        truth_rate=100.0, anchor_delay_std=0.0, multipath=False, **fields,
-    )  # fmt: skip
+        seed=1000 * seed + number,
+        constellation="planar",
+        height=HEIGHT,
+        start_in_air=True,
+        imu_rate=100.0,
+        truth_rate=100.0,
+        anchor_delay_std=0.0,
+        multipath=False,
+        **fields,
+    )
     flight = simulate(config)
-    delays = SimulationConfig.anchor_delay_std * np.random.default_rng([seed, 4]).standard_normal(len(flight.anchors))
-    flight = EFFECTS["anchor_delay"](dict(zip(map(str, flight.anchors.ids.tolist()), delays.tolist()))).inject(flight)
+    delays = SimulationConfig.anchor_delay_std * np.random.default_rng([seed, 4]).standard_normal(
+        len(flight.anchors)
+    )
+    flight = EFFECTS["anchor_delay"](
+        dict(zip(map(str, flight.anchors.ids.tolist()), delays.tolist()))
+    ).inject(flight)
     odometry = run_offline(_held_level(flight), AVERAGING).odometry
     rows = odometry.t > SETTLE
     columns = (
@@ -103,29 +137,46 @@ def measure(task, seed):
 
 
 def _held_level(flight):
-    """The flight with TDOAs of 0 between two more anchors, far above and below the middle: the filter then knows the
-    height, as it must, because four anchors in one plane with the tag do not tell it."""
+    """The flight with TDOAs of 0 between two more anchors, far above and below the middle: the
+    filter then knows the height, as it must, because four anchors in one plane with the tag do not
+    tell it.
+    """
     anchors, tdoa, n = flight.anchors, flight.tdoa, len(flight.anchors)
     poles = [[0.0, 0.0, HEIGHT + FAR], [0.0, 0.0, HEIGHT - FAR]]
     t = np.arange(0.01, tdoa.t[-1], 0.02)
     added = (t, np.full(len(t), n), np.full(len(t), n + 1), np.zeros(len(t)))
     order = np.argsort(np.concatenate([tdoa.t, t]), kind="stable")
     columns = (np.concatenate(pair)[order] for pair in zip((tdoa.t, tdoa.a, tdoa.b, tdoa.d), added))
-    return replace(flight, anchors=Anchors.from_positions(np.vstack([anchors.positions, poles])), tdoa=Tdoas(*columns))
+    return replace(
+        flight,
+        anchors=Anchors.from_positions(np.vstack([anchors.positions, poles])),
+        tdoa=Tdoas(*columns),
+    )
 
 
 def _stays(places):
-    return [{"trajectory": "hover", "place": tuple(place), "duration": SETTLE + STAY} for place in places.tolist()]
+    return [
+        {"trajectory": "hover", "place": tuple(place), "duration": SETTLE + STAY}
+        for place in places.tolist()
+    ]
 
 
 def _rail(direction, at, speed, passes):
     place = (0.0, at) if direction == "x" else (at, 0.0)
     duration = SETTLE + passes * 2.0 * HALF / speed
-    return {"trajectory": f"line_{direction}", "place": place, "radius": HALF, "speed": speed, "duration": duration}
+    return {
+        "trajectory": f"line_{direction}",
+        "place": place,
+        "radius": HALF,
+        "speed": speed,
+        "duration": duration,
+    }
 
 
 def copied(seed=0, jobs=None):
-    """All of it: (figures for JSON, {"calibration": [Measured], "validation": [Measured]}, {name: BiasMap})."""
+    """All of it: (figures for JSON, {"calibration": [Measured], "validation": [Measured]}, {name:
+    BiasMap}).
+    """
     calibration, validation = grid(-2.0, 2.0, STEP), grid(-1.75, 1.75, STEP)
     lines = np.arange(-1.5, 1.6, STEP)
     sides = SETTLE + PASSES * 24.0
@@ -143,12 +194,16 @@ def copied(seed=0, jobs=None):
     for source, name in (("calibration", "static"), ("sweeps", "dynamic")):
         parts = [measured.part for measured in found[source]]
         for kind in INTERPOLATORS:
-            maps[f"{name}, {kind}"] = fit(parts, STEP, 20, True, kind, source=f"simulated set-up, {name}, seed {seed}")
+            maps[f"{name}, {kind}"] = fit(
+                parts, STEP, 20, True, kind, source=f"simulated set-up, {name}, seed {seed}"
+            )
     (square,) = found["square"]
     figures = {
         "seed": seed,
         "static": {name: _static(found[name], maps) for name in ("calibration", "validation")},
-        "rails": [_rail_figures(rail, measured, maps) for rail, measured in zip(RAILS, found["rails"])],
+        "rails": [
+            _rail_figures(rail, measured, maps) for rail, measured in zip(RAILS, found["rails"])
+        ],
         "square": {name: _edge_figures(square, maps, *edge) for name, edge in EDGES.items()},
         "layers": _layer_figures(square, maps["static, thin_plate"]),
     }
@@ -159,24 +214,35 @@ def _errors(measured, maps):
     """{"before" or name of the map: (n, 2) m}."""
     out = {"before": (measured.p - measured.true)[:, :2]}
     return out | {
-        name: (one.correct(measured.p, measured.covariance)[0] - measured.true)[:, :2] for name, one in maps.items()
+        name: (one.correct(measured.p, measured.covariance)[0] - measured.true)[:, :2]
+        for name, one in maps.items()
     }
 
 
 def _static(stays, maps):
     """Mean over the places of |bias| in x, in y and in both, m."""
-    by_place = [{name: error.mean(axis=0) for name, error in _errors(stay, maps).items()} for stay in stays]
+    by_place = [
+        {name: error.mean(axis=0) for name, error in _errors(stay, maps).items()} for stay in stays
+    ]
     out = {"places": len(stays)}
     for name in by_place[0]:
         bias = np.abs([place[name] for place in by_place])
         size = np.hypot(*bias.T)
-        out[name] = {"x": bias[:, 0].mean(), "y": bias[:, 1].mean(), "both": size.mean(), "largest": size.max()}
+        out[name] = {
+            "x": bias[:, 0].mean(),
+            "y": bias[:, 1].mean(),
+            "both": size.mean(),
+            "largest": size.max(),
+        }
     return _plain(out)
 
 
 def _rail_figures(rail, measured, maps):
     inside = np.hypot(*(HALF - np.abs(measured.true[:, :2])).T) >= KEEP_OFF
-    rmse = {name: np.sqrt(np.mean(error[inside] ** 2, axis=0)) for name, error in _errors(measured, maps).items()}
+    rmse = {
+        name: np.sqrt(np.mean(error[inside] ** 2, axis=0))
+        for name, error in _errors(measured, maps).items()
+    }
     speed = np.mean(np.linalg.norm(np.diff(measured.true, axis=0), axis=1) / np.diff(measured.t))
     figures = {name: {"x": values[0], "y": values[1]} for name, values in rmse.items()}
     return _plain({"direction": rail[0], "at": rail[1] + HALF, "speed": speed, **figures})
@@ -185,11 +251,18 @@ def _rail_figures(rail, measured, maps):
 def _edge_figures(measured, maps, axis, value):
     on_edge = np.abs(measured.true[:, axis] - value) < 0.02
     errors = _errors(measured, maps)
-    return _plain({name: np.sqrt(np.mean(np.sum(error[on_edge] ** 2, axis=1))) for name, error in errors.items()})
+    return _plain(
+        {
+            name: np.sqrt(np.mean(np.sum(error[on_edge] ** 2, axis=1)))
+            for name, error in errors.items()
+        }
+    )
 
 
 def _layer_figures(measured, bias_map):
-    """RMSE, and scatter from one position to the next, on the square with the layers of appendix C before the map."""
+    """RMSE, and scatter from one position to the next, on the square with the layers of appendix C
+    before the map.
+    """
     out = {}
     none = LayerConfig()
     for name, config in {

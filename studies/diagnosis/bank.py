@@ -21,7 +21,8 @@ PAIRS = (
     ("received_power_bias", "anchor_delay"),
     ("truth_frame", "imu_misalignment"),
 )
-# Without ground truth an error of the position explains these as well, or nothing else is measured on their channel.
+# Without ground truth an error of the position explains these as well, or nothing else is measured
+# on their channel.
 INVISIBLE = (
     "tag_lever_arm",
     "tdoa_time_offset",
@@ -37,20 +38,27 @@ WORSE = 1.03  # ratio of errors beyond which a case counts as made worse
 
 
 def diagnose_case(effects, seed, aided=False):
-    """dict of one case: what was put in, found, how near the parameters, and the errors of the filter on a second
-    flight with the same effects: before, corrected as found, corrected as it is."""
+    """dict of one case: what was put in, found, how near the parameters, and the errors of the
+    filter on a second flight with the same effects: before, corrected as found, corrected as it is.
+    """
     flight, other = _flown(effects, seed, aided)
     reference = GroundTruth()
     attribution = attribute([reference.prepare(flight)], reference)
     case = _case(effects, seed, attribution)
-    for name, model in (("before", EffectSet()), ("found_rmse", usable(attribution.effects)), ("told_rmse", EffectSet(tuple(effects)))):
+    for name, model in (
+        ("before", EffectSet()),
+        ("found_rmse", usable(attribution.effects)),
+        ("told_rmse", EffectSet(tuple(effects))),
+    ):
         case[name] = _rmse(other, model)
     return case
 
 
 def case_without_truth(effects, seed):
-    """dict of one case diagnosed without ground truth: what was put in, found, said to be unobservable, and applied; and the
-    errors of the filter on a second flight with the same effects, before and after that."""
+    """dict of one case diagnosed without ground truth: what was put in, found, said to be
+    unobservable, and applied; and the errors of the filter on a second flight with the same
+    effects, before and after that.
+    """
     flight, other = _flown(effects, seed)
     result = diagnose([flight], reference=Nothing())
     case = _case(effects, seed, result.attribution)
@@ -73,7 +81,12 @@ def _flown(effects, seed, aided=False):
 
 
 def _case(effects, seed, attribution):
-    ambiguous = {other.effect for f in attribution.findings() for other in f.alternatives if other.gap is not None}
+    ambiguous = {
+        other.effect
+        for f in attribution.findings()
+        for other in f.alternatives
+        if other.gap is not None
+    }
     return {
         "put_in": [effect.name for effect in effects],
         "seed": seed,
@@ -88,8 +101,9 @@ def _rmse(flight, effects):
 
 
 def _right(effects, attribution):
-    """Whether every injected parameter was found within 10 % or 3 standard errors; limits of time and place are not
-    judged."""
+    """Whether every injected parameter was found within 10 % or 3 standard errors; limits of time
+    and place are not judged.
+    """
     found = {effect.name: effect for effect in attribution.effects}
     for effect in effects:
         other = found.get(effect.name)
@@ -97,8 +111,14 @@ def _right(effects, attribution):
             return False
         for key, value in effect.values.items():
             if effect.name == "outlier_rate":
-                value = value + (1.0 - value) * SimulationConfig.outlier_probability  # on top of what is nominal
-            limits = (".start", ".end", ".height") if effect.name == "floor_multipath" else (".start", ".end")
+                value = (
+                    value + (1.0 - value) * SimulationConfig.outlier_probability
+                )  # on top of what is nominal
+            limits = (
+                (".start", ".end", ".height")
+                if effect.name == "floor_multipath"
+                else (".start", ".end")
+            )
             if key.endswith(limits):
                 continue
             error = abs(other.values.get(key, 0.0) - value)
@@ -108,8 +128,9 @@ def _right(effects, attribution):
 
 
 def cases(seeds, aided=False, first=0):
-    """[(kind, effects, seed)] of the whole bank: small, large, pair, clean. aided : of effects on height, pressure and
-    velocity, for flights that have these; first : of the seeds."""
+    """[(kind, effects, seed)] of the whole bank: small, large, pair, clean. aided : of effects on
+    height, pressure and velocity, for flights that have these; first : of the seeds.
+    """
     out = []
     for name in (name for name in SIZES if name not in RANGED and (name in AIDED) == aided):
         out += [
@@ -155,18 +176,26 @@ def figures(results):
 def figures_without_truth(results):
     """Figures of several `case_without_truth`, with "kind"."""
     put_in = [r for r in results if r["put_in"]]
-    seen, hidden = ([r for r in put_in if (r["put_in"][0] in INVISIBLE) is unseen] for unseen in (False, True))
+    seen, hidden = (
+        [r for r in put_in if (r["put_in"][0] in INVISIBLE) is unseen] for unseen in (False, True)
+    )
     harmed = [r for r in results if r["after"] > WORSE * r["before"]]
     return {
         "observable": len(seen),
         "right first": share(r["found"][:1] == r["put_in"] for r in seen),
         "not observable": len(hidden),
-        "named as such, and nothing found": share(r["put_in"][0] in r["unobservable"] and not r["found"] for r in hidden),
+        "named as such, and nothing found": share(
+            r["put_in"][0] in r["unobservable"] and not r["found"] for r in hidden
+        ),
         "clean": len(results) - len(put_in),
         "false alarms": sum(bool(r["found"]) for r in results if not r["put_in"]),
         "applied": sum(bool(r["applied"]) for r in results),
-        "after over before, where applied": share(r["after"] / r["before"] for r in results if r["applied"]),
-        "worse by 3 % on another flight": [(r["put_in"], r["seed"], r["before"], r["after"]) for r in harmed],
+        "after over before, where applied": share(
+            r["after"] / r["before"] for r in results if r["applied"]
+        ),
+        "worse by 3 % on another flight": [
+            (r["put_in"], r["seed"], r["before"], r["after"]) for r in harmed
+        ],
     }
 
 

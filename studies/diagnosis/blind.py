@@ -1,7 +1,9 @@
-"""The blind bank: effects of the grammar put into flights, measured ones on top of what others of the day have told.
+"""The blind bank: effects of the grammar put into flights, measured ones on top of what others of
+the day have told.
 
-An effect is put into two flights. One is diagnosed, the other judges what was found: named rightly, and removed. Or into more,
-of which the last one judges what was found in one of the others, in two of them, and so on.
+An effect is put into two flights. One is diagnosed, the other judges what was found: named rightly,
+and removed. Or into more, of which the last one judges what was found in one of the others, in two
+of them, and so on.
 """
 
 from dataclasses import replace
@@ -27,8 +29,12 @@ from .claims import claims, truth_of
 
 LEAST_COST = 0.02  # m of 3D RMSE that an effect costs in both flights
 GROW, GROWTHS = 1.7, 3  # an effect that costs less is made larger, so often
-DEVELOPED_ON, DRAWN_ONCE = 0, 1_000_000  # first seeds: of cases that were looked at, and of those that are reported
-# {split of `measured`: places of its judged flights, in groups of one protocol}: each flight is judged on the next.
+DEVELOPED_ON, DRAWN_ONCE = (
+    0,
+    1_000_000,
+)  # first seeds: of cases that were looked at, and of those that are reported
+# {split of `measured`: places of its judged flights, in groups of one protocol}: each flight is
+# judged on the next.
 GROUPS = {
     "0425 a": ((0, 1, 2), (3, 4)),
     "0425 b": ((0, 1, 2), (3, 4)),
@@ -46,7 +52,9 @@ class Measured:
     """Measured flights, with what the other flights of their day and installation have told."""
 
     def __init__(self, data, out, splits=tuple(GROUPS)):
-        """data, out : Paths; what `measured` has written to `out` is what is known, and it is made where it is missing."""
+        """data, out : Paths; what `measured` has written to `out` is what is known, and it is made
+        where it is missing.
+        """
         self._data, self._out, self._splits = data, out, splits
         for split in splits:
             if not self._known(split).exists():
@@ -57,7 +65,10 @@ class Measured:
 
     def flights(self, rng, number):
         """([Flight] of that number, EffectSet, name of the split)."""
-        groups = {split: [group for group in GROUPS[split] if len(group) >= number] for split in self._splits}
+        groups = {
+            split: [group for group in GROUPS[split] if len(group) >= number]
+            for split in self._splits
+        }
         splits = [split for split in self._splits if groups[split]]
         split = splits[rng.integers(len(splits))]
         flights = _judged(self._data, split)
@@ -90,8 +101,9 @@ def rmse(flight, effects):
 
 
 def case(source, seed, number=2):
-    """(Undeclared, `number` flights with it, the same without, base, where) of a seed; None if the effect costs too little however
-    it is enlarged."""
+    """(Undeclared, `number` flights with it, the same without, base, where) of a seed; None if the
+    effect costs too little however it is enlarged.
+    """
     flights, base, where = source.flights(np.random.default_rng([seed, 7]), number)
     effect = grammar.draw(seed, flights[0])
     before = [rmse(flight, base) for flight in flights]
@@ -119,25 +131,40 @@ class Told(Effect):
         return STATES.get(self.undeclared.covariate, ()) if self.undeclared.stream == "tdoa" else ()
 
     def bias(self, samples):
-        return self.undeclared.bias(samples) if self.undeclared.stream == "tdoa" else np.zeros(len(samples))
+        return (
+            self.undeclared.bias(samples)
+            if self.undeclared.stream == "tdoa"
+            else np.zeros(len(samples))
+        )
 
     def sensor_functions(self):
         effect, (low, high) = self.undeclared, self.undeclared.limits
         if effect.stream == "tdoa" or effect.covariate not in OF_STATE:
             return ()
         beyond = 0.25 * (high - low)  # where the course of an Undeclared ends
-        return (SensorFunction.of(effect.course, f"{effect.stream}.{'xyz'[effect.who[0]]}", effect.covariate, low - beyond, high + beyond),)
+        return (
+            SensorFunction.of(
+                effect.course,
+                f"{effect.stream}.{'xyz'[effect.who[0]]}",
+                effect.covariate,
+                low - beyond,
+                high + beyond,
+            ),
+        )
 
 
 def told(effect, flown, plain, base):
-    """3D RMSE, m, of a Flight `flown` with an Undeclared that is known exactly. plain : the error without it. Of an inertial sensor
-    nodes know what it read and when, and where the filter is."""
+    """3D RMSE, m, of a Flight `flown` with an Undeclared that is known exactly. plain : the error
+    without it. Of an inertial sensor nodes know what it read and when, and where the filter is.
+    """
     if effect.stream == "tdoa" or effect.covariate in OF_STATE:
         return rmse(flown, EffectSet((*base.effects, Told(effect))))
     return rmse(flown, base) if effect.covariate in grammar.OF_POSE[1:] else plain
 
 
-_told_as_they_are = {}  # {(where, flights): ([Claim], m of the judging flight's error)} of this process: seeds share flights
+# {(where, flights): ([Claim], m of the judging flight's error)} of this process: seeds share
+# flights
+_told_as_they_are = {}
 
 
 def _as_they_are(flights, judge, base, where):
@@ -156,20 +183,35 @@ def run(source, seed):
 
 
 def several(source, number, seed):
-    """[dict] of the case of a seed among so many flights, with one of them diagnosed, with two, and so on; None if it costs too
-    little."""
+    """[dict] of the case of a seed among so many flights, with one of them diagnosed, with two, and
+    so on; None if it costs too little.
+    """
     drawn = case(source, seed, number)
-    return None if drawn is None else [{"seed": seed, **_judge(count, *drawn)} for count in range(1, number)]
+    return (
+        None
+        if drawn is None
+        else [{"seed": seed, **_judge(count, *drawn)} for count in range(1, number)]
+    )
 
 
 def _judge(count, effect, flown, flights, base, where):
     """dict of a case of which the first `count` flights are diagnosed. The last one judges."""
     result = diagnose(flown[:count], base=base)
-    plain, before, after = rmse(flights[-1], base), rmse(flown[-1], base), rmse(flown[-1], result.effects)
+    plain, before, after = (
+        rmse(flights[-1], base),
+        rmse(flown[-1], base),
+        rmse(flown[-1], result.effects),
+    )
     known, plain_after = _as_they_are(flights[:count], flights[-1], base, where)
     said, true = claims(result.findings), truth_of(effect, flown[0])
-    new = [claim for claim in said if not any(claim.names(one) and claim.depends_as(one) for one in known)]
-    place, among_new = (next((k for k, claim in enumerate(some) if claim.names(true)), None) for some in (said, new))
+    new = [
+        claim
+        for claim in said
+        if not any(claim.names(one) and claim.depends_as(one) for one in known)
+    ]
+    place, among_new = (
+        next((k for k, claim in enumerate(some) if claim.names(true)), None) for some in (said, new)
+    )
     return as_json(
         {
             "where": where,
@@ -186,15 +228,24 @@ def _judge(count, effect, flown, flights, base, where):
             "among_new": among_new,
             "covariate_right": place is not None and said[place].depends_as(true),
             "shape_right": place is not None and said[place].shape == true.shape,
-            "rmse": [value if np.isfinite(value) else None for value in (plain, before, after, plain_after)],
+            "rmse": [
+                value if np.isfinite(value) else None
+                for value in (plain, before, after, plain_after)
+            ],
             "removed": float(1.0 - (after - plain) / (before - plain)),
-            "removed_if_told": float(1.0 - (told(effect, flown[-1], plain, base) - plain) / (before - plain)),
+            "removed_if_told": float(
+                1.0 - (told(effect, flown[-1], plain, base) - plain) / (before - plain)
+            ),
         }
     )
 
 
 def _first(said):
-    return None if not said else [said[0].stream, said[0].subset, (*said[0].covariates, "")[0], said[0].shape]
+    return (
+        None
+        if not said
+        else [said[0].stream, said[0].subset, (*said[0].covariates, "")[0], said[0].shape]
+    )
 
 
 def false_alarms(number, first=DEVELOPED_ON):
@@ -209,9 +260,13 @@ def figures(results):
     removable = [r for r in results if r["removed_if_told"] >= 0.5]
     mean = {
         "cases": len(results),
-        "channel right, of the first": share(bool(r["first"]) and r["first"][0] == r["stream"] for r in results),
+        "channel right, of the first": share(
+            bool(r["first"]) and r["first"][0] == r["stream"] for r in results
+        ),
         "channel and subset right and first": share(r["place"] == 0 for r in results),
-        "the same, first of what is not said of the flight as it is": share(r["among_new"] == 0 for r in results),
+        "the same, first of what is not said of the flight as it is": share(
+            r["among_new"] == 0 for r in results
+        ),
         "named at any place": share(r["place"] is not None for r in results),
         "covariate right": share(r["covariate_right"] for r in results),
         "shape right": share(r["shape_right"] for r in results),
@@ -221,7 +276,10 @@ def figures(results):
     }
     for key in ("stream", "subset", "where"):
         mean[f"first, by {key}"] = {
-            name: f"{sum(r['place'] == 0 for r in results if r[key] == name)} of {sum(r[key] == name for r in results)}"
+            name: (
+                f"{sum(r['place'] == 0 for r in results if r[key] == name)} of "
+                f"{sum(r[key] == name for r in results)}"
+            )
             for name in sorted({r[key] for r in results})
         }
     return mean

@@ -1,6 +1,8 @@
-"""What findings say, and what an effect of the grammar is, in the same terms: stream, subset, covariate, shape.
+"""What findings say, and what an effect of the grammar is, in the same terms: stream, subset,
+covariate, shape.
 
-Some effects of the grammar have a name in the catalogue: an anchor that is late from one time to another is nlos.
+Some effects of the grammar have a name in the catalogue: an anchor that is late from one time to
+another is nlos.
 """
 
 from dataclasses import dataclass
@@ -12,7 +14,8 @@ from uwb_tdoa_bias.effects import true_samples
 from .grammar import NAMES
 
 CONSTANT = "nothing"  # that a function depends on
-# {declared effect: (subset, covariates, shapes)}; "key": an anchor, a pair or an axis for each parameter.
+# {declared effect: (subset, covariates, shapes)}; "key": an anchor, a pair or an axis for each
+# parameter.
 CATALOGUE = {
     "anchor_delay": ("anchor", (), ()),
     "pair_offset": ("pair", (CONSTANT,), ("step",)),
@@ -22,8 +25,16 @@ CATALOGUE = {
     "range_bias": ("arrivals", ("range",), ("bend", "ramp")),
     "received_power_bias": ("arrivals", ("range",), ("bend", "trend")),
     "antenna_pattern": ("arrivals", ("elevation_in_tag",), ("bend",)),
-    "truth_frame": ("arrivals", ("elevation", "bearing"), ("periodic",)),  # a shift is a function of the direction to each anchor,
-    "tag_lever_arm": ("arrivals", ("elevation_in_tag", "bearing_in_tag"), ("periodic",)),  # and so is an arm, in the tag
+    "truth_frame": (
+        "arrivals",
+        ("elevation", "bearing"),
+        ("periodic",),
+    ),  # a shift is a function of the direction to each anchor,
+    "tag_lever_arm": (
+        "arrivals",
+        ("elevation_in_tag", "bearing_in_tag"),
+        ("periodic",),
+    ),  # and so is an arm, in the tag
     "floor_multipath": ("arrivals", ("height",), ("step", "transient")),
     "gyro_scale": ("axis", ("rate",), ("trend",)),
     "accel_scale": ("axis", ("accel",), ("trend",)),
@@ -32,17 +43,23 @@ CATALOGUE = {
 }
 # {shape of a function without a name: that of the grammar}
 SHAPES = {
-    "line": "trend", "beyond": "ramp", "below": "ramp", "step": "step", "interval": "transient", "wave": "periodic",
+    "line": "trend",
+    "beyond": "ramp",
+    "below": "ramp",
+    "step": "step",
+    "interval": "transient",
+    "wave": "periodic",
     "parabola": "bend",
-}  # fmt: skip
+}
 NEARLY_ALL = 0.9  # of the TDOAs of a pair, as packets get lost
 STREAM = {"imu_gravity": "accel", "imu_misalignment": "gyro"}
 
 
 @dataclass(frozen=True)
 class Claim:
-    """stream; subset : kind of it; who : frozenset of the anchors, or of the axis; covariates : those that it names, the first
-    and what is the same in that flight; shape; text."""
+    """stream; subset : kind of it; who : frozenset of the anchors, or of the axis; covariates :
+    those that it names, the first and what is the same in that flight; shape; text.
+    """
 
     stream: str
     subset: str
@@ -61,15 +78,27 @@ class Claim:
 
 
 def truth_of(effect, flight):
-    """Claim of an Undeclared in a Flight. A direction is a pair where nobody hears the other one, and so is what follows an anchor
-    where only one pair does."""
+    """Claim of an Undeclared in a Flight. A direction is a pair where nobody hears the other one,
+    and so is what follows an anchor where only one pair does.
+    """
     subset = effect.subset
     if effect.covariate == NAMES and (pair := _only_pair(effect, flight)):
-        return Claim(effect.stream, "pair", frozenset(map(str, pair)), (effect.covariate, CONSTANT), effect.shape, effect.name)
+        return Claim(
+            effect.stream,
+            "pair",
+            frozenset(map(str, pair)),
+            (effect.covariate, CONSTANT),
+            effect.shape,
+            effect.name,
+        )
     if subset == "direction":
         a, b = effect.who
         back = np.sum((flight.tdoa.a == b) & (flight.tdoa.b == a))
-        subset = "direction" if back > 0.1 * np.sum((flight.tdoa.a == a) & (flight.tdoa.b == b)) else "pair"
+        subset = (
+            "direction"
+            if back > 0.1 * np.sum((flight.tdoa.a == a) & (flight.tdoa.b == b))
+            else "pair"
+        )
     who = frozenset(("xyz"[effect.who[0]],) if subset == "axis" else map(str, effect.who))
     return Claim(effect.stream, subset, who, (effect.covariate,), effect.shape, effect.name)
 
@@ -77,7 +106,10 @@ def truth_of(effect, flight):
 def _only_pair(effect, flight):
     """Ids of the pair whose TDOAs are those that it changes; None if there is no such pair."""
     samples, _ = true_samples(flight)
-    pairs, changed = np.sort(samples.anchors.ids[np.column_stack([samples.a, samples.b])], axis=1), effect.bias(samples) != 0.0
+    pairs, changed = (
+        np.sort(samples.anchors.ids[np.column_stack([samples.a, samples.b])], axis=1),
+        effect.bias(samples) != 0.0,
+    )
     several, count = np.unique(pairs[changed], axis=0, return_counts=True)
     if not len(several):
         return None
@@ -88,7 +120,9 @@ def _only_pair(effect, flight):
 
 def claims(findings):
     """[Claim] of Findings, those that are worth most first."""
-    ranked = sorted(findings, key=lambda finding: (bool(finding.together_with), -finding.prominence))
+    ranked = sorted(
+        findings, key=lambda finding: (bool(finding.together_with), -finding.prominence)
+    )
     out = []
     for finding in ranked:
         out += _undeclared(finding) if finding.effect.settings else _declared(finding.effect)
@@ -108,13 +142,22 @@ def _undeclared(finding):
         subset = {"common": "all", "arrival": "arrivals", "anchor": "anchors"}[effect.form]
         return [Claim(stream, subset, frozenset(), covariates, shape, effect.label)]
     return [
-        Claim(stream, effect.form, frozenset(part.split("-")), covariates, shape, f"{effect.label} {part} {shape}")
+        Claim(
+            stream,
+            effect.form,
+            frozenset(part.split("-")),
+            covariates,
+            shape,
+            f"{effect.label} {part} {shape}",
+        )
         for part in parts
     ]
 
 
 def _covariates(finding):
-    """That of the function, and those that are named as the same thing in that flight, of the same part."""
+    """That of the function, and those that are named as the same thing in that flight, of the same
+    part.
+    """
     own, _, name = finding.effect.label.rpartition(" over ")
     others = (other.effect.rpartition(" over ") for other in finding.alternatives)
     return tuple(dict.fromkeys((name, *(other for part, _, other in others if part == own))))
@@ -124,20 +167,31 @@ def _declared(effect):
     """A Claim for every anchor, pair or axis."""
     stream = STREAM.get(effect.name, effect.channels[0])
     if effect.name == "nlos":
-        return [_nlos(effect, who) for who in dict.fromkeys(key.partition(".")[0] for key in effect.values)]
-    turned = effect.name == "truth_frame" and not set("xyz") & set(effect.values)  # no function of the direction alone
-    subset, covariates, shapes = ("all", (), ()) if turned else CATALOGUE.get(effect.name, ("all", (), ()))
+        return [
+            _nlos(effect, who)
+            for who in dict.fromkeys(key.partition(".")[0] for key in effect.values)
+        ]
+    turned = effect.name == "truth_frame" and not set("xyz") & set(
+        effect.values
+    )  # no function of the direction alone
+    subset, covariates, shapes = (
+        ("all", (), ()) if turned else CATALOGUE.get(effect.name, ("all", (), ()))
+    )
     if subset in ("arrivals", "all"):
         return [Claim(stream, subset, frozenset(), covariates, (*shapes, "")[0], effect.name)]
     out = {}
     for key in effect.values:
         who = frozenset(key.split("-")) if subset == "pair" else frozenset((key.partition(".")[0],))
         names = tuple(f"{name}_{key}" if subset == "axis" else name for name in covariates)
-        out.setdefault(who, Claim(stream, subset, who, names, (*shapes, "")[0], f"{effect.name} {key}"))
+        out.setdefault(
+            who, Claim(stream, subset, who, names, (*shapes, "")[0], f"{effect.name} {key}")
+        )
     return list(out.values())
 
 
 def _nlos(effect, anchor):
     timed = f"{anchor}.start" in effect.values
     covariates = ("time",) if timed else ("x", "y", "height", "range")
-    return Claim("tdoa", "anchor", frozenset((anchor,)), covariates, "transient", f"nlos of {anchor}")
+    return Claim(
+        "tdoa", "anchor", frozenset((anchor,)), covariates, "transient", f"nlos of {anchor}"
+    )

@@ -14,8 +14,9 @@ TRIES = 8  # draws of a fault, for each that is to be costly, after which it cou
 
 
 def cases(data, number, first):
-    """Yields dict of each draw, of every fault until `number` of it cost the filter LEAST_COST, or spoil the truth. data : Path of
-    the measured flights; first : seed of the first draw."""
+    """Yields dict of each draw, of every fault until `number` of it cost the filter LEAST_COST, or
+    spoil the truth. data : Path of the measured flights; first : seed of the first draw.
+    """
     paths, known = _paths(), {}
     for place, (name, fault) in enumerate(FAULTS.items()):
         fit = [path for path in paths if path.startswith("flights") or not fault.inertial]
@@ -34,7 +35,9 @@ def cases(data, number, first):
 
 
 def as_they_are(data):
-    """{rule: [names of the flights]} of what is named in the measured flights without any fault put in."""
+    """{rule: [names of the flights]} of what is named in the measured flights without any fault put
+    in.
+    """
     said = {}
     for path in _paths():
         flight = measured.load(data, [path])[0]
@@ -44,16 +47,25 @@ def as_they_are(data):
 
 
 def _paths():
-    return list(dict.fromkeys(path for sides in measured.SPLITS.values() for side in sides for path in side))
+    return list(
+        dict.fromkeys(path for sides in measured.SPLITS.values() for side in sides for path in side)
+    )
 
 
 def draw(name, fault, flight, before, rng):
-    """dict of a fault put into a flight. before : m, 3D RMSE of the filter without it; cost : m by which it grows, None where that
-    says nothing."""
+    """dict of a fault put into a flight. before : m, 3D RMSE of the filter without it; cost : m by
+    which it grows, None where that says nothing.
+    """
     faulty = fault.put_in(flight, rng)
     found = [finding.rule for finding in numbers(faulty)]
     cost = None if fault.of_truth else rmse(faulty, EffectSet()) - before
-    return {"fault": name, "flight": flight.name, "said": found, "named": bool(set(found) & set(fault.rules)), "cost": cost}
+    return {
+        "fault": name,
+        "flight": flight.name,
+        "said": found,
+        "named": bool(set(found) & set(fault.rules)),
+        "cost": cost,
+    }
 
 
 def counts(result):
@@ -69,12 +81,17 @@ def figures(results):
         "named": share(r["named"] for r in results),
         "that cost 2 cm, or are of the truth": len(costly),
         "of these named": share(r["named"] for r in costly),
-        "by fault": {name: _of_fault([r for r in results if r["fault"] == name]) for name in FAULTS},
+        "by fault": {
+            name: _of_fault([r for r in results if r["fault"] == name]) for name in FAULTS
+        },
     }
 
 
 def _of_fault(results):
     costly = [r for r in results if counts(r)]
-    words = f"{sum(r['named'] for r in results)} of {len(results)}, costly {sum(r['named'] for r in costly)} of {len(costly)}"
+    words = (
+        f"{sum(r['named'] for r in results)} of {len(results)}, costly "
+        f"{sum(r['named'] for r in costly)} of {len(costly)}"
+    )
     costs = sorted(r["cost"] for r in results if r["cost"] is not None)
     return words + (f", cost {100 * costs[0]:.1f} to {100 * costs[-1]:.1f} cm" if costs else "")

@@ -1,5 +1,7 @@
-"""diagnosis: the figures of docs/diagnosis.md. Every part prints its figures and writes them, with all cases, to
-PART.json in the output folder; bank, blind and injected draw what was found first for what was put in, too."""
+"""diagnosis: the figures of docs/diagnosis.md. Every part prints its figures and writes them, with
+all cases, to PART.json in the output folder; bank, blind and injected draw what was found first for
+what was put in, too.
+"""
 
 from functools import partial
 import importlib.util
@@ -16,18 +18,33 @@ from uwb_tdoa_bias.foundation.flight import AIDS
 from uwb_tdoa_tools.diagnosis import diagnose
 from uwb_tdoa_tools.diagnosis.references import Heights, Nothing
 from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
+from uwb_tdoa_tools.outputs import OutputFolder
 from uwb_tdoa_tools.parallel import over, whole_number
 from uwb_tdoa_tools.results_file import ResultsFile
 from uwb_tdoa_tools.scoring.plots import plt
 from uwb_tdoa_tools.surveying.blocked import with_blocked
-from uwb_tdoa_tools.outputs import OutputFolder
 
 from . import bank, blind, faults, floor, measured, referenced, undeclared
 
 PARTS = (
-    "bank", "aids", "no-truth", "undeclared", "blind", "several", "faults", "injected", "measured", "measured-aids", "floor", "references", "speed",
-)  # fmt: skip
-SEVERAL_MEASURED, SEVERAL_SIMULATED = 3, 4  # flights with the same effect: no measured group of one protocol has more
+    "bank",
+    "aids",
+    "no-truth",
+    "undeclared",
+    "blind",
+    "several",
+    "faults",
+    "injected",
+    "measured",
+    "measured-aids",
+    "floor",
+    "references",
+    "speed",
+)
+SEVERAL_MEASURED, SEVERAL_SIMULATED = (
+    3,
+    4,
+)  # flights with the same effect: no measured group of one protocol has more
 
 
 def add_options(add):
@@ -39,7 +56,10 @@ def add_options(add):
         metavar="N",
         type=int,
         default=5,
-        help="flights for each effect and size, cases of blind and several, or costly draws of each of the faults (default: 5)",
+        help=(
+            "flights for each effect and size, cases of blind and several, or costly draws of "
+            "each of the faults (default: 5)"
+        ),
     )
     add(
         "--first",
@@ -49,14 +69,27 @@ def add_options(add):
         help="first seed of blind, several, faults and no-truth (default: %(default)s)",
     )
     add("--data", metavar="DIR", type=Path, help="the measured flights: flights/, util/, surveys/")
-    add("--jobs", metavar="N", type=whole_number, default=1, help="cases of blind and several at once (default: %(default)s)")
-    add("--cases", metavar="FILE.py", type=Path, help="effects that exist nowhere else, for undeclared")
+    add(
+        "--jobs",
+        metavar="N",
+        type=whole_number,
+        default=1,
+        help="cases of blind and several at once (default: %(default)s)",
+    )
+    add(
+        "--cases",
+        metavar="FILE.py",
+        type=Path,
+        help="effects that exist nowhere else, for undeclared",
+    )
 
 
 def run(args):
     """Run a part, and write and print its figures."""
     args.out.mkdir(parents=True, exist_ok=True)
-    on_data = dict.fromkeys(("faults", "injected", "measured", "measured-aids", "floor", "references"), ("data",))
+    on_data = dict.fromkeys(
+        ("faults", "injected", "measured", "measured-aids", "floor", "references"), ("data",)
+    )
     for option in {"undeclared": ("cases",), **on_data}.get(args.part, ()):
         if getattr(args, option) is None:
             raise InputError(f"--{option}: {args.part} needs it.")
@@ -90,7 +123,8 @@ def _each(cases, function):
 
 def _bank(args):
     results = _each(
-        bank.cases(args.seeds), lambda kind, effects, seed: {"kind": kind, **bank.diagnose_case(effects, seed)}
+        bank.cases(args.seeds),
+        lambda kind, effects, seed: {"kind": kind, **bank.diagnose_case(effects, seed)},
     )
     _confusion(results, args.out / "confusion.png")
     return {"figures": bank.figures(results), "cases": results}
@@ -105,9 +139,13 @@ def _aids(args):
 
 
 def _no_truth(args):
-    cases = [case for case in bank.cases(min(args.seeds, 2), first=args.first) if case[0] == "large"]
+    cases = [
+        case for case in bank.cases(min(args.seeds, 2), first=args.first) if case[0] == "large"
+    ]
     cases += [case for case in bank.cases(args.seeds, first=args.first) if case[0] == "clean"]
-    results = _each(cases, lambda kind, effects, seed: {"kind": kind, **bank.case_without_truth(effects, seed)})
+    results = _each(
+        cases, lambda kind, effects, seed: {"kind": kind, **bank.case_without_truth(effects, seed)}
+    )
     return {"figures": bank.figures_without_truth(results), "cases": results}
 
 
@@ -116,7 +154,11 @@ def _undeclared(args):
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     results = _each(
-        [(name, case, seed) for name, case in module.CASES.items() for seed in range(400, 400 + args.seeds)],
+        [
+            (name, case, seed)
+            for name, case in module.CASES.items()
+            for seed in range(400, 400 + args.seeds)
+        ],
         undeclared.run,
     )
     return {"figures": undeclared.figures(results), "cases": results}
@@ -134,10 +176,15 @@ def _blind(args):
 
 
 def _several(args):
-    """One, two and, where there are enough, three of the flights with the same effect, judged on one more."""
+    """One, two and, where there are enough, three of the flights with the same effect, judged on
+    one more.
+    """
     number = SEVERAL_SIMULATED if args.data is None else SEVERAL_MEASURED
     results = _drawn(args, partial(blind.several, _source(args), number))
-    figures = {f"flights diagnosed: {k + 1}": blind.figures([case[k] for case in results]) for k in range(number - 1)}
+    figures = {
+        f"flights diagnosed: {k + 1}": blind.figures([case[k] for case in results])
+        for k in range(number - 1)
+    }
     return {"figures": figures, "cases": results}
 
 
@@ -146,7 +193,9 @@ def _source(args):
 
 
 def _drawn(args, function):
-    """What a function of a seed returns, of the first seeds for which that is not None; kept as it comes."""
+    """What a function of a seed returns, of the first seeds for which that is not None; kept as it
+    comes.
+    """
     results, seed = [], args.first
     with ResultsFile(args.out / f"{args.part}.jsonl", {"data": str(args.data)}) as done:
         while len(results) < args.seeds:
@@ -171,20 +220,31 @@ def _injected(args):
     figures = {
         "cases": len(results),
         "found on top": bank.share(r["hit"] for r in results),
-        "found, or named as an alternative": bank.share(r["hit"] or r["put_in"][0] in r["ambiguous"] for r in results),
-        "found, or named at all": bank.share(r["hit"] or r["put_in"][0] in r["ambiguous"] + r["imitators"] for r in results),
-        "effects named at all, mean": float(np.mean([len({*r["found"], *r["ambiguous"], *r["imitators"]}) for r in results])),
+        "found, or named as an alternative": bank.share(
+            r["hit"] or r["put_in"][0] in r["ambiguous"] for r in results
+        ),
+        "found, or named at all": bank.share(
+            r["hit"] or r["put_in"][0] in r["ambiguous"] + r["imitators"] for r in results
+        ),
+        "effects named at all, mean": float(
+            np.mean([len({*r["found"], *r["ambiguous"], *r["imitators"]}) for r in results])
+        ),
     }
     return {"figures": figures, "cases": results}
 
 
 def _measured(args):
-    results = _each([(name,) for name in measured.SPLITS], lambda name: measured.run(args.data, name, args.out))
+    results = _each(
+        [(name,) for name in measured.SPLITS], lambda name: measured.run(args.data, name, args.out)
+    )
     return {"figures": {r["split"]: r["summary"] for r in results}, "cases": results}
 
 
 def _measured_aids(args):
-    results = _each([(name,) for name in measured.AIDED], lambda name: measured.run(args.data, name, args.out, AIDS))
+    results = _each(
+        [(name,) for name in measured.AIDED],
+        lambda name: measured.run(args.data, name, args.out, AIDS),
+    )
     return {"figures": {r["split"]: r["summary"] for r in results}, "cases": results}
 
 
@@ -198,7 +258,9 @@ def _references(args):
 
 
 def _speed(args):
-    """Seconds of one core: 120 s of one flight with its ground truth, and two flights of a minute with less."""
+    """Seconds of one core: 120 s of one flight with its ground truth, and two flights of a minute
+    with less.
+    """
     effect = bank.effect_of("anchor_delay", True, 1)
     flight = effect.inject(bank.clean_flight(500, 126.0))
     two = [effect.inject(bank.clean_flight(seed, 60.0, aided=True)) for seed in (502, 503)]
@@ -210,7 +272,10 @@ def _speed(args):
         "diagnose --reference heights, two of a minute": lambda: diagnose(two, reference=Heights()),
     }
     short = bank.clean_flight(501, 40.0, aided=True)
-    diagnose([short], reference=Heights()), self_calibrate([short.without(*AIDS)], Tape())  # compiles
+    (
+        diagnose([short], reference=Heights()),
+        self_calibrate([short.without(*AIDS)], Tape()),
+    )  # compiles
     figures = {}
     for name, call in calls.items():
         started = time.process_time()
@@ -223,7 +288,9 @@ def _confusions(results, path):
     """What was put in, and the first thing said, by channel, subset, covariate and shape."""
     figure, axes = plt.subplots(2, 2, figsize=(14, 13), layout="constrained")
     for k, (ax, key) in enumerate(zip(axes.ravel(), ("stream", "subset", "covariate", "shape"))):
-        pairs = [(r[key], (r["first"][k] or "none said") if r["first"] else "nothing") for r in results]
+        pairs = [
+            (r[key], (r["first"][k] or "none said") if r["first"] else "nothing") for r in results
+        ]
         rows, columns = (sorted({pair[side] for pair in pairs}) for side in range(2))
         count = np.zeros((len(rows), len(columns)))
         for one, other in pairs:
@@ -241,7 +308,9 @@ def _matrix(ax, count, rows, columns):
     for row, column in zip(*np.nonzero(count)):
         colour = "w" if share[row, column] > 0.5 else "k"
         ax.text(column, row, int(count[row, column]), ha="center", va="center", color=colour)
-    ax.set(xticks=range(len(columns)), yticks=range(len(rows)), xlabel="found first", ylabel="put in")
+    ax.set(
+        xticks=range(len(columns)), yticks=range(len(rows)), xlabel="found first", ylabel="put in"
+    )
     ax.set_xticklabels(columns, rotation=90)
     ax.set_yticklabels(rows)
 

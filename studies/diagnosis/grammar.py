@@ -1,6 +1,8 @@
-"""Effects that no catalogue holds, drawn from a grammar: which stream, which part of it, over what, of which shape, how large.
+"""Effects that no catalogue holds, drawn from a grammar: which stream, which part of it, over what,
+of which shape, how large.
 
-A seed is a different effect. None of this imports what searches for it, but the covariates that both must mean alike.
+A seed is a different effect. None of this imports what searches for it, but the covariates that
+both must mean alike.
 """
 
 from dataclasses import dataclass, replace
@@ -12,24 +14,49 @@ from uwb_tdoa_bias.effects.covariates import OF_ARRIVAL, OF_IMU, OF_TDOA, ImuFea
 from uwb_tdoa_bias.effects.samples import Track
 
 SHAPES = ("trend", "step", "ramp", "periodic", "transient", "bend")
-SIZES = {"tdoa": (0.15, 0.8), "gyro": (0.03, 0.3), "accel": (0.3, 2.0)}  # m, rad/s, m/s^2; drawn evenly in the logarithm
+SIZES = {
+    "tdoa": (0.15, 0.8),
+    "gyro": (0.03, 0.3),
+    "accel": (0.3, 2.0),
+}  # m, rad/s, m/s^2; drawn evenly in the logarithm
 STREAMS = ("tdoa", "tdoa", "tdoa", "tdoa", "gyro", "accel")
 SUBSETS = ("anchor", "anchor", "pair", "direction", "arrivals", "all")  # of TDOAs
-OF_POSE = ("time", "x", "y", "height", "speed", "climb_rate", "acceleration")  # of TDOAs and inertial samples alike
+OF_POSE = (
+    "time",
+    "x",
+    "y",
+    "height",
+    "speed",
+    "climb_rate",
+    "acceleration",
+)  # of TDOAs and inertial samples alike
 OF_ATTITUDE = ("turning_rate", "tilt", "bearing_in_tag", "elevation_in_tag")
 ANGLES = ("bearing", "bearing_in_tag")
 NAMES = "previous_anchor"
 ON_TDOA = (*OF_POSE, "turning_rate", "tilt", "interval", NAMES)
 ON_ARRIVAL = ("range", "bearing", "elevation", "bearing_in_tag", "elevation_in_tag")
-ON_IMU = (*OF_POSE, "vibration", "turning_rate", "rate_x", "rate_y", "rate_z", "accel_x", "accel_y", "accel_z")
+ON_IMU = (
+    *OF_POSE,
+    "vibration",
+    "turning_rate",
+    "rate_x",
+    "rate_y",
+    "rate_z",
+    "accel_x",
+    "accel_y",
+    "accel_z",
+)
 LOW, HIGH = 0.05, 0.95  # quantiles of the covariate between which a shape unfolds
 
 
 @dataclass(frozen=True)
 class Undeclared:
-    """stream : "tdoa", "gyro", "accel"; subset : one of SUBSETS, or "axis"; who : anchor ids or the number of the axis;
-    covariate : name; shape : one of SHAPES; size : of the stream's unit; limits : (low, high) of the covariate; form :
-    three numbers from 0 to 1 that the shape takes as it likes."""
+    """stream : "tdoa", "gyro", "accel"; subset : one of SUBSETS, or "axis"; who : anchor ids or the
+    number of the axis;
+    covariate : name; shape : one of SHAPES; size : of the stream's unit; limits : (low, high) of
+        the covariate; form :
+    three numbers from 0 to 1 that the shape takes as it likes.
+    """
 
     stream: str
     subset: str
@@ -44,7 +71,10 @@ class Undeclared:
     def name(self):
         """In a few words."""
         part = "xyz"[self.who[0]] if self.subset == "axis" else "-".join(map(str, self.who))
-        return f"{self.stream} {self.subset} {part}: {self.size:.2g} {self.shape} over {self.covariate}"
+        return (
+            f"{self.stream} {self.subset} {part}: {self.size:.2g} {self.shape} over "
+            f"{self.covariate}"
+        )
 
     def course(self, values):
         """What it adds at covariate values (n,): (n,)."""
@@ -76,7 +106,9 @@ class Undeclared:
             imu = flight.imu
             change = np.zeros((len(imu), 3))
             change[:, self.who[0]] = np.nan_to_num(self.course(_of_imu(flight, self.covariate)))
-            return replace(flight, imu=replace(imu, **{self.stream: getattr(imu, self.stream) + change}))
+            return replace(
+                flight, imu=replace(imu, **{self.stream: getattr(imu, self.stream) + change})
+            )
         samples, rows = true_samples(flight)
         d = flight.tdoa.d.copy()
         d[rows] += np.nan_to_num(self.bias(samples))
@@ -89,7 +121,11 @@ class Undeclared:
         if self.covariate in ON_ARRIVAL:
             both = _of_arrival(samples, self.covariate).reshape(2, -1)
             late = self.course(both)
-            of = [1.0, 1.0] if self.subset == "arrivals" else [1.0 * (a == self.who[0]), 1.0 * (b == self.who[0])]
+            of = (
+                [1.0, 1.0]
+                if self.subset == "arrivals"
+                else [1.0 * (a == self.who[0]), 1.0 * (b == self.who[0])]
+            )
             return late[1] * of[1] - late[0] * of[0]
         late = self.course(_of_tdoa(samples, self.covariate))
         if self.subset == "anchor":
@@ -103,12 +139,15 @@ class Undeclared:
 
 
 def draw(seed, flight):
-    """The Undeclared of a seed, on anchors and at values of the covariate that a Flight has; for its kind alone the
-    same for every flight."""
+    """The Undeclared of a seed, on anchors and at values of the covariate that a Flight has; for
+    its kind alone the same for every flight.
+    """
     rng = np.random.default_rng([seed, 20261])
     attitude = np.isfinite(flight.truth.q).all(axis=1).any()
     stream = STREAMS[rng.integers(len(STREAMS))] if flight.imu is not None else "tdoa"
-    heard, count = np.unique(np.column_stack([flight.tdoa.a, flight.tdoa.b]), axis=0, return_counts=True)
+    heard, count = np.unique(
+        np.column_stack([flight.tdoa.a, flight.tdoa.b]), axis=0, return_counts=True
+    )
     heard = heard[count > 0.2 * len(flight.tdoa) / len(heard)]
     if stream == "tdoa":
         subset = SUBSETS[rng.integers(len(SUBSETS))]
@@ -149,7 +188,11 @@ def _of_arrival(samples, name):
 
 def _of_tdoa(samples, name):
     if name == "interval":
-        return np.diff(samples.t, prepend=samples.t[:1]) if samples.interval is None else samples.interval
+        return (
+            np.diff(samples.t, prepend=samples.t[:1])
+            if samples.interval is None
+            else samples.interval
+        )
     if name == NAMES and samples.previous is not None:
         return samples.previous
     if name == NAMES:

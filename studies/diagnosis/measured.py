@@ -84,7 +84,11 @@ def folder_of(name):
 def _phases(content):
     """{phase: [3D RMSE m before, after]} of what is not in the air, of all judged flights."""
     before, after = (content[side]["pooled"]["phases"] for side in ("before", "after"))
-    return {name: [_rounded(side[name]["rmse_3d"]) for side in (before, after)] for name in NEAR_THE_FLOOR if name in before}
+    return {
+        name: [_rounded(side[name]["rmse_3d"]) for side in (before, after)]
+        for name in NEAR_THE_FLOOR
+        if name in before
+    }
 
 
 def _rounded(value):
@@ -92,8 +96,9 @@ def _rounded(value):
 
 
 def run(data, name, out, aids=()):
-    """Diagnose one split; writes its report and effects.yaml. aids : streams that are used where flights hold them. Returns
-    dict of the summary and all findings."""
+    """Diagnose one split; writes its report and effects.yaml. aids : streams that are used where
+    flights hold them. Returns dict of the summary and all findings.
+    """
     fit, judge = SPLITS[name]
     started = time.monotonic()
     result = diagnose(load(data, fit, aids), load(data, judge, aids))
@@ -103,7 +108,9 @@ def run(data, name, out, aids=()):
     result.effects.to_yaml(folder / "effects.yaml")
     content = output.as_json(result)
     write_text(folder / "diagnosis.json", json.dumps(content, indent=1, allow_nan=False))
-    sides = {side: [row["rmse_3d"] for row in content[side]["runs"]] for side in ("before", "after")}
+    sides = {
+        side: [row["rmse_3d"] for row in content[side]["runs"]] for side in ("before", "after")
+    }
     summary = {
         "mean 3D before": round(float(np.mean(sides["before"])), 3),
         "after": round(float(np.mean(sides["after"])), 3),
@@ -111,7 +118,9 @@ def run(data, name, out, aids=()):
         "diverged": sum(row["diverged"] for row in content["after"]["runs"]),
         "phases before, after": _phases(content),
         "found": [f["effect"] for f in content["findings"]],
-        "without a name": [f"{t['channel']}/{t['covariate']}/{t['form']}" for t in content["unattributed"]],
+        "without a name": [
+            f"{t['channel']}/{t['covariate']}/{t['form']}" for t in content["unattributed"]
+        ],
     }
     runs = [
         [row["flight"], row["rmse_3d"], other["rmse_3d"]]
@@ -127,9 +136,12 @@ def run(data, name, out, aids=()):
 
 
 def injected(data, each):
-    """Put large effects into measured flights whose own effects were diagnosed before: [dict], as of the bank, with "hit"
-    and "imitators": what explains as much, less plausibly."""
-    cases = [(path, name) for path in INTO for name in SIZES if name not in (*PRESENT, *ON_AIDS, *RANGED)]
+    """Put large effects into measured flights whose own effects were diagnosed before: [dict], as
+    of the bank, with "hit" and "imitators": what explains as much, less plausibly.
+    """
+    cases = [
+        (path, name) for path in INTO for name in SIZES if name not in (*PRESENT, *ON_AIDS, *RANGED)
+    ]
     known = {}
 
     def one(path, name):
@@ -144,7 +156,9 @@ def injected(data, each):
         same = next((f.effect for f in findings if f.effect.name == name), None)
         hit = same is not None and bool(set(same.values) & set(effect.values))
         others = [other for f in findings for other in f.alternatives]
-        rivals, imitators = (sorted({o.effect for o in others if (o.gap is None) == less}) for less in (False, True))
+        rivals, imitators = (
+            sorted({o.effect for o in others if (o.gap is None) == less}) for less in (False, True)
+        )
         return {
             "kind": "large",
             "flight": flight.name,

@@ -15,10 +15,18 @@ MOST = 3  # flights to judge a single one on
 
 
 def cases():
-    """[(reference, paths to fit, paths to judge)]: the splits, and every flight alone against the next of its split."""
+    """[(reference, paths to fit, paths to judge)]: the splits, and every flight alone against the
+    next of its split.
+    """
     splits = {name: split for name, split in SPLITS.items() if split[1]}
-    out = [("nothing", *split) for split in splits.values()] + [("heights", *splits[name]) for name in AIDED]
-    flights = {name.removesuffix(" a"): fit + judge for name, (fit, judge) in splits.items() if not name.endswith(" b")}
+    out = [("nothing", *split) for split in splits.values()] + [
+        ("heights", *splits[name]) for name in AIDED
+    ]
+    flights = {
+        name.removesuffix(" a"): fit + judge
+        for name, (fit, judge) in splits.items()
+        if not name.endswith(" b")
+    }
     for several in flights.values():
         for k, path in enumerate(several):
             others = [*several[k + 1 :], *several[:k]]
@@ -27,7 +35,9 @@ def cases():
 
 
 def run(data, reference, fit, judge):
-    """One case: dict with the mean 3D RMSE, m, of the judged flights before and after, from TDOAs and IMU alone."""
+    """One case: dict with the mean 3D RMSE, m, of the judged flights before and after, from TDOAs
+    and IMU alone.
+    """
     flights = load(data, fit, USED[reference])
     result = diagnose(flights, reference=REFERENCES[reference]())
     before, after = [], []
@@ -49,7 +59,11 @@ def figures(results):
     """The summary of several `run`s."""
     applied = [r for r in results if r["applied"] != "nothing"]
     rows = [
-        f"{r['reference']}: {', '.join(r['fit'])}: {r['before']:.3f} -> {r['after']:.3f}, {r['applied']}" for r in results
+        (
+            f"{r['reference']}: {', '.join(r['fit'])}: {r['before']:.3f} -> {r['after']:.3f}, "
+            f"{r['applied']}"
+        )
+        for r in results
     ]
     return {
         "cases": len(results),

@@ -1,4 +1,6 @@
-"""Effects that no catalogue holds: does the scan name channel and covariate, and does its term help other flights?"""
+"""Effects that no catalogue holds: does the scan name channel and covariate, and does its term help
+other flights?
+"""
 
 from known_effects import clean_flight, names_found
 import numpy as np
@@ -27,7 +29,8 @@ def run(name, case, seed):
         "right": first is not None and first.channel == channel and first.covariate in covariates,
         "residual_removed": _removed(channel, plain, other, model),
         "rmse": [
-            evaluate(f, effects=e)[0].row()["rmse_3d"] for f, e in ((plain, None), (other, None), (other, model))
+            evaluate(f, effects=e)[0].row()["rmse_3d"]
+            for f, e in ((plain, None), (other, None), (other, model))
         ],
     }
 
@@ -50,7 +53,9 @@ def figures(results):
     return {
         "cases": len(results),
         "right first": round(float(np.mean([r["right"] for r in results])), 3),
-        "half of the excess removed": round(float(np.mean([r["residual_removed"] >= 0.5 for r in results])), 3),
+        "half of the excess removed": round(
+            float(np.mean([r["residual_removed"] >= 0.5 for r in results])), 3
+        ),
         "median removed": round(float(np.median([r["residual_removed"] for r in results])), 3),
         "by effect": {
             name: round(float(np.mean([r["right"] for r in results if r["name"] == name])), 2)

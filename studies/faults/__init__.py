@@ -1,2 +1,3 @@
-"""Faults over topics. `events` makes what is sent of a flight, `changes` and `table` put faults into it, `play` sends it to real nodes, and
-`judge` compares what these publish with ground truth."""
+"""Faults over topics. `events` makes what is sent of a flight, `changes` and `table` put faults
+into it, `play` sends it to real nodes, and `judge` compares what these publish with ground truth.
+"""

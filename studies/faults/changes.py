@@ -1,4 +1,6 @@
-"""Changes of the events of a flight, by which faults are made: each takes (events, Scene) and returns events."""
+"""Changes of the events of a flight, by which faults are made: each takes (events, Scene) and
+returns events.
+"""
 
 from __future__ import annotations
 
@@ -35,7 +37,9 @@ def chain(*changes: Change) -> Change:
 
 
 def during(streams: str, of_one: OfOne) -> Change:
-    """What of_one makes of each event of some streams (names, split at blanks) while the fault lasts."""
+    """What of_one makes of each event of some streams (names, split at blanks) while the fault
+    lasts.
+    """
     names = streams.split()
 
     def change(events: list[Event], scene: Scene) -> list[Event]:
@@ -53,10 +57,15 @@ def first(count: int, stream: str, of_one: OfOne) -> Change:
 
     def change(events: list[Event], scene: Scene) -> list[Event]:
         times = [event.at for event in events if event.stream == stream]
-        chosen = {min((at for at in times if at >= scene.begin + 0.1 * k), default=None) for k in range(count)}
+        chosen = {
+            min((at for at in times if at >= scene.begin + 0.1 * k), default=None)
+            for k in range(count)
+        }
         out: list[Event] = []
         for event in events:
-            out.extend(of_one(event, scene) if event.stream == stream and event.at in chosen else (event,))
+            out.extend(
+                of_one(event, scene) if event.stream == stream and event.at in chosen else (event,)
+            )
         return in_order(out)
 
     return change
@@ -64,7 +73,9 @@ def first(count: int, stream: str, of_one: OfOne) -> Change:
 
 def restamped(seconds: float, rate: float = 0.0) -> OfOne:
     """Stamps are ahead by `seconds`, and by `rate` s more for each second."""
-    return lambda event, scene: (event._replace(t=event.t + seconds + rate * (event.t - scene.begin)),)
+    return lambda event, scene: (
+        event._replace(t=event.t + seconds + rate * (event.t - scene.begin)),
+    )
 
 
 def delayed(seconds: float, restamp: bool = False) -> OfOne:
@@ -107,7 +118,10 @@ def frozen(streams: str) -> Change:
 
     def change(events: list[Event], scene: Scene) -> list[Event]:
         kept: dict[str, dict[str, Any]] = {}
-        return during(streams, lambda event, _: (event._replace(values=kept.setdefault(event.stream, event.values)),))(events, scene)
+        return during(
+            streams,
+            lambda event, _: (event._replace(values=kept.setdefault(event.stream, event.values)),),
+        )(events, scene)
 
     return change
 
@@ -137,7 +151,11 @@ def late_anchor(anchor: int, metres: float) -> OfOne:
 
     def of_one(event: Event, _: Scene) -> Iterable[Event]:
         a, b, d = (event.values[key] for key in "abd")
-        return (event._replace(values=event.values | {"d": d + metres * (int(b == anchor) - int(a == anchor))}),)
+        return (
+            event._replace(
+                values=event.values | {"d": d + metres * (int(b == anchor) - int(a == anchor))}
+            ),
+        )
 
     return of_one
 
@@ -151,7 +169,12 @@ def survey(change: Callable[[Anchors], Anchors]) -> Change:
     """Other anchors from the start."""
 
     def changed(events: list[Event], _: Scene) -> list[Event]:
-        return [e._replace(values={"anchors": change(e.values["anchors"])}) if e.stream == "anchors" else e for e in events]
+        return [
+            e._replace(values={"anchors": change(e.values["anchors"])})
+            if e.stream == "anchors"
+            else e
+            for e in events
+        ]
 
     return changed
 
@@ -167,47 +190,73 @@ def moved(row: int, metres: np.ndarray | list[float]) -> Change:
 
 
 def republished(period: float, change: Callable[[Anchors, np.random.Generator], Anchors]) -> Change:
-    """Anchors are published again in each period, s, of the fault, changed; and unchanged at its end."""
+    """Anchors are published again in each period, s, of the fault, changed; and unchanged at its
+    end.
+    """
 
     def changed(events: list[Event], scene: Scene) -> list[Event]:
-        true, rng = next(e for e in events if e.stream == "anchors").values["anchors"], np.random.default_rng(0)
+        true, rng = (
+            next(e for e in events if e.stream == "anchors").values["anchors"],
+            np.random.default_rng(0),
+        )
         times = np.arange(scene.begin, scene.end, period).tolist()
-        return in_order(events + [Event(at, "anchors", at, {"anchors": change(true, rng)}) for at in times]
-                        + [Event(scene.end, "anchors", scene.end, {"anchors": true})])  # fmt: skip
+        return in_order(
+            events
+            + [Event(at, "anchors", at, {"anchors": change(true, rng)}) for at in times]
+            + [Event(scene.end, "anchors", scene.end, {"anchors": true})]
+        )
 
     return changed
 
 
 def framed(stream: str, *frames: str) -> Change:
-    """Messages of a stream come in these frames, in turn. By /tf_static the first is that of the body, each other is APART above
-    the one before."""
+    """Messages of a stream come in these frames, in turn. By /tf_static the first is that of the
+    body, each other is APART above the one before.
+    """
 
     def changed(events: list[Event], scene: Scene) -> list[Event]:
-        transforms = [(frame, [0.0, 0.0, APART * k], [0.0, 0.0, 0.0]) for k, frame in enumerate(frames)]
+        transforms = [
+            (frame, [0.0, 0.0, APART * k], [0.0, 0.0, 0.0]) for k, frame in enumerate(frames)
+        ]
         rows = [k for k, event in enumerate(events) if event.stream == stream]
         out = list(events)
         for turn, k in enumerate(rows):
-            out[k] = events[k]._replace(frame=frames[turn % len(frames) if events[k].at >= scene.begin else 0])
+            out[k] = events[k]._replace(
+                frame=frames[turn % len(frames) if events[k].at >= scene.begin else 0]
+            )
         return in_order([Event(-1.0, "frames", 0.0, {"transforms": transforms}), *out])
 
     return changed
 
 
 def jittered_frames(period: float, rad: float) -> Change:
-    """Frames of /tf_static are published again in each period, turned by `rad` (standard deviation)."""
+    """Frames of /tf_static are published again in each period, turned by `rad` (standard
+    deviation).
+    """
 
     def changed(events: list[Event], scene: Scene) -> list[Event]:
-        true, rng = next(e for e in events if e.stream == "frames").values["transforms"], np.random.default_rng(0)
+        true, rng = (
+            next(e for e in events if e.stream == "frames").values["transforms"],
+            np.random.default_rng(0),
+        )
         times = np.arange(scene.begin, scene.end, period).tolist()
-        turned = [[(frame, p, (rad * rng.standard_normal(3)).tolist()) for frame, p, _ in true] for _ in times]
-        return in_order(events + [Event(at, "frames", at, {"transforms": new}) for at, new in zip(times, turned)])
+        turned = [
+            [(frame, p, (rad * rng.standard_normal(3)).tolist()) for frame, p, _ in true]
+            for _ in times
+        ]
+        return in_order(
+            events
+            + [Event(at, "frames", at, {"transforms": new}) for at, new in zip(times, turned)]
+        )
 
     return changed
 
 
 def done(stream: str, after: float = 0.0, **values: Any) -> Change:
     """Something is done `after` s after the fault begins."""
-    return lambda events, scene: in_order([*events, Event(scene.begin + after, stream, scene.begin + after, values)])
+    return lambda events, scene: in_order(
+        [*events, Event(scene.begin + after, stream, scene.begin + after, values)]
+    )
 
 
 def pose_given(offset: float = 0.0, yaw: float = 0.0) -> Change:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 import math
-from typing import Any, NamedTuple, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -25,13 +25,20 @@ RATES = {"height": 50.0, "velocity": 100.0, "pressure": 25.0, "range": 100.0}  #
 HEIGHT_STD, PRESSURE_STD, RANGE_STD = 0.02, 0.1, 0.1  # m
 # {stream: the fields of its values that are numbers}
 NUMBERS = {
-    "imu": ("gyro", "accel"), "tdoa": ("d",), "height": ("range",), "velocity": ("v",), "pressure": ("pressure",), "range": ("d",)
-}  # fmt: skip
+    "imu": ("gyro", "accel"),
+    "tdoa": ("d",),
+    "height": ("range",),
+    "velocity": ("v",),
+    "pressure": ("pressure",),
+    "range": ("d",),
+}
 
 
 class Event(NamedTuple):
-    """A message, or something that is done. at : s, when it is sent; stream : name; t : s, its stamp; values : by field; frame : of the
-    sensor; sender : number of the publisher. `at` and `t` count from the first message of the flight."""
+    """A message, or something that is done. at : s, when it is sent; stream : name; t : s, its
+    stamp; values : by field; frame : of the sensor; sender : number of the publisher. `at` and `t`
+    count from the first message of the flight.
+    """
 
     at: float
     stream: str
@@ -51,11 +58,15 @@ class Scene:
 
     def pose(self, t: float) -> tuple[np.ndarray, float]:
         """True position (3,) m, and yaw, rad, at t, s."""
-        return position_at(np.array([t]), self.truth)[0], float(yaws_at(np.array([t]), self.truth)[0])
+        return position_at(np.array([t]), self.truth)[0], float(
+            yaws_at(np.array([t]), self.truth)[0]
+        )
 
 
 def part_of(flight: Flight, seconds: float) -> Flight:
-    """The first `seconds` of a flight from shortly before take-off on, on a clock that begins with them, with all sensors."""
+    """The first `seconds` of a flight from shortly before take-off on, on a clock that begins with
+    them, with all sensors.
+    """
     begin = judged_part(flight.truth)[1] - BEFORE
     flight = with_sensors(flight)
 
@@ -78,13 +89,17 @@ def with_sensors(flight: Flight) -> Flight:
 
     t, p = at("height")
     q = truth.q[np.clip(np.searchsorted(truth.t, t), 0, len(truth) - 1)]
-    heights = p[:, 2] / (1.0 - 2.0 * (q[:, 0] ** 2 + q[:, 1] ** 2)) + HEIGHT_STD * rng.standard_normal(len(t))
+    heights = p[:, 2] / (
+        1.0 - 2.0 * (q[:, 0] ** 2 + q[:, 1] ** 2)
+    ) + HEIGHT_STD * rng.standard_normal(len(t))
     height = Height(t, np.maximum(heights, 0.0))
     t, p = at("pressure")
     pressure = Pressure(t, pressure_at(SITE + p[:, 2] + PRESSURE_STD * rng.standard_normal(len(t))))
     t, p = at("range")
     row = np.arange(len(t)) % len(flight.anchors)
-    d = np.linalg.norm(p - flight.anchors.positions[row], axis=1) + RANGE_STD * rng.standard_normal(len(t))
+    d = np.linalg.norm(p - flight.anchors.positions[row], axis=1) + RANGE_STD * rng.standard_normal(
+        len(t)
+    )
     ranges = Ranges(t, flight.anchors.ids[row], np.maximum(d, 0.0), np.zeros(len(t)))
     velocity = with_velocity(flight.without("velocity"), RATES["velocity"]).velocity
     return flight.replaced(height=height, pressure=pressure, range=ranges, velocity=velocity)
@@ -97,7 +112,10 @@ def events_of(flight: Flight, streams: tuple[str, ...]) -> list[Event]:
         stream = getattr(flight, name)
         fields = [field for field in vars(stream) if field != "t"]
         columns = zip(*(getattr(stream, field) for field in fields))
-        out += [Event(t, name, t, dict(zip(fields, values))) for t, values in zip(stream.t.tolist(), columns)]
+        out += [
+            Event(t, name, t, dict(zip(fields, values)))
+            for t, values in zip(stream.t.tolist(), columns)
+        ]
     return in_order(out)
 
 
@@ -107,7 +125,9 @@ def in_order(events: list[Event]) -> list[Event]:
 
 
 def turned(truth: Truth, degrees: float) -> Truth:
-    """The truth in a world whose axes are turned about z, so that everything in it turns by `degrees`."""
+    """The truth in a world whose axes are turned about z, so that everything in it turns by
+    `degrees`.
+    """
     turn = Rotation.from_euler("z", degrees, degrees=True)
     return Truth(truth.t, turn.apply(truth.p), (turn * Rotation.from_quat(truth.q)).as_quat())
 

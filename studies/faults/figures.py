@@ -1,4 +1,6 @@
-"""Faults put into a flight that real nodes hear over topics: how wrong they get, what they say, and whether they recover."""
+"""Faults put into a flight that real nodes hear over topics: how wrong they get, what they say, and
+whether they recover.
+"""
 
 from __future__ import annotations
 
@@ -8,14 +10,14 @@ import json
 from pathlib import Path
 import re
 import tempfile
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.files import write_text
 from uwb_tdoa_tools import parallel
+from uwb_tdoa_tools.outputs import OutputFile
 from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.outputs import OutputFile
 
 from . import judge
 from .events import Scene, events_of, part_of, turned
@@ -24,6 +26,7 @@ from .table import FAULTS
 if TYPE_CHECKING:
     import argparse
     from collections.abc import Callable
+
     from uwb_tdoa_bias.foundation.flight import Flight
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -34,7 +37,12 @@ def add_options(add: Callable[..., object]) -> None:
     """add : add_argument of a parser."""
     data = "measured flights; without them a flight is simulated (default: %(default)s)"
     add("--data", metavar="DIR", type=Path, default=DATA, help=data)
-    add("--only", metavar="PATTERN", default="", help="faults whose names this regular expression finds")
+    add(
+        "--only",
+        metavar="PATTERN",
+        default="",
+        help="faults whose names this regular expression finds",
+    )
     jobs = "faults at once, each in a ROS domain of its own (default %(default)s)"
     add("--jobs", metavar="N", type=parallel.whole_number, default=1, help=jobs)
     add("--json", metavar="FILE", type=OutputFile, help="write all figures, and all that was said")
@@ -74,7 +82,9 @@ def row_of(name: str, data: Path) -> dict[str, Any]:
     events = fault.change(events_of(part, ("imu", "tdoa", *fault.plays)), scene)
     judged_by = replace(scene, truth=turned(scene.truth, fault.turned))
     with tempfile.TemporaryDirectory() as folder:
-        return judge.judged(name, fault, played(events, fault.seconds, fault.parameters, folder), judged_by)
+        return judge.judged(
+            name, fault, played(events, fault.seconds, fault.parameters, folder), judged_by
+        )
 
 
 @lru_cache(maxsize=1)

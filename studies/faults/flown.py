@@ -1,7 +1,9 @@
-"""fly-faults: the vehicle of `fly` takes off, flies and lands by the estimate while a fault is put into its streams.
+"""fly-faults: the vehicle of `fly` takes off, flies and lands by the estimate while a fault is put
+into its streams.
 
-It obeys what `status` would say: it sinks where that is not "running". Lockstep, without ROS; a fault lasts from 12 to 15 s after switching
-on, in the first circle."""
+It obeys what `status` would say: it sinks where that is not "running". Lockstep, without ROS; a
+fault lasts from 12 to 15 s after switching on, in the first circle.
+"""
 
 from argparse import Namespace
 from collections.abc import Callable
@@ -34,7 +36,9 @@ LOOK, REPORT = 0.2, 1.0  # s between two looks at the status, and two at the str
 LAG = 0.25  # s
 AIDS = "height", "velocity"
 
-Change = Callable[[Any], Any]  # of the part of a stream that came in one turn: Imu, Tdoas or another
+Change = Callable[
+    [Any], Any
+]  # of the part of a stream that came in one turn: Imu, Tdoas or another
 
 
 @dataclass(frozen=True)
@@ -58,7 +62,9 @@ def _put(**columns: Callable[[Any], np.ndarray]) -> Change:
 
 
 def _late(part: Any, anchors: dict[int, float]) -> np.ndarray:
-    delays = np.array([anchors.get(int(b), 0.0) - anchors.get(int(a), 0.0) for a, b in zip(part.a, part.b)])
+    delays = np.array(
+        [anchors.get(int(b), 0.0) - anchors.get(int(a), 0.0) for a, b in zip(part.a, part.b)]
+    )
     return part.d + delays.reshape(part.d.shape)
 
 
@@ -96,16 +102,26 @@ FAULTS = {
     "tdoa: in cm": FlownFault("tdoa", _put(d=lambda part: 100.0 * part.d)),
     "tdoa: half are outliers": FlownFault("tdoa", _put(d=_outliers)),
     "tdoa: an anchor 1 m late": FlownFault("tdoa", _put(d=lambda part: _late(part, {2: 1.0}))),
-    "tdoa: two anchors 1.5 m late, one of them low": FlownFault("tdoa", _put(d=lambda part: _late(part, {2: 1.5, 3: 1.5}))),
-    "tdoa: two low anchors 1.5 m late": FlownFault("tdoa", _put(d=lambda part: _late(part, {2: 1.5, 5: 1.5}))),
-    "tdoa: two ids exchanged": FlownFault("tdoa", _put(a=lambda part: _swapped(part.a), b=lambda part: _swapped(part.b)), lasts=math.inf),
+    "tdoa: two anchors 1.5 m late, one of them low": FlownFault(
+        "tdoa", _put(d=lambda part: _late(part, {2: 1.5, 3: 1.5}))
+    ),
+    "tdoa: two low anchors 1.5 m late": FlownFault(
+        "tdoa", _put(d=lambda part: _late(part, {2: 1.5, 5: 1.5}))
+    ),
+    "tdoa: two ids exchanged": FlownFault(
+        "tdoa",
+        _put(a=lambda part: _swapped(part.a), b=lambda part: _swapped(part.b)),
+        lasts=math.inf,
+    ),
     "tdoa: ids unknown": FlownFault("tdoa", _put(a=lambda part: part.a + 100)),
     "imu: one stamp 5 s ahead": FlownFault("imu", _ahead(5.0), once=True),
     "imu: one stamp 5 s behind": FlownFault("imu", _ahead(-5.0), once=True),
     "imu: silent": FlownFault("imu", _none),
     "imu: NaN": FlownFault("imu", _put(gyro=lambda part: np.full(part.gyro.shape, np.nan))),
     "imu: in g": FlownFault("imu", _put(accel=lambda part: part.accel / 9.80665)),
-    "imu: gyroscope 0.5 rad/s off": FlownFault("imu", _put(gyro=lambda part: part.gyro + [0.0, 0.0, 0.5])),
+    "imu: gyroscope 0.5 rad/s off": FlownFault(
+        "imu", _put(gyro=lambda part: part.gyro + [0.0, 0.0, 0.5])
+    ),
     "height: 60 s ahead": FlownFault("height", _ahead(60.0)),
     "height: 1 m too large": FlownFault("height", _put(range=lambda part: part.range + 1.0)),
     "velocity: 60 s ahead": FlownFault("velocity", _ahead(60.0)),
@@ -114,12 +130,18 @@ FAULTS = {
 
 
 class FaultyFilter:
-    """An EstimateSource: OurFilter, whose streams have a fault, and that obeys what `status` would say."""
+    """An EstimateSource: OurFilter, whose streams have a fault, and that obeys what `status` would
+    say.
+    """
 
     def __init__(self, ours: OurFilter, fault: FlownFault) -> None:
         """ours : OurFilter; fault : FlownFault."""
         self._ours, self._fault, self._begun = ours, fault, False
-        self._use, self._watch, self._findings = Use(LAG), StreamWatch(ours.estimator.anchors, LAG), []
+        self._use, self._watch, self._findings = (
+            Use(LAG),
+            StreamWatch(ours.estimator.anchors, LAG),
+            [],
+        )
         self._received = dict.fromkeys(("imu", "tdoa", *SENSORS), 0)
         self._now = self._looked = self._reported = self._last = 0.0
         self._restarts, self.why, self.said = 0, "", ""
@@ -154,7 +176,9 @@ class FaultyFilter:
         if self._begun:
             return part
         self._begun = True
-        return concatenated([fault.change(rows_of(part, slice(0, 1))), rows_of(part, slice(1, None))])
+        return concatenated(
+            [fault.change(rows_of(part, slice(0, 1))), rows_of(part, slice(1, None))]
+        )
 
     def _look(self) -> None:
         estimator, newest = self._ours.estimator, self._ours.newest
@@ -167,7 +191,11 @@ class FaultyFilter:
                 self._watch.restart()
             found = self._watch.findings(estimator.sign_turns, self._use.contradicted)
             self._findings = most_severe_first([*found, *estimator.findings])
-        yaw_std = math.nan if newest is None else rotation_std(newest.q[-1:], newest.covariance[-1:])[0, 2]
+        yaw_std = (
+            math.nan
+            if newest is None
+            else rotation_std(newest.q[-1:], newest.covariance[-1:])[0, 2]
+        )
         status = status_of(estimator, yaw_std, self._now - self._last, self._use, self._findings)
         self.why = "" if status.status == RUNNING else status.why
         self.said = self.said or (self.why if self._now > BEGIN else "")
@@ -197,14 +225,35 @@ def flown(task: tuple[str, int]) -> dict[str, Any]:
     trial.source = source = FaultyFilter(trial.source, fault)
     trial.fly()
     verdict = verdict_of(trial.flown)
-    return {key: verdict[key] for key in ("landed", "safe", "why", "said_lost", "tracking")} | {"fault": name, "seed": seed, "said": source.said}
+    return {key: verdict[key] for key in ("landed", "safe", "why", "said_lost", "tracking")} | {
+        "fault": name,
+        "seed": seed,
+        "said": source.said,
+    }
 
 
 def add_options(add: Callable) -> None:
     """add : add_argument of a parser."""
-    add("--flights", type=parallel.whole_number, default=10, metavar="N", help="of each fault (default: 10)")
-    add("--seed", type=parallel.whole_number, default=5001, metavar="S", help="of the first (default: 5001)")
-    add("--jobs", type=parallel.whole_number, metavar="N", help="flights at once (default: as many as there are cores)")
+    add(
+        "--flights",
+        type=parallel.whole_number,
+        default=10,
+        metavar="N",
+        help="of each fault (default: 10)",
+    )
+    add(
+        "--seed",
+        type=parallel.whole_number,
+        default=5001,
+        metavar="S",
+        help="of the first (default: 5001)",
+    )
+    add(
+        "--jobs",
+        type=parallel.whole_number,
+        metavar="N",
+        help="flights at once (default: as many as there are cores)",
+    )
     add("--json", type=OutputFile, metavar="FILE", help="write all figures")
 
 
@@ -218,10 +267,18 @@ def run(args: Namespace) -> None:
 
 
 def table(rows: list[dict[str, Any]]) -> list[str]:
-    """Lines of Markdown: of each fault how many landed at their place, came down safely, and the largest part of what was said."""
-    lines = ["| fault | flights | landed | safe | what `status` said first |", "|---|---:|---:|---:|---|"]
+    """Lines of Markdown: of each fault how many landed at their place, came down safely, and the
+    largest part of what was said.
+    """
+    lines = [
+        "| fault | flights | landed | safe | what `status` said first |",
+        "|---|---:|---:|---:|---|",
+    ]
     for name in dict.fromkeys(row["fault"] for row in rows):
         mine = [row for row in rows if row["fault"] == name]
         said = next((row["said"] for row in mine if row["said"]), "nothing")
-        lines.append(f"| {name} | {len(mine)} | {sum(r['landed'] for r in mine)} | {sum(r['safe'] for r in mine)} | {said[:90]} |")
+        lines.append(
+            f"| {name} | {len(mine)} | {sum(r['landed'] for r in mine)} | "
+            f"{sum(r['safe'] for r in mine)} | {said[:90]} |"
+        )
     return lines

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 import math
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,26 +19,51 @@ if TYPE_CHECKING:
 
 RUNNING = 2  # EstimatorStatus
 STEP = 0.02  # s between two looks
-FRESH, FRESH_STATUS = 0.5, 2.5  # s for which an odometry, and a status, count as new; the latter comes each second
+FRESH, FRESH_STATUS = (
+    0.5,
+    2.5,
+)  # s for which an odometry, and a status, count as new; the latter comes each second
 OTHER_CLOCK = 1.0  # s between stamp and arrival, from which on the stamp is of another clock
-WRONG, SIGMAS, WRONG_LIMIT = 1.0, 3.0, 2.0  # m; stated deviations; s for which both may be exceeded while nothing is said
-WRONG_YAW, YAW_LIMIT = math.radians(20.0), 5.0  # rad, s: the same for a yaw that is said to be known
+WRONG, SIGMAS, WRONG_LIMIT = (
+    1.0,
+    3.0,
+    2.0,
+)  # m; stated deviations; s for which both may be exceeded while nothing is said
+WRONG_YAW, YAW_LIMIT = (
+    math.radians(20.0),
+    5.0,
+)  # rad, s: the same for a yaw that is said to be known
 RECOVERED_LIMIT, STOP_LIMIT = 3.0, 5.0  # s
-LATE = 0.2  # s by which events may be sent late before the row says that the machine was too busy for it
+# s by which events may be sent late before the row says that the machine was too busy for it
+LATE = 0.2
 LEAST = 5.0  # s that are judged of a fault that is over at once
-SETTLED = 6.0  # s from the first message on that do not count of a fault of the whole flight: nothing can be found so fast
+# s from the first message on that do not count of a fault of the whole flight: nothing can be found
+# so fast
+SETTLED = 6.0
 CUT = 60  # characters of a sentence in the table
 HEAD = (
-    "fault", "3D RMSE", "largest", "stated", "gap", "`status`", "`/diagnostics`", "wrong", "yaw wrong", "recovered", "verdict",
-)  # fmt: skip
+    "fault",
+    "3D RMSE",
+    "largest",
+    "stated",
+    "gap",
+    "`status`",
+    "`/diagnostics`",
+    "wrong",
+    "yaw wrong",
+    "recovered",
+    "verdict",
+)
 
 
 @dataclass(frozen=True)
 class Looks:
     """What a vehicle sees that flies by odometry and status, each STEP.
 
-    t : (n,) s; error, std : (n,) m, of the position, true and stated, NaN before the first odometry; yaw_error, yaw_std : (n,) rad;
-    fresh : (n,) bool, an odometry came lately; running, clean : (n,) bool, a status came lately that says so, clean with an empty `why`.
+    t : (n,) s; error, std : (n,) m, of the position, true and stated, NaN before the first
+        odometry; yaw_error, yaw_std : (n,) rad;
+    fresh : (n,) bool, an odometry came lately; running, clean : (n,) bool, a status came lately
+        that says so, clean with an empty `why`.
     """
 
     t: np.ndarray
@@ -62,8 +87,10 @@ class Looks:
 
 
 def looks_at(heard: Heard, scene: Scene, seconds: float) -> Looks:
-    """Looks of what was heard. An odometry is compared with the truth at its stamp, or at its arrival if the stamp is of another clock. The
-    last one before a gap is compared with the truth of each look."""
+    """Looks of what was heard. An odometry is compared with the truth at its stamp, or at its
+    arrival if the stamp is of another clock. The last one before a gap is compared with the truth
+    of each look.
+    """
     t = np.arange(0.0, seconds, STEP)
     arrival = np.array([at for at, _ in heard.odometry])
     newest = np.searchsorted(arrival, t, side="right") - 1
@@ -72,11 +99,16 @@ def looks_at(heard: Heard, scene: Scene, seconds: float) -> Looks:
         nothing = np.full(len(t), math.nan)
         return Looks(t, nothing, nothing, nothing, nothing, there, *_status(heard, t))
     messages = [message for _, message in heard.odometry]
-    stamp = np.array([m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec for m in messages]) - heard.begin
+    stamp = (
+        np.array([m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec for m in messages])
+        - heard.begin
+    )
     stamp = np.where(np.abs(stamp - arrival) > OTHER_CLOCK, arrival, stamp)
     poses = [m.pose.pose for m in messages]
     p = np.array([[of.position.x, of.position.y, of.position.z] for of in poses])
-    x, y, z, w = np.array([[of.orientation.x, of.orientation.y, of.orientation.z, of.orientation.w] for of in poses]).T
+    x, y, z, w = np.array(
+        [[of.orientation.x, of.orientation.y, of.orientation.z, of.orientation.w] for of in poses]
+    ).T
     yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y**2 + z**2))
     covariance = np.array([m.pose.covariance for m in messages])
     k = np.maximum(newest, 0)
@@ -89,7 +121,15 @@ def looks_at(heard: Heard, scene: Scene, seconds: float) -> Looks:
     def known(values: np.ndarray) -> np.ndarray:
         return np.where(there, values, math.nan)
 
-    return Looks(t, known(error), known(std), known(np.abs(turn)), known(np.sqrt(covariance[k, 35])), fresh, *_status(heard, t))
+    return Looks(
+        t,
+        known(error),
+        known(std),
+        known(np.abs(turn)),
+        known(np.sqrt(covariance[k, 35])),
+        fresh,
+        *_status(heard, t),
+    )
 
 
 def _status(heard: Heard, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -108,9 +148,17 @@ def is_clean(status: Any) -> bool:
 
 
 def judged(name: str, fault: Fault, heard: Heard, scene: Scene) -> dict[str, Any]:
-    """The figures of a fault, by name, and its verdict. Times count from the begin of the fault, that of the recovery from its end."""
+    """The figures of a fault, by name, and its verdict.
+
+    Times count from the begin of the fault, that of the recovery from its end.
+    """
     if heard.failed:
-        return {"fault": name, "text": fault.text, "failed": heard.failed, "verdict": "MISS: the nodes did not start"}
+        return {
+            "fault": name,
+            "text": fault.text,
+            "failed": heard.failed,
+            "verdict": "MISS: the nodes did not start",
+        }
     looks = looks_at(heard, scene, fault.seconds)
     begin, end = fault.begin, max(fault.end, fault.begin + LEAST)
     inside = (looks.t >= (begin or SETTLED)) & (looks.t < end) & ~np.isnan(looks.error)
@@ -121,7 +169,8 @@ def judged(name: str, fault: Fault, heard: Heard, scene: Scene) -> dict[str, Any
     error, std = looks.error[inside], looks.std[inside]
     worst = int(np.argmax(error)) if len(error) else -1
     row = {
-        "fault": name, "text": fault.text,
+        "fault": name,
+        "text": fault.text,
         "rmse": float(np.sqrt(np.mean(error**2))) if len(error) else math.nan,
         "largest": float(error[worst]) if len(error) else math.nan,
         "stated": float(std.max()) if len(std) else math.nan,
@@ -131,11 +180,16 @@ def judged(name: str, fault: Fault, heard: Heard, scene: Scene) -> dict[str, Any
         "wrong": STEP * int((looks.wrong & (looks.t >= begin)).sum()),
         "yaw wrong": STEP * int((looks.yaw_wrong & (looks.t >= begin)).sum()),
         "recovered": _recovered(looks, fault) if fault.ends else None,
-        "status": _said([(at, "" if is_clean(of) else f"{of.status}: {of.why}") for at, of in heard.status], begin),
+        "status": _said(
+            [(at, "" if is_clean(of) else f"{of.status}: {of.why}") for at, of in heard.status],
+            begin,
+        ),
         "diagnostics": _said(_warnings(heard, "ekf_node"), begin),
         "diagnostics of bias_node": _said(_warnings(heard, "bias_node"), begin),
-        "stop": heard.stop, "late": heard.late, "latency": _latency(heard),
-    }  # fmt: skip
+        "stop": heard.stop,
+        "late": heard.late,
+        "latency": _latency(heard),
+    }
     return row | {"verdict": verdict(row)}
 
 
@@ -147,7 +201,8 @@ def verdict(row: dict[str, Any]) -> str:
             "wrong and certain": row["wrong"] > WRONG_LIMIT,
             "yaw wrong and certain": row["yaw wrong"] > YAW_LIMIT,
             "not recovered": row["recovered"] is not None and row["recovered"] > RECOVERED_LIMIT,
-            "a sensor disturbs": (row["gap"] > FRESH or row["status"]) and row["fault"].partition(":")[0] in AIDS,  # it can do without
+            "a sensor disturbs": (row["gap"] > FRESH or row["status"])
+            and row["fault"].partition(":")[0] in AIDS,  # it can do without
             "does not end": max(row["stop"].values(), default=0.0) > STOP_LIMIT,
         }.items()
         if is_missed
@@ -162,16 +217,24 @@ def line(row: dict[str, Any]) -> str:
         return f"| {row['fault']} |{(len(HEAD) - 2) * ' |'} {row['verdict']} |"
     recovered = row["recovered"]
     cells = [
-        row["fault"], *(f"{row[key]:.2f}" for key in ("rmse", "largest", "stated", "gap")),
-        _words(row["status"]), _words(row["diagnostics"] or row["diagnostics of bias_node"]),
-        *(f"{row[key]:.1f}" for key in ("wrong", "yaw wrong")), "" if recovered is None else f"{recovered:.1f}", row["verdict"],
-    ]  # fmt: skip
+        row["fault"],
+        *(f"{row[key]:.2f}" for key in ("rmse", "largest", "stated", "gap")),
+        _words(row["status"]),
+        _words(row["diagnostics"] or row["diagnostics of bias_node"]),
+        *(f"{row[key]:.1f}" for key in ("wrong", "yaw wrong")),
+        "" if recovered is None else f"{recovered:.1f}",
+        row["verdict"],
+    ]
     return f"| {' | '.join(cells)} |"
 
 
 def _warnings(heard: Heard, name: str) -> list[tuple[float, str]]:
     """[(s, text)] of the diagnostics of a node, "" where it has nothing to warn of."""
-    return [(at, f"{node}: {text}" if level else "") for at, node, level, text in heard.diagnostics if node == name]
+    return [
+        (at, f"{node}: {text}" if level else "")
+        for at, node, level, text in heard.diagnostics
+        if node == name
+    ]
 
 
 def _words(said: list[tuple[float, str]]) -> str:
@@ -183,7 +246,9 @@ def _words(said: list[tuple[float, str]]) -> str:
 
 
 def _said(sentences: list[tuple[float, str]], begin: float) -> list[tuple[float, str]]:
-    """[(s since the begin of the fault, text)] of sentences, (s, text), that are not empty and differ from the one before."""
+    """[(s since the begin of the fault, text)] of sentences, (s, text), that are not empty and
+    differ from the one before.
+    """
     out: list[tuple[float, str]] = []
     last = next((text for at, text in reversed(sentences) if at < begin), "")
     for at, text in sentences:
@@ -195,7 +260,8 @@ def _said(sentences: list[tuple[float, str]], begin: float) -> list[tuple[float,
 
 
 def _recovered(looks: Looks, fault: Fault) -> float:
-    """s from the end of the fault until odometry flows, is right, and status says so, and all this lasts; inf if it never does.
+    """s from the end of the fault until odometry flows, is right, and status says so, and all this
+    lasts; inf if it never does.
 
     A filter that is started anew by request may say that the yaw is not known.
     """
@@ -212,6 +278,9 @@ def _latency(heard: Heard) -> dict[str, float]:
     """{"p50", "p99"} s from the stamp of an odometry to its arrival."""
     if not heard.odometry:
         return {}
-    stamps = np.array([m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec for _, m in heard.odometry]) - heard.begin
+    stamps = (
+        np.array([m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec for _, m in heard.odometry])
+        - heard.begin
+    )
     late = np.array([at for at, _ in heard.odometry]) - stamps
     return {"p50": float(np.percentile(late, 50)), "p99": float(np.percentile(late, 99))}

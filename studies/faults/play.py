@@ -16,7 +16,7 @@ import struct
 import subprocess
 import sys
 import time
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped, Quaternion, TransformStamped
@@ -37,7 +37,13 @@ from uwb_tdoa_bias.foundation.ros_frames import TF_STATIC_QOS
 from uwb_tdoa_bias.foundation.ros_topics import unserved, waiting
 from uwb_tdoa_bias.foundation.sensors import SENSORS
 from uwb_tdoa_msgs.msg import AnchorArray, EstimatorStatus, Tdoa
-from uwb_tdoa_tools.live.processes import DiagnosticsListener, LiveError, Processes, own_domain, wait
+from uwb_tdoa_tools.live.processes import (
+    DiagnosticsListener,
+    LiveError,
+    Processes,
+    own_domain,
+    wait,
+)
 from uwb_tdoa_tools.live.session import session
 
 from .events import Event
@@ -47,9 +53,15 @@ if TYPE_CHECKING:
     from rclpy.publisher import Publisher
 
 PACKAGES = {"bias_node": "uwb_tdoa_bias", "ekf_node": "uwb_tdoa_ekf"}
-READY, LEAD = 180.0, 0.5  # s: the very first start compiles the filter; from ready nodes to the first message
+READY, LEAD = (
+    180.0,
+    0.5,
+)  # s: the very first start compiles the filter; from ready nodes to the first message
 FETCH = 0.02  # s between two looks at what has arrived
-STAMP, HEADER = struct.Struct("<iI"), 4  # of a message that begins with a header, behind the bytes that say how it is encoded
+STAMP, HEADER = (
+    struct.Struct("<iI"),
+    4,
+)  # of a message that begins with a header, behind the bytes that say how it is encoded
 RELIABLE = QoSProfile(depth=1000)
 KEPT = 3  # runs for which a domain stays reserved after its own
 _taken: deque[ExitStack] = deque()  # their reservations
@@ -72,8 +84,10 @@ HEARD: dict[str, tuple[type, QoSProfile]] = {
 class Heard:
     """What nodes published, on the clock of the events.
 
-    odometry : (arrival s, Odometry); status : (arrival s, EstimatorStatus); diagnostics : (arrival s, node, level, text); begin : s since
-    1970 of 0; late : s, by which an event was sent late at most; stop : {node: s that it took to end, inf if it did not end well};
+    odometry : (arrival s, Odometry); status : (arrival s, EstimatorStatus); diagnostics : (arrival
+        s, node, level, text); begin : s since
+    1970 of 0; late : s, by which an event was sent late at most; stop : {node: s that it took to
+    end, inf if it did not end well};
     failed : why the nodes did not start, or "".
     """
 
@@ -88,17 +102,26 @@ class Heard:
     def add(self, topic: str, arrival: float, message: Any) -> None:
         """Take a message of one of `HEARD`."""
         if topic == "/diagnostics":
-            self.diagnostics += [(arrival, of.name.strip("/"), ord(of.level), of.message) for of in message.status]
+            self.diagnostics += [
+                (arrival, of.name.strip("/"), ord(of.level), of.message) for of in message.status
+            ]
         else:
             getattr(self, topic).append((arrival, message))
 
 
-def played(events: list[Event], seconds: float, parameters: dict[str, dict[str, Any]], folder: str | Path) -> Heard:
-    """Start both nodes in a domain of their own, send them the events, listen for `seconds`, and end them.
+def played(
+    events: list[Event], seconds: float, parameters: dict[str, dict[str, Any]], folder: str | Path
+) -> Heard:
+    """Start both nodes in a domain of their own, send them the events, listen for `seconds`, and
+    end them.
 
     parameters : {node: {name: value}}; folder : where their output goes. Returns Heard.
     """
-    with _fresh_domain(), session("faults", []) as (node, stop), Processes(folder, stop) as processes:
+    with (
+        _fresh_domain(),
+        session("faults", []) as (node, stop),
+        Processes(folder, stop) as processes,
+    ):
         stage = _Stage(node, processes, parameters, {event.stream for event in events})
         try:
             stage.wait()
@@ -112,7 +135,9 @@ def played(events: list[Event], seconds: float, parameters: dict[str, dict[str, 
 
 @contextmanager
 def _fresh_domain() -> Iterator[None]:
-    """As `own_domain`, which others may have only some runs later: for seconds DDS lists nodes that were killed."""
+    """As `own_domain`, which others may have only some runs later: for seconds DDS lists nodes that
+    were killed.
+    """
     while len(_taken) > KEPT:
         _taken.popleft().close()
     _taken.append(ExitStack())
@@ -123,7 +148,13 @@ def _fresh_domain() -> Iterator[None]:
 class _Stage:
     """Nodes as processes, and who publishes to them, asks them and hears them."""
 
-    def __init__(self, node: Node, processes: Processes, parameters: dict[str, dict[str, Any]], streams: set[str]) -> None:
+    def __init__(
+        self,
+        node: Node,
+        processes: Processes,
+        parameters: dict[str, dict[str, Any]],
+        streams: set[str],
+    ) -> None:
         """Start the nodes. streams : names of what is sent to them."""
         self._node, self._processes, self._parameters = node, processes, parameters
         self._titles: dict[str, str] = {}
@@ -136,19 +167,34 @@ class _Stage:
             self._publisher(name)
         self._reset = node.create_client(Trigger, "ekf_node/reset")
         self._set = node.create_client(SetParameters, "ekf_node/set_parameters")
-        self._heard = {topic: node.create_subscription(kind, topic, unserved, qos, raw=True) for topic, (kind, qos) in HEARD.items()}
+        self._heard = {
+            topic: node.create_subscription(kind, topic, unserved, qos, raw=True)
+            for topic, (kind, qos) in HEARD.items()
+        }
         self._doing: dict[str, Callable[[dict[str, Any]], object]] = {
-            "kill": self._kill, "start": lambda values: self._start(values["node"], again=True), "busy": self._be_busy,
-            "reset": lambda _: self._reset.call_async(Trigger.Request()), "parameter": self._set_parameter,
-        }  # fmt: skip
+            "kill": self._kill,
+            "start": lambda values: self._start(values["node"], again=True),
+            "busy": self._be_busy,
+            "reset": lambda _: self._reset.call_async(Trigger.Request()),
+            "parameter": self._set_parameter,
+        }
 
     def wait(self) -> None:
         """Return when the nodes hear everything; raises LiveError."""
         newest, ends = self._diagnostics.newest, list(self._publishers.values())
-        wait(READY, "the nodes", self._processes, self._node, lambda: (
-            newest("ekf_node").get("publishers of uwb/tdoa_corrected") == "1" and newest("bias_node").get("publishers of uwb/tdoa") == "1"
-            and all(end.get_subscription_count() for end in ends) and self._reset.service_is_ready() and self._set.service_is_ready()
-        ))  # fmt: skip
+        wait(
+            READY,
+            "the nodes",
+            self._processes,
+            self._node,
+            lambda: (
+                newest("ekf_node").get("publishers of uwb/tdoa_corrected") == "1"
+                and newest("bias_node").get("publishers of uwb/tdoa") == "1"
+                and all(end.get_subscription_count() for end in ends)
+                and self._reset.service_is_ready()
+                and self._set.service_is_ready()
+            ),
+        )
 
     def call(self, event: Event) -> Callable[[float], object]:
         """call(begin) sends the event; begin : s since 1970 of 0 on its clock."""
@@ -174,8 +220,11 @@ class _Stage:
         for at, call in calls:
             while (left := begin + at - time.time()) > 0.0 or time.time() > due:
                 if time.time() > due:
-                    raw += [(information["received_timestamp"] or time.time_ns(), topic, data)
-                            for topic, end in self._heard.items() for data, information in waiting(end)]  # fmt: skip
+                    raw += [
+                        (information["received_timestamp"] or time.time_ns(), topic, data)
+                        for topic, end in self._heard.items()
+                        for data, information in waiting(end)
+                    ]
                     due = time.time() + FETCH
                 time.sleep(min(max(left, 0.0), FETCH))
             late = max(late, time.time() - begin - at)
@@ -186,7 +235,9 @@ class _Stage:
         return heard
 
     def close(self) -> None:
-        """End what keeps the cores busy, and what publishes: whoever gets the domain next would hear of it until it is collected."""
+        """End what keeps the cores busy, and what publishes: whoever gets the domain next would
+        hear of it until it is collected.
+        """
         for process in self._busy:
             process.kill()
             process.wait()
@@ -198,21 +249,34 @@ class _Stage:
         return self._publishers[name, sender]
 
     def _start(self, name: str, again: bool = False) -> None:
-        words = (f"{key}:={json.dumps(value)}" for key, value in self._parameters.get(name, {}).items())
+        words = (
+            f"{key}:={json.dumps(value)}" for key, value in self._parameters.get(name, {}).items()
+        )
         arguments = [part for word in words for part in ("-p", word)]
         self._titles[name] = f"{name} again" if again else name
-        self._processes.start(PACKAGES[name], name, *(["--ros-args", *arguments] if arguments else []), title=self._titles[name])
+        self._processes.start(
+            PACKAGES[name],
+            name,
+            *(["--ros-args", *arguments] if arguments else []),
+            title=self._titles[name],
+        )
 
     def _kill(self, values: dict[str, Any]) -> None:
         os.killpg(self._processes.pid(self._titles.pop(values["node"])), signal.SIGKILL)
 
     def _be_busy(self, values: dict[str, Any]) -> None:
-        loop = f"import time; end = time.time() + {values['seconds']}\nwhile time.time() < end: pass"
-        self._busy += [subprocess.Popen([sys.executable, "-c", loop]) for _ in range(os.cpu_count() or 1)]
+        loop = (
+            f"import time; end = time.time() + {values['seconds']}\nwhile time.time() < end: pass"
+        )
+        self._busy += [
+            subprocess.Popen([sys.executable, "-c", loop]) for _ in range(os.cpu_count() or 1)
+        ]
 
     def _set_parameter(self, values: dict[str, Any]) -> None:
         value = ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=values["value"])
-        self._set.call_async(SetParameters.Request(parameters=[Parameter(name=values["name"], value=value)]))
+        self._set.call_async(
+            SetParameters.Request(parameters=[Parameter(name=values["name"], value=value)])
+        )
 
     def _end(self) -> dict[str, float]:
         """{node: s that it took to end, inf if it did not end well}."""
@@ -241,18 +305,28 @@ def message_of(event: Event) -> Any:
         _set_vector(message.linear_acceleration, values["accel"])
     elif name == "tdoa":
         message.anchor_a, message.anchor_b = int(values["a"]), int(values["b"])
-        message.distance_difference, message.variance = float(values["d"]), float(values["variance"])
+        message.distance_difference, message.variance = (
+            float(values["d"]),
+            float(values["variance"]),
+        )
     elif name == "initialpose":
         message.header.frame_id = ""
         _set_vector(message.pose.pose.position, values["p"])
-        message.pose.pose.orientation = Quaternion(z=math.sin(values["yaw"] / 2.0), w=math.cos(values["yaw"] / 2.0))
+        message.pose.pose.orientation = Quaternion(
+            z=math.sin(values["yaw"] / 2.0), w=math.cos(values["yaw"] / 2.0)
+        )
         message.pose.covariance = np.diag([POSE_STD**2] * 3 + [YAW_STD**2] * 3).ravel()
     else:
         sensor = SENSORS[name]
-        one = sensor.stream(np.zeros(1), **{field: np.array([value]) for field, value in values.items()})
+        one = sensor.stream(
+            np.zeros(1), **{field: np.array([value]) for field, value in values.items()}
+        )
         for path, content in sensor.content(one).items():
             *way, last = path.split(".")
-            holder, value = reduce(getattr, way, message), np.broadcast_to(content, (1, *np.shape(content)[1:]))[0]
+            holder, value = (
+                reduce(getattr, way, message),
+                np.broadcast_to(content, (1, *np.shape(content)[1:]))[0],
+            )
             if np.ndim(value) and len(value) == 3:
                 _set_vector(getattr(holder, last), value)
             else:

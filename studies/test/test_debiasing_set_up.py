@@ -2,19 +2,22 @@
 
 import numpy as np
 
-from uwb_tdoa_tools.simulation import SimulationConfig
-
 from studies.debiasing import set_up
 from studies.debiasing.report import set_up_tables
+from uwb_tdoa_tools.simulation import SimulationConfig
 
 
 def stay(place, seed=0, number=0, **fields):
-    return set_up.measure((number, {"trajectory": "hover", "place": place, "duration": 5.0, **fields}), seed)
+    return set_up.measure(
+        (number, {"trajectory": "hover", "place": place, "duration": 5.0, **fields}), seed
+    )
 
 
 def test_grids_are_those_of_the_paper():
     calibration, validation = set_up.grid(-2.0, 2.0, 0.5), set_up.grid(-1.75, 1.75, 0.5)
-    assert len(calibration) == 81 - 4 and len(validation) == 64 - 4  # none within half a metre of the four anchors
+    assert (
+        len(calibration) == 81 - 4 and len(validation) == 64 - 4
+    )  # none within half a metre of the four anchors
     nearest = np.linalg.norm(calibration[:, None] - validation, axis=2).min(axis=0)
     np.testing.assert_allclose(nearest[[0, 30, -1]], 0.25 * np.sqrt(2.0))
 
@@ -23,7 +26,9 @@ def test_the_height_is_known_and_nothing_else_is_disturbed(monkeypatch):
     monkeypatch.setattr(SimulationConfig, "anchor_delay_std", 0.0)
     measured = stay((0.5, -1.0), bias=False, outlier_probability=0.0)
     error = (measured.p - measured.true).mean(axis=0)
-    np.testing.assert_allclose(measured.true, np.tile([0.5, -1.0, 0.2], (len(measured.t), 1)), atol=1e-9)
+    np.testing.assert_allclose(
+        measured.true, np.tile([0.5, -1.0, 0.2], (len(measured.t), 1)), atol=1e-9
+    )
     assert np.abs(error).max() < 0.03
 
 

@@ -33,8 +33,12 @@ def test_every_example_is_a_command_line_and_every_study_has_one():
 @pytest.fixture(scope="module")
 def documented(tmp_path_factory):
     """[(page, words)] of the studies in the documentation."""
-    shown = [found for page in PAGES for found in commands(page, (), tmp_path_factory.mktemp(page.stem))]
-    return [(page, words[2:]) for page, words in shown if words[:2] == ["./dev", "study"] and words[2:]]
+    shown = [
+        found for page in PAGES for found in commands(page, (), tmp_path_factory.mktemp(page.stem))
+    ]
+    return [
+        (page, words[2:]) for page, words in shown if words[:2] == ["./dev", "study"] and words[2:]
+    ]
 
 
 def test_the_documentation_shows_every_study(documented):

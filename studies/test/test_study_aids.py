@@ -11,18 +11,22 @@ pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from known_effects import clean_flight  # noqa: E402
 
+from studies import aids  # noqa: E402
+from studies.aids import FAULTS, ONSET, bounds, of_four, only  # noqa: E402
 from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
-from uwb_tdoa_ekf.results import VERDICTS  # noqa: E402
 from uwb_tdoa_ekf.monitoring.health import OK, WARN, Health  # noqa: E402
 from uwb_tdoa_ekf.offline import run_offline  # noqa: E402
+from uwb_tdoa_ekf.results import VERDICTS  # noqa: E402
 from uwb_tdoa_tools.scoring.metrics import judged_part  # noqa: E402
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate  # noqa: E402
 
-from studies import aids  # noqa: E402
-from studies.aids import FAULTS, ONSET, bounds, of_four, only  # noqa: E402
-
-# What the filter copes with is no reason to warn: steps, single wrong ranges, and a barometer that drifts.
-COPED_WITH = ("height: steps of 0.3 to 0.8 m", "height: one in five 1 m too long", "pressure: drifts 1 m per minute")
+# What the filter copes with is no reason to warn: steps, single wrong ranges, and a barometer that
+# drifts.
+COPED_WITH = (
+    "height: steps of 0.3 to 0.8 m",
+    "height: one in five 1 m too long",
+    "pressure: drifts 1 m per minute",
+)
 RUNNING = type("Estimator", (), {"running": True, "anchors": None, "side_unknown": None})
 
 
@@ -37,12 +41,19 @@ def said(flight, monkeypatch):
     begin, end = flight.imu.t[[0, -1]]
     for now in np.arange(begin + 1.0, end):
         monkeypatch.setattr("time.monotonic", lambda: now)
-        judge.received["imu"], judge.received["tdoa"] = (int(np.sum(stream.t < now)) for stream in (flight.imu, flight.tdoa))
+        judge.received["imu"], judge.received["tdoa"] = (
+            int(np.sum(stream.t < now)) for stream in (flight.imu, flight.tdoa)
+        )
         counts = Counter()
         for name, outcome in run.aids.items():
             heard = getattr(flight, name).t < now
             judge.received[name] = int(np.sum(heard))
-            counts.update({f"{name}_{word}": int(np.sum(outcome["verdict"][heard] == v)) for v, word in VERDICTS.items()})
+            counts.update(
+                {
+                    f"{name}_{word}": int(np.sum(outcome["verdict"][heard] == v))
+                    for v, word in VERDICTS.items()
+                }
+            )
         out.append(judge.report(None, RUNNING, counts)[:2])
     return out
 
@@ -56,8 +67,16 @@ def test_a_faulty_sensor_is_named(flight, monkeypatch, name):
     aid, from_start, change = FAULTS[name]
     begin = judged_part(flight.truth)[1] + (0.0 if from_start else ONSET)
     sound = only(flight, (aid,))
-    told = [text for level, text in said(replace(sound, **{aid: change(getattr(sound, aid), begin)}), monkeypatch) if level == WARN]
-    assert told and all(text.startswith(f"more than half of the messages on {aid} ") for text in told)
+    told = [
+        text
+        for level, text in said(
+            replace(sound, **{aid: change(getattr(sound, aid), begin)}), monkeypatch
+        )
+        if level == WARN
+    ]
+    assert told and all(
+        text.startswith(f"more than half of the messages on {aid} ") for text in told
+    )
 
 
 @pytest.mark.parametrize("name", COPED_WITH)
@@ -74,7 +93,9 @@ def test_what_the_filter_copes_with_leaves_the_estimate_sound(flight, name):
 def test_four_anchors_keep_their_tdoas_and_a_height_makes_their_bound_smaller(flight):
     few = of_four(flight)
     assert few.anchors.ids.tolist() == flight.anchors.ids[:4].tolist()
-    assert set(few.tdoa.a) | set(few.tdoa.b) == set(few.anchors.ids.tolist()) and 0 < len(few.tdoa) < len(flight.tdoa)
+    assert set(few.tdoa.a) | set(few.tdoa.b) == set(few.anchors.ids.tolist()) and 0 < len(
+        few.tdoa
+    ) < len(flight.tdoa)
     plain, aided, all_of_them = bounds([few], np.inf), bounds([few], 0.02), bounds([flight], np.inf)
     assert (aided < plain).all() and aided[2] < 0.02 and all_of_them[3] < plain[3]
     assert plain[3] == pytest.approx(np.linalg.norm(plain[:3]))
@@ -82,7 +103,16 @@ def test_four_anchors_keep_their_tdoas_and_a_height_makes_their_bound_smaller(fl
 
 def test_the_table_of_worth_tells_the_floor_too(capsys, monkeypatch):
     monkeypatch.setattr(aids, "SETS", ((), ("height",)))
-    hop = simulate(SimulationConfig(seed=1, duration=14.0, floor_time=1.5, imu_rate=200.0, truth_rate=50.0, height_noise=0.02))
+    hop = simulate(
+        SimulationConfig(
+            seed=1,
+            duration=14.0,
+            floor_time=1.5,
+            imu_rate=200.0,
+            truth_rate=50.0,
+            height_noise=0.02,
+        )
+    )
     aids._worth([hop], FilterConfig(), aids.SETS)
     head, rule, *rows = capsys.readouterr().out.splitlines()
     assert head.endswith("| at rest before, 2 s | first 3 s | last 3 s | at rest after |")

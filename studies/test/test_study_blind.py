@@ -7,12 +7,11 @@ from known_effects import clean_flight
 import numpy as np
 import pytest
 
+from studies.diagnosis import blind, grammar
+from studies.diagnosis.claims import claims, truth_of
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, SmoothTerm
 from uwb_tdoa_tools.diagnosis.findings import EffectFinding
 from uwb_tdoa_tools.diagnosis.regression.confounding import Alternative
-
-from studies.diagnosis import blind, grammar
-from studies.diagnosis.claims import claims, truth_of
 
 
 @pytest.fixture(scope="module")
@@ -49,13 +48,19 @@ def test_an_effect_changes_its_part_of_its_stream_and_nothing_else(flight, drawn
                 assert not (moved & ~(np.isin(a, effect.who) & np.isin(b, effect.who))).any()
         else:
             assert not moved.any()
-            same = [name for name in ("gyro", "accel") if np.array_equal(getattr(changed.imu, name), getattr(flight.imu, name))]
+            same = [
+                name
+                for name in ("gyro", "accel")
+                if np.array_equal(getattr(changed.imu, name), getattr(flight.imu, name))
+            ]
             assert effect.stream not in same and len(same) == 1
 
 
 @pytest.mark.parametrize("shape", grammar.SHAPES)
 def test_a_shape_is_as_large_as_it_says(shape):
-    effect = grammar.Undeclared("tdoa", "all", (), "height", shape, 0.4, (1.0, 2.0), (0.5, 0.2, 0.5))
+    effect = grammar.Undeclared(
+        "tdoa", "all", (), "height", shape, 0.4, (1.0, 2.0), (0.5, 0.2, 0.5)
+    )
     course = effect.course(np.linspace(1.0, 2.0, 400))
     assert np.ptp(course) == pytest.approx(0.8 if shape == "periodic" else 0.4, rel=0.02)
 
@@ -65,8 +70,13 @@ def finding(effect, alternatives=()):
 
 
 def test_a_claim_is_what_was_put_in(flight):
-    true = truth_of(grammar.Undeclared("tdoa", "anchor", (3,), "x", "step", 0.4, (1.0, 2.0), (0.5, 0.2, 0.5)), flight)
-    found = SmoothTerm({"3.c0": 0.0, "3.c1": 0.4}, {}, "", "tdoa", "y", "anchor", (0.0, 1.0, 2.0), "step")
+    true = truth_of(
+        grammar.Undeclared("tdoa", "anchor", (3,), "x", "step", 0.4, (1.0, 2.0), (0.5, 0.2, 0.5)),
+        flight,
+    )
+    found = SmoothTerm(
+        {"3.c0": 0.0, "3.c1": 0.4}, {}, "", "tdoa", "y", "anchor", (0.0, 1.0, 2.0), "step"
+    )
     (said,) = claims([finding(found)])
     assert said.names(true) and said.shape == true.shape and not said.depends_as(true)
     (said,) = claims([finding(found, (Alternative("tdoa of anchor 3 over x", 0.95, 4.0, ""),))])
@@ -75,7 +85,9 @@ def test_a_claim_is_what_was_put_in(flight):
 
 def test_what_follows_an_anchor_is_said_as_its_pair_where_no_other_pair_follows(flight):
     def true(first, a, b):
-        effect = grammar.Undeclared("tdoa", "all", (), grammar.NAMES, "step", 0.4, (first, first), (0.5, 0.2, 0.5))
+        effect = grammar.Undeclared(
+            "tdoa", "all", (), grammar.NAMES, "step", 0.4, (first, first), (0.5, 0.2, 0.5)
+        )
         return truth_of(effect, replace(flight, tdoa=replace(flight.tdoa, a=a, b=b)))
 
     a = np.arange(len(flight.tdoa)) % 8
@@ -87,25 +99,38 @@ def test_what_follows_an_anchor_is_said_as_its_pair_where_no_other_pair_follows(
 
 
 def test_what_has_a_name_in_the_catalogue_is_said_by_that(flight):
-    late = grammar.Undeclared("tdoa", "anchor", (3,), "time", "transient", 0.4, (1.0, 2.0), (0.5, 0.2, 0.5))
+    late = grammar.Undeclared(
+        "tdoa", "anchor", (3,), "time", "transient", 0.4, (1.0, 2.0), (0.5, 0.2, 0.5)
+    )
     (said,) = claims([finding(EFFECTS["nlos"]({"3.delay": 0.4, "3.start": 1.0, "3.end": 2.0}))])
     assert said.names(truth_of(late, flight)) and said.depends_as(truth_of(late, flight))
 
 
-def test_a_shifted_frame_is_a_function_of_the_direction_to_every_anchor_and_a_turned_one_is_not(flight):
-    late = grammar.Undeclared("tdoa", "arrivals", (), "elevation", "trend", 0.4, (-0.5, 0.5), (0.5, 0.2, 0.5))
-    shifted, turned = (claims([finding(EFFECTS["truth_frame"]({key: 0.1}))])[0] for key in ("z", "yaw"))
+def test_a_shifted_frame_is_a_function_of_the_direction_to_every_anchor_and_a_turned_one_is_not(
+    flight,
+):
+    late = grammar.Undeclared(
+        "tdoa", "arrivals", (), "elevation", "trend", 0.4, (-0.5, 0.5), (0.5, 0.2, 0.5)
+    )
+    shifted, turned = (
+        claims([finding(EFFECTS["truth_frame"]({key: 0.1}))])[0] for key in ("z", "yaw")
+    )
     assert shifted.names(truth_of(late, flight)) and shifted.depends_as(truth_of(late, flight))
     assert not turned.names(truth_of(late, flight))
     (arm,) = claims([finding(EFFECTS["tag_lever_arm"]({"z": 0.1}))])
     in_tag = truth_of(replace(late, covariate="bearing_in_tag"), flight)
-    assert arm.names(in_tag) and arm.depends_as(in_tag) and not arm.depends_as(truth_of(late, flight))
+    assert (
+        arm.names(in_tag) and arm.depends_as(in_tag) and not arm.depends_as(truth_of(late, flight))
+    )
 
 
 def test_cases_cost_what_they_must():
     drawn = (blind.case(blind.Simulated(), seed) for seed in range(20))
     effect, flown, plain, base, where = next(one for one in drawn if one is not None)
-    assert all(blind.rmse(one, base) - blind.rmse(none, base) >= blind.LEAST_COST for one, none in zip(flown, plain))
+    assert all(
+        blind.rmse(one, base) - blind.rmse(none, base) >= blind.LEAST_COST
+        for one, none in zip(flown, plain)
+    )
 
 
 def test_of_several_flights_all_but_the_last_are_diagnosed_and_the_last_one_judges(monkeypatch):
@@ -120,17 +145,33 @@ def test_of_several_flights_all_but_the_last_are_diagnosed_and_the_last_one_judg
     seed = next(seed for seed in range(20) if blind.case(source, seed, 3) is not None)
     _, flown, flights, _, _ = blind.case(source, seed, 3)
     one, two = blind.several(source, 3, seed)
-    assert [[flight.name for flight in some] for some in seen[::2]] == [[flown[0].name], [flown[0].name, flown[1].name]]
-    assert all(np.array_equal(some[0].tdoa.d, flights[0].tdoa.d) for some in seen[1::2])  # as they are
-    assert one["rmse"] == two["rmse"] and one["rmse"][:2] == [blind.rmse(flights[2], EffectSet()), blind.rmse(flown[2], EffectSet())]
+    assert [[flight.name for flight in some] for some in seen[::2]] == [
+        [flown[0].name],
+        [flown[0].name, flown[1].name],
+    ]
+    assert all(
+        np.array_equal(some[0].tdoa.d, flights[0].tdoa.d) for some in seen[1::2]
+    )  # as they are
+    assert one["rmse"] == two["rmse"] and one["rmse"][:2] == [
+        blind.rmse(flights[2], EffectSet()),
+        blind.rmse(flown[2], EffectSet()),
+    ]
     assert one["removed"] == two["removed"] == 0.0 and one["place"] is two["place"] is None
 
 
 @pytest.mark.parametrize("covariate", ["speed", "x", "previous_anchor", "interval"])
 def test_what_is_told_is_removed(flight, covariate):
-    limits = (2, 2) if covariate == "previous_anchor" else (0.01, 0.05) if covariate == "interval" else (0.0, 1.0)
+    limits = (
+        (2, 2)
+        if covariate == "previous_anchor"
+        else (0.01, 0.05)
+        if covariate == "interval"
+        else (0.0, 1.0)
+    )
     subset, who = ("all", ()) if covariate == "previous_anchor" else ("anchor", (3,))
-    effect = grammar.Undeclared("tdoa", subset, who, covariate, "trend", 1.0, limits, (0.5, 0.2, 0.5))
+    effect = grammar.Undeclared(
+        "tdoa", subset, who, covariate, "trend", 1.0, limits, (0.5, 0.2, 0.5)
+    )
     flown = effect.inject(flight)
     plain, before = (blind.rmse(one, EffectSet()) for one in (flight, flown))
     assert before > 1.5 * plain

@@ -1,4 +1,6 @@
-"""The experiment of the paper: its halls, its training, its table; the flights themselves are in the study alone."""
+"""The experiment of the paper: its halls, its training, its table; the flights themselves are in
+the study alone.
+"""
 
 import json
 
@@ -6,14 +8,21 @@ import numpy as np
 import pytest
 from test_flying_verdict import made_up
 
+from studies import __main__ as study
+from studies.closed_loop import experiment
+from studies.closed_loop.experiment import (
+    BASELINE,
+    ESTIMATORS,
+    KNOWN,
+    TRAINING,
+    UNSEEN,
+    WITH,
+    WITHOUT,
+)
 from uwb_tdoa_bias.correction.network import load_network
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_tools.flying.plots import drawn
 from uwb_tdoa_tools.flying.verdict import verdict_of
-
-from studies import __main__ as study
-from studies.closed_loop import experiment
-from studies.closed_loop.experiment import BASELINE, ESTIMATORS, KNOWN, TRAINING, UNSEEN, WITH, WITHOUT
 
 OFF = dict(zip(ESTIMATORS, (0.4, 0.3, 0.24, 0.36, 0.1)))  # m, of the estimates of made-up flights
 
@@ -23,12 +32,23 @@ def test_halls_differ_in_where_anchors_are_and_how_they_are_turned_and_in_nothin
     assert not set(TRAINING) & set(UNSEEN) and KNOWN in TRAINING
     for name, hall in halls.items():
         anchors = hall.anchors
-        assert len(anchors) == 8 and (np.abs(anchors.positions) <= 0.5 * np.array(hall.size) * [1, 1, 2] + 1e-9).all()
+        assert (
+            len(anchors) == 8
+            and (np.abs(anchors.positions) <= 0.5 * np.array(hall.size) * [1, 1, 2] + 1e-9).all()
+        )
         up = anchors.orientations[:, 0] ** 2 + anchors.orientations[:, 1] ** 2
         assert (np.minimum(up, 1.0 - up) < 0.2).all()  # upright or upside down, but for a tilt
         same = experiment.world_of(name).anchors
         np.testing.assert_array_equal(same.orientations, anchors.orientations)
-    assert len({(hall.delay, hall.installation, hall.antennas, hall.floor_effect) for hall in halls.values()}) == 1
+    assert (
+        len(
+            {
+                (hall.delay, hall.installation, hall.antennas, hall.floor_effect)
+                for hall in halls.values()
+            }
+        )
+        == 1
+    )
 
 
 def test_it_trains_flies_tells_and_draws(tmp_path, monkeypatch, capsys):
@@ -38,16 +58,35 @@ def test_it_trains_flies_tells_and_draws(tmp_path, monkeypatch, capsys):
     flown = []
 
     def judged(record, draw, task):
-        by = next(name for name, one in ESTIMATORS.items() if experiment.task((name, KNOWN, "A"), 1, trained).model == task.model
-                  and one.config == task.config and one.diagnosed == (task.effects is not None))  # fmt: skip
+        by = next(
+            name
+            for name, one in ESTIMATORS.items()
+            if experiment.task((name, KNOWN, "A"), 1, trained).model == task.model
+            and one.config == task.config
+            and one.diagnosed == (task.effects is not None)
+        )
         flown.append((by, task.seed, task.path.swing))
         one = made_up(off=OFF[by])
         return verdict_of(one), drawn(one, verdict_of(one))
 
     monkeypatch.setattr(experiment.fleet, "fly_one", judged)
-    arguments = ["closed-loop", "--flights", "2", "--seed", "5", "--jobs", "1", "--trained", str(trained), "--out", str(tmp_path)]
+    arguments = [
+        "closed-loop",
+        "--flights",
+        "2",
+        "--seed",
+        "5",
+        "--jobs",
+        "1",
+        "--trained",
+        str(trained),
+        "--out",
+        str(tmp_path),
+    ]
     assert study.main(arguments) == 0
-    assert sorted(set(flown)) == sorted((by, seed, swing) for by in ESTIMATORS for seed in (5, 6) for swing in (0.0, 0.4))
+    assert sorted(set(flown)) == sorted(
+        (by, seed, swing) for by in ESTIMATORS for seed in (5, 6) for swing in (0.0, 0.4)
+    )
     rows = json.loads((tmp_path / "flights.json").read_text())["kinds"]
     assert len(rows) == 5 * 4 * 2 and all(len(row["flights"]) == 2 for row in rows)
     printed = capsys.readouterr().out
@@ -72,5 +111,10 @@ def test_what_it_trains_takes_the_bias_of_antennas_out(tmp_path, monkeypatch):
     for name in experiment.NETWORKS:
         features = json.loads(load_network(str(folder / name / "model.onnx")).meta["features"])
         assert any("_A_" in one for one in features) == (name == "paper")
-    found = {effect.name: effect.values for effect in EffectSet.from_yaml(folder / "effects.yaml").effects}
-    assert found["received_power_bias"]["scale"] == pytest.approx(1.0, abs=0.3) and len(anchors) == 8
+    found = {
+        effect.name: effect.values
+        for effect in EffectSet.from_yaml(folder / "effects.yaml").effects
+    }
+    assert (
+        found["received_power_bias"]["scale"] == pytest.approx(1.0, abs=0.3) and len(anchors) == 8
+    )

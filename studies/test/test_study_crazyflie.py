@@ -4,9 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from uwb_tdoa_tools.readers import inputs
-
 from studies.crazyflie import table
+from uwb_tdoa_tools.readers import inputs
 
 
 @pytest.mark.slow

@@ -1,4 +1,6 @@
-"""The study of faults over topics: what its changes do to events, how it judges, and one fault played to real nodes."""
+"""The study of faults over topics: what its changes do to events, how it judges, and one fault
+played to real nodes.
+"""
 
 from dataclasses import replace
 import json
@@ -11,30 +13,53 @@ import pytest
 pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
-from hypothesis import given, settings, strategies as st  # noqa: E402
+from hypothesis import given, settings  # noqa: E402
+from hypothesis import strategies as st
 from nav_msgs.msg import Odometry  # noqa: E402
-
-from uwb_tdoa_bias.foundation.flight import AIDS, Truth  # noqa: E402
-from uwb_tdoa_msgs.msg import EstimatorStatus  # noqa: E402
-from uwb_tdoa_tools.simulation import SimulationConfig, simulate  # noqa: E402
 
 from studies.__main__ import main  # noqa: E402
 from studies.faults import judge  # noqa: E402
 from studies.faults.changes import (  # noqa: E402
-    delayed, during, first, frozen, in_bursts, late_anchor, lost, pose_given, relabelled, repeated, republished, restamped, scaled,
+    delayed,
+    during,
+    first,
+    frozen,
+    in_bursts,
+    late_anchor,
+    lost,
+    pose_given,
+    relabelled,
+    repeated,
+    republished,
+    restamped,
+    scaled,
     second_sender,
 )
 from studies.faults.events import NUMBERS, Event, Scene, events_of, part_of, turned, yaws_at  # noqa: E402
 from studies.faults.play import Heard, message_of  # noqa: E402
 from studies.faults.table import FAULTS, STREAMS, Fault  # noqa: E402
+from uwb_tdoa_bias.foundation.flight import AIDS, Truth  # noqa: E402
+from uwb_tdoa_msgs.msg import EstimatorStatus  # noqa: E402
+from uwb_tdoa_tools.simulation import SimulationConfig, simulate  # noqa: E402
 
-TRUTH = Truth(np.array([0.0, 100.0]), np.array([[0.0, 0.0, 1.0], [100.0, 0.0, 1.0]]), np.array([[0.0, 0.0, 0.0, 1.0]] * 2))
+TRUTH = Truth(
+    np.array([0.0, 100.0]),
+    np.array([[0.0, 0.0, 1.0], [100.0, 0.0, 1.0]]),
+    np.array([[0.0, 0.0, 0.0, 1.0]] * 2),
+)
 SCENE = Scene(4.0, 6.0, TRUTH)
 
 
 @pytest.fixture(scope="module")
 def part():
-    return part_of(simulate(SimulationConfig(seed=1, duration=60.0, protocol="tdoa3", imu_rate=400.0, truth_rate=100.0)), 40.0)
+    return part_of(
+        simulate(
+            SimulationConfig(
+                seed=1, duration=60.0, protocol="tdoa3", imu_rate=400.0, truth_rate=100.0
+            )
+        ),
+        40.0,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +91,9 @@ def test_events_are_in_order_and_are_all_messages(part):
     assert [event.at for event in events] == sorted(event.at for event in events)
     for name in STREAMS:
         sent = [event for event in events if event.stream == name]
-        assert len(sent) == len(getattr(part, name)) and all(set(NUMBERS[name]) <= set(event.values) for event in sent)
+        assert len(sent) == len(getattr(part, name)) and all(
+            set(NUMBERS[name]) <= set(event.values) for event in sent
+        )
     assert events[0].stream == "anchors" and events[0].at < 0.0
 
 
@@ -78,7 +105,9 @@ def test_every_fault_changes_something_while_it_lasts_and_nothing_before(part, f
     assert str(few) == kept  # what it was given stays
     assert [event.at for event in after] == sorted(event.at for event in after)
     assert (str(after) != kept) == (not name.startswith("nothing") and not fault.parameters)
-    assert sum(e.at < fault.begin for e in after if e.stream in STREAMS) == sum(e.at < fault.begin for e in few if e.stream in STREAMS)
+    assert sum(e.at < fault.begin for e in after if e.stream in STREAMS) == sum(
+        e.at < fault.begin for e in few if e.stream in STREAMS
+    )
     assert fault.seconds < 40.0
     for event in {event.stream: event for event in after}.values():
         if event.stream not in ("kill", "start", "reset", "parameter", "busy"):
@@ -102,10 +131,14 @@ def test_stamps_shift_only_during_the_fault(seconds, rate):
 
 
 def test_lost_repeated_late_and_bursts():
-    assert [e.at for e in during("tdoa", lost)(tdoas(TIMES), SCENE)] == [t for t in TIMES if t not in INSIDE]
+    assert [e.at for e in during("tdoa", lost)(tdoas(TIMES), SCENE)] == [
+        t for t in TIMES if t not in INSIDE
+    ]
     assert len(during("tdoa", repeated(10))(tdoas(TIMES), SCENE)) == len(TIMES) + 9 * len(INSIDE)
     late = during("tdoa", delayed(0.6))(tdoas(TIMES), SCENE)
-    assert {round(e.at - e.t, 6) for e in late} == {0.0, 0.6} and [e.at for e in late] == sorted(e.at for e in late)
+    assert {round(e.at - e.t, 6) for e in late} == {0.0, 0.6} and [e.at for e in late] == sorted(
+        e.at for e in late
+    )
     assert all(e.at == e.t for e in during("tdoa", delayed(1.2, restamp=True))(tdoas(TIMES), SCENE))
     bursts = during("tdoa", in_bursts(0.5))(tdoas(TIMES), SCENE)
     assert {e.at for e in bursts if 4.0 < e.at < 6.0} == {4.5, 5.0, 5.5}
@@ -119,9 +152,17 @@ def test_single_stamps(count):
 
 def test_values():
     assert {e.values["d"] for e in during("tdoa", scaled(-1.0))(tdoas(TIMES), SCENE)} == {0.5, -0.5}
-    assert any(math.isnan(e.values["d"]) for e in during("tdoa", scaled(math.nan))(tdoas(TIMES), SCENE))
-    assert {(e.values["a"], e.values["b"]) for e in during("tdoa", relabelled({1: 2, 2: 1}))(tdoas(TIMES), SCENE)} == {(1, 2), (2, 1)}
-    assert {e.values["d"] for e in during("tdoa", late_anchor(1, 1.0))(tdoas(TIMES), SCENE)} == {0.5, -0.5}
+    assert any(
+        math.isnan(e.values["d"]) for e in during("tdoa", scaled(math.nan))(tdoas(TIMES), SCENE)
+    )
+    assert {
+        (e.values["a"], e.values["b"])
+        for e in during("tdoa", relabelled({1: 2, 2: 1}))(tdoas(TIMES), SCENE)
+    } == {(1, 2), (2, 1)}
+    assert {e.values["d"] for e in during("tdoa", late_anchor(1, 1.0))(tdoas(TIMES), SCENE)} == {
+        0.5,
+        -0.5,
+    }
     ramp = [event._replace(values=event.values | {"d": event.t}) for event in tdoas(TIMES)]
     assert {e.values["d"] for e in frozen("tdoa")(ramp, SCENE) if e.at in INSIDE} == {4.0}
     both = during("tdoa", second_sender(scaled(2.0)))(tdoas(TIMES), SCENE)
@@ -130,7 +171,9 @@ def test_values():
 
 def test_anchors_and_poses(part):
     events = [Event(-1.0, "anchors", 0.0, {"anchors": part.anchors})]
-    removed = republished(6.0, lambda anchors, _: anchors.only(np.arange(len(anchors) - 1)))(events, SCENE)
+    removed = republished(6.0, lambda anchors, _: anchors.only(np.arange(len(anchors) - 1)))(
+        events, SCENE
+    )
     assert [(e.at, len(e.values["anchors"])) for e in removed] == [(-1.0, 8), (4.0, 7), (6.0, 8)]
     (pose,) = pose_given(offset=3.0, yaw=1.0)([], SCENE)
     assert pose.values["p"] == [7.0, 0.0, 1.0] and pose.values["yaw"] == pytest.approx(1.0)
@@ -138,24 +181,44 @@ def test_anchors_and_poses(part):
 
 def test_a_turned_world_turns_everything(part):
     there = turned(part.truth, 90.0)
-    np.testing.assert_allclose(there.p, np.column_stack([-part.truth.p[:, 1], part.truth.p[:, 0], part.truth.p[:, 2]]), atol=1e-9)
+    np.testing.assert_allclose(
+        there.p,
+        np.column_stack([-part.truth.p[:, 1], part.truth.p[:, 0], part.truth.p[:, 2]]),
+        atol=1e-9,
+    )
     turn = yaws_at(there.t, there) - yaws_at(part.truth.t, part.truth)
     np.testing.assert_allclose(np.cos(turn - math.pi / 2), 1.0)
     anchors = FAULTS["survey: rotated"].change(events_of(part, ()), SCENE)[0].values["anchors"]
     d = np.linalg.norm(there.p[:, None] - anchors.positions, axis=2)
-    np.testing.assert_allclose(d, np.linalg.norm(part.truth.p[:, None] - part.anchors.positions, axis=2))
+    np.testing.assert_allclose(
+        d, np.linalg.norm(part.truth.p[:, None] - part.anchors.positions, axis=2)
+    )
 
 
-def heard(error=0.0, std=0.1, yaw=0.0, why="", status=EstimatorStatus.STATUS_RUNNING, shift=0.0, until=20.0):
+def heard(
+    error=0.0,
+    std=0.1,
+    yaw=0.0,
+    why="",
+    status=EstimatorStatus.STATUS_RUNNING,
+    shift=0.0,
+    until=20.0,
+):
     """Heard of a tag that is `error` m off from 4 s on, and what it says."""
     begin, out = 4.0, Heard(begin=1000.0)
     for t in np.arange(0.0, until, 0.02).tolist():
         message = Odometry()
         stamp = 1000.0 + t + (shift if t >= begin else 0.0)
         message.header.stamp.sec, message.header.stamp.nanosec = int(stamp), int(stamp % 1.0 * 1e9)
-        message.pose.pose.position.x, message.pose.pose.position.z = t + (error if t >= begin else 0.0), 1.0
+        message.pose.pose.position.x, message.pose.pose.position.z = (
+            t + (error if t >= begin else 0.0),
+            1.0,
+        )
         angle = yaw if t >= begin else 0.0
-        message.pose.pose.orientation.z, message.pose.pose.orientation.w = math.sin(angle / 2.0), math.cos(angle / 2.0)
+        message.pose.pose.orientation.z, message.pose.pose.orientation.w = (
+            math.sin(angle / 2.0),
+            math.cos(angle / 2.0),
+        )
         message.pose.covariance = np.diag([std**2 / 3.0] * 3 + [0.01] * 3).ravel()
         out.odometry.append((t, message))
     for t in range(20):
@@ -167,7 +230,9 @@ FAULT = Fault("", begin=4.0, lasts=6.0, after=10.0)
 
 
 def verdict(fault=FAULT, **kinds):
-    return judge.judged("tdoa: x", fault, heard(**kinds), Scene(fault.begin, fault.end, TRUTH))["verdict"]
+    return judge.judged("tdoa: x", fault, heard(**kinds), Scene(fault.begin, fault.end, TRUTH))[
+        "verdict"
+    ]
 
 
 def test_wrong_and_certain_is_missed_unless_it_is_said():
@@ -189,7 +254,9 @@ def test_odometry_that_stops_is_wrong_once_the_tag_has_gone_on():
 
 def test_stamps_of_another_clock_are_judged_by_arrival():
     assert verdict(shift=5.0) == "ok" and verdict(shift=-5.0) == "ok"
-    assert verdict(replace(FAULT, lasts=16.0, after=0.0), shift=0.9, std=0.01) == "ok"  # below 1 s the stamp counts: 0.9 m off
+    assert (
+        verdict(replace(FAULT, lasts=16.0, after=0.0), shift=0.9, std=0.01) == "ok"
+    )  # below 1 s the stamp counts: 0.9 m off
 
 
 def test_list(capsys):
@@ -204,5 +271,12 @@ def test_one_fault_over_topics(tmp_path, capsys):
     out = ["--json", str(file), "--out", str(tmp_path / "table.md")]
     assert main(["faults", "--data", str(tmp_path), "--only", "^tdoa: silent 1 s$", *out]) == 0
     (row,) = json.loads(file.read_text())
-    assert row["rmse"] < 0.5 and row["wrong"] == 0.0 and row["recovered"] <= judge.RECOVERED_LIMIT and row["verdict"] == "ok"
-    assert (tmp_path / "table.md").read_text().splitlines() == capsys.readouterr().out.splitlines()[:3]
+    assert (
+        row["rmse"] < 0.5
+        and row["wrong"] == 0.0
+        and row["recovered"] <= judge.RECOVERED_LIMIT
+        and row["verdict"] == "ok"
+    )
+    assert (tmp_path / "table.md").read_text().splitlines() == capsys.readouterr().out.splitlines()[
+        :3
+    ]

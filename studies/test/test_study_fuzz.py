@@ -1,4 +1,6 @@
-"""Who fuzzes notices what is no InputError, takes too long or takes too much, and goes on behind it."""
+"""Who fuzzes notices what is no InputError, takes too long or takes too much, and goes on behind
+it.
+"""
 
 from mmap import mmap
 
@@ -56,7 +58,9 @@ def test_what_is_found(monkeypatch, tmp_path, capsys, work, said):
     outcomes, slowest, largest, findings = fuzz.fuzz("yaml", 0, 0, 3)
     assert outcomes.total() == 3 and slowest < 1.0
     assert (largest > 19.0) == (work is holds)
-    assert main(["fuzz", "yaml", "--count", "3", "--out", str(tmp_path / "out")]) == (said is not None)
+    assert main(["fuzz", "yaml", "--count", "3", "--out", str(tmp_path / "out")]) == (
+        said is not None
+    )
     if said is None:
         assert not findings and not (tmp_path / "out").exists()
     else:
@@ -65,4 +69,6 @@ def test_what_is_found(monkeypatch, tmp_path, capsys, work, said):
 
 
 def test_a_file_is_made_again_by_its_number():
-    assert [fuzz.changed("yaml", 1, number) for number in range(5)] == [fuzz.changed("yaml", 1, number) for number in range(5)]
+    assert [fuzz.changed("yaml", 1, number) for number in range(5)] == [
+        fuzz.changed("yaml", 1, number) for number in range(5)
+    ]

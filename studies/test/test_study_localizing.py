@@ -2,19 +2,30 @@
 
 import numpy as np
 
+from studies import calibrating, localizing
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.readers.inputs import Reading
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
-from studies import calibrating, localizing
-
 
 def test_verdicts_are_compared_with_what_is_true(tmp_path, monkeypatch):
-    monkeypatch.setattr(localizing, "MISTAKES", {name: localizing.MISTAKES[name] for name in ("sign", "in_g", "another_room")})
-    flight = simulate(SimulationConfig(seed=1, duration=14.0, floor_time=1.0, imu_rate=100.0, bias=False, multipath=False))
+    monkeypatch.setattr(
+        localizing,
+        "MISTAKES",
+        {name: localizing.MISTAKES[name] for name in ("sign", "in_g", "another_room")},
+    )
+    flight = simulate(
+        SimulationConfig(
+            seed=1, duration=14.0, floor_time=1.0, imu_rate=100.0, bias=False, multipath=False
+        )
+    )
     write_bag(flight, tmp_path / "flight.bag")
     plain, sign, in_g = localizing.judge((tmp_path / "flight.bag", None), Reading(), mistakes=True)
-    assert (plain["mistake"], plain["verdict"], plain["within"]) == ("nothing", "good", True) and plain["rmse"] < 0.2
+    assert (plain["mistake"], plain["verdict"], plain["within"]) == (
+        "nothing",
+        "good",
+        True,
+    ) and plain["rmse"] < 0.2
     assert (sign["mistake"], sign["verdict"], sign["within"]) == ("sign", "bad", False)
     assert in_g["mistake"] == "in_g" and in_g["verdict"] == "bad"
     assert localizing.summary([plain, sign, in_g]).split(" | ")[:3] == ["1", "1", "2"]

@@ -11,10 +11,18 @@ OUTPUTS = [(words, action) for words, parser in PARSERS.items() for action in ou
 
 
 def test_every_option_that_takes_a_path_is_an_output_or_read():
-    assert {words: unknown(parser) for words, parser in PARSERS.items() if unknown(parser)} == {} and len(OUTPUTS) > 15
+    assert {
+        words: unknown(parser) for words, parser in PARSERS.items() if unknown(parser)
+    } == {} and len(OUTPUTS) > 15
 
 
-@pytest.mark.parametrize(("words", "action"), OUTPUTS, ids=[f"{' '.join(words[1:])} {action.dest}" for words, action in OUTPUTS])
-def test_no_study_writes_through_a_link_or_over_what_it_reads(place, capsys, monkeypatch, words, action):  # noqa: F811
+@pytest.mark.parametrize(
+    ("words", "action"),
+    OUTPUTS,
+    ids=[f"{' '.join(words[1:])} {action.dest}" for words, action in OUTPUTS],
+)
+def test_no_study_writes_through_a_link_or_over_what_it_reads(
+    place, capsys, monkeypatch, words, action
+):  # noqa: F811
     monkeypatch.setattr(studies, "parser", lambda: PARSER)  # made once
     attack(studies.main, words, PARSERS[words], action, place, capsys)

@@ -1,4 +1,6 @@
-"""What comes over the radio of a Crazyflie, sampled and late, to streams; and the example node on that."""
+"""What comes over the radio of a Crazyflie, sampled and late, to streams; and the example node on
+that.
+"""
 
 from dataclasses import replace
 import json
@@ -10,12 +12,11 @@ from documented import ROOT
 import numpy as np
 import pytest
 
+from studies.radio_link import BLOCKS, PAIRS, Link, as_received, messages, streamed
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools.crazyflie.log_blocks import PERIOD, LogBlock
 from uwb_tdoa_tools.scoring.evaluation import evaluate
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-
-from studies.radio_link import BLOCKS, PAIRS, Link, as_received, messages, streamed
 
 
 @pytest.fixture(scope="module")
@@ -34,14 +35,19 @@ def test_what_is_sent_fits_the_link(flight):
 
 def test_what_comes_out_was_measured_and_in_time(flight):
     made = streamed(flight, Link())
-    known = {pair: np.flatnonzero((flight.tdoa.a == pair[0]) & (flight.tdoa.b == pair[1])) for pair in pairs()}
+    known = {
+        pair: np.flatnonzero((flight.tdoa.a == pair[0]) & (flight.tdoa.b == pair[1]))
+        for pair in pairs()
+    }
     late = []
     for t, a, b, d in zip(made.tdoa.t, made.tdoa.a, made.tdoa.b, made.tdoa.d):
         rows = known[a, b]
         row = rows[np.argmin(np.abs(flight.tdoa.d[rows] - d))]
         assert abs(flight.tdoa.d[row] - d) < 1e-6
         late.append(t - flight.tdoa.t[row])
-    assert np.median(late) == pytest.approx(Link().latency, abs=0.003) and np.ptp(late) < 2.0 * PERIOD
+    assert (
+        np.median(late) == pytest.approx(Link().latency, abs=0.003) and np.ptp(late) < 2.0 * PERIOD
+    )
     assert 0.7 < len(made.tdoa) / len(flight.tdoa) <= 1.0
     assert len(as_received(flight, Link()).tdoa) > 1.5 * len(flight.tdoa)
     assert 1.0 / np.median(np.diff(made.imu.t)) == pytest.approx(1.0 / PERIOD, rel=0.1)
@@ -113,7 +119,9 @@ def test_the_example_over_topics_gives_what_the_converter_gives(flight, tmp_path
     pytest.importorskip("colcon_core")
     package = tmp_path / "src" / "crazyflie_interfaces"
     (package / "msg").mkdir(parents=True)
-    (package / "msg" / "LogDataGeneric.msg").write_text("std_msgs/Header header\nuint32 timestamp\nfloat32[] values\n")
+    (package / "msg" / "LogDataGeneric.msg").write_text(
+        "std_msgs/Header header\nuint32 timestamp\nfloat32[] values\n"
+    )
     (package / "CMakeLists.txt").write_text(CMAKE)
     ours = (ROOT / "src" / "uwb_tdoa_msgs" / "package.xml").read_text()
     without = "".join(line for line in ours.splitlines(True) if "geometry_msgs" not in line)
@@ -121,7 +129,10 @@ def test_the_example_over_topics_gives_what_the_converter_gives(flight, tmp_path
     build = [sys.executable, "-m", "colcon", "--log-base", "log", "build", "--merge-install"]
     build += ["--cmake-args", f"-DPython3_EXECUTABLE={sys.executable}"]
     subprocess.run(build, cwd=tmp_path, check=True, capture_output=True)
-    short, link = replace(flight, tdoa=_until(flight.tdoa, 4.0), imu=_until(flight.imu, 4.0)), Link()
+    short, link = (
+        replace(flight, tdoa=_until(flight.tdoa, 4.0), imu=_until(flight.imu, 4.0)),
+        Link(),
+    )
     blocks, sent, answers = [LogBlock(variables) for variables in BLOCKS], [], 0
     for arrival, number, timestamp, values in messages(short, link, np.random.default_rng(0)):
         pairs, sample = blocks[number].take(timestamp, values)
@@ -129,9 +140,13 @@ def test_the_example_over_topics_gives_what_the_converter_gives(flight, tmp_path
         sent.append((arrival, number, int(timestamp), values.tolist(), answers))
     (tmp_path / "sent.json").write_text(json.dumps(sent))
     (tmp_path / "player.py").write_text(PLAYER)
-    # Not by `node & kill -INT $!` of a shell, which has SIGINT ignored in the background: rclpy then wakes the node before it ends its
+    # Not by `node & kill -INT $!` of a shell, which has SIGINT ignored in the background: rclpy
+    # then wakes the node before it ends its
     # context, and a node that waits anew between the two waits for ever.
-    with _python(tmp_path, ROOT / "docs/connect/crazyflie_node.py") as node, _python(tmp_path, "player.py", "sent.json") as player:
+    with (
+        _python(tmp_path, ROOT / "docs/connect/crazyflie_node.py") as node,
+        _python(tmp_path, "player.py", "sent.json") as player,
+    ):
         try:
             out, error = player.communicate(timeout=600)
             node.send_signal(signal.SIGINT)
@@ -144,13 +159,24 @@ def test_the_example_over_topics_gives_what_the_converter_gives(flight, tmp_path
     assert len(t) == len(expected.tdoa) and len(got["samples"]) == len(expected.imu)
     np.testing.assert_allclose(np.sort(t), np.sort(expected.tdoa.t), atol=1e-6)
     np.testing.assert_allclose(np.sort(d), np.sort(expected.tdoa.d), atol=1e-9)
-    assert np.mean([z for _, z in got["samples"]]) == pytest.approx(expected.imu.accel[:, 2].mean(), abs=1e-6)
+    assert np.mean([z for _, z in got["samples"]]) == pytest.approx(
+        expected.imu.accel[:, 2].mean(), abs=1e-6
+    )
 
 
 def _python(folder, *words):
     """A running Python that knows the messages built in a folder."""
-    command = ["bash", "-c", 'source install/local_setup.bash; exec "$@"', "bash", sys.executable, *map(str, words)]
-    return subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    command = [
+        "bash",
+        "-c",
+        'source install/local_setup.bash; exec "$@"',
+        "bash",
+        sys.executable,
+        *map(str, words),
+    ]
+    return subprocess.Popen(
+        command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
 
 
 def _until(stream, length):

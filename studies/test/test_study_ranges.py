@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
+from studies import ranges
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools.scoring.evaluation import evaluate
-
-from studies import ranges
 
 
 @pytest.fixture(scope="module")
@@ -30,7 +29,10 @@ def test_no_set_is_worse_than_the_bound_of_one_round(flight, what):
 
 
 def test_told_the_noise_both_are_better_than_each(flight):
-    error = {what: evaluate(taken(flight), ranges.KNOWN)[0].row()["rmse_3d"] for what, taken in ranges.SETS.items()}
+    error = {
+        what: evaluate(taken(flight), ranges.KNOWN)[0].row()["rmse_3d"]
+        for what, taken in ranges.SETS.items()
+    }
     assert error["both"] < 1.02 * min(error["ranges"], error["TDOAs"])
 
 
@@ -44,5 +46,6 @@ def test_faulty_ranges_do_no_harm_beside_tdoas(flight, name):
 def test_a_row_has_means_and_the_largest_ratio():
     rows = [{"rmse_3d": 0.1, "nees_mean": 1.0}, {"rmse_3d": 0.3, "nees_mean": 2.0}]
     assert (
-        ranges.line("ranges", "defaults", rows, [0.2, 0.2]) == "| ranges | defaults | 0.200 m | 0.200 m | 1.50 | 1.50 |"
+        ranges.line("ranges", "defaults", rows, [0.2, 0.2])
+        == "| ranges | defaults | 0.200 m | 0.200 m | 1.50 | 1.50 |"
     )

@@ -2,9 +2,8 @@
 
 import argparse
 
-from uwb_tdoa_tools.readers import read_flight
-
 from studies import scale
+from uwb_tdoa_tools.readers import read_flight
 
 
 def test_cases_are_done_once_and_make_one_table(tmp_path, monkeypatch, capsys):
@@ -24,8 +23,12 @@ def test_cases_are_done_once_and_make_one_table(tmp_path, monkeypatch, capsys):
     first, rule, *rows = capsys.readouterr().out.splitlines()[-12:]
     assert first.startswith("| tool | flights |") and rule.count("|") == first.count("|")
     assert "| evaluate | 100 | 8 | 0 | 52.0 | 0.500 | 500 | 3.000 |" in rows
-    assert "| evaluate | 10 | 8 | 5 | 7.0 |  | 230 |  |" in rows  # none with fewer flights to compare it with
-    assert rows == sorted(rows, key=lambda row: [int(cell) for cell in (row.split(" | ")[k] for k in (2, 3, 1))])
+    assert (
+        "| evaluate | 10 | 8 | 5 | 7.0 |  | 230 |  |" in rows
+    )  # none with fewer flights to compare it with
+    assert rows == sorted(
+        rows, key=lambda row: [int(cell) for cell in (row.split(" | ")[k] for k in (2, 3, 1))]
+    )
 
 
 def test_flights_are_made_once_each_with_another_seed(tmp_path):
@@ -33,4 +36,7 @@ def test_flights_are_made_once_each_with_another_seed(tmp_path):
     flights = [read_flight(path) for path in paths]
     assert flights[0].name != flights[1].name and len(flights[0].tdoa) > 2000
     before = [path.stat().st_mtime_ns for path in paths]
-    assert scale.make_flights(2, 8, tmp_path) == paths and [path.stat().st_mtime_ns for path in paths] == before
+    assert (
+        scale.make_flights(2, 8, tmp_path) == paths
+        and [path.stat().st_mtime_ns for path in paths] == before
+    )

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
+from studies.closed_loop.sines import Sines
 from uwb_tdoa_tools.flying.path import SINK
 from uwb_tdoa_tools.simulation.constellations import constellation
 from uwb_tdoa_tools.simulation.room import room_of
-
-from studies.closed_loop.sines import Sines
 
 ROOM = room_of(constellation("corners"))
 GROUND = 0.03
@@ -25,7 +24,9 @@ def test_it_begins_and_ends_at_rest_in_one_place_and_then_sinks():
     for k, height in ((0, GROUND), (-1, GROUND + 0.4)):
         np.testing.assert_allclose(wanted[k, 0], [0.3, -0.2, height], atol=0.01)
         np.testing.assert_allclose(wanted[k, 1], 0.0, atol=0.02)
-    np.testing.assert_allclose(np.gradient(wanted[:, 0], t, axis=0)[1:-1], wanted[1:-1, 1], atol=0.02)
+    np.testing.assert_allclose(
+        np.gradient(wanted[:, 0], t, axis=0)[1:-1], wanted[1:-1, 1], atol=0.02
+    )
     after = reference.at(np.array([t[-1] + 1.1]))[0]
     assert np.isnan(after[0, 2]) and after[1, 2] == -SINK
 
@@ -34,7 +35,11 @@ def test_sines_fill_the_room_stay_inside_and_turn():
     reference, t, wanted = followed(3, (0.0, 0.0))
     air = wanted[(t > 10.0) & (t < 56.0), 0]
     low, high = ROOM.flyable
-    assert (air >= low).all() and (air <= high).all() and (np.ptp(air, axis=0) > 0.4 * (high - low)).all()
+    assert (
+        (air >= low).all()
+        and (air <= high).all()
+        and (np.ptp(air, axis=0) > 0.4 * (high - low)).all()
+    )
     speed = np.linalg.norm(wanted[:, 1], axis=1)
     assert np.sqrt(np.mean(speed**2)) == pytest.approx(0.7, abs=0.2) and speed.max() < 2.0
     assert reference.turned(10.0) == pytest.approx(3.0)

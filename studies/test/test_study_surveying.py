@@ -7,9 +7,8 @@ from known_effects import MARK_STD, clean_flight, marks_of
 import numpy as np
 import pytest
 
-from uwb_tdoa_tools.diagnosis.self_calibration import Tape
-
 from studies.surveying import END_STD, add_options, draw, ends_of, odometry_of, third
+from uwb_tdoa_tools.diagnosis.self_calibration import Tape
 
 
 @pytest.fixture(scope="module")
@@ -24,18 +23,25 @@ def test_a_third_of_the_coordinates_are_trusted(flight):
 
 def test_marks_are_where_the_tag_was(flight):
     for mark in marks_of(flight, 6, np.random.default_rng(0)):
-        inside = (flight.truth.t - flight.tdoa.t[0] >= mark.first) & (flight.truth.t - flight.tdoa.t[0] <= mark.last)
+        inside = (flight.truth.t - flight.tdoa.t[0] >= mark.first) & (
+            flight.truth.t - flight.tdoa.t[0] <= mark.last
+        )
         assert np.linalg.norm(flight.truth.p[inside].mean(axis=0) - mark.position) < 5.0 * MARK_STD
 
 
 def test_marks_of_the_ends_are_on_the_floor(flight):
     first, last = ends_of(flight, 1, np.random.default_rng(0))
-    assert first.last < last.first and max(abs(first.position[2]), abs(last.position[2])) < 5.0 * END_STD
+    assert (
+        first.last < last.first
+        and max(abs(first.position[2]), abs(last.position[2])) < 5.0 * END_STD
+    )
 
 
 def test_an_odometry_is_the_path_in_another_frame_that_drifts(flight):
     (path,) = odometry_of(flight, 1, np.random.default_rng(0))
-    true = np.stack([np.interp(path.t, flight.truth.t, column) for column in flight.truth.p.T], axis=1)
+    true = np.stack(
+        [np.interp(path.t, flight.truth.t, column) for column in flight.truth.p.T], axis=1
+    )
     assert np.abs(path.p - true).max() > 0.5
     laid, _ = path.laid(path.t[::40], true[::40], [], path.t[0], path.t)
     assert np.sqrt(np.mean((laid - true) ** 2)) < 0.1
@@ -45,7 +51,10 @@ def test_an_odometry_is_the_path_in_another_frame_that_drifts(flight):
 def test_a_draw_makes_a_shaken_survey_better_and_repeats(flight):
     first, again = (draw([flight], [clean_flight(211, 30.0)], 0.3, 0) for _ in range(2))
     assert first == again and first["applied"]
-    assert first["surveyed"] < 0.5 * first["shaken"] and first["anchors_surveyed"] < first["anchors_shaken"]
+    assert (
+        first["surveyed"] < 0.5 * first["shaken"]
+        and first["anchors_surveyed"] < first["anchors_shaken"]
+    )
 
 
 def test_its_options_are_read():

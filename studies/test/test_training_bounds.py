@@ -3,10 +3,9 @@
 import numpy as np
 from training_flights import flight
 
+from studies.training.bounds import oracle, repeatability, rmse
 from uwb_tdoa_bias.effects import EFFECTS
 from uwb_tdoa_tools.training.labels import labels
-
-from studies.training.bounds import oracle, repeatability, rmse
 
 PLAIN = {"bias": False, "outlier_probability": 0.0, "trajectory": "circle"}
 

@@ -1,4 +1,6 @@
-"""What any model of the pose could reach at most, and how much of the errors comes again at the same place."""
+"""What any model of the pose could reach at most, and how much of the errors comes again at the
+same place.
+"""
 
 from types import SimpleNamespace
 
@@ -16,25 +18,35 @@ CELL = 0.3  # m, size of the cells in which residuals of two flights are compare
 
 def rmse(flight, corrector=None):
     """3D RMSE of the filter's estimate on a Flight, m."""
-    return Score(flight.name, run_offline(flight, corrector=corrector).odometry, flight.truth).row()["rmse_3d"]
+    return Score(
+        flight.name, run_offline(flight, corrector=corrector).odometry, flight.truth
+    ).row()["rmse_3d"]
 
 
 def oracle(flight, window):
-    """A stand-in for a Corrector that knows the error of each TDOA from the ground truth, smoothed over `window` s.
+    """A stand-in for a Corrector that knows the error of each TDOA from the ground truth, smoothed
+    over `window` s.
 
-    The running median of a pair's own errors: a bound for every model that follows the error no faster than this.
+    The running median of a pair's own errors: a bound for every model that follows the error no
+    faster than this.
     """
     data, anchors, truth = flight.tdoa, flight.anchors, flight.truth
     a, b = anchors.index(data.a), anchors.index(data.b)
     p = position_at(data.t, truth)
     error = data.d - tdoa(p, anchors.positions[a], anchors.positions[b])
     _, first, last = judged_part(truth)
-    bias, sane = np.zeros(len(data)), (np.abs(error) <= LARGEST) & (data.t >= first) & (data.t <= last)
+    bias, sane = (
+        np.zeros(len(data)),
+        (np.abs(error) <= LARGEST) & (data.t >= first) & (data.t <= last),
+    )
     pair = a * len(anchors) + b
     for one in np.unique(pair):
         rows = np.flatnonzero(pair == one)
         good = rows[sane[rows]]
-        starts, ends = (np.searchsorted(data.t[good], data.t[rows] + half) for half in (-0.5 * window, 0.5 * window))
+        starts, ends = (
+            np.searchsorted(data.t[good], data.t[rows] + half)
+            for half in (-0.5 * window, 0.5 * window)
+        )
         bias[rows] = [np.median(error[good[i:k]]) if k > i else 0.0 for i, k in zip(starts, ends)]
     table = {key: value for key, value in zip(zip(data.t, data.a, data.b, data.d), bias)}
 
@@ -47,13 +59,21 @@ def oracle(flight, window):
         return None
 
     return SimpleNamespace(
-        idle=False, lag=np.inf, effects=EffectSet(), weighed=EffectSet(), correct=correct, add_pose=nothing, reset=nothing
+        idle=False,
+        lag=np.inf,
+        effects=EffectSet(),
+        weighed=EffectSet(),
+        correct=correct,
+        add_pose=nothing,
+        reset=nothing,
     )
 
 
 def repeatability(one, other):
-    """How much of the errors of two flights is alike at the same place: (correlation, cells compared), over the medians
-    per pair of anchors and cell of 0.3 m that both flew through. one, other : Labels."""
+    """How much of the errors of two flights is alike at the same place: (correlation, cells
+    compared), over the medians per pair of anchors and cell of 0.3 m that both flew through. one,
+    other : Labels.
+    """
     maps = []
     for labels in (one, other):
         s = labels.samples
@@ -62,7 +82,13 @@ def repeatability(one, other):
         kinds, which = np.unique(keys, axis=0, return_inverse=True)
         order = np.argsort(which.ravel(), kind="stable")
         parts = np.split(labels.error[order], np.cumsum(np.bincount(which.ravel()))[:-1])
-        maps.append({tuple(kind): np.median(part) for kind, part in zip(kinds.tolist(), parts) if len(part) >= 5})
+        maps.append(
+            {
+                tuple(kind): np.median(part)
+                for kind, part in zip(kinds.tolist(), parts)
+                if len(part) >= 5
+            }
+        )
     shared = sorted(set(maps[0]) & set(maps[1]))
     if len(shared) < 20:
         return float("nan"), len(shared)

@@ -1,7 +1,9 @@
-"""compare-models: train bias models on some flights, run the filter with each of them, and with none, on others, and
-print the 3D RMSE, in metres. With --bound beside them: the filter with the true errors, smoothed, a bound for any model
-of the pose. With --simulated N both are simulated: N flights in each of three constellations, and of three others.
-Writes to --out: table.md, comparison.json, histograms.png, rmse.png, and each model in a folder of its own."""
+"""compare-models: train bias models on some flights, run the filter with each of them, and with
+none, on others, and print the 3D RMSE, in metres. With --bound beside them: the filter with the
+true errors, smoothed, a bound for any model of the pose. With --simulated N both are simulated: N
+flights in each of three constellations, and of three others. Writes to --out: table.md,
+comparison.json, histograms.png, rmse.png, and each model in a folder of its own.
+"""
 
 from functools import partial
 import json
@@ -11,9 +13,9 @@ from tqdm import tqdm
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.files import write_text
 from uwb_tdoa_bias.foundation.flight import AIDS
+from uwb_tdoa_tools.outputs import OutputFolder
 from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.training import models
-from uwb_tdoa_tools.outputs import OutputFolder
 
 from . import simulated
 from .comparison import compare
@@ -24,14 +26,33 @@ def add_options(add):
     """The options of the study."""
     add("--train", nargs="+", metavar="FLIGHT", help=inputs.HELP)
     add(
-        "--test", nargs="+", action="append", default=[], metavar="GROUP FLIGHT",
+        "--test",
+        nargs="+",
+        action="append",
+        default=[],
+        metavar="GROUP FLIGHT",
         help="a name for a group of flights, and the flights; may be repeated",
-    )  # fmt: skip
+    )
     add("--simulated", type=int, metavar="N", help="simulate the flights, N in each constellation")
     add("--survey", metavar="S", help=inputs.SURVEY_HELP)
-    add("--models", nargs="+", choices=models.KINDS, default=list(models.KINDS), help="(default: all)")
-    add("--validation", metavar="NAME", nargs="+", help="flights to validate on (default: one in five)")
-    add("--bound", action="store_true", help="with bounds, and how alike flights are, place by place")
+    add(
+        "--models",
+        nargs="+",
+        choices=models.KINDS,
+        default=list(models.KINDS),
+        help="(default: all)",
+    )
+    add(
+        "--validation",
+        metavar="NAME",
+        nargs="+",
+        help="flights to validate on (default: one in five)",
+    )
+    add(
+        "--bound",
+        action="store_true",
+        help="with bounds, and how alike flights are, place by place",
+    )
     add("--out", metavar="DIR", type=OutputFolder, required=True, help="where to write")
     add("--seed", metavar="N", type=int, default=0, help="of everything random (default: 0)")
 
@@ -53,7 +74,9 @@ def _simulated(args):
     bar = partial(tqdm, desc="simulating", unit="flight", disable=None, leave=False)
     first = 1000 * args.seed
     train = simulated.flights(simulated.TRAINING, args.simulated, first + 100, bar)
-    return sum(train.values(), []), simulated.flights(simulated.UNSEEN, args.simulated, first + 500, bar)
+    return sum(train.values(), []), simulated.flights(
+        simulated.UNSEEN, args.simulated, first + 500, bar
+    )
 
 
 def _measured(args):
@@ -66,9 +89,13 @@ def _measured(args):
             raise InputError(f"--test: {name} names no flight; write --test NAME FLIGHT...")
         tests[name] = _read(paths, args.survey)
     train = _read(args.train, args.survey)
-    both = {flight.name for flight in train} & {flight.name for group in tests.values() for flight in group}
+    both = {flight.name for flight in train} & {
+        flight.name for group in tests.values() for flight in group
+    }
     if both:
-        raise InputError(f"--test: {sorted(both)[0]} is among the flights to train on; test on others.")
+        raise InputError(
+            f"--test: {sorted(both)[0]} is among the flights to train on; test on others."
+        )
     return train, tests
 
 

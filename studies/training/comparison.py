@@ -1,4 +1,6 @@
-"""Every kind of bias model trained on the same flights, and what the filter reaches with each on others."""
+"""Every kind of bias model trained on the same flights, and what the filter reaches with each on
+others.
+"""
 
 import numpy as np
 from tqdm import tqdm
@@ -20,12 +22,17 @@ BOUNDS = {"oracle 0.5 s": 0.5, "oracle 1 s": 1.0, "oracle 2 s": 2.0}
 def compare(train, tests, kinds, out, seed=0, validation=None, bound=False):
     """Train, run, and draw. Returns a dict of plain values.
 
-    train : list of Flight; tests : {group: list of Flight}; kinds : of models.KINDS; out : folder, Path; validation :
+    train : list of Flight; tests : {group: list of Flight}; kinds : of models.KINDS; out : folder,
+        Path; validation :
     names or None; bound : with oracles and repeatability. Raises InputError.
     """
     out.mkdir(parents=True, exist_ok=True)
     names, correctors, skipped = _trained(train, kinds, out, seed, validation)
-    rows, errors, normalised = [], {kind: [] for kind in correctors}, {kind: [] for kind in correctors}
+    rows, errors, normalised = (
+        [],
+        {kind: [] for kind in correctors},
+        {kind: [] for kind in correctors},
+    )
     scores = {group: {kind: [] for kind in correctors} for group in tests}
     for group, flights in tests.items():
         for flight in tqdm(flights, desc=group, unit="flight", disable=None, leave=False):
@@ -38,41 +45,69 @@ def compare(train, tests, kinds, out, seed=0, validation=None, bound=False):
                 error, std = remaining(labels, effects, network)
                 errors[kind].append(error)
                 if network:
-                    normalised[kind].append(error**2 / (std**2 + labelling.white_noise([labels]) ** 2))
+                    normalised[kind].append(
+                        error**2 / (std**2 + labelling.white_noise([labels]) ** 2)
+                    )
             if bound:
-                row |= {name: bounds.rmse(flight, bounds.oracle(flight, window)) for name, window in BOUNDS.items()}
+                row |= {
+                    name: bounds.rmse(flight, bounds.oracle(flight, window))
+                    for name, window in BOUNDS.items()
+                }
             rows.append(row)
     errors = {kind: np.concatenate(parts) for kind, parts in errors.items()}
-    report = {"training": names[0], "validation": names[1], "skipped": skipped, "runs": rows, "seed": seed}
-    report["tdoa_rms"] = {kind: float(np.sqrt(np.mean(values**2))) for kind, values in errors.items()}
+    report = {
+        "training": names[0],
+        "validation": names[1],
+        "skipped": skipped,
+        "runs": rows,
+        "seed": seed,
+    }
+    report["tdoa_rms"] = {
+        kind: float(np.sqrt(np.mean(values**2))) for kind, values in errors.items()
+    }
     report["normalised_variance"] = {
         kind: float(np.mean(np.concatenate(parts))) for kind, parts in normalised.items() if parts
     }
     report["consistency"] = {
-        group: {kind: _consistency(some) for kind, some in parts.items()} for group, parts in scores.items()
+        group: {kind: _consistency(some) for kind, some in parts.items()}
+        for group, parts in scores.items()
     }
-    report["groups"] = {group: _means([row for row in rows if row["group"] == group]) for group in tests}
+    report["groups"] = {
+        group: _means([row for row in rows if row["group"] == group]) for group in tests
+    }
     if bound:
-        report["repeatability"] = _repeatability([labelling.labels(flight) for flight in train], tests)
+        report["repeatability"] = _repeatability(
+            [labelling.labels(flight) for flight in train], tests
+        )
     plot_histograms(errors, out / "histograms.png")
-    bars = {group: {kind: means[kind] for kind in correctors} for group, means in report["groups"].items()}
+    bars = {
+        group: {kind: means[kind] for kind in correctors}
+        for group, means in report["groups"].items()
+    }
     plot_bars(bars, out / "rmse.png")
     return report
 
 
 def _trained(train, kinds, out, seed, validation):
-    """((names to train on, to validate on), {kind: (EffectSet or None, Network or None)}, {kind left out: why})."""
+    """((names to train on, to validate on), {kind: (EffectSet or None, Network or None)}, {kind
+    left out: why}).
+    """
     known = {flight.name: flight for flight in train}
     names = labelling.split(list(known), seed, validation)
     correctors, skipped = {"none": (None, None)}, {}
     parts = [[known[name] for name in group] for group in names]
-    effects_found = physics.find(sum(parts, [])) if any(kind.startswith("physics") for kind in kinds) else None
+    effects_found = (
+        physics.find(sum(parts, [])) if any(kind.startswith("physics") for kind in kinds) else None
+    )
     for kind in kinds:
+
         def say(text, kind=kind):
             tqdm.write(f"{kind}: {text}")
 
         try:
-            trained = models.train(models.Recipe(kind, seed), *parts, kind, progress=say, found=effects_found)
+            trained = models.train(
+                models.Recipe(kind, seed), *parts, kind, progress=say, found=effects_found
+            )
         except InputError as error:
             skipped[kind] = str(error)
             tqdm.write(f"{kind}: left out: {error}")
@@ -80,12 +115,17 @@ def _trained(train, kinds, out, seed, validation):
         folder = out / kind.replace("+", "_")
         folder.mkdir(exist_ok=True)
         model, effects = models.save(trained, folder)
-        correctors[kind] = (EffectSet.from_yaml(effects) if effects else None, Network(model) if model else None)
+        correctors[kind] = (
+            EffectSet.from_yaml(effects) if effects else None,
+            Network(model) if model else None,
+        )
     return names, correctors, skipped
 
 
 def remaining(labels, effects, network):
-    """Errors of the TDOAs of Labels after correction at the true poses, and the deviation predicted: (n,), (n,) m."""
+    """Errors of the TDOAs of Labels after correction at the true poses, and the deviation
+    predicted: (n,), (n,) m.
+    """
     samples, left, std = labels.samples, labels.error.copy(), np.zeros(len(labels))
     if effects:
         left -= effects.bias(samples)
@@ -96,10 +136,18 @@ def remaining(labels, effects, network):
 
 
 def _repeatability(known, tests):
-    """{which pairs: (mean correlation, number of pairs)} of training flights with each other and with each group."""
-    found = {"training with training": [(one, other) for k, one in enumerate(known) for other in known[:k]]}
+    """{which pairs: (mean correlation, number of pairs)} of training flights with each other and
+    with each group.
+    """
+    found = {
+        "training with training": [
+            (one, other) for k, one in enumerate(known) for other in known[:k]
+        ]
+    }
     for group, flights in tests.items():
-        found[f"training with {group}"] = [(labelling.labels(flight), one) for flight in flights for one in known]
+        found[f"training with {group}"] = [
+            (labelling.labels(flight), one) for flight in flights for one in known
+        ]
     out = {}
     for name, pairs in found.items():
         values = np.array([bounds.repeatability(one, other)[0] for one, other in pairs])
@@ -109,10 +157,16 @@ def _repeatability(known, tests):
 
 
 def _consistency(scores):
-    """(NEES of the position, share of the time inside three standard deviations on the worst axis), runs pooled."""
+    """(NEES of the position, share of the time inside three standard deviations on the worst axis),
+    runs pooled.
+    """
     together = pooled(scores)
     return together["nees_mean"], min(together[f"coverage_3sigma_{axis}"] for axis in "xyz")
 
 
 def _means(rows):
-    return {key: float(np.mean([row[key] for row in rows])) for key in rows[0] if key not in ("group", "flight")}
+    return {
+        key: float(np.mean([row[key] for row in rows]))
+        for key in rows[0]
+        if key not in ("group", "flight")
+    }

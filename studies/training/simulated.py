@@ -9,6 +9,7 @@ from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
+
     from uwb_tdoa_bias.foundation.flight import Flight
 
 TRAINING = ("corners", "wall_middles", "staircase")
@@ -18,13 +19,16 @@ DURATION = 40.0  # s
 
 
 def flights(
-    constellations: Sequence[str], count: int, first_seed: int,
+    constellations: Sequence[str],
+    count: int,
+    first_seed: int,
     progress: Callable[[list[tuple[str, int]]], Iterable[tuple[str, int]]] = lambda names: names,
-) -> dict[str, list[Flight]]:  # fmt: skip
-    """{constellation: [Flight, ...]}, `count` each, of varied paths, yaws, protocols and tag specimens.
+) -> dict[str, list[Flight]]:
+    """{constellation: [Flight, ...]}, `count` each, of varied paths, yaws, protocols and tag
+    specimens.
 
-    The anchors' own delays are calibrated (zero): they are constants of single modules, which no model of poses can
-    know.
+    The anchors' own delays are calibrated (zero): they are constants of single modules, which no
+    model of poses can know.
     progress : wraps the list of what is to be flown, e.g. tqdm.
     """
     out: dict[str, list[Flight]] = {name: [] for name in constellations}

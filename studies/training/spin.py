@@ -1,5 +1,7 @@
-"""spin: simulate a tag that spins between two anchors, and draw the error of their TDOA over its yaw, for several
-orientations of anchor 0 and for five specimens of the tag. Counterpart of figure 4 of Zhao et al. (2021)."""
+"""spin: simulate a tag that spins between two anchors, and draw the error of their TDOA over its
+yaw, for several orientations of anchor 0 and for five specimens of the tag. Counterpart of figure 4
+of Zhao et al. (2021).
+"""
 
 from functools import partial
 
@@ -10,9 +12,9 @@ from uwb_tdoa_bias.effects import true_samples
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.files import write_filled
 from uwb_tdoa_bias.foundation.geometry import tdoa
+from uwb_tdoa_tools.outputs import OutputFile
 from uwb_tdoa_tools.scoring.plots import plt
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.outputs import OutputFile
 
 POSITIONS = ((0.0, 0.0, 1.2), (5.0, 0.0, 1.2))  # m, of the anchors 0 and 1
 PLACE, HEIGHT = (2.2, 1.5), 1.3  # m, of the tag
@@ -39,7 +41,10 @@ def run(args):
         apart = 100.0 * np.sqrt(np.mean(np.var([error for _, error in curves], axis=0)))
         size = 100.0 * np.mean([np.std(error) for _, error in curves])
         first = next(iter(cases))
-        print(f"{len(cases)} curves, {first} ...: spread over the yaw {size:.1f} cm, between them {apart:.1f} cm")
+        print(
+            f"{len(cases)} curves, {first} ...: spread over the yaw {size:.1f} cm, between "
+            f"them {apart:.1f} cm"
+        )
         ax.set(xlabel="yaw of the tag [deg]", xticks=range(0, 361, 90))
         ax.grid(alpha=0.3)
         ax.legend(fontsize="small")
@@ -56,10 +61,19 @@ def over_yaw(turn, unit, seed=0):
     """
     facing = Rotation.from_euler("z", [[turn], [180.0]], degrees=True).as_quat()
     config = SimulationConfig(
-        seed=seed, anchors=Anchors(np.array([0, 1]), np.array(POSITIONS), facing), trajectory="spin", place=PLACE,
-        height=HEIGHT, duration=26.0, start_in_air=True, imu_rate=100.0, tag_unit=unit, anchor_delay_std=0.0,
-        multipath=False, outlier_probability=0.0,
-    )  # fmt: skip
+        seed=seed,
+        anchors=Anchors(np.array([0, 1]), np.array(POSITIONS), facing),
+        trajectory="spin",
+        place=PLACE,
+        height=HEIGHT,
+        duration=26.0,
+        start_in_air=True,
+        imu_rate=100.0,
+        tag_unit=unit,
+        anchor_delay_std=0.0,
+        multipath=False,
+        outlier_probability=0.0,
+    )
     flight = simulate(config)
     samples, rows = true_samples(flight)
     sign = np.where(samples.a == 0, 1.0, -1.0)

@@ -1,6 +1,9 @@
-"""random-splits: every kind of bias model trained on some flights drawn at random, and judged on all others; by whole flights.
+"""random-splits: every kind of bias model trained on some flights drawn at random, and judged on
+all others; by whole flights.
 
-Each split goes to --out as one line of JSON as soon as it is done; what is there already is not done again."""
+Each split goes to --out as one line of JSON as soon as it is done; what is there already is not
+done again.
+"""
 
 from collections import defaultdict
 from pathlib import Path
@@ -11,11 +14,11 @@ from tqdm import tqdm
 
 from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.foundation.flight import AIDS
+from uwb_tdoa_tools.outputs import OutputFile
 from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.results_file import ResultsFile
 from uwb_tdoa_tools.scoring.shrinkage import best_share
 from uwb_tdoa_tools.training import models, physics, shrinking
-from uwb_tdoa_tools.outputs import OutputFile
 
 WORSE = 1.05  # ratio of errors beyond which a judged flight counts as harmed
 
@@ -24,8 +27,20 @@ def add_options(add):
     """The options of the study."""
     add("flights", nargs="+", metavar="FLIGHT", help=inputs.HELP)
     add("--survey", metavar="S", help=inputs.SURVEY_HELP)
-    add("--out", metavar="FILE", type=OutputFile, required=True, help="lines of JSON, one for each split and kind")
-    add("--models", nargs="+", choices=models.KINDS, default=list(models.KINDS), help="(default: all)")
+    add(
+        "--out",
+        metavar="FILE",
+        type=OutputFile,
+        required=True,
+        help="lines of JSON, one for each split and kind",
+    )
+    add(
+        "--models",
+        nargs="+",
+        choices=models.KINDS,
+        default=list(models.KINDS),
+        help="(default: all)",
+    )
     add("--splits", type=int, default=20, metavar="N", help="(default: 20)")
     add("--first", type=int, default=0, metavar="SEED", help="of the first split (default: 0)")
     add("--fit", type=int, default=4, metavar="N", help="flights to train on (default: 4)")
@@ -33,9 +48,13 @@ def add_options(add):
 
 def run(args):
     """Do the splits that are missing, and print the table of all."""
-    flights = [flight.without(*AIDS) for flight in inputs.Reading(args.survey).flights(args.flights)]
+    flights = [
+        flight.without(*AIDS) for flight in inputs.Reading(args.survey).flights(args.flights)
+    ]
     seeds, plain = range(args.first, args.first + args.splits), shrinking.uncorrected(flights)
-    with ResultsFile(args.out, {"fit": args.fit, "flights": [flight.name for flight in flights]}) as done:
+    with ResultsFile(
+        args.out, {"fit": args.fit, "flights": [flight.name for flight in flights]}
+    ) as done:
         for seed in tqdm(seeds, unit="split", disable=None):
             missing = [kind for kind in args.models if f"{kind} {seed}" not in done]
             for row in split(flights, plain, seed, args.fit, missing):
@@ -45,8 +64,10 @@ def run(args):
 
 
 def split(flights, plain, seed, fit, kinds):
-    """Yield, for each kind, a dict of one split: 3D RMSE of every left-out flight by share, and of every judged flight with the
-    share that is borne out, and with all. plain : of `shrinking.uncorrected`."""
+    """Yield, for each kind, a dict of one split: 3D RMSE of every left-out flight by share, and of
+    every judged flight with the share that is borne out, and with all. plain : of
+    `shrinking.uncorrected`.
+    """
     order = np.random.default_rng([seed, fit]).permutation(len(flights))
     chosen, others = ([flights[k] for k in part] for part in (order[:fit], order[fit:]))
     found = physics.find(chosen) if any(kind.startswith("physics") for kind in kinds) else None
@@ -54,20 +75,37 @@ def split(flights, plain, seed, fit, kinds):
         known = found if kind.startswith("physics") else None
         borne_out = shrinking.cross_validated(models.Recipe(kind, seed), chosen, plain, known)
         with TemporaryDirectory() as folder:
-            trained = models.train(models.Recipe(kind, seed), chosen[:-1], chosen[-1:], kind, found=known, curve=False)
+            trained = models.train(
+                models.Recipe(kind, seed), chosen[:-1], chosen[-1:], kind, found=known, curve=False
+            )
             model, _ = models.save(trained, Path(folder))
             network = Network(model) if model else None
             shares = sorted({borne_out.share, 1.0})
             errors = {
-                flight.name: shrinking.errors_by_share(flight, plain, trained.effects, network, shares) for flight in others
+                flight.name: shrinking.errors_by_share(
+                    flight, plain, trained.effects, network, shares
+                )
+                for flight in others
             }
-        yield {"seed": seed, "kind": kind, "left_out": borne_out.as_dict()["left_out"], "judged": _text(errors)}
+        yield {
+            "seed": seed,
+            "kind": kind,
+            "left_out": borne_out.as_dict()["left_out"],
+            "judged": _text(errors),
+        }
 
 
 def table(rows, shrunk):
-    """Markdown: a row for each kind. shrunk : with the shares that flights left out bear out, not all."""
+    """Markdown: a row for each kind. shrunk : with the shares that flights left out bear out, not
+    all.
+    """
     title = "as much as is borne out" if shrunk else "all of it"
-    lines = [f"| {title} | splits | gain | spread | worst split | largest ratio | flights worse by 5 % | expected | share |"]
+    lines = [
+        (
+            f"| {title} | splits | gain | spread | worst split | largest ratio | flights worse by "
+            "5 % | expected | share |"
+        )
+    ]
     lines.append("|---|" + 8 * "---:|")
     by_kind = defaultdict(list)
     for row in rows:
@@ -75,11 +113,15 @@ def table(rows, shrunk):
     for kind, some in by_kind.items():
         shares = [best_share(_numbers(row["left_out"])) if shrunk else 1.0 for row in some]
         ratios = [_ratios(row["judged"], share) for row, share in zip(some, shares)]
-        expected = np.mean([1.0 - _ratios(row["left_out"], share).mean() for row, share in zip(some, shares)])
+        expected = np.mean(
+            [1.0 - _ratios(row["left_out"], share).mean() for row, share in zip(some, shares)]
+        )
         gains, every = np.array([1.0 - each.mean() for each in ratios]), np.concatenate(ratios)
         lines.append(
-            f"| {kind} | {len(some)} | {gains.mean():.1%} | {gains.std(ddof=1) if len(some) > 1 else 0.0:.1%} | {gains.min():.1%} "
-            f"| {every.max():.2f} | {int((every > WORSE).sum())} of {len(every)} | {expected:.1%} | {np.mean(shares):.2f} |"
+            f"| {kind} | {len(some)} | {gains.mean():.1%} | "
+            f"{gains.std(ddof=1) if len(some) > 1 else 0.0:.1%} | {gains.min():.1%} "
+            f"| {every.max():.2f} | {int((every > WORSE).sum())} of {len(every)} | "
+            f"{expected:.1%} | {np.mean(shares):.2f} |"
         )
     return "\n".join(lines) + "\n"
 
@@ -94,4 +136,7 @@ def _text(errors):
 
 
 def _numbers(errors):
-    return {name: {None if share == "None" else float(share): error for share, error in of.items()} for name, of in errors.items()}
+    return {
+        name: {None if share == "None" else float(share): error for share, error in of.items()}
+        for name, of in errors.items()
+    }

@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.effects import RangeSamples, Samples
+from uwb_tdoa_bias.foundation.anchors import Anchors
 
 
 def random_rotation(rng):
@@ -16,7 +16,9 @@ def random_samples(seed, n=20, n_anchors=5):
     """Samples of n TDOAs between anchors in a cube of 10 m, all attitudes known."""
     rng = np.random.default_rng(seed)
     anchors = Anchors(
-        rng.permutation(100)[:n_anchors], rng.uniform(-5, 5, (n_anchors, 3)), rng.standard_normal((n_anchors, 4))
+        rng.permutation(100)[:n_anchors],
+        rng.uniform(-5, 5, (n_anchors, 3)),
+        rng.standard_normal((n_anchors, 4)),
     )
     a = rng.integers(0, n_anchors, n)
     b = (a + rng.integers(1, n_anchors, n)) % n_anchors

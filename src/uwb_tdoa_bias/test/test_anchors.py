@@ -1,4 +1,5 @@
-from hypothesis import given, strategies as st
+from hypothesis import given
+from hypothesis import strategies as st
 import numpy as np
 import pytest
 
@@ -33,8 +34,14 @@ def test_arrays_cannot_be_changed():
 def test_leaves_the_arrays_of_the_caller_alone():
     ids, positions, orientations = np.arange(3), np.eye(3), np.tile([0.0, 0.0, 0.0, 1.0], (3, 1))
     anchors = Anchors(ids, positions, orientations)
-    positions[0, 0], ids[0], orientations[0, 3] = 9.0, 9, 0.0  # the caller's own, to do with as it likes
-    assert anchors.positions[0, 0] == 1.0 and anchors.ids[0] == 0 and anchors.orientations[0, 3] == 1.0
+    positions[0, 0], ids[0], orientations[0, 3] = (
+        9.0,
+        9,
+        0.0,
+    )  # the caller's own, to do with as it likes
+    assert (
+        anchors.positions[0, 0] == 1.0 and anchors.ids[0] == 0 and anchors.orientations[0, 3] == 1.0
+    )
 
 
 @pytest.mark.parametrize(
@@ -94,7 +101,10 @@ def test_yaml_gives_back_what_was_written(tmp_path_factory, ids, random):
 
 def test_yaml_as_people_write_it(tmp_path):
     path = tmp_path / "anchors.yaml"
-    path.write_text("anchors:\n  2: {position: [1, 2.5, 3]}\n  '4': {position: [0, 0, 0], orientation: [0, 0, 1, 1]}\n")
+    path.write_text(
+        "anchors:\n  2: {position: [1, 2.5, 3]}\n  '4': {position: [0, 0, 0], orientation: "
+        "[0, 0, 1, 1]}\n"
+    )
     anchors = Anchors.from_yaml(path)
     assert anchors.ids.tolist() == [2, 4]
     assert anchors.positions[0].tolist() == [1, 2.5, 3]

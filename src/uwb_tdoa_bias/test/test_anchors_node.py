@@ -9,13 +9,14 @@ rclpy = pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from tf2_msgs.msg import TFMessage  # noqa: E402
+from visualization_msgs.msg import MarkerArray  # noqa: E402
+
 from uwb_tdoa_bias.anchors_node import PARAMETERS, AnchorsNode  # noqa: E402
 from uwb_tdoa_bias.foundation.anchors import Anchors  # noqa: E402
 from uwb_tdoa_bias.foundation.errors import InputError  # noqa: E402
 from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS, same_anchors  # noqa: E402
 from uwb_tdoa_bias.foundation.ros_frames import TF_STATIC_QOS  # noqa: E402
 from uwb_tdoa_msgs.msg import AnchorArray  # noqa: E402
-from visualization_msgs.msg import MarkerArray  # noqa: E402
 
 CONFIG = Path(__file__).resolve().parents[1] / "config" / "anchors_node.yaml"
 ANCHORS = Anchors([7, 3], [[1, 2, 3], [4, 5, 6]], [[0, 0, 0.6, 0.8], [np.nan] * 4], frame="hall")
@@ -36,18 +37,30 @@ def test_whoever_comes_later_gets_anchors_frames_and_markers():
         (TFMessage, "/tf_static", TF_STATIC_QOS),
         (MarkerArray, "uwb/anchors/markers", ANCHORS_QOS),
     ):
-        late.create_subscription(kind, topic, lambda message, kind=kind: got.update({kind: message}), qos)
+        late.create_subscription(
+            kind, topic, lambda message, kind=kind: got.update({kind: message}), qos
+        )
     until = time.monotonic() + 120.0
     while len(got) < 3 and time.monotonic() < until:
         rclpy.spin_once(late, timeout_sec=0.05)
     assert same_anchors(Anchors.from_message(got[AnchorArray]), ANCHORS)
     first, second = got[TFMessage].transforms
-    assert (first.header.frame_id, first.child_frame_id, first.transform.rotation.z) == ("hall", "anchor_7", 0.6)
-    assert (second.child_frame_id, second.transform.rotation.w) == ("anchor_3", 1.0)  # not known: level
+    assert (first.header.frame_id, first.child_frame_id, first.transform.rotation.z) == (
+        "hall",
+        "anchor_7",
+        0.6,
+    )
+    assert (second.child_frame_id, second.transform.rotation.w) == (
+        "anchor_3",
+        1.0,
+    )  # not known: level
     assert (second.transform.translation.x, second.transform.translation.z) == (4.0, 6.0)
     cubes = [marker for marker in got[MarkerArray].markers if marker.ns == "anchors"]
     assert [(marker.id, marker.pose.position.y) for marker in cubes] == [(7, 2.0), (3, 5.0)]
-    assert {marker.text for marker in got[MarkerArray].markers if marker.ns == "numbers"} == {"7", "3"}
+    assert {marker.text for marker in got[MarkerArray].markers if marker.ns == "numbers"} == {
+        "7",
+        "3",
+    }
     late.destroy_node()
     node.destroy_node()
 

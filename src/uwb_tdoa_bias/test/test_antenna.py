@@ -1,9 +1,14 @@
-import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+import numpy as np
+import pytest
 
-from uwb_tdoa_bias.foundation.antenna import DWM1000_AZIMUTH, DWM1000_ELEVATION_1, DWM1000_ELEVATION_2, Antenna
+from uwb_tdoa_bias.foundation.antenna import (
+    DWM1000_AZIMUTH,
+    DWM1000_ELEVATION_1,
+    DWM1000_ELEVATION_2,
+    Antenna,
+)
 from uwb_tdoa_bias.foundation.errors import InputError
 
 angles = st.floats(-np.pi, np.pi)
@@ -11,7 +16,9 @@ angles = st.floats(-np.pi, np.pi)
 
 def towards(theta, phi):
     theta, phi = np.broadcast_arrays(theta, phi)
-    return np.stack([np.cos(phi) * np.cos(theta), np.cos(phi) * np.sin(theta), np.sin(phi)], axis=-1)
+    return np.stack(
+        [np.cos(phi) * np.cos(theta), np.cos(phi) * np.sin(theta), np.sin(phi)], axis=-1
+    )
 
 
 def test_azimuth_cut_is_met_exactly():
@@ -19,12 +26,16 @@ def test_azimuth_cut_is_met_exactly():
     np.testing.assert_allclose(Antenna().gain(towards(theta, 0.0)), DWM1000_AZIMUTH, atol=1e-9)
 
 
-@pytest.mark.parametrize(("cut", "theta"), [(DWM1000_ELEVATION_1, 0.0), (DWM1000_ELEVATION_2, 90.0)])
+@pytest.mark.parametrize(
+    ("cut", "theta"), [(DWM1000_ELEVATION_1, 0.0), (DWM1000_ELEVATION_2, 90.0)]
+)
 def test_elevation_cuts_are_met_away_from_the_plane(cut, theta):
     """On an elevation cut, equation 14 leaves (1 - cos^40) of it: all but 0.4 % from 30 degrees on."""
     around = np.deg2rad(30.0 * np.arange(12))
     azimuth = np.deg2rad(theta)
-    direction = np.cos(around)[:, None] * towards(azimuth, 0.0) + np.sin(around)[:, None] * np.array([0.0, 0.0, 1.0])
+    direction = np.cos(around)[:, None] * towards(azimuth, 0.0) + np.sin(around)[
+        :, None
+    ] * np.array([0.0, 0.0, 1.0])
     np.testing.assert_allclose(Antenna().gain(direction), cut, atol=0.05)
     steep = [2, 3, 4, 8, 9, 10]
     np.testing.assert_allclose(Antenna().gain(direction)[steep], np.array(cut)[steep], atol=1e-6)
@@ -37,7 +48,9 @@ def test_blend_is_equation_14():
     a1, a2 = np.cos(theta) ** 2 * (1 - a3), (1 - np.cos(theta) ** 2) * (1 - a3)
     expected = a1 * DWM1000_ELEVATION_1[1] + a2 * DWM1000_ELEVATION_2[1] + a3 * DWM1000_AZIMUTH[1]
     assert antenna.gain(towards(theta, phi)) == pytest.approx(expected, abs=1e-9)
-    expected = a1 * DWM1000_ELEVATION_1[5] + a2 * DWM1000_ELEVATION_2[5] + a3 * DWM1000_AZIMUTH[7]  # x < 0, y < 0
+    expected = (
+        a1 * DWM1000_ELEVATION_1[5] + a2 * DWM1000_ELEVATION_2[5] + a3 * DWM1000_AZIMUTH[7]
+    )  # x < 0, y < 0
     assert antenna.gain(towards(np.pi + theta, phi)) == pytest.approx(expected, abs=1e-9)
 
 
@@ -49,7 +62,9 @@ def test_pattern_is_continuous(theta, phi, d_theta, d_phi):
     assert abs(antenna.group_delay(one) - antenna.group_delay(other)) < 10.0 * step
 
 
-@pytest.mark.parametrize("axis", [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)])
+@pytest.mark.parametrize(
+    "axis", [(1, 0, 0), (-1, 0, 0), (0, 1, 0), (0, -1, 0), (0, 0, 1), (0, 0, -1)]
+)
 def test_continuous_where_the_cuts_cross(axis):
     axis = np.array(axis, dtype=float)
     around = axis + 1e-6 * np.random.default_rng(0).standard_normal((50, 3))
@@ -68,7 +83,9 @@ def test_delay_is_late_and_largest_in_the_nulls():
     sphere = np.random.default_rng(1).standard_normal((20000, 3))
     delay = antenna.group_delay(sphere)
     assert delay.min() >= 0.0 and delay.max() <= antenna.delay_span
-    down, up, front = (antenna.group_delay(np.array(v)) for v in ((0, 0, -1.0), (0, 0, 1.0), (1.0, 0, 0)))
+    down, up, front = (
+        antenna.group_delay(np.array(v)) for v in ((0, 0, -1.0), (0, 0, 1.0), (1.0, 0, 0))
+    )
     assert down > up > 0.08 and front < 1e-3
     assert np.corrcoef(antenna.gain(sphere), delay)[0, 1] < -0.9
 
@@ -76,4 +93,6 @@ def test_delay_is_late_and_largest_in_the_nulls():
 def test_gain_offset_moves_the_gain_and_not_the_delay():
     sphere = np.random.default_rng(2).standard_normal((100, 3))
     np.testing.assert_allclose(Antenna(gain_offset=1.5).gain(sphere), Antenna().gain(sphere) + 1.5)
-    np.testing.assert_allclose(Antenna(gain_offset=1.5).group_delay(sphere), Antenna().group_delay(sphere))
+    np.testing.assert_allclose(
+        Antenna(gain_offset=1.5).group_delay(sphere), Antenna().group_delay(sphere)
+    )

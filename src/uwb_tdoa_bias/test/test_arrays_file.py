@@ -12,7 +12,12 @@ from uwb_tdoa_bias.foundation import arrays_file
 from uwb_tdoa_bias.foundation.arrays_file import read_arrays
 from uwb_tdoa_bias.foundation.errors import InputError
 
-ARRAYS = {"a": np.arange(6.0).reshape(2, 3), "n": np.array(7), "t": np.array("hall"), "f": np.zeros((0, 3))}
+ARRAYS = {
+    "a": np.arange(6.0).reshape(2, 3),
+    "n": np.array(7),
+    "t": np.array("hall"),
+    "f": np.zeros((0, 3)),
+}
 KINDS = {"a": "f", "n": "i", "t": "U", "f": "f"}
 
 

@@ -7,10 +7,10 @@ import yaml
 rclpy = pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
-from uwb_tdoa_msgs.msg import Tdoa  # noqa: E402
 from uwb_tdoa_bias.bias_node import MEASURED, BiasNode  # noqa: E402
 from uwb_tdoa_bias.foundation.anchors import Anchors  # noqa: E402
 from uwb_tdoa_bias.foundation.ros_cdr import CdrCodec  # noqa: E402
+from uwb_tdoa_msgs.msg import Tdoa  # noqa: E402
 
 CONFIG = Path(__file__).resolve().parents[1] / "config" / "bias_node.yaml"
 
@@ -25,9 +25,15 @@ def node():
 
 
 def test_every_parameter_is_in_the_parameter_file_with_its_default(node):
-    (parameters,) = (entry["ros__parameters"] for entry in yaml.safe_load(CONFIG.read_text()).values())
+    (parameters,) = (
+        entry["ros__parameters"] for entry in yaml.safe_load(CONFIG.read_text()).values()
+    )
     general = ("qos_overrides.", "use_sim_time", "start_type_description_service")
-    declared = {name: p.value for name, p in node.get_parameters_by_prefix("").items() if not name.startswith(general)}
+    declared = {
+        name: p.value
+        for name, p in node.get_parameters_by_prefix("").items()
+        if not name.startswith(general)
+    }
     assert parameters == declared
 
 
@@ -42,7 +48,10 @@ def test_an_antenna_that_would_be_too_far_from_the_body_is_said_and_taken_as_the
     node._frames.frames.set("base_link", "mast", (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 3.0))
     node._antenna("mast").heard = 1
     _, text, values = node._report()
-    assert text.startswith("uwb/tdoa: the place of 'mast' on 'base_link' in /tf_static is not taken: ") and "z is 3" in text
+    assert (
+        text.startswith("uwb/tdoa: the place of 'mast' on 'base_link' in /tf_static is not taken: ")
+        and "z is 3" in text
+    )
     assert "lever_arm" not in values["model"]
 
 
@@ -53,17 +62,26 @@ def test_tdoas_of_two_antennas_are_corrected_each_by_its_own_place_and_none_is_d
     node._anchors.anchors = Anchors.from_positions([[-9.0, 0.0, 0.0], [9.0, 0.0, 0.0]])
     node._on_anchors(node._anchors.anchors)
     sent = []
-    node._publish = lambda items, correction, stamps=None: sent.extend(zip((item[0] for item in items), correction.bias.tolist()))
+    node._publish = lambda items, correction, stamps=None: sent.extend(
+        zip((item[0] for item in items), correction.bias.tolist())
+    )
     wire = CdrCodec(Tdoa, *MEASURED)
     for k in range(200):
         t, frame = 0.01 * k, ("left", "right")[k % 2]
         node._corrector.add_pose(t, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
         node._poses.take_all([t])
         rows = wire.template(Tdoa(anchor_a=0, anchor_b=1)).rows(1)
-        rows["sec"], rows["nanosec"] = node._epoch.parts(np.array([t])) if node._epoch._second is not None else (0, 0)
-        node._on_tdoa(frame, node._epoch.seconds_of(rows["sec"], rows["nanosec"]), rows, np.zeros(1))
+        rows["sec"], rows["nanosec"] = (
+            node._epoch.parts(np.array([t])) if node._epoch._second is not None else (0, 0)
+        )
+        node._on_tdoa(
+            frame, node._epoch.seconds_of(rows["sec"], rows["nanosec"]), rows, np.zeros(1)
+        )
         node._release()
     assert node._counts["dropped"] == 0 and len(sent) > 190
     late = [(frame, round(bias, 6)) for frame, bias in sent[100:]]
-    assert set(late) == {("left", -0.6), ("right", 0.6)} or set(late) == {("left", 0.6), ("right", -0.6)}
+    assert set(late) == {("left", -0.6), ("right", 0.6)} or set(late) == {
+        ("left", 0.6),
+        ("right", -0.6),
+    }
     assert [frame for frame, _ in sent] == [("left", "right")[k % 2] for k in range(len(sent))]

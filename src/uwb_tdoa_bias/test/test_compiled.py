@@ -37,7 +37,11 @@ def foreign(monkeypatch, *paths):
 
     def changed(path, *a, **k):
         found = plain(path, *a, **k)
-        return os.stat_result((*found[:4], os.getuid() + 1, *found[5:])) if str(path) in map(str, paths) else found
+        return (
+            os.stat_result((*found[:4], os.getuid() + 1, *found[5:]))
+            if str(path) in map(str, paths)
+            else found
+        )
 
     monkeypatch.setattr(os, "stat", changed)
 
@@ -60,7 +64,9 @@ def test_a_folder_into_which_others_get_is_not_used(named, capsys, mode):
     (named / NAME).mkdir(parents=True)
     (named / NAME).chmod(mode)
     assert is_temporary(place())
-    assert f"others may write to {named / NAME}; a temporary folder is used" in capsys.readouterr().err
+    assert (
+        f"others may write to {named / NAME}; a temporary folder is used" in capsys.readouterr().err
+    )
 
 
 def test_what_belongs_to_somebody_else_is_not_used(named, monkeypatch):
@@ -71,7 +77,9 @@ def test_what_belongs_to_somebody_else_is_not_used(named, monkeypatch):
 
 @pytest.mark.parametrize("variables", [{"NUMBA_CACHE_DIR": "cache"}, {"XDG_CACHE_HOME": "cache"}])
 def test_no_folder_of_the_present_folder_is_used(named, monkeypatch, capsys, variables):
-    """An archive that is unpacked keeps its modes, and belongs to the user: compiled code may be planted in it."""
+    """An archive that is unpacked keeps its modes, and belongs to the user: compiled code may be
+    planted in it.
+    """
     for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME"):
         monkeypatch.delenv(name)
     for name, value in variables.items():
@@ -94,14 +102,22 @@ def test_where_nothing_can_be_kept_there_is_a_temporary_folder(named, capsys):
 
 
 def test_no_compiled_function_unpacks_an_argument_by_a_bare_name():
-    """numba 0.68 may lose what is changed in place of arrays in a tuple: `x, cost = places` and `x[0] -= step`. `places.x` is right."""
+    """numba 0.68 may lose what is changed in place of arrays in a tuple: `x, cost = places` and
+    `x[0] -= step`. `places.x` is right.
+    """
     unpacked, looked = [], 0
     for path in SOURCES.glob("uwb_tdoa_*/uwb_tdoa_*/**/*.py"):
         for function in ast.walk(ast.parse(path.read_text())):
-            if isinstance(function, ast.FunctionDef) and any(ast.unparse(by) == "compiled" for by in function.decorator_list):
+            if isinstance(function, ast.FunctionDef) and any(
+                ast.unparse(by) == "compiled" for by in function.decorator_list
+            ):
                 looked += 1
                 names = {argument.arg for argument in function.args.args}
                 for node in ast.walk(function):
-                    if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Tuple) and ast.unparse(node.value) in names:
+                    if (
+                        isinstance(node, ast.Assign)
+                        and isinstance(node.targets[0], ast.Tuple)
+                        and ast.unparse(node.value) in names
+                    ):
                         unpacked.append(f"{path.relative_to(SOURCES)}:{node.lineno}")
     assert looked > 200 and not unpacked

@@ -1,16 +1,28 @@
 from dataclasses import fields
 from functools import partial
 
-from hypothesis import given, strategies as st
+from hypothesis import given
+from hypothesis import strategies as st
 import numpy as np
 import pytest
 from random_samples import random_samples
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.correction.corrector import EFFECTS, FADED, NETWORK, PASSED, START, Correction, Corrector as LateCorrector
-from uwb_tdoa_bias.effects import EFFECTS as CATALOGUE, AnchorDelay, EffectSet, TagLeverArm
+from uwb_tdoa_bias.correction.corrector import (
+    EFFECTS,
+    FADED,
+    NETWORK,
+    PASSED,
+    START,
+    Correction,
+)
+from uwb_tdoa_bias.correction.corrector import (
+    Corrector as LateCorrector,
+)
 from uwb_tdoa_bias.correction.poses import known_yaw_std, parts_of, rotated_in_yaw
+from uwb_tdoa_bias.effects import EFFECTS as CATALOGUE
+from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, TagLeverArm
+from uwb_tdoa_bias.foundation.anchors import Anchors
 
 ANCHORS = Anchors.from_positions([[0, 0, 0], [8, 0, 0], [0, 8, 0], [0, 0, 3]], ids=[4, 5, 6, 7])
 Corrector = partial(LateCorrector, start=0.0)  # uses the first pose at once
@@ -19,7 +31,9 @@ ARM = EffectSet((TagLeverArm({"z": 0.3}),))
 
 
 class Height:
-    """Stands in for a network: the bias is the height of the tag, unknown where there is no pose or z is above 2 m."""
+    """Stands in for a network: the bias is the height of the tag, unknown where there is no pose or
+    z is above 2 m.
+    """
 
     name = "height"
 
@@ -28,7 +42,11 @@ class Height:
 
     def predict(self, samples):
         z = samples.p[:, 2]
-        return np.where(z > 2.0, np.nan, z), np.full(len(samples), self.std), np.full(len(samples), self.known)
+        return (
+            np.where(z > 2.0, np.nan, z),
+            np.full(len(samples), self.std),
+            np.full(len(samples), self.known),
+        )
 
 
 def correct(corrector, t, dense=False):
@@ -37,7 +55,9 @@ def correct(corrector, t, dense=False):
     each = 2 if dense else 1
     rows = np.repeat(np.arange(len(t)), each)
     found = corrector.correct(np.repeat(t, each), rows % 4, (rows + 1) % 4, np.ones(len(rows)))
-    return Correction(*(getattr(found, field.name)[each - 1 :: each] for field in fields(Correction)))
+    return Correction(
+        *(getattr(found, field.name)[each - 1 :: each] for field in fields(Correction))
+    )
 
 
 def climbing(corrector, stamps):
@@ -51,7 +71,11 @@ def test_with_nothing_to_correct_with_measurements_pass():
     corrector = climbing(Corrector(ANCHORS), [0.0, 1.0])
     assert corrector.idle and corrector.model == "none" and corrector.ready(1e9)
     found = correct(corrector, [0.5, 2.0])
-    assert found.bias.tolist() == [0, 0] and found.std.tolist() == [0, 0] and found.corrected.tolist() == [1, 1]
+    assert (
+        found.bias.tolist() == [0, 0]
+        and found.std.tolist() == [0, 0]
+        and found.corrected.tolist() == [1, 1]
+    )
     assert found.status.tolist() == [PASSED, PASSED]
 
 
@@ -100,7 +124,9 @@ def test_effects_see_the_pose():
 def test_uses_the_newest_pose_a_lag_before_the_preceding_measurement(poses, asked, lag):
     # eighths of a second are exact: "no later than" is tested at equality too
     corrector = climbing(Corrector(ANCHORS, None, Height(), lag=lag / 8), np.array(poses) / 8)
-    told = [t for k, t in enumerate(poses) if t > max(poses[:k], default=-1)]  # stamps must rise, others are ignored
+    told = [
+        t for k, t in enumerate(poses) if t > max(poses[:k], default=-1)
+    ]  # stamps must rise, others are ignored
     found = correct(corrector, np.array(asked) / 8)
     for k, (t, bias, status) in enumerate(zip(asked, found.bias, found.status)):
         preceding = min(t, max(asked[:k], default=t))
@@ -110,7 +136,11 @@ def test_uses_the_newest_pose_a_lag_before_the_preceding_measurement(poses, aske
         assert status == (NETWORK if height <= 2.0 else PASSED)
 
 
-@given(st.lists(st.integers(0, 60), max_size=20), st.integers(0, 60), st.lists(st.integers(0, 90), max_size=20))
+@given(
+    st.lists(st.integers(0, 60), max_size=20),
+    st.integers(0, 60),
+    st.lists(st.integers(0, 90), max_size=20),
+)
 def test_once_ready_no_later_pose_changes_a_correction(before, asked, after):
     corrector = climbing(Corrector(ANCHORS, None, Height(), lag=0.5), np.array(before) / 40)
     if not corrector.ready(asked / 40):
@@ -141,13 +171,17 @@ def test_a_batch_is_the_same_as_one_by_one():
 
 def test_where_the_network_cannot_tell_effects_remain():
     corrector = climbing(Corrector(ANCHORS, DELAYS, Height(), lag=0.0), [1.0, 2.5])
-    found = correct(corrector, [0.0, 1.0, 2.5], dense=True)  # no pose yet; a pose it knows; one it does not
+    found = correct(
+        corrector, [0.0, 1.0, 2.5], dense=True
+    )  # no pose yet; a pose it knows; one it does not
     np.testing.assert_allclose(found.bias, [-0.1, -0.2 + 1.0, 0.2])
     assert found.status.tolist() == [EFFECTS, NETWORK, EFFECTS]
     assert found.std.tolist() == [0.0, 0.05, 0.0]
 
 
-@pytest.mark.parametrize(("known", "status"), [(1.0, NETWORK), (0.5, NETWORK), (0.49, FADED), (0.0, FADED)])
+@pytest.mark.parametrize(
+    ("known", "status"), [(1.0, NETWORK), (0.5, NETWORK), (0.49, FADED), (0.0, FADED)]
+)
 def test_says_when_the_network_has_faded(known, status):
     corrector = climbing(Corrector(ANCHORS, None, Height(known=known), lag=0.0), [1.0])
     found = correct(corrector, [0.0, 1.0], dense=True)  # no pose yet: the network says nothing
@@ -160,19 +194,26 @@ def test_a_network_without_a_finite_deviation_predicts_none():
 
 
 def test_forgets_old_poses_and_keeps_the_last_ones():
-    corrector = climbing(Corrector(ANCHORS, None, Height(), lag=0.0, history=10), np.arange(1000) / 1000)
+    corrector = climbing(
+        Corrector(ANCHORS, None, Height(), lag=0.0, history=10), np.arange(1000) / 1000
+    )
     found = correct(corrector, [0.001, 0.990, 0.995, 0.999], dense=True)
     np.testing.assert_allclose(found.bias, [0.0, 0.990, 0.995, 0.999], atol=1e-12)
     assert len(corrector._poses.t) == len(corrector._poses.p) == len(corrector._poses.q) <= 20
 
 
-@given(st.lists(st.lists(st.integers(0, 60), max_size=12), max_size=6), st.lists(st.integers(0, 60), min_size=1))
+@given(
+    st.lists(st.lists(st.integers(0, 60), max_size=12), max_size=6),
+    st.lists(st.integers(0, 60), min_size=1),
+)
 def test_poses_told_together_are_poses_told_one_by_one(batches, asked):
     correctors = [Corrector(ANCHORS, None, Height(), lag=0.0, history=5) for _ in range(2)]
     for batch in batches:
         t = np.array(batch) / 8.0
         climbing(correctors[0], t)
-        correctors[1].add_pose(t, np.stack([t, t, t], axis=1), np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1)))
+        correctors[1].add_pose(
+            t, np.stack([t, t, t], axis=1), np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1))
+        )
     one, other = (corrector._poses for corrector in correctors)
     np.testing.assert_array_equal(one.t[-5:], other.t[-5:])
     np.testing.assert_array_equal(one.p[-5:, 2], other.p[-5:, 2])
@@ -186,11 +227,15 @@ def test_effects_are_those_of_the_mean_heading_while_the_yaw_is_unknown():
     told = {}
     for yaw_std in (0.1, 2.0):
         corrector = Corrector(ANCHORS, arm, lag=0.0)
-        corrector.add_pose(0.0, np.array([1.0, 2.0, 1.0]), np.array([0.0, 0.0, 0.0, 1.0]), yaw_std=yaw_std)
+        corrector.add_pose(
+            0.0, np.array([1.0, 2.0, 1.0]), np.array([0.0, 0.0, 0.0, 1.0]), yaw_std=yaw_std
+        )
         told[yaw_std] = correct(corrector, [0.0])
     upright = Corrector(ANCHORS, EffectSet((TagLeverArm({"z": 0.2}),)), lag=0.0)
     upright.add_pose(0.0, np.array([1.0, 2.0, 1.0]), np.array([0.0, 0.0, 0.0, 1.0]))
-    np.testing.assert_allclose(told[2.0].bias, correct(upright, [0.0]).bias, atol=0.01)  # what is across averages out
+    np.testing.assert_allclose(
+        told[2.0].bias, correct(upright, [0.0]).bias, atol=0.01
+    )  # what is across averages out
     assert abs(told[0.1].bias[0] - told[2.0].bias[0]) > 0.03
     assert told[0.1].std[0] == 0.0 and told[2.0].std[0] > 0.03
 
@@ -211,7 +256,12 @@ def test_without_an_estimated_attitude_the_yaw_is_what_everybody_assumes():
 def test_rotated_in_yaw_turns_about_the_vertical(quarters, seed):
     q = Rotation.random(3, random_state=seed)
     expected = Rotation.from_euler("z", quarters * np.pi / 2) * q
-    assert np.abs((Rotation.from_quat(rotated_in_yaw(q.as_quat(), quarters)) * expected.inv()).magnitude()).max() < 1e-9
+    assert (
+        np.abs(
+            (Rotation.from_quat(rotated_in_yaw(q.as_quat(), quarters)) * expected.inv()).magnitude()
+        ).max()
+        < 1e-9
+    )
 
 
 def test_empty_batch():
@@ -233,15 +283,27 @@ def test_parts_of_odometry_hold_the_velocity_in_the_world(seed):
 
 @given(st.floats(0.0, 0.999 * START))
 def test_the_first_pose_may_be_late_and_changes_nothing(late):
-    """TDOAs at 100 Hz; the pose of 0 s arrives later than its stamp, those after it do not. Where a pose is needed, it is waited for."""
+    """TDOAs at 100 Hz; the pose of 0 s arrives later than its stamp, those after it do not.
+
+    Where a pose is needed, it is waited for.
+    """
     stamps, told = np.arange(0.0, 1.5, 0.01), []
     for arrival in (0.0, late):
         corrector, before, told_now = LateCorrector(ANCHORS, ARM), 0.0, []
         for t in stamps:
             if t >= arrival:
-                climbing(corrector, [p for p in np.arange(0.0, t + 0.005, 0.01) if p > corrector._poses.newest])
-            assert t < arrival or corrector.ready(before)  # before the first pose nothing is waited for
+                climbing(
+                    corrector,
+                    [p for p in np.arange(0.0, t + 0.005, 0.01) if p > corrector._poses.newest],
+                )
+            assert t < arrival or corrector.ready(
+                before
+            )  # before the first pose nothing is waited for
             told_now.append(correct(corrector, t).bias[0])
             before = t
         told.append(told_now)
-    assert told[0] == told[1] and not any(told[0][: int(START / 0.01)]) and all(told[0][int(START / 0.01) + 2 :])
+    assert (
+        told[0] == told[1]
+        and not any(told[0][: int(START / 0.01)])
+        and all(told[0][int(START / 0.01) + 2 :])
+    )

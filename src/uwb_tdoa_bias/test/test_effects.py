@@ -2,31 +2,55 @@ from dataclasses import replace
 from pathlib import Path
 
 from finite_differences import numerical_jacobian
-from hypothesis import given, strategies as st
+from hypothesis import given
+from hypothesis import strategies as st
 import numpy as np
 import pytest
 from random_samples import random_samples, ranges_of
 from scipy.spatial.transform import Rotation
 import yaml
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.effects import (
-    EFFECTS, RADIO, AidCorrector, AnchorDelay, EffectSet, ImuCorrector, LabelEffect, Samples, SmoothTerm, TagLeverArm, Track,
-    aid_samples, true_samples,
-)  # fmt: skip
+    EFFECTS,
+    RADIO,
+    AidCorrector,
+    AnchorDelay,
+    EffectSet,
+    ImuCorrector,
+    LabelEffect,
+    Samples,
+    SmoothTerm,
+    TagLeverArm,
+    Track,
+    aid_samples,
+    true_samples,
+)
+from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import AIDS, Flight, Tdoas, Truth
-from uwb_tdoa_bias.foundation.sensors import BY_POSE, Height, Pressure, Ranges, Velocity
 from uwb_tdoa_bias.foundation.geometry import tdoa
+from uwb_tdoa_bias.foundation.sensors import BY_POSE, Height, Pressure, Ranges, Velocity
 from uwb_tdoa_bias.foundation.sensors.pressure import pressure_at
 
 seeds = st.integers(0, 2**32 - 1)
 
 
 FITTED = [effect for effect in EFFECTS.values() if effect.fitted and "tdoa" in effect.channels]
-SCALABLE = [effect for effect in EFFECTS.values() if not issubclass(effect, LabelEffect)]  # not whole numbers
-STAMPS = ("tdoa_time_offset", "truth_time_offset", "range_delay")  # act on stamps: their bias is zero, their regressors are not
-OF_RADIO = [(effect, channel) for effect in EFFECTS.values() if effect.fitted for channel in effect.channels if channel in RADIO]
+SCALABLE = [
+    effect for effect in EFFECTS.values() if not issubclass(effect, LabelEffect)
+]  # not whole numbers
+STAMPS = (
+    "tdoa_time_offset",
+    "truth_time_offset",
+    "range_delay",
+)  # act on stamps: their bias is zero, their regressors are not
+OF_RADIO = [
+    (effect, channel)
+    for effect in EFFECTS.values()
+    if effect.fitted
+    for channel in effect.channels
+    if channel in RADIO
+]
 OF_BOTH = [effect for effect, channel in OF_RADIO if channel == "range" and effect in FITTED]
 
 
@@ -37,7 +61,10 @@ def parameters(effect, samples, rng):
     return {key: 0.1 * min(1.0, effect.bound_of(key)) * rng.uniform(-1.0, 1.0) for key in keys}
 
 
-@pytest.mark.parametrize("effect, channel", [(effect, channel) for effect, channel in OF_RADIO if effect.name not in STAMPS])
+@pytest.mark.parametrize(
+    "effect, channel",
+    [(effect, channel) for effect, channel in OF_RADIO if effect.name not in STAMPS],
+)
 @given(seeds)
 def test_regressors_against_finite_differences(effect, channel, seed):
     samples = random_samples(seed)
@@ -50,7 +77,9 @@ def test_regressors_against_finite_differences(effect, channel, seed):
 
     found = effect(values).regressors(samples, keys)
     assert found.shape == (len(samples), len(keys))
-    np.testing.assert_allclose(found, numerical_jacobian(bias, [values[k] for k in keys]), atol=1e-5)
+    np.testing.assert_allclose(
+        found, numerical_jacobian(bias, [values[k] for k in keys]), atol=1e-5
+    )
 
 
 @pytest.mark.parametrize("effect", OF_BOTH)
@@ -60,7 +89,9 @@ def test_a_tdoa_errs_as_the_ranges_whose_difference_it_is(effect, seed):
     made = effect(parameters(effect, samples, np.random.default_rng(seed)))
     first, second = ranges_of(samples, samples.a), ranges_of(samples, samples.b)
     np.testing.assert_allclose(samples.true(), second.true() - first.true(), atol=1e-12)
-    np.testing.assert_allclose(samples.direction(), second.direction() - first.direction(), atol=1e-12)
+    np.testing.assert_allclose(
+        samples.direction(), second.direction() - first.direction(), atol=1e-12
+    )
     np.testing.assert_allclose(made.bias(samples), made.bias(second) - made.bias(first), atol=1e-9)
     keys = list(made.values)
     of_each = (made.regressors(part, keys) for part in (samples, second, first))
@@ -70,14 +101,19 @@ def test_a_tdoa_errs_as_the_ranges_whose_difference_it_is(effect, seed):
 
 def ranged(moving):
     """The same Flight with distances to anchors, one after the other."""
-    anchors = replace(random_samples(3).anchors, positions=random_samples(3).anchors.positions + 8.0)
+    anchors = replace(
+        random_samples(3).anchors, positions=random_samples(3).anchors.positions + 8.0
+    )
     t = np.linspace(moving.truth.t[0] + 0.5, moving.truth.t[-1] - 0.5, 60)
     row = np.arange(len(t)) % len(anchors)
     d = np.linalg.norm(Track(moving.truth).positions(t) - anchors.positions[row], axis=1)
     return replace(moving, anchors=anchors, range=Ranges(t, anchors.ids[row], d, np.zeros(len(t))))
 
 
-@pytest.mark.parametrize("effect", [effect for effect, channel in OF_RADIO if channel == "range" and effect.name not in STAMPS])
+@pytest.mark.parametrize(
+    "effect",
+    [effect for effect, channel in OF_RADIO if channel == "range" and effect.name not in STAMPS],
+)
 def test_is_injected_into_ranges_and_taken_out_of_them(effect):
     before = ranged(felt(1)[0])
     keys = effect.groups(before.anchors, np.array([[0, 1]]))[0]
@@ -85,7 +121,9 @@ def test_is_injected_into_ranges_and_taken_out_of_them(effect):
     after = made.inject(before)
     samples, rows = true_samples(after, RADIO["range"])
     assert len(rows) == len(before.range) and np.abs(after.range.d - before.range.d).max() > 0.01
-    np.testing.assert_allclose(after.range.d - EffectSet((made,)).bias(samples), before.range.d, atol=1e-12)
+    np.testing.assert_allclose(
+        after.range.d - EffectSet((made,)).bias(samples), before.range.d, atol=1e-12
+    )
 
 
 def test_late_stamps_of_ranges_are_moved_back():
@@ -93,7 +131,9 @@ def test_late_stamps_of_ranges_are_moved_back():
     before, late = ranged(flight), EFFECTS["range_delay"]({"offset": 0.05})
     after = late.inject(before)
     np.testing.assert_array_equal(after.range.t, before.range.t + 0.05)
-    np.testing.assert_allclose(EffectSet((late,)).correct_streams(after).range.t, before.range.t, atol=1e-12)
+    np.testing.assert_allclose(
+        EffectSet((late,)).correct_streams(after).range.t, before.range.t, atol=1e-12
+    )
     with pytest.raises(InputError, match="holds no range, which range_delay needs"):
         late.inject(flight)
 
@@ -120,8 +160,18 @@ def test_regressors_of_some_parameters_are_those_columns(effect):
 @pytest.mark.parametrize("effect", EFFECTS.values())
 def test_is_declared_in_full(effect):
     assert EFFECTS[effect.name] is effect
-    assert effect.bound > effect.negligible > 0.0 and effect.unit and effect.reference and effect.physics
-    assert set(effect.confounded_with) <= set(EFFECTS) and set(effect.channels) <= {"tdoa", "gyro", "accel", *AIDS}
+    assert (
+        effect.bound > effect.negligible > 0.0
+        and effect.unit
+        and effect.reference
+        and effect.physics
+    )
+    assert set(effect.confounded_with) <= set(EFFECTS) and set(effect.channels) <= {
+        "tdoa",
+        "gyro",
+        "accel",
+        *AIDS,
+    }
     np.testing.assert_array_equal(effect().bias(random_samples(1)), 0.0)  # no parameter, no effect
     np.testing.assert_array_equal(effect().noise_std(random_samples(1)), 0.0)
     bound = effect.bound_of(effect.example)
@@ -135,7 +185,12 @@ def test_is_declared_in_full(effect):
 def test_delay_of_an_anchor_makes_it_seem_farther_away():
     anchors = Anchors.from_positions([[0, 0, 0], [10, 0, 0], [0, 10, 0]], ids=[5, 6, 7])
     samples = Samples(
-        np.zeros(3), np.array([0, 1, 1]), np.array([1, 0, 2]), np.ones((3, 3)), np.full((3, 4), np.nan), anchors
+        np.zeros(3),
+        np.array([0, 1, 1]),
+        np.array([1, 0, 2]),
+        np.ones((3, 3)),
+        np.full((3, 4), np.nan),
+        anchors,
     )
     ranges = np.linalg.norm(samples.p[0] - anchors.positions, axis=1) + [0.3, 0.0, -0.1]
     late = ranges[samples.b] - ranges[samples.a]
@@ -157,7 +212,9 @@ def test_lever_arm_is_where_the_antenna_is(seed):
     effect = TagLeverArm({"x": -0.012, "z": 0.091})
     antenna = samples.p + Rotation.from_quat(samples.q).apply([-0.012, 0.0, 0.091])
     a, b = samples.anchors.positions[samples.a], samples.anchors.positions[samples.b]
-    np.testing.assert_allclose(effect.bias(samples), tdoa(antenna, a, b) - tdoa(samples.p, a, b), atol=1e-12)
+    np.testing.assert_allclose(
+        effect.bias(samples), tdoa(antenna, a, b) - tdoa(samples.p, a, b), atol=1e-12
+    )
 
 
 def test_lever_arm_without_attitude_cannot_tell_and_adds_nothing_to_the_set():
@@ -171,10 +228,14 @@ def test_lever_arm_without_attitude_cannot_tell_and_adds_nothing_to_the_set():
 
 
 def standing(heights, x=0.0):
-    """Samples at heights (n,), m, above (x, 0), of TDOAs from an anchor 0 that is on time to anchor 1."""
+    """Samples at heights (n,), m, above (x, 0), of TDOAs from an anchor 0 that is on time to anchor
+    1.
+    """
     anchors, n = Anchors.from_positions([[4, 4, 3], [5, 0, 0.2]], ids=[0, 1]), len(heights)
     p = np.column_stack([np.full(n, x), np.zeros(n), heights])
-    return Samples(np.arange(n) / 100.0, np.zeros(n, int), np.ones(n, int), p, np.full((n, 4), np.nan), anchors)
+    return Samples(
+        np.arange(n) / 100.0, np.zeros(n, int), np.ones(n, int), p, np.full((n, 4), np.nan), anchors
+    )
 
 
 def test_on_the_floor_an_anchor_is_late_below_its_height_and_may_be_about_it():
@@ -182,16 +243,22 @@ def test_on_the_floor_an_anchor_is_late_below_its_height_and_may_be_about_it():
     samples = standing(np.array([0.0, 0.03, 0.08, 0.12, 0.18, 1.0]))
     bias, noise = floor.bias(samples), floor.noise_std(samples)
     np.testing.assert_allclose(bias, [3.0, 3.0, 3.0, 1.5, 0.0, 0.0], atol=1e-6)
-    np.testing.assert_allclose(noise, [0.0, 0.0, 0.0, 1.5, 0.0, 0.0], atol=2e-3)  # late or not: 3 m times sqrt(p (1 - p))
+    np.testing.assert_allclose(
+        noise, [0.0, 0.0, 0.0, 1.5, 0.0, 0.0], atol=2e-3
+    )  # late or not: 3 m times sqrt(p (1 - p))
     hopping = EFFECTS["floor_multipath"]({"1.delay": 3.0, "1.height": 0.12, "1.noise": 0.4})
-    np.testing.assert_allclose(hopping.noise_std(samples)[[0, 3, 5]], [0.4, np.sqrt(1.5**2 + 0.5 * 0.4**2), 0.0], atol=2e-3)
+    np.testing.assert_allclose(
+        hopping.noise_std(samples)[[0, 3, 5]], [0.4, np.sqrt(1.5**2 + 0.5 * 0.4**2), 0.0], atol=2e-3
+    )
 
 
 def test_away_from_where_the_floor_was_seen_it_is_not_taken_out_but_feared():
     floor = EFFECTS["floor_multipath"]({"1.delay": 3.0, "1.height": 0.12, "x": 0.0, "y": 0.0})
     near, far = (standing(np.array([0.03]), x) for x in (0.1, 4.0))
     assert floor.bias(near)[0] == pytest.approx(3.0, abs=0.02) and floor.noise_std(near)[0] < 0.4
-    assert abs(floor.bias(far)[0]) < 0.01 and floor.noise_std(far)[0] == pytest.approx(3.0, abs=0.01)
+    assert abs(floor.bias(far)[0]) < 0.01 and floor.noise_std(far)[0] == pytest.approx(
+        3.0, abs=0.01
+    )
 
 
 def test_regressors_of_the_floor_are_what_its_delays_do():
@@ -200,13 +267,23 @@ def test_regressors_of_the_floor_are_what_its_delays_do():
     samples.p[:, 2] = rng.uniform(0.0, 0.3, len(samples))
     delays = {f"{i}.delay": rng.uniform(0.0, 4.0) for i in ids}
     floor = EFFECTS["floor_multipath"]({**delays, "x": 0.5, "y": -0.5})
-    np.testing.assert_allclose(floor.regressors(samples, list(delays)) @ list(delays.values()), floor.bias(samples), atol=1e-9)
+    np.testing.assert_allclose(
+        floor.regressors(samples, list(delays)) @ list(delays.values()),
+        floor.bias(samples),
+        atol=1e-9,
+    )
 
 
 def test_advice_on_the_floor_names_the_anchors_that_are_late_by_much():
     values = {"0.delay": 3.3, "1.delay": 0.4, "2.delay": 2.8, "0.height": 0.1, "2.height": 0.13}
-    mount, hang = EFFECTS["floor_multipath"](values, {key: 0.05 for key in values if key.endswith("delay")}).advice()
-    assert "0.13 m" in mount and "anchors 0 and 2 are up to 3.30 ± 0.05 m late" in mount and "anchors 0 and 2" in hang
+    mount, hang = EFFECTS["floor_multipath"](
+        values, {key: 0.05 for key in values if key.endswith("delay")}
+    ).advice()
+    assert (
+        "0.13 m" in mount
+        and "anchors 0 and 2 are up to 3.30 ± 0.05 m late" in mount
+        and "anchors 0 and 2" in hang
+    )
     assert EFFECTS["floor_multipath"]().advice() == ()
 
 
@@ -261,7 +338,9 @@ def test_is_in_the_document(effect):
     text = (Path(__file__).resolve().parents[3] / "docs" / "effects.md").read_text()
     section = text.partition(f"### {effect.name}\n")[2].partition("\n### ")[0]
     assert (
-        effect.physics in section and effect.reference in section and all(o in section for o in effect.confounded_with)
+        effect.physics in section
+        and effect.reference in section
+        and all(o in section for o in effect.confounded_with)
     )
     assert (
         f"| {effect.bound:g} | {effect.typical:g} | {effect.negligible:g} |"
@@ -282,12 +361,18 @@ def test_splines_are_those_of_scipy(values, seed):
 
 
 def term(**changes):
-    settings = {"channel": "tdoa", "covariate": "range", "form": "arrival", "knots": [1.0, 4.0, 9.0]}
+    settings = {
+        "channel": "tdoa",
+        "covariate": "range",
+        "form": "arrival",
+        "knots": [1.0, 4.0, 9.0],
+    }
     return SmoothTerm({"c0": 0.1, "c1": -0.2, "c2": 0.05, "c3": 0.3}, **{**settings, **changes})
 
 
 @pytest.mark.parametrize(
-    "form, covariate", [("common", "height"), ("arrival", "elevation_in_anchor"), ("anchor", "range")]
+    "form, covariate",
+    [("common", "height"), ("arrival", "elevation_in_anchor"), ("anchor", "range")],
 )
 @pytest.mark.parametrize("channel", RADIO)
 @given(seed=seeds)
@@ -299,7 +384,9 @@ def test_smooth_term_is_linear_in_its_coefficients(channel, form, covariate, see
     values = dict(zip(keys, rng.standard_normal(len(keys))))
     full = SmoothTerm(values, {}, "", channel, covariate, form, empty.knots)
     assert channel == "tdoa" or np.abs(full.bias(samples)).max() > 1e-3
-    np.testing.assert_allclose(full.bias(samples), full.regressors(samples, keys) @ list(values.values()), atol=1e-12)
+    np.testing.assert_allclose(
+        full.bias(samples), full.regressors(samples, keys) @ list(values.values()), atol=1e-12
+    )
 
 
 def test_a_function_of_ranges_adds_nothing_to_tdoas_nor_the_other_way_round():
@@ -314,18 +401,27 @@ def test_a_function_of_ranges_adds_nothing_to_tdoas_nor_the_other_way_round():
 
 def test_smooth_term_is_constant_beyond_its_knots_and_survives_a_file(tmp_path):
     one = term()
-    np.testing.assert_allclose(one.curve(np.array([-5.0, 1.0, 9.0, 50.0])), [0.1, 0.1, 0.3, 0.3], atol=1e-12)
+    np.testing.assert_allclose(
+        one.curve(np.array([-5.0, 1.0, 9.0, 50.0])), [0.1, 0.1, 0.3, 0.3], atol=1e-12
+    )
     EffectSet((one, term(covariate="height", form="common"))).to_yaml(tmp_path / "effects.yaml")
     again = EffectSet.from_yaml(tmp_path / "effects.yaml")
     assert [e.covariate for e in again.effects] == ["range", "height"]
     np.testing.assert_array_equal(
-        again.bias(random_samples(3)), EffectSet((one, term(covariate="height", form="common"))).bias(random_samples(3))
+        again.bias(random_samples(3)),
+        EffectSet((one, term(covariate="height", form="common"))).bias(random_samples(3)),
     )
 
 
 @pytest.mark.parametrize(
     "changes",
-    [{"knots": [1.0]}, {"knots": [2.0, 1.0]}, {"covariate": "colour"}, {"channel": "gyro.w"}, {"form": "odd"}],
+    [
+        {"knots": [1.0]},
+        {"knots": [2.0, 1.0]},
+        {"covariate": "colour"},
+        {"channel": "gyro.w"},
+        {"form": "odd"},
+    ],
 )
 def test_smooth_term_refuses_nonsense(changes):
     with pytest.raises(InputError, match="smooth_term"):
@@ -339,13 +435,25 @@ def test_inertial_samples_are_corrected_the_same_at_once_and_one_by_one():
         EFFECTS["imu_misalignment"]({"x": 0.1}),
         EFFECTS["accel_scale"]({"y": 0.03}),
     ]
-    effects += [SmoothTerm({"c0": 0.1, "c3": 0.4}, {}, "", "accel.z", "vibration", "common", [0.0, 1.0, 2.0])]
-    t, gyro, accel = np.arange(200) / 1000.0, rng.standard_normal((200, 3)), rng.standard_normal((200, 3))
+    effects += [
+        SmoothTerm(
+            {"c0": 0.1, "c3": 0.4}, {}, "", "accel.z", "vibration", "common", [0.0, 1.0, 2.0]
+        )
+    ]
+    t, gyro, accel = (
+        np.arange(200) / 1000.0,
+        rng.standard_normal((200, 3)),
+        rng.standard_normal((200, 3)),
+    )
     together = ImuCorrector(effects).correct(t, gyro, accel)
     corrector = ImuCorrector(effects)
-    single = [corrector.correct(t[k : k + 1], gyro[k : k + 1], accel[k : k + 1]) for k in range(200)]
+    single = [
+        corrector.correct(t[k : k + 1], gyro[k : k + 1], accel[k : k + 1]) for k in range(200)
+    ]
     for sensor in range(2):
-        np.testing.assert_allclose(np.concatenate([s[sensor] for s in single]), together[sensor], atol=1e-12)
+        np.testing.assert_allclose(
+            np.concatenate([s[sensor] for s in single]), together[sensor], atol=1e-12
+        )
 
 
 def test_stamps_and_spread():
@@ -355,7 +463,9 @@ def test_stamps_and_spread():
     hit = np.isin(samples.a, (0, 1)) & np.isin(samples.b, (0, 1))
     np.testing.assert_allclose(EffectSet((noisy,)).noise_std(samples), 0.3 * hit)
     late = EffectSet((EFFECTS["tdoa_time_offset"]({"offset": 0.03}),))
-    flight = Flight("f", samples.anchors, Tdoas(samples.t, ids[samples.a], ids[samples.b], samples.t))
+    flight = Flight(
+        "f", samples.anchors, Tdoas(samples.t, ids[samples.a], ids[samples.b], samples.t)
+    )
     assert late.stamp_offset("tdoa") == 0.03 and late.stamp_offset("imu") == 0.0
     np.testing.assert_allclose(late.correct_streams(flight).tdoa.t, samples.t - 0.03)
 
@@ -380,10 +490,19 @@ ON_AIDS = [effect for effect in EFFECTS.values() if set(effect.channels) <= set(
 
 
 def felt(seed, n=400):
-    """A Flight on a smooth path with true heights, pressures and velocities, and its AidSamples by stream."""
+    """A Flight on a smooth path with true heights, pressures and velocities, and its AidSamples by
+    stream.
+    """
     rng, t = np.random.default_rng(seed), np.arange(n) / 25.0
     phase = rng.uniform(0.0, 6.0, 6)
-    p = np.stack([np.sin(0.7 * t + phase[0]), np.cos(0.5 * t + phase[1]), 1.5 + 0.5 * np.sin(0.9 * t + phase[2])], axis=1)
+    p = np.stack(
+        [
+            np.sin(0.7 * t + phase[0]),
+            np.cos(0.5 * t + phase[1]),
+            1.5 + 0.5 * np.sin(0.9 * t + phase[2]),
+        ],
+        axis=1,
+    )
     angles = np.stack([0.1 * np.sin(t + phase[3]), 0.1 * np.cos(t + phase[4]), 0.3 * t], axis=1)
     truth = Truth(t, p, Rotation.from_euler("xyz", angles).as_quat())
     track = Track(truth)
@@ -413,11 +532,16 @@ def test_regressors_on_aids_are_what_inject_adds(effect, seed):
     changed = getattr(made.inject(flight), stream)
     before, after = getattr(flight, stream).values, changed.values
     if not np.array_equal(changed.t, flight.truth.t):  # stamps moved: what it reads at the old ones
-        after = np.stack([np.interp(flight.truth.t, changed.t, column) for column in after.T], axis=1)
-    predicted = effect({k: v for k, v in values.items() if k not in keys}).regressors(samples[stream], keys) @ [
-        values[key] for key in keys
-    ]
-    inner, rough = slice(5, -5), 5e-5 if effect.name == "velocity_delay" else 2e-6  # of accelerations from poses
+        after = np.stack(
+            [np.interp(flight.truth.t, changed.t, column) for column in after.T], axis=1
+        )
+    predicted = effect({k: v for k, v in values.items() if k not in keys}).regressors(
+        samples[stream], keys
+    ) @ [values[key] for key in keys]
+    inner, rough = (
+        slice(5, -5),
+        5e-5 if effect.name == "velocity_delay" else 2e-6,
+    )  # of accelerations from poses
     np.testing.assert_allclose((after - before)[inner], predicted[inner], atol=rough)
 
 
@@ -426,7 +550,9 @@ def test_what_is_put_into_an_aid_is_taken_out_of_it_or_out_of_the_residual(effec
     flight, samples = felt(3)
     (stream,), made = effect.channels, effect(some_values(effect, np.random.default_rng(0), 0.1))
     back = getattr(EffectSet((made,)).correct_streams(made.inject(flight)), stream)
-    assert not np.array_equal(getattr(made.inject(flight), stream).t, back.t) == (effect.name == "velocity_delay")
+    assert not np.array_equal(getattr(made.inject(flight), stream).t, back.t) == (
+        effect.name == "velocity_delay"
+    )
     left = back.values - EffectSet((made,)).uncorrected(samples[stream])
     np.testing.assert_allclose(left, getattr(flight, stream).values, atol=1e-6)
     np.testing.assert_allclose(back.t, flight.truth.t, atol=1e-9)
@@ -436,7 +562,11 @@ def test_what_is_put_into_an_aid_is_taken_out_of_it_or_out_of_the_residual(effec
 
 def test_aids_are_corrected_the_same_at_once_and_one_by_one_whatever_was_not_measured():
     rng, n = np.random.default_rng(0), 50
-    values = {"velocity_scale": {"scale": 0.1}, "velocity_misalignment": {"yaw": 1.5}, "velocity_delay": {"offset": 0.02}}
+    values = {
+        "velocity_scale": {"scale": 0.1},
+        "velocity_misalignment": {"yaw": 1.5},
+        "velocity_delay": {"offset": 0.02},
+    }
     corrector = AidCorrector([EFFECTS[name](each) for name, each in values.items()])
     t, v, std = np.arange(n) / 25.0, rng.standard_normal((n, 3)), rng.uniform(0.1, 0.2, (n, 3))
     v[:, 2], std[:, 2] = np.nan, np.inf
@@ -448,26 +578,60 @@ def test_aids_are_corrected_the_same_at_once_and_one_by_one_whatever_was_not_mea
     np.testing.assert_allclose(turned[:, :2], expected[:, :2], atol=1e-12)
     np.testing.assert_allclose(late, t - 0.02)
     assert np.isinf(wider[:, 2]).all() and (wider[:, :2] < 0.2).all()
-    unstated = corrector.correct("velocity", Velocity(t, v, np.where(np.isinf(std), std, 0.0))).columns[2]
-    np.testing.assert_array_equal(unstated, np.where(np.isinf(std), std, 0.0))  # the driver still states none
-    single = [corrector.correct("velocity", Velocity(*(column[k : k + 1] for column in (t, v, std)))).columns for k in range(n)]
+    unstated = corrector.correct(
+        "velocity", Velocity(t, v, np.where(np.isinf(std), std, 0.0))
+    ).columns[2]
+    np.testing.assert_array_equal(
+        unstated, np.where(np.isinf(std), std, 0.0)
+    )  # the driver still states none
+    single = [
+        corrector.correct(
+            "velocity", Velocity(*(column[k : k + 1] for column in (t, v, std)))
+        ).columns
+        for k in range(n)
+    ]
     for column, whole in enumerate((late, turned, wider)):
-        np.testing.assert_allclose(np.concatenate([each[column] for each in single]), whole, atol=1e-12)
+        np.testing.assert_allclose(
+            np.concatenate([each[column] for each in single]), whole, atol=1e-12
+        )
 
 
 @pytest.mark.parametrize(
-    "channel, covariate", [
-        ("gyro.x", "tilt"), ("gyro.y", "interval"), ("accel.z", "previous_anchor"), ("height", "tilt"), ("height", "extra.battery.voltage"),
-        ("velocity.x", "rate_x"), ("gyro.x", "range"), ("tdoa", "accel"),
+    "channel, covariate",
+    [
+        ("gyro.x", "tilt"),
+        ("gyro.y", "interval"),
+        ("accel.z", "previous_anchor"),
+        ("height", "tilt"),
+        ("height", "extra.battery.voltage"),
+        ("velocity.x", "rate_x"),
+        ("gyro.x", "range"),
+        ("tdoa", "accel"),
     ],
-)  # fmt: skip
-def test_a_function_of_what_its_channel_does_not_have_is_refused_when_it_is_read(tmp_path, channel, covariate):
-    entry = {"channel": channel, "covariate": covariate, "form": "common", "knots": [0.0, 1.0], "values": {"c0": 0.1}}
+)
+def test_a_function_of_what_its_channel_does_not_have_is_refused_when_it_is_read(
+    tmp_path, channel, covariate
+):
+    entry = {
+        "channel": channel,
+        "covariate": covariate,
+        "form": "common",
+        "knots": [0.0, 1.0],
+        "values": {"c0": 0.1},
+    }
     (tmp_path / "effects.yaml").write_text(yaml.safe_dump({"effects": {"smooth_term_1": entry}}))
-    with pytest.raises(InputError, match=f"function of '{covariate}' acts on '{channel}'; forms are .*, covariates of this channel time, "):
+    with pytest.raises(
+        InputError,
+        match=(
+            f"function of '{covariate}' acts on '{channel}'; forms are .*, covariates of this "
+            "channel time, "
+        ),
+    ):
         EffectSet.from_yaml(tmp_path / "effects.yaml")
 
 
 def test_a_function_of_no_channel_is_refused_with_those_that_there_are():
-    with pytest.raises(InputError, match="acts on 'gyro'; channels are tdoa, range, gyro.x, .* and velocity.z"):
+    with pytest.raises(
+        InputError, match="acts on 'gyro'; channels are tdoa, range, gyro.x, .* and velocity.z"
+    ):
         SmoothTerm(channel="gyro", covariate="time", knots=(0.0, 1.0))

@@ -1,6 +1,7 @@
 import re
 
-from hypothesis import assume, given, strategies as st
+from hypothesis import assume, given
+from hypothesis import strategies as st
 import numpy as np
 import pytest
 
@@ -16,7 +17,9 @@ WITH_ADVICE = [effect for effect in ESTIMATED if effect.name != "noise_correlati
 
 
 def filled(effect, value, std):
-    """The effect with one value for everything that can be fitted, "x, y, z, radius" of a region aside."""
+    """The effect with one value for everything that can be fitted, "x, y, z, radius" of a region
+    aside.
+    """
     keys = effect.groups(ANCHORS, PAIRS)[0] or (effect.example,)
     limits = {"0.x": 1.0, "0.y": -2.0, "0.z": 1.5, "0.radius": 0.6} if effect.name == "nlos" else {}
     return effect({**dict.fromkeys(keys, value), **limits}, dict.fromkeys(keys, std))
@@ -48,7 +51,9 @@ def test_a_value_without_spread_comes_last():
 @given(st.floats(-100, 100), st.floats(1e-6, 10))
 def test_what_is_printed_is_the_value_within_half_a_digit_of_its_standard_deviation(value, std):
     shown, error = (float(number) for number in measured(value, std).split(" ± "))
-    assert abs(shown - value) <= 0.5 * std * (1 + 1e-6) and error == pytest.approx(std, rel=0.51 if std > 1.0 else 0.12)
+    assert abs(shown - value) <= 0.5 * std * (1 + 1e-6) and error == pytest.approx(
+        std, rel=0.51 if std > 1.0 else 0.12
+    )
 
 
 def test_lists():
@@ -66,7 +71,11 @@ def test_advice_is_imperative_sentences_with_the_size(effect):
     sentences = filled(effect, 0.2, 0.01).advice()
     assert sentences
     for sentence in sentences:
-        assert re.match(r"[A-Z][a-z]+ [a-zA-Z]", sentence) and sentence.endswith(".") and "\n" not in sentence
+        assert (
+            re.match(r"[A-Z][a-z]+ [a-zA-Z]", sentence)
+            and sentence.endswith(".")
+            and "\n" not in sentence
+        )
         assert "nan" not in sentence and len(sentence) < 900
     assert any("±" in sentence for sentence in sentences)
 
@@ -89,10 +98,25 @@ def test_nothing_is_advised_on_what_the_data_do_not_tell(effect, value, doubt):
             {"5.x": 0.01, "5.z": 0.01},
             ["+x", "-z", "Measure anchor 5 again before you move it"],
         ),
-        ("nlos", {"1.delay": 0.5, "1.start": 20, "1.end": 32}, {"1.delay": 0.02}, ["from 20 to 32 s", "anchor 1"]),
-        ("imu_misalignment", {"z": -0.0698}, {"z": 0.005}, ["Turn the IMU by 4.0 ± 0.3 degrees about z"]),
+        (
+            "nlos",
+            {"1.delay": 0.5, "1.start": 20, "1.end": 32},
+            {"1.delay": 0.02},
+            ["from 20 to 32 s", "anchor 1"],
+        ),
+        (
+            "imu_misalignment",
+            {"z": -0.0698},
+            {"z": 0.005},
+            ["Turn the IMU by 4.0 ± 0.3 degrees about z"],
+        ),
         ("tdoa_time_offset", {"offset": 0.012}, {"offset": 0.001}, ["12 ± 1 ms late"]),
-        ("accel_bias", {"x": -2.181, "z": -0.04}, {"x": 0.092, "z": 0.055}, ["2.18 ± 0.09 m/s^2 too little along x"]),
+        (
+            "accel_bias",
+            {"x": -2.181, "z": -0.04},
+            {"x": 0.092, "z": 0.055},
+            ["2.18 ± 0.09 m/s^2 too little along x"],
+        ),
         ("anchor_ids", {"1": 4}, {}, ["Give the anchors", "called 1 is anchor 4 of the survey"]),
         ("pair_sign", {"1-4": -1}, {}, ["Look in the driver", "the sign of the TDOA of 1-4"]),
         ("gyro_scale", {"z": 0.03}, {"z": 0.001}, ["3.0 ± 0.1 % too much about z"]),
@@ -111,9 +135,15 @@ def test_a_blocked_region_is_named_by_its_place_and_marked_on_the_map():
     values = {"1.x": -0.9, "1.y": -1.2, "1.z": 2.0, "1.radius": 1.0, "1.delay": 0.53}
     effect = EFFECTS["nlos"](values, {"1.delay": 0.04})
     (sentence,) = effect.advice()
-    assert "anchor 1 and (-0.9, -1.2, 2.0) m" in sentence and "within 1.0 m" in sentence and "0.53 ± 0.04 m" in sentence
+    assert (
+        "anchor 1 and (-0.9, -1.2, 2.0) m" in sentence
+        and "within 1.0 m" in sentence
+        and "0.53 ± 0.04 m" in sentence
+    )
     (region,) = effect.marks(ANCHORS)
-    assert region.anchor == 1 and region.radius == 1.0 and region.centre.tolist() == [-0.9, -1.2, 2.0]
+    assert (
+        region.anchor == 1 and region.radius == 1.0 and region.centre.tolist() == [-0.9, -1.2, 2.0]
+    )
 
 
 def test_shifts_on_the_map_are_those_of_the_values():
@@ -134,7 +164,9 @@ def test_an_effect_without_a_sentence_of_its_own_is_advised_on_by_its_physics():
         advice = EFFECTS["noise_level"].__mro__[1].advice
 
     (sentence,) = Rust({3: 0.31, 1: 0.001}, {3: 0.01, 1: 0.002}).advice()
-    assert sentence == "Look for the cause of rust: rusty connectors (found: 3 = 0.31 ± 0.01, in m)."
+    assert (
+        sentence == "Look for the cause of rust: rusty connectors (found: 3 = 0.31 ± 0.01, in m)."
+    )
 
 
 def test_every_covariate_has_a_unit():

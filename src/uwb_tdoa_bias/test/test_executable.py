@@ -1,9 +1,9 @@
 """How executables start, and how they end when they are interrupted before they have begun."""
 
 import os
+from signal import SIGINT
 import subprocess
 import sys
-from signal import SIGINT
 
 import pytest
 
@@ -18,7 +18,10 @@ try:
 except BaseException:  # as some libraries do
     time.sleep(600)
 """
-START = "import sys; from uwb_tdoa_bias.foundation.executable import executable; sys.exit(executable('{}')())"
+START = (
+    "import sys; from uwb_tdoa_bias.foundation.executable import executable; "
+    "sys.exit(executable('{}')())"
+)
 
 
 @pytest.fixture
@@ -31,7 +34,9 @@ def write(tmp_path, monkeypatch):
 
 def start(module):
     code = START.format(module)
-    return subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
 
 
 def test_what_main_returns_is_returned(write):
@@ -45,7 +50,8 @@ def test_nothing_is_imported_before_it_is_called():
 
 def test_an_import_that_takes_long_is_said(write, monkeypatch, capsys):
     waits = (
-        "import sys, time\nend = time.monotonic() + 120.0\nwhile 'starting' not in sys.stderr.getvalue() and time.monotonic() < end: pass\n"
+        "import sys, time\nend = time.monotonic() + 120.0\nwhile 'starting' not in "
+        "sys.stderr.getvalue() and time.monotonic() < end: pass\n"
     )
     write("takes_long", waits + "def main(): return 0")
     monkeypatch.setattr(module, "SAID", 0.01)
@@ -55,7 +61,9 @@ def test_an_import_that_takes_long_is_said(write, monkeypatch, capsys):
 
 def test_it_is_said_within_two_seconds_and_short_imports_say_nothing(write, monkeypatch, capsys):
     assert module.SAID <= 2.0
-    monkeypatch.setattr(module, "SAID", 600.0)  # as short as any import is beside it, on a loaded machine too
+    monkeypatch.setattr(
+        module, "SAID", 600.0
+    )  # as short as any import is beside it, on a loaded machine too
     write("short", "def main(): return 0")
     assert executable("short")() == 0 and capsys.readouterr().err == ""
 
@@ -69,8 +77,12 @@ def test_an_interrupt_while_it_imports_is_quiet_whatever_is_imported(write):
 
 
 def test_an_interrupt_afterwards_is_the_affair_of_main(write):
-    write("careful", "import time\ndef main():\n    try:\n        print('in', flush=True)\n        time.sleep(600)\n"
-                     "    except KeyboardInterrupt:\n        return 7\n")  # fmt: skip
+    write(
+        "careful",
+        "import time\ndef main():\n    try:\n        print('in', flush=True)\n        "
+        "time.sleep(600)\n"
+        "    except KeyboardInterrupt:\n        return 7\n",
+    )
     process = start("careful")
     assert process.stdout.readline() == "in\n"
     process.send_signal(SIGINT)
@@ -99,7 +111,10 @@ def test_an_interrupt_that_c_code_loses_comes_again(write):
 
 @pytest.mark.parametrize(
     ("missing", "remedy"),
-    [("rclpy_is_gone_msgs", "source ROS 2 Jazzy and the built workspace"), ("nowhere", "install it with pip")],
+    [
+        ("rclpy_is_gone_msgs", "source ROS 2 Jazzy and the built workspace"),
+        ("nowhere", "install it with pip"),
+    ],
 )
 def test_what_is_not_installed_is_told_in_one_sentence(write, capsys, missing, remedy):
     write("needy", f"import {missing}.part")
@@ -116,24 +131,37 @@ def test_a_part_of_ours_that_is_missing_is_a_defect():
 
 @pytest.mark.parametrize("given, kept", [(None, "1"), ("3", "3")])
 @pytest.mark.parametrize("start", [executable, node_executable])
-def test_linear_algebra_takes_one_thread_unless_the_user_says_more(write, monkeypatch, start, given, kept):
+def test_linear_algebra_takes_one_thread_unless_the_user_says_more(
+    write, monkeypatch, start, given, kept
+):
     name = f"tells_{kept}_{start.__name__}"
     write(name, "import os\nseen = os.environ['OMP_NUM_THREADS']\ndef main(): return seen")
-    monkeypatch.setenv("OMP_NUM_THREADS", given) if given else monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    monkeypatch.setenv("OMP_NUM_THREADS", given) if given else monkeypatch.delenv(
+        "OMP_NUM_THREADS", raising=False
+    )
     assert start(name)() == kept  # before anything is imported
 
 
 @pytest.mark.parametrize("late", [False, True])
-def test_a_folder_of_recordings_does_not_say_how_libraries_behave(write, tmp_path, monkeypatch, late):
-    """matplotlib takes the settings of the folder in which it is imported: of its memory, and of LaTeX. numba takes its cache, and modules,
-    from there. Most commands import matplotlib when they draw, which is in the folder of the user."""
+def test_a_folder_of_recordings_does_not_say_how_libraries_behave(
+    write, tmp_path, monkeypatch, late
+):
+    """matplotlib takes the settings of the folder in which it is imported: of its memory, and of
+    LaTeX. numba takes its cache, and modules, from there. Most commands import matplotlib when they
+    draw, which is in the folder of the user.
+    """
     pytest.importorskip("matplotlib")
     (tmp_path / "matplotlibrc").write_text("savefig.dpi: 100000\ntext.usetex: True\n")
     (tmp_path / ".numba_config.yaml").write_text("disable_jit: 1\n")
     monkeypatch.chdir(tmp_path)
     imports = "import os, matplotlib, numba"
-    write("draws", ("" if late else f"{imports}\n") + f"def main():\n    {imports}\n"
-          "    print(matplotlib.rcParams['savefig.dpi'], numba.config.DISABLE_JIT, os.getcwd())")  # fmt: skip
+    write(
+        "draws",
+        ("" if late else f"{imports}\n") + f"def main():\n    {imports}\n"
+        "    print(matplotlib.rcParams['savefig.dpi'], numba.config.DISABLE_JIT, os.getcwd())",
+    )
     kept = {name: value for name, value in os.environ.items() if name != "NUMBA_DISABLE_JIT"}
-    done = subprocess.run([sys.executable, "-c", START.format("draws")], capture_output=True, text=True, env=kept)
+    done = subprocess.run(
+        [sys.executable, "-c", START.format("draws")], capture_output=True, text=True, env=kept
+    )
     assert done.stdout == f"figure 0 {tmp_path}\n", done.stderr

@@ -1,11 +1,12 @@
-from hypothesis import given, strategies as st
+from hypothesis import given
+from hypothesis import strategies as st
 import numpy as np
 from random_samples import random_rotation, random_samples
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.effects import Samples
 from uwb_tdoa_bias.correction.features import FEATURES, NAMES, PLACE, columns, everything
+from uwb_tdoa_bias.effects import Samples
+from uwb_tdoa_bias.foundation.anchors import Anchors
 
 ANGLES = [k for k, name in enumerate(FEATURES) if name.startswith(("azimuth", "elevation"))]
 seeds = st.integers(0, 2**32 - 1)
@@ -31,7 +32,10 @@ def expected(samples):
 def test_places(seed):
     samples = random_samples(seed)
     body = Rotation.from_quat(samples.q).as_matrix()
-    ends = [np.column_stack([samples.anchors.ids[k], samples.anchors.positions[k]]) for k in (samples.a, samples.b)]
+    ends = [
+        np.column_stack([samples.anchors.ids[k], samples.anchors.positions[k]])
+        for k in (samples.a, samples.b)
+    ]
     expected_place = np.concatenate([samples.p, body[:, :2, 0], body[:, :2, 2], *ends], axis=1)
     np.testing.assert_allclose(columns(samples, PLACE), expected_place, atol=1e-12)
     np.testing.assert_array_equal(columns(samples, NAMES[::-1]), everything(samples)[:, ::-1])
@@ -39,31 +43,55 @@ def test_places(seed):
 
 def test_fourteen_names_in_the_order_of_the_paper():
     assert FEATURES == (
-        "dx_a", "dy_a", "dz_a", "dx_b", "dy_b", "dz_b",
-        "azimuth_A_a", "azimuth_A_b", "azimuth_T_a", "azimuth_T_b",
-        "elevation_A_a", "elevation_A_b", "elevation_T_a", "elevation_T_b",
-    )  # fmt: skip
+        "dx_a",
+        "dy_a",
+        "dz_a",
+        "dx_b",
+        "dy_b",
+        "dz_b",
+        "azimuth_A_a",
+        "azimuth_A_b",
+        "azimuth_T_a",
+        "azimuth_T_b",
+        "elevation_A_a",
+        "elevation_A_b",
+        "elevation_T_a",
+        "elevation_T_b",
+    )
 
 
 @given(seeds)
 def test_definitions(seed):
     samples = random_samples(seed)
-    np.testing.assert_allclose(columns(samples, FEATURES), expected(samples), atol=1e-6)  # arcsin is steep near the pole
+    np.testing.assert_allclose(
+        columns(samples, FEATURES), expected(samples), atol=1e-6
+    )  # arcsin is steep near the pole
 
 
 def test_a_case_worked_by_hand():
     quarter = [0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]  # 90 degrees about z: body x is world y
     anchors = Anchors([0, 1], [[3.0, 0.0, 4.0], [0.0, -2.0, 0.0]], [[0, 0, 0, 1], quarter])
-    samples = Samples(np.zeros(1), np.array([0]), np.array([1]), np.zeros((1, 3)), np.array([quarter]), anchors)
+    samples = Samples(
+        np.zeros(1), np.array([0]), np.array([1]), np.zeros((1, 3)), np.array([quarter]), anchors
+    )
     found = dict(zip(FEATURES, columns(samples, FEATURES)[0]))
     up = np.arctan2(4.0, 3.0)
     hand = {
-        "dx_a": 3.0, "dy_a": 0.0, "dz_a": 4.0, "dx_b": 0.0, "dy_b": -2.0, "dz_b": 0.0,
-        "azimuth_A_a": np.pi, "elevation_A_a": -up,  # anchor a sees the tag at (-3, 0, -4)
-        "azimuth_A_b": 0.0, "elevation_A_b": 0.0,  # anchor b, whose x axis is world y, sees it ahead
-        "azimuth_T_a": -np.pi / 2, "elevation_T_a": up,  # world x is to the right of the tag
-        "azimuth_T_b": np.pi, "elevation_T_b": 0.0,
-    }  # fmt: skip
+        "dx_a": 3.0,
+        "dy_a": 0.0,
+        "dz_a": 4.0,
+        "dx_b": 0.0,
+        "dy_b": -2.0,
+        "dz_b": 0.0,
+        "azimuth_A_a": np.pi,
+        "elevation_A_a": -up,  # anchor a sees the tag at (-3, 0, -4)
+        "azimuth_A_b": 0.0,
+        "elevation_A_b": 0.0,  # anchor b, whose x axis is world y, sees it ahead
+        "azimuth_T_a": -np.pi / 2,
+        "elevation_T_a": up,  # world x is to the right of the tag
+        "azimuth_T_b": np.pi,
+        "elevation_T_b": 0.0,
+    }
     for name in FEATURES:
         apart = found[name] - hand[name]
         if name.startswith("azimuth"):
@@ -77,12 +105,16 @@ def test_a_rigid_motion_of_everything_turns_positions_and_keeps_angles(seed):
     samples = random_samples(seed)
     turn, shift = random_rotation(rng), rng.uniform(-10, 10, 3)
     old = samples.anchors
-    q, orientations = ((turn * Rotation.from_quat(known)).as_quat() for known in (samples.q, old.orientations))
+    q, orientations = (
+        (turn * Rotation.from_quat(known)).as_quat() for known in (samples.q, old.orientations)
+    )
     anchors = Anchors(old.ids, turn.apply(np.array(old.positions)) + shift, orientations)
     moved = Samples(samples.t, samples.a, samples.b, turn.apply(samples.p) + shift, q, anchors)
     before, after = columns(samples, FEATURES), columns(moved, FEATURES)
     for first in (0, 3):
-        np.testing.assert_allclose(after[:, first : first + 3], turn.apply(before[:, first : first + 3]), atol=1e-9)
+        np.testing.assert_allclose(
+            after[:, first : first + 3], turn.apply(before[:, first : first + 3]), atol=1e-9
+        )
     apart = (after[:, ANGLES] - before[:, ANGLES] + np.pi) % (2.0 * np.pi) - np.pi
     # an azimuth means nothing along the z axis: weigh it by the distance from there
     elevations = before[:, [10, 11, 12, 13]]
@@ -106,7 +138,9 @@ def test_unknown_attitudes_make_only_their_own_angles_nan():
     q = samples.q.copy()
     q[:2] = np.nan
     anchors = Anchors(samples.anchors.ids, samples.anchors.positions, orientations)
-    unknown = Samples(samples.t, np.array([0, 1, 0, 1]), np.array([1, 0, 1, 0]), samples.p, q, anchors)
+    unknown = Samples(
+        samples.t, np.array([0, 1, 0, 1]), np.array([1, 0, 1, 0]), samples.p, q, anchors
+    )
     found = columns(unknown, FEATURES)
     for i in range(4):
         for k, name in enumerate(FEATURES):

@@ -43,7 +43,9 @@ def test_a_file_that_is_replaced_keeps_its_permissions(tmp_path):
     (tmp_path / "there").write_bytes(b"old")
     (tmp_path / "there").chmod(0o604)
     write_bytes(tmp_path / "there", b"new")
-    assert (tmp_path / "there").read_bytes() == b"new" and stat.S_IMODE((tmp_path / "there").stat().st_mode) == 0o604
+    assert (tmp_path / "there").read_bytes() == b"new" and stat.S_IMODE(
+        (tmp_path / "there").stat().st_mode
+    ) == 0o604
     assert sorted(path.name for path in tmp_path.iterdir()) == ["there"]
 
 
@@ -65,10 +67,19 @@ def test_nothing_is_written_over_what_is_kept(tmp_path):
         folder.mkdir()
         (folder / "one").write_bytes(b"precious")
     (bag / "metadata.yaml").write_bytes(b"precious")
-    refused = [survey, tmp_path / "bag" / ".." / "survey", tmp_path / "hard", bag / "one", bag / "new", flights / "one"]
+    refused = [
+        survey,
+        tmp_path / "bag" / ".." / "survey",
+        tmp_path / "hard",
+        bag / "one",
+        bag / "new",
+        flights / "one",
+    ]
     with keeping([survey, bag, flights]):
         for path in refused:
-            with pytest.raises(InputError, match=f"{tmp_path}.*(is|lies in) {tmp_path}/.*, which is read"):
+            with pytest.raises(
+                InputError, match=f"{tmp_path}.*(is|lies in) {tmp_path}/.*, which is read"
+            ):
                 write_bytes(path, b"new")
         for path in (tmp_path / "new", flights / "new"):
             write_bytes(path, b"new")
@@ -77,7 +88,9 @@ def test_nothing_is_written_over_what_is_kept(tmp_path):
 
 
 def test_what_standard_output_goes_to_is_written_in_place(tmp_path):
-    code = "from uwb_tdoa_bias.foundation.files import write_text; write_text('/dev/stdout', 'said')"
+    code = (
+        "from uwb_tdoa_bias.foundation.files import write_text; write_text('/dev/stdout', 'said')"
+    )
     with open(tmp_path / "said", "wb") as said:
         subprocess.run([sys.executable, "-c", code], stdout=said, check=True)
     assert (tmp_path / "said").read_text() == "said" and os.path.islink("/dev/stdout")

@@ -1,7 +1,8 @@
-import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+import numpy as np
+import pytest
+
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flyable import FlyableVolume
@@ -15,7 +16,9 @@ def volume(**changes):
     fields = {"lower": [-1.0, 0.0, 0.5], "step": [0.5, 0.5, 0.25], "flyable": CELLS, "bound": BOUND}
     if "flyable" in changes:
         fields["bound"] = np.ones(changes["flyable"].shape)
-    return FlyableVolume(**{**fields, "ids": ANCHORS.ids, "positions": ANCHORS.positions, **changes})
+    return FlyableVolume(
+        **{**fields, "ids": ANCHORS.ids, "positions": ANCHORS.positions, **changes}
+    )
 
 
 @given(st.tuples(*[st.floats(-3, 4)] * 3))
@@ -23,16 +26,27 @@ def test_contains_looks_into_the_right_cell(p):
     inside = -1.0 <= p[0] < 1.5 and 0.0 <= p[1] < 2.0 and 0.5 <= p[2] < 1.25
     wanted = inside and CELLS[int((p[0] + 1.0) // 0.5), int(p[1] // 0.5), int((p[2] - 0.5) // 0.25)]
     assert volume().contains(p) == wanted
-    assert np.isfinite(volume().bound_at(p)) == wanted and np.isnan(volume().bound_at(p)) == (not inside)
+    assert np.isfinite(volume().bound_at(p)) == wanted and np.isnan(volume().bound_at(p)) == (
+        not inside
+    )
 
 
 def test_contains_takes_many_and_nothing_strange():
-    p = np.array([[[-0.75, 0.25, 0.6], [np.nan, 0.25, 0.6]], [[np.inf, 0.25, 0.6], [1e300, -1e300, 0.6]]])
-    assert volume(flyable=np.ones((5, 4, 3), bool)).contains(p).tolist() == [[True, False], [False, False]]
+    p = np.array(
+        [[[-0.75, 0.25, 0.6], [np.nan, 0.25, 0.6]], [[np.inf, 0.25, 0.6], [1e300, -1e300, 0.6]]]
+    )
+    assert volume(flyable=np.ones((5, 4, 3), bool)).contains(p).tolist() == [
+        [True, False],
+        [False, False],
+    ]
 
 
 def test_the_bound_is_that_of_the_cell():
-    p = np.stack(np.meshgrid(*[np.arange(n) + 0.5 for n in (5, 4, 3)], indexing="ij"), axis=-1) * [0.5, 0.5, 0.25]
+    p = np.stack(np.meshgrid(*[np.arange(n) + 0.5 for n in (5, 4, 3)], indexing="ij"), axis=-1) * [
+        0.5,
+        0.5,
+        0.25,
+    ]
     np.testing.assert_array_equal(volume().bound_at(p + [-1.0, 0.0, 0.5]), BOUND)
 
 
@@ -54,15 +68,24 @@ def test_a_saved_one_comes_back(tmp_path):
 def test_it_knows_its_anchors():
     assert volume().belongs_to(ANCHORS)
     order = [2, 0, 3, 1]
-    assert volume().belongs_to(Anchors.from_positions(ANCHORS.positions[order] + 0.05, ANCHORS.ids[order]))
+    assert volume().belongs_to(
+        Anchors.from_positions(ANCHORS.positions[order] + 0.05, ANCHORS.ids[order])
+    )
     assert not volume().belongs_to(Anchors.from_positions(ANCHORS.positions + 0.2, ANCHORS.ids))
     assert not volume().belongs_to(Anchors.from_positions(ANCHORS.positions, [3, 1, 7, 6]))
     assert not volume().belongs_to(Anchors.from_positions(ANCHORS.positions[:3], ANCHORS.ids[:3]))
-    assert not volume().belongs_to(Anchors.from_positions(ANCHORS.positions, ANCHORS.ids, frame="hall"))
+    assert not volume().belongs_to(
+        Anchors.from_positions(ANCHORS.positions, ANCHORS.ids, frame="hall")
+    )
 
 
 def test_other_files_are_refused(tmp_path):
-    for name, content in (("none", None), ("empty", b""), ("text", b"flyable: all"), ("zip", b"PK\x03\x04 cut")):
+    for name, content in (
+        ("none", None),
+        ("empty", b""),
+        ("text", b"flyable: all"),
+        ("zip", b"PK\x03\x04 cut"),
+    ):
         file = tmp_path / name
         if content is not None:
             file.write_bytes(content)
@@ -75,6 +98,13 @@ def test_other_files_are_refused(tmp_path):
         with pytest.raises(InputError, match="do not fit together"):
             volume(**wrong)
     negative, unknown = np.full((5, 4, 3), -1.0), np.full((5, 4, 3), np.nan)
-    for wrong in ({"step": [0.1, 0.1, 0.0]}, {"lower": [0.0, np.nan, 0.0]}, {"bound": negative}, {"bound": unknown}):
-        with pytest.raises(InputError, match="not finite, a step that is not above 0 or a bound below 0"):
+    for wrong in (
+        {"step": [0.1, 0.1, 0.0]},
+        {"lower": [0.0, np.nan, 0.0]},
+        {"bound": negative},
+        {"bound": unknown},
+    ):
+        with pytest.raises(
+            InputError, match="not finite, a step that is not above 0 or a bound below 0"
+        ):
             volume(**wrong)

@@ -1,9 +1,18 @@
 from finite_differences import numerical_jacobian
-from hypothesis import given, strategies as st
+from hypothesis import given
+from hypothesis import strategies as st
 import numpy as np
 from random_samples import random_rotation
 
-from uwb_tdoa_bias.foundation.geometry import linearized_tdoa, ranges, rotate, rotate_each, tdoa, tdoa_each, tdoa_jacobian
+from uwb_tdoa_bias.foundation.geometry import (
+    linearized_tdoa,
+    ranges,
+    rotate,
+    rotate_each,
+    tdoa,
+    tdoa_each,
+    tdoa_jacobian,
+)
 
 seeds = st.integers(0, 2**32 - 1)
 
@@ -89,7 +98,9 @@ def test_rotate_is_the_rotation_of_scipy(seed):
 def test_one_vector_turned_by_many_attitudes(seed):
     rng = np.random.default_rng(seed)
     turns, v = [random_rotation(rng) for _ in range(4)], rng.normal(size=3)
-    q = np.array([turn.as_quat() for turn in turns]) * rng.uniform(0.5, 2.0, (4, 1))  # of any length
+    q = np.array([turn.as_quat() for turn in turns]) * rng.uniform(
+        0.5, 2.0, (4, 1)
+    )  # of any length
     out = np.empty((6, 3))
     rotate_each(np.concatenate([q, [[0.0, 0.0, 0.0, 0.0], [np.nan, 0.0, 0.0, 1.0]]]), v, out)
     np.testing.assert_allclose(out[:4], [turn.apply(v) for turn in turns], atol=1e-12)

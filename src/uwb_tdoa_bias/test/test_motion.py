@@ -1,6 +1,7 @@
 from types import SimpleNamespace
 
-from hypothesis import given, strategies as st
+from hypothesis import given
+from hypothesis import strategies as st
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -26,7 +27,11 @@ def path(n=400, step=0.01):
 def test_of_an_even_acceleration_and_turn():
     poses = path()
     found = motion_at(poses.t, poses.v, poses.q, np.array([-1, 10, 30, 100, 399]))
-    assert np.isnan(found.velocity[0]).all() and np.isnan(found.acceleration[:2]).all() and np.isnan(found.rate[:2]).all()
+    assert (
+        np.isnan(found.velocity[0]).all()
+        and np.isnan(found.acceleration[:2]).all()
+        and np.isnan(found.rate[:2]).all()
+    )
     np.testing.assert_array_equal(found.velocity[1:], poses.v[[10, 30, 100, 399]])
     np.testing.assert_allclose(found.acceleration[2:], [[0.2, 0.4, -0.1]] * 3, atol=1e-9)
     np.testing.assert_allclose(found.rate[2:], [RATE] * 3, atol=1e-9)
@@ -48,14 +53,21 @@ def test_the_preceding_stamp_is_that_of_the_newest_before(t, newest):
         assert found[k] == min(t[k], max(earlier, default=t[k]))
 
 
-@pytest.mark.parametrize("covariate", ["speed", "climb_rate", "acceleration", "turning_rate", "interval", "previous_anchor"])
+@pytest.mark.parametrize(
+    "covariate",
+    ["speed", "climb_rate", "acceleration", "turning_rate", "interval", "previous_anchor"],
+)
 def test_what_is_learned_is_what_is_applied(covariate):
-    """The regressors at true poses, and those of a Corrector that is told the same poses, are the same function."""
+    """The regressors at true poses, and those of a Corrector that is told the same poses, are the
+    same function.
+    """
     poses = path()
     t = np.sort(np.random.default_rng(1).uniform(5.8, 8.9, 60))
     a, b = np.arange(60) % 4, (np.arange(60) + 1) % 4
     knots = (4.0, 5.0, 6.0, 7.0) if covariate == "previous_anchor" else (0.0, 0.3, 1.0, 2.0)
-    values = {f"c{k}": 0.1 * (k + 1) ** 2 for k in range(6 if covariate != "previous_anchor" else 4)}
+    values = {
+        f"c{k}": 0.1 * (k + 1) ** 2 for k in range(6 if covariate != "previous_anchor" else 4)
+    }
     term = SmoothTerm(values=values, covariate=covariate, form="common", knots=knots)
     learned = samples_at(t, a, b, poses, ANCHORS, t[0])
     corrector = Corrector(ANCHORS, EffectSet((term,)))
@@ -80,4 +92,6 @@ def test_batches_know_what_was_heard_before():
     expected = whole.samples(t, a, b)
     found = [parts.samples(t[k : k + 3], a[k : k + 3], b[k : k + 3]) for k in range(0, 10, 3)]
     for name in ("interval", "previous"):
-        np.testing.assert_array_equal(np.concatenate([getattr(part, name) for part in found]), getattr(expected, name))
+        np.testing.assert_array_equal(
+            np.concatenate([getattr(part, name) for part in found]), getattr(expected, name)
+        )

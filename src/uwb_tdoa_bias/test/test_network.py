@@ -4,11 +4,12 @@ import pickle
 
 import numpy as np
 import pytest
+
 from uwb_tdoa_bias.correction import known_answer
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.effects import Samples
-from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.correction.network import MODELS, SHIPPED, Network, load_network
+from uwb_tdoa_bias.effects import Samples
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.errors import InputError
 
 KNOWN = MODELS / "known_answer.onnx"
 ANCHORS = Anchors.from_positions([[5, 0, 1], [-3, 2, 3], [0, -400, 2]])
@@ -16,18 +17,24 @@ ANCHORS = Anchors.from_positions([[5, 0, 1], [-3, 2, 3], [0, -400, 2]])
 
 def samples(p, q, a, b):
     n = len(p)
-    return Samples(np.zeros(n), np.array(a), np.array(b), np.array(p, float), np.array(q, float), ANCHORS)
+    return Samples(
+        np.zeros(n), np.array(a), np.array(b), np.array(p, float), np.array(q, float), ANCHORS
+    )
 
 
 def batch(n=50):
     random = np.random.default_rng(3)
     q = random.normal(size=(n, 4))
     a = random.integers(0, 2, n)
-    return samples(random.uniform(-2, 2, (n, 3)), q / np.linalg.norm(q, axis=1, keepdims=True), a, 1 - a)
+    return samples(
+        random.uniform(-2, 2, (n, 3)), q / np.linalg.norm(q, axis=1, keepdims=True), a, 1 - a
+    )
 
 
 def expected(s):
-    """By hand: rotate the vector to anchor b into the body frame with x y z w written out as a matrix."""
+    """By hand: rotate the vector to anchor b into the body frame with x y z w written out as a
+    matrix.
+    """
     out = []
     for p, (x, y, z, w), a, b in zip(s.p, s.q, s.a, s.b):
         to_world = np.array(
@@ -130,18 +137,27 @@ def test_takes_nothing_out_before_the_yaw_is_known(tmp_path):
 
 
 def test_takes_out_the_share_that_is_borne_out_and_counts_the_rest_as_uncertainty(tmp_path):
-    whole, part = Network(KNOWN).predict(batch(5)), Network(changed(tmp_path, share="0.75")).predict(batch(5))
+    whole, part = (
+        Network(KNOWN).predict(batch(5)),
+        Network(changed(tmp_path, share="0.75")).predict(batch(5)),
+    )
     np.testing.assert_allclose(part[0], 0.75 * whole[0])
     np.testing.assert_allclose(part[1], np.hypot(whole[1], 0.25 * np.abs(whole[0])))
 
 
 def test_fades_beyond_what_it_knows(tmp_path):
-    network = Network(changed(tmp_path, validity='{"z": [0.0, 2.0, 1.0], "up_x": [-0.2, 0.2, 0.5]}', fade_std="0.3"))
+    network = Network(
+        changed(
+            tmp_path, validity='{"z": [0.0, 2.0, 1.0], "up_x": [-0.2, 0.2, 0.5]}', fade_std="0.3"
+        )
+    )
     tilted = [0.0, np.sin(0.25), 0.0, np.cos(0.25)]  # up_x = sin(0.5)
     s = samples(
         [[1, 0, 0.0], [1, 0, 2.0], [1, 0, 2.4], [1, 0, -1.0], [1, 0, 9.0], [1, 0, 1.0]],
-        [[0, 0, 0, 1]] * 5 + [tilted], [0] * 6, [1] * 6,
-    )  # fmt: skip
+        [[0, 0, 0, 1]] * 5 + [tilted],
+        [0] * 6,
+        [1] * 6,
+    )
     plain, (bias, std, known) = Network(KNOWN).predict(s)[0], network.predict(s)
     trust = np.array([1.0, 1.0, 0.6, 0.0, 0.0, 1.0 - (np.sin(0.5) - 0.2) / 0.5])
     np.testing.assert_allclose(known, trust, atol=1e-12)
@@ -214,11 +230,21 @@ WIDE = ("weight", np.ones((2, 4), np.float32))
     [
         ([("MatMul", ["features", "weight"], ["bias"])], [WIDE], "gives (n, 4)"),
         ([("ReduceSum", ["features"], ["bias"], {"keepdims": 0})], [], "an output with other rows"),
-        ([("Reshape", ["features", "shape"], ["bias"])], [("shape", np.array([7, 2], np.int64))], "cannot be played"),
-        ([("Div", ["features", "zero"], ["bias"])], [("zero", np.zeros(2, np.float32))], "no finite numbers"),
+        (
+            [("Reshape", ["features", "shape"], ["bias"])],
+            [("shape", np.array([7, 2], np.int64))],
+            "cannot be played",
+        ),
+        (
+            [("Div", ["features", "zero"], ["bias"])],
+            [("zero", np.zeros(2, np.float32))],
+            "no finite numbers",
+        ),
     ],
 )
-def test_a_model_that_gives_no_rows_of_numbers_is_refused_when_it_is_loaded(tmp_path, nodes, constants, named):
+def test_a_model_that_gives_no_rows_of_numbers_is_refused_when_it_is_loaded(
+    tmp_path, nodes, constants, named
+):
     with pytest.raises(InputError) as error:
         Network(otherwise(tmp_path, nodes, constants))
     assert named in str(error.value)

@@ -8,6 +8,7 @@ import sys
 
 import numpy as np
 import pytest
+
 from uwb_tdoa_bias.correction import trial
 from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.foundation.errors import InputError
@@ -17,7 +18,13 @@ onnx = pytest.importorskip("onnx")
 from onnx import TensorProto, helper, numpy_helper  # noqa: E402
 
 START = 2.0  # s of processor time that the process of a trial takes before it loads the model
-META = {"features": ["dx_a", "dy_a"], "offset": [0, 0], "scale": [1, 1], "clip": 1, "name": "attack"}
+META = {
+    "features": ["dx_a", "dy_a"],
+    "offset": [0, 0],
+    "scale": [1, 1],
+    "clip": 1,
+    "name": "attack",
+}
 NODE = helper.make_node
 SAME = NODE("Identity", ["x"], ["y"])
 COLUMN = numpy_helper.from_array(np.ones((2, 1), np.float32), "column")
@@ -26,48 +33,79 @@ COLUMN = numpy_helper.from_array(np.ones((2, 1), np.float32), "column")
 def model(*nodes, constants=(), width=2, meta=META, **more):
     """ModelProto whose output is that of the last node."""
     graph = helper.make_graph(
-        nodes, "attack", [helper.make_tensor_value_info("x", TensorProto.FLOAT, ["n", width])],
-        [helper.make_tensor_value_info(nodes[-1].output[0], TensorProto.FLOAT, None)], constants,
-    )  # fmt: skip
-    made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8, **more)
+        nodes,
+        "attack",
+        [helper.make_tensor_value_info("x", TensorProto.FLOAT, ["n", width])],
+        [helper.make_tensor_value_info(nodes[-1].output[0], TensorProto.FLOAT, None)],
+        constants,
+    )
+    made = helper.make_model(
+        graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8, **more
+    )
     helper.set_model_props(made, {key: json.dumps(value) for key, value in meta.items()})
     return made
 
 
 def doubling(count=30, *before):
     """A kilobyte that becomes 2^count columns."""
-    return model(*before, *(NODE("Concat", [f"v{k}" if k or before else "x"] * 2, [f"v{k + 1}"], axis=1) for k in range(count)))
+    return model(
+        *before,
+        *(
+            NODE("Concat", [f"v{k}" if k or before else "x"] * 2, [f"v{k + 1}"], axis=1)
+            for k in range(count)
+        ),
+    )
 
 
 def looping():
     kinds = {"i": TensorProto.INT64, "go": TensorProto.BOOL, "last": TensorProto.FLOAT}
-    inputs = [helper.make_tensor_value_info(name, kind, None if name == "last" else []) for name, kind in kinds.items()]
-    outputs = [helper.make_tensor_value_info(name, kind, None) for name, kind in (("go", TensorProto.BOOL), ("next", TensorProto.FLOAT))]
+    inputs = [
+        helper.make_tensor_value_info(name, kind, None if name == "last" else [])
+        for name, kind in kinds.items()
+    ]
+    outputs = [
+        helper.make_tensor_value_info(name, kind, None)
+        for name, kind in (("go", TensorProto.BOOL), ("next", TensorProto.FLOAT))
+    ]
     body = helper.make_graph([NODE("Add", ["last", "last"], ["next"])], "body", inputs, outputs)
     count = numpy_helper.from_array(np.array(2**62), "count")
     return model(NODE("Loop", ["count", "", "x"], ["y"], body=body), constants=[count])
 
 
 def branching():
-    branch = helper.make_graph([NODE("Exp", ["x"], ["z"])], "branch", [], [helper.make_tensor_value_info("z", TensorProto.FLOAT, None)])
+    branch = helper.make_graph(
+        [NODE("Exp", ["x"], ["z"])],
+        "branch",
+        [],
+        [helper.make_tensor_value_info("z", TensorProto.FLOAT, None)],
+    )
     return model(NODE("Identity", ["x"], ["y"], then_branch=branch, else_branch=branch))
 
 
 def read_elsewhere():
     """The weights are bytes of a file of the user."""
-    weights = onnx.TensorProto(name="column", data_type=TensorProto.FLOAT, dims=[2, 1], data_location=TensorProto.EXTERNAL)
+    weights = onnx.TensorProto(
+        name="column", data_type=TensorProto.FLOAT, dims=[2, 1], data_location=TensorProto.EXTERNAL
+    )
     weights.external_data.add(key="location", value="../../etc/passwd")
     return model(NODE("MatMul", ["x", "column"], ["y"]), constants=[weights])
 
 
 def read_elsewhere_in_a_node():
     weights = read_elsewhere().graph.initializer[0]
-    return model(NODE("Constant", [], ["column"], value=weights), NODE("MatMul", ["x", "column"], ["y"]))
+    return model(
+        NODE("Constant", [], ["column"], value=weights), NODE("MatMul", ["x", "column"], ["y"])
+    )
 
 
 def recursive():
     function = helper.make_function(
-        "own", "Twice", ["x"], ["y"], [NODE("Twice", ["x"], ["y"], domain="own")], [helper.make_opsetid("own", 1)]
+        "own",
+        "Twice",
+        ["x"],
+        ["y"],
+        [NODE("Twice", ["x"], ["y"], domain="own")],
+        [helper.make_opsetid("own", 1)],
     )
     made = model(NODE("Twice", ["x"], ["y"], domain="own"), functions=[function])
     made.opset_import.add(domain="own", version=1)
@@ -76,20 +114,30 @@ def recursive():
 
 def sparse():
     made = model(SAME)
-    values, at = numpy_helper.from_array(np.ones(1, np.float32), "huge"), numpy_helper.from_array(np.zeros((1, 2), np.int64), "at")
+    values, at = (
+        numpy_helper.from_array(np.ones(1, np.float32), "huge"),
+        numpy_helper.from_array(np.zeros((1, 2), np.int64), "at"),
+    )
     made.graph.sparse_initializer.append(helper.make_sparse_tensor(values, at, [2**20, 2**20]))
     return made
 
 
 def claiming(*dims):
-    return model(NODE("MatMul", ["x", "column"], ["y"]), constants=[onnx.TensorProto(name="column", data_type=1, dims=dims, raw_data=b"")])
+    return model(
+        NODE("MatMul", ["x", "column"], ["y"]),
+        constants=[onnx.TensorProto(name="column", data_type=1, dims=dims, raw_data=b"")],
+    )
 
 
 def busy():
     """The same weights a thousand times."""
     weights = numpy_helper.from_array(np.zeros((500, 500), np.float32), "weights")
     nodes = [NODE("Concat", ["x"] * 250, ["v0"], axis=1)]
-    return model(*nodes, *(NODE("MatMul", [f"v{k}", "weights"], [f"v{k + 1}"]) for k in range(1000)), constants=[weights])
+    return model(
+        *nodes,
+        *(NODE("MatMul", [f"v{k}", "weights"], [f"v{k + 1}"]) for k in range(1000)),
+        constants=[weights],
+    )
 
 
 def long():
@@ -97,21 +145,41 @@ def long():
 
 
 def gathering(index):
-    return model(NODE("Gather", ["x", "i"], ["y"], axis=1), constants=[numpy_helper.from_array(np.array([index]), "i")])
+    return model(
+        NODE("Gather", ["x", "i"], ["y"], axis=1),
+        constants=[numpy_helper.from_array(np.array([index]), "i")],
+    )
 
 
 def branching_seldom():
     """It branches, and loops, only for other numbers than those of the trial."""
-    far, text = numpy_helper.from_array(np.float32(1e6), "far"), helper.make_tensor_value_info("z", TensorProto.FLOAT, None)
-    then, other = (helper.make_graph([NODE(kind, ["x"], ["z"])], kind, [], [text]) for kind in ("Exp", "Identity"))
+    far, text = (
+        numpy_helper.from_array(np.float32(1e6), "far"),
+        helper.make_tensor_value_info("z", TensorProto.FLOAT, None),
+    )
+    then, other = (
+        helper.make_graph([NODE(kind, ["x"], ["z"])], kind, [], [text])
+        for kind in ("Exp", "Identity")
+    )
     nodes = NODE("ReduceMax", ["x"], ["most"], keepdims=0), NODE("Greater", ["most", "far"], ["is"])
-    return model(*nodes, NODE("If", ["is"], ["y"], then_branch=then, else_branch=other), constants=[far])
+    return model(
+        *nodes, NODE("If", ["is"], ["y"], then_branch=then, else_branch=other), constants=[far]
+    )
 
 
 def unfolding_seldom():
     """Its width follows from the numbers of the input."""
-    nodes = NODE("ReduceMax", ["x"], ["most"], keepdims=1), NODE("Exp", ["most"], ["e"]), NODE("Cast", ["e"], ["n"], to=TensorProto.INT64)
-    return model(*nodes, NODE("Reshape", ["n", "one"], ["m"]), NODE("Expand", ["x", "m"], ["y"]), constants=[numpy_helper.from_array(np.array([1]), "one")])
+    nodes = (
+        NODE("ReduceMax", ["x"], ["most"], keepdims=1),
+        NODE("Exp", ["most"], ["e"]),
+        NODE("Cast", ["e"], ["n"], to=TensorProto.INT64),
+    )
+    return model(
+        *nodes,
+        NODE("Reshape", ["n", "one"], ["m"]),
+        NODE("Expand", ["x", "m"], ["y"]),
+        constants=[numpy_helper.from_array(np.array([1]), "one")],
+    )
 
 
 def spent():
@@ -137,7 +205,10 @@ TOO_MUCH = "it takes more than 3 s or 256 MB|onnxruntime: .*(alloc|[Mm]emory|bfc
         (read_elsewhere_in_a_node(), "onnxruntime: "),
         (recursive(), "onnxruntime: |" + TOO_MUCH),
         (sparse(), "onnxruntime: |" + TOO_MUCH),
-        (model(NODE("Inverse", ["x"], ["y"], domain="com.microsoft")), "onnxruntime: |operator 'Inverse' is none of"),
+        (
+            model(NODE("Inverse", ["x"], ["y"], domain="com.microsoft")),
+            "onnxruntime: |operator 'Inverse' is none of",
+        ),
         (model(NODE("Dropout", ["x"], ["y"])), "operator 'Dropout' is none of Abs, Add, .*Concat"),
         (model(NODE("\x1b[2J", ["x"], ["y"])), r"onnxruntime: "),
         (claiming(2**31, 2**31), "onnxruntime: "),
@@ -150,7 +221,7 @@ TOO_MUCH = "it takes more than 3 s or 256 MB|onnxruntime: .*(alloc|[Mm]emory|bfc
         (model(NODE("LeakyRelu", ["x"], ["y"], alpha="x")), "onnxruntime: "),
         (gathering(2), "onnxruntime: .*out of"),
     ],
-)  # fmt: skip
+)
 def test_refused_at_once(tmp_path, made, said):
     path = tmp_path / "model.onnx"
     path.write_bytes(made.SerializeToString())
@@ -161,7 +232,16 @@ def test_refused_at_once(tmp_path, made, said):
     assert len(str(refused.value)) < 1000 and str(refused.value).isprintable()
 
 
-@pytest.mark.parametrize("content", [b"\xff" * 1_000_000, b"\x3a\x80\x80\x80\x80" + b"\xff" * 1_000_000, b"\x08\x01" * (MODEL_BYTES // 2), b"", b"a"])
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"\xff" * 1_000_000,
+        b"\x3a\x80\x80\x80\x80" + b"\xff" * 1_000_000,
+        b"\x08\x01" * (MODEL_BYTES // 2),
+        b"",
+        b"a",
+    ],
+)
 def test_bytes_that_are_no_model(tmp_path, content):
     (tmp_path / "model.onnx").write_bytes(content)
     with pytest.raises(InputError, match="onnxruntime: |is empty|no table|more than one input"):
@@ -176,15 +256,22 @@ def test_a_file_that_is_too_large_is_not_tried(tmp_path, monkeypatch):
 
 
 def test_a_model_opens_no_file_in_its_trial(tmp_path, monkeypatch):
-    """Weights in another file are bytes of a file of the user; a pipe in its place would hang. Here the file is there, and fits."""
+    """Weights in another file are bytes of a file of the user; a pipe in its place would hang.
+
+    Here the file is there, and fits.
+    """
     (tmp_path / "weights").write_bytes(np.ones(2, np.float32).tobytes())
-    weights = onnx.TensorProto(name="column", data_type=TensorProto.FLOAT, dims=[2, 1], data_location=TensorProto.EXTERNAL)
+    weights = onnx.TensorProto(
+        name="column", data_type=TensorProto.FLOAT, dims=[2, 1], data_location=TensorProto.EXTERNAL
+    )
     weights.external_data.add(key="location", value="weights")
     made = model(NODE("MatMul", ["x", "column"], ["y"]), constants=[weights]).SerializeToString()
     monkeypatch.chdir(tmp_path)
     options = trial.onnxruntime.SessionOptions()
     options.graph_optimization_level = trial.onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
-    assert trial.Session(made, options=options).run(np.ones((1, 2))) == 2.0  # the attack: bytes of the present folder are weights
+    assert (
+        trial.Session(made, options=options).run(np.ones((1, 2))) == 2.0
+    )  # the attack: bytes of the present folder are weights
     for place in (tmp_path, "/"):
         monkeypatch.chdir(place)
         with pytest.raises(trial.Unplayable, match="onnxruntime: "):
@@ -202,9 +289,16 @@ def test_a_model_opens_no_file_in_its_trial(tmp_path, monkeypatch):
     ],
 )
 def test_what_a_trial_may_take(tmp_path, work, said):
-    code = f"from uwb_tdoa_bias.correction.trial import MODEL_MEMORY, _limit_this_process\n_limit_this_process()\n{work}"
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True)
-    assert (done.returncode == 1) == bool(said) and said in done.stderr and not any(tmp_path.iterdir())
+    code = (
+        "from uwb_tdoa_bias.correction.trial import MODEL_MEMORY, "
+        f"_limit_this_process\n_limit_this_process()\n{work}"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True
+    )
+    assert (
+        (done.returncode == 1) == bool(said) and said in done.stderr and not any(tmp_path.iterdir())
+    )
 
 
 def test_a_trial_takes_no_module_of_the_present_folder(tmp_path, monkeypatch):
@@ -236,7 +330,11 @@ def test_a_model_is_tried_once(monkeypatch):
 
 def test_a_name_goes_into_messages_and_tables(tmp_path):
     path = tmp_path / "model.onnx"
-    made = model(NODE("MatMul", ["x", "column"], ["y"]), constants=[COLUMN], meta={**META, "name": "<b>\x1b[31m$\\frac$" + "x" * 10**5})
+    made = model(
+        NODE("MatMul", ["x", "column"], ["y"]),
+        constants=[COLUMN],
+        meta={**META, "name": "<b>\x1b[31m$\\frac$" + "x" * 10**5},
+    )
     path.write_bytes(made.SerializeToString())
     name = Network(path).name
     assert name.startswith("_b___31m__frac_x") and len(name) == 100

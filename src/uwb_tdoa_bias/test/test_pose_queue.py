@@ -1,5 +1,6 @@
 from hypothesis import given
 from hypothesis import strategies as st
+
 from uwb_tdoa_bias.correction.pose_queue import PoseQueue
 
 
@@ -9,7 +10,11 @@ def test_leaves_when_ready_in_order_of_arrival():
         hold.add(t, item)
     assert hold.take(lambda before: before < 0.2) == []  # b is ready but waits behind a
     assert hold.take(lambda before: before < 0.3) == []
-    assert hold.take(lambda before: before <= 0.3) == [(0.3, "a", True), (0.1, "b", True), (0.4, "c", True)]
+    assert hold.take(lambda before: before <= 0.3) == [
+        (0.3, "a", True),
+        (0.1, "b", True),
+        (0.4, "c", True),
+    ]
 
 
 def test_after_a_gap_what_counts_is_the_item_before_it():

@@ -1,10 +1,16 @@
-from hypothesis import given, strategies as st
+from hypothesis import given
+from hypothesis import strategies as st
 import numpy as np
 import pytest
 
 from uwb_tdoa_bias.foundation.robust_loss import (
-    CAUCHY, GEMAN_MCCLURE, HUBER, LOSSES, geman_mcclure_loss, weight,
-)  # fmt: skip
+    CAUCHY,
+    GEMAN_MCCLURE,
+    HUBER,
+    LOSSES,
+    geman_mcclure_loss,
+    weight,
+)
 
 # textbook losses (MacTavish and Barfoot 2015, table I), all e^2 / 2 near zero
 RHO = {
@@ -15,12 +21,18 @@ RHO = {
 
 
 def test_places_are_those_of_the_names():
-    assert [LOSSES.index(name) for name in ("geman_mcclure", "huber", "cauchy")] == [GEMAN_MCCLURE, HUBER, CAUCHY]
+    assert [LOSSES.index(name) for name in ("geman_mcclure", "huber", "cauchy")] == [
+        GEMAN_MCCLURE,
+        HUBER,
+        CAUCHY,
+    ]
 
 
 @given(st.sampled_from(list(RHO)), st.floats(-30.0, 30.0), st.floats(0.5, 5.0))
 def test_weight_is_the_slope_of_the_textbook_loss(loss, e, scale):
-    if abs(e) < 0.01 or abs(abs(e) - scale) < 1e-3:  # the second is where Huber's slope has its corner
+    if (
+        abs(e) < 0.01 or abs(abs(e) - scale) < 1e-3
+    ):  # the second is where Huber's slope has its corner
         return
     slope = (RHO[loss](e + 1e-5, scale) - RHO[loss](e - 1e-5, scale)) / 2e-5
     assert weight(loss, e, scale) == pytest.approx(slope / e, rel=1e-6, abs=1e-9)
@@ -42,4 +54,6 @@ def test_weight_has_its_limits(loss):
 
 @given(st.floats(-30.0, 30.0), st.floats(0.5, 5.0))
 def test_geman_mcclure_loss_is_the_textbook_one_over_its_limit(e, scale):
-    assert geman_mcclure_loss(e, scale) == pytest.approx(2.0 * RHO[GEMAN_MCCLURE](e, scale) / scale**2, abs=1e-12)
+    assert geman_mcclure_loss(e, scale) == pytest.approx(
+        2.0 * RHO[GEMAN_MCCLURE](e, scale) / scale**2, abs=1e-12
+    )

@@ -10,8 +10,15 @@ from geometry_msgs.msg import TwistWithCovarianceStamped  # noqa: E402
 from nav_msgs.msg import Odometry, Path  # noqa: E402
 from rclpy.serialization import deserialize_message, serialize_message  # noqa: E402
 from sensor_msgs.msg import FluidPressure, Imu, Range  # noqa: E402
+
 from uwb_tdoa_bias.foundation import ros_cdr  # noqa: E402
-from uwb_tdoa_bias.foundation.ros_cdr import LONGEST_TEXT, MOST_ELEMENTS, Unreadable, CdrCodec, decode  # noqa: E402
+from uwb_tdoa_bias.foundation.ros_cdr import (
+    LONGEST_TEXT,
+    MOST_ELEMENTS,
+    CdrCodec,
+    Unreadable,
+    decode,
+)  # noqa: E402
 from uwb_tdoa_msgs.msg import AnchorArray, Tdoa, TdoaCorrected, TdoaResidual  # noqa: E402
 
 POSE = "pose.pose.position", "pose.pose.orientation", "pose.covariance"
@@ -19,14 +26,18 @@ POSE = "pose.pose.position", "pose.pose.orientation", "pose.covariance"
 
 @pytest.fixture(params=["bytes", "objects"])
 def way(request, monkeypatch):
-    """Both ways of reading and writing: by the definition, and by message objects where that does not fit."""
+    """Both ways of reading and writing: by the definition, and by message objects where that does
+    not fit.
+    """
     if request.param == "objects":
         monkeypatch.setattr(CdrCodec, "_agrees", lambda self: False)
     return request.param
 
 
 def corrected(k, frame="base_link", model="none"):
-    message = TdoaCorrected(anchor_a=k, anchor_b=k + 1, raw=0.5 * k, bias=0.1, bias_std=0.2, corrected=-k / 3, status=2)
+    message = TdoaCorrected(
+        anchor_a=k, anchor_b=k + 1, raw=0.5 * k, bias=0.1, bias_std=0.2, corrected=-k / 3, status=2
+    )
     message.model, message.header.frame_id = model, frame
     message.header.stamp.sec, message.header.stamp.nanosec = 1_700_000_000 + k, 999_999_999 - k
     return message
@@ -34,11 +45,16 @@ def corrected(k, frame="base_link", model="none"):
 
 def test_the_definition_fits_the_types_of_our_topics():
     for kind, *fields in (
-        (Imu, "angular_velocity", "linear_acceleration_covariance"), (Tdoa, "distance_difference"), (TdoaCorrected, "raw"),
-        (TdoaResidual, "innovation", "verdict"), (Odometry, *POSE, "twist.covariance"), (Range, "range", "max_range"),
-        (FluidPressure, "fluid_pressure"), (TwistWithCovarianceStamped, "twist.twist.linear", "twist.covariance"),
+        (Imu, "angular_velocity", "linear_acceleration_covariance"),
+        (Tdoa, "distance_difference"),
+        (TdoaCorrected, "raw"),
+        (TdoaResidual, "innovation", "verdict"),
+        (Odometry, *POSE, "twist.covariance"),
+        (Range, "range", "max_range"),
+        (FluidPressure, "fluid_pressure"),
+        (TwistWithCovarianceStamped, "twist.twist.linear", "twist.covariance"),
         (Path,),
-    ):  # fmt: skip
+    ):
         assert CdrCodec(kind, *fields).fits, kind
 
 
@@ -49,7 +65,9 @@ def test_messages_are_read_in_order_in_runs_of_one_frame(way):
     parts = wire.read([serialize_message(message) for message in messages])
     assert [frame for frame, rows, _ in parts for _ in rows] == frames
     assert [k for *_, some in parts for k in range(6)[some]] == list(range(6))
-    rows = np.concatenate([rows[["sec", "nanosec", "corrected", "anchor_b", "status"]] for _, rows, _ in parts])
+    rows = np.concatenate(
+        [rows[["sec", "nanosec", "corrected", "anchor_b", "status"]] for _, rows, _ in parts]
+    )
     assert rows["corrected"].tolist() == [message.corrected for message in messages]
     assert rows["anchor_b"].tolist() == [message.anchor_b for message in messages]
     assert rows["sec"].tolist() == [message.header.stamp.sec for message in messages]
@@ -68,13 +86,17 @@ def test_vectors_and_arrays_are_columns(way):
 
 
 def test_what_is_written_is_what_an_object_would_be(way):
-    wire = CdrCodec(TdoaCorrected, "corrected", "anchor_b", "anchor_a", "raw")  # not in the order of the definition
+    wire = CdrCodec(
+        TdoaCorrected, "corrected", "anchor_b", "anchor_a", "raw"
+    )  # not in the order of the definition
     template = wire.template(corrected(7, model="effects"))
     wanted = [corrected(k, model="effects") for k in (7, 8, 300)]
     rows = template.rows(3)
     for name in ("anchor_a", "anchor_b", "raw", "corrected"):
         rows[name] = [getattr(message, name) for message in wanted]
-    rows["sec"], rows["nanosec"] = zip(*((m.header.stamp.sec, m.header.stamp.nanosec) for m in wanted))
+    rows["sec"], rows["nanosec"] = zip(
+        *((m.header.stamp.sec, m.header.stamp.nanosec) for m in wanted)
+    )
     for made, message in zip(template.messages(rows), wanted):
         if way == "bytes":
             assert isinstance(made, bytes)
@@ -83,9 +105,13 @@ def test_what_is_written_is_what_an_object_would_be(way):
 
 
 def test_a_middleware_that_serializes_otherwise_is_noticed(monkeypatch):
-    monkeypatch.setattr(ros_cdr, "serialize_message", lambda message: b"\0\0" + serialize_message(message)[2:])
+    monkeypatch.setattr(
+        ros_cdr, "serialize_message", lambda message: b"\0\0" + serialize_message(message)[2:]
+    )
     assert not CdrCodec(Tdoa, "distance_difference").fits
-    monkeypatch.setattr(ros_cdr, "serialize_message", lambda message: serialize_message(message)[:4] + b"\0" * 90)
+    monkeypatch.setattr(
+        ros_cdr, "serialize_message", lambda message: serialize_message(message)[:4] + b"\0" * 90
+    )
     assert not CdrCodec(Tdoa, "distance_difference").fits
 
 
@@ -94,7 +120,11 @@ def tdoa_bytes(order="<", options=0, frame=b"tag", variance=True, more=b""):
     kind = b"\0\1" if order == "<" else b"\0\0"
     body = struct.pack(f"{order}iII", 1, 2, len(frame) + 1) + frame + b"\0"
     body += b"\0" * (-len(body) % 2) + struct.pack(f"{order}HH", 3, 4)
-    body += b"\0" * (-len(body) % 8) + struct.pack(f"{order}d", 0.5) + (struct.pack(f"{order}d", 0.25) if variance else b"")
+    body += (
+        b"\0" * (-len(body) % 8)
+        + struct.pack(f"{order}d", 0.5)
+        + (struct.pack(f"{order}d", 0.25) if variance else b"")
+    )
     return kind + bytes([0, options]) + body + more
 
 
@@ -104,35 +134,51 @@ def tdoa_bytes(order="<", options=0, frame=b"tag", variance=True, more=b""):
 def test_every_encoding_that_means_something_is_read(way, order, options, more):
     wire = CdrCodec(Tdoa, "anchor_a", "anchor_b", "distance_difference", "variance")
     ((frame, rows, some),) = wire.read([tdoa_bytes(order, options, more=more)])
-    assert (frame, some) == ("tag", slice(0, 1)) and rows[list(wire.dtype.names)].tolist() == [(1, 2, 3, 4, 0.5, 0.25)]
+    assert (frame, some) == ("tag", slice(0, 1)) and rows[list(wire.dtype.names)].tolist() == [
+        (1, 2, 3, 4, 0.5, 0.25)
+    ]
 
 
 BAD = {
-    "8 too few for uwb_tdoa_msgs/Tdoa: cut off, or of another version of the type": tdoa_bytes(variance=False),
+    "8 too few for uwb_tdoa_msgs/Tdoa: cut off, or of another version of the type": tdoa_bytes(
+        variance=False
+    ),
     "8 too many for uwb_tdoa_msgs/Tdoa: of another version of the type": tdoa_bytes(more=bytes(8)),
     "header.frame_id is no UTF-8": tdoa_bytes(frame=b"t\xff"),
     "header.frame_id does not end where it says": tdoa_bytes(frame=b"t\0g"),
-    "header.frame_id would be 4294967295 bytes long": tdoa_bytes()[:12] + b"\xff" * 4 + tdoa_bytes()[16:],
+    "header.frame_id would be 4294967295 bytes long": tdoa_bytes()[:12]
+    + b"\xff" * 4
+    + tdoa_bytes()[16:],
     "header.frame_id would be 5001 bytes long": tdoa_bytes(frame=b"x" * 5000),
     "it ends after 14 bytes, before header.frame_id": tdoa_bytes()[:14],
     "not plain CDR": b"\0\7\0\0" + tdoa_bytes()[4:],
     "cannot be read as|bytes are|it has|not plain CDR": b"",
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("reason", BAD)
 def test_what_cannot_be_read_is_left_out_and_said(reason):
     wire, refused = CdrCodec(Tdoa, "anchor_a"), []
-    parts = wire.read([tdoa_bytes(), BAD[reason], tdoa_bytes(">"), BAD[reason], tdoa_bytes()], refused.append)
-    assert [some.start for *_, some in parts] == [0, 2, 4] and [rows["anchor_a"].tolist() for _, rows, _ in parts] == [[3]] * 3
+    parts = wire.read(
+        [tdoa_bytes(), BAD[reason], tdoa_bytes(">"), BAD[reason], tdoa_bytes()], refused.append
+    )
+    assert [some.start for *_, some in parts] == [0, 2, 4] and [
+        rows["anchor_a"].tolist() for _, rows, _ in parts
+    ] == [[3]] * 3
     assert len(refused) == 2
     with pytest.raises(Unreadable, match=reason):
         wire.read([BAD[reason]])
 
 
 def test_a_wrong_version_in_another_encoding_is_none_either():
-    for data in (tdoa_bytes(">", variance=False), tdoa_bytes(">", more=bytes(8)), tdoa_bytes("<", 1, variance=False)):
-        with pytest.raises(Unreadable, match="another version|cannot be read as uwb_tdoa_msgs/Tdoa"):
+    for data in (
+        tdoa_bytes(">", variance=False),
+        tdoa_bytes(">", more=bytes(8)),
+        tdoa_bytes("<", 1, variance=False),
+    ):
+        with pytest.raises(
+            Unreadable, match="another version|cannot be read as uwb_tdoa_msgs/Tdoa"
+        ):
             CdrCodec(Tdoa, "anchor_a").read([data])
     with pytest.raises(Unreadable, match="no UTF-8"):
         CdrCodec(Tdoa, "anchor_a").read([tdoa_bytes(">", frame=b"t\xff")])
@@ -143,7 +189,11 @@ def test_lists_are_bounded_before_anything_is_allocated():
     array.header.frame_id = "map"
     data = serialize_message(array)
     assert decode(data, AnchorArray) == array
-    for count, reason in ((MOST_ELEMENTS + 1, f"at most {MOST_ELEMENTS}"), (2**32 - 1, "at most"), (1000, "1000 elements, in")):
+    for count, reason in (
+        (MOST_ELEMENTS + 1, f"at most {MOST_ELEMENTS}"),
+        (2**32 - 1, "at most"),
+        (1000, "1000 elements, in"),
+    ):
         with pytest.raises(Unreadable, match=reason):
             decode(data[:-4] + struct.pack("<I", count), AnchorArray)
     with pytest.raises(Unreadable, match="bytes are too many"):
@@ -153,7 +203,12 @@ def test_lists_are_bounded_before_anything_is_allocated():
 
 
 def test_noise_is_refused_or_read_and_nothing_else(way):
-    rng, wire, refused, read = np.random.default_rng(1), CdrCodec(TdoaCorrected, "corrected", "bias_slope"), [], 0
+    rng, wire, refused, read = (
+        np.random.default_rng(1),
+        CdrCodec(TdoaCorrected, "corrected", "bias_slope"),
+        [],
+        0,
+    )
     whole = serialize_message(corrected(1))
     for _ in range(300):
         data = bytearray(whole[: rng.integers(len(whole) + 1)] if rng.random() < 0.3 else whole)

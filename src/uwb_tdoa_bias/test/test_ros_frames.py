@@ -10,6 +10,7 @@ pytest.importorskip("rclpy")
 from geometry_msgs.msg import TransformStamped  # noqa: E402
 from rclpy.serialization import serialize_message  # noqa: E402
 from tf2_msgs.msg import TFMessage  # noqa: E402
+
 from uwb_tdoa_bias.foundation.ros_cdr import MOST_ELEMENTS, Unreadable  # noqa: E402
 from uwb_tdoa_bias.foundation.ros_frames import read_transforms  # noqa: E402
 
@@ -25,39 +26,58 @@ def message(transforms):
         one.header.stamp.sec, one.header.stamp.nanosec, one.header.frame_id = sec, nanosec, parent
         one.transform.translation.x, one.transform.translation.y, one.transform.translation.z = p
         (
-            one.transform.rotation.x, one.transform.rotation.y, one.transform.rotation.z, one.transform.rotation.w,
-        ) = q  # fmt: skip
+            one.transform.rotation.x,
+            one.transform.rotation.y,
+            one.transform.rotation.z,
+            one.transform.rotation.w,
+        ) = q
         out.transforms.append(one)
     return out
 
 
 TRANSFORM = st.tuples(
-    st.integers(-(2**31), 2**31 - 1), st.integers(0, 10**9 - 1), NAMES, NAMES, st.tuples(*[NUMBERS] * 4), st.tuples(*[NUMBERS] * 3)
+    st.integers(-(2**31), 2**31 - 1),
+    st.integers(0, 10**9 - 1),
+    NAMES,
+    NAMES,
+    st.tuples(*[NUMBERS] * 4),
+    st.tuples(*[NUMBERS] * 3),
 )
 
 
 @given(st.lists(TRANSFORM, max_size=4))
 def test_transforms_are_read_as_the_middleware_wrote_them(transforms):
-    expected = [(*one[:2], *(name.lstrip("/") for name in one[2:4]), *one[4:]) for one in transforms]
+    expected = [
+        (*one[:2], *(name.lstrip("/") for name in one[2:4]), *one[4:]) for one in transforms
+    ]
     data = serialize_message(message(transforms))
     assert read_transforms(data) == expected
-    assert read_transforms(data[:3] + b"\1" + data[4:]) == expected  # with options, by the middleware itself
+    assert (
+        read_transforms(data[:3] + b"\1" + data[4:]) == expected
+    )  # with options, by the middleware itself
 
 
 def test_what_is_no_list_of_transforms_is_refused():
     data = serialize_message(message([(1, 2, "a", "b", (0.0, 0.0, 0.0, 1.0), (1.0, 2.0, 3.0))]))
     for bad, reason in (
-        (data[:-8], "8 too few"), (data[:20], "before|too few|would be"), (data[:6], "it has 6 bytes"), (b"", "not plain CDR|bytes"),
-        (data + bytes(8), "8 too many"), (data[:4] + struct.pack("<I", MOST_ELEMENTS + 1) + data[8:], "10001 transforms"),
-        (data[:4] + struct.pack("<I", 9) + data[8:], "too few|before"), (b"\0\x09" + data[2:], "not plain CDR"),
-    ):  # fmt: skip
+        (data[:-8], "8 too few"),
+        (data[:20], "before|too few|would be"),
+        (data[:6], "it has 6 bytes"),
+        (b"", "not plain CDR|bytes"),
+        (data + bytes(8), "8 too many"),
+        (data[:4] + struct.pack("<I", MOST_ELEMENTS + 1) + data[8:], "10001 transforms"),
+        (data[:4] + struct.pack("<I", 9) + data[8:], "too few|before"),
+        (b"\0\x09" + data[2:], "not plain CDR"),
+    ):
         with pytest.raises(Unreadable, match=reason):
             read_transforms(bad)
 
 
 def test_noise_is_refused_or_read_and_nothing_else():
     rng, refused = np.random.default_rng(3), 0
-    whole = serialize_message(message([(1, 2, "map", "base_link", (0.0, 0.0, 0.0, 1.0), (1.0, 2.0, 3.0))] * 3))
+    whole = serialize_message(
+        message([(1, 2, "map", "base_link", (0.0, 0.0, 0.0, 1.0), (1.0, 2.0, 3.0))] * 3)
+    )
     for _ in range(500):
         data = bytearray(whole)
         for place in rng.integers(len(data), size=rng.integers(1, 6)):

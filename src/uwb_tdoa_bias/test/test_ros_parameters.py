@@ -5,6 +5,7 @@ rclpy = pytest.importorskip("rclpy")
 from rclpy.impl.implementation_singleton import rclpy_implementation  # noqa: E402
 from rclpy.impl.rcutils_logger import RcutilsLogger  # noqa: E402
 from rclpy.parameter import Parameter as Value  # noqa: E402
+
 from uwb_tdoa_bias.foundation.errors import InputError  # noqa: E402
 from uwb_tdoa_bias.foundation.ros_parameters import (  # noqa: E402
     Parameter,
@@ -50,10 +51,25 @@ def said(monkeypatch):
 
 def test_values_and_descriptors(node_with):
     node = node_with("-p", "gate:=4.5", "-p", "mode:=none")
-    assert declare_all(node, PARAMETERS) == {"gate": 4.5, "count": 2, "mode": "none", "use_it": True, "speeds": [1.0, 2.0]}
-    gate, count, mode, speeds = (node.describe_parameter(name) for name in ("gate", "count", "mode", "speeds"))
-    assert (gate.description, gate.read_only, count.read_only) == ("standard deviations", False, True)
-    assert (gate.floating_point_range[0].from_value, gate.floating_point_range[0].to_value) == (0.0, 10.0)
+    assert declare_all(node, PARAMETERS) == {
+        "gate": 4.5,
+        "count": 2,
+        "mode": "none",
+        "use_it": True,
+        "speeds": [1.0, 2.0],
+    }
+    gate, count, mode, speeds = (
+        node.describe_parameter(name) for name in ("gate", "count", "mode", "speeds")
+    )
+    assert (gate.description, gate.read_only, count.read_only) == (
+        "standard deviations",
+        False,
+        True,
+    )
+    assert (gate.floating_point_range[0].from_value, gate.floating_point_range[0].to_value) == (
+        0.0,
+        10.0,
+    )
     assert (count.integer_range[0].from_value, count.integer_range[0].to_value) == (1, 5)
     assert mode.additional_constraints == "one of none, base"
     assert speeds.additional_constraints == "two numbers above 0"
@@ -84,14 +100,18 @@ def test_an_unknown_name_is_refused_with_the_nearest_one(node_with):
 
 
 def test_a_known_name_is_not_refused(node_with):
-    node = node_with("-p", "gate:=1.0", "-p", "use_sim_time:=true", "-p", "qos_overrides./x.publisher.depth:=3")
+    node = node_with(
+        "-p", "gate:=1.0", "-p", "use_sim_time:=true", "-p", "qos_overrides./x.publisher.depth:=3"
+    )
     declare_all(node, PARAMETERS)
     refuse_unknown(node)
 
 
 def test_what_changes_nothing_is_said(node_with, said, tmp_path):
     for name, key in (("mine", "/**"), ("other", "/**/other_node"), ("empty", None)):
-        (tmp_path / name).write_text(f"{key}: {{ros__parameters: {{gate: 5.0, a: {{b: 1}}}}}}" if key else "{}")
+        (tmp_path / name).write_text(
+            f"{key}: {{ros__parameters: {{gate: 5.0, a: {{b: 1}}}}}}" if key else "{}"
+        )
     files = [str(tmp_path / name) for name in ("other", "empty")]
     node = node_with("--params-file", files[0], "-p", "qos_overrides./x.publisher.depth:=3")
     assert declare_all(node, PARAMETERS)["gate"] == 3.0
@@ -113,7 +133,8 @@ def test_a_file_that_counts_is_not_said(node_with, said, tmp_path):
 
 
 ODD = [  # texts of a parameter file, and whether rcl takes it
-    "/**: {ros__parameters: {speeds: !!python/tuple [1.0, 2.0]}}",  # as launch_ros writes every list
+    # as launch_ros writes every list
+    "/**: {ros__parameters: {speeds: !!python/tuple [1.0, 2.0]}}",
     "/**: {ros__parameters: {mode: !!str none}}",
     "/**: {ros__parameters: {mode: !ours none}}",
     "/**: {ros__parameters: {mode: none, mode: base}}",
@@ -151,11 +172,24 @@ def test_a_parameter_file_is_judged_by_rcl_alone(node_with, said, tmp_path, text
 def test_a_read_only_parameter_may_be_set_to_what_it_is(node_with):
     node = node_with("-p", "count:=3", "-p", "speeds:=[1.5, 2.5]")
     declare_all(node, PARAMETERS)
-    so = [Value("count", value=3), Value("speeds", value=[1.5, 2.5]), Value("mode", value="base"), Value("use_it", value=True)]
+    so = [
+        Value("count", value=3),
+        Value("speeds", value=[1.5, 2.5]),
+        Value("mode", value="base"),
+        Value("use_it", value=True),
+    ]
     for parameters in ([one] for one in so):
         assert node.set_parameters_atomically(parameters).successful
-    assert node.set_parameters_atomically([*so, Value("gate", value=5.0)]).successful and node.get_parameter("gate").value == 5.0
-    for other in (Value("count", value=4), Value("count", value=3.0), Value("speeds", value=[1.5]), Value("mode", value="none")):
+    assert (
+        node.set_parameters_atomically([*so, Value("gate", value=5.0)]).successful
+        and node.get_parameter("gate").value == 5.0
+    )
+    for other in (
+        Value("count", value=4),
+        Value("count", value=3.0),
+        Value("speeds", value=[1.5]),
+        Value("mode", value="none"),
+    ):
         result = node.set_parameters_atomically([so[0], Value("gate", value=6.0), other])
         assert not result.successful and "read-only" in result.reason
     assert node.get_parameter("gate").value == 5.0

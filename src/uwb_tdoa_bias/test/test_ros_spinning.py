@@ -6,19 +6,20 @@ rclpy = pytest.importorskip("rclpy")
 
 from builtin_interfaces.msg import Time  # noqa: E402
 from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
+from rcl_interfaces.srv import GetParameters  # noqa: E402
 from rclpy.impl.implementation_singleton import rclpy_implementation  # noqa: E402
 from rclpy.qos import QoSProfile  # noqa: E402
 from rclpy.task import Future  # noqa: E402
-from rcl_interfaces.srv import GetParameters  # noqa: E402
 from rosgraph_msgs.msg import Clock  # noqa: E402
 from sensor_msgs.msg import FluidPressure  # noqa: E402
+
 from uwb_tdoa_bias.foundation import ros_spinning  # noqa: E402
 from uwb_tdoa_bias.foundation.ros_cdr import CdrCodec  # noqa: E402
 from uwb_tdoa_bias.foundation.ros_node import StreamNode  # noqa: E402
 from uwb_tdoa_bias.foundation.ros_parameters import MOST_ASKED, MOST_REQUESTS  # noqa: E402
 from uwb_tdoa_bias.foundation.ros_spinning import Spinner  # noqa: E402
 from uwb_tdoa_bias.foundation.ros_stamps import Epoch  # noqa: E402
-from uwb_tdoa_bias.foundation.ros_streams import PERIOD, Streams, RoundRobin  # noqa: E402
+from uwb_tdoa_bias.foundation.ros_streams import PERIOD, RoundRobin, Streams  # noqa: E402
 
 MANY = 300
 DEEP = QoSProfile(depth=1000)
@@ -60,8 +61,13 @@ def test_nothing_waits_behind_what_comes_often(surroundings):
     node, other = surroundings
     flood, asked = [], []
     node.create_subscription(DiagnosticStatus, "flood", flood.append, DEEP)
-    node.create_service(GetParameters, "ask", lambda request, response: asked.append(len(flood)) or response)
-    publisher, client = other.create_publisher(DiagnosticStatus, "flood", DEEP), other.create_client(GetParameters, "ask")
+    node.create_service(
+        GetParameters, "ask", lambda request, response: asked.append(len(flood)) or response
+    )
+    publisher, client = (
+        other.create_publisher(DiagnosticStatus, "flood", DEEP),
+        other.create_client(GetParameters, "ask"),
+    )
     spinner = Spinner([node])
     until(lambda: publisher.get_subscription_count() and client.service_is_ready())
     spinner._serve()
@@ -76,7 +82,9 @@ def test_nothing_waits_behind_what_comes_often(surroundings):
         return asked
 
     spin_until(spinner, answered)
-    assert sum(map(bool, busy)) < 50  # rounds in which something was served; one callback in each would be six times as many
+    assert (
+        sum(map(bool, busy)) < 50
+    )  # rounds in which something was served; one callback in each would be six times as many
     spin_until(spinner, lambda: len(flood) == MANY)
     spinner.close()
 
@@ -92,7 +100,9 @@ def test_what_waits_is_measured(surroundings):
         spinner._serve()
         return spinner.longest_wait < 0.2
 
-    spin_until(spinner, nothing_waited)  # a loaded machine may have kept this process waiting in between
+    spin_until(
+        spinner, nothing_waited
+    )  # a loaded machine may have kept this process waiting in between
     publisher.publish(DiagnosticStatus())
     spin_until(spinner, lambda: spinner.longest_wait > 0.25)
     spinner.close()
@@ -110,7 +120,10 @@ def test_streams_are_taken_together_and_the_newest_of_the_clock(surroundings):
 
     streams = Streams(node, epoch, lambda: None)
     streams.add(CdrCodec(FluidPressure, "fluid_pressure"), "pressure", take)
-    publisher, clock = other.create_publisher(FluidPressure, "pressure", DEEP), other.create_publisher(Clock, "/clock", DEEP)
+    publisher, clock = (
+        other.create_publisher(FluidPressure, "pressure", DEEP),
+        other.create_publisher(Clock, "/clock", DEEP),
+    )
     until(lambda: publisher.get_subscription_count() and clock.get_subscription_count())
     assert not {Clock, FluidPressure} & {each.msg_type for each in node.subscriptions}
     spinner = Spinner([node], RoundRobin([streams]))
@@ -141,7 +154,9 @@ def test_a_stream_that_begins_after_a_silence_is_taken(surroundings):
     streams.add(CdrCodec(FluidPressure, "fluid_pressure"), "pressure", take)
     publisher = other.create_publisher(FluidPressure, "pressure", DEEP)
     until(publisher.get_subscription_count)
-    node.create_timer(0.1, lambda: publisher.publish(FluidPressure()))  # the process sleeps in its executor until then
+    node.create_timer(
+        0.1, lambda: publisher.publish(FluidPressure())
+    )  # the process sleeps in its executor until then
     spinner = Spinner([node], RoundRobin([streams]))
     spinner.spin(stop)
     assert 0.0 <= heard[0] < 60.0
@@ -158,7 +173,9 @@ def test_turns_rest_as_long_as_they_took_and_only_if_there_was_something():
             return self.busy
 
     assert RoundRobin([Slow(0.0, False)]).take() is None
-    assert PERIOD <= RoundRobin([Slow(0.0, True), Slow(0.0, False)]).take() <= 0.01  # a busy computer takes its time
+    assert (
+        PERIOD <= RoundRobin([Slow(0.0, True), Slow(0.0, False)]).take() <= 0.01
+    )  # a busy computer takes its time
     assert 0.004 <= RoundRobin([Slow(0.005, True)]).take() <= 0.01
     assert RoundRobin([Slow(0.05, True)]).take() == 0.01
 
@@ -191,5 +208,7 @@ def test_a_flood_of_requests_does_not_keep_streams_waiting(surroundings, monkeyp
         spinner._serve()
         counts.append(len(asked))
     steps = [after - before for before, after in zip([0, *counts], counts)]
-    assert 0 < max(steps) <= MOST_REQUESTS * MOST_ASKED and not any(step % MOST_ASKED for step in steps)
+    assert 0 < max(steps) <= MOST_REQUESTS * MOST_ASKED and not any(
+        step % MOST_ASKED for step in steps
+    )
     spinner.close()

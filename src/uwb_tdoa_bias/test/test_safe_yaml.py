@@ -15,7 +15,9 @@ SCALARS = st.one_of(
     st.booleans(),
     st.integers(1 - 2**63, 2**63 - 1),
     st.floats(allow_nan=False, allow_infinity=False),
-    st.text(st.characters(codec="utf-8", exclude_categories=["Cc", "Cs", "Nd"]), max_size=8),  # no 1e3: YAML 1.1
+    st.text(
+        st.characters(codec="utf-8", exclude_categories=["Cc", "Cs", "Nd"]), max_size=8
+    ),  # no 1e3: YAML 1.1
 )
 KEYS = st.text("abcxyz01-", max_size=4)
 CONTENT = st.recursive(
@@ -30,11 +32,22 @@ def test_what_others_write_comes_back(content):
 
 
 def test_numbers_are_those_that_people_mean():
-    content = parse_yaml("a: 1e-3\nb: 010\nc: 1:30\nd: -.5\ne: 2026-01-01\nf: yes\ng: '1'\nh: +3\ni: 1.\nj: 0x10", "f")
+    content = parse_yaml(
+        "a: 1e-3\nb: 010\nc: 1:30\nd: -.5\ne: 2026-01-01\nf: yes\ng: '1'\nh: +3\ni: 1.\nj: 0x10",
+        "f",
+    )
     assert content == {
-        "a": 0.001, "b": "010", "c": "1:30", "d": -0.5, "e": "2026-01-01", "f": True, "g": "1", "h": 3, "i": 1.0,
+        "a": 0.001,
+        "b": "010",
+        "c": "1:30",
+        "d": -0.5,
+        "e": "2026-01-01",
+        "f": True,
+        "g": "1",
+        "h": 3,
+        "i": 1.0,
         "j": "0x10",
-    }  # fmt: skip
+    }
 
 
 @pytest.mark.parametrize("text", ["", "~", "# nothing"])
@@ -93,7 +106,10 @@ def test_files(tmp_path):
         read_yaml(tmp_path / "nowhere.yaml")
 
 
-@given(st.binary(max_size=60) | st.text("ab:-[]{}#&*!|>'\"%@`,? \n\t019.~<=e", max_size=60).map(str.encode))
+@given(
+    st.binary(max_size=60)
+    | st.text("ab:-[]{}#&*!|>'\"%@`,? \n\t019.~<=e", max_size=60).map(str.encode)
+)
 @example(b"<<: {a: 1}")
 @example(b"=: 1")
 @example(b"? \n: 1")
@@ -118,7 +134,9 @@ def assert_plain(content):
         assert not isinstance(content, float) or math.isfinite(content)
 
 
-@pytest.mark.parametrize("number", ["9" * 1_000_000, "-" + "9" * 1_000_000 + ".0", "1e" + "9" * 1_000_000])
+@pytest.mark.parametrize(
+    "number", ["9" * 1_000_000, "-" + "9" * 1_000_000 + ".0", "1e" + "9" * 1_000_000]
+)
 def test_a_long_number_is_refused_at_once_and_not_repeated(number):
     began = time.process_time()
     with pytest.raises(InputError) as refused:

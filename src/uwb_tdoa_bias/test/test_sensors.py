@@ -1,4 +1,6 @@
-"""Every sensor of the registry keeps what its record promises; what each says in particular is in tests of its own."""
+"""Every sensor of the registry keeps what its record promises; what each says in particular is in
+tests of its own.
+"""
 
 import numpy as np
 import pytest
@@ -6,7 +8,15 @@ import pytest
 from uwb_tdoa_bias.effects import RADIO
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.flight import AIDS, Flight, Tdoas
-from uwb_tdoa_bias.foundation.sensors import BY_POSE, DIAGNOSED, LOCATING, SENSORS, Height, Ranges, Velocity
+from uwb_tdoa_bias.foundation.sensors import (
+    BY_POSE,
+    DIAGNOSED,
+    LOCATING,
+    SENSORS,
+    Height,
+    Ranges,
+    Velocity,
+)
 from uwb_tdoa_bias.foundation.sensors.sensor import Stream
 
 N = 5
@@ -14,16 +24,21 @@ T = np.arange(N) / 25.0
 STREAMS = {  # measurements that are possible
     "height": Height(T, np.linspace(0.5, 2.0, N)),
     "pressure": SENSORS["pressure"].stream(T, np.linspace(98e3, 99e3, N)),
-    "velocity": Velocity(T, np.ones((N, 3)), np.full((N, 3), 0.5), np.linspace(-1.0, 1.0, N), np.full(N, 0.25)),
+    "velocity": Velocity(
+        T, np.ones((N, 3)), np.full((N, 3), 0.5), np.linspace(-1.0, 1.0, N), np.full(N, 0.25)
+    ),
     "range": Ranges(T, np.array([7, 2, 7, 2, 7]), np.linspace(1.0, 4.0, N), np.full(N, 0.01)),
 }
 
 
 def of_message(sensor, stream):
-    """{field: values} that are read of the messages that are written for a stream: what is not written is 0."""
+    """{field: values} that are read of the messages that are written for a stream: what is not
+    written is 0.
+    """
     content = sensor.content(stream)
     return {
-        name: np.broadcast_to(content.get(name, 0.0), (N, k) if k > 1 else (N,)) for name, k in sensor.fields.items()
+        name: np.broadcast_to(content.get(name, 0.0), (N, k) if k > 1 else (N,))
+        for name, k in sensor.fields.items()
     }
 
 
@@ -39,7 +54,11 @@ def test_a_flight_has_a_stream_of_each():
 @pytest.mark.parametrize("name", SENSORS)
 def test_what_is_written_is_read(name):
     sensor, stream = SENSORS[name], STREAMS[name]
-    assert sensor.name == name and isinstance(stream, sensor.stream) and issubclass(sensor.stream, Stream)
+    assert (
+        sensor.name == name
+        and isinstance(stream, sensor.stream)
+        and issubclass(sensor.stream, Stream)
+    )
     fields = of_message(sensor, stream)
     for one, other in zip(sensor.read(T, fields).columns, stream.columns):
         np.testing.assert_array_equal(one, other)
@@ -60,7 +79,11 @@ def test_values_that_effects_change(name):
 @pytest.mark.parametrize("name", SENSORS)
 def test_what_the_filter_gets(name):
     rows, usable = SENSORS[name].measured(STREAMS[name])
-    assert usable.all() and rows.keys() <= {"value", "std", "anchor"} and np.isfinite(rows["value"]).all()
+    assert (
+        usable.all()
+        and rows.keys() <= {"value", "std", "anchor"}
+        and np.isfinite(rows["value"]).all()
+    )
     if name != "velocity":  # NaN is no measurement, wherever it stands
         *_, broken = SENSORS[name].measured(STREAMS[name].with_values(np.full((N, 1), np.nan)))
         assert not broken.any()
@@ -69,12 +92,18 @@ def test_what_the_filter_gets(name):
 @pytest.mark.parametrize("name", SENSORS)
 def test_its_parameters_begin_with_the_switch(name):
     first, *_ = SENSORS[name].parameters.values()
-    assert next(iter(SENSORS[name].parameters)) == f"use_{name}" and first.default is True and first.metadata["fixed"]
+    assert (
+        next(iter(SENSORS[name].parameters)) == f"use_{name}"
+        and first.default is True
+        and first.metadata["fixed"]
+    )
 
 
 def test_registries_of_a_part():
     assert LOCATING == ("range",) and set(BY_POSE) == {"height", "pressure", "velocity"}
-    assert set(DIAGNOSED) - set(BY_POSE) == RADIO.keys() - {"tdoa"}  # distances to anchors, of which effects on arrivals know
+    assert set(DIAGNOSED) - set(BY_POSE) == RADIO.keys() - {
+        "tdoa"
+    }  # distances to anchors, of which effects on arrivals know
 
 
 # --- velocities and yaw rates ---
@@ -85,7 +114,14 @@ def of_twist(linear, rate, variances):
     covariance = np.zeros((1, 36))
     covariance[0, [0, 7, 14, 35]] = variances
     angular = np.array([[np.nan, 5.0, rate]])  # rates about x and y may be anything
-    return SENSORS["velocity"].read(T[:1], {"twist.twist.linear": np.array([linear]), "twist.twist.angular": angular, "twist.covariance": covariance})
+    return SENSORS["velocity"].read(
+        T[:1],
+        {
+            "twist.twist.linear": np.array([linear]),
+            "twist.twist.angular": angular,
+            "twist.covariance": covariance,
+        },
+    )
 
 
 @pytest.mark.parametrize(
@@ -125,7 +161,10 @@ def test_which_velocities_are_measurements(linear, rate, variances, usable):
 
 def test_which_parameters_stand_in_for_deviations():
     said = SENSORS["velocity"].assumed
-    assert said(of_twist([1.0, 0.0, 0.0], 0.5, (0.0, 0.0, 0.0, 0.0))) == ("velocity_std", "yaw_rate_std")
+    assert said(of_twist([1.0, 0.0, 0.0], 0.5, (0.0, 0.0, 0.0, 0.0))) == (
+        "velocity_std",
+        "yaw_rate_std",
+    )
     assert said(of_twist([1.0, 0.0, 0.0], 0.5, (0.01, 0.01, 0.01, 0.0))) == ("yaw_rate_std",)
     assert said(of_twist([1.0, 0.0, 0.0], 0.0, (0.01, 0.01, 1e6, 0.0))) == ()
 
@@ -145,7 +184,13 @@ def test_a_stream_without_yaw_rates_is_what_it_was():
 
 @pytest.mark.parametrize(
     "d, variance, usable",
-    [(0.0, 0.0, True), (-0.1, 0.0, False), (1e4, 0.0, False), (1.0, -1.0, False), (1.0, np.inf, False)],
+    [
+        (0.0, 0.0, True),
+        (-0.1, 0.0, False),
+        (1e4, 0.0, False),
+        (1.0, -1.0, False),
+        (1.0, np.inf, False),
+    ],
 )
 def test_which_ranges_are_measurements(d, variance, usable):
     one = Ranges(np.zeros(1), np.zeros(1, int), np.array([d]), np.array([variance]))

@@ -8,6 +8,7 @@ from onnx import helper, numpy_helper  # noqa: E402
 from onnx.reference import ReferenceEvaluator  # noqa: E402
 from onnx_models import model  # noqa: E402
 from random_samples import random_samples  # noqa: E402
+
 from uwb_tdoa_bias.correction import trial  # noqa: E402
 from uwb_tdoa_bias.correction.features import NAMES, everything  # noqa: E402
 from uwb_tdoa_bias.correction.network import MODELS, Network  # noqa: E402
@@ -39,7 +40,9 @@ def assert_plays(path, positive=False, atol=1e-6, seed=0):
     np.testing.assert_allclose(together, expected, rtol=2e-6, atol=atol)
     for n in (0, 1, 2, 3, 4, 5, 7, 16, BATCH - 1):
         for first in (0, 1, 6):
-            np.testing.assert_array_equal(session.run(x[first : first + n]), together[first : first + n])  # to the bit
+            np.testing.assert_array_equal(
+                session.run(x[first : first + n]), together[first : first + n]
+            )  # to the bit
     other = np.concatenate([x[:3], 100.0 * x[3:]])
     np.testing.assert_array_equal(session.run(other)[:3], together[:3])
     np.testing.assert_array_equal(session.run(x[::-1])[::-1], together)
@@ -60,7 +63,10 @@ def test_operators_of_one_value(tmp_path, kind, width):
 @pytest.mark.parametrize("other", ["x", "one", "row", "column"])
 @pytest.mark.parametrize("kind", ELEMENTWISE)
 def test_operators_of_two(tmp_path, kind, other):
-    nodes = [("Abs", ["column of x"], ["size"], {}), ("Add", ["size", "one"], ["column"], {})]  # not about 0: a quotient is then as exact
+    nodes = [
+        ("Abs", ["column of x"], ["size"], {}),
+        ("Add", ["size", "one"], ["column"], {}),
+    ]  # not about 0: a quotient is then as exact
     nodes = [("MatMul", ["x", "C"], ["column of x"], {}), *nodes, (kind, ["x", other], ["y"], {})]
     assert_plays(model(tmp_path / "model.onnx", nodes), atol=1e-5)
 
@@ -70,30 +76,56 @@ def test_operators_of_two(tmp_path, kind, other):
     [
         [("Gemm", ["x", "W", "c"], ["y"], {})],
         [("Gemm", ["x", "WT", "c"], ["y"], {"transB": 1, "alpha": 0.5, "beta": 2.0})],
-        [("Gemm", ["x", "W", "c"], ["h"], {}), ("Relu", ["h"], ["g"], {}), ("Gemm", ["g", "WT"], ["y"], {})],
+        [
+            ("Gemm", ["x", "W", "c"], ["h"], {}),
+            ("Relu", ["h"], ["g"], {}),
+            ("Gemm", ["g", "WT"], ["y"], {}),
+        ],
         [("Sum", ["x", "x", "r"], ["y"], {})],
         [("Gather", ["x", "i"], ["y"], {"axis": 1})],
         [
-            ("Reshape", ["x", "s"], ["y"], {}), ("ReduceMax", ["y"], ["z"], {"axes": [1], "keepdims": 1}),
+            ("Reshape", ["x", "s"], ["y"], {}),
+            ("ReduceMax", ["y"], ["z"], {"axes": [1], "keepdims": 1}),
             ("Reshape", ["z", "t"], ["u"], {}),
         ],
-        [("ReduceSum", ["x", "a"], ["y"], {"keepdims": 1}), ("Concat", ["y", "x", "y"], ["z"], {"axis": 1})],
-        [("MatMul", ["x", "W"], ["h"], {}), ("Tanh", ["h"], ["g"], {}), ("MatMul", ["g", "WT"], ["y"], {})],
+        [
+            ("ReduceSum", ["x", "a"], ["y"], {"keepdims": 1}),
+            ("Concat", ["y", "x", "y"], ["z"], {"axis": 1}),
+        ],
+        [
+            ("MatMul", ["x", "W"], ["h"], {}),
+            ("Tanh", ["h"], ["g"], {}),
+            ("MatMul", ["g", "WT"], ["y"], {}),
+        ],
         [("LeakyRelu", ["x"], ["y"], {}), ("LeakyRelu", ["y"], ["z"], {"alpha": 2.0})],
-        [("Clip", ["x", "low", "high"], ["y"], {}), ("Clip", ["y", "", "low"], ["z"], {}), ("Clip", ["z"], ["u"], {})],
-        [("Constant", [], ["k"], {"value": numpy_helper.from_array(np.float32([0.5]), "k")}), ("Mul", ["x", "k"], ["y"], {})],
+        [
+            ("Clip", ["x", "low", "high"], ["y"], {}),
+            ("Clip", ["y", "", "low"], ["z"], {}),
+            ("Clip", ["z"], ["u"], {}),
+        ],
+        [
+            ("Constant", [], ["k"], {"value": numpy_helper.from_array(np.float32([0.5]), "k")}),
+            ("Mul", ["x", "k"], ["y"], {}),
+        ],
         [  # what the processor adds up differs with the place of a row in memory
-            ("Reshape", ["x", "s"], ["h"], {}), ("MatMul", ["h", "d"], ["g"], {}), ("Sin", ["g"], ["f"], {}),
-            ("ReduceSum", ["f", "a"], ["e"], {"keepdims": 1}), ("Reshape", ["e", "t"], ["y"], {}),
+            ("Reshape", ["x", "s"], ["h"], {}),
+            ("MatMul", ["h", "d"], ["g"], {}),
+            ("Sin", ["g"], ["f"], {}),
+            ("ReduceSum", ["f", "a"], ["e"], {"keepdims": 1}),
+            ("Reshape", ["e", "t"], ["y"], {}),
         ],
     ],
-)  # fmt: skip
+)
 def test_what_models_are_made_of(tmp_path, nodes):
-    assert_plays(model(tmp_path / "model.onnx", nodes, d=np.float32([[1, 2, 3, 4, 5, 6, 7]])), atol=1e-5)
+    assert_plays(
+        model(tmp_path / "model.onnx", nodes, d=np.float32([[1, 2, 3, 4, 5, 6, 7]])), atol=1e-5
+    )
 
 
 def test_an_older_form_of_clip(tmp_path):
-    assert_plays(model(tmp_path / "model.onnx", [("Clip", ["x"], ["y"], {"min": -0.5, "max": 0.5})], opset=9))
+    assert_plays(
+        model(tmp_path / "model.onnx", [("Clip", ["x"], ["y"], {"min": -0.5, "max": 0.5})], opset=9)
+    )
 
 
 @pytest.mark.parametrize("width", [3, 4, 5, 7, 8, 14, 33, 200])
@@ -114,7 +146,13 @@ def test_a_model_for_one_row_at_a_time(tmp_path):
 
 
 def test_a_network_of_another_operator_predicts(tmp_path):
-    meta = {"features": '["dx_a"]', "offset": "[0.0]", "scale": "[1.0]", "clip": "1.0", "name": '"elu"'}
+    meta = {
+        "features": '["dx_a"]',
+        "offset": "[0.0]",
+        "scale": "[1.0]",
+        "clip": "1.0",
+        "name": '"elu"',
+    }
     path = model(tmp_path / "elu.onnx", [("Elu", ["x"], ["y"], {})], width=1)
     whole = onnx.load(path)
     helper.set_model_props(whole, meta)
@@ -123,17 +161,33 @@ def test_a_network_of_another_operator_predicts(tmp_path):
     (column,) = [k for k, name in enumerate(NAMES) if name == "dx_a"]
     feature = everything(samples)[:, column]
     np.testing.assert_allclose(
-        network.predict(samples)[0], np.clip(np.where(feature > 0.0, feature, np.expm1(feature)), -1.0, 1.0), atol=1e-6
+        network.predict(samples)[0],
+        np.clip(np.where(feature > 0.0, feature, np.expm1(feature)), -1.0, 1.0),
+        atol=1e-6,
     )
 
 
 @pytest.mark.parametrize("width", [1, 3, 4, 5, 7, 8, 14, 33])
 def test_which_rows_are_played_by_themselves(tmp_path, width):
-    """The bits of a sum depend on where the row begins, unless it has less than 4 numbers or fills packets of 4."""
-    assert played(model(tmp_path / "model.onnx", ROW_OF_ITS_OWN, width)).alone == (width > 4 and width % 4 != 0)
+    """The bits of a sum depend on where the row begins, unless it has less than 4 numbers or fills
+    packets of 4.
+    """
+    assert played(model(tmp_path / "model.onnx", ROW_OF_ITS_OWN, width)).alone == (
+        width > 4 and width % 4 != 0
+    )
 
 
-@pytest.mark.parametrize("nodes", [[("Softmax", ["x"], ["y"], {"axis": 0})], [("Reshape", ["x", "s"], ["h"], {}), ("Softmax", ["h"], ["g"], {"axis": 0}), ("Reshape", ["g", "t"], ["y"], {})]])
+@pytest.mark.parametrize(
+    "nodes",
+    [
+        [("Softmax", ["x"], ["y"], {"axis": 0})],
+        [
+            ("Reshape", ["x", "s"], ["h"], {}),
+            ("Softmax", ["h"], ["g"], {"axis": 0}),
+            ("Reshape", ["g", "t"], ["y"], {}),
+        ],
+    ],
+)
 def test_rows_that_mix_are_played_apart(tmp_path, nodes):
     session = played(model(tmp_path / "model.onnx", nodes))
     x = np.random.default_rng(0).normal(size=(9, 5))

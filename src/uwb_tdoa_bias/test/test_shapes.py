@@ -1,9 +1,9 @@
-import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
+import numpy as np
+import pytest
 from random_samples import random_samples
+
 from uwb_tdoa_bias.effects import EffectSet, SmoothTerm
 from uwb_tdoa_bias.effects.shapes import SHAPES, functions
 from uwb_tdoa_bias.foundation.errors import InputError
@@ -19,8 +19,12 @@ def test_a_shape_has_a_level_and_is_held_beyond_its_knots(shape):
     assert out.shape == (61, coefficients)
     np.testing.assert_array_equal(out[:, 0], 1.0)
     if shape != "wave":
-        np.testing.assert_array_equal(out[at <= 1.0], out[at <= 1.0][:1].repeat((at <= 1.0).sum(), axis=0))
-        np.testing.assert_array_equal(out[at >= 3.0], out[at >= 3.0][:1].repeat((at >= 3.0).sum(), axis=0))
+        np.testing.assert_array_equal(
+            out[at <= 1.0], out[at <= 1.0][:1].repeat((at <= 1.0).sum(), axis=0)
+        )
+        np.testing.assert_array_equal(
+            out[at >= 3.0], out[at >= 3.0][:1].repeat((at >= 3.0).sum(), axis=0)
+        )
 
 
 @pytest.mark.parametrize(
@@ -35,10 +39,16 @@ def test_a_shape_has_a_level_and_is_held_beyond_its_knots(shape):
     ],
 )
 def test_the_course_of_a_shape(shape, at, second):
-    np.testing.assert_allclose(functions(shape, KNOTS[SHAPES[shape][0]], at)[:, 1], second, atol=1e-12)
+    np.testing.assert_allclose(
+        functions(shape, KNOTS[SHAPES[shape][0]], at)[:, 1], second, atol=1e-12
+    )
 
 
-@given(st.sampled_from(sorted(SHAPES)), st.sampled_from(["pair", "direction", "anchor", "common"]), st.integers(0, 2**32 - 1))
+@given(
+    st.sampled_from(sorted(SHAPES)),
+    st.sampled_from(["pair", "direction", "anchor", "common"]),
+    st.integers(0, 2**32 - 1),
+)
 def test_the_bias_of_a_shape_is_what_its_regressors_say(shape, form, seed):
     samples, rng = random_samples(seed % 100), np.random.default_rng(seed)
     ids = samples.anchors.ids
@@ -47,7 +57,9 @@ def test_the_bias_of_a_shape_is_what_its_regressors_say(shape, form, seed):
     keys = term.keys_of((part,))
     values = dict(zip(keys, rng.standard_normal(len(keys)).tolist()))
     full = SmoothTerm(values, {}, "", "tdoa", "height", form, term.knots, shape)
-    np.testing.assert_allclose(full.bias(samples), full.regressors(samples, keys) @ list(values.values()), atol=1e-12)
+    np.testing.assert_allclose(
+        full.bias(samples), full.regressors(samples, keys) @ list(values.values()), atol=1e-12
+    )
 
 
 def test_a_pair_counts_both_ways_and_a_direction_one():
@@ -62,13 +74,16 @@ def test_a_pair_counts_both_ways_and_a_direction_one():
 
 
 def test_a_shape_survives_a_file(tmp_path):
-    term = SmoothTerm({"0-1.c1": 0.4}, {"0-1.c1": 0.1}, "", "tdoa", "time", "pair", (0.0, 3.0, 9.0), "step")
+    term = SmoothTerm(
+        {"0-1.c1": 0.4}, {"0-1.c1": 0.1}, "", "tdoa", "time", "pair", (0.0, 3.0, 9.0), "step"
+    )
     EffectSet((term,)).to_yaml(tmp_path / "effects.yaml")
     assert EffectSet.from_yaml(tmp_path / "effects.yaml") == EffectSet((term,))
 
 
 @pytest.mark.parametrize(
-    "changes", [{"shape": "odd"}, {"shape": "step"}, {"shape": "line", "form": "pair", "covariate": "range"}]
+    "changes",
+    [{"shape": "odd"}, {"shape": "step"}, {"shape": "line", "form": "pair", "covariate": "range"}],
 )
 def test_a_shape_refuses_nonsense(changes):
     with pytest.raises(InputError, match="smooth_term: (shape|form)"):

@@ -6,7 +6,16 @@ from uwb_tdoa_bias.effects.smooth_words import causes, described
 
 
 def term(values, covariate, form, knots, shape, channel="tdoa"):
-    return SmoothTerm(values, {key: 0.02 for key in values if key.endswith("c1")}, "", channel, covariate, form, knots, shape)
+    return SmoothTerm(
+        values,
+        {key: 0.02 for key in values if key.endswith("c1")},
+        "",
+        channel,
+        covariate,
+        form,
+        knots,
+        shape,
+    )
 
 
 @pytest.mark.parametrize(
@@ -18,7 +27,9 @@ def term(values, covariate, form, knots, shape, channel="tdoa"):
             "anchor 2 seems 0.64 ± 0.02 m farther where range is above 5 m (seen from 1 m to 8 m)",
         ),
         (
-            term({"0-1.c0": 0.0, "0-1.c1": -0.3}, "time", "pair", (0.0, 10.0, 20.0, 30.0), "interval"),
+            term(
+                {"0-1.c0": 0.0, "0-1.c1": -0.3}, "time", "pair", (0.0, 10.0, 20.0, 30.0), "interval"
+            ),
             "0-1",
             "the TDOA of 0-1 is 0.30 ± 0.02 m smaller from 10 s to 20 s (seen from 0 s to 30 s)",
         ),
@@ -30,7 +41,8 @@ def term(values, covariate, form, knots, shape, channel="tdoa"):
         (
             term({"c0": 0.0, "c1": 0.4}, "accel_z", "common", (8.0, 10.0, 12.0), "below", "gyro.y"),
             "",
-            "the gyroscope reads 0.20 ± 0.01 rad/s too little about y for each m/s^2 more of accel z, below 10 m/s^2 "
+            "the gyroscope reads 0.20 ± 0.01 rad/s too little about y for each m/s^2 more of "
+            "accel z, below 10 m/s^2 "
             "(seen from 8 m/s^2 to 12 m/s^2)",
         ),
     ],

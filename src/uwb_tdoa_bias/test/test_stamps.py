@@ -3,12 +3,21 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uwb_tdoa_bias.foundation.stamps import CONTRADICTED, LARGEST_STEP_AHEAD, LARGEST_STEP_BACK, MOST_HELD, STEP_AHEAD, UNCONTRADICTED
-from uwb_tdoa_bias.foundation.stamps import StampGate
+from uwb_tdoa_bias.foundation.stamps import (
+    CONTRADICTED,
+    LARGEST_STEP_AHEAD,
+    LARGEST_STEP_BACK,
+    MOST_HELD,
+    STEP_AHEAD,
+    UNCONTRADICTED,
+    StampGate,
+)
 
 
 def through(stamps, reached=()):
-    """(accepted, outliers, places at which the stream jumped back) of stamps fed one after the other."""
+    """(accepted, outliers, places at which the stream jumped back) of stamps fed one after the
+    other.
+    """
     gate, accepted, outliers, back = StampGate(), [], [], []
     for place, t in enumerate(stamps):
         good, bad, jumped_back = gate.take(t, place, reached)
@@ -35,8 +44,16 @@ def test_a_jump_that_persists_is_another_time():
 
 
 def test_a_jump_must_persist_for_longer_where_another_stream_goes_on():
-    assert through([50.0, 1.0, 1.1, 1.2, 1.3], [50.1]) == ([(50.0, 0), (1.0, 1), (1.1, 2), (1.2, 3), (1.3, 4)], [], [4])
-    assert through([50.0, 1.0, 1.1, 1.2, 50.1], [50.1]) == ([(50.0, 0), (50.1, 4)], [(1.0, 1), (1.1, 2), (1.2, 3)], [])
+    assert through([50.0, 1.0, 1.1, 1.2, 1.3], [50.1]) == (
+        [(50.0, 0), (1.0, 1), (1.1, 2), (1.2, 3), (1.3, 4)],
+        [],
+        [4],
+    )
+    assert through([50.0, 1.0, 1.1, 1.2, 50.1], [50.1]) == (
+        [(50.0, 0), (50.1, 4)],
+        [(1.0, 1), (1.1, 2), (1.2, 3)],
+        [],
+    )
 
 
 def test_a_jump_that_another_stream_has_made_is_another_time_at_once():
@@ -50,7 +67,9 @@ def test_a_burst_of_wrong_stamps_shorter_than_a_jump_costs_its_messages_alone(of
     stamps = [0.01 * k for k in range(200)]
     wrong = [t + off for t in stamps[100 : 100 + count]]
     accepted, outliers, back = through([*stamps[:100], *wrong, *stamps[100 + count :]], [1.0])
-    assert [place for place, _ in enumerate(stamps) if not 100 <= place < 100 + count] == [place for _, place in accepted]
+    assert [place for place, _ in enumerate(stamps) if not 100 <= place < 100 + count] == [
+        place for _, place in accepted
+    ]
     assert [t for t, _ in outliers] == wrong and not back
 
 

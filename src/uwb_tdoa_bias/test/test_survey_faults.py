@@ -1,14 +1,19 @@
-"""A survey that is certainly wrong is refused by itself; a usable one, of a table or of a large hall, is not."""
+"""A survey that is certainly wrong is refused by itself; a usable one, of a table or of a large
+hall, is not.
+"""
 
-import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+import numpy as np
+import pytest
+
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.survey_faults import UNITS, refuse_faulty, survey_faults
 
-ROOM = np.array([[x, y, z] for x, y in ((-3.1, -4.0), (-3.2, 3.8), (3.7, 3.7), (4.0, -4.4)) for z in (0.2, 3.0)])
+ROOM = np.array(
+    [[x, y, z] for x, y in ((-3.1, -4.0), (-3.2, 3.8), (3.7, 3.7), (4.0, -4.4)) for z in (0.2, 3.0)]
+)
 
 
 def sentence(positions):
@@ -61,12 +66,18 @@ def test_it_is_refused_with_its_source():
 
 @settings(max_examples=50, deadline=None)
 @given(
-    st.integers(0, 2**31), st.integers(1, 40), st.floats(0.5, 300.0), st.floats(0.5, 200.0), st.floats(0.0, 20.0),
+    st.integers(0, 2**31),
+    st.integers(1, 40),
+    st.floats(0.5, 300.0),
+    st.floats(0.5, 200.0),
+    st.floats(0.0, 20.0),
     st.sampled_from([0.0, 1e3, 5e6]),
-)  # fmt: skip
+)
 def test_rooms_and_halls_are_usable(seed, count, length, width, height, origin):
     """From a table to a hall of 300 x 200 m, in any frame."""
-    positions = np.random.default_rng(seed).uniform(0.0, 1.0, (count, 3)) * [length, width, height] + origin
+    positions = (
+        np.random.default_rng(seed).uniform(0.0, 1.0, (count, 3)) * [length, width, height] + origin
+    )
     assert survey_faults(Anchors.from_positions(positions)) == []
 
 

@@ -2,9 +2,10 @@
 
 import json
 
+from hypothesis import given
+from hypothesis import strategies as st
 import numpy as np
 import pytest
-from hypothesis import given, strategies as st
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.survey import read_survey
@@ -20,7 +21,9 @@ def joined(separator, rows=ROWS, header=None, comma=False):
 
 
 def scaled(factor):
-    return [(number, *(f"{factor * value:.6f}" for value in place)) for number, place in PLACES.items()]
+    return [
+        (number, *(f"{factor * value:.6f}" for value in place)) for number, place in PLACES.items()
+    ]
 
 
 def mappings(form):
@@ -58,13 +61,23 @@ READ = {
     "ours": "frame: hall\nanchors:\n" + mappings("  {0}: {{position: [{1}, {2}, {3}]}}"),
     "anchors as mappings of axes": "anchors:\n" + mappings("  {0}: {{x: {1}, y: {2}, z: {3}}}"),
     "anchors in a list": "anchors:\n" + mappings("  - {{id: {0}, position: [{1}, {2}, {3}]}}"),
-    "position as a mapping": "anchors:\n" + mappings("  - id: {0}\n    position: {{x: {1}, y: {2}, z: {3}}}"),
+    "position as a mapping": "anchors:\n"
+    + mappings("  - id: {0}\n    position: {{x: {1}, y: {2}, z: {3}}}"),
     "axes in a list": mappings("- {{anchor_id: {0}, x: {1}, y: {2}, z: {3}}}"),
     "rows in a list": mappings("- [{0}, {1}, {2}, {3}]"),
-    "parameters of ROS": "/**:\n  ros__parameters:\n    anchors:\n" + mappings("      '{0}': [{1}, {2}, {3}]"),
+    "parameters of ROS": "/**:\n  ros__parameters:\n    anchors:\n"
+    + mappings("      '{0}': [{1}, {2}, {3}]"),
     "JSON": json.dumps({str(number): dict(zip("xyz", place)) for number, place in PLACES.items()}),
-    "JSON list": json.dumps([{"id": number, "position": place} for number, place in PLACES.items()], indent=2),
-    "JSON anchors": json.dumps({"anchors": [{"name": number, "pos": dict(zip("xyz", place))} for number, place in PLACES.items()]}),
+    "JSON list": json.dumps(
+        [{"id": number, "position": place} for number, place in PLACES.items()], indent=2
+    ),
+    "JSON anchors": json.dumps(
+        {
+            "anchors": [
+                {"name": number, "pos": dict(zip("xyz", place))} for number, place in PLACES.items()
+            ]
+        }
+    ),
 }
 
 
@@ -81,7 +94,9 @@ def test_usual_forms_are_read(tmp_path, form):
 def test_the_rows_of_an_opencv_matrix_are_numbered(tmp_path):
     data = ", ".join(str(value) for place in PLACES.values() for value in place)
     head = "%YAML:1.0\n---\nnum_anchors: 3\naps_mat: !!opencv-matrix\n"
-    (tmp_path / "anchors.yaml").write_text(f"{head}   rows: 3\n   cols: 3\n   dt: d\n   data: [ {data} ]\n")
+    (tmp_path / "anchors.yaml").write_text(
+        f"{head}   rows: 3\n   cols: 3\n   dt: d\n   data: [ {data} ]\n"
+    )
     anchors = read_survey(tmp_path / "anchors.yaml")
     np.testing.assert_array_equal(anchors.ids, [0, 1, 2])
     np.testing.assert_allclose(anchors.positions, list(PLACES.values()))
@@ -89,7 +104,10 @@ def test_the_rows_of_an_opencv_matrix_are_numbered(tmp_path):
 
 def test_orientations_are_read_where_they_stand(tmp_path):
     turn = np.array([0.0, 0.0, 0.6, 0.8])
-    tables = "id,x,y,z,qx,qy,qz,qw\n3,1,2,3,0,0,0.6,0.8\n", "- {id: 3, x: 1, y: 2, z: 3, orientation: {x: 0, y: 0, z: 0.6, w: 0.8}}\n"
+    tables = (
+        "id,x,y,z,qx,qy,qz,qw\n3,1,2,3,0,0,0.6,0.8\n",
+        "- {id: 3, x: 1, y: 2, z: 3, orientation: {x: 0, y: 0, z: 0.6, w: 0.8}}\n",
+    )
     for text in (*tables, "anchors: {3: {position: [1, 2, 3], orientation: [0, 0, 0.6, 0.8]}}\n"):
         (tmp_path / "anchors").write_text(text)
         anchors = read_survey(tmp_path / "anchors")
@@ -98,20 +116,41 @@ def test_orientations_are_read_where_they_stand(tmp_path):
 
 
 REFUSED = {
-    "no ids in a table": ("x,y,z\n1,2,3\n", "line 1: columns x, y and z are recognized, and no column with the ids"),
-    "no ids and no header": ("1 2 3\n4 5 6\n", "line 1: three numbers are recognized as a position, and no id"),
+    "no ids in a table": (
+        "x,y,z\n1,2,3\n",
+        "line 1: columns x, y and z are recognized, and no column with the ids",
+    ),
+    "no ids and no header": (
+        "1 2 3\n4 5 6\n",
+        "line 1: three numbers are recognized as a position, and no id",
+    ),
     "too many numbers": ("0,1,2,3,9\n", "line 1: 5 numbers and no header"),
-    "no ids in a list": ("- [1, 2, 3]\n- [4, 5, 6]\n", r"anchors\[0\]: a position is recognized, and no id; write"),
+    "no ids in a list": (
+        "- [1, 2, 3]\n- [4, 5, 6]\n",
+        r"anchors\[0\]: a position is recognized, and no id; write",
+    ),
     "no axes": ("0: {lat: 48.1, lon: 11.5}\n", "0: no position is recognized among lat, lon"),
     "two axes": ("0: {x: 1, y: 2}\n", "0: no position is recognized among x, y"),
-    "decimal commas in a list": ("anchors:\n  0: {position: [-3,1062, -4,0031, 0,1832]}\n", "0: position: 6 numbers .* decimal commas"),
-    "decimal commas among commas": ("id,x,y,z\n0,-3,1062,-4,0031,0,1832\n", "line 2: .* 7 cells, the header 4; decimal commas need ';'"),
-    "a matrix of columns": ("m: !!opencv-matrix\n  rows: 3\n  cols: 2\n  data: [1, 2, 3, 4, 5, 6]\n", "m: a matrix of 3 x 2 is recognized"),
+    "decimal commas in a list": (
+        "anchors:\n  0: {position: [-3,1062, -4,0031, 0,1832]}\n",
+        "0: position: 6 numbers .* decimal commas",
+    ),
+    "decimal commas among commas": (
+        "id,x,y,z\n0,-3,1062,-4,0031,0,1832\n",
+        "line 2: .* 7 cells, the header 4; decimal commas need ';'",
+    ),
+    "a matrix of columns": (
+        "m: !!opencv-matrix\n  rows: 3\n  cols: 2\n  data: [1, 2, 3, 4, 5, 6]\n",
+        "m: a matrix of 3 x 2 is recognized",
+    ),
     "not a number": ("id x y z\n0 1 two 3\n", "line 2: '0,1,two,3' is not"),
     "nothing": ("scale: 3\n", "scale: 3 is no position"),
     "a name": ("id,x,y,z\nNE,1,2,3\n", "line 2: id is 'NE'"),
     "twice": ("- [0, 1, 2, 3]\n- [0, 4, 5, 6]\n", "id 0 is given twice"),
-    "an orientation of three": ("0: {position: [1, 2, 3], orientation: [0, 0, 1]}\n", "0: orientation is .* not 4 numbers"),
+    "an orientation of three": (
+        "0: {position: [1, 2, 3], orientation: [0, 0, 1]}\n",
+        "0: orientation is .* not 4 numbers",
+    ),
 }
 
 
@@ -126,9 +165,19 @@ def test_what_is_not_certain_is_refused_with_place_and_remedy(tmp_path, form):
 def test_cases_of_others(shared_data):
     """Small files that failed once."""
     folder = shared_data.parent / "cases" / "anchors"
-    for name in ("cfclient.yaml", "lps_ros.yaml", "list_pos.yaml", "opencv.yaml", "starloc.csv", "upper.csv", "spaces.txt"):
+    for name in (
+        "cfclient.yaml",
+        "lps_ros.yaml",
+        "list_pos.yaml",
+        "opencv.yaml",
+        "starloc.csv",
+        "upper.csv",
+        "spaces.txt",
+    ):
         anchors = read_survey(folder / name)
-        np.testing.assert_allclose(anchors.positions[[0, 7]], [[-3.1062, -4.0031, 0.1832], [-3.1298, 3.3829, 0.1824]])
+        np.testing.assert_allclose(
+            anchors.positions[[0, 7]], [[-3.1062, -4.0031, 0.1832], [-3.1298, 3.3829, 0.1824]]
+        )
         np.testing.assert_array_equal(anchors.ids, np.arange(8))
     with pytest.raises(InputError, match="decimal"):
         read_survey(folder / "decimalcomma.yaml")

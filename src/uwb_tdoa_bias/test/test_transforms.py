@@ -3,6 +3,7 @@ import math
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.transforms import HELD, Frames
 
@@ -101,7 +102,9 @@ def test_a_transform_that_is_sent_again_with_jitter_is_no_other():
     frames = Frames()
     assert frames.set("base_link", "imu", (0.0, 0.0, 0.0, 1.0), (0.1, 0.0, 0.0))
     for k in range(1, 50):  # it does not creep
-        assert not frames.set("base_link", "imu", (0.0, 0.0, 1e-6, 1.0), (0.1 + 1e-4 * min(k, 9), 0.0, 0.0))
+        assert not frames.set(
+            "base_link", "imu", (0.0, 0.0, 1e-6, 1.0), (0.1 + 1e-4 * min(k, 9), 0.0, 0.0)
+        )
     assert frames.between("base_link", "imu")[1].tolist() == [0.1, 0.0, 0.0]
     assert frames.set("base_link", "imu", (0.0, 0.0, 1e-3, 1.0), (0.1, 0.0, 0.0))
     assert frames.set("base_link", "imu", (0.0, 0.0, 1e-3, 1.0), (0.102, 0.0, 0.0))

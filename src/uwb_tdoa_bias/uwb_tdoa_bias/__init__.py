@@ -1,1 +1,4 @@
-"""The measurement side: anchors, TDOA geometry, features, effects and the network. No ROS outside the nodes and ros*.py."""
+"""The measurement side: anchors, TDOA geometry, features, effects and the network.
+
+No ROS outside the nodes and ros*.py.
+"""

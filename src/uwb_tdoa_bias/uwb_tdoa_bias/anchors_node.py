@@ -1,8 +1,10 @@
 """anchors_node: the anchors of a survey file, for nodes, RViz and bags.
 
-  -> uwb/anchors (AnchorArray), /tf_static (tf2_msgs/TFMessage: the frame of the survey -> anchor_<id>),
+  -> uwb/anchors (AnchorArray), /tf_static (tf2_msgs/TFMessage: the frame of the survey ->
+  anchor_<id>),
      uwb/anchors/markers (visualization_msgs/MarkerArray); all transient local.
-One for all tags of a room: remap their uwb/anchors to its own. Every parameter is documented in config/anchors_node.yaml.
+One for all tags of a room: remap their uwb/anchors to its own. Every parameter is documented in
+config/anchors_node.yaml.
 """
 
 from __future__ import annotations
@@ -19,17 +21,29 @@ from .foundation.errors import InputError
 from .foundation.ros_anchors import ANCHORS_FILE, ANCHORS_QOS, anchors_to_message
 from .foundation.ros_frames import TF_STATIC_QOS
 from .foundation.ros_node import StreamNode
-from .foundation.ros_parameters import FROZEN, Parameter, declare_all, files_of, refuse_unknown, say_unused
+from .foundation.ros_parameters import (
+    FROZEN,
+    Parameter,
+    declare_all,
+    files_of,
+    refuse_unknown,
+    say_unused,
+)
 from .foundation.survey import read_survey
 from .foundation.survey_faults import refuse_faulty
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from uwb_tdoa_msgs.msg import AnchorArray
 
 PARAMETERS = {  # in the order of config/anchors_node.yaml
-    "anchors_file": Parameter(ANCHORS_FILE.default, "survey of the anchors, as the tools read it; must be given"),
-    "marker_size": Parameter(0.12, "m; edge of the cube that shows an anchor, and height of its number", 0.001, 10.0),
+    "anchors_file": Parameter(
+        ANCHORS_FILE.default, "survey of the anchors, as the tools read it; must be given"
+    ),
+    "marker_size": Parameter(
+        0.12, "m; edge of the cube that shows an anchor, and height of its number", 0.001, 10.0
+    ),
     "frozen": FROZEN,
 }
 LEVEL = Quaternion(w=1.0)  # of an anchor whose orientation was not surveyed
@@ -46,7 +60,9 @@ class AnchorsNode(StreamNode):
         own = declare_all(self, PARAMETERS)
         refuse_unknown(self)
         if not own["anchors_file"]:
-            raise InputError("anchors_file: is empty; give a survey of the anchors, e.g. anchors.yaml.")
+            raise InputError(
+                "anchors_file: is empty; give a survey of the anchors, e.g. anchors.yaml."
+            )
         anchors = refuse_faulty(read_survey(own["anchors_file"]), own["anchors_file"])
         message = anchors_to_message(anchors)
         for topic, qos, content in (
@@ -56,17 +72,25 @@ class AnchorsNode(StreamNode):
         ):
             self.create_publisher(type(content), topic, qos).publish(content)
         say_unused([self], files_of(arguments))
-        self.get_logger().info(f"{len(anchors)} anchors of {own['anchors_file']} in frame '{anchors.frame}'")
+        self.get_logger().info(
+            f"{len(anchors)} anchors of {own['anchors_file']} in frame '{anchors.frame}'"
+        )
 
 
 def transforms(message: AnchorArray) -> TFMessage:
-    """TFMessage of an AnchorArray: a frame anchor_<id> for each, level where its orientation is not known."""
+    """TFMessage of an AnchorArray: a frame anchor_<id> for each, level where its orientation is not
+    known.
+    """
     out = TFMessage()
     for anchor in message.anchors:
         p, q = anchor.pose.position, anchor.pose.orientation
-        transform = Transform(translation=Vector3(x=p.x, y=p.y, z=p.z), rotation=q if _known(q) else LEVEL)
+        transform = Transform(
+            translation=Vector3(x=p.x, y=p.y, z=p.z), rotation=q if _known(q) else LEVEL
+        )
         out.transforms.append(
-            TransformStamped(header=message.header, child_frame_id=f"anchor_{anchor.id}", transform=transform)
+            TransformStamped(
+                header=message.header, child_frame_id=f"anchor_{anchor.id}", transform=transform
+            )
         )
     return out
 
@@ -76,7 +100,9 @@ def markers(message: AnchorArray, size: float) -> MarkerArray:
     out = MarkerArray()
     for anchor in message.anchors:
         for kind, name in ((Marker.CUBE, "anchors"), (Marker.TEXT_VIEW_FACING, "numbers")):
-            marker = Marker(header=message.header, ns=name, id=anchor.id, type=kind, text=str(anchor.id))
+            marker = Marker(
+                header=message.header, ns=name, id=anchor.id, type=kind, text=str(anchor.id)
+            )
             q, p = anchor.pose.orientation, anchor.pose.position
             marker.pose.orientation = q if _known(q) else LEVEL
             marker.pose.position.x, marker.pose.position.y = p.x, p.y

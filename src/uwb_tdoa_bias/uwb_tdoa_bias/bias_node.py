@@ -1,7 +1,8 @@
 """bias_node: raw TDOAs in, corrected TDOAs out.
 
 uwb/tdoa (Tdoa), odometry (nav_msgs/Odometry), uwb/anchors (AnchorArray), /tf_static
-  -> uwb/tdoa_corrected (TdoaCorrected: one for each Tdoa), /diagnostics (diagnostic_msgs/DiagnosticArray).
+  -> uwb/tdoa_corrected (TdoaCorrected: one for each Tdoa), /diagnostics
+  (diagnostic_msgs/DiagnosticArray).
 Every parameter is documented in config/bias_node.yaml.
 """
 
@@ -12,57 +13,101 @@ from dataclasses import dataclass
 from itertools import groupby
 import math
 import sys
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
 import numpy as np
+
 from uwb_tdoa_msgs.msg import Tdoa, TdoaCorrected
 
+from .correction.corrector import EFFECTS, FADED, NETWORK, PASSED, Correction, Corrector, warm_up
+from .correction.network import load_network
+from .correction.pose_queue import PoseQueue
+from .correction.poses import parts_of
+from .effects import EffectSet, LabelCorrector
+from .effects.tag_lever_arm import TagLeverArm
 from .foundation import ros
 from .foundation.errors import InputError
 from .foundation.ros_anchors import ANCHORS_FILE, AnchorsInput
 from .foundation.ros_cdr import CdrCodec
-from .correction.corrector import EFFECTS, FADED, NETWORK, PASSED, Correction, Corrector, warm_up
-from .effects import EffectSet, LabelCorrector
-from .effects.tag_lever_arm import TagLeverArm
 from .foundation.ros_diagnostics import Diagnostics, Rate, Report
 from .foundation.ros_frames import FramesInput, unknown_frame
 from .foundation.ros_node import StreamNode
-from .foundation.ros_parameters import FROZEN, Parameter, declare_all, files_of, refuse_unknown, say_unused
+from .foundation.ros_parameters import (
+    FROZEN,
+    Parameter,
+    declare_all,
+    files_of,
+    refuse_unknown,
+    say_unused,
+)
 from .foundation.ros_stamps import Epoch
 from .foundation.ros_streams import RoundRobin, StreamOutput, Streams
-from .correction.pose_queue import PoseQueue
-from .correction.network import load_network
-from .correction.poses import parts_of
 from .foundation.ros_topics import several_publishers
 from .foundation.stamps import LARGEST_STEP_BACK, StampGate
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Sequence
+
     from .foundation.anchors import Anchors
     from .foundation.ros_cdr import Template
 
 PARAMETERS = {  # in the order of config/bias_node.yaml
     "anchors_file": ANCHORS_FILE,
-    "effects_file": Parameter("", 'path of an effects.yaml: which systematic effects to remove, with which values; "" for none'),
+    "effects_file": Parameter(
+        "",
+        (
+            'path of an effects.yaml: which systematic effects to remove, with which values; "" '
+            "for none"
+        ),
+    ),
     "model_file": Parameter(
         "",
-        'path of an ONNX bias model; "" for none; default: the one shipped, for DW1000 modules, which helps some flights and harms others',
+        (
+            'path of an ONNX bias model; "" for none; default: the one shipped, for DW1000 '
+            "modules, which helps some flights and harms others"
+        ),
     ),
-    "pose_lag": Parameter(0.05, "s; a TDOA is corrected at the newest pose at least this much older than the TDOA before it", 0.001, 10.0),
-    "hold": Parameter(0.225, "s of stamps; longest wait for that pose: above ekf_node's lag - pose_lag, below its lag", 0.001, 100.0),
+    "pose_lag": Parameter(
+        0.05,
+        (
+            "s; a TDOA is corrected at the newest pose at least this much older than the TDOA "
+            "before it"
+        ),
+        0.001,
+        10.0,
+    ),
+    "hold": Parameter(
+        0.225,
+        "s of stamps; longest wait for that pose: above ekf_node's lag - pose_lag, below its lag",
+        0.001,
+        100.0,
+    ),
     "body_frame": Parameter(
-        "base_link", "frame of the odometry's body; TDOAs in another frame are of an antenna that /tf_static places in it"
+        "base_link",
+        (
+            "frame of the odometry's body; TDOAs in another frame are of an antenna that "
+            "/tf_static places in it"
+        ),
     ),
     "frozen": FROZEN,
 }
 POSE = "pose", "twist"  # what is read of an Odometry, its numbers,
 MEASURED = "anchor_a", "anchor_b", "distance_difference", "variance"  # and of a Tdoa
 CORRECTED = (  # what is written of a TdoaCorrected
-    "anchor_a", "anchor_b", "raw", "variance", "bias", "bias_std", "corrected", "status", "bias_slope", "bias_state",
-)  # fmt: skip
+    "anchor_a",
+    "anchor_b",
+    "raw",
+    "variance",
+    "bias",
+    "bias_std",
+    "corrected",
+    "status",
+    "bias_slope",
+    "bias_state",
+)
 MOST_FRAMES = 100  # that are remembered: names on a topic may be anything
 EARLY, EARLY_POSES = 2000, 500  # TDOAs and poses kept while there are no anchors
 Item = tuple[Any, ...]  # of a TDOA: frame, sec, nanosec, and MEASURED
@@ -71,9 +116,12 @@ STATUS = {PASSED: "passed", EFFECTS: "effects", NETWORK: "network", FADED: "fade
 
 @dataclass
 class Antenna:
-    """What is known of the antenna of a frame. effects : EffectSet, with its place on the body; models : what to call each status's bias;
-    trouble : why its place is not known, or None; corrector : Corrector, once there are anchors; heard, reported : TDOAs so far, and by
-    the last report."""
+    """What is known of the antenna of a frame. effects : EffectSet, with its place on the body;
+    models : what to call each status's bias;
+    trouble : why its place is not known, or None; corrector : Corrector, once there are anchors;
+        heard, reported : TDOAs so far, and by
+    the last report.
+    """
 
     effects: EffectSet
     models: dict[int, str]
@@ -84,13 +132,18 @@ class Antenna:
 
 
 class BiasNode(StreamNode):
-    """Converts messages for a Corrector and keeps the accounts: received = published + waiting + dropped."""
+    """Converts messages for a Corrector and keeps the accounts: received = published + waiting +
+    dropped.
+    """
 
     NAME = "bias_node"
 
-    def __init__(self, arguments: Sequence[str] = (), member: Collection[str] | None = None, **options: Any) -> None:
-        """arguments : of the process; member : of a localization_node, which has it take its turns and hands it the odometry:
-        names of parameters that are for others, too; options : of Node."""
+    def __init__(
+        self, arguments: Sequence[str] = (), member: Collection[str] | None = None, **options: Any
+    ) -> None:
+        """arguments : of the process; member : of a localization_node, which has it take its turns
+        and hands it the odometry: names of parameters that are for others, too; options : of Node.
+        """
         super().__init__(self.NAME, **options)
         own = declare_all(self, PARAMETERS)
         refuse_unknown(self, member or ())
@@ -106,7 +159,9 @@ class BiasNode(StreamNode):
         self._epoch, self._rate = Epoch(), Rate()
         self._counts: Counter[str] = Counter()
         self._early: deque[Item] = deque()
-        self._early_poses: deque[tuple[str, np.ndarray, np.ndarray]] = deque()  # as of `_take_poses`
+        self._early_poses: deque[tuple[str, np.ndarray, np.ndarray]] = (
+            deque()
+        )  # as of `_take_poses`
         self._hold = PoseQueue(self._limit)
         self._tdoas, self._poses = StampGate(), StampGate()
         self._reported_unready = self._reported_received = self._reported_poses = 0
@@ -117,7 +172,9 @@ class BiasNode(StreamNode):
         self._frames = FramesInput(self, self._epoch.seconds, self._on_frames)
         self._anchors = AnchorsInput(self, self._on_anchors, own["anchors_file"])
         self.streams = Streams(self, self._epoch, self._release)
-        self.streams.add(CdrCodec(Odometry, *POSE), "odometry", self._on_odometry, handed=member is not None)
+        self.streams.add(
+            CdrCodec(Odometry, *POSE), "odometry", self._on_odometry, handed=member is not None
+        )
         self.streams.add(CdrCodec(Tdoa, *MEASURED), "uwb/tdoa", self._on_tdoa)
         self._diagnostics = Diagnostics(self, self._report)
         self._anchors.start()
@@ -138,7 +195,10 @@ class BiasNode(StreamNode):
 
     @property
     def _idle(self) -> bool:
-        return all(antenna.models[NETWORK] == "none" for antenna in (self._body_antenna, *self._antennas.values()))
+        return all(
+            antenna.models[NETWORK] == "none"
+            for antenna in (self._body_antenna, *self._antennas.values())
+        )
 
     def _models(self, effects: EffectSet) -> dict[int, str]:
         """Compile what an EffectSet needs, and return what to call each status's bias."""
@@ -183,25 +243,38 @@ class BiasNode(StreamNode):
 
     def _antenna(self, frame: str) -> Antenna:
         """Antenna of TDOAs of this frame."""
-        if frame in ("", self._body) or frame not in self._antennas and len(self._antennas) >= MOST_FRAMES:
+        if (
+            frame in ("", self._body)
+            or frame not in self._antennas
+            and len(self._antennas) >= MOST_FRAMES
+        ):
             return self._body_antenna
         if frame not in self._antennas:
             self._place_antenna(frame)
         return self._antennas[frame]
 
     def _place_antenna(self, frame: str) -> None:
-        """Find where the antenna of this frame, another than the body's, is on the body, and remove what that does to its TDOAs."""
+        """Find where the antenna of this frame, another than the body's, is on the body, and remove
+        what that does to its TDOAs.
+        """
         trouble, effects, known = None, self._effects, self._antennas.get(frame)
         between = self._frames.frames.between(self._body, frame)
         if any(effect.name == TagLeverArm.name for effect in effects.effects):
-            self.get_logger().info(f"{TagLeverArm.name} of effects_file counts, not the transform of '{frame}'")
+            self.get_logger().info(
+                f"{TagLeverArm.name} of effects_file counts, not the transform of '{frame}'"
+            )
         elif between is None:
             trouble = unknown_frame("uwb/tdoa", frame, self._body)
         elif between[1].any():
             try:
-                effects = EffectSet((*effects.effects, TagLeverArm(values=dict(zip("xyz", between[1].tolist())))))
+                effects = EffectSet(
+                    (*effects.effects, TagLeverArm(values=dict(zip("xyz", between[1].tolist()))))
+                )
             except InputError as error:
-                trouble = f"uwb/tdoa: the place of '{frame}' on '{self._body}' in /tf_static is not taken: {error}"
+                trouble = (
+                    f"uwb/tdoa: the place of '{frame}' on '{self._body}' in /tf_static is not "
+                    f"taken: {error}"
+                )
         if trouble and frame not in self._frames_said:
             self._frames_said.add(frame)
             self.get_logger().warning(trouble)
@@ -213,9 +286,13 @@ class BiasNode(StreamNode):
         antenna = self._antennas[frame] = Antenna(effects, models, trouble)
         self._give_corrector(antenna)
         if elsewhere:
-            self.get_logger().info(f"'{frame}' is placed by /tf_static; correcting with: {antenna.models[NETWORK]}")
+            self.get_logger().info(
+                f"'{frame}' is placed by /tf_static; correcting with: {antenna.models[NETWORK]}"
+            )
 
-    def _on_odometry(self, frame: str, t: np.ndarray, rows: np.ndarray, arrival: np.ndarray) -> None:
+    def _on_odometry(
+        self, frame: str, t: np.ndarray, rows: np.ndarray, arrival: np.ndarray
+    ) -> None:
         self._counts["poses"] += len(t)
         if self._idle:
             return
@@ -230,7 +307,8 @@ class BiasNode(StreamNode):
         if frame != self._corrector.anchors.frame:
             self.warn_at_times(
                 "frame of odometry",
-                f"odometry is in frame '{frame}', the anchors in '{self._corrector.anchors.frame}': "
+                f"odometry is in frame '{frame}', the anchors in "
+                f"'{self._corrector.anchors.frame}': "
                 "taken as the same frame",
             )
         if self._poses.take_all(t.tolist()):
@@ -283,14 +361,18 @@ class BiasNode(StreamNode):
         return self._epoch.seconds(Time(sec=sec, nanosec=nanosec))
 
     def _take(self, stamps: Sequence[float], items: Iterable[Item | None]) -> None:
-        """Have TDOAs wait for their poses: stamps, s, as received; items : (frame, sec, nanosec, a, b, d, variance)."""
+        """Have TDOAs wait for their poses: stamps, s, as received; items : (frame, sec, nanosec, a,
+        b, d, variance).
+        """
         stamps = [t - self._late for t in stamps]
         if stamps and self._tdoas.take_all(stamps):
             for t, item in zip(stamps, items):
                 self._hold.add(t, item)
             return
         for t, item in zip(stamps, items):
-            if t < self._tdoas.newest - LARGEST_STEP_BACK:  # it needs no pose; ekf_node decides whether another time begins with it
+            if (
+                t < self._tdoas.newest - LARGEST_STEP_BACK
+            ):  # it needs no pose; ekf_node decides whether another time begins with it
                 self._pass(item)
                 item = None
             accepted, outliers, jumped_back = self._tdoas.take(t, item, [self._poses.newest])
@@ -322,9 +404,13 @@ class BiasNode(StreamNode):
     def _is_ready(self, before: float) -> bool:
         return self._poses.newest == -math.inf or self._corrector.ready(before)
 
-    def _release_alike(self, stamps: Sequence[float], items: Sequence[Item], ready: Sequence[bool]) -> None:
+    def _release_alike(
+        self, stamps: Sequence[float], items: Sequence[Item], ready: Sequence[bool]
+    ) -> None:
         """Correct and publish TDOAs of one frame."""
-        corrector: Any = self._antenna(items[0][0]).corrector  # there is one as soon as there are anchors
+        corrector: Any = self._antenna(
+            items[0][0]
+        ).corrector  # there is one as soon as there are anchors
         t, d = np.array(stamps), np.array([item[5] for item in items])
         a, b = (corrector.anchors.index([item[side] for item in items]) for side in (3, 4))
         valid = (a >= 0) & (b >= 0) & (a != b) & np.isfinite(d)
@@ -338,15 +424,22 @@ class BiasNode(StreamNode):
         self._publish(items, correction, self._epoch.parts(t) if self._late else None)
 
     def _publish(
-        self, items: Sequence[Item], correction: Correction, stamps: tuple[np.ndarray, np.ndarray] | None = None
+        self,
+        items: Sequence[Item],
+        correction: Correction,
+        stamps: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> None:
-        """Publish corrected TDOAs: items as in `_take`; their Correction; stamps : seconds and nanoseconds, (n,) each, instead of
-        their own."""
+        """Publish corrected TDOAs: items as in `_take`; their Correction; stamps : seconds and
+        nanoseconds, (n,) each, instead of their own.
+        """
         columns = [np.array(column) for column in list(zip(*items))[1:]]
         measured = columns if stamps is None else (*stamps, *columns[2:])  # up to the variance
         values = *measured, *vars(correction).values()
         status = correction.status.tolist()
-        kinds, first = [(item[0], self._antenna(item[0]).models[one]) for item, one in zip(items, status)], 0
+        kinds, first = (
+            [(item[0], self._antenna(item[0]).models[one]) for item, one in zip(items, status)],
+            0,
+        )
         for kind, same in groupby(kinds):
             some = slice(first, first := first + len(list(same)))
             rows = self._template(*kind).rows(some.stop - some.start)
@@ -368,26 +461,53 @@ class BiasNode(StreamNode):
     def _report(self) -> Report:
         counts = self._counts
         rate = self._rate.of(counts["received"])
-        received, self._reported_received = counts["received"] - self._reported_received, counts["received"]
+        received, self._reported_received = (
+            counts["received"] - self._reported_received,
+            counts["received"],
+        )
         poses, self._reported_poses = counts["poses"] - self._reported_poses, counts["poses"]
         recent = {"uwb/tdoa": received, "odometry": poses}
         wiring = [end.trouble(recent[name]) for name, end in self.streams.inputs.items()]
         wiring.append(several_publishers(self, "uwb/tdoa_corrected"))
         others = [*self._anchors.refusals, *self._frames.refusals]
         wiring += [*(refusals.trouble() for refusals in others), self._frames.trouble]
-        unready, self._reported_unready = counts["unready"] - self._reported_unready, counts["unready"]
-        values = {"model": self._model, "received": counts["received"], "published": counts["published"]}
-        values |= {"waiting": len(self._hold) + len(self._tdoas) + len(self._early), "dropped": counts["dropped"]}
+        unready, self._reported_unready = (
+            counts["unready"] - self._reported_unready,
+            counts["unready"],
+        )
+        values = {
+            "model": self._model,
+            "received": counts["received"],
+            "published": counts["published"],
+        }
+        values |= {
+            "waiting": len(self._hold) + len(self._tdoas) + len(self._early),
+            "dropped": counts["dropped"],
+        }
         values |= {name: counts[name] for name in STATUS.values()}
         values |= {"released before their pose": counts["unready"], "invalid": counts["invalid"]}
-        correctors = [antenna.corrector for antenna in (self._body_antenna, *self._antennas.values())]
-        outside = [phrase for corrector in correctors if corrector is not None for phrase in corrector.outside]
+        correctors = [
+            antenna.corrector for antenna in (self._body_antenna, *self._antennas.values())
+        ]
+        outside = [
+            phrase
+            for corrector in correctors
+            if corrector is not None
+            for phrase in corrector.outside
+        ]
         values |= {"beyond where effects were seen": "; ".join(outside) or "nothing"}
         values |= {"poses": counts["poses"], "TDOA rate": f"{rate:.1f} Hz"}
-        values |= {f"publishers of {name}": end.get_publisher_count() for name, end in self.streams.inputs.items()}
-        values |= {"subscribers of uwb/tdoa_corrected": self.output.publisher.get_subscription_count()}
+        values |= {
+            f"publishers of {name}": end.get_publisher_count()
+            for name, end in self.streams.inputs.items()
+        }
+        values |= {
+            "subscribers of uwb/tdoa_corrected": self.output.publisher.get_subscription_count()
+        }
         values |= {f"lost on {name}": end.lost for name, end in self.streams.inputs.items()}
-        values |= {f"unreadable on {end.topic}": end.count for end in (*self.streams.refusals, *others)}
+        values |= {
+            f"unreadable on {end.topic}": end.count for end in (*self.streams.refusals, *others)
+        }
         level, text = self._health(rate, unready)
         if level != DiagnosticStatus.ERROR and any(wiring):
             level, text = DiagnosticStatus.WARN, next(filter(None, wiring))
@@ -399,17 +519,32 @@ class BiasNode(StreamNode):
             if antenna.trouble and heard:
                 return DiagnosticStatus.WARN, antenna.trouble
         if self._idle:
-            return DiagnosticStatus.OK, "passing TDOAs on: neither effects_file nor model_file is set"
+            return (
+                DiagnosticStatus.OK,
+                "passing TDOAs on: neither effects_file nor model_file is set",
+            )
         if self._anchors.refused:
             return DiagnosticStatus.ERROR, self._anchors.refused
         if self._corrector is None:
-            return DiagnosticStatus.ERROR, "no anchors yet: publish them on uwb/anchors, reliable and transient local"
+            return (
+                DiagnosticStatus.ERROR,
+                "no anchors yet: publish them on uwb/anchors, reliable and transient local",
+            )
         if not rate:
-            return DiagnosticStatus.WARN, "no TDOAs on uwb/tdoa: check that the tag's driver runs in this namespace"
+            return (
+                DiagnosticStatus.WARN,
+                "no TDOAs on uwb/tdoa: check that the tag's driver runs in this namespace",
+            )
         if self._poses.newest == -math.inf:
-            return DiagnosticStatus.WARN, "no poses on odometry yet: what needs one is not corrected; start ekf_node"
+            return (
+                DiagnosticStatus.WARN,
+                "no poses on odometry yet: what needs one is not corrected; start ekf_node",
+            )
         if unready:
-            return DiagnosticStatus.WARN, "odometry is late: TDOAs leave before their pose; check the load of ekf_node"
+            return (
+                DiagnosticStatus.WARN,
+                "odometry is late: TDOAs leave before their pose; check the load of ekf_node",
+            )
         return DiagnosticStatus.OK, f"correcting with {self._model}"
 
 

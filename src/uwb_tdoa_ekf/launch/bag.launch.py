@@ -10,7 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument, ExecuteProcess, IncludeLaunchDescription, Shutdown, TimerAction
+from launch.actions import (
+    DeclareLaunchArgument,
+    ExecuteProcess,
+    IncludeLaunchDescription,
+    Shutdown,
+    TimerAction,
+)
 from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration
 
@@ -23,20 +29,30 @@ REST = 2.0  # s after the end of the bag, in which the nodes publish what they s
 
 
 def generate_launch_description() -> LaunchDescription:
-    """tdoa.launch.py, whose arguments all work here too, on simulated time, and ros2 bag play; ends when the bag does."""
+    """tdoa.launch.py, whose arguments all work here too, on simulated time, and ros2 bag play; ends
+    when the bag does.
+    """
     tag = PythonLaunchDescriptionSource(str(Path(__file__).with_name("tdoa.launch.py")))
     play = ["ros2", "bag", "play", LaunchConfiguration("bag"), "--clock", "200", "--delay", DELAY]
     return LaunchDescription(
         [
             DeclareLaunchArgument("bag", description="path of the bag"),
-            DeclareLaunchArgument("rate", default_value="1.0", description="times as fast as recorded"),
             DeclareLaunchArgument(
-                "at_end", default_value="shutdown", choices=["shutdown", "stay"],
+                "rate", default_value="1.0", description="times as fast as recorded"
+            ),
+            DeclareLaunchArgument(
+                "at_end",
+                default_value="shutdown",
+                choices=["shutdown", "stay"],
                 description="of the bag: shutdown ends all, stay leaves nodes and RViz as they are",
             ),
-            DeclareLaunchArgument("respawn", default_value="false", description="a node that crashes is to be seen"),
+            DeclareLaunchArgument(
+                "respawn", default_value="false", description="a node that crashes is to be seen"
+            ),
             IncludeLaunchDescription(tag, launch_arguments={"use_sim_time": "true"}.items()),
-            ExecuteProcess(cmd=[*play, "--rate", LaunchConfiguration("rate")], output="screen", on_exit=_played),
+            ExecuteProcess(
+                cmd=[*play, "--rate", LaunchConfiguration("rate")], output="screen", on_exit=_played
+            ),
         ]
     )
 
@@ -46,7 +62,9 @@ def _played(event: ProcessExited, context: LaunchContext) -> TimerAction | None:
     if context.is_shutdown:
         return None
     if event.returncode:
-        raise RuntimeError(f"ros2 bag play has ended with exit code {event.returncode}; it says above why")
+        raise RuntimeError(
+            f"ros2 bag play has ended with exit code {event.returncode}; it says above why"
+        )
     if LaunchConfiguration("at_end").perform(context) == "stay":
         return None
     return TimerAction(period=REST, actions=[Shutdown(reason="the bag is over")])

@@ -9,7 +9,8 @@ ros2 launch uwb_tdoa_ekf tags.launch.py tags:=tags.yaml processes:=auto    # tak
       tag1: {}                        # topics /tag1/imu/data ..., frame tag1/base_link
       tag2: {effects_file: tag2.yaml, tdoa_std: 0.3}
 
-With `host: NAME` for each tag, the same file is launched on every machine, and each starts the nodes of its tags.
+With `host: NAME` for each tag, the same file is launched on every machine, and each starts the
+nodes of its tags.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from typing import TYPE_CHECKING
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
+
 from uwb_tdoa_ekf.launching import FROZEN, NETWORK, RESPAWN, tags, typed
 from uwb_tdoa_ekf.launching_actions import actions
 
@@ -29,7 +31,10 @@ if TYPE_CHECKING:
 OTHERS = {
     "processes": (
         "",
-        "localization_nodes that share the tags: a number, or auto, one for each core; default: as the file says, or two nodes for each tag",
+        (
+            "localization_nodes that share the tags: a number, or auto, one for each core; "
+            "default: as the file says, or two nodes for each tag"
+        ),
     ),
     "host": ("", "start the tags of this host; default: the name of this machine"),
     "use_sim_time": ("", "true for bags that are played with --clock"),
@@ -42,10 +47,16 @@ OTHERS = {
 def generate_launch_description() -> LaunchDescription:
     """Arguments, and what follows from them and the file."""
     arguments = [
-        DeclareLaunchArgument(name, default_value=default, description=text) for name, (default, text) in OTHERS.items()
+        DeclareLaunchArgument(name, default_value=default, description=text)
+        for name, (default, text) in OTHERS.items()
     ]
     arguments += [
-        DeclareLaunchArgument(name, default_value="stay" if name == "on_exit" else default, description=text, choices=choices)
+        DeclareLaunchArgument(
+            name,
+            default_value="stay" if name == "on_exit" else default,
+            description=text,
+            choices=choices,
+        )
         for name, (default, text, choices) in (RESPAWN | NETWORK).items()
     ]  # one tag does not take the others along
     file = DeclareLaunchArgument("tags", description="YAML file of the tags")
@@ -53,7 +64,14 @@ def generate_launch_description() -> LaunchDescription:
 
 
 def _nodes(context: LaunchContext) -> list[Action]:
-    given = {name: LaunchConfiguration(name).perform(context) for name in ("tags", *OTHERS, *RESPAWN, *NETWORK)}
+    given = {
+        name: LaunchConfiguration(name).perform(context)
+        for name in ("tags", *OTHERS, *RESPAWN, *NETWORK)
+    }
     values = typed({name: given[name] for name in ("use_sim_time", "frozen")})
     starts = tags(given["tags"], values, given["log_level"], given["processes"], given["host"])
-    return actions(starts, *(given[name] for name in (*RESPAWN, *NETWORK, "rviz")), values.get("use_sim_time", False))
+    return actions(
+        starts,
+        *(given[name] for name in (*RESPAWN, *NETWORK, "rviz")),
+        values.get("use_sim_time", False),
+    )

@@ -1,8 +1,8 @@
 """All nodes of one tag.
 
-ros2 launch uwb_tdoa_ekf tdoa.launch.py anchors_file:=anchors.yaml
-ros2 launch uwb_tdoa_ekf tdoa.launch.py namespace:=tag1 ekf_params:=my_ekf.yaml publish_tf:=odom rviz:=true
-ros2 launch uwb_tdoa_ekf tdoa.launch.py --show-args
+ros2 launch uwb_tdoa_ekf tdoa.launch.py anchors_file:=anchors.yaml ros2 launch uwb_tdoa_ekf
+tdoa.launch.py namespace:=tag1 ekf_params:=my_ekf.yaml publish_tf:=odom rviz:=true ros2 launch
+uwb_tdoa_ekf tdoa.launch.py --show-args
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch.substitutions import LaunchConfiguration
+
 from uwb_tdoa_ekf.launching import FROZEN, NETWORK, RESPAWN, start, tag, typed
 from uwb_tdoa_ekf.launching_actions import actions
 
@@ -19,7 +20,8 @@ if TYPE_CHECKING:
     from launch.action import Action
     from launch.launch_context import LaunchContext
 
-VALUES = {  # parameters of the nodes; one that is not given is what the files say, or the node's default
+# parameters of the nodes; one that is not given is what the files say, or the node's default
+VALUES = {
     "anchors_file": "survey of the anchors; without it they come on uwb/anchors",
     "effects_file": "effects.yaml that diagnose wrote",
     "model_file": "ONNX bias model",
@@ -42,9 +44,13 @@ OTHERS = {
 
 def generate_launch_description() -> LaunchDescription:
     """Arguments, and what follows from them."""
-    arguments = [DeclareLaunchArgument(name, default_value="", description=text) for name, text in VALUES.items()]
+    arguments = [
+        DeclareLaunchArgument(name, default_value="", description=text)
+        for name, text in VALUES.items()
+    ]
     arguments += [
-        DeclareLaunchArgument(name, default_value=default, description=text) for name, (default, text) in OTHERS.items()
+        DeclareLaunchArgument(name, default_value=default, description=text)
+        for name, (default, text) in OTHERS.items()
     ]
     arguments += [
         DeclareLaunchArgument(name, default_value=default, description=text, choices=choices)
@@ -55,9 +61,19 @@ def generate_launch_description() -> LaunchDescription:
 
 def _nodes(context: LaunchContext) -> list[Action]:
     values = typed({name: LaunchConfiguration(name).perform(context) for name in VALUES})
-    given = {name: LaunchConfiguration(name).perform(context) for name in (*OTHERS, *RESPAWN, *NETWORK)}
-    files = {node: [given[key]] for node, key in (("bias_node", "bias_params"), ("ekf_node", "ekf_params")) if given[key]}
+    given = {
+        name: LaunchConfiguration(name).perform(context) for name in (*OTHERS, *RESPAWN, *NETWORK)
+    }
+    files = {
+        node: [given[key]]
+        for node, key in (("bias_node", "bias_params"), ("ekf_node", "ekf_params"))
+        if given[key]
+    }
     starts = tag(given["namespace"], values, files, given["log_level"])
     if "anchors_file" in values:
         starts.append(start("anchors_node", given["namespace"], values, (), given["log_level"]))
-    return actions(starts, *(given[name] for name in (*RESPAWN, *NETWORK, "rviz")), values.get("use_sim_time", False))
+    return actions(
+        starts,
+        *(given[name] for name in (*RESPAWN, *NETWORK, "rviz")),
+        values.get("use_sim_time", False),
+    )

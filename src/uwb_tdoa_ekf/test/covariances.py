@@ -4,7 +4,9 @@ import numpy as np
 
 
 def random_covariance(rng, n=15, spread=1.0):
-    """(n, n), symmetric positive definite; standard deviations over 10**-spread to 10**spread, any correlation."""
+    """(n, n), symmetric positive definite; standard deviations over 10**-spread to 10**spread, any
+    correlation.
+    """
     factor = rng.standard_normal((n, n)) + 0.5 * np.eye(n)
     covariance = factor @ factor.T
     std = np.sqrt(np.diag(covariance))
@@ -14,7 +16,9 @@ def random_covariance(rng, n=15, spread=1.0):
 
 
 def assert_covariance(covariance, tolerance=1e-9):
-    """Finite, symmetric, and positive definite: no eigenvalue of the correlation matrix below -tolerance."""
+    """Finite, symmetric, and positive definite: no eigenvalue of the correlation matrix below
+    -tolerance.
+    """
     assert np.isfinite(covariance).all()
     std = np.sqrt(np.einsum("...ii->...i", covariance))
     assert (std > 0.0).all()

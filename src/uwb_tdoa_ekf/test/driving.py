@@ -10,7 +10,9 @@ from uwb_tdoa_ekf.core.memory import Measurements, new_state
 
 
 def drive(flight, config=None, state=None, cuts=()):
-    """Odometry and residuals of the engine, fed in the pieces between the stamps `cuts`: fields by attribute."""
+    """Odometry and residuals of the engine, fed in the pieces between the stamps `cuts`: fields by
+    attribute.
+    """
     state = state_for(flight) if state is None else state
     parameters, whole, parts = (config or FilterConfig()).parameters(), measurements(flight), []
     edges = [-np.inf, *sorted(cuts), np.inf]

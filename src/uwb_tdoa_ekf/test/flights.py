@@ -7,8 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
-from uwb_tdoa_bias.foundation.sensors import Height, Pressure, Ranges, Velocity
 from uwb_tdoa_bias.foundation.geometry import tdoa
+from uwb_tdoa_bias.foundation.sensors import Height, Pressure, Ranges, Velocity
 from uwb_tdoa_bias.foundation.sensors.pressure import pressure_at
 from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, TDOA, Measurements, structured
 
@@ -22,7 +22,9 @@ def corners(size=(7.0, 8.0, 3.0), first_id=10):
 
 
 class Wave:
-    """A smooth path: every coordinate and every Euler angle is a sine of time, so that all derivatives are exact."""
+    """A smooth path: every coordinate and every Euler angle is a sine of time, so that all
+    derivatives are exact.
+    """
 
     def __init__(self, rng, middle, reach=1.5, tilt=0.15, yaw=0.5):
         self.middle = np.asarray(middle, dtype=float)
@@ -40,7 +42,9 @@ class Wave:
         v = self.size * self.pace * np.cos(self.pace * t + self.phase)
         a = -self.size * self.pace**2 * np.sin(self.pace * t + self.phase)
         yaw, pitch, roll = (self.angle_size * np.sin(self.angle_pace * t + self.angle_phase)).T
-        dyaw, dpitch, droll = (self.angle_size * self.angle_pace * np.cos(self.angle_pace * t + self.angle_phase)).T
+        dyaw, dpitch, droll = (
+            self.angle_size * self.angle_pace * np.cos(self.angle_pace * t + self.angle_phase)
+        ).T
         attitude = Rotation.from_euler("ZYX", np.stack([yaw, pitch, roll], axis=1))
         rates = np.stack(
             [
@@ -54,30 +58,51 @@ class Wave:
 
 
 def fly(
-    seed=0, duration=10.0, imu_rate=200.0, tdoa_rate=200.0, tdoa_std=0.1, accel_noise=0.0, gyro_noise=0.0,
-    accel_bias=0.0, gyro_bias=0.0, accel_bias_walk=0.0, gyro_bias_walk=0.0,
-    anchors=None, outliers=0.0, hover=False, begin=0.0,
-):  # fmt: skip
-    """A Flight with random pairs of anchors, and the exact pose every 5 ms. The errors are those of the filter's model:
-    tdoa_std, m, white; accel_noise, m/s^2/sqrt(Hz), and gyro_noise, rad/s/sqrt(Hz), white; accel_bias, m/s^2, and
-    gyro_bias, rad/s, standard deviations of the first bias; their random walks per sqrt(s); outliers: share of TDOAs
-    that are metres off."""
+    seed=0,
+    duration=10.0,
+    imu_rate=200.0,
+    tdoa_rate=200.0,
+    tdoa_std=0.1,
+    accel_noise=0.0,
+    gyro_noise=0.0,
+    accel_bias=0.0,
+    gyro_bias=0.0,
+    accel_bias_walk=0.0,
+    gyro_bias_walk=0.0,
+    anchors=None,
+    outliers=0.0,
+    hover=False,
+    begin=0.0,
+):
+    """A Flight with random pairs of anchors, and the exact pose every 5 ms. The errors are those of
+    the filter's model: tdoa_std, m, white; accel_noise, m/s^2/sqrt(Hz), and gyro_noise,
+    rad/s/sqrt(Hz), white; accel_bias, m/s^2, and gyro_bias, rad/s, standard deviations of the first
+    bias; their random walks per sqrt(s); outliers: share of TDOAs that are metres off.
+    """
     rng = np.random.default_rng(seed)
     anchors = corners() if anchors is None else anchors
     middle = anchors.positions.mean(axis=0)
     wave = Wave(rng, middle, 0.0, 0.0, 0.0) if hover else Wave(rng, middle)
     imu_t = np.arange(int(duration * imu_rate)) / imu_rate
     _, _, _, accel, rates = wave.motion(imu_t)
-    accel = accel + _inertial_error(rng, len(imu_t), imu_rate, accel_noise, accel_bias, accel_bias_walk)
-    rates = rates + _inertial_error(rng, len(imu_t), imu_rate, gyro_noise, gyro_bias, gyro_bias_walk)
+    accel = accel + _inertial_error(
+        rng, len(imu_t), imu_rate, accel_noise, accel_bias, accel_bias_walk
+    )
+    rates = rates + _inertial_error(
+        rng, len(imu_t), imu_rate, gyro_noise, gyro_bias, gyro_bias_walk
+    )
     # off the grid of the IMU, so that no two stamps of different streams agree
-    tdoa_t = (np.arange(int(duration * tdoa_rate)) + rng.uniform(0.1, 0.9, int(duration * tdoa_rate))) / tdoa_rate
+    tdoa_t = (
+        np.arange(int(duration * tdoa_rate)) + rng.uniform(0.1, 0.9, int(duration * tdoa_rate))
+    ) / tdoa_rate
     n = len(tdoa_t)
     a = rng.integers(0, len(anchors), n)
     b = (a + rng.integers(1, len(anchors), n)) % len(anchors)
     p = wave.motion(tdoa_t)[0]
     d = tdoa(p, anchors.positions[a], anchors.positions[b]) + tdoa_std * rng.standard_normal(n)
-    d += np.where(rng.random(n) < outliers, rng.choice([-1.0, 1.0], n) * rng.uniform(1.0, 5.0, n), 0.0)
+    d += np.where(
+        rng.random(n) < outliers, rng.choice([-1.0, 1.0], n) * rng.uniform(1.0, 5.0, n), 0.0
+    )
     truth_t = np.arange(0.0, duration, 0.005)
     p, _, attitude, _, _ = wave.motion(truth_t)
     return Flight(
@@ -90,9 +115,12 @@ def fly(
     )
 
 
-def with_aids(flight, seed=0, rate=25.0, height_std=0.01, pressure_std=0.05, drift=0.0, velocity_std=0.05):
-    """The flight of `fly` with a range finder over ground at z = 0, a barometer that drifts by `drift` m/s, and a
-    velocity; standard deviations in m, m and m/s, white."""
+def with_aids(
+    flight, seed=0, rate=25.0, height_std=0.01, pressure_std=0.05, drift=0.0, velocity_std=0.05
+):
+    """The flight of `fly` with a range finder over ground at z = 0, a barometer that drifts by
+    `drift` m/s, and a velocity; standard deviations in m, m and m/s, white.
+    """
     rng, begin = np.random.default_rng(seed), flight.truth.t[0]
     since = (np.arange(int((flight.truth.t[-1] - begin) * rate)) + 0.37) / rate
     t = since + begin
@@ -101,18 +129,26 @@ def with_aids(flight, seed=0, rate=25.0, height_std=0.01, pressure_std=0.05, dri
     return replace(
         flight,
         height=Height(t, (p[:, 2] + height_std * rng.standard_normal(n)) / up),
-        pressure=Pressure(t, pressure_at(100.0 + p[:, 2] + drift * since + pressure_std * rng.standard_normal(n))),
+        pressure=Pressure(
+            t, pressure_at(100.0 + p[:, 2] + drift * since + pressure_std * rng.standard_normal(n))
+        ),
         velocity=Velocity(
-            t, attitude.inv().apply(v) + velocity_std * rng.standard_normal((n, 3)), np.full((n, 3), velocity_std)
+            t,
+            attitude.inv().apply(v) + velocity_std * rng.standard_normal((n, 3)),
+            np.full((n, 3), velocity_std),
         ),
     )
 
 
 def with_ranges(flight, seed=0, rate=200.0, std=0.02):
-    """The flight of `fly` with distances to its anchors, each in its turn; standard deviation in m, white."""
+    """The flight of `fly` with distances to its anchors, each in its turn; standard deviation in m,
+    white.
+    """
     t = np.arange(flight.truth.t[0], flight.truth.t[-1], 1.0 / rate)
     row, p = np.arange(len(t)) % len(flight.anchors), position_at(flight, t)
-    d = np.linalg.norm(p - flight.anchors.positions[row], axis=1) + std * np.random.default_rng(seed).standard_normal(len(t))
+    d = np.linalg.norm(p - flight.anchors.positions[row], axis=1) + std * np.random.default_rng(
+        seed
+    ).standard_normal(len(t))
     return replace(flight, range=Ranges(t, flight.anchors.ids[row], d, np.zeros(len(t))))
 
 
@@ -136,12 +172,15 @@ def position_at(flight, t):
     return np.stack([np.interp(t, flight.truth.t, flight.truth.p[:, k]) for k in range(3)], axis=1)
 
 
-WORKSPACE = np.array([[-1.0, -1.0, -1.5], [8.0, 9.0, 4.5]])  # m, its bounds with the anchors of corners()
+WORKSPACE = np.array(
+    [[-1.0, -1.0, -1.5], [8.0, 9.0, 4.5]]
+)  # m, its bounds with the anchors of corners()
 
 
 def leaving(flight):
-    """A hovering Flight with the TDOAs of a tag that leaves its workspace along all axes, level, at constant velocity,
-    until 3 s."""
+    """A hovering Flight with the TDOAs of a tag that leaves its workspace along all axes, level, at
+    constant velocity, until 3 s.
+    """
     t, anchors = flight.tdoa.t, flight.anchors
     p = np.array([6.0, 7.0, 3.0]) + np.minimum(t, 3.0)[:, None] * [1.2, 1.2, 1.0]
     a, b = (anchors.positions[anchors.index(ids)] for ids in (flight.tdoa.a, flight.tdoa.b))

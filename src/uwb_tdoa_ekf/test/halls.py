@@ -1,5 +1,6 @@
-"""Simulated halls in which a tag hears the anchors within the radio's reach, and a room in which it hears few TDOAs, for tests and
-tables."""
+"""Simulated halls in which a tag hears the anchors within the radio's reach, and a room in which it
+hears few TDOAs, for tests and tables.
+"""
 
 from dataclasses import dataclass
 
@@ -35,7 +36,9 @@ ROOMS = {  # of 8 x 6 m: where the anchors are
 
 @dataclass(frozen=True)
 class Hall:
-    """anchors : Anchors; size : (x, y) m; reach : m; floor : (N,) number of the floor of each anchor, heard on that alone."""
+    """anchors : Anchors; size : (x, y) m; reach : m; floor : (N,) number of the floor of each
+    anchor, heard on that alone.
+    """
 
     anchors: Anchors
     size: tuple
@@ -44,27 +47,49 @@ class Hall:
 
 
 def hall(name, floors=1, seed=7):
-    """Hall of HALLS: a grid of anchors, 2.5 to 6 m high, a third of them 0.4 to 1.2 m; so many floors above each other."""
+    """Hall of HALLS: a grid of anchors, 2.5 to 6 m high, a third of them 0.4 to 1.2 m; so many
+    floors above each other.
+    """
     size, counts, reach = HALLS[name]
     rng, n, parts = np.random.default_rng(seed), counts[0] * counts[1], []
-    x, y = np.meshgrid(*((np.arange(count) + 0.5) * length / count for count, length in zip(counts, size)))
+    x, y = np.meshgrid(
+        *((np.arange(count) + 0.5) * length / count for count, length in zip(counts, size))
+    )
     for floor in range(floors):
-        z = np.where(rng.random(n) < 1.0 / 3.0, rng.uniform(0.4, 1.2, n), rng.uniform(2.5, 6.0, n)) + floor * FLOOR
-        parts.append(np.column_stack([x.ravel(), y.ravel(), z]) + np.append(rng.uniform(-1.0, 1.0, (n, 2)), np.zeros((n, 1)), axis=1))
-    return Hall(Anchors.from_positions(np.concatenate(parts)), size, reach, np.repeat(np.arange(floors), n))
+        z = (
+            np.where(rng.random(n) < 1.0 / 3.0, rng.uniform(0.4, 1.2, n), rng.uniform(2.5, 6.0, n))
+            + floor * FLOOR
+        )
+        parts.append(
+            np.column_stack([x.ravel(), y.ravel(), z])
+            + np.append(rng.uniform(-1.0, 1.0, (n, 2)), np.zeros((n, 1)), axis=1)
+        )
+    return Hall(
+        Anchors.from_positions(np.concatenate(parts)), size, reach, np.repeat(np.arange(floors), n)
+    )
 
 
 def room(name):
     """Hall of ROOMS, in which every anchor is heard."""
-    return Hall(Anchors.from_positions(np.array(ROOMS[name])), ROOM, 100.0, np.zeros(len(ROOMS[name])))
+    return Hall(
+        Anchors.from_positions(np.array(ROOMS[name])), ROOM, 100.0, np.zeros(len(ROOMS[name]))
+    )
 
 
 def walk(size, duration, rng, speed):
-    """Level path of somebody who turns smoothly towards one place after another: (n, 2) m and heading (n,) rad, every 1 / RATE s."""
+    """Level path of somebody who turns smoothly towards one place after another: (n, 2) m and
+    heading (n,) rad, every 1 / RATE s.
+    """
     n, dt = int(duration * RATE) + 1, 1.0 / RATE
     margin = np.minimum(3.0, 0.2 * np.array(size))
     p = rng.uniform(margin, np.array(size) - margin)
-    places, headings, heading, turning, goal = np.empty((n, 2)), np.empty(n), rng.uniform(-np.pi, np.pi), 0.0, p
+    places, headings, heading, turning, goal = (
+        np.empty((n, 2)),
+        np.empty(n),
+        rng.uniform(-np.pi, np.pi),
+        0.0,
+        p,
+    )
     for k in range(n):
         places[k], headings[k] = p, heading
         if np.hypot(*(goal - p)) < 3.0:
@@ -77,9 +102,11 @@ def walk(size, duration, rng, speed):
 
 
 def fly(where, seed, duration=20.0, rate=200.0, blinks=0.0, speed=1.5, dead=(), lift=None):
-    """Flight of a tag that walks in a Hall. rate : TDOAs per second between pairs of those heard; blinks : per second instead, each of all
-    TDOAs with the first of those heard; dead : (begin, end) s in which nothing is heard; lift : s at which it is carried one floor up, in
-    10 s, in which nothing is heard."""
+    """Flight of a tag that walks in a Hall. rate : TDOAs per second between pairs of those heard;
+    blinks : per second instead, each of all TDOAs with the first of those heard; dead : (begin,
+    end) s in which nothing is heard; lift : s at which it is carried one floor up, in 10 s, in
+    which nothing is heard.
+    """
     rng = np.random.default_rng([seed, 5])
     places, heading = walk(where.size, duration, rng, speed)
     t = np.arange(len(places)) / RATE
@@ -92,27 +119,49 @@ def fly(where, seed, duration=20.0, rate=200.0, blinks=0.0, speed=1.5, dead=(), 
     gyro = np.column_stack([np.zeros((len(t), 2)), turning]) + rng.normal(0.0, 0.01, p.shape)
 
     dead = [*dead, *([(lift, lift + 10.0)] if lift is not None else [])]
-    at = np.arange(0.05, duration, 1.0 / blinks) if blinks else np.arange(0.5 / rate, duration, 1.0 / rate)
+    at = (
+        np.arange(0.05, duration, 1.0 / blinks)
+        if blinks
+        else np.arange(0.5 / rate, duration, 1.0 / rate)
+    )
     at = at[~np.any([(begin <= at) & (at < end) for begin, end in dead], axis=0)] if dead else at
     row = np.minimum(np.rint(at * RATE).astype(int), len(t) - 1)
-    trees = [cKDTree(where.anchors.positions[where.floor == floor]) for floor in np.unique(where.floor)]
+    trees = [
+        cKDTree(where.anchors.positions[where.floor == floor]) for floor in np.unique(where.floor)
+    ]
     first = [np.flatnonzero(where.floor == floor)[0] for floor in np.unique(where.floor)]
     stamps, a, b = [], [], []
     for s, k in zip(at, row):
         floor = int(up[k] >= 1.0)
-        heard = first[floor] + np.array(trees[floor].query_ball_point(p[k], where.reach, return_sorted=True), int)
+        heard = first[floor] + np.array(
+            trees[floor].query_ball_point(p[k], where.reach, return_sorted=True), int
+        )
         if len(heard) < 2:
             continue
-        pairs = [(heard[0], other) for other in heard[1:]] if blinks else [rng.choice(heard, 2, replace=False)]
+        pairs = (
+            [(heard[0], other) for other in heard[1:]]
+            if blinks
+            else [rng.choice(heard, 2, replace=False)]
+        )
         for one, other in pairs:
             stamps.append(s), a.append(one), b.append(other)
     stamps, a, b = np.array(stamps), np.array(a), np.array(b)
     delay, n = DELAY * rng.standard_normal(len(where.anchors)), len(stamps)
     there = np.column_stack([np.interp(stamps, t, column) for column in p.T])
-    d = tdoa(there, where.anchors.positions[a], where.anchors.positions[b]) + delay[b] - delay[a] + NOISE * rng.standard_normal(n)
-    d += np.where(rng.random(n) < OUTLIERS, rng.exponential(OUTLIER_SIZE, n) * rng.choice([-1.0, 1.0], n), 0.0)
+    d = (
+        tdoa(there, where.anchors.positions[a], where.anchors.positions[b])
+        + delay[b]
+        - delay[a]
+        + NOISE * rng.standard_normal(n)
+    )
+    d += np.where(
+        rng.random(n) < OUTLIERS, rng.exponential(OUTLIER_SIZE, n) * rng.choice([-1.0, 1.0], n), 0.0
+    )
     ids = where.anchors.ids
     return Flight(
-        name=f"hall-{seed}", anchors=where.anchors, tdoa=Tdoas(stamps, ids[a], ids[b], d), imu=Imu(t[1:], gyro[1:], accel[1:]),
+        name=f"hall-{seed}",
+        anchors=where.anchors,
+        tdoa=Tdoas(stamps, ids[a], ids[b], d),
+        imu=Imu(t[1:], gyro[1:], accel[1:]),
         truth=Truth(t, p, attitude.as_quat()),
-    )  # fmt: skip
+    )

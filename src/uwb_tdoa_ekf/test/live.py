@@ -6,8 +6,8 @@ import numpy as np
 
 from uwb_tdoa_ekf.core.aids import STREAMS
 from uwb_tdoa_ekf.estimator import Estimator
-from uwb_tdoa_ekf.results import VERDICTS
 from uwb_tdoa_ekf.offline import run_offline
+from uwb_tdoa_ekf.results import VERDICTS
 
 IMU, TDOA, FIRST_AID = range(3)
 
@@ -33,16 +33,22 @@ def send(estimator, flight, stream, i):
 
 
 def arriving(flight, rng, imu_delay=0.0, tdoa_delay=0.0, imu_jitter=0.0, tdoa_jitter=0.0):
-    """The messages in the order in which they come in after such delays: constant, and uniform from 0 to jitter, s."""
+    """The messages in the order in which they come in after such delays: constant, and uniform from
+    0 to jitter, s.
+    """
     delay, jitter = {IMU: imu_delay, TDOA: tdoa_delay}, {IMU: imu_jitter, TDOA: tdoa_jitter}
-    return sorted(messages(flight), key=lambda m: m[0] + delay.get(m[1], 0.0) + jitter.get(m[1], 0.0) * rng.random())
+    return sorted(
+        messages(flight),
+        key=lambda m: m[0] + delay.get(m[1], 0.0) + jitter.get(m[1], 0.0) * rng.random(),
+    )
 
 
 def feed(estimator, flight, order=None, advance=None):
-    """Everything (Odometry, Residuals) that the estimator gives for the messages in this order (default: by stamp).
-    advance(): whether to advance after a message (default: always)."""
+    """Everything (Odometry, Residuals) that the estimator gives for the messages in this order
+    (default: by stamp). advance(): whether to advance after a message (default: always).
+    """
     parts = []
-    for t, stream, i in messages(flight) if order is None else order:
+    for _t, stream, i in messages(flight) if order is None else order:
         send(estimator, flight, stream, i)
         if advance is None or advance():
             parts.append(estimator.advance())
@@ -53,7 +59,9 @@ def feed(estimator, flight, order=None, advance=None):
 def joined(parts):
     """One Odometry or Residuals out of many."""
     kind = type(parts[0])
-    return kind(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(kind)))
+    return kind(
+        *(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(kind))
+    )
 
 
 def assert_same(left, right, tolerance=0.0):
@@ -69,10 +77,15 @@ def assert_same_as_offline(flight, config=None, **feeding):
     odometry, residuals = feed(estimator, flight, **feeding)
     expected = run_offline(flight, config)
     assert_same(odometry, expected.odometry)
-    assert_same(by_stamp(residuals), by_stamp(expected.residuals))  # what is refused is told at once
+    assert_same(
+        by_stamp(residuals), by_stamp(expected.residuals)
+    )  # what is refused is told at once
     assert {name: estimator.counts[name] for name in VERDICTS.values()} == expected.counts
 
 
 def by_stamp(residuals):
     order = np.argsort(residuals.t, kind="stable")
-    return replace(residuals, **{field.name: getattr(residuals, field.name)[order] for field in fields(residuals)})
+    return replace(
+        residuals,
+        **{field.name: getattr(residuals, field.name)[order] for field in fields(residuals)},
+    )

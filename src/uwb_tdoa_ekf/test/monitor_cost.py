@@ -1,4 +1,5 @@
-"""What watching the anchors in flight takes, by their number: memory, and time for each slice of half a second.
+"""What watching the anchors in flight takes, by their number: memory, and time for each slice of
+half a second.
 
 python src/uwb_tdoa_ekf/test/monitor_cost.py
 """
@@ -7,18 +8,27 @@ import time
 import tracemalloc
 
 import numpy as np
+
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_ekf.core.verdicts import USED
-from uwb_tdoa_ekf.results import Odometry, Residuals
 from uwb_tdoa_ekf.monitoring.monitor import Monitor
 from uwb_tdoa_ekf.monitoring.slices import LENGTH
+from uwb_tdoa_ekf.results import Odometry, Residuals
 
 RATE = 400  # Hz, of TDOAs
-CASES = (8, 8), (100, 30), (100, 100), (1000, 30), (1000, 200)  # anchors, and how many of them are heard at a time
+CASES = (
+    (8, 8),
+    (100, 30),
+    (100, 100),
+    (1000, 30),
+    (1000, 200),
+)  # anchors, and how many of them are heard at a time
 
 
 def fly(monitor, anchors, heard, slices, first=0, seed=0):
-    """Give a Monitor so many slices of a flight along a row of Anchors, of which it hears the nearest `heard`."""
+    """Give a Monitor so many slices of a flight along a row of Anchors, of which it hears the
+    nearest `heard`.
+    """
     rng, n = np.random.default_rng(seed), round(RATE * LENGTH)
     for k in range(first, first + slices):
         t = LENGTH * (k + (np.arange(n) + 0.5) / n)
@@ -36,7 +46,14 @@ def fly(monitor, anchors, heard, slices, first=0, seed=0):
             np.zeros((n, 9, 9)),
             np.zeros((n, 3, 3)),
         )
-        rows = anchors.ids[a], anchors.ids[b], 0.1 * rng.standard_normal(n), one, one, np.full(n, USED)
+        rows = (
+            anchors.ids[a],
+            anchors.ids[b],
+            0.1 * rng.standard_normal(n),
+            one,
+            one,
+            np.full(n, USED),
+        )
         monitor.add(Odometry(t, *state), Residuals(t, *rows))
         monitor.update(t[-1])
 
@@ -44,11 +61,15 @@ def fly(monitor, anchors, heard, slices, first=0, seed=0):
 def row_of(n):
     """n Anchors of a hall that is as long as it needs to be."""
     rng = np.random.default_rng(n)
-    return Anchors.from_positions(np.column_stack([np.arange(n) * 0.5 - 4.0, rng.uniform(-6.0, 6.0, (n, 2))]))
+    return Anchors.from_positions(
+        np.column_stack([np.arange(n) * 0.5 - 4.0, rng.uniform(-6.0, 6.0, (n, 2))])
+    )
 
 
 def cost(n, heard, slices):
-    """(largest memory, bytes; processor time of a slice, s) of a Monitor of n anchors, after so many slices."""
+    """(largest memory, bytes; processor time of a slice, s) of a Monitor of n anchors, after so
+    many slices.
+    """
     anchors = row_of(n)
     tracemalloc.start()
     monitor = Monitor(anchors)

@@ -9,10 +9,14 @@ from uwb_tdoa_ekf.core.update import project
 
 
 class Prior:
-    """A HYPOTHESIS and an INNOVATION, filled in and projected; the same as a dense Jacobian row h (15,)."""
+    """A HYPOTHESIS and an INNOVATION, filled in and projected; the same as a dense Jacobian row h
+    (15,).
+    """
 
     def __init__(self, seed, states=(0, 1, 2), surprise=1.0):
-        """states : the error states measured; surprise : size of the innovation in its standard deviations."""
+        """states : the error states measured; surprise : size of the innovation in its standard
+        deviations.
+        """
         self.rng = rng = np.random.default_rng(seed)
         self._ekf = new_state(np.zeros((1, 3))).record
         self.hypothesis, self.innovation = self._ekf.hypotheses[0], self._ekf.innovation
@@ -21,7 +25,10 @@ class Prior:
         self.h = np.zeros(15)
         self.h[list(states)] = rng.uniform(-1, 1, len(states))
         entries = self.innovation.entries = len(states)
-        self.innovation.states[:entries], self.innovation.row[:entries] = states, self.h[list(states)]
+        self.innovation.states[:entries], self.innovation.row[:entries] = (
+            states,
+            self.h[list(states)],
+        )
         self.innovation.noise_variance = 10.0 ** rng.uniform(-3, 1)
         self.project()
         variance = self.innovation.prior_variance + self.innovation.noise_variance
@@ -42,7 +49,9 @@ class Prior:
 
     def assert_is(self, x, P, rtol=1e-9):
         std = np.sqrt(np.diag(P))
-        np.testing.assert_allclose(self.hypothesis.P / np.outer(std, std), P / np.outer(std, std), atol=rtol)
+        np.testing.assert_allclose(
+            self.hypothesis.P / np.outer(std, std), P / np.outer(std, std), atol=rtol
+        )
         np.testing.assert_allclose(self.hypothesis.x, x, rtol=rtol, atol=rtol)
 
 

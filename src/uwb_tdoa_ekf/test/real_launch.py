@@ -1,4 +1,6 @@
-"""The real ros2 command: that of the ROS installation, or the one in ../shared/ros2cli beside the checkout, made ready once."""
+"""The real ros2 command: that of the ROS installation, or the one in ../shared/ros2cli beside the
+checkout, made ready once.
+"""
 
 import fcntl
 from importlib.util import find_spec
@@ -16,14 +18,21 @@ ROOT = Path(__file__).resolve().parents[3]
 FOLDER, MADE = ROOT.parent / "shared" / "ros2cli", ROOT / "build" / "ros2cli"
 WITH = "psutil", "argcomplete", "packaging"  # that it imports
 PATIENCE = 180.0  # s for anything that must happen
-# What asyncio says when SIGINT comes between two statements of the loop of launch, which then ends with 1, however well its nodes end.
+# What asyncio says when SIGINT comes between two statements of the loop of launch, which then ends
+# with 1, however well its nodes end.
 FAULT_OF_LAUNCH = "Task was destroyed but it is pending!"
-OURS = FOLDER.is_dir() and FOLDER.stat().st_uid in (os.getuid(), 0) and not FOLDER.stat().st_mode & 0o022  # what is in it is run
+OURS = (
+    FOLDER.is_dir()
+    and FOLDER.stat().st_uid in (os.getuid(), 0)
+    and not FOLDER.stat().st_mode & 0o022
+)  # what is in it is run
 WHY_NOT = (
-    None if shutil.which("ros2") or OURS and all(map(find_spec, WITH))
-    else f"no ros2 command: .venv/bin/python -m pip install {' '.join(WITH)}" if OURS
+    None
+    if shutil.which("ros2") or OURS and all(map(find_spec, WITH))
+    else f"no ros2 command: .venv/bin/python -m pip install {' '.join(WITH)}"
+    if OURS
     else "no ros2 command, and no ../shared/ros2cli of yours alone beside the checkout"
-)  # fmt: skip
+)
 
 
 def ros2():
@@ -37,29 +46,71 @@ def ros2():
     with open(MADE / "lock", "w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if not setup.exists():  # launch_ros imports composition_interfaces
-            command = [sys.executable, "-m", "colcon", "--log-base", MADE / "log", "build", "--merge-install"]
-            command += ["--base-paths", FOLDER / "src", "--build-base", MADE / "build", "--install-base", MADE / "install"]
-            command += ["--cmake-args", "-G", "Ninja", "-DBUILD_TESTING=OFF", f"-DPython3_EXECUTABLE={sys.executable}"]
+            command = [
+                sys.executable,
+                "-m",
+                "colcon",
+                "--log-base",
+                MADE / "log",
+                "build",
+                "--merge-install",
+            ]
+            command += [
+                "--base-paths",
+                FOLDER / "src",
+                "--build-base",
+                MADE / "build",
+                "--install-base",
+                MADE / "install",
+            ]
+            command += [
+                "--cmake-args",
+                "-G",
+                "Ninja",
+                "-DBUILD_TESTING=OFF",
+                f"-DPython3_EXECUTABLE={sys.executable}",
+            ]
             made = subprocess.run(list(map(str, command)), capture_output=True, text=True, cwd=ROOT)
             assert made.returncode == 0, made.stdout + made.stderr
-    return ["bash", "-c", 'source "$0" && exec "$@"', str(setup), sys.executable, str(FOLDER / "ros2")]
+    return [
+        "bash",
+        "-c",
+        'source "$0" && exec "$@"',
+        str(setup),
+        sys.executable,
+        str(FOLDER / "ros2"),
+    ]
 
 
 class Launch:
-    """A running `ros2 launch`, in a process group of its own as under a terminal. lines : what it and its nodes wrote so
-    far; over : whether all of it has ended."""
+    """A running `ros2 launch`, in a process group of its own as under a terminal. lines : what it
+    and its nodes wrote so far; over : whether all of it has ended.
+    """
 
     def __init__(self, folder, *words, path=()):
-        """folder : empty, for its temporary files and logs; words : after `ros2 launch`; path : folders that come first in PATH."""
+        """folder : empty, for its temporary files and logs; words : after `ros2 launch`; path :
+        folders that come first in PATH.
+        """
         self.temporary = folder / "temporary"
         self.temporary.mkdir()
-        variables = {"TMPDIR": str(self.temporary), "ROS_LOG_DIR": str(folder / "log"), "PYTHONUNBUFFERED": "1"}
+        variables = {
+            "TMPDIR": str(self.temporary),
+            "ROS_LOG_DIR": str(folder / "log"),
+            "PYTHONUNBUFFERED": "1",
+        }
         variables["PATH"] = os.pathsep.join([*map(str, path), os.environ["PATH"]])
-        self._terminal, stdin = os.openpty()  # without one launch passes Ctrl-C on, and nodes that have it already get it twice
+        self._terminal, stdin = (
+            os.openpty()
+        )  # without one launch passes Ctrl-C on, and nodes that have it already get it twice
         self.process = subprocess.Popen(
-            [*ros2(), "launch", *words], env={**os.environ, **variables}, stdin=stdin,
-            stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
-        )  # fmt: skip
+            [*ros2(), "launch", *words],
+            env={**os.environ, **variables},
+            stdin=stdin,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            start_new_session=True,
+        )
         os.close(stdin)
         self.lines, self._news, self.over = [], threading.Condition(), False
         self.reader = threading.Thread(target=self._collect, daemon=True)
@@ -96,16 +147,25 @@ class Launch:
         os.killpg(self.process.pid, signal.SIGINT)
         code = self.ended()
         if FAULT_OF_LAUNCH in self.said:
-            lines = [line for line in self.lines if line.startswith("[")]  # of nodes; launch has no such mark
+            lines = [
+                line for line in self.lines if line.startswith("[")
+            ]  # of nodes; launch has no such mark
         else:
             lines = self.lines
             assert code == 0, self.said
         assert not any("Traceback" in line for line in lines), self.said
-        assert self.said.count("process has finished cleanly") + self.said.count("process has died") == started, self.said
+        assert (
+            self.said.count("process has finished cleanly") + self.said.count("process has died")
+            == started
+        ), self.said
 
     def pid_of(self, node):
         """Process id of the node that was started last by this name."""
-        line = [line for line in self.lines if f"[{node}-" in line and "process started with pid [" in line][-1]
+        line = [
+            line
+            for line in self.lines
+            if f"[{node}-" in line and "process started with pid [" in line
+        ][-1]
         return int(line.rpartition("[")[2].partition("]")[0])
 
     def close(self):

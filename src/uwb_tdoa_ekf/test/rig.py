@@ -1,6 +1,7 @@
-"""The real nodes as processes of their own, and a node of the test that plays their surroundings and listens."""
+"""The real nodes as processes of their own, and a node of the test that plays their surroundings
+and listens.
+"""
 
-from builtin_interfaces.msg import Time
 from copy import copy
 from dataclasses import dataclass, replace
 import os
@@ -11,6 +12,7 @@ import sys
 import threading
 import time
 
+from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from flights import fly
 from geometry_msgs.msg import PoseWithCovarianceStamped, TwistWithCovarianceStamped
@@ -22,6 +24,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import ReliabilityPolicy
 from sensor_msgs.msg import FluidPressure, Imu, Range
 from tf2_msgs.msg import TFMessage
+
 from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS, anchors_to_message
 from uwb_tdoa_bias.foundation.ros_diagnostics import DIAGNOSTICS_QOS
 from uwb_tdoa_bias.foundation.ros_topics import STREAM_QOS
@@ -30,7 +33,9 @@ from uwb_tdoa_ekf.results import VERDICTS, rows_of
 from uwb_tdoa_msgs.msg import AnchorArray, Tdoa, TdoaCorrected, TdoaResidual
 
 EPOCH = 1_700_000_000  # s; stamps of today's size
-PATIENCE = 180.0  # s for anything that must happen; the very first start of ekf_node compiles the filter
+PATIENCE = (
+    180.0  # s for anything that must happen; the very first start of ekf_node compiles the filter
+)
 AGAIN = 10.0  # s after which a node that has not answered is asked once more
 MODULES = {
     "bias_node": "uwb_tdoa_bias.bias_node",
@@ -38,7 +43,9 @@ MODULES = {
     "debias_node": "uwb_tdoa_ekf.debias_node",
     "localization_node": "uwb_tdoa_ekf.localization_node",
 }
-MEMBERS = {"localization_node": ("bias_node", "ekf_node")}  # nodes of one process, which hand over to each other
+MEMBERS = {
+    "localization_node": ("bias_node", "ekf_node")
+}  # nodes of one process, which hand over to each other
 OUTPUTS = {
     "bias_node": ("uwb/tdoa_corrected",),
     "ekf_node": ("odometry", "uwb/residual"),
@@ -83,9 +90,18 @@ def make_rig():
 
 def recording(seconds=4.0, imu_rate=200.0, tdoa_rate=100.0):
     """A Flight whose stamps are what a node reads from the messages that hold them."""
-    flight = fly(seed=5, duration=seconds, imu_rate=imu_rate, tdoa_rate=tdoa_rate, accel_noise=0.01, gyro_noise=0.001)
+    flight = fly(
+        seed=5,
+        duration=seconds,
+        imu_rate=imu_rate,
+        tdoa_rate=tdoa_rate,
+        accel_noise=0.01,
+        gyro_noise=0.001,
+    )
     streams = (flight.imu, flight.tdoa)
-    imu, tdoa = (replace(stream, t=np.array([seconds_of(stamp(t)) for t in stream.t])) for stream in streams)
+    imu, tdoa = (
+        replace(stream, t=np.array([seconds_of(stamp(t)) for t in stream.t])) for stream in streams
+    )
     return replace(flight, imu=imu, tdoa=tdoa)
 
 
@@ -96,7 +112,9 @@ def stamp(t, epoch=EPOCH):
 
 
 def seconds_of(stamp, epoch=EPOCH):
-    """Seconds after the epoch, as a node reads them if its first stamp is in the epoch's first second."""
+    """Seconds after the epoch, as a node reads them if its first stamp is in the epoch's first
+    second.
+    """
     return (stamp.sec - epoch) + 1e-9 * stamp.nanosec
 
 
@@ -109,7 +127,9 @@ class Process:
     reader: threading.Thread
 
     def stop(self, number=signal.SIGINT):
-        """Signal the group; returns the exit code, and for how many seconds it neither ran nor waited for a core before it ended."""
+        """Signal the group; returns the exit code, and for how many seconds it neither ran nor
+        waited for a core before it ended.
+        """
         started, before, slept = time.monotonic(), worked(self.process.pid), 0.0
         os.killpg(self.process.pid, number)
         while self.process.poll() is None:
@@ -127,7 +147,8 @@ class Rig:
     """
 
     def __init__(self, namespace, listen=(*STREAMS, "/tf"), reliable=True, latched=True):
-        """listen : topics to keep; reliable : make the streams so, for a test that cannot bear the loss of a message;
+        """listen : topics to keep; reliable : make the streams so, for a test that cannot bear the
+        loss of a message;
         latched : have a latched publisher of anchors."""
         self.namespace = namespace
         self.node = rclpy.create_node("rig", namespace=namespace)
@@ -138,12 +159,18 @@ class Rig:
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self.node)
         self._processes, self._publishers, self._status, self._since = {}, {}, {}, 0.0
-        self._anchors = self.node.create_publisher(AnchorArray, "uwb/anchors", ANCHORS_QOS) if latched else None
+        self._anchors = (
+            self.node.create_publisher(AnchorArray, "uwb/anchors", ANCHORS_QOS) if latched else None
+        )
         self._subscriptions = {
-            topic: self.node.create_subscription(STREAMS.get(topic, TFMessage), topic, store.append, self._qos)
+            topic: self.node.create_subscription(
+                STREAMS.get(topic, TFMessage), topic, store.append, self._qos
+            )
             for topic, store in self.received.items()
         }
-        self.node.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, DIAGNOSTICS_QOS)
+        self.node.create_subscription(
+            DiagnosticArray, "/diagnostics", self._on_diagnostics, DIAGNOSTICS_QOS
+        )
 
     @property
     def odometry(self):
@@ -166,19 +193,37 @@ class Rig:
             self._status.update((status.name, status) for status in message.status)
 
     def start(self, *names, **arguments):
-        """Start nodes, with arguments by name of the node; returns when they hear what they need, and we hear them.
+        """Start nodes, with arguments by name of the node; returns when they hear what they need,
+        and we hear them.
 
         Topics that no started node publishes are played by us. From then on nothing is lost.
         """
         for name in names:
-            command = [sys.executable, "-u", "-m", MODULES[name], "--ros-args", "-r", f"__ns:=/{self.namespace}"]
+            command = [
+                sys.executable,
+                "-u",
+                "-m",
+                MODULES[name],
+                "--ros-args",
+                "-r",
+                f"__ns:=/{self.namespace}",
+            ]
             if self._reliable:
-                for end in (*(f"{i}.subscription" for i in INPUTS[name]), *(f"{o}.publisher" for o in OUTPUTS[name])):
-                    command += ["-p", f"qos_overrides./{self.namespace}/{end}.reliability:=reliable"]
+                for end in (
+                    *(f"{i}.subscription" for i in INPUTS[name]),
+                    *(f"{o}.publisher" for o in OUTPUTS[name]),
+                ):
+                    command += [
+                        "-p",
+                        f"qos_overrides./{self.namespace}/{end}.reliability:=reliable",
+                    ]
             process = subprocess.Popen(
                 [*command, *arguments.get(name, ())],
-                stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, start_new_session=True,
-            )  # fmt: skip
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+                start_new_session=True,
+            )
             lines = []
             reader = threading.Thread(target=_collect, args=(process.stdout, lines), daemon=True)
             reader.start()
@@ -195,32 +240,49 @@ class Rig:
 
         def all_matched():
             nodes = [node for name in names for node in MEMBERS.get(name, [name])]
-            heard = [self.values(node).get(f"publishers of {topic}") for node in nodes for topic in INPUTS[node]]
+            heard = [
+                self.values(node).get(f"publishers of {topic}")
+                for node in nodes
+                for topic in INPUTS[node]
+            ]
             hearing = [
-                self.values(node).get(f"subscribers of {topic}") == str((topic in taken) + (topic in self.received))
+                self.values(node).get(f"subscribers of {topic}")
+                == str((topic in taken) + (topic in self.received))
                 for node in nodes
                 for topic in OUTPUTS[node]
             ]
             return (
                 all(count == "1" for count in heard)
                 and all(hearing)
-                and all(publisher.get_subscription_count() for publisher in self._publishers.values())
-                and all(self._subscriptions[topic].get_publisher_count() for topic in made & self._subscriptions.keys())
+                and all(
+                    publisher.get_subscription_count() for publisher in self._publishers.values()
+                )
+                and all(
+                    self._subscriptions[topic].get_publisher_count()
+                    for topic in made & self._subscriptions.keys()
+                )
             )
 
         self.wait(all_matched, "all to have found each other")
 
     def add_publisher(self, topic):
         """Play a topic that a node can do without."""
-        publisher = self._publishers[topic] = self.node.create_publisher(STREAMS[topic], topic, self._qos)
+        publisher = self._publishers[topic] = self.node.create_publisher(
+            STREAMS[topic], topic, self._qos
+        )
         self.wait(publisher.get_subscription_count, f"{topic} to be heard")
 
     def pose_publisher(self, process):
-        """Publisher of initialpose that the started node of this Process, which has anchors, hears, and nothing of which is under way.
+        """Publisher of initialpose that the started node of this Process, which has anchors, hears,
+        and nothing of which is under way.
 
-        A node may hear a topic later than it is heard: poses of no frame are published until it has refused the last.
+        A node may hear a topic later than it is heard: poses of no frame are published until it has
+        refused the last.
         """
-        publisher, sent = self.node.create_publisher(PoseWithCovarianceStamped, "initialpose", 100), []
+        publisher, sent = (
+            self.node.create_publisher(PoseWithCovarianceStamped, "initialpose", 100),
+            [],
+        )
         self.wait(publisher.get_subscription_count, "initialpose to be heard")
 
         def refused():
@@ -262,13 +324,17 @@ class Rig:
             for name, process in self._processes.items():
                 assert process.process.poll() is None, f"{name} has ended: {''.join(process.lines)}"
             if time.monotonic() > deadline:
-                said = "".join(line for process in self._processes.values() for line in process.lines)
+                said = "".join(
+                    line for process in self._processes.values() for line in process.lines
+                )
                 accounts = {name: self.values(name) for name in self._processes}
                 raise AssertionError(f"waited {PATIENCE} s for {what}; {accounts}; {said}")
 
     def answer(self, ask, what):
-        """The result of the Future of ask(). It asks again after AGAIN: the middleware drops an answer to a client that it has not met
-        yet, and a node that was killed seems to be there for some time."""
+        """The result of the Future of ask(). It asks again after AGAIN: the middleware drops an
+        answer to a client that it has not met yet, and a node that was killed seems to be there for
+        some time.
+        """
         asked = []
 
         def answered():
@@ -292,7 +358,9 @@ class Rig:
         return self._status[f"/{self.namespace}/{name}"]
 
     def counts(self, name, **expected):
-        """{key: int} of all counts of a node, when those named have the expected values and we have what it sent."""
+        """{key: int} of all counts of a node, when those named have the expected values and we have
+        what it sent.
+        """
         own = {
             "bias_node": {"uwb/tdoa_corrected": ["published"]},
             "ekf_node": {"odometry": ["odometry published"], "uwb/residual": VERDICTS.values()},
@@ -303,7 +371,9 @@ class Rig:
             values = self.values(name)
             return (
                 values
-                and all(values[key.replace("_", " ")] == str(value) for key, value in expected.items())
+                and all(
+                    values[key.replace("_", " ")] == str(value) for key, value in expected.items()
+                )
                 and all(
                     sum(int(values[key]) for key in keys) == len(self.received[topic])
                     for topic, keys in own.items()
@@ -316,9 +386,13 @@ class Rig:
         return {key: int(value) for key, value in self.values(name).items() if value.isdigit()}
 
     def send_anchors(self, anchors, publisher=None):
-        """anchors : Anchors, or an AnchorArray to be sent as it is; publisher : another than the latched one."""
+        """anchors : Anchors, or an AnchorArray to be sent as it is; publisher : another than the
+        latched one.
+        """
         publisher = publisher or self._anchors
-        publisher.publish(anchors if isinstance(anchors, AnchorArray) else anchors_to_message(anchors))
+        publisher.publish(
+            anchors if isinstance(anchors, AnchorArray) else anchors_to_message(anchors)
+        )
 
     def send(self, topic, message, t, frame="base_link", epoch=EPOCH):
         """Publish a message with the stamp of t s after the epoch."""
@@ -336,17 +410,23 @@ class Rig:
         self.send("imu/data", self.imu_message(gyro, accel), t, epoch=epoch)
 
     def send_tdoa(self, t, a, b, d, epoch=EPOCH, variance=0.0):
-        message = Tdoa(anchor_a=int(a), anchor_b=int(b), distance_difference=float(d), variance=float(variance))
+        message = Tdoa(
+            anchor_a=int(a), anchor_b=int(b), distance_difference=float(d), variance=float(variance)
+        )
         self.send("uwb/tdoa", message, t, epoch=epoch)
 
     def send_corrected(self, t, a, b, d, epoch=EPOCH, variance=0.0):
-        message = TdoaCorrected(anchor_a=int(a), anchor_b=int(b), raw=float(d), corrected=float(d), model="none")
+        message = TdoaCorrected(
+            anchor_a=int(a), anchor_b=int(b), raw=float(d), corrected=float(d), model="none"
+        )
         message.variance = float(variance)
         self.send("uwb/tdoa_corrected", message, t, epoch=epoch)
 
     def send_pose(self, t, p=(0.0, 0.0, 0.0), epoch=EPOCH):
         message = Odometry(child_frame_id="base_link")
-        message.pose.pose.position.x, message.pose.pose.position.y, message.pose.pose.position.z = map(float, p)
+        message.pose.pose.position.x, message.pose.pose.position.y, message.pose.pose.position.z = (
+            map(float, p)
+        )
         self.send("odometry", message, t, "map", epoch)
 
     def send_aid(self, topic, flight, i, epoch=EPOCH):
@@ -366,14 +446,20 @@ class Rig:
         self.send(topic, message, part.t[i], epoch=epoch)
 
     def play(self, flight, epoch=EPOCH, ahead=0.025, send_tdoa=None, aids=()):
-        """Send a Flight in stamp order, never more than `ahead` s of stamps beyond what the nodes have made of it.
+        """Send a Flight in stamp order, never more than `ahead` s of stamps beyond what the nodes
+        have made of it.
 
-        Returns when every TDOA but those of the last `ahead` s has its residual. (Much further ahead than that, the
-        result would depend on timing while the filter starts: bias_node cannot know yet that there will be poses.)
+        Returns when every TDOA but those of the last `ahead` s has its residual. (Much further
+        ahead than that, the result would depend on timing while the filter starts: bias_node cannot
+        know yet that there will be poses.)
         aids : topics of height, pressure or velocity to play too.
         """
         imu, tdoa = flight.imu, flight.tdoa
-        of_aids = sorted((t, topic, i) for topic in aids for i, t in enumerate(getattr(flight, topic.partition("/")[0]).t))
+        of_aids = sorted(
+            (t, topic, i)
+            for topic in aids
+            for i, t in enumerate(getattr(flight, topic.partition("/")[0]).t)
+        )
         before, i = len(self.residuals), 0
         for k, t in enumerate(tdoa.t):
             while i < len(imu) and imu.t[i] <= t:
@@ -381,7 +467,9 @@ class Rig:
                 i += 1
             while of_aids and of_aids[0][0] <= t:
                 self.send_aid(*of_aids[0][1:2], flight, of_aids.pop(0)[2], epoch)
-            (send_tdoa or self.send_tdoa)(t, tdoa.a[k], tdoa.b[k], tdoa.d[k], epoch, tdoa.variance[k])
+            (send_tdoa or self.send_tdoa)(
+                t, tdoa.a[k], tdoa.b[k], tdoa.d[k], epoch, tdoa.variance[k]
+            )
             due = before + np.searchsorted(tdoa.t, t - ahead)
             self.wait(lambda due=due: len(self.residuals) >= due, f"{due} residuals")
         for t, gyro, accel in zip(imu.t[i:], imu.gyro[i:], imu.accel[i:]):

@@ -1,4 +1,5 @@
-"""Small simulated drives of a rover on a floor whose every error is known: wheels, an inertial sensor and TDOAs.
+"""Small simulated drives of a rover on a floor whose every error is known: wheels, an inertial
+sensor and TDOAs.
 
 As a program it prints the rows of docs/aids.md:  python src/uwb_tdoa_ekf/test/rovers.py
 """
@@ -14,7 +15,11 @@ from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_bias.foundation.sensors import Velocity
 
 GRAVITY = 9.81
-HEIGHT, HEIGHT_STD, TILT_STD = 0.2, 0.02, 0.01  # m, m, rad: of the body over a floor that is not quite even
+HEIGHT, HEIGHT_STD, TILT_STD = (
+    0.2,
+    0.02,
+    0.01,
+)  # m, m, rad: of the body over a floor that is not quite even
 FINE = 500.0  # Hz of the motion
 ANCHORS = [[0, 0, 2.4], [12, 0, 1.8], [12, 8, 2.4], [0, 8, 1.8], [6, 0, 0.9], [6, 8, 2.7]]
 STOPS = (25.0, 60.0)  # s, of the beginning of each; it lasts
@@ -28,8 +33,9 @@ def hall():
 
 
 def motion(rng, duration, speed):
-    """Stamps (n,) s, positions (n, 2) m, yaws, speeds and yaw rates (n,) of a unicycle that follows a point, with stops. It turns by
-    TURN rad/s at most."""
+    """Stamps (n,) s, positions (n, 2) m, yaws, speeds and yaw rates (n,) of a unicycle that follows
+    a point, with stops. It turns by TURN rad/s at most.
+    """
     t = np.arange(int(duration * FINE) + 1) / FINE
     pace = speed * (1.0 + 0.4 * np.sin(0.31 * t + rng.uniform(0.0, 6.0))) * np.minimum(1.0, t / 2.0)
     for begin in STOPS:
@@ -48,29 +54,59 @@ def motion(rng, duration, speed):
     return t, p, yaw, pace, rate
 
 
-def drive(seed=0, duration=90.0, speed=0.5, begin=10.0, tdoa_std=0.12, delay_std=0.05, scale=0.02, stated=False):
-    """A Flight of a rover: IMU 100 Hz, wheels 50 Hz that slip at times and state a covariance only if `stated`, TDOAs 100 Hz of random
-    pairs with constant errors of the anchors, and the true pose."""
+def drive(
+    seed=0,
+    duration=90.0,
+    speed=0.5,
+    begin=10.0,
+    tdoa_std=0.12,
+    delay_std=0.05,
+    scale=0.02,
+    stated=False,
+):
+    """A Flight of a rover: IMU 100 Hz, wheels 50 Hz that slip at times and state a covariance only
+    if `stated`, TDOAs 100 Hz of random pairs with constant errors of the anchors, and the true
+    pose.
+    """
     rng, anchors = np.random.default_rng(seed), hall()
     t, p, yaw, pace, rate = motion(rng, duration, speed)
     height, tilt = HEIGHT + HEIGHT_STD * rng.standard_normal(), TILT_STD * rng.standard_normal(2)
 
     def at(stamps):
         x, y, psi = (np.interp(stamps, t, column) for column in (*p.T, yaw))
-        turn = Rotation.from_euler("ZYX", np.column_stack([psi, np.full(len(psi), tilt[0]), np.full(len(psi), tilt[1])]))
+        turn = Rotation.from_euler(
+            "ZYX", np.column_stack([psi, np.full(len(psi), tilt[0]), np.full(len(psi), tilt[1])])
+        )
         return np.column_stack([x, y, np.full(len(x), height)]), turn, psi
 
     imu_t = np.arange(int(duration * 100.0)) / 100.0
     _, turn, psi = at(imu_t)
     v, w, dv = (np.interp(imu_t, t, column) for column in (pace, rate, np.gradient(pace, t)))
     across = v * w
-    a = np.stack([dv * np.cos(psi) - across * np.sin(psi), dv * np.sin(psi) + across * np.cos(psi), np.full(len(v), GRAVITY)], axis=1)
-    accel = turn.inv().apply(a) + 0.05 * rng.standard_normal(3) + 0.05 * rng.standard_normal((len(v), 3))
-    gyro = turn.inv().apply(np.outer(w, [0.0, 0.0, 1.0])) + 0.01 * rng.standard_normal(3) + 0.005 * rng.standard_normal((len(v), 3))
+    a = np.stack(
+        [
+            dv * np.cos(psi) - across * np.sin(psi),
+            dv * np.sin(psi) + across * np.cos(psi),
+            np.full(len(v), GRAVITY),
+        ],
+        axis=1,
+    )
+    accel = (
+        turn.inv().apply(a)
+        + 0.05 * rng.standard_normal(3)
+        + 0.05 * rng.standard_normal((len(v), 3))
+    )
+    gyro = (
+        turn.inv().apply(np.outer(w, [0.0, 0.0, 1.0]))
+        + 0.01 * rng.standard_normal(3)
+        + 0.005 * rng.standard_normal((len(v), 3))
+    )
     wheel_t = (np.arange(int(duration * 50.0)) + 0.37) / 50.0
     v, w = (np.interp(wheel_t, t, column) for column in (pace, rate))
     moving = np.abs(v) > 1e-3
-    for start in rng.uniform(0.05, 0.95, round(duration / 22.0)) * duration:  # the wheels turn faster than the rover moves, and unequally
+    for start in (
+        rng.uniform(0.05, 0.95, round(duration / 22.0)) * duration
+    ):  # the wheels turn faster than the rover moves, and unequally
         slips = (wheel_t > start) & (wheel_t < start + 0.7)
         v, w = np.where(slips, 1.3 * v, v), np.where(slips, w + 0.15 * moving, w)
     n = len(v)
@@ -79,12 +115,19 @@ def drive(seed=0, duration=90.0, speed=0.5, begin=10.0, tdoa_std=0.12, delay_std
     turned = w * (1.0 + 0.02 * rng.standard_normal()) + moving * 0.02 * rng.standard_normal(n)
     std = np.tile([0.02, 0.01, 0.01] if stated else [0.0, 0.0, 0.0], (n, 1))
     rate_std = np.full(n, 0.02 if stated else 0.0)
-    tdoa_t = (np.arange(int(duration * 100.0)) + rng.uniform(0.1, 0.9, int(duration * 100.0))) / 100.0
+    tdoa_t = (
+        np.arange(int(duration * 100.0)) + rng.uniform(0.1, 0.9, int(duration * 100.0))
+    ) / 100.0
     n = len(tdoa_t)
     one = rng.integers(0, 6, n)
     other = (one + rng.integers(1, 6, n)) % 6
     delays, true = delay_std * rng.standard_normal(6), at(tdoa_t)[0]
-    d = tdoa(true, anchors.positions[one], anchors.positions[other]) + delays[other] - delays[one] + tdoa_std * rng.standard_normal(n)
+    d = (
+        tdoa(true, anchors.positions[one], anchors.positions[other])
+        + delays[other]
+        - delays[one]
+        + tdoa_std * rng.standard_normal(n)
+    )
     d += np.where(rng.random(n) < 0.03, rng.uniform(-2.0, 2.0, n), 0.0)
     truth_t = np.arange(0.0, duration, 0.01)
     position, turn, _ = at(truth_t)
@@ -113,13 +156,17 @@ def yaw_of(q):
 
 
 class Errors:
-    """Of an Odometry against a Flight: position (n, 3) m, yaw and tilt (n,) rad, normalized squares of xy, height and yaw, and steps
-    (n - 1,) m of xy beyond those of the truth; after `since`, s from the begin."""
+    """Of an Odometry against a Flight: position (n, 3) m, yaw and tilt (n,) rad, normalized squares
+    of xy, height and yaw, and steps (n - 1,) m of xy beyond those of the truth; after `since`, s
+    from the begin.
+    """
 
     def __init__(self, flight, odometry, since=0.0):
         kept = (odometry.t >= flight.truth.t[0] + since) & (odometry.t <= flight.truth.t[-1])
         self.t, q, covariance = odometry.t[kept], odometry.q[kept], odometry.covariance[kept]
-        true = np.stack([np.interp(self.t, flight.truth.t, column) for column in flight.truth.p.T], axis=1)
+        true = np.stack(
+            [np.interp(self.t, flight.truth.t, column) for column in flight.truth.p.T], axis=1
+        )
         yaw = np.interp(self.t, flight.truth.t, np.unwrap(yaw_of(flight.truth.q)))
         self.position = odometry.p[kept] - true
         self.yaw = (yaw_of(q) - yaw + np.pi) % (2.0 * np.pi) - np.pi
@@ -128,8 +175,13 @@ class Errors:
         self.yaw_std, self.z_std = np.sqrt(of_world[:, 2, 2]), np.sqrt(covariance[:, 2, 2])
         self.tilt = np.arccos(np.clip(turn.as_matrix()[:, 2, 2], -1.0, 1.0))
         xy = self.position[:, :2]
-        self.nees_xy = np.einsum("ni,ni->n", xy, np.linalg.solve(covariance[:, :2, :2], xy[:, :, None])[:, :, 0])
-        self.nees_z, self.nees_yaw = self.position[:, 2] ** 2 / self.z_std**2, self.yaw**2 / self.yaw_std**2
+        self.nees_xy = np.einsum(
+            "ni,ni->n", xy, np.linalg.solve(covariance[:, :2, :2], xy[:, :, None])[:, :, 0]
+        )
+        self.nees_z, self.nees_yaw = (
+            self.position[:, 2] ** 2 / self.z_std**2,
+            self.yaw**2 / self.yaw_std**2,
+        )
         self.steps = np.linalg.norm(np.diff(xy, axis=0), axis=1)
 
     @property
@@ -139,27 +191,47 @@ class Errors:
 
 
 def main():
-    """Print a row for each way to use the sensors: root mean squares over drives that no test uses, and the largest step."""
+    """Print a row for each way to use the sensors: root mean squares over drives that no test uses,
+    and the largest step.
+    """
     from uwb_tdoa_ekf.core.config import FilterConfig
     from uwb_tdoa_ekf.offline import run_offline
 
     planar, bare = {"planar": True, "fixed_height": HEIGHT}, {"use_imu": False}
     matched = {"tdoa_std": 0.14, "gyro_noise": 0.001, "accel_noise": 0.02}
     rows = {
-        "wheels, IMU, planar": (planar, (), False), "wheels, planar": (planar | bare, (), False), "wheels": (bare, (), False),
-        "IMU, planar": (planar, ("velocity",), False), "TDOA alone, planar": (planar | bare, ("velocity",), False),
-        "TDOA alone": (bare, ("velocity",), False), "two late anchors: wheels, IMU, planar": (planar, (), True),
+        "wheels, IMU, planar": (planar, (), False),
+        "wheels, planar": (planar | bare, (), False),
+        "wheels": (bare, (), False),
+        "IMU, planar": (planar, ("velocity",), False),
+        "TDOA alone, planar": (planar | bare, ("velocity",), False),
+        "TDOA alone": (bare, ("velocity",), False),
+        "two late anchors: wheels, IMU, planar": (planar, (), True),
         "two late anchors: wheels, planar": (planar | bare, (), True),
-    }  # fmt: skip
-    rows |= {f"{name}; noise as it is": (rows[name][0] | matched, *rows[name][1:]) for name in list(rows)[:2]}
+    }
+    rows |= {
+        f"{name}; noise as it is": (rows[name][0] | matched, *rows[name][1:])
+        for name in list(rows)[:2]
+    }
     flights = [drive(seed) for seed in range(100, 120)]
-    print("| | xy, m | largest, m | yaw, degrees | stated, degrees | NEES of xy, of height, of yaw | largest step, m |")
+    print(
+        "| | xy, m | largest, m | yaw, degrees | stated, degrees | NEES of xy, of height, of "
+        "yaw | largest step, m |"
+    )
     for name, (parameters, without, lies) in rows.items():
         found = []
         for seed, flight in enumerate(flights):
             rng = np.random.default_rng(seed)
-            flight = late(flight, rng.choice(6, 2, replace=False), rng.uniform(30.0, 50.0)) if lies else flight
-            errors = Errors(flight, run_offline(flight.without(*without), FilterConfig(**parameters)).odometry, 15.0)
+            flight = (
+                late(flight, rng.choice(6, 2, replace=False), rng.uniform(30.0, 50.0))
+                if lies
+                else flight
+            )
+            errors = Errors(
+                flight,
+                run_offline(flight.without(*without), FilterConfig(**parameters)).odometry,
+                15.0,
+            )
             nees = [np.mean(some) for some in (errors.nees_xy, errors.nees_z, errors.nees_yaw)]
             squares = np.mean(errors.xy**2), np.mean(errors.yaw**2), np.mean(errors.yaw_std**2)
             found.append([*squares, errors.xy.max(), errors.steps.max(), *nees])
@@ -167,7 +239,10 @@ def main():
         xy, yaw, stated = np.sqrt(found[:, :3].mean(axis=0)) * [1.0, 57.3, 57.3]
         of_xy, of_z, of_yaw = found[:, 5:].mean(axis=0)
         largest, step = found[:, 3:5].max(axis=0)
-        numbers = f"{xy:.3f} | {largest:.2f} | {yaw:.1f} | {stated:.1f} | {of_xy:.2f}, {of_z:.2f}, {of_yaw:.2f} | {step:.2f}"
+        numbers = (
+            f"{xy:.3f} | {largest:.2f} | {yaw:.1f} | {stated:.1f} | {of_xy:.2f}, {of_z:.2f}, "
+            f"{of_yaw:.2f} | {step:.2f}"
+        )
         print(f"| {name} | {numbers} |", flush=True)
 
 

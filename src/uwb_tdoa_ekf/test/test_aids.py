@@ -1,10 +1,13 @@
-"""Height, pressure and velocity in the core: each update against the textbook, and what goes wrong with them in flights."""
+"""Height, pressure and velocity in the core: each update against the textbook, and what goes wrong
+with them in flights.
+"""
 
 from dataclasses import replace
 
 from covariances import assert_covariance
 from flights import corners, fly, measurements, position_at, with_aids, with_ranges
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, settings
+from hypothesis import strategies as st
 import numpy as np
 from priors import Prior, with_offset
 import pytest
@@ -35,7 +38,9 @@ def tilted(seed):
 
 
 def assert_row_is_the_derivative(prior, compare):
-    """compare() fills in the innovation; its row is by how much the innovation falls when the state errs."""
+    """compare() fills in the innovation; its row is by how much the innovation falls when the state
+    errs.
+    """
     compare()
     n = prior.innovation.entries
     row, states = prior.innovation.row[:n].copy(), prior.innovation.states[:n].tolist()
@@ -68,7 +73,9 @@ def test_a_velocity_depends_on_velocity_and_attitude(seed, axis):
 @given(seeds, st.integers(0, 1))
 def test_a_tilt_depends_on_the_attitude(seed, axis):
     prior, R = tilted(seed), np.empty((3, 3))
-    assert_row_is_the_derivative(prior, lambda: plane._is_tilted(prior.hypothesis, axis, 0.02, R, prior.innovation))
+    assert_row_is_the_derivative(
+        prior, lambda: plane._is_tilted(prior.hypothesis, axis, 0.02, R, prior.innovation)
+    )
     plane._is_tilted(prior.hypothesis, axis, 0.02, R, prior.innovation)
     x, y, z, w = prior.hypothesis.x[6:10]
     up = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x)
@@ -79,7 +86,9 @@ def test_a_tilt_depends_on_the_attitude(seed, axis):
 def test_a_yaw_rate_depends_on_the_bias_of_the_gyroscope(seed):
     prior, aid, imu = tilted(seed), np.zeros(1, AID)[0], new_state(np.eye(3)).record.imu
     aid["value"], aid["std"], imu.gyro[:] = [0.0, 0.0, 0.0, 0.7], 0.1, [0.1, 0.2, 0.5]
-    assert_row_is_the_derivative(prior, lambda: velocity._compare_yaw_rate(prior.hypothesis, aid, imu, prior.innovation))
+    assert_row_is_the_derivative(
+        prior, lambda: velocity._compare_yaw_rate(prior.hypothesis, aid, imu, prior.innovation)
+    )
     velocity._compare_yaw_rate(prior.hypothesis, aid, imu, prior.innovation)
     assert prior.innovation.value == pytest.approx(0.7 - (0.5 - prior.hypothesis.x[15]))
 
@@ -101,19 +110,33 @@ def test_an_update_reaches_the_auxiliary_states_as_the_textbook_says(seed, of):
     np.testing.assert_allclose(prior.hypothesis.P, expected[:15, :15], atol=1e-9 * scale)
     np.testing.assert_allclose(prior.hypothesis.offset_cross, expected[15:, :15], atol=1e-9 * scale)
     np.testing.assert_allclose(prior.hypothesis.offset_P, expected[15:, 15:], atol=1e-9 * scale)
-    np.testing.assert_allclose(prior.hypothesis.offset, [3.0, -0.2, 0.4] + gain[15:] * innovation.value, atol=1e-9)
+    np.testing.assert_allclose(
+        prior.hypothesis.offset, [3.0, -0.2, 0.4] + gain[15:] * innovation.value, atol=1e-9
+    )
 
 
 @given(seeds)
 def test_the_covariance_with_the_offset_moves_with_the_state(seed):
     prior, transition = Prior(seed), np.zeros(1, TRANSITION).view(np.recarray)[0]
     joint, rng = with_offset(prior), prior.rng
-    blocks = {name: rng.standard_normal((3, 3)) for name in ("velocity_attitude", "velocity_accel_bias")}
-    transition.dt, transition.attitude_attitude = 0.01, Rotation.from_rotvec(rng.standard_normal(3)).as_matrix()
+    blocks = {
+        name: rng.standard_normal((3, 3)) for name in ("velocity_attitude", "velocity_accel_bias")
+    }
+    transition.dt, transition.attitude_attitude = (
+        0.01,
+        Rotation.from_rotvec(rng.standard_normal(3)).as_matrix(),
+    )
     phi = np.eye(18)
-    phi[:3, 3:6], phi[6:9, 6:9], phi[6:9, 12:15] = 0.01 * np.eye(3), transition.attitude_attitude, -0.01 * np.eye(3)
+    phi[:3, 3:6], phi[6:9, 6:9], phi[6:9, 12:15] = (
+        0.01 * np.eye(3),
+        transition.attitude_attitude,
+        -0.01 * np.eye(3),
+    )
     phi[15, 16] = 0.01
-    for name, columns in (("velocity_attitude", slice(6, 9)), ("velocity_accel_bias", slice(9, 12))):
+    for name, columns in (
+        ("velocity_attitude", slice(6, 9)),
+        ("velocity_accel_bias", slice(9, 12)),
+    ):
         transition[name] = blocks[name]
         phi[3:6, columns] = blocks[name]
     auxiliary.predict(prior.hypothesis, transition)
@@ -124,19 +147,25 @@ def test_the_covariance_with_the_offset_moves_with_the_state(seed):
 
 
 def only(flight, *names):
-    return replace(flight, **{name: None for name in ("height", "pressure", "velocity") if name not in names})
+    return replace(
+        flight, **{name: None for name in ("height", "pressure", "velocity") if name not in names}
+    )
 
 
 def rms(flight, config=None, after=2.0):
     """RMS errors (3,) m per axis, from `after` s on."""
     odometry = run_offline(flight, config).odometry
     chosen = odometry.t > after
-    return np.sqrt(np.mean((odometry.p[chosen] - position_at(flight, odometry.t[chosen])) ** 2, axis=0))
+    return np.sqrt(
+        np.mean((odometry.p[chosen] - position_at(flight, odometry.t[chosen])) ** 2, axis=0)
+    )
 
 
 @pytest.fixture(scope="module")
 def flight():
-    return with_aids(fly(3, 20.0, tdoa_std=0.3, accel_noise=0.05, gyro_noise=0.002), drift=1.0 / 60.0)
+    return with_aids(
+        fly(3, 20.0, tdoa_std=0.3, accel_noise=0.05, gyro_noise=0.002), drift=1.0 / 60.0
+    )
 
 
 @pytest.fixture(scope="module")
@@ -145,7 +174,9 @@ def without(flight):
 
 
 def test_each_aid_helps(flight, without):
-    of_height, of_pressure, of_velocity = (rms(only(flight, name)) for name in ("height", "pressure", "velocity"))
+    of_height, of_pressure, of_velocity = (
+        rms(only(flight, name)) for name in ("height", "pressure", "velocity")
+    )
     assert of_height[2] < 0.02 and of_height[2] < 0.5 * without[2]
     assert of_pressure[2] < without[2]
     assert np.linalg.norm(of_velocity) < np.linalg.norm(without)
@@ -161,7 +192,9 @@ def test_a_fixed_height_is_kept():
 
 def changed(flight, change):
     """The flight with change(t, range) (n,) instead of its ranges."""
-    return replace(flight, height=replace(flight.height, range=change(flight.height.t, flight.height.range)))
+    return replace(
+        flight, height=replace(flight.height, range=change(flight.height.t, flight.height.range))
+    )
 
 
 HEIGHT_FAULTS = {
@@ -192,7 +225,9 @@ def test_wheels_that_spin_are_not_used(flight, without):
     wrong = replace(only(flight, "velocity"), velocity=replace(flight.velocity, v=spinning))
     assert np.linalg.norm(rms(wrong)) < 1.1 * np.linalg.norm(without)
     verdict = run_offline(wrong).aids["velocity"]["verdict"]
-    assert (verdict[(t > 6.0) & (t < 8.0)] != USED).mean() > 0.9 and (verdict[t > 9.0] == USED).mean() > 0.9
+    assert (verdict[(t > 6.0) & (t < 8.0)] != USED).mean() > 0.9 and (
+        verdict[t > 9.0] == USED
+    ).mean() > 0.9
 
 
 @settings(max_examples=10, deadline=None)
@@ -201,7 +236,10 @@ def test_the_filter_is_never_locked_out_by_a_wrong_start(seed):
     """Ranges come only after 2 s; whatever z was by then, it is right soon after."""
     flight = only(with_aids(fly(seed % 1000, 6.0, tdoa_std=0.5)), "height")
     kept = flight.height.t > 2.0
-    late = replace(flight, height=replace(flight.height, t=flight.height.t[kept], range=flight.height.range[kept]))
+    late = replace(
+        flight,
+        height=replace(flight.height, t=flight.height.t[kept], range=flight.height.range[kept]),
+    )
     run = run_offline(late)
     odometry = run.odometry
     error = odometry.p[:, 2] - position_at(late, odometry.t)[:, 2]
@@ -213,14 +251,26 @@ AIDS = "height", "pressure", "velocity", "range"
 
 
 @settings(max_examples=25, deadline=None)
-@given(seeds, st.sampled_from(ROBUST), st.sampled_from(LOSSES), st.sets(st.sampled_from(AIDS)), st.booleans(), st.booleans())
+@given(
+    seeds,
+    st.sampled_from(ROBUST),
+    st.sampled_from(LOSSES),
+    st.sets(st.sampled_from(AIDS)),
+    st.booleans(),
+    st.booleans(),
+)
 def test_any_sensors_in_any_mode_leave_covariances(seed, robust, loss, names, slopes, wrong):
-    """slopes : the TDOAs have biases that change with position and velocity; wrong : each sensor has outliers."""
+    """slopes : the TDOAs have biases that change with position and velocity; wrong : each sensor
+    has outliers.
+    """
     rng = np.random.default_rng(seed)
     flight = with_ranges(with_aids(fly(seed % 1000, 3.0, accel_noise=0.05, outliers=0.05)))
     fed, aids = measurements(flight), []
     if slopes:
-        fed.tdoa["slope"], fed.tdoa["state"] = 0.3 * rng.standard_normal((len(fed.tdoa), 6)), 0.3 * rng.standard_normal((len(fed.tdoa), 6))
+        fed.tdoa["slope"], fed.tdoa["state"] = (
+            0.3 * rng.standard_normal((len(fed.tdoa), 6)),
+            0.3 * rng.standard_normal((len(fed.tdoa), 6)),
+        )
     for name in names:
         rows, usable = aid_rows(name, getattr(flight, name), flight.anchors)
         rows["value"][:, 0] += np.where(wrong & (rng.random(len(rows)) < 0.1), 2.0, 0.0)
@@ -230,30 +280,58 @@ def test_any_sensors_in_any_mode_leave_covariances(seed, robust, loss, names, sl
     state = new_state(flight.anchors.positions)
     odometry, _, of_aids = feed(state, FilterConfig(robust=robust, loss=loss).parameters(), fed)
     assert len(odometry) and all(np.isfinite(odometry[name]).all() for name in ("x", "covariance"))
-    assert np.isfinite(state.record.barometer.nis) and (of_aids["variance"][~np.isnan(of_aids["variance"])] > 0.0).all()
+    assert (
+        np.isfinite(state.record.barometer.nis)
+        and (of_aids["variance"][~np.isnan(of_aids["variance"])] > 0.0).all()
+    )
     for hypothesis in state.record.hypotheses:
         if hypothesis["log_weight"] > -np.inf:
             there = np.flatnonzero(np.append(np.ones(15), np.diag(hypothesis["offset_P"]) > 0.0))
-            joint = np.block([[hypothesis["P"], hypothesis["offset_cross"].T], [hypothesis["offset_cross"], hypothesis["offset_P"]]])
+            joint = np.block(
+                [
+                    [hypothesis["P"], hypothesis["offset_cross"].T],
+                    [hypothesis["offset_cross"], hypothesis["offset_P"]],
+                ]
+            )
             assert_covariance(joint[np.ix_(there, there)], tolerance=1e-6)
 
 
 @pytest.mark.parametrize("followed", [0, 1])
 def test_a_range_finder_decides_between_mirrored_places(followed):
-    """Two hypotheses are 1.4 m below and above anchors in a plane, and equally probable; the tag is at the lower one."""
+    """Two hypotheses are 1.4 m below and above anchors in a plane, and equally probable; the tag is
+    at the lower one.
+    """
     state, parameters = new_state(np.array(corners().positions)), FilterConfig().parameters()[0]
-    ekf, aid, residual, places = state.record, np.zeros(1, AID)[0], np.zeros(1, RESIDUAL)[0], (0, YAWS)
-    ekf.workspace[:], ekf.running, ekf.best = [[-1.0, -1.0, -1.0], [8.0, 9.0, 4.0]], True, places[followed]
+    ekf, aid, residual, places = (
+        state.record,
+        np.zeros(1, AID)[0],
+        np.zeros(1, RESIDUAL)[0],
+        (0, YAWS),
+    )
+    ekf.workspace[:], ekf.running, ekf.best = (
+        [[-1.0, -1.0, -1.0], [8.0, 9.0, 4.0]],
+        True,
+        places[followed],
+    )
     ekf.hypotheses["log_weight"] = -np.inf
     for h, z in zip(places, (1.1, 2.5)):
-        ekf.hypotheses["log_weight"][h], ekf.hypotheses["x"][h, [2, 9]], ekf.hypotheses["P"][h] = 0.0, [z, 1.0], 0.01 * np.eye(15)
+        ekf.hypotheses["log_weight"][h], ekf.hypotheses["x"][h, [2, 9]], ekf.hypotheses["P"][h] = (
+            0.0,
+            [z, 1.0],
+            0.01 * np.eye(15),
+        )
     for t in np.arange(0.0, 3.0, 0.04):
         aid["t"], aid["value"] = t, [1.1 + 0.01 * np.sin(40.0 * t), 0.0, 0.0, 0.0]
         height.observe(ekf, parameters, aid, residual, NOTHING)
         if t < 0.04:
-            assert ekf.hypotheses["log_weight"][places[1]] - ekf.hypotheses["log_weight"][0] > PRUNED_BELOW
+            assert (
+                ekf.hypotheses["log_weight"][places[1]] - ekf.hypotheses["log_weight"][0]
+                > PRUNED_BELOW
+            )
     right, mirrored = ekf.hypotheses["log_weight"][list(places)]
-    assert right - mirrored > 5.0  # the mirrored one is 150 times less probable; if it was followed, it gives way then
+    assert (
+        right - mirrored > 5.0
+    )  # the mirrored one is 150 times less probable; if it was followed, it gives way then
 
 
 def test_a_velocity_that_does_not_change_any_more_is_not_used(flight):
@@ -261,12 +339,18 @@ def test_a_velocity_that_does_not_change_any_more_is_not_used(flight):
     t, v = flight.velocity.t, flight.velocity.v.copy()
     v[t > 8.0] = v[t > 8.0][0]
     heard = flight.tdoa.t < 10.0
-    cut = replace(flight.tdoa, **{name: column[heard] for name, column in vars(flight.tdoa).items()})
+    cut = replace(
+        flight.tdoa, **{name: column[heard] for name, column in vars(flight.tdoa).items()}
+    )
     noise = 0.2 * np.random.default_rng(1).standard_normal(flight.imu.accel.shape)  # of motors
     imu = replace(flight.imu, accel=flight.imu.accel + noise)
-    run = run_offline(replace(only(flight, "velocity"), velocity=replace(flight.velocity, v=v), tdoa=cut, imu=imu))
+    run = run_offline(
+        replace(only(flight, "velocity"), velocity=replace(flight.velocity, v=v), tdoa=cut, imu=imu)
+    )
     verdict, odometry = run.aids["velocity"]["verdict"], run.odometry
-    assert (verdict[t > 8.8] != USED).all() and (verdict[(t > 2.0) & (t < 8.0)] == USED).mean() > 0.9
+    assert (verdict[t > 8.8] != USED).all() and (
+        verdict[(t > 2.0) & (t < 8.0)] == USED
+    ).mean() > 0.9
     error = np.linalg.norm(odometry.p - position_at(flight, odometry.t), axis=1)
     stated = np.sqrt(np.trace(odometry.covariance[:, :3, :3], axis1=1, axis2=2))
     assert (error < 3.0 * stated + 0.1).all()
@@ -274,7 +358,9 @@ def test_a_velocity_that_does_not_change_any_more_is_not_used(flight):
 
 def test_wheels_that_stand_may_repeat_zero():
     still = with_aids(fly(2, 8.0, hover=True, accel_noise=0.02))
-    zero = replace(only(still, "velocity"), velocity=replace(still.velocity, v=np.zeros_like(still.velocity.v)))
+    zero = replace(
+        only(still, "velocity"), velocity=replace(still.velocity, v=np.zeros_like(still.velocity.v))
+    )
     t = zero.velocity.t
     assert (run_offline(zero).aids["velocity"]["verdict"][t > 2.0] == USED).mean() > 0.9
 
@@ -283,7 +369,9 @@ def test_a_fixed_height_of_a_tag_that_flies_is_contradicted_by_tdoas_and_the_dev
     flight = fly(4, 12.0, hover=True, tdoa_std=0.15)
     z = flight.truth.p[0, 2]
     for off, covered in ((1.4, True), (0.0, False)):
-        odometry = run_offline(flight, FilterConfig(fixed_height=float(z - off), fixed_height_std=0.05)).odometry
+        odometry = run_offline(
+            flight, FilterConfig(fixed_height=float(z - off), fixed_height_std=0.05)
+        ).odometry
         late = odometry.t > 4.0
         error = np.abs(odometry.p[late, 2] - position_at(flight, odometry.t[late])[:, 2])
         stated = np.sqrt(odometry.covariance[late, 2, 2])

@@ -1,8 +1,8 @@
 """The change detector with more anchors, and over longer flights, than those of test_monitor."""
 
+from monitor_cost import cost, row_of
 import numpy as np
 import pytest
-from monitor_cost import cost, row_of
 
 from uwb_tdoa_ekf.monitoring.change import CAPACITY, ChangeDetector
 from uwb_tdoa_ekf.monitoring.monitor import LIMIT
@@ -16,7 +16,9 @@ def test_memory_grows_with_the_number_of_anchors_not_with_its_square():
 
 
 def late(n, heard, row, since, slices, size=0.8, seed=1):
-    """The Change that is found last in slices of a tag that hears the nearest anchors; one is late from slice `since` on."""
+    """The Change that is found last in slices of a tag that hears the nearest anchors; one is late
+    from slice `since` on.
+    """
     rng, anchors, detector = np.random.default_rng(seed), row_of(n).positions, ChangeDetector()
     found = None
     for k in range(slices):
@@ -36,7 +38,9 @@ def test_finds_the_one_that_changed_among_many_after_slices_were_forgotten(n, he
     since = CAPACITY + 30 if n < 100 else 20
     found = late(n, heard, row=3, since=since, slices=since + 12)
     assert found.row == 3 and found.ratio > LIMIT
-    assert found.since == pytest.approx(LENGTH * since, abs=2 * LENGTH) and found.size == pytest.approx(0.8, abs=0.2)
+    assert found.since == pytest.approx(
+        LENGTH * since, abs=2 * LENGTH
+    ) and found.size == pytest.approx(0.8, abs=0.2)
 
 
 def test_of_more_than_it_takes_those_heard_most_count():

@@ -37,7 +37,12 @@ print([function.__name__ for function, count in compiled().items() if count > be
 
 @pytest.mark.slow
 def test_after_it_no_node_compiles_anything(make_rig, monkeypatch):
-    ended = subprocess.run([sys.executable, "-m", "uwb_tdoa_ekf.compile_nodes"], capture_output=True, text=True, timeout=300.0)
+    ended = subprocess.run(
+        [sys.executable, "-m", "uwb_tdoa_ekf.compile_nodes"],
+        capture_output=True,
+        text=True,
+        timeout=300.0,
+    )
     assert ended.returncode == 0 and ended.stdout.startswith("both nodes are compiled; ")
     monkeypatch.setitem(os.environ, "NUMBA_DEBUG_CACHE", "1")
     rig = make_rig()
@@ -49,7 +54,18 @@ def test_after_it_no_node_compiles_anything(make_rig, monkeypatch):
 
 @pytest.mark.slow
 def test_nothing_is_compiled_in_flight():
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([os.path.dirname(__file__), os.environ.get("PYTHONPATH", "")])}
-    ended = subprocess.run([sys.executable, "-c", IN_FLIGHT], env=environment, capture_output=True, text=True, timeout=300.0)
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join(
+            [os.path.dirname(__file__), os.environ.get("PYTHONPATH", "")]
+        ),
+    }
+    ended = subprocess.run(
+        [sys.executable, "-c", IN_FLIGHT],
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=300.0,
+    )
     assert ended.returncode == 0, ended.stderr
     assert ended.stdout.strip() == "[]"

@@ -10,8 +10,23 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import CHOICES, PARAMETERS, FilterConfig
 
 CONFIG = Path(__file__).resolve().parents[1] / "config" / "ekf_node.yaml"
-WITHOUT = ["vibration_gain", "yaw_rate_std", "range_offset_std", "fixed_height_std", "non_holonomic_std"]  # 0: there is no such thing
-SWITCHES = ("use_imu", "adapt_noise", "zero_velocity", "recover", "use_height", "use_pressure", "use_velocity", "planar")
+WITHOUT = [
+    "vibration_gain",
+    "yaw_rate_std",
+    "range_offset_std",
+    "fixed_height_std",
+    "non_holonomic_std",
+]  # 0: there is no such thing
+SWITCHES = (
+    "use_imu",
+    "adapt_noise",
+    "zero_velocity",
+    "recover",
+    "use_height",
+    "use_pressure",
+    "use_velocity",
+    "planar",
+)
 SIGNED = "initial_yaw", "height_arm", "ground_height", "fixed_height"
 OTHERS = (*CHOICES, *SIGNED, *SWITCHES)
 NUMBERS = [field.name for field in fields(FilterConfig) if field.name not in OTHERS]
@@ -75,7 +90,9 @@ def test_yaw_may_be_negative_or_zero():
     assert FilterConfig(initial_yaw=-1.0).initial_yaw == -1.0
 
 
-@pytest.mark.parametrize("field, value", [("robust", "median"), ("loss", "tukey"), ("loss", ""), ("robust", None)])
+@pytest.mark.parametrize(
+    "field, value", [("robust", "median"), ("loss", "tukey"), ("loss", ""), ("robust", None)]
+)
 def test_names_must_be_known(field, value):
     with pytest.raises(InputError, match=f"{field}: .* is not one of"):
         FilterConfig(**{field: value})
@@ -89,7 +106,10 @@ def test_choices_are_given_to_the_core_as_their_places():
 
 
 def test_how_a_number_was_written_changes_nothing(tmp_path):
-    path = write(tmp_path, "ekf_node: {ros__parameters: {gate: 3, tdoa_std: 1, odometry_rate: 100, use_imu: true}}")
+    path = write(
+        tmp_path,
+        "ekf_node: {ros__parameters: {gate: 3, tdoa_std: 1, odometry_rate: 100, use_imu: true}}",
+    )
     config = FilterConfig.from_yaml(path)
     assert isinstance(config.gate, float)
     expected = FilterConfig(gate=3.0, tdoa_std=1.0, odometry_rate=100.0).parameters()
@@ -97,8 +117,13 @@ def test_how_a_number_was_written_changes_nothing(tmp_path):
 
 
 def test_from_yaml_takes_what_tunes_the_filter_and_passes_over_the_rest(tmp_path):
-    text = "ekf_node:\n  ros__parameters:\n    tdoa_std: 0.5\n    loss: huber\n    use_imu: false\n    frame: map\n"
-    assert FilterConfig.from_yaml(write(tmp_path, text)) == FilterConfig(tdoa_std=0.5, loss="huber", use_imu=False)
+    text = (
+        "ekf_node:\n  ros__parameters:\n    tdoa_std: 0.5\n    loss: huber\n    use_imu: false\n  "
+        "  frame: map\n"
+    )
+    assert FilterConfig.from_yaml(write(tmp_path, text)) == FilterConfig(
+        tdoa_std=0.5, loss="huber", use_imu=False
+    )
 
 
 def test_from_yaml_of_any_namespace(tmp_path):

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
-from uwb_tdoa_bias.foundation.errors import InputError
 
+from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.debias import LayerConfig, Layers
 
 
@@ -41,10 +41,16 @@ def test_saturation_limits_the_velocity_either_way():
     p, v = np.zeros((60, 3)), np.zeros((60, 3))
     v[5:] = (50.0, -50.0, 0.0)
     config = LayerConfig(
-        saturate=True, max_speed=(2.0, 2.0, 2.0), max_acceleration=1000.0, adams_moulton=True, least_weight=0.0
+        saturate=True,
+        max_speed=(2.0, 2.0, 2.0),
+        max_acceleration=1000.0,
+        adams_moulton=True,
+        least_weight=0.0,
     )
     found = run(config, p, v)
-    np.testing.assert_allclose(found[-1], [0.02, -0.02, 0.0], atol=0.005)  # exp(-2) of the estimate is left
+    np.testing.assert_allclose(
+        found[-1], [0.02, -0.02, 0.0], atol=0.005
+    )  # exp(-2) of the estimate is left
 
 
 def test_smoothing_is_the_weighted_mean_of_eq_a26():
@@ -85,10 +91,16 @@ def test_reset_forgets():
 @pytest.mark.parametrize(
     "bad",
     [
-        {"max_speed": (1.0, 1.0)}, {"max_speed": (1.0, 0.0, 1.0)}, {"flipping_speed": (1.0, float("nan"), 1.0)},
-        {"max_acceleration": 0.0}, {"smooth": 0.0}, {"smooth": 1.5}, {"least_weight": -0.1}, {"history": 0},
+        {"max_speed": (1.0, 1.0)},
+        {"max_speed": (1.0, 0.0, 1.0)},
+        {"flipping_speed": (1.0, float("nan"), 1.0)},
+        {"max_acceleration": 0.0},
+        {"smooth": 0.0},
+        {"smooth": 1.5},
+        {"least_weight": -0.1},
+        {"history": 0},
     ],
-)  # fmt: skip
+)
 def test_bad_values_are_refused_by_name(bad):
     with pytest.raises(InputError, match=f"^{next(iter(bad))}: "):
         LayerConfig(**bad)

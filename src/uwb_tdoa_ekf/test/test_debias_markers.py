@@ -39,7 +39,11 @@ def test_a_path_is_cut_into_cells_and_thin_ones_are_left_out():
     true = np.column_stack([np.linspace(0.0, 1.9, 191), np.zeros(191)])
     found = collect(true + [0.1, -0.2], true, 0.5, least=30)
     np.testing.assert_allclose(found.bias, np.tile([0.1, -0.2], (len(found), 1)))
-    assert [tuple(cell) for cell in found.cell] == [(1, 0), (2, 0), (3, 0)]  # the ends hold 25 and 15
+    assert [tuple(cell) for cell in found.cell] == [
+        (1, 0),
+        (2, 0),
+        (3, 0),
+    ]  # the ends hold 25 and 15
     assert found.count.tolist() == [50, 50, 50]
 
 
@@ -47,14 +51,18 @@ def test_a_path_is_cut_into_cells_and_thin_ones_are_left_out():
 def test_corrected_bias_is_the_mean_of_the_integrals_along_the_axes(d):
     one = markers(d=d, std=np.linspace(0.05, 0.15, d))
     found = corrected_bias(one)
-    row = int(np.flatnonzero((one.cell == 2).all(axis=1))[0])  # in the middle: 3 standard deviations stay on the line
+    row = int(
+        np.flatnonzero((one.cell == 2).all(axis=1))[0]
+    )  # in the middle: 3 standard deviations stay on the line
     expected = np.zeros(d)
     for axis in range(d):
         on_line = (np.delete(one.cell, axis, axis=1) == 2).all(axis=1)
         for k in range(d):
             spline = CubicSpline(one.true[on_line, axis], one.bias[on_line, k], bc_type="natural")
             at, sigma = one.true[row, axis], one.std[row, axis]
-            value, _ = quad(lambda x: norm.pdf(x, at, sigma) * spline(x), at - 3 * sigma, at + 3 * sigma)
+            value, _ = quad(
+                lambda x: norm.pdf(x, at, sigma) * spline(x), at - 3 * sigma, at + 3 * sigma
+            )
             expected[k] += value / (norm.cdf(3.0) - norm.cdf(-3.0)) / d
     np.testing.assert_allclose(found[row], expected, atol=2e-4)
 
@@ -62,7 +70,9 @@ def test_corrected_bias_is_the_mean_of_the_integrals_along_the_axes(d):
 @given(st.floats(-0.3, 0.3), st.floats(0.0, 0.4), st.sampled_from([2, 3]))
 def test_a_bias_that_is_alike_everywhere_stays(bias, std, d):
     cell, true = grid(3, d)
-    one = Markers(cell, true, np.full(true.shape, bias), np.full(true.shape, std), np.ones(len(cell)))
+    one = Markers(
+        cell, true, np.full(true.shape, bias), np.full(true.shape, std), np.ones(len(cell))
+    )
     np.testing.assert_allclose(corrected_bias(one), bias, atol=1e-12)
 
 

@@ -36,10 +36,16 @@ def slow(cell, at, values, x):
         for j in range(len(at)):
             if j != i and np.abs(cell[i] - cell[j]).max() == 1:
                 away = at[j] - at[i]
-                widths.append((atan2(away[1], away[0]), -log(c3 * b[j] / b[i]) / float(away @ away)))
+                widths.append(
+                    (atan2(away[1], away[0]), -log(c3 * b[j] / b[i]) / float(away @ away))
+                )
         widths.sort()
         theta = atan2(x[1] - at[i][1], x[0] - at[i][0])
-        widths = [(widths[-1][0] - 2 * pi, widths[-1][1]), *widths, (widths[0][0] + 2 * pi, widths[0][1])]
+        widths = [
+            (widths[-1][0] - 2 * pi, widths[-1][1]),
+            *widths,
+            (widths[0][0] + 2 * pi, widths[0][1]),
+        ]
         c2 = np.interp(theta, *zip(*widths))
         total += c1 * b[i] * exp(-c2 * d2)
     return total
@@ -73,7 +79,9 @@ def test_negative_values_are_shifted_and_far_away_the_smallest_one_is_left(d):
 
 def test_a_width_that_would_be_negative_is_none_so_that_nothing_grows_with_distance():
     cell, at, values = nodes(3, 2, lambda at: np.where((at == 1.0).all(axis=1), 1.0, 0.01))
-    found = AngularNetwork(cell, at, values, STEP)(np.random.default_rng(1).uniform(-1.0, 2.0, (500, 2)))
+    found = AngularNetwork(cell, at, values, STEP)(
+        np.random.default_rng(1).uniform(-1.0, 2.0, (500, 2))
+    )
     assert found.max() < 0.7
 
 

@@ -15,13 +15,18 @@ pytest.importorskip("uwb_tdoa_msgs.msg")
 from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
 from rig import MODULES, make_rig, stamp  # noqa: E402, F401
+
 from uwb_tdoa_bias.foundation.anchors import Anchors  # noqa: E402
 from uwb_tdoa_ekf.debias import BiasMap  # noqa: E402
 from uwb_tdoa_ekf.debias_node import DebiasNode  # noqa: E402
 
 CONFIG = Path(__file__).resolve().parents[1] / "config" / "debias_node.yaml"
 ANCHORS = Anchors.from_positions([[0, 0, 0], [4, 0, 2], [4, 4, 0], [0, 4, 2], [2, 2, 3]])
-PLACES = [[0.7, 0.7, 0.7], [2.0, 0.7, 0.7], [9.0, 0.7, 0.7]]  # known, half a metre outside, far away
+PLACES = [
+    [0.7, 0.7, 0.7],
+    [2.0, 0.7, 0.7],
+    [9.0, 0.7, 0.7],
+]  # known, half a metre outside, far away
 
 
 @pytest.fixture
@@ -30,8 +35,16 @@ def file(tmp_path):
     cell = np.stack(np.meshgrid(*[np.arange(4)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     bias = np.tile([0.1, -0.2, 0.3], (64, 1))
     BiasMap(
-        cell, 0.5 * cell, bias, 0 * bias + 0.05, np.full(64, 50), 0.01 * np.eye(3), 0.5, ids=ANCHORS.ids, positions=ANCHORS.positions
-    ).save(tmp_path / "map.npz")  # fmt: skip
+        cell,
+        0.5 * cell,
+        bias,
+        0 * bias + 0.05,
+        np.full(64, 50),
+        0.01 * np.eye(3),
+        0.5,
+        ids=ANCHORS.ids,
+        positions=ANCHORS.positions,
+    ).save(tmp_path / "map.npz")
     ANCHORS.to_yaml(tmp_path / "anchors.yaml")
     return tmp_path / "map.npz"
 
@@ -65,11 +78,19 @@ def node(file):
 
 
 def test_every_parameter_is_in_the_parameter_file_with_its_default_described_and_fixed(node):
-    (parameters,) = (entry["ros__parameters"] for entry in yaml.safe_load(CONFIG.read_text()).values())
+    (parameters,) = (
+        entry["ros__parameters"] for entry in yaml.safe_load(CONFIG.read_text()).values()
+    )
     general = ("qos_overrides.", "use_sim_time", "start_type_description_service")
-    declared = {name: p.value for name, p in node.get_parameters_by_prefix("").items() if not name.startswith(general)}
+    declared = {
+        name: p.value
+        for name, p in node.get_parameters_by_prefix("").items()
+        if not name.startswith(general)
+    }
     descriptors = [node.describe_parameter(name) for name in declared]
-    declared = {name: value if np.ndim(value) == 0 else list(value) for name, value in declared.items()}
+    declared = {
+        name: value if np.ndim(value) == 0 else list(value) for name, value in declared.items()
+    }
     assert parameters == declared | {"map": "", "anchors_file": ""}
     assert all(descriptor.description and descriptor.read_only for descriptor in descriptors)
 
@@ -93,13 +114,20 @@ def test_positions_are_debiased_and_accounted_for(make_rig, file):
         np.testing.assert_allclose(xyz(message), p, atol=1e-12)
         np.testing.assert_allclose(np.reshape(message.pose.covariance, (6, 6))[:3, :3], covariance)
         np.testing.assert_array_equal(np.reshape(message.pose.covariance, (6, 6))[3:], before[3:])
-    np.testing.assert_allclose(xyz(rig.debiased[0]), np.array(PLACES[0]) - [0.1, -0.2, 0.3], atol=1e-9)
+    np.testing.assert_allclose(
+        xyz(rig.debiased[0]), np.array(PLACES[0]) - [0.1, -0.2, 0.3], atol=1e-9
+    )
     np.testing.assert_allclose(xyz(rig.debiased[2]), PLACES[2])
     np.testing.assert_array_equal(xyz(rig.debiased[3]), [0.7, np.nan, 0.7])
     np.testing.assert_array_equal(xyz(rig.debiased[4]), PLACES[0])  # of another frame: as it was
     assert rig.debiased[4].header.frame_id == "elsewhere"
     counts = rig.counts("debias_node", received=5)
-    assert (counts["corrected"], counts["faded"], counts["outside"], counts["invalid"]) == (1, 1, 1, 2)
+    assert (counts["corrected"], counts["faded"], counts["outside"], counts["invalid"]) == (
+        1,
+        1,
+        1,
+        2,
+    )
 
 
 def test_it_says_what_is_wrong(node):
@@ -109,7 +137,9 @@ def test_it_says_what_is_wrong(node):
             message.header.frame_id = frame
             node._on_odometry(message)
         level, text, values = node._report()
-        assert values["received"] == sum(values[name] for name in ("corrected", "faded", "outside", "refused", "invalid"))
+        assert values["received"] == sum(
+            values[name] for name in ("corrected", "faded", "outside", "refused", "invalid")
+        )
         return level, text
 
     inside, outside = (PLACES[0], "map"), (PLACES[2], "map")
@@ -139,20 +169,35 @@ def test_a_map_of_other_anchors_is_refused_and_of_these_is_used(node):
     level, text = sent(None)
     assert level == DiagnosticStatus.WARN and "no anchors" in text and "anchors_file" in text
     level, text = sent(ANCHORS.at(ANCHORS.positions + [0.5, 0.0, 0.0]))
-    assert level == DiagnosticStatus.ERROR and "made for other anchors" in text and "debias fit" in text
+    assert (
+        level == DiagnosticStatus.ERROR
+        and "made for other anchors" in text
+        and "debias fit" in text
+    )
     assert sent(ANCHORS)[0] == DiagnosticStatus.OK
     np.testing.assert_array_equal(got[:2], [PLACES[0]] * 2)
     np.testing.assert_allclose(got[2], np.array(PLACES[0]) - [0.1, -0.2, 0.3], atol=1e-9)
 
 
 def test_layers_act_before_the_map(make_rig, file):
-    """A jump is spread over steps of the largest speed, and the velocity, of the body, is turned into the world."""
+    """A jump is spread over steps of the largest speed, and the velocity, of the body, is turned
+    into the world.
+    """
     rig = make_rig()
-    limits = ["-p", "saturate:=true", "-p", "max_speed:=[0.5, 1.0, 0.5]", "-p", "max_acceleration:=1000.0"]
+    limits = [
+        "-p",
+        "saturate:=true",
+        "-p",
+        "max_speed:=[0.5, 1.0, 0.5]",
+        "-p",
+        "max_acceleration:=1000.0",
+    ]
     rig.start("debias_node", debias_node=[*parameters_of(file), *limits])
     for k, y in enumerate((0.5, 0.7, 0.7, 0.7)):
         rig.send("odometry", odometry([0.7, y, 0.7], speed=2.0), 0.1 * k, "map")
-    rig.send("odometry", odometry([0.7, 0.4, 0.7]), 10.0, "map")  # after a gap the past does not count
+    rig.send(
+        "odometry", odometry([0.7, 0.4, 0.7]), 10.0, "map"
+    )  # after a gap the past does not count
     rig.wait(lambda: len(rig.debiased) == 5, "all of them")
     y = [xyz(message)[1] - 0.2 for message in rig.debiased]
     np.testing.assert_allclose(y, [0.5, 0.6, 0.7, 0.7, 0.4], atol=1e-6)

@@ -6,7 +6,8 @@ import time
 from covariances import assert_covariance
 from driving import assert_equal, assert_sound, cut, drive, errors, state_for
 from flights import fly, position_at
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, settings
+from hypothesis import strategies as st
 import numpy as np
 import pytest
 
@@ -19,16 +20,22 @@ from uwb_tdoa_ekf.core.verdicts import STARTUP, USED
 MESSAGE = Path(__file__).resolve().parents[2] / "uwb_tdoa_msgs" / "msg" / "TdoaResidual.msg"
 
 
-@pytest.mark.skipif(not MESSAGE.is_file(), reason="the message definitions are not beside this package")
+@pytest.mark.skipif(
+    not MESSAGE.is_file(), reason="the message definitions are not beside this package"
+)
 def test_verdicts_are_those_of_the_message():
     declared = dict(re.findall(r"VERDICT_(\w+)=(\d)", MESSAGE.read_text()))
-    assert declared == {name: str(value) for name, value in vars(verdicts).items() if name.isupper()}
+    assert declared == {
+        name: str(value) for name, value in vars(verdicts).items() if name.isupper()
+    }
 
 
 def without_imu(flight, low=-np.inf, high=np.inf):
     """The flight with no inertial samples between two stamps."""
     kept = (flight.imu.t < low) | (flight.imu.t >= high)
-    return replace(flight, imu=Imu(flight.imu.t[kept], flight.imu.gyro[kept], flight.imu.accel[kept]))
+    return replace(
+        flight, imu=Imu(flight.imu.t[kept], flight.imu.gyro[kept], flight.imu.accel[kept])
+    )
 
 
 @settings(max_examples=20)
@@ -43,9 +50,15 @@ def test_tracks_a_flight_with_outliers():
         for adapt in (False, True):
             flight = fly(5, 15.0, outliers=0.1, accel_noise=0.02, gyro_noise=0.002)
             odometry, residuals = drive(flight, FilterConfig(robust=robust, adapt_noise=adapt))
-            assert np.sqrt(np.mean(errors(flight, odometry[odometry.t > 3.0]) ** 2)) < 0.15, (robust, adapt)
+            assert np.sqrt(np.mean(errors(flight, odometry[odometry.t > 3.0]) ** 2)) < 0.15, (
+                robust,
+                adapt,
+            )
             far = np.abs(residuals.innovation) > 1.5
-            wild, tame = residuals.weight[far], residuals.weight[~far & np.isfinite(residuals.innovation)]
+            wild, tame = (
+                residuals.weight[far],
+                residuals.weight[~far & np.isfinite(residuals.innovation)],
+            )
             assert len(wild) > 50 and np.median(wild) < 0.5 * np.median(tame), (robust, adapt)
             assert adapt or wild.max() < 0.6  # an anchor known to be noisy may be believed
 
@@ -61,15 +74,22 @@ def test_odometry_comes_at_the_first_event_of_each_period():
 
 
 def test_residuals_are_innovation_and_its_variance():
-    """Against the odometry: at 1 MHz every event gives one, so that the one before a TDOA holds the state it met."""
+    """Against the odometry: at 1 MHz every event gives one, so that the one before a TDOA holds the
+    state it met.
+    """
     flight = fly(7, 2.0, imu_rate=1000.0)
-    odometry, residuals = drive(flight, FilterConfig(odometry_rate=1e6, tdoa_std=0.2, tdoa_correlation_length=1.0))
+    odometry, residuals = drive(
+        flight, FilterConfig(odometry_rate=1e6, tdoa_std=0.2, tdoa_correlation_length=1.0)
+    )
     tested = 0
     for k in np.flatnonzero(residuals.verdict == USED)[50:150]:
         before = np.searchsorted(odometry.t, flight.tdoa.t[k]) - 1
         x, dt = odometry.x[before], flight.tdoa.t[k] - odometry.t[before]
         p = x[:3] + dt * x[3:6]
-        a, b = (flight.anchors.positions[flight.anchors.index(i[k])] for i in (flight.tdoa.a, flight.tdoa.b))
+        a, b = (
+            flight.anchors.positions[flight.anchors.index(i[k])]
+            for i in (flight.tdoa.a, flight.tdoa.b)
+        )
         assert residuals.innovation[k] == pytest.approx(flight.tdoa.d[k] - tdoa(p, a, b), abs=1e-4)
         g = (p - b) / np.linalg.norm(p - b) - (p - a) / np.linalg.norm(p - a)
         prior = g @ odometry.covariance[before, :3, :3] @ g
@@ -95,7 +115,10 @@ def test_bridges_seconds_without_imu_or_tdoas():
         assert_sound(state, drive(gap, state=state)[0])
     odometry, _ = drive(without_imu(flight, 8.0, 11.0))
     assert errors(flight, odometry[odometry.t > 3.0]).max() < 0.6
-    silent = replace(flight, tdoa=Tdoas(*np.concatenate([_columns(flight, 0, 8), _columns(flight, 10, 20)], axis=1)))
+    silent = replace(
+        flight,
+        tdoa=Tdoas(*np.concatenate([_columns(flight, 0, 8), _columns(flight, 10, 20)], axis=1)),
+    )
     odometry, _ = drive(silent)
     blind = odometry[(odometry.t > 8.0) & (odometry.t < 10.0)]
     std = np.sqrt(np.einsum("nii->ni", blind.covariance[:, :3, :3]))
@@ -110,8 +133,9 @@ def _columns(flight, low, high):
 
 
 def nasty(seed, imu_size):
-    """Streams that no sensor would send: huge and jumping IMU values, stamps that repeat, gaps of seconds, TDOAs of any
-    value that is not refused, a tag on an antenna."""
+    """Streams that no sensor would send: huge and jumping IMU values, stamps that repeat, gaps of
+    seconds, TDOAs of any value that is not refused, a tag on an antenna.
+    """
     rng = np.random.default_rng(seed)
     flight = fly(seed, 2.0, imu_rate=float(rng.choice([20.0, 100.0, 1000.0])))
 
@@ -130,7 +154,9 @@ def nasty(seed, imu_size):
     wild = rng.random(len(d)) < rng.choice([0.0, 0.1, 1.0])
     d[wild] = (rng.uniform(-1.0, 1.0, len(d)) * (baseline + 1.0))[wild]
     if rng.random() < 0.2:  # on the first anchor
-        d = tdoa(flight.anchors.positions[0], flight.anchors.positions[a], flight.anchors.positions[b])
+        d = tdoa(
+            flight.anchors.positions[0], flight.anchors.positions[a], flight.anchors.positions[b]
+        )
     return replace(
         flight,
         imu=Imu(stretch(flight.imu.t), gyro, accel),
@@ -148,8 +174,9 @@ def test_nothing_but_finite_states_and_covariances_comes_out(seed, robust, use_i
 
 
 def test_motion_between_samples_is_their_mean():
-    """Two seconds blind with every 20th sample of a perfect sensor end near where those with all of them do: 3.6 cm,
-    where holding each sample instead of their mean gives 7.2 cm."""
+    """Two seconds blind with every 20th sample of a perfect sensor end near where those with all of
+    them do: 3.6 cm, where holding each sample instead of their mean gives 7.2 cm.
+    """
     flight = fly(15, 5.0, imu_rate=1000.0)
     state = state_for(flight)
     early = replace(flight, imu=cut(flight.imu, 0.0, 3.0), tdoa=cut(flight.tdoa, 0.0, 3.0))
@@ -157,7 +184,11 @@ def test_motion_between_samples_is_their_mean():
     ends = []
     for every in (1, 20):
         blind = cut(flight.imu, 3.0, 5.0)
-        blind = Imu(blind.t[every - 1 :: every], blind.gyro[every - 1 :: every], blind.accel[every - 1 :: every])
+        blind = Imu(
+            blind.t[every - 1 :: every],
+            blind.gyro[every - 1 :: every],
+            blind.accel[every - 1 :: every],
+        )
         twin = state.copy()
         drive(replace(flight, imu=blind, tdoa=cut(flight.tdoa, 9.0, 9.0)), state=twin)
         ends.append(twin.record.hypotheses["x"][twin.record.best].copy())
@@ -178,17 +209,23 @@ def test_the_zero_of_time_changes_nothing():
 def test_stamps_that_repeat_are_used_and_move_nothing():
     flight = fly(12, 3.0)
     doubled = np.repeat(np.arange(len(flight.imu)), 2)
-    twice = replace(flight, imu=Imu(flight.imu.t[doubled], flight.imu.gyro[doubled], flight.imu.accel[doubled]))
+    twice = replace(
+        flight, imu=Imu(flight.imu.t[doubled], flight.imu.gyro[doubled], flight.imu.accel[doubled])
+    )
     odometry, _ = drive(flight)
     again, _ = drive(twice)
-    # the sample repeated is averaged with itself, not with the one before: a difference of half a sample's change
+    # the sample repeated is averaged with itself, not with the one before: a difference of half a
+    # sample's change
     np.testing.assert_allclose(again.x[:, :3], odometry.x[:, :3], atol=0.02)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("robust", ROBUST)
 def test_stays_sound_over_an_hour_of_updates(robust):
-    flight, config = fly(13, 60.0, imu_rate=100.0, tdoa_rate=50.0), FilterConfig(robust=robust, odometry_rate=1.0)
+    flight, config = (
+        fly(13, 60.0, imu_rate=100.0, tdoa_rate=50.0),
+        FilterConfig(robust=robust, odometry_rate=1.0),
+    )
     state = state_for(flight)
     for lap in range(60):
         later = replace(

@@ -1,8 +1,20 @@
 from dataclasses import replace
 
 from flights import corners, fly, position_at, with_aids
-from hypothesis import given, settings, strategies as st
-from live import FIRST_AID, assert_same_as_offline, IMU, TDOA, arriving, assert_same, feed, joined, messages, send
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from live import (
+    FIRST_AID,
+    IMU,
+    TDOA,
+    arriving,
+    assert_same,
+    assert_same_as_offline,
+    feed,
+    joined,
+    messages,
+    send,
+)
 import numpy as np
 import pytest
 
@@ -13,8 +25,8 @@ from uwb_tdoa_bias.foundation.stamps import LARGEST_STEP_BACK
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.verdicts import INVALID, LATE, STARTUP, USED
 from uwb_tdoa_ekf.estimator import Estimator
-from uwb_tdoa_ekf.results import VERDICTS
 from uwb_tdoa_ekf.offline import run_offline
+from uwb_tdoa_ekf.results import VERDICTS
 
 seeds = st.integers(0, 2**32 - 1)
 REST = (0.0, 0.0, 0.0), (0.0, 0.0, 9.81)
@@ -44,14 +56,21 @@ def assert_aids_as_offline(flight, config=None, **feeding):
     for name in AIDS:
         verdicts = expected.aids[name]["verdict"].tolist()
         counts = {said: estimator.counts[f"{name}_{said}"] for said in VERDICTS.values()}
-        assert counts == {said: verdicts.count(value) for value, said in VERDICTS.items()} and counts["used"] > 0
+        assert (
+            counts == {said: verdicts.count(value) for value, said in VERDICTS.items()}
+            and counts["used"] > 0
+        )
     return estimator
 
 
 def spoiled(flight):
     """Some of every aid cannot be measurements."""
     height, pressure, velocity = flight.height, flight.pressure, flight.velocity
-    height.range[10:13], pressure.pressure[10:12], velocity.v[10] = [np.nan, np.inf, -1.0], [0.0, np.nan], np.nan
+    height.range[10:13], pressure.pressure[10:12], velocity.v[10] = (
+        [np.nan, np.inf, -1.0],
+        [0.0, np.nan],
+        np.nan,
+    )
     return flight
 
 
@@ -102,18 +121,24 @@ def test_an_aid_that_stops_is_waited_for_for_half_of_the_lag_and_after_a_second_
     at = np.array(list(behind))
     waiting = late[(at > 2.5) & (at < 2.9)]
     assert 0.1 < waiting.min() and waiting.max() < 0.14 and late[at > 3.2].max() < 0.05
-    assert estimator.counts["height_used"] + estimator.counts["height_startup"] == np.sum(flight.height.t < 2.0)
+    assert estimator.counts["height_used"] + estimator.counts["height_startup"] == np.sum(
+        flight.height.t < 2.0
+    )
 
 
 def test_an_aid_that_is_not_used_changes_nothing():
     flight = with_aids(fly(1, 3.0))
-    odometry, _ = feed(Estimator(flight.anchors, FilterConfig(**{f"use_{name}": False for name in AIDS})), flight)
+    odometry, _ = feed(
+        Estimator(flight.anchors, FilterConfig(**{f"use_{name}": False for name in AIDS})), flight
+    )
     assert_same(odometry, run_offline(fly(1, 3.0)).odometry)
 
 
 @settings(max_examples=10)
 @given(seeds, st.floats(0.0, 0.2), st.sampled_from([0, 1]), st.floats(0.0, 0.0029))
-def test_neither_skew_of_the_streams_nor_disorder_within_reorder_changes_anything(seed, delay, behind, jitter):
+def test_neither_skew_of_the_streams_nor_disorder_within_reorder_changes_anything(
+    seed, delay, behind, jitter
+):
     flight, rng = fly(2, 2.0), np.random.default_rng(seed)
     delays = {"imu_delay": delay} if behind == IMU else {"tdoa_delay": delay}
     order = arriving(flight, rng, tdoa_jitter=jitter, **delays)
@@ -129,7 +154,9 @@ def test_inertial_samples_may_come_out_of_order_too(delay):
 
 def test_the_order_in_which_siblings_of_one_stamp_come_changes_nothing():
     flight = fly(3, 2.0)
-    flight = replace(flight, tdoa=replace(flight.tdoa, t=np.floor(flight.tdoa.t * 50.0) / 50.0 + 0.0013))
+    flight = replace(
+        flight, tdoa=replace(flight.tdoa, t=np.floor(flight.tdoa.t * 50.0) / 50.0 + 0.0013)
+    )
     backwards = sorted(messages(flight), key=lambda m: (m[0], m[1], -m[2]))
     one, _ = feed(Estimator(flight.anchors), flight)
     other, _ = feed(Estimator(flight.anchors), flight, order=backwards)
@@ -227,7 +254,9 @@ def test_an_inertial_sample_that_is_not_finite_is_as_if_it_had_never_come():
     flight, rng = fly(6, 3.0), np.random.default_rng(0)
     bad = rng.choice(len(flight.imu), 30, replace=False)
     estimator = Estimator(flight.anchors)
-    broken = replace(flight, imu=replace(flight.imu, gyro=flight.imu.gyro.copy(), accel=flight.imu.accel.copy()))
+    broken = replace(
+        flight, imu=replace(flight.imu, gyro=flight.imu.gyro.copy(), accel=flight.imu.accel.copy())
+    )
     broken.imu.gyro[bad[:15], 1] = np.nan
     broken.imu.accel[bad[15:], 2] = [np.inf, -np.inf, np.nan] * 5
     odometry, _ = feed(estimator, broken)
@@ -278,7 +307,9 @@ def test_every_message_is_accounted_for_once(seed, use_imu):
 def test_a_clock_that_falls_back_starts_anew_and_keeps_the_accounts():
     first, again = fly(7, 3.0, begin=1000.0), fly(7, 3.0)
     estimator = Estimator(first.anchors)
-    for t, stream, i in messages(first):  # not finished: some are still waiting when the clock falls back
+    for t, stream, i in messages(
+        first
+    ):  # not finished: some are still waiting when the clock falls back
         if stream == IMU:
             estimator.add_imu(t, first.imu.gyro[i], first.imu.accel[i])
         else:
@@ -302,11 +333,20 @@ def test_falling_back_by_less_is_late_not_a_restart():
     estimator.add_imu(flight.imu.t[-1] - 0.9 * LARGEST_STEP_BACK, *REST)
     _, residuals = estimator.advance()
     assert residuals.verdict.tolist() == [LATE]
-    assert estimator.running and estimator.counts["restarts"] == 0 and estimator.counts["imu_late"] == 1
+    assert (
+        estimator.running
+        and estimator.counts["restarts"] == 0
+        and estimator.counts["imu_late"] == 1
+    )
 
 
 @pytest.mark.parametrize(
-    "off, verdict, count", [(-500.0, LATE, "imu_late"), (-5.0, LATE, "imu_late"), *((off, INVALID, "imu_invalid") for off in (2.0, 9.0, 500.0))]
+    "off, verdict, count",
+    [
+        (-500.0, LATE, "imu_late"),
+        (-5.0, LATE, "imu_late"),
+        *((off, INVALID, "imu_invalid") for off in (2.0, 9.0, 500.0)),
+    ],
 )
 def test_one_stamp_far_from_its_neighbours_changes_nothing(off, verdict, count):
     flight = fly(8, 3.0)
@@ -328,7 +368,10 @@ def test_one_stamp_far_from_its_neighbours_changes_nothing(off, verdict, count):
     assert_same(joined([part[0] for part in parts]), plain)
     residuals = joined([part[1] for part in parts])
     stray = ~np.isin(residuals.t, flight.tdoa.t)
-    assert residuals.verdict[stray].tolist() == [verdict, verdict] and len(residuals.t) == len(clean.t) + 2
+    assert (
+        residuals.verdict[stray].tolist() == [verdict, verdict]
+        and len(residuals.t) == len(clean.t) + 2
+    )
     assert estimator.counts[count] == 1 and estimator.counts["restarts"] == 0
 
 
@@ -343,7 +386,9 @@ def test_what_is_invalid_does_not_hold_up_the_others():
     assert estimator.advance()[0].t[-1] < flight.tdoa.t[half]
     estimator.add_tdoa(last, FIRST, SECOND, 1e3)
     odometry, residuals = estimator.advance()
-    assert odometry.t[-1] > last - 0.02 and residuals.verdict[residuals.t == last].tolist() == [INVALID]
+    assert odometry.t[-1] > last - 0.02 and residuals.verdict[residuals.t == last].tolist() == [
+        INVALID
+    ]
 
 
 def test_rates_are_those_measured_last():
@@ -354,14 +399,16 @@ def test_rates_are_those_measured_last():
     t = flight.imu.t[-1]
     rates, variances = estimator.rates_at(np.array([t, t + 1.0]))
     np.testing.assert_array_equal(rates, [flight.imu.gyro[-1], [np.nan] * 3])
-    assert variances == pytest.approx([FilterConfig().gyro_noise ** 2 * 200.0, np.nan], nan_ok=True)  # of one sample at 200 Hz
+    assert variances == pytest.approx(
+        [FilterConfig().gyro_noise ** 2 * 200.0, np.nan], nan_ok=True
+    )  # of one sample at 200 Hz
 
 
 @pytest.mark.parametrize("compensating", [False, True])
 def test_rates_are_known_for_all_odometry_that_waited(compensating):
     flight = fly(8, 2.0)
     estimator = Estimator(flight.anchors, FilterConfig(compensate_changes=compensating))
-    for t, stream, i in messages(flight):
+    for _t, stream, i in messages(flight):
         send(estimator, flight, stream, i)
     for give in (estimator.advance, estimator.reset):
         odometry, _ = give()
@@ -385,7 +432,11 @@ def test_nothing_in_nothing_out():
     for odometry, residuals in (estimator.advance(), estimator.finish()):
         assert len(odometry) == len(residuals.t) == 0
         assert odometry.p.shape == (0, 3) and odometry.covariance.shape == (0, 9, 9)
-    assert not estimator.running and estimator.recoveries == 0 and set(estimator.counts.values()) == {0}
+    assert (
+        not estimator.running
+        and estimator.recoveries == 0
+        and set(estimator.counts.values()) == {0}
+    )
 
 
 def test_residuals_carry_ids_not_rows():
@@ -430,17 +481,25 @@ def test_five_anchors_and_an_imu_of_100_hz_are_enough():
     flight = fly(13, 8.0, imu_rate=100.0, tdoa_rate=60.0, anchors=five)
     odometry, _ = feed(Estimator(five), flight)
     late = odometry.t > 3.0
-    assert np.linalg.norm(odometry.p[late] - position_at(flight, odometry.t[late]), axis=1).max() < 0.4
+    assert (
+        np.linalg.norm(odometry.p[late] - position_at(flight, odometry.t[late]), axis=1).max() < 0.4
+    )
 
 
 def test_streams_of_columns_that_are_no_floats_are_taken_as_numbers():
-    """A driver may hand over what numpy or a message gives it: np.float32, np.uint16, tuples, arrays."""
+    """A driver may hand over what numpy or a message gives it: np.float32, np.uint16, tuples,
+    arrays.
+    """
     flight = fly(14, 1.5)
-    flight = replace(flight, tdoa=Tdoas(*(column for column in (flight.tdoa.t, *_ids(flight), flight.tdoa.d))))
+    flight = replace(
+        flight, tdoa=Tdoas(*(column for column in (flight.tdoa.t, *_ids(flight), flight.tdoa.d)))
+    )
     estimator, parts = Estimator(flight.anchors), []
     for t, stream, i in messages(flight):
         if stream == IMU:
-            estimator.add_imu(np.float64(t), tuple(flight.imu.gyro[i]), flight.imu.accel[i].tolist())
+            estimator.add_imu(
+                np.float64(t), tuple(flight.imu.gyro[i]), flight.imu.accel[i].tolist()
+            )
         else:
             estimator.add_tdoa(np.float64(t), flight.tdoa.a[i], flight.tdoa.b[i], flight.tdoa.d[i])
         parts.append(estimator.advance())
@@ -464,10 +523,19 @@ def test_a_sensor_whose_clock_is_ahead_costs_its_own_messages_and_is_named(ahead
         parts.append(estimator.advance())
         if k == 2300:
             (finding,) = estimator.clocks
-            assert finding.rule == "clock_ahead" and "velocity" in finding.sentence and finding.value == pytest.approx(ahead, abs=0.1)
+            assert (
+                finding.rule == "clock_ahead"
+                and "velocity" in finding.sentence
+                and finding.value == pytest.approx(ahead, abs=0.1)
+            )
     parts.append(estimator.finish())
     assert estimator.counts["velocity_invalid"] > 2300 and estimator.counts["velocity_used"] == 0
-    assert estimator.counts["late"] == estimator.counts["imu_late"] == estimator.counts["restarts"] == 0
+    assert (
+        estimator.counts["late"]
+        == estimator.counts["imu_late"]
+        == estimator.counts["restarts"]
+        == 0
+    )
     expected, _ = feed(Estimator(flight.anchors), flight)
     assert_same(joined([part[0] for part in parts]), expected)
 
@@ -479,9 +547,18 @@ def test_a_few_stamps_of_a_sensor_that_fell_back_start_nothing_anew():
         send(estimator, flight, stream, i)
         if stream == TDOA and i % 4 == 0:
             late = 5.0 if 100 <= i < 108 else 0.0
-            estimator.add("pressure", pressure.read(np.array([t - late]), {name: np.full(1, 1e5) for name in pressure.fields}))
+            estimator.add(
+                "pressure",
+                pressure.read(
+                    np.array([t - late]), {name: np.full(1, 1e5) for name in pressure.fields}
+                ),
+            )
         estimator.advance()
-    assert estimator.counts["restarts"] == 0 and estimator.counts["pressure_late"] == 2 and estimator.running
+    assert (
+        estimator.counts["restarts"] == 0
+        and estimator.counts["pressure_late"] == 2
+        and estimator.running
+    )
 
 
 def test_a_restart_is_named_for_a_while():
@@ -501,11 +578,13 @@ def test_anchors_that_are_sent_again_with_jitter_are_those_that_were_there():
     flight, rng = fly(8, 3.0), np.random.default_rng(4)
     expected, _ = feed(Estimator(flight.anchors), flight)
     estimator, parts = Estimator(flight.anchors), []
-    for k, (t, stream, i) in enumerate(messages(flight)):
+    for k, (_t, stream, i) in enumerate(messages(flight)):
         send(estimator, flight, stream, i)
         if k % 50 == 0:
             places = flight.anchors.positions
-            estimator.change_anchors(flight.anchors.at(places + rng.uniform(-0.002, 0.002, places.shape)))
+            estimator.change_anchors(
+                flight.anchors.at(places + rng.uniform(-0.002, 0.002, places.shape))
+            )
         parts.append(estimator.advance())
     parts.append(estimator.finish())
     assert_same(joined([part[0] for part in parts]), expected)

@@ -1,4 +1,6 @@
-"""Streams that are wrong, through the Estimator and off line: the same to the bit, and the covariance knows."""
+"""Streams that are wrong, through the Estimator and off line: the same to the bit, and the
+covariance knows.
+"""
 
 from dataclasses import fields, replace
 
@@ -9,8 +11,8 @@ import pytest
 
 from uwb_tdoa_ekf.core.verdicts import REPEATED
 from uwb_tdoa_ekf.estimator import Estimator
-from uwb_tdoa_ekf.reorder_buffer import MOST_WAITING
 from uwb_tdoa_ekf.offline import run_offline
+from uwb_tdoa_ekf.reorder_buffer import MOST_WAITING
 
 BEGIN, END = 5.0, 9.0  # s, of a fault
 IMU_FAULTS = {
@@ -21,17 +23,27 @@ IMU_FAULTS = {
 
 
 @pytest.mark.parametrize("fault", IMU_FAULTS)
-def test_without_an_imu_that_cannot_be_right_the_filter_knows_how_well_it_does_whatever_the_arrival(fault):
-    flight, rng = fly(3, 14.0, imu_rate=100.0, tdoa_rate=100.0, tdoa_std=0.05), np.random.default_rng(1)
+def test_without_an_imu_that_cannot_be_right_the_filter_knows_how_well_it_does_whatever_the_arrival(
+    fault,
+):
+    flight, rng = (
+        fly(3, 14.0, imu_rate=100.0, tdoa_rate=100.0, tdoa_std=0.05),
+        np.random.default_rng(1),
+    )
     imu = flight.imu
     wrong = ((imu.t > BEGIN) & (imu.t < END))[:, None]
-    gyro, accel = (np.where(wrong, bad, good) for bad, good in zip(IMU_FAULTS[fault](imu.gyro, imu.accel), (imu.gyro, imu.accel)))
+    gyro, accel = (
+        np.where(wrong, bad, good)
+        for bad, good in zip(IMU_FAULTS[fault](imu.gyro, imu.accel), (imu.gyro, imu.accel))
+    )
     harmed = replace(flight, imu=replace(imu, gyro=gyro, accel=accel))
     order = arriving(harmed, rng, tdoa_delay=0.05)
     assert_same_as_offline(harmed, order=order, advance=lambda: rng.random() < 0.2)
     odometry = run_offline(harmed).odometry
     error = odometry.p - position_at(flight, odometry.t)
-    nees = np.einsum("ni,ni->n", error, np.linalg.solve(odometry.covariance[:, :3, :3], error[..., None])[..., 0])
+    nees = np.einsum(
+        "ni,ni->n", error, np.linalg.solve(odometry.covariance[:, :3, :3], error[..., None])[..., 0]
+    )
     assert nees[odometry.t > 1.0].max() < 8.0
     assert np.linalg.norm(error, axis=1)[odometry.t > BEGIN].max() < 0.6
     assert np.linalg.norm(error, axis=1)[odometry.t > END + 1.0].max() < 0.2
@@ -39,7 +51,9 @@ def test_without_an_imu_that_cannot_be_right_the_filter_knows_how_well_it_does_w
 
 def twice(flight):
     """The Flight with every TDOA twice, the second one right after the first."""
-    repeated = {field.name: np.repeat(getattr(flight.tdoa, field.name), 2) for field in fields(flight.tdoa)}
+    repeated = {
+        field.name: np.repeat(getattr(flight.tdoa, field.name), 2) for field in fields(flight.tdoa)
+    }
     return replace(flight, tdoa=replace(flight.tdoa, **repeated))
 
 
@@ -70,7 +84,9 @@ def test_a_stream_whose_stamps_do_not_go_on_is_used_and_does_not_grow(step):
     imu, tdoa, n = flight.imu, flight.tdoa, MOST_WAITING + 500
     estimator = Estimator(flight.anchors)
     estimator.add_imu(imu.t, imu.gyro, imu.accel)
-    estimator.add_tdoa(tdoa.t[[1, 0]], tdoa.a[:2], tdoa.b[:2], tdoa.d[:2])  # out of order: what is stamped alike is waited for
+    estimator.add_tdoa(
+        tdoa.t[[1, 0]], tdoa.a[:2], tdoa.b[:2], tdoa.d[:2]
+    )  # out of order: what is stamped alike is waited for
     ids = flight.anchors.ids[np.arange(n) % len(flight.anchors)]
     for k in range(3):
         estimator.add_tdoa(100.0 + step * (k * n + np.arange(n)), ids, np.roll(ids, 1), np.zeros(n))

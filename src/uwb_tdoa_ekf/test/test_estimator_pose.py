@@ -1,4 +1,6 @@
-"""What an Estimator is told in flight: poses, a reset, another FilterConfig, that an anchor has changed."""
+"""What an Estimator is told in flight: poses, a reset, another FilterConfig, that an anchor has
+changed.
+"""
 
 from dataclasses import replace
 import math
@@ -65,14 +67,18 @@ def test_a_pose_that_comes_late_counts_from_the_next_measurement_and_another_tim
     t = flight.imu.t[-1] + 0.005
     estimator.add_imu(t, flight.imu.gyro[-1], flight.imu.accel[-1])
     odometry, _ = estimator.finish()
-    assert odometry.p[-1, 1] - position_at(flight, np.array([1.5]))[0, 1] == pytest.approx(3.0, abs=0.1)
+    assert odometry.p[-1, 1] - position_at(flight, np.array([1.5]))[0, 1] == pytest.approx(
+        3.0, abs=0.1
+    )
     for stamp in (t - 5.0, t + 100.0):
         with pytest.raises(InputError, match="its stamp is"):
             estimator.set_pose(stamp, np.zeros(3), np.eye(3))
 
 
 @pytest.mark.parametrize("stamp", [1.7e9, -500.0])
-def test_a_pose_of_another_clock_that_comes_before_the_first_measurement_is_dropped_and_said_to_be(stamp):
+def test_a_pose_of_another_clock_that_comes_before_the_first_measurement_is_dropped_and_said_to_be(
+    stamp,
+):
     flight = fly(duration=2.0)
     estimator = Estimator(flight.anchors)
     estimator.set_pose(stamp, np.zeros(3), np.eye(3))
@@ -137,16 +143,26 @@ def test_a_delay_that_comes_in_flight_is_taken_out_if_asked_for_whatever_the_arr
     rng = np.random.default_rng(2)
     assert_same_as_offline(harmed, config, advance=lambda: rng.random() < 0.01)
     errors = {}
-    for name, (run_of, of) in {"sound": (flight, config), "off": (harmed, None), "on": (harmed, config)}.items():
+    for name, (run_of, of) in {
+        "sound": (flight, config),
+        "off": (harmed, None),
+        "on": (harmed, config),
+    }.items():
         run = run_offline(run_of, of)
         late = run.odometry.t > 25.0
-        errors[name] = np.sqrt(np.mean((run.odometry.p[late] - position_at(flight, run.odometry.t[late])) ** 2))
+        errors[name] = np.sqrt(
+            np.mean((run.odometry.p[late] - position_at(flight, run.odometry.t[late])) ** 2)
+        )
         of_anchor = (run.residuals.a == FIRST) | (run.residuals.b == FIRST)
         compensated = run.residuals.verdict == COMPENSATED
         assert compensated.any() == (name == "on") and not compensated[~of_anchor].any()
         if name == "on":  # the innovation still has the delay
-            assert np.mean(np.abs(run.residuals.innovation[compensated])) == pytest.approx(0.8, abs=0.15)
+            assert np.mean(np.abs(run.residuals.innovation[compensated])) == pytest.approx(
+                0.8, abs=0.15
+            )
     assert errors["on"] < 0.5 * errors["off"]
     estimator = Estimator(harmed.anchors)
     feed(estimator, harmed)
-    assert estimator.alarms[0].startswith(f"anchor {FIRST}: ") and estimator.counts["compensated"] == 0
+    assert (
+        estimator.alarms[0].startswith(f"anchor {FIRST}: ") and estimator.counts["compensated"] == 0
+    )

@@ -3,19 +3,23 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.flyable import FlyableVolume
 
 pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
-from uwb_tdoa_ekf.monitoring import health  # noqa: E402
 from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
+from uwb_tdoa_ekf.monitoring import health  # noqa: E402
 from uwb_tdoa_ekf.monitoring.health import ERROR, OK, WARN  # noqa: E402
 from uwb_tdoa_ekf.streams import Finding  # noqa: E402
 
 # The node looks five times a second; here a report is a look, once a second.
-STARTING, RUNNING = SimpleNamespace(running=False, lost=None), SimpleNamespace(running=True, side_unknown=None)
+STARTING, RUNNING = (
+    SimpleNamespace(running=False, lost=None),
+    SimpleNamespace(running=True, side_unknown=None),
+)
 
 
 class Clock:
@@ -43,7 +47,10 @@ def test_says_what_is_missing(clock):
     judge = health.Health(FilterConfig(), lag=0.25)
     level, text, _ = second(clock, judge, None)
     assert level == ERROR and "uwb/anchors" in text
-    assert second(clock, judge, STARTING, refused="anchor 3 is nowhere")[:2] == (ERROR, "anchor 3 is nowhere")
+    assert second(clock, judge, STARTING, refused="anchor 3 is nowhere")[:2] == (
+        ERROR,
+        "anchor 3 is nowhere",
+    )
     level, text, _ = second(clock, judge, RUNNING, tdoa=0)
     assert level == ERROR and "uwb/tdoa_corrected" in text
     level, text, _ = second(clock, judge, RUNNING, imu=0)
@@ -53,7 +60,9 @@ def test_says_what_is_missing(clock):
 
 def test_a_lost_tag_is_a_warning_and_no_start(clock):
     judge = health.Health(FilterConfig(), lag=0.25)
-    level, text, values = second(clock, judge, SimpleNamespace(running=False, lost="the tag is lost"))
+    level, text, values = second(
+        clock, judge, SimpleNamespace(running=False, lost="the tag is lost")
+    )
     assert (level, text, values["state"]) == (WARN, "the tag is lost", "lost")
 
 
@@ -81,14 +90,26 @@ def test_most_tdoas_lost_for_one_reason_is_a_warning(clock, name):
 def test_most_tdoas_rejected_for_seconds_is_a_warning(clock):
     judge, said = health.Health(FilterConfig(), lag=0.25), []
     for k in range(20):
-        said.append(second(clock, judge, RUNNING, used=400 * min(k, 10) + 1, rejected=400 * max(k - 10, 0))[:2])
-    assert [level for level, _ in said[:11]] == [OK] * 11 and said[-1][0] == WARN and "contradict" in said[-1][1]
+        said.append(
+            second(clock, judge, RUNNING, used=400 * min(k, 10) + 1, rejected=400 * max(k - 10, 0))[
+                :2
+            ]
+        )
+    assert (
+        [level for level, _ in said[:11]] == [OK] * 11
+        and said[-1][0] == WARN
+        and "contradict" in said[-1][1]
+    )
 
 
 def test_a_filter_that_starts_anew_again_and_again_is_not_blamed_on_the_anchors(clock):
     judge = health.Health(FilterConfig(), lag=0.25)
     said = [second(clock, judge, STARTING, startup=100 * k, restarts=k) for k in range(10)]
-    assert said[-1][0] == WARN and "starts anew" in said[-1][1] and "ids and positions" not in said[-1][1]
+    assert (
+        said[-1][0] == WARN
+        and "starts anew" in said[-1][1]
+        and "ids and positions" not in said[-1][1]
+    )
 
 
 def test_rates_and_age(clock):
@@ -107,13 +128,17 @@ def test_rates_and_age(clock):
     }
 
 
-@pytest.mark.parametrize("behind, level", [(-0.5, OK), (0.9, OK), (1.1, WARN), (59.0, WARN), (3600.0, OK)])
+@pytest.mark.parametrize(
+    "behind, level", [(-0.5, OK), (0.9, OK), (1.1, WARN), (59.0, WARN), (3600.0, OK)]
+)
 def test_odometry_that_falls_behind_the_clock_is_a_warning(clock, behind, level):
     judge = health.Health(FilterConfig(), lag=0.25)
     judge.behind = behind
     said, text, values = second(clock, judge, RUNNING, used=400)
     assert said == level and ("too slow" in text) == (level == WARN)
-    expected = f"{behind:.3f} s" if behind < 60.0 else "not comparable: the stamps are of another time"
+    expected = (
+        f"{behind:.3f} s" if behind < 60.0 else "not comparable: the stamps are of another time"
+    )
     assert values["odometry behind the clock"].startswith(expected)
     judge.behind = 2.0
     said = [second(clock, judge, RUNNING, used=400, invalid=400 * (k + 1))[1] for k in range(3)]
@@ -134,7 +159,9 @@ def test_a_tag_outside_of_the_flyable_volume_is_a_warning(clock):
     level, text, values = second(clock, judge, running)
     assert level == WARN and "outside of the flyable volume" in text and values["flyable"] == "no"
     for k in range(3):
-        level, text, values = second(clock, judge, running, used=1, invalid=99 * (k + 1))  # what matters more is said
+        level, text, values = second(
+            clock, judge, running, used=1, invalid=99 * (k + 1)
+        )  # what matters more is said
     assert level == WARN and "invalid" in text and values["flyable"] == "no"
     judge.last_position = np.array([0.5, 0.5, 0.5]), np.eye(3)
     for _ in range(2):
@@ -160,7 +187,9 @@ def test_an_aid_that_stops_is_told_and_so_is_one_that_contradicts(clock):
 
 def test_what_is_wrong_with_the_streams_is_said_before_what_comes_of_it(clock):
     judge = health.Health(FilterConfig(), lag=0.25)
-    units = Finding("imu_force_unit", "error", "the accelerometer is in g", "it is 1.0", "multiply\n  it", 9.81)
+    units = Finding(
+        "imu_force_unit", "error", "the accelerometer is in g", "it is 1.0", "multiply\n  it", 9.81
+    )
     slow = Finding("rate", "warning", "imu/data is slow", "20 Hz", "raise it", 20.0)
     publishers = "2 publish on imu/data (/a, /b): stop all but one"
 
@@ -172,10 +201,18 @@ def test_what_is_wrong_with_the_streams_is_said_before_what_comes_of_it(clock):
     level, text, values = said(STARTING, [publishers], [units, slow])
     first = "the accelerometer is in g (it is 1.0): multiply it"
     assert (level, text) == (ERROR, f"{first} | {publishers} | imu/data is slow (20 Hz): raise it")
-    assert said(STARTING, [publishers, "one", "two"], [units, slow])[1].endswith("| one | and 2 more")
-    assert publishers in values["wrong with the streams"] and "imu/data is slow" in values["wrong with the streams"]
+    assert said(STARTING, [publishers, "one", "two"], [units, slow])[1].endswith(
+        "| one | and 2 more"
+    )
+    assert (
+        publishers in values["wrong with the streams"]
+        and "imu/data is slow" in values["wrong with the streams"]
+    )
     assert (values["found imu_force_unit"], values["found rate"]) == ("9.81", "20")
-    assert said(RUNNING, [publishers], [slow], used=400)[:2] == (WARN, f"{publishers} | imu/data is slow (20 Hz): raise it")
+    assert said(RUNNING, [publishers], [slow], used=400)[:2] == (
+        WARN,
+        f"{publishers} | imu/data is slow (20 Hz): raise it",
+    )
     assert said(RUNNING, [], [slow], used=800)[:2] == (WARN, "imu/data is slow (20 Hz): raise it")
     level, text, values = said(RUNNING, used=1200)
     assert (level, text, values["wrong with the streams"]) == (OK, "running", "nothing")
@@ -190,5 +227,10 @@ def test_odometry_that_is_ahead_of_the_clock_is_a_warning(clock):
 
 def test_a_side_that_nobody_knows_is_a_warning(clock):
     judge = health.Health(FilterConfig(), lag=0.25)
-    level, text, _ = second(clock, judge, SimpleNamespace(running=True, side_unknown="set tag_side to below or above"), used=400)
+    level, text, _ = second(
+        clock,
+        judge,
+        SimpleNamespace(running=True, side_unknown="set tag_side to below or above"),
+        used=400,
+    )
     assert (level, text) == (WARN, "set tag_side to below or above")

@@ -7,8 +7,15 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.hypotheses import (
-    LARGEST_NIS, MERGED_WITHIN, PRUNED_BELOW, YAW_STD, add_log_likelihood, add_spread_of_means, select, yaw_offset,
-)  # fmt: skip
+    LARGEST_NIS,
+    MERGED_WITHIN,
+    PRUNED_BELOW,
+    YAW_STD,
+    add_log_likelihood,
+    add_spread_of_means,
+    select,
+    yaw_offset,
+)
 from uwb_tdoa_ekf.core.memory import HYPOTHESES, PLACES, YAWS, new_state
 from uwb_tdoa_ekf.offline import run_offline
 
@@ -23,7 +30,9 @@ def yaw_errors(flight, odometry):
 
 def ekf_with(yaws, log_weights):
     ekf = new_state(np.zeros((4, 3))).record
-    ekf.hypotheses["log_weight"] = np.append(log_weights, np.full(HYPOTHESES - len(log_weights), -np.inf))
+    ekf.hypotheses["log_weight"] = np.append(
+        log_weights, np.full(HYPOTHESES - len(log_weights), -np.inf)
+    )
     for h, yaw in enumerate(yaws):
         ekf.hypotheses["x"][h, 6:10] = Rotation.from_euler("z", yaw).as_quat()
     return ekf
@@ -78,7 +87,9 @@ def test_spread_of_means_is_the_distance_to_the_others():
 
 @pytest.mark.parametrize("wrong", [0.5 * np.pi, -0.5 * np.pi, np.pi, 0.8])
 def test_a_yaw_that_nobody_told_is_found_while_moving_and_doubted_until_then(wrong):
-    """Within 15 degrees 10 s after the start; before, the error is inside three of its own standard deviations."""
+    """Within 15 degrees 10 s after the start; before, the error is inside three of its own standard
+    deviations.
+    """
     for seed in range(3):
         flight = fly(seed, 15.0, **NOISE)
         yaw = Rotation.from_quat(flight.truth.q[0]).as_euler("ZYX")[0]

@@ -9,9 +9,9 @@ from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
-from uwb_tdoa_ekf.core.verdicts import REJECTED, STARTUP, USED
 from uwb_tdoa_ekf.core.initialization import remember
 from uwb_tdoa_ekf.core.memory import TDOA, WINDOW, new_state, structured
+from uwb_tdoa_ekf.core.verdicts import REJECTED, STARTUP, USED
 
 
 def test_starts_by_itself_within_its_window_and_knows_where_it_is():
@@ -46,7 +46,10 @@ def test_contradicting_tdoas_start_only_after_the_timeout():
 def test_one_tdoa_long_before_the_others_does_not_use_up_the_timeout():
     flight = fly(4, 3.0, outliers=0.6, begin=30.0)
     early = np.concatenate([[1.0], flight.tdoa.t])
-    first = [np.concatenate([column[:1], column]) for column in (flight.tdoa.a, flight.tdoa.b, flight.tdoa.d)]
+    first = [
+        np.concatenate([column[:1], column])
+        for column in (flight.tdoa.a, flight.tdoa.b, flight.tdoa.d)
+    ]
     odometry, _ = drive(replace(flight, tdoa=Tdoas(early, *first)))
     assert odometry.t[0] > 30.4  # a window of start_window, not a dozen TDOAs
 
@@ -61,7 +64,9 @@ def test_finds_a_tag_again_that_was_carried_away(robust):
     d = tdoa(p, positions[far.anchors.index(far.tdoa.a)], positions[far.anchors.index(far.tdoa.b)])
     d += 0.1 * np.random.default_rng(0).standard_normal(len(d))
     state = state_for(far)
-    odometry, _ = drive(replace(far, tdoa=replace(far.tdoa, d=d)), FilterConfig(robust=robust), state)
+    odometry, _ = drive(
+        replace(far, tdoa=replace(far.tdoa, d=d)), FilterConfig(robust=robust), state
+    )
     assert state.record.recoveries <= 2
     assert np.linalg.norm(odometry.x[odometry.t > 8.0, :3] - there, axis=1).max() < 0.3
     assert_sound(state, odometry)
@@ -79,7 +84,11 @@ def test_the_window_keeps_the_latest_tdoas_in_order():
     state, fed = new_state(np.zeros((4, 3))), 5 * WINDOW + 7
     ekf = state.record
     for k in range(fed):
-        remember(ekf, structured(TDOA, *np.array([[0.01 * k], [k % 4], [0], [k], [0.0]]))[0], state.anchors)
+        remember(
+            ekf,
+            structured(TDOA, *np.array([[0.01 * k], [k % 4], [0], [k], [0.0]]))[0],
+            state.anchors,
+        )
     assert WINDOW <= ekf.kept <= 2 * WINDOW
     np.testing.assert_array_equal(ekf.window["d"][: ekf.kept], np.arange(fed - ekf.kept, fed))
 
@@ -89,7 +98,9 @@ def beside(flight, positions):
     a, b = flight.anchors.index(flight.tdoa.a), flight.anchors.index(flight.tdoa.b)
     p = flight.meta["wave"].motion(flight.tdoa.t)[0]
     d = tdoa(p, positions[a], positions[b]) + 0.1 * np.random.default_rng(0).standard_normal(len(p))
-    return replace(flight, anchors=replace(flight.anchors, positions=positions), tdoa=replace(flight.tdoa, d=d))
+    return replace(
+        flight, anchors=replace(flight.anchors, positions=positions), tdoa=replace(flight.tdoa, d=d)
+    )
 
 
 def test_of_anchors_on_a_wall_both_sides_are_followed_until_motion_tells():

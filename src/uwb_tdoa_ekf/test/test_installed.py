@@ -27,20 +27,27 @@ def after(before=BOX):
 
 
 def flight_through(seed=3, seconds=8.0, everything=False):
-    """Flight among the anchors that there are at each time; everything : the one that is gone sends on."""
+    """Flight among the anchors that there are at each time; everything : the one that is gone sends
+    on.
+    """
     flight, rng = fly(seed, seconds), np.random.default_rng(seed)
     t = flight.tdoa.t
     parts = []
     for anchors, rows in ((BOX, t < CHANGE), (after(), t >= CHANGE)):
         if everything:
             anchors = (
-                Anchors.from_positions(np.vstack([anchors.positions, BOX.positions[:1]]), np.append(anchors.ids[:], GONE))
+                Anchors.from_positions(
+                    np.vstack([anchors.positions, BOX.positions[:1]]),
+                    np.append(anchors.ids[:], GONE),
+                )
                 if rows[-1]
                 else anchors
             )
         a = rng.integers(0, len(anchors), rows.sum())
         b = (a + rng.integers(1, len(anchors), rows.sum())) % len(anchors)
-        d = tdoa(position_at(flight, t[rows]), anchors.positions[a], anchors.positions[b]) + 0.05 * rng.standard_normal(rows.sum())
+        d = tdoa(
+            position_at(flight, t[rows]), anchors.positions[a], anchors.positions[b]
+        ) + 0.05 * rng.standard_normal(rows.sum())
         parts.append((t[rows], anchors.ids[a], anchors.ids[b], d))
     return replace(flight, anchors=BOX, tdoa=Tdoas(*map(np.concatenate, zip(*parts))))
 
@@ -90,20 +97,36 @@ def test_untold_the_anchor_that_was_moved_contradicts():
 def test_one_that_is_gone_is_used_no_more():
     *_, (_, residuals) = flown(everything=True)
     gone = (residuals.a == GONE) | (residuals.b == GONE)
-    assert gone.sum() > 50 and (residuals.verdict[gone] == INVALID).all() and (residuals.verdict[~gone] != INVALID).all()
+    assert (
+        gone.sum() > 50
+        and (residuals.verdict[gone] == INVALID).all()
+        and (residuals.verdict[~gone] != INVALID).all()
+    )
 
 
 def test_what_was_learned_of_those_that_stay_is_kept_and_of_one_that_moved_forgotten():
     flight, estimator = flight_through(), Estimator(BOX)
     fed(estimator, cut(flight, -np.inf, CHANGE))
     before = estimator._pipeline.state.anchors.copy()
-    before["excess_variance"] = estimator._pipeline.state.anchors["excess_variance"] = 0.01 * (1.0 + np.arange(len(BOX)))
+    before["excess_variance"] = estimator._pipeline.state.anchors["excess_variance"] = 0.01 * (
+        1.0 + np.arange(len(BOX))
+    )
     estimator.change_anchors(after())
-    np.testing.assert_array_equal(estimator._pipeline.state.anchors["excess_variance"][: len(BOX)], before["excess_variance"])
+    np.testing.assert_array_equal(
+        estimator._pipeline.state.anchors["excess_variance"][: len(BOX)], before["excess_variance"]
+    )
     moved, added = estimator._installed.index(np.array([MOVED, ADDED]))
-    assert estimator._pipeline.state.anchors["excess_variance"][[moved, added]].tolist() == [0.0, 0.0]
-    np.testing.assert_array_equal(estimator._pipeline.state.anchors["position"][[moved, added]], [PLACE, NEW])
-    np.testing.assert_array_equal(estimator._pipeline.state.record.extent, [after().positions.min(axis=0), after().positions.max(axis=0)])
+    assert estimator._pipeline.state.anchors["excess_variance"][[moved, added]].tolist() == [
+        0.0,
+        0.0,
+    ]
+    np.testing.assert_array_equal(
+        estimator._pipeline.state.anchors["position"][[moved, added]], [PLACE, NEW]
+    )
+    np.testing.assert_array_equal(
+        estimator._pipeline.state.record.extent,
+        [after().positions.min(axis=0), after().positions.max(axis=0)],
+    )
 
 
 def test_a_reset_afterwards_and_an_anchor_that_comes_back():
@@ -127,7 +150,9 @@ def test_who_moves_anchors_again_and_again_fills_no_memory(monkeypatch):
     monkeypatch.setattr("uwb_tdoa_ekf.estimator.MOST_ROWS", len(BOX) + 3)
     estimator, moved = Estimator(BOX), 0
     for k in range(10):
-        other = BOX.at(BOX.positions + [[0.1 * (k + 1), 0.0, 0.0]] * (np.arange(len(BOX)) == 0)[:, None])
+        other = BOX.at(
+            BOX.positions + [[0.1 * (k + 1), 0.0, 0.0]] * (np.arange(len(BOX)) == 0)[:, None]
+        )
         if estimator.stay(other):
             estimator.change_anchors(other)
             moved += 1
@@ -138,14 +163,18 @@ def test_nothing_is_said_of_an_anchor_that_was_taken_away():
     """It is not heard any more; as long as it should be there, the monitor says so."""
     flight = fly(5, 16.0, tdoa_rate=400.0)
     quiet = (flight.tdoa.t > 6.0) & ((flight.tdoa.a == GONE) | (flight.tdoa.b == GONE))
-    flight = replace(flight, tdoa=Tdoas(*(getattr(flight.tdoa, name)[~quiet] for name in ("t", "a", "b", "d"))))
+    flight = replace(
+        flight, tdoa=Tdoas(*(getattr(flight.tdoa, name)[~quiet] for name in ("t", "a", "b", "d")))
+    )
     for taken in (False, True):
         estimator = Estimator(BOX)
         fed(estimator, cut(flight, -np.inf, 6.0))
         if taken:
             estimator.change_anchors(BOX.only(range(1, len(BOX))))
         fed(estimator, cut(flight, 6.0, np.inf))
-        assert any(f"anchor {GONE} is not heard" in alarm for alarm in estimator.alarms) == (not taken)
+        assert any(f"anchor {GONE} is not heard" in alarm for alarm in estimator.alarms) == (
+            not taken
+        )
 
 
 @pytest.mark.parametrize("times", [1, 3])

@@ -2,9 +2,9 @@
 
 from dataclasses import replace
 
+from flights import fly, position_at
 import numpy as np
 import pytest
-from flights import fly, position_at
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.flight import Imu
@@ -13,20 +13,35 @@ from uwb_tdoa_ekf.frames import rotation_std
 from uwb_tdoa_ekf.offline import run_offline
 
 LATE = 2.0  # s
-TURNS = {"upright": [0.0, 0.0, 0.0], "on its side": [1.5, 0.0, 0.0], "upside down, tilted": [2.7, 0.4, 1.0]}
+TURNS = {
+    "upright": [0.0, 0.0, 0.0],
+    "on its side": [1.5, 0.0, 0.0],
+    "upside down, tilted": [2.7, 0.4, 1.0],
+}
 
 
 def flown(turn):
-    """A flight with an inertial sensor that begins late, in axes that are turned by a rotation vector."""
+    """A flight with an inertial sensor that begins late, in axes that are turned by a rotation
+    vector.
+    """
     flight, turn = fly(seed=8, duration=16.0), Rotation.from_rotvec(turn)
     later = flight.imu.t > flight.imu.t[0] + LATE
-    return replace(flight, imu=Imu(flight.imu.t[later], turn.apply(flight.imu.gyro[later]), turn.apply(flight.imu.accel[later])))
+    return replace(
+        flight,
+        imu=Imu(
+            flight.imu.t[later],
+            turn.apply(flight.imu.gyro[later]),
+            turn.apply(flight.imu.accel[later]),
+        ),
+    )
 
 
 def errors(flight, run):
     late = run.odometry.t > flight.imu.t[0] + 3.0
     error = run.odometry.p[late] - position_at(flight, run.odometry.t[late])
-    nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(run.odometry.covariance[late, :3, :3]), error)
+    nees = np.einsum(
+        "ni,nij,nj->n", error, np.linalg.inv(run.odometry.covariance[late, :3, :3]), error
+    )
     return np.sqrt(np.mean(np.sum(error**2, axis=1))), np.mean(nees)
 
 

@@ -19,6 +19,7 @@ from real_launch import PATIENCE, WHY_NOT, Launch, ros2  # noqa: E402
 from rig import make_rig, recording  # noqa: E402, F401
 from rosgraph_msgs.msg import Clock  # noqa: E402
 from test_nodes import ticking  # noqa: E402
+
 from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(WHY_NOT is not None, reason=str(WHY_NOT))]
@@ -57,7 +58,9 @@ PROFILES = """<?xml version="1.0" encoding="UTF-8" ?>
 
 @pytest.fixture
 def launch(tmp_path):
-    """launch(*words, rig=None, path=()) gives a Launch, which ends with the test; rig : a Rig that waits for nodes of it."""
+    """launch(*words, rig=None, path=()) gives a Launch, which ends with the test; rig : a Rig that
+    waits for nodes of it.
+    """
     started = []
 
     def make(*words, rig=None, **options):
@@ -74,7 +77,9 @@ def launch(tmp_path):
 
 
 def left_behind(launched):
-    """Names of what is in its folder for temporary files, but for what numba and the middleware keep there."""
+    """Names of what is in its folder for temporary files, but for what numba and the middleware
+    keep there.
+    """
     return sorted(path.name for path in launched.temporary.iterdir())
 
 
@@ -95,8 +100,16 @@ def values_of(rig, node, *names):
 
 def reliable(file, namespace):
     """Write a parameter file, of both nodes, with which no message is lost."""
-    ends = "uwb/tdoa.subscription", "imu/data.subscription", "odometry.subscription", "uwb/tdoa_corrected.subscription"
-    told = {f"/{namespace}/{name}": {kind: {"reliability": "reliable"}} for name, kind in (end.rsplit(".", 1) for end in ends)}
+    ends = (
+        "uwb/tdoa.subscription",
+        "imu/data.subscription",
+        "odometry.subscription",
+        "uwb/tdoa_corrected.subscription",
+    )
+    told = {
+        f"/{namespace}/{name}": {kind: {"reliability": "reliable"}}
+        for name, kind in (end.rsplit(".", 1) for end in ends)
+    }
     file.write_text(yaml.safe_dump({"/**": {"ros__parameters": {"qos_overrides": told}}}))
     return file
 
@@ -112,20 +125,39 @@ def tags_file(folder, text):
 
 
 def test_one_tag_on_simulated_time_from_start_to_ctrl_c(make_rig, launch, tmp_path):
-    flight, rig, epoch = recording(2.0), make_rig(latched=False), int(time.time()) + 10**6  # diagnostics are newer than any before
+    flight, rig, epoch = (
+        recording(2.0),
+        make_rig(latched=False),
+        int(time.time()) + 10**6,
+    )  # diagnostics are newer than any before
     file = reliable(tmp_path / "reliable.yaml", rig.namespace)
     clock = rig.node.create_publisher(Clock, "/clock", 10)
     launched = launch(
-        "uwb_tdoa_ekf", "tdoa.launch.py", f"namespace:={rig.namespace}", f"anchors_file:={file_of(flight, tmp_path)}",
-        f"bias_params:={file}", f"ekf_params:={file}", "publish_tf:=odom", "use_sim_time:=true", "world_frame:=hall: 1 # 'ä'", rig=rig,
-    )  # fmt: skip
-    launched.wait(f"ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST, ROS_DOMAIN_ID={os.environ['ROS_DOMAIN_ID']}: heard by nodes on this machine")
+        "uwb_tdoa_ekf",
+        "tdoa.launch.py",
+        f"namespace:={rig.namespace}",
+        f"anchors_file:={file_of(flight, tmp_path)}",
+        f"bias_params:={file}",
+        f"ekf_params:={file}",
+        "publish_tf:=odom",
+        "use_sim_time:=true",
+        "world_frame:=hall: 1 # 'ä'",
+        rig=rig,
+    )
+    launched.wait(
+        "ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST, "
+        f"ROS_DOMAIN_ID={os.environ['ROS_DOMAIN_ID']}: heard by nodes on this machine"
+    )
     with ticking(clock, epoch):
         rig.meet("bias_node", "ekf_node")
         rig.play(flight, epoch)
-        assert values_of(rig, f"/{rig.namespace}/ekf_node", "publish_tf", "use_sim_time", "world_frame") == ["odom", True, "hall: 1 # 'ä'"]
+        assert values_of(
+            rig, f"/{rig.namespace}/ekf_node", "publish_tf", "use_sim_time", "world_frame"
+        ) == ["odom", True, "hall: 1 # 'ä'"]
         assert rig.counts("ekf_node", TDOAs_received=len(flight.tdoa))["used"] > 0
-    assert {message.header.frame_id for message in rig.odometry} == {"hall: 1 # 'ä'"} and len(rig.odometry) > 200
+    assert {message.header.frame_id for message in rig.odometry} == {"hall: 1 # 'ä'"} and len(
+        rig.odometry
+    ) > 200
     ends_well(launched)
 
 
@@ -133,35 +165,60 @@ def test_one_tag_on_simulated_time_from_start_to_ctrl_c(make_rig, launch, tmp_pa
 def test_several_tags_each_with_its_own_parameters(make_rig, launch, tmp_path, processes):
     flight, rig = recording(2.0), make_rig(latched=False)
     file_of(flight, tmp_path)
-    file = tags_file(tmp_path, "anchors_file: anchors.yaml\nmodel_file: ''\ntags: {tag0: {}, tag1: {tdoa_std: 0.3, body_frame: drone}}")
-    launched = launch("uwb_tdoa_ekf", "tags.launch.py", f"tags:={file}", *([f"processes:={processes}"] if processes else []), rig=rig)
+    file = tags_file(
+        tmp_path,
+        (
+            "anchors_file: anchors.yaml\nmodel_file: ''\ntags: {tag0: {}, tag1: {tdoa_std: 0.3, "
+            "body_frame: drone}}"
+        ),
+    )
+    launched = launch(
+        "uwb_tdoa_ekf",
+        "tags.launch.py",
+        f"tags:={file}",
+        *([f"processes:={processes}"] if processes else []),
+        rig=rig,
+    )
     rig.meet("bias_node", "ekf_node") if not processes else rig.meet("localization_node")
     rig.play(flight)
     rig.counts("ekf_node", TDOAs_received=len(flight.tdoa))
-    assert len(rig.odometry) > 200 and {message.child_frame_id for message in rig.odometry} == {"tag0/base_link"}
+    assert len(rig.odometry) > 200 and {message.child_frame_id for message in rig.odometry} == {
+        "tag0/base_link"
+    }
     default = FilterConfig().tdoa_std
     for tag, told in {"tag0": ["tag0/base_link", default], "tag1": ["drone", 0.3]}.items():
         assert values_of(rig, f"/{tag}/ekf_node", "body_frame", "tdoa_std") == told
-        assert values_of(rig, f"/{tag}/bias_node", "anchors_file") == [str(tmp_path / "anchors.yaml")]
+        assert values_of(rig, f"/{tag}/bias_node", "anchors_file") == [
+            str(tmp_path / "anchors.yaml")
+        ]
     for k in range(processes):
         tags = [["tag0", "tag1"]] if processes == 1 else [["tag0"], ["tag1"]]
         assert values_of(rig, f"/localization_node_{k + 1}", "tags") == [tags[k]]
     ends_well(launched)
 
 
-def test_list_parameters_of_a_launch_file_of_others_and_ours_in_their_namespace(make_rig, launch, tmp_path):
+def test_list_parameters_of_a_launch_file_of_others_and_ours_in_their_namespace(
+    make_rig, launch, tmp_path
+):
     rig = make_rig()
     file = tags_file(tmp_path, "model_file: ''\ntags: {tag0: {tdoa_std: 0.3}}")
     ours = Path(__file__).resolve().parents[1] / "launch" / "tags.launch.py"
-    (tmp_path / "robot.launch.py").write_text(INTEGRATOR.replace("TAGS", str(ours)).replace("FILE", str(file)))
+    (tmp_path / "robot.launch.py").write_text(
+        INTEGRATOR.replace("TAGS", str(ours)).replace("FILE", str(file))
+    )
     launched = launch(tmp_path / "robot.launch.py", rig=rig)
     assert values_of(rig, "/robot/localization_node", "tags") == [["one", "two"]]
     assert values_of(rig, "/robot/two/ekf_node", "body_frame") == ["drone"]
-    assert values_of(rig, "/hall/tag0/ekf_node", "tdoa_std", "body_frame") == [0.3, "tag0/base_link"]
+    assert values_of(rig, "/hall/tag0/ekf_node", "tdoa_std", "body_frame") == [
+        0.3,
+        "tag0/base_link",
+    ]
     assert "none of its parameters" not in launched.said
     launched.interrupt()
     assert "has died" not in launched.said
-    assert all(name.startswith("launch_params_") for name in left_behind(launched))  # of the node of the others
+    assert all(
+        name.startswith("launch_params_") for name in left_behind(launched)
+    )  # of the node of the others
 
 
 PLAYER = """#!/bin/sh
@@ -179,10 +236,16 @@ def test_a_bag_is_played_on_its_time_and_then_all_ends(make_rig, launch, tmp_pat
     player.chmod(0o755)
     bag.write_bag(recording(6.0), tmp_path / "flight")
     rig.node.create_subscription(Odometry, "/odometry", heard.append, 1000)
-    launched = launch("uwb_tdoa_ekf", "bag.launch.py", f"bag:={tmp_path / 'flight'}", path=[player.parent])
+    launched = launch(
+        "uwb_tdoa_ekf", "bag.launch.py", f"bag:={tmp_path / 'flight'}", path=[player.parent]
+    )
     rig.wait(lambda: len(heard) > 100 or launched.over, "the odometry of the bag")
     assert len(heard) > 100, launched.said
-    assert launched.ended() == 0 and "shutting down" in launched.said and "has died" not in launched.said, launched.said
+    assert (
+        launched.ended() == 0
+        and "shutting down" in launched.said
+        and "has died" not in launched.said
+    ), launched.said
     assert left_behind(launched) == []
     launched = launch("uwb_tdoa_ekf", "bag.launch.py", "bag:=/nowhere", path=[player.parent])
     assert launched.ended() == 1 and "ros2 bag play has ended with exit code 2" in launched.said
@@ -203,9 +266,15 @@ def test_a_node_that_crashes_is_started_again_each_time_later(make_rig, launch):
 
 @pytest.mark.parametrize("on_exit", ["shutdown", "stay"])
 def test_a_node_that_refuses_what_it_is_given_is_not_started_again(launch, on_exit):
-    launched = launch("uwb_tdoa_ekf", "tdoa.launch.py", "effects_file:=/nowhere.yaml", f"on_exit:={on_exit}")
-    launched.wait("_node: error: /nowhere.yaml")  # of either: with shutdown the first ends the other
-    launched.wait("_node refuses what it is given (see its message above), and is not started again")
+    launched = launch(
+        "uwb_tdoa_ekf", "tdoa.launch.py", "effects_file:=/nowhere.yaml", f"on_exit:={on_exit}"
+    )
+    launched.wait(
+        "_node: error: /nowhere.yaml"
+    )  # of either: with shutdown the first ends the other
+    launched.wait(
+        "_node refuses what it is given (see its message above), and is not started again"
+    )
     code = launched.ended()  # with stay too: both nodes take this file
     assert code == (1 if on_exit == "shutdown" else 0) and left_behind(launched) == []
 
@@ -214,7 +283,11 @@ def test_a_node_that_crashes_without_respawn_ends_all(launch):
     launched = launch("uwb_tdoa_ekf", "tdoa.launch.py", "respawn:=false")
     launched.wait(READY)
     os.kill(launched.pid_of("ekf_node"), signal.SIGKILL)
-    assert launched.ended() == 1 and "ekf_node has ended with exit code -9" in launched.said and left_behind(launched) == []
+    assert (
+        launched.ended() == 1
+        and "ekf_node has ended with exit code -9" in launched.said
+        and left_behind(launched) == []
+    )
 
 
 @pytest.mark.parametrize(
@@ -248,7 +321,9 @@ def param(rig, *words):
     return made[-1]
 
 
-def test_a_dump_of_parameters_goes_back_into_the_node_and_into_its_launch_file(make_rig, launch, tmp_path):
+def test_a_dump_of_parameters_goes_back_into_the_node_and_into_its_launch_file(
+    make_rig, launch, tmp_path
+):
     rig, dumps = make_rig(), []
     nodes = {node: f"/{rig.namespace}/{node}_node" for node in ("bias", "ekf")}
     words = "uwb_tdoa_ekf", "tdoa.launch.py", f"namespace:={rig.namespace}"
@@ -256,7 +331,9 @@ def test_a_dump_of_parameters_goes_back_into_the_node_and_into_its_launch_file(m
     for back in (False, True):
         if back:
             ends_well(launched)
-            launched = launch(*words, *(f"{node}_params:={tmp_path / node}.yaml" for node in nodes), rig=rig)
+            launched = launch(
+                *words, *(f"{node}_params:={tmp_path / node}.yaml" for node in nodes), rig=rig
+            )
         for node, name in nodes.items():
             values_of(rig, name, "use_sim_time")  # it is there
             dump = param(rig, "dump", name)
@@ -267,24 +344,38 @@ def test_a_dump_of_parameters_goes_back_into_the_node_and_into_its_launch_file(m
                 loaded = param(rig, "load", name, tmp_path / f"{node}.yaml")
                 assert loaded.returncode == 0 and loaded.stderr == ""
                 assert loaded.stdout.count("successful") == len(values_below(dumps[-1]))
-    assert dumps[:2] == dumps[2:] and dumps[1][nodes["ekf"]]["ros__parameters"]["publish_tf"] == "none"
+    assert (
+        dumps[:2] == dumps[2:] and dumps[1][nodes["ekf"]]["ros__parameters"]["publish_tf"] == "none"
+    )
     ends_well(launched)
 
 
 def values_below(part):
     """All values in nested mappings."""
-    return [value for each in part.values() for value in (values_below(each) if isinstance(each, dict) else [each])]
+    return [
+        value
+        for each in part.values()
+        for value in (values_below(each) if isinstance(each, dict) else [each])
+    ]
 
 
 @pytest.mark.parametrize("ours", [False, True])
-def test_what_is_launched_obeys_no_profiles_of_the_present_folder(launch, tmp_path, monkeypatch, ours):
+def test_what_is_launched_obeys_no_profiles_of_the_present_folder(
+    launch, tmp_path, monkeypatch, ours
+):
     """Programs of others, too, as rviz2. Fast DDS would empty the file that is named as its log."""
     (tmp_path / "bashrc").write_text("precious\n")
     (tmp_path / "DEFAULT_FASTRTPS_PROFILES.xml").write_text(PROFILES.format(tmp_path / "bashrc"))
-    line = "from uwb_tdoa_ekf.launching_actions import actions" if ours else "def actions(*_): return []"
+    line = (
+        "from uwb_tdoa_ekf.launching_actions import actions"
+        if ours
+        else "def actions(*_): return []"
+    )
     (tmp_path / "stock.launch.py").write_text(STOCK.format(actions=line))
     monkeypatch.delenv("SKIP_DEFAULT_XML_FILE", raising=False)
     monkeypatch.chdir(tmp_path)
     launched = launch(tmp_path / "stock.launch.py")
     assert launched.ended() == 0 and "process has finished cleanly" in launched.said, launched.said
-    assert (tmp_path / "bashrc").read_text() == ("precious\n" if ours else "")  # or the attack would be none
+    assert (tmp_path / "bashrc").read_text() == (
+        "precious\n" if ours else ""
+    )  # or the attack would be none

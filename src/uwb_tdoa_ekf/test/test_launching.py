@@ -1,4 +1,8 @@
-"""What the launch files start. Where there is no launch, it is played by stubs that take notes; test_launch_files.py runs the real one."""
+"""What the launch files start.
+
+Where there is no launch, it is played by stubs that take notes; test_launch_files.py runs the real
+one.
+"""
 
 import json
 import os
@@ -16,12 +20,26 @@ pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from nav_msgs.msg import Odometry  # noqa: E402
 from real_launch import WHY_NOT  # noqa: E402
+
 from uwb_tdoa_bias.foundation.errors import InputError  # noqa: E402
-from uwb_tdoa_ekf.launching import NODES, RANGE, Lives, discovery, network, pooled, start, tag, tags, typed  # noqa: E402
+from uwb_tdoa_ekf.launching import (
+    NODES,
+    RANGE,
+    Lives,
+    discovery,
+    network,
+    pooled,
+    start,
+    tag,
+    tags,
+    typed,
+)  # noqa: E402
 from uwb_tdoa_msgs.msg import TdoaResidual  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[1]
-CONFIGS = {name: ROOT.parent / package / "config" / f"{name}.yaml" for name, (package, _) in NODES.items()}
+CONFIGS = {
+    name: ROOT.parent / package / "config" / f"{name}.yaml" for name, (package, _) in NODES.items()
+}
 
 
 @pytest.mark.parametrize("name", NODES)
@@ -31,21 +49,51 @@ def test_the_parameters_of_a_node_are_those_of_its_file(name):
 
 
 def test_a_value_goes_to_the_nodes_that_have_it_and_overrides_their_file():
-    bias, ekf = tag("tag1", {"anchors_file": "a.yaml", "tdoa_std": 0.3, "hold": 0.1}, {"ekf_node": ["mine.yaml"]}, "debug")
-    assert (bias.executable, bias.namespace, bias.parameters) == ("bias_node", "tag1", [{"anchors_file": "a.yaml", "hold": 0.1}])
-    assert ekf.parameters == ["mine.yaml", {"anchors_file": "a.yaml", "tdoa_std": 0.3}] and ekf.log_level == "debug"
-    assert [node.executable for node in tag("", {"map": "map.npz"})] == ["bias_node", "ekf_node", "debias_node"]
+    bias, ekf = tag(
+        "tag1",
+        {"anchors_file": "a.yaml", "tdoa_std": 0.3, "hold": 0.1},
+        {"ekf_node": ["mine.yaml"]},
+        "debug",
+    )
+    assert (bias.executable, bias.namespace, bias.parameters) == (
+        "bias_node",
+        "tag1",
+        [{"anchors_file": "a.yaml", "hold": 0.1}],
+    )
+    assert (
+        ekf.parameters == ["mine.yaml", {"anchors_file": "a.yaml", "tdoa_std": 0.3}]
+        and ekf.log_level == "debug"
+    )
+    assert [node.executable for node in tag("", {"map": "map.npz"})] == [
+        "bias_node",
+        "ekf_node",
+        "debias_node",
+    ]
     assert start("ekf_node", "", {"map": "map.npz"}).parameters == []
     with pytest.raises(InputError, match="tdoa_sdt: is no parameter of .*; write tdoa_std"):
         tag("", {"tdoa_sdt": 1.0})
 
 
 def test_what_a_node_is_told_are_arguments_which_later_ones_override():
-    told = start("ekf_node", "", {"world_frame": 'hall: 1 # "ä"', "tdoa_std": 0.3, "use_sim_time": True}, ["mine.yaml"], "debug")
+    told = start(
+        "ekf_node",
+        "",
+        {"world_frame": 'hall: 1 # "ä"', "tdoa_std": 0.3, "use_sim_time": True},
+        ["mine.yaml"],
+        "debug",
+    )
     assert told.words == [
-        "--log-level", "debug", "--params-file", "mine.yaml",
-        "-p", 'world_frame:="hall: 1 # \\"ä\\""', "-p", "tdoa_std:=0.3", "-p", "use_sim_time:=true",
-    ]  # fmt: skip
+        "--log-level",
+        "debug",
+        "--params-file",
+        "mine.yaml",
+        "-p",
+        'world_frame:="hall: 1 # \\"ä\\""',
+        "-p",
+        "tdoa_std:=0.3",
+        "-p",
+        "use_sim_time:=true",
+    ]
 
 
 def test_a_node_that_crashes_is_started_again_each_time_later():
@@ -65,22 +113,43 @@ def test_a_node_that_was_asked_to_end_is_left_alone(code):
 
 @pytest.mark.parametrize(("on_exit", "everything"), [("shutdown", True), ("stay", False)])
 def test_what_ends_for_good_ends_all_if_it_is_to(on_exit, everything):
-    refused, crashed = Lives("ekf_node", True, on_exit).ended(2, 1.0), Lives("ekf_node", False, on_exit).ended(-11, 1.0)
-    assert refused.again is crashed.again is None and refused.everything is crashed.everything is everything
+    refused, crashed = (
+        Lives("ekf_node", True, on_exit).ended(2, 1.0),
+        Lives("ekf_node", False, on_exit).ended(-11, 1.0),
+    )
+    assert (
+        refused.again is crashed.again is None
+        and refused.everything is crashed.everything is everything
+    )
     assert "refuses what it is given" in refused.text and "ended with exit code -11" in crashed.text
 
 
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ({}, "ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET, ROS_DOMAIN_ID=0: heard by nodes on every machine that multicast reaches, any of which"),
+        (
+            {},
+            (
+                "ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET, ROS_DOMAIN_ID=0: heard by nodes on every "
+                "machine that multicast reaches, any of which"
+            ),
+        ),
         (
             {"ROS_DOMAIN_ID": "7", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"},
             "LOCALHOST, ROS_DOMAIN_ID=7: heard by nodes on this machine, and",
         ),
-        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_STATIC_PEERS": "robot"}, "this machine and of ROS_STATIC_PEERS=robot, and"),
-        ({"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF", "ROS_STATIC_PEERS": "robot"}, "OFF, ROS_DOMAIN_ID=0: heard by nobody"),
-        ({"ROS_LOCALHOST_ONLY": "1", "ROS_STATIC_PEERS": "robot"}, "LOCALHOST, ROS_DOMAIN_ID=0: heard by nodes on this machine, and"),
+        (
+            {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_STATIC_PEERS": "robot"},
+            "this machine and of ROS_STATIC_PEERS=robot, and",
+        ),
+        (
+            {"ROS_AUTOMATIC_DISCOVERY_RANGE": "OFF", "ROS_STATIC_PEERS": "robot"},
+            "OFF, ROS_DOMAIN_ID=0: heard by nobody",
+        ),
+        (
+            {"ROS_LOCALHOST_ONLY": "1", "ROS_STATIC_PEERS": "robot"},
+            "LOCALHOST, ROS_DOMAIN_ID=0: heard by nodes on this machine, and",
+        ),
     ],
 )
 def test_who_hears_the_nodes_is_said(given, said):
@@ -93,16 +162,26 @@ def test_only_this_machine_discovers_the_nodes_unless_the_user_says_otherwise():
 
 
 def test_texts_become_values():
-    assert typed({"use_sim_time": "true", "body_frame": "", "world_frame": "map"}) == {"use_sim_time": True, "world_frame": "map"}
+    assert typed({"use_sim_time": "true", "body_frame": "", "world_frame": "map"}) == {
+        "use_sim_time": True,
+        "world_frame": "map",
+    }
 
 
 def test_tags_of_a_file(tmp_path):
     file = tmp_path / "tags.yaml"
-    file.write_text("anchors_file: a.yaml\ntdoa_std: 0.3\ntags: {tag1: , tag2: {body_frame: base2, tdoa_std: 0.5}}")
+    file.write_text(
+        "anchors_file: a.yaml\ntdoa_std: 0.3\ntags: {tag1: , tag2: {body_frame: base2, "
+        "tdoa_std: 0.5}}"
+    )
     nodes = tags(file, {"use_sim_time": True})
     assert [(node.executable, node.namespace) for node in nodes] == [
-        ("bias_node", "tag1"), ("ekf_node", "tag1"), ("bias_node", "tag2"), ("ekf_node", "tag2"), ("anchors_node", ""),
-    ]  # fmt: skip
+        ("bias_node", "tag1"),
+        ("ekf_node", "tag1"),
+        ("bias_node", "tag2"),
+        ("ekf_node", "tag2"),
+        ("anchors_node", ""),
+    ]
     (first,), (second,), (anchors,) = (nodes[k].parameters for k in (1, 3, 4))
     shared = {"anchors_file": str(tmp_path / "a.yaml"), "use_sim_time": True}
     assert first == {"body_frame": "tag1/base_link", "tdoa_std": 0.3} | shared
@@ -113,11 +192,17 @@ def test_tags_of_a_file(tmp_path):
 @pytest.mark.parametrize(
     ("text", "named"),
     [
-        ("{}", "expected a mapping 'tags'"), ("tags: {a: 1}", "a: 1 must be a mapping"), ("tags: {a: {gaet: 1}}", "gaet: .* write gate"),
-        ("tags: {a: {gate: }}", "gate: None is no value"), ("tags: {a: {gate: {b: 1}}}", "gate: .* is no value"),
-        ("tags: {a: {host: x}, b: {}}", "b: names no host"), ("tags: {a: {host: 3}}", "3 is no name of a machine"),
-        ("tags: {a: {remaps: odom}}", "remaps: 'odom' must be"), ("remaps: {velocity: 3}\ntags: {a: }", "remaps: .* must be"),
-        ("anchors_file: []\ntags: {a: {}}", ".. is no path"), ("tags: {a: {params_file: 3}}", "3 is no path"),
+        ("{}", "expected a mapping 'tags'"),
+        ("tags: {a: 1}", "a: 1 must be a mapping"),
+        ("tags: {a: {gaet: 1}}", "gaet: .* write gate"),
+        ("tags: {a: {gate: }}", "gate: None is no value"),
+        ("tags: {a: {gate: {b: 1}}}", "gate: .* is no value"),
+        ("tags: {a: {host: x}, b: {}}", "b: names no host"),
+        ("tags: {a: {host: 3}}", "3 is no name of a machine"),
+        ("tags: {a: {remaps: odom}}", "remaps: 'odom' must be"),
+        ("remaps: {velocity: 3}\ntags: {a: }", "remaps: .* must be"),
+        ("anchors_file: []\ntags: {a: {}}", ".. is no path"),
+        ("tags: {a: {params_file: 3}}", "3 is no path"),
     ],
 )
 def test_a_bad_file_is_refused(tmp_path, text, named):
@@ -129,7 +214,10 @@ def test_a_bad_file_is_refused(tmp_path, text, named):
 
 def test_topics_of_tags_have_other_names(tmp_path):
     file = tmp_path / "tags.yaml"
-    file.write_text("remaps: {velocity/odometry: odom}\ntags: {tag1: , tag2: {remaps: {imu/data: /imu2, velocity/odometry: wheels}}}")
+    file.write_text(
+        "remaps: {velocity/odometry: odom}\ntags: {tag1: , tag2: {remaps: {imu/data: /imu2, "
+        "velocity/odometry: wheels}}}"
+    )
     first, second = (node for node in tags(file, {}) if node.executable == "ekf_node")
     assert first.words[2:4] == ["-r", "velocity/odometry:=odom"]
     assert second.words[2:6] == ["-r", "velocity/odometry:=wheels", "-r", "imu/data:=/imu2"]
@@ -139,13 +227,22 @@ def test_topics_of_tags_have_other_names(tmp_path):
 
 def test_each_host_starts_its_tags_and_the_first_the_anchors(tmp_path):
     file = tmp_path / "tags.yaml"
-    file.write_text("anchors_file: a.yaml\nprocesses: 1\ntags: {a: {host: one}, b: {host: two}, c: {host: one, tdoa_std: 0.3}}")
+    file.write_text(
+        "anchors_file: a.yaml\nprocesses: 1\ntags: {a: {host: one}, b: {host: two}, c: {host: "
+        "one, tdoa_std: 0.3}}"
+    )
     one, two = (tags(file, {}, host=host) for host in ("one.lan", "two"))
     assert [node.executable for node in one] == ["anchors_node", "localization_node"]
     assert one[1].parameters[1] == {"tags": ["a", "c"]}
     told = yaml.safe_load(Path(one[1].parameters[0]).read_text())
-    assert told["/**/c/ekf_node"]["ros__parameters"].keys() == {"body_frame", "tdoa_std", "anchors_file"}
-    assert [(node.executable, node.parameters[1]) for node in two] == [("localization_node", {"tags": ["b"]})]
+    assert told["/**/c/ekf_node"]["ros__parameters"].keys() == {
+        "body_frame",
+        "tdoa_std",
+        "anchors_file",
+    }
+    assert [(node.executable, node.parameters[1]) for node in two] == [
+        ("localization_node", {"tags": ["b"]})
+    ]
     assert [node.namespace for node in tags(file, {}, processes="2", host="one")[1:]] == ["", ""]
     with pytest.raises(InputError, match="no tag has the host three; those named are one, two"):
         tags(file, {}, host="three")
@@ -158,7 +255,9 @@ def test_as_many_processes_as_cores(tmp_path):
     file.write_text(f"tags: {{{', '.join(f't{k}: {{}}' for k in range(300))}}}")
     nodes = tags(file, {}, processes="auto")
     assert len(nodes) == min(300, len(os.sched_getaffinity(0)))
-    assert sorted(tag for node in nodes for tag in node.parameters[1]["tags"]) == sorted(f"t{k}" for k in range(300))
+    assert sorted(tag for node in nodes for tag in node.parameters[1]["tags"]) == sorted(
+        f"t{k}" for k in range(300)
+    )
 
 
 LEVEL = ["--log-level", "info"]
@@ -173,7 +272,9 @@ class Noted(SimpleNamespace):
 
 @pytest.fixture
 def launched(monkeypatch):
-    """launched(file, **arguments): the nodes of a launch file with such arguments, by stubs of launch."""
+    """launched(file, **arguments): the nodes of a launch file with such arguments, by stubs of
+    launch.
+    """
     if WHY_NOT is None:
         pytest.skip("the real launch is here: test_launch_files.py")
     given = {}
@@ -185,7 +286,13 @@ def launched(monkeypatch):
     kinds = {
         "launch": ["LaunchDescription"],
         "launch.actions": [
-            "DeclareLaunchArgument", "ExecuteProcess", "IncludeLaunchDescription", "LogInfo", "OpaqueFunction", "Shutdown", "TimerAction",
+            "DeclareLaunchArgument",
+            "ExecuteProcess",
+            "IncludeLaunchDescription",
+            "LogInfo",
+            "OpaqueFunction",
+            "Shutdown",
+            "TimerAction",
         ],
         "launch.launch_description_sources": ["PythonLaunchDescriptionSource"],
         "launch_ros": [],
@@ -200,10 +307,19 @@ def launched(monkeypatch):
 
     def launch(name, **arguments):
         found = runpy.run_path(str(ROOT / "launch" / name))["generate_launch_description"]().args[0]
-        declared = {each.args[0]: each for each in found if type(each).__name__ == "DeclareLaunchArgument"}
-        assert arguments.keys() <= declared.keys() and all(each.description for each in declared.values())
+        declared = {
+            each.args[0]: each for each in found if type(each).__name__ == "DeclareLaunchArgument"
+        }
+        assert arguments.keys() <= declared.keys() and all(
+            each.description for each in declared.values()
+        )
         given.clear()
-        given.update(arguments, defaults={name: getattr(each, "default_value", None) for name, each in declared.items()})
+        given.update(
+            arguments,
+            defaults={
+                name: getattr(each, "default_value", None) for name, each in declared.items()
+            },
+        )
         (function,) = (each.function for each in found if type(each).__name__ == "OpaqueFunction")
         return [action for action in function(None) if type(action).__name__ == "Node"]
 
@@ -212,10 +328,28 @@ def launched(monkeypatch):
 
 def test_one_tag(launched):
     bias, ekf = launched("tdoa.launch.py")
-    assert (bias.executable, ekf.executable, ekf.ros_arguments) == ("bias_node", "ekf_node", LEVEL)  # nothing set: can be overridden
-    told = dict(anchors_file="a.yaml", publish_tf="odom", ekf_params="e.yaml", use_sim_time="true", rviz="true", namespace="t")
+    assert (bias.executable, ekf.executable, ekf.ros_arguments) == (
+        "bias_node",
+        "ekf_node",
+        LEVEL,
+    )  # nothing set: can be overridden
+    told = dict(
+        anchors_file="a.yaml",
+        publish_tf="odom",
+        ekf_params="e.yaml",
+        use_sim_time="true",
+        rviz="true",
+        namespace="t",
+    )
     bias, ekf, anchors, rviz = launched("tdoa.launch.py", **told)
-    values = ["-p", 'anchors_file:="a.yaml"', "-p", 'publish_tf:="odom"', "-p", "use_sim_time:=true"]
+    values = [
+        "-p",
+        'anchors_file:="a.yaml"',
+        "-p",
+        'publish_tf:="odom"',
+        "-p",
+        "use_sim_time:=true",
+    ]
     assert ekf.ros_arguments == [*LEVEL, "--params-file", "e.yaml", *values]
     assert bias.ros_arguments == [*LEVEL, *values[:2], *values[4:]] and bias.namespace == "t"
     assert (anchors.executable, rviz.executable) == ("anchors_node", "rviz2")
@@ -223,22 +357,31 @@ def test_one_tag(launched):
 
 
 @pytest.mark.parametrize("name", ["tdoa.launch.py", "tags.launch.py"])
-def test_nodes_are_discovered_by_this_machine_and_frozen_on_request(launched, tmp_path, monkeypatch, name):
+def test_nodes_are_discovered_by_this_machine_and_frozen_on_request(
+    launched, tmp_path, monkeypatch, name
+):
     (tmp_path / "tags.yaml").write_text("tags: {a: {}}")
     file = {"tags": str(tmp_path / "tags.yaml")} if name.startswith("tags") else {}
     monkeypatch.delenv(RANGE, raising=False)
     nodes = launched(name, frozen="true", **file)
     assert [node.additional_env for node in nodes] == [{RANGE: "LOCALHOST"}] * 2
     assert all("frozen:=true" in node.ros_arguments for node in nodes)
-    assert all(node.additional_env == {RANGE: "SUBNET"} for node in launched(name, discovery_range="SUBNET", **file))
+    assert all(
+        node.additional_env == {RANGE: "SUBNET"}
+        for node in launched(name, discovery_range="SUBNET", **file)
+    )
 
 
 def test_several_tags(launched, tmp_path):
-    (tmp_path / "tags.yaml").write_text("tags: {a: {}, b: {}, c: {publish_tf: odom, odom_frame: c/odom}, d: {body_frame: drone}}")
+    (tmp_path / "tags.yaml").write_text(
+        "tags: {a: {}, b: {}, c: {publish_tf: odom, odom_frame: c/odom}, d: {body_frame: drone}}"
+    )
     nodes = launched("tags.launch.py", tags=str(tmp_path / "tags.yaml"))
     assert [node.namespace for node in nodes] == list("aabbccdd")
     told = [node.ros_arguments for node in nodes if node.executable == "ekf_node"]
-    for words, frame in zip(told, ["a/base_link", "b/base_link", "c/base_link", "drone"]):  # no two alike
+    for words, frame in zip(
+        told, ["a/base_link", "b/base_link", "c/base_link", "drone"]
+    ):  # no two alike
         assert f'body_frame:="{frame}"' in words
     assert 'odom_frame:="c/odom"' in told[2]
 
@@ -246,16 +389,29 @@ def test_several_tags(launched, tmp_path):
 def test_several_tags_in_a_pool_of_processes(tmp_path):
     file = tmp_path / "tags.yaml"
     file.write_text("anchors_file: a.yaml\ntags: {a: {}, b: {tdoa_std: 0.3}, c: {map: map.npz}}")
-    assert [node.parameters[1].get("frozen") for node in pooled(tags(file, {"frozen": True}), 1)[2:]] == [True]
+    assert [
+        node.parameters[1].get("frozen") for node in pooled(tags(file, {"frozen": True}), 1)[2:]
+    ] == [True]
     nodes = pooled(tags(file, {}), "2")
-    assert [node.executable for node in nodes] == ["debias_node", "anchors_node", "localization_node", "localization_node"]
+    assert [node.executable for node in nodes] == [
+        "debias_node",
+        "anchors_node",
+        "localization_node",
+        "localization_node",
+    ]
     one, other = nodes[2:]
-    assert (one.name, other.name, one.namespace) == ("localization_node_1", "localization_node_2", "")
+    assert (one.name, other.name, one.namespace) == (
+        "localization_node_1",
+        "localization_node_2",
+        "",
+    )
     assert [node.parameters[1] for node in (one, other)] == [{"tags": ["a", "c"]}, {"tags": ["b"]}]
     told = yaml.safe_load(Path(one.parameters[0]).read_text())
     assert told.keys() == {f"/**/{tag}/{node}_node" for tag in "abc" for node in ("bias", "ekf")}
     shared = {"anchors_file": str(tmp_path / "a.yaml")}
-    assert told["/**/b/ekf_node"] == {"ros__parameters": {"body_frame": "b/base_link", "tdoa_std": 0.3} | shared}
+    assert told["/**/b/ekf_node"] == {
+        "ros__parameters": {"body_frame": "b/base_link", "tdoa_std": 0.3} | shared
+    }
     with pytest.raises(InputError, match="params_file: does not go with processes"):
         pooled([start("ekf_node", "a", {}, ["mine.yaml"])], 2)
     with pytest.raises(InputError, match="processes: 'two' must be a whole number"):
@@ -263,15 +419,24 @@ def test_several_tags_in_a_pool_of_processes(tmp_path):
 
 
 def test_a_bag_is_played_on_its_time(launched):  # the fixture puts the stubs in their places
-    found = runpy.run_path(str(ROOT / "launch" / "bag.launch.py"))["generate_launch_description"]().args[0]
+    found = runpy.run_path(str(ROOT / "launch" / "bag.launch.py"))[
+        "generate_launch_description"
+    ]().args[0]
     include, play = found[-2:]
     assert dict(include.launch_arguments) == {"use_sim_time": "true"}
-    assert play.cmd[:3] == ["ros2", "bag", "play"] and "--clock" in play.cmd and "--delay" in play.cmd
+    assert (
+        play.cmd[:3] == ["ros2", "bag", "play"] and "--clock" in play.cmd and "--delay" in play.cmd
+    )
 
 
 def test_the_layout_of_rviz_is_yaml():
     content = yaml.safe_load((ROOT / "rviz" / "tdoa.rviz").read_text())
-    assert {each["Name"] for each in content["Visualization Manager"]["Displays"]} >= {"Odometry", "Ground truth", "Anchors", "TF"}
+    assert {each["Name"] for each in content["Visualization Manager"]["Displays"]} >= {
+        "Odometry",
+        "Ground truth",
+        "Anchors",
+        "TF",
+    }
 
 
 def test_the_layout_of_foxglove_shows_what_the_nodes_publish():
@@ -284,10 +449,15 @@ def test_the_layout_of_foxglove_shows_what_the_nodes_publish():
         "/diagnostics": None,
     }
     panels = content["configById"]
-    assert panels["3D!room"]["topics"].keys() | {panels["DiagnosticSummary!all"]["topicToRender"]} <= kinds.keys()
+    assert (
+        panels["3D!room"]["topics"].keys() | {panels["DiagnosticSummary!all"]["topicToRender"]}
+        <= kinds.keys()
+    )
     paths = [path["value"] for panel in panels.values() for path in panel.get("paths", ())]
     for path in paths:
-        topic, filters, fields, index = re.fullmatch(r"([/\w]+)((?:\{\w+==\d+\})*)\.([.\w]+)(\[\d+\])?", path).groups()
+        topic, filters, fields, index = re.fullmatch(
+            r"([/\w]+)((?:\{\w+==\d+\})*)\.([.\w]+)(\[\d+\])?", path
+        ).groups()
         message = kinds[topic]()
         for name in [*re.findall(r"\{(\w+)==", filters), *fields.split(".")]:
             value = getattr(message, name)

@@ -9,11 +9,12 @@ import pytest
 pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
-import rclpy  # noqa: E402
 from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
+import rclpy  # noqa: E402
 from rclpy.serialization import serialize_message  # noqa: E402
 from rig import make_rig, recording  # noqa: E402, F401
+
 from uwb_tdoa_bias.foundation.ros_spinning import Spinner  # noqa: E402
 from uwb_tdoa_ekf import localization_node  # noqa: E402
 from uwb_tdoa_ekf.localization_node import LocalizationNode, _for_all  # noqa: E402
@@ -21,16 +22,38 @@ from uwb_tdoa_msgs.msg import AnchorArray  # noqa: E402
 
 
 def test_what_is_for_all_nodes_of_the_process():
-    arguments = ["x", "--ros-args", "-r", "__ns:=/a", "-p", "lag:=0.2", "--remap", "__node:=y", "-r", "imu/data:=/imu"]
+    arguments = [
+        "x",
+        "--ros-args",
+        "-r",
+        "__ns:=/a",
+        "-p",
+        "lag:=0.2",
+        "--remap",
+        "__node:=y",
+        "-r",
+        "imu/data:=/imu",
+    ]
     assert _for_all(arguments) == ["x", "--ros-args", "-p", "lag:=0.2", "-r", "imu/data:=/imu"]
 
 
 @pytest.mark.parametrize(
     ("parameter", "named"),
-    [("tags:=[a, a]", "tags: .* different"), ("lagg:=0.2", "lagg: .* has no such parameter; write lag"), ("lag:=-1.0", "lag: ")],
+    [
+        ("tags:=[a, a]", "tags: .* different"),
+        ("lagg:=0.2", "lagg: .* has no such parameter; write lag"),
+        ("lag:=-1.0", "lag: "),
+    ],
 )
 def test_bad_parameters(parameter, named):
-    command = [sys.executable, "-m", "uwb_tdoa_ekf.localization_node", "--ros-args", "-p", parameter]
+    command = [
+        sys.executable,
+        "-m",
+        "uwb_tdoa_ekf.localization_node",
+        "--ros-args",
+        "-p",
+        parameter,
+    ]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=120.0)
     assert ended.returncode == 2
     *_, last = ended.stderr.splitlines()  # the first of its nodes may have said that it is ready
@@ -40,7 +63,11 @@ def test_bad_parameters(parameter, named):
 @pytest.mark.slow
 def test_tags_that_hear_the_same_say_the_same_each_in_its_namespace(make_rig):
     flight, rig, heard = recording(seconds=3.0), make_rig(), []
-    shared = [part for topic in ("imu/data", "uwb/tdoa", "uwb/anchors") for part in ("-r", f"{topic}:=/{rig.namespace}/{topic}")]
+    shared = [
+        part
+        for topic in ("imu/data", "uwb/tdoa", "uwb/anchors")
+        for part in ("-r", f"{topic}:=/{rig.namespace}/{topic}")
+    ]
     rig.node.create_subscription(Odometry, "other/odometry", heard.append, 1000)
     rig.start("localization_node", localization_node=["-p", 'tags:=["", "other"]', *shared])
     rig.wait(lambda: rig.node.count_publishers(f"/{rig.namespace}/other/odometry"), "the other tag")
@@ -54,7 +81,9 @@ def test_tags_that_hear_the_same_say_the_same_each_in_its_namespace(make_rig):
 
 @pytest.fixture
 def started():
-    """started(*arguments) gives a LocalizationNode with these ROS arguments, which its Spinner serves."""
+    """started(*arguments) gives a LocalizationNode with these ROS arguments, which its Spinner
+    serves.
+    """
     nodes, spinners = [], []
 
     def start(*arguments):
@@ -83,7 +112,10 @@ def test_a_tag_that_cannot_be_started_does_not_take_the_others_along(started, tm
     node = started("-p", "tags:=[a, b]", "--params-file", str(tmp_path / "bad.yaml"))
     assert served(node) == {"/b/bias_node", "/b/ekf_node"}
     level, text, values = node._report()
-    assert level == DiagnosticStatus.ERROR and "tag 'a' has failed and is not started again: lag" in text
+    assert (
+        level == DiagnosticStatus.ERROR
+        and "tag 'a' has failed and is not started again: lag" in text
+    )
     assert values == {"tags": 2, "not served": text}
     node.turns.take()
     assert served(node) == {"/b/bias_node", "/b/ekf_node"}
@@ -111,8 +143,12 @@ def test_a_tag_that_fails_in_flight_does_not_take_the_others_along(started, monk
     assert node._report()[0] == DiagnosticStatus.OK and node._tags[1].members == others
 
 
-@pytest.mark.parametrize("error", [OSError("no space left on device"), RuntimeError("failed to create subscription")])
-def test_whatever_is_raised_at_the_start_of_one_tag_concerns_that_tag_alone(started, monkeypatch, error):
+@pytest.mark.parametrize(
+    "error", [OSError("no space left on device"), RuntimeError("failed to create subscription")]
+)
+def test_whatever_is_raised_at_the_start_of_one_tag_concerns_that_tag_alone(
+    started, monkeypatch, error
+):
     """As an OSError of a file, or an RCLError of the middleware."""
     real, failing = localization_node.EkfNode, [True]
 

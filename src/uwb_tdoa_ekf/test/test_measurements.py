@@ -1,7 +1,14 @@
 import numpy as np
 import pytest
 
-from uwb_tdoa_ekf.core.measurements import FARTHEST, LARGEST_ERROR, STEEPEST, usable, usable_all, usable_slopes
+from uwb_tdoa_ekf.core.measurements import (
+    FARTHEST,
+    LARGEST_ERROR,
+    STEEPEST,
+    usable,
+    usable_all,
+    usable_slopes,
+)
 
 POSITIONS = np.array([[0.0, 0.0, 0.0], [3.0, 4.0, 0.0], [0.0, 0.0, 2.0]])
 CASES = [
@@ -41,10 +48,19 @@ def test_none():
     assert usable_all(none.astype(int), none.astype(int), none, none, POSITIONS).tolist() == []
 
 
-@pytest.mark.parametrize("slope, state, expected", [
-    (0.0, 0.0, True), (-0.99 * STEEPEST, -0.99 * FARTHEST, True), (STEEPEST, 0.0, False), (0.0, FARTHEST, False),
-    (np.nan, 0.0, False), (0.0, np.nan, False), (-np.inf, 0.0, False), (0.0, np.inf, False),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "slope, state, expected",
+    [
+        (0.0, 0.0, True),
+        (-0.99 * STEEPEST, -0.99 * FARTHEST, True),
+        (STEEPEST, 0.0, False),
+        (0.0, FARTHEST, False),
+        (np.nan, 0.0, False),
+        (0.0, np.nan, False),
+        (-np.inf, 0.0, False),
+        (0.0, np.inf, False),
+    ],
+)
 def test_slopes(slope, state, expected):
     slopes, states = np.zeros((2, 3, 6))
     slopes[1, 5], states[1, 0] = slope, state

@@ -3,26 +3,52 @@ import pytest
 
 from uwb_tdoa_bias.effects import Covariance
 from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_ekf.evidence import keys_of
 from uwb_tdoa_ekf.core.verdicts import INVALID, REJECTED, USED
+from uwb_tdoa_ekf.evidence import keys_of
 from uwb_tdoa_ekf.monitoring.monitor import Monitor
 from uwb_tdoa_ekf.monitoring.recorded import watched
 from uwb_tdoa_ekf.results import Odometry, Residuals, concatenated
 
-ANCHORS = Anchors.from_positions(np.random.default_rng(0).uniform(-4, 4, (6, 3)), ids=[3, 5, 7, 9, 11, 13])
+ANCHORS = Anchors.from_positions(
+    np.random.default_rng(0).uniform(-4, 4, (6, 3)), ids=[3, 5, 7, 9, 11, 13]
+)
 IDS, RATE = ANCHORS.ids, 100  # Hz
-CALIBRATED = Covariance(keys_of(IDS), np.diag(np.repeat([0.03**2, 0.02**2], [18, 6])))  # coordinates within 3 cm, delays within 2
+CALIBRATED = Covariance(
+    keys_of(IDS), np.diag(np.repeat([0.03**2, 0.02**2], [18, 6]))
+)  # coordinates within 3 cm, delays within 2
 
 
-def watch(delays_at, gyro=lambda t: 0.0, noise=0.06, seconds=60, seed=1, moving=True, heard=lambda t, a, b: t == t, rejected=lambda t: 0.0,
-          calibrated=None):  # fmt: skip
-    """[(s, alarms)] of a flight in which the anchors have delays_at(t, p) (6,) m; 100 TDOAs a second in a ring. The tag flies
-    rounds of 10 s; the filter knows where it is, and rejects that share of the TDOAs."""
-    return played(Monitor(ANCHORS, calibrated), delays_at, gyro, noise, seconds, seed, moving, heard, rejected)
+def watch(
+    delays_at,
+    gyro=lambda t: 0.0,
+    noise=0.06,
+    seconds=60,
+    seed=1,
+    moving=True,
+    heard=lambda t, a, b: t == t,
+    rejected=lambda t: 0.0,
+    calibrated=None,
+):
+    """[(s, alarms)] of a flight in which the anchors have delays_at(t, p) (6,) m; 100 TDOAs a
+    second in a ring. The tag flies rounds of 10 s; the filter knows where it is, and rejects that
+    share of the TDOAs.
+    """
+    return played(
+        Monitor(ANCHORS, calibrated), delays_at, gyro, noise, seconds, seed, moving, heard, rejected
+    )
 
 
-def played(monitor, delays_at, gyro=lambda t: 0.0, noise=0.06, seconds=60, seed=1, moving=True, heard=lambda t, a, b: t == t,
-           rejected=lambda t: 0.0):  # fmt: skip
+def played(
+    monitor,
+    delays_at,
+    gyro=lambda t: 0.0,
+    noise=0.06,
+    seconds=60,
+    seed=1,
+    moving=True,
+    heard=lambda t, a, b: t == t,
+    rejected=lambda t: 0.0,
+):
     """What `watch` gives, of a Monitor."""
     rng, said = np.random.default_rng(seed), []
     for second in range(seconds):
@@ -30,17 +56,38 @@ def played(monitor, delays_at, gyro=lambda t: 0.0, noise=0.06, seconds=60, seed=
         a = np.arange(RATE) % 6
         b = (a + 1) % 6
         angle = 0.2 * np.pi * t
-        p = np.stack([2.0 * np.cos(angle), 2.0 * np.sin(angle), np.sin(angle)], axis=1) if moving else np.zeros((RATE, 3))
+        p = (
+            np.stack([2.0 * np.cos(angle), 2.0 * np.sin(angle), np.sin(angle)], axis=1)
+            if moving
+            else np.zeros((RATE, 3))
+        )
         v = np.tile([1.0 * moving, 0.0, 0.0], (RATE, 1))
         delays = np.array([delays_at(x, place) for x, place in zip(t, p)])
         rows = np.arange(RATE)
         innovation = delays[rows, b] - delays[rows, a] + noise * rng.standard_normal(RATE)
         kept = heard(t, a, b)
         one = np.ones(kept.sum())
-        zeros, bias = np.zeros((RATE, 3)), np.column_stack([np.zeros((RATE, 2)), [gyro(x) for x in t]])
-        odometry = Odometry(t, p, v, np.tile([0, 0, 0, 1.0], (RATE, 1)), zeros, bias, np.zeros((RATE, 9, 9)), np.zeros((RATE, 3, 3)))
+        zeros, bias = (
+            np.zeros((RATE, 3)),
+            np.column_stack([np.zeros((RATE, 2)), [gyro(x) for x in t]]),
+        )
+        odometry = Odometry(
+            t,
+            p,
+            v,
+            np.tile([0, 0, 0, 1.0], (RATE, 1)),
+            zeros,
+            bias,
+            np.zeros((RATE, 9, 9)),
+            np.zeros((RATE, 3, 3)),
+        )
         verdict = np.where(rng.random(len(one)) < [rejected(x) for x in t[kept]], REJECTED, USED)
-        monitor.add(odometry, Residuals(t[kept], IDS[a][kept], IDS[b][kept], innovation[kept], noise**2 * one, one, verdict))
+        monitor.add(
+            odometry,
+            Residuals(
+                t[kept], IDS[a][kept], IDS[b][kept], innovation[kept], noise**2 * one, one, verdict
+            ),
+        )
         monitor.update(second + 1.0)
         said.append((second + 1.0, monitor.alarms))
     watch.history = monitor.history
@@ -62,7 +109,12 @@ def test_signs_turn_from_a_moment_in_which_the_filter_was_right():
     played(monitor, negated, rejected=lambda t: 0.9, moving=False, seconds=20)
     assert monitor.turns == 0
     monitor = Monitor(ANCHORS)
-    played(monitor, lambda t, place: negated(t, place) * (t > 12.3), rejected=lambda t: 0.9 * (t > 12.3), seconds=20)
+    played(
+        monitor,
+        lambda t, place: negated(t, place) * (t > 12.3),
+        rejected=lambda t: 0.9 * (t > 12.3),
+        seconds=20,
+    )
     assert monitor.turns == 1
 
 
@@ -77,9 +129,14 @@ def test_is_silent_while_nothing_changes_but_the_place(seed):
 @pytest.mark.parametrize(("row", "size", "word"), [(2, 0.5, "late"), (4, -0.5, "early")])
 def test_names_the_anchor_that_changed_and_by_how_much(row, size, word):
     said = watch(lambda t, p: only(row, size * (t > 30.0)))
-    assert not any(alarms for t, alarms in said if t <= 30.0) and [alarms for t, alarms in said if t == 35.0][0]
+    assert (
+        not any(alarms for t, alarms in said if t <= 30.0)
+        and [alarms for t, alarms in said if t == 35.0][0]
+    )
     for _, alarms in said[35:]:
-        assert len(alarms) == 1 and alarms[0].startswith(f"anchor {IDS[row]}: ") and word in alarms[0]
+        assert (
+            len(alarms) == 1 and alarms[0].startswith(f"anchor {IDS[row]}: ") and word in alarms[0]
+        )
         assert float(alarms[0].split()[2]) == pytest.approx(size, abs=0.15)
 
 
@@ -107,7 +164,10 @@ def test_an_alarm_ends_with_its_cause():
 
 
 def test_names_the_anchor_that_is_not_heard_any_more():
-    said = watch(lambda t, p: np.zeros(6), heard=lambda t, a, b: (t < 30.0) | (t > 40.0) | ((a != 3) & (b != 3)))
+    said = watch(
+        lambda t, p: np.zeros(6),
+        heard=lambda t, a, b: (t < 30.0) | (t > 40.0) | ((a != 3) & (b != 3)),
+    )
     assert [alarms for t, alarms in said if t <= 30.0 or t > 41.0 if alarms] == []
     assert said[34][1] == ["anchor 9 is not heard any more: check its power and sight"]
 
@@ -121,7 +181,12 @@ def test_names_two_anchors_that_were_exchanged():
 
     said = watch(delays)
     assert not any(alarms for t, alarms in said if t <= 30.0)
-    assert any("two anchors are exchanged, 5 and 11" in alarm for t, alarms in said if t <= 35.0 for alarm in alarms)
+    assert any(
+        "two anchors are exchanged, 5 and 11" in alarm
+        for t, alarms in said
+        if t <= 35.0
+        for alarm in alarms
+    )
 
 
 def test_names_the_axis_whose_bias_moves():
@@ -144,8 +209,13 @@ def test_what_makes_several_late_at_once_names_none(seed):
 
 def test_what_did_not_reach_the_filter_does_not_count():
     monitor, one = Monitor(ANCHORS), np.ones(1)
-    nothing = Odometry(*(np.empty((0, *shape)) for shape in ((), (3,), (3,), (4,), (3,), (3,), (9, 9), (3, 3))))
-    monitor.add(nothing, Residuals(one, 3 * one, 99 * one, np.nan * one, np.nan * one, 0 * one, np.full(1, INVALID)))
+    nothing = Odometry(
+        *(np.empty((0, *shape)) for shape in ((), (3,), (3,), (4,), (3,), (3,), (9, 9), (3, 3)))
+    )
+    monitor.add(
+        nothing,
+        Residuals(one, 3 * one, 99 * one, np.nan * one, np.nan * one, 0 * one, np.full(1, INVALID)),
+    )
     monitor.update(np.inf)
     assert monitor.alarms == []
 
@@ -156,8 +226,19 @@ def test_remembers_no_more_of_odometry_without_tdoas_than_of_one_slice():
     for second in range(100):
         t = second + np.arange(RATE) / RATE
         still = np.zeros((RATE, 3))
-        odometry = Odometry(t, still, still, np.zeros((RATE, 4)), still, still, np.zeros((RATE, 9, 9)), np.zeros((RATE, 3, 3)))
-        some = Residuals(t, IDS[[0] * RATE], IDS[[1] * RATE], 0 * t, 1 + 0 * t, 1 + 0 * t, np.full(RATE, USED))
+        odometry = Odometry(
+            t,
+            still,
+            still,
+            np.zeros((RATE, 4)),
+            still,
+            still,
+            np.zeros((RATE, 9, 9)),
+            np.zeros((RATE, 3, 3)),
+        )
+        some = Residuals(
+            t, IDS[[0] * RATE], IDS[[1] * RATE], 0 * t, 1 + 0 * t, 1 + 0 * t, np.full(RATE, USED)
+        )
         monitor.add(odometry, some if second == 10 else none)
         monitor.update(second + 1.0)
         held.append(sum(len(part[0]) for part in monitor._odometry))
@@ -177,8 +258,24 @@ def test_does_not_depend_on_when_it_is_asked():
         monitor = Monitor(ANCHORS)
         for part in np.array_split(np.arange(3000), pieces):
             n = len(part)
-            state = p[part], np.ones((n, 3)), np.ones((n, 4)), np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 9, 9)), np.zeros((n, 3, 3))
-            rows = Residuals(t[part], IDS[a[part]], IDS[b[part]], innovation[part], np.ones(n), np.ones(n), np.full(n, USED))
+            state = (
+                p[part],
+                np.ones((n, 3)),
+                np.ones((n, 4)),
+                np.zeros((n, 3)),
+                np.zeros((n, 3)),
+                np.zeros((n, 9, 9)),
+                np.zeros((n, 3, 3)),
+            )
+            rows = Residuals(
+                t[part],
+                IDS[a[part]],
+                IDS[b[part]],
+                innovation[part],
+                np.ones(n),
+                np.ones(n),
+                np.full(n, USED),
+            )
             monitor.add(Odometry(t[part], *state), rows)
             monitor.update(t[part][-1])
         said.append((monitor.alarms, monitor.delays[0].tolist()))
@@ -215,21 +312,39 @@ def test_names_an_anchor_that_was_moved_before_the_start_and_where_it_stands(row
     said = watch(delays, seconds=60, calibrated=CALIBRATED)
     assert said[-1][1]
     for _, alarms in said:
-        assert all(alarm.startswith(f"anchor {IDS[row]} does not stand where the survey has it") for alarm in alarms)
+        assert all(
+            alarm.startswith(f"anchor {IDS[row]} does not stand where the survey has it")
+            for alarm in alarms
+        )
     assert "survey RECORDING --survey anchors.yaml --effects effects.yaml" in said[-1][1][0]
-    found = [float(number) for number in said[-1][1][0].partition("(")[2].partition(")")[0].split(",")]
+    found = [
+        float(number) for number in said[-1][1][0].partition("(")[2].partition(")")[0].split(",")
+    ]
     assert np.linalg.norm(found - shift) < 0.3
 
 
 def test_an_anchor_that_is_late_for_the_last_calibration_is_named_and_what_the_calibration_knows_counts():
-    unknown, known = (watch(lambda t, p: only(3, 0.35), seconds=50, calibrated=of)[-1][1] for of in (None, CALIBRATED))
-    assert unknown == [] and len(known) == 1 and known[0].startswith("anchor 9 ") and "--effects effects.yaml" in known[0]
+    unknown, known = (
+        watch(lambda t, p: only(3, 0.35), seconds=50, calibrated=of)[-1][1]
+        for of in (None, CALIBRATED)
+    )
+    assert (
+        unknown == []
+        and len(known) == 1
+        and known[0].startswith("anchor 9 ")
+        and "--effects effects.yaml" in known[0]
+    )
 
 
 def test_history_says_when_each_finding_stood():
     said = watch(lambda t, p: only(0, 0.5 * (25.0 < t < 35.0)))
     (event,) = watch.history
-    assert said[32][1] and event.finding.rule == "anchor_changed" and 25.0 < event.since < 33.0 and 34.0 < event.until < 42.0
+    assert (
+        said[32][1]
+        and event.finding.rule == "anchor_changed"
+        and 25.0 < event.since < 33.0
+        and 34.0 < event.until < 42.0
+    )
 
 
 def test_who_is_moved_in_flight_is_not_said_to_have_been_elsewhere_before():
@@ -246,8 +361,18 @@ def test_a_gap_of_any_length_is_passed_at_once():
         a = np.arange(3 * RATE) % 6
         zeros = np.zeros((len(t), 3))
         covariances = np.zeros((len(t), 9, 9)), np.zeros((len(t), 3, 3))
-        odometry = Odometry(t, zeros, zeros, np.tile([0, 0, 0, 1.0], (len(t), 1)), zeros, zeros, *covariances)
-        residuals = Residuals(t, IDS[a], IDS[(a + 1) % 6], 0.05 * rng.standard_normal(len(t)), 0.05**2 * one, one, np.full(len(t), USED))
+        odometry = Odometry(
+            t, zeros, zeros, np.tile([0, 0, 0, 1.0], (len(t), 1)), zeros, zeros, *covariances
+        )
+        residuals = Residuals(
+            t,
+            IDS[a],
+            IDS[(a + 1) % 6],
+            0.05 * rng.standard_normal(len(t)),
+            0.05**2 * one,
+            one,
+            np.full(len(t), USED),
+        )
         parts.append((odometry, residuals))
         monitor.add(odometry, residuals)
         monitor.update(float(t[-1]))

@@ -1,4 +1,7 @@
-"""ekf_node and bias_node among the frames, parameters and services that a robot has. One start of the nodes serves many questions."""
+"""ekf_node and bias_node among the frames, parameters and services that a robot has.
+
+One start of the nodes serves many questions.
+"""
 
 import numpy as np
 import pytest
@@ -17,6 +20,7 @@ from rig import STREAMS, make_rig, recording, seconds_of, stamp  # noqa: E402, F
 from scipy.spatial.transform import Rotation  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 from tf2_msgs.msg import TFMessage  # noqa: E402
+
 from uwb_tdoa_bias.correction.corrector import Corrector  # noqa: E402
 from uwb_tdoa_bias.effects import EffectSet, SmoothTerm  # noqa: E402
 from uwb_tdoa_bias.effects.accel_bias import AccelBias  # noqa: E402
@@ -26,7 +30,9 @@ from uwb_tdoa_bias.foundation.ros_frames import TF_QOS, TF_STATIC_QOS  # noqa: E
 from uwb_tdoa_ekf.offline import run_offline  # noqa: E402
 from uwb_tdoa_msgs.msg import AnchorArray  # noqa: E402
 
-TURN = Rotation.from_euler("ZYX", [90.0, 0.0, 180.0], degrees=True)  # of the IMU on the body: upside down
+TURN = Rotation.from_euler(
+    "ZYX", [90.0, 0.0, 180.0], degrees=True
+)  # of the IMU on the body: upside down
 ARM = [0.05, 0.0, 0.1]  # m, of the antenna on the body
 
 
@@ -47,28 +53,54 @@ def call(rig, kind, service, request):
 
 
 def positions(messages):
-    return np.array([(m.pose.pose.position.x, m.pose.pose.position.y, m.pose.pose.position.z) for m in messages])
+    return np.array(
+        [(m.pose.pose.position.x, m.pose.pose.position.y, m.pose.pose.position.z) for m in messages]
+    )
 
 
 def test_sensors_in_frames_of_their_own_among_frames_that_move(make_rig, tmp_path):
-    """IMU turned, antenna on an arm, odom -> base_link from somebody else, anchors and effects of files: as the offline engine."""
+    """IMU turned, antenna on an arm, odom -> base_link from somebody else, anchors and effects of
+    files: as the offline engine.
+    """
     flight = recording(3.0)
     flight.anchors.to_yaml(tmp_path / "anchors.yaml")
-    straight = {"shape": "line", "covariate": "height", "knots": (0.0, 3.0), "values": {"c0": 0.1, "c1": 0.4}}
-    known = AccelBias({"x": 0.4}), SmoothTerm(channel="accel.y", **straight), SmoothTerm(form="common", **straight)
+    straight = {
+        "shape": "line",
+        "covariate": "height",
+        "knots": (0.0, 3.0),
+        "values": {"c0": 0.1, "c1": 0.4},
+    }
+    known = (
+        AccelBias({"x": 0.4}),
+        SmoothTerm(channel="accel.y", **straight),
+        SmoothTerm(form="common", **straight),
+    )
     EffectSet(known).to_yaml(tmp_path / "effects.yaml")
-    file = ["-p", f"anchors_file:={tmp_path / 'anchors.yaml'}", "-p", f"effects_file:={tmp_path / 'effects.yaml'}"]
+    file = [
+        "-p",
+        f"anchors_file:={tmp_path / 'anchors.yaml'}",
+        "-p",
+        f"effects_file:={tmp_path / 'effects.yaml'}",
+    ]
     rig = make_rig()
     static = rig.node.create_publisher(TFMessage, "/tf_static", TF_STATIC_QOS)
     moving = rig.node.create_publisher(TFMessage, "/tf", TF_QOS)
-    arms = [transform("base_link", "imu_link", q=TURN.as_quat()), transform("base_link", "uwb", ARM)]
+    arms = [
+        transform("base_link", "imu_link", q=TURN.as_quat()),
+        transform("base_link", "uwb", ARM),
+    ]
     static.publish(TFMessage(transforms=arms))
     rig.start("bias_node", "ekf_node", bias_node=file, ekf_node=[*file, "-p", "publish_tf:=odom"])
-    rig.wait(lambda: static.get_subscription_count() == 2 and moving.get_subscription_count() >= 1, "TF to be heard")
+    rig.wait(
+        lambda: static.get_subscription_count() == 2 and moving.get_subscription_count() >= 1,
+        "TF to be heard",
+    )
     effects = EffectSet((*known, TagLeverArm(values=dict(zip("xyz", ARM)))))
     flight = effects.effects[-1].inject(flight)
     turned = TURN.inv()
-    mounted = replace(flight, imu=Imu(flight.imu.t, turned.apply(flight.imu.gyro), turned.apply(flight.imu.accel)))
+    mounted = replace(
+        flight, imu=Imu(flight.imu.t, turned.apply(flight.imu.gyro), turned.apply(flight.imu.accel))
+    )
 
     send, course = rig.send, []
 
@@ -76,21 +108,29 @@ def test_sensors_in_frames_of_their_own_among_frames_that_move(make_rig, tmp_pat
         if topic == "imu/data" and round(t * 200.0) % 10 == 0:  # odom drifts away from the map
             course.append(t)
             q = Rotation.from_euler("z", 0.1 * t).as_quat()
-            moving.publish(TFMessage(transforms=[transform("odom", "base_link", (t, 0.5 * t, 0.0), q, t)]))
+            moving.publish(
+                TFMessage(transforms=[transform("odom", "base_link", (t, 0.5 * t, 0.0), q, t)])
+            )
         send(topic, message, t, {"imu/data": "imu_link", "uwb/tdoa": "uwb"}[topic], **epoch)
 
     rig.send = in_frames
     rig.play(mounted)
-    ekf = rig.counts("ekf_node", IMU_samples_received=len(flight.imu), TDOAs_received=len(flight.tdoa))
+    ekf = rig.counts(
+        "ekf_node", IMU_samples_received=len(flight.imu), TDOAs_received=len(flight.tdoa)
+    )
     assert ekf["late"] == ekf["imu_late"] == 0
-    assert {entry.key: entry.value for entry in rig.fresh_status("bias_node").values}["model"] == effects.name
+    assert {entry.key: entry.value for entry in rig.fresh_status("bias_node").values}[
+        "model"
+    ] == effects.name
     expected = run_offline(flight, None, Corrector(flight.anchors, effects)).odometry
     place = np.searchsorted(expected.t, [seconds_of(m.header.stamp) for m in rig.odometry])
     apart = np.linalg.norm(positions(rig.odometry) - expected.p[place], axis=1)
     assert len(apart) > 300 and apart.max() < 0.01
 
     # map -> odom leads, over odom -> base_link, to the odometry of the same stamp
-    poses = {(m.header.stamp.sec, m.header.stamp.nanosec): m.pose.pose.position for m in rig.odometry}
+    poses = {
+        (m.header.stamp.sec, m.header.stamp.nanosec): m.pose.pose.position for m in rig.odometry
+    }
     leading = [t for m in rig.received["/tf"] for t in m.transforms if t.child_frame_id == "odom"]
     assert len(leading) > 300 and {t.header.frame_id for t in leading} == {"map"}
     for message in leading[::20]:
@@ -100,11 +140,15 @@ def test_sensors_in_frames_of_their_own_among_frames_that_move(make_rig, tmp_pat
         v, q = message.transform.translation, message.transform.rotation
         led = Rotation.from_quat([q.x, q.y, q.z, q.w]).apply([t, 0.5 * t, 0.0]) + [v.x, v.y, v.z]
         p = poses[message.header.stamp.sec, message.header.stamp.nanosec]
-        np.testing.assert_allclose(led, [p.x, p.y, p.z], atol=0.02)  # of when the course was not there yet: 50 ms later
+        np.testing.assert_allclose(
+            led, [p.x, p.y, p.z], atol=0.02
+        )  # of when the course was not there yet: 50 ms later
 
 
 def test_what_a_robot_does_to_a_running_filter(make_rig):
-    """Volatile anchors, both kinds of subscribers, an unknown frame, parameters in flight, initialpose, reset."""
+    """Volatile anchors, both kinds of subscribers, an unknown frame, parameters in flight,
+    initialpose, reset.
+    """
     flight = recording(2.0)
     rig = make_rig(reliable=False, latched=False)
     counts = {}
@@ -112,9 +156,13 @@ def test_what_a_robot_does_to_a_running_filter(make_rig):
     for policy in (ReliabilityPolicy.BEST_EFFORT, ReliabilityPolicy.RELIABLE):
         for topic in ("odometry", "uwb/residual"):
             take = lambda _, key=(topic, policy): counts.update({key: counts.get(key, 0) + 1})  # noqa: E731
-            rig.node.create_subscription(STREAMS[topic], topic, take, QoSProfile(depth=1000, reliability=policy))
+            rig.node.create_subscription(
+                STREAMS[topic], topic, take, QoSProfile(depth=1000, reliability=policy)
+            )
     volatile = rig.node.create_publisher(AnchorArray, "uwb/anchors", 1)
-    rig.wait(lambda: "no anchors" in rig.fresh_status("ekf_node").message, "the node to miss the anchors")
+    rig.wait(
+        lambda: "no anchors" in rig.fresh_status("ekf_node").message, "the node to miss the anchors"
+    )
 
     def repeat_anchors():
         rig.send_anchors(flight.anchors, volatile)
@@ -126,7 +174,11 @@ def test_what_a_robot_does_to_a_running_filter(make_rig):
     assert ekf["used"] > 50
     rig.wait(lambda: len(counts) == 4, "all four to have received something")
     for topic in ("odometry", "uwb/residual"):
-        assert counts[topic, ReliabilityPolicy.RELIABLE] >= counts[topic, ReliabilityPolicy.BEST_EFFORT] > 50
+        assert (
+            counts[topic, ReliabilityPolicy.RELIABLE]
+            >= counts[topic, ReliabilityPolicy.BEST_EFFORT]
+            > 50
+        )
 
     # parameters
     def set_parameter(name, value):
@@ -142,7 +194,10 @@ def test_what_a_robot_does_to_a_running_filter(make_rig):
     t = flight.imu.t[-1]
     for k in range(1, 40):
         rig.send_imu(t + 0.005 * k)
-        rig.send_corrected(t + 0.005 * k, *(column[k].item() for column in (flight.tdoa.a, flight.tdoa.b, flight.tdoa.d)))
+        rig.send_corrected(
+            t + 0.005 * k,
+            *(column[k].item() for column in (flight.tdoa.a, flight.tdoa.b, flight.tdoa.d)),
+        )
     rig.wait(lambda: rig.residuals[-1].innovation_variance > 80.0, "the new tdoa_std to count")
 
     # a pose
@@ -154,11 +209,18 @@ def test_what_a_robot_does_to_a_running_filter(make_rig):
     poses.publish(message)
     message.header.frame_id = "odom"  # is refused
     poses.publish(message)
-    rig.wait(lambda: any("initialpose: not taken: its frame is 'odom'" in line for line in process.lines), "a refusal")
+    rig.wait(
+        lambda: any(
+            "initialpose: not taken: its frame is 'odom'" in line for line in process.lines
+        ),
+        "a refusal",
+    )
     for k in range(45, 60):
         rig.send_imu(t + 0.005 * k)
         rig.send_corrected(t + 0.005 * k, 99, 98, 0.0)
-    rig.wait(lambda: seconds_of(rig.odometry[-1].header.stamp) > t + 0.26, "odometry after the pose")
+    rig.wait(
+        lambda: seconds_of(rig.odometry[-1].header.stamp) > t + 0.26, "odometry after the pose"
+    )
     np.testing.assert_allclose(positions(rig.odometry[-1:])[0, :2], [1.0, 2.0], atol=0.2)
 
     # an IMU whose frame nobody knows

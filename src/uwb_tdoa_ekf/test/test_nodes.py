@@ -17,10 +17,11 @@ pytest.importorskip("uwb_tdoa_msgs.msg")
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy  # noqa: E402
 from rig import OUTPUTS, make_rig, recording, seconds_of, stamp  # noqa: E402, F401
 from rosgraph_msgs.msg import Clock  # noqa: E402
+
 from uwb_tdoa_bias.correction.corrector import Corrector  # noqa: E402
+from uwb_tdoa_bias.correction.network import Network  # noqa: E402
 from uwb_tdoa_bias.effects import EffectSet  # noqa: E402
 from uwb_tdoa_bias.foundation.flight import Tdoas  # noqa: E402
-from uwb_tdoa_bias.correction.network import Network  # noqa: E402
 from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 from uwb_tdoa_ekf.frames import to_odometry  # noqa: E402
 from uwb_tdoa_ekf.launching import tags  # noqa: E402
@@ -29,7 +30,10 @@ from uwb_tdoa_msgs.msg import TdoaCorrected, TdoaResidual  # noqa: E402
 
 SOURCES = Path(__file__).resolve().parents[2]
 MODEL = SOURCES / "uwb_tdoa_bias" / "uwb_tdoa_bias" / "correction" / "models" / "known_answer.onnx"
-EFFECTS = "effects: {anchor_delay: {values: {10: 0.1, 14: -0.05}}, tag_lever_arm: {values: {x: 0.05, z: 0.1}}}"
+EFFECTS = (
+    "effects: {anchor_delay: {values: {10: 0.1, 14: -0.05}}, tag_lever_arm: {values: {x: 0.05, z: "
+    "0.1}}}"
+)
 
 
 def vector(v):
@@ -46,13 +50,18 @@ SLOW = pytest.mark.slow
 @pytest.mark.parametrize(
     ("what", "processes"),
     [
-        pytest.param("shipped", 2, marks=SLOW), ("effects", 2), pytest.param("network", 2, marks=SLOW), ("effects", 1),
+        pytest.param("shipped", 2, marks=SLOW),
+        ("effects", 2),
+        pytest.param("network", 2, marks=SLOW),
+        ("effects", 1),
         pytest.param("shipped", 1, marks=SLOW),
     ],
-)  # fmt: skip
+)
 def test_odometry_is_that_of_the_offline_engine(make_rig, tmp_path, what, processes):
     flight = recording()
-    level = np.tile([0.0, 0.0, 0.0, 1.0], (len(flight.anchors), 1))  # the shipped model needs orientations
+    level = np.tile(
+        [0.0, 0.0, 0.0, 1.0], (len(flight.anchors), 1)
+    )  # the shipped model needs orientations
     heard = np.abs(flight.tdoa.t - 2.0) > 0.06  # nothing, for longer than a pose lag
     doubt = np.where(np.arange(len(flight.tdoa)) % 5, 0.0, 0.5)  # m^2, that the tag tells
     columns = vars(replace(flight.tdoa, variance=doubt)).values()
@@ -62,11 +71,22 @@ def test_odometry_is_that_of_the_offline_engine(make_rig, tmp_path, what, proces
     effects.write_text(EFFECTS)
     parameters, corrector = {
         "shipped": (
-            ["--params-file", f"{SOURCES}/uwb_tdoa_bias/config/bias_node.yaml", "-p", "model_file:=default"],
+            [
+                "--params-file",
+                f"{SOURCES}/uwb_tdoa_bias/config/bias_node.yaml",
+                "-p",
+                "model_file:=default",
+            ],
             Corrector(flight.anchors, network=Network(MODEL.with_name("default.onnx"))),
         ),
-        "effects": (["-p", f"effects_file:={effects}"], Corrector(flight.anchors, EffectSet.from_yaml(effects))),
-        "network": (["-p", f"model_file:={MODEL}"], Corrector(flight.anchors, network=Network(MODEL))),
+        "effects": (
+            ["-p", f"effects_file:={effects}"],
+            Corrector(flight.anchors, EffectSet.from_yaml(effects)),
+        ),
+        "network": (
+            ["-p", f"model_file:={MODEL}"],
+            Corrector(flight.anchors, network=Network(MODEL)),
+        ),
     }[what]
     config, told = FilterConfig(), ["--params-file", f"{SOURCES}/uwb_tdoa_ekf/config/ekf_node.yaml"]
     if what == "shipped":  # takes nothing out before the yaw is known
@@ -78,13 +98,22 @@ def test_odometry_is_that_of_the_offline_engine(make_rig, tmp_path, what, proces
         rig.start("localization_node", localization_node=[*told, *parameters])
     rig.send_anchors(flight.anchors)
     rig.play(flight)
-    ekf = rig.counts("ekf_node", IMU_samples_received=len(flight.imu), TDOAs_received=len(flight.tdoa))
+    ekf = rig.counts(
+        "ekf_node", IMU_samples_received=len(flight.imu), TDOAs_received=len(flight.tdoa)
+    )
     bias = rig.counts("bias_node", received=len(flight.tdoa))
     expected = run_offline(flight, config, corrector)
 
     # Nothing is lost, nothing is late, and the accounts add up.
     assert ekf["used"] + ekf["rejected"] + ekf["startup"] + ekf["waiting"] == len(flight.tdoa)
-    assert ekf["late"] == ekf["invalid"] == ekf["imu_late"] == ekf["imu_invalid"] == ekf["restarts"] == 0
+    assert (
+        ekf["late"]
+        == ekf["invalid"]
+        == ekf["imu_late"]
+        == ekf["imu_invalid"]
+        == ekf["restarts"]
+        == 0
+    )
     assert ekf["imu_used"] + ekf["imu_waiting"] == len(flight.imu)
     assert bias["published"] == bias["received"] == len(rig.corrected) == len(flight.tdoa)
     assert bias["waiting"] == bias["dropped"] == bias["released before their pose"] == 0
@@ -102,16 +131,24 @@ def test_odometry_is_that_of_the_offline_engine(make_rig, tmp_path, what, proces
     odometry = expected.odometry
     n = len(rig.odometry)
     assert len(odometry) - 3 <= n <= len(odometry) and n > 500
-    np.testing.assert_array_equal([seconds_of(m.header.stamp) for m in rig.odometry], odometry.t[:n])
+    np.testing.assert_array_equal(
+        [seconds_of(m.header.stamp) for m in rig.odometry], odometry.t[:n]
+    )
     poses, twists = [m.pose.pose for m in rig.odometry], [m.twist.twist for m in rig.odometry]
     velocity, covariance = to_odometry(odometry.q, odometry.v, odometry.covariance)
     np.testing.assert_allclose([vector(p.position) for p in poses], odometry.p[:n], atol=1e-6)
-    np.testing.assert_allclose([quaternion(p.orientation) for p in poses], odometry.q[:n], atol=1e-6)
+    np.testing.assert_allclose(
+        [quaternion(p.orientation) for p in poses], odometry.q[:n], atol=1e-6
+    )
     np.testing.assert_allclose([vector(t.linear) for t in twists], velocity[:n], atol=1e-6)
-    gyro = flight.imu.gyro[np.searchsorted(flight.imu.t, odometry.t, side="right") - 1] - odometry.gyro_bias
+    gyro = (
+        flight.imu.gyro[np.searchsorted(flight.imu.t, odometry.t, side="right") - 1]
+        - odometry.gyro_bias
+    )
     np.testing.assert_allclose([vector(t.angular) for t in twists], gyro[:n], atol=1e-6)
     pose, twist = (
-        np.array([getattr(m, name).covariance for m in rig.odometry]).reshape(n, 6, 6) for name in ("pose", "twist")
+        np.array([getattr(m, name).covariance for m in rig.odometry]).reshape(n, 6, 6)
+        for name in ("pose", "twist")
     )
     np.testing.assert_allclose(pose, covariance[:n, :6, :6], atol=1e-6)
     np.testing.assert_allclose(twist[:, :3, :3], covariance[:n, 6:, 6:], atol=1e-6)
@@ -127,7 +164,10 @@ def test_odometry_is_that_of_the_offline_engine(make_rig, tmp_path, what, proces
     outcome = {t: i for i, t in enumerate(expected.residuals.t)}
     for residual in rig.residuals:
         i = outcome[seconds_of(residual.header.stamp)]
-        assert (residual.anchor_a, residual.anchor_b) == (expected.residuals.a[i], expected.residuals.b[i])
+        assert (residual.anchor_a, residual.anchor_b) == (
+            expected.residuals.a[i],
+            expected.residuals.b[i],
+        )
         assert residual.verdict == expected.residuals.verdict[i]
         np.testing.assert_allclose(residual.innovation, expected.residuals.innovation[i], atol=1e-6)
         np.testing.assert_allclose(residual.weight, expected.residuals.weight[i], atol=1e-6)
@@ -168,7 +208,10 @@ def test_quality_of_service(make_rig):
         (subscriptions, rig.node.get_subscriptions_info_by_topic),
     ):
         for topic, nodes in expected.items():
-            rig.wait(lambda e=endpoints, t=topic, n=nodes: found(e, t).keys() >= n.keys(), f"the ends of {topic} to be known")
+            rig.wait(
+                lambda e=endpoints, t=topic, n=nodes: found(e, t).keys() >= n.keys(),
+                f"the ends of {topic} to be known",
+            )
             assert found(endpoints, topic) == nodes, topic
 
     def arrived():
@@ -187,16 +230,30 @@ tags: {tag0: {}, tag1: {body_frame: drone, publish_tf: none}}
 
 @SLOW
 def test_two_tags_of_a_launch_file(make_rig, tmp_path):
-    """On simulated time, which stands still in between; the second begins in the middle of its recording."""
-    flight, epoch = recording(2.0), int(time.time()) + 10**6  # what a node says is newer than anything before
+    """On simulated time, which stands still in between; the second begins in the middle of its
+    recording.
+    """
+    flight, epoch = (
+        recording(2.0),
+        int(time.time()) + 10**6,
+    )  # what a node says is newer than anything before
     flight.anchors.to_yaml(tmp_path / "anchors.yaml")
     (tmp_path / "tags.yaml").write_text(TAGS)
-    one, other = make_rig(listen=["odometry", "uwb/residual", "/tf"]), make_rig(listen=["odometry", "uwb/residual"])
+    one, other = (
+        make_rig(listen=["odometry", "uwb/residual", "/tf"]),
+        make_rig(listen=["odometry", "uwb/residual"]),
+    )
     clock = one.node.create_publisher(Clock, "/clock", 10)
-    starts = [each for each in tags(tmp_path / "tags.yaml", {"use_sim_time": True}) if each.executable in OUTPUTS]
+    starts = [
+        each
+        for each in tags(tmp_path / "tags.yaml", {"use_sim_time": True})
+        if each.executable in OUTPUTS
+    ]
     with ticking(clock, epoch) as running:
         for rig in (one, other):
-            arguments = {each.executable: each.words for each in starts if each.namespace == rig.namespace}
+            arguments = {
+                each.executable: each.words for each in starts if each.namespace == rig.namespace
+            }
             rig.start(*arguments, **arguments)
         one.play(flight, epoch)
         assert one.counts("ekf_node")["used"] > 0
@@ -205,18 +262,33 @@ def test_two_tags_of_a_launch_file(make_rig, tmp_path):
         late = np.searchsorted(flight.tdoa.t, 0.7)
         tdoa = Tdoas(*(column[late:] for column in vars(flight.tdoa).values()))
         other.play(replace(flight, tdoa=tdoa), epoch)
-        ekf = one.counts("ekf_node", TDOAs_received=len(flight.tdoa), IMU_samples_received=len(flight.imu))
+        ekf = one.counts(
+            "ekf_node", TDOAs_received=len(flight.tdoa), IMU_samples_received=len(flight.imu)
+        )
         assert ekf["late"] == ekf["restarts"] == 0
         assert other.counts("ekf_node", TDOAs_received=len(tdoa))["used"] > 0
         running.clear()  # the pause
         for rig in (one, other):
-            rig.wait(lambda rig=rig: rig.fresh_status("ekf_node").message == "paused: /clock stands still", "it to be said")
+            rig.wait(
+                lambda rig=rig: (
+                    rig.fresh_status("ekf_node").message == "paused: /clock stands still"
+                ),
+                "it to be said",
+            )
     expected = run_offline(flight).odometry
-    np.testing.assert_allclose([vector(m.pose.pose.position) for m in one.odometry], expected.p[: len(one.odometry)], atol=1e-6)
+    np.testing.assert_allclose(
+        [vector(m.pose.pose.position) for m in one.odometry],
+        expected.p[: len(one.odometry)],
+        atol=1e-6,
+    )
     assert len(one.odometry) > 100 and seconds_of(other.odometry[0].header.stamp, epoch) > 0.7
-    assert {(m.header.frame_id, m.child_frame_id) for m in one.odometry} == {("hall", "tag0/base_link")}
+    assert {(m.header.frame_id, m.child_frame_id) for m in one.odometry} == {
+        ("hall", "tag0/base_link")
+    }
     assert {(m.header.frame_id, m.child_frame_id) for m in other.odometry} == {("hall", "drone")}
-    frames = {(t.header.frame_id, t.child_frame_id) for m in one.received["/tf"] for t in m.transforms}
+    frames = {
+        (t.header.frame_id, t.child_frame_id) for m in one.received["/tf"] for t in m.transforms
+    }
     assert frames == {("hall", "tag0/base_link")}  # of both, on the one /tf that there is
 
 
@@ -248,10 +320,14 @@ def test_a_recording_that_starts_again_gives_the_same_again(make_rig):
     rig.start("bias_node", "ekf_node", bias_node=["-p", f"model_file:={MODEL}"])
     rig.send_anchors(flight.anchors)
     rig.play(flight)
-    ekf = rig.counts("ekf_node", TDOAs_received=len(flight.tdoa), IMU_samples_received=len(flight.imu))
+    ekf = rig.counts(
+        "ekf_node", TDOAs_received=len(flight.tdoa), IMU_samples_received=len(flight.imu)
+    )
     first, waiting = list(rig.odometry), ekf["waiting"]
     rig.play(flight)
-    ekf = rig.counts("ekf_node", TDOAs_received=2 * len(flight.tdoa), IMU_samples_received=2 * len(flight.imu))
+    ekf = rig.counts(
+        "ekf_node", TDOAs_received=2 * len(flight.tdoa), IMU_samples_received=2 * len(flight.imu)
+    )
     assert ekf["restarts"] == 1
     assert ekf["late"] == waiting  # what the first round left waiting
     second = rig.odometry[len(first) :]
@@ -276,7 +352,9 @@ def test_a_signal_ends_both_in_good_order(make_rig, number):
             code, slept = process.stop(number)
             assert code == 0, "".join(process.lines)
             assert slept < 4.0  # ros2 launch loses patience after 5 s
-            assert not any("Traceback" in line or "FATAL" in line for line in process.lines), "".join(process.lines)
+            assert not any("Traceback" in line or "FATAL" in line for line in process.lines), (
+                "".join(process.lines)
+            )
 
 
 @contextmanager

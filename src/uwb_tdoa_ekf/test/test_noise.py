@@ -1,9 +1,11 @@
-import numpy as np
-from hypothesis import given, strategies as st
-import pytest
+from dataclasses import replace
 
 from flights import corners, fly
-from dataclasses import replace
+from hypothesis import given
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.memory import new_state
 from uwb_tdoa_ekf.core.noise import excess_variance, learn
@@ -11,7 +13,9 @@ from uwb_tdoa_ekf.offline import run_offline
 
 
 def taught(std, noise, seconds=20.0, seed=0):
-    """Excess variances after TDOAs at 400 Hz whose anchors have the standard deviations `noise`, (N,) m."""
+    """Excess variances after TDOAs at 400 Hz whose anchors have the standard deviations `noise`,
+    (N,) m.
+    """
     rng, n = np.random.default_rng(seed), len(noise)
     state, parameters = new_state(np.zeros((n, 3))), FilterConfig(tdoa_std=std).parameters()[0]
     anchors, innovation, sampled = state.anchors, state.record.innovation, []
@@ -89,8 +93,12 @@ def test_an_anchor_that_is_late_for_a_while_disturbs_less():
             flight = fly(seed, 12.0, tdoa_std=0.05, accel_noise=0.05, gyro_noise=0.003)
             late = np.where((flight.tdoa.t % 3.0) < 1.0, 1.0, 0.0)
             three = corners().ids[3]
-            d = flight.tdoa.d + late * ((flight.tdoa.b == three).astype(float) - (flight.tdoa.a == three))
-            result = run_offline(replace(flight, tdoa=replace(flight.tdoa, d=d)), FilterConfig(adapt_noise=adapt))
+            d = flight.tdoa.d + late * (
+                (flight.tdoa.b == three).astype(float) - (flight.tdoa.a == three)
+            )
+            result = run_offline(
+                replace(flight, tdoa=replace(flight.tdoa, d=d)), FilterConfig(adapt_noise=adapt)
+            )
             odometry = result.odometry
             after = odometry.t > 3.0
             off = odometry.p[after] - flight.meta["wave"].motion(odometry.t[after])[0]

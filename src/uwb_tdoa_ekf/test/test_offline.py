@@ -8,9 +8,9 @@ import pytest
 from scipy.stats import chi2
 
 from uwb_tdoa_bias.correction.corrector import Corrector
+from uwb_tdoa_bias.correction.poses import known_yaw_std
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, SmoothTerm, TagLeverArm
 from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas
-from uwb_tdoa_bias.correction.poses import known_yaw_std
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.verdicts import INVALID, STARTUP, USED
 from uwb_tdoa_ekf.estimator import Estimator
@@ -18,18 +18,31 @@ from uwb_tdoa_ekf.frames import to_odometry
 from uwb_tdoa_ekf.offline import run_offline
 
 IDS = corners().ids.tolist()
-STEEP = SmoothTerm(covariate="height", form="common", knots=(0.5, 2.5), shape="parabola", values={"c0": 0.1, "c1": 0.3, "c2": 0.4})
-EFFECTS = EffectSet((AnchorDelay({IDS[0]: 0.3, IDS[4]: -0.2}), TagLeverArm({"x": 0.05, "z": 0.2}), STEEP))
+STEEP = SmoothTerm(
+    covariate="height",
+    form="common",
+    knots=(0.5, 2.5),
+    shape="parabola",
+    values={"c0": 0.1, "c1": 0.3, "c2": 0.4},
+)
+EFFECTS = EffectSet(
+    (AnchorDelay({IDS[0]: 0.3, IDS[4]: -0.2}), TagLeverArm({"x": 0.05, "z": 0.2}), STEEP)
+)
 
 
 def live(flight, corrector, config=None):
-    """Estimator and corrector as the two nodes use them, message by message in the order of the stamps: what a
-    measurement is corrected with is what the filter has told by then."""
+    """Estimator and corrector as the two nodes use them, message by message in the order of the
+    stamps: what a measurement is corrected with is what the filter has told by then.
+    """
     estimator, parts, corrected = Estimator(flight.anchors, config, reorder=0.0), [], []
 
     def advance():
         odometry, residuals = estimator.advance()
-        told = to_odometry(odometry.q, odometry.v, odometry.covariance)[1] if len(odometry) else np.empty((0, 9, 9))
+        told = (
+            to_odometry(odometry.q, odometry.v, odometry.covariance)[1]
+            if len(odometry)
+            else np.empty((0, 9, 9))
+        )
         yaw_std = known_yaw_std(np.sqrt(told[:, [3, 4, 5], [3, 4, 5]]))
         for pose in zip(odometry.t, odometry.p, odometry.q, odometry.v, yaw_std):
             corrector.add_pose(*pose)
@@ -48,11 +61,17 @@ def live(flight, corrector, config=None):
         advance()
     odometry, residuals = estimator.finish()
     parts.append((odometry, residuals))
-    return joined([part[0] for part in parts]), joined([part[1] for part in parts]), np.array(corrected)
+    return (
+        joined([part[0] for part in parts]),
+        joined([part[1] for part in parts]),
+        np.array(corrected),
+    )
 
 
 class Doubt:
-    """Stands in for a network that knows a bias and how sure it is of it, both depending on the pose."""
+    """Stands in for a network that knows a bias and how sure it is of it, both depending on the
+    pose.
+    """
 
     name = "doubt"
 
@@ -69,7 +88,9 @@ def test_corrections_are_those_of_live_feeding(lag, network):
     odometry, residuals, corrected = live(flight, Corrector(flight.anchors, EFFECTS, network, lag))
     assert_same(odometry, baseline.odometry, 1e-9)
     valid = baseline.residuals.verdict != INVALID
-    np.testing.assert_allclose(corrected[valid], np.stack([baseline.bias, baseline.bias_std], axis=1)[valid], atol=1e-9)
+    np.testing.assert_allclose(
+        corrected[valid], np.stack([baseline.bias, baseline.bias_std], axis=1)[valid], atol=1e-9
+    )
     assert np.abs(baseline.bias).max() > 0.3 and (baseline.residuals.verdict == USED).sum() > 500
 
 
@@ -88,7 +109,9 @@ def test_what_is_corrected_is_what_was_wrong():
     a, b = flight.anchors.index(flight.tdoa.a), flight.anchors.index(flight.tdoa.b)
     delay = np.where(flight.anchors.ids == IDS[0], 0.5, 0.0)
     wrong = replace(flight, tdoa=replace(flight.tdoa, d=flight.tdoa.d + delay[b] - delay[a]))
-    right = run_offline(wrong, None, Corrector(flight.anchors, EffectSet((AnchorDelay({IDS[0]: 0.5}),))))
+    right = run_offline(
+        wrong, None, Corrector(flight.anchors, EffectSet((AnchorDelay({IDS[0]: 0.5}),)))
+    )
     np.testing.assert_allclose(right.bias, delay[b] - delay[a], atol=1e-12)
     expected = run_offline(flight)
     np.testing.assert_allclose(right.odometry.p, expected.odometry.p, atol=1e-9)
@@ -96,18 +119,27 @@ def test_what_is_corrected_is_what_was_wrong():
 
 def climbing(flight, steep):
     """The Flight, its TDOAs with an error that is proportional to the climb rate, and that effect."""
-    effect = SmoothTerm(covariate="climb_rate", knots=(-5.0, 5.0), shape="line", values={"c0": 0.0, "c1": 10.0 * steep})
+    effect = SmoothTerm(
+        covariate="climb_rate",
+        knots=(-5.0, 5.0),
+        shape="line",
+        values={"c0": 0.0, "c1": 10.0 * steep},
+    )
     rate = np.gradient(flight.truth.p[:, 2], flight.truth.t)
     d = flight.tdoa.d + effect.curve(np.interp(flight.tdoa.t, flight.truth.t, rate))
     return replace(flight, tdoa=replace(flight.tdoa, d=d)), effect
 
 
 def test_a_bias_that_changes_with_the_state_is_taken_out_at_the_state(monkeypatch):
-    """At the pose of a moment ago alone it is not: the error of the velocity comes back as one of the position."""
+    """At the pose of a moment ago alone it is not: the error of the velocity comes back as one of
+    the position.
+    """
     wrong, effect = climbing(fly(3, 12.0), 1.5)
 
     def error(effects=EffectSet()):
-        odometry = run_offline(wrong, FilterConfig(use_imu=False), Corrector(wrong.anchors, effects)).odometry
+        odometry = run_offline(
+            wrong, FilterConfig(use_imu=False), Corrector(wrong.anchors, effects)
+        ).odometry
         late = odometry.t > odometry.t[0] + 3.0
         return np.sqrt(np.mean((odometry.p[late] - position_at(wrong, odometry.t[late])) ** 2))
 
@@ -117,7 +149,9 @@ def test_a_bias_that_changes_with_the_state_is_taken_out_at_the_state(monkeypatc
 
 
 def test_a_slope_tells_nothing_of_a_place_far_away():
-    """As after the tag was lost and found elsewhere, when the bias is still that of where it was not."""
+    """As after the tag was lost and found elsewhere, when the bias is still that of where it was
+    not.
+    """
     flight = fly(7, 2.0)
     slope, state = np.ones((2, len(flight.tdoa), 6))
     state[:, :3] = position_at(flight, flight.tdoa.t) + 5.0
@@ -125,7 +159,9 @@ def test_a_slope_tells_nothing_of_a_place_far_away():
 
     def positions(*about):
         estimator = Estimator(flight.anchors, FilterConfig(use_imu=False))
-        estimator.add_tdoa(*(getattr(flight.tdoa, name) for name in ("t", "a", "b", "d")), 0.0, *about)
+        estimator.add_tdoa(
+            *(getattr(flight.tdoa, name) for name in ("t", "a", "b", "d")), 0.0, *about
+        )
         return estimator.finish()[0].p
 
     np.testing.assert_array_equal(positions(slope, state), positions())
@@ -139,7 +175,9 @@ def test_an_absurd_slope_makes_a_tdoa_invalid(absurd):
     slope, state = np.zeros((2, len(flight.tdoa), 6))
     slope[150, 4], state[200, 2] = absurd, absurd
     estimator = Estimator(flight.anchors, FilterConfig(use_imu=False))
-    estimator.add_tdoa(*(getattr(flight.tdoa, name) for name in ("t", "a", "b", "d")), 0.0, slope, state)
+    estimator.add_tdoa(
+        *(getattr(flight.tdoa, name) for name in ("t", "a", "b", "d")), 0.0, slope, state
+    )
     odometry, residuals = estimator.finish()
     assert np.flatnonzero(residuals.verdict == INVALID).size == 2 and np.isfinite(odometry.p).all()
 
@@ -173,7 +211,9 @@ def test_every_tdoa_gets_one_verdict_in_the_order_of_the_flight(effects):
 
 def _baseline(flight):
     positions, anchors = flight.anchors.positions, flight.anchors
-    return np.linalg.norm(positions[anchors.index(flight.tdoa.a)] - positions[anchors.index(flight.tdoa.b)], axis=1)
+    return np.linalg.norm(
+        positions[anchors.index(flight.tdoa.a)] - positions[anchors.index(flight.tdoa.b)], axis=1
+    )
 
 
 def test_an_inertial_sample_that_is_not_finite_is_passed_over_as_on_line():
@@ -199,7 +239,9 @@ def test_one_absurd_inertial_sample_does_not_poison_the_filter(stream, size):
 @pytest.mark.parametrize("imu", [True, False])
 def test_flights_too_short_to_start(effects, count, imu):
     flight = fly(7, 2.0)
-    tdoa = Tdoas(*(column[:count] for column in (flight.tdoa.t, flight.tdoa.a, flight.tdoa.b, flight.tdoa.d)))
+    tdoa = Tdoas(
+        *(column[:count] for column in (flight.tdoa.t, flight.tdoa.a, flight.tdoa.b, flight.tdoa.d))
+    )
     none = Imu(np.empty(0), np.empty((0, 3)), np.empty((0, 3)))
     for samples in (flight.imu, None, none) if imu else (None,):
         short = Flight("short", flight.anchors, tdoa, samples)
@@ -236,16 +278,27 @@ def test_arrays_of_any_layout_are_taken():
     assert_same(run_offline(other).odometry, run_offline(flight).odometry)
 
 
-def consistency(robust, loss="geman_mcclure", seeds=range(40), duration=20.0, tdoa_std=0.1, **config):
-    """NEES and NIS of flights whose every error is of the filter's own model, with the filter told their true sizes.
+def consistency(
+    robust, loss="geman_mcclure", seeds=range(40), duration=20.0, tdoa_std=0.1, **config
+):
+    """NEES and NIS of flights whose every error is of the filter's own model, with the filter told
+    their true sizes.
 
-    Returns (nees (flights, times) at 20 Hz after 3 s, nis (flights,) mean over that time, TDOAs in it).
+    Returns (nees (flights, times) at 20 Hz after 3 s, nis (flights,) mean over that time, TDOAs in
+    it).
     """
     sizes = dict(accel_noise=0.05, gyro_noise=0.003, accel_bias_walk=0.01, gyro_bias_walk=1e-4)
     settings = FilterConfig(
-        robust=robust, loss=loss, tdoa_std=tdoa_std, tdoa_correlation_length=1.0, gate=1e6,
-        initial_accel_bias_std=0.1, initial_gyro_bias_std=0.01, **sizes, **config,
-    )  # fmt: skip
+        robust=robust,
+        loss=loss,
+        tdoa_std=tdoa_std,
+        tdoa_correlation_length=1.0,
+        gate=1e6,
+        initial_accel_bias_std=0.1,
+        initial_gyro_bias_std=0.01,
+        **sizes,
+        **config,
+    )
     times, nees, nis = np.arange(3.0, duration - 0.1, 0.05), [], []
     for seed in seeds:
         flight = fly(seed, duration, tdoa_std=tdoa_std, accel_bias=0.1, gyro_bias=0.01, **sizes)
@@ -253,7 +306,9 @@ def consistency(robust, loss="geman_mcclure", seeds=range(40), duration=20.0, td
         at = np.searchsorted(result.odometry.t, times)
         error = result.odometry.p[at] - position_at(flight, result.odometry.t[at])
         covariance = result.odometry.covariance[at, :3, :3]
-        nees.append(np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0]))
+        nees.append(
+            np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])
+        )
         residuals = result.residuals
         counted = (residuals.verdict <= 1) & (residuals.t > 3.0)
         nis.append(np.mean(residuals.innovation[counted] ** 2 / residuals.variance[counted]))
@@ -261,8 +316,10 @@ def consistency(robust, loss="geman_mcclure", seeds=range(40), duration=20.0, td
 
 
 def shares_inside(nees, nis, count, what):
-    """Shares of times and of flights inside the two-sided 95 % chi-square bounds of their averages: Bar-Shalom et al.,
-    Estimation with Applications to Tracking and Navigation, sec. 5.4.2: the NEES over flights, the NIS over time."""
+    """Shares of times and of flights inside the two-sided 95 % chi-square bounds of their averages:
+    Bar-Shalom et al., Estimation with Applications to Tracking and Navigation, sec. 5.4.2: the NEES
+    over flights, the NIS over time.
+    """
     flights = len(nees)
     low, high = chi2.ppf([0.025, 0.975], 3 * flights) / flights
     mean = nees.mean(axis=0)
@@ -270,7 +327,8 @@ def shares_inside(nees, nis, count, what):
     nis_low, nis_high = chi2.ppf([0.025, 0.975], count) / count
     inside = np.mean((nis > nis_low) & (nis < nis_high))
     print(
-        f"{what}, {flights} flights: NEES {nees.mean():.2f}, {times:.0%} of the times in {low:.2f} ... {high:.2f}; "
+        f"{what}, {flights} flights: NEES {nees.mean():.2f}, {times:.0%} of the times in "
+        f"{low:.2f} ... {high:.2f}; "
         f"NIS {nis.mean():.3f}, {inside:.0%} of the flights in {nis_low:.3f} ... {nis_high:.3f}"
     )
     return times, inside
@@ -278,19 +336,25 @@ def shares_inside(nees, nis, count, what):
 
 @pytest.mark.slow
 def test_a_plain_update_is_consistent():
-    """White noise only, and a filter that knows it. Average position NEES of 40 flights inside its 95 % bounds at 90 %
-    of the times; NIS inside for 85 % of the flights: 38 of 40 are expected, fewer than 34 happen once in 300 times to an
-    honest filter."""
-    times, flights = shares_inside(*consistency("gate", vibration_gain=0.0, adapt_noise=False), "no gate")
+    """White noise only, and a filter that knows it. Average position NEES of 40 flights inside its
+    95 % bounds at 90 % of the times; NIS inside for 85 % of the flights: 38 of 40 are expected,
+    fewer than 34 happen once in 300 times to an honest filter.
+    """
+    times, flights = shares_inside(
+        *consistency("gate", vibration_gain=0.0, adapt_noise=False), "no gate"
+    )
     assert times >= 0.9 and flights >= 0.85
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "robust, loss", [("innovation", "geman_mcclure"), ("innovation", "huber"), ("m_estimation", "huber")]
+    "robust, loss",
+    [("innovation", "geman_mcclure"), ("innovation", "huber"), ("m_estimation", "huber")],
 )
 def test_robust_updates_are_cautious_but_not_overconfident(robust, loss):
-    """Weights throw information away that Gaussian noise does not ask them to: the covariance may only be too large."""
+    """Weights throw information away that Gaussian noise does not ask them to: the covariance may
+    only be too large.
+    """
     nees, nis, count = consistency(robust, loss)
     shares_inside(nees, nis, count, f"{robust}, {loss}")
     high = chi2.ppf(0.975, 3 * len(nees)) / len(nees)

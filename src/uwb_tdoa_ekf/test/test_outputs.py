@@ -7,6 +7,7 @@ pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from scipy.spatial.transform import Rotation  # noqa: E402
+
 from uwb_tdoa_bias.foundation.ros_stamps import Epoch  # noqa: E402
 from uwb_tdoa_ekf import outputs  # noqa: E402
 from uwb_tdoa_ekf.results import Odometry  # noqa: E402
@@ -24,7 +25,13 @@ class Publisher:
     def publish(self, message):
         (one,) = message.transforms
         v, q, stamp = one.transform.translation, one.transform.rotation, one.header.stamp
-        self.sent.append((np.array([v.x, v.y, v.z]), Rotation.from_quat([q.x, q.y, q.z, q.w]), stamp.sec + 1e-9 * stamp.nanosec))
+        self.sent.append(
+            (
+                np.array([v.x, v.y, v.z]),
+                Rotation.from_quat([q.x, q.y, q.z, q.w]),
+                stamp.sec + 1e-9 * stamp.nanosec,
+            )
+        )
 
 
 class Stub:
@@ -56,7 +63,10 @@ def made(monkeypatch, node, planar):
 
 
 def odometry(t, p, yaw, tilt=0.0):
-    n, q = len(t), Rotation.from_euler("ZYX", np.column_stack([yaw, np.full((len(t), 2), tilt)])).as_quat()
+    n, q = (
+        len(t),
+        Rotation.from_euler("ZYX", np.column_stack([yaw, np.full((len(t), 2), tilt)])).as_quat(),
+    )
     zeros, covariance = np.zeros((n, 3)), np.tile(0.01 * np.eye(9), (n, 1, 1))
     return Odometry(t, p, zeros, q, zeros, zeros, covariance, np.zeros((n, 3, 3)))
 
@@ -74,7 +84,9 @@ def test_world_to_odom_stays_while_the_position_is_unsure(monkeypatch):
     publish(out, odometry(t[:1], p[:1], np.array([0.5])))
     publish(out, odometry(t[1:], p[1:], np.array([0.5, 2.0])), held=True)
     (first, turn, _), *others = node.tf.sent
-    assert len(others) == 2 and [stamp for *_, stamp in others] == pytest.approx((t[1:] + 100.0).tolist())
+    assert len(others) == 2 and [stamp for *_, stamp in others] == pytest.approx(
+        (t[1:] + 100.0).tolist()
+    )
     for translation, rotation, _ in others:
         np.testing.assert_array_equal(translation, first)
         assert (rotation.inv() * turn).magnitude() == 0.0
@@ -84,7 +96,11 @@ def test_world_to_odom_stays_while_the_position_is_unsure(monkeypatch):
 
 def test_the_first_transform_is_not_held(monkeypatch):
     node = Stub()
-    publish(made(monkeypatch, node, False), odometry(np.array([1.0]), np.ones((1, 3)), np.array([0.5])), held=True)
+    publish(
+        made(monkeypatch, node, False),
+        odometry(np.array([1.0]), np.ones((1, 3)), np.array([0.5])),
+        held=True,
+    )
     (_, turn, _) = node.tf.sent[0]
     assert turn.as_euler("ZYX")[0] == pytest.approx(0.4)
 
@@ -93,7 +109,10 @@ def test_the_first_transform_is_not_held(monkeypatch):
 def test_world_to_odom_of_a_planar_vehicle_turns_about_the_vertical_alone(monkeypatch, planar):
     """odom -> base_link of an odometry in three dimensions tilts."""
     node = Stub(lift=0.05, tilt=0.03)
-    publish(made(monkeypatch, node, planar), odometry(np.array([1.0]), np.array([[1.0, 2.0, 0.0]]), np.array([0.5])))
+    publish(
+        made(monkeypatch, node, planar),
+        odometry(np.array([1.0]), np.array([[1.0, 2.0, 0.0]]), np.array([0.5])),
+    )
     (translation, turn, _) = node.tf.sent[0]
     yaw, pitch, roll = turn.as_euler("ZYX")
     assert yaw == pytest.approx(0.4, abs=0.01) and (np.hypot(pitch, roll) < 1e-9) == planar

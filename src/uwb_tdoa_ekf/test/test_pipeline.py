@@ -36,7 +36,9 @@ def test_the_same_comes_out_whatever_is_used_at_once(compensating):
     whole, of_whole, pipeline = run(flight, config, row, [np.inf])
     assert any(f"anchor {flight.anchors.ids[row]}:" in alarm for alarm in pipeline.alarms)
     assert (pipeline.state.anchors["delay"][row] > 0.5 * LATE) == compensating
-    pieces, of_pieces, _ = run(flight, config, row, [*np.sort(np.random.default_rng(0).uniform(0.0, 24.0, 200)), np.inf])
+    pieces, of_pieces, _ = run(
+        flight, config, row, [*np.sort(np.random.default_rng(0).uniform(0.0, 24.0, 200)), np.inf]
+    )
     for one, other in ((whole, pieces), (of_whole, of_pieces)):
         for name, values in vars(one).items():
             np.testing.assert_array_equal(getattr(other, name), values, name)
@@ -46,4 +48,9 @@ def test_nobody_watches_unless_that_is_asked_for():
     flight = fly(5, 1.0)
     assert Pipeline(Installed(flight.anchors), FilterConfig(), watched=False).alarms == []
     assert Pipeline(Installed(flight.anchors), FilterConfig(), watched=False).monitor is None
-    assert Pipeline(Installed(flight.anchors), FilterConfig(compensate_changes=True), watched=False).monitor is not None
+    assert (
+        Pipeline(
+            Installed(flight.anchors), FilterConfig(compensate_changes=True), watched=False
+        ).monitor
+        is not None
+    )

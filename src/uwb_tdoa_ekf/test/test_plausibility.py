@@ -1,5 +1,6 @@
-"""Inertial samples that cannot be right are left out at once, and used again; healthy ones never are (those of measured flights:
-test_stream_watch.py)."""
+"""Inertial samples that cannot be right are left out at once, and used again; healthy ones never
+are (those of measured flights: test_stream_watch.py).
+"""
 
 import re
 
@@ -28,7 +29,9 @@ def swaying(yaw_rate=0.05):
 def sensed(attitude, acceleration=0.0):
     """Rates and specific force of attitudes at T, and of accelerations (n, 3) m/s^2 in the world."""
     turns = (attitude[:-1].inv() * attitude[1:]).as_rotvec() / np.diff(T)[:, None]
-    return np.vstack([turns, turns[-1:]]), attitude.inv().apply(np.broadcast_to(acceleration + np.array([0, 0, GRAVITY]), (len(T), 3)))
+    return np.vstack([turns, turns[-1:]]), attitude.inv().apply(
+        np.broadcast_to(acceleration + np.array([0, 0, GRAVITY]), (len(T), 3))
+    )
 
 
 def left_out(gyro, accel):
@@ -56,7 +59,9 @@ FAULTS = {
 def test_a_fault_is_seen_within_a_second_and_its_end_after_another(fault):
     change, reason, within = FAULTS[fault]
     gyro, accel = swaying()
-    wrong = (np.where(BAD, changed, right) for changed, right in zip(change(gyro, accel), (gyro, accel)))
+    wrong = (
+        np.where(BAD, changed, right) for changed, right in zip(change(gyro, accel), (gyro, accel))
+    )
     stamps, reasons = map(np.array, zip(*left_out(*wrong)))
     assert reasons[0] == reason
     assert BEGIN <= stamps[0] < BEGIN + within and END < stamps[-1] < END + CLEARED + 0.3
@@ -70,18 +75,26 @@ def test_a_spin_about_the_vertical_in_degrees_is_faster_than_anything_turns():
 
 
 def test_what_a_tag_may_do_is_no_fault():
-    """It falls, is hit, spins, banks with its thrust (all that a multirotor feels), and is turned on its back for a while."""
-    fall = np.where((T > 5.0) & (T < 5.2), -GRAVITY, 0.0) + np.where((T > 5.2) & (T < 5.25), 4.0 * GRAVITY, 0.0)
+    """It falls, is hit, spins, banks with its thrust (all that a multirotor feels), and is turned
+    on its back for a while.
+    """
+    fall = np.where((T > 5.0) & (T < 5.2), -GRAVITY, 0.0) + np.where(
+        (T > 5.2) & (T < 5.25), 4.0 * GRAVITY, 0.0
+    )
     bank = np.interp(T, [5.0, 5.5, 7.0, 7.5], np.deg2rad([0.0, 60.0, 60.0, 0.0]))
-    swing = np.where(np.sin(2.0 * np.pi * 0.6 * T) > 0.0, 0.3, 1.5) * GRAVITY  # as a controller that is pulled up and down
+    swing = (
+        np.where(np.sin(2.0 * np.pi * 0.6 * T) > 0.0, 0.3, 1.5) * GRAVITY
+    )  # as a controller that is pulled up and down
     turn = np.interp(T, [5.0, 5.5, 9.0, 9.5], [1.0, 3.3, 3.3, 1.0]) * GRAVITY
     over = np.interp(T, [5.0, 6.0, 8.0, 9.0], [0.0, np.pi, np.pi, 0.0])
     thrust = (GRAVITY / np.cos(bank))[:, None] * [0.0, 0.0, 1.0]
     rest = Rotation.from_euler("X", 0.0 * T)
     for gyro, accel in (
-        sensed(rest, fall[:, None] * [0.0, 0.0, 1.0]), sensed(Rotation.from_euler("Z", 9.0 * T)),
-        sensed(Rotation.from_euler("X", over)), (sensed(Rotation.from_euler("X", bank))[0], thrust),
-    ):  # fmt: skip
+        sensed(rest, fall[:, None] * [0.0, 0.0, 1.0]),
+        sensed(Rotation.from_euler("Z", 9.0 * T)),
+        sensed(Rotation.from_euler("X", over)),
+        (sensed(Rotation.from_euler("X", bank))[0], thrust),
+    ):
         assert left_out(gyro, accel) == []
     for force in (swing, turn):
         assert left_out(sensed(rest)[0], force[:, None] * [0.0, 0.0, 1.0]) == []
@@ -92,9 +105,13 @@ def test_a_tag_that_lies_on_its_back_goes_without_after_some_seconds():
     assert 6.0 < said[0][0] < 7.2 and said[0][1] == TILT and said[-1][0] == T[-1]
 
 
-@pytest.mark.parametrize(("turn", "says"), [([1.0, -1.0, -1.0], r"-9\.\d m/s\^2"), ([0.0, 0.0, 0.0], r"of 0 m/s\^2")])
+@pytest.mark.parametrize(
+    ("turn", "says"), [([1.0, -1.0, -1.0], r"-9\.\d m/s\^2"), ([0.0, 0.0, 0.0], r"of 0 m/s\^2")]
+)
 def test_what_is_said_has_the_number_of_the_sensor(turn, says):
-    """It once was 1.0, whatever the sensor read: the field `size` of a numpy record is hidden by how many it is."""
+    """It once was 1.0, whatever the sensor read: the field `size` of a numpy record is hidden by
+    how many it is.
+    """
     gyro, accel = (values * turn for values in swaying())
     state, parameters = new_state(np.zeros((4, 3))), FilterConfig().parameters()
     feed(state, parameters, Measurements(structured(IMU_SAMPLE, T, gyro, accel), np.empty(0, TDOA)))

@@ -8,6 +8,7 @@ pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from builtin_interfaces.msg import Time  # noqa: E402
 from geometry_msgs.msg import PoseWithCovarianceStamped  # noqa: E402
+
 from uwb_tdoa_bias.foundation.errors import InputError  # noqa: E402
 from uwb_tdoa_bias.foundation.ros_stamps import Epoch  # noqa: E402
 from uwb_tdoa_ekf.pose_message import pose_from_message  # noqa: E402
@@ -31,7 +32,12 @@ def read(content, newest=3.0):
 
 def test_what_has_a_variance_is_told():
     t, p, covariance, yaw, std = read(message())
-    assert (t, p[:2].tolist(), yaw, std) == (3.0, [1.0, 2.0], pytest.approx(math.pi / 2), pytest.approx(math.sqrt(0.07)))
+    assert (t, p[:2].tolist(), yaw, std) == (
+        3.0,
+        [1.0, 2.0],
+        pytest.approx(math.pi / 2),
+        pytest.approx(math.sqrt(0.07)),
+    )
     assert math.isnan(p[2]) and covariance[0, 0] == 0.25
     _, p, _, yaw, std = read(message((0.25, 0.25, 0.1, 0.0, 0.0, 0.0)))
     assert p[2] == 0.0 and math.isnan(yaw) and math.isnan(std)

@@ -1,4 +1,6 @@
-"""Distances to anchors, corrected in the filter's own process: the same live and off line, and at poses of the past alone."""
+"""Distances to anchors, corrected in the filter's own process: the same live and off line, and at
+poses of the past alone.
+"""
 
 from dataclasses import replace
 
@@ -21,7 +23,10 @@ from uwb_tdoa_ekf.radio_corrections import SLICE, RadioCorrections
 
 NO_TDOAS = Tdoas(*(np.empty(0, kind) for kind in (float, int, int, float)))
 RATE, STD = 100.0, 0.1  # Hz, m
-DELAY, MOVED = EFFECTS["anchor_delay"]({"1": 0.3}), EFFECTS["anchor_position"]({"2.x": 0.6, "2.z": -0.4})
+DELAY, MOVED = (
+    EFFECTS["anchor_delay"]({"1": 0.3}),
+    EFFECTS["anchor_position"]({"2.x": 0.6, "2.z": -0.4}),
+)
 BOX = Anchors.from_positions([[0, 0, 0], [5, 0, 0], [0, 5, 0], [0, 0, 5]], ids=[1, 2, 3, 4])
 
 
@@ -35,23 +40,37 @@ def ranged():
     row = np.arange(len(t)) % len(flight.anchors)
     anchors = Anchors.from_positions(flight.anchors.positions, ids=np.arange(8))
     d = np.linalg.norm(p - anchors.positions[row], axis=1) + STD * rng.standard_normal(len(t))
-    return replace(flight, anchors=anchors, tdoa=NO_TDOAS, range=Ranges(t, anchors.ids[row], d, np.zeros(len(t))))
+    return replace(
+        flight,
+        anchors=anchors,
+        tdoa=NO_TDOAS,
+        range=Ranges(t, anchors.ids[row], d, np.zeros(len(t))),
+    )
 
 
 def error(flight, odometry):
-    truth = np.stack([np.interp(odometry.t, flight.truth.t, column) for column in flight.truth.p.T], axis=1)
+    truth = np.stack(
+        [np.interp(odometry.t, flight.truth.t, column) for column in flight.truth.p.T], axis=1
+    )
     late = odometry.t > odometry.t[0] + 2.0
     return float(np.sqrt(np.mean(np.sum((odometry.p - truth)[late] ** 2, axis=1))))
 
 
-@pytest.mark.parametrize("effects", [(DELAY,), (MOVED,), (DELAY, MOVED)], ids=lambda effects: "+".join(one.name for one in effects))
+@pytest.mark.parametrize(
+    "effects",
+    [(DELAY,), (MOVED,), (DELAY, MOVED)],
+    ids=lambda effects: "+".join(one.name for one in effects),
+)
 def test_what_is_known_of_ranges_is_taken_out_live_as_off_line(ranged, effects):
     wrong = ranged
     for effect in effects:
         wrong = effect.inject(wrong)
     known = EffectSet(effects)
     run = run_offline(wrong, None, Corrector(wrong.anchors, known))
-    clean, without = error(ranged, run_offline(ranged).odometry), error(ranged, run_offline(wrong).odometry)
+    clean, without = (
+        error(ranged, run_offline(ranged).odometry),
+        error(ranged, run_offline(wrong).odometry),
+    )
     assert without > 1.5 * clean and error(ranged, run.odometry) < 1.1 * clean
     odometry, _ = feed(Estimator(wrong.anchors, effects=known), wrong)
     assert_same(odometry, run.odometry)
@@ -60,7 +79,12 @@ def test_what_is_known_of_ranges_is_taken_out_live_as_off_line(ranged, effects):
 def measured(t, anchor, value):
     """Measurements of ranges alone."""
     rows = np.zeros(len(t), AID)
-    rows["t"], rows["kind"], rows["anchor"], rows["value"][:, 0] = t, STREAMS.index("range"), anchor, value
+    rows["t"], rows["kind"], rows["anchor"], rows["value"][:, 0] = (
+        t,
+        STREAMS.index("range"),
+        anchor,
+        value,
+    )
     return Measurements(np.empty(0, IMU_SAMPLE), np.empty(0, TDOA), rows)
 
 
@@ -81,7 +105,11 @@ def test_a_slice_is_corrected_at_the_last_pose_before_it():
     for k, part in enumerate(corrections.slices(measured(t, np.ones(5, int), np.full(5, 4.0)))):
         found.append(part.aids)
         corrections.add_odometry(odometry_at(part.aids["t"][-1:], places[min(k, 1)]))
-    assert [part["t"].tolist() for part in found] == [t[:2].tolist(), t[2:4].tolist(), t[4:].tolist()]
+    assert [part["t"].tolist() for part in found] == [
+        t[:2].tolist(),
+        t[2:4].tolist(),
+        t[4:].tolist(),
+    ]
     np.testing.assert_array_equal(found[0]["value"][:, 0], 4.0)  # nobody knows where it is
     for part, place in zip(found[1:], places):
         bias = np.linalg.norm(place - moved) - np.linalg.norm(place - BOX.positions[1])
@@ -90,14 +118,21 @@ def test_a_slice_is_corrected_at_the_last_pose_before_it():
 
 def test_ranges_of_anchors_that_are_gone_stay_as_they_are_and_others_keep_their_rows():
     installed = Installed(BOX)
-    corrections = RadioCorrections(EffectSet((EFFECTS["anchor_delay"]({"1": 0.3, "4": 0.1}),)), installed)
+    corrections = RadioCorrections(
+        EffectSet((EFFECTS["anchor_delay"]({"1": 0.3, "4": 0.1}),)), installed
+    )
     installed.change(BOX.only(np.array([1, 2, 3])))
-    (part,) = corrections.slices(measured(np.array([0.01, 0.02, 0.03]), np.array([0, 1, 3]), np.full(3, 4.0)))
+    (part,) = corrections.slices(
+        measured(np.array([0.01, 0.02, 0.03]), np.array([0, 1, 3]), np.full(3, 4.0))
+    )
     np.testing.assert_allclose(part.aids["value"][:, 0], [4.0, 4.0, 3.9])
 
 
 def test_what_does_not_act_on_ranges_leaves_everything_in_one_piece(ranged):
-    assert RadioCorrections(EffectSet((EFFECTS["pair_offset"]({"1-2": 0.3}), EFFECTS["range_delay"]({"offset": 0.1}))), Installed(BOX)).idle
+    assert RadioCorrections(
+        EffectSet((EFFECTS["pair_offset"]({"1-2": 0.3}), EFFECTS["range_delay"]({"offset": 0.1}))),
+        Installed(BOX),
+    ).idle
     assert not RadioCorrections(EffectSet((DELAY,)), Installed(BOX)).idle
 
 
@@ -128,7 +163,9 @@ def test_what_comes_at_once_and_one_by_one_is_corrected_alike():
 
 
 def test_what_holds_no_distances_is_one_part_and_distances_after_it_are_corrected_as_they_would_be():
-    """Inertial samples and TDOAs alone, then a distance in the slice that they ended in, and one in the next."""
+    """Inertial samples and TDOAs alone, then a distance in the slice that they ended in, and one in
+    the next.
+    """
     t = 1.7e9 + np.arange(12) / 100.0
     imu = np.zeros(len(t), IMU_SAMPLE)
     imu["t"] = t

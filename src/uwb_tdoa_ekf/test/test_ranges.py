@@ -31,12 +31,18 @@ def ranged():
     t = np.arange(truth.t[0], truth.t[-1], 1.0 / RATE)
     p = np.stack([np.interp(t, truth.t, column) for column in truth.p.T], axis=1)
     row = np.arange(len(t)) % len(flight.anchors)
-    d = np.linalg.norm(p - flight.anchors.positions[row], axis=1) + STD * rng.standard_normal(len(t))
-    return replace(flight, tdoa=NO_TDOAS, range=Ranges(t, flight.anchors.ids[row], d, np.zeros(len(t))))
+    d = np.linalg.norm(p - flight.anchors.positions[row], axis=1) + STD * rng.standard_normal(
+        len(t)
+    )
+    return replace(
+        flight, tdoa=NO_TDOAS, range=Ranges(t, flight.anchors.ids[row], d, np.zeros(len(t)))
+    )
 
 
 def error(flight, odometry):
-    truth = np.stack([np.interp(odometry.t, flight.truth.t, column) for column in flight.truth.p.T], axis=1)
+    truth = np.stack(
+        [np.interp(odometry.t, flight.truth.t, column) for column in flight.truth.p.T], axis=1
+    )
     late = odometry.t > odometry.t[0] + 2.0
     return float(np.sqrt(np.mean(np.sum((odometry.p - truth)[late] ** 2, axis=1))))
 
@@ -83,7 +89,10 @@ def test_what_is_no_range_is_counted(ranged):
 
 def test_outliers_are_not_used(ranged):
     rng, n = np.random.default_rng(1), len(ranged.range)
-    late = replace(ranged.range, d=ranged.range.d + np.where(rng.random(n) < 0.1, rng.uniform(2.0, 5.0, n), 0.0))
+    late = replace(
+        ranged.range,
+        d=ranged.range.d + np.where(rng.random(n) < 0.1, rng.uniform(2.0, 5.0, n), 0.0),
+    )
     assert error(ranged, run_offline(replace(ranged, range=late)).odometry) < 1.5 * STD
 
 
@@ -114,7 +123,9 @@ def test_two_ranges_make_a_tdoa():
     two["t"], two["anchor"], two["value"][0], two["std"][0] = 1.05, 1, 4.5, 0.4
     assert not ranges.pair(state.ekf[0], one) and ranges.pair(state.ekf[0], two)
     made = state.ekf[0]["paired"][0]
-    assert (made["t"], made["a"], made["b"], made["d"]) == (1.05, 2, 1, 1.5) and made["variance"] == pytest.approx(0.25)
+    assert (made["t"], made["a"], made["b"], made["d"]) == (1.05, 2, 1, 1.5) and made[
+        "variance"
+    ] == pytest.approx(0.25)
     one["t"] = 2.0  # a second later
     assert not ranges.pair(state.ekf[0], one)
 
@@ -125,16 +136,23 @@ def test_an_offset_of_all_ranges_is_found(ranged, offset):
     known = run_offline(ranged, CALIBRATED).odometry
     found = run_offline(longer).odometry
     assert error(ranged, found) < 1.2 * error(ranged, known)
-    truth = np.stack([np.interp(found.t, ranged.truth.t, column) for column in ranged.truth.p.T], axis=1)
+    truth = np.stack(
+        [np.interp(found.t, ranged.truth.t, column) for column in ranged.truth.p.T], axis=1
+    )
     away = found.p - truth
-    assert np.mean(np.einsum("ni,nij,nj->n", away, np.linalg.inv(found.covariance[:, :3, :3]), away)) < 3.0  # as many as there are axes
+    assert (
+        np.mean(np.einsum("ni,nij,nj->n", away, np.linalg.inv(found.covariance[:, :3, :3]), away))
+        < 3.0
+    )  # as many as there are axes
 
 
 def test_who_knows_of_no_offset_is_wrong_and_certain(ranged):
     """What the offset is for."""
     longer = replace(ranged, range=replace(ranged.range, d=ranged.range.d + 0.25))
     found = run_offline(longer)
-    assert error(ranged, run_offline(longer, CALIBRATED).odometry) > 2.0 * error(ranged, found.odometry)
+    assert error(ranged, run_offline(longer, CALIBRATED).odometry) > 2.0 * error(
+        ranged, found.odometry
+    )
 
 
 def test_the_smoother_takes_the_offset_out_that_the_filter_finds(ranged):

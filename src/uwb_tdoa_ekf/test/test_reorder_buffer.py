@@ -2,15 +2,25 @@ from dataclasses import replace
 import math
 
 from flights import fly
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from live import IMU, TDOA, arriving, assert_same, assert_same_as_offline, feed, messages, send
 import numpy as np
 
 from uwb_tdoa_bias.foundation.flight import Tdoas
-from uwb_tdoa_ekf.core.memory import AID, IMU_SAMPLE, TDOA as TDOA_ROW
+from uwb_tdoa_ekf.core.memory import AID, IMU_SAMPLE
+from uwb_tdoa_ekf.core.memory import TDOA as TDOA_ROW
 from uwb_tdoa_ekf.core.verdicts import INVALID, LATE
 from uwb_tdoa_ekf.estimator import Estimator
-from uwb_tdoa_ekf.reorder_buffer import FIRST_AID, IMU_STREAM, SILENT, TDOA_STREAM, TRIAL, LatenessPolicy, ReorderBuffer
+from uwb_tdoa_ekf.reorder_buffer import (
+    FIRST_AID,
+    IMU_STREAM,
+    SILENT,
+    TDOA_STREAM,
+    TRIAL,
+    LatenessPolicy,
+    ReorderBuffer,
+)
 
 
 def late(stamps):
@@ -37,7 +47,10 @@ def test_the_first_that_breaks_a_trusted_order_is_late_and_what_is_older_than_wh
     end = 2.0 * TRIAL
     stamps = [0.0, end, end - 0.001, end + 0.002, end + 0.001, end - 0.002, end]
     assert late(stamps) == ([False, False, True, False, False, True, True], False)
-    assert late([0.0, *stamps]) == ([False, False, False, True, False, False, True, False], False)  # some come twice
+    assert late([0.0, *stamps]) == (
+        [False, False, False, True, False, False, True, False],
+        False,
+    )  # some come twice
 
 
 @given(st.lists(st.floats(0.0, 3.0 * TRIAL), max_size=30))
@@ -62,10 +75,16 @@ def test_where_stamps_come_twice_from_the_beginning_nothing_is_late():
 
 
 def on_grid(flight, until):
-    """The flight with stamps that are multiples of 0.01 s, without TDOAs that would share one with another before `until`, s."""
-    imu, tdoa = (replace(part, t=np.round(100.0 * part.t) / 100.0) for part in (flight.imu, flight.tdoa))
+    """The flight with stamps that are multiples of 0.01 s, without TDOAs that would share one with
+    another before `until`, s.
+    """
+    imu, tdoa = (
+        replace(part, t=np.round(100.0 * part.t) / 100.0) for part in (flight.imu, flight.tdoa)
+    )
     kept = np.append(True, np.diff(tdoa.t) > 0.0) | (tdoa.t > until)
-    return replace(flight, imu=imu, tdoa=Tdoas(*(column[kept] for column in (tdoa.t, tdoa.a, tdoa.b, tdoa.d))))
+    return replace(
+        flight, imu=imu, tdoa=Tdoas(*(column[kept] for column in (tdoa.t, tdoa.a, tdoa.b, tdoa.d)))
+    )
 
 
 def test_an_odometry_waits_for_nothing_where_no_stamp_comes_twice():
@@ -82,14 +101,21 @@ def test_an_odometry_waits_for_nothing_where_no_stamp_comes_twice():
 
 @settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1), st.floats(0.0, 0.2), st.sampled_from([IMU, TDOA]))
-def test_the_first_stamp_that_comes_twice_late_in_a_flight_is_late_however_the_streams_arrive(seed, delay, behind):
+def test_the_first_stamp_that_comes_twice_late_in_a_flight_is_late_however_the_streams_arrive(
+    seed, delay, behind
+):
     rng, told = np.random.default_rng(seed), []
     flight = on_grid(fly(2, 2.6, imu_rate=100.0, tdoa_rate=60.0), 2.2)
     delays = {"imu_delay": delay} if behind == IMU else {"tdoa_delay": delay}
     for order in (messages(flight), arriving(flight, rng, **delays)):
-        told.append(feed(Estimator(flight.anchors), flight, order=order, advance=lambda: rng.random() < 0.3))
+        told.append(
+            feed(Estimator(flight.anchors), flight, order=order, advance=lambda: rng.random() < 0.3)
+        )
     assert_same(told[0][0], told[1][0])
-    became = [sorted(zip(residuals.t, residuals.a, residuals.b, residuals.verdict)) for _, residuals in told]
+    became = [
+        sorted(zip(residuals.t, residuals.a, residuals.b, residuals.verdict))
+        for _, residuals in told
+    ]
     assert became[0] == became[1] and sum(verdict == LATE for *_, verdict in became[0]) == 1
 
 
@@ -104,9 +130,14 @@ def buffer_of(reorder=0.1, lag=1.0, use_imu=True):
     """(ReorderBuffer, what it refuses: [(stream, stamp, verdict)], stamps of its restarts)."""
     refused, restarts = [], []
     buffer = ReorderBuffer(
-        reorder, lag, use_imu, lambda stream, gone, verdict: refused.extend((stream, t, verdict) for t in gone["t"].tolist()),
+        reorder,
+        lag,
+        use_imu,
+        lambda stream, gone, verdict: refused.extend(
+            (stream, t, verdict) for t in gone["t"].tolist()
+        ),
         lambda cause: restarts.append((cause.stream, round(cause.step, 9), cause.overtaken)),
-    )  # fmt: skip
+    )
     return buffer, refused, restarts
 
 
@@ -141,7 +172,9 @@ def test_a_stamp_that_is_no_number_begins_nothing():
     buffer.add(IMU_STREAM, rows(IMU_SAMPLE, math.nan)[0], np.array([False]))
     assert buffer.began == math.inf and buffer.newest == -math.inf
     buffer.add(TDOA_STREAM, *rows(TDOA_ROW, 0.0, 0.5, 1.0, 1.5, 2.0))
-    assert buffer.began == 0.0 and buffer.watermark == 2.0  # nothing waits for an IMU of which no sample has come
+    assert (
+        buffer.began == 0.0 and buffer.watermark == 2.0
+    )  # nothing waits for an IMU of which no sample has come
 
 
 def test_a_stamp_that_is_no_measurement_counts_and_a_lone_one_far_away_is_refused():
@@ -161,7 +194,11 @@ def test_a_stream_that_falls_back_starts_anew_and_what_waited_is_late():
     buffer.add(TDOA_STREAM, *rows(TDOA_ROW, 50.0, 10.0, 10.1))
     assert not refused and not restarts  # it may be a few wrong stamps
     buffer.add(TDOA_STREAM, *rows(TDOA_ROW, 10.2, 10.3))
-    assert sorted(refused) == [(IMU_STREAM, 50.0, LATE), (IMU_STREAM, 50.1, LATE), (TDOA_STREAM, 50.0, LATE)]
+    assert sorted(refused) == [
+        (IMU_STREAM, 50.0, LATE),
+        (IMU_STREAM, 50.1, LATE),
+        (TDOA_STREAM, 50.0, LATE),
+    ]
     assert restarts == [("tdoa", -40.0, False)]
     assert buffer.take(math.inf).tdoa["t"].tolist() == [10.0, 10.1, 10.2, 10.3]
 
@@ -174,4 +211,8 @@ def test_of_a_recording_nothing_is_late():
     assert buffer.take(1.0).aids["t"].tolist() == [1.0] and buffer.used_until == 1.0
     buffer.load(TDOA_STREAM, rows(TDOA_ROW, 3.0, 4.0)[0])
     imu, tdoa, aids = buffer.take(math.inf)
-    assert (len(imu), tdoa["t"].tolist(), aids["t"].tolist()) == (0, [3.0, 3.0, 4.0], [1.5, 2.0, 2.0])
+    assert (len(imu), tdoa["t"].tolist(), aids["t"].tolist()) == (
+        0,
+        [3.0, 3.0, 4.0],
+        [1.5, 2.0, 2.0],
+    )

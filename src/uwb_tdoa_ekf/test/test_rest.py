@@ -19,15 +19,21 @@ PLACE = np.array([2.5, 5.0, 0.03])
 
 
 def on_floor(seed, duration, late=3.3, shaking=0.0, lift=np.inf, back=np.inf, known=None):
-    """A flight that stands at PLACE and, from `lift` s on, rises by 0.5 m/s^2 for 2 s, stays up, and comes down likewise from `back` s on;
-    while it is below 0.12 m the anchors at 0.15 m are about `late` m later, or all by `known` (8,) m. shaking : m/s^2, white, of the
-    accelerometer."""
+    """A flight that stands at PLACE and, from `lift` s on, rises by 0.5 m/s^2 for 2 s, stays up,
+    and comes down likewise from `back` s on; while it is below 0.12 m the anchors at 0.15 m are
+    about `late` m later, or all by `known` (8,) m. shaking : m/s^2, white, of the accelerometer.
+    """
     low = replace(corners(), positions=np.array(corners().positions) + [0.0, 0.0, 0.15])
-    flight, rng = fly(seed, duration, hover=True, anchors=low, imu_rate=400.0, tdoa_rate=360.0), np.random.default_rng(seed)
+    flight, rng = (
+        fly(seed, duration, hover=True, anchors=low, imu_rate=400.0, tdoa_rate=360.0),
+        np.random.default_rng(seed),
+    )
 
     def risen(t):
         since = np.clip(t, 0.0, 2.0)
-        return np.where(since < 1.0, 0.25 * since**2, 0.25 + 0.5 * (since - 1.0) - 0.25 * (since - 1.0) ** 2)
+        return np.where(
+            since < 1.0, 0.25 * since**2, 0.25 + 0.5 * (since - 1.0) - 0.25 * (since - 1.0) ** 2
+        )
 
     def at(t):
         return PLACE + np.stack([0.0 * t, 0.0 * t, risen(t - lift) - risen(t - back)], axis=1)
@@ -38,20 +44,37 @@ def on_floor(seed, duration, late=3.3, shaking=0.0, lift=np.inf, back=np.inf, kn
     t, positions = flight.tdoa.t, low.positions
     a, b = low.index(flight.tdoa.a), low.index(flight.tdoa.b)
     p = at(t)
-    of_anchor = np.where(positions[:, 2] < 1.0, late + 0.2 * rng.standard_normal(len(positions)), 0.0)
+    of_anchor = np.where(
+        positions[:, 2] < 1.0, late + 0.2 * rng.standard_normal(len(positions)), 0.0
+    )
     of_anchor = of_anchor if known is None else known
     near = p[:, 2] < 0.12
-    d = tdoa(p, positions[a], positions[b]) + 0.08 * rng.standard_normal(len(t)) + near * (of_anchor[b] - of_anchor[a])
+    d = (
+        tdoa(p, positions[a], positions[b])
+        + 0.08 * rng.standard_normal(len(t))
+        + near * (of_anchor[b] - of_anchor[a])
+    )
     up = force(flight.imu.t - lift) - force(flight.imu.t - back)
-    accel = flight.imu.accel + np.stack([0.0 * up, 0.0 * up, up], axis=1) + shaking * rng.standard_normal((len(up), 3))
+    accel = (
+        flight.imu.accel
+        + np.stack([0.0 * up, 0.0 * up, up], axis=1)
+        + shaking * rng.standard_normal((len(up), 3))
+    )
     truth = replace(flight.truth, p=at(flight.truth.t))
-    return replace(flight, tdoa=replace(flight.tdoa, d=d), imu=Imu(flight.imu.t, flight.imu.gyro, accel), truth=truth)
+    return replace(
+        flight,
+        tdoa=replace(flight.tdoa, d=d),
+        imu=Imu(flight.imu.t, flight.imu.gyro, accel),
+        truth=truth,
+    )
 
 
 def run(flight, corrector=None, **config):
     """(t, error (n, 3) m, NEES (n,)) of the odometry."""
     odometry = run_offline(flight, FilterConfig(**config), corrector).odometry
-    error = odometry.p - np.stack([np.interp(odometry.t, flight.truth.t, flight.truth.p[:, k]) for k in range(3)], axis=1)
+    error = odometry.p - np.stack(
+        [np.interp(odometry.t, flight.truth.t, flight.truth.p[:, k]) for k in range(3)], axis=1
+    )
     nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(odometry.covariance[:, :3, :3]), error)
     return odometry.t, error, nees
 
@@ -91,8 +114,13 @@ def test_it_comes_down_with_the_tag_while_rotors_still_turn():
 
 
 def test_delays_that_are_known_of_the_floor_make_it_sharp():
-    delays = np.where(np.array(corners().positions)[:, 2] < 1.0, 3.3, [0.0, 0.6, 0.0, 0.0] * 2) + 0.05 * np.arange(8)
-    values = {f"{i}.delay": delay for i, delay in zip(corners().ids, delays)} | {"x": PLACE[0], "y": PLACE[1]}
+    delays = np.where(
+        np.array(corners().positions)[:, 2] < 1.0, 3.3, [0.0, 0.6, 0.0, 0.0] * 2
+    ) + 0.05 * np.arange(8)
+    values = {f"{i}.delay": delay for i, delay in zip(corners().ids, delays)} | {
+        "x": PLACE[0],
+        "y": PLACE[1],
+    }
     for seed in range(4):
         flight = on_floor(seed, 8.0, shaking=0.6, lift=5.0, known=delays)
         corrector = Corrector(flight.anchors, EffectSet((EFFECTS["floor_multipath"](values),)))
@@ -106,11 +134,19 @@ def test_delays_that_are_known_of_the_floor_make_it_sharp():
 def test_live_the_delays_of_the_floor_do_the_same():
     delays = np.where(np.array(corners().positions)[:, 2] < 1.0, 3.3, 0.3)
     flight = on_floor(0, 3.0, known=delays)
-    known = EffectSet((EFFECTS["floor_multipath"]({f"{i}.delay": delay for i, delay in zip(flight.anchors.ids, delays)}),))
+    known = EffectSet(
+        (
+            EFFECTS["floor_multipath"](
+                {f"{i}.delay": delay for i, delay in zip(flight.anchors.ids, delays)}
+            ),
+        )
+    )
     estimator = Estimator(flight.anchors, reorder=0.0, effects=known)
     estimator.add_imu(flight.imu.t, flight.imu.gyro, flight.imu.accel)
     estimator.add_tdoa(flight.tdoa.t, flight.tdoa.a, flight.tdoa.b, flight.tdoa.d)
-    assert_same(estimator.finish()[0], run_offline(flight, None, Corrector(flight.anchors, known)).odometry)
+    assert_same(
+        estimator.finish()[0], run_offline(flight, None, Corrector(flight.anchors, known)).odometry
+    )
 
 
 def test_a_tag_that_lies_still_stays_where_it_is_without_tdoas():
@@ -118,7 +154,9 @@ def test_a_tag_that_lies_still_stays_where_it_is_without_tdoas():
     for seed in range(4):
         flight = on_floor(seed, 11.0, late=0.0)
         heard = flight.tdoa.t < 1.0
-        flight = replace(flight, tdoa=Tdoas(*(column[heard] for column in vars(flight.tdoa).values())))
+        flight = replace(
+            flight, tdoa=Tdoas(*(column[heard] for column in vars(flight.tdoa).values()))
+        )
         t, error, nees = run(flight)
         assert t[-1] > 10.9 and np.linalg.norm(error, axis=1).max() < 0.5 and nees.max() < 20.0
 
@@ -144,7 +182,15 @@ def share_at_rest(flight):
 
 
 def test_too_few_tdoas_are_no_evidence_of_motion():
-    """Pairs at random, as TDoA3 has them: in many looks no pair is heard often enough. Counted as motion, such looks left 0.15 of the time."""
-    at_rest = [fly(seed, 20.0, hover=True, tdoa_rate=240.0, accel_noise=0.003, gyro_noise=0.0005) for seed in range(3)]
+    """Pairs at random, as TDoA3 has them: in many looks no pair is heard often enough.
+
+    Counted as motion, such looks left 0.15 of the time.
+    """
+    at_rest = [
+        fly(seed, 20.0, hover=True, tdoa_rate=240.0, accel_noise=0.003, gyro_noise=0.0005)
+        for seed in range(3)
+    ]
     assert np.mean([share_at_rest(flight) for flight in at_rest]) > 0.6
-    assert share_at_rest(fly(0, 20.0, tdoa_rate=240.0, accel_noise=0.003, gyro_noise=0.0005)) == 0.0  # it flies
+    assert (
+        share_at_rest(fly(0, 20.0, tdoa_rate=240.0, accel_noise=0.003, gyro_noise=0.0005)) == 0.0
+    )  # it flies

@@ -1,5 +1,6 @@
 from covariances import assert_covariance
-from hypothesis import given, strategies as st
+from hypothesis import given
+from hypothesis import strategies as st
 import numpy as np
 from priors import Prior, kalman, with_offset
 import pytest
@@ -8,8 +9,13 @@ from uwb_tdoa_bias.foundation.robust_loss import LOSSES, weight
 from uwb_tdoa_ekf.core.auxiliary import PRESSURE, RANGE, depend
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
 from uwb_tdoa_ekf.core.robust import (
-    NEGLIGIBLE, SMALLEST_WEIGHT, update, update_gate, update_innovation, update_m_estimation,
-)  # fmt: skip
+    NEGLIGIBLE,
+    SMALLEST_WEIGHT,
+    update,
+    update_gate,
+    update_innovation,
+    update_m_estimation,
+)
 
 seeds = st.integers(0, 2**32 - 1)
 losses = st.sampled_from(LOSSES)
@@ -22,10 +28,13 @@ def tuned(**config):
 
 
 def m_estimation(prior, noise, parameters):
-    """Eqs. 8 - 13 of Zhao et al. (RA-L 2021) as they stand there, the Jacobian at the prior mean, no weight of the
-    measurement below SMALLEST_WEIGHT: error, covariance, weight."""
+    """Eqs. 8 - 13 of Zhao et al. (RA-L 2021) as they stand there, the Jacobian at the prior mean,
+    no weight of the measurement below SMALLEST_WEIGHT: error, covariance, weight.
+    """
     S, error, value = np.linalg.cholesky(prior.hypothesis.P), np.zeros(15), prior.innovation.value
-    loss, state_scale, scale = (parameters[name] for name in ("loss", "state_scale", "measurement_scale"))
+    loss, state_scale, scale = (
+        parameters[name] for name in ("loss", "state_scale", "measurement_scale")
+    )
     for _ in range(parameters["iterations"]):
         scaled = np.linalg.solve(S, error)  # eq. 9
         rescaled = S @ np.diag([1.0 / weight(loss, e, state_scale) for e in scaled]) @ S.T  # eq. 10
@@ -38,7 +47,9 @@ def m_estimation(prior, noise, parameters):
 def test_gate_that_is_open_gives_the_textbook_update(seed, length):
     prior = Prior(seed)
     expected = prior.textbook(prior.innovation.noise_variance * length)
-    update_gate(prior.hypothesis, prior.innovation, tuned(gate=HUGE, tdoa_correlation_length=length))
+    update_gate(
+        prior.hypothesis, prior.innovation, tuned(gate=HUGE, tdoa_correlation_length=length)
+    )
     assert prior.innovation.weight == 1.0
     prior.assert_is(*expected)
 
@@ -47,7 +58,9 @@ def test_gate_that_is_open_gives_the_textbook_update(seed, length):
 def test_gate_judges_with_the_variance_of_one_measurement_and_leaves_all_as_it_was(seed, length):
     prior, gate = Prior(seed, surprise=3.0), 2.0
     innovation, before = prior.innovation, prior.hypothesis.copy()
-    passed = abs(innovation.value) <= gate * np.sqrt(innovation.prior_variance + innovation.noise_variance)
+    passed = abs(innovation.value) <= gate * np.sqrt(
+        innovation.prior_variance + innovation.noise_variance
+    )
     update_gate(prior.hypothesis, innovation, tuned(gate=gate, tdoa_correlation_length=length))
     assert innovation.weight == passed
     assert passed or (prior.hypothesis == before and innovation.total_variance == np.inf)
@@ -95,7 +108,9 @@ def test_m_estimation_is_that_of_the_paper(seed, loss, length, iterations, state
     prior = Prior(seed, surprise=2.0)
     scales = dict(measurement_scale=scale, state_scale=state_scale, iterations=iterations)
     parameters = tuned(loss=loss, tdoa_correlation_length=length, **scales)
-    error, covariance, expected = m_estimation(prior, prior.innovation.noise_variance * length, parameters)
+    error, covariance, expected = m_estimation(
+        prior, prior.innovation.noise_variance * length, parameters
+    )
     posterior = prior.after(error, covariance)
     update_m_estimation(prior.hypothesis, prior.innovation, parameters)
     assert prior.innovation.weight == pytest.approx(expected, rel=1e-6)
@@ -110,7 +125,13 @@ def test_m_estimation_follows_an_outlier_less_than_the_textbook(loss):
     prior.project()
     textbook, _ = prior.textbook(0.01)
     before = prior.hypothesis.x.copy()
-    parameters = tuned(loss=loss, tdoa_correlation_length=1.0, state_scale=HUGE, measurement_scale=2.5, iterations=2)
+    parameters = tuned(
+        loss=loss,
+        tdoa_correlation_length=1.0,
+        state_scale=HUGE,
+        measurement_scale=2.5,
+        iterations=2,
+    )
     update_m_estimation(prior.hypothesis, prior.innovation, parameters)
     assert 0.0 < prior.innovation.weight < 0.2
     assert np.linalg.norm(prior.hypothesis.x - before) < 0.5 * np.linalg.norm(textbook - before)
@@ -119,7 +140,9 @@ def test_m_estimation_follows_an_outlier_less_than_the_textbook(loss):
 def joint_m_estimation(prior, joint, h, noise, parameters):
     """`m_estimation` of a joint state of any size: its error, its covariance."""
     S, error, value = np.linalg.cholesky(joint), np.zeros(len(h)), prior.innovation.value
-    loss, state_scale, scale = (parameters[name] for name in ("loss", "state_scale", "measurement_scale"))
+    loss, state_scale, scale = (
+        parameters[name] for name in ("loss", "state_scale", "measurement_scale")
+    )
     for _ in range(parameters["iterations"]):
         scaled = np.linalg.solve(S, error)
         rescaled = S @ np.diag([1.0 / weight(loss, e, state_scale) for e in scaled]) @ S.T
@@ -140,8 +163,17 @@ MEASURED = {  # error states that a measurement depends on, and the auxiliary on
 }
 
 
-@given(seeds, st.sampled_from(sorted(MEASURED)), st.sampled_from(ROBUST), losses, st.integers(1, 4), st.floats(0.0, 5.0))
-def test_whatever_is_measured_the_joint_covariance_stays_one(seed, name, robust, loss, iterations, surprise):
+@given(
+    seeds,
+    st.sampled_from(sorted(MEASURED)),
+    st.sampled_from(ROBUST),
+    losses,
+    st.integers(1, 4),
+    st.floats(0.0, 5.0),
+)
+def test_whatever_is_measured_the_joint_covariance_stays_one(
+    seed, name, robust, loss, iterations, surprise
+):
     states, offset = MEASURED[name]
     prior = Prior(seed, states, surprise)
     joint, innovation = with_offset(prior), prior.innovation
@@ -157,20 +189,30 @@ def test_whatever_is_measured_the_joint_covariance_stays_one(seed, name, robust,
         error, expected = joint_m_estimation(prior, joint, h, innovation.noise_variance, parameters)
     update(prior.hypothesis, innovation, parameters)
     after = np.zeros((18, 18))
-    after[:15, :15], after[15:, :15], after[15:, 15:] = prior.hypothesis.P, prior.hypothesis.offset_cross, prior.hypothesis.offset_P
+    after[:15, :15], after[15:, :15], after[15:, 15:] = (
+        prior.hypothesis.P,
+        prior.hypothesis.offset_cross,
+        prior.hypothesis.offset_P,
+    )
     after[:15, 15:] = after[15:, :15].T
     assert_covariance(after, tolerance=1e-8)
     if robust == "m_estimation":
         std = np.sqrt(np.diag(expected))
-        np.testing.assert_allclose(after / np.outer(std, std), expected / np.outer(std, std), atol=1e-6)
-        np.testing.assert_allclose((prior.hypothesis.offset - x) / std[15:], error[15:] / std[15:], atol=1e-6)
+        np.testing.assert_allclose(
+            after / np.outer(std, std), expected / np.outer(std, std), atol=1e-6
+        )
+        np.testing.assert_allclose(
+            (prior.hypothesis.offset - x) / std[15:], error[15:] / std[15:], atol=1e-6
+        )
 
 
 @given(seeds, st.sampled_from(ROBUST), losses, st.floats(0.0, 5.0), st.integers(1, 5))
 def test_every_update_leaves_a_covariance(seed, robust, loss, surprise, iterations):
     prior = Prior(seed, surprise=surprise)
     before = prior.hypothesis.P.copy()
-    update(prior.hypothesis, prior.innovation, tuned(robust=robust, loss=loss, iterations=iterations))
+    update(
+        prior.hypothesis, prior.innovation, tuned(robust=robust, loss=loss, iterations=iterations)
+    )
     x, P = prior.hypothesis.x, prior.hypothesis.P
     assert np.isfinite(x).all() and abs(np.linalg.norm(x[6:10]) - 1.0) < 1e-12
     assert_covariance(P)

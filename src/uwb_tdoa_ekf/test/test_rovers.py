@@ -1,10 +1,13 @@
-"""A rover on a floor: wheels as a sensor of motion, the plane, and TDOAs that contradict the wheels."""
+"""A rover on a floor: wheels as a sensor of motion, the plane, and TDOAs that contradict the
+wheels.
+"""
 
 from dataclasses import replace
 import math
 
 from flights import corners, fly, with_aids
-from hypothesis import given, strategies as st
+from hypothesis import given
+from hypothesis import strategies as st
 from live import assert_same, feed, joined, messages, send
 import numpy as np
 import pytest
@@ -42,34 +45,51 @@ def rover(request):
     return drive(request.param, SHORT)
 
 
-@pytest.mark.parametrize(("config", "xy", "yaw"), [(PLANAR, 0.08, 2.0), (WHEELS, 0.09, 3.0), (replace(WHEELS, planar=False), 0.12, 3.0)])
+@pytest.mark.parametrize(
+    ("config", "xy", "yaw"),
+    [(PLANAR, 0.08, 2.0), (WHEELS, 0.09, 3.0), (replace(WHEELS, planar=False), 0.12, 3.0)],
+)
 def test_wheels_tell_position_and_yaw_with_an_imu_and_without(rover, config, xy, yaw):
     found = errors(rover, config)
     assert rms(found.xy) < xy and rms(np.degrees(found.yaw)) < yaw
-    assert (found.yaw_std < YAW_KNOWN).all() and np.mean(found.nees_yaw) < 5.0 and np.mean(found.nees_xy) < 5.0
+    assert (
+        (found.yaw_std < YAW_KNOWN).all()
+        and np.mean(found.nees_yaw) < 5.0
+        and np.mean(found.nees_xy) < 5.0
+    )
     early = errors(rover, config, 0.0)  # the yaw is not said to be known before it is
     assert not np.any((early.yaw_std < YAW_KNOWN) & (np.abs(early.yaw) > 3.0 * YAW_KNOWN))
 
 
 def test_a_yaw_that_nothing_measures_is_not_known(rover):
-    told = FilterConfig(use_imu=False, initial_yaw=float(yaw_of(rover.truth.q)[0]), initial_yaw_std=0.05)
+    told = FilterConfig(
+        use_imu=False, initial_yaw=float(yaw_of(rover.truth.q)[0]), initial_yaw_std=0.05
+    )
     found = errors(rover.without("velocity"), told, 0.0)
-    assert found.yaw_std[0] < 0.2 and np.degrees(found.yaw_std[-1]) == pytest.approx(np.degrees(ANY_YAW), rel=0.05)
+    assert found.yaw_std[0] < 0.2 and np.degrees(found.yaw_std[-1]) == pytest.approx(
+        np.degrees(ANY_YAW), rel=0.05
+    )
     assert rms(found.xy[found.t - found.t[0] > SETTLED]) < 0.12 and np.mean(found.nees_yaw) < 5.0
 
 
 def test_a_yaw_without_a_yaw_rate_is_known_by_motion_alone(rover):
-    """Velocities without a yaw rate: the yaw follows from the direction of the motion, and is lost while the rover stands."""
+    """Velocities without a yaw rate: the yaw follows from the direction of the motion, and is lost
+    while the rover stands.
+    """
     no_rate = rover.replaced(velocity=replace(rover.velocity, yaw_rate=None, yaw_rate_std=None))
     found = errors(no_rate, WHEELS)
     assert np.mean(found.nees_yaw) < 5.0
-    stands = (found.t - rover.truth.t[0] > 27.0) & (found.t - rover.truth.t[0] < 28.5)  # the last part of the stop
+    stands = (found.t - rover.truth.t[0] > 27.0) & (
+        found.t - rover.truth.t[0] < 28.5
+    )  # the last part of the stop
     assert (found.yaw_std[stands] > YAW_KNOWN).all()
 
 
 def test_wheels_carry_the_tag_while_no_tdoas_come(rover):
     kept = np.abs(rover.tdoa.t - rover.truth.t[0] - 32.5) > 7.5
-    silent = rover.replaced(tdoa=type(rover.tdoa)(*(column[kept] for column in vars(rover.tdoa).values())))
+    silent = rover.replaced(
+        tdoa=type(rover.tdoa)(*(column[kept] for column in vars(rover.tdoa).values()))
+    )
     for config, share in ((PLANAR, 0.1), (WHEELS, 0.2)):  # of the way
         found = errors(silent, config)
         assert found.xy.max() < share * 15.0 * 0.5 and np.mean(found.nees_xy) < 5.0
@@ -78,7 +98,12 @@ def test_wheels_carry_the_tag_while_no_tdoas_come(rover):
 @pytest.mark.parametrize("config", [PLANAR, WHEELS, replace(WHEELS, use_velocity=False)])
 def test_a_planar_vehicle_is_flat_and_says_how_well_that_is_known(rover, config):
     kept = rover.tdoa.t - rover.truth.t[0] < 30.0
-    odometry = run_offline(rover.replaced(tdoa=type(rover.tdoa)(*(column[kept] for column in vars(rover.tdoa).values()))), config).odometry
+    odometry = run_offline(
+        rover.replaced(
+            tdoa=type(rover.tdoa)(*(column[kept] for column in vars(rover.tdoa).values()))
+        ),
+        config,
+    ).odometry
     np.testing.assert_array_equal(odometry.p[:, 2], HEIGHT)
     np.testing.assert_array_equal(odometry.q[:, :2], 0.0)
     np.testing.assert_array_equal(odometry.v[:, 2], 0.0)
@@ -96,16 +121,23 @@ def test_a_fixed_height_alone_is_held_and_stated(rover):
 
 
 def test_planar_without_a_deviation_has_one():
-    assert FilterConfig(planar=True).fixed_height_std == PLANAR_HEIGHT_STD and FilterConfig().fixed_height_std == 0.0
+    assert (
+        FilterConfig(planar=True).fixed_height_std == PLANAR_HEIGHT_STD
+        and FilterConfig().fixed_height_std == 0.0
+    )
     assert FilterConfig(planar=True, fixed_height_std=0.1).fixed_height_std == 0.1
 
 
 def test_a_yaw_rate_alone_shows_no_yaw(rover):
     """A gyroscope in a twist, and no IMU: where the rover is stays as good as with TDOAs alone."""
     n = len(rover.velocity)
-    alone = rover.replaced(velocity=replace(rover.velocity, v=np.full((n, 3), np.nan), std=np.full((n, 3), np.inf)))
+    alone = rover.replaced(
+        velocity=replace(rover.velocity, v=np.full((n, 3), np.nan), std=np.full((n, 3), np.inf))
+    )
     found, without = errors(alone, WHEELS), errors(rover.without("velocity"), WHEELS)
-    assert (found.yaw_std > YAW_KNOWN).all() and rms(found.xy) == pytest.approx(rms(without.xy), rel=0.05)
+    assert (found.yaw_std > YAW_KNOWN).all() and rms(found.xy) == pytest.approx(
+        rms(without.xy), rel=0.05
+    )
 
 
 def test_two_sources_of_velocity_do_not_disturb_each_other(rover):
@@ -113,9 +145,12 @@ def test_two_sources_of_velocity_do_not_disturb_each_other(rover):
     wheels = rover.velocity
     n = len(wheels)
     parts = [
-        (wheels.t, wheels.t + 0.01), (wheels.v, wheels.v), (wheels.std, np.tile([0.1, 0.1, np.inf], (n, 1))),
-        (wheels.yaw_rate, np.full(n, np.nan)), (wheels.yaw_rate_std, np.full(n, np.inf)),
-    ]  # fmt: skip
+        (wheels.t, wheels.t + 0.01),
+        (wheels.v, wheels.v),
+        (wheels.std, np.tile([0.1, 0.1, np.inf], (n, 1))),
+        (wheels.yaw_rate, np.full(n, np.nan)),
+        (wheels.yaw_rate_std, np.full(n, np.inf)),
+    ]
     order = np.argsort(np.concatenate(parts[0]))
     both = Velocity(*(np.concatenate(part)[order] for part in parts))
     found, one = errors(rover.replaced(velocity=both), WHEELS), errors(rover, WHEELS)
@@ -135,7 +170,11 @@ def test_messages_without_a_variance_are_used_with_the_deviation_of_the_paramete
     silent = run_offline(rover, PLANAR)
     assert (silent.aids["velocity"]["verdict"] == USED).mean() > 0.8
     n, config = len(rover.velocity), FilterConfig()
-    stated = replace(rover.velocity, std=np.full((n, 3), config.velocity_std), yaw_rate_std=np.full(n, config.yaw_rate_std))
+    stated = replace(
+        rover.velocity,
+        std=np.full((n, 3), config.velocity_std),
+        yaw_rate_std=np.full(n, config.yaw_rate_std),
+    )
     assert_same(run_offline(rover.replaced(velocity=stated), PLANAR).odometry, silent.odometry)
 
 
@@ -149,8 +188,14 @@ def test_live_is_off_line(config):
 def test_without_an_imu_time_goes_on_by_wheels_while_no_tdoas_come():
     flight = drive(1, 20.0)
     since = flight.tdoa.t - flight.truth.t[0]
-    tdoas = type(flight.tdoa)(*(column[(since < 12.0) | (since > 17.0)] for column in vars(flight.tdoa).values()))
-    flight = replace(flight, tdoa=tdoas, imu=replace(flight.imu, **{name: column[:0] for name, column in vars(flight.imu).items()}))
+    tdoas = type(flight.tdoa)(
+        *(column[(since < 12.0) | (since > 17.0)] for column in vars(flight.tdoa).values())
+    )
+    flight = replace(
+        flight,
+        tdoa=tdoas,
+        imu=replace(flight.imu, **{name: column[:0] for name, column in vars(flight.imu).items()}),
+    )
     estimator, parts = Estimator(flight.anchors, WHEELS), []
     for t, stream, i in messages(flight):
         send(estimator, flight, stream, i)
@@ -164,7 +209,10 @@ def test_without_an_imu_time_goes_on_by_wheels_while_no_tdoas_come():
 
 def test_the_smoother_takes_wheels():
     short = drive(1, 30.0)
-    smoothed, online = (Errors(short, run.odometry, SETTLED) for run in (smooth(short, WHEELS), run_offline(short, WHEELS)))
+    smoothed, online = (
+        Errors(short, run.odometry, SETTLED)
+        for run in (smooth(short, WHEELS), run_offline(short, WHEELS))
+    )
     assert rms(smoothed.xy) < rms(online.xy) and rms(smoothed.yaw) < 1.2 * rms(online.yaw)
 
 
@@ -181,7 +229,9 @@ def test_two_late_anchors_do_not_overrule_wheels(seed, rows, config):
 
 
 def test_a_tag_that_two_places_are_possible_for_says_so():
-    """`unsure` while TDOAs agree on another place, with a deviation that covers it; not before, nor some time after."""
+    """`unsure` while TDOAs agree on another place, with a deviation that covers it; not before, nor
+    some time after.
+    """
     flight = late(drive(3, SHORT), (0, 4), since=33.0)
     estimator, said = Estimator(flight.anchors, PLANAR), []
 
@@ -191,7 +241,11 @@ def test_a_tag_that_two_places_are_possible_for_says_so():
 
     odometry, _ = feed(estimator, flight, advance=look)
     t, unsure = (np.array(column) for column in zip(*said))
-    assert not unsure[t < 33.0].any() and unsure[(t > 34.0) & (t < 38.0)].mean() > 0.3 and not unsure[t > 39.5].any()
+    assert (
+        not unsure[t < 33.0].any()
+        and unsure[(t > 34.0) & (t < 38.0)].mean() > 0.3
+        and not unsure[t > 39.5].any()
+    )
     std = np.sqrt(odometry.covariance[:, 0, 0])
     since = odometry.t - flight.truth.t[0]
     assert np.median(std[since < 33.0]) < 0.3 < 0.5 < std[(since > 33.0) & (since < 38.5)].max()
@@ -199,7 +253,9 @@ def test_a_tag_that_two_places_are_possible_for_says_so():
 
 @pytest.mark.parametrize("config", [PLANAR, WHEELS])
 def test_a_rover_that_is_lost_is_found(config):
-    """The filter is told a wrong place, and wheels are good: TDOAs of all anchors win, after a time in which it is unsure."""
+    """The filter is told a wrong place, and wheels are good: TDOAs of all anchors win, after a time
+    in which it is unsure.
+    """
     flight = drive(1, 40.0)
     estimator, begin = Estimator(flight.anchors, config), flight.truth.t[0]
     told = False
@@ -239,6 +295,15 @@ def test_wheels_that_turn_evenly_are_not_stuck():
     """A simulated rover drives straight at one speed: its wheels repeat a value."""
     flight = with_aids(fly(2, 6.0, anchors=corners()))
     t = flight.velocity.t
-    even = Velocity(t, np.tile([0.3, 0.0, 0.0], (len(t), 1)), np.full((len(t), 3), 3.0), np.full(len(t), 0.1), np.full(len(t), 3.0))
+    even = Velocity(
+        t,
+        np.tile([0.3, 0.0, 0.0], (len(t), 1)),
+        np.full((len(t), 3), 3.0),
+        np.full(len(t), 0.1),
+        np.full(len(t), 3.0),
+    )
     for velocity, used in ((even, 1.0), (Velocity(t, even.v, even.std), 0.0)):
-        assert (run_offline(flight.replaced(velocity=velocity)).aids["velocity"]["verdict"][t > 3.0] == USED).mean() == used
+        assert (
+            run_offline(flight.replaced(velocity=velocity)).aids["velocity"]["verdict"][t > 3.0]
+            == USED
+        ).mean() == used

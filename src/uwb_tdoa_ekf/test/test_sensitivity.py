@@ -1,10 +1,10 @@
 from dataclasses import replace
 
+from flights import fly, with_aids, with_ranges
 import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from flights import fly, with_aids, with_ranges
 from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, samples_at
 from uwb_tdoa_bias.effects.samples import RADIO
 from uwb_tdoa_bias.foundation.flight import Tdoas
@@ -13,8 +13,16 @@ from uwb_tdoa_ekf.offline import without_offset
 from uwb_tdoa_ekf.sensitivity import FORGOTTEN, record_innovations
 
 # Nothing that decides or learns, so that the filter is as linear as it can be.
-PLAIN = FilterConfig(robust="gate", gate=1e3, adapt_noise=False, recover=False, workspace_margin=1e3, initial_yaw_std=0.1)
-SETTLED = 4.0  # s; the start itself follows biases too, which `Innovations` do not know: it must be forgotten
+PLAIN = FilterConfig(
+    robust="gate",
+    gate=1e3,
+    adapt_noise=False,
+    recover=False,
+    workspace_margin=1e3,
+    initial_yaw_std=0.1,
+)
+# s; the start itself follows biases too, which `Innovations` do not know: it must be forgotten
+SETTLED = 4.0
 
 
 @pytest.mark.parametrize("imu, aided", [(True, False), (False, False), (True, True)])
@@ -29,7 +37,9 @@ def test_derivatives_are_those_of_two_runs(imu, aided):
     derivative = found.by_bias(AnchorDelay().regressors(samples, keys))
     late = flight.tdoa.t[found.rows] > SETTLED
     for column, key in enumerate(keys):
-        ends = [record_innovations(AnchorDelay({key: s}).inject(flight), config) for s in (-step, step)]
+        ends = [
+            record_innovations(AnchorDelay({key: s}).inject(flight), config) for s in (-step, step)
+        ]
         assert all(np.array_equal(end.rows, found.rows) for end in ends)
         numeric = (ends[1].value - ends[0].value) / (2.0 * step)
         start = found.by_bias(np.zeros((len(found.rows), 1)))[:, 0]
@@ -48,7 +58,9 @@ def test_what_the_position_can_follow_leaves_little_trace():
     late = samples.t > SETTLED
 
     def kept(regressors):
-        return np.sqrt(np.mean(found.by_bias(regressors)[late] ** 2) / np.mean(regressors[late] ** 2))
+        return np.sqrt(
+            np.mean(found.by_bias(regressors)[late] ** 2) / np.mean(regressors[late] ** 2)
+        )
 
     assert kept(shift) < 0.1 and kept(delay) > 0.5
 
@@ -67,14 +79,22 @@ def test_an_unknown_offset_of_ranges_bends_no_innovations_of_tdoas():
     flight = with_ranges(fly(seed=5, duration=6.0), std=0.1)
     calibrated = FilterConfig(range_offset_std=0.0)
     longer = without_offset(flight, -0.3)
-    known, unknown, found = (record_innovations(*both) for both in ((flight, calibrated), (longer, calibrated), (longer,)))
+    known, unknown, found = (
+        record_innovations(*both)
+        for both in ((flight, calibrated), (longer, calibrated), (longer,))
+    )
 
     def beside(one):
         return np.sqrt(np.mean((one.value - known.value)[one.t > SETTLED] ** 2))
 
     assert beside(found) < 0.02 < 0.1 < beside(unknown)
-    of_ranges = record_innovations(longer, calibrated, streams=("tdoa", "range")), record_innovations(longer, streams=("tdoa", "range"))
-    np.testing.assert_array_equal(*(one.value for one in of_ranges))  # there the offset is what somebody looks for
+    of_ranges = (
+        record_innovations(longer, calibrated, streams=("tdoa", "range")),
+        record_innovations(longer, streams=("tdoa", "range")),
+    )
+    np.testing.assert_array_equal(
+        *(one.value for one in of_ranges)
+    )  # there the offset is what somebody looks for
 
 
 def test_blocks_of_sparse_regressors_give_the_same():
@@ -88,7 +108,9 @@ def test_blocks_of_sparse_regressors_give_the_same():
     stamps = np.array([1.0, 5.0, 7.5])
     whole, moved = found.and_positions(regressors, stamps)
     out, positions = np.zeros_like(regressors), np.zeros((3, 3, 5))
-    for rows, columns, values in found.in_blocks(csr_array(regressors), ((t - t[0]) / 3.0).astype(int), stamps, positions):
+    for rows, columns, values in found.in_blocks(
+        csr_array(regressors), ((t - t[0]) / 3.0).astype(int), stamps, positions
+    ):
         out[rows, columns] = values
     np.testing.assert_array_equal(out, whole)
     np.testing.assert_array_equal(positions, moved)
@@ -104,27 +126,42 @@ def test_what_is_not_heard_any_more_is_forgotten():
     assert blocks[0][1].tolist() == [0, 1] and blocks[-1][1].tolist() == [1]
     whole = found.by_bias(regressors)[:, 0]
     share = np.sqrt(np.mean(whole[t > 2.0 + FORGOTTEN] ** 2) / np.mean(whole[t < 2.0] ** 2))
-    assert share < 0.05  # of an error of all TDOAs at the start, which the bias of the accelerometer takes up: 0.04; a fit weighs squares
+    assert (
+        share < 0.05
+        # of an error of all TDOAs at the start, which the bias of the accelerometer takes up: 0.04; a
+        # fit weighs squares
+    )
 
 
 @pytest.mark.parametrize("streams", [("range",), ("tdoa", "range")])
 def test_derivatives_of_distances_beside_tdoas_are_those_of_two_runs(streams):
     """An anchor that is late is late for both."""
     flight, step, keys = with_ranges(fly(seed=3, duration=8.0, tdoa_std=0.02)), 1e-4, ["11", "14"]
-    flight = flight if "tdoa" in streams else replace(flight, tdoa=Tdoas(*(column[:0] for column in vars(flight.tdoa).values())))
+    flight = (
+        flight
+        if "tdoa" in streams
+        else replace(flight, tdoa=Tdoas(*(column[:0] for column in vars(flight.tdoa).values())))
+    )
     found = record_innovations(flight, PLAIN, streams=streams)
-    assert np.all(np.diff(found.t) >= 0.0) and [len(found.places(name)) > 500 for name in streams] == [True] * len(streams)
+    assert np.all(np.diff(found.t) >= 0.0) and [
+        len(found.places(name)) > 500 for name in streams
+    ] == [True] * len(streams)
     regressors = np.zeros((len(found.t), len(keys)))
     for name in streams:
         places = found.places(name)
         stream, a, b = RADIO[name].measured(flight)
         rows = found.rows[places]
         np.testing.assert_array_equal(stream.t[rows], found.t[places])
-        samples = RADIO[name](**vars(samples_at(stream.t[rows], a[rows], b[rows], flight.truth, flight.anchors)))
+        samples = RADIO[name](
+            **vars(samples_at(stream.t[rows], a[rows], b[rows], flight.truth, flight.anchors))
+        )
         regressors[places] = AnchorDelay().regressors(samples, keys)
     derivative, late = found.by_bias(regressors), found.t > SETTLED
     for column, key in enumerate(keys):
-        ends = [record_innovations(AnchorDelay({key: s}).inject(flight), PLAIN, streams=streams) for s in (-step, step)]
+        ends = [
+            record_innovations(AnchorDelay({key: s}).inject(flight), PLAIN, streams=streams)
+            for s in (-step, step)
+        ]
         assert all(np.array_equal(end.rows, found.rows) for end in ends)
         numeric = (ends[1].value - ends[0].value) / (2.0 * step)
         error = numeric[late] - derivative[late, column]
@@ -134,7 +171,10 @@ def test_derivatives_of_distances_beside_tdoas_are_those_of_two_runs(streams):
 def test_what_is_recorded_of_tdoas_does_not_depend_on_what_else_is():
     flight = with_ranges(fly(seed=6, duration=6.0))
     calibrated = FilterConfig(range_offset_std=0.0)  # else the offset is looked for among them
-    alone, both = (record_innovations(flight, calibrated, streams=streams) for streams in (("tdoa",), ("tdoa", "range")))
+    alone, both = (
+        record_innovations(flight, calibrated, streams=streams)
+        for streams in (("tdoa",), ("tdoa", "range"))
+    )
     places = both.places("tdoa")
     np.testing.assert_array_equal(alone.rows, both.rows[places])
     np.testing.assert_array_equal(alone.value, both.value[places])

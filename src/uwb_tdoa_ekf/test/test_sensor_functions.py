@@ -1,7 +1,8 @@
 from dataclasses import replace
 
 from flights import fly
-from hypothesis import given, strategies as st
+from hypothesis import given
+from hypothesis import strategies as st
 from live import assert_same
 import numpy as np
 import pytest
@@ -14,14 +15,26 @@ from uwb_tdoa_ekf.core.sensor_functions import rows_of, subtract
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.offline import run_offline
 
-SHAPES = {"line": (0.2, 1.4), "step": (0.2, 0.7, 1.4), "wave": (0.2, 0.9), "parabola": (0.2, 1.4), "spline": (0.2, 0.6, 1.4)}
+SHAPES = {
+    "line": (0.2, 1.4),
+    "step": (0.2, 0.7, 1.4),
+    "wave": (0.2, 0.9),
+    "parabola": (0.2, 1.4),
+    "spline": (0.2, 0.6, 1.4),
+}
 
 
 def function(channel="accel.z", covariate="height", shape="line", size=1.0):
     knots = SHAPES[shape]
     values = dict(zip(("c0", "c1", "c2", "c3"), size * np.array([0.3, 1.0, -0.5, 0.2])))
     count = {"line": 2, "step": 2, "wave": 3, "parabola": 3, "spline": 4}[shape]
-    return SmoothTerm(channel=channel, covariate=covariate, knots=knots, shape=shape, values=dict(list(values.items())[:count]))
+    return SmoothTerm(
+        channel=channel,
+        covariate=covariate,
+        knots=knots,
+        shape=shape,
+        values=dict(list(values.items())[:count]),
+    )
 
 
 def taken(effect, x):
@@ -31,7 +44,10 @@ def taken(effect, x):
     return -samples["gyro"][0], -samples["accel"][0]
 
 
-@given(state=st.lists(st.floats(-3.0, 3.0), min_size=6, max_size=6), shape=st.sampled_from([s for s in SHAPES if s != "step"]))
+@given(
+    state=st.lists(st.floats(-3.0, 3.0), min_size=6, max_size=6),
+    shape=st.sampled_from([s for s in SHAPES if s != "step"]),
+)
 def test_it_is_the_curve_at_the_state(state, shape):
     x = np.array([*state, *np.zeros(10)])
     at = {"x": x[0], "y": x[1], "height": x[2], "speed": np.linalg.norm(x[3:6]), "climb_rate": x[5]}
@@ -56,7 +72,9 @@ def test_several_add_up_on_their_axes():
     subtract(rows_of(EffectSet(tuple(effects)).sensor_functions), x, samples[0])
     expected = [effect.curve(np.ones(1))[0] for effect in effects]
     np.testing.assert_allclose(samples["gyro"][0], [-expected[0], 0.0, 0.0], atol=1e-3)
-    np.testing.assert_allclose(samples["accel"][0], [0.0, -expected[1] - expected[2], 0.0], atol=1e-3)
+    np.testing.assert_allclose(
+        samples["accel"][0], [0.0, -expected[1] - expected[2], 0.0], atol=1e-3
+    )
 
 
 def with_error(flight, effect):
@@ -74,7 +92,10 @@ def test_the_filter_takes_it_out():
     def error(flight, *effects):
         odometry = run_offline(flight, None, Corrector(flight.anchors, EffectSet(effects))).odometry
         late = odometry.t > odometry.t[0] + 3.0
-        truth = np.stack([np.interp(odometry.t[late], flight.truth.t, column) for column in flight.truth.p.T], axis=1)
+        truth = np.stack(
+            [np.interp(odometry.t[late], flight.truth.t, column) for column in flight.truth.p.T],
+            axis=1,
+        )
         return np.sqrt(np.mean((odometry.p[late] - truth) ** 2))
 
     plain, before, after = error(flight), error(wrong), error(wrong, effect)

@@ -5,6 +5,7 @@ from dataclasses import replace
 from flights import fly
 import numpy as np
 import pytest
+
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.monitoring.sign_turn import turned
@@ -13,7 +14,9 @@ from uwb_tdoa_ekf.monitoring.stream_watch import StreamWatch
 
 
 def watched(flight, sign):
-    """[(s, finding or None, certain)] of a Flight, second by second, with such a sign: callable of the stamps."""
+    """[(s, finding or None, certain)] of a Flight, second by second, with such a sign: callable of
+    the stamps.
+    """
     watch, tdoa, said = SignWatch(flight.anchors), flight.tdoa, []
     second = np.floor(tdoa.t - tdoa.t[0])
     for k in range(int(second[-1])):
@@ -47,7 +50,12 @@ def test_disorder_and_nonsense():
     rng = np.random.default_rng(0)
     for rows in np.array_split(rng.permutation(len(flight.tdoa)), 5):
         t = np.where(rng.random(len(rows)) < 0.1, np.nan, flight.tdoa.t[rows])
-        watch.feed(t, np.where(rows % 7, flight.tdoa.a[rows], 999), flight.tdoa.b[rows], flight.tdoa.d[rows] * 1e9)
+        watch.feed(
+            t,
+            np.where(rows % 7, flight.tdoa.a[rows], 999),
+            flight.tdoa.b[rows],
+            flight.tdoa.d[rows] * 1e9,
+        )
     watch.feed(*(np.empty(0) for _ in range(4)))
     assert watch.finding is None
 
@@ -66,13 +74,20 @@ def test_doubts_make_it_compare_again():
 
 
 def flown(flight, sign, seconds):
-    """[(s, rules)] of what an Estimator and a StreamWatch find, each second of a Flight with such a sign: callable of the stamps."""
+    """[(s, rules)] of what an Estimator and a StreamWatch find, each second of a Flight with such a
+    sign: callable of the stamps.
+    """
     flight = replace(flight, tdoa=replace(flight.tdoa, d=flight.tdoa.d * sign(flight.tdoa.t)))
     estimator, watch, said = Estimator(flight.anchors), StreamWatch(flight.anchors, 0.25), []
     for now in np.arange(0.1, seconds, 0.1):
-        for stream, add, keep in ((flight.imu, estimator.add_imu, watch.add_imu), (flight.tdoa, estimator.add_tdoa, watch.add_tdoa)):
+        for stream, add, keep in (
+            (flight.imu, estimator.add_imu, watch.add_imu),
+            (flight.tdoa, estimator.add_tdoa, watch.add_tdoa),
+        ):
             inside = (stream.t >= now - 0.1) & (stream.t < now)
-            t, *columns = (column[inside] for column in list(vars(stream).values())[:4] if column is not None)
+            t, *columns = (
+                column[inside] for column in list(vars(stream).values())[:4] if column is not None
+            )
             add(t, *columns)
             keep(t, t + 0.002, *columns)
         estimator.advance()
@@ -93,19 +108,32 @@ def test_large_innovations_alone_are_no_turn():
     rng = np.random.default_rng(0)
     predicted = rng.normal(0.0, 3.0, 200)
     late = rng.uniform(0.8, 3.0, 200)  # as on a floor
-    assert not turned(late, predicted) and not turned(np.zeros(200), predicted) and turned(-2.0 * predicted, predicted)
+    assert (
+        not turned(late, predicted)
+        and not turned(np.zeros(200), predicted)
+        and turned(-2.0 * predicted, predicted)
+    )
     assert not turned(np.empty(0), np.empty(0))
 
 
 def test_no_measured_flight_turns_its_signs_or_opens_its_yaw(shared_data):
     flights = pytest.importorskip("test_stream_watch").flights
     for name, flight in flights(shared_data):
-        estimator, imu, tdoa, corrector = Estimator(flight.anchors), flight.imu, flight.tdoa, Corrector(flight.anchors)
+        estimator, imu, tdoa, corrector = (
+            Estimator(flight.anchors),
+            flight.imu,
+            flight.tdoa,
+            Corrector(flight.anchors),
+        )
         for now in np.arange(min(imu.t[0], tdoa.t[0]), max(imu.t[-1], tdoa.t[-1]), 1.0):
-            of_imu, of_tdoa = (slice(*np.searchsorted(t, [now, now + 1.0])) for t in (imu.t, tdoa.t))
+            of_imu, of_tdoa = (
+                slice(*np.searchsorted(t, [now, now + 1.0])) for t in (imu.t, tdoa.t)
+            )
             estimator.add_imu(imu.t[of_imu], imu.gyro[of_imu], imu.accel[of_imu])
             t, a, b, d = (column[of_tdoa] for column in (tdoa.t, tdoa.a, tdoa.b, tdoa.d))
-            known = corrector.correct(t, flight.anchors.index(a), flight.anchors.index(b), d)  # as bias_node hands them over
+            known = corrector.correct(
+                t, flight.anchors.index(a), flight.anchors.index(b), d
+            )  # as bias_node hands them over
             estimator.add_tdoa(t, a, b, known.corrected, known.std**2)
             estimator.advance()
         assert estimator.sign_turns == 0, name

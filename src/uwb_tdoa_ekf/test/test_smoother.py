@@ -2,7 +2,8 @@ from dataclasses import replace
 
 from covariances import assert_covariance
 from flights import WORKSPACE, corners, fly, leaving, position_at, with_ranges
-from hypothesis import given, settings, strategies as st
+from hypothesis import given, settings
+from hypothesis import strategies as st
 import numpy as np
 import pytest
 
@@ -21,8 +22,10 @@ def rmse(flight, odometry, after=1.0):
 
 
 def batch(t, a, b, d, positions, p0, prior_std, q, tdoa_std):
-    """Least squares over a whole recording of a tag that moves along a straight line with white acceleration noise,
-    linearised about p0: positions (n, 3) and their covariances, by one large system of equations."""
+    """Least squares over a whole recording of a tag that moves along a straight line with white
+    acceleration noise, linearised about p0: positions (n, 3) and their covariances, by one large
+    system of equations.
+    """
     n = len(t)
     rows, values = [], []
 
@@ -43,11 +46,17 @@ def batch(t, a, b, d, positions, p0, prior_std, q, tdoa_std):
     for i in range(n):
         ra, rb = p0 - positions[a[i]], p0 - positions[b[i]]
         g = rb / np.linalg.norm(rb) - ra / np.linalg.norm(ra)
-        add([(6 * i + k, g[k]) for k in range(3)], d[i] - np.linalg.norm(rb) + np.linalg.norm(ra), tdoa_std)
+        add(
+            [(6 * i + k, g[k]) for k in range(3)],
+            d[i] - np.linalg.norm(rb) + np.linalg.norm(ra),
+            tdoa_std,
+        )
     A = np.array(rows)
     solution = np.linalg.lstsq(A, np.array(values), rcond=None)[0]
     covariance = np.linalg.inv(A.T @ A)
-    return solution.reshape(n, 6)[:, :3], np.array([covariance[6 * i : 6 * i + 3, 6 * i : 6 * i + 3] for i in range(n)])
+    return solution.reshape(n, 6)[:, :3], np.array(
+        [covariance[6 * i : 6 * i + 3, 6 * i : 6 * i + 3] for i in range(n)]
+    )
 
 
 @pytest.mark.parametrize("use_imu", [True, False])
@@ -57,7 +66,8 @@ def test_smoothing_halves_what_filtering_leaves(use_imu):
         flight = fly(seed, 12.0, tdoa_std=0.25, outliers=0.05, **NOISE)
         config = FilterConfig(use_imu=use_imu, tdoa_correlation_length=1.0, initial_yaw_std=0.5)
         ratios.append(
-            rmse(flight, smooth(flight, config).odometry) / rmse(flight, run_offline(flight, config).odometry)
+            rmse(flight, smooth(flight, config).odometry)
+            / rmse(flight, run_offline(flight, config).odometry)
         )
     assert np.mean(ratios) < 0.75
 
@@ -68,12 +78,22 @@ def test_its_covariance_is_honest_and_never_larger_than_the_filters(use_imu):
     for seed in range(8):
         flight = fly(seed, 12.0, tdoa_std=0.1, accel_bias=0.1, gyro_bias=0.01, **NOISE)
         config = FilterConfig(
-            use_imu=use_imu, tdoa_std=0.1, tdoa_correlation_length=1.0, robust="gate", gate=1e6, adapt_noise=False,
-            accel_noise=0.05, gyro_noise=0.003, vibration_gain=0.0, initial_yaw_std=0.5,
-        )  # fmt: skip
+            use_imu=use_imu,
+            tdoa_std=0.1,
+            tdoa_correlation_length=1.0,
+            robust="gate",
+            gate=1e6,
+            adapt_noise=False,
+            accel_noise=0.05,
+            gyro_noise=0.003,
+            vibration_gain=0.0,
+            initial_yaw_std=0.5,
+        )
         filtered, smoothed = run_offline(flight, config).odometry, smooth(flight, config).odometry
         assert_covariance(smoothed.covariance)
-        variance = [np.einsum("nii->ni", odometry.covariance)[:, :3] for odometry in (filtered, smoothed)]
+        variance = [
+            np.einsum("nii->ni", odometry.covariance)[:, :3] for odometry in (filtered, smoothed)
+        ]
         common = np.isin(filtered.t, smoothed.t), np.isin(smoothed.t, filtered.t)
         assert (variance[1][common[1]] <= variance[0][common[0]] * (1 + 1e-6)).all()
         middle = (smoothed.t > 2.0) & (smoothed.t < 11.0)
@@ -86,27 +106,50 @@ def test_its_covariance_is_honest_and_never_larger_than_the_filters(use_imu):
 def test_its_covariance_holds_errors_that_do_not_average_out():
     """As much of them as the filter's: it averages no more of them out."""
     flight = fly(2, 14.0, **NOISE)
-    config = FilterConfig(initial_yaw_std=0.1)  # known: an unknown one the smoother finds first, and runs the filter with it
+    config = FilterConfig(
+        initial_yaw_std=0.1
+    )  # known: an unknown one the smoother finds first, and runs the filter with it
     filtered, smoothed = (engine(flight, config).odometry for engine in (run_offline, smooth))
     rows = np.searchsorted(filtered.t, smoothed.t, side="right") - 1
     known = (rows > 0) & (smoothed.t > 2.0)
     expected = np.einsum("nii->n", filtered.persistent[rows[known]])
     np.testing.assert_array_equal(np.einsum("nii->n", smoothed.persistent[known]), expected)
-    assert (np.einsum("nii->n", smoothed.covariance[known, :3, :3]) > expected).all() and expected.min() > 0.0
+    assert (
+        np.einsum("nii->n", smoothed.covariance[known, :3, :3]) > expected
+    ).all() and expected.min() > 0.0
 
 
 def test_its_covariance_holds_what_an_offset_of_all_ranges_may_be_off_by():
-    """Of white noise, so that nothing else persists; anchors at about one height, where an error of the offset is a much larger one of the height."""
-    told = dict(range_std=0.1, tdoa_correlation_length=1.0, robust="gate", gate=1e6, adapt_noise=False, **NOISE)
-    config, nees = FilterConfig(vibration_gain=0.0, initial_yaw_std=0.5, range_offset_std=0.3, **told), []
+    """Of white noise, so that nothing else persists; anchors at about one height, where an error of
+    the offset is a much larger one of the height.
+    """
+    told = dict(
+        range_std=0.1,
+        tdoa_correlation_length=1.0,
+        robust="gate",
+        gate=1e6,
+        adapt_noise=False,
+        **NOISE,
+    )
+    config, nees = (
+        FilterConfig(vibration_gain=0.0, initial_yaw_std=0.5, range_offset_std=0.3, **told),
+        [],
+    )
     for seed in range(8):
-        flight = with_ranges(fly(seed, 5.0, anchors=corners((7.0, 8.0, 0.3)), **NOISE), seed, 100.0, 0.1)
+        flight = with_ranges(
+            fly(seed, 5.0, anchors=corners((7.0, 8.0, 0.3)), **NOISE), seed, 100.0, 0.1
+        )
         none = Tdoas(*(column[:0] for column in vars(flight.tdoa).values()))
         smoothed = smooth(without_offset(replace(flight, tdoa=none), -0.3), config).odometry
         middle = (smoothed.t > 1.5) & (smoothed.t < 4.5)
-        error, covariance = smoothed.p[middle] - position_at(flight, smoothed.t[middle]), smoothed.covariance[middle, :3, :3]
+        error, covariance = (
+            smoothed.p[middle] - position_at(flight, smoothed.t[middle]),
+            smoothed.covariance[middle, :3, :3],
+        )
         both = covariance, covariance - smoothed.persistent[middle]
-        nees.append([np.einsum("ni,nij,nj->n", error, np.linalg.inv(one), error).mean() for one in both])
+        nees.append(
+            [np.einsum("ni,nij,nj->n", error, np.linalg.inv(one), error).mean() for one in both]
+        )
     honest, less = np.mean(nees, axis=0)
     assert 2.0 < honest < 5.0 and less > 2.0 * honest
 
@@ -115,10 +158,15 @@ def test_without_imu_it_is_the_least_squares_solution():
     """After the start, with white noise and a tag at rest, where nothing is non-linear."""
     flight = fly(3, 2.0, hover=True, tdoa_rate=50.0, tdoa_std=0.05)
     config = FilterConfig(
-        use_imu=False, tdoa_std=0.05, tdoa_correlation_length=1.0, robust="gate", gate=1e6,
-        adapt_noise=False, recover=False,
+        use_imu=False,
+        tdoa_std=0.05,
+        tdoa_correlation_length=1.0,
+        robust="gate",
+        gate=1e6,
+        adapt_noise=False,
+        recover=False,
         odometry_rate=1e4,
-    )  # fmt: skip
+    )
     first = run_offline(flight, config)
     smoothed = smooth(flight, config).odometry
     used = np.isin(flight.tdoa.t, smoothed.t)
@@ -127,12 +175,23 @@ def test_without_imu_it_is_the_least_squares_solution():
     a, b = flight.anchors.index(flight.tdoa.a[used]), flight.anchors.index(flight.tdoa.b[used])
     p0 = flight.truth.p[0]
     p, covariance = batch(
-        t, a, b, flight.tdoa.d[used], flight.anchors.positions, p0, (1e3, 1e3), config.motion_noise, 0.05
+        t,
+        a,
+        b,
+        flight.tdoa.d[used],
+        flight.anchors.positions,
+        p0,
+        (1e3, 1e3),
+        config.motion_noise,
+        0.05,
     )
     late = t > t[0] + 0.6  # by when the start's covariance is forgotten
     at = np.searchsorted(smoothed.t, t[late])
     np.testing.assert_allclose(smoothed.p[at] - p0, p[late], atol=0.01)
-    std, expected = (np.sqrt(np.einsum("nii->ni", c)) for c in (smoothed.covariance[at, :3, :3], covariance[late]))
+    std, expected = (
+        np.sqrt(np.einsum("nii->ni", c))
+        for c in (smoothed.covariance[at, :3, :3], covariance[late])
+    )
     np.testing.assert_allclose(std, expected, rtol=0.1)
     assert len(first.odometry) > 0
 
@@ -144,7 +203,9 @@ def test_sound_for_any_weights_gaps_and_recoveries(seed, robust, use_imu):
     flight = fly(seed, 6.0, outliers=0.3, **NOISE)
     kept = (flight.tdoa.t < rng.uniform(1.0, 3.0)) | (flight.tdoa.t > rng.uniform(3.0, 4.0))
     d = flight.tdoa.d + np.where(flight.tdoa.t > 4.5, 1.5 * rng.standard_normal(), 0.0)
-    flight = replace(flight, tdoa=Tdoas(flight.tdoa.t[kept], flight.tdoa.a[kept], flight.tdoa.b[kept], d[kept]))
+    flight = replace(
+        flight, tdoa=Tdoas(flight.tdoa.t[kept], flight.tdoa.a[kept], flight.tdoa.b[kept], d[kept])
+    )
     odometry = smooth(flight, FilterConfig(robust=robust, use_imu=use_imu)).odometry
     assert np.isfinite(odometry.p).all() and (np.diff(odometry.t) > 0.0).all()
     assert_covariance(odometry.covariance, tolerance=1e-6)
@@ -162,9 +223,14 @@ def test_the_unknown_yaw_is_known_from_the_beginning():
 
 @pytest.mark.parametrize("yaw", [-6.9, -3.2, 3.0, 4.5, 6.0, 7.0])
 def test_any_yaw_that_can_be_given_is_smoothed(yaw):
-    """The direction that the filter followed is a multiple of 90 degrees from the given one: their sum may be more than a yaw may be."""
+    """The direction that the filter followed is a multiple of 90 degrees from the given one: their
+    sum may be more than a yaw may be.
+    """
     flight = fly(4, 6.0, **NOISE)
-    given, same = (smooth(flight, FilterConfig(initial_yaw=each)).odometry for each in (yaw, np.remainder(yaw, 2.0 * np.pi) - np.pi))
+    given, same = (
+        smooth(flight, FilterConfig(initial_yaw=each)).odometry
+        for each in (yaw, np.remainder(yaw, 2.0 * np.pi) - np.pi)
+    )
     assert len(given) and np.isfinite(given.p).all()
     assert rmse(flight, given) < 1.5 * rmse(flight, same) + 0.01
 

@@ -1,6 +1,7 @@
 from covariances import assert_covariance
 from flights import GRAVITY, corners
-from hypothesis import given, strategies as st
+from hypothesis import given
+from hypothesis import strategies as st
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -17,7 +18,9 @@ STD = 0.25  # m, what locate is told of one TDOA
 
 
 def constellation(n, rng):
-    """(n, 3) positions in the room: four corners that form a tetrahedron, the eight corners, then anywhere."""
+    """(n, 3) positions in the room: four corners that form a tetrahedron, the eight corners, then
+    anywhere.
+    """
     corner = np.array(corners().positions)
     chosen = [0, 3, 5, 6] + [1, 2, 4, 7]
     return np.concatenate([corner[chosen], rng.uniform(0.0, 1.0, (max(n - 8, 0), 3)) * SIZE])[:n]
@@ -41,10 +44,15 @@ def window_of(t, a, b, d):
 
 def places(tdoas, positions, count=2, std=STD):
     """(x (count, 6), covariance (count, 6, 6), cost (count,), share) as of `locate`."""
-    found, workspace = Places(np.empty((count, 6)), np.empty((count, 6, 6)), np.empty(count)), np.empty((2, 3))
+    found, workspace = (
+        Places(np.empty((count, 6)), np.empty((count, 6, 6)), np.empty(count)),
+        np.empty((2, 3)),
+    )
     state, parameters = new_state(positions), FilterConfig(tdoa_std=std).parameters()[0]
     set_bounds(state.record.extent, 1.0, workspace)
-    share = locate(window_of(*tdoas), state.anchors, workspace, parameters, KnownHeight(np.nan, np.nan), found)
+    share = locate(
+        window_of(*tdoas), state.anchors, workspace, parameters, KnownHeight(np.nan, np.nan), found
+    )
     return *found, share
 
 
@@ -60,7 +68,9 @@ def errors(n, count, speed=0.0, seed=0, **kind):
     for _ in range(count):
         positions, v = constellation(n, rng), rng.standard_normal(3)
         p = rng.uniform(0.15, 0.85, 3) * SIZE
-        x, covariance, share = located(window(rng, positions, p, speed * v / np.linalg.norm(v), **kind), positions)
+        x, covariance, share = located(
+            window(rng, positions, p, speed * v / np.linalg.norm(v), **kind), positions
+        )
         assert_covariance(covariance)
         off.append(np.linalg.norm(x[:3] - p))
         shares.append(share)
@@ -76,7 +86,8 @@ def test_finds_a_tag_at_rest_exactly_but_for_its_prior(n):
 @pytest.mark.parametrize("n", [4, 6, 8, 64])
 def test_finds_a_moving_tag(n):
     off, shares = errors(n, 60, speed=1.0)
-    # the prior of 1 m/s per axis holds the velocity back: half the window's path is the most that this can cost
+    # the prior of 1 m/s per axis holds the velocity back: half the window's path is the most that
+    # this can cost
     assert off.max() < 0.25 + 0.05 and (shares == 1.0).all()
 
 
@@ -100,7 +111,9 @@ def test_anchors_in_one_plane_tell_the_distance_from_it_but_not_the_side():
         positions[:, 2] = 3.0
         p = rng.uniform(0.15, 0.85, 3) * SIZE
         x, _, _ = located(window(rng, positions, p, np.zeros(3)), positions)
-        np.testing.assert_allclose([x[0], x[1], abs(x[2] - 3.0)], [p[0], p[1], abs(p[2] - 3.0)], atol=0.1)
+        np.testing.assert_allclose(
+            [x[0], x[1], abs(x[2] - 3.0)], [p[0], p[1], abs(p[2] - 3.0)], atol=0.1
+        )
 
 
 def test_anchors_on_a_wall_leave_two_places_and_no_others():
@@ -150,7 +163,10 @@ def test_a_place_is_split_along_its_principal_axis_whichever_that_is(seed, norma
     x, covariance, cost = np.zeros((2, 6)), np.array([whole, whole]), np.array([0.0, np.inf])
     split(Places(x, covariance, cost))
     apart = x[1, :3] - x[0, :3]
-    assert abs(apart @ basis[:, 0]) == pytest.approx(np.linalg.norm(apart), rel=1e-6) and np.linalg.norm(apart) > 3.0
+    assert (
+        abs(apart @ basis[:, 0]) == pytest.approx(np.linalg.norm(apart), rel=1e-6)
+        and np.linalg.norm(apart) > 3.0
+    )
     for each in covariance:
         assert_covariance(each)
 
@@ -165,8 +181,14 @@ def test_few_anchors_in_one_plane_say_how_little_they_tell():
     rng, seen = np.random.default_rng(2), []
     for _ in range(100):
         around = 2.0 * np.pi * (np.arange(8) + rng.uniform(0.0, 0.7, 8)) / 8
-        positions = np.stack([3.5 + 3.5 * np.cos(around), 4.0 + 4.0 * np.sin(around), np.full(8, 3.0)], axis=1)
-        p = np.array([3.5, 4.0, 0.0]) + rng.uniform(-1.5, 1.5, 3) * [1, 1, 0] + [0, 0, rng.uniform(0.5, 3.0)]
+        positions = np.stack(
+            [3.5 + 3.5 * np.cos(around), 4.0 + 4.0 * np.sin(around), np.full(8, 3.0)], axis=1
+        )
+        p = (
+            np.array([3.5, 4.0, 0.0])
+            + rng.uniform(-1.5, 1.5, 3) * [1, 1, 0]
+            + [0, 0, rng.uniform(0.5, 3.0)]
+        )
         x, covariance, _ = located(window(rng, positions, p, np.zeros(3), std=0.1), positions)
         side = np.copysign(1.0, x[2] - 3.0)
         e = x[:3] - [p[0], p[1], 3.0 + side * abs(p[2] - 3.0)]
@@ -176,14 +198,22 @@ def test_few_anchors_in_one_plane_say_how_little_they_tell():
 
 @pytest.mark.parametrize("n", [8, 16])
 def test_covariance_is_honest_when_errors_persist_over_the_window(n):
-    """Errors of the anchors, of the size that locate is told, last for the whole window, as measured ones do."""
+    """Errors of the anchors, of the size that locate is told, last for the whole window, as
+    measured ones do.
+    """
     rng, seen = np.random.default_rng(n), []
     for _ in range(400):
-        positions, p, v = constellation(n, rng), rng.uniform(0.15, 0.85, 3) * SIZE, rng.standard_normal(3)
+        positions, p, v = (
+            constellation(n, rng),
+            rng.uniform(0.15, 0.85, 3) * SIZE,
+            rng.standard_normal(3),
+        )
         tdoas = window(rng, positions, p, v, std=0.03, anchor_std=STD / np.sqrt(2.0))
         x, covariance, _ = located(tdoas, positions)
         e = x - np.concatenate([p, v])
-        seen.append([e @ np.linalg.solve(covariance, e), e[:3] @ np.linalg.solve(covariance[:3, :3], e[:3])])
+        seen.append(
+            [e @ np.linalg.solve(covariance, e), e[:3] @ np.linalg.solve(covariance[:3, :3], e[:3])]
+        )
     whole, position = np.mean(seen, axis=0)
     print(f"{n} anchors: mean NEES {whole:.2f} of 6, position {position:.2f} of 3")
     assert 6.0 / 3.0 < whole < 6.5 and 3.0 / 3.0 < position < 3.5
@@ -192,7 +222,9 @@ def test_covariance_is_honest_when_errors_persist_over_the_window(n):
 def test_two_anchors_do_not_break_it():
     positions = np.array([[0.0, 0.0, 0.0], [7.0, 0.0, 0.0]])
     rng = np.random.default_rng(0)
-    x, covariance, _ = located(window(rng, positions, np.array([2.0, 1.0, 1.0]), np.zeros(3), n=12), positions)
+    x, covariance, _ = located(
+        window(rng, positions, np.array([2.0, 1.0, 1.0]), np.zeros(3), n=12), positions
+    )
     assert np.isfinite(x).all()
     assert_covariance(covariance)
     assert covariance[1, 1] > 1.0  # it knows that it does not know
@@ -203,7 +235,9 @@ def test_all_at_one_instant():
     t, a, b, d = window(rng, positions, np.array([2.0, 3.0, 1.0]), np.zeros(3))
     x, covariance, _ = located((np.zeros(len(t)), a, b, d), positions)
     np.testing.assert_allclose(x, [2, 3, 1, 0, 0, 0], atol=0.05)
-    np.testing.assert_allclose(np.diag(covariance)[3:], 1.0, rtol=0.01)  # nothing was learned of the velocity
+    np.testing.assert_allclose(
+        np.diag(covariance)[3:], 1.0, rtol=0.01
+    )  # nothing was learned of the velocity
 
 
 @given(st.integers(0, 2**32 - 1))

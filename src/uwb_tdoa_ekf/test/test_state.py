@@ -1,6 +1,7 @@
 from covariances import assert_covariance, random_covariance
 from finite_differences import numerical_jacobian
-from hypothesis import given, strategies as st
+from hypothesis import given
+from hypothesis import strategies as st
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
@@ -8,7 +9,16 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_ekf.core.config import PARAMETERS
 from uwb_tdoa_ekf.core.memory import new_state
-from uwb_tdoa_ekf.core.state import GRAVITY, coast, exponential, inject, predict, propagate, rotation, turn
+from uwb_tdoa_ekf.core.state import (
+    GRAVITY,
+    coast,
+    exponential,
+    inject,
+    predict,
+    propagate,
+    rotation,
+    turn,
+)
 
 seeds = st.integers(0, 2**32 - 1)
 DOWN = np.array([0.0, 0.0, -GRAVITY])
@@ -16,7 +26,9 @@ DOWN = np.array([0.0, 0.0, -GRAVITY])
 
 def random_state(rng):
     q = rng.standard_normal(4)
-    return np.concatenate([rng.normal(0, 5, 3), rng.normal(0, 2, 3), q / np.linalg.norm(q), rng.normal(0, 0.2, 6)])
+    return np.concatenate(
+        [rng.normal(0, 5, 3), rng.normal(0, 2, 3), q / np.linalg.norm(q), rng.normal(0, 0.2, 6)]
+    )
 
 
 def plus(x, error):
@@ -41,9 +53,13 @@ def ekf_with(x, P):
 
 
 def predicted(x, P, dt, gyro, accel, weight, psd=(0.0, 0.0, 0.0), rest=(0.0, 0.0, 0.0)):
-    """State and covariance after one prediction; psd of the accelerometer, rest: gyroscope and both bias walks."""
+    """State and covariance after one prediction; psd of the accelerometer, rest: gyroscope and both
+    bias walks.
+    """
     ekf, parameters = ekf_with(x, P), np.zeros(1, PARAMETERS)[0]
-    for name, value in zip(("gyro", "accel", "accel_weight", "accel_psd"), (gyro, accel, weight, psd)):
+    for name, value in zip(
+        ("gyro", "accel", "accel_weight", "accel_psd"), (gyro, accel, weight, psd)
+    ):
         ekf.imu[name] = value
     for name, value in zip(("gyro_noise", "accel_bias_walk", "gyro_bias_walk"), np.sqrt(rest)):
         parameters[name] = value
@@ -104,7 +120,9 @@ def test_free_fall():
     x = np.zeros(16)
     x[9] = 1.0
     after, _ = predicted(x, np.eye(15), 0.5, np.zeros(3), np.zeros(3), np.ones(3))
-    np.testing.assert_allclose(after[:6], [0, 0, -0.5 * GRAVITY * 0.25, 0, 0, -0.5 * GRAVITY], atol=1e-12)
+    np.testing.assert_allclose(
+        after[:6], [0, 0, -0.5 * GRAVITY * 0.25, 0, 0, -0.5 * GRAVITY], atol=1e-12
+    )
 
 
 @given(seeds)
@@ -121,7 +139,9 @@ def test_many_small_steps_solve_the_equations_of_motion(seed):
     P, after = np.eye(15), x
     for _ in range(400):
         after, _ = predicted(after, P, 0.0005, gyro, accel, np.ones(3))
-    np.testing.assert_allclose(after[:6], exact, atol=0.005)  # input held over each step: first order
+    np.testing.assert_allclose(
+        after[:6], exact, atol=0.005
+    )  # input held over each step: first order
     attitude = Rotation.from_quat(x[6:10]) * Rotation.from_rotvec(0.2 * rates)
     assert (attitude.inv() * Rotation.from_quat(after[6:10])).magnitude() < 1e-10
 
@@ -136,7 +156,9 @@ def test_no_weight_means_hovering_thrust():
 
 def documented_phi(x, dt, gyro, accel, weight):
     R = Rotation.from_quat(x[6:10]).as_matrix()
-    f = -DOWN + weight * (accel - x[10:13] + DOWN)  # share `weight` of what was measured, the rest is hovering
+    f = -DOWN + weight * (
+        accel - x[10:13] + DOWN
+    )  # share `weight` of what was measured, the rest is hovering
     phi = np.eye(15)
     phi[0:3, 3:6] = dt * np.eye(3)
     phi[3:6, 6:9] = -dt * R @ cross(f)
@@ -162,7 +184,11 @@ def test_covariance_is_phi_p_phi_of_the_documented_phi(seed):
     rng, x, gyro, accel, weight = random_case(seed)
     dt, P = 10.0 ** rng.uniform(-4, -1.3), random_covariance(rng)
     psd, rest = rng.uniform(0, 1, 3), rng.uniform(0, 1, 3)
-    R, phi, Q = Rotation.from_quat(x[6:10]).as_matrix(), documented_phi(x, dt, gyro, accel, weight), np.zeros((15, 15))
+    R, phi, Q = (
+        Rotation.from_quat(x[6:10]).as_matrix(),
+        documented_phi(x, dt, gyro, accel, weight),
+        np.zeros((15, 15)),
+    )
     Q[3:6, 3:6] = dt * R @ np.diag(psd) @ R.T
     for first, density in zip((6, 9, 12), rest):
         Q[first : first + 3, first : first + 3] = dt * density * np.eye(3)
@@ -175,7 +201,9 @@ def test_covariance_is_phi_p_phi_of_the_documented_phi(seed):
 
 @given(seeds)
 def test_covariance_follows_the_nominal_state_to_first_order_in_dt(seed):
-    """Phi from finite differences of the nominal prediction: what is left falls with the square of dt."""
+    """Phi from finite differences of the nominal prediction: what is left falls with the square of
+    dt.
+    """
     rng, x, gyro, accel, weight = random_case(seed)
     P, left = random_covariance(rng, spread=0.3), []
     for dt in (1e-2, 1e-3):
@@ -186,7 +214,9 @@ def test_covariance_follows_the_nominal_state_to_first_order_in_dt(seed):
 
         phi = numerical_jacobian(moved, np.zeros(15), 1e-5)
         left.append(np.linalg.norm(after - phi @ P @ phi.T))
-        assert left[-1] < 0.25 * np.linalg.norm(phi @ P @ phi.T - P), "beside what the prediction changes"
+        assert left[-1] < 0.25 * np.linalg.norm(phi @ P @ phi.T - P), (
+            "beside what the prediction changes"
+        )
     assert left[1] < left[0] / 50.0
 
 
@@ -194,7 +224,9 @@ def test_noise_enters_where_it_belongs():
     x = random_state(np.random.default_rng(2))
     P = 1e-9 * np.eye(15)
     R = Rotation.from_quat(x[6:10]).as_matrix()
-    _, after = predicted(x, P, 0.01, np.zeros(3), -DOWN, np.ones(3), (1.0, 2.0, 3.0), (4.0, 5.0, 6.0))
+    _, after = predicted(
+        x, P, 0.01, np.zeros(3), -DOWN, np.ones(3), (1.0, 2.0, 3.0), (4.0, 5.0, 6.0)
+    )
     expected = np.zeros((15, 15))
     expected[3:6, 3:6] = 0.01 * R @ np.diag([1.0, 2.0, 3.0]) @ R.T
     expected[range(6, 15), range(6, 15)] = np.repeat([0.04, 0.05, 0.06], 3)

@@ -5,18 +5,39 @@ from types import SimpleNamespace
 from flights import fly
 import numpy as np
 import pytest
-from uwb_tdoa_ekf.monitoring.status import FAULT, LOST, RUNNING, STARTING, WAITING, Status, doubted, status_of, yaw_in_words
+
+from uwb_tdoa_ekf.monitoring.status import (
+    FAULT,
+    LOST,
+    RUNNING,
+    STARTING,
+    WAITING,
+    Status,
+    doubted,
+    status_of,
+    yaw_in_words,
+)
 from uwb_tdoa_ekf.monitoring.use import Use
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.streams import ERROR, WARNING, Finding
 
-STARTS = SimpleNamespace(running=False, lost=None, without_imu=None, yaw_doubts=0, unsure=None, restarted=None)
+STARTS = SimpleNamespace(
+    running=False, lost=None, without_imu=None, yaw_doubts=0, unsure=None, restarted=None
+)
 RUNS = SimpleNamespace(running=True, lost=None, without_imu=None, yaw_doubts=0, unsure=None)
-IS_LOST = SimpleNamespace(running=False, lost="the tag is lost", without_imu=None, yaw_doubts=0, unsure=None)
+IS_LOST = SimpleNamespace(
+    running=False, lost="the tag is lost", without_imu=None, yaw_doubts=0, unsure=None
+)
 KNOWN, UNKNOWN = math.radians(6.0), math.radians(100.0)
-LEFT_OUT = Finding("imu_left_out", ERROR, "what the accelerometer reads is not gravity", "1 m/s^2", "in m/s^2", 1.0)
-GOES_WITHOUT = SimpleNamespace(running=True, lost=None, without_imu=LEFT_OUT, yaw_doubts=0, unsure=None)
-UNSURE = SimpleNamespace(running=True, lost=None, without_imu=None, yaw_doubts=0, unsure="TDOAs agree on another place")
+LEFT_OUT = Finding(
+    "imu_left_out", ERROR, "what the accelerometer reads is not gravity", "1 m/s^2", "in m/s^2", 1.0
+)
+GOES_WITHOUT = SimpleNamespace(
+    running=True, lost=None, without_imu=LEFT_OUT, yaw_doubts=0, unsure=None
+)
+UNSURE = SimpleNamespace(
+    running=True, lost=None, without_imu=None, yaw_doubts=0, unsure="TDOAs agree on another place"
+)
 DOUBTS = SimpleNamespace(running=True, lost=None, without_imu=None, yaw_doubts=1, unsure=None)
 
 
@@ -24,8 +45,12 @@ def found(rule, severity=ERROR, value=1.0):
     return Finding(rule, severity, f"cause of {rule}", "evidence", "remedy", value)
 
 
-def used(seconds=8.0, running=True, tdoa="used", imu=True, received=True, silent=0.0, velocity=False):
-    """Use, looked at five times a second for so many seconds, of which in the last `silent` nothing came."""
+def used(
+    seconds=8.0, running=True, tdoa="used", imu=True, received=True, silent=0.0, velocity=False
+):
+    """Use, looked at five times a second for so many seconds, of which in the last `silent` nothing
+    came.
+    """
     use, counts, arrived = Use(0.25), Counter(), Counter()
     for k in range(int(5 * seconds)):
         if k < 5 * (seconds - silent):
@@ -43,26 +68,74 @@ NEVER = used(received=False, imu=False)
 @pytest.mark.parametrize(
     ("estimator", "yaw_std", "use", "status", "yaw_known", "why"),
     [
-        (None, math.nan, NEVER, WAITING, False, "no anchors yet"), (STARTS, math.nan, NEVER, WAITING, False, "no TDOAs"),
+        (None, math.nan, NEVER, WAITING, False, "no anchors yet"),
+        (STARTS, math.nan, NEVER, WAITING, False, "no TDOAs"),
         (STARTS, math.nan, used(running=False, tdoa="startup"), STARTING, False, "start position"),
-        (RUNS, UNKNOWN, used(), RUNNING, False, "yaw is not known"), (RUNS, KNOWN, used(), RUNNING, True, ""),
+        (RUNS, UNKNOWN, used(), RUNNING, False, "yaw is not known"),
+        (RUNS, KNOWN, used(), RUNNING, True, ""),
         (RUNS, KNOWN, used(received=False), RUNNING, True, "IMU alone"),
-        (RUNS, KNOWN, used(received=False, imu=False), RUNNING, True, "on as the tag moved last, without the IMU"),
+        (
+            RUNS,
+            KNOWN,
+            used(received=False, imu=False),
+            RUNNING,
+            True,
+            "on as the tag moved last, without the IMU",
+        ),
         (RUNS, UNKNOWN, used(received=False), RUNNING, False, "IMU alone"),
-        (RUNS, KNOWN, used(received=False, velocity=True), RUNNING, True, "by the IMU and the velocities alone"),
-        (RUNS, KNOWN, used(received=False, imu=False, velocity=True), RUNNING, True, "by the velocities alone"),
-        (GOES_WITHOUT, KNOWN, used(received=False, velocity=True), RUNNING, True, "by the velocities alone"),
+        (
+            RUNS,
+            KNOWN,
+            used(received=False, velocity=True),
+            RUNNING,
+            True,
+            "by the IMU and the velocities alone",
+        ),
+        (
+            RUNS,
+            KNOWN,
+            used(received=False, imu=False, velocity=True),
+            RUNNING,
+            True,
+            "by the velocities alone",
+        ),
+        (
+            GOES_WITHOUT,
+            KNOWN,
+            used(received=False, velocity=True),
+            RUNNING,
+            True,
+            "by the velocities alone",
+        ),
         (RUNS, UNKNOWN, used(imu=False), RUNNING, False, "neither an IMU nor velocities"),
-        (RUNS, UNKNOWN, used(imu=False, velocity=True), RUNNING, False, "is once the tag has moved"),
-        (UNSURE, KNOWN, used(), RUNNING, True, "another place"), (UNSURE, KNOWN, used(tdoa="rejected"), RUNNING, True, "another place"),
-        (RUNS, KNOWN, used(tdoa="late"), RUNNING, True, "-p lag"), (RUNS, KNOWN, used(tdoa="invalid"), RUNNING, True, "are invalid"),
+        (
+            RUNS,
+            UNKNOWN,
+            used(imu=False, velocity=True),
+            RUNNING,
+            False,
+            "is once the tag has moved",
+        ),
+        (UNSURE, KNOWN, used(), RUNNING, True, "another place"),
+        (UNSURE, KNOWN, used(tdoa="rejected"), RUNNING, True, "another place"),
+        (RUNS, KNOWN, used(tdoa="late"), RUNNING, True, "-p lag"),
+        (RUNS, KNOWN, used(tdoa="invalid"), RUNNING, True, "are invalid"),
         (RUNS, KNOWN, used(tdoa="rejected"), RUNNING, True, "contradict the filter"),
-        (IS_LOST, math.nan, NEVER, LOST, False, "the tag is lost"), (IS_LOST, math.nan, used(), LOST, False, "the tag is lost"),
+        (IS_LOST, math.nan, NEVER, LOST, False, "the tag is lost"),
+        (IS_LOST, math.nan, used(), LOST, False, "the tag is lost"),
         (RUNS, math.nan, used(), RUNNING, False, "yaw is not known"),
-        (DOUBTS, UNKNOWN, used(), RUNNING, False, "the yaw was wrong"), (DOUBTS, KNOWN, used(), RUNNING, True, ""),
-        (GOES_WITHOUT, UNKNOWN, used(imu=False), RUNNING, False, "goes without the IMU: what the accelerometer reads"),
+        (DOUBTS, UNKNOWN, used(), RUNNING, False, "the yaw was wrong"),
+        (DOUBTS, KNOWN, used(), RUNNING, True, ""),
+        (
+            GOES_WITHOUT,
+            UNKNOWN,
+            used(imu=False),
+            RUNNING,
+            False,
+            "goes without the IMU: what the accelerometer reads",
+        ),
     ],
-)  # fmt: skip
+)
 def test_what_may_be_flown_by(estimator, yaw_std, use, status, yaw_known, why):
     said = status_of(estimator, yaw_std, 0.01, use)
     assert said == Status(status, yaw_known, said.why) and said.lost == (status == LOST)
@@ -76,14 +149,26 @@ def test_without_odometry_nothing_goes_by_the_imu_alone():
 
 @pytest.mark.parametrize("estimator", [STARTS, RUNS])
 @pytest.mark.parametrize(
-    "rule", ["tdoa_sign", "tdoa_large", "tdoa_one_sign", "two_tags", "ids_unknown", "ids_exchanged", "survey_unit", "stamps_unit"]
+    "rule",
+    [
+        "tdoa_sign",
+        "tdoa_large",
+        "tdoa_one_sign",
+        "two_tags",
+        "ids_unknown",
+        "ids_exchanged",
+        "survey_unit",
+        "stamps_unit",
+    ],
 )
 def test_a_finding_that_makes_the_position_wrong_ends_running_and_is_why(rule, estimator):
     said = status_of(estimator, KNOWN, 0.01, used(), [found("gap", WARNING), found(rule)])
     assert said == Status(FAULT, False, found(rule).sentence) and not said.lost
 
 
-@pytest.mark.parametrize("rule", ["imu_force_unit", "imu_rate_unit", "imu_turned", "imu_silent", "stamps_apart"])
+@pytest.mark.parametrize(
+    "rule", ["imu_force_unit", "imu_rate_unit", "imu_turned", "imu_silent", "stamps_apart"]
+)
 def test_a_fault_of_the_imu_counts_while_the_filter_uses_it(rule):
     assert status_of(RUNS, KNOWN, 0.01, used(), [found(rule)]).status == FAULT
     for estimator, use in ((GOES_WITHOUT, used()), (RUNS, used(imu=False))):
@@ -92,7 +177,12 @@ def test_a_fault_of_the_imu_counts_while_the_filter_uses_it(rule):
 
 
 def test_what_does_not_make_the_position_wrong_does_not_end_running():
-    for harmless in (found("tdoa_sign", WARNING), found("ids_unknown", value=0.2), found("tdoa_twice"), found("surveys_differ", WARNING)):
+    for harmless in (
+        found("tdoa_sign", WARNING),
+        found("ids_unknown", value=0.2),
+        found("tdoa_twice"),
+        found("surveys_differ", WARNING),
+    ):
         assert status_of(RUNS, KNOWN, 0.01, used(), [harmless]).status == RUNNING
 
 
@@ -100,18 +190,29 @@ def test_the_odometry_of_a_fault_states_that_it_may_be_anywhere():
     odometry = run_offline(fly(0, 3.0)).odometry
     wide = doubted(odometry, np.array([8.0, 9.0, 4.0]))
     added = wide.covariance - odometry.covariance
-    assert np.allclose(added[:, :3, :3], np.diag([64.0, 81.0, 16.0])) and np.allclose(added[:, 3:6, 3:6], 4.0 * np.eye(3))
-    assert np.allclose(np.trace(added[:, 6:, 6:], axis1=1, axis2=2), math.pi**2)  # about the vertical alone
+    assert np.allclose(added[:, :3, :3], np.diag([64.0, 81.0, 16.0])) and np.allclose(
+        added[:, 3:6, 3:6], 4.0 * np.eye(3)
+    )
+    assert np.allclose(
+        np.trace(added[:, 6:, 6:], axis1=1, axis2=2), math.pi**2
+    )  # about the vertical alone
     assert (wide.p == odometry.p).all() and (np.linalg.eigvalsh(wide.covariance) > -1e-9).all()
 
 
 def test_the_yaw_in_words():
-    assert yaw_in_words(KNOWN) == "known: +-6 degrees" and yaw_in_words(UNKNOWN) == "not known yet: +-100 degrees"
+    assert (
+        yaw_in_words(KNOWN) == "known: +-6 degrees"
+        and yaw_in_words(UNKNOWN) == "not known yet: +-100 degrees"
+    )
     assert yaw_in_words(math.nan) == "unknown: there is no odometry"
 
 
 def test_the_numbers_are_those_of_the_message():
     message = pytest.importorskip("uwb_tdoa_msgs.msg").EstimatorStatus
     assert (WAITING, STARTING, RUNNING, LOST, FAULT) == (
-        message.STATUS_WAITING, message.STATUS_STARTING, message.STATUS_RUNNING, message.STATUS_LOST, message.STATUS_FAULT,
-    )  # fmt: skip
+        message.STATUS_WAITING,
+        message.STATUS_STARTING,
+        message.STATUS_RUNNING,
+        message.STATUS_LOST,
+        message.STATUS_FAULT,
+    )

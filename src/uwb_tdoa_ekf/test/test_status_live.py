@@ -13,6 +13,7 @@ from geometry_msgs.msg import TransformStamped  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
 from rig import make_rig, recording  # noqa: E402, F401
 from tf2_msgs.msg import TFMessage  # noqa: E402
+
 from uwb_tdoa_bias.foundation.ros_diagnostics import AGAIN  # noqa: E402
 from uwb_tdoa_bias.foundation.ros_frames import TF_STATIC_QOS  # noqa: E402
 from uwb_tdoa_msgs.msg import EstimatorStatus  # noqa: E402
@@ -25,15 +26,24 @@ def test_status_says_what_may_be_flown_by_and_why_not(make_rig):  # noqa: F811
     rig.start("bias_node", "ekf_node")
     rig.node.create_subscription(EstimatorStatus, "status", heard.append, LATCHED)
     rig.wait(lambda: heard, "the latched status, or the next")
-    assert heard[-1].status == EstimatorStatus.STATUS_WAITING and "no anchors yet" in heard[-1].why and not heard[-1].yaw_known
+    assert (
+        heard[-1].status == EstimatorStatus.STATUS_WAITING
+        and "no anchors yet" in heard[-1].why
+        and not heard[-1].yaw_known
+    )
     flight = recording(2.0)
     rig.send_anchors(flight.anchors)
     rig.play(flight)
-    rig.wait(lambda: any(each.status == EstimatorStatus.STATUS_RUNNING for each in heard), "it to run")
+    rig.wait(
+        lambda: any(each.status == EstimatorStatus.STATUS_RUNNING for each in heard), "it to run"
+    )
     running = [each for each in heard if each.status == EstimatorStatus.STATUS_RUNNING]
     assert not any(each.yaw_known or each.lost for each in running)  # it has not moved enough
     assert all(each.yaw_std > 0.4 and each.header.frame_id == "map" for each in running)
-    rig.wait(lambda: "no odometry" in heard[-1].why and heard[-1].tdoa_age > 1.0, "the silence to be said")
+    rig.wait(
+        lambda: "no odometry" in heard[-1].why and heard[-1].tdoa_age > 1.0,
+        "the silence to be said",
+    )
     assert heard[-1].status == EstimatorStatus.STATUS_WAITING
     assert re.match(r"not known yet: \+-\d+ degrees", rig.values("ekf_node")["yaw"])
 
@@ -55,11 +65,19 @@ def test_frames_that_alternate_are_warned_of_once(make_rig):  # noqa: F811
     rig.wait(both_are_said, "two frames to be said")
 
     def warned(frame):
-        return [line for line in ekf.lines if f"frame '{frame}', which /tf_static does not connect" in line]
+        return [
+            line
+            for line in ekf.lines
+            if f"frame '{frame}', which /tf_static does not connect" in line
+        ]
 
     rig.wait(lambda: warned("left") and warned("right"), "both frames to be warned of")
-    again = 1 + int((time.monotonic() - began) / AGAIN)  # how often the log says what it has said before
-    assert max(len(warned("left")), len(warned("right"))) <= 1 + 2 * again  # once, and with /diagnostics when its text is of another kind
+    again = 1 + int(
+        (time.monotonic() - began) / AGAIN
+    )  # how often the log says what it has said before
+    assert (
+        max(len(warned("left")), len(warned("right"))) <= 1 + 2 * again
+    )  # once, and with /diagnostics when its text is of another kind
 
 
 def test_a_transform_that_is_none_ends_nothing(make_rig):  # noqa: F811

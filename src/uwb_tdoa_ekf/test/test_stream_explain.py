@@ -1,10 +1,13 @@
-"""What a filter leaves unexplained: fed block by block as at once, and left out from where on it is certain to be too much."""
+"""What a filter leaves unexplained: fed block by block as at once, and left out from where on it is
+certain to be too much.
+"""
 
 from dataclasses import replace
 
 from flights import fly
 import numpy as np
 import pytest
+
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.measurements import imu_rows
 from uwb_tdoa_ekf.core.memory import TDOA, structured
@@ -41,13 +44,19 @@ def test_the_rest_is_left_out_once_it_is_certain(monkeypatch):
     """Of 6 blocks that each leave about as much, the limit is passed in the third."""
     rows, positions, fed = rows_of(FLIGHT, -1.0), FLIGHT.anchors.positions, []
     limit, innovations = 0.4 * unexplained(rows, positions).mean, explain.innovations
-    monkeypatch.setattr(explain, "innovations", lambda state, tdoa, *more: fed.append(tdoa["t"][-1]) or innovations(state, tdoa, *more))
+    monkeypatch.setattr(
+        explain,
+        "innovations",
+        lambda state, tdoa, *more: fed.append(tdoa["t"][-1]) or innovations(state, tdoa, *more),
+    )
     unexplained(rows, positions, limit=limit)
     assert fed[-1] - rows["t"][0] < 5.0 * BLOCK
 
 
 def test_no_tdoas_and_few_leave_no_block():
-    none = replace(FLIGHT, tdoa=type(FLIGHT.tdoa)(*(column[:0] for column in vars(FLIGHT.tdoa).values())))
+    none = replace(
+        FLIGHT, tdoa=type(FLIGHT.tdoa)(*(column[:0] for column in vars(FLIGHT.tdoa).values()))
+    )
     few = rows_of(FLIGHT)[:: len(FLIGHT.tdoa) // 20]
     for rows in (rows_of(none), few):
         for limit in (0.0, np.inf, np.nan):

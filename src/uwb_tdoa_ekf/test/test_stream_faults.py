@@ -1,5 +1,6 @@
-"""Faults of drivers, live, through a real ekf_node: named within seconds, and nothing is said of a healthy flight. (All of them,
-without nodes: test_stream_watch.py.)"""
+"""Faults of drivers, live, through a real ekf_node: named within seconds, and nothing is said of a
+healthy flight. (All of them, without nodes: test_stream_watch.py.)
+"""
 
 import os
 import re
@@ -18,7 +19,10 @@ from stream_faults import PUBLISHERS, lanes_of, play, process_of, publish_twice 
 
 SECONDS = 6.0  # s of each fault, and within which it is named (how soon: stream_faults.py)
 FLOWN = 5  # times at most: what a loaded machine hands over late or loses tells less
-FLIGHTS = [(), ("IMU in g", "TDOAs stamped 0")]  # in lanes side by side; faults that do not hide each other
+FLIGHTS = [
+    (),
+    ("IMU in g", "TDOAs stamped 0"),
+]  # in lanes side by side; faults that do not hide each other
 
 
 def values_of(status):
@@ -27,12 +31,19 @@ def values_of(status):
 
 def said_by(lane):
     """What the node of a Lane has said while flights were played: statuses of each flight."""
-    return [[status for at, status in lane.heard if low < at < high] for _, ((low, high, _),) in lane.plan]
+    return [
+        [status for at, status in lane.heard if low < at < high]
+        for _, ((low, high, _),) in lane.plan
+    ]
 
 
 def is_named(lane, name):
     """Whether the node of a Lane has named a fault."""
-    return any(re.search(FAULTS[name][1], text(status)) for statuses in said_by(lane) for status in statuses)
+    return any(
+        re.search(FAULTS[name][1], text(status))
+        for statuses in said_by(lane)
+        for status in statuses
+    )
 
 
 def text(status):
@@ -48,7 +59,9 @@ def test_faults_are_named_and_a_healthy_flight_runs(make_rig):
     said = [text(status) for lane in lanes for statuses in said_by(lane) for status in statuses]
     for statuses in said_by(healthy):
         assert statuses[-1].message == "running" and statuses[-1].level == DiagnosticStatus.OK, said
-        assert {values_of(status)["wrong with the streams"] for status in statuses} == {"nothing"}, said
+        assert {values_of(status)["wrong with the streams"] for status in statuses} == {
+            "nothing"
+        }, said
     for name in FLIGHTS[1]:
         assert is_named(faulty, name), (name, said)
     last = said_by(faulty)[-1][-1]
@@ -58,7 +71,12 @@ def test_faults_are_named_and_a_healthy_flight_runs(make_rig):
     for name, topic in PUBLISHERS.items():
         publisher = publish_twice(lane, name)
         both = f"2 publish on {topic} \\(.*rig"
-        lane.rig.wait(lambda: re.search(both, values_of(lane.rig.fresh_status("ekf_node"))["wrong with the streams"]), name)  # noqa: B023
+        lane.rig.wait(
+            lambda: re.search(
+                both, values_of(lane.rig.fresh_status("ekf_node"))["wrong with the streams"]
+            ),
+            name,
+        )  # noqa: B023
         lane.rig.node.destroy_publisher(publisher)
 
     # what is sent while a node is stopped is lost, and counted to the last message

@@ -3,10 +3,11 @@
 import math
 
 from flights import corners
-import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+import numpy as np
+import pytest
+
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_ekf.streams import SEVERITIES, StreamRules
 
@@ -16,13 +17,23 @@ RADIO = 0.05  # m, noise of a TDOA
 
 
 def streams(seconds=20.0, imu_rate=500.0, tdoa_rate=300.0, seed=0):
-    """Healthy columns: imu (t, arrival, gyro, force) of a tag that sways, tdoa (t, arrival, a, b, d) of the same."""
+    """Healthy columns: imu (t, arrival, gyro, force) of a tag that sways, tdoa (t, arrival, a, b,
+    d) of the same.
+    """
     rng = np.random.default_rng(seed)
     t = 100.0 + np.arange(int(seconds * imu_rate)) / imu_rate
     gyro = 0.2 * np.sin(np.outer(t, [0.9, 1.1, 0.4])) + 0.02 * rng.normal(size=(len(t), 3))
-    force = 0.5 * np.sin(np.outer(t, [1.1, 0.7, 0.9])) + 0.2 * rng.normal(size=(len(t), 3)) + [0.0, 0.0, GRAVITY]
+    force = (
+        0.5 * np.sin(np.outer(t, [1.1, 0.7, 0.9]))
+        + 0.2 * rng.normal(size=(len(t), 3))
+        + [0.0, 0.0, GRAVITY]
+    )
     imu = t, _arrival(t, rng), gyro, force
-    t = 100.0 + (np.arange(int(seconds * tdoa_rate)) + rng.uniform(0.1, 0.9, int(seconds * tdoa_rate))) / tdoa_rate
+    t = (
+        100.0
+        + (np.arange(int(seconds * tdoa_rate)) + rng.uniform(0.1, 0.9, int(seconds * tdoa_rate)))
+        / tdoa_rate
+    )
     a = np.arange(len(t)) % 8
     b = (a + 1) % 8
     p = ANCHORS.positions.mean(axis=0) + np.sin(np.outer(t, [0.5, 0.7, 0.3])) * [1.5, 1.5, 0.8]
@@ -64,11 +75,15 @@ IMU_FAULTS = {
     "imu_rate_unit": lambda c, rng: put(c, GYRO, np.rad2deg(c[GYRO])),
     "imu_no_gravity": lambda c, rng: put(c, FORCE, c[FORCE] - [0.0, 0.0, GRAVITY]),
     "imu_turned": lambda c, rng: put(c, FORCE, c[FORCE][:, [2, 0, 1]]),
-    "imu_tilted": lambda c, rng: put(c, FORCE, c[FORCE] @ np.array([[1, 0, 0], [0, 0.7, 0.7], [0, -0.7, 0.7]])),
+    "imu_tilted": lambda c, rng: put(
+        c, FORCE, c[FORCE] @ np.array([[1, 0, 0], [0, 0.7, 0.7], [0, -0.7, 0.7]])
+    ),
     "imu_silent": lambda c, rng: put(put(c, FORCE, 0.0 * c[FORCE]), GYRO, 0.0 * c[GYRO]),
     "imu_repeated": lambda c, rng: put(put(c, FORCE, _held(c[FORCE])), GYRO, _held(c[GYRO])),
     "imu_axis_dead": lambda c, rng: put(c, GYRO, c[GYRO] * [1.0, 0.0, 1.0]),
-    "imu_invalid": lambda c, rng: put(c, GYRO, np.where(rng.random(c[GYRO].shape) < 0.01, np.nan, c[GYRO])),
+    "imu_invalid": lambda c, rng: put(
+        c, GYRO, np.where(rng.random(c[GYRO].shape) < 0.01, np.nan, c[GYRO])
+    ),
     "imu_shaking": lambda c, rng: put(c, FORCE, c[FORCE] + 3.0 * rng.normal(size=c[FORCE].shape)),
     "imu_clipped": lambda c, rng: put(c, FORCE, np.clip(c[FORCE] + _bumps(c[T]), None, 19.6)),
     "stamps_zero": lambda c, rng: put(c, T, 0.0 * c[T]),
@@ -143,7 +158,9 @@ def test_a_fault_of_the_tdoas_is_named(rule):
     _is_whole(found[rule])
 
 
-TICKS = 2.0**32 * 299792458.0 / (128 * 499.2e6)  # m, after which 32 bits of the clock of a DW1000 begin anew
+TICKS = (
+    2.0**32 * 299792458.0 / (128 * 499.2e6)
+)  # m, after which 32 bits of the clock of a DW1000 begin anew
 
 
 @pytest.mark.parametrize("step", [10.0, 299792.458, TICKS])
@@ -160,14 +177,18 @@ def test_a_fixed_step_is_named_with_its_size_and_nothing_else(step, share, signs
 
 
 def at_rest(imu, bias):
-    """The samples of a tag that stands still, with a bias of the gyroscope, in the unit of its message."""
+    """The samples of a tag that stands still, with a bias of the gyroscope, in the unit of its
+    message.
+    """
     rng = np.random.default_rng(5)
     n = len(imu[T])
     still = put(imu, GYRO, bias + 0.01 * rng.normal(size=(n, 3)))
     return put(still, FORCE, [0.1, -0.2, GRAVITY] + 0.03 * rng.normal(size=(n, 3)))
 
 
-@pytest.mark.parametrize("bias", [(0.0, 0.0, 0.0), (0.02, -0.03, 0.01), (0.6, 0.0, 0.1), (1.5, -2.0, 0.7)])
+@pytest.mark.parametrize(
+    "bias", [(0.0, 0.0, 0.0), (0.02, -0.03, 0.01), (0.6, 0.0, 0.1), (1.5, -2.0, 0.7)]
+)
 def test_at_rest_no_unit_of_the_gyroscope_is_alleged(bias):
     imu, tdoa = streams()
     found = judged(at_rest(imu, np.array(bias)), tdoa)
@@ -188,7 +209,9 @@ def test_pairs_in_both_orders_with_both_signs_are_healthy():
 
 def test_a_log_shows_an_offset_by_where_its_streams_begin_and_end():
     imu, tdoa = streams()
-    assert judged(put(imu, T, imu[T] + 0.4), tdoa, arrivals=False)["stamps_apart"].value == pytest.approx(0.4, abs=0.02)
+    assert judged(put(imu, T, imu[T] + 0.4), tdoa, arrivals=False)[
+        "stamps_apart"
+    ].value == pytest.approx(0.4, abs=0.02)
     late = tuple(column[imu[T] > 104.0] for column in imu)  # switched on later, and no offset
     assert judged(late, tdoa, arrivals=False) == {}
 
@@ -234,14 +257,23 @@ def test_nothing_that_arrives_breaks_it(tdoas, samples):
 def test_tdoas_that_come_late_are_late_and_the_imu_is_not_blamed():
     imu, tdoa = streams()
     found = judged(imu, put(tdoa, ARRIVAL, tdoa[ARRIVAL] + 0.6))["stamps_apart"]
-    assert "TDOAs arrive 0.6" in found.cause and "-p lag:=0.9" in found.remedy and "t_imu" not in found.remedy
+    assert (
+        "TDOAs arrive 0.6" in found.cause
+        and "-p lag:=0.9" in found.remedy
+        and "t_imu" not in found.remedy
+    )
     ahead = judged(put(imu, T, imu[T] + 0.6), tdoa)["stamps_apart"]
     assert "imu/data" in ahead.cause and "t_imu" in ahead.remedy
 
 
 @pytest.mark.parametrize("share", [0.3, 0.9, 1.0])
-@pytest.mark.parametrize(("rule", "spoil"), [("tdoa_invalid", lambda c, bad: put(c, D, np.where(bad, np.nan, c[D]))),
-                                             ("tdoa_of_one", lambda c, bad: put(c, A, np.where(bad, c[B], c[A])))])  # fmt: skip
+@pytest.mark.parametrize(
+    ("rule", "spoil"),
+    [
+        ("tdoa_invalid", lambda c, bad: put(c, D, np.where(bad, np.nan, c[D]))),
+        ("tdoa_of_one", lambda c, bad: put(c, A, np.where(bad, c[B], c[A]))),
+    ],
+)
 def test_no_share_is_above_all(rule, spoil, share):
     imu, tdoa = streams()
     bad = np.random.default_rng(0).random(len(tdoa[T])) < share

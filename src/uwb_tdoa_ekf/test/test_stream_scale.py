@@ -1,17 +1,20 @@
-"""The scale of a survey is found in TDOAs, before TDOAs are blamed; what they do not determine is not named."""
+"""The scale of a survey is found in TDOAs, before TDOAs are blamed; what they do not determine is
+not named.
+"""
 
 import time
 
 from flights import corners
 import numpy as np
 import pytest
+
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_bias.foundation.survey_faults import UNITS
+from uwb_tdoa_ekf.core import workspace
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.ground import KnownHeight
 from uwb_tdoa_ekf.core.memory import TDOA, new_state, structured
 from uwb_tdoa_ekf.core.startup import locate, room_for
-from uwb_tdoa_ekf.core import workspace
 from uwb_tdoa_ekf.streams import StreamRules
 from uwb_tdoa_ekf.streams.scale import SurveyScale
 
@@ -20,14 +23,20 @@ RADIO, SYSTEMATIC = 0.07, 0.1  # m, noise of a TDOA, and error of each pair
 
 
 def flown(positions, seconds=25.0, rate=300.0, moving=1.0, sign=1.0, unit=1.0, seed=0):
-    """{rule: Finding} of what StreamRules say with the anchors at `positions`, of TDOAs in the room of ANCHORS."""
+    """{rule: Finding} of what StreamRules say with the anchors at `positions`, of TDOAs in the room
+    of ANCHORS.
+    """
     rng = np.random.default_rng(seed)
     t = 100.0 + np.arange(int(seconds * rate)) / rate
     a = np.arange(len(t)) % 8
     b = (a + 1) % 8
     path = moving * np.sin(np.outer(t, [0.5, 0.7, 0.3])) * [2.5, 2.5, 1.0]
     p = ANCHORS.positions.mean(axis=0) + (1.0 - moving) * np.array([1.5, -2.0, -1.2]) + path
-    d = tdoa(p, ANCHORS.positions[a], ANCHORS.positions[b]) + SYSTEMATIC * rng.normal(size=8)[a] + RADIO * rng.normal(size=len(t))
+    d = (
+        tdoa(p, ANCHORS.positions[a], ANCHORS.positions[b])
+        + SYSTEMATIC * rng.normal(size=8)[a]
+        + RADIO * rng.normal(size=len(t))
+    )
     rules = StreamRules(ANCHORS.at(positions))
     rules.feed_tdoa(t, t + 0.002, ANCHORS.ids[a], ANCHORS.ids[b], sign * d / unit)
     rules.finish()
@@ -49,7 +58,9 @@ def test_a_right_survey_is_left_alone(seed, moving):
 def test_a_unit_of_the_survey_is_named_and_tdoas_are_not_blamed(unit):
     found = flown(scaled(UNITS[unit]))
     assert found.keys() == {"survey_scale"}, found
-    assert unit in found["survey_scale"].cause and found["survey_scale"].value == pytest.approx(UNITS[unit])
+    assert unit in found["survey_scale"].cause and found["survey_scale"].value == pytest.approx(
+        UNITS[unit]
+    )
 
 
 def test_feet_name_their_factor():
@@ -91,7 +102,9 @@ def test_mistakes_of_the_tdoas_are_not_blamed_on_the_survey(mistake):
 @pytest.mark.parametrize("unit", [0.299792458, 0.3048])
 def test_tdoas_in_nanoseconds_or_feet_are_named(unit):
     found = flown(scaled(1.0), unit=unit)
-    assert "nanoseconds or in feet" in found["tdoa_unit"].cause and found["tdoa_unit"].position_wrong()
+    assert (
+        "nanoseconds or in feet" in found["tdoa_unit"].cause and found["tdoa_unit"].position_wrong()
+    )
     assert not found.keys() & {"tdoa_large", "tdoa_outliers"}
 
 
@@ -117,13 +130,16 @@ def test_a_tag_that_stands_shows_a_clear_scale_only():
 
 
 def test_a_snapshot_takes_little_time():
-    """In a node one comes each second: a turn must not take 50 ms. Of the best of some tries: this machine does other things too."""
+    """In a node one comes each second: a turn must not take 50 ms.
+
+    Of the best of some tries: this machine does other things too.
+    """
     snapshot = np.array([(a, b, 0.5 * (a - b)) for a in range(8) for b in range(8) if a != b])
     watch, taken = SurveyScale(ANCHORS.at(scaled(1000.0))), []
     for _ in range(6):
         begin = time.process_time()
         watch.add(snapshot)
-        watch.finding
+        _ = watch.finding
         taken.append(time.process_time() - begin)
     assert min(taken) < 0.05
 
@@ -139,6 +155,13 @@ def test_the_work_of_a_start_does_not_grow_with_the_survey(factor):
     workspace.set_bounds(state.record.extent, config.workspace_margin, box)
     for _ in range(4):
         begin = time.process_time()
-        locate(window, state.anchors, box, config.parameters()[0], KnownHeight(np.nan, np.nan), room_for(1))
+        locate(
+            window,
+            state.anchors,
+            box,
+            config.parameters()[0],
+            KnownHeight(np.nan, np.nan),
+            room_for(1),
+        )
         taken.append(time.process_time() - begin)
     assert min(taken) < 0.05

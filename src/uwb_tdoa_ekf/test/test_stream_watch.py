@@ -6,6 +6,7 @@ from faults import ARRIVAL, FAULTS, FLIGHT, OF_THE_CLOCK, columns_of
 import numpy as np
 import pytest
 from test_stream_rules import ANCHORS, streams
+
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.engine import feed
 from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, TDOA, Measurements, new_state, structured
@@ -38,7 +39,9 @@ def test_a_healthy_flight_has_no_findings():
 def test_a_fault_is_named_within_five_seconds_and_forgotten_when_it_ends(fault, phase):
     begin, rng = 1e9 + 3.7 * phase, np.random.default_rng(0)
     columns = columns_of(begin, [(0.0, 4.0, ()), (4.0, 10.0, (fault,)), (10.0, 16.0, ())])
-    for stream in columns:  # who sends is not on time either: messages come in lumps, up to 30 ms late
+    for (
+        stream
+    ) in columns:  # who sends is not on time either: messages come in lumps, up to 30 ms late
         late = stream[ARRIVAL] + 0.03 * rng.random(len(stream[ARRIVAL])) ** 4
         stream[ARRIVAL][:] = np.maximum.accumulate(late)
     watch, said, before = StreamWatch(FLIGHT.anchors, 0.25), [], -np.inf
@@ -56,14 +59,24 @@ def test_a_fault_is_named_within_five_seconds_and_forgotten_when_it_ends(fault, 
 
 def test_the_text_of_a_finding_stays_as_long_as_it_goes_on():
     imu, tdoa = streams(16.0)
-    turned = (*imu[:-1], imu[-1] * [1.0, -1.0, -1.0] + np.array([0.0, 0.0, 0.3]) * np.sin(0.7 * imu[0])[:, None])
-    said = [found["imu_turned"].sentence for found in watched(turned, tdoa, 16.0) if "imu_turned" in found]
+    turned = (
+        *imu[:-1],
+        imu[-1] * [1.0, -1.0, -1.0] + np.array([0.0, 0.0, 0.3]) * np.sin(0.7 * imu[0])[:, None],
+    )
+    said = [
+        found["imu_turned"].sentence
+        for found in watched(turned, tdoa, 16.0)
+        if "imu_turned" in found
+    ]
     assert len(said) > 8 and len(set(said)) == 1
 
 
 def test_a_replay_at_another_speed_is_none():
     imu, tdoa = streams(8.0)
-    fast = [shifted(columns, columns[1][0] + (columns[1] - columns[1][0]) / 4.0) for columns in (imu, tdoa)]
+    fast = [
+        shifted(columns, columns[1][0] + (columns[1] - columns[1][0]) / 4.0)
+        for columns in (imu, tdoa)
+    ]
     assert not any(watched(*fast, 2.0))
 
 
@@ -94,7 +107,9 @@ def test_another_time_is_judged_anew():
 def flights(folder):
     """(name, Flight) of the measured micro-SD logs."""
     readers = pytest.importorskip("uwb_tdoa_tools.readers")
-    for log in sorted(path for path in (folder / "flights").rglob("*") if path.is_file() and not path.suffix):
+    for log in sorted(
+        path for path in (folder / "flights").rglob("*") if path.is_file() and not path.suffix
+    ):
         day = log.relative_to(folder / "flights").parts[0]
         yield log.name, readers.read_flight(log, folder / "surveys" / f"anchor_{day}.txt")
 
@@ -107,12 +122,21 @@ def test_nothing_is_said_of_measured_flights(shared_data):
         late = [t + 0.002 + rng.exponential(0.001, len(t)) for t in (imu.t, tdoa.t)]
         begin, end = min(imu.t[0], tdoa.t[0]), max(imu.t[-1], tdoa.t[-1])
         for second in np.arange(begin, end):
-            of_imu, of_tdoa = (slice(*np.searchsorted(t, [second, second + 1.0])) for t in (imu.t, tdoa.t))
+            of_imu, of_tdoa = (
+                slice(*np.searchsorted(t, [second, second + 1.0])) for t in (imu.t, tdoa.t)
+            )
             watch.add_imu(*(column[of_imu] for column in (imu.t, late[0], imu.gyro, imu.accel)))
-            watch.add_tdoa(*(column[of_tdoa] for column in (tdoa.t, late[1], tdoa.a, tdoa.b, tdoa.d)))
+            watch.add_tdoa(
+                *(column[of_tdoa] for column in (tdoa.t, late[1], tdoa.a, tdoa.b, tdoa.d))
+            )
             assert watch.findings() == [], (name, second - begin)
-        state, samples = new_state(flight.anchors.positions), structured(IMU_SAMPLE, imu.t, imu.gyro, imu.accel)
+        state, samples = (
+            new_state(flight.anchors.positions),
+            structured(IMU_SAMPLE, imu.t, imu.gyro, imu.accel),
+        )
         feed(state, FilterConfig().parameters(), Measurements(samples, np.empty(0, TDOA)))
-        assert state.record.plausibility.contradicted == -np.inf, name  # the filter never goes without its IMU
+        assert state.record.plausibility.contradicted == -np.inf, (
+            name
+        )  # the filter never goes without its IMU
         count += 1
     assert count == 22

@@ -51,7 +51,9 @@ def test_it_is_the_covariance_of_a_position_by_one_arrival_from_each_anchor(p):
 
 
 def test_it_does_not_become_less_with_more_tdoas():
-    slow, quick = (np.trace(stated(informed([3.0, 4.0, 1.5], rate=rate), np.eye(3))) for rate in (50.0, 800.0))
+    slow, quick = (
+        np.trace(stated(informed([3.0, 4.0, 1.5], rate=rate), np.eye(3))) for rate in (50.0, 800.0)
+    )
     assert slow == pytest.approx(quick, rel=0.2)
 
 

@@ -1,5 +1,6 @@
 from covariances import assert_covariance
-from hypothesis import given, strategies as st
+from hypothesis import given
+from hypothesis import strategies as st
 import numpy as np
 from priors import Prior
 import pytest
@@ -22,7 +23,9 @@ def test_projection_of_a_sparse_row_is_that_of_the_dense_one(seed, states):
 def test_kalman_is_the_textbook_update(seed, states):
     prior = Prior(seed, states)
     expected = prior.textbook(prior.innovation.noise_variance)
-    prior.innovation.total_variance = prior.innovation.prior_variance + prior.innovation.noise_variance
+    prior.innovation.total_variance = (
+        prior.innovation.prior_variance + prior.innovation.noise_variance
+    )
     kalman(prior.hypothesis, prior.innovation)
     prior.assert_is(*expected)
     np.testing.assert_array_equal(prior.hypothesis.P, prior.hypothesis.P.T)

@@ -2,9 +2,11 @@
 
 from collections import Counter
 
-from hypothesis import given, strategies as st
+from hypothesis import given
+from hypothesis import strategies as st
 import numpy as np
 import pytest
+
 from uwb_tdoa_ekf.monitoring.use import Use
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.results import VERDICTS
@@ -19,7 +21,10 @@ class Looked:
         self.use, self.now, self.received, self.counts = Use(0.25), 50.0, Counter(), Counter()
 
     def go(self, seconds, running=True, rate=400, imu=1000, **shares):
-        """Go on for seconds in which so many TDOAs came, with these shares of what became of them. Returns [(s, trouble)]."""
+        """Go on for seconds in which so many TDOAs came, with these shares of what became of them.
+
+        Returns [(s, trouble)].
+        """
         said = []
         for k in range(round(seconds / LOOK)):
             self.now += LOOK
@@ -33,10 +38,15 @@ class Looked:
 
     def first(self, seconds, **shares):
         """Seconds until something is said, and what."""
-        return next(((at, words) for at, words in self.go(seconds, **shares) if words), (float("inf"), ""))
+        return next(
+            ((at, words) for at, words in self.go(seconds, **shares) if words), (float("inf"), "")
+        )
 
 
-@pytest.mark.parametrize(("reason", "words"), [("late", "-p lag"), ("invalid", "of ids that"), ("rejected", "contradict")])
+@pytest.mark.parametrize(
+    ("reason", "words"),
+    [("late", "-p lag"), ("invalid", "of ids that"), ("rejected", "contradict")],
+)
 def test_tdoas_of_which_none_is_used_are_named_within_two_seconds(reason, words):
     looked = Looked()
     assert not any(said for _, said in looked.go(10.0, used=1.0))
@@ -47,7 +57,9 @@ def test_tdoas_of_which_none_is_used_are_named_within_two_seconds(reason, words)
 
 
 def test_a_start_and_a_landing_do_not_contradict():
-    """Of measured flights on the floor: 85 % rejected for 3 s after the start and for 2 s after landing."""
+    """Of measured flights on the floor: 85 % rejected for 3 s after the start and for 2 s after
+    landing.
+    """
     looked = Looked()
     assert not any(said for _, said in looked.go(3.0, rejected=0.85, used=0.15))
     assert not any(said for _, said in looked.go(20.0, rejected=0.03, used=0.97))
@@ -66,7 +78,11 @@ def test_silence_and_restarts_have_an_age():
     assert looked.use.tdoa_age == looked.use.imu_age == float("inf")
     looked.go(2.0, used=1.0)
     looked.go(3.0, rate=0, imu=0)
-    assert looked.use.tdoa_age == pytest.approx(3.0) == looked.use.imu_age and not looked.use.imu_used and looked.use.trouble is None
+    assert (
+        looked.use.tdoa_age == pytest.approx(3.0) == looked.use.imu_age
+        and not looked.use.imu_used
+        and looked.use.trouble is None
+    )
     looked.counts["restarts"] += 1
     looked.go(1.0, rejected=1.0)
     assert looked.use.restart_age == pytest.approx(0.8)
@@ -82,7 +98,9 @@ def test_nothing_is_said_of_measured_flights(shared_data):
             use = Use(0.25)
             for now in np.arange(t[0] + phase, t[-1], LOOK):
                 so_far = verdict[: np.searchsorted(t, now)]
-                counts = Counter({word: int(np.sum(so_far == value)) for value, word in VERDICTS.items()})
+                counts = Counter(
+                    {word: int(np.sum(so_far == value)) for value, word in VERDICTS.items()}
+                )
                 use.look(now, Counter(tdoa=len(so_far)), counts, bool(now > run.odometry.t[0]))
                 assert use.trouble is None, (name, now - t[0], use.trouble)
 
@@ -96,4 +114,6 @@ def test_shares_are_shares_whatever_comes(steps):
         received["tdoa"] += sum(step)
         use.look(now, received, counts, True)
         shares = use._shares(1.5)
-        assert all(0.0 <= share <= 1.0 for share in shares.values()) and (not shares or sum(shares.values()) == pytest.approx(1.0))
+        assert all(0.0 <= share <= 1.0 for share in shares.values()) and (
+            not shares or sum(shares.values()) == pytest.approx(1.0)
+        )

@@ -1,4 +1,7 @@
-"""Tags in halls with many anchors, tags that hear few TDOAs, and anchors in a plane. The figures of many seeds: warehouse_table.py."""
+"""Tags in halls with many anchors, tags that hear few TDOAs, and anchors in a plane.
+
+The figures of many seeds: warehouse_table.py.
+"""
 
 from halls import HALLS, fly, hall, room
 import numpy as np
@@ -35,18 +38,24 @@ def test_in_a_hall_it_is_searched_within_reach_of_all_that_are_heard():
     positions = np.array([[0.0, 0.0, 3.0], [10.0, 0.0, 1.0], [300.0, 0.0, 3.0], [0.0, 200.0, 5.0]])
     bounds, _ = surroundings(positions, [0], [1])
     np.testing.assert_allclose(bounds[:, :2], [[-1.0, -1.0], [30.0, 30.0]])
-    bounds, _ = surroundings(positions, [0], [1], reach=5.0)  # they are farther apart than that: the radio reaches farther
+    bounds, _ = surroundings(
+        positions, [0], [1], reach=5.0
+    )  # they are farther apart than that: the radio reaches farther
     np.testing.assert_allclose(bounds[:, 0], [10.0 - np.hypot(10.0, 2.0), np.hypot(10.0, 2.0)])
 
 
 @pytest.mark.parametrize(
-    ("name", "side", "axis", "sign"), [("ceiling, 4", "below", 2, -1), ("wall, 8", "+x", 0, 1), ("wall, 8", "-x", 0, -1)]
+    ("name", "side", "axis", "sign"),
+    [("ceiling, 4", "below", 2, -1), ("wall, 8", "+x", 0, 1), ("wall, 8", "-x", 0, -1)],
 )
 def test_a_side_that_is_told_bounds_the_search(name, side, axis, sign):
     positions = room(name).anchors.positions
     rows = np.arange(len(positions) - 1)
     bounds, state = surroundings(positions, rows, rows + 1, tag_side=side)
-    assert bounds[0 if sign > 0 else 1, axis] == pytest.approx(positions[0, axis]) and not state.ekf["flat"][0][axis]
+    assert (
+        bounds[0 if sign > 0 else 1, axis] == pytest.approx(positions[0, axis])
+        and not state.ekf["flat"][0][axis]
+    )
     _, state = surroundings(positions, rows, rows + 1)
     assert state.ekf["flat"][0][axis]
 
@@ -54,7 +63,10 @@ def test_a_side_that_is_told_bounds_the_search(name, side, axis, sign):
 def test_a_side_of_anchors_that_are_in_no_plane_means_nothing():
     positions = room("corners").anchors.positions
     rows = np.arange(7)
-    np.testing.assert_array_equal(surroundings(positions, rows, rows + 1, tag_side="below")[0], surroundings(positions, rows, rows + 1)[0])
+    np.testing.assert_array_equal(
+        surroundings(positions, rows, rows + 1, tag_side="below")[0],
+        surroundings(positions, rows, rows + 1)[0],
+    )
 
 
 @pytest.mark.parametrize("name", ["300 x 200 m, 294 anchors", "300 x 200 m, 988 anchors"])
@@ -134,7 +146,10 @@ def test_after_a_silence_no_tdoa_makes_a_wrong_place_certain():
 def test_a_tag_that_walks_beyond_the_margin_is_found_after_a_silence():
     where = hall("100 x 60 m, 77 anchors")
     flight = fly(where, 18, 17.0, dead=[(3.0, 16.3)])
-    over = np.abs(flight.truth.p[-70:, :2] - 0.5 * np.array(where.size)) - np.ptp(where.anchors.positions[:, :2], axis=0) / 2.0
+    over = (
+        np.abs(flight.truth.p[-70:, :2] - 0.5 * np.array(where.size))
+        - np.ptp(where.anchors.positions[:, :2], axis=0) / 2.0
+    )
     assert over.max() > 1.0  # m beyond the anchors, by which the search is bounded
     found = judge(flight, WITHOUT_IMU)
     assert (found["off"][found["odometry"].t > 16.4] < 1.0).all()
@@ -142,7 +157,12 @@ def test_a_tag_that_walks_beyond_the_margin_is_found_after_a_silence():
 
 def test_how_far_a_place_is_outside_and_one_that_is_no_number_is_nowhere():
     bounds = np.array([[0.0, 0.0, 0.0], [4.0, 4.0, 4.0]])
-    for x, beyond in (([2.0, 2.0, 3.0], -1.0), ([4.5, -0.2, 2.0], 0.5), ([2.0, -0.7, 5.0], 1.0), ([2.0, np.nan, 2.0], np.inf)):
+    for x, beyond in (
+        ([2.0, 2.0, 3.0], -1.0),
+        ([4.5, -0.2, 2.0], 0.5),
+        ([2.0, -0.7, 5.0], 1.0),
+        ([2.0, np.nan, 2.0], np.inf),
+    ):
         assert workspace.outside(bounds, np.array(x)) == pytest.approx(beyond)
         assert workspace.contains(bounds, np.array(x)) == (beyond <= 0.0)
 
@@ -150,7 +170,13 @@ def test_how_far_a_place_is_outside_and_one_that_is_no_number_is_nowhere():
 @pytest.mark.slow
 @pytest.mark.parametrize("config", [FilterConfig(), WITHOUT_IMU])
 def test_ten_minutes_with_dead_zones_and_a_change_of_floor(config):
-    flight = fly(hall("100 x 60 m, 77 anchors", floors=2), 0, 600.0, dead=[(120.0, 133.3), (220.0, 233.3), (450.0, 463.3)], lift=300.0)
+    flight = fly(
+        hall("100 x 60 m, 77 anchors", floors=2),
+        0,
+        600.0,
+        dead=[(120.0, 133.3), (220.0, 233.3), (450.0, 463.3)],
+        lift=300.0,
+    )
     found = judge(flight, config)
     assert found["nees"] < 6.0 and max(after_gaps(flight, found)) < 2.0
     assert np.quantile(found["off"] / found["std"], 0.999) < 4.0
@@ -158,13 +184,18 @@ def test_ten_minutes_with_dead_zones_and_a_change_of_floor(config):
 
 def test_memory_and_estimate_of_a_tag_do_not_depend_on_how_many_anchors_are_installed():
     (_, few, _, one), (_, many, _, other) = (cost(n, 3.0, 1) for n in (20, 10_000))
-    assert many < few + 10_000 * 1000  # bytes: what is known of an anchor, and no matrix of all with all
+    assert (
+        many < few + 10_000 * 1000
+    )  # bytes: what is known of an anchor, and no matrix of all with all
     np.testing.assert_allclose(one.p, other.p, atol=0.05)
 
 
 @pytest.mark.slow
 def test_a_tag_costs_what_it_hears_and_starts_with_ten_thousand_anchors_within_three_seconds():
-    """Runs in turn, until a pair that nothing disturbs shows it. What grows with what is installed, up to 500 times here, shows it in none."""
+    """Runs in turn, until a pair that nothing disturbs shows it.
+
+    What grows with what is installed, up to 500 times here, shows it in none.
+    """
     cost(20, 5.0, 1)  # what is compiled, is
     ratios, start = [], np.inf
     while min(ratios, default=np.inf) >= 1.1 and len(ratios) < PAIRS:

@@ -34,13 +34,18 @@ def test_it_ends_a_margin_beyond_the_anchors_and_is_never_flat():
 
 @pytest.mark.parametrize("axis, off", [(0, -2.0), (1, 0.7), (2, 5.0)])
 def test_a_tag_outside_is_drawn_back_by_as_much_as_it_is_uncertain(axis, off):
-    bounds, ekf = bounds_of(np.array(corners().positions)), new_state(np.array(corners().positions)).record
+    bounds, ekf = (
+        bounds_of(np.array(corners().positions)),
+        new_state(np.array(corners().positions)).record,
+    )
     hypothesis = ekf.hypotheses[0]
     hypothesis.x[:3] = 0.5 * (bounds[0] + bounds[1])
     hypothesis.x[axis] = bounds[int(off > 0.0), axis] + off
     hypothesis.P[axis, axis] = 3.0
     before = hypothesis.x.copy()
-    assert [constrain(hypothesis, ekf.innovation, bounds, k) for k in range(3)] == [k == axis for k in range(3)]
+    assert [constrain(hypothesis, ekf.innovation, bounds, k) for k in range(3)] == [
+        k == axis for k in range(3)
+    ]
     gain = 3.0 / (3.0 + STD**2)
     assert hypothesis.x[axis] == pytest.approx(before[axis] - gain * off)
     assert hypothesis.P[axis, axis] == pytest.approx((1.0 - gain) * 3.0)
@@ -48,7 +53,10 @@ def test_a_tag_outside_is_drawn_back_by_as_much_as_it_is_uncertain(axis, off):
 
 
 def test_a_tag_inside_is_left_alone():
-    bounds, ekf = bounds_of(np.array(corners().positions)), new_state(np.array(corners().positions)).record
+    bounds, ekf = (
+        bounds_of(np.array(corners().positions)),
+        new_state(np.array(corners().positions)).record,
+    )
     hypothesis = ekf.hypotheses[0]
     hypothesis.x[:3] = bounds[1]
     before = hypothesis.copy()
@@ -57,8 +65,13 @@ def test_a_tag_inside_is_left_alone():
 
 
 def test_what_is_known_better_than_its_bounds_is_not_drawn_back():
-    """A tag outside whose TDOAs agree: every one of them used to tell the bound anew, and the deviation fell with their rate."""
-    bounds, ekf = bounds_of(np.array(corners().positions)), new_state(np.array(corners().positions)).record
+    """A tag outside whose TDOAs agree: every one of them used to tell the bound anew, and the
+    deviation fell with their rate.
+    """
+    bounds, ekf = (
+        bounds_of(np.array(corners().positions)),
+        new_state(np.array(corners().positions)).record,
+    )
     hypothesis = ekf.hypotheses[0]
     hypothesis.x[:3] = bounds[1] + 3.0
     hypothesis.P[:3, :3] = 0.5 * np.eye(3)

@@ -11,9 +11,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.core.memory import new_state
 from uwb_tdoa_ekf.core.state import ERROR_STATES
 from uwb_tdoa_ekf.core.yaw_doubt import evidence
-from uwb_tdoa_ekf.core.memory import new_state
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.frames import rotation_std
 from uwb_tdoa_ekf.offline import run_offline
@@ -45,14 +45,18 @@ def yaw_at(flight, t):
 def told(flight, wrong, degrees=5.0):
     """FilterConfig that is told a yaw that is so many rad off, and its deviation."""
     yaw = float(yaw_at(flight, 0.0)[0]) + wrong
-    return FilterConfig(initial_yaw=math.remainder(yaw, 2.0 * math.pi), initial_yaw_std=math.radians(degrees))
+    return FilterConfig(
+        initial_yaw=math.remainder(yaw, 2.0 * math.pi), initial_yaw_std=math.radians(degrees)
+    )
 
 
 def dishonest(flight, odometry):
     """(n,) bool: the yaw is farther off than three of its deviations, and than 20 degrees."""
     error = Rotation.from_quat(odometry.q).as_euler("ZYX")[:, 0] - yaw_at(flight, odometry.t)
     off = np.abs((error + np.pi) % (2.0 * np.pi) - np.pi)
-    return off > np.maximum(3.0 * rotation_std(odometry.q, odometry.covariance)[:, 2], math.radians(20.0))
+    return off > np.maximum(
+        3.0 * rotation_std(odometry.q, odometry.covariance)[:, 2], math.radians(20.0)
+    )
 
 
 def opened(estimator, flight):
@@ -85,7 +89,11 @@ def test_a_wrong_yaw_that_is_told_is_opened_within_seconds(seed, wrong):
 @pytest.mark.parametrize("seed", range(6))
 def test_a_right_yaw_is_not(seed, degrees):
     flight = fly(seed, 20.0, outliers=0.05, accel_bias=0.1, gyro_bias=0.005, **NOISE)
-    for config in (told(flight, 0.0, degrees), told(flight, math.radians(degrees), degrees), FilterConfig()):
+    for config in (
+        told(flight, 0.0, degrees),
+        told(flight, math.radians(degrees), degrees),
+        FilterConfig(),
+    ):
         _, stamps = opened(Estimator(flight.anchors, config), flight)
         assert not stamps
 
@@ -95,7 +103,9 @@ def test_a_wrong_yaw_of_a_pose_in_flight_is_opened(seed):
     flight = fly(seed, 25.0, tdoa_std=0.05, **NOISE)
     estimator = Estimator(flight.anchors, told(flight, 0.0))
     p, yaw = position_at(flight, np.array([10.0]))[0], float(yaw_at(flight, 10.0)[0])
-    estimator.set_pose(10.0, p, 0.01 * np.eye(3), math.remainder(yaw + 2.0, 2.0 * math.pi), math.radians(5.0))
+    estimator.set_pose(
+        10.0, p, 0.01 * np.eye(3), math.remainder(yaw + 2.0, 2.0 * math.pi), math.radians(5.0)
+    )
     odometry, stamps = opened(estimator, flight)
     assert stamps and 10.0 < stamps[0] < 10.0 + SOON
     assert not dishonest(flight, odometry)[(odometry.t > stamps[0] + 0.3)].any()
@@ -115,9 +125,14 @@ def test_it_depends_on_stamps_alone_and_the_smoother_goes_on():
     config = told(flight, math.pi)
     assert_same_as_offline(flight, config, advance=lambda: rng.random() < 0.1)
     smoothed = smooth(flight, config).odometry
-    assert np.isfinite(smoothed.p).all() and (np.diagonal(smoothed.covariance, axis1=1, axis2=2) > 0.0).all()
+    assert (
+        np.isfinite(smoothed.p).all()
+        and (np.diagonal(smoothed.covariance, axis1=1, axis2=2) > 0.0).all()
+    )
     records: list[np.ndarray] = []
-    assert_same(run_offline(flight, config, records=records).odometry, run_offline(flight, config).odometry)
+    assert_same(
+        run_offline(flight, config, records=records).odometry, run_offline(flight, config).odometry
+    )
 
 
 def test_a_tag_at_rest_doubts_nothing():
@@ -129,7 +144,9 @@ def test_evidence_is_the_likelihood_ratio_of_the_best_angle():
     doubt = new_state(np.zeros((4, 3))).record.yaw_doubt
     assert evidence(doubt) == 0.0 and doubt.response.shape == (2, ERROR_STATES)
     doubt.information[:] = 10.0 * np.eye(2)
-    doubt.vector[:] = 10.0 * np.array([math.cos(1.5 * math.pi) - 1.0, math.sin(1.5 * math.pi)])  # innovations of 270 degrees
+    doubt.vector[:] = 10.0 * np.array(
+        [math.cos(1.5 * math.pi) - 1.0, math.sin(1.5 * math.pi)]
+    )  # innovations of 270 degrees
     assert evidence(doubt) == pytest.approx(0.5 * 10.0 * 2.0)
     doubt.vector[:] = 0.0
     doubt.turned, doubt.variance = 0.3, 0.01

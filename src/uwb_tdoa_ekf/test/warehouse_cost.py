@@ -1,4 +1,5 @@
-"""What a tag costs by how many anchors are installed, of which it hears the same 20: the table of docs/warehouse.md.
+"""What a tag costs by how many anchors are installed, of which it hears the same 20: the table of
+docs/warehouse.md.
 
 python src/uwb_tdoa_ekf/test/warehouse_cost.py
 """
@@ -22,20 +23,30 @@ TURN = 0.005  # s of stamps that a node takes at once
 
 
 def installation(n):
-    """n Anchors, the first 20 of which are the same for every n; the others are out of reach of a tag among these."""
+    """n Anchors, the first 20 of which are the same for every n; the others are out of reach of a
+    tag among these.
+    """
     rng = np.random.default_rng(1)
     x, y = np.meshgrid(np.arange(5) * SPACING, np.arange(4) * SPACING)
     near = np.column_stack([x.ravel(), y.ravel(), rng.uniform(0.5, 6.0, 20)])
     beyond = np.arange(n - 20)
-    far = np.column_stack([200.0 + SPACING * (beyond % 125), SPACING * (beyond // 125), np.full(len(beyond), 4.0)])
+    far = np.column_stack(
+        [200.0 + SPACING * (beyond % 125), SPACING * (beyond // 125), np.full(len(beyond), 4.0)]
+    )
     return Anchors.from_positions(np.concatenate([near, far]))
 
 
 class Tag:
-    """Both nodes of a tag, without ROS: correction, filter with its monitor, and watch over the streams."""
+    """Both nodes of a tag, without ROS: correction, filter with its monitor, and watch over the
+    streams.
+    """
 
     def __init__(self, anchors):
-        self.corrector, self.estimator, self.watch = Corrector(anchors), Estimator(anchors), StreamWatch(anchors, 0.25)
+        self.corrector, self.estimator, self.watch = (
+            Corrector(anchors),
+            Estimator(anchors),
+            StreamWatch(anchors, 0.25),
+        )
 
     def take(self, flight):
         """Take a Flight, turn by turn. Returns the Odometry of each."""
@@ -48,7 +59,9 @@ class Tag:
             self.estimator.add_imu(imu.t[i], imu.gyro[i], imu.accel[i])
             self.watch.add_imu(imu.t[i], imu.t[i], imu.gyro[i], imu.accel[i])
             if j.stop > j.start:
-                corrected = self.corrector.correct(d.t[j], rows(d.a[j]), rows(d.b[j]), d.d[j]).corrected
+                corrected = self.corrector.correct(
+                    d.t[j], rows(d.a[j]), rows(d.b[j]), d.d[j]
+                ).corrected
                 self.estimator.add_tdoa(d.t[j], d.a[j], d.b[j], corrected)
                 self.watch.add_tdoa(d.t[j], d.t[j], d.a[j], d.b[j], d.d[j])
             out.append(self.estimator.advance()[0])
@@ -59,13 +72,17 @@ class Tag:
 
 
 def flight_among(anchors, duration):
-    """Flight of a tag that walks among the first 20 of Anchors and hears these alone, the same whatever the others are."""
+    """Flight of a tag that walks among the first 20 of Anchors and hears these alone, the same
+    whatever the others are.
+    """
     few = Hall(anchors.only(np.arange(20)), (4.0 * SPACING, 3.0 * SPACING), 100.0, np.zeros(20))
     return fly(few, 0, duration)
 
 
 def cost(n, duration=30.0, repeat=3):
-    """(share of a core, memory of a tag, bytes, start from a file, s of processor time, the last Odometry) among n installed anchors."""
+    """(share of a core, memory of a tag, bytes, start from a file, s of processor time, the last
+    Odometry) among n installed anchors.
+    """
     anchors, shares = installation(n), []
     with tempfile.TemporaryDirectory() as folder:
         anchors.to_yaml(path := Path(folder) / "anchors.yaml")
@@ -88,9 +105,15 @@ def cost(n, duration=30.0, repeat=3):
 
 if __name__ == "__main__":
     cost(20, 5.0, 1)  # what is compiled, is
-    print("| installed | of a core | over that of 20 | memory of a tag, MB | start, s |\n|---:|---:|---:|---:|---:|")
+    print(
+        "| installed | of a core | over that of 20 | memory of a tag, MB | start, s "
+        "|\n|---:|---:|---:|---:|---:|"
+    )
     for n in INSTALLED:
         share, memory, start, _ = cost(n)
         if n == INSTALLED[0]:
             least = share
-        print(f"| {n} | {share:.4f} | {share / least:.2f} | {memory / 1e6:.1f} | {start:.2f} |", flush=True)
+        print(
+            f"| {n} | {share:.4f} | {share / least:.2f} | {memory / 1e6:.1f} | {start:.2f} |",
+            flush=True,
+        )

@@ -1,1 +1,4 @@
-"""The estimation side: error-state filter, robust weights, start-up, time ordering. No ROS outside the nodes."""
+"""The estimation side: error-state filter, robust weights, start-up, time ordering.
+
+No ROS outside the nodes.
+"""

@@ -1,7 +1,9 @@
-"""compile_nodes: compile what the nodes need, so that their first start takes no longer than any other.
+"""compile_nodes: compile what the nodes need, so that their first start takes no longer than any
+other.
 
-Compiled code is kept in the folder that NUMBA_CACHE_DIR names, by default ~/.cache/uwb_tdoa, and used until the sources, numba or
-the processor change. `./dev build` and `./dev demo` call this; after a `colcon build` call it as the user who starts the nodes.
+Compiled code is kept in the folder that NUMBA_CACHE_DIR names, by default ~/.cache/uwb_tdoa, and
+used until the sources, numba or the processor change. `./dev build` and `./dev demo` call this;
+after a `colcon build` call it as the user who starts the nodes.
 """
 
 from __future__ import annotations
@@ -19,15 +21,17 @@ from uwb_tdoa_bias.effects.tag_lever_arm import TagLeverArm
 from .warm_up import warm_up
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
     from argparse import ArgumentParser
+    from collections.abc import Sequence
 
 
 def parser() -> ArgumentParser:
     """Its options: none."""
     layout = argparse.RawDescriptionHelpFormatter
     examples = "examples:\n  compile_nodes"
-    return argparse.ArgumentParser(prog="compile_nodes", description=__doc__, epilog=examples, formatter_class=layout)
+    return argparse.ArgumentParser(
+        prog="compile_nodes", description=__doc__, epilog=examples, formatter_class=layout
+    )
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -39,7 +43,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     began = time.monotonic()
     warm_up()
     corrector.warm_up(EffectSet(), load_network(SHIPPED))
-    corrector.warm_up(EffectSet((TagLeverArm(values={"z": 0.1}),)), None)  # a frame on /tf_static brings one, while the node runs
+    corrector.warm_up(
+        EffectSet((TagLeverArm(values={"z": 0.1}),)), None
+    )  # a frame on /tf_static brings one, while the node runs
     print(f"both nodes are compiled; {time.monotonic() - began:.0f} s")
     return 0
 

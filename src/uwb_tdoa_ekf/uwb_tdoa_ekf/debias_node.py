@@ -12,40 +12,59 @@ from collections import Counter
 from copy import copy
 import math
 import sys
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
 import numpy as np
 from scipy.spatial.transform import Rotation
+
 from uwb_tdoa_bias.foundation import ros
-from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_FILE, AnchorsInput
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_FILE, AnchorsInput
 from uwb_tdoa_bias.foundation.ros_diagnostics import Diagnostics, Rate
 from uwb_tdoa_bias.foundation.ros_node import StreamNode
-from uwb_tdoa_bias.foundation.ros_parameters import FROZEN, Parameter, declare_all, files_of, refuse_unknown, say_unused
+from uwb_tdoa_bias.foundation.ros_parameters import (
+    FROZEN,
+    Parameter,
+    declare_all,
+    files_of,
+    refuse_unknown,
+    say_unused,
+)
 from uwb_tdoa_bias.foundation.ros_stamps import Epoch, orientation_of
-from uwb_tdoa_bias.foundation.ros_topics import Input, OVERRIDES, STREAM_QOS, publish_stream
+from uwb_tdoa_bias.foundation.ros_topics import OVERRIDES, STREAM_QOS, Input, publish_stream
 
 from .debias import BiasMap, LayerConfig, Layers
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from uwb_tdoa_bias.foundation.anchors import Anchors
 
 GAP = 1.0  # s; after a longer silence, or when time goes back, the layers start anew
 LARGEST_OUTSIDE = 0.5  # share of positions outside of the map, before it becomes a warning
-PARAMETERS = {  # in the order of config/debias_node.yaml; the layers are those of Grasso et al., appendix C
+# in the order of config/debias_node.yaml; the layers are those of Grasso et al., appendix C
+PARAMETERS = {
     "map": Parameter("", "file that `debias` wrote; must be given"),
     "anchors_file": ANCHORS_FILE,
     "saturate": Parameter(False, "limit the steps of velocity and position"),
-    "max_speed": Parameter([3.0, 3.0, 3.0], "m/s along x, y, z", constraint="three numbers above 0"),
+    "max_speed": Parameter(
+        [3.0, 3.0, 3.0], "m/s along x, y, z", constraint="three numbers above 0"
+    ),
     "max_acceleration": Parameter(10.0, "m/s^2", 0.0, 1e6),
-    "smooth": Parameter(1.0, "share of the newest position in the weighted mean, above 0; 1.0 for no smoothing", 0.0, 1.0),
+    "smooth": Parameter(
+        1.0,
+        "share of the newest position in the weighted mean, above 0; 1.0 for no smoothing",
+        0.0,
+        1.0,
+    ),
     "history": Parameter(4, "earlier positions in that mean", 1, 1000),
     "adams_moulton": Parameter(False, "mix in what the velocities predict"),
     "flipping_speed": Parameter(
-        [1.0, 1.0, 1.0], "m/s along x, y, z at which the prediction begins to count", constraint="three numbers above 0"
+        [1.0, 1.0, 1.0],
+        "m/s along x, y, z at which the prediction begins to count",
+        constraint="three numbers above 0",
     ),
     "least_weight": Parameter(0.5, "share that the estimate keeps at high speed", 0.0, 1.0),
     "frozen": FROZEN,
@@ -53,7 +72,9 @@ PARAMETERS = {  # in the order of config/debias_node.yaml; the layers are those 
 
 
 class DebiasNode(StreamNode):
-    """Converts messages for a BiasMap and keeps the accounts: received = corrected + faded + outside + refused + invalid."""
+    """Converts messages for a BiasMap and keeps the accounts: received = corrected + faded +
+    outside + refused + invalid.
+    """
 
     NAME = "debias_node"
 
@@ -62,7 +83,11 @@ class DebiasNode(StreamNode):
         super().__init__(self.NAME)
         own = declare_all(self, PARAMETERS)
         refuse_unknown(self)
-        layers = {name: value for name, value in own.items() if name not in ("map", "anchors_file", "frozen")}
+        layers = {
+            name: value
+            for name, value in own.items()
+            if name not in ("map", "anchors_file", "frozen")
+        }
         file = own["map"]
         if not file:
             raise InputError("map: is empty; give a file that `debias` wrote.")
@@ -74,7 +99,12 @@ class DebiasNode(StreamNode):
         self._map.correct(np.zeros((1, 3)), np.zeros((1, 3, 3)))  # what the first call prepares
         self._publisher = publish_stream(self, Odometry, "odometry/debiased")
         self._input = Input(
-            self, Odometry, "odometry", self._on_odometry, copy(STREAM_QOS), qos_overriding_options=OVERRIDES
+            self,
+            Odometry,
+            "odometry",
+            self._on_odometry,
+            copy(STREAM_QOS),
+            qos_overriding_options=OVERRIDES,
         )
         self._belongs: bool | None = None  # until there are anchors
         self._anchors = AnchorsInput(self, self._on_anchors, own["anchors_file"])
@@ -98,7 +128,9 @@ class DebiasNode(StreamNode):
             kind = "refused"
         else:
             covariance = np.array(message.pose.covariance).reshape(6, 6)
-            (p,), (covariance[:3, :3],), (validity,) = self._map.correct(p[None], covariance[None, :3, :3])
+            (p,), (covariance[:3, :3],), (validity,) = self._map.correct(
+                p[None], covariance[None, :3, :3]
+            )
             kind = "corrected" if validity == 1.0 else "faded" if validity > 0.0 else "outside"
             point.x, point.y, point.z = p.tolist()
             message.pose.covariance = covariance.ravel()
@@ -106,8 +138,9 @@ class DebiasNode(StreamNode):
         self._publisher.publish(message)
 
     def _layered(self, message: Odometry, p: np.ndarray) -> np.ndarray:
-        """The position after the layers, which also need the velocity, in the world frame; NaN where one is not
-        known."""
+        """The position after the layers, which also need the velocity, in the world frame; NaN
+        where one is not known.
+        """
         u = message.twist.twist.linear
         state = np.array([*p, u.x, u.y, u.z, *orientation_of(message.pose.pose.orientation)])
         if not np.isfinite(state).all():
@@ -124,7 +157,11 @@ class DebiasNode(StreamNode):
         self._counts_before = Counter(self._counts)
         rate = self._rate.of(self._counts["received"])
         values: dict[str, Any] = {name: self._counts[name] for name in ("received", *kinds)}
-        values |= {"odometry rate": f"{rate:.1f} Hz", "map": self._map.source, "markers": len(self._map.at)}
+        values |= {
+            "odometry rate": f"{rate:.1f} Hz",
+            "map": self._map.source,
+            "markers": len(self._map.at),
+        }
         values |= {"publishers of odometry": self._input.subscription.get_publisher_count()}
         values |= {"subscribers of odometry/debiased": self._publisher.get_subscription_count()}
         values |= {"unreadable on odometry": self._input.refusals.count}
@@ -138,15 +175,30 @@ class DebiasNode(StreamNode):
         if not total:
             return DiagnosticStatus.WARN, "no odometry: start ekf_node in this namespace"
         if recent["invalid"]:
-            what = f"odometry is not finite, or not in the map's frame '{self._map.frame}', and is passed on as it is"
-            return DiagnosticStatus.ERROR, f"{what}: correct world_frame of ekf_node, or make a map in its frame"
+            what = (
+                f"odometry is not finite, or not in the map's frame '{self._map.frame}', and is "
+                "passed on as it is"
+            )
+            return (
+                DiagnosticStatus.ERROR,
+                f"{what}: correct world_frame of ekf_node, or make a map in its frame",
+            )
         if recent["refused"] and self._belongs is None:
-            return DiagnosticStatus.WARN, "no anchors, so positions pass uncorrected: start anchors_node, or give anchors_file"
+            return (
+                DiagnosticStatus.WARN,
+                (
+                    "no anchors, so positions pass uncorrected: start anchors_node, or give "
+                    "anchors_file"
+                ),
+            )
         if recent["refused"]:
             what = "the map was made for other anchors, so positions pass uncorrected"
             return DiagnosticStatus.ERROR, f"{what}: make one for these with debias fit"
         if recent["outside"] > LARGEST_OUTSIDE * total:
-            return DiagnosticStatus.WARN, "most positions are outside of the map, not corrected: map more of the room"
+            return (
+                DiagnosticStatus.WARN,
+                "most positions are outside of the map, not corrected: map more of the room",
+            )
         return DiagnosticStatus.OK, "debiasing"
 
 

@@ -1,9 +1,11 @@
 """ekf_node: inertial samples and corrected TDOAs in, odometry out.
 
-imu/data (sensor_msgs/Imu), uwb/tdoa_corrected (TdoaCorrected), uwb/anchors (AnchorArray), /tf_static; if they are there: SENSORS,
-initialpose (geometry_msgs/PoseWithCovarianceStamped)
-  -> odometry (nav_msgs/Odometry), /tf (tf2_msgs/TFMessage), uwb/residual (TdoaResidual: one for each TdoaCorrected),
-     status (EstimatorStatus: whether the odometry may be flown by), /diagnostics (diagnostic_msgs/DiagnosticArray).
+imu/data (sensor_msgs/Imu), uwb/tdoa_corrected (TdoaCorrected), uwb/anchors (AnchorArray),
+/tf_static; if they are there: SENSORS, initialpose (geometry_msgs/PoseWithCovarianceStamped)
+  -> odometry (nav_msgs/Odometry), /tf (tf2_msgs/TFMessage), uwb/residual (TdoaResidual: one for
+  each TdoaCorrected),
+     status (EstimatorStatus: whether the odometry may be flown by), /diagnostics
+     (diagnostic_msgs/DiagnosticArray).
 Service ~/reset (std_srvs/Trigger): start anew.
 Every parameter is documented in config/ekf_node.yaml.
 """
@@ -15,13 +17,14 @@ from functools import partial
 import math
 import sys
 import time
-from typing import Any, TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
 import numpy as np
 from rclpy.time import Time
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
+
 from uwb_tdoa_bias.effects import AidCorrector, EffectSet, ImuCorrector
 from uwb_tdoa_bias.effects.tag_lever_arm import TagLeverArm
 from uwb_tdoa_bias.foundation import ros
@@ -39,8 +42,8 @@ from uwb_tdoa_bias.foundation.ros_topics import Input, Refusals, several_publish
 from uwb_tdoa_bias.foundation.sensors import SENSORS
 from uwb_tdoa_msgs.msg import TdoaCorrected
 
-from .ekf_parameters import ODOM, declare_parameters, follow_changes
 from .core.verdicts import INVALID
+from .ekf_parameters import ODOM, declare_parameters, follow_changes
 from .estimator import Estimator
 from .frames import rotation_std
 from .imu_mount import ImuMount
@@ -48,17 +51,20 @@ from .monitoring.health import OK, WARN, Health, together
 from .monitoring.status import FAULT, Status, doubted, status_of, yaw_in_words
 from .monitoring.stream_watch import FEW_ANCHORS, StreamWatch
 from .outputs import Outputs, StatusOutput
-from .streams import most_severe_first
 from .pose_message import pose_from_message
 from .reorder_buffer import STREAMS
 from .results import VERDICTS, Residuals
+from .streams import most_severe_first
 from .warm_up import warm_up
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
+
     from rclpy.clock import ROSClock
+
     from uwb_tdoa_bias.foundation.anchors import Anchors
     from uwb_tdoa_bias.foundation.ros_diagnostics import Report
+
     from .core.config import FilterConfig
     from .results import Odometry
     from .streams.finding import Finding
@@ -67,14 +73,32 @@ if TYPE_CHECKING:
 TOPICS = {
     "imu": [
         (
-            "imu/data", Imu, "angular_velocity", "linear_acceleration", "angular_velocity_covariance",
+            "imu/data",
+            Imu,
+            "angular_velocity",
+            "linear_acceleration",
+            "angular_velocity_covariance",
             "linear_acceleration_covariance",
         )
     ],
-    "tdoa": [("uwb/tdoa_corrected", TdoaCorrected, "anchor_a", "anchor_b", "raw", "corrected", "bias_std", "variance", "bias_slope", "bias_state")],
+    "tdoa": [
+        (
+            "uwb/tdoa_corrected",
+            TdoaCorrected,
+            "anchor_a",
+            "anchor_b",
+            "raw",
+            "corrected",
+            "bias_std",
+            "variance",
+            "bias_slope",
+            "bias_state",
+        )
+    ],
 } | {
-    name: [(topic, message_class(kind), *sensor.fields) for topic, kind in sensor.topics] for name, sensor in SENSORS.items()
-}  # fmt: skip
+    name: [(topic, message_class(kind), *sensor.fields) for topic, kind in sensor.topics]
+    for name, sensor in SENSORS.items()
+}
 MOST_FRAMES = 100  # of the IMU that are remembered: names on a topic may be anything
 MOST_NAMED = 3  # of them in a sentence
 MAST = 0.1  # m, of an antenna over the body, from which on its height is not that of the body
@@ -86,44 +110,76 @@ class EkfNode(StreamNode):
 
     NAME = "ekf_node"
 
-    def __init__(self, arguments: Sequence[str] = (), member: set[str] | None = None, **options: Any) -> None:
-        """arguments : of the process; member : of a localization_node, which has it take its turns and hands it the corrected TDOAs:
-        names of parameters that are for others, too; options : of Node."""
+    def __init__(
+        self, arguments: Sequence[str] = (), member: set[str] | None = None, **options: Any
+    ) -> None:
+        """arguments : of the process; member : of a localization_node, which has it take its turns
+        and hands it the corrected TDOAs: names of parameters that are for others, too; options : of
+        Node.
+        """
         super().__init__(self.NAME, **options)
         self._config, own = declare_parameters(self)
         self._reorder, self._lag, self._world, self._body = (
             own[name] for name in ("reorder", "lag", "world_frame", "body_frame")
         )
         if not self._reorder < self._lag:
-            raise InputError(f"reorder, lag: {self._reorder!r}, {self._lag!r} must be seconds with 0 <= reorder < lag.")
+            raise InputError(
+                f"reorder, lag: {self._reorder!r}, {self._lag!r} must be seconds with 0 <= "
+                "reorder < lag."
+            )
         volume, effects_file = own["flyable_volume"], own["effects_file"]
         self._effects = EffectSet.from_yaml(effects_file) if effects_file else EffectSet()
         self._aid_corrector = AidCorrector(self._effects.effects)
         self._estimator: Estimator = None  # type: ignore[assignment]  # until there are anchors
         self._said_restart: Finding | None = None
         self._epoch, self._ros_clock = Epoch(), cast("ROSClock", self.get_clock())
-        self._attitude: tuple[np.ndarray, np.ndarray] | None = None  # quaternion and covariance of the newest odometry
+        self._attitude: tuple[np.ndarray, np.ndarray] | None = (
+            None  # quaternion and covariance of the newest odometry
+        )
         self._findings: list[Finding] = []  # of the last report
-        self._assumed: dict[str, tuple[str, ...]] = {}  # parameters that count for deviations which messages do not state, by sensor
+        self._assumed: dict[
+            str, tuple[str, ...]
+        ] = {}  # parameters that count for deviations which messages do not state, by sensor
         self._fault = False  # one of these, or the use of TDOAs, makes the position wrong
         self._received_before: dict[str, int] = {}  # messages by topic, by the last report
         self._early: deque[tuple[str, tuple[Any, ...]]] = (
             deque()
-        )  # what came while there were no anchors: (stream, (frame, stamps, rows, arrivals)), one message each
-        self._past: Counter[str] = Counter()  # accounts of estimators that were replaced, and of messages that none received
-        self._lately: list[str] = []  # frames of the IMU since the last report, and the last one before it
+            # what came while there were no anchors: (stream, (frame, stamps, rows, arrivals)), one
+            # message each
+        )
+        self._past: Counter[str] = (
+            Counter()
+        )  # accounts of estimators that were replaced, and of messages that none received
+        self._lately: list[
+            str
+        ] = []  # frames of the IMU since the last report, and the last one before it
         self._placed: dict[
             str, tuple[ImuMount | None, str | None]
-        ] = {}  # (ImuMount, or None for the body, and what is wrong) by frame of the IMU, in the order of coming
+            # (ImuMount, or None for the body, and what is wrong) by frame of the IMU, in the order of
+            # coming
+        ] = {}
         self._remark_height()
-        self._health = Health(self._config, self._lag, FlyableVolume.load(volume) if volume else None)
+        self._health = Health(
+            self._config, self._lag, FlyableVolume.load(volume) if volume else None
+        )
         refuse_unknown(self, member or ())
-        self.get_logger().info("loading the filter; the first time it is compiled, which takes a minute, unless compile_nodes has done so")
+        self.get_logger().info(
+            "loading the filter; the first time it is compiled, which takes a minute, unless "
+            "compile_nodes has done so"
+        )
         warm_up()
         moving = own["publish_tf"] == ODOM
         self._frames = FramesInput(self, self._epoch.seconds, self._on_frames, moving)
         frames = self._frames.frames
-        self.outputs = Outputs(self, self._epoch, frames, self._body, own["publish_tf"], own["odom_frame"], self._config.planar)
+        self.outputs = Outputs(
+            self,
+            self._epoch,
+            frames,
+            self._body,
+            own["publish_tf"],
+            own["odom_frame"],
+            self._config.planar,
+        )
         self._anchors = AnchorsInput(self, self._on_anchors, own["anchors_file"])
         self.streams = self._subscribe({"uwb/tdoa_corrected"} if member is not None else ())
         self._pose = Input(self, PoseWithCovarianceStamped, "initialpose", self._on_pose, 10)
@@ -139,28 +195,47 @@ class EkfNode(StreamNode):
 
     def _remark_height(self) -> None:
         """Log that fixed_height seems to be that of the antenna."""
-        arm = sum(effect.values.get("z", 0.0) for effect in self._effects.effects if isinstance(effect, TagLeverArm))
-        if self._config.fixed_height_std > 0.0 and abs(arm) > MAST and abs(self._config.fixed_height - arm) < 0.5 * MAST:
+        arm = sum(
+            effect.values.get("z", 0.0)
+            for effect in self._effects.effects
+            if isinstance(effect, TagLeverArm)
+        )
+        if (
+            self._config.fixed_height_std > 0.0
+            and abs(arm) > MAST
+            and abs(self._config.fixed_height - arm) < 0.5 * MAST
+        ):
             self.get_logger().warning(
-                f"fixed_height is that of {self._body}, and equals the height of the antenna over it ({TagLeverArm.name} of effects_file): "
+                f"fixed_height is that of {self._body}, and equals the height of the antenna "
+                f"over it ({TagLeverArm.name} of effects_file): "
                 f"give 0.0 for a {self._body} on the floor"
             )
 
     def _subscribe(self, handed: Collection[str]) -> Streams:
-        """Streams of everything that the filter takes. handed : topics that a node of this process hands over."""
+        """Streams of everything that the filter takes. handed : topics that a node of this process
+        hands over.
+        """
         streams = Streams(self, self._epoch, self._advance)
-        self._takers = {"imu": self._take_imu, "tdoa": self._take_tdoa} | {name: partial(self._take_sensor, name) for name in SENSORS}
+        self._takers = {"imu": self._take_imu, "tdoa": self._take_tdoa} | {
+            name: partial(self._take_sensor, name) for name in SENSORS
+        }
         for stream, topics in TOPICS.items():
             if stream in SENSORS and not getattr(self._config, f"use_{stream}"):
                 continue
             for topic, kind, *fields in topics:
-                streams.add(CdrCodec(kind, *fields), topic, partial(self._receive, stream), topic in handed)
+                streams.add(
+                    CdrCodec(kind, *fields), topic, partial(self._receive, stream), topic in handed
+                )
         streams.wait_for("uwb/tdoa_corrected", self.due)
         return streams
 
     def due(self) -> float:
         """Stamp, s since 1970, up to which no odometry will come."""
-        return -math.inf if self._estimator is None else self._estimator.next_odometry + self._epoch.begin
+        return (
+            -math.inf
+            if self._estimator is None
+            else self._estimator.next_odometry + self._epoch.begin
+        )
 
     def _on_anchors(self, anchors: Anchors) -> None:
         if self._estimator is not None and self._estimator.stay(anchors):
@@ -169,7 +244,9 @@ class EkfNode(StreamNode):
             return
         if self._estimator is not None:
             self._publish(*self._estimator.finish())
-            self._past.update(self._estimator.counts, restarts=1, recoveries=self._estimator.recoveries)
+            self._past.update(
+                self._estimator.counts, restarts=1, recoveries=self._estimator.recoveries
+            )
         self._estimator = Estimator(anchors, self._config, self._reorder, self._lag, self._effects)
         self._imu_corrector = ImuCorrector(self._effects.effects)
         self._watch, self._restarts = self._new_watch(anchors), 0
@@ -180,7 +257,9 @@ class EkfNode(StreamNode):
         self._advance()
 
     def _new_watch(self, anchors: Anchors) -> StreamWatch:
-        return StreamWatch(anchors, self._lag, [FEW_ANCHORS] if self._config.fixed_height_std > 0.0 else [])
+        return StreamWatch(
+            anchors, self._lag, [FEW_ANCHORS] if self._config.fixed_height_std > 0.0 else []
+        )
 
     def _on_config(self, config: FilterConfig) -> None:
         self._config = config
@@ -193,7 +272,11 @@ class EkfNode(StreamNode):
             response.message = "starting over"
             self._start_over()
         else:
-            response.message = self.refuse("a reset") if self.frozen else "there are no anchors yet: nothing has started"
+            response.message = (
+                self.refuse("a reset")
+                if self.frozen
+                else "there are no anchors yet: nothing has started"
+            )
         return response
 
     def _start_over(self) -> None:
@@ -207,7 +290,9 @@ class EkfNode(StreamNode):
         try:
             if self._estimator is None:
                 raise InputError("there are no anchors yet; give the pose again when there are.")
-            self._estimator.set_pose(*pose_from_message(message, self.outputs.world, self._epoch, self._estimator.newest))
+            self._estimator.set_pose(
+                *pose_from_message(message, self.outputs.world, self._epoch, self._estimator.newest)
+            )
         except InputError as error:
             self.get_logger().warning(f"initialpose: not taken: {error}")
 
@@ -217,13 +302,17 @@ class EkfNode(StreamNode):
         for frame in before:
             self._place_imu(frame, say=False)
         moved = [frame for frame in before if before[frame] != self._placed[frame]]
-        self._placed |= {frame: before[frame] for frame in before if frame not in moved}  # it goes on where it was
+        self._placed |= {
+            frame: before[frame] for frame in before if frame not in moved
+        }  # it goes on where it was
         if moved and self._estimator is not None:
             self.get_logger().warning(f"the transform of '{moved[0]}' is new: starting over")
             self._start_over()
 
     def _place_imu(self, frame: str, say: bool = True) -> ImuMount | None:
-        """ImuMount of an IMU of this frame, None for one that is taken as the body's; say : log what is wrong, once for each."""
+        """ImuMount of an IMU of this frame, None for one that is taken as the body's; say : log
+        what is wrong, once for each.
+        """
         if frame in self._placed:
             return self._placed[frame][0]
         mount: ImuMount | None = None
@@ -243,10 +332,18 @@ class EkfNode(StreamNode):
     def _frame_troubles(self) -> list[str]:
         """What is wrong with the frames of the IMU, a list of sentences."""
         lately, self._lately = self._lately, self._lately[-1:]
-        troubles = [*filter(None, (self._placed[frame][1] for frame in lately if frame in self._placed))]
+        troubles = [
+            *filter(None, (self._placed[frame][1] for frame in lately if frame in self._placed))
+        ]
         if len(lately) > 1:
             names = ", ".join(f"'{frame}'" for frame in lately[:MOST_NAMED])
-            troubles.insert(0, f"imu/data comes in {len(lately)} frames ({names}): stop all but one of the drivers")
+            troubles.insert(
+                0,
+                (
+                    f"imu/data comes in {len(lately)} frames ({names}): stop all but one of the "
+                    "drivers"
+                ),
+            )
         return troubles
 
     def _receive(self, stream: str, *part: Any) -> None:
@@ -257,12 +354,16 @@ class EkfNode(StreamNode):
             self._takers[stream](*part)
             return
         frame, *columns = part
-        self._early.extend((stream, (frame, *(column[k : k + 1] for column in columns))) for k in range(n))
+        self._early.extend(
+            (stream, (frame, *(column[k : k + 1] for column in columns))) for k in range(n)
+        )
         while len(self._early) > EARLY:
             stream, (_, t, rows, _) = self._early.popleft()
             self._past["invalid" if stream == "tdoa" else f"{stream}_invalid"] += 1
             if stream == "tdoa":
-                self.outputs.publish_residuals(Residuals.refused(t, rows["anchor_a"], rows["anchor_b"], INVALID))
+                self.outputs.publish_residuals(
+                    Residuals.refused(t, rows["anchor_a"], rows["anchor_b"], INVALID)
+                )
 
     def _advance(self) -> None:
         self._frames.catch_up()
@@ -274,12 +375,18 @@ class EkfNode(StreamNode):
         mount = self._place_imu(frame)
         if frame not in self._lately and len(self._lately) < MOST_FRAMES:
             self._lately.append(frame)
-        gyro, accel = rows["angular_velocity"].copy(), rows["linear_acceleration"].copy()  # the specific force, says REP 145
-        unmeasured = (rows["angular_velocity_covariance"][:, 0] == -1.0) | (rows["linear_acceleration_covariance"][:, 0] == -1.0)
+        gyro, accel = (
+            rows["angular_velocity"].copy(),
+            rows["linear_acceleration"].copy(),
+        )  # the specific force, says REP 145
+        unmeasured = (rows["angular_velocity_covariance"][:, 0] == -1.0) | (
+            rows["linear_acceleration_covariance"][:, 0] == -1.0
+        )
         if unmeasured.any():
             self.warn_at_times(
                 "unmeasured",
-                "imu/data says with a covariance of -1 that it has no angular velocity or no acceleration: such "
+                "imu/data says with a covariance of -1 that it has no angular velocity or no "
+                "acceleration: such "
                 "samples are not used; without a whole IMU set use_imu to false",
             )
             gyro[unmeasured] = math.nan
@@ -294,9 +401,13 @@ class EkfNode(StreamNode):
         a, b = rows["anchor_a"], rows["anchor_b"]
         self._watch.add_tdoa(t + self._epoch.begin, self._arrived(arrival), a, b, rows["raw"])
         variance = rows["bias_std"] ** 2 + rows["variance"]
-        self._estimator.add_tdoa(t, a, b, rows["corrected"], variance, rows["bias_slope"], rows["bias_state"])
+        self._estimator.add_tdoa(
+            t, a, b, rows["corrected"], variance, rows["bias_slope"], rows["bias_state"]
+        )
 
-    def _take_sensor(self, name: str, frame: str, t: np.ndarray, rows: np.ndarray, arrival: np.ndarray) -> None:
+    def _take_sensor(
+        self, name: str, frame: str, t: np.ndarray, rows: np.ndarray, arrival: np.ndarray
+    ) -> None:
         """Messages of one of the SENSORS."""
         sensor = SENSORS[name]
         stream = sensor.read(t, {field: rows[field] for field in sensor.fields})
@@ -343,7 +454,9 @@ class EkfNode(StreamNode):
 
     def _wiring(self) -> list[str]:
         """What is wrong with who publishes what to whom, a list of sentences."""
-        received = {topics[0][0]: self._health.received[stream] for stream, topics in TOPICS.items()}
+        received = {
+            topics[0][0]: self._health.received[stream] for stream, topics in TOPICS.items()
+        }
         troubles = []
         for topic, end in self.streams.inputs.items():
             total = received.get(topic, 0)
@@ -358,13 +471,19 @@ class EkfNode(StreamNode):
         return [self._pose.refusals, *self._anchors.refusals, *self._frames.refusals]
 
     def _behind(self) -> float | None:
-        """s from the stamp of the newest odometry to now, by the clock of the node; None without odometry."""
+        """s from the stamp of the newest odometry to now, by the clock of the node; None without
+        odometry.
+        """
         if not self.outputs.published:
             return None
-        return 1e-9 * (self.get_clock().now().nanoseconds - Time.from_msg(self.outputs.stamp).nanoseconds)
+        return 1e-9 * (
+            self.get_clock().now().nanoseconds - Time.from_msg(self.outputs.stamp).nanoseconds
+        )
 
     def _tell_status(self) -> None:
-        """Say on `status` whether the odometry may be flown by; not while simulated time stands still: then nothing can come."""
+        """Say on `status` whether the odometry may be flown by; not while simulated time stands
+        still: then nothing can come.
+        """
         if self._diagnostics.paused:
             return
         self._health.look(self._estimator, self._counts())
@@ -384,11 +503,17 @@ class EkfNode(StreamNode):
         """Totals of all estimators so far, by what became of messages."""
         counts = Counter(self._past)
         if self._estimator is not None:
-            counts.update(self._estimator.counts, recoveries=self._estimator.recoveries, yaw_doubts=self._estimator.yaw_doubts)
+            counts.update(
+                self._estimator.counts,
+                recoveries=self._estimator.recoveries,
+                yaw_doubts=self._estimator.yaw_doubts,
+            )
         return counts
 
     def _yaw_std(self) -> float:
-        """Standard deviation of the rotation about the world's z axis, rad; NaN unless there is odometry."""
+        """Standard deviation of the rotation about the world's z axis, rad; NaN unless there is
+        odometry.
+        """
         if self._estimator is None or not self._estimator.running or self._attitude is None:
             return math.nan
         return rotation_std(*self._attitude)[0, 2]
@@ -401,9 +526,13 @@ class EkfNode(StreamNode):
             waiting = Counter(dict(zip(STREAMS, estimator.waiting)))
         self._health.behind = self._behind()
         self._findings = self._stream_findings()
-        level, text, values = self._health.report(self._anchors.refused, estimator, counts, self._wiring(), self._findings)
+        level, text, values = self._health.report(
+            self._anchors.refused, estimator, counts, self._wiring(), self._findings
+        )
         alarms: list[str] = estimator.alarms if estimator is not None else []
-        refused, unsure = (None, None) if estimator is None else (estimator.refused_pose, estimator.unsure)
+        refused, unsure = (
+            (None, None) if estimator is None else (estimator.refused_pose, estimator.unsure)
+        )
         heard = ", ".join(self._lately[:MOST_NAMED])
         frames = [*self._frame_troubles(), self._frames.trouble]
         others = [*filter(None, [*frames, self.outputs.trouble, refused, unsure, *alarms])]
@@ -414,26 +543,50 @@ class EkfNode(StreamNode):
         values |= {"changed since the start": "; ".join(alarms) or "nothing"}
         outside: list[str] = self._imu_corrector.outside if estimator is not None else []
         values |= {"beyond where effects were seen": "; ".join(outside) or "nothing"}
-        values |= {"TDOAs received": self._health.received["tdoa"]} | {name: counts[name] for name in VERDICTS.values()}
+        values |= {"TDOAs received": self._health.received["tdoa"]} | {
+            name: counts[name] for name in VERDICTS.values()
+        }
         values |= {"waiting": waiting["tdoa"], "IMU samples received": self._health.received["imu"]}
         values |= {name: counts[name] for name in ("imu_used", "imu_late", "imu_invalid")}
         values |= {"imu_waiting": waiting["imu"], "odometry published": self.outputs.published}
         values |= {name: counts[name] for name in ("recoveries", "restarts", "yaw_doubts")}
         for aid in SENSORS:
-            values |= {f"{aid}_received": self._health.received[aid], f"{aid}_waiting": waiting[aid]}
-            values |= {f"{aid}_{verdict}": counts[f"{aid}_{verdict}"] for verdict in VERDICTS.values()}
-        values |= {f"{aid} deviations of": ", ".join(names) or "the messages" for aid, names in self._assumed.items()}
+            values |= {
+                f"{aid}_received": self._health.received[aid],
+                f"{aid}_waiting": waiting[aid],
+            }
+            values |= {
+                f"{aid}_{verdict}": counts[f"{aid}_{verdict}"] for verdict in VERDICTS.values()
+            }
+        values |= {
+            f"{aid} deviations of": ", ".join(names) or "the messages"
+            for aid, names in self._assumed.items()
+        }
         values |= {f"lost on {name}": end.lost for name, end in self.streams.inputs.items()}
-        values |= {f"unreadable on {refusals.topic}": refusals.count for refusals in (*self.streams.refusals, *self._single)}
-        values |= {f"publishers of {name}": end.get_publisher_count() for name, end in self.streams.inputs.items()}
-        values |= {"subscribers of odometry": self.outputs.odometry.publisher.get_subscription_count()}
-        values |= {"subscribers of uwb/residual": self.outputs.residual.publisher.get_subscription_count()}
+        values |= {
+            f"unreadable on {refusals.topic}": refusals.count
+            for refusals in (*self.streams.refusals, *self._single)
+        }
+        values |= {
+            f"publishers of {name}": end.get_publisher_count()
+            for name, end in self.streams.inputs.items()
+        }
+        values |= {
+            "subscribers of odometry": self.outputs.odometry.publisher.get_subscription_count()
+        }
+        values |= {
+            "subscribers of uwb/residual": self.outputs.residual.publisher.get_subscription_count()
+        }
         return level, text, values
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the node; returns the exit code."""
-    topics = (f"{topic} ({kind.replace('/msg', '')})" for sensor in SENSORS.values() for topic, kind in sensor.topics)
+    topics = (
+        f"{topic} ({kind.replace('/msg', '')})"
+        for sensor in SENSORS.values()
+        for topic, kind in sensor.topics
+    )
     return ros.run(EkfNode, __doc__.replace("SENSORS", ",\n".join(topics)), argv)
 
 

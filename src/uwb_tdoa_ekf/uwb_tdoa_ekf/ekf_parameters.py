@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import fields, replace
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rcl_interfaces.msg import SetParametersResult
+
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_FILE
 from uwb_tdoa_bias.foundation.ros_parameters import FROZEN, Parameter, declare, declare_all
@@ -14,41 +15,63 @@ from .core.config import CHOICES, FilterConfig
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
     from rclpy.node import Node
-    from uwb_tdoa_bias.foundation.ros_parameters import ParameterNode
     from rclpy.parameter import Parameter as RosParameter
+
+    from uwb_tdoa_bias.foundation.ros_parameters import ParameterNode
 
 PUBLISH_TF = NONE, BASE, ODOM = "none", "base", "odom"
 PARAMETERS = {  # in the order of config/ekf_node.yaml
     "anchors_file": ANCHORS_FILE,
-    "world_frame": Parameter("", 'frame of the odometry and the parent on /tf; "" for the frame of the anchors'),
+    "world_frame": Parameter(
+        "", 'frame of the odometry and the parent on /tf; "" for the frame of the anchors'
+    ),
     "body_frame": Parameter(
-        "base_link", "frame whose pose is estimated; sensors in other frames are placed in it by /tf_static; one per tag"
+        "base_link",
+        (
+            "frame whose pose is estimated; sensors in other frames are placed in it by "
+            "/tf_static; one per tag"
+        ),
     ),
     "publish_tf": Parameter(
-        BASE, "on /tf: none, base (world -> body) or odom (world -> odom_frame, REP 105)", choices=PUBLISH_TF
+        BASE,
+        "on /tf: none, base (world -> body) or odom (world -> odom_frame, REP 105)",
+        choices=PUBLISH_TF,
     ),
-    "odom_frame": Parameter("odom", "for publish_tf odom: the frame in which somebody else publishes the body on /tf"),
+    "odom_frame": Parameter(
+        "odom", "for publish_tf odom: the frame in which somebody else publishes the body on /tf"
+    ),
     "flyable_volume": Parameter(
         "", 'flyable.npz of plan; a warning on /diagnostics while the tag is outside; "" for none'
     ),
     "effects_file": Parameter(
-        "", "effects.yaml, the same as bias_node's: what it says of gyroscope, accelerometer, height and velocity is taken out"
+        "",
+        (
+            "effects.yaml, the same as bias_node's: what it says of gyroscope, accelerometer, "
+            "height and velocity is taken out"
+        ),
     ),
     "reorder": Parameter(
         0.003,
-        "s of stamps; how long messages wait for older ones that are still on their way, until 2 s of their stream were in order",
+        (
+            "s of stamps; how long messages wait for older ones that are still on their way, "
+            "until 2 s of their stream were in order"
+        ),
         0.0,
         10.0,
     ),
     "lag": Parameter(
         0.25,
-        "s of stamps; how long a silent stream is waited for (height, pressure, velocity: half of that); what comes later is late",
+        (
+            "s of stamps; how long a silent stream is waited for (height, pressure, velocity: "
+            "half of that); what comes later is late"
+        ),
         0.0,
         100.0,
     ),
     "frozen": FROZEN,
-}  # fmt: skip
+}
 
 
 def names_of_parameters() -> set[str]:
@@ -62,15 +85,23 @@ def declare_parameters(node: ParameterNode) -> tuple[FilterConfig, dict[str, Any
     for field in fields(FilterConfig):
         limits = field.metadata
         parameter = Parameter(
-            field.default, limits["text"], limits["low"], limits["high"], CHOICES.get(field.name, ()), settable=not limits["fixed"]
+            field.default,
+            limits["text"],
+            limits["low"],
+            limits["high"],
+            CHOICES.get(field.name, ()),
+            settable=not limits["fixed"],
         )
         values[field.name] = declare(node, field.name, parameter)
     return FilterConfig(**values), declare_all(node, PARAMETERS)
 
 
-def follow_changes(node: Node, config: Callable[[], FilterConfig], on_change: Callable[[FilterConfig], None]) -> None:
-    """Let the parameters of FilterConfig that are not fixed be set in flight. config() : the present one; on_change(config)
-    is called with another."""
+def follow_changes(
+    node: Node, config: Callable[[], FilterConfig], on_change: Callable[[FilterConfig], None]
+) -> None:
+    """Let the parameters of FilterConfig that are not fixed be set in flight. config() : the
+    present one; on_change(config) is called with another.
+    """
 
     def changed(parameters: list[RosParameter]) -> FilterConfig:
         names = {field.name for field in fields(FilterConfig)}

@@ -1,4 +1,6 @@
-"""The filter for live streams: messages in any order in, odometry that depends on their stamps alone out."""
+"""The filter for live streams: messages in any order in, odometry that depends on their stamps
+alone out.
+"""
 
 from __future__ import annotations
 
@@ -30,8 +32,10 @@ from .streams import Steady
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
+
     from uwb_tdoa_bias.foundation.anchors import Anchors
     from uwb_tdoa_bias.foundation.sensors import Stream
+
     from .pipeline import Fed
     from .reorder_buffer import Restart
     from .streams import Finding
@@ -40,29 +44,45 @@ RATE_SAMPLES = 10  # inertial samples from whose stamps their rate is known
 LARGEST_POSE_AHEAD = 10.0  # s of a pose that is set, from the newest measurement
 RESTART_NAMED = 10.0  # s of stamps for which a restart is named
 MOST_POSES = 100  # that were set and wait for their time
-NOTHING = Odometry.from_rows(np.empty(0, ODOMETRY)), Residuals.refused(np.empty(0), np.empty(0), np.empty(0), INVALID)
+NOTHING = (
+    Odometry.from_rows(np.empty(0, ODOMETRY)),
+    Residuals.refused(np.empty(0), np.empty(0), np.empty(0), INVALID),
+)
 
 
 class Estimator:
     """Time-ordered buffer, filter and accounts.
 
-    A ReorderBuffer, the Pipeline that `run_offline` has too, poses that are set from outside, and accounts of every message.
+    A ReorderBuffer, the Pipeline that `run_offline` has too, poses that are set from outside, and
+    accounts of every message.
     """
 
     def __init__(
-        self, anchors: Anchors, config: FilterConfig | None = None, reorder: float = 0.003, lag: float = 0.25,
+        self,
+        anchors: Anchors,
+        config: FilterConfig | None = None,
+        reorder: float = 0.003,
+        lag: float = 0.25,
         effects: EffectSet = EffectSet(),
-    ) -> None:  # fmt: skip
-        """anchors : Anchors; config : FilterConfig; reorder, lag : s, see ReorderBuffer; effects : EffectSet that is known, as of a
-        Pipeline; streams that are added are free of the rest (ImuCorrector, AidCorrector, bias_node)."""
+    ) -> None:
+        """anchors : Anchors; config : FilterConfig; reorder, lag : s, see ReorderBuffer; effects :
+        EffectSet that is known, as of a Pipeline; streams that are added are free of the rest
+        (ImuCorrector, AidCorrector, bias_node).
+        """
         self._installed, self._effects = Installed(anchors), effects
         self.config = config or FilterConfig()
-        of_aids = [f"{stream}_{verdict}" for stream in aids.STREAMS for verdict in VERDICTS.values()]
+        of_aids = [
+            f"{stream}_{verdict}" for stream in aids.STREAMS for verdict in VERDICTS.values()
+        ]
         names = [*VERDICTS.values(), "imu_used", "imu_late", "imu_invalid", "restarts", *of_aids]
         self.counts = dict.fromkeys(names, 0)
         self._refused: list[Residuals] = []
-        self._sensed = np.empty(0, IMU_SAMPLE)  # the inertial samples that were used last, and RATE_SAMPLES before them
-        self._buffer = ReorderBuffer(reorder, lag, self.config.use_imu, self._refuse, self._start_anew)
+        self._sensed = np.empty(
+            0, IMU_SAMPLE
+        )  # the inertial samples that were used last, and RATE_SAMPLES before them
+        self._buffer = ReorderBuffer(
+            reorder, lag, self.config.use_imu, self._refuse, self._start_anew
+        )
         self._restart: Restart | None = None  # the last one
         self._steady = Steady()
         self._clear()
@@ -71,7 +91,10 @@ class Estimator:
         self._pipeline = Pipeline(self._installed, self.config, self._effects)
         self._poses: list[np.ndarray] = []  # (1,) of POSE, set and not reached yet
         self._begun = False  # there was a measurement
-        self.refused_pose: str | None = None  # sentence on a pose that was set before the first measurement, and is of another time
+        self.refused_pose: str | None = (
+            # sentence on a pose that was set before the first measurement, and is of another time
+            None
+        )
 
     @property
     def anchors(self) -> Anchors:
@@ -89,39 +112,58 @@ class Estimator:
 
     @property
     def lost(self) -> str | None:
-        """Why there is no odometry any more, a sentence, until the tag is found anew; None while it is not lost, and before it was
-        found. Depends on stamps alone."""
+        """Why there is no odometry any more, a sentence, until the tag is found anew; None while it
+        is not lost, and before it was found. Depends on stamps alone.
+        """
         ekf = self._ekf
         if ekf["running"] or ekf["t"] == -math.inf:
             return None
         return (
-            f"the tag is lost: for more than {LOST_TIME:g} s no TDOA came, and nothing else tells where it is by now; there is no odometry "
+            f"the tag is lost: for more than {LOST_TIME:g} s no TDOA came, and nothing else "
+            "tells where it is by now; there is no odometry "
             "until TDOAs tell that anew"
         )
 
     @property
     def side_unknown(self) -> str | None:
-        """Why nobody knows on which side of its anchors the tag is, a sentence; None where that is known, or does not matter. Anchors that
-        are heard lie in a plane, and the place is uncertain across it."""
+        """Why nobody knows on which side of its anchors the tag is, a sentence; None where that is
+        known, or does not matter. Anchors that are heard lie in a plane, and the place is uncertain
+        across it.
+        """
         ekf = self._ekf
         if not ekf.running:
             return None
         known = self.config.fixed_height_std > 0.0 or ekf.t - ekf.height.used < LONGEST_GAP
-        places = {h // YAWS for h in np.flatnonzero(ekf.hypotheses["log_weight"] > -np.inf).tolist()}
+        places = {
+            h // YAWS for h in np.flatnonzero(ekf.hypotheses["log_weight"] > -np.inf).tolist()
+        }
         flat, variances = ekf["flat"], np.diagonal(ekf.hypotheses["P"][ekf.best])
-        for axis, (sides, where) in enumerate((("-x or +x", "x"), ("-y or +y", "y"), ("below or above", "height"))):
-            if flat[axis] and (len(places) > 1 or variances[axis] > APART**2) and not (axis == 2 and known):
-                return f"the anchors that are heard have one {where}, so that TDOAs do not tell on which side of them the tag is: set tag_side to {sides}"
+        for axis, (sides, where) in enumerate(
+            (("-x or +x", "x"), ("-y or +y", "y"), ("below or above", "height"))
+        ):
+            if (
+                flat[axis]
+                and (len(places) > 1 or variances[axis] > APART**2)
+                and not (axis == 2 and known)
+            ):
+                return (
+                    f"the anchors that are heard have one {where}, so that TDOAs do not tell on "
+                    f"which side of them the tag is: set tag_side to {sides}"
+                )
         return None
 
     @property
     def unsure(self) -> str | None:
-        """Why the tag may be elsewhere, a sentence; None while nothing says so. Depends on stamps alone."""
+        """Why the tag may be elsewhere, a sentence; None while nothing says so.
+
+        Depends on stamps alone.
+        """
         ekf = self._ekf
         if not ekf.running or ekf.t >= ekf.rival_until:
             return None
         return (
-            "TDOAs agree on another place than the wheels have gone to: the position is unsure, and follows the wheels; look for anchors that "
+            "TDOAs agree on another place than the wheels have gone to: the position is "
+            "unsure, and follows the wheels; look for anchors that "
             "are late or blocked"
         )
 
@@ -133,7 +175,9 @@ class Estimator:
 
     @property
     def newest(self) -> float:
-        """Stamp that the time of the streams has reached, s; -inf before the first TDOA, range or inertial sample."""
+        """Stamp that the time of the streams has reached, s; -inf before the first TDOA, range or
+        inertial sample.
+        """
         return self._buffer.newest
 
     @property
@@ -159,7 +203,9 @@ class Estimator:
 
     @property
     def findings(self) -> list[Finding]:
-        """What the filter, the clocks of its streams, and who watches its residuals, have found: Findings."""
+        """What the filter, the clocks of its streams, and who watches its residuals, have found:
+        Findings.
+        """
         monitor = self._pipeline.monitor
         exchanged = None if monitor is None else monitor.exchanged
         return [*filter(None, [self.without_imu, exchanged, self.restarted]), *self.clocks]
@@ -171,21 +217,33 @@ class Estimator:
 
     @property
     def without_imu(self) -> Finding | None:
-        """Finding by which the filter goes without inertial samples, because they cannot be right; None while it uses them."""
+        """Finding by which the filter goes without inertial samples, because they cannot be right;
+        None while it uses them.
+        """
         ekf = self._ekf
-        return next(iter(self._steady([implausible(ekf.plausibility)] if ekf.distrusted else [])), None)
+        return next(
+            iter(self._steady([implausible(ekf.plausibility)] if ekf.distrusted else [])), None
+        )
 
     @property
     def restarted(self) -> Finding | None:
         """Finding on why the filter started anew, for RESTART_NAMED seconds of stamps after it did."""
         cause = self._restart
-        return restarted(cause) if cause is not None and self.newest < cause.at + RESTART_NAMED else None
+        return (
+            restarted(cause)
+            if cause is not None and self.newest < cause.at + RESTART_NAMED
+            else None
+        )
 
     @property
     def clocks(self) -> list[Finding]:
         """Findings on streams whose clocks are wrong at present."""
         of_streams = zip(STREAMS, self._buffer.leads)
-        return [clock_ahead(name, lead, self.counts["invalid" if name == "tdoa" else f"{name}_invalid"]) for name, lead in of_streams if lead]
+        return [
+            clock_ahead(name, lead, self.counts["invalid" if name == "tdoa" else f"{name}_invalid"])
+            for name, lead in of_streams
+            if lead
+        ]
 
     @property
     def waiting(self) -> tuple[int, ...]:
@@ -193,18 +251,31 @@ class Estimator:
         return self._buffer.waiting
 
     def add_imu(self, t: ArrayLike, gyro: ArrayLike, accel: ArrayLike) -> None:
-        """Take inertial samples in the order of their arrival: t (n,) s; gyro (n, 3) rad/s; accel (n, 3) m/s^2, specific
-        force; body frame. Or one: a number, (3,), (3,)."""
-        self._add(IMU_STREAM, *imu_rows(np.atleast_1d(t), np.atleast_2d(gyro), np.atleast_2d(accel)))
+        """Take inertial samples in the order of their arrival: t (n,) s; gyro (n, 3) rad/s; accel
+        (n, 3) m/s^2, specific force; body frame. Or one: a number, (3,), (3,).
+        """
+        self._add(
+            IMU_STREAM, *imu_rows(np.atleast_1d(t), np.atleast_2d(gyro), np.atleast_2d(accel))
+        )
 
     def add_tdoa(
-        self, t: ArrayLike, a: ArrayLike, b: ArrayLike, d: ArrayLike, variance: ArrayLike = 0.0, slope: ArrayLike = 0.0,
+        self,
+        t: ArrayLike,
+        a: ArrayLike,
+        b: ArrayLike,
+        d: ArrayLike,
+        variance: ArrayLike = 0.0,
+        slope: ArrayLike = 0.0,
         state: ArrayLike = 0.0,
-    ) -> None:  # fmt: skip
-        """Take corrected TDOAs in the order of their arrival: t (n,) s; a, b (n,) anchor ids; d (n,) m; variance (n,) m^2, of
-        what is known beyond tdoa_std; slope, state (n, 6), as of a Correction. Or one: numbers."""
+    ) -> None:
+        """Take corrected TDOAs in the order of their arrival: t (n,) s; a, b (n,) anchor ids; d
+        (n,) m; variance (n,) m^2, of what is known beyond tdoa_std; slope, state (n, 6), as of a
+        Correction. Or one: numbers.
+        """
         t, a, b, d = map(np.atleast_1d, (t, a, b, d))
-        rows = structured(TDOA, t, self._installed.index(a), self._installed.index(b), d, variance, slope, state)
+        rows = structured(
+            TDOA, t, self._installed.index(a), self._installed.index(b), d, variance, slope, state
+        )
         usable = usable_tdoas(rows, self._installed.positions)
         if not usable.all():
             self._refused.append(Residuals.refused(t[~usable], a[~usable], b[~usable], INVALID))
@@ -220,44 +291,68 @@ class Estimator:
         self._buffer.add(stream, rows, usable)
 
     def set_pose(
-        self, t: float, p: ArrayLike, covariance: ArrayLike, yaw: float = math.nan, yaw_std: float = math.nan
+        self,
+        t: float,
+        p: ArrayLike,
+        covariance: ArrayLike,
+        yaw: float = math.nan,
+        yaw_std: float = math.nan,
     ) -> None:
-        """Take a pose that is known from outside: t s; p (3,) m, NaN where it is not known; covariance (3, 3) m^2; yaw and yaw_std rad,
-        or NaN. It holds from its stamp on; if the filter has passed that, from the next measurement on.
+        """Take a pose that is known from outside: t s; p (3,) m, NaN where it is not known;
+        covariance (3, 3) m^2; yaw and yaw_std rad, or NaN. It holds from its stamp on; if the
+        filter has passed that, from the next measurement on.
 
-        Raises InputError for a stamp that is not of the time of the streams, and when too many wait. One that is set before there is any
-        measurement is judged by the first, and dropped if it is not of its time: `refused_pose`.
+        Raises InputError for a stamp that is not of the time of the streams, and when too many
+        wait. One that is set before there is any measurement is judged by the first, and dropped if
+        it is not of its time: `refused_pose`.
         """
         self.refused_pose = None
         newest = self.newest
-        if newest > -math.inf and not newest - LARGEST_STEP_BACK <= t <= newest + LARGEST_POSE_AHEAD:
+        if (
+            newest > -math.inf
+            and not newest - LARGEST_STEP_BACK <= t <= newest + LARGEST_POSE_AHEAD
+        ):
             raise InputError(
-                f"pose: its stamp is {t - newest:+.3f} s from that of the newest measurement; give one from "
+                f"pose: its stamp is {t - newest:+.3f} s from that of the newest measurement; "
+                "give one from "
                 f"-{LARGEST_STEP_BACK:g} to {LARGEST_POSE_AHEAD:g} s."
             )
         if len(self._poses) >= MOST_POSES:
             raise InputError(f"pose: {MOST_POSES} wait for their time already; give fewer.")
-        self._poses.append(np.array([(max(t, self._buffer.used_until), p, covariance, yaw, yaw_std)], POSE))
+        self._poses.append(
+            np.array([(max(t, self._buffer.used_until), p, covariance, yaw, yaw_std)], POSE)
+        )
         self._poses.sort(key=lambda pose: pose["t"][0])
 
     def configure(self, config: FilterConfig) -> None:
-        """Go on with another FilterConfig, which differs in nothing that is fixed (see FilterConfig)."""
+        """Go on with another FilterConfig, which differs in nothing that is fixed (see
+        FilterConfig).
+        """
         self.config = config
         self._pipeline.configure(config)
 
     def stay(self, anchors: Anchors) -> bool:
-        """Whether it can go on among other Anchors: some of its own are there still, in the same frame."""
+        """Whether it can go on among other Anchors: some of its own are there still, in the same
+        frame.
+        """
         stay = self._installed.stay(anchors)
-        return anchors.frame == self.anchors.frame and bool(stay.any()) and len(self._installed) + int(np.sum(~stay)) <= MOST_ROWS
+        return (
+            anchors.frame == self.anchors.frame
+            and bool(stay.any())
+            and len(self._installed) + int(np.sum(~stay)) <= MOST_ROWS
+        )
 
     def change_anchors(self, anchors: Anchors) -> None:
-        """Go on among other Anchors: those that are new are used from now on, those that are gone no more, and one that stands elsewhere as
-        a new one. Nothing is forgotten of those that stay. TDOAs that wait are used, as far as their anchors were there when they came."""
+        """Go on among other Anchors: those that are new are used from now on, those that are gone
+        no more, and one that stands elsewhere as a new one. Nothing is forgotten of those that
+        stay. TDOAs that wait are used, as far as their anchors were there when they came.
+        """
         self._pipeline.change_anchors(self._installed.change(anchors))
 
     def reset(self) -> tuple[Odometry, Residuals]:
-        """Use everything that still waits, and forget it: what comes next starts the filter anew. Returns
-        (Odometry, Residuals)."""
+        """Use everything that still waits, and forget it: what comes next starts the filter anew.
+        Returns (Odometry, Residuals).
+        """
         out = self.finish()
         self._buffer.clear()
         self._installed = Installed(self.anchors)  # no row waits any more
@@ -266,7 +361,10 @@ class Estimator:
         return out
 
     def advance(self) -> tuple[Odometry, Residuals]:
-        """Use every message that nothing earlier can precede any more. Returns (Odometry, Residuals), possibly empty."""
+        """Use every message that nothing earlier can precede any more.
+
+        Returns (Odometry, Residuals), possibly empty.
+        """
         return self._use(self._buffer.watermark)
 
     def finish(self) -> tuple[Odometry, Residuals]:
@@ -275,11 +373,20 @@ class Estimator:
         return self._use(math.inf)
 
     def rates_at(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(angular velocity as measured, (n, 3) rad/s, its variance per axis, (n,) rad^2/s^2) at stamps t (n,) of the Odometry
-        returned last; NaN where no sample is near. White noise of density gyro_noise has, in samples that are dt apart, the
-        variance gyro_noise^2 / dt; dt is the mean of the last RATE_SAMPLES."""
+        """(angular velocity as measured, (n, 3) rad/s, its variance per axis, (n,) rad^2/s^2) at
+        stamps t (n,) of the Odometry returned last; NaN where no sample is near. White noise of
+        density gyro_noise has, in samples that are dt apart, the variance gyro_noise^2 / dt; dt is
+        the mean of the last RATE_SAMPLES.
+        """
         rates, variances = np.empty((len(t), 3)), np.empty(len(t))
-        _look_up(np.ascontiguousarray(t), self._sensed, self.config.imu_timeout, self.config.gyro_noise, rates, variances)
+        _look_up(
+            np.ascontiguousarray(t),
+            self._sensed,
+            self.config.imu_timeout,
+            self.config.gyro_noise,
+            rates,
+            variances,
+        )
         return rates, variances
 
     def _refuse(self, stream: int, rows: np.ndarray, verdict: int) -> None:
@@ -313,9 +420,13 @@ class Estimator:
         """Count what was used in parts, and what was refused; returns what is said of it."""
         for part in parts:
             self.counts["imu_used"] += len(part.measured.imu)
-            for kind, verdict in zip(part.measured.aids["kind"].tolist(), part.aids["verdict"].tolist()):
+            for kind, verdict in zip(
+                part.measured.aids["kind"].tolist(), part.aids["verdict"].tolist()
+            ):
                 self.counts[f"{aids.STREAMS[kind]}_{VERDICTS[verdict]}"] += 1
-        self._sensed = joined(IMU_SAMPLE, [self._sensed[-RATE_SAMPLES:], *(part.measured.imu for part in parts)])
+        self._sensed = joined(
+            IMU_SAMPLE, [self._sensed[-RATE_SAMPLES:], *(part.measured.imu for part in parts)]
+        )
         residuals = concatenated([self._pipeline.residuals(parts), *self._refused])
         self._refused = []
         for verdict in residuals.verdict.tolist():
@@ -335,7 +446,8 @@ class Estimator:
                 self._poses.append(pose)
             else:
                 self.refused_pose = (
-                    f"the pose that was told is not used: its stamp is {ahead:+.3f} s from that of the first measurement; give one from "
+                    f"the pose that was told is not used: its stamp is {ahead:+.3f} s from "
+                    "that of the first measurement; give one from "
                     f"-{LOST_TIME:g} to {LARGEST_POSE_AHEAD:g} s, on the clock of the measurements"
                 )
 
@@ -345,10 +457,16 @@ class Estimator:
 
 @compiled
 def _look_up(
-    t: np.ndarray, sensed: np.ndarray, timeout: float, noise: float, rates: np.ndarray, variances: np.ndarray
+    t: np.ndarray,
+    sensed: np.ndarray,
+    timeout: float,
+    noise: float,
+    rates: np.ndarray,
+    variances: np.ndarray,
 ) -> None:
-    """Rates of the last of `sensed`, (m,) of IMU_SAMPLE, up to each of t (n,) s, and their variances; NaN where it is older than
-    timeout, s."""
+    """Rates of the last of `sensed`, (m,) of IMU_SAMPLE, up to each of t (n,) s, and their
+    variances; NaN where it is older than timeout, s.
+    """
     k = len(sensed) - 1
     for i in range(len(t) - 1, -1, -1):
         while k >= 0 and sensed[k].t > t[i]:

@@ -1,7 +1,8 @@
-"""From the filter's conventions to those of nav_msgs/Odometry (REP-105, and the comments of its definition).
+"""From the filter's conventions to those of nav_msgs/Odometry (REP-105, and the comments of its
+definition).
 
-The filter: position and velocity in the world, attitude error in the body frame. Odometry: pose in the parent (world)
-frame with rotations about its fixed axes, twist in the child (body) frame.
+The filter: position and velocity in the world, attitude error in the body frame. Odometry: pose in
+the parent (world) frame with rotations about its fixed axes, twist in the child (body) frame.
 """
 
 from __future__ import annotations
@@ -23,20 +24,28 @@ if TYPE_CHECKING:
 POSE, TWIST = 3 + 4 + 36, 3 + 3 + 36  # numbers in a PoseWithCovariance and in a TwistWithCovariance
 
 
-def to_odometry(q: np.ndarray, v: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def to_odometry(
+    q: np.ndarray, v: np.ndarray, covariance: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Velocity in the body frame, and the covariance of what an Odometry holds.
 
-    q : (n, 4) x y z w, body to world; v : (n, 3) m/s, world; covariance : (n, 9, 9) of [p, v, attitude], the attitude
-    in the body frame. Returns u = R(q)' v, (n, 3) m/s, and (n, 9, 9) of [position, rotation about the world's axes,
-    u]. An attitude error dtheta is R dtheta in the world; with an error dv, u changes by R' dv + u x dtheta.
+    q : (n, 4) x y z w, body to world; v : (n, 3) m/s, world; covariance : (n, 9, 9) of [p, v,
+        attitude], the attitude
+    in the body frame. Returns u = R(q)' v, (n, 3) m/s, and (n, 9, 9) of [position, rotation about
+    the world's axes, u]. An attitude error dtheta is R dtheta in the world; with an error dv, u
+    changes by R' dv + u x dtheta.
     """
     u, out = np.empty((len(q), 3)), np.empty((len(q), 9, 9))
-    _to_odometry(np.ascontiguousarray(q), np.ascontiguousarray(v), np.ascontiguousarray(covariance), u, out)
+    _to_odometry(
+        np.ascontiguousarray(q), np.ascontiguousarray(v), np.ascontiguousarray(covariance), u, out
+    )
     return u, out
 
 
 @compiled
-def _to_odometry(q: np.ndarray, v: np.ndarray, covariance: np.ndarray, u: np.ndarray, out: np.ndarray) -> None:
+def _to_odometry(
+    q: np.ndarray, v: np.ndarray, covariance: np.ndarray, u: np.ndarray, out: np.ndarray
+) -> None:
     R, jacobian, half = np.empty((3, 3)), np.zeros((9, 9)), np.empty((9, 9))
     for n in range(len(q)):
         rotation(q[n, 0], q[n, 1], q[n, 2], q[n, 3], R)
@@ -64,8 +73,9 @@ def _multiply(a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
 
 
 def rotation_std(q: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Standard deviations of the rotation about the world's axes, (n, 3) rad: those of to_odometry. Arguments as there,
-    without v."""
+    """Standard deviations of the rotation about the world's axes, (n, 3) rad: those of to_odometry.
+    Arguments as there, without v.
+    """
     out = np.empty((len(q), 3))
     _rotation_std(np.ascontiguousarray(q), np.ascontiguousarray(covariance), out)
     return out
@@ -84,14 +94,27 @@ def _rotation_std(q: np.ndarray, covariance: np.ndarray, out: np.ndarray) -> Non
             out[n, axis] = math.sqrt(variance)
 
 
-def poses_of(odometry: Odometry) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """What a Corrector takes of an Odometry, as bias_node gets it: (t (n,) s, p (n, 3) m, q (n, 4), v (n, 3) m/s, yaw_std
-    (n,) rad)."""
-    return odometry.t, odometry.p, odometry.q, odometry.v, known_yaw_std(rotation_std(odometry.q, odometry.covariance))
+def poses_of(
+    odometry: Odometry,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """What a Corrector takes of an Odometry, as bias_node gets it: (t (n,) s, p (n, 3) m, q (n, 4),
+    v (n, 3) m/s, yaw_std (n,) rad).
+    """
+    return (
+        odometry.t,
+        odometry.p,
+        odometry.q,
+        odometry.v,
+        known_yaw_std(rotation_std(odometry.q, odometry.covariance)),
+    )
 
 
-def pose_and_twist(odometry: Odometry, rates: np.ndarray, rate_variances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The numbers of PoseWithCovariance, (n, POSE), and of TwistWithCovariance, (n, TWIST), of Odometry messages."""
+def pose_and_twist(
+    odometry: Odometry, rates: np.ndarray, rate_variances: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The numbers of PoseWithCovariance, (n, POSE), and of TwistWithCovariance, (n, TWIST), of
+    Odometry messages.
+    """
     velocity, covariance = to_odometry(odometry.q, odometry.v, odometry.covariance)
     pose, twist = np.empty((len(odometry), POSE)), np.zeros((len(odometry), TWIST))
     pose[:, :3], pose[:, 3:7], twist[:, :3] = odometry.p, odometry.q, velocity
@@ -101,7 +124,11 @@ def pose_and_twist(odometry: Odometry, rates: np.ndarray, rate_variances: np.nda
 
 @compiled
 def _fill(
-    covariance: np.ndarray, rates: np.ndarray, rate_variances: np.ndarray, pose: np.ndarray, twist: np.ndarray
+    covariance: np.ndarray,
+    rates: np.ndarray,
+    rate_variances: np.ndarray,
+    pose: np.ndarray,
+    twist: np.ndarray,
 ) -> None:
     for n in range(len(pose)):
         known = math.isfinite(rates[n, 0]) and math.isfinite(rate_variances[n])

@@ -1,4 +1,6 @@
-"""Anchors that come and go while a filter runs: each has a row of its own, and whatever is remembered by rows stays right."""
+"""Anchors that come and go while a filter runs: each has a row of its own, and whatever is
+remembered by rows stays right.
+"""
 
 from __future__ import annotations
 
@@ -15,13 +17,16 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.effects.sensor_function import SensorFunction
 
-MOST_ROWS = 20_000  # twice as many as a message may hold: after so many changes the filter starts anew
+MOST_ROWS = (
+    20_000  # twice as many as a message may hold: after so many changes the filter starts anew
+)
 
 
 class Installed:
     """The anchors that a filter has had so far, by rows, and which of them are there now.
 
-    anchors : Anchors that are there; ids (M,), positions (M, 3) m: of all rows. An anchor that is moved gets another row, with nothing
+    anchors : Anchors that are there; ids (M,), positions (M, 3) m: of all rows. An anchor that is
+        moved gets another row, with nothing
     known of it.
     """
 
@@ -40,12 +45,19 @@ class Installed:
     def index(self, ids: np.ndarray) -> np.ndarray:
         """Row of each of some ids, -1 for those that are not there."""
         places = self.anchors.index(ids)
-        return places if len(self._rows) == len(self.ids) else np.where(places >= 0, self._rows[places], -1)
+        return (
+            places
+            if len(self._rows) == len(self.ids)
+            else np.where(places >= 0, self._rows[places], -1)
+        )
 
     def stay(self, anchors: Anchors) -> np.ndarray:
         """Which of other Anchors are there already, within SAME_PLACE: (n,) bool."""
         places = self.anchors.index(anchors.ids)
-        return (places >= 0) & (np.linalg.norm(self.positions[self._rows[places]] - anchors.positions, axis=1) <= SAME_PLACE)
+        return (places >= 0) & (
+            np.linalg.norm(self.positions[self._rows[places]] - anchors.positions, axis=1)
+            <= SAME_PLACE
+        )
 
     def change(self, anchors: Anchors) -> np.ndarray:
         """Go on with other Anchors; returns the rows of those that are gone, or stand elsewhere."""
@@ -58,16 +70,24 @@ class Installed:
         return np.setdiff1d(before, rows)
 
 
-def new_state_of(installed: Installed, functions: Sequence[SensorFunction], floor: Floor | None) -> FilterState:
-    """`new_state` with a row for each row of Installed; functions, floor : of the anchors that are there. No TDOA comes of the other
-    rows."""
-    state, places = new_state(installed.anchors.positions, functions, floor), np.zeros(len(installed), int)
+def new_state_of(
+    installed: Installed, functions: Sequence[SensorFunction], floor: Floor | None
+) -> FilterState:
+    """`new_state` with a row for each row of Installed; functions, floor : of the anchors that are
+    there. No TDOA comes of the other rows.
+    """
+    state, places = (
+        new_state(installed.anchors.positions, functions, floor),
+        np.zeros(len(installed), int),
+    )
     places[installed.present] = np.arange(len(installed.present))
     return state._replace(anchors=state.anchors[places])
 
 
 def forget(state: FilterState, gone: np.ndarray) -> None:
-    """Have the state of a filter without what was received of anchors in rows (k,), which are not there any more."""
+    """Have the state of a filter without what was received of anchors in rows (k,), which are not
+    there any more.
+    """
     state.anchors["heard"][gone] = -np.inf
     ekf = state.ekf[0]
     window = ekf["window"][: ekf["kept"]]

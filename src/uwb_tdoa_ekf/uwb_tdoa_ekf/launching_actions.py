@@ -10,6 +10,7 @@ from ament_index_python.packages import get_package_share_directory
 from launch.actions import LogInfo, OpaqueFunction, TimerAction
 import launch.logging
 from launch_ros.actions import Node
+
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.executable import leave_present_folder_out
 
@@ -17,24 +18,42 @@ from .launching import Lives, discovery, network
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping
+
     from launch.action import Action
-    from launch.launch_context import LaunchContext
     from launch.events.process import ProcessExited
+    from launch.launch_context import LaunchContext
+
     from .launching import Start
 
 
 def actions(
-    starts: Iterable[Start], respawn: str, on_exit: str, discovery_range: str, rviz: str, use_sim_time: str = "false"
+    starts: Iterable[Start],
+    respawn: str,
+    on_exit: str,
+    discovery_range: str,
+    rviz: str,
+    use_sim_time: str = "false",
 ) -> list[Action]:
-    """Of [Start]s, as texts of launch arguments say: what is printed of the network, the nodes, and RViz if rviz is "true"."""
+    """Of [Start]s, as texts of launch arguments say: what is printed of the network, the nodes, and
+    RViz if rviz is "true".
+    """
     leave_present_folder_out()  # what is launched inherits it
     of_nodes = discovery(os.environ, discovery_range)
-    nodes = [_node(each, Lives(each.label, respawn == "true", on_exit), of_nodes) for each in starts]
-    return [LogInfo(msg=network({**os.environ, **of_nodes})), *nodes, *([_rviz(use_sim_time)] if rviz == "true" else [])]
+    nodes = [
+        _node(each, Lives(each.label, respawn == "true", on_exit), of_nodes) for each in starts
+    ]
+    return [
+        LogInfo(msg=network({**os.environ, **of_nodes})),
+        *nodes,
+        *([_rviz(use_sim_time)] if rviz == "true" else []),
+    ]
 
 
 def _node(start: Start, lives: Lives, variables: Mapping[str, str]) -> Node:
-    """The action of a Start, which its Lives may have started again. Nothing is given to it by a file that launch_ros would leave."""
+    """The action of a Start, which its Lives may have started again.
+
+    Nothing is given to it by a file that launch_ros would leave.
+    """
     began = time.monotonic()
 
     def on_exit(event: ProcessExited, context: LaunchContext) -> Action | None:
@@ -64,4 +83,6 @@ def _rviz(use_sim_time: str) -> Node:
     """RViz with our layout."""
     layout = f"{get_package_share_directory('uwb_tdoa_ekf')}/rviz/tdoa.rviz"
     parameters = ["-p", f"use_sim_time:={str(use_sim_time).lower()}"]
-    return Node(package="rviz2", executable="rviz2", arguments=["-d", layout], ros_arguments=parameters)
+    return Node(
+        package="rviz2", executable="rviz2", arguments=["-d", layout], ros_arguments=parameters
+    )

@@ -1,11 +1,14 @@
 """localization_node: bias_node and ekf_node of one tag, or of several, in one process.
 
-Both are nodes of their own for each tag, with the names, parameters, topics and diagnostics that they have as processes, in the
-namespace of the tag. Corrected TDOAs and odometry are handed over in memory, and published for whoever else listens. The nodes of a
-tag that fail do not take the others along: they are started again after 1 s, 2 s, 4 s ... 30 s.
-  -> /diagnostics (diagnostic_msgs/DiagnosticArray): which tags are not there, beside what their nodes say.
-Every parameter of this node itself is documented in config/localization_node.yaml; those of bias_node and ekf_node may be given
-too, for all tags, or in a parameter file for one: /tag1/ekf_node.
+Both are nodes of their own for each tag, with the names, parameters, topics and diagnostics that
+they have as processes, in the namespace of the tag. Corrected TDOAs and odometry are handed over in
+memory, and published for whoever else listens. The nodes of a tag that fail do not take the others
+along: they are started again after 1 s, 2 s, 4 s ... 30 s.
+  -> /diagnostics (diagnostic_msgs/DiagnosticArray): which tags are not there, beside what their
+  nodes say.
+Every parameter of this node itself is documented in config/localization_node.yaml; those of
+bias_node and ekf_node may be given too, for all tags, or in a parameter file for one:
+/tag1/ekf_node.
 """
 
 from __future__ import annotations
@@ -15,16 +18,23 @@ import math
 import sys
 import time
 import traceback
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
+
 from uwb_tdoa_bias import bias_node
 from uwb_tdoa_bias.bias_node import BiasNode
 from uwb_tdoa_bias.foundation import ros
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.ros_diagnostics import Diagnostics
 from uwb_tdoa_bias.foundation.ros_node import StreamNode
-from uwb_tdoa_bias.foundation.ros_parameters import FROZEN, Parameter, declare_all, files_of, say_unused
+from uwb_tdoa_bias.foundation.ros_parameters import (
+    FROZEN,
+    Parameter,
+    declare_all,
+    files_of,
+    say_unused,
+)
 from uwb_tdoa_bias.foundation.ros_streams import Handed, RoundRobin
 
 from .ekf_node import EkfNode
@@ -32,14 +42,21 @@ from .ekf_parameters import names_of_parameters
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
+
     from uwb_tdoa_bias.foundation.ros_diagnostics import Report
 
 PARAMETERS = {
-    "tags": Parameter([""], 'namespaces of the tags, below that of this node, e.g. ["tag1", "tag2"]; "" is its own'),
+    "tags": Parameter(
+        [""],
+        'namespaces of the tags, below that of this node, e.g. ["tag1", "tag2"]; "" is its own',
+    ),
     "frozen": FROZEN,
 }
 OF_PROCESS = "__ns", "__node", "__name"  # of this node, not of all
-FIRST, LONGEST = 1.0, 30.0  # s, until the nodes of a tag that have failed are started again: twice as long each time
+FIRST, LONGEST = (
+    1.0,
+    30.0,
+)  # s, until the nodes of a tag that have failed are started again: twice as long each time
 SOUND = 60.0  # s; nodes that lived for so long have failed for the first time again
 
 
@@ -53,7 +70,10 @@ class LocalizationNode(StreamNode):
         super().__init__(self.NAME)
         tags = declare_all(self, PARAMETERS)["tags"]
         if not tags or len(set(tags)) < len(tags):
-            raise InputError(f"tags: {list(tags)!r} must be a list of different namespaces, e.g. ['tag1', 'tag2'].")
+            raise InputError(
+                f"tags: {list(tags)!r} must be a list of different namespaces, e.g. ['tag1', "
+                "'tag2']."
+            )
         self._tags = [Tag(self, tag, partial(self._start, tag, list(arguments))) for tag in tags]
         for tag in self._tags:
             tag.begin()
@@ -68,14 +88,27 @@ class LocalizationNode(StreamNode):
 
     def _report(self) -> Report:
         troubles = [tag.trouble for tag in self._tags if tag.trouble]
-        level, text = (DiagnosticStatus.ERROR, troubles[0]) if troubles else (DiagnosticStatus.OK, "all tags are served")
+        level, text = (
+            (DiagnosticStatus.ERROR, troubles[0])
+            if troubles
+            else (DiagnosticStatus.OK, "all tags are served")
+        )
         return level, text, {"tags": len(self._tags), "not served": "; ".join(troubles) or "none"}
 
     def _start(self, tag: str, arguments: list[str]) -> Pair:
         """Pair of a tag."""
         namespace = f"{self.get_namespace().rstrip('/')}/{tag}".rstrip("/") or "/"
-        given = ["--ros-args", *(["-p", f"body_frame:={tag}/base_link"] if tag else []), "--", *_for_all(arguments)]
-        options: dict[str, Any] = {"namespace": namespace, "cli_args": given, "use_global_arguments": False}
+        given = [
+            "--ros-args",
+            *(["-p", f"body_frame:={tag}/base_link"] if tag else []),
+            "--",
+            *_for_all(arguments),
+        ]
+        options: dict[str, Any] = {
+            "namespace": namespace,
+            "cli_args": given,
+            "use_global_arguments": False,
+        }
         names = {*bias_node.PARAMETERS, *names_of_parameters(), *PARAMETERS}
         bias = BiasNode(member=names, **options)
         try:
@@ -86,8 +119,9 @@ class LocalizationNode(StreamNode):
 
 
 class Tag:
-    """A tag, whose nodes are started again when they fail. refused : InputError with which they were not started at all; trouble : a
-    sentence while they are not there, or None."""
+    """A tag, whose nodes are started again when they fail. refused : InputError with which they
+    were not started at all; trouble : a sentence while they are not there, or None.
+    """
 
     def __init__(self, node: LocalizationNode, name: str, start: Callable[[], Pair]) -> None:
         """node : LocalizationNode; start() : Pair of the tag, anew; raises InputError."""
@@ -104,7 +138,11 @@ class Tag:
         return [] if self._pair is None else [self._pair.bias, self._pair.ekf]
 
     def begin(self) -> None:
-        """Start its nodes. What they refuse at their first start is not tried again. Whatever else is raised concerns this tag alone."""
+        """Start its nodes.
+
+        What they refuse at their first start is not tried again. Whatever else is raised concerns
+        this tag alone.
+        """
         try:
             self._pair = self._start()
         except Exception as error:
@@ -135,7 +173,9 @@ class Tag:
             return False
 
     def _fail(self, error: Exception) -> None:
-        """Note what was raised; the nodes end with the next turn, when none of their callbacks is under way."""
+        """Note what was raised; the nodes end with the next turn, when none of their callbacks is
+        under way.
+        """
         self._failure = error
 
     def _end(self, error: Exception) -> None:
@@ -171,7 +211,10 @@ class Pair:
     def __init__(self, bias: BiasNode, ekf: EkfNode) -> None:
         """bias : BiasNode; ekf : EkfNode."""
         self.bias, self.ekf = bias, ekf
-        corrected, odometry = ekf.streams.inputs["uwb/tdoa_corrected"], bias.streams.inputs["odometry"]
+        corrected, odometry = (
+            ekf.streams.inputs["uwb/tdoa_corrected"],
+            bias.streams.inputs["odometry"],
+        )
         assert isinstance(corrected, Handed) and isinstance(odometry, Handed)  # as of members
         self._odometry = odometry
         bias.output.hand_to(corrected)
@@ -179,7 +222,10 @@ class Pair:
         bias.streams.wait_for("uwb/tdoa", ekf.due)
 
     def take(self) -> bool:
-        """Give everything that has arrived to those that take it. Returns whether there was anything, or is."""
+        """Give everything that has arrived to those that take it.
+
+        Returns whether there was anything, or is.
+        """
         busy = [self.bias.streams.take(), self.ekf.streams.take()]
         while self.bias.holds and len(self._odometry):  # poses that TDOAs wait for
             self.bias.streams.take(at_once=True)
@@ -190,7 +236,11 @@ class Pair:
 def _for_all(arguments: list[str]) -> list[str]:
     """The arguments of a process without the name and the namespace of its node."""
     flags = [k for k, word in enumerate(arguments) if word in ("-r", "--remap")]
-    names = [k for k in flags if k + 1 < len(arguments) and arguments[k + 1].partition(":=")[0] in OF_PROCESS]
+    names = [
+        k
+        for k in flags
+        if k + 1 < len(arguments) and arguments[k + 1].partition(":=")[0] in OF_PROCESS
+    ]
     dropped = {*names, *(k + 1 for k in names)}
     return [word for k, word in enumerate(arguments) if k not in dropped]
 

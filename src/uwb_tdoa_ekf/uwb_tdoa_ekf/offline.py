@@ -27,18 +27,25 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from uwb_tdoa_bias.foundation.flight import Flight
+
     from .pipeline import Fed
 
-RECORDED_AT_ONCE = 256  # TDOAs that are used together while a history is recorded: its room is for the worst case
+RECORDED_AT_ONCE = (
+    256  # TDOAs that are used together while a history is recorded: its room is for the worst case
+)
 
 
 @dataclass(frozen=True)
 class Run:
-    """Result of one recording. odometry : Odometry; residuals : Residuals, one per TDOA of the flight, in its order;
-    bias, bias_std : (n,) m, what was taken from each raw TDOA; recoveries : how often the filter lost and found the
-    tag; yaw_offset : rad, from initial_yaw to the start of the yaw hypothesis that was right; aids : {stream: (m,) of
-    RESIDUAL, one per measurement}, for those of the SENSORS that the flight has; range_offset : (m, m), by how much all ranges are too
-    long, where the filter knew it best, and its standard deviation, of noise alone; None if it did not look for that."""
+    """Result of one recording. odometry : Odometry; residuals : Residuals, one per TDOA of the
+    flight, in its order;
+    bias, bias_std : (n,) m, what was taken from each raw TDOA; recoveries : how often the filter
+        lost and found the
+    tag; yaw_offset : rad, from initial_yaw to the start of the yaw hypothesis that was right; aids
+    : {stream: (m,) of RESIDUAL, one per measurement}, for those of the SENSORS that the flight has;
+    range_offset : (m, m), by how much all ranges are too long, where the filter knew it best, and
+    its standard deviation, of noise alone; None if it did not look for that.
+    """
 
     odometry: Odometry
     residuals: Residuals
@@ -52,17 +59,24 @@ class Run:
     @property
     def counts(self) -> dict[str, int]:
         """TDOAs by verdict."""
-        return {name: int(np.sum(self.residuals.verdict == value)) for value, name in VERDICTS.items()}
+        return {
+            name: int(np.sum(self.residuals.verdict == value)) for value, name in VERDICTS.items()
+        }
 
 
 def run_offline(
-    flight: Flight, config: FilterConfig | None = None, corrector: Corrector | None = None, records: list[np.ndarray] | None = None
+    flight: Flight,
+    config: FilterConfig | None = None,
+    corrector: Corrector | None = None,
+    records: list[np.ndarray] | None = None,
 ) -> Run:
     """Run a Flight through bias correction and filter.
 
-    flight : Flight; config : FilterConfig; corrector : Corrector, whose poses are forgotten first, or None for no
-    correction; records : list to which the history of the run is appended (see engine.feed), or None. Returns a Run. A
-    measurement uses only what was stamped before it, as on line. The filter starts anew at each of the restarts of the Flight.
+    flight : Flight; config : FilterConfig; corrector : Corrector, whose poses are forgotten first,
+        or None for no
+    correction; records : list to which the history of the run is appended (see engine.feed), or
+    None. Returns a Run. A measurement uses only what was stamped before it, as on line. The filter
+    starts anew at each of the restarts of the Flight.
     """
     config = config or FilterConfig()
     corrector = corrector or Corrector(flight.anchors)
@@ -76,9 +90,13 @@ def run_offline(
     buffer, places = loaded(flight, config)
     bias, std = np.zeros((2, len(tdoa)))
     parts: list[Fed] = []
-    of_tdoas: list[np.ndarray] = []  # places in the flight of those that can be measurements, in the order of their stamps
+    of_tdoas: list[
+        np.ndarray
+    ] = []  # places in the flight of those that can be measurements, in the order of their stamps
     recoveries = 0
-    for batch, until, anew in _batches(*raw, corrector, len(tdoa) if records is None else RECORDED_AT_ONCE, flight.restarts):
+    for batch, until, anew in _batches(
+        *raw, corrector, len(tdoa) if records is None else RECORDED_AT_ONCE, flight.restarts
+    ):
         if anew:  # as on line, when the stamps fall back
             recoveries += int(pipeline.state.record.recoveries)
             pipeline = Pipeline(installed, config, effects, watched=False, records=records)
@@ -87,7 +105,9 @@ def run_offline(
         correction = corrector.correct(t, a, b, d)
         bias[batch], std[batch] = correction.bias, correction.std
         variance = correction.std**2 + tdoa.variance[batch]
-        rows = structured(TDOA, t, a, b, correction.corrected, variance, correction.slope, correction.state)
+        rows = structured(
+            TDOA, t, a, b, correction.corrected, variance, correction.slope, correction.state
+        )
         usable = usable_tdoas(rows, anchors.positions)
         buffer.load(TDOA_STREAM, rows if usable.all() else rows[usable])
         of_tdoas.append(batch[usable])
@@ -102,7 +122,16 @@ def run_offline(
     ekf = pipeline.state.record
     offset, variance = ekf.range_offset.tolist()
     found = (offset, math.sqrt(variance)) if variance < math.inf else None
-    return Run(odometry_of(parts), residuals, bias, std, recoveries + int(ekf.recoveries), yaw_offset(int(ekf.best)), aids, found)
+    return Run(
+        odometry_of(parts),
+        residuals,
+        bias,
+        std,
+        recoveries + int(ekf.recoveries),
+        yaw_offset(int(ekf.best)),
+        aids,
+        found,
+    )
 
 
 def may_have_offset(flight: Flight, config: FilterConfig) -> bool:
@@ -116,16 +145,27 @@ def without_offset(flight: Flight, offset: float) -> Flight:
     return flight.replaced(range=replace(flight.range, d=flight.range.d - offset))
 
 
-def without_unknown_offset(flight: Flight, config: FilterConfig, corrector: Corrector | None = None) -> Flight:
-    """The Flight without the offset of all ranges that the filter finds, where a FilterConfig makes it look for one. Takes what
-    run_offline takes."""
-    offset = run_offline(flight, config, corrector).range_offset if may_have_offset(flight, config) else None
+def without_unknown_offset(
+    flight: Flight, config: FilterConfig, corrector: Corrector | None = None
+) -> Flight:
+    """The Flight without the offset of all ranges that the filter finds, where a FilterConfig makes
+    it look for one. Takes what run_offline takes.
+    """
+    offset = (
+        run_offline(flight, config, corrector).range_offset
+        if may_have_offset(flight, config)
+        else None
+    )
     return flight if offset is None else without_offset(flight, offset[0])
 
 
-def loaded(flight: Flight, config: FilterConfig) -> tuple[ReorderBuffer, dict[str, tuple[int, np.ndarray, np.ndarray]]]:
-    """ReorderBuffer with the inertial samples and the SENSORS of a Flight, and of each of these how many there are, the places of those
-    that can be measurements, in the order of their stamps, and their ranks among all that leave the buffer."""
+def loaded(
+    flight: Flight, config: FilterConfig
+) -> tuple[ReorderBuffer, dict[str, tuple[int, np.ndarray, np.ndarray]]]:
+    """ReorderBuffer with the inertial samples and the SENSORS of a Flight, and of each of these how
+    many there are, the places of those that can be measurements, in the order of their stamps, and
+    their ranks among all that leave the buffer.
+    """
     buffer = ReorderBuffer.of_recording()
     if flight.imu is not None and config.use_imu:
         rows, usable = imu_rows(flight.imu.t, flight.imu.gyro, flight.imu.accel)
@@ -142,11 +182,16 @@ def loaded(flight: Flight, config: FilterConfig) -> tuple[ReorderBuffer, dict[st
     together = joined(AID, felt)  # as one stream, whose order is found once
     together = together[np.lexsort((together["kind"], together["t"]))]
     buffer.load(FIRST_AID, together)
-    return buffer, {name: (*kept, np.flatnonzero(together["kind"] == AIDS.index(name))) for name, kept in kept_of.items()}
+    return buffer, {
+        name: (*kept, np.flatnonzero(together["kind"] == AIDS.index(name)))
+        for name, kept in kept_of.items()
+    }
 
 
 def _became(n: int, places: np.ndarray, outcomes: list[np.ndarray]) -> np.ndarray:
-    """(n,) of RESIDUAL: what became of those that were used, at their places; the others are invalid."""
+    """(n,) of RESIDUAL: what became of those that were used, at their places; the others are
+    invalid.
+    """
     out = np.zeros(n, RESIDUAL)
     out["innovation"] = out["variance"] = np.nan
     out["verdict"] = INVALID
@@ -155,23 +200,41 @@ def _became(n: int, places: np.ndarray, outcomes: list[np.ndarray]) -> np.ndarra
 
 
 def _batches(
-    t: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray, corrector: Corrector, longest: int, restarts: Sequence[float]
+    t: np.ndarray,
+    a: np.ndarray,
+    b: np.ndarray,
+    d: np.ndarray,
+    corrector: Corrector,
+    longest: int,
+    restarts: Sequence[float],
 ) -> Iterator[tuple[np.ndarray, float, bool]]:
-    """What can be corrected and used together, at most `longest` TDOAs: (their places, in the order of their stamps, the stamp, s, up to
-    which everything may be used then, and whether the clock began anew before them), at least one for each time of the clock.
+    """What can be corrected and used together, at most `longest` TDOAs: (their places, in the order
+    of their stamps, the stamp, s, up to which everything may be used then, and whether the clock
+    began anew before them), at least one for each time of the clock.
 
-    Corrections need poses that are `lag` old: measurements less than that apart can be corrected as one batch.
+    Corrections need poses that are `lag` old: measurements less than that apart can be corrected as
+    one batch.
     """
     known = np.flatnonzero((a >= 0) & (b >= 0) & np.isfinite(d) & np.isfinite(t))
     if not (np.diff(t[known]) > 0.0).all():
-        known = known[np.lexsort((d[known], b[known], a[known], t[known]))]  # siblings of one stamp as on line
+        known = known[
+            np.lexsort((d[known], b[known], a[known], t[known]))
+        ]  # siblings of one stamp as on line
     stamps, lag, first = t[known], math.inf if corrector.idle else corrector.lag, 0
     for number, bound in enumerate([*sorted(restarts), math.inf]):
         last, anew = int(np.searchsorted(stamps, bound)), number > 0
         while first < last or anew or not number:
-            end = min(int(np.searchsorted(stamps, stamps[first] + lag)), first + longest, last) if first < last else last
+            end = (
+                min(int(np.searchsorted(stamps, stamps[first] + lag)), first + longest, last)
+                if first < last
+                else last
+            )
             before = stamps[end] if end < last else bound
-            yield known[first:end], math.nextafter(before, -math.inf) if before < math.inf else before, anew
+            yield (
+                known[first:end],
+                math.nextafter(before, -math.inf) if before < math.inf else before,
+                anew,
+            )
             first, anew = end, False
             if first >= last:
                 break

@@ -10,6 +10,7 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
 from tf2_msgs.msg import TFMessage
+
 from uwb_tdoa_bias.foundation.later import rotations
 from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS as STATUS_QOS
 from uwb_tdoa_bias.foundation.ros_cdr import CdrCodec
@@ -21,12 +22,14 @@ from .ekf_parameters import NONE, ODOM
 from .frames import pose_and_twist
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from uwb_tdoa_bias.foundation.ros_node import StreamNode
     from uwb_tdoa_bias.foundation.ros_stamps import Epoch
     from uwb_tdoa_bias.foundation.transforms import Frames
+
     from .monitoring.status import Status
     from .results import Residuals
-    import numpy as np
 
 STATUS_PERIOD = 0.95  # s; it is looked at five times a second
 ODOMETRY = "pose", "twist"
@@ -42,37 +45,60 @@ class StatusOutput:
         self._said: Status | None = None
         self._due = -math.inf
 
-    def publish(self, status: Status, yaw_std: float, tdoa_age: float, stamp: Time, frame: str) -> None:
-        """Publish if it is due. status : monitoring.status.Status; yaw_std : rad; tdoa_age : s; stamp : builtin_interfaces/Time."""
+    def publish(
+        self, status: Status, yaw_std: float, tdoa_age: float, stamp: Time, frame: str
+    ) -> None:
+        """Publish if it is due. status : monitoring.status.Status; yaw_std : rad; tdoa_age : s;
+        stamp : builtin_interfaces/Time.
+        """
         now = time.monotonic()
         if status == self._said and now < self._due:
             return
         self._said, self._due = status, now + STATUS_PERIOD
-        message = EstimatorStatus(status=status.status, lost=status.lost, yaw_known=status.yaw_known, why=status.why)
+        message = EstimatorStatus(
+            status=status.status, lost=status.lost, yaw_known=status.yaw_known, why=status.why
+        )
         message.header.stamp, message.header.frame_id = stamp, frame
         message.yaw_std, message.tdoa_age = float(yaw_std), float(tdoa_age)
         self._publisher.publish(message)
 
 
 class Outputs:
-    """published : number of messages on odometry; stamp : of the newest; world : name of its frame; odometry, residual :
-    StreamOutputs."""
+    """published : number of messages on odometry; stamp : of the newest; world : name of its frame;
+    odometry, residual : StreamOutputs.
+    """
 
-    def __init__(self, node: StreamNode, epoch: Epoch, frames: Frames, body: str, publish_tf: str, odom: str, planar: bool = False) -> None:
-        """epoch : Epoch; frames : transforms.Frames; body, odom : names of frames; publish_tf : of PUBLISH_TF; planar : world -> odom is
-        to turn about the vertical alone."""
+    def __init__(
+        self,
+        node: StreamNode,
+        epoch: Epoch,
+        frames: Frames,
+        body: str,
+        publish_tf: str,
+        odom: str,
+        planar: bool = False,
+    ) -> None:
+        """epoch : Epoch; frames : transforms.Frames; body, odom : names of frames; publish_tf : of
+        PUBLISH_TF; planar : world -> odom is to turn about the vertical alone.
+        """
         self._epoch, self._frames, self._body, self._planar = epoch, frames, body, planar
         self._odom = odom if publish_tf == ODOM else None
-        self.published = self._unplaced = 0  # messages; those in a row for which /tf had no odom -> body
+        self.published = self._unplaced = (
+            0  # messages; those in a row for which /tf had no odom -> body
+        )
         self._placed = False  # a transform was published
         self._wires = CdrCodec(Odometry, *ODOMETRY), CdrCodec(TdoaResidual, *RESIDUAL)
         self._transform = TransformStamped(child_frame_id=self._odom or body)
-        self._tf = TFMessage(transforms=[self._transform])  # one for all: what is published is copied
+        self._tf = TFMessage(
+            transforms=[self._transform]
+        )  # one for all: what is published is copied
         self.stamp = Time()  # of the newest odometry
         self.set_world("")
         self.odometry = StreamOutput(node, Odometry, "odometry")
         self.residual = StreamOutput(node, TdoaResidual, "uwb/residual")
-        self._tf_publisher = node.create_publisher(TFMessage, "/tf", TF_QOS) if publish_tf != NONE else None
+        self._tf_publisher = (
+            node.create_publisher(TFMessage, "/tf", TF_QOS) if publish_tf != NONE else None
+        )
 
     def set_world(self, frame: str) -> None:
         """Name the world frame."""
@@ -80,7 +106,9 @@ class Outputs:
         messages = Odometry(child_frame_id=self._body), TdoaResidual()
         for message in messages:
             message.header.frame_id = frame
-        self._odometry, self._residual = (wire.template(message) for wire, message in zip(self._wires, messages))
+        self._odometry, self._residual = (
+            wire.template(message) for wire, message in zip(self._wires, messages)
+        )
 
     @property
     def trouble(self) -> str | None:
@@ -88,7 +116,8 @@ class Outputs:
         if self._unplaced < UNPLACED:
             return None
         return (
-            f"publish_tf is odom, and /tf has no {self._odom} -> {self._body} at the time of the odometry: start what "
+            f"publish_tf is odom, and /tf has no {self._odom} -> {self._body} at the time of "
+            "the odometry: start what "
             "publishes it, or set publish_tf to base"
         )
 
@@ -99,30 +128,44 @@ class Outputs:
         rows = self._residual.rows(len(residuals.t))
         rows["sec"], rows["nanosec"] = self._epoch.parts(residuals.t)
         columns = (
-            residuals.a, residuals.b, residuals.innovation, residuals.variance, residuals.weight, residuals.verdict,
-        )  # fmt: skip
+            residuals.a,
+            residuals.b,
+            residuals.innovation,
+            residuals.variance,
+            residuals.weight,
+            residuals.verdict,
+        )
         for name, column in zip(RESIDUAL, columns):
             rows[name] = column
         self.residual.publish(self.world, self._residual, rows)
 
-    def publish_odometry(self, odometry: Odometry, rates: np.ndarray, rate_variances: np.ndarray, held: bool = False) -> None:
-        """Publish Odometry. rates (n, 3) rad/s and their variances (n,) rad^2/s^2, NaN where not known; held : world -> odom stays what it
-        was last."""
+    def publish_odometry(
+        self, odometry: Odometry, rates: np.ndarray, rate_variances: np.ndarray, held: bool = False
+    ) -> None:
+        """Publish Odometry. rates (n, 3) rad/s and their variances (n,) rad^2/s^2, NaN where not
+        known; held : world -> odom stays what it was last.
+        """
         n = len(odometry)
         rows = self._odometry.rows(n)
         rows["sec"], rows["nanosec"] = self._epoch.parts(odometry.t)
         rows["pose"], rows["twist"] = pose_and_twist(odometry, rates, rate_variances)
-        transformed = self._tf_publisher is not None and (self._odom or self._tf_publisher.get_subscription_count())
+        transformed = self._tf_publisher is not None and (
+            self._odom or self._tf_publisher.get_subscription_count()
+        )
         self.odometry.publish(self.world, self._odometry, rows)
         for k in range(n) if transformed else ():
             self.stamp = self._epoch.stamp(odometry.t[k].item())
-            self._publish_transform(odometry.t[k], odometry.p[k].tolist(), odometry.q[k].tolist(), held)
+            self._publish_transform(
+                odometry.t[k], odometry.p[k].tolist(), odometry.q[k].tolist(), held
+            )
         if n:
             self.stamp = self._epoch.stamp(odometry.t[-1].item())
         self.published += n
 
     def _publish_transform(self, t: float, p: np.ndarray, q: np.ndarray, held: bool) -> None:
-        """World -> body, or world -> odom such that odom -> body of /tf leads to the same; or, held, world -> odom as it was last."""
+        """World -> body, or world -> odom such that odom -> body of /tf leads to the same; or,
+        held, world -> odom as it was last.
+        """
         if self._odom and not (held and self._placed):
             between = self._frames.between(self._odom, self._body, t)
             self._unplaced = self._unplaced + 1 if between is None else 0

@@ -1,9 +1,11 @@
-"""From measurements in the order of their stamps to odometry: the filter, and the watch for changes, live and off line."""
+"""From measurements in the order of their stamps to odometry: the filter, and the watch for
+changes, live and off line.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -25,8 +27,9 @@ if TYPE_CHECKING:
 
 
 class Fed(NamedTuple):
-    """measured : Measurements that were used at once; odometry : (n,) of ODOMETRY that came of them; tdoas, aids : (k,) and (m,) of
-    RESIDUAL, what became of them."""
+    """measured : Measurements that were used at once; odometry : (n,) of ODOMETRY that came of
+    them; tdoas, aids : (k,) and (m,) of RESIDUAL, what became of them.
+    """
 
     measured: Measurements
     odometry: np.ndarray
@@ -35,19 +38,29 @@ class Fed(NamedTuple):
 
 
 class Pipeline:
-    """Takes what a ReorderBuffer releases. state : FilterState; monitor : Monitor, or None, if nobody asks what has changed."""
+    """Takes what a ReorderBuffer releases. state : FilterState; monitor : Monitor, or None, if
+    nobody asks what has changed.
+    """
 
     def __init__(
-        self, anchors: Installed, config: FilterConfig, effects: EffectSet = EffectSet(), watched: bool = True,
+        self,
+        anchors: Installed,
+        config: FilterConfig,
+        effects: EffectSet = EffectSet(),
+        watched: bool = True,
         records: list[np.ndarray] | None = None,
-    ) -> None:  # fmt: skip
-        """anchors : Installed; config : FilterConfig; effects : EffectSet that is known, of which the filter itself is told, or that is
-        taken out of distances to anchors; watched : have a Monitor in any case; records : list to which the history is appended (see
-        engine.feed), or None."""
+    ) -> None:
+        """anchors : Installed; config : FilterConfig; effects : EffectSet that is known, of which
+        the filter itself is told, or that is taken out of distances to anchors; watched : have a
+        Monitor in any case; records : list to which the history is appended (see engine.feed), or
+        None.
+        """
         self._anchors, self._effects, self._records = anchors, effects, records
         self.state = self._new_state()
         self._corrections = RadioCorrections(effects, anchors)
-        self.monitor = Monitor(anchors, effects.covariance) if watched or config.compensate_changes else None
+        self.monitor = (
+            Monitor(anchors, effects.covariance) if watched or config.compensate_changes else None
+        )
         self.configure(config)
 
     def configure(self, config: FilterConfig) -> None:
@@ -57,23 +70,34 @@ class Pipeline:
             self.state.anchors["delay"] = self.state.anchors["delay_variance"] = 0.0
 
     def _new_state(self) -> FilterState:
-        return new_state_of(self._anchors, self._effects.sensor_functions, self._effects.on_floor(self._anchors.anchors))
+        return new_state_of(
+            self._anchors,
+            self._effects.sensor_functions,
+            self._effects.on_floor(self._anchors.anchors),
+        )
 
     def change_anchors(self, gone: np.ndarray) -> None:
-        """Go on after a change of the Installed: with what is known of its new rows, and without the rows `gone` (k,)."""
+        """Go on after a change of the Installed: with what is known of its new rows, and without
+        the rows `gone` (k,).
+        """
         more, first = self._new_state(), len(self.state.anchors)
-        self.state = self.state._replace(anchors=np.concatenate([self.state.anchors, more.anchors[first:]]))
+        self.state = self.state._replace(
+            anchors=np.concatenate([self.state.anchors, more.anchors[first:]])
+        )
         self.state.record.extent[:] = more.record.extent
         forget(self.state, gone)
         if self.monitor is not None:
             self.monitor.forget(gone)
 
     def run(self, buffer: ReorderBuffer, until: float) -> list[Fed]:
-        """Use what a ReorderBuffer holds up to `until`, s; where delays are taken out, from the stamps on at which the monitor finds
-        them."""
+        """Use what a ReorderBuffer holds up to `until`, s; where delays are taken out, from the
+        stamps on at which the monitor finds them.
+        """
         parts = []
         while self._config.compensate_changes and self.monitor is not None and len(buffer):
-            end = min(self.monitor.end, (math.floor(buffer.first / LENGTH) + 1.0) * LENGTH)  # the first slice begins with the first TDOA
+            end = min(
+                self.monitor.end, (math.floor(buffer.first / LENGTH) + 1.0) * LENGTH
+            )  # the first slice begins with the first TDOA
             if end > until:
                 break
             parts += self._feed(buffer.take(math.nextafter(end, -math.inf)))
@@ -109,7 +133,10 @@ class Pipeline:
 
     def residuals(self, parts: Sequence[Fed]) -> Residuals:
         """What became of the TDOAs of several Fed, in the order in which they were used."""
-        tdoa, rows = joined(TDOA, [part.measured.tdoa for part in parts]), joined(RESIDUAL, [part.tdoas for part in parts])
+        tdoa, rows = (
+            joined(TDOA, [part.measured.tdoa for part in parts]),
+            joined(RESIDUAL, [part.tdoas for part in parts]),
+        )
         ids = self._anchors.ids
         return Residuals.from_rows(tdoa["t"], ids[tdoa["a"]], ids[tdoa["b"]], rows)
 

@@ -1,7 +1,9 @@
-"""Fixed-interval smoother over the filter's own run: every estimate from all measurements, before and after it.
+"""Fixed-interval smoother over the filter's own run: every estimate from all measurements, before
+and after it.
 
-Modified Bryson-Frazier recursion (Bierman, Fixed interval smoothing with discrete measurements, Int. J. Control 1973):
-backwards through the scalar updates of the filter's history, with its robust weights, inverting no covariance.
+Modified Bryson-Frazier recursion (Bierman, Fixed interval smoothing with discrete measurements,
+Int. J. Control 1973): backwards through the scalar updates of the filter's history, with its robust
+weights, inverting no covariance.
 """
 
 from __future__ import annotations
@@ -27,16 +29,19 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.correction.corrector import Corrector
     from uwb_tdoa_bias.foundation.compiled import Record
     from uwb_tdoa_bias.foundation.flight import Flight
+
     from .offline import Run
 
 
-def smooth(flight: Flight, config: FilterConfig | None = None, corrector: Corrector | None = None) -> Run:
+def smooth(
+    flight: Flight, config: FilterConfig | None = None, corrector: Corrector | None = None
+) -> Run:
     """Run a Flight through bias correction, filter and smoother.
 
-    Takes what run_offline takes and returns its Run with the odometry smoothed: at the stamps of updates, thinned to
-    odometry_rate. Pressures are not used. If the yaw is unknown, the direction that the filter follows in the end counts
-    from the beginning; so does the offset of all ranges, if it is unknown (`range_offset_std`): that takes a second smoothing.
-    Memory: 3.5 kB per update.
+    Takes what run_offline takes and returns its Run with the odometry smoothed: at the stamps of
+    updates, thinned to odometry_rate. Pressures are not used. If the yaw is unknown, the direction
+    that the filter follows in the end counts from the beginning; so does the offset of all ranges,
+    if it is unknown (`range_offset_std`): that takes a second smoothing. Memory: 3.5 kB per update.
     """
     config, offset = replace(config or FilterConfig(), **auxiliary.NO_PRESSURE), None
     unknown_yaw = config.use_imu and config.initial_yaw_std > YAW_STD
@@ -50,8 +55,13 @@ def smooth(flight: Flight, config: FilterConfig | None = None, corrector: Correc
     if offset is None:
         return _smoothed_run(flight, config, corrector)
     value, std = offset
-    run, beside = (_smoothed_run(without_offset(flight, one), config, corrector) for one in (value, value + std))
-    return replace(run, odometry=_with_common_error(run.odometry, beside.odometry), range_offset=offset)
+    run, beside = (
+        _smoothed_run(without_offset(flight, one), config, corrector)
+        for one in (value, value + std)
+    )
+    return replace(
+        run, odometry=_with_common_error(run.odometry, beside.odometry), range_offset=offset
+    )
 
 
 def _smoothed_run(flight: Flight, config: FilterConfig, corrector: Corrector | None) -> Run:
@@ -59,7 +69,9 @@ def _smoothed_run(flight: Flight, config: FilterConfig, corrector: Corrector | N
     records: list[np.ndarray] = []
     result = run_offline(flight, config, corrector, records)
     records = [part for part in records if len(part)]
-    before = [-math.inf] + [part["t"][-1] for part in records]  # stamp of the record before each array of them
+    before = [-math.inf] + [
+        part["t"][-1] for part in records
+    ]  # stamp of the record before each array of them
     adjoint, information = np.zeros(ERROR_STATES), np.zeros((ERROR_STATES, ERROR_STATES))
     rows = [np.empty(0, ODOMETRY)]
     for k in reversed(range(len(records))):
@@ -73,22 +85,30 @@ def _smoothed_run(flight: Flight, config: FilterConfig, corrector: Corrector | N
 
 
 def _with_persistent(smoothed: Odometry, online: Odometry) -> Odometry:
-    """The smoothed Odometry with what errors that do not average out make of its covariance: smoothing averages no more of them out than
-    the filter does, so that it is the same as on line, at the last stamp before."""
+    """The smoothed Odometry with what errors that do not average out make of its covariance:
+    smoothing averages no more of them out than the filter does, so that it is the same as on line,
+    at the last stamp before.
+    """
     if not len(online):
         return smoothed
-    persistent = online.persistent[np.maximum(np.searchsorted(online.t, smoothed.t, side="right") - 1, 0)]
+    persistent = online.persistent[
+        np.maximum(np.searchsorted(online.t, smoothed.t, side="right") - 1, 0)
+    ]
     covariance = smoothed.covariance.copy()
     covariance[:, :3, :3] += persistent
     return replace(smoothed, covariance=covariance, persistent=persistent)
 
 
 def _with_common_error(smoothed: Odometry, beside: Odometry) -> Odometry:
-    """The smoothed Odometry with what an error that is the same all the time makes of its covariance; beside : Odometry with one standard
-    deviation of that error more."""
+    """The smoothed Odometry with what an error that is the same all the time makes of its
+    covariance; beside : Odometry with one standard deviation of that error more.
+    """
     if not len(smoothed) or not len(beside):
         return smoothed
-    off = np.stack([np.interp(smoothed.t, beside.t, column) for column in beside.p.T], axis=1) - smoothed.p
+    off = (
+        np.stack([np.interp(smoothed.t, beside.t, column) for column in beside.p.T], axis=1)
+        - smoothed.p
+    )
     common, covariance = off[:, :, None] * off[:, None, :], smoothed.covariance.copy()
     covariance[:, :3, :3] += common
     return replace(smoothed, covariance=covariance, persistent=smoothed.persistent + common)
@@ -96,12 +116,18 @@ def _with_common_error(smoothed: Odometry, beside: Odometry) -> Odometry:
 
 @compiled
 def _backward(
-    records: np.ndarray, before: float, rate: float, adjoint: np.ndarray, information: np.ndarray, rows: np.ndarray
+    records: np.ndarray,
+    before: float,
+    rate: float,
+    adjoint: np.ndarray,
+    information: np.ndarray,
+    rows: np.ndarray,
 ) -> int:
     """Through (n,) of RECORD from the end on; `before` : s, stamp of the record in front of them.
 
-    adjoint (15,), information (15, 15): Bierman's lambda and Lambda, those behind the records, which become those in
-    front of them. Fills (n,) of ODOMETRY from the end on, and returns how many.
+    adjoint (15,), information (15, 15): Bierman's lambda and Lambda, those behind the records,
+    which become those in front of them. Fills (n,) of ODOMETRY from the end on, and returns how
+    many.
     """
     count = 0
     for i in range(len(records) - 1, -1, -1):
@@ -145,25 +171,36 @@ def _smoothed(record: Record, adjoint: np.ndarray, information: np.ndarray, row:
 
 @compiled
 def _through_update(record: Record, adjoint: np.ndarray, information: np.ndarray) -> None:
-    """lambda <- C' lambda - h' y / S, Lambda <- C' Lambda C + h' h / S; C = I - K h, innovation y of variance S."""
+    """lambda <- C' lambda - h' y / S, Lambda <- C' Lambda C + h' h / S; C = I - K h, innovation y
+    of variance S.
+    """
     h, gain = record.row, record.gain
     information_gain = np.zeros(ERROR_STATES)  # Lambda K
     for j in range(ERROR_STATES):
         for k in range(ERROR_STATES):
             information_gain[j] += information[j, k] * gain[k]
-    along, across = record.innovation / record.variance, 1.0 / record.variance  # K' lambda + y / S, K' Lambda K + 1 / S
+    along, across = (
+        record.innovation / record.variance,
+        1.0 / record.variance,
+    )  # K' lambda + y / S, K' Lambda K + 1 / S
     for k in range(ERROR_STATES):
         along += gain[k] * adjoint[k]
         across += gain[k] * information_gain[k]
     for j in range(ERROR_STATES):
         adjoint[j] -= h[j] * along
         for k in range(ERROR_STATES):
-            information[j, k] += h[j] * h[k] * across - h[j] * information_gain[k] - information_gain[j] * h[k]
+            information[j, k] += (
+                h[j] * h[k] * across - h[j] * information_gain[k] - information_gain[j] * h[k]
+            )
 
 
 @compiled
-def _through_prediction(transition: np.ndarray, adjoint: np.ndarray, information: np.ndarray) -> None:
-    """lambda <- Phi' lambda, Lambda <- Phi' Lambda Phi; the lower rows of Phi are those of the identity."""
+def _through_prediction(
+    transition: np.ndarray, adjoint: np.ndarray, information: np.ndarray
+) -> None:
+    """lambda <- Phi' lambda, Lambda <- Phi' Lambda Phi; the lower rows of Phi are those of the
+    identity.
+    """
     before = adjoint.copy()
     product = np.zeros((ERROR_STATES, ERROR_STATES))  # Lambda Phi
     for i in range(ERROR_STATES):

@@ -14,11 +14,13 @@ from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
+
 from uwb_tdoa_ekf.launching import FROZEN, NETWORK, Start, discovery, tag, typed
 from uwb_tdoa_ekf.launching_actions import actions
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
+
     from launch.action import Action
     from launch.events.process import ProcessExited
     from launch.launch_context import LaunchContext
@@ -43,8 +45,14 @@ NUMBERS = {"seed": int, "duration": float}
 
 def generate_launch_description() -> LaunchDescription:
     """Arguments, and what follows from them."""
-    arguments = [DeclareLaunchArgument(name, default_value="", description=text) for name, text in VALUES.items()]
-    arguments += [DeclareLaunchArgument(name, default_value=default, description=text) for name, (default, text) in OTHERS.items()]
+    arguments = [
+        DeclareLaunchArgument(name, default_value="", description=text)
+        for name, text in VALUES.items()
+    ]
+    arguments += [
+        DeclareLaunchArgument(name, default_value=default, description=text)
+        for name, (default, text) in OTHERS.items()
+    ]
     arguments += [
         DeclareLaunchArgument(name, default_value=default, description=text, choices=choices)
         for name, (default, text, choices) in NETWORK.items()
@@ -54,12 +62,18 @@ def generate_launch_description() -> LaunchDescription:
 
 def _nodes(context: LaunchContext) -> list[Action]:
     values = typed({name: LaunchConfiguration(name).perform(context) for name in VALUES})
-    values |= {name: _number(kind, values[name]) for name, kind in NUMBERS.items() if name in values}
+    values |= {
+        name: _number(kind, values[name]) for name, kind in NUMBERS.items() if name in values
+    }
     given = {name: LaunchConfiguration(name).perform(context) for name in (*OTHERS, *NETWORK)}
     simulated = values.get("simulated_time", False)
-    of_nodes = {"use_sim_time": simulated} | typed({name: given[name] for name in ("effects_file", "frozen")})
+    of_nodes = {"use_sim_time": simulated} | typed(
+        {name: given[name] for name in ("effects_file", "frozen")}
+    )
     starts = tag(given["namespace"], of_nodes, None, given["log_level"])
-    vehicle = Start("uwb_tdoa_tools", "vehicle_node", given["namespace"], [values], given["log_level"])
+    vehicle = Start(
+        "uwb_tdoa_tools", "vehicle_node", given["namespace"], [values], given["log_level"]
+    )
     return [
         *actions(starts, "false", "shutdown", given["discovery_range"], given["rviz"], simulated),
         _vehicle(vehicle, discovery(os.environ, given["discovery_range"])),
@@ -77,14 +91,21 @@ def _number(kind: Callable[[str], float], text: str) -> float | str:
 def _vehicle(start: Start, variables: Mapping[str, str]) -> Node:
     """The action of its Start; all ends with it."""
     return Node(
-        package=start.package, executable=start.executable, namespace=start.namespace, ros_arguments=start.words,
-        additional_env=variables, output="screen", on_exit=_ended,
-    )  # fmt: skip
+        package=start.package,
+        executable=start.executable,
+        namespace=start.namespace,
+        ros_arguments=start.words,
+        additional_env=variables,
+        output="screen",
+        on_exit=_ended,
+    )
 
 
 def _ended(event: ProcessExited, context: LaunchContext) -> Shutdown | None:
     if context.is_shutdown:
         return None
     if event.returncode:
-        raise RuntimeError(f"vehicle_node has ended with exit code {event.returncode}; it says above why")
+        raise RuntimeError(
+            f"vehicle_node has ended with exit code {event.returncode}; it says above why"
+        )
     return Shutdown(reason="the flight is over")

@@ -1,16 +1,26 @@
 """Simulated recordings for the tests of `check`: healthy, and quick to try."""
 
-from functools import lru_cache
+from functools import cache
 
 from mistakes import arriving
+
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
-# Errors of TDOAs that a calibrated installation has. Turning, so that every axis of the gyroscope tells something.
-QUICK = dict(duration=18.0, imu_rate=400.0, truth_rate=50.0, yaw="rotating", yaw_rate=0.4, speed=1.2, floor_time=2.0)
+# Errors of TDOAs that a calibrated installation has. Turning, so that every axis of the gyroscope
+# tells something.
+QUICK = dict(
+    duration=18.0,
+    imu_rate=400.0,
+    truth_rate=50.0,
+    yaw="rotating",
+    yaw_rate=0.4,
+    speed=1.2,
+    floor_time=2.0,
+)
 
 
-@lru_cache(maxsize=None)
+@cache
 def recording(seed=0, live=False, **config):
     """Recording of a simulated flight."""
     made = of_flight(simulate(SimulationConfig(seed=seed, **{**QUICK, **config})))

@@ -1,6 +1,8 @@
-"""The commands that the documentation shows, found by letting a shell run its blocks among stubs that only take notes.
+"""The commands that the documentation shows, found by letting a shell run its blocks among stubs
+that only take notes.
 
-What braces, variables and loops stand for is the shell's to say, not a guess of ours. Nothing else is on its PATH.
+What braces, variables and loops stand for is the shell's to say, not a guess of ours. Nothing else
+is on its PATH.
 """
 
 from pathlib import Path
@@ -17,13 +19,20 @@ PLACEHOLDERS = ("PACKAGE NAME", "PKG EXE")
 
 
 def commands(page, names, folder):
-    """[(page, [word, ...])] of every command on a page whose first word is ./dev, ros2 or one of names.
+    """[(page, [word, ...])] of every command on a page whose first word is ./dev, ros2 or one of
+    names.
 
     folder : an empty one to run in; gets ./dev and a DATA that is as measured flights are.
     """
     text = page.read_text()
-    scripts = [block for language, block in BLOCK.findall(text) if language in ("", "sh", "bash") and _is_shell(block, names)]
-    scripts += [line for line in INLINE.findall(text) if not any(word in line for word in PLACEHOLDERS)]
+    scripts = [
+        block
+        for language, block in BLOCK.findall(text)
+        if language in ("", "sh", "bash") and _is_shell(block, names)
+    ]
+    scripts += [
+        line for line in INLINE.findall(text) if not any(word in line for word in PLACEHOLDERS)
+    ]
     notes = folder / "notes"
     notes.touch()
     stubs = folder / "stubs"
@@ -31,10 +40,17 @@ def commands(page, names, folder):
     shutil.copy(stubs / "ros2", folder / "dev")
     _write_stub(folder / "dev", "./dev", notes)
     _write_data(folder / "DATA")
-    script = "DATA=DATA; S='--survey DATA/surveys'; F=DATA/flights\n" + "\n".join(map(_without_brackets, scripts))
+    script = "DATA=DATA; S='--survey DATA/surveys'; F=DATA/flights\n" + "\n".join(
+        map(_without_brackets, scripts)
+    )
     bash = shutil.which("bash")
     done = subprocess.run(
-        [bash, "-c", script], cwd=folder, env={"PATH": str(stubs)}, capture_output=True, text=True, timeout=60
+        [bash, "-c", script],
+        cwd=folder,
+        env={"PATH": str(stubs)},
+        capture_output=True,
+        text=True,
+        timeout=60,
     )
     assert "syntax error" not in done.stderr, done.stderr
     found = [line.split("\0")[:-1] for line in notes.read_text().split("\n")[:-1]]
@@ -42,7 +58,9 @@ def commands(page, names, folder):
 
 
 def _is_shell(block, names):
-    first = [line.split()[0] for line in block.splitlines() if line.strip() and not line.startswith(" ")]
+    first = [
+        line.split()[0] for line in block.splitlines() if line.strip() and not line.startswith(" ")
+    ]
     return any(word in ("./dev", "ros2", "for", *names) for word in first)
 
 
@@ -60,12 +78,21 @@ def _write_stubs(folder, names, notes):
 
 
 def _write_stub(path, name, notes):
-    path.write_text(f'#!{shutil.which("bash")}\nprintf "%s\\0" {name} "$@" >> {notes}\necho >> {notes}\n')
+    path.write_text(
+        f'#!{shutil.which("bash")}\nprintf "%s\\0" {name} "$@" >> {notes}\necho >> {notes}\n'
+    )
     path.chmod(0o755)
 
 
 def _write_data(folder):
-    for name in ("flights/0425/TDOA2", "flights/0425/TDOA3", "flights/0426", "flights/0422", "flights/0607", "surveys"):
+    for name in (
+        "flights/0425/TDOA2",
+        "flights/0425/TDOA3",
+        "flights/0426",
+        "flights/0422",
+        "flights/0607",
+        "surveys",
+    ):
         (folder / name).mkdir(parents=True)
     (folder / "util").mkdir()
     for number in (1, 3, 4):

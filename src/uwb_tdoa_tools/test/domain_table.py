@@ -1,5 +1,6 @@
-"""What an effect does to flights beyond where it was seen: a clock's drift, fitted to the first seconds of one flight, taken out of the
-others, without its domain and with it. The figures of docs/reliability.md.
+"""What an effect does to flights beyond where it was seen: a clock's drift, fitted to the first
+seconds of one flight, taken out of the others, without its domain and with it. The figures of
+docs/reliability.md.
 
 python src/uwb_tdoa_tools/test/domain_table.py DATA
 """
@@ -8,9 +9,8 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from monitor_table import flights_of
+import numpy as np
 
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet
@@ -20,7 +20,11 @@ from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.scoring.metrics import Score
 
 # s
-FITTED = {"const1": ("const1-trial1-tdoa2", 40.0), "const3": ("const3-trial1-tdoa2", 60.0), "const4": ("const4-trial1-tdoa2-traj1", 40.0)}
+FITTED = {
+    "const1": ("const1-trial1-tdoa2", 40.0),
+    "const3": ("const3-trial1-tdoa2", 60.0),
+    "const4": ("const4-trial1-tdoa2-traj1", 40.0),
+}
 BLOCKED = "const4-trial3", "const4-trial5"  # their anchors change in flight
 
 
@@ -45,11 +49,16 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path)
     data, reference = parser.parse_args().data, GroundTruth()
-    print("| flight | fitted to | no correction: error, m, NEES | without domain | with domain |\n|---|---|---|---|---|")
+    print(
+        "| flight | fitted to | no correction: error, m, NEES | without domain | with domain "
+        "|\n|---|---|---|---|---|"
+    )
     for constellation, (name, seconds) in FITTED.items():
         flights = {flight.name: flight for flight in flights_of(data, [constellation])}
         fitted = reference.prepare(beginning(flights.pop(name), seconds))
-        found = attribute([fitted], reference, undeclared=False, kinds=["anchor_clock_drift"]).effects
+        found = attribute(
+            [fitted], reference, undeclared=False, kinds=["anchor_clock_drift"]
+        ).effects
         models = (), tuple(replace(effect, domain={}) for effect in found), found
         means = []
         for flight in flights.values():
@@ -58,7 +67,12 @@ def main():
                 means.append([error for error, _ in row])
                 cells = " | ".join(f"{error:.3f}, {nees:.1f}" for error, nees in row)
                 print(f"| {flight.name} | {seconds:g} s of {name} | {cells} |", flush=True)
-        print(f"| mean of {len(means)} | | " + " | ".join(f"{mean:.3f}" for mean in np.mean(means, axis=0)) + " |", flush=True)
+        print(
+            f"| mean of {len(means)} | | "
+            + " | ".join(f"{mean:.3f}" for mean in np.mean(means, axis=0))
+            + " |",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":

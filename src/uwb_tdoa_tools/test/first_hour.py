@@ -1,8 +1,9 @@
 """What a new user has in the first hour.
 
-A recording in CSV files of another tool, a survey by tape that is good to 10 cm, ground truth in a file of its own: late, on another epoch,
-in another frame. After each step that claims to help, a flight that took no part is judged by what the user has in hand then, with the
-true ground truth: the error is smaller, or the step has said that nothing is to be used.
+A recording in CSV files of another tool, a survey by tape that is good to 10 cm, ground truth in a
+file of its own: late, on another epoch, in another frame. After each step that claims to help, a
+flight that took no part is judged by what the user has in hand then, with the true ground truth:
+the error is smaller, or the step has said that nothing is to be used.
 """
 
 from dataclasses import dataclass, replace
@@ -35,29 +36,39 @@ TRUTHS = {  # what may be wrong with a ground truth: function of a Truth
     "late": lambda truth: replace(truth, t=truth.t + LATE),
     "in another frame": lambda truth: moved_frame(truth, TURNED, np.array([0.5, -0.3, 0.0])),
     "on another epoch": lambda truth: replace(truth, t=truth.t + EPOCH),
-    "z down, on another epoch": lambda truth: moved_frame(replace(truth, t=truth.t + EPOCH), np.diag([1.0, 1.0, -1.0]), np.zeros(3)),
+    "z down, on another epoch": lambda truth: moved_frame(
+        replace(truth, t=truth.t + EPOCH), np.diag([1.0, 1.0, -1.0]), np.zeros(3)
+    ),
 }
 CALIBRATION = {"anchors": "anchors.yaml", "effects": "effects.yaml", "config": "ekf_node.yaml"}
 
 
 @dataclass
 class Hall:
-    """Two Flights of an installation whose anchors are as they are, and another one that judges; tape : Anchors as somebody measured
-    them."""
+    """Two Flights of an installation whose anchors are as they are, and another one that judges;
+    tape : Anchors as somebody measured them.
+    """
 
     flights: list
     judge: Flight
     tape: object
 
     def error(self, folder=None, anchors=None, **files):
-        """m, 3D RMSE of the flight that judges, with the files of a calibration that are there in a folder. files : {"effects": name, ...},
-        in place of CALIBRATION."""
-        there = {name: Path(folder) / file for name, file in (files or CALIBRATION).items()} if folder else {}
+        """m, 3D RMSE of the flight that judges, with the files of a calibration that are there in a
+        folder. files : {"effects": name, ...}, in place of CALIBRATION.
+        """
+        there = (
+            {name: Path(folder) / file for name, file in (files or CALIBRATION).items()}
+            if folder
+            else {}
+        )
         there = {name: file for name, file in there.items() if file.exists()}
         survey = read_survey(there["anchors"]) if "anchors" in there else anchors or self.tape
         effects = EffectSet.from_yaml(there["effects"]) if "effects" in there else None
         config = FilterConfig.from_yaml(there["config"]) if "config" in there else None
-        return score_of(replace(self.judge, anchors=survey), FlightEstimator(config, effects))[0].row()["rmse_3d"]
+        return score_of(replace(self.judge, anchors=survey), FlightEstimator(config, effects))[
+            0
+        ].row()["rmse_3d"]
 
 
 def off(positions, seed, exact=()):
@@ -71,14 +82,24 @@ def simulated(tape, exact=(), duration=40.0):
     """The Hall of a tape: anchors that stand elsewhere, and are late. duration : s of each flight."""
     true = tape.at(off(tape.positions, 1, exact))
     rng = np.random.default_rng(2)
-    late = AnchorDelay({str(i): float(delay) for i, delay in zip(true.ids, 0.05 * rng.standard_normal(len(true)))})
-    flown = [late.inject(simulate(SimulationConfig(seed=seed, anchors=true, duration=duration, **CLEAN))) for seed in (11, 12, 13)]
+    late = AnchorDelay(
+        {str(i): float(delay) for i, delay in zip(true.ids, 0.05 * rng.standard_normal(len(true)))}
+    )
+    flown = [
+        late.inject(simulate(SimulationConfig(seed=seed, anchors=true, duration=duration, **CLEAN)))
+        for seed in (11, 12, 13)
+    ]
     return Hall(flown[:2], flown[2], tape)
 
 
 def measured(folder):
-    """The Hall of const1 in a folder of measured flights; of the flights that are not judged the first MINUTE."""
-    flown = [Reading(folder / "surveys").one(folder / "util" / f"const1-trial{k}.csv.gz") for k in ("1-tdoa2", "2-tdoa2", "3-tdoa2")]
+    """The Hall of const1 in a folder of measured flights; of the flights that are not judged the
+    first MINUTE.
+    """
+    flown = [
+        Reading(folder / "surveys").one(folder / "util" / f"const1-trial{k}.csv.gz")
+        for k in ("1-tdoa2", "2-tdoa2", "3-tdoa2")
+    ]
     anchors = flown[0].anchors
     short = [between(flight, flight.tdoa.t[0], flight.tdoa.t[0] + MINUTE) for flight in flown[:2]]
     return Hall(short, flown[2], anchors.at(off(anchors.positions, 100, (0, 6))))
@@ -95,13 +116,16 @@ WALK = section("connect.md", "From a CSV file and a tape measure to a diagnosed 
 
 
 def recorded(hall, truth, name="in time"):
-    """The commands of the page that convert a Hall's recordings, once these are there as another tool writes them; without what is not
-    there, as the page says."""
+    """The commands of the page that convert a Hall's recordings, once these are there as another
+    tool writes them; without what is not there, as the page says.
+    """
     for day, flight in zip(("monday", "tuesday"), hall.flights):
         write_tables(replace(flight, truth=TRUTHS[name](flight.truth) if truth else None), day)
     hall.tape.to_yaml("anchors.yaml")
     script, *_ = blocks(WALK)
-    lacking = [("mocap", "pose_")] * (not truth) + [("imu", "(?:gyro|accel)_")] * (hall.judge.imu is None)
+    lacking = [("mocap", "pose_")] * (not truth) + [("imu", "(?:gyro|accel)_")] * (
+        hall.judge.imu is None
+    )
     for table, columns in lacking:
         script = re.sub(rf" \$\{{day\}}_{table}\.csv", "", script)
         script = re.sub(rf"^COLUMNS=\$COLUMNS,{columns}.*\n", "", script, flags=re.MULTILINE)

@@ -9,7 +9,11 @@ def truth_of(*legs, rate=100.0):
     """A Truth through (stamp, x, y, z), straight in between."""
     stamps, *places = np.transpose(legs)
     t = np.arange(stamps[0], stamps[-1] + 0.5 / rate, 1.0 / rate)
-    return Truth(t, np.stack([np.interp(t, stamps, values) for values in places], axis=1), np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1)))
+    return Truth(
+        t,
+        np.stack([np.interp(t, stamps, values) for values in places], axis=1),
+        np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1)),
+    )
 
 
 def flown(floor=0.03, rest=5.0, after=4.0):

@@ -1,5 +1,6 @@
-"""Measured flights played live at their own rate beside a computer at work: what ekf_node says of their streams, which are
-sound. The figures of docs/reliability.md, in a shell with the workspace sourced (./dev shell):
+"""Measured flights played live at their own rate beside a computer at work: what ekf_node says of
+their streams, which are sound. The figures of docs/reliability.md, in a shell with the workspace
+sourced (./dev shell):
 
     python src/uwb_tdoa_tools/test/healthy_table.py DATA --load 2 --days 0425
 """
@@ -16,6 +17,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from monitor_table import flights_of  # noqa: E402
+
 from uwb_tdoa_tools.bags.bag import write_bag  # noqa: E402
 from uwb_tdoa_tools.live.processes import Processes, own_domain, wait  # noqa: E402
 from uwb_tdoa_tools.live.session import session  # noqa: E402
@@ -26,15 +28,22 @@ SOUND = "nothing"  # is wrong with the streams
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("data", type=Path)
     parser.add_argument("--days", nargs="+", default=["0422", "0425", "0426", "0607"])
     parser.add_argument("--first", type=int, default=0, help="of the flights (default 0)")
     parser.add_argument("--count", type=int, help="of flights (default: all)")
-    parser.add_argument("--load", type=int, default=2, help="busy processes beside them (default 2)")
+    parser.add_argument(
+        "--load", type=int, default=2, help="busy processes beside them (default 2)"
+    )
     args = parser.parse_args()
     flights = flights_of(args.data, args.days)[args.first :][: args.count]
-    print("| flight | s | reports | with a warning about streams | TDOAs late | lost | what they say |")
+    print(
+        "| flight | s | reports | with a warning about streams | TDOAs late | lost | what "
+        "they say |"
+    )
     print("|---|---|---|---|---|---|---|")
     with ExitStack() as stack:
         for _ in range(args.load):
@@ -50,12 +59,19 @@ def row(flight):
     with tempfile.TemporaryDirectory() as folder:
         write_bag(flight, Path(folder) / "flight.bag")
         reports = heard(Path(folder) / "flight.bag", Path(folder))
-    troubles = [values["wrong with the streams"] for values in reports if values["wrong with the streams"] != SOUND]
+    troubles = [
+        values["wrong with the streams"]
+        for values in reports
+        if values["wrong with the streams"] != SOUND
+    ]
     last = reports[-1]
     lost = sum(int(text) for key, text in last.items() if key.startswith("lost on"))
     said = "; ".join(dict.fromkeys(troubles)) or SOUND
     seconds = flight.tdoa.t[-1] - flight.tdoa.t[0]
-    return f"| {flight.name} | {seconds:.0f} | {len(reports)} | {len(troubles)} | {last['late']} | {lost} | {said} |"
+    return (
+        f"| {flight.name} | {seconds:.0f} | {len(reports)} | {len(troubles)} | {last['late']} | "
+        f"{lost} | {said} |"
+    )
 
 
 def heard(bag, folder):
@@ -75,7 +91,13 @@ def heard(bag, folder):
             processes.start(package, name)
         wait(READY_LIMIT, "the nodes", processes, node, lambda: all(hearing.values()))
         replay = processes.start("uwb_tdoa_tools", "replay", bag, may_end_with=(0,))
-        wait(READY_LIMIT, "the first messages", processes, node, lambda: reports[-1]["TDOAs received"] != "0")
+        wait(
+            READY_LIMIT,
+            "the first messages",
+            processes,
+            node,
+            lambda: reports[-1]["TDOAs received"] != "0",
+        )
         first = len(reports)
         wait(None, None, processes, node, lambda: replay.poll() is not None)
     return reports[first:]

@@ -1,5 +1,6 @@
-"""Simulated flights without any effect, every effect at a small and at a large size to put into them, places known on their paths, and what
-is found by name."""
+"""Simulated flights without any effect, every effect at a small and at a large size to put into
+them, places known on their paths, and what is found by name.
+"""
 
 import numpy as np
 
@@ -21,7 +22,10 @@ SIZES = {
     "tag_lever_arm": ({"z": 0.05}, {"x": 0.1, "y": -0.1, "z": 0.2}),
     "tdoa_time_offset": ({"offset": 0.01}, {"offset": 0.05}),
     "truth_time_offset": ({"offset": 0.01}, {"offset": 0.05}),
-    "truth_frame": ({"z": 0.04}, {"x": 0.1, "y": 0.1, "z": 0.1, "roll": 0.02, "pitch": 0.02, "yaw": 0.05}),
+    "truth_frame": (
+        {"z": 0.04},
+        {"x": 0.1, "y": 0.1, "z": 0.1, "roll": 0.02, "pitch": 0.02, "yaw": 0.05},
+    ),
     "range_offset": ({"N": 0.05}, {"N": 0.3}),
     "range_delay": ({"offset": 0.02}, {"offset": 0.05}),
     "range_scale": ({"scale": 0.01}, {"scale": 0.05}),
@@ -29,10 +33,19 @@ SIZES = {
     "received_power_bias": ({"scale": 0.5}, {"scale": 2.0}),
     "antenna_pattern": ({"tag": 0.08}, {"tag": 0.3, "anchor": 0.3}),
     "anchor_clock_drift": ({"N": 0.0015}, {"N": 0.01}),
-    "nlos": ({"N.delay": 0.15, "N.start": 20.0, "N.end": 32.0}, {"N.delay": 0.6, "N.start": 20.0, "N.end": 32.0}),
+    "nlos": (
+        {"N.delay": 0.15, "N.start": 20.0, "N.end": 32.0},
+        {"N.delay": 0.6, "N.start": 20.0, "N.end": 32.0},
+    ),
     "floor_multipath": (
         {"0.delay": 0.8, "2.delay": 0.8, "0.height": 0.15, "2.height": 0.15},
-        {"0.delay": 3.3, "2.delay": 2.8, "5.delay": 3.6, "7.delay": 3.3, **{f"{i}.height": 0.15 for i in (0, 2, 5, 7)}},
+        {
+            "0.delay": 3.3,
+            "2.delay": 2.8,
+            "5.delay": 3.6,
+            "7.delay": 3.3,
+            **{f"{i}.height": 0.15 for i in (0, 2, 5, 7)},
+        },
     ),
     "gyro_bias": ({"z": 0.005}, {"x": 0.03, "y": -0.03, "z": 0.05}),
     "gyro_scale": ({"z": 0.03}, {"z": 0.1}),
@@ -46,24 +59,33 @@ SIZES = {
     "height_offset": ({"offset": 0.02}, {"offset": 0.1}),
     "height_scale": ({"scale": 0.02}, {"scale": 0.1}),
     "floor_step": (
-        {"1.height": 0.1, "1.start": 20.0, "1.end": 32.0}, {"1.height": 0.5, "1.start": 20.0, "1.end": 32.0},
+        {"1.height": 0.1, "1.start": 20.0, "1.end": 32.0},
+        {"1.height": 0.5, "1.start": 20.0, "1.end": 32.0},
     ),
     "barometer_drift": ({"rate": 0.01}, {"rate": 0.05}),
     "velocity_scale": ({"scale": 0.03}, {"scale": 0.15}),
     "velocity_misalignment": ({"yaw": 0.03}, {"yaw": 0.3}),
     "velocity_delay": ({"offset": 0.04}, {"offset": 0.15}),
     "velocity_slip": (
-        {"1.share": 0.3, "1.start": 20.0, "1.end": 26.0}, {"1.share": 1.0, "1.start": 20.0, "1.end": 26.0},
+        {"1.share": 0.3, "1.start": 20.0, "1.end": 26.0},
+        {"1.share": 1.0, "1.start": 20.0, "1.end": 26.0},
     ),
-}  # fmt: skip
-AIDED = tuple(name for name in SIZES if set(EFFECTS[name].channels) <= set(BY_POSE))  # effects on height, pressure, velocity
-RANGED = "range_offset", "range_delay"  # effects on ranges alone, of which `study diagnose-ranges` tells
+}
+AIDED = tuple(
+    name for name in SIZES if set(EFFECTS[name].channels) <= set(BY_POSE)
+)  # effects on height, pressure, velocity
+RANGED = (
+    "range_offset",
+    "range_delay",
+)  # effects on ranges alone, of which `study diagnose-ranges` tells
 MARK_TIME, MARK_STD = 2.0, 0.05  # s, m
 NOISES = {"height_noise": 0.01, "pressure_noise": 0.1, "velocity_noise": 0.05}
 
 
 def clean_flight(seed, duration=50.0, aided=False, ranged=False):
-    """A simulated flight without any effect. aided : with height, pressure and velocity; ranged : with distances to anchors."""
+    """A simulated flight without any effect. aided : with height, pressure and velocity; ranged :
+    with distances to anchors.
+    """
     return simulate(
         SimulationConfig(
             seed=seed,
@@ -84,11 +106,15 @@ def effect_of(name, large, seed):
     anchor = int(rng.integers(8))
     pair = f"{anchor}-{(anchor + 1) % 8}"  # is heard in both protocols
     values = SIZES[name][int(large)]
-    return EFFECTS[name]({key.replace("N", str(anchor)).replace("P", pair): value for key, value in values.items()})
+    return EFFECTS[name](
+        {key.replace("N", str(anchor)).replace("P", pair): value for key, value in values.items()}
+    )
 
 
 def marks_of(flight, count, rng):
-    """[Mark] at places of the ground truth, MARK_TIME long, evenly over the airborne part, MARK_STD off."""
+    """[Mark] at places of the ground truth, MARK_TIME long, evenly over the airborne part, MARK_STD
+    off.
+    """
     truth, (begin, end) = flight.truth, judged_part(flight.truth)[1:]
     out = []
     for first in np.linspace(begin + MARK_TIME, end - 2.0 * MARK_TIME, count):
@@ -107,4 +133,6 @@ def names_found(attribution):
         key=lambda f: -f.evidence.get("held_out_gain", f.evidence.get("standard_errors", 0.0)),
     )
     unnamed = [finding.effect for finding in findings if not finding.declared]
-    return [f.effect.name for f in declared] + [f"{effect.channel}/{effect.covariate}" for effect in unnamed]
+    return [f.effect.name for f in declared] + [
+        f"{effect.channel}/{effect.covariate}" for effect in unnamed
+    ]

@@ -1,15 +1,19 @@
-"""A vehicle_node and the nodes that it flies by, as processes, and a node of the test that asks and listens."""
+"""A vehicle_node and the nodes that it flies by, as processes, and a node of the test that asks and
+listens.
+"""
 
 from contextlib import contextmanager
 import json
 
 from nav_msgs.msg import Odometry
 from std_msgs.msg import String
+
 from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS
 from uwb_tdoa_tools.live.processes import Processes, own_domain, wait
 from uwb_tdoa_tools.live.session import session
 
-PATIENCE = 400.0  # s for anything that must happen; the very first start compiles the filter and the vehicle
+# s for anything that must happen; the very first start compiles the filter and the vehicle
+PATIENCE = 400.0
 
 
 class Hall:
@@ -19,7 +23,12 @@ class Hall:
         self.verdicts, self.odometry, self.node = [], None, node
         self._processes = processes
         self._ends = [
-            node.create_subscription(String, "verdict", lambda message: self.verdicts.append(json.loads(message.data)), ANCHORS_QOS),
+            node.create_subscription(
+                String,
+                "verdict",
+                lambda message: self.verdicts.append(json.loads(message.data)),
+                ANCHORS_QOS,
+            ),
             node.create_subscription(Odometry, "odometry", self._on_odometry, 10),
         ]
 
@@ -41,7 +50,9 @@ class Hall:
 
 @contextmanager
 def hall(folder, *parameters, ekf=()):
-    """A Hall with all nodes, on simulated time, while the block lasts. parameters, ekf : NAME:=VALUE, of vehicle_node and ekf_node."""
+    """A Hall with all nodes, on simulated time, while the block lasts. parameters, ekf :
+    NAME:=VALUE, of vehicle_node and ekf_node.
+    """
     with own_domain(), session("test", []) as (node, stop), Processes(folder, stop) as processes:
         told = {
             ("uwb_tdoa_bias", "bias_node"): ["use_sim_time:=true"],
@@ -50,5 +61,7 @@ def hall(folder, *parameters, ekf=()):
         }
         for (package, name), values in told.items():
             arguments = ["--ros-args", *(word for value in values for word in ("-p", value))]
-            processes.start(package, name, *arguments, may_end_with=(0, 1) if "mission:=true" in values else ())
+            processes.start(
+                package, name, *arguments, may_end_with=(0, 1) if "mission:=true" in values else ()
+            )
         yield Hall(node, processes)

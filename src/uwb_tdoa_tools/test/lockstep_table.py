@@ -1,6 +1,7 @@
-"""Makes the table of replays in step in docs/reliability.md, in a shell with the workspace sourced (./dev shell):
+"""Makes the table of replays in step in docs/reliability.md, in a shell with the workspace sourced
+(./dev shell):
 
-    python src/uwb_tdoa_tools/test/lockstep_table.py LOG SURVEY --runs 10 --from 10 --seconds 8
+python src/uwb_tdoa_tools/test/lockstep_table.py LOG SURVEY --runs 10 --from 10 --seconds 8
 """
 
 import argparse
@@ -17,6 +18,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from test_lockstep import replayed  # noqa: E402
 from time_offset_table import cut  # noqa: E402
+
 from uwb_tdoa_bias.correction.network import SHIPPED, load_network  # noqa: E402
 from uwb_tdoa_bias.foundation.flight import Truth  # noqa: E402
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag  # noqa: E402
@@ -26,37 +28,62 @@ from uwb_tdoa_tools.scoring.metrics import Score  # noqa: E402
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("log")
     parser.add_argument("survey")
-    parser.add_argument("--from", dest="begin", type=float, default=0.0, help="s after the first TDOA (default 0)")
-    parser.add_argument("--seconds", type=float, default=np.inf, help="of the flight (default: all)")
+    parser.add_argument(
+        "--from", dest="begin", type=float, default=0.0, help="s after the first TDOA (default 0)"
+    )
+    parser.add_argument(
+        "--seconds", type=float, default=np.inf, help="of the flight (default: all)"
+    )
     parser.add_argument("--runs", type=int, default=3, help="of each rate and load (default 3)")
     parser.add_argument("--rates", type=float, nargs="+", default=[1, 2, 4, 8])
-    parser.add_argument("--loads", type=int, nargs="+", default=[0, 1, 3], help="busy processes beside it")
+    parser.add_argument(
+        "--loads", type=int, nargs="+", default=[0, 1, 3], help="busy processes beside it"
+    )
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         bag = Path(folder) / "flight.bag"
         flight = cut(read_flight(args.log, args.survey), args.begin, args.begin + args.seconds)
         judged = (flight.truth.t >= flight.tdoa.t[0]) & (flight.truth.t <= flight.tdoa.t[-1])
-        write_bag(replace(flight, truth=Truth(*(column[judged] for column in vars(flight.truth).values()))), bag)
+        write_bag(
+            replace(
+                flight, truth=Truth(*(column[judged] for column in vars(flight.truth).values()))
+            ),
+            bag,
+        )
         flight = read_bag(bag)
         score, offline = evaluate(flight, network=load_network(SHIPPED))
         rmse = score.row()["rmse_3d"]
-        print(f"offline {rmse:.4f} m, {len(offline.odometry)} poses; of all runs the largest figure, of the times the median")
-        print("| rate | load | runs | exit code not 0 | late | 3D RMSE - offline, mm | poses not recorded | others apart by, mm | s |")
+        print(
+            f"offline {rmse:.4f} m, {len(offline.odometry)} poses; of all runs the largest "
+            "figure, of the times the median"
+        )
+        print(
+            "| rate | load | runs | exit code not 0 | late | 3D RMSE - offline, mm | poses "
+            "not recorded | others apart by, mm | s |"
+        )
         print("|---|---|---|---|---|---|---|---|---|")
         for load in args.loads:
             for rate in args.rates:
-                rows = np.array([run(bag, flight, rate, load, rmse, offline.odometry) for _ in range(args.runs)])
+                rows = np.array(
+                    [run(bag, flight, rate, load, rmse, offline.odometry) for _ in range(args.runs)]
+                )
                 codes, late, rmse_apart, missing, apart = np.abs(rows).max(axis=0)[:5]
-                cells = f"{np.count_nonzero(rows[:, 0])} | {late:.0f} | {rmse_apart:.2f} | {missing:.0f} | {apart:.3f} | {np.median(rows[:, 5]):.1f}"
+                cells = (
+                    f"{np.count_nonzero(rows[:, 0])} | {late:.0f} | {rmse_apart:.2f} | "
+                    f"{missing:.0f} | {apart:.3f} | {np.median(rows[:, 5]):.1f}"
+                )
                 print(f"| {rate:g} | {load} | {args.runs} | {cells} |", flush=True)
 
 
 def run(bag, flight, rate, load, rmse, offline):
-    """(exit code, TDOAs late, mm of RMSE from the offline one, poses of the offline Odometry that were not recorded, mm of the others
-    from it at most, s that the replay took) of one replay."""
+    """(exit code, TDOAs late, mm of RMSE from the offline one, poses of the offline Odometry that
+    were not recorded, mm of the others from it at most, s that the replay took) of one replay.
+    """
     with ExitStack() as stack, tempfile.TemporaryDirectory() as folder:
         for _ in range(load):
             process = subprocess.Popen([sys.executable, "-c", "while True: pass"])

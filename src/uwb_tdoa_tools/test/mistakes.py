@@ -1,5 +1,6 @@
-"""Mistakes of drivers, surveys and clocks, put into recordings: what each does to the streams, and by what name it is
-found."""
+"""Mistakes of drivers, surveys and clocks, put into recordings: what each does to the streams, and
+by what name it is found.
+"""
 
 from dataclasses import dataclass, replace
 
@@ -11,14 +12,18 @@ from uwb_tdoa_bias.foundation.flight import Imu, Tdoas
 from uwb_tdoa_tools.checking.recording import IMU, TDOA
 
 MISTAKES = {}
-LATENCY, JITTER = 2e-3, 1e-3  # s, of a message on its way, the least and the mean of what comes on top
+LATENCY, JITTER = (
+    2e-3,
+    1e-3,
+)  # s, of a message on its way, the least and the mean of what comes on top
 
 
 @dataclass(frozen=True)
 class Mistake:
-    """text : for the table; named : rules of `check` that name it; needs : "imu", "tdoa3", "rooms" (other surveys) or
-    ""; make : callable of (Recording, Generator, other Recording of the same room or None) -> Recording; alone : no
-    other survey may be tried."""
+    """text : for the table; named : rules of `check` that name it; needs : "imu", "tdoa3", "rooms"
+    (other surveys) or ""; make : callable of (Recording, Generator, other Recording of the same
+    room or None) -> Recording; alone : no other survey may be tried.
+    """
 
     text: str
     named: tuple
@@ -38,8 +43,9 @@ def mistake(text, *named, needs="", alone=False):
 
 
 def arriving(recording, seed):
-    """The Recording with arrival times: every message a few milliseconds after its stamp, none before the one before
-    it."""
+    """The Recording with arrival times: every message a few milliseconds after its stamp, none
+    before the one before it.
+    """
     rng = np.random.default_rng([seed, 1])
     out = {"tdoa_arrival": _arrival(recording.tdoa.t, rng)}
     if recording.imu is not None:
@@ -62,13 +68,17 @@ def _imu(recording, rows=slice(None), **columns):
     """The same of the inertial samples."""
     imu = replace(recording.imu, **columns)
     return replace(
-        recording, imu=Imu(imu.t[rows], imu.gyro[rows], imu.accel[rows]), imu_arrival=recording.imu_arrival[rows]
+        recording,
+        imu=Imu(imu.t[rows], imu.gyro[rows], imu.accel[rows]),
+        imu_arrival=recording.imu_arrival[rows],
     )
 
 
 def _moved(recording, positions, rows=slice(None)):
     anchors = recording.anchors
-    return replace(recording, anchors=Anchors(anchors.ids[rows], positions[rows], anchors.orientations[rows]))
+    return replace(
+        recording, anchors=Anchors(anchors.ids[rows], positions[rows], anchors.orientations[rows])
+    )
 
 
 # The values of the TDOAs
@@ -125,7 +135,9 @@ def clipped(recording, rng, other):
 
 @mistake("every tenth TDOA is not a number", "tdoa_invalid")
 def not_finite(recording, rng, other):
-    return _tdoa(recording, d=np.where(np.arange(len(recording.tdoa)) % 10 == 0, np.nan, recording.tdoa.d))
+    return _tdoa(
+        recording, d=np.where(np.arange(len(recording.tdoa)) % 10 == 0, np.nan, recording.tdoa.d)
+    )
 
 
 @mistake("published twice", "tdoa_twice")
@@ -143,8 +155,14 @@ def by_timer(recording, rng, other):
     d = np.zeros(len(t))
     for k in common:
         mine, due = np.flatnonzero(inverse.reshape(-1) == k), turn == k
-        d[due] = tdoa.d[mine[np.maximum(np.searchsorted(tdoa.t[mine], t[due], side="right") - 1, 0)]]
-    made = replace(recording, tdoa=Tdoas(t, pairs[turn, 0], pairs[turn, 1], d), tdoa_arrival=np.full(len(t), np.nan))
+        d[due] = tdoa.d[
+            mine[np.maximum(np.searchsorted(tdoa.t[mine], t[due], side="right") - 1, 0)]
+        ]
+    made = replace(
+        recording,
+        tdoa=Tdoas(t, pairs[turn, 0], pairs[turn, 1], d),
+        tdoa_arrival=np.full(len(t), np.nan),
+    )
     return arriving(made, 3) if np.isfinite(recording.tdoa_arrival).any() else made
 
 
@@ -204,7 +222,13 @@ def another_room(recording, rng, other):
     return replace(recording, anchors=other)
 
 
-@mistake("survey of another room, no other at hand", "survey_misfit", "anchor_moved", needs="rooms", alone=True)
+@mistake(
+    "survey of another room, no other at hand",
+    "survey_misfit",
+    "anchor_moved",
+    needs="rooms",
+    alone=True,
+)
 def another_room_alone(recording, rng, other):
     return replace(recording, anchors=other)
 
@@ -261,7 +285,11 @@ def gyro_sign(recording, rng, other):
 
 @mistake("y of both sensors with the other sign (left-handed)", "imu_axes", needs="imu")
 def left_handed(recording, rng, other):
-    return _imu(recording, gyro=recording.imu.gyro * [1.0, -1.0, 1.0], accel=recording.imu.accel * [1.0, -1.0, 1.0])
+    return _imu(
+        recording,
+        gyro=recording.imu.gyro * [1.0, -1.0, 1.0],
+        accel=recording.imu.accel * [1.0, -1.0, 1.0],
+    )
 
 
 @mistake("x and y of the gyroscope exchanged", "imu_axes", needs="imu")
@@ -298,13 +326,18 @@ def shaking(recording, rng, other):
 
 @mistake("IMU in the frame imu_link, no transform", "frame_unknown", needs="imu")
 def unknown_frame(recording, rng, other):
-    return replace(recording, frames={TDOA: {"base_link": len(recording.tdoa)}, IMU: {"imu_link": len(recording.imu)}})
+    return replace(
+        recording,
+        frames={TDOA: {"base_link": len(recording.tdoa)}, IMU: {"imu_link": len(recording.imu)}},
+    )
 
 
 @mistake("IMU turned by 90 degrees about z, as /tf_static says", "frame_turned", needs="imu")
 def turned_frame(recording, rng, other):
     quarter = Rotation.from_euler("z", 90.0, degrees=True)
-    return replace(unknown_frame(recording, rng, other), places={"imu_link": (quarter, np.zeros(3))})
+    return replace(
+        unknown_frame(recording, rng, other), places={"imu_link": (quarter, np.zeros(3))}
+    )
 
 
 # Stamps

@@ -1,5 +1,6 @@
-"""What the monitor of ekf_node names on measured flights, and what it names on flights that nothing was put into: the
-figures of docs/reliability.md. The same filter and monitor as in the node, off line.
+"""What the monitor of ekf_node names on measured flights, and what it names on flights that nothing
+was put into: the figures of docs/reliability.md. The same filter and monitor as in the node, off
+line.
 
 python src/uwb_tdoa_tools/test/monitor_table.py DATA --days 0426 0607
 """
@@ -58,13 +59,22 @@ def silenced(flight, ids, since):
 
 def exchanged(flight, ids, since):
     """The Flight in which two anchors have each other's id from a stamp on."""
+
     def other(column):
-        return np.where(flight.tdoa.t < since, column, np.where(column == ids[0], ids[1], np.where(column == ids[1], ids[0], column)))
+        return np.where(
+            flight.tdoa.t < since,
+            column,
+            np.where(column == ids[0], ids[1], np.where(column == ids[1], ids[0], column)),
+        )
 
-    return replace(flight, tdoa=replace(flight.tdoa, a=other(flight.tdoa.a), b=other(flight.tdoa.b)))
+    return replace(
+        flight, tdoa=replace(flight.tdoa, a=other(flight.tdoa.a), b=other(flight.tdoa.b))
+    )
 
 
-EVENTS = {  # what is put into flights, and what is to be said of anchors, first {} and second {}, within EVENT_LIMIT
+# what is put into flights, and what is to be said of anchors, first {} and second {}, within
+# EVENT_LIMIT
+EVENTS = {
     "silent": (silenced, "anchor {0} is not heard any more"),
     "exchanged": (exchanged, "two anchors are exchanged, {0} and {1}"),
 }
@@ -72,11 +82,15 @@ EVENT_LIMIT = 5.0  # s
 
 
 def run(flight, config):
-    """[(s, sentences)], every STEP, and (t (n,) s, p (n, 3) m) of a Flight: off line, which is what live gives."""
+    """[(s, sentences)], every STEP, and (t (n,) s, p (n, 3) m) of a Flight: off line, which is what
+    live gives.
+    """
     result, monitor, said = run_offline(flight, config), Monitor(flight.anchors), []
     odometry, residuals = (_by_stamp(part) for part in (result.odometry, result.residuals))
     low = -np.inf
-    for until in np.arange((np.floor(flight.tdoa.t[0] / STEP) + 1.0) * STEP, flight.tdoa.t[-1] + STEP, STEP):
+    for until in np.arange(
+        (np.floor(flight.tdoa.t[0] / STEP) + 1.0) * STEP, flight.tdoa.t[-1] + STEP, STEP
+    ):
         monitor.add(*(_between(part, low, until) for part in (odometry, residuals)))
         monitor.update(until)
         said.append((until, monitor.alarms))
@@ -99,11 +113,15 @@ def error_of(flight, track, low, high):
     """RMSE, m, between two stamps."""
     t, p = track
     inside = (t >= low) & (t < high)
-    return float(np.sqrt(np.nanmean(np.sum((p[inside] - position_at(t[inside], flight.truth)) ** 2, axis=1))))
+    return float(
+        np.sqrt(np.nanmean(np.sum((p[inside] - position_at(t[inside], flight.truth)) ** 2, axis=1)))
+    )
 
 
 def delays_at_truth(flight):
-    """(t (n,) s, delays (n, N) m): as the monitor reduces them, by half seconds in the air, but at the ground truth."""
+    """(t (n,) s, delays (n, N) m): as the monitor reduces them, by half seconds in the air, but at
+    the ground truth.
+    """
     tdoa, (begin, end), positions = flight.tdoa, airborne(flight), flight.anchors.positions
     a, b = flight.anchors.index(tdoa.a), flight.anchors.index(tdoa.b)
     p = position_at(tdoa.t, flight.truth)
@@ -111,7 +129,11 @@ def delays_at_truth(flight):
     known, t, out = np.isfinite(error), np.arange(begin, end, LENGTH), []
     for low in t:
         now = known & (tdoa.t >= low) & (tdoa.t < low + LENGTH)
-        piece = reduced(low, p[now].mean(axis=0), positions, a[now], b[now], error[now]) if now.any() else None
+        piece = (
+            reduced(low, p[now].mean(axis=0), positions, a[now], b[now], error[now])
+            if now.any()
+            else None
+        )
         out.append(np.full(len(positions), np.nan))
         if piece is not None:
             out[-1][piece.rows] = piece.delays
@@ -119,18 +141,25 @@ def delays_at_truth(flight):
 
 
 def borne_out(flight, t, sentence):
-    """By how much the anchor that a sentence names, first said at t, s, is later at the ground truth in the SPAN seconds around t than
-    from 2 SPAN to SPAN before t: m, as the monitor would have it, which shrinks delays; NaN for other sentences."""
+    """By how much the anchor that a sentence names, first said at t, s, is later at the ground
+    truth in the SPAN seconds around t than from 2 SPAN to SPAN before t: m, as the monitor would
+    have it, which shrinks delays; NaN for other sentences.
+    """
     if not sentence.startswith("anchor "):
         return np.nan
     row = int(flight.anchors.index(np.array([int(sentence.split()[1].rstrip(":"))]))[0])
     at, delays = delays_at_truth(flight)
-    now, before = (at > t - 0.5 * SPAN) & (at < t + 0.5 * SPAN), (at > t - 2.0 * SPAN) & (at < t - SPAN)
+    now, before = (
+        (at > t - 0.5 * SPAN) & (at < t + 0.5 * SPAN),
+        (at > t - 2.0 * SPAN) & (at < t - SPAN),
+    )
     return float(np.nanmean(delays[now, row]) - np.nanmean(delays[before, row]))
 
 
 def clean(flights, config):
-    """Prints what is said of flights that nothing was put into, and what the ground truth says to it."""
+    """Prints what is said of flights that nothing was put into, and what the ground truth says to
+    it.
+    """
     seconds = alarmed = grounded = 0
     for flight in flights:
         said, _ = run(flight, config)
@@ -138,18 +167,34 @@ def clean(flights, config):
         seconds += end - begin
         first = next(((t, sentences[0]) for t, sentences in said if sentences), None)
         alarmed += first is not None
-        grounded += any(sentences for t, sentences in said if t < begin or (t > end and not (first and first[0] <= end)))
+        grounded += any(
+            sentences
+            for t, sentences in said
+            if t < begin or (t > end and not (first and first[0] <= end))
+        )
         if first:
             truth = borne_out(flight, *first)
-            print(f"  {flight.name}: {first[0] - begin:.1f} s in the air: {first[1]} (at the ground truth by {truth:+.2f} m)", flush=True)
-    print(f"{alarmed} of {len(flights)} unharmed flights with an alarm, {grounded} on the floor, {seconds:.0f} s in the air")
+            print(
+                (
+                    f"  {flight.name}: {first[0] - begin:.1f} s in the air: {first[1]} (at the "
+                    f"ground truth by {truth:+.2f} m)"
+                ),
+                flush=True,
+            )
+    print(
+        f"{alarmed} of {len(flights)} unharmed flights with an alarm, {grounded} on the "
+        f"floor, {seconds:.0f} s in the air"
+    )
 
 
 def faults(flights, config, draws, seed):
     """Prints how often a late anchor is named, and the errors with and without it compensated."""
     rng = np.random.default_rng(seed)
     compensating = replace(config, compensate_changes=True)
-    print("| late by, m | cases | named in time | another named first | median after, s | error, m: unharmed | harmed | compensated |")
+    print(
+        "| late by, m | cases | named in time | another named first | median after, s | "
+        "error, m: unharmed | harmed | compensated |"
+    )
     print("|---|---|---|---|---|---|---|---|")
     for size, limit in SIZES.items():
         named, wrong, after, errors = 0, 0, [], []
@@ -171,15 +216,24 @@ def faults(flights, config, draws, seed):
         ratios = np.array(errors)[:, 1:] / np.array(errors)[:, :1]
         cells = " | ".join(f"{value:.3f}" for value in np.sqrt(np.mean(np.square(errors), axis=0)))
         n = len(errors)
-        print(f"| {size} | {n} | {100 * named / n:.0f} % | {100 * wrong / n:.0f} % | {np.median(after):.1f} | {cells} |")
+        print(
+            f"| {size} | {n} | {100 * named / n:.0f} % | {100 * wrong / n:.0f} % | "
+            f"{np.median(after):.1f} | {cells} |"
+        )
         for name, column in zip(("harmed", "compensated"), ratios.T):
-            print(f"  {name} / unharmed: median {np.median(column):.2f}, at most 1.2 in {100 * np.mean(column <= 1.2):.0f} %")
+            print(
+                f"  {name} / unharmed: median {np.median(column):.2f}, at most 1.2 in "
+                f"{100 * np.mean(column <= 1.2):.0f} %"
+            )
 
 
 def events(flights, config, draws, seed):
     """Prints how often a silent anchor, and two that were exchanged, are named."""
     rng = np.random.default_rng(seed)
-    print(f"| anchors | cases | named within {EVENT_LIMIT:g} s | something else named first | median after, s |\n|---|---|---|---|---|")
+    print(
+        f"| anchors | cases | named within {EVENT_LIMIT:g} s | something else named first | "
+        "median after, s |\n|---|---|---|---|---|"
+    )
     for name, (change, sentence) in EVENTS.items():
         after, wrong, n = [], 0, 0
         for row in range(min(len(flight.anchors) for flight in flights)):
@@ -188,22 +242,49 @@ def events(flights, config, draws, seed):
                 begin, end = airborne(flight)
                 since = begin + (end - begin) * rng.uniform(*MIDDLE)
                 other = rng.choice(np.delete(np.arange(len(flight.anchors)), row))
-                ids = flight.anchors.ids[sorted([row, other]) if name == "exchanged" else [row, other]]
-                said, _ = run(cut(change(flight, ids, since), 0.0, since + EVENT_LIMIT + STEP - flight.tdoa.t[0]), config)
+                ids = flight.anchors.ids[
+                    sorted([row, other]) if name == "exchanged" else [row, other]
+                ]
+                said, _ = run(
+                    cut(
+                        change(flight, ids, since),
+                        0.0,
+                        since + EVENT_LIMIT + STEP - flight.tdoa.t[0],
+                    ),
+                    config,
+                )
                 told = next(((t, s[0]) for t, s in said if t > since and s), (np.inf, ""))
                 n += 1
-                right = told[1].startswith(sentence.format(*ids)) and told[0] - since <= EVENT_LIMIT + STEP
+                right = (
+                    told[1].startswith(sentence.format(*ids))
+                    and told[0] - since <= EVENT_LIMIT + STEP
+                )
                 after += [told[0] - since] if right else []
                 wrong += bool(told[1]) and not told[1].startswith(sentence.format(*ids))
-        print(f"| {name} | {n} | {100 * len(after) / n:.0f} % | {100 * wrong / n:.0f} % | {np.median(after):.1f} |", flush=True)
+        print(
+            (
+                f"| {name} | {n} | {100 * len(after) / n:.0f} % | {100 * wrong / n:.0f} % | "
+                f"{np.median(after):.1f} |"
+            ),
+            flush=True,
+        )
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("data", type=Path)
     parser.add_argument("--days", nargs="+", default=["0422", "0425", "0426", "0607"])
-    parser.add_argument("--draws", type=int, default=10, help="of flight and time, for each anchor; 0: unharmed flights alone")
-    parser.add_argument("--events", action="store_true", help="anchors that are silent or exchanged, instead of late ones")
+    parser.add_argument(
+        "--draws",
+        type=int,
+        default=10,
+        help="of flight and time, for each anchor; 0: unharmed flights alone",
+    )
+    parser.add_argument(
+        "--events",
+        action="store_true",
+        help="anchors that are silent or exchanged, instead of late ones",
+    )
     parser.add_argument("--seed", type=int, default=1)
     arguments = parser.parse_args()
     flights = flights_of(arguments.data, arguments.days)

@@ -1,5 +1,6 @@
-"""Who hears whom on two machines, by what each is told: the table of docs/ros.md. The machines are two network namespaces of this
-one, joined by a virtual cable, for which it takes root. In a shell with the workspace sourced (./dev shell):
+"""Who hears whom on two machines, by what each is told: the table of docs/ros.md. The machines are
+two network namespaces of this one, joined by a virtual cable, for which it takes root. In a shell
+with the workspace sourced (./dev shell):
 
 python src/uwb_tdoa_tools/test/network_table.py
 """
@@ -12,11 +13,20 @@ import sys
 ROBOT, HERE = (f"uwb{os.getpid()}{side}" for side in "ab")
 ADDRESS = {ROBOT: "10.99.0.1", HERE: "10.99.0.2"}
 RANGE = "ROS_AUTOMATIC_DISCOVERY_RANGE"
-LOCALHOST, SUBNET, PEER = f"{RANGE}=LOCALHOST", f"{RANGE}=SUBNET", f"ROS_STATIC_PEERS={ADDRESS[ROBOT]}"
+LOCALHOST, SUBNET, PEER = (
+    f"{RANGE}=LOCALHOST",
+    f"{RANGE}=SUBNET",
+    f"ROS_STATIC_PEERS={ADDRESS[ROBOT]}",
+)
 CASES = [  # what the robot is told, and what we are
-    ((), ()), ((LOCALHOST,), (LOCALHOST,)), ((SUBNET,), (LOCALHOST,)), ((SUBNET,), (SUBNET,)), ((LOCALHOST,), (LOCALHOST, PEER)),
-    ((SUBNET, "ROS_DOMAIN_ID=3"), (SUBNET, "ROS_DOMAIN_ID=4")), ((SUBNET, "ROS_DOMAIN_ID=3"), (SUBNET, "ROS_DOMAIN_ID=3")),
-]  # fmt: skip
+    ((), ()),
+    ((LOCALHOST,), (LOCALHOST,)),
+    ((SUBNET,), (LOCALHOST,)),
+    ((SUBNET,), (SUBNET,)),
+    ((LOCALHOST,), (LOCALHOST, PEER)),
+    ((SUBNET, "ROS_DOMAIN_ID=3"), (SUBNET, "ROS_DOMAIN_ID=4")),
+    ((SUBNET, "ROS_DOMAIN_ID=3"), (SUBNET, "ROS_DOMAIN_ID=3")),
+]
 TALK = """
 import rclpy, time
 from uwb_tdoa_msgs.msg import Tdoa
@@ -43,13 +53,27 @@ print("heard" if heard else "not heard in 10 s")
 @contextmanager
 def cable():
     """Two network namespaces that are joined."""
+
     def ip(*words):
         subprocess.run(["ip", *words], check=True)
 
     try:
         for name in ADDRESS:
             ip("netns", "add", name)
-        ip("link", "add", "cable", "netns", ROBOT, "type", "veth", "peer", "name", "cable", "netns", HERE)
+        ip(
+            "link",
+            "add",
+            "cable",
+            "netns",
+            ROBOT,
+            "type",
+            "veth",
+            "peer",
+            "name",
+            "cable",
+            "netns",
+            HERE,
+        )
         for name, address in ADDRESS.items():
             ip("-n", name, "addr", "add", f"{address}/24", "dev", "cable")
             for device in ("lo", "cable"):
@@ -63,7 +87,11 @@ def cable():
 def started(name, told, body):
     """A process in a namespace, with these variables and no others of ROS's network."""
     words = ["ip", "netns", "exec", name, "env", "-u", RANGE, "-u", "ROS_DOMAIN_ID", *told]
-    return subprocess.Popen([*words, sys.executable, "-c", TALK.format(name=name, body=body)], stdout=subprocess.PIPE, text=True)
+    return subprocess.Popen(
+        [*words, sys.executable, "-c", TALK.format(name=name, body=body)],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
 
 
 if __name__ == "__main__":
@@ -74,5 +102,7 @@ if __name__ == "__main__":
             said = here.communicate()[0].strip()
             robot.kill()
             robot.communicate()
-            told = (", ".join(f"`{word}`" for word in words) or "nothing" for words in (robots, ours))
+            told = (
+                ", ".join(f"`{word}`" for word in words) or "nothing" for words in (robots, ours)
+            )
             print("|", " | ".join([*told, said]), "|", flush=True)

@@ -1,10 +1,13 @@
-"""What nodes do with messages that no driver should send: python src/uwb_tdoa_tools/test/odd_messages.py 10000
+"""What nodes do with messages that no driver should send: python
+src/uwb_tdoa_tools/test/odd_messages.py 10000
 
-Messages of every type that a node takes, so many on each topic, changed at random: numbers that are none, huge, tiny or negative, ids
-and stamps of anything, long names; then, as bytes, cut off, longer, of a type without its last 8 bytes, bits turned over, of another
-encoding, noise. In between come whole ones. No node may end; every message of a stream is received or counted as unreadable, every
-other one that cannot be read is counted; memory stays what it was. Then as many requests of every service of each node, those for
-parameters too, with values that are odd: each is answered. With them come odd messages to those nodes that count none.
+Messages of every type that a node takes, so many on each topic, changed at random: numbers that are
+none, huge, tiny or negative, ids and stamps of anything, long names; then, as bytes, cut off,
+longer, of a type without its last 8 bytes, bits turned over, of another encoding, noise. In between
+come whole ones. No node may end; every message of a stream is received or counted as unreadable,
+every other one that cannot be read is counted; memory stays what it was. Then as many requests of
+every service of each node, those for parameters too, with values that are odd: each is answered.
+With them come odd messages to those nodes that count none.
 """
 
 import argparse
@@ -18,14 +21,23 @@ import sys
 import tempfile
 import time
 
-from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped, TwistWithCovarianceStamped
+from geometry_msgs.msg import (
+    PoseWithCovarianceStamped,
+    TransformStamped,
+    TwistWithCovarianceStamped,
+)
 from nav_msgs.msg import Odometry
 import numpy as np
-import rclpy
 from rcl_interfaces.msg import Parameter
 from rcl_interfaces.srv import (
-    DescribeParameters, GetParameters, GetParameterTypes, ListParameters, SetParameters, SetParametersAtomically,
-)  # fmt: skip
+    DescribeParameters,
+    GetParameters,
+    GetParameterTypes,
+    ListParameters,
+    SetParameters,
+    SetParametersAtomically,
+)
+import rclpy
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
@@ -33,6 +45,7 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import FluidPressure, Imu, Range
 from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
+
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.ros_anchors import anchors_to_message
 from uwb_tdoa_bias.foundation.ros_cdr import Unreadable, decode
@@ -48,43 +61,78 @@ from uwb_tdoa_tools.live.session import answer_of
 RCLError = rclpy_implementation.RCLError
 CORPUS = Path(__file__).parent / "fuzz" / "corpus"
 ALIGNED = 4  # bytes; the middleware fills up to that, so that other lengths arrive longer
-SHORTEST = 4  # bytes; after an empty message Fast DDS delivers nothing more of a reliable publisher, to whomever
+# bytes; after an empty message Fast DDS delivers nothing more of a reliable publisher, to whomever
+SHORTEST = 4
 PATIENCE = 60.0  # s
 LATCHED = "uwb/anchors", "/tf_static", "status"
 EXTREME = np.nan, np.inf, -np.inf, 1e308, -1e308, 1e150, 1e16, 1e-320, 0.0, -1.0
 STREAMS = {  # of each node: topic, type, and what counts those that could be read
     "ekf_node": {
-        "imu/data": (Imu, "IMU samples received"), "uwb/tdoa_corrected": (TdoaCorrected, "TDOAs received"),
-        "height": (Range, "height_received"), "pressure": (FluidPressure, "pressure_received"),
-        "velocity": (TwistWithCovarianceStamped, "velocity_received"), "velocity/odometry": (Odometry, "velocity_received"),
+        "imu/data": (Imu, "IMU samples received"),
+        "uwb/tdoa_corrected": (TdoaCorrected, "TDOAs received"),
+        "height": (Range, "height_received"),
+        "pressure": (FluidPressure, "pressure_received"),
+        "velocity": (TwistWithCovarianceStamped, "velocity_received"),
+        "velocity/odometry": (Odometry, "velocity_received"),
     },
     "bias_node": {"uwb/tdoa": (Tdoa, "received"), "odometry": (Odometry, "poses")},
     "debias_node": {"odometry": (Odometry, "received")},
-}  # fmt: skip
+}
 SINGLE = {
     "ekf_node": {
-        "uwb/anchors": AnchorArray, "/tf_static": TFMessage, "/tf": TFMessage, "initialpose": PoseWithCovarianceStamped,
+        "uwb/anchors": AnchorArray,
+        "/tf_static": TFMessage,
+        "/tf": TFMessage,
+        "initialpose": PoseWithCovarianceStamped,
     },
     "bias_node": {"uwb/anchors": AnchorArray, "/tf_static": TFMessage},
     "debias_node": {},
-}  # fmt: skip
-UNCOUNTED = {"vehicle_node": {"odometry": Odometry, "status": EstimatorStatus}}  # topics, beside requests
-PACKAGES = nodes.PACKAGES | {"debias_node": "uwb_tdoa_ekf", "anchors_node": "uwb_tdoa_bias", "vehicle_node": "uwb_tdoa_tools"}
+}
+UNCOUNTED = {
+    "vehicle_node": {"odometry": Odometry, "status": EstimatorStatus}
+}  # topics, beside requests
+PACKAGES = nodes.PACKAGES | {
+    "debias_node": "uwb_tdoa_ekf",
+    "anchors_node": "uwb_tdoa_bias",
+    "vehicle_node": "uwb_tdoa_tools",
+}
 OF_PARAMETERS = {
-    "set_parameters": SetParameters, "set_parameters_atomically": SetParametersAtomically, "get_parameters": GetParameters,
-    "get_parameter_types": GetParameterTypes, "describe_parameters": DescribeParameters, "list_parameters": ListParameters,
-}  # fmt: skip
+    "set_parameters": SetParameters,
+    "set_parameters_atomically": SetParametersAtomically,
+    "get_parameters": GetParameters,
+    "get_parameter_types": GetParameterTypes,
+    "describe_parameters": DescribeParameters,
+    "list_parameters": ListParameters,
+}
 SERVICES = {
-    "ekf_node": {"ekf_node/reset": Trigger}, "bias_node": {}, "debias_node": {}, "anchors_node": {},
+    "ekf_node": {"ekf_node/reset": Trigger},
+    "bias_node": {},
+    "debias_node": {},
+    "anchors_node": {},
     "vehicle_node": {"takeoff": Takeoff, "go_to": GoTo, "land": Land},
-}  # fmt: skip
-NAMES = "use_sim_time", "frozen", "tdoa_std", "anchors_file", "map", "marker_size", "seed", "", "nothing", "x" * 5000, "\x1b[2J"
-ANCHORS = Anchors.from_positions([[0, 0, 0], [8, 0, 1], [0, 8, 2], [8, 8, 0], [0, 0, 3], [8, 0, 3], [0, 8, 3], [8, 8, 3]])
+}
+NAMES = (
+    "use_sim_time",
+    "frozen",
+    "tdoa_std",
+    "anchors_file",
+    "map",
+    "marker_size",
+    "seed",
+    "",
+    "nothing",
+    "x" * 5000,
+    "\x1b[2J",
+)
+ANCHORS = Anchors.from_positions(
+    [[0, 0, 0], [8, 0, 1], [0, 8, 2], [8, 8, 0], [0, 0, 3], [8, 0, 3], [0, 8, 3], [8, 8, 3]]
+)
 
 
 @dataclass
 class Account:
-    """sent, received, unreadable, expected : messages by topic (received: streams; expected : unreadable ones of the others);
+    """sent, received, unreadable, expected : messages by topic (received: streams; expected :
+    unreadable ones of the others);
     memory : bytes after each tenth; log : bytes."""
 
     sent: dict
@@ -96,7 +144,9 @@ class Account:
 
 
 def changed(data, rng, step=1):
-    """A message as bytes, changed at random, or as it is. step : bytes, of which its length is made a multiple."""
+    """A message as bytes, changed at random, or as it is. step : bytes, of which its length is made
+    a multiple.
+    """
     data += bytes(-len(data) % step)
     out, kind = bytearray(data), rng.random()
     if kind < 0.15:
@@ -108,7 +158,9 @@ def changed(data, rng, step=1):
     if kind < 0.45:
         return bytes(out) + rng.bytes(step * rng.integers(1, 64 // step))
     if kind < 0.55:
-        out[:4] = rng.bytes(4) if rng.random() < 0.3 else bytes([0, rng.integers(12), 0, rng.integers(4)])
+        out[:4] = (
+            rng.bytes(4) if rng.random() < 0.3 else bytes([0, rng.integers(12), 0, rng.integers(4)])
+        )
     elif kind < 0.6:
         return rng.bytes(max(SHORTEST, step * rng.integers(400 // step)))
     else:
@@ -121,7 +173,11 @@ def odd(message, rng):
     """The same message with some values that are odd, but that its type may have."""
     for name, kind in message.get_fields_and_field_types().items():
         value = getattr(message, name)
-        parts = [part for part in (value if isinstance(value, list) else [value]) if hasattr(part, "get_fields_and_field_types")]
+        parts = [
+            part
+            for part in (value if isinstance(value, list) else [value])
+            if hasattr(part, "get_fields_and_field_types")
+        ]
         for part in parts:
             odd(part, rng)
         if parts or rng.random() > 0.2:
@@ -129,11 +185,24 @@ def odd(message, rng):
         if kind == "string":
             setattr(message, name, "x" * int(rng.choice([0, 1, 200, 5000])))
         elif isinstance(value, float):
-            setattr(message, name, float(np.clip(rng.choice(EXTREME), *([-3e38, 3e38] if kind == "float" else [-np.inf, np.inf]))))
+            setattr(
+                message,
+                name,
+                float(
+                    np.clip(
+                        rng.choice(EXTREME),
+                        *([-3e38, 3e38] if kind == "float" else [-np.inf, np.inf]),
+                    )
+                ),
+            )
         elif isinstance(value, int) and not isinstance(value, bool):
             signed, bits = not kind.startswith("u"), int("".join(filter(str.isdigit, kind)) or 8)
             low, high = (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if signed else (0, 2**bits - 1)
-            setattr(message, name, (low, high, int(rng.integers(low, min(high, 2**63 - 1))))[rng.integers(3)])
+            setattr(
+                message,
+                name,
+                (low, high, int(rng.integers(low, min(high, 2**63 - 1))))[rng.integers(3)],
+            )
         elif isinstance(value, np.ndarray) and len(value):
             value[rng.integers(len(value), size=3)] = rng.choice(EXTREME, size=3)
     return message
@@ -149,7 +218,9 @@ def _message(kind, k):
         return anchors_to_message(ANCHORS)
     message = kind()
     if kind is TFMessage:
-        message.transforms = [TransformStamped(child_frame_id=child) for child in ("base_link", "imu")]
+        message.transforms = [
+            TransformStamped(child_frame_id=child) for child in ("base_link", "imu")
+        ]
         for transform in message.transforms:
             transform.header.frame_id = "odom"
             transform.header.stamp.sec = 100 + k // 100
@@ -165,10 +236,20 @@ def ordeal(name, count, folder, seed=1):
     """Account of a node that is sent `count` messages on each topic."""
     with surroundings(folder) as (node, processes):
         diagnostics, log = DiagnosticsListener(node), processes.file(name)
-        told = [part for topic in STREAMS[name] for part in ("-p", f"qos_overrides./{topic}.subscription.reliability:=reliable")]
+        told = [
+            part
+            for topic in STREAMS[name]
+            for part in ("-p", f"qos_overrides./{topic}.subscription.reliability:=reliable")
+        ]
         told += _told(name, folder)
         processes.start(PACKAGES[name], name, "--ros-args", *told)
-        wait(READY_LIMIT, f"{name} to be ready", processes, node, lambda: ready_at(name, log.read_text(errors="replace")))
+        wait(
+            READY_LIMIT,
+            f"{name} to be ready",
+            processes,
+            node,
+            lambda: ready_at(name, log.read_text(errors="replace")),
+        )
         publishers = _publishers(node, processes, diagnostics, name)
         out = _send(node, processes, publishers, name, count, np.random.default_rng(seed))
 
@@ -195,26 +276,52 @@ def _publishers(node, processes, diagnostics, name):
     """{topic: publisher} of everything that the node takes, after both ends know of each other."""
     kinds = {topic: kind for topic, (kind, _) in STREAMS[name].items()} | SINGLE[name]
     out = {topic: node.create_publisher(kind, topic, qos(topic)) for topic, kind in kinds.items()}
-    wait(PATIENCE, "it to listen", processes, node, lambda: all(p.get_subscription_count() for p in out.values()))
+    wait(
+        PATIENCE,
+        "it to listen",
+        processes,
+        node,
+        lambda: all(p.get_subscription_count() for p in out.values()),
+    )
     found = {f"publishers of {topic}" for topic in STREAMS[name]}
-    wait(PATIENCE, "the node to find us", processes, node, lambda: all(diagnostics.newest(name).get(key) == "1" for key in found))
+    wait(
+        PATIENCE,
+        "the node to find us",
+        processes,
+        node,
+        lambda: all(diagnostics.newest(name).get(key) == "1" for key in found),
+    )
     return out
 
 
 def _send(node, processes, publishers, name, count, rng):
-    """Account of what was sent: one message on each topic until the node has answered; of anchors only the last is kept."""
+    """Account of what was sent: one message on each topic until the node has answered; of anchors
+    only the last is kept.
+    """
     out = Account(dict.fromkeys(publishers, count), {}, {}, dict.fromkeys(SINGLE[name], 0), [], 0)
     client = node.create_client(GetParameters, f"/{name}/get_parameters")
     wait(PATIENCE, "the node to be found", processes, node, client.service_is_ready)
     for k in range(count):
         for topic, publisher in publishers.items():
             kind, single = publisher.msg_type, topic in SINGLE[name]
-            data = whole(kind, k, (lambda message: odd(message, rng)) if rng.random() < 0.5 else (lambda message: message))
+            data = whole(
+                kind,
+                k,
+                (lambda message: odd(message, rng))
+                if rng.random() < 0.5
+                else (lambda message: message),
+            )
             data = changed(data, rng, ALIGNED if single else 1)
             if single:
                 out.expected[topic] += not is_readable(data, kind)
             publisher.publish(data)
-        wait(PATIENCE, "an answer", processes, node, answer_of(partial(client.call_async, GetParameters.Request(names=["use_sim_time"]))))
+        wait(
+            PATIENCE,
+            "an answer",
+            processes,
+            node,
+            answer_of(partial(client.call_async, GetParameters.Request(names=["use_sim_time"]))),
+        )
         if k % max(1, count // 10) == 0:
             out.memory.append(memory(processes.pid(name)))
     return out
@@ -224,8 +331,10 @@ def wrong(account):
     """Topics whose messages are not all accounted for: {topic: sentence}."""
     out = {}
     by_counter = {}
-    for topic, received in account.received.items():  # two topics may share a counter
-        by_counter.setdefault("velocity" if topic.startswith("velocity") else topic, []).append(topic)
+    for topic, _received in account.received.items():  # two topics may share a counter
+        by_counter.setdefault("velocity" if topic.startswith("velocity") else topic, []).append(
+            topic
+        )
     for name, topics in by_counter.items():
         sent = sum(account.sent[topic] for topic in topics)
         known = account.received[topics[0]] + sum(account.unreadable[topic] for topic in topics)
@@ -266,20 +375,42 @@ def _told(name, folder):
 
 
 def request_ordeal(name, count, folder, seed=1):
-    """{service: how many of `count` odd requests were answered}, and bytes of memory after each tenth, of a node that is asked by
-    every service, and gets the messages of UNCOUNTED. A vehicle that falls ends its node, as it should: it is started again."""
+    """{service: how many of `count` odd requests were answered}, and bytes of memory after each
+    tenth, of a node that is asked by every service, and gets the messages of UNCOUNTED. A vehicle
+    that falls ends its node, as it should: it is started again.
+    """
     answered, used, rng = Counter(), [], np.random.default_rng(seed)
     while (left := count - max(answered.values(), default=0)) > 0:
         with surroundings(folder) as (node, processes):
             processes.start(PACKAGES[name], name, "--ros-args", *_told(name, folder))
-            services = {f"{name}/{service}": kind for service, kind in OF_PARAMETERS.items()} | SERVICES[name]
-            clients = {service: node.create_client(kind, f"/{service}") for service, kind in services.items()}
-            publishers = {topic: node.create_publisher(kind, topic, qos(topic)) for topic, kind in UNCOUNTED.get(name, {}).items()}
-            wait(READY_LIMIT, f"{name} to offer its services", processes, node, lambda: all(c.service_is_ready() for c in clients.values()))
+            services = {
+                f"{name}/{service}": kind for service, kind in OF_PARAMETERS.items()
+            } | SERVICES[name]
+            clients = {
+                service: node.create_client(kind, f"/{service}")
+                for service, kind in services.items()
+            }
+            publishers = {
+                topic: node.create_publisher(kind, topic, qos(topic))
+                for topic, kind in UNCOUNTED.get(name, {}).items()
+            }
+            wait(
+                READY_LIMIT,
+                f"{name} to offer its services",
+                processes,
+                node,
+                lambda: all(c.service_is_ready() for c in clients.values()),
+            )
             try:
                 for k in range(left):
                     for publisher in publishers.values():
-                        message = whole(publisher.msg_type, k, (lambda one: odd(one, rng)) if rng.random() < 0.5 else (lambda one: one))
+                        message = whole(
+                            publisher.msg_type,
+                            k,
+                            (lambda one: odd(one, rng))
+                            if rng.random() < 0.5
+                            else (lambda one: one),
+                        )
                         publisher.publish(changed(message, rng))
                     for service, client in clients.items():
                         ask = partial(client.call_async, _request(services[service], rng))
@@ -291,7 +422,9 @@ def request_ordeal(name, count, folder, seed=1):
             except LiveError:
                 if "the flight is over" not in processes.file(name).read_text(errors="replace"):
                     raise
-            assert not re.search("Traceback", processes.file(name).read_text(errors="replace")), processes.file(name)
+            assert not re.search("Traceback", processes.file(name).read_text(errors="replace")), (
+                processes.file(name)
+            )
     return answered, used
 
 
@@ -303,8 +436,12 @@ def _request(kind, rng):
         for parameter in out.parameters:
             parameter.value.type = int(rng.integers(12))
             odd(parameter.value, rng)
-            parameter.value.double_array_value = [float(one) for one in rng.choice(EXTREME, size=rng.integers(4))]
-            parameter.value.string_array_value = [str(one) for one in rng.choice(NAMES, size=rng.integers(4))]
+            parameter.value.double_array_value = [
+                float(one) for one in rng.choice(EXTREME, size=rng.integers(4))
+            ]
+            parameter.value.string_array_value = [
+                str(one) for one in rng.choice(NAMES, size=rng.integers(4))
+            ]
     elif hasattr(out, "names"):
         out.names = some
     elif hasattr(out, "prefixes"):
@@ -318,10 +455,22 @@ def clock_ordeal(count, folder, seed=1):
     with surroundings(folder) as (node, processes):
         processes.start(PACKAGES["ekf_node"], "ekf_node", "--ros-args", "-p", "use_sim_time:=true")
         log = processes.file("ekf_node")
-        wait(READY_LIMIT, "ekf_node to be ready", processes, node, lambda: ready_at("ekf_node", log.read_text(errors="replace")))
+        wait(
+            READY_LIMIT,
+            "ekf_node to be ready",
+            processes,
+            node,
+            lambda: ready_at("ekf_node", log.read_text(errors="replace")),
+        )
         publisher = node.create_publisher(Clock, "/clock", 10)
         client = node.create_client(GetParameters, "/ekf_node/get_parameters")
-        wait(PATIENCE, "it to listen", processes, node, lambda: publisher.get_subscription_count() and client.service_is_ready())
+        wait(
+            PATIENCE,
+            "it to listen",
+            processes,
+            node,
+            lambda: publisher.get_subscription_count() and client.service_is_ready(),
+        )
         for _ in range(count):
             try:
                 publisher.publish(changed(serialize_message(Clock()), rng))
@@ -335,23 +484,45 @@ def clock_ordeal(count, folder, seed=1):
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("count", type=int, help="messages on each topic")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--only", nargs="+", choices=SERVICES, default=[*SERVICES], metavar="NODE", help="default: all")
+    parser.add_argument(
+        "--only",
+        nargs="+",
+        choices=SERVICES,
+        default=[*SERVICES],
+        metavar="NODE",
+        help="default: all",
+    )
     args, bad = parser.parse_args(), False
     with tempfile.TemporaryDirectory() as folder:
         for name in (name for name in STREAMS if name in args.only):
             began = time.monotonic()
             account = ordeal(name, args.count, Path(folder), args.seed)
             took, total = time.monotonic() - began, sum(account.sent.values())
-            print(name, json.dumps({k: v for k, v in vars(account).items()}), wrong(account) or "all accounted for")
-            print(f"{name}: {total} messages in {took:.0f} s, {total / took:.0f} in a second", flush=True)
+            print(
+                name,
+                json.dumps({k: v for k, v in vars(account).items()}),
+                wrong(account) or "all accounted for",
+            )
+            print(
+                f"{name}: {total} messages in {took:.0f} s, {total / took:.0f} in a second",
+                flush=True,
+            )
             bad |= bool(wrong(account))
         for name in args.only:
             began = time.monotonic()
             answered, used = request_ordeal(name, args.count, Path(folder), args.seed)
-            print(f"{name}: answered {dict(answered)} in {time.monotonic() - began:.0f} s; memory {used}", flush=True)
+            print(
+                (
+                    f"{name}: answered {dict(answered)} in {time.monotonic() - began:.0f} s; "
+                    f"memory {used}"
+                ),
+                flush=True,
+            )
         fine = "ekf_node" not in args.only or clock_ordeal(args.count, Path(folder), args.seed)
         print("/clock:", "goes on" if fine else "ended")
     return int(bad or not fine)

@@ -3,8 +3,9 @@
     python odometry_equal.py --save before.npz FOLDER        # with the old sources; FOLDER holds flights/ and surveys/
     python odometry_equal.py --compare before.npz FOLDER     # with the new ones: prints the largest difference of each flight
 
-Each raw flight goes through the offline engine, and as it would come live, through an Estimator in batches of up to 20 messages.
-With --network or --effects it is corrected, off line alone. Exit code 1 if a position differs by more than --limit (default 1e-9 m).
+Each raw flight goes through the offline engine, and as it would come live, through an Estimator in
+batches of up to 20 messages. With --network or --effects it is corrected, off line alone. Exit code
+1 if a position differs by more than --limit (default 1e-9 m).
 """
 
 import argparse
@@ -28,8 +29,15 @@ def offline(flight, effects, network):
 
 
 def live(flight):
-    """(t, p) of an Estimator that is given the messages in the order of their stamps, a few at a time."""
-    estimator, random, parts, first = Estimator(flight.anchors), np.random.default_rng(0), [], [0, 0]
+    """(t, p) of an Estimator that is given the messages in the order of their stamps, a few at a
+    time.
+    """
+    estimator, random, parts, first = (
+        Estimator(flight.anchors),
+        np.random.default_rng(0),
+        [],
+        [0, 0],
+    )
     stamps = flight.imu.t, flight.tdoa.t
     order = np.sort(np.concatenate(stamps))
     place = 0
@@ -40,7 +48,9 @@ def live(flight):
         if end[0] > first[0]:
             estimator.add_imu(flight.imu.t[imu], flight.imu.gyro[imu], flight.imu.accel[imu])
         if end[1] > first[1]:
-            estimator.add_tdoa(flight.tdoa.t[tdoa], flight.tdoa.a[tdoa], flight.tdoa.b[tdoa], flight.tdoa.d[tdoa])
+            estimator.add_tdoa(
+                flight.tdoa.t[tdoa], flight.tdoa.a[tdoa], flight.tdoa.b[tdoa], flight.tdoa.d[tdoa]
+            )
         first = end
         parts.append(estimator.advance()[0])
     parts.append(estimator.finish()[0])
@@ -49,7 +59,9 @@ def live(flight):
 
 def main():
     """Save or compare; returns the exit code."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("folder", type=Path)
     parser.add_argument("--save", type=Path)
     parser.add_argument("--compare", type=Path)
@@ -61,7 +73,9 @@ def main():
     network = load_network(SHIPPED) if args.network else None
     before, made, worst = np.load(args.compare) if args.compare else {}, {}, 0.0
     for flight in inputs.Reading(args.folder / "surveys").flights([args.folder / "flights"]):
-        ways = {"offline": offline(flight, effects, network)} | ({} if effects or network else {"live": live(flight)})
+        ways = {"offline": offline(flight, effects, network)} | (
+            {} if effects or network else {"live": live(flight)}
+        )
         for way, (t, p) in ways.items():
             name = f"{flight.name}, {way}"
             made[f"{name}, t"], made[name] = t, p
@@ -72,7 +86,9 @@ def main():
                 print(f"{name}: {len(t)} positions, largest difference {largest:.3g} m")
     if args.save:
         np.savez_compressed(args.save, **made)
-    print(f"{len(made) // 2} runs" + (f", largest difference {worst:.3g} m" if args.compare else ""))
+    print(
+        f"{len(made) // 2} runs" + (f", largest difference {worst:.3g} m" if args.compare else "")
+    )
     return int(worst > args.limit)
 
 

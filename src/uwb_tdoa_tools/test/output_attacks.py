@@ -5,6 +5,7 @@ from pathlib import Path
 import re
 
 import pytest
+
 from uwb_tdoa_tools.outputs import Output, OutputBag, OutputFile, OutputFolder
 
 READ = set(  # options and arguments that name what is read, or no path at all
@@ -20,12 +21,20 @@ def parsers(words, parser):
     inner = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
     if not inner:
         return {words: parser}
-    return {more: found for name, one in inner[0].choices.items() for more, found in parsers((*words, name), one).items()}
+    return {
+        more: found
+        for name, one in inner[0].choices.items()
+        for more, found in parsers((*words, name), one).items()
+    }
 
 
 def outputs(parser):
     """The options of a parser that name outputs."""
-    return [action for action in parser._actions if isinstance(action.type, type) and issubclass(action.type, Output)]
+    return [
+        action
+        for action in parser._actions
+        if isinstance(action.type, type) and issubclass(action.type, Output)
+    ]
 
 
 def unknown(parser):
@@ -33,7 +42,11 @@ def unknown(parser):
     found = []
     for action in parser._actions:
         metavar = action.metavar if isinstance(action.metavar, str) else ""
-        if action.nargs != 0 and PATHS.match(metavar) and getattr(action.type, "__name__", "") not in NUMBERS:
+        if (
+            action.nargs != 0
+            and PATHS.match(metavar)
+            and getattr(action.type, "__name__", "") not in NUMBERS
+        ):
             found += [action.dest] if (action.dest in READ) == (action in outputs(parser)) else []
     return found
 
@@ -58,7 +71,11 @@ def place(tmp_path):
     return tmp_path
 
 
-LINKS = [("link", "is a link to {0}/home/bashrc"), ("to nothing", "is a link to {0}/home/new"), ("to a folder", "is a link to {0}/home")]
+LINKS = [
+    ("link", "is a link to {0}/home/bashrc"),
+    ("to nothing", "is a link to {0}/home/new"),
+    ("to a folder", "is a link to {0}/home"),
+]
 ATTACKS = {  # [(output, what is read, what is said)]
     OutputFile: [
         *((name, None, said) for name, said in LINKS),
@@ -87,35 +104,55 @@ ATTACKS = {  # [(output, what is read, what is said)]
         ("flights", "flights", "is {0}/flights, which is read"),
         ("flights/one.log", "flights", "lies in {0}/flights, which is read"),
     ],
-}  # fmt: skip
+}
 
 
 def line(words, parser, attacked, out, read):
-    """A command line with an output and, where there is an option for it, what is read; None where there is none."""
+    """A command line with an output and, where there is an option for it, what is read; None where
+    there is none.
+    """
     line, reads = [], read is None
     for action in parser._actions:
         own = getattr(action.type, "__name__", "")
         if action is attacked:
             values = [out]
-        elif not reads and action.dest in READ and action.nargs != 0 and not action.choices and own not in NUMBERS:
+        elif (
+            not reads
+            and action.dest in READ
+            and action.nargs != 0
+            and not action.choices
+            and own not in NUMBERS
+        ):
             values, reads = [read] * (action.nargs if isinstance(action.nargs, int) else 1), True
         elif action.required and isinstance(action.type, type) and issubclass(action.type, Output):
             values = [Path(out).parent / "other"]
         elif action.required and action.nargs != "*":
-            values = [next(iter(action.choices)) if action.choices else "1" if own in NUMBERS else "nowhere"]
+            values = [
+                next(iter(action.choices))
+                if action.choices
+                else "1"
+                if own in NUMBERS
+                else "nowhere"
+            ]
         else:
             continue
         line += [*action.option_strings[:1], *map(str, values)]
-    forced = ["--force"] if any("--force" in action.option_strings for action in parser._actions) else []
+    forced = (
+        ["--force"] if any("--force" in action.option_strings for action in parser._actions) else []
+    )
     return [*words[1:], *forced, *line] if reads else None
 
 
 def content(folder):
-    return {path: path.read_bytes() if path.is_file() else path.is_dir() for path in folder.rglob("*")}
+    return {
+        path: path.read_bytes() if path.is_file() else path.is_dir() for path in folder.rglob("*")
+    }
 
 
 def attack(main, words, parser, action, place, capsys):
-    """Attack an output of a command, whose main(arguments) is given, in the folder `place`: all is refused, and stays as it is."""
+    """Attack an output of a command, whose main(arguments) is given, in the folder `place`: all is
+    refused, and stays as it is.
+    """
     before = content(place)
     for out, read, said in ATTACKS[action.type]:
         arguments = line(words, parser, action, place / out, read and place / read)

@@ -4,6 +4,7 @@ import struct
 import zlib
 
 import numpy as np
+
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
 
@@ -62,7 +63,9 @@ FULL_HEADER = (
     "t_tdoa,idA,idB,tdoa_meas,t_acc,acc_x,acc_y,acc_z,t_gyro,gyro_x,gyro_y,gyro_z,t_tof,tof,t_flow,deltaX,deltaY,"
     "t_baro,baro,t_pose,pose_x,pose_y,pose_z,pose_qx,pose_qy,pose_qz,pose_qw"
 )
-FULL_ROWS = [  # three TDOAs, four IMU samples, one tof, two flow, one baro, two poses: side by side, not at one instant
+# three TDOAs, four IMU samples, one tof, two flow, one baro, two poses: side by side, not at one
+# instant
+FULL_ROWS = [
     "0.010,0,1,0.25,0.001,0,0,1,0.001,180,0,0,0.02,31,0.03,1,-2,0.04,99.5,0.005,1,2,3,0,0,0,1",
     "0.012,1.0,5.0,-0.50,0.002,0,0,1,0.002,0,90,0,,,0.05,3,4,,,0.009,1,2,3.5,0,0,0.6,0.8",
     "0.014,5,0,0.75,0.003,0,0,2,0.003,0,0,45,,,,,,,,,,,,,,,",
@@ -75,16 +78,22 @@ def csv_text(header=FULL_HEADER, rows=FULL_ROWS):
 
 
 def small_flight(seconds=2.0, rate=1000, name="small"):
-    """A Flight whose streams have different stamps, with an unknown orientation among anchors and truth."""
+    """A Flight whose streams have different stamps, with an unknown orientation among anchors and
+    truth.
+    """
     rng = np.random.default_rng(7)
-    ticks = 10_000_000 + np.arange(round(seconds * rate)) * 1_000_000 // rate  # us, as a log has them
+    ticks = (
+        10_000_000 + np.arange(round(seconds * rate)) * 1_000_000 // rate
+    )  # us, as a log has them
     n, k, m = len(ticks), len(ticks) // 2, len(ticks) // 4
     quaternions = rng.normal(size=(m, 4))
     quaternions[0] = np.nan
     return Flight(
         name,
         ANCHORS,
-        Tdoas((ticks[::2][:k] + 300) / 1e6, rng.integers(0, 2, k), np.full(k, 5), rng.normal(size=k)),
+        Tdoas(
+            (ticks[::2][:k] + 300) / 1e6, rng.integers(0, 2, k), np.full(k, 5), rng.normal(size=k)
+        ),
         Imu(ticks / 1e6, rng.normal(size=(n, 3)), rng.normal(size=(n, 3))),
         Truth((ticks[::4][:m] + 100) / 1e6, rng.normal(size=(m, 3)), quaternions),
         {},

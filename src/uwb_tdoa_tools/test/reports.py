@@ -31,14 +31,22 @@ def delay(value=0.3, std=0.01):
 
 
 def run(name, error, diverged=False):
-    return {"flight": name, "rmse_3d": error, "diverged": diverged, "rmse_3d_ci": [0.9 * error, 1.1 * error]}
+    return {
+        "flight": name,
+        "rmse_3d": error,
+        "diverged": diverged,
+        "rmse_3d_ci": [0.9 * error, 1.1 * error],
+    }
 
 
 def judged(result, before, after, gain, **changes):
     """The Diagnosis with other errors: {flight: m}, and the interval of the gain."""
     sides = []
     for errors in (before, after):
-        runs = [run(name, *(value if isinstance(value, tuple) else (value,))) for name, value in errors.items()]
+        runs = [
+            run(name, *(value if isinstance(value, tuple) else (value,)))
+            for name, value in errors.items()
+        ]
         pooled = {"rmse_3d": float(np.sqrt(np.mean([item["rmse_3d"] ** 2 for item in runs])))}
         pooled["rmse_3d_ci"] = [0.9 * pooled["rmse_3d"], 1.1 * pooled["rmse_3d"]]
         sides.append({"runs": runs, "pooled": pooled, "scores": result.before["scores"]})
@@ -51,7 +59,9 @@ def keys_of(content):
         return set().union(*map(keys_of, content))
     if not isinstance(content, dict):
         return set()
-    return set(content).union(*(keys_of(item) for key, item in content.items() if key not in NAMES_BELOW))
+    return set(content).union(
+        *(keys_of(item) for key, item in content.items() if key not in NAMES_BELOW)
+    )
 
 
 class Tags(HTMLParser):

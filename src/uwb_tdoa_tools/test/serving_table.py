@@ -1,7 +1,9 @@
-"""What it costs to be given messages, in ways that rclpy has: python src/uwb_tdoa_tools/test/serving_table.py [SECONDS]
+"""What it costs to be given messages, in ways that rclpy has: python
+src/uwb_tdoa_tools/test/serving_table.py [SECONDS]
 
-Two streams, 1 kHz and 400 Hz, are only counted, beside another topic at 1 kHz for the rest of the graph. CPU is that of the process that
-receives; a message is late from its publication until it is in the hands of whoever computes with it.
+Two streams, 1 kHz and 400 Hz, are only counted, beside another topic at 1 kHz for the rest of the
+graph. CPU is that of the process that receives; a message is late from its publication until it is
+in the hands of whoever computes with it.
 
   single     SingleThreadedExecutor, a callback with the bytes of each message
   events     EventsExecutor, the same
@@ -24,6 +26,7 @@ from rclpy.experimental import EventsExecutor
 from rclpy.serialization import serialize_message
 from rclpy.task import Future
 from sensor_msgs.msg import FluidPressure, Imu, Range
+
 from uwb_tdoa_bias.foundation.ros_node import StreamNode
 from uwb_tdoa_bias.foundation.ros_spinning import Spinner
 from uwb_tdoa_bias.foundation.ros_topics import OUTPUT_QOS, STREAM_QOS, unserved, waiting
@@ -37,13 +40,19 @@ SETTLE = 2.0  # s
 
 def main():
     seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 10.0
-    print("| way | messages/s | CPU, % of a core | us per message | p50, ms | p99, ms | the rest, callbacks/s |")
+    print(
+        "| way | messages/s | CPU, % of a core | us per message | p50, ms | p99, ms | the "
+        "rest, callbacks/s |"
+    )
     print("|---|---:|---:|---:|---:|---:|---:|")
     spawn = multiprocessing.get_context("spawn")
     with own_domain():
         for way in WAYS:
             stop, queue = spawn.Event(), spawn.Queue()
-            processes = [spawn.Process(target=publish, args=(stop,)), spawn.Process(target=receive, args=(way, seconds, queue))]
+            processes = [
+                spawn.Process(target=publish, args=(stop,)),
+                spawn.Process(target=receive, args=(way, seconds, queue)),
+            ]
             for process in processes:
                 process.start()
             print(f"| {way} | {queue.get(timeout=120.0)} |", flush=True)
@@ -58,7 +67,9 @@ def publish(stop):
     node = rclpy.create_node("source")
     publishers = [node.create_publisher(kind, topic, OUTPUT_QOS) for kind, topic in STREAMS.items()]
     rest = node.create_publisher(FluidPressure, "rest", 10)
-    imu, tdoa, pressure = (bytearray(serialize_message(kind())) for kind in (Imu, Range, FluidPressure))
+    imu, tdoa, pressure = (
+        bytearray(serialize_message(kind())) for kind in (Imu, Range, FluidPressure)
+    )
     due, k = time.monotonic(), 0
     while not stop.is_set():
         for publisher, data, is_due in zip(publishers, (imu, tdoa), (True, k % 5 in (0, 2))):
@@ -108,7 +119,10 @@ def receive(way, seconds, queue):
 
     kept = []
     callback = {"kept": kept.append, "beside": unserved, "spinner": unserved}.get(way, handle)
-    streams = [node.create_subscription(kind, topic, callback, STREAM_QOS, raw=True) for kind, topic in STREAMS.items()]
+    streams = [
+        node.create_subscription(kind, topic, callback, STREAM_QOS, raw=True)
+        for kind, topic in STREAMS.items()
+    ]
     node.create_subscription(FluidPressure, "rest", count, 10, raw=True)
     stop = Future()
     signal.signal(signal.SIGALRM, lambda *_: stop.set_result(None))
@@ -139,7 +153,10 @@ def receive(way, seconds, queue):
             time.sleep(turns.PERIOD)
     cpu, took = time.process_time() - cpu, time.monotonic() - began
     p50, p99 = np.percentile(1e-6 * np.array(late), [50, 99])
-    line = f"{len(late) / took:.0f} | {100 * cpu / took:.1f} | {1e6 * cpu / len(late):.0f} | {p50:.2f} | {p99:.1f} | {rest[0] / took:.0f}"
+    line = (
+        f"{len(late) / took:.0f} | {100 * cpu / took:.1f} | {1e6 * cpu / len(late):.0f} | "
+        f"{p50:.2f} | {p99:.1f} | {rest[0] / took:.0f}"
+    )
     queue.put(line)
     queue.close()
     queue.join_thread()

@@ -1,13 +1,14 @@
-"""Both nodes for hours at 1 kHz IMU and 400 Hz TDOAs: their memory, and whether their counters hold all that was published.
+"""Both nodes for hours at 1 kHz IMU and 400 Hz TDOAs: their memory, and whether their counters hold
+all that was published.
 
 python src/uwb_tdoa_tools/test/soak.py --minutes 60 [--together]
 """
 
 import argparse
 import math
+from pathlib import Path
 import tempfile
 import time
-from pathlib import Path
 
 from uwb_tdoa_tools.benchmark import nodes
 from uwb_tdoa_tools.benchmark.flights import make_flight
@@ -15,13 +16,17 @@ from uwb_tdoa_tools.benchmark.source import Source
 from uwb_tdoa_tools.benchmark.usage import memory
 from uwb_tdoa_tools.live.processes import DiagnosticsListener, wait
 
-LAP = dict(trajectory="circle", radius=1.5, speed=1.0, start_in_air=True)  # which ends where it begins
+LAP = dict(
+    trajectory="circle", radius=1.5, speed=1.0, start_in_air=True
+)  # which ends where it begins
 LAPS = 6  # of a flight, which is played again and again
 EVERY = 60.0  # s from one figure of the memory to the next
 
 
 def soak(minutes, starts, folder):
-    """Prints the memory of each process, MB, and what became of the messages. starts : of nodes.pairs or nodes.pool."""
+    """Prints the memory of each process, MB, and what became of the messages. starts : of
+    nodes.pairs or nodes.pool.
+    """
     flight = make_flight(LAPS * 2.0 * math.pi * LAP["radius"] / LAP["speed"], **LAP)
     rounds = math.ceil(60.0 * minutes / (flight.imu.t[-1] - flight.imu.t[0]))
     nodes.start(folder)  # whoever compiles the filter keeps the memory that took
@@ -33,7 +38,9 @@ def soak(minutes, starts, folder):
         wait(nodes.MATCH_LIMIT, "all to find each other", processes, node, matched)
 
         def say():
-            used = "  ".join(f"{title} {1e-6 * memory(processes.pid(title)):.1f} MB" for title in starts)
+            used = "  ".join(
+                f"{title} {1e-6 * memory(processes.pid(title)):.1f} MB" for title in starts
+            )
             print(f"{(time.monotonic() - began) / 60.0:6.1f} min  {used}", flush=True)
             source.received[0].clear()  # the odometry; nobody looks at it
 
@@ -42,7 +49,9 @@ def soak(minutes, starts, folder):
         settled = lambda: source.take() or diagnostics.is_settled()  # noqa: E731
         wait(nodes.SETTLE_LIMIT, "the nodes to finish", processes, node, settled)
         say()
-        print(f"published: {rounds * len(flight.tdoa)} TDOAs, {rounds * len(flight.imu)} IMU samples")
+        print(
+            f"published: {rounds * len(flight.tdoa)} TDOAs, {rounds * len(flight.imu)} IMU samples"
+        )
         for name in nodes.NODES:
             print(name, diagnostics.newest(name))
 
@@ -53,7 +62,9 @@ def main():
     arguments.add_argument("--together", action="store_true", help="in one localization_node")
     args = arguments.parse_args()
     with tempfile.TemporaryDirectory() as folder:
-        soak(args.minutes, nodes.pool([""], 1) if args.together else nodes.pairs([""]), Path(folder))
+        soak(
+            args.minutes, nodes.pool([""], 1) if args.together else nodes.pairs([""]), Path(folder)
+        )
 
 
 if __name__ == "__main__":

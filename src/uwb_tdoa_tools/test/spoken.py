@@ -23,11 +23,14 @@ LEAST = 7  # characters that tell one sentence from another
 
 
 def sentences():
-    """{what is always in a sentence: file} of warnings and errors: texts beside a level, texts of functions that are
-    known to give sentences, and what is put into sentences."""
+    """{what is always in a sentence: file} of warnings and errors: texts beside a level, texts of
+    functions that are known to give sentences, and what is put into sentences.
+    """
     found = {}
     for folder in FOLDERS:
-        for path in sorted(set((SRC / folder).rglob("*.py")) - set((SRC / folder / "effects").glob("*.py"))):
+        for path in sorted(
+            set((SRC / folder).rglob("*.py")) - set((SRC / folder / "effects").glob("*.py"))
+        ):
             for text in map(_fixed, _texts(ast.parse(path.read_text()))):
                 if len(text) > LEAST:
                     found[text] = path.name
@@ -38,10 +41,17 @@ def rules():
     """Names of all Findings, of the streams and of `check`."""
     found = set()
     folders = "uwb_tdoa_ekf/uwb_tdoa_ekf/streams", "uwb_tdoa_tools/uwb_tdoa_tools/checking"
-    for paths in ([SRC / "uwb_tdoa_ekf/uwb_tdoa_ekf/monitoring/monitor.py"], *((SRC / folder).rglob("*.py") for folder in folders)):
+    for paths in (
+        [SRC / "uwb_tdoa_ekf/uwb_tdoa_ekf/monitoring/monitor.py"],
+        *((SRC / folder).rglob("*.py") for folder in folders),
+    ):
         for path in paths:
             for node in ast.walk(ast.parse(path.read_text())):
-                if isinstance(node, ast.Call) and _name(node.func) in ("Finding", "_says") and node.args:
+                if (
+                    isinstance(node, ast.Call)
+                    and _name(node.func) in ("Finding", "_says")
+                    and node.args
+                ):
                     if isinstance(node.args[0], ast.Constant):
                         found.add(node.args[0].value)
     return found
@@ -58,7 +68,9 @@ def _texts(tree):
         elif isinstance(node, ast.FunctionDef) and node.name in SAYING:
             for inner in ast.walk(node):
                 if isinstance(inner, ast.Return) and inner.value is not None:
-                    value = inner.value.elt if isinstance(inner.value, ast.ListComp) else inner.value
+                    value = (
+                        inner.value.elt if isinstance(inner.value, ast.ListComp) else inner.value
+                    )
                     yield value.elts[0] if isinstance(value, ast.Tuple) and value.elts else value
                 elif isinstance(inner, ast.Call) and _name(inner.func) == "append":
                     yield inner.args[0]
@@ -69,9 +81,16 @@ def _name(node):
 
 
 def _fixed(node):
-    """The beginning of a text up to its colon; of one that begins with a value the longest part that stays."""
+    """The beginning of a text up to its colon; of one that begins with a value the longest part
+    that stays.
+    """
     parts = node.values if isinstance(node, ast.JoinedStr) else [node]
-    texts = [part.value if isinstance(part, ast.Constant) and isinstance(part.value, str) else "" for part in parts]
+    texts = [
+        part.value if isinstance(part, ast.Constant) and isinstance(part.value, str) else ""
+        for part in parts
+    ]
     begin = texts[0].partition(":")[0]
-    fixed = begin if len(begin) > LEAST else max((text.partition(":")[0] for text in texts), key=len)
+    fixed = (
+        begin if len(begin) > LEAST else max((text.partition(":")[0] for text in texts), key=len)
+    )
     return fixed.strip(" ,'(")

@@ -1,4 +1,5 @@
-"""The first seconds in the air of measured flights, from switched on on the floor: a table of docs/measured.md.
+"""The first seconds in the air of measured flights, from switched on on the floor: a table of
+docs/measured.md.
 
 python src/uwb_tdoa_tools/test/takeoff_table.py DATA
 """
@@ -34,8 +35,14 @@ def main():
     for name, (nees, error) in rows.items():
         print(f"{name:16s} NEES {nees:5.1f}  largest error {error:.2f} m")
     nees, error = np.array([*rows.values()]).T
-    print(f"NEES at most {LARGEST_NEES:g}: {np.sum(nees <= LARGEST_NEES)} of {len(rows)}, largest {nees.max():.1f}")
-    print(f"error at most {LARGEST_ERROR:g} m: {np.sum(error <= LARGEST_ERROR)} of {len(rows)}, largest {error.max():.2f} m")
+    print(
+        f"NEES at most {LARGEST_NEES:g}: {np.sum(nees <= LARGEST_NEES)} of {len(rows)}, "
+        f"largest {nees.max():.1f}"
+    )
+    print(
+        f"error at most {LARGEST_ERROR:g} m: {np.sum(error <= LARGEST_ERROR)} of {len(rows)}, "
+        f"largest {error.max():.2f} m"
+    )
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from dataclasses import replace
 import re
 
+from known_effects import clean_flight
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -13,7 +14,6 @@ from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.scoring.alignment import alignment_of, moved_frame, need_truth, rigid
 from uwb_tdoa_tools.scoring.settling import on_one_clock, settled
-from known_effects import clean_flight
 
 EPOCH = 1.7e9 - 12.3
 TURN = Rotation.from_euler("z", 8.0, degrees=True).as_matrix()
@@ -41,7 +41,9 @@ def path_of_bare(bare):
 
 def in_frame(flight, axes=np.eye(3), shift=(0.0, 0.0, 0.0)):
     """The Flight whose ground truth is in another frame."""
-    return replace(flight, truth=moved_frame(flight.truth, np.asarray(axes, dtype=float), np.array(shift)))
+    return replace(
+        flight, truth=moved_frame(flight.truth, np.asarray(axes, dtype=float), np.array(shift))
+    )
 
 
 def mislabelled(flight, one, two):
@@ -50,7 +52,9 @@ def mislabelled(flight, one, two):
     def other(ids):
         return np.where(ids == one, two, np.where(ids == two, one, ids))
 
-    return replace(flight, tdoa=replace(flight.tdoa, a=other(flight.tdoa.a), b=other(flight.tdoa.b)))
+    return replace(
+        flight, tdoa=replace(flight.tdoa, a=other(flight.tdoa.a), b=other(flight.tdoa.b))
+    )
 
 
 def test_a_rigid_motion_is_found_beside_outliers():
@@ -66,20 +70,37 @@ def test_a_rigid_motion_is_found_beside_outliers():
 def test_a_healthy_ground_truth_is_left_alone(flight, bare, odometry, path_of_bare):
     for one, path in ((flight, odometry), (bare, path_of_bare)):
         found = alignment_of(one, path)
-        assert found.late == 0.0 and not found.other_frame and found.of_clock() is None and found.of_frame() is None
+        assert (
+            found.late == 0.0
+            and not found.other_frame
+            and found.of_clock() is None
+            and found.of_frame() is None
+        )
         same, said = settled(one)
-        assert said == () and np.array_equal(same.truth.p, one.truth.p) and np.array_equal(same.truth.t, one.truth.t)
+        assert (
+            said == ()
+            and np.array_equal(same.truth.p, one.truth.p)
+            and np.array_equal(same.truth.t, one.truth.t)
+        )
 
 
 def test_the_inertial_sensor_tells_that_the_ground_truth_is_late(flight):
     put_right, said = settled(shifted(flight, "truth", 0.4))
     np.testing.assert_allclose(put_right.truth.t, flight.truth.t, atol=0.02)
-    assert len(said) == 1 and "the stamps of the ground truth are 0.4" in said[0] and "as the gyroscope" in said[0]
+    assert (
+        len(said) == 1
+        and "the stamps of the ground truth are 0.4" in said[0]
+        and "as the gyroscope" in said[0]
+    )
 
 
 def test_the_inertial_sensor_tells_that_the_tdoas_are_late_and_not_the_ground_truth(flight):
     same, said = settled(shifted(flight, "tdoa", 0.4))
-    assert said == () and np.array_equal(same.truth.t, flight.truth.t) and np.array_equal(same.truth.p, flight.truth.p)
+    assert (
+        said == ()
+        and np.array_equal(same.truth.t, flight.truth.t)
+        and np.array_equal(same.truth.p, flight.truth.p)
+    )
 
 
 def test_without_inertial_sensor_nothing_tells_which_is_late(bare):
@@ -87,21 +108,33 @@ def test_without_inertial_sensor_nothing_tells_which_is_late(bare):
         put_right, said = settled(shifted(bare, stream, 0.4))
         late = shifted(bare, stream, 0.4).truth.t
         np.testing.assert_allclose(put_right.truth.t, late + sign * 0.4, atol=0.03)
-        assert len(said) == 1 and "ground truth or TDOAs are 0.4" in said[0] and "nothing of that goes to the nodes" in said[0]
+        assert (
+            len(said) == 1
+            and "ground truth or TDOAs are 0.4" in said[0]
+            and "nothing of that goes to the nodes" in said[0]
+        )
 
 
 @pytest.mark.parametrize("name", ["flight", "bare"])
 def test_another_epoch_is_refused_or_found(name, request):
     one = request.getfixturevalue(name)
     later = shifted(one, "truth", EPOCH)
-    with pytest.raises(InputError, match="on another clock than the TDOAs: its stamps go from .* write both on one clock, or give --align"):
+    with pytest.raises(
+        InputError,
+        match=(
+            "on another clock than the TDOAs: its stamps go from .* write both on one clock, or "
+            "give --align"
+        ),
+    ):
         settled(later)
     for put_right in (settled(later, align="time")[0], on_one_clock(later, "time")):
         np.testing.assert_allclose(put_right.truth.t, one.truth.t, atol=0.03)
     assert on_one_clock(one) is one
 
 
-@pytest.mark.parametrize("axes", [np.diag([1, 1, -1]), [[1, 0, 0], [0, 0, -1], [0, 1, 0]]])  # z down; y up, as Motive writes it
+@pytest.mark.parametrize(
+    "axes", [np.diag([1, 1, -1]), [[1, 0, 0], [0, 0, -1], [0, 1, 0]]]
+)  # z down; y up, as Motive writes it
 def test_another_epoch_and_other_axes_at_once_are_found(flight, axes):
     later = shifted(in_frame(flight, np.transpose(axes)), "truth", EPOCH)
     put_right, said = settled(later, align="time")
@@ -115,14 +148,32 @@ def test_a_path_that_repeats_itself_does_not_tell_the_epoch(bare):
     t = np.arange(0.0, 120.0, 0.01)
     circle = np.stack([np.cos(t), np.sin(t), np.full_like(t, 1.5)], axis=1)
     truth = replace(bare.truth, t=t + EPOCH, p=circle, q=np.full((len(t), 4), np.nan))
-    path = replace(run_offline(bare).odometry, t=t, p=circle + 0.1 * np.random.default_rng(0).standard_normal(circle.shape))
-    tdoa = replace(bare.tdoa, **{name: np.resize(getattr(bare.tdoa, name), len(t)) for name in "abd"}, t=t, variance=None)
+    path = replace(
+        run_offline(bare).odometry,
+        t=t,
+        p=circle + 0.1 * np.random.default_rng(0).standard_normal(circle.shape),
+    )
+    tdoa = replace(
+        bare.tdoa,
+        **{name: np.resize(getattr(bare.tdoa, name), len(t)) for name in "abd"},
+        t=t,
+        variance=None,
+    )
     with pytest.raises(InputError, match="its path does not tell on which"):
         alignment_of(replace(bare, truth=truth, tdoa=tdoa), path)
 
 
 def test_a_part_of_the_ground_truth_is_no_other_clock(flight):
-    need_truth(replace(flight, tdoa=replace(flight.tdoa, **{name: getattr(flight.tdoa, name)[:5] for name in "tabd"}, variance=None)))
+    need_truth(
+        replace(
+            flight,
+            tdoa=replace(
+                flight.tdoa,
+                **{name: getattr(flight.tdoa, name)[:5] for name in "tabd"},
+                variance=None,
+            ),
+        )
+    )
 
 
 @pytest.mark.parametrize("name", ["flight", "bare"])
@@ -132,8 +183,16 @@ def test_a_part_of_the_ground_truth_is_no_other_clock(flight):
         (TURN, (0.0, 0.0, 0.0), r"turned by (7|8)\.\d degrees|or the frame of the truth is turned"),
         (np.eye(3), (0.5, -0.3, 0.0), r"shifted by \(0\.(4|5)\d, -0\.(2|3)\d"),
         (np.diag([1, 1, -1]), (0.0, 0.0, 0.0), "its axes x, y, z are x, y, -z of the survey"),
-        ([[0, 1, 0], [1, 0, 0], [0, 0, -1]], (0.0, 0.0, 0.0), "its axes x, y, z are y, x, -z of the survey"),
-        ([[0, 1, 0], [-1, 0, 0], [0, 0, 1]], (0.0, 0.0, 0.0), "its axes x, y, z are y, -x, z of the survey"),
+        (
+            [[0, 1, 0], [1, 0, 0], [0, 0, -1]],
+            (0.0, 0.0, 0.0),
+            "its axes x, y, z are y, x, -z of the survey",
+        ),
+        (
+            [[0, 1, 0], [-1, 0, 0], [0, 0, 1]],
+            (0.0, 0.0, 0.0),
+            "its axes x, y, z are y, -x, z of the survey",
+        ),
     ],
 )
 def test_another_frame_is_put_right(name, axes, shift, words, request):
@@ -158,9 +217,13 @@ def test_wrong_ids_and_signs_are_no_other_frame(name, request):
 
 @pytest.mark.slow
 def test_no_healthy_recording_is_moved_and_every_late_one_is(shared_data):
-    """Every third of 37 recordings; those with an inertial sensor are told by it, to 20 ms, the others by the TDOAs, to 30 ms."""
+    """Every third of 37 recordings; those with an inertial sensor are told by it, to 20 ms, the
+    others by the TDOAs, to 30 ms.
+    """
     reading = inputs.Reading(str(shared_data / "surveys"))
-    found = inputs.find_flights([shared_data / "flights", shared_data / "util"], shared_data / "surveys")
+    found = inputs.find_flights(
+        [shared_data / "flights", shared_data / "util"], shared_data / "surveys"
+    )
     flights = reading.flights([str(path) for path, _ in found][::3])
     assert len(flights) == 13
     for one in flights:

@@ -1,20 +1,21 @@
 import dataclasses
 import os
+from pathlib import Path
 import shutil
 import tempfile
-from pathlib import Path
 
-import numpy as np
-import pytest
-import yaml
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+import numpy as np
+import pytest
 from recordings import ANCHORS, differences, small_flight
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import QosDurability, QosReliability
 from rosbags.rosbag2 import Reader, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+import yaml
+
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
@@ -22,8 +23,8 @@ from uwb_tdoa_bias.foundation.sensors import Height, Pressure, Velocity
 from uwb_tdoa_bias.foundation.survey_faults import survey_faults
 from uwb_tdoa_tools.bags.bag import read_bag, read_fields, read_odometry, write_bag
 from uwb_tdoa_tools.bags.files import messages, new_bag, open_bag
-from uwb_tdoa_tools.bags.messages import tdoa_messages
 from uwb_tdoa_tools.bags.message_types import typestore
+from uwb_tdoa_tools.bags.messages import tdoa_messages
 from uwb_tdoa_tools.readers.streams import LARGEST_NUMBER
 
 BOTH = pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
@@ -34,7 +35,9 @@ def content(path):
     with AnyReader([path]) as reader:
         found = {}
         for connection, stamp, data in reader.messages():
-            found.setdefault(connection.topic, []).append((stamp, reader.deserialize(data, connection.msgtype)))
+            found.setdefault(connection.topic, []).append(
+                (stamp, reader.deserialize(data, connection.msgtype))
+            )
         return found
 
 
@@ -43,11 +46,17 @@ def test_round_trip(tmp_path, storage):
     flight = small_flight(0.2)
     counts = write_bag(flight, tmp_path / "flight", storage)
     assert counts == {
-        "/imu/data": 200, "/uwb/tdoa": 100, "/ground_truth/pose": 50, "/uwb/anchors": 1, "/tf_static": 1,
-    }  # fmt: skip
+        "/imu/data": 200,
+        "/uwb/tdoa": 100,
+        "/ground_truth/pose": 50,
+        "/uwb/anchors": 1,
+        "/tf_static": 1,
+    }
     back = read_bag(tmp_path / "flight")
     assert differences(flight, back) == []
-    assert back.name == "small" and back.meta["protocol"] == "tdoa3" and "reordered" not in back.meta
+    assert (
+        back.name == "small" and back.meta["protocol"] == "tdoa3" and "reordered" not in back.meta
+    )
     (file,) = (tmp_path / "flight").glob("flight.*")  # the data file alone will do
     assert differences(flight, read_bag(file)) == []
 
@@ -59,7 +68,11 @@ def test_a_file_that_was_read_is_closed(tmp_path, storage):
     (file,) = (tmp_path / "flight").glob("flight.*")
 
     def opened():
-        return [name for name in map(os.path.realpath, Path("/proc/self/fd").iterdir()) if name == str(file)]
+        return [
+            name
+            for name in map(os.path.realpath, Path("/proc/self/fd").iterdir())
+            if name == str(file)
+        ]
 
     for path in (tmp_path / "flight", file):
         read_bag(path)
@@ -84,14 +97,19 @@ def flights(draw):
     anchors = Anchors(ids, positions, draw(st.lists(unit, min_size=n, max_size=n)))
     assume(not survey_faults(anchors))  # or the bag is refused
     t = stamps(1)
-    a, variance = draw(arrays(np.int64, len(t), elements=st.sampled_from(ids))), np.abs(values(len(t)))
+    a, variance = (
+        draw(arrays(np.int64, len(t), elements=st.sampled_from(ids))),
+        np.abs(values(len(t))),
+    )
     tdoas = Tdoas(t, a, np.full(len(t), 65535), values(len(t)), variance)
     t = stamps(1)
     imu = draw(st.sampled_from([None, Imu(t, values(len(t), 3), values(len(t), 3))]))
     t = stamps(1)
     q = np.array(draw(st.lists(unit, min_size=len(t), max_size=len(t))))
     truth = draw(st.sampled_from([None, Truth(t, values(len(t), 3), q)]))
-    name = draw(st.text(st.characters(codec="utf-8", exclude_characters="/\0\n\r"), min_size=1, max_size=5))
+    name = draw(
+        st.text(st.characters(codec="utf-8", exclude_characters="/\0\n\r"), min_size=1, max_size=5)
+    )
     t, ranges = stamps(1), st.sampled_from([0.0, 1.25, 1000.0, np.inf, np.nan])
     height = draw(st.sampled_from([None, Height(t, draw(arrays(float, len(t), elements=ranges)))]))
     t = stamps(1)
@@ -119,18 +137,30 @@ def test_what_the_messages_say(tmp_path):
     write_bag(flight, tmp_path / "flight")
     messages = content(tmp_path / "flight")
     stamp, imu = messages["/imu/data"][3]
-    assert (imu.header.stamp.sec, imu.header.stamp.nanosec) == (10, 3_000_000) and stamp == 10_003_000_000
+    assert (imu.header.stamp.sec, imu.header.stamp.nanosec) == (
+        10,
+        3_000_000,
+    ) and stamp == 10_003_000_000
     assert imu.header.frame_id == "base_link"
     assert imu.orientation_covariance.tolist() == [-1] + [0] * 8
-    assert not imu.angular_velocity_covariance.any() and not imu.linear_acceleration_covariance.any()
+    assert (
+        not imu.angular_velocity_covariance.any() and not imu.linear_acceleration_covariance.any()
+    )
     ((stamp, array),) = messages["/uwb/anchors"]
     assert stamp == 10_000_000_000 and array.header.frame_id == "map"
     unknown = array.anchors[2].pose.orientation
     assert (unknown.x, unknown.y, unknown.z, unknown.w) == (0, 0, 0, 0)
     ((_, tf),) = messages["/tf_static"]
-    assert [transform.child_frame_id for transform in tf.transforms] == ["anchor_0", "anchor_1", "anchor_5"]
+    assert [transform.child_frame_id for transform in tf.transforms] == [
+        "anchor_0",
+        "anchor_1",
+        "anchor_5",
+    ]
     assert {transform.header.frame_id for transform in tf.transforms} == {"map"}
-    assert tf.transforms[2].transform.rotation.w == 1 and tf.transforms[1].transform.translation.z == 3.0
+    assert (
+        tf.transforms[2].transform.rotation.w == 1
+        and tf.transforms[1].transform.translation.z == 3.0
+    )
     pose = messages["/ground_truth/pose"][0][1]
     assert pose.header.frame_id == "map" and pose.pose.orientation.w == 0
 
@@ -152,7 +182,9 @@ def test_qos_and_type_hashes_are_recorded(tmp_path, storage):
         for connection in reader.connections:
             (qos,) = connection.ext.offered_qos_profiles
             latched = connection.topic in ("/uwb/anchors", "/tf_static")
-            assert qos.durability == (QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE)
+            assert qos.durability == (
+                QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE
+            )
             assert qos.reliability == QosReliability.RELIABLE
             assert connection.digest == store.hash_rihs01(connection.msgtype)
             assert connection.digest.startswith("RIHS01_") and len(connection.digest) == 71
@@ -167,7 +199,9 @@ def test_metadata_may_tell_another_qos_than_the_data_file(tmp_path, storage, tol
     content = yaml.safe_load(file.read_text())
     for entry in content["rosbag2_bagfile_information"]["topics_with_message_count"]:
         (qos,) = entry["topic_metadata"]["offered_qos_profiles"]
-        entry["topic_metadata"]["offered_qos_profiles"] = [] if told == "none" else [{**qos, "reliability": "best_effort"}]
+        entry["topic_metadata"]["offered_qos_profiles"] = (
+            [] if told == "none" else [{**qos, "reliability": "best_effort"}]
+        )
     file.write_text(yaml.safe_dump(content))
     assert differences(flight, read_bag(tmp_path / "flight")) == []
 
@@ -193,7 +227,10 @@ def test_failure_half_way_leaves_nothing(tmp_path):
     t = flight.truth.t.copy()
     t[-1] = np.nan  # found when the last stream is serialized
     with pytest.raises(InputError, match="truth: stamp 24 is nan"):
-        write_bag(dataclasses.replace(flight, truth=Truth(t, flight.truth.p, flight.truth.q)), tmp_path / "flight")
+        write_bag(
+            dataclasses.replace(flight, truth=Truth(t, flight.truth.p, flight.truth.q)),
+            tmp_path / "flight",
+        )
     assert list(tmp_path.iterdir()) == []
 
 
@@ -227,14 +264,19 @@ def test_namespace_other_topics_and_order_of_stamps(tmp_path):
     store = typestore()
     tdoa = small_flight(0.05).tdoa
     late = list(tdoa_messages(tdoa, store))
-    late[3], late[4] = (late[3][0], late[4][1]), (late[4][0], late[3][1])  # two arrive the wrong way round
+    late[3], late[4] = (
+        (late[3][0], late[4][1]),
+        (late[4][0], late[3][1]),
+    )  # two arrive the wrong way round
     text = store.types["std_msgs/msg/String"]("hello")
     write_topics(
         tmp_path / "bag",
         ("/tag1/uwb/tdoa", "uwb_tdoa_msgs/msg/Tdoa", late),
         ("/chatter", "std_msgs/msg/String", [(5, text)]),
     )
-    with pytest.raises(InputError, match="no message on /uwb/tdoa; give the namespace it was recorded in: /tag1"):
+    with pytest.raises(
+        InputError, match="no message on /uwb/tdoa; give the namespace it was recorded in: /tag1"
+    ):
         read_bag(tmp_path / "bag", anchors=ANCHORS)
     with pytest.raises(InputError, match="no message on /tag1/uwb/anchors; give a survey"):
         read_bag(tmp_path / "bag", namespace="/tag1")
@@ -248,14 +290,18 @@ def test_namespace_other_topics_and_order_of_stamps(tmp_path):
 def test_wrong_type_on_a_topic(tmp_path):
     text = typestore().types["std_msgs/msg/String"]("hello")
     write_topics(tmp_path / "bag", ("/uwb/tdoa", "std_msgs/msg/String", [(5, text)]))
-    with pytest.raises(InputError, match="/uwb/tdoa is std_msgs/msg/String; uwb_tdoa_msgs/msg/Tdoa is needed"):
+    with pytest.raises(
+        InputError, match="/uwb/tdoa is std_msgs/msg/String; uwb_tdoa_msgs/msg/Tdoa is needed"
+    ):
         read_bag(tmp_path / "bag", anchors=ANCHORS)
 
 
 def test_other_version_of_a_type(tmp_path):
     with Writer(tmp_path / "bag", version=9) as writer:
         definition, rihs01 = "uint16 anchor_a", "RIHS01_" + 64 * "0"
-        connection = writer.add_connection("/uwb/tdoa", "uwb_tdoa_msgs/msg/Tdoa", msgdef=definition, rihs01=rihs01)
+        connection = writer.add_connection(
+            "/uwb/tdoa", "uwb_tdoa_msgs/msg/Tdoa", msgdef=definition, rihs01=rihs01
+        )
         writer.write(connection, 5, b"\0\1\0\0\1\0")
     for path in (tmp_path / "bag", tmp_path / "bag" / "bag.db3"):
         with pytest.raises(InputError, match="another version of uwb_tdoa_msgs/msg/Tdoa"):
@@ -264,7 +310,9 @@ def test_other_version_of_a_type(tmp_path):
 
 def odometry_message(stamp, p, q, twist, pose_covariance, twist_covariance):
     types = typestore().types
-    header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9)), "map")
+    header = types["std_msgs/msg/Header"](
+        types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9)), "map"
+    )
     point, vector = types["geometry_msgs/msg/Point"], types["geometry_msgs/msg/Vector3"]
     pose = types["geometry_msgs/msg/Pose"](point(*p), types["geometry_msgs/msg/Quaternion"](*q))
     speed = types["geometry_msgs/msg/Twist"](vector(*twist), vector(0.0, 0.0, 0.0))
@@ -280,9 +328,16 @@ def test_odometry(tmp_path):
     covariance = np.arange(36.0)
     half = np.sqrt(0.5)
     messages = [
-        odometry_message(2_000_000_001, (4.0, 5.0, 6.0), (0, 0, 0, 1), (1.0, 0.0, 0.0), covariance, -covariance),
         odometry_message(
-            1_000_000_000, (1.0, 2.0, 3.0), (0, 0, half, half), (1.0, 0.0, 0.0), 2 * covariance, covariance
+            2_000_000_001, (4.0, 5.0, 6.0), (0, 0, 0, 1), (1.0, 0.0, 0.0), covariance, -covariance
+        ),
+        odometry_message(
+            1_000_000_000,
+            (1.0, 2.0, 3.0),
+            (0, 0, half, half),
+            (1.0, 0.0, 0.0),
+            2 * covariance,
+            covariance,
         ),
     ]
     write_topics(tmp_path / "bag", ("/odometry", "nav_msgs/msg/Odometry", messages))
@@ -290,38 +345,53 @@ def test_odometry(tmp_path):
     assert len(odometry) == 2
     np.testing.assert_array_equal(odometry.t, [1.0, 2.000000001])
     np.testing.assert_array_equal(odometry.p, [[1, 2, 3], [4, 5, 6]])
-    np.testing.assert_allclose(odometry.v, [[0, 1, 0], [1, 0, 0]], atol=1e-12)  # turned from body to world
+    np.testing.assert_allclose(
+        odometry.v, [[0, 1, 0], [1, 0, 0]], atol=1e-12
+    )  # turned from body to world
     np.testing.assert_allclose(odometry.q[0], [0, 0, half, half])
     np.testing.assert_array_equal(odometry.covariance[0], 2 * covariance.reshape(6, 6))
     with pytest.raises(InputError, match="no message on /tag1/odometry"):
         read_odometry(tmp_path / "bag", namespace="tag1")
 
 
-EARLIER = "std_msgs/Header header\nuint16 anchor_a\nuint16 anchor_b\nfloat64 distance_difference\n"  # before `variance`
+# before `variance`
+EARLIER = "std_msgs/Header header\nuint16 anchor_a\nuint16 anchor_b\nfloat64 distance_difference\n"
 
 
 @BOTH
 @pytest.mark.parametrize("file_alone", [False, True])
 def test_a_bag_from_before_the_variance(tmp_path, storage, file_alone):
-    store, msgtype, header = get_typestore(Stores.ROS2_JAZZY), "uwb_tdoa_msgs/msg/Tdoa", "std_msgs/msg/Header"
+    store, msgtype, header = (
+        get_typestore(Stores.ROS2_JAZZY),
+        "uwb_tdoa_msgs/msg/Tdoa",
+        "std_msgs/msg/Header",
+    )
     store.register(get_types_from_msg(EARLIER, msgtype))
     with new_bag(tmp_path / "old", storage) as writer:
         connection = writer.add_connection("/uwb/tdoa", msgtype, typestore=store)
         for k in range(3):
-            stamp = store.types[header](store.types["builtin_interfaces/msg/Time"](k + 1, 0), "x" * k)  # any alignment
+            stamp = store.types[header](
+                store.types["builtin_interfaces/msg/Time"](k + 1, 0), "x" * k
+            )  # any alignment
             message = store.types[msgtype](stamp, k, 7, 0.25 * k)
             writer.write(connection, 10**9 * (k + 1), store.serialize_cdr(message, msgtype))
     path = next((tmp_path / "old").glob("old.*")) if file_alone else tmp_path / "old"
     for salvage in (False, True):
         tdoa = read_bag(path, anchors=ANCHORS, salvage=salvage).tdoa
-        assert tdoa.a.tolist() == [0, 1, 2] and tdoa.d.tolist() == [0.0, 0.25, 0.5] and tdoa.variance.tolist() == [0.0] * 3
+        assert (
+            tdoa.a.tolist() == [0, 1, 2]
+            and tdoa.d.tolist() == [0.0, 0.25, 0.5]
+            and tdoa.variance.tolist() == [0.0] * 3
+        )
     with open_bag(path) as reader:  # as `replay` publishes them
         for _, stamp, data in messages(path, reader, reader.connections):
             assert typestore().deserialize_cdr(data, msgtype).variance == 0.0 and stamp
             assert type(data) is bytes  # rclpy publishes nothing else
 
 
-@pytest.mark.parametrize("lacking", [("bias_slope", "bias_state"), ("variance", "bias_slope", "bias_state")])
+@pytest.mark.parametrize(
+    "lacking", [("bias_slope", "bias_state"), ("variance", "bias_slope", "bias_state")]
+)
 def test_corrected_tdoas_of_a_bag_from_before_fields_were_added(tmp_path, lacking):
     store, msgtype = get_typestore(Stores.ROS2_JAZZY), "uwb_tdoa_msgs/msg/TdoaCorrected"
     constants, fields = typestore().fielddefs[msgtype]
@@ -337,15 +407,22 @@ def test_corrected_tdoas_of_a_bag_from_before_fields_were_added(tmp_path, lackin
         "status": 1,
         "model": "x",
     }
-    header = store.types["std_msgs/msg/Header"](store.types["builtin_interfaces/msg/Time"](1, 0), "map")
+    header = store.types["std_msgs/msg/Header"](
+        store.types["builtin_interfaces/msg/Time"](1, 0), "map"
+    )
     with new_bag(tmp_path / "old", "mcap") as writer:
         connection = writer.add_connection("/uwb/tdoa_corrected", msgtype, typestore=store)
-        message = store.types[msgtype](header=header, **{name: value for name, value in values.items() if name not in lacking})
+        message = store.types[msgtype](
+            header=header, **{name: value for name, value in values.items() if name not in lacking}
+        )
         writer.write(connection, 10**9, store.serialize_cdr(message, msgtype))
     with open_bag(tmp_path / "old") as reader:
         ((_, _, data),) = messages(tmp_path / "old", reader, reader.connections)
     message = typestore().deserialize_cdr(data, msgtype)
-    assert {name: getattr(message, name) for name in values} == {**values, **({"variance": 0.0} if "variance" in lacking else {})}
+    assert {name: getattr(message, name) for name in values} == {
+        **values,
+        **({"variance": 0.0} if "variance" in lacking else {}),
+    }
     assert message.bias_slope.tolist() == message.bias_state.tolist() == [0.0] * 6
 
 
@@ -353,10 +430,21 @@ def test_fields_of_any_topic(tmp_path):
     store = typestore()
     Residual = store.types["uwb_tdoa_msgs/msg/TdoaResidual"]
     header = next(iter(tdoa_messages(small_flight(0.01).tdoa, store)))[1].header
-    messages = [(7, Residual(header, 1, 2, 0.25, np.nan, 0.5, 3)), (8, Residual(header, 2, 1, -0.25, 1.0, 1.0, 0))]
+    messages = [
+        (7, Residual(header, 1, 2, 0.25, np.nan, 0.5, 3)),
+        (8, Residual(header, 2, 1, -0.25, 1.0, 1.0, 0)),
+    ]
     write_topics(tmp_path / "bag", ("/uwb/residual", "uwb_tdoa_msgs/msg/TdoaResidual", messages))
     fields = read_fields(tmp_path / "bag", "uwb/residual")
-    assert set(fields) == {"t", "anchor_a", "anchor_b", "innovation", "innovation_variance", "weight", "verdict"}
+    assert set(fields) == {
+        "t",
+        "anchor_a",
+        "anchor_b",
+        "innovation",
+        "innovation_variance",
+        "weight",
+        "verdict",
+    }
     np.testing.assert_array_equal(fields["verdict"], [3, 0])
     np.testing.assert_array_equal(fields["innovation"], [0.25, -0.25])
     with pytest.raises(InputError, match="no topic /uwb/tdoa_corrected; record it"):
@@ -395,7 +483,10 @@ def test_not_a_bag(tmp_path):
 
 def test_anchors_without_a_frame_are_in_the_map(tmp_path):
     flight = small_flight(0.01)
-    write_bag(dataclasses.replace(flight, anchors=dataclasses.replace(flight.anchors, frame="")), tmp_path / "flight")
+    write_bag(
+        dataclasses.replace(flight, anchors=dataclasses.replace(flight.anchors, frame="")),
+        tmp_path / "flight",
+    )
     assert read_bag(tmp_path / "flight").anchors.frame == "map"
 
 
@@ -403,9 +494,13 @@ def test_anchors_of_no_use_are_told_with_the_bag(tmp_path):
     store = typestore()
     with new_bag(tmp_path / "bad") as writer:
         tdoa = writer.add_connection("/uwb/tdoa", "uwb_tdoa_msgs/msg/Tdoa", typestore=store)
-        ((stamp, message),) = tdoa_messages(Tdoas(np.ones(1), np.zeros(1, int), np.ones(1, int), np.ones(1)), store)
+        ((stamp, message),) = tdoa_messages(
+            Tdoas(np.ones(1), np.zeros(1, int), np.ones(1, int), np.ones(1)), store
+        )
         writer.write(tdoa, stamp, store.serialize_cdr(message, tdoa.msgtype))
-        anchors = writer.add_connection("/uwb/anchors", "uwb_tdoa_msgs/msg/AnchorArray", typestore=store)
+        anchors = writer.add_connection(
+            "/uwb/anchors", "uwb_tdoa_msgs/msg/AnchorArray", typestore=store
+        )
         empty = store.types["uwb_tdoa_msgs/msg/AnchorArray"](message.header, [])
         writer.write(anchors, stamp, store.serialize_cdr(empty, anchors.msgtype))
     with pytest.raises(InputError, match=r"bad: /uwb/anchors: anchors: the list is empty"):

@@ -1,4 +1,6 @@
-"""Bags that are cut, damaged or forged: refused with what is wrong, or read as far as they are sound."""
+"""Bags that are cut, damaged or forged: refused with what is wrong, or read as far as they are
+sound.
+"""
 
 from dataclasses import replace
 import json
@@ -14,6 +16,7 @@ import numpy as np
 import pytest
 from recordings import differences, small_flight
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.sensors import Height, Pressure, Velocity
 from uwb_tdoa_tools.bags import mcap
@@ -61,7 +64,9 @@ def flip(file, at, mask=1):
 
 
 @BOTH
-@settings(deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    deadline=None, max_examples=40, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(share=st.floats(0.0, 1.0, exclude_max=True), mask=st.integers(1, 255))
 def test_any_changed_byte_is_refused(bags, storage, share, mask):
     file = data_file(bags[storage])
@@ -74,11 +79,16 @@ def test_any_changed_byte_is_refused(bags, storage, share, mask):
         flip(file, at, mask)
 
 
-@settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(share=st.floats(0.0, 1.0, exclude_max=True), mask=st.integers(1, 255))
 @example(share=0.0, mask=1)
 def test_mcap_has_checksums_of_its_own(bags, share, mask):
-    """The data file alone, without metadata.yaml. Two bytes in the footer's place of its own checksums may be zeroed."""
+    """The data file alone, without metadata.yaml.
+
+    Two bytes in the footer's place of its own checksums may be zeroed.
+    """
     file = data_file(bags["mcap"])
     at = int(share * file.stat().st_size)
     flip(file, at, mask)
@@ -90,7 +100,9 @@ def test_mcap_has_checksums_of_its_own(bags, share, mask):
 
 
 def test_sums_are_where_others_look_for_them(bags):
-    """MCAP specification: CRC-32 of each chunk unpacked, of the data, of the summary with the footer up to the sum."""
+    """MCAP specification: CRC-32 of each chunk unpacked, of the data, of the summary with the
+    footer up to the sum.
+    """
     content = data_file(bags["mcap"]).read_bytes()
     with open(data_file(bags["mcap"]), "rb") as file:
         found = list(mcap.records(file, 8, len(content) - 8))
@@ -104,7 +116,9 @@ def test_sums_are_where_others_look_for_them(bags):
             assert struct.unpack("<I", body)[0] == zlib.crc32(content[: record.start])
         elif record.kind == mcap.FOOTER:
             (start,) = struct.unpack_from("<Q", body)
-            assert struct.unpack_from("<I", body, 16)[0] == zlib.crc32(content[start : record.content + 16])
+            assert struct.unpack_from("<I", body, 16)[0] == zlib.crc32(
+                content[start : record.content + 16]
+            )
         else:
             continue
         sums += 1
@@ -148,13 +162,19 @@ def test_a_cut_bag_of_several_chunks_is_read_up_to_the_cut(tmp_path):
     n = len(back.imu)
     assert 0.3 < n / len(flight.imu) < 0.7 and len(back.meta["remarks"]) == 2
     np.testing.assert_array_equal(back.imu.gyro, flight.imu.gyro[:n])
-    assert differences(flight, read_bag(file, anchors=back.anchors, salvage=True))  # the file alone as well
+    assert differences(
+        flight, read_bag(file, anchors=back.anchors, salvage=True)
+    )  # the file alone as well
 
 
 @BOTH
 def test_a_whole_bag_loses_nothing_by_salvage(bags, storage):
     flight = read_bag(bags[storage], salvage=True)
-    assert differences(FLIGHT, flight) == [] and "remarks" not in flight.meta and flight.name == FLIGHT.name
+    assert (
+        differences(FLIGHT, flight) == []
+        and "remarks" not in flight.meta
+        and flight.name == FLIGHT.name
+    )
 
 
 @BOTH
@@ -164,16 +184,22 @@ def test_numbers_that_are_not_finite(tmp_path, storage):
     flight.truth.p[5, 1] = 1e308  # what is computed of it is not finite
     flight.imu.accel[7, 2] = -np.inf
     write_bag(flight, tmp_path / "bag", storage)
-    with pytest.raises(InputError, match=r"/uwb/tdoa, message 4 of 50 at 10\.006 s: its number 3 is nan"):
+    with pytest.raises(
+        InputError, match=r"/uwb/tdoa, message 4 of 50 at 10\.006 s: its number 3 is nan"
+    ):
         read_bag(tmp_path / "bag")
     back = read_bag(tmp_path / "bag", salvage=True)
-    assert (len(back.tdoa), len(back.truth), len(back.imu)) == (49, 24, 99) and len(back.meta["remarks"]) == 3
+    assert (len(back.tdoa), len(back.truth), len(back.imu)) == (49, 24, 99) and len(
+        back.meta["remarks"]
+    ) == 3
 
 
 @BOTH
 def test_heights_and_velocities_say_what_was_not_measured(tmp_path, storage):
     height = Height(np.array([10.0, 10.1, 10.2]), np.array([1.25, np.inf, np.nan]))
-    velocity = Velocity(np.array([10.0]), np.array([[0.5, 0.0, np.nan]]), np.array([[0.1, 0.1, np.inf]]))
+    velocity = Velocity(
+        np.array([10.0]), np.array([[0.5, 0.0, np.nan]]), np.array([[0.1, 0.1, np.inf]])
+    )
     flight = replace(small_flight(0.1), height=height, velocity=velocity)
     write_bag(flight, tmp_path / "bag", storage)
     assert differences(flight, read_bag(tmp_path / "bag")) == []
@@ -184,8 +210,13 @@ def test_pressures_and_velocities_that_are_not_finite(tmp_path, storage):
     t = np.array([10.0, 10.1])
     pressure = Pressure(t, np.array([101325.0, np.nan]))
     velocity = Velocity(t, np.array([[0.5, 0.0, 0.0], [0.0, np.inf, 0.0]]), np.full((2, 3), 0.1))
-    for aid, said in (({"pressure": pressure}, "/pressure, message 2 of 2 at 10.100 s: its number 1 is nan"),
-                      ({"velocity": velocity}, "/velocity and /velocity/odometry, message 2 of 2 at 10.100 s: its number 2 is inf")):  # fmt: skip
+    for aid, said in (
+        ({"pressure": pressure}, "/pressure, message 2 of 2 at 10.100 s: its number 1 is nan"),
+        (
+            {"velocity": velocity},
+            "/velocity and /velocity/odometry, message 2 of 2 at 10.100 s: its number 2 is inf",
+        ),
+    ):
         write_bag(replace(small_flight(0.1), **aid), tmp_path / "bag", storage, force=True)
         with pytest.raises(InputError, match=said):
             read_bag(tmp_path / "bag")
@@ -281,7 +312,12 @@ def chunked(compression, packed, size, crc=0):
     def text(content):
         return struct.pack("<I", len(content)) + content
 
-    body = struct.pack("<QQQI", 0, 1, size, crc) + text(compression) + struct.pack("<Q", len(packed)) + packed
+    body = (
+        struct.pack("<QQQI", 0, 1, size, crc)
+        + text(compression)
+        + struct.pack("<Q", len(packed))
+        + packed
+    )
     parts = [record(mcap.HEADER, text(b"ros2") + text(b"")), record(mcap.CHUNK, body)]
     parts += [record(mcap.DATA_END, bytes(4)), record(mcap.FOOTER, bytes(20))]
     return mcap.MAGIC + b"".join(parts) + mcap.MAGIC
@@ -292,8 +328,14 @@ def chunked(compression, packed, size, crc=0):
     [
         (chunked(b"", b"", 80 << 30), "claims 85899345920 bytes"),
         (chunked(b"", b"abc", 4), "does not hold the 4 bytes it claims"),
-        (chunked(b"zstd", mcap.zstd.compress(bytes(1 << 28)), 1000), "does not hold the 1000 bytes"),
-        (chunked(b"lz4", mcap.lz4.frame.compress(bytes(1 << 26)), 1000), "does not hold the 1000 bytes"),
+        (
+            chunked(b"zstd", mcap.zstd.compress(bytes(1 << 28)), 1000),
+            "does not hold the 1000 bytes",
+        ),
+        (
+            chunked(b"lz4", mcap.lz4.frame.compress(bytes(1 << 26)), 1000),
+            "does not hold the 1000 bytes",
+        ),
         (chunked(b"zstd", b"nothing packed", 10), "cannot be unpacked"),
         (chunked(b"lz4", b"nothing packed", 10), "cannot be unpacked"),
         (chunked(b"br", b"x", 1), "compression b'br' is not known"),
@@ -310,7 +352,9 @@ def test_sizes_are_checked_before_they_are_believed(tmp_path, content, said):
         read_bag(file)
 
 
-@pytest.mark.parametrize("mode", [CompressionMode.FILE, CompressionMode.MESSAGE, CompressionMode.STORAGE])
+@pytest.mark.parametrize(
+    "mode", [CompressionMode.FILE, CompressionMode.MESSAGE, CompressionMode.STORAGE]
+)
 @BOTH
 def test_compressed_bags(bags, tmp_path, mode, storage):
     if (mode, storage) == (CompressionMode.STORAGE, "sqlite3"):
@@ -323,7 +367,10 @@ def test_compressed_bags(bags, tmp_path, mode, storage):
         for connection, stamp, data in messages(bags["mcap"], reader, reader.connections):
             if connection.topic not in made:
                 made[connection.topic] = writer.add_connection(
-                    connection.topic, connection.msgtype, msgdef=connection.msgdef.data, rihs01=connection.digest
+                    connection.topic,
+                    connection.msgtype,
+                    msgdef=connection.msgdef.data,
+                    rihs01=connection.digest,
                 )
             writer.write(made[connection.topic], stamp, data)
     back = read_bag(tmp_path / "packed")

@@ -15,6 +15,8 @@ import pytest
 from recordings import small_flight
 from rosbags.rosbag2 import StoragePlugin, Writer
 from test_bag_damage import chunked, data_file, forget_sum
+import yaml
+
 from uwb_tdoa_bias.foundation import limits
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.bags import integrity, mcap
@@ -22,9 +24,8 @@ from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag
 from uwb_tdoa_tools.bags.files import messages, open_bag
 from uwb_tdoa_tools.bags.message_types import typestore
 from uwb_tdoa_tools.checking.recording import read_recording
-from uwb_tdoa_tools.readers.inputs import Reading
 from uwb_tdoa_tools.estimate import with_antenna
-import yaml
+from uwb_tdoa_tools.readers.inputs import Reading
 
 BOTH = pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 AT_ONCE = 2.0  # s of processor time
@@ -51,20 +52,37 @@ def tables(tmp_path):
 @pytest.mark.parametrize(
     "statements",
     [
-        ("DROP TABLE messages", f"CREATE VIEW messages AS {ENDLESS} i AS id, 1 AS topic_id, i AS timestamp, x'00' AS data FROM n"),
+        (
+            "DROP TABLE messages",
+            (
+                f"CREATE VIEW messages AS {ENDLESS} i AS id, 1 AS topic_id, i AS timestamp, x'00' "
+                "AS data FROM n"
+            ),
+        ),
         ("ALTER TABLE topics RENAME TO other", f"CREATE VIEW topics AS {ENDLESS} * FROM other, n"),
         ("CREATE VIRTUAL TABLE more USING fts5(x)",),
         ("CREATE INDEX slow ON messages(hex(data))",),
         ("CREATE TRIGGER t AFTER INSERT ON topics BEGIN DELETE FROM messages; END",),
-        ("DROP TABLE messages", "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp, data AS (zeroblob(900000000)))"),
-        ("DROP TABLE messages", f"CREATE TABLE messages(id, topic_id, timestamp, data CHECK (data LIKE '{'%a' * 40}'))"),
+        (
+            "DROP TABLE messages",
+            (
+                "CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id, timestamp, data AS "
+                "(zeroblob(900000000)))"
+            ),
+        ),
+        (
+            "DROP TABLE messages",
+            f"CREATE TABLE messages(id, topic_id, timestamp, data CHECK (data LIKE '{'%a' * 40}'))",
+        ),
     ],
-)  # fmt: skip
+)
 def test_nothing_in_a_database_is_computed(tables, statements, salvage):
     bag, run = tables
     run(*statements)
     began = time.process_time()
-    with pytest.raises(InputError, match="is no table and no index of columns|no message that can be read"):
+    with pytest.raises(
+        InputError, match="is no table and no index of columns|no message that can be read"
+    ):
         read_bag(bag, salvage=salvage)
     assert time.process_time() - began < AT_ONCE
 
@@ -80,7 +98,9 @@ def test_a_row_that_fills_the_memory(tables, monkeypatch):
 
 @pytest.fixture
 def packed(tmp_path):
-    """A bag whose files are compressed as a whole, with files of our own: {name: bytes that are packed}."""
+    """A bag whose files are compressed as a whole, with files of our own: {name: bytes that are
+    packed}.
+    """
     write_bag(small_flight(0.1), tmp_path / "plain")
     forget_sum(tmp_path / "plain")
 
@@ -88,11 +108,21 @@ def packed(tmp_path):
         bag = tmp_path / "packed"
         bag.mkdir()
         for name, content in files.items():
-            (bag / name).write_bytes(content if isinstance(content, bytes) else mcap.zstd.compress(bytes(content)))
-        text = (tmp_path / "plain" / "metadata.yaml").read_text().replace("plain.mcap", ", ".join(files))
+            (bag / name).write_bytes(
+                content if isinstance(content, bytes) else mcap.zstd.compress(bytes(content))
+            )
+        text = (
+            (tmp_path / "plain" / "metadata.yaml")
+            .read_text()
+            .replace("plain.mcap", ", ".join(files))
+        )
         listed = f"  relative_file_paths: [{', '.join(files)}]\n  other:"
-        text = text.replace("  relative_file_paths:", listed).replace("compression_mode: ''", "compression_mode: file")
-        (bag / "metadata.yaml").write_text(text.replace("compression_format: ''", "compression_format: zstd"))
+        text = text.replace("  relative_file_paths:", listed).replace(
+            "compression_mode: ''", "compression_mode: file"
+        )
+        (bag / "metadata.yaml").write_text(
+            text.replace("compression_format: ''", "compression_format: zstd")
+        )
         return bag
 
     return make
@@ -102,14 +132,18 @@ def test_several_files_may_not_unfold_to_more_than_all_of_them_may(packed, monke
     """Three files of 33 kB that became 3 GiB; here 32 MiB each, of which the limit is 16 MiB."""
     bag = packed({f"{k}.mcap.zstd": 32 << 20 for k in range(3)})
     assert sum(file.stat().st_size for file in bag.iterdir()) < 30_000
-    with pytest.raises(InputError, match="more than [12][0-9]{7} bytes when its files are unpacked"):
+    with pytest.raises(
+        InputError, match="more than [12][0-9]{7} bytes when its files are unpacked"
+    ):
         read_bag(bag)
 
 
 def test_a_file_is_unpacked_once(tmp_path):
     write_bag(small_flight(0.1), tmp_path / "bag")
     text = (tmp_path / "bag" / "metadata.yaml").read_text()
-    (tmp_path / "bag" / "metadata.yaml").write_text(text.replace("  - bag.mcap", "  - bag.mcap\n  - ./bag.mcap"))
+    (tmp_path / "bag" / "metadata.yaml").write_text(
+        text.replace("  - bag.mcap", "  - bag.mcap\n  - ./bag.mcap")
+    )
     with pytest.raises(InputError, match="is no file, or is there twice"):
         read_bag(tmp_path / "bag")
 
@@ -129,9 +163,15 @@ def test_files_that_are_no_list(tmp_path, files):
 def test_a_definition_that_takes_a_minute_to_read(tables):
     bag, run = tables
     fields = "".join(f"float64 x{k}\n" for k in range(20_000))
-    run(f"UPDATE message_definitions SET encoded_message_definition = '{fields}'", "UPDATE topics SET type_description_hash = ''")
+    run(
+        f"UPDATE message_definitions SET encoded_message_definition = '{fields}'",
+        "UPDATE topics SET type_description_hash = ''",
+    )
     began = time.process_time()
-    with pytest.raises(InputError, match="the definition of uwb_tdoa_msgs/msg/Tdoa in the bag has more than 65536 bytes"):
+    with pytest.raises(
+        InputError,
+        match="the definition of uwb_tdoa_msgs/msg/Tdoa in the bag has more than 65536 bytes",
+    ):
         read_bag(data_file(bag))
     assert time.process_time() - began < AT_ONCE
 
@@ -143,8 +183,12 @@ def test_chunks_may_not_unfold_to_more_than_all_of_them_may(tmp_path, monkeypatc
     (tmp_path / "forged.mcap").write_bytes(head + 3 * body + end)
     unfolded = []
     original = mcap.unpacked
-    monkeypatch.setattr(mcap, "unpacked", lambda *given: unfolded.append(original(*given)) or unfolded[-1])
-    with pytest.raises(InputError, match="a chunk claims 8388608 bytes, more than|no message that can be read"):
+    monkeypatch.setattr(
+        mcap, "unpacked", lambda *given: unfolded.append(original(*given)) or unfolded[-1]
+    )
+    with pytest.raises(
+        InputError, match="a chunk claims 8388608 bytes, more than|no message that can be read"
+    ):
         read_bag(tmp_path / "forged.mcap", salvage=salvage)
     assert sum(map(len, unfolded)) <= limits.most_unpacked(len(3 * body) + 200)
 
@@ -165,10 +209,17 @@ def with_bad_messages(path, storage, of, count=100, many=1, cut=5):
     write_bag(small_flight(count / 500.0), plain)
     seen, writer = (
         dict.fromkeys(of, 0),
-        Writer(path, version=9, storage_plugin={"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}[storage]),
+        Writer(
+            path,
+            version=9,
+            storage_plugin={"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}[storage],
+        ),
     )
     with open_bag(plain) as reader, writer:
-        to = {c.topic: writer.add_connection(c.topic, c.msgtype, typestore=typestore()) for c in reader.connections}
+        to = {
+            c.topic: writer.add_connection(c.topic, c.msgtype, typestore=typestore())
+            for c in reader.connections
+        }
         for connection, stamp, data in messages(plain, reader, reader.connections):
             if seen.get(connection.topic, many) < many:
                 seen[connection.topic] += 1
@@ -183,7 +234,10 @@ def test_a_message_that_cannot_be_read_is_counted_and_said(tmp_path, storage, sa
     bag = with_bad_messages(tmp_path / "bag", storage, ["/uwb/tdoa", "/imu/data"], many=2)
     flight = read_bag(bag, salvage=salvage)
     assert (len(flight.tdoa), len(flight.imu), len(flight.truth)) == (98, 198, 50)
-    said = ["/uwb/tdoa: 2 messages left out, they cannot be read.", "/imu/data: 2 messages left out, they cannot be read."]
+    said = [
+        "/uwb/tdoa: 2 messages left out, they cannot be read.",
+        "/imu/data: 2 messages left out, they cannot be read.",
+    ]
     assert flight.meta["remarks"] == said
     checked = read_recording(Reading(salvage=salvage), bag)
     assert len(checked.tdoa) == 98 and list(checked.remarks) == said
@@ -193,12 +247,16 @@ def test_a_message_that_cannot_be_read_is_counted_and_said(tmp_path, storage, sa
 def test_one_bad_message_among_many_tdoas(tmp_path):
     bag = with_bad_messages(tmp_path / "bag", "mcap", ["/uwb/tdoa"], count=20_000)
     flight = read_bag(bag)
-    assert len(flight.tdoa) == 19_999 and flight.meta["remarks"] == ["/uwb/tdoa: 1 messages left out, they cannot be read."]
+    assert len(flight.tdoa) == 19_999 and flight.meta["remarks"] == [
+        "/uwb/tdoa: 1 messages left out, they cannot be read."
+    ]
 
 
 def test_a_topic_of_nothing_but_bad_messages(tmp_path):
     bag = with_bad_messages(tmp_path / "bag", "mcap", ["/uwb/tdoa"], many=1000)
-    with pytest.raises(InputError, match="has no message on /uwb/tdoa; 100 that are there cannot be read"):
+    with pytest.raises(
+        InputError, match="has no message on /uwb/tdoa; 100 that are there cannot be read"
+    ):
         read_bag(bag)
 
 
@@ -212,20 +270,29 @@ def test_a_message_that_is_too_long_to_be_one_of_ours(tmp_path, monkeypatch):
 def test_recorded_odometry_says_what_is_missing(tmp_path):
     store, zeros = typestore(), np.zeros(36)
     types = store.types
-    pose = types["geometry_msgs/msg/Pose"](types["geometry_msgs/msg/Point"](0, 0, 0), types["geometry_msgs/msg/Quaternion"](0, 0, 0, 1))
-    twist = types["geometry_msgs/msg/Twist"](*(types["geometry_msgs/msg/Vector3"](0, 0, 0) for _ in range(2)))
+    pose = types["geometry_msgs/msg/Pose"](
+        types["geometry_msgs/msg/Point"](0, 0, 0), types["geometry_msgs/msg/Quaternion"](0, 0, 0, 1)
+    )
+    twist = types["geometry_msgs/msg/Twist"](
+        *(types["geometry_msgs/msg/Vector3"](0, 0, 0) for _ in range(2))
+    )
     header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](1, 0), "map")
     with_covariance = (
         types["geometry_msgs/msg/PoseWithCovariance"](pose, zeros),
         types["geometry_msgs/msg/TwistWithCovariance"](twist, zeros),
     )
-    data = store.serialize_cdr(types["nav_msgs/msg/Odometry"](header, "base_link", *with_covariance), "nav_msgs/msg/Odometry")
+    data = store.serialize_cdr(
+        types["nav_msgs/msg/Odometry"](header, "base_link", *with_covariance),
+        "nav_msgs/msg/Odometry",
+    )
     with Writer(tmp_path / "bag", version=9) as writer:
         connection = writer.add_connection("/odometry", "nav_msgs/msg/Odometry", typestore=store)
         for stamp, content in enumerate((data, data[:30], data), start=1):
             writer.write(connection, stamp, content)
     odometry = read_odometry(tmp_path / "bag")
-    assert len(odometry) == 2 and odometry.remarks == ("/odometry: 1 messages left out, they cannot be read.",)
+    assert len(odometry) == 2 and odometry.remarks == (
+        "/odometry: 1 messages left out, they cannot be read.",
+    )
 
 
 def test_a_damaged_chunk_is_left_out_and_what_follows_is_read(tmp_path):
@@ -233,7 +300,11 @@ def test_a_damaged_chunk_is_left_out_and_what_follows_is_read(tmp_path):
     write_bag(flight, tmp_path / "bag")
     file = data_file(tmp_path / "bag")
     with open(file, "rb") as opened:
-        chunks = [record for record in mcap.records(opened, 8, file.stat().st_size - 8) if record.kind == mcap.CHUNK]
+        chunks = [
+            record
+            for record in mcap.records(opened, 8, file.stat().st_size - 8)
+            if record.kind == mcap.CHUNK
+        ]
     content = bytearray(file.read_bytes())
     content[chunks[1].content + 1000] ^= 1
     file.write_bytes(content)
@@ -243,7 +314,9 @@ def test_a_damaged_chunk_is_left_out_and_what_follows_is_read(tmp_path):
     assert back.imu.t[-1] == flight.imu.t[-1] and 0.3 < len(back.imu) / len(flight.imu) < 0.9
 
 
-@pytest.mark.parametrize("statement", ["timestamp = 'soon'", "data = 'text'", "topic_id = 77", "timestamp = -5"])
+@pytest.mark.parametrize(
+    "statement", ["timestamp = 'soon'", "data = 'text'", "topic_id = 77", "timestamp = -5"]
+)
 def test_rows_that_are_none_are_left_out(tables, statement):
     bag, run = tables
     run(f"UPDATE messages SET {statement} WHERE id = 20")
@@ -267,10 +340,15 @@ def claiming(path, meta, name="flight"):
 @pytest.mark.parametrize(
     "meta",
     [
-        {"antenna": [0.5, 0, 0]}, {"remarks": 5}, {"remarks": ["all is well"]}, {"reordered": {"tdoa": "x"}}, {"bag": "/etc/passwd"},
-        {"protocol": 7, "parameters": {}}, {"config": "x"},
+        {"antenna": [0.5, 0, 0]},
+        {"remarks": 5},
+        {"remarks": ["all is well"]},
+        {"reordered": {"tdoa": "x"}},
+        {"bag": "/etc/passwd"},
+        {"protocol": 7, "parameters": {}},
+        {"config": "x"},
     ],
-)  # fmt: skip
+)
 def test_what_a_bag_says_of_itself_is_not_believed(tmp_path, meta):
     bag = claiming(tmp_path / "bag", meta)
     flight = Reading().one(bag)
@@ -278,7 +356,9 @@ def test_what_a_bag_says_of_itself_is_not_believed(tmp_path, meta):
 
 
 def test_what_a_bag_says_of_itself_is_printable(tmp_path):
-    flight = read_bag(claiming(tmp_path / "bag", {"protocol": "tdoa2", "source": "\x1b[2Jx\n" + 10**5 * "y"}))
+    flight = read_bag(
+        claiming(tmp_path / "bag", {"protocol": "tdoa2", "source": "\x1b[2Jx\n" + 10**5 * "y"})
+    )
     assert flight.meta["protocol"] == "tdoa2" and flight.meta["source"].startswith(r"\x1b[2Jx\nyyy")
     assert len(flight.meta["source"]) == 1000
 
@@ -286,26 +366,38 @@ def test_what_a_bag_says_of_itself_is_printable(tmp_path):
 @BOTH
 def test_the_place_of_the_antenna_is_written_where_nodes_look_for_it(tmp_path, storage):
     flight = small_flight(0.1)
-    write_bag(replace(flight, meta={**flight.meta, "antenna": [0.5, 0.0, -0.1]}), tmp_path / "bag", storage)
+    write_bag(
+        replace(flight, meta={**flight.meta, "antenna": [0.5, 0.0, -0.1]}),
+        tmp_path / "bag",
+        storage,
+    )
     back = read_bag(tmp_path / "bag")
     assert back.meta["antenna"] == [0.5, 0.0, -0.1]
     assert back.meta["remarks"] == [
-        "uwb/tdoa is taken from frame 'uwb_antenna', which /tf_static places at (0.500, 0.000, -0.100) m in 'base_link'."
+        (
+            "uwb/tdoa is taken from frame 'uwb_antenna', which /tf_static places at (0.500, "
+            "0.000, -0.100) m in 'base_link'."
+        )
     ]
     write_bag(back, tmp_path / "again", storage)
     assert read_bag(tmp_path / "again").meta["antenna"] == [0.5, 0.0, -0.1]
 
 
 def shared_children(file, table, levels=10):
-    """Make the tree of a table of a SQLite file one whose pages share their children: each of `levels` pages has the next one hundreds
-    of times. Returns the bytes of the file."""
+    """Make the tree of a table of a SQLite file one whose pages share their children: each of
+    `levels` pages has the next one hundreds of times. Returns the bytes of the file.
+    """
     connection = sqlite3.connect(file)
-    roots = dict(connection.execute("SELECT name, rootpage FROM sqlite_master")) | {"sqlite_master": 1}
+    roots = dict(connection.execute("SELECT name, rootpage FROM sqlite_master")) | {
+        "sqlite_master": 1
+    }
     (size,) = connection.execute("PRAGMA page_size").fetchone()
     connection.close()
     data, root = bytearray(file.read_bytes()), roots[table]
     pages, leaf = len(data) // size, bytearray(data[(root - 1) * size : root * size])
-    of_file = 100 if root == 1 else 0  # bytes of the file's own header, before that of its first page
+    of_file = (
+        100 if root == 1 else 0
+    )  # bytes of the file's own header, before that of its first page
     leaf[: 300 - of_file] = leaf[of_file:300]
     for level in range(levels):
         numbers = [root, *range(pages + 1, pages + levels + 1)]
@@ -314,7 +406,9 @@ def shared_children(file, table, levels=10):
         cells = b"".join(struct.pack(">I", numbers[level + 1]) + b"\x01" for _ in range(count))
         start = size - len(cells)
         page[at : at + 12] = struct.pack(">BHHHBI", 5, 0, count, start, 0, numbers[level + 1])
-        page[at + 12 : at + 12 + 2 * count] = b"".join(struct.pack(">H", start + 5 * k) for k in range(count))
+        page[at + 12 : at + 12 + 2 * count] = b"".join(
+            struct.pack(">H", start + 5 * k) for k in range(count)
+        )
         page[start:] = cells
         if level:
             data += page
@@ -328,13 +422,17 @@ def shared_children(file, table, levels=10):
 
 @pytest.mark.parametrize("salvage", [False, True])
 @pytest.mark.parametrize("table", ["sqlite_master", "topics", "messages"])
-def test_pages_that_share_their_children_are_not_walked_for_ever(tables, table, salvage, monkeypatch):
+def test_pages_that_share_their_children_are_not_walked_for_ever(
+    tables, table, salvage, monkeypatch
+):
     """A file of 53 kB hung for ever. In five levels are 10^13 rows."""
     bag, _ = tables
     assert shared_children(data_file(bag), table) < 200_000
     monkeypatch.setattr(limits, "SECONDS", 0.5)
     began = time.process_time()
-    with nullcontext() if salvage and table == "messages" else pytest.raises(InputError):  # there the first rows are read
+    with (
+        nullcontext() if salvage and table == "messages" else pytest.raises(InputError)
+    ):  # there the first rows are read
         read_bag(bag, salvage=salvage)
     assert time.process_time() - began < 5.0
 
@@ -344,11 +442,17 @@ def test_an_interrupt_ends_a_walk_through_a_database(tables):
     shared_children(data_file(bag), "topics")
     code = (
         "import sys; from uwb_tdoa_bias.foundation import limits; limits.SECONDS = 1e9\n"
-        "from uwb_tdoa_tools.bags import integrity; integrity.Budget.is_late = lambda self: print('walks', flush=True)\n"
+        "from uwb_tdoa_tools.bags import integrity; integrity.Budget.is_late = lambda self: "
+        "print('walks', flush=True)\n"
         "from uwb_tdoa_bias.foundation.executable import executable\n"
         "sys.exit(executable('uwb_tdoa_tools.commands.check')())"
     )
-    check = subprocess.Popen([sys.executable, "-c", code, str(bag), "--salvage"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    check = subprocess.Popen(
+        [sys.executable, "-c", code, str(bag), "--salvage"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
     for line in check.stdout:
         if line == "walks\n":
             break

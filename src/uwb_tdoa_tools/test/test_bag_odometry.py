@@ -1,4 +1,6 @@
-"""Wheel odometry in bags, as nav_msgs/Odometry and as a twist, under our name and another: read as the node reads it."""
+"""Wheel odometry in bags, as nav_msgs/Odometry and as a twist, under our name and another: read as
+the node reads it.
+"""
 
 from dataclasses import replace
 
@@ -56,11 +58,19 @@ def bag_of(flight, folder, *topics):
         ([("/velocity", VELOCITY.message), ("/velocity/odometry", ODOMETRY)], {}),
     ],
 )
-def test_velocities_are_the_same_on_each_topic_that_the_node_hears(flight, tmp_path, names, renamed):
+def test_velocities_are_the_same_on_each_topic_that_the_node_hears(
+    flight, tmp_path, names, renamed
+):
     parts = halves(flight.velocity) if len(names) > 1 else [flight.velocity]
-    path = bag_of(flight, tmp_path, *((topic, kind, part) for (topic, kind), part in zip(names, parts)))
-    for column, expected in zip(read_bag(path, topics=renamed).velocity.columns, flight.velocity.columns):
-        np.testing.assert_allclose(column, expected, rtol=1e-15)  # variances, of which messages hold the square
+    path = bag_of(
+        flight, tmp_path, *((topic, kind, part) for (topic, kind), part in zip(names, parts))
+    )
+    for column, expected in zip(
+        read_bag(path, topics=renamed).velocity.columns, flight.velocity.columns
+    ):
+        np.testing.assert_allclose(
+            column, expected, rtol=1e-15
+        )  # variances, of which messages hold the square
     recording = read_recording(Reading(topics=renamed), path)
     np.testing.assert_array_equal(recording.sensors["velocity"].v, flight.velocity.v)
     assert not list(labels.odometry_unread(recording))

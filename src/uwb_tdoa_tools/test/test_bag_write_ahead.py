@@ -1,4 +1,6 @@
-"""SQLite bags of a recorder that was killed: what is in the -wal file counts, or the bag is refused."""
+"""SQLite bags of a recorder that was killed: what is in the -wal file counts, or the bag is
+refused.
+"""
 
 from pathlib import Path
 import shutil
@@ -6,6 +8,7 @@ import sqlite3
 
 import pytest
 from recordings import differences, small_flight
+
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.bags.bag import read_bag, write_bag
 from uwb_tdoa_tools.bags.files import messages, open_bag
@@ -17,20 +20,27 @@ BATCHES = 12  # transactions in the log
 
 @pytest.fixture(params=["file", "directory"])
 def unclosed(request, tmp_path):
-    """A bag whose last two thirds are in the log of its file, as a recorder leaves it that is killed."""
+    """A bag whose last two thirds are in the log of its file, as a recorder leaves it that is
+    killed.
+    """
     write_bag(FLIGHT, tmp_path / "written", "sqlite3")
     (written,) = (tmp_path / "written").glob("*.db3")
     connection = sqlite3.connect(written, isolation_level=None)
     connection.execute("PRAGMA journal_mode=WAL")
     connection.execute("PRAGMA wal_autocheckpoint=0")
-    rows = connection.execute("SELECT id, topic_id, timestamp, data FROM messages ORDER BY id").fetchall()
+    rows = connection.execute(
+        "SELECT id, topic_id, timestamp, data FROM messages ORDER BY id"
+    ).fetchall()
     first = len(rows) // 3
     connection.execute("DELETE FROM messages WHERE id > ?", (rows[first - 1][0],))
     connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
     size = (len(rows) - first) // BATCHES + 1
     for begin in range(first, len(rows), size):
         connection.execute("BEGIN")
-        connection.executemany("INSERT INTO messages(id, topic_id, timestamp, data) VALUES (?, ?, ?, ?)", rows[begin : begin + size])
+        connection.executemany(
+            "INSERT INTO messages(id, topic_id, timestamp, data) VALUES (?, ?, ?, ?)",
+            rows[begin : begin + size],
+        )
         connection.execute("COMMIT")
     killed = tmp_path / "killed"
     killed.mkdir()
@@ -41,7 +51,9 @@ def unclosed(request, tmp_path):
     if request.param == "directory":  # without our checksum of the file
         text = (killed / "metadata.yaml").read_text()
         (killed / "metadata.yaml").chmod(0o644)
-        (killed / "metadata.yaml").write_text("\n".join(line for line in text.splitlines() if "crc32" not in line))
+        (killed / "metadata.yaml").write_text(
+            "\n".join(line for line in text.splitlines() if "crc32" not in line)
+        )
     connection.close()
     return killed if request.param == "directory" else killed / written.name
 
@@ -73,11 +85,16 @@ def test_a_damaged_log_is_refused_or_read_up_to_there(unclosed):
     content = bytearray(log.read_bytes())
     content[len(content) // 2] ^= 0xFF
     log.write_bytes(content)
-    with pytest.raises(InputError, match=r"-wal: \d+ of \d+ transactions cannot be read.*--salvage"):
+    with pytest.raises(
+        InputError, match=r"-wal: \d+ of \d+ transactions cannot be read.*--salvage"
+    ):
         read_bag(unclosed)
     flight = read_bag(unclosed, salvage=True)
     assert 0.3 * len(FLIGHT.tdoa) < len(flight.tdoa) < len(FLIGHT.tdoa)
-    assert any("transactions cannot be read: read up to there" in remark for remark in flight.meta["remarks"])
+    assert any(
+        "transactions cannot be read: read up to there" in remark
+        for remark in flight.meta["remarks"]
+    )
 
 
 def test_a_log_without_its_head_is_refused(unclosed):

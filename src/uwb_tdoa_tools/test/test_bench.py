@@ -13,7 +13,7 @@ pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 from uwb_tdoa_tools.benchmark import core, nodes, source, usage  # noqa: E402
 from uwb_tdoa_tools.benchmark.figures import Figure, as_json, table  # noqa: E402
-from uwb_tdoa_tools.benchmark.flights import among, TDOA_RATE, make_flight  # noqa: E402
+from uwb_tdoa_tools.benchmark.flights import TDOA_RATE, among, make_flight  # noqa: E402
 from uwb_tdoa_tools.commands import bench  # noqa: E402
 
 OTHERS = 0.2  # of the CPU time, from which on nothing can be asked of what is played in real time
@@ -26,7 +26,9 @@ def test_a_figure_is_the_median_and_the_quartiles_of_what_is_known():
     assert figure.met is True
     assert Figure.of("core", "prediction", "us", 3.1, target=3.0).met is False
     assert Figure.of("core", "prediction", "us", 3.1).met is None
-    assert Figure.of("core", "prediction", "us", np.nan, target=3.0).met is False  # not known is not met
+    assert (
+        Figure.of("core", "prediction", "us", np.nan, target=3.0).met is False
+    )  # not known is not met
 
 
 def test_table():
@@ -45,7 +47,9 @@ def test_table():
 
 
 def test_json_is_what_everybody_reads():
-    rows = as_json([Figure.of("core", "prediction", "us", np.nan), Figure.of("core", "update", "us", 1.0, 3.5)])
+    rows = as_json(
+        [Figure.of("core", "prediction", "us", np.nan), Figure.of("core", "update", "us", 1.0, 3.5)]
+    )
     assert all(set(row) == KEYS for row in rows)
     assert json.loads(json.dumps(rows, allow_nan=False))[0]["median"] is None
     assert [row["met"] for row in rows] == [None, True]
@@ -70,8 +74,13 @@ def test_a_flight_among_more_anchors_hears_its_own():
 
 
 def test_cpu_time_and_memory_of_a_process():
-    code = "import time; a = bytearray(50_000_000)\nwhile time.process_time() < 0.5: pass\nprint(flush=True); input()"
-    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+    code = (
+        "import time; a = bytearray(50_000_000)\nwhile time.process_time() < 0.5: "
+        "pass\nprint(flush=True); input()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as process:
         process.stdout.readline()
         assert usage.cpu_seconds(process.pid) == pytest.approx(0.5, abs=0.1)
         assert 50e6 < usage.memory(process.pid) < 150e6
@@ -84,22 +93,30 @@ def test_what_others_use():
     while time.process_time() < until:
         pass
     shares = usage.used_by_others(before)
-    assert set(shares) == {"others", "stolen"} and all(0.0 <= share <= 1.0 for share in shares.values())
+    assert set(shares) == {"others", "stolen"} and all(
+        0.0 <= share <= 1.0 for share in shares.values()
+    )
     ours = usage.used_by_all()[3] - before[3]
     assert ours == pytest.approx(0.3, abs=0.05)
-    assert shares["others"] + shares["stolen"] <= 1.0 - 0.8 * ours / (usage.used_by_all()[0] - before[0])
+    assert shares["others"] + shares["stolen"] <= 1.0 - 0.8 * ours / (
+        usage.used_by_all()[0] - before[0]
+    )
 
 
 @pytest.mark.parametrize("aid", core.NOISES)
 def test_an_aid_is_measured_beside_the_rest(aid):
     microseconds = core.per_aid(aid, 15)
-    assert len(microseconds) == 15 and np.isfinite(microseconds).all()  # a difference: on a loaded machine below 0 at times
+    assert (
+        len(microseconds) == 15 and np.isfinite(microseconds).all()
+    )  # a difference: on a loaded machine below 0 at times
 
 
 def test_the_core_is_measured_per_event():
     prediction, update = core.per_event(8, "innovation", 1, 5)
     assert prediction.shape == update.shape == (5,)
-    assert (prediction > 0.0).all() and np.isfinite(update).all()  # a difference: on a loaded machine below 0 at times
+    assert (prediction > 0.0).all() and np.isfinite(
+        update
+    ).all()  # a difference: on a loaded machine below 0 at times
 
 
 def test_the_core_is_measured_while_several_yaws_are_followed():
@@ -111,26 +128,41 @@ def test_latency_is_that_of_the_first_odometry_that_contains_a_tdoa():
     ms = 1_000_000
     stamps = np.array([0, 10, 12, 20, 30, 90]) * ms
     sent = 1000 * ms + stamps
-    of = np.array([5, 15, 10, 30]) * ms  # stamps in order of arrival; the third is one that came late
+    of = (
+        np.array([5, 15, 10, 30]) * ms
+    )  # stamps in order of arrival; the third is one that came late
     arrivals = 1000 * ms + np.array([8, 18, 19, 37]) * ms
     found = source.latencies(sent, stamps, arrivals, of)
     # before the first arrival: unknown; 10 and 12 are in 15; 20 and 30 in 30; 90 in none
     np.testing.assert_allclose(found, [np.nan, 0.008, 0.006, 0.017, 0.007, np.nan], atol=1e-12)
-    assert np.isnan(source.latencies(sent, stamps, np.empty(0, np.int64), np.empty(0, np.int64))).all()
+    assert np.isnan(
+        source.latencies(sent, stamps, np.empty(0, np.int64), np.empty(0, np.int64))
+    ).all()
 
 
 def test_ready_is_read_from_the_log():
-    log = "[INFO] [17.5] [tag1.ekf_node]: loading\nnot ready\n[INFO] [18.25] [tag1.ekf_node]: ready\n"
+    log = (
+        "[INFO] [17.5] [tag1.ekf_node]: loading\nnot ready\n[INFO] [18.25] [tag1.ekf_node]: ready\n"
+    )
     assert nodes.ready_at("ekf_node", log) == ["18.25"]
-    assert not nodes.ready_at("ekf_node", log[:-30]) and not nodes.ready_at("localization_node", log)
+    assert not nodes.ready_at("ekf_node", log[:-30]) and not nodes.ready_at(
+        "localization_node", log
+    )
 
 
 def test_bad_usage(tmp_path, capsys):
     assert bench.main(["--only", "cpu"]) == 2
-    assert "core, offline, nodes, tags, hall, replay, graph" in capsys.readouterr().err.replace("'", "")
+    assert "core, offline, nodes, tags, hall, replay, graph" in capsys.readouterr().err.replace(
+        "'", ""
+    )
     assert bench.main(["--json", str(tmp_path / "no" / "bench.json"), "--out", str(tmp_path)]) == 2
     assert "its directory does not exist" in capsys.readouterr().err
-    assert bench.main(["--only", "offline", "--model", str(tmp_path / "no.onnx"), "--out", str(tmp_path)]) == 2
+    assert (
+        bench.main(
+            ["--only", "offline", "--model", str(tmp_path / "no.onnx"), "--out", str(tmp_path)]
+        )
+        == 2
+    )
     assert "no.onnx does not exist" in capsys.readouterr().err
 
 
@@ -144,7 +176,12 @@ def test_a_quick_run_of_the_real_nodes(tmp_path, capsys):
     report = tmp_path / "bench.json"
     before = dict(os.environ)
     only = ["core", "offline", "nodes", "replay"]
-    assert bench.main(["--quick", "--only", *only, "--json", str(report), "--out", str(tmp_path / "out")]) == 0
+    assert (
+        bench.main(
+            ["--quick", "--only", *only, "--json", str(report), "--out", str(tmp_path / "out")]
+        )
+        == 0
+    )
     assert dict(os.environ) == before
     told = json.loads(report.read_text())
     assert told["machine"]["cores"] >= 1 and 0.0 <= told["machine"]["others"] <= 1.0
@@ -152,7 +189,9 @@ def test_a_quick_run_of_the_real_nodes(tmp_path, capsys):
     assert None not in value.values()
     printed = capsys.readouterr().out
     assert all(name in printed for name in value)
-    if told["machine"]["others"] < OTHERS:  # else they may not get the share of a core that 1400 messages a second take
+    if (
+        told["machine"]["others"] < OTHERS
+    ):  # else they may not get the share of a core that 1400 messages a second take
         assert all(value[f"lost, {what}"] == 0 for what in ("TDOAs", "IMU samples")), value
         assert value["latency p50, TDOA published to odometry arrived"] < 1000.0
     # What must hold however slow the machine is

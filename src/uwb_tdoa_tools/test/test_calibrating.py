@@ -22,14 +22,23 @@ from uwb_tdoa_tools.estimate import FlightEstimator
 from uwb_tdoa_tools.scoring.evaluation import score_of
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
-CLEAN = dict(duration=60.0, floor_time=1.0, imu_rate=100.0, bias=False, multipath=False, outlier_probability=0.0)
+CLEAN = dict(
+    duration=60.0,
+    floor_time=1.0,
+    imu_rate=100.0,
+    bias=False,
+    multipath=False,
+    outlier_probability=0.0,
+)
 
 
 def shaken_flight(seed):
     """A flight whose anchors stand elsewhere than the survey says, the same in each."""
     flight = simulate(SimulationConfig(seed=seed, trajectory="sines", **CLEAN))
     off = 0.1 * np.random.default_rng(5).standard_normal(flight.anchors.positions.shape)
-    return replace(flight, name=f"flight{seed}", anchors=flight.anchors.at(flight.anchors.positions + off))
+    return replace(
+        flight, name=f"flight{seed}", anchors=flight.anchors.at(flight.anchors.positions + off)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -57,22 +66,36 @@ def test_a_flight_in_two_parts_is_all_of_it(flights):
 def test_without_ground_truth_other_flights_get_better_and_none_is_read(flights):
     *fitted, other = flights
     blind = [replace(flight, truth=None) for flight in fitted]
-    wrong = [replace(flight, truth=replace(flight.truth, p=flight.truth.p + np.nan)) for flight in fitted]
+    wrong = [
+        replace(flight, truth=replace(flight.truth, p=flight.truth.p + np.nan)) for flight in fitted
+    ]
     made = [without_truth(some[:1], some[1:]) for some in (blind, wrong)]
-    assert made[0].why_not is None and made[0].after < 0.8 * made[0].before and made[0].judged_on == "flight2"
+    assert (
+        made[0].why_not is None
+        and made[0].after < 0.8 * made[0].before
+        and made[0].judged_on == "flight2"
+    )
     np.testing.assert_array_equal(made[0].anchors.positions, made[1].anchors.positions)
     before = score_of(other, FlightEstimator())[0].row()["rmse_3d"]
-    after = score_of(replace(other, anchors=made[0].anchors), FlightEstimator(None, made[0].effects))[0].row()["rmse_3d"]
+    after = score_of(
+        replace(other, anchors=made[0].anchors), FlightEstimator(None, made[0].effects)
+    )[0].row()["rmse_3d"]
     assert after < 0.8 * before
 
 
 @pytest.mark.slow
 def test_ranges_of_another_tag_judge():
-    """Another tag has a delay of its own, which the filter finds: anchors are not to blame for that, and nothing need be calibrated."""
+    """Another tag has a delay of its own, which the filter finds: anchors are not to blame for
+    that, and nothing need be calibrated.
+    """
     flown = dict(CLEAN, range_noise=0.1)
-    ranged = [simulate(SimulationConfig(seed=seed, trajectory=path, **flown)) for seed, path in ((500, "sines"), (501, "circle"))]
     ranged = [
-        without_offset(replace(flight, truth=None, tdoa=Tdoas(*np.empty((4, 0)))), -delay) for flight, delay in zip(ranged, (0.25, 0.4))
+        simulate(SimulationConfig(seed=seed, trajectory=path, **flown))
+        for seed, path in ((500, "sines"), (501, "circle"))
+    ]
+    ranged = [
+        without_offset(replace(flight, truth=None, tdoa=Tdoas(*np.empty((4, 0)))), -delay)
+        for flight, delay in zip(ranged, (0.25, 0.4))
     ]
     made = without_truth(ranged[:1], ranged[1:])
     assert max(made.before, made.after) < 0.05 and made.why_not is not None
@@ -88,14 +111,26 @@ def test_a_single_flight_is_judged_on_its_end(flights):
 def test_what_makes_it_worse_where_it_took_no_part_is_not_to_be_used(flights, monkeypatch):
     told = iter([0.01, 0.02])
     monkeypatch.setattr(library, "slow_innovations", lambda *_: next(told))
-    made = without_truth([replace(flight, truth=None) for flight in flights[:1]], [replace(flights[1], truth=None)])
-    assert "it makes things worse where it took no part: slow innovations 1.0 -> 2.0 cm (it rises by 100 %) on flight2" in made.why_not
+    made = without_truth(
+        [replace(flight, truth=None) for flight in flights[:1]], [replace(flights[1], truth=None)]
+    )
+    assert (
+        "it makes things worse where it took no part: slow innovations 1.0 -> 2.0 cm (it "
+        "rises by 100 %) on flight2"
+    ) in made.why_not
 
 
 @pytest.mark.parametrize(
     ("before", "after", "why"),
     [
-        (0.2, 0.1, "10.0 cm of the innovations are slow with it on flight3, more than 5.5 cm: something else is wrong too"),
+        (
+            0.2,
+            0.1,
+            (
+                "10.0 cm of the innovations are slow with it on flight3, more than 5.5 cm: "
+                "something else is wrong too"
+            ),
+        ),
         (0.05, 0.04, "it gains too little to be sure that it does no harm"),
         (0.055, 0.02, None),
         (0.08, 0.05, None),  # a tape that is good to 5 cm
@@ -112,7 +147,10 @@ def test_quick_says_what_is_to_be_expected(flights):
     assert told.exciting and told.left < told.before and told.better.mean() > 0.5
     assert np.median(told.expected) < 0.7 * np.median(told.given)
     sentences = told.sentences()
-    assert f"all flights are likely to tell {told.better.sum()} of 24 coordinates better" in sentences[1]
+    assert (
+        f"all flights are likely to tell {told.better.sum()} of 24 coordinates better"
+        in sentences[1]
+    )
     assert sentences[-1] == "the flights are exciting enough"
 
 
@@ -139,14 +177,27 @@ def room(bags, tmp_path, monkeypatch):
 
 
 GOOD = Calibration(
-    Anchors([0, 1, 2, 3], np.eye(4)[:, :3], np.full((4, 4), np.nan)), EffectSet((AnchorDelay({"0": 0.1}),)), 0.1, "3D RMSE", 0.2, 0.1,
-    "flight3", None, "found",
-)  # fmt: skip
+    Anchors([0, 1, 2, 3], np.eye(4)[:, :3], np.full((4, 4), np.nan)),
+    EffectSet((AnchorDelay({"0": 0.1}),)),
+    0.1,
+    "3D RMSE",
+    0.2,
+    0.1,
+    "flight3",
+    None,
+    "found",
+)
 
 
 def stub(monkeypatch, made, seen):
     def instead(flights, holdout, *_):
-        seen.append(([flight.name for flight in flights], [flight.name for flight in holdout], [f.truth is not None for f in flights]))
+        seen.append(
+            (
+                [flight.name for flight in flights],
+                [flight.name for flight in holdout],
+                [f.truth is not None for f in flights],
+            )
+        )
         return made
 
     monkeypatch.setattr(calibrate, "with_truth", instead)
@@ -168,7 +219,12 @@ def test_what_judges_takes_no_part(room, monkeypatch, more, seen):
     flights = [f"flight{k}.bag" for k in (1, 2, 3) if f"flight{k}.bag" not in more]
     assert calibrate.main([*flights, *more, "--out", "out"]) == 0
     assert calls == [seen]
-    assert sorted(path.name for path in (room / "out").iterdir()) == ["anchors.yaml", "calibration.json", "effects.yaml", "ekf_node.yaml"]
+    assert sorted(path.name for path in (room / "out").iterdir()) == [
+        "anchors.yaml",
+        "calibration.json",
+        "effects.yaml",
+        "ekf_node.yaml",
+    ]
 
 
 def test_what_is_not_to_be_used_is_not_written(room, monkeypatch, capsys):
@@ -176,7 +232,10 @@ def test_what_is_not_to_be_used_is_not_written(room, monkeypatch, capsys):
     assert calibrate.main(["flight1.bag", "--out", "out"]) == 1
     assert [path.name for path in (room / "out").iterdir()] == ["calibration.json"]
     assert json.loads((room / "out" / "calibration.json").read_text())["offered"] is False
-    assert "calibrate: stopped, and nothing to use is written: it makes things worse." in capsys.readouterr().err
+    assert (
+        "calibrate: stopped, and nothing to use is written: it makes things worse."
+        in capsys.readouterr().err
+    )
 
 
 def test_it_stops_where_check_finds_an_error(room, flights, monkeypatch, capsys):
@@ -186,13 +245,20 @@ def test_it_stops_where_check_finds_an_error(room, flights, monkeypatch, capsys)
     write_bag(wrong, "wrong.bag")
     assert calibrate.main(["wrong.bag", "--out", "out"]) == 1
     printed = capsys.readouterr()
-    assert "sign" in printed.out and "check finds an error" in printed.err and not (room / "out").exists()
+    assert (
+        "sign" in printed.out
+        and "check finds an error" in printed.err
+        and not (room / "out").exists()
+    )
 
 
 def test_a_tape_that_is_off_does_not_stop_it_and_another_room_does(flights):
     flight, findings = flights[0], [Finding(library.MISFIT, ERROR, "", "", "", 0.0)]
     assert library.stopping(of_flight(flight), findings, 0.1) == []
-    far = flight.anchors.at(flight.anchors.positions + np.random.default_rng(6).standard_normal(flight.anchors.positions.shape))
+    far = flight.anchors.at(
+        flight.anchors.positions
+        + np.random.default_rng(6).standard_normal(flight.anchors.positions.shape)
+    )
     assert library.stopping(of_flight(replace(flight, anchors=far)), findings, 0.1) == findings
     other = Finding("tdoa_sign", ERROR, "", "", "", 0.0)
     assert library.stopping(of_flight(flight), [other, *findings], 0.1) == [other]
@@ -203,8 +269,14 @@ def test_a_tape_that_is_off_does_not_stop_it_and_another_room_does(flights):
     [
         (["flight1.bag"], "--out: is missing"),
         (["flight1.bag", "--holdout", "flight1.bag", "--out", "out"], "is also a FLIGHT to fit"),
-        (["flight1.bag", "--std", "0.1", "--out", "out"], "--std: says how well anchors are known, and ground truth is there to tell"),
-        (["flight1.bag", "blind.bag", "--out", "out"], "blind: holds no ground truth, and others do"),
+        (
+            ["flight1.bag", "--std", "0.1", "--out", "out"],
+            "--std: says how well anchors are known, and ground truth is there to tell",
+        ),
+        (
+            ["flight1.bag", "blind.bag", "--out", "out"],
+            "blind: holds no ground truth, and others do",
+        ),
     ],
 )
 def test_bad_usage_is_one_sentence(room, monkeypatch, capsys, words, sentence):

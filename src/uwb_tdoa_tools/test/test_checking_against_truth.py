@@ -2,12 +2,12 @@
 
 from dataclasses import replace
 
+from known_effects import clean_flight
 import numpy as np
 import pytest
 
 from uwb_tdoa_bias.foundation.flight import Truth
 from uwb_tdoa_tools.checking.against_truth import against_truth, of_truth
-from known_effects import clean_flight
 
 
 @pytest.fixture(scope="module")
@@ -28,10 +28,14 @@ def test_holes_and_leaps_in_the_air(flight):
 def test_what_is_not_there_is_not_compared(flight):
     assert against_truth(replace(flight, truth=None)) == []
     bare = Truth(flight.truth.t, flight.truth.p, np.full_like(flight.truth.q, np.nan))
-    assert against_truth(replace(flight, truth=bare)) == against_truth(replace(flight, imu=None)) == []
+    assert (
+        against_truth(replace(flight, truth=bare)) == against_truth(replace(flight, imu=None)) == []
+    )
 
 
 def test_ids_are_put_right_before_signs_are_judged(flight):
     of = flight.tdoa
     a, b = (np.where(ids == 2, 3, np.where(ids == 3, 2, ids)) for ids in (of.a, of.b))
-    assert [finding.rule for finding in against_truth(replace(flight, tdoa=replace(of, a=a, b=b)))] == ["ids_exchanged"]
+    assert [
+        finding.rule for finding in against_truth(replace(flight, tdoa=replace(of, a=a, b=b)))
+    ] == ["ids_exchanged"]

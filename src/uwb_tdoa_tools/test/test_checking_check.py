@@ -1,21 +1,27 @@
-"""What `check` says of whole recordings: nothing of healthy ones, and the mistake where there is one."""
+"""What `check` says of whole recordings: nothing of healthy ones, and the mistake where there is
+one.
+"""
 
 from dataclasses import replace
 
+from checking_flights import QUICK, recording
+from known_effects import clean_flight
+from mistakes import MISTAKES
 import numpy as np
 import pytest
+
 from uwb_tdoa_tools.checking.check import check, different_surveys, upright
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.readers import inputs, read_flight, read_survey
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.constellations import constellation
-from mistakes import MISTAKES
-from known_effects import clean_flight
-
-from checking_flights import QUICK, recording
 
 OTHER_ROOM = constellation("random-5")
-NOTHING_TRIED = ["stamp_zero", "clipped", "jump"]  # with these, nothing but the streams themselves is judged
+NOTHING_TRIED = [
+    "stamp_zero",
+    "clipped",
+    "jump",
+]  # with these, nothing but the streams themselves is judged
 LONGER = {"mirrored_survey": {"duration": 30.0}}  # shows once the yaw is known
 HARMLESS = "clipped_accel"  # nothing is cut off in a smooth simulated flight
 
@@ -27,8 +33,14 @@ def rules(report):
 def with_mistake(name, seed=0):
     mistake = MISTAKES[name]
     protocol = "tdoa3" if mistake.needs == "tdoa3" else "tdoa2"
-    healthy = recording(seed, live="live" in mistake.needs, protocol=protocol, **LONGER.get(name, {}))
-    other = OTHER_ROOM if mistake.needs == "rooms" else recording(seed + 1, protocol=protocol, trajectory="circle")
+    healthy = recording(
+        seed, live="live" in mistake.needs, protocol=protocol, **LONGER.get(name, {})
+    )
+    other = (
+        OTHER_ROOM
+        if mistake.needs == "rooms"
+        else recording(seed + 1, protocol=protocol, trajectory="circle")
+    )
     made = mistake.make(healthy, np.random.default_rng([seed, *name.encode()]), other)
     others = [] if mistake.alone else [("right.yaml", healthy.anchors), ("wrong.yaml", OTHER_ROOM)]
     return check(made, others)
@@ -45,7 +57,9 @@ def test_nothing_is_said_of_a_healthy_flight(protocol, live):
 @pytest.mark.parametrize("trajectory", ["circle", "square", "line_x", "rising_circle", "hover"])
 @pytest.mark.parametrize("room", ["corners", "random-3", "random-8-6"])
 def test_no_error_is_alleged_of_healthy_flights(trajectory, room):
-    report = check(recording(trajectory=trajectory, constellation=room), [("other.yaml", OTHER_ROOM)])
+    report = check(
+        recording(trajectory=trajectory, constellation=room), [("other.yaml", OTHER_ROOM)]
+    )
     assert not report.faulty, report.findings
 
 
@@ -55,7 +69,9 @@ def test_a_mistake_is_named(name):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in MISTAKES if name not in (*NOTHING_TRIED, HARMLESS)])
+@pytest.mark.parametrize(
+    "name", [name for name in MISTAKES if name not in (*NOTHING_TRIED, HARMLESS)]
+)
 def test_a_mistake_that_takes_trials_is_named(name):
     report = with_mistake(name)
     assert rules(report) & set(MISTAKES[name].named), report.findings
@@ -71,14 +87,18 @@ def test_two_mistakes_at_once_are_both_named():
 def test_ground_truth_is_not_read():
     flight = simulate(SimulationConfig(seed=3, **QUICK))
     wrong = replace(flight, truth=replace(flight.truth, p=flight.truth.p + 100.0))
-    first, second, none = (check(of_flight(f)) for f in (flight, wrong, replace(flight, truth=None, extra={})))
+    first, second, none = (
+        check(of_flight(f)) for f in (flight, wrong, replace(flight, truth=None, extra={}))
+    )
     assert first == second == none
 
 
 def test_the_errors_come_first():
     report = with_mistake("three_anchors")
     severities = [finding.severity for finding in report.findings]
-    assert severities == sorted(severities, key=["error", "warning", "note"].index) and report.faulty
+    assert (
+        severities == sorted(severities, key=["error", "warning", "note"].index) and report.faulty
+    )
 
 
 def test_recordings_of_two_rooms_do_not_belong_together():
@@ -103,7 +123,10 @@ def test_what_brings_an_axis_upwards_is_a_rotation(axis, sign):
 def test_measured_flights_and_their_mistakes(shared_data, name):
     """Two flights that took no part in choosing the limits; the table of all is in docs/connect.md."""
     ((path, survey),) = inputs.find_flights([shared_data / name], shared_data / "surveys")
-    surveys = [(str(path), read_survey(path)) for path in sorted((shared_data / "surveys").glob("anchor_?*"))]
+    surveys = [
+        (str(path), read_survey(path))
+        for path in sorted((shared_data / "surveys").glob("anchor_?*"))
+    ]
     measured = of_flight(read_flight(path, survey))
     assert check(measured, surveys).findings == []
     for mistake in ("sign", "swapped", "another_room"):
@@ -112,23 +135,41 @@ def test_measured_flights_and_their_mistakes(shared_data, name):
         assert rules(check(made, surveys)) & set(MISTAKES[mistake].named)
 
 
-OF_ANOTHER_ROOM = {"ids_swapped", "pair_sign", "imu_rate_unit", "imu_axes", "tdoa_sign"}  # what it was taken for
+OF_ANOTHER_ROOM = {
+    "ids_swapped",
+    "pair_sign",
+    "imu_rate_unit",
+    "imu_axes",
+    "tdoa_sign",
+}  # what it was taken for
 
 
 def test_a_survey_of_another_room_is_not_blamed_on_ids_nor_on_the_gyroscope():
-    """Eight anchors elsewhere under the same ids: many of them exchanged explain most of it, and a slower gyroscope the rest."""
+    """Eight anchors elsewhere under the same ids: many of them exchanged explain most of it, and a
+    slower gyroscope the rest.
+    """
     flight = clean_flight(702, 40.0)
-    elsewhere = flight.anchors.positions[[3, 7, 2, 5, 0, 4, 1, 6]] * [0.8, 1.0, 1.0] + [0.5, 0.0, 0.2]
+    elsewhere = flight.anchors.positions[[3, 7, 2, 5, 0, 4, 1, 6]] * [0.8, 1.0, 1.0] + [
+        0.5,
+        0.0,
+        0.2,
+    ]
     found = rules(check(of_flight(replace(flight, anchors=flight.anchors.at(elsewhere)))))
     assert "survey_misfit" in found and not found & OF_ANOTHER_ROOM
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("log", "survey"), [("util/const1-trial2-tdoa2.csv.gz", "const4.csv"), ("flights/0425/TDOA2/0425-traj2", "const1.csv")]
+    ("log", "survey"),
+    [
+        ("util/const1-trial2-tdoa2.csv.gz", "const4.csv"),
+        ("flights/0425/TDOA2/0425-traj2", "const1.csv"),
+    ],
 )
 def test_a_measured_log_with_the_survey_of_another_room(log, survey, shared_data):
     """The first was said to have the sign of all TDOAs wrong."""
-    (flight,) = inputs.Reading(str(shared_data / "surveys" / f"anchor_{survey}")).flights([str(shared_data / log)])
+    (flight,) = inputs.Reading(str(shared_data / "surveys" / f"anchor_{survey}")).flights(
+        [str(shared_data / log)]
+    )
     found = rules(check(of_flight(flight)))
     assert "survey_misfit" in found and not found & OF_ANOTHER_ROOM

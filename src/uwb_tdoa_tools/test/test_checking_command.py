@@ -1,22 +1,24 @@
 """The executable: text, JSON and exit codes."""
 
 import contextlib
+from dataclasses import replace
 import io
 import json
-from dataclasses import replace
 
+from checking_flights import QUICK
 import numpy as np
 import pytest
+
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands.check import main
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
-from checking_flights import QUICK
-
 
 @pytest.fixture(scope="module")
 def checked(tmp_path_factory):
-    """A folder with a healthy bag and one with flipped signs, the exit code of checking it, and the JSON."""
+    """A folder with a healthy bag and one with flipped signs, the exit code of checking it, and the
+    JSON.
+    """
     folder = tmp_path_factory.mktemp("bags")
     flight = simulate(SimulationConfig(seed=0, **{**QUICK, "imu_rate": 200.0}))
     write_bag(flight, folder / "good.bag")
@@ -39,7 +41,9 @@ def test_errors_have_code_one_and_a_line_to_copy(checked):
     assert "ERROR: the sign of all TDOAs is wrong" in out
     assert "remedy: message.distance_difference = distance_to_b - distance_to_a" in out
     (finding,) = content["recordings"][0]["findings"]
-    assert finding["rule"] == "tdoa_sign" and finding["severity"] == "error" and finding["value"] < 0.9
+    assert (
+        finding["rule"] == "tdoa_sign" and finding["severity"] == "error" and finding["value"] < 0.9
+    )
 
 
 @pytest.mark.slow
@@ -47,7 +51,9 @@ def test_without_errors_the_code_is_zero(checked):
     assert main([str(checked[0] / "good.bag")]) == 0
 
 
-@pytest.mark.parametrize("arguments, sentence", [(["nowhere.bag"], "does not exist"), ([], "give recordings, or --live")])
+@pytest.mark.parametrize(
+    "arguments, sentence", [(["nowhere.bag"], "does not exist"), ([], "give recordings, or --live")]
+)
 def test_bad_input_is_two(arguments, sentence, capsys):
     assert main(arguments) == 2
     assert sentence in capsys.readouterr().err

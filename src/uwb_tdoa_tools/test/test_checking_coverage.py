@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_ekf.streams import StreamRules
 from uwb_tdoa_tools.checking import coverage
@@ -18,7 +19,11 @@ def windows(anchors, heard, seconds=20):
     rows = heard(t, a, b)
     rules = StreamRules(anchors)
     rules.feed_tdoa(
-        t[rows], np.full(rows.sum(), np.nan), anchors.ids[a[rows]], anchors.ids[b[rows]], 0.1 * np.sin(t[rows])
+        t[rows],
+        np.full(rows.sum(), np.nan),
+        anchors.ids[a[rows]],
+        anchors.ids[b[rows]],
+        0.1 * np.sin(t[rows]),
     )
     rules.finish()
     return list(rules.tdoa)
@@ -44,7 +49,9 @@ def test_an_anchor_that_is_hardly_heard():
 
 
 def test_an_anchor_that_falls_silent():
-    found = said(heard=lambda t, a, b: ((a != 3) & (b != 3)) | (t < 8.0) | (t > 16.0))["anchor_silent"]
+    found = said(heard=lambda t, a, b: ((a != 3) & (b != 3)) | (t < 8.0) | (t > 16.0))[
+        "anchor_silent"
+    ]
     assert found.value == pytest.approx(8.0, abs=1.0) and "anchor 3" in found.cause
 
 
@@ -57,7 +64,12 @@ def test_anchors_in_a_plane(axis):
 
 @pytest.mark.parametrize(
     ("axis", "at", "said_of"),
-    [(2, 3.0, "tag_side:=below"), (2, 0.1, "tag_side:=above"), (0, 0.0, "tag_side:=+x or -p tag_side:=-x"), (1, 0.0, "tag_side:=+y")],
+    [
+        (2, 3.0, "tag_side:=below"),
+        (2, 0.1, "tag_side:=above"),
+        (0, 0.0, "tag_side:=+x or -p tag_side:=-x"),
+        (1, 0.0, "tag_side:=+y"),
+    ],
 )
 def test_anchors_in_a_plane_across_an_axis_need_a_side(axis, at, said_of):
     flat = BOX.copy()
@@ -75,12 +87,16 @@ def test_where_something_measures_the_height_no_side_is_needed():
     flat = BOX.copy()
     flat[:, 2] = 3.0
     anchors = Anchors.from_positions(flat)
-    view = coverage.CoverageView(anchors, windows(anchors, lambda t, a, b: t >= 0.0), PLACES, height_known=True)
+    view = coverage.CoverageView(
+        anchors, windows(anchors, lambda t, a, b: t >= 0.0), PLACES, height_known=True
+    )
     assert not list(coverage.side(view))
 
 
 def test_anchors_with_z_down():
-    assert "survey_z_down" in said(positions=BOX * [1.0, 1.0, -1.0], places=PLACES * [1.0, 1.0, -1.0])
+    assert "survey_z_down" in said(
+        positions=BOX * [1.0, 1.0, -1.0], places=PLACES * [1.0, 1.0, -1.0]
+    )
 
 
 def test_a_tag_outside():

@@ -14,7 +14,9 @@ def course(t):
 
 
 def found(late, noise=0.1):
-    """Delays of three series with noise and constant errors of their own, each sample `late` (n,) s."""
+    """Delays of three series with noise and constant errors of their own, each sample `late` (n,)
+    s.
+    """
     measured = course(T - late) + SERIES + noise * np.random.default_rng(0).standard_normal(len(T))
     return delays(SERIES, T, lambda delay: measured - course(T - delay))
 
@@ -47,8 +49,12 @@ def test_a_clock_that_drifts_and_one_that_jumps():
 
 def test_gross_errors_do_not_count():
     rng, late = np.random.default_rng(1), np.full(len(T), 0.25)
-    measured = course(T - late) + np.where(rng.random(len(T)) < 0.1, rng.uniform(-50.0, 50.0, len(T)), 0.0)
-    assert delays(SERIES, T, lambda delay: measured - course(T - delay)).constant()[1] == pytest.approx(0.25)
+    measured = course(T - late) + np.where(
+        rng.random(len(T)) < 0.1, rng.uniform(-50.0, 50.0, len(T)), 0.0
+    )
+    assert delays(SERIES, T, lambda delay: measured - course(T - delay)).constant()[
+        1
+    ] == pytest.approx(0.25)
 
 
 def test_a_series_of_which_nothing_or_little_is_heard_together_tells_nothing():
@@ -63,6 +69,8 @@ def test_a_series_of_which_nothing_or_little_is_heard_together_tells_nothing():
 
 def test_of_nothing_nothing_is_late():
     few = np.arange(0.0, 600.0, 7.0)  # never five in a block
-    of = delays(np.zeros(len(few), int), few, lambda delay: np.sin(1.3 * few) - np.sin(1.3 * (few - delay)))
+    of = delays(
+        np.zeros(len(few), int), few, lambda delay: np.sin(1.3 * few) - np.sin(1.3 * (few - delay))
+    )
     assert of.constant() == (1.0, 0.0) and of.exact() == 0.0
     assert of.drift() == (1.0, 0.0) and of.jump()[:2] == (1.0, 0.0)

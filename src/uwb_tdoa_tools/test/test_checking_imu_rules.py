@@ -1,11 +1,11 @@
 """Arrangements of the axes of the IMU, tried on a tag that turns."""
 
+from checking_flights import recording
 import numpy as np
 import pytest
+
 from uwb_tdoa_tools.checking import imu_rules
 from uwb_tdoa_tools.checking.ordered import OrderedRecording
-
-from checking_flights import recording
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +28,9 @@ def test_a_sign_of_the_gyroscope(healthy, axis):
 @pytest.mark.slow
 def test_a_turn_about_the_vertical_cannot_be_seen(healthy):
     quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    turned = healthy.with_imu(gyro=healthy.imu.gyro @ quarter.T, accel=healthy.imu.accel @ quarter.T)
+    turned = healthy.with_imu(
+        gyro=healthy.imu.gyro @ quarter.T, accel=healthy.imu.accel @ quarter.T
+    )
     assert imu_rules.fit(turned) is None
 
 
@@ -43,7 +45,11 @@ def test_means_of_samples_keep_rate_and_mean(healthy):
     "accel, gyro, words",
     [
         (np.eye(3), np.diag([1.0, -1.0, 1.0]), "w.x, w.y, w.z = w.x, -w.y, w.z"),
-        (imu_rules.MIRROR, imu_rules.MIRROR, "a.x, a.y, a.z = a.x, -a.y, a.z; w.x, w.y, w.z = w.x, -w.y, w.z"),
+        (
+            imu_rules.MIRROR,
+            imu_rules.MIRROR,
+            "a.x, a.y, a.z = a.x, -a.y, a.z; w.x, w.y, w.z = w.x, -w.y, w.z",
+        ),
         (np.eye(3), np.eye(3)[[1, 2, 0]], "w.x, w.y, w.z = w.y, w.z, w.x"),
     ],
 )

@@ -1,6 +1,5 @@
 """Saturated and filtered inertial samples."""
 
-
 import numpy as np
 import pytest
 from scipy.signal import lfilter

@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from recordings import ANCHORS, small_flight
 from scipy.spatial.transform import Rotation
+
 from uwb_tdoa_tools.checking import labels
 from uwb_tdoa_tools.checking.recording import IMU, TDOA, of_flight
-
-from recordings import ANCHORS, small_flight
 
 
 def said(**changes):
@@ -25,7 +25,9 @@ def test_a_frame_that_nobody_knows():
     assert said(frames={IMU: {"imu_link": 5}})["frame_unknown"].severity == "warning"
 
 
-@pytest.mark.parametrize("angle, shift, severity", [(90.0, 0.0, "note"), (0.0, 0.1, "note"), (0.5, 0.0, None)])
+@pytest.mark.parametrize(
+    "angle, shift, severity", [(90.0, 0.0, "note"), (0.0, 0.1, "note"), (0.5, 0.0, None)]
+)
 def test_a_frame_that_is_known(angle, shift, severity):
     place = Rotation.from_euler("z", angle, degrees=True), np.array([shift, 0.0, 0.0])
     found = said(frames={IMU: {"imu_link": 5}}, places={"imu_link": place})
@@ -33,7 +35,10 @@ def test_a_frame_that_is_known(angle, shift, severity):
         {"frame_turned": severity} if severity else {}
     )
     if angle == 90.0:
-        assert found["frame_turned"].value == pytest.approx(np.pi / 2) and "yaw 90" in found["frame_turned"].evidence
+        assert (
+            found["frame_turned"].value == pytest.approx(np.pi / 2)
+            and "yaw 90" in found["frame_turned"].evidence
+        )
 
 
 def test_two_frames_are_two_senders():
@@ -41,7 +46,9 @@ def test_two_frames_are_two_senders():
 
 
 def test_an_imu_on_another_topic():
-    found = said(imu=None, topics={"/uwb/tdoa": "uwb_tdoa_msgs/msg/Tdoa", "/imu/raw": "sensor_msgs/msg/Imu"})
+    found = said(
+        imu=None, topics={"/uwb/tdoa": "uwb_tdoa_msgs/msg/Tdoa", "/imu/raw": "sensor_msgs/msg/Imu"}
+    )
     assert "--topic imu/data=/imu/raw" in found["imu_elsewhere"].remedy
     assert "imu_missing" in said(imu=None, topics={"/uwb/tdoa": "uwb_tdoa_msgs/msg/Tdoa"})
     assert said(imu=None) == {}  # a CSV file has no topics
@@ -51,7 +58,13 @@ ODOMETRY = "nav_msgs/msg/Odometry"
 
 
 def test_odometry_that_nothing_reads():
-    topics = {"/uwb/tdoa": "", "/tag1/uwb/tdoa": "", "/odometry": ODOMETRY, "/tag1/odometry": ODOMETRY, "/odometry/debiased": ODOMETRY}
+    topics = {
+        "/uwb/tdoa": "",
+        "/tag1/uwb/tdoa": "",
+        "/odometry": ODOMETRY,
+        "/tag1/odometry": ODOMETRY,
+        "/odometry/debiased": ODOMETRY,
+    }
     assert said(topics=topics) == {}  # of filters of ours
     found = said(topics={**topics, "/odom": ODOMETRY})
     assert "--topic velocity/odometry=/odom" in found["odometry_unread"].remedy
@@ -59,7 +72,12 @@ def test_odometry_that_nothing_reads():
 
 
 def test_other_anchors_in_the_bag():
-    moved = replace(ANCHORS, positions=ANCHORS.positions + [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    moved = replace(
+        ANCHORS, positions=ANCHORS.positions + [[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
+    )
     assert said(recorded=moved)["survey_differs"].value == pytest.approx(1.0)
     assert said(recorded=ANCHORS) == {}
-    assert "no id in common" in said(recorded=replace(ANCHORS, ids=[7, 8, 9]))["survey_differs"].evidence
+    assert (
+        "no id in common"
+        in said(recorded=replace(ANCHORS, ids=[7, 8, 9]))["survey_differs"].evidence
+    )

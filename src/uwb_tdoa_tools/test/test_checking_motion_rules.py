@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+from known_effects import CLEAN, clean_flight
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -9,7 +10,6 @@ from scipy.signal import lfilter
 from uwb_tdoa_tools.checking import motion_rules
 from uwb_tdoa_tools.checking.motion_rules import TrueMotion
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from known_effects import CLEAN, clean_flight
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +36,9 @@ def test_what_is_measured_is_what_the_truth_does(flight):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("order, signs", [([1, 0, 2], (1, 1, 1)), ([0, 1, 2], (-1, 1, 1)), ([2, 0, 1], (1, -1, 1))])
+@pytest.mark.parametrize(
+    "order, signs", [([1, 0, 2], (1, 1, 1)), ([0, 1, 2], (-1, 1, 1)), ([2, 0, 1], (1, -1, 1))]
+)
 def test_axes_of_either_sensor(flight, order, signs):
     for sensor in ("gyro", "accel"):
         values = getattr(flight.imu, sensor)[:, order] * signs
@@ -46,7 +48,9 @@ def test_axes_of_either_sensor(flight, order, signs):
 @pytest.mark.slow
 @pytest.mark.parametrize("scale", [180.0 / np.pi, np.pi / 180.0])
 def test_unit_of_the_gyroscope(flight, scale):
-    assert said(with_imu(flight, gyro=flight.imu.gyro * scale))["imu_rate_unit"].value == pytest.approx(1.0 / scale)
+    assert said(with_imu(flight, gyro=flight.imu.gyro * scale))[
+        "imu_rate_unit"
+    ].value == pytest.approx(1.0 / scale)
 
 
 def test_a_sensor_that_has_nothing_to_measure_is_in_no_other_unit():
@@ -70,7 +74,10 @@ def test_a_low_pass_in_a_sensor(flight, sensor):
     share = 0.001 / (0.001 + 0.4)
     filtered = lfilter([share], [1.0, share - 1.0], values - values[0], axis=0) + values[0]
     found = said(with_imu(flight, **{sensor: filtered}))
-    assert found["imu_filtered"].value in motion_rules.SLOWNESS and motion_rules.SENSORS[sensor] in found["imu_filtered"].cause
+    assert (
+        found["imu_filtered"].value in motion_rules.SLOWNESS
+        and motion_rules.SENSORS[sensor] in found["imu_filtered"].cause
+    )
 
 
 def test_stamps_that_jump_or_drift(flight):

@@ -1,11 +1,11 @@
 """What `numbers` says of a flight as a whole; single rules are in the tests of their modules."""
 
+from known_effects import clean_flight
+from number_faults import FAULTS
 import numpy as np
 import pytest
 
 from uwb_tdoa_tools.checking.numbers import numbers
-from known_effects import clean_flight
-from number_faults import FAULTS
 
 HARD = ("pair_late",)  # hidden by the noise in most draws
 QUICK = ("tdoa_rounded", "ids_exchanged", "truth_leap")

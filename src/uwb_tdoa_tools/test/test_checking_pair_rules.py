@@ -1,12 +1,12 @@
 """Faults in the TDOAs of one pair."""
 
+from known_effects import clean_flight
+from number_faults import FAULTS
 import numpy as np
 import pytest
 
 from uwb_tdoa_tools.checking import pair_rules
 from uwb_tdoa_tools.checking.known_path import KnownPath
-from known_effects import clean_flight
-from number_faults import FAULTS
 
 T = np.arange(600) / 20.0
 TRUE = 3.0 * np.sin(0.5 * T)
@@ -83,7 +83,9 @@ def test_ids_that_are_exchanged_by_two_or_around(cycle):
     table = dict(zip(cycle, np.roll(cycle, 1).tolist()))
     of = flight.tdoa
     a, b = (np.array([table.get(i, i) for i in ids.tolist()]) for ids in (of.a, of.b))
-    renamed = KnownPath(type(flight)(flight.name, flight.anchors, type(of)(of.t, a, b, of.d), truth=flight.truth))
+    renamed = KnownPath(
+        type(flight)(flight.name, flight.anchors, type(of)(of.t, a, b, of.d), truth=flight.truth)
+    )
     found, before, after = pair_rules.renamed(renamed)
     assert found == {called: anchor for anchor, called in table.items()} and after < 0.4 * before
     (finding,) = pair_rules.ids(renamed)

@@ -4,12 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from recordings import SURVEY, csv_text, small_flight
+
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.checking.recording import IMU, TDOA, of_flight, read_recording
 from uwb_tdoa_tools.readers.inputs import Reading
-
-from recordings import SURVEY, csv_text, small_flight
 
 
 def test_a_bag_gives_the_streams_of_the_flight(tmp_path):
@@ -19,7 +19,10 @@ def test_a_bag_gives_the_streams_of_the_flight(tmp_path):
     for stream, other in ((made.tdoa, flight.tdoa), (made.imu, flight.imu)):
         for name, column in vars(stream).items():
             assert np.array_equal(column, getattr(other, name))
-    assert made.frames == {TDOA: {"base_link": len(flight.tdoa)}, IMU: {"base_link": len(flight.imu)}}
+    assert made.frames == {
+        TDOA: {"base_link": len(flight.tdoa)},
+        IMU: {"base_link": len(flight.imu)},
+    }
     assert np.array_equal(made.recorded.positions, flight.anchors.positions)
     assert made.topics["/imu/data"] == "sensor_msgs/msg/Imu"
 
@@ -37,7 +40,11 @@ def test_the_truth_stays_closed(tmp_path, monkeypatch):
 
     opened = []
     original = bag.readable
-    monkeypatch.setattr(bag, "readable", lambda p, r, some: opened.extend(c.topic for c in some) or original(p, r, some))
+    monkeypatch.setattr(
+        bag,
+        "readable",
+        lambda p, r, some: opened.extend(c.topic for c in some) or original(p, r, some),
+    )
     read_recording(Reading(), tmp_path / "f.bag")
     assert "/ground_truth/pose" not in opened and "/uwb/tdoa" in opened
 
@@ -59,7 +66,9 @@ def test_a_file_whose_stamps_fall_says_so(tmp_path):
 def test_no_tdoas_is_bad_input(tmp_path):
     flight = small_flight()
     write_bag(flight, tmp_path / "f.bag")
-    with pytest.raises(InputError, match="/tag1/uwb/tdoa; say where they are .--topic uwb/tdoa=/uwb/tdoa"):
+    with pytest.raises(
+        InputError, match="/tag1/uwb/tdoa; say where they are .--topic uwb/tdoa=/uwb/tdoa"
+    ):
         read_recording(Reading(namespace="tag1"), tmp_path / "f.bag")
 
 

@@ -5,6 +5,7 @@ import json
 
 import numpy as np
 import pytest
+
 from uwb_tdoa_bias.effects import EFFECTS
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
@@ -18,13 +19,18 @@ from uwb_tdoa_tools.simulation.constellations import constellation
 
 @pytest.fixture(scope="module")
 def flight():
-    return simulate(SimulationConfig(seed=0, duration=20.0, imu_rate=100.0, truth_rate=50.0, start_in_air=True))
+    return simulate(
+        SimulationConfig(seed=0, duration=20.0, imu_rate=100.0, truth_rate=50.0, start_in_air=True)
+    )
 
 
 def renamed(flight, ids):
     """The flight with a survey in which the anchors have other ids."""
     anchors = flight.anchors
-    return replace(flight, anchors=Anchors(ids, anchors.positions[: len(ids)], anchors.orientations[: len(ids)]))
+    return replace(
+        flight,
+        anchors=Anchors(ids, anchors.positions[: len(ids)], anchors.orientations[: len(ids)]),
+    )
 
 
 def test_a_right_survey_is_passed_over(flight):
@@ -42,13 +48,18 @@ def test_the_survey_of_another_room(flight):
 
 
 def test_no_anchor_in_common(flight):
-    with pytest.raises(InputError, match="hears anchors 0, 1, .* the survey has 100, .* give the survey of that room"):
+    with pytest.raises(
+        InputError,
+        match="hears anchors 0, 1, .* the survey has 100, .* give the survey of that room",
+    ):
         list(survey_remarks(renamed(flight, np.arange(8) + 100)))
 
 
 @pytest.mark.slow
 def test_measured_flights_are_passed_over(shared_data):
-    for pair in inputs.find_flights([shared_data / "flights" / "0426", shared_data / "util"], shared_data / "surveys"):
+    for pair in inputs.find_flights(
+        [shared_data / "flights" / "0426", shared_data / "util"], shared_data / "surveys"
+    ):
         assert list(survey_remarks(inputs.Reading().read(pair))) == []
 
 
@@ -63,29 +74,50 @@ def test_evaluate_says_so(flight, tmp_path, capsys):
 
 def test_diagnose_says_so_before_it_begins(flight, tmp_path, capsys, monkeypatch):
     write_bag(flight, tmp_path / "f.bag")
-    other = replace(flight, name="other", anchors=Anchors.from_positions(flight.anchors.positions + [0.0, 1.0, 0.0]))
+    other = replace(
+        flight,
+        name="other",
+        anchors=Anchors.from_positions(flight.anchors.positions + [0.0, 1.0, 0.0]),
+    )
     write_bag(other, tmp_path / "g.bag")
 
     def stop(*args):
         raise InputError("far enough.")
 
     monkeypatch.setattr(diagnose, "diagnose", stop)
-    assert diagnose.main([str(tmp_path / "f.bag"), str(tmp_path / "g.bag"), "--out", str(tmp_path / "out")]) == 2
+    assert (
+        diagnose.main(
+            [str(tmp_path / "f.bag"), str(tmp_path / "g.bag"), "--out", str(tmp_path / "out")]
+        )
+        == 2
+    )
     assert "have different surveys: the same ids are up to 1.00 m apart" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("name, key", [("anchor_delay", "33"), ("pair_offset", "0-33"), ("nlos", "33.delay")])
+@pytest.mark.parametrize(
+    "name, key", [("anchor_delay", "33"), ("pair_offset", "0-33"), ("nlos", "33.delay")]
+)
 def test_inject_refuses_an_anchor_that_is_not_there(flight, tmp_path, name, key, capsys):
     write_bag(flight, tmp_path / "f.bag")
     value = f"{key}=0.4" if name != "nlos" else "33.delay=0.4 33.start=1 33.end=5"
-    words = [str(tmp_path / "f.bag"), "--effect", name, "--value", *value.split(), "--out", str(tmp_path / "late.bag")]
+    words = [
+        str(tmp_path / "f.bag"),
+        "--effect",
+        name,
+        "--value",
+        *value.split(),
+        "--out",
+        str(tmp_path / "late.bag"),
+    ]
     assert inject.main(words) == 2
     assert "has no anchor 33; it has 0, 1, 2" in capsys.readouterr().err
     assert not (tmp_path / "late.bag").exists()
 
 
 def test_what_is_no_anchor_is_not_taken_for_one(flight):
-    assert "tdoa" not in EFFECTS["floor_step"].channels  # 1.height is of the first step, whatever anchors there are
+    assert (
+        "tdoa" not in EFFECTS["floor_step"].channels
+    )  # 1.height is of the first step, whatever anchors there are
 
 
 def test_a_model_without_its_effects_is_said(flight, tmp_path, capsys):

@@ -2,12 +2,12 @@
 
 from dataclasses import replace
 
+from known_effects import clean_flight
 import numpy as np
 import pytest
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_tools.checking.repairs import repairs
-from known_effects import clean_flight
 
 IDS, SIGN = EFFECTS["anchor_ids"]({"1": 4, "4": 1}), EFFECTS["pair_sign"]({"2-3": -1.0})
 
@@ -23,7 +23,9 @@ def test_what_was_put_in_is_undone(flight, put_in):
     for effect in reversed(put_in):
         changed = effect.inject(changed)
     undone = repairs(changed)
-    assert [(effect.name, effect.values) for effect in undone] == [(effect.name, effect.values) for effect in put_in]
+    assert [(effect.name, effect.values) for effect in undone] == [
+        (effect.name, effect.values) for effect in put_in
+    ]
     back = EffectSet(undone).correct_streams(changed).tdoa
     assert np.array_equal(back.a, flight.tdoa.a) and np.array_equal(back.d, flight.tdoa.d)
 

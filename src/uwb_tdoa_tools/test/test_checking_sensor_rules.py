@@ -18,7 +18,9 @@ NONE = Tdoas(*(np.empty(0, kind) for kind in (float, int, int, float)))
 @pytest.fixture(scope="module")
 def ranged():
     """A Flight of ranges alone."""
-    config = SimulationConfig(duration=20.0, imu_rate=200.0, truth_rate=20.0, start_in_air=True, range_noise=0.1)
+    config = SimulationConfig(
+        duration=20.0, imu_rate=200.0, truth_rate=20.0, start_in_air=True, range_noise=0.1
+    )
     return replace(simulate(config), tdoa=NONE)
 
 

@@ -1,10 +1,11 @@
 """Anchors found where they are, from TDOAs alone."""
 
-import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
+
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_tools.checking.survey_fit import SurveyFit, displacement
 from uwb_tdoa_tools.checking.tdoa_rules import SAME, gained
@@ -28,7 +29,9 @@ def test_a_right_survey_stays():
     assert displacement(BOX, anchors).max() < SAME
 
 
-@pytest.mark.parametrize("row, shift", [(0, [1.0, 0.0, 0.0]), (5, [0.0, -1.5, 0.0]), (7, [0.5, 0.5, -1.0])])
+@pytest.mark.parametrize(
+    "row, shift", [(0, [1.0, 0.0, 0.0]), (5, [0.0, -1.5, 0.0]), (7, [0.5, 0.5, -1.0])]
+)
 def test_one_anchor_is_found_where_it_is(row, shift):
     surveyed = BOX.copy()
     surveyed[row] -= shift

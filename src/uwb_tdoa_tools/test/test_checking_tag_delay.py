@@ -7,8 +7,8 @@ import pytest
 
 from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_tools.checking.check import check
-from uwb_tdoa_tools.checking.tag_delay import tag_delay, window_offsets
 from uwb_tdoa_tools.checking.recording import of_flight
+from uwb_tdoa_tools.checking.tag_delay import tag_delay, window_offsets
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 
@@ -16,7 +16,14 @@ from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 def ranged(request):
     """A Flight of ranges alone, without systematic errors."""
     config = SimulationConfig(
-        seed=7, trajectory=request.param, duration=20.0, imu_rate=100.0, truth_rate=20.0, range_noise=0.1, bias=False, multipath=False
+        seed=7,
+        trajectory=request.param,
+        duration=20.0,
+        imu_rate=100.0,
+        truth_rate=20.0,
+        range_noise=0.1,
+        bias=False,
+        multipath=False,
     )
     return replace(simulate(config), tdoa=Tdoas(*np.empty((4, 0))))
 
@@ -36,7 +43,9 @@ def test_what_all_ranges_are_wrong_by_is_told(ranged, by):
 
 def test_nothing_is_said_of_sound_ranges_nor_of_a_tape_of_ten_centimetres(ranged):
     assert not [*tag_delay(of_flight(ranged))]
-    shaken = ranged.anchors.positions + 0.1 * np.random.default_rng(3).standard_normal(ranged.anchors.positions.shape)
+    shaken = ranged.anchors.positions + 0.1 * np.random.default_rng(3).standard_normal(
+        ranged.anchors.positions.shape
+    )
     assert not [*tag_delay(of_flight(replace(ranged, anchors=ranged.anchors.at(shaken))))]
 
 

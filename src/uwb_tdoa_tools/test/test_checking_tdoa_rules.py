@@ -2,14 +2,14 @@
 
 from dataclasses import replace
 
+from checking_flights import recording
 import numpy as np
 import pytest
+
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_tools.checking import tdoa_rules
 from uwb_tdoa_tools.checking.ordered import LONG, OrderedRecording
 from uwb_tdoa_tools.checking.survey_fit import SPREAD, spread
-
-from checking_flights import recording
 
 
 @pytest.fixture(scope="module")
@@ -19,7 +19,9 @@ def healthy():
 
 @pytest.mark.slow
 def test_nothing_is_better_than_what_is_right(healthy):
-    shifted = Anchors(healthy.anchors.ids, healthy.anchors.positions * 1.3, healthy.anchors.orientations)
+    shifted = Anchors(
+        healthy.anchors.ids, healthy.anchors.positions * 1.3, healthy.anchors.orientations
+    )
     finding, same = tdoa_rules.best(healthy, [("other.yaml", shifted)])
     assert finding is None and same is healthy
 
@@ -45,16 +47,27 @@ def test_swapped_ids_are_undone(healthy):
     swapped = tdoa_rules.relabelled(healthy, {one: two, two: one})
     finding, undone = tdoa_rules.best(swapped)
     assert finding.rule == "ids_swapped" and finding.severity == "error"
-    assert np.array_equal(undone.tdoa.a, healthy.tdoa.a) and np.array_equal(undone.tdoa.b, healthy.tdoa.b)
+    assert np.array_equal(undone.tdoa.a, healthy.tdoa.a) and np.array_equal(
+        undone.tdoa.b, healthy.tdoa.b
+    )
     assert str({one: two, two: one}) in finding.remedy
 
 
 def test_surveys_of_one_room_are_named_together(healthy):
     wrong = replace(
-        healthy, anchors=Anchors(healthy.anchors.ids, healthy.anchors.positions[::-1], healthy.anchors.orientations)
+        healthy,
+        anchors=Anchors(
+            healthy.anchors.ids, healthy.anchors.positions[::-1], healthy.anchors.orientations
+        ),
     )
-    by_millimetres = Anchors(healthy.anchors.ids, healthy.anchors.positions + 0.004, healthy.anchors.orientations)
-    trials = list(tdoa_rules.survey(wrong, [("monday.yaml", healthy.anchors), ("tuesday.yaml", by_millimetres)]))
+    by_millimetres = Anchors(
+        healthy.anchors.ids, healthy.anchors.positions + 0.004, healthy.anchors.orientations
+    )
+    trials = list(
+        tdoa_rules.survey(
+            wrong, [("monday.yaml", healthy.anchors), ("tuesday.yaml", by_millimetres)]
+        )
+    )
     assert len(trials) == 1 and "monday.yaml or tuesday.yaml" in trials[0].finding(0.5, 9.0).cause
     assert list(tdoa_rules.survey(healthy, [("monday.yaml", by_millimetres)])) == []
 
@@ -64,7 +77,9 @@ def test_ids_are_replaced_all_at_once(healthy, table):
     back = {new: old for old, new in table.items()}
     there = tdoa_rules.relabelled(healthy, table)
     again = tdoa_rules.relabelled(there, back)
-    assert np.array_equal(again.tdoa.a, healthy.tdoa.a) and not np.array_equal(there.tdoa.a, healthy.tdoa.a)
+    assert np.array_equal(again.tdoa.a, healthy.tdoa.a) and not np.array_equal(
+        there.tdoa.a, healthy.tdoa.a
+    )
 
 
 def test_the_part_that_is_tried_is_where_the_tag_moves():
@@ -90,7 +105,9 @@ def test_ids_are_not_tried_where_the_tag_stands():
 
 @pytest.mark.parametrize("gain, believed", [(0.5, True), (2.0, False)])
 def test_what_systematic_errors_could_explain_is_no_evidence(healthy, monkeypatch, gain, believed):
-    """The same trial, judged where systematic errors are said to be small, and where they are said to be large."""
+    """The same trial, judged where systematic errors are said to be small, and where they are said
+    to be large.
+    """
     flipped = tdoa_rules._flipped(healthy, np.ones(len(healthy.tdoa), dtype=bool))
     least = gain * (flipped.part(LONG).unexplained().mean - healthy.part(LONG).unexplained().mean)
     monkeypatch.setattr(tdoa_rules, "BY_ERRORS", least)

@@ -2,6 +2,8 @@
 
 from dataclasses import replace
 
+from known_effects import clean_flight
+from number_faults import FAULTS
 import numpy as np
 import pytest
 
@@ -9,8 +11,6 @@ from uwb_tdoa_bias.effects import true_samples
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_tools.checking.known_path import KnownPath
 from uwb_tdoa_tools.checking.time_rules import tdoas
-from known_effects import clean_flight
-from number_faults import FAULTS
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +42,9 @@ def test_out_of_order(flight):
     t = flight.tdoa.t
     order = np.lexsort((np.random.default_rng(0).random(len(t)), np.floor(t)))
     columns = {name: column[order] for name, column in vars(flight.tdoa).items()}
-    assert list(said(replace(flight, tdoa=replace(flight.tdoa, **{**columns, "t": t})))) == ["tdoa_reordered"]
+    assert list(said(replace(flight, tdoa=replace(flight.tdoa, **{**columns, "t": t})))) == [
+        "tdoa_reordered"
+    ]
 
 
 def test_a_pair_that_is_late_is_named_where_noise_does_not_hide_it(flight):

@@ -8,20 +8,22 @@ import sys
 
 import numpy as np
 import pytest
+from recordings import small_flight
+
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.checking.recording import of_flight, read_live, read_recording
-from uwb_tdoa_tools.live.ends import End
 from uwb_tdoa_tools.checking.wiring import RULES
 from uwb_tdoa_tools.commands.check import main
+from uwb_tdoa_tools.live.ends import End
 from uwb_tdoa_tools.readers.inputs import Reading
-
-from recordings import small_flight
 
 IMU, TDOA = "sensor_msgs/msg/Imu", "uwb_tdoa_msgs/msg/Tdoa"
 DRIVER = End("/imu/data", "/driver", IMU, True, False, False)
 NODE = End("/imu/data", "/ekf_node", IMU, False, False, False)
 STRICT = replace(NODE, reliable=True)
-ANCHORS = End("/tag1/uwb/anchors", "/tag1/driver", "uwb_tdoa_msgs/msg/AnchorArray", True, True, False)
+ANCHORS = End(
+    "/tag1/uwb/anchors", "/tag1/driver", "uwb_tdoa_msgs/msg/AnchorArray", True, True, False
+)
 
 
 @pytest.mark.parametrize(
@@ -33,7 +35,13 @@ ANCHORS = End("/tag1/uwb/anchors", "/tag1/driver", "uwb_tdoa_msgs/msg/AnchorArra
         ([replace(DRIVER, reliable=True), STRICT], set()),
         ([replace(DRIVER, reliable=True), replace(NODE, latched=True)], {"qos_unmatched"}),
         ([DRIVER, replace(DRIVER, node="/other"), NODE], {"publishers_several"}),
-        ([replace(DRIVER, topic="/tf_static"), replace(DRIVER, topic="/tf_static", node="/other")], set()),
+        (
+            [
+                replace(DRIVER, topic="/tf_static"),
+                replace(DRIVER, topic="/tf_static", node="/other"),
+            ],
+            set(),
+        ),
         ([DRIVER, replace(NODE, kind=TDOA)], {"type_other"}),
         ([ANCHORS], {"anchors_volatile"}),
         ([replace(ANCHORS, latched=True)], set()),
@@ -45,12 +53,19 @@ def test_rules(ends, expected):
     found = [finding for rule in RULES for finding in rule(recording)]
     assert {finding.rule for finding in found} == expected
     for finding in found:
-        assert all(node in finding.sentence for node in {end.node for end in ends if end.node != "/ekf_node"})
+        assert all(
+            node in finding.sentence
+            for node in {end.node for end in ends if end.node != "/ekf_node"}
+        )
 
 
 @pytest.mark.parametrize(
     "arguments, sentence",
-    [([], "give recordings, or --live"), (["x.bag", "--live", "3"], "not both"), (["--live", "-1"], "above 0")],
+    [
+        ([], "give recordings, or --live"),
+        (["x.bag", "--live", "3"], "not both"),
+        (["--live", "-1"], "above 0"),
+    ],
 )
 def test_recordings_or_topics(arguments, sentence, capsys):
     assert main(arguments) == 2
@@ -101,7 +116,9 @@ def process():
     started = []
 
     def start(*command):
-        started.append(subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True))
+        started.append(
+            subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+        )
         return started[-1]
 
     yield start
@@ -116,36 +133,65 @@ def test_live_topics_of_a_faulty_driver(tmp_path, process, capsys, monkeypatch):
     listen = pytest.importorskip("uwb_tdoa_tools.live.listen")
     monkeypatch.setattr(listen, "FIRST_LIMIT", 180.0)
     out = tmp_path / "live.json"
-    code = main(["--live", "3", "--namespace", "tag1", "--topic", "uwb/tdoa=ranging", "--json", str(out)])
+    code = main(
+        ["--live", "3", "--namespace", "tag1", "--topic", "uwb/tdoa=ranging", "--json", str(out)]
+    )
     said = capsys.readouterr()
     assert code == 1, said
     (content,) = json.loads(out.read_text())["recordings"]
     found = {finding["rule"]: finding for finding in content["findings"]}
-    assert {"imu_force_unit", "frame_turned", "qos_unmatched", "anchors_volatile"} <= found.keys(), said.out
-    assert "/tag1/logger hears nothing of what /tag1/driver publishes" in found["qos_unmatched"]["cause"]
-    assert not {"imu_turned", "stamps_apart", "other_clock", "frame_unknown"} & found.keys(), said.out
+    assert {
+        "imu_force_unit",
+        "frame_turned",
+        "qos_unmatched",
+        "anchors_volatile",
+    } <= found.keys(), said.out
+    assert (
+        "/tag1/logger hears nothing of what /tag1/driver publishes"
+        in found["qos_unmatched"]["cause"]
+    )
+    assert not {"imu_turned", "stamps_apart", "other_clock", "frame_unknown"} & found.keys(), (
+        said.out
+    )
     assert "/tag1/imu/data from /tag1/driver: best effort, volatile" in said.out
-    assert 1.0 < float(content["facts"]["duration"].split()[0]) < 9.0  # 3 s, by the clock, of a driver that may be late
+    assert (
+        1.0 < float(content["facts"]["duration"].split()[0]) < 9.0
+    )  # 3 s, by the clock, of a driver that may be late
 
 
 @pytest.mark.slow
 def test_what_is_live_is_judged_as_what_is_recorded(tmp_path, process, monkeypatch):
-    """Played on simulated time, listened to for a part of it: the very samples, so that the rules say the same."""
+    """Played on simulated time, listened to for a part of it: the very samples, so that the rules
+    say the same.
+    """
     pytest.importorskip("uwb_tdoa_msgs.msg")
     listen = pytest.importorskip("uwb_tdoa_tools.live.listen")
     monkeypatch.setattr(listen, "FIRST_LIMIT", 180.0)
     flight = small_flight(4.0)
     write_bag(flight, tmp_path / "flight.bag")
     topics = ("--wait-matched", "180", "--wait-topics", "uwb/tdoa", "imu/data", "uwb/anchors")
-    replay = ("-m", "uwb_tdoa_tools.commands.replay", tmp_path / "flight.bag", "--rate", "0.1", "--clock", "100")
+    replay = (
+        "-m",
+        "uwb_tdoa_tools.commands.replay",
+        tmp_path / "flight.bag",
+        "--rate",
+        "0.1",
+        "--clock",
+        "100",
+    )
     process(sys.executable, *replay, *topics)
     live, whole = read_live(Reading(), 1.5), read_recording(Reading(), tmp_path / "flight.bag")
     for stream, there in ((live.tdoa, whole.tdoa), (live.imu, whole.imu)):
-        assert 10 < len(stream) < len(there) and stream.t[0] == there.t[0]  # nothing is lost, from the first on
+        assert (
+            10 < len(stream) < len(there) and stream.t[0] == there.t[0]
+        )  # nothing is lost, from the first on
         for name, column in vars(stream).items():
             np.testing.assert_array_equal(column, getattr(there, name)[: len(stream)])
     assert np.isnan(live.tdoa_arrival).all() and np.isnan(live.imu_arrival).all()  # of another time
-    assert np.array_equal(live.anchors.positions, whole.anchors.positions) and live.frames.keys() == whole.frames.keys()
+    assert (
+        np.array_equal(live.anchors.positions, whole.anchors.positions)
+        and live.frames.keys() == whole.frames.keys()
+    )
     assert {end.topic for end in live.ends} >= {"/uwb/tdoa", "/imu/data", "/uwb/anchors"}
 
 

@@ -4,6 +4,7 @@ import subprocess
 import sys
 
 import pytest
+
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools import cli
 
@@ -19,7 +20,10 @@ def test_help_keeps_line_breaks_and_shows_examples_as_they_run(capsys, monkeypat
     assert cli.run(None, make_parser(), ["--help"]) == 0
     out = capsys.readouterr().out
     assert "Weigh things.\n\nSecond paragraph." in out
-    assert "examples:\n  ./dev run uwb_tdoa_tools weigh 3\n  ./dev run uwb_tdoa_tools weigh 4 --twice\n" in out
+    assert (
+        "examples:\n  ./dev run uwb_tdoa_tools weigh 3\n  ./dev run uwb_tdoa_tools weigh 4 "
+        "--twice\n"
+    ) in out
 
 
 @pytest.mark.parametrize("returned, code", [(None, 0), (0, 0), (1, 1)])
@@ -42,8 +46,14 @@ def test_bad_usage_is_two(capsys):
 @pytest.mark.parametrize(
     "error, sentence",
     [
-        (InputError("number: 7 is too heavy; give at most 6."), "number: 7 is too heavy; give at most 6."),
-        (FileNotFoundError(2, "No such file or directory", "scale.csv"), "scale.csv: No such file or directory."),
+        (
+            InputError("number: 7 is too heavy; give at most 6."),
+            "number: 7 is too heavy; give at most 6.",
+        ),
+        (
+            FileNotFoundError(2, "No such file or directory", "scale.csv"),
+            "scale.csv: No such file or directory.",
+        ),
     ],
 )
 def test_bad_input_is_one_sentence_and_two(error, sentence, capsys):
@@ -82,8 +92,9 @@ def test_a_full_disk_is_one_sentence(error, capsys):
         raise error
 
     assert cli.run(command, make_parser(), ["7"]) == 2
-    assert (
-        capsys.readouterr().err == "weigh: error: the disk is full: what was being written is not whole; make room, or write elsewhere.\n"
+    assert capsys.readouterr().err == (
+        "weigh: error: the disk is full: what was being written is not whole; make room, or "
+        "write elsewhere.\n"
     )
 
 
@@ -98,7 +109,9 @@ def test_reader_that_goes_away_is_no_traceback():
         "import sys; from uwb_tdoa_tools import cli;"
         "sys.exit(cli.run(lambda args: print('line\\n' * 100000), cli.parser('talk', 'Talk.'), []))"
     )
-    talk = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    talk = subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    )
     talk.stdout.read(10)
     talk.stdout.close()
     err = talk.stderr.read()

@@ -14,7 +14,8 @@ RATES = {"imu": 100.0, "tdoa": 50.0, "height": 10.0}
 def stamps_of(duration=20.0, rates=RATES, start=3.0, seed=0):
     rng = np.random.default_rng(seed)
     return {
-        name: start + (np.arange(int(duration * rate)) + rng.uniform(-0.2, 0.2, int(duration * rate))) / rate
+        name: start
+        + (np.arange(int(duration * rate)) + rng.uniform(-0.2, 0.2, int(duration * rate))) / rate
         for name, rate in rates.items()
     }
 
@@ -26,22 +27,38 @@ def moved(stamps, at, by):
 
 def whole(stamps, found):
     """{stream: stamps on the continuous time, without outliers}."""
-    return {name: (t + found.shifts.get(name, 0.0))[found.kept.get(name, slice(None))] for name, t in stamps.items()}
+    return {
+        name: (t + found.shifts.get(name, 0.0))[found.kept.get(name, slice(None))]
+        for name, t in stamps.items()
+    }
 
 
 def assert_continuous(stamps, found, true):
-    """All streams run on as they truly did, but for the instant of a jump, whose length only the usual step tells."""
+    """All streams run on as they truly did, but for the instant of a jump, whose length only the
+    usual step tells.
+    """
     for name, t in whole(stamps, found).items():
         kept = true[name][found.kept.get(name, slice(None))]
         off = t - kept
         assert np.ptp(off) < 0.05 * (1 + len(found.jumps)), name
-    shifts = [np.median((whole(stamps, found)[name] - true[name][found.kept.get(name, slice(None))])[-FEW:]) for name in ("imu", "tdoa")]
+    shifts = [
+        np.median(
+            (whole(stamps, found)[name] - true[name][found.kept.get(name, slice(None))])[-FEW:]
+        )
+        for name in ("imu", "tdoa")
+    ]
     assert abs(shifts[0] - shifts[1]) < 1e-6  # streams of one clock stay together
 
 
 @pytest.mark.parametrize(
     "by, kind",
-    [(-8.0, RESTART), (-1.8e9, RESTART), (YEARS, SET), (10 * 86400.0, SET), *((-length, WRAP) for length in WRAPS.values())],
+    [
+        (-8.0, RESTART),
+        (-1.8e9, RESTART),
+        (YEARS, SET),
+        (10 * 86400.0, SET),
+        *((-length, WRAP) for length in WRAPS.values()),
+    ],
 )
 def test_a_jump_is_recognised_and_undone(by, kind):
     true = stamps_of()
@@ -66,7 +83,9 @@ def test_a_wrap_is_undone_by_its_exact_size():
 
 @pytest.mark.parametrize("by", [-5.0, 40.0, 2000.0, YEARS])
 def test_arrivals_tell_the_size_of_a_jump_and_the_pause_that_goes_with_it(by):
-    true = {name: np.where(t < 12.0, t, t + 3.0) for name, t in stamps_of().items()}  # the recorder hears nothing for 3 s
+    true = {
+        name: np.where(t < 12.0, t, t + 3.0) for name, t in stamps_of().items()
+    }  # the recorder hears nothing for 3 s
     stamps = moved(true, 13.0, by)
     rng = np.random.default_rng(1)
     arrived = {name: 1e3 + t + 0.02 + 0.001 * rng.random(len(t)) for name, t in true.items()}
@@ -81,8 +100,12 @@ def test_arrivals_tell_the_size_of_a_jump_and_the_pause_that_goes_with_it(by):
 def test_a_pause_of_all_is_named_and_moves_nothing():
     stamps = moved(stamps_of(), 12.0, 60.0)
     found = straightened(stamps)
-    assert [jump.kind for jump in found.jumps] == [SILENCE] and not found.shifts and not found.restarts
-    arrived = {name: t + 0.01 for name, t in stamps.items()}  # then it is known that nothing happened
+    assert (
+        [jump.kind for jump in found.jumps] == [SILENCE] and not found.shifts and not found.restarts
+    )
+    arrived = {
+        name: t + 0.01 for name, t in stamps.items()
+    }  # then it is known that nothing happened
     assert not straightened(stamps, arrived).jumps
 
 
@@ -105,15 +128,22 @@ def test_the_clock_of_one_stream_is_set_alone():
     true = stamps_of(60.0)
     stamps = {**true, "imu": np.where(true["imu"] < 30.0, true["imu"], true["imu"] + 100.0)}
     found = straightened(stamps)
-    assert [(jump.kind, jump.streams) for jump in found.jumps] == [(SET, ("imu",))] and set(found.shifts) == {"imu"}
+    assert [(jump.kind, jump.streams) for jump in found.jumps] == [(SET, ("imu",))] and set(
+        found.shifts
+    ) == {"imu"}
     np.testing.assert_allclose(stamps["imu"] + found.shifts["imu"], true["imu"], atol=0.02)
 
 
 def test_an_optional_sensor_that_starts_again_restarts_nothing():
     true = stamps_of(60.0)
-    stamps = {**true, "height": np.where(true["height"] < 30.0, true["height"], true["height"] - 20.0)}
+    stamps = {
+        **true,
+        "height": np.where(true["height"] < 30.0, true["height"], true["height"] - 20.0),
+    }
     found = straightened(stamps)
-    assert [(jump.kind, jump.streams) for jump in found.jumps] == [(RESTART, ("height",))] and not found.restarts
+    assert [(jump.kind, jump.streams) for jump in found.jumps] == [
+        (RESTART, ("height",))
+    ] and not found.restarts
 
 
 def test_a_stream_that_begins_after_the_jump_is_shifted_with_the_others():
@@ -145,7 +175,12 @@ def test_two_tags_on_one_topic_are_no_clock():
 
 @settings(max_examples=60, deadline=None)
 @given(
-    jumps=st.lists(st.tuples(st.floats(0.5, 4.0), st.sampled_from([-2.0, -50.0, -1e9, YEARS, 1e5, -(2**32) * 1e-6])), max_size=4),
+    jumps=st.lists(
+        st.tuples(
+            st.floats(0.5, 4.0), st.sampled_from([-2.0, -50.0, -1e9, YEARS, 1e5, -(2**32) * 1e-6])
+        ),
+        max_size=4,
+    ),
     wild=st.sets(st.integers(0, 999), max_size=8),
     far=st.floats(20.0, 1e9) | st.floats(-1e9, -20.0),
     drop=st.floats(0.0, 0.5),
@@ -176,7 +211,11 @@ def test_every_message_has_an_account_and_time_goes_on(jumps, wild, far, drop, s
 
 @settings(max_examples=60, deadline=None)
 @given(
-    rate=st.floats(0.2, 500.0), seed=st.integers(0, 1000), drop=st.floats(0.0, 0.9), late=st.floats(0.0, 0.4), pauses=st.integers(0, 3)
+    rate=st.floats(0.2, 500.0),
+    seed=st.integers(0, 1000),
+    drop=st.floats(0.0, 0.9),
+    late=st.floats(0.0, 0.4),
+    pauses=st.integers(0, 3),
 )
 def test_a_sound_recording_is_untouched(rate, seed, drop, late, pauses):
     rng = np.random.default_rng(seed)
@@ -184,7 +223,9 @@ def test_a_sound_recording_is_untouched(rate, seed, drop, late, pauses):
     for _ in range(pauses):
         t[rng.integers(400) :] += rng.uniform(0.0, 9.0)
     t = t[rng.random(400) >= drop]
-    order = np.argsort(t + rng.uniform(0.0, late, len(t)), kind="stable")  # messages overtake each other
+    order = np.argsort(
+        t + rng.uniform(0.0, late, len(t)), kind="stable"
+    )  # messages overtake each other
     stamps = {"tdoa": t[order], "imu": np.arange(t[0], t[-1], 0.05)} if len(t) else {"tdoa": t}
     found = straightened(stamps)
     assert not found.shifts and not found.kept and not found.restarts and not found.jumps

@@ -1,4 +1,6 @@
-"""Recordings whose clock is set, starts again or wraps: read on one continuous time, named by check, and of no more memory."""
+"""Recordings whose clock is set, starts again or wraps: read on one continuous time, named by
+check, and of no more memory.
+"""
 
 from dataclasses import replace
 import os
@@ -6,11 +8,11 @@ import resource
 import subprocess
 import sys
 
+from known_effects import clean_flight
 import numpy as np
 import pytest
 from rosbags.rosbag2 import Writer
 
-from known_effects import clean_flight
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.bags.bag import bag_messages, read_bag, typestore, write_bag
 from uwb_tdoa_tools.bags.files import STORAGES
@@ -32,16 +34,36 @@ KINDS = {
 
 
 def bag(path, clock, storage="mcap", arrivals=True, imu=lambda t: t):
-    """Write FLIGHT as it is recorded by a clock(t): each message in its turn. arrivals : log times are of a sound clock, else the stamps."""
+    """Write FLIGHT as it is recorded by a clock(t): each message in its turn. arrivals : log times
+    are of a sound clock, else the stamps.
+    """
     write_bag(FLIGHT, path.with_name(path.name + "_anchors"))  # for its anchors
     store, rows = typestore(), []
     tdoa, samples = FLIGHT.tdoa, FLIGHT.imu
     for topic, kind, true, messages in (
-        ("/uwb/tdoa", "uwb_tdoa_msgs/msg/Tdoa", tdoa.t, bag_messages.tdoa_messages(replace(tdoa, t=BASE + clock(tdoa.t)), store, None)),
-        ("/imu/data", "sensor_msgs/msg/Imu", samples.t, bag_messages.imu_messages(replace(samples, t=BASE + clock(imu(samples.t))), store)),
+        (
+            "/uwb/tdoa",
+            "uwb_tdoa_msgs/msg/Tdoa",
+            tdoa.t,
+            bag_messages.tdoa_messages(replace(tdoa, t=BASE + clock(tdoa.t)), store, None),
+        ),
+        (
+            "/imu/data",
+            "sensor_msgs/msg/Imu",
+            samples.t,
+            bag_messages.imu_messages(replace(samples, t=BASE + clock(imu(samples.t))), store),
+        ),
     ):
         for at, (stamp, message) in zip(true, messages):
-            rows.append((at, round(1e9 * (BASE + 1e5 + at)) if arrivals else stamp, topic, kind, store.serialize_cdr(message, kind)))
+            rows.append(
+                (
+                    at,
+                    round(1e9 * (BASE + 1e5 + at)) if arrivals else stamp,
+                    topic,
+                    kind,
+                    store.serialize_cdr(message, kind),
+                )
+            )
     with Writer(path, version=Writer.VERSION_LATEST, storage_plugin=STORAGES[storage]) as writer:
         connections = {}
         for _, received, topic, kind, data in sorted(rows, key=lambda row: row[0]):
@@ -107,9 +129,17 @@ def test_a_sensor_of_another_time_is_named_with_its_count():
     from uwb_tdoa_tools.checking.recording import of_flight
 
     moved = replace(aided, height=replace(aided.height, t=aided.height.t + 1e4))
-    (finding,) = (finding for finding in check(of_flight(moved)).findings if finding.rule == "sensor_apart")
-    assert finding.severity == "error" and str(len(aided.height.t)) in finding.evidence and "10000" in finding.cause
-    assert not [finding for finding in check(of_flight(aided)).findings if finding.rule == "sensor_apart"]
+    (finding,) = (
+        finding for finding in check(of_flight(moved)).findings if finding.rule == "sensor_apart"
+    )
+    assert (
+        finding.severity == "error"
+        and str(len(aided.height.t)) in finding.evidence
+        and "10000" in finding.cause
+    )
+    assert not [
+        finding for finding in check(of_flight(aided)).findings if finding.rule == "sensor_apart"
+    ]
 
 
 PROGRAM = """
@@ -133,11 +163,20 @@ def test_a_gap_of_any_length_takes_no_more_memory(by):
     from pathlib import Path
 
     def bound():
-        resource.setrlimit(resource.RLIMIT_AS, (6 << 30, 6 << 30))  # of addresses: libraries reserve many
+        resource.setrlimit(
+            resource.RLIMIT_AS, (6 << 30, 6 << 30)
+        )  # of addresses: libraries reserve many
 
-    there = {name: value for name, value in os.environ.items() if name != "PYTHONSAFEPATH"}  # other tests set it
+    there = {
+        name: value for name, value in os.environ.items() if name != "PYTHONSAFEPATH"
+    }  # other tests set it
     done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, str(by)], cwd=Path(__file__).parent, env=there, preexec_fn=bound, capture_output=True, text=True,
+        [sys.executable, "-c", PROGRAM, str(by)],
+        cwd=Path(__file__).parent,
+        env=there,
+        preexec_fn=bound,
+        capture_output=True,
+        text=True,
         timeout=300,
-    )  # fmt: skip
+    )
     assert done.returncode == 0, done.stderr[-2000:]

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from recordings import ANCHORS, SURVEY
+
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.commands.convert import main
 from uwb_tdoa_tools.readers import read_flight, read_survey
@@ -11,7 +12,11 @@ from uwb_tdoa_tools.readers.names import Named, read_named
 
 NAMED = Named(ANCHORS)
 TDOA = "time=t_ms:ms,anchor_a=from,anchor_b=to,tdoa=diff:mm"
-IMU = ",".join(f"{s}_{axis}={s[0]}{axis}{unit}" for s, unit in (("gyro", ":deg/s"), ("accel", ":g")) for axis in "xyz")
+IMU = ",".join(
+    f"{s}_{axis}={s[0]}{axis}{unit}"
+    for s, unit in (("gyro", ":deg/s"), ("accel", ":g"))
+    for axis in "xyz"
+)
 RANGING = "t_ms,to,from,diff,quality\n1000,1,0,250,9\n1010,5,1,-500,9\n1020,0,0x5,750,9\n"
 INERTIAL = "t_ms,gx,gy,gz,ax,ay,az\n1000,180,0,0,0,0,1\n1001,0,90,0,0,0.5,1\n"
 
@@ -38,18 +43,25 @@ def test_units_and_names_end_at_the_border(files):
 
 
 @pytest.mark.parametrize(
-    "unit, cell", [("m", "1.5"), ("cm", "150"), ("mm", "1500"), ("ns", "5.00346143"), ("ticks", "319.7097")]
+    "unit, cell",
+    [("m", "1.5"), ("cm", "150"), ("mm", "1500"), ("ns", "5.00346143"), ("ticks", "319.7097")],
 )
 def test_every_unit_of_a_tdoa(files, unit, cell):
     (files / "one.csv").write_text(f"t,a,b,d\n0.5,0,1,{cell}\n")
-    flight = read_columns(["one.csv"], parse_columns(f"time=t,anchor_a=a,anchor_b=b,tdoa=d:{unit}"), NAMED)
+    flight = read_columns(
+        ["one.csv"], parse_columns(f"time=t,anchor_a=a,anchor_b=b,tdoa=d:{unit}"), NAMED
+    )
     assert flight.tdoa.d[0] == pytest.approx(1.5, abs=1e-4)
 
 
 def test_rows_of_several_sensors_in_one_file(files):
     rows = "t,a,b,d,gx,gy,gz,ax,ay,az,px,py,pz\n0.1,0,1,0.5,,,,,,,,,\n0.1,,,,1,2,3,4,5,6,,,\n0.2,,,,,,,,,,7,8,9\n"
     (files / "all.csv").write_text(rows)
-    others = (f"{sensor}_{axis}={sensor[0]}{axis}" for sensor in ("gyro", "accel", "pose") for axis in "xyz")
+    others = (
+        f"{sensor}_{axis}={sensor[0]}{axis}"
+        for sensor in ("gyro", "accel", "pose")
+        for axis in "xyz"
+    )
     columns = parse_columns(",".join(["time=t,anchor_a=a,anchor_b=b,tdoa=d", *others]))
     flight = read_columns(["all.csv"], columns, NAMED)
     assert (len(flight.tdoa), len(flight.imu), len(flight.truth)) == (1, 1, 1)
@@ -81,7 +93,9 @@ def test_a_mapping_that_cannot_be_is_one_sentence(text, said):
 
 
 def test_every_column_can_be_named_and_every_time_has_units():
-    assert {"time", "tdoa_time", "imu_time", "pose_time"} <= UNITS.keys() and UNITS["imu_time"] == TIME
+    assert {"time", "tdoa_time", "imu_time", "pose_time"} <= UNITS.keys() and UNITS[
+        "imu_time"
+    ] == TIME
 
 
 @pytest.mark.parametrize(
@@ -90,11 +104,23 @@ def test_every_column_can_be_named_and_every_time_has_units():
         ("t_ms,from,to\n1,0,1\n", "has no column 'diff'; its columns are t_ms, from, to"),
         ("t_ms,from,to,diff\n1,0,1,x\n", "line 2: diff is 'x'; it must be a finite number"),
         ("t_ms,from,to,diff\n1,,1,3\n", "line 2: from is ''; it must be an anchor"),
-        ("t_ms,from,to,diff\n1,0.5,1,3\n", "it must be an anchor of the survey, by its name, or an id 0 ... 65535"),
-        ("t_ms,from,to,diff\n1,0,70000,3\n", "it must be an anchor of the survey, by its name, or an id 0 ... 65535"),
-        ("t_ms,from,to,diff\n1,0,nan,3\n", "it must be an anchor of the survey, by its name, or an id 0 ... 65535"),
+        (
+            "t_ms,from,to,diff\n1,0.5,1,3\n",
+            "it must be an anchor of the survey, by its name, or an id 0 ... 65535",
+        ),
+        (
+            "t_ms,from,to,diff\n1,0,70000,3\n",
+            "it must be an anchor of the survey, by its name, or an id 0 ... 65535",
+        ),
+        (
+            "t_ms,from,to,diff\n1,0,nan,3\n",
+            "it must be an anchor of the survey, by its name, or an id 0 ... 65535",
+        ),
         ("t_ms,from,to,diff\n1,0,1,inf\n", "it must be a finite number"),
-        (f"t_ms,from,to,diff\n1,0,1,0x{'f' * 300}\n", "line 2: diff is '0xffff.*; it must be a finite number"),
+        (
+            f"t_ms,from,to,diff\n1,0,1,0x{'f' * 300}\n",
+            "line 2: diff is '0xffff.*; it must be a finite number",
+        ),
         ("t_ms,from,to,diff\n", "has no row below"),
     ],
 )
@@ -111,7 +137,16 @@ def test_columns_in_two_files_are_refused(files):
 
 
 def test_the_command_writes_a_bag_that_every_tool_reads(files, capsys):
-    words = ["ranging.csv", "imu.csv", "--columns", f"{TDOA},{IMU}", "--survey", "survey.csv", "--out", "our.bag"]
+    words = [
+        "ranging.csv",
+        "imu.csv",
+        "--columns",
+        f"{TDOA},{IMU}",
+        "--survey",
+        "survey.csv",
+        "--out",
+        "our.bag",
+    ]
     assert main(words) == 0
     assert "uwb/tdoa: 3" in capsys.readouterr().out
     flight = read_flight("our.bag")
@@ -122,7 +157,10 @@ def test_the_command_writes_a_bag_that_every_tool_reads(files, capsys):
 @pytest.mark.parametrize(
     "words, said",
     [
-        (["ranging.csv", "imu.csv", "--survey", "survey.csv"], "convert one by one, or name --columns"),
+        (
+            ["ranging.csv", "imu.csv", "--survey", "survey.csv"],
+            "convert one by one, or name --columns",
+        ),
         (["ranging.csv", "--columns", TDOA], "give a survey file"),
     ],
 )
@@ -148,7 +186,15 @@ NAMES = "name,x,y,z\nNE Ecke,0,0,1\nSW Ecke,5,0,1\nTuer,0,5,2\n"
 def test_semicolons_commas_names_and_holes_of_a_spreadsheet(files, capsys):
     (files / "tag.csv").write_text(OTHERS)
     (files / "names.csv").write_text(NAMES)
-    words = ["tag.csv", "--columns", "time=Zeit,anchor_a=von,anchor_b=nach,tdoa=Differenz", "--survey", "names.csv", "--out", "our.bag"]
+    words = [
+        "tag.csv",
+        "--columns",
+        "time=Zeit,anchor_a=von,anchor_b=nach,tdoa=Differenz",
+        "--survey",
+        "names.csv",
+        "--out",
+        "our.bag",
+    ]
     assert main(words) == 0
     told = capsys.readouterr().out
     assert "ids in the bag: NE Ecke is 0, SW Ecke is 1, Tuer is 2" in told
@@ -164,7 +210,10 @@ def test_semicolons_commas_names_and_holes_of_a_spreadsheet(files, capsys):
     [
         (NAMES, {"NE Ecke": 0, "SW Ecke": 1, "Tuer": 2}),
         ("id,x,y,z\nA7,0,0,1\nA3,5,0,1\nA12,0,5,2\n", {"A7": 7, "A3": 3, "A12": 12}),
-        ("anchors: {left: {position: [0, 0, 1]}, right: {position: [5, 0, 1]}}\n", {"left": 0, "right": 1}),
+        (
+            "anchors: {left: {position: [0, 0, 1]}, right: {position: [5, 0, 1]}}\n",
+            {"left": 0, "right": 1},
+        ),
         (SURVEY, {}),
     ],
 )
@@ -181,16 +230,26 @@ def test_gaps_are_skipped_and_counted_and_too_many_are_refused(files, capsys):
     (files / "gaps.csv").write_text("t_ms,from,to,diff\n" + "\n".join(lines))
     words = ["gaps.csv", "--columns", TDOA, "--survey", "survey.csv", "--out", "our.bag"]
     assert main(words) == 0
-    assert "2 of 30 records left out, line 6: diff is 'broken'; it must be a finite number." in capsys.readouterr().out
+    assert (
+        "2 of 30 records left out, line 6: diff is 'broken'; it must be a finite number."
+        in capsys.readouterr().out
+    )
     assert len(read_flight("our.bag").tdoa) == 28
-    (files / "gaps.csv").write_text("t_ms,from,to,diff\n" + "\n".join(line.replace(",1,1", ",1,x1") for line in lines))
+    (files / "gaps.csv").write_text(
+        "t_ms,from,to,diff\n" + "\n".join(line.replace(",1,1", ",1,x1") for line in lines)
+    )
     assert main([*words, "--force"]) == 2
-    assert "records of anchor_a, anchor_b, tdoa are like that: more than a gap" in capsys.readouterr().err
+    assert (
+        "records of anchor_a, anchor_b, tdoa are like that: more than a gap"
+        in capsys.readouterr().err
+    )
     assert main([*words, "--force", "--salvage"]) == 0
 
 
 def test_sensors_with_clocks_of_their_own_in_one_file(files, capsys):
-    """A time column for each sensor; the stamps of the inertial sensor count from elsewhere, those of motion capture are late."""
+    """A time column for each sensor; the stamps of the inertial sensor count from elsewhere, those
+    of motion capture are late.
+    """
     rows = ["t_uwb,from,to,diff,t_gyro,gx,gy,gz,t_acc,ax,ay,az,t_cap,x,y,z"]
     rows += [f"{k},0,1,100,{k + 1.7e9},1,2,3,{k + 1.7e9},0,0,1,{k + 0.2},1,2,3" for k in range(5)]
     (files / "all.csv").write_text("\n".join(rows))
@@ -200,8 +259,16 @@ def test_sensors_with_clocks_of_their_own_in_one_file(files, capsys):
     assert main(words) == 0
     told = capsys.readouterr()
     assert "all: 4.2 s" in told.out  # and not 1.7e9
-    assert "imu runs from 1700000000.0 to 1700000004.0 s" in told.err and "--time-offset imu=-1700000000.000" in told.err
-    assert main([*words, "--force", "--time-offset", "imu=-1700000000.0", "--time-offset", "truth=-0.2"]) == 0
+    assert (
+        "imu runs from 1700000000.0 to 1700000004.0 s" in told.err
+        and "--time-offset imu=-1700000000.000" in told.err
+    )
+    assert (
+        main(
+            [*words, "--force", "--time-offset", "imu=-1700000000.0", "--time-offset", "truth=-0.2"]
+        )
+        == 0
+    )
     assert "no time in common" not in capsys.readouterr().err
     flight = read_flight("our.bag")
     np.testing.assert_allclose(flight.truth.t, flight.tdoa.t, atol=1e-6)
@@ -218,7 +285,17 @@ def test_sensors_with_clocks_of_their_own_in_one_file(files, capsys):
     ],
 )
 def test_an_offset_that_cannot_be_is_one_sentence(files, offset, said, capsys):
-    words = ["ranging.csv", "--columns", TDOA, "--survey", "survey.csv", "--out", "our.bag", "--time-offset", offset]
+    words = [
+        "ranging.csv",
+        "--columns",
+        TDOA,
+        "--survey",
+        "survey.csv",
+        "--out",
+        "our.bag",
+        "--time-offset",
+        offset,
+    ]
     assert main(words) == 2
     assert said in capsys.readouterr().err
 
@@ -227,12 +304,26 @@ def test_ranges_need_no_tdoas(files, capsys):
     rows = "9,1,2500,100", "9,5,,100", "9,0,750,50", "9,0,760,50", "9,1,760,50"
     lines = [f"{0.5 + 0.1 * k:.1f},{row},1,2,3" for k, row in enumerate(rows)]
     (files / "twr.csv").write_text("\n".join(["t,tag,to,mm,sigma,px,py,pz", *lines, ""]))
-    flight = read_columns(["twr.csv"], parse_columns("time=t,anchor=to,range=mm:mm,range_std=sigma:mm"), NAMED)
-    assert len(flight.tdoa) == 0 and flight.range.anchor.tolist() == [1, 0, 0, 1] and (flight.start, flight.end) == (0.5, 0.9)
+    flight = read_columns(
+        ["twr.csv"], parse_columns("time=t,anchor=to,range=mm:mm,range_std=sigma:mm"), NAMED
+    )
+    assert (
+        len(flight.tdoa) == 0
+        and flight.range.anchor.tolist() == [1, 0, 0, 1]
+        and (flight.start, flight.end) == (0.5, 0.9)
+    )
     np.testing.assert_allclose(flight.range.d, [2.5, 0.75, 0.76, 0.76])
     np.testing.assert_allclose(flight.range.variance, [0.01, 0.0025, 0.0025, 0.0025])
     assert "1 of 5 records left out" in flight.meta["remarks"][0]
-    words = ["twr.csv", "--columns", "time=t,anchor=to,range=mm:mm,pose_x=px,pose_y=py,pose_z=pz", "--survey", "survey.csv", "--out", "twr.bag"]
+    words = [
+        "twr.csv",
+        "--columns",
+        "time=t,anchor=to,range=mm:mm,pose_x=px,pose_y=py,pose_z=pz",
+        "--survey",
+        "survey.csv",
+        "--out",
+        "twr.bag",
+    ]
     assert main(words) == 0 and "uwb/range: 4" in capsys.readouterr().out
     back = read_flight("twr.bag", survey=None)
     np.testing.assert_allclose(back.range.d, flight.range.d)
@@ -241,8 +332,14 @@ def test_ranges_need_no_tdoas(files, capsys):
 
 def test_tdoas_and_ranges_of_one_file(files):
     (files / "both.csv").write_text("t,a,b,d,to,r\n0.1,0,1,0.5,,\n0.2,,,,5,2.5\n")
-    flight = read_columns(["both.csv"], parse_columns("time=t,anchor_a=a,anchor_b=b,tdoa=d,anchor=to,range=r"), NAMED)
-    assert flight.tdoa.d.tolist() == [0.5] and flight.range.d.tolist() == [2.5] and flight.start == flight.end == 0.1
+    flight = read_columns(
+        ["both.csv"], parse_columns("time=t,anchor_a=a,anchor_b=b,tdoa=d,anchor=to,range=r"), NAMED
+    )
+    assert (
+        flight.tdoa.d.tolist() == [0.5]
+        and flight.range.d.tolist() == [2.5]
+        and flight.start == flight.end == 0.1
+    )
 
 
 def test_a_survey_of_pandas_has_no_name_for_its_ids(files):

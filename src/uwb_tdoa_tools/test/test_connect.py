@@ -1,4 +1,6 @@
-"""docs/connect.md as a new user follows it: the files it speaks of, and its commands in their order."""
+"""docs/connect.md as a new user follows it: the files it speaks of, and its commands in their
+order.
+"""
 
 from importlib import import_module
 import re
@@ -29,7 +31,9 @@ def desk(tmp_path, monkeypatch):
     late = AnchorDelay({"3": LATE})
     for seed, day in enumerate(("monday", "tuesday")):
         rates = dict(duration=40.0, imu_rate=200.0, truth_rate=50.0)
-        config = SimulationConfig(seed=seed, anchors=true, anchor_delay_std=0.03, yaw="rotating", **rates)
+        config = SimulationConfig(
+            seed=seed, anchors=true, anchor_delay_std=0.03, yaw="rotating", **rates
+        )
         write_tables(late.inject(simulate(config)), tmp_path / day)
 
 
@@ -62,12 +66,20 @@ def test_the_way_to_a_diagnosed_flight(desk, tmp_path, capsys):
 
 def errors(out):
     """3D errors, m, in the lines of `evaluate`, in their order."""
-    return [float(line.split()[4]) for line in out.splitlines() if re.match(r"(mon|tues)day_ranging ", line)]
+    return [
+        float(line.split()[4])
+        for line in out.splitlines()
+        if re.match(r"(mon|tues)day_ranging ", line)
+    ]
 
 
 def test_the_page_names_every_column_and_unit():
     columns = import_module("uwb_tdoa_tools.readers.columns")
     for name, units in columns.UNITS.items():
         stem, _, axis = name.rpartition("_")
-        assert f"`{name}`" in WALK or (axis in "yz" and f"`{stem}_x`" in WALK) or name.startswith("pose_q"), name
+        assert (
+            f"`{name}`" in WALK
+            or (axis in "yz" and f"`{stem}_x`" in WALK)
+            or name.startswith("pose_q")
+        ), name
         assert all(unit in WALK for unit in units), name

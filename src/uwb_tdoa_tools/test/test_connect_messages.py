@@ -1,12 +1,14 @@
-"""The publishers of docs/connect.md: the Python one as a process, over topics; the C++ one as far as its messages go."""
+"""The publishers of docs/connect.md: the Python one as a process, over topics; the C++ one as far
+as its messages go.
+"""
 
 import os
+from pathlib import Path
 import shutil
 import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,10 +18,11 @@ pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
 from sensor_msgs.msg import Imu  # noqa: E402
+from walking import blocks, section  # noqa: E402
+
 from uwb_tdoa_bias.foundation.anchors import Anchors  # noqa: E402
 from uwb_tdoa_ekf.streams import ERROR, StreamRules  # noqa: E402
 from uwb_tdoa_msgs.msg import AnchorArray, Tdoa  # noqa: E402
-from walking import blocks, section  # noqa: E402
 
 STAND_IN = """
 #pragma once
@@ -48,12 +51,20 @@ def findings_of(anchors, imu, tdoas):
     """[Finding] of the rules over streams, as check and ekf_node have them, of messages."""
 
     def seconds(messages):
-        return np.array([message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec for message in messages])
+        return np.array(
+            [message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec for message in messages]
+        )
 
     rules, t = StreamRules(anchors), seconds(imu)
-    gyro, force = ([[v.x, v.y, v.z] for v in vectors] for vectors in zip(*((m.angular_velocity, m.linear_acceleration) for m in imu)))
+    gyro, force = (
+        [[v.x, v.y, v.z] for v in vectors]
+        for vectors in zip(*((m.angular_velocity, m.linear_acceleration) for m in imu))
+    )
     rules.feed_imu(t, np.full(len(t), np.nan), np.array(gyro), np.array(force))
-    a, b, d = (np.array([getattr(message, name) for message in tdoas]) for name in ("anchor_a", "anchor_b", "distance_difference"))
+    a, b, d = (
+        np.array([getattr(message, name) for message in tdoas])
+        for name in ("anchor_a", "anchor_b", "distance_difference")
+    )
     rules.feed_tdoa(seconds(tdoas), np.full(len(tdoas), np.nan), a, b, d)
     rules.finish()
     return rules.findings()
@@ -70,8 +81,12 @@ def listener():
 
 def test_the_publisher_in_python(tmp_path, listener):
     """With reliable subscriptions, as most have, that come after the anchors were sent."""
-    (tmp_path / "driver.py").write_text(*blocks(section("connect.md", "Message by message"), "python"))
-    process = subprocess.Popen([sys.executable, tmp_path / "driver.py"], stderr=subprocess.PIPE, text=True)
+    (tmp_path / "driver.py").write_text(
+        *blocks(section("connect.md", "Message by message"), "python")
+    )
+    process = subprocess.Popen(
+        [sys.executable, tmp_path / "driver.py"], stderr=subprocess.PIPE, text=True
+    )
     try:
         imu, tdoas, surveys = [], [], []
         once = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -80,7 +95,11 @@ def test_the_publisher_in_python(tmp_path, listener):
         listener.create_subscription(Tdoa, "uwb/tdoa", tdoas.append, reliable)
         end = time.monotonic() + 180.0
         while not (len(imu) > ENOUGH and len(tdoas) > 8 and surveys):
-            if tdoas and not surveys and len(listener.get_subscriptions_info_by_topic("uwb/anchors")) == 0:
+            if (
+                tdoas
+                and not surveys
+                and len(listener.get_subscriptions_info_by_topic("uwb/anchors")) == 0
+            ):
                 listener.create_subscription(AnchorArray, "uwb/anchors", surveys.append, once)
             assert process.poll() is None and time.monotonic() < end, process.poll()
             rclpy.spin_once(listener, timeout_sec=0.1)
@@ -90,7 +109,9 @@ def test_the_publisher_in_python(tmp_path, listener):
     anchors = Anchors.from_message(surveys[0])
     assert len(anchors) == 4 and anchors.frame == "map" and np.isnan(anchors.orientations).all()
     assert all(message.linear_acceleration.z == pytest.approx(9.81, abs=0.2) for message in imu)
-    assert [finding.cause for finding in findings_of(anchors, imu, tdoas) if finding.severity == ERROR] == []
+    assert [
+        finding.cause for finding in findings_of(anchors, imu, tdoas) if finding.severity == ERROR
+    ] == []
     for message in tdoas:
         to_a, to_b = (
             np.linalg.norm([3.0, 4.0, 1.0] - anchors.positions[anchors.row(k)])
@@ -112,12 +133,23 @@ def test_the_publisher_in_cpp(tmp_path):
     }
     paths = [word for folder in sorted(folders) for word in ("-I", folder)]
     done = subprocess.run(
-        ["g++", "-std=c++17", "-fsyntax-only", "-Wall", "-I", tmp_path, *paths, tmp_path / "driver.cpp"],
-        capture_output=True, text=True,
-    )  # fmt: skip
+        [
+            "g++",
+            "-std=c++17",
+            "-fsyntax-only",
+            "-Wall",
+            "-I",
+            tmp_path,
+            *paths,
+            tmp_path / "driver.cpp",
+        ],
+        capture_output=True,
+        text=True,
+    )
     assert done.returncode == 0, done.stderr[:2000]
     broken = code.replace("distance_difference", "tdoa")
     (tmp_path / "driver.cpp").write_text(broken)
     assert subprocess.run(
-        ["g++", "-std=c++17", "-fsyntax-only", "-I", tmp_path, *paths, tmp_path / "driver.cpp"], capture_output=True
+        ["g++", "-std=c++17", "-fsyntax-only", "-I", tmp_path, *paths, tmp_path / "driver.cpp"],
+        capture_output=True,
     ).returncode  # the headers are those of the messages

@@ -2,6 +2,7 @@ import json
 
 import pytest
 from recordings import SURVEY, csv_text, differences, log_bytes
+
 from uwb_tdoa_tools.commands.convert import main
 from uwb_tdoa_tools.readers import read_flight
 
@@ -16,15 +17,32 @@ def files(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_bag_is_the_flight(files, capsys, storage):
-    argv = ["flight.log", "--survey", "survey.csv", "--out", "made/flight.bag", "--storage", storage, "--json"]
+    argv = [
+        "flight.log",
+        "--survey",
+        "survey.csv",
+        "--out",
+        "made/flight.bag",
+        "--storage",
+        storage,
+        "--json",
+    ]
     assert main(argv) == 0
     summary = json.loads(capsys.readouterr().out)
     assert summary["messages"] == {
-        "/uwb/anchors": 1, "/tf_static": 1, "/imu/data": 3, "/height": 2, "/pressure": 2, "/uwb/tdoa": 2, "/ground_truth/pose": 1,
-    }  # fmt: skip
+        "/uwb/anchors": 1,
+        "/tf_static": 1,
+        "/imu/data": 3,
+        "/height": 2,
+        "/pressure": 2,
+        "/uwb/tdoa": 2,
+        "/ground_truth/pose": 1,
+    }
     assert summary["left_out"] == {"estTemperature": 2} and summary["tdoa_unknown_anchor"] == 0
     assert (summary["start"], summary["end"]) == (1.0, 1.0025)
-    assert differences(read_flight("flight.log", "survey.csv"), read_flight("made/flight.bag")) == []
+    assert (
+        differences(read_flight("flight.log", "survey.csv"), read_flight("made/flight.bag")) == []
+    )
 
 
 def test_says_what_it_did(files, capsys):
@@ -40,7 +58,8 @@ def test_existing_output_is_refused_before_the_work(files, capsys):
     assert main(argv) == 0
     assert main(argv) == 2
     assert capsys.readouterr().err == (
-        "convert: error: flight.bag: exists already; choose another name, or --force to replace it.\n"
+        "convert: error: flight.bag: exists already; choose another name, or --force to "
+        "replace it.\n"
     )
     assert main([*argv, "--force"]) == 0
 
@@ -77,12 +96,17 @@ def test_what_a_moved_clock_puts_before_zero_is_left_out_and_said(tmp_path, monk
     """As of a tool whose clock begins with the recording."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "survey.csv").write_text(SURVEY)
-    rows = [f"{0.1 * k:.1f},0,1,0.25,,,," for k in range(20)] + [f",,,,{0.1 * k:.1f},1,2,3" for k in range(20)]
+    rows = [f"{0.1 * k:.1f},0,1,0.25,,,," for k in range(20)] + [
+        f",,,,{0.1 * k:.1f},1,2,3" for k in range(20)
+    ]
     (tmp_path / "a.csv").write_text("\n".join(["t,a,b,d,tp,x,y,z", *rows, ""]))
     columns = "tdoa_time=t,anchor_a=a,anchor_b=b,tdoa=d,pose_time=tp,pose_x=x,pose_y=y,pose_z=z"
     words = ["a.csv", "--columns", columns, "--survey", "survey.csv", "--out", "new.bag"]
     assert main([*words, "--time-offset", "truth=-0.45"]) == 0
-    assert "truth: 5 samples before 0 s, which a bag has no place for, are left out" in capsys.readouterr().out
+    assert (
+        "truth: 5 samples before 0 s, which a bag has no place for, are left out"
+        in capsys.readouterr().out
+    )
     truth = read_flight("new.bag").truth
     assert len(truth) == 15 and truth.t[0] == pytest.approx(0.05)
     assert main([*words[:-1], "other.bag", "--time-offset", "tdoa=-0.45"]) == 2

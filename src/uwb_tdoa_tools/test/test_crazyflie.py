@@ -1,4 +1,6 @@
-"""Log variables of a Crazyflie to streams; studies/test/test_study_radio_link.py runs the example node around that."""
+"""Log variables of a Crazyflie to streams; studies/test/test_study_radio_link.py runs the example
+node around that.
+"""
 
 import subprocess
 import sys
@@ -8,14 +10,25 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 import numpy as np
 import pytest
-from uwb_tdoa_tools.crazyflie.log_blocks import FORCES, GRAVITY, PERIOD, RATES, LogBlock, VehicleClock
+
+from uwb_tdoa_tools.crazyflie.log_blocks import (
+    FORCES,
+    GRAVITY,
+    PERIOD,
+    RATES,
+    LogBlock,
+    VehicleClock,
+)
 
 
 def test_a_value_is_a_measurement_once():
     block = LogBlock(["stateEstimate.z", "tdoa2.d7-0", "tdoa2.d0-1"])
     first = [(pytest.approx(1.0 - PERIOD / 2), 0, 1, 0.5)]  # the other is 0: never received
     assert block.take(1000, [1.0, 0.0, 0.5]) == (first, None)
-    assert block.take(1010, [1.0, -2.0, 0.5]) == ([(pytest.approx(1.01 - PERIOD / 2), 7, 0, -2.0)], None)
+    assert block.take(1010, [1.0, -2.0, 0.5]) == (
+        [(pytest.approx(1.01 - PERIOD / 2), 7, 0, -2.0)],
+        None,
+    )
     assert block.take(1020, [1.0, -2.0, 0.5]) == ([], None)
     assert block.take(1030, [1.0, float("nan"), 0.25])[0][0][3] == 0.25
 
@@ -44,8 +57,15 @@ def test_the_example_says_what_is_missing():
     pytest.importorskip("rclpy")
     pytest.importorskip("uwb_tdoa_msgs.msg")
     done = subprocess.run(
-        [sys.executable, ROOT / "docs" / "connect" / "crazyflie_node.py"], capture_output=True, text=True, timeout=180
+        [sys.executable, ROOT / "docs" / "connect" / "crazyflie_node.py"],
+        capture_output=True,
+        text=True,
+        timeout=180,
     )
     if "crazyflie_interfaces" not in done.stderr:
         pytest.skip("crazyswarm2 is installed")
-    assert done.returncode == 1 and done.stderr.count("\n") == 1 and "install crazyswarm2" in done.stderr
+    assert (
+        done.returncode == 1
+        and done.stderr.count("\n") == 1
+        and "install crazyswarm2" in done.stderr
+    )

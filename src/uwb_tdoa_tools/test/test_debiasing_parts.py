@@ -1,14 +1,20 @@
 import numpy as np
 import pytest
-from uwb_tdoa_bias.foundation.errors import InputError
 
+from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.debiasing.parts import part_of, static_parts
 from uwb_tdoa_tools.scoring.evaluation import evaluate
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 CONFIG = SimulationConfig(
-    seed=2, duration=6.0, imu_rate=100.0, truth_rate=50.0, start_in_air=True, place=(0.5, 0.3), height=1.5
+    seed=2,
+    duration=6.0,
+    imu_rate=100.0,
+    truth_rate=50.0,
+    start_in_air=True,
+    place=(0.5, 0.3),
+    height=1.5,
 )
 
 
@@ -40,7 +46,9 @@ def test_a_recording_that_moves_holds_no_place(tmp_path):
 
 def test_rows_of_one_place_are_one_part(tmp_path):
     file = tmp_path / "points.csv"
-    file.write_text("true_x, true_y, true_z, x, y, z, note\n0,0,1,0.1,0,1,a\n1,0,1,1.1,0,1,b\n0,0,1,0.3,0,1,c\n")
+    file.write_text(
+        "true_x, true_y, true_z, x, y, z, note\n0,0,1,0.1,0,1,a\n1,0,1,1.1,0,1,b\n0,0,1,0.3,0,1,c\n"
+    )
     one, two = static_parts(file)
     np.testing.assert_allclose(one.measured, [[0.1, 0.0, 1.0], [0.3, 0.0, 1.0]])
     np.testing.assert_allclose(two.true, [[1.0, 0.0, 1.0]])

@@ -2,6 +2,7 @@ import shlex
 from types import SimpleNamespace
 
 import pytest
+
 from uwb_tdoa_bias.correction.network import SHIPPED, UNPROVEN
 
 pytest.importorskip("rclpy")
@@ -14,7 +15,10 @@ from uwb_tdoa_tools.simulation.constellations import corners  # noqa: E402
     "arguments, sentence",
     [
         (["--rate", "0"], "--rate: 0 is not a speed; give a number above 0."),
-        (["--survey", "survey.txt"], "--survey: needs --flight; a simulated flight has its own anchors."),
+        (
+            ["--survey", "survey.txt"],
+            "--survey: needs --flight; a simulated flight has its own anchors.",
+        ),
         (["--flight", "nowhere.log"], "nowhere.log: does not exist"),
     ],
 )
@@ -28,7 +32,11 @@ def test_the_next_commands_are_commands(given):
     for command in next_steps(*given):
         words = shlex.split(command)
         name, *rest = words[words.index("uwb_tdoa_tools") + 1 :]
-        args = {"calibrate": calibrate, "check": check, "localize": localize}[name].parser().parse_args(rest)
+        args = (
+            {"calibrate": calibrate, "check": check, "localize": localize}[name]
+            .parser()
+            .parse_args(rest)
+        )
         assert args.flights == [given[0]] and args.survey == (given[1] if len(given) > 1 else None)
 
 
@@ -44,7 +52,9 @@ class ErrorOnly:
 
 def test_it_says_what_corrects_and_that_nothing_does_unless_it_is_asked_for(tmp_path):
     plain = DemoFlight(None, None, None)
-    assert plain.corrector() is None and plain.correction().startswith("nothing: neither --effects nor --model is given")
+    assert plain.corrector() is None and plain.correction().startswith(
+        "nothing: neither --effects nor --model is given"
+    )
     assert UNPROVEN in DemoFlight(SimpleNamespace(anchors=corners()), None, SHIPPED).correction()
 
 
@@ -53,7 +63,13 @@ def test_it_says_what_corrects_and_that_nothing_does_unless_it_is_asked_for(tmp_
     [
         ((0.2, 0.2), "3D RMSE 0.200 m, with nothing corrected: diagnose finds"),
         ((0.2, 0.15, 0.15), "3D RMSE raw 0.200 m, corrected 0.150 m: -25 %"),
-        ((0.219, 0.228, 0.228), "corrected 0.228 m: +4 %; this correction does not fit this flight: other anchors, another day"),
+        (
+            (0.219, 0.228, 0.228),
+            (
+                "corrected 0.228 m: +4 %; this correction does not fit this flight: other "
+                "anchors, another day"
+            ),
+        ),
     ],
 )
 def test_a_correction_that_does_harm_is_called_that(errors, said):

@@ -1,14 +1,17 @@
-"""What ./dev says without doing anything, and what it says is missing. Nothing here installs or builds."""
+"""What ./dev says without doing anything, and what it says is missing.
+
+Nothing here installs or builds.
+"""
 
 import fcntl
 from importlib.util import module_from_spec, spec_from_file_location
 import os
+from pathlib import Path
 import re
 import shutil
 import subprocess
 import sys
 import zipfile
-from pathlib import Path
 
 import pytest
 
@@ -42,7 +45,9 @@ def machine(tmp_path):
 
 def dev(folder, *arguments, **environment):
     plain = {"PATH": os.environ["PATH"], "HOME": os.environ.get("HOME", "/"), **environment}
-    done = subprocess.run([folder / "dev", *arguments], env=plain, capture_output=True, text=True, timeout=60)
+    done = subprocess.run(
+        [folder / "dev", *arguments], env=plain, capture_output=True, text=True, timeout=60
+    )
     return done.returncode, done.stdout, done.stderr
 
 
@@ -61,7 +66,11 @@ def test_usage_names_every_command(arguments):
 
 
 def test_unknown_command(workspace):
-    assert dev(workspace, "fly") == (2, "", "dev: error: unknown command 'fly'; './dev help' lists them.\n")
+    assert dev(workspace, "fly") == (
+        2,
+        "",
+        "dev: error: unknown command 'fly'; './dev help' lists them.\n",
+    )
 
 
 def test_run_needs_package_and_executable(workspace):
@@ -74,7 +83,10 @@ def test_named_python_of_a_wrong_version(workspace):
     old = script(workspace / "python3.9", "exit 1")
     code, out, err = dev(workspace, "build", PYTHON=str(old))
     assert (code, out) == (1, "")
-    assert err == f"dev: error: PYTHON={old} is no Python 3.10, 3.11 or 3.12; name one of these, or unset PYTHON.\n"
+    assert err == (
+        f"dev: error: PYTHON={old} is no Python 3.10, 3.11 or 3.12; name one of these, or "
+        "unset PYTHON.\n"
+    )
 
 
 def test_no_python_of_a_right_version(workspace, machine):
@@ -88,7 +100,10 @@ def test_no_compiler(workspace, machine):
     code, _, err = dev(workspace, "demo", **machine(python3=BASE_PYTHON))
     assert (code, err) == (
         1,
-        "dev: error: no C++ compiler found, which the message package needs; install one, e.g. sudo apt install g++\n",
+        (
+            "dev: error: no C++ compiler found, which the message package needs; install one, "
+            "e.g. sudo apt install g++\n"
+        ),
     )
     assert not (workspace / ".venv").exists()
 
@@ -99,7 +114,10 @@ def test_no_venv_module(workspace, machine):
     version = f"{sys.version_info.major}.{sys.version_info.minor}"
     assert (code, err) == (
         1,
-        f"dev: error: Python {version} has no venv module; install it, e.g. sudo apt install python{version}-venv\n",
+        (
+            f"dev: error: Python {version} has no venv module; install it, e.g. sudo apt install "
+            f"python{version}-venv\n"
+        ),
     )
 
 
@@ -121,23 +139,42 @@ def test_what_is_not_what_was_locked_is_not_installed(workspace, machine):
     environment = machine(python3=BASE_PYTHON, **{"c++": script(workspace / "c++", "exit 1")})
     other = workspace / "other-1.0-py3-none-any.whl"  # in the place of one of this name and version
     with zipfile.ZipFile(other, "w") as wheel:
-        wheel.writestr("other-1.0.dist-info/METADATA", "Metadata-Version: 2.1\nName: other\nVersion: 1.0\n")
-        wheel.writestr("other-1.0.dist-info/WHEEL", "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n")
+        wheel.writestr(
+            "other-1.0.dist-info/METADATA", "Metadata-Version: 2.1\nName: other\nVersion: 1.0\n"
+        )
+        wheel.writestr(
+            "other-1.0.dist-info/WHEEL",
+            "Wheel-Version: 1.0\nRoot-Is-Purelib: true\nTag: py3-none-any\n",
+        )
         wheel.writestr("other-1.0.dist-info/RECORD", "")
     (workspace / ".dev" / "requirements.lock").write_text(f"other==1.0 --hash=sha256:{64 * '0'}\n")
-    code, _, err = dev(workspace, "build", PIP_NO_INDEX="1", PIP_FIND_LINKS=str(workspace), **environment)
-    assert code == 1 and "DO NOT MATCH THE HASHES" in (workspace / "log" / "dev_pip.log").read_text()
+    code, _, err = dev(
+        workspace, "build", PIP_NO_INDEX="1", PIP_FIND_LINKS=str(workspace), **environment
+    )
+    assert (
+        code == 1 and "DO NOT MATCH THE HASHES" in (workspace / "log" / "dev_pip.log").read_text()
+    )
     assert not (workspace / ".venv" / "steps.json").exists()
 
 
 @pytest.mark.parametrize(
-    ("asked", "lock"), [("requirements.txt", ".dev/requirements.lock"), (".ci/requirements.txt", ".ci/requirements.lock")]
+    ("asked", "lock"),
+    [
+        ("requirements.txt", ".dev/requirements.lock"),
+        (".ci/requirements.txt", ".ci/requirements.lock"),
+    ],
 )
 def test_all_that_is_installed_is_locked(asked, lock):
     entry = re.compile(r"^(\S+)==(\S+)((?: \\\n    --hash=sha256:[0-9a-f]{64})*)$", re.MULTILINE)
-    locked = {(canonical(name), version): hashes for name, version, hashes in entry.findall((ROOT / lock).read_text())}
+    locked = {
+        (canonical(name), version): hashes
+        for name, version, hashes in entry.findall((ROOT / lock).read_text())
+    }
     wanted = [line.split("==") for line in (ROOT / asked).read_text().splitlines() if "==" in line]
-    assert all(locked.values()) and {(canonical(name), version) for name, version in wanted} < locked.keys()
+    assert (
+        all(locked.values())
+        and {(canonical(name), version) for name, version in wanted} < locked.keys()
+    )
 
 
 def canonical(name):
@@ -179,17 +216,27 @@ def test_where_nothing_is_to_be_done_nobody_waits_for_another(prepare, monkeypat
     with open(prepare.LOG / "dev.lock", "w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         prepare.main("run")
-    with pytest.raises(BaseException, match="nothing to do"):  # the demo wants the nodes compiled, too
+    with pytest.raises(
+        BaseException, match="nothing to do"
+    ):  # the demo wants the nodes compiled, too
         prepare.main("demo")
 
 
 @pytest.mark.parametrize(
     ("name", "output", "share"),
     [
-        ("dev_compile.log", "compiling, which is done once: 40%, 20 s\ncompiling, which is done once: 52%, 25 s\n", ", 52 %"),
+        (
+            "dev_compile.log",
+            "compiling, which is done once: 40%, 20 s\ncompiling, which is done once: 52%, 25 s\n",
+            ", 52 %",
+        ),
         ("dev_build_messages.log", "[0.1s] Starting\n[12/48] Building CXX object a.o\n", ", 25 %"),
         ("dev_pip.log", "Collecting numpy\nCollecting scipy\n", ", package 2 of 3"),
-        ("dev_pip.log", "Collecting numpy\nInstalling collected packages: numpy, scipy\n", ", unpacking"),
+        (
+            "dev_pip.log",
+            "Collecting numpy\nInstalling collected packages: numpy, scipy\n",
+            ", unpacking",
+        ),
         ("dev_venv.log", "", ""),
     ],
 )
@@ -201,6 +248,8 @@ def test_how_far_a_step_is(prepare, name, output, share):
 
 def test_a_step_that_fails_ends_those_beside_it(prepare):
     long = prepare.start("wait", "wait", ["sleep", "600"])
-    with pytest.raises(prepare.Failure, match="the step 'fail' failed; all of its output is in log/dev_fail.log."):
+    with pytest.raises(
+        prepare.Failure, match="the step 'fail' failed; all of its output is in log/dev_fail.log."
+    ):
         prepare.finish(long, prepare.start("fail", "fail", ["false"]))
     assert long[2].returncode is not None

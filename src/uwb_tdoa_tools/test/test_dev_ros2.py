@@ -1,4 +1,6 @@
-"""`./dev ros2` of those without ROS, as processes against a live node; and the commands of the documentation."""
+"""`./dev ros2` of those without ROS, as processes against a live node; and the commands of the
+documentation.
+"""
 
 import argparse
 from pathlib import Path
@@ -15,8 +17,14 @@ import pytest
 rclpy = pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
-from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor, ParameterType, ParameterValue  # noqa: E402
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    ParameterDescriptor,
+    ParameterType,
+    ParameterValue,
+)  # noqa: E402
 from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
+
 from uwb_tdoa_bias.foundation.ros_parameters import Parameter, declare_all  # noqa: E402
 from uwb_tdoa_msgs.msg import Tdoa, TdoaResidual  # noqa: E402
 
@@ -25,16 +33,26 @@ SCRIPT = ROOT / ".dev" / "ros2.py"
 COMMANDS = {  # words: what they say, as an expression, and the exit code
     "topic list -t": (r"/tag1/uwb/tdoa \[uwb_tdoa_msgs/msg/Tdoa\]\n", 0),
     "topic info -v /tag1/uwb/tdoa": (
-        r"Type: uwb_tdoa_msgs/msg/Tdoa\nPublisher count: 1\n  /tag1/driver \[.*\]: best_effort, volatile\nSubscription count: ", 0,
+        (
+            r"Type: uwb_tdoa_msgs/msg/Tdoa\nPublisher count: 1\n  /tag1/driver \[.*\]: "
+            r"best_effort, volatile\nSubscription count: "
+        ),
+        0,
     ),
-    "topic echo /tag1/uwb/tdoa --once": (r"frame_id: base_link[^$]*anchor_a: 3\n[^$]*distance_difference: 0.25\n[^$]*---\n", 0),
+    "topic echo /tag1/uwb/tdoa --once": (
+        r"frame_id: base_link[^$]*anchor_a: 3\n[^$]*distance_difference: 0.25\n[^$]*---\n",
+        0,
+    ),
     "node list": (r"(?m)^/tag1/driver$", 0),
     "param list": (r"/tag1/driver:\n(  .*\n)*  gain\n", 0),
     "param set tag1/driver gain 0.75": (r"^Set parameter successful\n$", 0),
     "param set tag1/driver limit 2.0": (r"error: limit: not set: ", 1),
-    "param describe /tag1/driver limit": (r"^limit: m; what is too far\n  from 0 to 9\n  read only\n$", 0),
+    "param describe /tag1/driver limit": (
+        r"^limit: m; what is too far\n  from 0 to 9\n  read only\n$",
+        0,
+    ),
     "param get /tag1/driver gian": (r"error: /tag1/driver has no parameter gian", 1),
-}  # fmt: skip
+}
 
 
 PATIENCE = 300.0  # s
@@ -58,7 +76,10 @@ def driver():
     }
     declare_all(node, parameters)
     poor = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
-    publisher, message = node.create_publisher(Tdoa, "uwb/tdoa", poor), Tdoa(anchor_a=3, distance_difference=0.25)
+    publisher, message = (
+        node.create_publisher(Tdoa, "uwb/tdoa", poor),
+        Tdoa(anchor_a=3, distance_difference=0.25),
+    )
     message.header.frame_id = "base_link"
     node.create_timer(0.02, lambda: publisher.publish(message))
     yield node
@@ -67,12 +88,19 @@ def driver():
 
 
 def start(words, stdout=subprocess.PIPE):
-    return subprocess.Popen([sys.executable, "-u", SCRIPT, *words.split()], stdout=stdout, stderr=subprocess.STDOUT, text=True)
+    return subprocess.Popen(
+        [sys.executable, "-u", SCRIPT, *words.split()],
+        stdout=stdout,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
 
 
 @pytest.mark.slow
 def test_commands(driver):
-    """Asked again as long as the answer is another one: on a loaded machine a command may have looked before it could see the node."""
+    """Asked again as long as the answer is another one: on a loaded machine a command may have
+    looked before it could see the node.
+    """
     asked, said = {words: start(words) for words in COMMANDS}, {}
 
     def all_are_answered():
@@ -102,7 +130,9 @@ def test_the_rate_of_a_topic(driver, tmp_path):
     with said.open("w") as file:
         hz = start("topic hz /tag1/uwb/tdoa", file)
         try:  # a loaded machine publishes at 50 Hz later, not never
-            spin_until(driver, lambda: any(abs(rate - 50.0) < 15.0 for rate in rates_in(said.read_text())))
+            spin_until(
+                driver, lambda: any(abs(rate - 50.0) < 15.0 for rate in rates_in(said.read_text()))
+            )
         finally:
             hz.terminate()
             hz.wait()
@@ -116,13 +146,19 @@ def rates_in(text):
 def test_any_message_is_yaml():
     plain = runpy.run_path(str(SCRIPT))["_plain"]
     residual = plain(TdoaResidual(verdict=3, weight=0.5))
-    assert residual["header"] == {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""} and residual["verdict"] == 3
+    assert (
+        residual["header"] == {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}
+        and residual["verdict"] == 3
+    )
 
 
 HOSTILE = "x\x1b]52;c;ZXZpbA==\x07\u202e\nforged"
 
 
-@pytest.mark.parametrize("command", ["param get", "param describe", "param list", "node list", "topic list -t", "topic info -v t"])
+@pytest.mark.parametrize(
+    "command",
+    ["param get", "param describe", "param list", "node list", "topic list -t", "topic info -v t"],
+)
 def test_a_terminal_obeys_nothing_that_others_have_written(monkeypatch, capsys, command):
     """`param get` of a text with escape sequences wrote to the clipboard."""
     script = runpy.run_path(str(SCRIPT))
@@ -130,29 +166,52 @@ def test_a_terminal_obeys_nothing_that_others_have_written(monkeypatch, capsys, 
     value = ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=HOSTILE)
     bounds = [FloatingPointRange(from_value=0.0, to_value=1.0)]
     described = ParameterDescriptor(
-        name=HOSTILE, type=4, description=HOSTILE, additional_constraints=HOSTILE, floating_point_range=bounds
+        name=HOSTILE,
+        type=4,
+        description=HOSTILE,
+        additional_constraints=HOSTILE,
+        floating_point_range=bounds,
     )
     end = SimpleNamespace(
-        node_namespace=HOSTILE, node_name=HOSTILE, topic_type=HOSTILE,
-        qos_profile=SimpleNamespace(reliability=ReliabilityPolicy.RELIABLE, durability=ReliabilityPolicy.RELIABLE),
-    )  # fmt: skip
+        node_namespace=HOSTILE,
+        node_name=HOSTILE,
+        topic_type=HOSTILE,
+        qos_profile=SimpleNamespace(
+            reliability=ReliabilityPolicy.RELIABLE, durability=ReliabilityPolicy.RELIABLE
+        ),
+    )
     node = SimpleNamespace(
-        get_topic_names_and_types=lambda: [(HOSTILE, [HOSTILE])], get_publishers_info_by_topic=lambda _: [end],
-        get_subscriptions_info_by_topic=lambda _: [end], count_publishers=lambda _: 1, count_subscribers=lambda _: 1,
-    )  # fmt: skip
+        get_topic_names_and_types=lambda: [(HOSTILE, [HOSTILE])],
+        get_publishers_info_by_topic=lambda _: [end],
+        get_subscriptions_info_by_topic=lambda _: [end],
+        count_publishers=lambda _: 1,
+        count_subscribers=lambda _: 1,
+    )
     answers = {
-        "param get": SimpleNamespace(values=[value]), "param describe": SimpleNamespace(descriptors=[described]),
+        "param get": SimpleNamespace(values=[value]),
+        "param describe": SimpleNamespace(descriptors=[described]),
         "param list": SimpleNamespace(result=SimpleNamespace(names=[HOSTILE])),
-    }  # fmt: skip
+    }
     fakes = {
-        "_answer": lambda *_: answers[command], "_client": lambda *_, **__: Any_(), "_nodes": lambda *_: [HOSTILE],
-        "_settled": lambda look, *_: look(), "_topic": lambda *_, **__: HOSTILE,
-    }  # fmt: skip
+        "_answer": lambda *_: answers[command],
+        "_client": lambda *_, **__: Any_(),
+        "_nodes": lambda *_: [HOSTILE],
+        "_settled": lambda look, *_: look(),
+        "_topic": lambda *_, **__: HOSTILE,
+    }
     function.__globals__.update(fakes)
-    for of in ([HOSTILE, None] if command == "param list" else [HOSTILE]):
-        function(node, [], argparse.Namespace(node=of, name="n", topic=HOSTILE, show_types=True, verbose=True))
+    for of in [HOSTILE, None] if command == "param list" else [HOSTILE]:
+        function(
+            node,
+            [],
+            argparse.Namespace(node=of, name="n", topic=HOSTILE, show_types=True, verbose=True),
+        )
     said = capsys.readouterr().out
-    assert r"\x1b]52" in said and r"\nforged" in said and all(line.isprintable() for line in said.split("\n"))
+    assert (
+        r"\x1b]52" in said
+        and r"\nforged" in said
+        and all(line.isprintable() for line in said.split("\n"))
+    )
 
 
 class Any_:
@@ -168,4 +227,6 @@ def test_its_examples_are_command_lines():
     assert len(examples) > 5
     for example in examples:
         dev, name, *words = example.split()
-        assert (dev, name) == ("./dev", "ros2") and isinstance(parser.parse_args(words), argparse.Namespace)
+        assert (dev, name) == ("./dev", "ros2") and isinstance(
+            parser.parse_args(words), argparse.Namespace
+        )

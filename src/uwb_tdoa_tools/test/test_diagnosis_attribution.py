@@ -1,18 +1,18 @@
+from known_effects import AIDED, SIZES, clean_flight, effect_of, names_found
 import numpy as np
 import pytest
-
 import undeclared
+
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, LabelEffect, SmoothTerm
 from uwb_tdoa_tools.diagnosis import attribution, refinement
 from uwb_tdoa_tools.diagnosis.attribution import attribute, residuals_of
-from uwb_tdoa_tools.diagnosis.refinement import _simpler, effects_of, relinearised
 from uwb_tdoa_tools.diagnosis.channels import residuals
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
+from uwb_tdoa_tools.diagnosis.refinement import _simpler, effects_of, relinearised
 from uwb_tdoa_tools.diagnosis.regression.fit import fit
 from uwb_tdoa_tools.diagnosis.regression.select import select
 from uwb_tdoa_tools.diagnosis.regression.table import table_of
 from uwb_tdoa_tools.diagnosis.regression.terms import candidates_of
-from known_effects import AIDED, SIZES, clean_flight, effect_of, names_found
 
 TRUTH = GroundTruth()
 
@@ -52,14 +52,18 @@ def test_a_declared_effect_is_found_with_its_size(flight, name):
 
 
 def test_an_anchor_that_is_far_off_is_fitted_where_it_is(flight):
-    """A fit about the surveyed place takes the change of direction for something else: it must be made about its own values."""
+    """A fit about the surveyed place takes the change of direction for something else: it must be
+    made about its own values.
+    """
     far = EFFECTS["anchor_position"]({"3.z": -1.3})
 
     def at(model):
         return [residuals(TRUTH.prepare(far.inject(flight)), TRUTH, EffectSet(model))]
 
     candidates = candidates_of(far, flight.anchors, [])
-    table = table_of(at(())).with_terms([term for candidate in candidates for term in candidate.terms])
+    table = table_of(at(())).with_terms(
+        [term for candidate in candidates for term in candidate.terms]
+    )
     selection = select(table, candidates, np.ones(3 * len(table.channels)))
     before = np.std(table_of(at(effects_of(selection))).y - selection.fit.residual)
     after = relinearised(selection, at, candidates)
@@ -70,7 +74,9 @@ def test_an_anchor_that_is_far_off_is_fitted_where_it_is(flight):
 
 
 def test_every_declared_effect_is_in_the_bank():
-    of_numbers = {name for name, effect in EFFECTS.items() if issubclass(effect, LabelEffect)}  # see test_study_faults.py
+    of_numbers = {
+        name for name, effect in EFFECTS.items() if issubclass(effect, LabelEffect)
+    }  # see test_study_faults.py
     assert set(SIZES) == set(EFFECTS) - of_numbers
 
 
@@ -78,7 +84,9 @@ def test_an_interval_of_nlos_is_found_with_its_anchor_and_time(flight):
     effect = effect_of("nlos", True, 2)
     (finding,) = quick(effect.inject(flight)).findings()
     for key, value in effect.values.items():
-        assert finding.effect.values[key] == pytest.approx(value, abs=0.02 if key.endswith("delay") else 1.0)
+        assert finding.effect.values[key] == pytest.approx(
+            value, abs=0.02 if key.endswith("delay") else 1.0
+        )
 
 
 @pytest.mark.parametrize("name", ["noise_level", "outlier_rate"])
@@ -102,10 +110,16 @@ def test_measured_flight(shared_data):
     from uwb_tdoa_tools.readers import read_flight
 
     survey = shared_data / "surveys" / "anchor_const1.csv"
-    one, two = (read_flight(shared_data / "util" / f"const1-trial{k}-tdoa2.csv.gz", survey) for k in (1, 2))
+    one, two = (
+        read_flight(shared_data / "util" / f"const1-trial{k}-tdoa2.csv.gz", survey) for k in (1, 2)
+    )
     effects = EffectSet(attribute([one], TRUTH).effects)
-    before, after = (residuals(two, TRUTH, model)["tdoa"] for model in (EffectSet(), effects))  # of a flight that was not fitted
-    assert np.median(np.abs(after.residual[after.airborne])) < 0.7 * np.median(np.abs(before.residual[before.airborne]))
+    before, after = (
+        residuals(two, TRUTH, model)["tdoa"] for model in (EffectSet(), effects)
+    )  # of a flight that was not fitted
+    assert np.median(np.abs(after.residual[after.airborne])) < 0.7 * np.median(
+        np.abs(before.residual[before.airborne])
+    )
 
 
 @pytest.fixture(scope="module")
@@ -119,7 +133,9 @@ def test_what_is_wrong_with_height_pressure_and_velocity_is_found_with_its_size(
     (found,) = quick(put_in.inject(aided)).effects
     assert found.name == name
     for key, value in put_in.values.items():
-        assert found.values[key] == pytest.approx(value, rel=0.1, abs=1.0 if key.endswith(("start", "end")) else 0.0)
+        assert found.values[key] == pytest.approx(
+            value, rel=0.1, abs=1.0 if key.endswith(("start", "end")) else 0.0
+        )
 
 
 def test_nothing_is_found_in_sound_heights_pressures_and_velocities(aided):
@@ -127,21 +143,33 @@ def test_nothing_is_found_in_sound_heights_pressures_and_velocities(aided):
 
 
 def test_of_two_models_that_tell_the_same_the_one_of_fewer_parameters_counts(flight):
-    """A frame that is shifted along z; the same with delays of all anchors, which are of no use beside it; and nothing."""
+    """A frame that is shifted along z; the same with delays of all anchors, which are of no use
+    beside it; and nothing.
+    """
     shifted = EFFECTS["truth_frame"]({"z": 0.3}).inject(flight)
-    frame, delays = (candidates_of(EFFECTS[name](), flight.anchors, None) for name in ("truth_frame", "anchor_delay"))
+    frame, delays = (
+        candidates_of(EFFECTS[name](), flight.anchors, None)
+        for name in ("truth_frame", "anchor_delay")
+    )
     along_z = next(one for one in frame if one.terms[0].keys == ("z",))
-    table = table_of(residuals_of([shifted], TRUTH, EffectSet())).with_terms([*along_z.terms, *delays[0].terms])
+    table = table_of(residuals_of([shifted], TRUTH, EffectSet())).with_terms(
+        [*along_z.terms, *delays[0].terms]
+    )
     found = select(table, [along_z], None)
     for other in (found.plus(delays[0]), found.only(())):
         assert _simpler(other, found, 10) is _simpler(found, other, 10) is found
 
 
 def test_of_two_models_of_the_same_things_the_one_that_is_worth_more_counts(flight, monkeypatch):
-    """A frame that is shifted along z and a little along x: both are shifts of the frame, and one tells three quarters of it."""
+    """A frame that is shifted along z and a little along x: both are shifts of the frame, and one
+    tells three quarters of it.
+    """
     shifted = EFFECTS["truth_frame"]({"z": 0.3, "x": 0.02}).inject(flight)
     frame = candidates_of(EFFECTS["truth_frame"](), flight.anchors, None)
-    whole, along_z = (next(one for one in frame if one.terms[0].keys == keys) for keys in (("x", "y", "z"), ("z",)))
+    whole, along_z = (
+        next(one for one in frame if one.terms[0].keys == keys)
+        for keys in (("x", "y", "z"), ("z",))
+    )
     table = table_of(residuals_of([shifted], TRUTH, EffectSet())).with_terms(whole.terms)
     inflation = fit(table, list(whole.columns)).inflation
     more, fewer = (select(table, [one], inflation) for one in (whole, along_z))
@@ -151,7 +179,11 @@ def test_of_two_models_of_the_same_things_the_one_that_is_worth_more_counts(flig
 
 def test_maps_of_the_place_are_looked_for_in_three_flights_or_more(monkeypatch):
     looked = []
-    monkeypatch.setattr(attribution, "with_maps", lambda selection, *_: looked.append(selection.table.flights) or selection)
+    monkeypatch.setattr(
+        attribution,
+        "with_maps",
+        lambda selection, *_: looked.append(selection.table.flights) or selection,
+    )
     flights = [clean_flight(seed, 17.0) for seed in (100, 101, 102)]
     for number in (1, 2, 3):
         attribute(flights[:number], TRUTH)

@@ -1,12 +1,12 @@
 from dataclasses import replace
 
+from known_effects import clean_flight
 import numpy as np
 import pytest
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, SmoothTerm
 from uwb_tdoa_tools.diagnosis.channels import CHANNELS, residuals
 from uwb_tdoa_tools.diagnosis.references import GroundTruth, Nothing
-from known_effects import clean_flight
 
 
 @pytest.fixture(scope="module")
@@ -16,7 +16,11 @@ def parts():
 
 def test_residuals_of_a_clean_flight_are_its_noise(parts):
     assert np.std(parts["gyro"].residual) < 0.002 and np.std(parts["accel"].residual) < 0.01
-    for name, noise in (("height", 0.01), ("pressure", 0.1), ("velocity", 0.05)):  # medians of the 6 or 7 in a cell
+    for name, noise in (
+        ("height", 0.01),
+        ("pressure", 0.1),
+        ("velocity", 0.05),
+    ):  # medians of the 6 or 7 in a cell
         assert np.std(parts[name].residual) == pytest.approx(1.2 * noise / np.sqrt(6.25), rel=0.15)
     ranges = parts["range"]
     assert np.std(ranges.residual[ranges.airborne]) == pytest.approx(0.1, rel=0.05)
@@ -44,12 +48,19 @@ def test_every_function_that_is_looked_for_has_columns(parts, name):
         assert np.isfinite(parts[name].columns(term, keys)).all()
 
 
-@pytest.mark.parametrize("channel, covariate", [("height", "vibration"), ("velocity.x", "vibration"), ("gyro.x", "extra.battery.voltage")])
+@pytest.mark.parametrize(
+    "channel, covariate",
+    [("height", "vibration"), ("velocity.x", "vibration"), ("gyro.x", "extra.battery.voltage")],
+)
 def test_a_function_of_what_a_flight_does_not_hold_adds_nothing(channel, covariate):
     flight, name = clean_flight(100, 40.0, aided=True), channel.partition(".")[0]
     flight = flight if name == "gyro" else replace(flight, imu=None)
-    term = SmoothTerm({"c0": 0.3, "c1": 0.3, "c2": 0.3}, channel=channel, covariate=covariate, knots=(0.0, 1.0))
-    plain, part = (residuals(flight, GroundTruth(), EffectSet(effects))[name] for effects in ((), (term,)))
+    term = SmoothTerm(
+        {"c0": 0.3, "c1": 0.3, "c2": 0.3}, channel=channel, covariate=covariate, knots=(0.0, 1.0)
+    )
+    plain, part = (
+        residuals(flight, GroundTruth(), EffectSet(effects))[name] for effects in ((), (term,))
+    )
     np.testing.assert_array_equal(part.residual, plain.residual)
     assert part.covariate(covariate) is None and not part.columns(term, term.keys()).any()
 
@@ -58,7 +69,10 @@ def test_without_reference_the_residual_is_the_innovation_and_a_shift_of_all_lea
     flight, reference = clean_flight(103, 30.0), Nothing()
     part = residuals(reference.prepare(flight), reference, EffectSet())["tdoa"]
     np.testing.assert_array_equal(part.residual, part.innovations.value)
-    shift, delay = (part.columns(EFFECTS[name](), keys) for name, keys in (("truth_frame", "xyz"), ("anchor_delay", "3")))
+    shift, delay = (
+        part.columns(EFFECTS[name](), keys)
+        for name, keys in (("truth_frame", "xyz"), ("anchor_delay", "3"))
+    )
     assert np.sqrt(np.mean(shift**2)) < 0.1 < np.sqrt(np.mean(delay**2))
 
 
@@ -70,14 +84,23 @@ def test_at_rest_the_gyroscope_is_no_function_of_what_it_measures_itself():
 
 
 def test_without_attitude_the_gyroscope_is_judged_at_rest_and_the_accelerometer_not_at_all():
-    reference, flight = Nothing(), clean_flight(110, 30.0)  # turns slowly, soon after it has left the floor
+    reference, flight = (
+        Nothing(),
+        clean_flight(110, 30.0),
+    )  # turns slowly, soon after it has left the floor
     parts = residuals(reference.prepare(flight), reference, EffectSet())
-    assert "accel" not in parts and len(parts["gyro"].residual) > 15 and np.abs(parts["gyro"].residual).max() < 0.003
+    assert (
+        "accel" not in parts
+        and len(parts["gyro"].residual) > 15
+        and np.abs(parts["gyro"].residual).max() < 0.003
+    )
 
 
 def test_without_reference_height_pressure_and_velocity_are_not_judged():
     reference, flight = Nothing(), clean_flight(103, 30.0, aided=True)
-    assert not {"height", "pressure", "velocity"} & set(residuals(reference.prepare(flight), reference, EffectSet()))
+    assert not {"height", "pressure", "velocity"} & set(
+        residuals(reference.prepare(flight), reference, EffectSet())
+    )
 
 
 def test_a_component_of_the_velocity_that_is_not_measured_has_no_rows():

@@ -1,18 +1,18 @@
 from dataclasses import replace
 
+from known_effects import clean_flight, effect_of
 import numpy as np
 import pytest
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_tools.diagnosis.attribution import attribute, near_floor, on_floor
-from uwb_tdoa_tools.diagnosis.refinement import effects_of
+from uwb_tdoa_tools.diagnosis.channels import CHANNELS, residuals
 from uwb_tdoa_tools.diagnosis.detectors import DETECTORS
 from uwb_tdoa_tools.diagnosis.references import GroundTruth, Nothing
+from uwb_tdoa_tools.diagnosis.refinement import effects_of
 from uwb_tdoa_tools.diagnosis.regression.fit import fit
-from uwb_tdoa_tools.diagnosis.channels import CHANNELS, residuals
 from uwb_tdoa_tools.diagnosis.regression.table import table_of
-from known_effects import clean_flight, effect_of
 
 OF_NOISE = ("outlier_rate", "noise_level", "noise_correlation")
 
@@ -45,7 +45,10 @@ def test_nothing_is_detected_in_a_clean_flight(clean, name):
 def test_pairs_among_more_than_a_thousand_anchors_are_called_by_their_ids(clean):
     effect, anchors = effect_of("noise_level", True, 3), clean.anchors
     far = np.column_stack([1000.0 + np.arange(1100), np.zeros((1100, 2))])
-    among = Anchors.from_positions(np.concatenate([far, anchors.positions]), np.concatenate([5000 + np.arange(1100), anchors.ids]))
+    among = Anchors.from_positions(
+        np.concatenate([far, anchors.positions]),
+        np.concatenate([5000 + np.arange(1100), anchors.ids]),
+    )
     noisy = effect.inject(replace(clean, anchors=among), np.random.default_rng(1))
     assert set(DETECTORS["noise_level"].detect(seen(noisy)).effect.values) == set(effect.values)
     (part,) = (one["tdoa"] for one in seen(noisy))
@@ -64,7 +67,9 @@ def test_an_interval_without_sight_is_searched_in_a_single_flight(clean):
     effect = effect_of("nlos", True, 2)
     (key,) = (key for key in effect.values if key.endswith("delay"))
     anchor = key.partition(".")[0]
-    intervals = [c for c in searched(effect.inject(clean)) if f"{anchor}.start" in c.terms[0].effect.values]
+    intervals = [
+        c for c in searched(effect.inject(clean)) if f"{anchor}.start" in c.terms[0].effect.values
+    ]
     limits = intervals[0].terms[0].effect.values
     assert limits[f"{anchor}.start"] == pytest.approx(effect.values[f"{anchor}.start"], abs=1.0)
     assert limits[f"{anchor}.end"] == pytest.approx(effect.values[f"{anchor}.end"], abs=1.0)
@@ -97,7 +102,9 @@ def near(*flights):
 
 def on_the_floor(*flights, named=True):
     """Effects found near the floor of some flights."""
-    return effects_of(on_floor(near(*flights), [DETECTORS["floor_multipath"]] if named else [], True, []))
+    return effects_of(
+        on_floor(near(*flights), [DETECTORS["floor_multipath"]] if named else [], True, [])
+    )
 
 
 @pytest.fixture(scope="module")
@@ -115,12 +122,17 @@ def test_anchors_that_are_late_on_the_floor_are_found_with_their_heights(landed)
 
 
 def test_the_floor_is_described_without_a_name_for_it(landed):
-    """By functions of the height: together they say that low anchors are metres late below, and on time above."""
+    """By functions of the height: together they say that low anchors are metres late below, and on
+    time above.
+    """
     found = on_the_floor(landed, named=False)
     assert found and all(effect.covariate in ("height", "elevation") for effect in found)
     (part,) = near(landed)
     samples, low = part["tdoa"].samples, part["tdoa"].samples.p[:, 2] < 0.05
-    told, true = (EffectSet(tuple(effects)).bias(samples) for effects in (found, [EFFECTS["floor_multipath"]({**LATE, **LOW})]))
+    told, true = (
+        EffectSet(tuple(effects)).bias(samples)
+        for effects in (found, [EFFECTS["floor_multipath"]({**LATE, **LOW})])
+    )
     assert np.mean((true - told)[low] ** 2) < 0.3 * np.mean(true[low] ** 2)
 
 
@@ -134,7 +146,9 @@ def test_one_anchor_that_is_late_there_is_not_the_floor(clean):
 
 
 def test_what_is_found_in_the_air_does_not_depend_on_the_floor(clean, landed):
-    assert [e.values for e in effects_of(attribute([landed], GroundTruth(), undeclared=False).selection)] == [
+    assert [
+        e.values for e in effects_of(attribute([landed], GroundTruth(), undeclared=False).selection)
+    ] == [
         e.values for e in effects_of(attribute([clean], GroundTruth(), undeclared=False).selection)
     ]
 

@@ -1,6 +1,9 @@
-"""Deviations of positions of anchors that are found beside ground truth: whether errors are as large as they say."""
+"""Deviations of positions of anchors that are found beside ground truth: whether errors are as
+large as they say.
+"""
 
 from deviations_table import normalised, root
+from known_effects import clean_flight
 import numpy as np
 import pytest
 
@@ -10,7 +13,6 @@ from uwb_tdoa_tools.diagnosis.deviations import with_deviations
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.diagnosis.refinement import effects_of
 from uwb_tdoa_tools.readers import inputs
-from known_effects import clean_flight
 
 MEASURED = {  # recordings on which nothing was chosen, and how far off their surveys are put, m
     "util/const1-trial3-tdoa2.csv.gz": 0.1,
@@ -24,13 +26,18 @@ MEASURED = {  # recordings on which nothing was chosen, and how far off their su
 
 @pytest.mark.slow
 def test_deviations_hold_on_simulated_flights():
-    told = [normalised(clean_flight(seed, 60.0), 0.1, seed)["anchor_position"][0] for seed in (504, 505, 506, 507)]
+    told = [
+        normalised(clean_flight(seed, 60.0), 0.1, seed)["anchor_position"][0]
+        for seed in (504, 505, 506, 507)
+    ]
     assert 0.6 < root(told) < 1.5 and all(len(one) == 24 for one in told)
 
 
 @pytest.mark.slow
 def test_deviations_hold_on_measured_flights(shared_data):
-    """Those of the fit alone are two to four times too small: what is wrong beside the anchors is wrong all of the flight."""
+    """Those of the fit alone are two to four times too small: what is wrong beside the anchors is
+    wrong all of the flight.
+    """
     reading, told, fitted = inputs.Reading(str(shared_data / "surveys")), [], []
     for path, std in MEASURED.items():
         (flight,) = reading.flights([str(shared_data / path)])
@@ -47,9 +54,13 @@ def test_what_is_no_anchor_keeps_its_deviation():
 
 
 def test_delays_are_stated_apart_from_what_all_have_in_common():
-    """No TDOA shows what is common to all delays: a fit leaves it at 0, and no deviation of a value holds it."""
+    """No TDOA shows what is common to all delays: a fit leaves it at 0, and no deviation of a value
+    holds it.
+    """
     delays = 0.05 * np.random.default_rng(5).standard_normal(8)
-    flight = EFFECTS["anchor_delay"](dict(zip("01234567", delays.tolist()))).inject(clean_flight(301, 30.0))
+    flight = EFFECTS["anchor_delay"](dict(zip("01234567", delays.tolist()))).inject(
+        clean_flight(301, 30.0)
+    )
     found = attribute([flight], GroundTruth(), kinds=("anchor_delay",), undeclared=False)
     (effect,) = effects_of(found.selection)
     errors = np.array([effect.values[key] for key in "01234567"]) - (delays - delays.mean())

@@ -1,6 +1,7 @@
 from dataclasses import replace
 import json
 
+from known_effects import clean_flight, effect_of
 import pytest
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
@@ -11,7 +12,6 @@ from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands.diagnose import main
 from uwb_tdoa_tools.diagnosis import diagnose, output
 from uwb_tdoa_tools.diagnosis.references import Nothing
-from known_effects import clean_flight, effect_of
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +23,9 @@ def test_anchors_of_two_installations_are_refused(flight):
     other = replace(
         flight,
         name="elsewhere",
-        anchors=Anchors(flight.anchors.ids, flight.anchors.positions + 1.0, flight.anchors.orientations),
+        anchors=Anchors(
+            flight.anchors.ids, flight.anchors.positions + 1.0, flight.anchors.orientations
+        ),
     )
     with pytest.raises(InputError, match="elsewhere: its anchors are not those"):
         diagnose([flight, other])
@@ -32,14 +34,20 @@ def test_anchors_of_two_installations_are_refused(flight):
 @pytest.mark.slow
 def test_the_loop_is_closed(flight, tmp_path, capsys):
     write_bag(effect_of("anchor_delay", True, 4).inject(flight), tmp_path / "late")
-    write_bag(effect_of("anchor_delay", True, 4).inject(clean_flight(101, 30.0)), tmp_path / "other")
+    write_bag(
+        effect_of("anchor_delay", True, 4).inject(clean_flight(101, 30.0)), tmp_path / "other"
+    )
     out = tmp_path / "out"
-    assert main([str(tmp_path / "late"), "--holdout", str(tmp_path / "other"), "--out", str(out)]) == 0
+    assert (
+        main([str(tmp_path / "late"), "--holdout", str(tmp_path / "other"), "--out", str(out)]) == 0
+    )
     assert "found     anchor_delay" in capsys.readouterr().out
     content = json.loads((out / "diagnosis.json").read_text())
     (finding,) = content["findings"]
     assert finding["effect"] == "anchor_delay" and finding["channel"] == "tdoa" and finding["added"]
-    assert {"parameters", "std", "evidence", "variance_explained", "confounded_with"} <= set(finding)
+    assert {"parameters", "std", "evidence", "variance_explained", "confounded_with"} <= set(
+        finding
+    )
     before, after = content["before"]["pooled"]["rmse_3d"], content["after"]["pooled"]["rmse_3d"]
     assert after < 0.3 * before and content["unattributed"] == [] and content["ambiguous"] == []
     assert len(EffectSet.from_yaml(out / "effects.yaml")) == 1
@@ -57,7 +65,10 @@ def test_what_is_late_on_the_floor_goes_to_the_file_whatever_the_air_says(flight
 @pytest.mark.slow
 def test_without_truth(flight):
     result = diagnose([effect_of("anchor_delay", True, 4).inject(flight)], reference=Nothing())
-    assert {finding.effect.name for finding in result.findings if finding.added} == {"anchor_position", "anchor_delay"}
+    assert {finding.effect.name for finding in result.findings if finding.added} == {
+        "anchor_position",
+        "anchor_delay",
+    }
     hidden = {item.effect for item in result.unobservable}
     assert {"truth_frame", "accel_bias", "truth_time_offset"} <= hidden
 
@@ -65,7 +76,10 @@ def test_without_truth(flight):
 @pytest.mark.slow
 @pytest.mark.parametrize("more", [(), ("--no-truth",)])
 def test_two_processes_give_the_same_to_the_bit(tmp_path, more):
-    flights = [effect_of("anchor_delay", True, 4).inject(clean_flight(seed, 20.0)) for seed in (100, 101, 102)]
+    flights = [
+        effect_of("anchor_delay", True, 4).inject(clean_flight(seed, 20.0))
+        for seed in (100, 101, 102)
+    ]
     flights[1] = EFFECTS["pair_offset"]({"0-1": 0.3}).inject(flights[1])  # of one flight alone
     paths = [str(tmp_path / flight.name) for flight in flights]
     for flight, path in zip(flights, paths):
@@ -75,7 +89,9 @@ def test_two_processes_give_the_same_to_the_bit(tmp_path, more):
     for name in ("diagnosis.json", "effects.yaml", "ekf_node.yaml"):
         assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "2" / name).read_bytes()
     told = json.loads((tmp_path / "1" / "diagnosis.json").read_text())
-    assert told["findings"][0]["added"] and (more or told["unattributed"][0]["flight"] == flights[1].name)
+    assert told["findings"][0]["added"] and (
+        more or told["unattributed"][0]["flight"] == flights[1].name
+    )
 
 
 @pytest.mark.slow
@@ -89,13 +105,17 @@ def test_a_late_ground_truth_is_no_fault_of_the_robot(inertial):
     assert not {"tdoa_time_offset", "truth_frame"} & {effect.name for effect in result.effects}
     assert result.after["pooled"]["rmse_3d"] <= 1.05 * result.before["pooled"]["rmse_3d"]
     (said,) = result.of_truth[fitted.name]
-    assert ("gyroscope" in said) == inertial and said in output.as_text(result).replace("\n          ", " ")
+    assert ("gyroscope" in said) == inertial and said in output.as_text(result).replace(
+        "\n          ", " "
+    )
     assert list(output.as_json(result)["ground_truth"]) == [fitted.name]
 
 
 @pytest.mark.slow
 def test_without_inertial_sensor_the_clock_of_the_tdoas_is_left_alone():
-    late = shifted(clean_flight(100, 40.0).without("imu"), "tdoa", 0.06)  # too little to be seen before anything else
+    late = shifted(
+        clean_flight(100, 40.0).without("imu"), "tdoa", 0.06
+    )  # too little to be seen before anything else
     result = diagnose([late])
     assert "tdoa_time_offset" not in {effect.name for effect in result.effects}
     assert "tdoa_time_offset" in {item.effect for item in result.unobservable}

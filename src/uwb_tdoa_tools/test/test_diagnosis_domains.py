@@ -1,3 +1,4 @@
+from known_effects import clean_flight
 import numpy as np
 import pytest
 
@@ -7,7 +8,6 @@ from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.channels import TdoaResidual
 from uwb_tdoa_tools.diagnosis.domains import Seen
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
-from known_effects import clean_flight
 
 
 @pytest.fixture(scope="module")
@@ -17,7 +17,9 @@ def flight():
 
 def test_a_drift_that_is_found_knows_for_how_long_it_was_seen(flight):
     drift = EFFECTS["anchor_clock_drift"]({"1": 0.02})
-    (found,) = attribute([drift.inject(flight)], GroundTruth(), undeclared=False, kinds=["anchor_clock_drift"]).effects
+    (found,) = attribute(
+        [drift.inject(flight)], GroundTruth(), undeclared=False, kinds=["anchor_clock_drift"]
+    ).effects
     low, high = found.domain["time"]
     assert 0.0 <= low < 5.0 and 30.0 < high < 40.0
 

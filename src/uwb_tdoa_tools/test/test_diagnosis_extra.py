@@ -1,5 +1,6 @@
 from dataclasses import replace
 
+from known_effects import clean_flight
 import numpy as np
 import pytest
 
@@ -8,7 +9,6 @@ from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.channels import residuals
 from uwb_tdoa_tools.diagnosis.channels.extra import extra_at
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
-from known_effects import clean_flight
 
 
 def temperature(t):
@@ -21,14 +21,24 @@ def flight():
     """With a temperature in its log, beside what is no covariate."""
     flight = clean_flight(103, 40.0)
     t = np.linspace(flight.imu.t[0], flight.imu.t[-1], 200)
-    log = {"t": t, "temperature": temperature(t), "constant": np.ones(200), "names": np.array(["a"] * 200)}
-    return replace(flight, extra={"baro": log, "short": {"t": t[:5], "x": t[:5]}, "pose_truth": {"t": t, "x": t}})
+    log = {
+        "t": t,
+        "temperature": temperature(t),
+        "constant": np.ones(200),
+        "names": np.array(["a"] * 200),
+    }
+    return replace(
+        flight,
+        extra={"baro": log, "short": {"t": t[:5], "x": t[:5]}, "pose_truth": {"t": t, "x": t}},
+    )
 
 
 def test_what_changes_in_a_log_is_a_covariate(flight):
     (name,) = extra_at(flight, flight.tdoa.t)
     assert name == "baro.temperature"
-    assert extra_at(flight, flight.tdoa.t[:3])[name] == pytest.approx(temperature(flight.tdoa.t[:3]), abs=0.01)
+    assert extra_at(flight, flight.tdoa.t[:3])[name] == pytest.approx(
+        temperature(flight.tdoa.t[:3]), abs=0.01
+    )
 
 
 @pytest.mark.slow
@@ -37,7 +47,9 @@ def test_a_gyroscope_that_drifts_with_the_temperature_is_told_in_words(flight):
     gyro[:, 1] += 0.02 * (extra_at(flight, flight.imu.t)["baro.temperature"] - 30.0)
     warm = replace(flight, imu=replace(flight.imu, gyro=gyro))
     (finding,) = attribute([warm], GroundTruth()).findings()
-    assert finding.effect.covariate == "extra.baro.temperature" and finding.effect.channel == "gyro.y"
+    assert (
+        finding.effect.covariate == "extra.baro.temperature" and finding.effect.channel == "gyro.y"
+    )
     assert not finding.effect.usable
     (advice,) = finding.effect.advice()
     assert "too much about y" in advice and "baro temperature" in advice
@@ -49,7 +61,9 @@ def test_a_gyroscope_that_drifts_with_the_temperature_is_told_in_words(flight):
 def test_one_anchor_that_changes_with_the_log_is_found(flight):
     late = 0.1 * (extra_at(flight, flight.tdoa.t)["baro.temperature"] - 30.0)
     d = flight.tdoa.d + late * (1.0 * (flight.tdoa.b == 2) - (flight.tdoa.a == 2))
-    (finding,) = attribute([replace(flight, tdoa=replace(flight.tdoa, d=d))], GroundTruth()).findings()
+    (finding,) = attribute(
+        [replace(flight, tdoa=replace(flight.tdoa, d=d))], GroundTruth()
+    ).findings()
     assert finding.effect.covariate == "extra.baro.temperature" and finding.effect.form == "anchor"
     assert "baro temperature" in finding.effect.advice()[0]
     ends = finding.effect.curve(np.array(finding.effect.knots)[[0, -1]], "2.")
@@ -62,7 +76,16 @@ def test_what_nodes_cannot_take_out_leaves_no_residual_under_a_model_that_has_it
     gyro = flight.imu.gyro.copy()
     gyro[:, 1] += 0.02 * (extra_at(flight, flight.imu.t)["baro.temperature"] - 30.0)
     warm, reference = replace(flight, imu=replace(flight.imu, gyro=gyro)), GroundTruth()
-    term = SmoothTerm({"c0": 0.04, "c1": 0.08}, {}, "", "gyro.y", "extra.baro.temperature", "common", (30.0, 34.0), "line")
+    term = SmoothTerm(
+        {"c0": 0.04, "c1": 0.08},
+        {},
+        "",
+        "gyro.y",
+        "extra.baro.temperature",
+        "common",
+        (30.0, 34.0),
+        "line",
+    )
     plain, modelled = (
         residuals(reference.prepare(one), reference, EffectSet(effects))["gyro"].residual
         for one, effects in ((flight, ()), (warm, (term,)))

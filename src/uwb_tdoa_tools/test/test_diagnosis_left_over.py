@@ -1,6 +1,7 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
+from known_effects import clean_flight
 import numpy as np
 import pytest
 
@@ -8,7 +9,6 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_tools.diagnosis.channels import residuals
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.diagnosis.report.left_over import left_over
-from known_effects import clean_flight
 
 
 @pytest.fixture(scope="module")

@@ -20,13 +20,19 @@ CLASSES = {effect.__name__ for effect in EFFECTS.values()}
 @pytest.mark.parametrize("path", DRIVER, ids=lambda path: str(path.relative_to(FOLDER)))
 def test_no_name_of_an_effect_or_channel(path):
     tree = ast.parse(path.read_text())
-    texts = {node.value for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)}
+    texts = {
+        node.value
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    }
     names = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
     assert not texts & {*EFFECTS, *CHANNELS} and not names & CLASSES
 
 
 def test_a_detector_for_every_effect_that_no_regression_finds_and_that_is_not_of_the_numbers():
-    physical = {name: effect for name, effect in EFFECTS.items() if not issubclass(effect, LabelEffect)}
+    physical = {
+        name: effect for name, effect in EFFECTS.items() if not issubclass(effect, LabelEffect)
+    }
     assert set(DETECTORS) == {name for name, effect in physical.items() if not effect.fitted}
 
 

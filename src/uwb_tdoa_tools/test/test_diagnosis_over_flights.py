@@ -1,14 +1,23 @@
 from dataclasses import replace
 
+from known_effects import clean_flight, effect_of
 import pytest
 
 from uwb_tdoa_bias.effects import EffectSet, SmoothTerm
 from uwb_tdoa_tools.diagnosis import diagnose, output
 from uwb_tdoa_tools.diagnosis.attribution import attribute
-from uwb_tdoa_tools.diagnosis.over_flights import ALL, ALONE, DIFFERS, GROWS, Share, course, in_words, shares
+from uwb_tdoa_tools.diagnosis.over_flights import (
+    ALL,
+    ALONE,
+    DIFFERS,
+    GROWS,
+    Share,
+    course,
+    in_words,
+    shares,
+)
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.diagnosis.report.page import html
-from known_effects import clean_flight, effect_of
 
 
 def several(*values, std=0.05):
@@ -44,20 +53,26 @@ def test_words_name_the_flights():
 
 def test_shares_are_those_that_were_put_in():
     flights = [
-        replace(effect_of("anchor_delay", True, 1), values={"2": delay}).inject(clean_flight(100 + k, 30.0))
+        replace(effect_of("anchor_delay", True, 1), values={"2": delay}).inject(
+            clean_flight(100 + k, 30.0)
+        )
         for k, delay in enumerate((0.1, 0.2, 0.3))
     ]
     attribution = attribute(flights, GroundTruth(), kinds=("anchor_delay",), undeclared=False)
     (candidate,) = attribution.selection.chosen
     found = shares(attribution.selection, candidate, attribution.names)
-    assert [share.share / found[1].share for share in found] == pytest.approx([0.5, 1.0, 1.5], abs=0.05)
+    assert [share.share / found[1].share for share in found] == pytest.approx(
+        [0.5, 1.0, 1.5], abs=0.05
+    )
     assert course(found) == GROWS
 
 
 @pytest.mark.slow
 def test_what_came_in_one_flight_is_said_of_that_flight_and_not_applied():
     """A reflector that makes anchor 3 late beyond x = 0.5 m."""
-    step = SmoothTerm({"3.c0": 0.0, "3.c1": 0.5}, {}, "", "tdoa", "x", "anchor", (-2.0, 0.5, 2.0), "step")
+    step = SmoothTerm(
+        {"3.c0": 0.0, "3.c1": 0.5}, {}, "", "tdoa", "x", "anchor", (-2.0, 0.5, 2.0), "step"
+    )
     flights = [clean_flight(seed, 30.0) for seed in (100, 101, 102)]
     flights[1] = step.inject(flights[1])
     result = diagnose(flights)

@@ -16,11 +16,30 @@ from uwb_tdoa_tools.diagnosis.report.page import html
 from uwb_tdoa_tools.scoring.settling import settled
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
-DELAY, MOVED = EFFECTS["anchor_delay"]({"3": 0.3}), EFFECTS["anchor_position"]({"5.x": 0.3, "5.y": -0.3, "5.z": 0.2})
+DELAY, MOVED = (
+    EFFECTS["anchor_delay"]({"3": 0.3}),
+    EFFECTS["anchor_position"]({"5.x": 0.3, "5.y": -0.3, "5.z": 0.2}),
+)
 LATE, LONG = EFFECTS["range_delay"]({"offset": 0.05}), EFFECTS["range_scale"]({"scale": 0.03})
 OWN = EFFECTS["range_offset"]({"1": 0.3, "2": -0.2})
-KINDS = "anchor_delay", "anchor_position", "range_delay", "range_scale", "range_offset", "pair_offset"
-FLOWN = dict(duration=40.0, floor_time=1.0, imu_rate=200.0, truth_rate=100.0, noise_std=0.1, range_noise=0.1, bias=False, multipath=False)
+KINDS = (
+    "anchor_delay",
+    "anchor_position",
+    "range_delay",
+    "range_scale",
+    "range_offset",
+    "pair_offset",
+)
+FLOWN = dict(
+    duration=40.0,
+    floor_time=1.0,
+    imu_rate=200.0,
+    truth_rate=100.0,
+    noise_std=0.1,
+    range_noise=0.1,
+    bias=False,
+    multipath=False,
+)
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +50,9 @@ def both():
 
 def alone(flight):
     """The Flight without TDOAs."""
-    return replace(flight, tdoa=type(flight.tdoa)(*(column[:0] for column in vars(flight.tdoa).values())))
+    return replace(
+        flight, tdoa=type(flight.tdoa)(*(column[:0] for column in vars(flight.tdoa).values()))
+    )
 
 
 def found(flight, kinds=KINDS):
@@ -40,15 +61,24 @@ def found(flight, kinds=KINDS):
     return {effect.name: effect.values for effect in effects}
 
 
-@pytest.mark.parametrize("effect, taken", [
-    (DELAY, alone), (LATE, alone), (LONG, alone), *((each, lambda flight: flight) for each in (DELAY, MOVED, LATE, OWN)),
-], ids=lambda each: getattr(each, "name", None))  # fmt: skip
+@pytest.mark.parametrize(
+    "effect, taken",
+    [
+        (DELAY, alone),
+        (LATE, alone),
+        (LONG, alone),
+        *((each, lambda flight: flight) for each in (DELAY, MOVED, LATE, OWN)),
+    ],
+    ids=lambda each: getattr(each, "name", None),
+)
 def test_what_is_wrong_with_ranges_is_found(both, effect, taken):
     """What TDOAs and ranges say of an anchor together is one finding."""
     values = found(taken(effect.inject(both)))
     assert set(values) == {effect.name}
     for key in {*effect.values, *values[effect.name]}:
-        assert values[effect.name].get(key, 0.0) == pytest.approx(effect.values.get(key, 0.0), abs=0.01 if effect is LATE else 0.1)
+        assert values[effect.name].get(key, 0.0) == pytest.approx(
+            effect.values.get(key, 0.0), abs=0.01 if effect is LATE else 0.1
+        )
 
 
 def test_nothing_is_found_where_nothing_is_wrong(both):
@@ -59,23 +89,36 @@ def test_the_residual_is_what_the_model_leaves(both):
     wrong = DELAY.inject(alone(both))
     part = residuals(wrong, GroundTruth(), EffectSet())["range"]
     at = part.samples.anchors.ids[part.samples.b]
-    assert np.median(part.residual[at == 3]) == pytest.approx(0.3, abs=0.03) and abs(np.median(part.residual[at != 3])) < 0.03
+    assert (
+        np.median(part.residual[at == 3]) == pytest.approx(0.3, abs=0.03)
+        and abs(np.median(part.residual[at != 3])) < 0.03
+    )
     assert set(residuals(wrong, GroundTruth(), EffectSet())) == {"range", "gyro", "accel"}
     after = residuals(wrong, GroundTruth(), EffectSet((DELAY,)))["range"]
     assert abs(np.median(after.residual[at == 3])) < 0.03
     rows = part.rows()
-    assert {part.place_in_room(series) for series in np.unique(rows.series).tolist()} == {str(i) for i in both.anchors.ids}
+    assert {part.place_in_room(series) for series in np.unique(rows.series).tolist()} == {
+        str(i) for i in both.anchors.ids
+    }
 
 
 def test_without_ground_truth_ranges_have_a_channel_where_there_are_no_tdoas(both):
-    shown = [residuals(Nothing().prepare(flight), Nothing(), EffectSet()) for flight in (both, alone(both))]
-    assert ["range" in one for one in shown] == [False, True] and ["tdoa" in one for one in shown] == [True, False]
+    shown = [
+        residuals(Nothing().prepare(flight), Nothing(), EffectSet())
+        for flight in (both, alone(both))
+    ]
+    assert ["range" in one for one in shown] == [False, True] and [
+        "tdoa" in one for one in shown
+    ] == [True, False]
     assert np.sqrt(np.mean(shown[1]["range"].residual ** 2)) < 0.15
 
 
 def test_without_ground_truth_the_delay_of_the_tag_bends_no_path(both):
     longer = without_offset(Nothing().prepare(both), -0.3)
-    one, other = (residuals(flight, Nothing(), EffectSet())["tdoa"].residual for flight in (longer, Nothing().prepare(both)))
+    one, other = (
+        residuals(flight, Nothing(), EffectSet())["tdoa"].residual
+        for flight in (longer, Nothing().prepare(both))
+    )
     assert np.sqrt(np.mean(one**2)) < 1.05 * np.sqrt(np.mean(other**2))
 
 
@@ -88,8 +131,13 @@ def test_without_ground_truth_nothing_is_added_for_what_the_filter_finds_itself(
 def test_without_ground_truth_the_delay_of_the_tag_is_found_with_that_of_an_anchor(both, taken):
     result = diagnose([taken(without_offset(DELAY.inject(both), -0.3))], reference=Nothing())
     values = {effect.name: effect.values for effect in result.effects}["anchor_delay"]
-    assert np.mean(list(values.values())) == pytest.approx(0.3 + DELAY.values["3"] / len(values), abs=0.05)
-    assert {finding.effect.name for finding in result.findings if finding.added} == {"anchor_delay", "anchor_position"}
+    assert np.mean(list(values.values())) == pytest.approx(
+        0.3 + DELAY.values["3"] / len(values), abs=0.05
+    )
+    assert {finding.effect.name for finding in result.findings if finding.added} == {
+        "anchor_delay",
+        "anchor_position",
+    }
     assert result.after["pooled"]["nis_mean"] < result.before["pooled"]["nis_mean"]
     assert ("predicted ranges" in output.as_text(result).replace("\n", " ")) == (taken is alone)
 
@@ -101,8 +149,19 @@ def test_without_ground_truth_nothing_is_added_where_nothing_is_wrong(both):
 
 @pytest.mark.slow
 def test_a_function_of_ranges_that_nobody_declared_is_found(both):
-    bend = SmoothTerm({"c0": 0.0, "c1": 0.4}, channel="range", covariate="range", form="arrival", knots=(2.0, 5.0, 9.0), shape="beyond")
-    terms = [effect for effect in attribute([bend.inject(alone(both))], GroundTruth(), kinds=()).effects if isinstance(effect, SmoothTerm)]
+    bend = SmoothTerm(
+        {"c0": 0.0, "c1": 0.4},
+        channel="range",
+        covariate="range",
+        form="arrival",
+        knots=(2.0, 5.0, 9.0),
+        shape="beyond",
+    )
+    terms = [
+        effect
+        for effect in attribute([bend.inject(alone(both))], GroundTruth(), kinds=()).effects
+        if isinstance(effect, SmoothTerm)
+    ]
     (mine,) = [term for term in terms if term.channel == "range"]
     at = np.linspace(2.5, 9.0, 20)
     assert mine.covariate == "range" and np.abs(np.ptp(mine.curve(at) - bend.curve(at))) < 0.15
@@ -117,15 +176,24 @@ def test_delays_of_all_anchors_do_not_turn_the_ground_truth(both):
     assert said == ()
     turned = replace(wrong, truth=replace(wrong.truth, p=wrong.truth.p + [0.0, 2.0, 0.0]))
     flight, said = settled(turned)
-    assert len(said) == 1 and "another frame" in said[0] and np.abs(flight.truth.p - wrong.truth.p).max() < 1.0
+    assert (
+        len(said) == 1
+        and "another frame" in said[0]
+        and np.abs(flight.truth.p - wrong.truth.p).max() < 1.0
+    )
 
 
 @pytest.mark.slow
 def test_ranges_alone_are_diagnosed_from_beginning_to_end(both):
     other = simulate(SimulationConfig(seed=12, trajectory="circle", **FLOWN))
     result = diagnose([DELAY.inject(alone(both))], [DELAY.inject(alone(other))])
-    assert {effect.name: effect.values for effect in result.effects}["anchor_delay"]["3"] == pytest.approx(0.3, abs=0.05)
+    assert {effect.name: effect.values for effect in result.effects}["anchor_delay"][
+        "3"
+    ] == pytest.approx(0.3, abs=0.05)
     assert result.after["pooled"]["rmse_3d"] < 0.6 * result.before["pooled"]["rmse_3d"]
-    assert "range 3" in {row["axis"] for row in result.health["axes"]} and result.health["filter"][0]["nis_mean"] > 0.0
+    assert (
+        "range 3" in {row["axis"] for row in result.health["axes"]}
+        and result.health["filter"][0]["nis_mean"] > 0.0
+    )
     page, told = html(result), output.as_json(result)
     assert "anchor 3" in page and "nan" not in str(told["health"]["filter"]).lower()

@@ -1,5 +1,6 @@
 from dataclasses import replace
 
+from known_effects import clean_flight, effect_of, marks_of
 import numpy as np
 import pytest
 
@@ -9,7 +10,6 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.diagnosis import diagnose, output
 from uwb_tdoa_tools.diagnosis.references import REFERENCES, GroundTruth, Heights, Marks, Nothing
 from uwb_tdoa_tools.scoring.evaluation import evaluate
-from known_effects import clean_flight, effect_of, marks_of
 
 NONSENSE = np.array([100.0, -50.0, 7.0])
 
@@ -26,11 +26,15 @@ def aided():
 
 def with_wrong_truth(flight):
     truth = flight.truth
-    return replace(flight, truth=replace(truth, p=truth.p[::-1] + NONSENSE, q=np.roll(truth.q, 1, axis=1)))
+    return replace(
+        flight, truth=replace(truth, p=truth.p[::-1] + NONSENSE, q=np.roll(truth.q, 1, axis=1))
+    )
 
 
 def test_what_is_told_to_do_without_the_truth_has_none_to_read(flight):
-    prepared = Nothing().prepare(replace(flight, extra={"pose_truth": {"t": np.zeros(3)}, "battery": {"t": np.zeros(3)}}))
+    prepared = Nothing().prepare(
+        replace(flight, extra={"pose_truth": {"t": np.zeros(3)}, "battery": {"t": np.zeros(3)}})
+    )
     assert prepared.truth is None and list(prepared.extra) == ["battery"]
 
 
@@ -48,7 +52,10 @@ def test_without_truth_a_wrong_one_changes_nothing(flight):
 
 @pytest.mark.parametrize("reference", [Nothing, Heights])
 def test_what_a_reference_does_without_is_taken_out_first(aided, reference):
-    prepared = [reference().prepare(each) for each in (aided, with_wrong_truth(aided), replace(aided, truth=None))]
+    prepared = [
+        reference().prepare(each)
+        for each in (aided, with_wrong_truth(aided), replace(aided, truth=None))
+    ]
     if reference is Nothing:
         assert [each.truth for each in prepared] == [None] * 3
     else:
@@ -58,7 +65,13 @@ def test_what_a_reference_does_without_is_taken_out_first(aided, reference):
 
 
 def test_a_path_by_heights_is_at_the_right_height(aided):
-    path = Heights().prepare(EFFECTS["anchor_delay"]({"0": 0.5, "5": -0.3}).inject(aided, np.random.default_rng(0))).truth
+    path = (
+        Heights()
+        .prepare(
+            EFFECTS["anchor_delay"]({"0": 0.5, "5": -0.3}).inject(aided, np.random.default_rng(0))
+        )
+        .truth
+    )
     z = np.interp(path.t, aided.truth.t, aided.truth.p[:, 2])
     flown = z > 0.5
     assert np.sqrt(np.mean((path.p[flown, 2] - z[flown]) ** 2)) < 0.03
@@ -73,14 +86,28 @@ def test_a_flight_without_a_range_finder_cannot_be_compared_with_heights(flight)
 def test_marks_tell_which_anchor_is_late_without_the_truth():
     flight = effect_of("anchor_delay", True, 4).inject(clean_flight(100, 40.0))
     marks = marks_of(flight, 6, np.random.default_rng(0))
-    found = [diagnose([each], reference=Marks(None, marks)) for each in (replace(flight, truth=None), with_wrong_truth(flight))]
-    assert output.as_json(found[0]) == output.as_json(found[1]) and output.as_json(found[0])["rests_on"].startswith("places measured")
-    assert {"anchor_position", "anchor_delay"} == {effect.name for effect in found[0].effects.effects}
+    found = [
+        diagnose([each], reference=Marks(None, marks))
+        for each in (replace(flight, truth=None), with_wrong_truth(flight))
+    ]
+    assert output.as_json(found[0]) == output.as_json(found[1]) and output.as_json(found[0])[
+        "rests_on"
+    ].startswith("places measured")
+    assert {"anchor_position", "anchor_delay"} == {
+        effect.name for effect in found[0].effects.effects
+    }
     assert found[0].effects.covariance.matrix.shape == (32, 32)
-    after, before = (evaluate(flight, effects=effects)[0].row()["rmse_3d"] for effects in (found[0].effects, EffectSet()))
+    after, before = (
+        evaluate(flight, effects=effects)[0].row()["rmse_3d"]
+        for effects in (found[0].effects, EffectSet())
+    )
     assert after < 0.5 * before
-    again = diagnose([flight], base=found[0].effects, reference=Marks(None, marks))  # last week's as the prior
-    assert [effect.name for effect in again.effects.effects] == [effect.name for effect in found[0].effects.effects]
+    again = diagnose(
+        [flight], base=found[0].effects, reference=Marks(None, marks)
+    )  # last week's as the prior
+    assert [effect.name for effect in again.effects.effects] == [
+        effect.name for effect in found[0].effects.effects
+    ]
     assert not again.changes
 
 

@@ -3,30 +3,41 @@
 from dataclasses import replace
 from functools import cache
 
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from known_effects import clean_flight, effect_of
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
+from uwb_tdoa_tools.diagnosis.channels import CHANNELS, residuals
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
-from uwb_tdoa_tools.diagnosis.regression.confounding import alternatives, flight_to_tell, unobservable
+from uwb_tdoa_tools.diagnosis.regression.confounding import (
+    alternatives,
+    flight_to_tell,
+    unobservable,
+)
 from uwb_tdoa_tools.diagnosis.regression.fit import fit, refit
 from uwb_tdoa_tools.diagnosis.regression.held_out import held_out
 from uwb_tdoa_tools.diagnosis.regression.scorer import Scorer
 from uwb_tdoa_tools.diagnosis.regression.select import rank, select
-from uwb_tdoa_tools.diagnosis.channels import CHANNELS, residuals
 from uwb_tdoa_tools.diagnosis.regression.table import table_of
 from uwb_tdoa_tools.diagnosis.regression.terms import Candidate, Term, candidates_of, columns_of
-from known_effects import clean_flight, effect_of
 
 PAIRS = np.array([[k, (k + 1) % 8] for k in range(8)])
 
 
-def table_with(*flights, names=("anchor_delay", "pair_offset", "anchor_position", "gyro_bias", "accel_bias")):
+def table_with(
+    *flights, names=("anchor_delay", "pair_offset", "anchor_position", "gyro_bias", "accel_bias")
+):
     """(Table, [Candidate]) of flights with the columns of some effects."""
     parts = [residuals(flight, GroundTruth(), EffectSet()) for flight in flights]
-    candidates = [c for name in names for c in candidates_of(EFFECTS[name](), flights[0].anchors, PAIRS)]
-    table = table_of(parts).with_terms([term for candidate in candidates for term in candidate.terms])
+    candidates = [
+        c for name in names for c in candidates_of(EFFECTS[name](), flights[0].anchors, PAIRS)
+    ]
+    table = table_of(parts).with_terms(
+        [term for candidate in candidates for term in candidate.terms]
+    )
     return table, candidates
 
 
@@ -41,7 +52,9 @@ def late():
 
 
 def named(candidates, name, keys=None):
-    return next(c for c in candidates if c.name == name and (keys is None or c.terms[0].keys == keys))
+    return next(
+        c for c in candidates if c.name == name and (keys is None or c.terms[0].keys == keys)
+    )
 
 
 def test_a_table_is_not_changed_by_a_wider_one(clean):
@@ -52,8 +65,12 @@ def test_a_table_is_not_changed_by_a_wider_one(clean):
     assert len(wider.columns) == len(table.columns) + 1
     np.testing.assert_array_equal(table.matrix(table.columns), before[0])
     assert list(table.columns) == list(before[1])
-    assert all(wider.columns[column] is values for column, values in before[1].items())  # shared, not copied
-    contributed = wider.with_contribution([(EFFECTS["anchor_delay"]({"2": 0.5}), named(candidates, "anchor_delay", ("2",)).columns)])
+    assert all(
+        wider.columns[column] is values for column, values in before[1].items()
+    )  # shared, not copied
+    contributed = wider.with_contribution(
+        [(EFFECTS["anchor_delay"]({"2": 0.5}), named(candidates, "anchor_delay", ("2",)).columns)]
+    )
     np.testing.assert_array_equal(table.y, before[2])
     assert np.abs(contributed.y - table.y).max() == pytest.approx(0.5)
 
@@ -62,7 +79,9 @@ def test_rows_of_a_channel_lie_together(clean):
     table, _ = clean
     for number, name in enumerate(table.channels):
         rows = table.rows_of(name)
-        assert (table.channel[rows] == number).all() and np.sum(table.channel == number) == rows.stop - rows.start
+        assert (table.channel[rows] == number).all() and np.sum(
+            table.channel == number
+        ) == rows.stop - rows.start
 
 
 def test_columns_of_one_parameter_are_one_column(clean):
@@ -75,7 +94,9 @@ def test_columns_of_one_parameter_are_one_column(clean):
 
 @cache
 def short():
-    return table_with(clean_flight(100, 20.0), names=("anchor_delay", "gyro_bias", "anchor_position"))
+    return table_with(
+        clean_flight(100, 20.0), names=("anchor_delay", "gyro_bias", "anchor_position")
+    )
 
 
 @settings(max_examples=25, deadline=None)
@@ -92,13 +113,21 @@ def test_the_scorer_gives_what_the_whole_equations_would(data):
     if set(candidate.columns) <= set(base):
         assert judged is None
         return
-    information, x, sizes = model.information(table), table.matrix(both), np.array([c.typical for c in both])
+    information, x, sizes = (
+        model.information(table),
+        table.matrix(both),
+        np.array([c.typical for c in both]),
+    )
     gram = (x * information[:, None]).T @ x + np.diag(sizes**-2)
     beta = np.linalg.solve(gram, x.T @ (information * table.y))
     place = {column: k for k, column in enumerate(both)}
-    np.testing.assert_allclose(judged.beta, beta[[place[column] for column in candidate.columns]], rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(
+        judged.beta, beta[[place[column] for column in candidate.columns]], rtol=1e-6, atol=1e-9
+    )
     told = len(both) - np.trace(np.linalg.inv(gram) / np.outer(sizes, sizes))
-    assert judged.determined == pytest.approx(told - Scorer(table, base, model, [])._determined, abs=1e-6)
+    assert judged.determined == pytest.approx(
+        told - Scorer(table, base, model, [])._determined, abs=1e-6
+    )
 
 
 def test_a_delay_is_ranked_first_and_a_clean_flight_has_nothing(clean, late):
@@ -138,14 +167,21 @@ def test_a_refit_to_some_rows_does_not_look_at_the_others(late):
     model = fit(table, columns)
     half = table.block % 2 == 0
     spoilt = replace(table, y=np.where(half, table.y, 1e3))
-    np.testing.assert_allclose(refit(table, columns, model, half).beta, refit(spoilt, columns, model, half).beta)
+    np.testing.assert_allclose(
+        refit(table, columns, model, half).beta, refit(spoilt, columns, model, half).beta
+    )
 
 
 def test_what_is_kept_is_fitted_with_the_weights_of_all_that_was_chosen(late):
     table, candidates = late
     delay, idle = named(candidates, "anchor_delay"), named(candidates, "gyro_bias", ("x",))
     selection = select(table, [delay], fit(table, columns_of(candidates)).inflation).plus(idle)
-    spoilt = replace(selection, fit=replace(selection.fit, weight=np.where(table.block % 2 == 0, selection.fit.weight, 1e-9)))
+    spoilt = replace(
+        selection,
+        fit=replace(
+            selection.fit, weight=np.where(table.block % 2 == 0, selection.fit.weight, 1e-9)
+        ),
+    )
     kept = spoilt.kept([delay])
     assert kept.chosen == (delay,) and len(kept.loss) == len(kept.rivals) == 1
     half = refit(table, delay.columns, selection.fit, table.block % 2 == 0)
@@ -158,7 +194,10 @@ def test_an_alternative_is_named_where_the_flight_cannot_tell(late):
     table, candidates = late
     inflation = fit(table, columns_of(candidates)).inflation
     selection = select(table, candidates, inflation)
-    names = {alternative.effect for alternative in alternatives(selection, selection.chosen[0], candidates)}
+    names = {
+        alternative.effect
+        for alternative in alternatives(selection, selection.chosen[0], candidates)
+    }
     assert "pair_offset" in names  # TDoA2: a delay of an anchor is two offsets of pairs
     assert "gyro_bias" not in names
 
@@ -167,8 +206,12 @@ def test_what_no_tdoa_can_tell_is_named(late):
     table, candidates = late
     selection = select(table, candidates, fit(table, columns_of(candidates)).inflation)
     hidden = unobservable(selection, candidates)
-    assert any(item.effect == "anchor_delay" and len(item.direction) == 8 for item in hidden)  # the sum of all
-    assert any(item.effect == "range_scale" and item.direction is None for item in hidden)  # has no column here
+    assert any(
+        item.effect == "anchor_delay" and len(item.direction) == 8 for item in hidden
+    )  # the sum of all
+    assert any(
+        item.effect == "range_scale" and item.direction is None for item in hidden
+    )  # has no column here
 
 
 def test_a_flight_that_tells_is_the_same_both_ways():

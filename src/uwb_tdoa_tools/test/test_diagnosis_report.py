@@ -4,10 +4,11 @@ from pathlib import Path
 import re
 from types import SimpleNamespace
 
+from known_effects import clean_flight
 import numpy as np
 import pytest
-
 from reports import Tags, delay, finding, judged, keys_of, said
+
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, SmoothTerm
 from uwb_tdoa_bias.effects.wording import measured
 from uwb_tdoa_tools.command_lines import applying
@@ -22,7 +23,6 @@ from uwb_tdoa_tools.diagnosis.report.page import html
 from uwb_tdoa_tools.diagnosis.report.unclear import by_remedy, undetermined
 from uwb_tdoa_tools.diagnosis.report.verdict import _flights, verdict
 from uwb_tdoa_tools.diagnosis.report.words import TERMS
-from known_effects import clean_flight
 
 DOCS = Path(__file__).resolve().parents[3] / "docs"
 STYLE = (Path(maps.__file__).parent / "templates" / "style.css").read_text()
@@ -32,17 +32,26 @@ AS_WELL = Alternative("anchor_position", 1.0, 2.0, "a flight on several sides")
 
 @pytest.fixture(scope="module")
 def result():
-    """Diagnosis of a short flight with a late anchor and an anchor that stands elsewhere, judged on another one."""
-    effects = EFFECTS["anchor_delay"]({"3": 0.3}), EFFECTS["anchor_position"]({"6.x": 0.25, "6.z": -0.2})
+    """Diagnosis of a short flight with a late anchor and an anchor that stands elsewhere, judged on
+    another one.
+    """
+    effects = (
+        EFFECTS["anchor_delay"]({"3": 0.3}),
+        EFFECTS["anchor_position"]({"6.x": 0.25, "6.z": -0.2}),
+    )
     flights = [clean_flight(100, 24.0), clean_flight(101, 18.0)]
     for effect in effects:
         flights = [effect.inject(flight) for flight in flights]
-    return replace(diagnose(flights[:1], flights[1:]), applying=applying(Path("out"), ["other.bag"]))
+    return replace(
+        diagnose(flights[:1], flights[1:]), applying=applying(Path("out"), ["other.bag"])
+    )
 
 
 @pytest.fixture(scope="module")
 def without_truth():
-    return diagnose([EFFECTS["anchor_delay"]({"3": 0.4}).inject(clean_flight(100, 40.0))], reference=Nothing())
+    return diagnose(
+        [EFFECTS["anchor_delay"]({"3": 0.4}).inject(clean_flight(100, 40.0))], reference=Nothing()
+    )
 
 
 @pytest.fixture(scope="module")
@@ -50,31 +59,57 @@ def page(result):
     return html(result)
 
 
-# ---------------------------------------------------------------------------------------------------------- verdict
+# ----------------------------------------------------------------------------------------------------------
+# verdict
 
 
 def test_the_verdict_has_the_error_before_and_after_its_interval_and_how_many_flights(result):
-    found = verdict(judged(result, {"one": 0.3, "two": 0.3}, {"one": 0.2, "two": 0.2}, [0.24, 0.44]))
+    found = verdict(
+        judged(result, {"one": 0.3, "two": 0.3}, {"one": 0.2, "two": 0.2}, [0.24, 0.44])
+    )
     assert found.kind == "better"
-    assert found.headline == "The position error (3D RMSE) falls from 30.0 cm to 20.0 cm: 33 % of it is gone."
-    assert "95 % intervals: 27.0 to 33.0 cm before, 18.0 to 22.0 cm after; gain 33 % (24 to 44 %)." in found.more
-    assert any("flights that took no part in the fit: 2 flights" in sentence for sentence in found.more)
+    assert (
+        found.headline
+        == "The position error (3D RMSE) falls from 30.0 cm to 20.0 cm: 33 % of it is gone."
+    )
+    assert (
+        "95 % intervals: 27.0 to 33.0 cm before, 18.0 to 22.0 cm after; gain 33 % (24 to 44 %)."
+        in found.more
+    )
+    assert any(
+        "flights that took no part in the fit: 2 flights" in sentence for sentence in found.more
+    )
 
 
 def test_a_flight_of_which_each_half_was_judged_was_flown_once():
     parts = ("one", 2.0, 55.0), ("one", 7.0, 60.0), ("two", 1.0, 31.0)
-    scores = [SimpleNamespace(name=name, first=first, last=last, part="in_the_air") for name, first, last in parts]
+    scores = [
+        SimpleNamespace(name=name, first=first, last=last, part="in_the_air")
+        for name, first, last in parts
+    ]
     before = {"runs": [{"flight": name} for name, _, _ in parts], "scores": scores}
     assert _flights(SimpleNamespace(before=before)) == "2 flights, 88 s in the air"
 
 
 def test_the_report_tells_every_phase_of_the_judged_flights(result, page):
-    before, after = (side["pooled"]["phases"]["first_3_s"]["rmse_3d"] for side in (result.before, result.after))
+    before, after = (
+        side["pooled"]["phases"]["first_3_s"]["rmse_3d"] for side in (result.before, result.after)
+    )
     assert after < before
-    (sentence,) = [one for one in verdict(result).sentences if one.startswith("Outside of that, before and after: ")]
-    assert f"first 3 s {100 * before:.1f} cm (NEES " in sentence and f" to {100 * after:.1f} cm (NEES " in sentence
+    (sentence,) = [
+        one
+        for one in verdict(result).sentences
+        if one.startswith("Outside of that, before and after: ")
+    ]
+    assert (
+        f"first 3 s {100 * before:.1f} cm (NEES " in sentence
+        and f" to {100 * after:.1f} cm (NEES " in sentence
+    )
     text = said(page)
-    assert "From the floor to the floor" in text and f"{100 * before:.1f} → {100 * after:.1f}; NEES" in text
+    assert (
+        "From the floor to the floor" in text
+        and f"{100 * before:.1f} → {100 * after:.1f}; NEES" in text
+    )
     flat = " ".join(output.as_text(result).split())
     assert sentence in flat
 
@@ -82,11 +117,18 @@ def test_the_report_tells_every_phase_of_the_judged_flights(result, page):
 @pytest.mark.parametrize("gain", [[-0.1, 0.4], [0.0, 0.4], None])
 def test_a_gain_that_may_be_chance_is_not_called_one(result, gain):
     found = verdict(judged(result, {"one": 0.3}, {"one": 0.25}, gain))
-    assert found.kind == "unsure" and "not certain" in found.headline and "is gone" not in " ".join(found.sentences)
+    assert (
+        found.kind == "unsure"
+        and "not certain" in found.headline
+        and "is gone" not in " ".join(found.sentences)
+    )
 
 
 def test_the_verdict_says_where_it_became_worse_and_what_diverged(result):
-    before, after = {"one": 0.3, "two": 0.2, "three": (0.9, True)}, {"one": 0.1, "two": 0.25, "three": 0.3}
+    before, after = (
+        {"one": 0.3, "two": 0.2, "three": (0.9, True)},
+        {"one": 0.1, "two": 0.25, "three": 0.3},
+    )
     text = " ".join(verdict(judged(result, before, after, [0.1, 0.5])).sentences)
     assert "On 1 of 3 runs the error grows, most on two, from 20.0 cm to 25.0 cm." in text
     assert "Of 3 runs, 1 diverged before and 0 after." in text
@@ -96,19 +138,26 @@ def test_a_single_judged_flight_and_a_judge_that_was_fitted_are_named_as_such(re
     own = result.flights[0].name
     alone = verdict(judged(result, {"other": 0.3}, {"other": 0.1}, [0.5, 0.8])).more
     halves = verdict(judged(result, {own: 0.3}, {own: 0.1}, [0.5, 0.8])).more
-    assert all("One flight does not tell how much flights differ." in more for more in (alone, halves))
+    assert all(
+        "One flight does not tell how much flights differ." in more for more in (alone, halves)
+    )
     assert any("decided on these same flights" in sentence for sentence in halves)
     assert not any("decided on these same flights" in sentence for sentence in alone)
 
 
 def test_effects_that_were_in_the_model_already_are_mentioned(result):
     more = EffectSet((*result.effects.effects, EFFECTS["range_scale"]({"scale": 0.01})))
-    assert any("with the 1 effect that the model held" in s for s in verdict(replace(result, effects=more)).more)
+    assert any(
+        "with the 1 effect that the model held" in s
+        for s in verdict(replace(result, effects=more)).more
+    )
     assert not any("held already" in sentence for sentence in verdict(result).more)
 
 
 def test_nothing_found_and_nothing_added_are_told_apart(result):
-    nothing = judged(result, {"one": 0.1}, {"one": 0.1}, [0.0, 0.0], findings=[], effects=EffectSet())
+    nothing = judged(
+        result, {"one": 0.1}, {"one": 0.1}, [0.0, 0.0], findings=[], effects=EffectSet()
+    )
     assert verdict(nothing).kind == "nothing" and "looks like noise" in verdict(nothing).headline
     assert "10.0 cm, 95 % interval 9.0 to 11.0 cm" in " ".join(verdict(nothing).more)
     useless = replace(nothing, findings=[finding(delay(), added=False, worth=None)])
@@ -125,33 +174,50 @@ def test_what_errors_are_against_is_said_where_only_heights_are_known(result):
 def test_without_ground_truth_no_error_is_claimed(without_truth):
     found = verdict(without_truth)
     text = " ".join(found.sentences)
-    assert found.kind == "unknown" and "Without ground truth" in text and without_truth.judged_on in text
+    assert (
+        found.kind == "unknown"
+        and "Without ground truth" in text
+        and without_truth.judged_on in text
+    )
     assert "what it leaves is not above 5.5 cm" in text
     assert "RMSE" not in text and "falls" not in text
     calm = replace(without_truth, findings=[])
     assert verdict(calm).kind == "nothing"
 
 
-def test_without_ground_truth_what_is_not_borne_out_is_not_added_with_the_reason_in_one_place(without_truth):
+def test_without_ground_truth_what_is_not_borne_out_is_not_added_with_the_reason_in_one_place(
+    without_truth,
+):
     findings = [
-        replace(item, added=False) for item in (finding(delay()), finding(EFFECTS["range_scale"]({"scale": 0.1})))
+        replace(item, added=False)
+        for item in (finding(delay()), finding(EFFECTS["range_scale"]({"scale": 0.1})))
     ]
     why = Refused("anchor_delay + range_scale", "explain 20 % of what is slow")
     refused = [*without_truth.attribution.refused, why]
     doubted = replace(without_truth, findings=findings, refused=refused, effects=EffectSet())
     found = verdict(doubted)
-    assert found.kind == "unknown" and found.headline.startswith("Nothing of what was found is added")
+    assert found.kind == "unknown" and found.headline.startswith(
+        "Nothing of what was found is added"
+    )
     assert "Not added, anchor_delay + range_scale: explain 20 % of what is slow." in found.more
-    assert {entry.why_not for entry in entries(doubted)} == {"judged together with others: see the verdict"}
+    assert {entry.why_not for entry in entries(doubted)} == {
+        "judged together with others: see the verdict"
+    }
 
 
-# ---------------------------------------------------------------------------------------------------------- entries
+# ----------------------------------------------------------------------------------------------------------
+# entries
 
 
 def test_what_came_into_the_model_together_is_one_entry_with_one_worth(result):
-    terms = [SmoothTerm({"3.c0": 0.1}, {"3.c0": 0.01}, "", "tdoa", name, "anchor", (0.0, 1.0)) for name in ("x", "y")]
+    terms = [
+        SmoothTerm({"3.c0": 0.1}, {"3.c0": 0.01}, "", "tdoa", name, "anchor", (0.0, 1.0))
+        for name in ("x", "y")
+    ]
     together = Candidate(tuple(Term(term, ("3.c0",)) for term in terms))
-    findings = [EffectFinding(term, "tdoa", {}, 0.2, (), (together,), True, 0.015) for term in terms]
+    findings = [
+        EffectFinding(term, "tdoa", {}, 0.2, (), (together,), True, 0.015) for term in terms
+    ]
     (entry,) = entries(replace(result, findings=findings))
     assert entry.title == "tdoa of anchor 3 over x and y" and worth_in_words(entry) == "1.5 cm"
 
@@ -163,7 +229,11 @@ def test_entries_are_ordered_by_worth_those_not_added_last(result):
     ]
     findings.append(finding(EFFECTS["pair_offset"]({"0-1": 0.1}, {"0-1": 0.01}), worth=0.05))
     found = entries(
-        replace(result, findings=findings, refused=[Refused("anchor_delay", "the filter does better without it")])
+        replace(
+            result,
+            findings=findings,
+            refused=[Refused("anchor_delay", "the filter does better without it")],
+        )
     )
     assert [entry.title for entry in found] == ["pair_offset", "range_scale", "anchor_delay"]
     assert [bool(entry.why_not) for entry in found] == [False, False, True]
@@ -186,18 +256,41 @@ def test_worth_in_words(result, worth, words, matters):
 
 def test_what_is_on_the_floor_alone_is_not_judged_by_the_air(result):
     values = {"2.height": 0.1, "2.noise": 0.3, "2.delay": 2.8}
-    floor = replace(finding(EFFECTS["floor_multipath"](values, {"2.delay": 0.1}), worth=None), on_floor=True)
+    floor = replace(
+        finding(EFFECTS["floor_multipath"](values, {"2.delay": 0.1}), worth=None), on_floor=True
+    )
     changed = judged(result, {"one": 0.3}, {"one": 0.3}, [-0.1, 0.1], findings=[floor])
-    assert verdict(changed).headline.startswith("The position error (3D RMSE) stays 30.0 cm: what is added acts near the floor alone")
+    assert verdict(changed).headline.startswith(
+        "The position error (3D RMSE) stays 30.0 cm: what is added acts near the floor alone"
+    )
     (entry,) = entries(changed)
-    assert worth_in_words(entry) == "not told by errors in the air" and entry.values.startswith("2.delay = 2.8 ± 0.1, ")
-    told = SmoothTerm({"2.c0": 0.0, "2.c1": -1.5}, {"2.c1": 0.1}, covariate="height", form="anchor", knots=(0.0, 0.1, 1.0), shape="step")
-    (entry,) = entries(judged(result, {"one": 0.3}, {"one": 0.3}, None, findings=[replace(finding(told, False, None), on_floor=True)]))
+    assert worth_in_words(entry) == "not told by errors in the air" and entry.values.startswith(
+        "2.delay = 2.8 ± 0.1, "
+    )
+    told = SmoothTerm(
+        {"2.c0": 0.0, "2.c1": -1.5},
+        {"2.c1": 0.1},
+        covariate="height",
+        form="anchor",
+        knots=(0.0, 0.1, 1.0),
+        shape="step",
+    )
+    (entry,) = entries(
+        judged(
+            result,
+            {"one": 0.3},
+            {"one": 0.3},
+            None,
+            findings=[replace(finding(told, False, None), on_floor=True)],
+        )
+    )
     assert "near the floor is told, and not taken out" in entry.why_not
 
 
 def test_what_else_it_could_be_stands_in_one_place(result):
-    (entry,) = entries(replace(result, findings=[finding(delay(), alternatives=(AS_WELL, ELSEWHERE))]))
+    (entry,) = entries(
+        replace(result, findings=[finding(delay(), alternatives=(AS_WELL, ELSEWHERE))])
+    )
     assert doubt_in_words(entry) == [
         "Could as well be anchor_position; to tell: a flight on several sides.",
         "Could be imitated by pair_offset, less plausibly; to tell: TDoA3.",
@@ -213,11 +306,19 @@ def test_values_that_are_not_significant_are_counted_not_shown(result):
 def test_a_few_values_are_named_however_uncertain_they_are(result):
     few = EFFECTS["anchor_delay"]({"3": 0.3}, {"3": 0.2})
     many = EFFECTS["anchor_delay"]({str(k): 0.3 for k in range(8)}, {str(k): 0.2 for k in range(8)})
-    found = [entry.values for effect in (few, many) for entry in entries(replace(result, findings=[finding(effect)]))]
-    assert found == ["3 = 0.3 ± 0.2 (m); not twice the standard deviation", "8 values, none twice its standard deviation"]
+    found = [
+        entry.values
+        for effect in (few, many)
+        for entry in entries(replace(result, findings=[finding(effect)]))
+    ]
+    assert found == [
+        "3 = 0.3 ± 0.2 (m); not twice the standard deviation",
+        "8 values, none twice its standard deviation",
+    ]
 
 
-# ---------------------------------------------------------------------------------------------------- what is unclear
+# ----------------------------------------------------------------------------------------------------
+# what is unclear
 
 
 def test_what_could_not_be_told_comes_with_what_would_tell(result):
@@ -229,8 +330,13 @@ def test_what_could_not_be_told_comes_with_what_would_tell(result):
     ]
     items.append(Unobservable("pair_offset", {"0-1": 0.7, "1-2": -0.7}))
     found = {item.effect: item for item in undetermined(replace(result, unobservable=items))}
-    assert found["anchor_delay"].harmless and found["anchor_delay"].what == "0, 1, 2, 3, 4, 5, 6 and 7 together"
-    assert "gyroscope" in found["gyro_bias"].remedy and found["pair_offset"].what == "0-1 against 1-2"
+    assert (
+        found["anchor_delay"].harmless
+        and found["anchor_delay"].what == "0, 1, 2, 3, 4, 5, 6 and 7 together"
+    )
+    assert (
+        "gyroscope" in found["gyro_bias"].remedy and found["pair_offset"].what == "0-1 against 1-2"
+    )
     assert "other places" in found["accel_scale"].remedy
     assert by_remedy(found.values())[found["accel_scale"].remedy] == [
         "accel_scale (x)",
@@ -244,23 +350,34 @@ def test_what_the_flights_have_is_not_asked_for(result):
     assert all(np.isfinite(flight.truth.q).all() for flight in result.flights)
     items = [Unobservable("gyro_bias", None), Unobservable("velocity_scale", None)]
     flights = tuple(flight.without("imu") for flight in result.flights)
-    asked = [item.remedy for item in undetermined(replace(result, unobservable=items, flights=flights))]
+    asked = [
+        item.remedy for item in undetermined(replace(result, unobservable=items, flights=flights))
+    ]
     assert asked == ["a gyroscope", "a velocity (wheels, optical flow, visual odometry)"]
 
 
 def test_without_truth_ground_truth_would_tell(without_truth):
     remedies = {item.effect: item.remedy for item in undetermined(without_truth)}
     assert "ground truth" in remedies["truth_frame"]
-    assert remedies["accel_bias"] == "ground truth of position and attitude"  # there is an accelerometer
+    assert (
+        remedies["accel_bias"] == "ground truth of position and attitude"
+    )  # there is an accelerometer
 
 
-# ------------------------------------------------------------------------------------------- the same in all outputs
+# ------------------------------------------------------------------------------------------- the
+# same in all outputs
 
 
 def test_the_numbers_of_findings_are_those_of_effects_yaml(result, page, tmp_path):
     result.effects.to_yaml(tmp_path / "effects.yaml")
-    written = {effect.name: effect for effect in EffectSet.from_yaml(tmp_path / "effects.yaml").effects}
-    content, screen, text = output.as_json(result), " ".join(output.as_text(result).split()), said(page)
+    written = {
+        effect.name: effect for effect in EffectSet.from_yaml(tmp_path / "effects.yaml").effects
+    }
+    content, screen, text = (
+        output.as_json(result),
+        " ".join(output.as_text(result).split()),
+        said(page),
+    )
     added = [item for item in content["findings"] if item["added"]]
     assert {item["effect"] for item in added} == set(written) >= {"anchor_delay", "anchor_position"}
     for item in added:
@@ -274,7 +391,11 @@ def test_the_numbers_of_findings_are_those_of_effects_yaml(result, page, tmp_pat
 
 
 def test_all_outputs_say_the_same(result, page):
-    content, screen, text = output.as_json(result), " ".join(output.as_text(result).split()), said(page)
+    content, screen, text = (
+        output.as_json(result),
+        " ".join(output.as_text(result).split()),
+        said(page),
+    )
     for sentence in content["verdict"]:
         assert sentence in screen and sentence in text
     for entry in entries(result):
@@ -301,9 +422,14 @@ def test_findings_and_alternatives_in_json(result):
     content = output.as_json(replace(result, findings=[doubtful]))
     (item,) = content["findings"]
     assert item["alternatives"][0] == {
-        "effect": "anchor_position", "share": 1.0, "criterion_gap": 2.0, "tell_apart": "a flight on several sides",
-    }  # fmt: skip
-    assert [other["effect"] for other in content["ambiguous"][0]["alternatives"]] == ["anchor_position"]
+        "effect": "anchor_position",
+        "share": 1.0,
+        "criterion_gap": 2.0,
+        "tell_apart": "a flight on several sides",
+    }
+    assert [other["effect"] for other in content["ambiguous"][0]["alternatives"]] == [
+        "anchor_position"
+    ]
     assert json.loads(json.dumps(content, allow_nan=False)) == content
 
 
@@ -315,7 +441,8 @@ def test_every_key_of_json_is_in_the_document(result, without_truth):
     assert {key for key in keys if f"`{key}`" not in text} == set()
 
 
-# ------------------------------------------------------------------------------------------------------------- page
+# -------------------------------------------------------------------------------------------------------------
+# page
 
 
 @pytest.fixture(scope="module")
@@ -326,15 +453,25 @@ def all_pages(page, result, without_truth):
 
 def test_a_page_holds_everything_itself_and_is_light(all_pages):
     for page in all_pages:
-        assert "http" not in page and "<script" not in page and "<link" not in page and "url(" not in page
+        assert (
+            "http" not in page
+            and "<script" not in page
+            and "<link" not in page
+            and "url(" not in page
+        )
         assert len(page) < 1_000_000
 
 
 def test_names_of_others_are_text(result):
     name = """</title><script>alert('"')</script>"""
     flights = tuple(replace(flight, name=name) for flight in result.flights)
-    sides = [{**side, "runs": [{**run, "flight": name} for run in side["runs"]]} for side in (result.before, result.after)]
-    page = html(replace(result, flights=flights, before=sides[0], after=sides[1], applying=((name, name),)))
+    sides = [
+        {**side, "runs": [{**run, "flight": name} for run in side["runs"]]}
+        for side in (result.before, result.after)
+    ]
+    page = html(
+        replace(result, flights=flights, before=sides[0], after=sides[1], applying=((name, name),))
+    )
     assert "<script" not in page and Tags(page).open == []
     assert name in said(page)
     assert any(name in attributes["alt"] for tag, attributes, _ in Tags(page).seen if tag == "img")
@@ -345,12 +482,18 @@ def test_a_page_is_well_formed_and_every_picture_is_described(all_pages):
         tags = Tags(page)
         assert tags.open == []
         pictures = [attributes for tag, attributes, _ in tags.seen if tag == "img"]
-        assert pictures and all(len(item["alt"]) > 20 and item["src"].startswith("data:image/") for item in pictures)
+        assert pictures and all(
+            len(item["alt"]) > 20 and item["src"].startswith("data:image/") for item in pictures
+        )
         assert len({item["alt"] for item in pictures}) == len(pictures)
 
 
 def test_nothing_runs_off_a_narrow_page(all_pages):
-    for rule in ("img { display: block; max-width: 100%", ".wide { overflow-x: auto", "overflow-wrap: anywhere"):
+    for rule in (
+        "img { display: block; max-width: 100%",
+        ".wide { overflow-x: auto",
+        "overflow-wrap: anywhere",
+    ):
         assert rule in STYLE
     assert "minmax(min(100%, 27rem), 1fr)" in STYLE
     for page in all_pages:
@@ -377,15 +520,21 @@ def test_every_abbreviation_is_spelled_out_and_every_effect_explained(all_pages)
 def test_a_row_is_either_worth_something_or_says_why_it_is_not_in_the_file(result):
     findings = [
         finding(delay(), worth=0.03),
-        finding(EFFECTS["floor_multipath"]({"2.delay": 2.0}, {"2.delay": 0.1}), False, None, tried=False),
+        finding(
+            EFFECTS["floor_multipath"]({"2.delay": 2.0}, {"2.delay": 0.1}), False, None, tried=False
+        ),
     ]
     changed = replace(
-        result, findings=findings, refused=[Refused("floor_multipath", "does not make the filter better")]
+        result,
+        findings=findings,
+        refused=[Refused("floor_multipath", "does not make the filter better")],
     )
     text = said(html(changed, "worth"))
     assert "3.0 cm" in text and "not in effects.yaml: does not make the filter better" in text
     assert "yes" not in text.split() and "0 %" not in text
-    assert "Nothing else in the catalogue explains as much." in text  # of the delay, that nothing imitates
+    assert (
+        "Nothing else in the catalogue explains as much." in text
+    )  # of the delay, that nothing imitates
     assert "Was not compared with others; may be confused with" in text
 
 
@@ -396,12 +545,20 @@ def test_advice_on_what_is_not_added_is_less_urgent(result):
     ]
     text = said(html(replace(result, findings=findings), "to_do"))
     todo, _, rest = text.partition("Seen too, not worth a visit")
-    assert "Calibrate" not in todo and "Calibrate the antenna delay" in rest and "10 ± 1 % of the TDOAs" in rest
+    assert (
+        "Calibrate" not in todo
+        and "Calibrate the antenna delay" in rest
+        and "10 ± 1 % of the TDOAs" in rest
+    )
 
 
 def test_what_gains_less_than_half_a_centimetre_is_asked_of_nobody_unless_it_is_a_fault(result):
     sign = EFFECTS["pair_sign"]({"0-1": -1.0}, {})
-    for effect, worth, asked in ((delay(), 0.0045, False), (delay(), 0.0055, True), (sign, 0.001, True)):
+    for effect, worth, asked in (
+        (delay(), 0.0045, False),
+        (delay(), 0.0055, True),
+        (sign, 0.001, True),
+    ):
         changed = replace(result, findings=[finding(effect, worth=worth)])
         todo, _, rest = said(html(changed, "to_do")).partition("Seen too, not worth a visit")
         (sentence,) = effect.advice()
@@ -416,11 +573,18 @@ def test_values_of_many_anchors_are_a_table(result):
         page = html(replace(result, findings=[finding(effect)]), "to_do")
         assert ("<table>" in page) == (len(values) > 3)
     text = said(page)
-    assert "Calibrate the antenna delay of anchors 0, 1, 2, 3 and 4." in text and "4 +14 ± 1" in text and "[cm]" in text
-    shifts = EFFECTS["anchor_position"]({f"{k}.{axis}": 0.2 for k in range(4) for axis in "xz"}, {f"{k}.x": 0.01 for k in range(4)})
+    assert (
+        "Calibrate the antenna delay of anchors 0, 1, 2, 3 and 4." in text
+        and "4 +14 ± 1" in text
+        and "[cm]" in text
+    )
+    shifts = EFFECTS["anchor_position"](
+        {f"{k}.{axis}": 0.2 for k in range(4) for axis in "xz"}, {f"{k}.x": 0.01 for k in range(4)}
+    )
     text = said(html(replace(result, findings=[finding(shifts)]), "to_do"))
     assert (
-        "Measure anchors 0, 1, 2 and 3 again before you move them. If the survey proves right" in text
+        "Measure anchors 0, 1, 2 and 3 again before you move them. If the survey proves right"
+        in text
         and "anchor x [cm] z [cm] 0 +20 ± 1 +20" in text
     )
 
@@ -437,7 +601,10 @@ def test_labels_of_anchors_lie_on_nothing(result, monkeypatch):
     drawn = []
     monkeypatch.setattr(maps, "embedded", lambda figure, *_: drawn.append(figure))
     caption, _ = maps.maps(result)
-    assert "Triangles: anchors" in caption and f"Flight: {result.before['runs'][0]['flight']}." in caption
+    assert (
+        "Triangles: anchors" in caption
+        and f"Flight: {result.before['runs'][0]['flight']}." in caption
+    )
     assert len(drawn) == 2
     for figure in drawn:
         figure.canvas.draw()
@@ -445,7 +612,9 @@ def test_labels_of_anchors_lie_on_nothing(result, monkeypatch):
             boxes = [text.get_window_extent() for text in ax.texts if text.get_text()]
             (triangles,) = [line for line in ax.lines if line.get_marker() == "^"]
             marks = ax.transData.transform(triangles.get_xydata())
-            assert not any(one.overlaps(other) for k, one in enumerate(boxes) for other in boxes[:k])
+            assert not any(
+                one.overlaps(other) for k, one in enumerate(boxes) for other in boxes[:k]
+            )
             assert not any(box.contains(*mark) for box in boxes for mark in marks)
         pictures.plt.close(figure)
 
@@ -456,7 +625,9 @@ def test_letters_of_pictures_can_be_read_on_a_phone_and_curves_are_as_wide_as_th
     sources = [attributes for tag, attributes, _ in Tags(page).seen if tag == "source"]
     assert sources and all(item["media"] == "(max-width: 44rem)" for item in sources)
     assert any(
-        attributes.get("width") == str(round(pictures.FULL * pictures.PIXELS)) for tag, attributes, _ in Tags(page).seen if tag == "img"
+        attributes.get("width") == str(round(pictures.FULL * pictures.PIXELS))
+        for tag, attributes, _ in Tags(page).seen
+        if tag == "img"
     )
 
 
@@ -479,7 +650,8 @@ def test_shifts_of_anchors_add_up_over_effects(result):
     assert by[0] == pytest.approx(0.3) and std[0] == pytest.approx(0.05)
 
 
-# --------------------------------------------------------------------------------------------------------- pictures
+# ---------------------------------------------------------------------------------------------------------
+# pictures
 
 
 def score(error):
@@ -489,7 +661,9 @@ def score(error):
 
 
 def test_mean_errors_are_those_of_the_cells():
-    runs = room.flown([score(np.where(np.arange(20)[:, None] < 10, [0.2, 0.0, 0.0], [0.0, 0.0, 0.1]))])
+    runs = room.flown(
+        [score(np.where(np.arange(20)[:, None] < 10, [0.2, 0.0, 0.0], [0.0, 0.0, 0.1]))]
+    )
     places, errors = room.mean_errors(runs, [0, 2])
     np.testing.assert_allclose(places, [[0.5, 1.5], [1.5, 1.5]])
     np.testing.assert_allclose(errors, [[0.2, 0.0], [0.0, 0.1]])

@@ -1,4 +1,6 @@
-"""What `diagnose` finds on a vehicle that never leaves the floor, whose truth is known; and values that are those of the written model."""
+"""What `diagnose` finds on a vehicle that never leaves the floor, whose truth is known; and values
+that are those of the written model.
+"""
 
 import numpy as np
 import pytest
@@ -19,13 +21,19 @@ ERRORS = ImuErrors(gyro_bias=0.01)
 
 
 def rover(seed, **changes):
-    return simulate(SimulationConfig.of("rover", seed=seed, wheel_scale=SCALE, imu_errors=ERRORS, duration=90.0, **changes))
+    return simulate(
+        SimulationConfig.of(
+            "rover", seed=seed, wheel_scale=SCALE, imu_errors=ERRORS, duration=90.0, **changes
+        )
+    )
 
 
 def traced(flight, *streams):
     """Attribution of some streams of a flight alone."""
     others = {"tdoa": NO_TDOAS, "imu": None, "velocity": None}
-    kept = flight.replaced(**{name: nothing for name, nothing in others.items() if name not in streams})
+    kept = flight.replaced(
+        **{name: nothing for name, nothing in others.items() if name not in streams}
+    )
     reference = GroundTruth()
     return attribute([reference.settled(reference.prepare(kept), EffectSet())[0]], reference)
 
@@ -44,11 +52,17 @@ def test_a_rover_is_diagnosed_from_where_it_starts_to_where_it_stops():
 @pytest.mark.parametrize("seed", [1, 2])
 def test_biases_of_a_gyroscope_that_turns_about_one_axis_have_their_signs(seed):
     flight = rover(seed)
-    (found,) = [effect for effect in effects_of(traced(flight, "imu").selection) if effect.name == "gyro_bias"]
+    (found,) = [
+        effect
+        for effect in effects_of(traced(flight, "imu").selection)
+        if effect.name == "gyro_bias"
+    ]
     state = flight.extra["state_truth"]
     for axis in "xyz":
         true = np.mean(state[f"gyro_bias_{axis}"])
-        assert abs(found.values[axis] - true) < 3.0 * np.hypot(found.std[axis], 2e-5), axis  # and it walks
+        assert abs(found.values[axis] - true) < 3.0 * np.hypot(found.std[axis], 2e-5), (
+            axis
+        )  # and it walks
 
 
 def test_a_rate_that_is_noise_explains_nothing():
@@ -56,7 +70,9 @@ def test_a_rate_that_is_noise_explains_nothing():
     turning = np.column_stack([np.zeros(300), 0.3 * np.sin(np.linspace(0.0, 20.0, 300))])
     measured = turning + 0.01 + 1e-3 * rng.standard_normal(turning.shape)
     assert _turns(measured, turning).tolist() == [False, True]
-    noisy = turning + 0.02 * rng.standard_normal(turning.shape)  # the ground truth is worse than the sensor
+    noisy = turning + 0.02 * rng.standard_normal(
+        turning.shape
+    )  # the ground truth is worse than the sensor
     assert _turns(measured, noisy).tolist() == [False, True]
 
 
@@ -65,7 +81,9 @@ def test_what_is_written_has_the_values_of_the_written_model(of_wheels):
     effects = effects_of(chosen)
     assert all(effect.usable for effect in effects)
     again = refit(chosen.table, columns_of(chosen.chosen), chosen.fit)
-    values = {(column.effect[0], column.key): value for column, value in zip(again.columns, again.beta)}
+    values = {
+        (column.effect[0], column.key): value for column, value in zip(again.columns, again.beta)
+    }
     for effect in effects:
         for key, value in effect.values.items():
             assert value == pytest.approx(values[effect.name, key], rel=1e-2)

@@ -1,5 +1,6 @@
 from dataclasses import replace
 
+from known_effects import clean_flight, effect_of
 import numpy as np
 import pytest
 
@@ -11,7 +12,6 @@ from uwb_tdoa_tools.diagnosis.regression.fit import fit
 from uwb_tdoa_tools.diagnosis.regression.scan import Scan, _held
 from uwb_tdoa_tools.diagnosis.regression.table import table_of
 from uwb_tdoa_tools.diagnosis.regression.terms import Candidate, Term
-from known_effects import clean_flight, effect_of
 
 TRUTH = GroundTruth()
 
@@ -25,12 +25,18 @@ def scanned(flight):
     """(Table, Fit of nothing, Scan) of a flight."""
     found = [residuals(flight, TRUTH, EffectSet())]
     table = table_of(found)
-    views = {name: channel.views([found[0][name]]) for name, channel in CHANNELS.items() if name in found[0]}
+    views = {
+        name: channel.views([found[0][name]])
+        for name, channel in CHANNELS.items()
+        if name in found[0]
+    }
     return table, fit(table, [], np.ones(3 * len(table.channels))), Scan(table, views)
 
 
 def put_in(form, key, covariate, knots, shape, size):
-    return SmoothTerm({f"{key}.c1".lstrip("."): size}, {}, "", "tdoa", covariate, form, knots, shape)
+    return SmoothTerm(
+        {f"{key}.c1".lstrip("."): size}, {}, "", "tdoa", covariate, form, knots, shape
+    )
 
 
 TERMS = [
@@ -44,8 +50,14 @@ TERMS = [
 def test_of_thousands_the_right_function_is_proposed_first(flight, term):
     table, model, scan = scanned(term.inject(flight))
     first = scan(table, model, ())[0].terms[0]
-    assert (first.effect.form, first.effect.covariate, first.effect.shape) == (term.form, term.covariate, term.shape)
-    assert {key.rpartition(".")[0] for key in first.keys} == {key.rpartition(".")[0] for key in term.values}
+    assert (first.effect.form, first.effect.covariate, first.effect.shape) == (
+        term.form,
+        term.covariate,
+        term.shape,
+    )
+    assert {key.rpartition(".")[0] for key in first.keys} == {
+        key.rpartition(".")[0] for key in term.values
+    }
 
 
 def test_the_gain_is_that_of_normal_equations_with_the_same_weights(flight):
@@ -56,7 +68,9 @@ def test_the_gain_is_that_of_normal_equations_with_the_same_weights(flight):
     table = table.with_terms(chosen[0].terms)
     model = fit(table, chosen[0].columns, np.ones(3 * len(table.channels)))
     gain, shapes, shape, knots, _ = scan.gains(table, _held(table, model, chosen))[0]
-    term = SmoothTerm(covariate=shapes.view.covariate, form=shapes.view.form, knots=knots, shape=shape)
+    term = SmoothTerm(
+        covariate=shapes.view.covariate, form=shapes.view.form, knots=knots, shape=shape
+    )
     candidate = Candidate((Term(term, term.keys_of((shapes.view.key,))),))
     table = table.with_terms(candidate.terms)
     columns, information = [*chosen[0].columns, *candidate.columns], model.information(table)
@@ -83,7 +97,11 @@ def test_what_acts_on_a_few_rows_alone_is_not_taken_for_outliers(flight):
 def test_a_function_of_one_pair_is_found_added_and_said(flight):
     attribution = attribute([TERMS[1].inject(flight)], TRUTH)
     (finding,) = attribution.findings()
-    assert (finding.effect.form, finding.effect.covariate, finding.effect.shape) == ("pair", "time", "interval")
+    assert (finding.effect.form, finding.effect.covariate, finding.effect.shape) == (
+        "pair",
+        "time",
+        "interval",
+    )
     assert finding.effect.values["0-1.c1"] == pytest.approx(0.4, abs=0.05)
     (sentence,) = finding.effect.advice()
     assert "the TDOA of 0-1 is 0." in sentence and "larger from" in sentence

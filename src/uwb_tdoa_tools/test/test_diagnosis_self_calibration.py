@@ -1,7 +1,10 @@
-"""One calibration of anchors from flights alone, whoever asks for it: when it may be used, and what `diagnose` makes of it."""
+"""One calibration of anchors from flights alone, whoever asks for it: when it may be used, and what
+`diagnose` makes of it.
+"""
 
 from dataclasses import replace
 
+from known_effects import clean_flight
 import numpy as np
 import pytest
 
@@ -16,7 +19,6 @@ from uwb_tdoa_tools.diagnosis.self_calibration.equations import Runs
 from uwb_tdoa_tools.diagnosis.self_calibration.prior import with_calibration
 from uwb_tdoa_tools.diagnosis.self_calibration.solve import CLEARLY, LEFT
 from uwb_tdoa_tools.scoring.evaluation import evaluate
-from known_effects import clean_flight
 
 DELAYS = {"1": 0.3, "4": -0.2, "6": 0.25}
 LATE = EFFECTS["anchor_delay"](DELAYS)
@@ -43,9 +45,13 @@ def diagnosis():
 def test_delays_of_several_anchors_are_told_well_enough_from_the_innovations_alone(late):
     assert late.why_not is None and late.explained > 0.5 and late.left < LEFT
     other, given = flight_with(LATE, seed=102, seconds=30.0), EffectSet(late.found(late.shifts))
-    errors = [evaluate(other, effects=effects)[0].row()["rmse_3d"] for effects in (EffectSet(), given)]
+    errors = [
+        evaluate(other, effects=effects)[0].row()["rmse_3d"] for effects in (EffectSet(), given)
+    ]
     moved = evaluate(replace(other, anchors=late.anchors), effects=late.effects)[0].row()["rmse_3d"]
-    assert errors[1] < 0.4 * errors[0] and moved == pytest.approx(errors[1], rel=0.02)  # shifts in effects.yaml, or in the anchors
+    assert errors[1] < 0.4 * errors[0] and moved == pytest.approx(
+        errors[1], rel=0.02
+    )  # shifts in effects.yaml, or in the anchors
 
 
 @pytest.mark.slow
@@ -53,14 +59,18 @@ def test_who_asks_makes_no_difference(late, diagnosis):
     written = {effect.name: effect.values for effect in diagnosis.effects.effects}
     for effect in late.found(late.shifts):
         assert written[effect.name] == pytest.approx(effect.values, abs=1e-12)
-    np.testing.assert_array_equal(diagnosis.effects.covariance.matrix, late.effects.covariance.matrix)
+    np.testing.assert_array_equal(
+        diagnosis.effects.covariance.matrix, late.effects.covariance.matrix
+    )
 
 
 @pytest.mark.slow
 def test_what_is_applied_is_found_with_its_evidence_and_the_same_in_all_flights(late, diagnosis):
     added = [finding for finding in diagnosis.findings if finding.added]
     assert [finding.effect.name for finding in added] == ["anchor_position", "anchor_delay"]
-    assert added[1].evidence == pytest.approx({"slow_before": late.before, "slow_left": late.left}, abs=1e-4)
+    assert added[1].evidence == pytest.approx(
+        {"slow_before": late.before, "slow_left": late.left}, abs=1e-4
+    )
     assert added[1].explained == late.explained
     assert "pair_offset" in [other.effect for other in added[1].alternatives]
     shares = [(one.share, one.std) for one in added[1].shares]
@@ -72,7 +82,10 @@ def test_the_noise_that_the_filter_is_told_asks_for_no_functions_of_the_place():
     flight, config = flight_with(LATE), FilterConfig()
     anchors = flight.anchors
     about = anchors, np.zeros(len(anchors)), np.full(4 * len(anchors), 0.1)
-    with_all, alone = (Runs([flight], EffectSet(), config).equations(*about, functions=functions) for functions in (True, False))
+    with_all, alone = (
+        Runs([flight], EffectSet(), config).equations(*about, functions=functions)
+        for functions in (True, False)
+    )
     n = len(alone.vector)
     assert n == 4 * len(anchors) < len(with_all.vector)
     np.testing.assert_allclose(alone.gram, with_all.gram[:n, :n], rtol=1e-9, atol=1e-6)
@@ -88,7 +101,11 @@ def test_a_delay_of_one_flight_is_no_delay_of_the_other():
 def why_not_of(flight):
     """What `diagnose` says of a self-calibration of a flight, where it does not apply it."""
     reference = Nothing()
-    return _calibrated(_Work(reference, EffectSet(), None, lambda what: None, map), (reference.prepare(flight),), EffectSet())
+    return _calibrated(
+        _Work(reference, EffectSet(), None, lambda what: None, map),
+        (reference.prepare(flight),),
+        EffectSet(),
+    )
 
 
 def test_nothing_is_a_finding_in_a_flight_of_which_nothing_is_wrong():
@@ -110,7 +127,12 @@ def test_nothing_is_applied_if_something_else_is_wrong_too():
     [
         (0.1, 0.9 * LEFT, None, True),
         (0.1, 1.1 * LEFT, None, False),
-        (1.2 * CLEARLY * LEFT, 1.1 * LEFT, None, True),  # the tape was worse than what else is wrong
+        (
+            1.2 * CLEARLY * LEFT,
+            1.1 * LEFT,
+            None,
+            True,
+        ),  # the tape was worse than what else is wrong
         (0.1, 1.1 * LEFT, (0.2, 0.1, 0.8), True),  # marks know better
         (0.1, 0.9 * LEFT, (0.2, 0.1, 0.7), False),
         (0.1, 0.9 * LEFT, (0.1, 0.2, 0.8), False),
@@ -119,13 +141,25 @@ def test_nothing_is_applied_if_something_else_is_wrong_too():
 def test_one_rule_says_whether_it_is_applied(late, before, left, marks, applied):
     found = replace(late, before=before, left=left, marks=marks)
     assert (found.why_not is None) == applied
-    assert found.anchors is (found.surveyed if applied else found.given) and len(found.effects) == 2 * applied
+    assert (
+        found.anchors is (found.surveyed if applied else found.given)
+        and len(found.effects) == 2 * applied
+    )
 
 
 def test_what_is_found_is_added_to_what_was_known():
     known = Covariance((("anchor_delay", "1"),), np.eye(1))
     base = EffectSet((AnchorDelay({"1": 0.1, "2": 0.2}, {"1": 0.01, "2": 0.01}),), known)
-    found = AnchorPosition({"1.x": 0.5}, {"1.x": 0.1}), AnchorDelay({"1": 0.05, "3": 0.3}, {"1": 0.02, "3": 0.02})
+    found = (
+        AnchorPosition({"1.x": 0.5}, {"1.x": 0.1}),
+        AnchorDelay({"1": 0.05, "3": 0.3}, {"1": 0.02, "3": 0.02}),
+    )
     delay, position = with_calibration(base, found, None).effects
-    assert delay.values == pytest.approx({"1": 0.15, "2": 0.2, "3": 0.3}) and delay.std == {"1": 0.02, "2": 0.01, "3": 0.02}
-    assert position.values == {"1.x": 0.5} and with_calibration(base, found, None).covariance is known
+    assert delay.values == pytest.approx({"1": 0.15, "2": 0.2, "3": 0.3}) and delay.std == {
+        "1": 0.02,
+        "2": 0.01,
+        "3": 0.02,
+    }
+    assert (
+        position.values == {"1.x": 0.5} and with_calibration(base, found, None).covariance is known
+    )

@@ -9,11 +9,18 @@ from uwb_tdoa_bias.correction.fixed_pose import FixedPoseCorrector
 from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, EffectSet, SmoothTerm, TagLeverArm
 from uwb_tdoa_bias.effects.samples import Track
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.frames import poses_of
+from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.diagnosis import validation
 from uwb_tdoa_tools.diagnosis.attribution import attribute
-from uwb_tdoa_tools.diagnosis.comparison import Baseline, ValidationCase, _gain_interval, compare, score, why_not
+from uwb_tdoa_tools.diagnosis.comparison import (
+    Baseline,
+    ValidationCase,
+    _gain_interval,
+    compare,
+    score,
+    why_not,
+)
 from uwb_tdoa_tools.diagnosis.detectors import Detection
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.diagnosis.validation import cross_fitted, select_by_error, validation_cases
@@ -24,7 +31,9 @@ NONE = EffectSet()
 
 @pytest.fixture(scope="module")
 def flights():
-    return [effect_of("anchor_delay", True, 1).inject(clean_flight(seed, 30.0)) for seed in (100, 101)]
+    return [
+        effect_of("anchor_delay", True, 1).inject(clean_flight(seed, 30.0)) for seed in (100, 101)
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -69,14 +78,37 @@ def test_what_helps_is_kept_and_said_what_it_is_worth(flights, attribution):
 def test_what_does_harm_is_left_out_with_a_reason(flights, attribution):
     clean = [clean_flight(seed, 30.0) for seed in (100, 101)]
     kept = select_by_error(attribution, clean, Baseline(NONE))
-    assert kept.selection.chosen == () and "the filter does better without it" in kept.refused[0].why
+    assert (
+        kept.selection.chosen == () and "the filter does better without it" in kept.refused[0].why
+    )
 
 
-@pytest.mark.parametrize("effect, recurs", [
-    (EFFECTS["nlos"]({"1.delay": 0.8, "1.start": 8.0, "1.end": 14.0}), False),
-    (SmoothTerm({"3.c0": 0.0, "3.c1": 0.7}, covariate="time", form="anchor", knots=(0.0, 17.0, 32.0), shape="step"), False),
-    (SmoothTerm({"3.c0": 0.0, "3.c1": 0.9}, covariate="time", form="anchor", knots=(0.0, 32.0), shape="line"), True),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "effect, recurs",
+    [
+        (EFFECTS["nlos"]({"1.delay": 0.8, "1.start": 8.0, "1.end": 14.0}), False),
+        (
+            SmoothTerm(
+                {"3.c0": 0.0, "3.c1": 0.7},
+                covariate="time",
+                form="anchor",
+                knots=(0.0, 17.0, 32.0),
+                shape="step",
+            ),
+            False,
+        ),
+        (
+            SmoothTerm(
+                {"3.c0": 0.0, "3.c1": 0.9},
+                covariate="time",
+                form="anchor",
+                knots=(0.0, 32.0),
+                shape="line",
+            ),
+            True,
+        ),
+    ],
+)
 def test_what_happened_at_a_time_of_one_flight_is_said_and_not_kept(effect, recurs):
     flight = effect.inject(clean_flight(100, 30.0))
     found = attribute([flight], TRUTH)
@@ -84,18 +116,27 @@ def test_what_happened_at_a_time_of_one_flight_is_said_and_not_kept(effect, recu
     assert found.selection.chosen and bool(kept.selection.chosen) == recurs
     assert all(kept.worth[candidate] > 0.02 for candidate in found.selection.chosen[:1])
     if not recurs:
-        assert any("it happened at a time of this flight" in refused.why for refused in kept.refused)
+        assert any(
+            "it happened at a time of this flight" in refused.why for refused in kept.refused
+        )
 
 
 def test_what_is_worth_little_is_kept_of_several_flights_and_not_of_one(flights):
     two = [EFFECTS["gyro_bias"]({"z": 0.006}).inject(flight) for flight in flights]
     found = [attribute(some, TRUTH, undeclared=False) for some in (two, two[:1])]
-    several, alone = (select_by_error(one, some, Baseline(NONE)) for one, some in zip(found, (two, two[:1])))
-    assert {candidate.name for candidate in several.selection.chosen} == {"anchor_delay", "gyro_bias"}
+    several, alone = (
+        select_by_error(one, some, Baseline(NONE)) for one, some in zip(found, (two, two[:1]))
+    )
+    assert {candidate.name for candidate in several.selection.chosen} == {
+        "anchor_delay",
+        "gyro_bias",
+    }
     assert {candidate.name for candidate in alone.selection.chosen} == {"anchor_delay"}
     assert "of one flight, worth less than 5% of the error" in alone.refused[-1].why
     assert sorted(candidate.name for candidate in alone.worth) == ["anchor_delay", "gyro_bias"]
-    assert np.array_equal(alone.selection.fit.weight, found[1].selection.fit.weight)  # it is applied as it was tried
+    assert np.array_equal(
+        alone.selection.fit.weight, found[1].selection.fit.weight
+    )  # it is applied as it was tried
 
 
 def test_what_no_node_can_take_out_is_not_tried():
@@ -109,13 +150,19 @@ def test_what_no_node_can_take_out_is_not_tried():
     assert not kept.worth and not kept.refused
 
 
-def test_noise_that_the_filter_should_know_of_is_kept_and_noise_that_it_should_not_is_not(flights, attribution):
+def test_noise_that_the_filter_should_know_of_is_kept_and_noise_that_it_should_not_is_not(
+    flights, attribution
+):
     def judged(std):
         noise = Detection(EFFECTS["noise_level"]({"0-1": std, "1-2": std}), "tdoa", {})
-        return select_by_error(replace(attribution, detections=(noise,)), noisy, Baseline(NONE)), noise
+        return select_by_error(
+            replace(attribution, detections=(noise,)), noisy, Baseline(NONE)
+        ), noise
 
     rng = np.random.default_rng(0)
-    noisy = [EFFECTS["noise_level"]({"0-1": 0.3, "1-2": 0.3}).inject(flight, rng) for flight in flights]  # no gate rejects that
+    noisy = [
+        EFFECTS["noise_level"]({"0-1": 0.3, "1-2": 0.3}).inject(flight, rng) for flight in flights
+    ]  # no gate rejects that
     kept, noise = judged(0.3)
     assert kept.detections == (noise,) and kept.worth[noise] > 0.0
     noisy = flights
@@ -131,16 +178,25 @@ def test_a_trial_is_judged_by_the_figure_of_the_whole_row(flights):
 def test_a_run_corrected_at_the_poses_of_the_run_itself_is_that_run(flights):
     effects = EffectSet((AnchorDelay({"1": 0.3}), TagLeverArm({"x": 0.1, "z": 0.1})))
     run = run_offline(flights[0], None, Corrector(flights[0].anchors, effects))
-    again = run_offline(flights[0], None, FixedPoseCorrector(flights[0].anchors, effects, poses_of(run.odometry)))
+    again = run_offline(
+        flights[0], None, FixedPoseCorrector(flights[0].anchors, effects, poses_of(run.odometry))
+    )
     np.testing.assert_allclose(again.odometry.p, run.odometry.p, atol=1e-9)
 
 
 def test_a_run_corrected_at_the_poses_of_another_model_is_nearly_the_run(flights):
-    moved, anchors = EffectSet((EFFECTS["anchor_position"]({"3.x": 0.3, "5.z": -0.3}),)), flights[0].anchors
+    moved, anchors = (
+        EffectSet((EFFECTS["anchor_position"]({"3.x": 0.3, "5.z": -0.3}),)),
+        flights[0].anchors,
+    )
     without = run_offline(flights[0], None, Corrector(anchors))
     run = run_offline(flights[0], None, Corrector(anchors, moved))
-    at_poses = run_offline(flights[0], None, FixedPoseCorrector(anchors, moved, poses_of(without.odometry)))
-    away, apart = (np.mean(np.abs(other.odometry.p - run.odometry.p)) for other in (at_poses, without))
+    at_poses = run_offline(
+        flights[0], None, FixedPoseCorrector(anchors, moved, poses_of(without.odometry))
+    )
+    away, apart = (
+        np.mean(np.abs(other.odometry.p - run.odometry.p)) for other in (at_poses, without)
+    )
     assert away < 0.1 * apart
 
 
@@ -170,13 +226,22 @@ def test_before_and_after_with_intervals(flights):
 def test_halves_of_a_flight_count_what_is_before_and_after_the_fit_once(flights):
     single = attribute(flights[:1], TRUTH, undeclared=False)
     cases, run = cross_fitted(single, flights[:1], NONE, (), ()), Baseline(NONE).run(flights[0])
-    parts, whole = [score(case, run).phases() for case in cases], score(ValidationCase(flights[0], NONE), run).phases()
+    parts, whole = (
+        [score(case, run).phases() for case in cases],
+        score(ValidationCase(flights[0], NONE), run).phases(),
+    )
     for name, figures in whole.items():
-        assert sum(part[name]["duration"] for part in parts) == pytest.approx(figures["duration"]), name
-        assert figures["count"] <= sum(part[name]["count"] for part in parts) <= figures["count"] + 10, name  # on an edge, in both
+        assert sum(part[name]["duration"] for part in parts) == pytest.approx(
+            figures["duration"]
+        ), name
+        assert (
+            figures["count"] <= sum(part[name]["count"] for part in parts) <= figures["count"] + 10
+        ), name  # on an edge, in both
 
 
-def test_without_flights_held_out_it_is_said_that_the_choice_was_made_on_the_same(flights, attribution):
+def test_without_flights_held_out_it_is_said_that_the_choice_was_made_on_the_same(
+    flights, attribution
+):
     chosen_on = "chosen on all of them"
     assert chosen_on in validation_cases(attribution, flights, (), NONE, NONE)[1]
     assert chosen_on not in validation_cases(attribution, flights[:1], flights[1:], NONE, NONE)[1]
@@ -184,7 +249,11 @@ def test_without_flights_held_out_it_is_said_that_the_choice_was_made_on_the_sam
 
 def test_a_flight_that_the_filter_gives_no_estimate_of_ends_in_a_sentence(flights):
     tdoa = flights[0].tdoa
-    few = replace(flights[0], imu=None, tdoa=replace(tdoa, **{f.name: getattr(tdoa, f.name)[:3] for f in fields(tdoa)}))
+    few = replace(
+        flights[0],
+        imu=None,
+        tdoa=replace(tdoa, **{f.name: getattr(tdoa, f.name)[:3] for f in fields(tdoa)}),
+    )
     with pytest.raises(InputError, match=f"{few.name}: the filter gives no estimate"):
         compare([ValidationCase(few, NONE)], Baseline(NONE))
 
@@ -192,15 +261,25 @@ def test_a_flight_that_the_filter_gives_no_estimate_of_ends_in_a_sentence(flight
 def test_a_gain_that_a_shift_of_the_reference_can_feign_is_none():
     rng = np.random.default_rng(0)
     errors = [rng.normal(size=(12, 3)) * 0.02 + off for off in ([0.0, 0.0, 0.15], [0.0, 0.0, 0.02])]
-    before, after = ([np.column_stack([100 * np.sum(e**2, axis=1), np.full(12, 100.0), 100 * e])] for e in errors)
-    sure, unsure = (_gain_interval(before, after, ["a"], lambda name, std=std: np.full(3, std)) for std in (0.0, 0.1))
+    before, after = (
+        [np.column_stack([100 * np.sum(e**2, axis=1), np.full(12, 100.0), 100 * e])] for e in errors
+    )
+    sure, unsure = (
+        _gain_interval(before, after, ["a"], lambda name, std=std: np.full(3, std))
+        for std in (0.0, 0.1)
+    )
     assert sure[0] > 0.5 and unsure[0] < 0.0 < unsure[1]
     sides = [{"pooled": {"rmse_3d": 0.15}}, {"pooled": {"rmse_3d": 0.04, "rmse_3d_gain_ci": sure}}]
     assert why_not(*sides, 0.0) is None and why_not(*sides, 0.1) is None
-    sides[1]["pooled"]["rmse_3d_gain_ci"] = [0.02, 0.28]  # above zero by 2.3 standard deviations alone
+    sides[1]["pooled"]["rmse_3d_gain_ci"] = [
+        0.02,
+        0.28,
+    ]  # above zero by 2.3 standard deviations alone
     assert "may be 10 cm from where" in why_not(*sides, 0.1)
     sides[1]["pooled"]["rmse_3d_gain_ci"] = unsure
-    assert "may be chance" in why_not(*sides, 0.0) and "may be 10 cm from where" in why_not(*sides, 0.1)
+    assert "may be chance" in why_not(*sides, 0.0) and "may be 10 cm from where" in why_not(
+        *sides, 0.1
+    )
     sides[1]["pooled"]["rmse_3d"] = 0.16
     assert "do not make the error smaller" in why_not(*sides, 0.0)
 
@@ -213,7 +292,10 @@ class _Figures:
 
     def errors(self, models):
         self.tried += len(models)
-        return [1.0 + sum(value for name, value in self.worth.items() if name not in candidates) for candidates, _ in models]
+        return [
+            1.0 + sum(value for name, value in self.worth.items() if name not in candidates)
+            for candidates, _ in models
+        ]
 
 
 def test_as_many_go_at_once_as_may_together():
@@ -221,7 +303,11 @@ def test_as_many_go_at_once_as_may_together():
     nothing = _Figures(dict.fromkeys(names, 0.001))
     assert validation._gone(nothing, (names, []), names, 1.05) == names and nothing.tried == 1
     one = _Figures({**dict.fromkeys(names, 0.001), "h": 0.049})
-    assert validation._gone(one, (names, []), names, 1.05) == [name for name in names if name != "h"] and one.tried < len(names)
+    assert validation._gone(one, (names, []), names, 1.05) == [
+        name for name in names if name != "h"
+    ] and one.tried < len(names)
     both = _Figures({"a": 0.04, "b": 0.04})
-    assert validation._gone(both, (["a", "b"], []), ["a", "b"], 1.05) == ["a"]  # either may go, but not both
+    assert validation._gone(both, (["a", "b"], []), ["a", "b"], 1.05) == [
+        "a"
+    ]  # either may go, but not both
     assert validation._gone(both, (["a", "b"], []), [], 1.05) == []

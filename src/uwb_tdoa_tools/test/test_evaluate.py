@@ -14,14 +14,31 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.bags.files import new_bag
+from uwb_tdoa_tools.bags.message_types import typestore
 from uwb_tdoa_tools.commands.convert import main as convert
 from uwb_tdoa_tools.commands.evaluate import main
 from uwb_tdoa_tools.scoring.evaluation import evaluate
-from uwb_tdoa_tools.bags.message_types import typestore
 from uwb_tdoa_tools.simulation import ImuErrors, SimulationConfig, simulate
 
-CLEAN = dict(duration=14.0, floor_time=1.0, imu_rate=200.0, bias=False, multipath=False, outlier_probability=0.0)
-NEEDED = {"flight", "rmse_x", "rmse_y", "rmse_z", "rmse_3d", "median_3d", "max_3d", "frac_gt_1m", "diverged"}
+CLEAN = dict(
+    duration=14.0,
+    floor_time=1.0,
+    imu_rate=200.0,
+    bias=False,
+    multipath=False,
+    outlier_probability=0.0,
+)
+NEEDED = {
+    "flight",
+    "rmse_x",
+    "rmse_y",
+    "rmse_z",
+    "rmse_3d",
+    "median_3d",
+    "max_3d",
+    "frac_gt_1m",
+    "diverged",
+}
 
 
 @pytest.fixture(scope="module")
@@ -37,8 +54,9 @@ def bag(flight, tmp_path_factory):
 
 
 def write_odometry(path, odometry, covariance=None, space="", verdicts=()):
-    """A bag with a nav_msgs/Odometry for each estimate on /odometry; covariance: 36 numbers, default the estimate's;
-    space: before the topics; verdicts: one uwb/residual for each."""
+    """A bag with a nav_msgs/Odometry for each estimate on /odometry; covariance: 36 numbers,
+    default the estimate's; space: before the topics; verdicts: one uwb/residual for each.
+    """
     store = typestore()
     types = store.types
 
@@ -47,10 +65,14 @@ def write_odometry(path, odometry, covariance=None, space="", verdicts=()):
         return types[f"{package}/msg/{kind}"](*values)
 
     with new_bag(path) as writer:
-        connection = writer.add_connection(f"{space}/odometry", "nav_msgs/msg/Odometry", typestore=store)
+        connection = writer.add_connection(
+            f"{space}/odometry", "nav_msgs/msg/Odometry", typestore=store
+        )
         for k in range(len(odometry.t)):
             stamp = int(round(odometry.t[k] * 1e9))
-            header = of("std_msgs/Header", of("builtin_interfaces/Time", *divmod(stamp, 10**9)), "map")
+            header = of(
+                "std_msgs/Header", of("builtin_interfaces/Time", *divmod(stamp, 10**9)), "map"
+            )
             pose = of(
                 "geometry_msgs/Pose",
                 of("geometry_msgs/Point", *odometry.p[k].tolist()),
@@ -60,9 +82,17 @@ def write_odometry(path, odometry, covariance=None, space="", verdicts=()):
             whole[:3, :3] = odometry.covariance[k, :3, :3]
             whole = whole.ravel() if covariance is None else np.asarray(covariance, dtype=float)
             zero = of("geometry_msgs/Vector3", 0.0, 0.0, 0.0)
-            twist = of("geometry_msgs/TwistWithCovariance", of("geometry_msgs/Twist", zero, zero), np.zeros(36))
+            twist = of(
+                "geometry_msgs/TwistWithCovariance",
+                of("geometry_msgs/Twist", zero, zero),
+                np.zeros(36),
+            )
             message = of(
-                "nav_msgs/Odometry", header, "base_link", of("geometry_msgs/PoseWithCovariance", pose, whole), twist
+                "nav_msgs/Odometry",
+                header,
+                "base_link",
+                of("geometry_msgs/PoseWithCovariance", pose, whole),
+                twist,
             )
             writer.write(connection, stamp, store.serialize_cdr(message, connection.msgtype))
         if verdicts:
@@ -110,7 +140,9 @@ def test_report_of_one_flight(flight, bag, tmp_path, capsys):
     (row,) = told["runs"]
     assert NEEDED <= set(row) and NEEDED <= set(told["pooled"])
     assert row["flight"] == flight.name
-    assert row["rmse_3d"] == pytest.approx(evaluate(flight)[0].row()["rmse_3d"], abs=1e-4)  # stamps are rounded to ns
+    assert row["rmse_3d"] == pytest.approx(
+        evaluate(flight)[0].row()["rmse_3d"], abs=1e-4
+    )  # stamps are rounded to ns
     assert told["pooled"]["rmse_3d"] == row["rmse_3d"] and told["pooled"]["diverged"] == 0
     first, *table = capsys.readouterr().out.splitlines()
     assert first == "correcting with: nothing (neither effects nor a network are in use)"
@@ -120,19 +152,42 @@ def test_report_of_one_flight(flight, bag, tmp_path, capsys):
 
 def test_report_of_the_phases_of_one_flight_and_of_several(bag, tmp_path, capsys):
     one = report([bag, "--no-bias"], tmp_path)["runs"][0]
-    expected = ["at_rest_before", "first_3_s", "to_0.3_m", "in_the_air", "last_3_s", "at_rest_after", "whole"]
+    expected = [
+        "at_rest_before",
+        "first_3_s",
+        "to_0.3_m",
+        "in_the_air",
+        "last_3_s",
+        "at_rest_after",
+        "whole",
+    ]
     assert list(one["phases"]) == expected and one["part"] == "in_the_air"
     assert one["phases"]["in_the_air"]["rmse_3d"] == pytest.approx(one["rmse_3d"])
-    assert 0.0 < one["phases"]["at_rest_before"]["rmse_3d"] < 0.1 and one["phases"]["at_rest_after"]["nees_mean"] < 9.0
-    assert one["phases"]["at_rest_before"]["without_estimate"] > 0.0 == one["phases"]["last_3_s"]["without_estimate"]
+    assert (
+        0.0 < one["phases"]["at_rest_before"]["rmse_3d"] < 0.1
+        and one["phases"]["at_rest_after"]["nees_mean"] < 9.0
+    )
+    assert (
+        one["phases"]["at_rest_before"]["without_estimate"]
+        > 0.0
+        == one["phases"]["last_3_s"]["without_estimate"]
+    )
     assert 0.0 < one["ready_delay"] < 1.0
     capsys.readouterr()
     told = report([bag, bag, "--no-bias", "--markdown", tmp_path / "table.md"], tmp_path)
     assert [run["phases"] for run in told["runs"]] == [one["phases"]] * 2
     for name, figures in told["pooled"]["phases"].items():
-        assert figures["runs"] == 2 and figures["rmse_3d"] == pytest.approx(one["phases"][name]["rmse_3d"]), name
+        assert figures["runs"] == 2 and figures["rmse_3d"] == pytest.approx(
+            one["phases"][name]["rmse_3d"]
+        ), name
     for text in (capsys.readouterr().out, (tmp_path / "table.md").read_text()):
-        for title in ("at rest before, 2 s", "first 3 s", "last 3 s", "at rest after", "whole recording"):
+        for title in (
+            "at rest before, 2 s",
+            "first 3 s",
+            "last 3 s",
+            "at rest after",
+            "whole recording",
+        ):
             assert title in text
 
 
@@ -148,7 +203,11 @@ def test_a_recording_of_a_rover_is_judged(flight, tmp_path, capsys):
     truth = replace(flight.truth, p=np.minimum(flight.truth.p, [np.inf, np.inf, 1.2]) - down)
     write_bag(replace(flight, anchors=anchors, truth=truth), tmp_path / "rover")
     (row,) = report([tmp_path / "rover", "--no-bias"], tmp_path)["runs"]
-    assert row["part"] == "moving" and row["phases"]["moving"]["count"] > 100 and "in_the_air" not in row["phases"]
+    assert (
+        row["part"] == "moving"
+        and row["phases"]["moving"]["count"] > 100
+        and "in_the_air" not in row["phases"]
+    )
     assert "moving" in capsys.readouterr().out
 
 
@@ -175,12 +234,16 @@ def test_a_result_that_somebody_has_forged_is_refused(bag, tmp_path, capsys):
     options = [str(bag), "--no-bias", "--resume", str(kept)]
     assert main(options) == 0
     first, line = kept.read_text().splitlines()
-    forged = [json.loads(result) for result in FORGED] + [json.loads(line)["result"] for _ in range(3)]
+    forged = [json.loads(result) for result in FORGED] + [
+        json.loads(line)["result"] for _ in range(3)
+    ]
     forged[-3]["row"]["rmse_3d"] = "a"
     forged[-2]["distributions"]["distance"][3] = [0, 1]
     forged[-1]["phases"]["in_the_air"] = {}
     for result in forged:
-        kept.write_text(f"{first}\n{json.dumps({'key': json.loads(line)['key'], 'result': result})}\n")
+        kept.write_text(
+            f"{first}\n{json.dumps({'key': json.loads(line)['key'], 'result': result})}\n"
+        )
         capsys.readouterr()
         assert main(options) == 2, result
         assert "kept: holds something else than results" in capsys.readouterr().err
@@ -188,14 +251,18 @@ def test_a_result_that_somebody_has_forged_is_refused(bag, tmp_path, capsys):
     assert main(options) == 0
 
 
-def test_corrects_with_nothing_unless_told_and_says_what_is_known_of_the_shipped_network(flight, bag, tmp_path, capsys):
+def test_corrects_with_nothing_unless_told_and_says_what_is_known_of_the_shipped_network(
+    flight, bag, tmp_path, capsys
+):
     effects = tmp_path / "effects.yaml"
     EffectSet((AnchorDelay({int(flight.anchors.ids[0]): 0.1}),)).to_yaml(effects)
     (row,) = report([bag], tmp_path)["runs"]
     assert row["rmse_3d"] == pytest.approx(evaluate(flight)[0].row()["rmse_3d"], abs=1e-4)
     assert main([str(bag), "--effects", str(effects)]) == 0
     (row,) = report([bag, "--model", SHIPPED], tmp_path)["runs"]
-    assert row["rmse_3d"] == pytest.approx(evaluate(flight, network=load_network(SHIPPED))[0].row()["rmse_3d"], abs=1e-4)
+    assert row["rmse_3d"] == pytest.approx(
+        evaluate(flight, network=load_network(SHIPPED))[0].row()["rmse_3d"], abs=1e-4
+    )
     lines = capsys.readouterr().out.splitlines()
     assert [line for line in lines if line.startswith("correcting")] == [
         "correcting with: nothing (neither effects nor a network are in use)",
@@ -229,8 +296,21 @@ def test_several_flights_are_pooled(bag, tmp_path, capsys):
 
 
 def test_an_interrupted_run_over_many_goes_on_where_it_was(tmp_path, capsys):
-    short = simulate(SimulationConfig(seed=2, duration=4.0, start_in_air=True, imu_rate=100.0, truth_rate=50.0, protocol="tdoa3"))
-    bags, kept, alone = [tmp_path / name for name in ("one", "two", "three")], tmp_path / "kept", ["--jobs", "1"]
+    short = simulate(
+        SimulationConfig(
+            seed=2,
+            duration=4.0,
+            start_in_air=True,
+            imu_rate=100.0,
+            truth_rate=50.0,
+            protocol="tdoa3",
+        )
+    )
+    bags, kept, alone = (
+        [tmp_path / name for name in ("one", "two", "three")],
+        tmp_path / "kept",
+        ["--jobs", "1"],
+    )
     for bag in bags:
         write_bag(short, bag)
     whole = report([*bags, "--no-bias", *alone], tmp_path)
@@ -251,7 +331,10 @@ def test_recorded_odometry_is_judged(flight, bag, tmp_path):
     odometry = run_offline(flight).odometry
     off = replace(odometry, p=odometry.p + [0.3, 0.0, 0.0])
     recorded = write_odometry(tmp_path / "recorded", off)
-    own, judged = report([bag, "--no-bias"], tmp_path)["runs"][0], report([bag, "--odometry", recorded], tmp_path)["runs"][0]
+    own, judged = (
+        report([bag, "--no-bias"], tmp_path)["runs"][0],
+        report([bag, "--odometry", recorded], tmp_path)["runs"][0],
+    )
     assert judged["rmse_x"] == pytest.approx(0.3, abs=0.05)
     assert judged["rmse_y"] == pytest.approx(own["rmse_y"], abs=1e-3)
     assert judged["nees_mean"] > own["nees_mean"]
@@ -262,16 +345,27 @@ def test_recorded_odometry_without_covariance_is_judged(flight, bag, tmp_path):
     assert report([bag, "--odometry", recorded], tmp_path)["runs"][0]["rmse_3d"] < 0.1
 
 
-def test_odometry_of_a_tag_is_judged_against_the_flight_of_a_bag_without_namespace(flight, bag, tmp_path, capsys):
-    recorded = write_odometry(tmp_path / "recorded", run_offline(flight).odometry, space="/tag1", verdicts=(0, 1))
+def test_odometry_of_a_tag_is_judged_against_the_flight_of_a_bag_without_namespace(
+    flight, bag, tmp_path, capsys
+):
+    recorded = write_odometry(
+        tmp_path / "recorded", run_offline(flight).odometry, space="/tag1", verdicts=(0, 1)
+    )
     assert main([str(bag), "--odometry", str(recorded)]) == 2
-    assert "has no message on /odometry; say which to take (--topic odometry=/tag1/odometry)." in capsys.readouterr().err
-    judged = report([bag, "--odometry", recorded, "--topic", "odometry=/tag1/odometry"], tmp_path)["runs"][0]
+    assert (
+        "has no message on /odometry; say which to take (--topic odometry=/tag1/odometry)."
+        in capsys.readouterr().err
+    )
+    judged = report([bag, "--odometry", recorded, "--topic", "odometry=/tag1/odometry"], tmp_path)[
+        "runs"
+    ][0]
     assert judged["rmse_3d"] < 0.1
 
 
 def test_odometry_of_late_tdoas_is_told_with_code_1(flight, bag, tmp_path, capsys):
-    recorded = write_odometry(tmp_path / "recorded", run_offline(flight).odometry, verdicts=(0, 2, 1, 2))
+    recorded = write_odometry(
+        tmp_path / "recorded", run_offline(flight).odometry, verdicts=(0, 2, 1, 2)
+    )
     assert main([str(bag), "--odometry", str(recorded)]) == 1
     assert "2 TDOAs came too late for that filter" in capsys.readouterr().err
 
@@ -285,7 +379,9 @@ def test_flights_without_truth_are_told_in_one_sentence(flight, tmp_path, capsys
 
 
 def test_picture_and_trajectories(flight, bag, tmp_path):
-    assert main([str(bag), "--plot", str(tmp_path / "error.png"), "--tum", str(tmp_path / "tum")]) == 0
+    assert (
+        main([str(bag), "--plot", str(tmp_path / "error.png"), "--tum", str(tmp_path / "tum")]) == 0
+    )
     assert (tmp_path / "error.png").read_bytes()[:4] == b"\x89PNG"
     for name, rate in ((flight.name, 200.0), (f"{flight.name}_truth", 250.0)):
         rows = np.loadtxt(tmp_path / "tum" / f"{name}.tum")
@@ -295,7 +391,9 @@ def test_picture_and_trajectories(flight, bag, tmp_path):
 
 
 def test_the_picture_of_a_run_that_never_started(flight, tmp_path):
-    few = replace(flight, tdoa=replace(flight.tdoa, **{c: getattr(flight.tdoa, c)[:5] for c in "tabd"}))
+    few = replace(
+        flight, tdoa=replace(flight.tdoa, **{c: getattr(flight.tdoa, c)[:5] for c in "tabd"})
+    )
     write_bag(few, tmp_path / "few")
     assert main([str(tmp_path / "few"), "--plot", str(tmp_path / "error.png")]) == 1  # it diverged
     assert (tmp_path / "error.png").exists()
@@ -303,7 +401,9 @@ def test_the_picture_of_a_run_that_never_started(flight, tmp_path):
 
 def test_a_report_is_json_that_everybody_reads(flight, tmp_path):
     """RFC 8259 has no NaN and no Infinity, which a run that never started could bring in."""
-    few = replace(flight, tdoa=replace(flight.tdoa, **{c: getattr(flight.tdoa, c)[:5] for c in "tabd"}))
+    few = replace(
+        flight, tdoa=replace(flight.tdoa, **{c: getattr(flight.tdoa, c)[:5] for c in "tabd"})
+    )
     write_bag(few, tmp_path / "few")
     assert main([str(tmp_path / "few"), "--json", str(tmp_path / "report.json")]) == 1
 
@@ -323,8 +423,15 @@ def test_table_beside_others(flight, bag, tmp_path):
         "other,firmware,std,0.1,0.1,0.1,0.5,0.0,False\n"
     )
     assert main([str(bag), "--markdown", str(tmp_path / "table.md"), "--beside", str(peers)]) == 0
-    header, rule, row = (line.strip("| ").split(" | ") for line in (tmp_path / "table.md").read_text().splitlines()[:3])
-    assert header[0] == "flight" and header[-2:] == ["firmware std", "firmware robust"] and len(rule) == len(header)
+    header, rule, row = (
+        line.strip("| ").split(" | ")
+        for line in (tmp_path / "table.md").read_text().splitlines()[:3]
+    )
+    assert (
+        header[0] == "flight"
+        and header[-2:] == ["firmware std", "firmware robust"]
+        and len(rule) == len(header)
+    )
     assert row[0] == flight.name and row[-2:] == ["0.173", "diverged"]
     peers.write_text("name,error\nx,1\n")
     assert main([str(bag), "--markdown", str(tmp_path / "table.md"), "--beside", str(peers)]) == 2
@@ -348,25 +455,39 @@ def test_help_has_examples(capsys):
 
 @pytest.mark.slow
 def test_a_simulated_flight_without_bias_is_consistent():
-    """White TDOA noise of known size, an inertial sensor with noise and biases of the filter's kind and size: the NEES
-    of the position averaged over 20 flights inside its 95 % chi-square bounds at 90 % of the times after 3 s in the
-    air, and the NIS of 80 % of the flights inside theirs (Bar-Shalom et al., sec. 5.4.2; 19 of 20 are expected, fewer
-    than 16 happen once in 400 times to an honest filter)."""
+    """White TDOA noise of known size, an inertial sensor with noise and biases of the filter's kind
+    and size: the NEES of the position averaged over 20 flights inside its 95 % chi-square bounds at
+    90 % of the times after 3 s in the air, and the NIS of 80 % of the flights inside theirs
+    (Bar-Shalom et al., sec. 5.4.2; 19 of 20 are expected, fewer than 16 happen once in 400 times to
+    an honest filter).
+    """
     noise = dict(accel_noise=0.05, gyro_noise=0.003, accel_bias_walk=0.01, gyro_bias_walk=1e-4)
     told = FilterConfig(
-        robust="gate", gate=1e6, tdoa_std=0.1, tdoa_correlation_length=1.0, vibration_gain=0.0, adapt_noise=False, **noise
-    )  # fmt: skip
-    errors = ImuErrors(**noise, accel_bias=told.initial_accel_bias_std, gyro_bias=told.initial_gyro_bias_std)
+        robust="gate",
+        gate=1e6,
+        tdoa_std=0.1,
+        tdoa_correlation_length=1.0,
+        vibration_gain=0.0,
+        adapt_noise=False,
+        **noise,
+    )
+    errors = ImuErrors(
+        **noise, accel_bias=told.initial_accel_bias_std, gyro_bias=told.initial_gyro_bias_std
+    )
     clean = {**CLEAN, "duration": 25.0, "start_in_air": True, "noise_std": 0.1, "protocol": "tdoa3"}
     nees, nis = [], []
     for seed in range(20):
-        score, result = evaluate(simulate(SimulationConfig(seed=seed, imu_errors=errors, **clean)), told)
+        score, result = evaluate(
+            simulate(SimulationConfig(seed=seed, imu_errors=errors, **clean)), told
+        )
         times = np.arange(score.first + 3.0, score.last - 0.1, 0.05)
         nees.append(score.nees[np.searchsorted(score.t, times)])
         nis.append(score.nis)
     nees = np.mean([values[: min(map(len, nees))] for values in nees], axis=0)
     low, high = chi2.ppf([0.025, 0.975], 3 * 20) / 20
-    inside = [np.prod(np.sign(chi2.ppf([0.025, 0.975], len(v)) / len(v) - v.mean())) < 0 for v in nis]
+    inside = [
+        np.prod(np.sign(chi2.ppf([0.025, 0.975], len(v)) / len(v) - v.mean())) < 0 for v in nis
+    ]
     print(
         f"NEES {nees.mean():.2f}, {np.mean((nees > low) & (nees < high)):.0%} of the times inside; "
         f"NIS {np.mean([v.mean() for v in nis]):.3f}, {np.mean(inside):.0%} of the flights inside"
@@ -378,11 +499,16 @@ def test_parameters_on_the_command_line_are_those_of_a_file(bag, tmp_path):
     file = tmp_path / "filter.yaml"
     file.write_text("ekf_node: {ros__parameters: {tdoa_std: 0.1, adapt_noise: false}}")
     one = report([bag, "--config", file, "-p", "loss:=huber"], tmp_path)
-    other = report([bag, "-p", "adapt_noise:=false", "-p", "tdoa_std:=0.1", "-p", "loss:=huber"], tmp_path)
+    other = report(
+        [bag, "-p", "adapt_noise:=false", "-p", "tdoa_std:=0.1", "-p", "loss:=huber"], tmp_path
+    )
     assert one["runs"][0] == other["runs"][0] != report([bag], tmp_path)["runs"][0]
 
 
-@pytest.mark.parametrize("text", ["tdoa_std=0.1", "sdt:=0.1", "tdoa_std:=[", "tdoa_std:=much", "adapt_noise:=1", ":=", ""])
+@pytest.mark.parametrize(
+    "text",
+    ["tdoa_std=0.1", "sdt:=0.1", "tdoa_std:=[", "tdoa_std:=much", "adapt_noise:=1", ":=", ""],
+)
 def test_a_bad_parameter_is_told(bag, text, capsys):
     assert main([str(bag), "-p", text]) == 2
     assert "error" in capsys.readouterr().err
@@ -399,18 +525,31 @@ def test_a_name_is_no_command_to_picture_table_or_terminal(flight, tmp_path, cap
     write_bag(flight, folder / "bag")
     file = folder / "bag" / "metadata.yaml"
     content = yaml.safe_load(file.read_text())
-    content["rosbag2_bagfile_information"]["custom_data"]["uwb_tdoa_tools.flight"] = json.dumps({"name": name})
+    content["rosbag2_bagfile_information"]["custom_data"]["uwb_tdoa_tools.flight"] = json.dumps(
+        {"name": name}
+    )
     file.write_text(yaml.safe_dump(content))
     peers = tmp_path / "peers.csv"
     peers.write_text("flight,peer,mode,rmse_3d,diverged\nx,<script>,a|b,0.1,False\n")
-    options = ["--plot", tmp_path / "error.png", "--markdown", tmp_path / "table.md", "--beside", peers]
+    options = [
+        "--plot",
+        tmp_path / "error.png",
+        "--markdown",
+        tmp_path / "table.md",
+        "--beside",
+        peers,
+    ]
     assert main([*map(str, [folder / "bag", *options])]) == 0
     assert (tmp_path / "error.png").stat().st_size > 10_000
     table = (tmp_path / "table.md").read_text()
     assert "| __frac_ _b____31m |" in table and "| _script_ a_b |" in table and "<" not in table
     assert main([str(folder / "none")]) == 2
     said = capsys.readouterr()
-    assert "\x1b" not in said.out + said.err and r"\x1b[2Jflights" in said.err and "__frac_ _b____31m" in said.out
+    assert (
+        "\x1b" not in said.out + said.err
+        and r"\x1b[2Jflights" in said.err
+        and "__frac_ _b____31m" in said.out
+    )
 
 
 @pytest.mark.slow
@@ -419,13 +558,23 @@ def test_ground_truth_of_another_epoch_is_refused_or_aligned(flight, tmp_path, c
     other = shifted(flight, "truth", 1.7e9)
     write_bag(other, tmp_path / "epoch")
     assert main([str(tmp_path / "epoch")]) == 2
-    assert "on another clock than the TDOAs: its stamps go from 1700000000" in capsys.readouterr().err
-    assert main([str(tmp_path / "epoch"), "--align", "time", "--json", str(tmp_path / "errors.json")]) == 0
+    assert (
+        "on another clock than the TDOAs: its stamps go from 1700000000" in capsys.readouterr().err
+    )
+    assert (
+        main([str(tmp_path / "epoch"), "--align", "time", "--json", str(tmp_path / "errors.json")])
+        == 0
+    )
     (run,) = json.loads((tmp_path / "errors.json").read_text())["runs"]
     assert "nan" not in capsys.readouterr().out and run["rmse_3d"] < 0.2
-    assert run["aligned"]["late"] == pytest.approx(1.7e9, abs=0.05) and run["aligned"]["rmse_3d_none"] is None
+    assert (
+        run["aligned"]["late"] == pytest.approx(1.7e9, abs=0.05)
+        and run["aligned"]["rmse_3d_none"] is None
+    )
     assert convert([str(tmp_path / "epoch"), "--out", str(tmp_path / "one")]) == 2
-    assert convert([str(tmp_path / "epoch"), "--align", "time", "--out", str(tmp_path / "one")]) == 0
+    assert (
+        convert([str(tmp_path / "epoch"), "--align", "time", "--out", str(tmp_path / "one")]) == 0
+    )
     capsys.readouterr()
     assert main([str(tmp_path / "one")]) == 0
 
@@ -435,10 +584,17 @@ def test_what_is_found_of_the_ground_truth_is_told_with_the_error_of_each(flight
     write_bag(shifted(flight, "truth", 0.4), tmp_path / "late")
     errors = {}
     for how in ("none", "time", "frame"):
-        assert main([str(tmp_path / "late"), "--align", how, "--json", str(tmp_path / "errors.json")]) == 0
+        assert (
+            main([str(tmp_path / "late"), "--align", how, "--json", str(tmp_path / "errors.json")])
+            == 0
+        )
         (run,) = json.loads((tmp_path / "errors.json").read_text())["runs"]
         assert run["rmse_3d"] == run["aligned"][f"rmse_3d_{how}"]
         errors[how] = run["rmse_3d"]
         out, err = capsys.readouterr()
-        assert "its stamps 0.4" in out and "--align time" in out and ("judge with --align time" in err) == (how == "none")
+        assert (
+            "its stamps 0.4" in out
+            and "--align time" in out
+            and ("judge with --align time" in err) == (how == "none")
+        )
     assert errors["time"] < 0.5 * errors["none"] and errors["frame"] <= errors["time"] + 0.01

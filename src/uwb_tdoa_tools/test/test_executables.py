@@ -1,4 +1,6 @@
-"""Every executable: its help, its examples, the commands that the documentation shows, and Ctrl-C while it starts."""
+"""Every executable: its help, its examples, the commands that the documentation shows, and Ctrl-C
+while it starts.
+"""
 
 import argparse
 from importlib import import_module
@@ -19,6 +21,7 @@ pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from documented import PAGES, ROOT, commands  # noqa: E402
+
 from uwb_tdoa_tools import cli  # noqa: E402
 from uwb_tdoa_tools.bags.bag import write_bag  # noqa: E402
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate  # noqa: E402
@@ -53,7 +56,9 @@ def subcommands(parser):
 
 
 def parses(name, words):
-    """Whether the words are a command line of an executable, to its own parser; prints what is wrong."""
+    """Whether the words are a command line of an executable, to its own parser; prints what is
+    wrong.
+    """
     try:
         parser_of(name).parse_args(cli.without_ros_arguments(words))
     except SystemExit as stop:
@@ -82,7 +87,9 @@ def test_help_of_its_own_commands(name, capsys):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", EVERY)
 def test_help_as_a_process(name):
-    done = subprocess.run([sys.executable, "-m", EVERY[name], "--help"], capture_output=True, text=True, timeout=600)
+    done = subprocess.run(
+        [sys.executable, "-m", EVERY[name], "--help"], capture_output=True, text=True, timeout=600
+    )
     assert (done.returncode, done.stderr) == (0, "") and done.stdout.startswith(f"usage: {name} ")
 
 
@@ -101,7 +108,9 @@ def test_every_example_is_a_command_line(name):
 def parameters(name):
     """Names of a node's parameters, which its parameter file lists (see the tests of the nodes)."""
     package = NODES[name].partition(".")[0]
-    (content,) = yaml.safe_load((ROOT / "src" / package / "config" / f"{name}.yaml").read_text()).values()
+    (content,) = yaml.safe_load(
+        (ROOT / "src" / package / "config" / f"{name}.yaml").read_text()
+    ).values()
     return set(content["ros__parameters"]).union(*map(parameters, MEMBERS.get(name, ())))
 
 
@@ -121,7 +130,16 @@ def documented(tmp_path_factory):
                     assert words[0] == EVERY[words[1]].partition(".")[0], (where, words)
                     found.append((where, words[1], words[2:]))
                 else:
-                    assert verb in ("test", "build", "shell", "study", "help", "launch", "bag", "service"), (where, verb)
+                    assert verb in (
+                        "test",
+                        "build",
+                        "shell",
+                        "study",
+                        "help",
+                        "launch",
+                        "bag",
+                        "service",
+                    ), (where, verb)
             else:
                 found.append((where, first, words))
     return found
@@ -137,7 +155,11 @@ def test_every_documented_command_is_a_command_line(documented):
     for where, name, words in documented:
         if name in NODES:
             given = re.findall(r"-p (\w+):=", " ".join(words))
-            assert words[:1] == ["--ros-args"] and given and set(given) <= parameters(name) | {"use_sim_time"}, (where, name, words)
+            assert (
+                words[:1] == ["--ros-args"]
+                and given
+                and set(given) <= parameters(name) | {"use_sim_time"}
+            ), (where, name, words)
         elif words:  # without any, it is the name of the executable in a sentence
             assert parses(name, words), (where, name, words)
 
@@ -150,8 +172,19 @@ def hall(tmp_path, monkeypatch):
     """A working directory with the recordings that the documentation speaks of, simulated."""
     monkeypatch.chdir(tmp_path)
     corners().to_yaml("anchors.yaml")
-    for speed, name in ((1.0, "flight"), (0.8, "other")):  # of one radio: a map of another one would do harm, and not be written
-        config = SimulationConfig(seed=4, duration=18.0, imu_rate=100.0, truth_rate=50.0, start_in_air=True, multipath=False, speed=speed)
+    for speed, name in (
+        (1.0, "flight"),
+        (0.8, "other"),
+    ):  # of one radio: a map of another one would do harm, and not be written
+        config = SimulationConfig(
+            seed=4,
+            duration=18.0,
+            imu_rate=100.0,
+            truth_rate=50.0,
+            start_in_air=True,
+            multipath=False,
+            speed=speed,
+        )
         write_bag(simulate(config), f"{name}.bag")
     shutil.copytree("flight.bag", "FLIGHT.log")
     Path("SURVEY.txt").symlink_to("anchors.yaml")
@@ -161,11 +194,20 @@ def hall(tmp_path, monkeypatch):
 def test_the_cheap_ones_of_the_first_page_run(documented, hall, capsys):
     ran = []
     for where, name, words in documented:
-        if where == "README.md" and name in CHEAP and "--live" not in words and "flight3" not in words:
+        if (
+            where == "README.md"
+            and name in CHEAP
+            and "--live" not in words
+            and "flight3" not in words
+        ):
             written = Path(words[words.index("--out") + 1]) if "--out" in words else None
             if written is not None and written.exists():
                 words = [*words, "--force"]
-            assert import_module(COMMANDS[name]).main(words) == 0, (name, words, capsys.readouterr().err)
+            assert import_module(COMMANDS[name]).main(words) == 0, (
+                name,
+                words,
+                capsys.readouterr().err,
+            )
             ran.append(name)
     assert set(ran) == set(CHEAP)
     for name in ("simulate", "inject"):
@@ -197,11 +239,20 @@ sys.meta_path.insert(0, Halt())
 
 @pytest.mark.parametrize("name", EVERY)
 def test_an_interrupt_while_it_imports_is_quiet(name, tmp_path):
-    """In the middle of it: the first of some modules of libraries is not there before the interrupt comes."""
+    """In the middle of it: the first of some modules of libraries is not there before the interrupt
+    comes.
+    """
     (tmp_path / "sitecustomize.py").write_text(HALT)
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])}
+    environment = {
+        **os.environ,
+        "PYTHONPATH": os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")]),
+    }
     process = subprocess.Popen(
-        [sys.executable, installed(name)], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [sys.executable, installed(name)],
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     assert process.stdout.readline() == "importing\n"
     process.send_signal(signal.SIGINT)

@@ -1,27 +1,45 @@
-"""The first hour of a new user with ground truth, by the commands of the documentation word for word, and what came of it."""
+"""The first hour of a new user with ground truth, by the commands of the documentation word for
+word, and what came of it.
+"""
 
 import re
 
-from first_hour import TRUTHS, WALK, at_desk, measured, recorded, said_on_the_way, simulated, written
+from first_hour import (
+    TRUTHS,
+    WALK,
+    at_desk,
+    measured,
+    recorded,
+    said_on_the_way,
+    simulated,
+    written,
+)
 import pytest
 from walking import blocks, commands, main, run
 
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.survey import read_survey
 
-CHECKED = ("simulated", "in time"), ("measured", "late")  # check reads no ground truth, and says the same of the others
+CHECKED = (
+    ("simulated", "in time"),
+    ("measured", "late"),
+)  # check reads no ground truth, and says the same of the others
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("source", "name"),
     [
-        *(("simulated", name) for name in TRUTHS if name != "on another epoch"),  # which is in the one with z down, too
+        *(
+            ("simulated", name) for name in TRUTHS if name != "on another epoch"
+        ),  # which is in the one with z down, too
         ("measured", "late"),
         ("measured", "z down, on another epoch"),  # is in another frame, too
     ],
 )
-def test_from_csv_and_tape_to_a_diagnosed_flight(tmp_path, monkeypatch, capsys, shared_data, source, name):
+def test_from_csv_and_tape_to_a_diagnosed_flight(
+    tmp_path, monkeypatch, capsys, shared_data, source, name
+):
     """convert, check, evaluate, diagnose, evaluate: docs/connect.md."""
     at_desk(tmp_path, monkeypatch)
     if source == "simulated":
@@ -41,7 +59,10 @@ def test_from_csv_and_tape_to_a_diagnosed_flight(tmp_path, monkeypatch, capsys, 
     before = hall.error()
     diverged = (0, 1) if "z down" in name else (0,)  # by that ground truth, until it is turned
     for command, words in commands(judging):
-        assert main(command, words) in (diverged if command == "evaluate" else (0,)), (command, words)
+        assert main(command, words) in (diverged if command == "evaluate" else (0,)), (
+            command,
+            words,
+        )
     printed = capsys.readouterr()
     after = hall.error("diagnosis")
     said_on_the_way(capsys, f"{source}, truth {name}", before, after)

@@ -1,11 +1,21 @@
-"""The first hour of a new user without ground truth, and the steps of README.md, by the commands of the documentation word for word, and
-what came of it."""
+"""The first hour of a new user without ground truth, and the steps of README.md, by the commands of
+the documentation word for word, and what came of it.
+"""
 
 from pathlib import Path
 import re
 import shlex
 
-from first_hour import MINUTE, WALK, at_desk, measured, recorded, said_on_the_way, simulated, written
+from first_hour import (
+    MINUTE,
+    WALK,
+    at_desk,
+    measured,
+    recorded,
+    said_on_the_way,
+    simulated,
+    written,
+)
 import numpy as np
 import pytest
 from recordings import log_bytes
@@ -23,7 +33,9 @@ def ended(name, words):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("source", ["simulated", "measured"])
-def test_from_tape_to_calibrated_without_ground_truth(tmp_path, monkeypatch, capsys, shared_data, source):
+def test_from_tape_to_calibrated_without_ground_truth(
+    tmp_path, monkeypatch, capsys, shared_data, source
+):
     """docs/calibration.md, in one command and step by step, and docs/localizing.md."""
     at_desk(tmp_path, monkeypatch)
     survey = read_survey(written("anchors.yaml", *blocks(WALK, "yaml")))
@@ -33,7 +45,9 @@ def test_from_tape_to_calibrated_without_ground_truth(tmp_path, monkeypatch, cap
         Path(f"{day}.bag").rename(f"{name}.bag")
     Path("flight.bag").symlink_to("first.bag")
     before = hall.error()
-    (quick, whole), *_ = [commands(text) for text in blocks(section("calibration.md", "In one command"))]
+    (quick, whole), *_ = [
+        commands(text) for text in blocks(section("calibration.md", "In one command"))
+    ]
     assert main(*quick) == 0
     capsys.readouterr()
     code = ended(*whole)
@@ -45,7 +59,10 @@ def test_from_tape_to_calibrated_without_ground_truth(tmp_path, monkeypatch, cap
     else:
         assert after < before
         _lines_run(printed.out)
-    (checked,), (surveyed,) = (commands(blocks(section("calibration.md", heading))[0]) for heading in ("2. Fly, and check", "3. Survey"))
+    (checked,), (surveyed,) = (
+        commands(blocks(section("calibration.md", heading))[0])
+        for heading in ("2. Fly, and check", "3. Survey")
+    )
     assert main(*checked) in (0, 1)
     capsys.readouterr()
     code = ended(*surveyed)
@@ -58,7 +75,9 @@ def test_from_tape_to_calibrated_without_ground_truth(tmp_path, monkeypatch, cap
 
 
 def _lines_run(text):
-    """Lines that a tool has printed to be copied run as they stand; those of nodes have files that can be read."""
+    """Lines that a tool has printed to be copied run as they stand; those of nodes have files that
+    can be read.
+    """
     lines = re.findall(r"\./dev run uwb_tdoa_\w+ .*$", text, re.MULTILINE)
     assert len(lines) == 3
     for line in lines:
@@ -75,10 +94,18 @@ def _lines_run(text):
 
 def write_log(flight, path):
     """Write a Flight as a micro-SD log: deg/s and g."""
-    rows = [("estTDOA", t, (int(a), int(b), d)) for t, a, b, d in zip(flight.tdoa.t, flight.tdoa.a, flight.tdoa.b, flight.tdoa.d)]
-    for name, values in (("estGyroscope", np.rad2deg(flight.imu.gyro)), ("estAcceleration", flight.imu.accel / 9.81)):
+    rows = [
+        ("estTDOA", t, (int(a), int(b), d))
+        for t, a, b, d in zip(flight.tdoa.t, flight.tdoa.a, flight.tdoa.b, flight.tdoa.d)
+    ]
+    for name, values in (
+        ("estGyroscope", np.rad2deg(flight.imu.gyro)),
+        ("estAcceleration", flight.imu.accel / 9.81),
+    ):
         rows += [(name, t, tuple(value)) for t, value in zip(flight.imu.t, values)]
-    rows += [("estPose", t, (*p, *q)) for t, p, q in zip(flight.truth.t, flight.truth.p, flight.truth.q)]
+    rows += [
+        ("estPose", t, (*p, *q)) for t, p, q in zip(flight.truth.t, flight.truth.p, flight.truth.q)
+    ]
     rows.sort(key=lambda row: row[1])
     Path(path).write_bytes(log_bytes([(name, round(1e6 * t), values) for name, t, values in rows]))
 
@@ -89,11 +116,26 @@ def test_the_four_steps_of_the_readme(tmp_path, monkeypatch, capsys):
     at_desk(tmp_path, monkeypatch)
     hall = simulated(read_survey(written("anchors.yaml", *blocks(WALK, "yaml"))))
     write_log(hall.flights[0], "FLIGHT.log")
-    rows = [f"{i},{x:.3f},{y:.3f},{z:.3f}" for i, (x, y, z) in zip(hall.tape.ids, hall.tape.positions)]
+    rows = [
+        f"{i},{x:.3f},{y:.3f},{z:.3f}" for i, (x, y, z) in zip(hall.tape.ids, hall.tape.positions)
+    ]
     written("SURVEY.txt", "\n".join(["id,x,y,z", *rows, ""]))
-    steps = [command for text in blocks(section("README.md", "Four steps")) for command in commands(text)]
-    steps = [(name, words) for name, words in steps if words and "--live" not in words and not name.endswith("_node")]
-    assert [name for name, _ in steps] == ["check", "calibrate", "calibrate", "diagnose", "survey", "localize"]
+    steps = [
+        command for text in blocks(section("README.md", "Four steps")) for command in commands(text)
+    ]
+    steps = [
+        (name, words)
+        for name, words in steps
+        if words and "--live" not in words and not name.endswith("_node")
+    ]
+    assert [name for name, _ in steps] == [
+        "check",
+        "calibrate",
+        "calibrate",
+        "diagnose",
+        "survey",
+        "localize",
+    ]
     before = hall.error()
     for name, words in steps:
         code = ended(name, words)
@@ -102,5 +144,9 @@ def test_the_four_steps_of_the_readme(tmp_path, monkeypatch, capsys):
             continue
         after = hall.error(words[words.index("--out") + 1])
         said_on_the_way(capsys, f"README, {name}", before, after)
-        assert after < before if code == 0 else "nothing" in printed.out + printed.err and after == before
+        assert (
+            after < before
+            if code == 0
+            else "nothing" in printed.out + printed.err and after == before
+        )
     assert Path("localized/FLIGHT.tum").exists()

@@ -13,7 +13,17 @@ from uwb_tdoa_tools.readers import read_flight
 
 def test_flights_are_counted_told_and_drawn(tmp_path, capsys):
     out, picture = tmp_path / "flown.json", tmp_path / "flown.png"
-    options = ["--flights", "1", "--no-floor-effect", "--told", "place", "--json", str(out), "--plot", str(picture)]
+    options = [
+        "--flights",
+        "1",
+        "--no-floor-effect",
+        "--told",
+        "place",
+        "--json",
+        str(out),
+        "--plot",
+        str(picture),
+    ]
     code = main([*options, "--at-least", "1"])
     content = json.loads(out.read_text())
     assert [one["seed"] for one in content["flights"]] == [1]
@@ -48,7 +58,17 @@ def test_what_cannot_be_is_told(options, said, capsys):
 
 def test_it_goes_on_from_what_is_there(tmp_path, capsys, monkeypatch):
     kept, out = tmp_path / "kept.jsonl", tmp_path / "flown.json"
-    options = ["--no-floor-effect", "--flights", "2", "--jobs", "1", "--resume", str(kept), "--json", str(out)]
+    options = [
+        "--no-floor-effect",
+        "--flights",
+        "2",
+        "--jobs",
+        "1",
+        "--resume",
+        str(kept),
+        "--json",
+        str(out),
+    ]
     flown = []
 
     def one(task):
@@ -61,15 +81,32 @@ def test_it_goes_on_from_what_is_there(tmp_path, capsys, monkeypatch):
     main(options)
     assert flown == [1, 2]
     main(["--no-floor-effect", "--flights", "3", *options[3:]])
-    assert flown == [1, 2, 3] and [one["seed"] for one in json.loads(out.read_text())["flights"]] == [1, 2, 3]
+    assert flown == [1, 2, 3] and [
+        one["seed"] for one in json.loads(out.read_text())["flights"]
+    ] == [1, 2, 3]
     assert main(["--flights", "3", *options[3:]]) == 2
     assert "another floor_effect" in capsys.readouterr().err
-    kept.write_text(kept.read_text().splitlines()[0] + '\n{"key": "1", "result": {"landed": true}}\n')
+    kept.write_text(
+        kept.read_text().splitlines()[0] + '\n{"key": "1", "result": {"landed": true}}\n'
+    )
     assert main(["--no-floor-effect", "--flights", "1", *options[3:]]) == 2
     assert "holds something else than results" in capsys.readouterr().err
 
 
 def test_a_flight_is_recorded_for_the_other_tools(tmp_path):
-    assert main(["--no-floor-effect", "--flights", "1", "--aid", "height", "--record", str(tmp_path / "flown")]) == 0
+    assert (
+        main(
+            [
+                "--no-floor-effect",
+                "--flights",
+                "1",
+                "--aid",
+                "height",
+                "--record",
+                str(tmp_path / "flown"),
+            ]
+        )
+        == 0
+    )
     flight = read_flight(tmp_path / "flown" / "flown-1")
     assert len(flight.height) and len(flight.tdoa) > 5000 and flight.truth.p[:, 2].max() > 1.0

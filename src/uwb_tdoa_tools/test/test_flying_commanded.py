@@ -21,7 +21,9 @@ def up():
 def test_it_goes_up_and_stays(up):
     start, halfway, there, later = up.at(np.array([0.0, 1.25, 2.5, 60.0]))
     np.testing.assert_allclose(start, [[1.0, -1.0, 0.03], [0.0] * 3, [0.0] * 3], atol=1e-12)
-    assert halfway[0, 2] == pytest.approx(0.615) and halfway[1, 2] == pytest.approx(15 / 8 * 1.17 / 2.5)
+    assert halfway[0, 2] == pytest.approx(0.615) and halfway[1, 2] == pytest.approx(
+        15 / 8 * 1.17 / 2.5
+    )
     for wanted in (there, later):
         np.testing.assert_allclose(wanted, [[1.0, -1.0, 1.2], [0.0] * 3, [0.0] * 3], atol=1e-9)
     assert up.duration == math.inf and up.turned(60.0) == pytest.approx(0.0)
@@ -36,7 +38,9 @@ def test_each_command_goes_on_from_where_the_last_one_has_it(up):
     up.go_to(5.0, True, (0.5, 0.0, 0.0), 0.1, 2.0)
     np.testing.assert_allclose(up.at(np.array([7.0]))[0, 0], [0.5, 0.0, 1.5], atol=1e-9)
     assert up.turned(7.0) == pytest.approx(2.0 * math.pi - 5.9)
-    np.testing.assert_allclose(up.at(np.array([1.25]))[0, 0, 2], 0.615)  # the past stays what it was
+    np.testing.assert_allclose(
+        up.at(np.array([1.25]))[0, 0, 2], 0.615
+    )  # the past stays what it was
 
 
 def test_it_comes_down_and_sinks_to_wherever_the_ground_is(up):

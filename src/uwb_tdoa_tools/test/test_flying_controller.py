@@ -11,19 +11,33 @@ TICK = 4
 
 
 def flown(wanted, yaw, seconds, turn=0.0, believed=None):
-    """States (n, 17) of a vehicle whose controller knows the truth, from (0, 0, 2) m and a yaw `turn`, rad, on."""
+    """States (n, 17) of a vehicle whose controller knows the truth, from (0, 0, 2) m and a yaw
+    `turn`, rad, on.
+    """
     vehicle, n = Vehicle(), int(seconds * IMU_RATE)
     state = vehicle.at_rest(0.0, 0.0, turn)
     state[2], state[13:] = 2.0, math.sqrt(vehicle.mass * GRAVITY / (4.0 * vehicle.thrust))
     controller, gyro = Controller(vehicle=believed), np.zeros((2, 3))
-    states, samples, contact, still = np.empty((n, 17)), np.empty((n, 6)), np.zeros(n), np.zeros((n, 6))
+    states, samples, contact, still = (
+        np.empty((n, 17)),
+        np.empty((n, 6)),
+        np.zeros(n),
+        np.zeros((n, 6)),
+    )
     for k in range(0, n, TICK):
         rows = slice(k, k + TICK)
-        controller.fly(state[POSITION], state[VELOCITY], state[ATTITUDE], wanted, yaw, TICK / IMU_RATE)
+        controller.fly(
+            state[POSITION], state[VELOCITY], state[ATTITUDE], wanted, yaw, TICK / IMU_RATE
+        )
         interval(
-            state, gyro, (controller.thrust, controller.rates), (controller.numbers, controller.vehicle.numbers()), vehicle.numbers(),
-            (still[rows, :3], still[rows], still[rows, :3]), (states[rows], samples[rows], contact[rows]),
-        )  # fmt: skip
+            state,
+            gyro,
+            (controller.thrust, controller.rates),
+            (controller.numbers, controller.vehicle.numbers()),
+            vehicle.numbers(),
+            (still[rows, :3], still[rows], still[rows, :3]),
+            (states[rows], samples[rows], contact[rows]),
+        )
     return states
 
 
@@ -35,7 +49,9 @@ def at(p):
 def test_it_goes_where_it_is_wanted_and_turns_there(turn):
     states = flown(at([1.0, -0.5, 2.5]), 0.3, 8.0, turn)
     np.testing.assert_allclose(states[-1, POSITION], [1.0, -0.5, 2.5], atol=0.02)
-    assert 2.0 * math.atan2(states[-1, 8], states[-1, 9]) % (2.0 * math.pi) == pytest.approx(0.3, abs=0.02)
+    assert 2.0 * math.atan2(states[-1, 8], states[-1, 9]) % (2.0 * math.pi) == pytest.approx(
+        0.3, abs=0.02
+    )
     assert np.linalg.norm(states[-1, VELOCITY]) < 0.02
 
 
@@ -54,7 +70,9 @@ def test_where_no_position_is_wanted_the_velocity_counts():
 def test_support_is_what_the_rotors_do_not_carry():
     controller = Controller()
     for _ in range(100):
-        controller.fly(np.zeros(3), np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), at([0.0, 0.0, 0.0]), 0.0, 0.01)
+        controller.fly(
+            np.zeros(3), np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), at([0.0, 0.0, 0.0]), 0.0, 0.01
+        )
     assert controller.support(GRAVITY) == pytest.approx(0.0, abs=1e-3)
     assert controller.support(1.5 * GRAVITY) == pytest.approx(0.5, abs=1e-3)
     controller.stop()
@@ -65,4 +83,6 @@ def test_an_attitude_turns_as_the_gyroscope_says():
     q = np.array([0.0, 0.0, 0.0, 1.0])
     for _ in range(100):
         turned(q, np.array([0.0, 0.0, math.pi / 2]), 0.01)
-    np.testing.assert_allclose(q, [0.0, 0.0, math.sin(math.pi / 4), math.cos(math.pi / 4)], atol=1e-9)
+    np.testing.assert_allclose(
+        q, [0.0, 0.0, math.sin(math.pi / 4), math.cos(math.pi / 4)], atol=1e-9
+    )

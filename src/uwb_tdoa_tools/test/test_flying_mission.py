@@ -61,7 +61,9 @@ def test_it_is_up_flies_its_circles_and_sinks(said):
 
 def test_an_estimate_that_does_not_come_down_is_pulled_down_and_another_is_not(said):
     high = said.until(30.0)[0, 2]
-    assert high == pytest.approx(-PULL) and said.until(31.0)[0, 2] == high  # of an estimate of 0: no lower than that
+    assert (
+        high == pytest.approx(-PULL) and said.until(31.0)[0, 2] == high
+    )  # of an estimate of 0: no lower than that
     falling = Said(Mission(Circles(), (1.0, 2.0), 0.03))
     falling.sinks = 0.15
     assert falling.until(30.0)[0, 2] == pytest.approx(-0.15 * 29.99, abs=1e-6)

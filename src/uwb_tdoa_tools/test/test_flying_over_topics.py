@@ -10,6 +10,7 @@ pytest.importorskip("uwb_tdoa_msgs.msg", reason="needs the built workspace: ./de
 
 from nav_msgs.msg import Odometry  # noqa: E402
 from rclpy.serialization import serialize_message  # noqa: E402
+
 from uwb_tdoa_bias.foundation.flight import Imu, Tdoas  # noqa: E402
 from uwb_tdoa_bias.foundation.ros_node import StreamNode  # noqa: E402
 from uwb_tdoa_msgs.msg import EstimatorStatus  # noqa: E402
@@ -39,7 +40,11 @@ def topics():
     node, pace = StreamNode("vehicle"), Pace()
     made = OverTopics(node, HALL, pace, clock=True)
     none = np.empty(0)
-    made.take(SensorReadings(Imu(none, np.empty((0, 3)), np.empty((0, 3))), Tdoas(none, none, none, none, none), {}))
+    made.take(
+        SensorReadings(
+            Imu(none, np.empty((0, 3)), np.empty((0, 3))), Tdoas(none, none, none, none, none), {}
+        )
+    )
     made.turned(5.0, np.zeros(STATE))
     made.status = EstimatorStatus(status=EstimatorStatus.STATUS_RUNNING)
     yield made
@@ -47,7 +52,14 @@ def topics():
     rclpy.shutdown()
 
 
-def odometry(t, frame="map", p=(1.0, 2.0, 0.5), q=(0.0, 0.0, 2.0**-0.5, 2.0**-0.5), v=(1.0, 0.0, 0.0), variance=0.04):
+def odometry(
+    t,
+    frame="map",
+    p=(1.0, 2.0, 0.5),
+    q=(0.0, 0.0, 2.0**-0.5, 2.0**-0.5),
+    v=(1.0, 0.0, 0.0),
+    variance=0.04,
+):
     message = Odometry(child_frame_id="base_link")
     message.header.frame_id = frame
     message.header.stamp.sec, message.header.stamp.nanosec = divmod(round(t * 1e9), 10**9)
@@ -102,24 +114,33 @@ def test_what_is_none_is_passed_over(topics, bad):
     assert topics.pose[0] == pytest.approx(4.96)
 
 
-@pytest.mark.parametrize("status", [EstimatorStatus.STATUS_WAITING, EstimatorStatus.STATUS_STARTING, EstimatorStatus.STATUS_FAULT])
+@pytest.mark.parametrize(
+    "status",
+    [EstimatorStatus.STATUS_WAITING, EstimatorStatus.STATUS_STARTING, EstimatorStatus.STATUS_FAULT],
+)
 def test_by_a_status_that_is_not_running_it_neither_starts_nor_goes_on(topics, status):
     hear(topics, odometry(5.0))
     assert topics.deviation == pytest.approx(0.2)
-    topics.status = EstimatorStatus(status=status, yaw_known=True, why="the sign of all TDOAs is wrong")
+    topics.status = EstimatorStatus(
+        status=status, yaw_known=True, why="the sign of all TDOAs is wrong"
+    )
     assert topics.deviation == np.inf and topics.why == "the sign of all TDOAs is wrong"
 
 
 def test_where_the_filter_does_not_run_it_knows_nothing_and_says_why(topics):
     hear(topics, odometry(4.9))
-    topics.status = EstimatorStatus(status=EstimatorStatus.STATUS_LOST, lost=True, why="the tag is lost")
+    topics.status = EstimatorStatus(
+        status=EstimatorStatus.STATUS_LOST, lost=True, why="the tag is lost"
+    )
     assert topics.deviation == np.inf and topics.why == "the tag is lost"
     topics.status = None
     assert topics.deviation == np.inf and "nothing came on status" in topics.why
 
 
 def test_odometry_from_before_anything_was_measured_is_not_taken(topics):
-    """Whoever publishes it would have ended the node: in real time stamps count from the start, and there was none."""
+    """Whoever publishes it would have ended the node: in real time stamps count from the start, and
+    there was none.
+    """
     topics._begin = None
     hear(topics, odometry(4.9))
     assert topics.pose is None

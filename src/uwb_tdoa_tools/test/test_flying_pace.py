@@ -23,7 +23,9 @@ def stream(*t):
 
 
 def measured(now, tdoa=True):
-    return SensorReadings(stream(now - 0.005, now), stream(*([now - 0.004, now - 0.001] if tdoa else [])), {})
+    return SensorReadings(
+        stream(now - 0.005, now), stream(*([now - 0.004, now - 0.001] if tdoa else [])), {}
+    )
 
 
 @pytest.fixture

@@ -15,7 +15,15 @@ from uwb_tdoa_tools.flying.verdict import verdict_of
 from uwb_tdoa_tools.flying.world import HALL
 from uwb_tdoa_tools.simulation.imu import NO_IMU_ERRORS
 
-PERFECT = replace(HALL, floor_effect=False, noise=0.01, outlier_share=0.0, delay=0.0, bearing_bias=0.0, imu=NO_IMU_ERRORS)
+PERFECT = replace(
+    HALL,
+    floor_effect=False,
+    noise=0.01,
+    outlier_share=0.0,
+    delay=0.0,
+    bearing_bias=0.0,
+    imu=NO_IMU_ERRORS,
+)
 
 
 class Said(OurFilter):
@@ -50,7 +58,9 @@ def test_up_to_a_place_and_down_twice(flight):
     np.testing.assert_allclose(trial.simulator.state[:3], [*begin[:2], 1.0], atol=0.15)
     pilot.go_to(0, True, (0.5, 0.0, 0.2), 0.5, 2.0)
     turn(trial, 3.0)
-    np.testing.assert_allclose(trial.simulator.state[:3], [begin[0] + 0.5, begin[1], 1.2], atol=0.15)
+    np.testing.assert_allclose(
+        trial.simulator.state[:3], [begin[0] + 0.5, begin[1], 1.2], atol=0.15
+    )
     pilot.land(0, 0.0, 2.0)
     while not trial.over:
         trial.turn()
@@ -68,7 +78,9 @@ def test_it_does_not_start_unless_it_knows_where_it_is(flight):
         pilot.take_off(0, 1.0, 2.0)
     turn(trial, 1.0)
     trial.source.unsure = True
-    with pytest.raises(InputError, match="it does not know where it is: to 2.0 m, where 1 m is wanted"):
+    with pytest.raises(
+        InputError, match="it does not know where it is: to 2.0 m, where 1 m is wanted"
+    ):
         pilot.take_off(0, 1.0, 2.0)
     trial.source.why = "the start position is looked for"
     with pytest.raises(InputError, match="it does not know where it is: the start position"):

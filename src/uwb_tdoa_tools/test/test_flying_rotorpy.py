@@ -6,7 +6,16 @@ python src/uwb_tdoa_tools/test/test_flying_rotorpy.py        # prints how far th
 import numpy as np
 import pytest
 
-from uwb_tdoa_tools.flying.vehicle import ATTITUDE, POSITION, RATE, SPEED, STEP, VELOCITY, Vehicle, step
+from uwb_tdoa_tools.flying.vehicle import (
+    ATTITUDE,
+    POSITION,
+    RATE,
+    SPEED,
+    STEP,
+    VELOCITY,
+    Vehicle,
+    step,
+)
 
 multirotor = pytest.importorskip("rotorpy.vehicles.multirotor")
 from rotorpy.vehicles.crazyflie_params import quad_params  # noqa: E402
@@ -16,12 +25,18 @@ PRECISE = {"method": "RK45", "rtol": 1e-9, "atol": 1e-10}
 
 
 def flights(seed):
-    """States (n, 17) of ours and of rotorpy's vehicle, from the same state, with the same random commands and wind."""
+    """States (n, 17) of ours and of rotorpy's vehicle, from the same state, with the same random
+    commands and wind.
+    """
     rng = np.random.default_rng(seed)
     ours = Vehicle(radius=0.0)  # rotorpy has no ground effect
     state = ours.at_rest(0.0, 0.0, 0.5)
     hover = np.sqrt(ours.mass * 9.81 / (4.0 * ours.thrust))
-    state[POSITION], state[VELOCITY], state[SPEED] = (0.0, 0.0, 50.0), rng.normal(0.0, 1.0, 3), hover
+    state[POSITION], state[VELOCITY], state[SPEED] = (
+        (0.0, 0.0, 50.0),
+        rng.normal(0.0, 1.0, 3),
+        hover,
+    )
     wind, numbers, scratch = rng.normal(0.0, 1.0, 3), ours.numbers(), np.empty((2, 17))
     theirs = {
         "x": state[POSITION],
@@ -32,23 +47,41 @@ def flights(seed):
         "rotor_speeds": state[SPEED],
     }
     theirs = {name: np.array(value) for name, value in theirs.items()}
-    oracle = multirotor.Multirotor(quad_params, theirs, "cmd_motor_speeds", integrator_kwargs=PRECISE)
+    oracle = multirotor.Multirotor(
+        quad_params, theirs, "cmd_motor_speeds", integrator_kwargs=PRECISE
+    )
     out = []
     for _ in range(round(SECONDS / HELD)):
         speeds = hover + rng.normal(0.0, 100.0) + rng.normal(0.0, 150.0, 4)
         for _ in range(round(HELD / STEP)):
             step(state, speeds, wind, STEP, numbers, scratch)
         theirs = oracle.step({**theirs, "wind": wind}, {"cmd_motor_speeds": speeds}, HELD)
-        out.append((state.copy(), np.concatenate([theirs[name] for name in ("x", "v", "q", "w", "rotor_speeds")])))
+        out.append(
+            (
+                state.copy(),
+                np.concatenate([theirs[name] for name in ("x", "v", "q", "w", "rotor_speeds")]),
+            )
+        )
     return np.array(out).transpose(1, 0, 2)
 
 
 def apart(seed):
-    """Largest differences, of positions m, velocities m/s, attitudes rad, rates rad/s, over a flight; and the largest rate, rad/s."""
+    """Largest differences, of positions m, velocities m/s, attitudes rad, rates rad/s, over a
+    flight; and the largest rate, rad/s.
+    """
     ours, theirs = flights(seed)
-    p, v, w = (np.linalg.norm(ours[:, part] - theirs[:, part], axis=1).max() for part in (POSITION, VELOCITY, RATE))
+    p, v, w = (
+        np.linalg.norm(ours[:, part] - theirs[:, part], axis=1).max()
+        for part in (POSITION, VELOCITY, RATE)
+    )
     along = np.abs(np.sum(ours[:, ATTITUDE] * theirs[:, ATTITUDE], axis=1))
-    return p, v, 2.0 * np.arccos(np.minimum(along, 1.0)).max(), w, np.linalg.norm(theirs[:, RATE], axis=1).max()
+    return (
+        p,
+        v,
+        2.0 * np.arccos(np.minimum(along, 1.0)).max(),
+        w,
+        np.linalg.norm(theirs[:, RATE], axis=1).max(),
+    )
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -60,5 +93,8 @@ def test_two_seconds_of_tumbling_agree_to_a_tenth_of_a_millimetre(seed):
 
 if __name__ == "__main__":
     every = np.array([apart(seed) for seed in range(20)])
-    for what, column in zip(("position, m", "velocity, m/s", "attitude, rad", "rate, rad/s", "(fastest rate, rad/s)"), every.T):
+    for what, column in zip(
+        ("position, m", "velocity, m/s", "attitude, rad", "rate, rad/s", "(fastest rate, rad/s)"),
+        every.T,
+    ):
         print(f"{what:22s} median {np.median(column):.2e}, largest {column.max():.2e}")

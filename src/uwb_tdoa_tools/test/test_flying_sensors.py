@@ -3,13 +3,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from uwb_tdoa_bias.foundation.flight import Imu, Tdoas
+from uwb_tdoa_bias.foundation.radio import arrival_bias
 from uwb_tdoa_tools.flying.loop import IMU_RATE
 from uwb_tdoa_tools.flying.sensors import AIDS, InertialErrors, Radio, gusts
 from uwb_tdoa_tools.flying.simulator import SensorReadings
 from uwb_tdoa_tools.flying.transport import Transport
 from uwb_tdoa_tools.flying.world import HALL, WORLDS
-from uwb_tdoa_bias.foundation.flight import Imu, Tdoas
-from uwb_tdoa_bias.foundation.radio import arrival_bias
 from uwb_tdoa_tools.simulation.constellations import constellation
 from uwb_tdoa_tools.simulation.ranging import tag_link
 
@@ -21,7 +21,9 @@ def residual(world, p=HIGH, seed=0, duration=20.0, happens=(np.inf, np.inf)):
     """(Radio, what each TDOA has beside geometry (n,) m) at one place."""
     radio = Radio(world, seed, duration)
     radio.happens(*happens)
-    d = radio.measured(slice(0, len(radio.t)), *(np.tile(one, (len(radio.t), 1)) for one in (p, LEVEL)))
+    d = radio.measured(
+        slice(0, len(radio.t)), *(np.tile(one, (len(radio.t), 1)) for one in (p, LEVEL))
+    )
     distance = np.linalg.norm(p - radio.positions, axis=1)
     return radio, d - (distance[radio.b] - distance[radio.a])
 
@@ -44,7 +46,10 @@ def test_noise_and_outliers_are_as_large_as_asked_for():
     hit = rest[np.abs(rest) > 1e-9]
     assert len(hit) / len(rest) == pytest.approx(0.03, rel=0.2) and np.abs(hit).max() <= 2.5
     _, rest = residual(replace(CLEAN, outlier_share=0.1, outlier_size=0.0))
-    kinds = [np.mean((np.abs(rest) > low) & (np.abs(rest) <= high)) for low, high in ((0.4, 0.6), (3.0, 5.0), (20.0, 250.0))]
+    kinds = [
+        np.mean((np.abs(rest) > low) & (np.abs(rest) <= high))
+        for low, high in ((0.4, 0.6), (3.0, 5.0), (20.0, 250.0))
+    ]
     np.testing.assert_allclose(kinds, [0.06, 0.03, 0.01], rtol=0.25)
 
 
@@ -68,17 +73,24 @@ def test_an_installation_is_the_same_in_every_flight():
     same, own = replace(HALL, installation=7), HALL
     for world, alike in ((same, True), (own, False)):
         first, second = Radio(world, 0, 5.0), Radio(world, 1, 5.0)
-        assert np.array_equal(first.constants, second.constants) == alike and (first.floor.values == second.floor.values) == alike
+        assert (
+            np.array_equal(first.constants, second.constants) == alike
+            and (first.floor.values == second.floor.values) == alike
+        )
         assert not np.array_equal(first.t[:100], second.t[:100])
 
 
 def test_antennas_make_late_what_they_make_late_in_simulate():
     world = replace(CLEAN, layout=constellation("pillars"), antennas=True)
     radio, rest = residual(world, seed=4)
-    late = arrival_bias(HIGH, LEVEL, world.anchors.positions, world.anchors.orientations, tag_link(4))
+    late = arrival_bias(
+        HIGH, LEVEL, world.anchors.positions, world.anchors.orientations, tag_link(4)
+    )
     assert len(late) == 12 and np.ptp(late) > 0.03
     np.testing.assert_allclose(rest, late[radio.b] - late[radio.a], atol=1e-12)
-    turned = replace(world, layout=replace(world.layout, orientations=world.layout.orientations[::-1]))
+    turned = replace(
+        world, layout=replace(world.layout, orientations=world.layout.orientations[::-1])
+    )
     assert np.abs(residual(turned, seed=4)[1] - rest).max() > 0.01
 
 
@@ -126,17 +138,27 @@ def test_gusts_are_as_strong_as_asked_for_and_slow():
 
 def test_other_sensors_say_what_is_true_but_for_their_noise():
     world, rows = replace(HALL, height_noise=0.01), slice(0, 100)
-    p, q, v = np.tile(HIGH, (100, 1)), np.tile([np.sin(0.1), 0.0, 0.0, np.cos(0.1)], (100, 1)), np.ones((100, 3))
+    p, q, v = (
+        np.tile(HIGH, (100, 1)),
+        np.tile([np.sin(0.1), 0.0, 0.0, np.cos(0.1)], (100, 1)),
+        np.ones((100, 3)),
+    )
     sensors = {name: kind(world, 0, 10.0) for name, kind in AIDS.items()}
     (height,) = sensors["height"].measured(rows, p, q, v, p[:, 2] - 0.2)
-    assert height.mean() == pytest.approx(1.0 / np.cos(0.2), abs=0.005) and height.std() == pytest.approx(0.01, rel=0.3)
+    assert height.mean() == pytest.approx(
+        1.0 / np.cos(0.2), abs=0.005
+    ) and height.std() == pytest.approx(0.01, rel=0.3)
     assert np.isinf(sensors["height"].measured(rows, p, q, v, p[:, 2] + 4.0)[0]).all()
     speed, std = sensors["velocity"].measured(rows, p, q, v, p[:, 2])
     np.testing.assert_allclose(speed.mean(axis=0), 1.0, atol=0.02)
     assert (std == 0.05).all()
     assert len(sensors["height"].t) == 200 and len(sensors["pressure"].t) == 250
     ids, d, variance = sensors["range"].measured(slice(50, 150), p, q, v, p[:, 2])
-    assert len(sensors["range"].t) == 1000 and ids.tolist() == np.resize(world.anchors.ids, 150)[50:].tolist() and not variance.any()
+    assert (
+        len(sensors["range"].t) == 1000
+        and ids.tolist() == np.resize(world.anchors.ids, 150)[50:].tolist()
+        and not variance.any()
+    )
     off = d - np.linalg.norm(p - world.anchors.positions[world.anchors.index(ids)], axis=1)
     assert abs(off.mean()) < 0.04 and off.std() == pytest.approx(0.1, rel=0.3)
 
@@ -144,13 +166,19 @@ def test_other_sensors_say_what_is_true_but_for_their_noise():
 def test_what_takes_its_time_arrives_in_order_and_whole():
     def sent(k):
         t = 0.01 * k + 0.0025 * np.arange(1, 5)
-        return SensorReadings(Imu(t, np.zeros((4, 3)), np.zeros((4, 3))), Tdoas(t, np.zeros(4, int), np.ones(4, int), t), {})
+        return SensorReadings(
+            Imu(t, np.zeros((4, 3)), np.zeros((4, 3))),
+            Tdoas(t, np.zeros(4, int), np.ones(4, int), t),
+            {},
+        )
 
     transport, came = Transport(0.05, 0.01, np.random.default_rng(0)), []
     for k in range(200):
         now = 0.01 * (k + 1)
         arrived = transport.arrived(sent(k), now)
-        assert (arrived.imu.t <= now - 0.05 + 1e-9).all() and (arrived.tdoa.t == arrived.tdoa.d).all()
+        assert (arrived.imu.t <= now - 0.05 + 1e-9).all() and (
+            arrived.tdoa.t == arrived.tdoa.d
+        ).all()
         came.append(arrived.imu.t)
     came = np.concatenate(came)
     np.testing.assert_allclose(came, 0.0025 * np.arange(1, len(came) + 1))

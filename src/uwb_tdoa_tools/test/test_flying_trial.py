@@ -3,19 +3,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_tools.flying.mission import DONE, REFUSED, Rules
 from uwb_tdoa_tools.flying.path import Circles
 from uwb_tdoa_tools.flying.trial import Task, fly
 from uwb_tdoa_tools.flying.verdict import verdict_of
 from uwb_tdoa_tools.flying.world import HALL, WORLDS
-from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_tools.scoring.metrics import position_at
-from uwb_tdoa_tools.simulation.inject import parse_effect
 from uwb_tdoa_tools.simulation.imu import NO_IMU_ERRORS
+from uwb_tdoa_tools.simulation.inject import parse_effect
 
 SHORT = Circles(turns=1)
 PLAIN = replace(HALL, floor_effect=False)
-PERFECT = replace(PLAIN, noise=0.01, outlier_share=0.0, delay=0.0, bearing_bias=0.0, imu=NO_IMU_ERRORS)
+PERFECT = replace(
+    PLAIN, noise=0.01, outlier_share=0.0, delay=0.0, bearing_bias=0.0, imu=NO_IMU_ERRORS
+)
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +46,10 @@ def test_what_was_measured_is_a_flight_of_the_truth(plain):
     flight = plain.flight
     truth, tdoa = flight.truth, flight.tdoa
     p = np.stack([np.interp(tdoa.t, truth.t, truth.p[:, k]) for k in range(3)], axis=1)
-    at = flight.anchors.positions[flight.anchors.index(tdoa.b)], flight.anchors.positions[flight.anchors.index(tdoa.a)]
+    at = (
+        flight.anchors.positions[flight.anchors.index(tdoa.b)],
+        flight.anchors.positions[flight.anchors.index(tdoa.a)],
+    )
     residual = tdoa.d - (np.linalg.norm(p - at[0], axis=1) - np.linalg.norm(p - at[1], axis=1))
     assert np.std(residual) == pytest.approx(0.01, rel=0.05)
     assert len(tdoa) / (truth.t[-1] - truth.t[0]) == pytest.approx(360.0, rel=0.03)
@@ -61,7 +66,9 @@ def test_in_a_silence_nothing_is_heard_and_it_lands(silent):
     heard = silent.flight.tdoa.t
     gap = np.argmax(np.diff(heard))
     began = silent.missions[0].started + SHORT.rise + 4.0
-    assert heard[gap] == pytest.approx(began, abs=0.02) and heard[gap + 1] - heard[gap] == pytest.approx(3.0, abs=0.02)
+    assert heard[gap] == pytest.approx(began, abs=0.02) and heard[gap + 1] - heard[
+        gap
+    ] == pytest.approx(3.0, abs=0.02)
     assert verdict_of(silent)["safe"]
 
 
@@ -77,16 +84,23 @@ def test_an_effect_is_in_the_loop_what_inject_makes_of_it(plain):
     effect = parse_effect("nlos", ["2.delay=0.4", "2.start=1", "2.end=3"])
     rules = Rules(rest=3.5, patience=0.0, arm=1e-6)  # stays where it is
     task = Task(PERFECT, seed=3, told="place", path=SHORT, rules=rules)
-    without, with_it = fly(task).flight, fly(replace(task, world=replace(PERFECT, effects=EffectSet((effect,))))).flight
+    without, with_it = (
+        fly(task).flight,
+        fly(replace(task, world=replace(PERFECT, effects=EffectSet((effect,))))).flight,
+    )
     np.testing.assert_allclose(with_it.tdoa.d, effect.inject(without).tdoa.d, atol=1e-9)
     assert not np.array_equal(with_it.tdoa.d, without.tdoa.d)
 
 
 def test_after_a_minute_it_flies_once_more_from_where_it_was_carried():
-    flown = fly(Task(replace(PERFECT, outlier_share=0.01), seed=3, told="place", path=SHORT, again=True))
+    flown = fly(
+        Task(replace(PERFECT, outlier_share=0.01), seed=3, told="place", path=SHORT, again=True)
+    )
     first, second = flown.missions
     assert np.linalg.norm(first.place - second.place) == pytest.approx(2.0, abs=0.3)
-    assert second.begin - first.ended > 60.0 and second.started == pytest.approx(second.begin + 4.0, abs=0.02)
+    assert second.begin - first.ended > 60.0 and second.started == pytest.approx(
+        second.begin + 4.0, abs=0.02
+    )
     truth, imu = flown.flight.truth, flown.flight.imu
     carried = truth.p[(truth.t > second.begin - 6.0) & (truth.t < second.begin)]
     assert carried[:, 2].max() == pytest.approx(0.53, abs=0.02)
@@ -100,15 +114,24 @@ def test_after_a_minute_it_flies_once_more_from_where_it_was_carried():
 def test_it_is_flown_by_what_a_network_corrects():
     world, path = replace(PERFECT, antennas=True), Circles(turns=1, turn_time=4.0)
     models = None, "default"
-    plain, corrected = (verdict_of(fly(Task(world, seed=1, told="place", model=model, path=path))) for model in models)
+    plain, corrected = (
+        verdict_of(fly(Task(world, seed=1, told="place", model=model, path=path)))
+        for model in models
+    )
     assert corrected["landed"] and corrected["estimation"] < 0.9 * plain["estimation"]
 
 
-@pytest.mark.parametrize("name", ["table", "person", "three-kinds", "tdoa3", "jitter", "rectifying", "gusts"])
+@pytest.mark.parametrize(
+    "name", ["table", "person", "three-kinds", "tdoa3", "jitter", "rectifying", "gusts"]
+)
 def test_every_world_can_be_flown_in(name):
     world = replace(WORLDS[name], aids=("height", "pressure", "velocity"))
     flown = fly(Task(world, seed=1, path=Circles(turns=1, turn_time=2.0, radius=0.0), told="place"))
-    assert flown.missions[0].started is not None and len(flown.flight.height) and len(flown.flight.velocity)
+    assert (
+        flown.missions[0].started is not None
+        and len(flown.flight.height)
+        and len(flown.flight.velocity)
+    )
     assert flown.flight.truth.p[0, 2] == pytest.approx(world.table + 0.03, abs=0.005)
 
 
@@ -119,6 +142,12 @@ def test_near_the_floor_low_anchors_are_late_one_by_one():
     low = anchors.positions[:, 2] < 1.0
     p = flown.flight.truth.p[-1]
     a, b = anchors.index(tdoa.a), anchors.index(tdoa.b)
-    residual = tdoa.d - (np.linalg.norm(p - anchors.positions[b], axis=1) - np.linalg.norm(p - anchors.positions[a], axis=1))
-    late = [np.median(residual[(low[b] == of_b) & (low[a] == of_a)]) for of_b, of_a in ((True, False), (False, True))]
+    residual = tdoa.d - (
+        np.linalg.norm(p - anchors.positions[b], axis=1)
+        - np.linalg.norm(p - anchors.positions[a], axis=1)
+    )
+    late = [
+        np.median(residual[(low[b] == of_b) & (low[a] == of_a)])
+        for of_b, of_a in ((True, False), (False, True))
+    ]
     assert late[0] == pytest.approx(3.45, abs=0.5) and late[1] == pytest.approx(-3.45, abs=0.5)

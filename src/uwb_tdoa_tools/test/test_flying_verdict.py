@@ -15,7 +15,18 @@ T = np.arange(0.0, 20.0, 0.0025)
 UP, DOWN = 4.0, 14.0  # s, between which it is in the air
 
 
-def made_up(z=None, xy=(0.0, 0.0), tilt=0.0, off=0.1, deviation=0.1, sink=0.2, crash="", started=UP, ended=DOWN + 0.5, state=DONE):
+def made_up(
+    z=None,
+    xy=(0.0, 0.0),
+    tilt=0.0,
+    off=0.1,
+    deviation=0.1,
+    sink=0.2,
+    crash="",
+    started=UP,
+    ended=DOWN + 0.5,
+    state=DONE,
+):
     """A flight that goes straight up at UP and down at DOWN with so many m/s."""
     states = np.zeros((len(T), 17))
     height = np.clip(np.minimum(T - UP, (DOWN - T) * sink), 0.0, 1.2) if z is None else z
@@ -25,17 +36,36 @@ def made_up(z=None, xy=(0.0, 0.0), tilt=0.0, off=0.1, deviation=0.1, sink=0.2, c
     t = T[::2]
     p = states[::2, :3] + off / np.sqrt(3.0)
     odometry = Odometry(
-        t, p, np.zeros((len(t), 3)), np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1)), *np.zeros((2, len(t), 3)),
-        np.tile(deviation**2 * np.eye(9), (len(t), 1, 1)), np.zeros((len(t), 3, 3)),
-    )  # fmt: skip
+        t,
+        p,
+        np.zeros((len(t), 3)),
+        np.tile([0.0, 0.0, 0.0, 1.0], (len(t), 1)),
+        *np.zeros((2, len(t), 3)),
+        np.tile(deviation**2 * np.eye(9), (len(t), 1, 1)),
+        np.zeros((len(t), 3, 3)),
+    )
     mission = SimpleNamespace(
-        begin=0.0, started=started, ended=ended, lost=None, state=state, place=np.zeros(2), ground=0.0,
-        wanted=lambda stamps: np.column_stack([0.0 * stamps, 0.0 * stamps, np.interp(stamps, T, height)])[:, None] + [[[0.3, 0.0, 0.0]]],
-    )  # fmt: skip
+        begin=0.0,
+        started=started,
+        ended=ended,
+        lost=None,
+        state=state,
+        place=np.zeros(2),
+        ground=0.0,
+        wanted=lambda stamps: (
+            np.column_stack([0.0 * stamps, 0.0 * stamps, np.interp(stamps, T, height)])[:, None]
+            + [[[0.3, 0.0, 0.0]]]
+        ),
+    )
     return SimpleNamespace(
-        task=SimpleNamespace(seed=7, again=False), flight=SimpleNamespace(truth=Truth(T, states[:, :3], states[:, 6:10])), states=states,
-        contact=np.where(height <= 0.0, 4, 0), odometry=odometry, missions=[mission], crash=crash,
-    )  # fmt: skip
+        task=SimpleNamespace(seed=7, again=False),
+        flight=SimpleNamespace(truth=Truth(T, states[:, :3], states[:, 6:10])),
+        states=states,
+        contact=np.where(height <= 0.0, 4, 0),
+        odometry=odometry,
+        missions=[mission],
+        crash=crash,
+    )
 
 
 def test_a_good_flight_has_landed_and_its_figures_are_right():
@@ -43,7 +73,9 @@ def test_a_good_flight_has_landed_and_its_figures_are_right():
     assert verdict["landed"] and verdict["safe"] and verdict["why"] == "" and verdict["seed"] == 7
     assert verdict["touchdown"] == pytest.approx(0.2, abs=0.01) and verdict["place"] == 0.0
     assert verdict["tracking"] == pytest.approx(0.3) and verdict["estimation"] == pytest.approx(0.1)
-    assert verdict["armed_off"] == pytest.approx(0.1) and verdict["armed_deviations"] == pytest.approx(1.0 / np.sqrt(3.0))
+    assert verdict["armed_off"] == pytest.approx(0.1) and verdict[
+        "armed_deviations"
+    ] == pytest.approx(1.0 / np.sqrt(3.0))
     for phase in ("before", "lift_off", "air", "landing", "after"):
         assert verdict["phases"][phase]["nees"] == pytest.approx(1.0)
 
@@ -52,7 +84,9 @@ def test_an_estimate_that_is_no_number_is_none():
     flown = made_up()
     flown.odometry.p[flown.odometry.t > UP + 5.0] = np.nan
     verdict = verdict_of(flown)
-    assert [*verdict["phases"]] == ["before", "lift_off", "air"] and verdict["phases"]["air"]["rmse"] == pytest.approx(0.1)
+    assert [*verdict["phases"]] == ["before", "lift_off", "air"] and verdict["phases"]["air"][
+        "rmse"
+    ] == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize(
@@ -81,9 +115,22 @@ def test_the_estimate_is_judged_and_does_not_judge():
 
 
 def test_flights_are_summed_up():
-    verdicts = [verdict_of(made_up()), verdict_of(made_up(xy=(1.0, 0.0))), verdict_of(made_up(off=2.0))]
+    verdicts = [
+        verdict_of(made_up()),
+        verdict_of(made_up(xy=(1.0, 0.0))),
+        verdict_of(made_up(off=2.0)),
+    ]
     summed = summary(verdicts)
-    assert (summed["flights"], summed["landed"], summed["safe"], summed["why"]) == (3, 2, 3, {"landed elsewhere": 1})
+    assert (summed["flights"], summed["landed"], summed["safe"], summed["why"]) == (
+        3,
+        2,
+        3,
+        {"landed elsewhere": 1},
+    )
     assert summed["armed_beyond_three_deviations"] == 1
-    assert summed["armed_off"] == {"median": pytest.approx(0.1), "least": pytest.approx(0.1), "most": pytest.approx(2.0)}
+    assert summed["armed_off"] == {
+        "median": pytest.approx(0.1),
+        "least": pytest.approx(0.1),
+        "most": pytest.approx(2.0),
+    }
     assert "2 of 3 landed" in text(summed) and "1 landed elsewhere" in text(summed)

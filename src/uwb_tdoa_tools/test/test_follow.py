@@ -10,11 +10,12 @@ pytest.importorskip("uwb_tdoa_msgs.msg")
 from rclpy.serialization import serialize_message  # noqa: E402
 from sensor_msgs.msg import Imu, TimeReference  # noqa: E402
 from std_msgs.msg import Float64  # noqa: E402
+
 from uwb_tdoa_bias.foundation.errors import InputError  # noqa: E402
 from uwb_tdoa_ekf.ekf_parameters import PARAMETERS  # noqa: E402
 from uwb_tdoa_ekf.reorder_buffer import OF_AIDS, SILENT  # noqa: E402
-from uwb_tdoa_tools.live import follow  # noqa: E402
 from uwb_tdoa_msgs.msg import TdoaResidual  # noqa: E402
+from uwb_tdoa_tools.live import follow  # noqa: E402
 from uwb_tdoa_tools.live.follow import LEAD, Follower, is_stamped, stamp_of  # noqa: E402
 
 SECOND = 10**9
@@ -24,7 +25,9 @@ SECOND = 10**9
 def node():
     context = rclpy.Context()
     rclpy.init(context=context)
-    yield rclpy.create_node("player", context=context, enable_rosout=False, start_parameter_services=False)
+    yield rclpy.create_node(
+        "player", context=context, enable_rosout=False, start_parameter_services=False
+    )
     rclpy.shutdown(context=context)
 
 
@@ -101,12 +104,19 @@ def test_what_cannot_be_followed_is_named(node):
     with pytest.raises(InputError, match="nobody publishes /odometry"):
         Follower(node, "odometry")
     node.create_publisher(Float64, "number", 1)
-    with pytest.raises(InputError, match="std_msgs/msg/Float64: not installed, or without a header"):
+    with pytest.raises(
+        InputError, match="std_msgs/msg/Float64: not installed, or without a header"
+    ):
         Follower(node, "/number")
 
 
 def test_stamps_are_read_from_the_bytes():
-    assert is_stamped(Imu) and is_stamped(TimeReference) and not is_stamped(Float64) and not is_stamped(None)
+    assert (
+        is_stamped(Imu)
+        and is_stamped(TimeReference)
+        and not is_stamped(Float64)
+        and not is_stamped(None)
+    )
     message = Imu()
     message.header.stamp.sec, message.header.stamp.nanosec = -3, 999_999_999
     message.header.frame_id = "somewhere"
@@ -145,7 +155,8 @@ def play(follower, stamps):
 
 
 class Soon:
-    """True after 0.2 s in which it was asked often: on a loaded machine time may pass in which nobody does anything.
+    """True after 0.2 s in which it was asked often: on a loaded machine time may pass in which
+    nobody does anything.
     came : whether somebody was told so."""
 
     def __init__(self):

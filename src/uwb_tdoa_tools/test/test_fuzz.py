@@ -1,11 +1,21 @@
-"""Every reader on changed files: it returns or raises InputError. `./dev study fuzz` does the same for as long as one likes."""
+"""Every reader on changed files: it returns or raises InputError.
+
+`./dev study fuzz` does the same for as long as one likes.
+"""
 
 import random
 
 from fuzz import mutations, targets
 import pytest
 
-SLOW = {"bag_mcap_salvaged": 8, "bag_sqlite": 15, "bag_sqlite_salvaged": 8, "bag_metadata": 10, "bag_message": 30, "bag_packed": 8}
+SLOW = {
+    "bag_mcap_salvaged": 8,
+    "bag_sqlite": 15,
+    "bag_sqlite_salvaged": 8,
+    "bag_metadata": 10,
+    "bag_message": 30,
+    "bag_packed": 8,
+}
 EXAMPLES = 60
 
 
@@ -37,4 +47,6 @@ def test_any_bytes_are_read_or_refused(name):
 
 
 def test_the_corpus_is_small():
-    assert sum(path.stat().st_size for path in targets.CORPUS.rglob("*") if path.is_file()) < 200_000
+    assert (
+        sum(path.stat().st_size for path in targets.CORPUS.rglob("*") if path.is_file()) < 200_000
+    )

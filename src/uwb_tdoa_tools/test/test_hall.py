@@ -31,7 +31,8 @@ def hall(nx=11, ny=7, spacing=9.0):
     x, y = np.meshgrid((np.arange(nx) + 0.5) * spacing, (np.arange(ny) + 0.5) * spacing)
     z = np.where(rng.random(n) < 1.0 / 3.0, rng.uniform(0.4, 1.2, n), rng.uniform(2.5, 6.0, n))
     return Anchors.from_positions(
-        np.column_stack([x.ravel(), y.ravel(), z]) + np.append(rng.uniform(-1.0, 1.0, (n, 2)), np.zeros((n, 1)), axis=1)
+        np.column_stack([x.ravel(), y.ravel(), z])
+        + np.append(rng.uniform(-1.0, 1.0, (n, 2)), np.zeros((n, 1)), axis=1)
     )
 
 
@@ -55,20 +56,30 @@ def sound():
 @pytest.fixture(scope="module")
 def faulty(sound):
     late = EFFECTS["anchor_delay"]({str(LATE): 0.3}).inject(sound, np.random.default_rng(0))
-    return EFFECTS["anchor_position"]({f"{MOVED}.{axis}": value for axis, value in SHIFT.items()}).inject(late, np.random.default_rng(0))
+    return EFFECTS["anchor_position"](
+        {f"{MOVED}.{axis}": value for axis, value in SHIFT.items()}
+    ).inject(late, np.random.default_rng(0))
 
 
 @pytest.mark.slow
 def test_an_anchor_that_is_late_and_one_that_was_moved_are_named_and_nothing_else(faulty):
     assert len(hall()) > MANY
     of_tdoas = [
-        finding.effect for finding in diagnose([faulty]).findings if "tdoa" in finding.effect.channels
+        finding.effect
+        for finding in diagnose([faulty]).findings
+        if "tdoa" in finding.effect.channels
     ]  # the inertial sensor has errors of its own
-    found = {(effect.name, key): value for effect in of_tdoas for key, value in effect.values.items()}
+    found = {
+        (effect.name, key): value for effect in of_tdoas for key, value in effect.values.items()
+    }
     assert found.pop(("anchor_delay", str(LATE))) == pytest.approx(0.3, abs=0.03)
     shift = {key: found.pop(("anchor_position", f"{MOVED}.{key}"), 0.0) for key in "xyz"}
     assert all(shift[axis] == pytest.approx(SHIFT[axis], abs=0.06) for axis in "xy")
-    assert not [key for key in found if key[0].startswith("anchor") or key[0] in ("pair_offset", "nlos", "smooth_term")]
+    assert not [
+        key
+        for key in found
+        if key[0].startswith("anchor") or key[0] in ("pair_offset", "nlos", "smooth_term")
+    ]
 
 
 def test_columns_of_some_anchors_are_made_of_their_tdoas_alone(sound):
@@ -93,8 +104,14 @@ def test_columns_of_some_anchors_are_made_of_their_tdoas_alone(sound):
 def test_what_a_survey_asks_of_single_anchors_is_made_of_their_tdoas_alone(sound):
     samples = residuals(sound, GroundTruth(), EffectSet())["tdoa"].samples
     ids = [str(i) for i in samples.anchors.ids]
-    for effect, keys in (EFFECTS["anchor_delay"](), ids), (EFFECTS["anchor_position"](), [f"{i}.{axis}" for i in ids[30:50] for axis in "xyz"]):
-        np.testing.assert_array_equal(_sparse(effect, samples, keys).toarray(), np.nan_to_num(effect.regressors(samples, keys)))
+    for effect, keys in (
+        (EFFECTS["anchor_delay"](), ids),
+        (EFFECTS["anchor_position"](), [f"{i}.{axis}" for i in ids[30:50] for axis in "xyz"]),
+    ):
+        np.testing.assert_array_equal(
+            _sparse(effect, samples, keys).toarray(),
+            np.nan_to_num(effect.regressors(samples, keys)),
+        )
 
 
 @pytest.mark.slow
@@ -115,10 +132,25 @@ def test_an_anchor_that_stands_apart_from_the_others_is_named_even_if_the_tape_a
     covariance = np.diag(np.full(4 * len(given), 0.01**2))
     covariance[:3, :3] = 0.1**2 * np.eye(3)  # one that was never heard
     found = SelfCalibration(
-        given, Prior.of(given, np.full((len(given), 3), 0.1)), ("flight",), EffectSet(), given.at(given.positions + shifts),
-        np.zeros(len(given)), Solution(0.0, np.zeros(len(covariance)), covariance, 0.003), 100.0, 0.05, 0.02, 0.2, (), None, 0, {},
-    )  # fmt: skip
-    assert apart(found) == [MOVED] and f"anchor {MOVED} does not stand where it was given" in as_text(found)
+        given,
+        Prior.of(given, np.full((len(given), 3), 0.1)),
+        ("flight",),
+        EffectSet(),
+        given.at(given.positions + shifts),
+        np.zeros(len(given)),
+        Solution(0.0, np.zeros(len(covariance)), covariance, 0.003),
+        100.0,
+        0.05,
+        0.02,
+        0.2,
+        (),
+        None,
+        0,
+        {},
+    )
+    assert apart(found) == [
+        MOVED
+    ] and f"anchor {MOVED} does not stand where it was given" in as_text(found)
     still = np.delete(shifts, MOVED, axis=0)[[*range(MOVED), 0, *range(MOVED, len(given) - 1)]]
     assert not apart(replace(found, surveyed=given.at(given.positions + still)))
 
@@ -126,14 +158,23 @@ def test_an_anchor_that_stands_apart_from_the_others_is_named_even_if_the_tape_a
 def test_check_tries_few_exchanges_of_ids_in_a_hall(sound, monkeypatch):
     runs, whole = [], OrderedRecording.of(of_flight(sound))
     brief, judged = whole.part(SHORT), OrderedRecording.unexplained
-    monkeypatch.setattr(OrderedRecording, "unexplained", lambda recording, *limit: runs.append(recording) or judged(recording, *limit))
+    monkeypatch.setattr(
+        OrderedRecording,
+        "unexplained",
+        lambda recording, *limit: runs.append(recording) or judged(recording, *limit),
+    )
     assert not list(tdoa_rules.swapped(whole)) and not runs
     ids, times = np.unique(np.concatenate([brief.tdoa.a, brief.tdoa.b]), return_counts=True)
     one, two = ids[np.argsort(-times)][[0, 5]].tolist()
     swap = {one: two, two: one}
-    a, b = (np.array([swap.get(int(i), int(i)) for i in column]) for column in (whole.tdoa.a, whole.tdoa.b))
+    a, b = (
+        np.array([swap.get(int(i), int(i)) for i in column])
+        for column in (whole.tdoa.a, whole.tdoa.b)
+    )
     (trial,) = tdoa_rules.swapped(whole.with_tdoa(a=a, b=b))
-    assert trial.finding(0.5, 5.0).cause.endswith(f"{min(one, two)} is {max(one, two)}, {max(one, two)} is {min(one, two)}")
+    assert trial.finding(0.5, 5.0).cause.endswith(
+        f"{min(one, two)} is {max(one, two)}, {max(one, two)} is {min(one, two)}"
+    )
     assert len(runs) < 0.5 * len(hall()) ** 2 / 2.0
 
 
@@ -142,7 +183,9 @@ def test_a_fast_tag_does_not_speak_against_the_survey():
     config = SimulationConfig(**hears, duration=180.0, speed=4.0, imu_rate=100.0, seed=2)
     fit = OrderedRecording.of(of_flight(simulate(config))).survey_fit
     assert len(fit) > tdoa_rules.FEWEST and tdoa_rules.gained(fit) is None
-    assert fit._loss(fit._start, fit.positions) - fit.solve()[0] > tdoa_rules.GAIN  # it would, from where a start puts the tag
+    assert (
+        fit._loss(fit._start, fit.positions) - fit.solve()[0] > tdoa_rules.GAIN
+    )  # it would, from where a start puts the tag
 
 
 def test_a_hall_is_no_plane_unless_those_that_are_heard_together_lie_in_one(sound):
@@ -162,15 +205,23 @@ def test_tdoas_that_are_late_in_a_hall_are_found_and_others_are_not(sound, late,
 
 
 def test_check_says_in_one_line_who_is_not_heard_in_a_hall(sound):
-    found = [finding for finding in check(of_flight(sound)).findings if finding.rule.startswith("anchor_")]
+    found = [
+        finding
+        for finding in check(of_flight(sound)).findings
+        if finding.rule.startswith("anchor_")
+    ]
     heard = np.unique(np.concatenate([sound.tdoa.a, sound.tdoa.b]))
-    assert [finding.rule for finding in found] == (["anchor_missing"] if len(heard) < len(hall()) else [])
+    assert [finding.rule for finding in found] == (
+        ["anchor_missing"] if len(heard) < len(hall()) else []
+    )
 
 
 def test_ids_that_are_exchanged_in_a_hall_are_found(sound):
     of = sound.tdoa
     swap = {38: 49, 49: 38}
     a, b = (np.array([swap.get(int(i), int(i)) for i in ids]) for ids in (of.a, of.b))
-    path = KnownPath(type(sound)(sound.name, sound.anchors, type(of)(of.t, a, b, of.d), truth=sound.truth))
+    path = KnownPath(
+        type(sound)(sound.name, sound.anchors, type(of)(of.t, a, b, of.d), truth=sound.truth)
+    )
     assert pair_rules.renamed(path)[0] == swap
     assert not pair_rules.renamed(KnownPath(sound))[0]

@@ -7,8 +7,8 @@ from uwb_tdoa_bias.foundation.sensors import DIAGNOSED
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands.inject import main
 from uwb_tdoa_tools.readers import read_flight
-from uwb_tdoa_tools.simulation.inject import parse_effect
 from uwb_tdoa_tools.simulation import NO_IMU_ERRORS, SimulationConfig, simulate
+from uwb_tdoa_tools.simulation.inject import parse_effect
 
 
 @pytest.fixture(scope="module")
@@ -42,8 +42,16 @@ def example(effect):
 def test_injected_effect_is_what_the_model_takes_out(flight, effect):
     effect = example(effect)
     changed = effect.inject(flight, np.random.default_rng(1))
-    streams = [(flight.tdoa.t, changed.tdoa.t), (flight.tdoa.d, changed.tdoa.d), (flight.truth.t, changed.truth.t)]
-    streams += [(flight.tdoa.a, changed.tdoa.a), (flight.imu.gyro, changed.imu.gyro), (flight.imu.accel, changed.imu.accel)]
+    streams = [
+        (flight.tdoa.t, changed.tdoa.t),
+        (flight.tdoa.d, changed.tdoa.d),
+        (flight.truth.t, changed.truth.t),
+    ]
+    streams += [
+        (flight.tdoa.a, changed.tdoa.a),
+        (flight.imu.gyro, changed.imu.gyro),
+        (flight.imu.accel, changed.imu.accel),
+    ]
     streams += [(getattr(flight, name).t, getattr(changed, name).t) for name in DIAGNOSED]
     streams += [(getattr(flight, name).values, getattr(changed, name).values) for name in DIAGNOSED]
     assert any(not np.array_equal(before, after) for before, after in streams)
@@ -64,7 +72,10 @@ def test_noise_has_the_size_asked_for(flight):
     noisy = parse_effect("noise_level", ["0-1=0.2"]).inject(flight, rng).tdoa.d - flight.tdoa.d
     pair = (flight.tdoa.a == 0) & (flight.tdoa.b == 1)
     assert np.std(noisy[pair]) == pytest.approx(0.2, rel=0.1) and (noisy[~pair] == 0.0).all()
-    slow = parse_effect("noise_correlation", ["std=0.1", "time=0.5"]).inject(flight, rng).tdoa.d - flight.tdoa.d
+    slow = (
+        parse_effect("noise_correlation", ["std=0.1", "time=0.5"]).inject(flight, rng).tdoa.d
+        - flight.tdoa.d
+    )
     assert np.std(slow) == pytest.approx(0.1 * np.sqrt(2.0), rel=0.3)
     wrong = parse_effect("outlier_rate", ["0.1"]).inject(flight, rng).tdoa.d != flight.tdoa.d
     assert np.mean(wrong) == pytest.approx(0.1, rel=0.2)
@@ -72,10 +83,20 @@ def test_noise_has_the_size_asked_for(flight):
 
 def test_executable_writes_the_bag(flight, tmp_path, capsys):
     write_bag(flight, tmp_path / "in")
-    arguments = [str(tmp_path / "in"), "--effect", "anchor_delay", "--value", "3=0.3", "--out", str(tmp_path / "out")]
+    arguments = [
+        str(tmp_path / "in"),
+        "--effect",
+        "anchor_delay",
+        "--value",
+        "3=0.3",
+        "--out",
+        str(tmp_path / "out"),
+    ]
     assert main(arguments) == 0
     added = read_flight(tmp_path / "out").tdoa.d - flight.tdoa.d
-    np.testing.assert_allclose(added, 0.3 * (flight.tdoa.b == 3) - 0.3 * (flight.tdoa.a == 3), atol=1e-6)
+    np.testing.assert_allclose(
+        added, 0.3 * (flight.tdoa.b == 3) - 0.3 * (flight.tdoa.a == 3), atol=1e-6
+    )
     assert main(arguments) == 2 and "exists" in capsys.readouterr().err
 
 

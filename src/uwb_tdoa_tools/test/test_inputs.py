@@ -21,8 +21,8 @@ from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.bags.files import messages, new_bag, open_bag
 from uwb_tdoa_tools.bags.message_types import typestore
 from uwb_tdoa_tools.readers import inputs, read_flight
-from uwb_tdoa_tools.readers.names import read_named
 from uwb_tdoa_tools.readers.inputs import Reading, find_flights, need_tdoas, survey_for
+from uwb_tdoa_tools.readers.names import read_named
 
 
 def make(folder, *names):
@@ -34,7 +34,13 @@ def make(folder, *names):
 @pytest.fixture
 def surveys(tmp_path):
     folder = tmp_path / "surveys"
-    make(folder, *(f"anchor_{key}" for key in ("0422.txt", "0425.txt", "const1.csv", "const10.csv", "const3.csv")))
+    make(
+        folder,
+        *(
+            f"anchor_{key}"
+            for key in ("0422.txt", "0425.txt", "const1.csv", "const10.csv", "const3.csv")
+        ),
+    )
     return folder
 
 
@@ -46,11 +52,16 @@ def surveys(tmp_path):
         ("0422/log00", "anchor_0422.txt"),  # the folder names it
         ("backup-0422/flights/0425/traj1", "anchor_0425.txt"),  # what is said last is meant
         ("util/const1-trial1-tdoa2.csv.gz", "anchor_const1.csv"),
-        ("util/const10-trial1-tdoa2.csv.gz", "anchor_const10.csv"),  # the longer key is the better fit
+        (
+            "util/const10-trial1-tdoa2.csv.gz",
+            "anchor_const10.csv",
+        ),  # the longer key is the better fit
         ("util/const3-trial2-tdoa3-traj1.csv", "anchor_const3.csv"),
     ],
 )
-def test_a_folder_of_surveys_serves_the_recordings_whose_path_has_the_key(tmp_path, surveys, recording, survey):
+def test_a_folder_of_surveys_serves_the_recordings_whose_path_has_the_key(
+    tmp_path, surveys, recording, survey
+):
     assert survey_for(tmp_path / recording, surveys) == surveys / survey
 
 
@@ -81,14 +92,24 @@ def test_folders_are_searched_in_order_and_hidden_files_left_out(tmp_path):
     make(tmp_path / "b", "2", "1", "deep/er/0", ".hidden", ".cache/x")
     make(tmp_path / "a", "9")
     found = find_flights([tmp_path / "b", tmp_path / "a"])
-    assert [str(path.relative_to(tmp_path)) for path, _ in found] == ["b/1", "b/2", "b/deep/er/0", "a/9"]
+    assert [str(path.relative_to(tmp_path)) for path, _ in found] == [
+        "b/1",
+        "b/2",
+        "b/deep/er/0",
+        "a/9",
+    ]
     assert [survey for _, survey in found] == [None] * 4
 
 
-def test_a_bag_that_no_survey_of_a_folder_fits_keeps_its_own_anchors_and_says_so(tmp_path, surveys, capsys, monkeypatch):
+def test_a_bag_that_no_survey_of_a_folder_fits_keeps_its_own_anchors_and_says_so(
+    tmp_path, surveys, capsys, monkeypatch
+):
     monkeypatch.setattr(inputs, "_REPORTED", set())  # of what ran before in this process
     make(tmp_path / "flights", "bag1/metadata.yaml", "bag1/bag1_0.mcap", "0422-log")
-    for name, magic in (("loose.mcap", b"\x89MCAP0\r\n"), ("old", b"SQLite format 3\0")):  # a bag by what is in it, not by its name
+    for name, magic in (
+        ("loose.mcap", b"\x89MCAP0\r\n"),
+        ("old", b"SQLite format 3\0"),
+    ):  # a bag by what is in it, not by its name
         (tmp_path / "flights" / name).write_bytes(magic)
     found = find_flights([str(tmp_path / "flights")], surveys)
     assert [(path.name, survey and survey.name) for path, survey in found] == [
@@ -101,7 +122,9 @@ def test_a_bag_that_no_survey_of_a_folder_fits_keeps_its_own_anchors_and_says_so
     said = capsys.readouterr().err
     assert said.count("fits; the anchors that it holds count") == 1 == len(said.splitlines())
     make(tmp_path / "flights", "0422/bag/metadata.yaml")
-    assert find_flights([tmp_path / "flights" / "0422"], surveys)[0][1] == surveys / "anchor_0422.txt"
+    assert (
+        find_flights([tmp_path / "flights" / "0422"], surveys)[0][1] == surveys / "anchor_0422.txt"
+    )
 
 
 def test_nothing_there_is_bad_input(tmp_path):
@@ -132,7 +155,9 @@ def test_of_more_flights_than_are_to_be_held_some_are_drawn(tmp_path, capsys, mo
     assert [flight.name for flight in reading.flights(paths, 18)] == names
     assert not capsys.readouterr().err
     read, read_one = [], Reading.read
-    monkeypatch.setattr(Reading, "read", lambda self, recording: read.append(recording) or read_one(self, recording))
+    monkeypatch.setattr(
+        Reading, "read", lambda self, recording: read.append(recording) or read_one(self, recording)
+    )
     drawn = [flight.name for flight in reading.flights(paths, 7)]
     assert len(drawn) == 3 and drawn == sorted(drawn) and set(drawn) < set(names) and len(read) == 4
     assert "3 of 9 flights, drawn at random, are taken" in capsys.readouterr().err
@@ -152,10 +177,16 @@ def test_what_is_missing_in_a_recording_is_told(tmp_path, capsys):
 def test_every_measured_recording_finds_its_survey(shared_data):
     folders = [shared_data / "flights", shared_data / "util"]
     found = find_flights(folders, shared_data / "surveys")
-    assert {path for path, _ in found} == {file for folder in folders for file in folder.rglob("*") if file.is_file()}
+    assert {path for path, _ in found} == {
+        file for folder in folders for file in folder.rglob("*") if file.is_file()
+    }
     for path, survey in found:
         key = survey.stem.removeprefix("anchor_")
-        day = path.relative_to(shared_data / "flights").parts[0] if "flights" in path.parts else path.name.split("-")[0]
+        day = (
+            path.relative_to(shared_data / "flights").parts[0]
+            if "flights" in path.parts
+            else path.name.split("-")[0]
+        )
         assert key == day
 
 
@@ -163,8 +194,12 @@ def test_a_bag_without_anchors_takes_the_survey_that_is_given(tmp_path):
     flight = small_flight()
     write_bag(flight, tmp_path / "whole")
     with open_bag(tmp_path / "whole") as reader, new_bag(tmp_path / "bag") as writer:
-        there = [connection for connection in reader.connections if connection.topic != "/uwb/anchors"]
-        to = {c.topic: writer.add_connection(c.topic, c.msgtype, typestore=typestore()) for c in there}
+        there = [
+            connection for connection in reader.connections if connection.topic != "/uwb/anchors"
+        ]
+        to = {
+            c.topic: writer.add_connection(c.topic, c.msgtype, typestore=typestore()) for c in there
+        }
         for connection, stamp, data in messages(tmp_path / "whole", reader, there):
             writer.write(to[connection.topic], stamp, data)
     (tmp_path / "survey.csv").write_text(SURVEY)
@@ -175,7 +210,9 @@ def test_a_bag_without_anchors_takes_the_survey_that_is_given(tmp_path):
         Reading().read((tmp_path / "bag", None))
 
 
-def test_a_survey_that_is_given_counts_whatever_anchors_a_bag_holds_and_that_is_said_once(tmp_path, capsys):
+def test_a_survey_that_is_given_counts_whatever_anchors_a_bag_holds_and_that_is_said_once(
+    tmp_path, capsys
+):
     for name in ("one", "two"):
         write_bag(small_flight(), tmp_path / name)
     survey = tmp_path / "survey.csv"
@@ -184,7 +221,9 @@ def test_a_survey_that_is_given_counts_whatever_anchors_a_bag_holds_and_that_is_
     assert [flight.anchors.positions[0, 0] for flight in reading.flights(bags)] == [0.5, 0.5]
     assert [reading.one(bag).anchors.positions[0, 0] for bag in bags] == [0.5, 0.5]
     assert [flight.anchors.positions[0, 0] for flight in Reading().flights(bags)] == [0.1, 0.1]
-    said = [line for line in capsys.readouterr().err.splitlines() if " flights done, " not in line]  # as a slow computer says
+    said = [
+        line for line in capsys.readouterr().err.splitlines() if " flights done, " not in line
+    ]  # as a slow computer says
     assert len(said) == 1 and f"the anchors of {survey} count here" in said[0]
 
 
@@ -194,7 +233,9 @@ def test_topics_of_bags_are_refused_where_there_is_no_bag(tmp_path, given):
     (tmp_path / "survey.csv").write_text(SURVEY)
     reading = Reading(tmp_path / "survey.csv", **given)
     for read in (reading.one, lambda path: reading.find([path])):
-        with pytest.raises(InputError, match="says where topics are in bags, and .*log is none; leave it out"):
+        with pytest.raises(
+            InputError, match="says where topics are in bags, and .*log is none; leave it out"
+        ):
             read(tmp_path / "log")
 
 
@@ -249,7 +290,10 @@ def test_folders_within_folders_have_a_limit(tmp_path):
         find_flights([tmp_path], "survey.txt")
 
 
-@pytest.mark.parametrize("read", [read_survey, read_yaml, read_bytes, lambda path: read_arrays(path, {}, "map", "make it anew")])
+@pytest.mark.parametrize(
+    "read",
+    [read_survey, read_yaml, read_bytes, lambda path: read_arrays(path, {}, "map", "make it anew")],
+)
 @pytest.mark.parametrize("what", ["pipe", "device"])
 def test_a_pipe_is_refused_at_once(tmp_path, read, what):
     os.mkfifo(tmp_path / "pipe")
@@ -271,7 +315,12 @@ def test_a_folder_that_a_killed_process_left_is_removed_by_the_next(tmp_path, mo
         "from uwb_tdoa_bias.foundation.files import temporary_folder\n"
         "with temporary_folder() as folder: print(folder, flush=True); sys.stdin.read()"
     )
-    killed = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    killed = subprocess.Popen(
+        [sys.executable, "-c", code, str(tmp_path)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
     left = Path(killed.stdout.readline().strip())
     old = time.time() - 3600.0
     os.utime(left, (old, old))
@@ -283,7 +332,9 @@ def test_a_folder_that_a_killed_process_left_is_removed_by_the_next(tmp_path, mo
         assert not left.exists() and own.is_dir()
 
 
-@pytest.mark.parametrize("position", ["[1, 2an, 3]", "[1, [2], 3]", "[1, {a: 1}, 3]", "x", "~", "{x: 1}", "[]"])
+@pytest.mark.parametrize(
+    "position", ["[1, 2an, 3]", "[1, [2], 3]", "[1, {a: 1}, 3]", "x", "~", "{x: 1}", "[]"]
+)
 @pytest.mark.parametrize("name", ["0", "NE corner"])
 def test_a_position_that_is_no_numbers_is_refused(tmp_path, name, position):
     (tmp_path / "survey.yaml").write_text(f"anchors: {{{name}: {{position: {position}}}}}\n")

@@ -1,7 +1,9 @@
-"""The layout of the packages, read from their sources: who imports whom, and what is declared as a dependency."""
+"""The layout of the packages, read from their sources: who imports whom, and what is declared as a
+dependency.
+"""
 
 import ast
-from functools import lru_cache
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 import re
@@ -11,7 +13,12 @@ from xml.etree import ElementTree
 import pytest
 
 SRC = Path(__file__).resolve().parents[2]
-ORDER = ("uwb_tdoa_msgs", "uwb_tdoa_bias", "uwb_tdoa_ekf", "uwb_tdoa_tools")  # imports go to the left
+ORDER = (
+    "uwb_tdoa_msgs",
+    "uwb_tdoa_bias",
+    "uwb_tdoa_ekf",
+    "uwb_tdoa_tools",
+)  # imports go to the left
 PACKAGES = ORDER[1:]
 # Who talks ROS. Everything else can be imported and tested without it.
 ROS = """
@@ -33,7 +40,8 @@ ROS = """
     uwb_tdoa_tools.flying.over_topics uwb_tdoa_tools.live.run uwb_tdoa_tools.live.session uwb_tdoa_tools.vehicle_node
 """.split()
 IS_ROS = re.compile(r"rclpy|\w+_msgs|\w+_interfaces|domain_coordinator|ament_index_python")
-# import name: (rosdep key, name on the Python package index); ROS packages are imported under their own name
+# import name: (rosdep key, name on the Python package index); ROS packages are imported under their
+# own name
 KEYS = {
     "PIL": ("python3-pil", "Pillow"),
     "backports": (None, "backports.zstd"),  # comes with rosbags, as lz4 does
@@ -57,11 +65,15 @@ KEYS = {
     "tqdm": ("python3-tqdm", "tqdm"),
     "yaml": ("python3-yaml", "PyYAML"),
 }
-STARTED = {"uwb_tdoa_ekf": {"ros2bag", "ros2launch", "rviz2"}}  # by launch files, and what starts these
-RUNNERS = {"ament_flake8", "ament_pep257", "python3-pytest-xdist"}  # of the tests, which import them not, or where they are
+STARTED = {
+    "uwb_tdoa_ekf": {"ros2bag", "ros2launch", "rviz2"}
+}  # by launch files, and what starts these
+RUNNERS = {
+    "python3-pytest-xdist",
+}  # of the tests, which import them not, or where they are
 
 
-@lru_cache(maxsize=None)
+@cache
 def modules():
     """{module: path} of all our packages."""
     found = {}
@@ -72,7 +84,7 @@ def modules():
     return found
 
 
-@lru_cache(maxsize=None)
+@cache
 def imports(module, top_only=False):
     """Full names of what a module imports: modules of ours, and top-level names of others."""
     path = modules()[module]
@@ -85,7 +97,11 @@ def imports(module, top_only=False):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            base = ".".join(package.split(".")[: len(package.split(".")) + 1 - node.level]) if node.level else ""
+            base = (
+                ".".join(package.split(".")[: len(package.split(".")) + 1 - node.level])
+                if node.level
+                else ""
+            )
             base = ".".join(part for part in (base, node.module) if part)
             for alias in node.names:
                 inner = f"{base}.{alias.name}"
@@ -108,13 +124,17 @@ def test_the_walk_sees_what_there_is():
 def test_no_library_imports_a_command():
     for module in modules():
         if not module.startswith("uwb_tdoa_tools.commands."):
-            assert not {name for name in imports(module) if name.startswith("uwb_tdoa_tools.commands")}, module
+            assert not {
+                name for name in imports(module) if name.startswith("uwb_tdoa_tools.commands")
+            }, module
 
 
 def test_no_command_imports_another():
     for module in modules():
         if module.startswith("uwb_tdoa_tools.commands."):
-            assert not {name for name in imports(module) if name.startswith("uwb_tdoa_tools.commands")}, module
+            assert not {
+                name for name in imports(module) if name.startswith("uwb_tdoa_tools.commands")
+            }, module
 
 
 def test_no_package_imports_one_above():
@@ -122,12 +142,16 @@ def test_no_package_imports_one_above():
         for name in imports(module):
             package = name.partition(".")[0]
             if package in ORDER:
-                assert ORDER.index(package) <= ORDER.index(module.partition(".")[0]), f"{module} imports {name}"
+                assert ORDER.index(package) <= ORDER.index(module.partition(".")[0]), (
+                    f"{module} imports {name}"
+                )
 
 
 def test_files_are_on_floors():
     """No file needs itself by others, neither for what it runs nor for its types."""
-    TopologicalSorter({module: ours(module) - {module} for module in modules()}).prepare()  # raises CycleError, which names the circle
+    TopologicalSorter(
+        {module: ours(module) - {module} for module in modules()}
+    ).prepare()  # raises CycleError, which names the circle
 
 
 def test_folders_are_on_floors():
@@ -159,7 +183,9 @@ def test_nothing_imports_studies_and_they_import_no_command():
     for path in files:
         assert not re.search(r"^\s*(from|import) studies\b", path.read_text(), re.MULTILINE), path
     for path in studies:
-        assert not re.search(r"^\s*(from|import) uwb_tdoa_tools\.commands\b", path.read_text(), re.MULTILINE), path
+        assert not re.search(
+            r"^\s*(from|import) uwb_tdoa_tools\.commands\b", path.read_text(), re.MULTILINE
+        ), path
     for package in PACKAGES:
         assert "studies" not in (SRC / package / "setup.py").read_text()
 
@@ -172,7 +198,9 @@ def way_to_ros(module):
         for name in imports(way[-1], True):
             if IS_ROS.fullmatch(name.partition(".")[0]):
                 return " imports ".join((*way, name))
-            parents = {name.rsplit(".", k)[0] for k in range(name.count(".") + 1)}  # importing it runs their __init__
+            parents = {
+                name.rsplit(".", k)[0] for k in range(name.count(".") + 1)
+            }  # importing it runs their __init__
             for other in (parents & modules().keys()) - seen:
                 seen.add(other)
                 waiting.append((*way, other))
@@ -186,15 +214,23 @@ def test_ros_is_imported_by_those_who_talk_it_and_nobody_else(module):
 
 def names_of_messages(package):
     """Packages of the message types that are named as text, and become classes when a program runs."""
-    texts = "".join(path.read_text() for path in modules().values() if path.is_relative_to(SRC / package))
+    texts = "".join(
+        path.read_text() for path in modules().values() if path.is_relative_to(SRC / package)
+    )
     return set(re.findall(r'"(\w+)/msg/\w+"', texts)) - {"pkg", package}  # in a docstring
 
 
 def needed(package, *folders):
-    """Top-level names, not of ours and not of Python, that the files in some folders of a package import."""
+    """Top-level names, not of ours and not of Python, that the files in some folders of a package
+    import.
+    """
     names = set()
     for folder in folders:
-        local = {path.stem for path in (SRC / package / folder).rglob("*.py")} if folder != package else set()
+        local = (
+            {path.stem for path in (SRC / package / folder).rglob("*.py")}
+            if folder != package
+            else set()
+        )
         for path in (SRC / package / folder).rglob("*.py"):
             for node in ast.walk(ast.parse(path.read_text())):
                 if isinstance(node, ast.Import):
@@ -202,7 +238,9 @@ def needed(package, *folders):
                 elif isinstance(node, ast.ImportFrom) and not node.level:
                     names.add(node.module.partition(".")[0])
         names -= local
-    beside = {path.stem for other in PACKAGES for path in (SRC / other / "test").iterdir()}  # helpers of tests
+    beside = {
+        path.stem for other in PACKAGES for path in (SRC / other / "test").iterdir()
+    }  # helpers of tests
     return names - set(sys.stdlib_module_names) - beside - {package, "setuptools", "compression"}
 
 
@@ -232,17 +270,26 @@ def test_setup_py_declares_what_is_imported_and_nothing_else(package):
     extras = ast.literal_eval(given["extras_require"])
     tests = {re.match(r"[\w.-]+", text)[0] for text in extras.pop("test")}
     assert tests == {"hypothesis", "pytest"} <= needed(package, "test")
-    oracle = {re.match(r"[\w.-]+", text)[0] for text in extras.pop("oracle", ())}  # of tests that are skipped without it
+    oracle = {
+        re.match(r"[\w.-]+", text)[0] for text in extras.pop("oracle", ())
+    }  # of tests that are skipped without it
     assert oracle <= needed(package, "test")
-    required = [*ast.literal_eval(given["install_requires"]), *(text for some in extras.values() for text in some)]
+    required = [
+        *ast.literal_eval(given["install_requires"]),
+        *(text for some in extras.values() for text in some),
+    ]
     names = {re.match(r"[\w.-]+", text)[0] for text in required} - {"setuptools"}
     imported = needed(package, package)
-    assert names == {KEYS[name][1] for name in imported if name in KEYS} | (imported & set(PACKAGES))
+    assert names == {KEYS[name][1] for name in imported if name in KEYS} | (
+        imported & set(PACKAGES)
+    )
 
 
 def test_messages_declare_what_they_are_made_of():
     texts = "".join(path.read_text() for path in (SRC / "uwb_tdoa_msgs").glob("*/*"))
-    assert declared("uwb_tdoa_msgs", "depend") == set(re.findall(r"^(\w+)/\w+", texts, flags=re.MULTILINE))
+    assert declared("uwb_tdoa_msgs", "depend") == set(
+        re.findall(r"^(\w+)/\w+", texts, flags=re.MULTILINE)
+    )
 
 
 @pytest.mark.parametrize("package", PACKAGES)
@@ -251,7 +298,9 @@ def test_every_executable_starts_behind_an_entry_point_of_its_name(package):
     points = re.findall(r'"(\w+) = ([\w.]+):(\w+)"', text)
     assert points
     started = (SRC / package / package / "executables.py").read_text()
-    entries = dict(re.findall(r'^(\w+) = (?:node_)?executable\("([\w.]+)"\)$', started, re.MULTILINE))
+    entries = dict(
+        re.findall(r'^(\w+) = (?:node_)?executable\("([\w.]+)"\)$', started, re.MULTILINE)
+    )
     assert {name for name, _, _ in points} == set(entries)
     for name, module, attribute in points:
         assert (module, attribute) == (f"{package}.executables", name)
@@ -261,17 +310,29 @@ def test_every_executable_starts_behind_an_entry_point_of_its_name(package):
         assert set(entries.values()) == commands | {"uwb_tdoa_tools.vehicle_node"}
 
 
-@pytest.mark.parametrize("module", [name for name in modules() if name.startswith("uwb_tdoa_tools.commands.")])
+@pytest.mark.parametrize(
+    "module", [name for name in modules() if name.startswith("uwb_tdoa_tools.commands.")]
+)
 def test_commands_are_thin(module):
     text = modules()[module].read_text()
     body = ast.parse(text).body
     functions = {node.name for node in body if isinstance(node, ast.FunctionDef)}
-    assert "parser" in functions and re.search(r'\nmain = cli.executable\(.*\)\n\nif __name__ == "__main__":\n    sys.exit\(main\(\)\)\n$', text)
+    assert "parser" in functions and re.search(
+        r'\nmain = cli.executable\(.*\)\n\nif __name__ == "__main__":\n    sys.exit\(main\(\)\)\n$',
+        text,
+    )
     imported = [
-        node for node in body if isinstance(node, (ast.Import, ast.ImportFrom)) or ast.unparse(node).startswith("if TYPE_CHECKING:")
+        node
+        for node in body
+        if isinstance(node, (ast.Import, ast.ImportFrom))
+        or ast.unparse(node).startswith("if TYPE_CHECKING:")
     ]
-    assert len(text.splitlines()) - sum(node.end_lineno - node.lineno + 1 for node in imported) <= 118
-    assert not re.search(r"(?<!\w)print\(|tqdm\.write", text)  # cli.show and cli.say make text of others printable
+    assert (
+        len(text.splitlines()) - sum(node.end_lineno - node.lineno + 1 for node in imported) <= 118
+    )
+    assert not re.search(
+        r"(?<!\w)print\(|tqdm\.write", text
+    )  # cli.show and cli.say make text of others printable
 
 
 def test_the_way_of_a_tdoa_is_as_documented():
@@ -280,10 +341,15 @@ def test_the_way_of_a_tdoa_is_as_documented():
     section = text.split("## One TDOA, from topic to odometry")[1].split("\n## ")[0]
     rows = re.findall(r"^\|.*\| `([\w/]+\.py)` \| (.*) \|$", section, re.MULTILINE)
     for file, names in rows:
-        (path,) = (path for package in PACKAGES[:2] if (path := SRC / package / package / file).exists())
+        (path,) = (
+            path for package in PACKAGES[:2] if (path := SRC / package / package / file).exists()
+        )
         source = path.read_text()
         for name in re.findall(r"`(\w+)(?:\.(\w+))?`", names):
             kind = "class" if name[1] else "def"
             assert re.search(rf"^\s*{kind} {name[0]}\b", source, re.MULTILINE), (file, name)
-            assert not name[1] or re.search(rf"^    def {name[1]}\b", source, re.MULTILINE), (file, name)
+            assert not name[1] or re.search(rf"^    def {name[1]}\b", source, re.MULTILINE), (
+                file,
+                name,
+            )
     assert len(rows) > 20

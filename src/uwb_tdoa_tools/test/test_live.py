@@ -24,7 +24,10 @@ def test_what_is_replayed_is_waited_for():
 
 
 def test_tdoas_that_wait_in_either_node_are_not_lost():
-    ekf = {**dict.fromkeys((*VERDICTS.values(), "imu_late", "waiting"), "1"), "IMU samples received": "4"}
+    ekf = {
+        **dict.fromkeys((*VERDICTS.values(), "imu_late", "waiting"), "1"),
+        "IMU samples received": "4",
+    }
     flight = SimpleNamespace(tdoa=np.empty(len(VERDICTS) + 5), imu=np.empty(4))
     counts = live.accounts({"waiting": "3"}, ekf, flight)
     assert (counts["waiting"], counts["lost"], counts["imu_lost"]) == (4, 1, 0)

@@ -12,13 +12,20 @@ from uwb_tdoa_ekf.offline import without_offset
 from uwb_tdoa_ekf.results import Odometry, Residuals
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag
 from uwb_tdoa_tools.commands import evaluate, localize
-from uwb_tdoa_tools.localizing import belief, residuals, zones
 from uwb_tdoa_tools.estimate import FlightEstimator
+from uwb_tdoa_tools.localizing import belief, residuals, zones
 from uwb_tdoa_tools.localizing.localize import check_names, name_of
 from uwb_tdoa_tools.readers.inputs import Reading, find_flights
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
-CLEAN = dict(duration=14.0, floor_time=1.0, imu_rate=200.0, bias=False, multipath=False, outlier_probability=0.0)
+CLEAN = dict(
+    duration=14.0,
+    floor_time=1.0,
+    imu_rate=200.0,
+    bias=False,
+    multipath=False,
+    outlier_probability=0.0,
+)
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +35,9 @@ def flight():
 
 @pytest.fixture(scope="module")
 def bags(flight, tmp_path_factory):
-    """The same flight with its truth, without any, and with one that is somewhere else and no number once."""
+    """The same flight with its truth, without any, and with one that is somewhere else and no
+    number once.
+    """
     folder = tmp_path_factory.mktemp("localize")
     wrong = replace(flight.truth, p=flight.truth.p + 3.0)
     wrong.p[9] = np.nan
@@ -45,45 +54,82 @@ def run(arguments, code=0):
 
 
 @pytest.mark.parametrize("more", [(), ("--smooth",)])
-def test_ground_truth_is_not_read_and_the_trajectory_is_that_of_evaluate_to_the_bit(bags, tmp_path, more):
+def test_ground_truth_is_not_read_and_the_trajectory_is_that_of_evaluate_to_the_bit(
+    bags, tmp_path, more
+):
     for name in ("true", "none", "wrong"):
         run([bags / name / "flight.bag", "--out", tmp_path / name, "--residuals", *more])
     for file in ("flight.tum", "flight.csv", "flight_residuals.csv"):
         one = (tmp_path / "true" / file).read_bytes()
         assert one.count(b"\n") > 100
-        assert one == (tmp_path / "none" / file).read_bytes() == (tmp_path / "wrong" / file).read_bytes()
-    assert evaluate.main([str(bags / "true" / "flight.bag"), "--tum", str(tmp_path / "judged"), *more]) == 0
-    (judged,) = [path for path in (tmp_path / "judged").glob("*.tum") if not path.stem.endswith("_truth")]
+        assert (
+            one
+            == (tmp_path / "none" / file).read_bytes()
+            == (tmp_path / "wrong" / file).read_bytes()
+        )
+    assert (
+        evaluate.main([str(bags / "true" / "flight.bag"), "--tum", str(tmp_path / "judged"), *more])
+        == 0
+    )
+    (judged,) = [
+        path for path in (tmp_path / "judged").glob("*.tum") if not path.stem.endswith("_truth")
+    ]
     assert judged.read_bytes() == (tmp_path / "true" / "flight.tum").read_bytes()
 
 
 def test_what_is_written_says_the_same(bags, flight, tmp_path, capsys):
-    run([bags / "none" / "flight.bag", "--out", tmp_path, "--bag", "--residuals", "--json", tmp_path / "all.json", "--no-bias"])
+    run(
+        [
+            bags / "none" / "flight.bag",
+            "--out",
+            tmp_path,
+            "--bag",
+            "--residuals",
+            "--json",
+            tmp_path / "all.json",
+            "--no-bias",
+        ]
+    )
     odometry = FlightEstimator()(read_bag(bags / "none" / "flight.bag")).odometry
     table = np.genfromtxt(tmp_path / "flight.csv", delimiter=",", names=True)
-    np.testing.assert_allclose(np.column_stack([table[name] for name in "xyz"]), odometry.p, atol=1e-6)
+    np.testing.assert_allclose(
+        np.column_stack([table[name] for name in "xyz"]), odometry.p, atol=1e-6
+    )
     np.testing.assert_allclose(table["std_z"], np.sqrt(odometry.covariance[:, 2, 2]), atol=1e-6)
     recorded = read_odometry(tmp_path / "flight.bag")
     np.testing.assert_allclose(recorded.p, odometry.p, atol=1e-12)
     np.testing.assert_allclose(recorded.v, odometry.v, atol=1e-9)
-    np.testing.assert_allclose(recorded.covariance[:, :3, :3], odometry.covariance[:, :3, :3], atol=1e-12)
+    np.testing.assert_allclose(
+        recorded.covariance[:, :3, :3], odometry.covariance[:, :3, :3], atol=1e-12
+    )
     lines = (tmp_path / "flight_residuals.csv").read_text().splitlines()
     assert len(lines) == 1 + len(flight.tdoa) and lines[0] == "t,a,b,residual,std,weight,verdict"
     for picture in ("flight.png", "flight_residuals.png"):
         assert (tmp_path / picture).read_bytes().startswith(b"\x89PNG")
     (told,) = json.loads((tmp_path / "all.json").read_text())["flights"]
-    assert told["verdict"] == "good" and told["explained"] > 0.95 and told["estimates"] == len(odometry)
+    assert (
+        told["verdict"] == "good"
+        and told["explained"] > 0.95
+        and told["estimates"] == len(odometry)
+    )
     assert "flight: good: standard deviation" in capsys.readouterr().out
 
 
 @pytest.mark.slow
 def test_the_trajectory_of_shared_recordings_is_that_of_evaluate_to_the_bit(shared_data, tmp_path):
     """Every ninth of the 37 recordings."""
-    folders = [str(path) for path, _ in find_flights([shared_data / "flights", shared_data / "util"], shared_data / "surveys")][::9]
+    folders = [
+        str(path)
+        for path, _ in find_flights(
+            [shared_data / "flights", shared_data / "util"], shared_data / "surveys"
+        )
+    ][::9]
     survey = ["--survey", str(shared_data / "surveys")]
     assert evaluate.main([*folders, *survey, "--tum", str(tmp_path / "judged")]) == 0
     assert localize.main([*folders, *survey, "--out", str(tmp_path / "located")]) in (0, 1)
-    judged = sorted(path for path in (tmp_path / "judged").glob("*.tum") if not path.stem.endswith("_truth"))
+    judged = sorted(
+        path for path in (tmp_path / "judged").glob("*.tum") if not path.stem.endswith("_truth")
+    )
     assert len(judged) == len(folders) == 5
     for path in judged:
         assert path.read_bytes() == (tmp_path / "located" / path.name).read_bytes(), path.name
@@ -105,7 +151,9 @@ def test_a_clean_flight_is_good_and_within_what_is_stated(flight):
     told = believed(replace(flight, truth=None))
     assert told.level == belief.GOOD and not told.reasons and not told.lost
     odometry = FlightEstimator()(flight).odometry
-    true = np.stack([np.interp(odometry.t, flight.truth.t, flight.truth.p[:, k]) for k in range(3)], axis=1)
+    true = np.stack(
+        [np.interp(odometry.t, flight.truth.t, flight.truth.p[:, k]) for k in range(3)], axis=1
+    )
     assert np.mean(np.linalg.norm(odometry.p - true, axis=1) <= told.figures["within"]) >= 0.95
 
 
@@ -113,19 +161,30 @@ def test_a_clean_flight_is_good_and_within_what_is_stated(flight):
 def ranged():
     """A flight of ranges alone, without ground truth."""
     made = simulate(SimulationConfig(seed=1, range_noise=0.1, **CLEAN))
-    return replace(made, tdoa=type(made.tdoa)(*(column[:0] for column in vars(made.tdoa).values())), truth=None)
+    return replace(
+        made, tdoa=type(made.tdoa)(*(column[:0] for column in vars(made.tdoa).values())), truth=None
+    )
 
 
 def test_ranges_alone_are_believed_as_tdoas_are(ranged, tmp_path):
     told = believed(ranged)
     assert told.level == belief.GOOD and not told.reasons and not told.lost
-    assert f"% of {len(ranged.range)} ranges fit it" in told.sentences()[0] and told.figures["seconds"] > 12.0
+    assert (
+        f"% of {len(ranged.range)} ranges fit it" in told.sentences()[0]
+        and told.figures["seconds"] > 12.0
+    )
     write_bag(ranged, tmp_path / "ranged.bag")
     run([tmp_path / "ranged.bag", "--residuals", "--zones", "2", "--out", tmp_path / "out"])
     lines = (tmp_path / "out" / "ranged_residuals.csv").read_text().splitlines()
     assert len(lines) == 1 + len(ranged.range)
-    assert {line.split(",")[1] for line in lines[1:]} == {line.split(",")[2] for line in lines[1:]} == {str(i) for i in ranged.anchors.ids}
-    assert (tmp_path / "out" / "ranged_residuals.png").exists() and (tmp_path / "out" / "ranged_zones.csv").exists()
+    assert (
+        {line.split(",")[1] for line in lines[1:]}
+        == {line.split(",")[2] for line in lines[1:]}
+        == {str(i) for i in ranged.anchors.ids}
+    )
+    assert (tmp_path / "out" / "ranged_residuals.png").exists() and (
+        tmp_path / "out" / "ranged_zones.csv"
+    ).exists()
 
 
 def test_an_offset_of_ranges_that_was_found_is_told(ranged):
@@ -133,7 +192,9 @@ def test_an_offset_of_ranges_that_was_found_is_told(ranged):
     assert told.figures["range_offset"] == pytest.approx(0.25, abs=0.02)
     assert "all ranges are 25 cm too long: that was found, and taken out" in told.sentences()
     sound = believed(ranged)
-    assert abs(sound.figures["range_offset"]) < 0.02 and not any("all ranges" in sentence for sentence in sound.sentences())
+    assert abs(sound.figures["range_offset"]) < 0.02 and not any(
+        "all ranges" in sentence for sentence in sound.sentences()
+    )
 
 
 def test_ranges_that_contradict_each_other_are_not_good(ranged):
@@ -145,7 +206,11 @@ def test_ranges_that_contradict_each_other_are_not_good(ranged):
 def test_silence_among_ranges_is_where_the_tag_was_lost(ranged):
     begin, end = ranged.range.t[0] + 5.0, ranged.range.t[0] + 9.0
     heard = (ranged.range.t < begin) | (ranged.range.t > end)
-    quiet = replace(ranged, imu=None, range=type(ranged.range)(*(column[heard] for column in ranged.range.columns)))
+    quiet = replace(
+        ranged,
+        imu=None,
+        range=type(ranged.range)(*(column[heard] for column in ranged.range.columns)),
+    )
     told = believed(quiet)
     assert told.level == belief.DOUBTFUL and told.lost[0][0] == pytest.approx(begin, abs=1.0)
 
@@ -164,19 +229,30 @@ def test_silence_is_where_the_tag_was_lost(flight):
     """The filter says nothing while nobody tells it anything."""
     begin, end = flight.tdoa.t[0] + 6.0, flight.tdoa.t[0] + 10.0
     heard = (flight.tdoa.t < begin) | (flight.tdoa.t > end)
-    quiet = replace(flight, imu=None, tdoa=type(flight.tdoa)(*(column[heard] for column in vars(flight.tdoa).values())))
+    quiet = replace(
+        flight,
+        imu=None,
+        tdoa=type(flight.tdoa)(*(column[heard] for column in vars(flight.tdoa).values())),
+    )
     told = believed(quiet)
     assert told.level != belief.GOOD and "the tag was lost for" in " ".join(told.reasons)
-    assert told.lost[0][0] == pytest.approx(begin, abs=2.1) and told.lost[-1][1] == pytest.approx(end, abs=1.0)
+    assert told.lost[0][0] == pytest.approx(begin, abs=2.1) and told.lost[-1][1] == pytest.approx(
+        end, abs=1.0
+    )
     assert any("inertial" in sentence for sentence in told.remedies)
 
 
 def test_residuals_of_a_pair_are_of_one_sign_of_it():
     n = 4
     some = Residuals(
-        np.arange(n), np.array([1, 2, 1, 3]), np.array([2, 1, 2, 1]), np.array([0.1, -0.2, 5.0, 0.3]), np.full(n, 0.01),
-        np.ones(n), np.array([USED, USED, REJECTED, USED], np.uint8),
-    )  # fmt: skip
+        np.arange(n),
+        np.array([1, 2, 1, 3]),
+        np.array([2, 1, 2, 1]),
+        np.array([0.1, -0.2, 5.0, 0.3]),
+        np.full(n, 0.01),
+        np.ones(n),
+        np.array([USED, USED, REJECTED, USED], np.uint8),
+    )
     first, second = residuals.by_pair(some)
     assert (first.a, first.b, second.a, second.b) == (1, 2, 1, 3)
     np.testing.assert_allclose(first.value, [0.1, 0.2, 5.0])
@@ -188,7 +264,11 @@ def test_residuals_of_a_pair_are_of_one_sign_of_it():
 
 
 def test_names_of_files_are_those_of_recordings_and_must_differ():
-    assert [name_of(path) for path in ("a/const1-tdoa2.csv.gz", "b/flight.bag", "0425-traj1")] == ["const1-tdoa2", "flight", "0425-traj1"]
+    assert [name_of(path) for path in ("a/const1-tdoa2.csv.gz", "b/flight.bag", "0425-traj1")] == [
+        "const1-tdoa2",
+        "flight",
+        "0425-traj1",
+    ]
     with pytest.raises(InputError, match="b/x.csv: a/x.bag has the same name"):
         check_names([("a/x.bag", None), ("b/x.csv", None)])
 
@@ -201,11 +281,26 @@ def test_what_is_not_good_is_told_by_the_exit_code(flight, tmp_path, capsys):
 
 def test_a_recording_without_an_estimate_has_files_and_a_picture_too(flight, tmp_path, capsys):
     few = {name: getattr(flight.tdoa, name)[:5] for name in "tabd"}
-    write_bag(replace(flight, tdoa=replace(flight.tdoa, **few, variance=None)), tmp_path / "flight.bag")
-    run([tmp_path / "flight.bag", "--out", tmp_path / "out", "--bag", "--residuals", "--json", tmp_path / "all.json"], 1)
+    write_bag(
+        replace(flight, tdoa=replace(flight.tdoa, **few, variance=None)), tmp_path / "flight.bag"
+    )
+    run(
+        [
+            tmp_path / "flight.bag",
+            "--out",
+            tmp_path / "out",
+            "--bag",
+            "--residuals",
+            "--json",
+            tmp_path / "all.json",
+        ],
+        1,
+    )
     (told,) = json.loads((tmp_path / "all.json").read_text())["flights"]
     assert told["verdict"] == "bad" and told["estimates"] == 0
-    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(path.rpartition("/")[2] for path in told["files"])
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(
+        path.rpartition("/")[2] for path in told["files"]
+    )
     assert "flight: bad: there is no estimate" in capsys.readouterr().out
 
 
@@ -213,21 +308,38 @@ def test_a_recording_without_an_estimate_has_files_and_a_picture_too(flight, tmp
 
 
 def walked(n=600):
-    """(Odometry, Residuals) of a tag that goes from x = 0 to 40 m; anchor k is heard from 10 k to 10 k + 20 m, the last TDOAs are
-    rejected."""
+    """(Odometry, Residuals) of a tag that goes from x = 0 to 40 m; anchor k is heard from 10 k to
+    10 k + 20 m, the last TDOAs are rejected.
+    """
     t = 0.1 * np.arange(n)
     p = np.column_stack([40.0 * t / t[-1], np.full(n, 2.0), np.ones(n)])
     covariance = np.broadcast_to(0.01 * np.eye(9), (n, 9, 9))
     nothing = np.zeros((n, 3))
-    odometry = Odometry(t, p, nothing, np.tile([0.0, 0.0, 0.0, 1.0], (n, 1)), nothing, nothing, covariance, covariance[:, :3, :3])
+    odometry = Odometry(
+        t,
+        p,
+        nothing,
+        np.tile([0.0, 0.0, 0.0, 1.0], (n, 1)),
+        nothing,
+        nothing,
+        covariance,
+        covariance[:, :3, :3],
+    )
     first = np.clip(p[:, 0] // 10.0, 1, 4).astype(int)
     verdict = np.where(p[:, 0] > 35.0, REJECTED, USED).astype(np.uint8)
-    return odometry, Residuals(t, first, first - 1, np.full(n, 0.05), np.full(n, 0.01), np.ones(n), verdict)
+    return odometry, Residuals(
+        t, first, first - 1, np.full(n, 0.05), np.full(n, 0.01), np.ones(n), verdict
+    )
 
 
 def test_zones_say_who_is_heard_where_and_how_well():
     found = zones.zones_of(*walked(), 10.0)
-    assert [(zone.x, zone.y) for zone in found[:4]] == [(5.0, 5.0), (15.0, 5.0), (25.0, 5.0), (35.0, 5.0)]
+    assert [(zone.x, zone.y) for zone in found[:4]] == [
+        (5.0, 5.0),
+        (15.0, 5.0),
+        (25.0, 5.0),
+        (35.0, 5.0),
+    ]
     assert [dict(zone.anchors).keys() for zone in found[1:3]] == [{0, 1}, {1, 2}]
     for zone in found[:3]:
         assert (
@@ -236,15 +348,26 @@ def test_zones_say_who_is_heard_where_and_how_well():
             and zone.left == pytest.approx(1.4826 * 0.05)
             and zone.std == pytest.approx(np.sqrt(0.03))
         )
-        assert zone.seconds == pytest.approx(15.0, abs=0.2) and zone.tdoas_per_s == pytest.approx(10.0, rel=0.05)
+        assert zone.seconds == pytest.approx(15.0, abs=0.2) and zone.tdoas_per_s == pytest.approx(
+            10.0, rel=0.05
+        )
     assert found[3].used == pytest.approx(0.5, abs=0.05)
-    assert zones.zones_of(*(part for part in (walked()[0], Residuals(*(np.empty(0) for _ in range(7))))), 10.0) == []
+    assert (
+        zones.zones_of(
+            *(part for part in (walked()[0], Residuals(*(np.empty(0) for _ in range(7))))), 10.0
+        )
+        == []
+    )
 
 
 def test_zones_are_written_as_a_table_and_a_map(bags, tmp_path, capsys):
     run([bags / "none" / "flight.bag", "--zones", "2", "--out", tmp_path])
     lines = (tmp_path / "flight_zones.csv").read_text().splitlines()
-    assert lines[0] == ",".join(zones.COLUMNS) and len(lines) > 3 and all(len(line.split(",")) == len(zones.COLUMNS) for line in lines)
+    assert (
+        lines[0] == ",".join(zones.COLUMNS)
+        and len(lines) > 3
+        and all(len(line.split(",")) == len(zones.COLUMNS) for line in lines)
+    )
     assert (tmp_path / "flight_zones.png").stat().st_size > 10_000
     run([bags / "none" / "flight.bag", "--zones", "0", "--out", tmp_path], 2)
     assert "--zones: 0 m is no size" in capsys.readouterr().err

@@ -1,4 +1,6 @@
-"""Replays that follow the nodes, with the nodes' own parameters and best-effort links, beside a computer at work."""
+"""Replays that follow the nodes, with the nodes' own parameters and best-effort links, beside a
+computer at work.
+"""
 
 from dataclasses import replace
 import subprocess
@@ -32,7 +34,9 @@ def load():
     running = []
 
     def start(count):
-        running.extend(subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count))
+        running.extend(
+            subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)
+        )
 
     yield start
     for process in running:
@@ -41,16 +45,28 @@ def load():
 
 
 def replayed(bag, folder, *options, nodes=(), begin=lambda: None):
-    """(exit code of a replay that follows the odometry, its output, diagnostics {node: {key: text}}, recorded bag).
+    """(exit code of a replay that follows the odometry, its output, diagnostics {node: {key:
+    text}}, recorded bag).
     nodes : {node: arguments}; begin() : called when the nodes are there, before the replay."""
-    nodes, recorded = {"bias_node": ("--ros-args", "-p", f"model_file:={SHIPPED}"), **dict(nodes)}, folder / "recorded.bag"
+    nodes, recorded = (
+        {"bias_node": ("--ros-args", "-p", f"model_file:={SHIPPED}"), **dict(nodes)},
+        folder / "recorded.bag",
+    )
     with own_domain(), session("test", []) as (node, stop), Processes(folder, stop) as processes:
         diagnostics = DiagnosticsListener(node)
         for package, name in (("uwb_tdoa_bias", "bias_node"), ("uwb_tdoa_ekf", "ekf_node")):
             processes.start(package, name, *nodes.get(name, ()))
-        wait(READY_LIMIT, "the nodes", processes, node, lambda: all(map(diagnostics.newest, ("bias_node", "ekf_node"))))
+        wait(
+            READY_LIMIT,
+            "the nodes",
+            processes,
+            node,
+            lambda: all(map(diagnostics.newest, ("bias_node", "ekf_node"))),
+        )
         processes.start("uwb_tdoa_tools", "record", "--output", recorded, "odometry")
-        wait(READY_LIMIT, "record", processes, node, lambda: node.count_subscribers("/odometry") == 2)
+        wait(
+            READY_LIMIT, "record", processes, node, lambda: node.count_subscribers("/odometry") == 2
+        )
         begin()
         command = ("uwb_tdoa_tools", "replay", bag, "--follow", "odometry", *options)
         replay = processes.start(*command, may_end_with=(0, 1, 2))
@@ -73,13 +89,20 @@ def assert_equal_to_offline(flight, told, recorded):
 
 @pytest.mark.slow
 def test_ranges_beside_tdoas_are_played_and_used_as_off_line(tmp_path):
-    write_bag(simulate(SimulationConfig(seed=4, duration=16.0, range_noise=0.1)), tmp_path / "flight.bag")
+    write_bag(
+        simulate(SimulationConfig(seed=4, duration=16.0, range_noise=0.1)), tmp_path / "flight.bag"
+    )
     flight = read_bag(tmp_path / "flight.bag")
     _, said, told, recorded = replayed(tmp_path / "flight.bag", tmp_path, "--rate", 4)
     assert_equal_to_offline(flight, told, recorded)
     _, run = evaluate(flight, network=load_network(SHIPPED))
-    assert told["ekf_node"]["range_received"] == str(len(flight.range)) and told["ekf_node"]["range_late"] == "0", said
-    assert abs(int(told["ekf_node"]["range_used"]) - np.sum(run.aids["range"]["verdict"] == USED)) <= 2
+    assert (
+        told["ekf_node"]["range_received"] == str(len(flight.range))
+        and told["ekf_node"]["range_late"] == "0"
+    ), said
+    assert (
+        abs(int(told["ekf_node"]["range_used"]) - np.sum(run.aids["range"]["verdict"] == USED)) <= 2
+    )
 
 
 @pytest.mark.slow
@@ -90,16 +113,22 @@ def test_heights_with_holes_are_no_reason_to_wait(tmp_path):
     holed = {name: column[heard] for name, column in vars(flight.height).items()}
     write_bag(replace(flight, height=replace(flight.height, **holed)), tmp_path / "flight.bag")
     _, said, told, recorded = replayed(tmp_path / "flight.bag", tmp_path)
-    assert int(told["ekf_node"]["height_late"]) <= 1, said  # the first of all, as nobody waits for what has not come yet
+    assert int(told["ekf_node"]["height_late"]) <= 1, (
+        said
+    )  # the first of all, as nobody waits for what has not come yet
     assert_equal_to_offline(read_bag(tmp_path / "flight.bag"), told, recorded)
-    assert (tmp_path / "ekf_node.log").read_text().partition("running")[2].count("no TDOAs") <= 1  # when all has been played
+    assert (tmp_path / "ekf_node.log").read_text().partition("running")[2].count(
+        "no TDOAs"
+    ) <= 1  # when all has been played
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("rate", "busy"), [(1, 0), (8, 1)])
 def test_at_any_rate_and_load_the_result_is_that_of_the_bag(tmp_path, load, rate, busy):
     write_bag(simulate(SimulationConfig(seed=3, duration=16.0)), tmp_path / "flight.bag")
-    code, said, told, recorded = replayed(tmp_path / "flight.bag", tmp_path, "--rate", rate, begin=lambda: load(busy))
+    code, said, told, recorded = replayed(
+        tmp_path / "flight.bag", tmp_path, "--rate", rate, begin=lambda: load(busy)
+    )
     assert code == 0, said
     assert_equal_to_offline(read_bag(tmp_path / "flight.bag"), told, recorded)
 
@@ -108,7 +137,9 @@ def test_at_any_rate_and_load_the_result_is_that_of_the_bag(tmp_path, load, rate
 def test_a_measured_flight_beside_three_busy_processes(shared_data, tmp_path, load):
     log, survey = shared_data / "flights/0426/0426-traj3", shared_data / "surveys/anchor_0426.txt"
     write_bag(first(read_flight(log, survey), 24.0), tmp_path / "flight.bag")
-    code, said, told, recorded = replayed(tmp_path / "flight.bag", tmp_path, "--rate", 4, begin=lambda: load(3))
+    code, said, told, recorded = replayed(
+        tmp_path / "flight.bag", tmp_path, "--rate", 4, begin=lambda: load(3)
+    )
     assert code == 0, said
     assert_equal_to_offline(read_bag(tmp_path / "flight.bag"), told, recorded)
 
@@ -118,19 +149,33 @@ def test_nodes_that_do_not_wait_long_enough_are_not_followed(tmp_path):
     write_bag(simulate(SimulationConfig(seed=3, duration=16.0)), tmp_path / "flight.bag")
     nodes = {"bias_node": ("--ros-args", "-p", "hold:=0.08")}
     code, said, _, _ = replayed(tmp_path / "flight.bag", tmp_path, nodes=nodes)
-    assert code == 2 and "hold is 0.08 s and ekf_node's lag 0.25 s; to be followed they need 0.205 s < hold < lag" in said
+    assert (
+        code == 2
+        and (
+            "hold is 0.08 s and ekf_node's lag 0.25 s; to be followed they need 0.205 s < hold < "
+            "lag"
+        )
+        in said
+    )
 
 
 def delayed(bag, out, count=10, delay=1_000_000_000):
-    """A copy of a bag in which some TDOAs from the middle were recorded a second after their stamps."""
+    """A copy of a bag in which some TDOAs from the middle were recorded a second after their
+    stamps.
+    """
     with open_bag(bag) as reader, new_bag(out) as writer:
         made = {
             c.topic: writer.add_connection(
-                c.topic, c.msgtype, typestore=typestore(), offered_qos_profiles=c.ext.offered_qos_profiles
+                c.topic,
+                c.msgtype,
+                typestore=typestore(),
+                offered_qos_profiles=c.ext.offered_qos_profiles,
             )
             for c in reader.connections
         }
-        found = [(stamp, c.topic, data) for c, stamp, data in messages(bag, reader, reader.connections)]
+        found = [
+            (stamp, c.topic, data) for c, stamp, data in messages(bag, reader, reader.connections)
+        ]
         tdoas = [number for number, (_, topic, _) in enumerate(found) if topic == "/uwb/tdoa"]
         for number in tdoas[len(tdoas) // 2 :][:count]:
             stamp, topic, data = found[number]

@@ -1,4 +1,6 @@
-"""The main job on a measured flight: nodes over topics, at two speeds, against the offline engine and ground truth."""
+"""The main job on a measured flight: nodes over topics, at two speeds, against the offline engine
+and ground truth.
+"""
 
 import pytest
 
@@ -7,10 +9,10 @@ pytest.importorskip("uwb_tdoa_msgs.msg", reason="needs the built workspace: ./de
 from uwb_tdoa_bias.correction.network import SHIPPED, load_network  # noqa: E402
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag  # noqa: E402
 from uwb_tdoa_tools.benchmark.flights import first  # noqa: E402
-from uwb_tdoa_tools.scoring.evaluation import evaluate  # noqa: E402
 from uwb_tdoa_tools.live.run import run_live  # noqa: E402
-from uwb_tdoa_tools.scoring.metrics import Score  # noqa: E402
 from uwb_tdoa_tools.readers import read_flight  # noqa: E402
+from uwb_tdoa_tools.scoring.evaluation import evaluate  # noqa: E402
+from uwb_tdoa_tools.scoring.metrics import Score  # noqa: E402
 
 SECONDS = 16.0
 VERDICTS = ("used", "rejected", "late", "invalid", "startup", "waiting")

@@ -1,4 +1,6 @@
-"""Measured ranges, as docs/sensors.md takes them: the filter finds the antenna delay of a tag that nobody has calibrated."""
+"""Measured ranges, as docs/sensors.md takes them: the filter finds the antenna delay of a tag that
+nobody has calibrated.
+"""
 
 import csv
 import gzip
@@ -22,12 +24,19 @@ def tag(request, tmp_path, shared_data):
     with open(tmp_path / "tag.csv", "w", newline="") as file:
         csv.writer(file).writerows([head, *(row for row in rows if row[2] == request.param)])
     survey, bag = str(folder / "uwb_markers_v2.csv"), tmp_path / "tag.bag"
-    assert convert([str(tmp_path / "tag.csv"), "--columns", COLUMNS, "--survey", survey, "--out", str(bag)]) == 0
+    assert (
+        convert(
+            [str(tmp_path / "tag.csv"), "--columns", COLUMNS, "--survey", survey, "--out", str(bag)]
+        )
+        == 0
+    )
     return read_flight(bag)
 
 
 def test_a_tag_of_which_nobody_knows_the_delay_is_located_and_honest(tag):
     """A filter that takes the tag for calibrated is a metre off, and certain."""
-    row, wrong = (evaluate(tag, config)[0].row() for config in (None, FilterConfig(range_offset_std=0.0)))
+    row, wrong = (
+        evaluate(tag, config)[0].row() for config in (None, FilterConfig(range_offset_std=0.0))
+    )
     assert row["rmse_3d"] < 0.25 < 0.9 < wrong["rmse_3d"]
     assert row["nees_mean"] < 3.0 < 15.0 < wrong["nees_mean"]

@@ -1,12 +1,13 @@
 """Every measured file is read whole: against counts from a second, plain way through the file."""
 
-import gzip
-import struct
 from collections import Counter
+import gzip
 from pathlib import Path
+import struct
 
 import numpy as np
 import pytest
+
 from uwb_tdoa_tools.readers import read_flight
 
 DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
@@ -57,14 +58,21 @@ def test_log(path):
     assert len(flight.imu) == counts.pop("estGyroscope") == counts.pop("estAcceleration") > 30_000
     assert len(flight.truth) == counts.pop("estPose") > 8000
     assert len(flight.height or ()) == counts.pop("estTOF", 0)
-    readings = len(flight.pressure or ())  # the log repeats each of them, up to a thousand times a second
+    readings = len(
+        flight.pressure or ()
+    )  # the log repeats each of them, up to a thousand times a second
     assert (readings > 500) == (counts.pop("estBarometer", 0) > 0)
-    pixel_counts, velocities = counts.pop("estFlow", 0), 0 if flight.velocity is None else len(flight.velocity.t)
+    pixel_counts, velocities = (
+        counts.pop("estFlow", 0),
+        0 if flight.velocity is None else len(flight.velocity.t),
+    )
     assert 0.2 * pixel_counts <= velocities <= 0.4 * pixel_counts  # some three readings for each
     assert {name: len(columns["t"]) for name, columns in flight.extra.items()} == dict(counts)
     assert "reordered" not in flight.meta and "imu_accel_interpolated" not in flight.meta
     assert set(flight.tdoa.a) == set(flight.tdoa.b) == set(range(8)) == set(flight.anchors.ids)
-    assert 9.5 < np.linalg.norm(np.median(flight.imu.accel, axis=0)) < 10.2  # it hovers most of the time
+    assert (
+        9.5 < np.linalg.norm(np.median(flight.imu.accel, axis=0)) < 10.2
+    )  # it hovers most of the time
     np.testing.assert_allclose(np.linalg.norm(flight.truth.q, axis=1), 1.0, atol=1e-3)
 
 
@@ -88,9 +96,13 @@ def test_none_is_missing(shared_data):
     assert len(TABLES) >= 15
     flights = [read_flight(path, shared_data / "surveys" / "anchor_0425.txt") for path in LOGS]
     assert len({flight.name for flight in flights}) == 22
-    peers = {line.split(",")[0] for line in (shared_data / "peers.csv").read_text().splitlines()[1:]}
+    peers = {
+        line.split(",")[0] for line in (shared_data / "peers.csv").read_text().splitlines()[1:]
+    }
     assert peers <= {flight.name for flight in flights}
     folders = {"TDOA2": "tdoa2", "TDOA3": "tdoa3"}
-    told = [(log.meta["protocol"], folders.get(path.parent.name)) for log, path in zip(flights, LOGS)]
+    told = [
+        (log.meta["protocol"], folders.get(path.parent.name)) for log, path in zip(flights, LOGS)
+    ]
     told = [pair for pair in told if pair[1]]
     assert len(told) > 5 and all(found == folder for found, folder in told)

@@ -1,4 +1,6 @@
-"""Bad starts on measured flights: put 2 m aside, switched on in flight, with a yaw that is 90 degrees wrong."""
+"""Bad starts on measured flights: put 2 m aside, switched on in flight, with a yaw that is 90
+degrees wrong.
+"""
 
 from dataclasses import replace
 
@@ -15,8 +17,14 @@ from uwb_tdoa_tools.readers.inputs import Reading
 from uwb_tdoa_tools.scoring.metrics import judged_part
 
 FLIGHTS = (
-    "0422-log00", "0425-traj13", "0425-traj2", "0426-traj1", "0426-traj15", "0426-traj9", "tdoa2-obs-log1",
-)  # fmt: skip
+    "0422-log00",
+    "0425-traj13",
+    "0425-traj2",
+    "0426-traj1",
+    "0426-traj15",
+    "0426-traj9",
+    "tdoa2-obs-log1",
+)
 TIMES = (5.0, 15.0)  # s after take-off at which something goes wrong
 AFTER, WINDOW = 3.0, 2.0  # s until it must be over, and over which that is judged
 YAW_TIME = 10.0  # s in the air by which the yaw must be known
@@ -51,15 +59,22 @@ def drive(flight, state):
 def rms(flight, t, p, low, high):
     chosen = (t >= low) & (t < high)
     assert chosen.any()
-    truth = np.stack([np.interp(t[chosen], flight.truth.t, flight.truth.p[:, k]) for k in range(3)], axis=1)
+    truth = np.stack(
+        [np.interp(t[chosen], flight.truth.t, flight.truth.p[:, k]) for k in range(3)], axis=1
+    )
     return np.sqrt(np.mean(np.sum((p[chosen] - truth) ** 2, axis=1)))
 
 
 @pytest.mark.slow
 def test_a_filter_put_aside_or_started_in_flight_is_back_within_three_seconds(flights):
-    """Within twice the error of the undisturbed filter: its RMSE, or what it is just then, as beside an obstacle."""
+    """Within twice the error of the undisturbed filter: its RMSE, or what it is just then, as
+    beside an obstacle.
+    """
     kinds = ("usual", "2 m off", "in flight")
-    print(f"\n{'flight':16s}{'RMSE':>8s}" + "".join(f"{kind}@{at:.0f}s".rjust(14) for at in TIMES for kind in kinds))
+    print(
+        f"\n{'flight':16s}{'RMSE':>8s}"
+        + "".join(f"{kind}@{at:.0f}s".rjust(14) for at in TIMES for kind in kinds)
+    )
     for flight in flights:
         usual = run_offline(flight).odometry
         _, first, last = judged_part(flight.truth)
@@ -80,16 +95,23 @@ def test_a_filter_put_aside_or_started_in_flight_is_back_within_three_seconds(fl
 
 @pytest.mark.slow
 def test_a_wrong_yaw_is_mended_or_honestly_doubted(flights):
-    print(f"\n{'flight':16s}" + "".join(f"{name:>22s}" for name in ("told +90: error, std", "told -90: error, std")))
+    print(
+        f"\n{'flight':16s}"
+        + "".join(f"{name:>22s}" for name in ("told +90: error, std", "told -90: error, std"))
+    )
     mended = []
     for flight in flights:
         cells = []
         for wrong in (0.5 * np.pi, -0.5 * np.pi):
             _, first, _ = judged_part(flight.truth)
-            true = Rotation.from_quat(flight.truth.q[np.searchsorted(flight.truth.t, first)]).as_euler("ZYX")[0]
+            true = Rotation.from_quat(
+                flight.truth.q[np.searchsorted(flight.truth.t, first)]
+            ).as_euler("ZYX")[0]
             odometry = run_offline(flight, FilterConfig(initial_yaw=true + wrong)).odometry
             at = np.minimum(np.searchsorted(flight.truth.t, odometry.t), len(flight.truth) - 1)
-            error = (Rotation.from_quat(flight.truth.q[at]).inv() * Rotation.from_quat(odometry.q)).as_rotvec()[:, 2]
+            error = (
+                Rotation.from_quat(flight.truth.q[at]).inv() * Rotation.from_quat(odometry.q)
+            ).as_rotvec()[:, 2]
             std = np.sqrt(odometry.covariance[:, 8, 8])
             assert np.mean(np.abs(error) < 3.0 * std) > 0.95, flight.name
             k = np.searchsorted(odometry.t, first + YAW_TIME)

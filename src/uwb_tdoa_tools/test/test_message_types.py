@@ -4,10 +4,13 @@ from pathlib import Path
 
 import pytest
 from rosbags.typesys import Stores, get_typestore
+
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.bags.message_types import OUR_TYPES, add_type, typestore
 
-PREFIXES = [Path(prefix) for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if prefix]
+PREFIXES = [
+    Path(prefix) for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if prefix
+]
 BUILT = [prefix / "share" / "uwb_tdoa_msgs" / "msg" for prefix in PREFIXES]
 
 
@@ -18,11 +21,14 @@ def test_our_types_are_all_messages_of_the_package():
 
 @pytest.mark.parametrize("name", OUR_TYPES)
 def test_type_hash_is_the_one_of_the_build(name):
-    descriptions = [folder / f"{name}.json" for folder in BUILT if (folder / f"{name}.json").exists()]
+    descriptions = [
+        folder / f"{name}.json" for folder in BUILT if (folder / f"{name}.json").exists()
+    ]
     if not descriptions:
         pytest.skip("uwb_tdoa_msgs is not built and sourced")
     hashes = {
-        entry["type_name"]: entry["hash_string"] for entry in json.loads(descriptions[0].read_text())["type_hashes"]
+        entry["type_name"]: entry["hash_string"]
+        for entry in json.loads(descriptions[0].read_text())["type_hashes"]
     }
     msgtype = f"uwb_tdoa_msgs/msg/{name}"
     assert typestore().hash_rihs01(msgtype) == hashes[msgtype]

@@ -6,14 +6,27 @@ import pytest
 
 from uwb_tdoa_bias.foundation.flight import Truth
 from uwb_tdoa_ekf.core.verdicts import INVALID, LATE, REJECTED, STARTUP, USED
-from uwb_tdoa_tools.scoring.metrics import Pool, Result, Score, coverage, judged_part, nees, nis, pooled, position_errors, summary
 from uwb_tdoa_tools.evaluating.table import line
+from uwb_tdoa_tools.scoring.metrics import (
+    Pool,
+    Result,
+    Score,
+    coverage,
+    judged_part,
+    nees,
+    nis,
+    pooled,
+    position_errors,
+    summary,
+)
 
 UPRIGHT = [0.0, 0.0, 0.0, 1.0]
 
 
 def straight(duration=10.0, rate=50.0, floor=1.0):
-    """A truth that flies along x with 1 m/s at 1 m, on the floor for the first and last `floor` seconds."""
+    """A truth that flies along x with 1 m/s at 1 m, on the floor for the first and last `floor`
+    seconds.
+    """
     t = np.arange(0.0, duration + 0.5 / rate, 1.0 / rate)
     z = np.where((t >= floor) & (t <= duration - floor), 1.0, 0.0)
     return Truth(t, np.stack([t, np.zeros(len(t)), z], axis=1), np.tile(UPRIGHT, (len(t), 1)))
@@ -24,7 +37,9 @@ def estimate(truth, error, low=0.0, high=10.0, std=0.1, rate=100.0):
     t = np.arange(low, high, 1.0 / rate)
     true = np.stack([np.interp(t, truth.t, truth.p[:, k]) for k in range(3)], axis=1)
     covariance = np.tile(np.diag([std**2] * 3 + [1.0] * 6), (len(t), 1, 1))
-    return SimpleNamespace(t=t, p=true + error(t), q=np.tile(UPRIGHT, (len(t), 1)), covariance=covariance)
+    return SimpleNamespace(
+        t=t, p=true + error(t), q=np.tile(UPRIGHT, (len(t), 1)), covariance=covariance
+    )
 
 
 def constant(x, y, z):
@@ -32,7 +47,9 @@ def constant(x, y, z):
 
 
 def residuals(innovation, variance, verdict):
-    return SimpleNamespace(innovation=np.array(innovation), variance=np.array(variance), verdict=np.array(verdict))
+    return SimpleNamespace(
+        innovation=np.array(innovation), variance=np.array(variance), verdict=np.array(verdict)
+    )
 
 
 def test_what_is_judged_is_from_the_first_to_the_last_instant_above_the_limit():
@@ -66,7 +83,9 @@ def test_figures_of_a_constant_error():
     truth = straight()
     row = Score("flight", estimate(truth, constant(0.299, -0.4, 1.2)), truth).row()
     expected = {"rmse_x": 0.299, "rmse_y": 0.4, "rmse_z": 1.2}
-    expected.update(dict.fromkeys(("rmse_3d", "median_3d", "max_3d"), np.sqrt(0.299**2 + 0.4**2 + 1.2**2)))
+    expected.update(
+        dict.fromkeys(("rmse_3d", "median_3d", "max_3d"), np.sqrt(0.299**2 + 0.4**2 + 1.2**2))
+    )
     for name, value in expected.items():
         assert row[name] == pytest.approx(value, abs=1e-9), name
     assert row["flight"] == "flight" and row["frac_gt_1m"] == 1.0 and row["diverged"] is True
@@ -122,18 +141,27 @@ def test_a_late_start_does_not_hide_what_else_is_wrong():
 
 def test_an_estimate_that_ends_in_mid_flight_has_diverged():
     truth = straight()
-    assert Score("flight", estimate(truth, constant(0.0, 0.0, 0.0), high=3.0), truth).row()["diverged"]
+    assert Score("flight", estimate(truth, constant(0.0, 0.0, 0.0), high=3.0), truth).row()[
+        "diverged"
+    ]
 
 
 def test_no_estimate_at_all_has_diverged():
     truth = straight()
     row = Score("flight", estimate(truth, constant(0.0, 0.0, 0.0), low=9.5), truth).row()
-    assert row["diverged"] and row["frac_gt_1m"] == 1.0 and np.isnan(row["rmse_3d"]) and row["start_delay"] == np.inf
+    assert (
+        row["diverged"]
+        and row["frac_gt_1m"] == 1.0
+        and np.isnan(row["rmse_3d"])
+        and row["start_delay"] == np.inf
+    )
     assert not row["late_start"]
 
 
 def test_nees_of_hand_made_errors():
-    covariance = np.array([np.diag([1.0, 4.0, 9.0]), [[2.0, 1.0, 0.0], [1.0, 2.0, 0.0], [0.0, 0.0, 1.0]]])
+    covariance = np.array(
+        [np.diag([1.0, 4.0, 9.0]), [[2.0, 1.0, 0.0], [1.0, 2.0, 0.0], [0.0, 0.0, 1.0]]]
+    )
     error = np.array([[1.0, 2.0, 3.0], [1.0, 1.0, 0.0]])
     np.testing.assert_allclose(nees(error, covariance), [3.0, 2.0 / 3.0])
     assert nees(np.empty((0, 3)), np.empty((0, 3, 3))).shape == (0,)
@@ -155,7 +183,9 @@ def test_an_odometry_that_claims_no_covariance_still_has_errors():
 
 def test_nis_counts_what_reached_the_filter():
     verdicts = [USED, REJECTED, LATE, INVALID, STARTUP]
-    found = nis(residuals([1.0, 4.0, np.nan, np.nan, np.nan], [2.0, 4.0, np.nan, np.nan, np.nan], verdicts))
+    found = nis(
+        residuals([1.0, 4.0, np.nan, np.nan, np.nan], [2.0, 4.0, np.nan, np.nan, np.nan], verdicts)
+    )
     np.testing.assert_allclose(found, [0.5, 4.0])
 
 
@@ -166,7 +196,10 @@ def test_coverage_per_axis():
     np.testing.assert_allclose(coverage(error, covariance, sigmas=1.0), [0.5, 0.25, 1.0])
     assert np.isnan(coverage(np.empty((0, 3)), np.empty((0, 3, 3)))).all()
     rng = np.random.default_rng(0)
-    error, covariance = 0.1 * rng.standard_normal((50000, 3)), np.tile(np.diag([0.01] * 3), (50000, 1, 1))
+    error, covariance = (
+        0.1 * rng.standard_normal((50000, 3)),
+        np.tile(np.diag([0.01] * 3), (50000, 1, 1)),
+    )
     np.testing.assert_allclose(coverage(error, covariance), 0.9973, atol=0.001)
 
 
@@ -181,11 +214,18 @@ def test_pooled_weighs_samples_and_tells_of_runs():
     long, short = straight(10.0), straight(6.0)
     scores = [
         Score("a", estimate(long, constant(0.1, 0.0, 0.0)), long, residuals([1.0], [1.0], [USED])),
-        Score("b", estimate(short, constant(0.0, 2.0, 0.0), low=1.5, high=6.0), short, residuals([3.0], [1.0], [USED])),
+        Score(
+            "b",
+            estimate(short, constant(0.0, 2.0, 0.0), low=1.5, high=6.0),
+            short,
+            residuals([3.0], [1.0], [USED]),
+        ),
     ]
     counts = [len(score.t) for score in scores]
     together = pooled(scores)
-    assert together["rmse_3d"] == pytest.approx(np.sqrt((counts[0] * 0.01 + counts[1] * 4.0) / sum(counts)))
+    assert together["rmse_3d"] == pytest.approx(
+        np.sqrt((counts[0] * 0.01 + counts[1] * 4.0) / sum(counts))
+    )
     assert together["rmse_x"] == pytest.approx(np.sqrt(counts[0] * 0.01 / sum(counts)))
     assert together["frac_gt_1m"] == pytest.approx(counts[1] / sum(counts))
     assert together["max_3d"] == pytest.approx(2.0) and together["nis_mean"] == 5.0
@@ -193,7 +233,17 @@ def test_pooled_weighs_samples_and_tells_of_runs():
     assert together["rmse_3d_max_of_runs"] == pytest.approx(2.0)
     assert together["diverged"] == 1  # a count here
     assert together["start_delay"] == pytest.approx(0.5, abs=0.011)
-    needed = {"flight", "rmse_x", "rmse_y", "rmse_z", "rmse_3d", "median_3d", "max_3d", "frac_gt_1m", "diverged"}
+    needed = {
+        "flight",
+        "rmse_x",
+        "rmse_y",
+        "rmse_z",
+        "rmse_3d",
+        "median_3d",
+        "max_3d",
+        "frac_gt_1m",
+        "diverged",
+    }
     assert needed <= set(together) and needed <= set(scores[0].row())
 
 
@@ -204,7 +254,11 @@ def test_pooled_with_a_run_that_never_started():
         Score("b", estimate(truth, constant(0.0, 0.0, 0.0), low=9.5), truth),
     ]
     together = pooled(scores)
-    assert together["rmse_3d"] == pytest.approx(0.1) and together["diverged"] == 1 and together["start_delay"] == np.inf
+    assert (
+        together["rmse_3d"] == pytest.approx(0.1)
+        and together["diverged"] == 1
+        and together["start_delay"] == np.inf
+    )
 
 
 def test_figures_pooled_of_what_runs_leave_are_those_of_all_samples():
@@ -216,14 +270,26 @@ def test_figures_pooled_of_what_runs_leave_are_those_of_all_samples():
         made = estimate(truth, lambda t: spread * rng.standard_normal((len(t), 3)), high=seconds)
         scores.append(Score(f"flight of {seconds:g} s", made, truth, told))
     error, covariance, of_nees, of_nis = (
-        np.concatenate([getattr(score, name) for score in scores]) for name in ("error", "covariance", "nees", "nis")
+        np.concatenate([getattr(score, name) for score in scores])
+        for name in ("error", "covariance", "nees", "nis")
     )
     expected, together = summary(error, of_nees, of_nis), pooled(scores)
-    for name in ("rmse_x", "rmse_y", "rmse_z", "rmse_3d", "max_3d", "frac_gt_1m", "nees_mean", "nis_mean"):
+    for name in (
+        "rmse_x",
+        "rmse_y",
+        "rmse_z",
+        "rmse_3d",
+        "max_3d",
+        "frac_gt_1m",
+        "nees_mean",
+        "nis_mean",
+    ):
         assert together[name] == pytest.approx(expected[name], rel=1e-12), name
     for name in ("median_3d", "nees_median", "nis_median"):
         assert together[name] == pytest.approx(expected[name], rel=0.01), name
-    np.testing.assert_allclose([together[f"coverage_3sigma_{axis}"] for axis in "xyz"], coverage(error, covariance))
+    np.testing.assert_allclose(
+        [together[f"coverage_3sigma_{axis}"] for axis in "xyz"], coverage(error, covariance)
+    )
 
 
 def test_what_a_run_leaves_survives_json_and_does_not_grow_with_it():
@@ -239,5 +305,7 @@ def test_what_a_run_leaves_survives_json_and_does_not_grow_with_it():
     for score in (Score("flight", made, truth), never, nan):
         one, other = Pool(), Pool()
         one.add(score.result())
-        other.add(Result.from_dict(json.loads(json.dumps(score.result().as_dict(), allow_nan=False))))
+        other.add(
+            Result.from_dict(json.loads(json.dumps(score.result().as_dict(), allow_nan=False)))
+        )
         assert repr(one.figures()) == repr(other.figures())

@@ -1,4 +1,6 @@
-"""Anchors that were moved or exchanged, before a recording or on the way: who names them, and who is not blamed."""
+"""Anchors that were moved or exchanged, before a recording or on the way: who names them, and who
+is not blamed.
+"""
 
 from dataclasses import replace
 
@@ -28,10 +30,17 @@ CONFIG = SimulationConfig(seed=21, bias=False, multipath=False)
 
 
 def flown(positions=None):
-    """The flight among the anchors of the survey, or at other positions, always along the same path."""
+    """The flight among the anchors of the survey, or at other positions, always along the same
+    path.
+    """
     filled, room = CONFIG.complete()
     moved = None if positions is None else filled.anchors.at(positions)
-    return replace(simulate(replace(CONFIG, anchors=moved), Trajectory(filled, room, np.random.default_rng(1))), anchors=filled.anchors)
+    return replace(
+        simulate(
+            replace(CONFIG, anchors=moved), Trajectory(filled, room, np.random.default_rng(1))
+        ),
+        anchors=filled.anchors,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -60,45 +69,83 @@ def calibrated(sound):
     keys = keys_of(sound.anchors.ids)
     n = len(sound.anchors)
     known = Covariance(keys, np.diag(np.repeat([0.02**2, 0.01**2], [3 * n, n])))
-    none = {name: {key: 0.0 for effect, key in keys if effect == name} for name in ("anchor_position", "anchor_delay")}
-    return EffectSet((AnchorPosition(none["anchor_position"]), AnchorDelay(none["anchor_delay"])), known)
+    none = {
+        name: {key: 0.0 for effect, key in keys if effect == name}
+        for name in ("anchor_position", "anchor_delay")
+    }
+    return EffectSet(
+        (AnchorPosition(none["anchor_position"]), AnchorDelay(none["anchor_delay"])), known
+    )
 
 
 def from_the_middle_on(flight, other):
     """The one until its middle, then the other."""
     middle = flight.tdoa.t[0] + 0.5 * np.ptp(flight.tdoa.t)
-    return replace(flight, tdoa=concatenated([rows_of(flight.tdoa, flight.tdoa.t < middle), rows_of(other.tdoa, other.tdoa.t >= middle)]))
+    return replace(
+        flight,
+        tdoa=concatenated(
+            [
+                rows_of(flight.tdoa, flight.tdoa.t < middle),
+                rows_of(other.tdoa, other.tdoa.t >= middle),
+            ]
+        ),
+    )
 
 
 def said(flight, effects=None, line=None):
-    return {finding.rule: finding for finding in check(of_flight(flight), (), FlightEstimator(None, effects), line).findings}
+    return {
+        finding.rule: finding
+        for finding in check(of_flight(flight), (), FlightEstimator(None, effects), line).findings
+    }
 
 
 def test_nothing_is_said_of_anchors_that_stand_where_they_should(sound, calibrated):
     assert said(sound, calibrated) == {}
 
 
-def test_an_anchor_that_was_moved_before_the_start_is_named_with_the_command_that_mends_it(moved, calibrated):
+def test_an_anchor_that_was_moved_before_the_start_is_named_with_the_command_that_mends_it(
+    moved, calibrated
+):
     found = said(moved, calibrated, "survey flight.bag --effects effects.yaml")
     (one,) = found.values()
-    assert one.rule in ("anchor_displaced", "anchor_moved") and "anchor 3 does not stand where the survey has it" in one.cause
+    assert (
+        one.rule in ("anchor_displaced", "anchor_moved")
+        and "anchor 3 does not stand where the survey has it" in one.cause
+    )
     assert one.remedy.startswith("survey flight.bag --effects effects.yaml")
 
 
 def test_localize_doubts_a_flight_with_a_moved_anchor_and_says_why(sound, moved, calibrated):
     estimator = FlightEstimator(None, calibrated)
-    good, doubtful = (believe(replace(flight, truth=None), estimator(flight), estimator) for flight in (sound, moved))
-    assert good.level == GOOD and doubtful.level != GOOD and "anchor 3 does not stand" in doubtful.reasons[0]
+    good, doubtful = (
+        believe(replace(flight, truth=None), estimator(flight), estimator)
+        for flight in (sound, moved)
+    )
+    assert (
+        good.level == GOOD
+        and doubtful.level != GOOD
+        and "anchor 3 does not stand" in doubtful.reasons[0]
+    )
 
 
-def test_what_happens_in_the_middle_of_a_recording_is_named_with_its_time(sound, moved, exchanged, calibrated):
+def test_what_happens_in_the_middle_of_a_recording_is_named_with_its_time(
+    sound, moved, exchanged, calibrated
+):
     (change,) = said(from_the_middle_on(sound, moved), calibrated).values()
-    assert change.rule in ("anchor_changed", "anchor_displaced") and change.cause.startswith("anchor 3")
+    assert change.rule in ("anchor_changed", "anchor_displaced") and change.cause.startswith(
+        "anchor 3"
+    )
     (swap,) = said(from_the_middle_on(sound, exchanged)).values()
-    assert swap.rule == "ids_exchanged" and swap.cause.endswith("2 and 5") and 28.0 < float(swap.evidence.split()[1]) < 50.0
+    assert (
+        swap.rule == "ids_exchanged"
+        and swap.cause.endswith("2 and 5")
+        and 28.0 < float(swap.evidence.split()[1]) < 50.0
+    )
 
 
-def test_with_exchanged_ids_evaluate_blames_neither_the_truth_nor_itself(exchanged, tmp_path, capsys):
+def test_with_exchanged_ids_evaluate_blames_neither_the_truth_nor_itself(
+    exchanged, tmp_path, capsys
+):
     """It said "tilted by 89.6 degrees", and ended with 0."""
     write_bag(exchanged, tmp_path / "flight")
     code = evaluate.main([str(tmp_path / "flight")])
@@ -109,7 +156,10 @@ def test_with_exchanged_ids_evaluate_blames_neither_the_truth_nor_itself(exchang
 
 def test_a_run_that_diverges_is_no_success(sound, tmp_path, capsys):
     rng = np.random.default_rng(0)
-    write_bag(replace(sound, tdoa=replace(sound.tdoa, d=rng.permutation(sound.tdoa.d))), tmp_path / "flight")
+    write_bag(
+        replace(sound, tdoa=replace(sound.tdoa, d=rng.permutation(sound.tdoa.d))),
+        tmp_path / "flight",
+    )
     assert evaluate.main([str(tmp_path / "flight")]) == 1 and "DIVERGED" in capsys.readouterr().out
 
 
@@ -118,7 +168,11 @@ def test_survey_asks_for_ids_before_anchors(exchanged, tmp_path, capsys):
     write_bag(exchanged, tmp_path / "flight")
     assert survey.main([str(tmp_path / "flight"), "--out", str(tmp_path / "surveyed")]) == 1
     out, err = capsys.readouterr()
-    assert "swapped" in out and "ids, signs and units first" in err and not (tmp_path / "surveyed" / "anchors.yaml").exists()
+    assert (
+        "swapped" in out
+        and "ids, signs and units first" in err
+        and not (tmp_path / "surveyed" / "anchors.yaml").exists()
+    )
 
 
 def test_one_moved_anchor_is_found_as_such_without_ground_truth(moved):
@@ -127,20 +181,34 @@ def test_one_moved_anchor_is_found_as_such_without_ground_truth(moved):
     (change,) = found.changes
     assert change.effect == "anchor_position" and change.anchor == "3"
     assert np.linalg.norm(found.shifts[ROW] - SHIFT) < 0.08
-    assert (np.abs(np.delete(found.shifts, ROW, axis=0)) < np.delete(found.position_std, ROW, axis=0)).all()
+    assert (
+        np.abs(np.delete(found.shifts, ROW, axis=0)) < np.delete(found.position_std, ROW, axis=0)
+    ).all()
 
 
 def test_nothing_is_said_to_be_untold_of_an_anchor_that_has_moved(moved):
     found = self_calibrate([replace(moved, truth=None)], Tape(std=0.05))
     told = replace(found, solution=replace(found.solution, covariance=found.prior.covariance))
-    (line,) = (line for line in as_text(told).splitlines() if line.startswith("nothing new is told"))
+    (line,) = (
+        line for line in as_text(told).splitlines() if line.startswith("nothing new is told")
+    )
     assert "3" not in line and "anchor 3 has moved" in as_text(told)
 
 
 def test_anchors_of_a_hall_that_are_left_behind_are_no_fault():
     """There were 44 warnings: look at its power."""
-    grid = np.array([[10.0 * i, 10.0 * k, 3.0 + 2.0 * ((i + k) % 2)] for i in range(9) for k in range(5)])
+    grid = np.array(
+        [[10.0 * i, 10.0 * k, 3.0 + 2.0 * ((i + k) % 2)] for i in range(9) for k in range(5)]
+    )
     hall = Anchors.from_positions(grid)
-    drive = SimulationConfig(anchors=hall, radio_reach=25.0, trajectory="line_x", radius=30.0, speed=3.0, duration=35.0, bias=False)
+    drive = SimulationConfig(
+        anchors=hall,
+        radio_reach=25.0,
+        trajectory="line_x",
+        radius=30.0,
+        speed=3.0,
+        duration=35.0,
+        bias=False,
+    )
     found = said(simulate(drive))
     assert len(hall) == 45 and not {"anchor_silent", "anchor_missing", "anchor_rare"} & set(found)

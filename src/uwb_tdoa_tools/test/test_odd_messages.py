@@ -6,15 +6,22 @@ import pytest
 pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
-import odd_messages  # noqa: E402
 from geometry_msgs.msg import PoseWithCovarianceStamped  # noqa: E402
+import odd_messages  # noqa: E402
+
 from uwb_tdoa_msgs.msg import AnchorArray, Tdoa  # noqa: E402
 
 FEW = 100
 GROWTH = 100e6  # bytes in the second half; an effect that is compiled takes 50 MB
 
 
-@pytest.mark.parametrize("name", ["ekf_node", *(pytest.param(name, marks=pytest.mark.slow) for name in ("bias_node", "debias_node"))])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "ekf_node",
+        *(pytest.param(name, marks=pytest.mark.slow) for name in ("bias_node", "debias_node")),
+    ],
+)
 def test_no_message_ends_a_node_and_each_is_accounted_for(name, tmp_path):
     account = odd_messages.ordeal(name, FEW, tmp_path)
     assert not odd_messages.wrong(account)
@@ -24,11 +31,17 @@ def test_no_message_ends_a_node_and_each_is_accounted_for(name, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=() if name == "vehicle_node" else pytest.mark.slow) for name in odd_messages.SERVICES]
+    "name",
+    [
+        pytest.param(name, marks=() if name == "vehicle_node" else pytest.mark.slow)
+        for name in odd_messages.SERVICES
+    ],
 )
 def test_no_request_ends_a_node_and_each_is_answered(name, tmp_path):
     answered, used = odd_messages.request_ordeal(name, FEW // 4, tmp_path)
-    assert len(answered) == 6 + len(odd_messages.SERVICES[name]) and min(answered.values()) >= FEW // 4
+    assert (
+        len(answered) == 6 + len(odd_messages.SERVICES[name]) and min(answered.values()) >= FEW // 4
+    )
     assert used[-1] < used[len(used) // 2] + GROWTH
 
 
@@ -41,5 +54,8 @@ def test_no_time_ends_a_node(tmp_path):
 def test_whole_messages_are_readable_and_changed_ones_often_are_not(kind):
     rng = np.random.default_rng(2)
     assert odd_messages.is_readable(odd_messages.whole(kind, 7), kind)
-    readable = [odd_messages.is_readable(odd_messages.changed(odd_messages.whole(kind, k), rng), kind) for k in range(200)]
+    readable = [
+        odd_messages.is_readable(odd_messages.changed(odd_messages.whole(kind, k), rng), kind)
+        for k in range(200)
+    ]
     assert 30 < sum(readable) < 170

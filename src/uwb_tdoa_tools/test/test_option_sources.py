@@ -1,4 +1,6 @@
-"""What an option says and a file says too: the option counts, or is refused with a sentence; nothing is passed over."""
+"""What an option says and a file says too: the option counts, or is refused with a sentence;
+nothing is passed over.
+"""
 
 from dataclasses import replace
 
@@ -11,13 +13,30 @@ pytest.importorskip("rclpy")  # of demo
 from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, Covariance, EffectSet, TagLeverArm  # noqa: E402
 from uwb_tdoa_bias.foundation.survey import read_survey  # noqa: E402
 from uwb_tdoa_tools.bags.bag import read_bag, write_bag  # noqa: E402
-from uwb_tdoa_tools.commands import check, convert, debias, demo, diagnose, evaluate, inject, localize, survey  # noqa: E402
+from uwb_tdoa_tools.commands import (
+    check,
+    convert,
+    debias,
+    demo,
+    diagnose,
+    evaluate,
+    inject,
+    localize,
+    survey,
+)  # noqa: E402
 from uwb_tdoa_tools.diagnosis.references import REFERENCES  # noqa: E402
 from uwb_tdoa_tools.estimate import with_antenna  # noqa: E402
 from uwb_tdoa_tools.evaluating.evaluator import Evaluator  # noqa: E402
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate  # noqa: E402
 
-CLEAN = dict(duration=14.0, floor_time=1.0, imu_rate=100.0, bias=False, multipath=False, outlier_probability=0.0)
+CLEAN = dict(
+    duration=14.0,
+    floor_time=1.0,
+    imu_rate=100.0,
+    bias=False,
+    multipath=False,
+    outlier_probability=0.0,
+)
 
 
 @pytest.fixture
@@ -27,7 +46,9 @@ def desk(tmp_path, monkeypatch):
     flight = simulate(SimulationConfig(seed=1, **CLEAN))
     flight.anchors.to_yaml("right.yaml")
     off = 0.4 * np.random.default_rng(2).standard_normal(flight.anchors.positions.shape)
-    write_bag(replace(flight, anchors=flight.anchors.at(flight.anchors.positions + off)), "flight.bag")
+    write_bag(
+        replace(flight, anchors=flight.anchors.at(flight.anchors.positions + off)), "flight.bag"
+    )
     return tmp_path
 
 
@@ -35,7 +56,9 @@ def rmse(words, monkeypatch):
     """3D RMSE that evaluate reaches."""
     results, judge = [], Evaluator.__call__
     with monkeypatch.context() as patch:
-        patch.setattr(Evaluator, "__call__", lambda self, one: results.append(judge(self, one)) or results[-1])
+        patch.setattr(
+            Evaluator, "__call__", lambda self, one: results.append(judge(self, one)) or results[-1]
+        )
         assert evaluate.main(words) == 0
     return results[0].row["rmse_3d"]
 
@@ -44,7 +67,10 @@ def rmse(words, monkeypatch):
 
 
 def test_evaluate_takes_the_survey(desk, monkeypatch, capsys):
-    own, given = rmse(["flight.bag", "--no-bias"], monkeypatch), rmse(["flight.bag", "--no-bias", "--survey", "right.yaml"], monkeypatch)
+    own, given = (
+        rmse(["flight.bag", "--no-bias"], monkeypatch),
+        rmse(["flight.bag", "--no-bias", "--survey", "right.yaml"], monkeypatch),
+    )
     assert given < 0.5 * own
     assert "right.yaml count here, whatever anchors the bag holds" in capsys.readouterr().err
 
@@ -52,7 +78,22 @@ def test_evaluate_takes_the_survey(desk, monkeypatch, capsys):
 def test_convert_and_inject_put_the_survey_into_the_bag(desk):
     right = read_survey("right.yaml").positions
     assert convert.main(["flight.bag", "--survey", "right.yaml", "--out", "new.bag"]) == 0
-    assert inject.main(["flight.bag", "--survey", "right.yaml", "--effect", "anchor_delay", "--value", "0=0.1", "--out", "late.bag"]) == 0
+    assert (
+        inject.main(
+            [
+                "flight.bag",
+                "--survey",
+                "right.yaml",
+                "--effect",
+                "anchor_delay",
+                "--value",
+                "0=0.1",
+                "--out",
+                "late.bag",
+            ]
+        )
+        == 0
+    )
     for bag in ("new.bag", "late.bag"):
         np.testing.assert_allclose(read_bag(bag).anchors.positions, right, atol=1e-9)
     assert not np.allclose(read_bag("flight.bag").anchors.positions, right, atol=0.01)
@@ -76,11 +117,17 @@ def test_localize_takes_the_survey(desk):
 def test_every_tool_reads_the_recording_with_the_survey(desk, monkeypatch, command, words):
     """It says so, and whatever it then does it does with those anchors."""
     seen = []
-    module = {check: "uwb_tdoa_tools.checking.recording", debias: "uwb_tdoa_tools.readers.inputs"}.get(
-        command, "uwb_tdoa_tools.readers.inputs"
-    )
+    module = {
+        check: "uwb_tdoa_tools.checking.recording",
+        debias: "uwb_tdoa_tools.readers.inputs",
+    }.get(command, "uwb_tdoa_tools.readers.inputs")
     name = "_read_bag" if command is check else "read_flight"
-    monkeypatch.setattr(f"{module}.{name}", lambda *args: seen.append(args[2] if command is check else args[1]) or pytest.fail("enough"))
+    monkeypatch.setattr(
+        f"{module}.{name}",
+        lambda *args: (
+            seen.append(args[2] if command is check else args[1]) or pytest.fail("enough")
+        ),
+    )
     with pytest.raises(BaseException, match="enough"):
         command.main([*words, "--survey", "right.yaml"])
     assert [str(one) for one in seen] == ["right.yaml"]
@@ -94,7 +141,14 @@ def test_a_parameter_counts_before_the_config(desk, monkeypatch):
     (desk / "ekf_node.yaml").write_text(yaml.safe_dump(parameters))
     plain = rmse(["flight.bag", "--no-bias"], monkeypatch)
     of_file = rmse(["flight.bag", "--no-bias", "--config", "ekf_node.yaml"], monkeypatch)
-    assert of_file != plain == rmse(["flight.bag", "--no-bias", "--config", "ekf_node.yaml", "-p", "tdoa_std:=0.25"], monkeypatch)
+    assert (
+        of_file
+        != plain
+        == rmse(
+            ["flight.bag", "--no-bias", "--config", "ekf_node.yaml", "-p", "tdoa_std:=0.25"],
+            monkeypatch,
+        )
+    )
 
 
 def test_the_arm_of_an_effect_counts_before_that_of_a_bag(desk):
@@ -129,30 +183,62 @@ def test_no_option_of_the_estimate_goes_with_an_odometry_that_was_recorded(desk,
 KNOWN = {"marks": "m.yaml", "distances": "d.csv", "odometry": "/vio"}
 
 
-@pytest.mark.parametrize("reference, option", [(reference, option) for reference, some in diagnose.UNUSED.items() for option in some])
+@pytest.mark.parametrize(
+    "reference, option",
+    [(reference, option) for reference, some in diagnose.UNUSED.items() for option in some],
+)
 def test_what_a_reference_does_not_use_is_refused(desk, capsys, reference, option):
     sentence = f"--{option}: no part of it is used with --reference {reference}"
-    refused(diagnose, ["flight.bag", "--reference", reference, f"--{option}", KNOWN[option], "--out", "out"], sentence, capsys)
+    refused(
+        diagnose,
+        ["flight.bag", "--reference", reference, f"--{option}", KNOWN[option], "--out", "out"],
+        sentence,
+        capsys,
+    )
 
 
 def test_every_reference_says_which_options_it_does_not_use():
     assert diagnose.UNUSED.keys() == REFERENCES.keys()
 
 
-@pytest.mark.parametrize("more", [("--std", "0.2"), ("--height-std", "0.1"), ("--trusted", "0"), ("--trusted-std", "0.01")])
+@pytest.mark.parametrize(
+    "more",
+    [("--std", "0.2"), ("--height-std", "0.1"), ("--trusted", "0"), ("--trusted-std", "0.01")],
+)
 def test_what_the_last_calibration_says_of_anchors_no_tape_says(desk, capsys, more):
     keys = (("anchor_position", "0.x"), ("anchor_delay", "0"))
-    effects = (EFFECTS["anchor_position"]({"0.x": 0.0}, {"0.x": 0.1}), AnchorDelay({"0": 0.0}, {"0": 0.1}))
+    effects = (
+        EFFECTS["anchor_position"]({"0.x": 0.0}, {"0.x": 0.1}),
+        AnchorDelay({"0": 0.0}, {"0": 0.1}),
+    )
     EffectSet(effects, Covariance(keys, 0.01 * np.eye(2))).to_yaml("effects.yaml")
-    sentence = f"{more[0]}: effects.yaml says how well each anchor is known, by its last calibration"
-    refused(survey, ["flight.bag", "--effects", "effects.yaml", *more, "--out", "out"], sentence, capsys)
+    sentence = (
+        f"{more[0]}: effects.yaml says how well each anchor is known, by its last calibration"
+    )
+    refused(
+        survey, ["flight.bag", "--effects", "effects.yaml", *more, "--out", "out"], sentence, capsys
+    )
 
 
 @pytest.mark.parametrize("more", [("--topic", "uwb/tdoa=/x"), ("--namespace", "tag1")])
 def test_topics_do_not_go_with_columns(desk, capsys, more):
     (desk / "a.csv").write_text("t,a,b,d\n0,1,2,0.1\n")
-    words = ["a.csv", "--columns", "time=t,anchor_a=a,anchor_b=b,tdoa=d", "--survey", "right.yaml", *more, "--out", "new.bag"]
-    refused(convert, words, f"{more[0]}: says where topics are in bags, and --columns is of CSV files", capsys)
+    words = [
+        "a.csv",
+        "--columns",
+        "time=t,anchor_a=a,anchor_b=b,tdoa=d",
+        "--survey",
+        "right.yaml",
+        *more,
+        "--out",
+        "new.bag",
+    ]
+    refused(
+        convert,
+        words,
+        f"{more[0]}: says where topics are in bags, and --columns is of CSV files",
+        capsys,
+    )
 
 
 def test_a_survey_does_not_go_with_a_simulated_demo(desk, capsys):

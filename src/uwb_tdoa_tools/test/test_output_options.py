@@ -1,4 +1,7 @@
-"""No command writes through a link, or over what it reads. The commands are those of setup.py, so that a new one is among them."""
+"""No command writes through a link, or over what it reads.
+
+The commands are those of setup.py, so that a new one is among them.
+"""
 
 from importlib import import_module
 import re
@@ -6,10 +9,16 @@ import re
 from documented import ROOT
 from output_attacks import attack, content, outputs, parsers, place, unknown  # noqa: F401
 import pytest
+
 from uwb_tdoa_tools import cli
 from uwb_tdoa_tools.outputs import OutputBag, OutputFile, OutputFolder
 
-NAMES = sorted(re.findall(r"uwb_tdoa_tools\.executables:(\w+)", (ROOT / "src" / "uwb_tdoa_tools" / "setup.py").read_text()))
+NAMES = sorted(
+    re.findall(
+        r"uwb_tdoa_tools\.executables:(\w+)",
+        (ROOT / "src" / "uwb_tdoa_tools" / "setup.py").read_text(),
+    )
+)
 COMMANDS = [name for name in NAMES if not name.endswith("_node")]  # a node writes no file
 PARSERS = {}
 for _name in COMMANDS:
@@ -27,9 +36,20 @@ def test_all_that_write_are_there():
     assert {action.type for _, action in OUTPUTS} == {OutputFile, OutputFolder, OutputBag}
 
 
-@pytest.mark.parametrize(("words", "action"), OUTPUTS, ids=[f"{' '.join(words)} {action.dest}" for words, action in OUTPUTS])
+@pytest.mark.parametrize(
+    ("words", "action"),
+    OUTPUTS,
+    ids=[f"{' '.join(words)} {action.dest}" for words, action in OUTPUTS],
+)
 def test_no_command_writes_through_a_link_or_over_what_it_reads(place, capsys, words, action):
-    attack(import_module(f"uwb_tdoa_tools.commands.{words[0]}").main, words, PARSERS[words], action, place, capsys)
+    attack(
+        import_module(f"uwb_tdoa_tools.commands.{words[0]}").main,
+        words,
+        PARSERS[words],
+        action,
+        place,
+        capsys,
+    )
 
 
 @pytest.mark.parametrize("kind", [OutputFile, OutputFolder, OutputBag])
@@ -58,7 +78,9 @@ def test_standard_output_is_a_file():
         (OutputFile, "no/file", "its directory does not exist"),
     ],
 )
-def test_a_place_that_cannot_be_written_to_is_refused_before_the_work(place, capsys, kind, out, said):
+def test_a_place_that_cannot_be_written_to_is_refused_before_the_work(
+    place, capsys, kind, out, said
+):
     before, parser = content(place), cli.parser("write", "Write.")
     parser.add_argument("--out", type=kind)
     assert cli.run(None, parser, ["--out", str(place / out)]) == 2

@@ -1,16 +1,19 @@
-"""Runs over many flights at once. (The functions are of this module, which the other processes import.)"""
+"""Runs over many flights at once.
+
+(The functions are of this module, which the other processes import.)
+"""
 
 import os
+from pathlib import Path
 import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
+
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_tools import cli
-from uwb_tdoa_tools import parallel
+from uwb_tdoa_tools import cli, parallel
 
 
 def times_ten(number):
@@ -52,7 +55,9 @@ def test_the_first_is_done_here_and_the_others_elsewhere(importable):
     assert here == os.getpid() and here not in others and 1 <= len(set(others)) <= 2
 
 
-def test_what_draws_in_other_processes_takes_no_settings_of_the_present_folder(importable, tmp_path, monkeypatch):
+def test_what_draws_in_other_processes_takes_no_settings_of_the_present_folder(
+    importable, tmp_path, monkeypatch
+):
     (tmp_path / "matplotlibrc").write_text("savefig.dpi: 100000\n")
     monkeypatch.chdir(tmp_path)
     assert list(parallel.over(resolution, range(4), 2))[1:] == ["figure"] * 3
@@ -86,29 +91,43 @@ def test_an_interrupt_ends_all_of_it_without_a_word(importable):
     code = (
         "import sys, time; from uwb_tdoa_tools import cli, parallel\n"
         "def work(args):\n"
-        "    for number in parallel.over(time.sleep, [0.0] + 200 * [0.2], 2): print('done', flush=True)\n"
+        "    for number in parallel.over(time.sleep, [0.0] + 200 * [0.2], 2): print('done', "
+        "flush=True)\n"
         "sys.exit(cli.run(work, cli.parser('work', 'Work.'), []))"
     )
     work = subprocess.Popen(
-        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
+        [sys.executable, "-c", code],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
     )
     for _ in range(3):
-        assert work.stdout.readline() == b"done\n"  # the first by itself, the others by its children
+        assert (
+            work.stdout.readline() == b"done\n"
+        )  # the first by itself, the others by its children
     os.killpg(work.pid, signal.SIGINT)  # as a terminal does
     _, err = work.communicate(timeout=120)  # returns when the children have closed their ends, too
-    assert work.returncode == 130 and all(b" of 201 flights done, " in line for line in err.splitlines())
+    assert work.returncode == 130 and all(
+        b" of 201 flights done, " in line for line in err.splitlines()
+    )
 
 
 def test_a_folder_of_flights_does_not_say_what_the_others_run(tmp_path, importable):
-    """Python looks for modules where it starts, if it is told to by -m, as joblib does: whatever lies there would run."""
+    """Python looks for modules where it starts, if it is told to by -m, as joblib does: whatever
+    lies there would run.
+    """
     for name in ("joblib", "struct", "selectors", "runpy", "pickle"):
-        (tmp_path / f"{name}.py").write_text(f"open('{tmp_path}/ran', 'w').close(); raise SystemExit(1)")
+        (tmp_path / f"{name}.py").write_text(
+            f"open('{tmp_path}/ran', 'w').close(); raise SystemExit(1)"
+        )
     (tmp_path / "work.py").write_text(
         "import os, sys; sys.path.pop(0)\n"
         "from uwb_tdoa_tools import parallel\n"
         "print([*parallel.over(os.path.abspath, ['a', 'b', 'c', 'd'], 2)])\n"
     )
-    ended = subprocess.run([sys.executable, "work.py"], cwd=tmp_path, capture_output=True, text=True, timeout=100)
+    ended = subprocess.run(
+        [sys.executable, "work.py"], cwd=tmp_path, capture_output=True, text=True, timeout=100
+    )
     assert ended.stdout == f"{[str(tmp_path / name) for name in 'abcd']}\n", ended.stderr
     assert not (tmp_path / "ran").exists()
 
@@ -134,7 +153,11 @@ def test_few_items_are_done_in_one_process_unless_more_are_asked_for():
 
 
 def test_other_calls_have_the_same_processes(importable):
-    seen = {number for count in (6, 3, 8) for number in list(parallel.over(process, range(count), 2))[1:]}
+    seen = {
+        number
+        for count in (6, 3, 8)
+        for number in list(parallel.over(process, range(count), 2))[1:]
+    }
     assert 1 <= len(seen) <= 2
 
 
@@ -164,13 +187,20 @@ def test_an_address_that_is_none(monkeypatch):
         list(parallel.over(times_ten, [1, 2], dask="nowhere"))
 
 
-@pytest.mark.parametrize(("address", "said"), [("tcp://10.0.0.1:8786", 1), ("ucx://10.0.0.2:1", 1), ("tls://10.0.0.1:8786", 0)])
+@pytest.mark.parametrize(
+    ("address", "said"),
+    [("tcp://10.0.0.1:8786", 1), ("ucx://10.0.0.2:1", 1), ("tls://10.0.0.1:8786", 0)],
+)
 def test_whom_a_connection_trusts_is_said_once(address, said, capsys):
     parallel._say_whom_it_trusts.cache_clear()
     for _ in range(2):
         parallel._say_whom_it_trusts(address)
     err = capsys.readouterr().err
-    assert err.count(f"--dask: {address} is not encrypted: whoever reaches it") == err.count("\n") == said
+    assert (
+        err.count(f"--dask: {address} is not encrypted: whoever reaches it")
+        == err.count("\n")
+        == said
+    )
 
 
 @pytest.mark.parametrize("encrypted", [False, True])
@@ -181,13 +211,21 @@ def test_a_cluster_is_asked_by_the_certificates_of_dask(importable, encrypted, m
         pytest.importorskip("cryptography")
     security = distributed.Security.temporary() if encrypted else None
     parallel._say_whom_it_trusts.cache_clear()
-    with distributed.LocalCluster(1, threads_per_worker=1, dashboard_address=None, security=security) as cluster:
+    with distributed.LocalCluster(
+        1, threads_per_worker=1, dashboard_address=None, security=security
+    ) as cluster:
         address = cluster.scheduler_address
         if encrypted:
             with pytest.raises(InputError, match="no scheduler answers"):  # a stranger without them
                 list(parallel.over(times_ten, range(3), dask=address))
-            tls = {"ca-file": security.tls_ca_file, "client.cert": security.tls_client_cert, "client.key": security.tls_client_key}
-            with dask.config.set({f"distributed.comm.tls.{name}": value for name, value in tls.items()}):
+            tls = {
+                "ca-file": security.tls_ca_file,
+                "client.cert": security.tls_client_cert,
+                "client.key": security.tls_client_key,
+            }
+            with dask.config.set(
+                {f"distributed.comm.tls.{name}": value for name, value in tls.items()}
+            ):
                 assert list(parallel.over(times_ten, range(3), dask=address)) == [0, 10, 20]
         else:
             assert list(parallel.over(times_ten, range(3), dask=address)) == [0, 10, 20]

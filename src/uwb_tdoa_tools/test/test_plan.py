@@ -7,10 +7,11 @@ import time
 
 import numpy as np
 import pytest
+
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.flyable import FlyableVolume
-from uwb_tdoa_tools.commands import plan
 from uwb_tdoa_tools.bags.bag import write_bag
+from uwb_tdoa_tools.commands import plan
 from uwb_tdoa_tools.planning import advice, run
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.constellations import corners
@@ -38,19 +39,44 @@ def report(out):
 
 def test_a_volume(anchors, tmp_path, capsys):
     out = tmp_path / "new" / "plan"
-    assert plan.main([anchors, "--volume", *COARSE, "--flyable", "pairings", "--out", str(out), "--json", str(tmp_path / "copy.json")]) == 0
+    assert (
+        plan.main(
+            [
+                anchors,
+                "--volume",
+                *COARSE,
+                "--flyable",
+                "pairings",
+                "--out",
+                str(out),
+                "--json",
+                str(tmp_path / "copy.json"),
+            ]
+        )
+        == 0
+    )
     assert {path.name for path in out.iterdir()} == FILES
     assert report(out) == json.loads((tmp_path / "copy.json").read_text())
     found = report(out)["map"]
     assert found["cells"] == [14, 16, 6] and 0.3 < found["flyable_share"] < 1.0
-    assert sum(found[f"{name}_share"] for name in ("flyable", "two_solutions", "imprecise", "too_few", "outside")) == pytest.approx(1.0)
+    assert sum(
+        found[f"{name}_share"]
+        for name in ("flyable", "two_solutions", "imprecise", "too_few", "outside")
+    ) == pytest.approx(1.0)
     for name in ("precision.png", "flyable.png"):
         assert (out / name).read_bytes().startswith(b"\x89PNG")
     volume = FlyableVolume.load(out / "flyable.npz")
-    assert volume.belongs_to(corners()) and volume.contains([0.0, 0.0, 1.5]) and not volume.contains([3.4, 3.9, 0.2])
+    assert (
+        volume.belongs_to(corners())
+        and volume.contains([0.0, 0.0, 1.5])
+        and not volume.contains([3.4, 3.9, 0.2])
+    )
     assert found["flyable_size"] == pytest.approx(volume.flyable.sum() * 0.125)
     text = capsys.readouterr().out
-    assert f"{100 * found['flyable_share']:.0f} % of your room can be flown (" in text and str(out) in text
+    assert (
+        f"{100 * found['flyable_share']:.0f} % of your room can be flown (" in text
+        and str(out) in text
+    )
     assert "what the anchors span; if yours is another: --room" in text
 
 
@@ -67,18 +93,49 @@ def test_a_round_of_ranges_and_of_both(anchors, tmp_path, capsys):
     assert report(tmp_path / "ranges")["map"]["two_solutions_share"] == 0.0
     capsys.readouterr()
     for wrong in (["--flyable", "pairings"], ["--check"]):
-        assert plan.main([anchors, "--protocol", "ranges", *wrong, "--step", "1", "--out", str(tmp_path / "no")]) == 2
+        assert (
+            plan.main(
+                [
+                    anchors,
+                    "--protocol",
+                    "ranges",
+                    *wrong,
+                    "--step",
+                    "1",
+                    "--out",
+                    str(tmp_path / "no"),
+                ]
+            )
+            == 2
+        )
         assert "ranges have none; leave it out" in capsys.readouterr().err
 
 
 def test_a_slice_of_known_height(square, tmp_path, capsys):
     out = tmp_path / "out"
-    options = ["--planar", "--height", "0.2", "--room", "-1", "5", "-1", "5", "--tx-power", "-3", "--flyable", "pairings", "--check", *COARSE]
+    options = [
+        "--planar",
+        "--height",
+        "0.2",
+        "--room",
+        "-1",
+        "5",
+        "-1",
+        "5",
+        "--tx-power",
+        "-3",
+        "--flyable",
+        "pairings",
+        "--check",
+        *COARSE,
+    ]
     assert plan.main([square, *options, "--out", str(out)]) == 0
     assert {path.name for path in out.iterdir()} == FILES | {"flips.png"}
     found = report(out)
     assert found["check"]["agreement"] >= 0.99 and found["check"]["places"] == 144
-    assert list(found["map"]["bound_99_per_axis_in_hull"]) == ["x", "y"] and found["map"]["cells"] == [12, 12, 1]
+    assert list(found["map"]["bound_99_per_axis_in_hull"]) == ["x", "y"] and found["map"][
+        "cells"
+    ] == [12, 12, 1]
     assert FlyableVolume.load(out / "flyable.npz").contains([2.0, 2.0, 77.0])
     assert "without orientation" in capsys.readouterr().out
 
@@ -90,7 +147,9 @@ def test_options_change_the_bound(anchors, tmp_path, monkeypatch):
 
     base = median()
     assert median("--protocol", "tdoa3") == pytest.approx(median("--covariance", "all_pairs"))
-    monkeypatch.setattr(run, "draw_map", lambda *_, **__: None)  # nor is the bound looked for in what follows from it
+    monkeypatch.setattr(
+        run, "draw_map", lambda *_, **__: None
+    )  # nor is the bound looked for in what follows from it
     monkeypatch.setattr(run, "room_advice", lambda *_: None)
     (tmp_path / "weak.yaml").write_text(
         "azimuth: [0,0,0,0]\nelevation_1: [0,0,0,0]\nelevation_2: [0,0,0,0]\ngain_offset: -20\n"
@@ -108,7 +167,10 @@ def test_measured_accuracy(anchors, tmp_path, capsys):
     flight = simulate(SimulationConfig(anchors=corners(), trajectory="circle", duration=20))
     write_bag(flight, tmp_path / "flight.bag")
     out = tmp_path / "out"
-    assert plan.main([anchors, *COARSE, "--flights", str(tmp_path / "flight.bag"), "--out", str(out)]) == 0
+    assert (
+        plan.main([anchors, *COARSE, "--flights", str(tmp_path / "flight.bag"), "--out", str(out)])
+        == 0
+    )
     assert {path.name for path in out.iterdir()} == FILES | {"accuracy.png"}
     one, pooled = report(out)["flights"]
     assert one["flight"] == flight.name and pooled["samples"] == one["samples"] > 1000
@@ -116,19 +178,43 @@ def test_measured_accuracy(anchors, tmp_path, capsys):
 
 
 def test_one_figure_of_the_room_and_an_anchor_that_makes_it_larger(tmp_path, capsys):
-    """Six anchors in one half of a room: the other half is imprecise, and the plan with the anchor that is proposed says what was promised."""
-    half = Anchors.from_positions([[0, 0, 0.2], [4, 0, 2.8], [4, 5, 0.2], [0, 5, 2.8], [0, 0, 2.8], [4, 5, 2.8]], [7, 3, 12, 5, 1, 9])
+    """Six anchors in one half of a room: the other half is imprecise, and the plan with the anchor
+    that is proposed says what was promised.
+    """
+    half = Anchors.from_positions(
+        [[0, 0, 0.2], [4, 0, 2.8], [4, 5, 0.2], [0, 5, 2.8], [0, 0, 2.8], [4, 5, 2.8]],
+        [7, 3, 12, 5, 1, 9],
+    )
     half.to_yaml(tmp_path / "half.yaml")
-    options = [str(tmp_path / "half.yaml"), "--volume", "--room", "0", "8", "0", "5", "0", "3", "--step", "0.5", "--accuracy", "0.1"]
+    options = [
+        str(tmp_path / "half.yaml"),
+        "--volume",
+        "--room",
+        "0",
+        "8",
+        "0",
+        "5",
+        "0",
+        "3",
+        "--step",
+        "0.5",
+        "--accuracy",
+        "0.1",
+    ]
     out = tmp_path / "out"
     assert plan.main([*options, "--out", str(out)]) == 0
     found, text = report(out), capsys.readouterr().out
     share, more = found["map"]["flyable_share"], found["addition"]
-    assert share == pytest.approx(found["map"]["flyable_size"] / 120.0) and found["map"]["size"] == pytest.approx(120.0)
+    assert share == pytest.approx(found["map"]["flyable_size"] / 120.0) and found["map"][
+        "size"
+    ] == pytest.approx(120.0)
     x, y, z = more["position"]
     assert x > 4.0 and more["gain"] > 0.05 and more["bound_after"] < more["bound_before"]
     assert np.linalg.norm(half.positions - more["position"], axis=1).min() >= 1.0
-    assert f"add an anchor at ({x:.2f}, {y:.2f}, {z:.2f}): {100 * share:.1f} -> {100 * more['flyable_share']:.1f} % can be flown" in text
+    assert (
+        f"add an anchor at ({x:.2f}, {y:.2f}, {z:.2f}): {100 * share:.1f} -> "
+        f"{100 * more['flyable_share']:.1f} % can be flown"
+    ) in text
     Anchors.from_positions([*half.positions, more["position"]]).to_yaml(tmp_path / "half.yaml")
     assert plan.main([*options, "--out", str(out)]) == 0
     again = report(out)["map"]
@@ -139,7 +225,9 @@ def test_one_figure_of_the_room_and_an_anchor_that_makes_it_larger(tmp_path, cap
 def test_where_no_anchor_helps_it_says_so(anchors, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(run, "TRIED", 4)
     monkeypatch.setattr(advice, "FINER", 0.9)
-    assert plan.main([anchors, "--step", "1", "--accuracy", "5", "--out", str(tmp_path / "out")]) == 0
+    assert (
+        plan.main([anchors, "--step", "1", "--accuracy", "5", "--out", str(tmp_path / "out")]) == 0
+    )
     assert "no place that was tried for one more anchor gains 1 %" in capsys.readouterr().out
     assert report(tmp_path / "out")["addition"] is None
 
@@ -148,26 +236,49 @@ def test_where_no_anchor_helps_it_says_so(anchors, tmp_path, capsys, monkeypatch
 @pytest.mark.parametrize("how", ["add", "move"])
 def test_improve(how, turned, tmp_path, capsys):
     poor = corners()
-    ids, orientations = [7, 3, 12, 5, 1], poor.orientations[:5] if turned else np.full((5, 4), np.nan)
+    ids, orientations = (
+        [7, 3, 12, 5, 1],
+        poor.orientations[:5] if turned else np.full((5, 4), np.nan),
+    )
     before = Anchors(ids, poor.positions[:5] * [0.5, 1, 1], orientations, "hall")
     before.to_yaml(tmp_path / "poor.yaml")
     out = tmp_path / "out"
     options = ["--fly", "-1", "1", "-2", "2", "0.6", "1.6", "--starts", "1"]
-    assert plan.main([str(tmp_path / "poor.yaml"), "--step", "1", *options, "--improve", how, "--out", str(out)]) == 0
-    assert {path.name for path in out.iterdir()} == FILES | {"improved.yaml", "layout.png"} | ({"places.png"} if how == "add" else set())
+    assert (
+        plan.main(
+            [
+                str(tmp_path / "poor.yaml"),
+                "--step",
+                "1",
+                *options,
+                "--improve",
+                how,
+                "--out",
+                str(out),
+            ]
+        )
+        == 0
+    )
+    assert {path.name for path in out.iterdir()} == FILES | {"improved.yaml", "layout.png"} | (
+        {"places.png"} if how == "add" else set()
+    )
     found, text = report(out)["improve"], capsys.readouterr().out
     assert found["after"]["worst"] < found["before"]["worst"]
     assert found["before"]["flyable_share"] == report(out)["map"]["flyable_share"]
-    assert f"{100 * found['after']['flyable_share']:8.1f}" in next(line for line in text.splitlines() if line.startswith("flyable, %"))
+    assert f"{100 * found['after']['flyable_share']:8.1f}" in next(
+        line for line in text.splitlines() if line.startswith("flyable, %")
+    )
     better = Anchors.from_yaml(out / "improved.yaml")
     assert set(better.ids) == set(ids) | ({0} if how == "add" else set()) and better.frame == "hall"
-    np.testing.assert_allclose(better.positions, better.positions.round(2), atol=1e-4 if how == "add" else 1e-12)
+    np.testing.assert_allclose(
+        better.positions, better.positions.round(2), atol=1e-4 if how == "add" else 1e-12
+    )
     assert np.isfinite(better.orientations).all() if turned else np.isnan(better.orientations).all()
     if how == "add":
         np.testing.assert_array_equal(better.positions[better.index(ids)], before.positions)
-    assert [int(line.split()[1].strip(":")) for line in text.splitlines() if line.startswith("anchor ")] == [
-        one["id"] for one in found["placed"]
-    ]
+    assert [
+        int(line.split()[1].strip(":")) for line in text.splitlines() if line.startswith("anchor ")
+    ] == [one["id"] for one in found["placed"]]
 
 
 @pytest.mark.parametrize(
@@ -213,7 +324,12 @@ def test_useless_anchors_are_told_in_one_sentence(positions, says, tmp_path, cap
     Anchors.from_positions(positions).to_yaml(tmp_path / "a.yaml")
     assert plan.main([str(tmp_path / "a.yaml"), "--out", str(tmp_path / "out")]) == 2
     err = capsys.readouterr().err
-    assert err.startswith("plan: error: ") and "anchors" in err and says in err and err.count("\n") == 1
+    assert (
+        err.startswith("plan: error: ")
+        and "anchors" in err
+        and says in err
+        and err.count("\n") == 1
+    )
     assert not (tmp_path / "out").exists()
 
 
@@ -243,7 +359,9 @@ def test_maps_are_published_to_late_subscribers(anchors, tmp_path):
         node = rclpy.create_node("viewer", context=context)
         latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
         for kind, topic in ((OccupancyGrid, "plan/flyable"), (MarkerArray, "plan/markers")):
-            node.create_subscription(kind, topic, lambda message, topic=topic: got.setdefault(topic, message), latched)
+            node.create_subscription(
+                kind, topic, lambda message, topic=topic: got.setdefault(topic, message), latched
+            )
         executor = rclpy.executors.SingleThreadedExecutor(context=context)
         executor.add_node(node)
         until = time.monotonic() + 120.0
@@ -255,20 +373,34 @@ def test_maps_are_published_to_late_subscribers(anchors, tmp_path):
         process.kill()
         process.stdout.close()
         context.try_shutdown()
-    assert set(np.unique(got["plan/flyable"].data)) <= {0, 50, 75, 100} and len(got["plan/markers"].markers) == 10
+    assert (
+        set(np.unique(got["plan/flyable"].data)) <= {0, 50, 75, 100}
+        and len(got["plan/markers"].markers) == 10
+    )
 
 
 def test_with_a_height_sensor_four_anchors_at_one_height_serve_a_volume(square, tmp_path, capsys):
     """They do not without: their plane mirrors every position."""
-    options, out = ["--volume", "--room", "0", "4", "0", "4", "0", "2", "--step", "0.5"], tmp_path / "o"
+    options, out = (
+        ["--volume", "--room", "0", "4", "0", "4", "0", "2", "--step", "0.5"],
+        tmp_path / "o",
+    )
     assert plan.main([square, *options, "--out", str(out)]) == 2
     assert "--with height" in capsys.readouterr().err
     figures = []
     for std in ("0.02", "0.2"):
-        assert plan.main([square, *options, "--with", "height", "--height-std", std, "--out", str(out)]) == 0
+        assert (
+            plan.main(
+                [square, *options, "--with", "height", "--height-std", std, "--out", str(out)]
+            )
+            == 0
+        )
         figures.append(json.loads((out / "plan.json").read_text())["map"])
     assert figures[0] != figures[1]
-    assert plan.main([square, *options, "--with", "height", "--height-std", "0", "--out", str(out)]) == 2
+    assert (
+        plan.main([square, *options, "--with", "height", "--height-std", "0", "--out", str(out)])
+        == 2
+    )
     assert "height std" in capsys.readouterr().err
 
 
@@ -276,7 +408,15 @@ def test_flights_are_judged_with_the_height_that_they_hold(anchors, tmp_path, ca
     write_bag(simulate(SimulationConfig(duration=20.0, height_noise=0.01)), tmp_path / "flight.bag")
     ratios = {}
     for options in ((), ("--with", "height")):
-        arguments = [anchors, *COARSE, *options, "--flights", str(tmp_path / "flight.bag"), "--out", str(tmp_path / "o")]
+        arguments = [
+            anchors,
+            *COARSE,
+            *options,
+            "--flights",
+            str(tmp_path / "flight.bag"),
+            "--out",
+            str(tmp_path / "o"),
+        ]
         assert plan.main(arguments) == 0
         ratios[options] = json.loads((tmp_path / "o" / "plan.json").read_text())["flights"][-1]
     without, aided = ratios.values()

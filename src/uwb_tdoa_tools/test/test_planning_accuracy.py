@@ -1,7 +1,15 @@
 import numpy as np
 import pytest
+
 from uwb_tdoa_tools.planning import accuracy
-from uwb_tdoa_tools.planning.accuracy import FEW, ErrorSamples, accuracy_map, comparison, fly, together
+from uwb_tdoa_tools.planning.accuracy import (
+    FEW,
+    ErrorSamples,
+    accuracy_map,
+    comparison,
+    fly,
+    together,
+)
 from uwb_tdoa_tools.planning.installation import Installation
 from uwb_tdoa_tools.planning.maps import Grid
 from uwb_tdoa_tools.planning.noise import FixedNoise
@@ -15,8 +23,9 @@ BIAS = np.array([0.1, -0.2, 0.3])
 
 
 def samples(n=4000, scale=1.0, seed=0):
-    """As good as the bound of one round times `scale`, beside a bias; the filter claims twice the standard
-    deviation."""
+    """As good as the bound of one round times `scale`, beside a bias; the filter claims twice the
+    standard deviation.
+    """
     rng = np.random.default_rng(seed)
     place = rng.uniform([-2, -2, 0.5], [2, 2, 1.5], (n, 3))
     limit = bound(information(place, INSTALLATION))
@@ -29,7 +38,9 @@ def test_a_map_shows_bias_and_scatter_where_they_are():
     found = accuracy_map(samples(), INSTALLATION, grid)
     assert found.count.sum() == 4000 and found.count.min() > 200
     np.testing.assert_allclose(found.bias, np.tile(BIAS, (16, 1)), atol=0.015)
-    np.testing.assert_allclose(np.sqrt(found.rmse**2 - found.bias**2), found.bound, rtol=0.15)  # eq. 22 of Grasso et al.
+    np.testing.assert_allclose(
+        np.sqrt(found.rmse**2 - found.bias**2), found.bound, rtol=0.15
+    )  # eq. 22 of Grasso et al.
     np.testing.assert_allclose(found.claimed, 2.0 * found.bound, rtol=1e-9)
 
 
@@ -56,7 +67,9 @@ def test_flights_pool_without_mixing_their_seconds():
     one, other = samples(seed=1), samples(seed=2)
     shifted = ErrorSamples(other.t, other.place, other.error + 1.0, other.covariance)
     pooled = comparison(together([one, shifted]), INSTALLATION)
-    assert pooled["samples"] == 8000 and pooled["scatter_over_bound"] == pytest.approx(1.0, abs=0.03)
+    assert pooled["samples"] == 8000 and pooled["scatter_over_bound"] == pytest.approx(
+        1.0, abs=0.03
+    )
 
 
 @pytest.mark.parametrize("trajectory", ["hover", "circle"])
@@ -64,7 +77,12 @@ def test_a_simulated_flight(trajectory):
     """Without bias, what the filter reaches is better than one round, and far from a thousand."""
     flight = simulate(
         SimulationConfig(
-            trajectory=trajectory, duration=20, bias=False, multipath=False, outlier_probability=0.0, shared_noise=True
+            trajectory=trajectory,
+            duration=20,
+            bias=False,
+            multipath=False,
+            outlier_probability=0.0,
+            shared_noise=True,
         )
     )
     flown = fly(flight)
@@ -82,7 +100,12 @@ def test_a_static_grid_is_mapped_place_by_place():
         fly(
             simulate(
                 SimulationConfig(
-                    trajectory="hover", place=place, height=1.2, duration=20, start_in_air=True, floor_time=0.0
+                    trajectory="hover",
+                    place=place,
+                    height=1.2,
+                    duration=20,
+                    start_in_air=True,
+                    floor_time=0.0,
                 )
             )
         )
@@ -98,7 +121,10 @@ def test_a_static_grid_is_mapped_place_by_place():
 
 
 def test_a_measured_flight(shared_data):
-    path, survey = shared_data / "flights/0425/TDOA2/0425-traj2", shared_data / "surveys/anchor_0425.txt"
+    path, survey = (
+        shared_data / "flights/0425/TDOA2/0425-traj2",
+        shared_data / "surveys/anchor_0425.txt",
+    )
     flight = read_flight(path, survey)
     found = comparison(fly(flight), Installation(flight.anchors))
     assert 0.10 < found["bound"] < 0.13

@@ -1,7 +1,8 @@
-import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+import numpy as np
+import pytest
+
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.planning.bifurcation import MOST_SUBSETS, Subsets
@@ -21,7 +22,9 @@ def tdoas(points, anchors):
 
 
 def test_in_the_plane_it_is_the_polynomial_of_compagnoni_et_al():
-    """|D_1 a_2 - D_2 a_1|^2 - |a_1 ^ a_2|^2, whose sign decides in Inverse Problems 30, 2014, 035004."""
+    """|D_1 a_2 - D_2 a_1|^2 - |a_1 ^ a_2|^2, whose sign decides in Inverse Problems 30, 2014,
+    035004.
+    """
     points = np.column_stack([np.random.default_rng(0).uniform(-3, 7, (300, 2)), np.full(300, 0.2)])
     subsets = Subsets(SKEW, 2)
     for rows, got in zip(subsets.rows, subsets.discriminant(points).T):
@@ -29,7 +32,9 @@ def test_in_the_plane_it_is_the_polynomial_of_compagnoni_et_al():
         d = np.linalg.norm(points[:, None] - corner, axis=-1)
         (a1, a2), d1, d2 = corner[1:, :2] - corner[0, :2], d[:, 1] - d[:, 0], d[:, 2] - d[:, 0]
         wedge = a1[0] * a2[1] - a1[1] * a2[0]
-        np.testing.assert_allclose(got, np.sum((d1[:, None] * a2 - d2[:, None] * a1) ** 2, axis=1) / wedge**2 - 1)
+        np.testing.assert_allclose(
+            got, np.sum((d1[:, None] * a2 - d2[:, None] * a1) ** 2, axis=1) / wedge**2 - 1
+        )
 
 
 @pytest.mark.parametrize("dimensions", [2, 3])
@@ -40,14 +45,18 @@ def test_the_order_of_the_anchors_does_not_matter(dimensions):
     points = rng.uniform([-4, -4, 0], [4, 4, 3], (200, 3))
     one, order = Subsets(anchors, dimensions), rng.permutation(6)
     shuffled = Anchors(anchors.ids[order], anchors.positions[order], anchors.orientations[order])
-    np.testing.assert_allclose(Subsets(shuffled, dimensions).ambiguous(points), one.ambiguous(points))
+    np.testing.assert_allclose(
+        Subsets(shuffled, dimensions).ambiguous(points), one.ambiguous(points)
+    )
 
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 10**6), st.sampled_from([2, 3]))
 def test_a_mirrored_position_has_the_same_tdoas(seed, dimensions):
     rng = np.random.default_rng(seed)
-    anchors = Anchors.from_positions(rng.uniform([-4, -4, 0], [4, 4, 3], (dimensions + 1, 3)))  # of any heights
+    anchors = Anchors.from_positions(
+        rng.uniform([-4, -4, 0], [4, 4, 3], (dimensions + 1, 3))
+    )  # of any heights
     try:
         subsets = Subsets(anchors, dimensions)
     except InputError:
@@ -58,7 +67,9 @@ def test_a_mirrored_position_has_the_same_tdoas(seed, dimensions):
         np.testing.assert_array_equal(mirror[:, 2], points[row, 2])
     near = np.linalg.norm(mirror, axis=1) < 1e4
     np.testing.assert_allclose(
-        tdoas(mirror[near], anchors.positions), tdoas(points[row[near]], anchors.positions), atol=1e-6
+        tdoas(mirror[near], anchors.positions),
+        tdoas(points[row[near]], anchors.positions),
+        atol=1e-6,
     )
     assert len(row) == np.sum(subsets.discriminant(points) > 0.0)
 
@@ -80,7 +91,9 @@ def agreement(anchors, dimensions, points, chosen=None):
     for q in range(len(subsets.rows)) if chosen is None else chosen:
         corner = anchors.positions[subsets.rows[q]]
         found = solutions(points, corner, dimensions)
-        assert (same_place(points[:, None], found, corner)).any(axis=1).all()  # it finds at least the point
+        assert (
+            (same_place(points[:, None], found, corner)).any(axis=1).all()
+        )  # it finds at least the point
         unique = (np.isnan(found[..., 0]) | same_place(points[:, None], found, corner)).all(axis=1)
         agree.append(unique == predicted[:, q])
     assert 0.02 < np.mean(predicted) < 0.98
@@ -107,7 +120,11 @@ def test_brute_force_agrees_in_space():
 @pytest.mark.slow
 def test_brute_force_agrees_on_a_whole_grid():
     for anchors, dimensions, grid in (
-        (SQUARE, 2, Grid.slice((-1, 5), (-1, 5), 0.2, 0.2)),  # with the diagonals, on which two solutions meet in one
+        (
+            SQUARE,
+            2,
+            Grid.slice((-1, 5), (-1, 5), 0.2, 0.2),
+        ),  # with the diagonals, on which two solutions meet in one
         (corners(), 3, Grid.box((-4, -4.5, -0.5), (4, 4.5, 3.5), 1.5)),
     ):
         unique, agrees, points, _ = brute_force(Installation(anchors, dimensions=dimensions), grid)
@@ -116,8 +133,9 @@ def test_brute_force_agrees_on_a_whole_grid():
 
 
 def test_the_flyable_area_of_the_paper():
-    """Fig. 6c and sec. 5.1: an envelope about each anchor that holds at least all within 0.5 m of it; the middle and
-    the middles of the sides are free; the same at all four corners."""
+    """Fig. 6c and sec. 5.1: an envelope about each anchor that holds at least all within 0.5 m of
+    it; the middle and the middles of the sides are free; the same at all four corners.
+    """
     subsets, installation = Subsets(SQUARE, 2), Installation(SQUARE, dimensions=2)
     assert len(subsets.rows) == 4 and subsets.left_out == 0
     points = Grid.slice((-1, 5), (-1, 5), 0.2, 0.04).points
@@ -131,8 +149,12 @@ def test_the_flyable_area_of_the_paper():
     hull = installation.inside_hull(points)
     assert np.mean(free[hull]) == pytest.approx(0.890, abs=0.002)
     on_the_diagonal = np.linspace(0.01, 1.5, 150)
-    reach = Subsets(SQUARE, 2).ambiguous(np.column_stack([on_the_diagonal, on_the_diagonal, 0 * on_the_diagonal + 0.2]))
-    assert np.sqrt(2) * on_the_diagonal[np.flatnonzero(reach)[-1]] == pytest.approx(np.sqrt(0.5), abs=0.02)
+    reach = Subsets(SQUARE, 2).ambiguous(
+        np.column_stack([on_the_diagonal, on_the_diagonal, 0 * on_the_diagonal + 0.2])
+    )
+    assert np.sqrt(2) * on_the_diagonal[np.flatnonzero(reach)[-1]] == pytest.approx(
+        np.sqrt(0.5), abs=0.02
+    )
 
 
 def test_flat_choices_are_left_out():

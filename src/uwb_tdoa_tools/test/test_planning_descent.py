@@ -9,8 +9,8 @@ from uwb_tdoa_tools.planning import descent
 from uwb_tdoa_tools.planning.bifurcation import Subsets
 from uwb_tdoa_tools.planning.descent import descend, errors_and_slopes, failing_and_slopes
 from uwb_tdoa_tools.planning.goal import UNUSABLE, Goal
-from uwb_tdoa_tools.planning.judging import Demand
 from uwb_tdoa_tools.planning.installation import Installation
+from uwb_tdoa_tools.planning.judging import Demand
 from uwb_tdoa_tools.planning.layout import Layout
 from uwb_tdoa_tools.planning.places import AnchorPlaces, lattice
 from uwb_tdoa_tools.simulation.constellations import corners
@@ -19,13 +19,25 @@ ROOM = np.array([-4.0, -4.5, 0.0]), np.array([4.0, 4.5, 3.0])
 POINTS = lattice((-3.2, -3.1, 0.5), (2.9, 3.3, 2), 1.6)
 
 
-def case(pairing="ring", link_std=0.0, dimensions=3, fixed=None, depth=0.0, objective="worst", criterion="pairings"):
+def case(
+    pairing="ring",
+    link_std=0.0,
+    dimensions=3,
+    fixed=None,
+    depth=0.0,
+    objective="worst",
+    criterion="pairings",
+):
     installation = Installation(corners(), link_std=link_std, dimensions=dimensions)
     count, places = 6 if fixed is None else 2, AnchorPlaces.walls(*ROOM, depth=depth)
     layout = Layout(places, count, fixed, np.array([0.0, 0.0, 1.5]))
     x = layout.start(places.nearest(corners().positions[-count:]))
     x += np.random.default_rng(4).uniform(-0.1, 0.1, len(x))
-    return Goal(POINTS, installation, pairing, objective, Demand(criterion=criterion)), layout, np.clip(x, *np.transpose(layout.bounds))
+    return (
+        Goal(POINTS, installation, pairing, objective, Demand(criterion=criterion)),
+        layout,
+        np.clip(x, *np.transpose(layout.bounds)),
+    )
 
 
 CASES = [
@@ -53,8 +65,12 @@ def test_slopes_are_those_of_numerical_differentiation(options):
     share, along = failing_and_slopes(goal, layout, x, POINTS)
     assert 0.05 < share < 0.95
     for k, step in enumerate(1e-5 * np.eye(len(x))):
-        np.testing.assert_allclose(slopes[:, k], (bound(x + step) - bound(x - step)) / 2e-5, atol=2e-4 * slopes.max())
-        assert along[k] == pytest.approx((failing(x + step) - failing(x - step)) / 2e-5, abs=1e-3 * np.abs(along).max())
+        np.testing.assert_allclose(
+            slopes[:, k], (bound(x + step) - bound(x - step)) / 2e-5, atol=2e-4 * slopes.max()
+        )
+        assert along[k] == pytest.approx(
+            (failing(x + step) - failing(x - step)) / 2e-5, abs=1e-3 * np.abs(along).max()
+        )
 
 
 @pytest.mark.parametrize("dimensions", [2, 3])
@@ -88,7 +104,9 @@ def test_a_descent_goes_down_and_stays_in_bounds(objective):
 
 def test_anchors_that_locate_nothing_have_no_slopes():
     goal, layout, x = case()
-    low = Layout(AnchorPlaces([[0, 0, 1, 6, 5, 1]]), 6, None, np.zeros(3))  # all in one plane, with the points beside it
+    low = Layout(
+        AnchorPlaces([[0, 0, 1, 6, 5, 1]]), 6, None, np.zeros(3)
+    )  # all in one plane, with the points beside it
     x, points = low.start(np.random.default_rng(0).random((6, 2))), POINTS * [1, 1, 0] + [0, 0, 1]
     errors, slopes = errors_and_slopes(goal, low, x, points)
     assert (errors == UNUSABLE).all() and not slopes.any()
@@ -100,9 +118,13 @@ def test_anchors_that_locate_nothing_have_no_slopes():
 
 @pytest.mark.parametrize("objective", ["worst", "mean"])
 def test_a_descent_leaves_a_start_at_which_the_goal_cannot_be_told(objective):
-    """A slope of zero that was made up there would be a valley: the descent would be over before it began."""
+    """A slope of zero that was made up there would be a valley: the descent would be over before it
+    began.
+    """
     goal, layout, x = case(objective=objective)
-    level = np.column_stack([np.linspace(0.05, 0.95, 6), np.full(6, 0.5)])  # round the walls, half-way up
+    level = np.column_stack(
+        [np.linspace(0.05, 0.95, 6), np.full(6, 0.5)]
+    )  # round the walls, half-way up
     x = layout.start(level)
     goal = replace(goal, points=POINTS * [1, 1, 0] + [0, 0, 1.5])
     with pytest.raises(InputError):

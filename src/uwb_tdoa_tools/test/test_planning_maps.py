@@ -2,14 +2,15 @@ import time
 
 import numpy as np
 import pytest
+
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.planning.bifurcation import Subsets
 from uwb_tdoa_tools.planning.installation import Installation
 from uwb_tdoa_tools.planning.judging import OUTSIDE, TWO_SOLUTIONS, Demand
 from uwb_tdoa_tools.planning.maps import MOST_CELLS, Grid, chart
 from uwb_tdoa_tools.planning.pairing import PAIRINGS
-from uwb_tdoa_tools.simulation.room import Room
 from uwb_tdoa_tools.simulation.constellations import constellation, corners
+from uwb_tdoa_tools.simulation.room import Room
 
 
 def test_cells_are_cubes_that_cover_the_box():
@@ -17,7 +18,8 @@ def test_cells_are_cubes_that_cover_the_box():
     assert grid.shape == (10, 3, 1) and grid.points.shape == (30, 3)
     np.testing.assert_allclose(grid.lower, [0.0, -0.025, 0.0], atol=1e-12)
     np.testing.assert_allclose(
-        grid.points[[0, 1, 3, -1]], [[0.05, 0.025, 0.05], [0.05, 0.125, 0.05], [0.15, 0.025, 0.05], [0.95, 0.225, 0.05]]
+        grid.points[[0, 1, 3, -1]],
+        [[0.05, 0.025, 0.05], [0.05, 0.125, 0.05], [0.15, 0.025, 0.05], [0.95, 0.225, 0.05]],
     )
     assert Grid.slice((0, 1), (0, 1), 1.2, 0.25).axes[2].tolist() == [1.2]
     layer = grid.layer(np.arange(30), 0)
@@ -26,9 +28,13 @@ def test_cells_are_cubes_that_cover_the_box():
 
 @pytest.mark.parametrize(
     ("upper", "step", "says"),
-    [((1, 1, 0), 0.1, "is empty"), ((1, 1, 1), 0.0, "step: 0"), ((1, 1, 1), float("nan"), "step: nan"),
-     ((9, 9, 9), 1e-3, f"more than {MOST_CELLS}")],
-)  # fmt: skip
+    [
+        ((1, 1, 0), 0.1, "is empty"),
+        ((1, 1, 1), 0.0, "step: 0"),
+        ((1, 1, 1), float("nan"), "step: nan"),
+        ((9, 9, 9), 1e-3, f"more than {MOST_CELLS}"),
+    ],
+)
 def test_impossible_grids(upper, step, says):
     with pytest.raises(InputError, match=says):
         Grid.box((0, 0, 0), upper, step)
@@ -51,8 +57,13 @@ def test_a_chart_says_the_same_as_its_parts():
 
 def test_a_whole_round_leaves_more_flyable_than_every_pairing_alone():
     grid = Grid.box((-4, -4, 0), (4, 4, 3), 0.8)
-    alone, whole = (chart(Installation(corners()), grid, Demand(criterion=criterion)) for criterion in ("pairings", "round"))
-    assert (whole.flyable | ~alone.flyable).all() and whole.flyable.sum() > 1.2 * alone.flyable.sum()
+    alone, whole = (
+        chart(Installation(corners()), grid, Demand(criterion=criterion))
+        for criterion in ("pairings", "round")
+    )
+    assert (
+        whole.flyable | ~alone.flyable
+    ).all() and whole.flyable.sum() > 1.2 * alone.flyable.sum()
 
 
 def cpu_seconds(anchors, shape, pairing):
@@ -61,7 +72,9 @@ def cpu_seconds(anchors, shape, pairing):
     grid = Grid(anchors.positions.min(axis=0) + [0, 0, 0.3 * step], step, shape)
     installation = Installation(anchors, pairing=PAIRINGS[pairing](len(anchors)))
     began = time.process_time()
-    found = chart(installation, grid, Demand(Room(grid.lower, grid.lower + grid.step * np.array(shape))))
+    found = chart(
+        installation, grid, Demand(Room(grid.lower, grid.lower + grid.step * np.array(shape)))
+    )
     assert np.isfinite(found.error).mean() > 0.9
     return time.process_time() - began
 

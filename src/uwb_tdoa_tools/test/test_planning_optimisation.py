@@ -1,12 +1,13 @@
 import numpy as np
 import pytest
+
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.planning.goal import Goal
-from uwb_tdoa_tools.planning.judging import Demand
 from uwb_tdoa_tools.planning.installation import Installation
-from uwb_tdoa_tools.planning.optimisation import BESIDE, one_more, optimise
+from uwb_tdoa_tools.planning.judging import Demand
 from uwb_tdoa_tools.planning.noise import FixedNoise
+from uwb_tdoa_tools.planning.optimisation import BESIDE, one_more, optimise
 from uwb_tdoa_tools.planning.places import AnchorPlaces, lattice
 from uwb_tdoa_tools.readers import read_survey
 from uwb_tdoa_tools.simulation.constellations import constellation, facing
@@ -16,12 +17,20 @@ MARGIN = np.array([0.8, 0.8, 0.6])  # m of a room that are not flown
 
 
 def goal(installation, criterion="pairings", objective="worst"):
-    return Goal(lattice((1, 1, 0.5), (5, 4, 2), 1.5), installation, "ring", objective, Demand(criterion=criterion))
+    return Goal(
+        lattice((1, 1, 0.5), (5, 4, 2), 1.5),
+        installation,
+        "ring",
+        objective,
+        Demand(criterion=criterion),
+    )
 
 
 def bad_anchors():
     """All crowded into one corner of the room."""
-    return facing([[0, 0, 0.2], [1.5, 0, 2.5], [0, 1.5, 1.5], [0.5, 0, 1.0], [0, 0.7, 2.9]], (3, 2.5, 1.5))
+    return facing(
+        [[0, 0, 0.2], [1.5, 0, 2.5], [0, 1.5, 1.5], [0.5, 0, 1.0], [0, 0.7, 2.9]], (3, 2.5, 1.5)
+    )
 
 
 @pytest.mark.parametrize("objective", ["worst", "mean"])
@@ -43,7 +52,9 @@ def test_failure_is_avoided_where_the_bound_would_not_mind():
         if a["failing"] != b["failing"]:
             break
     assert a["failing"] > 0 or b["failing"] > 0
-    assert aim.score(constellation(f"random-{seed}-5")) == pytest.approx(a["worst"] * (1 + a["failing"]))
+    assert aim.score(constellation(f"random-{seed}-5")) == pytest.approx(
+        a["worst"] * (1 + a["failing"])
+    )
 
 
 def test_one_more_anchor():
@@ -71,18 +82,25 @@ def test_no_layout_at_all():
         optimise(aim, AnchorPlaces([[0, 0, 1, 6, 5, 1]]), 5, starts=2)
 
 
-FLIGHTS = (-1.6, -1.6, 0.3), (1.6, 1.6, 2.1)  # what holds all that was flown higher than 0.3 m on 0422, 0425 and 0426
+FLIGHTS = (
+    (-1.6, -1.6, 0.3),
+    (1.6, 1.6, 2.1),
+)  # what holds all that was flown higher than 0.3 m on 0422, 0425 and 0426
 
 
 @pytest.mark.parametrize("where", ["shared flights", "room"])
 @pytest.mark.slow
 def test_the_surveyed_layout_is_beaten_by_a_fifth(where, shared_data):
-    """8 anchors in 7 x 8 x 3 m: the worst bound over a flown volume, on a grid the search has not seen. On the walls for
-    the volume of the shared flights; on stands up to 0.5 m before them, for all of the room but 0.8 m at the walls and
-    0.6 m at floor and ceiling (on the bare walls hardly a fifth is possible)."""
+    """8 anchors in 7 x 8 x 3 m: the worst bound over a flown volume, on a grid the search has not
+    seen. On the walls for the volume of the shared flights; on stands up to 0.5 m before them, for
+    all of the room but 0.8 m at the walls and 0.6 m at floor and ceiling (on the bare walls hardly
+    a fifth is possible).
+    """
     survey = read_survey(shared_data / "surveys" / "anchor_0425.txt")
     lower, upper = np.array([-3.05, -4.2, 0.0]), np.array([3.95, 3.8, 3.0])
-    flown, depth = (FLIGHTS, 0.0) if where == "shared flights" else ((lower + MARGIN, upper - MARGIN), 0.5)
+    flown, depth = (
+        (FLIGHTS, 0.0) if where == "shared flights" else ((lower + MARGIN, upper - MARGIN), 0.5)
+    )
     step = 0.09 * (np.array(flown[1]) - flown[0]).max()
     aim = Goal(lattice(*flown, step), Installation(survey), demand=Demand())
     better = optimise(aim, AnchorPlaces.walls(lower, upper, depth=depth), 8, starts=8)

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.planning.places import AnchorPlaces, lattice, spread
 
@@ -29,10 +30,16 @@ def test_places_of_all_shapes():
     places = AnchorPlaces([[0, 0, 0, 1, 2, 3], [5, 5, 5, 5, 5, 5], [7, 0, 1, 9, 0, 1]])
     assert places.numbers == 3
     p = places.positions(np.random.default_rng(0).random((4000, 3)))
-    block, post, rail = (p[:, 0] <= 1, (p == 5).all(axis=1), (p[:, 0] >= 7) & (p[:, 1] == 0) & (p[:, 2] == 1))
+    block, post, rail = (
+        p[:, 0] <= 1,
+        (p == 5).all(axis=1),
+        (p[:, 0] >= 7) & (p[:, 1] == 0) & (p[:, 2] == 1),
+    )
     assert (block | post | rail).all() and block.any() and rail.any()
     np.testing.assert_allclose(p[block].max(axis=0), [1, 2, 3], atol=0.05)
-    np.testing.assert_allclose(AnchorPlaces([[5, 5, 5, 5, 5, 5]]).positions(np.array([0.3, 0.9])), [5, 5, 5])
+    np.testing.assert_allclose(
+        AnchorPlaces([[5, 5, 5, 5, 5, 5]]).positions(np.array([0.3, 0.9])), [5, 5, 5]
+    )
 
 
 def test_nearest_place():
@@ -62,7 +69,9 @@ def test_bad_places(content, tmp_path):
 
 def test_a_lattice_holds_the_corners():
     p = lattice((0, 0, 1), (2, 1, 1), 0.6)
-    assert {(0, 0, 1), (2, 1, 1), (0, 1, 1), (2, 0, 1)} <= set(map(tuple, p.tolist())) and len(p) == 5 * 3
+    assert {(0, 0, 1), (2, 1, 1), (0, 1, 1), (2, 0, 1)} <= set(map(tuple, p.tolist())) and len(
+        p
+    ) == 5 * 3
     assert np.diff(np.unique(p[:, 0])).max() <= 0.6
 
 
@@ -70,6 +79,8 @@ def test_a_spread_begins_with_the_corners_and_covers_the_rest():
     p = lattice((0, 0, 1), (5, 4, 2), 0.5)
     rows = spread(p, 40)
     assert len(set(rows)) == 40
-    assert set(map(tuple, p[rows[:8]])) == {(x, y, z) for x in (0, 5) for y in (0, 4) for z in (1, 2)}
+    assert set(map(tuple, p[rows[:8]])) == {
+        (x, y, z) for x in (0, 5) for y in (0, 4) for z in (1, 2)
+    }
     assert np.linalg.norm(p[:, None] - p[rows], axis=-1).min(axis=1).max() <= 1.0
     assert sorted(spread(p[:5], 40)) == [0, 1, 2, 3, 4] and len(spread(p, 3)) == 3

@@ -1,21 +1,23 @@
-"""What the pictures of plan show: what a legend or a title names is there, colours say at which end there is more, labels keep apart."""
+"""What the pictures of plan show: what a legend or a title names is there, colours say at which end
+there is more, labels keep apart.
+"""
 
 from dataclasses import replace
 
 import numpy as np
 from PIL import Image
 import pytest
+
 from uwb_tdoa_tools.planning import plots
+from uwb_tdoa_tools.planning.goal import Goal
 from uwb_tdoa_tools.planning.installation import Installation
 from uwb_tdoa_tools.planning.judging import IMPRECISE, Demand
 from uwb_tdoa_tools.planning.maps import Grid, chart
 from uwb_tdoa_tools.planning.optimisation import one_more
-from uwb_tdoa_tools.planning.goal import Goal
 from uwb_tdoa_tools.planning.places import AnchorPlaces, lattice
 from uwb_tdoa_tools.scoring.labels import put_labels
 from uwb_tdoa_tools.scoring.plots import plt
 from uwb_tdoa_tools.simulation.constellations import corners
-
 
 FLOWN = lattice((-1, -1, 0.5), (1, 1, 2), 1.0)
 
@@ -35,8 +37,18 @@ def found():
 
 @pytest.mark.parametrize("flyable", [True, False])
 def test_what_the_title_calls_hatched_is_hatched(found, flyable, figures):
-    one = replace(found, status=np.where(np.arange(len(found.status)) % 3 == 0, IMPRECISE, found.status)) if not flyable else found
-    plots.plot_layouts([("before", Installation(corners()), one), ("after", Installation(corners()), one)], FLOWN, None)
+    one = (
+        replace(
+            found, status=np.where(np.arange(len(found.status)) % 3 == 0, IMPRECISE, found.status)
+        )
+        if not flyable
+        else found
+    )
+    plots.plot_layouts(
+        [("before", Installation(corners()), one), ("after", Installation(corners()), one)],
+        FLOWN,
+        None,
+    )
     (figure, title) = figures[0]
     hatched = figure.findobj(lambda artist: any(getattr(artist, "hatches", ())))
     assert bool(hatched) == ("hatched" in title) == (not flyable)
@@ -47,17 +59,32 @@ def test_a_scale_has_an_arrow_at_each_end_beyond_which_there_is_more(found, figu
     (figure, _) = figures[0]
     (bar,) = (ax._colorbar for ax in figure.axes if hasattr(ax, "_colorbar"))
     values = 100.0 * found.error
-    assert bar.extend == {(True, True): "both", (True, False): "min", (False, True): "max", (False, False): "neither"}[
-        bool(values.min() < bar.vmin), bool(values.max() > bar.vmax)
-    ]
-    assert bar.get_ticks()[0] == pytest.approx(bar.vmin) and bar.get_ticks()[-1] == pytest.approx(bar.vmax)
+    assert (
+        bar.extend
+        == {
+            (True, True): "both",
+            (True, False): "min",
+            (False, True): "max",
+            (False, False): "neither",
+        }[bool(values.min() < bar.vmin), bool(values.max() > bar.vmax)]
+    )
+    assert bar.get_ticks()[0] == pytest.approx(bar.vmin) and bar.get_ticks()[-1] == pytest.approx(
+        bar.vmax
+    )
 
 
 def test_the_legend_states_the_share_of_each_state_that_there_is(found, figures):
     one = replace(found, status=np.where(np.arange(len(found.status)) % 4 == 0, IMPRECISE, 0))
     plots.plot_flyable(corners(), one, None)
-    (_, title), texts = figures[0], [text.get_text() for text in figures[0][0].legends[0].get_texts()]
-    assert "can be flown: 75 %" in texts and "imprecise: 25 %" in texts and not any("two solutions" in text for text in texts)
+    (_, title), texts = (
+        figures[0],
+        [text.get_text() for text in figures[0][0].legends[0].get_texts()],
+    )
+    assert (
+        "can be flown: 75 %" in texts
+        and "imprecise: 25 %" in texts
+        and not any("two solutions" in text for text in texts)
+    )
     assert "75 % of the room" in title
 
 
@@ -67,7 +94,9 @@ def test_every_picture_is_700_pixels_wide(found, tmp_path):
     plots.plot_precision(anchors, found, tmp_path / "precision.png")
     plots.plot_flyable(anchors, found, tmp_path / "flyable.png", pairings=Installation(anchors))
     plots.plot_heard(anchors, found, tmp_path / "heard.png")
-    plots.plot_layouts([("before", Installation(anchors), found)] * 2, FLOWN, tmp_path / "layout.png")
+    plots.plot_layouts(
+        [("before", Installation(anchors), found)] * 2, FLOWN, tmp_path / "layout.png"
+    )
     plots.plot_places(places, *one_more(goal, anchors, places, 40), tmp_path / "places.png")
     for path in tmp_path.iterdir():
         assert Image.open(path).width == 700, path.name

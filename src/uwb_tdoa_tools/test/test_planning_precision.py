@@ -1,25 +1,44 @@
 from dataclasses import replace
 
-import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+import numpy as np
+import pytest
 from scipy.linalg import cho_factor, cho_solve
 from scipy.ndimage import median_filter
+
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_tools.planning.installation import Installation
 from uwb_tdoa_tools.planning.maps import Grid
 from uwb_tdoa_tools.planning.noise import FixedNoise, RadioNoise
-from uwb_tdoa_tools.planning.pairing import PAIRINGS, Pairing, all_pairs, common_reference, every_range, ring
-from uwb_tdoa_tools.planning.precision import NORMAL_99, bound, dilution, ellipses, information, position_error, range_weights, weigh
+from uwb_tdoa_tools.planning.pairing import (
+    PAIRINGS,
+    Pairing,
+    all_pairs,
+    common_reference,
+    every_range,
+    ring,
+)
+from uwb_tdoa_tools.planning.precision import (
+    NORMAL_99,
+    bound,
+    dilution,
+    ellipses,
+    information,
+    position_error,
+    range_weights,
+    weigh,
+)
 from uwb_tdoa_tools.readers import read_flight
 from uwb_tdoa_tools.simulation.constellations import constellation, corners, facing
 from uwb_tdoa_tools.simulation.schedule import make_schedule
 
 SQUARE = facing([[0, 0, 0.2], [4, 0, 0.2], [4, 4, 0.2], [0, 4, 0.2]], (2, 2, 0.2))
-NOISY = RadioNoise(tx_power_dbm=-38.0, full_strength=0.1)  # metres of noise: the second term of eq. 1 counts
+NOISY = RadioNoise(
+    tx_power_dbm=-38.0, full_strength=0.1
+)  # metres of noise: the second term of eq. 1 counts
 PLACES = np.array([[0.4, -0.7, 1.3], [2.9, 3.1, 0.8], [-3.0, 1.0, 2.2], [3.2, 3.6, 0.5]])
 
 
@@ -33,7 +52,9 @@ def without(pairing, k):
 
 
 def numerical_information(point, installation, pairing, step=1e-3):
-    """Minus the second derivatives, by finite differences, of the expected log-likelihood of the TDOAs."""
+    """Minus the second derivatives, by finite differences, of the expected log-likelihood of the
+    TDOAs.
+    """
     k, anchors, d = installation.dimensions, installation.anchors, pairing.incidence()
 
     def moments(x):
@@ -73,7 +94,9 @@ CASES = {
 def test_information_is_the_curvature_of_the_likelihood(case, dimensions):
     make, link_std = CASES[case]
     installation = Installation(corners(), NOISY, make(8), link_std, dimensions)
-    pairing = without(ring(8), 3) if case == "ring" else installation.pairing  # the closed ring has no density
+    pairing = (
+        without(ring(8), 3) if case == "ring" else installation.pairing
+    )  # the closed ring has no density
     got = information(PLACES, installation)
     for point, matrix in zip(PLACES, got):
         wanted = numerical_information(point, installation, pairing)
@@ -83,15 +106,25 @@ def test_information_is_the_curvature_of_the_likelihood(case, dimensions):
 @pytest.mark.parametrize("noise", [NOISY, FixedNoise(0.1)])
 def test_what_tdoas_and_ranges_tell_adds_up(noise):
     """They are measured one without the other."""
-    alone = [information(PLACES, Installation(corners(), noise, PAIRINGS[name](8), 0.05)) for name in ("ring", "every_range")]
-    both = information(PLACES, Installation(corners(), noise, PAIRINGS["ring+every_range"](8), 0.05))
+    alone = [
+        information(PLACES, Installation(corners(), noise, PAIRINGS[name](8), 0.05))
+        for name in ("ring", "every_range")
+    ]
+    both = information(
+        PLACES, Installation(corners(), noise, PAIRINGS["ring+every_range"](8), 0.05)
+    )
     np.testing.assert_allclose(both, sum(alone), rtol=1e-12)
-    assert (position_error(bound(both)) < 0.95 * np.minimum(*(position_error(bound(one)) for one in alone))).all()
+    assert (
+        position_error(bound(both))
+        < 0.95 * np.minimum(*(position_error(bound(one)) for one in alone))
+    ).all()
 
 
 def test_the_second_term_of_eq_1_counts_here():
     installation = Installation(corners(), NOISY)
-    with_it, without_it = (bound(information(PLACES, installation, correction=c)) for c in (True, False))
+    with_it, without_it = (
+        bound(information(PLACES, installation, correction=c)) for c in (True, False)
+    )
     assert (position_error(without_it) > 1.1 * position_error(with_it)).all()
 
 
@@ -108,7 +141,8 @@ def test_it_does_not_matter_which_pair_of_the_ring_is_dropped():
     assert np.linalg.matrix_rank(full[0]) == 7
     np.testing.assert_allclose(h.swapaxes(1, 2) @ np.linalg.pinv(full) @ h, wanted, rtol=1e-9)
     np.testing.assert_allclose(
-        information(PLACES, replace(installation, pairing=common_reference(8))), information(PLACES, installation)
+        information(PLACES, replace(installation, pairing=common_reference(8))),
+        information(PLACES, installation),
     )
 
 
@@ -118,22 +152,29 @@ def test_link_noise_that_vanishes_leaves_the_ring():
 
 
 def information_of_schedule(protocol, anchors, point, variance, rounds):
-    """Information per N TDOAs of a simulated schedule in which TDOAs share the receptions that they are made from."""
+    """Information per N TDOAs of a simulated schedule in which TDOAs share the receptions that they
+    are made from.
+    """
     n = len(anchors)
-    schedule = make_schedule(protocol, n, 0.0165 * rounds * (1 if protocol == "tdoa2" else 2), np.random.default_rng(5))
+    schedule = make_schedule(
+        protocol, n, 0.0165 * rounds * (1 if protocol == "tdoa2" else 2), np.random.default_rng(5)
+    )
     d = np.zeros((len(schedule.t), len(schedule.sender)))
     rows = np.arange(len(d))
     d[rows, schedule.heard_b], d[rows, schedule.heard_a] = 1.0, -1.0
     covariance = (d * variance[schedule.sender]) @ d.T
-    unit = (point - anchors.positions[schedule.sender]) / ranges(point, anchors)[schedule.sender][:, None]
+    unit = (point - anchors.positions[schedule.sender]) / ranges(point, anchors)[schedule.sender][
+        :, None
+    ]
     h = d @ unit
     return h.T @ np.linalg.solve(covariance, h) / (len(d) / n)
 
 
 @pytest.mark.parametrize("protocol", ["tdoa2", "tdoa3"])
 def test_many_rounds_of_shared_receptions_tell_as_much_each_as_one_closed_ring(protocol):
-    """In flight, the ring does not close on the same reception of the first anchor, and TDOA3 pairs at random. Over
-    many rounds both come to the same information per round, but for lost packets."""
+    """In flight, the ring does not close on the same reception of the first anchor, and TDOA3 pairs
+    at random. Over many rounds both come to the same information per round, but for lost packets.
+    """
     anchors, point = corners(), PLACES[0]
     variance = RadioNoise().variance(point[None], anchors)[0]
     one = information(point[None], Installation(anchors), correction=False)[0]
@@ -144,7 +185,9 @@ def test_many_rounds_of_shared_receptions_tell_as_much_each_as_one_closed_ring(p
 
 @given(arrays(float, st.integers(4, 9), elements=st.floats(1e-4, 1.0)))
 def test_the_covariance_of_eqs_6_to_8_never_is_one(variance):
-    """Pairs without an anchor in common at the bound of eq. 7: the sum of all elements, a variance, is negative."""
+    """Pairs without an anchor in common at the bound of eq. 7: the sum of all elements, a variance,
+    is negative.
+    """
     pairs = ring(len(variance))
     matrix = pairs.covariance(variance[None])[0]
     assert abs(matrix.sum()) < 1e-9
@@ -155,7 +198,9 @@ def test_the_covariance_of_eqs_6_to_8_never_is_one(variance):
 
 
 def estimates(point, installation, trials, rounds, seed):
-    """Maximum-likelihood positions (Fisher scoring of the whole likelihood) of simulated rounds of TDOAs."""
+    """Maximum-likelihood positions (Fisher scoring of the whole likelihood) of simulated rounds of
+    TDOAs.
+    """
     rng, anchors, k = np.random.default_rng(seed), installation.anchors, installation.dimensions
     pairing = installation.pairing
     if pairing.shared and installation.link_std == 0.0 and len(pairing.a) == len(anchors):
@@ -167,7 +212,10 @@ def estimates(point, installation, trials, rounds, seed):
         return ranges(x, anchors) @ d.T, pairing.covariance(variance, installation.link_std)
 
     mean, covariance = moments(point[None])
-    tau = mean[0] + rng.standard_normal((trials, rounds, len(d))) @ np.linalg.cholesky(covariance[0]).T
+    tau = (
+        mean[0]
+        + rng.standard_normal((trials, rounds, len(d))) @ np.linalg.cholesky(covariance[0]).T
+    )
     x = np.tile(point, (trials, 1))
     steps = 1e-4 * np.eye(3)[:k]
     for _ in range(6):
@@ -208,28 +256,38 @@ def test_an_estimator_reaches_the_bound_where_the_size_of_the_errors_tells_the_p
 def test_dilution_in_the_middle_of_a_square():
     """Four alike ranges with an unknown offset from the corners: variance 1/2 along each axis."""
     installation = Installation(SQUARE, dimensions=2)
-    np.testing.assert_allclose(dilution(np.array([[2.0, 2.0, 0.2]]), installation), [[np.sqrt(0.5)] * 2])
+    np.testing.assert_allclose(
+        dilution(np.array([[2.0, 2.0, 0.2]]), installation), [[np.sqrt(0.5)] * 2]
+    )
     assert (dilution(np.array([[9.0, 2.0, 0.2]]), installation)[0] > [5.0, 1.0]).all()
 
 
 def test_no_bound_where_there_is_no_information():
-    singular = np.array([np.diag([4.0, 1.0, 0.0]), np.diag([4.0, 1.0, 0.5]), np.full((3, 3), np.nan)])
+    singular = np.array(
+        [np.diag([4.0, 1.0, 0.0]), np.diag([4.0, 1.0, 0.5]), np.full((3, 3), np.nan)]
+    )
     got = bound(singular)
     assert np.isinf(got[[0, 2]]).all()
     np.testing.assert_allclose(got[1], np.diag([0.25, 1.0, 2.0]))
 
 
 def test_the_4_x_4_m_square_of_the_paper():
-    """Grasso et al., sec. 2.2.3: best inside the hull, about +-5 cm at 99 % there. Power is not printed: the most that
-    the data sheet gives, -39 dBm/MHz over 499.2 MHz, and 9 dB for frames shorter than 0.125 ms."""
-    installation = Installation(SQUARE, RadioNoise(tx_power_dbm=-39.0 + 10 * np.log10(499.2) + 9.0), dimensions=2)
+    """Grasso et al., sec. 2.2.3: best inside the hull, about +-5 cm at 99 % there. Power is not
+    printed: the most that the data sheet gives, -39 dBm/MHz over 499.2 MHz, and 9 dB for frames
+    shorter than 0.125 ms.
+    """
+    installation = Installation(
+        SQUARE, RadioNoise(tx_power_dbm=-39.0 + 10 * np.log10(499.2) + 9.0), dimensions=2
+    )
     points = Grid.slice((-2, 6), (-2, 6), 0.2, 0.1).points
     covariance = bound(information(points, installation))
     per_axis = NORMAL_99 * np.sqrt(0.5) * position_error(covariance)
     inside = installation.inside_hull(points)
     assert 0.04 < np.median(per_axis[inside]) < 0.055
     assert np.quantile(per_axis[inside], 0.95) < 0.07
-    assert per_axis[~inside].min() > np.median(per_axis[inside]) and np.median(per_axis[~inside]) > 0.1
+    assert (
+        per_axis[~inside].min() > np.median(per_axis[inside]) and np.median(per_axis[~inside]) > 0.1
+    )
 
 
 def test_ellipses_hold_their_share():
@@ -260,27 +318,45 @@ def test_one_more_anchor_never_hurts(seed):
 
 @pytest.mark.parametrize("name", ["0422/0422-log00", "0425/TDOA2/0425-traj2", "0426/0426-traj1"])
 def test_what_measured_tdoas_share(shared_data, name):
-    """Noise of TDOAs that follow each other in flight: pairs with one anchor in common are anticorrelated, by less than
-    the -1/2 of eq. 5 because each TDOA also has an error of its own; pairs without one are uncorrelated, against eq. 7."""
+    """Noise of TDOAs that follow each other in flight: pairs with one anchor in common are
+    anticorrelated, by less than the -1/2 of eq. 5 because each TDOA also has an error of its own;
+    pairs without one are uncorrelated, against eq. 7.
+    """
     day = name[:4]
-    flight = read_flight(shared_data / "flights" / name, shared_data / "surveys" / f"anchor_{day}.txt")
+    flight = read_flight(
+        shared_data / "flights" / name, shared_data / "surveys" / f"anchor_{day}.txt"
+    )
     truth, measured, anchors = flight.truth, flight.tdoa, flight.anchors
     above = truth.t[truth.p[:, 2] > 0.3]
     flown = (measured.t > above[0] + 1.0) & (measured.t < above[-1] - 1.0)
-    t, a, b, d = measured.t[flown], anchors.index(measured.a[flown]), anchors.index(measured.b[flown]), measured.d[flown]
+    t, a, b, d = (
+        measured.t[flown],
+        anchors.index(measured.a[flown]),
+        anchors.index(measured.b[flown]),
+        measured.d[flown],
+    )
     place = np.stack([np.interp(t, truth.t, truth.p[:, k]) for k in range(3)], axis=1)
     residual = d - tdoa(place, anchors.positions[a], anchors.positions[b])
     noise = np.full(len(t), np.nan)
     for pair in set(zip(a.tolist(), b.tolist())):
         rows = np.flatnonzero((a == pair[0]) & (b == pair[1]))
-        noise[rows] = residual[rows] - median_filter(residual[rows], 31)  # without what lasts longer than about 0.5 s
+        noise[rows] = residual[rows] - median_filter(
+            residual[rows], 31
+        )  # without what lasts longer than about 0.5 s
     noise[np.abs(noise) > 0.4] = np.nan
 
     def correlation(lag):
         one, other = slice(None, -lag), slice(lag, None)
         near = t[other] - t[one] < 2.2e-3 * lag + 1e-3  # no packet missed in between
-        common = (a[one] == a[other]) | (a[one] == b[other]) | (b[one] == a[other]) | (b[one] == b[other])
-        rows = np.flatnonzero(near & (common == (lag == 1)) & np.isfinite(noise[one]) & np.isfinite(noise[other]))
+        common = (
+            (a[one] == a[other])
+            | (a[one] == b[other])
+            | (b[one] == a[other])
+            | (b[one] == b[other])
+        )
+        rows = np.flatnonzero(
+            near & (common == (lag == 1)) & np.isfinite(noise[one]) & np.isfinite(noise[other])
+        )
         assert len(rows) > 3000
         return np.corrcoef(noise[rows], noise[rows + lag])[0, 1]
 
@@ -302,8 +378,10 @@ def test_a_perfect_height_sensor_leaves_the_bound_at_known_height():
     known = bound(information(PLACES, Installation(anchors, NOISY, dimensions=2)))
     measured = bound(information(PLACES, Installation(anchors, NOISY, height_std=1e-4)))
     np.testing.assert_allclose(measured[:, :2, :2], known, rtol=1e-6, atol=1e-6)
-    np.testing.assert_allclose(dilution(PLACES, Installation(anchors, height_std=0.1)),
-                               dilution(PLACES, Installation(anchors, dimensions=2)))  # fmt: skip
+    np.testing.assert_allclose(
+        dilution(PLACES, Installation(anchors, height_std=0.1)),
+        dilution(PLACES, Installation(anchors, dimensions=2)),
+    )
 
 
 @pytest.mark.parametrize("pairing", PAIRINGS)
@@ -311,4 +389,6 @@ def test_a_perfect_height_sensor_leaves_the_bound_at_known_height():
 def test_weights_of_ranges_are_those_that_weigh_gives(pairing, link_std):
     variance, made = np.random.default_rng(0).uniform(0.01, 0.1, (5, 8)), PAIRINGS[pairing](8)
     each = np.broadcast_to(np.eye(8), (5, 8, 8))
-    np.testing.assert_allclose(range_weights(variance, made, link_std), weigh(each, variance, made, link_std), atol=1e-12)
+    np.testing.assert_allclose(
+        range_weights(variance, made, link_std), weigh(each, variance, made, link_std), atol=1e-12
+    )

@@ -1,19 +1,30 @@
-"""A second minimum of all that is heard, and the shares that follow: against a solver of its own, and as more or less is heard."""
+"""A second minimum of all that is heard, and the shares that follow: against a solver of its own,
+and as more or less is heard.
+"""
 
 from dataclasses import replace
 
-import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+import numpy as np
+import pytest
 from scipy.optimize import least_squares
 from scipy.stats import norm
+
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.planning.goal import Goal
 from uwb_tdoa_tools.planning.hall import Hall
 from uwb_tdoa_tools.planning.installation import Installation
-from uwb_tdoa_tools.planning.judging import FLYABLE, IMPRECISE, TOO_FEW, TWO_SOLUTIONS, Demand, judge, other_solutions
+from uwb_tdoa_tools.planning.judging import (
+    FLYABLE,
+    IMPRECISE,
+    TOO_FEW,
+    TWO_SOLUTIONS,
+    Demand,
+    judge,
+    other_solutions,
+)
 from uwb_tdoa_tools.planning.noise import FixedNoise, RadioNoise
 from uwb_tdoa_tools.planning.pairing import all_pairs
 from uwb_tdoa_tools.planning.second_minimum import CLEAR, FLIP
@@ -35,13 +46,19 @@ def whitened(p, anchors, variance, planar):
     true = np.linalg.norm(p - anchors, axis=1)
 
     def residual(x):
-        return root @ d @ (np.linalg.norm((np.append(x, p[2]) if planar else x) - anchors, axis=1) - true)
+        return (
+            root
+            @ d
+            @ (np.linalg.norm((np.append(x, p[2]) if planar else x) - anchors, axis=1) - true)
+        )
 
     return residual
 
 
 def second_minimum(p, anchors, variance, room, rng, planar=False, around=np.inf):
-    """Least misfit of a minimum in the room elsewhere than at p, by scipy from random starts; inf without one."""
+    """Least misfit of a minimum in the room elsewhere than at p, by scipy from random starts; inf
+    without one.
+    """
     k, best = 2 if planar else 3, np.inf
     low, high = np.maximum(room.lower, p - around)[:k], np.minimum(room.upper, p + around)[:k]
     residual = whitened(p, anchors, variance, planar)
@@ -54,21 +71,33 @@ def second_minimum(p, anchors, variance, room, rng, planar=False, around=np.inf)
 
 
 def bound_of(p, anchors, noise, planar):
-    """Cramer-Rao bound of a round at p, by numerical differences of the model, with noise that does not depend on the place."""
+    """Cramer-Rao bound of a round at p, by numerical differences of the model, with noise that does
+    not depend on the place.
+    """
     k = 2 if planar else 3
     variance = noise.variance(p[None], Anchors.from_positions(anchors))[0]
     residual, step = whitened(p, anchors, variance, planar), 1e-5
-    jacobian = np.stack([(residual(p[:k] + s) - residual(p[:k] - s)) / (2 * step) for s in step * np.eye(k)], axis=1)
+    jacobian = np.stack(
+        [(residual(p[:k] + s) - residual(p[:k] - s)) / (2 * step) for s in step * np.eye(k)], axis=1
+    )
     information = jacobian.T @ jacobian
-    return np.sqrt(np.trace(np.linalg.inv(information))) if np.linalg.cond(information) < 1e12 else np.inf
+    return (
+        np.sqrt(np.trace(np.linalg.inv(information)))
+        if np.linalg.cond(information) < 1e12
+        else np.inf
+    )
 
 
 def shares(status):
-    return np.array([np.mean(status == code) for code in (FLYABLE, TWO_SOLUTIONS, IMPRECISE, TOO_FEW)])
+    return np.array(
+        [np.mean(status == code) for code in (FLYABLE, TWO_SOLUTIONS, IMPRECISE, TOO_FEW)]
+    )
 
 
 def case(seed, places):
-    """(shares by the planner, shares by the independent solver) of a random room, or hall with a wall for odd seeds."""
+    """(shares by the planner, shares by the independent solver) of a random room, or hall with a
+    wall for odd seeds.
+    """
     rng = np.random.default_rng(seed)
     planar, noise = bool(rng.integers(2)), FixedNoise(float(rng.uniform(0.05, 0.25)))
     hall = seed % 2 == 1
@@ -76,15 +105,27 @@ def case(seed, places):
     count = int(rng.integers(9, 22)) if hall else int(rng.integers(4, 9))
     anchors = rng.uniform(room.lower, room.upper, (count, 3))
     x = float(rng.uniform(0.3, 0.7) * room.upper[0])
-    walls, reach = (Walls(((x, 0.0, x, 0.5 * room.upper[1], np.inf),)), float(rng.uniform(14, 22))) if hall else (None, 1e3)
+    walls, reach = (
+        (Walls(((x, 0.0, x, 0.5 * room.upper[1], np.inf),)), float(rng.uniform(14, 22)))
+        if hall
+        else (None, 1e3)
+    )
     demand = Demand(room, 0.5)
-    installation = Installation(Anchors.from_positions(anchors), noise, dimensions=2 if planar else 3, hall=True)
+    installation = Installation(
+        Anchors.from_positions(anchors), noise, dimensions=2 if planar else 3, hall=True
+    )
     points = rng.uniform(room.lower, room.upper, (places, 3))
-    whole = Hall(Goal(np.empty((0, 3)), installation, demand=demand), installation.anchors, reach, walls)
+    whole = Hall(
+        Goal(np.empty((0, 3)), installation, demand=demand), installation.anchors, reach, walls
+    )
     ours, _ = whole.judge(points)
     theirs = []
     for p in points:
-        rows = [i for i, a in enumerate(anchors) if np.linalg.norm(a - p) <= reach and not (walls and walls.between(p[None], a[None])[0])]
+        rows = [
+            i
+            for i, a in enumerate(anchors)
+            if np.linalg.norm(a - p) <= reach and not (walls and walls.between(p[None], a[None])[0])
+        ]
         if len(rows) < (3 if planar else 4):
             theirs.append(TOO_FEW)
             continue
@@ -92,7 +133,11 @@ def case(seed, places):
         if second_minimum(p, anchors[rows], variance, room, rng, planar, 2 * reach) <= CLEAR:
             theirs.append(TWO_SOLUTIONS)
         else:
-            theirs.append(FLYABLE if bound_of(p, anchors[rows], noise, planar) <= demand.accuracy else IMPRECISE)
+            theirs.append(
+                FLYABLE
+                if bound_of(p, anchors[rows], noise, planar) <= demand.accuracy
+                else IMPRECISE
+            )
     return shares(ours.status), shares(np.array(theirs))
 
 
@@ -107,7 +152,13 @@ def test_shares_are_those_of_an_independent_solver_in_twenty_rooms_and_halls(cap
     rows = [(seed, *case(seed, 120)) for seed in range(100, 120)]
     with capsys.disabled():
         for seed, ours, theirs in rows:
-            print(f"\n{'hall' if seed % 2 else 'room'} {seed}: ours {(100 * ours).round(1)}, theirs {(100 * theirs).round(1)} %", end="")
+            print(
+                (
+                    f"\n{'hall' if seed % 2 else 'room'} {seed}: ours {(100 * ours).round(1)}, "
+                    f"theirs {(100 * theirs).round(1)} %"
+                ),
+                end="",
+            )
     for seed, ours, theirs in rows:
         assert np.abs(ours - theirs).max() <= 0.03, seed
 
@@ -123,10 +174,15 @@ def random_room(seed):
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 10**6))
 def test_one_more_anchor_never_lowers_a_share(seed):
-    """A place that explains a round with it explained one at least as well without. Still 1 place in 1000 is lost: a long valley comes
-    apart in two minima, or a minimum beyond a wall moves into the room."""
+    """A place that explains a round with it explained one at least as well without. Still 1 place
+    in 1000 is lost: a long valley comes apart in two minima, or a minimum beyond a wall moves into
+    the room.
+    """
     _, room, positions, noise, points = random_room(seed)
-    few, more = (Installation(Anchors.from_positions(p), noise, hall=True) for p in (positions[:-1], positions))
+    few, more = (
+        Installation(Anchors.from_positions(p), noise, hall=True)
+        for p in (positions[:-1], positions)
+    )
     before, after = (judge(points, one, Demand(room)) for one in (few, more))
     assert (after.error <= before.error * (1.0 + 1e-9)).all()
     assert after.flyable.mean() >= before.flyable.mean() - 0.005
@@ -135,7 +191,9 @@ def test_one_more_anchor_never_lowers_a_share(seed):
     for row in rows[:20]:
         for one in (few, more):
             variance = noise.variance(points[[row]], one.anchors)[0]
-            value = np.linalg.norm(whitened(points[row], one.anchors.positions, variance, False)(places[row]))
+            value = np.linalg.norm(
+                whitened(points[row], one.anchors.positions, variance, False)(places[row])
+            )
             assert value <= misfit[row] + 1e-6
 
 
@@ -144,9 +202,17 @@ def test_one_more_anchor_never_lowers_a_share(seed):
 def test_more_noise_never_raises_a_share_and_a_known_height_never_lowers_it(seed):
     _, room, positions, _, points = random_room(seed)
     anchors = Anchors.from_positions(positions)
-    quiet, loud = (judge(points, Installation(anchors, FixedNoise(std), hall=True), Demand(room)) for std in (0.1, 0.2))
-    assert not (loud.flyable & ~quiet.flyable).any() and not ((quiet.status == TWO_SOLUTIONS) & (loud.status != TWO_SOLUTIONS)).any()
-    planar = judge(points, Installation(anchors, FixedNoise(0.1), dimensions=2, hall=True), Demand(room))
+    quiet, loud = (
+        judge(points, Installation(anchors, FixedNoise(std), hall=True), Demand(room))
+        for std in (0.1, 0.2)
+    )
+    assert (
+        not (loud.flyable & ~quiet.flyable).any()
+        and not ((quiet.status == TWO_SOLUTIONS) & (loud.status != TWO_SOLUTIONS)).any()
+    )
+    planar = judge(
+        points, Installation(anchors, FixedNoise(0.1), dimensions=2, hall=True), Demand(room)
+    )
     assert (planar.error <= quiet.error * (1.0 + 1e-9)).all()
     assert planar.flyable.mean() >= quiet.flyable.mean() - 0.005
 
@@ -157,7 +223,11 @@ def test_a_wall_never_raises_a_share_and_an_anchor_in_a_hall_never_lowers_it(see
     rng = np.random.default_rng(seed)
     room = box(rng, [30, 20, 4], [60, 40, 8])
     positions = rng.uniform(room.lower, room.upper, (int(rng.integers(10, 25)), 3))
-    goal = Goal(np.empty((0, 3)), Installation(Anchors.from_positions(positions), FixedNoise(0.1), hall=True), demand=Demand(room))
+    goal = Goal(
+        np.empty((0, 3)),
+        Installation(Anchors.from_positions(positions), FixedNoise(0.1), hall=True),
+        demand=Demand(room),
+    )
     whole = Hall(goal, Anchors.from_positions(positions), 20.0)
     points = rng.uniform(room.lower, room.upper, (300, 3))
     x, y = rng.uniform(room.lower, room.upper)[:2]
@@ -170,18 +240,30 @@ def test_a_wall_never_raises_a_share_and_an_anchor_in_a_hall_never_lowers_it(see
 
 
 def test_imprecision_is_no_second_solution():
-    """Anchors at nearly one height hardly tell z; all of them together have one minimum in the room all the same."""
+    """Anchors at nearly one height hardly tell z; all of them together have one minimum in the room
+    all the same.
+    """
     rng = np.random.default_rng(0)
     x, y = (axis.ravel() for axis in np.meshgrid(np.arange(5) * 12.0, np.arange(4) * 12.0))
     anchors = Anchors.from_positions(np.column_stack([x, y, 5.0 + 0.3 * rng.random(len(x))]))
     room = Room(np.zeros(3), np.array([48.0, 36.0, 5.0]))
     points = rng.uniform([6, 6, 0.5], [42, 30, 2.0], (60, 3))
-    status = Hall(Goal(np.empty((0, 3)), Installation(anchors, hall=True), demand=Demand(room, 0.3)), anchors, 25.0).judge(points)[0].status
+    status = (
+        Hall(
+            Goal(np.empty((0, 3)), Installation(anchors, hall=True), demand=Demand(room, 0.3)),
+            anchors,
+            25.0,
+        )
+        .judge(points)[0]
+        .status
+    )
     assert (status != TWO_SOLUTIONS).all() and (status == IMPRECISE).mean() > 0.5
 
 
 def test_a_second_minimum_predicts_how_often_an_estimator_flips():
-    """Phi(-misfit / 2) of noisy rounds are explained better by the other minimum than by the true place."""
+    """Phi(-misfit / 2) of noisy rounds are explained better by the other minimum than by the true
+    place.
+    """
     anchors, rng = constellation("random-3-5"), np.random.default_rng(4)
     room = Room(anchors.positions.min(axis=0) - 1.0, anchors.positions.max(axis=0) + 1.0)
     for pairing, noise in ((None, 0.1), (all_pairs(5), 0.1)):
@@ -190,8 +272,15 @@ def test_a_second_minimum_predicts_how_often_an_estimator_flips():
         misfits, places = other_solutions(points, installation, room)
         k = np.argmin(np.abs(misfits - 1.5))
         d = installation.pairing.incidence()[: 4 if pairing is None else None]
-        root = np.linalg.cholesky(noise**2 * (d @ d.T)) if pairing is None else np.sqrt(2) * noise * np.eye(len(d))
-        change = d @ (np.linalg.norm(places[k] - anchors.positions, axis=1) - np.linalg.norm(points[k] - anchors.positions, axis=1))
+        root = (
+            np.linalg.cholesky(noise**2 * (d @ d.T))
+            if pairing is None
+            else np.sqrt(2) * noise * np.eye(len(d))
+        )
+        change = d @ (
+            np.linalg.norm(places[k] - anchors.positions, axis=1)
+            - np.linalg.norm(points[k] - anchors.positions, axis=1)
+        )
         shift = np.linalg.solve(root, change) * np.sqrt(installation.pairing.times)
         assert np.linalg.norm(shift) == pytest.approx(misfits[k], rel=1e-6)
         draws = rng.standard_normal((40_000, len(d)))
@@ -203,11 +292,18 @@ def test_a_second_minimum_predicts_how_often_an_estimator_flips():
 def test_anchors_in_a_plane_mirror_a_place_in_the_room_and_not_one_beyond_it():
     x, y = (axis.ravel() for axis in np.meshgrid([0.0, 5.0, 10.0], [0.0, 4.0, 8.0]))
     anchors = Anchors.from_positions(np.column_stack([x, y, np.full(9, 3.0)]))
-    installation, points = Installation(anchors, FixedNoise(0.05), hall=True), np.array([[4.0, 3.0, 1.0]])
+    installation, points = (
+        Installation(anchors, FixedNoise(0.05), hall=True),
+        np.array([[4.0, 3.0, 1.0]]),
+    )
     for height, two in ((6.0, True), (3.0, False)):
-        misfit, place = other_solutions(points, installation, Room(np.zeros(3), np.array([10.0, 8.0, height])))
+        misfit, place = other_solutions(
+            points, installation, Room(np.zeros(3), np.array([10.0, 8.0, height]))
+        )
         assert (misfit[0] <= CLEAR) == two
-    (misfit,), (place,) = other_solutions(points, installation, Room(np.zeros(3), np.array([10.0, 8.0, 6.0])))
+    (misfit,), (place,) = other_solutions(
+        points, installation, Room(np.zeros(3), np.array([10.0, 8.0, 6.0]))
+    )
     assert misfit == pytest.approx(0.0, abs=1e-3)
     np.testing.assert_allclose(place, [4.0, 3.0, 5.0], atol=1e-3)
 
@@ -217,7 +313,9 @@ def test_more_anchors_leave_a_round_less_doubt():
     for n in (5, 8):
         installation = Installation(constellation(f"random-3-{n}"))
         points = np.random.default_rng(0).uniform([-3, -3, 0.3], [3, 3, 2], (500, 3))
-        misfit, _ = other_solutions(points, installation, Room(np.array([-4.0, -4.0, 0.0]), np.array([4.0, 4.0, 3.0])))
+        misfit, _ = other_solutions(
+            points, installation, Room(np.array([-4.0, -4.0, 0.0]), np.array([4.0, 4.0, 3.0]))
+        )
         doubtful.append(np.mean(misfit < CLEAR))
     assert doubtful[0] > 0.01 >= doubtful[1]
 

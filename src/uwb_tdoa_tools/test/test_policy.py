@@ -20,7 +20,10 @@ from uwb_tdoa_tools.vehicle_node import VehicleNode  # noqa: E402
 
 FILE = Path(__file__).resolve().parents[2] / "uwb_tdoa_ekf" / "sros2" / "policy.xml"
 ROLES = ("topic", "publish"), ("topic", "subscribe"), ("service", "reply"), ("service", "request")
-KINDS = {kind.NAME: kind for kind in (BiasNode, EkfNode, LocalizationNode, AnchorsNode, DebiasNode, VehicleNode)}
+KINDS = {
+    kind.NAME: kind
+    for kind in (BiasNode, EkfNode, LocalizationNode, AnchorsNode, DebiasNode, VehicleNode)
+}
 OTHERS = {"robot", "operator"}  # who are not ours
 
 
@@ -45,12 +48,16 @@ def arguments(tmp_path):
     Anchors.from_positions(np.eye(3)).to_yaml(tmp_path / "anchors.yaml")
     cell = np.stack(np.meshgrid(*[np.arange(3)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     bias = np.zeros((27, 3))
-    BiasMap(cell, 0.5 * cell, bias, bias + 0.05, np.full(27, 50), 0.01 * np.eye(3), 0.5).save(tmp_path / "map.npz")
+    BiasMap(cell, 0.5 * cell, bias, bias + 0.05, np.full(27, 50), 0.01 * np.eye(3), 0.5).save(
+        tmp_path / "map.npz"
+    )
     own = {
-        "anchors_node": ["-p", f"anchors_file:={tmp_path / 'anchors.yaml'}"], "debias_node": ["-p", f"map:={tmp_path / 'map.npz'}"],
-        "ekf_node": ["-p", "publish_tf:=odom"], "localization_node": ["-p", "publish_tf:=odom"],
+        "anchors_node": ["-p", f"anchors_file:={tmp_path / 'anchors.yaml'}"],
+        "debias_node": ["-p", f"map:={tmp_path / 'map.npz'}"],
+        "ekf_node": ["-p", "publish_tf:=odom"],
+        "localization_node": ["-p", "publish_tf:=odom"],
         "vehicle_node": ["-p", "simulated_time:=true", "-p", "aids:=[height, pressure, velocity]"],
-    }  # fmt: skip
+    }
     return {name: ["--ros-args", "-p", "use_sim_time:=true", *own.get(name, ())] for name in KINDS}
 
 
@@ -72,7 +79,9 @@ def test_a_node_may_do_what_it_does_and_nothing_else(name, arguments):
     node = KINDS[name](arguments[name])
     nodes, observer = [node, *node.members], rclpy.create_node("observer")
     try:
-        assert allowed()[name] == {each.get_fully_qualified_name(): of_graph(observer, each) for each in nodes}
+        assert allowed()[name] == {
+            each.get_fully_qualified_name(): of_graph(observer, each) for each in nodes
+        }
     finally:
         for each in (*nodes, observer):
             each.destroy_node()  # or the next test sees it
@@ -83,8 +92,19 @@ def test_nobody_else_may_take_over():
     policy = allowed()
     assert policy.keys() == KINDS.keys() | OTHERS
     (robot,), (operator,) = policy["robot"].values(), policy["operator"].values()
-    assert not robot["publish"] & {"/uwb/anchors", "/initialpose", "/odometry", "/uwb/tdoa_corrected", "/clock"} and not robot["request"]
-    offered = {name for nodes in policy.values() for roles in nodes.values() for name in roles["reply"]}
+    assert (
+        not robot["publish"]
+        & {"/uwb/anchors", "/initialpose", "/odometry", "/uwb/tdoa_corrected", "/clock"}
+        and not robot["request"]
+    )
+    offered = {
+        name for nodes in policy.values() for roles in nodes.values() for name in roles["reply"]
+    }
     assert "/ekf_node/reset" in operator["request"] <= offered | {"/bias_node/set_parameters"}
-    told = {enclave for enclave, nodes in policy.items() for roles in nodes.values() if "/initialpose" in roles["publish"]}
+    told = {
+        enclave
+        for enclave, nodes in policy.items()
+        for roles in nodes.values()
+        if "/initialpose" in roles["publish"]
+    }
     assert told == {"operator", "vehicle_node"}

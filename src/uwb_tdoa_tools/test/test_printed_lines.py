@@ -1,4 +1,6 @@
-"""Command lines that are printed to be copied: each runs as it stands, and does good where it says so."""
+"""Command lines that are printed to be copied: each runs as it stands, and does good where it says
+so.
+"""
 
 import ast
 from dataclasses import replace
@@ -21,11 +23,15 @@ from uwb_tdoa_tools import command_lines
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.checking import report
 from uwb_tdoa_tools.commands import calibrate, diagnose, evaluate, survey
-from uwb_tdoa_tools.readers.inputs import Reading
 from uwb_tdoa_tools.evaluating.evaluator import Evaluator
+from uwb_tdoa_tools.readers.inputs import Reading
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
-READS = {"anchors_file": read_survey, "effects_file": EffectSet.from_yaml, "--params-file": FilterConfig.from_yaml}
+READS = {
+    "anchors_file": read_survey,
+    "effects_file": EffectSet.from_yaml,
+    "--params-file": FilterConfig.from_yaml,
+}
 LINE = re.compile(r"\./dev run uwb_tdoa_\w+ .*$", re.MULTILINE)
 
 
@@ -58,7 +64,10 @@ def run(line):
 
 def test_lines_are_quoted_and_begin_as_the_user_began(monkeypatch):
     monkeypatch.delenv(command_lines.RUN, raising=False)
-    assert command_lines.tool("check", "a flight.bag") == "ros2 run uwb_tdoa_tools check 'a flight.bag'"
+    assert (
+        command_lines.tool("check", "a flight.bag")
+        == "ros2 run uwb_tdoa_tools check 'a flight.bag'"
+    )
     monkeypatch.setenv(command_lines.RUN, "../dev run")
     assert command_lines.node("ekf_node", {"effects_file": "e.yaml"}, ["p.yaml"]) == (
         "../dev run uwb_tdoa_ekf ekf_node --ros-args -p effects_file:=e.yaml --params-file p.yaml"
@@ -70,19 +79,29 @@ def test_remedies_begin_as_the_user_began(monkeypatch):
     monkeypatch.setattr(command_lines.shutil, "which", lambda name: None)
     for line, runs in (
         ("ros2 topic hz imu/data", "./dev ros2 topic hz imu/data"),
-        ("record a minute in which the tag is carried", "record a minute in which the tag is carried"),
+        (
+            "record a minute in which the tag is carried",
+            "record a minute in which the tag is carried",
+        ),
         ("id -= 1", "id -= 1"),
     ):
         assert command_lines.as_it_runs(line) == runs
-        assert list(report.lines(Finding("rule", "error", "cause", "evidence", line, 0.0)))[2] == f"      remedy: {runs}"
+        assert (
+            list(report.lines(Finding("rule", "error", "cause", "evidence", line, 0.0)))[2]
+            == f"      remedy: {runs}"
+        )
     monkeypatch.delenv(command_lines.RUN)
     assert command_lines.as_it_runs("ros2 topic hz imu/data") == "ros2 topic hz imu/data"
 
 
 # --- all that any tool or node may print: from the sources ---
 
-PACKAGES = [ROOT / "src" / name / name for name in ("uwb_tdoa_bias", "uwb_tdoa_ekf", "uwb_tdoa_tools")]
-TOOLS = tuple(path.stem for path in (PACKAGES[2] / "commands").glob("*.py") if path.stem != "__init__")
+PACKAGES = [
+    ROOT / "src" / name / name for name in ("uwb_tdoa_bias", "uwb_tdoa_ekf", "uwb_tdoa_tools")
+]
+TOOLS = tuple(
+    path.stem for path in (PACKAGES[2] / "commands").glob("*.py") if path.stem != "__init__"
+)
 # Whose lines tests below, and test_demo.py, run
 PRINT = {"commands/calibrate.py", "commands/diagnose.py", "commands/survey.py", "flying/demo.py"}
 
@@ -90,47 +109,79 @@ PRINT = {"commands/calibrate.py", "commands/diagnose.py", "commands/survey.py", 
 @cache
 def sources():
     """[(name, syntax tree)] of all modules that are installed."""
-    paths = [(path.relative_to(package).as_posix(), path) for package in PACKAGES for path in package.rglob("*.py")]
+    paths = [
+        (path.relative_to(package).as_posix(), path)
+        for package in PACKAGES
+        for path in package.rglob("*.py")
+    ]
     return [(name, ast.parse(path.read_text())) for name, path in paths]
 
 
 def texts(tree):
-    """Texts in a module that may be printed, with "value" where a value is put in: no docstrings, and no examples of --help, which begin as
-    the user began."""
+    """Texts in a module that may be printed, with "value" where a value is put in: no docstrings,
+    and no examples of --help, which begin as the user began.
+    """
     passed = {
-        id(part) for node in ast.walk(tree) if isinstance(node, ast.Call) and "parser" in ast.unparse(node.func) for part in ast.walk(node)
+        id(part)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and "parser" in ast.unparse(node.func)
+        for part in ast.walk(node)
     }
-    inside = {id(part) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in node.values}
+    inside = {
+        id(part)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.JoinedStr)
+        for part in node.values
+    }
     for node in ast.walk(tree):
         if id(node) in passed | inside:
             continue
         if isinstance(node, ast.JoinedStr):
-            yield "".join(part.value if isinstance(part, ast.Constant) else "value" for part in node.values)
-        elif isinstance(node, ast.Constant) and isinstance(node.value, str) and not node.value.startswith("\n"):
+            yield "".join(
+                part.value if isinstance(part, ast.Constant) else "value" for part in node.values
+            )
+        elif (
+            isinstance(node, ast.Constant)
+            and isinstance(node.value, str)
+            and not node.value.startswith("\n")
+        ):
             yield node.value
 
 
 def test_whoever_prints_lines_to_copy_is_tested_here():
-    made = {name for name, tree in sources() for node in ast.walk(tree) if isinstance(node, ast.Attribute)
-            and getattr(node.value, "id", "") == "command_lines" and node.attr in ("tool", "node", "nodes", "judging", "applying")}  # fmt: skip
+    made = {
+        name
+        for name, tree in sources()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Attribute)
+        and getattr(node.value, "id", "") == "command_lines"
+        and node.attr in ("tool", "node", "nodes", "judging", "applying")
+    }
     assert made == PRINT
 
 
 def test_no_text_is_a_command_that_does_not_run_as_it_stands():
-    """One that begins with a command of ROS is understood by ./dev ros2 too, and has no gap that the user must fill."""
+    """One that begins with a command of ROS is understood by ./dev ros2 too, and has no gap that
+    the user must fill.
+    """
     pytest.importorskip("rclpy")
     spec = spec_from_file_location("dev_ros2", ROOT / ".dev" / "ros2.py")
     ros2 = module_from_spec(spec)
     spec.loader.exec_module(ros2)
     found = [(name, text) for name, tree in sources() for text in texts(tree)]
     commands = [
-        (name, text) for name, text in found if re.match(r"(ros2|\./dev) \w+ \S|(" + "|".join(TOOLS) + r") (?:\S*[./]\S* )*--\w", text)
+        (name, text)
+        for name, text in found
+        if re.match(r"(ros2|\./dev) \w+ \S|(" + "|".join(TOOLS) + r") (?:\S*[./]\S* )*--\w", text)
     ]
     assert len(commands) >= 3
     for name, text in commands:
         line, *_ = text.split("  #")
         begin, *words = shlex.split(line)
-        assert begin == "ros2" and not any(re.fullmatch("[A-Z]{3,}", word) for word in words), (name, text)
+        assert begin == "ros2" and not any(re.fullmatch("[A-Z]{3,}", word) for word in words), (
+            name,
+            text,
+        )
         assert ros2.parser().parse_args(words), (name, text)
 
 
@@ -138,11 +189,27 @@ def test_no_text_is_a_command_that_does_not_run_as_it_stands():
 @pytest.mark.parametrize("name", ["survey", "calibrate", "diagnose"])
 def test_every_line_that_a_calibration_prints_runs_as_it_stands(desk, capsys, name):
     """From another folder than --out, with a survey in a file."""
-    flight = simulate(SimulationConfig(seed=1, duration=60.0, trajectory="sines", imu_rate=100.0, multipath=False, outlier_probability=0.0))
-    off = flight.anchors.at(flight.anchors.positions + 0.1 * np.random.default_rng(5).standard_normal(flight.anchors.positions.shape))
+    flight = simulate(
+        SimulationConfig(
+            seed=1,
+            duration=60.0,
+            trajectory="sines",
+            imu_rate=100.0,
+            multipath=False,
+            outlier_probability=0.0,
+        )
+    )
+    off = flight.anchors.at(
+        flight.anchors.positions
+        + 0.1 * np.random.default_rng(5).standard_normal(flight.anchors.positions.shape)
+    )
     off.to_yaml("tape.yaml")
     write_bag(flight, "a flight.bag")
-    command, more = {"survey": (survey, []), "calibrate": (calibrate, ["--no-truth"]), "diagnose": (diagnose, [])}[name]
+    command, more = {
+        "survey": (survey, []),
+        "calibrate": (calibrate, ["--no-truth"]),
+        "diagnose": (diagnose, []),
+    }[name]
     assert command.main(["a flight.bag", "--survey", "tape.yaml", "--out", "made/in", *more]) == 0
     lines = lines_of(capsys.readouterr().out)
     assert len(lines) == {"survey": 1, "calibrate": 3, "diagnose": 3}[name]
@@ -152,19 +219,31 @@ def test_every_line_that_a_calibration_prints_runs_as_it_stands(desk, capsys, na
 
 
 @pytest.mark.slow
-def test_the_line_that_survey_prints_makes_the_error_of_a_measured_flight_smaller(desk, shared_data, capsys, monkeypatch):
+def test_the_line_that_survey_prints_makes_the_error_of_a_measured_flight_smaller(
+    desk, shared_data, capsys, monkeypatch
+):
     """Though its bag holds the anchors of the tape."""
     for trial in (1, 2):
-        flight = Reading(shared_data / "surveys").one(shared_data / "util" / f"const1-trial{trial}-tdoa2.csv.gz")
+        flight = Reading(shared_data / "surveys").one(
+            shared_data / "util" / f"const1-trial{trial}-tdoa2.csv.gz"
+        )
         tape = 0.1 * np.random.default_rng(100).standard_normal(flight.anchors.positions.shape)
-        write_bag(replace(flight, anchors=flight.anchors.at(flight.anchors.positions + tape)), f"flight{trial}.bag")
+        write_bag(
+            replace(flight, anchors=flight.anchors.at(flight.anchors.positions + tape)),
+            f"flight{trial}.bag",
+        )
     assert survey.main(["flight1.bag", "--out", "surveyed/"]) == 0
     (line,) = lines_of(capsys.readouterr().out)
     errors = []
     judge = Evaluator.__call__
-    monkeypatch.setattr(Evaluator, "__call__", lambda self, one: errors.append(judge(self, one)) or errors[-1])
+    monkeypatch.setattr(
+        Evaluator, "__call__", lambda self, one: errors.append(judge(self, one)) or errors[-1]
+    )
     words = shlex.split(line.replace("flight1.bag", "flight2.bag"))[4:]
     assert evaluate.main(["flight2.bag"]) == evaluate.main(words) == 0
     before, after = (one.row["rmse_3d"] for one in errors)
     assert after < 0.7 * before
-    assert "surveyed/anchors.yaml count here, whatever anchors the bag holds" in capsys.readouterr().err
+    assert (
+        "surveyed/anchors.yaml count here, whatever anchors the bag holds"
+        in capsys.readouterr().err
+    )

@@ -10,12 +10,16 @@ import pytest
 
 pytest.importorskip("rclpy")
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue  # noqa: E402
+
 from uwb_tdoa_tools.live import processes  # noqa: E402
 
 
 @pytest.fixture
 def start(tmp_path, monkeypatch):
-    """start(name, script lines): run a shell script as an executable of a package. Ends everything afterwards."""
+    """start(name, script lines): run a shell script as an executable of a package.
+
+    Ends everything afterwards.
+    """
     folder = tmp_path / "lib" / "some_package"
     folder.mkdir(parents=True)
     monkeypatch.setattr(processes, "get_package_prefix", lambda package: str(tmp_path))
@@ -119,16 +123,29 @@ def test_who_starts_and_works_is_waited_for_however_long_that_takes(start, quick
     start("node", *COMPILING)
     wait_for_output(tmp_path / "node.log", "compiling")
     until, told = time.monotonic() + 6.0, []
-    processes.wait(3.0, "the node", start.processes, None, lambda: told and time.monotonic() > until, told.append)
+    processes.wait(
+        3.0,
+        "the node",
+        start.processes,
+        None,
+        lambda: told and time.monotonic() > until,
+        told.append,
+    )
     assert set(told) == {"waiting for the node: node: compiling, which is done once: 40%, 20 s"}
 
 
-@pytest.mark.parametrize("lines", [["sleep 600"], [READY, *COMPILING[1:]]], ids=["it sleeps", "it is ready, and busy otherwise"])
+@pytest.mark.parametrize(
+    "lines",
+    [["sleep 600"], [READY, *COMPILING[1:]]],
+    ids=["it sleeps", "it is ready, and busy otherwise"],
+)
 def test_if_nothing_goes_on_it_is_not_waited_for_any_longer(start, quick, tmp_path, lines):
     start("node", *lines)
     if READY in lines:
         wait_for_output(tmp_path / "node.log", "ready")
-    with pytest.raises(processes.LiveError, match=r"waited 0.5 s for the node, and nothing went on \(node: "):
+    with pytest.raises(
+        processes.LiveError, match=r"waited 0.5 s for the node, and nothing went on \(node: "
+    ):
         processes.wait(0.5, "the node", start.processes, None, lambda: False)
 
 
@@ -141,7 +158,14 @@ def test_who_dies_is_reported_at_once(start, quick):
 def test_signs_of_life_are_waited_for(start, quick):
     start("node", READY, "sleep 600")
     until = time.monotonic() + 2.0
-    processes.wait(0.5, "the counts", start.processes, None, lambda: time.monotonic() > until, goes_on=lambda: int(10 * time.monotonic()))
+    processes.wait(
+        0.5,
+        "the counts",
+        start.processes,
+        None,
+        lambda: time.monotonic() > until,
+        goes_on=lambda: int(10 * time.monotonic()),
+    )
 
 
 class Queue(nullcontext):

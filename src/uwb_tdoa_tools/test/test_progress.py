@@ -46,7 +46,9 @@ def test_it_says_what_is_done_and_how_much_though_nobody_calls_it(often):
 
 
 def test_short_work_says_nothing(monkeypatch):
-    monkeypatch.setattr(progress, "FIRST", 600.0)  # beside which it is short on a loaded machine, too
+    monkeypatch.setattr(
+        progress, "FIRST", 600.0
+    )  # beside which it is short on a loaded machine, too
     lines = Lines(1)
     with Progress("weigh", stream=lines):
         pass
@@ -66,7 +68,11 @@ def test_on_a_terminal_it_is_one_line_that_goes_at_the_end(often, total):
         while stream.getvalue().count("\r") < 4 and time.monotonic() < end:
             told.update()
             time.sleep(0.01)
-    assert "weigh" in stream.getvalue() and stream.getvalue().endswith("\r") and "\n" not in stream.getvalue().strip()
+    assert (
+        "weigh" in stream.getvalue()
+        and stream.getvalue().endswith("\r")
+        and "\n" not in stream.getvalue().strip()
+    )
 
 
 def test_work_on_many_flights_says_how_many_are_done(often, monkeypatch):
@@ -75,7 +81,9 @@ def test_work_on_many_flights_says_how_many_are_done(often, monkeypatch):
 
     def work(item):
         end = time.monotonic() + 120.0
-        while item == 2 and "2 of 3 flights done" not in lines.getvalue() and time.monotonic() < end:
+        while (
+            item == 2 and "2 of 3 flights done" not in lines.getvalue() and time.monotonic() < end
+        ):
             time.sleep(0.01)
 
     list(parallel.over(work, range(3), 1))

@@ -1,6 +1,7 @@
 import threading
 
 import pytest
+
 from uwb_tdoa_tools.live.read_ahead import BATCH, BATCHES_AHEAD, read_ahead
 
 

@@ -5,6 +5,7 @@ import shlex
 import numpy as np
 import pytest
 from recordings import ANCHORS, SURVEY, csv_text, log_bytes, small_flight
+
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.readers import read_flight
@@ -62,7 +63,9 @@ def test_foreign_files(tmp_path, survey, content, sentence):
         read_flight(file, survey)
 
 
-@pytest.mark.parametrize("name", ["r1;touch x;.bag", "r1 $(touch x).bag", "r1'`touch x`.bag", "r1\n touch x.bag"])
+@pytest.mark.parametrize(
+    "name", ["r1;touch x;.bag", "r1 $(touch x).bag", "r1'`touch x`.bag", "r1\n touch x.bag"]
+)
 def test_a_line_that_is_printed_to_be_copied_runs_nothing_else(tmp_path, survey, name):
     (tmp_path / name).write_bytes(b"#ROSBAG V2.0\n")
     with pytest.raises(InputError) as refused:

@@ -1,5 +1,9 @@
-"""Replay and record as real processes that talk over DDS. No step waits for time to pass, only for what must happen."""
+"""Replay and record as real processes that talk over DDS.
 
+No step waits for time to pass, only for what must happen.
+"""
+
+from contextlib import contextmanager
 import queue
 import re
 import signal
@@ -7,11 +11,11 @@ import subprocess
 import sys
 import threading
 import time
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
 from recordings import differences, small_flight
+
 from uwb_tdoa_tools.bags.bag import read_bag, read_fields, write_bag
 
 rclpy = pytest.importorskip("rclpy")
@@ -23,6 +27,7 @@ from rosbags.rosbag2 import Reader  # noqa: E402
 from rosgraph_msgs.msg import Clock  # noqa: E402
 from sensor_msgs.msg import Imu  # noqa: E402
 from tf2_msgs.msg import TFMessage  # noqa: E402
+
 from uwb_tdoa_msgs.msg import AnchorArray, Tdoa  # noqa: E402
 from uwb_tdoa_tools.commands import record, replay  # noqa: E402
 
@@ -36,7 +41,9 @@ class Process:
 
     def __init__(self, name, *arguments):
         command = [sys.executable, "-m", f"uwb_tdoa_tools.commands.{name}", *map(str, arguments)]
-        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        self.process = subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
         self.said = []
         self._lines = queue.Queue()
         threading.Thread(target=self._listen, daemon=True).start()
@@ -94,7 +101,9 @@ def start():
 def node():
     context = rclpy.Context()
     rclpy.init(context=context)
-    yield rclpy.create_node("listener", context=context, enable_rosout=False, start_parameter_services=False)
+    yield rclpy.create_node(
+        "listener", context=context, enable_rosout=False, start_parameter_services=False
+    )
     rclpy.shutdown(context=context)
 
 
@@ -118,7 +127,8 @@ def subscribe(node, message_type, topic, qos=DEEP):
 
 
 @pytest.mark.parametrize(
-    "storage, ending", [("mcap", signal.SIGINT), pytest.param("sqlite3", signal.SIGTERM, marks=pytest.mark.slow)]
+    "storage, ending",
+    [("mcap", signal.SIGINT), pytest.param("sqlite3", signal.SIGTERM, marks=pytest.mark.slow)],
 )
 def test_recorded_replay_is_the_bag(tmp_path, start, storage, ending):
     flight = small_flight(seconds=4.0)
@@ -152,7 +162,10 @@ def test_recorded_replay_is_the_bag(tmp_path, start, storage, ending):
     assert {path.name for path in tmp_path.iterdir()} == {"flight.bag", "again.bag"}
     with Reader(again) as reader:
         clock = [data for connection, _, data in reader.messages() if connection.topic == "/clock"]
-    seconds = [int.from_bytes(data[4:8], "little") + 1e-9 * int.from_bytes(data[8:12], "little") for data in clock]
+    seconds = [
+        int.from_bytes(data[4:8], "little") + 1e-9 * int.from_bytes(data[8:12], "little")
+        for data in clock
+    ]
     assert (np.diff(seconds) >= 0).all()
     assert flight.imu.t[0] <= seconds[0] and seconds[-1] <= flight.imu.t[-1] + 0.001
     assert len(seconds) > 20
@@ -161,9 +174,20 @@ def test_recorded_replay_is_the_bag(tmp_path, start, storage, ending):
 def test_anchors_reach_who_comes_late(tmp_path, start, node):
     write_bag(small_flight(seconds=30.0, rate=100), tmp_path / "flight.bag")
     imu = subscribe(node, Imu, "imu/data")
-    replaying = start("replay", tmp_path / "flight.bag", "--rate", 0.1, "--wait-matched", LIMIT, "--wait-topics", "imu/data")
+    replaying = start(
+        "replay",
+        tmp_path / "flight.bag",
+        "--rate",
+        0.1,
+        "--wait-matched",
+        LIMIT,
+        "--wait-topics",
+        "imu/data",
+    )
     take(imu, lambda messages: len(messages) > 10)  # the anchors have long been published
-    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE)
+    latched = QoSProfile(
+        depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE
+    )
     (array,) = take(subscribe(node, AnchorArray, "uwb/anchors", latched), lambda messages: messages)
     assert [anchor.id for anchor in array.anchors] == [0, 1, 5]
     code, out = replaying.end(signal.SIGINT)
@@ -179,19 +203,33 @@ def test_slow_reliable_subscription_loses_nothing(tmp_path, start, node):
     keep_all = QoSProfile(history=HistoryPolicy.KEEP_ALL, reliability=ReliabilityPolicy.RELIABLE)
     imu = subscribe(node, Imu, "imu/data", keep_all)
     replaying = start(
-        "replay", tmp_path / "flight.bag", "--rate", 100, "--wait-matched", LIMIT, "--wait-topics", "imu/data"
+        "replay",
+        tmp_path / "flight.bag",
+        "--rate",
+        100,
+        "--wait-matched",
+        LIMIT,
+        "--wait-topics",
+        "imu/data",
     )
     replaying.until("playing")
     time.sleep(1.0)
     messages = take(imu, lambda messages: len(messages) == count)
-    stamps = [message.header.stamp.sec * 1000 + message.header.stamp.nanosec // 10**6 for message in messages]
+    stamps = [
+        message.header.stamp.sec * 1000 + message.header.stamp.nanosec // 10**6
+        for message in messages
+    ]
     assert stamps == list(range(10_000, 10_000 + count))
 
 
 def test_best_effort_subscription_is_served(tmp_path, start, node):
     write_bag(small_flight(seconds=1.0), tmp_path / "flight.bag")
-    tdoa = subscribe(node, Tdoa, "uwb/tdoa", QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT))
-    replaying = start("replay", tmp_path / "flight.bag", "--wait-matched", LIMIT, "--wait-topics", "uwb/tdoa")
+    tdoa = subscribe(
+        node, Tdoa, "uwb/tdoa", QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+    )
+    replaying = start(
+        "replay", tmp_path / "flight.bag", "--wait-matched", LIMIT, "--wait-topics", "uwb/tdoa"
+    )
     first = take(tdoa, lambda messages: len(messages) >= 10)[0]
     assert first.header.frame_id == "base_link" and first.anchor_b == 5
     assert replaying.end()[0] == 0
@@ -200,7 +238,15 @@ def test_best_effort_subscription_is_served(tmp_path, start, node):
 def test_loop_starts_again_until_stopped(tmp_path, start, node):
     write_bag(small_flight(seconds=0.2), tmp_path / "flight.bag")
     imu = subscribe(node, Imu, "imu/data")
-    replaying = start("replay", tmp_path / "flight.bag", "--loop", "--wait-matched", LIMIT, "--wait-topics", "imu/data")
+    replaying = start(
+        "replay",
+        tmp_path / "flight.bag",
+        "--loop",
+        "--wait-matched",
+        LIMIT,
+        "--wait-topics",
+        "imu/data",
+    )
     messages = take(imu, lambda messages: len(messages) == 500)
     stamps = np.array([message.header.stamp.nanosec for message in messages])
     np.testing.assert_array_equal(stamps, np.tile(np.arange(200), 3)[:500] * 1_000_000)
@@ -209,14 +255,28 @@ def test_loop_starts_again_until_stopped(tmp_path, start, node):
 
 @pytest.mark.slow
 def test_clock_can_be_followed(tmp_path, start, node):
-    write_bag(small_flight(seconds=1.0, rate=10), tmp_path / "flight.bag")  # ticks come between messages too
+    write_bag(
+        small_flight(seconds=1.0, rate=10), tmp_path / "flight.bag"
+    )  # ticks come between messages too
     clock = subscribe(node, Clock, "/clock")
-    start("replay", tmp_path / "flight.bag", "--rate", 0.01, "--clock", "--wait-matched", LIMIT, "--wait-topics", "imu/data")
+    start(
+        "replay",
+        tmp_path / "flight.bag",
+        "--rate",
+        0.01,
+        "--clock",
+        "--wait-matched",
+        LIMIT,
+        "--wait-topics",
+        "imu/data",
+    )
     subscribe(node, Imu, "imu/data")
     ticks = take(clock, lambda messages: len(messages) >= 20)
     stamps = np.array([tick.clock.sec + 1e-9 * tick.clock.nanosec for tick in ticks])
     assert (np.diff(stamps) >= 0).all() and 10.0 <= stamps[0] and stamps[-1] < 11.0
-    assert len(set(stamps)) > 12 and np.ptp(stamps) < 0.5  # those of 10 messages alone would not be as many and as dense
+    assert (
+        len(set(stamps)) > 12 and np.ptp(stamps) < 0.5
+    )  # those of 10 messages alone would not be as many and as dense
 
 
 @pytest.mark.parametrize("remap", ["/uwb/tdoa:=/tag1/uwb/tdoa", "uwb/tdoa:=/tag1/uwb/tdoa"])
@@ -229,14 +289,20 @@ def test_one_topic_can_be_moved(tmp_path, start, node, remap):
 
 
 def test_the_recording_of_one_tag_in_the_namespace_of_another(tmp_path, start, node):
-    """As in the example of --help: all of the tag's topics, the anchors too, and the frames stay where they are."""
+    """As in the example of --help: all of the tag's topics, the anchors too, and the frames stay
+    where they are.
+    """
     write_bag(small_flight(seconds=0.2), tmp_path / "flight.bag")
-    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE)
+    latched = QoSProfile(
+        depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE
+    )
     kinds = {"uwb/tdoa": Tdoa, "imu/data": Imu, "ground_truth/pose": PoseStamped}
     streams = {topic: subscribe(node, kind, f"/tag1/{topic}") for topic, kind in kinds.items()}
     anchors = subscribe(node, AnchorArray, "/tag1/uwb/anchors", latched)
     frames = subscribe(node, TFMessage, "/tf_static", latched)
-    command = [line.split() for line in replay.parser().epilog.splitlines() if "__ns:=/tag1" in line][0]
+    command = [
+        line.split() for line in replay.parser().epilog.splitlines() if "__ns:=/tag1" in line
+    ][0]
     options = ["--wait-matched", LIMIT, "--wait-topics", *kinds]
     start("replay", tmp_path / "flight.bag", *options, *command[command.index("flight.bag") + 1 :])
     for topic, count in (("uwb/tdoa", 100), ("imu/data", 200), ("ground_truth/pose", 50)):
@@ -247,12 +313,21 @@ def test_the_recording_of_one_tag_in_the_namespace_of_another(tmp_path, start, n
 
 def test_nobody_subscribes(tmp_path, start):
     write_bag(small_flight(seconds=0.1), tmp_path / "flight.bag")
-    waited = start("replay", tmp_path / "flight.bag", "--wait-matched", 0.1, "--wait-topics", "imu/data")
+    waited = start(
+        "replay", tmp_path / "flight.bag", "--wait-matched", 0.1, "--wait-topics", "imu/data"
+    )
     assert waited.end()[0] == 2
-    assert "replay: error: nobody subscribes to /imu/data within 0.1 s; start the nodes first" in waited.said[-1]
+    assert (
+        "replay: error: nobody subscribes to /imu/data within 0.1 s; start the nodes first"
+        in waited.said[-1]
+    )
     alone = start("replay", tmp_path / "flight.bag", "--wait-matched", 0.1)
     code, out = alone.end()
-    assert code == 2 and "nobody subscribes to any topic of the bag within 0.1 s" in alone.said[-1] and out == ""
+    assert (
+        code == 2
+        and "nobody subscribes to any topic of the bag within 0.1 s" in alone.said[-1]
+        and out == ""
+    )
 
 
 def test_nobody_to_follow(tmp_path, start, node):
@@ -262,22 +337,39 @@ def test_nobody_to_follow(tmp_path, start, node):
     unheard = start("replay", tmp_path / "flight.bag", "--wait-matched", 1, "--follow", "odometry")
     assert unheard.end()[0] == 2 and "nobody subscribes to /uwb/tdoa within 1 s" in unheard.said[-1]
     subscribe(node, Tdoa, "uwb/tdoa")
-    for wait in (2, 20, LIMIT):  # it waits for the publisher so long; on a loaded machine it may not have found us by then
-        silent = start("replay", tmp_path / "flight.bag", "--wait-matched", wait, "--follow", "odometry")
+    for wait in (
+        2,
+        20,
+        LIMIT,
+    ):  # it waits for the publisher so long; on a loaded machine it may not have found us by then
+        silent = start(
+            "replay", tmp_path / "flight.bag", "--wait-matched", wait, "--follow", "odometry"
+        )
         code, _ = silent.end()
         if "nobody subscribes" not in silent.said[-1]:
             break
-    assert code == 2 and "--follow: nobody publishes /odometry; start the node that does" in silent.said[-1]
+    assert (
+        code == 2
+        and "--follow: nobody publishes /odometry; start the node that does" in silent.said[-1]
+    )
 
 
 def test_who_listens_to_some_topics_gets_all_of_them(tmp_path, start, node):
-    """Best effort, and without naming topics to wait for: not one message may be lost for want of discovery."""
+    """Best effort, and without naming topics to wait for: not one message may be lost for want of
+    discovery.
+    """
     write_bag(small_flight(seconds=0.3), tmp_path / "flight.bag")
-    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE)
+    latched = QoSProfile(
+        depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL, reliability=ReliabilityPolicy.RELIABLE
+    )
     subscribe(node, AnchorArray, "uwb/anchors", latched)
-    imu = subscribe(node, Imu, "imu/data", QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT))
+    imu = subscribe(
+        node, Imu, "imu/data", QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)
+    )
     replaying = start("replay", tmp_path / "flight.bag", "--wait-matched", LIMIT)
-    messages = take(imu, lambda messages: messages and messages[-1].header.stamp.nanosec == 299_000_000)
+    messages = take(
+        imu, lambda messages: messages and messages[-1].header.stamp.nanosec == 299_000_000
+    )
     assert len(messages) == 300 and replaying.end()[0] == 0
 
 
@@ -285,7 +377,9 @@ def test_who_listens_to_some_topics_gets_all_of_them(tmp_path, start, node):
 def test_record_everything(tmp_path, start, node):
     flight = small_flight(seconds=0.5)
     write_bag(flight, tmp_path / "flight.bag")
-    publisher = node.create_publisher(Imu, "other/imu", DEEP)  # any type, any time, before there is a message
+    publisher = node.create_publisher(
+        Imu, "other/imu", DEEP
+    )  # any type, any time, before there is a message
     recording = start("record", "-o", tmp_path / "all.bag", "--all")
     recording.until("recording /other/imu (sensor_msgs/msg/Imu, reliable)")
     deadline = time.monotonic() + LIMIT
@@ -293,7 +387,9 @@ def test_record_everything(tmp_path, start, node):
         assert time.monotonic() < deadline
         time.sleep(0.01)
     publisher.publish(Imu())
-    replaying = start("replay", tmp_path / "flight.bag", "--wait-matched", LIMIT, "--wait-topics", *STREAMS)
+    replaying = start(
+        "replay", tmp_path / "flight.bag", "--wait-matched", LIMIT, "--wait-topics", *STREAMS
+    )
     assert replaying.end()[0] == 0
     assert publisher.wait_for_all_acked(rclpy.duration.Duration(seconds=LIMIT))
     assert recording.end(signal.SIGINT)[0] == 0
@@ -313,8 +409,14 @@ def test_nothing_came(tmp_path, start):
     "arguments, sentence",
     [
         (["replay", "nothing.bag"], "replay: error: nothing.bag: is not a bag"),
-        (["replay", "nothing.bag", "--rate", "0"], "argument -r/--rate: '0' is not a number above 0"),
-        (["replay", "flight.bag", "--wait-topics", "uwb/nothing"], "/uwb/nothing is not in the bag"),
+        (
+            ["replay", "nothing.bag", "--rate", "0"],
+            "argument -r/--rate: '0' is not a number above 0",
+        ),
+        (
+            ["replay", "flight.bag", "--wait-topics", "uwb/nothing"],
+            "/uwb/nothing is not in the bag",
+        ),
         (["replay", "flight.bag", "--ros-args", "--nonsense"], "replay: error: ROS arguments: "),
         (["record", "-o", "flight.bag", "imu/data"], "record: error: flight.bag: exists already"),
         (["record", "-o", "new.bag"], "name the topics to record"),

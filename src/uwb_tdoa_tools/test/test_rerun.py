@@ -11,19 +11,38 @@ from uwb_tdoa_bias.effects import AnchorDelay
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands import diagnose, evaluate, localize
-from uwb_tdoa_tools.localizing import rerun_file
 from uwb_tdoa_tools.estimate import FlightEstimator
+from uwb_tdoa_tools.localizing import rerun_file
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 CLEAN = dict(floor_time=1.0, imu_rate=100.0, bias=False, multipath=False, outlier_probability=0.0)
-RESIDUAL_FIELDS = "t", "anchor_a", "anchor_b", "innovation", "innovation_variance", "weight", "verdict"
-ALWAYS = {"world/anchors", "world/path", "world/tag", "world/tag/3_sigma", "verdict", "deviation/x", "deviation/y", "deviation/z"}
+RESIDUAL_FIELDS = (
+    "t",
+    "anchor_a",
+    "anchor_b",
+    "innovation",
+    "innovation_variance",
+    "weight",
+    "verdict",
+)
+ALWAYS = {
+    "world/anchors",
+    "world/path",
+    "world/tag",
+    "world/tag/3_sigma",
+    "verdict",
+    "deviation/x",
+    "deviation/y",
+    "deviation/z",
+}
 
 
 @pytest.fixture(scope="module")
 def flight():
     """One whose anchor 3 is late."""
-    return AnchorDelay({"3": 0.3}).inject(simulate(SimulationConfig(seed=1, duration=40.0, **CLEAN)))
+    return AnchorDelay({"3": 0.3}).inject(
+        simulate(SimulationConfig(seed=1, duration=40.0, **CLEAN))
+    )
 
 
 @pytest.fixture
@@ -45,7 +64,9 @@ def viewer(monkeypatch):
 def names(viewer):
     """Of all that was written."""
     stream = viewer.RecordingStream.return_value
-    return {call.args[0] for call in (*stream.log.call_args_list, *stream.send_columns.call_args_list)}
+    return {
+        call.args[0] for call in (*stream.log.call_args_list, *stream.send_columns.call_args_list)
+    }
 
 
 def verdict(viewer):
@@ -56,7 +77,9 @@ def test_localize_writes_no_truth(desk, viewer):
     assert localize.main(["flight.bag", "--out", "out", "--rerun", "flight.rrd"]) in (0, 1)
     found = names(viewer)
     assert ALWAYS <= found and any(name.startswith("residual/") for name in found)
-    assert not found & {"world/truth", "error", "world/before"} and "standard deviation" in verdict(viewer)
+    assert not found & {"world/truth", "error", "world/before"} and "standard deviation" in verdict(
+        viewer
+    )
     assert str(viewer.RecordingStream.return_value.save.call_args.args[0]) == "flight.rrd"
 
 
@@ -77,14 +100,21 @@ def test_demo_writes_what_the_nodes_said(flight, viewer, tmp_path):
     from uwb_tdoa_tools.flying.demo import DemoResult
 
     run = FlightEstimator()(flight)
-    DemoResult({}, [], run.odometry, run, run.odometry).show(tmp_path / "flight.rrd", flight, ["landed"])
-    assert ALWAYS | {"world/truth", "world/before", "error", "error/before"} <= names(viewer) and verdict(viewer) == "landed"
+    DemoResult({}, [], run.odometry, run, run.odometry).show(
+        tmp_path / "flight.rrd", flight, ["landed"]
+    )
+    assert (
+        ALWAYS | {"world/truth", "world/before", "error", "error/before"} <= names(viewer)
+        and verdict(viewer) == "landed"
+    )
 
 
 def test_errors_are_those_of_each_path(flight, viewer, tmp_path):
     run = FlightEstimator()(flight)
     off = replace(run.odometry, p=run.odometry.p + [0.0, 0.0, 1.0])
-    rerun_file.write_rerun(tmp_path / "flight.rrd", flight, run.odometry, None, [], flight.truth, off)
+    rerun_file.write_rerun(
+        tmp_path / "flight.rrd", flight, run.odometry, None, [], flight.truth, off
+    )
     told = [np.asarray(call.kwargs["scalars"]) for call in viewer.Scalars.columns.call_args_list]
     assert np.median(told[-2]) < 0.3 and np.median(told[-1]) > 0.7
 
@@ -99,13 +129,26 @@ def test_it_is_left_out_with_a_sentence_where_it_is_not_installed(desk, capsys, 
         command.main(["flight.bag", *out, "--rerun", "flight.rrd"])
     except pytest.skip.Exception:
         pass
-    assert capsys.readouterr().err.count("pip install rerun-sdk") == 1 and not (desk / "flight.rrd").exists()
+    assert (
+        capsys.readouterr().err.count("pip install rerun-sdk") == 1
+        and not (desk / "flight.rrd").exists()
+    )
 
 
 @pytest.mark.parametrize("residuals", [True, False])
-def test_what_nodes_said_is_written_as_it_was_recorded(desk, flight, viewer, monkeypatch, residuals):
+def test_what_nodes_said_is_written_as_it_was_recorded(
+    desk, flight, viewer, monkeypatch, residuals
+):
     run = FlightEstimator()(flight)
-    said = dict(zip(RESIDUAL_FIELDS, (getattr(run.residuals, name) for name in ("t", "a", "b", "innovation", "variance", "weight", "verdict"))))
+    said = dict(
+        zip(
+            RESIDUAL_FIELDS,
+            (
+                getattr(run.residuals, name)
+                for name in ("t", "a", "b", "innovation", "variance", "weight", "verdict")
+            ),
+        )
+    )
 
     def read_fields(bag, topic):
         if not residuals:
@@ -116,7 +159,10 @@ def test_what_nodes_said_is_written_as_it_was_recorded(desk, flight, viewer, mon
     monkeypatch.setattr(rerun_file, "read_fields", read_fields)
     rerun_file.write_recorded("live.rrd", "flight.bag")
     found = names(viewer)
-    assert ALWAYS | {"world/truth", "error"} <= found and any(name.startswith("residual/") for name in found) == residuals
+    assert (
+        ALWAYS | {"world/truth", "error"} <= found
+        and any(name.startswith("residual/") for name in found) == residuals
+    )
     assert f"{len(run.odometry.t)} odometry messages" in verdict(viewer)
 
 

@@ -9,8 +9,9 @@ from uwb_tdoa_tools import results_file
 from uwb_tdoa_tools.results_file import ResultsFile, asked_of, state_of
 
 
-def fill(path, keys, asked={"seed": 1}):
+def fill(path, keys, asked=None):
     """What had to be made of keys, whose results are their lengths."""
+    asked = asked or {"seed": 1}
     made = []
     with ResultsFile(path, asked) as done:
         for key in (key for key in keys if key not in done):
@@ -26,7 +27,9 @@ def test_what_is_there_is_not_made_again(tmp_path):
     assert fill(path, ["bb", "a", "ccc"]) == ["ccc"]
     assert fill(path, ["a", "bb", "ccc"]) == []
     lines = [json.loads(line) for line in path.read_text().splitlines()]
-    assert lines[0]["asked"]["seed"] == 1 and lines[1:] == [{"key": k, "result": {"length": len(k)}} for k in ("a", "bb", "ccc")]
+    assert lines[0]["asked"]["seed"] == 1 and lines[1:] == [
+        {"key": k, "result": {"length": len(k)}} for k in ("a", "bb", "ccc")
+    ]
 
 
 @pytest.mark.parametrize("left", [0, 1, 12, -1, -5])
@@ -42,13 +45,19 @@ def test_a_file_cut_anywhere_goes_on(tmp_path, left):
 def test_results_are_there_as_soon_as_they_are_made(tmp_path):
     with ResultsFile(tmp_path / "results", {}) as done:
         done["a"] = 1
-        assert json.loads((tmp_path / "results").read_text().splitlines()[-1]) == {"key": "a", "result": 1}
+        assert json.loads((tmp_path / "results").read_text().splitlines()[-1]) == {
+            "key": "a",
+            "result": 1,
+        }
 
 
 def test_what_was_asked_otherwise_is_not_mixed(tmp_path):
     path = tmp_path / "results"
     fill(path, ["a"], {"seed": 1, "smooth": False, "effects": None})
-    with pytest.raises(InputError, match="made with another effects and seed; ask for the same, or name another file"):
+    with pytest.raises(
+        InputError,
+        match="made with another effects and seed; ask for the same, or name another file",
+    ):
         fill(path, ["a"], {"seed": 2, "smooth": False, "effects": "1f"})
 
 
@@ -57,7 +66,11 @@ def test_a_result_that_somebody_has_written_is_one_or_is_refused(tmp_path):
     fill(path, ["a"])
     with ResultsFile(path, {"seed": 1}) as done:
         assert done.read("a", lambda result: result["length"]) == 1
-        for parse in (lambda result: result["width"], lambda result: result["length"]["of"], lambda result: float(result["length"] * "x")):
+        for parse in (
+            lambda result: result["width"],
+            lambda result: result["length"]["of"],
+            lambda result: float(result["length"] * "x"),
+        ):
             with pytest.raises(InputError, match="holds something else"):
                 done.read("a", parse)
 
@@ -72,7 +85,16 @@ def test_a_line_without_end_is_not_read(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    "content", ["flight,rmse\n", "[1]\n", "not a result", '{"runs": []}\n', '{"asked": 1}\n', b"\xff\x00\n", "[" * 100_000 + "\n"]
+    "content",
+    [
+        "flight,rmse\n",
+        "[1]\n",
+        "not a result",
+        '{"runs": []}\n',
+        '{"asked": 1}\n',
+        b"\xff\x00\n",
+        "[" * 100_000 + "\n",
+    ],
 )
 def test_another_file_is_left_alone(tmp_path, content):
     path = tmp_path / "other"
@@ -118,5 +140,12 @@ def test_what_was_asked_is_every_option_that_matters_and_what_stands_in_its_file
     asked = asked_of(args, ["jobs"], ["effects", "model", "config"])
     file.write_text("two")
     changed = asked_of(args, ["jobs"], ["effects", "model", "config"])
-    assert asked == {"smooth": True, "effects": asked["effects"], "model": "default", "config": None}
-    assert changed["effects"] != asked["effects"] and {**changed, "effects": asked["effects"]} == asked
+    assert asked == {
+        "smooth": True,
+        "effects": asked["effects"],
+        "model": "default",
+        "config": None,
+    }
+    assert (
+        changed["effects"] != asked["effects"] and {**changed, "effects": asked["effects"]} == asked
+    )

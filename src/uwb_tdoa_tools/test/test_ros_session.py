@@ -6,6 +6,7 @@ rclpy = pytest.importorskip("rclpy")
 
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
 from rosbags.interfaces import QosDurability, QosHistory, QosLiveliness, QosReliability  # noqa: E402
+
 from uwb_tdoa_tools.live.session import message_class, publisher_qos, recorded_qos, subscription_qos  # noqa: E402
 
 RELIABLE, BEST_EFFORT = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
@@ -20,7 +21,10 @@ def qos(reliability=RELIABLE, durability=VOLATILE, depth=5):
     "profile, expected",
     [
         (qos(), (QosReliability.RELIABLE, QosDurability.VOLATILE, 5)),
-        (qos(BEST_EFFORT, LATCHED, 7), (QosReliability.BEST_EFFORT, QosDurability.TRANSIENT_LOCAL, 7)),
+        (
+            qos(BEST_EFFORT, LATCHED, 7),
+            (QosReliability.BEST_EFFORT, QosDurability.TRANSIENT_LOCAL, 7),
+        ),
     ],
 )
 def test_recorded_qos_says_the_same(profile, expected):

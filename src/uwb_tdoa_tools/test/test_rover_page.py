@@ -20,11 +20,17 @@ FILE = ROOT / "docs/connect/rover.yaml"
 def test_the_file_of_tags_starts_nodes_with_its_names():
     ekf = next(node for node in launching.tags(str(FILE), {}) if node.executable == "ekf_node")
     values = ekf.parameters[-1]
-    assert values["publish_tf"] == "odom" and values["odom_frame"] == "rover1/odom" and values["body_frame"] == "rover1/base_link"
+    assert (
+        values["publish_tf"] == "odom"
+        and values["odom_frame"] == "rover1/odom"
+        and values["body_frame"] == "rover1/base_link"
+    )
     assert ekf.remaps["velocity/odometry"] == "odom"
     known = {topic for sensor in SENSORS.values() for topic, _ in sensor.topics} | {"imu/data"}
     assert set(ekf.remaps) <= known
-    config = FilterConfig(**{name: value for name, value in values.items() if name in vars(FilterConfig())})
+    config = FilterConfig(
+        **{name: value for name, value in values.items() if name in vars(FilterConfig())}
+    )
     assert config.planar and config.fixed_height == 0.0 and config.non_holonomic_std == 0.05
 
 
@@ -35,7 +41,11 @@ def test_parameters_of_the_page_are_there():
 
 
 def test_yaml_of_the_page_can_be_read():
-    recipes = [yaml.safe_load(text) for heading in ("Nav2", "robot_localization") for text in blocks(section("rover.md", heading), "yaml")]
+    recipes = [
+        yaml.safe_load(text)
+        for heading in ("Nav2", "robot_localization")
+        for text in blocks(section("rover.md", heading), "yaml")
+    ]
     nav2, robot_localization = recipes
     assert nav2["global_costmap"]["global_costmap"]["ros__parameters"]["global_frame"] == "map"
     ours = robot_localization["ekf_map"]["ros__parameters"]
@@ -43,8 +53,17 @@ def test_yaml_of_the_page_can_be_read():
 
 
 def test_commands_of_the_page_are_command_lines():
-    parsers = {"simulate": simulate.parser, "check": check.parser, "evaluate": evaluate.parser, "diagnose": diagnose.parser}
-    lines = [shlex.split(line) for text in blocks(section("rover.md", "Check, diagnose, evaluate")) for line in text.splitlines()]
+    parsers = {
+        "simulate": simulate.parser,
+        "check": check.parser,
+        "evaluate": evaluate.parser,
+        "diagnose": diagnose.parser,
+    }
+    lines = [
+        shlex.split(line)
+        for text in blocks(section("rover.md", "Check, diagnose, evaluate"))
+        for line in text.splitlines()
+    ]
     assert {words[3] for words in lines} == set(parsers)
     for _, _, _, name, *words in lines:
         parsers[name]().parse_args(words)

@@ -16,8 +16,15 @@ def test_list_names_everything(capsys):
 
 
 def test_writes_bag_json_and_plot(tmp_path, capsys):
-    bag, report, picture = tmp_path / "flight.bag", tmp_path / "flight.json", tmp_path / "flight.png"
-    assert simulate.main([*SHORT, "--out", str(bag), "--json", str(report), "--plot", str(picture)]) == 0
+    bag, report, picture = (
+        tmp_path / "flight.bag",
+        tmp_path / "flight.json",
+        tmp_path / "flight.png",
+    )
+    assert (
+        simulate.main([*SHORT, "--out", str(bag), "--json", str(report), "--plot", str(picture)])
+        == 0
+    )
     assert (bag / "metadata.yaml").is_file()
     content = json.loads(report.read_text())
     assert content["imu_samples"] == 20_000 and content["config"]["trajectory"] == "circle"
@@ -39,19 +46,34 @@ def test_an_existing_bag_is_kept_unless_forced(tmp_path, capsys):
 def test_options_reach_the_configuration(tmp_path):
     report, anchors = tmp_path / "r.json", tmp_path / "a.yaml"
     SimulationConfig().complete()[0].anchors.to_yaml(anchors)
-    options = "--protocol tdoa3 --seed 4 --noise 0.02 --shared-noise --no-bias --no-outliers --no-multipath"
+    options = (
+        "--protocol tdoa3 --seed 4 --noise 0.02 --shared-noise --no-bias --no-outliers "
+        "--no-multipath"
+    )
     options += " --perfect-imu --yaw rotating --height 1.1 --speed 0.8 --start-in-air"
     options += " --height-noise 0.02 --pressure-noise 0.3 --velocity-noise 0.1"
     options += f" --anchors {anchors} --json {report}"
     assert simulate.main([*SHORT, *options.split()]) == 0
     content = json.loads(report.read_text())
     config = content["config"]
-    assert {k: config[k] for k in ("protocol", "seed", "noise_std", "shared_noise", "bias", "multipath", "yaw")} == {
-        "protocol": "tdoa3", "seed": 4, "noise_std": 0.02, "shared_noise": True, "bias": False, "multipath": False,
+    assert {
+        k: config[k]
+        for k in ("protocol", "seed", "noise_std", "shared_noise", "bias", "multipath", "yaw")
+    } == {
+        "protocol": "tdoa3",
+        "seed": 4,
+        "noise_std": 0.02,
+        "shared_noise": True,
+        "bias": False,
+        "multipath": False,
         "yaw": "rotating",
-    }  # fmt: skip
+    }
     assert (config["height"], config["speed"], config["outlier_probability"]) == (1.1, 0.8, 0.0)
-    assert [config[f"{stream}_noise"] for stream in ("height", "pressure", "velocity")] == [0.02, 0.3, 0.1]
+    assert [config[f"{stream}_noise"] for stream in ("height", "pressure", "velocity")] == [
+        0.02,
+        0.3,
+        0.1,
+    ]
     assert config["start_in_air"] and content["parameters"]["take_off"] is None
     assert set(config["imu_errors"].values()) == {0.0}
     assert content["bias_std"] == content["multipath_std"] == content["outliers"] == 0

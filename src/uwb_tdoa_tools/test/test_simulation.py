@@ -1,10 +1,10 @@
 import json
 import time
 
-import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
@@ -48,7 +48,11 @@ def test_any_config_gives_a_sound_flight(config):
     for stream in (flight.tdoa, flight.imu, flight.truth):
         assert all(np.isfinite(column).all() for column in vars(stream).values())
         assert len({len(column) for column in vars(stream).values()}) == 1
-        assert (np.diff(stream.t) > 0.0).all() and stream.t[0] > 0.0 and stream.t[-1] <= config.duration + 1e-9
+        assert (
+            (np.diff(stream.t) > 0.0).all()
+            and stream.t[0] > 0.0
+            and stream.t[-1] <= config.duration + 1e-9
+        )
     for columns in flight.extra.values():
         assert all(np.isfinite(column).all() for column in columns.values())
     room = room_of(flight.anchors)
@@ -73,7 +77,11 @@ def test_same_seed_same_flight_other_seed_other_flight():
 def test_rates_and_names():
     flight = simulate(SimulationConfig(protocol="tdoa3", trajectory="square", seed=9))
     assert flight.name == "sim-square-tdoa3-corners-9"
-    assert len(flight.imu) == 60_000 and len(flight.truth) == 15_000 and 12_000 < len(flight.tdoa) < 16_200
+    assert (
+        len(flight.imu) == 60_000
+        and len(flight.truth) == 15_000
+        and 12_000 < len(flight.tdoa) < 16_200
+    )
     assert np.diff(flight.imu.t) == pytest.approx(1e-3)
     assert flight.meta["protocol"] == "tdoa3" and flight.meta["source"] == "simulation"
 
@@ -101,7 +109,9 @@ def test_state_truth_is_the_velocity():
     state = flight.extra["state_truth"]
     np.testing.assert_array_equal(state["t"], flight.truth.t)
     v = np.gradient(flight.truth.p, flight.truth.t, axis=0)
-    np.testing.assert_allclose(np.column_stack([state["vx"], state["vy"], state["vz"]])[1:-1], v[1:-1], atol=1e-3)
+    np.testing.assert_allclose(
+        np.column_stack([state["vx"], state["vy"], state["vz"]])[1:-1], v[1:-1], atol=1e-3
+    )
 
 
 def test_a_minute_takes_no_time():
@@ -142,14 +152,22 @@ def test_anchors_without_orientation_do_without_bias():
 
 
 def test_height_pressure_and_velocity_are_true_without_noise_and_noisy_as_told():
-    exact = simulate(SimulationConfig(duration=20.0, height_noise=0.0, pressure_noise=0.0, velocity_noise=0.0))
-    config = SimulationConfig(duration=20.0, height_noise=0.02, pressure_noise=0.1, velocity_noise=0.05)
+    exact = simulate(
+        SimulationConfig(duration=20.0, height_noise=0.0, pressure_noise=0.0, velocity_noise=0.0)
+    )
+    config = SimulationConfig(
+        duration=20.0, height_noise=0.02, pressure_noise=0.1, velocity_noise=0.05
+    )
     noisy, plain = simulate(config), simulate(SimulationConfig(duration=20.0))
     at = np.searchsorted(exact.truth.t, exact.height.t)
     turn = Rotation.from_quat(exact.truth.q[at])
     np.testing.assert_allclose(exact.truth.t[at], exact.height.t, atol=1e-9)
-    np.testing.assert_allclose(exact.height.range * turn.as_matrix()[:, 2, 2], exact.truth.p[at, 2], atol=1e-9)
-    np.testing.assert_allclose(altitude_of(exact.pressure.pressure) - 200.0, exact.truth.p[at, 2], atol=1e-6)
+    np.testing.assert_allclose(
+        exact.height.range * turn.as_matrix()[:, 2, 2], exact.truth.p[at, 2], atol=1e-9
+    )
+    np.testing.assert_allclose(
+        altitude_of(exact.pressure.pressure) - 200.0, exact.truth.p[at, 2], atol=1e-6
+    )
     state = exact.extra["state_truth"]
     v = np.stack([state[name][at] for name in ("vx", "vy", "vz")], axis=1)
     np.testing.assert_allclose(turn.apply(exact.velocity.v), v, atol=1e-9)
@@ -158,4 +176,6 @@ def test_height_pressure_and_velocity_are_true_without_noise_and_noisy_as_told()
     assert np.std(noisy.velocity.v - exact.velocity.v) == pytest.approx(0.05, rel=0.1)
     assert (noisy.velocity.std == 0.05).all() and (exact.velocity.std > 0.0).all()
     assert plain.height is None and plain.pressure is None and plain.velocity is None
-    np.testing.assert_array_equal(noisy.tdoa.d, plain.tdoa.d)  # every part draws from its own stream
+    np.testing.assert_array_equal(
+        noisy.tdoa.d, plain.tdoa.d
+    )  # every part draws from its own stream

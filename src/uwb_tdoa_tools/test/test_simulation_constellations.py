@@ -13,7 +13,9 @@ NAMES = [*CONSTELLATIONS, "random-5", "random-1-4", "random-2-64"]
 def test_is_a_usable_constellation_that_faces_the_middle(name):
     anchors = constellation(name)
     assert (4 <= len(anchors) <= 64) or name == "pair"
-    gaps = np.linalg.norm(anchors.positions[:, None] - anchors.positions, axis=2)[np.triu_indices(len(anchors), 1)]
+    gaps = np.linalg.norm(anchors.positions[:, None] - anchors.positions, axis=2)[
+        np.triu_indices(len(anchors), 1)
+    ]
     assert gaps.min() > 0.4
     front = Rotation.from_quat(anchors.orientations).apply([1.0, 0.0, 0.0])
     inwards = -(anchors.positions - anchors.positions.mean(axis=0))
@@ -27,7 +29,9 @@ def test_corners_are_like_the_surveyed_ones():
     np.testing.assert_allclose(np.ptp(anchors.positions[:, :2], axis=0), [7.0, 8.0])
     assert np.count_nonzero(anchors.positions[:, 2] < 0.5) == 4
     up = Rotation.from_quat(anchors.orientations).apply([0.0, 0.0, 1.0])
-    np.testing.assert_allclose(up[:, 2], np.where(anchors.positions[:, 2] < 0.5, 1.0, -1.0), atol=1e-12)
+    np.testing.assert_allclose(
+        up[:, 2], np.where(anchors.positions[:, 2] < 0.5, 1.0, -1.0), atol=1e-12
+    )
 
 
 def test_planar_is_the_one_of_grasso():
@@ -36,7 +40,9 @@ def test_planar_is_the_one_of_grasso():
     np.testing.assert_allclose(anchors.positions[:, 2], 0.2)
     np.testing.assert_allclose(np.linalg.norm(np.diff(anchors.positions, axis=0), axis=1), 4.0)
     front = Rotation.from_quat(anchors.orientations).apply([1.0, 0.0, 0.0])
-    np.testing.assert_allclose(front * np.sqrt(8.0), [0.0, 0.0, 0.2] - anchors.positions, atol=1e-12)
+    np.testing.assert_allclose(
+        front * np.sqrt(8.0), [0.0, 0.0, 0.2] - anchors.positions, atol=1e-12
+    )
 
 
 def test_tilted_fronts_point_at_the_target_itself():
@@ -51,7 +57,11 @@ def test_tilted_fronts_point_at_the_target_itself():
 
 
 def test_random_is_seeded():
-    one, same, other = constellation("random-7-12"), constellation("random-7-12"), constellation("random-8-12")
+    one, same, other = (
+        constellation("random-7-12"),
+        constellation("random-7-12"),
+        constellation("random-8-12"),
+    )
     assert len(one) == 12
     np.testing.assert_array_equal(one.orientations, same.orientations)
     assert np.abs(one.positions - other.positions).max() > 0.1

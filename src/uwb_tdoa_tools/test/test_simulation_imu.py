@@ -18,7 +18,9 @@ def errors_of(imu_errors, **change):
 
 @pytest.mark.parametrize("rate", [1000.0, 250.0])
 def test_white_noise_has_the_density_whatever_the_rate(rate):
-    gyro, accel, _ = errors_of(replace(NO_IMU_ERRORS, gyro_noise=3e-4, accel_noise=2e-3), imu_rate=rate)
+    gyro, accel, _ = errors_of(
+        replace(NO_IMU_ERRORS, gyro_noise=3e-4, accel_noise=2e-3), imu_rate=rate
+    )
     assert gyro.std() == pytest.approx(3e-4 * np.sqrt(rate), rel=0.02)
     assert accel.std() == pytest.approx(2e-3 * np.sqrt(rate), rel=0.02)
     flat = (gyro / gyro.std()).ravel()
@@ -26,7 +28,9 @@ def test_white_noise_has_the_density_whatever_the_rate(rate):
 
 
 def test_bias_walks_as_configured():
-    gyro, accel, flight = errors_of(replace(NO_IMU_ERRORS, gyro_bias_walk=1e-3, accel_bias_walk=1e-2))
+    gyro, accel, flight = errors_of(
+        replace(NO_IMU_ERRORS, gyro_bias_walk=1e-3, accel_bias_walk=1e-2)
+    )
     assert np.diff(gyro, axis=0).std() == pytest.approx(1e-3 * np.sqrt(1e-3), rel=0.02)
     assert np.diff(accel, axis=0).std() == pytest.approx(1e-2 * np.sqrt(1e-3), rel=0.02)
     state = flight.extra["state_truth"]
@@ -39,13 +43,17 @@ def test_initial_bias_has_the_configured_spread():
     only_bias = replace(NO_IMU_ERRORS, gyro_bias=0.01, accel_bias=0.1)
     start = [errors_of(only_bias, seed=k, duration=1.0, start_in_air=True)[:2] for k in range(20)]
     for values, spread in zip(zip(*start), (0.01, 0.1)):
-        np.testing.assert_allclose(np.ptp(values, axis=1), 0.0, atol=1e-12)  # constant over each flight
+        np.testing.assert_allclose(
+            np.ptp(values, axis=1), 0.0, atol=1e-12
+        )  # constant over each flight
         assert np.std([v[0] for v in values]) == pytest.approx(spread, rel=0.3)
 
 
 def test_vibration_only_while_the_motors_turn():
     gyro, accel, flight = errors_of(replace(NO_IMU_ERRORS, vibration=2.0))
-    flying = (flight.imu.t >= 2.5) & (flight.imu.t <= 27.5)  # half a second before take-off and after landing
+    flying = (flight.imu.t >= 2.5) & (
+        flight.imu.t <= 27.5
+    )  # half a second before take-off and after landing
     assert accel[flying].std() == pytest.approx(2.0, rel=0.02)
     np.testing.assert_array_equal(accel[~flying], 0.0)
     np.testing.assert_array_equal(gyro, 0.0)
@@ -54,7 +62,9 @@ def test_vibration_only_while_the_motors_turn():
 def test_each_error_has_its_own_stream():
     everything = errors_of(ImuErrors())[0]
     without_walk = errors_of(ImuErrors(gyro_bias_walk=0.0, accel_noise=0.0))[0]
-    assert np.abs(np.diff(everything - without_walk, axis=0)).max() < 1e-5  # only the walk's steps are gone
+    assert (
+        np.abs(np.diff(everything - without_walk, axis=0)).max() < 1e-5
+    )  # only the walk's steps are gone
 
 
 def test_no_two_errors_draw_the_same_numbers():

@@ -4,7 +4,13 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.antenna import Antenna
-from uwb_tdoa_bias.foundation.radio import RadioLink, arrival_bias, into_frame, power_bias, received_power_dbm
+from uwb_tdoa_bias.foundation.radio import (
+    RadioLink,
+    arrival_bias,
+    into_frame,
+    power_bias,
+    received_power_dbm,
+)
 from uwb_tdoa_tools.simulation.constellations import pair
 from uwb_tdoa_tools.simulation.ranging import tag_link
 
@@ -22,7 +28,9 @@ def test_power_bias_is_the_table_of_aps011():
 
 
 def test_friis_by_hand():
-    """Two isotropic antennas: the free-space loss of the handbooks, 32.45 + 20 log10(km) + 20 log10(MHz) dB."""
+    """Two isotropic antennas: the free-space loss of the handbooks, 32.45 + 20 log10(km) + 20
+    log10(MHz) dB.
+    """
     link = RadioLink(ISOTROPIC, ISOTROPIC, tx_power_dbm=0.0, frequency=4.0e9)
     p = received_power_dbm(np.zeros(3), LEVEL, np.array([4.0, 0, 0]), LEVEL, link)
     assert p == pytest.approx(-(32.45 + 20 * np.log10(0.004) + 20 * np.log10(4000.0)), abs=0.01)
@@ -31,12 +39,16 @@ def test_friis_by_hand():
 
 
 def test_gains_of_both_antennas_count():
-    """Tag above the anchor, which it has at its back (-x of a flat antenna), in the upper null of the anchor."""
+    """Tag above the anchor, which it has at its back (-x of a flat antenna), in the upper null of
+    the anchor.
+    """
     link = RadioLink(tx_power_dbm=0.0)
     isotropic = RadioLink(ISOTROPIC, ISOTROPIC, tx_power_dbm=0.0)
     where = np.array([0.0, 0.0, 2.0]), LEVEL, np.zeros(3), LEVEL
     gains = Antenna().gain(np.array([-1.0, 0, 0])) + Antenna().gain(np.array([0, 0, 1.0]))
-    assert received_power_dbm(*where, link) - received_power_dbm(*where, isotropic) == pytest.approx(gains)
+    assert received_power_dbm(*where, link) - received_power_dbm(
+        *where, isotropic
+    ) == pytest.approx(gains)
 
 
 def test_only_relative_poses_matter():
@@ -46,7 +58,10 @@ def test_only_relative_poses_matter():
     turn, shift = Rotation.from_euler("xyz", [0.4, -1.0, 2.0]), np.array([1.0, -2.0, 0.5])
     one = arrival_bias(p_tag, q_tag.as_quat(), p_anchor, q_anchor.as_quat())
     other = arrival_bias(
-        turn.apply(p_tag) + shift, (turn * q_tag).as_quat(), turn.apply(p_anchor) + shift, (turn * q_anchor).as_quat()
+        turn.apply(p_tag) + shift,
+        (turn * q_tag).as_quat(),
+        turn.apply(p_anchor) + shift,
+        (turn * q_anchor).as_quat(),
     )
     np.testing.assert_allclose(one, other, atol=1e-9)
     assert np.ptp(one) > 0.1
@@ -56,10 +71,14 @@ def test_broadcasts_samples_against_anchors():
     anchors = pair()
     p_tag = np.random.default_rng(4).uniform(-1.0, 1.0, (7, 3))
     q_tag = np.tile(LEVEL, (7, 1))
-    table = received_power_dbm(p_tag[:, None], q_tag[:, None], anchors.positions, anchors.orientations)
+    table = received_power_dbm(
+        p_tag[:, None], q_tag[:, None], anchors.positions, anchors.orientations
+    )
     assert table.shape == (7, 2)
     np.testing.assert_allclose(
-        table[:, 1], received_power_dbm(p_tag, q_tag, anchors.positions[1], anchors.orientations[1]), rtol=1e-12
+        table[:, 1],
+        received_power_dbm(p_tag, q_tag, anchors.positions[1], anchors.orientations[1]),
+        rtol=1e-12,
     )
 
 
@@ -73,7 +92,13 @@ def spin(anchors, link=RadioLink()):
     """TDOA bias of the pair (0, 1) over a full turn of the tag half-way between the anchors."""
     yaw = np.linspace(-np.pi, np.pi, 181)
     q_tag = Rotation.from_rotvec(np.outer(yaw, [0.0, 0.0, 1.0])).as_quat()
-    late = arrival_bias(anchors.positions.mean(axis=0), q_tag[:, None], anchors.positions, anchors.orientations, link)
+    late = arrival_bias(
+        anchors.positions.mean(axis=0),
+        q_tag[:, None],
+        anchors.positions,
+        anchors.orientations,
+        link,
+    )
     return late[:, 1] - late[:, 0]
 
 

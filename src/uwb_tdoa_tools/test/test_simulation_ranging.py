@@ -3,8 +3,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.geometry import tdoa
-from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_bias.foundation.radio import arrival_bias
+from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.ranging import floor_multipath, outliers, tdoa_noise
 from uwb_tdoa_tools.simulation.schedule import make_schedule
 
@@ -16,7 +16,10 @@ def geometry(flight, lever=(0.0, 0.0, 0.0)):
     """TDOAs from the true pose that is next in time."""
     at = np.minimum(np.searchsorted(flight.truth.t, flight.tdoa.t), len(flight.truth) - 1)
     p = flight.truth.p[at] + Rotation.from_quat(flight.truth.q[at]).apply(lever)
-    a, b = (flight.anchors.positions[flight.anchors.index(ids)] for ids in (flight.tdoa.a, flight.tdoa.b))
+    a, b = (
+        flight.anchors.positions[flight.anchors.index(ids)]
+        for ids in (flight.tdoa.a, flight.tdoa.b)
+    )
     return tdoa(p, a, b)
 
 
@@ -25,20 +28,33 @@ def geometry(flight, lever=(0.0, 0.0, 0.0)):
 def test_without_errors_a_tdoa_is_geometry(protocol, lever):
     """A hovering tag: the poses at any stamp are those of the truth."""
     config = SimulationConfig(
-        trajectory="hover", place=(0.7, -1.1), yaw_angle=0.8, protocol=protocol, tag_lever_arm=lever, start_in_air=True,
-        duration=5.0, **CLEAN,
-    )  # fmt: skip
+        trajectory="hover",
+        place=(0.7, -1.1),
+        yaw_angle=0.8,
+        protocol=protocol,
+        tag_lever_arm=lever,
+        start_in_air=True,
+        duration=5.0,
+        **CLEAN,
+    )
     flight = simulate(config)
     np.testing.assert_allclose(flight.tdoa.d, geometry(flight, lever), atol=1e-9)
 
 
 def test_without_errors_a_moving_tag_too():
-    flight = simulate(SimulationConfig(trajectory="sines", truth_rate=10000.0, duration=20.0, **CLEAN))
+    flight = simulate(
+        SimulationConfig(trajectory="sines", truth_rate=10000.0, duration=20.0, **CLEAN)
+    )
     truth, parts = flight.truth, flight.extra["tdoa_truth"]
     p = np.column_stack([np.interp(flight.tdoa.t, truth.t, truth.p[:, k]) for k in range(3)])
-    a, b = (flight.anchors.positions[flight.anchors.index(ids)] for ids in (flight.tdoa.a, flight.tdoa.b))
+    a, b = (
+        flight.anchors.positions[flight.anchors.index(ids)]
+        for ids in (flight.tdoa.a, flight.tdoa.b)
+    )
     inside = flight.tdoa.t >= truth.t[0]
-    np.testing.assert_allclose(flight.tdoa.d[inside], tdoa(p, a, b)[inside], atol=1e-8)  # linear within 0.1 ms
+    np.testing.assert_allclose(
+        flight.tdoa.d[inside], tdoa(p, a, b)[inside], atol=1e-8
+    )  # linear within 0.1 ms
     for name in ("bias", "multipath", "noise", "outlier"):
         np.testing.assert_array_equal(parts[name], 0.0)
 
@@ -51,7 +67,9 @@ def test_the_parts_add_up_and_are_independent_of_each_other():
     parts_in_order = ("bias", "multipath", "noise", "outlier")
     total = sum(parts[name] for name in parts_in_order)
     np.testing.assert_allclose(everything.tdoa.d, exact.d + total, atol=1e-9)
-    for switch, part in zip(("bias", "multipath", "noise_std", "outlier_probability"), parts_in_order):
+    for switch, part in zip(
+        ("bias", "multipath", "noise_std", "outlier_probability"), parts_in_order
+    ):
         assert np.abs(parts[part]).max() > 0.1
         other = simulate(SimulationConfig(**full, **{switch: CLEAN[switch]})).extra["tdoa_truth"]
         for name in ("bias", "multipath", "noise", "outlier"):
@@ -59,9 +77,13 @@ def test_the_parts_add_up_and_are_independent_of_each_other():
 
 
 def test_bias_is_that_of_both_arrivals_and_the_anchor_delays():
-    flight = simulate(SimulationConfig(trajectory="hover", start_in_air=True, duration=3.0, yaw_angle=1.1))
+    flight = simulate(
+        SimulationConfig(trajectory="hover", start_in_air=True, duration=3.0, yaw_angle=1.1)
+    )
     delays = flight.meta["parameters"]["anchor_delays"]
-    late = arrival_bias(flight.truth.p[0], flight.truth.q[0], flight.anchors.positions, flight.anchors.orientations)
+    late = arrival_bias(
+        flight.truth.p[0], flight.truth.q[0], flight.anchors.positions, flight.anchors.orientations
+    )
     late = late + [delays[i] for i in flight.anchors.ids.tolist()]
     a, b = flight.anchors.index(flight.tdoa.a), flight.anchors.index(flight.tdoa.b)
     np.testing.assert_allclose(flight.extra["tdoa_truth"]["bias"], late[b] - late[a], atol=1e-6)
@@ -90,7 +112,9 @@ def test_shared_noise_covariance_of_neighbours():
     chained = schedule.heard_a[1:] == schedule.heard_b[:-1]
     for j in range(4):
         rows = np.flatnonzero(chained & (schedule.a[1:] == j))
-        assert np.mean(n[rows] * n[rows + 1]) == pytest.approx(-(std[j] ** 2), abs=0.03 * np.max(std) ** 2)
+        assert np.mean(n[rows] * n[rows + 1]) == pytest.approx(
+            -(std[j] ** 2), abs=0.03 * np.max(std) ** 2
+        )
     apart = np.mean(n[2:] * n[:-2])
     assert abs(apart) < 0.03 * np.var(n)
 
@@ -128,13 +152,17 @@ def test_multipath_is_late_near_the_floor_only_and_correlated_in_time():
 
     def late_at(height):
         each = np.repeat(np.arange(6)[:, None], len(t), axis=1)
-        return floor_multipath(t, np.full(len(t), height), each, 6, np.random.default_rng(3), 500.0).T
+        return floor_multipath(
+            t, np.full(len(t), height), each, 6, np.random.default_rng(3), 500.0
+        ).T
 
     late = late_at(0.03)
     assert late.min() == 0.0 and 0.2 < late.max() < 2.0
     assert 0.3 < np.mean(late > 0.0) < 0.7
     centred = late - late.mean(axis=0)
-    correlation = [np.mean(centred[k:] * centred[: len(t) - k]) / np.mean(centred**2) for k in (1, 25, 250)]
+    correlation = [
+        np.mean(centred[k:] * centred[: len(t) - k]) / np.mean(centred**2) for k in (1, 25, 250)
+    ]
     assert correlation[0] > 0.9 and 0.1 < correlation[1] < 0.6 and abs(correlation[2]) < 0.1
     assert np.abs(np.corrcoef(late.T) - np.eye(6)).max() < 0.2
     np.testing.assert_allclose(late_at(0.25), 0.5 * late, atol=1e-12)
@@ -146,4 +174,6 @@ def test_in_flight_there_is_no_multipath():
     late = flight.extra["tdoa_truth"]["multipath"]
     airborne = np.interp(flight.tdoa.t, flight.truth.t, flight.truth.p[:, 2]) > 0.41
     np.testing.assert_array_equal(late[airborne], 0.0)
-    assert late[~airborne].max() > 0.2 and late[~airborne].min() < -0.2  # of either anchor of a pair
+    assert (
+        late[~airborne].max() > 0.2 and late[~airborne].min() < -0.2
+    )  # of either anchor of a pair

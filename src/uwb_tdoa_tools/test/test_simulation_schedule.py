@@ -1,7 +1,7 @@
-import numpy as np
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+import numpy as np
+import pytest
 
 from uwb_tdoa_tools.simulation.schedule import PROTOCOLS, among_heard, make_schedule
 from uwb_tdoa_tools.simulation.walls import heard_at
@@ -54,11 +54,15 @@ def test_seeded(protocol):
 
 
 def across_a_hall(protocol, reach, seed, cells=None):
-    """(Schedule, place (n, 3) of each measurement, positions (40, 3)) of a tag that crosses 60 m of a hall."""
+    """(Schedule, place (n, 3) of each measurement, positions (40, 3)) of a tag that crosses 60 m of
+    a hall.
+    """
     rng = np.random.default_rng(seed)
     positions = np.column_stack([rng.uniform(0.0, 60.0, (40, 2)), rng.uniform(0.0, 5.0, 40)])
     schedule = make_schedule(protocol, len(positions), 2.0, rng)
-    p = np.column_stack([np.linspace(5.0, 55.0, len(schedule.t)), np.full((len(schedule.t), 2), (30.0, 1.0))])
+    p = np.column_stack(
+        [np.linspace(5.0, 55.0, len(schedule.t)), np.full((len(schedule.t), 2), (30.0, 1.0))]
+    )
     near = among_heard(schedule, heard_at(p, positions, reach), protocol, rng, cells)
     assert np.isin(near.t, schedule.t).all()
     return near, p[np.searchsorted(schedule.t, near.t)], positions

@@ -17,10 +17,14 @@ def fly(config):
     return Trajectory(filled, room, filled.random("trajectory")), filled, room
 
 
-@pytest.fixture(params=[(name, in_air) for name in TRAJECTORIES for in_air in (False, True)], ids=str)
+@pytest.fixture(
+    params=[(name, in_air) for name in TRAJECTORIES for in_air in (False, True)], ids=str
+)
 def flown(request):
     name, in_air = request.param
-    return fly(replace(CONFIG, trajectory=name, yaw=YAWS.get(name, "fixed"), start_in_air=in_air))[0]
+    return fly(replace(CONFIG, trajectory=name, yaw=YAWS.get(name, "fixed"), start_in_air=in_air))[
+        0
+    ]
 
 
 def test_derivatives_are_those_of_the_position(flown):
@@ -46,7 +50,9 @@ def test_specific_force_integrates_to_the_position(flown):
     motion = flown.motion(t)
     a = Rotation.from_quat(motion.q).apply(motion.specific_force) - [0.0, 0.0, GRAVITY]
     dt = np.diff(t)[:, None]
-    v = motion.v[0] + np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * dt * (a[1:] + a[:-1]), axis=0)])
+    v = motion.v[0] + np.concatenate(
+        [np.zeros((1, 3)), np.cumsum(0.5 * dt * (a[1:] + a[:-1]), axis=0)]
+    )
     p = motion.p[0] + np.cumsum(dt * (v[:-1] + dt * (2 * a[:-1] + a[1:]) / 6), axis=0)
     assert np.abs(p - motion.p[1:]).max() < 1e-3
 
@@ -57,11 +63,16 @@ def test_rests_exactly_on_the_floor():
     np.testing.assert_array_equal(motion.v, 0.0)
     np.testing.assert_array_equal(motion.a, 0.0)
     np.testing.assert_array_equal(motion.body_rates, 0.0)
-    np.testing.assert_allclose(motion.specific_force, np.tile([0.0, 0.0, GRAVITY], (5, 1)), atol=1e-12)
+    np.testing.assert_allclose(
+        motion.specific_force, np.tile([0.0, 0.0, GRAVITY], (5, 1)), atol=1e-12
+    )
     np.testing.assert_allclose(motion.p[:, 2], 0.03, atol=1e-9)
     np.testing.assert_array_equal(motion.p[0], motion.p[2])
     assert (trajectory.take_off, trajectory.landing) == (3.0, 37.0)
-    assert not trajectory.motors(np.array([0.0, 40.0])).any() and trajectory.motors(np.array([3.0, 20.0])).all()
+    assert (
+        not trajectory.motors(np.array([0.0, 40.0])).any()
+        and trajectory.motors(np.array([3.0, 20.0])).all()
+    )
 
 
 def test_start_in_air_is_moving_from_the_first_instant():
@@ -73,9 +84,13 @@ def test_start_in_air_is_moving_from_the_first_instant():
 
 
 def test_circle_is_a_circle():
-    trajectory, config, room = fly(replace(CONFIG, trajectory="circle", radius=1.5, place=(0.3, -0.4), height=1.2))
+    trajectory, config, room = fly(
+        replace(CONFIG, trajectory="circle", radius=1.5, place=(0.3, -0.4), height=1.2)
+    )
     motion = trajectory.motion(np.linspace(10.0, 30.0, 500))
-    np.testing.assert_allclose(np.linalg.norm(motion.p[:, :2] - [0.3, -0.4], axis=1), 1.5, atol=1e-4)
+    np.testing.assert_allclose(
+        np.linalg.norm(motion.p[:, :2] - [0.3, -0.4], axis=1), 1.5, atol=1e-4
+    )
     np.testing.assert_allclose(np.linalg.norm(motion.v, axis=1), 1.2, atol=1e-3)
     np.testing.assert_allclose(motion.p[:, 2], 1.2, atol=1e-4)
 
@@ -92,10 +107,14 @@ def test_square_keeps_its_speed_on_the_edges_and_slows_in_the_corners():
 
 @pytest.mark.parametrize("axis", [0, 1])
 def test_line_goes_back_and_forth_along_its_axis(axis):
-    trajectory = fly(replace(CONFIG, trajectory=f"line_{'xy'[axis]}", radius=2.0, place=(0.2, -0.3), height=1.0))[0]
+    trajectory = fly(
+        replace(CONFIG, trajectory=f"line_{'xy'[axis]}", radius=2.0, place=(0.2, -0.3), height=1.0)
+    )[0]
     motion = trajectory.motion(np.linspace(10.0, 30.0, 2000))
     middle = [0.2, -0.3, 1.0]
-    assert motion.p[:, axis].min() == pytest.approx(middle[axis] - 2.0, abs=0.3)  # the turns are smooth
+    assert motion.p[:, axis].min() == pytest.approx(
+        middle[axis] - 2.0, abs=0.3
+    )  # the turns are smooth
     assert motion.p[:, axis].max() == pytest.approx(middle[axis] + 2.0, abs=0.3)
     aside = np.delete(motion.p - middle, axis, axis=1)
     assert np.abs(aside).max() < 1e-6
@@ -106,7 +125,9 @@ def test_line_goes_back_and_forth_along_its_axis(axis):
 def test_sines_are_seeded_fill_the_room_and_keep_the_mean_speed():
     paths = []
     for seed in (1, 1, 2):
-        trajectory, config, room = fly(replace(CONFIG, seed=seed, duration=200.0, start_in_air=True))
+        trajectory, config, room = fly(
+            replace(CONFIG, seed=seed, duration=200.0, start_in_air=True)
+        )
         motion = trajectory.motion(np.linspace(0.0, 200.0, 4000))
         paths.append(motion.p)
         low, high = room.flyable

@@ -1,4 +1,6 @@
-"""What carries a tag in a simulation: a rover on wheels, a person on foot; waypoints and areas for all of them."""
+"""What carries a tag in a simulation: a rover on wheels, a person on foot; waypoints and areas for
+all of them.
+"""
 
 from dataclasses import replace
 
@@ -25,16 +27,31 @@ def moved(config):
 
 
 @settings(max_examples=25, deadline=None)
-@given(st.sampled_from(ON_FOOT_OR_WHEELS), st.sampled_from(list(TRAJECTORIES)), st.integers(0, 2**32 - 1), st.floats(0.2, 1.0))
+@given(
+    st.sampled_from(ON_FOOT_OR_WHEELS),
+    st.sampled_from(list(TRAJECTORIES)),
+    st.integers(0, 2**32 - 1),
+    st.floats(0.2, 1.0),
+)
 def test_rates_and_forces_are_those_of_the_motion(vehicle, trajectory, seed, speed):
-    motion = moved(SimulationConfig.of(vehicle, trajectory=trajectory, seed=seed, speed=speed, duration=40.0)).motion
+    motion = moved(
+        SimulationConfig.of(vehicle, trajectory=trajectory, seed=seed, speed=speed, duration=40.0)
+    ).motion
     t, h = np.linspace(0.1, 39.9, 2003), 1e-3
     before, here, after = (motion(t + k * h) for k in (-1, 0, 1))
     np.testing.assert_allclose((after.p - before.p) / (2 * h), here.v, atol=1e-4)
-    np.testing.assert_allclose((after.v - before.v) / (2 * h), here.a, atol=2e-2)  # of a cubic, whose second derivative has corners
-    turned = (Rotation.from_quat(before.q).inv() * Rotation.from_quat(after.q)).as_rotvec() / (2 * h)
+    np.testing.assert_allclose(
+        (after.v - before.v) / (2 * h), here.a, atol=2e-2
+    )  # of a cubic, whose second derivative has corners
+    turned = (Rotation.from_quat(before.q).inv() * Rotation.from_quat(after.q)).as_rotvec() / (
+        2 * h
+    )
     np.testing.assert_allclose(turned, here.body_rates, atol=2e-3)
-    np.testing.assert_allclose(Rotation.from_quat(here.q).apply(here.specific_force), here.a + [0.0, 0.0, GRAVITY], atol=1e-9)
+    np.testing.assert_allclose(
+        Rotation.from_quat(here.q).apply(here.specific_force),
+        here.a + [0.0, 0.0, GRAVITY],
+        atol=1e-9,
+    )
 
 
 def test_a_rover_drives_ahead_on_the_floor_and_stops():
@@ -47,7 +64,9 @@ def test_a_rover_drives_ahead_on_the_floor_and_stops():
     still = (body[:, 0] == 0.0) & (flight.truth.t > 4.0) & (flight.truth.t < 86.0)
     assert 0.05 < still.mean() < 0.5
     assert (np.ptp(flight.truth.p[:, :2], axis=0) > [5.0, 3.0]).all()
-    assert [len(stream) for stream in (flight.imu, flight.velocity)] == [9000, 4500] and 8500 < len(flight.tdoa) < 9500
+    assert [len(stream) for stream in (flight.imu, flight.velocity)] == [9000, 4500] and 8500 < len(
+        flight.tdoa
+    ) < 9500
 
 
 def test_wheels_say_too_much_and_slip():
@@ -70,7 +89,9 @@ def test_wheels_say_too_much_and_slip():
 def test_a_person_walks_at_the_height_of_a_hand():
     flight = simulate(SimulationConfig.of("hand", seed=1, imu_errors=NO_IMU_ERRORS))
     assert 1.0 < flight.truth.p[:, 2].min() < flight.truth.p[:, 2].max() < 1.2
-    assert np.abs(np.linalg.norm(flight.imu.accel, axis=1) - GRAVITY).max() > 1.0  # its steps are felt
+    assert (
+        np.abs(np.linalg.norm(flight.imu.accel, axis=1) - GRAVITY).max() > 1.0
+    )  # its steps are felt
     assert flight.velocity is None
 
 
@@ -81,7 +102,9 @@ def test_waypoints_are_passed_in_turn(vehicle):
     assert (away.min(axis=0) < 0.45).all()
     first = np.argmax(away < 0.5, axis=0)
     assert (np.diff(first) > 0).all()
-    assert flight.name.endswith("path-tdoa3-six_wide-0" if vehicle == "rover" else "path-tdoa2-corners-0")
+    assert flight.name.endswith(
+        "path-tdoa3-six_wide-0" if vehicle == "rover" else "path-tdoa2-corners-0"
+    )
 
 
 def test_waypoints_have_heights():
@@ -128,7 +151,11 @@ def test_what_is_given_counts_more_than_what_is_usual(tmp_path, monkeypatch):
     assert command.main(["--vehicle", "rover", "--duration", "12", *given]) == 0
     assert command.main(["--duration", "20", "--area", "-1,-1 1,1"]) == 0
     rover, quadrotor = made
-    changes = {"path": ((-2.0, -1.0), (2.0, 1.0)), "tdoa_rate": 50.0, "tag_lever_arm": (0.0, 0.0, 0.2)}
+    changes = {
+        "path": ((-2.0, -1.0), (2.0, 1.0)),
+        "tdoa_rate": 50.0,
+        "tag_lever_arm": (0.0, 0.0, 0.2),
+    }
     assert rover == SimulationConfig.of("rover", duration=12.0, **changes)
     assert quadrotor == SimulationConfig(duration=20.0, area=((-1.0, -1.0), (1.0, 1.0)))
 

@@ -14,7 +14,9 @@ SHELF = Walls(((4.0, -10.0, 4.0, 20.0, 3.0),))
 
 
 def hall():
-    """32 Anchors in 28 x 14 m, whose ids are 256 times the number of their cell of 16, and 0 ... 15."""
+    """32 Anchors in 28 x 14 m, whose ids are 256 times the number of their cell of 16, and 0 ...
+    15.
+    """
     x, y = np.meshgrid(np.arange(8) * 4.0, np.arange(4) * 14.0 / 3.0)
     positions = np.column_stack([x.ravel(), y.ravel(), np.tile([0.5, 3.0, 5.5, 4.0], 8)])
     right = positions[:, 0] > 14.0
@@ -23,7 +25,15 @@ def hall():
 
 
 def flown(**kind):
-    config = SimulationConfig(anchors=hall(), bias=False, protocol="tdoa3", duration=20.0, start_in_air=True, radio_reach=12.0, **kind)
+    config = SimulationConfig(
+        anchors=hall(),
+        bias=False,
+        protocol="tdoa3",
+        duration=20.0,
+        start_in_air=True,
+        radio_reach=12.0,
+        **kind,
+    )
     return simulate(config)
 
 
@@ -58,11 +68,17 @@ def test_nothing_is_heard_through_a_wall(monkeypatch):
 def test_a_flight_hears_nothing_through_walls():
     walls = Walls(((14.0, -1.0, 14.0, 20.0, np.inf),))
     flight = flown(walls=walls)
-    place = np.column_stack([np.interp(flight.tdoa.t, flight.truth.t, column) for column in flight.truth.p.T])
+    place = np.column_stack(
+        [np.interp(flight.tdoa.t, flight.truth.t, column) for column in flight.truth.p.T]
+    )
     for ids in (flight.tdoa.a, flight.tdoa.b):
         assert not walls.between(place, flight.anchors.positions[flight.anchors.index(ids)]).any()
-    assert np.ptp(place[:, 0]) > 5.0 and flight.meta["config"]["walls"] == [[14.0, -1.0, 14.0, 20.0]]
-    assert walls.between(place, flown().anchors.positions[flown().anchors.index(flown().tdoa.a[: len(place)])]).any()
+    assert np.ptp(place[:, 0]) > 5.0 and flight.meta["config"]["walls"] == [
+        [14.0, -1.0, 14.0, 20.0]
+    ]
+    assert walls.between(
+        place, flown().anchors.positions[flown().anchors.index(flown().tdoa.a[: len(place)])]
+    ).any()
 
 
 def test_cells_that_use_the_same_ids_have_clocks_of_their_own():
@@ -76,7 +92,9 @@ def test_cells_that_use_the_same_ids_have_clocks_of_their_own():
 def test_a_tag_among_cells_is_found():
     flight = flown(cell_ids=256)
     odometry = run_offline(flight).odometry
-    place = np.column_stack([np.interp(odometry.t, flight.truth.t, column) for column in flight.truth.p.T])
+    place = np.column_stack(
+        [np.interp(odometry.t, flight.truth.t, column) for column in flight.truth.p.T]
+    )
     assert np.linalg.norm(odometry.p - place, axis=1)[odometry.t > 5.0].max() < 0.5
 
 
@@ -98,10 +116,20 @@ def test_what_is_no_wall_is_refused(tmp_path, text, wrong):
 
 def test_walls_of_a_file(tmp_path):
     (tmp_path / "walls.yaml").write_text("walls:\n- [0, 1, 2.5, 3]\n- [0, 1, 2, 3, 4]\n")
-    assert Walls.from_yaml(tmp_path / "walls.yaml").segments == ((0.0, 1.0, 2.5, 3.0, np.inf), (0.0, 1.0, 2.0, 3.0, 4.0))
+    assert Walls.from_yaml(tmp_path / "walls.yaml").segments == (
+        (0.0, 1.0, 2.5, 3.0, np.inf),
+        (0.0, 1.0, 2.0, 3.0, 4.0),
+    )
 
 
-@pytest.mark.parametrize("kind, wrong", [({"walls": ACROSS}, "radio_reach"), ({"cell_ids": 256}, "radio_reach"), ({"cell_ids": 1, "radio_reach": 9.0}, "cell_ids")])
+@pytest.mark.parametrize(
+    "kind, wrong",
+    [
+        ({"walls": ACROSS}, "radio_reach"),
+        ({"cell_ids": 256}, "radio_reach"),
+        ({"cell_ids": 1, "radio_reach": 9.0}, "cell_ids"),
+    ],
+)
 def test_what_does_not_fit_together_is_refused(kind, wrong):
     with pytest.raises(InputError, match=wrong):
         SimulationConfig(**kind)

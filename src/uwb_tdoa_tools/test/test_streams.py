@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+
 from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_tools.readers.streams import protocol
 
@@ -27,7 +28,10 @@ RING = [4, 1, 7, 0, 3, 6]  # the order in which anchors send need not be that of
 def test_a_ring_in_any_order_whichever_id_a_tool_writes_first():
     rng = np.random.default_rng(0)
     a = np.arange(300) % 6
-    pair = np.array([RING[k] for k in a]), np.array([RING[k] for k in (a + 1 + (rng.random(300) < 0.1)) % 6])
+    pair = (
+        np.array([RING[k] for k in a]),
+        np.array([RING[k] for k in (a + 1 + (rng.random(300) < 0.1)) % 6]),
+    )
     assert protocol(tdoas(*pair)) == protocol(tdoas(*np.sort(pair, axis=0))) == "tdoa2"
 
 

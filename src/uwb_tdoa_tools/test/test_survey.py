@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from recordings import ANCHORS, SURVEY
 from scipy.spatial.transform import Rotation
+
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.survey import ARM_TIPS, orientation_from_tips, read_survey
 
@@ -13,7 +14,9 @@ def survey_lines(rotation=SOME, centre=CENTRE, number=4, noise=0.0):
     tips = rotation.apply(ARM_TIPS) + centre + noise * np.array([[1, 0, 0], [0, -1, 0], [0, 0, 1]])
     antenna = rotation.apply([0.011, -0.026, 0.049]) + centre
     lines = [f"anchorAnt{number},{antenna[0]:.4f},{antenna[1]:.4f}, {antenna[2]:.4f}  "]
-    lines += [f"anchor{number}_{k},{x:.4f},{y:.4f},{z:.4f}" for k, (x, y, z) in enumerate(tips, start=1)]
+    lines += [
+        f"anchor{number}_{k},{x:.4f},{y:.4f},{z:.4f}" for k, (x, y, z) in enumerate(tips, start=1)
+    ]
     return lines, antenna
 
 
@@ -46,7 +49,9 @@ def test_orientation_is_exact_and_says_what_remains():
 
 
 def test_arms_up_left_forward_are_what_the_surveyor_saw():
-    """Standing before an upright stand that faces us, arm 2 is on the left; REP 103 calls this side -y."""
+    """Standing before an upright stand that faces us, arm 2 is on the left; REP 103 calls this side
+    -y.
+    """
     up, left_of_viewer, forward = ARM_TIPS
     assert up[2] == 0.110 and forward[0] == 0.080
     np.testing.assert_allclose(np.linalg.norm(left_of_viewer), 0.121)
@@ -100,7 +105,9 @@ def test_missing_and_binary(tmp_path):
 
 
 def test_measured_stands_are_one_shape(shared_data):
-    """The antenna sits at one place of all stands, and those on the floor stand upright: the frame is the right one."""
+    """The antenna sits at one place of all stands, and those on the floor stand upright: the frame
+    is the right one.
+    """
     for file in sorted((shared_data / "surveys").glob("*.txt")):
         anchors = read_survey(file)
         rotation = Rotation.from_quat(anchors.orientations)
@@ -109,11 +116,18 @@ def test_measured_stands_are_one_shape(shared_data):
         assert floor.sum() == 4
         assert (up[floor] > np.cos(np.radians(3))).all(), file
         assert (up[~floor] < -0.8).all(), file  # the upper ones hang upside down
-        to_room = np.einsum("ij,ij->i", rotation.apply([1.0, 0.0, 0.0])[:, :2], -anchors.positions[:, :2])
+        to_room = np.einsum(
+            "ij,ij->i", rotation.apply([1.0, 0.0, 0.0])[:, :2], -anchors.positions[:, :2]
+        )
         assert (to_room > 0).all(), file  # all face the room
-        points = {line.split(",")[0]: line.split(",")[1:] for line in file.read_text().replace(" ", "").splitlines()}
+        points = {
+            line.split(",")[0]: line.split(",")[1:]
+            for line in file.read_text().replace(" ", "").splitlines()
+        }
         for number, position, turn in zip(anchors.ids, anchors.positions, rotation):
             tips = np.array([points[f"anchor{number}_{k}"] for k in (1, 2, 3)], dtype=float)
             centre = tips.mean(axis=0) - turn.apply(ARM_TIPS.mean(axis=0))
             in_stand = turn.inv().apply(position - centre)
-            np.testing.assert_allclose(in_stand, [0.011, -0.026, 0.049], atol=0.009, err_msg=str(file))
+            np.testing.assert_allclose(
+                in_stand, [0.011, -0.026, 0.049], atol=0.009, err_msg=str(file)
+            )

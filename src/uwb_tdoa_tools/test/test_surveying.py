@@ -4,6 +4,7 @@ from dataclasses import replace
 import json
 import re
 
+from known_effects import clean_flight
 import numpy as np
 import pytest
 
@@ -20,9 +21,8 @@ from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
 from uwb_tdoa_tools.diagnosis.self_calibration.equations import delay_effect, tdoa_std_of
 from uwb_tdoa_tools.diagnosis.self_calibration.placing import place
 from uwb_tdoa_tools.scoring.evaluation import evaluate
-from known_effects import clean_flight
-from uwb_tdoa_tools.surveying.marks import read_marks
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
+from uwb_tdoa_tools.surveying.marks import read_marks
 from uwb_tdoa_tools.surveying.report import as_dict, as_text
 
 TRUSTED = ("0", "6", "1.z", "2.z")
@@ -35,7 +35,9 @@ def at(flight, positions):
 def shaken(anchors, std, seed):
     """Positions as a tape of this std tells them, TRUSTED coordinates as they are."""
     off = std * np.random.default_rng(seed).standard_normal(anchors.positions.shape)
-    return anchors.positions + np.where(Tape(1.0, trusted=TRUSTED).position_std(anchors) < 0.5, 0.0, off)
+    return anchors.positions + np.where(
+        Tape(1.0, trusted=TRUSTED).position_std(anchors) < 0.5, 0.0, off
+    )
 
 
 def error(flight, **options):
@@ -45,13 +47,18 @@ def error(flight, **options):
 @pytest.fixture(scope="module")
 def flights():
     delays = EFFECTS["anchor_delay"]({"3": 0.15})
-    return [delays.inject(clean_flight(seed, 40.0), np.random.default_rng(0)) for seed in (200, 201, 202)]
+    return [
+        delays.inject(clean_flight(seed, 40.0), np.random.default_rng(0))
+        for seed in (200, 201, 202)
+    ]
 
 
 @pytest.fixture(scope="module")
 def result(flights):
     measured = shaken(flights[0].anchors, 0.2, 0)
-    return self_calibrate([at(flight, measured) for flight in flights[:2]], Tape(0.2, trusted=TRUSTED))
+    return self_calibrate(
+        [at(flight, measured) for flight in flights[:2]], Tape(0.2, trusted=TRUSTED)
+    )
 
 
 def test_anchors_come_nearer_to_where_they_are_and_say_how_near(flights, result):
@@ -67,7 +74,10 @@ def test_anchors_come_nearer_to_where_they_are_and_say_how_near(flights, result)
 def test_a_flight_that_took_no_part_gains(flights, result):
     other, found = flights[2], result
     before = error(at(other, result.given.positions))
-    effects, config = EffectSet((delay_effect(found.surveyed, found.delays),)), FilterConfig(tdoa_std=found.tdoa_std)
+    effects, config = (
+        EffectSet((delay_effect(found.surveyed, found.delays),)),
+        FilterConfig(tdoa_std=found.tdoa_std),
+    )
     after = evaluate(at(other, found.surveyed.positions), config, effects=effects)[0].row()
     assert after["rmse_3d"] < 0.5 * before and after["rmse_3d"] < 1.2 * error(other)
     assert found.tdoa_std < 0.25 and 0.5 < after["nees_mean"] < 6.0  # of white noise of 0.05 m
@@ -76,12 +86,19 @@ def test_a_flight_that_took_no_part_gains(flights, result):
 def test_the_noise_beside_a_calibration_is_that_of_the_flights_without_their_ground_truth(flights):
     late = EffectSet((EFFECTS["anchor_delay"]({"3": 0.15}),))
     bare = [replace(flight, truth=None) for flight in flights[:1]]
-    assert tdoa_std_of(flights[:1], late) == tdoa_std_of(bare, late) < tdoa_std_of(bare, EffectSet())
+    assert (
+        tdoa_std_of(flights[:1], late) == tdoa_std_of(bare, late) < tdoa_std_of(bare, EffectSet())
+    )
 
 
 def test_ground_truth_is_not_looked_at(flights, result):
-    wrong = [replace(flight, truth=replace(flight.truth, p=flight.truth.p + 1.0)) for flight in flights[:2]]
-    again = self_calibrate([at(flight, result.given.positions) for flight in wrong], Tape(0.2, trusted=TRUSTED))
+    wrong = [
+        replace(flight, truth=replace(flight.truth, p=flight.truth.p + 1.0))
+        for flight in flights[:2]
+    ]
+    again = self_calibrate(
+        [at(flight, result.given.positions) for flight in wrong], Tape(0.2, trusted=TRUSTED)
+    )
     np.testing.assert_array_equal(again.surveyed.positions, result.surveyed.positions)
 
 
@@ -100,7 +117,15 @@ def marks_file(path, flight, places=3, changes=()):
     for first in np.linspace(5.0, 30.0, places):
         inside = (truth.t >= begin + first) & (truth.t <= begin + first + 2.0)
         place = [float(round(value, 4)) for value in truth.p[inside].mean(axis=0)]
-        marks.append({"flight": flight.name, "from": float(first), "to": float(first + 2.0), "position": place, "std": 0.01})
+        marks.append(
+            {
+                "flight": flight.name,
+                "from": float(first),
+                "to": float(first + 2.0),
+                "position": place,
+                "std": 0.01,
+            }
+        )
     marks[0].update(changes)
     path.write_text(json.dumps({"marks": marks}))
     return path
@@ -109,7 +134,9 @@ def marks_file(path, flight, places=3, changes=()):
 def test_nothing_is_applied_where_something_else_is_wrong_too(flights, tmp_path, capsys):
     region = {"2.x": 1.0, "2.y": 0.0, "2.z": 1.0, "2.radius": 1.5, "2.delay": 1.5}
     blocked = EFFECTS["nlos"](region).inject(flights[0], np.random.default_rng(0))
-    blocked = EFFECTS["noise_correlation"]({"std": 0.2, "time": 1.0}).inject(blocked, np.random.default_rng(0))
+    blocked = EFFECTS["noise_correlation"]({"std": 0.2, "time": 1.0}).inject(
+        blocked, np.random.default_rng(0)
+    )
     write_bag(blocked, tmp_path / "flight.bag")
     assert main([str(tmp_path / "flight.bag"), "--out", str(tmp_path / "out")]) == 1
     assert "nothing is applied, anchors stay as given" in capsys.readouterr().out
@@ -128,8 +155,14 @@ def test_marks_hold_the_frame_where_no_anchor_is_trusted(flights, tmp_path):
     away = flight.anchors.positions + [0.2, -0.15, 0.1]  # all alike: nothing in the TDOAs tells
     moved = [at(flight, away)]
     marks = read_marks(marks_file(tmp_path / "marks.yaml", flight, 6), moved)
-    with_marks, without = (self_calibrate(moved, Tape(0.3), constraints=some).surveyed.positions for some in (marks, ()))
-    off = [np.abs((found - flight.anchors.positions).mean(axis=0)).max() for found in (with_marks, without)]
+    with_marks, without = (
+        self_calibrate(moved, Tape(0.3), constraints=some).surveyed.positions
+        for some in (marks, ())
+    )
+    off = [
+        np.abs((found - flight.anchors.positions).mean(axis=0)).max()
+        for found in (with_marks, without)
+    ]
     assert off[0] < 0.05 < 0.1 < off[1]
 
 
@@ -153,7 +186,10 @@ def test_marks_that_cannot_be_are_refused(flights, tmp_path, changes, words):
 def test_words_name_what_is_better_and_what_is_not(result):
     text = as_text(result)
     assert text.count("\n") >= 9 and "coordinates are known better than before" in text
-    assert json.loads(json.dumps(as_dict(result), allow_nan=False))["anchors"]["0"]["improved"] == [False] * 3
+    assert (
+        json.loads(json.dumps(as_dict(result), allow_nan=False))["anchors"]["0"]["improved"]
+        == [False] * 3
+    )
 
 
 @pytest.mark.parametrize(
@@ -176,13 +212,24 @@ def test_the_command_writes_surveys_that_are_read(flights, tmp_path, capsys):
     write_bag(flights[0], tmp_path / "flight.bag")
     at(flights[0], measured).anchors.to_yaml(tmp_path / "tape.yaml")
     out = tmp_path / "out"
-    words = ["--survey", str(tmp_path / "tape.yaml"), "--height-std", "0.03", "--trusted", *TRUSTED, "--out", str(out)]
+    words = [
+        "--survey",
+        str(tmp_path / "tape.yaml"),
+        "--height-std",
+        "0.03",
+        "--trusted",
+        *TRUSTED,
+        "--out",
+        str(out),
+    ]
     assert main([str(tmp_path / "flight.bag"), *words]) == 0
     assert re.search(r"next: .*evaluate .*flight\.bag --survey", capsys.readouterr().out)
     found = [read_survey(out / name).positions for name in ("anchors.yaml", "anchors.csv")]
     np.testing.assert_allclose(*found, atol=1e-4)
     assert (out / "survey.png").stat().st_size > 5000 and np.abs(found[0] - measured).max() > 0.01
-    assert main([str(tmp_path / "flight.bag"), *words[:-2], "--out", str(tmp_path / "tape.yaml")]) == 2
+    assert (
+        main([str(tmp_path / "flight.bag"), *words[:-2], "--out", str(tmp_path / "tape.yaml")]) == 2
+    )
 
 
 TAG = 0.25  # m, that all ranges are too long by
@@ -191,10 +238,23 @@ TAG = 0.25  # m, that all ranges are too long by
 @pytest.fixture(scope="module")
 def ranged():
     """Two flights of ranges alone, with delays of anchors and of the tag."""
-    flown = dict(duration=40.0, floor_time=1.0, trajectory="sines", imu_rate=200.0, truth_rate=100.0, range_noise=0.1)
-    flights = [simulate(SimulationConfig(seed=seed, bias=False, multipath=False, **flown)) for seed in (400, 401)]
+    flown = dict(
+        duration=40.0,
+        floor_time=1.0,
+        trajectory="sines",
+        imu_rate=200.0,
+        truth_rate=100.0,
+        range_noise=0.1,
+    )
+    flights = [
+        simulate(SimulationConfig(seed=seed, bias=False, multipath=False, **flown))
+        for seed in (400, 401)
+    ]
     late = EFFECTS["anchor_delay"]({str(i): TAG + 0.03 * (-1) ** i for i in flights[0].anchors.ids})
-    flights = [replace(late.inject(flight, np.random.default_rng(0)), tdoa=Tdoas(*np.empty((4, 0)))) for flight in flights]
+    flights = [
+        replace(late.inject(flight, np.random.default_rng(0)), tdoa=Tdoas(*np.empty((4, 0))))
+        for flight in flights
+    ]
     return [at(flight, shaken(flight.anchors, 0.1, 1)) for flight in flights], flights
 
 
@@ -205,7 +265,10 @@ def test_ranges_tell_of_anchors_and_of_the_delay_of_the_tag(ranged):
     assert np.mean(found.delays) == pytest.approx(TAG, abs=0.06)
     effects = EffectSet((delay_effect(found.surveyed, found.delays),))
     none = FilterConfig(range_offset_std=0.0)
-    before, after = error(given[1], config=none), error(at(given[1], found.surveyed.positions), effects=effects, config=none)
+    before, after = (
+        error(given[1], config=none),
+        error(at(given[1], found.surveyed.positions), effects=effects, config=none),
+    )
     assert after < 0.3 * before and after < 0.6 * error(true[1], config=none)
     assert error(at(given[1], found.surveyed.positions), effects=effects) < error(given[1])
     assert "TDOAs" not in as_text(found)
@@ -220,7 +283,9 @@ def test_another_tag_needs_no_parameter_by_hand(ranged):
     def left(flight, config=None):
         return error(at(flight, found.anchors.positions), effects=found.effects, config=config)
 
-    assert left(other) < 1.1 * left(same) < 1.2 * left(same, none) and left(other, none) > 1.5 * left(other)
+    assert left(other) < 1.1 * left(same) < 1.2 * left(same, none) and left(
+        other, none
+    ) > 1.5 * left(other)
 
 
 def test_only_tdoas_place_an_anchor(ranged):
@@ -235,9 +300,14 @@ def test_tdoas_know_nothing_of_the_delay_of_the_tag(flights, result):
 def test_ranges_that_are_not_to_be_used_tell_nothing(flights):
     """Neither of anchors, nor that the tag may have a delay."""
     tdoa = flights[0].tdoa
-    late = replace(flights[0], range=Ranges(tdoa.t, tdoa.a, np.full(len(tdoa), 9.0), np.zeros(len(tdoa))))
+    late = replace(
+        flights[0], range=Ranges(tdoa.t, tdoa.a, np.full(len(tdoa), 9.0), np.zeros(len(tdoa)))
+    )
     config = FilterConfig(use_range=False)
-    with_them, without = (self_calibrate([flight], Tape(0.2, trusted=TRUSTED), config=config) for flight in (late, flights[0]))
+    with_them, without = (
+        self_calibrate([flight], Tape(0.2, trusted=TRUSTED), config=config)
+        for flight in (late, flights[0])
+    )
     np.testing.assert_array_equal(with_them.surveyed.positions, without.surveyed.positions)
 
 
@@ -252,4 +322,7 @@ def test_survey_of_a_recording_of_ranges(ranged, tmp_path, capsys):
     assert not (out / "ekf_node.yaml").exists()
     told = json.loads((out / "survey.json").read_text())
     delay, std = told["tag_delay"]
-    assert told["tdoa_std"] is None and f"all ranges are {100 * delay:.1f} +- {100 * std:.1f} cm too long" in said
+    assert (
+        told["tdoa_std"] is None
+        and f"all ranges are {100 * delay:.1f} +- {100 * std:.1f} cm too long" in said
+    )

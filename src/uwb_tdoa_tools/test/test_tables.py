@@ -2,6 +2,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
+
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.readers.tables import number, read_numbers, read_table
 
@@ -31,8 +32,14 @@ def test_columns_by_name(write):
         (b"a,b\n1,2\n3\n", "line 3: has fewer cells"),
         (b"a,b\n\xff,1\n", "byte 4 is not text"),
         (b'a,b\n"' + b"x" * 200_000 + b'",1\n', "is no CSV"),
-        (b"a,b\n1,2\n" + b"1," * 60_000 + b"\n", "line 2: is no CSV .has a row of more than 100000 characters"),
-        (b"a,b\n" + b'"\n",' * 60_000 + b"\n", "is no CSV .has a row of more than 100000 characters"),
+        (
+            b"a,b\n1,2\n" + b"1," * 60_000 + b"\n",
+            "line 2: is no CSV .has a row of more than 100000 characters",
+        ),
+        (
+            b"a,b\n" + b'"\n",' * 60_000 + b"\n",
+            "is no CSV .has a row of more than 100000 characters",
+        ),
         (b"a,b\n" + b"1,2\n" * 200_001, "has more than 400000 cells"),
     ],
 )

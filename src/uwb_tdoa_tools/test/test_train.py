@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from training_flights import flight, without_attitude
 
-from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_bias.correction.network import Network
-from uwb_tdoa_tools.commands import train
+from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_tools.bags.bag import write_bag
+from uwb_tdoa_tools.commands import train
 from uwb_tdoa_tools.training import shrinking, structured
 from uwb_tdoa_tools.training.labels import labels
 
@@ -34,7 +34,19 @@ def files(out):
 
 def test_trains_on_flights_with_and_without_attitude_in_one_command(folder, tmp_path, capsys):
     out = tmp_path / "model"
-    arguments = [str(folder), "--model", "physics+structured", "--out", str(out), "--seed", "3", "--name", "hall", "--jobs", "1"]
+    arguments = [
+        str(folder),
+        "--model",
+        "physics+structured",
+        "--out",
+        str(out),
+        "--seed",
+        "3",
+        "--name",
+        "hall",
+        "--jobs",
+        "1",
+    ]
     assert train.main(arguments) == 0
     assert files(out) == ["effects.yaml", "model.onnx", "training.json", "training.png"]
     printed = capsys.readouterr().out
@@ -48,14 +60,18 @@ def test_trains_on_flights_with_and_without_attitude_in_one_command(folder, tmp_
     (layout,) = meta["constellations"]
     assert set(layout) == {str(i) for i in range(8)} and len(meta["data"]) == 16
     assert set(meta["validity"]) >= {"forward_x", "up_x"} and meta["fade_std"] > 0.0
-    assert meta["features"][:3] == ["x", "y", "z"] and "largest_yaw_std" not in meta  # maps of places alone
+    assert (
+        meta["features"][:3] == ["x", "y", "z"] and "largest_yaw_std" not in meta
+    )  # maps of places alone
     assert len(meta["offset"]) == len(meta["scale"]) == len(meta["features"])
 
     told = json.loads((out / "training.json").read_text())
     assert told["curve"]["training flights"] == [1, 2, 3] and len(told["curve"]["validation"]) == 3
     ((before, after),) = told["validation"].values()
     assert after < 0.8 * before
-    assert next(e for e in effects.effects if e.name == "anchor_delay").values["3"] == pytest.approx(0.4, abs=0.06)
+    assert next(e for e in effects.effects if e.name == "anchor_delay").values[
+        "3"
+    ] == pytest.approx(0.4, abs=0.06)
     held = labels(flight(9))
     assert np.isfinite(network.predict(held.samples)[0]).all()
 
@@ -64,7 +80,19 @@ def test_the_same_seed_gives_the_same_file(folder, tmp_path):
     contents = []
     for k in range(2):
         out = tmp_path / str(k)
-        train.main([str(folder), "--model", "structured", "--out", str(out), "--validation", "corners-1", "--jobs", "1"])
+        train.main(
+            [
+                str(folder),
+                "--model",
+                "structured",
+                "--out",
+                str(out),
+                "--validation",
+                "corners-1",
+                "--jobs",
+                "1",
+            ]
+        )
         contents.append((out / "model.onnx").read_bytes())
         assert files(out) == ["model.onnx", "training.json", "training.png"]
     assert contents[0] == contents[1]
@@ -72,7 +100,9 @@ def test_the_same_seed_gives_the_same_file(folder, tmp_path):
 
 def test_physics_alone_is_no_network_and_leaves_none_behind(folder, tmp_path):
     (tmp_path / "model.onnx").write_text("of an earlier training")
-    assert train.main([str(folder), "--model", "physics", "--out", str(tmp_path), "--jobs", "1"]) == 0
+    assert (
+        train.main([str(folder), "--model", "physics", "--out", str(tmp_path), "--jobs", "1"]) == 0
+    )
     assert files(tmp_path) == ["effects.yaml", "training.json", "training.png"]
 
 
@@ -80,7 +110,11 @@ def test_physics_alone_is_no_network_and_leaves_none_behind(folder, tmp_path):
     ("flights", "model", "message"),
     [
         (["corners-0.bag"], "structured", "1 is too few"),
-        (["corners-0.bag", "corners-1.bag", "--validation", "nobody"], "structured", "nobody is not one of"),
+        (
+            ["corners-0.bag", "corners-1.bag", "--validation", "nobody"],
+            "structured",
+            "nobody is not one of",
+        ),
     ],
 )
 def test_says_what_is_missing(folder, tmp_path, capsys, flights, model, message):
@@ -100,15 +134,35 @@ def test_what_was_interrupted_goes_on_and_gives_the_same(folder, tmp_path, monke
         return left(*args)
 
     def trained(out, *more):
-        code = train.main([str(folder), "--model", "structured", "--jobs", "1", "--out", str(tmp_path / out), *more])
-        return code, [(tmp_path / out / name).read_bytes() for name in ("model.onnx", "training.json")] if code == 0 else None
+        code = train.main(
+            [
+                str(folder),
+                "--model",
+                "structured",
+                "--jobs",
+                "1",
+                "--out",
+                str(tmp_path / out),
+                *more,
+            ]
+        )
+        return code, [
+            (tmp_path / out / name).read_bytes() for name in ("model.onnx", "training.json")
+        ] if code == 0 else None
 
     whole, resume = trained("whole"), ("--resume", str(tmp_path / "parts.jsonl"))
     monkeypatch.setattr(shrinking, "_left_out", interrupted)
     assert trained("out", *resume)[0] == 130 and len(done) == 2
     before, done[:] = list(done), []
-    assert trained("out", *resume) == whole and len(done) == 2 and not any(fold in before for fold in done)
+    assert (
+        trained("out", *resume) == whole
+        and len(done) == 2
+        and not any(fold in before for fold in done)
+    )
     assert "holds 4 of 4 parts" in capsys.readouterr().err  # the errors without correction
     assert trained("again", *resume) == whole and len(done) == 2
     assert trained("other", "--seed", "5", *resume)[0] == 2
-    assert "parts.jsonl: its results were made with another seed; ask for the same" in capsys.readouterr().err
+    assert (
+        "parts.jsonl: its results were made with another seed; ask for the same"
+        in capsys.readouterr().err
+    )

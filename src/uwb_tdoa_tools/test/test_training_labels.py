@@ -7,7 +7,14 @@ from training_flights import flight, without_attitude
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, TagLeverArm
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.geometry import tdoa
-from uwb_tdoa_tools.training.labels import constellations, digest, labels, split, thinned, white_noise
+from uwb_tdoa_tools.training.labels import (
+    constellations,
+    digest,
+    labels,
+    split,
+    thinned,
+    white_noise,
+)
 
 PERFECT = {"noise_std": 0.0, "bias": False, "outlier_probability": 0.0}
 
@@ -24,7 +31,9 @@ def changed(one, **columns):
 def test_labels_are_measured_minus_geometry_at_the_true_pose(one):
     found = labels(one)
     rows = np.searchsorted(one.tdoa.t, found.samples.t)
-    at = np.stack([np.interp(found.samples.t, one.truth.t, one.truth.p[:, k]) for k in range(3)], axis=1)
+    at = np.stack(
+        [np.interp(found.samples.t, one.truth.t, one.truth.p[:, k]) for k in range(3)], axis=1
+    )
     expected = one.tdoa.d[rows] - tdoa(at, found.samples.position_a, found.samples.position_b)
     np.testing.assert_allclose(found.error, expected, atol=1e-12)
     assert np.abs(found.error).max() <= 1.0 and found.samples.p[:, 2].min() > 0.3
@@ -50,8 +59,14 @@ def test_without_attitude_the_vehicle_is_level(one):
     ("spoil", "message"),
     [
         (lambda one: replace(one, truth=None), "holds no ground truth"),
-        (lambda one: changed(one, a=np.where(one.tdoa.a == 2, 99, one.tdoa.a)), "anchor 99 is heard but not in"),
-        (lambda one: changed(one, d=np.where(one.tdoa.a == 2, np.nan, one.tdoa.d)), r"\d+ TDOAs are not finite"),
+        (
+            lambda one: changed(one, a=np.where(one.tdoa.a == 2, 99, one.tdoa.a)),
+            "anchor 99 is heard but not in",
+        ),
+        (
+            lambda one: changed(one, d=np.where(one.tdoa.a == 2, np.nan, one.tdoa.d)),
+            r"\d+ TDOAs are not finite",
+        ),
         (lambda one: changed(one, d=one.tdoa.d + 30.0), "only 0 TDOAs are right to 1 m"),
         (lambda one: replace(one, truth=replace(one.truth, p=one.truth.p * np.nan)), "truth"),
     ],
@@ -70,8 +85,13 @@ def test_split_is_by_flight_and_by_seed():
     names = [f"flight {k}" for k in range(10)]
     training, validation = split(names, 3)
     assert sorted([*training, *validation]) == names and len(validation) == 2
-    assert split(names, 3) == (training, validation) and any(split(names, seed)[1] != validation for seed in range(9))
-    assert split(names, 0, ["flight 4"]) == ([name for name in names if name != "flight 4"], ["flight 4"])
+    assert split(names, 3) == (training, validation) and any(
+        split(names, seed)[1] != validation for seed in range(9)
+    )
+    assert split(names, 0, ["flight 4"]) == (
+        [name for name in names if name != "flight 4"],
+        ["flight 4"],
+    )
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,10 @@ SITES, FEATURES, DENSE = 4, 6, 3
 
 
 def design(noise, outliers, seed=0, n=4000):
-    """(Design, weights of the sites, dense weights). The sites' weights sum to zero: differences tell no common one."""
+    """(Design, weights of the sites, dense weights).
+
+    The sites' weights sum to zero: differences tell no common one.
+    """
     random = np.random.default_rng(seed)
     weights, dense = random.normal(size=(SITES, FEATURES)), random.normal(size=DENSE)
     weights -= weights.mean(axis=0)

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 from training_flights import flight, without_attitude
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.correction.features import FEATURES
 from uwb_tdoa_bias.correction.network import Network
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.training import paper
 from uwb_tdoa_tools.training.labels import labels, thinned
 
@@ -21,14 +21,18 @@ def data():
 
 def test_learns_stops_early_and_says_the_same_as_its_file(data, tmp_path):
     epochs = []
-    model, (training, validation) = paper.fit(*data, True, 1, lambda epoch, error: epochs.append(error))
+    model, (training, validation) = paper.fit(
+        *data, True, 1, lambda epoch, error: epochs.append(error)
+    )
     assert epochs == validation and len(training) == len(validation)
     assert model.names == FEATURES and len(FEATURES) == 14
     best = int(np.argmin(validation))
     assert len(validation) in (best + 1 + paper.PATIENCE, paper.MOST_EPOCHS)
     (held,) = data[1]
     error = held.error - model.mean(held.samples)
-    assert np.sqrt(np.mean(error**2)) == pytest.approx(validation[best])  # the best weights, not the last
+    assert np.sqrt(np.mean(error**2)) == pytest.approx(
+        validation[best]
+    )  # the best weights, not the last
     assert validation[best] < 0.9 * np.sqrt(np.mean(held.error**2))
 
     model.std = 0.07
@@ -44,8 +48,11 @@ def test_the_seed_decides(data):
     models, curves = zip(*(paper.fit(*data, False, seed) for seed in (0, 0, 1)))
     assert curves[0] == curves[1] != curves[2]
     assert [name for name in FEATURES if name not in models[0].names] == [
-        "azimuth_A_a", "azimuth_A_b", "elevation_A_a", "elevation_A_b"
-    ]  # fmt: skip
+        "azimuth_A_a",
+        "azimuth_A_b",
+        "elevation_A_a",
+        "elevation_A_b",
+    ]
 
 
 def test_needs_orientations_of_anchors():

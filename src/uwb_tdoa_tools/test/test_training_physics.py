@@ -40,7 +40,11 @@ def test_of_several_constellations_only_what_carries_over(one_place):
     flights = [*one_place[:2], *injected(elsewhere, DELAY, PUSHED)]
     flights = [*injected(flights[:2], MOVED), *flights[2:]]
     names = {effect.name for effect in physics.find(flights).effects.effects}
-    assert "anchor_delay" in names and names <= {*physics.PORTABLE, "noise_level", "noise_correlation"}
+    assert "anchor_delay" in names and names <= {
+        *physics.PORTABLE,
+        "noise_level",
+        "noise_correlation",
+    }
 
 
 def test_does_without_attitude():
@@ -53,11 +57,19 @@ def test_network_learns_what_the_effects_leave(one_place):
     kinds = ("physics", "physics+structured")
     found = physics.find(one_place)
     options = StructuredPriors(centres=40)
-    alone, both = (models.train(models.Recipe(kind, 0, options), one_place[:2], one_place[2:], kind, found=found) for kind in kinds)
+    alone, both = (
+        models.train(
+            models.Recipe(kind, 0, options), one_place[:2], one_place[2:], kind, found=found
+        )
+        for kind in kinds
+    )
     assert alone.model is None and alone.onnx() is None and both.onnx() is not None
     assert alone.effects == both.effects == found.effects
     for trained in (alone, both):
         ((before, after),) = trained.errors.values()
-        assert before == pytest.approx(np.sqrt(np.mean(labels(one_place[2]).error ** 2))) and after < 0.75 * before
+        assert (
+            before == pytest.approx(np.sqrt(np.mean(labels(one_place[2]).error ** 2)))
+            and after < 0.75 * before
+        )
     left = labels(one_place[2], found.effects)
     assert np.sqrt(np.mean(both.model.mean(left.samples) ** 2)) < 0.02  # nothing is left to learn

@@ -15,7 +15,10 @@ RECIPE = models.Recipe("structured", 0, structured.StructuredPriors(centres=10, 
 
 def errors(*ratios):
     """As of Shrinkage: of flights with an error of 0.5 m, ratios at all SHARES."""
-    return {str(k): {None: 0.5} | dict(zip(SHARES, (0.5 * ratio for ratio in some))) for k, some in enumerate(ratios)}
+    return {
+        str(k): {None: 0.5} | dict(zip(SHARES, (0.5 * ratio for ratio in some)))
+        for k, some in enumerate(ratios)
+    }
 
 
 @pytest.mark.parametrize(
@@ -23,7 +26,10 @@ def errors(*ratios):
     [
         ([(1.0, 0.8, 0.7, 0.6), (1.0, 0.8, 0.7, 0.6)], 1.0),  # all gain
         ([(1.0, 1.0, 1.1, 1.2), (1.0, 1.1, 1.1, 1.1)], 0.0),  # none gains
-        ([(1.0, 0.8, 0.7, 0.6), (1.0, 0.96, 1.0, 1.15)], 0.5),  # the mean alone would take all but the last bit
+        (
+            [(1.0, 0.8, 0.7, 0.6), (1.0, 0.96, 1.0, 1.15)],
+            0.5,
+        ),  # the mean alone would take all but the last bit
     ],
 )
 def test_takes_what_gains_without_harm(ratios, share):
@@ -32,7 +38,11 @@ def test_takes_what_gains_without_harm(ratios, share):
 
 def test_effects_alone_are_taken_as_they_are():
     told = Shrinkage(best_share({"a": {None: 0.4, 1.0: 0.3}}), {"a": {None: 0.4, 1.0: 0.3}})
-    assert told.share == 1.0 and "falls by 25 % +- 0 % (of 1 flights, each left out; on the worst it falls by 25 %)" in told.as_text()
+    assert (
+        told.share == 1.0
+        and "falls by 25 % +- 0 % (of 1 flights, each left out; on the worst it falls by 25 %)"
+        in told.as_text()
+    )
 
 
 def test_a_flight_is_judged_by_what_it_took_no_part_in():
@@ -47,7 +57,10 @@ def test_a_flight_is_judged_by_what_it_took_no_part_in():
 
 @pytest.mark.slow
 def test_two_processes_give_the_same_to_the_bit():
-    flights, told = [EFFECTS["anchor_delay"]({"3": 0.4}).inject(flight(seed)) for seed in range(3)], []
+    flights, told = (
+        [EFFECTS["anchor_delay"]({"3": 0.4}).inject(flight(seed)) for seed in range(3)],
+        [],
+    )
     for jobs in (1, 2):
         over = partial(parallel.over, jobs=jobs)
         plain = shrinking.uncorrected(flights, over)

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from training_flights import flight, without_attitude
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.correction.network import Network
+from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_tools.training import models, structured
 from uwb_tdoa_tools.training.labels import labels, thinned
 
@@ -24,12 +24,16 @@ def trained(flights, path):
 
 @pytest.fixture(scope="module")
 def one_place(tmp_path_factory):
-    return trained([flight(seed, **CIRCLE) for seed in (0, 1)], tmp_path_factory.mktemp("one") / "model.onnx")
+    return trained(
+        [flight(seed, **CIRCLE) for seed in (0, 1)], tmp_path_factory.mktemp("one") / "model.onnx"
+    )
 
 
 @pytest.fixture(scope="module")
 def two_places(tmp_path_factory):
-    flights = [flight(seed, name) for seed, name in enumerate(("corners", "pillars", "corners", "pillars"))]
+    flights = [
+        flight(seed, name) for seed, name in enumerate(("corners", "pillars", "corners", "pillars"))
+    ]
     return trained(flights, tmp_path_factory.mktemp("two") / "model.onnx")
 
 
@@ -45,7 +49,9 @@ def test_its_file_says_what_it_says(which, request):
     np.testing.assert_allclose(bias, model.mean(found.samples), atol=2e-4)
     assert bool(model.links) == (which == "two_places")
     expected = np.sqrt(model.variance(found.samples) + model.floor**2)
-    assert (std >= expected - 2e-3).all()  # directions of the posterior that are left out count as unknown
+    assert (
+        std >= expected - 2e-3
+    ).all()  # directions of the posterior that are left out count as unknown
     np.testing.assert_allclose(np.median(std / expected), 1.0, atol=0.35)
     assert ((known >= 0.0) & (known <= 1.0)).all() and np.median(known) > 0.3
     assert rms(found.error - bias) < 0.9 * rms(found.error)
@@ -63,7 +69,10 @@ def test_errors_add_up_round_a_triangle(two_places):
     _, network = two_places
     s = labels(flight(5)).samples
     n = len(s)
-    pairs = [network.predict(replace(s, a=np.full(n, a), b=np.full(n, b)))[0] for a, b in ((0, 3), (3, 6), (6, 0))]
+    pairs = [
+        network.predict(replace(s, a=np.full(n, a), b=np.full(n, b)))[0]
+        for a, b in ((0, 3), (3, 6), (6, 0))
+    ]
     np.testing.assert_allclose(sum(pairs), 0.0, atol=1e-5)
 
 
@@ -113,18 +122,29 @@ def test_what_holds_for_all_anchors_can_be_kept_alone(two_places, tmp_path):
     model, network = two_places
     found = labels(flight(7, "wall_middles"))  # none of its anchors has a site
     general = copy.deepcopy(model)
-    general.site_ids, general.site_positions, general.weights = model.site_ids[:0], model.site_positions[:0], model.weights[:0]
+    general.site_ids, general.site_positions, general.weights = (
+        model.site_ids[:0],
+        model.site_positions[:0],
+        model.weights[:0],
+    )
     assert len(general.inputs()) < len(model.inputs())
     path = tmp_path / "general.onnx"
     path.write_bytes(general.onnx({"clip": 1.0, "name": "general"}).SerializeToString())
     for expected, told in zip(network.predict(found.samples), Network(path).predict(found.samples)):
         np.testing.assert_allclose(told, expected, atol=1e-5)
     np.testing.assert_allclose(general.mean(found.samples), model.mean(found.samples), atol=1e-12)
-    np.testing.assert_allclose(general.variance(found.samples), model.variance(found.samples), rtol=1e-9)
+    np.testing.assert_allclose(
+        general.variance(found.samples), model.variance(found.samples), rtol=1e-9
+    )
 
 
 def test_flights_with_and_without_attitude_together(tmp_path):
-    flights = [flight(0), flight(1, "pillars"), without_attitude(flight(2)), without_attitude(flight(3, "pillars"))]
+    flights = [
+        flight(0),
+        flight(1, "pillars"),
+        without_attitude(flight(2)),
+        without_attitude(flight(3, "pillars")),
+    ]
     model, network = trained(flights, tmp_path / "model.onnx")
     assert list(model.links) == ["T", "A"]
     found = labels(flight(5))

@@ -1,10 +1,11 @@
-"""mypy, where it is installed, as .ci/mypy.ini says: the annotations of the packages and folders that it names."""
+"""mypy, where it is installed, as .ci/mypy.ini says: the annotations of the packages and folders
+that it names.
+"""
 
 import configparser
 
-import pytest
-
 from documented import ROOT
+import pytest
 
 WRONG = "from uwb_tdoa_bias.foundation.version import version; version() + 1"
 
@@ -13,7 +14,9 @@ def annotated():
     """Names of the packages and folders whose functions must have annotations."""
     found = configparser.ConfigParser()
     found.read(ROOT / ".ci/mypy.ini")
-    sections = (name for name in found.sections() if found[name].getboolean("disallow_untyped_defs", False))
+    sections = (
+        name for name in found.sections() if found[name].getboolean("disallow_untyped_defs", False)
+    )
     return [name.removeprefix("mypy-").removesuffix(".*") for name in sections]
 
 

@@ -7,11 +7,12 @@ import time
 import tracemalloc
 import zlib
 
-import numpy as np
-import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+import numpy as np
+import pytest
 from recordings import ANCHORS, EVENTS, ROWS, log_bytes
+
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.readers import read_usd_log
 
@@ -33,24 +34,41 @@ def test_streams_units_and_stamps(read):
     np.testing.assert_array_equal(flight.tdoa.a, [0, 1])
     np.testing.assert_array_equal(flight.tdoa.b, [1, 5])
     np.testing.assert_array_equal(flight.tdoa.d, [1.25, -0.5])
-    np.testing.assert_array_equal(flight.imu.t, [1.0, 1.001, 1.002])  # the accelerometer's 20 us later belong to these
-    np.testing.assert_allclose(flight.imu.gyro, np.pi * np.array([[1, 0, -0.5], [0, 0.5, 0], [0, 0, 0.25]]))
-    np.testing.assert_allclose(flight.imu.accel, 9.81 * np.array([[0, 0.5, 1], [0, 0, 2], [1, 0, 1]]))
+    np.testing.assert_array_equal(
+        flight.imu.t, [1.0, 1.001, 1.002]
+    )  # the accelerometer's 20 us later belong to these
+    np.testing.assert_allclose(
+        flight.imu.gyro, np.pi * np.array([[1, 0, -0.5], [0, 0.5, 0], [0, 0, 0.25]])
+    )
+    np.testing.assert_allclose(
+        flight.imu.accel, 9.81 * np.array([[0, 0.5, 1], [0, 0, 2], [1, 0, 1]])
+    )
     np.testing.assert_array_equal(flight.truth.p, [[1, 2, 0.5]])
     np.testing.assert_array_equal(flight.truth.q, [[0, 0, 0, 1]])
     assert "imu_accel_interpolated" not in flight.meta
 
 
-CANDIDATES = [("group", "H"), ("idA", "B"), ("idB", "B"), ("distanceDiff", "f"), ("isSelected", "B")]
+CANDIDATES = [
+    ("group", "H"),
+    ("idA", "B"),
+    ("idB", "B"),
+    ("distanceDiff", "f"),
+    ("isSelected", "B"),
+]
 
 
 def with_candidates(*but):
-    """A log that has the same TDOAs as candidates, of the other sign, and others that were not selected."""
+    """A log that has the same TDOAs as candidates, of the other sign, and others that were not
+    selected.
+    """
     rows = [row for row in ROWS if row[0] not in but]
     for name, ticks, values in ROWS:
         if name == "estTDOA":
             a, b, d = values
-            rows += [("estTdoaCand", ticks, (7, a, b, -d, 1)), ("estTdoaCand", ticks, (7, a, b, 9.0, 0))]
+            rows += [
+                ("estTdoaCand", ticks, (7, a, b, -d, 1)),
+                ("estTdoaCand", ticks, (7, a, b, 9.0, 0)),
+            ]
     events = {name: known for name, known in EVENTS.items() if name not in but}
     return log_bytes(rows, events=events | {"estTdoaCand": (20, CANDIDATES)})
 
@@ -58,7 +76,9 @@ def with_candidates(*but):
 def test_selected_candidates_have_the_other_sign(read):
     flight = read(with_candidates("estTDOA"))
     np.testing.assert_array_equal(flight.tdoa.t, [1.0005, 1.0025])
-    signs = np.where(flight.tdoa.a == [0, 1], 1.0, -1.0)  # the pair may come in either order, with its sign
+    signs = np.where(
+        flight.tdoa.a == [0, 1], 1.0, -1.0
+    )  # the pair may come in either order, with its sign
     np.testing.assert_array_equal(np.sort([flight.tdoa.a, flight.tdoa.b], axis=0), [[0, 1], [1, 5]])
     np.testing.assert_array_equal(signs * flight.tdoa.d, [1.25, -0.5])
     assert "estTdoaCand" not in flight.extra
@@ -82,8 +102,12 @@ def test_range_finder_and_barometer_in_si_units_one_row_for_each_reading(read):
     flight = read(log_bytes())
     np.testing.assert_array_equal(flight.height.t, [1.0012, 1.0013])
     np.testing.assert_array_equal(flight.height.range, [1.25, np.inf])  # 32767 mm: nothing in sight
-    np.testing.assert_array_equal(flight.pressure.t, [1.0014, 1.0015])  # that of 1.00152 repeats the one before
-    np.testing.assert_allclose(flight.pressure.pressure, [101325.0, 101325.0 - 12.013 * 101.5], atol=6.0)  # 12 Pa/m
+    np.testing.assert_array_equal(
+        flight.pressure.t, [1.0014, 1.0015]
+    )  # that of 1.00152 repeats the one before
+    np.testing.assert_allclose(
+        flight.pressure.pressure, [101325.0, 101325.0 - 12.013 * 101.5], atol=6.0
+    )  # 12 Pa/m
 
 
 def test_version_1_counts_milliseconds(read):
@@ -98,8 +122,12 @@ def test_lost_accelerometer_event_is_interpolated(read):
     rows = [row for row in ROWS if row[:2] != ("estAcceleration", 1_001_020)]
     flight = read(log_bytes(rows))
     assert flight.meta["imu_accel_interpolated"]
-    np.testing.assert_array_equal(flight.imu.t, [1.001, 1.002])  # before the first accelerometer sample there is none
-    np.testing.assert_allclose(flight.imu.accel[0], 9.81 * np.array([0.49, 0.5 - 0.245, 1.0]), rtol=1e-6)
+    np.testing.assert_array_equal(
+        flight.imu.t, [1.001, 1.002]
+    )  # before the first accelerometer sample there is none
+    np.testing.assert_allclose(
+        flight.imu.accel[0], 9.81 * np.array([0.49, 0.5 - 0.245, 1.0]), rtol=1e-6
+    )
 
 
 def test_without_imu_and_truth(read):
@@ -134,7 +162,10 @@ def with_checksum(content):
         (with_checksum(log_bytes()[:-4] + b"\xff\xff12345678"), "faulty logger"),
         (with_checksum(struct.pack("<BHH", 0xBC, 3, 0)), "version 3"),
         (with_checksum(struct.pack("<BHH", 0xBC, 2, 0)), "no TDOA"),
-        (log_bytes(events=EVENTS | {"estOdd": (77, [("a", "Z")])}), "'a\\(Z\\)' is not a new variable of estOdd"),
+        (
+            log_bytes(events=EVENTS | {"estOdd": (77, [("a", "Z")])}),
+            "'a\\(Z\\)' is not a new variable of estOdd",
+        ),
         (log_bytes(events=EVENTS | {"estOdd": (3, [("a", "f")])}), "defined twice"),
         (log_bytes([], events={"estTDOA": (3, [("idA", "B")])}), "no variable idB"),
         (log_bytes([row for row in ROWS if row[0] != "estTDOA"]), "no TDOA"),
@@ -168,22 +199,36 @@ def with_number(name, column, value):
     ],
 )
 def test_a_number_that_is_not_finite_is_refused_or_left_out(read, name, column, said, value):
-    rows = [*with_number(name, column, value), ("estPose", 1_003_000, (1.0, 2.0, 0.5, 0.0, 0.0, 0.0, 1.0))]
+    rows = [
+        *with_number(name, column, value),
+        ("estPose", 1_003_000, (1.0, 2.0, 0.5, 0.0, 0.0, 0.0, 1.0)),
+    ]
     with pytest.raises(InputError, match=said):
         read(log_bytes(rows))
     flight = read(log_bytes(rows), salvage=True)
     (remark,) = flight.meta["remarks"]
     assert "1 of " in remark and "left out" in remark
     whole = read(log_bytes([*ROWS, rows[-1]]))
-    assert sum(map(len, (flight.tdoa, flight.truth))) >= sum(map(len, (whole.tdoa, whole.truth))) - 1
-    numbers = (flight.tdoa.d, flight.imu.gyro, flight.imu.accel, flight.truth.p, flight.truth.q, flight.pressure.pressure)
+    assert (
+        sum(map(len, (flight.tdoa, flight.truth))) >= sum(map(len, (whole.tdoa, whole.truth))) - 1
+    )
+    numbers = (
+        flight.tdoa.d,
+        flight.imu.gyro,
+        flight.imu.accel,
+        flight.truth.p,
+        flight.truth.q,
+        flight.pressure.pressure,
+    )
     for array in numbers:
         assert np.isfinite(array).all()
 
 
 def test_an_altitude_above_the_air_is_refused_or_left_out(read):
     content = log_bytes(with_number("estBarometer", 0, 45_000.0))
-    with pytest.raises(InputError, match="baro is 45000.0; it must be finite, within \\+-40000: leave"):
+    with pytest.raises(
+        InputError, match="baro is 45000.0; it must be finite, within \\+-40000: leave"
+    ):
         read(content)
     assert np.isfinite(read(content, salvage=True).pressure.pressure).all()
 
@@ -216,7 +261,9 @@ def test_a_damaged_log_is_read_up_to_the_damage(read):
 
 def test_names_of_our_streams_are_no_events(read):
     rows = [*ROWS, ("tdoa", 1_000_000, (1.0,)), ("pose", 1_000_000, (1.0,))]
-    flight = read(log_bytes(rows, events=EVENTS | {"tdoa": (50, [("x", "f")]), "pose": (51, [("t", "f")])}))
+    flight = read(
+        log_bytes(rows, events=EVENTS | {"tdoa": (50, [("x", "f")]), "pose": (51, [("t", "f")])})
+    )
     assert len(flight.tdoa) == 2 and set(flight.extra) == {"estTemperature", "tdoa", "pose"}
 
 
@@ -229,11 +276,17 @@ def test_a_header_of_many_types_takes_no_time(read):
 
 
 @pytest.mark.parametrize(
-    ("types", "variables", "said"), [(40, 60_000, "more than 10000 variables"), (20_000, 0, "more than 1000 event types")]
+    ("types", "variables", "said"),
+    [(40, 60_000, "more than 10000 variables"), (20_000, 0, "more than 1000 event types")],
 )
 def test_a_header_of_millions_of_variables_takes_no_memory(read, types, variables, said):
     """2.6 million of them, in 21 MB, took 1.3 GB."""
-    content = log_bytes([], events={f"e{k}": (1000 + k, [(f"v{i}", "b") for i in range(variables)]) for k in range(types)})
+    content = log_bytes(
+        [],
+        events={
+            f"e{k}": (1000 + k, [(f"v{i}", "b") for i in range(variables)]) for k in range(types)
+        },
+    )
     tracemalloc.start()
     with pytest.raises(InputError, match=said):
         read(content)
@@ -241,15 +294,36 @@ def test_a_header_of_millions_of_variables_takes_no_memory(read, types, variable
     tracemalloc.stop()
 
 
-@pytest.mark.parametrize("setting", ["cache_dir: planted", "cache_locator_classes: evil.Locator", "disable_jit: 1", "opt: none", "["])
+@pytest.mark.parametrize(
+    "setting",
+    [
+        "cache_dir: planted",
+        "cache_locator_classes: evil.Locator",
+        "disable_jit: 1",
+        "opt: none",
+        "[",
+    ],
+)
 def test_a_folder_of_flights_does_not_say_where_compiled_code_is(tmp_path, setting):
-    """numba looks for a configuration of its own where it is started; what it finds in such a cache, or module, is run."""
+    """numba looks for a configuration of its own where it is started; what it finds in such a
+    cache, or module, is run.
+    """
     (tmp_path / ".numba_config.yaml").write_text(f"{setting}\n")
     (tmp_path / "evil.py").write_text("open('planted', 'w').close()")
     (tmp_path / "flight.log").write_bytes(log_bytes())
-    environment = {name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"} | {"XDG_CACHE_HOME": str(tmp_path)}
-    reads = "from recordings import ANCHORS; from uwb_tdoa_tools.readers import read_usd_log; read_usd_log('flight.log', ANCHORS); from uwb_tdoa_bias.foundation import compiled; assert not compiled.config.DISABLE_JIT"
-    environment["PYTHONPATH"] = os.pathsep.join([os.path.dirname(__file__), environment.get("PYTHONPATH", "")])
-    ended = subprocess.run([sys.executable, "-c", reads], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    environment = {
+        name: value for name, value in os.environ.items() if name != "NUMBA_CACHE_DIR"
+    } | {"XDG_CACHE_HOME": str(tmp_path)}
+    reads = (
+        "from recordings import ANCHORS; from uwb_tdoa_tools.readers import read_usd_log; "
+        "read_usd_log('flight.log', ANCHORS); from uwb_tdoa_bias.foundation import compiled; "
+        "assert not compiled.config.DISABLE_JIT"
+    )
+    environment["PYTHONPATH"] = os.pathsep.join(
+        [os.path.dirname(__file__), environment.get("PYTHONPATH", "")]
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", reads], cwd=tmp_path, env=environment, capture_output=True, text=True
+    )
     assert ended.returncode == 0, ended.stderr
     assert (tmp_path / "uwb_tdoa").exists() and not (tmp_path / "planted").exists()

@@ -5,6 +5,7 @@ import tracemalloc
 import numpy as np
 import pytest
 from recordings import ANCHORS, FULL_HEADER, FULL_ROWS, csv_text
+
 from uwb_tdoa_bias.foundation import limits
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.readers import read_util_csv, util_csv
@@ -132,9 +133,21 @@ def test_every_kind_of_line_end(read, end):
         (csv_text(TDOA, ["1,0,1,1", "2,0", "3,0,1,1"]), 1, "line 3 has 2 cells"),
         (csv_text(TDOA, ["1,0,1,1", "2,0,1,nan", "3,0,1,1"]), 2, "tdoa: 1 of 3 records left out"),
         (csv_text(TDOA, ["1,0,1,1", "2,0,1,one", "3,0,1,1"]), 2, "tdoa: 1 of 3 records left out"),
-        (csv_text(TDOA + ",t_baro,baro", ["1,0,1,1,1,99.5", "2,0,1,2,2,nan"]), 2, "baro: 1 of 2 records left out"),
-        (csv_text(TDOA + ",t_baro,baro", ["1,0,1,1e31,1,99.5", "2,0,1,2,2,99"]), 1, "tdoa: 1 of 2 records left out"),
-        (csv_text(TDOA + ",t_tof,tof", ["1,0,1,1,1,31", "2,0,1,2,2,-1e12"]), 2, "tof: 1 of 2 records left out"),
+        (
+            csv_text(TDOA + ",t_baro,baro", ["1,0,1,1,1,99.5", "2,0,1,2,2,nan"]),
+            2,
+            "baro: 1 of 2 records left out",
+        ),
+        (
+            csv_text(TDOA + ",t_baro,baro", ["1,0,1,1e31,1,99.5", "2,0,1,2,2,99"]),
+            1,
+            "tdoa: 1 of 2 records left out",
+        ),
+        (
+            csv_text(TDOA + ",t_tof,tof", ["1,0,1,1,1,31", "2,0,1,2,2,-1e12"]),
+            2,
+            "tof: 1 of 2 records left out",
+        ),
     ],
 )
 def test_what_is_sound_can_be_read(read, text, count, said):
@@ -155,7 +168,9 @@ def test_a_cut_gzip_can_be_read_up_to_the_cut(read):
 
 def test_two_members_and_padding_are_one_file(read):
     head, tail = csv_text(TDOA, ["1,0,1,1"]), "2,0,1,2\n"
-    assert len(read(gzip.compress(head.encode()) + gzip.compress(tail.encode()) + b"\0" * 9).tdoa) == 2
+    assert (
+        len(read(gzip.compress(head.encode()) + gzip.compress(tail.encode()) + b"\0" * 9).tdoa) == 2
+    )
 
 
 def test_a_gzip_that_unfolds_without_end_is_refused(read, monkeypatch):
@@ -197,14 +212,19 @@ def test_cells_of_all_blocks_count(read, monkeypatch):
     flight = read(csv_text(TDOA + ",t_baro,baro", rows))
     np.testing.assert_array_equal(flight.tdoa.d, range(7))
     np.testing.assert_array_equal(flight.pressure.t, range(3))
-    with pytest.raises(InputError, match="line 8: baro is filled although t_baro, baro ended with an empty cell at line 5"):
+    with pytest.raises(
+        InputError,
+        match="line 8: baro is filled although t_baro, baro ended with an empty cell at line 5",
+    ):
         read(csv_text(TDOA + ",t_baro,baro", [*rows[:6], "6,0,1,6,,9"]))
     with pytest.raises(InputError, match="line 8: tdoa_meas is 'x'; it must be a number"):
         read(csv_text(TDOA + ",t_baro,baro", [*rows[:6], "6,0,1,x,,"]))
 
 
 def test_a_million_empty_members_of_gzip_take_no_time(read):
-    """20 MB of them were not finished in 60 s: the time must grow as the file does, or end with the limit of seconds."""
+    """20 MB of them were not finished in 60 s: the time must grow as the file does, or end with the
+    limit of seconds.
+    """
     empty, packed = gzip.compress(b""), gzip.compress(csv_text(TDOA, ["1,0,1,1"]).encode())
     took = []
     for count in (20_000, 80_000):

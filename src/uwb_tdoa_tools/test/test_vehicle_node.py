@@ -1,4 +1,6 @@
-"""vehicle_node: its parameters, and a flight with the real nodes by services, beside a computer at work."""
+"""vehicle_node: its parameters, and a flight with the real nodes by services, beside a computer at
+work.
+"""
 
 from pathlib import Path
 import re
@@ -13,15 +15,19 @@ pytest.importorskip("uwb_tdoa_msgs.srv", reason="needs the built workspace: ./de
 
 from live_flights import hall  # noqa: E402
 from test_lockstep import load  # noqa: E402, F401
-from uwb_tdoa_msgs.srv import GoTo, Land, Takeoff  # noqa: E402
+
 from uwb_tdoa_bias.foundation.errors import InputError  # noqa: E402
+from uwb_tdoa_msgs.srv import GoTo, Land, Takeoff  # noqa: E402
 from uwb_tdoa_tools.vehicle_node import PARAMETERS, VehicleNode  # noqa: E402
 
 CONFIG = Path(__file__).resolve().parents[1] / "config" / "vehicle_node.yaml"
 SERVICES = Path(__file__).resolve().parents[2] / "uwb_tdoa_msgs" / "srv"
 OF_CRAZYSWARM2 = {  # the requests of crazyflie_interfaces 1.0
     "Takeoff": "uint8 group_mask, float32 height, builtin_interfaces/Duration duration",
-    "GoTo": "uint8 group_mask, bool relative, geometry_msgs/Point goal, float32 yaw, builtin_interfaces/Duration duration",
+    "GoTo": (
+        "uint8 group_mask, bool relative, geometry_msgs/Point goal, float32 yaw, "
+        "builtin_interfaces/Duration duration"
+    ),
     "Land": "uint8 group_mask, float32 height, builtin_interfaces/Duration duration",
 }
 
@@ -39,7 +45,10 @@ def test_requests_are_those_that_users_of_crazyswarm2_know(name):
 
 @pytest.mark.parametrize(
     "given, why",
-    [("aids:=[sonar]", "aids: 'sonar' is not one of height, pressure, velocity, range."), ("world:=moon", "world: 'moon' is not one of hall,")],
+    [
+        ("aids:=[sonar]", "aids: 'sonar' is not one of height, pressure, velocity, range."),
+        ("world:=moon", "world: 'moon' is not one of hall,"),
+    ],
 )
 def test_what_it_does_not_know_is_refused(given, why):
     rclpy.init(args=["--ros-args", "-p", given])
@@ -57,9 +66,18 @@ def test_it_flies_by_services_beside_two_busy_processes(tmp_path, load):  # noqa
         assert not refused.success and refused.message == "it does not fly; take off first."
         flown.wait(lambda: flown.odometry, "odometry")
         load(2)
-        flown.wait(lambda: flown.ask(Takeoff, "takeoff", height=1.0, duration=Duration(sec=2, nanosec=500_000_000)).success, "it to arm")
+        flown.wait(
+            lambda: (
+                flown.ask(
+                    Takeoff, "takeoff", height=1.0, duration=Duration(sec=2, nanosec=500_000_000)
+                ).success
+            ),
+            "it to arm",
+        )
         flown.wait(lambda: flown.odometry.pose.pose.position.z > 0.8, "it to be up")
-        beside = flown.ask(GoTo, "go_to", relative=True, goal=Point(x=0.3), duration=Duration(sec=2))
+        beside = flown.ask(
+            GoTo, "go_to", relative=True, goal=Point(x=0.3), duration=Duration(sec=2)
+        )
         assert beside.success and beside.message == ""
         assert flown.ask(Land, "land", duration=Duration(sec=2)).success
         flown.wait(lambda: flown.verdicts, "the verdict")

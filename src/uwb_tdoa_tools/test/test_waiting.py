@@ -1,7 +1,9 @@
-"""Nobody waits in silence: each command says something within 2 s, and goes on to say something every 5 s.
+"""Nobody waits in silence: each command says something within 2 s, and goes on to say something
+every 5 s.
 
-Time counts as long as the command itself computes. Where it has to wait for a core, others compute on the same ones, and it takes up to
-twice as long to compute, too."""
+Time counts as long as the command itself computes. Where it has to wait for a core, others compute
+on the same ones, and it takes up to twice as long to compute, too.
+"""
 
 import os
 from pathlib import Path
@@ -19,9 +21,14 @@ from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.constellations import corners
 
-FIRST, EVERY, LONG_ENOUGH = 2.0, 5.0, 10.0  # s; the last: of computing, after which enough is known of what does not end before
+FIRST, EVERY, LONG_ENOUGH = (
+    2.0,
+    5.0,
+    10.0,
+)  # s; the last: of computing, after which enough is known of what does not end before
 PATIENCE = 120.0  # s for a command that is interrupted to end
-CROWD = 0.05  # of the time that a command has waited for a core, from which on others compute on the same ones
+# of the time that a command has waited for a core, from which on others compute on the same ones
+CROWD = 0.05
 WORDS = {  # command: words after it
     "bench": "--quick --only core",
     "calibrate": "flight.bag --out calibrated",
@@ -46,7 +53,9 @@ ELSEWHERE = {"record", "replay"}  # what these wait for is the time of a recordi
 
 
 def test_every_command_is_here():
-    commands = {path.stem for path in (Path(command_lines.__file__).parent / "commands").glob("[a-z]*.py")}
+    commands = {
+        path.stem for path in (Path(command_lines.__file__).parent / "commands").glob("[a-z]*.py")
+    }
     assert commands == {name.partition(",")[0] for name in WORDS} | ELSEWHERE
 
 
@@ -81,8 +90,9 @@ def waited(pid):
 
 
 def end(process):
-    """Interrupt a command, so that it ends what it has started, nodes in process groups of their own among it, which a kill would leave
-    behind; and kill what is left of its group."""
+    """Interrupt a command, so that it ends what it has started, nodes in process groups of their
+    own among it, which a kill would leave behind; and kill what is left of its group.
+    """
     for number, patience in ((signal.SIGINT, PATIENCE), (signal.SIGKILL, None)):
         try:
             os.killpg(process.pid, number)
@@ -92,8 +102,9 @@ def end(process):
 
 
 def silences(name, words, folder):
-    """[s] of computing until each thing that a command says, and until its end, or LONG_ENOUGH; and the share of time that it had to wait
-    for a core."""
+    """[s] of computing until each thing that a command says, and until its end, or LONG_ENOUGH; and
+    the share of time that it had to wait for a core.
+    """
     out, process = [], None
     line = [sys.executable, "-m", f"uwb_tdoa_tools.commands.{name}", *words]
     pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
@@ -127,5 +138,8 @@ def test_nobody_waits_in_silence(desk, name):
         pytest.importorskip("rclpy")
     crowd, (first, *others) = silences(name.partition(",")[0], WORDS[name].split(), desk)
     slower = 2.0 if crowd > CROWD else 1.0
-    print(f"{name}: first word after {first:.1f} s, then at most {max(others, default=0.0):.1f} s of silence")
+    print(
+        f"{name}: first word after {first:.1f} s, then at most {max(others, default=0.0):.1f} "
+        "s of silence"
+    )
     assert first < FIRST * slower and max(others, default=0.0) < EVERY * slower, (first, others)

@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 import re
 
+from known_effects import clean_flight
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -13,14 +14,18 @@ from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.channels import CHANNELS
 from uwb_tdoa_tools.diagnosis.detectors import DETECTORS
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
-from known_effects import clean_flight
 
 DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "effects.md"
 
 
 def written(heading):
     """The names that the code under a heading of the document defines."""
-    section = DOCUMENT.read_text().partition(f"### {heading}\n")[2].partition("\n## ")[0].partition("\n### ")[0]
+    section = (
+        DOCUMENT.read_text()
+        .partition(f"### {heading}\n")[2]
+        .partition("\n## ")[0]
+        .partition("\n### ")[0]
+    )
     names = {"__name__": "worked_example"}
     for block in re.findall(r"```python\n(.*?)```", section, re.DOTALL):
         exec(compile(block, str(DOCUMENT), "exec"), names)
@@ -54,7 +59,10 @@ def test_a_channel(flight, monkeypatch, tmp_path):
     monkeypatch.setitem(CHANNELS, "heading", names["Heading"]())
     truth = flight.truth
     noise = 0.02 * np.random.default_rng(0).standard_normal(len(truth))
-    stream = {"t": truth.t, "heading": Rotation.from_quat(truth.q).as_euler("ZYX")[:, 0] - 0.1 + noise}
+    stream = {
+        "t": truth.t,
+        "heading": Rotation.from_quat(truth.q).as_euler("ZYX")[:, 0] - 0.1 + noise,
+    }
     seen = replace(flight, extra={"compass": stream})
     attribution = attribute([seen], GroundTruth())
     assert [effect.name for effect in attribution.effects] == ["compass_offset"]

@@ -1,4 +1,6 @@
-"""Whatever the suite writes goes through `foundation/files.py`: whole or not at all, and in UTF-8 in any locale."""
+"""Whatever the suite writes goes through `foundation/files.py`: whole or not at all, and in UTF-8
+in any locale.
+"""
 
 import ast
 from dataclasses import replace
@@ -9,13 +11,15 @@ import re
 import subprocess
 import sys
 
-import pytest
-
 from documented import ROOT
 from known_effects import clean_flight
+import pytest
+
 from uwb_tdoa_tools.bags.bag import write_bag
 
-SOURCES = [ROOT / "src" / name / name for name in ("uwb_tdoa_bias", "uwb_tdoa_ekf", "uwb_tdoa_tools")] + [ROOT / "studies"]
+SOURCES = [
+    ROOT / "src" / name / name for name in ("uwb_tdoa_bias", "uwb_tdoa_ekf", "uwb_tdoa_tools")
+] + [ROOT / "studies"]
 ELSEWHERE = {  # what is no file that a user gets at once
     "uwb_tdoa_bias/foundation/files.py",
     "uwb_tdoa_tools/bags/integrity.py",  # a bag unpacked in a temporary folder
@@ -35,11 +39,21 @@ def direct(path):
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if not isinstance(node, ast.Call):
             continue
-        name = node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
-        texts = [one.value for one in (*node.args, *(word.value for word in node.keywords)) if isinstance(one, ast.Constant)]
-        wrong = name in ("open", "fdopen", "FileType") and any(isinstance(text, str) and WRITING.fullmatch(text) for text in texts)
+        name = (
+            node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+        )
+        texts = [
+            one.value
+            for one in (*node.args, *(word.value for word in node.keywords))
+            if isinstance(one, ast.Constant)
+        ]
+        wrong = name in ("open", "fdopen", "FileType") and any(
+            isinstance(text, str) and WRITING.fullmatch(text) for text in texts
+        )
         wrong |= name in ("write_text", "write_bytes") and isinstance(node.func, ast.Attribute)
-        wrong |= name in FILLED and not (node.args and isinstance(node.args[0], ast.Name) and node.args[0].id == "file")
+        wrong |= name in FILLED and not (
+            node.args and isinstance(node.args[0], ast.Name) and node.args[0].id == "file"
+        )
         wrong |= name == "dump" and len(node.args) > 1  # of json or yaml
         if wrong:
             found.append((node.lineno, ast.unparse(node)))
@@ -47,15 +61,32 @@ def direct(path):
 
 
 def test_nothing_is_written_but_by_the_functions_for_it():
-    files = [path for folder in SOURCES for path in folder.rglob("*.py") if "test" not in path.relative_to(folder).parts]
+    files = [
+        path
+        for folder in SOURCES
+        for path in folder.rglob("*.py")
+        if "test" not in path.relative_to(folder).parts
+    ]
     assert len(files) > 300
-    direct_ones = {path: direct(path) for path in files if not any(str(path).endswith(name) for name in ELSEWHERE)}
+    direct_ones = {
+        path: direct(path)
+        for path in files
+        if not any(str(path).endswith(name) for name in ELSEWHERE)
+    }
     assert not {path: found for path, found in direct_ones.items() if found}
 
 
 @pytest.mark.parametrize(
     "line",
-    ["open(p, 'w')", "p.open('wb')", "p.write_text('a')", "p.write_bytes(b'')", "figure.savefig(p)", "np.savetxt(p, a)", "json.dump(a, p)"],
+    [
+        "open(p, 'w')",
+        "p.open('wb')",
+        "p.write_text('a')",
+        "p.write_bytes(b'')",
+        "figure.savefig(p)",
+        "np.savetxt(p, a)",
+        "json.dump(a, p)",
+    ],
 )
 def test_a_direct_write_is_found(tmp_path, line):
     (tmp_path / "a.py").write_text(line)
@@ -67,9 +98,16 @@ ASCII = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "PYTHONIO
 
 def in_ascii(folder, command, *arguments):
     """Run a command in an ASCII locale; returns what it printed."""
-    line = [sys.executable, "-m", f"uwb_tdoa_tools.commands.{command}", *map(os.fsencode, arguments)]
+    line = [
+        sys.executable,
+        "-m",
+        f"uwb_tdoa_tools.commands.{command}",
+        *map(os.fsencode, arguments),
+    ]
     done = subprocess.run(line, cwd=folder, env=os.environ | ASCII, capture_output=True)
-    assert done.returncode == 0 and b"Traceback" not in done.stderr, done.stderr.decode("utf-8", "replace")
+    assert done.returncode == 0 and b"Traceback" not in done.stderr, done.stderr.decode(
+        "utf-8", "replace"
+    )
     return done.stdout.decode("ascii")
 
 
@@ -93,7 +131,11 @@ def test_evaluate_writes_its_files_in_an_ascii_locale(bag, tmp_path):
 
 def test_localize_writes_its_files_in_an_ascii_locale(bag, tmp_path):
     in_ascii(tmp_path, "localize", bag, "--out", "wo_ü")
-    written = [path for path in (tmp_path / "wo_ü").rglob("*") if path.suffix in (".csv", ".json", ".txt", ".md", ".tum")]
+    written = [
+        path
+        for path in (tmp_path / "wo_ü").rglob("*")
+        if path.suffix in (".csv", ".json", ".txt", ".md", ".tum")
+    ]
     assert written and all(read(path) for path in written)
 
 

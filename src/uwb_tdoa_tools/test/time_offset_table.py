@@ -1,4 +1,5 @@
-"""What a time offset between IMU and TDOAs does, and whether the innovations tell it: the table of docs/reliability.md.
+"""What a time offset between IMU and TDOAs does, and whether the innovations tell it: the table of
+docs/reliability.md.
 
 python src/uwb_tdoa_tools/test/time_offset_table.py DATA
 """
@@ -22,7 +23,9 @@ LARGEST = 1.0  # m; a larger innovation counts as this
 
 def measured(folder):
     """The micro-SD logs below DATA/flights, without range finders and the like."""
-    for log in sorted(path for path in (folder / "flights").rglob("*") if path.is_file() and not path.suffix):
+    for log in sorted(
+        path for path in (folder / "flights").rglob("*") if path.is_file() and not path.suffix
+    ):
         day = log.relative_to(folder / "flights").parts[0]
         flight = read_flight(log, folder / "surveys" / f"anchor_{day}.txt")
         yield replace(flight, height=None, pressure=None, velocity=None)
@@ -31,7 +34,9 @@ def measured(folder):
 def simulated():
     """Flights without systematic errors, at 2 m/s."""
     for seed in range(6):
-        yield simulate(SimulationConfig(seed=seed, duration=40.0, speed=2.0, yaw="rotating", yaw_rate=0.4))
+        yield simulate(
+            SimulationConfig(seed=seed, duration=40.0, speed=2.0, yaw="rotating", yaw_rate=0.4)
+        )
 
 
 def cut(flight, low, high):
@@ -52,7 +57,9 @@ def run(flight, shift):
     used = (r.t > r.t[0] + SETTLE) & np.isfinite(r.innovation)
     innovation = np.mean(np.clip(r.innovation[used], -LARGEST, LARGEST) ** 2)
     truth = flight.truth
-    t = odometry.t[(odometry.t > max(odometry.t[0] + SETTLE, truth.t[0])) & (odometry.t < truth.t[-1])]
+    t = odometry.t[
+        (odometry.t > max(odometry.t[0] + SETTLE, truth.t[0])) & (odometry.t < truth.t[-1])
+    ]
     p = np.stack([np.interp(t, odometry.t, odometry.p[:, k]) for k in range(3)], axis=1)
     error = np.linalg.norm(p - position_at(t, truth), axis=1)
     return innovation, float(np.sqrt(np.nanmean(error**2)))
@@ -74,10 +81,15 @@ def main():
                     best.append(SHIFTS[np.argmin([run(part, shift)[0] for shift in SHIFTS])])
         print(f"{title}: {len(rmse)} flights")
         print("  IMU shifted by, s     " + "  ".join(f"{shift:+.1f}" for shift in SHIFTS))
-        print("  mean RMSE, m          " + "  ".join(f"{value:.2f}" for value in np.mean(rmse, axis=0)))
+        print(
+            "  mean RMSE, m          "
+            + "  ".join(f"{value:.2f}" for value in np.mean(rmse, axis=0))
+        )
         for what, shifts in (("whole flights", wholes), ("12 s", best)):
             counts = [int(np.sum(np.isclose(shifts, shift))) for shift in SHIFTS]
-            print(f"  least innovations at  {'  '.join(f'{count:4d}' for count in counts)}   ({what})")
+            print(
+                f"  least innovations at  {'  '.join(f'{count:4d}' for count in counts)}   ({what})"
+            )
 
 
 if __name__ == "__main__":

@@ -11,10 +11,17 @@ def flight(seed=0, constellation="corners", **changes):
     """A Flight of 12 s in the air; the anchors are calibrated."""
     config = SimulationConfig(
         **{
-            "seed": seed, "constellation": constellation, "duration": 12.0, "start_in_air": True, "imu_rate": 100.0,
-            "yaw_angle": 0.5 * seed, "anchor_delay_std": 0.0, "multipath": False, **changes,
+            "seed": seed,
+            "constellation": constellation,
+            "duration": 12.0,
+            "start_in_air": True,
+            "imu_rate": 100.0,
+            "yaw_angle": 0.5 * seed,
+            "anchor_delay_std": 0.0,
+            "multipath": False,
+            **changes,
         }
-    )  # fmt: skip
+    )
     return replace(simulate(config), name=f"{constellation}-{seed}")
 
 

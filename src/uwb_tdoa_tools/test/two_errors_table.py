@@ -1,4 +1,5 @@
-"""How far accelerometers rectify vibration, and how late each anchor is over the height of the tag: the tables of docs/measured.md.
+"""How far accelerometers rectify vibration, and how late each anchor is over the height of the tag:
+the tables of docs/measured.md.
 
 python src/uwb_tdoa_tools/test/two_errors_table.py DATA
 """
@@ -22,7 +23,9 @@ FEWEST, OUTLIER, SCALE = 40, 6.0, 0.15  # TDOAs of a height; m, not looked at; m
 
 
 def rectified(flight: Flight) -> tuple[np.ndarray, np.ndarray]:
-    """(vibration, mean of the specific force beyond hovering), each (3,) m/s^2, of a Flight in the air."""
+    """(vibration, mean of the specific force beyond hovering), each (3,) m/s^2, of a Flight in the
+    air.
+    """
     t, accel = flight.imu.t, flight.imu.accel
     step = float(np.median(np.diff(t)))
 
@@ -37,17 +40,31 @@ def rectified(flight: Flight) -> tuple[np.ndarray, np.ndarray]:
 
 
 def lateness(flight: Flight) -> dict[int, np.ndarray]:
-    """{number of an interval of HEIGHTS: lateness (n,) m of the anchors of a Flight, by the mean of those above 1.5 m}."""
+    """{number of an interval of HEIGHTS: lateness (n,) m of the anchors of a Flight, by the mean of
+    those above 1.5 m}.
+    """
     tdoa, positions = flight.tdoa, flight.anchors.positions
     inside = (tdoa.t > flight.truth.t[0]) & (tdoa.t < flight.truth.t[-1])
-    a, b, p = flight.anchors.index(tdoa.a[inside]), flight.anchors.index(tdoa.b[inside]), position_at(tdoa.t[inside], flight.truth)
-    r = tdoa.d[inside] - np.linalg.norm(p - positions[b], axis=1) + np.linalg.norm(p - positions[a], axis=1)
+    a, b, p = (
+        flight.anchors.index(tdoa.a[inside]),
+        flight.anchors.index(tdoa.b[inside]),
+        position_at(tdoa.t[inside], flight.truth),
+    )
+    r = (
+        tdoa.d[inside]
+        - np.linalg.norm(p - positions[b], axis=1)
+        + np.linalg.norm(p - positions[a], axis=1)
+    )
     out = {}
     for k, (low, high) in enumerate(zip(HEIGHTS, HEIGHTS[1:])):
         chosen = np.flatnonzero((p[:, 2] >= low) & (p[:, 2] < high) & (np.abs(r) < OUTLIER))
         if len(chosen) < FEWEST:
             continue
-        rows, weight, late = np.zeros((len(chosen), len(positions))), np.ones(len(chosen)), np.zeros(len(positions))
+        rows, weight, late = (
+            np.zeros((len(chosen), len(positions))),
+            np.ones(len(chosen)),
+            np.zeros(len(positions)),
+        )
         rows[np.arange(len(chosen)), b[chosen]] = 1.0
         rows[np.arange(len(chosen)), a[chosen]] -= 1.0
         for _ in range(20):
@@ -64,7 +81,9 @@ def main() -> None:
     parser.add_argument("data", type=Path, metavar="DATA")
     folder = parser.parse_args().data
     shaking, late = defaultdict(list), defaultdict(lambda: defaultdict(list))
-    for log in sorted(path for path in (folder / "flights").rglob("*") if path.is_file() and not path.suffix):
+    for log in sorted(
+        path for path in (folder / "flights").rglob("*") if path.is_file() and not path.suffix
+    ):
         day = log.relative_to(folder / "flights").parts[0]
         flight = read_flight(log, folder / "surveys" / f"anchor_{day}.txt")
         shaking[day].append(rectified(flight))
@@ -72,11 +91,24 @@ def main() -> None:
             late[day][k].append(each)
     print("| day | vibration x, y, z, m/s^2 | mean beyond hovering x, y, z, m/s^2 |\n|---|---|---|")
     for day, both in shaking.items():
-        print(f"| {day} |", " | ".join(", ".join(f"{value:.2f}" for value in np.median(part, axis=0)) for part in zip(*both)), "|")
+        print(
+            f"| {day} |",
+            " | ".join(
+                ", ".join(f"{value:.2f}" for value in np.median(part, axis=0))
+                for part in zip(*both)
+            ),
+            "|",
+        )
     for day, by_height in late.items():
-        print(f"\n{day}, lateness of the anchors in the order of their ids, m, median of the flights")
+        print(
+            f"\n{day}, lateness of the anchors in the order of their ids, m, median of the flights"
+        )
         for k, each in sorted(by_height.items()):
-            print(f"| {HEIGHTS[k]:g} - {HEIGHTS[k + 1]:g} |", " | ".join(f"{value:.2f}" for value in np.median(each, axis=0)), "|")
+            print(
+                f"| {HEIGHTS[k]:g} - {HEIGHTS[k + 1]:g} |",
+                " | ".join(f"{value:.2f}" for value in np.median(each, axis=0)),
+                "|",
+            )
 
 
 if __name__ == "__main__":

@@ -1,6 +1,7 @@
 """Effects that nobody declared: they exist here only, for tests and benchmarks of diagnose to find.
 
-Each takes a Flight and returns the Flight with the effect. CASES: {name: (function, channel, covariates that name it)}.
+Each takes a Flight and returns the Flight with the effect. CASES: {name: (function, channel,
+covariates that name it)}.
 """
 
 from dataclasses import replace

@@ -1,4 +1,6 @@
-"""The commands of a page of the documentation, run as somebody who follows it would, and files as other tools write them."""
+"""The commands of a page of the documentation, run as somebody who follows it would, and files as
+other tools write them.
+"""
 
 from importlib import import_module
 import re
@@ -16,7 +18,11 @@ def section(page, heading):
     path = ROOT / page if page == "README.md" else ROOT / "docs" / page
     text = path.read_text()
     level = re.search(rf"^(#+) {re.escape(heading)}$", text, re.MULTILINE).group(1)
-    return re.split(rf"^#{{2,{max(2, len(level))}}} ", text.partition(f"{level} {heading}\n")[2], flags=re.MULTILINE)[0]
+    return re.split(
+        rf"^#{{2,{max(2, len(level))}}} ",
+        text.partition(f"{level} {heading}\n")[2],
+        flags=re.MULTILINE,
+    )[0]
 
 
 def blocks(text, language=""):
@@ -26,10 +32,20 @@ def blocks(text, language=""):
 
 
 def commands(script):
-    """[(name of a tool, [word, ...])] of the lines of a script that run one of our tools, split as the shell splits them."""
+    """[(name of a tool, [word, ...])] of the lines of a script that run one of our tools, split as
+    the shell splits them.
+    """
     stub = "dev() { test $1 = run || return 0; shift 2; printf '%s\\0' \"$@\"; echo; }; "
-    told = subprocess.run(["bash", "-ec", stub + script.replace("./dev ", "dev ")], capture_output=True, text=True, check=True)
-    return [(name, words) for name, *words in (line.split("\0")[:-1] for line in told.stdout.splitlines())]
+    told = subprocess.run(
+        ["bash", "-ec", stub + script.replace("./dev ", "dev ")],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return [
+        (name, words)
+        for name, *words in (line.split("\0")[:-1] for line in told.stdout.splitlines())
+    ]
 
 
 def main(name, words):
@@ -44,13 +60,24 @@ def run(script):
 
 
 def write_tables(flight, stem):
-    """Write a Flight as CSV files of another tool, STEM_ranging.csv and so on: milliseconds, millimetres, degrees/s and g, with the ids the
-    other way round."""
+    """Write a Flight as CSV files of another tool, STEM_ranging.csv and so on: milliseconds,
+    millimetres, degrees/s and g, with the ids the other way round.
+    """
     tdoa, imu, truth = flight.tdoa, flight.imu, flight.truth
     tables = {"ranging": ("t_ms,to,from,diff_mm", [MILLI * tdoa.t, tdoa.b, tdoa.a, MILLI * tdoa.d])}
     if imu is not None:
-        tables["imu"] = "t_ms,gx,gy,gz,ax,ay,az", [MILLI * imu.t, np.rad2deg(imu.gyro), imu.accel / 9.81]
+        tables["imu"] = (
+            "t_ms,gx,gy,gz,ax,ay,az",
+            [MILLI * imu.t, np.rad2deg(imu.gyro), imu.accel / 9.81],
+        )
     if truth is not None:
         tables["mocap"] = "t_ms,x,y,z", [MILLI * truth.t, MILLI * truth.p]
     for name, (header, columns) in tables.items():
-        np.savetxt(f"{stem}_{name}.csv", np.column_stack(columns), fmt=FIGURES, delimiter=",", header=header, comments="")
+        np.savetxt(
+            f"{stem}_{name}.csv",
+            np.column_stack(columns),
+            fmt=FIGURES,
+            delimiter=",",
+            header=header,
+            comments="",
+        )

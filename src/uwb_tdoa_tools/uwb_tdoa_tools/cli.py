@@ -1,11 +1,11 @@
-"""What the mains of all executables share: the look of --help, and how a failure is reported and counted.
+"""What the mains of all executables share: the look of --help, and how a failure is reported and
+counted.
 
-    def parser():
-        made = cli.parser("convert", "Convert a log to a bag.", "convert flight.log --survey s.txt --out flight.bag")
-        made.add_argument("log")
-        return made
+def parser():
+    made = cli.parser("convert", "Convert a log to a bag.", "convert flight.log --survey s.txt --out
+    flight.bag") made.add_argument("log") return made
 
-    main = cli.executable(_convert, parser)          # _convert(args) -> exit code, None for 0
+main = cli.executable(_convert, parser)          # _convert(args) -> exit code, None for 0
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import os
 from pathlib import Path
 import sqlite3
 import sys
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
@@ -32,41 +32,60 @@ from . import command_lines, outputs
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-FULL = {errno.ENOSPC: "the disk is full", errno.EDQUOT: "the disk quota is used up", errno.EFBIG: "the file may not become larger"}
+FULL = {
+    errno.ENOSPC: "the disk is full",
+    errno.EDQUOT: "the disk quota is used up",
+    errno.EFBIG: "the file may not become larger",
+}
 
 
 def parser(name: str, description: str, *examples: str) -> argparse.ArgumentParser:
-    """An ArgumentParser that keeps line breaks, and ends its help with the given example command lines: those that begin with the name, as
-    they run where the user is."""
+    """An ArgumentParser that keeps line breaks, and ends its help with the given example command
+    lines: those that begin with the name, as they run where the user is.
+    """
     started = command_lines.started(name).removesuffix(name)
-    lines = [f"  {started if example.partition(' ')[0] == name else ''}{example}" for example in examples]
+    lines = [
+        f"  {started if example.partition(' ')[0] == name else ''}{example}" for example in examples
+    ]
     epilog = "\n".join(["examples:", *lines]) if examples else None
     made = argparse.ArgumentParser(
-        prog=name, description=description, epilog=epilog, formatter_class=argparse.RawDescriptionHelpFormatter
+        prog=name,
+        description=description,
+        epilog=epilog,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     made.add_argument("--version", action="version", version=f"{name} of {written_by()}")
     return made
 
 
 def executable(
-    command: Callable[[argparse.Namespace], int | None], parser: Callable[[], argparse.ArgumentParser], ros: bool = False
+    command: Callable[[argparse.Namespace], int | None],
+    parser: Callable[[], argparse.ArgumentParser],
+    ros: bool = False,
 ) -> Callable[..., int]:
     """The function main(argv=None) of an executable: `run` with what parser() gives."""
     return lambda argv=None: run(command, parser(), argv, ros)
 
 
 def run(
-    command: Callable[[argparse.Namespace], int | None], parser: argparse.ArgumentParser,
-    argv: Sequence[str] | None = None, ros: bool = False,
-) -> int:  # fmt: skip
-    """Parse argv (default: sys.argv[1:]), call command(args), and return the exit code of the process.
+    command: Callable[[argparse.Namespace], int | None],
+    parser: argparse.ArgumentParser,
+    argv: Sequence[str] | None = None,
+    ros: bool = False,
+) -> int:
+    """Parse argv (default: sys.argv[1:]), call command(args), and return the exit code of the
+    process.
 
-    0 or what command returned; 1 for a Failure; 2 for bad usage, an InputError or a file that cannot be used, each reported
-    in one sentence on stderr; 130 after Ctrl-C; 141 when whoever read our output has gone.
-    ros : --ros-args are for rclpy and not parsed; args.ros_arguments is the whole command line, with them.
+    0 or what command returned; 1 for a Failure; 2 for bad usage, an InputError or a file that
+    cannot be used, each reported in one sentence on stderr; 130 after Ctrl-C; 141 when whoever read
+    our output has gone.
+    ros : --ros-args are for rclpy and not parsed; args.ros_arguments is the whole command line,
+        with them.
     """
     arguments = sys.argv[1:] if argv is None else list(argv)
-    if isinstance(sys.stdout, io.TextIOWrapper):  # a result must not end in an error because the locale has no letter for it
+    if isinstance(
+        sys.stdout, io.TextIOWrapper
+    ):  # a result must not end in an error because the locale has no letter for it
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
         args = parser.parse_args(without_ros_arguments(arguments) if ros else arguments)
@@ -85,18 +104,26 @@ def run(
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the flush at exit fails once more
+        os.dup2(
+            os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
+        )  # or the flush at exit fails once more
         return 141
     except (OSError, sqlite3.OperationalError) as error:
         if full := _full(error):
-            return _fail(parser.prog, f"{full}: what was being written is not whole; make room, or write elsewhere.", 2)
+            return _fail(
+                parser.prog,
+                f"{full}: what was being written is not whole; make room, or write elsewhere.",
+                2,
+            )
         if not isinstance(error, OSError) or error.filename is None:
             raise
         return _fail(parser.prog, f"{error.filename}: {error.strerror}.", 2)
 
 
 def _full(error: Exception) -> str | None:
-    """What of the disk has no room for what an OSError or an sqlite3.OperationalError was raised about: text, or None."""
+    """What of the disk has no room for what an OSError or an sqlite3.OperationalError was raised
+    about: text, or None.
+    """
     if isinstance(error, OSError):
         return FULL.get(error.errno) if error.errno is not None else None
     return FULL[errno.ENOSPC] if "disk is full" in str(error) else None
@@ -116,7 +143,9 @@ def without_ros_arguments(arguments: Iterable[str]) -> list[str]:
 
 
 def write_json(path: str | Path, content: dict[str, Any]) -> None:
-    """Write a dict as JSON, with the version of the suite; NaN must be None by now (ValueError otherwise)."""
+    """Write a dict as JSON, with the version of the suite; NaN must be None by now (ValueError
+    otherwise).
+    """
     text = json.dumps({"written_by": written_by(), **content}, indent=1, allow_nan=False)
     write_text(path, text + "\n")
 
@@ -127,7 +156,9 @@ def say(name: str, sentence: object) -> None:
 
 
 def show(*lines: str) -> None:
-    """Print a result on stdout, line by line, each made `printable`, beside a progress bar if there is one."""
+    """Print a result on stdout, line by line, each made `printable`, beside a progress bar if there
+    is one.
+    """
     tqdm.write("\n".join(printable(line) for text in lines for line in text.split("\n")))
     sys.stdout.flush()
 

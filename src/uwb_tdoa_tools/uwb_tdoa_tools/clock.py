@@ -1,12 +1,14 @@
-"""One continuous time for the streams of a recording whose clock restarted, wrapped or was set while it was recorded.
+"""One continuous time for the streams of a recording whose clock restarted, wrapped or was set
+while it was recorded.
 
-The evidence is the order in which messages stand in the file: sorted by stamp, a clock that starts again is two flights in one.
+The evidence is the order in which messages stand in the file: sorted by stamp, a clock that starts
+again is two flights in one.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple, TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -20,10 +22,13 @@ LEADING = "tdoa", "imu", "gyro", "acc", *LOCATING  # streams whose clock starts 
 AHEAD = 10.0  # s; a longer step forward of a quick stream is a pause, or a clock that was set
 SLOW = 20.0  # usual steps; the same of a slow one
 PAUSE = 3600.0  # s for which a recorder may pause, where no arrival times tell
-FEW = 10  # messages that agree with each other and not with those before: another time; fewer are outliers
+# messages that agree with each other and not with those before: another time; fewer are outliers
+FEW = 10
 NEAR = 20  # messages on both sides of a jump by whose arrivals its size is known
 TOGETHER = 5.0  # s by which a jump may differ between streams of one clock
-MOST = 0.01  # jumps per message, or ten; where there are more, no clock is at work, but several tags or a faulty driver
+# jumps per message, or ten; where there are more, no clock is at work, but several tags or a faulty
+# driver
+MOST = 0.01
 WRAPS = {  # what counters of drivers hold: s
     "2^40 ticks of 15.65 ps": 2**40 / (128 * 499.2e6),
     "2^32 microseconds": 2**32 * 1e-6,
@@ -36,19 +41,26 @@ WRAPS = {  # what counters of drivers hold: s
     "2^32 nanoseconds": 2**32 * 1e-9,
     "a day": 86400.0,
     "a week": 604800.0,
-}  # fmt: skip
+}
 SPARSE = 50.0  # times of a grid for each message; where there are more, most are far from any
 WRAP_TOLERANCE = 0.1  # s
-WORDS = {"tdoa": "uwb/tdoa", "gyro": "imu/data", "acc": "imu/data", "imu": "imu/data", "pose": "ground_truth/pose"} | {
-    name: sensor.topics[0][0] for name, sensor in SENSORS.items()
-}  # topics of streams
+WORDS = {
+    "tdoa": "uwb/tdoa",
+    "gyro": "imu/data",
+    "acc": "imu/data",
+    "imu": "imu/data",
+    "pose": "ground_truth/pose",
+} | {name: sensor.topics[0][0] for name, sensor in SENSORS.items()}  # topics of streams
 RESTART, WRAP, SET, SILENCE = "restart", "wrap", "set", "silence"
 
 
 class Jump(NamedTuple):
-    """kind : RESTART, WRAP, SET (forward) or SILENCE (of all streams; or SET, nothing tells); streams : names of those that jumped;
-    message : number of the first one after it in the first of them, from 1, and `after`, s, since the first one of all; by : s, of the
-    clock; at : s, stamp of the first message after it, as it is now; period : what wrapped, text."""
+    """kind : RESTART, WRAP, SET (forward) or SILENCE (of all streams; or SET, nothing tells);
+    streams : names of those that jumped;
+    message : number of the first one after it in the first of them, from 1, and `after`, s, since
+        the first one of all; by : s, of the
+    clock; at : s, stamp of the first message after it, as it is now; period : what wrapped, text.
+    """
 
     kind: str
     streams: tuple[str, ...]
@@ -61,8 +73,10 @@ class Jump(NamedTuple):
 
 @dataclass(frozen=True)
 class Straightened:
-    """shifts : {stream: (n,) s, to be added to its stamps} of those with a jump; kept : {stream: (n,) bool} of those with outliers; jumps :
-    in the order of time; restarts : s, where a clock that leads began anew."""
+    """shifts : {stream: (n,) s, to be added to its stamps} of those with a jump; kept : {stream:
+    (n,) bool} of those with outliers; jumps : in the order of time; restarts : s, where a clock
+    that leads began anew.
+    """
 
     shifts: dict[str, np.ndarray]
     kept: dict[str, np.ndarray]
@@ -73,7 +87,11 @@ class Straightened:
         """The columns of a stream, with "t", s, on the continuous time, without outliers."""
         if name in self.shifts:
             columns = {**columns, "t": columns["t"] + self.shifts[name]}
-        return {key: values[self.kept[name]] for key, values in columns.items()} if name in self.kept else columns
+        return (
+            {key: values[self.kept[name]] for key, values in columns.items()}
+            if name in self.kept
+            else columns
+        )
 
     @property
     def outliers(self) -> dict[str, int]:
@@ -81,12 +99,16 @@ class Straightened:
         return {name: int(np.count_nonzero(~kept)) for name, kept in self.kept.items()}
 
 
-def straightened(stamps: Mapping[str, np.ndarray], arrived: Mapping[str, np.ndarray] | None = None) -> Straightened:
+def straightened(
+    stamps: Mapping[str, np.ndarray], arrived: Mapping[str, np.ndarray] | None = None
+) -> Straightened:
     """Put the streams of a recording on one continuous time.
 
-    stamps : {stream: (n,) s, in the order of the file}; arrived : {stream: (n,) s, when they were recorded, NaN where that is not
-    known}. What follows a jump that persists is shifted, of all streams alike that jumped together: by arrivals where they are known,
-    else so that the next message follows at the usual step. A pause moves nothing. Few stamps far from their neighbours are outliers.
+    stamps : {stream: (n,) s, in the order of the file}; arrived : {stream: (n,) s, when they were
+        recorded, NaN where that is not
+    known}. What follows a jump that persists is shifted, of all streams alike that jumped together:
+    by arrivals where they are known, else so that the next message follows at the usual step. A
+    pause moves nothing. Few stamps far from their neighbours are outliers.
     """
     found = {name: _Stream(name, t, (arrived or {}).get(name)) for name, t in stamps.items()}
     ends = {name: stream.end for name, stream in found.items() if stream.steady}
@@ -98,21 +120,30 @@ def straightened(stamps: Mapping[str, np.ndarray], arrived: Mapping[str, np.ndar
         _join_late(stream, found)
     shifts = {name: of for name, stream in found.items() if (of := stream.shifts()) is not None}
     whole = {name: t + shifts.get(name, 0.0) for name, t in stamps.items()} if jumps else {}
-    begin = min((float(np.min(t[found[name].kept], initial=np.inf)) for name, t in whole.items()), default=0.0)
+    begin = min(
+        (float(np.min(t[found[name].kept], initial=np.inf)) for name, t in whole.items()),
+        default=0.0,
+    )
     done = []
     for named, members in jumps:
         at = min(float(whole[stream.name][of.first]) for stream, of in members)
         done.append(named._replace(at=at, after=at - begin))
     done.sort(key=lambda jump: jump.at)
-    restarts = [jump.at for jump in done if jump.kind == RESTART and not set(jump.streams).isdisjoint(LEADING)]
+    restarts = [
+        jump.at
+        for jump in done
+        if jump.kind == RESTART and not set(jump.streams).isdisjoint(LEADING)
+    ]
     kept = {name: stream.kept for name, stream in found.items() if not stream.kept.all()}
     return Straightened(shifts, kept, tuple(done), tuple(sorted(set(restarts))))
 
 
 @dataclass
 class _Break:
-    """Where a stream goes on with another time. first, last : places of the message after and of the last one before; by : s, of the clock;
-    sure : it is no silence."""
+    """Where a stream goes on with another time. first, last : places of the message after and of
+    the last one before; by : s, of the clock;
+    sure : it is no silence.
+    """
 
     first: int
     last: int
@@ -122,8 +153,9 @@ class _Break:
 
 
 class _Stream:
-    """Stamps t (n,) s of one stream, in the order of the file; arrived : (n,) s or None; steady : whether they are of one time, without a
-    pause."""
+    """Stamps t (n,) s of one stream, in the order of the file; arrived : (n,) s or None; steady :
+    whether they are of one time, without a pause.
+    """
 
     def __init__(self, name: str, t: np.ndarray, arrived: np.ndarray | None) -> None:
         self.name, self.t = name, t
@@ -136,17 +168,26 @@ class _Stream:
         self.usual = float(np.median(rising)) if len(rising) else 0.0  # s
         self.limit = max(AHEAD, SLOW * self.usual)
         self.arrived = arrived if arrived is not None and _sound(arrived) else None
-        far = (steps < -LARGEST_STEP_BACK) | (steps > max(LARGEST_STEP_BACK, 1.5 * self.usual))  # also back from where a stamp was wild
+        far = (steps < -LARGEST_STEP_BACK) | (
+            steps > max(LARGEST_STEP_BACK, 1.5 * self.usual)
+        )  # also back from where a stamp was wild
         self._edges = np.concatenate([[0], np.flatnonzero(far) + 1, [len(self.finite)]])
-        self.steady = bool(len(self.finite) and (steps >= -LARGEST_STEP_BACK).all() and (steps <= self.limit).all())
+        self.steady = bool(
+            len(self.finite) and (steps >= -LARGEST_STEP_BACK).all() and (steps <= self.limit).all()
+        )
 
     @property
     def end(self) -> float:
         return float(self.t[self.finite[-1]])
 
     def cut(self, ends: Sequence[float]) -> None:
-        """Find the breaks and the outliers. ends : s, stamps of the last messages of other streams, which are steady."""
-        few, pieces = min(FEW, max(2, len(self.finite) // 20)), list(zip(self._edges[:-1].tolist(), self._edges[1:].tolist()))
+        """Find the breaks and the outliers. ends : s, stamps of the last messages of other streams,
+        which are steady.
+        """
+        few, pieces = (
+            min(FEW, max(2, len(self.finite) // 20)),
+            list(zip(self._edges[:-1].tolist(), self._edges[1:].tolist())),
+        )
         if len(pieces) == 1:
             return
         last, breaks, kept = -1, list[_Break](), self.kept.copy()
@@ -155,13 +196,22 @@ class _Stream:
             following = pieces[number + 1][0] if number + 1 < len(pieces) else None
             many = self._lasts(pieces[number:], few, last)
             if last < 0:
-                accepted = many or any(self._follows(end - 1, piece[0]) for piece in pieces[number + 1 : number + 4])
+                accepted = many or any(
+                    self._follows(end - 1, piece[0]) for piece in pieces[number + 1 : number + 4]
+                )
             elif self._continues(last, first, following, ends, many):
                 accepted = True
             else:
                 accepted = many
                 if many:
-                    breaks.append(_Break(first, last, self._size(last, first), self._sure(last, first, following, ends)))
+                    breaks.append(
+                        _Break(
+                            first,
+                            last,
+                            self._size(last, first),
+                            self._sure(last, first, following, ends),
+                        )
+                    )
             if accepted:
                 last = int(self.finite[end - 1])
             else:
@@ -173,44 +223,70 @@ class _Stream:
 
     def _follows(self, before: int, after: int) -> bool:
         """Whether the message at one place of `finite` may follow that at another."""
-        return bool(-LARGEST_STEP_BACK <= self.t[self.finite[after]] - self.t[self.finite[before]] <= self.limit)
+        return bool(
+            -LARGEST_STEP_BACK
+            <= self.t[self.finite[after]] - self.t[self.finite[before]]
+            <= self.limit
+        )
 
     def _lasts(self, pieces: Sequence[tuple[int, int]], few: int, last: int) -> bool:
-        """Whether the first of some pieces, with those that follow it and are not of the time of the message at `last`, is of many."""
+        """Whether the first of some pieces, with those that follow it and are not of the time of
+        the message at `last`, is of many.
+        """
         count, behind = 0, pieces[0][1] - 1
         for begin, end in pieces:
             if count and not self._follows(behind, begin):
                 break
-            if count and last >= 0 and self.t[self.finite[pieces[0][0]]] < self.t[last] <= self.t[self.finite[begin]]:
+            if (
+                count
+                and last >= 0
+                and self.t[self.finite[pieces[0][0]]] < self.t[last] <= self.t[self.finite[begin]]
+            ):
                 break  # back in time
             count, behind = count + end - begin, end - 1
             if count >= few:
                 return True
         return False
 
-    def _continues(self, last: int, first: int, following: int | None, ends: Sequence[float], many: bool) -> bool:
-        """Whether the message at `first` is of the time of the one at `last`, after a pause or none."""
+    def _continues(
+        self, last: int, first: int, following: int | None, ends: Sequence[float], many: bool
+    ) -> bool:
+        """Whether the message at `first` is of the time of the one at `last`, after a pause or
+        none.
+        """
         t, step = self.t, self.t[first] - self.t[last]
         if step < -LARGEST_STEP_BACK:
             return False
         if self.arrived is not None:
-            ahead = self._by_arrival(last, first) if many else step - float(self.arrived[first] - self.arrived[last])
+            ahead = (
+                self._by_arrival(last, first)
+                if many
+                else step - float(self.arrived[first] - self.arrived[last])
+            )
             return bool(ahead < LARGEST_STEP_BACK)
         if step <= self.limit:
             return True
         if many:
-            others = any(end > t[last] + self.limit for end in ends) and step <= PAUSE  # that went on meanwhile
+            others = (
+                any(end > t[last] + self.limit for end in ends) and step <= PAUSE
+            )  # that went on meanwhile
             return others and not self._sure(last, first, following, ends)
         if following is None:
             return any(end + self.limit > t[first] for end in ends)
-        return step <= PAUSE and -LARGEST_STEP_BACK <= float(self.t[self.finite[following]] - self.t[first]) <= PAUSE
+        return (
+            step <= PAUSE
+            and -LARGEST_STEP_BACK <= float(self.t[self.finite[following]] - self.t[first]) <= PAUSE
+        )
 
     def _falls(self, first: int, following: int | None) -> bool:
-        return following is not None and bool(self.t[self.finite[following]] < self.t[first] - LARGEST_STEP_BACK)
+        return following is not None and bool(
+            self.t[self.finite[following]] < self.t[first] - LARGEST_STEP_BACK
+        )
 
     def _sure(self, last: int, first: int, following: int | None, ends: Sequence[float]) -> bool:
-        """Whether the step between two messages is certainly of the clock: by arrivals, because the stamps fall back soon, or because the
-        stream ends with others only without it."""
+        """Whether the step between two messages is certainly of the clock: by arrivals, because the
+        stamps fall back soon, or because the stream ends with others only without it.
+        """
         step = float(self.t[first] - self.t[last])
         if self.arrived is not None or step < 0.0 or self._falls(first, following):
             return True
@@ -221,11 +297,18 @@ class _Stream:
         """By how much the clock jumped, s, by the arrivals of the messages on both sides."""
         assert self.arrived is not None
         ahead = self.t - self.arrived
-        return float(np.median(ahead[first : first + NEAR]) - np.median(ahead[max(0, last + 1 - NEAR) : last + 1]))
+        return float(
+            np.median(ahead[first : first + NEAR])
+            - np.median(ahead[max(0, last + 1 - NEAR) : last + 1])
+        )
 
     def _size(self, last: int, first: int) -> float:
         step = float(self.t[first] - self.t[last])
-        return min(step, self._by_arrival(last, first)) if self.arrived is not None else step - self.usual
+        return (
+            min(step, self._by_arrival(last, first))
+            if self.arrived is not None
+            else step - self.usual
+        )
 
     def shifts(self) -> np.ndarray | None:
         """(n,) s to be added to its stamps; None for nothing."""
@@ -252,7 +335,9 @@ def _sound(arrived: np.ndarray) -> bool:
 
 
 def _groups(streams: list[_Stream]) -> Iterator[list[tuple[_Stream, _Break]]]:
-    """Breaks of several streams that are one jump of their clock, each with its stream; the quickest stream comes first."""
+    """Breaks of several streams that are one jump of their clock, each with its stream; the
+    quickest stream comes first.
+    """
     left = {stream.name: list(stream.breaks) for stream in streams}
     for stream in sorted(streams, key=lambda stream: (stream.name not in LEADING, stream.usual)):
         while left[stream.name]:
@@ -261,7 +346,10 @@ def _groups(streams: list[_Stream]) -> Iterator[list[tuple[_Stream, _Break]]]:
             left[stream.name].remove(one)
             for other in (other for other in streams if other is not stream):
                 for its in left[other.name]:
-                    near = abs(its.by - one.by) < TOGETHER and abs(other.t[its.last] - stream.t[one.last]) < TOGETHER + other.usual
+                    near = (
+                        abs(its.by - one.by) < TOGETHER
+                        and abs(other.t[its.last] - stream.t[one.last]) < TOGETHER + other.usual
+                    )
                     if near:
                         group.append((other, its))
                         left[other.name].remove(its)
@@ -272,8 +360,9 @@ def _groups(streams: list[_Stream]) -> Iterator[list[tuple[_Stream, _Break]]]:
 def _of_group(
     group: list[tuple[_Stream, _Break]], every: Mapping[str, _Stream]
 ) -> tuple[Jump, list[tuple[_Stream, _Break]]] | None:
-    """The Jump of one clock, by whose size all its streams are shifted from there on; None where some of them were silent, others
-    not."""
+    """The Jump of one clock, by whose size all its streams are shifted from there on; None where
+    some of them were silent, others not.
+    """
     by = min(one.by for _, one in group)
     known = [(stream, one) for stream, one in group if stream.arrived is not None]
     if known:
@@ -302,7 +391,11 @@ def _join_late(stream: _Stream, every: Mapping[str, _Stream]) -> None:
     first, last = float(stream.t[stream.finite[0]]), stream.end
     for other in every.values():
         if other.breaks:
-            fits = [shift for begin, end, shift in other.runs() if begin - TOGETHER <= first and last <= end + TOGETHER]
+            fits = [
+                shift
+                for begin, end, shift in other.runs()
+                if begin - TOGETHER <= first and last <= end + TOGETHER
+            ]
             if len(fits) == 1:
                 stream.offset = fits[0]
                 return
@@ -315,22 +408,38 @@ def sentences(clock: Straightened) -> Iterator[str]:
         yield f"{cause}: {done}."
     for name, count in clock.outliers.items():
         of = f"{count} of {len(clock.kept[name])} messages"
-        yield f"{WORDS.get(name, name)}: {of} left out, their stamps are far from those of their neighbours."
+        yield (
+            f"{WORDS.get(name, name)}: {of} left out, their stamps are far from those of their "
+            "neighbours."
+        )
 
 
 def in_words(jump: Jump) -> tuple[str, str]:
     """(what the clock did, what was done about it) of a Jump."""
     who = " and ".join(dict.fromkeys(WORDS.get(name, name) for name in jump.streams))
-    where = f"at message {jump.message} of {WORDS.get(jump.streams[0], jump.streams[0])}, {jump.after:.1f} s after the first"
+    where = (
+        f"at message {jump.message} of {WORDS.get(jump.streams[0], jump.streams[0])}, "
+        f"{jump.after:.1f} s after the first"
+    )
     shifted = f"the stamps after it are shifted by {-jump.by:+.3f} s"
     if jump.kind == WRAP:
         return f"the clock of {who} wraps at {jump.period} ({-jump.by:.3f} s) {where}", shifted
     if jump.kind == RESTART:
-        anew = ", and the filter starts anew there" if not set(jump.streams).isdisjoint(LEADING) else ""
-        return f"the clock of {who} started again {where}: it fell back by {_long(-jump.by)}", shifted + anew
+        anew = (
+            ", and the filter starts anew there"
+            if not set(jump.streams).isdisjoint(LEADING)
+            else ""
+        )
+        return (
+            f"the clock of {who} started again {where}: it fell back by {_long(-jump.by)}",
+            shifted + anew,
+        )
     if jump.kind == SET:
         return f"the clock of {who} was set forward {where}, by {_long(jump.by)}", shifted
-    return f"the recorder paused, or the clock of {who} was set forward, by {_long(jump.by)} {where}", "no stamp is changed"
+    return (
+        f"the recorder paused, or the clock of {who} was set forward, by {_long(jump.by)} {where}",
+        "no stamp is changed",
+    )
 
 
 def _long(seconds: float) -> str:
@@ -341,8 +450,10 @@ def _long(seconds: float) -> str:
 
 
 def apart(stamps: Mapping[str, np.ndarray]) -> Iterator[tuple[str, float, int]]:
-    """(stream, s by which its stamps are ahead, messages) of those of which no message is stamped within the time of the TDOAs, or which
-    begins and ends as much later, or earlier, than these. stamps : {stream: (n,) s}; "tdoa" is one of them."""
+    """(stream, s by which its stamps are ahead, messages) of those of which no message is stamped
+    within the time of the TDOAs, or which begins and ends as much later, or earlier, than these.
+    stamps : {stream: (n,) s}; "tdoa" is one of them.
+    """
     tdoa = stamps["tdoa"][np.isfinite(stamps["tdoa"])]
     if not len(tdoa):
         return
@@ -353,7 +464,11 @@ def apart(stamps: Mapping[str, np.ndarray]) -> Iterator[tuple[str, float, int]]:
             continue
         begin, end = float(t.min()) - first, float(t.max()) - last
         outside = t.min() > last or t.max() < first
-        alike = begin * end > 0.0 and min(abs(begin), abs(end)) > LARGEST_STEP_BACK and abs(end - begin) < 0.3 * abs(begin + end) / 2.0
+        alike = (
+            begin * end > 0.0
+            and min(abs(begin), abs(end)) > LARGEST_STEP_BACK
+            and abs(end - begin) < 0.3 * abs(begin + end) / 2.0
+        )
         if outside or (alike and name == "imu"):
             yield name, 0.5 * (begin + end), len(t)
 
@@ -361,23 +476,31 @@ def apart(stamps: Mapping[str, np.ndarray]) -> Iterator[tuple[str, float, int]]:
 def sentence_on(name: str, ahead: float, count: int, first: str = "TDOAs") -> str:
     """What is to be said of a stream that is `apart`."""
     return (
-        f"the stamps of {WORDS.get(name, name)} are {abs(ahead):.3f} s {'ahead of' if ahead > 0.0 else 'behind'} those of the {first}: "
+        f"the stamps of {WORDS.get(name, name)} are {abs(ahead):.3f} s "
+        f"{'ahead of' if ahead > 0.0 else 'behind'} those of the {first}: "
         f"none of its {count} messages can be used as they are; check names the remedy"
     )
 
 
 def numbered(t: np.ndarray, length: float) -> np.ndarray:
-    """(n,) number of the stretch of `length`, s, in which each of t (n,) s is, from 0: without the empty ones where most would be empty, so
-    that an array with a place for each takes no more room than t."""
-    number = ((t - np.min(t, initial=np.inf)) / length).astype(np.int64) if len(t) else np.zeros(0, np.int64)
+    """(n,) number of the stretch of `length`, s, in which each of t (n,) s is, from 0: without the
+    empty ones where most would be empty, so that an array with a place for each takes no more room
+    than t.
+    """
+    number = (
+        ((t - np.min(t, initial=np.inf)) / length).astype(np.int64)
+        if len(t)
+        else np.zeros(0, np.int64)
+    )
     if len(t) and number.max() >= len(t):
         number = np.unique(number, return_inverse=True)[1].reshape(-1)
     return number
 
 
 def grid(begin: float, end: float, step: float, t: np.ndarray) -> np.ndarray:
-    """Times from `begin` to before `end`, every `step`, s; only those up to `step` before one of t (n,) s where they would be far more
-    than these."""
+    """Times from `begin` to before `end`, every `step`, s; only those up to `step` before one of t
+    (n,) s where they would be far more than these.
+    """
     if end - begin <= step * SPARSE * max(len(t), 1000):
         return np.arange(begin, max(begin, end), step)
     inside = t[(t >= begin) & (t < end)]

@@ -16,7 +16,8 @@ from uwb_tdoa_ekf.smoother import smooth
 class FlightEstimator:
     """estimator(flight) is the Run over a Flight; its ground truth is not used. Can be pickled.
 
-    config : FilterConfig; effects, network : what the TDOAs are corrected with, or None; smoothed : use what came after each
+    config : FilterConfig; effects, network : what the TDOAs are corrected with, or None; smoothed :
+        use what came after each
     estimate too.
     """
 
@@ -27,17 +28,26 @@ class FlightEstimator:
 
     def __call__(self, flight: Flight) -> Run:
         engine = smooth if self.smoothed else run_offline
-        return engine(flight, self.config, Corrector(flight.anchors, with_antenna(self.effects, flight), self.network))
+        return engine(
+            flight,
+            self.config,
+            Corrector(flight.anchors, with_antenna(self.effects, flight), self.network),
+        )
 
     @property
     def correction(self) -> str:
         """What it corrects with, in words."""
-        names = "+".join(part.name for part in (self.effects, self.network) if part) or "nothing (neither effects nor a network are in use)"
+        names = (
+            "+".join(part.name for part in (self.effects, self.network) if part)
+            or "nothing (neither effects nor a network are in use)"
+        )
         return names + (f" ({UNPROVEN})" if self.network and self.network.name == SHIPPED else "")
 
 
 def with_antenna(effects: EffectSet | None, flight: Flight) -> EffectSet | None:
-    """An EffectSet, or None, and the lever arm of the antenna that the recording of a Flight gives, unless it holds one."""
+    """An EffectSet, or None, and the lever arm of the antenna that the recording of a Flight gives,
+    unless it holds one.
+    """
     arm, known = flight.meta.get("antenna"), effects.effects if effects else ()
     if not arm or not any(arm) or any(effect.name == TagLeverArm.name for effect in known):
         return effects

@@ -8,7 +8,9 @@ import numpy as np
 
 
 def as_json(value: Any) -> Any:
-    """A value, or dicts and sequences of values, as JSON has them: NaN and infinity are null, arrays lists."""
+    """A value, or dicts and sequences of values, as JSON has them: NaN and infinity are null,
+    arrays lists.
+    """
     if isinstance(value, dict):
         return {str(key): as_json(item) for key, item in value.items()}
     if isinstance(value, (list, tuple, np.ndarray)):

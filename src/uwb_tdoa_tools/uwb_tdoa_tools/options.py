@@ -1,23 +1,23 @@
 """Options that several commands share, and what they ask for.
 
-    options.add_recordings(parser)                  # FLIGHT..., --survey, --namespace, --topic, --salvage
-    options.add_filter(parser)                      # --effects, --config
-    options.add_estimator(parser)                   # these, --model, --no-bias, -p, --without, --smooth
-    options.add_most(parser, 10**6)                 # --most
-    options.add_bag(parser)                         # --storage, --force
-    options.add_holdout(parser)                     # --holdout
-    options.add_known(parser)                       # --marks, --distances
-    options.add_tape(parser)                        # --std, --height-std, --trusted, --trusted-std, --unknown
-    options.add_align(parser)                       # --align
-    options.add_rerun(parser)                       # --rerun
-    reading, (config, effects) = options.reading_of(args), options.filter_of(args)
+options.add_recordings(parser)                  # FLIGHT..., --survey, --namespace, --topic, --salvage
+options.add_filter(parser)                      # --effects, --config
+options.add_estimator(parser)                   # these, --model, --no-bias, -p, --without, --smooth
+options.add_most(parser, 10**6)                 # --most
+options.add_bag(parser)                         # --storage, --force
+options.add_holdout(parser)                     # --holdout
+options.add_known(parser)                       # --marks, --distances
+options.add_tape(parser)                        # --std, --height-std, --trusted, --trusted-std, --unknown
+options.add_align(parser)                       # --align
+options.add_rerun(parser)                       # --rerun
+reading, (config, effects) = options.reading_of(args), options.filter_of(args)
 """
 
 from __future__ import annotations
 
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from uwb_tdoa_bias.correction.network import UNPROVEN, load_network
 from uwb_tdoa_bias.effects import EffectSet
@@ -28,8 +28,8 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 
 from .bags.files import STORAGES
 from .diagnosis.self_calibration import Tape
-from .localizing import rerun_file
 from .estimate import FlightEstimator
+from .localizing import rerun_file
 from .outputs import OutputFile
 from .parallel import whole_number
 from .readers import inputs
@@ -40,14 +40,20 @@ from .surveying.marks import read_marks
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
     from collections.abc import Callable, Iterable, Sequence
+
     from uwb_tdoa_bias.foundation.flight import Flight
+
     from .diagnosis.constraints.distance import Distance
     from .diagnosis.constraints.mark import Mark
 
 TOPICS = (  # that are read from bags
-    "uwb/tdoa", "uwb/anchors", "imu/data", *(topic for sensor in SENSORS.values() for topic, _ in sensor.topics),
-    "ground_truth/pose", "odometry",
-)  # fmt: skip
+    "uwb/tdoa",
+    "uwb/anchors",
+    "imu/data",
+    *(topic for sensor in SENSORS.values() for topic, _ in sensor.topics),
+    "ground_truth/pose",
+    "odometry",
+)
 
 
 def add_recordings(parser: ArgumentParser, nargs: str = "+") -> None:
@@ -62,10 +68,18 @@ def add_reading(parser: ArgumentParser) -> None:
     add("--survey", metavar="S", help=inputs.SURVEY_HELP)
     add("--namespace", default="", metavar="NS", help="of the tag's topics in bags, e.g. tag1")
     add(
-        "--topic", dest="topics", action="append", default=[], metavar="OURS=THEIRS",
+        "--topic",
+        dest="topics",
+        action="append",
+        default=[],
+        metavar="OURS=THEIRS",
         help="a topic of bags that has another name there, e.g. uwb/tdoa=/my/tdoa; may be repeated",
-    )  # fmt: skip
-    add("--salvage", action="store_true", help="read cut or damaged recordings as far as they are sound, with a remark")
+    )
+    add(
+        "--salvage",
+        action="store_true",
+        help="read cut or damaged recordings as far as they are sound, with a remark",
+    )
 
 
 def reading_of(args: Namespace, truth: bool = True) -> inputs.Reading:
@@ -74,17 +88,23 @@ def reading_of(args: Namespace, truth: bool = True) -> inputs.Reading:
     for text in args.topics:
         ours, given, theirs = text.partition("=")
         if not given or ours not in TOPICS or not theirs.strip("/") or ours in topics:
-            raise InputError(f"--topic: {text!r} is not OURS=THEIRS, where OURS, once, is one of {', '.join(TOPICS)}.")
+            raise InputError(
+                f"--topic: {text!r} is not OURS=THEIRS, where OURS, once, is one of "
+                f"{', '.join(TOPICS)}."
+            )
         topics[ours] = theirs
     return inputs.Reading(args.survey, args.namespace, topics, args.salvage, truth)
 
 
 def add_filter(
-    parser: ArgumentParser, effects: str = "effects.yaml to correct the TDOAs with, before the filter"
+    parser: ArgumentParser,
+    effects: str = "effects.yaml to correct the TDOAs with, before the filter",
 ) -> None:
     """--effects and --config. effects : help of the first."""
     parser.add_argument("--effects", metavar="FILE", help=effects)
-    parser.add_argument("--config", metavar="FILE", help="filter parameters, as for ekf_node (ekf_node.yaml)")
+    parser.add_argument(
+        "--config", metavar="FILE", help="filter parameters, as for ekf_node (ekf_node.yaml)"
+    )
 
 
 def filter_of(args: Namespace) -> tuple[FilterConfig, EffectSet | None]:
@@ -94,19 +114,29 @@ def filter_of(args: Namespace) -> tuple[FilterConfig, EffectSet | None]:
 
 
 def add_estimator(parser: ArgumentParser) -> None:
-    """--effects, --config, --model, --no-bias, -p, --without and --smooth: how positions are estimated."""
+    """--effects, --config, --model, --no-bias, -p, --without and --smooth: how positions are
+    estimated.
+    """
     add_filter(parser, "effects.yaml: systematic effects to correct for")
     add_model(parser)
     add = parser.add_argument
     add("--no-bias", action="store_true", help="correct for nothing, whatever else is given")
     add(
-        "-p", dest="parameters", metavar="NAME:=VALUE", action="append", default=[],
+        "-p",
+        dest="parameters",
+        metavar="NAME:=VALUE",
+        action="append",
+        default=[],
         help="one filter parameter, before --config",
-    )  # fmt: skip
+    )
     add(
-        "--without", metavar="AID", action="append", default=[], choices=tuple(SENSORS),
+        "--without",
+        metavar="AID",
+        action="append",
+        default=[],
+        choices=tuple(SENSORS),
         help=f"not to be used though it is there: {', '.join(SENSORS)}; may be repeated",
-    )  # fmt: skip
+    )
     add("--smooth", action="store_true", help="smooth: use what came after each estimate too")
 
 
@@ -117,16 +147,24 @@ def add_model(parser: ArgumentParser) -> None:
 
 
 def estimator_of(args: Namespace, say: Callable[[str], object]) -> FlightEstimator:
-    """The FlightEstimator that those options ask for. say(sentence) : called with what it lacks. Raises InputError."""
+    """The FlightEstimator that those options ask for. say(sentence) : called with what it lacks.
+
+    Raises InputError.
+    """
     config, effects = filter_of(args)
-    config = with_parameters(config, args.parameters + [f"use_{aid}:=false" for aid in args.without])
+    config = with_parameters(
+        config, args.parameters + [f"use_{aid}:=false" for aid in args.without]
+    )
     if args.no_bias:
         return FlightEstimator(config, smoothed=args.smooth)
     network = load_network(args.model)
     given = {effect.name for effect in effects.effects} if effects else set()
     if network and (lacking := sorted(set(network.trained_with) - given)):
-        say(f"{args.model} was trained with {', '.join(lacking)} taken out, which no --effects gives; give the effects.yaml that was "
-            "written beside it.")  # fmt: skip
+        say(
+            f"{args.model} was trained with {', '.join(lacking)} taken out, which no "
+            "--effects gives; give the effects.yaml that was "
+            "written beside it."
+        )
     return FlightEstimator(config, effects, network, args.smooth)
 
 
@@ -137,66 +175,130 @@ def given(args: Namespace, name: str) -> bool:
 
 
 def refuse(args: Namespace, names: Iterable[str], because: str) -> None:
-    """Raise InputError for the first of some options that is given and has no part in what is asked for, rather than pass it over."""
+    """Raise InputError for the first of some options that is given and has no part in what is asked
+    for, rather than pass it over.
+    """
     for name in names:
         if given(args, name):
-            option = {"parameters": "-p", "topics": "--topic"}.get(name, f"--{name.replace('_', '-')}")
+            option = {"parameters": "-p", "topics": "--topic"}.get(
+                name, f"--{name.replace('_', '-')}"
+            )
             raise InputError(f"{option}: {because}; leave it out.")
 
 
 def add_bag(parser: ArgumentParser) -> None:
     """--storage and --force: how a bag is written."""
-    parser.add_argument("--storage", choices=STORAGES, default="mcap", help="kind of bag (default: mcap)")
+    parser.add_argument(
+        "--storage", choices=STORAGES, default="mcap", help="kind of bag (default: mcap)"
+    )
     parser.add_argument("--force", action="store_true", help="replace an existing bag")
 
 
 def add_holdout(parser: ArgumentParser) -> None:
     """--holdout."""
-    parser.add_argument("--holdout", nargs="+", default=[], metavar="FLIGHT", help="flights to judge on, not to fit")
+    parser.add_argument(
+        "--holdout", nargs="+", default=[], metavar="FLIGHT", help="flights to judge on, not to fit"
+    )
 
 
 def check_holdout(fitted: Iterable[str | Path], held: Iterable[str | Path]) -> None:
     """Raise InputError if a flight to judge on, by its name or its path, is also one to fit."""
     if shared := set(fitted) & set(held):
-        raise InputError(f"--holdout: {min(map(str, shared))} is also a FLIGHT to fit; leave it out of one of them.")
+        raise InputError(
+            f"--holdout: {min(map(str, shared))} is also a FLIGHT to fit; leave it out of one "
+            "of them."
+        )
 
 
 def add_most(parser: ArgumentParser, default: int) -> None:
     """--most: how many TDOAs to learn from at most."""
     parser.add_argument(
-        "--most", metavar="N", type=whole_number, default=default,
-        help="TDOAs to hold at most, by which memory and time are bounded: of flights with more, some are drawn (default %(default)s)",
-    )  # fmt: skip
+        "--most",
+        metavar="N",
+        type=whole_number,
+        default=default,
+        help=(
+            "TDOAs to hold at most, by which memory and time are bounded: of flights with more, "
+            "some are drawn (default %(default)s)"
+        ),
+    )
 
 
-OF_TAPE = "std", "height_std", "trusted", "trusted_std"  # fields of Tape, for which the covariance of the last calibration stands
+OF_TAPE = (
+    "std",
+    "height_std",
+    "trusted",
+    "trusted_std",
+)  # fields of Tape, for which the covariance of the last calibration stands
 
 
 def add_tape(parser: ArgumentParser) -> None:
     """--std, --height-std, --trusted, --trusted-std and --unknown: how well anchors are known."""
     add = parser.add_argument
-    add("--std", type=float, metavar="M", help=f"m, standard deviation of a coordinate as given (default {Tape.std:g})")
-    add("--height-std", type=float, metavar="M", help="m, the same of heights, which are easier to measure")
-    add("--trusted", nargs="+", default=[], metavar="A", help="anchors (3) or coordinates (3.z) that are known well")
-    add("--trusted-std", type=float, metavar="M", help=f"m, how well those are known (default {Tape.trusted_std:g})")
-    add("--unknown", nargs="+", default=[], metavar="A", help="anchors whose position is not known at all")
+    add(
+        "--std",
+        type=float,
+        metavar="M",
+        help=f"m, standard deviation of a coordinate as given (default {Tape.std:g})",
+    )
+    add(
+        "--height-std",
+        type=float,
+        metavar="M",
+        help="m, the same of heights, which are easier to measure",
+    )
+    add(
+        "--trusted",
+        nargs="+",
+        default=[],
+        metavar="A",
+        help="anchors (3) or coordinates (3.z) that are known well",
+    )
+    add(
+        "--trusted-std",
+        type=float,
+        metavar="M",
+        help=f"m, how well those are known (default {Tape.trusted_std:g})",
+    )
+    add(
+        "--unknown",
+        nargs="+",
+        default=[],
+        metavar="A",
+        help="anchors whose position is not known at all",
+    )
 
 
 def tape_of(args: Namespace, effects: EffectSet | None) -> Tape:
-    """The Tape that those options speak of. effects : EffectSet of --effects, or None: what its covariance says of all anchors stands
-    against no option. Raises InputError."""
+    """The Tape that those options speak of. effects : EffectSet of --effects, or None: what its
+    covariance says of all anchors stands against no option. Raises InputError.
+    """
     if effects is not None and effects.covariance is not None:
-        refuse(args, OF_TAPE, f"{args.effects} says how well each anchor is known, by its last calibration")
-    return Tape(**{name: getattr(args, name) for name in OF_TAPE if given(args, name)}, unknown=tuple(args.unknown))
+        refuse(
+            args,
+            OF_TAPE,
+            f"{args.effects} says how well each anchor is known, by its last calibration",
+        )
+    return Tape(
+        **{name: getattr(args, name) for name in OF_TAPE if given(args, name)},
+        unknown=tuple(args.unknown),
+    )
 
 
 def add_align(parser: ArgumentParser, judges: bool = False) -> None:
-    """--align. judges : of a tool that judges by ground truth, and may move its frame too; else of what learns from it."""
-    words = "ground truth on another clock (another epoch): none refuses it (default), time finds how far they are apart"
+    """--align. judges : of a tool that judges by ground truth, and may move its frame too; else of
+    what learns from it.
+    """
+    words = (
+        "ground truth on another clock (another epoch): none refuses it (default), time finds how "
+        "far they are apart"
+    )
     if judges:
         words = (
-            "what of the ground truth to move onto the estimate before it is judged: none (default); time, its stamps; frame, its frame too, "
-            "turned and shifted (as evo -a, without scale). What is found is told in any case, with the error of each"
+            "what of the ground truth to move onto the estimate before it is judged: none "
+            "(default); time, its stamps; frame, its frame too, "
+            "turned and shifted (as evo -a, without scale). What is found is told in any "
+            "case, with the error of each"
         )
     parser.add_argument("--align", choices=ALIGN if judges else ALIGN[:2], default=NONE, help=words)
 
@@ -207,8 +309,9 @@ def add_rerun(parser: ArgumentParser) -> None:
 
 
 def rerun_of(args: Namespace, count: int, say: Callable[[str], object]) -> Path | None:
-    """Path of the file that --rerun asks for; None without it, or without the library, which say(sentence) reports. count : of
-    flights, of which it shows one. Raises InputError."""
+    """Path of the file that --rerun asks for; None without it, or without the library, which
+    say(sentence) reports. count : of flights, of which it shows one. Raises InputError.
+    """
     if not args.rerun:
         return None
     if count != 1:
@@ -219,8 +322,16 @@ def rerun_of(args: Namespace, count: int, say: Callable[[str], object]) -> Path 
 def add_known(parser: ArgumentParser) -> None:
     """--marks and --distances: what is known beside a recording."""
     add = parser.add_argument
-    add("--marks", metavar="FILE", help="YAML: measured places where the tag stood or passed, and when (docs/calibration.md)")
-    add("--distances", metavar="FILE", help="CSV with columns a, b, distance, std: measured distances between anchors, m")
+    add(
+        "--marks",
+        metavar="FILE",
+        help="YAML: measured places where the tag stood or passed, and when (docs/calibration.md)",
+    )
+    add(
+        "--distances",
+        metavar="FILE",
+        help="CSV with columns a, b, distance, std: measured distances between anchors, m",
+    )
 
 
 def known_of(args: Namespace, flights: Sequence[Flight]) -> tuple[Mark | Distance, ...]:

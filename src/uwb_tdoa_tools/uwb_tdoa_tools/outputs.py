@@ -1,5 +1,5 @@
-"""What a command writes: its options have one of these types, and are checked before the work. No output follows a link, or changes an
-input or a bag.
+"""What a command writes: its options have one of these types, and are checked before the work. No
+output follows a link, or changes an input or a bag.
 
     add("--json", metavar="FILE", type=OutputFile)
     add("--out", metavar="DIR", type=OutputFolder)
@@ -14,7 +14,7 @@ from contextlib import AbstractContextManager
 import os
 from pathlib import Path
 import tempfile
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.files import keeping, refuse_output
@@ -41,9 +41,12 @@ class OutputBag(Output):
 
 
 def checked(args: Namespace) -> AbstractContextManager[None]:
-    """A context in which nothing is written over what the other options name. Raises InputError for an output that cannot be written, is
-    reached over a link, or would change what is read or a bag."""
-    values = list(_flat(value for name, value in vars(args).items() if name != "ros_arguments"))  # which hold the whole command line
+    """A context in which nothing is written over what the other options name. Raises InputError for
+    an output that cannot be written, is reached over a link, or would change what is read or a bag.
+    """
+    values = list(
+        _flat(value for name, value in vars(args).items() if name != "ros_arguments")
+    )  # which hold the whole command line
     outputs = [value for value in values if isinstance(value, Output)]
     inputs = [Path(value) for value in values if not isinstance(value, Output) and _is_there(value)]
     with keeping(inputs):
@@ -105,4 +108,6 @@ def _check_writable(path: Path, folder: Path) -> None:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}: {folder}); give another place.") from error
+        raise InputError(
+            f"{path}: cannot be written ({error.strerror}: {folder}); give another place."
+        ) from error

@@ -1,9 +1,10 @@
-"""Telling that long work goes on: on a terminal in one line, by tqdm; elsewhere in a line every few seconds, which tqdm cannot.
+"""Telling that long work goes on: on a terminal in one line, by tqdm; elsewhere in a line every few
+seconds, which tqdm cannot.
 
-    with Progress("diagnose") as progress:                       # what is done is printed by a thread of its own
-        progress("looking at ids")
-    with Progress("evaluate", total=22, unit="flight") as progress:
-        progress.update()                                        # one more is done
+with Progress("diagnose") as progress:                       # what is done is printed by a thread of its own
+    progress("looking at ids")
+with Progress("evaluate", total=22, unit="flight") as progress:
+    progress.update()                                        # one more is done
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from __future__ import annotations
 import sys
 from threading import Event, Thread
 import time
-from typing import TextIO, TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, TextIO, TypeVar
 
 from tqdm import tqdm
 
@@ -25,14 +26,22 @@ OFTEN = 0.5  # s between two changes of the line on a terminal
 
 
 class Progress:
-    """As a context, says what is being done, how much of it is done, and for how long, until it ends; whatever takes shorter than
-    FIRST says nothing. Call it with what is being done, as often as you like."""
+    """As a context, says what is being done, how much of it is done, and for how long, until it
+    ends; whatever takes shorter than FIRST says nothing. Call it with what is being done, as often
+    as you like.
+    """
 
     def __init__(
-        self, name: str = "", total: int | None = None, unit: str = "", stream: TextIO | None = None, what: str = ""
+        self,
+        name: str = "",
+        total: int | None = None,
+        unit: str = "",
+        stream: TextIO | None = None,
+        what: str = "",
     ) -> None:
-        """name : what the lines begin with; total : of what is to be done, in `unit`, or None; stream : where to, default stderr; what :
-        what is done first."""
+        """name : what the lines begin with; total : of what is to be done, in `unit`, or None;
+        stream : where to, default stderr; what : what is done first.
+        """
         self._name, self._total, self._unit, self._stream = name, total, unit, stream
         self._what, self._done, self._ended = what, 0, Event()
 
@@ -57,7 +66,11 @@ class Progress:
         stream = self._stream or sys.stderr
         self._start, self._bar = time.monotonic(), None
         if stream.isatty():
-            form = {"bar_format": "{desc}"} if self._total is None else {"desc": self._name or None, "unit": self._unit}
+            form = (
+                {"bar_format": "{desc}"}
+                if self._total is None
+                else {"desc": self._name or None, "unit": self._unit}
+            )
             self._bar = tqdm(total=self._total, file=stream, leave=False, **form)
         self._thread = Thread(target=self._tell, args=(stream,), daemon=True)
         self._thread.start()

@@ -1,12 +1,13 @@
-"""Results of long work in a file, each as a line of JSON as soon as it is there: what was interrupted goes on where it was.
+"""Results of long work in a file, each as a line of JSON as soon as it is there: what was
+interrupted goes on where it was.
 
     with ResultsFile(path, {"seed": 1}) as done:            # what they depend on, besides their keys
         for key in (key for key in keys if key not in done):
             done[key] = work(key)
         results = [done[key] for key in keys]
 
-The first line is what was asked for; every other one is {"key": ..., "result": ...}. Results stay in the file: only the
-places of their lines are held.
+The first line is what was asked for; every other one is {"key": ..., "result": ...}. Results stay
+in the file: only the places of their lines are held.
 """
 
 from __future__ import annotations
@@ -17,18 +18,19 @@ import json
 import os
 from pathlib import Path
 import sys
-from typing import Any, TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from tqdm import tqdm
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.files import read_bytes, refuse_output
-from uwb_tdoa_bias.foundation.limits import Budget, FOLDER_ENTRIES
+from uwb_tdoa_bias.foundation.limits import FOLDER_ENTRIES, Budget
 from uwb_tdoa_bias.foundation.version import written_by
 
 if TYPE_CHECKING:
     from argparse import Namespace
     from collections.abc import Callable, Iterable, Iterator, Sequence
+
     from .parallel import MapFunction
 
 Item = TypeVar("Item")
@@ -39,11 +41,16 @@ LINE = 64 << 20  # bytes of one result
 
 
 class ResultsFile:
-    """Results by their keys, texts, in the file `path`; one that is not there is made. Results are what JSON takes, no NaN."""
+    """Results by their keys, texts, in the file `path`; one that is not there is made.
+
+    Results are what JSON takes, no NaN.
+    """
 
     def __init__(self, path: str | Path, asked: dict[str, Any]) -> None:
-        """asked : dict for JSON, all that results depend on besides their keys. Raises InputError if the file holds
-        something else, or results that were made by another version, or with something else asked for."""
+        """asked : dict for JSON, all that results depend on besides their keys. Raises InputError
+        if the file holds something else, or results that were made by another version, or with
+        something else asked for.
+        """
         self._path = Path(path)
         self._places: dict[str, int] = {}  # of the lines, by their keys
         asked = json.loads(json.dumps({"written_by": written_by(), **asked}))
@@ -74,7 +81,8 @@ class ResultsFile:
         different = sorted(key for key in {*before, *asked} if before.get(key) != asked.get(key))
         if different:
             raise InputError(
-                f"{self._path}: its results were made with another {' and '.join(different)}; ask for the same, or name another file."
+                f"{self._path}: its results were made with another {' and '.join(different)}; "
+                "ask for the same, or name another file."
             )
         budget = Budget(self._path, os.fstat(self._file.fileno()).st_size)
         while line := self._file.readline(LINE):
@@ -101,20 +109,39 @@ class ResultsFile:
         """parse(result). Raises InputError where that fails: anybody may have written the file."""
         try:
             return parse(self[key])
-        except (AssertionError, AttributeError, IndexError, KeyError, OverflowError, TypeError, ValueError):
+        except (
+            AssertionError,
+            AttributeError,
+            IndexError,
+            KeyError,
+            OverflowError,
+            TypeError,
+            ValueError,
+        ):
             raise self._foreign() from None
 
     def __setitem__(self, key: str, result: object) -> None:
         self._places[key] = self._append({"key": key, "result": result})
 
     def keys_done(
-        self, keys: Sequence[str], items: Sequence[Item], make: Callable[[Iterable[Item]], Iterable[object]], unit: str
+        self,
+        keys: Sequence[str],
+        items: Sequence[Item],
+        make: Callable[[Iterable[Item]], Iterable[object]],
+        unit: str,
     ) -> Iterator[str]:
-        """Generator of keys, in turn, each when its result is here. make(items) : results of those that are not there, in order; unit :
-        what items are called, in words."""
+        """Generator of keys, in turn, each when its result is here. make(items) : results of those
+        that are not there, in order; unit : what items are called, in words.
+        """
         missing = {key: item for key, item in zip(keys, items) if key not in self}
         if len(missing) < len(items):
-            tqdm.write(f"{self._path} holds {len(items) - len(missing)} of {len(items)} {unit}; going on with the others", sys.stderr)
+            tqdm.write(
+                (
+                    f"{self._path} holds {len(items) - len(missing)} of {len(items)} {unit}; "
+                    "going on with the others"
+                ),
+                sys.stderr,
+            )
         made = iter(make(missing.values()))
         for key in keys:
             if key not in self:
@@ -145,12 +172,15 @@ class ResultsFile:
         return content
 
     def _foreign(self) -> InputError:
-        return InputError(f"{self._path}: holds something else than results of this tool; name another file.")
+        return InputError(
+            f"{self._path}: holds something else than results of this tool; name another file."
+        )
 
 
 def resumed(over: MapFunction, done: ResultsFile) -> MapFunction:
-    """over(function, items), as of `parallel.over`, that takes from a ResultsFile what is there, by the name of the function and the
-    place of the item, and keeps there what is not."""
+    """over(function, items), as of `parallel.over`, that takes from a ResultsFile what is there, by
+    the name of the function and the place of the item, and keeps there what is not.
+    """
 
     def over_missing(function: Callable[[Item], Made], items: Iterable[Item]) -> Iterator[Made]:
         name, items = getattr(function, "func", function).__name__, list(items)
@@ -162,7 +192,10 @@ def resumed(over: MapFunction, done: ResultsFile) -> MapFunction:
 
 
 def state_of(path: str | Path | None) -> str:
-    """What changes when a file or a folder of files does: a text; of None "None". Raises OSError and InputError."""
+    """What changes when a file or a folder of files does: a text; of None "None".
+
+    Raises OSError and InputError.
+    """
     if path is None:
         return "None"
     path = Path(path).absolute()
@@ -170,13 +203,25 @@ def state_of(path: str | Path | None) -> str:
     for inside in path.iterdir() if path.is_dir() else ():
         budget.spend("entries", 1, FOLDER_ENTRIES)
         files.append(inside)
-    return f"{path} {sum(file.stat().st_size for file in files if file.is_file())} {max(file.stat().st_mtime_ns for file in files)}"
+    return (
+        f"{path} {sum(file.stat().st_size for file in files if file.is_file())} "
+        f"{max(file.stat().st_mtime_ns for file in files)}"
+    )
 
 
-def asked_of(args: Namespace, besides: Iterable[str] = (), files: Iterable[str] = ()) -> dict[str, Any]:
-    """What was asked of a command: {option: value}, JSON. besides : names of options that do not matter; files : of those that name
-    files, whose content counts. Raises OSError."""
+def asked_of(
+    args: Namespace, besides: Iterable[str] = (), files: Iterable[str] = ()
+) -> dict[str, Any]:
+    """What was asked of a command: {option: value}, JSON. besides : names of options that do not
+    matter; files : of those that name files, whose content counts. Raises OSError.
+    """
     given = {name: value for name, value in vars(args).items() if name not in besides}
-    asked = {name: str(value) if isinstance(value, Path) else value for name, value in given.items()}
-    named = {name: Path(asked[name]) for name in files if asked[name] and Path(asked[name]).is_file()}
-    return asked | {name: hashlib.sha256(read_bytes(path)).hexdigest()[:16] for name, path in named.items()}
+    asked = {
+        name: str(value) if isinstance(value, Path) else value for name, value in given.items()
+    }
+    named = {
+        name: Path(asked[name]) for name in files if asked[name] and Path(asked[name]).is_file()
+    }
+    return asked | {
+        name: hashlib.sha256(read_bytes(path)).hexdigest()[:16] for name, path in named.items()
+    }

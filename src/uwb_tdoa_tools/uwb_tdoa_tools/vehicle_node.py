@@ -1,9 +1,11 @@
 """vehicle_node: a simulated quadrotor that flies by the odometry of our nodes, or of others.
 
 odometry (nav_msgs/Odometry), status (EstimatorStatus)
-  -> imu/data (sensor_msgs/Imu), uwb/tdoa (Tdoa), uwb/anchors (AnchorArray, latched), ground_truth/pose (geometry_msgs/PoseStamped),
-     initialpose (geometry_msgs/PoseWithCovarianceStamped, once), verdict (std_msgs/String: JSON, latched); if asked for: height
-     (sensor_msgs/Range), pressure (sensor_msgs/FluidPressure), velocity (geometry_msgs/TwistWithCovarianceStamped), /clock.
+  -> imu/data (sensor_msgs/Imu), uwb/tdoa (Tdoa), uwb/anchors (AnchorArray, latched),
+  ground_truth/pose (geometry_msgs/PoseStamped),
+     initialpose (geometry_msgs/PoseWithCovarianceStamped, once), verdict (std_msgs/String: JSON,
+     latched); if asked for: height (sensor_msgs/Range), pressure (sensor_msgs/FluidPressure),
+     velocity (geometry_msgs/TwistWithCovarianceStamped), /clock.
 Services takeoff, go_to, land (Takeoff, GoTo, Land), as users of crazyswarm2 know them.
 Every parameter is documented in config/vehicle_node.yaml.
 """
@@ -13,15 +15,23 @@ from __future__ import annotations
 import json
 import sys
 import time
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rclpy.duration import Duration
 from std_msgs.msg import String
+
 from uwb_tdoa_bias.foundation import ros
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS
 from uwb_tdoa_bias.foundation.ros_node import StreamNode
-from uwb_tdoa_bias.foundation.ros_parameters import FROZEN, Parameter, declare_all, files_of, refuse_unknown, say_unused
+from uwb_tdoa_bias.foundation.ros_parameters import (
+    FROZEN,
+    Parameter,
+    declare_all,
+    files_of,
+    refuse_unknown,
+    say_unused,
+)
 from uwb_tdoa_bias.foundation.ros_streams import RoundRobin
 from uwb_tdoa_msgs.srv import GoTo, Land, Takeoff
 
@@ -41,11 +51,21 @@ PARAMETERS = {  # in the order of config/vehicle_node.yaml
     "world": Parameter("hall", "what it flies in (docs/flying.md)", choices=tuple(WORLDS)),
     "seed": Parameter(1, "of all that is random, as of fly", 0, 2**31 - 1),
     "told": Parameter(
-        "place", "what it tells the filter at the start: its place and yaw, to 0.1 m and 0.1 rad", choices=("nothing", "place")
+        "place",
+        "what it tells the filter at the start: its place and yaw, to 0.1 m and 0.1 rad",
+        choices=("nothing", "place"),
     ),
     "aids": Parameter([""], f'what else it measures, of {", ".join(AIDS)}; [""] for nothing'),
-    "mission": Parameter(False, "fly the standard mission, say what became of it, and end, with exit code 1 unless it has landed"),
-    "simulated_time": Parameter(False, "publish /clock, and go on when the odometry is there; else in real time"),
+    "mission": Parameter(
+        False,
+        (
+            "fly the standard mission, say what became of it, and end, with exit code 1 unless it "
+            "has landed"
+        ),
+    ),
+    "simulated_time": Parameter(
+        False, "publish /clock, and go on when the odometry is there; else in real time"
+    ),
     "duration": Parameter(600.0, "s; how long it can be flown, without the mission", 10.0, 1800.0),
     "frozen": FROZEN,
 }
@@ -72,15 +92,23 @@ class VehicleNode(StreamNode):
         self._trial = Trial(task, self._topics, None if self._mission else own["duration"])
         self._pilot, self._reported = Pilot(self._trial), 0  # missions that were judged
         self._verdict = self.create_publisher(String, "verdict", ANCHORS_QOS)
-        self._offered = () if self._mission else [
-            self.create_service(Takeoff, "takeoff", self._on_takeoff),
-            self.create_service(GoTo, "go_to", self._on_go_to),
-            self.create_service(Land, "land", self._on_land),
-        ]  # fmt: skip
-        self._starts: float | None = None  # time.monotonic(), s, when it begins, once somebody listens
+        self._offered = (
+            ()
+            if self._mission
+            else [
+                self.create_service(Takeoff, "takeoff", self._on_takeoff),
+                self.create_service(GoTo, "go_to", self._on_go_to),
+                self.create_service(Land, "land", self._on_land),
+            ]
+        )
+        self._starts: float | None = (
+            None  # time.monotonic(), s, when it begins, once somebody listens
+        )
         say_unused([self], files_of(arguments))
         self.turns = RoundRobin([self])
-        self.get_logger().info("ready; waiting for who listens to imu/data and uwb/tdoa, and publishes odometry")
+        self.get_logger().info(
+            "ready; waiting for who listens to imu/data and uwb/tdoa, and publishes odometry"
+        )
 
     def take(self) -> bool:
         """A turn, if it may come. Returns True: another one is to come."""
@@ -121,7 +149,13 @@ class VehicleNode(StreamNode):
         return response
 
     def _on_takeoff(self, request: Any, response: Any) -> Any:
-        return self._answer(response, self._pilot.take_off, request.group_mask, request.height, _seconds(request.duration))
+        return self._answer(
+            response,
+            self._pilot.take_off,
+            request.group_mask,
+            request.height,
+            _seconds(request.duration),
+        )
 
     def _on_go_to(self, request: Any, response: Any) -> Any:
         goal = request.goal.x, request.goal.y, request.goal.z
@@ -129,7 +163,13 @@ class VehicleNode(StreamNode):
         return self._answer(response, self._pilot.go_to, *values)
 
     def _on_land(self, request: Any, response: Any) -> Any:
-        return self._answer(response, self._pilot.land, request.group_mask, request.height, _seconds(request.duration))
+        return self._answer(
+            response,
+            self._pilot.land,
+            request.group_mask,
+            request.height,
+            _seconds(request.duration),
+        )
 
 
 def _seconds(duration: Any) -> float:

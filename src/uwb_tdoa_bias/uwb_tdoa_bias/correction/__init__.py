@@ -1,1 +1,3 @@
-"""From raw TDOAs to corrected ones: effects and network together, at the poses that the filter reports."""
+"""From raw TDOAs to corrected ones: effects and network together, at the poses that the filter
+reports.
+"""

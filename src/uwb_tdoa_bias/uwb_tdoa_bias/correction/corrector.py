@@ -17,19 +17,27 @@ from .poses import POSE_NUMBERS, TWIST_NUMBERS, Poses, parts_of, rotated_in_yaw
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
+
     from .network import Network
 
 # status of one correction; the values of TdoaCorrected.STATUS_*
 PASSED, EFFECTS, NETWORK, FADED = range(4)
-START = 0.2  # s after the first pose, before which no TDOA is corrected: what is not corrected there costs accuracy
-LARGEST_YAW_STD = 1.0  # rad; a yaw that is less certain is unknown: the filter follows four, 90 degrees apart
-FADED_BELOW = 0.5  # share of what can be known that a network's prediction has at least, or it counts as faded
+# s after the first pose, before which no TDOA is corrected: what is not corrected there costs
+# accuracy
+START = 0.2
+LARGEST_YAW_STD = (
+    1.0  # rad; a yaw that is less certain is unknown: the filter follows four, 90 degrees apart
+)
+# share of what can be known that a network's prediction has at least, or it counts as faded
+FADED_BELOW = 0.5
 
 
 @dataclass(frozen=True)
 class Correction:
-    """bias, std : (n,) m; corrected = d - bias, (n,) m; status : (n,) one of PASSED, EFFECTS, NETWORK, FADED; slope : (n, 6) change of
-    the bias, m, with position, m, and velocity, m/s, of the tag, world axes, about state (n, 6), where the bias is that."""
+    """bias, std : (n,) m; corrected = d - bias, (n,) m; status : (n,) one of PASSED, EFFECTS,
+    NETWORK, FADED; slope : (n, 6) change of the bias, m, with position, m, and velocity, m/s, of
+    the tag, world axes, about state (n, 6), where the bias is that.
+    """
 
     bias: np.ndarray
     std: np.ndarray
@@ -39,7 +47,9 @@ class Correction:
     state: np.ndarray
 
     @classmethod
-    def flat(cls, d: np.ndarray, bias: np.ndarray, std: np.ndarray, status: np.ndarray) -> Correction:
+    def flat(
+        cls, d: np.ndarray, bias: np.ndarray, std: np.ndarray, status: np.ndarray
+    ) -> Correction:
         """Of raw d (n,) m with a bias that nobody knows to change with the state."""
         return cls(bias, std, d - bias, status, *np.zeros((2, len(d), N_STATES)))
 
@@ -51,23 +61,35 @@ class Correction:
 
 
 class Corrector:
-    """Predicts the systematic error of each TDOA at the pose the tag had a little earlier, and removes it.
+    """Predicts the systematic error of each TDOA at the pose the tag had a little earlier, and
+    removes it.
 
-    The pose used for a measurement is the newest one stamped no later than `lag` before the measurement that preceded it.
-    It depends on stamps alone, so that a recording gives the same result at any speed; it leaves the filter `lag` seconds to
-    report that pose; and the filter can: it needs nothing later than the preceding measurement, after a gap neither. In the first `start`
-    seconds after the first pose no pose is used: it may arrive so much later than it is stamped, and changes nothing.
+    The pose used for a measurement is the newest one stamped no later than `lag` before the
+    measurement that preceded it. It depends on stamps alone, so that a recording gives the same
+    result at any speed; it leaves the filter `lag` seconds to report that pose; and the filter can:
+    it needs nothing later than the preceding measurement, after a gap neither. In the first `start`
+    seconds after the first pose no pose is used: it may arrive so much later than it is stamped,
+    and changes nothing.
     """
 
     def __init__(
-        self, anchors: Anchors, effects: EffectSet | None = None, network: Network | None = None, lag: float = POSE_LAG,
-        history: int = 4096, start: float = START,
-    ) -> None:  # fmt: skip
-        """anchors : Anchors; effects : EffectSet or None, of which those that the filter weighs stay in, as `weighed`; network : Network or
-        None;
-        lag : s; history : poses kept; start : s."""
+        self,
+        anchors: Anchors,
+        effects: EffectSet | None = None,
+        network: Network | None = None,
+        lag: float = POSE_LAG,
+        history: int = 4096,
+        start: float = START,
+    ) -> None:
+        """anchors : Anchors; effects : EffectSet or None, of which those that the filter weighs
+        stay in, as `weighed`; network : Network or None;
+        lag : s; history : poses kept; start : s.
+        """
         self.anchors = anchors
-        self.effects, self.weighed = (EffectSet(tuple(e for e in effects or () if e.weighed == weighed)) for weighed in (False, True))
+        self.effects, self.weighed = (
+            EffectSet(tuple(e for e in effects or () if e.weighed == weighed))
+            for weighed in (False, True)
+        )
         self.network = network
         self.lag = lag
         parts = [self.effects.name] if len(self.effects) else []
@@ -94,21 +116,36 @@ class Corrector:
 
     @property
     def outside(self) -> list[str]:
-        """Phrases on those effects of which less than half was taken out of some of the latest TDOAs, because they were not seen
-        where those were."""
+        """Phrases on those effects of which less than half was taken out of some of the latest
+        TDOAs, because they were not seen where those were.
+        """
         return [] if self._latest is None else self.effects.outside(self._latest)
 
     def add_pose(
-        self, t: ArrayLike, p: ArrayLike, q: ArrayLike, v: ArrayLike = np.nan, yaw_std: ArrayLike = 0.0
+        self,
+        t: ArrayLike,
+        p: ArrayLike,
+        q: ArrayLike,
+        v: ArrayLike = np.nan,
+        yaw_std: ArrayLike = 0.0,
     ) -> None:
-        """Tell where the tag was: t s, p (3,) m, q (4,) x y z w body to world, v (3,) m/s, world, NaN for an unknown one, yaw_std
-        rad: deviation of its rotation about the vertical; or several: (k,), (k, 3), (k, 4), (k, 3), (k,). Stamps must rise;
-        others are ignored."""
-        self._poses.add(t, p, q, np.broadcast_to(v, np.shape(p)), np.broadcast_to(yaw_std, np.shape(t)))
+        """Tell where the tag was: t s, p (3,) m, q (4,) x y z w body to world, v (3,) m/s, world,
+        NaN for an unknown one, yaw_std rad: deviation of its rotation about the vertical; or
+        several: (k,), (k, 3), (k, 4), (k, 3), (k,). Stamps must rise; others are ignored.
+        """
+        self._poses.add(
+            t, p, q, np.broadcast_to(v, np.shape(p)), np.broadcast_to(yaw_std, np.shape(t))
+        )
 
     def ready(self, before: float) -> bool:
-        """True if no pose that is still to come can change the correction of a measurement that follows one stamped so."""
-        return self.idle or self._poses.newest > before - self.lag or before < self._poses.begin < math.inf
+        """True if no pose that is still to come can change the correction of a measurement that
+        follows one stamped so.
+        """
+        return (
+            self.idle
+            or self._poses.newest > before - self.lag
+            or before < self._poses.begin < math.inf
+        )
 
     def share_poses(self, other: Corrector) -> None:
         """Use the poses of another Corrector, which alone is given them from now on."""
@@ -117,7 +154,8 @@ class Corrector:
     def correct(self, t: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray) -> Correction:
         """Correct a batch.
 
-        t : (n,) s; a, b : (n,) anchor rows (of `anchors`); d : (n,) raw d_ab, m. Returns a Correction. Where no pose is
+        t : (n,) s; a, b : (n,) anchor rows (of `anchors`); d : (n,) raw d_ab, m. Returns a
+            Correction. Where no pose is
         known yet, only effects that need none contribute.
         """
         if self.idle or len(t) == 0:
@@ -129,9 +167,13 @@ class Corrector:
             _add_learned(*self.network.predict(samples), bias, std, status)
         return Correction(bias, std, d - bias, status, slope, state)
 
-    def contribution(self, samples: Samples) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """(bias (n,) m, its standard deviation (n,) m, slope (n, 6), state (n, 6)), as of a Correction, of the effects in Samples; while
-        the yaw is unknown the mean over four headings, and its scatter, without the slope of those that depend on it."""
+    def contribution(
+        self, samples: Samples
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """(bias (n,) m, its standard deviation (n,) m, slope (n, 6), state (n, 6)), as of a
+        Correction, of the effects in Samples; while the yaw is unknown the mean over four headings,
+        and its scatter, without the slope of those that depend on it.
+        """
         slope = state = np.zeros((len(samples), N_STATES))
         if not len(self.effects):
             return np.zeros(len(samples)), np.zeros(len(samples)), slope, state
@@ -140,15 +182,23 @@ class Corrector:
         if len(steep):
             of_steep, slope, curved = slope_of(steep.effects, samples)
             bias, noise, state = bias + of_steep, np.hypot(noise, curved), state_of(samples)
-        unknown = np.zeros(len(samples), bool) if samples.yaw_std is None else samples.yaw_std > LARGEST_YAW_STD
+        unknown = (
+            np.zeros(len(samples), bool)
+            if samples.yaw_std is None
+            else samples.yaw_std > LARGEST_YAW_STD
+        )
         turning = self.effects.of_attitude
         if len(turning) and unknown.any():
-            headings = np.concatenate([samples.q, *(rotated_in_yaw(samples.q, k) for k in range(4))])
+            headings = np.concatenate(
+                [samples.q, *(rotated_in_yaw(samples.q, k) for k in range(4))]
+            )
             known, *each = turning.bias(replace(samples.repeated(5), q=headings)).reshape(5, -1)
             bias = np.where(unknown, bias - known + np.mean(each, axis=0), bias)
             noise = np.where(unknown, np.hypot(noise, np.std(each, axis=0)), noise)
         if len(steep) and unknown.any():
-            level = slope_of([effect for effect in steep.effects if not effect.uses_attitude], samples)[1]
+            level = slope_of(
+                [effect for effect in steep.effects if not effect.uses_attitude], samples
+            )[1]
             slope[unknown] = level[unknown]
         return bias, noise, slope, state
 
@@ -172,18 +222,29 @@ class Corrector:
 
 
 def warm_up(effects: EffectSet, network: Network | None, lag: float = POSE_LAG) -> Corrector:
-    """A Corrector, after compiling, or loading from numba's cache, whatever its first correction needs."""
+    """A Corrector, after compiling, or loading from numba's cache, whatever its first correction
+    needs.
+    """
     corrector = Corrector(Anchors.from_positions(np.eye(3)), effects, network, lag)
-    corrector.add_pose(np.zeros(1), *parts_of(np.eye(1, POSE_NUMBERS, 6), np.zeros((1, TWIST_NUMBERS))))
+    corrector.add_pose(
+        np.zeros(1), *parts_of(np.eye(1, POSE_NUMBERS, 6), np.zeros((1, TWIST_NUMBERS)))
+    )
     corrector.correct(np.array([1.0]), np.array([0]), np.array([1]), np.array([0.0]))
     return corrector
 
 
 @compiled
 def _add_learned(
-    learned: np.ndarray, deviation: np.ndarray, known: np.ndarray, bias: np.ndarray, std: np.ndarray, status: np.ndarray
+    learned: np.ndarray,
+    deviation: np.ndarray,
+    known: np.ndarray,
+    bias: np.ndarray,
+    std: np.ndarray,
+    status: np.ndarray,
 ) -> None:
-    """Put what a network predicts, three (n,) arrays, on top of bias and std (n,) m of effects, where it is known."""
+    """Put what a network predicts, three (n,) arrays, on top of bias and std (n,) m of effects,
+    where it is known.
+    """
     for i in range(len(bias)):
         if math.isfinite(learned[i]):
             bias[i] += learned[i]

@@ -1,4 +1,7 @@
-"""What a network may ask for: the 14 features of Zhao et al. (RA-L 2021, section III), and where everything is."""
+"""What a network may ask for: the 14 features of Zhao et al.
+
+(RA-L 2021, section III), and where everything is.
+"""
 
 from __future__ import annotations
 
@@ -12,45 +15,89 @@ from ..foundation.geometry import rotate
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
+
     from ..effects.samples import Samples
 
-# Azimuth (about z, from x) and elevation (above the x-y plane) of the tag seen from the antenna frame of each anchor (A),
-# and of each anchor seen from the tag's body frame (T), rad; positions of the anchors relative to the tag, world axes, m.
+# Azimuth (about z, from x) and elevation (above the x-y plane) of the tag seen from the antenna
+# frame of each anchor (A),
+# and of each anchor seen from the tag's body frame (T), rad; positions of the anchors relative to
+# the tag, world axes, m.
 FEATURES = (
-    "dx_a", "dy_a", "dz_a", "dx_b", "dy_b", "dz_b",
-    "azimuth_A_a", "azimuth_A_b", "azimuth_T_a", "azimuth_T_b",
-    "elevation_A_a", "elevation_A_b", "elevation_T_a", "elevation_T_b",
-)  # fmt: skip
+    "dx_a",
+    "dy_a",
+    "dz_a",
+    "dx_b",
+    "dy_b",
+    "dz_b",
+    "azimuth_A_a",
+    "azimuth_A_b",
+    "azimuth_T_a",
+    "azimuth_T_b",
+    "elevation_A_a",
+    "elevation_A_b",
+    "elevation_T_a",
+    "elevation_T_b",
+)
 
 # Position of the tag, world, m; horizontal parts of the body's x and z axes; ids
 # and positions, world, m, of both anchors. With these a model knows a place when it is there again.
 PLACE = (
-    "x", "y", "z", "forward_x", "forward_y", "up_x", "up_y",
-    "id_a", "x_a", "y_a", "z_a", "id_b", "x_b", "y_b", "z_b",
-)  # fmt: skip
+    "x",
+    "y",
+    "z",
+    "forward_x",
+    "forward_y",
+    "up_x",
+    "up_y",
+    "id_a",
+    "x_a",
+    "y_a",
+    "z_a",
+    "id_b",
+    "x_b",
+    "y_b",
+    "z_b",
+)
 
 
 NAMES = FEATURES + PLACE
 
 
 def columns(samples: Samples, names: Iterable[str]) -> np.ndarray:
-    """The named features (of NAMES) of a batch: Samples -> (n, len(names)) float, NaN where unknown."""
+    """The named features (of NAMES) of a batch: Samples -> (n, len(names)) float, NaN where
+    unknown.
+    """
     return everything(samples)[:, [NAMES.index(name) for name in names]]
 
 
 def everything(samples: Samples) -> np.ndarray:
-    """All features of a batch, in the order of NAMES: Samples -> (n, 29) float, NaN where a pose it needs is
-    unknown."""
+    """All features of a batch, in the order of NAMES: Samples -> (n, 29) float, NaN where a pose it
+    needs is unknown.
+    """
     out = np.empty((len(samples), len(NAMES)))
     anchors = samples.anchors
     _fill(samples.p, samples.q, samples.a, samples.b, anchors.positions, anchors.orientations, out)
-    _fill_place(samples.p, samples.q, samples.a, samples.b, anchors.ids, anchors.positions, out[:, len(FEATURES) :])
+    _fill_place(
+        samples.p,
+        samples.q,
+        samples.a,
+        samples.b,
+        anchors.ids,
+        anchors.positions,
+        out[:, len(FEATURES) :],
+    )
     return out
 
 
 @compiled
 def _fill_place(
-    p: np.ndarray, q: np.ndarray, a: np.ndarray, b: np.ndarray, ids: np.ndarray, positions: np.ndarray, out: np.ndarray
+    p: np.ndarray,
+    q: np.ndarray,
+    a: np.ndarray,
+    b: np.ndarray,
+    ids: np.ndarray,
+    positions: np.ndarray,
+    out: np.ndarray,
 ) -> None:
     for i in range(len(a)):
         x, y, z, w = q[i]
@@ -66,9 +113,14 @@ def _fill_place(
 
 @compiled
 def _fill(
-    p: np.ndarray, q: np.ndarray, a: np.ndarray, b: np.ndarray, positions: np.ndarray, orientations: np.ndarray,
+    p: np.ndarray,
+    q: np.ndarray,
+    a: np.ndarray,
+    b: np.ndarray,
+    positions: np.ndarray,
+    orientations: np.ndarray,
     out: np.ndarray,
-) -> None:  # fmt: skip
+) -> None:
     delta = np.empty(3)
     inverse = np.empty(4)
     seen = np.empty(3)

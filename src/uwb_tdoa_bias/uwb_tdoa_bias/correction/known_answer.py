@@ -1,4 +1,5 @@
-"""Makes models/known_answer.onnx, a model that proves the path: anyone can compute what it must say.
+"""Makes models/known_answer.onnx, a model that proves the path: anyone can compute what it must
+say.
 
     bias = 0.05 m + 0.02 dx_a + 0.01 m elevation_T_b,  limited to +-1 m
 
@@ -18,7 +19,8 @@ from ..foundation.files import write_bytes
 if TYPE_CHECKING:
     from onnx import ModelProto
 
-# Neither the order of the features nor offset and scale are what a reader that ignores them would assume.
+# Neither the order of the features nor offset and scale are what a reader that ignores them would
+# assume.
 FEATURES = ("elevation_T_b", "dx_a")
 OFFSET = (0.25, -1.5)  # rad, m
 SCALE = (0.5, 4.0)  # rad, m
@@ -28,7 +30,9 @@ CONSTANT = 0.05  # m
 
 
 def known_answer(elevation: float, dx: float) -> float:
-    """What the model says, m: elevation of anchor b seen from the tag, rad; dx: anchor a minus tag along x, m."""
+    """What the model says, m: elevation of anchor b seen from the tag, rad; dx: anchor a minus tag
+    along x, m.
+    """
     return np.clip(CONSTANT + SLOPES[0] * elevation + SLOPES[1] * dx, -CLIP, CLIP)
 
 
@@ -46,7 +50,13 @@ def make() -> ModelProto:
         [numpy_helper.from_array(weight, "weight"), numpy_helper.from_array(constant, "constant")],
     )
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
-    meta = {"features": FEATURES, "offset": OFFSET, "scale": SCALE, "clip": CLIP, "name": "known_answer"}
+    meta = {
+        "features": FEATURES,
+        "offset": OFFSET,
+        "scale": SCALE,
+        "clip": CLIP,
+        "name": "known_answer",
+    }
     helper.set_model_props(model, {key: json.dumps(value) for key, value in meta.items()})
     return model
 

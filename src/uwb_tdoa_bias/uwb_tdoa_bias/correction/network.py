@@ -6,15 +6,16 @@ Metadata of the model (all values JSON text):
     clip      number, metres: the output is limited to +-clip
     name      short name, goes into every message
     validity  optional: {feature: [lowest, highest, margin]}, in the units of the features. Inside, the network is
-              believed; beyond by `margin` or more, not at all; linearly in between, the worst feature counting.
+              believed; beyond by `margin` or more, not at all; linearly in between, the worst
+              feature counting.
     fade_std  number, metres, with validity: standard deviation of the bias where the network is not believed
     largest_yaw_std  optional: number, radians; where the yaw is less certain, the bias is not taken out, but counts as
               uncertainty
     share     optional: number 0 ... 1: how much of the prediction is taken out, found by cross-validation over the
               flights of the training; the rest counts as uncertainty
-Input: one float tensor (n, number of features), of any name. Output: one float tensor (n, 1), bias in metres; (n, 2),
-bias and its standard deviation in metres; or (n, 3), with the share 0 ... 1 of what can be known that the network knows
-there: it has already faded bias and deviation itself.
+Input: one float tensor (n, number of features), of any name. Output: one float tensor (n, 1), bias
+in metres; (n, 2), bias and its standard deviation in metres; or (n, 3), with the share 0 ... 1 of
+what can be known that the network knows there: it has already faded bias and deviation itself.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import NamedTuple, TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -40,22 +41,27 @@ if TYPE_CHECKING:
 MODELS = Path(__file__).parent / "models"
 SHIPPED = "default"  # instead of a path: the model that comes with the package
 UNPROVEN = (  # `study default-model`, and evaluate with and without it
-    "learned from simulated flights; on 22 measured ones, with their height sensors, it made 12 worse, by up to 14 %, and 8 better"
+    "learned from simulated flights; on 22 measured ones, with their height sensors, it made "
+    "12 worse, by up to 14 %, and 8 better"
 )
 NO_NUMBERS = np.empty(0)
 _COLUMN = {name: column for column, name in enumerate(NAMES)}
 
 
 def load_network(name: str | Path | None) -> Network | None:
-    """The Network of a file; for "default" the one shipped; None for an empty name. Raises InputError."""
+    """The Network of a file; for "default" the one shipped; None for an empty name.
+
+    Raises InputError.
+    """
     if not name:
         return None
     return Network(MODELS / "default.onnx" if str(name) == SHIPPED else name)
 
 
 class Validity(NamedTuple):
-    """The features, columns (k,) of NAMES, that a network fades by: between lower and upper (k,) it is right, margin (k,) beyond it says
-    nothing."""
+    """The features, columns (k,) of NAMES, that a network fades by: between lower and upper (k,) it
+    is right, margin (k,) beyond it says nothing.
+    """
 
     columns: np.ndarray
     lower: np.ndarray
@@ -65,37 +71,54 @@ class Validity(NamedTuple):
 
 class Network:
     """An ONNX bias model. meta : all its metadata, dict of str; trained_with : names of the effects
-    that were taken out before it was trained, and have to be corrected beside it; share : how much of its prediction is
-    taken out, 0 ... 1."""
+    that were taken out before it was trained, and have to be corrected beside it; share : how much
+    of its prediction is taken out, 0 ... 1.
+    """
 
     def __init__(self, path: str | Path) -> None:
         """Load `path`; raises InputError if it is no model or its metadata do not fit."""
         self._path = Path(path).absolute()
         if not Path(path).is_file():
-            raise InputError(f"model: {path} does not exist; give an .onnx file or leave the model empty.")
+            raise InputError(
+                f"model: {path} does not exist; give an .onnx file or leave the model empty."
+            )
         self._model = _session(path)
         self.meta = self._model.meta
         try:
             self._read(self.meta)
-        except (KeyError, ValueError, TypeError, AttributeError, OverflowError, RecursionError) as error:
+        except (
+            KeyError,
+            ValueError,
+            TypeError,
+            AttributeError,
+            OverflowError,
+            RecursionError,
+        ) as error:
             raise InputError(
-                f"model: {path}: its metadata must hold features (names out of {', '.join(NAMES)}), offset, scale, "
-                f"clip and name, and may hold validity with fade_std, as JSON; the problem is {error!r}."
+                f"model: {path}: its metadata must hold features (names out of "
+                f"{', '.join(NAMES)}), offset, scale, "
+                "clip and name, and may hold validity with fade_std, as JSON; the problem is "
+                f"{error!r}."
             ) from error
         width, n = self._model.width, len(self._inputs)
         if not (n == len(self._offset) == len(self._scale) == width) or (self._scale == 0).any():
             raise InputError(
                 f"model: {path}: the input has {width} columns, the metadata name {n} features, "
-                f"{len(self._offset)} offsets and {len(self._scale)} scales; they must agree, and no scale may be 0."
+                f"{len(self._offset)} offsets and {len(self._scale)} scales; they must agree, "
+                "and no scale may be 0."
             )
         self._ask(path)
 
     def _ask(self, path: str | Path) -> None:
-        """Ask it for the mean of all features. Raises InputError unless it gives up to three finite numbers for each row."""
+        """Ask it for the mean of all features.
+
+        Raises InputError unless it gives up to three finite numbers for each row.
+        """
         out = self._model.run(np.zeros((1, len(self._inputs))))
         if out.shape[1] > 3 or not np.isfinite(out).all():
             raise InputError(
-                f"model: {path}: gives (n, {out.shape[1]}), or no finite numbers; the output must be (n, 1), (n, 2) or (n, 3)."
+                f"model: {path}: gives (n, {out.shape[1]}), or no finite numbers; the output "
+                "must be (n, 1), (n, 2) or (n, 3)."
             )
 
     def __reduce__(self) -> tuple[type[Network], tuple[Path]]:
@@ -103,8 +126,13 @@ class Network:
         return Network, (self._path,)
 
     def _read(self, meta: dict[str, str]) -> None:
-        names, self._offset, self._scale = (json.loads(meta[key]) for key in ("features", "offset", "scale"))
-        self._offset, self._scale = np.array(self._offset, dtype=float), np.array(self._scale, dtype=float)
+        names, self._offset, self._scale = (
+            json.loads(meta[key]) for key in ("features", "offset", "scale")
+        )
+        self._offset, self._scale = (
+            np.array(self._offset, dtype=float),
+            np.array(self._scale, dtype=float),
+        )
         self.clip = float(json.loads(meta["clip"]))
         self.name = harmless(json.loads(meta["name"]))
         self.trained_with = tuple(map(harmless, json.loads(meta.get("trained_with", "[]"))))
@@ -112,23 +140,36 @@ class Network:
         self._fade_std = float(json.loads(meta["fade_std"])) if limits else 0.0
         self._largest_yaw_std = float(json.loads(meta.get("largest_yaw_std", "Infinity")))
         self.share = float(json.loads(meta.get("share", "1.0")))
-        self._inputs, limited = (np.array([_COLUMN[name] for name in some], dtype=int) for some in (names, limits))
+        self._inputs, limited = (
+            np.array([_COLUMN[name] for name in some], dtype=int) for some in (names, limits)
+        )
         lower, upper, margin = np.array([*limits.values()], dtype=float).reshape(-1, 3).T
         self._validity = Validity(limited, lower, upper, margin)
         if not ((margin > 0.0) & (upper >= lower)).all():
             raise ValueError("validity: every feature needs [lowest, highest, margin above 0]")
         if not all(np.isfinite(values).all() for values in (self._offset, self._scale, margin)):
             raise ValueError("offset, scale and margins must be finite numbers")
-        if not (self.clip > 0.0 and 0.0 <= self._fade_std < np.inf and self._largest_yaw_std >= 0.0):
+        if not (
+            self.clip > 0.0 and 0.0 <= self._fade_std < np.inf and self._largest_yaw_std >= 0.0
+        ):
             raise ValueError("clip must be above 0, fade_std and largest_yaw_std not below")
         if not 0.0 <= self.share <= 1.0:
             raise ValueError("share must be between 0 and 1")
 
     def predict(self, samples: Samples) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Bias and its standard deviation, metres, and how much of what can be known is known there, 0 ... 1: three
-        (n,) arrays. The first two are NaN where a feature that is needed is unknown."""
-        yaw_std = NO_NUMBERS if samples.yaw_std is None else np.ascontiguousarray(samples.yaw_std, dtype=float)
-        limits, found = (self.clip, self._fade_std, self.share, self._largest_yaw_std), np.empty((3, len(samples)))
+        """Bias and its standard deviation, metres, and how much of what can be known is known
+        there, 0 ... 1: three (n,) arrays. The first two are NaN where a feature that is needed is
+        unknown.
+        """
+        yaw_std = (
+            NO_NUMBERS
+            if samples.yaw_std is None
+            else np.ascontiguousarray(samples.yaw_std, dtype=float)
+        )
+        limits, found = (
+            (self.clip, self._fade_std, self.share, self._largest_yaw_std),
+            np.empty((3, len(samples))),
+        )
         table, x = everything(samples), np.empty((len(samples), len(self._inputs)))
         _select(table, self._inputs, self._offset, self._scale, x)
         _limit(self._model.run(x), table, self._validity, limits, yaw_std, found)
@@ -138,18 +179,21 @@ class Network:
 def _session(path: str | Path) -> Session:
     """The Session of a file whose content has stood its trial. Raises InputError."""
     content = read_bytes(path, MODEL_BYTES)
-    from .trial import Session, tried_out, Unplayable  # imports onnxruntime
+    from .trial import Session, Unplayable, tried_out  # imports onnxruntime
 
     try:
         return Session(content, alone=tried_out(content))
     except Unplayable as error:
         raise InputError(
-            f"model: {path} cannot be played as an ONNX model of dense layers ({printable(str(error))}); export it again, without what it names."
+            f"model: {path} cannot be played as an ONNX model of dense layers "
+            f"({printable(str(error))}); export it again, without what it names."
         ) from error
 
 
 @compiled
-def _select(table: np.ndarray, columns: np.ndarray, offset: np.ndarray, scale: np.ndarray, x: np.ndarray) -> None:
+def _select(
+    table: np.ndarray, columns: np.ndarray, offset: np.ndarray, scale: np.ndarray, x: np.ndarray
+) -> None:
     for i in range(len(table)):
         for k in range(len(columns)):
             x[i, k] = (table[i, columns[k]] - offset[k]) / scale[k]
@@ -157,11 +201,20 @@ def _select(table: np.ndarray, columns: np.ndarray, offset: np.ndarray, scale: n
 
 @compiled
 def _limit(
-    out: np.ndarray, table: np.ndarray, validity: Validity, limits: tuple[float, float, float, float], yaw_std: np.ndarray,
+    out: np.ndarray,
+    table: np.ndarray,
+    validity: Validity,
+    limits: tuple[float, float, float, float],
+    yaw_std: np.ndarray,
     found: np.ndarray,
-) -> None:  # fmt: skip
+) -> None:
     """What the network says, (n, 1 to 3), becomes bias, std and known, (3, n)."""
-    columns, lower, upper, margin = validity.columns, validity.lower, validity.upper, validity.margin
+    columns, lower, upper, margin = (
+        validity.columns,
+        validity.lower,
+        validity.upper,
+        validity.margin,
+    )
     clip, fade_std, share, largest_yaw_std = limits[0], limits[1], limits[2], limits[3]
     for i in range(len(out)):
         bias, std, known = out[i, 0], 0.0, 1.0

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -13,10 +13,11 @@ MOST = 10_000  # items: what has one stamp for ever would never have waited too 
 
 
 class PoseQueue:
-    """A queue in order of arrival. Its first item leaves when it is ready, or when it has been waited for too long.
+    """A queue in order of arrival. Its first item leaves when it is ready, or when it has been
+    waited for too long.
 
-    What makes an item ready depends on the stamp of the item before it. Too long is counted in stamps: a newer item is
-    stamped more than `limit` seconds later, or MOST wait.
+    What makes an item ready depends on the stamp of the item before it. Too long is counted in
+    stamps: a newer item is stamped more than `limit` seconds later, or MOST wait.
     """
 
     def __init__(self, limit: float) -> None:
@@ -35,8 +36,9 @@ class PoseQueue:
         self._newest = max(newest, t)
 
     def take(self, ready: Callable[[float], bool]) -> list[tuple[float, Any, bool]]:
-        """Remove and return what may leave: a list of (t, item, ready(before)), `before` being the latest stamp added before
-        the item, at most t; t for the first."""
+        """Remove and return what may leave: a list of (t, item, ready(before)), `before` being the
+        latest stamp added before the item, at most t; t for the first.
+        """
         out = []
         while self._items:
             t, before, item = self._items[0]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -18,8 +18,9 @@ TILT = 0.5  # rad; a filter that does not know the tilt better estimates no atti
 
 
 class Columns(NamedTuple):
-    """Stamps t (m,) s, positions p (m, 3) m, attitudes q (m, 4) x y z w, body to world, velocities v (m, 3) m/s, world, and standard
-    deviations of the yaw (m,) rad."""
+    """Stamps t (m,) s, positions p (m, 3) m, attitudes q (m, 4) x y z w, body to world, velocities
+    v (m, 3) m/s, world, and standard deviations of the yaw (m,) rad.
+    """
 
     t: np.ndarray
     p: np.ndarray
@@ -29,12 +30,16 @@ class Columns(NamedTuple):
 
 
 class Poses:
-    """Poses in the order of their stamps, of which at least the last `history` are kept. begin : stamp, s, of the first pose and `start`
-    later, from which on poses are used; inf before there is one."""
+    """Poses in the order of their stamps, of which at least the last `history` are kept. begin :
+    stamp, s, of the first pose and `start` later, from which on poses are used; inf before there is
+    one.
+    """
 
     def __init__(self, history: int, start: float) -> None:
         self._history, self._count, self._start, self.begin = history, 0, start, math.inf
-        self._columns = Columns(*(np.empty((2 * history, *shape)) for shape in ((), (3,), (4,), (3,), ())))
+        self._columns = Columns(
+            *(np.empty((2 * history, *shape)) for shape in ((), (3,), (4,), (3,), ()))
+        )
 
     @property
     def t(self) -> np.ndarray:
@@ -61,18 +66,25 @@ class Poses:
         """Stamp of the last pose, s; -inf if there is none."""
         return self.t[-1] if self._count else -np.inf
 
-    def add(self, t: ArrayLike, p: ArrayLike, q: ArrayLike, v: ArrayLike, yaw_std: ArrayLike) -> None:
-        """Append one pose, or several: t (k,), p (k, 3), q (k, 4), v (k, 3), yaw_std (k,) rad. Those not later than all before
-        them are ignored."""
+    def add(
+        self, t: ArrayLike, p: ArrayLike, q: ArrayLike, v: ArrayLike, yaw_std: ArrayLike
+    ) -> None:
+        """Append one pose, or several: t (k,), p (k, 3), q (k, 4), v (k, 3), yaw_std (k,) rad.
+        Those not later than all before them are ignored.
+        """
         parts: Any = (t, p, q, v, yaw_std) if np.ndim(t) else ([t], [p], [q], [v], [yaw_std])
         new = Columns(*(np.ascontiguousarray(part, dtype=float) for part in parts))
         self._count = _append(self._count, self._columns, new)
         if self._count and self.begin == math.inf:
             self.begin = float(self._columns.t[0]) + self._start
 
-    def before(self, t: np.ndarray, newest: float, lag: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Of the newest poses stamped no later than `lag` s before the TDOA that precedes each of t (n,) s, as `preceding`
-        says: numbers (n,), p (n, 3), q (n, 4), yaw_std (n,); -1 and NaN where there is none, and before `begin`."""
+    def before(
+        self, t: np.ndarray, newest: float, lag: float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Of the newest poses stamped no later than `lag` s before the TDOA that precedes each of t
+        (n,) s, as `preceding` says: numbers (n,), p (n, 3), q (n, 4), yaw_std (n,); -1 and NaN
+        where there is none, and before `begin`.
+        """
         n = len(t)
         out = np.empty(n, dtype=np.int64), np.empty((n, 3)), np.empty((n, 4)), np.empty(n)
         _look_up(t, newest, (lag, self.begin), self._count, self._columns, out)
@@ -81,14 +93,21 @@ class Poses:
 
 @compiled
 def _append(count: int, kept: Columns, new: Columns) -> int:
-    """Append what is later than all before it, and returns how many there are. Once there is no room, only the last half is kept."""
+    """Append what is later than all before it, and returns how many there are.
+
+    Once there is no room, only the last half is kept.
+    """
     history = len(kept.t) // 2
     for i in range(len(new.t)):
         if not new.t[i] > (kept.t[count - 1] if count else -np.inf):
             continue
         if count == 2 * history:
             kept.t[:history], kept.yaw_std[:history] = kept.t[history:], kept.yaw_std[history:]
-            kept.p[:history], kept.q[:history], kept.v[:history] = kept.p[history:], kept.q[history:], kept.v[history:]
+            kept.p[:history], kept.q[:history], kept.v[:history] = (
+                kept.p[history:],
+                kept.q[history:],
+                kept.v[history:],
+            )
             count = history
         kept.t[count], kept.yaw_std[count] = new.t[i], new.yaw_std[i]
         kept.p[count], kept.q[count], kept.v[count] = new.p[i], new.q[i], new.v[i]
@@ -98,14 +117,22 @@ def _append(count: int, kept: Columns, new: Columns) -> int:
 
 @compiled
 def _look_up(
-    t: np.ndarray, newest: float, limits: tuple[float, float], count: int, kept: Columns,
+    t: np.ndarray,
+    newest: float,
+    limits: tuple[float, float],
+    count: int,
+    kept: Columns,
     out: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
-) -> None:  # fmt: skip
+) -> None:
     places, p, q, yaw_std = out[0], out[1], out[2], out[3]
     lag, begin = limits[0], limits[1]
     precede(t, newest, yaw_std)
     for i in range(len(t)):
-        place = np.searchsorted(kept.t[:count], yaw_std[i] - lag, side="right") - 1 if yaw_std[i] >= begin else -1
+        place = (
+            np.searchsorted(kept.t[:count], yaw_std[i] - lag, side="right") - 1
+            if yaw_std[i] >= begin
+            else -1
+        )
         places[i] = place
         if place >= 0:
             p[i], q[i], yaw_std[i] = kept.p[place], kept.q[place], kept.yaw_std[place]
@@ -114,17 +141,23 @@ def _look_up(
 
 
 def known_yaw_std(std: np.ndarray) -> np.ndarray:
-    """Standard deviation of the yaw, (n,) rad, of attitudes with deviations std (n, 3) rad about the axes of the world.
+    """Standard deviation of the yaw, (n,) rad, of attitudes with deviations std (n, 3) rad about
+    the axes of the world.
 
-    It is 0 where the tilt is not known either: then no attitude is estimated, and level at yaw 0 is what is meant.
+    It is 0 where the tilt is not known either: then no attitude is estimated, and level at yaw 0 is
+    what is meant.
     """
     return np.where(np.maximum(std[:, 0], std[:, 1]) < TILT, std[:, 2], 0.0)
 
 
-def parts_of(poses: np.ndarray, twists: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """What a Corrector takes of nav_msgs/Odometry: (p (n, 3) m, q (n, 4) x y z w, v (n, 3) m/s, world, yaw_std (n,) rad).
+def parts_of(
+    poses: np.ndarray, twists: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """What a Corrector takes of nav_msgs/Odometry: (p (n, 3) m, q (n, 4) x y z w, v (n, 3) m/s,
+    world, yaw_std (n,) rad).
 
-    poses, twists : PoseWithCovariance (n, 43) and TwistWithCovariance (n, 42), body frame, their numbers in their order. An orientation of
+    poses, twists : PoseWithCovariance (n, 43) and TwistWithCovariance (n, 42), body frame, their
+        numbers in their order. An orientation of
     (0, 0, 0, 0) says that it is not known: NaN.
     """
     p, q, v, std = (np.empty((len(poses), k)) for k in (3, 4, 3, 3))
@@ -133,15 +166,30 @@ def parts_of(poses: np.ndarray, twists: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 @compiled
-def _part(poses: np.ndarray, twists: np.ndarray, p: np.ndarray, q: np.ndarray, v: np.ndarray, std: np.ndarray) -> None:
+def _part(
+    poses: np.ndarray,
+    twists: np.ndarray,
+    p: np.ndarray,
+    q: np.ndarray,
+    v: np.ndarray,
+    std: np.ndarray,
+) -> None:
     for n in range(len(poses)):
         p[n], q[n] = poses[n, :3], poses[n, 3:7]
         if not q[n].any():
             q[n] = np.nan
         x, y, z, w = q[n]
         a, b, c = twists[n, :3]
-        d, e, f = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)  # v + w d + (x, y, z) x d
-        v[n, 0], v[n, 1], v[n, 2] = a + w * d + y * f - z * e, b + w * e + z * d - x * f, c + w * f + x * e - y * d
+        d, e, f = (
+            2.0 * (y * c - z * b),
+            2.0 * (z * a - x * c),
+            2.0 * (x * b - y * a),
+        )  # v + w d + (x, y, z) x d
+        v[n, 0], v[n, 1], v[n, 2] = (
+            a + w * d + y * f - z * e,
+            b + w * e + z * d - x * f,
+            c + w * f + x * e - y * d,
+        )
         for axis in range(3):
             std[n, axis] = math.sqrt(max(poses[n, 7 + 7 * (3 + axis)], 0.0))
 

@@ -14,19 +14,26 @@ class Unplayable(ValueError):
 
 
 class Session:
-    """A model on one thread, which gives each row of the input the same bits, whatever comes with it.
+    """A model on one thread, which gives each row of the input the same bits, whatever comes with
+    it.
 
-    width, outputs : columns of the input and of the output; meta : {key: text} of the file; alone : whether each row is played by itself.
+    width, outputs : columns of the input and of the output; meta : {key: text} of the file; alone :
+        whether each row is played by itself.
     """
 
-    def __init__(self, content: bytes, alone: bool = False, options: onnxruntime.SessionOptions | None = None) -> None:
-        """Load the content of an ONNX file, as `options` say. Raises Unplayable where onnxruntime does not take it, or it has not one
-        input (n, width) and one output (n, outputs)."""
+    def __init__(
+        self, content: bytes, alone: bool = False, options: onnxruntime.SessionOptions | None = None
+    ) -> None:
+        """Load the content of an ONNX file, as `options` say. Raises Unplayable where onnxruntime
+        does not take it, or it has not one input (n, width) and one output (n, outputs).
+        """
         options = options or onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = 1
         options.log_severity_level = 4  # what goes wrong is reported by who calls
         try:
-            self._session = onnxruntime.InferenceSession(content, options, providers=["CPUExecutionProvider"], enable_fallback=0)
+            self._session = onnxruntime.InferenceSession(
+                content, options, providers=["CPUExecutionProvider"], enable_fallback=0
+            )
         except Exception as error:  # of its own family, with no common public base
             raise Unplayable(f"onnxruntime: {str(error).splitlines()[0][:200]}") from error
         inputs = self._session.get_inputs()
@@ -35,12 +42,17 @@ class Session:
         self._name, (rows, self.width) = inputs[0].name, inputs[0].shape
         if not isinstance(self.width, int):
             raise Unplayable("an input of unknown width")
-        self.alone, self.meta = alone or rows == 1, dict(self._session.get_modelmeta().custom_metadata_map)
+        self.alone, self.meta = (
+            alone or rows == 1,
+            dict(self._session.get_modelmeta().custom_metadata_map),
+        )
         self.outputs = self._play(np.zeros((1, self.width), np.float32)).shape[1]
 
     def run(self, x: np.ndarray) -> np.ndarray:
-        """x (n, width) float -> (n, outputs) float. Rows are filled up to whole packets: other kernels play the rest of one, and
-        a single row. Each batch begins at an address of its own, which is a multiple of 16 bytes."""
+        """x (n, width) float -> (n, outputs) float. Rows are filled up to whole packets: other
+        kernels play the rest of one, and a single row. Each batch begins at an address of its own,
+        which is a multiple of 16 bytes.
+        """
         out, most = np.empty((len(x), self.outputs)), 1 if self.alone else BATCH
         for first in range(0, len(x), most):
             out[first : first + most] = self._play(x[first : first + most])
@@ -52,12 +64,17 @@ class Session:
 
     def _play(self, some: np.ndarray) -> np.ndarray:
         """One batch. Raises Unplayable."""
-        padded = np.zeros((len(some) + (0 if self.alone else -len(some) % PACKED), self.width), np.float32)
+        padded = np.zeros(
+            (len(some) + (0 if self.alone else -len(some) % PACKED), self.width), np.float32
+        )
         padded[: len(some)] = some
         try:
             (made,) = self._session.run(None, {self._name: padded})
         except Exception as error:  # as above
             raise Unplayable(f"onnxruntime: {str(error).splitlines()[0][:200]}") from error
         if made.ndim != 2 or len(made) != len(padded):
-            raise Unplayable(f"{made.shape} comes out of {padded.shape}: an output with other rows than the input")
+            raise Unplayable(
+                f"{made.shape} comes out of {padded.shape}: an output with other rows than "
+                "the input"
+            )
         return made[: len(some)]

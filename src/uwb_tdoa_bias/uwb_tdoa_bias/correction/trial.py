@@ -1,9 +1,11 @@
-"""Play a model first where it does no harm: in a process with little time and memory, which opens no file.
+"""Play a model first where it does no harm: in a process with little time and memory, which opens
+no file.
 
-A model comes from anywhere, and a kilobyte of it may unfold to terabytes. So `tried_out` starts a process that gets the bytes and limits
-itself, loads them with onnxruntime, and plays them. Only bytes that stand the trial are loaded here. No trial can find what a model
-does with other numbers. So the operators that onnxruntime executes, by its own profile, are those of a list: none of them loops,
-branches, or makes a shape out of numbers.
+A model comes from anywhere, and a kilobyte of it may unfold to terabytes. So `tried_out` starts a
+process that gets the bytes and limits itself, loads them with onnxruntime, and plays them. Only
+bytes that stand the trial are loaded here. No trial can find what a model does with other numbers.
+So the operators that onnxruntime executes, by its own profile, are those of a list: none of them
+loops, branches, or makes a shape out of numbers.
 """
 
 from __future__ import annotations
@@ -21,31 +23,50 @@ import time
 import numpy as np
 
 from ..foundation.files import temporary_folder
-from ..foundation.limits import MODEL_MEMORY, MODEL_NODES, MODEL_ROW_SECONDS, MODEL_SECONDS, MODEL_WAIT
+from ..foundation.limits import (
+    MODEL_MEMORY,
+    MODEL_NODES,
+    MODEL_ROW_SECONDS,
+    MODEL_SECONDS,
+    MODEL_WAIT,
+)
 from .session import BATCH, PACKED, Session, Unplayable, onnxruntime
 
 OPERATORS = (
-    "Abs Add Ceil Celu Clip Concat Constant Cos Div Elu Erf Exp Floor Gather Gemm HardSigmoid Identity LeakyRelu Log LogSoftmax MatMul Max Min Mul "
-    "Neg Reciprocal ReduceMax ReduceSum Relu Reshape Selu Sigmoid Sign Sin Softmax Softplus Softsign Sqrt Sub Sum Tanh"
+    "Abs Add Ceil Celu Clip Concat Constant Cos Div Elu Erf Exp Floor Gather Gemm HardSigmoid "
+    "Identity LeakyRelu Log LogSoftmax MatMul Max Min Mul "
+    "Neg Reciprocal ReduceMax ReduceSum Relu Reshape Selu Sigmoid Sign Sin Softmax Softplus "
+    "Softsign Sqrt Sub Sum Tanh"
 ).split()
-START = f"import json, sys; sys.path[:] = json.loads(sys.argv[1]); from {__name__} import main; main()"
+START = (
+    f"import json, sys; sys.path[:] = json.loads(sys.argv[1]); from {__name__} import main; main()"
+)
 
 
 @lru_cache(maxsize=4)
 def tried_out(content: bytes) -> bool:
-    """Whether each row of a model has to be played by itself to get the same bits whatever comes with it. Raises Unplayable where the
-    content of an ONNX file is none that is played here."""
-    path = [entry for entry in sys.path if os.path.isabs(entry)]  # the present folder of the process is an empty one
+    """Whether each row of a model has to be played by itself to get the same bits whatever comes
+    with it. Raises Unplayable where the content of an ONNX file is none that is played here.
+    """
+    path = [
+        entry for entry in sys.path if os.path.isabs(entry)
+    ]  # the present folder of the process is an empty one
     with temporary_folder() as folder:
         try:
             done = subprocess.run(
-                [sys.executable, "-I", "-S", "-c", START, json.dumps(path)], input=content, capture_output=True, cwd=folder,
-                env={**os.environ, "OMP_NUM_THREADS": "1"}, timeout=MODEL_WAIT,
-            )  # fmt: skip
+                [sys.executable, "-I", "-S", "-c", START, json.dumps(path)],
+                input=content,
+                capture_output=True,
+                cwd=folder,
+                env={**os.environ, "OMP_NUM_THREADS": "1"},
+                timeout=MODEL_WAIT,
+            )
         except subprocess.TimeoutExpired as error:
             raise Unplayable(f"no end of its trial after {MODEL_WAIT:g} s") from error
     if done.returncode < 0:
-        raise Unplayable(f"it takes more than {MODEL_SECONDS} s or {MODEL_MEMORY >> 20} MB to load and play")
+        raise Unplayable(
+            f"it takes more than {MODEL_SECONDS} s or {MODEL_MEMORY >> 20} MB to load and play"
+        )
     if done.returncode > 0:
         raise RuntimeError(done.stderr.decode(errors="replace"))
     alone, why = json.loads(done.stdout)
@@ -60,7 +81,10 @@ def main() -> None:
 
 
 def judge(content: bytes) -> tuple[bool, str]:
-    """(whether rows are to be played alone, why the model is refused, or ""). Limits this process for good, and writes to the present folder."""
+    """(whether rows are to be played alone, why the model is refused, or "").
+
+    Limits this process for good, and writes to the present folder.
+    """
     _limit_this_process()
     try:
         _refuse_operators(content)
@@ -76,7 +100,12 @@ def _limit_this_process() -> None:
     """From now on it has so much more time and memory, opens no file, and leaves no dump."""
     memory = int(re.search(r"VmSize:\s+(\d+)", Path("/proc/self/status").read_text())[1]) << 10  # type: ignore[index]  # it is there
     seconds = int(time.process_time()) + 1 + MODEL_SECONDS
-    for limit, most in (("AS", memory + MODEL_MEMORY), ("CPU", seconds), ("CORE", 0), ("FSIZE", MODEL_MEMORY)):
+    for limit, most in (
+        ("AS", memory + MODEL_MEMORY),
+        ("CPU", seconds),
+        ("CORE", 0),
+        ("FSIZE", MODEL_MEMORY),
+    ):
         resource.setrlimit(getattr(resource, f"RLIMIT_{limit}"), (most, most))
     _let_open(0)
 
@@ -91,15 +120,23 @@ def _let_open(count: int) -> None:
 
 
 def _refuse_operators(content: bytes) -> None:
-    """Raise Unplayable unless all operators that onnxruntime executes are OPERATORS, each as it stands in the file."""
+    """Raise Unplayable unless all operators that onnxruntime executes are OPERATORS, each as it
+    stands in the file.
+    """
     options = onnxruntime.SessionOptions()
     options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
     options.enable_profiling, options.profile_file_prefix = True, "profile"
-    _let_open(1)  # the profile, which is opened first; a model whose weights are in another file finds no more
+    _let_open(
+        1
+    )  # the profile, which is opened first; a model whose weights are in another file finds no more
     session = Session(content, options=options)
     profile = session.end_profiling()
     _let_open(1)
-    kinds = [event["args"]["op_name"] for event in json.loads(Path(profile).read_bytes()) if event["cat"] == "Node"]
+    kinds = [
+        event["args"]["op_name"]
+        for event in json.loads(Path(profile).read_bytes())
+        if event["cat"] == "Node"
+    ]
     if len(kinds) > MODEL_NODES:
         raise Unplayable(f"more than {MODEL_NODES} operators")
     for kind in {*kinds} - {*OPERATORS}:
@@ -107,13 +144,20 @@ def _refuse_operators(content: bytes) -> None:
 
 
 def _is_the_same_in_any_batch(session: Session) -> bool:
-    """Whether each row of random numbers comes out as by itself, to the bit. A sum over columns may not: in which order onnxruntime adds up
-    depends on where in memory the row begins. Rows that mix, and batches of one size, do not either."""
+    """Whether each row of random numbers comes out as by itself, to the bit. A sum over columns may
+    not: in which order onnxruntime adds up depends on where in memory the row begins. Rows that
+    mix, and batches of one size, do not either.
+    """
     x = np.random.default_rng(0).normal(size=(BATCH, session.width))
     try:
         expected = np.concatenate([session.run(row[None]) for row in x])
-        batches = [slice(0, count) for count in range(PACKED, BATCH + 1, PACKED)] + [slice(None, None, -1)]
-        return all(np.array_equal(session.run(x[batch]), expected[batch], equal_nan=True) for batch in batches)
+        batches = [slice(0, count) for count in range(PACKED, BATCH + 1, PACKED)] + [
+            slice(None, None, -1)
+        ]
+        return all(
+            np.array_equal(session.run(x[batch]), expected[batch], equal_nan=True)
+            for batch in batches
+        )
     except Unplayable:
         return False
 
@@ -126,4 +170,6 @@ def _refuse_slow(session: Session) -> None:
         session.run(row)
     each = (time.process_time() - began) / PACKED
     if each > MODEL_ROW_SECONDS:
-        raise Unplayable(f"a row takes {1e3 * each:.1f} ms, more than {1e3 * MODEL_ROW_SECONDS:g} ms")
+        raise Unplayable(
+            f"a row takes {1e3 * each:.1f} ms, more than {1e3 * MODEL_ROW_SECONDS:g} ms"
+        )

@@ -30,13 +30,42 @@ from .covariance import Covariance
 from .effect_set import EffectSet
 from .imu_corrector import ImuCorrector
 from .label_error import LabelCorrector, LabelEffect
-from .samples import RADIO, AidSamples, ImuSamples, RangeSamples, Samples, Track, aid_samples, samples_at, true_samples
+from .samples import (
+    RADIO,
+    AidSamples,
+    ImuSamples,
+    RangeSamples,
+    Samples,
+    Track,
+    aid_samples,
+    samples_at,
+    true_samples,
+)
 from .smooth_term import SmoothTerm
 from .stream_corrector import StreamCorrector
 from .tag_lever_arm import TagLeverArm
 
 __all__ = [
-    "EFFECTS", "RADIO", "AidCorrector", "AidSamples", "AnchorDelay", "ArrivalEffect", "Covariance", "Effect", "EffectSet", "ImuCorrector",
-    "ImuSamples", "LabelCorrector", "LabelEffect", "RangeSamples", "Samples", "SmoothTerm", "StreamCorrector", "TagLeverArm", "Track",
-    "aid_samples", "samples_at", "true_samples",
-]  # fmt: skip
+    "EFFECTS",
+    "RADIO",
+    "AidCorrector",
+    "AidSamples",
+    "AnchorDelay",
+    "ArrivalEffect",
+    "Covariance",
+    "Effect",
+    "EffectSet",
+    "ImuCorrector",
+    "ImuSamples",
+    "LabelCorrector",
+    "LabelEffect",
+    "RangeSamples",
+    "Samples",
+    "SmoothTerm",
+    "StreamCorrector",
+    "TagLeverArm",
+    "Track",
+    "aid_samples",
+    "samples_at",
+    "true_samples",
+]

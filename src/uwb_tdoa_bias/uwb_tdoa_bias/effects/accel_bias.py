@@ -28,7 +28,12 @@ class AccelBias(ImuEffect):
     def advice(self) -> tuple[str, ...]:
         found = readings(self, "along")
         return (
-            (f"Calibrate the accelerometer at rest and damp the vibration of its mount: it reads {found}.",)
+            (
+                (
+                    "Calibrate the accelerometer at rest and damp the vibration of its mount: it "
+                    f"reads {found}."
+                ),
+            )
             if found
             else ()
         )

@@ -30,4 +30,8 @@ class AccelScale(ImuEffect):
 
     def advice(self) -> tuple[str, ...]:
         found = readings(self, "along", "%", 100.0)
-        return (f"Calibrate the accelerometer, each axis up and down: it reads {found}.",) if found else ()
+        return (
+            (f"Calibrate the accelerometer, each axis up and down: it reads {found}.",)
+            if found
+            else ()
+        )

@@ -35,10 +35,14 @@ IDENTITY = Affine(np.eye(3), np.zeros(3))
 
 
 def regressors(
-    model: Callable[[dict[str, float]], Affine], values: dict[str, float], reading: np.ndarray, keys: Sequence[str]
+    model: Callable[[dict[str, float]], Affine],
+    values: dict[str, float],
+    reading: np.ndarray,
+    keys: Sequence[str],
 ) -> np.ndarray:
-    """Derivative of what `model`, the Affine of parameters, makes at `values` of a `reading` (n, k), by the parameters `keys`:
-    (n, k, len(keys)); numerical."""
+    """Derivative of what `model`, the Affine of parameters, makes at `values` of a `reading` (n,
+    k), by the parameters `keys`: (n, k, len(keys)); numerical.
+    """
     step, out = 1e-6, np.empty((*reading.shape, len(keys)))
     for column, key in enumerate(keys):
         here = values.get(key, 0.0)

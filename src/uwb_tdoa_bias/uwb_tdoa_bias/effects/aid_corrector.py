@@ -1,9 +1,11 @@
-"""Takes the effects out of what other sensors measure, and out of their stamps, at once or one by one."""
+"""Takes the effects out of what other sensors measure, and out of their stamps, at once or one by
+one.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,6 +15,7 @@ from .affine import IDENTITY
 
 if TYPE_CHECKING:
     from collections.abc import Collection
+
     from ..foundation.sensors.sensor import Stream
     from .affine import Affine
     from .base import Effect
@@ -23,7 +26,9 @@ class AidCorrector:
 
     def __init__(self, effects: Collection[Effect]) -> None:
         """effects : those that do not act on these streams are passed over."""
-        self._late = {stream: sum(effect.stamp_offset(stream) for effect in effects) for stream in AIDS}
+        self._late = {
+            stream: sum(effect.stamp_offset(stream) for effect in effects) for stream in AIDS
+        }
         self._undo = {stream: self._inverse(effects, stream) for stream in AIDS}
         self.idle = not any(self._late.values()) and not any(self._undo.values())
 
@@ -49,5 +54,7 @@ class AidCorrector:
         known = np.isfinite(std)  # what was not measured may be anything
         variance = np.where(known, std, UNKNOWN_STD) ** 2 @ undo.matrix.T**2
         std = np.where(variance < UNKNOWN_VARIANCE, np.sqrt(variance), np.inf)
-        corrected: Any = stream.with_values(undo(np.where(known, stream.values, 0.0)))  # its class has a std, as `stream` has
+        corrected: Any = stream.with_values(
+            undo(np.where(known, stream.values, 0.0))
+        )  # its class has a std, as `stream` has
         return replace(corrected, std=std)

@@ -10,7 +10,9 @@ from .base import Effect
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     import numpy as np
+
     from ..foundation.flight import Flight
     from ..foundation.sensors.sensor import Stream
     from .affine import Affine
@@ -36,7 +38,12 @@ class AidEffect(Effect):
         return self.aid() if channel in self.channels else IDENTITY
 
     def regressors(self, samples: AidSamples, keys: Sequence[str]) -> np.ndarray:
-        return regressors(lambda values: type(self)(values).sensor_model(samples.channel), self.values, samples.reading, keys)
+        return regressors(
+            lambda values: type(self)(values).sensor_model(samples.channel),
+            self.values,
+            samples.reading,
+            keys,
+        )
 
     def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
         (stream,) = self.channels

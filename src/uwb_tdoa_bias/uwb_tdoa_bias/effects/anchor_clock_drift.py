@@ -9,11 +9,14 @@ from .wording import counted, listed
 
 if TYPE_CHECKING:
     import numpy as np
+
     from .samples import Samples
 
 
 class AnchorClockDrift(AnchorEffect):
-    """Anchor i gets later by `values[i]` metres a second, counted from the first TDOA of the recording."""
+    """Anchor i gets later by `values[i]` metres a second, counted from the first TDOA of the
+    recording.
+    """
 
     name = "anchor_clock_drift"
     unit = "m/s"
@@ -21,7 +24,10 @@ class AnchorClockDrift(AnchorEffect):
     negligible = 5e-4
     typical = 0.01
     example = "0"
-    physics = "the correction of an anchor's clock lags behind its crystal, which warms up: its delay grows with time"
+    physics = (
+        "the correction of an anchor's clock lags behind its crystal, which warms up: its delay "
+        "grows with time"
+    )
     confounded_with = ("anchor_delay", "nlos")
     distinguished_by = {
         "nlos": "a longer flight: a drift goes on, an obstacle ends",
@@ -36,7 +42,10 @@ class AnchorClockDrift(AnchorEffect):
 
     def advice(self) -> tuple[str, ...]:
         drifts = [
-            f"anchor {key} by {self.size(key, 'm')} a second {'later' if value > 0.0 else 'earlier'}"
+            (
+                f"anchor {key} by {self.size(key, 'm')} a second "
+                f"{'later' if value > 0.0 else 'earlier'}"
+            )
             for key, value in self.significant().items()
         ]
         if not drifts:

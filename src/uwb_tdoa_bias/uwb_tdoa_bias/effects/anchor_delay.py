@@ -7,7 +7,8 @@ from .wording import counted, listed
 
 
 class AnchorDelay(AnchorEffect):
-    """Everything heard from anchor i arrives `values[i]` metres late: bias of d_ab = delay_b - delay_a, of a range to b delay_b.
+    """Everything heard from anchor i arrives `values[i]` metres late: bias of d_ab = delay_b -
+    delay_a, of a range to b delay_b.
 
     In TDOAs only differences of delays are observable: the sum over all anchors is not.
     """
@@ -18,7 +19,10 @@ class AnchorDelay(AnchorEffect):
     negligible = 0.01
     typical = 0.3
     example = "0"
-    physics = "the antenna delay of an anchor is not calibrated: it always seems farther away by the same distance"
+    physics = (
+        "the antenna delay of an anchor is not calibrated: it always seems farther away by the "
+        "same distance"
+    )
     confounded_with = ("anchor_position", "pair_offset", "range_offset")
     distinguished_by = {
         "pair_offset": "TDoA3, where each anchor is heard in many pairs",
@@ -28,7 +32,8 @@ class AnchorDelay(AnchorEffect):
 
     def advice(self) -> tuple[str, ...]:
         late = {
-            key: f"{self.size(key)} {'late' if value > 0.0 else 'early'}" for key, value in self.significant().items()
+            key: f"{self.size(key)} {'late' if value > 0.0 else 'early'}"
+            for key, value in self.significant().items()
         }
         if not late:
             return ()
@@ -38,4 +43,9 @@ class AnchorDelay(AnchorEffect):
             else f"it {next(iter(late.values()))}"
         )
         which = counted(sorted(late, key=int), "anchor")
-        return (f"Calibrate the antenna delay of {which}: the tag hears {each}, against the other anchors.",)
+        return (
+            (
+                f"Calibrate the antenna delay of {which}: the tag hears {each}, against the other "
+                "anchors."
+            ),
+        )

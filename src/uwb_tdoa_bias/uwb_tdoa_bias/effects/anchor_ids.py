@@ -10,7 +10,10 @@ from .wording import listed
 
 
 class AnchorIds(LabelEffect):
-    """What comes with the id of a parameter is of the anchor that has its value in the survey. Corrected by giving it that id."""
+    """What comes with the id of a parameter is of the anchor that has its value in the survey.
+
+    Corrected by giving it that id.
+    """
 
     name = "anchor_ids"
     unit = "id"
@@ -18,9 +21,15 @@ class AnchorIds(LabelEffect):
     negligible = 0.5
     typical = 1.0
     example = "1"
-    physics = "modules were configured with, or put up by, the number of another anchor, or the survey lists them in another order"
+    physics = (
+        "modules were configured with, or put up by, the number of another anchor, or the survey "
+        "lists them in another order"
+    )
     confounded_with = ("anchor_position",)
-    reference = "Bitcraze documentation of the loco positioning system: every anchor is given its id by hand"
+    reference = (
+        "Bitcraze documentation of the loco positioning system: every anchor is given its id by "
+        "hand"
+    )
     separable = False
     expected = "the id of an anchor, a whole number"
 
@@ -32,10 +41,14 @@ class AnchorIds(LabelEffect):
     def possible(value: float) -> bool:
         return value >= 0.0 and value == round(value)
 
-    def relabelled(self, a: np.ndarray, b: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def relabelled(
+        self, a: np.ndarray, b: np.ndarray, d: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         return self._with_ids(a, {int(key): int(value) for key, value in self.values.items()}, b, d)
 
-    def mislabelled(self, a: np.ndarray, b: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def mislabelled(
+        self, a: np.ndarray, b: np.ndarray, d: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         return self._with_ids(a, {int(value): int(key) for key, value in self.values.items()}, b, d)
 
     @staticmethod
@@ -53,5 +66,8 @@ class AnchorIds(LabelEffect):
     def advice(self) -> tuple[str, ...]:
         if not self.values:
             return ()
-        wrong = listed(f"what is called {key} is anchor {value:.0f} of the survey" for key, value in self.values.items())
+        wrong = listed(
+            f"what is called {key} is anchor {value:.0f} of the survey"
+            for key, value in self.values.items()
+        )
         return (f"Give the anchors their ids again, or list them so in the survey: {wrong}.",)

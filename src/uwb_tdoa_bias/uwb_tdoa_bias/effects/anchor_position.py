@@ -15,12 +15,15 @@ from .wording import counted, listed
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from ..foundation.anchors import Anchors
     from .samples import Samples
 
 
 class AnchorPosition(Effect):
-    """Anchor i really stands `values["i.x"]`, ... metres away from its surveyed position, along the world's axes."""
+    """Anchor i really stands `values["i.x"]`, ... metres away from its surveyed position, along the
+    world's axes.
+    """
 
     name = "anchor_position"
     unit = "m"
@@ -29,7 +32,8 @@ class AnchorPosition(Effect):
     typical = 0.15
     example = "0.x"
     physics = (
-        "the antenna of an anchor is not where the survey has it: the range is wrong by the shift along the "
+        "the antenna of an anchor is not where the survey has it: the range is wrong by the "
+        "shift along the "
         "line of sight"
     )
     confounded_with = ("anchor_delay", "truth_frame", "tag_lever_arm")
@@ -37,7 +41,10 @@ class AnchorPosition(Effect):
         "tag_lever_arm": "a flight that turns through all headings and passes on all sides of the anchor",
         "truth_frame": "a flight through the whole room; several anchors that moved alike are a frame",
     }
-    reference = "geometry; survey repeatability of a total station is millimetres, of a tape some centimetres"
+    reference = (
+        "geometry; survey repeatability of a total station is millimetres, of a tape some "
+        "centimetres"
+    )
     portable = False
     channels = tuple(RADIO)
 
@@ -45,7 +52,10 @@ class AnchorPosition(Effect):
     def check_key(cls, key: str) -> None:
         anchor, _, axis = key.partition(".")
         if axis not in ("x", "y", "z") or not axis:
-            raise InputError(f"effects: {cls.name}: parameter {key!r} is not an anchor and an axis; write '3.x: 0.05'.")
+            raise InputError(
+                f"effects: {cls.name}: parameter {key!r} is not an anchor and an axis; write "
+                "'3.x: 0.05'."
+            )
         check_anchor(cls.name, anchor, key)
 
     @classmethod
@@ -79,13 +89,19 @@ class AnchorPosition(Effect):
         shifts: dict[str, dict[str, str]] = {}
         for key, value in self.significant().items():
             anchor, axis = key.split(".")
-            shifts.setdefault(anchor, {})[axis] = f"{self.size(key)} towards {'+' if value > 0.0 else '-'}{axis}"
+            shifts.setdefault(anchor, {})[axis] = (
+                f"{self.size(key)} towards {'+' if value > 0.0 else '-'}{axis}"
+            )
         if not shifts:
             return ()
         moved = {anchor: listed(by[axis] for axis in sorted(by)) for anchor, by in shifts.items()}
-        each = [f"{f'anchor {anchor}' if len(moved) > 1 else 'it'} seems off by {by}" for anchor, by in moved.items()]
+        each = [
+            f"{f'anchor {anchor}' if len(moved) > 1 else 'it'} seems off by {by}"
+            for anchor, by in moved.items()
+        ]
         return (
-            f"Measure {counted(sorted(shifts, key=int), 'anchor')} again before you move {'them' if len(moved) > 1 else 'it'}: {'; '.join(each)}. "
+            f"Measure {counted(sorted(shifts, key=int), 'anchor')} again before you move "
+            f"{'them' if len(moved) > 1 else 'it'}: {'; '.join(each)}. "
             "If the survey proves right, ranges to there are wrong by direction.",
         )
 

@@ -14,6 +14,7 @@ from .wording import listed
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from ..foundation.anchors import Anchors
     from .samples import Samples
 
@@ -21,7 +22,9 @@ UNIT = Antenna(delay_span=1.0)
 
 
 class AntennaPattern(ArrivalEffect):
-    """`tag` and `anchor` metres times the shape of a DWM1000-like module's group delay over direction (0 ... 1)."""
+    """`tag` and `anchor` metres times the shape of a DWM1000-like module's group delay over
+    direction (0 ... 1).
+    """
 
     name = "antenna_pattern"
     unit = "m"
@@ -29,19 +32,27 @@ class AntennaPattern(ArrivalEffect):
     negligible = 0.02
     typical = 0.2
     example = "tag"
-    physics = "off its best direction an antenna radiates over longer ways: the group delay grows towards its nulls"
+    physics = (
+        "off its best direction an antenna radiates over longer ways: the group delay grows "
+        "towards its nulls"
+    )
     confounded_with = ("received_power_bias", "tag_lever_arm")
     distinguished_by = {
         "received_power_bias": "one place at many headings, then one heading at many ranges",
     }
-    reference = "Qorvo support: 10 - 15 cm over direction for a module; the shape is that of uwb_tdoa_bias.foundation.antenna"
+    reference = (
+        "Qorvo support: 10 - 15 cm over direction for a module; the shape is that of "
+        "uwb_tdoa_bias.foundation.antenna"
+    )
     uses_attitude = True
 
     @classmethod
     def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
         return [("tag", "anchor"), ("tag",), ("anchor",)]
 
-    def delay_regressors(self, samples: Samples, rows: np.ndarray, keys: Sequence[str]) -> np.ndarray:
+    def delay_regressors(
+        self, samples: Samples, rows: np.ndarray, keys: Sequence[str]
+    ) -> np.ndarray:
         to_anchor = samples.anchors.positions[rows] - tile(samples, samples.p)
         out = np.zeros((len(rows), len(keys)))
         for column, key in enumerate(keys):
@@ -56,9 +67,17 @@ class AntennaPattern(ArrivalEffect):
 
     def advice(self) -> tuple[str, ...]:
         spans = [
-            f"{self.size(key)} {'later' if value > 0.0 else 'earlier'} in the nulls of the {key}'s antenna"
+            (
+                f"{self.size(key)} {'later' if value > 0.0 else 'earlier'} in the nulls of the "
+                f"{key}'s antenna"
+            )
             for key, value in self.significant().items()
         ]
         if not spans:
             return ()
-        return (f"Turn antennas so that their nulls point at nothing that is heard: arrivals are {listed(spans)}.",)
+        return (
+            (
+                "Turn antennas so that their nulls point at nothing that is heard: arrivals are "
+                f"{listed(spans)}."
+            ),
+        )

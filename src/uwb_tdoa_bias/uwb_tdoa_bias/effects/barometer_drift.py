@@ -11,13 +11,15 @@ from .base import Effect
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from ..foundation.flight import Flight
     from .samples import AidSamples
 
 
 class BarometerDrift(Effect):
-    """The altitude of the barometer grows by `rate` metres a second beyond the true one, counted from the first TDOA. The
-    filter estimates offset and drift of a barometer itself."""
+    """The altitude of the barometer grows by `rate` metres a second beyond the true one, counted
+    from the first TDOA. The filter estimates offset and drift of a barometer itself.
+    """
 
     name = "barometer_drift"
     unit = "m/s"
@@ -26,7 +28,10 @@ class BarometerDrift(Effect):
     typical = 0.02
     example = "rate"
     physics = "the sensor warms up, the weather or the pressure in the hall changes"
-    reference = "BMP388 data sheet: 0.75 Pa/K, that is 6 cm per degree; 10 Pa, 0.8 m, a quarter of an hour of weather"
+    reference = (
+        "BMP388 data sheet: 0.75 Pa/K, that is 6 cm per degree; 10 Pa, 0.8 m, a quarter of an "
+        "hour of weather"
+    )
     portable = False
     usable = False  # the filter estimates it while it flies
     channels = ("pressure",)

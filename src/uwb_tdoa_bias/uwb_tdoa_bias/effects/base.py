@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from functools import wraps
 import math
-from typing import Any, ClassVar, TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from .wording import LARGEST, listed, measured
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterable, Sequence
+
     from ..foundation.anchors import Anchors
     from ..foundation.flight import Flight, Truth
     from .affine import Affine
@@ -31,7 +32,9 @@ Made = TypeVar("Made")
 
 
 def once_per_anchors(method: Callable[[Any, Anchors], Made]) -> Callable[[Any, Anchors], Made]:
-    """A method(self, anchors) that is computed once as long as it is asked for the same Anchors object."""
+    """A method(self, anchors) that is computed once as long as it is asked for the same Anchors
+    object.
+    """
     name = f"_{method.__name__}_of"
 
     @wraps(method)
@@ -46,14 +49,18 @@ def once_per_anchors(method: Callable[[Any, Anchors], Made]) -> Callable[[Any, A
 
 @dataclass
 class Effect:
-    """A named systematic error with scalar parameters. One effect, one file: subclass and list it in EFFECTS.
+    """A named systematic error with scalar parameters. One effect, one file: subclass and list it
+    in EFFECTS.
 
-    values : {parameter name: value in `unit`}; std : the same keys, standard errors, empty if unknown;
-    source : where the values came from, free text; domain : {covariate: (low, high)}, where it was seen, see `domain.py`.
-    An effect says what it does to measurements, and by that how it is undone, the same way in a node, off line and in a
-    recording: `bias` and `noise_std` of TDOAs, `stamp_offset` of streams, `sensor_model` of inertial samples, heights and
-    velocities, `sensor_bias` of inertial samples, `sensor_functions` of what these do by the state of the filter. For `diagnose`
-    it gives `regressors` on the channels where it shows.
+    values : {parameter name: value in `unit`}; std : the same keys, standard errors, empty if
+        unknown;
+    source : where the values came from, free text; domain : {covariate: (low, high)}, where it was
+        seen, see `domain.py`.
+    An effect says what it does to measurements, and by that how it is undone, the same way in a
+    node, off line and in a recording: `bias` and `noise_std` of TDOAs, `stamp_offset` of streams,
+    `sensor_model` of inertial samples, heights and velocities, `sensor_bias` of inertial samples,
+    `sensor_functions` of what these do by the state of the filter. For `diagnose` it gives
+    `regressors` on the channels where it shows.
     """
 
     values: dict[str, float] = field(default_factory=dict)
@@ -65,24 +72,38 @@ class Effect:
     unit: ClassVar[str]
     bound: ClassVar[float]  # a larger magnitude is refused as a mistake, in `unit`
     negligible: ClassVar[float]  # a smaller magnitude is not worth a term in the model, in `unit`
-    typical: ClassVar[float]  # a plausible size, standard deviation of what fits expect before they see data, in `unit`
+    typical: ClassVar[
+        float
+    ]  # a plausible size, standard deviation of what fits expect before they see data, in `unit`
     example: ClassVar[str]  # the parameter that a value without a name is for; see `from_text`
     physics: ClassVar[str]  # one sentence for the catalogue
     confounded_with: ClassVar[tuple[str, ...]] = ()
     reference: ClassVar[str]
     channels: ClassVar[tuple[str, ...]] = ("tdoa",)  # where it shows: names of channels of diagnose
     fitted: ClassVar[bool] = True  # False: found by a detector of its own, not by linear regression
-    portable: ClassVar[bool] = True  # goes with the tag, the vehicle and the anchors' modules to another installation
+    portable: ClassVar[bool] = (
+        True  # goes with the tag, the vehicle and the anchors' modules to another installation
+    )
     # what it is a function of, and must not be taken beyond: its domain is of these
     covariates: ClassVar[tuple[str, ...]] = ()
-    settings: ClassVar[tuple[str, ...]] = ()  # further entries in effects.yaml, constructor arguments
-    price: ClassVar[float] = 0.0  # what it must gain beyond others, twice a log-likelihood, to be chosen by diagnose
-    distinguished_by: ClassVar[dict[str, str]] = {}  # {other effect: which flight tells this one from it}
+    settings: ClassVar[
+        tuple[str, ...]
+    ] = ()  # further entries in effects.yaml, constructor arguments
+    price: ClassVar[float] = (
+        0.0  # what it must gain beyond others, twice a log-likelihood, to be chosen by diagnose
+    )
+    distinguished_by: ClassVar[
+        dict[str, str]
+    ] = {}  # {other effect: which flight tells this one from it}
     usable: ClassVar[bool] = True  # False: nodes cannot, or need not, take it out
-    unused: ClassVar[str] = "nodes cannot, or need not, take it out"  # why not, where it is not usable
+    unused: ClassVar[str] = (
+        "nodes cannot, or need not, take it out"  # why not, where it is not usable
+    )
     # channels, one of which must be there too: else what it is compared with may be as wrong
     witnesses: ClassVar[tuple[str, ...]] = ()
-    weighed: ClassVar[bool] = False  # may be there or not: the filter weighs that, and no Corrector takes it out
+    weighed: ClassVar[bool] = (
+        False  # may be there or not: the filter weighs that, and no Corrector takes it out
+    )
     needs_reference: ClassVar[bool] = False  # not observable in the filter's innovations alone
     needs_motion: ClassVar[bool] = False  # looks at more than the pose of the tag
     uses_attitude: ClassVar[bool] = False  # its part of a TDOA changes with the attitude of the tag
@@ -100,7 +121,8 @@ class Effect:
                 bound = self.bound_of(key)
                 if not np.isfinite(read[key]) or abs(read[key]) > bound:
                     raise InputError(
-                        f"effects: {self.name}: {group}: {key} is {value!r}; expected a number of {self.unit} "
+                        f"effects: {self.name}: {group}: {key} is {value!r}; expected a "
+                        f"number of {self.unit} "
                         f"between -{bound:g} and {bound:g}."
                     )
             setattr(self, group, read)
@@ -125,9 +147,11 @@ class Effect:
 
     @classmethod
     def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
-        """Sets of parameters that make sense together, as tuples of names, the full set first; here the one of `example`.
+        """Sets of parameters that make sense together, as tuples of names, the full set first; here
+        the one of `example`.
 
-        anchors : Anchors; pairs : (m, 2) ids of the pairs that were heard. Both may be None where they do not matter.
+        anchors : Anchors; pairs : (m, 2) ids of the pairs that were heard. Both may be None where
+            they do not matter.
         """
         return [(cls.example,)]
 
@@ -142,7 +166,9 @@ class Effect:
 
     @property
     def identity(self) -> tuple[Hashable, ...]:
-        """Hashable: equal for effects whose parameters of one name are the same quantity, which can hence be merged."""
+        """Hashable: equal for effects whose parameters of one name are the same quantity, which can
+        hence be merged.
+        """
         return (self.name, *(getattr(self, name) for name in self.settings))
 
     @classmethod
@@ -151,19 +177,23 @@ class Effect:
         return all(abs(value) <= cls.bound_of(key) for key, value in values.items())
 
     def bias(self, samples: Samples) -> np.ndarray:
-        """Contribution to what `samples.channel` measures, (n,) metres: of Samples to d_ab, of RangeSamples to the distance; NaN where it
-        is not known (unknown pose)."""
+        """Contribution to what `samples.channel` measures, (n,) metres: of Samples to d_ab, of
+        RangeSamples to the distance; NaN where it is not known (unknown pose).
+        """
         return np.zeros(len(samples))
 
     @property
     def states(self) -> tuple[int, ...]:
-        """Which of position (0, 1, 2) and velocity (3, 4, 5) its part of a TDOA may change steeply with, so that the filter should
-        follow it: tuple."""
+        """Which of position (0, 1, 2) and velocity (3, 4, 5) its part of a TDOA may change steeply
+        with, so that the filter should follow it: tuple.
+        """
         return ()
 
     def regressors(self, samples: Any, keys: Sequence[str]) -> np.ndarray:
-        """Derivative of what `samples.channel` measures by the parameters `keys`: of Samples (n, len(keys)), metres per
-        `unit`; of ImuSamples (n, 3, len(keys)), body axes; of AidSamples (n, k, len(keys)). Asked for the channels in `channels` only."""
+        """Derivative of what `samples.channel` measures by the parameters `keys`: of Samples (n,
+        len(keys)), metres per `unit`; of ImuSamples (n, 3, len(keys)), body axes; of AidSamples (n,
+        k, len(keys)). Asked for the channels in `channels` only.
+        """
         return np.zeros((len(samples), len(keys)))
 
     def noise_std(self, samples: Samples) -> np.ndarray:
@@ -171,48 +201,74 @@ class Effect:
         return np.zeros(len(samples))
 
     def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
-        """The Flight that would have been recorded with this effect on top. Raises InputError where that needs a ground
-        truth, or an attitude, that the flight does not have. rng : numpy Generator, for random effects."""
+        """The Flight that would have been recorded with this effect on top. Raises InputError where
+        that needs a ground truth, or an attitude, that the flight does not have. rng : numpy
+        Generator, for random effects.
+        """
         need_truth(self, flight)
-        for channel in [channel for channel in self.channels if channel in RADIO and getattr(flight, channel) is not None]:
+        for channel in [
+            channel
+            for channel in self.channels
+            if channel in RADIO and getattr(flight, channel) is not None
+        ]:
             stream, (samples, rows) = getattr(flight, channel), true_samples(flight, RADIO[channel])
             bias = self.bias(samples)
             if not np.isfinite(bias).all():
-                raise InputError(f"{flight.name}: has no attitude in its ground truth, which {self.name} needs.")
+                raise InputError(
+                    f"{flight.name}: has no attitude in its ground truth, which {self.name} needs."
+                )
             d = stream.d.copy()
             d[rows] += bias
             flight = flight.replaced(**{channel: replace(stream, d=d)})
         return flight
 
     def advice(self) -> tuple[str, ...]:
-        """What a person can do about it in the hall: imperative sentences, the most important first; () if nothing but
-        taking it out of the measurements helps. They name `significant` values alone."""
+        """What a person can do about it in the hall: imperative sentences, the most important
+        first; () if nothing but taking it out of the measurements helps. They name `significant`
+        values alone.
+        """
         largest = list(self.significant().items())[:LARGEST]
         if not largest:
             return ()
         values = listed(f"{key} = {measured(value, self.std.get(key))}" for key, value in largest)
-        return (f"Look for the cause of {self.name}: {self.physics} (found: {values}, in {self.unit}).",)
+        return (
+            f"Look for the cause of {self.name}: {self.physics} (found: {values}, in {self.unit}).",
+        )
 
     def significant(self) -> dict[str, float]:
-        """{parameter: value} of those values that the data determine, the largest first in standard deviations; values without a standard
-        deviation, or with none but 0, were set, not estimated, and come last."""
+        """{parameter: value} of those values that the data determine, the largest first in standard
+        deviations; values without a standard deviation, or with none but 0, were set, not
+        estimated, and come last.
+        """
         std = self.std
-        known = {key: value for key, value in self.values.items() if not abs(value) < SIGNIFICANT * std.get(key, 0.0)}
-        return dict(sorted(known.items(), key=lambda item: -abs(item[1]) / (std.get(item[0]) or math.inf)))
+        known = {
+            key: value
+            for key, value in self.values.items()
+            if not abs(value) < SIGNIFICANT * std.get(key, 0.0)
+        }
+        return dict(
+            sorted(known.items(), key=lambda item: -abs(item[1]) / (std.get(item[0]) or math.inf))
+        )
 
     def size(self, key: str, unit: str | None = None, factor: float = 1.0) -> str:
         """Magnitude of a parameter with its standard deviation, times `factor`, in `unit`."""
         unit = self.unit if unit is None else unit
         return measured(abs(self.values[key]) * factor, self.std.get(key, 0.0) * abs(factor), unit)
 
-    def directed(self, key: str, above: str, below: str, unit: str | None = None, factor: float = 1.0) -> str:
-        """The `size` of a significant parameter, and which way it is off: "12.0 ± 0.3 ms late"; "" if the data do not determine it."""
+    def directed(
+        self, key: str, above: str, below: str, unit: str | None = None, factor: float = 1.0
+    ) -> str:
+        """The `size` of a significant parameter, and which way it is off: "12.0 ± 0.3 ms late"; ""
+        if the data do not determine it.
+        """
         if key not in self.significant():
             return ""
         return f"{self.size(key, unit, factor)} {above if self.values[key] > 0.0 else below}"
 
     def on_floor(self, anchors: Anchors) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What is given to the filter of an effect that is `weighed`, as of `FloorMultipath.on_floor`."""
+        """What is given to the filter of an effect that is `weighed`, as of
+        `FloorMultipath.on_floor`.
+        """
         raise NotImplementedError
 
     def marks(self, anchors: Anchors) -> tuple[Shift | Region, ...]:
@@ -224,34 +280,48 @@ class Effect:
         return 0.0
 
     def sensor_model(self, channel: str) -> Affine:
-        """Affine from the true to the measured values of "gyro" (rad/s), "accel" (m/s^2) or "velocity" (m/s), body axes, or
-        of "height" (m)."""
+        """Affine from the true to the measured values of "gyro" (rad/s), "accel" (m/s^2) or
+        "velocity" (m/s), body axes, or of "height" (m).
+        """
         return IDENTITY
 
     def sensor_bias(self, channel: str, features: np.ndarray) -> np.ndarray | None:
-        """What it adds to "gyro" or "accel" besides, (n, 3), given their features (n, len(OF_IMU)); None for nothing."""
+        """What it adds to "gyro" or "accel" besides, (n, 3), given their features (n, len(OF_IMU));
+        None for nothing.
+        """
         return None
 
     def sensor_functions(self) -> tuple[SensorFunction, ...]:
-        """What it adds to inertial samples that changes with the state of the filter: tuple of SensorFunction."""
+        """What it adds to inertial samples that changes with the state of the filter: tuple of
+        SensorFunction.
+        """
         return ()
 
     def uncorrected(self, samples: Any) -> np.ndarray | float:
-        """What taking it out of a stream leaves of it in ImuSamples, (n, 3), or AidSamples, (n, k), because nodes know less
-        than those."""
+        """What taking it out of a stream leaves of it in ImuSamples, (n, 3), or AidSamples, (n, k),
+        because nodes know less than those.
+        """
         return 0.0
 
 
 class ArrivalEffect(Effect):
-    """An effect that makes the signals of single anchors arrive late: bias of d_ab = delay_b - delay_a, of a range to b delay_b."""
+    """An effect that makes the signals of single anchors arrive late: bias of d_ab = delay_b -
+    delay_a, of a range to b delay_b.
+    """
 
     channels = tuple(RADIO)
 
     def delays(self, samples: Samples, rows: np.ndarray) -> np.ndarray:
-        """By how much the anchors in `rows` (k * n,), the samples repeated k times, seem too far: (k * n,) m; here linear in all values."""
-        return self.delay_regressors(samples, rows, list(self.values)) @ np.array(list(self.values.values()))
+        """By how much the anchors in `rows` (k * n,), the samples repeated k times, seem too far:
+        (k * n,) m; here linear in all values.
+        """
+        return self.delay_regressors(samples, rows, list(self.values)) @ np.array(
+            list(self.values.values())
+        )
 
-    def delay_regressors(self, samples: Samples, rows: np.ndarray, keys: Sequence[str]) -> np.ndarray:
+    def delay_regressors(
+        self, samples: Samples, rows: np.ndarray, keys: Sequence[str]
+    ) -> np.ndarray:
         """Its derivative with respect to `keys`, (k * n, len(keys))."""
         raise NotImplementedError
 
@@ -263,7 +333,9 @@ class ArrivalEffect(Effect):
 
 
 class AnchorEffect(Effect):
-    """An effect with one parameter for each anchor, named by its id, that makes its arrivals late in proportion."""
+    """An effect with one parameter for each anchor, named by its id, that makes its arrivals late
+    in proportion.
+    """
 
     channels = tuple(RADIO)
 
@@ -304,7 +376,9 @@ def need_truth(effect: Effect, flight: Flight) -> Truth:
 def check_anchor(name: str, text: str, key: str) -> None:
     """Raise InputError if `text`, of the parameter `key` of effect `name`, is not an anchor id."""
     if not (text.isdigit() and int(text) <= 65535):
-        raise InputError(f"effects: {name}: parameter {key!r} is not an anchor id; write for example '3: 0.05'.")
+        raise InputError(
+            f"effects: {name}: parameter {key!r} is not an anchor id; write for example '3: 0.05'."
+        )
 
 
 def known_anchors(anchors: Anchors | None) -> tuple[str, ...]:

@@ -26,4 +26,8 @@ class GyroBias(ImuEffect):
 
     def advice(self) -> tuple[str, ...]:
         found = readings(self, "about")
-        return (f"Let the gyroscope find its zero at rest before take-off: it reads {found}.",) if found else ()
+        return (
+            (f"Let the gyroscope find its zero at rest before take-off: it reads {found}.",)
+            if found
+            else ()
+        )

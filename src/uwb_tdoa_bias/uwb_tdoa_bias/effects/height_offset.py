@@ -9,8 +9,9 @@ from .aid_error import AidEffect
 
 
 class HeightOffset(AidEffect):
-    """Measured range = true one from the origin of the body frame + `offset`. The filter's `height_arm` is the same with
-    the other sign: set one of them."""
+    """Measured range = true one from the origin of the body frame + `offset`. The filter's
+    `height_arm` is the same with the other sign: set one of them.
+    """
 
     name = "height_offset"
     unit = "m"
@@ -18,9 +19,14 @@ class HeightOffset(AidEffect):
     negligible = 0.005
     typical = 0.1
     example = "offset"
-    physics = "the range finder reads too long, or is mounted above the origin of the body frame along its z"
+    physics = (
+        "the range finder reads too long, or is mounted above the origin of the body frame along "
+        "its z"
+    )
     confounded_with = ("height_scale",)
-    distinguished_by = {"height_scale": "a flight at several heights: an offset is the same at all of them"}
+    distinguished_by = {
+        "height_scale": "a flight at several heights: an offset is the same at all of them"
+    }
     reference = "VL53L1X data sheet: offset calibration, up to some centimetres"
     channels = ("height",)
 
@@ -29,4 +35,8 @@ class HeightOffset(AidEffect):
 
     def advice(self) -> tuple[str, ...]:
         off = self.directed("offset", "too long", "too short")
-        return (f"Check where the range finder is mounted, and its offset: it reads {off}.",) if off else ()
+        return (
+            (f"Check where the range finder is mounted, and its offset: it reads {off}.",)
+            if off
+            else ()
+        )

@@ -28,4 +28,8 @@ class HeightScale(AidEffect):
 
     def advice(self) -> tuple[str, ...]:
         off = self.directed("scale", "too long", "too short", "%", 100.0)
-        return (f"Check the unit and the calibration of the range finder: it reads {off}.",) if off else ()
+        return (
+            (f"Check the unit and the calibration of the range finder: it reads {off}.",)
+            if off
+            else ()
+        )

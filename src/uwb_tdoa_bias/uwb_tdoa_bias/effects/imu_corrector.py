@@ -13,13 +13,16 @@ from .fading import LITTLE, in_words
 
 if TYPE_CHECKING:
     from collections.abc import Collection
+
     from .base import Effect
 
 SENSORS = ("gyro", "accel")
 
 
 class ImuCorrector:
-    """Undoes the effects of a set in the order in which they are listed; what depends on features comes last."""
+    """Undoes the effects of a set in the order in which they are listed; what depends on features
+    comes last.
+    """
 
     def __init__(self, effects: Collection[Effect]) -> None:
         """effects : those that do not act on inertial samples are passed over."""
@@ -30,7 +33,11 @@ class ImuCorrector:
                 undo = effect.sensor_model(channel).inverse().after(undo)
             self._undo.append(undo)
         still = np.zeros((1, len(OF_IMU)))
-        self._additive = [e for e in effects if any(e.sensor_bias(channel, still) is not None for channel in SENSORS)]
+        self._additive = [
+            e
+            for e in effects
+            if any(e.sensor_bias(channel, still) is not None for channel in SENSORS)
+        ]
         self._features, self._latest = ImuFeatures(), still[:0]
         self.idle = not self._additive and all(
             effect.sensor_model(channel) is IDENTITY for effect in effects for channel in SENSORS
@@ -38,14 +45,25 @@ class ImuCorrector:
 
     @property
     def outside(self) -> list[str]:
-        """Phrases on those effects of which less than half was taken out of some of the latest samples, because they were not seen
-        there."""
-        return [in_words(effect) for effect in self._additive if any(self._is_beyond(*limits) for limits in effect.domain.items())]
+        """Phrases on those effects of which less than half was taken out of some of the latest
+        samples, because they were not seen there.
+        """
+        return [
+            in_words(effect)
+            for effect in self._additive
+            if any(self._is_beyond(*limits) for limits in effect.domain.items())
+        ]
 
     def _is_beyond(self, covariate: str, limits: tuple[float, float]) -> bool:
-        return covariate in OF_IMU and np.min(share(self._latest[:, OF_IMU.index(covariate)], limits), initial=1.0) < LITTLE
+        return (
+            covariate in OF_IMU
+            and np.min(share(self._latest[:, OF_IMU.index(covariate)], limits), initial=1.0)
+            < LITTLE
+        )
 
-    def correct(self, t: np.ndarray, gyro: np.ndarray, accel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def correct(
+        self, t: np.ndarray, gyro: np.ndarray, accel: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
         """t (n,) s; gyro (n, 3) rad/s; accel (n, 3) m/s^2. Returns corrected (gyro, accel)."""
         sensed = [undo(samples) for undo, samples in zip(self._undo, (gyro, accel))]
         if self._additive:

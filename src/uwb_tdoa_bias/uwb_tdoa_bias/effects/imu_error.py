@@ -14,6 +14,7 @@ from .wording import listed
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from ..foundation.anchors import Anchors
     from ..foundation.flight import Flight, Imu
     from .affine import Affine
@@ -21,7 +22,10 @@ if TYPE_CHECKING:
 
 
 class ImuEffect(Effect):
-    """An effect on inertial samples. Subclasses say what a sensor makes of the truth: `gyro()` and `accel()`."""
+    """An effect on inertial samples.
+
+    Subclasses say what a sensor makes of the truth: `gyro()` and `accel()`.
+    """
 
     def gyro(self) -> Affine:
         """Affine, from the true turning rate to the measured one, rad/s, body."""
@@ -43,18 +47,29 @@ class ImuEffect(Effect):
         return {"gyro": self.gyro, "accel": self.accel}.get(channel, lambda: IDENTITY)()
 
     def regressors(self, samples: ImuSamples, keys: Sequence[str]) -> np.ndarray:
-        return regressors(lambda values: type(self)(values).sensor_model(samples.channel), self.values, samples.reading, keys)
+        return regressors(
+            lambda values: type(self)(values).sensor_model(samples.channel),
+            self.values,
+            samples.reading,
+            keys,
+        )
 
     def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
         imu = need_imu(self, flight)
-        return replace(flight, imu=replace(imu, gyro=self.gyro()(imu.gyro), accel=self.accel()(imu.accel)))
+        return replace(
+            flight, imu=replace(imu, gyro=self.gyro()(imu.gyro), accel=self.accel()(imu.accel))
+        )
 
 
 def readings(effect: ImuEffect, along: str, unit: str | None = None, factor: float = 1.0) -> str:
-    """Significant values of an ImuEffect that adds to what a sensor reads: "0.20 ± 0.01 m/s^2 too much along x"; ""
-    without any. along : "along" or "about" the axes."""
+    """Significant values of an ImuEffect that adds to what a sensor reads: "0.20 ± 0.01 m/s^2 too
+    much along x"; "" without any. along : "along" or "about" the axes.
+    """
     parts = {
-        key: f"{effect.size(key, unit, factor)} too {'much' if value > 0.0 else 'little'} {along} {key}"
+        key: (
+            f"{effect.size(key, unit, factor)} too {'much' if value > 0.0 else 'little'} {along} "
+            f"{key}"
+        )
         for key, value in effect.significant().items()
     }
     return listed(parts[key] for key in sorted(parts)) if parts else ""

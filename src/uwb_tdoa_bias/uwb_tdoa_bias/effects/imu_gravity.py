@@ -8,21 +8,23 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..foundation.later import rotations
-from .base import need_truth
 from .affine import Affine
+from .base import need_truth
 from .imu_error import ImuEffect, need_imu
 from .samples import Track
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from ..foundation.anchors import Anchors
     from ..foundation.flight import Flight
     from .samples import ImuSamples
 
 
 class ImuGravity(ImuEffect):
-    """Gravity is 9.81 m/s^2 + `excess`, along the world's z. Corrected along the body's z: at the tilt of a flight that
-    is right to a few percent of the excess, and needs no attitude."""
+    """Gravity is 9.81 m/s^2 + `excess`, along the world's z. Corrected along the body's z: at the
+    tilt of a flight that is right to a few percent of the excess, and needs no attitude.
+    """
 
     name = "imu_gravity"
     unit = "m/s^2"
@@ -30,7 +32,9 @@ class ImuGravity(ImuEffect):
     negligible = 0.03
     typical = 0.1
     example = "excess"
-    physics = "local gravity, or the factor from g to m/s^2, differs from the 9.81 m/s^2 of the filter"
+    physics = (
+        "local gravity, or the factor from g to m/s^2, differs from the 9.81 m/s^2 of the filter"
+    )
     confounded_with = ("accel_bias", "accel_scale")
     distinguished_by = {
         "accel_bias": "a flight that tilts, or the vehicle at rest on its sides",
@@ -49,7 +53,9 @@ class ImuGravity(ImuEffect):
         return self.values.get("excess", 0.0)
 
     def regressors(self, samples: ImuSamples, keys: Sequence[str]) -> np.ndarray:
-        return np.repeat(samples.up[:, :, None], len(keys), axis=2)  # the true vertical, not the body's z
+        return np.repeat(
+            samples.up[:, :, None], len(keys), axis=2
+        )  # the true vertical, not the body's z
 
     def uncorrected(self, samples: ImuSamples) -> np.ndarray:
         return self.excess * (samples.up - [0.0, 0.0, 1.0])
@@ -69,4 +75,13 @@ class ImuGravity(ImuEffect):
 
     def advice(self) -> tuple[str, ...]:
         off = self.directed("excess", "too much", "too little")
-        return (f"Check the accelerometer's factor from g to m/s^2, and local gravity: it reads {off} upwards.",) if off else ()
+        return (
+            (
+                (
+                    "Check the accelerometer's factor from g to m/s^2, and local gravity: it "
+                    f"reads {off} upwards."
+                ),
+            )
+            if off
+            else ()
+        )

@@ -11,8 +11,9 @@ from .wording import listed, measured
 
 
 class ImuMisalignment(ImuEffect):
-    """The IMU's axes are the body's, turned by the rotation vector (x, y, z): it measures R^T of what the body
-    feels."""
+    """The IMU's axes are the body's, turned by the rotation vector (x, y, z): it measures R^T of
+    what the body feels.
+    """
 
     name = "imu_misalignment"
     unit = "rad"
@@ -39,10 +40,18 @@ class ImuMisalignment(ImuEffect):
 
     def advice(self) -> tuple[str, ...]:
         turns = {
-            key: f"{measured(-np.degrees(value), np.degrees(self.std.get(key, 0.0)), 'degrees')} about {key}"
+            key: (
+                f"{measured(-np.degrees(value), np.degrees(self.std.get(key, 0.0)), 'degrees')} "
+                f"about {key}"
+            )
             for key, value in self.significant().items()
         }
         if not turns:
             return ()
         back = listed(turns[key] for key in sorted(turns))
-        return (f"Turn the IMU by {back}: its axes are not those of the body as the ground truth has it.",)
+        return (
+            (
+                f"Turn the IMU by {back}: its axes are not those of the body as the ground truth "
+                "has it."
+            ),
+        )

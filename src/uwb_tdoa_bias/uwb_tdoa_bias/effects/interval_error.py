@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from .wording import measured
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Sequence
+
     from ..foundation.anchors import Anchors
     from ..foundation.flight import Flight
     from .samples import AidSamples
@@ -22,8 +23,9 @@ LIMITS = ("start", "end")  # s after the first TDOA
 
 
 class IntervalEffect(Effect):
-    """An effect on one stream, its only channel, of the size "N.<part>" from "N.start" to "N.end" seconds after the first
-    TDOA; N counts from 1; a limit that is not given does not limit it."""
+    """An effect on one stream, its only channel, of the size "N.<part>" from "N.start" to "N.end"
+    seconds after the first TDOA; N counts from 1; a limit that is not given does not limit it.
+    """
 
     part: ClassVar[str]
     portable = False
@@ -39,7 +41,8 @@ class IntervalEffect(Effect):
         number, _, part = key.partition(".")
         if not number.isdigit() or part not in (cls.part, *LIMITS):
             raise InputError(
-                f"effects: {cls.name}: parameter {key!r} is not a number and {cls.part}, start or end, as 1.{cls.part}."
+                f"effects: {cls.name}: parameter {key!r} is not a number and {cls.part}, "
+                f"start or end, as 1.{cls.part}."
             )
 
     @classmethod
@@ -52,7 +55,10 @@ class IntervalEffect(Effect):
 
     @property
     def identity(self) -> tuple[Hashable, ...]:
-        return (self.name, *sorted((key, value) for key, value in self.values.items() if key.endswith(LIMITS)))
+        return (
+            self.name,
+            *sorted((key, value) for key, value in self.values.items() if key.endswith(LIMITS)),
+        )
 
     @property
     def sizes(self) -> dict[str, float]:
@@ -64,7 +70,9 @@ class IntervalEffect(Effect):
         out = np.zeros((*unit.shape, len(keys)))
         for column, key in enumerate(keys):
             number = key.partition(".")[0]
-            inside = (since >= get(f"{number}.start", -np.inf)) & (since <= get(f"{number}.end", np.inf))
+            inside = (since >= get(f"{number}.start", -np.inf)) & (
+                since <= get(f"{number}.end", np.inf)
+            )
             out[inside, :, column] = unit[inside]
         return out
 
@@ -78,16 +86,24 @@ class IntervalEffect(Effect):
         samples = aid_samples(stream, part.t, Track(truth), float(flight.tdoa.t[0]))
         extra = self.uncorrected(samples)
         if not np.isfinite(extra).all():
-            raise InputError(f"{flight.name}: has no attitude in its ground truth, which {self.name} needs.")
+            raise InputError(
+                f"{flight.name}: has no attitude in its ground truth, which {self.name} needs."
+            )
         return flight.replaced(**{stream: part.sensed(part.values + extra)})
 
     def significant_sizes(self, unit: str, factor: float = 1.0) -> list[tuple[float, str, str]]:
-        """[(signed size, its words, when, in words)] of those sizes that are significant, the most certain first."""
+        """[(signed size, its words, when, in words)] of those sizes that are significant, the most
+        certain first.
+        """
         out = []
         for key, value in self.significant().items():
             if key in self.sizes:
                 number, std = key.partition(".")[0], self.std.get(key, 0.0)
                 start, end = (self.values.get(f"{number}.{limit}") for limit in LIMITS)
-                when = "" if start is None or end is None else f" from {start:.0f} to {end:.0f} s after the first TDOA"
+                when = (
+                    ""
+                    if start is None or end is None
+                    else f" from {start:.0f} to {end:.0f} s after the first TDOA"
+                )
                 out.append((value, measured(abs(value) * factor, std * factor, unit), when))
         return out

@@ -8,12 +8,13 @@ import numpy as np
 
 from ..foundation.errors import InputError
 from .base import ArrivalEffect, check_anchor
-from .samples import tile
 from .marks import Region
+from .samples import tile
 from .wording import measured
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Sequence
+
     from ..foundation.anchors import Anchors
     from .samples import Samples
 
@@ -21,8 +22,10 @@ PARTS = ("delay", "start", "end", "x", "y", "z", "radius")
 
 
 class Nlos(ArrivalEffect):
-    """Anchor i is "i.delay" metres late: from "i.start" to "i.end" seconds after the first TDOA, or while the tag is
-    within "i.radius" metres of ("i.x", "i.y", "i.z"); what is not given does not limit it."""
+    """Anchor i is "i.delay" metres late: from "i.start" to "i.end" seconds after the first TDOA, or
+    while the tag is within "i.radius" metres of ("i.x", "i.y", "i.z"); what is not given does not
+    limit it.
+    """
 
     name = "nlos"
     channels = ("tdoa",)
@@ -31,7 +34,10 @@ class Nlos(ArrivalEffect):
     negligible = 0.02
     typical = 0.5
     example = "0.delay"
-    physics = "something between tag and anchor: the direct path is slowed or lost, and a later one is taken for it"
+    physics = (
+        "something between tag and anchor: the direct path is slowed or lost, and a later one is "
+        "taken for it"
+    )
     confounded_with = ("anchor_delay", "anchor_clock_drift", "anchor_position")
     distinguished_by = {
         "anchor_delay": "the same path again without the obstacle, or from another side",
@@ -44,7 +50,10 @@ class Nlos(ArrivalEffect):
     def check_key(cls, key: str) -> None:
         anchor, _, part = key.partition(".")
         if part not in PARTS:
-            raise InputError(f"effects: {cls.name}: parameter {key!r} is not an anchor and one of {', '.join(PARTS)}.")
+            raise InputError(
+                f"effects: {cls.name}: parameter {key!r} is not an anchor and one of "
+                f"{', '.join(PARTS)}."
+            )
         check_anchor(cls.name, anchor, key)
 
     @classmethod
@@ -57,30 +66,44 @@ class Nlos(ArrivalEffect):
 
     @property
     def identity(self) -> tuple[Hashable, ...]:
-        return (self.name, *sorted((key, value) for key, value in self.values.items() if not key.endswith(".delay")))
+        return (
+            self.name,
+            *sorted(
+                (key, value) for key, value in self.values.items() if not key.endswith(".delay")
+            ),
+        )
 
     @classmethod
     def plausible(cls, values: dict[str, float]) -> bool:
-        return super().plausible(values) and all(values[key] >= 0.0 for key in values if key.endswith(".delay"))
+        return super().plausible(values) and all(
+            values[key] >= 0.0 for key in values if key.endswith(".delay")
+        )
 
     def _blocked(self, samples: Samples, rows: np.ndarray, anchor: str) -> np.ndarray:
         """(k * n,) bool"""
         get = self.values.get
         since = tile(samples, samples.t) - samples.start
         blocked = samples.anchors.ids[rows] == int(anchor)
-        blocked &= (since >= get(f"{anchor}.start", -np.inf)) & (since <= get(f"{anchor}.end", np.inf))
+        blocked &= (since >= get(f"{anchor}.start", -np.inf)) & (
+            since <= get(f"{anchor}.end", np.inf)
+        )
         if f"{anchor}.radius" in self.values:
             near = (
-                np.linalg.norm(samples.p - self._centre(anchor), axis=1) <= self.values[f"{anchor}.radius"]
+                np.linalg.norm(samples.p - self._centre(anchor), axis=1)
+                <= self.values[f"{anchor}.radius"]
             )  # False where NaN
             blocked &= tile(samples, near)
         return blocked
 
     def delays(self, samples: Samples, rows: np.ndarray) -> np.ndarray:
         keys = [key for key in self.values if key.endswith(".delay")]
-        return self.delay_regressors(samples, rows, keys) @ np.array([self.values[key] for key in keys])
+        return self.delay_regressors(samples, rows, keys) @ np.array(
+            [self.values[key] for key in keys]
+        )
 
-    def delay_regressors(self, samples: Samples, rows: np.ndarray, keys: Sequence[str]) -> np.ndarray:
+    def delay_regressors(
+        self, samples: Samples, rows: np.ndarray, keys: Sequence[str]
+    ) -> np.ndarray:
         out = np.zeros((len(rows), len(keys)))
         for column, key in enumerate(keys):
             out[:, column] = self._blocked(samples, rows, key.partition(".")[0])
@@ -93,11 +116,15 @@ class Nlos(ArrivalEffect):
             place, when = self._place(anchor), self._time(anchor)
             if place:
                 out.append(
-                    f"Look what stands between anchor {anchor} and {place}: the anchor is heard {late} late while "
+                    f"Look what stands between anchor {anchor} and {place}: the anchor is "
+                    f"heard {late} late while "
                     f"the tag is within {self.values[f'{anchor}.radius']:.1f} m of there{when}."
                 )
             else:
-                out.append(f"Look what stood between anchor {anchor} and the tag{when}: it was heard {late} late.")
+                out.append(
+                    f"Look what stood between anchor {anchor} and the tag{when}: it was heard "
+                    f"{late} late."
+                )
         return tuple(out)
 
     def marks(self, anchors: Anchors) -> tuple[Region, ...]:

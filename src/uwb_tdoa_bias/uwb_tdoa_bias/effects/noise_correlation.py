@@ -16,8 +16,9 @@ if TYPE_CHECKING:
 
 
 class NoiseCorrelation(Effect):
-    """Each anchor's arrivals carry a random error of standard deviation `std` (m) that is forgotten over `time` (s,
-    exponentially). It cannot be removed: the filter gets it as spread."""
+    """Each anchor's arrivals carry a random error of standard deviation `std` (m) that is forgotten
+    over `time` (s, exponentially). It cannot be removed: the filter gets it as spread.
+    """
 
     name = "noise_correlation"
     unit = "m, s"
@@ -25,7 +26,9 @@ class NoiseCorrelation(Effect):
     negligible = 0.03
     typical = 0.2
     example = "std"
-    physics = "multipath and attitude change slowly: errors of successive arrivals of an anchor are alike"
+    physics = (
+        "multipath and attitude change slowly: errors of successive arrivals of an anchor are alike"
+    )
     confounded_with = ("noise_level",)
     reference = "third-party analysis of the UTIL identification data: noise correlated in time"
     portable = False

@@ -17,7 +17,9 @@ if TYPE_CHECKING:
 
 
 class NoiseLevel(Effect):
-    """The link "a-b", in both directions, has white noise of `values["a-b"]` metres on top of what all have."""
+    """The link "a-b", in both directions, has white noise of `values["a-b"]` metres on top of what
+    all have.
+    """
 
     name = "noise_level"
     unit = "m"
@@ -49,10 +51,15 @@ class NoiseLevel(Effect):
         from .samples import Samples
 
         tdoa, n = flight.tdoa, len(flight.tdoa)
-        a, b = np.maximum(flight.anchors.index(tdoa.a), 0), np.maximum(flight.anchors.index(tdoa.b), 0)
+        a, b = (
+            np.maximum(flight.anchors.index(tdoa.a), 0),
+            np.maximum(flight.anchors.index(tdoa.b), 0),
+        )
         samples = Samples(tdoa.t, a, b, np.zeros((n, 3)), np.full((n, 4), np.nan), flight.anchors)
         rng = rng or np.random.default_rng()
-        return replace(flight, tdoa=replace(tdoa, d=tdoa.d + self.noise_std(samples) * rng.standard_normal(n)))
+        return replace(
+            flight, tdoa=replace(tdoa, d=tdoa.d + self.noise_std(samples) * rng.standard_normal(n))
+        )
 
     def advice(self) -> tuple[str, ...]:
         noisy = [f"those of {key} by {self.size(key)}" for key in self.significant()]
@@ -60,5 +67,8 @@ class NoiseLevel(Effect):
             return ()
         links = listed(key.replace("-", " and ") for key in self.significant())
         return (
-            f"Check the antennas of anchors {links} and the sight between them: TDOAs scatter more, {listed(noisy)}.",
+            (
+                f"Check the antennas of anchors {links} and the sight between them: TDOAs scatter "
+                f"more, {listed(noisy)}."
+            ),
         )

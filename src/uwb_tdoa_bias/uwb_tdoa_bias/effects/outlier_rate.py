@@ -14,8 +14,9 @@ if TYPE_CHECKING:
 
 
 class OutlierRate(Effect):
-    """A `share` of the TDOAs is wrong by something else: 0.5 to 5 m, either sign. The filter's robust weights are the
-    remedy; there is nothing to subtract."""
+    """A `share` of the TDOAs is wrong by something else: 0.5 to 5 m, either sign. The filter's
+    robust weights are the remedy; there is nothing to subtract.
+    """
 
     name = "outlier_rate"
     unit = "1"
@@ -23,7 +24,10 @@ class OutlierRate(Effect):
     negligible = 0.02
     typical = 0.05
     example = "share"
-    physics = "lost or mixed-up packets and reflections: single measurements that have nothing to do with the geometry"
+    physics = (
+        "lost or mixed-up packets and reflections: single measurements that have nothing to do "
+        "with the geometry"
+    )
     confounded_with = ("noise_level",)
     reference = "crazyflie-firmware issues 277, 305, 375"
     portable = False
@@ -40,4 +44,9 @@ class OutlierRate(Effect):
         if not self.significant():
             return ()
         share = self.size("share", "%", 100.0)
-        return (f"Look for lost or mixed-up packets and for reflections: {share} of the TDOAs are plainly wrong.",)
+        return (
+            (
+                f"Look for lost or mixed-up packets and for reflections: {share} of the TDOAs are "
+                "plainly wrong."
+            ),
+        )

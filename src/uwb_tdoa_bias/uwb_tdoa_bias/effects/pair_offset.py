@@ -12,13 +12,17 @@ from .wording import listed
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from numpy.typing import ArrayLike
+
     from ..foundation.anchors import Anchors
     from .samples import Samples
 
 
 class PairOffset(Effect):
-    """d_ab of the ordered pair "a-b" is `values["a-b"]` metres too large, and d_ba as much too small."""
+    """d_ab of the ordered pair "a-b" is `values["a-b"]` metres too large, and d_ba as much too
+    small.
+    """
 
     name = "pair_offset"
     unit = "m"
@@ -27,7 +31,8 @@ class PairOffset(Effect):
     typical = 0.3
     example = "0-1"
     physics = (
-        "the tag subtracts the time of flight that two anchors measured between them; its error is a "
+        "the tag subtracts the time of flight that two anchors measured between them; its "
+        "error is a "
         "constant of the pair"
     )
     confounded_with = ("anchor_delay", "anchor_position")
@@ -59,7 +64,9 @@ class PairOffset(Effect):
     def regressors(self, samples: Samples, keys: Sequence[str]) -> np.ndarray:
         a, b = samples.anchors.ids[samples.a], samples.anchors.ids[samples.b]
         links = [tuple(map(int, key.split("-"))) for key in keys]
-        return np.stack([1.0 * ((a == i) & (b == k)) - ((a == k) & (b == i)) for i, k in links], axis=1)
+        return np.stack(
+            [1.0 * ((a == i) & (b == k)) - ((a == k) & (b == i)) for i, k in links], axis=1
+        )
 
     def advice(self) -> tuple[str, ...]:
         off = [
@@ -69,13 +76,17 @@ class PairOffset(Effect):
         if not off:
             return ()
         links = listed(f"{key.replace('-', ' and ')}" for key in self.significant())
-        return (f"Let anchors {links} measure the time of flight between them again: {listed(off)}.",)
+        return (
+            f"Let anchors {links} measure the time of flight between them again: {listed(off)}.",
+        )
 
 
 def check_pair(name: str, key: str) -> None:
     """Raise InputError for a key of the effect of a name that is no pair of anchors, "a-b"."""
     if len(key.split("-")) != 2 or not all(part.isdigit() for part in key.split("-")):
-        raise InputError(f"effects: {name}: parameter {key!r} is not a pair of anchors; write for example '0-1'.")
+        raise InputError(
+            f"effects: {name}: parameter {key!r} is not a pair of anchors; write for example '0-1'."
+        )
 
 
 def link_keys(pairs: ArrayLike | None) -> tuple[str, ...]:

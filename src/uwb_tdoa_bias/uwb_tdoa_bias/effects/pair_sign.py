@@ -31,18 +31,27 @@ class PairSign(LabelEffect):
     def possible(value: float) -> bool:
         return value in (-1.0, 1.0)
 
-    def relabelled(self, a: np.ndarray, b: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def relabelled(
+        self, a: np.ndarray, b: np.ndarray, d: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         sign = np.ones(len(d))
         for key, value in self.values.items():
             one, two = map(int, key.split("-"))
             sign[(np.asarray(a) == one) & (np.asarray(b) == two)] *= value
         return a, b, sign * d
 
-    def mislabelled(self, a: np.ndarray, b: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def mislabelled(
+        self, a: np.ndarray, b: np.ndarray, d: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         return self.relabelled(a, b, d)
 
     def advice(self) -> tuple[str, ...]:
         wrong = [key for key, value in self.values.items() if value < 0.0]
         if not wrong:
             return ()
-        return (f"Look in the driver for what orders the pair: the sign of the TDOA of {listed(wrong)} is wrong.",)
+        return (
+            (
+                "Look in the driver for what orders the pair: the sign of the TDOA of "
+                f"{listed(wrong)} is wrong."
+            ),
+        )

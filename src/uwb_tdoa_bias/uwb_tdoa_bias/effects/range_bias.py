@@ -11,13 +11,17 @@ from .samples import tile
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from .samples import Samples
 
 EXAMPLES = 4.0, 8.0  # m, distances that advice names
 
 
 class RangeBias(ArrivalEffect):
-    """An anchor at range r seems farther by quadratic * r^2. (A constant cancels in a TDOA; a slope is range_scale.)"""
+    """An anchor at range r seems farther by quadratic * r^2.
+
+    (A constant cancels in a TDOA; a slope is range_scale.)
+    """
 
     name = "range_bias"
     unit = "1/m"
@@ -32,9 +36,13 @@ class RangeBias(ArrivalEffect):
         "range_scale": "a flight near to and far from the anchors",
     }
     covariates = ("range",)
-    reference = "Decawave APS011: the range error is a bent function of received power, hence of range"
+    reference = (
+        "Decawave APS011: the range error is a bent function of received power, hence of range"
+    )
 
-    def delay_regressors(self, samples: Samples, rows: np.ndarray, keys: Sequence[str]) -> np.ndarray:
+    def delay_regressors(
+        self, samples: Samples, rows: np.ndarray, keys: Sequence[str]
+    ) -> np.ndarray:
         to_anchor = samples.anchors.positions[rows] - tile(samples, samples.p)
         return np.repeat(np.sum(to_anchor**2, axis=1)[:, None], len(keys), axis=1)
 
@@ -43,4 +51,6 @@ class RangeBias(ArrivalEffect):
             return ()
         sign = "far" if self.values["quadratic"] > 0.0 else "near"
         near, far = (f"{self.size('quadratic', 'm', r * r)} at {r:g} m" for r in EXAMPLES)
-        return (f"Calibrate ranges over distance: an anchor seems too {sign} by {near} and by {far}.",)
+        return (
+            f"Calibrate ranges over distance: an anchor seems too {sign} by {near} and by {far}.",
+        )

@@ -11,6 +11,7 @@ from .samples import RADIO
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from .samples import Samples
 
 
@@ -24,7 +25,8 @@ class RangeScale(Effect):
     typical = 0.02
     example = "scale"
     physics = (
-        "the tag converts ticks to metres with a wrong length: a wrong clock frequency, speed of propagation or unit"
+        "the tag converts ticks to metres with a wrong length: a wrong clock frequency, speed of "
+        "propagation or unit"
     )
     confounded_with = ("range_bias", "anchor_position", "truth_frame")
     covariates = ("range",)

@@ -13,13 +13,15 @@ from .wording import measured
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from .samples import Samples
 
 LINK = RadioLink()
 
 
 class ReceivedPowerBias(ArrivalEffect):
-    """`scale` times the table of Decawave APS011 at the power that Friis and the antennas' patterns predict.
+    """`scale` times the table of Decawave APS011 at the power that Friis and the antennas' patterns
+    predict.
 
     An anchor, or a tag, whose attitude is not known counts with the mean gain of its antenna.
     """
@@ -35,7 +37,9 @@ class ReceivedPowerBias(ArrivalEffect):
     reference = "Decawave APS011, table 2 (500 MHz, 64 MHz PRF)"
     uses_attitude = True
 
-    def delay_regressors(self, samples: Samples, rows: np.ndarray, keys: Sequence[str]) -> np.ndarray:
+    def delay_regressors(
+        self, samples: Samples, rows: np.ndarray, keys: Sequence[str]
+    ) -> np.ndarray:
         anchors = samples.anchors
         power = received_power_dbm(
             tile(samples, samples.p),
@@ -57,5 +61,8 @@ class ReceivedPowerBias(ArrivalEffect):
             return ()
         scale = measured(self.values["scale"], self.std.get("scale"))
         return (
-            f"Correct ranges for received power in the tag: they err by {scale} times the table of Decawave APS011.",
+            (
+                f"Correct ranges for received power in the tag: they err by {scale} times the "
+                "table of Decawave APS011."
+            ),
         )

@@ -1,4 +1,6 @@
-"""What an inertial sensor reads beside the truth, as a function of where the filter is: a table that compiled code looks up."""
+"""What an inertial sensor reads beside the truth, as a function of where the filter is: a table
+that compiled code looks up.
+"""
 
 from __future__ import annotations
 
@@ -15,8 +17,10 @@ STEPS = 256  # of a table
 
 @dataclass(frozen=True, eq=False)
 class SensorFunction:
-    """sensor : "gyro" or "accel"; axis : 0 to 2, of the body; covariate : one of OF_STATE; low, high : of it; values (STEPS + 1,) rad/s or
-    m/s^2, evenly between them, held constant beyond; periodic : it goes on beyond them instead."""
+    """sensor : "gyro" or "accel"; axis : 0 to 2, of the body; covariate : one of OF_STATE; low,
+    high : of it; values (STEPS + 1,) rad/s or m/s^2, evenly between them, held constant beyond;
+    periodic : it goes on beyond them instead.
+    """
 
     sensor: str
     axis: int
@@ -28,9 +32,22 @@ class SensorFunction:
 
     @classmethod
     def of(
-        cls, function: Callable[[np.ndarray], np.ndarray], channel: str, covariate: str, low: float, high: float,
+        cls,
+        function: Callable[[np.ndarray], np.ndarray],
+        channel: str,
+        covariate: str,
+        low: float,
+        high: float,
         periodic: bool = False,
-    ) -> SensorFunction:  # fmt: skip
+    ) -> SensorFunction:
         """Of a function of the covariate, (n,) to (n,); channel : "gyro.x" ... "accel.z"."""
         sensor, _, axis = channel.partition(".")
-        return cls(sensor, "xyz".index(axis), covariate, low, high, function(np.linspace(low, high, STEPS + 1)), periodic)
+        return cls(
+            sensor,
+            "xyz".index(axis),
+            covariate,
+            low,
+            high,
+            function(np.linspace(low, high, STEPS + 1)),
+            periodic,
+        )

@@ -1,9 +1,11 @@
-"""What the effects on stamps share: a stream is stamped some seconds after the instant it was taken at."""
+"""What the effects on stamps share: a stream is stamped some seconds after the instant it was taken
+at.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import ClassVar, TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -12,12 +14,16 @@ from .base import Effect
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from ..foundation.flight import Flight
     from .samples import AidSamples, Samples
 
 
 class StampEffect(Effect):
-    """An effect on the stamps of one stream. Subclasses say which, by its name in a Flight, and what to do about it."""
+    """An effect on the stamps of one stream.
+
+    Subclasses say which, by its name in a Flight, and what to do about it.
+    """
 
     unit = "s"
     bound = 1.0
@@ -45,4 +51,8 @@ class StampEffect(Effect):
 def shifted(flight: Flight, stream: str, seconds: float) -> Flight:
     """The Flight with `seconds` added to the stamps of a stream, which may be missing."""
     part = getattr(flight, stream)
-    return flight if part is None or not seconds else replace(flight, **{stream: replace(part, t=part.t + seconds)})
+    return (
+        flight
+        if part is None or not seconds
+        else replace(flight, **{stream: replace(part, t=part.t + seconds)})
+    )

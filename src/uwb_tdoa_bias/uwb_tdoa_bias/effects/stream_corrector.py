@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ..foundation.flight import AIDS
 from .aid_corrector import AidCorrector
@@ -12,21 +12,35 @@ from .label_error import LabelCorrector
 
 if TYPE_CHECKING:
     from collections.abc import Collection
+
     from .base import Effect
 
 STREAMS = ("tdoa", "imu", "truth", *AIDS)  # of a Flight
 
 
 class StreamCorrector:
-    """Undoes the effects of a set in ids, signs, stamps, inertial samples, heights and velocities. TDOA biases are the Corrector's."""
+    """Undoes the effects of a set in ids, signs, stamps, inertial samples, heights and velocities.
+
+    TDOA biases are the Corrector's.
+    """
 
     def __init__(self, effects: Collection[Effect]) -> None:
         """effects : those that do not act on these are passed over."""
-        self._late = {stream: sum(effect.stamp_offset(stream) for effect in effects) for stream in STREAMS if stream not in AIDS}
-        self._labels, self._imu, self._aids = LabelCorrector(effects), ImuCorrector(effects), AidCorrector(effects)
+        self._late = {
+            stream: sum(effect.stamp_offset(stream) for effect in effects)
+            for stream in STREAMS
+            if stream not in AIDS
+        }
+        self._labels, self._imu, self._aids = (
+            LabelCorrector(effects),
+            ImuCorrector(effects),
+            AidCorrector(effects),
+        )
 
     def correct(self, name: str, stream: Any) -> Any:
-        """A stream of a Flight, by its name, or the part of it that follows the last one, corrected."""
+        """A stream of a Flight, by its name, or the part of it that follows the last one,
+        corrected.
+        """
         if name in AIDS:
             return self._aids.correct(name, stream)
         if self._late[name]:

@@ -13,6 +13,7 @@ from .wording import listed
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from ..foundation.anchors import Anchors
     from .samples import Samples
 
@@ -26,10 +27,15 @@ class TagLeverArm(Effect):
     negligible = 0.01
     typical = 0.15
     example = "z"
-    physics = "the tag's antenna is off the origin of the body frame, by an arm that turns with the body"
+    physics = (
+        "the tag's antenna is off the origin of the body frame, by an arm that turns with the body"
+    )
     confounded_with = ("truth_frame", "anchor_position")
     distinguished_by = {
-        "truth_frame": "a flight that turns through all headings: the arm turns with the body, the frame does not",
+        "truth_frame": (
+            "a flight that turns through all headings: the arm turns with the body, the frame "
+            "does not"
+        ),
     }
     reference = "any text on strapdown navigation: lever arm compensation"
     uses_attitude = True
@@ -48,15 +54,23 @@ class TagLeverArm(Effect):
     def regressors(self, samples: Samples, keys: Sequence[str]) -> np.ndarray:
         jacobian = samples.direction(samples.p + _rotate(samples.q, self._arm()))
         axes = np.eye(3)[["xyz".index(key) for key in keys]]
-        return np.stack([np.sum(jacobian * _rotate(samples.q, axis), axis=1) for axis in axes], axis=1)
+        return np.stack(
+            [np.sum(jacobian * _rotate(samples.q, axis), axis=1) for axis in axes], axis=1
+        )
 
     def advice(self) -> tuple[str, ...]:
-        arm = {key: f"{self.size(key)} towards {'+' if v > 0.0 else '-'}{key}" for key, v in self.significant().items()}
+        arm = {
+            key: f"{self.size(key)} towards {'+' if v > 0.0 else '-'}{key}"
+            for key, v in self.significant().items()
+        }
         if not arm:
             return ()
         parts = listed(arm[key] for key in sorted(arm))
         return (
-            f"Measure where the tag's antenna sits on the vehicle: it is {parts} from the origin of the body frame.",
+            (
+                f"Measure where the tag's antenna sits on the vehicle: it is {parts} from the "
+                "origin of the body frame."
+            ),
         )
 
 

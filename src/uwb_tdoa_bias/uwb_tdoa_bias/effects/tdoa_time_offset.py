@@ -6,11 +6,17 @@ from .stamp_error import StampEffect
 
 
 class TdoaTimeOffset(StampEffect):
-    """TDOAs are stamped `offset` seconds after the instant they were taken at. Corrected by moving the stamps."""
+    """TDOAs are stamped `offset` seconds after the instant they were taken at.
+
+    Corrected by moving the stamps.
+    """
 
     name = "tdoa_time_offset"
     stream = "tdoa"
-    physics = "the radio's stamps lag behind the IMU's: by buffers, or because they are taken on arrival at the host"
+    physics = (
+        "the radio's stamps lag behind the IMU's: by buffers, or because they are taken on "
+        "arrival at the host"
+    )
     remedy = "Stamp TDOAs at the instant they are taken: their stamps are {}."
     confounded_with = ("truth_time_offset",)
     distinguished_by = {

@@ -14,6 +14,7 @@ from .wording import listed, measured
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from ..foundation.anchors import Anchors
     from .samples import Samples
 
@@ -22,9 +23,11 @@ DEGREES = 180.0 / np.pi
 
 
 class TruthFrame(Effect):
-    """In the frame of the truth, an anchor surveyed at A stands at R A + (x, y, z), R of the rotation vector (roll,
-    pitch, yaw). Which of the two frames is right is not observable, so that nodes are not given it. Where effects.yaml has it,
-    correcting it moves the anchors, so that estimates come out in the frame of the truth."""
+    """In the frame of the truth, an anchor surveyed at A stands at R A + (x, y, z), R of the
+    rotation vector (roll, pitch, yaw). Which of the two frames is right is not observable, so that
+    nodes are not given it. Where effects.yaml has it, correcting it moves the anchors, so that
+    estimates come out in the frame of the truth.
+    """
 
     name = "truth_frame"
     unit = "m, rad"
@@ -32,14 +35,20 @@ class TruthFrame(Effect):
     negligible = 0.01
     typical = 0.15
     example = "z"
-    physics = "survey and motion capture do not share one frame: all anchors are shifted and turned together"
+    physics = (
+        "survey and motion capture do not share one frame: all anchors are shifted and turned "
+        "together"
+    )
     confounded_with = ("tag_lever_arm", "anchor_position")
     reference = "rigid alignment of two coordinate frames"
     needs_reference = True
     portable = False
     usable = False
     channels = tuple(RADIO)
-    unused = "whether the survey or the ground truth is turned or shifted nobody can tell, so that nothing goes to the nodes"
+    unused = (
+        "whether the survey or the ground truth is turned or shifted nobody can tell, so that "
+        "nothing goes to the nodes"
+    )
 
     @classmethod
     def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
@@ -72,14 +81,20 @@ class TruthFrame(Effect):
         parts = []
         for key in (key for key in KEYS if key in self.significant()):
             factor, unit = (1.0, "m") if key in "xyz" else (DEGREES, "degrees")
-            parts.append(f"{key} {measured(self.values[key] * factor, self.std.get(key, 0.0) * factor, unit)}")
+            parts.append(
+                f"{key} "
+                f"{measured(self.values[key] * factor, self.std.get(key, 0.0) * factor, unit)}"
+            )
         if not parts:
             return ()
         return (
-            "Align the frames of the survey and of the ground truth anew: seen from the ground truth, all anchors are "
+            "Align the frames of the survey and of the ground truth anew: seen from the "
+            "ground truth, all anchors are "
             f"shifted and turned together by {listed(parts)}.",
         )
 
     def marks(self, anchors: Anchors) -> tuple[Shift, ...]:
         by = self._moved(anchors) - anchors.positions
-        return tuple(Shift(int(anchor), shift, np.full(3, np.nan)) for anchor, shift in zip(anchors.ids, by))
+        return tuple(
+            Shift(int(anchor), shift, np.full(3, np.nan)) for anchor, shift in zip(anchors.ids, by)
+        )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+
 import numpy as np
 
 from .affine import Affine
@@ -10,8 +11,9 @@ from .aid_error import AidEffect
 
 
 class VelocityMisalignment(AidEffect):
-    """The axes of the velocity are the body's, turned by `yaw` about z: it measures R_z(yaw)^T of the velocity in the body
-    frame."""
+    """The axes of the velocity are the body's, turned by `yaw` about z: it measures R_z(yaw)^T of
+    the velocity in the body frame.
+    """
 
     name = "velocity_misalignment"
     unit = "rad"
@@ -19,8 +21,12 @@ class VelocityMisalignment(AidEffect):
     negligible = 0.005
     typical = 0.1
     example = "yaw"
-    physics = "the camera, the flow sensor or the axes of the wheels are turned against the body's axes"
-    reference = "Borenstein and Feng, IEEE Trans. Robotics and Automation 12, 1996: misalignment of wheels"
+    physics = (
+        "the camera, the flow sensor or the axes of the wheels are turned against the body's axes"
+    )
+    reference = (
+        "Borenstein and Feng, IEEE Trans. Robotics and Automation 12, 1996: misalignment of wheels"
+    )
     channels = ("velocity",)
 
     def aid(self) -> Affine:
@@ -33,4 +39,9 @@ class VelocityMisalignment(AidEffect):
             return ()
         way = "counterclockwise" if self.values["yaw"] > 0.0 else "clockwise"
         angle = self.size("yaw", "degrees", math.degrees(1.0))
-        return (f"Turn the velocity sensor, or its frame: seen from above it is turned {way} by {angle}.",)
+        return (
+            (
+                f"Turn the velocity sensor, or its frame: seen from above it is turned {way} by "
+                f"{angle}."
+            ),
+        )

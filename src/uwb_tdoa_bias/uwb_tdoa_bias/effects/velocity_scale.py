@@ -20,7 +20,10 @@ class VelocityScale(AidEffect):
     physics = "a wheel of another radius, a wrong focal length or height of optical flow"
     confounded_with = ("velocity_slip",)
     distinguished_by = {"velocity_slip": "a longer flight: a scale stays, slip ends"}
-    reference = "Borenstein and Feng, IEEE Trans. Robotics and Automation 12, 1996: systematic errors of odometry"
+    reference = (
+        "Borenstein and Feng, IEEE Trans. Robotics and Automation 12, 1996: systematic errors of "
+        "odometry"
+    )
     channels = ("velocity",)
 
     def aid(self) -> Affine:
@@ -28,4 +31,13 @@ class VelocityScale(AidEffect):
 
     def advice(self) -> tuple[str, ...]:
         off = self.directed("scale", "too fast", "too slow", "%", 100.0)
-        return (f"Calibrate the velocity over a known distance (radius of the wheels, focal length): it is {off}.",) if off else ()
+        return (
+            (
+                (
+                    "Calibrate the velocity over a known distance (radius of the wheels, focal "
+                    f"length): it is {off}."
+                ),
+            )
+            if off
+            else ()
+        )

@@ -8,11 +8,14 @@ from .interval_error import IntervalEffect
 
 if TYPE_CHECKING:
     import numpy as np
+
     from .samples import AidSamples
 
 
 class VelocitySlip(IntervalEffect):
-    """A share "N.share" of the velocity is missing from "N.start" to "N.end" seconds after the first TDOA."""
+    """A share "N.share" of the velocity is missing from "N.start" to "N.end" seconds after the
+    first TDOA.
+    """
 
     name = "velocity_slip"
     part = "share"
@@ -24,7 +27,10 @@ class VelocitySlip(IntervalEffect):
     physics = "wheels slip or spin, a camera loses its features and says that it stands still"
     confounded_with = ("velocity_scale",)
     distinguished_by = {"velocity_scale": "a longer flight: slip ends, a scale stays"}
-    reference = "Borenstein and Feng, IEEE Trans. Robotics and Automation 12, 1996: non-systematic errors of odometry"
+    reference = (
+        "Borenstein and Feng, IEEE Trans. Robotics and Automation 12, 1996: non-systematic errors "
+        "of odometry"
+    )
     channels = ("velocity",)
 
     def per_unit(self, samples: AidSamples) -> np.ndarray:

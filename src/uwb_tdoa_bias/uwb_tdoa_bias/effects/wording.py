@@ -13,8 +13,9 @@ LARGEST = 3  # values that a sentence names
 
 
 def rounded(value: float, std: float | None = None) -> str:
-    """A number to the first digit of its standard deviation, or to the second where the first is off by more than ROUNDED; to three digits
-    without one."""
+    """A number to the first digit of its standard deviation, or to the second where the first is
+    off by more than ROUNDED; to three digits without one.
+    """
     if not std:
         return f"{value:.3g}"
     return f"{value:.{_decimals(std)}f}"

@@ -1,1 +1,3 @@
-"""What everything else stands on: flights, anchors, geometry, antennas, stamps, errors, compiled code, and what talks ROS."""
+"""What everything else stands on: flights, anchors, geometry, antennas, stamps, errors, compiled
+code, and what talks ROS.
+"""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import yaml
@@ -19,9 +19,13 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 SAME_PLACE = 0.01  # m; an anchor that is sent again with less of a change is at the same place
-CONSTELLATION = 0.1  # m within which each anchor must stand, for what was made for others to hold for these
+CONSTELLATION = (
+    0.1  # m within which each anchor must stand, for what was made for others to hold for these
+)
 MOST = 10_000  # anchors, as many as a message holds
-FARTHEST = 1e8  # m along each axis: grid coordinates of a country fit, and their squares do not overflow
+FARTHEST = (
+    1e8  # m along each axis: grid coordinates of a country fit, and their squares do not overflow
+)
 
 
 @dataclass(frozen=True)
@@ -32,7 +36,8 @@ class Anchors:
     ----------
     ids : (N,) int array, each id once
     positions : (N, 3) float array, antenna centres, metres
-    orientations : (N, 4) float array, quaternions x y z w, antenna to world, normalised; a row of NaN where the
+    orientations : (N, 4) float array, quaternions x y z w, antenna to world, normalised; a row of
+        NaN where the
         orientation was not surveyed
     frame : name of the world frame
     """
@@ -50,29 +55,39 @@ class Anchors:
         if n == 0:
             raise InputError("anchors: the list is empty; give at least two anchors.")
         if n > MOST:
-            raise InputError(f"anchors: there are {n}; give at most {MOST}, e.g. those of one hall.")
+            raise InputError(
+                f"anchors: there are {n}; give at most {MOST}, e.g. those of one hall."
+            )
         if positions.shape != (n, 3) or orientations.shape != (n, 4):
             raise InputError(
-                f"anchors: {n} ids need positions of shape ({n}, 3) and orientations of shape ({n}, 4), "
+                f"anchors: {n} ids need positions of shape ({n}, 3) and orientations of shape "
+                f"({n}, 4), "
                 f"got {positions.shape} and {orientations.shape}."
             )
         values, counts = np.unique(ids, return_counts=True)
         if (counts > 1).any():
-            raise InputError(f"anchors: id {values[counts > 1][0]} is given twice; every anchor needs its own id.")
+            raise InputError(
+                f"anchors: id {values[counts > 1][0]} is given twice; every anchor needs its "
+                "own id."
+            )
         bad = ~(np.abs(positions) <= FARTHEST).all(axis=1)
         if bad.any():
             raise InputError(
-                f"anchors: position of anchor {ids[bad][0]} is {positions[bad][0]}; it must be finite metres, at most "
+                f"anchors: position of anchor {ids[bad][0]} is {positions[bad][0]}; it must "
+                "be finite metres, at most "
                 f"{FARTHEST:g} from the origin."
             )
         bad = ~np.isfinite(orientations).all(axis=1) & ~np.isnan(orientations).all(axis=1)
         bad |= np.abs(np.nan_to_num(orientations)).max(axis=1) > 1e6
         if bad.any():
             raise InputError(
-                f"anchors: orientation of anchor {ids[bad][0]} is {orientations[bad][0]}; give a quaternion x, y, z, w."
+                f"anchors: orientation of anchor {ids[bad][0]} is {orientations[bad][0]}; "
+                "give a quaternion x, y, z, w."
             )
         norm = np.linalg.norm(orientations, axis=1, keepdims=True)
-        orientations = np.where(norm > 1e-9, orientations / np.where(norm > 1e-9, norm, 1.0), np.nan)
+        orientations = np.where(
+            norm > 1e-9, orientations / np.where(norm > 1e-9, norm, 1.0), np.nan
+        )
         for name, value in (("ids", ids), ("positions", positions), ("orientations", orientations)):
             value.setflags(write=False)
             object.__setattr__(self, name, value)
@@ -93,11 +108,15 @@ class Anchors:
         return rows.take(np.asarray(ids, dtype=np.int64) + 1, mode="clip")
 
     def stand_at(self, ids: np.ndarray, positions: np.ndarray, frame: str) -> bool:
-        """Return whether these are the anchors with such ids (n,), positions (n, 3) m and frame, each within CONSTELLATION."""
+        """Return whether these are the anchors with such ids (n,), positions (n, 3) m and frame,
+        each within CONSTELLATION.
+        """
         rows = self.index(ids)
         if frame != self.frame or len(ids) != len(self) or (rows < 0).any():
             return False
-        return bool((np.linalg.norm(self.positions[rows] - positions, axis=1) <= CONSTELLATION).all())
+        return bool(
+            (np.linalg.norm(self.positions[rows] - positions, axis=1) <= CONSTELLATION).all()
+        )
 
     def at(self, positions: np.ndarray) -> Anchors:
         """The same Anchors at other positions, (N, 3) m."""
@@ -108,16 +127,22 @@ class Anchors:
         return Anchors(self.ids[rows], self.positions[rows], self.orientations[rows], self.frame)
 
     @classmethod
-    def from_positions(cls, positions: ArrayLike, ids: ArrayLike | None = None, frame: str = "map") -> Anchors:
-        """Anchors at (N, 3) positions in metres whose orientations are not known. Default ids: 0 ... N-1."""
+    def from_positions(
+        cls, positions: ArrayLike, ids: ArrayLike | None = None, frame: str = "map"
+    ) -> Anchors:
+        """Anchors at (N, 3) positions in metres whose orientations are not known.
+
+        Default ids: 0 ... N-1.
+        """
         positions = np.asarray(positions, dtype=float)
         ids = np.arange(len(positions)) if ids is None else np.asarray(ids)
         return cls(ids, positions, np.full((len(positions), 4), np.nan), frame)
 
     @classmethod
     def from_message(cls, message: Any) -> Anchors:
-        """Anchors of a uwb_tdoa_msgs/AnchorArray, of rclpy or out of a bag. An orientation of (0, 0, 0, 0) is not
-        known; without a frame_id the frame is "map". Raises InputError."""
+        """Anchors of a uwb_tdoa_msgs/AnchorArray, of rclpy or out of a bag. An orientation of (0,
+        0, 0, 0) is not known; without a frame_id the frame is "map". Raises InputError.
+        """
         poses = [anchor.pose for anchor in message.anchors]
         return cls(
             np.array([anchor.id for anchor in message.anchors]),
@@ -128,14 +153,20 @@ class Anchors:
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> Anchors:
-        """Read `frame` and `anchors: {id: {position: [x, y, z], orientation: [x, y, z, w]}}`; raises InputError."""
+        """Read `frame` and `anchors: {id: {position: [x, y, z], orientation: [x, y, z, w]}}`;
+        raises InputError.
+        """
         content = read_yaml(path)
         entries = content.get("anchors") if isinstance(content, dict) else None
         if not isinstance(entries, dict) or not entries:
-            raise InputError(f"{path}: expected a mapping 'anchors' of id to position and orientation.")
+            raise InputError(
+                f"{path}: expected a mapping 'anchors' of id to position and orientation."
+            )
         frame = content.get("frame", "map")
         if not isinstance(frame, str):
-            raise InputError(f"{path}: frame: {frame!r} is no name; write the name of the world frame, e.g. map.")
+            raise InputError(
+                f"{path}: frame: {frame!r} is no name; write the name of the world frame, e.g. map."
+            )
         ids, positions, orientations = [], [], []
         for key, entry in entries.items():
             try:
@@ -149,7 +180,12 @@ class Anchors:
             positions.append(position)
             orientations.append(orientation)
         try:
-            return cls(np.array(ids), np.array(positions, dtype=float), np.array(orientations, dtype=float), frame)
+            return cls(
+                np.array(ids),
+                np.array(positions, dtype=float),
+                np.array(orientations, dtype=float),
+                frame,
+            )
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
 
@@ -158,14 +194,20 @@ class Anchors:
         entries = {}
         for i, p, q in zip(self.ids.tolist(), self.positions.tolist(), self.orientations.tolist()):
             entries[i] = {"position": p, **({"orientation": q} if np.isfinite(q).all() else {})}
-        text = yaml.safe_dump({"frame": self.frame, "anchors": entries}, sort_keys=False, default_flow_style=None)
+        text = yaml.safe_dump(
+            {"frame": self.frame, "anchors": entries}, sort_keys=False, default_flow_style=None
+        )
         write_text(path, f"# {written_by()}\n{text}")
 
 
 def _whole(ids: ArrayLike) -> np.ndarray:
     """(N,) int64. Raises InputError for what is no whole number 0 ... 65535."""
     values = np.asarray(ids).reshape(-1)
-    bad = [value for value in values.tolist() if isinstance(value, bool) or not (0 <= value <= 65535) or value % 1]
+    bad = [
+        value
+        for value in values.tolist()
+        if isinstance(value, bool) or not (0 <= value <= 65535) or value % 1
+    ]
     if bad:
         raise InputError(f"anchors: id {bad[0]!r} is not a whole number 0 ... 65535.")
     return values.astype(np.int64)

@@ -1,7 +1,7 @@
 """The antenna of a UWB module: gain and group delay over direction.
 
-Antenna frame: z along the null axis of the doughnut (the long side of an upright module), x out of its front face.
-Azimuth runs from +x through +y, elevation from the xy plane towards +z.
+Antenna frame: z along the null axis of the doughnut (the long side of an upright module), x out of
+its front face. Azimuth runs from +x through +y, elevation from the xy plane towards +z.
 """
 
 from __future__ import annotations
@@ -17,15 +17,58 @@ from .later import interpolate
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
     from numpy.typing import ArrayLike
 
-# Gain in dBi every 30 degrees around the full circle, of a DWM1000-like module near 4 GHz. These are not measured
-# numbers: they are drawn in the shape of the plots in the DWM1000 data sheet (an uneven doughnut: 3 dB of ripple around
-# the upright module, two nulls of unequal depth along its axis, the deeper one where the board is in the way), at the
+# Gain in dBi every 30 degrees around the full circle, of a DWM1000-like module near 4 GHz. These
+# are not measured
+# numbers: they are drawn in the shape of the plots in the DWM1000 data sheet (an uneven doughnut: 3
+# dB of ripple around
+# the upright module, two nulls of unequal depth along its axis, the deeper one where the board is
+# in the way), at the
 # level that Decawave's support quotes for the upright module (-2 to -5 dB).
-DWM1000_AZIMUTH = (-2.0, -2.2, -3.0, -4.0, -3.6, -2.8, -3.0, -4.2, -5.0, -4.4, -3.2, -2.3)  # from +x through +y
-DWM1000_ELEVATION_1 = (-2.0, -2.5, -5.0, -11.0, -6.5, -3.5, -3.0, -4.5, -9.0, -20.0, -8.0, -3.0)  # from +x through +z
-DWM1000_ELEVATION_2 = (-4.0, -3.5, -5.5, -11.0, -7.0, -5.0, -4.4, -5.5, -10.0, -20.0, -9.0, -5.0)  # from +y through +z
+DWM1000_AZIMUTH = (
+    -2.0,
+    -2.2,
+    -3.0,
+    -4.0,
+    -3.6,
+    -2.8,
+    -3.0,
+    -4.2,
+    -5.0,
+    -4.4,
+    -3.2,
+    -2.3,
+)  # from +x through +y
+DWM1000_ELEVATION_1 = (
+    -2.0,
+    -2.5,
+    -5.0,
+    -11.0,
+    -6.5,
+    -3.5,
+    -3.0,
+    -4.5,
+    -9.0,
+    -20.0,
+    -8.0,
+    -3.0,
+)  # from +x through +z
+DWM1000_ELEVATION_2 = (
+    -4.0,
+    -3.5,
+    -5.5,
+    -11.0,
+    -7.0,
+    -5.0,
+    -4.4,
+    -5.5,
+    -10.0,
+    -20.0,
+    -9.0,
+    -5.0,
+)  # from +y through +z
 LARGEST_GAIN = 200.0  # dB, in magnitude; more is a mistake
 
 
@@ -39,7 +82,8 @@ class Antenna:
     elevation_1 : gains around the xz plane from +x through +z, dBi
     elevation_2 : gains around the yz plane from +y through +z, dBi
     gain_offset : added to all gains, dB (default 0)
-    delay_span : group delay of a direction in which nothing is radiated directly, metres (default 0.15: 10 - 15 cm is
+    delay_span : group delay of a direction in which nothing is radiated directly, metres (default
+        0.15: 10 - 15 cm is
         what is reported for modules, 20 cm and more for poor antennas)
 
     Where two cuts cross they must agree (to 0.01 dB), or the pattern would jump.
@@ -55,32 +99,56 @@ class Antenna:
         cuts = []  # their gains on the axes
         for name, most in (("gain_offset", LARGEST_GAIN), ("delay_span", 10.0)):
             value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= most:
-                raise InputError(f"antenna: {name}: {value!r} must be a number between -{most:g} and {most:g}.")
+            if (
+                isinstance(value, bool)
+                or not isinstance(value, (int, float))
+                or not abs(value) <= most
+            ):
+                raise InputError(
+                    f"antenna: {name}: {value!r} must be a number between -{most:g} and {most:g}."
+                )
         for name in ("azimuth", "elevation_1", "elevation_2"):
             gains = np.asarray(getattr(self, name), dtype=float)
-            if gains.ndim != 1 or len(gains) < 4 or len(gains) % 4 or not (np.abs(gains) <= LARGEST_GAIN).all():
+            if (
+                gains.ndim != 1
+                or len(gains) < 4
+                or len(gains) % 4
+                or not (np.abs(gains) <= LARGEST_GAIN).all()
+            ):
                 raise InputError(
-                    f"antenna: {name} needs a multiple of 4 gains between -{LARGEST_GAIN:g} and {LARGEST_GAIN:g} dBi "
+                    f"antenna: {name} needs a multiple of 4 gains between -{LARGEST_GAIN:g} "
+                    f"and {LARGEST_GAIN:g} dBi "
                     "around the full circle."
                 )
             cuts.append(gains[:: len(gains) // 4])
         azimuth, first, second = cuts
         crossings = {
-            "+x": (azimuth[0], first[0]), "-x": (azimuth[2], first[2]), "+y": (azimuth[1], second[0]),
-            "-y": (azimuth[3], second[2]), "+z": (first[1], second[1]), "-z": (first[3], second[3]),
-        }  # fmt: skip
+            "+x": (azimuth[0], first[0]),
+            "-x": (azimuth[2], first[2]),
+            "+y": (azimuth[1], second[0]),
+            "-y": (azimuth[3], second[2]),
+            "+z": (first[1], second[1]),
+            "-z": (first[3], second[3]),
+        }
         for axis, (one, other) in crossings.items():
             if abs(one - other) > 0.01:
-                raise InputError(f"antenna: two cuts cross at {axis} with {one:.2f} and {other:.2f} dBi; make it one.")
+                raise InputError(
+                    f"antenna: two cuts cross at {axis} with {one:.2f} and {other:.2f} dBi; "
+                    "make it one."
+                )
 
     @cached_property
     def _cuts(self) -> tuple[Callable[..., np.ndarray], ...]:
-        """Gain around each of the cuts, functions of the angle, rad. Not made before they are asked: scipy takes long to load."""
+        """Gain around each of the cuts, functions of the angle, rad.
+
+        Not made before they are asked: scipy takes long to load.
+        """
         out = []
         for gains in map(np.asarray, (self.azimuth, self.elevation_1, self.elevation_2)):
             angle = np.linspace(0.0, 2.0 * np.pi, len(gains) + 1)
-            out.append(interpolate.CubicSpline(angle, np.append(gains, gains[0]), bc_type="periodic"))
+            out.append(
+                interpolate.CubicSpline(angle, np.append(gains, gains[0]), bc_type="periodic")
+            )
         return tuple(out)
 
     @cached_property
@@ -96,9 +164,9 @@ class Antenna:
     def gain(self, direction: ArrayLike) -> np.ndarray:
         """Gain towards `direction`, (..., 3) in the antenna frame, any length: (...) dBi.
 
-        Source: eq. 14 of Grasso et al. (Sensors 2022, 22, 9136). Of each elevation cut the side of the direction's own
-        quadrant is used. The azimuth cut is met exactly; the elevation cuts where cos(elevation)^40 has died out, and
-        where they cross the others.
+        Source: eq. 14 of Grasso et al. (Sensors 2022, 22, 9136). Of each elevation cut the side of
+        the direction's own quadrant is used. The azimuth cut is met exactly; the elevation cuts
+        where cos(elevation)^40 has died out, and where they cross the others.
         """
         direction = np.asarray(direction, dtype=float)
         x, y, z = direction[..., 0], direction[..., 1], direction[..., 2]
@@ -114,11 +182,13 @@ class Antenna:
         return (1.0 - near_plane) * elevation + near_plane * gain_theta + self.gain_offset
 
     def group_delay(self, direction: ArrayLike) -> np.ndarray:
-        """How late the antenna is in `direction`, (..., 3) in its frame: (...) metres, 0 ... delay_span.
+        """How late the antenna is in `direction`, (..., 3) in its frame: (...) metres, 0 ...
+        delay_span.
 
-        Own model: of the field that arrives, the share g = 10^((gain - peak gain) / 20) came straight from the antenna
-        and the rest, 1 - g, came over the board by a path that is `delay_span` longer; the centroid of the two is late
-        by delay_span (1 - g). So the best direction is not delayed, and a null is late by nearly all of delay_span.
+        Own model: of the field that arrives, the share g = 10^((gain - peak gain) / 20) came
+        straight from the antenna and the rest, 1 - g, came over the board by a path that is
+        `delay_span` longer; the centroid of the two is late by delay_span (1 - g). So the best
+        direction is not delayed, and a null is late by nearly all of delay_span.
         """
         return self.delay_at(self.gain(direction))
 

@@ -1,4 +1,6 @@
-"""Numpy .npz files from anywhere: what their headers claim is compared with the file before memory is taken for it."""
+"""Numpy .npz files from anywhere: what their headers claim is compared with the file before memory
+is taken for it.
+"""
 
 from __future__ import annotations
 
@@ -19,22 +21,39 @@ if TYPE_CHECKING:
     from zipfile import ZipInfo
 
 
-def read_arrays(path: str | Path, kinds: dict[str, str], what: str, remedy: str) -> dict[str, np.ndarray]:
+def read_arrays(
+    path: str | Path, kinds: dict[str, str], what: str, remedy: str
+) -> dict[str, np.ndarray]:
     """{name: array} of an .npz file that `numpy.savez` wrote. Nothing is unpickled.
 
-    kinds : {name: letters of `dtype.kind` that are right}; what, remedy : what the file should be, and how it is made.
+    kinds : {name: letters of `dtype.kind` that are right}; what, remedy : what the file should be,
+        and how it is made.
     Raises InputError, also for floating-point numbers that are NaN.
     """
     try:
         with open_file(path) as opened, ZipFile(opened) as file:
             members = {name: _member(file, f"{name}.npy") for name in kinds}
-            Budget(path).spend("bytes of arrays", sum(member.file_size for member in members.values()), ARRAYS_BYTES)
-            return {name: _array(name, file, member, kinds[name]) for name, member in members.items()}
+            Budget(path).spend(
+                "bytes of arrays",
+                sum(member.file_size for member in members.values()),
+                ARRAYS_BYTES,
+            )
+            return {
+                name: _array(name, file, member, kinds[name]) for name, member in members.items()
+            }
     except InputError:
         raise
     except OSError as error:
         reason = error.strerror or str(error)
-    except (BadZipFile, EOFError, KeyError, NotImplementedError, RuntimeError, ValueError, zlib.error) as error:
+    except (
+        BadZipFile,
+        EOFError,
+        KeyError,
+        NotImplementedError,
+        RuntimeError,
+        ValueError,
+        zlib.error,
+    ) as error:
         reason = str(error.args[0] if error.args else type(error).__name__)
     raise InputError(f"{path}: is no {what} ({' '.join(reason.split())}); {remedy}.")
 
@@ -51,7 +70,10 @@ def _array(name: str, file: ZipFile, member: ZipInfo, kinds: str) -> np.ndarray:
         data = opened.read(member.file_size + 1)
     stream = io.BytesIO(data)
     version = np.lib.format.read_magic(stream)
-    read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
+    read_header = {
+        (1, 0): np.lib.format.read_array_header_1_0,
+        (2, 0): np.lib.format.read_array_header_2_0,
+    }
     if version not in read_header:
         raise ValueError(f"{name} is of format {version}")
     try:
@@ -67,6 +89,11 @@ def _array(name: str, file: ZipFile, member: ZipInfo, kinds: str) -> np.ndarray:
     if dtype.kind == "f" and np.isnan(array).any():
         raise ValueError(f"{name} holds NaN")
     if dtype.kind == "U" and size:
-        if np.frombuffer(data, np.dtype(np.uint32).newbyteorder(dtype.byteorder), offset=stream.tell()).max() > 0x10FFFF:
+        if (
+            np.frombuffer(
+                data, np.dtype(np.uint32).newbyteorder(dtype.byteorder), offset=stream.tell()
+            ).max()
+            > 0x10FFFF
+        ):
             raise ValueError(f"{name} holds no text")
     return array.reshape(shape, order="F" if fortran else "C").copy()

@@ -1,25 +1,26 @@
 """numba's njit with an on-disk cache that never runs yesterday's code.
 
-numba's own cache notices a change in the file of a compiled function, but not in the files of the functions it calls.
-Here every state of the sources has a cache folder of its own.
+numba's own cache notices a change in the file of a compiled function, but not in the files of the
+functions it calls. Here every state of the sources has a cache folder of its own.
 """
 
 from __future__ import annotations
 
 from contextlib import contextmanager
-from functools import lru_cache
+from functools import cache
 import hashlib
 import os
 from pathlib import Path
 import sys
 import time
-from typing import Any, TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from . import executable  # noqa: F401  # imports numba in another folder
 from .files import folder_of_process
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+
     from numba.core.event import Event
 
 
@@ -35,7 +36,8 @@ def _hidden(*names: str) -> Iterator[None]:
             del sys.modules[name]
 
 
-# numba imports these only to see whether they are there, which takes a fifth of a second of a node's start: for products of matrices
+# numba imports these only to see whether they are there, which takes a fifth of a second of a
+# node's start: for products of matrices
 # in compiled code, of which there are none here, and for coverage of it.
 with _hidden("scipy", "coverage"):
     from numba import config, njit
@@ -44,14 +46,19 @@ with _hidden("scipy", "coverage"):
 
 _FUNCTIONS: list[Any] = []  # all that are compiled when they are first called
 SAY_EVERY = 4.0  # s
-Record = Any  # one row of a structured array, whose fields compiled code reads and writes as attributes: Python knows no type of it
+# one row of a structured array, whose fields compiled code reads and writes as attributes: Python
+# knows no type of it
+Record = Any
 Function = TypeVar("Function", bound="Callable[..., Any]")
 
-config._config_fname = "/dev/null/.numba_config.yaml"  # numba would look into the present folder before it compiles anything
+# numba would look into the present folder before it compiles anything
+config._config_fname = "/dev/null/.numba_config.yaml"
 
 
 def compiled(function: Function) -> Function:
-    """Decorator: compile `function`, which may call others below its folder and of the foundation, and cache it."""
+    """Decorator: compile `function`, which may call others below its folder and of the foundation,
+    and cache it.
+    """
     before = config.CACHE_DIR  # type: ignore[attr-defined]  # numba puts its settings there while it is imported
     place = _place(_digest(Path(function.__code__.co_filename).parent))
     config.CACHE_DIR = str(place)  # type: ignore[attr-defined]  # as above
@@ -63,8 +70,10 @@ def compiled(function: Function) -> Function:
 
 
 class _Listener(event.Listener):
-    """Says on stderr, every few seconds, how much is compiled: where nothing is in the cache that takes a minute or two. The share is of
-    the functions of all modules that are imported, nearly all of which the filter needs."""
+    """Says on stderr, every few seconds, how much is compiled: where nothing is in the cache that
+    takes a minute or two. The share is of the functions of all modules that are imported, nearly
+    all of which the filter needs.
+    """
 
     def __init__(self) -> None:
         self._compiled, self._depth, self._began = 0.0, 0, 0.0  # s
@@ -83,16 +92,21 @@ class _Listener(event.Listener):
         if now - self._began > SAY_EVERY:
             self._compiled, self._began = self._compiled + now - self._began, now
             share = sum(bool(each.signatures) for each in _FUNCTIONS) / len(_FUNCTIONS)
-            print(f"compiling, which is done once: {share:.0%}, {self._compiled:.0f} s", file=sys.stderr, flush=True)
+            print(
+                f"compiling, which is done once: {share:.0%}, {self._compiled:.0f} s",
+                file=sys.stderr,
+                flush=True,
+            )
 
 
 event.register("numba:compile", _Listener())
 
 
-@lru_cache(maxsize=None)
+@cache
 def _place(name: str) -> Path:
-    """The folder `name` in NUMBA_CACHE_DIR, by default in the user's cache folder; a temporary one where others may have put compiled code
-    there, which would be run."""
+    """The folder `name` in NUMBA_CACHE_DIR, by default in the user's cache folder; a temporary one
+    where others may have put compiled code there, which would be run.
+    """
     home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
     place = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(home, "uwb_tdoa")) / name
     try:
@@ -100,10 +114,17 @@ def _place(name: str) -> Path:
             place.mkdir(mode=0o700, parents=True, exist_ok=True)
             if _is_ours_alone(place.resolve()):
                 return place.resolve()
-        why = "others may write to" if place.is_absolute() else "the present folder may be another's, and holds"
+        why = (
+            "others may write to"
+            if place.is_absolute()
+            else "the present folder may be another's, and holds"
+        )
     except OSError as error:
         why = f"nothing can be kept ({error.strerror}) in"
-    print(f"{why} {place}; a temporary folder is used: set NUMBA_CACHE_DIR to a folder of your own.", file=sys.stderr)
+    print(
+        f"{why} {place}; a temporary folder is used: set NUMBA_CACHE_DIR to a folder of your own.",
+        file=sys.stderr,
+    )
     return folder_of_process()
 
 
@@ -113,7 +134,7 @@ def _is_ours_alone(folder: Path) -> bool:
     return found.st_uid == os.getuid() and not found.st_mode & 0o077
 
 
-@lru_cache(maxsize=None)
+@cache
 def _digest(folder: Path) -> str:
     """Name of the present state of the sources below `folder` and beside this file."""
     digest = hashlib.sha256()

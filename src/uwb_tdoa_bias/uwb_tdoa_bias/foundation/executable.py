@@ -1,4 +1,5 @@
-"""How every executable starts: Ctrl-C ends it quietly, whenever it comes, and the present folder has no say in what it does.
+"""How every executable starts: Ctrl-C ends it quietly, whenever it comes, and the present folder
+has no say in what it does.
 
     evaluate = executable("uwb_tdoa_tools.commands.evaluate")        # an entry point; the module has a main()
     ekf_node = node_executable("uwb_tdoa_ekf.ekf_node")
@@ -17,7 +18,7 @@ import os
 import signal
 import sys
 from threading import Timer
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -27,14 +28,20 @@ if TYPE_CHECKING:
 INTERRUPTED = 130  # exit code, as a shell gives it: 128 + SIGINT
 SOON = 0.05  # s, until an interrupt that was lost comes again
 SAID = 1.5  # s of importing after which it is said that something goes on
-# Paths in which an empty entry, as a dot, is the present folder. `.dev/paths.sh` has the same list, for what a shell starts.
-PATHS = "PATH LD_LIBRARY_PATH PYTHONPATH AMENT_PREFIX_PATH CMAKE_PREFIX_PATH COLCON_PREFIX_PATH PKG_CONFIG_PATH".split()
+# Paths in which an empty entry, as a dot, is the present folder. `.dev/paths.sh` has the same list,
+# for what a shell starts.
+PATHS = (
+    "PATH LD_LIBRARY_PATH PYTHONPATH AMENT_PREFIX_PATH CMAKE_PREFIX_PATH COLCON_PREFIX_PATH "
+    "PKG_CONFIG_PATH"
+).split()
 
 
 def executable(module: str) -> Callable[..., Any]:
-    """The entry point of a module with a main(): imports the module when it is called, returns what main returns. Its linear algebra, of
-    small matrices, takes one thread: several would wait for each other by spinning. That is set in the environment, where libraries that
-    are loaded later read it; a user's own setting stays."""
+    """The entry point of a module with a main(): imports the module when it is called, returns what
+    main returns. Its linear algebra, of small matrices, takes one thread: several would wait for
+    each other by spinning. That is set in the environment, where libraries that are loaded later
+    read it; a user's own setting stays.
+    """
     return partial(_run, module)
 
 
@@ -44,9 +51,13 @@ def node_executable(module: str) -> Callable[..., Any]:
 
 
 def leave_present_folder_out() -> None:
-    """Change the environment of this process, and of those that it starts, so that a file of the present folder is no library, module,
-    program or setting of any. To be called before rclpy is imported. A folder of recordings may hold anything."""
-    os.environ["SKIP_DEFAULT_XML_FILE"] = "1"  # or Fast DDS reads DEFAULT_FASTRTPS_PROFILES.xml there
+    """Change the environment of this process, and of those that it starts, so that a file of the
+    present folder is no library, module, program or setting of any. To be called before rclpy is
+    imported. A folder of recordings may hold anything.
+    """
+    os.environ["SKIP_DEFAULT_XML_FILE"] = (
+        "1"  # or Fast DDS reads DEFAULT_FASTRTPS_PROFILES.xml there
+    )
     for name in PATHS:
         entries = os.environ.get(name, "").split(os.pathsep)
         others = [entry for entry in entries if entry not in ("", ".")]
@@ -61,7 +72,9 @@ def leave_present_folder_out() -> None:
 
 @contextmanager
 def elsewhere() -> Iterator[None]:
-    """In the root folder while the block lasts: the present folder may hold modules for `python -m`, and settings."""
+    """In the root folder while the block lasts: the present folder may hold modules for `python
+    -m`, and settings.
+    """
     here = os.open(".", os.O_PATH | os.O_DIRECTORY)  # also where its name is gone
     try:
         os.chdir("/")
@@ -72,8 +85,9 @@ def elsewhere() -> Iterator[None]:
 
 
 class _ImportedElsewhere:
-    """Finder of modules that read settings of the present folder (matplotlibrc, .numba_config.yaml) when they are imported. They are
-    imported in the root folder, whoever imports them."""
+    """Finder of modules that read settings of the present folder (matplotlibrc, .numba_config.yaml)
+    when they are imported. They are imported in the root folder, whoever imports them.
+    """
 
     @staticmethod
     def find_spec(name: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
@@ -90,9 +104,10 @@ sys.meta_path.insert(0, _ImportedElsewhere)
 def interrupt(number: int, frame: FrameType | None) -> None:
     """Signal handler: raises KeyboardInterrupt, for good.
 
-    What C code calls back cannot raise, and a destructor cannot either: Python prints such an exception on stderr and
-    goes on (the compiler of numba has both). From now on nothing of that kind is printed, objects that are half made
-    included, and where it was the KeyboardInterrupt that was lost, SIGINT comes again in a moment.
+    What C code calls back cannot raise, and a destructor cannot either: Python prints such an
+    exception on stderr and goes on (the compiler of numba has both). From now on nothing of that
+    kind is printed, objects that are half made included, and where it was the KeyboardInterrupt
+    that was lost, SIGINT comes again in a moment.
     """
 
     def on_lost(lost: sys.UnraisableHookArgs) -> None:
@@ -117,24 +132,33 @@ def _run(module: str, *arguments: Any) -> Any:
         package = (error.name or "").partition(".")[0]
         if package.startswith("uwb_tdoa_") and package != "uwb_tdoa_msgs":
             raise  # ours is not whole: a defect, which needs its traceback
-        print(f"{name}: error: the Python package {package} is missing; {_remedy(package)}.", file=sys.stderr)
+        print(
+            f"{name}: error: the Python package {package} is missing; {_remedy(package)}.",
+            file=sys.stderr,
+        )
         return 2
     except KeyboardInterrupt:
         return INTERRUPTED
 
 
 def _run_node(module: str, *arguments: Any) -> Any:
-    gc.disable()  # until the node runs: nothing that is imported is garbage, and searching it is a tenth of a start
+    # until the node runs: nothing that is imported is garbage, and searching it is a tenth of a
+    # start
+    gc.disable()
     return _run(module, *arguments)
 
 
 def _imported(module: str) -> ModuleType:
-    """Import a module, and say that it takes its time where it does. Meanwhile SIGINT ends the process at once: some of what is imported
-    answers a KeyboardInterrupt with a traceback or not at all, and there is nothing yet to clean up."""
+    """Import a module, and say that it takes its time where it does. Meanwhile SIGINT ends the
+    process at once: some of what is imported answers a KeyboardInterrupt with a traceback or not at
+    all, and there is nothing yet to clean up.
+    """
     before = signal.getsignal(signal.SIGINT)
     if before is not signal.SIG_IGN:  # as in a job that a shell script put in the background
         signal.signal(signal.SIGINT, lambda number, frame: os._exit(INTERRUPTED))
-    slow = Timer(SAID, lambda: print(f"{module.rpartition('.')[2]}: starting", file=sys.stderr, flush=True))
+    slow = Timer(
+        SAID, lambda: print(f"{module.rpartition('.')[2]}: starting", file=sys.stderr, flush=True)
+    )
     slow.daemon = True
     slow.start()
     try:
@@ -146,6 +170,10 @@ def _imported(module: str) -> ModuleType:
 
 
 def _remedy(package: str) -> str:
-    if package.endswith(("_msgs", "_interfaces")) or package in ("rclpy", "ament_index_python", "domain_coordinator"):
+    if package.endswith(("_msgs", "_interfaces")) or package in (
+        "rclpy",
+        "ament_index_python",
+        "domain_coordinator",
+    ):
         return "source ROS 2 Jazzy and the built workspace, or use ./dev run"
     return "install it with pip"

@@ -1,9 +1,11 @@
-"""Read files whole, or their beginning, with a limit; write files whole or not at all, and over no input; temporary folders."""
+"""Read files whole, or their beginning, with a limit; write files whole or not at all, and over no
+input; temporary folders.
+"""
 
 from __future__ import annotations
 
 import atexit
-from contextlib import contextmanager, ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
 import fcntl
 import io
 import os
@@ -13,10 +15,10 @@ import shutil
 import stat
 import tempfile
 import time
-from typing import BinaryIO, TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
 
 from .errors import InputError
-from .limits import Budget, RECORDING_BYTES
+from .limits import RECORDING_BYTES, Budget
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -24,11 +26,15 @@ if TYPE_CHECKING:
 TEMPORARY = "uwb_tdoa_temporary_"  # what the names of our temporary folders begin with
 STREAMS = "/dev/stdout", "/dev/stderr"  # links to what the user has chosen
 SETTLED = 60.0  # s after which a temporary folder that nobody holds is no longer needed
-_KEPT: list[tuple[Path, Path, os.stat_result, bool]] = []  # see `keeping`: path, the same without links, state, whether it is a bag
+_KEPT: list[
+    tuple[Path, Path, os.stat_result, bool]
+] = []  # see `keeping`: path, the same without links, state, whether it is a bag
 
 
 def read_bytes(path: str | Path, most: int = RECORDING_BYTES) -> bytes:
-    """The content of a file; raises InputError if it cannot be read, is empty or has more than `most` bytes."""
+    """The content of a file; raises InputError if it cannot be read, is empty or has more than
+    `most` bytes.
+    """
     content = read_head(path, most + 1)
     Budget(path).spend("bytes", len(content), most)
     return content
@@ -40,7 +46,9 @@ def read_head(path: str | Path, size: int) -> bytes:
         with open_file(path) as file:
             content = b"".join(_blocks(file, size))
     except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); give the path of a recording.") from error
+        raise InputError(
+            f"{path}: cannot be read ({error.strerror}); give the path of a recording."
+        ) from error
     if not content:
         raise InputError(f"{path}: is empty (0 bytes); copy the recording again.")
     return content
@@ -49,7 +57,8 @@ def read_head(path: str | Path, size: int) -> bytes:
 def write_text(path: str | Path, text: str) -> None:
     """Write a text file in UTF-8, whatever the locale, as `write_bytes` does.
 
-    Bytes that Python could not decode in an argument or a file name are written as they were, or as U+FFFD if they are no UTF-8.
+    Bytes that Python could not decode in an argument or a file name are written as they were, or as
+    U+FFFD if they are no UTF-8.
     """
     try:
         content = text.encode("utf-8", "surrogateescape")
@@ -68,12 +77,15 @@ def write_filled(path: str | Path, fill: Callable[[BinaryIO], object]) -> None:
 def write_bytes(path: str | Path, content: bytes) -> None:
     """Write a file whole: readers see the old content or the new one, never a part. Raises OSError.
 
-    The content goes to a temporary sibling, which then takes the name. A file that is replaced passes on its permissions. What is no
-    regular file, as /dev/stdout, and a file whose folder takes no other, are written in place. Raises InputError as `refuse_output`.
+    The content goes to a temporary sibling, which then takes the name. A file that is replaced
+    passes on its permissions. What is no regular file, as /dev/stdout, and a file whose folder
+    takes no other, are written in place. Raises InputError as `refuse_output`.
     """
     refuse_output(path)
     path = Path(path)
-    if path.exists() and (path.is_symlink() or not (path.is_file() and os.access(path.parent, os.W_OK))):
+    if path.exists() and (
+        path.is_symlink() or not (path.is_file() and os.access(path.parent, os.W_OK))
+    ):
         _write_in_place(path, content)
         return
     sibling = path.with_name(f".{secrets.token_hex(8)}.partial")
@@ -92,7 +104,9 @@ def write_bytes(path: str | Path, content: bytes) -> None:
 def keeping(inputs: Iterable[Path]) -> Iterator[None]:
     """While the block lasts, `refuse_output` refuses these files and folders, and what is in them."""
     before = _KEPT[:]
-    _KEPT.extend((path, path.resolve(), path.stat(), (path / "metadata.yaml").exists()) for path in inputs)
+    _KEPT.extend(
+        (path, path.resolve(), path.stat(), (path / "metadata.yaml").exists()) for path in inputs
+    )
     try:
         yield
     finally:
@@ -100,14 +114,20 @@ def keeping(inputs: Iterable[Path]) -> Iterator[None]:
 
 
 def refuse_output(path: str | Path) -> None:
-    """Raise InputError where writing to a path would follow a link, which may lead to any file, or change what is read or a bag."""
+    """Raise InputError where writing to a path would follow a link, which may lead to any file, or
+    change what is read or a bag.
+    """
     path = Path(path)
     if path.is_symlink() and str(path) not in STREAMS:
-        raise InputError(f"{path}: is a link to {os.readlink(path)}; give the path it leads to, or another name.")
+        raise InputError(
+            f"{path}: is a link to {os.readlink(path)}; give the path it leads to, or another name."
+        )
     where, state = path.resolve(), path.stat() if path.exists() else None
     for kept, its_place, its_state, is_bag in _KEPT:
         if state is not None and os.path.samestat(state, its_state):
-            raise InputError(f"{path}: is {kept}, which is read, and would be overwritten; give another name.")
+            raise InputError(
+                f"{path}: is {kept}, which is read, and would be overwritten; give another name."
+            )
         if where.is_relative_to(its_place) and (state is not None or is_bag):
             raise InputError(f"{path}: lies in {kept}, which is read; give another place.")
 
@@ -118,7 +138,10 @@ def _write_in_place(path: Path, content: bytes) -> None:
 
 
 def open_file(path: str | Path) -> BinaryIO:
-    """An open file, to be read. Raises InputError for a pipe or a device, at which reading would wait for ever, and OSError."""
+    """An open file, to be read.
+
+    Raises InputError for a pipe or a device, at which reading would wait for ever, and OSError.
+    """
     file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))
     if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         file.close()
@@ -128,7 +151,10 @@ def open_file(path: str | Path) -> BinaryIO:
 
 @contextmanager
 def temporary_folder() -> Iterator[Path]:
-    """A folder that is removed when the block ends. If this process is killed, the next one of ours removes it."""
+    """A folder that is removed when the block ends.
+
+    If this process is killed, the next one of ours removes it.
+    """
     for old in Path(tempfile.gettempdir()).glob(f"{TEMPORARY}*"):
         with suppress(OSError):  # of another user, in use, or gone
             if time.time() - old.lstat().st_mtime > SETTLED:
@@ -159,7 +185,9 @@ def _held(folder: Path, kind: int) -> Iterator[None]:
 
 
 def _blocks(file: BinaryIO, size: int) -> Iterator[bytes]:
-    """The first bytes of an open file, block by block: one read would take the memory of `size` at once."""
+    """The first bytes of an open file, block by block: one read would take the memory of `size` at
+    once.
+    """
     while size > 0 and (block := file.read(min(size, 1 << 24))):
         size -= len(block)
         yield block

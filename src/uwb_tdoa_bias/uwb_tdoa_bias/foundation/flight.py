@@ -31,8 +31,10 @@ class Imu:
 
 @dataclass(frozen=True)
 class Tdoas:
-    """Raw measurements. t : (n,) s; a, b : (n,) anchor ids; d : (n,) metres, d_ab = |p - b| - |p - a|; variance : (n,) m^2,
-    of the noise as the tag knows it, 0 where it does not, which is everywhere unless it is given."""
+    """Raw measurements. t : (n,) s; a, b : (n,) anchor ids; d : (n,) metres, d_ab = |p - b| - |p -
+    a|; variance : (n,) m^2, of the noise as the tag knows it, 0 where it does not, which is
+    everywhere unless it is given.
+    """
 
     t: np.ndarray
     a: np.ndarray
@@ -50,7 +52,9 @@ class Tdoas:
 
 @dataclass(frozen=True)
 class Truth:
-    """Ground truth. t : (n,) s; p : (n, 3) m, world; q : (n, 4) x y z w, body to world, NaN where not recorded."""
+    """Ground truth. t : (n,) s; p : (n, 3) m, world; q : (n, 4) x y z w, body to world, NaN where
+    not recorded.
+    """
 
     t: np.ndarray
     p: np.ndarray
@@ -61,22 +65,28 @@ class Truth:
 
 
 _SensorStreams: Any = make_dataclass(  # the names of its attributes are those of SENSORS
-    "_SensorStreams", [(name, sensor.stream | None, None) for name, sensor in SENSORS.items()], frozen=True, kw_only=True
+    "_SensorStreams",
+    [(name, sensor.stream | None, None) for name, sensor in SENSORS.items()],
+    frozen=True,
+    kw_only=True,
 )
 
 
 @dataclass(frozen=True)
 class Flight(_SensorStreams):
-    """One recording. All stamps are of one clock, in s; every stream keeps its own; within a stream stamps never fall.
+    """One recording. All stamps are of one clock, in s; every stream keeps its own; within a stream
+    stamps never fall.
 
     name : short and unique, e.g. "0425-traj1"; whatever is given, it is `harmless`
     anchors : Anchors
     tdoa : Tdoas
     imu : Imu or None
     truth : Truth or None
-    extra : other streams of the log by name, each a dict of column name to (n,) array with a "t" among them, file units
+    extra : other streams of the log by name, each a dict of column name to (n,) array with a "t"
+        among them, file units
     meta : where it came from: source file, format, protocol ("tdoa2", "tdoa3"), ...
-    restarts : stamps, s, at which the clock of the recording began anew: nothing before tells where the tag is after it
+    restarts : stamps, s, at which the clock of the recording began anew: nothing before tells where
+        the tag is after it
     for each of SENSORS, by name : its Stream or None
     """
 
@@ -94,7 +104,9 @@ class Flight(_SensorStreams):
 
     @property
     def start(self) -> float:
-        """Stamp from which slow changes count, s: of the first TDOA; without any, of what else locates first; 0 without anything."""
+        """Stamp from which slow changes count, s: of the first TDOA; without any, of what else
+        locates first; 0 without anything.
+        """
         return float(min((part.t[0] for part in self._located), default=0.0))
 
     @property
@@ -120,4 +132,6 @@ class Flight(_SensorStreams):
         """The Flight among its anchors of some rows alone, with the TDOAs that are between them."""
         anchors, tdoa = self.anchors.only(rows), self.tdoa
         kept = np.isin(tdoa.a, anchors.ids) & np.isin(tdoa.b, anchors.ids)
-        return replace(self, anchors=anchors, tdoa=Tdoas(*(column[kept] for column in vars(tdoa).values())))
+        return replace(
+            self, anchors=anchors, tdoa=Tdoas(*(column[kept] for column in vars(tdoa).values()))
+        )

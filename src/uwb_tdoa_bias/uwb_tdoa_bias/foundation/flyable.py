@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,12 +13,21 @@ from .files import write_filled
 
 if TYPE_CHECKING:
     from pathlib import Path
+
     from numpy.typing import ArrayLike
+
     from .anchors import Anchors
 
 _FIELDS = {  # of the file, and the kinds of their numbers
-    "frame": "U", "lower": "f", "step": "f", "flyable": "b", "bound": "f", "ids": "i", "positions": "f", "planar": "b",
-}  # fmt: skip
+    "frame": "U",
+    "lower": "f",
+    "step": "f",
+    "flyable": "b",
+    "bound": "f",
+    "ids": "i",
+    "positions": "f",
+    "planar": "b",
+}
 _REMEDY = "make one with `plan ... --volume`"
 
 
@@ -30,7 +39,8 @@ class FlyableVolume:
     ----------
     lower : (3,) corner of the first cell, m; step : (3,) size of a cell, m
     flyable : (nx, ny, nz) bool
-    bound : (nx, ny, nz) m, the smallest error that one round of TDOAs allows: root of the summed variances along x, y
+    bound : (nx, ny, nz) m, the smallest error that one round of TDOAs allows: root of the summed
+        variances along x, y
         and, unless planar, z; inf where there is none
     ids, positions : (N,) and (N, 3) m, the anchors
     frame : name of the world frame
@@ -47,22 +57,43 @@ class FlyableVolume:
     planar: bool = False
 
     def __post_init__(self) -> None:
-        kinds = {"lower": float, "step": float, "flyable": bool, "bound": np.float32, "ids": int, "positions": float}
+        kinds = {
+            "lower": float,
+            "step": float,
+            "flyable": bool,
+            "bound": np.float32,
+            "ids": int,
+            "positions": float,
+        }
         for name, kind in kinds.items():
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=kind))
-        shapes = (self.lower.shape, self.step.shape, self.flyable.ndim, self.ids.ndim, self.positions.shape)
-        fits = shapes == ((3,), (3,), 3, 1, (self.ids.size, 3)) and self.bound.shape == self.flyable.shape
+        shapes = (
+            self.lower.shape,
+            self.step.shape,
+            self.flyable.ndim,
+            self.ids.ndim,
+            self.positions.shape,
+        )
+        fits = (
+            shapes == ((3,), (3,), 3, 1, (self.ids.size, 3))
+            and self.bound.shape == self.flyable.shape
+        )
         if not (fits and self.flyable.size):
-            raise InputError("flyable volume: lower, step, flyable, bound, ids and positions do not fit together.")
+            raise InputError(
+                "flyable volume: lower, step, flyable, bound, ids and positions do not fit "
+                "together."
+            )
         finite = all(np.isfinite(array).all() for array in (self.lower, self.step, self.positions))
         if not (finite and (self.step > 0.0).all() and (self.bound >= 0.0).all()):
             raise InputError(
-                "flyable volume: it holds a number that is not finite, a step that is not above 0 or a bound below 0."
+                "flyable volume: it holds a number that is not finite, a step that is not "
+                "above 0 or a bound below 0."
             )
 
     def contains(self, p: ArrayLike) -> np.ndarray:
-        """Whether positions p (..., 3), m, are flyable: (...) bool. Nothing is outside of the box or where not
-        finite."""
+        """Whether positions p (..., 3), m, are flyable: (...) bool. Nothing is outside of the box
+        or where not finite.
+        """
         inside, cell = self._cells(p)
         return inside & self.flyable[cell]
 
@@ -95,7 +126,11 @@ class FlyableVolume:
         """Read a file that `save` wrote; raises InputError."""
         fields = read_arrays(path, _FIELDS, "flyable volume", _REMEDY)
         try:
-            given: dict[str, Any] = {**fields, "frame": str(fields["frame"]), "planar": bool(fields["planar"])}
+            given: dict[str, Any] = {
+                **fields,
+                "frame": str(fields["frame"]),
+                "planar": bool(fields["planar"]),
+            }
             return cls(**given)
         except (TypeError, ValueError, OverflowError) as error:  # InputError is a ValueError
             raise InputError(f"{path}: is no flyable volume ({error}); {_REMEDY}.") from error

@@ -1,7 +1,7 @@
 """What a TDOA is when nothing is wrong with it.
 
-For arrays of any shape with numpy, and once more for a single TDOA in compiled code, where the filter needs it a
-thousand times a second; a test holds them to the same bits.
+For arrays of any shape with numpy, and once more for a single TDOA in compiled code, where the
+filter needs it a thousand times a second; a test holds them to the same bits.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ _ON_ANTENNA = 1e-9  # m; closer than that, an antenna is in no direction
 def ranges(p: np.ndarray, anchors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distances between tag and anchors, and their derivatives with respect to the tag's position.
 
-    p, anchors : (..., 3) m, one frame. Returns (...) m, and (..., 3) unit vectors from anchor to tag, zero where the
+    p, anchors : (..., 3) m, one frame. Returns (...) m, and (..., 3) unit vectors from anchor to
+        tag, zero where the
     tag sits on the antenna.
     """
     delta = p - anchors
@@ -29,20 +30,26 @@ def ranges(p: np.ndarray, anchors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def tdoa(p: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Difference of the distances to two anchors, d_ab = |p - b| - |p - a|.
 
-    Parameters: p, a, b : (..., 3) positions of tag and anchors in one frame, metres. Returns (...) metres.
-    Source: eq. 2 of Zhao et al. (RA-L 2021), with the sign that the Crazyflie firmware logs.
+    Parameters: p, a, b : (..., 3) positions of tag and anchors in one frame, metres. Returns (...)
+    metres. Source: eq. 2 of Zhao et al. (RA-L 2021), with the sign that the Crazyflie firmware
+    logs.
     """
     return np.linalg.norm(p - b, axis=-1) - np.linalg.norm(p - a, axis=-1)
 
 
 def tdoa_jacobian(p: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Derivative of `tdoa` with respect to p: (..., 3), no unit. Zero where the tag sits on an antenna."""
+    """Derivative of `tdoa` with respect to p: (..., 3), no unit.
+
+    Zero where the tag sits on an antenna.
+    """
     return ranges(p, b)[1] - ranges(p, a)[1]
 
 
 @compiled
 def tdoa_each(p: np.ndarray, a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
-    """`tdoa` (n,) m of p, a, b (n, 3), compiled: for arrays so short that what numpy takes for each operation is most of it."""
+    """`tdoa` (n,) m of p, a, b (n, 3), compiled: for arrays so short that what numpy takes for each
+    operation is most of it.
+    """
     for i in range(len(p)):
         ax, ay, az = p[i, 0] - a[i, 0], p[i, 1] - a[i, 1], p[i, 2] - a[i, 2]
         bx, by, bz = p[i, 0] - b[i, 0], p[i, 1] - b[i, 1], p[i, 2] - b[i, 2]
@@ -78,7 +85,9 @@ def rotate(q: np.ndarray, v: np.ndarray, out: np.ndarray) -> None:
 
 @compiled
 def rotate_each(q: np.ndarray, v: np.ndarray, out: np.ndarray) -> None:
-    """out = R(q) v for quaternions q (n, 4) x y z w, of any length, and one v (3,): (n, 3); NaN where q is not finite, or zero."""
+    """out = R(q) v for quaternions q (n, 4) x y z w, of any length, and one v (3,): (n, 3); NaN
+    where q is not finite, or zero.
+    """
     unit = np.empty(4)
     for i in range(len(q)):
         length = math.sqrt(q[i, 0] ** 2 + q[i, 1] ** 2 + q[i, 2] ** 2 + q[i, 3] ** 2)

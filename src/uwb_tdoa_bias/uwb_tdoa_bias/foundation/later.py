@@ -1,8 +1,10 @@
-"""Parts of scipy that take long to import and that a node hardly ever needs: imported when something of them is used."""
+"""Parts of scipy that take long to import and that a node hardly ever needs: imported when
+something of them is used.
+"""
 
 from __future__ import annotations
 
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from collections.abc import Callable

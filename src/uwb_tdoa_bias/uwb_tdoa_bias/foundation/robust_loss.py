@@ -1,8 +1,8 @@
 """Robust losses: how little a residual counts that is larger than it should be.
 
-A loss rho(e) of the normalised residual e gives iteratively re-weighted least squares with the weight rho'(e) / e, 1
-at e = 0 (MacTavish and Barfoot, At all costs: a comparison of robust cost functions for camera correspondence
-outliers, 2015, table I).
+A loss rho(e) of the normalised residual e gives iteratively re-weighted least squares with the
+weight rho'(e) / e, 1 at e = 0 (MacTavish and Barfoot, At all costs: a comparison of robust cost
+functions for camera correspondence outliers, 2015, table I).
 """
 
 from __future__ import annotations
@@ -17,7 +17,9 @@ GEMAN_MCCLURE, HUBER, CAUCHY = range(3)  # places in LOSSES
 
 @compiled
 def weight(loss: int, e: float, scale: float) -> float:
-    """rho'(e) / e, 0 to 1. loss : place in LOSSES; e : normalised residual; scale : where the loss bends, same unit."""
+    """rho'(e) / e, 0 to 1. loss : place in LOSSES; e : normalised residual; scale : where the loss
+    bends, same unit.
+    """
     u = (e / scale) ** 2
     if loss == GEMAN_MCCLURE:
         return 1.0 / ((1.0 + u) * (1.0 + u))

@@ -23,15 +23,19 @@ from .ros_spinning import Spinner
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from types import FrameType
+
     from .ros_node import StreamNode
 
 
-def run(node_class: type[StreamNode], description: str | None, argv: Sequence[str] | None = None) -> int:
-    """Live as a node until SIGINT or SIGTERM. Returns the exit code: 0, 2 for bad usage or an InputError, or 128 and the
-    number of a signal that came before the node was ready.
+def run(
+    node_class: type[StreamNode], description: str | None, argv: Sequence[str] | None = None
+) -> int:
+    """Live as a node until SIGINT or SIGTERM. Returns the exit code: 0, 2 for bad usage or an
+    InputError, or 128 and the number of a signal that came before the node was ready.
 
-    node_class(arguments) makes the StreamNode, in an initialised rclpy, of the arguments of the process; it has the executable's
-    NAME, and may have `members` and `turns`, ros_streams.RoundRobin. description : for --help.
+    node_class(arguments) makes the StreamNode, in an initialised rclpy, of the arguments of the
+    process; it has the executable's NAME, and may have `members` and `turns`,
+    ros_streams.RoundRobin. description : for --help.
     """
     name = node_class.NAME
     arguments = [name, *(sys.argv[1:] if argv is None else argv)]
@@ -89,5 +93,9 @@ def _init(parser: argparse.ArgumentParser, arguments: list[str]) -> None:
     try:
         parser.parse_args(remove_ros_args(arguments)[1:])
         rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)
-    except (implementation.RCLError, implementation.RCLInvalidROSArgsError, implementation.UnknownROSArgsError) as error:
+    except (
+        implementation.RCLError,
+        implementation.RCLInvalidROSArgsError,
+        implementation.UnknownROSArgsError,
+    ) as error:
         raise InputError(f"--ros-args: {error}.") from error

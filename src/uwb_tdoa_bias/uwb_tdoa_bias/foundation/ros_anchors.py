@@ -8,6 +8,7 @@ from geometry_msgs.msg import Point, Pose, Quaternion
 import numpy as np
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
 from uwb_tdoa_msgs.msg import Anchor, AnchorArray
 
 from .anchors import SAME_PLACE, Anchors
@@ -19,7 +20,9 @@ from .survey_faults import refuse_faulty
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
     from rclpy.event_handler import QoSRequestedIncompatibleQoSInfo
+
     from .ros_node import StreamNode
 
 ANCHORS_QOS = QoSProfile(
@@ -27,9 +30,15 @@ ANCHORS_QOS = QoSProfile(
 )
 MOST_NAMED = 10  # anchors that a sentence names
 SAME_TURN = 1e-3  # of a quaternion, by which orientations of the same anchor may differ
-ANY_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)  # gets from every publisher what is repeated
+ANY_QOS = QoSProfile(
+    depth=1, reliability=ReliabilityPolicy.BEST_EFFORT
+)  # gets from every publisher what is repeated
 ANCHORS_FILE = Parameter(
-    "", 'survey of the anchors, as the tools read it (YAML, CSV, total station); "" for those of uwb/anchors'
+    "",
+    (
+        'survey of the anchors, as the tools read it (YAML, CSV, total station); "" for those of '
+        "uwb/anchors"
+    ),
 )
 
 
@@ -40,17 +49,23 @@ def anchors_to_message(anchors: Anchors) -> AnchorArray:
     known = np.where(np.isfinite(anchors.orientations), anchors.orientations, 0.0)
     for i, (x, y, z), q in zip(anchors.ids.tolist(), anchors.positions.tolist(), known.tolist()):
         orientation = Quaternion(x=q[0], y=q[1], z=q[2], w=q[3])
-        message.anchors.append(Anchor(id=i, pose=Pose(position=Point(x=x, y=y, z=z), orientation=orientation)))
+        message.anchors.append(
+            Anchor(id=i, pose=Pose(position=Point(x=x, y=y, z=z), orientation=orientation))
+        )
     return message
 
 
 def same_anchors(one: Anchors, other: Anchors) -> bool:
-    """Return whether two Anchors are the same but for jitter: each anchor within SAME_PLACE and SAME_TURN."""
+    """Return whether two Anchors are the same but for jitter: each anchor within SAME_PLACE and
+    SAME_TURN.
+    """
     return (
         one.frame == other.frame
         and np.array_equal(one.ids, other.ids)
         and bool((np.linalg.norm(one.positions - other.positions, axis=1) <= SAME_PLACE).all())
-        and np.allclose(one.orientations, other.orientations, rtol=0.0, atol=SAME_TURN, equal_nan=True)
+        and np.allclose(
+            one.orientations, other.orientations, rtol=0.0, atol=SAME_TURN, equal_nan=True
+        )
     )
 
 
@@ -59,14 +74,22 @@ def in_words(before: Anchors, after: Anchors) -> str:
     if before.frame != after.frame:
         return f"they are in frame '{after.frame}', and were in '{before.frame}': starting over"
     places = before.index(after.ids)
-    stay = (places >= 0) & (np.linalg.norm(before.positions[places] - after.positions, axis=1) <= SAME_PLACE)
-    named = {"new": after.ids[places < 0], "gone": before.ids[after.index(before.ids) < 0], "elsewhere": after.ids[(places >= 0) & ~stay]}
+    stay = (places >= 0) & (
+        np.linalg.norm(before.positions[places] - after.positions, axis=1) <= SAME_PLACE
+    )
+    named = {
+        "new": after.ids[places < 0],
+        "gone": before.ids[after.index(before.ids) < 0],
+        "elsewhere": after.ids[(places >= 0) & ~stay],
+    }
     parts = [
         f"{word}: {', '.join(map(str, ids[:MOST_NAMED]))}{', ...' if len(ids) > MOST_NAMED else ''}"
         for word, ids in named.items()
         if len(ids)
     ]
-    return "; ".join([*parts, f"going on with the {stay.sum()} that stay" if stay.any() else "starting over"])
+    return "; ".join(
+        [*parts, f"going on with the {stay.sum()} that stay" if stay.any() else "starting over"]
+    )
 
 
 class AnchorsInput:
@@ -75,16 +98,21 @@ class AnchorsInput:
     anchors : Anchors or None; refused : what is wrong with what came on the topic, or None.
     """
 
-    def __init__(self, node: StreamNode, on_change: Callable[[Anchors], None], file: str = "") -> None:
-        """on_change(anchors) is called with the first Anchors, and with others that differ; those of a file are the only
-        ones, and are given by `start`. Raises InputError for the file."""
+    def __init__(
+        self, node: StreamNode, on_change: Callable[[Anchors], None], file: str = ""
+    ) -> None:
+        """on_change(anchors) is called with the first Anchors, and with others that differ; those
+        of a file are the only ones, and are given by `start`. Raises InputError for the file.
+        """
         self.anchors: Anchors | None = None
         self.refused: str | None = None
         self._node, self._on_change, self._file = node, on_change, file
         self._of_file = refuse_faulty(read_survey(file), file) if file else None
         self._repeated: Input | None = None  # the subscription to volatile ones
         events = SubscriptionEventCallbacks(incompatible_qos=self._on_incompatible)
-        self._latched = Input(node, AnchorArray, "uwb/anchors", self._on_message, ANCHORS_QOS, event_callbacks=events)
+        self._latched = Input(
+            node, AnchorArray, "uwb/anchors", self._on_message, ANCHORS_QOS, event_callbacks=events
+        )
 
     def start(self) -> None:
         """Give the anchors of the file, if there is one."""
@@ -100,9 +128,12 @@ class AnchorsInput:
     def _on_incompatible(self, _: QoSRequestedIncompatibleQoSInfo) -> None:
         if self._repeated is None:
             self._node.get_logger().warning(
-                "uwb/anchors is not published reliable and transient local: taken when it is repeated"
+                "uwb/anchors is not published reliable and transient local: taken when it is "
+                "repeated"
             )
-            self._repeated = Input(self._node, AnchorArray, "uwb/anchors", self._on_message, ANY_QOS)
+            self._repeated = Input(
+                self._node, AnchorArray, "uwb/anchors", self._on_message, ANY_QOS
+            )
 
     def _on_message(self, message: AnchorArray) -> None:
         try:
@@ -116,11 +147,16 @@ class AnchorsInput:
             return
         if self._of_file is not None:
             if not same_anchors(anchors, self._of_file):
-                self.refused = f"uwb/anchors has other anchors than anchors_file, {self._file}, which counts: stop one"
+                self.refused = (
+                    f"uwb/anchors has other anchors than anchors_file, {self._file}, which "
+                    "counts: stop one"
+                )
             return
         if self.anchors is not None:
             if same_anchors(anchors, self.anchors):
                 return
-            self._node.get_logger().warning(f"the anchors have changed: {in_words(self.anchors, anchors)}")
+            self._node.get_logger().warning(
+                f"the anchors have changed: {in_words(self.anchors, anchors)}"
+            )
         self.anchors = anchors
         self._on_change(anchors)

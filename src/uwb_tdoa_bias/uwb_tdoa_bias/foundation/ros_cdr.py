@@ -1,21 +1,22 @@
 """Serialized messages (CDR) to rows of numbers and back, by the definition of their type.
 
-A message object costs tens of microseconds to make and to read, most of it for fields that nobody asks for. Here a field is
-a place in the bytes: everything behind the strings of a message lies where the definition says, and strings (frame ids)
-hardly ever change. The layout is that of OMG Data Distribution Service Interoperability (DDSI-RTPS), CDR with 4 bytes of
-encapsulation and every number aligned to its size. Whether that is so is tried on a message with known numbers.
+A message object costs tens of microseconds to make and to read, most of it for fields that nobody
+asks for. Here a field is a place in the bytes: everything behind the strings of a message lies
+where the definition says, and strings (frame ids) hardly ever change. The layout is that of OMG
+Data Distribution Service Interoperability (DDSI-RTPS), CDR with 4 bytes of encapsulation and every
+number aligned to its size. Whether that is so is tried on a message with known numbers.
 
-What comes over a topic may be anything: a driver that was built with another version of a type, another encoding, noise. So
-lengths, texts and numbers of elements are checked before anything is made of them, and what cannot be read is Unreadable,
-with the reason.
+What comes over a topic may be anything: a driver that was built with another version of a type,
+another encoding, noise. So lengths, texts and numbers of elements are checked before anything is
+made of them, and what cannot be read is Unreadable, with the reason.
 """
 
 from __future__ import annotations
 
-from functools import lru_cache, reduce
+from functools import cache, reduce
 from importlib import import_module
 import struct
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rclpy.impl.implementation_singleton import rclpy_implementation as implementation
@@ -27,7 +28,10 @@ if TYPE_CHECKING:
 
 STAMP, FRAME = ("sec", "nanosec"), "header.frame_id"
 ENCAPSULATION = b"\x00\x01\x00\x00"  # plain CDR, little endian
-KNOWN_ENCAPSULATIONS = b"\x00\x00\x00", b"\x00\x01\x00"  # plain CDR in big and little endian; options are in the last byte
+KNOWN_ENCAPSULATIONS = (
+    b"\x00\x00\x00",
+    b"\x00\x01\x00",
+)  # plain CDR in big and little endian; options are in the last byte
 LONGEST_TEXT = 4096  # bytes of a frame_id, or of another text
 MOST_ELEMENTS = 10_000  # in a message that is a list: anchors, transforms
 LARGEST_ELEMENT = 512  # bytes, on the average
@@ -36,9 +40,20 @@ LENGTH = struct.Struct("<I")
 PADDING = 3  # bytes that some middlewares add at the end
 TEXT = "text"
 CODES = {
-    "double": "f8", "float": "f4", "boolean": "?", "octet": "u1", "char": "u1", "int8": "i1", "uint8": "u1", "int16": "i2",
-    "uint16": "u2", "int32": "i4", "uint32": "u4", "int64": "i8", "uint64": "u8",
-}  # fmt: skip
+    "double": "f8",
+    "float": "f4",
+    "boolean": "?",
+    "octet": "u1",
+    "char": "u1",
+    "int8": "i1",
+    "uint8": "u1",
+    "int16": "i2",
+    "uint16": "u2",
+    "int32": "i4",
+    "uint32": "u4",
+    "int64": "i8",
+    "uint64": "u8",
+}
 
 
 def message_class(kind: str) -> Any:
@@ -54,16 +69,24 @@ class Unreadable(ValueError):
 class CdrCodec:
     """Some fields of the messages of one type, which begin with a std_msgs/Header.
 
-    dtype : of the rows: "sec" and "nanosec" of the stamp, then the fields by their names in the message, dots in between
+    dtype : of the rows: "sec" and "nanosec" of the stamp, then the fields by their names in the
+        message, dots in between
     ("pose.pose.position": (3,) of float, as "pose.covariance" is (36,)).
     """
 
     def __init__(self, kind: type, *fields: str) -> None:
-        """kind : class of the messages; fields : their names, of numbers or of what holds only numbers of one type."""
+        """kind : class of the messages; fields : their names, of numbers or of what holds only
+        numbers of one type.
+        """
         self.kind = kind
-        paths = {name: f"header.stamp.{name}" for name in STAMP} | {field: field for field in fields}
+        paths = {name: f"header.stamp.{name}" for name in STAMP} | {
+            field: field for field in fields
+        }
         self._leaves, self._whole = _leaves(kind)
-        self._paths = {name: [leaf for leaf, *_ in self._leaves if _is_in(leaf, path)] for name, path in paths.items()}
+        self._paths = {
+            name: [leaf for leaf, *_ in self._leaves if _is_in(leaf, path)]
+            for name, path in paths.items()
+        }
         spaces = {leaf: (code, count) for leaf, code, count in self._leaves}
         columns = []
         for name, leaves in self._paths.items():
@@ -76,8 +99,10 @@ class CdrCodec:
     def read(
         self, messages: Sequence[bytes], refuse: Callable[[Unreadable], None] | None = None
     ) -> list[tuple[str, np.ndarray, slice]]:
-        """Serialized messages in their order, a list of bytes: a list of (frame_id, rows, slice), each of successive messages of
-        one frame, and which they are. What cannot be read is left out: refuse(Unreadable), without which it is raised."""
+        """Serialized messages in their order, a list of bytes: a list of (frame_id, rows, slice),
+        each of successive messages of one frame, and which they are. What cannot be read is left
+        out: refuse(Unreadable), without which it is raised.
+        """
         out, first = [], 0
         while first < len(messages):
             end = first + 1
@@ -88,7 +113,10 @@ class CdrCodec:
                     layout = self._layout(messages[first])
                     while end < len(messages) and layout.holds(messages[end]):
                         end += 1
-                    frame, rows = layout.frame, np.frombuffer(b"".join(messages[first:end]), layout.dtype)
+                    frame, rows = (
+                        layout.frame,
+                        np.frombuffer(b"".join(messages[first:end]), layout.dtype),
+                    )
                 out.append((frame, rows, slice(first, end)))
             except Unreadable as error:
                 if refuse is None:
@@ -102,7 +130,10 @@ class CdrCodec:
         return Template(self, message)
 
     def layout(self, data: bytes) -> _Layout:
-        """Where the fields are in this serialized message, and in those that have the same texts. Raises Unreadable."""
+        """Where the fields are in this serialized message, and in those that have the same texts.
+
+        Raises Unreadable.
+        """
         if data[:4] != ENCAPSULATION:
             raise Unreadable("it is not plain CDR in little endian")
         place, places, texts, frame = 4, {}, [], ""
@@ -122,7 +153,12 @@ class CdrCodec:
         formats = [self.dtype[name] for name in self._paths]
         offsets = [places[leaves[0]] for leaves in self._paths.values()]
         dtype = np.dtype(
-            {"names": list(self._paths), "formats": formats, "offsets": offsets, "itemsize": len(data)}
+            {
+                "names": list(self._paths),
+                "formats": formats,
+                "offsets": offsets,
+                "itemsize": len(data),
+            }
         )
         return _Layout(frame, dtype, texts)
 
@@ -132,7 +168,9 @@ class CdrCodec:
         return self._known
 
     def _is_foreign(self, data: bytes) -> bool:
-        """Whether only the type support of the middleware can read it: another byte order, or options."""
+        """Whether only the type support of the middleware can read it: another byte order, or
+        options.
+        """
         return not self.fits or (data[:4] != ENCAPSULATION and data[:3] in KNOWN_ENCAPSULATIONS)
 
     def _convert(self, data: bytes) -> tuple[str, np.ndarray]:
@@ -175,7 +213,9 @@ class Template:
 
     def rows(self, n: int) -> np.ndarray:
         """(n,) of them, whose fields are to be filled in."""
-        return np.frombuffer(bytearray(self._data * n), self._dtype)  # a copy of rows is none of what is between the fields
+        return np.frombuffer(
+            bytearray(self._data * n), self._dtype
+        )  # a copy of rows is none of what is between the fields
 
     def messages(self, rows: np.ndarray) -> Iterator[Any]:
         """Generator of what to give to a publisher, for each of the rows that `rows` made."""
@@ -213,7 +253,10 @@ class _Layout:
 
 
 def decode(data: bytes, kind: type) -> Any:
-    """Message of a serialized one, of any type, by the type support of the middleware. Raises Unreadable."""
+    """Message of a serialized one, of any type, by the type support of the middleware.
+
+    Raises Unreadable.
+    """
     if data[:3] not in KNOWN_ENCAPSULATIONS:
         raise Unreadable("it is not plain CDR" if len(data) >= 4 else f"it has {len(data)} bytes")
     _check_size(data, kind)
@@ -227,7 +270,10 @@ def decode(data: bytes, kind: type) -> Any:
 
 
 def read_text(data: bytes, place: int, what: str) -> tuple[str, int]:
-    """(text, place behind it) of a text in plain little-endian CDR, whose length is at `place`. Raises Unreadable."""
+    """(text, place behind it) of a text in plain little-endian CDR, whose length is at `place`.
+
+    Raises Unreadable.
+    """
     if place + 4 > len(data):
         raise Unreadable(f"it ends after {len(data)} bytes, before {what}")
     (length,), begin = LENGTH.unpack_from(data, place), place + 4
@@ -244,15 +290,24 @@ def read_text(data: bytes, place: int, what: str) -> tuple[str, int]:
 
 
 def check_length(data: bytes, length: int, kind: type, exactly: bool = True) -> None:
-    """Raise Unreadable for a message that is shorter than so many bytes, or, with `exactly`, longer."""
+    """Raise Unreadable for a message that is shorter than so many bytes, or, with `exactly`,
+    longer.
+    """
     if length > len(data):
-        raise Unreadable(f"{len(data)} bytes are {length - len(data)} too few for {name_of(kind)}: cut off, or of {ANOTHER}")
+        raise Unreadable(
+            f"{len(data)} bytes are {length - len(data)} too few for {name_of(kind)}: cut "
+            f"off, or of {ANOTHER}"
+        )
     if exactly and length < len(data) - PADDING:
-        raise Unreadable(f"{len(data)} bytes are {len(data) - length} too many for {name_of(kind)}: of {ANOTHER}")
+        raise Unreadable(
+            f"{len(data)} bytes are {len(data) - length} too many for {name_of(kind)}: of {ANOTHER}"
+        )
 
 
 def _check_size(data: bytes, kind: type) -> None:
-    """Raise Unreadable for more than may be allocated: long messages, lists that say that they are longer than they are."""
+    """Raise Unreadable for more than may be allocated: long messages, lists that say that they are
+    longer than they are.
+    """
     leaves, whole = _leaves(kind)
     texts = sum(code == TEXT for _, code, _ in leaves)
     fixed = sum(np.dtype(code).itemsize * count + 8 for _, code, count in leaves if code != TEXT)
@@ -284,10 +339,12 @@ def name_of(kind: type) -> str:
     return f"{kind.__module__.partition('.')[0]}/{kind.__name__}"
 
 
-@lru_cache(maxsize=None)
+@cache
 def _leaves(kind: Any) -> tuple[list[tuple[str, str, int]], bool]:
-    """Of a message class up to the first field that has no fixed size: ([(name of a number, an array of numbers or a string,
-    its code in CODES, or TEXT, and how many)], whether that is all of it)."""
+    """Of a message class up to the first field that has no fixed size: ([(name of a number, an
+    array of numbers or a string, its code in CODES, or TEXT, and how many)], whether that is all of
+    it).
+    """
     out: list[tuple[str, str, int]] = []
     for name, slot in zip(kind.get_fields_and_field_types(), kind.SLOT_TYPES):
         count, slot = (slot.size, slot.value_type) if isinstance(slot, Array) else (1, slot)

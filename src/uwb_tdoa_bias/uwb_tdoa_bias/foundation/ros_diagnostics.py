@@ -1,47 +1,70 @@
-"""What a node says of itself: its status on /diagnostics and on the log, also of simulated time that stands still."""
+"""What a node says of itself: its status on /diagnostics and on the log, also of simulated time
+that stands still.
+"""
 
 from __future__ import annotations
 
 import math
 import re
 import time
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rclpy.clock import Clock as SteadyClock, ClockType
+from rclpy.clock import Clock as SteadyClock
+from rclpy.clock import ClockType
 from rclpy.qos import QoSProfile
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
     from rclpy.clock import ROSClock
     from rclpy.node import Node
+
     from .ros_node import StreamNode
 
 BEHIND = 0.5  # s that something may wait until this process serves it
 AGAIN = 30.0  # s after which the log says what it has said before
-# Each number whole, whatever follows: a pattern that tries again at each digit takes 8 s for 20 000 of them.
-NUMBER = re.compile(r"([-+]?)\d+(\.\d+)?(?=(\s*(?:%|s\b|ms\b|m\b|Hz|messages|samples|TDOAs|times))?)")
-REPORT_PERIOD, LOOKS = 1.0, 5  # s from one report to the next, and looks in between at what is to be reported at once
-PAUSED, SLOWEST_CLOCK = 0.5, 2.0  # s without a new time on /clock; s from one time to the next of a clock that runs
+# Each number whole, whatever follows: a pattern that tries again at each digit takes 8 s for 20 000
+# of them.
+NUMBER = re.compile(
+    r"([-+]?)\d+(\.\d+)?(?=(\s*(?:%|s\b|ms\b|m\b|Hz|messages|samples|TDOAs|times))?)"
+)
+REPORT_PERIOD, LOOKS = (
+    1.0,
+    5,
+)  # s from one report to the next, and looks in between at what is to be reported at once
+PAUSED, SLOWEST_CLOCK = (
+    0.5,
+    2.0,
+)  # s without a new time on /clock; s from one time to the next of a clock that runs
 DIAGNOSTICS_QOS = QoSProfile(depth=10)
 
 Report = tuple[bytes, str, dict[str, Any]]  # level of a DiagnosticStatus, text, values
 
 
 class Diagnostics:
-    """Publishes one status on /diagnostics each second of the wall clock, and at once when simulated time stops or goes on; logs it
-    when it says something else than before (see Saying).
+    """Publishes one status on /diagnostics each second of the wall clock, and at once when
+    simulated time stops or goes on; logs it when it says something else than before (see Saying).
 
-    report() -> (level, text, {key: value}), with level one of DiagnosticStatus.OK, WARN, ERROR; look() : called LOOKS times a
-    second.
+    report() -> (level, text, {key: value}), with level one of DiagnosticStatus.OK, WARN, ERROR;
+    look() : called LOOKS times a second.
     """
 
-    def __init__(self, node: StreamNode, report: Callable[[], Report], look: Callable[[], None] = lambda: None) -> None:
+    def __init__(
+        self,
+        node: StreamNode,
+        report: Callable[[], Report],
+        look: Callable[[], None] = lambda: None,
+    ) -> None:
         self._node, self._report, self._look, self._saying = node, report, look, Saying()
         self._clock, self._looks = SimulatedClock(node), 0
         self._clock_status: tuple[bytes, str] | None = None
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", DIAGNOSTICS_QOS)
-        node.create_timer(REPORT_PERIOD / LOOKS, self._on_timer, clock=SteadyClock(clock_type=ClockType.STEADY_TIME))
+        node.create_timer(
+            REPORT_PERIOD / LOOKS,
+            self._on_timer,
+            clock=SteadyClock(clock_type=ClockType.STEADY_TIME),
+        )
 
     def _on_timer(self) -> None:
         before, self._clock_status = self._clock_status, self._clock.status()
@@ -64,8 +87,14 @@ class Diagnostics:
             spinner.longest_wait = 0.0  # of the process: the first of its nodes that asks says it
             values |= {"longest wait of a request": f"{late:.3f} s"}
             if late > BEHIND and level == DiagnosticStatus.OK:
-                level, text = DiagnosticStatus.WARN, f"this node answers up to {late:.1f} s late: check the load of this machine"
-        values |= {"frozen": "yes" if self._node.frozen else "no", "refused because frozen": self._node.refused}
+                level, text = (
+                    DiagnosticStatus.WARN,
+                    f"this node answers up to {late:.1f} s late: check the load of this machine",
+                )
+        values |= {
+            "frozen": "yes" if self._node.frozen else "no",
+            "refused because frozen": self._node.refused,
+        }
         refused = self._node.refused_lately()
         if refused and level == DiagnosticStatus.OK:
             level, text = DiagnosticStatus.WARN, refused
@@ -78,15 +107,19 @@ class Diagnostics:
                 logger.warning(text)
         name = self._node.get_fully_qualified_name()
         entries = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
-        status = DiagnosticStatus(level=level, name=name, message=text, hardware_id=name, values=entries)
+        status = DiagnosticStatus(
+            level=level, name=name, message=text, hardware_id=name, values=entries
+        )
         message = DiagnosticArray(status=[status])
         message.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(message)
 
 
 class Saying:
-    """What is worth a line of the log: a sentence of another kind than the last one. Sentences that differ in measured numbers alone,
-    not in the anchors that they name, are of one kind, and each kind is said once in AGAIN seconds."""
+    """What is worth a line of the log: a sentence of another kind than the last one. Sentences that
+    differ in measured numbers alone, not in the anchors that they name, are of one kind, and each
+    kind is said once in AGAIN seconds.
+    """
 
     def __init__(self) -> None:
         self._last: str | None = None
@@ -97,13 +130,18 @@ class Saying:
         kind = NUMBER.sub(_unless_id, text)
         if kind == self._last or now - self._when.get(kind, -math.inf) < AGAIN:
             return False
-        self._when = {one: when for one, when in self._when.items() if now - when < AGAIN} | {kind: now}
+        self._when = {one: when for one, when in self._when.items() if now - when < AGAIN} | {
+            kind: now
+        }
         self._last = kind
         return True
 
 
 def _unless_id(number: re.Match[str]) -> str:
-    """ "#" for what is measured: a number with a sign, a decimal point or a unit. The id of an anchor has none of these, and stays."""
+    """ "#" for what is measured: a number with a sign, a decimal point or a unit.
+
+    The id of an anchor has none of these, and stays.
+    """
     return "#" if any(number.groups()) else number[0]
 
 
@@ -125,7 +163,10 @@ class SimulatedClock:
         time_of_it = clock.now().nanoseconds
         if time_of_it == 0:
             remedy = "play the bag with --clock, or set use_sim_time to false"
-            return DiagnosticStatus.WARN, f"use_sim_time is set, and nobody publishes /clock: {remedy}"
+            return (
+                DiagnosticStatus.WARN,
+                f"use_sim_time is set, and nobody publishes /clock: {remedy}",
+            )
         if time_of_it != self._time:
             took = now - self._since
             if self._time is not None and took < SLOWEST_CLOCK:

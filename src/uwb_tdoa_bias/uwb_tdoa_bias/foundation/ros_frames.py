@@ -3,21 +3,32 @@
 from __future__ import annotations
 
 import struct
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from builtin_interfaces.msg import Time
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from tf2_msgs.msg import TFMessage
 
 from .errors import InputError
+from .ros_cdr import (
+    ENCAPSULATION,
+    LENGTH,
+    MOST_ELEMENTS,
+    Unreadable,
+    aligned,
+    check_length,
+    decode,
+    read_text,
+)
 from .ros_parameters import LONGEST_NAME
-from .ros_cdr import ENCAPSULATION, LENGTH, MOST_ELEMENTS, Unreadable, aligned, check_length, decode, read_text
 from .ros_topics import Input
 from .transforms import Frames
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
+
     from geometry_msgs.msg import TransformStamped
+
     from .ros_node import StreamNode
 
 TF_QOS = QoSProfile(depth=100)  # what tf2 uses
@@ -27,22 +38,48 @@ TF_STATIC_QOS = QoSProfile(
     depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
 
-Transform = tuple[int, int, str, str, tuple[float, ...], tuple[float, ...]]  # sec, nanosec, parent, child, q, p
+Transform = tuple[
+    int, int, str, str, tuple[float, ...], tuple[float, ...]
+]  # sec, nanosec, parent, child, q, p
 
 
 class FramesInput:
-    """Frames of /tf_static, and of /tf if they may move: its messages wait until `catch_up`. Of a node that is frozen, the first
-    constant transform of a frame counts. trouble : a transform that is none, or None; refusals : Refusals."""
+    """Frames of /tf_static, and of /tf if they may move: its messages wait until `catch_up`. Of a
+    node that is frozen, the first constant transform of a frame counts. trouble : a transform that
+    is none, or None; refusals : Refusals.
+    """
 
     def __init__(
-        self, node: StreamNode, seconds: Callable[[Time], float], on_new: Callable[[], None], moving: bool = False
+        self,
+        node: StreamNode,
+        seconds: Callable[[Time], float],
+        on_new: Callable[[], None],
+        moving: bool = False,
     ) -> None:
-        """seconds(stamp) : s of a builtin_interfaces/Time; on_new() is called when a constant transform is new."""
+        """seconds(stamp) : s of a builtin_interfaces/Time; on_new() is called when a constant
+        transform is new.
+        """
         self.frames = Frames()
         self.trouble: str | None = None
         self._node, self._seconds, self._on_new = node, seconds, on_new
-        static = Input(node, TFMessage, "/tf_static", self._on_static, TF_STATIC_QOS, read_transforms)
-        self._moving = [Input(node, TFMessage, "/tf", self._on_moving, MOVING_QOS, read_transforms, served=False)] if moving else []
+        static = Input(
+            node, TFMessage, "/tf_static", self._on_static, TF_STATIC_QOS, read_transforms
+        )
+        self._moving = (
+            [
+                Input(
+                    node,
+                    TFMessage,
+                    "/tf",
+                    self._on_moving,
+                    MOVING_QOS,
+                    read_transforms,
+                    served=False,
+                )
+            ]
+            if moving
+            else []
+        )
         self.refusals = [end.refusals for end in (static, *self._moving)]
 
     def catch_up(self) -> None:
@@ -65,7 +102,12 @@ class FramesInput:
     def _on_moving(self, transforms: list[Transform]) -> None:
         for sec, nanosec, *transform in transforms:
             if sec or nanosec:
-                self._take("/tf", self.frames.move, *transform, self._seconds(Time(sec=sec, nanosec=nanosec)))
+                self._take(
+                    "/tf",
+                    self.frames.move,
+                    *transform,
+                    self._seconds(Time(sec=sec, nanosec=nanosec)),
+                )
 
     def _take(self, topic: str, take: Callable[..., bool | None], *transform: Any) -> bool | None:
         try:
@@ -77,7 +119,8 @@ class FramesInput:
 
 
 def read_transforms(data: bytes) -> list[Transform]:
-    """[(sec, nanosec, parent, child, q, p)] of a serialized tf2_msgs/TFMessage: q x y z w, p m. Raises Unreadable.
+    """[(sec, nanosec, parent, child, q, p)] of a serialized tf2_msgs/TFMessage: q x y z w, p m.
+    Raises Unreadable.
 
     A robot publishes hundreds a second, and a message object takes ten times as long as this.
     """
@@ -113,6 +156,8 @@ def _of(message: TransformStamped) -> Transform:
 def unknown_frame(topic: str, frame: str, body: str) -> str:
     """The sentence for a sensor whose place on the robot nobody says."""
     return (
-        f"{topic} is in frame '{frame}', which /tf_static does not connect with '{body}': taken as '{body}'; publish it: "
-        f"static_transform_publisher --frame-id {body} --child-frame-id {frame}, or correct the driver's frame_id"
+        f"{topic} is in frame '{frame}', which /tf_static does not connect with '{body}': "
+        f"taken as '{body}'; publish it: "
+        f"static_transform_publisher --frame-id {body} --child-frame-id {frame}, or correct "
+        "the driver's frame_id"
     )

@@ -4,24 +4,31 @@ from __future__ import annotations
 
 import sys
 import time
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from .foreign_text import line_of
 
 if TYPE_CHECKING:
-    from rclpy.impl.rcutils_logger import RcutilsLogger
     from types import CodeType
 
-BURST, REFILL = 200, 10.0  # lines that one statement of the program may write at once, and s until it may write one more
+    from rclpy.impl.rcutils_logger import RcutilsLogger
+
+BURST, REFILL = (
+    200,
+    10.0,
+)  # lines that one statement of the program may write at once, and s until it may write one more
 
 
 class Log:
-    """A logger of rclpy whose lines are printable and of a bounded length. Each statement of the program writes BURST of them at once, then
-    one in REFILL seconds: whoever makes one statement write hides no other."""
+    """A logger of rclpy whose lines are printable and of a bounded length. Each statement of the
+    program writes BURST of them at once, then one in REFILL seconds: whoever makes one statement
+    write hides no other.
+    """
 
     def __init__(self, logger: RcutilsLogger) -> None:
         self._logger = logger
-        # Of each statement: the lines that it may write, since when (s), and how many were left out before.
+        # Of each statement: the lines that it may write, since when (s), and how many were left out
+        # before.
         self._left: dict[tuple[CodeType, int], tuple[float, float, int]] = {}
 
     def info(self, text: str) -> None:

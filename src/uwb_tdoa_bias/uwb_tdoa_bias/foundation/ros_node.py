@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import wraps
-from typing import Any, Protocol, TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from rclpy.event_handler import PublisherEventCallbacks, SubscriptionEventCallbacks
 from rosgraph_msgs.msg import Clock
@@ -14,6 +14,7 @@ from .ros_topics import unserved, waiting
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Sequence
+
     from rclpy.publisher import Publisher
     from rclpy.qos import QoSProfile
     from rclpy.subscription import Subscription
@@ -23,7 +24,9 @@ Events = TypeVar("Events", SubscriptionEventCallbacks, PublisherEventCallbacks)
 
 
 class Serving(Protocol):
-    """Serves nodes, see Spinner. longest_wait : s, the longest that anything has waited since this was set to 0.0."""
+    """Serves nodes, see Spinner. longest_wait : s, the longest that anything has waited since this
+    was set to 0.0.
+    """
 
     longest_wait: float
 
@@ -32,9 +35,12 @@ class Serving(Protocol):
 
 
 class StreamNode(ParameterNode):
-    """A node whose streams and /clock are not served by an executor (see Spinner). members : nodes that live and end with it;
-    spinner : the Spinner that serves it, once there is one; ready : what it says on the log when it begins to be served;
-    on_failure(error) : is called with what a callback raises, instead of raising it."""
+    """A node whose streams and /clock are not served by an executor (see Spinner). members : nodes
+    that live and end with it;
+    spinner : the Spinner that serves it, once there is one; ready : what it says on the log when it
+        begins to be served;
+    on_failure(error) : is called with what a callback raises, instead of raising it.
+    """
 
     members: Sequence[StreamNode] = ()
     spinner: Serving | None = None
@@ -42,23 +48,39 @@ class StreamNode(ParameterNode):
     on_failure: Callable[[Exception], None] | None = None
 
     def create_subscription(
-        self, msg_type: type, topic: str, callback: Callable[..., None], qos_profile: QoSProfile | int, **options: Any
+        self,
+        msg_type: type,
+        topic: str,
+        callback: Callable[..., None],
+        qos_profile: QoSProfile | int,
+        **options: Any,
     ) -> Subscription:
         """Of rclpy."""
         callback = callback if callback is unserved else self._contained(callback)
-        options["event_callbacks"] = self._quiet(topic, options.get("event_callbacks") or SubscriptionEventCallbacks())
+        options["event_callbacks"] = self._quiet(
+            topic, options.get("event_callbacks") or SubscriptionEventCallbacks()
+        )
         return super().create_subscription(msg_type, topic, callback, qos_profile, **options)
 
-    def create_publisher(self, msg_type: type, topic: str, qos_profile: QoSProfile | int, **options: Any) -> Publisher:
+    def create_publisher(
+        self, msg_type: type, topic: str, qos_profile: QoSProfile | int, **options: Any
+    ) -> Publisher:
         """Of rclpy."""
-        options["event_callbacks"] = self._quiet(topic, options.get("event_callbacks") or PublisherEventCallbacks())
+        options["event_callbacks"] = self._quiet(
+            topic, options.get("event_callbacks") or PublisherEventCallbacks()
+        )
         return super().create_publisher(msg_type, topic, qos_profile, **options)
 
     def _quiet(self, topic: str, events: Events) -> Events:
-        """The event callbacks of a topic, which warn of peers with another QoS or type at times: rclpy writes a line for each peer."""
+        """The event callbacks of a topic, which warn of peers with another QoS or type at times:
+        rclpy writes a line for each peer.
+        """
         for event in ("incompatible_qos", "incompatible_type"):
             if getattr(events, event) is None:
-                text = f"{topic}: a peer has an {event.replace('_', ' ')}, so its messages, or ours, do not arrive; correct the peer"
+                text = (
+                    f"{topic}: a peer has an {event.replace('_', ' ')}, so its messages, or ours, "
+                    "do not arrive; correct the peer"
+                )
                 setattr(events, event, self._warning(f"{topic} {event}", text))
         return events
 
@@ -91,7 +113,11 @@ class StreamNode(ParameterNode):
     @property
     def subscriptions(self) -> Iterator[Subscription]:
         """Those that an executor serves."""
-        yield from (one for one in super().subscriptions if one.msg_type is not Clock and one.callback is not unserved)
+        yield from (
+            one
+            for one in super().subscriptions
+            if one.msg_type is not Clock and one.callback is not unserved
+        )
 
     def take_clock(self) -> None:
         """Set the clock of the node to the newest of /clock."""

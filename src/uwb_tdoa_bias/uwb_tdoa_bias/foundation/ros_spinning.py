@@ -1,17 +1,21 @@
-"""How a process serves its streams, and everything else of the graph that concerns it: in turn, so that neither waits for the other."""
+"""How a process serves its streams, and everything else of the graph that concerns it: in turn, so
+that neither waits for the other.
+"""
 
 from __future__ import annotations
 
 import math
 import time
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rclpy.executors import SingleThreadedExecutor, TimeoutException
 from rclpy.impl.implementation_singleton import rclpy_implementation as implementation
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
+
     from rclpy import Future
+
     from .ros_node import StreamNode
     from .ros_streams import RoundRobin
 
@@ -21,18 +25,25 @@ except ImportError:
     EventsExecutor = None  # type: ignore[assignment]  # says that there is none
 
 LONGEST_SLEEP = 0.2  # s, until a process without streams sees a signal
-QUIET, LOOK = 1.0, 0.05  # s without a message of a stream, after which it is looked for each LOOK s, and not each millisecond
+QUIET, LOOK = (
+    1.0,
+    0.05,
+    # s without a message of a stream, after which it is looked for each LOOK s, and not each
+    # millisecond
+)
 SERVED = 0.005  # s from one service of the graph to the next, while streams flow
 LONGEST_SERVICE = 0.05  # s; only with a SingleThreadedExecutor
 
 
 class Spinner:
-    """The life of the nodes of a process. Messages of streams, and those of /clock and /tf, which may come a thousand times a second,
-    wait in the middleware until a turn takes and computes them together: a callback for each costs a fifth more in all, and a call of
-    the filter for each more than that. Then the process rests as long as the turn took, at least a millisecond. Every SERVED s
-    everything else of the graph, requests, timers, transforms, is served by an executor of rclpy, in the order in which it came, and
-    nothing can be passed over: a mark is put at the end of its queue, and it is run until the mark comes. Where no stream has said
-    anything for a while, the process sleeps in the executor. (`docs/measured.md` has what was measured.)
+    """The life of the nodes of a process. Messages of streams, and those of /clock and /tf, which
+    may come a thousand times a second, wait in the middleware until a turn takes and computes them
+    together: a callback for each costs a fifth more in all, and a call of the filter for each more
+    than that. Then the process rests as long as the turn took, at least a millisecond. Every SERVED
+    s everything else of the graph, requests, timers, transforms, is served by an executor of rclpy,
+    in the order in which it came, and nothing can be passed over: a mark is put at the end of its
+    queue, and it is run until the mark comes. Where no stream has said anything for a while, the
+    process sleeps in the executor. (`docs/measured.md` has what was measured.)
 
     longest_wait : s, the longest that anything has waited since this was set to 0.0.
     """
@@ -61,7 +72,11 @@ class Spinner:
 
     def spin(self, stop: Future) -> None:
         """Live until the future `stop` is done, or the context ends."""
-        taken, sleep, quiet = -math.inf, LONGEST_SLEEP if self._turns is None else LOOK, True  # taken : when a turn last took anything
+        taken, sleep, quiet = (
+            -math.inf,
+            LONGEST_SLEEP if self._turns is None else LOOK,
+            True,
+        )  # taken : when a turn last took anything
         while not stop.done() and self._nodes[0].context.ok():
             if quiet or time.monotonic() >= self._served + SERVED:
                 self._guarded(self._serve)
@@ -85,7 +100,9 @@ class Spinner:
         if EventsExecutor is None:
             self._serve_each()
         else:
-            mark = self._executor.create_task(_nothing)  # tasks wait in the same queue as everything else
+            mark = self._executor.create_task(
+                _nothing
+            )  # tasks wait in the same queue as everything else
             while not mark.done():
                 self._executor.spin_once(timeout_sec=0.0)
         now = time.monotonic()
@@ -94,7 +111,9 @@ class Spinner:
             node.take_clock()
 
     def _serve_each(self) -> None:
-        """With the SingleThreadedExecutor, which has no queue: one of everything that waits, until nothing does, or for a while."""
+        """With the SingleThreadedExecutor, which has no queue: one of everything that waits, until
+        nothing does, or for a while.
+        """
         until, found = time.monotonic() + LONGEST_SERVICE, True
         while found and time.monotonic() < until:
             found = False

@@ -12,9 +12,11 @@ if TYPE_CHECKING:
 
 
 class Epoch:
-    """Stamps as float seconds, exact to the nanosecond: counted from the whole second of the first stamp.
+    """Stamps as float seconds, exact to the nanosecond: counted from the whole second of the first
+    stamp.
 
-    Seconds since 1970 in a float64 are only good to 2e-7 s. Exact for 48 days before and after the first stamp.
+    Seconds since 1970 in a float64 are only good to 2e-7 s. Exact for 48 days before and after the
+    first stamp.
     """
 
     def __init__(self) -> None:

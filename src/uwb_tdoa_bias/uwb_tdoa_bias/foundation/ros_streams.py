@@ -1,9 +1,11 @@
-"""The streams of a node: all that has arrived is taken together, in turns; a call of the filter costs more than a message."""
+"""The streams of a node: all that has arrived is taken together, in turns; a call of the filter
+costs more than a message.
+"""
 
 from __future__ import annotations
 
 import time
-from typing import Any, Protocol, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -12,16 +14,20 @@ from .stamps import LARGEST_STEP_BACK
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
+
+    from .ros_cdr import CdrCodec, Template
     from .ros_node import StreamNode
-    from .ros_cdr import Template, CdrCodec
     from .ros_stamps import Epoch
 
-    Take = Callable[[str, np.ndarray, np.ndarray, np.ndarray], None]  # frame, stamps, rows and arrivals
+    Take = Callable[
+        [str, np.ndarray, np.ndarray, np.ndarray], None
+    ]  # frame, stamps, rows and arrivals
 
 PERIOD = 0.001  # s, at least, of rest after a turn
 LONGEST_WAIT = 0.02  # s without a turn in which anything is taken, whatever it waits for
 ROUNDING = 1e-6  # s by which two ways to compute a stamp since 1970 may differ
-LONGEST_REST = 0.01  # s; after a turn there is a rest as long as it took, at most so long: more is then taken at a time
+# s; after a turn there is a rest as long as it took, at most so long: more is then taken at a time
+LONGEST_REST = 0.01
 Part = tuple[str, np.ndarray, np.ndarray]  # frame, rows and arrivals of successive messages
 
 
@@ -32,7 +38,10 @@ class Taking(Protocol):
 
 
 class RoundRobin:
-    """Has nodes take what has arrived for them, one after the other. A node that has `turns` is given them by ros.run."""
+    """Has nodes take what has arrived for them, one after the other.
+
+    A node that has `turns` is given them by ros.run.
+    """
 
     PERIOD = PERIOD
 
@@ -53,7 +62,9 @@ class Streams:
 
     def __init__(self, node: StreamNode, epoch: Epoch, on_taken: Callable[[], None]) -> None:
         """epoch : Epoch; on_taken() is called after anything was given to those that take it."""
-        self.inputs: dict[str, StreamInput | Handed] = {}  # by topic, in the order in which they are taken
+        self.inputs: dict[
+            str, StreamInput | Handed
+        ] = {}  # by topic, in the order in which they are taken
         self._node, self._epoch, self._on_taken = node, epoch, on_taken
         self._streams: list[_Stream] = []
         self._by_topic: dict[str, _Stream] = {}
@@ -67,33 +78,43 @@ class Streams:
         return [end.refusals for end in self.inputs.values()]
 
     def wait_for(self, topic: str, due: Callable[[], float]) -> None:
-        """Take nothing before a message of this topic is stamped due(), s since 1970, or later, for LONGEST_WAIT: less could not
-        be done with it yet."""
+        """Take nothing before a message of this topic is stamped due(), s since 1970, or later, for
+        LONGEST_WAIT: less could not be done with it yet.
+        """
         self._awaited, self._due = self._by_topic[topic], due
 
     def add(self, wire: CdrCodec, topic: str, take: Take, handed: bool = False) -> None:
-        """Subscribe. wire : CdrCodec; take(frame, t, rows, arrival) gets successive messages of one frame: their stamps (n,) s,
-        rows (n,) of the CdrCodec, and when they arrived, (n,) s since 1970. handed : a node of this process hands them over."""
+        """Subscribe. wire : CdrCodec; take(frame, t, rows, arrival) gets successive messages of one
+        frame: their stamps (n,) s, rows (n,) of the CdrCodec, and when they arrived, (n,) s since
+        1970. handed : a node of this process hands them over.
+        """
         kind = Handed if handed else StreamInput
         self.inputs[topic] = kind(self._node, wire.kind, topic)
         stream = self._by_topic[topic] = _Stream(wire, take, self.inputs[topic])
         self._streams.append(stream)
 
     def take(self, at_once: bool = False) -> bool:
-        """Give everything that has arrived to those that take it; at_once : whatever they wait for. Returns whether there was
-        anything, or is."""
+        """Give everything that has arrived to those that take it; at_once : whatever they wait for.
+        Returns whether there was anything, or is.
+        """
         if self._awaited is not None and not at_once:
             arrived, now = self._awaited.fetch(), time.monotonic()
-            if now < self._until and not (arrived and self._awaited.newest_waiting > self._due() - ROUNDING):
+            if now < self._until and not (
+                arrived and self._awaited.newest_waiting > self._due() - ROUNDING
+            ):
                 return bool(self._awaited.waiting)
             self._until = now + LONGEST_WAIT
         for stream in self._streams:
             stream.fetch()
-        parts = [part for stream in self._streams if stream.waiting for part in stream.parts(self._epoch)]
+        parts = [
+            part for stream in self._streams if stream.waiting for part in stream.parts(self._epoch)
+        ]
         if not parts:
             return False
         if any(stream.fell for stream in self._streams):  # then it matters which stream was first
-            parts = sorted((piece for part in parts for piece in _pieces(part)), key=lambda piece: piece[-1][0])
+            parts = sorted(
+                (piece for part in parts for piece in _pieces(part)), key=lambda piece: piece[-1][0]
+            )
         for take, *part in parts:
             take(*part)
         self._on_taken()
@@ -153,7 +174,9 @@ class Handed:
 
 
 class _Stream:
-    """What has arrived on one of them. waiting : parts; fell : the stamps of what was taken last have fallen back."""
+    """What has arrived on one of them. waiting : parts; fell : the stamps of what was taken last
+    have fallen back.
+    """
 
     def __init__(self, wire: CdrCodec, take: Take, source: StreamInput | Handed) -> None:
         self.waiting: list[Part] = []
@@ -194,4 +217,6 @@ class _Stream:
 def _pieces(part: tuple[Any, ...]) -> list[tuple[Any, ...]]:
     """The messages of a part one by one."""
     take, frame, *columns = part
-    return [(take, frame, *(column[k : k + 1] for column in columns)) for k in range(len(columns[0]))]
+    return [
+        (take, frame, *(column[k : k + 1] for column in columns)) for k in range(len(columns[0]))
+    ]

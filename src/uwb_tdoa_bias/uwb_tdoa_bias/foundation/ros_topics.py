@@ -1,10 +1,12 @@
-"""The ends of topics: QoS, subscriptions of which messages are read as bytes, and what is wrong with them as ROS sees it."""
+"""The ends of topics: QoS, subscriptions of which messages are read as bytes, and what is wrong
+with them as ROS sees it.
+"""
 
 from __future__ import annotations
 
 from copy import copy
 import time
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -15,25 +17,33 @@ from .ros_cdr import Unreadable, decode, name_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+
     from rclpy.event_handler import QoSMessageLostInfo
     from rclpy.node import Node
     from rclpy.publisher import Publisher
     from rclpy.subscription import Subscription
     from rclpy.topic_endpoint_info import TopicEndpointInfo
-    from .ros_parameters import ParameterNode
-    from .ros_cdr import CdrCodec
 
-# What comes in is sensor data: best effort, which hears every publisher. Deep, because a node that was not scheduled for a
-# moment must find all of it: 10 s of a 1 kHz IMU, or 2.5 s of it replayed four times as fast. Takes memory only where it
+    from .ros_cdr import CdrCodec
+    from .ros_parameters import ParameterNode
+
+# What comes in is sensor data: best effort, which hears every publisher. Deep, because a node that
+# was not scheduled for a
+# moment must find all of it: 10 s of a 1 kHz IMU, or 2.5 s of it replayed four times as fast. Takes
+# memory only where it
 # is used. What goes out is reliable, which every subscriber hears: RViz and most others ask for it.
 STREAM_QOS = QoSProfile(depth=10_000, reliability=ReliabilityPolicy.BEST_EFFORT)
 OUTPUT_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 LARGEST_LOSS = 0.01  # share of the messages of a second
-OVERRIDES = QoSOverridingOptions([QoSPolicyKind.RELIABILITY, QoSPolicyKind.DEPTH])  # written into the given profile
+OVERRIDES = QoSOverridingOptions(
+    [QoSPolicyKind.RELIABILITY, QoSPolicyKind.DEPTH]
+)  # written into the given profile
 
 
 def publish_stream(node: Node, kind: type, topic: str) -> Publisher:
-    """Publisher of a stream; QoS by parameter: qos_overrides.<topic>.publisher.reliability and .depth."""
+    """Publisher of a stream; QoS by parameter: qos_overrides.<topic>.publisher.reliability and
+    .depth.
+    """
     return node.create_publisher(kind, topic, copy(OUTPUT_QOS), qos_overriding_options=OVERRIDES)
 
 
@@ -42,14 +52,18 @@ def unserved(_: Any) -> None:
 
 
 def waiting(subscription: Subscription) -> Iterator[tuple[bytes, dict[str, Any]]]:
-    """Generator of what waits at a subscription that no executor serves: (bytes, information) of each message, which is taken."""
+    """Generator of what waits at a subscription that no executor serves: (bytes, information) of
+    each message, which is taken.
+    """
     kind, take = subscription.msg_type, subscription.handle.take_message
     while (taken := take(kind, True)) is not None:
         yield taken
 
 
 class Refusals:
-    """Messages of a topic that could not be read. count : of them; reason : of the last; topic : its name."""
+    """Messages of a topic that could not be read. count : of them; reason : of the last; topic :
+    its name.
+    """
 
     def __init__(self, node: ParameterNode, topic: str, kind: type) -> None:
         self.count, self.reason = 0, ""
@@ -58,7 +72,10 @@ class Refusals:
     def add(self, error: Unreadable) -> None:
         """Count one."""
         self.count, self.reason = self.count + 1, str(error)
-        self._node.warn_at_times(f"unreadable {self.topic}", f"{self.topic}: a message cannot be read and is not used: {error}")
+        self._node.warn_at_times(
+            f"unreadable {self.topic}",
+            f"{self.topic}: a message cannot be read and is not used: {error}",
+        )
 
     def trouble(self) -> str | None:
         """The sentence for those since this was asked last, or None."""
@@ -66,15 +83,27 @@ class Refusals:
         if not new:
             return None
         others = self._others()
-        remedy = f"{others} publishes another version of {name_of(self._kind)}: build it anew" if others else "check who publishes it"
+        remedy = (
+            f"{others} publishes another version of {name_of(self._kind)}: build it anew"
+            if others
+            else "check who publishes it"
+        )
         return f"{new} messages on {self.topic} cannot be read ({self.reason}): {remedy}"
 
     def _others(self) -> str:
         """Who publishes another definition of the type than ours, as text."""
         name = self._node.resolve_topic_name(self.topic)
-        own = {_hash(end) for end in self._node.get_subscriptions_info_by_topic(name) if end.node_name == self._node.get_name()}
-        ends = [end for end in self._node.get_publishers_info_by_topic(name) if _hash(end) not in own]
-        return ", ".join(sorted({f"{end.node_namespace.rstrip('/')}/{end.node_name}" for end in ends}))
+        own = {
+            _hash(end)
+            for end in self._node.get_subscriptions_info_by_topic(name)
+            if end.node_name == self._node.get_name()
+        }
+        ends = [
+            end for end in self._node.get_publishers_info_by_topic(name) if _hash(end) not in own
+        ]
+        return ", ".join(
+            sorted({f"{end.node_namespace.rstrip('/')}/{end.node_name}" for end in ends})
+        )
 
 
 def _hash(end: TopicEndpointInfo) -> str:
@@ -82,20 +111,29 @@ def _hash(end: TopicEndpointInfo) -> str:
 
 
 class Input:
-    """Subscription of messages that come one at a time, not in streams: callback(message), by an executor, or in `take_all` if it is
-    not served. What cannot be read is refused.
+    """Subscription of messages that come one at a time, not in streams: callback(message), by an
+    executor, or in `take_all` if it is not served. What cannot be read is refused.
 
     refusals : Refusals; options : of Node.create_subscription.
     """
 
     def __init__(
-        self, node: ParameterNode, kind: type, topic: str, callback: Callable[[Any], None], qos: int | QoSProfile,
-        read: Callable[[bytes], Any] | None = None, served: bool = True, **options: Any,
-    ) -> None:  # fmt: skip
+        self,
+        node: ParameterNode,
+        kind: type,
+        topic: str,
+        callback: Callable[[Any], None],
+        qos: int | QoSProfile,
+        read: Callable[[bytes], Any] | None = None,
+        served: bool = True,
+        **options: Any,
+    ) -> None:
         """read(bytes) : what is given to the callback; default the message; raises Unreadable."""
         self.refusals = Refusals(node, topic, kind)
         self._read, self._callback = read or (lambda data: decode(data, kind)), callback
-        self.subscription = node.create_subscription(kind, topic, self._take if served else unserved, qos, raw=True, **options)
+        self.subscription = node.create_subscription(
+            kind, topic, self._take if served else unserved, qos, raw=True, **options
+        )
 
     def take_all(self) -> None:
         """Take what waits."""
@@ -112,10 +150,11 @@ class Input:
 
 
 class StreamInput:
-    """Subscription of a stream, of which what arrives waits in the middleware until it is fetched. QoS by parameter:
-    qos_overrides.<topic>.subscription.reliability and .depth.
+    """Subscription of a stream, of which what arrives waits in the middleware until it is fetched.
+    QoS by parameter: qos_overrides.<topic>.subscription.reliability and .depth.
 
-    lost : messages that were sent and that DDS did not deliver, as far as it knows; refusals : Refusals.
+    lost : messages that were sent and that DDS did not deliver, as far as it knows; refusals :
+        Refusals.
     """
 
     def __init__(self, node: ParameterNode, kind: type, topic: str) -> None:
@@ -124,12 +163,19 @@ class StreamInput:
         self._node, self._topic = node, topic
         events = SubscriptionEventCallbacks(message_lost=self._on_lost)
         self._subscription = node.create_subscription(
-            kind, topic, unserved, copy(STREAM_QOS), event_callbacks=events, qos_overriding_options=OVERRIDES, raw=True
-        )  # fmt: skip
+            kind,
+            topic,
+            unserved,
+            copy(STREAM_QOS),
+            event_callbacks=events,
+            qos_overriding_options=OVERRIDES,
+            raw=True,
+        )
 
     def fetch(self, wire: CdrCodec) -> list[tuple[str, np.ndarray, np.ndarray]]:
-        """What has arrived, by a CdrCodec: [(frame, rows (n,), arrivals (n,) s since 1970)], each of successive messages of one
-        frame."""
+        """What has arrived, by a CdrCodec: [(frame, rows (n,), arrivals (n,) s since 1970)], each
+        of successive messages of one frame.
+        """
         messages, stamps = [], []
         for data, information in waiting(self._subscription):
             messages.append(data)
@@ -137,7 +183,10 @@ class StreamInput:
         if not messages:
             return []
         arrivals = 1e-9 * np.array(stamps)
-        return [(frame, rows, arrivals[some]) for frame, rows, some in wire.read(messages, self.refusals.add)]
+        return [
+            (frame, rows, arrivals[some])
+            for frame, rows, some in wire.read(messages, self.refusals.add)
+        ]
 
     def _on_lost(self, status: QoSMessageLostInfo) -> None:
         self.lost += status.total_count_change
@@ -147,7 +196,9 @@ class StreamInput:
         return self._subscription.get_publisher_count()
 
     def trouble(self, received: int) -> str | None:
-        """What is wrong with the stream as ROS sees it, or None. received : messages since this was asked last."""
+        """What is wrong with the stream as ROS sees it, or None. received : messages since this was
+        asked last.
+        """
         lost, self._before = self.lost - self._before, self.lost
         refused = self.refusals.trouble()
         if refused:
@@ -156,8 +207,10 @@ class StreamInput:
             return several_publishers(self._node, self._topic)
         if lost > LARGEST_LOSS * (received + lost):
             return (
-                f"{lost} of {received + lost} messages on {self._topic} were lost on their way to this node: check the load "
-                f"of machine and network, or set qos_overrides.{self._subscription.topic_name}.subscription.reliability"
+                f"{lost} of {received + lost} messages on {self._topic} were lost on their "
+                "way to this node: check the load "
+                "of machine and network, or set "
+                f"qos_overrides.{self._subscription.topic_name}.subscription.reliability"
             )
         return None
 
@@ -168,4 +221,6 @@ def several_publishers(node: ParameterNode, topic: str) -> str | None:
     if len(ends) < 2:
         return None
     names = ", ".join(sorted(f"{end.node_namespace.rstrip('/')}/{end.node_name}" for end in ends))
-    return f"{len(ends)} publish on {topic} ({names}): stop all but one, or give each tag a namespace"
+    return (
+        f"{len(ends)} publish on {topic} ({names}): stop all but one, or give each tag a namespace"
+    )

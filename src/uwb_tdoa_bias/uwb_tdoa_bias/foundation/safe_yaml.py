@@ -1,7 +1,8 @@
 """YAML as our files need it, and nothing more: what could be misread is refused with the line.
 
-Mappings, lists, texts, finite numbers, true, false and null (YAML 1.2's core schema, with yes, no, on and off as ROS
-has them). No tags, no aliases (ROS refuses them too), no key twice, no second document, no number that is not finite.
+Mappings, lists, texts, finite numbers, true, false and null (YAML 1.2's core schema, with yes, no,
+on and off as ROS has them). No tags, no aliases (ROS refuses them too), no key twice, no second
+document, no number that is not finite.
 """
 
 from __future__ import annotations
@@ -9,7 +10,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 import re
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import yaml
 from yaml.composer import Composer
@@ -18,19 +19,24 @@ from yaml.resolver import Resolver
 
 from .errors import InputError
 from .files import open_file
-from .limits import Budget, YAML_BYTES, YAML_DEPTH, YAML_NODES
+from .limits import YAML_BYTES, YAML_DEPTH, YAML_NODES, Budget
 
 if TYPE_CHECKING:
     from yaml import CollectionNode, MappingNode, Mark, Node, ScalarNode
 
 
 def read_yaml(path: str | Path) -> Any:
-    """What a YAML file holds: dict, list, str, int, float, bool or None. Raises InputError that names file and line."""
+    """What a YAML file holds: dict, list, str, int, float, bool or None.
+
+    Raises InputError that names file and line.
+    """
     try:
         with open_file(path) as file:
             data = file.read(YAML_BYTES + 1)
     except OSError as error:
-        raise InputError(f"{path}: cannot be read as YAML ({error.strerror}); give the path of a YAML file.") from error
+        raise InputError(
+            f"{path}: cannot be read as YAML ({error.strerror}); give the path of a YAML file."
+        ) from error
     Budget(path).spend("bytes", len(data), YAML_BYTES)
     return parse_yaml(data, path)
 
@@ -40,7 +46,9 @@ def parse_yaml(data: bytes | str, name: str | Path) -> Any:
     try:
         text = data.decode("utf-8-sig") if isinstance(data, bytes) else data
     except UnicodeDecodeError as error:
-        raise InputError(f"{name}: byte {error.start} is not UTF-8; save the file as UTF-8 text.") from error
+        raise InputError(
+            f"{name}: byte {error.start} is not UTF-8; save the file as UTF-8 text."
+        ) from error
     try:
         loader = _Loader(text, Budget(name, len(text)))
         try:
@@ -55,7 +63,9 @@ def parse_yaml(data: bytes | str, name: str | Path) -> Any:
         line = min(mark.line, text.count("\n")) + 1  # of the end libyaml says the next
         raise InputError(f"{name}: line {line}: is no YAML ({said}); correct it there.") from error
     except yaml.YAMLError as error:
-        raise InputError(f"{name}: is no YAML ({' '.join(str(error).split())}); give a YAML file.") from error
+        raise InputError(
+            f"{name}: is no YAML ({' '.join(str(error).split())}); give a YAML file."
+        ) from error
 
 
 class _Refused(Exception):
@@ -65,12 +75,17 @@ class _Refused(Exception):
 
 
 class _WithLibyaml(Composer, SafeConstructor, Resolver):
-    """The events of libyaml, which reads 10 000 anchors in a second instead of four; nodes and values are made here, where they are
-    checked."""
+    """The events of libyaml, which reads 10 000 anchors in a second instead of four; nodes and
+    values are made here, where they are checked.
+    """
 
     def __init__(self, text: str) -> None:
         self._parser = yaml.cyaml.CParser(text)
-        self.check_event, self.peek_event, self.get_event = self._parser.check_event, self._parser.peek_event, self._parser.get_event
+        self.check_event, self.peek_event, self.get_event = (
+            self._parser.check_event,
+            self._parser.peek_event,
+            self._parser.get_event,
+        )
         for base in (Composer, SafeConstructor, Resolver):
             base.__init__(self)
 
@@ -93,7 +108,9 @@ class _Loader(_Base):
         self._budget.spend("entries", 1, YAML_NODES)
         self._depth += 1
         if isinstance(event, yaml.AliasEvent):
-            raise _Refused(event.start_mark, f"*{event.anchor} is an alias; write the value itself.")
+            raise _Refused(
+                event.start_mark, f"*{event.anchor} is an alias; write the value itself."
+            )
         if event.tag is not None:
             raise _Refused(event.start_mark, f"{event.tag} is a tag; leave it out.")
         if self._depth > YAML_DEPTH:
@@ -106,7 +123,10 @@ class _Loader(_Base):
         content = {}
         for key_node, value_node in node.value:
             if not isinstance(key_node, yaml.ScalarNode):
-                raise _Refused(key_node.start_mark, "a list or mapping is used as a key; use a text or a number.")
+                raise _Refused(
+                    key_node.start_mark,
+                    "a list or mapping is used as a key; use a text or a number.",
+                )
             key = self.construct_object(key_node)
             if key in content:
                 raise _Refused(key_node.start_mark, f"{key_node.value!r} is there twice; keep one.")
@@ -116,7 +136,10 @@ class _Loader(_Base):
     def construct_yaml_int(self, node: ScalarNode) -> int:
         text = node.value.lstrip("+-0")
         if len(text) > 19 or abs(int(node.value)) >= 2**63:
-            raise _Refused(node.start_mark, f"{node.value[:40]} does not fit into 64 bits; give a smaller number.")
+            raise _Refused(
+                node.start_mark,
+                f"{node.value[:40]} does not fit into 64 bits; give a smaller number.",
+            )
         return int(node.value)
 
     def construct_yaml_float(self, node: ScalarNode) -> float:
@@ -128,8 +151,14 @@ class _Loader(_Base):
 
 _TAG = "tag:yaml.org,2002:"
 _IMPLICIT = {
-    "bool": (r"yes|Yes|YES|no|No|NO|true|True|TRUE|false|False|FALSE|on|On|ON|off|Off|OFF", "yYnNtTfFoO"),
-    "int": (r"[-+]?(0|[1-9][0-9]*)", "-+0123456789"),  # 010 is a text, or it would be 8 to some and 10 to others
+    "bool": (
+        r"yes|Yes|YES|no|No|NO|true|True|TRUE|false|False|FALSE|on|On|ON|off|Off|OFF",
+        "yYnNtTfFoO",
+    ),
+    "int": (
+        r"[-+]?(0|[1-9][0-9]*)",
+        "-+0123456789",
+    ),  # 010 is a text, or it would be 8 to some and 10 to others
     "float": (
         r"[-+]?(\.[0-9]+|(0|[1-9][0-9]*)(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
         "-+.0123456789",

@@ -3,19 +3,27 @@
 from __future__ import annotations
 
 import math
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from .compiled import compiled
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-LARGEST_STEP_BACK = 1.0  # s behind the newest stamp of a stream; messages of one clock are not out of order by more
-STEP_AHEAD, LARGEST_STEP_AHEAD = 0.25, 2.0  # s ahead of the newest stamp, that any stream and that a slow one may go at once
-USUAL = 4.0  # times the usual step of a stream, that it may go at once; one lost message is twice, three are four times
+LARGEST_STEP_BACK = (
+    1.0  # s behind the newest stamp of a stream; messages of one clock are not out of order by more
+)
+STEP_AHEAD, LARGEST_STEP_AHEAD = (
+    0.25,
+    2.0,
+)  # s ahead of the newest stamp, that any stream and that a slow one may go at once
+# times the usual step of a stream, that it may go at once; one lost message is twice, three are
+# four times
+USUAL = 4.0
 FORGETTING = 0.1  # share of the usual step that the latest one makes
 NEAR = 0.25  # s between stamps of two streams that confirm each other
-# s over which a jump must persist that no other stream confirms: where another one goes on in the time before, and where none does
+# s over which a jump must persist that no other stream confirms: where another one goes on in the
+# time before, and where none does
 CONTRADICTED, UNCONTRADICTED = 0.3, 0.05
 MOST_HELD = 1000  # messages of a stream that stands still at another time
 
@@ -23,9 +31,10 @@ MOST_HELD = 1000  # messages of a stream that stands still at another time
 class StampGate:
     """Let through the items of one stream whose stamps are plausible.
 
-    An item with another stamp is held. If the next stamp is plausible again, the held item is an outlier. If the following stamps
-    agree with it, the clock has jumped: the items are accepted. They agree at once when another stream has reached the same time, else
-    when they have gone on for a while. A gap in a stream looks like a jump ahead and is treated alike.
+    An item with another stamp is held. If the next stamp is plausible again, the held item is an
+    outlier. If the following stamps agree with it, the clock has jumped: the items are accepted.
+    They agree at once when another stream has reached the same time, else when they have gone on
+    for a while. A gap in a stream looks like a jump ahead and is treated alike.
     """
 
     def __init__(self) -> None:
@@ -50,8 +59,10 @@ class StampGate:
     def take(
         self, t: float, item: Any, reached: Iterable[float] = ()
     ) -> tuple[list[tuple[float, Any]], list[tuple[float, Any]], bool]:
-        """Take an item stamped t, s. reached : stamps, s, that other streams have reached. Returns (accepted, outliers, jumped_back): lists
-        of (t, item), and whether the accepted ones are the first of an earlier time."""
+        """Take an item stamped t, s. reached : stamps, s, that other streams have reached. Returns
+        (accepted, outliers, jumped_back): lists of (t, item), and whether the accepted ones are the
+        first of an earlier time.
+        """
         if self.newest == -math.inf or self._is_plausible(t):
             outliers, self._held = self._held, []
             self._go_on(t)
@@ -72,7 +83,9 @@ class StampGate:
         return accepted, outliers, jumped_back
 
     def take_all(self, stamps: Sequence[float]) -> bool:
-        """Whether items stamped so, a list of s in the order of their arrival, are all plausible; then they are accepted."""
+        """Whether items stamped so, a list of s in the order of their arrival, are all plausible;
+        then they are accepted.
+        """
         if self._held:
             return False
         newest, usual = self.newest, self.usual
@@ -85,7 +98,11 @@ class StampGate:
 
     def pass_time(self, t: float, reached: Iterable[float] = ()) -> None:
         """Note the time t, s, of an item that is good for nothing else. reached : as of `take`."""
-        if self._is_plausible(t) or t > self.newest and any(abs(t - other) <= NEAR for other in reached):
+        if (
+            self._is_plausible(t)
+            or t > self.newest
+            and any(abs(t - other) <= NEAR for other in reached)
+        ):
             self._go_on(t)
 
     def finish(self) -> list[tuple[float, Any]]:
@@ -103,7 +120,9 @@ class StampGate:
 
     def _is_confirmed(self, reached: Iterable[float]) -> bool:
         first, last = self._held[0][0], self._held[-1][0]
-        if (last > self.newest or len(self._held) > 1) and any(abs(last - t) <= NEAR for t in reached):
+        if (last > self.newest or len(self._held) > 1) and any(
+            abs(last - t) <= NEAR for t in reached
+        ):
             return True
         contradicted = any(self.newest < t < self.newest + LARGEST_STEP_BACK for t in reached)
         return last - first >= (CONTRADICTED if contradicted else UNCONTRADICTED)
@@ -111,7 +130,9 @@ class StampGate:
 
 @compiled
 def allowed_step(usual: float) -> float:
-    """Return by how much, s, the next stamp may be ahead of the newest one of a stream with this usual step, s."""
+    """Return by how much, s, the next stamp may be ahead of the newest one of a stream with this
+    usual step, s.
+    """
     return min(max(STEP_AHEAD, USUAL * usual), LARGEST_STEP_AHEAD)
 
 

@@ -1,10 +1,12 @@
-"""The usual forms of anchor files: tables with any header or none, and mappings or lists in YAML or JSON."""
+"""The usual forms of anchor files: tables with any header or none, and mappings or lists in YAML or
+JSON.
+"""
 
 from __future__ import annotations
 
 import math
 import re
-from typing import Any, NamedTuple, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -18,20 +20,61 @@ if TYPE_CHECKING:
 Lines = list[tuple[int, list[str]]]  # numbers of lines, and their cells
 
 NOT_SURVEYED = [math.nan] * 4  # the orientation of such an anchor
-IDS = ("id", "anchor", "anchor id", "anchorid", "name", "anchor name", "label", "address", "addr", "node", "node id", "beacon", "nr", "no", "#", "index")
+IDS = (
+    "id",
+    "anchor",
+    "anchor id",
+    "anchorid",
+    "name",
+    "anchor name",
+    "label",
+    "address",
+    "addr",
+    "node",
+    "node id",
+    "beacon",
+    "nr",
+    "no",
+    "#",
+    "index",
+)
 LENGTHS = {"": 1.0, "m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "ft": 0.3048, "in": 0.0254}  # m
-NESTED = ("position", "pos", "pose", "translation", "location", "coordinates", "xyz", "point")  # keys that hold a position
+NESTED = (
+    "position",
+    "pos",
+    "pose",
+    "translation",
+    "location",
+    "coordinates",
+    "xyz",
+    "point",
+)  # keys that hold a position
 TURNED = ("orientation", "rotation", "quaternion")
-_UNIT = re.compile(r"^(.*?)[ (\[]+(m|dm|cm|mm|ft|in|metres|meters|metre|meter|feet|foot|inch|inches)[)\]]?$")
-_SPELT = {"metres": "m", "meters": "m", "metre": "m", "meter": "m", "feet": "ft", "foot": "ft", "inch": "in", "inches": "in"}
-_NUMBERED = re.compile(r"^(?:anchor|anc|a|beacon|node)[ _-]?([0-9]{1,5})(?:[ _-]?(?:pos|position|xyz))?$", re.IGNORECASE)
+_UNIT = re.compile(
+    r"^(.*?)[ (\[]+(m|dm|cm|mm|ft|in|metres|meters|metre|meter|feet|foot|inch|inches)[)\]]?$"
+)
+_SPELT = {
+    "metres": "m",
+    "meters": "m",
+    "metre": "m",
+    "meter": "m",
+    "feet": "ft",
+    "foot": "ft",
+    "inch": "in",
+    "inches": "in",
+}
+_NUMBERED = re.compile(
+    r"^(?:anchor|anc|a|beacon|node)[ _-]?([0-9]{1,5})(?:[ _-]?(?:pos|position|xyz))?$",
+    re.IGNORECASE,
+)
 _COMMA = re.compile(r"^[-+]?[0-9]+,[0-9]+$")
 _OPENCV = re.compile(r"^%YAML:1\.0\s*$", re.MULTILINE)
 
 
 class Entry(NamedTuple):
-    """One anchor of a file. name : its id as text, or a name; position : (3,) m; orientation : (4,) x y z w, NaN if not surveyed; where :
-    the line or key, for messages."""
+    """One anchor of a file. name : its id as text, or a name; position : (3,) m; orientation : (4,)
+    x y z w, NaN if not surveyed; where : the line or key, for messages.
+    """
 
     name: str
     position: list[float]
@@ -40,8 +83,10 @@ class Entry(NamedTuple):
 
 
 class Columns(NamedTuple):
-    """What the cells of a header are. name : place of the id or name, or None; axes : places of x, y and z; lengths : m, unit of each;
-    turn : places of the quaternion x, y, z, w, or ()."""
+    """What the cells of a header are. name : place of the id or name, or None; axes : places of x,
+    y and z; lengths : m, unit of each;
+    turn : places of the quaternion x, y, z, w, or ().
+    """
 
     name: int | None
     axes: tuple[int, int, int]
@@ -50,7 +95,9 @@ class Columns(NamedTuple):
 
 
 def columns_of(header: Sequence[str]) -> Columns | None:
-    """Return the Columns that names of a header mean, in upper or lower case, with or without a unit; None without x, y and z."""
+    """Return the Columns that names of a header mean, in upper or lower case, with or without a
+    unit; None without x, y and z.
+    """
     roles: dict[str, int] = {}
     lengths: dict[str, float] = {}
     for place, cell in enumerate(header):
@@ -61,7 +108,12 @@ def columns_of(header: Sequence[str]) -> Columns | None:
         return None
     turn = tuple(roles[name] for name in ("qx", "qy", "qz", "qw") if name in roles)
     x, y, z = (roles[axis] for axis in "xyz")
-    return Columns(roles.get("name"), (x, y, z), (lengths["x"], lengths["y"], lengths["z"]), turn if len(turn) == 4 else ())
+    return Columns(
+        roles.get("name"),
+        (x, y, z),
+        (lengths["x"], lengths["y"], lengths["z"]),
+        turn if len(turn) == 4 else (),
+    )
 
 
 def _role(cell: str) -> tuple[str, float]:
@@ -82,10 +134,14 @@ def _role(cell: str) -> tuple[str, float]:
 
 def is_table(text: str) -> bool:
     """Return whether a text is a table: no YAML and no JSON."""
-    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
+    lines = [
+        line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")
+    ]
     if not lines:
         return True
-    begins_tree = lines[0].lstrip()[0] in "{[%-" and not _is_number(cells_of(lines[0])[0])  # a table may begin with -3.1
+    begins_tree = lines[0].lstrip()[0] in "{[%-" and not _is_number(
+        cells_of(lines[0])[0]
+    )  # a table may begin with -3.1
     return not begins_tree and not any(map(_KEY.match, lines))
 
 
@@ -95,27 +151,53 @@ _KEY = re.compile(r"^\s*(?:- *)?[{\s]*[\"']?[\w /*.-]+[\"']?\s*:(?:\s|$)")
 def cells_of(line: str, delimiter: str | None = None) -> list[str]:
     """Return the cells of a line, stripped. delimiter : default: what `delimiter_of` finds in it."""
     delimiter = delimiter or delimiter_of(line)
-    return line.split() if delimiter == " " else [cell.strip().strip("\"'") for cell in line.split(delimiter)]
+    return (
+        line.split()
+        if delimiter == " "
+        else [cell.strip().strip("\"'") for cell in line.split(delimiter)]
+    )
 
 
 def lines_of(text: str) -> Lines:
     """Return the lines of a table that are neither empty nor comments; a comment may be the header."""
-    texts = [(number, line) for number, line in enumerate(text.splitlines(), start=1) if line.strip()]
+    texts = [
+        (number, line) for number, line in enumerate(text.splitlines(), start=1) if line.strip()
+    ]
     rows = [(number, line) for number, line in texts if not line.lstrip().startswith("#")] or texts
     delimiter = delimiter_of(rows[0][1])
-    headers = [(number, cells_of(line.lstrip("# \t"), delimiter)) for number, line in texts if number < rows[0][0]]
-    return [*[line for line in headers[-1:] if columns_of(line[1])], *((number, cells_of(line, delimiter)) for number, line in rows)]
+    headers = [
+        (number, cells_of(line.lstrip("# \t"), delimiter))
+        for number, line in texts
+        if number < rows[0][0]
+    ]
+    return [
+        *[line for line in headers[-1:] if columns_of(line[1])],
+        *((number, cells_of(line, delimiter)) for number, line in rows),
+    ]
 
 
 def delimiter_of(line: str) -> str:
     """Return what stands between the cells of a line: ";", tab, "," or " "."""
-    return next((each for each in ";\t," if each in line and not (each == "," and _all_commas_decimal(line))), " ")
+    return next(
+        (
+            each
+            for each in ";\t,"
+            if each in line and not (each == "," and _all_commas_decimal(line))
+        ),
+        " ",
+    )
 
 
 def _all_commas_decimal(line: str) -> bool:
-    """Whether each comma of a line is one within a number of a table whose cells stand apart by blanks."""
+    """Whether each comma of a line is one within a number of a table whose cells stand apart by
+    blanks.
+    """
     cells = line.split()
-    return len(cells) >= 3 and all(_COMMA.match(cell) for cell in cells if "," in cell) and sum("," in cell for cell in cells) >= 2
+    return (
+        len(cells) >= 3
+        and all(_COMMA.match(cell) for cell in cells if "," in cell)
+        and sum("," in cell for cell in cells) >= 2
+    )
 
 
 def _is_number(cell: str) -> bool:
@@ -126,7 +208,11 @@ def _number(value: Any) -> float:
     """A finite number of a cell or value, a decimal comma allowed; NaN for anything else."""
     if isinstance(value, bool) or not isinstance(value, (int, float, str)):
         return math.nan
-    text = value.strip().replace(",", ".") if isinstance(value, str) and _COMMA.match(value.strip()) else value
+    text = (
+        value.strip().replace(",", ".")
+        if isinstance(value, str) and _COMMA.match(value.strip())
+        else value
+    )
     try:
         number = float(text)
     except (ValueError, OverflowError):
@@ -135,8 +221,9 @@ def _number(value: Any) -> float:
 
 
 def read_table(lines: Lines) -> list[Entry] | None:
-    """Return the entries of a table, numbers of lines and their cells; None if it has neither a header that is understood, nor an id and
-    three numbers in each line. Raises InputError."""
+    """Return the entries of a table, numbers of lines and their cells; None if it has neither a
+    header that is understood, nor an id and three numbers in each line. Raises InputError.
+    """
     (number, header), rest = lines[0], lines[1:]
     columns = columns_of(header)
     if columns is None:
@@ -145,7 +232,8 @@ def read_table(lines: Lines) -> list[Entry] | None:
         return None
     if columns.name is None:
         raise InputError(
-            f"line {number}: columns x, y and z are recognized, and no column with the ids of the anchors; add one named 'id'."
+            f"line {number}: columns x, y and z are recognized, and no column with the ids of "
+            "the anchors; add one named 'id'."
         )
     if not rest:
         raise InputError("holds no anchor; add lines 'id,x,y,z' in metres.")
@@ -156,43 +244,69 @@ def _without_header(lines: Lines) -> list[Entry]:
     number, cells = lines[0]
     if len(cells) == 3:
         raise InputError(
-            f"line {number}: three numbers are recognized as a position, and no id; put the id of each anchor before its position, "
+            f"line {number}: three numbers are recognized as a position, and no id; put the "
+            "id of each anchor before its position, "
             "and 'id,x,y,z' in the first line."
         )
     if len(cells) != 4:
         raise InputError(
-            f"line {number}: {len(cells)} numbers and no header: what they mean is not known; put 'id,x,y,z' in the first line, "
+            f"line {number}: {len(cells)} numbers and no header: what they mean is not known; "
+            "put 'id,x,y,z' in the first line, "
             "and other names for what is more."
         )
-    return [_row(number, cells, Columns(0, (1, 2, 3), (1.0, 1.0, 1.0)), 4) for number, cells in lines]
+    return [
+        _row(number, cells, Columns(0, (1, 2, 3), (1.0, 1.0, 1.0)), 4) for number, cells in lines
+    ]
 
 
 def _row(number: int, cells: list[str], columns: Columns, count: int) -> Entry:
     assert columns.name is not None
-    if len(cells) < max(*columns.axes, columns.name, *columns.turn) + 1 or len(cells) > max(count, 4):
+    if len(cells) < max(*columns.axes, columns.name, *columns.turn) + 1 or len(cells) > max(
+        count, 4
+    ):
         hint = "; decimal commas need ';' between the cells" if len(cells) == 2 * count - 1 else ""
-        raise InputError(f"line {number}: {','.join(cells)[:60]!r} has {len(cells)} cells, the header {count}{hint}.")
+        raise InputError(
+            f"line {number}: {','.join(cells)[:60]!r} has {len(cells)} cells, the header "
+            f"{count}{hint}."
+        )
     values = [_number(cells[place]) for place in columns.axes]
     if not all(map(math.isfinite, values)):
-        raise InputError(f"line {number}: {','.join(cells)[:60]!r} is not 'id,x,y,z' with finite metres.")
+        raise InputError(
+            f"line {number}: {','.join(cells)[:60]!r} is not 'id,x,y,z' with finite metres."
+        )
     turn = [_number(cells[place]) for place in columns.turn] or NOT_SURVEYED
     position = [value * length for value, length in zip(values, columns.lengths)]
     return Entry(cells[columns.name], position, turn, f"line {number}")
 
 
 def read_tree(text: str, path: str | Path) -> tuple[list[Entry], str]:
-    """Return the entries of YAML or JSON, and the name of the world frame. Raises InputError that names key and remedy."""
+    """Return the entries of YAML or JSON, and the name of the world frame.
+
+    Raises InputError that names key and remedy.
+    """
     opencv = bool(_OPENCV.search(text)) or "!!opencv-matrix" in text
-    content = parse_yaml(_OPENCV.sub("", text).replace("!!opencv-matrix", "") if opencv else text, path)
+    content = parse_yaml(
+        _OPENCV.sub("", text).replace("!!opencv-matrix", "") if opencv else text, path
+    )
     frame = "map"
     for _ in range(8):  # the levels around the anchors: those of a parameter file, and "anchors"
         if not isinstance(content, dict):
             break
         given = content.get("frame", content.get("frame_id", frame))
         if not isinstance(given, str):
-            raise InputError(f"{path}: frame: {given!r} is no name; write the name of the world frame, e.g. map.")
+            raise InputError(
+                f"{path}: frame: {given!r} is no name; write the name of the world frame, e.g. map."
+            )
         frame = given
-        inner = next((key for key in content if str(key).lower() in ("anchors", "anchor_positions", "ros__parameters", "/**", "beacons")), None)
+        inner = next(
+            (
+                key
+                for key in content
+                if str(key).lower()
+                in ("anchors", "anchor_positions", "ros__parameters", "/**", "beacons")
+            ),
+            None,
+        )
         if inner is None or not isinstance(content[inner], (dict, list)):
             break
         content = content[inner]
@@ -216,28 +330,55 @@ def _entries(content: Any) -> Iterator[Entry]:
         return
     if not isinstance(content, dict):
         return
-    matrices = [(key, value) for key, value in content.items() if isinstance(value, dict) and value.keys() >= {"rows", "cols", "data"}]
+    matrices = [
+        (key, value)
+        for key, value in content.items()
+        if isinstance(value, dict) and value.keys() >= {"rows", "cols", "data"}
+    ]
     if matrices:
         yield from _of_matrix(*matrices[0])
         return
     numbered = {key: _NUMBERED.match(str(key)) for key in content}
-    if any(numbered.values()) and all(isinstance(content[key], (list, dict)) for key, found in numbered.items() if found):
-        yield from (_of_value(found[1], content[key], str(key)) for key, found in numbered.items() if found)
+    if any(numbered.values()) and all(
+        isinstance(content[key], (list, dict)) for key, found in numbered.items() if found
+    ):
+        yield from (
+            _of_value(found[1], content[key], str(key)) for key, found in numbered.items() if found
+        )
         return
     for key, value in content.items():
         if isinstance(value, (dict, list)):
             yield _of_value(str(key), value, str(key))
-        elif not str(key).lower().startswith(("n_", "num", "count", "frame", "unit", "name", "version", "type", "description")):
+        elif (
+            not str(key)
+            .lower()
+            .startswith(
+                ("n_", "num", "count", "frame", "unit", "name", "version", "type", "description")
+            )
+        ):
             raise ValueError(f"{key}: {value!r} is no position; {WRITE}.")
 
 
 def _of_matrix(key: Any, value: dict[str, Any]) -> Iterator[Entry]:
     """Rows of an OpenCV matrix are the anchors 0, 1, 2, ...: it has no place for ids."""
     rows, columns, data = value["rows"], value["cols"], value["data"]
-    if columns != 3 or not isinstance(data, list) or not isinstance(rows, int) or len(data) != 3 * rows:
-        raise ValueError(f"{key}: a matrix of {rows} x {columns} is recognized; it must have a row x, y, z for each anchor, so 3 columns.")
+    if (
+        columns != 3
+        or not isinstance(data, list)
+        or not isinstance(rows, int)
+        or len(data) != 3 * rows
+    ):
+        raise ValueError(
+            f"{key}: a matrix of {rows} x {columns} is recognized; it must have a row x, y, z "
+            "for each anchor, so 3 columns."
+        )
     for row in range(rows):
-        yield Entry(str(row), _three(data[3 * row : 3 * row + 3], f"{key}, row {row}"), NOT_SURVEYED, f"{key}, row {row}")
+        yield Entry(
+            str(row),
+            _three(data[3 * row : 3 * row + 3], f"{key}, row {row}"),
+            NOT_SURVEYED,
+            f"{key}, row {row}",
+        )
 
 
 def _of_list(item: Any, where: str) -> Entry:
@@ -245,14 +386,26 @@ def _of_list(item: Any, where: str) -> Entry:
         if len(item) == 4:
             return Entry(_text(item[0]), _three(item[1:], where), NOT_SURVEYED, where)
         three = len(item) == 3
-        what = "a position is recognized, and no id" if three else f"{len(item)} values are no anchor"
+        what = (
+            "a position is recognized, and no id" if three else f"{len(item)} values are no anchor"
+        )
         raise ValueError(f"{where}: {what}; write '- {{id: 0, position: [x, y, z]}}'.")
     if not isinstance(item, dict):
-        raise ValueError(f"{where}: {item!r} is no anchor; write '- {{id: 0, position: [x, y, z]}}'.")
-    named = [key for key in item if " ".join(str(key).lower().split("_")) in IDS and not isinstance(item[key], (dict, list))]
+        raise ValueError(
+            f"{where}: {item!r} is no anchor; write '- {{id: 0, position: [x, y, z]}}'."
+        )
+    named = [
+        key
+        for key in item
+        if " ".join(str(key).lower().split("_")) in IDS and not isinstance(item[key], (dict, list))
+    ]
     if not named:
-        raise ValueError(f"{where}: no id is recognized among {', '.join(map(str, item))}; write 'id: 0'.")
-    return _of_value(_text(item[named[0]]), {key: value for key, value in item.items() if key != named[0]}, where)
+        raise ValueError(
+            f"{where}: no id is recognized among {', '.join(map(str, item))}; write 'id: 0'."
+        )
+    return _of_value(
+        _text(item[named[0]]), {key: value for key, value in item.items() if key != named[0]}, where
+    )
 
 
 def _text(name: Any) -> str:
@@ -260,7 +413,9 @@ def _text(name: Any) -> str:
 
 
 def _of_value(name: str, value: Any, where: str) -> Entry:
-    """The anchor `name` of a list of three numbers, or a mapping with a position, or with x, y and z."""
+    """The anchor `name` of a list of three numbers, or a mapping with a position, or with x, y and
+    z.
+    """
     if isinstance(value, list):
         return Entry(name, _three(value, where), NOT_SURVEYED, where)
     keys = {str(key).lower(): key for key in value}
@@ -274,16 +429,26 @@ def _of_value(name: str, value: Any, where: str) -> Entry:
         return Entry(name, _three(inner, f"{where}: {keys[nested]}"), _turn(turn, where), where)
     columns = columns_of([str(key) for key in value])
     if columns is None:
-        raise ValueError(f"{where}: no position is recognized among {', '.join(map(str, value))[:80]}; {WRITE}.")
+        raise ValueError(
+            f"{where}: no position is recognized among {', '.join(map(str, value))[:80]}; {WRITE}."
+        )
     values = list(value.values())
     numbers = _three([values[place] for place in columns.axes], where)
-    return Entry(name, [number * length for number, length in zip(numbers, columns.lengths)], _turn(turn, where), where)
+    return Entry(
+        name,
+        [number * length for number, length in zip(numbers, columns.lengths)],
+        _turn(turn, where),
+        where,
+    )
 
 
 def _three(value: Any, where: str) -> list[float]:
     numbers = [_number(each) for each in value] if isinstance(value, list) else []
     if len(numbers) == 6:
-        raise ValueError(f"{where}: 6 numbers stand where 3 belong, as decimal commas make it; write decimal points, [-3.1, 4.0, 0.2].")
+        raise ValueError(
+            f"{where}: 6 numbers stand where 3 belong, as decimal commas make it; write "
+            "decimal points, [-3.1, 4.0, 0.2]."
+        )
     if len(numbers) != 3 or not np.isfinite(numbers).all():
         raise ValueError(f"{where}: {str(value)[:60]} is not 3 numbers x, y, z in metres.")
     return numbers

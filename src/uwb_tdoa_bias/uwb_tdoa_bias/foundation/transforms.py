@@ -14,6 +14,7 @@ from .later import rotations
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
+
     from scipy.spatial.transform import Rotation
 
 KEPT = 1000  # transforms of a frame that moves
@@ -21,7 +22,10 @@ HELD = 0.5  # s for which the last transform of a frame that moves holds
 DEEPEST = 100  # frames between a frame and its root
 MOST, MOST_MOVING = 1000, 200  # frames that do not move, and that do
 SHORTEST, LONGEST = 1e-3, 1e3  # of a quaternion, which should be 1
-SAME_PLACE, SAME_TURN = 1e-3, 1e-3  # m and rad; a constant transform that is sent again with less of a change is the same
+SAME_PLACE, SAME_TURN = (
+    1e-3,
+    1e-3,
+)  # m and rad; a constant transform that is sent again with less of a change is the same
 FARTHEST = 1e8  # m; squares of what is off by more, and is turned by a gyroscope, may overflow
 
 _Moved = tuple[float, tuple[float, ...], tuple[float, ...]]  # t, q and p
@@ -31,12 +35,15 @@ class Frames:
     """A tree of frames, each with a transform to its parent that is constant, or a course in time."""
 
     def __init__(self) -> None:
-        self._static: dict[str, tuple[str, Rotation, np.ndarray]] = {}  # parent, turn and p of each frame
+        self._static: dict[
+            str, tuple[str, Rotation, np.ndarray]
+        ] = {}  # parent, turn and p of each frame
         self._moving: dict[str, tuple[str, deque[_Moved]]] = {}  # parent, and the last transforms
 
     def set(self, parent: str, child: str, q: Sequence[float], p: Sequence[float]) -> bool:
-        """Set a constant transform, unless that is known: x_parent = R(q) x_child + p; q (4,) x y z w, p (3,) m. Returns whether it is
-        new. Raises InputError for what is no transform."""
+        """Set a constant transform, unless that is known: x_parent = R(q) x_child + p; q (4,) x y z
+        w, p (3,) m. Returns whether it is new. Raises InputError for what is no transform.
+        """
         new = self.differs(parent, child, q, p)
         if new:
             self._static[child] = parent, rotations.Rotation.from_quat(q), np.array(p, dtype=float)
@@ -47,17 +54,21 @@ class Frames:
         return child in self._static
 
     def differs(self, parent: str, child: str, q: Sequence[float], p: Sequence[float]) -> bool:
-        """Whether this is the first constant transform of that frame, or differs from it by more than SAME_PLACE or SAME_TURN. Raises
-        InputError as `set` does."""
+        """Whether this is the first constant transform of that frame, or differs from it by more
+        than SAME_PLACE or SAME_TURN. Raises InputError as `set` does.
+        """
         self._check(self._static, MOST, parent, child, q, p)
         known = self._static.get(child)
         if known is None or known[0] != parent or np.linalg.norm(known[2] - p) > SAME_PLACE:
             return True
         return bool((known[1].inv() * rotations.Rotation.from_quat(q)).magnitude() > SAME_TURN)
 
-    def move(self, parent: str, child: str, q: Sequence[float], p: Sequence[float], t: float) -> None:
-        """The transform at stamp t, s. One that is not later than the last is passed over; another parent starts anew. Raises
-        InputError for what is no transform."""
+    def move(
+        self, parent: str, child: str, q: Sequence[float], p: Sequence[float], t: float
+    ) -> None:
+        """The transform at stamp t, s. One that is not later than the last is passed over; another
+        parent starts anew. Raises InputError for what is no transform.
+        """
         self._check(self._moving, MOST_MOVING, parent, child, q, p)
         known = self._moving.get(child)
         if known is None or known[0] != parent:
@@ -69,19 +80,39 @@ class Frames:
             course.append((t, tuple(q), tuple(p)))
 
     def _check(
-        self, known: Collection[str], most: int, parent: str, child: str, q: Sequence[float], p: Sequence[float]
+        self,
+        known: Collection[str],
+        most: int,
+        parent: str,
+        child: str,
+        q: Sequence[float],
+        p: Sequence[float],
     ) -> None:
         if not all(map(math.isfinite, (*q, *p))):
-            raise InputError(f"{parent} -> {child}: q = {tuple(q)}, p = {tuple(p)} must be finite numbers.")
+            raise InputError(
+                f"{parent} -> {child}: q = {tuple(q)}, p = {tuple(p)} must be finite numbers."
+            )
         if max(map(abs, p)) > FARTHEST:
-            raise InputError(f"{parent} -> {child}: p = {tuple(p)} must be metres, at most {FARTHEST:g} along each axis.")
+            raise InputError(
+                f"{parent} -> {child}: p = {tuple(p)} must be metres, at most {FARTHEST:g} "
+                "along each axis."
+            )
         if not SHORTEST <= math.hypot(*q) <= LONGEST:
-            raise InputError(f"{parent} -> {child}: {tuple(q)} is no rotation; give a quaternion x, y, z, w of length 1.")
+            raise InputError(
+                f"{parent} -> {child}: {tuple(q)} is no rotation; give a quaternion x, y, z, "
+                "w of length 1."
+            )
         if child not in known and len(known) >= most:
-            raise InputError(f"{parent} -> {child}: there are {most} frames already; publish fewer.")
+            raise InputError(
+                f"{parent} -> {child}: there are {most} frames already; publish fewer."
+            )
 
-    def between(self, target: str, source: str, t: float | None = None) -> tuple[Rotation, np.ndarray] | None:
-        """(Rotation, p (3,) m) with x_target = R x_source + p, at stamp t, s, for frames that move; None if not known."""
+    def between(
+        self, target: str, source: str, t: float | None = None
+    ) -> tuple[Rotation, np.ndarray] | None:
+        """(Rotation, p (3,) m) with x_target = R x_source + p, at stamp t, s, for frames that move;
+        None if not known.
+        """
         ours, theirs = self._to_root(source, t), self._to_root(target, t)
         common = next((frame for frame in ours if frame in theirs), None)
         if common is None:
@@ -115,5 +146,7 @@ class Frames:
         if after is before:
             return parent, rotations.Rotation.from_quat(before[1]), np.array(before[2])
         share = (t - before[0]) / (after[0] - before[0])
-        turn = rotations.Slerp([0.0, 1.0], rotations.Rotation.from_quat([before[1], after[1]]))(share)
+        turn = rotations.Slerp([0.0, 1.0], rotations.Rotation.from_quat([before[1], after[1]]))(
+            share
+        )
         return parent, turn, (1.0 - share) * np.array(before[2]) + share * np.array(after[2])

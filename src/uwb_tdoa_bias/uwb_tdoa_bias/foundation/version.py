@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import cache
 
 
-@lru_cache(maxsize=None)
+@cache
 def version() -> str:
     """Its version, e.g. "0.1.0"; "unknown" where the packages are not installed."""
     from importlib import metadata  # takes a twentieth of a second

@@ -1,1 +1,4 @@
-"""The filter itself, compiled: states, prediction, robust updates, hypotheses, start. No ROS, no files."""
+"""The filter itself, compiled: states, prediction, robust updates, hypotheses, start.
+
+No ROS, no files.
+"""

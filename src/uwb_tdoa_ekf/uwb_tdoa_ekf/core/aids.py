@@ -14,8 +14,12 @@ HEIGHT, PRESSURE, VELOCITY, RANGE = map(STREAMS.index, ("height", "pressure", "v
 
 
 @compiled
-def observe(ekf: Record, parameters: Record, aid: Record, residual: Record, records: np.ndarray) -> None:
-    """Take one of AID into a running filter that has been predicted to its stamp; fills one of RESIDUAL."""
+def observe(
+    ekf: Record, parameters: Record, aid: Record, residual: Record, records: np.ndarray
+) -> None:
+    """Take one of AID into a running filter that has been predicted to its stamp; fills one of
+    RESIDUAL.
+    """
     if aid.kind == HEIGHT:
         height.observe(ekf, parameters, aid, residual, records)
     elif aid.kind == PRESSURE:

@@ -1,7 +1,9 @@
-"""States beside the 15 of the error state: what is common to all measurements of one sensor, and is found with the position.
+"""States beside the 15 of the error state: what is common to all measurements of one sensor, and is
+found with the position.
 
-Each has its own covariance with the error state, and all of them one of their own. A variance of 0: there is no such state, and while
-there is none nothing is computed. What they are, and where they begin, `barometer` and `ranges` say.
+Each has its own covariance with the error state, and all of them one of their own. A variance of 0:
+there is no such state, and while there is none nothing is computed. What they are, and where they
+begin, `barometer` and `ranges` say.
 """
 
 from __future__ import annotations
@@ -14,8 +16,13 @@ from .state import ERROR_STATES
 
 PRESSURE, PRESSURE_DRIFT, RANGE = 0, 1, 2  # m and m/s, of the barometer; m, of all ranges
 OFFSET_STATES = 3
-NO_PRESSURE: dict[str, Any] = {"use_pressure": False}  # parameters of a filter without those of the barometer,
-NONE: dict[str, Any] = {**NO_PRESSURE, "range_offset_std": 0.0}  # and of one without any: a history has none
+NO_PRESSURE: dict[str, Any] = {
+    "use_pressure": False
+}  # parameters of a filter without those of the barometer,
+NONE: dict[str, Any] = {
+    **NO_PRESSURE,
+    "range_offset_std": 0.0,
+}  # and of one without any: a history has none
 
 
 @compiled
@@ -68,9 +75,15 @@ def correct(hypothesis: Record, innovation: Record) -> None:
 
 @compiled
 def predict(hypothesis: Record, transition: Record) -> None:
-    """After `state.predict` of a HYPOTHESIS that has any: their covariance with the state, by the same TRANSITION."""
+    """After `state.predict` of a HYPOTHESIS that has any: their covariance with the state, by the
+    same TRANSITION.
+    """
     dt, cross = transition.dt, hypothesis.offset_cross
-    A, B, E = transition.velocity_attitude, transition.velocity_accel_bias, transition.attitude_attitude
+    A, B, E = (
+        transition.velocity_attitude,
+        transition.velocity_accel_bias,
+        transition.attitude_attitude,
+    )
     for k in range(OFFSET_STATES):
         t0, t1, t2 = cross[k, 6], cross[k, 7], cross[k, 8]
         for r in range(3):
@@ -99,7 +112,9 @@ def _drift(hypothesis: Record, dt: float) -> None:
     hypothesis.offset[PRESSURE] += dt * hypothesis.offset[PRESSURE_DRIFT]
     for j in range(ERROR_STATES):
         cross[PRESSURE, j] += dt * cross[PRESSURE_DRIFT, j]
-    P[PRESSURE, PRESSURE] += dt * (2.0 * P[PRESSURE, PRESSURE_DRIFT] + dt * P[PRESSURE_DRIFT, PRESSURE_DRIFT])
+    P[PRESSURE, PRESSURE] += dt * (
+        2.0 * P[PRESSURE, PRESSURE_DRIFT] + dt * P[PRESSURE_DRIFT, PRESSURE_DRIFT]
+    )
     for k in (PRESSURE_DRIFT, RANGE):
         P[PRESSURE, k] += dt * P[PRESSURE_DRIFT, k]
         P[k, PRESSURE] = P[PRESSURE, k]

@@ -20,13 +20,19 @@ from .verdicts import REJECTED, USED
 
 GATE = 4.0  # standard deviations beyond which an altitude is not used
 LONGEST_DISAGREEMENT = 1.0  # s, after which the offset is taken anew
-AVERAGE = 3.0  # s of innovations that tell how much worse a barometer is than its standard deviation
+AVERAGE = (
+    3.0  # s of innovations that tell how much worse a barometer is than its standard deviation
+)
 UNTRIED, WORST = 10.0, 100.0  # at first, and at most, in standard deviations
 
 
 @compiled
-def observe(ekf: Record, parameters: Record, aid: Record, residual: Record, records: np.ndarray) -> None:
-    """Take an altitude of the standard atmosphere, one of AID, into a running filter; fills one of RESIDUAL."""
+def observe(
+    ekf: Record, parameters: Record, aid: Record, residual: Record, records: np.ndarray
+) -> None:
+    """Take an altitude of the standard atmosphere, one of AID, into a running filter; fills one of
+    RESIDUAL.
+    """
     barometer, innovation, altitude = ekf.barometer, ekf.innovation, aid.value[0]
     dt = min(max(aid.t - barometer.heard, 0.0), AVERAGE)
     barometer.heard = aid.t
@@ -72,7 +78,9 @@ def _compare(hypothesis: Record, altitude: float, parameters: Record, innovation
 
 @compiled
 def _take_anew(hypothesis: Record, altitude: float, parameters: Record) -> None:
-    """The offset is what leads from the height of the filter to an altitude; the drift is not known."""
+    """The offset is what leads from the height of the filter to an altitude; the drift is not
+    known.
+    """
     hypothesis.offset[PRESSURE], hypothesis.offset[PRESSURE_DRIFT] = altitude - hypothesis.x[2], 0.0
     cross, P = hypothesis.offset_cross, hypothesis.offset_P
     for j in range(ERROR_STATES):

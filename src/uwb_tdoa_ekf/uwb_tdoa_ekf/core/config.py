@@ -3,7 +3,7 @@
 from dataclasses import Field, dataclass, fields, make_dataclass
 import math
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,7 +15,11 @@ from uwb_tdoa_bias.foundation.sensors.sensor import parameter
 
 ROBUST = ("innovation", "gate", "m_estimation")
 SIDES = "unknown", "below", "above", "-x", "+x", "-y", "+y"
-CHOICES = {"robust": ROBUST, "loss": LOSSES, "tag_side": SIDES}  # parameters that are one of a few names
+CHOICES = {
+    "robust": ROBUST,
+    "loss": LOSSES,
+    "tag_side": SIDES,
+}  # parameters that are one of a few names
 PLANAR_HEIGHT_STD = 0.02  # m
 
 
@@ -23,71 +27,146 @@ PLANAR_HEIGHT_STD = 0.02  # m
 class _FilterParameters:
     # The measurement
     tdoa_std: float = parameter(
-        0.25, "m; deviation of a TDOA from its prediction, uncorrected systematic part included", high=100.0
+        0.25,
+        "m; deviation of a TDOA from its prediction, uncorrected systematic part included",
+        high=100.0,
     )
     tdoa_correlation_length: float = parameter(
-        6.0, "n successive TDOAs tell as much as n / this independent ones; 1.0 for white noise", high=1000.0
+        6.0,
+        "n successive TDOAs tell as much as n / this independent ones; 1.0 for white noise",
+        high=1000.0,
     )
-    adapt_noise: bool = parameter(True, "learn the noise of each anchor beyond tdoa_std from the innovations")
+    adapt_noise: bool = parameter(
+        True, "learn the noise of each anchor beyond tdoa_std from the innovations"
+    )
     noise_memory: float = parameter(0.5, "s over which it is learned", high=1000.0)
     robust: str = parameter(
-        "innovation", "against outliers: innovation (weight from the whitened innovation), gate, m_estimation"
+        "innovation",
+        "against outliers: innovation (weight from the whitened innovation), gate, m_estimation",
     )
     loss: str = parameter(
-        "geman_mcclure", "weight function of innovation and m_estimation: geman_mcclure, huber, cauchy"
+        "geman_mcclure",
+        "weight function of innovation and m_estimation: geman_mcclure, huber, cauchy",
     )
-    measurement_scale: float = parameter(2.5, "standard deviations of a measurement at which the loss bends", high=1e8)
+    measurement_scale: float = parameter(
+        2.5, "standard deviations of a measurement at which the loss bends", high=1e8
+    )
     state_scale: float = parameter(2.5, "the same for the prior's share in m_estimation", high=1e8)
     iterations: int = parameter(2, "re-weightings per update of m_estimation", high=100)
     gate: float = parameter(3.0, "standard deviations beyond which gate rejects", high=1e8)
 
     # The motion
-    use_imu: bool = parameter(True, "false: a tag without an IMU goes on as wheels turn, or at constant velocity", fixed=True)
-    motion_noise: float = parameter(1.5, "m/s^2/sqrt(Hz); random acceleration of the tag while no IMU says better", high=1000.0)
-    imu_timeout: float = parameter(0.1, "s without an IMU sample after which motion_noise takes over", high=10.0)
+    use_imu: bool = parameter(
+        True,
+        "false: a tag without an IMU goes on as wheels turn, or at constant velocity",
+        fixed=True,
+    )
+    motion_noise: float = parameter(
+        1.5, "m/s^2/sqrt(Hz); random acceleration of the tag while no IMU says better", high=1000.0
+    )
+    imu_timeout: float = parameter(
+        0.1, "s without an IMU sample after which motion_noise takes over", high=10.0
+    )
     accel_noise: float = parameter(0.1, "m/s^2/sqrt(Hz); accelerometer, motors running", high=100.0)
     gyro_noise: float = parameter(0.005, "rad/s/sqrt(Hz); gyroscope", high=10.0)
-    accel_bias_walk: float = parameter(0.01, "m/s^3/sqrt(Hz); how fast the accelerometer's bias wanders", high=100.0)
-    gyro_bias_walk: float = parameter(1e-4, "rad/s^2/sqrt(Hz); how fast the gyroscope's bias wanders", high=10.0)
+    accel_bias_walk: float = parameter(
+        0.01, "m/s^3/sqrt(Hz); how fast the accelerometer's bias wanders", high=100.0
+    )
+    gyro_bias_walk: float = parameter(
+        1e-4, "rad/s^2/sqrt(Hz); how fast the gyroscope's bias wanders", high=10.0
+    )
     accel_prior_std: float = parameter(
-        1.5, "m/s^2; deviation of the specific force from hovering, per axis, known before it is measured", high=1000.0
+        1.5,
+        (
+            "m/s^2; deviation of the specific force from hovering, per axis, known before it is "
+            "measured"
+        ),
+        high=1000.0,
     )
     vibration_gain: float = parameter(
-        4.0, "variance of a vibrating accelerometer's error over that of its vibration; 0.0: it has none", high=1000.0, with_low=True
+        4.0,
+        (
+            "variance of a vibrating accelerometer's error over that of its vibration; 0.0: it "
+            "has none"
+        ),
+        high=1000.0,
+        with_low=True,
     )
     workspace_margin: float = parameter(
-        1.0, "m beyond the anchors' extent; a tag further out is drawn back while less is known of its place", high=10000.0, fixed=True
+        1.0,
+        (
+            "m beyond the anchors' extent; a tag further out is drawn back while less is known of "
+            "its place"
+        ),
+        high=10000.0,
+        fixed=True,
     )
     radio_reach: float = parameter(
-        30.0, "m; a tag is looked for within that of each anchor it hears, or as far as these are apart, if that is more", high=10000.0
+        30.0,
+        (
+            "m; a tag is looked for within that of each anchor it hears, or as far as these are "
+            "apart, if that is more"
+        ),
+        high=10000.0,
     )
     tag_side: str = parameter(
         "unknown",
-        "of anchors that lie in a plane: on which side of it the tag is, below, above, or along an axis of the world, -x, +x, -y, +y",
+        (
+            "of anchors that lie in a plane: on which side of it the tag is, below, above, or "
+            "along an axis of the world, -x, +x, -y, +y"
+        ),
     )
     zero_velocity: bool = parameter(
-        True, "a tag whose TDOAs stay what they are, or whose inertial sensors neither shake nor turn, stands still"
+        True,
+        (
+            "a tag whose TDOAs stay what they are, or whose inertial sensors neither shake nor "
+            "turn, stands still"
+        ),
     )
-    recover: bool = parameter(True, "find the tag anew, untold where it is, when the TDOAs agree on another place that it can have come to")
-    compensate_changes: bool = parameter(False, "take out the delay of an anchor that is found to have changed in flight")
+    recover: bool = parameter(
+        True,
+        (
+            "find the tag anew, untold where it is, when the TDOAs agree on another place that it "
+            "can have come to"
+        ),
+    )
+    compensate_changes: bool = parameter(
+        False, "take out the delay of an anchor that is found to have changed in flight"
+    )
 
     # The start
     initial_yaw: float = parameter(0.0, "rad; yaw of the body at the start", high=7.0, low=-7.0)
     initial_yaw_std: float = parameter(
-        6.3, "rad; its deviation; above 0.6 it is unknown: four yaws are followed until motion tells", high=100.0
+        6.3,
+        "rad; its deviation; above 0.6 it is unknown: four yaws are followed until motion tells",
+        high=100.0,
     )
-    initial_accel_bias_std: float = parameter(0.1, "m/s^2; of the accelerometer's bias about 0", high=100.0)
-    initial_gyro_bias_std: float = parameter(0.01, "rad/s; of the gyroscope's bias about 0", high=10.0)
-    start_window: float = parameter(0.5, "s of TDOAs from which the start position is found", high=10.0)
-    start_timeout: float = parameter(1.0, "s after which a start from contradicting TDOAs is better than none", high=1000.0)
+    initial_accel_bias_std: float = parameter(
+        0.1, "m/s^2; of the accelerometer's bias about 0", high=100.0
+    )
+    initial_gyro_bias_std: float = parameter(
+        0.01, "rad/s; of the gyroscope's bias about 0", high=10.0
+    )
+    start_window: float = parameter(
+        0.5, "s of TDOAs from which the start position is found", high=10.0
+    )
+    start_timeout: float = parameter(
+        1.0, "s after which a start from contradicting TDOAs is better than none", high=1000.0
+    )
 
 
 # What else the tag feels
-_PARAMETERS = [(name, type(each.default), each) for sensor in SENSORS.values() for name, each in sensor.parameters.items()]
+_PARAMETERS = [
+    (name, type(each.default), each)
+    for sensor in SENSORS.values()
+    for name, each in sensor.parameters.items()
+]
 if TYPE_CHECKING:
     _SensorParameters = _FilterParameters
 else:
-    _SensorParameters = make_dataclass("_SensorParameters", _PARAMETERS, bases=(_FilterParameters,), frozen=True)
+    _SensorParameters = make_dataclass(
+        "_SensorParameters", _PARAMETERS, bases=(_FilterParameters,), frozen=True
+    )
 
 
 @dataclass(frozen=True)
@@ -95,16 +174,37 @@ class FilterConfig(_SensorParameters):
     """Tuning of the filter. The node's parameters have the same names."""
 
     # The floor
-    fixed_height: float = parameter(0.0, "m; height of body_frame in the world, of what stays on its floor", high=10000.0, low=-10000.0)
+    fixed_height: float = parameter(
+        0.0,
+        "m; height of body_frame in the world, of what stays on its floor",
+        high=10000.0,
+        low=-10000.0,
+    )
     fixed_height_std: float = parameter(
-        0.0, "m; its standard deviation; 0.0: the tag does not stay there, or, if it is planar, 0.02", high=10.0, with_low=True
+        0.0,
+        "m; its standard deviation; 0.0: the tag does not stay there, or, if it is planar, 0.02",
+        high=10.0,
+        with_low=True,
     )
     planar: bool = parameter(
-        False, "a vehicle on a level floor: height, roll and pitch of the odometry are fixed_height, 0 and 0", fixed=True
+        False,
+        (
+            "a vehicle on a level floor: height, roll and pitch of the odometry are fixed_height, "
+            "0 and 0"
+        ),
+        fixed=True,
     )
-    tilt_std: float = parameter(0.02, "rad; of roll and pitch of a planar vehicle about 0", high=1.0)
+    tilt_std: float = parameter(
+        0.02, "rad; of roll and pitch of a planar vehicle about 0", high=1.0
+    )
     non_holonomic_std: float = parameter(
-        0.0, "m/s; of velocities across the body's x, of a vehicle that cannot move sideways; 0.0: it can", high=100.0, with_low=True
+        0.0,
+        (
+            "m/s; of velocities across the body's x, of a vehicle that cannot move sideways; 0.0: "
+            "it can"
+        ),
+        high=100.0,
+        with_low=True,
     )
 
     # The output
@@ -126,12 +226,17 @@ class FilterConfig(_SensorParameters):
 
     @classmethod
     def from_parameters(cls, parameters: dict[str, Any]) -> "FilterConfig":
-        """Of a dict by name; names that are no parameter of the filter are passed over. Raises InputError."""
+        """Of a dict by name; names that are no parameter of the filter are passed over.
+
+        Raises InputError.
+        """
         return cls(**{f.name: parameters[f.name] for f in fields(cls) if f.name in parameters})
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> "FilterConfig":
-        """Read the ros__parameters of a node's parameter file; those that do not tune the filter are passed over."""
+        """Read the ros__parameters of a node's parameter file; those that do not tune the filter
+        are passed over.
+        """
         content = read_yaml(path)
         try:
             (node,) = content.values()
@@ -139,20 +244,30 @@ class FilterConfig(_SensorParameters):
         except InputError as error:
             raise InputError(f"{path}: {error}") from error
         except (AttributeError, KeyError, TypeError, ValueError) as error:
-            raise InputError(f"{path}: expected one node's 'ros__parameters' mapping, as in ekf_node.yaml.") from error
+            raise InputError(
+                f"{path}: expected one node's 'ros__parameters' mapping, as in ekf_node.yaml."
+            ) from error
 
     def parameters(self) -> np.ndarray:
-        """The numbers as the compiled core takes them: (1,) of PARAMETERS, for choices their places in CHOICES."""
+        """The numbers as the compiled core takes them: (1,) of PARAMETERS, for choices their places
+        in CHOICES.
+        """
         values = ((each.name, getattr(self, each.name)) for each in fields(self))
-        places = (CHOICES[name].index(value) if name in CHOICES else value for name, value in values)
+        places = (
+            CHOICES[name].index(value) if name in CHOICES else value for name, value in values
+        )
         return np.array([tuple(places)], PARAMETERS)
 
 
-PARAMETERS = np.dtype([(f.name, np.int64 if f.name in CHOICES else f.type) for f in fields(FilterConfig)], align=True)
+PARAMETERS = np.dtype(
+    [(f.name, np.int64 if f.name in CHOICES else f.type) for f in fields(FilterConfig)], align=True
+)
 
 
 def _number(parameter: Field[Any], value: Any) -> float:
-    """`value` as the type of a field of FilterConfig; raises InputError if it is none, or out of bounds."""
+    """`value` as the type of a field of FilterConfig; raises InputError if it is none, or out of
+    bounds.
+    """
     kind: Any = parameter.type
     low, high, with_low = (parameter.metadata[name] for name in ("low", "high", "with_low"))
     try:
@@ -161,5 +276,7 @@ def _number(parameter: Field[Any], value: Any) -> float:
         number = math.nan
     if not (low < number <= high or (with_low and number == low)) or number != value:
         what = "whole number" if kind is int else "number"
-        raise InputError(f"{parameter.name}: {value!r} must be a {what} above {low:g}, at most {high:g}.")
+        raise InputError(
+            f"{parameter.name}: {value!r} must be a {what} above {low:g}, at most {high:g}."
+        )
     return number

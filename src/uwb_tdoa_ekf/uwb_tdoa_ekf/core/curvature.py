@@ -1,7 +1,8 @@
-"""What a TDOA tells of a place that is hardly known: less than its slope says, because it is curved within the covariance.
+"""What a TDOA tells of a place that is hardly known: less than its slope says, because it is curved
+within the covariance.
 
-The second-order term of a Gaussian filter (e.g. Bar-Shalom et al., Estimation with Applications to Tracking and Navigation, 2001,
-section 10.3.2), mean and variance, taken as a variance.
+The second-order term of a Gaussian filter (e.g. Bar-Shalom et al., Estimation with Applications to
+Tracking and Navigation, 2001, section 10.3.2), mean and variance, taken as a variance.
 """
 
 from __future__ import annotations
@@ -18,8 +19,9 @@ NEAREST = 0.1  # m, of an anchor, for its curvature
 
 @compiled
 def variance(x: np.ndarray, P: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
-    """Mean square, m^2, of the second-order term of a TDOA between anchors at a and b (3,), of a tag at x (3,), m, with covariance P
-    (15, 15)."""
+    """Mean square, m^2, of the second-order term of a TDOA between anchors at a and b (3,), of a
+    tag at x (3,), m, with covariance P (15, 15).
+    """
     if P[0, 0] + P[1, 1] + P[2, 2] < SMALLEST**2:
         return 0.0
     product = np.zeros((3, 3))
@@ -31,7 +33,9 @@ def variance(x: np.ndarray, P: np.ndarray, a: np.ndarray, b: np.ndarray) -> floa
             for k in range(3):
                 along += away[k] * P[k, i] / distance**2
             for j in range(3):
-                product[j, i] += sign * (P[j, i] - away[j] * along) / distance  # of Hessian and covariance
+                product[j, i] += (
+                    sign * (P[j, i] - away[j] * along) / distance
+                )  # of Hessian and covariance
     mean = squared = 0.0
     for i in range(3):
         mean += 0.5 * product[i, i]

@@ -1,4 +1,7 @@
-"""The compiled filter: events in stamp order in, odometry and residuals out. Everything it remembers is in FilterState."""
+"""The compiled filter: events in stamp order in, odometry and residuals out.
+
+Everything it remembers is in FilterState.
+"""
 
 from __future__ import annotations
 
@@ -40,24 +43,38 @@ from .verdicts import COMPENSATED, REJECTED, REPEATED, STARTUP, USED
 
 CONSISTENCY_TIME = 0.3  # s over which the share of TDOAs that the filter explains is averaged
 INCONSISTENT = 0.5  # share below which the tag is looked for elsewhere
-UNSURE_TIME = 0.5  # s of TDOAs, after a silence in which a tag got lost, in which it is looked for anew
-LOST_TIME = 30.0  # s without a TDOA after which a tag that may be anywhere in its workspace is lost: the filter starts anew
+UNSURE_TIME = (
+    0.5  # s of TDOAs, after a silence in which a tag got lost, in which it is looked for anew
+)
+# s without a TDOA after which a tag that may be anywhere in its workspace is lost: the filter
+# starts anew
+LOST_TIME = 30.0
 MAX_STEP = 0.05  # s, longest single prediction
-AVERAGED = 0.25  # s of inertial samples that tell how a sensor is mounted which comes when the filter runs
+AVERAGED = (
+    0.25  # s of inertial samples that tell how a sensor is mounted which comes when the filter runs
+)
 STALE_TURN_PSD = 0.25  # (rad/s)^2/Hz while nothing measures how the tag turns
-LINEAR_RANGE = 1.0  # m or m/s of the state, within which the slope of a bias tells what it is elsewhere
+LINEAR_RANGE = (
+    1.0  # m or m/s of the state, within which the slope of a bias tells what it is elsewhere
+)
 
-# In a history, at most: its update, workspace, a place at rest, another hypothesis, starts or recoveries, a yaw opened again
+# In a history, at most: its update, workspace, a place at rest, another hypothesis, starts or
+# recoveries, a yaw opened again
 RECORDS_OF_TDOA = 1 + 4 + 6 + 1 + 2 + 2
 RECORDS_OF_REST = 3  # one per axis
-RECORDS_OF_AID = RECORDS_OF_TDOA  # a range has as many, a velocity one per component, and a yaw opened again
+RECORDS_OF_AID = (
+    RECORDS_OF_TDOA  # a range has as many, a velocity one per component, and a yaw opened again
+)
 
 
 @compiled
-def run(state: FilterState, parameters: np.ndarray, measurements: Measurements, output: Output) -> int:
+def run(
+    state: FilterState, parameters: np.ndarray, measurements: Measurements, output: Output
+) -> int:
     """Feed Measurements in stamp order, neither before what was fed earlier.
 
-    state : FilterState, whose functions are taken out of the inertial samples where they lie; parameters : (1,) of config.PARAMETERS;
+    state : FilterState, whose functions are taken out of the inertial samples where they lie;
+        parameters : (1,) of config.PARAMETERS;
     output : Output, which is filled. Returns the number of odometry
     rows. Raises IndexError if a history has less room than `most_records`.
     """
@@ -81,14 +98,18 @@ def run(state: FilterState, parameters: np.ndarray, measurements: Measurements, 
             _on_aid(ekf, anchors, values, aid[m], output.aids[m], output.history)
             m += 1
         if ekf.running and t >= ekf.next_odometry:
-            ekf.next_odometry = (math.floor(t * values.odometry_rate + 1e-6) + 1.0) / values.odometry_rate
+            ekf.next_odometry = (
+                math.floor(t * values.odometry_rate + 1e-6) + 1.0
+            ) / values.odometry_rate
             _report(ekf, values, t, output.odometry[rows])
             rows += 1
     return rows
 
 
 @compiled
-def _set_pose(state: FilterState, parameters: np.ndarray, poses: np.ndarray, records: np.ndarray) -> None:
+def _set_pose(
+    state: FilterState, parameters: np.ndarray, poses: np.ndarray, records: np.ndarray
+) -> None:
     ekf, pose = state.ekf[0], poses[0]
     if ekf.running:
         _advance(ekf, parameters[0], pose.t, records)
@@ -96,7 +117,10 @@ def _set_pose(state: FilterState, parameters: np.ndarray, poses: np.ndarray, rec
 
 
 def set_pose(state: FilterState, parameters: np.ndarray, pose: np.ndarray) -> None:
-    """Put the filter at a pose, (1,) of POSE, that is not before what was fed earlier. Is not recorded in a history."""
+    """Put the filter at a pose, (1,) of POSE, that is not before what was fed earlier.
+
+    Is not recorded in a history.
+    """
     _set_pose(state, parameters, pose, history.NOTHING)
 
 
@@ -128,14 +152,21 @@ def _on_imu(ekf: Record, parameters: Record, sample: Record, records: np.ndarray
             initialization.level_first(ekf, parameters, records)
         if continuous and not ekf.distrusted:
             rest.feel(ekf, sample, sample.t - ekf.imu.t, records)
-        ekf.quiet = parameters.zero_velocity and continuous and not ekf.distrusted and inertial.is_quiet(ekf.imu)
+        ekf.quiet = (
+            parameters.zero_velocity
+            and continuous
+            and not ekf.distrusted
+            and inertial.is_quiet(ekf.imu)
+        )
         rest.update_zero_velocity(ekf, sample.t, records)
     inertial.store(ekf.imu, sample)
 
 
 @compiled
 def _switch(ekf: Record, parameters: Record, records: np.ndarray) -> None:
-    """Go without inertial samples from here on, or with them again: from the attitude that they then have."""
+    """Go without inertial samples from here on, or with them again: from the attitude that they
+    then have.
+    """
     if ekf.running and ekf.distrusted:
         initialization.widen(ekf, records)
     elif ekf.running:
@@ -144,9 +175,13 @@ def _switch(ekf: Record, parameters: Record, records: np.ndarray) -> None:
 
 @compiled
 def _on_tdoa(
-    ekf: Record, anchors: np.ndarray, parameters: Record, tdoa: Record, residual: Record,
+    ekf: Record,
+    anchors: np.ndarray,
+    parameters: Record,
+    tdoa: Record,
+    residual: Record,
     records: np.ndarray,
-) -> None:  # fmt: skip
+) -> None:
     residual.innovation = residual.variance = np.nan
     residual.weight, residual.verdict = 0.0, STARTUP
     if initialization.is_repeat(ekf, tdoa, anchors):
@@ -158,20 +193,28 @@ def _on_tdoa(
         return
     before = ekf.unsure_until
     _before_update(ekf, anchors, parameters, t, records)
-    if parameters.recover and initialization.waits(ekf, anchors, parameters, t, ekf.unsure_until > before, records):
+    if parameters.recover and initialization.waits(
+        ekf, anchors, parameters, t, ekf.unsure_until > before, records
+    ):
         ekf.last_tdoa = t
         return
     late = _update(ekf, anchors, parameters, tdoa, residual, records)
     initialization.relocate(ekf, anchors, parameters, t, records)
     known = anchors[tdoa.b].delay - anchors[tdoa.a].delay
-    _after_update(ekf, anchors, parameters, t, not late, abs(residual.innovation - known) < INLIER, records)
+    _after_update(
+        ekf, anchors, parameters, t, not late, abs(residual.innovation - known) < INLIER, records
+    )
 
 
 @compiled
 def _on_range(
-    ekf: Record, anchors: np.ndarray, parameters: Record, aid: Record, residual: Record,
+    ekf: Record,
+    anchors: np.ndarray,
+    parameters: Record,
+    aid: Record,
+    residual: Record,
     records: np.ndarray,
-) -> None:  # fmt: skip
+) -> None:
     """The distance to an anchor, one of AID; as a TDOA with the one before it tells the start."""
     if ranges.is_repeat(ekf, aid):
         residual.verdict = REPEATED
@@ -197,11 +240,17 @@ def _on_range(
 
 
 @compiled
-def _before_update(ekf: Record, anchors: np.ndarray, parameters: Record, t: float, records: np.ndarray) -> None:
-    """Before an update stamped t, s: whether the tag is at rest, which anchors are heard, and whether a silence left the place open."""
+def _before_update(
+    ekf: Record, anchors: np.ndarray, parameters: Record, t: float, records: np.ndarray
+) -> None:
+    """Before an update stamped t, s: whether the tag is at rest, which anchors are heard, and
+    whether a silence left the place open.
+    """
     if parameters.zero_velocity:
         if t >= ekf.next_look:
-            rest.look(ekf, anchors, parameters, initialization.recent(ekf, rest.LOOK_WINDOW), t, records)
+            rest.look(
+                ekf, anchors, parameters, initialization.recent(ekf, rest.LOOK_WINDOW), t, records
+            )
         if not parameters.use_imu or t - ekf.imu.t > parameters.imu_timeout:
             rest.update_zero_velocity(ekf, t, records)
     if t >= ekf.next_bounds:
@@ -212,15 +261,22 @@ def _before_update(ekf: Record, anchors: np.ndarray, parameters: Record, t: floa
 
 @compiled
 def _after_update(
-    ekf: Record, anchors: np.ndarray, parameters: Record, t: float, counts: bool, agrees: bool,
+    ekf: Record,
+    anchors: np.ndarray,
+    parameters: Record,
+    t: float,
+    counts: bool,
+    agrees: bool,
     records: np.ndarray,
-) -> None:  # fmt: skip
-    """After an update stamped t, s: what holds anyway, which hypothesis is best, and whether the tag is elsewhere. counts :
-    what was measured shows that; agrees : with the best hypothesis."""
+) -> None:
+    """After an update stamped t, s: what holds anyway, which hypothesis is best, and whether the
+    tag is elsewhere. counts : what was measured shows that; agrees : with the best hypothesis.
+    """
     _stay_in_workspace(ekf, t, records)
     followed = ekf.best
     alone = hypotheses.select(ekf, t) and parameters.use_imu and not (ekf.quiet or ekf.resting)
-    # At another place. Or with another yaw, after one was opened again: the yaws of a start share the history before the choice.
+    # At another place. Or with another yaw, after one was opened again: the yaws of a start share
+    # the history before the choice.
     opened = ekf.yaw_doubt.count > 0 or not parameters.use_imu
     if ekf.best // YAWS != followed // YAWS or (ekf.best != followed and opened):
         history.add_reset(ekf, t, records)
@@ -231,7 +287,9 @@ def _after_update(
         yaw_doubt.clear(ekf.yaw_doubt)
     ekf.yaw_doubt.alone = alone
     if counts:
-        ekf.consistency += min(1.0, (t - ekf.last_tdoa) / CONSISTENCY_TIME) * ((1.0 if agrees else 0.0) - ekf.consistency)
+        ekf.consistency += min(1.0, (t - ekf.last_tdoa) / CONSISTENCY_TIME) * (
+            (1.0 if agrees else 0.0) - ekf.consistency
+        )
     ekf.last_tdoa = t
     if ekf.consistency > initialization.AGREE:
         ekf.sure = t
@@ -242,9 +300,13 @@ def _after_update(
 
 @compiled
 def _on_aid(
-    ekf: Record, anchors: np.ndarray, parameters: Record, aid: Record, residual: Record,
+    ekf: Record,
+    anchors: np.ndarray,
+    parameters: Record,
+    aid: Record,
+    residual: Record,
     records: np.ndarray,
-) -> None:  # fmt: skip
+) -> None:
     residual.innovation = residual.variance = np.nan
     residual.weight, residual.verdict = 0.0, STARTUP
     if aid.kind == aids.RANGE:
@@ -258,8 +320,13 @@ def _on_aid(
 
 
 @compiled
-def _reach(ekf: Record, anchors: np.ndarray, parameters: Record, t: float, records: np.ndarray) -> bool:
-    """A TDOA or range stamped t, s, has come: predict a filter that runs, or wait for its start. Returns whether it runs at t."""
+def _reach(
+    ekf: Record, anchors: np.ndarray, parameters: Record, t: float, records: np.ndarray
+) -> bool:
+    """A TDOA or range stamped t, s, has come: predict a filter that runs, or wait for its start.
+
+    Returns whether it runs at t.
+    """
     if not ekf.running:
         _wait_for_start(ekf, anchors, parameters, t, records)
         return False
@@ -278,18 +345,27 @@ def _wait_for_start(
     if t < ekf.next_search:
         return
     if waited > 0.9 * parameters.start_window:
-        initialization.start(ekf, anchors, parameters, t, waited > parameters.start_timeout, records)
+        initialization.start(
+            ekf, anchors, parameters, t, waited > parameters.start_timeout, records
+        )
     if t >= ekf.next_search:
         initialization.start_slowly(ekf, anchors, parameters, t, records)
 
 
 @compiled
 def _advance(ekf: Record, parameters: Record, t: float, records: np.ndarray) -> bool:
-    """Predict every hypothesis to stamp t, with the inertial sample at hand or, if it is too old, with the last velocity of wheels, or
-    without either. Returns False if the filter has stopped, because nothing has shown for too long where the tag is."""
+    """Predict every hypothesis to stamp t, with the inertial sample at hand or, if it is too old,
+    with the last velocity of wheels, or without either. Returns False if the filter has stopped,
+    because nothing has shown for too long where the tag is.
+    """
     if t - ekf.t > LOST_TIME:
         return _stop(ekf, t)
-    sensed = parameters.use_imu and t - ekf.imu.t < parameters.imu_timeout and not ekf.distrusted and t >= ekf.levelled
+    sensed = (
+        parameters.use_imu
+        and t - ekf.imu.t < parameters.imu_timeout
+        and not ekf.distrusted
+        and t >= ekf.levelled
+    )
     ekf.sensed = sensed
     if sensed and ekf.t < t:
         inertial.weigh(ekf.imu, ekf.quiet, parameters)
@@ -318,22 +394,31 @@ def _advance(ekf: Record, parameters: Record, t: float, records: np.ndarray) -> 
         ekf.t = t if t - ekf.t <= MAX_STEP else ekf.t + dt
     if t >= ekf.next_floor and plane.is_given(parameters):
         plane.hold(ekf, parameters, t, records)
-    if t - ekf.last_tdoa > LOST_TIME and workspace.is_filled(ekf.workspace, ekf.hypotheses[ekf.best].P):
+    if t - ekf.last_tdoa > LOST_TIME and workspace.is_filled(
+        ekf.workspace, ekf.hypotheses[ekf.best].P
+    ):
         return _stop(ekf, t)
     return True
 
 
 @compiled
 def _coast(ekf: Record, hypothesis: Record, parameters: Record, dt: float) -> None:
-    """Advance a HYPOTHESIS by dt seconds without inertial samples: as wheels tell, or as it was. Nothing measures a tilt where no IMU is
-    used; then the tag is taken to be level."""
+    """Advance a HYPOTHESIS by dt seconds without inertial samples: as wheels tell, or as it was.
+    Nothing measures a tilt where no IMU is used; then the tag is taken to be level.
+    """
     wheels = ekf.velocity
     driven = velocity.drives(wheels, ekf.t)
     alike = 2.0 * velocity.CORRELATION_TIME
     yaw_psd = alike * wheels.yaw_rate_variance if driven else STALE_TURN_PSD
     if not parameters.use_imu and hypothesis.P[8, 8] > initialization.ANY_YAW**2:
         yaw_psd = 0.0
-    coast(hypothesis, dt, parameters.motion_noise**2, STALE_TURN_PSD if parameters.use_imu else 0.0, yaw_psd)
+    coast(
+        hypothesis,
+        dt,
+        parameters.motion_noise**2,
+        STALE_TURN_PSD if parameters.use_imu else 0.0,
+        yaw_psd,
+    )
     if driven:
         turn_about_vertical(hypothesis.x, wheels.yaw_rate * dt)
         for k in range(2):
@@ -349,13 +434,20 @@ def _stop(ekf: Record, t: float) -> bool:
 
 @compiled
 def _update(
-    ekf: Record, anchors: np.ndarray, parameters: Record, tdoa: Record, residual: Record,
+    ekf: Record,
+    anchors: np.ndarray,
+    parameters: Record,
+    tdoa: Record,
+    residual: Record,
     records: np.ndarray,
-) -> bool:  # fmt: skip
-    """Every hypothesis with one TDOA; the best one's innovation becomes the residual. Returns whether one of its anchors is late because
-    it is near the ground: then it tells nothing."""
+) -> bool:
+    """Every hypothesis with one TDOA; the best one's innovation becomes the residual. Returns
+    whether one of its anchors is late because it is near the ground: then it tells nothing.
+    """
     a, b, innovation = anchors[tdoa.a], anchors[tdoa.b], ekf.innovation
-    innovation.noise_variance = parameters.tdoa_std**2 + tdoa.variance + a.delay_variance + b.delay_variance
+    innovation.noise_variance = (
+        parameters.tdoa_std**2 + tdoa.variance + a.delay_variance + b.delay_variance
+    )
     change = known = b.delay - a.delay
     on_floor = ekf.resting and ekf.late_as_known
     if on_floor and not math.isnan(a.floor_delay):
@@ -367,7 +459,9 @@ def _update(
     if parameters.adapt_noise:
         innovation.noise_variance += noise.excess_variance(a, b)
     innovation.noise_variance += ground.blur(ekf.hypotheses[ekf.best], parameters.ground_height)
-    if not on_floor and ground.find_lateness(a, b, ekf.hypotheses[ekf.best], tdoa.t, parameters.ground_height):
+    if not on_floor and ground.find_lateness(
+        a, b, ekf.hypotheses[ekf.best], tdoa.t, parameters.ground_height
+    ):
         _compare(ekf.hypotheses[ekf.best], a, b, tdoa, known, innovation)
         in_time = ground.in_time(a, b, innovation)
         if in_time < ground.NOT_USED:
@@ -399,13 +493,19 @@ def _update(
 
 
 @compiled
-def _is_of_rival(ekf: Record, a: Record, b: Record, tdoa: Record, known: float, residual: Record) -> bool:
-    """Whether a TDOA contradicts the place that wheels have gone to, while they outweigh those that agree on another one; fills one of
-    RESIDUAL. A robust weight would leave it some, and many pull."""
+def _is_of_rival(
+    ekf: Record, a: Record, b: Record, tdoa: Record, known: float, residual: Record
+) -> bool:
+    """Whether a TDOA contradicts the place that wheels have gone to, while they outweigh those that
+    agree on another one; fills one of RESIDUAL. A robust weight would leave it some, and many pull.
+    """
     innovation = ekf.innovation
     noise_variance = innovation.noise_variance
     _compare(ekf.hypotheses[ekf.best], a, b, tdoa, known, innovation)
-    residual.innovation, residual.variance = innovation.value, innovation.prior_variance + noise_variance
+    residual.innovation, residual.variance = (
+        innovation.value,
+        innovation.prior_variance + noise_variance,
+    )
     residual.weight, residual.verdict = 0.0, REJECTED
     return abs(innovation.value) > INLIER
 
@@ -414,9 +514,13 @@ def _is_of_rival(ekf: Record, a: Record, b: Record, tdoa: Record, known: float, 
 def _compare(
     hypothesis: Record, a: Record, b: Record, tdoa: Record, known: float, innovation: Record
 ) -> None:
-    """Fill in what a TDOA between two of ANCHOR, `known` (m) too long, says to a HYPOTHESIS; its Jacobian is that of the position, and
-    of what its bias changes with, where the state is about as it was when the bias was given."""
-    innovation.value = tdoa.d - known - linearized_tdoa(hypothesis.x, a.position, b.position, innovation.row)
+    """Fill in what a TDOA between two of ANCHOR, `known` (m) too long, says to a HYPOTHESIS; its
+    Jacobian is that of the position, and of what its bias changes with, where the state is about as
+    it was when the bias was given.
+    """
+    innovation.value = (
+        tdoa.d - known - linearized_tdoa(hypothesis.x, a.position, b.position, innovation.row)
+    )
     innovation.entries = 3
     for k in range(N_STATES):
         innovation.states[k] = k
@@ -434,12 +538,22 @@ def _compare(
 
 @compiled
 def _assimilate(
-    ekf: Record, h: int, parameters: Record, t: float, residual: Record, records: np.ndarray, of_tdoa: bool
+    ekf: Record,
+    h: int,
+    parameters: Record,
+    t: float,
+    residual: Record,
+    records: np.ndarray,
+    of_tdoa: bool,
 ) -> None:
-    """Hypothesis h with ekf.innovation, of whatever kind; that of the best one becomes the RESIDUAL. of_tdoa : it shows whether the yaw is
-    right; ranges may be off by an offset, which looks alike."""
+    """Hypothesis h with ekf.innovation, of whatever kind; that of the best one becomes the
+    RESIDUAL. of_tdoa : it shows whether the yaw is right; ranges may be off by an offset, which
+    looks alike.
+    """
     hypothesis, innovation = ekf.hypotheses[h], ekf.innovation
-    hypotheses.add_log_likelihood(hypothesis, innovation, parameters.tdoa_correlation_length * innovation.repeated)
+    hypotheses.add_log_likelihood(
+        hypothesis, innovation, parameters.tdoa_correlation_length * innovation.repeated
+    )
     robust.update(hypothesis, innovation, parameters)
     if h == ekf.best:
         residual.innovation = innovation.value
@@ -447,7 +561,9 @@ def _assimilate(
         residual.weight = innovation.weight
         residual.verdict = USED if innovation.weight > 0.0 else REJECTED
         if ekf.yaw_doubt.alone:
-            yaw_doubt.observe(ekf, parameters.tdoa_correlation_length * innovation.repeated, of_tdoa)
+            yaw_doubt.observe(
+                ekf, parameters.tdoa_correlation_length * innovation.repeated, of_tdoa
+            )
         if residual.verdict == USED:
             history.add_update(ekf, t, records)
 
@@ -474,10 +590,21 @@ def _report(ekf: Record, parameters: Record, t: float, row: Record) -> None:
     row.x[:] = best.x
     row.covariance[:] = best.P[:9, :9]
     hypotheses.add_spread_of_means(ekf, row.covariance)
-    workspace.add_circle(ekf, parameters.fixed_height_std > 0.0 or t - ekf.height.used < height.LONGEST_GAP, best.x, row.covariance)
+    workspace.add_circle(
+        ekf,
+        parameters.fixed_height_std > 0.0 or t - ekf.height.used < height.LONGEST_GAP,
+        best.x,
+        row.covariance,
+    )
     wrong = height.contradiction(ekf.height, parameters, t)
     row.covariance[2, 2] += wrong**2
-    systematic.fill(ekf.information, best.P, parameters.tdoa_correlation_length, parameters.fixed_height_std, row.persistent)
+    systematic.fill(
+        ekf.information,
+        best.P,
+        parameters.tdoa_correlation_length,
+        parameters.fixed_height_std,
+        row.persistent,
+    )
     row.covariance[:3, :3] += row.persistent
     if t < ekf.rival_until:
         _widen(ekf, best.x, row.covariance)
@@ -487,7 +614,9 @@ def _report(ekf: Record, parameters: Record, t: float, row: Record) -> None:
 
 @compiled
 def _widen(ekf: Record, x: np.ndarray, covariance: np.ndarray) -> None:
-    """Add to the (9, 9) covariance of a position x (3,), m, how far away the place is that TDOAs agree on."""
+    """Add to the (9, 9) covariance of a position x (3,), m, how far away the place is that TDOAs
+    agree on.
+    """
     square = 0.0
     for k in range(3):
         square += (ekf.rival[k] - x[k]) ** 2
@@ -496,16 +625,25 @@ def _widen(ekf: Record, x: np.ndarray, covariance: np.ndarray) -> None:
 
 
 def feed(
-    state: FilterState, parameters: np.ndarray, measurements: Measurements, records: list[np.ndarray] | None = None
+    state: FilterState,
+    parameters: np.ndarray,
+    measurements: Measurements,
+    records: list[np.ndarray] | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """`run`, with room for what it gives: (odometry of ODOMETRY, residuals of TDOAs and those of aids, of RESIDUAL).
+    """`run`, with room for what it gives: (odometry of ODOMETRY, residuals of TDOAs and those of
+    aids, of RESIDUAL).
 
-    records : list to which the records of the history are appended, an array for each call; None: nothing is recorded.
+    records : list to which the records of the history are appended, an array for each call; None:
+        nothing is recorded.
     """
     imu, tdoa, aid = measurements
-    room = history.NOTHING if records is None else np.empty(most_records(measurements), history.RECORD)
+    room = (
+        history.NOTHING if records is None else np.empty(most_records(measurements), history.RECORD)
+    )
     n = len(imu) + len(tdoa) + len(aid)
-    output = Output(np.empty(n, ODOMETRY), np.empty(len(tdoa), RESIDUAL), room, np.empty(len(aid), RESIDUAL))
+    output = Output(
+        np.empty(n, ODOMETRY), np.empty(len(tdoa), RESIDUAL), room, np.empty(len(aid), RESIDUAL)
+    )
     rows = run(state, parameters, measurements, output)
     if records is not None:
         records.append(room[: state.record.recorded].copy())

@@ -1,8 +1,9 @@
 """A tag near the ground: anchors that may be late there, and where a tag stands that does not move.
 
-Between two antennas near the ground the reflected ray, whose phase the ground turns, cancels the direct one where both are nearly
-equally long (two-ray ground-reflection model, e.g. Rappaport, Wireless Communications, ch. 4). The receiver then takes a later
-arrival for the first, metres late. By how much is not known; that it may be so follows from the two heights and the distance.
+Between two antennas near the ground the reflected ray, whose phase the ground turns, cancels the
+direct one where both are nearly equally long (two-ray ground-reflection model, e.g. Rappaport,
+Wireless Communications, ch. 4). The receiver then takes a later arrival for the first, metres late.
+By how much is not known; that it may be so follows from the two heights and the distance.
 """
 
 from __future__ import annotations
@@ -15,16 +16,24 @@ import numpy as np
 from uwb_tdoa_bias.foundation.compiled import Record, compiled
 from uwb_tdoa_bias.foundation.geometry import linearized_tdoa
 
-GRAZING = math.tan(math.radians(15.0))  # elevation below which the ground turns the phase of what it reflects
+GRAZING = math.tan(
+    math.radians(15.0)
+)  # elevation below which the ground turns the phase of what it reflects
 HALF_WAVE = 0.0375  # m, at 4 GHz: rays that differ by more do not cancel
 HIGHEST = 1.0  # m above the ground; above, no anchor near the ground can be late for that
-LATEST = 6.0  # m, lateness of an anchor is up to that, the more probable, the larger: the way by what reflects is a detour
+# m, lateness of an anchor is up to that, the more probable, the larger: the way by what reflects is
+# a detour
+LATEST = 6.0
 FARTHER = 1e-3  # 1/m, density of what is later still, and of outliers of any kind
 RARE = 0.02  # probability that an anchor is late, and that it is not, at least,
 USUAL = 0.1  # and that it is late where nothing is known
 CHANGE_TIME = 2.0  # s after which what an anchor was does not tell what it is
 DEVIATIONS = 3.0  # standard deviations that a tag may be lower than the filter has it
-BLURRED, BLUR_STD = 0.8, 0.25  # m above the ground below which what it reflects blurs what arrives, and by how much at the ground
+BLURRED, BLUR_STD = (
+    0.8,
+    0.25,
+    # m above the ground below which what it reflects blurs what arrives, and by how much at the ground
+)
 NOT_USED = 0.2  # probability that both anchors of a TDOA are in time, below which it says nothing
 
 MOST_PAIRS, MOST_ANCHORS = 64, 24  # of a window that are looked at, those heard first
@@ -33,7 +42,10 @@ STILL_TDOAS = 2  # of a pair in each half of the window, at least
 SMALLEST_SPREAD = 0.02  # m, of the values of a pair
 STILL_SPEED = 0.3  # m/s; a velocity that is not known better than that may be none
 LIKELY_SPEED = 1.0  # m/s, of a tag of which nothing is known
-STILL_SCALE, STILL_SWEEPS = 2.5, 5  # standard deviations of a change from which on it is the lateness that has changed
+STILL_SCALE, STILL_SWEEPS = (
+    2.5,
+    5,
+)  # standard deviations of a change from which on it is the lateness that has changed
 MOVING = 12.0  # normalised square of a velocity that is not zero
 STILL, UNKNOWN, MOVES = range(3)  # what the TDOAs of a window show of the motion of a tag
 # Median normalised square of the changes at rest, and by how much one of n is larger, times sqrt(n)
@@ -41,34 +53,52 @@ EXPECTED_RATIO, LARGEST_RATIO = 0.45, 3.5
 
 GROUND_STD = 0.15  # m, of the height of the tag of a body that stands on the ground
 GROUND_HEIGHT = 0.05  # m, its mean
-PAIR_SHARE, ANCHOR_SHARE = 0.4, 1.0  # of tdoa_std: standard deviation of a pair's own error, and of an anchor's
-USUAL_LATENESS, LATENESS_STD, ALIKE_STD = 2.0, 2.0, 0.3  # m: what late anchors have in common, and by how much they differ from it
+PAIR_SHARE, ANCHOR_SHARE = (
+    0.4,
+    1.0,
+)  # of tdoa_std: standard deviation of a pair's own error, and of an anchor's
+USUAL_LATENESS, LATENESS_STD, ALIKE_STD = (
+    2.0,
+    2.0,
+    0.3,
+)  # m: what late anchors have in common, and by how much they differ from it
 OTHER, TIMELY = 0.1, 0.5  # how probable other lateness is, and none, beside one that is alike
 ABOVE_STD, BESIDE_STD = 0.2, 2.0  # m; a tag is not above the workspace, and not often beside it
 SWEEPS = 25
 KNOWN_STD = 0.1  # m, by which an anchor may be late beyond what is known
-IN_TIME, ALIKE, KNOWN = range(3)  # what an explanation takes anchors near the ground for: late by what they have in common; as is known
+IN_TIME, ALIKE, KNOWN = range(
+    3
+    # what an explanation takes anchors near the ground for: late by what they have in common; as is
+    # known
+)
 
 PAIR = np.dtype(
     [
-        ("a", np.int64), ("b", np.int64),  # rows of its anchors
-        ("value", float), ("change", float), ("change_variance", float),  # m, median; median of the second half less that of the first
+        ("a", np.int64),
+        ("b", np.int64),  # rows of its anchors
+        ("value", float),
+        ("change", float),
+        ("change_variance", float),  # m, median; median of the second half less that of the first
         ("apart", float),  # s between the two halves
     ],
     align=True,
-)  # fmt: skip
+)
 
 
 class KnownHeight(NamedTuple):
-    """A height of the tag that something else than TDOAs gives, and its standard deviation, m; NaN for none."""
+    """A height of the tag that something else than TDOAs gives, and its standard deviation, m; NaN
+    for none.
+    """
 
     z: float
     std: float
 
 
 class Evidence(NamedTuple):
-    """What is known of a tag at rest: what pairs of anchors say, (k,) of PAIR; anchors (N,) of ANCHOR; workspace (2, 3) m; prior (4, 3),
-    position that is known before, m, and its information, 1/m^2; one of PARAMETERS."""
+    """What is known of a tag at rest: what pairs of anchors say, (k,) of PAIR; anchors (N,) of
+    ANCHOR; workspace (2, 3) m; prior (4, 3), position that is known before, m, and its information,
+    1/m^2; one of PARAMETERS.
+    """
 
     pairs: np.ndarray
     anchors: np.ndarray
@@ -79,7 +109,9 @@ class Evidence(NamedTuple):
 
 @compiled
 def may_be_late(position: np.ndarray, x: np.ndarray, lower: float, ground: float) -> bool:
-    """Whether an anchor at `position` (3,) may be late at a tag at x (3,), m, or up to `lower` m below it, over level ground."""
+    """Whether an anchor at `position` (3,) may be late at a tag at x (3,), m, or up to `lower` m
+    below it, over level ground.
+    """
     tag, anchor = max(x[2] - ground - lower, 0.0), max(position[2] - ground, 0.0)
     distance = math.hypot(x[0] - position[0], x[1] - position[1])
     return tag + anchor < GRAZING * distance and 2.0 * tag * anchor < HALF_WAVE * distance
@@ -87,16 +119,18 @@ def may_be_late(position: np.ndarray, x: np.ndarray, lower: float, ground: float
 
 @compiled
 def blur(hypothesis: Record, ground: float) -> float:
-    """Variance, m^2, of a TDOA at a HYPOTHESIS over level ground beyond that in the air: the ray that the ground reflects comes within the
-    length of the pulse, and moves its leading edge."""
+    """Variance, m^2, of a TDOA at a HYPOTHESIS over level ground beyond that in the air: the ray
+    that the ground reflects comes within the length of the pulse, and moves its leading edge.
+    """
     share = min(max(1.0 - (hypothesis.x[2] - ground) / BLURRED, 0.0), 1.0)
     return (BLUR_STD * share) ** 2
 
 
 @compiled
 def find_lateness(a: Record, b: Record, hypothesis: Record, t: float, ground: float) -> bool:
-    """Predict to stamp t, s, how probable it is that each of two ANCHORs is late at a HYPOTHESIS over level ground. Returns whether either
-    can be."""
+    """Predict to stamp t, s, how probable it is that each of two ANCHORs is late at a HYPOTHESIS
+    over level ground. Returns whether either can be.
+    """
     lower = DEVIATIONS * math.sqrt(hypothesis.P[2, 2])
     if hypothesis.x[2] - lower > ground + HIGHEST:
         a.late = b.late = 0.0
@@ -118,15 +152,19 @@ def _predict_lateness(anchor: Record, x: np.ndarray, lower: float, t: float, gro
 
 @compiled
 def in_time(a: Record, b: Record, innovation: Record) -> float:
-    """Probability that a TDOA between two of ANCHOR, an INNOVATION after `project` of the best HYPOTHESIS, is of two anchors in time.
+    """Probability that a TDOA between two of ANCHOR, an INNOVATION after `project` of the best
+    HYPOTHESIS, is of two anchors in time.
 
-    After `find_lateness`; what is known of each anchor becomes what it is after that TDOA (a filter of four modes, Bar-Shalom et al.,
-    Estimation with Applications to Tracking and Navigation, 2001, section 11.6, without an exchange of states: lateness shows no place).
+    After `find_lateness`; what is known of each anchor becomes what it is after that TDOA (a filter
+    of four modes, Bar-Shalom et al., Estimation with Applications to Tracking and Navigation, 2001,
+    section 11.6, without an exchange of states: lateness shows no place).
     """
     late_a, late_b = a.late, b.late
     r, variance = innovation.value, innovation.prior_variance + innovation.noise_variance
     gauss = math.exp(-0.5 * r * r / variance)
-    neither = (1.0 - late_a) * (1.0 - late_b) * (gauss / math.sqrt(2.0 * math.pi * variance) + FARTHER)
+    neither = (
+        (1.0 - late_a) * (1.0 - late_b) * (gauss / math.sqrt(2.0 * math.pi * variance) + FARTHER)
+    )
     of_b = (1.0 - late_a) * late_b * _lateness(r)
     of_a = (1.0 - late_b) * late_a * _lateness(-r)
     both = late_a * late_b * max(FARTHER, (1.0 - abs(r) / LATEST) / LATEST)
@@ -143,7 +181,8 @@ def _lateness(r: float) -> float:
 
 @compiled
 def find_pairs(window: np.ndarray, pairs: np.ndarray) -> int:
-    """Fill in (k,) of PAIR what each pair of anchors, in either order, says in a window (n,) of TDOA, n > 0. Returns how many there are.
+    """Fill in (k,) of PAIR what each pair of anchors, in either order, says in a window (n,) of
+    TDOA, n > 0. Returns how many there are.
 
     The scatter within halves of the window is that of all pairs.
     """
@@ -193,11 +232,15 @@ def _is_of(tdoa: Record, a: int, b: int) -> bool:
 
 
 @compiled
-def judge_motion(pairs: np.ndarray, anchors: np.ndarray, x: np.ndarray, covariance: np.ndarray) -> int:
-    """STILL if the TDOAs of most (k,) of PAIR stay what they are: whatever their anchors are late by, the tag does not move. MOVES if they
-    change, and UNKNOWN if they are too few, or too noisy, to show either.
+def judge_motion(
+    pairs: np.ndarray, anchors: np.ndarray, x: np.ndarray, covariance: np.ndarray
+) -> int:
+    """STILL if the TDOAs of most (k,) of PAIR stay what they are: whatever their anchors are late
+    by, the tag does not move. MOVES if they change, and UNKNOWN if they are too few, or too noisy,
+    to show either.
 
-    x : (3,) m, about where it is; covariance (3, 3) m^2/s^2 of the velocity that they would have shown is filled, large where that is not
+    x : (3,) m, about where it is; covariance (3, 3) m^2/s^2 of the velocity that they would have
+        shown is filled, large where that is not
     known. Least squares of the changes, robust against anchors whose lateness has changed.
     """
     n, changes, ratios = 0, np.empty((len(pairs), 5)), np.empty(len(pairs))
@@ -205,7 +248,10 @@ def judge_motion(pairs: np.ndarray, anchors: np.ndarray, x: np.ndarray, covarian
         pair = pairs[k]
         if pair.change_variance < np.inf:
             linearized_tdoa(x, anchors[pair.a].position, anchors[pair.b].position, changes[n, :3])
-            changes[n, 3], changes[n, 4] = pair.change / pair.apart, pair.change_variance / pair.apart**2
+            changes[n, 3], changes[n, 4] = (
+                pair.change / pair.apart,
+                pair.change_variance / pair.apart**2,
+            )
             ratios[n] = pair.change**2 / pair.change_variance
             n += 1
     if n < FEWEST_PAIRS:
@@ -213,7 +259,7 @@ def judge_motion(pairs: np.ndarray, anchors: np.ndarray, x: np.ndarray, covarian
     if np.median(ratios[:n]) > EXPECTED_RATIO + LARGEST_RATIO / math.sqrt(n):
         return MOVES
     both, v = np.empty((3, 7)), np.zeros(3)
-    for sweep in range(STILL_SWEEPS):
+    for _sweep in range(STILL_SWEEPS):
         both[:, :] = 0.0
         for k in range(3):
             both[k, k], both[k, 3 + k] = 1.0 / LIKELY_SPEED**2, 1.0
@@ -239,15 +285,19 @@ def judge_motion(pairs: np.ndarray, anchors: np.ndarray, x: np.ndarray, covarian
 
 
 @compiled
-def explain(evidence: Evidence, height: KnownHeight, lateness: int, x: np.ndarray, covariance: np.ndarray) -> float:
+def explain(
+    evidence: Evidence, height: KnownHeight, lateness: int, x: np.ndarray, covariance: np.ndarray
+) -> float:
     """Where a tag at rest is, by the evidence, as far as anchors are alike.
 
-    lateness : IN_TIME, ALIKE or KNOWN; x : (3,) m, where to begin, becomes the most probable position; covariance (3, 3) m^2 is filled.
+    lateness : IN_TIME, ALIKE or KNOWN; x : (3,) m, where to begin, becomes the most probable
+        position; covariance (3, 3) m^2 is filled.
     Returns minus the logarithm of its probability, up to a constant.
 
-    An error of its own for each anchor, and one for each pair, rarely large (Student's distribution). ALIKE: of the anchors near the
-    ground most are late by the same, as that is the way by what reflects, some by anything, and some in time (a mixture). KNOWN: the
-    error of an anchor is about its floor_delay. Iteratively re-weighted least squares.
+    An error of its own for each anchor, and one for each pair, rarely large (Student's
+    distribution). ALIKE: of the anchors near the ground most are late by the same, as that is the
+    way by what reflects, some by anything, and some in time (a mixture). KNOWN: the error of an
+    anchor is about its floor_delay. Iteratively re-weighted least squares.
     """
     anchors, parameters = evidence.anchors, evidence.parameters
     rows, places = heard(evidence.pairs)
@@ -264,7 +314,9 @@ def explain(evidence: Evidence, height: KnownHeight, lateness: int, x: np.ndarra
             u[3 + i] = anchor.floor_delay
     for sweep in range(SWEEPS):
         for i in range(len(rows)):
-            late[i] = lateness == ALIKE and may_be_late(anchors[rows[i]].position, u, 0.0, parameters.ground_height)
+            late[i] = lateness == ALIKE and may_be_late(
+                anchors[rows[i]].position, u, 0.0, parameters.ground_height
+            )
             if sweep == 0 and late[i]:
                 u[3 + i] = USUAL_LATENESS
         _equations(evidence, height, places, late, errors, u, system)
@@ -285,7 +337,9 @@ def explain(evidence: Evidence, height: KnownHeight, lateness: int, x: np.ndarra
 
 @compiled
 def heard(pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of the anchors that are heard, and for each pair the places of its two anchors among these (k, 2)."""
+    """Rows of the anchors that are heard, and for each pair the places of its two anchors among
+    these (k, 2).
+    """
     rows, places, count = np.empty(MOST_ANCHORS, np.int64), np.full((len(pairs), 2), -1), 0
     for k in range(len(pairs)):
         for side in range(2):
@@ -302,11 +356,26 @@ def heard(pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 @compiled
 def _equations(
-    evidence: Evidence, height: KnownHeight, places: np.ndarray, late: np.ndarray, errors: np.ndarray, u: np.ndarray, system: np.ndarray
+    evidence: Evidence,
+    height: KnownHeight,
+    places: np.ndarray,
+    late: np.ndarray,
+    errors: np.ndarray,
+    u: np.ndarray,
+    system: np.ndarray,
 ) -> float:
-    """Normal equations of a step from u (n,): position, error of each anchor heard, what late ones have in common; (n, n + 1) is filled.
-    errors : (k, 2) m, expected error of an anchor that is not late, and its standard deviation. Returns the cost."""
-    pairs, anchors, workspace, prior, parameters = evidence.pairs, evidence.anchors, evidence.workspace, evidence.prior, evidence.parameters
+    """Normal equations of a step from u (n,): position, error of each anchor heard, what late ones
+    have in common; (n, n + 1) is filled.
+    errors : (k, 2) m, expected error of an anchor that is not late, and its standard deviation.
+        Returns the cost.
+    """
+    pairs, anchors, workspace, prior, parameters = (
+        evidence.pairs,
+        evidence.anchors,
+        evidence.workspace,
+        evidence.prior,
+        evidence.parameters,
+    )
     n = len(u)
     system[:, :] = 0.0
     row, cost = np.empty(3), 0.0
@@ -316,7 +385,12 @@ def _equations(
         i, j = places[k, 0], places[k, 1]
         if i < 0 or j < 0:
             continue
-        r = pairs[k].value - linearized_tdoa(u, anchors[pairs[k].a].position, anchors[pairs[k].b].position, row) - u[3 + j] + u[3 + i]
+        r = (
+            pairs[k].value
+            - linearized_tdoa(u, anchors[pairs[k].a].position, anchors[pairs[k].b].position, row)
+            - u[3 + j]
+            + u[3 + i]
+        )
         square = 0.5 * (r / of_pair) ** 2
         cost += math.log1p(square)
         for axis in range(3):
@@ -327,11 +401,21 @@ def _equations(
         if late[i]:
             apart = u[3 + i] - u[n - 1]
             square = 0.5 * (apart / ALIKE_STD) ** 2
-            alike, other, timely = 1.0 / (1.0 + square), OTHER, TIMELY * math.exp(-0.5 * (u[3 + i] / of_anchor) ** 2)
+            alike, other, timely = (
+                1.0 / (1.0 + square),
+                OTHER,
+                TIMELY * math.exp(-0.5 * (u[3 + i] / of_anchor) ** 2),
+            )
             total = alike + other + timely
             cost -= math.log(total)
             states[0], entries[0], states[1], entries[1] = 3 + i, 1.0, n - 1, -1.0
-            _add(system, states[:2], entries[:2], -apart, alike / total / (ALIKE_STD**2 * (1.0 + square)))
+            _add(
+                system,
+                states[:2],
+                entries[:2],
+                -apart,
+                alike / total / (ALIKE_STD**2 * (1.0 + square)),
+            )
             _add(system, states[:1], entries[:1], -u[3 + i], timely / total / of_anchor**2)
             _add(system, states[:1], entries[:1], 0.0, 1.0 / LATENESS_STD**2)
         else:
@@ -357,14 +441,18 @@ def _equations(
         if outside != 0.0:
             _add(system, states[:1], entries[:1], -outside, 1.0 / std**2)
     if not math.isnan(height.z):
-        cost += 0.5 * ((u[2] - height.z) / height.std) ** 2 - math.log((workspace[1, 2] - workspace[0, 2]) / (2.5 * height.std))
+        cost += 0.5 * ((u[2] - height.z) / height.std) ** 2 - math.log(
+            (workspace[1, 2] - workspace[0, 2]) / (2.5 * height.std)
+        )
         states[0] = 2
         _add(system, states[:1], entries[:1], height.z - u[2], 1.0 / height.std**2)
     return cost
 
 
 @compiled
-def _add(system: np.ndarray, states: np.ndarray, entries: np.ndarray, r: float, weight: float) -> None:
+def _add(
+    system: np.ndarray, states: np.ndarray, entries: np.ndarray, r: float, weight: float
+) -> None:
     """One scalar equation: sum of entries * step of the states = r."""
     last = system.shape[1] - 1
     for i in range(len(states)):
@@ -375,8 +463,9 @@ def _add(system: np.ndarray, states: np.ndarray, entries: np.ndarray, r: float, 
 
 @compiled
 def solve(system: np.ndarray) -> bool:
-    """Turn the right sides of positive definite equations, (n, n + m), into their solutions; returns False if they have none. (LAPACK is
-    scipy's, whose import takes a fifth of a second.)"""
+    """Turn the right sides of positive definite equations, (n, n + m), into their solutions;
+    returns False if they have none. (LAPACK is scipy's, whose import takes a fifth of a second.)
+    """
     n, columns = system.shape
     for k in range(n):
         pivot = system[k, k]

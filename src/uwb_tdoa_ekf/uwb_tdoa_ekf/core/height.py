@@ -1,9 +1,10 @@
 """A range finder that looks down along the body's -z, over ground that may have steps.
 
-The height of the body above the world's z = 0 is that of the ground below it plus (range + height_arm) * cos(tilt). The
-ground is level but for steps (boxes, edges), which show as a sudden disagreement that lasts and agrees with itself: then
-either the ground below has changed, or the filter is wrong. A filter that has agreed with the range finder until then is
-right, and the ground has changed; any other gives way. If the TDOAs in turn disagree with the result for long, the range
+The height of the body above the world's z = 0 is that of the ground below it plus (range +
+height_arm) * cos(tilt). The ground is level but for steps (boxes, edges), which show as a sudden
+disagreement that lasts and agrees with itself: then either the ground below has changed, or the
+filter is wrong. A filter that has agreed with the range finder until then is right, and the ground
+has changed; any other gives way. If the TDOAs in turn disagree with the result for long, the range
 finder is not used for a while, and longer each time.
 """
 
@@ -16,15 +17,16 @@ import numpy as np
 from uwb_tdoa_bias.foundation.compiled import Record, compiled
 from uwb_tdoa_bias.foundation.robust_loss import GEMAN_MCCLURE, weight
 
-from .hypotheses import LARGEST_NIS, alive
 from .history import add_reset, add_update
+from .hypotheses import LARGEST_NIS, alive
 from .memory import YAWS
 from .state import rotation
 from .update import kalman, project
 from .verdicts import REJECTED, USED
 
 STEEPEST = 0.5  # cos(tilt) below which the beam meets the ground anywhere
-CORRELATION_TIME = 0.5  # s over which the error of a range stays alike: the ground is uneven, the sensor has an offset
+# s over which the error of a range stays alike: the ground is uneven, the sensor has an offset
+CORRELATION_TIME = 0.5
 LONGEST_GAP = 1.0  # s without a range that agrees, after which nobody knows what ground is below
 STUCK_TIME = 0.5  # s; a range finder in motion never repeats a value for so long
 GATE = 4.0  # standard deviations beyond which a range disagrees
@@ -34,18 +36,37 @@ SETTLED = 1.0  # s of agreement that make the filter the one to be believed
 HIGHEST_STEP = 1.5  # m
 BEYOND = 1.0  # m beyond the workspace, up or down, where no tag is
 PULL_SCALE = 3.0  # m, of the loss that TDOAs are weighed with
-PULL_TIME, PULL_LIMIT, PULL_DELAY = 1.0, 0.45, 3.0  # s, m, s: TDOAs averaged over the first disagree for the last
-IGNORE_TIME, LONGEST_IGNORED = 3.0, 60.0  # s for which a range finder is not used, the first time and at most
+PULL_TIME, PULL_LIMIT, PULL_DELAY = (
+    1.0,
+    0.45,
+    3.0,
+)  # s, m, s: TDOAs averaged over the first disagree for the last
+IGNORE_TIME, LONGEST_IGNORED = (
+    3.0,
+    60.0,
+)  # s for which a range finder is not used, the first time and at most
 
 
 @compiled
-def observe(ekf: Record, parameters: Record, aid: Record, residual: Record, records: np.ndarray) -> None:
+def observe(
+    ekf: Record, parameters: Record, aid: Record, residual: Record, records: np.ndarray
+) -> None:
     """Take a range, one of AID, into a running filter at its stamp; fills one of RESIDUAL."""
-    height, share = ekf.height, min(max(aid.t - ekf.height.heard, 0.0) / (2.0 * CORRELATION_TIME), 1.0)
+    height, share = (
+        ekf.height,
+        min(max(aid.t - ekf.height.heard, 0.0) / (2.0 * CORRELATION_TIME), 1.0),
+    )
     record(ekf, aid)
     residual.weight, residual.verdict = 0.0, REJECTED
     innovation, distance = ekf.innovation, aid.value[0] + parameters.height_arm
-    up = compare(ekf.hypotheses[ekf.best], height.level, distance, parameters, ekf.transition.rotation, innovation)
+    up = compare(
+        ekf.hypotheses[ekf.best],
+        height.level,
+        distance,
+        parameters,
+        ekf.transition.rotation,
+        innovation,
+    )
     residual.innovation = innovation.value
     residual.variance = innovation.prior_variance + innovation.noise_variance
     z = _plausible_z(ekf, parameters, up)
@@ -55,7 +76,14 @@ def observe(ekf: Record, parameters: Record, aid: Record, residual: Record, reco
         height.agreed = 0.0
         return
     if _weigh_places(ekf, parameters, distance, share):
-        compare(ekf.hypotheses[ekf.best], height.level, distance, parameters, ekf.transition.rotation, innovation)
+        compare(
+            ekf.hypotheses[ekf.best],
+            height.level,
+            distance,
+            parameters,
+            ekf.transition.rotation,
+            innovation,
+        )
     if aid.t - height.used > LONGEST_GAP:
         height.agreed = 0.0
     base_innovation = z - ekf.hypotheses[ekf.best].x[2]
@@ -74,7 +102,9 @@ def observe(ekf: Record, parameters: Record, aid: Record, residual: Record, reco
         total = innovation.prior_variance + innovation.noise_variance
         w = weight(GEMAN_MCCLURE, innovation.value / math.sqrt(total), GATE)
         inflation = max(1.0, 2.0 * CORRELATION_TIME / max(min(since, LONGEST_GAP), 1e-3))
-        innovation.total_variance = innovation.prior_variance + innovation.noise_variance * inflation / w
+        innovation.total_variance = (
+            innovation.prior_variance + innovation.noise_variance * inflation / w
+        )
         kalman(hypothesis, innovation)
         if h == ekf.best:
             residual.weight, residual.verdict = w, USED
@@ -92,10 +122,16 @@ def record(ekf: Record, aid: Record) -> None:
 
 @compiled
 def compare(
-    hypothesis: Record, level: float, distance: float, parameters: Record, R: np.ndarray, innovation: Record
+    hypothesis: Record,
+    level: float,
+    distance: float,
+    parameters: Record,
+    R: np.ndarray,
+    innovation: Record,
 ) -> float:
-    """Fill in what a distance (m, along the body's -z to ground at `level`) says to a HYPOTHESIS, and R (3, 3), body to
-    world. Returns cos(tilt)."""
+    """Fill in what a distance (m, along the body's -z to ground at `level`) says to a HYPOTHESIS,
+    and R (3, 3), body to world. Returns cos(tilt).
+    """
     x = hypothesis.x
     rotation(x[6], x[7], x[8], x[9], R)
     innovation.entries = 3
@@ -110,17 +146,30 @@ def compare(
 
 @compiled
 def _weigh_places(ekf: Record, parameters: Record, distance: float, share: float) -> bool:
-    """Weigh hypotheses at several places, where there are any, by a distance (m) to the ground without steps. It counts as a share (0 to 1)
-    of a distance with an error of its own. Returns whether there are several places; then ekf.innovation is another."""
+    """Weigh hypotheses at several places, where there are any, by a distance (m) to the ground
+    without steps. It counts as a share (0 to 1) of a distance with an error of its own. Returns
+    whether there are several places; then ekf.innovation is another.
+    """
     several = False
     for h in range(len(ekf.hypotheses)):
         several = several or (h // YAWS != ekf.best // YAWS and alive(ekf.hypotheses[h]))
     for h in range(len(ekf.hypotheses) if several else 0):
         hypothesis, innovation = ekf.hypotheses[h], ekf.innovation
         if alive(hypothesis):
-            compare(hypothesis, parameters.ground_height, distance, parameters, ekf.transition.rotation, innovation)
+            compare(
+                hypothesis,
+                parameters.ground_height,
+                distance,
+                parameters,
+                ekf.transition.rotation,
+                innovation,
+            )
             variance = innovation.prior_variance + innovation.noise_variance
-            hypothesis.log_weight -= 0.5 * share * (min(innovation.value**2 / variance, LARGEST_NIS) + math.log(variance))
+            hypothesis.log_weight -= (
+                0.5
+                * share
+                * (min(innovation.value**2 / variance, LARGEST_NIS) + math.log(variance))
+            )
     return several
 
 
@@ -132,9 +181,17 @@ def _is_alike(height: Record, value: float) -> bool:
 
 @compiled
 def _settle(
-    ekf: Record, parameters: Record, t: float, base_innovation: float, limit: float, records: np.ndarray
+    ekf: Record,
+    parameters: Record,
+    t: float,
+    base_innovation: float,
+    limit: float,
+    records: np.ndarray,
 ) -> bool:
-    """A range disagrees: after a while that it does so alike, the ground or the filter changes. Returns whether."""
+    """A range disagrees: after a while that it does so alike, the ground or the filter changes.
+
+    Returns whether.
+    """
     height, value = ekf.height, ekf.innovation.value
     if not _is_alike(height, value):
         height.disagreeing -= 1
@@ -167,7 +224,9 @@ def _settle(
 
 @compiled
 def update_pull(height: Record, parameters: Record, innovation: Record, t: float) -> None:
-    """What one TDOA (INNOVATION of the best hypothesis) says of z beyond the filter, while a range finder or a fixed height holds that."""
+    """What one TDOA (INNOVATION of the best hypothesis) says of z beyond the filter, while a range
+    finder or a fixed height holds that.
+    """
     ranged = t - height.used < LONGEST_GAP and t >= height.ignored_until
     if not (ranged or parameters.fixed_height_std > 0.0):
         height.pulls_since = t
@@ -190,17 +249,25 @@ def update_pull(height: Record, parameters: Record, innovation: Record, t: float
 
 @compiled
 def contradiction(height: Record, parameters: Record, t: float) -> float:
-    """By how much, m, TDOAs say that the tag is above its fixed height at stamp t, s; 0 if it has none, or if TDOAs alone could be off by
-    that. Low among anchors, noise alone makes them say so for a moment."""
+    """By how much, m, TDOAs say that the tag is above its fixed height at stamp t, s; 0 if it has
+    none, or if TDOAs alone could be off by that. Low among anchors, noise alone makes them say so
+    for a moment.
+    """
     moment = t - height.pulls_since < PULL_TIME
-    if parameters.fixed_height_std == 0.0 or moment or abs(height.pull) <= PULL_LIMIT * height.pull_information:
+    if (
+        parameters.fixed_height_std == 0.0
+        or moment
+        or abs(height.pull) <= PULL_LIMIT * height.pull_information
+    ):
         return 0.0
     return height.pull / height.pull_information
 
 
 @compiled
 def at_start(ekf: Record, parameters: Record, up: float, t: float) -> float:
-    """z of the body, m, that the last range tells with cos(tilt) `up` at stamp t (s); NaN if it tells nothing."""
+    """z of the body, m, that the last range tells with cos(tilt) `up` at stamp t (s); NaN if it
+    tells nothing.
+    """
     height = ekf.height
     if t - height.heard > LONGEST_GAP or t < height.ignored_until:
         return np.nan

@@ -9,7 +9,10 @@ from uwb_tdoa_bias.foundation.compiled import Record, compiled
 from . import yaw_doubt
 from .state import ERROR_STATES, MOVING_STATES, NOMINAL_STATES, propagate
 
-UPDATE, RESET = 0, 1  # kinds of records: a Kalman update, or another state was put in place of the one before
+UPDATE, RESET = (
+    0,
+    1,
+)  # kinds of records: a Kalman update, or another state was put in place of the one before
 
 RECORD = np.dtype(
     [
@@ -48,7 +51,10 @@ def add_coasting(ekf: Record, dt: float, history: np.ndarray) -> None:
 
 @compiled
 def replace_velocity(ekf: Record, history: np.ndarray) -> None:
-    """Record that the velocity of the best hypothesis was replaced. The new one does not depend on what came before."""
+    """Record that the velocity of the best hypothesis was replaced.
+
+    The new one does not depend on what came before.
+    """
     if len(history) > 0:
         ekf.since_record[3:6, :] = 0.0
 
@@ -68,7 +74,9 @@ def add_update(ekf: Record, t: float, history: np.ndarray) -> None:
 
 @compiled
 def add_reset(ekf: Record, t: float, history: np.ndarray) -> None:
-    """After the state of the best hypothesis was replaced: nothing carries over, and no evidence against its yaw."""
+    """After the state of the best hypothesis was replaced: nothing carries over, and no evidence
+    against its yaw.
+    """
     yaw_doubt.clear(ekf.yaw_doubt)
     if len(history) > 0:
         record = _next(ekf, t, RESET, history)
@@ -77,7 +85,10 @@ def add_reset(ekf: Record, t: float, history: np.ndarray) -> None:
 
 @compiled
 def _next(ekf: Record, t: float, kind: int, history: np.ndarray) -> Record:
-    """The next record, with all but what is particular to its kind. Raises IndexError if there is no room."""
+    """The next record, with all but what is particular to its kind.
+
+    Raises IndexError if there is no room.
+    """
     if ekf.recorded == len(history):
         raise IndexError("the history is full: most_records is too small")
     best, record = ekf.hypotheses[ekf.best], history[ekf.recorded]

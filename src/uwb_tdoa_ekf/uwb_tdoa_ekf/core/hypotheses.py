@@ -1,9 +1,10 @@
 """Several yaws and places at once, while nobody knows which is right.
 
-A tag that starts anywhere cannot see its yaw: only motion that its accelerometer feels and its TDOAs see makes it observable. Anchors
-in a plane do not determine on which side of it a tag is. One filter per direction and place runs until the TDOAs have decided (multiple
-model estimation, e.g. Bar-Shalom et al., Estimation with Applications to Tracking and Navigation, 2001, section 11.6.2, static
-case).
+A tag that starts anywhere cannot see its yaw: only motion that its accelerometer feels and its
+TDOAs see makes it observable. Anchors in a plane do not determine on which side of it a tag is. One
+filter per direction and place runs until the TDOAs have decided (multiple model estimation, e.g.
+Bar-Shalom et al., Estimation with Applications to Tracking and Navigation, 2001, section 11.6.2,
+static case).
 """
 
 from __future__ import annotations
@@ -38,7 +39,9 @@ def alive(hypothesis: Record) -> bool:
 
 @compiled
 def add_log_likelihood(hypothesis: Record, innovation: Record, correlation_length: float) -> None:
-    """Weigh a HYPOTHESIS by the Gaussian density of an INNOVATION; correlation_length as in robust.py."""
+    """Weigh a HYPOTHESIS by the Gaussian density of an INNOVATION; correlation_length as in
+    robust.py.
+    """
     variance = innovation.prior_variance + innovation.noise_variance * correlation_length
     nis = min(innovation.value**2 / variance, LARGEST_NIS)
     hypothesis.log_weight -= 0.5 * (nis + math.log(variance))
@@ -46,8 +49,9 @@ def add_log_likelihood(hypothesis: Record, innovation: Record, correlation_lengt
 
 @compiled
 def select(ekf: Record, t: float) -> bool:
-    """Follow the most probable hypothesis at stamp t; prune those that are improbable, or have become the same. Returns whether one is
-    left."""
+    """Follow the most probable hypothesis at stamp t; prune those that are improbable, or have
+    become the same. Returns whether one is left.
+    """
     best = followed = 0
     for h in range(HYPOTHESES):
         if ekf.hypotheses[h].log_weight > ekf.hypotheses[best].log_weight:
@@ -69,7 +73,10 @@ def select(ekf: Record, t: float) -> bool:
             if not alive(one) or (better.log_weight, -other) <= (one.log_weight, -h):
                 continue
             apart = difference(better.x, one.x)
-            turned, away = apart[6] ** 2 + apart[7] ** 2 + apart[8] ** 2, apart[0] ** 2 + apart[1] ** 2 + apart[2] ** 2
+            turned, away = (
+                apart[6] ** 2 + apart[7] ** 2 + apart[8] ** 2,
+                apart[0] ** 2 + apart[1] ** 2 + apart[2] ** 2,
+            )
             if turned < MERGED_BELOW**2 and away < MERGED_WITHIN**2:
                 one.log_weight = -np.inf
     return followed == 1
@@ -77,7 +84,9 @@ def select(ekf: Record, t: float) -> bool:
 
 @compiled
 def add_spread_of_means(ekf: Record, covariance: np.ndarray) -> None:
-    """Add to the (9, 9) covariance of the best hypothesis what the others say: their mean square distance from it."""
+    """Add to the (9, 9) covariance of the best hypothesis what the others say: their mean square
+    distance from it.
+    """
     best = ekf.hypotheses[ekf.best]
     weights = 0.0
     for h in range(HYPOTHESES):

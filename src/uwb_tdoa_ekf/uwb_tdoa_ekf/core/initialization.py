@@ -8,30 +8,60 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.compiled import Record, compiled
 
-from . import auxiliary, ground, height, hypotheses, inertial, standing, systematic, velocity, workspace
+from . import (
+    auxiliary,
+    ground,
+    height,
+    hypotheses,
+    inertial,
+    standing,
+    systematic,
+    velocity,
+    workspace,
+)
+from .ground import KnownHeight
 from .history import add_reset
 from .memory import HYPOTHESES, PLACES, WINDOW, YAWS
-from .ground import KnownHeight
 from .startup import APART, SPEED, Places, inliers, level, locate, room_for, share_of_inliers, split
 from .state import GRAVITY
 
 MINIMUM = 12  # TDOAs a search needs
 AGREE, AGREE_ANYHOW = 0.7, 0.6  # share of TDOAs that a start, and a recovery, must explain
 CLEARLY_MORE = 0.2  # share by which a recovery must explain more than the filter does
-RECOVERY_WINDOW = 0.3  # s of TDOAs that a recovery rests on: a tag that leaves a floor must not wait for those of the floor
-SLOW_TDOAS, SLOW_STAMPS, SLOWEST = 20, 3, 30.0  # TDOAs and stamps, and s, that a start looks back where few TDOAs come
-UNKNOWN, BETTER = 2.0, 0.5  # m, deviation of a place that is hardly known; share of its variance that is clearly less
-LONGEST_GAP = 0.6  # share of the time of these within which none came: beyond, they are those of a tag that has just been switched on
+# s of TDOAs that a recovery rests on: a tag that leaves a floor must not wait for those of the
+# floor
+RECOVERY_WINDOW = 0.3
+SLOW_TDOAS, SLOW_STAMPS, SLOWEST = (
+    20,
+    3,
+    30.0,
+)  # TDOAs and stamps, and s, that a start looks back where few TDOAs come
+UNKNOWN, BETTER = (
+    2.0,
+    0.5,
+)  # m, deviation of a place that is hardly known; share of its variance that is clearly less
+# share of the time of these within which none came: beyond, they are those of a tag that has just
+# been switched on
+LONGEST_GAP = 0.6
 LISTEN_PERIOD = 1.0  # s between two looks at who is heard
 SEARCH_PERIOD = 0.1  # s between two searches
 TILT_STD = 0.1  # rad, at the start
 ANY_YAW = math.pi / math.sqrt(3.0)  # rad, deviation of a yaw that may be any
 WRONG_POSITION = 1.0  # m, that inertial samples which are wrong have made
 SMALLEST_STD = 0.03  # m, of a height that is known at the start
-REACH, REACH_SPEED, REACH_ACCELERATION = 0.5, 0.5, 0.5  # m, m/s, m/s^2: how far from where it was right a filter may be found, by time
-LATE_ANCHORS = 2  # that TDOAs which contradict wheels may be explained by: two that are late are as probable as a rover that jumps
+REACH, REACH_SPEED, REACH_ACCELERATION = (
+    0.5,
+    0.5,
+    0.5,
+)  # m, m/s, m/s^2: how far from where it was right a filter may be found, by time
+# that TDOAs which contradict wheels may be explained by: two that are late are as probable as a
+# rover that jumps
+LATE_ANCHORS = 2
 AMONG_OTHERS = 6, 3  # TDOAs and anchors, at least, that agree with wheels without these
-RIVAL_TIME, RIVAL_HELD = 1.0, 0.5  # s for which TDOAs must agree on another place than wheels; s for which the tag may be there
+RIVAL_TIME, RIVAL_HELD = (
+    1.0,
+    0.5,
+)  # s for which TDOAs must agree on another place than wheels; s for which the tag may be there
 
 
 @compiled
@@ -48,7 +78,9 @@ def remember(ekf: Record, tdoa: Record, anchors: np.ndarray) -> None:
 
 @compiled
 def is_repeat(ekf: Record, tdoa: Record, anchors: np.ndarray) -> bool:
-    """Whether the window holds a TDOA already, with its stamp, anchors and value: somebody has sent it twice."""
+    """Whether the window holds a TDOA already, with its stamp, anchors and value: somebody has sent
+    it twice.
+    """
     d = tdoa.d - (anchors[tdoa.b].delay - anchors[tdoa.a].delay)
     for k in range(ekf.kept - 1, -1, -1):
         other = ekf.window[k]
@@ -61,17 +93,27 @@ def is_repeat(ekf: Record, tdoa: Record, anchors: np.ndarray) -> bool:
 
 @compiled
 def _height_at_start(ekf: Record, parameters: Record, t: float) -> KnownHeight:
-    """The height that other sensors give at stamp t, s, of a tag whose attitude only the accelerometer gives."""
+    """The height that other sensors give at stamp t, s, of a tag whose attitude only the
+    accelerometer gives.
+    """
     accel = _mean_accel(ekf.imu, parameters)
     return _known_height(ekf, parameters, accel[2] / max(math.sqrt(np.sum(accel**2)), 1e-9), t)
 
 
 @compiled
 def _look_for_places(
-    ekf: Record, anchors: np.ndarray, parameters: Record, window: np.ndarray, known: KnownHeight, places: Places, near: np.ndarray
+    ekf: Record,
+    anchors: np.ndarray,
+    parameters: Record,
+    window: np.ndarray,
+    known: KnownHeight,
+    places: Places,
+    near: np.ndarray,
 ) -> float:
-    """`locate` in the surroundings of the anchors of a window; the most probable place first. near (2, 3) m: the box about these anchors is
-    written to it. Returns the share of TDOAs that agree with the first place."""
+    """`locate` in the surroundings of the anchors of a window; the most probable place first. near
+    (2, 3) m: the box about these anchors is written to it. Returns the share of TDOAs that agree
+    with the first place.
+    """
     _find_surroundings(ekf, window, anchors, parameters)
     share = locate(window, anchors, ekf.workspace, parameters, known, places)
     workspace.surround(ekf, standing.NEAR, near)
@@ -82,9 +124,16 @@ def _look_for_places(
 
 @compiled
 def start(
-    ekf: Record, anchors: np.ndarray, parameters: Record, t: float, anyhow: bool, history: np.ndarray
+    ekf: Record,
+    anchors: np.ndarray,
+    parameters: Record,
+    t: float,
+    anyhow: bool,
+    history: np.ndarray,
 ) -> None:
-    """Begin if the window determines one position, or `anyhow` with the covariance that its contradictions leave."""
+    """Begin if the window determines one position, or `anyhow` with the covariance that its
+    contradictions leave.
+    """
     window = recent(ekf, parameters.start_window)
     if len(window) < MINIMUM:
         return
@@ -110,21 +159,36 @@ def start(
         standing.sort(places, near)
     for place in range(PLACES if still else 0):
         standing.stop(x[place], covariance[place], ekf.still_covariance)
-    _begin(ekf, parameters, t, places, parameters.initial_yaw, parameters.initial_yaw_std, parameters.use_imu)
+    _begin(
+        ekf,
+        parameters,
+        t,
+        places,
+        parameters.initial_yaw,
+        parameters.initial_yaw_std,
+        parameters.use_imu,
+    )
     ekf.resting, ekf.rest_since = still and parameters.zero_velocity, t
     add_reset(ekf, t, history)
 
 
 @compiled
-def start_slowly(ekf: Record, anchors: np.ndarray, parameters: Record, t: float, history: np.ndarray) -> None:
-    """The same where few TDOAs come: from the last SLOW_TDOAS or SLOW_STAMPS of them, if these determine one position, and in any case
-    when there are so many."""
+def start_slowly(
+    ekf: Record, anchors: np.ndarray, parameters: Record, t: float, history: np.ndarray
+) -> None:
+    """The same where few TDOAs come: from the last SLOW_TDOAS or SLOW_STAMPS of them, if these
+    determine one position, and in any case when there are so many.
+    """
     window, stamps = _last(ekf, t)
     enough = len(window) >= SLOW_TDOAS or (stamps >= SLOW_STAMPS and len(window) > 2 * stamps)
     span, gap = t - window[0].t, 0.0
     for i in range(1, len(window)):
         gap = max(gap, window[i].t - window[i - 1].t)
-    if not (enough or len(window) >= MINIMUM) or span < parameters.start_window or gap > LONGEST_GAP * span:
+    if (
+        not (enough or len(window) >= MINIMUM)
+        or span < parameters.start_window
+        or gap > LONGEST_GAP * span
+    ):
         return
     places, near, known = room_for(PLACES), np.empty((2, 3)), _height_at_start(ekf, parameters, t)
     share = _look_for_places(ekf, anchors, parameters, window, known, places, near)
@@ -133,7 +197,15 @@ def start_slowly(ekf: Record, anchors: np.ndarray, parameters: Record, t: float,
     if np.trace(places.covariance[0, :3, :3]) > APART**2:
         split(places)
         standing.sort(places, near)
-    _begin(ekf, parameters, t, places, parameters.initial_yaw, parameters.initial_yaw_std, parameters.use_imu)
+    _begin(
+        ekf,
+        parameters,
+        t,
+        places,
+        parameters.initial_yaw,
+        parameters.initial_yaw_std,
+        parameters.use_imu,
+    )
     ekf.resting, ekf.rest_since = False, t
     add_reset(ekf, t, history)
 
@@ -146,12 +218,19 @@ def is_unsure(ekf: Record) -> bool:
 
 
 @compiled
-def waits(ekf: Record, anchors: np.ndarray, parameters: Record, t: float, silent: bool, history: np.ndarray) -> bool:
-    """Whether a TDOA stamped t, s, of a tag that may be anywhere after a silence is kept for a search; with the last that this needs,
-    searches.
+def waits(
+    ekf: Record,
+    anchors: np.ndarray,
+    parameters: Record,
+    t: float,
+    silent: bool,
+    history: np.ndarray,
+) -> bool:
+    """Whether a TDOA stamped t, s, of a tag that may be anywhere after a silence is kept for a
+    search; with the last that this needs, searches.
 
-    Each by itself is linearized far from where the tag is, and the covariance would shrink about a wrong place. Not of a tag that few TDOAs
-    come from. silent : the silence ends with this TDOA.
+    Each by itself is linearized far from where the tag is, and the covariance would shrink about a
+    wrong place. Not of a tag that few TDOAs come from. silent : the silence ends with this TDOA.
     """
     first = ekf.kept - 1 - MINIMUM
     if silent and first >= 0 and ekf.window[first].t > ekf.last_tdoa - RECOVERY_WINDOW:
@@ -165,9 +244,13 @@ def waits(ekf: Record, anchors: np.ndarray, parameters: Record, t: float, silent
 
 
 @compiled
-def relocate(ekf: Record, anchors: np.ndarray, parameters: Record, t: float, history: np.ndarray) -> None:
-    """Of a tag that few TDOAs come from, and whose place is hardly known by now: go to the place that its last TDOAs determine, if better
-    than the filter. So far from where the TDOAs are linearized these do together what each of them does not alone."""
+def relocate(
+    ekf: Record, anchors: np.ndarray, parameters: Record, t: float, history: np.ndarray
+) -> None:
+    """Of a tag that few TDOAs come from, and whose place is hardly known by now: go to the place
+    that its last TDOAs determine, if better than the filter. So far from where the TDOAs are
+    linearized these do together what each of them does not alone.
+    """
     if not is_unsure(ekf) or len(recent(ekf, parameters.start_window)) >= MINIMUM:
         return
     best, window = ekf.hypotheses[ekf.best], _last(ekf, t)[0]
@@ -179,7 +262,11 @@ def relocate(ekf: Record, anchors: np.ndarray, parameters: Record, t: float, his
     variance = np.trace(covariance[0, :3, :3])
     if cost[1] < np.inf:
         variance += np.sum((x[1, :3] - x[0, :3]) ** 2)
-    if share < AGREE or variance > BETTER * np.trace(best.P[:3, :3]) or not workspace.contains(ekf.workspace, x[0]):
+    if (
+        share < AGREE
+        or variance > BETTER * np.trace(best.P[:3, :3])
+        or not workspace.contains(ekf.workspace, x[0])
+    ):
         return
     for h in range(HYPOTHESES):
         hypothesis = ekf.hypotheses[h]
@@ -191,7 +278,9 @@ def relocate(ekf: Record, anchors: np.ndarray, parameters: Record, t: float, his
 
 @compiled
 def _last(ekf: Record, t: float) -> tuple[np.ndarray, int]:
-    """The last SLOW_TDOAs, or as many more as have SLOW_STAMPS, none older than SLOWEST: (n,) of TDOA, and how many stamps they have."""
+    """The last SLOW_TDOAs, or as many more as have SLOW_STAMPS, none older than SLOWEST: (n,) of
+    TDOA, and how many stamps they have.
+    """
     first, stamps = ekf.kept - 1, 1
     while first > 0 and ekf.kept - first < WINDOW and ekf.window[first - 1].t > t - SLOWEST:
         new = ekf.window[first - 1].t != ekf.window[first].t
@@ -203,7 +292,9 @@ def _last(ekf: Record, t: float) -> tuple[np.ndarray, int]:
 
 
 @compiled
-def _find_surroundings(ekf: Record, window: np.ndarray, anchors: np.ndarray, parameters: Record) -> None:
+def _find_surroundings(
+    ekf: Record, window: np.ndarray, anchors: np.ndarray, parameters: Record
+) -> None:
     """Where a tag is expected that hears the anchors of a window (n,) of TDOA."""
     workspace.listen(ekf, window, anchors, parameters.radio_reach, parameters.tag_side)
     workspace.surround(ekf, parameters.workspace_margin, ekf.workspace)
@@ -218,12 +309,18 @@ def look_around(ekf: Record, anchors: np.ndarray, parameters: Record, t: float) 
 
 @compiled
 def place(
-    ekf: Record, anchors: np.ndarray, parameters: Record, t: float, pose: Record, history: np.ndarray
+    ekf: Record,
+    anchors: np.ndarray,
+    parameters: Record,
+    t: float,
+    pose: Record,
+    history: np.ndarray,
 ) -> None:
     """Go to the pose that one of POSE gives; begin there, if the filter does not run.
 
-    What is not given stays as it is; before the filter runs, it is anywhere in the workspace. Tilt, velocity and biases
-    stay as they are too: gravity and TDOAs know them better than who gives a pose.
+    What is not given stays as it is; before the filter runs, it is anywhere in the workspace. Tilt,
+    velocity and biases stay as they are too: gravity and TDOAs know them better than who gives a
+    pose.
     """
     x, covariance = np.zeros(6), np.zeros((6, 6))
     if ekf.running:
@@ -247,8 +344,20 @@ def place(
                 covariance[k, j] = covariance[j, k] = pose.covariance[k, j]
     has_yaw = not math.isnan(pose.yaw)
     if not ekf.running:
-        yaw, std = (pose.yaw, pose.yaw_std) if has_yaw else (parameters.initial_yaw, parameters.initial_yaw_std)
-        _begin(ekf, parameters, t, Places(x.reshape(1, 6), covariance.reshape(1, 6, 6), np.zeros(1)), yaw, std, parameters.use_imu)
+        yaw, std = (
+            (pose.yaw, pose.yaw_std)
+            if has_yaw
+            else (parameters.initial_yaw, parameters.initial_yaw_std)
+        )
+        _begin(
+            ekf,
+            parameters,
+            t,
+            Places(x.reshape(1, 6), covariance.reshape(1, 6, 6), np.zeros(1)),
+            yaw,
+            std,
+            parameters.use_imu,
+        )
     else:
         for h in range(HYPOTHESES):
             hypothesis = ekf.hypotheses[h]
@@ -264,9 +373,18 @@ def place(
 
 
 @compiled
-def _begin(ekf: Record, parameters: Record, t: float, places: Places, yaw: float, yaw_std: float, steered: bool) -> None:
-    """Start hypotheses at places, level, with the yaws that are possible. steered : something measures motion in the body frame, so that
-    these can be told apart."""
+def _begin(
+    ekf: Record,
+    parameters: Record,
+    t: float,
+    places: Places,
+    yaw: float,
+    yaw_std: float,
+    steered: bool,
+) -> None:
+    """Start hypotheses at places, level, with the yaws that are possible. steered : something
+    measures motion in the body frame, so that these can be told apart.
+    """
     x, covariance, cost = places.x, places.covariance, places.cost
     accel = _mean_accel(ekf.imu, parameters)
     unknown = steered and yaw_std > hypotheses.YAW_STD
@@ -283,7 +401,9 @@ def _begin(ekf: Record, parameters: Record, t: float, places: Places, yaw: float
         hypothesis.x[10:] = 0.0
         hypothesis.P[:] = 0.0
         _put(hypothesis, x[place], covariance[place])
-        _spread_attitude(hypothesis.P, parameters, min(yaw_std, hypotheses.YAW_STD if steered else ANY_YAW))
+        _spread_attitude(
+            hypothesis.P, parameters, min(yaw_std, hypotheses.YAW_STD if steered else ANY_YAW)
+        )
     ekf.best = 0
     systematic.begin(ekf.information, ekf.hypotheses[0].P)
     ekf.t = ekf.last_tdoa = ekf.sure = t
@@ -306,12 +426,19 @@ def _turn(hypothesis: Record, yaw: float, std: float) -> None:
 
 @compiled
 def recover(
-    ekf: Record, anchors: np.ndarray, parameters: Record, t: float, anywhere: bool, history: np.ndarray
+    ekf: Record,
+    anchors: np.ndarray,
+    parameters: Record,
+    t: float,
+    anywhere: bool,
+    history: np.ndarray,
 ) -> None:
-    """If the window agrees on a position and the filter on another one, go there; attitude and biases stay.
+    """If the window agrees on a position and the filter on another one, go there; attitude and
+    biases stay.
 
-    A tag whose inertial sensor is sound does not jump: as far as it can have come since the filter was right, and no farther. One that may
-    be `anywhere` does, and to several places, if there are several.
+    A tag whose inertial sensor is sound does not jump: as far as it can have come since the filter
+    was right, and no farther. One that may be `anywhere` does, and to several places, if there are
+    several.
     """
     window = recent(ekf, min(parameters.start_window, RECOVERY_WINDOW))
     if len(window) < MINIMUM:
@@ -325,7 +452,10 @@ def recover(
     share = locate(window, anchors, ekf.workspace, parameters, known, places)
     x, covariance, cost = places.x, places.covariance, places.cost
     explained = share_of_inliers(window, anchors, ekf.hypotheses[ekf.best].x[:6])
-    if workspace.outside(ekf.workspace, x[0]) > (workspace.STD if anywhere else 0.0) or share < AGREE_ANYHOW:
+    if (
+        workspace.outside(ekf.workspace, x[0]) > (workspace.STD if anywhere else 0.0)
+        or share < AGREE_ANYHOW
+    ):
         return
     if anywhere and cost[count - 1] < np.inf:
         _reopen(ekf, cost)
@@ -348,7 +478,9 @@ def recover(
         hypothesis.P[:6, :] = 0.0
         hypothesis.P[:, :6] = 0.0
         _put(hypothesis, x[place], covariance[place])
-        if not parameters.use_imu:  # wheels have led to another place: by a wrong yaw, as likely as not
+        if (
+            not parameters.use_imu
+        ):  # wheels have led to another place: by a wrong yaw, as likely as not
             hypothesis.P[8, :] = 0.0
             hypothesis.P[:, 8] = 0.0
             hypothesis.P[8, 8] = ANY_YAW**2
@@ -362,9 +494,13 @@ def recover(
 
 
 @compiled
-def _outweighs(ekf: Record, anchors: np.ndarray, window: np.ndarray, rival: np.ndarray, t: float) -> bool:
-    """Whether the motion that wheels measure outweighs a window (n,) of TDOA that agree on a rival place (3,), m, at stamp t, s: until they
-    have agreed on it for a while, and no few late anchors have explained them in that time. Until then the tag may be at either."""
+def _outweighs(
+    ekf: Record, anchors: np.ndarray, window: np.ndarray, rival: np.ndarray, t: float
+) -> bool:
+    """Whether the motion that wheels measure outweighs a window (n,) of TDOA that agree on a rival
+    place (3,), m, at stamp t, s: until they have agreed on it for a while, and no few late anchors
+    have explained them in that time. Until then the tag may be at either.
+    """
     if t > ekf.rival_until or _are_late(window, anchors, ekf.hypotheses[ekf.best].x[:6]):
         ekf.rival_since = t
     ekf.rival_until = t + RIVAL_HELD
@@ -375,7 +511,9 @@ def _outweighs(ekf: Record, anchors: np.ndarray, window: np.ndarray, rival: np.n
 
 @compiled
 def _are_late(window: np.ndarray, anchors: np.ndarray, x: np.ndarray) -> bool:
-    """Whether the TDOAs of a window (n,) agree with position and velocity x (6,) at its end, but for those of LATE_ANCHORS anchors."""
+    """Whether the TDOAs of a window (n,) agree with position and velocity x (6,) at its end, but
+    for those of LATE_ANCHORS anchors.
+    """
     agree, rows = inliers(window, anchors, x), workspace.rows_heard(window)
     fewest, others = AMONG_OTHERS
     if len(rows) < LATE_ANCHORS + others:
@@ -395,7 +533,9 @@ def _are_late(window: np.ndarray, anchors: np.ndarray, x: np.ndarray) -> bool:
 
 @compiled
 def _reopen(ekf: Record, cost: np.ndarray) -> None:
-    """Follow the yaws of the best hypothesis at each place again, whose probabilities are exp(-cost) (PLACES,)."""
+    """Follow the yaws of the best hypothesis at each place again, whose probabilities are
+    exp(-cost) (PLACES,).
+    """
     of_best = ekf.best // YAWS
     for yaw in range(YAWS):
         one = ekf.hypotheses[of_best * YAWS + yaw]
@@ -416,7 +556,9 @@ def widen(ekf: Record, history: np.ndarray) -> None:
 
 @compiled
 def level_anew(ekf: Record, parameters: Record, yaw_std: float, history: np.ndarray) -> None:
-    """Stay at position and velocity; attitude as at a start: level, the yaw as it is, to so many rad; biases as at a start too."""
+    """Stay at position and velocity; attitude as at a start: level, the yaw as it is, to so many
+    rad; biases as at a start too.
+    """
     best = ekf.hypotheses[ekf.best]
     x, y, z, w = best.x[6], best.x[7], best.x[8], best.x[9]
     yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
@@ -427,7 +569,9 @@ def level_anew(ekf: Record, parameters: Record, yaw_std: float, history: np.ndar
 
 @compiled
 def open_yaw(ekf: Record, parameters: Record, history: np.ndarray) -> None:
-    """The yaw was wrong, and with it what was integrated lately: follow four yaws again, from a place that is less certain."""
+    """The yaw was wrong, and with it what was integrated lately: follow four yaws again, from a
+    place that is less certain.
+    """
     ekf.yaw_doubt.count += 1
     widen(ekf, history)
     level_anew(ekf, parameters, 2.0 * math.pi, history)
@@ -435,7 +579,10 @@ def open_yaw(ekf: Record, parameters: Record, history: np.ndarray) -> None:
 
 @compiled
 def open_unknown_yaw(ekf: Record, parameters: Record, history: np.ndarray) -> None:
-    """Of a tag without an IMU, before a velocity: follow four yaws if it may have any. From now on motion can show it."""
+    """Of a tag without an IMU, before a velocity: follow four yaws if it may have any.
+
+    From now on motion can show it.
+    """
     alive = 0
     for h in range(HYPOTHESES):
         alive += hypotheses.alive(ekf.hypotheses[h])
@@ -445,11 +592,18 @@ def open_unknown_yaw(ekf: Record, parameters: Record, history: np.ndarray) -> No
 
 @compiled
 def level_first(ekf: Record, parameters: Record, history: np.ndarray) -> None:
-    """`level_anew` when inertial samples have come for the first time: the yaw is known as well as it was before."""
+    """`level_anew` when inertial samples have come for the first time: the yaw is known as well as
+    it was before.
+    """
     alive = 0
     for h in range(HYPOTHESES):
         alive += hypotheses.alive(ekf.hypotheses[h])
-    level_anew(ekf, parameters, 2.0 * math.pi if alive > 1 else math.sqrt(ekf.hypotheses[ekf.best].P[8, 8]), history)
+    level_anew(
+        ekf,
+        parameters,
+        2.0 * math.pi if alive > 1 else math.sqrt(ekf.hypotheses[ekf.best].P[8, 8]),
+        history,
+    )
 
 
 @compiled
@@ -457,7 +611,9 @@ def _known_height(ekf: Record, parameters: Record, up: float, t: float) -> Known
     """Height of a tag with cos(tilt) `up`, as something else than TDOAs gives it."""
     if parameters.fixed_height_std > 0.0:
         return KnownHeight(parameters.fixed_height, parameters.fixed_height_std)
-    return KnownHeight(height.at_start(ekf, parameters, up, t), max(parameters.height_std, SMALLEST_STD))
+    return KnownHeight(
+        height.at_start(ekf, parameters, up, t), max(parameters.height_std, SMALLEST_STD)
+    )
 
 
 @compiled

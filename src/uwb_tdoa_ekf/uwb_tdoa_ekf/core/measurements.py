@@ -16,6 +16,7 @@ from .memory import AID, IMU_SAMPLE, structured
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.anchors import Anchors
     from uwb_tdoa_bias.foundation.sensors import Stream
+
     from ..installed import Installed
 
 MAX_RATE, MAX_ACCEL = 100.0, 1000.0  # rad/s, m/s^2: beyond what any inertial sensor reads
@@ -24,18 +25,24 @@ LARGEST_ERROR = 1.0  # m by which |d_ab| may exceed the distance between a and b
 
 
 def imu_rows(t: np.ndarray, gyro: np.ndarray, accel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(n,) of IMU_SAMPLE, and (n,) bool: usable; of t (n,) s, gyro (n, 3) rad/s, accel (n, 3) m/s^2, body."""
+    """(n,) of IMU_SAMPLE, and (n,) bool: usable; of t (n,) s, gyro (n, 3) rad/s, accel (n, 3)
+    m/s^2, body.
+    """
     rows = structured(IMU_SAMPLE, t, gyro, accel)
     return rows, usable_imu(rows["t"], rows["gyro"], rows["accel"])
 
 
 def usable_tdoas(rows: np.ndarray, positions: np.ndarray) -> np.ndarray:
     """(n,) bool: which of (n,) of TDOA can be measurements among anchors at (N, 3) m."""
-    usable = usable_all(rows["a"], rows["b"], rows["d"], rows["variance"], positions) & np.isfinite(rows["t"])
+    usable = usable_all(rows["a"], rows["b"], rows["d"], rows["variance"], positions) & np.isfinite(
+        rows["t"]
+    )
     return usable & usable_slopes(rows["slope"], rows["state"])
 
 
-def aid_rows(name: str, stream: Stream, anchors: Anchors | Installed) -> tuple[np.ndarray, np.ndarray]:
+def aid_rows(
+    name: str, stream: Stream, anchors: Anchors | Installed
+) -> tuple[np.ndarray, np.ndarray]:
     """(n,) of AID, and (n,) bool: usable; of the Stream of a sensor among Anchors."""
     columns, usable = SENSORS[name].measured(stream)
     rows = np.zeros(len(stream), AID)
@@ -51,8 +58,8 @@ def aid_rows(name: str, stream: Stream, anchors: Anchors | Installed) -> tuple[n
 
 @compiled
 def usable(a: int, b: int, d: float, variance: float, positions: np.ndarray) -> bool:
-    """False for an unknown anchor (row -1), a pair of one anchor, a value not finite or longer than the baseline, a variance
-    that is none.
+    """False for an unknown anchor (row -1), a pair of one anchor, a value not finite or longer than
+    the baseline, a variance that is none.
 
     a, b : anchor rows; d : m; variance : m^2; positions : (N, 3) m.
     """
@@ -65,7 +72,9 @@ def usable(a: int, b: int, d: float, variance: float, positions: np.ndarray) -> 
 
 
 @compiled
-def usable_all(a: np.ndarray, b: np.ndarray, d: np.ndarray, variance: np.ndarray, positions: np.ndarray) -> np.ndarray:
+def usable_all(
+    a: np.ndarray, b: np.ndarray, d: np.ndarray, variance: np.ndarray, positions: np.ndarray
+) -> np.ndarray:
     """`usable` for (n,) arrays: (n,) bool."""
     out = np.empty(len(d), np.bool_)
     for i in range(len(d)):
@@ -75,7 +84,9 @@ def usable_all(a: np.ndarray, b: np.ndarray, d: np.ndarray, variance: np.ndarray
 
 @compiled
 def usable_slopes(slope: np.ndarray, state: np.ndarray) -> np.ndarray:
-    """(n,) bool: whether a bias can change with the state by a slope (n, 6), m per m or m/s, about a state (n, 6), m or m/s."""
+    """(n,) bool: whether a bias can change with the state by a slope (n, 6), m per m or m/s, about
+    a state (n, 6), m or m/s.
+    """
     out = np.ones(len(slope), np.bool_)
     for i in range(len(slope)):
         for k in range(slope.shape[1]):  # NaN is not below anything
@@ -85,7 +96,9 @@ def usable_slopes(slope: np.ndarray, state: np.ndarray) -> np.ndarray:
 
 @compiled
 def usable_imu(t: np.ndarray, gyro: np.ndarray, accel: np.ndarray) -> np.ndarray:
-    """(n,) bool: finite and within the range of any sensor. t (n,) s; gyro (n, 3) rad/s, accel (n, 3) m/s^2."""
+    """(n,) bool: finite and within the range of any sensor. t (n,) s; gyro (n, 3) rad/s, accel (n,
+    3) m/s^2.
+    """
     out = np.empty(len(t), np.bool_)
     for i in range(len(t)):
         out[i] = math.isfinite(t[i])

@@ -1,12 +1,14 @@
-"""Everything one filter remembers between two events, by name. A copy of its arrays is a copy of the filter.
+"""Everything one filter remembers between two events, by name. A copy of its arrays is a copy of
+the filter.
 
-The types are rows of numpy's structured arrays: compiled code reads and writes `ekf.imu.slow_accel[k]` where it lies in
-memory, a function takes a whole record as one pointer, and Python sees the same bytes (`FilterState.record`).
+The types are rows of numpy's structured arrays: compiled code reads and writes
+`ekf.imu.slow_accel[k]` where it lies in memory, a function takes a whole record as one pointer, and
+Python sees the same bytes (`FilterState.record`).
 """
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -21,9 +23,13 @@ from .update import INNOVATION
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from uwb_tdoa_bias.effects.sensor_function import SensorFunction
 
-YAWS, PLACES = 4, 2  # directions and places that a start follows at once while it is not known which is right
+YAWS, PLACES = (
+    4,
+    2,
+)  # directions and places that a start follows at once while it is not known which is right
 HYPOTHESES = YAWS * PLACES
 Floor = tuple[np.ndarray, np.ndarray, np.ndarray]  # as of EffectSet.on_floor
 WINDOW = 512  # TDOAs kept for a start
@@ -34,12 +40,25 @@ def _record(*columns: tuple[Any, ...]) -> np.dtype:
 
 
 # What is measured. Rows of an anchor, not ids; both in the order of their stamps.
-IMU_SAMPLE = _record(("t", float), ("gyro", float, 3), ("accel", float, 3))  # s, rad/s, m/s^2 (specific force); body
+IMU_SAMPLE = _record(
+    ("t", float), ("gyro", float, 3), ("accel", float, 3)
+)  # s, rad/s, m/s^2 (specific force); body
 TDOA = _record(
-    ("t", float), ("a", int), ("b", int), ("d", float), ("variance", float),  # s, rows, m (corrected), m^2 (beyond tdoa_std)
-    ("slope", float, N_STATES), ("state", float, N_STATES),  # of the bias taken out, with position and velocity, about a state; m, m/s
-)  # fmt: skip
-AID = _record(("t", float), ("kind", int), ("value", float, 4), ("std", float, 4), ("anchor", int))  # see aids.py
+    ("t", float),
+    ("a", int),
+    ("b", int),
+    ("d", float),
+    ("variance", float),  # s, rows, m (corrected), m^2 (beyond tdoa_std)
+    ("slope", float, N_STATES),
+    (
+        "state",
+        float,
+        N_STATES,
+    ),  # of the bias taken out, with position and velocity, about a state; m, m/s
+)
+AID = _record(
+    ("t", float), ("kind", int), ("value", float, 4), ("std", float, 4), ("anchor", int)
+)  # see aids.py
 
 # One estimate of the state, for one direction that the tag may have started in.
 HYPOTHESIS = _record(
@@ -59,7 +78,11 @@ IMU_STATE = _record(
     ("slow_accel", float, 3),  # m/s^2, low pass
     ("vibration", float, 3),  # m^2/s^4, power of what is faster
     ("mean_accel", float, 3),  # m/s^2, over a longer time
-    ("rectified", float, 3),  # 0 to 1: power of what of it does not hover, lately, beside that of the vibration
+    (
+        "rectified",
+        float,
+        3,
+    ),  # 0 to 1: power of what of it does not hover, lately, beside that of the vibration
     ("gyro_power", float, 3),  # rad^2/s^2
     ("accel_weight", float, 3),  # of the measurement against hovering, 0 to 1, by inertial.weigh
     ("accel_psd", float, 3),  # (m/s^2)^2/Hz, of the noise that this leaves
@@ -93,7 +116,12 @@ ANCHOR = _record(
     ("heard", float),  # s, stamp of the last TDOA that was used
     ("delay", float),  # m, that it is found to have since it changed in flight,
     ("delay_variance", float),  # and its variance, m^2;
-    ("late", float),  # probability that it is late because tag and anchor are near the ground, see ground.py, 0: it cannot be,
+    (
+        "late",
+        float,
+        # probability that it is late because tag and anchor are near the ground, see ground.py, 0: it
+        # cannot be,
+    ),
     ("predicted", float),  # s, stamp to which that was predicted;
     ("floor_delay", float),  # m, by which it was late at a tag on the ground, NaN: nobody knows,
     ("floor_std", float),  # m, and its standard deviation
@@ -136,7 +164,11 @@ VELOCITY = _record(
 )
 
 YAW_DOUBT = _record(
-    ("response", float, (2, ERROR_STATES)),  # of the error state to cos(psi) - 1 and sin(psi), for a yaw that is wrong by psi
+    (
+        "response",
+        float,
+        (2, ERROR_STATES),
+    ),  # of the error state to cos(psi) - 1 and sin(psi), for a yaw that is wrong by psi
     ("vector", float, 2),  # of the least squares of late innovations by these two,
     ("information", float, (2, 2)),  # and the upper triangle of its matrix
     ("turned", float),  # rad, by which updates have turned the yaw of late,
@@ -158,40 +190,85 @@ EKF = _record(
     ("barometer", BAROMETER),
     ("velocity", VELOCITY),
     ("ranged", AID, 1),  # the last distance to an anchor
-    ("range_offset", float, 2),  # m, of all distances, when it was known best, and its variance, m^2; inf: it was not looked for
+    (
+        "range_offset",
+        float,
+        2,
+        # m, of all distances, when it was known best, and its variance, m^2; inf: it was not looked for
+    ),
     ("next_floor", float),  # s, stamp before which not to hold the tag on its floor again
     ("sensed", bool),  # inertial samples drive the prediction
-    ("rival", float, 3),  # m, another place that late TDOAs agree on, and the motion that sensors feel does not lead to;
+    (
+        "rival",
+        float,
+        3,
+        # m, another place that late TDOAs agree on, and the motion that sensors feel does not lead to;
+    ),
     ("rival_since", float),  # s, stamps: since when they do,
     ("rival_until", float),  # and until when the tag may be there
     ("plausibility", PLAUSIBILITY),  # of the inertial samples,
     ("distrusted", bool),  # which are not used, because they cannot be right
     ("yaw_doubt", YAW_DOUBT),  # see yaw_doubt.py
-    ("levelled", float),  # s, stamp until which they are averaged, where the filter ran before there were any; -inf: they are used
+    (
+        "levelled",
+        float,
+        # s, stamp until which they are averaged, where the filter ran before there were any; -inf: they
+        # are used
+    ),
     ("quiet", bool),  # the inertial sensor neither shakes nor turns
     ("resting", bool),  # the tag does not move, see rest.py,
-    ("floor_place", float, 2),  # m, x and y of where anchors are known to be late on the ground, NaN: anywhere,
+    (
+        "floor_place",
+        float,
+        2,
+    ),  # m, x and y of where anchors are known to be late on the ground, NaN: anywhere,
     ("late_as_known", bool),  # and they are, where the tag came to rest last
     ("rest_since", float),  # s, stamps: since when,
     ("next_look", float),  # and before which not to look again,
-    ("doubts", int),  # looks in a row in which its TDOAs have changed, and in which it was not known to rest
+    (
+        "doubts",
+        int,
+    ),  # looks in a row in which its TDOAs have changed, and in which it was not known to rest
     ("stills", int),  # but neither TDOAs nor inertial samples showed that it moves,
-    ("shaking", float),  # m^2/s^4, power of the vibration of a tag that is not at rest, over some seconds
+    (
+        "shaking",
+        float,
+    ),  # m^2/s^4, power of the vibration of a tag that is not at rest, over some seconds
     ("lift", float, 3),  # m/s, that the inertial sensor has felt lately at rest, in the world
-    ("sure", float),  # s, stamp at which the inertial sensor was sound and TDOAs agreed with the filter last
+    (
+        "sure",
+        float,
+    ),  # s, stamp at which the inertial sensor was sound and TDOAs agreed with the filter last
     ("extent", float, (2, 3)),  # m, lower and upper bounds: of all anchors,
     ("within", float, (2, 3)),  # of the reach of those that were heard lately,
     ("workspace", float, (2, 3)),  # and of where the tag is expected, see workspace.py
     ("side", float, 3),  # on which the tag is of anchors in a plane, see workspace.configured_side
-    ("flat", float, 3),  # 1.0 for axes along which these are at one coordinate, while it is not known on which side of that the tag is
+    (
+        "flat",
+        float,
+        3,
+        # 1.0 for axes along which these are at one coordinate, while it is not known on which side of
+        # that the tag is
+    ),
     ("middle", float, 3),  # m, of the anchors heard lately
     ("next_bounds", float),  # s, stamp before which not to look anew who is heard
-    ("information", float, (3, 3)),  # 1/m^2, of the place, that one arrival from each anchor heard lately gives, see systematic.py
-    ("unsure_until", float),  # s, stamp until which the tag may be anywhere, as its place was hardly known before
+    (
+        "information",
+        float,
+        (3, 3),
+        # 1/m^2, of the place, that one arrival from each anchor heard lately gives, see systematic.py
+    ),
+    (
+        "unsure_until",
+        float,
+    ),  # s, stamp until which the tag may be anywhere, as its place was hardly known before
     ("waits_until", float),  # s, stamp until which its TDOAs wait for a search
     ("consistency", float),  # share of the latest TDOAs that agree with the best hypothesis
     ("recoveries", int),
-    ("first_tdoa", float),  # s, stamps: of the first TDOA since the filter stopped, and the last one
+    (
+        "first_tdoa",
+        float,
+    ),  # s, stamps: of the first TDOA since the filter stopped, and the last one
     ("last_tdoa", float),
     ("next_search", float),  # s, stamps before which not to do again: look for the tag,
     ("next_odometry", float),
@@ -200,7 +277,11 @@ EKF = _record(
     ("kept", int),  # TDOAs in the window
     ("window", TDOA, 2 * WINDOW),  # recent TDOAs, oldest first
     ("recorded", int),  # records written to the history, see history.py
-    ("since_record", float, (ERROR_STATES, ERROR_STATES)),  # transition of the best hypothesis since the last record
+    (
+        "since_record",
+        float,
+        (ERROR_STATES, ERROR_STATES),
+    ),  # transition of the best hypothesis since the last record
     # Scratch: nothing below outlives an event.
     ("transition", TRANSITION),
     ("innovation", INNOVATION),
@@ -212,15 +293,20 @@ EKF = np.dtype((np.record, EKF))  # whose fields Python reads as attributes
 
 # What comes out.
 ODOMETRY = _record(
-    ("t", float), ("x", float, NOMINAL_STATES), ("covariance", float, (9, 9)),  # of [p, v, attitude]
+    ("t", float),
+    ("x", float, NOMINAL_STATES),
+    ("covariance", float, (9, 9)),  # of [p, v, attitude]
     ("persistent", float, (3, 3)),  # what of it errors that persist make, see systematic.py
-)  # fmt: skip
-RESIDUAL = _record(("innovation", float), ("variance", float), ("weight", float), ("verdict", np.uint8))
+)
+RESIDUAL = _record(
+    ("innovation", float), ("variance", float), ("weight", float), ("verdict", np.uint8)
+)
 
 
 class FilterState(NamedTuple):
-    """State of one filter. ekf : (1,) of EKF; anchors : (N,) of ANCHOR; functions : (k,) of SENSOR_FUNCTION, errors of the inertial
-    sensor that are known."""
+    """State of one filter. ekf : (1,) of EKF; anchors : (N,) of ANCHOR; functions : (k,) of
+    SENSOR_FUNCTION, errors of the inertial sensor that are known.
+    """
 
     ekf: np.ndarray
     anchors: np.ndarray
@@ -237,7 +323,9 @@ class FilterState(NamedTuple):
 
 
 class Measurements(NamedTuple):
-    """What a filter is fed with at once. imu : (n,) of IMU_SAMPLE; tdoa : (k,) of TDOA; aids : (m,) of AID."""
+    """What a filter is fed with at once. imu : (n,) of IMU_SAMPLE; tdoa : (k,) of TDOA; aids : (m,)
+    of AID.
+    """
 
     imu: np.ndarray
     tdoa: np.ndarray
@@ -245,8 +333,11 @@ class Measurements(NamedTuple):
 
 
 class Output(NamedTuple):
-    """Room for what it makes of that. odometry : at least (n + k + m,) of ODOMETRY; residuals : (k,) of RESIDUAL;
-    history : of history.RECORD, with room for engine.most_records, or empty for no recording; aids : (m,) of RESIDUAL."""
+    """Room for what it makes of that. odometry : at least (n + k + m,) of ODOMETRY; residuals :
+    (k,) of RESIDUAL;
+    history : of history.RECORD, with room for engine.most_records, or empty for no recording; aids
+        : (m,) of RESIDUAL.
+    """
 
     odometry: np.ndarray
     residuals: np.ndarray
@@ -254,9 +345,12 @@ class Output(NamedTuple):
     aids: np.ndarray = np.empty(0, RESIDUAL)
 
 
-def new_state(positions: np.ndarray, functions: Sequence[SensorFunction] = (), floor: Floor | None = None) -> FilterState:
-    """FilterState of a filter that has seen nothing; positions : (N, 3) m, of the anchors; functions : SensorFunctions; floor : as of
-    `EffectSet.on_floor`."""
+def new_state(
+    positions: np.ndarray, functions: Sequence[SensorFunction] = (), floor: Floor | None = None
+) -> FilterState:
+    """FilterState of a filter that has seen nothing; positions : (N, 3) m, of the anchors;
+    functions : SensorFunctions; floor : as of `EffectSet.on_floor`.
+    """
     state = FilterState(np.zeros(1, EKF), np.zeros(len(positions), ANCHOR), rows_of(functions))
     state.anchors["position"] = positions
     state.record.extent[:] = np.min(positions, axis=0), np.max(positions, axis=0)
@@ -264,7 +358,11 @@ def new_state(positions: np.ndarray, functions: Sequence[SensorFunction] = (), f
     for stamp in ("learned", "predicted", "heard"):
         state.anchors[stamp] = -np.inf
     ekf = state.record
-    state.anchors["floor_delay"], state.anchors["floor_std"], ekf["floor_place"][:] = floor or (np.nan, 0.0, np.nan)
+    state.anchors["floor_delay"], state.anchors["floor_std"], ekf["floor_place"][:] = floor or (
+        np.nan,
+        0.0,
+        np.nan,
+    )
     for stamp in (
         "t",
         "first_tdoa",
@@ -300,8 +398,9 @@ def new_state(positions: np.ndarray, functions: Sequence[SensorFunction] = (), f
 
 
 def structured(kind: np.dtype, *columns: Any) -> np.ndarray:
-    """(n,) array of a type of this module; columns : one array for each of its fields, in their order; of the last ones that are not
-    given, 0."""
+    """(n,) array of a type of this module; columns : one array for each of its fields, in their
+    order; of the last ones that are not given, 0.
+    """
     out = np.zeros(len(columns[0]), kind)
     for name, column in zip(kind.names or (), columns):
         out[name] = column
@@ -309,7 +408,9 @@ def structured(kind: np.dtype, *columns: Any) -> np.ndarray:
 
 
 def joined(kind: np.dtype, parts: Sequence[np.ndarray]) -> np.ndarray:
-    """(n,) array of a type of this module, of several one after the other; numpy finds out anew for each what the type of all is."""
+    """(n,) array of a type of this module, of several one after the other; numpy finds out anew for
+    each what the type of all is.
+    """
     if len(parts) == 1:
         return parts[0]
     out, first = np.empty(sum(map(len, parts)), kind), 0

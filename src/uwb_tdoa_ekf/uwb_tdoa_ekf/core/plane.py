@@ -1,7 +1,8 @@
-"""A vehicle on its floor: the height is known, and of a planar one also that it is level and does not rise. What cannot move sideways does
-not.
+"""A vehicle on its floor: the height is known, and of a planar one also that it is level and does
+not rise. What cannot move sideways does not.
 
-What is given once is not known better by being repeated: a state is held where the filter knows less of it than that.
+What is given once is not known better by being repeated: a state is held where the filter knows
+less of it than that.
 """
 
 from __future__ import annotations
@@ -49,25 +50,33 @@ def hold(ekf: Record, parameters: Record, t: float, records: np.ndarray) -> None
             if best:
                 add_update(ekf, t, records)
         for axis in range(2):
-            if parameters.planar and _is_tilted(hypothesis, axis, parameters.tilt_std, R, innovation):
+            if parameters.planar and _is_tilted(
+                hypothesis, axis, parameters.tilt_std, R, innovation
+            ):
                 kalman(hypothesis, innovation)
                 if best:
                     add_update(ekf, t, records)
             if rolls:
-                velocity.compare(hypothesis, 0.0, parameters.non_holonomic_std, 1 + axis, R, innovation)
+                velocity.compare(
+                    hypothesis, 0.0, parameters.non_holonomic_std, 1 + axis, R, innovation
+                )
                 total = innovation.prior_variance + innovation.noise_variance
                 w = weight(GEMAN_MCCLURE, innovation.value / math.sqrt(total), velocity.GATE)
                 alike = 2.0 * velocity.CORRELATION_TIME / PERIOD
-                innovation.total_variance = innovation.prior_variance + innovation.noise_variance * alike / w
+                innovation.total_variance = (
+                    innovation.prior_variance + innovation.noise_variance * alike / w
+                )
                 kalman(hypothesis, innovation)
                 if best:
                     add_update(ekf, t, records)
 
 
 @compiled
-def _is_tilted(hypothesis: Record, axis: int, std: float, R: np.ndarray, innovation: Record) -> bool:
-    """Fill in that the vertical has no component along an axis of the body, 0 or 1, and R (3, 3), body to world. Returns whether a
-    HYPOTHESIS knows less of that.
+def _is_tilted(
+    hypothesis: Record, axis: int, std: float, R: np.ndarray, innovation: Record
+) -> bool:
+    """Fill in that the vertical has no component along an axis of the body, 0 or 1, and R (3, 3),
+    body to world. Returns whether a HYPOTHESIS knows less of that.
 
     u = R' e_z; with the true attitude R Exp(dtheta), du = u x dtheta.
     """
@@ -85,11 +94,20 @@ def _is_tilted(hypothesis: Record, axis: int, std: float, R: np.ndarray, innovat
 
 @compiled
 def flatten(row: Record, parameters: Record, wrong: float) -> None:
-    """Make one of ODOMETRY that of a planar vehicle: at its height, level, neither rising nor tilting; with the deviations that these have.
-    wrong : m, by which TDOAs contradict the height."""
+    """Make one of ODOMETRY that of a planar vehicle: at its height, level, neither rising nor
+    tilting; with the deviations that these have.
+    wrong : m, by which TDOAs contradict the height.
+    """
     x, P = row.x, row.covariance
     yaw = math.atan2(2.0 * (x[9] * x[8] + x[6] * x[7]), 1.0 - 2.0 * (x[7] ** 2 + x[8] ** 2))
-    x[2], x[5], x[6], x[7], x[8], x[9] = parameters.fixed_height, 0.0, 0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw)
+    x[2], x[5], x[6], x[7], x[8], x[9] = (
+        parameters.fixed_height,
+        0.0,
+        0.0,
+        0.0,
+        math.sin(0.5 * yaw),
+        math.cos(0.5 * yaw),
+    )
     row.persistent[2, :] = 0.0
     row.persistent[:, 2] = 0.0
     for state in (2, 5, 6, 7):

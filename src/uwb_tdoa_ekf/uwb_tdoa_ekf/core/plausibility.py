@@ -1,8 +1,9 @@
-"""Can it be what an inertial sensor says? Gravity is 9.81 m/s^2 long and turns as the gyroscope says it does.
+"""Can it be what an inertial sensor says? Gravity is 9.81 m/s^2 long and turns as the gyroscope
+says it does.
 
-A sensor in another unit, or turned, is left out within tenths of a second, and used again after some time without evidence against
-it. Samples and their stamps alone decide. The limits are beyond what 22 measured flights show, a crash among them; a multirotor
-that flips is taken for a fault.
+A sensor in another unit, or turned, is left out within tenths of a second, and used again after
+some time without evidence against it. Samples and their stamps alone decide. The limits are beyond
+what 22 measured flights show, a crash among them; a multirotor that flips is taken for a fault.
 """
 
 from __future__ import annotations
@@ -14,13 +15,18 @@ import numpy as np
 from uwb_tdoa_bias.foundation.compiled import Record, compiled
 from uwb_tdoa_bias.foundation.vibration import low_pass
 
-# m/s^2, mean specific force over VIBRATION_CORNER: upwards, and in all; a multirotor comes down with 3, turns with 30
+# m/s^2, mean specific force over VIBRATION_CORNER: upwards, and in all; a multirotor comes down
+# with 3, turns with 30
 LIGHTEST, HEAVIEST = 2.5, 50.0
 TOO_LONG = 0.25  # s for which it may be beyond: falling, or landing
 DOWNWARDS = -2.0  # m/s^2, upwards, that nothing flies with
 FASTEST, TOO_FAR = 10.0, 4.0  # rad/s that a tag may turn, and rad beyond that for a moment
-MEMORY = 2.0  # s after which upwards is what the accelerometer says, not what the gyroscope has made of it
-UPRIGHT, AXIS = math.cos(math.radians(35.0)), math.cos(math.radians(25.0))  # tilt, and of an axis that points up instead
+# s after which upwards is what the accelerometer says, not what the gyroscope has made of it
+MEMORY = 2.0
+UPRIGHT, AXIS = (
+    math.cos(math.radians(35.0)),
+    math.cos(math.radians(25.0)),
+)  # tilt, and of an axis that points up instead
 LYING = 3.0  # s for which a tag may lie on its side or its back
 CLEARED = 1.5  # s without evidence after which the samples are used again
 
@@ -29,8 +35,10 @@ WEIGHT, TURN, RATE, TILT = range(1, 5)  # what is impossible
 
 @compiled
 def update(check: Record, imu: Record, sample: Record, continuous: bool, distrusted: bool) -> bool:
-    """Whether to go without inertial samples from this IMU_SAMPLE on. check : PLAUSIBILITY, which is updated; imu : IMU_STATE after
-    `observe` of the sample and before `store`; continuous : what that returned; distrusted : what this returned before."""
+    """Whether to go without inertial samples from this IMU_SAMPLE on. check : PLAUSIBILITY, which
+    is updated; imu : IMU_STATE after `observe` of the sample and before `store`; continuous : what
+    that returned; distrusted : what this returned before.
+    """
     t, force, up = sample.t, imu.slow_accel, check.up
     if not continuous:
         check.weighed = check.upright = t
@@ -47,7 +55,11 @@ def update(check: Record, imu: Record, sample: Record, continuous: bool, distrus
         rate += imu.gyro[k] ** 2
         if abs(force[k]) > abs(force[tallest]):
             tallest = k
-    weight, upwards, rate = math.sqrt(weight), upwards / max(math.sqrt(length), 1e-9), math.sqrt(rate)
+    weight, upwards, rate = (
+        math.sqrt(weight),
+        upwards / max(math.sqrt(length), 1e-9),
+        math.sqrt(rate),
+    )
     if upwards > LIGHTEST and weight < HEAVIEST:
         check.weighed = t
     check.spun = min(max(check.spun + (rate - FASTEST) * dt, 0.0), TOO_FAR)
@@ -74,7 +86,9 @@ def _contradict(check: Record, force: np.ndarray, t: float, reason: int, size: f
 
 @compiled
 def _turn(vector: np.ndarray, rate: np.ndarray, dt: float) -> None:
-    """Turn a constant vector of the world, given in the body frame, (3,), by -rate (3,) rad/s for dt s (Rodrigues)."""
+    """Turn a constant vector of the world, given in the body frame, (3,), by -rate (3,) rad/s for
+    dt s (Rodrigues).
+    """
     angle = dt * math.sqrt(rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2)
     if angle < 1e-12:
         return

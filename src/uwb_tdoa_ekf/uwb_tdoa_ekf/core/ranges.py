@@ -1,6 +1,7 @@
 """Two-way ranging: the distance to an anchor.
 
-Two distances, one after the other, are a TDOA: by such TDOAs the filter starts, and finds a tag again that it has lost.
+Two distances, one after the other, are a TDOA: by such TDOAs the filter starts, and finds a tag
+again that it has lost.
 """
 
 from __future__ import annotations
@@ -22,7 +23,12 @@ def pair(ekf: Record, aid: Record) -> bool:
     """Make the TDOA of a range, one of AID, and the one before; returns whether they are one."""
     before, made = ekf.ranged[0], ekf.paired[0]
     apart = before.anchor != aid.anchor and aid.t - before.t < APART
-    made.t, made.a, made.b, made.d = aid.t, before.anchor, aid.anchor, aid.value[0] - before.value[0]
+    made.t, made.a, made.b, made.d = (
+        aid.t,
+        before.anchor,
+        aid.anchor,
+        aid.value[0] - before.value[0],
+    )
     made.variance = aid.std[0] ** 2 + before.std[0] ** 2
     made.slope[:], made.state[:] = 0.0, 0.0
     ekf.ranged[0] = aid
@@ -60,7 +66,9 @@ def compare(
 
 @compiled
 def keep_offset(ekf: Record, hypothesis: Record) -> None:
-    """After the update of a HYPOTHESIS: its offset of all ranges, where it was never known better; later it may be forgotten."""
+    """After the update of a HYPOTHESIS: its offset of all ranges, where it was never known better;
+    later it may be forgotten.
+    """
     variance = hypothesis.offset_P[RANGE, RANGE]
     if 0.0 < variance < ekf.range_offset[1]:
         ekf.range_offset[0], ekf.range_offset[1] = hypothesis.offset[RANGE], variance

@@ -1,7 +1,8 @@
-"""A tag that does not move: its velocity is zero, and what it hears from one place tells that place once.
+"""A tag that does not move: its velocity is zero, and what it hears from one place tells that place
+once.
 
-Inertial samples alone cannot tell rest from a steady glide, and they shake while rotors idle on the ground. TDOAs can, whatever
-their systematic errors are: at rest they stay what they are.
+Inertial samples alone cannot tell rest from a steady glide, and they shake while rotors idle on the
+ground. TDOAs can, whatever their systematic errors are: at rest they stay what they are.
 """
 
 from __future__ import annotations
@@ -19,32 +20,59 @@ from .state import GRAVITY, rotation
 from .update import update_state
 
 PERIOD = 0.05  # s between zero-velocity updates
-QUIET_STD, SHAKING_STD = 0.02, 0.15  # m/s, standard deviation of such an update: of a quiet inertial sensor, and of one that shakes
+QUIET_STD, SHAKING_STD = (
+    0.02,
+    0.15,
+)  # m/s, standard deviation of such an update: of a quiet inertial sensor, and of one that shakes
 SPEED = 0.05  # m/s; a quiet tag that is known to be slower stands, a faster one may glide
 LOOK_PERIOD, LOOK_WINDOW = 0.1, 0.4  # s between two looks at the TDOAs, and s of TDOAs in each
-MOST_DOUBTS = 3  # looks in a row with changed TDOAs that end a rest: one look in twenty shows a change by chance
-UNFELT = 0.06  # m/s; where the inertial sensor has felt more lift than that, one such look ends the rest
-LONG = 10  # looks in a row without a change that begin the rest of a quiet tag: fewer may be a turning point
-EARLY, LONG_ENOUGH = 1.5, 3  # s after the start, or after its last rest began, within which so many looks are enough
+# looks in a row with changed TDOAs that end a rest: one look in twenty shows a change by chance
+MOST_DOUBTS = 3
+UNFELT = (
+    0.06  # m/s; where the inertial sensor has felt more lift than that, one such look ends the rest
+)
+# looks in a row without a change that begin the rest of a quiet tag: fewer may be a turning point
+LONG = 10
+EARLY, LONG_ENOUGH = (
+    1.5,
+    3,
+)  # s after the start, or after its last rest began, within which so many looks are enough
 AGAIN = 0.3  # s between two corrections of a tag that is near the ground, and is not known to stand
-GATE = 3.0  # standard deviations of the velocity that inertial samples tell, beyond which the tag moves
-CALM, SHAKING_MEMORY = 0.1, 2.0  # rotors or wheels have stopped when the vibration is below that share of its mean over so many seconds
-LIFT, QUIET_LIFT = 0.25, 0.1  # m/s that end a rest when the inertial sensor feels them: upwards, and to any side where it is quiet
+# standard deviations of the velocity that inertial samples tell, beyond which the tag moves
+GATE = 3.0
+CALM, SHAKING_MEMORY = (
+    0.1,
+    2.0,
+    # rotors or wheels have stopped when the vibration is below that share of its mean over so many
+    # seconds
+)
+LIFT, QUIET_LIFT = (
+    0.25,
+    0.1,
+    # m/s that end a rest when the inertial sensor feels them: upwards, and to any side where it is
+    # quiet
+)
 LIFT_MEMORY = 0.7  # s over which what it feels adds up
 AWAY = 1.5  # s after such an end, for which the tag is not taken for one at rest again
 SILENT = 0.5  # s without TDOAs after which a tag that shakes is not known to be at rest
-SAME_ERROR = 0.01  # s; TDOAs of a tag at rest have the same errors: those of each such interval repeat what is known once more
+# s; TDOAs of a tag at rest have the same errors: those of each such interval repeat what is known
+# once more
+SAME_ERROR = 0.01
 
 
 @compiled
 def repetition(ekf: Record, t: float) -> float:
-    """Factor on the variance of a TDOA stamped t, s: how many times over the TDOAs of this rest have measured the same, errors included."""
+    """Factor on the variance of a TDOA stamped t, s: how many times over the TDOAs of this rest
+    have measured the same, errors included.
+    """
     return 1.0 + (t - ekf.rest_since) / SAME_ERROR if ekf.resting else 1.0
 
 
 @compiled
 def feel(ekf: Record, sample: Record, dt: float, records: np.ndarray) -> None:
-    """Take an IMU_SAMPLE of a tag that is at rest, dt s after the one before: if it is lifted, it moves as fast as that has made it."""
+    """Take an IMU_SAMPLE of a tag that is at rest, dt s after the one before: if it is lifted, it
+    moves as fast as that has made it.
+    """
     if not ekf.resting:
         ekf.shaking += min(1.0, dt / SHAKING_MEMORY) * (np.sum(ekf.imu.vibration) - ekf.shaking)
         return
@@ -72,9 +100,16 @@ def feel(ekf: Record, sample: Record, dt: float, records: np.ndarray) -> None:
 
 @compiled
 def look(
-    ekf: Record, anchors: np.ndarray, parameters: Record, window: np.ndarray, t: float, records: np.ndarray
+    ekf: Record,
+    anchors: np.ndarray,
+    parameters: Record,
+    window: np.ndarray,
+    t: float,
+    records: np.ndarray,
 ) -> None:
-    """Whether the tag is at rest, by a window (n,) of TDOA up to stamp t, s, where that can be; not before ekf.next_look."""
+    """Whether the tag is at rest, by a window (n,) of TDOA up to stamp t, s, where that can be; not
+    before ekf.next_look.
+    """
     ekf.next_look = t + LOOK_PERIOD
     best = ekf.hypotheses[ekf.best]
     calm = ekf.quiet or np.sum(ekf.imu.vibration) < CALM * ekf.shaking
@@ -83,7 +118,9 @@ def look(
     count = ground.find_pairs(window, ekf.pairs)
     motion = ground.judge_motion(ekf.pairs[:count], anchors, best.x, ekf.still_covariance)
     still = motion == ground.STILL
-    unshown = motion == ground.UNKNOWN and ekf.quiet  # too few TDOAs: no evidence, and neither has the inertial sensor any
+    unshown = (
+        motion == ground.UNKNOWN and ekf.quiet
+    )  # too few TDOAs: no evidence, and neither has the inertial sensor any
     if ekf.resting:
         if not unshown:
             ekf.doubts = 0 if still else ekf.doubts + 1
@@ -95,7 +132,9 @@ def look(
             ekf.stills = ekf.stills + 1 if still and ekf.quiet else 0
         stands = calm and (still or ekf.quiet)
         place, covariance = np.empty(3), np.empty((3, 3))
-        lateness = standing.find_landed(ekf, ekf.pairs[:count], anchors, parameters, still, place, covariance)
+        lateness = standing.find_landed(
+            ekf, ekf.pairs[:count], anchors, parameters, still, place, covariance
+        )
         landed = lateness >= 0
         if landed and stands:
             ekf.late_as_known = lateness == ground.KNOWN
@@ -116,7 +155,9 @@ def look(
 
 @compiled
 def update_zero_velocity(ekf: Record, t: float, records: np.ndarray) -> None:
-    """Zero velocity, one axis after the other, for a tag at rest, and for a quiet one that TDOAs have shown to be slow."""
+    """Zero velocity, one axis after the other, for a tag at rest, and for a quiet one that TDOAs
+    have shown to be slow.
+    """
     if ekf.resting and not ekf.quiet and t - ekf.last_tdoa > SILENT:
         ekf.resting = False
     if not (ekf.resting or ekf.quiet) or t < ekf.next_rest:

@@ -1,4 +1,6 @@
-"""Errors of the inertial sensor that change with the state of the filter: taken out of each sample at the best hypothesis."""
+"""Errors of the inertial sensor that change with the state of the filter: taken out of each sample
+at the best hypothesis.
+"""
 
 from __future__ import annotations
 
@@ -12,23 +14,34 @@ from uwb_tdoa_bias.effects.sensor_function import STEPS, SensorFunction
 from uwb_tdoa_bias.foundation.compiled import Record, compiled
 
 SENSORS = ("gyro", "accel")
-SPEED, CLIMB_RATE = OF_STATE.index("speed"), OF_STATE.index("climb_rate")  # those before them are the position
+SPEED, CLIMB_RATE = (
+    OF_STATE.index("speed"),
+    OF_STATE.index("climb_rate"),
+)  # those before them are the position
 
 # A SensorFunction, by its fields.
 SENSOR_FUNCTION = np.dtype(
     [
-        ("sensor", np.int64), ("axis", np.int64), ("covariate", np.int64),  # the first and the last by their places
-        ("low", float), ("high", float), ("values", float, STEPS + 1), ("periodic", np.bool_),
+        ("sensor", np.int64),
+        ("axis", np.int64),
+        ("covariate", np.int64),  # the first and the last by their places
+        ("low", float),
+        ("high", float),
+        ("values", float, STEPS + 1),
+        ("periodic", np.bool_),
     ],
     align=True,
-)  # fmt: skip
+)
 
 
 def rows_of(functions: Sequence[SensorFunction]) -> np.ndarray:
     """(k,) of SENSOR_FUNCTION, of SensorFunctions."""
     out = np.zeros(len(functions), SENSOR_FUNCTION)
     for row, function in zip(out, functions):
-        row["sensor"], row["covariate"] = SENSORS.index(function.sensor), OF_STATE.index(function.covariate)
+        row["sensor"], row["covariate"] = (
+            SENSORS.index(function.sensor),
+            OF_STATE.index(function.covariate),
+        )
         for name in ("axis", "low", "high", "values", "periodic"):
             row[name] = getattr(function, name)
     return out

@@ -1,7 +1,8 @@
-"""Where a tag is that does not move: on the ground, with anchors that are late there, or somewhere else.
+"""Where a tag is that does not move: on the ground, with anchors that are late there, or somewhere
+else.
 
-Nothing is assumed: the explanations are weighed by their probability, and the covariance of the one that is taken is as wide as they
-are apart.
+Nothing is assumed: the explanations are weighed by their probability, and the covariance of the one
+that is taken is as wide as they are apart.
 """
 
 from __future__ import annotations
@@ -13,10 +14,10 @@ import numpy as np
 from uwb_tdoa_bias.foundation.compiled import Record, compiled
 
 from . import auxiliary, ground
+from .ground import Evidence, KnownHeight
 from .history import add_reset, add_update
 from .hypotheses import alive
 from .memory import HYPOTHESES
-from .ground import Evidence, KnownHeight
 from .startup import Places, locate, room_for
 from .update import update_state
 from .workspace import surround
@@ -28,20 +29,33 @@ SPEED_STD = 0.05  # m/s, of a tag at rest, beyond what its TDOAs tell
 ABSURD = 20.0  # that a tag that rests is more than NEAR above or below the anchors,
 UNUSUAL = 3.0  # that anchors are late because they are near the ground, by what nobody knows,
 REACH = 1.0  # m from where they are known to be late, over which echoes become others
-DECISIVE = 6.0  # and by how much the ground must be more probable than what the filter says of a tag that lands
+# and by how much the ground must be more probable than what the filter says of a tag that lands
+DECISIVE = 6.0
 HOVER_STD = 0.3  # m, of the place of a tag that seems to stand but may hover
 FEWEST_LATE = 1.5  # anchors that are late because the tag is low, where its TDOAs change
-LANDING_STD = 0.2, 0.2, 0.5  # m, by which the filter may be wrong beyond what it says when a tag lands: mostly in height
+LANDING_STD = (
+    0.2,
+    0.2,
+    0.5,
+)  # m, by which the filter may be wrong beyond what it says when a tag lands: mostly in height
 
 
 @compiled
 def weigh(
-    ekf: Record, pairs: np.ndarray, anchors: np.ndarray, parameters: Record, height: KnownHeight, x: np.ndarray, covariance: np.ndarray
+    ekf: Record,
+    pairs: np.ndarray,
+    anchors: np.ndarray,
+    parameters: Record,
+    height: KnownHeight,
+    x: np.ndarray,
+    covariance: np.ndarray,
 ) -> float:
-    """Weigh the explanations of (k,) of ground.PAIR by a tag at rest that may be anywhere in its workspace: position x (6,) with its
-    covariance (6, 6), and the ground, with each lateness of ground.explain.
+    """Weigh the explanations of (k,) of ground.PAIR by a tag at rest that may be anywhere in its
+    workspace: position x (6,) with its covariance (6, 6), and the ground, with each lateness of
+    ground.explain.
 
-    The best one goes to x and covariance. Returns the logarithm of how much more probable the ground is.
+    The best one goes to x and covariance. Returns the logarithm of how much more probable the
+    ground is.
     """
     prior, bounds = np.zeros((4, 3)), ekf.workspace
     for k in range(3):
@@ -49,7 +63,9 @@ def weigh(
         prior[1 + k, k] = 1.0 / half**2
     evidence, explained = Evidence(pairs, anchors, bounds, prior, parameters), _explanations()
     explained.x[0] = x[:3]
-    explained.cost[0] = ground.explain(evidence, height, ground.IN_TIME, explained.x[0], explained.covariance[0])
+    explained.cost[0] = ground.explain(
+        evidence, height, ground.IN_TIME, explained.x[0], explained.covariance[0]
+    )
     starts, near = np.empty((4, 2)), np.empty((2, 3))
     surround(ekf, NEAR, near)
     near[0, 2] = min(near[0, 2], parameters.ground_height)
@@ -57,7 +73,9 @@ def weigh(
     explained.x[0], explained.covariance[0] = x[:3], covariance[:3, :3]
     for start in range(4):
         for k in range(2):
-            starts[start, k] = near[0, k] + (near[1, k] - near[0, k]) * (0.75 if (start >> k) & 1 else 0.25)
+            starts[start, k] = near[0, k] + (near[1, k] - near[0, k]) * (
+                0.75 if (start >> k) & 1 else 0.25
+            )
     _on_ground(ekf, evidence, height, starts, explained)
     best = _mix(explained)
     ekf.late_as_known = best == 1 + ground.KNOWN
@@ -70,12 +88,16 @@ def weigh(
 
 @compiled
 def _explanations() -> Places:
-    return Places(np.empty((EXPLANATIONS, 3)), np.empty((EXPLANATIONS, 3, 3)), np.empty(EXPLANATIONS))
+    return Places(
+        np.empty((EXPLANATIONS, 3)), np.empty((EXPLANATIONS, 3, 3)), np.empty(EXPLANATIONS)
+    )
 
 
 @compiled
 def sort(places: Places, near: np.ndarray) -> None:
-    """Put the more probable of two places that explain TDOAs first; near : (2, 3) m, bounds of the anchors."""
+    """Put the more probable of two places that explain TDOAs first; near : (2, 3) m, bounds of the
+    anchors.
+    """
     x, covariance, cost = places.x, places.covariance, places.cost
     for place in range(2):
         cost[place] += _absurdity(near, x[place])
@@ -90,11 +112,15 @@ def _absurdity(near: np.ndarray, x: np.ndarray) -> float:
 
 
 @compiled
-def _on_ground(ekf: Record, evidence: Evidence, height: KnownHeight, starts: np.ndarray, explained: Places) -> None:
+def _on_ground(
+    ekf: Record, evidence: Evidence, height: KnownHeight, starts: np.ndarray, explained: Places
+) -> None:
     """Fill in the explanations from 1 on: on the ground, with each lateness, by starts (k, 2) m."""
     position, each, cost = explained.x, explained.covariance, explained.cost
     if math.isnan(height.z):
-        height = KnownHeight(evidence.parameters.ground_height + ground.GROUND_HEIGHT, ground.GROUND_STD)
+        height = KnownHeight(
+            evidence.parameters.ground_height + ground.GROUND_HEIGHT, ground.GROUND_STD
+        )
     trial, its = np.empty(3), np.empty((3, 3))
     known = False
     for row in ground.heard(evidence.pairs)[0]:
@@ -110,12 +136,16 @@ def _on_ground(ekf: Record, evidence: Evidence, height: KnownHeight, starts: np.
     cost[1 + ground.ALIKE] += UNUSUAL
     if known and not math.isnan(ekf.floor_place[0]):
         for axis in range(2):
-            cost[1 + ground.KNOWN] += 0.5 * ((position[1 + ground.KNOWN, axis] - ekf.floor_place[axis]) / REACH) ** 2
+            cost[1 + ground.KNOWN] += (
+                0.5 * ((position[1 + ground.KNOWN, axis] - ekf.floor_place[axis]) / REACH) ** 2
+            )
 
 
 @compiled
 def _mix(explained: Places) -> int:
-    """Place of the most probable explanation; its covariance becomes that of all of them about its position (spread of the means)."""
+    """Place of the most probable explanation; its covariance becomes that of all of them about its
+    position (spread of the means).
+    """
     position, each, cost = explained.x, explained.covariance, explained.cost
     best = int(np.argmin(cost))
     weights = np.exp(cost[best] - cost)
@@ -124,14 +154,19 @@ def _mix(explained: Places) -> int:
         if k != best and weights[k] > 0.0:
             for i in range(3):
                 for j in range(3):
-                    each[best, i, j] += weights[k] * (position[k, i] - position[best, i]) * (position[k, j] - position[best, j])
+                    each[best, i, j] += (
+                        weights[k]
+                        * (position[k, i] - position[best, i])
+                        * (position[k, j] - position[best, j])
+                    )
     return best
 
 
 @compiled
 def stop(x: np.ndarray, covariance: np.ndarray, of_velocity: np.ndarray) -> None:
-    """Position and velocity x (6,) and their covariance (6, 6) become those of a tag at rest, as far as of_velocity (3, 3) m^2/s^2
-    determines them."""
+    """Position and velocity x (6,) and their covariance (6, 6) become those of a tag at rest, as
+    far as of_velocity (3, 3) m^2/s^2 determines them.
+    """
     x[3:] = 0.0
     covariance[:, 3:] = 0.0
     covariance[3:, :] = 0.0
@@ -159,20 +194,36 @@ def _expected_late(pairs: np.ndarray, anchors: np.ndarray) -> float:
 
 @compiled
 def find_landed(
-    ekf: Record, pairs: np.ndarray, anchors: np.ndarray, parameters: Record, still: bool, place: np.ndarray, covariance: np.ndarray
+    ekf: Record,
+    pairs: np.ndarray,
+    anchors: np.ndarray,
+    parameters: Record,
+    still: bool,
+    place: np.ndarray,
+    covariance: np.ndarray,
 ) -> int:
-    """Whether (k,) of PAIR tell that a tag is on the ground: its lateness, as of ground.explain, and -1 if not. Fills in place (3,) m and
-    covariance (3, 3) m^2. still : TDOAs stay what they are."""
+    """Whether (k,) of PAIR tell that a tag is on the ground: its lateness, as of ground.explain,
+    and -1 if not. Fills in place (3,) m and covariance (3, 3) m^2. still : TDOAs stay what they
+    are.
+    """
     best = ekf.hypotheses[ekf.best]
-    if not is_near_ground(best, parameters) or not (still or _expected_late(pairs, anchors) > FEWEST_LATE):
+    if not is_near_ground(best, parameters) or not (
+        still or _expected_late(pairs, anchors) > FEWEST_LATE
+    ):
         return -1
     prior, wide = np.empty((4, 3)), best.P[:3, :3].copy()
     for k in range(3):
         wide[k, k] += LANDING_STD[k] ** 2
     prior[0], prior[1:] = best.x[:3], _inverse(wide)
-    evidence, nowhere, explained = Evidence(pairs, anchors, ekf.workspace, prior, parameters), KnownHeight(np.nan, np.nan), _explanations()
+    evidence, nowhere, explained = (
+        Evidence(pairs, anchors, ekf.workspace, prior, parameters),
+        KnownHeight(np.nan, np.nan),
+        _explanations(),
+    )
     explained.x[0] = best.x[:3]
-    explained.cost[0] = ground.explain(evidence, nowhere, ground.IN_TIME, explained.x[0], explained.covariance[0])
+    explained.cost[0] = ground.explain(
+        evidence, nowhere, ground.IN_TIME, explained.x[0], explained.covariance[0]
+    )
     starts = np.empty((1, 2))
     starts[0, 0], starts[0, 1] = best.x[0], best.x[1]
     _on_ground(ekf, evidence, nowhere, starts, explained)
@@ -185,8 +236,9 @@ def find_landed(
 
 @compiled
 def hover(ekf: Record, place: np.ndarray, still: bool, t: float, records: np.ndarray) -> None:
-    """A tag near the ground that does not stand may hover low: its place (3,) m counts to HOVER_STD, of a tag that is not still the height
-    alone."""
+    """A tag near the ground that does not stand may hover low: its place (3,) m counts to
+    HOVER_STD, of a tag that is not still the height alone.
+    """
     for h in range(HYPOTHESES):
         if not alive(ekf.hypotheses[h]):
             continue
@@ -194,7 +246,9 @@ def hover(ekf: Record, place: np.ndarray, still: bool, t: float, records: np.nda
             value, std = 0.0, HOVER_STD
             if state < 3:
                 value, P = place[state], ekf.hypotheses[h].P
-                P[state, state] = max(P[state, state], HOVER_STD**2)  # a place that is measured again adds nothing new
+                P[state, state] = max(
+                    P[state, state], HOVER_STD**2
+                )  # a place that is measured again adds nothing new
             else:
                 std = math.sqrt(ekf.still_covariance[state - 3, state - 3] + SPEED_STD**2)
             update_state(ekf.hypotheses[h], ekf.innovation, state, value, std)
@@ -204,10 +258,17 @@ def hover(ekf: Record, place: np.ndarray, still: bool, t: float, records: np.nda
 
 @compiled
 def find_again(
-    ekf: Record, pairs: np.ndarray, window: np.ndarray, anchors: np.ndarray, parameters: Record, t: float,
+    ekf: Record,
+    pairs: np.ndarray,
+    window: np.ndarray,
+    anchors: np.ndarray,
+    parameters: Record,
+    t: float,
     records: np.ndarray,
-) -> None:  # fmt: skip
-    """A tag lies still at stamp t, s, but inertial samples have shown that it moves: they were wrong, and it may be anywhere."""
+) -> None:
+    """A tag lies still at stamp t, s, but inertial samples have shown that it moves: they were
+    wrong, and it may be anywhere.
+    """
     places, nowhere = room_for(1), KnownHeight(np.nan, np.nan)
     locate(window, anchors, ekf.workspace, parameters, nowhere, places)
     weigh(ekf, pairs, anchors, parameters, nowhere, places.x[0], places.covariance[0])
@@ -217,8 +278,12 @@ def find_again(
 
 
 @compiled
-def put(ekf: Record, position: np.ndarray, covariance: np.ndarray, t: float, records: np.ndarray) -> None:
-    """Every hypothesis to a position (3,), m, with its covariance (3, 3), at rest; attitude and biases stay."""
+def put(
+    ekf: Record, position: np.ndarray, covariance: np.ndarray, t: float, records: np.ndarray
+) -> None:
+    """Every hypothesis to a position (3,), m, with its covariance (3, 3), at rest; attitude and
+    biases stay.
+    """
     for h in range(HYPOTHESES):
         hypothesis = ekf.hypotheses[h]
         hypothesis.P[:6, :] = 0.0

@@ -1,7 +1,8 @@
 """Where is the tag? A position and velocity from a short window of TDOAs and nothing else.
 
-In a room the search begins in the middle and the corners of its workspace. Where that is large a coarse grid over it says where else to
-begin. TDOAs that are older than a usual window, of a tag that hears few, tell less, as the tag may have moved by any acceleration since.
+In a room the search begins in the middle and the corners of its workspace. Where that is large a
+coarse grid over it says where else to begin. TDOAs that are older than a usual window, of a tag
+that hears few, tell less, as the tag may have moved by any acceleration since.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from uwb_tdoa_bias.foundation.geometry import linearized_tdoa
 from uwb_tdoa_bias.foundation.robust_loss import GEMAN_MCCLURE, geman_mcclure_loss, weight
 
 from .ground import KnownHeight, solve
-from .workspace import reflect, rows_heard, configured_side
+from .workspace import configured_side, reflect, rows_heard
 
 STARTS = 9  # the middle of the workspace and the corners of the half-size box around it,
 GRID_STARTS = 7  # and the best places of a grid over one that is larger than
@@ -25,7 +26,10 @@ LARGE = 20.0  # m, along x or y
 GRID_STEP, GRID_POINTS, GRID_LEVEL = 2.0, 600, 4.0
 GRID_LEVELS = 20  # heights at most: the work has a bound, however far the anchors are apart
 GRID_TDOAS = 60  # of the window, that it looks at
-GRID_LOSS, GRID_APART = 1.5, 2.5  # grid steps: scale of the loss, and between two of the best places
+GRID_LOSS, GRID_APART = (
+    1.5,
+    2.5,
+)  # grid steps: scale of the loss, and between two of the best places
 SWEEPS = 14  # Gauss-Newton steps per start
 COARSE, FINE = 5.0, 0.5  # m, scale of the Geman-McClure loss at the first and the last steps
 SPEED = 1.0  # m/s, standard deviation of the velocity before anything is known
@@ -33,14 +37,18 @@ LONGEST_STEP = 2.0  # m
 INLIER = 0.75  # m, a residual below this does not contradict a position
 NO_SCALE = 1e6  # m, of a loss that is quadratic
 APART = 1.0  # m between two places, and standard deviation of a place that becomes two
-IMPROBABLE = 8.0  # minus the logarithm of the probability of a place beside another, beyond which it is none
+IMPROBABLE = (
+    8.0  # minus the logarithm of the probability of a place beside another, beyond which it is none
+)
 SMALLEST = 1e-300  # m^2, in place of a variance of 0
 SPLIT = 0.8  # standard deviations from the middle of a place to each of two that it becomes
 
 
 class Places(NamedTuple):
-    """Places where a tag may be: positions and velocities x (k, 6) m, m/s (or positions alone, (k, 3)), their covariance (k, 6, 6), and
-    minus the logarithm of the probability of each, up to a constant, cost (k,): inf for a place that is none."""
+    """Places where a tag may be: positions and velocities x (k, 6) m, m/s (or positions alone, (k,
+    3)), their covariance (k, 6, 6), and minus the logarithm of the probability of each, up to a
+    constant, cost (k,): inf for a place that is none.
+    """
 
     x: np.ndarray
     covariance: np.ndarray
@@ -55,19 +63,27 @@ def room_for(count: int) -> Places:
 
 @compiled
 def locate(
-    window: np.ndarray, anchors: np.ndarray, workspace: np.ndarray, parameters: Record, height: KnownHeight, places: Places
+    window: np.ndarray,
+    anchors: np.ndarray,
+    workspace: np.ndarray,
+    parameters: Record,
+    height: KnownHeight,
+    places: Places,
 ) -> float:
     """Robust multilateration over a window, with constant velocity.
 
-    window : (n,) of TDOA, stamps rising; anchors : (N,) of ANCHOR; workspace : (2, 3) m, see workspace.py; parameters : one of
-    PARAMETERS. Fills in places, at the last stamp, with costs less that of the first: the most probable one first, then others that are
-    APART. In a large workspace the covariance of the last one holds those for which there is no room. Returns the share of TDOAs that agree
-    with the first, 0 to 1.
+    window : (n,) of TDOA, stamps rising; anchors : (N,) of ANCHOR; workspace : (2, 3) m, see
+        workspace.py; parameters : one of
+    PARAMETERS. Fills in places, at the last stamp, with costs less that of the first: the most
+    probable one first, then others that are APART. In a large workspace the covariance of the last
+    one holds those for which there is no room. Returns the share of TDOAs that agree with the
+    first, 0 to 1.
 
-    Graduated Geman-McClure: Gauss-Newton from several starts while the loss narrows; the start with the least final
-    loss wins. A tag is in its workspace and slow until proven otherwise: without that prior, the late arrivals on a
-    floor are explained best by a tag ten metres up. The covariance counts one independent error per anchor heard, not
-    per TDOA, because errors persist over the window, and grows with the disagreement that is left.
+    Graduated Geman-McClure: Gauss-Newton from several starts while the loss narrows; the start with
+    the least final loss wins. A tag is in its workspace and slow until proven otherwise: without
+    that prior, the late arrivals on a floor are explained best by a tag ten metres up. The
+    covariance counts one independent error per anchor heard, not per TDOA, because errors persist
+    over the window, and grows with the disagreement that is left.
     """
     x, covariance, cost = places.x, places.covariance, places.cost
     std, ageing = parameters.tdoa_std, np.zeros(len(window))
@@ -76,7 +92,10 @@ def locate(
         ageing[i] = parameters.motion_noise**2 * age**3 / 3.0 / std**2
     mean, prior_std = np.zeros(6), np.full(6, SPEED)
     for k in range(3):
-        mean[k], prior_std[k] = 0.5 * (workspace[0, k] + workspace[1, k]), 0.5 * (workspace[1, k] - workspace[0, k])
+        mean[k], prior_std[k] = (
+            0.5 * (workspace[0, k] + workspace[1, k]),
+            0.5 * (workspace[1, k] - workspace[0, k]),
+        )
     if not math.isnan(height.z):
         mean[2], prior_std[2], prior_std[5] = height.z, height.std, SPEED
     prior_information = 1.0 / prior_std**2
@@ -86,7 +105,9 @@ def locate(
     residuals, system = np.zeros(len(window)), np.zeros((6, 7))
     side = configured_side(rows, anchors, parameters.tag_side)
     large = max(prior_std[0], prior_std[1]) > 0.5 * LARGE
-    starts = STARTS + (_best_of_grid(window, anchors, mean, prior_std, ageing, trials[STARTS:]) if large else 0)
+    starts = STARTS + (
+        _best_of_grid(window, anchors, mean, prior_std, ageing, trials[STARTS:]) if large else 0
+    )
     for start in range(starts):
         trial = trials[start]
         if start < STARTS:
@@ -98,7 +119,12 @@ def locate(
             scale = max(COARSE * 0.7**sweep, FINE)
             reflect(trial, side)
             _normal_equations(window, anchors, trial, ageing, scale, system, residuals)
-            _step(trial, system, correlation_length * max(std, 0.5 * scale) ** 2 * prior_information, mean)
+            _step(
+                trial,
+                system,
+                correlation_length * max(std, 0.5 * scale) ** 2 * prior_information,
+                mean,
+            )
         reflect(trial, side)
         loss = _normal_equations(window, anchors, trial, ageing, FINE, system, residuals)
         far = np.sum(((trial - mean) / prior_std) ** 2)
@@ -127,7 +153,9 @@ def locate(
 
 @compiled
 def _hold_others(trials: np.ndarray, costs: np.ndarray, places: Places) -> None:
-    """Spread the last of the places that is one over the others (m, 6) that are left, whose costs (m,) are inf where they are not."""
+    """Spread the last of the places that is one over the others (m, 6) that are left, whose costs
+    (m,) are inf where they are not.
+    """
     x, covariance, cost = places.x, places.covariance, places.cost
     last = 0
     for place in range(len(x)):
@@ -141,18 +169,29 @@ def _hold_others(trials: np.ndarray, costs: np.ndarray, places: Places) -> None:
             share = math.exp(-costs[other]) / total
             for i in range(3):
                 for j in range(3):
-                    covariance[last, i, j] += share * (trials[other, i] - x[last, i]) * (trials[other, j] - x[last, j])
+                    covariance[last, i, j] += (
+                        share * (trials[other, i] - x[last, i]) * (trials[other, j] - x[last, j])
+                    )
     cost[last] = min(cost[last], -math.log(total))
 
 
 @compiled
 def _best_of_grid(
-    window: np.ndarray, anchors: np.ndarray, mean: np.ndarray, prior_std: np.ndarray, ageing: np.ndarray,
+    window: np.ndarray,
+    anchors: np.ndarray,
+    mean: np.ndarray,
+    prior_std: np.ndarray,
+    ageing: np.ndarray,
     places: np.ndarray,
-) -> int:  # fmt: skip
-    """Fill in places (k, 6), at rest, of a grid over `mean` +- `prior_std` (6,) that explain a window best, apart from each other. Returns
-    how many."""
-    step = max(GRID_STEP, math.sqrt(4.0 * prior_std[0] * prior_std[1] / GRID_POINTS), 2.0 * max(prior_std[0], prior_std[1]) / GRID_POINTS)
+) -> int:
+    """Fill in places (k, 6), at rest, of a grid over `mean` +- `prior_std` (6,) that explain a
+    window best, apart from each other. Returns how many.
+    """
+    step = max(
+        GRID_STEP,
+        math.sqrt(4.0 * prior_std[0] * prior_std[1] / GRID_POINTS),
+        2.0 * max(prior_std[0], prior_std[1]) / GRID_POINTS,
+    )
     counts, origin, steps = np.empty(3, np.int64), np.empty(3), np.empty(3)
     for k in range(3):
         wanted = math.ceil(2.0 * prior_std[k] / (GRID_LEVEL if k == 2 else step))
@@ -167,7 +206,9 @@ def _best_of_grid(
         p[2] = origin[2] + steps[2] * (i // (counts[0] * counts[1]))
         losses[i] = 0.0
         for j in range(len(window) - 1, -1, -apart):
-            r = window[j].d - linearized_tdoa(p, anchors[window[j].a].position, anchors[window[j].b].position, row)
+            r = window[j].d - linearized_tdoa(
+                p, anchors[window[j].a].position, anchors[window[j].b].position, row
+            )
             losses[i] += geman_mcclure_loss(r / math.sqrt(1.0 + ageing[j]), GRID_LOSS * step)
     for place in range(len(places)):
         i = int(np.argmin(losses))
@@ -178,7 +219,9 @@ def _best_of_grid(
         places[place, 2] = origin[2] + steps[2] * (i // (counts[0] * counts[1]))
         for other in range(len(losses)):
             away = (origin[0] + steps[0] * (other % counts[0]) - places[place, 0]) ** 2
-            away += (origin[1] + steps[1] * (other // counts[0] % counts[1]) - places[place, 1]) ** 2
+            away += (
+                origin[1] + steps[1] * (other // counts[0] % counts[1]) - places[place, 1]
+            ) ** 2
             if away < (GRID_APART * step) ** 2:
                 losses[other] = np.inf
     return len(places)
@@ -186,11 +229,15 @@ def _best_of_grid(
 
 @compiled
 def split(places: Places) -> None:
-    """Where there is a single one of two places, and it is less known than APART along any direction, fill in two of equal probability that
-    have the same mean and covariance together: TDOAs are as curved there as the anchors are far."""
+    """Where there is a single one of two places, and it is less known than APART along any
+    direction, fill in two of equal probability that have the same mean and covariance together:
+    TDOAs are as curved there as the anchors are far.
+    """
     x, covariance, cost = places.x, places.covariance, places.cost
     axis, variance = np.empty(3), 0.0
-    for start in range(3):  # power iteration; the principal axis is not normal to all axes of the world
+    for start in range(
+        3
+    ):  # power iteration; the principal axis is not normal to all axes of the world
         trial, its = np.zeros(3), 0.0
         trial[start] = 1.0
         for _ in range(30):
@@ -222,16 +269,25 @@ def share_of_inliers(window: np.ndarray, anchors: np.ndarray, x: np.ndarray) -> 
 def inliers(window: np.ndarray, anchors: np.ndarray, x: np.ndarray) -> np.ndarray:
     """(n,) bool, which of the window's TDOAs agree with position and velocity x (6,) at its end."""
     residuals = np.empty(len(window))
-    _normal_equations(window, anchors, x, np.zeros(len(window)), NO_SCALE, np.empty((6, 7)), residuals)
+    _normal_equations(
+        window, anchors, x, np.zeros(len(window)), NO_SCALE, np.empty((6, 7)), residuals
+    )
     return np.abs(residuals) < INLIER
 
 
 @compiled
 def level(accel: np.ndarray, yaw: float, x: np.ndarray) -> None:
-    """Write to x the attitude in which `accel` (3,), the mean specific force, points up, and which has this yaw."""
+    """Write to x the attitude in which `accel` (3,), the mean specific force, points up, and which
+    has this yaw.
+    """
     roll = math.atan2(accel[1], accel[2])
     pitch = math.atan2(-accel[0], math.hypot(accel[1], accel[2]))
-    cr, sr, cp, sp = math.cos(roll / 2), math.sin(roll / 2), math.cos(pitch / 2), math.sin(pitch / 2)
+    cr, sr, cp, sp = (
+        math.cos(roll / 2),
+        math.sin(roll / 2),
+        math.cos(pitch / 2),
+        math.sin(pitch / 2),
+    )
     cy, sy = math.cos(yaw / 2), math.sin(yaw / 2)
     x[6] = sr * cp * cy - cr * sp * sy
     x[7] = cr * sp * cy + sr * cp * sy
@@ -240,7 +296,9 @@ def level(accel: np.ndarray, yaw: float, x: np.ndarray) -> None:
 
 
 @compiled
-def _step(trial: np.ndarray, system: np.ndarray, prior_information: np.ndarray, mean: np.ndarray) -> None:
+def _step(
+    trial: np.ndarray, system: np.ndarray, prior_information: np.ndarray, mean: np.ndarray
+) -> None:
     """One Gauss-Newton step of `trial` (6,), with a prior about `mean` (6,)."""
     for k in range(6):
         system[k, k] += prior_information[k]
@@ -253,13 +311,21 @@ def _step(trial: np.ndarray, system: np.ndarray, prior_information: np.ndarray, 
 
 @compiled
 def _normal_equations(
-    window: np.ndarray, anchors: np.ndarray, x: np.ndarray, ageing: np.ndarray, scale: float, system: np.ndarray,
+    window: np.ndarray,
+    anchors: np.ndarray,
+    x: np.ndarray,
+    ageing: np.ndarray,
+    scale: float,
+    system: np.ndarray,
     residuals: np.ndarray,
-) -> float:  # fmt: skip
-    """Weighted normal equations of the window at x (6,): information matrix and gradient to `system` (6, 7).
+) -> float:
+    """Weighted normal equations of the window at x (6,): information matrix and gradient to
+    `system` (6, 7).
 
-    ageing : (n,) variance of where the tag was, per axis, beyond what x says, over that of a TDOA, by which its residual counts less.
-    Returns the mean Geman-McClure loss, 0 to 1; writes the residuals (n,), m."""
+    ageing : (n,) variance of where the tag was, per axis, beyond what x says, over that of a TDOA,
+        by which its residual counts less.
+    Returns the mean Geman-McClure loss, 0 to 1; writes the residuals (n,), m.
+    """
     system[:, :] = 0.0
     loss, n = 0.0, len(window)
     p, row = np.empty(3), np.empty(6)

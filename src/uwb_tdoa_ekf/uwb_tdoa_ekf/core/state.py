@@ -1,9 +1,9 @@
 """The nominal state, its error state, and their prediction with one IMU sample.
 
-Nominal state x, (16,): position p (m) and velocity v (m/s) in the world, quaternion q (x y z w, body to world),
-accelerometer bias (m/s^2) and gyroscope bias (rad/s) in the body frame. Error state, (15,), with covariance P:
-[dp, dv, dtheta, dba, dbg], where the true attitude is q * Exp(dtheta), dtheta in the body frame.
-Motion model: eq. 14 of Zhao et al. (RA-L 2021).
+Nominal state x, (16,): position p (m) and velocity v (m/s) in the world, quaternion q (x y z w,
+body to world), accelerometer bias (m/s^2) and gyroscope bias (rad/s) in the body frame. Error
+state, (15,), with covariance P: [dp, dv, dtheta, dba, dbg], where the true attitude is q *
+Exp(dtheta), dtheta in the body frame. Motion model: eq. 14 of Zhao et al. (RA-L 2021).
 """
 
 from __future__ import annotations
@@ -26,7 +26,11 @@ TRANSITION = np.dtype(
         ("velocity_attitude", float, (3, 3)),  # -R [f]x dt
         ("velocity_accel_bias", float, (3, 3)),  # -R diag(accel_weight) dt
         ("attitude_attitude", float, (3, 3)),  # Exp(-w dt)
-        ("product", float, (MOVING_STATES, ERROR_STATES)),  # room for the upper rows of a transition times a matrix
+        (
+            "product",
+            float,
+            (MOVING_STATES, ERROR_STATES),
+        ),  # room for the upper rows of a transition times a matrix
     ],
     align=True,
 )
@@ -78,13 +82,21 @@ def inject(x: np.ndarray, direction: np.ndarray, size: float) -> None:
 
 
 @compiled
-def predict(hypothesis: Record, imu: Record, parameters: Record, dt: float, transition: Record) -> None:
-    """Advance a HYPOTHESIS by dt seconds with the input that an IMU_STATE holds; fills the TRANSITION."""
+def predict(
+    hypothesis: Record, imu: Record, parameters: Record, dt: float, transition: Record
+) -> None:
+    """Advance a HYPOTHESIS by dt seconds with the input that an IMU_STATE holds; fills the
+    TRANSITION.
+    """
     _move(hypothesis.x, imu, dt, transition)
     P, T = hypothesis.P, transition.product
     propagate(P, transition)
     # P <- T Phi', T = Phi P: the triangle is computed, the rest mirrored
-    A, B, E = transition.velocity_attitude, transition.velocity_accel_bias, transition.attitude_attitude
+    A, B, E = (
+        transition.velocity_attitude,
+        transition.velocity_accel_bias,
+        transition.attitude_attitude,
+    )
     for i in range(MOVING_STATES):
         for j in range(MOVING_STATES, ERROR_STATES):
             P[i, j] = P[j, i] = T[i, j]
@@ -105,8 +117,9 @@ def predict(hypothesis: Record, imu: Record, parameters: Record, dt: float, tran
 def _move(x: np.ndarray, imu: Record, dt: float, transition: Record) -> None:
     """The nominal state; fills the TRANSITION.
 
-    The specific force that drives it is between hovering (gravity along body z) and what was measured, by
-    imu.accel_weight for each axis."""
+    The specific force that drives it is between hovering (gravity along body z) and what was
+    measured, by imu.accel_weight for each axis.
+    """
     R, weight = transition.rotation, imu.accel_weight
     rotation(x[6], x[7], x[8], x[9], R)
     f0 = weight[0] * (imu.accel[0] - x[10])
@@ -130,29 +143,40 @@ def _move(x: np.ndarray, imu: Record, dt: float, transition: Record) -> None:
 
 @compiled
 def propagate(M: np.ndarray, transition: Record) -> None:
-    """transition.product <- the upper rows of Phi M for a matrix M (15, 15); its lower rows stay what they are.
+    """transition.product <- the upper rows of Phi M for a matrix M (15, 15); its lower rows stay
+    what they are.
 
     Phi, by what of it differs from the identity: dp' = dp + dv dt;  dv' = dv - R ([f]x dtheta + W dba) dt;
     dtheta' = Exp(-w dt) dtheta - dbg dt.
     """
     dt, out = transition.dt, transition.product
-    A, B, E = transition.velocity_attitude, transition.velocity_accel_bias, transition.attitude_attitude
+    A, B, E = (
+        transition.velocity_attitude,
+        transition.velocity_accel_bias,
+        transition.attitude_attitude,
+    )
     for r in range(3):
         for j in range(ERROR_STATES):
             out[r, j] = M[r, j] + dt * M[3 + r, j]
             by_attitude = A[r, 0] * M[6, j] + A[r, 1] * M[7, j] + A[r, 2] * M[8, j]
             by_bias = B[r, 0] * M[9, j] + B[r, 1] * M[10, j] + B[r, 2] * M[11, j]
             out[3 + r, j] = M[3 + r, j] + by_attitude + by_bias
-            out[6 + r, j] = E[r, 0] * M[6, j] + E[r, 1] * M[7, j] + E[r, 2] * M[8, j] - dt * M[12 + r, j]
+            out[6 + r, j] = (
+                E[r, 0] * M[6, j] + E[r, 1] * M[7, j] + E[r, 2] * M[8, j] - dt * M[12 + r, j]
+            )
 
 
 @compiled
-def _add_noise(P: np.ndarray, R: np.ndarray, accel_psd: np.ndarray, parameters: Record, dt: float) -> None:
+def _add_noise(
+    P: np.ndarray, R: np.ndarray, accel_psd: np.ndarray, parameters: Record, dt: float
+) -> None:
     """White noise of the sensors over dt, and the random walks of their biases."""
     s0, s1, s2 = dt * accel_psd[0], dt * accel_psd[1], dt * accel_psd[2]
     for r in range(3):
         for c in range(r, 3):
-            P[3 + r, 3 + c] += R[r, 0] * s0 * R[c, 0] + R[r, 1] * s1 * R[c, 1] + R[r, 2] * s2 * R[c, 2]
+            P[3 + r, 3 + c] += (
+                R[r, 0] * s0 * R[c, 0] + R[r, 1] * s1 * R[c, 1] + R[r, 2] * s2 * R[c, 2]
+            )
             P[3 + c, 3 + r] = P[3 + r, 3 + c]
         P[6 + r, 6 + r] += dt * parameters.gyro_noise**2
         P[9 + r, 9 + r] += dt * parameters.accel_bias_walk**2
@@ -161,7 +185,8 @@ def _add_noise(P: np.ndarray, R: np.ndarray, accel_psd: np.ndarray, parameters: 
 
 @compiled
 def coast(hypothesis: Record, dt: float, accel_psd: float, tilt_psd: float, yaw_psd: float) -> None:
-    """Advance by dt seconds with no inertial sample: constant velocity with random acceleration, attitude held.
+    """Advance by dt seconds with no inertial sample: constant velocity with random acceleration,
+    attitude held.
 
     accel_psd (m/s^2)^2/Hz; tilt_psd, yaw_psd (rad/s)^2/Hz, growth of the attitude's uncertainty.
     """
@@ -182,7 +207,10 @@ def coast(hypothesis: Record, dt: float, accel_psd: float, tilt_psd: float, yaw_
 
 @compiled
 def turn_about_vertical(x: np.ndarray, angle: float) -> None:
-    """Turn the attitude of a nominal state by an angle, rad, about the world's z. The attitude error, which is of the body, stays."""
+    """Turn the attitude of a nominal state by an angle, rad, about the world's z.
+
+    The attitude error, which is of the body, stays.
+    """
     sine, cosine = math.sin(0.5 * angle), math.cos(0.5 * angle)
     qx, qy, qz, qw = x[6], x[7], x[8], x[9]
     x[6], x[7] = cosine * qx - sine * qy, cosine * qy + sine * qx
@@ -190,7 +218,9 @@ def turn_about_vertical(x: np.ndarray, angle: float) -> None:
 
 
 @compiled
-def difference(a: np.ndarray, b: np.ndarray) -> tuple[float, float, float, float, float, float, float, float, float]:
+def difference(
+    a: np.ndarray, b: np.ndarray
+) -> tuple[float, float, float, float, float, float, float, float, float]:
     """Error state that leads from nominal state a to b, its first nine elements: [dp, dv, dtheta]."""
     ax, ay, az, aw = -a[6], -a[7], -a[8], a[9]
     bx, by, bz, bw = b[6], b[7], b[8], b[9]
@@ -203,6 +233,13 @@ def difference(a: np.ndarray, b: np.ndarray) -> tuple[float, float, float, float
     norm = math.sqrt(x * x + y * y + z * z)
     scale = 2.0 if norm < 1e-9 else 2.0 * math.atan2(norm, w) / norm
     return (
-        b[0] - a[0], b[1] - a[1], b[2] - a[2], b[3] - a[3], b[4] - a[4], b[5] - a[5],
-        scale * x, scale * y, scale * z,
-    )  # fmt: skip
+        b[0] - a[0],
+        b[1] - a[1],
+        b[2] - a[2],
+        b[3] - a[3],
+        b[4] - a[4],
+        b[5] - a[5],
+        scale * x,
+        scale * y,
+        scale * z,
+    )

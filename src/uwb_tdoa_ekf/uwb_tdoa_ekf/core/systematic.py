@@ -1,7 +1,9 @@
-"""Errors that persist: delays, antennas and surroundings make the same error of every TDOA for seconds, and it does not average out.
+"""Errors that persist: delays, antennas and surroundings make the same error of every TDOA for
+seconds, and it does not average out.
 
-The filter divides errors by how many TDOAs there are. What it states therefore has the covariance of errors that persist added to it
-(consider covariance, Tapley, Schutz and Born, Statistical Orbit Determination, 2004, ch. 6).
+The filter divides errors by how many TDOAs there are. What it states therefore has the covariance
+of errors that persist added to it (consider covariance, Tapley, Schutz and Born, Statistical Orbit
+Determination, 2004, ch. 6).
 """
 
 from __future__ import annotations
@@ -12,38 +14,59 @@ from uwb_tdoa_bias.foundation.compiled import Record, compiled
 
 from .ground import solve
 
-SHARE = 0.5  # of the variance of a TDOA that persists where its errors are correlated: delays and antennas, as large as noise
+# of the variance of a TDOA that persists where its errors are correlated: delays and antennas, as
+# large as noise
+SHARE = 0.5
 MEMORY = 1.0  # s of TDOAs that are looked at: an anchor that was not heard for so long is not there
 LONGEST_STEP = 0.1  # s; what anchors tell is not forgotten in silence
-MOST = 400.0  # times the covariance of the filter is the most that is added: it does not hear anchors alone
+# times the covariance of the filter is the most that is added: it does not hear anchors alone
+MOST = 400.0
 
 
 @compiled
 def begin(information: np.ndarray, P: np.ndarray) -> None:
-    """Fill in the information (3, 3), 1/m^2, of a start whose covariance P (15, 15) has counted each anchor once, see `observe`."""
+    """Fill in the information (3, 3), 1/m^2, of a start whose covariance P (15, 15) has counted
+    each anchor once, see `observe`.
+    """
     both = np.concatenate((P[:3, :3], np.eye(3)), axis=1)
     solve(both)
     information[:, :] = SHARE * both[:, 3:]
 
 
 @compiled
-def observe(information: np.ndarray, a: Record, b: Record, innovation: Record, t: float, last: float) -> None:
-    """Take a TDOA stamped t, s, between two of ANCHOR, an INNOVATION, into the information (3, 3), 1/m^2, of a position by a single
-    TDOA of each anchor that is heard, as noisy as it is; last : s, stamp of the TDOA before."""
+def observe(
+    information: np.ndarray, a: Record, b: Record, innovation: Record, t: float, last: float
+) -> None:
+    """Take a TDOA stamped t, s, between two of ANCHOR, an INNOVATION, into the information (3, 3),
+    1/m^2, of a position by a single TDOA of each anchor that is heard, as noisy as it is; last : s,
+    stamp of the TDOA before.
+    """
     fades = min(t - last, LONGEST_STEP) / MEMORY
-    apart = 0.5 * (min(t - a.heard, MEMORY) + min(t - b.heard, MEMORY)) / MEMORY  # adds up to the number of anchors
+    apart = (
+        0.5 * (min(t - a.heard, MEMORY) + min(t - b.heard, MEMORY)) / MEMORY
+    )  # adds up to the number of anchors
     a.heard = b.heard = t
     gain = apart * innovation.weight / (innovation.noise_variance + innovation.curvature / SHARE)
     for i in range(3):
         for j in range(3):
-            information[i, j] += gain * innovation.row[i] * innovation.row[j] - fades * information[i, j]
+            information[i, j] += (
+                gain * innovation.row[i] * innovation.row[j] - fades * information[i, j]
+            )
 
 
 @compiled
-def fill(information: np.ndarray, P: np.ndarray, correlation_length: float, height_std: float, covariance: np.ndarray) -> None:
-    """Fill in the covariance (3, 3), m^2, that errors which persist make of a position whose covariance in the filter is P (15, 15). Of
-    white noise, of correlation_length 1, nothing persists. height_std : m, of a height that is held, 0: none is; what is held does not
-    follow these errors."""
+def fill(
+    information: np.ndarray,
+    P: np.ndarray,
+    correlation_length: float,
+    height_std: float,
+    covariance: np.ndarray,
+) -> None:
+    """Fill in the covariance (3, 3), m^2, that errors which persist make of a position whose
+    covariance in the filter is P (15, 15). Of white noise, of correlation_length 1, nothing
+    persists. height_std : m, of a height that is held, 0: none is; what is held does not follow
+    these errors.
+    """
     covariance[:, :] = 0.0
     share = SHARE * (1.0 - 1.0 / max(correlation_length, 1.0))
     both = np.concatenate((P[:3, :3], np.eye(3)), axis=1)

@@ -1,8 +1,8 @@
 """One scalar measurement against the state, whatever it measures.
 
-A kind of measurement fills an INNOVATION: which error states it depends on and how, by how much it differs from what
-the state predicts, and the variance of its noise. The rest is the same for all: `project`, then `kalman`, by way of
-`robust.update` if the measurement may be an outlier.
+A kind of measurement fills an INNOVATION: which error states it depends on and how, by how much it
+differs from what the state predicts, and the variance of its noise. The rest is the same for all:
+`project`, then `kalman`, by way of `robust.update` if the measurement may be an outlier.
 """
 
 from __future__ import annotations
@@ -19,24 +19,44 @@ JOINT_STATES = ERROR_STATES + auxiliary.OFFSET_STATES
 
 INNOVATION = np.dtype(
     [
-        ("states", np.int64, LONGEST_ROW),  # the error states that the Jacobian row h has an entry for,
+        (
+            "states",
+            np.int64,
+            LONGEST_ROW,
+        ),  # the error states that the Jacobian row h has an entry for,
         ("row", float, LONGEST_ROW),  # the entries,
         ("entries", np.int64),  # and how many there are
         ("value", float),  # measured minus predicted
         ("noise_variance", float),  # of one measurement
         ("prior_variance", float),  # h P h', and
-        ("curvature", float),  # what of it comes from a TDOA that is curved within P, see curvature.py
+        (
+            "curvature",
+            float,
+        ),  # what of it comes from a TDOA that is curved within P, see curvature.py
         (
             "cross_covariance",
             float,
             ERROR_STATES,
         ),  # P h', of state and prediction; the gain is this over total_variance
-        ("on_offset", float, auxiliary.OFFSET_STATES),  # entries of the Jacobian row for the auxiliary states: 0, but of their own sensors
+        (
+            "on_offset",
+            float,
+            auxiliary.OFFSET_STATES,
+        ),  # entries of the Jacobian row for the auxiliary states: 0, but of their own sensors
         ("offset_covariance", float, auxiliary.OFFSET_STATES),  # scratch of auxiliary.correct
-        ("repeated", float),  # how often the same error is met, in tdoa_correlation_length: 1, but for a tag that does not move
+        (
+            "repeated",
+            float,
+            # how often the same error is met, in tdoa_correlation_length: 1, but for a tag that does
+            # not move
+        ),
         ("weight", float),  # 0 to 1, given by robust.update
         ("total_variance", float),  # of the value, as the update took it
-        ("factor", float, (JOINT_STATES, JOINT_STATES)),  # scratch of the M-estimation: S', by rows the columns of S,
+        (
+            "factor",
+            float,
+            (JOINT_STATES, JOINT_STATES),
+        ),  # scratch of the M-estimation: S', by rows the columns of S,
         ("scaled_row", float, JOINT_STATES),  # S' h',
         ("scaled_error", float, JOINT_STATES),  # and of the state scaled by S the error
         ("prior_weights", float, JOINT_STATES),  # and its weights
@@ -47,7 +67,9 @@ INNOVATION = np.dtype(
 
 @compiled
 def project(P: np.ndarray, innovation: Record) -> None:
-    """Fill in what the prior P (15, 15) makes of the Jacobian row: prior_variance and cross_covariance."""
+    """Fill in what the prior P (15, 15) makes of the Jacobian row: prior_variance and
+    cross_covariance.
+    """
     covariance = innovation.cross_covariance
     for j in range(ERROR_STATES):
         covariance[j] = 0.0
@@ -64,7 +86,9 @@ def project(P: np.ndarray, innovation: Record) -> None:
 
 @compiled
 def kalman(hypothesis: Record, innovation: Record) -> None:
-    """Kalman update of a HYPOTHESIS with an INNOVATION of value, cross_covariance and total_variance."""
+    """Kalman update of a HYPOTHESIS with an INNOVATION of value, cross_covariance and
+    total_variance.
+    """
     P, covariance, total = hypothesis.P, innovation.cross_covariance, innovation.total_variance
     if auxiliary.present(hypothesis):
         auxiliary.correct(hypothesis, innovation)
@@ -77,8 +101,12 @@ def kalman(hypothesis: Record, innovation: Record) -> None:
 
 
 @compiled
-def update_state(hypothesis: Record, innovation: Record, state: int, value: float, std: float) -> None:
-    """Kalman update with a measurement of one of the first six states, position and velocity: `value` +- `std`."""
+def update_state(
+    hypothesis: Record, innovation: Record, state: int, value: float, std: float
+) -> None:
+    """Kalman update with a measurement of one of the first six states, position and velocity:
+    `value` +- `std`.
+    """
     innovation.entries, innovation.states[0], innovation.row[0] = 1, state, 1.0
     innovation.value, innovation.noise_variance = value - hypothesis.x[state], std * std
     project(hypothesis.P, innovation)

@@ -1,8 +1,10 @@
-"""A velocity in the body frame: wheels, optical flow, visual odometry. Slip and lost features show as innovations.
+"""A velocity in the body frame: wheels, optical flow, visual odometry. Slip and lost features show
+as innovations.
 
-A velocity that comes with a yaw rate is that of wheels. While there is no inertial sample, wheels drive the prediction: the yaw turns by
-their yaw rate, the velocity of the state follows theirs, and their errors, alike for a while, are noise of the position and the yaw. With
-inertial samples, velocities are measurements, and the yaw rate shows the bias of the gyroscope.
+A velocity that comes with a yaw rate is that of wheels. While there is no inertial sample, wheels
+drive the prediction: the yaw turns by their yaw rate, the velocity of the state follows theirs, and
+their errors, alike for a while, are noise of the position and the yaw. With inertial samples,
+velocities are measurements, and the yaw rate shows the bias of the gyroscope.
 """
 
 from __future__ import annotations
@@ -14,8 +16,8 @@ import numpy as np
 from uwb_tdoa_bias.foundation.compiled import Record, compiled
 from uwb_tdoa_bias.foundation.robust_loss import GEMAN_MCCLURE, weight
 
-from .hypotheses import add_log_likelihood, alive
 from .history import add_update
+from .hypotheses import add_log_likelihood, alive
 from .state import rotation
 from .update import kalman, project
 from .verdicts import REJECTED, USED
@@ -23,10 +25,19 @@ from .verdicts import REJECTED, USED
 GATE = 3.0  # standard deviations beyond which a component is not used
 CORRELATION_TIME = 1.0  # s over which its error stays alike
 LONGEST_STD = 1e3  # m/s and rad/s; a component that is less precise is not measured
-STUCK_TIME, STUCK_COUNT = 0.5, 5  # s, and velocities, all the same, after which the sensor of a tag that shakes is stuck
+STUCK_TIME, STUCK_COUNT = (
+    0.5,
+    5,
+)  # s, and velocities, all the same, after which the sensor of a tag that shakes is stuck
 AVERAGE = 0.5  # s of innovations that tell whether it agrees with everything else
-DISAGREES, AGREES = 4.0, 2.0  # mean normalised innovation squared above which it is not used any more, below which again
-YAW_RATE, GYRO_BIAS = 3, 14  # place of the yaw rate in an AID, and error state of the gyroscope's bias about z
+DISAGREES, AGREES = (
+    4.0,
+    2.0,
+)  # mean normalised innovation squared above which it is not used any more, below which again
+YAW_RATE, GYRO_BIAS = (
+    3,
+    14,
+)  # place of the yaw rate in an AID, and error state of the gyroscope's bias about z
 SLIP = 2.0  # s for which wheels that disagree may slip
 HELD = 0.5  # s for which the last velocity of wheels drives the prediction
 STANDING = 0.1  # times its deviation is that of wheels that do not turn at all
@@ -34,8 +45,12 @@ GYRO_RATE = 100.0  # Hz, of samples of a gyroscope: their noise is gyro_noise ti
 
 
 @compiled
-def observe(ekf: Record, parameters: Record, aid: Record, residual: Record, records: np.ndarray) -> None:
-    """Take a velocity, one of AID, into a running filter; fills one of RESIDUAL with its worst component."""
+def observe(
+    ekf: Record, parameters: Record, aid: Record, residual: Record, records: np.ndarray
+) -> None:
+    """Take a velocity, one of AID, into a running filter; fills one of RESIDUAL with its worst
+    component.
+    """
     state, innovation = ekf.velocity, ekf.innovation
     dt = min(max(aid.t - state.heard, 1e-3), AVERAGE)
     _complete(aid, parameters)
@@ -46,14 +61,20 @@ def observe(ekf: Record, parameters: Record, aid: Record, residual: Record, reco
     inflation = max(1.0, 2.0 * CORRELATION_TIME / dt)
     worst = _worst(ekf, aid, residual)
     state.nis += min(1.0, dt / AVERAGE) * (min(worst, GATE**4) - state.nis)
-    stuck = frozen and (state.refused or (np.any(state.value != 0.0) and not of_wheels))  # simulated wheels turn evenly
+    stuck = frozen and (
+        state.refused or (np.any(state.value != 0.0) and not of_wheels)
+    )  # simulated wheels turn evenly
     state.refused = state.nis > (AGREES if state.refused else DISAGREES) or stuck
     residual.weight, residual.verdict = 0.0, REJECTED
     if state.refused or worst > GATE**2:
         return
     residual.weight, residual.verdict = 1.0, USED
     if of_wheels:
-        state.agreed, state.yaw_rate, state.yaw_rate_variance = aid.t, aid.value[YAW_RATE], aid.std[YAW_RATE] ** 2
+        state.agreed, state.yaw_rate, state.yaw_rate_variance = (
+            aid.t,
+            aid.value[YAW_RATE],
+            aid.std[YAW_RATE] ** 2,
+        )
         state.speed_variance = aid.std[0] ** 2 if aid.std[0] <= LONGEST_STD else 0.0
     for h in range(len(ekf.hypotheses)):
         hypothesis = ekf.hypotheses[h]
@@ -62,12 +83,21 @@ def observe(ekf: Record, parameters: Record, aid: Record, residual: Record, reco
         for axis in range(3):
             if aid.std[axis] > LONGEST_STD:
                 continue
-            compare(hypothesis, aid.value[axis], aid.std[axis], axis, ekf.transition.rotation, innovation)
+            compare(
+                hypothesis,
+                aid.value[axis],
+                aid.std[axis],
+                axis,
+                ekf.transition.rotation,
+                innovation,
+            )
             total = innovation.prior_variance + innovation.noise_variance
             w = weight(GEMAN_MCCLURE, innovation.value / math.sqrt(total), GATE)
             add_log_likelihood(hypothesis, innovation, inflation)
             repeated = 1.0 if leads else inflation
-            innovation.total_variance = innovation.prior_variance + innovation.noise_variance * repeated / w
+            innovation.total_variance = (
+                innovation.prior_variance + innovation.noise_variance * repeated / w
+            )
             kalman(hypothesis, innovation)
             if h == ekf.best:
                 residual.weight = min(residual.weight, w)
@@ -75,7 +105,9 @@ def observe(ekf: Record, parameters: Record, aid: Record, residual: Record, reco
         if of_wheels and ekf.sensed:
             _compare_yaw_rate(hypothesis, aid, ekf.imu, innovation)
             white = innovation.prior_variance + GYRO_RATE * parameters.gyro_noise**2
-            w = weight(GEMAN_MCCLURE, innovation.value / math.sqrt(white + innovation.noise_variance), GATE)
+            w = weight(
+                GEMAN_MCCLURE, innovation.value / math.sqrt(white + innovation.noise_variance), GATE
+            )
             innovation.total_variance = white + innovation.noise_variance * inflation / w
             kalman(hypothesis, innovation)
             if h == ekf.best:
@@ -90,18 +122,24 @@ def drives(state: Record, t: float) -> bool:
 
 @compiled
 def agrees(state: Record, t: float) -> bool:
-    """Whether wheels, by the state of a VELOCITY, have agreed with everything else until lately, at stamp t, s: slip ends soon."""
+    """Whether wheels, by the state of a VELOCITY, have agreed with everything else until lately, at
+    stamp t, s: slip ends soon.
+    """
     return t - state.agreed < SLIP
 
 
 @compiled
 def _complete(aid: Record, parameters: Record) -> None:
-    """Give an AID the configured deviations, where the message states none, and smaller ones if the wheels stand."""
+    """Give an AID the configured deviations, where the message states none, and smaller ones if the
+    wheels stand.
+    """
     for axis in range(3):
         if aid.std[axis] == 0.0:
             aid.std[axis] = parameters.velocity_std
     if aid.std[YAW_RATE] == 0.0:
-        aid.std[YAW_RATE] = parameters.yaw_rate_std if parameters.yaw_rate_std > 0.0 else 2.0 * LONGEST_STD
+        aid.std[YAW_RATE] = (
+            parameters.yaw_rate_std if parameters.yaw_rate_std > 0.0 else 2.0 * LONGEST_STD
+        )
     if aid.std[YAW_RATE] > LONGEST_STD:
         return
     for axis in range(4):
@@ -114,7 +152,9 @@ def _complete(aid: Record, parameters: Record) -> None:
 
 @compiled
 def _repeats(state: Record, aid: Record) -> bool:
-    """Remember a velocity, one of AID; returns whether it has been the same for as long as a sensor that works repeats none."""
+    """Remember a velocity, one of AID; returns whether it has been the same for as long as a sensor
+    that works repeats none.
+    """
     since = aid.t - state.heard
     for k in range(4):
         if aid.std[k] <= LONGEST_STD and aid.value[k] != state.value[k]:
@@ -124,12 +164,21 @@ def _repeats(state: Record, aid: Record) -> bool:
 
 @compiled
 def _worst(ekf: Record, aid: Record, residual: Record) -> float:
-    """The largest normalised innovation squared of the components, for the best hypothesis; fills the residual."""
+    """The largest normalised innovation squared of the components, for the best hypothesis; fills
+    the residual.
+    """
     innovation, worst = ekf.innovation, -1.0
     for axis in range(3):
         if aid.std[axis] > LONGEST_STD:
             continue
-        compare(ekf.hypotheses[ekf.best], aid.value[axis], aid.std[axis], axis, ekf.transition.rotation, innovation)
+        compare(
+            ekf.hypotheses[ekf.best],
+            aid.value[axis],
+            aid.std[axis],
+            axis,
+            ekf.transition.rotation,
+            innovation,
+        )
         total = innovation.prior_variance + innovation.noise_variance
         nis = innovation.value**2 / total
         if nis > worst:
@@ -138,8 +187,11 @@ def _worst(ekf: Record, aid: Record, residual: Record) -> float:
 
 
 @compiled
-def compare(hypothesis: Record, value: float, std: float, axis: int, R: np.ndarray, innovation: Record) -> None:
-    """Fill in what one component of a velocity in the body frame, value +- std m/s, says to a HYPOTHESIS, and R (3, 3), body to world.
+def compare(
+    hypothesis: Record, value: float, std: float, axis: int, R: np.ndarray, innovation: Record
+) -> None:
+    """Fill in what one component of a velocity in the body frame, value +- std m/s, says to a
+    HYPOTHESIS, and R (3, 3), body to world.
 
     u = R' v; with the true attitude q * Exp(dtheta), du = R' dv + [u]x dtheta.
     """
@@ -161,7 +213,9 @@ def compare(hypothesis: Record, value: float, std: float, axis: int, R: np.ndarr
 
 @compiled
 def _compare_yaw_rate(hypothesis: Record, aid: Record, imu: Record, innovation: Record) -> None:
-    """Fill in what the yaw rate of an AID says to a HYPOTHESIS beside the sample that an IMU_STATE holds: the bias of the gyroscope."""
+    """Fill in what the yaw rate of an AID says to a HYPOTHESIS beside the sample that an IMU_STATE
+    holds: the bias of the gyroscope.
+    """
     innovation.entries, innovation.states[0], innovation.row[0] = 1, GYRO_BIAS, -1.0
     innovation.value = aid.value[YAW_RATE] - (imu.gyro[2] - hypothesis.x[GYRO_BIAS + 1])
     innovation.noise_variance = aid.std[YAW_RATE] ** 2

@@ -1,9 +1,12 @@
-"""Is the yaw that the filter follows the right one? Innovations and the inertial sensor decide, as they do at a start.
+"""Is the yaw that the filter follows the right one? Innovations and the inertial sensor decide, as
+they do at a start.
 
-A yaw that is wrong by psi turns each predicted change of velocity. The error of the state is linear in cos(psi) - 1 and sin(psi), and the
-filter's own predictions and updates carry it on: two responses of the error state. A generalized likelihood ratio (Willsky and Jones, IEEE
-Trans. Automatic Control 1976) tests the innovations of late against them, for any psi. If the updates have turned the yaw by more than its
-deviation allows, that is evidence too. Nothing here changes the filter before the evidence suffices.
+A yaw that is wrong by psi turns each predicted change of velocity. The error of the state is linear
+in cos(psi) - 1 and sin(psi), and the filter's own predictions and updates carry it on: two
+responses of the error state. A generalized likelihood ratio (Willsky and Jones, IEEE Trans.
+Automatic Control 1976) tests the innovations of late against them, for any psi. If the updates have
+turned the yaw by more than its deviation allows, that is evidence too. Nothing here changes the
+filter before the evidence suffices.
 """
 
 from __future__ import annotations
@@ -20,11 +23,17 @@ MEMORY, TURN_MEMORY = 6.0, 4.0  # s over which innovations, and turns by updates
 LARGEST = 3.0  # standard deviations that an innovation counts as at most
 KNOWN = 0.35**2  # rad^2, variance of a yaw that is said to be known: 20 degrees
 PERIOD = 0.1  # s between two tests
-# Log likelihood ratio above which the yaw is opened again. Of 22 measured flights 3.5 at most; in the worst of them 9.9 without its range
+# Log likelihood ratio above which the yaw is opened again. Of 22 measured flights 3.5 at most; in
+# the worst of them 9.9 without its range
 # finder. See docs/reliability.md
 EVIDENCE = 12.0
-ANGLES = 2.0 * math.pi * np.arange(1, 24) / 24.0  # rad, by which the yaw may be wrong: those that are tried,
-COSINES, SINES = np.cos(ANGLES) - 1.0, np.sin(ANGLES)  # and what the error of the state is linear in
+ANGLES = (
+    2.0 * math.pi * np.arange(1, 24) / 24.0
+)  # rad, by which the yaw may be wrong: those that are tried,
+COSINES, SINES = (
+    np.cos(ANGLES) - 1.0,
+    np.sin(ANGLES),
+)  # and what the error of the state is linear in
 
 
 @compiled
@@ -38,9 +47,16 @@ def clear(doubt: Record) -> None:
 
 @compiled
 def predict(ekf: Record, vx: float, vy: float) -> None:
-    """Carry the responses on after `state.predict` of the best hypothesis; vx, vy : m/s, its velocity before."""
+    """Carry the responses on after `state.predict` of the best hypothesis; vx, vy : m/s, its
+    velocity before.
+    """
     transition, x = ekf.transition, ekf.hypotheses[ekf.best].x
-    A, B, E, dt = transition.velocity_attitude, transition.velocity_accel_bias, transition.attitude_attitude, transition.dt
+    A, B, E, dt = (
+        transition.velocity_attitude,
+        transition.velocity_accel_bias,
+        transition.attitude_attitude,
+        transition.dt,
+    )
     along, across = x[3] - vx, x[4] - vy
     for c in range(2):
         response = ekf.yaw_doubt.response[c]
@@ -48,7 +64,14 @@ def predict(ekf: Record, vx: float, vy: float) -> None:
         b0, b1, b2 = response[9], response[10], response[11]
         for r in range(3):
             response[r] += dt * response[3 + r]
-            response[3 + r] += A[r, 0] * t0 + A[r, 1] * t1 + A[r, 2] * t2 + B[r, 0] * b0 + B[r, 1] * b1 + B[r, 2] * b2
+            response[3 + r] += (
+                A[r, 0] * t0
+                + A[r, 1] * t1
+                + A[r, 2] * t2
+                + B[r, 0] * b0
+                + B[r, 1] * b1
+                + B[r, 2] * b2
+            )
             response[6 + r] = E[r, 0] * t0 + E[r, 1] * t1 + E[r, 2] * t2 - dt * response[12 + r]
         dx, dy = (along, across) if c == 0 else (-across, along)
         response[0] += 0.5 * dt * dx
@@ -59,8 +82,9 @@ def predict(ekf: Record, vx: float, vy: float) -> None:
 
 @compiled
 def observe(ekf: Record, correlation_length: float, shows: bool) -> None:
-    """Take the INNOVATION of the best hypothesis, after its update. correlation_length as in robust.py; shows : it is evidence; else the
-    responses follow its update, and nothing more."""
+    """Take the INNOVATION of the best hypothesis, after its update. correlation_length as in
+    robust.py; shows : it is evidence; else the responses follow its update, and nothing more.
+    """
     doubt, innovation = ekf.yaw_doubt, ekf.innovation
     to_cosine, to_sine = doubt.response[0], doubt.response[1]
     cosine = sine = 0.0
@@ -89,7 +113,9 @@ def observe(ekf: Record, correlation_length: float, shows: bool) -> None:
             if doubt.variance == 0.0:
                 doubt.variance = _yaw_variance(best)
             u0, u1, u2 = _up(best.x)
-            doubt.turned += (u0 * gain[6] + u1 * gain[7] + u2 * gain[8]) * per_total * innovation.value
+            doubt.turned += (
+                (u0 * gain[6] + u1 * gain[7] + u2 * gain[8]) * per_total * innovation.value
+            )
 
 
 @compiled
@@ -111,13 +137,19 @@ def evidence(doubt: Record) -> float:
     best = 0.0
     for k in range(len(ANGLES)):
         c, s = COSINES[k], SINES[k]
-        best = max(best, c * v[0] + s * v[1] - 0.5 * (c * c * J[0, 0] + 2.0 * c * s * J[0, 1] + s * s * J[1, 1]))
+        best = max(
+            best,
+            c * v[0] + s * v[1] - 0.5 * (c * c * J[0, 0] + 2.0 * c * s * J[0, 1] + s * s * J[1, 1]),
+        )
     return best + 0.5 * doubt.turned**2 / max(doubt.variance, 1e-9)
 
 
 @compiled
 def contradicts(ekf: Record, t: float) -> bool:
-    """Whether the yaw is said to be known, and the evidence at stamp t, s, is against it. Looks once in PERIOD."""
+    """Whether the yaw is said to be known, and the evidence at stamp t, s, is against it.
+
+    Looks once in PERIOD.
+    """
     doubt = ekf.yaw_doubt
     if t < doubt.next_look:
         return False
@@ -131,7 +163,11 @@ def contradicts(ekf: Record, t: float) -> bool:
 @compiled
 def _up(x: np.ndarray) -> tuple[float, float, float]:
     """The vertical of the world in the body frame, of a nominal state."""
-    return 2.0 * (x[6] * x[8] - x[9] * x[7]), 2.0 * (x[7] * x[8] + x[9] * x[6]), 1.0 - 2.0 * (x[6] ** 2 + x[7] ** 2)
+    return (
+        2.0 * (x[6] * x[8] - x[9] * x[7]),
+        2.0 * (x[7] * x[8] + x[9] * x[6]),
+        1.0 - 2.0 * (x[6] ** 2 + x[7] ** 2),
+    )
 
 
 @compiled

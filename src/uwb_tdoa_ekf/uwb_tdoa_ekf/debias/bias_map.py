@@ -1,10 +1,11 @@
-"""The map from a measured position to its bias, after Grasso et al. (Sensors 2022, 22, 9136), eqs. 20 and 21; and its
-file."""
+"""The map from a measured position to its bias, after Grasso et al. (Sensors 2022, 22, 9136), eqs.
+20 and 21; and its file.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.interpolate import RBFInterpolator
@@ -20,33 +21,49 @@ from .network import AngularNetwork
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
+
     from uwb_tdoa_bias.foundation.anchors import Anchors
 
 FORMAT, VERSION = "uwb_tdoa position bias map", 2
-UNITS = "metres, square metres for added, in the world frame named by frame; bias is measured minus true"
+UNITS = (
+    "metres, square metres for added, in the world frame named by frame; bias is measured minus "
+    "true"
+)
 INTERPOLATORS = ("thin_plate", "network")
 SMOOTHING = 0.3  # of the thin plate, at a marker of median count; see docs/debiasing.md
-FADE = 1.0  # m beyond the known region over which the correction goes to nothing; see docs/debiasing.md
+# m beyond the known region over which the correction goes to nothing; see docs/debiasing.md
+FADE = 1.0
 LARGEST = 1e5  # m; more is a mistake
 _ARRAYS = {
-    "cell": int, "at": float, "bias": float, "std": float, "count": int, "added": float, "ids": int, "positions": float,
-}  # fmt: skip
+    "cell": int,
+    "at": float,
+    "bias": float,
+    "std": float,
+    "count": int,
+    "added": float,
+    "ids": int,
+    "positions": float,
+}
 
 
 @dataclass(frozen=True)
 class BiasMap:
     """Biases at n markers in d = 2 or 3 dimensions, and what lies between them.
 
-    cell : (n, d) int, place in the grid of `step` m; at : (n, d) m, where the markers are measured, eq. 19
-    bias : (n, d) m, b* of eqs. 17 and 18; std : (n, d) m, scatter of the measurements; count : (n,) measurements
+    cell : (n, d) int, place in the grid of `step` m; at : (n, d) m, where the markers are measured,
+        eq. 19
+    bias : (n, d) m, b* of eqs. 17 and 18; std : (n, d) m, scatter of the measurements; count : (n,)
+        measurements
     added : (d, d) m^2, to be added to the covariance of a position that is corrected; see `fit`
-    interpolator : "thin_plate" (scipy's RBFInterpolator: passes near all markers, the nearer the more was measured
+    interpolator : "thin_plate" (scipy's RBFInterpolator: passes near all markers, the nearer the
+        more was measured
         there) or "network" (Grasso et al., appendix A)
     frame : name of the world frame; source : where it came from, free text
-    ids : (N,), positions : (N, 3) m of the anchors that it was made for; without any it belongs to none
+    ids : (N,), positions : (N, 3) m of the anchors that it was made for; without any it belongs to
+        none
 
-    A position is known inside the convex hull of the markers and no further than one step from the next of them.
-    Beyond, the correction fades to nothing over FADE.
+    A position is known inside the convex hull of the markers and no further than one step from the
+    next of them. Beyond, the correction fades to nothing over FADE.
     """
 
     cell: np.ndarray
@@ -70,34 +87,64 @@ class BiasMap:
         for name, kind in _ARRAYS.items():
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=kind))
         n, d = self.at.shape if self.at.ndim == 2 else (0, 0)
-        shapes = (self.cell.shape, self.bias.shape, self.std.shape, self.count.shape, self.added.shape)
+        shapes = (
+            self.cell.shape,
+            self.bias.shape,
+            self.std.shape,
+            self.count.shape,
+            self.added.shape,
+        )
         if d not in (2, 3) or shapes != ((n, d), (n, d), (n, d), (n,), (d, d)):
             raise InputError("bias map: cell, at, bias, std, count and added do not fit together.")
-        if self.ids.ndim != 1 or self.positions.shape != (len(self.ids), 3) or not np.isfinite(self.positions).all():
+        if (
+            self.ids.ndim != 1
+            or self.positions.shape != (len(self.ids), 3)
+            or not np.isfinite(self.positions).all()
+        ):
             raise InputError("bias map: ids and positions of its anchors do not fit together.")
         if n > MAP_MARKERS:
-            raise InputError(f"bias map: {n} markers are more than {MAP_MARKERS}; map with a larger step.")
+            raise InputError(
+                f"bias map: {n} markers are more than {MAP_MARKERS}; map with a larger step."
+            )
         arrays = (self.at, self.bias, self.std, self.added)
         if not (all(np.isfinite(array).all() for array in arrays) and 0.0 < self.step < np.inf):
-            raise InputError("bias map: it holds a number that is not finite, or a step that is not above 0.")
-        if max(np.abs(array).max(initial=0.0) for array in (self.at, self.bias, self.std)) > LARGEST:
+            raise InputError(
+                "bias map: it holds a number that is not finite, or a step that is not above 0."
+            )
+        if (
+            max(np.abs(array).max(initial=0.0) for array in (self.at, self.bias, self.std))
+            > LARGEST
+        ):
             raise InputError(f"bias map: it holds a place or a bias of more than {LARGEST:g} m.")
-        if (self.std < 0.0).any() or (self.count < 1).any() or np.linalg.eigvalsh(self.added).min() < -1e-9:
-            raise InputError("bias map: it holds a deviation or a variance below 0, or a marker of no measurements.")
+        if (
+            (self.std < 0.0).any()
+            or (self.count < 1).any()
+            or np.linalg.eigvalsh(self.added).min() < -1e-9
+        ):
+            raise InputError(
+                "bias map: it holds a deviation or a variance below 0, or a marker of no "
+                "measurements."
+            )
         if not np.allclose(self.added, self.added.T):
             raise InputError("bias map: added is no covariance: it is not symmetric.")
         if self.interpolator not in INTERPOLATORS:
-            raise InputError(f"interpolator: {self.interpolator!r} is not one of {', '.join(INTERPOLATORS)}.")
+            raise InputError(
+                f"interpolator: {self.interpolator!r} is not one of {', '.join(INTERPOLATORS)}."
+            )
         try:
             hull = ConvexHull(self.at).equations
         except (QhullError, ValueError) as error:
             remedy = "lie on one line" if d == 2 else "lie in one plane: make a planar map of them"
-            raise InputError(f"bias map: its {n} markers are too few, or {remedy}; measure more places.") from error
+            raise InputError(
+                f"bias map: its {n} markers are too few, or {remedy}; measure more places."
+            ) from error
         if self.interpolator == "network":
             surface = AngularNetwork(self.cell, self.at, self.bias, self.step)
         else:
             smoothing = SMOOTHING * np.median(self.count) / self.count
-            surface = RBFInterpolator(self.at, self.bias, kernel="thin_plate_spline", smoothing=smoothing)
+            surface = RBFInterpolator(
+                self.at, self.bias, kernel="thin_plate_spline", smoothing=smoothing
+            )
         object.__setattr__(self, "_hull", (hull[:, :d], hull[:, d]))
         object.__setattr__(self, "_tree", cKDTree(self.at))
         object.__setattr__(self, "_surface", surface)
@@ -113,11 +160,19 @@ class BiasMap:
         return bool(len(self.ids)) and anchors.stand_at(self.ids, self.positions, self.frame)
 
     def scaled(self, share: float) -> BiasMap:
-        """The BiasMap of a share, 0 ... 1, of all biases; the rest, which is not taken out, is in `added`."""
-        return replace(self, bias=share * self.bias, added=share**2 * self.added + (1.0 - share) ** 2 * self._mean_square)
+        """The BiasMap of a share, 0 ... 1, of all biases; the rest, which is not taken out, is in
+        `added`.
+        """
+        return replace(
+            self,
+            bias=share * self.bias,
+            added=share**2 * self.added + (1.0 - share) ** 2 * self._mean_square,
+        )
 
     def validity(self, p: np.ndarray) -> np.ndarray:
-        """How far the map is valid at positions p (m, 3), m: (m,), 1 inside of the known region, 0 from FADE beyond it."""
+        """How far the map is valid at positions p (m, 3), m: (m,), 1 inside of the known region, 0
+        from FADE beyond it.
+        """
         p = p[:, : self.at.shape[1]]
         normals, offsets = self._hull
         outside = (p @ normals.T + offsets).max(axis=1)
@@ -125,7 +180,9 @@ class BiasMap:
         return np.clip(1.0 - np.maximum(outside, far_from_markers) / FADE, 0.0, 1.0)
 
     def bias_at(self, p: np.ndarray) -> np.ndarray:
-        """beta of eq. 20 at measured positions p (m, 3), m: (m, 3) m, already faded; 0 in z if the map is planar."""
+        """beta of eq. 20 at measured positions p (m, 3), m: (m, 3) m, already faded; 0 in z if the
+        map is planar.
+        """
         return self._faded(p, self.validity(p))
 
     def _faded(self, p: np.ndarray, validity: np.ndarray) -> np.ndarray:
@@ -136,12 +193,15 @@ class BiasMap:
             out[known, :d] = validity[known, None] * self._surface(p[known, :d])
         return out
 
-    def correct(self, p: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def correct(
+        self, p: np.ndarray, covariance: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Positions without their bias (eq. 21) and the covariance of what is left.
 
-        p : (m, 3) m; covariance : (m, 3, 3) m^2. Returns (p, covariance, validity). With validity w, what is added to
-        the covariance is w^2 `added` for what the map does not know, and (1 - w)^2 of the mean square of all biases, for
-        one that was not taken out.
+        p : (m, 3) m; covariance : (m, 3, 3) m^2. Returns (p, covariance, validity). With validity
+            w, what is added to
+        the covariance is w^2 `added` for what the map does not know, and (1 - w)^2 of the mean
+        square of all biases, for one that was not taken out.
         """
         validity, d = self.validity(p), self.at.shape[1]
         covariance = covariance.copy()
@@ -151,7 +211,13 @@ class BiasMap:
 
     def save(self, path: Path) -> None:
         """Write what `load` reads: a numpy .npz file that names its format, version and units."""
-        about: dict[str, Any] = {"format": FORMAT, "version": VERSION, "units": UNITS, "frame": self.frame, "source": self.source}
+        about: dict[str, Any] = {
+            "format": FORMAT,
+            "version": VERSION,
+            "units": UNITS,
+            "frame": self.frame,
+            "source": self.source,
+        }
         content: dict[str, Any] = {
             "step": self.step,
             "interpolator": self.interpolator,
@@ -165,11 +231,15 @@ class BiasMap:
         what, remedy = f"position bias map of version {VERSION}", "make one with `debias`"
         kinds = {name: "i" if kind is int else "f" for name, kind in _ARRAYS.items()}
         texts = ("format", "units", "frame", "source", "interpolator")
-        content = read_arrays(path, {**kinds, **dict.fromkeys(texts, "U"), "version": "i", "step": "f"}, what, remedy)
+        content = read_arrays(
+            path, {**kinds, **dict.fromkeys(texts, "U"), "version": "i", "step": "f"}, what, remedy
+        )
         try:
             if str(content["format"]) != FORMAT or int(content["version"]) != VERSION:
                 raise ValueError(f"format {content['format']}, version {content['version']}")
-            fields: dict[str, Any] = {name: content[name] for name in _ARRAYS} | {name: str(content[name]) for name in texts[2:]}
+            fields: dict[str, Any] = {name: content[name] for name in _ARRAYS} | {
+                name: str(content[name]) for name in texts[2:]
+            }
             return cls(**fields, step=float(content["step"]))
         except (TypeError, ValueError, OverflowError) as error:  # InputError is a ValueError
             raise InputError(f"{path}: is no {what} ({error}); {remedy}.") from error

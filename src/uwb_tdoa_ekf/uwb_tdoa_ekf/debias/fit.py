@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple, TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from scipy.optimize import brentq
@@ -15,6 +15,7 @@ from .markers import collect, corrected_bias, measured_places
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.anchors import Anchors
+
     from .markers import Markers
 
 FOLDS = 5  # into which parts are shared out, if there are more
@@ -25,11 +26,14 @@ LARGEST = 1e4  # times the map's own error that may be added to a covariance
 class Part:
     """What was measured in one go: a flight, or the stay at one point of a grid.
 
-    measured, true : (N, 3) m, world frame; covariance : (N, 3, 3) m^2 of measured, or None where nobody knows it. Pairs
+    measured, true : (N, 3) m, world frame; covariance : (N, 3, 3) m^2 of measured, or None where
+        nobody knows it. Pairs
     that are more than LOST apart, or not finite, are left out.
     """
 
-    def __init__(self, measured: np.ndarray, true: np.ndarray, covariance: np.ndarray | None = None) -> None:
+    def __init__(
+        self, measured: np.ndarray, true: np.ndarray, covariance: np.ndarray | None = None
+    ) -> None:
         usable = np.linalg.norm(measured - true, axis=1) <= LOST
         self.measured, self.true = measured[usable], true[usable]
         self.covariance = None if covariance is None else covariance[usable]
@@ -50,17 +54,23 @@ class _Options(NamedTuple):
 
 
 def fit(
-    parts: list[Part], step: float, least: int = 1, planar: bool = False, interpolator: str = "thin_plate",
-    anchors: Anchors | None = None, source: str = "",
-) -> BiasMap:  # fmt: skip
+    parts: list[Part],
+    step: float,
+    least: int = 1,
+    planar: bool = False,
+    interpolator: str = "thin_plate",
+    anchors: Anchors | None = None,
+    source: str = "",
+) -> BiasMap:
     """BiasMap of a list of Part. Raises InputError where they hold too little.
 
-    step : m, of the grid; least : measurements that make a marker; planar : map x and y only; anchors : Anchors that
-    the map is for.
-    `added` comes from maps that were fitted without some of the parts and asked about them (without stretches of it, if
-    there is one part only): their mean squared error at markers. If the covariances of the measured positions are
-    known, as much of it is added as makes the normalised squared error of the corrected positions d on average there,
-    nothing if they are honest as they are; else all of it.
+    step : m, of the grid; least : measurements that make a marker; planar : map x and y only;
+        anchors : Anchors that
+    the map is for. `added` comes from maps that were fitted without some of the parts and asked
+    about them (without stretches of it, if there is one part only): their mean squared error at
+    markers. If the covariances of the measured positions are known, as much of it is added as makes
+    the normalised squared error of the corrected positions d on average there, nothing if they are
+    honest as they are; else all of it.
     """
     options = _Options(step, least, planar, interpolator, anchors, source)
     whole = _fit(parts, options, np.zeros((2, 2) if planar else (3, 3)))
@@ -88,7 +98,9 @@ def fit(
 
 
 def _bias_errors(bias_map: BiasMap, parts: list[Part], options: _Options) -> np.ndarray:
-    """Biases of the markers that parts make, less what a map of others says where it is valid: (n, d) m."""
+    """Biases of the markers that parts make, less what a map of others says where it is valid: (n,
+    d) m.
+    """
     markers = _markers(parts, options)
     at = _in_space(measured_places(markers, markers.bias))
     error = markers.bias - bias_map.bias_at(at)[:, : markers.bias.shape[1]]
@@ -96,7 +108,9 @@ def _bias_errors(bias_map: BiasMap, parts: list[Part], options: _Options) -> np.
 
 
 def _position_errors(bias_map: BiasMap, part: Part) -> tuple[np.ndarray, np.ndarray | None]:
-    """What a map of others leaves of the errors of a Part where it is valid, (n, d) m; their covariances or None."""
+    """What a map of others leaves of the errors of a Part where it is valid, (n, d) m; their
+    covariances or None.
+    """
     d, valid = bias_map.at.shape[1], bias_map.validity(part.measured) == 1.0
     p = part.measured[valid]
     error = (p - bias_map.bias_at(p) - part.true[valid])[:, :d]
@@ -104,8 +118,9 @@ def _position_errors(bias_map: BiasMap, part: Part) -> tuple[np.ndarray, np.ndar
 
 
 def _needed(error: np.ndarray, covariance: np.ndarray, added: np.ndarray) -> float:
-    """The factor of `added` with which the mean of e' (P + factor added)^-1 e is d, the number of dimensions; 0 or
-    more."""
+    """The factor of `added` with which the mean of e' (P + factor added)^-1 e is d, the number of
+    dimensions; 0 or more.
+    """
 
     def excess(factor: float) -> float:
         solved = np.linalg.solve(covariance + factor * added, error[:, :, None])[:, :, 0]
@@ -121,23 +136,42 @@ def _fit(parts: list[Part], options: _Options, added: np.ndarray) -> BiasMap:
     bias = corrected_bias(markers)
     at = measured_places(markers, bias)
     made = BiasMap(
-        markers.cell, at, bias, markers.std, markers.count, added, options.step, options.interpolator, source=options.source
+        markers.cell,
+        at,
+        bias,
+        markers.std,
+        markers.count,
+        added,
+        options.step,
+        options.interpolator,
+        source=options.source,
     )
     anchors = options.anchors
-    return replace(made, frame=anchors.frame, ids=anchors.ids, positions=anchors.positions) if anchors is not None else made
+    return (
+        replace(made, frame=anchors.frame, ids=anchors.ids, positions=anchors.positions)
+        if anchors is not None
+        else made
+    )
 
 
 def _markers(parts: list[Part], options: _Options) -> Markers:
     parts = [part for part in parts if len(part)]
     if not parts:
         raise InputError(
-            f"positions: none is within {LOST:g} m of the truth; is it in the same frame, by the same clock?"
+            f"positions: none is within {LOST:g} m of the truth; is it in the same frame, by "
+            "the same clock?"
         )
     d, step, least = 2 if options.planar else 3, options.step, options.least
-    measured, true = (np.concatenate([getattr(part, name)[:, :d] for part in parts]) for name in ("measured", "true"))
+    measured, true = (
+        np.concatenate([getattr(part, name)[:, :d] for part in parts])
+        for name in ("measured", "true")
+    )
     markers = collect(measured, true, step, least)
     if len(markers) == 0:
-        raise InputError(f"step: no cell of {step:g} m holds {least} positions; give a larger step, or more data.")
+        raise InputError(
+            f"step: no cell of {step:g} m holds {least} positions; give a larger step, or "
+            "more data."
+        )
     return markers
 
 

@@ -1,14 +1,14 @@
-"""From pairs of measured and true positions to a cloud of markers with a bias each: Grasso et al. (Sensors 2022, 22,
-9136), eqs. 15 - 19 and 22, in two dimensions as published or in three.
+"""From pairs of measured and true positions to a cloud of markers with a bias each: Grasso et al.
+(Sensors 2022, 22, 9136), eqs. 15 - 19 and 22, in two dimensions as published or in three.
 
-Static data (many measurements at each point of a grid) and dynamic data (one at each instant of a path) go the same
-way: the markers of a path are the means of what was measured in each cell of a grid.
+Static data (many measurements at each point of a grid) and dynamic data (one at each instant of a
+path) go the same way: the markers of a path are the means of what was measured in each cell of a
+grid.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -24,7 +24,8 @@ _WEIGHTS /= _WEIGHTS.sum()
 class Markers:
     """n markers in d = 2 or 3 dimensions, world frame.
 
-    cell : (n, d) int, place in a grid; true : (n, d) m, where they are; bias : (n, d) m, mean of measured minus true;
+    cell : (n, d) int, place in a grid; true : (n, d) m, where they are; bias : (n, d) m, mean of
+        measured minus true;
     std : (n, d) m, its standard deviation; count : (n,) measurements.
     """
 
@@ -39,9 +40,11 @@ class Markers:
 
 
 def collect(measured: np.ndarray, true: np.ndarray, step: float, least: int = 1) -> Markers:
-    """Markers of N pairs of positions: one for each cell of a grid of `step` m that holds at least `least` pairs.
+    """Markers of N pairs of positions: one for each cell of a grid of `step` m that holds at least
+    `least` pairs.
 
-    measured, true : (N, d) m. The grid starts at the smallest true coordinates, so that points surveyed on a grid of
+    measured, true : (N, d) m. The grid starts at the smallest true coordinates, so that points
+        surveyed on a grid of
     this step keep a cell each. bias b, standard deviation and mean square as in eq. 22.
     """
     cell = np.floor((true - true.min(axis=0)) / step + 0.5).astype(int)
@@ -61,11 +64,12 @@ def collect(measured: np.ndarray, true: np.ndarray, step: float, least: int = 1)
 def corrected_bias(markers: Markers) -> np.ndarray:
     """b*, (n, d) m: the bias to expect where a marker was measured, eqs. 17 and 18.
 
-    Along each axis through a marker, cubic splines through the biases of the markers on that line are averaged with the
-    Gaussian of the marker's standard deviation along that axis over +-3 of them; b* is the mean over the axes (the two
-    of the plane as published, or all three). Here the Gaussian's weights add up to one, where the published integral
-    over +-3 standard deviations leaves out 0.3 %, and beyond the last marker of a line the spline keeps its value
-    there, of which the paper does not speak.
+    Along each axis through a marker, cubic splines through the biases of the markers on that line
+    are averaged with the Gaussian of the marker's standard deviation along that axis over +-3 of
+    them; b* is the mean over the axes (the two of the plane as published, or all three). Here the
+    Gaussian's weights add up to one, where the published integral over +-3 standard deviations
+    leaves out 0.3 %, and beyond the last marker of a line the spline keeps its value there, of
+    which the paper does not speak.
     """
     d = markers.true.shape[1]
     total = np.zeros_like(markers.bias)

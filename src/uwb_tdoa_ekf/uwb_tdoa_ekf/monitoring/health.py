@@ -18,8 +18,10 @@ from .volume import VolumeCheck
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+
     from uwb_tdoa_bias.foundation.flyable import FlyableVolume
     from uwb_tdoa_bias.foundation.ros_diagnostics import Report
+
     from ..core.config import FilterConfig
     from ..estimator import Estimator
     from ..streams.finding import Finding
@@ -28,7 +30,9 @@ START_TIMEOUT = 5.0  # s of data without a start position before it becomes a wa
 BEHIND = 1.0, 60.0  # s that the newest odometry is old: less is good, and more is of another time
 STOPPED = 2.0  # s without a message of an aid that was there, before it becomes a warning
 MOST_SAID = 3  # sentences in one text; all of them are among the values
-REPEATS = 2  # reports in a row in which that is so of an aid; optical flow contradicts everything else for a second at times
+# reports in a row in which that is so of an aid; optical flow contradicts everything else for a
+# second at times
+REPEATS = 2
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
@@ -36,39 +40,68 @@ OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.E
 class Health:
     """Looks once a second, by the wall clock."""
 
-    def __init__(self, config: FilterConfig, lag: float, volume: FlyableVolume | None = None) -> None:
+    def __init__(
+        self, config: FilterConfig, lag: float, volume: FlyableVolume | None = None
+    ) -> None:
         """config : FilterConfig; lag : s; volume : FlyableVolume, or None."""
-        self.received: Counter[str] = Counter()  # messages of each stream: imu, tdoa, and those of aids
+        self.received: Counter[str] = (
+            Counter()
+        )  # messages of each stream: imu, tdoa, and those of aids
         self.last_odometry: float | None = None  # time.monotonic(), s
-        self.last_position: tuple[np.ndarray, np.ndarray] | None = None  # (3,) m and its covariance (3, 3) m^2
-        self.behind: float | None = None  # s from the stamp of the newest odometry to the present time of ROS
+        self.last_position: tuple[np.ndarray, np.ndarray] | None = (
+            None  # (3,) m and its covariance (3, 3) m^2
+        )
+        self.behind: float | None = (
+            None  # s from the stamp of the newest odometry to the present time of ROS
+        )
         self._use_imu, self._lag = config.use_imu, lag
         self._volume = VolumeCheck(volume)
         self._imu_rate, self._tdoa_rate, self._located_rate = Rate(), Rate(), Rate()
-        self._aids_before: dict[str, dict[str, int]] = {}  # messages of each, received and not used, by the last report
-        self._aids_bad: dict[tuple[str, str], int] = {}  # reports in a row in which most messages of an aid were not used for a reason
-        self._aids_heard: dict[str, tuple[int, float]] = {}  # messages of each so far, and since when no more of them, time.monotonic(), s
+        self._aids_before: dict[
+            str, dict[str, int]
+        ] = {}  # messages of each, received and not used, by the last report
+        self._aids_bad: dict[
+            tuple[str, str], int
+        ] = {}  # reports in a row in which most messages of an aid were not used for a reason
+        self._aids_heard: dict[
+            str, tuple[int, float]
+        ] = {}  # messages of each so far, and since when no more of them, time.monotonic(), s
         self._starting: float | None = None  # time.monotonic(), s
         self.use = Use(lag)
 
     def look(self, estimator: Estimator | None, counts: Mapping[str, int]) -> None:
-        """See what became of what was received. Call it several times a second with totals by verdict."""
-        self.use.look(time.monotonic(), self.received, counts, estimator is not None and estimator.running)
+        """See what became of what was received.
+
+        Call it several times a second with totals by verdict.
+        """
+        self.use.look(
+            time.monotonic(), self.received, counts, estimator is not None and estimator.running
+        )
 
     def report(
-        self, refused: str | None, estimator: Estimator | None, counts: Mapping[str, int], wiring: Sequence[str] = (),
+        self,
+        refused: str | None,
+        estimator: Estimator | None,
+        counts: Mapping[str, int],
+        wiring: Sequence[str] = (),
         findings: Sequence[Finding] = (),
-    ) -> Report:  # fmt: skip
+    ) -> Report:
         """Returns (level, text, values).
 
         refused : what was wrong with the last anchors, or None; estimator : Estimator or None;
-        counts : totals by verdict; wiring : sentences, what is wrong with who publishes what; findings : Findings of the
+        counts : totals by verdict; wiring : sentences, what is wrong with who publishes what;
+            findings : Findings of the
         rules over streams. What is wrong with the streams is said before what comes of it.
         """
         now = time.monotonic()
         self.look(estimator, counts)
-        imu_rate, tdoa_rate = self._imu_rate.of(self.received["imu"]), self._tdoa_rate.of(self.received["tdoa"])
-        located = self._located_rate.of(self.received["tdoa"] + sum(self.received[name] for name in LOCATING))
+        imu_rate, tdoa_rate = (
+            self._imu_rate.of(self.received["imu"]),
+            self._tdoa_rate.of(self.received["tdoa"]),
+        )
+        located = self._located_rate.of(
+            self.received["tdoa"] + sum(self.received[name] for name in LOCATING)
+        )
         running = estimator is not None and estimator.running
         if running or not located:
             self._starting = None
@@ -78,11 +111,23 @@ class Health:
         if refused:
             status = ERROR, refused
         elif estimator is None:
-            status = ERROR, "no anchors yet: publish them on uwb/anchors, reliable and transient local"
+            status = (
+                ERROR,
+                "no anchors yet: publish them on uwb/anchors, reliable and transient local",
+            )
         elif not located:
-            status = ERROR, "no TDOAs on uwb/tdoa_corrected: start bias_node in this namespace and the tag's driver"
+            status = (
+                ERROR,
+                (
+                    "no TDOAs on uwb/tdoa_corrected: start bias_node in this namespace and the "
+                    "tag's driver"
+                ),
+            )
         elif self._use_imu and not imu_rate:
-            status = ERROR, "no samples on imu/data: check the IMU's driver, or set use_imu to false"
+            status = (
+                ERROR,
+                "no samples on imu/data: check the IMU's driver, or set use_imu to false",
+            )
         elif wiring or findings:
             status = _worst(wiring, findings)
         elif running:
@@ -102,13 +147,35 @@ class Health:
             trouble, at_position = self._volume.trouble_at(estimator.anchors, *self.last_position)
             if trouble and status[0] == OK:
                 status = WARN, trouble
-        if running and self.behind is not None and BEHIND[0] < self.behind < BEHIND[1] and status[0] == OK:
+        if (
+            running
+            and self.behind is not None
+            and BEHIND[0] < self.behind < BEHIND[1]
+            and status[0] == OK
+        ):
             reason = "this machine is too slow for all it receives, or clocks differ"
             status = WARN, f"the odometry is {self.behind:.1f} s behind: {reason}"
-        if running and self.behind is not None and -BEHIND[1] < self.behind < -BEHIND[0] and status[0] == OK:
-            status = WARN, f"the odometry is {-self.behind:.1f} s ahead of the clock: correct the stamps, or the clock"
+        if (
+            running
+            and self.behind is not None
+            and -BEHIND[1] < self.behind < -BEHIND[0]
+            and status[0] == OK
+        ):
+            status = (
+                WARN,
+                (
+                    f"the odometry is {-self.behind:.1f} s ahead of the clock: correct the "
+                    "stamps, or the clock"
+                ),
+            )
         age = "none yet" if self.last_odometry is None else f"{now - self.last_odometry:.3f} s"
-        state = "running" if running else "lost" if estimator is not None and estimator.lost else "starting"
+        state = (
+            "running"
+            if running
+            else "lost"
+            if estimator is not None and estimator.lost
+            else "starting"
+        )
         values = {"state": state, "age of last odometry": age}
         values |= {"odometry behind the clock": _behind(self.behind)}
         values |= {"IMU rate": f"{imu_rate:.1f} Hz", "TDOA rate": f"{tdoa_rate:.1f} Hz"}
@@ -127,35 +194,61 @@ class Health:
                 since = now
             self._aids_heard[aid] = received, since
             reasons = {
-                "rejected": f"contradict everything else and are not used: check the sensor, {sensor.remedy}",
+                "rejected": (
+                    "contradict everything else and are not used: check the sensor, "
+                    f"{sensor.remedy}"
+                ),
                 "late": f"are late: check its stamps, or raise lag (now {self._lag} s)",
                 "invalid": f"are invalid: {sensor.invalid}",
             }
-            totals = {"received": received} | {reason: counts[f"{aid}_{reason}"] for reason in reasons}
+            totals = {"received": received} | {
+                reason: counts[f"{aid}_{reason}"] for reason in reasons
+            }
             before = self._aids_before.get(aid, dict.fromkeys(totals, 0))
             recent = {name: total - before[name] for name, total in totals.items()}
             self._aids_before[aid] = totals
             if received and now - since > STOPPED:
-                status = WARN, f"no messages on {sensor.topics[0][0]} any more: done without; check the sensor and its driver"
+                status = (
+                    WARN,
+                    (
+                        f"no messages on {sensor.topics[0][0]} any more: done without; check the "
+                        "sensor and its driver"
+                    ),
+                )
                 continue
             for reason, words in reasons.items():
                 bad = recent[reason] > LARGEST_UNUSED * recent["received"]
-                repeats = self._aids_bad[aid, reason] = self._aids_bad.get((aid, reason), 0) + 1 if bad else 0
+                repeats = self._aids_bad[aid, reason] = (
+                    self._aids_bad.get((aid, reason), 0) + 1 if bad else 0
+                )
                 if repeats >= REPEATS:
-                    status = WARN, f"more than half of the messages on {sensor.topics[0][0]} {words}"
+                    status = (
+                        WARN,
+                        f"more than half of the messages on {sensor.topics[0][0]} {words}",
+                    )
         return status
 
     def _no_start(self) -> str:
         """Why no start position is found."""
         if self.use.restart_age < START_TIMEOUT:
-            return "the filter starts anew again and again, because stamps of a stream fall back: see restarts, and correct its clock"
-        return "no start position found: check ids and positions of the anchors, and that four are heard"
+            return (
+                "the filter starts anew again and again, because stamps of a stream fall back: "
+                "see restarts, and correct its clock"
+            )
+        return (
+            "no start position found: check ids and positions of the anchors, and that four are "
+            "heard"
+        )
 
 
 def _worst(wiring: Sequence[str], findings: Sequence[Finding]) -> tuple[bytes, str]:
     """(level, text) of what is wrong, the worst first; findings come most severe first."""
     severe = [finding for finding in findings if finding.severity == SEVERE]
-    said = [*(f.sentence for f in severe), *wiring, *(f.sentence for f in findings if f not in severe)]
+    said = [
+        *(f.sentence for f in severe),
+        *wiring,
+        *(f.sentence for f in findings if f not in severe),
+    ]
     return ERROR if severe else WARN, together(said)
 
 
@@ -169,5 +262,8 @@ def _behind(seconds: float | None) -> str:
     if seconds is None:
         return "unknown"
     if abs(seconds) > BEHIND[1]:
-        return "not comparable: the stamps are of another time than the clock; for a recording set use_sim_time"
+        return (
+            "not comparable: the stamps are of another time than the clock; for a recording set "
+            "use_sim_time"
+        )
     return f"{seconds:.3f} s"

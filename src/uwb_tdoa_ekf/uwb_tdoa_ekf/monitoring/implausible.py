@@ -12,20 +12,29 @@ if TYPE_CHECKING:
 
 SAID = {
     WEIGHT: (
-        "what the accelerometer reads is not gravity", "a specific force of {:.3g} m/s^2, where 9.81 is expected",
+        "what the accelerometer reads is not gravity",
+        "a specific force of {:.3g} m/s^2, where 9.81 is expected",
         "linear_acceleration = ...  # the specific force, with gravity, in m/s^2",
     ),
     TURN: (
         "gyroscope and accelerometer contradict each other",
-        "where the gyroscope has turned upwards to, the specific force is {:+.1f} m/s^2, and 9.81 is expected",
+        (
+            "where the gyroscope has turned upwards to, the specific force is {:+.1f} m/s^2, and "
+            "9.81 is expected"
+        ),
         "angular_velocity = ...  # in rad/s, and the axes of both sensors x forward, y left, z up",
     ),
-    RATE: ("the gyroscope turns as nothing does", "{:.0f} rad/s", "angular_velocity = ...  # in rad/s"),
+    RATE: (
+        "the gyroscope turns as nothing does",
+        "{:.0f} rad/s",
+        "angular_velocity = ...  # in rad/s",
+    ),
     TILT: (
-        "the IMU is turned, or the tag lies on its side", "the specific force along z is {:+.1f} m/s^2, where +9.81 is expected",
+        "the IMU is turned, or the tag lies on its side",
+        "the specific force along z is {:+.1f} m/s^2, where +9.81 is expected",
         "x, y, z = ...  # of both sensors: x forward, y left, z up",
     ),
-}  # fmt: skip
+}
 
 
 def implausible(check: Record) -> Finding:

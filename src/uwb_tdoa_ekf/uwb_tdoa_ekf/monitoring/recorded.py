@@ -13,13 +13,19 @@ from .monitor import GAP, Event, Monitor
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from uwb_tdoa_bias.effects.covariance import Covariance
     from uwb_tdoa_bias.foundation.anchors import Anchors
+
     from ..results import Odometry, Residuals
 
 
 def watched(
-    anchors: Anchors, odometry: Odometry, residuals: Residuals, calibrated: Covariance | None = None, restarts: Sequence[float] = ()
+    anchors: Anchors,
+    odometry: Odometry,
+    residuals: Residuals,
+    calibrated: Covariance | None = None,
+    restarts: Sequence[float] = (),
 ) -> list[Event]:
     """Return the Events of the Odometry and the Residuals of a recording.
 
@@ -27,7 +33,10 @@ def watched(
     """
     events: list[Event] = []
     for low, high in pairwise([-math.inf, *restarts, math.inf]):
-        monitor, t = Monitor(anchors, calibrated), np.sort(residuals.t[(residuals.t >= low) & (residuals.t < high)])
+        monitor, t = (
+            Monitor(anchors, calibrated),
+            np.sort(residuals.t[(residuals.t >= low) & (residuals.t < high)]),
+        )
         for begin, end in pairwise([low, *t[1:][np.diff(t) > GAP].tolist(), high]):
             heard = rows_of(residuals, _between(residuals.t, begin, end))
             monitor.add(rows_of(odometry, _between(odometry.t, begin, end)), heard)

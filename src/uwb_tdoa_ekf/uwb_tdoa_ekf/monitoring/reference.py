@@ -1,9 +1,11 @@
-"""Does each anchor stand where the survey has it, and is it as late as it was calibrated? A Bayesian test over Slices.
+"""Does each anchor stand where the survey has it, and is it as late as it was calibrated? A
+Bayesian test over Slices.
 
-The survey may be off by the standard deviations that it states. Each anchor is late by something that depends on the place: antennas,
-reflections. Slices of one cell of the room share that error, so that many of them count as little more than one. A part of it is a slope
-over all cells. The evidence chooses how large such errors are. A change of one anchor is named if it makes the flight ODDS times as
-probable, then the next (`..evidence`).
+The survey may be off by the standard deviations that it states. Each anchor is late by something
+that depends on the place: antennas, reflections. Slices of one cell of the room share that error,
+so that many of them count as little more than one. A part of it is a slope over all cells. The
+evidence chooses how large such errors are. A change of one anchor is named if it makes the flight
+ODDS times as probable, then the next (`..evidence`).
 """
 
 from __future__ import annotations
@@ -15,21 +17,46 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.geometry import ranges
 
-from ..evidence import DELAY, POSITION, Part, changes_of, eliminated, known_before, most_likely_changes
+from ..evidence import (
+    DELAY,
+    POSITION,
+    Part,
+    changes_of,
+    eliminated,
+    known_before,
+    most_likely_changes,
+)
 from .slices import TDOA_VARIANCE
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from uwb_tdoa_bias.effects.covariance import Covariance
     from uwb_tdoa_bias.foundation.anchors import Anchors
+
     from ..installed import Installed
     from .slices import Slice
 
 CELL = 0.7  # m
-MOST_CELLS, MOST_ANCHORS = 150, 24  # that are compared, those where the tag was last; and the anchors that are heard in them
+MOST_CELLS, MOST_ANCHORS = (
+    150,
+    24,
+)  # that are compared, those where the tag was last; and the anchors that are heard in them
 TDOA_STD = 0.1  # m, of one TDOA beside these
-ERROR_STDS = 0.02, 0.05, 0.1, 0.15, 0.22, 0.32, 0.45, 0.65  # m, of errors of an anchor that last in a cell, of which the evidence chooses
-SURVEY_STD, DELAY_STD = 0.05, 0.15  # m, of coordinates and of delays of anchors, where no calibration states them
+ERROR_STDS = (
+    0.02,
+    0.05,
+    0.1,
+    0.15,
+    0.22,
+    0.32,
+    0.45,
+    0.65,
+)  # m, of errors of an anchor that last in a cell, of which the evidence chooses
+SURVEY_STD, DELAY_STD = (
+    0.05,
+    0.15,
+)  # m, of coordinates and of delays of anchors, where no calibration states them
 ODDS = 1e3  # by how much more probable a change must make the flight
 FEWEST_CELLS, FEWEST_SLICES = 12, 40  # that must be compared
 SLOPES = 0.5  # 1/m, of such errors that go on from cell to cell
@@ -38,8 +65,10 @@ MORE = TDOA_VARIANCE / TDOA_STD**2
 
 @dataclass(frozen=True)
 class Displaced:
-    """row : of an anchor; shift, std : (3,) m, by how much it stands elsewhere than surveyed; later : m, by how much it is later than
-    calibrated; odds : logarithm of those of the change; either : whether its being later explains as much as its standing elsewhere."""
+    """row : of an anchor; shift, std : (3,) m, by how much it stands elsewhere than surveyed; later
+    : m, by how much it is later than calibrated; odds : logarithm of those of the change; either :
+    whether its being later explains as much as its standing elsewhere.
+    """
 
     row: int
     shift: np.ndarray
@@ -50,8 +79,9 @@ class Displaced:
 
 
 class _Cell:
-    """What the slices of a cell tell of the delays of anchors in rows (H,): information (H, H) and vector (H,); place : (3,) m, the mean of
-    the tag's; slices : how many there are."""
+    """What the slices of a cell tell of the delays of anchors in rows (H,): information (H, H) and
+    vector (H,); place : (3,) m, the mean of the tag's; slices : how many there are.
+    """
 
     def __init__(self) -> None:
         self.rows: np.ndarray = np.empty(0, int)
@@ -80,7 +110,11 @@ class _Cell:
     def parts(self) -> list[Part]:
         """Part of the delays beside errors that last, for each of ERROR_STDS."""
         if not self._parts:
-            gram, vector, n = np.tile(self._information, (2, 2)), np.tile(self._vector, 2), len(self.rows)
+            gram, vector, n = (
+                np.tile(self._information, (2, 2)),
+                np.tile(self._vector, 2),
+                len(self.rows),
+            )
             self._parts = [Part(*eliminated(gram, vector, n, std), std) for std in ERROR_STDS]
         return self._parts
 
@@ -89,9 +123,13 @@ class SurveyComparison:
     """Takes Slices; `find` says which anchors do not stand where they should."""
 
     def __init__(self, anchors: Anchors | Installed, calibrated: Covariance | None = None) -> None:
-        """anchors : Anchors, or Installed; calibrated : Covariance of their positions and delays, or None."""
+        """anchors : Anchors, or Installed; calibrated : Covariance of their positions and delays,
+        or None.
+        """
         self._anchors, self._calibrated = anchors, calibrated
-        self._cells: dict[tuple[int, ...], _Cell] = {}  # the one that the tag was in last is the last
+        self._cells: dict[
+            tuple[int, ...], _Cell
+        ] = {}  # the one that the tag was in last is the last
 
     def add(self, piece: Slice) -> None:
         """Take a Slice."""
@@ -104,7 +142,9 @@ class SurveyComparison:
 
     def forget(self, rows: set[int]) -> None:
         """Anchors, by their rows, are not there any more."""
-        self._cells = {key: cell for key, cell in self._cells.items() if not rows & set(cell.rows.tolist())}
+        self._cells = {
+            key: cell for key, cell in self._cells.items() if not rows & set(cell.rows.tolist())
+        }
 
     def find(self) -> list[Displaced]:
         """The anchors that are elsewhere or later than they should be, the clearest first."""
@@ -115,7 +155,11 @@ class SurveyComparison:
         parts = self._parts(rows, positions, cells)
         variance = np.repeat([SURVEY_STD**2, DELAY_STD**2], [3 * n, n])
         covariance, known = known_before(self._anchors.ids[rows], variance, self._calibrated)
-        possible = {key: one for key, one in changes_of(n).items() if key[0] == POSITION or known[one[0]].all()}
+        possible = {
+            key: one
+            for key, one in changes_of(n).items()
+            if key[0] == POSITION or known[one[0]].all()
+        }
         changes = most_likely_changes(parts, covariance, np.zeros(4 * n), possible, ODDS)
         if not changes.found:
             return []
@@ -123,7 +167,9 @@ class SurveyComparison:
             (POSITION if (POSITION, k) in rivals else what, k): (odds, bool(rivals))
             for (what, k), (odds, rivals) in changes.found.items()
         }
-        for some, size in (possible[key] for key in named):  # who cannot be told from a late anchor has rather been moved
+        for some, size in (
+            possible[key] for key in named
+        ):  # who cannot be told from a late anchor has rather been moved
             covariance[some, some] += size**2
         part, prior = parts[changes.number], np.linalg.inv(covariance)
         inverse = np.linalg.inv(part.gram + prior)
@@ -132,7 +178,9 @@ class SurveyComparison:
         for (what, k), (odds, either) in named.items():
             places = slice(3 * k, 3 * k + 3)
             later = float(step[3 * n + k]) if what == DELAY else 0.0
-            out.setdefault(k, Displaced(int(rows[k]), step[places], std[places], later, odds, either))
+            out.setdefault(
+                k, Displaced(int(rows[k]), step[places], std[places], later, odds, either)
+            )
         return list(out.values())
 
     def _latest(self) -> tuple[np.ndarray, list[_Cell]]:
@@ -147,15 +195,24 @@ class SurveyComparison:
         return np.array(sorted(rows), int), cells
 
     def _parts(self, rows: np.ndarray, positions: np.ndarray, cells: Sequence[_Cell]) -> list[Part]:
-        """Part of the coordinates and delays of anchors in rows (n,), at positions (n, 3) m, for each of ERROR_STDS."""
+        """Part of the coordinates and delays of anchors in rows (n,), at positions (n, 3) m, for
+        each of ERROR_STDS.
+        """
         n, middle = len(rows), np.mean([cell.place for cell in cells], axis=0)
-        grams, vectors, rests = np.zeros((len(ERROR_STDS), 7 * n, 7 * n)), np.zeros((len(ERROR_STDS), 7 * n)), np.zeros(len(ERROR_STDS))
+        grams, vectors, rests = (
+            np.zeros((len(ERROR_STDS), 7 * n, 7 * n)),
+            np.zeros((len(ERROR_STDS), 7 * n)),
+            np.zeros(len(ERROR_STDS)),
+        )
         for cell in cells:
             own = np.searchsorted(rows, cell.rows)
             towards = ranges(cell.place, positions[own])[1]
             axes = (3 * own[:, None] + np.arange(3)).ravel()
             columns = np.concatenate([axes, 3 * n + own, 4 * n + axes])
-            by, each = np.zeros((len(own), 7 * len(own))), np.arange(len(own))  # derivatives of delays by coordinates, delays and slopes
+            by, each = (
+                np.zeros((len(own), 7 * len(own))),
+                np.arange(len(own)),
+            )  # derivatives of delays by coordinates, delays and slopes
             for axis in range(3):
                 by[each, 3 * each + axis] = -towards[:, axis]
                 by[each, 4 * len(own) + 3 * each + axis] = cell.place[axis] - middle[axis]

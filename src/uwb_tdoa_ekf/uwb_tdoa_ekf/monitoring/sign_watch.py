@@ -1,5 +1,6 @@
-"""Are the signs of all TDOAs the wrong way round? No counter shows that: a second filter, without the IMU, is fed with both
-signs, and what each leaves unexplained is compared, as `check` does."""
+"""Are the signs of all TDOAs the wrong way round? No counter shows that: a second filter, without
+the IMU, is fed with both signs, and what each leaves unexplained is compared, as `check` does.
+"""
 
 from __future__ import annotations
 
@@ -14,18 +15,21 @@ from ..streams.explain import Unexplained, compare, innovations
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.anchors import Anchors
 
-# What must stay unexplained less, and by how many standard errors. On 37 measured flights, of any 10 to 40 s from the start or
-# in the air: healthy ones 0.98 and 0.2, those with the other sign 0.81 and 2.5 after 30 s in the air, most after 12.
+# What must stay unexplained less, and by how many standard errors. On 37 measured flights, of any
+# 10 to 40 s from the start or
+# in the air: healthy ones 0.98 and 0.2, those with the other sign 0.81 and 2.5 after 30 s in the
+# air, most after 12.
 RATIO, DEVIATIONS = 0.85, 3.0
 TURNED = -1.0  # value of a Finding on signs that have turned in flight
 LONGEST = 40.0  # s of stamps, after which it begins anew
 
 
 class SignWatch:
-    """Compares until it is certain that the signs are right, and again once they are doubted; of wrong ones it goes on to see when they
-    are right again.
+    """Compares until it is certain that the signs are right, and again once they are doubted; of
+    wrong ones it goes on to see when they are right again.
 
-    finding : Finding, or None."""
+    finding : Finding, or None.
+    """
 
     def __init__(self, anchors: Anchors) -> None:
         """anchors : Anchors."""
@@ -41,10 +45,25 @@ class SignWatch:
             self._begin()
 
     def turn(self) -> None:
-        """The signs of all TDOAs have turned in flight: name that at once, or its end. The comparison begins again, and decides."""
-        line = "message.distance_difference = distance_to_b - distance_to_a  # always, not only in the beginning"
-        evidence = "from one moment on, each TDOA is the negative of what the place of the tag makes it"
-        turned = Finding("tdoa_sign", ERROR, "the sign of all TDOAs has changed in flight", evidence, line, TURNED)
+        """The signs of all TDOAs have turned in flight: name that at once, or its end.
+
+        The comparison begins again, and decides.
+        """
+        line = (
+            "message.distance_difference = distance_to_b - distance_to_a  # always, not only in "
+            "the beginning"
+        )
+        evidence = (
+            "from one moment on, each TDOA is the negative of what the place of the tag makes it"
+        )
+        turned = Finding(
+            "tdoa_sign",
+            ERROR,
+            "the sign of all TDOAs has changed in flight",
+            evidence,
+            line,
+            TURNED,
+        )
         if self.finding is None:
             self.finding = turned
         elif self.finding.value == turned.value:
@@ -58,7 +77,10 @@ class SignWatch:
         self._innovations: tuple[list[np.ndarray], list[np.ndarray]] = [], []
 
     def feed(self, t: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray) -> None:
-        """Take raw TDOAs (n,) of about a second: stamps, s; ids; m. Those that came too late for this are left out."""
+        """Take raw TDOAs (n,) of about a second: stamps, s; ids; m.
+
+        Those that came too late for this are left out.
+        """
         if self._certain:
             return
         last = self._stamps[-1][-1] if self._stamps else -np.inf
@@ -69,7 +91,9 @@ class SignWatch:
         t, a, b, d = t[rows], self._anchors.index(a[rows]), self._anchors.index(b[rows]), d[rows]
         self._stamps.append(t)
         for state, kept, sign in zip(self._states, self._innovations, (1.0, -1.0)):
-            kept.append(innovations(state, structured(TDOA, t, a, b, sign * d), self._anchors.positions))
+            kept.append(
+                innovations(state, structured(TDOA, t, a, b, sign * d), self._anchors.positions)
+            )
         self._test()
 
     def _test(self) -> None:
@@ -80,9 +104,14 @@ class SignWatch:
             self._states, self._stamps, self._innovations = [], [], ([], [])
         elif _better(wrong, right):
             ratio, z = compare(right, wrong)
-            evidence = f"the other way round {100.0 * (1.0 - ratio):.0f} % less stays unexplained, {z:.0f} standard errors"
+            evidence = (
+                f"the other way round {100.0 * (1.0 - ratio):.0f} % less stays unexplained, "
+                f"{z:.0f} standard errors"
+            )
             line = "message.distance_difference = distance_to_b - distance_to_a  # not a - b"
-            self.finding = Finding("tdoa_sign", ERROR, "the sign of all TDOAs is wrong", evidence, line, ratio)
+            self.finding = Finding(
+                "tdoa_sign", ERROR, "the sign of all TDOAs is wrong", evidence, line, ratio
+            )
             self._begin()
         elif t[-1] - t[0] > LONGEST:
             self._begin()

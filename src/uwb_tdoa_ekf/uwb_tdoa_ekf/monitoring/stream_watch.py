@@ -1,4 +1,6 @@
-"""The rules over streams in flight: over the last seconds, and without those that say nothing there."""
+"""The rules over streams in flight: over the last seconds, and without those that say nothing
+there.
+"""
 
 from __future__ import annotations
 
@@ -7,12 +9,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..streams import NOTE, Steady, StreamRules, most_severe_first
-from .sign_watch import SignWatch
 from ..streams.stamp_rules import usual
+from .sign_watch import SignWatch
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from uwb_tdoa_bias.foundation.anchors import Anchors
+
     from ..streams.finding import Finding
 
 KEPT = 4  # windows of a second that are checked together
@@ -22,14 +26,18 @@ LATEST = 2  # of them, which must say it too, or it is over
 NOT_IN_FLIGHT = {"imu_shaking"}
 FEW_ANCHORS = "few_anchors"  # a tag with a fixed height needs three
 SMALLEST_UNIT = 100.0  # of another unit of stamps: what is less is the pace of a replay
-ALIKE = 0.5  # share of the swing of one stream's latency that the other has too, when it is we who are not scheduled
+# share of the swing of one stream's latency that the other has too, when it is we who are not
+# scheduled
+ALIKE = 0.5
 
 
 class StreamWatch:
     """Keeps what arrives and checks it when it is asked, once a second."""
 
     def __init__(self, anchors: Anchors, lag: float, ignored: Sequence[str] = ()) -> None:
-        """anchors : Anchors; lag : s, what the node waits for; ignored : names of rules that do not hold for this tag."""
+        """anchors : Anchors; lag : s, what the node waits for; ignored : names of rules that do not
+        hold for this tag.
+        """
         self._anchors, self._lag, self._ignored = anchors, lag, NOT_IN_FLIGHT | set(ignored)
         self.restart()
 
@@ -42,17 +50,24 @@ class StreamWatch:
         self._turns: int | None = None  # as of Monitor, at the last look
         self._steady = Steady()
 
-    def add_imu(self, t: np.ndarray, arrival: np.ndarray, gyro: np.ndarray, accel: np.ndarray) -> None:
-        """Take samples: stamps and arrivals, (n,) s, of one clock if possible; gyro (n, 3) rad/s; accel (n, 3) m/s^2."""
+    def add_imu(
+        self, t: np.ndarray, arrival: np.ndarray, gyro: np.ndarray, accel: np.ndarray
+    ) -> None:
+        """Take samples: stamps and arrivals, (n,) s, of one clock if possible; gyro (n, 3) rad/s;
+        accel (n, 3) m/s^2.
+        """
         self._imu.append((t, arrival, gyro, accel))
 
-    def add_tdoa(self, t: np.ndarray, arrival: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray) -> None:
+    def add_tdoa(
+        self, t: np.ndarray, arrival: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray
+    ) -> None:
         """Take raw TDOAs: stamps and arrivals, (n,) s; a, b (n,) ids; d (n,) m."""
         self._tdoa.append((t, arrival, a, b, d))
 
     def findings(self, turns: int = 0, doubted: bool = False) -> list[Finding]:
-        """What stands: a list of Finding, most severe first. turns : of the signs of all TDOAs so far, as of Monitor; doubted : most TDOAs
-        contradict the filter."""
+        """What stands: a list of Finding, most severe first. turns : of the signs of all TDOAs so
+        far, as of Monitor; doubted : most TDOAs contradict the filter.
+        """
         imu, self._imu = self._imu, []
         tdoa, self._tdoa = self._tdoa, []
         if self._turns is not None and turns > self._turns:
@@ -71,7 +86,11 @@ class StreamWatch:
             return []
         still, found = {finding.rule for finding in rules.findings(LATEST)}, []
         if still:
-            found = [finding for finding in rules.findings() if finding.rule in still and self._counts(finding)]
+            found = [
+                finding
+                for finding in rules.findings()
+                if finding.rule in still and self._counts(finding)
+            ]
         return most_severe_first(self._steady([*found, *filter(None, [self._sign.finding])]))
 
     def _counts(self, finding: Finding) -> bool:

@@ -1,7 +1,7 @@
 """Two anchors that were exchanged: each sends from where the other is said to be.
 
-The place of the filter may be wrong by then. So each exchange gets the place, about that of the filter, at which it explains a slice best,
-and so does the survey as it is.
+The place of the filter may be wrong by then. So each exchange gets the place, about that of the
+filter, at which it explains a slice best, and so does the survey as it is.
 """
 
 from __future__ import annotations
@@ -16,30 +16,61 @@ from uwb_tdoa_bias.foundation.geometry import ranges, tdoa
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    Residuals = dict[tuple[int, ...], float]  # m, mean absolute residual by the rows of two exchanged anchors; () : of none
+    Residuals = dict[
+        tuple[int, ...], float
+    ]  # m, mean absolute residual by the rows of two exchanged anchors; () : of none
 
 SUSPECTS = 8  # anchors with the largest innovations, whose exchanges are tried,
 LARGE = 0.3  # m, if the largest is as large as that
 PLACE_STD = 1.0  # m, by which the filter may be off
-STD, ROBUST, STEPS = 0.15, 0.4, 3  # m, of one TDOA; m, scale of the Geman-McClure weight; solutions for the place
+STD, ROBUST, STEPS = (
+    0.15,
+    0.4,
+    3,
+)  # m, of one TDOA; m, scale of the Geman-McClure weight; solutions for the place
 CLIP = 1.5  # m; a larger residual counts as this
 FEWEST = 10  # TDOAs of a slice
-SHARE, OF_OTHERS = 0.4, 0.8  # of the residuals that an exchange may leave, of those as surveyed and of those of any other exchange;
-MOST_LEFT, LEAST, ALONE = 0.65, 0.1, 2.5  # or more, if it explains so much, m, and so many times as much as any other
+SHARE, OF_OTHERS = (
+    0.4,
+    0.8,
+    # of the residuals that an exchange may leave, of those as surveyed and of those of any other
+    # exchange;
+)
+MOST_LEFT, LEAST, ALONE = (
+    0.65,
+    0.1,
+    2.5,
+)  # or more, if it explains so much, m, and so many times as much as any other
 
 
-def residuals(positions: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray, p: np.ndarray, named: Sequence[int] = ()) -> Residuals:
-    """Residuals of a slice with each exchange of two suspects, and with none; {} where nothing is far off, and no exchange is named.
+def residuals(
+    positions: np.ndarray,
+    a: np.ndarray,
+    b: np.ndarray,
+    d: np.ndarray,
+    p: np.ndarray,
+    named: Sequence[int] = (),
+) -> Residuals:
+    """Residuals of a slice with each exchange of two suspects, and with none; {} where nothing is
+    far off, and no exchange is named.
 
-    positions : (N, 3) m; a, b : (n,) rows; d : (n,) m, measured; p : (3,) m, where the filter had the tag; named : rows of two anchors
+    positions : (N, 3) m; a, b : (n,) rows; d : (n,) m, measured; p : (3,) m, where the filter had
+        the tag; named : rows of two anchors
     that are tried in any case.
     """
     rows, both = np.unique(np.concatenate([a, b]), return_inverse=True)
-    a, b, positions, n = both[: len(a)], both[len(a) :], positions[rows], len(rows)  # of those that are heard
+    a, b, positions, n = (
+        both[: len(a)],
+        both[len(a) :],
+        positions[rows],
+        len(rows),
+    )  # of those that are heard
     if len(a) < FEWEST:
         return {}
     error = np.abs(d - tdoa(p, positions[a], positions[b]))
-    mean = (np.bincount(a, error, n) + np.bincount(b, error, n)) / (np.bincount(a, minlength=n) + np.bincount(b, minlength=n))
+    mean = (np.bincount(a, error, n) + np.bincount(b, error, n)) / (
+        np.bincount(a, minlength=n) + np.bincount(b, minlength=n)
+    )
     tried = set(np.flatnonzero(np.isin(rows, named)).tolist()) if len(named) else set()
     if mean.max() >= LARGE:
         tried |= set(np.argsort(-mean)[:SUSPECTS].tolist())
@@ -53,8 +84,12 @@ def residuals(positions: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray
     return dict(zip([(), *((int(rows[i]), int(rows[k])) for i, k in pairs)], left))
 
 
-def _left(positions: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray, p: np.ndarray) -> np.ndarray:
-    """(m,) m: mean absolute residual with each of several positions (m, N, 3) m of the anchors, at the place that fits best."""
+def _left(
+    positions: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray, p: np.ndarray
+) -> np.ndarray:
+    """(m,) m: mean absolute residual with each of several positions (m, N, 3) m of the anchors, at
+    the place that fits best.
+    """
     place = np.tile(p, (len(positions), 1))
     for _ in range(STEPS):
         away, towards = ranges(place[:, None], positions)
@@ -69,7 +104,11 @@ def _left(positions: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray, p:
 
 def mean_of(slices: Sequence[Residuals]) -> Residuals:
     """Mean of the Residuals of several slices, of the exchanges that were tried in all."""
-    return {key: sum(one[key] for one in slices) / len(slices) for key in slices[0] if all(key in one for one in slices)}
+    return {
+        key: sum(one[key] for one in slices) / len(slices)
+        for key in slices[0]
+        if all(key in one for one in slices)
+    }
 
 
 def clear_exchange(left: Residuals) -> tuple[int, ...]:

@@ -1,4 +1,6 @@
-"""What became of the measurements lately, by the clock of this machine: the one judge of that for `status` and for /diagnostics."""
+"""What became of the measurements lately, by the clock of this machine: the one judge of that for
+`status` and for /diagnostics.
+"""
 
 from __future__ import annotations
 
@@ -13,32 +15,49 @@ if TYPE_CHECKING:
 
 SILENT = 1.0  # s without a measurement that was used, before it is said
 WINDOW = 1.5  # s over which shares are judged
-WINDOW_OF_REJECTED = 4.0  # s, the same for TDOAs that contradict the filter: 46 % at most in 22 measured flights, of which some land
-SETTLED = 5.0  # s after a start, before which it is not said that TDOAs contradict the filter: on the floor, 85 % for 3 s
+# s, the same for TDOAs that contradict the filter: 46 % at most in 22 measured flights, of which
+# some land
+WINDOW_OF_REJECTED = 4.0
+# s after a start, before which it is not said that TDOAs contradict the filter: on the floor, 85 %
+# for 3 s
+SETTLED = 5.0
 EARLY = 0.05  # s by which a look may come early
 LARGEST_UNUSED = 0.5  # share of TDOAs that are not used for one reason, before it is said
 FEWEST = 10  # TDOAs of a window that say something
 REASONS = "late", "invalid", "rejected"
-USED = "used", "compensated", *(f"{name}_{verdict}" for name in LOCATING for verdict in ("used", "compensated"))
+USED = (
+    "used",
+    "compensated",
+    *(f"{name}_{verdict}" for name in LOCATING for verdict in ("used", "compensated")),
+)
 
 
 class Use:
     """Looks at the counts of an Estimator several times a second.
 
-    tdoa_age, imu_age : s since a TDOA or distance, or an inertial sample, was seen to be used; inf before the first. arrival_age : s since
+    tdoa_age, imu_age : s since a TDOA or distance, or an inertial sample, was seen to be used; inf
+        before the first. arrival_age : s since
     a TDOA or distance was seen to arrive.
     """
 
     def __init__(self, lag: float) -> None:
         """lag : s, for which the filter waits."""
         self._lag = lag
-        self._looks: deque[tuple[float, dict[str, int]]] = deque()  # (time.monotonic(), counts) of the last seconds
-        self._since: dict[str, float] = {}  # time.monotonic() of the last look at which there was more, by kind
+        self._looks: deque[tuple[float, dict[str, int]]] = (
+            deque()
+        )  # (time.monotonic(), counts) of the last seconds
+        self._since: dict[
+            str, float
+        ] = {}  # time.monotonic() of the last look at which there was more, by kind
         self._running_since = math.inf  # time.monotonic()
         self._now = -math.inf
 
-    def look(self, now: float, received: Mapping[str, int], counts: Mapping[str, int], running: bool) -> None:
-        """Take totals at time.monotonic() `now`, s. received : messages by stream; counts : by verdict; running : there is a position."""
+    def look(
+        self, now: float, received: Mapping[str, int], counts: Mapping[str, int], running: bool
+    ) -> None:
+        """Take totals at time.monotonic() `now`, s. received : messages by stream; counts : by
+        verdict; running : there is a position.
+        """
         totals = {
             "arrival": received["tdoa"] + sum(received[name] for name in LOCATING),
             "tdoa": sum(counts[name] for name in USED),
@@ -49,7 +68,11 @@ class Use:
             **{reason: counts[reason] for reason in REASONS},
         }
         before = self._looks[-1][1] if self._looks else dict.fromkeys(totals, 0)
-        self._since |= {kind: now for kind in ("arrival", "tdoa", "imu", "velocity", "restarts") if totals[kind] > before[kind]}
+        self._since |= {
+            kind: now
+            for kind in ("arrival", "tdoa", "imu", "velocity", "restarts")
+            if totals[kind] > before[kind]
+        }
         if not running or totals["restarts"] > before["restarts"]:
             self._running_since = math.inf
         if running and self._running_since == math.inf:
@@ -90,7 +113,9 @@ class Use:
         return self._age("velocity") < SILENT
 
     def _shares(self, window: float) -> dict[str, float]:
-        """Shares of the TDOAs of the last `window`, s, by what became of them, 0 to 1; empty for too few."""
+        """Shares of the TDOAs of the last `window`, s, by what became of them, 0 to 1; empty for
+        too few.
+        """
         until = self._now - window + EARLY
         first = next((totals for at, totals in reversed(self._looks) if at <= until), None)
         if first is None:
@@ -119,10 +144,14 @@ class Use:
     def _sentence(self, reason: str) -> str:
         reasons = {
             "late": (
-                f"come too late to be used: if they arrive late or in bursts, raise lag (-p lag:=, now {self._lag} s); if they come out of "
+                "come too late to be used: if they arrive late or in bursts, raise lag (-p "
+                f"lag:=, now {self._lag} s); if they come out of "
                 "order, raise reorder; otherwise another stream is stamped ahead"
             ),
-            "invalid": "are invalid (not finite, or of ids that uwb/anchors does not list): correct the driver, or list its anchors",
+            "invalid": (
+                "are invalid (not finite, or of ids that uwb/anchors does not list): correct the "
+                "driver, or list its anchors"
+            ),
             "rejected": "contradict the filter: check the anchors' positions, and tdoa_std",
         }
         return f"more than half of the TDOAs {reasons[reason]}"

@@ -1,4 +1,5 @@
-"""Streams checked by themselves: units, stamps, rates, repeats, several senders. Without a filter and without ROS.
+"""Streams checked by themselves: units, stamps, rates, repeats, several senders. Without a filter
+and without ROS.
 
 streams = StreamRules(anchors)
 streams.feed_imu(t, arrival, gyro, force)
@@ -11,4 +12,13 @@ for finding in streams.findings():
 from .finding import ERROR, NOTE, SEVERITIES, WARNING, Finding, Steady, most_severe_first
 from .rules import StreamRules
 
-__all__ = ["ERROR", "NOTE", "SEVERITIES", "WARNING", "Finding", "Steady", "StreamRules", "most_severe_first"]
+__all__ = [
+    "ERROR",
+    "NOTE",
+    "SEVERITIES",
+    "WARNING",
+    "Finding",
+    "Steady",
+    "StreamRules",
+    "most_severe_first",
+]

@@ -10,7 +10,15 @@ import numpy as np
 from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.vibration import VIBRATION_CORNER, low_pass
 
-from .stamps import LAST, StampWindow, complete, count_stamp, new_stamps, restart_stamps, stamp_window
+from .stamps import (
+    LAST,
+    StampWindow,
+    complete,
+    count_stamp,
+    new_stamps,
+    restart_stamps,
+    stamp_window,
+)
 
 ABSURD = 1e9  # in any unit: no number that a sensor gives
 
@@ -29,11 +37,14 @@ class ImuCounters(NamedTuple):
 
 
 class ImuWindow(NamedTuple):
-    """One window of inertial samples. Rates in rad/s and specific force in m/s^2 if the driver is right.
+    """One window of inertial samples. Rates in rad/s and specific force in m/s^2 if the driver is
+    right.
 
-    mean, deviation, vibration (6,) : of gyroscope x y z and accelerometer x y z; vibration is the rms of what is
-    faster than VIBRATION_CORNER; still (6,) : share of samples that equal the one before, per channel;
-    repeated : share of samples in which all six do; clipped (6,) : samples at the same far end of what the channel
+    mean, deviation, vibration (6,) : of gyroscope x y z and accelerometer x y z; vibration is the
+    rms of what is faster than VIBRATION_CORNER; still (6,) : share of samples that equal the one
+    before, per channel;
+    repeated : share of samples in which all six do; clipped (6,) : samples at the same far end of
+        what the channel
     showed, and limit (6,) that end; invalid : share of samples that are no numbers.
     """
 
@@ -66,9 +77,12 @@ def restart_imu(counters: ImuCounters) -> None:
 
 
 @compiled
-def count_imu(counters: ImuCounters, t: float, arrival: float, gyro: np.ndarray, force: np.ndarray) -> bool:
-    """Take one sample: stamp and arrival, s (NaN: not known); rates and specific force as the message has them. Returns
-    whether the window is complete."""
+def count_imu(
+    counters: ImuCounters, t: float, arrival: float, gyro: np.ndarray, force: np.ndarray
+) -> bool:
+    """Take one sample: stamp and arrival, s (NaN: not known); rates and specific force as the
+    message has them. Returns whether the window is complete.
+    """
     s, whole = counters.stamps, counters.whole
     dt = t - s[LAST]
     count_stamp(s, t, arrival)
@@ -106,10 +120,16 @@ def count_imu(counters: ImuCounters, t: float, arrival: float, gyro: np.ndarray,
 
 @compiled
 def feed_imu(
-    counters: ImuCounters, t: np.ndarray, arrival: np.ndarray, gyro: np.ndarray, force: np.ndarray, first: int
+    counters: ImuCounters,
+    t: np.ndarray,
+    arrival: np.ndarray,
+    gyro: np.ndarray,
+    force: np.ndarray,
+    first: int,
 ) -> tuple[int, bool]:
-    """`count_imu` for the rows of arrays from `first` on, until a window is complete: (row after the last, whether it
-    is)."""
+    """`count_imu` for the rows of arrays from `first` on, until a window is complete: (row after
+    the last, whether it is).
+    """
     for i in range(first, len(t)):
         if count_imu(counters, t[i], arrival[i], gyro[i], force[i]):
             return i + 1, True

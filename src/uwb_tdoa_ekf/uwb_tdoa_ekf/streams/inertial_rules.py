@@ -1,4 +1,7 @@
-"""Rules for the values of an inertial stream. A rule takes windows and returns a Finding or None."""
+"""Rules for the values of an inertial stream.
+
+A rule takes windows and returns a Finding or None.
+"""
 
 from __future__ import annotations
 
@@ -14,18 +17,43 @@ if TYPE_CHECKING:
 
 GRAVITY = 9.81
 FORCE_RANGE = 7.0, 14.0  # m/s^2, median length of the mean specific force; healthy 9.7 - 10.5
-FORCE_UNITS = {"g": (GRAVITY, 0.7, 1.5), "mg": (1e-3 * GRAVITY, 700.0, 1500.0), "mm/s^2": (1e-3, 7e3, 14e3)}
-WEIGHTLESS = 0.65  # of the deviation over the mean, m/s^2 over m/s^2: no gravity in it; healthy 0.41 at most
-STEADY = 0.8  # length of the mean specific force over the mean of its lengths; healthy 0.96 at least
-# Without gravity 29 measured and simulated flights deviate by 0.74 at least, or are steady to 0.64 at most.
-TURN_EXCESS = 0.35  # rad/s of turning that gravity does not follow; healthy 0.02 at most, in degrees/s 0.7 at least
-REST_SHAKES, REST_TURNS = 0.02, 0.02  # of the specific force: its deviation in a window, and rad of its direction, of a tag at rest
-UPRIGHT, AXIS = np.cos(np.deg2rad(35.0)), np.cos(np.deg2rad(25.0))  # healthy: 22 degrees, from vibration, at most
-SHAKING = 1.0  # m/s^2 rms of what is faster than 50 ms; healthy 0.6; where the accelerometer rectifies 1.4 at least
+FORCE_UNITS = {
+    "g": (GRAVITY, 0.7, 1.5),
+    "mg": (1e-3 * GRAVITY, 700.0, 1500.0),
+    "mm/s^2": (1e-3, 7e3, 14e3),
+}
+WEIGHTLESS = (
+    0.65  # of the deviation over the mean, m/s^2 over m/s^2: no gravity in it; healthy 0.41 at most
+)
+STEADY = (
+    0.8  # length of the mean specific force over the mean of its lengths; healthy 0.96 at least
+)
+# Without gravity 29 measured and simulated flights deviate by 0.74 at least, or are steady to 0.64
+# at most.
+# rad/s of turning that gravity does not follow; healthy 0.02 at most, in degrees/s 0.7 at least
+TURN_EXCESS = 0.35
+REST_SHAKES, REST_TURNS = (
+    0.02,
+    0.02,
+)  # of the specific force: its deviation in a window, and rad of its direction, of a tag at rest
+UPRIGHT, AXIS = (
+    np.cos(np.deg2rad(35.0)),
+    np.cos(np.deg2rad(25.0)),
+)  # healthy: 22 degrees, from vibration, at most
+# m/s^2 rms of what is faster than 50 ms; healthy 0.6; where the accelerometer rectifies 1.4 at
+# least
+SHAKING = 1.0
 REPEATS, DEAD = 0.2, 0.95  # shares; healthy 0
 # samples at one end in a window, which is that far, m/s^2 and rad/s, off the mean
 CLIPPED, FAR_FORCE, FAR_RATE = 8, 8.0, 2.0
-AXES = ("gyroscope x", "gyroscope y", "gyroscope z", "accelerometer x", "accelerometer y", "accelerometer z")
+AXES = (
+    "gyroscope x",
+    "gyroscope y",
+    "gyroscope z",
+    "accelerometer x",
+    "accelerometer y",
+    "accelerometer z",
+)
 
 
 def force_of(windows: list[ImuWindow]) -> np.ndarray:
@@ -34,15 +62,20 @@ def force_of(windows: list[ImuWindow]) -> np.ndarray:
 
 
 def weight(windows: list[ImuWindow]) -> float:
-    """Median length of the mean specific force: gravity, whatever the tag does, as long as it does not fly away."""
+    """Median length of the mean specific force: gravity, whatever the tag does, as long as it does
+    not fly away.
+    """
     return median(float(np.linalg.norm(window.mean[3:])) for window in windows)
 
 
 def steadiness(windows: list[ImuWindow]) -> float:
-    """Length of the mean of the windows' specific forces over the mean of their lengths: 1 where it always points one
-    way."""
+    """Length of the mean of the windows' specific forces over the mean of their lengths: 1 where it
+    always points one way.
+    """
     forces = np.array([window.mean[3:] for window in windows])
-    return float(np.linalg.norm(forces.mean(axis=0)) / max(np.linalg.norm(forces, axis=1).mean(), 1e-9))
+    return float(
+        np.linalg.norm(forces.mean(axis=0)) / max(np.linalg.norm(forces, axis=1).mean(), 1e-9)
+    )
 
 
 def silent(windows: list[ImuWindow]) -> Finding | None:
@@ -51,8 +84,13 @@ def silent(windows: list[ImuWindow]) -> Finding | None:
     if share < DEAD:
         return None
     remedy = "ros2 topic echo imu/data  # the sensor is not read: check its driver"
-    evidence = f"{100.0 * share:.0f} % of the samples equal the one before, specific force {weight(windows):.2f} m/s^2"
-    return Finding("imu_silent", ERROR, "the IMU is silent: its samples do not change", evidence, remedy, share)
+    evidence = (
+        f"{100.0 * share:.0f} % of the samples equal the one before, specific force "
+        f"{weight(windows):.2f} m/s^2"
+    )
+    return Finding(
+        "imu_silent", ERROR, "the IMU is silent: its samples do not change", evidence, remedy, share
+    )
 
 
 def repeated(windows: list[ImuWindow]) -> Finding | None:
@@ -61,9 +99,19 @@ def repeated(windows: list[ImuWindow]) -> Finding | None:
         return None
     rate = 1.0 / max(median(window.stamps.step for window in windows), 1e-9)
     measured = rate * (1.0 - share)
-    evidence = f"{100.0 * share:.0f} % equal the one before: {rate:.0f} Hz are published, {measured:.0f} Hz measured"
+    evidence = (
+        f"{100.0 * share:.0f} % equal the one before: {rate:.0f} Hz are published, {measured:.0f} "
+        "Hz measured"
+    )
     remedy = "publish a sample when there is a new one, not by a timer"
-    return Finding("imu_repeated", WARNING, "inertial samples are published more than once", evidence, remedy, share)
+    return Finding(
+        "imu_repeated",
+        WARNING,
+        "inertial samples are published more than once",
+        evidence,
+        remedy,
+        share,
+    )
 
 
 def dead_axis(windows: list[ImuWindow]) -> Finding | None:
@@ -72,8 +120,18 @@ def dead_axis(windows: list[ImuWindow]) -> Finding | None:
     if not axes or len(axes) == 6:
         return None
     evidence = f"{100.0 * still.max():.0f} % of its samples equal the one before"
-    remedy = "ros2 topic echo imu/data  # compare with the data sheet's registers: an axis is not read or not copied"
-    return Finding("imu_axis_dead", ERROR, f"{', '.join(axes)} does not change", evidence, remedy, float(len(axes)))
+    remedy = (
+        "ros2 topic echo imu/data  # compare with the data sheet's registers: an axis is not read "
+        "or not copied"
+    )
+    return Finding(
+        "imu_axis_dead",
+        ERROR,
+        f"{', '.join(axes)} does not change",
+        evidence,
+        remedy,
+        float(len(axes)),
+    )
 
 
 def invalid(windows: list[ImuWindow]) -> Finding | None:
@@ -81,18 +139,34 @@ def invalid(windows: list[ImuWindow]) -> Finding | None:
     if share < 1e-3:
         return None
     remedy = "do not publish samples that are not finite"
-    return Finding("imu_invalid", WARNING, "inertial samples are not finite", f"{100.0 * share:.1f} %", remedy, share)
+    return Finding(
+        "imu_invalid",
+        WARNING,
+        "inertial samples are not finite",
+        f"{100.0 * share:.1f} %",
+        remedy,
+        share,
+    )
 
 
 def no_gravity(windows: list[ImuWindow]) -> Finding | None:
     """Little mean, and what there is does not outweigh the motion: gravity was taken out."""
     length = weight(windows)
     motion = median(float(np.linalg.norm(window.deviation[3:])) for window in windows)
-    if silent(windows) or length > FORCE_RANGE[0] or (motion < WEIGHTLESS * length and steadiness(windows) > STEADY):
+    if (
+        silent(windows)
+        or length > FORCE_RANGE[0]
+        or (motion < WEIGHTLESS * length and steadiness(windows) > STEADY)
+    ):
         return None
     cause = "gravity was taken out of the acceleration; specific force, with gravity, is needed"
-    evidence = f"the specific force is {length:.2g} on average, and deviates by {motion:.2g}; it should be 9.81 m/s^2"
-    line = "/imu/data_raw:=/imu/data  # publish what the accelerometer reads, not linear acceleration"
+    evidence = (
+        f"the specific force is {length:.2g} on average, and deviates by {motion:.2g}; it should "
+        "be 9.81 m/s^2"
+    )
+    line = (
+        "/imu/data_raw:=/imu/data  # publish what the accelerometer reads, not linear acceleration"
+    )
     return Finding("imu_no_gravity", ERROR, cause, evidence, line, length)
 
 
@@ -105,39 +179,80 @@ def force_unit(windows: list[ImuWindow]) -> Finding | None:
     for unit, (scale, low, high) in FORCE_UNITS.items():
         if low <= length <= high:
             line = (
-                f"for axis in 'xyz': setattr(a, axis, {scale:g} * getattr(a, axis))  # a = message.linear_acceleration"
+                f"for axis in 'xyz': setattr(a, axis, {scale:g} * getattr(a, axis))  # a = "
+                "message.linear_acceleration"
             )
             return Finding(
-                "imu_force_unit", ERROR, f"the accelerometer is in {unit}, not in m/s^2", evidence, line, scale
+                "imu_force_unit",
+                ERROR,
+                f"the accelerometer is in {unit}, not in m/s^2",
+                evidence,
+                line,
+                scale,
             )
-    line = f"scale linear_acceleration by {GRAVITY / length:.4g}, after a look at the sensor's range setting"
-    return Finding("imu_force_unit", ERROR, "the accelerometer is not in m/s^2", evidence, line, GRAVITY / length)
+    line = (
+        f"scale linear_acceleration by {GRAVITY / length:.4g}, after a look at the sensor's range "
+        "setting"
+    )
+    return Finding(
+        "imu_force_unit",
+        ERROR,
+        "the accelerometer is not in m/s^2",
+        evidence,
+        line,
+        GRAVITY / length,
+    )
 
 
 def rate_unit(windows: list[ImuWindow]) -> Finding | None:
-    """What turns about a horizontal axis turns gravity with it: a gyroscope that says otherwise is not in rad/s."""
+    """What turns about a horizontal axis turns gravity with it: a gyroscope that says otherwise is
+    not in rad/s.
+    """
     excess = turn_excess(windows)
     if not excess > TURN_EXCESS:
         return None
     evidence = f"{excess:.2f} rad/s of turning that gravity does not follow"
     if resting(windows):
-        cause = "the gyroscope turns at rest: its bias is large, or it is not in rad/s; a tag at rest does not determine which"
-        remedy = "calibrate the gyroscope at rest, look at its unit in the data sheet, and check a recording in motion"
+        cause = (
+            "the gyroscope turns at rest: its bias is large, or it is not in rad/s; a tag at rest "
+            "does not determine which"
+        )
+        remedy = (
+            "calibrate the gyroscope at rest, look at its unit in the data sheet, and check a "
+            "recording in motion"
+        )
         return Finding("imu_rate_offset", WARNING, cause, evidence, remedy, excess)
-    line = "for axis in 'xyz': setattr(w, axis, math.radians(getattr(w, axis)))  # w = message.angular_velocity"
-    return Finding("imu_rate_unit", ERROR, "the gyroscope is in degrees/s, not in rad/s", evidence, line, excess)
+    line = (
+        "for axis in 'xyz': setattr(w, axis, math.radians(getattr(w, axis)))  # w = "
+        "message.angular_velocity"
+    )
+    return Finding(
+        "imu_rate_unit",
+        ERROR,
+        "the gyroscope is in degrees/s, not in rad/s",
+        evidence,
+        line,
+        excess,
+    )
 
 
 def resting(windows: list[ImuWindow]) -> bool:
-    """Whether the specific force neither changes nor turns: nothing of a gyroscope but its bias can be judged."""
+    """Whether the specific force neither changes nor turns: nothing of a gyroscope but its bias can
+    be judged.
+    """
     shakes = median(float(np.linalg.norm(window.deviation[3:])) for window in windows)
-    ups = np.array([window.mean[3:] / max(np.linalg.norm(window.mean[3:]), 1e-9) for window in windows])
-    return shakes < REST_SHAKES * weight(windows) and bool(np.linalg.norm(ups - np.median(ups, axis=0), axis=1).max() < REST_TURNS)
+    ups = np.array(
+        [window.mean[3:] / max(np.linalg.norm(window.mean[3:]), 1e-9) for window in windows]
+    )
+    return shakes < REST_SHAKES * weight(windows) and bool(
+        np.linalg.norm(ups - np.median(ups, axis=0), axis=1).max() < REST_TURNS
+    )
 
 
 def turn_excess(windows: list[ImuWindow]) -> float:
-    """Median, over pairs of windows that follow each other, of the turn rate about the horizontal, less what the
-    direction of the specific force turned, rad/s; NaN where there are no such pairs."""
+    """Median, over pairs of windows that follow each other, of the turn rate about the horizontal,
+    less what the direction of the specific force turned, rad/s; NaN where there are no such pairs.
+    """
     values = []
     for one, two in zip(windows, windows[1:]):
         time = 0.5 * (two.stamps.end - one.stamps.begin)
@@ -158,14 +273,26 @@ def upright(windows: list[ImuWindow]) -> Finding | None:
     up = force / length
     if up[2] >= UPRIGHT:
         return None
-    evidence = f"mean specific force ({force[0]:+.2f}, {force[1]:+.2f}, {force[2]:+.2f}); upright it is (0, 0, +9.81)"
+    evidence = (
+        f"mean specific force ({force[0]:+.2f}, {force[1]:+.2f}, {force[2]:+.2f}); upright it is "
+        "(0, 0, +9.81)"
+    )
     k = int(np.argmax(np.abs(up)))
     if abs(up[k]) < AXIS:
         tilt = float(np.rad2deg(np.arccos(np.clip(up[2], -1.0, 1.0))))
         remedy = "turn the samples into base_link (x forward, y left, z up) in the driver"
-        return Finding("imu_tilted", WARNING, f"the IMU is tilted by {tilt:.0f} degrees", evidence, remedy, tilt)
+        return Finding(
+            "imu_tilted",
+            WARNING,
+            f"the IMU is tilted by {tilt:.0f} degrees",
+            evidence,
+            remedy,
+            tilt,
+        )
     axis = ("-" if up[k] < 0.0 else "+") + "xyz"[k]
-    line = f"x, y, z = {TURNS[axis]}  # of both sensors, in the driver: {axis} is up in what it reads"
+    line = (
+        f"x, y, z = {TURNS[axis]}  # of both sensors, in the driver: {axis} is up in what it reads"
+    )
     cause = f"the IMU is turned: {axis} points up, where base_link has +z"
     return Finding("imu_turned", ERROR, cause, evidence, line, float(k))
 
@@ -182,14 +309,19 @@ def shaking(windows: list[ImuWindow]) -> Finding | None:
     mean = ", ".join(f"{v:+.1f}" for v in force_of(windows))
     evidence = f"{rms[k]:.1f} m/s^2 rms on {'xyz'[k]}, mean specific force ({mean})"
     cause = "the accelerometer shakes, and what it reads on average is wrong then"
-    remedy = "put the board on foam, balance the propellers; the filter believes the axis less (vibration_gain)"
+    remedy = (
+        "put the board on foam, balance the propellers; the filter believes the axis less "
+        "(vibration_gain)"
+    )
     return Finding("imu_shaking", WARNING, cause, evidence, remedy, float(rms[k]))
 
 
 def clipped(windows: list[ImuWindow]) -> Finding | None:
     """Many samples at one far end of the range."""
     far = np.array([FAR_RATE] * 3 + [FAR_FORCE] * 3)
-    hits = np.array([np.where(abs(w.limit - w.mean) > far, w.clipped * (1.0 - w.still), 0.0) for w in windows])
+    hits = np.array(
+        [np.where(abs(w.limit - w.mean) > far, w.clipped * (1.0 - w.still), 0.0) for w in windows]
+    )
     hits[hits < CLIPPED] = 0.0
     k = int(np.argmax(hits.sum(axis=0)))
     if not hits[:, k].any():
@@ -200,4 +332,15 @@ def clipped(windows: list[ImuWindow]) -> Finding | None:
     return Finding("imu_clipped", WARNING, f"{AXES[k]} is clipped", evidence, remedy, float(limit))
 
 
-RULES = (silent, repeated, dead_axis, invalid, no_gravity, force_unit, rate_unit, upright, shaking, clipped)
+RULES = (
+    silent,
+    repeated,
+    dead_axis,
+    invalid,
+    no_gravity,
+    force_unit,
+    rate_unit,
+    upright,
+    shaking,
+    clipped,
+)

@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from uwb_tdoa_bias.foundation.compiled import compiled
 
-from .stamps import LAST, StampWindow, complete, count_stamp, new_stamps, restart_stamps, stamp_window
+from .stamps import (
+    LAST,
+    StampWindow,
+    complete,
+    count_stamp,
+    new_stamps,
+    restart_stamps,
+    stamp_window,
+)
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.anchors import Anchors
@@ -17,26 +25,47 @@ if TYPE_CHECKING:
 ABSURD = 1e15  # in any unit: no number that a radio gives
 FOLLOWING = 0.1  # s between two TDOAs of a pair that count as successive
 LEAP = 0.5  # m between successive TDOAs of a pair that no tag flies in that time
-BEYOND = 1.0  # m by which a TDOA may exceed the distance of its anchors before it counts as impossible
+BEYOND = (
+    1.0  # m by which a TDOA may exceed the distance of its anchors before it counts as impossible
+)
 GRIDS = np.array(
     [1.0, 0.5, 0.25, 0.1, 0.05, 0.02, 0.01]
 )  # m, to which a driver might round; the radio's tick is 4.69 mm
 ON_GRID = 1e-6  # m
-# Pairs that are remembered, of all that a tag hears in a minute; places that one may have, of which it takes the oldest
+# Pairs that are remembered, of all that a tag hears in a minute; places that one may have, of which
+# it takes the oldest
 PAIRS, PROBES = 4096, 16
-FRESH = 0.3  # s before the end of a window, whose TDOAs belong together: no tag gets far in that time
+FRESH = (
+    0.3  # s before the end of a window, whose TDOAs belong together: no tag gets far in that time
+)
 STEPS = 64  # leaps of a window whose size is kept
 
 # places in the counters; those of the grids come after
-(KNOWN, UNKNOWN, SELF, INVALID, IMPOSSIBLE, DUPLICATES, SUCCESSIVE, REPEATED, LEAPS, RETURNS, OPPOSED, EVEN, SUM, HIGH,
- HIGH_HITS) = range(15)  # fmt: skip
+(
+    KNOWN,
+    UNKNOWN,
+    SELF,
+    INVALID,
+    IMPOSSIBLE,
+    DUPLICATES,
+    SUCCESSIVE,
+    REPEATED,
+    LEAPS,
+    RETURNS,
+    OPPOSED,
+    EVEN,
+    SUM,
+    HIGH,
+    HIGH_HITS,
+) = range(15)
 GRID = 15
 
 
 class TdoaCounters(NamedTuple):
-    """stamps : see stamps.py; counts; heard (N,) per anchor; steps (STEPS,) m : sizes of the latest leaps; pair, d, before, t (PAIRS,) : of
-    each pair of anchors heard lately the number, last value, the one before and the last stamp, which outlive a window; positions
-    (N, 3) : m."""
+    """stamps : see stamps.py; counts; heard (N,) per anchor; steps (STEPS,) m : sizes of the latest
+    leaps; pair, d, before, t (PAIRS,) : of each pair of anchors heard lately the number, last
+    value, the one before and the last stamp, which outlive a window; positions (N, 3) : m.
+    """
 
     stamps: np.ndarray
     counts: np.ndarray
@@ -52,14 +81,17 @@ class TdoaCounters(NamedTuple):
 class TdoaWindow(NamedTuple):
     """One window of TDOAs. Counts, unless it says otherwise.
 
-    known : finite and between two known anchors; unknown : with an anchor that the survey does not have; of_one : of
-    one anchor with itself; invalid : no number; impossible : longer than the anchors are apart; duplicates : same pair,
-    stamp and value as the one before of its pair; successive : that follow one of their pair within FOLLOWING; repeated
-    : of those, with the same value; leaps : of those, by more than LEAP; returns : leaps that go back to the value
-    before; opposed : pairs that came in both orders, one soon after the other; even : of those, with the same sign in
-    both; size : mean |d|, m; ceiling, hits : largest |d|, m, and how many have it; grids (7,) : share of the values on
-    multiples of GRIDS; heard (N,) : TDOAs in which an anchor takes part; steps (k,) : m, sizes of leaps; latest (k, 3) : rows of the
-    anchors and value, m, of the last TDOA of each pair, FRESH at most before the end.
+    known : finite and between two known anchors; unknown : with an anchor that the survey does not
+        have; of_one : of
+    one anchor with itself; invalid : no number; impossible : longer than the anchors are apart;
+    duplicates : same pair, stamp and value as the one before of its pair; successive : that follow
+    one of their pair within FOLLOWING; repeated : of those, with the same value; leaps : of those,
+    by more than LEAP; returns : leaps that go back to the value before; opposed : pairs that came
+    in both orders, one soon after the other; even : of those, with the same sign in both; size :
+    mean |d|, m; ceiling, hits : largest |d|, m, and how many have it; grids (7,) : share of the
+    values on multiples of GRIDS; heard (N,) : TDOAs in which an anchor takes part; steps (k,) : m,
+    sizes of leaps; latest (k, 3) : rows of the anchors and value, m, of the last TDOA of each pair,
+    FRESH at most before the end.
     """
 
     stamps: StampWindow
@@ -88,7 +120,17 @@ def new_tdoa(anchors: Anchors) -> TdoaCounters:
     """TdoaCounters of a stream of which nothing was received; anchors : Anchors."""
     d, before, t = np.full((3, PAIRS), np.nan)
     counts, heard = np.zeros(GRID + len(GRIDS)), np.zeros(len(anchors))
-    return TdoaCounters(new_stamps(), counts, heard, np.zeros(STEPS), np.full(PAIRS, -1), d, before, t, np.array(anchors.positions))
+    return TdoaCounters(
+        new_stamps(),
+        counts,
+        heard,
+        np.zeros(STEPS),
+        np.full(PAIRS, -1),
+        d,
+        before,
+        t,
+        np.array(anchors.positions),
+    )
 
 
 @compiled
@@ -101,8 +143,9 @@ def restart_tdoa(counters: TdoaCounters) -> None:
 
 @compiled
 def count_tdoa(counters: TdoaCounters, t: float, arrival: float, a: int, b: int, d: float) -> bool:
-    """Take one TDOA: stamp and arrival, s (NaN: not known); a, b rows of its anchors, negative if unknown; d as
-    received. Returns whether the window is complete."""
+    """Take one TDOA: stamp and arrival, s (NaN: not known); a, b rows of its anchors, negative if
+    unknown; d as received. Returns whether the window is complete.
+    """
     count_stamp(counters.stamps, t, arrival)
     _count(counters, t, a, b, d)
     return complete(counters.stamps)
@@ -181,7 +224,9 @@ def _find(counters: TdoaCounters, a: int, b: int) -> int:
 
 @compiled
 def _place(counters: TdoaCounters, a: int, b: int) -> int:
-    """Place of a pair of rows; one that is not remembered takes that of the pair that was heard the longest ago."""
+    """Place of a pair of rows; one that is not remembered takes that of the pair that was heard the
+    longest ago.
+    """
     place = _find(counters, a, b)
     if place >= 0:
         return place
@@ -201,10 +246,17 @@ def _place(counters: TdoaCounters, a: int, b: int) -> int:
 
 @compiled
 def feed_tdoa(
-    counters: TdoaCounters, t: np.ndarray, arrival: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray, first: int
+    counters: TdoaCounters,
+    t: np.ndarray,
+    arrival: np.ndarray,
+    a: np.ndarray,
+    b: np.ndarray,
+    d: np.ndarray,
+    first: int,
 ) -> tuple[int, bool]:
-    """`count_tdoa` for the rows of arrays from `first` on, until a window is complete: (row after the last, whether it
-    is)."""
+    """`count_tdoa` for the rows of arrays from `first` on, until a window is complete: (row after
+    the last, whether it is).
+    """
     for i in range(first, len(t)):
         if count_tdoa(counters, t[i], arrival[i], a[i], b[i], d[i]):
             return i + 1, True
@@ -230,6 +282,8 @@ def tdoa_window(counters: TdoaCounters) -> TdoaWindow:
 
 
 def _latest(counters: TdoaCounters) -> np.ndarray:
-    kept = np.flatnonzero((counters.pair >= 0) & (np.abs(counters.stamps[LAST] - counters.t) < FRESH))
+    kept = np.flatnonzero(
+        (counters.pair >= 0) & (np.abs(counters.stamps[LAST] - counters.t) < FRESH)
+    )
     a, b = np.divmod(counters.pair[kept], len(counters.heard))
     return np.column_stack([a, b, counters.d[kept]])

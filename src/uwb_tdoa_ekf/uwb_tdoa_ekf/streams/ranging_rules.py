@@ -21,11 +21,16 @@ RETURNS = 0.08  # share of TDOAs that leap by more than 0.5 m and back; healthy 
 EVEN = 0.6  # share of the pairs, heard in both orders, that have one sign; healthy 0.1
 ON_GRID = 0.95  # share; healthy 0.005
 CLIPPED = 0.02  # share at the largest value
-STEP, ALIKE, NEAR, FEWEST = 5.0, 0.6, 0.5, 10  # m, median leap; share of the leaps within NEAR, m, of that; leaps
+STEP, ALIKE, NEAR, FEWEST = (
+    5.0,
+    0.6,
+    0.5,
+    10,
+)  # m, median leap; share of the leaps within NEAR, m, of that; leaps
 TICK = 299792458.0 / (128 * 499.2e6)  # m, of the clock of a DW1000
-WRAPS = {f"2^{bits} ticks of a DW1000": 2.0**bits * TICK for bits in (8, 16, 24, 31, 32, 39, 40)} | {
-    f"2^{bits} ns": 2.0**bits * 0.299792458 for bits in (16, 31, 32)
-}
+WRAPS = {
+    f"2^{bits} ticks of a DW1000": 2.0**bits * TICK for bits in (8, 16, 24, 31, 32, 39, 40)
+} | {f"2^{bits} ns": 2.0**bits * 0.299792458 for bits in (16, 31, 32)}
 FEW = 3.9  # anchors heard in a second, below which there is no position
 
 
@@ -44,16 +49,29 @@ def fixed_step(windows: list[TdoaWindow]) -> Finding | None:
     share = share_of(windows, "impossible")
     if alike < ALIKE or share < 0.5 * OUTLIERS:
         return None
-    known = next((name for name, size in WRAPS.items() if abs(size - step) < max(NEAR, 1e-5 * size)), None)
+    known = next(
+        (name for name, size in WRAPS.items() if abs(size - step) < max(NEAR, 1e-5 * size)), None
+    )
     cause = f"TDOAs are off by a fixed step of {step:.8g} m"
-    cause += f": a time stamp wraps at {known}" if known else ": a time stamp wraps or loses its upper bits"
-    evidence = f"{100.0 * share:.0f} % of the TDOAs; {100.0 * alike:.0f} % of the leaps have this size"
-    remedy = "d = (d + step / 2) % step - step / 2  # step as above; or subtract the time stamps with all their bits, modulo their range"
+    cause += (
+        f": a time stamp wraps at {known}"
+        if known
+        else ": a time stamp wraps or loses its upper bits"
+    )
+    evidence = (
+        f"{100.0 * share:.0f} % of the TDOAs; {100.0 * alike:.0f} % of the leaps have this size"
+    )
+    remedy = (
+        "d = (d + step / 2) % step - step / 2  # step as above; or subtract the time stamps with "
+        "all their bits, modulo their range"
+    )
     return Finding("tdoa_wraps", WARNING, cause, evidence, remedy, step)
 
 
 def share_beside_known(windows: list[TdoaWindow], field: str) -> float:
-    """Share of TDOAs that `field` counts because they cannot be used, among these and the known ones, 0 to 1."""
+    """Share of TDOAs that `field` counts because they cannot be used, among these and the known
+    ones, 0 to 1.
+    """
     count = sum(getattr(w, field) for w in windows)
     return count / max(count + sum(w.known for w in windows), 1)
 
@@ -63,9 +81,14 @@ def impossible(windows: list[TdoaWindow]) -> Finding | None:
         return None
     share = share_of(windows, "impossible")
     size = median(w.size for w in windows)
-    evidence = f"{100.0 * share:.1f} % are longer than their anchors are apart, mean size {size:.3g}"
+    evidence = (
+        f"{100.0 * share:.1f} % are longer than their anchors are apart, mean size {size:.3g}"
+    )
     if share > LARGE:
-        remedy = "message.distance_difference = ...  # metres: seconds times 299792458, DW1000 ticks times 0.0046918"
+        remedy = (
+            "message.distance_difference = ...  # metres: seconds times 299792458, DW1000 ticks "
+            "times 0.0046918"
+        )
         return Finding(
             "tdoa_large",
             ERROR,
@@ -75,7 +98,9 @@ def impossible(windows: list[TdoaWindow]) -> Finding | None:
             share,
         )
     if share > OUTLIERS:
-        remedy = "keep radio and anchors clear of metal; drop TDOAs that the radio marks as doubtful"
+        remedy = (
+            "keep radio and anchors clear of metal; drop TDOAs that the radio marks as doubtful"
+        )
         return Finding("tdoa_outliers", WARNING, "many TDOAs are outliers", evidence, remedy, share)
     return None
 
@@ -84,7 +109,14 @@ def of_one(windows: list[TdoaWindow]) -> Finding | None:
     share = share_beside_known(windows, "of_one")
     if share > 1e-3:
         remedy = "message.anchor_a, message.anchor_b = ...  # the two anchors of the difference"
-        return Finding("tdoa_of_one", ERROR, "TDOAs name one anchor twice", f"{100.0 * share:.1f} %", remedy, share)
+        return Finding(
+            "tdoa_of_one",
+            ERROR,
+            "TDOAs name one anchor twice",
+            f"{100.0 * share:.1f} %",
+            remedy,
+            share,
+        )
     return None
 
 
@@ -92,7 +124,9 @@ def invalid(windows: list[TdoaWindow]) -> Finding | None:
     share = share_beside_known(windows, "invalid")
     if share > 1e-3:
         remedy = "do not publish what is not finite"
-        return Finding("tdoa_invalid", WARNING, "TDOAs are not finite", f"{100.0 * share:.1f} %", remedy, share)
+        return Finding(
+            "tdoa_invalid", WARNING, "TDOAs are not finite", f"{100.0 * share:.1f} %", remedy, share
+        )
     return None
 
 
@@ -111,7 +145,12 @@ def repeated(windows: list[TdoaWindow]) -> Finding | None:
         evidence = f"{100.0 * share:.0f} % have the value that their pair had before"
         remedy = "publish a TDOA when there is a new one, not by a timer"
         return Finding(
-            "tdoa_repeated", WARNING, "TDOAs are sampled faster than they are measured", evidence, remedy, share
+            "tdoa_repeated",
+            WARNING,
+            "TDOAs are sampled faster than they are measured",
+            evidence,
+            remedy,
+            share,
         )
     return None
 
@@ -120,7 +159,9 @@ def two_tags(windows: list[TdoaWindow]) -> Finding | None:
     share = share_of(windows, "returns", "successive")
     if share > RETURNS and fixed_step(windows) is None:
         evidence = f"{100.0 * share:.0f} % leap by more than 0.5 m and back within 0.1 s"
-        remedy = "give each tag a namespace of its own: start its driver with --ros-args -r __ns:=/tag2"
+        remedy = (
+            "give each tag a namespace of its own: start its driver with --ros-args -r __ns:=/tag2"
+        )
         return Finding("two_tags", ERROR, "two tags share uwb/tdoa", evidence, remedy, share)
     return None
 
@@ -128,8 +169,12 @@ def two_tags(windows: list[TdoaWindow]) -> Finding | None:
 def one_sign(windows: list[TdoaWindow]) -> Finding | None:
     share = share_of(windows, "even", "opposed")
     if share > EVEN and sum(w.opposed for w in windows) > 20:
-        evidence = f"{100.0 * share:.0f} % of the pairs that come as (a, b) and (b, a) have the same sign"
-        remedy = "message.distance_difference = distance_b - distance_a  # for the anchors in this order"
+        evidence = (
+            f"{100.0 * share:.0f} % of the pairs that come as (a, b) and (b, a) have the same sign"
+        )
+        remedy = (
+            "message.distance_difference = distance_b - distance_a  # for the anchors in this order"
+        )
         return Finding(
             "tdoa_one_sign",
             ERROR,
@@ -150,16 +195,30 @@ def rounded(windows: list[TdoaWindow]) -> Finding | None:
     severity = WARNING if grid >= 0.05 else NOTE
     evidence = f"{100.0 * shares[on[0]]:.0f} % are multiples of {grid:g} m"
     return Finding(
-        "tdoa_rounded", severity, "TDOAs are rounded", evidence, "publish them as float64, as measured", grid
+        "tdoa_rounded",
+        severity,
+        "TDOAs are rounded",
+        evidence,
+        "publish them as float64, as measured",
+        grid,
     )
 
 
 def clipped(windows: list[TdoaWindow]) -> Finding | None:
     ceiling = max(w.ceiling for w in windows)
-    share = sum(w.hits for w in windows if w.ceiling == ceiling) / max(sum(w.known for w in windows), 1)
+    share = sum(w.hits for w in windows if w.ceiling == ceiling) / max(
+        sum(w.known for w in windows), 1
+    )
     if share > CLIPPED and rounded(windows) is None and ceiling > 0.0:
         evidence = f"{100.0 * share:.0f} % are {ceiling:.3f} m or its negative"
-        return Finding("tdoa_clipped", ERROR, "TDOAs are clipped", evidence, "widen the limit of the driver", ceiling)
+        return Finding(
+            "tdoa_clipped",
+            ERROR,
+            "TDOAs are clipped",
+            evidence,
+            "widen the limit of the driver",
+            ceiling,
+        )
     return None
 
 
@@ -169,8 +228,27 @@ def heard(windows: list[TdoaWindow]) -> Finding | None:
     if count < FEW:
         evidence = f"{count:.0f} anchors in a second; four are needed, five or more are good"
         remedy = "switch on more anchors, or bring the tag among them"
-        return Finding("few_anchors", ERROR, "too few anchors are heard for a position", evidence, remedy, count)
+        return Finding(
+            "few_anchors",
+            ERROR,
+            "too few anchors are heard for a position",
+            evidence,
+            remedy,
+            count,
+        )
     return None
 
 
-RULES = (fixed_step, impossible, of_one, invalid, duplicates, repeated, two_tags, one_sign, rounded, clipped, heard)
+RULES = (
+    fixed_step,
+    impossible,
+    of_one,
+    invalid,
+    duplicates,
+    repeated,
+    two_tags,
+    one_sign,
+    rounded,
+    clipped,
+    heard,
+)

@@ -13,6 +13,7 @@ from .scale import KEPT, SurveyScale
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.anchors import Anchors
+
     from .inertial import ImuWindow
     from .ranging import TdoaWindow
 
@@ -25,8 +26,8 @@ FULL = 20  # messages without which a window says little of values
 class StreamRules:
     """Checks the inertial samples and the TDOAs of one tag by themselves.
 
-    Windows of a second of arrival (of stamps, where the arrival is not known) are counted as they come; the rules judge
-    windows.
+    Windows of a second of arrival (of stamps, where the arrival is not known) are counted as they
+    come; the rules judge windows.
     """
 
     def __init__(self, anchors: Anchors, kept: int | None = None) -> None:
@@ -38,16 +39,22 @@ class StreamRules:
         self._imu, self._tdoa = inertial.new_imu(), ranging.new_tdoa(anchors)
         self._scale = SurveyScale(anchors, kept and KEPT)
 
-    def feed_imu(self, t: np.ndarray, arrival: np.ndarray, gyro: np.ndarray, force: np.ndarray) -> None:
+    def feed_imu(
+        self, t: np.ndarray, arrival: np.ndarray, gyro: np.ndarray, force: np.ndarray
+    ) -> None:
         """Take many samples in the order of their arrival: t, arrival (n,), gyro, force (n, 3)."""
-        t, arrival, gyro, force = (np.ascontiguousarray(column, dtype=float) for column in (t, arrival, gyro, force))
+        t, arrival, gyro, force = (
+            np.ascontiguousarray(column, dtype=float) for column in (t, arrival, gyro, force)
+        )
         row = 0
         while row < len(t):
             row, complete = inertial.feed_imu(self._imu, t, arrival, gyro, force, row)
             if complete:
                 self._close_imu()
 
-    def feed_tdoa(self, t: np.ndarray, arrival: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray) -> None:
+    def feed_tdoa(
+        self, t: np.ndarray, arrival: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray
+    ) -> None:
         """Take many TDOAs in the order of their arrival: all (n,), a and b ids."""
         row_a, row_b = self.anchors.index(a), self.anchors.index(b)
         for ids, known in ((a, row_a), (b, row_b)):
@@ -67,18 +74,33 @@ class StreamRules:
                 close()
 
     def findings(self, latest: int = 0) -> list[Finding]:
-        """What stands: a list of Finding, most severe first. latest : of how many windows of each stream; 0: of all."""
+        """What stands: a list of Finding, most severe first. latest : of how many windows of each
+        stream; 0: of all.
+        """
         imu, tdoa = self.imu[-latest:], self.tdoa[-latest:]
         of_imu, of_tdoa = [window.stamps for window in imu], [window.stamps for window in tdoa]
         found: list[Finding | None] = []
         if imu:
-            found += [rule("imu/data", of_imu) for rule in stamp_rules.OF_ONE] + [rule(imu) for rule in inertial_rules.RULES]
+            found += [rule("imu/data", of_imu) for rule in stamp_rules.OF_ONE] + [
+                rule(imu) for rule in inertial_rules.RULES
+            ]
         if tdoa:
-            found += [rule("uwb/tdoa", of_tdoa) for rule in stamp_rules.OF_ONE] + [rule(tdoa) for rule in ranging_rules.RULES]
+            found += [rule("uwb/tdoa", of_tdoa) for rule in stamp_rules.OF_ONE] + [
+                rule(tdoa) for rule in ranging_rules.RULES
+            ]
         if imu and tdoa:
             found += [rule(of_imu, of_tdoa) for rule in stamp_rules.OF_BOTH]
-        if (scale := self._scale.finding) is not None:  # of which impossible TDOAs are what it looks like
-            found = [scale, *(finding for finding in found if finding is None or finding.rule not in LOOKS_LIKE)]
+        if (
+            scale := self._scale.finding
+        ) is not None:  # of which impossible TDOAs are what it looks like
+            found = [
+                scale,
+                *(
+                    finding
+                    for finding in found
+                    if finding is None or finding.rule not in LOOKS_LIKE
+                ),
+            ]
         found.append(self._unknown(tdoa))
         return most_severe_first(finding for finding in found if finding is not None)
 
@@ -89,11 +111,19 @@ class StreamRules:
         share = count / sum(window.stamps.count for window in windows)
         ids = ", ".join(map(str, sorted(self.unknown)))
         evidence = (
-            f"{100.0 * share:.1f} % of the TDOAs are with {ids}; the survey has {', '.join(map(str, self.anchors.ids))}"
+            f"{100.0 * share:.1f} % of the TDOAs are with {ids}; the survey has "
+            f"{', '.join(map(str, self.anchors.ids))}"
         )
-        line = "".join(f"  {number}: {{position: [x, y, z]}}\n" for number in sorted(self.unknown)).rstrip("\n")
+        line = "".join(
+            f"  {number}: {{position: [x, y, z]}}\n" for number in sorted(self.unknown)
+        ).rstrip("\n")
         return Finding(
-            "ids_unknown", ERROR, "the tag hears anchors that the survey does not have", evidence, line, share
+            "ids_unknown",
+            ERROR,
+            "the tag hears anchors that the survey does not have",
+            evidence,
+            line,
+            share,
         )
 
     def _close_imu(self) -> None:

@@ -1,7 +1,9 @@
-"""Is the survey in another unit, or one anchor of it? The TDOAs that are heard together are located in surveys of every scale.
+"""Is the survey in another unit, or one anchor of it? The TDOAs that are heard together are located
+in surveys of every scale.
 
-TDOAs in metres have a scale of their own: where the tag is among more than four anchors, one scale of the survey fits, and no other.
-The same measurements are located with other mistakes undone. The scale is named only if it explains more than each of these.
+TDOAs in metres have a scale of their own: where the tag is among more than four anchors, one scale
+of the survey fits, and no other. The same measurements are located with other mistakes undone. The
+scale is named only if it explains more than each of these.
 """
 
 from __future__ import annotations
@@ -21,19 +23,49 @@ from .finding import ERROR, Finding
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.anchors import Anchors
 
-PAIRS, HEARD = 32, 5  # pairs of a snapshot at most; anchors at least: three coordinates and a scale take four differences
+PAIRS, HEARD = (
+    32,
+    5,
+    # pairs of a snapshot at most; anchors at least: three coordinates and a scale take four differences
+)
 SMALL = 0.05  # m, median size of TDOAs below which they are not in metres themselves
-FEWEST, MANY, KEPT = 4, 20, 60  # snapshots that say something clear, and anything, and that are kept in flight
-SINGLE = 12  # anchors at most, of which each by itself, and any two, are tried: the work has a bound
-SMALLEST, RATIO, LARGEST = 1.5, 1.25, 1500.0  # least factor that counts, ratio of successive ones, and the largest
-LOSS, STEPS, NEAR = 0.5, 8, 0.3  # m, scale of the Geman-McClure loss; Gauss-Newton steps; of the size of the room, the longest of them
-STARTS = np.array([[0.0, 0.0, 0.0], [0.6, 0.6, 0.6], [-0.6, -0.6, 0.6], [0.6, -0.6, -0.6], [-0.6, 0.6, -0.6]])
-# Share of the loss that may be left, and standard errors by which it is less than that of the survey as it is. Another scale, or another
-# place of one anchor, explains some of any mistake: 0.84 of a tape with errors of 0.1 m. In feet 0.50 is left on measured flights.
+FEWEST, MANY, KEPT = (
+    4,
+    20,
+    60,
+)  # snapshots that say something clear, and anything, and that are kept in flight
+SINGLE = (
+    12  # anchors at most, of which each by itself, and any two, are tried: the work has a bound
+)
+SMALLEST, RATIO, LARGEST = (
+    1.5,
+    1.25,
+    1500.0,
+)  # least factor that counts, ratio of successive ones, and the largest
+LOSS, STEPS, NEAR = (
+    0.5,
+    8,
+    0.3,
+    # m, scale of the Geman-McClure loss; Gauss-Newton steps; of the size of the room, the longest of
+    # them
+)
+STARTS = np.array(
+    [[0.0, 0.0, 0.0], [0.6, 0.6, 0.6], [-0.6, -0.6, 0.6], [0.6, -0.6, -0.6], [-0.6, 0.6, -0.6]]
+)
+# Share of the loss that may be left, and standard errors by which it is less than that of the
+# survey as it is. Another scale, or another
+# place of one anchor, explains some of any mistake: 0.84 of a tape with errors of 0.1 m. In feet
+# 0.50 is left on measured flights.
 LEFT, DEVIATIONS = 0.65, 3.5
 GOOD = 0.35  # loss of a survey that fits; healthy flights of three days have 0.10 to 0.25
-MOVED, CLEARLY = 0.3, 0.5  # m by which the tag must have moved; share of the loss that shows it after few seconds and at rest, too
-NANOSECONDS = 0.299792458  # m; TDOAs in this unit, and in feet, look like a survey that is too small by this factor
+MOVED, CLEARLY = (
+    0.3,
+    0.5,
+    # m by which the tag must have moved; share of the loss that shows it after few seconds and at rest,
+    # too
+)
+# m; TDOAs in this unit, and in feet, look like a survey that is too small by this factor
+NANOSECONDS = 0.299792458
 AS_IT_IS, SCALED, SIGN, EXCHANGED, ALONE = range(5)  # kinds of hypotheses
 
 
@@ -51,11 +83,20 @@ class SurveyScale:
         """Take TDOAs that were heard together, (k, 3): rows of both anchors, and m."""
         if len(np.unique(snapshot[:, :2])) < HEARD or not np.median(np.abs(snapshot[:, 2])) > SMALL:
             return
-        some = snapshot[np.linspace(0, len(snapshot) - 1, min(PAIRS, len(snapshot))).round().astype(int)]
+        some = snapshot[
+            np.linspace(0, len(snapshot) - 1, min(PAIRS, len(snapshot))).round().astype(int)
+        ]
         losses, places = np.empty(len(self._table)), np.empty((len(self._table), 3))
         rows = np.ascontiguousarray(some[:, :2].astype(np.int64))
         for k, hypothesis in enumerate(self._table):
-            losses[k] = locate(self._anchors.positions, hypothesis, rows, np.ascontiguousarray(some[:, 2]), STARTS, places[k])
+            losses[k] = locate(
+                self._anchors.positions,
+                hypothesis,
+                rows,
+                np.ascontiguousarray(some[:, 2]),
+                STARTS,
+                places[k],
+            )
         self._losses.append(losses)
         self._places.append(places)
 
@@ -73,10 +114,20 @@ class SurveyScale:
         left, z = _compared(losses[:, rival], losses[:, best])
         if left > LEFT or z < DEVIATIONS or mean[best] > GOOD:
             return None
-        if left > CLEARLY and (len(losses) < MANY or _spread(np.array([places[best] for places in self._places])) < MOVED):
+        if left > CLEARLY and (
+            len(losses) < MANY
+            or _spread(np.array([places[best] for places in self._places])) < MOVED
+        ):
             return None
-        evidence = f"{100.0 * (1.0 - left):.0f} % less stays unexplained then, {z:.1f} standard errors, in {len(losses)} snapshots"
-        near = [k for k in chosen.tolist() if self._names[k] and kind[k] == SCALED == kind[best] and self._near(k, best)]
+        evidence = (
+            f"{100.0 * (1.0 - left):.0f} % less stays unexplained then, {z:.1f} standard errors, "
+            f"in {len(losses)} snapshots"
+        )
+        near = [
+            k
+            for k in chosen.tolist()
+            if self._names[k] and kind[k] == SCALED == kind[best] and self._near(k, best)
+        ]
         named = min(near, key=lambda k: mean[k], default=best)
         return self._found(named, self._factors[named], evidence)
 
@@ -87,37 +138,73 @@ class SurveyScale:
     def _found(self, k: int, factor: float, evidence: str) -> Finding | None:
         if self._table[k, 0] == ALONE:
             number = int(self._anchors.ids[int(self._table[k, 3])])
-            line = f"{number}: {{position: [x, y, z]}}  # what is there now, divided by {factor:.6g}"
+            line = (
+                f"{number}: {{position: [x, y, z]}}  # what is there now, divided by {factor:.6g}"
+            )
             cause = f"the position of anchor {number} is in {self._names[k]}, not in metres"
             return Finding("anchor_scale", ERROR, cause, evidence, line, factor)
         if abs(math.log(factor / NANOSECONDS)) < math.log(RATIO):
             line = f"message.distance_difference *= {NANOSECONDS}  # of nanoseconds; of feet 0.3048"
-            return Finding("tdoa_unit", ERROR, "TDOAs are in nanoseconds or in feet, not in metres", evidence, line, NANOSECONDS)
+            return Finding(
+                "tdoa_unit",
+                ERROR,
+                "TDOAs are in nanoseconds or in feet, not in metres",
+                evidence,
+                line,
+                NANOSECONDS,
+            )
         line = f"x, y, z = x / {factor:.6g}, y / {factor:.6g}, z / {factor:.6g}  # of every anchor"
-        size = f"about {factor:.3g} times too large" if factor > 1.0 else f"about {1.0 / factor:.3g} times too small"
+        size = (
+            f"about {factor:.3g} times too large"
+            if factor > 1.0
+            else f"about {1.0 / factor:.3g} times too small"
+        )
         cause = f"the survey is not in metres: its positions are {size}"
         if self._names[k]:
-            cause = f"the survey is in {self._names[k]}, not in metres: its positions are {factor:,.5g} times too large"
+            cause = (
+                f"the survey is in {self._names[k]}, not in metres: its positions are "
+                f"{factor:,.5g} times too large"
+            )
         return Finding("survey_scale", ERROR, cause, evidence, line, factor)
 
 
 def _hypotheses(count: int) -> tuple[list[str], list[float], np.ndarray]:
-    """(names of units or "", factors, (h, 5): kind, factor of all, sign, and two rows) of what is tried with so many anchors."""
-    out: list[tuple[str, float, tuple[float, ...]]] = [("", 1.0, (AS_IT_IS, 1.0, 1.0, 0, 0)), ("", 1.0, (SIGN, 1.0, -1.0, 0, 0))]
-    scales = SMALLEST * RATIO ** np.arange(math.floor(math.log(LARGEST / SMALLEST) / math.log(RATIO)) + 1)
-    out += [("", factor, (SCALED, factor, 1.0, 0, 0)) for factor in [*scales.tolist(), *(1.0 / scales).tolist()]]
+    """(names of units or "", factors, (h, 5): kind, factor of all, sign, and two rows) of what is
+    tried with so many anchors.
+    """
+    out: list[tuple[str, float, tuple[float, ...]]] = [
+        ("", 1.0, (AS_IT_IS, 1.0, 1.0, 0, 0)),
+        ("", 1.0, (SIGN, 1.0, -1.0, 0, 0)),
+    ]
+    scales = SMALLEST * RATIO ** np.arange(
+        math.floor(math.log(LARGEST / SMALLEST) / math.log(RATIO)) + 1
+    )
+    out += [
+        ("", factor, (SCALED, factor, 1.0, 0, 0))
+        for factor in [*scales.tolist(), *(1.0 / scales).tolist()]
+    ]
     out += [(name, factor, (SCALED, factor, 1.0, 0, 0)) for name, factor in UNITS.items()]
     if count <= SINGLE:
-        out += [(name, factor, (ALONE, factor, 1.0, row, 0)) for row in range(count) for name, factor in UNITS.items()]
-        out += [("", 1.0, (EXCHANGED, 1.0, 1.0, one, two)) for one, two in combinations(range(count), 2)]
+        out += [
+            (name, factor, (ALONE, factor, 1.0, row, 0))
+            for row in range(count)
+            for name, factor in UNITS.items()
+        ]
+        out += [
+            ("", 1.0, (EXCHANGED, 1.0, 1.0, one, two)) for one, two in combinations(range(count), 2)
+        ]
     names, factors, rows = zip(*out)
     return [*names], [*factors], np.array(rows, dtype=float)
 
 
 def _compared(one: np.ndarray, other: np.ndarray) -> tuple[float, float]:
-    """(mean of `other` over that of `one`, standard errors by which it is less), of losses (n,) of the same snapshots."""
+    """(mean of `other` over that of `one`, standard errors by which it is less), of losses (n,) of
+    the same snapshots.
+    """
     error = float(np.std(one - other, ddof=1)) / math.sqrt(len(one))
-    return float(np.mean(other) / max(np.mean(one), 1e-9)), float(np.mean(one - other)) / max(error, 1e-9)
+    return float(np.mean(other) / max(np.mean(one), 1e-9)), float(np.mean(one - other)) / max(
+        error, 1e-9
+    )
 
 
 def _spread(places: np.ndarray) -> float:
@@ -127,13 +214,20 @@ def _spread(places: np.ndarray) -> float:
 
 @compiled
 def locate(
-    positions: np.ndarray, hypothesis: np.ndarray, rows: np.ndarray, d: np.ndarray, starts: np.ndarray, place: np.ndarray
+    positions: np.ndarray,
+    hypothesis: np.ndarray,
+    rows: np.ndarray,
+    d: np.ndarray,
+    starts: np.ndarray,
+    place: np.ndarray,
 ) -> float:
-    """Return the mean Geman-McClure loss, 0 to 1, of TDOAs d (k,) m where the tag fits them best; write that to place (3,) m.
+    """Return the mean Geman-McClure loss, 0 to 1, of TDOAs d (k,) m where the tag fits them best;
+    write that to place (3,) m.
 
     positions : (N, 3) m, of anchors; rows : (k, 2), of both anchors of each TDOA.
 
-    hypothesis : (5,), see `_hypotheses`. A robust Gauss-Newton search from starts (s, 3), in units of half the room, while
+    hypothesis : (5,), see `_hypotheses`. A robust Gauss-Newton search from starts (s, 3), in units
+        of half the room, while
     the loss narrows.
     """
     n = len(d)
@@ -142,13 +236,25 @@ def locate(
         for side in range(2):
             row, factor = rows[i, side], hypothesis[1]
             if hypothesis[0] == EXCHANGED:
-                row = int(hypothesis[4]) if row == hypothesis[3] else int(hypothesis[3]) if row == hypothesis[4] else row
+                row = (
+                    int(hypothesis[4])
+                    if row == hypothesis[3]
+                    else int(hypothesis[3])
+                    if row == hypothesis[4]
+                    else row
+                )
             elif hypothesis[0] == ALONE and row != hypothesis[3]:
                 factor = 1.0
             for j in range(3):
                 ends[i, side, j] = positions[row, j] / factor
                 low[j], high[j] = min(low[j], ends[i, side, j]), max(high[j], ends[i, side, j])
-    size, least, p, g, system = math.sqrt(np.sum((high - low) ** 2)), np.inf, np.empty(3), np.empty(3), np.empty((3, 4))
+    size, least, p, g, system = (
+        math.sqrt(np.sum((high - low) ** 2)),
+        np.inf,
+        np.empty(3),
+        np.empty(3),
+        np.empty((3, 4)),
+    )
     for start in range(len(starts)):
         for j in range(3):
             p[j] = 0.5 * (low[j] + high[j]) + 0.5 * starts[start, j] * (high[j] - low[j])
@@ -184,7 +290,9 @@ def locate(
 
 @compiled
 def _go(p: np.ndarray, system: np.ndarray, longest: float) -> None:
-    """One step of p (3,) by normal equations (3, 4), which are overwritten, no longer than `longest`, m."""
+    """One step of p (3,) by normal equations (3, 4), which are overwritten, no longer than
+    `longest`, m.
+    """
     for j in range(3):
         system[j, j] += 1e-6
     for j in range(3):

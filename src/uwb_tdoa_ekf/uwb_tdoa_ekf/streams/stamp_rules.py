@@ -1,7 +1,8 @@
 """Rules for the stamps of one stream, and of two against each other.
 
-A rule takes (name of the topic, its windows) and returns a Finding or None. The healthy values beside the limits are
-the extremes of 37 measured recordings of a Crazyflie, all with one clock and without arrival times.
+A rule takes (name of the topic, its windows) and returns a Finding or None. The healthy values
+beside the limits are the extremes of 37 measured recordings of a Crazyflie, all with one clock and
+without arrival times.
 """
 
 from __future__ import annotations
@@ -17,17 +18,26 @@ from .median import median
 if TYPE_CHECKING:
     from .stamps import StampWindow
 
-STAMP_LINE = "message.header.stamp = ...  # when the sample was measured, ROS time, in seconds and nanoseconds"
+STAMP_LINE = (
+    "message.header.stamp = ...  # when the sample was measured, ROS time, in seconds and "
+    "nanoseconds"
+)
 SLOWEST = {"imu/data": 50.0, "uwb/tdoa": 20.0}  # Hz; healthy 946 and 191 at least
 LONGEST_GAP = {"imu/data": 0.1, "uwb/tdoa": 0.5}  # s; healthy 0.012 and 0.116 at most
 SCATTER = 3.0  # standard deviation of the steps over their mean; healthy 1.4 at most
-REPEATED, LEAP = 0.3, 0.01  # share of stamps that equal the one before, healthy 0, and s between those that do not
+REPEATED, LEAP = (
+    0.3,
+    0.01,
+)  # share of stamps that equal the one before, healthy 0, and s between those that do not
 PACE = 0.05  # by which the pace of the stamps may differ from that of the clock
 BLOCK = 0.1  # s between the soonest and the latest arrival of a window, beyond the lag of the first
 APART = 0.1  # s between two streams
 LATEST = 5.0  # s that TDOAs may come late; what is more is another clock
 DRIFT, DRIFTED = 3e-4, 0.03  # s/s, and s over the recording
-LAG, REORDER = 0.25, 0.003  # s: what ekf_node waits for, as its parameters of these names say by default
+LAG, REORDER = (
+    0.25,
+    0.003,
+)  # s: what ekf_node waits for, as its parameters of these names say by default
 UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
 
 
@@ -44,21 +54,29 @@ def usual(windows: list[StampWindow], field: str) -> float:
 def pace_of(windows: list[StampWindow]) -> float:
     """Seconds of stamps per second of arrival; NaN where arrivals are not known.
 
-    From the first to the last message of a window, which blocks upset, or by the smallest latencies of successive windows, which
-    leaps of the stamps upset: the one of both that is nearer to 1.
+    From the first to the last message of a window, which blocks upset, or by the smallest latencies
+    of successive windows, which leaps of the stamps upset: the one of both that is nearer to 1.
     """
     known = [(window.end, window.latency) for window in windows if math.isfinite(window.latency)]
     ratios = [usual(windows, "pace")]
-    steps = [(then - end, later - latency) for (end, latency), (then, later) in zip(known, known[1:])]
+    steps = [
+        (then - end, later - latency) for (end, latency), (then, later) in zip(known, known[1:])
+    ]
     if steps and all(time > 0.0 for time, _ in steps):
         ratios.append(1.0 - median(latency / time for time, latency in steps))
     return min(ratios, key=lambda ratio: abs(ratio - 1.0) if math.isfinite(ratio) else math.inf)
 
 
 def orderly(windows: list[StampWindow]) -> bool:
-    """False for stamps with which nothing else can be determined: of 0, standing still, leaping, or of another unit."""
+    """False for stamps with which nothing else can be determined: of 0, standing still, leaping, or
+    of another unit.
+    """
     count, ratio = total(windows, "count"), pace_of(windows)
-    broken = total(windows, "zeros") > 0.01 * count or total(windows, "same") > 0.98 * count or total(windows, "jumps")
+    broken = (
+        total(windows, "zeros") > 0.01 * count
+        or total(windows, "same") > 0.98 * count
+        or total(windows, "jumps")
+    )
     return not broken and not abs(ratio - 1.0) > PACE
 
 
@@ -77,7 +95,14 @@ def standing(name: str, windows: list[StampWindow]) -> Finding | None:
         return None
     if share > 0.98:
         cause = f"the stamps of {name} stand still"
-        return Finding("stamps_stand", ERROR, cause, f"{100.0 * share:.0f} % repeat the one before", STAMP_LINE, share)
+        return Finding(
+            "stamps_stand",
+            ERROR,
+            cause,
+            f"{100.0 * share:.0f} % repeat the one before",
+            STAMP_LINE,
+            share,
+        )
     scatter, step = usual(windows, "scatter"), usual(windows, "gap")
     packets = share > REPEATED and usual(windows, "step") > LEAP * (1.0 - share)
     if not (packets or scatter > SCATTER):
@@ -85,11 +110,18 @@ def standing(name: str, windows: list[StampWindow]) -> Finding | None:
     evidence = f"{100.0 * share:.0f} % repeat the one before, then they leap by {step:.3f} s"
     if packets:
         cause = (
-            f"the stamps of {name} come in steps of {step:.3f} s: a coarse clock, or one stamp for a packet of samples"
+            f"the stamps of {name} come in steps of {step:.3f} s: a coarse clock, or one stamp "
+            "for a packet of samples"
         )
     else:
-        cause = f"the messages of {name} are stamped when they are read, in bursts, or nanosec holds microseconds"
-        evidence = f"steps of {usual(windows, 'step'):.4f} s on average scatter by {scatter:.1f} times that"
+        cause = (
+            f"the messages of {name} are stamped when they are read, in bursts, or nanosec holds "
+            "microseconds"
+        )
+        evidence = (
+            f"steps of {usual(windows, 'step'):.4f} s on average scatter by {scatter:.1f} times "
+            "that"
+        )
     severity = ERROR if step > LAG else WARNING
     return Finding("stamps_coarse", severity, cause, evidence, STAMP_LINE, step)
 
@@ -102,9 +134,12 @@ def falls(name: str, windows: list[StampWindow]) -> Finding | None:
     severity = WARNING if depth < LAG else ERROR
     evidence = f"{100.0 * share:.1f} % come after a later one, by up to {depth:.3f} s"
     remedy = (
-        f"-p reorder:={1.2 * depth:.3f} -p lag:={max(LAG, 2.0 * depth):.2f}  # of ekf_node, or publish them in order"
+        f"-p reorder:={1.2 * depth:.3f} -p lag:={max(LAG, 2.0 * depth):.2f}  # of ekf_node, or "
+        "publish them in order"
     )
-    return Finding("stamps_fall", severity, f"messages of {name} are out of order", evidence, remedy, depth)
+    return Finding(
+        "stamps_fall", severity, f"messages of {name} are out of order", evidence, remedy, depth
+    )
 
 
 def jumps(name: str, windows: list[StampWindow]) -> Finding | None:
@@ -113,7 +148,9 @@ def jumps(name: str, windows: list[StampWindow]) -> Finding | None:
         return None
     farthest = max((window.jump for window in windows), key=abs)
     evidence = f"{count} leaps, the farthest of {farthest:+.3f} s"
-    return Finding("stamps_jump", ERROR, f"the clock of {name} jumps", evidence, STAMP_LINE, farthest)
+    return Finding(
+        "stamps_jump", ERROR, f"the clock of {name} jumps", evidence, STAMP_LINE, farthest
+    )
 
 
 def gaps(name: str, windows: list[StampWindow]) -> Finding | None:
@@ -126,8 +163,13 @@ def gaps(name: str, windows: list[StampWindow]) -> Finding | None:
     ):
         return None
     count = sum(window.gap > limit for window in windows)
-    evidence = f"{count} gaps, the longest of {longest:.2f} s; more than {limit:.1f} s is coasted over"
-    remedy = f"ros2 topic hz {name}  # check the radio, the load of the machine and the depth of the queue"
+    evidence = (
+        f"{count} gaps, the longest of {longest:.2f} s; more than {limit:.1f} s is coasted over"
+    )
+    remedy = (
+        f"ros2 topic hz {name}  # check the radio, the load of the machine and the depth of the "
+        "queue"
+    )
     return Finding("gap", WARNING, f"{name} falls silent in between", evidence, remedy, longest)
 
 
@@ -138,11 +180,18 @@ def rate(name: str, windows: list[StampWindow]) -> Finding | None:
         return None
     for scale, unit in UNITS.items():
         if 1e-5 < step / scale < 1.0 / SLOWEST[name] and step > 0.5:
-            line = f"stamp = rclpy.time.Time(seconds=ticks / {scale:.0e}).to_msg()  # the clock counts {unit}"
+            line = (
+                f"stamp = rclpy.time.Time(seconds=ticks / {scale:.0e}).to_msg()  # the clock "
+                f"counts {unit}"
+            )
             evidence = f"{step:.3g} s from one stamp to the next"
-            return Finding("stamps_unit", ERROR, f"the stamps of {name} are in {unit}", evidence, line, scale)
+            return Finding(
+                "stamps_unit", ERROR, f"the stamps of {name} are in {unit}", evidence, line, scale
+            )
     evidence = f"{1.0 / step:.1f} Hz; below {SLOWEST[name]:.0f} Hz the estimate gets worse"
-    return Finding("rate", WARNING, f"{name} is slow", evidence, "raise the rate of the driver", 1.0 / step)
+    return Finding(
+        "rate", WARNING, f"{name} is slow", evidence, "raise the rate of the driver", 1.0 / step
+    )
 
 
 def pace(name: str, windows: list[StampWindow]) -> Finding | None:
@@ -156,7 +205,9 @@ def pace(name: str, windows: list[StampWindow]) -> Finding | None:
         return None
     unit = next((unit for scale, unit in UNITS.items() if 0.5 < ratio / scale < 2.0), None)
     cause = f"the stamps of {name} " + (f"are in {unit}" if unit else "do not run with the clock")
-    return Finding("stamps_unit", ERROR, cause, f"{ratio:.4g} s of stamps in 1 s", STAMP_LINE, ratio)
+    return Finding(
+        "stamps_unit", ERROR, cause, f"{ratio:.4g} s of stamps in 1 s", STAMP_LINE, ratio
+    )
 
 
 def blocks(name: str, windows: list[StampWindow]) -> Finding | None:
@@ -178,7 +229,9 @@ def blocks(name: str, windows: list[StampWindow]) -> Finding | None:
 
 
 def drift(name: str, windows: list[StampWindow]) -> Finding | None:
-    """A clock that is slower or faster than that of the arrivals (Theil-Sen slope of the smallest latencies)."""
+    """A clock that is slower or faster than that of the arrivals (Theil-Sen slope of the smallest
+    latencies).
+    """
     known = [(window.begin, window.latency) for window in windows if math.isfinite(window.latency)]
     if len(known) < 10 or not orderly(windows):
         return None
@@ -203,36 +256,63 @@ OF_ONE = (zeros, standing, falls, jumps, gaps, rate, pace, blocks, drift)
 
 
 def offset(imu: list[StampWindow], tdoa: list[StampWindow]) -> Finding | None:
-    """The streams against each other: by their latencies where arrivals are known, else by where they begin and end."""
+    """The streams against each other: by their latencies where arrivals are known, else by where
+    they begin and end.
+    """
     if not (orderly(imu) and orderly(tdoa)):
         return None
     by_arrival = usual(tdoa, "latency") - usual(imu, "latency")
     if math.isfinite(by_arrival):
-        ahead, evidence = by_arrival, f"stamp minus arrival: {-usual(imu, 'latency'):+.3f} s of the IMU, "
+        ahead, evidence = (
+            by_arrival,
+            f"stamp minus arrival: {-usual(imu, 'latency'):+.3f} s of the IMU, ",
+        )
         evidence += f"{-usual(tdoa, 'latency'):+.3f} s of the TDOAs"
     else:
         begin, end = imu[0].begin - tdoa[0].begin, imu[-1].end - tdoa[-1].end
         ahead = 0.5 * (begin + end)
         evidence = f"the IMU begins {begin:+.3f} s and ends {end:+.3f} s after the TDOAs"
-        outside = imu[0].begin > tdoa[-1].end or imu[-1].end < tdoa[0].begin  # no sample is of the time of the TDOAs
-        alike = min(abs(begin), abs(end)) >= APART and begin * end > 0.0 and abs(end - begin) <= 0.3 * abs(ahead)
+        outside = (
+            imu[0].begin > tdoa[-1].end or imu[-1].end < tdoa[0].begin
+        )  # no sample is of the time of the TDOAs
+        alike = (
+            min(abs(begin), abs(end)) >= APART
+            and begin * end > 0.0
+            and abs(end - begin) <= 0.3 * abs(ahead)
+        )
         if not (outside or alike):
             return None
     if abs(ahead) < APART:
         return None
     severity = ERROR if abs(ahead) > LAG else WARNING
     if _late(by_arrival, usual(tdoa, "latency"), usual(imu, "latency")):
-        cause = f"the TDOAs arrive {usual(tdoa, 'latency'):.3f} s after their stamps, the IMU's samples in time"
-        line = f"-p lag:={1.5 * by_arrival:.2f}  # of ekf_node, if the TDOAs are stamped when they are measured; else stamp them so"
+        cause = (
+            f"the TDOAs arrive {usual(tdoa, 'latency'):.3f} s after their stamps, the IMU's "
+            "samples in time"
+        )
+        line = (
+            f"-p lag:={1.5 * by_arrival:.2f}  # of ekf_node, if the TDOAs are stamped when they "
+            "are measured; else stamp them so"
+        )
         return Finding("stamps_apart", severity, cause, evidence, line, ahead)
-    cause = f"the stamps of imu/data are {abs(ahead):.3f} s {'ahead of' if ahead > 0.0 else 'behind'} those of uwb/tdoa"
-    line = f"t_imu {'-' if ahead > 0.0 else '+'}= {abs(ahead):.3f}  # s; or stamp both with the clock of one machine"
+    cause = (
+        f"the stamps of imu/data are {abs(ahead):.3f} s {'ahead of' if ahead > 0.0 else 'behind'} "
+        "those of uwb/tdoa"
+    )
+    line = (
+        f"t_imu {'-' if ahead > 0.0 else '+'}= {abs(ahead):.3f}  # s; or stamp both with the "
+        "clock of one machine"
+    )
     return Finding("stamps_apart", severity, cause, evidence, line, ahead)
 
 
 def _late(by_arrival: float, tdoa: float, imu: float) -> bool:
-    """Whether TDOAs come late, by latencies, s, of streams that have the clock of the arrivals: no stamp is ahead of that."""
-    return math.isfinite(by_arrival) and by_arrival > APART and -APART < imu < APART and tdoa < LATEST
+    """Whether TDOAs come late, by latencies, s, of streams that have the clock of the arrivals: no
+    stamp is ahead of that.
+    """
+    return (
+        math.isfinite(by_arrival) and by_arrival > APART and -APART < imu < APART and tdoa < LATEST
+    )
 
 
 def other_clock(imu: list[StampWindow], tdoa: list[StampWindow]) -> Finding | None:
@@ -243,9 +323,17 @@ def other_clock(imu: list[StampWindow], tdoa: list[StampWindow]) -> Finding | No
     if not abs(latency) > 1.0 or abs(latency - usual(imu, "latency")) > LAG:
         return None
     evidence = f"they arrive {latency:.3f} s after their stamps"
-    line = "message.header.stamp = node.get_clock().now().to_msg()  # or what you measured, on that clock"
+    line = (
+        "message.header.stamp = node.get_clock().now().to_msg()  # or what you measured, on that "
+        "clock"
+    )
     return Finding(
-        "other_clock", NOTE, "the stamps are not of the clock of the machine that records", evidence, line, latency
+        "other_clock",
+        NOTE,
+        "the stamps are not of the clock of the machine that records",
+        evidence,
+        line,
+        latency,
     )
 
 

@@ -10,24 +10,49 @@ import numpy as np
 from uwb_tdoa_bias.foundation.compiled import compiled
 
 LENGTH = 1.0  # s of a window
-JUMP_LIMIT = 1.0  # s by which a stamp is ahead of what the arrival allows, or behind the newest: no late packet
+# s by which a stamp is ahead of what the arrival allows, or behind the newest: no late packet
+JUMP_LIMIT = 1.0
 ABSURD = 1e12  # s; no clock says that
 MINIMUM = 10  # messages of a window
 MAXIMUM = 5000  # messages of a window, for streams whose stamps stand still
 
 # places in the counters; the first three outlive a window
-(NEWEST, LAST, LAST_ARRIVAL, COUNT, BEGIN, NOW, FALLS, DEPTH, JUMPS, JUMP, GAP, SAME, ZEROS, STEPS, STEP_SUM,
- STEP_SQUARES, LATENCY_MIN, LATENCY_MAX, ARRIVAL_BEGIN, STAMP_BEGIN) = range(20)  # fmt: skip
+(
+    NEWEST,
+    LAST,
+    LAST_ARRIVAL,
+    COUNT,
+    BEGIN,
+    NOW,
+    FALLS,
+    DEPTH,
+    JUMPS,
+    JUMP,
+    GAP,
+    SAME,
+    ZEROS,
+    STEPS,
+    STEP_SUM,
+    STEP_SQUARES,
+    LATENCY_MIN,
+    LATENCY_MAX,
+    ARRIVAL_BEGIN,
+    STAMP_BEGIN,
+) = range(20)
 
 
 class StampWindow(NamedTuple):
     """The stamps of one window of messages, in the order of their arrival.
 
-    count : messages; begin, end : s, arrival (or stamp, where the arrival is not known) of the first and the last;
-    falls : messages stamped before the newest, and depth, s, by how much at most; jumps : stamps that leapt by more
-    than JUMP_LIMIT, and jump, s, the farthest; gap : s, longest step forward; same : messages with the stamp of the one
-    before; zeros : stamps of 0; step : s, mean step forward; scatter : standard deviation of the steps over their mean;
-    latency, spread : s, smallest arrival minus stamp, and largest minus smallest, NaN where the arrival is not known;
+    count : messages; begin, end : s, arrival (or stamp, where the arrival is not known) of the
+        first and the last;
+    falls : messages stamped before the newest, and depth, s, by how much at most; jumps : stamps
+        that leapt by more
+    than JUMP_LIMIT, and jump, s, the farthest; gap : s, longest step forward; same : messages with
+    the stamp of the one before; zeros : stamps of 0; step : s, mean step forward; scatter :
+    standard deviation of the steps over their mean;
+    latency, spread : s, smallest arrival minus stamp, and largest minus smallest, NaN where the
+        arrival is not known;
     pace : seconds of stamps per second of arrival.
     """
 
@@ -102,7 +127,10 @@ def count_stamp(s: np.ndarray, t: float, arrival: float) -> None:
     else:
         s[NEWEST] = t
     if not math.isnan(arrival):
-        s[LATENCY_MIN], s[LATENCY_MAX] = min(s[LATENCY_MIN], arrival - t), max(s[LATENCY_MAX], arrival - t)
+        s[LATENCY_MIN], s[LATENCY_MAX] = (
+            min(s[LATENCY_MIN], arrival - t),
+            max(s[LATENCY_MAX], arrival - t),
+        )
     s[LAST], s[LAST_ARRIVAL] = t, arrival
 
 
@@ -132,6 +160,8 @@ def stamp_window(s: np.ndarray) -> StampWindow:
         step=float(step),
         scatter=float(math.sqrt(variance) / step) if step > 0.0 else 0.0,
         latency=float(s[LATENCY_MIN]) if math.isfinite(s[LATENCY_MIN]) else math.nan,
-        spread=float(s[LATENCY_MAX] - s[LATENCY_MIN]) if math.isfinite(s[LATENCY_MIN]) else math.nan,
+        spread=float(s[LATENCY_MAX] - s[LATENCY_MIN])
+        if math.isfinite(s[LATENCY_MIN])
+        else math.nan,
         pace=float((s[LAST] - s[STAMP_BEGIN]) / arrived) if arrived > 0.0 else math.nan,
     )

@@ -1,4 +1,6 @@
-"""Changes of files: bytes, and by what the files are made of (numbers and lines of text, trees, protocol buffers, records, tables)."""
+"""Changes of files: bytes, and by what the files are made of (numbers and lines of text, trees,
+protocol buffers, records, tables).
+"""
 
 import re
 import sqlite3
@@ -10,9 +12,39 @@ import yaml
 from uwb_tdoa_tools.bags import mcap
 
 NUMBERS = (
-    "nan", "inf", "-inf", "1e308", "-1e308", "1e-320", "0", "-0", "-1", "1e400", "9" * 400, "0x10", "65536", "4294967296", "18446744073709551616", "", " ",
-    "true", "~", "1_0", "\u0661", "1.7976931348623157e308", "2147483648", "x" * 5000, "$\\frac$", "\x1b[2J", "<b>", "{", "[[[[", "&a", "*a", "!!int",
-)  # fmt: skip
+    "nan",
+    "inf",
+    "-inf",
+    "1e308",
+    "-1e308",
+    "1e-320",
+    "0",
+    "-0",
+    "-1",
+    "1e400",
+    "9" * 400,
+    "0x10",
+    "65536",
+    "4294967296",
+    "18446744073709551616",
+    "",
+    " ",
+    "true",
+    "~",
+    "1_0",
+    "\u0661",
+    "1.7976931348623157e308",
+    "2147483648",
+    "x" * 5000,
+    "$\\frac$",
+    "\x1b[2J",
+    "<b>",
+    "{",
+    "[[[[",
+    "&a",
+    "*a",
+    "!!int",
+)
 VALUES = (
     None,
     True,
@@ -57,7 +89,11 @@ def changed(name, data, chance):
     """The data of a target's corpus, changed once or several times. chance : random.Random."""
     for _ in range(chance.choice((1, 1, 1, 2, 4))):
         try:
-            data = STRUCTURES.get(name, of_bytes)(data, chance) if chance.random() < 0.6 else of_bytes(data, chance)
+            data = (
+                STRUCTURES.get(name, of_bytes)(data, chance)
+                if chance.random() < 0.6
+                else of_bytes(data, chance)
+            )
         except (IndexError, struct.error):  # it has no such structure by now
             data = of_bytes(data, chance)
     return data
@@ -70,7 +106,9 @@ def of_bytes(data, chance):
         data[at : at + 1] = chance.randbytes(1)
     elif what == 1:
         size = min(size, 8)
-        data[at : at + size] = (chance.choice(WORDS) & (1 << 8 * size) - 1).to_bytes(size, chance.choice(("little", "big")))
+        data[at : at + size] = (chance.choice(WORDS) & (1 << 8 * size) - 1).to_bytes(
+            size, chance.choice(("little", "big"))
+        )
     elif what == 2:
         del data[at : at + size]
     elif what == 3:
@@ -112,7 +150,9 @@ def of_yaml(data, chance):
     stack = [tree]
     while stack:
         node = stack.pop()
-        keys = node if isinstance(node, dict) else range(len(node)) if isinstance(node, list) else ()
+        keys = (
+            node if isinstance(node, dict) else range(len(node)) if isinstance(node, list) else ()
+        )
         for key in keys:
             places.append((node, key))
             stack.append(node[key])
@@ -127,11 +167,15 @@ def of_yaml(data, chance):
         node[key : key + chance.randrange(2)] = [node[key]] * chance.choice((0, 2, 20))
     else:
         node[key] = value
-    return yaml.safe_dump(tree, sort_keys=False, allow_unicode=True).encode("utf-8", "surrogatepass")
+    return yaml.safe_dump(tree, sort_keys=False, allow_unicode=True).encode(
+        "utf-8", "surrogatepass"
+    )
 
 
 def of_protobuf(data, chance, depth=0):
-    """One field of a message changed, left out or repeated; the lengths of what it is in stay right."""
+    """One field of a message changed, left out or repeated; the lengths of what it is in stay
+    right.
+    """
     fields, at = [], 0
     while at < len(data):
         start = at
@@ -152,9 +196,13 @@ def of_protobuf(data, chance, depth=0):
     if what < 0.1:
         del fields[place]
     elif what < 0.2:
-        fields[place:place] = [fields[place]] * chance.choice((1, 1, 10, 1000 if len(data) < 2000 else 10))
+        fields[place:place] = [fields[place]] * chance.choice(
+            (1, 1, 10, 1000 if len(data) < 2000 else 10)
+        )
     elif what < 0.3:
-        fields[place][0] = chance.choice((chance.randrange(1, 30) << 3 | key & 7, key & ~7 | chance.choice((0, 2, 5))))
+        fields[place][0] = chance.choice(
+            (chance.randrange(1, 30) << 3 | key & 7, key & ~7 | chance.choice((0, 2, 5)))
+        )
     elif isinstance(value, int):
         fields[place][1] = chance.choice(WORDS)
     elif depth < 5 and key & 7 == 2 and len(value) > 3 and what < 0.9:
@@ -163,7 +211,11 @@ def of_protobuf(data, chance, depth=0):
         except (IndexError, TypeError):
             fields[place][1] = of_bytes(value, chance)
     else:
-        fields[place][1] = of_bytes(value, chance) if value else chance.choice((b"Concat", b"Loop", b"\xff" * 20, b"x"))
+        fields[place][1] = (
+            of_bytes(value, chance)
+            if value
+            else chance.choice((b"Concat", b"Loop", b"\xff" * 20, b"x"))
+        )
     return b"".join(_field(*each) for each in fields)
 
 
@@ -192,7 +244,10 @@ def _field(key, value):
 
 
 def of_mcap(data, chance):
-    """One record changed, left out, moved or repeated; those around it stay right. Of a chunk what is in it, if it is not packed."""
+    """One record changed, left out, moved or repeated; those around it stay right.
+
+    Of a chunk what is in it, if it is not packed.
+    """
     found, at = [], len(mcap.MAGIC)
     while at + 9 <= len(data) - len(mcap.MAGIC):
         kind, size = struct.unpack_from("<BQ", data, at)
@@ -218,12 +273,24 @@ def of_mcap(data, chance):
 
 
 STATEMENTS = (
-    "UPDATE {table} SET {column} = {value} WHERE rowid = {row}", "UPDATE {table} SET {column} = {value}", "DELETE FROM {table} WHERE rowid = {row}",
-    "INSERT INTO {table} SELECT * FROM {table} WHERE 0", "UPDATE {table} SET rowid = rowid + 1000", "DELETE FROM {table}", "DROP TABLE {table}",
-    "ALTER TABLE {table} RENAME TO other", "ALTER TABLE {table} DROP COLUMN {column}", "ALTER TABLE {table} ADD COLUMN more TEXT", "DROP INDEX timestamp_idx",
-    "CREATE VIEW v AS SELECT * FROM {table}", "CREATE INDEX i ON {table}({column})", "CREATE TRIGGER t AFTER INSERT ON {table} BEGIN SELECT 1; END",
-    "CREATE TABLE IF NOT EXISTS schema(schema_version)", "UPDATE messages SET data = substr(data, 1, {row})", "UPDATE messages SET data = zeroblob({row} * 1000)",
-)  # fmt: skip
+    "UPDATE {table} SET {column} = {value} WHERE rowid = {row}",
+    "UPDATE {table} SET {column} = {value}",
+    "DELETE FROM {table} WHERE rowid = {row}",
+    "INSERT INTO {table} SELECT * FROM {table} WHERE 0",
+    "UPDATE {table} SET rowid = rowid + 1000",
+    "DELETE FROM {table}",
+    "DROP TABLE {table}",
+    "ALTER TABLE {table} RENAME TO other",
+    "ALTER TABLE {table} DROP COLUMN {column}",
+    "ALTER TABLE {table} ADD COLUMN more TEXT",
+    "DROP INDEX timestamp_idx",
+    "CREATE VIEW v AS SELECT * FROM {table}",
+    "CREATE INDEX i ON {table}({column})",
+    "CREATE TRIGGER t AFTER INSERT ON {table} BEGIN SELECT 1; END",
+    "CREATE TABLE IF NOT EXISTS schema(schema_version)",
+    "UPDATE messages SET data = substr(data, 1, {row})",
+    "UPDATE messages SET data = zeroblob({row} * 1000)",
+)
 CELLS = (
     "NULL",
     "0",
@@ -241,9 +308,19 @@ CELLS = (
     "char(27)",
 )
 TABLES = {
-    "messages": ("id", "topic_id", "timestamp", "data"), "topics": ("id", "name", "type", "serialization_format", "offered_qos_profiles", "type_description_hash"),
-    "message_definitions": ("topic_type", "encoding", "encoded_message_definition"), "schema": ("schema_version", "ros_distro"), "metadata": ("metadata",),
-}  # fmt: skip
+    "messages": ("id", "topic_id", "timestamp", "data"),
+    "topics": (
+        "id",
+        "name",
+        "type",
+        "serialization_format",
+        "offered_qos_profiles",
+        "type_description_hash",
+    ),
+    "message_definitions": ("topic_type", "encoding", "encoded_message_definition"),
+    "schema": ("schema_version", "ros_distro"),
+    "metadata": ("metadata",),
+}
 
 
 def of_sqlite(data, chance):
@@ -253,7 +330,12 @@ def of_sqlite(data, chance):
         file.flush()
         connection = sqlite3.connect(file.name)
         table = chance.choice(list(TABLES))
-        words = {"table": table, "column": chance.choice(TABLES[table]), "value": chance.choice(CELLS), "row": chance.randrange(1, 9)}
+        words = {
+            "table": table,
+            "column": chance.choice(TABLES[table]),
+            "value": chance.choice(CELLS),
+            "row": chance.randrange(1, 9),
+        }
         try:
             connection.execute(chance.choice(STATEMENTS).format(**words))
             connection.commit()
@@ -266,8 +348,35 @@ def of_sqlite(data, chance):
 
 
 STRUCTURES = {
-    **dict.fromkeys(("csv", "csv_salvaged", "csv_gzip", "survey", "table", "columns", "distances", "peers", "results"), of_text),
-    **dict.fromkeys(("yaml", "anchors", "effects", "config", "places", "walls", "antenna", "bag_metadata", "marks", "tags"), of_yaml),
+    **dict.fromkeys(
+        (
+            "csv",
+            "csv_salvaged",
+            "csv_gzip",
+            "survey",
+            "table",
+            "columns",
+            "distances",
+            "peers",
+            "results",
+        ),
+        of_text,
+    ),
+    **dict.fromkeys(
+        (
+            "yaml",
+            "anchors",
+            "effects",
+            "config",
+            "places",
+            "walls",
+            "antenna",
+            "bag_metadata",
+            "marks",
+            "tags",
+        ),
+        of_yaml,
+    ),
     "model": of_protobuf,
     **dict.fromkeys(("bag_mcap", "bag_mcap_sealed", "bag_mcap_salvaged", "bag_packed"), of_mcap),
     **dict.fromkeys(("bag_sqlite", "bag_sqlite_salvaged"), of_sqlite),

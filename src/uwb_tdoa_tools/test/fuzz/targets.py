@@ -1,10 +1,11 @@
-"""What is fuzzed: every function that reads a file from outside, each with bytes. It may return or raise InputError.
+"""What is fuzzed: every function that reads a file from outside, each with bytes. It may return or
+raise InputError.
 
-A target that is protected by a checksum is also entered behind it (`*_sealed`): what a fuzzer changes would not get
-past it otherwise.
+A target that is protected by a checksum is also entered behind it (`*_sealed`): what a fuzzer
+changes would not get past it otherwise.
 """
 
-from functools import lru_cache
+from functools import cache
 import gzip
 import io
 import json
@@ -29,13 +30,14 @@ from uwb_tdoa_bias.foundation.flight import Flight, Tdoas
 from uwb_tdoa_bias.foundation.flyable import FlyableVolume
 from uwb_tdoa_bias.foundation.safe_yaml import parse_yaml
 from uwb_tdoa_bias.foundation.version import written_by
+from uwb_tdoa_ekf import launching
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.debias import BiasMap
 from uwb_tdoa_tools.bags import mcap
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry
 from uwb_tdoa_tools.bags.message_types import typestore
 from uwb_tdoa_tools.bags.messages import tdoa_messages
-from uwb_tdoa_ekf import launching
+from uwb_tdoa_tools.evaluating.table import read_others
 from uwb_tdoa_tools.planning.noise import antenna_from_yaml
 from uwb_tdoa_tools.planning.places import AnchorPlaces
 from uwb_tdoa_tools.readers import read_survey, read_usd_log, read_util_csv
@@ -44,12 +46,13 @@ from uwb_tdoa_tools.readers.names import Named
 from uwb_tdoa_tools.readers.tables import number, read_table
 from uwb_tdoa_tools.results_file import ResultsFile
 from uwb_tdoa_tools.simulation.walls import Walls
-from uwb_tdoa_tools.evaluating.table import read_others
 from uwb_tdoa_tools.surveying.distances import read_distances
 from uwb_tdoa_tools.surveying.marks import read_marks
 
 CORPUS = Path(__file__).parent / "corpus"
-ANCHORS = Anchors([0, 1, 5], [[0.1, 0.2, 0.3], [4.0, 0.0, 3.0], [4.0, 5.0, 0.2]], np.full((3, 4), np.nan))
+ANCHORS = Anchors(
+    [0, 1, 5], [[0.1, 0.2, 0.3], [4.0, 0.0, 3.0], [4.0, 5.0, 0.2]], np.full((3, 4), np.nan)
+)
 TDOA = "uwb_tdoa_msgs/msg/Tdoa"
 MESSAGES = {
     "/imu/data": "sensor_msgs/msg/Imu",
@@ -60,7 +63,9 @@ MESSAGES = {
     "/pressure": "sensor_msgs/msg/FluidPressure",
     "/velocity": "geometry_msgs/msg/TwistWithCovarianceStamped",
 }
-FOLDER = Path(tempfile.mkdtemp(prefix="fuzz_", dir="/dev/shm" if os.path.isdir("/dev/shm") else None))
+FOLDER = Path(
+    tempfile.mkdtemp(prefix="fuzz_", dir="/dev/shm" if os.path.isdir("/dev/shm") else None)
+)
 
 
 def clean_up():
@@ -183,18 +188,26 @@ def bag_message(data):
 
 
 def bag_packed(data):
-    """A bag whose file is compressed as a whole: what is in it, or if that is no MCAP, the compressed file itself."""
+    """A bag whose file is compressed as a whole: what is in it, or if that is no MCAP, the
+    compressed file itself.
+    """
     folder = FOLDER / "packed"
     folder.mkdir(exist_ok=True)
-    (folder / "small.mcap.zstd").write_bytes(mcap.zstd.compress(data) if data.startswith(mcap.MAGIC) else data)
+    (folder / "small.mcap.zstd").write_bytes(
+        mcap.zstd.compress(data) if data.startswith(mcap.MAGIC) else data
+    )
     text = (CORPUS / "bag_metadata" / "0").read_text().replace("small.mcap", "small.mcap.zstd")
-    text = text.replace("compression_mode: ''", "compression_mode: FILE").replace("compression_format: ''", "compression_format: zstd")
+    text = text.replace("compression_mode: ''", "compression_mode: FILE").replace(
+        "compression_format: ''", "compression_format: zstd"
+    )
     (folder / "metadata.yaml").write_text(text)
     _finite(read_bag(folder))
 
 
 def columns(data):
-    asked = parse_columns("time=t:ms,anchor_a=from,anchor_b=to,tdoa=d:mm,gyro_x=gx,gyro_y=gy,gyro_z=gz,accel_x=ax,accel_y=ay,accel_z=az")
+    asked = parse_columns(
+        "time=t:ms,anchor_a=from,anchor_b=to,tdoa=d:mm,gyro_x=gx,gyro_y=gy,gyro_z=gz,accel_x=ax,accel_y=ay,accel_z=az"
+    )
     _finite(read_columns([_file(data)], asked, Named(ANCHORS)))
 
 
@@ -215,7 +228,9 @@ def peers(data):
 
 
 def results(data):
-    with ResultsFile(_file(data.replace(b"WRITTEN_BY", written_by().encode())), {"seed": 1}) as done:
+    with ResultsFile(
+        _file(data.replace(b"WRITTEN_BY", written_by().encode())), {"seed": 1}
+    ) as done:
         for key in list(done._places):
             done[key]
 
@@ -242,7 +257,9 @@ def model(data):
 
 
 def _judged_by_a_copy(content):
-    """As `trial.tried_out`, by a copy of this process: to start Python anew would take 0.3 s each time."""
+    """As `trial.tried_out`, by a copy of this process: to start Python anew would take 0.3 s each
+    time.
+    """
     ours, theirs = os.pipe()
     if not (child := os.fork()):
         try:
@@ -261,11 +278,18 @@ def _judged_by_a_copy(content):
 
 
 def _finite(flight):
-    """What is read is finite: AssertionError otherwise. (A height of inf or NaN says that nothing was in range.)"""
+    """What is read is finite: AssertionError otherwise.
+
+    (A height of inf or NaN says that nothing was in range.)
+    """
     finite = {
-        "tdoa": "tabd", "imu": ("t", "gyro", "accel"), "truth": "tp",
-        "height": "t", "pressure": ("t", "pressure"), "velocity": "t",
-    }  # fmt: skip
+        "tdoa": "tabd",
+        "imu": ("t", "gyro", "accel"),
+        "truth": "tp",
+        "height": "t",
+        "pressure": ("t", "pressure"),
+        "velocity": "t",
+    }
     for stream, names in finite.items():
         part = getattr(flight, stream)
         for name in names if part is not None else ():
@@ -276,7 +300,9 @@ def _finite(flight):
 
 
 def _repacked(data):
-    """A .npz file with the members of the data, its checksums set right: members end where the next zip header is."""
+    """A .npz file with the members of the data, its checksums set right: members end where the next
+    zip header is.
+    """
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w") as file:
         at = data.find(b"PK\x03\x04")
@@ -291,18 +317,24 @@ def _repacked(data):
 
 
 def _flight():
-    return Flight("monday", ANCHORS, Tdoas(np.array([0.0, 60.0]), np.zeros(2, int), np.ones(2, int), np.ones(2)))
+    return Flight(
+        "monday",
+        ANCHORS,
+        Tdoas(np.array([0.0, 60.0]), np.zeros(2, int), np.ones(2, int), np.ones(2)),
+    )
 
 
-@lru_cache(maxsize=None)
+@cache
 def _definition(msgtype):
     return typestore().generate_msgdef(msgtype, ros_version=2)[0]
 
 
-@lru_cache(maxsize=None)
+@cache
 def _tdoa():
     """A message that is right."""
-    ((_, message),) = tdoa_messages(Tdoas(np.ones(1), np.zeros(1, int), np.ones(1, int), np.ones(1)), typestore())
+    ((_, message),) = tdoa_messages(
+        Tdoas(np.ones(1), np.zeros(1, int), np.ones(1, int), np.ones(1)), typestore()
+    )
     return bytes(typestore().serialize_cdr(message, TDOA))
 
 
@@ -316,10 +348,16 @@ def bag_of(topic, msgtype, data):
         return struct.pack("<BQ", kind, len(content)) + content
 
     parts = [record(mcap.HEADER, text("ros2") + text(""))]
-    for place, (name, kind, content) in enumerate((("/uwb/tdoa", TDOA, _tdoa()), (topic, msgtype, data)), start=1):
+    for place, (name, kind, content) in enumerate(
+        (("/uwb/tdoa", TDOA, _tdoa()), (topic, msgtype, data)), start=1
+    ):
         schema = struct.pack("<H", place) + text(kind) + text("ros2msg") + text(_definition(kind))
         parts.append(record(mcap.SCHEMA, schema))
-        parts.append(record(mcap.CHANNEL, struct.pack("<HH", place, place) + text(name) + text("cdr") + bytes(4)))
+        parts.append(
+            record(
+                mcap.CHANNEL, struct.pack("<HH", place, place) + text(name) + text("cdr") + bytes(4)
+            )
+        )
         parts.append(record(mcap.MESSAGE, struct.pack("<HIQQ", place, 0, place, place) + content))
     parts += [record(mcap.DATA_END, bytes(4)), record(mcap.FOOTER, bytes(20))]
     return mcap.MAGIC + b"".join(parts) + mcap.MAGIC
@@ -328,16 +366,51 @@ def bag_of(topic, msgtype, data):
 TARGETS = {
     function.__name__: function
     for function in (
-        yaml, anchors, effects, config, antenna, places, walls, survey, table, log, log_sealed, log_salvaged, csv,
-        csv_salvaged, csv_gzip, bag_mcap, bag_mcap_sealed, bag_mcap_salvaged, bag_sqlite, bag_sqlite_salvaged, bag_metadata, bag_message,
-        bag_packed, columns, marks, distances, tags, peers, results,
-        flyable, flyable_sealed, bias_map, bias_map_sealed, model,
+        yaml,
+        anchors,
+        effects,
+        config,
+        antenna,
+        places,
+        walls,
+        survey,
+        table,
+        log,
+        log_sealed,
+        log_salvaged,
+        csv,
+        csv_salvaged,
+        csv_gzip,
+        bag_mcap,
+        bag_mcap_sealed,
+        bag_mcap_salvaged,
+        bag_sqlite,
+        bag_sqlite_salvaged,
+        bag_metadata,
+        bag_message,
+        bag_packed,
+        columns,
+        marks,
+        distances,
+        tags,
+        peers,
+        results,
+        flyable,
+        flyable_sealed,
+        bias_map,
+        bias_map_sealed,
+        model,
     )
-}  # fmt: skip
+}
 SEEDS = {  # whose corpus a target starts from, if not its own
-    "log_sealed": "log", "log_salvaged": "log", "csv_salvaged": "csv", "csv_gzip": "csv", "bag_mcap_sealed": "bag_mcap",
-    "bag_mcap_salvaged": "bag_mcap", "bag_sqlite_salvaged": "bag_sqlite",
-}  # fmt: skip
+    "log_sealed": "log",
+    "log_salvaged": "log",
+    "csv_salvaged": "csv",
+    "csv_gzip": "csv",
+    "bag_mcap_sealed": "bag_mcap",
+    "bag_mcap_salvaged": "bag_mcap",
+    "bag_sqlite_salvaged": "bag_sqlite",
+}
 
 
 def seeds(name):

@@ -12,7 +12,12 @@ def of_sensor(sensor, change):
     """A fault of "gyro" or "accel": change(values (n, 3), rng, t) -> values."""
 
     def fault(flight, rng):
-        return replace(flight, imu=replace(flight.imu, **{sensor: change(getattr(flight.imu, sensor), rng, flight.imu.t)}))
+        return replace(
+            flight,
+            imu=replace(
+                flight.imu, **{sensor: change(getattr(flight.imu, sensor), rng, flight.imu.t)}
+            ),
+        )
 
     return fault
 
@@ -21,7 +26,9 @@ def repeated(flight, rng):
     """Each sample several times."""
     times = int(rng.integers(2, 16))
     rows = np.arange(len(flight.imu)) // times * times
-    return replace(flight, imu=replace(flight.imu, gyro=flight.imu.gyro[rows], accel=flight.imu.accel[rows]))
+    return replace(
+        flight, imu=replace(flight.imu, gyro=flight.imu.gyro[rows], accel=flight.imu.accel[rows])
+    )
 
 
 def turned(values, rng, t):

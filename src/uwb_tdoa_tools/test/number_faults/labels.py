@@ -8,14 +8,18 @@ from .values import rows_of_pairs
 
 
 def _taken(flight, rows):
-    return replace(flight, tdoa=type(flight.tdoa)(*(column[rows] for column in vars(flight.tdoa).values())))
+    return replace(
+        flight, tdoa=type(flight.tdoa)(*(column[rows] for column in vars(flight.tdoa).values()))
+    )
 
 
 def ids(flight, rng):
     """Two anchors are each called by the name of the other."""
     one, two = rng.choice(np.unique(flight.tdoa.a), 2, replace=False)
     table = {one: two, two: one}
-    a, b = (np.array([table.get(i, i) for i in ids.tolist()]) for ids in (flight.tdoa.a, flight.tdoa.b))
+    a, b = (
+        np.array([table.get(i, i) for i in ids.tolist()]) for ids in (flight.tdoa.a, flight.tdoa.b)
+    )
     return replace(flight, tdoa=replace(flight.tdoa, a=a, b=b))
 
 

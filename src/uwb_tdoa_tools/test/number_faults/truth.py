@@ -31,5 +31,7 @@ def leap(flight, rng):
 def attitude(flight, rng):
     """Of a mirrored frame, about one axis; the other way round; or with w first."""
     x, y, z, w = flight.truth.q.T
-    columns = [(x, -y, -z, w), (-x, y, -z, w), (-x, -y, z, w), (-x, -y, -z, w), (w, x, y, z)][rng.integers(5)]
+    columns = [(x, -y, -z, w), (-x, y, -z, w), (-x, -y, z, w), (-x, -y, -z, w), (w, x, y, z)][
+        rng.integers(5)
+    ]
     return replace(flight, truth=replace(flight.truth, q=np.column_stack(columns)))

@@ -1,4 +1,7 @@
-"""Faults in the values of TDOAs: of one pair, or of every pair. Each takes a Flight and a generator and gives the Flight with it."""
+"""Faults in the values of TDOAs: of one pair, or of every pair.
+
+Each takes a Flight and a generator and gives the Flight with it.
+"""
 
 from dataclasses import replace
 
@@ -10,14 +13,18 @@ STEPS = 2, 11  # packets over which values are held or interpolated, from and be
 def rows_of_pairs(flight, rng, every):
     """[rows (n,)] of each pair that is heard, or of one that is heard often."""
     of = flight.tdoa
-    heard, key, count = np.unique(np.column_stack([of.a, of.b]), axis=0, return_inverse=True, return_counts=True)
+    heard, key, count = np.unique(
+        np.column_stack([of.a, of.b]), axis=0, return_inverse=True, return_counts=True
+    )
     often = np.flatnonzero(count >= 0.8 * np.median(count))
     chosen = range(len(heard)) if every else [rng.choice(often)]
     return [np.flatnonzero(key.reshape(-1) == k) for k in chosen]
 
 
 def of_pairs(change, every):
-    """A fault of the values of one pair, or of every pair in the same way: change(values, t, size) -> values, size = draw(rng)."""
+    """A fault of the values of one pair, or of every pair in the same way: change(values, t, size)
+    -> values, size = draw(rng).
+    """
     draw, apply = change
 
     def fault(flight, rng):
@@ -67,7 +74,10 @@ def _interpolated(d, t, packets):
 
 
 REPEATED = _packets, _held
-ROUNDED = (lambda rng, d: float(np.round(np.exp(rng.uniform(np.log(0.1), np.log(2.0))), 2))), _rounded
+ROUNDED = (
+    (lambda rng, d: float(np.round(np.exp(rng.uniform(np.log(0.1), np.log(2.0))), 2))),
+    _rounded,
+)
 CLIPPED = (lambda rng, d: np.quantile(np.abs(d), rng.uniform(0.3, 0.85))), _clipped
 FROZEN = _interval, _stands
 LATE = _packets, _late

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from .bag import check_output, write_bag
 if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
+
     from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
     from uwb_tdoa_bias.foundation.sensors import Stream
 
@@ -26,9 +27,12 @@ SENSORS = "tdoa", "imu", "truth", *AIDS  # streams of a Flight, each on its own 
 
 @dataclass(frozen=True)
 class Converted:
-    """flight : name; bag : path; messages : {topic: count}; start, end : s; anchors : how many; tdoa_unknown_anchor :
-    measurements of anchors that the survey does not have; left_out : {stream that a bag has no place for: events};
-    meta : of the Flight; apart : sentences on sensors that never overlap with the TDOAs, or ranges, in time."""
+    """flight : name; bag : path; messages : {topic: count}; start, end : s; anchors : how many;
+    tdoa_unknown_anchor : measurements of anchors that the survey does not have; left_out : {stream
+    that a bag has no place for: events};
+    meta : of the Flight; apart : sentences on sensors that never overlap with the TDOAs, or ranges,
+        in time.
+    """
 
     flight: str
     bag: str
@@ -42,15 +46,22 @@ class Converted:
     apart: list[str]
 
 
-def convert(read: Callable[[], Flight], out: str | Path, storage: str = "mcap", force: bool = False) -> Converted:
-    """Write a recording as a bag, see `write_bag`. read : callable, gives the Flight. Returns Converted. Raises
-    InputError."""
+def convert(
+    read: Callable[[], Flight], out: str | Path, storage: str = "mcap", force: bool = False
+) -> Converted:
+    """Write a recording as a bag, see `write_bag`. read : callable, gives the Flight. Returns
+    Converted. Raises InputError.
+    """
     check_output(out, force)  # before the work, not after it
     flight = _from_zero_on(read())
     counts = write_bag(flight, out, storage, force)
-    together = [stream for name in _held(flight) if _overlaps(stream := getattr(flight, name), flight)]
+    together = [
+        stream for name in _held(flight) if _overlaps(stream := getattr(flight, name), flight)
+    ]
     known = (flight.anchors.index(flight.tdoa.a) >= 0) & (flight.anchors.index(flight.tdoa.b) >= 0)
-    ranges_known = np.ones(0, bool) if flight.range is None else flight.anchors.index(flight.range.anchor) >= 0
+    ranges_known = (
+        np.ones(0, bool) if flight.range is None else flight.anchors.index(flight.range.anchor) >= 0
+    )
     return Converted(
         flight=flight.name,
         bag=str(out),
@@ -66,32 +77,44 @@ def convert(read: Callable[[], Flight], out: str | Path, storage: str = "mcap", 
 
 
 def shifted(flight: Flight, offsets: dict[str, float]) -> Flight:
-    """The Flight with offsets {of SENSORS: s} added to the stamps of what it holds. Raises InputError for a sensor that it does not
-    hold."""
+    """The Flight with offsets {of SENSORS: s} added to the stamps of what it holds. Raises
+    InputError for a sensor that it does not hold.
+    """
     changed = {}
     for sensor, offset in offsets.items():
         stream = getattr(flight, sensor)
         if stream is None:
-            raise InputError(f"--time-offset: {flight.name} holds no {sensor}; it holds {', '.join(_held(flight))}.")
+            raise InputError(
+                f"--time-offset: {flight.name} holds no {sensor}; it holds "
+                f"{', '.join(_held(flight))}."
+            )
         changed[sensor] = replace(stream, t=stream.t + offset)
     return replace(flight, **changed)
 
 
 def _from_zero_on(flight: Flight) -> Flight:
-    """The Flight without what its other sensors say before 0 s, where what locates the tag is not: a clock that was moved may begin there,
-    and a bag has no place for it."""
+    """The Flight without what its other sensors say before 0 s, where what locates the tag is not:
+    a clock that was moved may begin there, and a bag has no place for it.
+    """
     changed, said = {}, list(flight.meta.get("remarks", ()))
     for name in _held(flight) if flight.start >= 0.0 else ():
         stream = getattr(flight, name)
         inside = stream.t >= 0.0
         if inside.any() and not inside.all():
             changed[name] = rows_of(stream, inside)
-            said.append(f"{name}: {np.count_nonzero(~inside)} samples before 0 s, which a bag has no place for, are left out")
+            said.append(
+                f"{name}: {np.count_nonzero(~inside)} samples before 0 s, which a bag has no "
+                "place for, are left out"
+            )
     return replace(flight, **changed, meta={**flight.meta, "remarks": said}) if changed else flight
 
 
 def _held(flight: Flight) -> list[str]:
-    return [name for name in SENSORS if getattr(flight, name) is not None and len(getattr(flight, name).t)]
+    return [
+        name
+        for name in SENSORS
+        if getattr(flight, name) is not None and len(getattr(flight, name).t)
+    ]
 
 
 def _overlaps(one: Timed, flight: Flight) -> bool:
@@ -100,14 +123,17 @@ def _overlaps(one: Timed, flight: Flight) -> bool:
 
 
 def _apart(flight: Flight) -> list[str]:
-    """Sentences on sensors whose stamps have no time in common with those of the TDOAs, or ranges: they are on another clock."""
+    """Sentences on sensors whose stamps have no time in common with those of the TDOAs, or ranges:
+    they are on another clock.
+    """
     begin, end, said = flight.start, flight.end, []
     radio = "TDOAs" if len(flight.tdoa) else "ranges"
     for name in _held(flight):
         t = getattr(flight, name).t
         if not _overlaps(getattr(flight, name), flight):
             said.append(
-                f"{name} runs from {t[0]:.1f} to {t[-1]:.1f} s, the {radio} from {begin:.1f} to {end:.1f} s: clocks that have no time in common; "
+                f"{name} runs from {t[0]:.1f} to {t[-1]:.1f} s, the {radio} from {begin:.1f} "
+                f"to {end:.1f} s: clocks that have no time in common; "
                 f"--time-offset {name}={begin - t[0]:.3f} lets both begin together, if they did."
             )
     return said

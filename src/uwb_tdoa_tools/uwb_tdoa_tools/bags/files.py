@@ -1,4 +1,6 @@
-"""Bags as files: opening them, going through their messages, and making new ones that are never half-written."""
+"""Bags as files: opening them, going through their messages, and making new ones that are never
+half-written.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +13,7 @@ import re
 import shutil
 import sys
 import tempfile
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
@@ -22,11 +24,25 @@ from uwb_tdoa_bias.foundation.stamps import LARGEST_STEP_BACK
 
 from ..command_lines import SALVAGE
 from . import mcap, write_ahead
-from .integrity import NO_SUM, SUM_KEY, check as check_whole, data_files, is_mcap, is_packed, metadata, seal, sqlite_messages, unpack
+from .integrity import (
+    NO_SUM,
+    SUM_KEY,
+    data_files,
+    is_mcap,
+    is_packed,
+    metadata,
+    seal,
+    sqlite_messages,
+    unpack,
+)
+from .integrity import (
+    check as check_whole,
+)
 from .kind import is_bag
 from .mcap import Damaged, zstd
 from .message_types import check_type, earlier_types, typestore, upgraded
-from .salvage import as_written, salvage as write_sound_part
+from .salvage import as_written
+from .salvage import salvage as write_sound_part
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -37,8 +53,10 @@ STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 class BagReader(Reader):
     """A Reader that knows what of a bag cannot be read.
 
-    remarks : sentences on what is missing in a damaged one; unreadable : {topic: messages that are none of its type};
-    most : bytes that its messages may hold together; data : its files; packed : whether each message is compressed; falls_back : whether
+    remarks : sentences on what is missing in a damaged one; unreadable : {topic: messages that are
+        none of its type};
+    most : bytes that its messages may hold together; data : its files; packed : whether each
+        message is compressed; falls_back : whether
     the times of its messages do, in the order in which they were written.
     """
 
@@ -58,10 +76,13 @@ def new_bag(out: str | Path, storage: str = "mcap", force: bool = False) -> Iter
         raise InputError(f"storage: {storage!r} is not known; choose one of {', '.join(STORAGES)}.")
     check_output(out, force)
     out.parent.mkdir(parents=True, exist_ok=True)
-    # A sibling, so that the last step is a rename. In it the bag's own name: rosbags names the data file after it.
+    # A sibling, so that the last step is a rename. In it the bag's own name: rosbags names the data
+    # file after it.
     scratch = Path(tempfile.mkdtemp(prefix=f".{out.name}.", suffix=".partial", dir=out.parent))
     try:
-        with Writer(scratch / out.name, version=Writer.VERSION_LATEST, storage_plugin=STORAGES[storage]) as writer:
+        with Writer(
+            scratch / out.name, version=Writer.VERSION_LATEST, storage_plugin=STORAGES[storage]
+        ) as writer:
             writer.set_custom_data(SUM_KEY, NO_SUM)
             yield writer
         seal(scratch / out.name)
@@ -74,7 +95,9 @@ def new_bag(out: str | Path, storage: str = "mcap", force: bool = False) -> Iter
 
 
 def check_output(out: str | Path, force: bool = False) -> None:
-    """Raise InputError if a new bag cannot be put at `out`: something is there that force may not replace."""
+    """Raise InputError if a new bag cannot be put at `out`: something is there that force may not
+    replace.
+    """
     out = Path(out)
     if not out.name:
         raise InputError(f"{out}: is no name for a bag; give the path of a new directory.")
@@ -84,21 +107,29 @@ def check_output(out: str | Path, force: bool = False) -> None:
     if not force:
         raise InputError(f"{out}: exists already; choose another name, or --force to replace it.")
     if not (out / "metadata.yaml").is_file():
-        raise InputError(f"{out}: exists and is not a bag, so --force does not replace it; choose another name.")
+        raise InputError(
+            f"{out}: exists and is not a bag, so --force does not replace it; choose another name."
+        )
 
 
 @contextmanager
 def open_bag(path: str | Path, salvage: bool = False) -> Iterator[BagReader]:
-    """An open rosbags Reader of a bag directory or data file; raises InputError with what is wrong with it.
+    """An open rosbags Reader of a bag directory or data file; raises InputError with what is wrong
+    with it.
 
-    salvage : read what is sound of a cut or damaged one; the Reader's `remarks` are sentences on what is missing.
+    salvage : read what is sound of a cut or damaged one; the Reader's `remarks` are sentences on
+        what is missing.
     """
     path = Path(path)
     if not is_bag(path):
-        raise InputError(f"{path}: is not a bag; give the directory with metadata.yaml or its .mcap or .db3 file.")
+        raise InputError(
+            f"{path}: is not a bag; give the directory with metadata.yaml or its .mcap or "
+            ".db3 file."
+        )
     if path.is_dir() and not (path / "metadata.yaml").is_file() and not salvage:
         raise InputError(
-            f"{path}: has no metadata.yaml: the recording was not closed; run `ros2 bag reindex` on it, or {SALVAGE}."
+            f"{path}: has no metadata.yaml: the recording was not closed; run `ros2 bag "
+            f"reindex` on it, or {SALVAGE}."
         )
     with temporary_folder() as folder:
         reader = _opened(path, folder, salvage)
@@ -115,7 +146,10 @@ def _opened(path: Path, folder: Path, salvage: bool) -> BagReader:
         if files := write_ahead.unclosed(path):
             path = _with_log(path, folder, salvage, remarks)
             names = " and ".join(file.name for file in files)
-            remarks.append(f"the recorder did not close {names}: what it left in the -wal file beside it is read as well.")
+            remarks.append(
+                f"the recorder did not close {names}: what it left in the -wal file beside it "
+                "is read as well."
+            )
         readable = path
         if salvage:
             readable = folder / "sound"
@@ -136,9 +170,13 @@ def _opened(path: Path, folder: Path, salvage: bool) -> BagReader:
         reader.packed = information["compression_mode"] == "message"
         reader.falls_back = any(_falls_back(file) for file in reader.data)
         reader.remarks, reader.unreadable = remarks, Counter()
-        reader.most = most_unpacked(sum(file.stat().st_size for file in (path, *path.glob("*")) if file.is_file()))
+        reader.most = most_unpacked(
+            sum(file.stat().st_size for file in (path, *path.glob("*")) if file.is_file())
+        )
         for connection in reader.connections:
-            if not re.fullmatch(r"[/\w]+", connection.topic) or not re.fullmatch(r"\w+/\w+/\w+", connection.msgtype):
+            if not re.fullmatch(r"[/\w]+", connection.topic) or not re.fullmatch(
+                r"\w+/\w+/\w+", connection.msgtype
+            ):
                 raise Damaged(f"topic {connection.topic!r} of type {connection.msgtype!r} is none")
     except InputError:
         raise
@@ -148,7 +186,10 @@ def _opened(path: Path, folder: Path, salvage: bool) -> BagReader:
 
 
 def _with_log(path: Path, folder: Path, salvage: bool, remarks: list[str]) -> Path:
-    """The bag with what its logs hold, in a folder. Raises Damaged where a log cannot be read, or tells in remarks."""
+    """The bag with what its logs hold, in a folder.
+
+    Raises Damaged where a log cannot be read, or tells in remarks.
+    """
     (folder / "closed").mkdir()
     whole, lost = write_ahead.closed(path, folder / "closed")
     if lost and not salvage:
@@ -159,10 +200,15 @@ def _with_log(path: Path, folder: Path, salvage: bool, remarks: list[str]) -> Pa
 
 @contextmanager
 def _closing_second_connections(reader: Reader) -> Iterator[None]:
-    """rosbags opens each SQLite file twice, and closes it once: each file that was read would stay open."""
+    """rosbags opens each SQLite file twice, and closes it once: each file that was read would stay
+    open.
+    """
     before = {*map(id, _connections())}
     yield
-    used = {id(getattr(one, "dbconn", None)) for one in (reader.storage, *getattr(reader.storage, "storages", ()))}
+    used = {
+        id(getattr(one, "dbconn", None))
+        for one in (reader.storage, *getattr(reader.storage, "storages", ()))
+    }
     for connection in _connections():
         if id(connection) not in before | used:
             connection.close(True)
@@ -174,7 +220,9 @@ def _connections() -> list[Any]:
 
 
 def _take_qos_of_metadata(reader: Reader) -> None:
-    """Have data files offer each topic as metadata.yaml says: rosbags skips the messages of a topic of which they say another QoS."""
+    """Have data files offer each topic as metadata.yaml says: rosbags skips the messages of a topic
+    of which they say another QoS.
+    """
     recorded = {
         (one.topic, one.msgtype): one.ext.offered_qos_profiles  # type: ignore[union-attr]  # a bag of ROS 2
         for one in reader.connections
@@ -185,8 +233,12 @@ def _take_qos_of_metadata(reader: Reader) -> None:
             file.connections[k] = one._replace(ext=one.ext._replace(offered_qos_profiles=qos))
 
 
-def _as_written(reader: BagReader, connections: list[Connection]) -> Iterator[tuple[Connection, int, bytes]]:
-    """(connection, stamp ns, bytes) of the given connections in the order in which they were written."""
+def _as_written(
+    reader: BagReader, connections: list[Connection]
+) -> Iterator[tuple[Connection, int, bytes]]:
+    """(connection, stamp ns, bytes) of the given connections in the order in which they were
+    written.
+    """
     wanted = {(connection.topic, connection.msgtype): connection for connection in connections}
     for file in reader.data:
         for written, stamp, data in as_written(file, Counter()):
@@ -195,12 +247,15 @@ def _as_written(reader: BagReader, connections: list[Connection]) -> Iterator[tu
 
 
 def _falls_back(file: Path) -> bool:
-    """Whether the times of the messages of a data file fall by more than a message can be late: the clock of the recorder, or of what is
-    recorded, was set."""
+    """Whether the times of the messages of a data file fall by more than a message can be late: the
+    clock of the recorder, or of what is recorded, was set.
+    """
     newest = -math.inf
     if is_mcap(file):
         times: Iterator[int] = (
-            int.from_bytes(content[6:14], "little") for kind, content in mcap.sound(file) if kind == mcap.MESSAGE and len(content) >= 14
+            int.from_bytes(content[6:14], "little")
+            for kind, content in mcap.sound(file)
+            if kind == mcap.MESSAGE and len(content) >= 14
         )
     else:
         times = (stamp for _, _, stamp, _ in sqlite_messages(file))
@@ -214,17 +269,25 @@ def _falls_back(file: Path) -> bool:
 def messages(
     path: str | Path, reader: BagReader, connections: list[Connection], written: bool = False
 ) -> Iterator[tuple[Connection, int, bytes]]:
-    """Yield (connection, stamp ns, bytes) of the given connections in the bag's order (written : if its times fall back, in the order in
-    which they were written), as their types are now, without those that
-    cannot be read as such, which are counted in `reader.unreadable`; raises InputError, also if there are more or fewer than the bag
-    says, or they hold more bytes than its files."""
+    """Yield (connection, stamp ns, bytes) of the given connections in the bag's order (written : if
+    its times fall back, in the order in which they were written), as their types are now, without
+    those that cannot be read as such, which are counted in `reader.unreadable`; raises InputError,
+    also if there are more or fewer than the bag says, or they hold more bytes than its files.
+    """
     found: Iterator[tuple[Connection, int, bytes]] = iter(())
     if connections:
-        found = _as_written(reader, connections) if written and reader.falls_back else reader.messages(connections=connections)
+        found = (
+            _as_written(reader, connections)
+            if written and reader.falls_back
+            else reader.messages(connections=connections)
+        )
     left = {(connection.topic, connection.msgtype): 0 for connection in connections}
     for connection in connections:
         left[connection.topic, connection.msgtype] += connection.msgcount
-    earlier, room = {connection.id: earlier_types(path, connection) for connection in connections}, reader.most
+    earlier, room = (
+        {connection.id: earlier_types(path, connection) for connection in connections},
+        reader.most,
+    )
     while True:
         try:
             connection, stamp, data = next(found)
@@ -235,7 +298,10 @@ def messages(
         left[connection.topic, connection.msgtype] -= 1
         room -= len(data)
         if room < 0:
-            raise TooMuch(f"{path}: has more than {reader.most} bytes of messages; give another file, or split it.")
+            raise TooMuch(
+                f"{path}: has more than {reader.most} bytes of messages; give another file, "
+                "or split it."
+            )
         if store := earlier[connection.id]:
             try:
                 data = upgraded(data, connection.msgtype, store)
@@ -245,14 +311,17 @@ def messages(
         yield connection, stamp, data
     for (topic, _), count in left.items():
         if count:
-            what = f"{count} messages are missing" if count > 0 else f"{-count} messages are too many"
+            what = (
+                f"{count} messages are missing" if count > 0 else f"{-count} messages are too many"
+            )
             raise _damaged(path, f"{what} on {topic}")
 
 
 def readable(
     path: str | Path, reader: BagReader, connections: list[Connection]
 ) -> Iterator[tuple[Connection, int, Any]]:
-    """The same as (connection, stamp ns, message): what are no such messages, as a faulty publisher sends them, is counted too.
+    """The same as (connection, stamp ns, message): what are no such messages, as a faulty publisher
+    sends them, is counted too.
 
     Where the times of a bag fall back, in the order in which they were written.
     """
@@ -267,19 +336,29 @@ def readable(
         yield connection, stamp, message
 
 
-def connections_of(path: str | Path, reader: BagReader, topic: str, msgtype: str | None = None) -> list[Connection]:
+def connections_of(
+    path: str | Path, reader: BagReader, topic: str, msgtype: str | None = None
+) -> list[Connection]:
     """The connections of a topic; raises InputError if their type is another, or not known."""
     found = [connection for connection in reader.connections if connection.topic == topic]
     for connection in found:
         if msgtype is not None and connection.msgtype != msgtype:
-            raise InputError(f"{path}: {connection.topic} is {connection.msgtype}; {msgtype} is needed there.")
+            raise InputError(
+                f"{path}: {connection.topic} is {connection.msgtype}; {msgtype} is needed there."
+            )
         check_type(path, connection)
     return found
 
 
 def remarks_of(reader: BagReader) -> list[str]:
     """Sentences on what is missing in what was read so far."""
-    return [*reader.remarks, *(f"{topic}: {count} messages left out, they cannot be read." for topic, count in reader.unreadable.items())]
+    return [
+        *reader.remarks,
+        *(
+            f"{topic}: {count} messages left out, they cannot be read."
+            for topic, count in reader.unreadable.items()
+        ),
+    ]
 
 
 def _damaged(path: str | Path, error: Exception | str) -> InputError:

@@ -1,11 +1,13 @@
-"""Whether the files of a bag are whole, as far as their format can tell, before anything else is done with them."""
+"""Whether the files of a bag are whole, as far as their format can tell, before anything else is
+done with them.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
 import re
 import sqlite3
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 import zlib
 
@@ -21,12 +23,17 @@ from .mcap import Damaged, zstd
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-SUM_KEY = "uwb_tdoa_tools.crc32"  # in the bag's custom data: CRC-32 of its data file, 8 hexadecimal digits
+# in the bag's custom data: CRC-32 of its data file, 8 hexadecimal digits
+SUM_KEY = "uwb_tdoa_tools.crc32"
 NO_SUM = "--------"
 _BLOCK = 1 << 20  # bytes that are read at once
 _STEPS = 20_000  # instructions of SQLite from one look at the time to the next: some milliseconds
-_PLAIN = re.compile(r"CREATE\s+(TABLE|INDEX)\s[^()]*\([\w\s,\"'`\[\]]*\)\s*", re.IGNORECASE)  # no bracket within: nothing is computed
-sqlite3.enable_callback_tracebacks(True)  # or Ctrl-C that comes while SQLite asks for the time is lost (foundation/executable.py)
+_PLAIN = re.compile(
+    r"CREATE\s+(TABLE|INDEX)\s[^()]*\([\w\s,\"'`\[\]]*\)\s*", re.IGNORECASE
+)  # no bracket within: nothing is computed
+sqlite3.enable_callback_tracebacks(
+    True
+)  # or Ctrl-C that comes while SQLite asks for the time is lost (foundation/executable.py)
 _TYPES = (  # columns of an SQLite bag and what they hold
     ("messages", {"timestamp": "integer", "topic_id": "integer", "data": "blob"}),
     ("topics", {"id": "integer", "name": "text", "type": "text", "serialization_format": "text"}),
@@ -34,10 +41,12 @@ _TYPES = (  # columns of an SQLite bag and what they hold
 
 
 def check(path: str | Path) -> None:
-    """Raise Damaged, or InputError for metadata.yaml, unless the files of a bag (directory or data file) are whole.
+    """Raise Damaged, or InputError for metadata.yaml, unless the files of a bag (directory or data
+    file) are whole.
 
-    The checksums that MCAP files hold and that `seal` left in metadata.yaml, the structure of SQLite files, and that
-    metadata.yaml says what it must. Files that rosbag2 compressed as a whole (see `is_packed`) are only there or not.
+    The checksums that MCAP files hold and that `seal` left in metadata.yaml, the structure of
+    SQLite files, and that metadata.yaml says what it must. Files that rosbag2 compressed as a whole
+    (see `is_packed`) are only there or not.
     """
     path = Path(path)
     if not path.is_dir():
@@ -48,7 +57,9 @@ def check(path: str | Path) -> None:
         if not file.is_file():
             raise Damaged(f"{file.name} is missing")
         if stored != NO_SUM and _sum(file) != stored:
-            raise Damaged(f"the checksum of {file.name} in metadata.yaml is {stored}, but it has {_sum(file)}")
+            raise Damaged(
+                f"the checksum of {file.name} in metadata.yaml is {stored}, but it has {_sum(file)}"
+            )
         if not is_packed(information):
             _check_data(file, packed_messages=information["compression_mode"] == "message")
 
@@ -64,7 +75,10 @@ def is_packed(information: dict[str, Any]) -> bool:
 
 
 def unpack(path: Path, folder: Path) -> None:
-    """Write a bag whose files are compressed as a whole to an empty folder, unpacked. Raises Damaged, InputError."""
+    """Write a bag whose files are compressed as a whole to an empty folder, unpacked.
+
+    Raises Damaged, InputError.
+    """
     information = metadata(path)
     names, files = [], data_files(path, information)
     packed = sum(file.stat().st_size for file in files)
@@ -78,15 +92,21 @@ def unpack(path: Path, folder: Path) -> None:
                     target.write(block)
         except (zstd.ZstdError, EOFError) as error:
             raise Damaged(f"{file.name} cannot be unpacked ({error})") from error
-    information |= {"relative_file_paths": names, "compression_mode": "", "compression_format": "", "files": []}
+    information |= {
+        "relative_file_paths": names,
+        "compression_mode": "",
+        "compression_format": "",
+        "files": [],
+    }
     information["custom_data"].pop(SUM_KEY, None)
     content = yaml.safe_dump({"rosbag2_bagfile_information": information}, sort_keys=False)
     write_text(folder / "metadata.yaml", content)
 
 
 def metadata(path: Path) -> dict[str, Any]:
-    """What metadata.yaml of a bag directory says, with what we use in it present and of the right kind: dict. Raises
-    InputError, and Damaged."""
+    """What metadata.yaml of a bag directory says, with what we use in it present and of the right
+    kind: dict. Raises InputError, and Damaged.
+    """
     content = read_yaml(path / "metadata.yaml")
     information = content.get("rosbag2_bagfile_information") if isinstance(content, dict) else None
     if not isinstance(information, dict):
@@ -94,19 +114,30 @@ def metadata(path: Path) -> dict[str, Any]:
     information = {"compression_mode": "", "custom_data": None, "files": [], **information}
     information["custom_data"] = information["custom_data"] or {}
     if isinstance(information["compression_mode"], str):
-        information["compression_mode"] = information["compression_mode"].lower().replace("none", "")
+        information["compression_mode"] = (
+            information["compression_mode"].lower().replace("none", "")
+        )
     kinds = {
-        "version": int, "message_count": int, "relative_file_paths": list, "topics_with_message_count": list,
-        "custom_data": dict, "storage_identifier": str, "duration": dict, "starting_time": dict,
-        "compression_mode": str, "files": list,
-    }  # fmt: skip
+        "version": int,
+        "message_count": int,
+        "relative_file_paths": list,
+        "topics_with_message_count": list,
+        "custom_data": dict,
+        "storage_identifier": str,
+        "duration": dict,
+        "starting_time": dict,
+        "compression_mode": str,
+        "files": list,
+    }
     for name, kind in kinds.items():
         if type(information.get(name)) is not kind:
             raise Damaged(f"metadata.yaml: {name} is {information.get(name)!r}")
     seen = set()
     for name in information["relative_file_paths"]:
         if not isinstance(name, str) or not Path(name).name or Path(name).name in seen:
-            raise Damaged(f"metadata.yaml: relative_file_paths: {name!r} is no file, or is there twice")
+            raise Damaged(
+                f"metadata.yaml: relative_file_paths: {name!r} is no file, or is there twice"
+            )
         seen.add(Path(name).name)
     for name, key in (("duration", "nanoseconds"), ("starting_time", "nanoseconds_since_epoch")):
         if type(information[name].get(key)) is not int:
@@ -119,7 +150,10 @@ def metadata(path: Path) -> dict[str, Any]:
 
 
 def seal(path: str | Path) -> None:
-    """Put the checksums of a bag that rosbags has just written in their places. It must hold SUM_KEY: NO_SUM."""
+    """Put the checksums of a bag that rosbags has just written in their places.
+
+    It must hold SUM_KEY: NO_SUM.
+    """
     (data,) = (file for file in Path(path).iterdir() if file.name != "metadata.yaml")
     if data.suffix == ".mcap":
         mcap.set_sums(data)
@@ -131,14 +165,22 @@ def seal(path: str | Path) -> None:
 
 
 def open_sqlite(file: str | Path) -> sqlite3.Connection:
-    """A connection that only reads, a file that is cut as well, in which nothing is but tables and indexes of columns: what is
-    computed (views, virtual tables, checks, expressions) may take for ever. So may pages that share their children: each query ends when
-    the time of the file is up. Raises Damaged."""
-    connection = sqlite3.connect(f"file:{quote(str(Path(file).absolute()))}?mode=ro&immutable=1", uri=True)
+    """A connection that only reads, a file that is cut as well, in which nothing is but tables and
+    indexes of columns: what is computed (views, virtual tables, checks, expressions) may take for
+    ever. So may pages that share their children: each query ends when the time of the file is up.
+    Raises Damaged.
+    """
+    connection = sqlite3.connect(
+        f"file:{quote(str(Path(file).absolute()))}?mode=ro&immutable=1", uri=True
+    )
     connection.set_progress_handler(Budget(file, Path(file).stat().st_size).is_late, _STEPS)
     try:
-        connection.execute("PRAGMA writable_schema=ON")  # else not one page of a file that has fewer than it says
-        for name, text in connection.execute("SELECT name, sql FROM sqlite_master WHERE sql IS NOT NULL"):
+        connection.execute(
+            "PRAGMA writable_schema=ON"
+        )  # else not one page of a file that has fewer than it says
+        for name, text in connection.execute(
+            "SELECT name, sql FROM sqlite_master WHERE sql IS NOT NULL"
+        ):
             if not _PLAIN.fullmatch(text):
                 raise Damaged(f"{name} in it is no table and no index of columns")
         return connection
@@ -167,16 +209,24 @@ def _check_data(file: Path, packed_messages: bool = False) -> None:
         except (zstd.ZstdError, TypeError) as error:
             raise Damaged(f"a message cannot be unpacked ({error})") from error
         if size > most:
-            raise Damaged(f"its messages unpack to more than {MESSAGE_BYTES} bytes each, or are too many")
+            raise Damaged(
+                f"its messages unpack to more than {MESSAGE_BYTES} bytes each, or are too many"
+            )
         left -= size
 
 
 def sqlite_messages(file: Path) -> Iterator[tuple[int, int, int, bytes]]:
-    """Yields (id, topic id, stamp, data) of an SQLite file in the order of the ids. Raises Damaged where it is."""
+    """Yields (id, topic id, stamp, data) of an SQLite file in the order of the ids.
+
+    Raises Damaged where it is.
+    """
     connection, last = open_sqlite(file), None
     budget = Budget(file, file.stat().st_size)
     connection.set_progress_handler(budget.is_late, _STEPS)
-    query = f"SELECT id, topic_id, timestamp, iif(length(data) <= {MESSAGE_BYTES}, data, NULL) FROM messages ORDER BY id"
+    query = (
+        f"SELECT id, topic_id, timestamp, iif(length(data) <= {MESSAGE_BYTES}, data, NULL) FROM "
+        "messages ORDER BY id"
+    )
     try:
         for row in connection.execute(query):
             if last is not None and not row[0] > last:
@@ -196,13 +246,20 @@ def _check_sqlite(file: Path) -> None:
         connection.execute("PRAGMA writable_schema=OFF")
         problems = [row[0] for row in connection.execute("PRAGMA integrity_check(1)")]
         if problems != ["ok"]:
-            raise Damaged(" ".join(str(problems[0]).split()) if problems else "its integrity cannot be checked")
+            raise Damaged(
+                " ".join(str(problems[0]).split())
+                if problems
+                else "its integrity cannot be checked"
+            )
         for table, columns in _TYPES:
             wrong = " OR ".join(f"typeof({name}) <> '{kind}'" for name, kind in columns.items())
             wrong += f" OR length({[*columns][-1]}) > {MESSAGE_BYTES}"
             count = connection.execute(f"SELECT count(*) FROM {table} WHERE {wrong}").fetchone()[0]
             if count:
-                raise Damaged(f"{count} rows of {table} hold text where numbers belong, or the other way round, or are too long")
+                raise Damaged(
+                    f"{count} rows of {table} hold text where numbers belong, or the other "
+                    "way round, or are too long"
+                )
     except (sqlite3.Error, UnicodeDecodeError) as error:
         raise damage(error) from error
     finally:
@@ -211,7 +268,11 @@ def _check_sqlite(file: Path) -> None:
 
 def damage(error: Exception) -> Damaged:
     """Of an error of SQLite, which calls a query whose time is up interrupted."""
-    return Damaged("it takes longer to read than a file of its size may" if "interrupted" in str(error) else str(error))
+    return Damaged(
+        "it takes longer to read than a file of its size may"
+        if "interrupted" in str(error)
+        else str(error)
+    )
 
 
 def _sum(file: Path) -> str:

@@ -1,7 +1,9 @@
-"""MCAP files record by record (https://mcap.dev/spec): what rosbags does not check, and what is left of a cut one.
+"""MCAP files record by record (https://mcap.dev/spec): what rosbags does not check, and what is
+left of a cut one.
 
-Sizes are compared with the file, or bounded, before anything is read or unpacked. The package `mcap` (1.6) does neither: it unpacks a chunk
-whatever it unpacks to, does not compare the index with the chunks, and cannot fill in the checksums that rosbags leaves out.
+Sizes are compared with the file, or bounded, before anything is read or unpacked. The package
+`mcap` (1.6) does neither: it unpacks a chunk whatever it unpacks to, does not compare the index
+with the chunks, and cannot fill in the checksums that rosbags leaves out.
 """
 
 from __future__ import annotations
@@ -10,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 import struct
 import sys
-from typing import BinaryIO, TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
 import zlib
 
 import lz4.frame
@@ -26,7 +28,16 @@ else:
     from backports import zstd
 
 MAGIC = b"\x89MCAP0\r\n"
-HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, CHUNK_INDEX, DATA_END = 0x01, 0x02, 0x03, 0x04, 0x05, 0x06, 0x08, 0x0F
+HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, CHUNK_INDEX, DATA_END = (
+    0x01,
+    0x02,
+    0x03,
+    0x04,
+    0x05,
+    0x06,
+    0x08,
+    0x0F,
+)
 _BLOCK = 1 << 20  # bytes that are read at once
 
 
@@ -36,7 +47,9 @@ class Damaged(Exception):
 
 @dataclass(frozen=True)
 class Record:
-    """kind : opcode; start : of its opcode, bytes from the begin of the file; size : of its content."""
+    """kind : opcode; start : of its opcode, bytes from the begin of the file; size : of its
+    content.
+    """
 
     kind: int
     start: int
@@ -54,7 +67,9 @@ class Record:
 
 
 def check(path: str | Path) -> None:
-    """Raise Damaged unless the file is whole: its records fill it, and the checksums that it has are right."""
+    """Raise Damaged unless the file is whole: its records fill it, and the checksums that it has
+    are right.
+    """
     with open(path, "rb") as file:
         last = _size(file)
         if _at(file, 0, 8) != MAGIC:
@@ -68,7 +83,11 @@ def check(path: str | Path) -> None:
             if footer is not None:
                 raise Damaged(f"byte {record.start}: a record follows the footer")
             if record.kind == HEADER:
-                begin = (0, 8, record.end)  # where the data begin is not the same to all who write these files
+                begin = (
+                    0,
+                    8,
+                    record.end,
+                )  # where the data begin is not the same to all who write these files
             elif record.kind == CHUNK:
                 chunks[record.start] = _described(file, record)
                 left -= len(unpacked(file, record, left))
@@ -85,8 +104,10 @@ def check(path: str | Path) -> None:
 
 
 def sound(path: str | Path) -> Iterator[tuple[int, bytes]]:
-    """What is left of a file: yields (kind, content) of the schemas, channels and messages, and (CHUNK, b"") for a
-    chunk that is damaged, up to where no record follows, and raises Damaged there."""
+    """What is left of a file: yields (kind, content) of the schemas, channels and messages, and
+    (CHUNK, b"") for a chunk that is damaged, up to where no record follows, and raises Damaged
+    there.
+    """
     with open(path, "rb") as file:
         last = _size(file)
         left = most_unpacked(last)
@@ -115,7 +136,9 @@ def records(file: BinaryIO, start: int, end: int) -> Iterator[Record]:
         kind, size = struct.unpack("<BQ", _at(file, start, 9))
         record = Record(kind, start, size)
         if record.end > end or kind == 0:
-            raise Damaged(f"byte {start}: a record claims {size} bytes, {end - start - 9} are there")
+            raise Damaged(
+                f"byte {start}: a record claims {size} bytes, {end - start - 9} are there"
+            )
         yield record
         start = record.end
 
@@ -128,8 +151,14 @@ def inner(data: bytes) -> Iterator[tuple[int, bytes]]:
             raise Damaged("a chunk is cut within a record")
         kind, size = struct.unpack_from("<BQ", data, at)
         at += 9
-        if size > len(data) - at or kind not in (SCHEMA, CHANNEL, MESSAGE) or (kind == MESSAGE and size < 22):
-            raise Damaged(f"a chunk holds a record of kind {kind} and {size} bytes that does not fit")
+        if (
+            size > len(data) - at
+            or kind not in (SCHEMA, CHANNEL, MESSAGE)
+            or (kind == MESSAGE and size < 22)
+        ):
+            raise Damaged(
+                f"a chunk holds a record of kind {kind} and {size} bytes that does not fit"
+            )
         yield kind, data[at : at + size]
         at += size
 
@@ -138,7 +167,9 @@ def unpacked(file: BinaryIO, record: Record, most: int = CHUNK_BYTES) -> bytes:
     """Content of a chunk, at most so many bytes, its size and checksum verified. Raises Damaged."""
     size, crc, compression, packed_at, packed_size = _chunk(file, record)
     if size > min(most, CHUNK_BYTES):
-        raise Damaged(f"byte {record.start}: a chunk claims {size} bytes, more than {min(most, CHUNK_BYTES)}")
+        raise Damaged(
+            f"byte {record.start}: a chunk claims {size} bytes, more than {min(most, CHUNK_BYTES)}"
+        )
     data = _at(file, packed_at, packed_size)
     try:
         if compression == b"lz4":
@@ -157,7 +188,9 @@ def unpacked(file: BinaryIO, record: Record, most: int = CHUNK_BYTES) -> bytes:
 
 
 def set_sums(path: str | Path) -> None:
-    """Fill in the checksums that rosbags leaves at zero: of each chunk, of the data and of the summary."""
+    """Fill in the checksums that rosbags leaves at zero: of each chunk, of the data and of the
+    summary.
+    """
     with open(path, "r+b") as file:
         last = _size(file)
         found = list(records(file, 8, last - 8))
@@ -169,7 +202,11 @@ def set_sums(path: str | Path) -> None:
                 _put(file, record.content, _sum(file, 0, record.start))
             elif record.kind == FOOTER:
                 (start,) = struct.unpack("<Q", _at(file, record.content, 8))
-                _put(file, record.content + 16, _sum(file, start or record.start, record.content + 16))
+                _put(
+                    file,
+                    record.content + 16,
+                    _sum(file, start or record.start, record.content + 16),
+                )
 
 
 def _chunk(file: BinaryIO, record: Record) -> tuple[int, int, bytes, int, int]:
@@ -178,7 +215,9 @@ def _chunk(file: BinaryIO, record: Record) -> tuple[int, int, bytes, int, int]:
         raise Damaged(f"byte {record.start}: a chunk has {record.size} bytes, too few")
     _, _, size, crc, length = struct.unpack("<QQQII", _at(file, record.content, 32))
     if length > record.size - 40:
-        raise Damaged(f"byte {record.start}: the compression of a chunk has a name of {length} bytes")
+        raise Damaged(
+            f"byte {record.start}: the compression of a chunk has a name of {length} bytes"
+        )
     name = _at(file, record.content + 32, length)
     (packed,) = struct.unpack("<Q", _at(file, record.content + 32 + length, 8))
     at = record.content + 40 + length
@@ -188,12 +227,16 @@ def _chunk(file: BinaryIO, record: Record) -> tuple[int, int, bytes, int, int]:
 
 
 def _described(file: BinaryIO, record: Record) -> tuple[int, bytes, int, int]:
-    """What an index must say of a chunk: (start, size of the record, compression, packed and unpacked size)."""
+    """What an index must say of a chunk: (start, size of the record, compression, packed and
+    unpacked size).
+    """
     size, _, compression, _, packed = _chunk(file, record)
     return record.end - record.start, compression, packed, size
 
 
-def _check_index(file: BinaryIO, record: Record, chunks: dict[int, tuple[int, bytes, int, int]]) -> None:
+def _check_index(
+    file: BinaryIO, record: Record, chunks: dict[int, tuple[int, bytes, int, int]]
+) -> None:
     """Raise Damaged unless a chunk index describes one of the chunks."""
     data = _at(file, record.content, record.size)
     try:
@@ -208,8 +251,9 @@ def _check_index(file: BinaryIO, record: Record, chunks: dict[int, tuple[int, by
 
 
 def _check_sum(file: BinaryIO, record: Record, starts: tuple[int, ...], last: int, at: int) -> None:
-    """Raise Damaged unless the checksum at `at` in a record is 0, none, or that of the file from one of the starts to
-    last."""
+    """Raise Damaged unless the checksum at `at` in a record is 0, none, or that of the file from
+    one of the starts to last.
+    """
     (stored,) = struct.unpack("<I", _at(file, record.content + at, 4))
     if stored and not any(_sum(file, first, last) == stored for first in starts if first <= last):
         raise Damaged(f"byte {record.start}: the checksum of the bytes before it is wrong")

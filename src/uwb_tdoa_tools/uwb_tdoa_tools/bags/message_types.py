@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from functools import cache, lru_cache
 import os
-from functools import lru_cache
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rosbags.interfaces import MessageDefinitionFormat, Nodetype
@@ -21,13 +21,26 @@ if TYPE_CHECKING:
 
 OUR_PACKAGE = "uwb_tdoa_msgs"
 OUR_TYPES = (
-    "Tdoa", "TdoaCorrected", "TdoaResidual", "Anchor", "AnchorArray", "EstimatorStatus",
-    *(of.message.rpartition("/")[2] for of in SENSORS.values() if of.message.startswith(OUR_PACKAGE)),
-)  # fmt: skip
-# Fields that our types were given since they were first recorded, the latest last, and what is meant where they lack.
+    "Tdoa",
+    "TdoaCorrected",
+    "TdoaResidual",
+    "Anchor",
+    "AnchorArray",
+    "EstimatorStatus",
+    *(
+        of.message.rpartition("/")[2]
+        for of in SENSORS.values()
+        if of.message.startswith(OUR_PACKAGE)
+    ),
+)
+# Fields that our types were given since they were first recorded, the latest last, and what is
+# meant where they lack.
 ADDED: dict[str, tuple[dict[str, Any], ...]] = {
     f"{OUR_PACKAGE}/msg/Tdoa": ({"variance": 0.0},),
-    f"{OUR_PACKAGE}/msg/TdoaCorrected": ({"variance": 0.0}, {"bias_slope": np.zeros(6), "bias_state": np.zeros(6)}),
+    f"{OUR_PACKAGE}/msg/TdoaCorrected": (
+        {"variance": 0.0},
+        {"bias_slope": np.zeros(6), "bias_state": np.zeros(6)},
+    ),
 }
 _SOURCE_TREE = Path(__file__).resolve().parents[3]  # where our packages lie side by side
 
@@ -42,7 +55,9 @@ def typestore() -> Typestore:
 
 
 def add_type(store: Typestore, msgtype: str) -> None:
-    """Make a type like "pkg/msg/Name" known to a store, with the types it is made of, from installed .msg files."""
+    """Make a type like "pkg/msg/Name" known to a store, with the types it is made of, from
+    installed .msg files.
+    """
     if msgtype in store.fielddefs:
         return
     types = get_types_from_msg(_definition(msgtype), msgtype)
@@ -60,18 +75,27 @@ def check_type(path: str | Path, connection: Connection) -> None:
     store = typestore()
     add_type(store, connection.msgtype)
     recorded = _recorded_hash(path, connection)
-    if recorded and recorded != store.hash_rihs01(connection.msgtype) and not earlier_types(path, connection):
+    if (
+        recorded
+        and recorded != store.hash_rihs01(connection.msgtype)
+        and not earlier_types(path, connection)
+    ):
         raise InputError(
-            f"{path}: {connection.topic} was recorded with another version of {connection.msgtype}; use the version of "
+            f"{path}: {connection.topic} was recorded with another version of "
+            f"{connection.msgtype}; use the version of "
             "this software that recorded it."
         )
 
 
 def earlier_types(path: str | Path, connection: Connection) -> Typestore | None:
-    """The types as of when a topic was recorded, if its type has been ADDED fields since; None if not. Raises InputError."""
+    """The types as of when a topic was recorded, if its type has been ADDED fields since; None if
+    not. Raises InputError.
+    """
     versions = _earlier(connection.msgtype)
     recorded = _recorded_hash(path, connection) if versions else None
-    return next((store for store in versions if store.hash_rihs01(connection.msgtype) == recorded), None)
+    return next(
+        (store for store in versions if store.hash_rihs01(connection.msgtype) == recorded), None
+    )
 
 
 def upgraded(data: bytes, msgtype: str, store: Typestore) -> bytes:
@@ -81,34 +105,48 @@ def upgraded(data: bytes, msgtype: str, store: Typestore) -> bytes:
     for fields in ADDED[msgtype]:
         defaults |= fields
     known = {name: getattr(message, name) for name, _ in store.fielddefs[msgtype][1]}
-    return bytes(typestore().serialize_cdr(typestore().types[msgtype](**{**defaults, **known}), msgtype))
+    return bytes(
+        typestore().serialize_cdr(typestore().types[msgtype](**{**defaults, **known}), msgtype)
+    )
 
 
-@lru_cache(maxsize=None)
+@cache
 def _earlier(msgtype: str) -> tuple[Typestore, ...]:
     """The types as before each addition of fields to one of them: tuple of stores."""
     out, added = [], ADDED.get(msgtype, ())
     for k in range(len(added)):
-        lacking, store = {name for fields in added[k:] for name in fields}, get_typestore(Stores.ROS2_JAZZY)
+        lacking, store = (
+            {name for fields in added[k:] for name in fields},
+            get_typestore(Stores.ROS2_JAZZY),
+        )
         constants, fields = typestore().fielddefs[msgtype]
-        store.register({msgtype: (constants, [field for field in fields if field[0] not in lacking])})
+        store.register(
+            {msgtype: (constants, [field for field in fields if field[0] not in lacking])}
+        )
         out.append(store)
     return tuple(out)
 
 
 def _recorded_hash(path: str | Path, connection: Connection) -> str:
-    """Hash of the type that a topic was recorded with; empty where the bag does not say. Raises InputError."""
+    """Hash of the type that a topic was recorded with; empty where the bag does not say.
+
+    Raises InputError.
+    """
     recorded = connection.digest
-    if not recorded and connection.msgdef.format == MessageDefinitionFormat.MSG:  # a data file without metadata.yaml
+    if (
+        not recorded and connection.msgdef.format == MessageDefinitionFormat.MSG
+    ):  # a data file without metadata.yaml
         if len(connection.msgdef.data) > DEFINITION_BYTES:
             raise InputError(
-                f"{path}: the definition of {connection.msgtype} in the bag has more than {DEFINITION_BYTES} bytes; record it again."
+                f"{path}: the definition of {connection.msgtype} in the bag has more than "
+                f"{DEFINITION_BYTES} bytes; record it again."
             )
         try:
             recorded = _hash_of(connection.msgdef.data, connection.msgtype)
         except Exception as error:  # rosbags raises whatever its parsers run into
             raise InputError(
-                f"{path}: the definition of {connection.msgtype} in the bag cannot be read ({error!r}); record it again."
+                f"{path}: the definition of {connection.msgtype} in the bag cannot be read "
+                f"({error!r}); record it again."
             ) from error
     return recorded
 
@@ -124,10 +162,15 @@ def _hash_of(definition: str, msgtype: str) -> str:
 def _definition(msgtype: str) -> str:
     package, _, name = msgtype.split("/")
     prefixes = [
-        Path(prefix) / "share" for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if prefix
+        Path(prefix) / "share"
+        for prefix in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)
+        if prefix
     ]
     for share in [*prefixes, _SOURCE_TREE]:
         file = share / package / "msg" / f"{name}.msg"
         if file.is_file():
             return file.read_text(encoding="utf-8")
-    raise InputError(f"{msgtype}: its definition is not installed; build and source the workspace that has {package}.")
+    raise InputError(
+        f"{msgtype}: its definition is not installed; build and source the workspace that has "
+        f"{package}."
+    )

@@ -1,15 +1,15 @@
 """The arrays of a Flight as ROS messages (of a rosbags typestore), and back.
 
-`sound`, or `<stream>_sound`, tells which numbers of rows (n, k) may be there: (n, k) bool.
-What was not measured is marked as the messages say: an orientation of (0, 0, 0, 0), an orientation_covariance[0] of -1,
-covariances of 0 for unknown.
+`sound`, or `<stream>_sound`, tells which numbers of rows (n, k) may be there: (n, k) bool. What was
+not measured is marked as the messages say: an orientation of (0, 0, 0, 0), an
+orientation_covariance[0] of -1, covariances of 0 for unknown.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import reduce
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rosbags.interfaces import Nodetype
@@ -22,7 +22,9 @@ from uwb_tdoa_ekf.frames import pose_and_twist
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
+
     from rosbags.typesys.store import Typestore
+
     from uwb_tdoa_bias.foundation.anchors import Anchors
     from uwb_tdoa_ekf.results import Odometry
 
@@ -35,15 +37,23 @@ BODY_FRAME, ANTENNA_FRAME = "base_link", "uwb_antenna"
 
 
 def nanoseconds(name: str, t: np.ndarray) -> np.ndarray:
-    """(n,) int stamps of (n,) s; raises InputError, with the name of the stream, for what a ROS stamp cannot hold."""
+    """(n,) int stamps of (n,) s; raises InputError, with the name of the stream, for what a ROS
+    stamp cannot hold.
+    """
     bad = np.flatnonzero(~((t >= 0) & (t < 2**31)))
     if len(bad):
-        raise InputError(f"{name}: stamp {bad[0]} is {t[bad[0]]} s; ROS stamps are 0 s to 2^31 s: shift the clock.")
+        raise InputError(
+            f"{name}: stamp {bad[0]} is {t[bad[0]]} s; ROS stamps are 0 s to 2^31 s: shift "
+            "the clock."
+        )
     return np.rint(np.asarray(t, dtype=float) * 1e9).astype(np.int64)
 
 
 def stamp_of(header: Any) -> int:
-    """Nanoseconds of a header's stamp. (Dividing them by 1e9 gives back the very float that was written.)"""
+    """Nanoseconds of a header's stamp.
+
+    (Dividing them by 1e9 gives back the very float that was written.)
+    """
     return header.stamp.sec * 10**9 + header.stamp.nanosec
 
 
@@ -58,9 +68,16 @@ def imu_messages(imu: Imu, store: Typestore) -> Iterator[tuple[int, Any]]:
     no_orientation = store.types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 0.0)
     unknown, none = np.zeros(9), np.zeros(9)
     none[0] = -1.0
-    for stamp, rate, force in zip(nanoseconds("imu", imu.t).tolist(), imu.gyro.tolist(), imu.accel.tolist()):
+    for stamp, rate, force in zip(
+        nanoseconds("imu", imu.t).tolist(), imu.gyro.tolist(), imu.accel.tolist()
+    ):
         header = header_of(store, stamp, BODY_FRAME)
-        yield stamp, Message(header, no_orientation, none, Vector3(*rate), unknown, Vector3(*force), unknown)
+        yield (
+            stamp,
+            Message(
+                header, no_orientation, none, Vector3(*rate), unknown, Vector3(*force), unknown
+            ),
+        )
 
 
 def imu_row(message: Any) -> tuple[float, ...]:
@@ -76,7 +93,10 @@ def imu_of(stamps: np.ndarray, rows: np.ndarray) -> Imu:
 
 def sensor_messages(sensor: Sensor, stream: Stream, store: Typestore) -> Iterator[tuple[int, Any]]:
     """Yield (stamp ns, message) of the Stream of a Sensor; what it says nothing of is 0."""
-    content = {field: np.broadcast_to(values, (len(stream), *np.shape(values)[1:])) for field, values in sensor.content(stream).items()}
+    content = {
+        field: np.broadcast_to(values, (len(stream), *np.shape(values)[1:]))
+        for field, values in sensor.content(stream).items()
+    }
     for k, stamp in enumerate(nanoseconds(sensor.name, stream.t).tolist()):
         message = _blank(store, sensor.message)
         message.header = header_of(store, stamp, BODY_FRAME)
@@ -110,11 +130,15 @@ def _set(holder: object, name: str, value: np.ndarray) -> None:
 
 
 def of_sensor(sensor: Sensor) -> tuple[RowOfMessage, StreamOfRows, Sound]:
-    """(row of a message, Stream of stamps and rows, which numbers of rows may be there), as `read_bag` takes them, of a Sensor."""
+    """(row of a message, Stream of stamps and rows, which numbers of rows may be there), as
+    `read_bag` takes them, of a Sensor.
+    """
 
     def row(message: Any) -> tuple[float, ...]:
         return stamp_of(message.header), *(
-            number for field in sensor.fields for number in _numbers(reduce(getattr, field.split("."), message))
+            number
+            for field in sensor.fields
+            for number in _numbers(reduce(getattr, field.split("."), message))
         )
 
     def sound_ones(rows: np.ndarray) -> np.ndarray:
@@ -127,8 +151,12 @@ def _numbers(value: Any) -> Iterable[float]:
     return _point(value) if hasattr(value, "x") else np.ravel(value).tolist()
 
 
-def tdoa_messages(tdoa: Tdoas, store: Typestore, antenna: Sequence[float] | None = None) -> Iterator[tuple[int, Any]]:
-    """Yield (stamp ns, uwb_tdoa_msgs/Tdoa). antenna : where it is on the body, see `transforms_message`."""
+def tdoa_messages(
+    tdoa: Tdoas, store: Typestore, antenna: Sequence[float] | None = None
+) -> Iterator[tuple[int, Any]]:
+    """Yield (stamp ns, uwb_tdoa_msgs/Tdoa). antenna : where it is on the body, see
+    `transforms_message`.
+    """
     Message, frame = store.types["uwb_tdoa_msgs/msg/Tdoa"], ANTENNA_FRAME if antenna else BODY_FRAME
     columns = (nanoseconds("tdoa", tdoa.t), tdoa.a, tdoa.b, tdoa.d, tdoa.variance)
     for stamp, *values in zip(*(column.tolist() for column in columns)):
@@ -137,29 +165,45 @@ def tdoa_messages(tdoa: Tdoas, store: Typestore, antenna: Sequence[float] | None
 
 def tdoa_row(message: Any) -> tuple[float, ...]:
     """Of a uwb_tdoa_msgs/Tdoa: its stamp, ns, ids a and b, d_ab, m, and variance, m^2."""
-    return stamp_of(message.header), message.anchor_a, message.anchor_b, message.distance_difference, message.variance
+    return (
+        stamp_of(message.header),
+        message.anchor_a,
+        message.anchor_b,
+        message.distance_difference,
+        message.variance,
+    )
 
 
 def tdoas_of(stamps: np.ndarray, rows: np.ndarray) -> Tdoas:
     """The Tdoas of stamps (n,) s and rows (n, 4), of `tdoa_row` without the stamp."""
-    return Tdoas(stamps, rows[:, 0].astype(np.int64), rows[:, 1].astype(np.int64), rows[:, 2], rows[:, 3])
+    return Tdoas(
+        stamps, rows[:, 0].astype(np.int64), rows[:, 1].astype(np.int64), rows[:, 2], rows[:, 3]
+    )
 
 
 def pose_messages(truth: Truth, frame: str, store: Typestore) -> Iterator[tuple[int, Any]]:
     """Yield (stamp ns, geometry_msgs/PoseStamped)."""
     Message = store.types["geometry_msgs/msg/PoseStamped"]
     q_or_zero = np.where(np.isfinite(truth.q), truth.q, 0.0)
-    for stamp, p, q in zip(nanoseconds("truth", truth.t).tolist(), truth.p.tolist(), q_or_zero.tolist()):
+    for stamp, p, q in zip(
+        nanoseconds("truth", truth.t).tolist(), truth.p.tolist(), q_or_zero.tolist()
+    ):
         yield stamp, Message(header_of(store, stamp, frame), pose_of(store, p, q))
 
 
 def pose_row(message: Any) -> tuple[float, ...]:
     """Of a geometry_msgs/PoseStamped: its stamp, ns, position (3), m, and quaternion x y z w."""
-    return stamp_of(message.header), *_point(message.pose.position), *_quaternion(message.pose.orientation)
+    return (
+        stamp_of(message.header),
+        *_point(message.pose.position),
+        *_quaternion(message.pose.orientation),
+    )
 
 
 def truth_of(stamps: np.ndarray, rows: np.ndarray) -> Truth:
-    """The Truth of stamps (n,) s and rows (n, 7), of `pose_row` without the stamp; a quaternion of zeros is none."""
+    """The Truth of stamps (n,) s and rows (n, 7), of `pose_row` without the stamp; a quaternion of
+    zeros is none.
+    """
     q = rows[:, 3:7]
     return Truth(stamps, rows[:, 0:3], np.where((q == 0).all(axis=1, keepdims=True), np.nan, q))
 
@@ -170,23 +214,32 @@ def anchors_message(anchors: Anchors, stamp: int, store: Typestore) -> tuple[int
     q_or_zero = np.where(np.isfinite(anchors.orientations), anchors.orientations, 0.0)
     array = [
         Anchor(number, pose_of(store, p, q))
-        for number, p, q in zip(anchors.ids.tolist(), anchors.positions.tolist(), q_or_zero.tolist())
+        for number, p, q in zip(
+            anchors.ids.tolist(), anchors.positions.tolist(), q_or_zero.tolist()
+        )
     ]
-    return stamp, store.types["uwb_tdoa_msgs/msg/AnchorArray"](header_of(store, stamp, anchors.frame), array)
+    return stamp, store.types["uwb_tdoa_msgs/msg/AnchorArray"](
+        header_of(store, stamp, anchors.frame), array
+    )
 
 
 def transforms_message(
     anchors: Anchors, stamp: int, store: Typestore, antenna: Sequence[float] | None = None
 ) -> tuple[int, Any]:
-    """(stamp ns, tf2_msgs/TFMessage) with the anchors as frames anchor_<id>, and the antenna, (3,) m in the body frame.
+    """(stamp ns, tf2_msgs/TFMessage) with the anchors as frames anchor_<id>, and the antenna, (3,)
+    m in the body frame.
 
     An unknown orientation is the identity here: tf has no word for "not known".
     """
     types = store.types
-    q_or_identity = np.where(np.isfinite(anchors.orientations), anchors.orientations, [0.0, 0.0, 0.0, 1.0])
+    q_or_identity = np.where(
+        np.isfinite(anchors.orientations), anchors.orientations, [0.0, 0.0, 0.0, 1.0]
+    )
     frames = [
         (anchors.frame, f"anchor_{number}", p, q)
-        for number, p, q in zip(anchors.ids.tolist(), anchors.positions.tolist(), q_or_identity.tolist())
+        for number, p, q in zip(
+            anchors.ids.tolist(), anchors.positions.tolist(), q_or_identity.tolist()
+        )
     ]
     if antenna:
         frames.append((BODY_FRAME, ANTENNA_FRAME, antenna, (0.0, 0.0, 0.0, 1.0)))
@@ -203,17 +256,27 @@ def transforms_message(
     return stamp, types["tf2_msgs/msg/TFMessage"](transforms)
 
 
-def odometry_messages(odometry: Odometry, frame: str, store: Typestore) -> Iterator[tuple[int, Any]]:
-    """Yield (stamp ns, nav_msgs/Odometry) of an Odometry: its twist is in the body frame, and rates are not known."""
+def odometry_messages(
+    odometry: Odometry, frame: str, store: Typestore
+) -> Iterator[tuple[int, Any]]:
+    """Yield (stamp ns, nav_msgs/Odometry) of an Odometry: its twist is in the body frame, and rates
+    are not known.
+    """
     types = store.types
     Message, Vector3 = types["nav_msgs/msg/Odometry"], types["geometry_msgs/msg/Vector3"]
-    Pose, Twist = types["geometry_msgs/msg/PoseWithCovariance"], types["geometry_msgs/msg/TwistWithCovariance"]
+    Pose, Twist = (
+        types["geometry_msgs/msg/PoseWithCovariance"],
+        types["geometry_msgs/msg/TwistWithCovariance"],
+    )
     n = len(odometry)
     numbers = pose_and_twist(odometry, np.full((n, 3), np.nan), np.full(n, np.nan))
     for stamp, of_pose, of_twist in zip(nanoseconds("odometry", odometry.t).tolist(), *numbers):
         twist = types["geometry_msgs/msg/Twist"](Vector3(*of_twist[:3]), Vector3(*of_twist[3:6]))
         pose = Pose(pose_of(store, of_pose[:3], of_pose[3:7]), of_pose[7:])
-        yield stamp, Message(header_of(store, stamp, frame), BODY_FRAME, pose, Twist(twist, of_twist[6:]))
+        yield (
+            stamp,
+            Message(header_of(store, stamp, frame), BODY_FRAME, pose, Twist(twist, of_twist[6:])),
+        )
 
 
 def odometry_row(message: Any) -> tuple[float, ...]:
@@ -233,7 +296,9 @@ def header_of(store: Typestore, stamp: int, frame: str) -> Any:
     return store.types["std_msgs/msg/Header"](time, frame)
 
 
-def pose_of(store: Typestore, p: Sequence[float] | np.ndarray, q: Sequence[float] = (0.0, 0.0, 0.0, 1.0)) -> Any:
+def pose_of(
+    store: Typestore, p: Sequence[float] | np.ndarray, q: Sequence[float] = (0.0, 0.0, 0.0, 1.0)
+) -> Any:
     """geometry_msgs/Pose of p (3,) m and q x y z w."""
     types = store.types
     return types["geometry_msgs/msg/Pose"](

@@ -1,4 +1,6 @@
-"""Sensors that are not in the frame of the body: where /tf_static of a bag places them, taken as the nodes take it."""
+"""Sensors that are not in the frame of the body: where /tf_static of a bag places them, taken as
+the nodes take it.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +19,9 @@ from .messages import BODY_FRAME
 if TYPE_CHECKING:
     from collections import Counter
     from pathlib import Path
+
     from scipy.spatial.transform import Rotation
+
     from .files import BagReader
 
     Place = tuple[Rotation, np.ndarray]  # of a sensor in the body: its turn, and its arm (3,) m
@@ -33,7 +37,11 @@ def is_body(frame: str) -> bool:
 def read_frames(path: str | Path, reader: BagReader) -> Frames:
     """Frames of all messages on /tf_static of an open bag. Raises InputError."""
     frames = Frames()
-    connections = [c for c in reader.connections if c.topic == TF_STATIC and c.msgtype == "tf2_msgs/msg/TFMessage"]
+    connections = [
+        c
+        for c in reader.connections
+        if c.topic == TF_STATIC and c.msgtype == "tf2_msgs/msg/TFMessage"
+    ]
     for connection in connections:
         check_type(path, connection)
     for _, _, message in readable(path, reader, connections):
@@ -46,7 +54,9 @@ def read_frames(path: str | Path, reader: BagReader) -> Frames:
 
 
 def place_of(frames: Frames, frame: str) -> Place | None:
-    """(Rotation, arm (3,) m) of a sensor's frame in the body: of the same robot, or of the only one; None if not known."""
+    """(Rotation, arm (3,) m) of a sensor's frame in the body: of the same robot, or of the only
+    one; None if not known.
+    """
     robot = frame.lstrip("/").rpartition("/")[0]
     for body in ([f"{robot}/{BODY_FRAME}"] if robot else []) + [BODY_FRAME]:
         if place := frames.between(body, frame.lstrip("/")):
@@ -55,20 +65,41 @@ def place_of(frames: Frames, frame: str) -> Place | None:
 
 
 def imu_in_body(imu: Imu, place: Place) -> Imu:
-    """The Imu with the samples of one that is at a place (see `place_of`), in the origin of the body."""
+    """The Imu with the samples of one that is at a place (see `place_of`), in the origin of the
+    body.
+    """
     return Imu(imu.t, *ImuMount(*place).in_body(imu.t, imu.gyro, imu.accel))
 
 
 def placed(frames: Frames, topic: str, counts: Counter[str]) -> tuple[Place | None, str | None]:
-    """(place or None, remark or None) of the one frame that the messages of a topic have. counts : {frame_id: messages}. A place
-    changes the result, so it is remarked on, too."""
+    """(place or None, remark or None) of the one frame that the messages of a topic have. counts :
+    {frame_id: messages}. A place changes the result, so it is remarked on, too.
+    """
     others = sorted(frame for frame in counts if not is_body(frame))
     if not others:
         return None, None
     if len(counts) > 1:
-        return None, f"{topic} comes in several frames ({', '.join(sorted(counts))}): taken as {BODY_FRAME}."
+        return (
+            None,
+            (
+                f"{topic} comes in several frames ({', '.join(sorted(counts))}): taken as "
+                f"{BODY_FRAME}."
+            ),
+        )
     place = place_of(frames, others[0])
     if place is None:
-        return None, f"{topic} is in frame '{others[0]}', which {TF_STATIC} does not connect with '{BODY_FRAME}': taken as that."
+        return (
+            None,
+            (
+                f"{topic} is in frame '{others[0]}', which {TF_STATIC} does not connect with "
+                f"'{BODY_FRAME}': taken as that."
+            ),
+        )
     at = ", ".join(f"{value:.3f}" for value in place[1])
-    return place, f"{topic} is taken from frame '{others[0]}', which {TF_STATIC} places at ({at}) m in '{BODY_FRAME}'."
+    return (
+        place,
+        (
+            f"{topic} is taken from frame '{others[0]}', which {TF_STATIC} places at ({at}) m in "
+            f"'{BODY_FRAME}'."
+        ),
+    )

@@ -8,7 +8,12 @@ import sqlite3
 import struct
 from typing import TYPE_CHECKING
 
-from rosbags.interfaces import Connection, ConnectionExtRosbag2, MessageDefinition, MessageDefinitionFormat
+from rosbags.interfaces import (
+    Connection,
+    ConnectionExtRosbag2,
+    MessageDefinition,
+    MessageDefinitionFormat,
+)
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from uwb_tdoa_bias.foundation.errors import InputError
@@ -26,8 +31,10 @@ _FORMATS = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinition
 
 
 def salvage(path: str | Path, out: str | Path) -> list[str]:
-    """Write what is sound of a bag (directory or data file, with or without metadata.yaml) to a new bag `out`, without
-    topics of types that are not installed. Returns remarks on what is missing, list of sentences. Raises InputError."""
+    """Write what is sound of a bag (directory or data file, with or without metadata.yaml) to a new
+    bag `out`, without topics of types that are not installed. Returns remarks on what is missing,
+    list of sentences. Raises InputError.
+    """
     path = Path(path)
     remarks: list[str] = []
     connections: dict[tuple[str, str], Connection | None] = {}
@@ -36,17 +43,26 @@ def salvage(path: str | Path, out: str | Path) -> list[str]:
         for file in files:
             count, lost, damage = _copy(path, file, writer, connections)
             if lost:
-                remarks.append(f"{file.name}: {' and '.join(f'{n} {what}' for what, n in lost.items())} cannot be read: left out.")
+                remarks.append(
+                    f"{file.name}: {' and '.join(f'{n} {what}' for what, n in lost.items())} "
+                    "cannot be read: left out."
+                )
             if damage:
-                remarks.append(f"{file.name} is cut or damaged ({damage}): read up to there, {count} messages.")
+                remarks.append(
+                    f"{file.name} is cut or damaged ({damage}): read up to there, {count} messages."
+                )
         if not any(connections.values()):
-            raise InputError(f"{path}: holds no message that can be read; copy it again, or record it again.")
+            raise InputError(
+                f"{path}: holds no message that can be read; copy it again, or record it again."
+            )
     return remarks
 
 
 def _files(path: Path, remarks: list[str]) -> list[Path]:
     try:
-        return [file for file in integrity.data_files(path, integrity.metadata(path)) if file.is_file()]
+        return [
+            file for file in integrity.data_files(path, integrity.metadata(path)) if file.is_file()
+        ]
     except (Damaged, InputError) as error:
         remarks.append(f"metadata.yaml is of no use ({error}): read without it.")
         return sorted([*path.glob("*.mcap"), *path.glob("*.db3")])
@@ -55,8 +71,10 @@ def _files(path: Path, remarks: list[str]) -> list[Path]:
 def _copy(
     path: Path, file: Path, writer: Writer, connections: dict[tuple[str, str], Connection | None]
 ) -> tuple[int, Counter[str], str | None]:
-    """Copy the messages of a data file. Returns (how many, {what cannot be read: how often}, where they end, as text, or None).
-    connections : {(topic, type): Connection of the writer, or None}."""
+    """Copy the messages of a data file. Returns (how many, {what cannot be read: how often}, where
+    they end, as text, or None).
+    connections : {(topic, type): Connection of the writer, or None}.
+    """
     count = 0
     lost: Counter[str] = Counter()
     try:
@@ -80,8 +98,9 @@ def _copy(
 
 
 def as_written(file: Path, lost: Counter[str]) -> Iterator[tuple[Connection, int, bytes]]:
-    """Yield (connection, stamp ns, bytes) of the messages of a data file in the order in which they were written; lost : {what cannot be
-    read: how often}, counted. Raises Damaged where they end."""
+    """Yield (connection, stamp ns, bytes) of the messages of a data file in the order in which they
+    were written; lost : {what cannot be read: how often}, counted. Raises Damaged where they end.
+    """
     return (_from_mcap if integrity.is_mcap(file) else _from_sqlite)(file, lost)
 
 
@@ -125,13 +144,20 @@ def _from_sqlite(file: Path, lost: Counter[str]) -> Iterator[tuple[Connection, i
     try:
         definitions = _definitions(connection)
         for number, topic, msgtype in connection.execute("SELECT id, name, type FROM topics"):
-            topics[number] = _channel(number, str(topic), str(msgtype), *definitions.get(msgtype, ("", "")))
+            topics[number] = _channel(
+                number, str(topic), str(msgtype), *definitions.get(msgtype, ("", ""))
+            )
     except (sqlite3.Error, UnicodeDecodeError) as error:
         raise integrity.damage(error) from error
     finally:
         connection.close()
     for _, topic, stamp, data in integrity.sqlite_messages(file):
-        if topic not in topics or type(stamp) is not int or type(data) is not bytes or not 0 <= stamp < LATEST:
+        if (
+            topic not in topics
+            or type(stamp) is not int
+            or type(data) is not bytes
+            or not 0 <= stamp < LATEST
+        ):
             lost[MESSAGES] += 1
             continue
         yield topics[topic], stamp, data
@@ -141,7 +167,10 @@ def _definitions(connection: sqlite3.Connection) -> dict[str, tuple[str, str]]:
     """{type: (encoding, text)}; rosbag2 writes them since ROS 2 Iron."""
     query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
     try:
-        return {msgtype: (str(encoding), str(text)) for msgtype, encoding, text in connection.execute(query)}
+        return {
+            msgtype: (str(encoding), str(text))
+            for msgtype, encoding, text in connection.execute(query)
+        }
     except sqlite3.OperationalError:  # no such table
         return {}
 
@@ -160,4 +189,6 @@ def _texts(content: bytes, at: int, count: int) -> list[str]:
 
 def _channel(number: int, topic: str, msgtype: str, encoding: str, definition: str) -> Connection:
     described = MessageDefinition(_FORMATS.get(encoding, MessageDefinitionFormat.NONE), definition)
-    return Connection(number, topic, msgtype, described, "", 0, ConnectionExtRosbag2("cdr", []), None)
+    return Connection(
+        number, topic, msgtype, described, "", 0, ConnectionExtRosbag2("cdr", []), None
+    )

@@ -1,4 +1,6 @@
-"""SQLite files that the recorder did not close: what their -wal file holds is not yet in the file itself (sqlite.org/walformat.html)."""
+"""SQLite files that the recorder did not close: what their -wal file holds is not yet in the file
+itself (sqlite.org/walformat.html).
+"""
 
 from __future__ import annotations
 
@@ -25,24 +27,34 @@ def unclosed(path: Path) -> list[Path]:
 
 
 def check_no_journal(path: Path) -> None:
-    """Raise Damaged if a file of a bag has a transaction that was begun and neither finished nor undone."""
+    """Raise Damaged if a file of a bag has a transaction that was begun and neither finished nor
+    undone.
+    """
     for file in [path] if path.is_file() else sorted(path.glob("*.db3")):
         journal = _beside(file, JOURNAL)
         if journal.is_file():
             with journal.open("rb") as opened:
                 if opened.read(len(_HOT)) == _HOT:
-                    raise Damaged(f"{journal.name} holds a transaction that was not finished: the recorder was ended while it wrote")
+                    raise Damaged(
+                        f"{journal.name} holds a transaction that was not finished: the "
+                        "recorder was ended while it wrote"
+                    )
 
 
 def closed(path: Path, folder: Path) -> tuple[Path, str]:
-    """(path of a copy of a bag, in a folder, whose files hold what their logs hold; what of the logs cannot be read, "" for nothing).
+    """(path of a copy of a bag, in a folder, whose files hold what their logs hold; what of the
+    logs cannot be read, "" for nothing).
 
     path : a bag with `unclosed` files; nothing is changed there. Raises Damaged.
     """
     whole = folder / path.name
     if path.is_dir():
         whole.mkdir()
-        for file in (one for one in path.iterdir() if one.is_file() and not one.name.endswith((INDEX, JOURNAL))):
+        for file in (
+            one
+            for one in path.iterdir()
+            if one.is_file() and not one.name.endswith((INDEX, JOURNAL))
+        ):
             shutil.copyfile(file, whole / file.name)  # without its permissions: we write to it
     else:
         shutil.copyfile(path, whole)
@@ -52,15 +64,23 @@ def closed(path: Path, folder: Path) -> tuple[Path, str]:
 
 
 def _merge(file: Path) -> str:
-    """Put what is sound of the log of a file into the file. Returns what cannot be read, "" for nothing. Raises Damaged."""
+    """Put what is sound of the log of a file into the file.
+
+    Returns what cannot be read, "" for nothing. Raises Damaged.
+    """
     log = _beside(file, LOG)
     size, commits = file.stat().st_size + log.stat().st_size, _commits(log)
     try:
         connection = sqlite3.connect(file, isolation_level=None)
         try:
-            (pages,), (of_page,) = (connection.execute(f"PRAGMA {what}").fetchone() for what in ("page_count", "page_size"))
+            (pages,), (of_page,) = (
+                connection.execute(f"PRAGMA {what}").fetchone()
+                for what in ("page_count", "page_size")
+            )
             if pages * of_page > size:  # SQLite would make a file of that size
-                raise Damaged(f"{log.name} claims {pages} pages of {of_page} bytes, more than there are")
+                raise Damaged(
+                    f"{log.name} claims {pages} pages of {of_page} bytes, more than there are"
+                )
             _, frames, merged = connection.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone()
             if merged < frames:
                 raise Damaged(f"{log.name}: {frames - merged} of {frames} frames cannot be merged")
@@ -85,7 +105,9 @@ def _commits(log: Path) -> list[int]:
         for number in range(1, frames + 1):
             file.seek(_HEAD + (number - 1) * (_FRAME_HEAD + of_page))
             frame = file.read(_FRAME_HEAD)
-            if frame[8:16] == salt and frame[4:8] != bytes(4):  # others are of a log that was used up before
+            if frame[8:16] == salt and frame[4:8] != bytes(
+                4
+            ):  # others are of a log that was used up before
                 found.append(number)
     return found
 

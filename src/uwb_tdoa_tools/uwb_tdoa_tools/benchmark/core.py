@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from .flights import make_flight
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
+
     from uwb_tdoa_bias.foundation.flight import Flight
     from uwb_tdoa_ekf.core.memory import FilterState
 
@@ -33,8 +34,9 @@ SECTION = "compiled core, one core"
 def measure(progress: Callable[[str], object], quick: bool = False) -> Iterator[Figure]:
     """Generator of Figures. progress(text) : called with what comes next.
 
-    Each pair of figures comes from the same stretch of a flight, run from the same state: with its inertial samples
-    alone, and with TDOAs at the stamps of inertial samples, so that the difference is their updates and nothing else.
+    Each pair of figures comes from the same stretch of a flight, run from the same state: with its
+    inertial samples alone, and with TDOAs at the stamps of inertial samples, so that the difference
+    is their updates and nothing else.
     """
     repeats = 9 if quick else 41
     for anchors in ANCHORS[1:2] if quick else ANCHORS:
@@ -45,7 +47,9 @@ def measure(progress: Callable[[str], object], quick: bool = False) -> Iterator[
         progress(f"core, {robust}")
         yield from _pair(f"8 anchors, {robust}", 8, robust, 1, repeats)
     progress("core, yaw unknown")
-    yield from _pair(f"8 anchors, {ROBUST[0]}, while {YAWS} yaws are followed", 8, ROBUST[0], YAWS, repeats)
+    yield from _pair(
+        f"8 anchors, {ROBUST[0]}, while {YAWS} yaws are followed", 8, ROBUST[0], YAWS, repeats
+    )
     for aid in NOISES:
         progress(f"core, {aid}")
         yield Figure.of(SECTION, f"one {aid}", "us", per_aid(aid, repeats), OF_AID)
@@ -60,14 +64,18 @@ def _pair(
     yield Figure.of(SECTION, f"both, {name}", "us", prediction + update, target)
 
 
-def per_event(anchors: int, robust: str, hypotheses: int, repeats: int) -> tuple[np.ndarray, np.ndarray]:
+def per_event(
+    anchors: int, robust: str, hypotheses: int, repeats: int
+) -> tuple[np.ndarray, np.ndarray]:
     """us per prediction and per update, two (repeats,) arrays, while 1 or YAWS yaws are followed."""
     # A tag that hovers tells nothing about its yaw.
     trajectory = "hover" if hypotheses > 1 else "sines"
     path: dict[str, Any] = {"trajectory": trajectory, "start_in_air": True, "multipath": False}
     flight = make_flight(BEFORE + MEASURED, anchors, **path)
     config = FilterConfig(
-        robust=robust, initial_yaw_std=FilterConfig.initial_yaw_std if hypotheses > 1 else 0.5, odometry_rate=RARELY
+        robust=robust,
+        initial_yaw_std=FilterConfig.initial_yaw_std if hypotheses > 1 else 0.5,
+        odometry_rate=RARELY,
     )
     core = Core(flight, config)
     core.start()
@@ -90,7 +98,9 @@ def per_aid(aid: str, repeats: int) -> np.ndarray:
 
 
 def sample_before(stamps: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """The last of some stamps (m,), rising, that is no later than each of t (n,), or the first of all: (n,)."""
+    """The last of some stamps (m,), rising, that is no later than each of t (n,), or the first of
+    all: (n,).
+    """
     return stamps[np.maximum(np.searchsorted(stamps, t, side="right") - 1, 0)]
 
 
@@ -112,7 +122,10 @@ class Core:
         self._begin = imu.t[0]
 
     def start(self) -> None:
-        """Feed what comes BEFORE; what is measured is the rest. Raises RuntimeError if the filter does not run by then."""
+        """Feed what comes BEFORE; what is measured is the rest.
+
+        Raises RuntimeError if the filter does not run by then.
+        """
         streams = self._imu, self._tdoa, self._aids
         ends = [int(np.searchsorted(stream["t"], self._begin + BEFORE)) for stream in streams]
         self._feed(self.state, *(stream[:end] for stream, end in zip(streams, ends)))
@@ -122,10 +135,15 @@ class Core:
         self.samples, self.tdoas, self.aids = len(self._imu), len(self._tdoa), len(self._aids)
 
     def timed(self, tdoa: bool, aids: bool = False) -> float:
-        """s that the rest takes, with or without its TDOAs, and its heights, pressures and velocities."""
+        """s that the rest takes, with or without its TDOAs, and its heights, pressures and
+        velocities.
+        """
         self.last = self.state.copy()
         return self._feed(
-            self.last, self._imu, self._tdoa if tdoa else self._tdoa[:0], self._aids if aids else self._aids[:0]
+            self.last,
+            self._imu,
+            self._tdoa if tdoa else self._tdoa[:0],
+            self._aids if aids else self._aids[:0],
         )
 
     def _feed(self, state: FilterState, *measured: np.ndarray) -> float:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from .. import json_values
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
+
     from numpy.typing import ArrayLike
 
 HEADER = ("", "median", "quartiles", "unit", "target")
@@ -20,7 +21,8 @@ HEADER = ("", "median", "quartiles", "unit", "target")
 class Figure:
     """One line of the table: the median of repeated measurements and their quartiles, in `unit`.
 
-    section, name : unique together; count : of the measurements; target : upper limit in the same unit, or None.
+    section, name : unique together; count : of the measurements; target : upper limit in the same
+        unit, or None.
     """
 
     section: str
@@ -33,12 +35,16 @@ class Figure:
     target: float | None = None
 
     @classmethod
-    def of(cls, section: str, name: str, unit: str, values: ArrayLike, target: float | None = None) -> Figure:
+    def of(
+        cls, section: str, name: str, unit: str, values: ArrayLike, target: float | None = None
+    ) -> Figure:
         """From repeated measurements, a number or (n,) of them; NaN where there is none."""
         numbers = np.atleast_1d(np.asarray(values, dtype=float))
         numbers = numbers[np.isfinite(numbers)]
         low, median, high = np.percentile(numbers, [25, 50, 75]) if len(numbers) else (np.nan,) * 3
-        return cls(section, name, unit, float(median), float(low), float(high), len(numbers), target)
+        return cls(
+            section, name, unit, float(median), float(low), float(high), len(numbers), target
+        )
 
     @property
     def met(self) -> bool | None:
@@ -80,6 +86,7 @@ def _number(value: float) -> str:
 
 def _line(cells: Sequence[str], wide: Sequence[int]) -> str:
     name, median, spread, unit, target = (
-        cell.rjust(width) if k in (1, 2) else cell.ljust(width) for k, (cell, width) in enumerate(zip(cells, wide))
+        cell.rjust(width) if k in (1, 2) else cell.ljust(width)
+        for k, (cell, width) in enumerate(zip(cells, wide))
     )
     return f"{name}  {median}  {spread}  {unit}  {target}".rstrip()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,18 +21,27 @@ TDOA_RATE = 400.0  # Hz
 FAR, SPACING, ROW = 1000.0, 8.0, 125  # m, m, anchors: where those stand that nobody hears
 
 
-def make_flight(seconds: float, anchors: int = 8, tdoa_rate: float = TDOA_RATE, **more: Any) -> Flight:
-    """A Flight of at least `seconds` among so many anchors; tdoa_rate : Hz; more : of SimulationConfig. Its first `seconds`
-    count."""
+def make_flight(
+    seconds: float, anchors: int = 8, tdoa_rate: float = TDOA_RATE, **more: Any
+) -> Flight:
+    """A Flight of at least `seconds` among so many anchors; tdoa_rate : Hz; more : of
+    SimulationConfig. Its first `seconds` count.
+    """
     room = "corners" if anchors == 8 else f"random-1-{anchors}"
-    flight = simulate(SimulationConfig(seed=1, constellation=room, duration=max(seconds, SHORTEST), **more))
+    flight = simulate(
+        SimulationConfig(seed=1, constellation=room, duration=max(seconds, SHORTEST), **more)
+    )
     return first(thinned(flight, tdoa_rate), seconds)
 
 
 def among(flight: Flight, installed: int) -> Flight:
-    """The flight where so many anchors are installed: its own, and others out of the radio's reach, in rows of a hall beside it."""
+    """The flight where so many anchors are installed: its own, and others out of the radio's reach,
+    in rows of a hall beside it.
+    """
     beyond = np.arange(installed - len(flight.anchors))
-    far = np.column_stack([FAR + SPACING * (beyond % ROW), SPACING * (beyond // ROW), np.full(len(beyond), 4.0)])
+    far = np.column_stack(
+        [FAR + SPACING * (beyond % ROW), SPACING * (beyond // ROW), np.full(len(beyond), 4.0)]
+    )
     own = flight.anchors
     ids = np.concatenate([own.ids, max(own.ids) + 1 + beyond])
     orientations = np.concatenate([own.orientations, np.full((len(beyond), 4), np.nan)])
@@ -43,7 +52,9 @@ def thinned(flight: Flight, rate: float) -> Flight:
     """The flight with `rate` of its TDOAs, Hz, evenly left out."""
     assert flight.imu is not None
     duration = flight.imu.t[-1] - flight.imu.t[0]
-    kept = np.linspace(0, len(flight.tdoa) - 1, min(len(flight.tdoa), round(rate * duration))).astype(int)
+    kept = np.linspace(
+        0, len(flight.tdoa) - 1, min(len(flight.tdoa), round(rate * duration))
+    ).astype(int)
     return replace(flight, tdoa=rows_of(flight.tdoa, kept))
 
 

@@ -1,4 +1,6 @@
-"""How fast nodes answer the rest of the graph, parameters, poses that are given, a clock that stops, while messages flow."""
+"""How fast nodes answer the rest of the graph, parameters, poses that are given, a clock that
+stops, while messages flow.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +10,13 @@ import re
 import subprocess
 import sys
 import time
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseWithCovarianceStamped
+import numpy as np
 from rcl_interfaces.srv import GetParameters
+import rclpy
 
 from ..live.processes import LiveError
 from .figures import Figure
@@ -24,26 +26,39 @@ from .usage import cpu_seconds
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
+
     from numpy.typing import ArrayLike
     from rclpy.node import Node
+
     from ..live.processes import Processes
 
 CASES = (  # Hz of /clock, Hz of /tf, whether streams flow, busy loops beside
-    (0.0, 0.0, False, 0), (0.0, 0.0, True, 0), (40.0, 0.0, True, 0), (200.0, 0.0, True, 0), (1000.0, 0.0, True, 0),
-    (1000.0, 500.0, True, 0), (1000.0, 500.0, True, 2),
-)  # fmt: skip
+    (0.0, 0.0, False, 0),
+    (0.0, 0.0, True, 0),
+    (40.0, 0.0, True, 0),
+    (200.0, 0.0, True, 0),
+    (1000.0, 0.0, True, 0),
+    (1000.0, 500.0, True, 0),
+    (1000.0, 500.0, True, 2),
+)
 NODE = "ekf_node"
 FLIGHT = 30.0  # s, over and over
 UNASKED = 5.0  # s in which its CPU is taken
 SILENCE = 20.0  # s without an answer, or without a report, after which there will be none
-TARGETS = {"get_parameters p99": 0.2, "initialpose, the longest": 0.2, "a pause told after": 1.0}  # s
+TARGETS = {
+    "get_parameters p99": 0.2,
+    "initialpose, the longest": 0.2,
+    "a pause told after": 1.0,
+}  # s
 TARGET_IDLE = 1.0  # % of a core
 
 
 @dataclass
 class Answers:
-    """answers, poses : s that each get_parameters, each initialpose took, SILENCE without an answer; periods : s between reports;
-    pause : s until a clock that stopped was reported, None without one; cpu : share of one core."""
+    """answers, poses : s that each get_parameters, each initialpose took, SILENCE without an
+    answer; periods : s between reports;
+    pause : s until a clock that stopped was reported, None without one; cpu : share of one core.
+    """
 
     answers: list[float] = field(default_factory=list)
     poses: list[float] = field(default_factory=list)
@@ -52,7 +67,9 @@ class Answers:
     cpu: float = np.nan
 
 
-def measure(progress: Callable[[str], object], folder: Path, quick: bool = False) -> Iterator[Figure]:
+def measure(
+    progress: Callable[[str], object], folder: Path, quick: bool = False
+) -> Iterator[Figure]:
     """Generator of Figures. progress(text); folder : for the output of the nodes."""
     seconds = 6.0 if quick else 20.0
     for clock, tf, streams, busy in [CASES[0], CASES[3], CASES[-1]] if quick else CASES:
@@ -72,6 +89,7 @@ def describe(clock: float, tf: float, streams: bool, busy: int) -> str:
 
 def figures(section: str, found: Answers, streams: bool) -> Iterator[Figure]:
     """Figures of Answers."""
+
     def of(name: str, unit: str, values: ArrayLike) -> Figure:
         return Figure.of(section, name, unit, values, TARGETS.get(name))
 
@@ -87,11 +105,18 @@ def figures(section: str, found: Answers, streams: bool) -> Iterator[Figure]:
 
 
 def ask(
-    folder: Path, seconds: float, clock: float = 0.0, tf: float = 0.0, streams: bool = True, busy: int = 0,
+    folder: Path,
+    seconds: float,
+    clock: float = 0.0,
+    tf: float = 0.0,
+    streams: bool = True,
+    busy: int = 0,
     arguments: Sequence[str] = (),
-) -> Answers:  # fmt: skip
-    """Answers of an ekf_node, for so long. clock, tf : Hz, 0.0 for none; streams : whether a tag flies, through a bias_node; busy :
-    loops that take all of a core; arguments : more of the ekf_node."""
+) -> Answers:
+    """Answers of an ekf_node, for so long. clock, tf : Hz, 0.0 for none; streams : whether a tag
+    flies, through a bias_node; busy : loops that take all of a core; arguments : more of the
+    ekf_node.
+    """
     with ExitStack() as stack:
         node, processes = stack.enter_context(surroundings(folder))
         options = ["--ros-args", "-p", f"publish_tf:={'odom' if tf else 'base'}", *arguments]
@@ -100,11 +125,25 @@ def ask(
         log = processes.file(NODE)
         processes.start(PACKAGES[NODE], NODE, *options)
         if streams:
-            processes.start(PACKAGES["bias_node"], "bias_node", *(["--ros-args", "-p", "use_sim_time:=true"] if clock else []))
-            _wait(node, READY_LIMIT, lambda: ready_at("bias_node", processes.file("bias_node").read_text(errors="replace")))
+            processes.start(
+                PACKAGES["bias_node"],
+                "bias_node",
+                *(["--ros-args", "-p", "use_sim_time:=true"] if clock else []),
+            )
+            _wait(
+                node,
+                READY_LIMIT,
+                lambda: ready_at(
+                    "bias_node", processes.file("bias_node").read_text(errors="replace")
+                ),
+            )
         _wait(node, READY_LIMIT, lambda: ready_at(NODE, log.read_text(errors="replace")))
         loads = {"tf": tf, "streams": FLIGHT if streams else 0.0, "clock": clock}
-        running = {what: stack.enter_context(_load(what, number)) for what, number in loads.items() if number}
+        running = {
+            what: stack.enter_context(_load(what, number))
+            for what, number in loads.items()
+            if number
+        }
         for _ in range(busy):
             stack.enter_context(_process([sys.executable, "-I", "-c", "while True: pass"]))
         return _Asking(node, processes, log).ask(seconds, running.get("clock"))
@@ -119,12 +158,20 @@ class _Asking:
         node.create_subscription(DiagnosticArray, "/diagnostics", self._on_report, 10)
 
     def _on_report(self, message: DiagnosticArray) -> None:
-        self._reports += [(time.monotonic(), each.message) for each in message.status if each.name.strip("/") == NODE]
+        self._reports += [
+            (time.monotonic(), each.message)
+            for each in message.status
+            if each.name.strip("/") == NODE
+        ]
 
     def ask(self, seconds: float, clock: subprocess.Popen[bytes] | None) -> Answers:
         """clock : Popen of what publishes it, or None."""
         out, began = Answers(), time.monotonic()
-        _wait(self._node, SILENCE, lambda: len(self._reports) > 2 or time.monotonic() > began + SILENCE - 1.0)
+        _wait(
+            self._node,
+            SILENCE,
+            lambda: len(self._reports) > 2 or time.monotonic() > began + SILENCE - 1.0,
+        )
         _wait(self._node, SILENCE, self._client.service_is_ready)
         _wait(self._node, SILENCE, self._poses.get_subscription_count)
         before, began = cpu_seconds(self._processes.pid(NODE)), time.monotonic()
@@ -146,20 +193,27 @@ class _Asking:
         return out
 
     def _call(self) -> float:
-        began, future = time.monotonic(), self._client.call_async(GetParameters.Request(names=["tdoa_std"]))
+        began, future = (
+            time.monotonic(),
+            self._client.call_async(GetParameters.Request(names=["tdoa_std"])),
+        )
         while not future.done() and time.monotonic() < began + SILENCE:
             rclpy.spin_once(self._node, timeout_sec=0.01)
         return time.monotonic() - began if future.done() else SILENCE
 
     def _tell(self, number: int) -> float:
-        """s until the node has said, by the time of its log, that it does not take a pose in a frame of this number."""
+        """s until the node has said, by the time of its log, that it does not take a pose in a
+        frame of this number.
+        """
         message, frame, began = PoseWithCovarianceStamped(), f"nowhere_{number}", time.time()
         message.header.frame_id = frame
         self._poses.publish(message)
         found: list[str] = []
 
         def said() -> bool:
-            found[:] = re.findall(r"\[([0-9.]+)\] .*initialpose: not taken: .*", self._log.read_text(errors="replace"))[number:]
+            found[:] = re.findall(
+                r"\[([0-9.]+)\] .*initialpose: not taken: .*", self._log.read_text(errors="replace")
+            )[number:]
             return bool(found) or time.time() > began + SILENCE
 
         _wait(self._node, SILENCE + 1.0, said)
@@ -181,7 +235,9 @@ class _Asking:
 @contextmanager
 def _load(what: str, number: float) -> Iterator[subprocess.Popen[bytes]]:
     command = [sys.executable, "-m", "uwb_tdoa_tools.benchmark.load", what, f"{number:g}"]
-    with _process(command, stdout=subprocess.PIPE, cwd="/") as process:  # -m looks for modules in the folder where it starts
+    with _process(
+        command, stdout=subprocess.PIPE, cwd="/"
+    ) as process:  # -m looks for modules in the folder where it starts
         assert process.stdout is not None  # it is a pipe
         process.stdout.readline()  # it begins
         yield process

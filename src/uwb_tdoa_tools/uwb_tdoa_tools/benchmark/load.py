@@ -1,4 +1,5 @@
-"""What else there is in a graph, as a process: a simulator's clock, a robot's transforms, a tag's streams.
+"""What else there is in a graph, as a process: a simulator's clock, a robot's transforms, a tag's
+streams.
 
 python -m uwb_tdoa_tools.benchmark.load clock 200
 python -m uwb_tdoa_tools.benchmark.load tf 500
@@ -9,7 +10,7 @@ from __future__ import annotations
 
 import sys
 import time
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TransformStamped
@@ -23,15 +24,18 @@ from .source import Source
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
+
     from rclpy.node import Node
+
     from ..live.session import Stop
 
 WHEELS = "odom", "base_link"  # of the transform on /tf
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Publish `what` at so many Hz (clock, tf), or streams of a flight of so many seconds over and over, until interrupted.
-    Says an empty line when it begins."""
+    """Publish `what` at so many Hz (clock, tf), or streams of a flight of so many seconds over and
+    over, until interrupted. Says an empty line when it begins.
+    """
     what, number = sys.argv[1:] if argv is None else argv
     with session(f"load_{what}", []) as (node, stop):
         if what == "streams":
@@ -40,10 +44,17 @@ def main(argv: Sequence[str] | None = None) -> None:
             source.play(flight, 1.0, lambda: stop_if(stop), 10_000)
         else:
             print(flush=True)
-            publish(node, stop, float(number), *{"clock": (Clock, "/clock", of_clock), "tf": (TFMessage, "/tf", of_tf)}[what])
+            publish(
+                node,
+                stop,
+                float(number),
+                *{"clock": (Clock, "/clock", of_clock), "tf": (TFMessage, "/tf", of_tf)}[what],
+            )
 
 
-def publish(node: Node, stop: Stop, rate: float, kind: type, topic: str, of: Callable[[Time], Any]) -> None:
+def publish(
+    node: Node, stop: Stop, rate: float, kind: type, topic: str, of: Callable[[Time], Any]
+) -> None:
     """Publish of(Time of now) at `rate` Hz."""
     publisher, due = node.create_publisher(kind, topic, QoSProfile(depth=100)), time.monotonic()
     while not stop:

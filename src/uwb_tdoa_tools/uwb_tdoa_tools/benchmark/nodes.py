@@ -1,20 +1,22 @@
-"""The nodes live, in real time: CPU, memory, latency, losses, time to ready; for one tag and for several."""
+"""The nodes live, in real time: CPU, memory, latency, losses, time to ready; for one tag and for
+several.
+"""
 
 from __future__ import annotations
 
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
 import json
 import os
 import re
 import time
-from contextlib import contextmanager
-from dataclasses import dataclass, field
-from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..live.run import accounts
 from ..live.processes import DiagnosticsListener, Processes, own_domain, variables, wait
+from ..live.run import accounts
 from ..live.session import session
 from .figures import Figure
 from .flights import among, make_flight
@@ -24,18 +26,39 @@ from .usage import cpu_seconds, memory
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
     from pathlib import Path
+
     from rclpy.node import Node
+
     from uwb_tdoa_bias.foundation.flight import Flight
 
     Starts = dict[str, tuple[str, Sequence[str]]]  # {title: (executable, arguments)}
 
-PACKAGES = {"bias_node": "uwb_tdoa_bias", "ekf_node": "uwb_tdoa_ekf", "localization_node": "uwb_tdoa_ekf"}
+PACKAGES = {
+    "bias_node": "uwb_tdoa_bias",
+    "ekf_node": "uwb_tdoa_ekf",
+    "localization_node": "uwb_tdoa_ekf",
+}
 NODES = "bias_node", "ekf_node"
-SHARED = ("imu/data", "uwb/tdoa", "uwb/anchors")  # published once for all tags, so that the source stays the same
+SHARED = (
+    "imu/data",
+    "uwb/tdoa",
+    "uwb/anchors",
+)  # published once for all tags, so that the source stays the same
 BLOCK = 3.0  # s over which CPU and latencies are taken: their median and quartiles are of blocks
-READY_LIMIT, MATCH_LIMIT, SETTLE_LIMIT = 300.0, 60.0, 60.0  # s; the very first start compiles the filter
+READY_LIMIT, MATCH_LIMIT, SETTLE_LIMIT = (
+    300.0,
+    60.0,
+    60.0,
+)  # s; the very first start compiles the filter
 # Tags, Hz, Hz
-FLEETS = (1, 1000.0, 400.0), (2, 1000.0, 400.0), (4, 1000.0, 400.0), (8, 1000.0, 400.0), (30, 100.0, 100.0), (60, 100.0, 40.0)
+FLEETS = (
+    (1, 1000.0, 400.0),
+    (2, 1000.0, 400.0),
+    (4, 1000.0, 400.0),
+    (8, 1000.0, 400.0),
+    (30, 100.0, 100.0),
+    (60, 100.0, 40.0),
+)
 INSTALLED = 8, 1000, 10_000  # anchors, 8 of which are heard
 TARGET_CPU, TARGET_LATENCY, TARGET_READY = 25.0, 10.0, 0.5  # % of one core, ms, s
 TARGET_LATENCY_OF_FLEET = 30.0  # ms
@@ -45,10 +68,13 @@ SECTION = "both nodes live at 1 kHz IMU + 400 Hz TDOA, default parameters and Qo
 
 @dataclass
 class NodeFigures:
-    """ready : {title: s from its start}; first : s from the anchors to the first odometry, half a second of which passes before the
-    first measurement; memory : {title: bytes}; cpu : {title: share of one core in each block};
-    latency : one (n,) array of ms per block; lost, late : messages; source_late : (k,) ms, each message of the source;
-    source_cpu : share of one core in each block."""
+    """ready : {title: s from its start}; first : s from the anchors to the first odometry, half a
+    second of which passes before the first measurement; memory : {title: bytes}; cpu : {title:
+    share of one core in each block};
+    latency : one (n,) array of ms per block; lost, late : messages; source_late : (k,) ms, each
+        message of the source;
+    source_cpu : share of one core in each block.
+    """
 
     ready: dict[str, float] = field(default_factory=dict)
     first: float = np.nan
@@ -61,11 +87,15 @@ class NodeFigures:
     source_cpu: np.ndarray = field(default_factory=lambda: np.empty(0))
 
 
-def measure(progress: Callable[[str], object], folder: Path, quick: bool = False) -> Iterator[Figure]:
+def measure(
+    progress: Callable[[str], object], folder: Path, quick: bool = False
+) -> Iterator[Figure]:
     """Generator of Figures for one tag. progress(text); folder : for the output of the nodes."""
     progress("nodes, first start")
     first, ready, seconds = start(folder), [], 6.0 if quick else 30.0
-    yield Figure.of(SECTION, "ready after its first start in this run, ekf_node", "s", first["ekf_node"])
+    yield Figure.of(
+        SECTION, "ready after its first start in this run, ekf_node", "s", first["ekf_node"]
+    )
     for _ in range(0 if quick else 4):
         progress("nodes, start")
         ready.append(start(folder))
@@ -74,18 +104,30 @@ def measure(progress: Callable[[str], object], folder: Path, quick: bool = False
     live = fly(flight, folder, [""], pairs([""]))
     ready.append(live.ready)
     for name in NODES:
-        yield Figure.of(SECTION, f"ready after its start, {name}", "s", [one[name] for one in ready], TARGET_READY)
+        yield Figure.of(
+            SECTION,
+            f"ready after its start, {name}",
+            "s",
+            [one[name] for one in ready],
+            TARGET_READY,
+        )
     yield from _figures(SECTION, live)
     progress(f"localization_node, {seconds:g} s live")
     together = fly(flight, folder, [""], pool([""], 1))
     yield from _figures(f"{SECTION}, in one process", together, TARGET_CPU, TARGET_LATENCY)
     if not quick:
         progress(f"nodes, 64 anchors, {seconds:g} s live")
-        yield from _figures(f"{SECTION}, 64 anchors", fly(make_flight(seconds, 64), folder, [""], pairs([""])))
+        yield from _figures(
+            f"{SECTION}, 64 anchors", fly(make_flight(seconds, 64), folder, [""], pairs([""]))
+        )
 
 
-def measure_tags(progress: Callable[[str], object], folder: Path, quick: bool = False) -> Iterator[Figure]:
-    """Generator of Figures for several tags that all hear the same streams, in a localization_node for each core."""
+def measure_tags(
+    progress: Callable[[str], object], folder: Path, quick: bool = False
+) -> Iterator[Figure]:
+    """Generator of Figures for several tags that all hear the same streams, in a localization_node
+    for each core.
+    """
     seconds, cores = 10.0 if quick else 20.0, len(os.sched_getaffinity(0))
     progress("tags, first start")
     start(folder)  # whoever compiles the filter keeps the memory that took
@@ -93,19 +135,30 @@ def measure_tags(progress: Callable[[str], object], folder: Path, quick: bool = 
         progress(f"{tags} tags, {seconds:g} s live")
         spaces = [f"/tag{k + 1}" for k in range(tags)]
         starts = pool(spaces, min(cores, tags))
-        section = f"{tags} tag{'s' * (tags > 1)} at {imu_rate:g} Hz IMU + {tdoa_rate:g} Hz TDOA, {len(starts)} localization_node"
+        section = (
+            f"{tags} tag{'s' * (tags > 1)} at {imu_rate:g} Hz IMU + {tdoa_rate:g} Hz TDOA, "
+            f"{len(starts)} localization_node"
+        )
         flight = make_flight(seconds, tdoa_rate=tdoa_rate, imu_rate=imu_rate)
-        yield from _figures(section, fly(flight, folder, spaces, starts), None, TARGET_LATENCY_OF_FLEET)
+        yield from _figures(
+            section, fly(flight, folder, spaces, starts), None, TARGET_LATENCY_OF_FLEET
+        )
 
 
-def measure_hall(progress: Callable[[str], object], folder: Path, quick: bool = False) -> Iterator[Figure]:
-    """Generator of Figures for a tag in a localization_node by how many anchors are installed, of which it hears the same 8."""
+def measure_hall(
+    progress: Callable[[str], object], folder: Path, quick: bool = False
+) -> Iterator[Figure]:
+    """Generator of Figures for a tag in a localization_node by how many anchors are installed, of
+    which it hears the same 8.
+    """
     progress("hall, first start")
     start(folder)
     flight = make_flight(10.0 if quick else 20.0, tdoa_rate=200.0, imu_rate=100.0)
     for installed in INSTALLED[::2] if quick else INSTALLED:
         progress(f"hall, {installed} anchors live")
-        section = f"{installed} anchors installed, 8 heard, 100 Hz IMU + 200 Hz TDOA, localization_node"
+        section = (
+            f"{installed} anchors installed, 8 heard, 100 Hz IMU + 200 Hz TDOA, localization_node"
+        )
         live = fly(among(flight, installed), folder, [""], pool([""], 1))
         (ready,) = live.ready.values()
         yield Figure.of(section, "ready after its start", "s", ready)
@@ -122,21 +175,36 @@ def start(folder: Path) -> dict[str, float]:
 
 def pairs(namespaces: Sequence[str]) -> Starts:
     """A bias_node and an ekf_node for each namespace: {title: (executable, arguments)}."""
-    return {_title(space, name): (name, _arguments(space, name)) for space in namespaces for name in NODES}
+    return {
+        _title(space, name): (name, _arguments(space, name))
+        for space in namespaces
+        for name in NODES
+    }
 
 
 def pool(namespaces: Sequence[str], processes: int) -> Starts:
     """So many localization_nodes, which share the namespaces: {title: (executable, arguments)}."""
-    name, shared = "localization_node", [part for topic in SHARED for part in ("-r", f"{topic}:=/{topic}")]
+    name, shared = (
+        "localization_node",
+        [part for topic in SHARED for part in ("-r", f"{topic}:=/{topic}")],
+    )
     if namespaces == [""]:
         return {name: (name, [])}
-    tags = [json.dumps([space.strip("/") for space in namespaces[k::processes]]) for k in range(processes)]
+    tags = [
+        json.dumps([space.strip("/") for space in namespaces[k::processes]])
+        for k in range(processes)
+    ]
     own = [["-p", f"tags:={each}", "-r", f"__node:={name}_{k + 1}"] for k, each in enumerate(tags)]
-    return {f"{k + 1}/{name}": (name, ["--ros-args", *arguments, *shared]) for k, arguments in enumerate(own)}
+    return {
+        f"{k + 1}/{name}": (name, ["--ros-args", *arguments, *shared])
+        for k, arguments in enumerate(own)
+    }
 
 
 def fly(flight: Flight, folder: Path, namespaces: Sequence[str], starts: Starts) -> NodeFigures:
-    """NodeFigures of a flight in real time through the nodes of each namespace ("" or "/name"); starts : of `pairs` or `pool`."""
+    """NodeFigures of a flight in real time through the nodes of each namespace ("" or "/name");
+    starts : of `pairs` or `pool`.
+    """
     out = NodeFigures()
     with surroundings(folder) as (node, processes):
         diagnostics, source = DiagnosticsListener(node), Source(node, namespaces)
@@ -165,8 +233,14 @@ def fly(flight: Flight, folder: Path, namespaces: Sequence[str], starts: Starts)
     times = np.array([t for t, _, _ in samples])
     took = 1e-9 * np.diff(times)
     out.cpu = {title: np.diff([cpu[title] for _, cpu, _ in samples]) / took for title in out.ready}
-    out.source_cpu, out.source_late = np.diff([own for _, _, own in samples]) / took, 1e3 * np.maximum(late, 0.0)
-    delay = [latencies(sent, stamps, *np.array(got, dtype=np.int64).reshape(-1, 2).T) for got in source.received]
+    out.source_cpu, out.source_late = (
+        np.diff([own for _, _, own in samples]) / took,
+        1e3 * np.maximum(late, 0.0),
+    )
+    delay = [
+        latencies(sent, stamps, *np.array(got, dtype=np.int64).reshape(-1, 2).T)
+        for got in source.received
+    ]
     block = np.searchsorted(times, sent, side="right") - 1
     arrived = [got[0][0] for got in source.received if got]
     out.first = 1e-9 * (min(arrived) - source.anchors_sent) if arrived else np.nan
@@ -180,7 +254,12 @@ def surroundings(folder: str | Path) -> Iterator[tuple[Node, Processes]]:
     """(node of ours, Processes) in a domain of their own, whose logs ready_at understands."""
     form = "[{severity}] [{time}] [{name}]: {message}"
     logs = {"RCUTILS_CONSOLE_OUTPUT_FORMAT": form, "RCUTILS_COLORIZED_OUTPUT": "0"}
-    with own_domain(), variables(logs), session("bench", []) as (node, stop), Processes(folder, stop) as processes:
+    with (
+        own_domain(),
+        variables(logs),
+        session("bench", []) as (node, stop),
+        Processes(folder, stop) as processes,
+    ):
         yield node, processes
 
 
@@ -192,8 +271,12 @@ def _arguments(space: str, name: str) -> list[str]:
     return ["--ros-args", *(part for remap in remaps for part in ("-r", remap)), *own]
 
 
-def _start(processes: Processes, node: Node, title: str, name: str, arguments: Sequence[str]) -> float:
-    """Start an executable and wait until it is ready; returns the s that took, by the clock of its log."""
+def _start(
+    processes: Processes, node: Node, title: str, name: str, arguments: Sequence[str]
+) -> float:
+    """Start an executable and wait until it is ready; returns the s that took, by the clock of its
+    log.
+    """
     began = time.time()
     processes.start(PACKAGES[name], name, *arguments, title=title)
     said: list[str] = []
@@ -215,7 +298,9 @@ def _title(space: str, name: str) -> str:
     return f"{space}/{name}".strip("/")
 
 
-def _matched(node: Node, source: Source, diagnostics: DiagnosticsListener, titles: Sequence[str]) -> bool:
+def _matched(
+    node: Node, source: Source, diagnostics: DiagnosticsListener, titles: Sequence[str]
+) -> bool:
     """Whether every node hears what it needs, and we hear every odometry."""
     wanted = {"bias_node": ("uwb/tdoa", "odometry"), "ekf_node": ("imu/data", "uwb/tdoa_corrected")}
     return (
@@ -230,7 +315,13 @@ def _matched(node: Node, source: Source, diagnostics: DiagnosticsListener, title
     )
 
 
-def _count(out: NodeFigures, flight: Flight, namespaces: Sequence[str], diagnostics: DiagnosticsListener, source: Source) -> None:
+def _count(
+    out: NodeFigures,
+    flight: Flight,
+    namespaces: Sequence[str],
+    diagnostics: DiagnosticsListener,
+    source: Source,
+) -> None:
     """Fill in what was lost between the processes, and what came too late to be used."""
     out.lost = dict.fromkeys(("TDOAs", "IMU samples", "odometry"), 0)
     for space, received in zip(namespaces, source.received):
@@ -243,26 +334,55 @@ def _count(out: NodeFigures, flight: Flight, namespaces: Sequence[str], diagnost
 
 
 def _figures(
-    section: str, measured: NodeFigures, target_cpu: float | None = None, target_latency: float | None = None
+    section: str,
+    measured: NodeFigures,
+    target_cpu: float | None = None,
+    target_latency: float | None = None,
 ) -> Iterator[Figure]:
-    """Figures of a NodeFigures. CPU and latency: medians and quartiles of blocks; memory: of nodes."""
+    """Figures of a NodeFigures.
+
+    CPU and latency: medians and quartiles of blocks; memory: of nodes.
+    """
     for name in PACKAGES:
         titles = [title for title in measured.cpu if title.endswith(name)]
         if not titles:
             continue
         of = f"{name}s" if len(titles) > 1 else name
-        yield Figure.of(section, f"CPU, {of}", "% of a core", 100.0 * sum(measured.cpu[title] for title in titles))
-        yield Figure.of(section, f"resident memory, each {name}", "MB", [1e-6 * measured.memory[t] for t in titles])
-    yield Figure.of(section, "CPU, all nodes", "% of a core", 100.0 * sum(measured.cpu.values()), target_cpu)
+        yield Figure.of(
+            section,
+            f"CPU, {of}",
+            "% of a core",
+            100.0 * sum(measured.cpu[title] for title in titles),
+        )
+        yield Figure.of(
+            section,
+            f"resident memory, each {name}",
+            "MB",
+            [1e-6 * measured.memory[t] for t in titles],
+        )
+    yield Figure.of(
+        section, "CPU, all nodes", "% of a core", 100.0 * sum(measured.cpu.values()), target_cpu
+    )
     for percent, target in ((50, None), (99, target_latency)):
-        values = [np.percentile(block, percent) for block in map(_known, measured.latency) if len(block)]
-        yield Figure.of(section, f"latency p{percent}, TDOA published to odometry arrived", "ms", values, target)
+        values = [
+            np.percentile(block, percent) for block in map(_known, measured.latency) if len(block)
+        ]
+        yield Figure.of(
+            section, f"latency p{percent}, TDOA published to odometry arrived", "ms", values, target
+        )
     everything = _known(np.concatenate(measured.latency))
-    yield Figure.of(section, "latency, the longest", "ms", everything.max() if len(everything) else np.nan)
+    yield Figure.of(
+        section, "latency, the longest", "ms", everything.max() if len(everything) else np.nan
+    )
     for name, count in measured.lost.items():
         yield Figure.of(section, f"lost, {name}", "messages", count)
     yield Figure.of(section, "too late to be used", "messages", measured.late)
-    yield Figure.of(section, "this process: CPU of source and listener", "% of a core", 100.0 * measured.source_cpu)
+    yield Figure.of(
+        section,
+        "this process: CPU of source and listener",
+        "% of a core",
+        100.0 * measured.source_cpu,
+    )
     late = np.percentile(measured.source_late, 99)
     yield Figure.of(section, "this process: p99 of how late it published", "ms", late)
 

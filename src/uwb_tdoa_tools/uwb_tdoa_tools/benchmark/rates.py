@@ -22,7 +22,9 @@ NEEDED = 10.0
 SECTION = "replay of a bag through both nodes, reliable links, odometry recorded"
 
 
-def measure(progress: Callable[[str], object], folder: Path, quick: bool = False) -> Iterator[Figure]:
+def measure(
+    progress: Callable[[str], object], folder: Path, quick: bool = False
+) -> Iterator[Figure]:
     """Generator of Figures; folder : for bags and the output of the processes. progress(text)."""
     flight = make_flight(8.0 if quick else 45.0)
     bag, highest = folder / "flight.bag", 0.0
@@ -33,8 +35,12 @@ def measure(progress: Callable[[str], object], folder: Path, quick: bool = False
         became, reached = accounts(live.bias, live.ekf, flight), speed(live.recorded)
         lost = became["lost"] + became["imu_lost"]
         late = became["late"] + became["imu_late"]
-        yield Figure.of(SECTION, f"lost at rate {rate:g}", "messages", lost, 0.0 if rate <= NEEDED else None)
-        yield Figure.of(SECTION, f"too late at rate {rate:g}", "messages", late, 0.0 if rate <= NEEDED else None)
+        yield Figure.of(
+            SECTION, f"lost at rate {rate:g}", "messages", lost, 0.0 if rate <= NEEDED else None
+        )
+        yield Figure.of(
+            SECTION, f"too late at rate {rate:g}", "messages", late, 0.0 if rate <= NEEDED else None
+        )
         yield Figure.of(SECTION, f"reached at rate {rate:g}", "s of flight/s", reached)
         if lost or late:
             break

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 import time
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, TagLeverArm, samples_at
 from uwb_tdoa_bias.correction.network import SHIPPED, load_network
+from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, TagLeverArm, samples_at
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.smoother import smooth
 
@@ -20,6 +20,7 @@ from .flights import make_flight
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
+
     from uwb_tdoa_bias.correction.network import Network
     from uwb_tdoa_bias.foundation.flight import Flight
 
@@ -33,7 +34,9 @@ BATCHES = (1, 4, 16)  # TDOAs that arrive together
 def measure(
     progress: Callable[[str], object], quick: bool = False, model: str | Path | None = None
 ) -> Iterator[Figure]:
-    """Generator of Figures; model : path of an ONNX network, default the one shipped. progress(text)."""
+    """Generator of Figures; model : path of an ONNX network, default the one shipped.
+    progress(text).
+    """
     repeats = 2 if quick else 7
     flight = make_flight(SECONDS)
     section = f"recording of {SECONDS:g} s, 1 kHz IMU, 400 Hz TDOA"
@@ -42,36 +45,55 @@ def measure(
     yield Figure.of(section, name, "s", _seconds(run_offline, flight))
     network = load_network(model or SHIPPED)
     assert network is not None  # as a name is given
-    effects = EffectSet((
-        AnchorDelay(flight.meta["parameters"]["anchor_delays"]), TagLeverArm({"x": 0.01, "y": 0.0, "z": 0.05}),
-    ))  # fmt: skip
+    effects = EffectSet(
+        (
+            AnchorDelay(flight.meta["parameters"]["anchor_delays"]),
+            TagLeverArm({"x": 0.01, "y": 0.0, "z": 0.05}),
+        )
+    )
     ways = {
         "no correction": (run_offline, None),
         f"effects ({effects.name})": (run_offline, Corrector(flight.anchors, effects)),
         f"network ({network.name})": (run_offline, Corrector(flight.anchors, network=network)),
-        f"effects and network ({network.name})": (run_offline, Corrector(flight.anchors, effects, network)),
+        f"effects and network ({network.name})": (
+            run_offline,
+            Corrector(flight.anchors, effects, network),
+        ),
         "no correction, smoothed": (smooth, None),
     }
     for name, (function, corrector) in ways.items():
         progress(f"recording, {name}")
-        function(flight, None, corrector)  # compiles, or loads, what the ways before it did not need
+        function(
+            flight, None, corrector
+        )  # compiles, or loads, what the ways before it did not need
         taken = [_seconds(function, flight, None, corrector) for _ in range(repeats)]
         target = TARGET if corrector is None else TARGET_CORRECTED
         yield Figure.of(section, name, "s", taken, None if function is smooth else target)
         if corrector is None and function is run_offline:
-            yield Figure.of(section, "the same per second of flight", "ms/s", [1e3 * s / SECONDS for s in taken])
+            yield Figure.of(
+                section, "the same per second of flight", "ms/s", [1e3 * s / SECONDS for s in taken]
+            )
     progress("single TDOAs")
     name = f"prediction by the network ({network.name}), 1 at a time"
     yield Figure.of(section, name, "us", _per_prediction(flight, network, repeats))
     for batch in BATCHES:
         name = f"correction of a TDOA by the network ({network.name}), {batch} at a time"
         corrector = Corrector(flight.anchors, network=network)
-        yield Figure.of(section, name, "us", _per_tdoa(flight, corrector, batch, repeats), CORRECTION_TARGET if batch == 1 else None)
+        yield Figure.of(
+            section,
+            name,
+            "us",
+            _per_tdoa(flight, corrector, batch, repeats),
+            CORRECTION_TARGET if batch == 1 else None,
+        )
     for anchors in () if quick else ANCHORS:
         progress(f"recording, {anchors} anchors")
         flight = make_flight(SECONDS, anchors)
         yield Figure.of(
-            section, f"no correction, {anchors} anchors", "s", [_seconds(run_offline, flight) for _ in range(repeats)]
+            section,
+            f"no correction, {anchors} anchors",
+            "s",
+            [_seconds(run_offline, flight) for _ in range(repeats)],
         )
 
 
@@ -83,7 +105,11 @@ def _per_prediction(flight: Flight, network: Network, repeats: int) -> np.ndarra
     some = slice(400)
     samples = samples_at(tdoa.t[some], a[some], b[some], truth, flight.anchors, lag=None)
     alone = [
-        replace(samples, **{name: getattr(samples, name)[k : k + 1] for name in ("t", "a", "b", "p", "q")}) for k in range(len(samples))
+        replace(
+            samples,
+            **{name: getattr(samples, name)[k : k + 1] for name in ("t", "a", "b", "p", "q")},
+        )
+        for k in range(len(samples))
     ]
 
     def predict() -> None:

@@ -1,4 +1,6 @@
-"""The surroundings of the nodes: publishes a flight in real time and takes the odometry that comes back."""
+"""The surroundings of the nodes: publishes a flight in real time and takes the odometry that comes
+back.
+"""
 
 from __future__ import annotations
 
@@ -7,62 +9,79 @@ import struct
 import time
 from typing import TYPE_CHECKING
 
-import numpy as np
 from builtin_interfaces.msg import Time
 from nav_msgs.msg import Odometry
+import numpy as np
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Imu
+
 from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS, anchors_to_message
 from uwb_tdoa_bias.foundation.ros_topics import OUTPUT_QOS, publish_stream
 from uwb_tdoa_msgs.msg import AnchorArray, Tdoa
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
+
     from rclpy.node import Node
     from rclpy.publisher import Publisher
+
     from uwb_tdoa_bias.foundation.flight import Flight
 
-HEADER_STAMP = struct.Struct("<iI")  # of a little-endian CDR message that begins with a header, after 4 bytes
+HEADER_STAMP = struct.Struct(
+    "<iI"
+)  # of a little-endian CDR message that begins with a header, after 4 bytes
 AHEAD = 0.5  # s from the call to the first message
 SHORTEST_SLEEP = 5e-5  # s
 
 
 class Source:
-    """Publishes imu/data, uwb/tdoa and uwb/anchors with the default QoS; subscribes to `odometry` in each namespace.
+    """Publishes imu/data, uwb/tdoa and uwb/anchors with the default QoS; subscribes to `odometry`
+    in each namespace.
 
-    Takes messages from the middleware without callbacks: what is published is not delayed by what is received, and the
-    arrival of an odometry is when the middleware of this process had it.
+    Takes messages from the middleware without callbacks: what is published is not delayed by what
+    is received, and the arrival of an odometry is when the middleware of this process had it.
     """
 
     def __init__(self, node: Node, namespaces: Sequence[str]) -> None:
         self.publishers = {
-            kind: publish_stream(node, kind, topic) for kind, topic in ((Imu, "/imu/data"), (Tdoa, "/uwb/tdoa"))
+            kind: publish_stream(node, kind, topic)
+            for kind, topic in ((Imu, "/imu/data"), (Tdoa, "/uwb/tdoa"))
         }
         self.anchors_sent = 0  # ns since 1970
         self._anchors = node.create_publisher(AnchorArray, "/uwb/anchors", ANCHORS_QOS)
-        self.received: list[list[tuple[int, int]]] = [[] for _ in namespaces]  # (arrival, stamp), ns
-        self.subscriptions = [  # whose callbacks only run while somebody waits, before and after `play`
-            node.create_subscription(Odometry, f"{space}/odometry", partial(_keep, received), OUTPUT_QOS, raw=True)
+        self.received: list[list[tuple[int, int]]] = [
+            [] for _ in namespaces
+        ]  # (arrival, stamp), ns
+        # whose callbacks only run while somebody waits, before and after `play`
+        self.subscriptions = [
+            node.create_subscription(
+                Odometry, f"{space}/odometry", partial(_keep, received), OUTPUT_QOS, raw=True
+            )
             for space, received in zip(namespaces, self.received)
         ]
 
     def play(
         self, flight: Flight, block: float, on_block: Callable[[], object], rounds: int = 1
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Publish a Flight as fast as it was flown, so many times, one after the other. on_block(): called first, after every
-        `block` s, and at the end.
+        """Publish a Flight as fast as it was flown, so many times, one after the other. on_block():
+        called first, after every `block` s, and at the end.
 
-        Returns (sent, stamps, late): of each TDOA when it was published and its stamp, (n,) ns since 1970; s by which
-        each message was late.
+        Returns (sent, stamps, late): of each TDOA when it was published and its stamp, (n,) ns
+        since 1970; s by which each message was late.
         """
         assert flight.imu is not None
         message, self.anchors_sent = anchors_to_message(flight.anchors), time.time_ns()
         self._anchors.publish(message)
         start = time.time_ns() // 10**9 + 1  # stamps are of now, too
         events = self._events(flight, start - flight.imu.t[0])
-        began, period = time.perf_counter() + AHEAD, round((flight.imu.t[-1] - flight.imu.t[0]) * 1e3 + 1.0) * 10**6
+        began, period = (
+            time.perf_counter() + AHEAD,
+            round((flight.imu.t[-1] - flight.imu.t[0]) * 1e3 + 1.0) * 10**6,
+        )
         sent, stamps, late, next_block = [], [], [], began
-        for turn, (due, stamp, publisher, data) in ((turn, event) for turn in range(rounds) for event in events):
+        for turn, (due, stamp, publisher, data) in (
+            (turn, event) for turn in range(rounds) for event in events
+        ):
             due += began + 1e-9 * turn * period
             if due >= next_block:
                 on_block()
@@ -83,7 +102,9 @@ class Source:
         """Keep what has arrived."""
         for subscription, received in zip(self.subscriptions, self.received):
             with subscription.handle:
-                while (taken := subscription.handle.take_message(subscription.msg_type, True)) is not None:
+                while (
+                    taken := subscription.handle.take_message(subscription.msg_type, True)
+                ) is not None:
                     data, information = taken
                     _keep(received, data, information["received_timestamp"])
 
@@ -92,7 +113,9 @@ class Source:
         assert flight.imu is not None
         imu, tdoa, events = flight.imu, flight.tdoa, []
         message, publisher = Imu(), self.publishers[Imu]
-        for t, (gx, gy, gz), (fx, fy, fz) in zip(imu.t.tolist(), imu.gyro.tolist(), imu.accel.tolist()):
+        for t, (gx, gy, gz), (fx, fy, fz) in zip(
+            imu.t.tolist(), imu.gyro.tolist(), imu.accel.tolist()
+        ):
             message.header.stamp, _ = _stamp(t + epoch)
             rate, force = message.angular_velocity, message.linear_acceleration
             rate.x, rate.y, rate.z, force.x, force.y, force.z = gx, gy, gz, fx, fy, fz
@@ -117,11 +140,15 @@ def later(data: bytes, ns: int) -> bytes:
     return data[:4] + HEADER_STAMP.pack(second, nanosecond) + data[4 + HEADER_STAMP.size :]
 
 
-def latencies(sent: np.ndarray, stamps: np.ndarray, arrivals: np.ndarray, of: np.ndarray) -> np.ndarray:
-    """s from the publication of each TDOA to the arrival of the first odometry whose stamp is not older: (n,), NaN for
-    those that were published before there was any odometry, or that none contains.
+def latencies(
+    sent: np.ndarray, stamps: np.ndarray, arrivals: np.ndarray, of: np.ndarray
+) -> np.ndarray:
+    """s from the publication of each TDOA to the arrival of the first odometry whose stamp is not
+    older: (n,), NaN for those that were published before there was any odometry, or that none
+    contains.
 
-    sent, stamps : (n,) ns, of TDOAs; arrivals, of : (k,) ns, arrival and stamp of each odometry in order of arrival.
+    sent, stamps : (n,) ns, of TDOAs; arrivals, of : (k,) ns, arrival and stamp of each odometry in
+        order of arrival.
     """
     out = np.full(len(sent), np.nan)
     if len(arrivals) == 0:

@@ -6,7 +6,7 @@ from functools import partial
 import os
 from pathlib import Path
 import platform
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from tqdm import tqdm
@@ -16,20 +16,25 @@ from .usage import used_by_all, used_by_others
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
+
     from .figures import Figure
 
 PARTS = ("core", "offline", "nodes", "tags", "hall", "replay", "graph")
 
 
 def measure(
-    parts: Sequence[str], folder: Path, quick: bool = False, model: str | Path | None = None,
+    parts: Sequence[str],
+    folder: Path,
+    quick: bool = False,
+    model: str | Path | None = None,
     other: peer.Peer | None = None,
-) -> tuple[dict[str, Any], list[Figure]]:  # fmt: skip
+) -> tuple[dict[str, Any], list[Figure]]:
     """Measure some of PARTS. Returns (machine, list of Figure).
 
-    folder : for bags and the output of the nodes; quick : fewer repetitions and cases; model : ONNX file for "offline",
-    default the one shipped; other : Peer, to measure beside the core. machine : what the figures depend on, dict. Raises
-    InputError, LiveError.
+    folder : for bags and the output of the nodes; quick : fewer repetitions and cases; model : ONNX
+        file for "offline",
+    default the one shipped; other : Peer, to measure beside the core. machine : what the figures
+    depend on, dict. Raises InputError, LiveError.
     """
     folder.mkdir(parents=True, exist_ok=True)
     before, figures = used_by_all(), []
@@ -54,7 +59,11 @@ def measure(
 
 
 def _machine() -> dict[str, Any]:
-    names = [line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith("model name")]
+    names = [
+        line
+        for line in Path("/proc/cpuinfo").read_text().splitlines()
+        if line.startswith("model name")
+    ]
     return {
         "cpu": names[0].partition(":")[2].strip() if names else platform.machine(),
         "cores": len(os.sched_getaffinity(0)),

@@ -17,19 +17,25 @@ from .parts import between
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
+
     from uwb_tdoa_bias.foundation.flight import Flight
     from uwb_tdoa_ekf.core.config import FilterConfig
 
 SECONDS = 60.0  # of a flight that are looked at
-MOVES = 0.25  # of the extent of the anchors that a path must have along an axis to tell much of them
+MOVES = (
+    0.25  # of the extent of the anchors that a path must have along an axis to tell much of them
+)
 ENOUGH = 0.5  # of the coordinates that must become known better
 
 
 @dataclass(frozen=True, eq=False)
 class Prospect:
-    """seconds : s in the air that were looked at, and `total` that there are; given, expected : (N, 3) m, standard deviations of the
-    anchors before, and as they are to be expected of all flights; before, left : m, of the slow innovations; path : (3,) m, its extent;
-    hall : (3,) m, of the anchors; ids : of the anchors; why_not : what keeps a survey from being applied so far, or None."""
+    """seconds : s in the air that were looked at, and `total` that there are; given, expected : (N,
+    3) m, standard deviations of the anchors before, and as they are to be expected of all flights;
+    before, left : m, of the slow innovations; path : (3,) m, its extent;
+    hall : (3,) m, of the anchors; ids : of the anchors; why_not : what keeps a survey from being
+        applied so far, or None.
+    """
 
     seconds: float
     total: float
@@ -55,28 +61,47 @@ class Prospect:
     def sentences(self) -> list[str]:
         """For people."""
         lines = [
-            f"from {self.seconds:.0f} s of {self.total:.0f} s in the air: of the innovations {100 * self.before:.1f} cm are slow with the anchors as "
+            f"from {self.seconds:.0f} s of {self.total:.0f} s in the air: of the innovations "
+            f"{100 * self.before:.1f} cm are slow with the anchors as "
             f"given, and {100 * self.left:.1f} cm with others",
-            f"all flights are likely to tell {int(self.better.sum())} of {self.better.size} coordinates better: "
-            f"{100 * np.median(self.expected):.0f} cm in the median instead of {100 * np.median(self.given):.0f} cm",
+            f"all flights are likely to tell {int(self.better.sum())} of {self.better.size} "
+            "coordinates better: "
+            f"{100 * np.median(self.expected):.0f} cm in the median instead of "
+            f"{100 * np.median(self.given):.0f} cm",
         ]
         if self.why_not:
             lines.append(f"so far nothing would be applied: {self.why_not}")
         unseen = [str(i) for i, row in zip(self.ids, self.better) if not row.any()]
         if unseen:
-            lines.append(f"nothing is told of anchors {listed(unseen)}: fly closer to them, on all sides, high and low")
+            lines.append(
+                f"nothing is told of anchors {listed(unseen)}: fly closer to them, on all "
+                "sides, high and low"
+            )
         for axis, size, room in zip("xyz", self.path, self.hall):
             if size < MOVES * room:
-                lines.append(f"along {axis} the tag moves by {size:.1f} m among anchors that are {room:.1f} m apart: fly more of it")
-        lines.append("the flights are exciting enough" if self.exciting else "the flights are not exciting enough: fly more, and elsewhere")
+                lines.append(
+                    f"along {axis} the tag moves by {size:.1f} m among anchors that are "
+                    f"{room:.1f} m apart: fly more of it"
+                )
+        lines.append(
+            "the flights are exciting enough"
+            if self.exciting
+            else "the flights are not exciting enough: fly more, and elsewhere"
+        )
         return lines
 
 
 def prospect(
-    flights: Sequence[Flight], tape: Tape = Tape(), base: EffectSet = EffectSet(), config: FilterConfig | None = None,
+    flights: Sequence[Flight],
+    tape: Tape = Tape(),
+    base: EffectSet = EffectSet(),
+    config: FilterConfig | None = None,
     progress: Callable[[], object] = lambda: None,
-) -> Prospect:  # fmt: skip
-    """Prospect of a calibration of Flights without their ground truth. Raises InputError where they are too short to say."""
+) -> Prospect:
+    """Prospect of a calibration of Flights without their ground truth.
+
+    Raises InputError where they are too short to say.
+    """
     longest = max(flights, key=_duration)
     middle = 0.5 * (longest.start + longest.end)
     part = between(longest, middle - 0.5 * SECONDS, middle + 0.5 * SECONDS)
@@ -86,9 +111,17 @@ def prospect(
     path = np.quantile(FlightEstimator(config, base)(part).odometry.p, [0.02, 0.98], axis=0)
     anchors = longest.anchors
     return Prospect(
-        seconds, total, found.given_std, _expected(found, total / seconds), found.before, found.left,
-        np.ptp(path, axis=0), np.ptp(anchors.positions, axis=0), tuple(anchors.ids.tolist()), found.why_not,
-    )  # fmt: skip
+        seconds,
+        total,
+        found.given_std,
+        _expected(found, total / seconds),
+        found.before,
+        found.left,
+        np.ptp(path, axis=0),
+        np.ptp(anchors.positions, axis=0),
+        tuple(anchors.ids.tolist()),
+        found.why_not,
+    )
 
 
 def _duration(flight: Flight) -> float:
@@ -97,7 +130,9 @@ def _duration(flight: Flight) -> float:
 
 
 def _expected(found: SelfCalibration, more: float) -> np.ndarray:
-    """(N, 3) m: standard deviations after `more` times what was looked at for a SelfCalibration, as its information adds up."""
+    """(N, 3) m: standard deviations after `more` times what was looked at for a SelfCalibration, as
+    its information adds up.
+    """
     prior = np.linalg.inv(found.prior.covariance)
     values, vectors = np.linalg.eigh(np.linalg.inv(found.solution.covariance) - prior)
     information = (vectors * np.maximum(values, 0.0)) @ vectors.T

@@ -1,6 +1,8 @@
-"""What is wrong with the numbers of a flight whose ground truth is known: of pairs, of stamps, of the axes of the IMU, of the truth itself.
+"""What is wrong with the numbers of a flight whose ground truth is known: of pairs, of stamps, of
+the axes of the IMU, of the truth itself.
 
-What holds for whole streams is in `uwb_tdoa_ekf.streams`; here geometry and motion say what should have been measured.
+What holds for whole streams is in `uwb_tdoa_ekf.streams`; here geometry and motion say what should
+have been measured.
 """
 
 from __future__ import annotations
@@ -19,9 +21,14 @@ from .repairs import repairs_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
     from uwb_tdoa_bias.foundation.flight import Flight
 
-HOLE, LEAP, LEAST_LEAP = 1.0, 20.0, 0.2  # s without ground truth in the air; m/s, and m, between two poses; healthy 0.11
+HOLE, LEAP, LEAST_LEAP = (
+    1.0,
+    20.0,
+    0.2,
+)  # s without ground truth in the air; m/s, and m, between two poses; healthy 0.11
 
 
 def against_truth(flight: Flight) -> list[Finding]:
@@ -32,11 +39,21 @@ def against_truth(flight: Flight) -> list[Finding]:
 
 
 def _of_tdoas(path: KnownPath) -> list[Finding]:
-    """Ids, then what is wrong beside these, then stamps, where the values can say something of these."""
+    """Ids, then what is wrong beside these, then stamps, where the values can say something of
+    these.
+    """
     repairs = repairs_of(path)
-    found = list(pair_rules.ids(path)) if any(effect.name == AnchorIds.name for effect in repairs) else []
+    found = (
+        list(pair_rules.ids(path))
+        if any(effect.name == AnchorIds.name for effect in repairs)
+        else []
+    )
     found += pair_rules.values(path.without(repairs[0]) if found else path)
-    return found if any(finding.rule.startswith(("ids", "tdoa")) for finding in found) else [*found, *time_rules.tdoas(path)]
+    return (
+        found
+        if any(finding.rule.startswith(("ids", "tdoa")) for finding in found)
+        else [*found, *time_rules.tdoas(path)]
+    )
 
 
 def _of_imu(flight: Flight) -> list[Finding]:
@@ -63,10 +80,27 @@ def of_truth(flight: Flight) -> Iterator[Finding]:
     k = int(np.argmax(dt))
     if dt[k] > HOLE:
         evidence = f"{dt[k]:.1f} s without a pose from {t[k] - flight.tdoa.t[0]:.1f} s on"
-        yield Finding("truth_hole", WARNING, "the ground truth has a hole", evidence, "judge on what lies before or after", float(dt[k]))
+        yield Finding(
+            "truth_hole",
+            WARNING,
+            "the ground truth has a hole",
+            evidence,
+            "judge on what lies before or after",
+            float(dt[k]),
+        )
     step = np.linalg.norm(np.diff(p, axis=0), axis=1)
     speed = np.where(step > LEAST_LEAP, step / np.maximum(dt, 1e-3), 0.0)
     if (speed > LEAP).any():
         k = int(np.argmax(speed))
-        evidence = f"{np.linalg.norm(p[k + 1] - p[k]):.2f} m in {dt[k]:.3f} s at {t[k] - flight.tdoa.t[0]:.1f} s"
-        yield Finding("truth_leap", WARNING, "the ground truth leaps", evidence, "look for exchanged or hidden markers", float(speed[k]))
+        evidence = (
+            f"{np.linalg.norm(p[k + 1] - p[k]):.2f} m in {dt[k]:.3f} s at "
+            f"{t[k] - flight.tdoa.t[0]:.1f} s"
+        )
+        yield Finding(
+            "truth_leap",
+            WARNING,
+            "the ground truth leaps",
+            evidence,
+            "look for exchanged or hidden markers",
+            float(speed[k]),
+        )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Protocol, TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -20,11 +20,13 @@ from .watch import found_by_monitor, together
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
+
     from uwb_tdoa_bias.foundation.anchors import Anchors
+
+    from ..live.ends import End
     from .recording import Recording
     from .survey_fit import SurveyFit
     from .tdoa_rules import Survey
-    from ..live.ends import End
 
 ROUNDS = 3  # mistakes that are undone one after the other
 # Where one of these stands, nothing, or not the IMU, can be tried.
@@ -40,8 +42,11 @@ NOTHING_TO_TRY = {
     "anchor_scale",
 }
 WITHOUT_IMU = {"imu_silent", "imu_no_gravity", "imu_axis_dead", "imu_tilted", "imu_clipped"}
-OTHER_SURVEY = "give --survey a folder of all surveys: check says which one fits; or survey the anchors again"
-# What a survey of another room is taken for: many things explain some of it, and it does not fit with them undone either.
+OTHER_SURVEY = (
+    "give --survey a folder of all surveys: check says which one fits; or survey the anchors again"
+)
+# What a survey of another room is taken for: many things explain some of it, and it does not fit
+# with them undone either.
 BLAMED = {"tdoa_sign", "ids_swapped", "pair_sign", "tdoa_one_sign", "anchor_moved"}
 # What a finding explains that the stream itself only shows.
 EXPLAINS = {
@@ -67,8 +72,9 @@ class NamedAnchors(Protocol):
 
 @dataclass(frozen=True)
 class Report:
-    """recording : its name; findings : [Finding], most severe first; facts : {what: text}, what was heard; ends : [End] of
-    live topics."""
+    """recording : its name; findings : [Finding], most severe first; facts : {what: text}, what was
+    heard; ends : [End] of live topics.
+    """
 
     recording: str
     findings: list[Finding]
@@ -82,18 +88,27 @@ class Report:
 
 
 def check(
-    recording: Recording, others: Sequence[Survey] = (), estimator: FlightEstimator = FlightEstimator(), line: str | None = None
+    recording: Recording,
+    others: Sequence[Survey] = (),
+    estimator: FlightEstimator = FlightEstimator(),
+    line: str | None = None,
 ) -> Report:
-    """Report of a Recording. others : [(name, Anchors)] of other surveys that might be the right one; estimator : FlightEstimator, with
-    what is calibrated; line : command that surveys the anchors with the recording, or None."""
+    """Report of a Recording. others : [(name, Anchors)] of other surveys that might be the right
+    one; estimator : FlightEstimator, with what is calibrated; line : command that surveys the
+    anchors with the recording, or None.
+    """
     streams = fed(recording)
     found = [*streams.findings(), *sensors(recording)]
     for rule in (*labels.RULES, *wiring.RULES, *tag_delay.RULES):
         found += rule(recording)
-    if any(finding.rule == "clock_silence" for finding in found):  # which says the same of all streams
+    if any(
+        finding.rule == "clock_silence" for finding in found
+    ):  # which says the same of all streams
         found = [finding for finding in found if finding.rule != "gap"]
     if not len(recording.tdoa):  # of ranges alone: nothing else is there to be tried
-        return Report(recording.name, most_severe_first(found), _facts(recording, streams), recording.ends)
+        return Report(
+            recording.name, most_severe_first(found), _facts(recording, streams), recording.ends
+        )
     names = {finding.rule for finding in found}
     places, explained, track = np.empty((0, 3)), set(), None
     if names & NOTHING_TO_TRY:
@@ -101,7 +116,9 @@ def check(
             "sign, ids, survey and axes were not tried",
             "put the errors right, record again, and check again",
         )
-        found.append(Finding("not_tried", NOTE, cause, "the streams are of no use for that", remedy, np.nan))
+        found.append(
+            Finding("not_tried", NOTE, cause, "the streams are of no use for that", remedy, np.nan)
+        )
     else:
         ordered = _undone(OrderedRecording.of(recording), found)
         tried, places = _tried(ordered, names, others)
@@ -114,10 +131,14 @@ def check(
         found = [finding for finding in found if finding.rule not in explained] + tried
     if "survey_scale" in names:  # of a room of another size
         places = np.empty((0, 3))
-    view = coverage.CoverageView(recording.anchors, list(streams.tdoa), places, "height" in recording.sensors, track)
+    view = coverage.CoverageView(
+        recording.anchors, list(streams.tdoa), places, "height" in recording.sensors, track
+    )
     for covered in coverage.RULES:
         found += (finding for finding in covered(view) if finding.rule not in explained)
-    return Report(recording.name, most_severe_first(found), _facts(recording, streams), recording.ends)
+    return Report(
+        recording.name, most_severe_first(found), _facts(recording, streams), recording.ends
+    )
 
 
 def fed(recording: Recording) -> StreamRules:
@@ -135,14 +156,25 @@ def sensors(recording: Recording) -> Iterator[Finding]:
     for name, stream in recording.sensors.items():
         for rule in SENSORS[name].rules:
             if (found := rule(stream, recording.anchors)) is not None:
-                yield Finding(found.rule, ERROR if found.severe else WARNING, found.cause, found.evidence, found.remedy, found.value)
+                yield Finding(
+                    found.rule,
+                    ERROR if found.severe else WARNING,
+                    found.cause,
+                    found.evidence,
+                    found.remedy,
+                    found.value,
+                )
 
 
 def _undone(ordered: OrderedRecording, found: list[Finding]) -> OrderedRecording:
-    """The OrderedRecording without the mistakes that the streams show themselves, so that it can be tried."""
+    """The OrderedRecording without the mistakes that the streams show themselves, so that it can be
+    tried.
+    """
     for finding in found:
         if finding.rule == "survey_scale":
-            ordered = replace(ordered, anchors=ordered.anchors.at(ordered.anchors.positions / finding.value))
+            ordered = replace(
+                ordered, anchors=ordered.anchors.at(ordered.anchors.positions / finding.value)
+            )
         elif finding.rule == "tdoa_wraps":
             ordered = ordered.possible()
         if (imu := ordered.imu) is None:
@@ -160,14 +192,18 @@ def _undone(ordered: OrderedRecording, found: list[Finding]) -> OrderedRecording
 
 
 def upright(force: np.ndarray) -> np.ndarray:
-    """(3, 3) rotation by quarter turns that brings the axis along which `force` (3,) is largest to +z."""
+    """(3, 3) rotation by quarter turns that brings the axis along which `force` (3,) is largest to
+    +z.
+    """
     k = int(np.argmax(np.abs(force)))
     up = np.sign(force[k]) * np.eye(3)[k]
     side = np.eye(3)[(k + 1) % 3]
     return np.stack([side, np.cross(up, side), up])
 
 
-def _tried(ordered: OrderedRecording, names: set[str], others: Sequence[Survey]) -> tuple[list[Finding], np.ndarray]:
+def _tried(
+    ordered: OrderedRecording, names: set[str], others: Sequence[Survey]
+) -> tuple[list[Finding], np.ndarray]:
     """([Finding], places of the tag (k, 3) m): what is found by undoing it."""
     found, given = [], ordered
     for _ in range(ROUNDS):
@@ -182,18 +218,29 @@ def _tried(ordered: OrderedRecording, names: set[str], others: Sequence[Survey])
     elif blamed and tdoa_rules.gained(fit) is not None:  # what was put right did not make it fit
         found = [finding for finding in found if finding not in blamed]
         found += [*_misfit(given.survey_fit)] or [*_misfit(fit)]
-    if ordered.imu is not None and not names & WITHOUT_IMU and not any(f.rule == "survey_misfit" for f in found):
+    if (
+        ordered.imu is not None
+        and not names & WITHOUT_IMU
+        and not any(f.rule == "survey_misfit" for f in found)
+    ):
         finding = imu_rules.fit(ordered)
         found += [finding] if finding else []
-        if finding and (mixed := [other for other in found if other.cause.startswith(tdoa_rules.MIXED_UP)]):
-            found = [other for other in found if other is not finding and other not in mixed] + [_other_room(*mixed)]
+        if finding and (
+            mixed := [other for other in found if other.cause.startswith(tdoa_rules.MIXED_UP)]
+        ):
+            found = [other for other in found if other is not finding and other not in mixed] + [
+                _other_room(*mixed)
+            ]
     return found, fit.places
 
 
 def _other_room(mixed: Finding) -> Finding:
-    """Many ids mixed up and a faulty inertial sensor at once: rather the survey of another room, of which both are what it looks like."""
+    """Many ids mixed up and a faulty inertial sensor at once: rather the survey of another room, of
+    which both are what it looks like.
+    """
     cause = (
-        "the survey is of another room, or its ids are mixed up: with many ids exchanged it nearly fits, and the inertial sensor does not"
+        "the survey is of another room, or its ids are mixed up: with many ids exchanged it "
+        "nearly fits, and the inertial sensor does not"
     )
     return Finding("survey_misfit", ERROR, cause, mixed.evidence, OTHER_SURVEY, mixed.value)
 
@@ -202,14 +249,29 @@ def _misfit(fit: SurveyFit) -> Iterator[Finding]:
     """A survey that fits much better with its anchors elsewhere, and not with one of them alone."""
     gain = tdoa_rules.gained(fit)
     if gain is None and tdoa_rules.apparent_gain(fit) > tdoa_rules.GAIN:
-        evidence = "with the anchors elsewhere each half of the recording fits better, and not the other half"
-        cause = "the TDOAs fit the survey less well than usual, and this recording does not determine why"
-        remedy = "record a minute in which the tag is carried through the whole room, and check again"
-        yield Finding("misfit_unclear", NOTE, cause, evidence, remedy, tdoa_rules.apparent_gain(fit))
+        evidence = (
+            "with the anchors elsewhere each half of the recording fits better, and not the other "
+            "half"
+        )
+        cause = (
+            "the TDOAs fit the survey less well than usual, and this recording does not determine "
+            "why"
+        )
+        remedy = (
+            "record a minute in which the tag is carried through the whole room, and check again"
+        )
+        yield Finding(
+            "misfit_unclear", NOTE, cause, evidence, remedy, tdoa_rules.apparent_gain(fit)
+        )
     if gain is not None:
         heard, (_, anchors) = fit.heard, fit.all_moved
-        evidence = f"{100.0 * gain / fit.before:.0f} % less stays unexplained with the anchors elsewhere, "
-        evidence += f"by {np.median(displacement(fit.positions[heard], anchors[heard])):.1f} m in the median"
+        evidence = (
+            f"{100.0 * gain / fit.before:.0f} % less stays unexplained with the anchors elsewhere, "
+        )
+        evidence += (
+            f"by {np.median(displacement(fit.positions[heard], anchors[heard])):.1f} m in the "
+            "median"
+        )
         cause = "the survey does not fit: of another room, or anchors have been moved"
         yield Finding("survey_misfit", ERROR, cause, evidence, OTHER_SURVEY, gain)
 
@@ -224,22 +286,33 @@ def _facts(recording: Recording, streams: StreamRules) -> dict[str, str]:
     for name, stream in recording.sensors.items():
         step = float(np.median(np.diff(stream.t))) if len(stream) > 1 else 0.0
         step = step or float(np.ptp(stream.t)) / max(len(stream) - 1, 1)  # several of one stamp
-        facts[name] = f"{SENSORS[name].plural} {1.0 / step:.0f} Hz" if step > 0.0 else f"{SENSORS[name].plural}, no rate"
+        facts[name] = (
+            f"{SENSORS[name].plural} {1.0 / step:.0f} Hz"
+            if step > 0.0
+            else f"{SENSORS[name].plural}, no rate"
+        )
     if streams.tdoa:
         windows = list(streams.tdoa)
         facts["duration"] = f"{windows[-1].stamps.end - windows[0].stamps.begin:.1f} s"
-        facts["anchors"] = f"{np.count_nonzero(sum(w.heard for w in windows))} of {len(recording.anchors)} heard"
+        facts["anchors"] = (
+            f"{np.count_nonzero(sum(w.heard for w in windows))} of {len(recording.anchors)} heard"
+        )
         facts["protocol"] = protocol(recording.tdoa).replace("tdoa", "TDoA")
     return facts
 
 
 def different_surveys(recordings: Sequence[NamedAnchors]) -> Iterator[Finding]:
-    """Findings about Recordings whose surveys differ: anchors of one id that are elsewhere. Their flights do not belong
-    together."""
+    """Findings about Recordings whose surveys differ: anchors of one id that are elsewhere. Their
+    flights do not belong together.
+    """
     for one, two in zip(recordings, recordings[1:]):
         off = furthest(one.anchors, two.anchors)
         if off > SAME:
-            evidence = f"the same ids are up to {off:.2f} m apart" if np.isfinite(off) else "they have no id in common"
+            evidence = (
+                f"the same ids are up to {off:.2f} m apart"
+                if np.isfinite(off)
+                else "they have no id in common"
+            )
             cause = f"{one.name} and {two.name} have different surveys"
             remedy = "diagnose, train and fit maps for each installation by itself"
             yield Finding("surveys_differ", WARNING, cause, evidence, remedy, off)

@@ -1,4 +1,7 @@
-"""What the anchors and the motion of the tag let anybody know. A rule takes a CoverageView and yields Findings."""
+"""What the anchors and the motion of the tag let anybody know.
+
+A rule takes a CoverageView and yields Findings.
+"""
 
 from __future__ import annotations
 
@@ -17,6 +20,7 @@ from .survey_fit import SPREAD, spread
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
+
     from uwb_tdoa_ekf.streams.ranging import TdoaWindow
 
 RARE = 0.2  # of what the anchors are heard in the middle; healthy 0.54 at least
@@ -31,8 +35,10 @@ PART = 0.2  # of the seconds in which the side is not known, beyond which that i
 
 @dataclass(frozen=True)
 class CoverageView:
-    """anchors : Anchors; windows : [TdoaWindow]; places (k, 3) m, where the tag was located, none if that was not
-    tried; height_known : whether something measures its height; track : (t (k,) s, p (k, 3) m) of the tag, or None."""
+    """anchors : Anchors; windows : [TdoaWindow]; places (k, 3) m, where the tag was located, none
+    if that was not tried; height_known : whether something measures its height; track : (t (k,) s,
+    p (k, 3) m) of the tag, or None.
+    """
 
     anchors: Anchors
     windows: list[TdoaWindow]
@@ -41,8 +47,9 @@ class CoverageView:
     track: tuple[np.ndarray, np.ndarray] | None = None
 
     def within_reach(self, heard: np.ndarray) -> np.ndarray:
-        """(W, N) bool: windows in which the tag is near enough to an anchor to hear it, by how far away it hears others. heard (W, N) :
-        TDOAs. All of them if the track is not known."""
+        """(W, N) bool: windows in which the tag is near enough to an anchor to hear it, by how far
+        away it hears others. heard (W, N) : TDOAs. All of them if the track is not known.
+        """
         if self.track is None or len(self.track[0]) < 2:
             return np.ones(heard.shape, bool)
         t = np.array([0.5 * (window.stamps.begin + window.stamps.end) for window in self.windows])
@@ -62,14 +69,34 @@ def missing(view: CoverageView) -> Iterator[Finding]:
     lost = view.anchors.ids[(counts == 0) & (many | near.any(axis=0))].tolist()
     if many:
         if lost:
-            cause = f"the tag never hears {len(lost)} of {len(counts)} anchors, such as {', '.join(map(str, lost[:SAID]))}"
-            remedy = "look whether they are on, if the tag was near them: localize --zones says who was heard where"
-            yield Finding("anchor_missing", NOTE, cause, f"{len(lost)} of {len(counts)}", remedy, float(len(lost)))
+            cause = (
+                f"the tag never hears {len(lost)} of {len(counts)} anchors, such as "
+                f"{', '.join(map(str, lost[:SAID]))}"
+            )
+            remedy = (
+                "look whether they are on, if the tag was near them: localize --zones says who "
+                "was heard where"
+            )
+            yield Finding(
+                "anchor_missing",
+                NOTE,
+                cause,
+                f"{len(lost)} of {len(counts)}",
+                remedy,
+                float(len(lost)),
+            )
         return
     if lost:
         cause = f"anchors of the survey that the tag never hears: {', '.join(map(str, lost))}"
         remedy = "switch them on, or take them out of the survey"
-        yield Finding("anchor_missing", WARNING, cause, f"{len(lost)} of {len(counts)}", remedy, float(len(lost)))
+        yield Finding(
+            "anchor_missing",
+            WARNING,
+            cause,
+            f"{len(lost)} of {len(counts)}",
+            remedy,
+            float(len(lost)),
+        )
     rates = counts / np.maximum(near.sum(axis=0), 1)
     for row in np.flatnonzero((counts > 0) & near.any(axis=0)):
         share = rates[row] / np.median(rates[counts > 0])
@@ -78,14 +105,25 @@ def missing(view: CoverageView) -> Iterator[Finding]:
         since, until = _silence(view.windows, (heard[:, row] > 0) | ~near[:, row])
         if until - since > SILENT:
             evidence = f"{until - since:.0f} s from {since:.1f} s on"
-            yield Finding("anchor_silent", WARNING, f"anchor {number} falls silent", evidence, remedy, until - since)
+            yield Finding(
+                "anchor_silent",
+                WARNING,
+                f"anchor {number} falls silent",
+                evidence,
+                remedy,
+                until - since,
+            )
         elif share < RARE:
             evidence = f"{100.0 * share:.0f} % of what is heard of the one in the middle"
-            yield Finding("anchor_rare", NOTE, f"anchor {number} is hardly heard", evidence, remedy, share)
+            yield Finding(
+                "anchor_rare", NOTE, f"anchor {number} is hardly heard", evidence, remedy, share
+            )
 
 
 def _silence(windows: Sequence[TdoaWindow], heard: np.ndarray) -> tuple[float, float]:
-    """(first, last stamp or arrival) of the longest run of windows that are not `heard`, (W,) bool; (0, 0) if there is none."""
+    """(first, last stamp or arrival) of the longest run of windows that are not `heard`, (W,) bool;
+    (0, 0) if there is none.
+    """
     longest, begin = (0.0, 0.0), None
     for window, there in zip(windows, heard):
         if there:
@@ -97,8 +135,9 @@ def _silence(windows: Sequence[TdoaWindow], heard: np.ndarray) -> tuple[float, f
 
 
 def flat(view: CoverageView) -> Iterator[Finding]:
-    """Anchors in one plane, all or of a hall those that are heard at once, tell next to nothing about the distance from it, and nothing
-    about the side."""
+    """Anchors in one plane, all or of a hall those that are heard at once, tell next to nothing
+    about the distance from it, and nothing about the side.
+    """
     p = view.anchors.positions
     together = [p[window.heard > 0] for window in view.windows] if len(p) > MANY else [p]
     sizes = [_size_and_thickness(some) for some in together if len(some) > FEWEST]
@@ -106,32 +145,50 @@ def flat(view: CoverageView) -> Iterator[Finding]:
     if len(found) > PART * len(sizes):
         size, thickness = np.median(found, axis=0)
         evidence = f"they are within {thickness:.2f} m (rms) of a plane and {size:.1f} m across"
-        remedy = "put half of the anchors low, and half of them high; plan --improve move says which where"
+        remedy = (
+            "put half of the anchors low, and half of them high; plan --improve move says which "
+            "where"
+        )
         cause = "the anchors lie in a plane: the direction across it is hardly told"
         yield Finding("anchors_flat", WARNING, cause, evidence, remedy, float(thickness))
 
 
 def _size_and_thickness(positions: np.ndarray) -> tuple[float, float]:
     """m, largest and smallest standard deviation of positions (n, 3) along any direction."""
-    size, thickness = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)[[0, 2]] / np.sqrt(len(positions))
+    size, thickness = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)[
+        [0, 2]
+    ] / np.sqrt(len(positions))
     return float(size), float(thickness)
 
 
 def side(view: CoverageView) -> Iterator[Finding]:
-    """Anchors in a plane across an axis of the world, all or those that are heard at once: the side of it that the tag is on must be
-    given."""
+    """Anchors in a plane across an axis of the world, all or those that are heard at once: the side
+    of it that the tag is on must be given.
+    """
     heard = [view.anchors.positions[window.heard > 0] for window in view.windows]
-    sides = [sides_of(positions) for positions in heard or [view.anchors.positions] if len(positions) > FEWEST]
+    sides = [
+        sides_of(positions)
+        for positions in heard or [view.anchors.positions]
+        if len(positions) > FEWEST
+    ]
     needed = [one for one in sides if one]
     if len(needed) <= PART * len(sides):
         return
     most = max(sorted(set(needed)), key=needed.count)
     if view.height_known and most[0] in ("below", "above"):
         return
-    evidence = f"in {100.0 * len(needed) / len(sides):.0f} % of the seconds those that are heard have one {'height' if len(most) == 1 else most[0][1:]}"
+    evidence = (
+        f"in {100.0 * len(needed) / len(sides):.0f} % of the seconds those that are heard have "
+        f"one {'height' if len(most) == 1 else most[0][1:]}"
+    )
     remedy = to_copy(most)
     yield Finding(
-        "side_unknown", WARNING, "TDOAs do not tell on which side of its anchors the tag is", evidence, remedy, len(needed) / len(sides)
+        "side_unknown",
+        WARNING,
+        "TDOAs do not tell on which side of its anchors the tag is",
+        evidence,
+        remedy,
+        len(needed) / len(sides),
     )
 
 
@@ -158,7 +215,9 @@ def outside(view: CoverageView) -> Iterator[Finding]:
     low, high = p.min(axis=0) - MARGIN, p.max(axis=0) + MARGIN
     share = float(np.mean(((view.places < low) | (view.places > high)).any(axis=1)))
     if share > OUTSIDE:
-        evidence = f"{100.0 * share:.0f} % of the places are more than {MARGIN} m beyond the anchors"
+        evidence = (
+            f"{100.0 * share:.0f} % of the places are more than {MARGIN} m beyond the anchors"
+        )
         yield Finding(
             "outside",
             WARNING,
@@ -177,7 +236,10 @@ def still(view: CoverageView) -> Iterator[Finding]:
     duration = view.windows[-1].stamps.end - view.windows[0].stamps.begin
     if duration < SHORT or moved < SPREAD:
         evidence = f"{duration:.0f} s, {moved:.2f} m (rms) off a straight line"
-        remedy = "record a minute in which the tag is carried through the whole room, turned, lifted and lowered"
+        remedy = (
+            "record a minute in which the tag is carried through the whole room, turned, lifted "
+            "and lowered"
+        )
         yield Finding(
             "little_motion",
             NOTE,

@@ -1,6 +1,8 @@
-"""Is a stream late against the ground truth, and by how much when? Power of what is left, for every delay that it could have.
+"""Is a stream late against the ground truth, and by how much when? Power of what is left, for every
+delay that it could have.
 
-What changes slowly, as a systematic error does, is taken out first: a mean for each pair, or axis, and block of time.
+What changes slowly, as a systematic error does, is taken out first: a mean for each pair, or axis,
+and block of time.
 """
 
 from __future__ import annotations
@@ -18,27 +20,35 @@ from .known_path import MANY
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
     from .known_path import KnownPath
 
 LONGEST, STEP = 1.5, 0.05  # s that are tried to both sides, and between them
 DELAYS = np.arange(-LONGEST, LONGEST + 0.5 * STEP, STEP)
 NONE = len(DELAYS) // 2  # place of the delay 0
 BLOCK, FEWEST = 5.0, 5  # s, and samples that a series must have in one
-TELLING = 30.0  # samples, about, of which a series has that many in a block, that it must have for anything to be said of it
+# samples, about, of which a series has that many in a block, that it must have for anything to be
+# said of it
+TELLING = 30.0
 MOST = 15000  # TDOAs that are looked at, evenly taken
-LIMIT = 2.0  # standard deviations of a series, robust, beyond which an error counts no more: what is behind obstacles is many
+# standard deviations of a series, robust, beyond which an error counts no more: what is behind
+# obstacles is many
+LIMIT = 2.0
 
 
 @dataclass(frozen=True)
 class Delays:
-    """power (series, blocks, len(DELAYS)) : sum of squares that is left of each series, in units of its variance as it is, with each
-    delay. All together tell nothing, and nothing is late, where fewer than TELLING samples are in it."""
+    """power (series, blocks, len(DELAYS)) : sum of squares that is left of each series, in units of
+    its variance as it is, with each delay. All together tell nothing, and nothing is late, where
+    fewer than TELLING samples are in it.
+    """
 
     power: np.ndarray
 
     def of_series(self, k: int) -> tuple[float, float]:
-        """(ratio, s): what is left of a series with its best delay, over what is left with the best one of all; and that delay. (1, 0) of a
-        series that tells nothing."""
+        """(ratio, s): what is left of a series with its best delay, over what is left with the best
+        one of all; and that delay. (1, 0) of a series that tells nothing.
+        """
         own, common = self.power[k].sum(axis=0), self._common
         if own[NONE] < TELLING:
             return 1.0, 0.0
@@ -51,27 +61,38 @@ class Delays:
         return int(np.argmin(self.power.sum(axis=(0, 1))))
 
     def constant(self) -> tuple[float, float]:
-        """(ratio, s): what is left with the best delay of all, over what is left without any; and that delay."""
+        """(ratio, s): what is left with the best delay of all, over what is left without any; and
+        that delay.
+        """
         total = self.power.sum(axis=(0, 1))
         best = int(np.argmin(total))
-        return (float(total[best] / total[NONE]), float(DELAYS[best])) if self._tells else (1.0, 0.0)
+        return (
+            (float(total[best] / total[NONE]), float(DELAYS[best])) if self._tells else (1.0, 0.0)
+        )
 
     @property
     def _tells(self) -> bool:
         return bool(self.power[..., NONE].sum() >= TELLING)
 
     def exact(self) -> float:
-        """s, the best delay of all, between those that are tried: the vertex of a parabola through the three about it."""
+        """s, the best delay of all, between those that are tried: the vertex of a parabola through
+        the three about it.
+        """
         if not self._tells:
             return 0.0
         total = self.power.sum(axis=(0, 1))
         k = int(np.clip(np.argmin(total), 1, len(total) - 2))
         before, here, after = total[k - 1 : k + 2]
         bend = before - 2.0 * here + after
-        return float(DELAYS[k] + (0.5 * STEP * np.clip((before - after) / bend, -1.0, 1.0) if bend > 0.0 else 0.0))
+        return float(
+            DELAYS[k]
+            + (0.5 * STEP * np.clip((before - after) / bend, -1.0, 1.0) if bend > 0.0 else 0.0)
+        )
 
     def drift(self) -> tuple[float, float]:
-        """(ratio, s): what is left if the delay changes evenly, over what is left with a constant one; from first to last block."""
+        """(ratio, s): what is left if the delay changes evenly, over what is left with a constant
+        one; from first to last block.
+        """
         if not self._tells:
             return 1.0, 0.0
         of = self.power.sum(axis=0)
@@ -81,11 +102,14 @@ class Delays:
         place = np.rint(start[..., None] + (end - start)[..., None] * share).astype(int)
         left = of[blocks, place].sum(axis=-1)
         best = np.unravel_index(np.argmin(left), left.shape)
-        return float(left[best] / max(of.sum(axis=0).min(), 1e-12)), float(DELAYS[best[1]] - DELAYS[best[0]])
+        return float(left[best] / max(of.sum(axis=0).min(), 1e-12)), float(
+            DELAYS[best[1]] - DELAYS[best[0]]
+        )
 
     def jump(self) -> tuple[float, float, int]:
-        """(ratio, s, block): what is left if the delay changes once, over what is left with a constant one; by how much, and the
-        first block after that."""
+        """(ratio, s, block): what is left if the delay changes once, over what is left with a
+        constant one; by how much, and the first block after that.
+        """
         if not self._tells:
             return 1.0, 0.0, 0
         of = self.power.sum(axis=0)
@@ -97,9 +121,15 @@ class Delays:
         return float(left[k] / max(before[-1].min(), 1e-12)), float(step), k + 1
 
 
-def delays(series: np.ndarray, t: np.ndarray, error: Callable[[float], np.ndarray], count_of_series: int | None = None) -> Delays:
-    """Delays of (n,) samples at t, s, of series numbered from 0; error(delay) -> (n,), what is left of each. count_of_series :
-    how many there are, where samples of the last may be missing."""
+def delays(
+    series: np.ndarray,
+    t: np.ndarray,
+    error: Callable[[float], np.ndarray],
+    count_of_series: int | None = None,
+) -> Delays:
+    """Delays of (n,) samples at t, s, of series numbered from 0; error(delay) -> (n,), what is left
+    of each. count_of_series : how many there are, where samples of the last may be missing.
+    """
     block = numbered(t, BLOCK)
     blocks = block.max() + 1
     group = series * blocks + block
@@ -110,7 +140,9 @@ def delays(series: np.ndarray, t: np.ndarray, error: Callable[[float], np.ndarra
     for k in np.roll(np.arange(len(DELAYS)), -NONE):  # as it is first
         left = error(DELAYS[k])
         left = left - (np.bincount(group, left, size) / np.maximum(count, 1))[group]
-        scale = _scatter(series, np.where(counted, left, np.nan))[series] if scale is None else scale
+        scale = (
+            _scatter(series, np.where(counted, left, np.nan))[series] if scale is None else scale
+        )
         left = np.where(counted, np.clip(left / scale, -LIMIT, LIMIT), 0.0)
         power[:, k] = np.bincount(group, left**2, size)
     return Delays(power.reshape(-1, blocks, len(DELAYS)))
@@ -127,15 +159,24 @@ def of_tdoas(path: KnownPath) -> Delays | None:
     parts = _looked_at(path)
     if not any(map(len, parts)):
         return None
-    series, rows = np.repeat(np.arange(len(parts)), [len(part) for part in parts]), np.concatenate(parts)
+    series, rows = (
+        np.repeat(np.arange(len(parts)), [len(part) for part in parts]),
+        np.concatenate(parts),
+    )
     t, samples = path.t[rows], path.samples
     a, b = samples.position_a[rows], samples.position_b[rows]
-    return delays(series, t, lambda delay: path.d[rows] - tdoa(path.track.positions(t - delay), a, b), len(parts))
+    return delays(
+        series,
+        t,
+        lambda delay: path.d[rows] - tdoa(path.track.positions(t - delay), a, b),
+        len(parts),
+    )
 
 
 def _looked_at(path: KnownPath) -> list[np.ndarray]:
-    """Rows of each pair of a KnownPath that are looked at, about MOST of all together: of a room some of each block, of a hall, of which
-    few pairs are heard in a block, those of some blocks."""
+    """Rows of each pair of a KnownPath that are looked at, about MOST of all together: of a room
+    some of each block, of a hall, of which few pairs are heard in a block, those of some blocks.
+    """
     every = max(1, sum(map(len, path.pairs.values())) // MOST)
     if len(path.ids) <= MANY:
         return [part[::every] for part in path.pairs.values()]

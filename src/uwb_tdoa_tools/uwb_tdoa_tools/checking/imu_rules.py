@@ -1,8 +1,8 @@
-"""Does the inertial sensor fit the TDOAs? Its axes are tried in every arrangement, its rates in other units: a filter
-that leans on the sensor says by its innovations what fits.
+"""Does the inertial sensor fit the TDOAs? Its axes are tried in every arrangement, its rates in
+other units: a filter that leans on the sensor says by its innovations what fits.
 
-What turns both sensors about the vertical cannot be seen, for the yaw is not known; nor can a sign about an axis about
-which the tag did not turn.
+What turns both sensors about the vertical cannot be seen, for the yaw is not known; nor can a sign
+about an axis about which the tag did not turn.
 """
 
 from __future__ import annotations
@@ -22,32 +22,57 @@ from uwb_tdoa_ekf.streams.explain import Unexplained, compare, unexplained
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
+
     from .ordered import OrderedRecording
 
-    # ratio of what stays unexplained, its standard errors; (3, 3) for the accelerometer, for the gyroscope
+    # ratio of what stays unexplained, its standard errors; (3, 3) for the accelerometer, for the
+    # gyroscope
     Arrangement = tuple[float, float, np.ndarray, np.ndarray]
 
 # s that are tried, to be sure and to choose; Hz to which the samples are averaged
 PART, BRIEF, RATE = 30.0, 14.0, 200.0
 SLOWEST = 50.0  # Hz; of fewer samples nothing is alleged
-# The filter leans on the IMU: TDOAs count for little, and the bias of the accelerometer may be large.
+# The filter leans on the IMU: TDOAs count for little, and the bias of the accelerometer may be
+# large.
 LEANING = FilterConfig(tdoa_correlation_length=100.0, initial_accel_bias_std=0.5)
-RATIO, DEVIATIONS = 0.9, 2.5  # of what stays unexplained; healthy flights: 0.98 at least for anything that is tried
-MOVED = 0.3  # m, standard deviation of the places of a tag that moves; measured flights 1.2 at least
-STEADY, TURNED = 0.02, 0.3  # share of the specific force by which it varies at rest; rad that a sensor in motion turns at least
+RATIO, DEVIATIONS = (
+    0.9,
+    2.5,
+)  # of what stays unexplained; healthy flights: 0.98 at least for anything that is tried
+MOVED = (
+    0.3  # m, standard deviation of the places of a tag that moves; measured flights 1.2 at least
+)
+STEADY, TURNED = (
+    0.02,
+    0.3,
+    # share of the specific force by which it varies at rest; rad that a sensor in motion turns at least
+)
 TIE = 0.03  # ratios this close say the same: the simplest arrangement is taken
 CHOSEN = 8  # arrangements that are tried on the longer part
 UPRIGHT, MIRROR = np.eye(3), np.diag([1.0, -1.0, 1.0])
 # Axes that are exchanged or mirrored, as (3, 3) matrices that undo it; the first is as it is.
-ARRANGEMENTS = [np.diag(signs)[list(order)] for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3))]
+ARRANGEMENTS = [
+    np.diag(signs)[list(order)]
+    for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3))
+]
 # Of the gyroscope, and what it would be. (Degrees/s are seen in the stream itself.)
-SCALES = {180.0 / np.pi: "rad/s, divided by 57.3 once too often", 2.0 * np.pi: "revolutions/s, not rad/s"}
+SCALES = {
+    180.0 / np.pi: "rad/s, divided by 57.3 once too often",
+    2.0 * np.pi: "revolutions/s, not rad/s",
+}
 
 
 def fit(recording: OrderedRecording) -> Finding | None:
-    """What does not fit about the IMU: Finding or None. recording : OrderedRecording whose TDOAs are right."""
+    """What does not fit about the IMU: Finding or None. recording : OrderedRecording whose TDOAs
+    are right.
+    """
     brief = replace(recording, imu=averaged(recording.imu)).part(PART)
-    if brief.imu is None or len(brief.imu) < SLOWEST * PART / 2.0 or stands(brief.imu) or not moved(recording.survey_fit.places):
+    if (
+        brief.imu is None
+        or len(brief.imu) < SLOWEST * PART / 2.0
+        or stands(brief.imu)
+        or not moved(recording.survey_fit.places)
+    ):
         return None
     base = _unexplained(brief)
     trials = [_tried(base, brief, accel, gyro) for accel, gyro in _usual()]
@@ -68,14 +93,20 @@ def fit(recording: OrderedRecording) -> Finding | None:
 
 
 def moved(places: np.ndarray) -> bool:
-    """Whether a tag that was at places (k, 3) m has moved: of one that stands, TDOAs tell nothing about the inertial sensor."""
+    """Whether a tag that was at places (k, 3) m has moved: of one that stands, TDOAs tell nothing
+    about the inertial sensor.
+    """
     return len(places) > 0 and bool(np.sqrt(np.sum(np.var(places, axis=0))) > MOVED)
 
 
 def stands(imu: Imu) -> bool:
-    """Whether an inertial sensor neither shakes nor turns, in whatever unit its rates are: nothing determines that unit then."""
+    """Whether an inertial sensor neither shakes nor turns, in whatever unit its rates are: nothing
+    determines that unit then.
+    """
     turned = np.cumsum(imu.gyro - imu.gyro.mean(axis=0), axis=0) * float(np.median(np.diff(imu.t)))
-    steady = np.linalg.norm(np.std(imu.accel, axis=0)) < STEADY * np.linalg.norm(imu.accel.mean(axis=0))
+    steady = np.linalg.norm(np.std(imu.accel, axis=0)) < STEADY * np.linalg.norm(
+        imu.accel.mean(axis=0)
+    )
     return bool(steady and np.ptp(turned, axis=0).max() * max(SCALES) < TURNED)
 
 
@@ -86,13 +117,16 @@ def averaged(imu: Imu | None) -> Imu | None:
     count = max(1, round((len(imu) - 1) / max(imu.t[-1] - imu.t[0], 1e-9) / RATE))
     rows = len(imu) // count * count
     columns = (
-        column[:rows].reshape(-1, count, *column.shape[1:]).mean(axis=1) for column in (imu.t, imu.gyro, imu.accel)
+        column[:rows].reshape(-1, count, *column.shape[1:]).mean(axis=1)
+        for column in (imu.t, imu.gyro, imu.accel)
     )
     return Imu(*map(np.ascontiguousarray, columns))
 
 
 def _usual() -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """The mistakes that are made most: (accelerometer, gyroscope) as (3, 3) matrices that undo them."""
+    """The mistakes that are made most: (accelerometer, gyroscope) as (3, 3) matrices that undo
+    them.
+    """
     for signs in product((1.0, -1.0), repeat=3):
         if signs != (1.0, 1.0, 1.0):
             yield UPRIGHT, np.diag(signs)
@@ -112,23 +146,34 @@ def _scaled(trials: Sequence[Arrangement]) -> np.ndarray | None:
 
 
 def _all(recording: OrderedRecording, base: Unexplained) -> list[Arrangement]:
-    """Trials of all arrangements of the gyroscope against the accelerometer, and its mirror image; the yaw is free
-    anyway."""
+    """Trials of all arrangements of the gyroscope against the accelerometer, and its mirror image;
+    the yaw is free anyway.
+    """
     short = recording.part(BRIEF)
     of_short = _unexplained(short)
     ratios: list[float] = []
     arrangements = list(product((UPRIGHT, MIRROR), ARRANGEMENTS))
     for accel, gyro in arrangements:
         chosen = sorted(ratios)[CHOSEN - 1] if len(ratios) >= CHOSEN else np.inf  # of those so far
-        ratio, _ = compare(of_short, _unexplained(_arranged(short, accel, gyro), chosen * of_short.mean))
+        ratio, _ = compare(
+            of_short, _unexplained(_arranged(short, accel, gyro), chosen * of_short.mean)
+        )
         ratios.append(ratio if np.isfinite(ratio) else np.inf)
-    return [_tried(base, recording, *arrangements[k]) for k in np.argsort(ratios, kind="stable")[:CHOSEN]]
+    return [
+        _tried(base, recording, *arrangements[k])
+        for k in np.argsort(ratios, kind="stable")[:CHOSEN]
+    ]
 
 
-def _tried(base: Unexplained, recording: OrderedRecording, accel: np.ndarray, gyro: np.ndarray) -> Arrangement:
-    """What an arrangement leaves of `base`; an infinite ratio if that is so much that it is neither taken nor says the same as one that
-    is."""
-    ratio, z = compare(base, _unexplained(_arranged(recording, accel, gyro), (RATIO + TIE) * base.mean))
+def _tried(
+    base: Unexplained, recording: OrderedRecording, accel: np.ndarray, gyro: np.ndarray
+) -> Arrangement:
+    """What an arrangement leaves of `base`; an infinite ratio if that is so much that it is neither
+    taken nor says the same as one that is.
+    """
+    ratio, z = compare(
+        base, _unexplained(_arranged(recording, accel, gyro), (RATIO + TIE) * base.mean)
+    )
     return ratio if np.isfinite(ratio) else np.inf, z, accel, gyro
 
 
@@ -150,7 +195,9 @@ def _unexplained(recording: OrderedRecording, limit: float = np.inf) -> Unexplai
 
 def _complexity(accel: np.ndarray, gyro: np.ndarray) -> float:
     """How many things must have gone wrong."""
-    if np.array_equal(accel, MIRROR) and (np.array_equal(gyro, MIRROR) or np.array_equal(gyro, -MIRROR)):
+    if np.array_equal(accel, MIRROR) and (
+        np.array_equal(gyro, MIRROR) or np.array_equal(gyro, -MIRROR)
+    ):
         return 1.5
     wrong_signs = np.count_nonzero(gyro.sum(axis=1) < 0.0)
     moved = np.count_nonzero(np.diag(gyro) == 0.0)
@@ -161,20 +208,29 @@ def _finding(accel: np.ndarray, gyro: np.ndarray, evidence: str, ratio: float) -
     scale = scale_of(gyro)
     unit = next((name for value, name in SCALES.items() if abs(value / scale - 1.0) < 1e-6), None)
     if unit:
-        line = f"for axis in 'xyz': setattr(w, axis, {scale:.6g} * getattr(w, axis))  # w = message.angular_velocity"
+        line = (
+            f"for axis in 'xyz': setattr(w, axis, {scale:.6g} * getattr(w, axis))  # w = "
+            "message.angular_velocity"
+        )
         return Finding("imu_rate_unit", ERROR, f"the gyroscope is in {unit}", evidence, line, scale)
     if np.array_equal(accel, MIRROR) and np.array_equal(gyro, -MIRROR):
         cause = (
-            "the survey is the mirror image of the room: an axis has the wrong sign, e.g. z down, or two are exchanged"
+            "the survey is the mirror image of the room: an axis has the wrong sign, e.g. z down, "
+            "or two are exchanged"
         )
-        line = "x, y, z = y, x, z  # of every anchor; or the axis with the wrong sign turned: z = -z"
+        line = (
+            "x, y, z = y, x, z  # of every anchor; or the axis with the wrong sign turned: z = -z"
+        )
         return Finding("survey_mirrored", ERROR, cause, evidence, line, ratio)
     parts = []
     for name, variable, matrix in (("accelerometer", "a", accel), ("gyroscope", "w", gyro)):
         if not np.array_equal(matrix, UPRIGHT):
             parts.append((name, variable, matrix))
     who = " and ".join(name for name, _, _ in parts)
-    line = "; ".join(f"{v}.x, {v}.y, {v}.z = {', '.join(signed_axis(row, f'{v}.') for row in matrix)}" for _, v, matrix in parts)
+    line = "; ".join(
+        f"{v}.x, {v}.y, {v}.z = {', '.join(signed_axis(row, f'{v}.') for row in matrix)}"
+        for _, v, matrix in parts
+    )
     cause = f"axes or signs of the {who} are wrong: x forward, y left, z up is needed, right-handed"
     return Finding("imu_axes", ERROR, cause, evidence, line, ratio)
 

@@ -1,6 +1,8 @@
-"""Does the inertial sensor fit the turns and accelerations of the ground truth? A rule takes a TrueMotion and yields Findings.
+"""Does the inertial sensor fit the turns and accelerations of the ground truth? A rule takes a
+TrueMotion and yields Findings.
 
-Both sensors are compared over short cells; constant biases and what changes slowly are taken out first.
+Both sensors are compared over short cells; constant biases and what changes slowly are taken out
+first.
 """
 
 from __future__ import annotations
@@ -19,7 +21,9 @@ from .time_rules import changing
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
     from uwb_tdoa_bias.foundation.flight import Flight
+
     from .delays import Delays
 
 CELL, HALF = 0.05, 0.1  # s between cells, and half the time over which one is averaged
@@ -27,11 +31,17 @@ BEYOND = round(LONGEST / CELL)  # cells at either end that are there for what is
 FEWEST = 200  # cells in the air
 LIMIT = 4.0  # standard deviations, robust, beyond which a difference counts no more
 GRAVITY = 9.81  # m/s^2
-# Of the power that is left with the axes of a sensor otherwise: healthy 1.22 and 0.92 at least; of that, with another attitude of
+# Of the power that is left with the axes of a sensor otherwise: healthy 1.22 and 0.92 at least; of
+# that, with another attitude of
 # the truth.
 AXES, ATTITUDE = {"gyro": 0.8, "accel": 0.75}, 1.2
-# Of the power that is left behind a low pass: healthy 0.87 at least, and where the sensor is too smooth; and the time constants, s.
-FILTERED, FILTERED_TOO, SLOWNESS = 0.8, 0.97, (0.05, 0.1, 0.2, 0.4, 0.8)  # of the power that is left with a low pass; s, its time constants
+# Of the power that is left behind a low pass: healthy 0.87 at least, and where the sensor is too
+# smooth; and the time constants, s.
+FILTERED, FILTERED_TOO, SLOWNESS = (
+    0.8,
+    0.97,
+    (0.05, 0.1, 0.2, 0.4, 0.8),
+)  # of the power that is left with a low pass; s, its time constants
 SENSORS = {"gyro": "gyroscope", "accel": "accelerometer"}
 # What an attitude x, y, z, w may be instead: {words: places, signs}
 ATTITUDES = {
@@ -40,12 +50,14 @@ ATTITUDES = {
     "of a frame that is mirrored along z": ([0, 1, 2, 3], (-1, -1, 1, 1)),
     "from the world to the body": ([0, 1, 2, 3], (-1, -1, -1, 1)),
     "written with w first": ([1, 2, 3, 0], (1, 1, 1, 1)),
-}  # fmt: skip
+}
 
 
 class TrueMotion:
-    """measured {"gyro", "accel": (n, 3)}, means over cells at t (n,) s in the air, or of all of a rover; block (n,), of BLOCK seconds;
-    smooth {sensor: bool}, whether it changes too evenly for a sensor that vibrates."""
+    """measured {"gyro", "accel": (n, 3)}, means over cells at t (n,) s in the air, or of all of a
+    rover; block (n,), of BLOCK seconds; smooth {sensor: bool}, whether it changes too evenly for a
+    sensor that vibrates.
+    """
 
     def __init__(self, flight: Flight) -> None:
         """flight : Flight with inertial samples and ground truth with attitudes."""
@@ -57,13 +69,21 @@ class TrueMotion:
         above = self._p[:, 2] > 0.3
         flown = self._t[above] if above.any() else self._t  # a rover
         margin = LONGEST + 0.5
-        start, end = max(flown[0], imu.t[0], self._t[0]) + margin, min(flown[-1], imu.t[-1], self._t[-1]) - margin
-        cells = min(max(int((end - start) / CELL), 0), len(imu))  # of a pause of days, the time before it
+        start, end = (
+            max(flown[0], imu.t[0], self._t[0]) + margin,
+            min(flown[-1], imu.t[-1], self._t[-1]) - margin,
+        )
+        cells = min(
+            max(int((end - start) / CELL), 0), len(imu)
+        )  # of a pause of days, the time before it
         self.t = start + CELL * np.arange(cells)
         self.block = (CELL * np.arange(len(self.t)) / BLOCK).astype(int)
         if len(self) < FEWEST:
             return
-        self.measured = {"gyro": _mean(imu.t, imu.gyro, self.t), "accel": _triangle(imu.t, imu.accel, self.t)}
+        self.measured = {
+            "gyro": _mean(imu.t, imu.gyro, self.t),
+            "accel": _triangle(imu.t, imu.accel, self.t),
+        }
         self.true = self.with_attitude(None)
         self.smooth = {"gyro": smooth(imu.t, imu.gyro), "accel": smooth(imu.t, imu.accel)}
         self._scale = {}
@@ -76,8 +96,9 @@ class TrueMotion:
         return len(self.t)
 
     def with_attitude(self, name: str | None) -> dict[str, np.ndarray]:
-        """{"gyro", "accel": (n + 2 BEYOND, 3)}, what the sensors should have measured at t and LONGEST before and after, with an
-        attitude of ATTITUDES, or the one that is written."""
+        """{"gyro", "accel": (n + 2 BEYOND, 3)}, what the sensors should have measured at t and
+        LONGEST before and after, with an attitude of ATTITUDES, or the one that is written.
+        """
         order, signs = ATTITUDES[name] if name else ([0, 1, 2, 3], (1, 1, 1, 1))
         turn = Slerp(self._t, Rotation.from_quat(self._q[:, order] * signs))
         t = self.t[0] + CELL * np.arange(-BEYOND, len(self.t) + BEYOND)
@@ -91,7 +112,9 @@ class TrueMotion:
         return true[BEYOND - late : len(true) - BEYOND - late]
 
     def power(self, sensor: str, true: np.ndarray, change: np.ndarray | None = None) -> float:
-        """Mean clipped square of measured, turned by `change`, minus true (n + 2 BEYOND, 3), in units of its scatter as it is."""
+        """Mean clipped square of measured, turned by `change`, minus true (n + 2 BEYOND, 3), in
+        units of its scatter as it is.
+        """
         measured = self.measured[sensor] if change is None else self.measured[sensor] @ change.T
         left = _slowly_left(measured - self.at(true), self.block) / self._scale[sensor]
         return float(np.mean(np.clip(left, -LIMIT, LIMIT) ** 2))
@@ -110,7 +133,9 @@ class TrueMotion:
 def _slowly_left(values: np.ndarray, block: np.ndarray) -> np.ndarray:
     """(n, 3) without their means over blocks."""
     count = np.maximum(np.bincount(block), 1)
-    return values - np.stack([(np.bincount(block, column) / count)[block] for column in values.T], axis=1)
+    return values - np.stack(
+        [(np.bincount(block, column) / count)[block] for column in values.T], axis=1
+    )
 
 
 def _integral(t: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -130,32 +155,59 @@ def _mean(t: np.ndarray, values: np.ndarray, when: np.ndarray) -> np.ndarray:
 
 
 def _triangle(t: np.ndarray, values: np.ndarray, when: np.ndarray) -> np.ndarray:
-    """(n, 3): means with a triangular weight, HALF to both sides, which is what a second difference of places is of."""
+    """(n, 3): means with a triangular weight, HALF to both sides, which is what a second difference
+    of places is of.
+    """
     total = _integral(t, _integral(t, values - values.mean(axis=0)))
     second = _at(t, total, when + HALF) - 2.0 * _at(t, total, when) + _at(t, total, when - HALF)
     return second / HALF**2 + values.mean(axis=0)
 
 
 def axes(motion: TrueMotion) -> Iterator[Finding]:
-    """Axes that are exchanged or mirrored, a gyroscope in another unit, or a truth whose attitude is another one."""
+    """Axes that are exchanged or mirrored, a gyroscope in another unit, or a truth whose attitude
+    is another one.
+    """
     base = {sensor: motion.power(sensor, motion.true[sensor]) for sensor in SENSORS}
     best = {sensor: _best_arrangement(motion, sensor) for sensor in SENSORS}
     wrong = [sensor for sensor in SENSORS if _explains(motion, sensor, base[sensor], *best[sensor])]
-    attitude, power = min(((name, _with_attitude(motion, name)) for name in ATTITUDES), key=lambda x: x[1]["gyro"])
-    if power["gyro"] < AXES["gyro"] * base["gyro"] and power["accel"] < base["accel"] and power["gyro"] < ATTITUDE * best["gyro"][0]:
-        evidence = f"{100 * (1 - power['gyro'] / base['gyro']):.0f} % less mean square difference of the turns then, "
+    attitude, power = min(
+        ((name, _with_attitude(motion, name)) for name in ATTITUDES), key=lambda x: x[1]["gyro"]
+    )
+    if (
+        power["gyro"] < AXES["gyro"] * base["gyro"]
+        and power["accel"] < base["accel"]
+        and power["gyro"] < ATTITUDE * best["gyro"][0]
+    ):
+        evidence = (
+            f"{100 * (1 - power['gyro'] / base['gyro']):.0f} % less mean square difference of the "
+            "turns then, "
+        )
         evidence += f"{100 * (1 - power['accel'] / base['accel']):.0f} % of the accelerations"
         cause = f"the attitude of the ground truth is {attitude}"
-        yield Finding("truth_attitude", ERROR, cause, evidence, "write body to world, right-handed, x y z w", power["gyro"])
+        yield Finding(
+            "truth_attitude",
+            ERROR,
+            cause,
+            evidence,
+            "write body to world, right-handed, x y z w",
+            power["gyro"],
+        )
         return
     for sensor in wrong:
         left, change = best[sensor]
-        evidence = f"{100 * (1 - left / base[sensor]):.0f} % less mean square difference to the ground truth"
+        evidence = (
+            f"{100 * (1 - left / base[sensor]):.0f} % less mean square difference to the ground "
+            "truth"
+        )
         yield _of_axes(sensor, change, evidence, left)
 
 
-def _explains(motion: TrueMotion, sensor: str, base: float, power: float, change: np.ndarray) -> bool:
-    """Whether a change of the axes explains much of what is left without; one that makes values small, more than no values would."""
+def _explains(
+    motion: TrueMotion, sensor: str, base: float, power: float, change: np.ndarray
+) -> bool:
+    """Whether a change of the axes explains much of what is left without; one that makes values
+    small, more than no values would.
+    """
     if scale_of(change) < 0.9:
         base = min(base, motion.power(sensor, motion.true[sensor], np.zeros((3, 3))))
     return power < AXES[sensor] * base
@@ -163,12 +215,22 @@ def _explains(motion: TrueMotion, sensor: str, base: float, power: float, change
 
 def _best_arrangement(motion: TrueMotion, sensor: str) -> tuple[float, np.ndarray]:
     """(power that is left, (3, 3) matrix) of what explains most."""
-    return min(((motion.power(sensor, motion.true[sensor], change), change) for change in _arrangements(sensor)), key=lambda x: x[0])
+    return min(
+        (
+            (motion.power(sensor, motion.true[sensor], change), change)
+            for change in _arrangements(sensor)
+        ),
+        key=lambda x: x[0],
+    )
 
 
 def _arrangements(sensor: str) -> list[np.ndarray]:
     """[(3, 3) matrix that undoes it] of what may be wrong with the axes of a sensor."""
-    scales = [scale * np.eye(3) for unit in SCALES for scale in (unit, 1.0 / unit)] if sensor == "gyro" else []
+    scales = (
+        [scale * np.eye(3) for unit in SCALES for scale in (unit, 1.0 / unit)]
+        if sensor == "gyro"
+        else []
+    )
     return [*ARRANGEMENTS[1:], *scales]
 
 
@@ -180,26 +242,66 @@ def _with_attitude(motion: TrueMotion, name: str) -> dict[str, float]:
 def _of_axes(sensor: str, change: np.ndarray, evidence: str, power: float) -> Finding:
     scale = scale_of(change)
     if abs(scale - 1.0) > 0.1:
-        cause = f"the gyroscope is in another unit than rad/s: it reads {1.0 / scale:.3g} times the turns of the ground truth"
-        return Finding("imu_rate_unit", ERROR, cause, evidence, f"angular_velocity *= {scale:.6g}", scale)
-    words = [f"{axis} is {found}" for axis, found in zip("xyz", map(signed_axis, change)) if found != axis]
-    cause = f"axes of the {SENSORS[sensor]} are exchanged or mirrored: {', '.join(words)} of what it reads"
-    return Finding(f"{sensor}_axes", ERROR, cause, evidence, "put the driver right: x forward, y left, z up", power)
+        cause = (
+            f"the gyroscope is in another unit than rad/s: it reads {1.0 / scale:.3g} times the "
+            "turns of the ground truth"
+        )
+        return Finding(
+            "imu_rate_unit", ERROR, cause, evidence, f"angular_velocity *= {scale:.6g}", scale
+        )
+    words = [
+        f"{axis} is {found}"
+        for axis, found in zip("xyz", map(signed_axis, change))
+        if found != axis
+    ]
+    cause = (
+        f"axes of the {SENSORS[sensor]} are exchanged or mirrored: {', '.join(words)} of what it "
+        "reads"
+    )
+    return Finding(
+        f"{sensor}_axes",
+        ERROR,
+        cause,
+        evidence,
+        "put the driver right: x forward, y left, z up",
+        power,
+    )
 
 
 def filtered(motion: TrueMotion) -> Iterator[Finding]:
-    """A low pass of first order in a sensor: its output is late and too small. The truth is noisy, and fits better behind any low
-    pass: one that runs backwards tells by how much."""
+    """A low pass of first order in a sensor: its output is late and too small. The truth is noisy,
+    and fits better behind any low pass: one that runs backwards tells by how much.
+    """
     for sensor in SENSORS:
         true, limit = motion.true[sensor], FILTERED_TOO if motion.smooth[sensor] else FILTERED
-        powers = [(motion.power(sensor, _slowed(true, tau)), motion.power(sensor, _slowed(true[::-1], tau)[::-1]), tau) for tau in SLOWNESS]
+        powers = [
+            (
+                motion.power(sensor, _slowed(true, tau)),
+                motion.power(sensor, _slowed(true[::-1], tau)[::-1]),
+                tau,
+            )
+            for tau in SLOWNESS
+        ]
         power, backwards, slowness = min(powers)
         backwards = min(backwards, motion.power(sensor, true))
         if power < limit * backwards:
-            cause = f"the {SENSORS[sensor]} is filtered: what it reads is {slowness:g} s late and too small"
-            less = f"{100 * (1 - power / backwards):.0f} % less mean square difference to the ground truth"
+            cause = (
+                f"the {SENSORS[sensor]} is filtered: what it reads is {slowness:g} s late and too "
+                "small"
+            )
+            less = (
+                f"{100 * (1 - power / backwards):.0f} % less mean square difference to the ground "
+                "truth"
+            )
             evidence = f"{less} behind a low pass of {slowness:g} s"
-            yield Finding("imu_filtered", ERROR, cause, evidence, "set the low pass of the sensor to 20 Hz or more", slowness)
+            yield Finding(
+                "imu_filtered",
+                ERROR,
+                cause,
+                evidence,
+                "set the low pass of the sensor to 20 Hz or more",
+                slowness,
+            )
 
 
 def _slowed(values: np.ndarray, tau: float) -> np.ndarray:

@@ -1,6 +1,8 @@
-"""What is wrong with the TDOAs of single pairs, or of all: values, signs, ids. A rule takes a KnownPath and yields Findings.
+"""What is wrong with the TDOAs of single pairs, or of all: values, signs, ids. A rule takes a
+KnownPath and yields Findings.
 
-Limits are shares, or what is left of an error. The healthy values beside them are the extremes of the pairs of 37 measured recordings.
+Limits are shares, or what is left of an error. The healthy values beside them are the extremes of
+the pairs of 37 measured recordings.
 """
 
 from __future__ import annotations
@@ -17,24 +19,41 @@ from .known_path import MANY
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
+
     from .known_path import KnownPath
 
-    Fault = tuple[str, str, str, float]  # what the pair does, evidence, remedy, and the number that decided
+    Fault = tuple[
+        str, str, str, float
+    ]  # what the pair does, evidence, remedy, and the number that decided
 
-# Of the median error that is left with the other sign, or with the ids exchanged: healthy 2.1 and 0.68 at least.
+# Of the median error that is left with the other sign, or with the ids exchanged: healthy 2.1 and
+# 0.68 at least.
 CONTRARY = 0.4
 MOVED = 0.3  # m by which what a pair should measure varies, at least, for its sign to be determined
-GRID, ON_GRID = 0.03, 1e-4  # m: least step of what counts as rounded, healthy 0.014 at most, and how near to it values are
+GRID, ON_GRID = (
+    0.03,
+    1e-4,
+)  # m: least step of what counts as rounded, healthy 0.014 at most, and how near to it values are
 BETWEEN = 0.2  # share of TDOAs on the line between their neighbours; healthy 0.04
-REPEATED, FROZEN = 0.2, 8  # share of TDOAs that equal the one before, healthy 0.06; how many together with one value, healthy 5
-AT_END, HITS = 0.04, 5  # share of TDOAs at the largest or smallest value, healthy 0.03, and how many
+REPEATED, FROZEN = (
+    0.2,
+    8,
+    # share of TDOAs that equal the one before, healthy 0.06; how many together with one value, healthy
+    # 5
+)
+AT_END, HITS = (
+    0.04,
+    5,
+)  # share of TDOAs at the largest or smallest value, healthy 0.03, and how many
 MOST = 0.5  # share of the pairs with the same fault, from which on it is one of all
 OFF = 3.0  # times the median error of most anchors, of one that may be exchanged with another
 EXCHANGES = 4  # pairs of anchors that are exchanged one after the other
 
 
 def values(path: KnownPath) -> Iterator[Finding]:
-    """Pairs with the other sign, rounded, interpolated, repeated, clipped or frozen; all of them alike count as one finding."""
+    """Pairs with the other sign, rounded, interpolated, repeated, clipped or frozen; all of them
+    alike count as one finding.
+    """
     found: dict[str, dict[tuple[int, int], Fault]] = {}
     for pair, rows in path.pairs.items():
         for rule in OF_PAIR:
@@ -46,21 +65,44 @@ def values(path: KnownPath) -> Iterator[Finding]:
         if len(of_pairs) >= MOST * len(path.pairs):
             _, (what, evidence, remedy, value) = next(iter(of_pairs.items()))
             evidence = f"{len(of_pairs)} of {len(path.pairs)} pairs; of the first: {evidence}"
-            yield Finding(f"tdoa_{name}", ERROR, f"the TDOAs of all pairs are wrong: each {what}", evidence, remedy, value)
+            yield Finding(
+                f"tdoa_{name}",
+                ERROR,
+                f"the TDOAs of all pairs are wrong: each {what}",
+                evidence,
+                remedy,
+                value,
+            )
             continue
         for pair, (what, evidence, remedy, value) in of_pairs.items():
-            yield Finding(f"pair_{name}", ERROR, f"the TDOA of the pair ({pair[0]}, {pair[1]}) {what}", evidence, remedy, value)
+            yield Finding(
+                f"pair_{name}",
+                ERROR,
+                f"the TDOA of the pair ({pair[0]}, {pair[1]}) {what}",
+                evidence,
+                remedy,
+                value,
+            )
 
 
 def contrary(path: KnownPath) -> list[tuple[int, int]]:
     """[(a, b)] of the pairs whose sign is the other one."""
-    return [pair for pair, rows in path.pairs.items() if _sign(path.d[rows], path.true[rows], None) is not None]
+    return [
+        pair
+        for pair, rows in path.pairs.items()
+        if _sign(path.d[rows], path.true[rows], None) is not None
+    ]
 
 
 def _sign(d: np.ndarray, true: np.ndarray, t: np.ndarray | None) -> Fault | None:
     same, other = (float(np.median(np.abs(sign * d - true))) for sign in (1.0, -1.0))
     if np.std(true) > MOVED and other < CONTRARY * same:
-        return "has the wrong sign", f"median error {same:.2f} m, with the other sign {other:.2f} m", "distance_difference *= -1.0", other
+        return (
+            "has the wrong sign",
+            f"median error {same:.2f} m, with the other sign {other:.2f} m",
+            "distance_difference *= -1.0",
+            other,
+        )
     return None
 
 
@@ -70,7 +112,12 @@ def _rounded(d: np.ndarray, true: np.ndarray, t: np.ndarray) -> Fault | None:
         return None
     grid = float(np.diff(values).min())
     if grid > GRID and (np.abs(d / grid - np.round(d / grid)) < ON_GRID / grid).all():
-        return f"is rounded to {grid:.3g} m", f"{len(values)} values, all multiples of it", "publish it as measured", grid
+        return (
+            f"is rounded to {grid:.3g} m",
+            f"{len(values)} values, all multiples of it",
+            "publish it as measured",
+            grid,
+        )
     return None
 
 
@@ -95,20 +142,38 @@ def _repeated(d: np.ndarray, true: np.ndarray, t: np.ndarray) -> Fault | None:
     length = length[(d[first] > d.min()) & (d[first] < d.max())]
     if not len(length):
         return None
-    share = float((length.sum() - len(length) - (length.max() - 1)) / max(length.sum() - length.max(), 1))
+    share = float(
+        (length.sum() - len(length) - (length.max() - 1)) / max(length.sum() - length.max(), 1)
+    )
     if share > REPEATED:
-        return "is published more than once", f"{100 * share:.0f} % equal the one before", "publish a TDOA when there is a new one", share
+        return (
+            "is published more than once",
+            f"{100 * share:.0f} % equal the one before",
+            "publish a TDOA when there is a new one",
+            share,
+        )
     return None
 
 
 def _clipped(d: np.ndarray, true: np.ndarray, t: np.ndarray) -> Fault | None:
-    """Many at one end; if they are all together, there where the geometry is beyond it, or it stands still."""
+    """Many at one end; if they are all together, there where the geometry is beyond it, or it
+    stands still.
+    """
     for end, outward in ((d.max(), 1.0), (d.min(), -1.0)):
         at = d == end
         together = np.sum(np.diff(np.flatnonzero(at)) > 1) == 0
-        if at.sum() > AT_END * len(d) and at.sum() >= HITS and not (together and np.median(outward * (true[at] - end)) < 0.0):
+        if (
+            at.sum() > AT_END * len(d)
+            and at.sum() >= HITS
+            and not (together and np.median(outward * (true[at] - end)) < 0.0)
+        ):
             evidence = f"{100 * at.mean():.0f} % have this value"
-            return f"is clipped at {end:.2f} m", evidence, "widen the limit of the driver", float(end)
+            return (
+                f"is clipped at {end:.2f} m",
+                evidence,
+                "widen the limit of the driver",
+                float(end),
+            )
     return None
 
 
@@ -117,7 +182,9 @@ def _frozen(d: np.ndarray, true: np.ndarray, t: np.ndarray) -> Fault | None:
     k = int(np.argmax(length))
     rows = slice(first[k], first[k] + length[k])
     if length[k] >= FROZEN and np.ptp(true[rows]) > 0.02:
-        evidence = f"{length[k]} times {d[first[k]]:.3f} m while it changes by {np.ptp(true[rows]):.2f} m"
+        evidence = (
+            f"{length[k]} times {d[first[k]]:.3f} m while it changes by {np.ptp(true[rows]):.2f} m"
+        )
         what = f"stands still from {t[rows][0]:.1f} to {t[rows][-1]:.1f} s"
         return what, evidence, "publish a TDOA when there is a new one", float(t[rows][0])
     return None
@@ -138,19 +205,33 @@ def ids(path: KnownPath) -> Iterator[Finding]:
     if table:
         names = ", ".join(f"{wrong} is {right}" for wrong, right in table.items())
         evidence = f"median error of their TDOAs {before:.2f} m, exchanged {after:.2f} m"
-        line = f"id = {{{', '.join(f'{wrong}: {right}' for wrong, right in table.items())}}}.get(id, id)"
-        yield Finding("ids_exchanged", ERROR, f"the ids of anchors are exchanged: what is called {names}", evidence, line, after)
+        line = (
+            f"id = {{{', '.join(f'{wrong}: {right}' for wrong, right in table.items())}}}.get(id, "
+            "id)"
+        )
+        yield Finding(
+            "ids_exchanged",
+            ERROR,
+            f"the ids of anchors are exchanged: what is called {names}",
+            evidence,
+            line,
+            after,
+        )
 
 
 def renamed(path: KnownPath) -> tuple[dict[int, int], float, float]:
-    """({id as received: id of that anchor}, median error m of the TDOAs of these anchors as they are, and then)."""
+    """({id as received: id of that anchor}, median error m of the TDOAs of these anchors as they
+    are, and then).
+    """
     rows = np.arange(len(path.ids))
     table: dict[int, int] = {}
     errors: tuple[float, ...] = (0.0, 0.0)
     doubtful: np.ndarray = rows
     if len(rows) > MANY:  # only what is called by another's name is far off
         each = np.array([_median_errors(path, [row], rows)[0] for row in rows.tolist()])
-        doubtful = np.flatnonzero(np.isfinite(each) & (each > OFF * np.median(each[np.isfinite(each)])))
+        doubtful = np.flatnonzero(
+            np.isfinite(each) & (each > OFF * np.median(each[np.isfinite(each)]))
+        )
     for _ in range(EXCHANGES):
         best = None
         for one, two in combinations(doubtful.tolist(), 2):
@@ -169,8 +250,12 @@ def renamed(path: KnownPath) -> tuple[dict[int, int], float, float]:
     return table, before, after
 
 
-def _median_errors(path: KnownPath, anchors: Sequence[int] | np.ndarray, *tables: np.ndarray) -> tuple[float, ...]:
-    """Median |error| m of the TDOAs in the air with some anchors (rows), under each table of the rows of the anchors."""
+def _median_errors(
+    path: KnownPath, anchors: Sequence[int] | np.ndarray, *tables: np.ndarray
+) -> tuple[float, ...]:
+    """Median |error| m of the TDOAs in the air with some anchors (rows), under each table of the
+    rows of the anchors.
+    """
     samples, flown = path.samples, path.flown
     a, b = samples.a[flown], samples.b[flown]
     named = np.zeros(len(path.ids), bool)
@@ -180,4 +265,6 @@ def _median_errors(path: KnownPath, anchors: Sequence[int] | np.ndarray, *tables
         return tuple(np.inf for _ in tables)
     a, b, d, p = a[with_them], b[with_them], path.d[flown][with_them], samples.p[flown][with_them]
     at = samples.anchors.positions
-    return tuple(float(np.median(np.abs(d - tdoa(p, at[table[a]], at[table[b]])))) for table in tables)
+    return tuple(
+        float(np.median(np.abs(d - tdoa(p, at[table[a]], at[table[b]])))) for table in tables
+    )

@@ -15,23 +15,26 @@ from uwb_tdoa_bias.foundation.flight import Imu, Tdoas
 from uwb_tdoa_bias.foundation.sensors import LOCATING, SENSORS
 from uwb_tdoa_bias.foundation.survey_faults import refuse_faulty
 
-from ..bags import messages as bag_messages, placing
+from ..bags import messages as bag_messages
+from ..bags import placing
 from ..bags.anchor_sources import recorded_anchors
 from ..bags.bag import Names, arrivals, on_one_clock, read_sensor, read_topic
 from ..bags.files import open_bag, remarks_of
+from ..bags.kind import is_bag
 from ..bags.placing import TF_STATIC
 from ..readers import read_survey
-from ..bags.kind import is_bag
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
     from uwb_tdoa_bias.foundation.flight import Flight
     from uwb_tdoa_bias.foundation.sensors.sensor import Sensor, Stream
+
     from ..bags.bag import TopicMessages
     from ..bags.placing import Place
     from ..clock import Jump
-    from ..readers.inputs import Reading
     from ..live.ends import End
+    from ..readers.inputs import Reading
 
 IMU, TDOA = "imu/data", "uwb/tdoa"
 OF_SENSORS = tuple(topic for sensor in SENSORS.values() for topic, _ in sensor.topics)
@@ -44,14 +47,19 @@ _ROWS = {
 
 @dataclass(frozen=True)
 class Recording:
-    """Nothing here is sorted, and ground truth is not read. Stamps are on one continuous time (see `clock.straightened`).
+    """Nothing here is sorted, and ground truth is not read. Stamps are on one continuous time (see
+    `clock.straightened`).
 
     name : short; anchors : Anchors to check against; tdoa : Tdoas; imu : Imu or None;
-    tdoa_arrival, imu_arrival : (n,) s, when the recorder received them, NaN where that is not known;
-    frames : {topic: {frame_id: messages}}; places : {frame_id: (Rotation, arm (3,) m)} of those that /tf_static connects
+    tdoa_arrival, imu_arrival : (n,) s, when the recorder received them, NaN where that is not
+        known;
+    frames : {topic: {frame_id: messages}}; places : {frame_id: (Rotation, arm (3,) m)} of those
+        that /tf_static connects
     with the body, where the samples are those of an IMU in its origin;
-    topics : {topic: type} of a bag, or of all that are live; read : names of those that were read, or are our own;
-    recorded : Anchors that the bag itself holds, or None; falls : how often the stamps fell in a file whose reader has sorted them;
+    topics : {topic: type} of a bag, or of all that are live; read : names of those that were read,
+        or are our own;
+    recorded : Anchors that the bag itself holds, or None; falls : how often the stamps fell in a
+        file whose reader has sorted them;
     remarks : sentences on what could not be read of a damaged one; ends : [End] of live topics;
     sensors : {name: Stream} of those of the SENSORS that there are; jumps : of the clock, which
     is continuous here, and outliers : {stream: messages left out because of their stamps};
@@ -78,19 +86,26 @@ class Recording:
     losses: tuple[tuple[str, str, str], ...] = ()
 
 
-def read_recording(reading: Reading, path: str | Path, survey: str | Path | None = None) -> Recording:
-    """Recording of a log, a CSV file or a bag, as a Reading says; survey : path of a survey, or None. Raises
-    InputError."""
+def read_recording(
+    reading: Reading, path: str | Path, survey: str | Path | None = None
+) -> Recording:
+    """Recording of a log, a CSV file or a bag, as a Reading says; survey : path of a survey, or
+    None. Raises InputError.
+    """
     if is_bag(path):
         return _read_bag(reading, Path(path), survey)
     return of_flight(reading.read((Path(path), survey)))
 
 
 def read_live(
-    reading: Reading, seconds: float, survey: str | Path | None = None, say: Callable[[str], object] = print
+    reading: Reading,
+    seconds: float,
+    survey: str | Path | None = None,
+    say: Callable[[str], object] = print,
 ) -> Recording:
-    """Recording of live topics, named as a Reading says, for so many seconds. say(sentence) : called with what happens. Raises
-    InputError."""
+    """Recording of live topics, named as a Reading says, for so many seconds. say(sentence) :
+    called with what happens. Raises InputError.
+    """
     from ..live.listen import listen  # needs ROS
 
     name_of = Names(reading.namespace, reading.topics)
@@ -103,21 +118,36 @@ def read_live(
             raise InputError(str(error).replace(str(bag), "live topics")) from error
     recording = replace(recording, topics=topics, ends=tuple(ends))
     if "/clock" in topics:  # simulated time: the arrivals are of another
-        tdoa, imu = (np.full_like(arrival, np.nan) for arrival in (recording.tdoa_arrival, recording.imu_arrival))
+        tdoa, imu = (
+            np.full_like(arrival, np.nan)
+            for arrival in (recording.tdoa_arrival, recording.imu_arrival)
+        )
         recording = replace(recording, tdoa_arrival=tdoa, imu_arrival=imu)
     return recording
 
 
 def of_flight(flight: Flight) -> Recording:
     """Recording of a Flight. When its messages arrived is not known."""
-    tdoa, imu = (np.full(len(stream) if stream is not None else 0, np.nan) for stream in (flight.tdoa, flight.imu))
+    tdoa, imu = (
+        np.full(len(stream) if stream is not None else 0, np.nan)
+        for stream in (flight.tdoa, flight.imu)
+    )
     falls = sum(flight.meta.get("reordered", {}).values())
     sensors = {name: stream for name in SENSORS if (stream := getattr(flight, name)) is not None}
     jumps, outliers = flight.meta.get("clock", ((), {}))
-    losses = tuple((cause, evidence, remedy) for cause, evidence, remedy in flight.meta.get("losses", ()))
+    losses = tuple(
+        (cause, evidence, remedy) for cause, evidence, remedy in flight.meta.get("losses", ())
+    )
     streams = flight.tdoa, flight.imu, tdoa, imu
     return Recording(
-        flight.name, flight.anchors, *streams, falls=falls, sensors=sensors, jumps=jumps, outliers=outliers, losses=losses
+        flight.name,
+        flight.anchors,
+        *streams,
+        falls=falls,
+        sensors=sensors,
+        jumps=jumps,
+        outliers=outliers,
+        losses=losses,
     )
 
 
@@ -126,13 +156,24 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
     with open_bag(path, reading.salvage) as reader:
         topics = {connection.topic: connection.msgtype for connection in reader.connections}
         kinds = {"tdoa": (TDOA, *_ROWS[TDOA]), "imu": (IMU, *_ROWS[IMU])}
-        found = {name: read_topic(path, reader, name_of(topic), kind, row) for name, (topic, kind, row) in kinds.items()}
-        found |= {name: read_sensor(path, reader, sensor, name_of) for name, sensor in SENSORS.items()}
+        found = {
+            name: read_topic(path, reader, name_of(topic), kind, row)
+            for name, (topic, kind, row) in kinds.items()
+        }
+        found |= {
+            name: read_sensor(path, reader, sensor, name_of) for name, sensor in SENSORS.items()
+        }
         arrival = arrivals(found)
         found, clock = on_one_clock(found)
         tdoa, imu = found["tdoa"], found["imu"]
-        arrival = {name: arrival[name][clock.kept.get(name, slice(None))] for name in ("tdoa", "imu")}
-        sensors = {name: _stream_of(found[name], sensor) for name, sensor in SENSORS.items() if len(found[name].stamps)}
+        arrival = {
+            name: arrival[name][clock.kept.get(name, slice(None))] for name in ("tdoa", "imu")
+        }
+        sensors = {
+            name: _stream_of(found[name], sensor)
+            for name, sensor in SENSORS.items()
+            if len(found[name].stamps)
+        }
         recorded = recorded_anchors(path, reader, name_of("uwb/anchors"))
         tree = placing.read_frames(path, reader)
         remarks = tuple(remarks_of(reader))
@@ -143,8 +184,13 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
         raise InputError(f"{path}: has no message on {name_of(TDOA)}; {hint}.")
     anchors = read_survey(survey) if survey else recorded and recorded.anchors
     if anchors is None:
-        raise InputError(f"{path}: has no message on {name_of('uwb/anchors')}; give a survey file (--survey FILE).")
-    refuse_faulty(anchors, str(survey) if survey or recorded is None else f"{path}: {recorded.source}")
+        raise InputError(
+            f"{path}: has no message on {name_of('uwb/anchors')}; give a survey file "
+            "(--survey FILE)."
+        )
+    refuse_faulty(
+        anchors, str(survey) if survey or recorded is None else f"{path}: {recorded.source}"
+    )
     samples = bag_messages.imu_of(imu.stamps / 1e9, imu.rows) if len(imu.stamps) else None
     if samples is not None and (place := placing.placed(tree, IMU, imu.frames)[0]):
         samples = placing.imu_in_body(samples, place)
@@ -155,8 +201,16 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
         imu=samples,
         tdoa_arrival=arrival["tdoa"],
         imu_arrival=arrival["imu"],
-        frames={topic: dict(stream.frames) for topic, stream in ((TDOA, tdoa), (IMU, imu)) if len(stream.stamps)},
-        places={frame: place for frame in {*tdoa.frames, *imu.frames} if (place := placing.place_of(tree, frame))},
+        frames={
+            topic: dict(stream.frames)
+            for topic, stream in ((TDOA, tdoa), (IMU, imu))
+            if len(stream.stamps)
+        },
+        places={
+            frame: place
+            for frame in {*tdoa.frames, *imu.frames}
+            if (place := placing.place_of(tree, frame))
+        },
         topics=topics,
         read=frozenset(map(name_of, HEARD)),
         recorded=recorded and recorded.anchors,
@@ -170,4 +224,6 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
 def _stream_of(found: TopicMessages, sensor: Sensor) -> Stream:
     """Stream of a Sensor."""
     make = bag_messages.of_sensor(sensor)[1]
-    return make(found.stamps / 1e9, found.rows.reshape(len(found.stamps), sum(sensor.fields.values())))
+    return make(
+        found.stamps / 1e9, found.rows.reshape(len(found.stamps), sum(sensor.fields.values()))
+    )

@@ -18,16 +18,25 @@ SOURCE = "numbers"
 
 
 def repairs(flight: Flight) -> tuple[LabelEffect, ...]:
-    """(LabelEffect, ...) that undo wrong ids and signs of a Flight, in the order in which they are undone; () without ground truth or
-    TDOAs."""
-    return () if flight.truth is None or len(flight.truth) < 2 or not len(flight.tdoa) else repairs_of(KnownPath(flight))
+    """(LabelEffect, ...) that undo wrong ids and signs of a Flight, in the order in which they are
+    undone; () without ground truth or TDOAs.
+    """
+    return (
+        ()
+        if flight.truth is None or len(flight.truth) < 2 or not len(flight.tdoa)
+        else repairs_of(KnownPath(flight))
+    )
 
 
 def repairs_of(path: KnownPath) -> tuple[LabelEffect, ...]:
     """The same of a KnownPath. Where most signs are wrong, nothing is said of ids."""
     out: list[LabelEffect] = []
     signs = pair_rules.contrary(path)
-    table = {} if len(signs) >= pair_rules.MOST * max(len(path.pairs), 1) else pair_rules.renamed(path)[0]
+    table = (
+        {}
+        if len(signs) >= pair_rules.MOST * max(len(path.pairs), 1)
+        else pair_rules.renamed(path)[0]
+    )
     if table:
         out.append(AnchorIds({str(wrong): right for wrong, right in table.items()}, source=SOURCE))
         signs = pair_rules.contrary(path.without(out[0]))

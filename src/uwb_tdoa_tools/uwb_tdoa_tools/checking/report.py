@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from .. import command_lines
 from ..json_values import as_json
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
+
     from uwb_tdoa_ekf.streams import Finding
+
     from .check import Report
 
 SYMBOL = {"error": "ERROR", "warning": "warning", "note": "note"}
@@ -18,7 +20,10 @@ SYMBOL = {"error": "ERROR", "warning": "warning", "note": "note"}
 
 def text(report: Report) -> str:
     """Lines about one Report: the verdict first, then the findings, most severe first."""
-    facts = ", ".join(f"{name} {value}" if name in ("TDOAs", "IMU") else value for name, value in report.facts.items())
+    facts = ", ".join(
+        f"{name} {value}" if name in ("TDOAs", "IMU") else value
+        for name, value in report.facts.items()
+    )
     out = [f"{report.recording}: {verdict(report.findings)}  ({facts})"]
     out += [f"  {end.topic} from {end.node}: {end.qos}" for end in report.ends if end.publishes]
     for finding in report.findings:
@@ -31,7 +36,9 @@ def verdict(findings: Sequence[Finding]) -> str:
     counts = {severity: sum(f.severity == severity for f in findings) for severity in SYMBOL}
     if not counts["error"] and not counts["warning"]:
         return "OK" if not counts["note"] else "OK, with a remark"
-    return ", ".join(f"{count} {severity}{'s' * (count > 1)}" for severity, count in counts.items() if count)
+    return ", ".join(
+        f"{count} {severity}{'s' * (count > 1)}" for severity, count in counts.items() if count
+    )
 
 
 def lines(finding: Finding) -> Iterator[str]:
@@ -45,8 +52,9 @@ def lines(finding: Finding) -> Iterator[str]:
 
 
 def as_dict(reports: Iterable[Report], together: Iterable[Finding]) -> dict[str, Any]:
-    """For JSON: {"recordings": [{"recording", "facts", "findings", "ends"}], "together": [findings about several
-    recordings]}; ends : who publishes and hears live topics."""
+    """For JSON: {"recordings": [{"recording", "facts", "findings", "ends"}], "together": [findings
+    about several recordings]}; ends : who publishes and hears live topics.
+    """
     return {
         "recordings": [
             {

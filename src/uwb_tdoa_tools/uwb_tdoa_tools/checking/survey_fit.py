@@ -1,7 +1,8 @@
-"""Where would the anchors have to be? Positions of tag and anchors together, from windows of TDOAs and nothing else.
+"""Where would the anchors have to be? Positions of tag and anchors together, from windows of TDOAs
+and nothing else.
 
-Systematic errors move the anchors by some decimetres too; only what moving them explains beyond that speaks against a
-survey.
+Systematic errors move the anchors by some decimetres too; only what moving them explains beyond
+that speaks against a survey.
 """
 
 from __future__ import annotations
@@ -24,19 +25,28 @@ if TYPE_CHECKING:
 
     Window = tuple[np.ndarray, ...]  # t (n,) s, a and b (n,) rows of the anchors, d (n,) m
 
-WINDOWS, LENGTH, FEWEST = 40, 0.5, 30  # windows over the recording, s each, and TDOAs that one must have
-PRIOR = 0.5  # m, by which an anchor may be off the survey; of no anchor in particular is more believed
+WINDOWS, LENGTH, FEWEST = (
+    40,
+    0.5,
+    30,
+)  # windows over the recording, s each, and TDOAs that one must have
+PRIOR = (
+    0.5  # m, by which an anchor may be off the survey; of no anchor in particular is more believed
+)
 TAG, SPEED = 5.0, 1.0  # m and m/s, the same for the tag about where it was located
 STD, TOGETHER = 0.15, 20.0  # m, of one TDOA; TDOAs of a window that count as independent at most
 ROBUST = 0.4  # m, scale of the Geman-McClure weight
 SWEEPS, STEP = 12, 1.0  # Gauss-Newton steps, and the longest of an anchor, m
-SPREAD = 0.3  # m of `spread`; measured flights 0.50 at least, also with ids swapped, a hovering tag 0.16 at most
+# m of `spread`; measured flights 0.50 at least, also with ids swapped, a hovering tag 0.16 at most
+SPREAD = 0.3
 
 
 class SurveyFit:
     """Windows of TDOAs, located with the anchors as surveyed."""
 
-    def __init__(self, t: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray, positions: np.ndarray) -> None:
+    def __init__(
+        self, t: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray, positions: np.ndarray
+    ) -> None:
         """t (n,) s, rising; a, b (n,) rows of positions (N, 3) m; d (n,) m."""
         self.positions = positions
         self._windows, self._start = [], []
@@ -48,10 +58,19 @@ class SurveyFit:
             if end - first < FEWEST:
                 continue
             window, places = tuple(column[first:end] for column in (t, a, b, d)), room_for(1)
-            locate(rows[first:end], state.anchors, box, config.parameters()[0], KnownHeight(np.nan, np.nan), places)
+            locate(
+                rows[first:end],
+                state.anchors,
+                box,
+                config.parameters()[0],
+                KnownHeight(np.nan, np.nan),
+                places,
+            )
             self._windows.append(window)
             self._start.append(places.x[0])
-        self.before, _ = self.solve([])  # where the tag fits best: a fast one is not where a start puts it
+        self.before, _ = self.solve(
+            []
+        )  # where the tag fits best: a fast one is not where a start puts it
 
     def __len__(self) -> int:
         """Windows that tell something."""
@@ -75,11 +94,20 @@ class SurveyFit:
 
     @cached_property
     def held_out_gain(self) -> float:
-        """Loss that anchors moved as one half of the windows says leave less in the other half, the mean of both halves: errors of places
-        where the tag is for a while are no errors of the survey."""
+        """Loss that anchors moved as one half of the windows says leave less in the other half, the
+        mean of both halves: errors of places where the tag is for a while are no errors of the
+        survey.
+        """
         half = len(self) // 2
         parts = [self._part(slice(None, half)), self._part(slice(half, None))]
-        return float(np.mean([test.before - test._at(fitted.all_moved[1]) for fitted, test in (parts, parts[::-1])]))
+        return float(
+            np.mean(
+                [
+                    test.before - test._at(fitted.all_moved[1])
+                    for fitted, test in (parts, parts[::-1])
+                ]
+            )
+        )
 
     def _part(self, windows: slice) -> SurveyFit:
         """The same of some of the windows."""
@@ -96,26 +124,40 @@ class SurveyFit:
         return elsewhere.solve([])[0]
 
     def solve(self, free: Sequence[int] | None = None) -> tuple[float, np.ndarray]:
-        """(loss that is left, 0 to 1; anchor positions (N, 3) m) with the anchors in `free` (rows; None for all)
-        moved, and the tag."""
-        moved = np.ones(len(self.positions), dtype=bool) if free is None else np.isin(range(len(self.positions)), free)
+        """(loss that is left, 0 to 1; anchor positions (N, 3) m) with the anchors in `free` (rows;
+        None for all) moved, and the tag.
+        """
+        moved = (
+            np.ones(len(self.positions), dtype=bool)
+            if free is None
+            else np.isin(range(len(self.positions)), free)
+        )
         columns = np.flatnonzero(np.repeat(moved, 3))  # of the coordinates that are free
         anchors, start = self.positions.copy(), [x.copy() for x in self._start]
-        heard = [moved & np.isin(np.arange(len(moved)), ends[1:3]) for ends in self._windows]  # in each window; of a hall few are
-        places = [np.flatnonzero(np.repeat(some[moved], 3)) for some in heard]  # of their coordinates, among the free ones
+        heard = [
+            moved & np.isin(np.arange(len(moved)), ends[1:3]) for ends in self._windows
+        ]  # in each window; of a hall few are
+        places = [
+            np.flatnonzero(np.repeat(some[moved], 3)) for some in heard
+        ]  # of their coordinates, among the free ones
         for _ in range(SWEEPS):
             H = np.eye(len(columns)) / PRIOR**2
             g = (self.positions - anchors).reshape(-1)[columns] / PRIOR**2
             eliminated = []
             for x, window, some, its in zip(start, self._windows, heard, places):
                 by_tag, by_anchors, residual = _linearised(x, window, anchors, some)
-                weight = min(1.0, TOGETHER / len(residual)) / (STD * (1.0 + (residual / ROBUST) ** 2)) ** 2
+                weight = (
+                    min(1.0, TOGETHER / len(residual))
+                    / (STD * (1.0 + (residual / ROBUST) ** 2)) ** 2
+                )
                 left = by_tag * weight[:, None]
                 A = left.T @ by_tag + np.diag([TAG**-2] * 3 + [SPEED**-2] * 3)
                 B = left.T @ by_anchors
                 c = left.T @ residual - np.r_[np.zeros(3), x[3:] / SPEED**2]
                 solved = np.linalg.solve(A, np.column_stack([B, c]))
-                H[np.ix_(its, its)] += by_anchors.T @ (weight[:, None] * by_anchors) - B.T @ solved[:, :-1]
+                H[np.ix_(its, its)] += (
+                    by_anchors.T @ (weight[:, None] * by_anchors) - B.T @ solved[:, :-1]
+                )
                 g[its] += by_anchors.T @ (weight * residual) - B.T @ solved[:, -1]
                 eliminated.append(solved)
             step = np.linalg.solve(H, g)
@@ -127,13 +169,20 @@ class SurveyFit:
 
     def _loss(self, states: list[np.ndarray], anchors: np.ndarray) -> float:
         """Mean Geman-McClure loss over the windows."""
-        squares = (_residual(x, window, anchors)[0] ** 2 for x, window in zip(states, self._windows))
-        return float(np.mean([np.mean(square / (square + SCALE**2)) for square in squares])) if states else np.nan
+        squares = (
+            _residual(x, window, anchors)[0] ** 2 for x, window in zip(states, self._windows)
+        )
+        return (
+            float(np.mean([np.mean(square / (square + SCALE**2)) for square in squares]))
+            if states
+            else np.nan
+        )
 
 
 def displacement(surveyed: np.ndarray, fitted: np.ndarray) -> np.ndarray:
-    """(N,) m, how far each anchor has moved, after the best rotation and shift of all of them (Kabsch, Acta Cryst. A
-    32, 1976)."""
+    """(N,) m, how far each anchor has moved, after the best rotation and shift of all of them
+    (Kabsch, Acta Cryst. A 32, 1976).
+    """
     one, two = surveyed - surveyed.mean(axis=0), fitted - fitted.mean(axis=0)
     U, _, V = np.linalg.svd(two.T @ one)
     turn = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ V))]) @ V
@@ -141,17 +190,23 @@ def displacement(surveyed: np.ndarray, fitted: np.ndarray) -> np.ndarray:
 
 
 def spread(places: np.ndarray) -> float:
-    """m by which places of a tag (k, 3) are off the straight line that fits them best (second largest standard
-    deviation): a tag that stands, or moves along one line, does not tell one anchor from its mirror image."""
+    """m by which places of a tag (k, 3) are off the straight line that fits them best (second
+    largest standard deviation): a tag that stands, or moves along one line, does not tell one
+    anchor from its mirror image.
+    """
     if not len(places):
         return 0.0
-    return float(np.linalg.svd(places - places.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(places)))
+    return float(
+        np.linalg.svd(places - places.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(places))
+    )
 
 
 def _residual(
     x: np.ndarray, window: Window, anchors: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """(residuals (n,) m, unit vectors (n, 3) from a, and from b, to the tag, time (n,) before the end, s)."""
+    """(residuals (n,) m, unit vectors (n, 3) from a, and from b, to the tag, time (n,) before the
+    end, s).
+    """
     t, a, b, d = window
     before = t - t[-1]
     tag = x[:3] + before[:, None] * x[3:]
@@ -163,8 +218,9 @@ def _residual(
 def _linearised(
     x: np.ndarray, window: Window, anchors: np.ndarray, moved: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Jacobians of the TDOAs by position and velocity (n, 6) and by the k anchors of which `moved` (N,) is true (n, 3 k), and the
-    residuals (n,)."""
+    """Jacobians of the TDOAs by position and velocity (n, 6) and by the k anchors of which `moved`
+    (N,) is true (n, 3 k), and the residuals (n,).
+    """
     residual, from_a, from_b, before = _residual(x, window, anchors)
     by_position = from_b - from_a
     by_anchors, number = np.zeros((len(residual), int(moved.sum()), 3)), np.cumsum(moved) - 1

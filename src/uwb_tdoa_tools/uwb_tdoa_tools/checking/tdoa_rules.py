@@ -1,7 +1,8 @@
-"""What is wrong with all TDOAs, or with the ids of the anchors? Found by what fits: each mistake is undone, and the
-recording says whether more of it is explained then.
+"""What is wrong with all TDOAs, or with the ids of the anchors? Found by what fits: each mistake is
+undone, and the recording says whether more of it is explained then.
 
-A rule takes an OrderedRecording and yields Trials: that with one mistake undone, and the Finding if that was it.
+A rule takes an OrderedRecording and yields Trials: that with one mistake undone, and the Finding if
+that was it.
 """
 
 from __future__ import annotations
@@ -26,27 +27,51 @@ from .survey_fit import SPREAD, spread
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
+
     from uwb_tdoa_bias.foundation.anchors import Anchors
     from uwb_tdoa_bias.foundation.flight import Tdoas
+
     from .survey_fit import SurveyFit
 
     Survey = tuple[str, Anchors]  # its name, and what it says
 
-RATIO, DEVIATIONS = 0.93, 2.5  # of what stays unexplained; healthy recordings: 1.02 at least for anything that is tried
+RATIO, DEVIATIONS = (
+    0.93,
+    2.5,
+)  # of what stays unexplained; healthy recordings: 1.02 at least for anything that is tried
 UNITS = {  # m in one
-    "nanoseconds": 0.299792458, "centimetres": 0.01, "DW1000 ticks": 0.0046917639, "millimetres": 0.001,
-    "kilometres": 1000.0, "microseconds": 299.792458, "milliseconds": 299792.458, "seconds": 299792458.0,
-}  # fmt: skip
-NOISE, USUAL = (0.02, 0.2), 0.063  # m, median difference of successive TDOAs of a pair; healthy 0.047 - 0.084
+    "nanoseconds": 0.299792458,
+    "centimetres": 0.01,
+    "DW1000 ticks": 0.0046917639,
+    "millimetres": 0.001,
+    "kilometres": 1000.0,
+    "microseconds": 299.792458,
+    "milliseconds": 299792.458,
+    "seconds": 299792458.0,
+}
+NOISE, USUAL = (
+    (0.02, 0.2),
+    0.063,
+)  # m, median difference of successive TDOAs of a pair; healthy 0.047 - 0.084
 WELL = 0.4  # of the loss; healthy 0.31 at most
-BY_ERRORS = 0.1**2 / (0.1**2 + SCALE**2)  # of the loss: what systematic errors of 0.1 m leave unexplained
+BY_ERRORS = 0.1**2 / (
+    0.1**2 + SCALE**2
+)  # of the loss: what systematic errors of 0.1 m leave unexplained
 GAIN = 0.065  # of the loss by moving all anchors; healthy 0.056 at most, of measured flights
-POOR = 0.33  # of the loss, as surveyed: beyond what the errors of any healthy recording leave; 0.28 at most
-HELD = 0.5  # share of GAIN that must be left where the other half of the recording has moved the anchors
+# of the loss, as surveyed: beyond what the errors of any healthy recording leave; 0.28 at most
+POOR = 0.33
+# share of GAIN that must be left where the other half of the recording has moved the anchors
+HELD = 0.5
 ALONE = 0.85  # share of the gain that one anchor explains
-FEWEST = 10  # windows in which the tag was located; TDOAs of an anchor that may be called by the id of another
-APART = 1.0  # m, by which TDOAs of such an anchor are off at least: anchors of a hall are farther from each other
-CONTRARY, FAR = 0.7, 0.5  # share of a pair's TDOAs that fit the other sign, of those longer than that, m
+# windows in which the tag was located; TDOAs of an anchor that may be called by the id of another
+FEWEST = 10
+# m, by which TDOAs of such an anchor are off at least: anchors of a hall are farther from each
+# other
+APART = 1.0
+CONTRARY, FAR = (
+    0.7,
+    0.5,
+)  # share of a pair's TDOAs that fit the other sign, of those longer than that, m
 MOST_PAIRS = 4  # that may be wrong by themselves
 MIXED_UP = "the ids of anchors are mixed up"  # of more than two
 SAME = 0.2  # m at most between the places of an anchor in two surveys of one installation
@@ -54,8 +79,10 @@ SAME = 0.2  # m at most between the places of an anchor in two surveys of one in
 
 @dataclass(frozen=True)
 class MistakeTrial:
-    """recording : OrderedRecording with a mistake undone; finding : callable of the ratio, its standard errors -> Finding;
-    share : of the TDOAs that it changes."""
+    """recording : OrderedRecording with a mistake undone; finding : callable of the ratio, its
+    standard errors -> Finding;
+    share : of the TDOAs that it changes.
+    """
 
     recording: OrderedRecording
     finding: Callable[[float, float], Finding]
@@ -68,20 +95,31 @@ def in_metres(recording: OrderedRecording) -> bool:
 
 
 def units(recording: OrderedRecording) -> Iterator[tuple[Finding, OrderedRecording]]:
-    """In metres? The noise of the radio is known, and that a motion explains most of it. Yields (Finding,
-    OrderedRecording)."""
+    """In metres? The noise of the radio is known, and that a motion explains most of it. Yields
+    (Finding, OrderedRecording).
+    """
     noise = successive(recording.tdoa)
-    if not noise > 0.0 or (in_metres(recording) and recording.part(LONG).unexplained(WELL).mean < WELL):
+    if not noise > 0.0 or (
+        in_metres(recording) and recording.part(LONG).unexplained(WELL).mean < WELL
+    ):
         return
     near = sorted(UNITS.items(), key=lambda unit: abs(np.log(unit[1] * noise / USUAL)))[:2]
     (name, scale), (other, its) = near
     trial = recording.with_tdoa(d=recording.tdoa.d * scale)
-    if not NOISE[0] <= scale * noise <= NOISE[1] or not trial.part(LONG).unexplained(WELL).mean < WELL:
+    if (
+        not NOISE[0] <= scale * noise <= NOISE[1]
+        or not trial.part(LONG).unexplained(WELL).mean < WELL
+    ):
         return
-    evidence = f"successive TDOAs of a pair differ by {noise:.3g}: {scale * noise:.2f} m as {name}, "
+    evidence = (
+        f"successive TDOAs of a pair differ by {noise:.3g}: {scale * noise:.2f} m as {name}, "
+    )
     evidence += f"{its * noise:.2g} m as {other}; radios have 0.05 - 0.1 m"
     line = f"message.distance_difference *= {scale:.10g}"
-    yield Finding("tdoa_unit", ERROR, f"TDOAs are in {name}, not in metres", evidence, line, scale), trial
+    yield (
+        Finding("tdoa_unit", ERROR, f"TDOAs are in {name}, not in metres", evidence, line, scale),
+        trial,
+    )
 
 
 def successive(tdoa: Tdoas) -> float:
@@ -95,20 +133,32 @@ def successive(tdoa: Tdoas) -> float:
 def sign(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     """All signs the other way."""
     line = "message.distance_difference = distance_to_b - distance_to_a  # not a - b"
-    yield MistakeTrial(recording.with_tdoa(d=-recording.tdoa.d), _says("tdoa_sign", "the sign of all TDOAs is wrong", line))
+    yield MistakeTrial(
+        recording.with_tdoa(d=-recording.tdoa.d),
+        _says("tdoa_sign", "the sign of all TDOAs is wrong", line),
+    )
 
 
 def scaled(recording: OrderedRecording) -> Iterator[MistakeTrial]:
-    """The survey in another unit. (Where TDOAs show it at a glance, the streams have said so before.)"""
+    """The survey in another unit.
+
+    (Where TDOAs show it at a glance, the streams have said so before.)
+    """
     for name, factor in SURVEY_UNITS.items():
-        cause = f"the survey is in {name}, not in metres: its positions are {factor:,.5g} times too large"
+        cause = (
+            f"the survey is in {name}, not in metres: its positions are {factor:,.5g} times too "
+            "large"
+        )
         line = f"x, y, z = x / {factor:.6g}, y / {factor:.6g}, z / {factor:.6g}  # of every anchor"
         anchors = recording.anchors.at(recording.anchors.positions / factor)
         yield MistakeTrial(replace(recording, anchors=anchors), _says("survey_scale", cause, line))
 
 
 def survey(recording: OrderedRecording, others: Sequence[Survey]) -> Iterator[MistakeTrial]:
-    """Another survey. others : [(name, Anchors)]. Those of one installation, of different days, count as one."""
+    """Another survey. others : [(name, Anchors)].
+
+    Those of one installation, of different days, count as one.
+    """
     while others:
         (name, anchors), *rest = others
         duplicates = [other for other, its in rest if same_place(anchors, its)]
@@ -117,7 +167,9 @@ def survey(recording: OrderedRecording, others: Sequence[Survey]) -> Iterator[Mi
             continue
         names = " or ".join([name, *duplicates])
         cause = f"the survey is of another room or day: {names} fits"
-        yield MistakeTrial(replace(recording, anchors=anchors), _says("survey_other", cause, f"--survey {name}"))
+        yield MistakeTrial(
+            replace(recording, anchors=anchors), _says("survey_other", cause, f"--survey {name}")
+        )
 
 
 def same_place(one: Anchors, other: Anchors) -> bool:
@@ -127,7 +179,9 @@ def same_place(one: Anchors, other: Anchors) -> bool:
 
 
 def furthest(one: Anchors, other: Anchors) -> float:
-    """m between the two places of an id that two Anchors have furthest apart; infinite if they have none in common."""
+    """m between the two places of an id that two Anchors have furthest apart; infinite if they have
+    none in common.
+    """
     rows = other.index(one.ids)
     off = np.linalg.norm(one.positions - other.positions[rows], axis=1)[rows >= 0]
     return float(off.max()) if len(off) else np.inf
@@ -135,7 +189,10 @@ def furthest(one: Anchors, other: Anchors) -> float:
 
 def renumbered(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     """Ids that the survey does not have: the same anchors in the same order, with other numbers?"""
-    heard, known = np.unique(np.r_[recording.tdoa.a, recording.tdoa.b]), np.sort(recording.anchors.ids)
+    heard, known = (
+        np.unique(np.r_[recording.tdoa.a, recording.tdoa.b]),
+        np.sort(recording.anchors.ids),
+    )
     if len(heard) != len(known) or np.isin(heard, known).all():
         return
     table = dict(zip(heard.tolist(), known.tolist()))
@@ -147,8 +204,10 @@ def renumbered(recording: OrderedRecording) -> Iterator[MistakeTrial]:
 
 
 def swapped(recording: OrderedRecording) -> Iterator[MistakeTrial]:
-    """Anchors whose ids were mixed up: the best exchange of two, then of two more, as long as more is explained.
-    Not along a line: in a room that is symmetrical about it, anchors differ by their systematic errors alone."""
+    """Anchors whose ids were mixed up: the best exchange of two, then of two more, as long as more
+    is explained. Not along a line: in a room that is symmetrical about it, anchors differ by their
+    systematic errors alone.
+    """
     if spread(recording.survey_fit.places) < SPREAD:
         return
     table: dict[int, int] = {}
@@ -159,7 +218,9 @@ def swapped(recording: OrderedRecording) -> Iterator[MistakeTrial]:
         if not doubtful:
             break
         base, least, best_swap = brief.unexplained(), 1.0 - 0.02 * (1 + len(table)), {}
-        for one, two in ((one, two) for one, two in combinations(ids, 2) if one in doubtful or two in doubtful):
+        for one, two in (
+            (one, two) for one, two in combinations(ids, 2) if one in doubtful or two in doubtful
+        ):
             swap = {one: two, two: one}
             ratio, _ = compare(base, relabelled(brief, swap).unexplained(least * base.mean))
             if ratio < least:
@@ -170,22 +231,29 @@ def swapped(recording: OrderedRecording) -> Iterator[MistakeTrial]:
         table = {i: k for i, k in table.items() if i != k}
         brief, trial = relabelled(brief, best_swap), relabelled(trial, best_swap)
     if not table or (len(table) > 2 and gained(trial.survey_fit) is not None):
-        return  # a survey of another room is explained better by exchanging many ids, and still does not fit
+        # a survey of another room is explained better by exchanging many ids, and still does not
+        # fit
+        return
     names = ", ".join(f"{i} is {k}" for i, k in sorted(table.items()))
     cause = "the ids of two anchors are swapped" if len(table) == 2 else MIXED_UP
     yield MistakeTrial(
         trial,
         _says(
-            "ids_swapped", f"{cause}: what is called {names}", f"id = {table}.get(id, id)  # or swap them in the survey"
+            "ids_swapped",
+            f"{cause}: what is called {names}",
+            f"id = {table}.get(id, id)  # or swap them in the survey",
         ),
     )
 
 
 def _far_off(recording: OrderedRecording) -> list[int]:
-    """Ids of the anchors whose TDOAs are far from what the filter expects, in comparison with those of most anchors: what is called by
-    the id of another anchor of a hall is."""
+    """Ids of the anchors whose TDOAs are far from what the filter expects, in comparison with those
+    of most anchors: what is called by the id of another anchor of a hall is.
+    """
     (a, b), tdoa, positions = recording.rows(), recording.tdoa, recording.anchors.positions
-    off = np.abs(innovations(new_state(positions), structured(TDOA, tdoa.t, a, b, tdoa.d), positions))
+    off = np.abs(
+        innovations(new_state(positions), structured(TDOA, tdoa.t, a, b, tdoa.d), positions)
+    )
     rows = np.unique(np.concatenate([a, b])[np.tile(np.isfinite(off), 2)])  # of known anchors
     mine = [off[((a == row) | (b == row)) & np.isfinite(off)] for row in rows.tolist()]
     each = np.array([np.median(some) if len(some) >= FEWEST else 0.0 for some in mine])
@@ -194,13 +262,17 @@ def _far_off(recording: OrderedRecording) -> list[int]:
 
 
 def contrary(recording: OrderedRecording) -> Iterator[MistakeTrial]:
-    """Single pairs with the other sign: a filter that hardly believes them knows. Or all pairs that name the larger id
-    first."""
+    """Single pairs with the other sign: a filter that hardly believes them knows. Or all pairs that
+    name the larger id first.
+    """
     tdoa = recording.tdoa
     pairs = np.unique(np.column_stack([tdoa.a, tdoa.b]), axis=0)
     backward = tdoa.a > tdoa.b
     if 0.2 < backward.mean() < 0.8:
-        line = "message.distance_difference = distance_to_b - distance_to_a  # in the order of the message's ids"
+        line = (
+            "message.distance_difference = distance_to_b - distance_to_a  # in the order of the "
+            "message's ids"
+        )
         cause = "the sign of the TDOAs does not follow the order of the anchors"
         yield MistakeTrial(_flipped(recording, backward), _says("tdoa_one_sign", cause, line))
     wrong = _contrary(recording.part(LONG), pairs)
@@ -211,15 +283,24 @@ def contrary(recording: OrderedRecording) -> Iterator[MistakeTrial]:
         flip |= (tdoa.a == a) & (tdoa.b == b)
     trial = _flipped(recording, flip)
     if gained(trial.survey_fit) is not None:
-        return  # of a survey of another room some pairs seem to have the other sign, and still it does not fit
+        # of a survey of another room some pairs seem to have the other sign, and still it does not
+        # fit
+        return
     names = ", ".join(f"({a}, {b})" for a, b in wrong)
     line = f"if (a, b) in {{{names}}}: message.distance_difference *= -1.0  # and find out why"
-    yield MistakeTrial(trial, _says("pair_sign", f"the sign of the pairs {names} is wrong", line), flip.mean())
+    yield MistakeTrial(
+        trial, _says("pair_sign", f"the sign of the pairs {names} is wrong", line), flip.mean()
+    )
 
 
 def _contrary(recording: OrderedRecording, pairs: np.ndarray) -> list[tuple[int, int]]:
-    """The pairs, [(a, b)], most of whose TDOAs are nearer to the negative of what the filter predicts."""
-    tdoa, run = recording.tdoa, run_offline(recording.flight(), FilterConfig(use_imu=False)).residuals
+    """The pairs, [(a, b)], most of whose TDOAs are nearer to the negative of what the filter
+    predicts.
+    """
+    tdoa, run = (
+        recording.tdoa,
+        run_offline(recording.flight(), FilterConfig(use_imu=False)).residuals,
+    )
     predicted = tdoa.d - run.innovation
     counted = np.isfinite(predicted) & (np.abs(tdoa.d) > FAR) & (np.abs(predicted) > FAR)
     other = np.abs(tdoa.d + predicted) < np.abs(tdoa.d - predicted)
@@ -236,7 +317,9 @@ def _flipped(recording: OrderedRecording, rows: np.ndarray) -> OrderedRecording:
 
 
 def moved(recording: OrderedRecording) -> Iterator[MistakeTrial]:
-    """An anchor that is not where the survey has it: there, TDOAs are explained that no motion explains otherwise."""
+    """An anchor that is not where the survey has it: there, TDOAs are explained that no motion
+    explains otherwise.
+    """
     fit = recording.survey_fit
     gain = gained(fit)
     if gain is None:
@@ -251,14 +334,18 @@ def moved(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     number = int(recording.anchors.ids[row])
     where = ", ".join(f"{s:+.1f}" for s in shift)
     cause = f"anchor {number} is not where the survey has it, but about ({where}) m from there"
-    line = f"{number}: {{position: [x, y, z]}}  # measure it again; look for exchanged digits and axes"
+    line = (
+        f"{number}: {{position: [x, y, z]}}  # measure it again; look for exchanged digits and axes"
+    )
     anchors = recording.anchors.at(alone[row][1])
     yield MistakeTrial(replace(recording, anchors=anchors), _says("anchor_moved", cause, line))
 
 
 def gained(fit: SurveyFit) -> float | None:
-    """How much less stays unexplained with all anchors moved; None if that is no more than in a healthy recording, or if anchors that one
-    half of the recording has moved do not fit the other half, and errors of the TDOAs can explain it as well."""
+    """How much less stays unexplained with all anchors moved; None if that is no more than in a
+    healthy recording, or if anchors that one half of the recording has moved do not fit the other
+    half, and errors of the TDOAs can explain it as well.
+    """
     gain = apparent_gain(fit)
     return gain if gain > GAIN and (fit.before > POOR or fit.held_out_gain > HELD * GAIN) else None
 
@@ -268,13 +355,16 @@ def apparent_gain(fit: SurveyFit) -> float:
     return fit.before - fit.all_moved[0] if len(fit) >= FEWEST else 0.0
 
 
-def best(recording: OrderedRecording, others: Sequence[Survey] = ()) -> tuple[Finding | None, OrderedRecording]:
-    """(Finding, OrderedRecording with it undone), or (None, recording): of all that can be tried, what explains the most, if it is
-    certain, and more than systematic errors could: along a line, in a room that is symmetrical about it, swapped ids
-    differ by these alone.
+def best(
+    recording: OrderedRecording, others: Sequence[Survey] = ()
+) -> tuple[Finding | None, OrderedRecording]:
+    """(Finding, OrderedRecording with it undone), or (None, recording): of all that can be tried,
+    what explains the most, if it is certain, and more than systematic errors could: along a line,
+    in a room that is symmetrical about it, swapped ids differ by these alone.
 
-    Smaller TDOAs are always explained better: another unit is believed at once where the noise speaks against metres,
-    and else only where nothing different helps."""
+    Smaller TDOAs are always explained better: another unit is believed at once where the noise
+    speaks against metres, and else only where nothing different helps.
+    """
     if not in_metres(recording):
         for found in units(recording):
             return found
@@ -294,7 +384,9 @@ def best(recording: OrderedRecording, others: Sequence[Survey] = ()) -> tuple[Fi
 
 def _says(rule: str, cause: str, line: str) -> Callable[[float, float], Finding]:
     def finding(ratio: float, z: float) -> Finding:
-        evidence = f"{100.0 * (1.0 - ratio):.0f} % less stays unexplained then, {z:.1f} standard errors"
+        evidence = (
+            f"{100.0 * (1.0 - ratio):.0f} % less stays unexplained then, {z:.1f} standard errors"
+        )
         return Finding(rule, ERROR, cause, evidence, line, ratio)
 
     return finding

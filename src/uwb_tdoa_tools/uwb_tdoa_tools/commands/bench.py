@@ -46,16 +46,30 @@ def parser() -> ArgumentParser:
     )
     add = made.add_argument
     add("--quick", action="store_true", help="fewer repetitions, shorter flights, fewer cases")
-    add("--only", nargs="+", choices=PARTS, default=PARTS, metavar="PART", help=f"of {', '.join(PARTS)} (default: all)")
+    add(
+        "--only",
+        nargs="+",
+        choices=PARTS,
+        default=PARTS,
+        metavar="PART",
+        help=f"of {', '.join(PARTS)} (default: all)",
+    )
     add("--model", metavar="FILE", help="ONNX bias network for offline (default: the one shipped)")
     add(
-        "--peer", metavar="LIBRARY",
-        help="measure this shared library of another filter beside ours, event by event (what it exports: docs/speed.md)",
-    )  # fmt: skip
+        "--peer",
+        metavar="LIBRARY",
+        help=(
+            "measure this shared library of another filter beside ours, event by event (what it "
+            "exports: docs/speed.md)"
+        ),
+    )
     add(
-        "--out", metavar="DIR", type=OutputFolder, default="out/bench",
+        "--out",
+        metavar="DIR",
+        type=OutputFolder,
+        default="out/bench",
         help="for the bags and the output of the nodes (default: out/bench)",
-    )  # fmt: skip
+    )
     add("--json", metavar="FILE", type=OutputFile, help="write the machine and all figures")
     return made
 
@@ -63,8 +77,14 @@ def parser() -> ArgumentParser:
 def _bench(args: Namespace) -> None:
     other = None if args.peer is None else Peer(args.peer)
     machine, figures = measure(args.only, args.out, args.quick, args.model, other)
-    cli.show(f"{machine['cpu']}, {machine['cores']} cores, Python {machine['python']}, numpy {machine['numpy']}")
-    cli.show(f"meanwhile others used {machine['others']:.0%} of its CPU time, its host {machine['stolen']:.0%}")
+    cli.show(
+        f"{machine['cpu']}, {machine['cores']} cores, Python {machine['python']}, numpy "
+        f"{machine['numpy']}"
+    )
+    cli.show(
+        f"meanwhile others used {machine['others']:.0%} of its CPU time, its host "
+        f"{machine['stolen']:.0%}"
+    )
     cli.show("\n".join(table(figures)))
     if args.json is not None:
         cli.write_json(args.json, {"machine": machine, "figures": as_json(figures)})

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
     from collections.abc import Sequence
     from pathlib import Path
+
     from ..calibrating.calibrate import Calibration
     from ..readers.inputs import Reading, Recording
 
@@ -44,18 +45,34 @@ def parser() -> ArgumentParser:
         "calibrate",
         DESCRIPTION,
         "calibrate flight.bag --out calibrated/",
-        "calibrate first.bag second.bag --survey tape.yaml --no-truth --std 0.1 --trusted 0 6 --out calibrated/",
+        (
+            "calibrate first.bag second.bag --survey tape.yaml --no-truth --std 0.1 --trusted 0 6 "
+            "--out calibrated/"
+        ),
         "calibrate flight.log --survey anchors.yaml --holdout other.log --out calibrated/",
         "calibrate flight.bag --no-truth --quick",
-        "calibrate today.bag --no-truth --survey calibrated/anchors.yaml --effects calibrated/effects.yaml --out today/",
+        (
+            "calibrate today.bag --no-truth --survey calibrated/anchors.yaml --effects "
+            "calibrated/effects.yaml --out today/"
+        ),
     )
     options.add_recordings(made)
-    options.add_filter(made, "effects.yaml: what is in the model already; without ground truth its covariance is the prior")
+    options.add_filter(
+        made,
+        (
+            "effects.yaml: what is in the model already; without ground truth its covariance is "
+            "the prior"
+        ),
+    )
     add = made.add_argument
     options.add_holdout(made)
     add("--no-truth", action="store_true", help="do without ground truth, and leave it unread")
     options.add_tape(made)
-    add("--quick", action="store_true", help="say within a minute what to expect, and whether the flights are exciting enough")
+    add(
+        "--quick",
+        action="store_true",
+        help="say within a minute what to expect, and whether the flights are exciting enough",
+    )
     add("--out", metavar="DIR", type=OutputFolder, help="where to write; made if it is not there")
     return made
 
@@ -67,42 +84,70 @@ def _calibrate(args: Namespace) -> int:
     base, tape = effects or EffectSet(), options.tape_of(args, effects)
     reading = options.reading_of(args, truth=not args.no_truth)
     found, held = reading.find(args.flights), reading.find(args.holdout)
-    options.check_holdout((path.resolve() for path, _ in found), (path.resolve() for path, _ in held))
+    options.check_holdout(
+        (path.resolve() for path, _ in found), (path.resolve() for path, _ in held)
+    )
     if not _checked(reading, found + held, tape.std, FlightEstimator(config, base), args.effects):
         return _stop("check finds an error: put it right first, as said above")
     flights, holdout = reading.flights(args.flights), reading.flights(args.holdout)
     known = [flight.truth is not None for flight in flights + holdout]
     if any(known) and not all(known):
-        raise InputError(f"{(flights + holdout)[known.index(False)].name}: holds no ground truth, and others do; leave it out, or give --no-truth.")
+        raise InputError(
+            f"{(flights + holdout)[known.index(False)].name}: holds no ground truth, and "
+            "others do; leave it out, or give --no-truth."
+        )
     if args.quick:
         with Progress("calibrate") as progress:
-            expected = prospect(flights, tape, base, config, lambda: progress("looking at a part of the flights"))
+            expected = prospect(
+                flights, tape, base, config, lambda: progress("looking at a part of the flights")
+            )
         cli.show(*expected.sentences())
         return int(not expected.exciting)
     if not holdout and len(flights) > 1:
         flights, holdout = flights[:-1], flights[-1:]
     with Progress("calibrate") as progress:
         if all(known):
-            options.refuse(args, options.OF_TAPE, "says how well anchors are known, and ground truth is there to tell; give --no-truth, too")
+            options.refuse(
+                args,
+                options.OF_TAPE,
+                (
+                    "says how well anchors are known, and ground truth is there to tell; give "
+                    "--no-truth, too"
+                ),
+            )
             made = with_truth(flights, holdout, base, config, progress)
         else:
             made = without_truth(flights, holdout, tape, base, config, progress)
     cli.show(made.text, made.as_text())
     out = args.out  # only --quick does without
     out.mkdir(parents=True, exist_ok=True)
-    cli.write_json(out / "calibration.json", {"flights": [flight.name for flight in flights], **made.as_dict()})
+    cli.write_json(
+        out / "calibration.json", {"flights": [flight.name for flight in flights], **made.as_dict()}
+    )
     judges = args.holdout or [path for path, _ in found[-1:]]
-    return _stop(made.why_not) if made.why_not is not None else _write(made, out, judges, all(known))
+    return (
+        _stop(made.why_not) if made.why_not is not None else _write(made, out, judges, all(known))
+    )
 
 
-def _checked(reading: Reading, recordings: Sequence[Recording], std: float, estimator: FlightEstimator, effects: str | None) -> bool:
-    """Whether check finds no error in recordings that stops a calibration; says what it finds. std : m, of a coordinate of an anchor;
-    effects : file of those of the FlightEstimator, or None."""
+def _checked(
+    reading: Reading,
+    recordings: Sequence[Recording],
+    std: float,
+    estimator: FlightEstimator,
+    effects: str | None,
+) -> bool:
+    """Whether check finds no error in recordings that stops a calibration; says what it finds. std
+    : m, of a coordinate of an anchor;
+    effects : file of those of the FlightEstimator, or None.
+    """
     checked, sound = [], True
     with Progress("calibrate", len(recordings), "recording") as progress:
         for path, survey in recordings:
             checked.append(read_recording(reading, path, survey))
-            result = check(checked[-1], (), estimator, command_lines.surveying(path, survey, effects))
+            result = check(
+                checked[-1], (), estimator, command_lines.surveying(path, survey, effects)
+            )
             cli.show(report.text(result))
             sound = sound and not stopping(checked[-1], result.findings, std)
             progress.update()
@@ -118,12 +163,19 @@ def _stop(why: str) -> int:
 
 
 def _write(made: Calibration, out: Path, recordings: Sequence[str | Path], truth: bool) -> int:
-    files = anchors, effects, config = out / "anchors.yaml", out / "effects.yaml", out / "ekf_node.yaml"
+    files = anchors, effects, config = (
+        out / "anchors.yaml",
+        out / "effects.yaml",
+        out / "ekf_node.yaml",
+    )
     made.anchors.to_yaml(anchors)
     made.effects.to_yaml(effects)
     write_parameters(config, made.tdoa_std)
     survey, corrected, tuned = (file if file.exists() else None for file in files)
-    cli.show(f"wrote {', '.join(file.name for file in files if file.exists())} and calibration.json to {out}")
+    cli.show(
+        f"wrote {', '.join(file.name for file in files if file.exists())} and "
+        f"calibration.json to {out}"
+    )
     cli.show(f"judge it:   {command_lines.judging(recordings, survey, corrected, tuned, truth)}")
     cli.show("fly by it:", *command_lines.nodes(survey, corrected, tuned))
     return 0

@@ -1,4 +1,6 @@
-"""check: what a driver may have got wrong, found in a recording before anything else is done with it."""
+"""check: what a driver may have got wrong, found in a recording before anything else is done with
+it.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ from ..readers import read_survey
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
     from collections.abc import Iterator
+
     from uwb_tdoa_bias.foundation.anchors import Anchors
+
     from ..checking.recording import Recording
     from ..readers.inputs import Reading
 
@@ -53,8 +57,12 @@ def parser() -> ArgumentParser:
         "check tags.bag --topic uwb/tdoa=/tag1/tdoa --topic imu/data=/tag1/imu",
     )
     options.add_recordings(made, nargs="*")
-    options.add_filter(made, "effects.yaml: what is calibrated; its covariance says how well anchors are known")
-    made.add_argument("--live", metavar="S", type=float, help="listen to live topics for S seconds instead")
+    options.add_filter(
+        made, "effects.yaml: what is calibrated; its covariance says how well anchors are known"
+    )
+    made.add_argument(
+        "--live", metavar="S", type=float, help="listen to live topics for S seconds instead"
+    )
     made.add_argument("--json", metavar="FILE", type=OutputFile, help="write all findings")
     return made
 
@@ -85,8 +93,9 @@ def _check(args: Namespace) -> int:
 def _recordings(
     args: Namespace, reading: Reading, survey: str | Path | None
 ) -> Iterator[tuple[Recording, Path | None, str | Path | None]]:
-    """Yield (Recording, its path, that of its survey) of each, or (Recording, None, None) of what is live. survey : path of the one
-    survey, or None."""
+    """Yield (Recording, its path, that of its survey) of each, or (Recording, None, None) of what
+    is live. survey : path of the one survey, or None.
+    """
     if args.live is not None:
         yield read_live(reading, args.live, survey, partial(cli.say, "check")), None, None
     found = reading.find(args.flights)

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, options
-from ..outputs import OutputBag
 from ..bags.convert import SENSORS, convert, shifted
+from ..outputs import OutputBag
 from ..progress import Progress
 from ..readers import columns
 from ..readers.names import read_named
@@ -21,7 +21,9 @@ from ..scoring.settling import on_one_clock
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
     from collections.abc import Iterable
+
     from uwb_tdoa_bias.foundation.flight import Flight
+
     from ..readers.names import Named
 
 DESCRIPTION = """Convert a recorded flight to a ROS 2 bag.
@@ -39,24 +41,47 @@ def parser() -> ArgumentParser:
         "convert",
         DESCRIPTION,
         "convert 0425-traj1 --survey anchor_0425.txt --out 0425-traj1.bag",
-        "convert const1-trial1-tdoa2.csv.gz --survey anchor_const1.csv --out const1.bag --storage sqlite3",
+        (
+            "convert const1-trial1-tdoa2.csv.gz --survey anchor_const1.csv --out const1.bag "
+            "--storage sqlite3"
+        ),
         "convert flight.log --survey anchors.yaml --out flight.bag --force --json",
         "convert cut.log --survey anchors.yaml --salvage --out flight.bag",
-        "convert theirs.bag --topic uwb/tdoa=/dwm/tdoa --topic imu/data=/fcu/imu --survey anchors.yaml --out our.bag",
-        "convert ranging.csv --columns time=t_ms:ms,anchor_a=from,anchor_b=to,tdoa=diff_mm:mm --survey anchors.yaml "
+        (
+            "convert theirs.bag --topic uwb/tdoa=/dwm/tdoa --topic imu/data=/fcu/imu --survey "
+            "anchors.yaml --out our.bag"
+        ),
+        "convert ranging.csv --columns time=t_ms:ms,anchor_a=from,anchor_b=to,tdoa=diff_mm:mm "
+        "--survey anchors.yaml "
         "--out our.bag",
-        "convert ranging.csv mocap.csv --columns time=t,anchor_a=from,anchor_b=to,tdoa=d,pose_x=x,pose_y=y,pose_z=z "
+        "convert ranging.csv mocap.csv --columns "
+        "time=t,anchor_a=from,anchor_b=to,tdoa=d,pose_x=x,pose_y=y,pose_z=z "
         "--time-offset truth=-0.4 --survey anchors.csv --out our.bag",
     )
-    made.add_argument("input", metavar="IN", nargs="+", help="the recording; its kind is found by its content")
+    made.add_argument(
+        "input", metavar="IN", nargs="+", help="the recording; its kind is found by its content"
+    )
     made.add_argument("--columns", metavar="MAP", help=columns.HELP)
     options.add_reading(made)
     options.add_align(made)
     made.add_argument(
-        "--time-offset", dest="offsets", action="append", default=[], metavar="SENSOR=SECONDS",
-        help=f"add this to the stamps of a sensor with a clock of its own: {', '.join(SENSORS)}; may be repeated",
-    )  # fmt: skip
-    made.add_argument("--out", metavar="BAG", type=OutputBag, required=True, help="the bag to write, a new directory")
+        "--time-offset",
+        dest="offsets",
+        action="append",
+        default=[],
+        metavar="SENSOR=SECONDS",
+        help=(
+            f"add this to the stamps of a sensor with a clock of its own: {', '.join(SENSORS)}; "
+            "may be repeated"
+        ),
+    )
+    made.add_argument(
+        "--out",
+        metavar="BAG",
+        type=OutputBag,
+        required=True,
+        help="the bag to write, a new directory",
+    )
     options.add_bag(made)
     made.add_argument("--json", action="store_true", help="print the summary as JSON")
     return made
@@ -66,13 +91,24 @@ def _convert(args: Namespace) -> None:
     offsets = _offsets(args.offsets)
     named = _named(args)
     with Progress("convert", what="reading and writing"):
-        made = convert(lambda: on_one_clock(shifted(_read(args, named), offsets), args.align), args.out, args.storage, args.force)
+        made = convert(
+            lambda: on_one_clock(shifted(_read(args, named), offsets), args.align),
+            args.out,
+            args.storage,
+            args.force,
+        )
     if args.json:
         cli.show(json.dumps(asdict(made), indent=2, default=str))
         return
-    cli.show(f"{made.flight}: {made.end - made.start:.1f} s, {made.meta.get('protocol', 'protocol unknown')}")
+    cli.show(
+        f"{made.flight}: {made.end - made.start:.1f} s, "
+        f"{made.meta.get('protocol', 'protocol unknown')}"
+    )
     if named and named.ids:
-        cli.show("  ids in the bag: " + ", ".join(f"{name} is {number}" for name, number in named.ids.items()))
+        cli.show(
+            "  ids in the bag: "
+            + ", ".join(f"{name} is {number}" for name, number in named.ids.items())
+        )
     for remark in made.meta.get("remarks", ()):
         cli.show(f"  {remark}")
     for topic, count in made.messages.items():
@@ -82,7 +118,10 @@ def _convert(args: Namespace) -> None:
     for topic, falls in made.meta.get("reordered", {}).items():
         cli.show(f"  {topic}: sorted, its stamps fell {falls} times")
     if made.tdoa_unknown_anchor:
-        cli.show(f"  {made.tdoa_unknown_anchor} measurements name an anchor that the survey does not have")
+        cli.show(
+            f"  {made.tdoa_unknown_anchor} measurements name an anchor that the survey does "
+            "not have"
+        )
     cli.show(f"  -> {args.out}")
     for sentence in made.apart:
         cli.say("convert", sentence)
@@ -98,7 +137,10 @@ def _offsets(texts: Iterable[str]) -> dict[str, float]:
         except ValueError:
             offset = math.nan
         if not given or sensor not in SENSORS or sensor in offsets or not abs(offset) < 1e11:
-            raise InputError(f"--time-offset: {text!r} is not SENSOR=SECONDS, where SENSOR, once, is one of {', '.join(SENSORS)}.")
+            raise InputError(
+                f"--time-offset: {text!r} is not SENSOR=SECONDS, where SENSOR, once, is one "
+                f"of {', '.join(SENSORS)}."
+            )
         offsets[sensor] = offset
     return offsets
 
@@ -106,18 +148,29 @@ def _offsets(texts: Iterable[str]) -> dict[str, float]:
 def _named(args: Namespace) -> Named | None:
     """Named anchors for --columns, or None. Raises InputError."""
     if args.columns and not args.survey:
-        raise InputError("--columns: CSV files do not say where the anchors are; give a survey file (--survey FILE).")
+        raise InputError(
+            "--columns: CSV files do not say where the anchors are; give a survey file "
+            "(--survey FILE)."
+        )
     return read_named(args.survey) if args.columns else None
 
 
 def _read(args: Namespace, named: Named | None) -> Flight:
     """The Flight."""
     if args.columns:
-        options.refuse(args, ("namespace", "topics"), "says where topics are in bags, and --columns is of CSV files")
+        options.refuse(
+            args,
+            ("namespace", "topics"),
+            "says where topics are in bags, and --columns is of CSV files",
+        )
         assert named is not None  # as `_named` has seen to it
-        return columns.read_columns(args.input, columns.parse_columns(args.columns), named, args.salvage)
+        return columns.read_columns(
+            args.input, columns.parse_columns(args.columns), named, args.salvage
+        )
     if len(args.input) > 1:
-        raise InputError(f"IN: {len(args.input)} recordings are given; convert one by one, or name --columns.")
+        raise InputError(
+            f"IN: {len(args.input)} recordings are given; convert one by one, or name --columns."
+        )
     return options.reading_of(args).one(args.input[0])
 
 

@@ -4,20 +4,21 @@ from __future__ import annotations
 
 from pathlib import Path
 import sys
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.debias import INTERPOLATORS, BiasMap
 
 from .. import cli, options, parallel
-from ..outputs import OutputFile
 from ..debiasing import report
 from ..debiasing.evaluation import PositionEstimator, of_its_anchors
 from ..debiasing.mapping import cross_validated, fit_map
+from ..outputs import OutputFile
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
     from collections.abc import Sequence
+
     from ..readers.inputs import Recording
 
 DESCRIPTION = """Map the bias of estimated positions over the room, after Grasso et al. (Sensors 2022, 22, 9136), and
@@ -35,8 +36,14 @@ def parser() -> ArgumentParser:
     made = cli.parser(
         "debias",
         DESCRIPTION,
-        "debias fit 0425-traj1 0425-traj2 --survey anchor_0425.txt --holdout 0425-traj3 --out map.npz",
-        "debias fit --static points.csv --survey anchors.yaml --planar --step 0.5 --interpolator network --out map.npz",
+        (
+            "debias fit 0425-traj1 0425-traj2 --survey anchor_0425.txt --holdout 0425-traj3 --out "
+            "map.npz"
+        ),
+        (
+            "debias fit --static points.csv --survey anchors.yaml --planar --step 0.5 "
+            "--interpolator network --out map.npz"
+        ),
         "debias judge map.npz 0426-traj1 --survey surveys/ --json errors.json",
     )
     commands = made.add_subparsers(dest="command", required=True, metavar="COMMAND")
@@ -51,12 +58,24 @@ def parser() -> ArgumentParser:
         parallel.add_options(one)
     add = fitting.add_argument
     add(
-        "--static", nargs="+", default=[], metavar="FILE",
-        help="of a tag that stood still: CSV with true_x, true_y, true_z, x, y, z in metres, or recordings with truth",
-    )  # fmt: skip
+        "--static",
+        nargs="+",
+        default=[],
+        metavar="FILE",
+        help=(
+            "of a tag that stood still: CSV with true_x, true_y, true_z, x, y, z in metres, or "
+            "recordings with truth"
+        ),
+    )
     options.add_holdout(fitting)
     add("--out", metavar="FILE", type=OutputFile, required=True, help="the map to write (.npz)")
-    add("--step", metavar="M", type=float, default=0.35, help="of the grid of markers, m (default: 0.35)")
+    add(
+        "--step",
+        metavar="M",
+        type=float,
+        default=0.35,
+        help="of the grid of markers, m (default: 0.35)",
+    )
     add("--planar", action="store_true", help="map x and y only, whatever the height")
     add("--interpolator", choices=INTERPOLATORS, default="thin_plate", help="(default: thin_plate)")
     return made
@@ -64,20 +83,33 @@ def parser() -> ArgumentParser:
 
 def _fit(args: Namespace) -> int:
     if not (args.flights or args.static):
-        raise InputError("FLIGHT: there is none; give flights with ground truth, or --static points.")
+        raise InputError(
+            "FLIGHT: there is none; give flights with ground truth, or --static points."
+        )
     if not 0.01 <= args.step <= 10.0:
         raise InputError(f"--step: {args.step!r} is outside 0.01 ... 10 m.")
     estimator = PositionEstimator(options.reading_of(args), *options.filter_of(args), args.align)
-    recordings, held = (estimator.reading.find(paths, bool(args.dask)) for paths in (args.flights, args.holdout))
-    options.check_holdout((path.resolve() for path, _ in recordings), (path.resolve() for path, _ in held))
+    recordings, held = (
+        estimator.reading.find(paths, bool(args.dask)) for paths in (args.flights, args.holdout)
+    )
+    options.check_holdout(
+        (path.resolve() for path, _ in recordings), (path.resolve() for path, _ in held)
+    )
     fitted = list(parallel.over(estimator, recordings, args.jobs, args.dask))
     settings = {"step": args.step, "planar": args.planar, "interpolator": args.interpolator}
     shrinkage = cross_validated(fitted, args.static, estimator, **settings)
     made = fit_map(fitted, args.static, estimator, **settings)
     made = made.scaled(shrinkage.share) if shrinkage else made
     cli.show(report.about(made))
-    cli.show(shrinkage.as_text() if shrinkage else "how much of it flights to come bear out is not known: give several flights")
-    figures: dict[str, Any] = {"map": report.about_figures(made), "fitted": report.rows(fitted, made, estimator.effects)}
+    cli.show(
+        shrinkage.as_text()
+        if shrinkage
+        else "how much of it flights to come bear out is not known: give several flights"
+    )
+    figures: dict[str, Any] = {
+        "map": report.about_figures(made),
+        "fitted": report.rows(fitted, made, estimator.effects),
+    }
     figures["borne_out"] = shrinkage.as_dict() if shrinkage else None
     report.say_rows("in sample", figures["fitted"])
     refusals = []
@@ -100,7 +132,10 @@ def _fit(args: Namespace) -> int:
 
 
 def _judge(args: Namespace) -> int:
-    estimator, made = PositionEstimator(options.reading_of(args), *options.filter_of(args), args.align), BiasMap.load(args.map)
+    estimator, made = (
+        PositionEstimator(options.reading_of(args), *options.filter_of(args), args.align),
+        BiasMap.load(args.map),
+    )
     rows = _judged(args, estimator, estimator.reading.find(args.flights, bool(args.dask)), made)
     report.say_rows("flight", rows)
     gained = report.gain_of(rows)

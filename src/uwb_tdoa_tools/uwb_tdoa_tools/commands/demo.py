@@ -10,14 +10,16 @@ from typing import TYPE_CHECKING
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, options
-from ..outputs import OutputFolder
 from ..evaluating.table import lines_of_errors
 from ..flying import demo
+from ..outputs import OutputFolder
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
     from collections.abc import Sequence
+
     from uwb_tdoa_bias.foundation.flight import Flight
+
     from ..scoring.metrics import Score
 
 DESCRIPTION = """Take a flight, write it as a bag, replay the bag through bias_node and ekf_node over ROS topics, and
@@ -42,10 +44,26 @@ def parser() -> ArgumentParser:
         "demo --flight flight.bag --effects effects.yaml --out out/corrected",
     )
     add = made.add_argument
-    add("--flight", metavar="LOG", help="a recording: micro-SD log, UTIL CSV or bag (default: simulate one)")
+    add(
+        "--flight",
+        metavar="LOG",
+        help="a recording: micro-SD log, UTIL CSV or bag (default: simulate one)",
+    )
     options.add_reading(made)
-    add("--rate", metavar="R", type=float, default=1.0, help="replay R times as fast as flown (default 1)")
-    add("--out", metavar="DIR", type=OutputFolder, default="out/demo", help="for all files (default out/demo)")
+    add(
+        "--rate",
+        metavar="R",
+        type=float,
+        default=1.0,
+        help="replay R times as fast as flown (default 1)",
+    )
+    add(
+        "--out",
+        metavar="DIR",
+        type=OutputFolder,
+        default="out/demo",
+        help="for all files (default out/demo)",
+    )
     add("--effects", metavar="FILE", help="effects.yaml to correct with")
     options.add_model(made)
     options.add_rerun(made)
@@ -68,7 +86,10 @@ def _demo(args: Namespace) -> int:
     flight = chosen.flight
     assert flight.truth is not None
     length = flight.truth.t[-1] - flight.truth.t[0]
-    cli.show(f"flight     {flight.name}: {length:.1f} s, {len(flight.tdoa)} TDOAs, {len(flight.anchors)} anchors")
+    cli.show(
+        f"flight     {flight.name}: {length:.1f} s, {len(flight.tdoa)} TDOAs, "
+        f"{len(flight.anchors)} anchors"
+    )
     if chosen.became:
         cli.show(f"flown      by the estimate: {chosen.became}")
     cli.show(f"correction {chosen.correction()}")
@@ -86,7 +107,10 @@ def _demo(args: Namespace) -> int:
         flown.show(rerun, flight, [chosen.became, _change_in_words(scores)])
         cli.show(f"rerun      {rerun}")
     cli.show(f"took {time.monotonic() - started:.0f} s")
-    cli.show("next       " + "\n           ".join(demo.next_steps(args.flight or args.out / "flight.bag", args.survey)))
+    cli.show(
+        "next       "
+        + "\n           ".join(demo.next_steps(args.flight or args.out / "flight.bag", args.survey))
+    )
     return int(scores[-2].row()["diverged"] or not in_time)  # of the nodes
 
 
@@ -94,18 +118,31 @@ def _change_in_words(scores: Sequence[Score]) -> str:
     """What correction did to the error, in words."""
     before, after = (score.row()["rmse_3d"] for score in scores[:2])
     if len(scores) == 2:
-        return f"3D RMSE {before:.3f} m, with nothing corrected: diagnose finds what is wrong with this flight, and what that is worth on others"
-    change = f"3D RMSE raw {before:.3f} m, corrected {after:.3f} m: {round(100.0 * (after - before) / before):+d} %"
-    worse = "; this correction does not fit this flight: other anchors, another day, another IMU. Do not fly with it; diagnose finds one that fits"
+        return (
+            f"3D RMSE {before:.3f} m, with nothing corrected: diagnose finds what is wrong with "
+            "this flight, and what that is worth on others"
+        )
+    change = (
+        f"3D RMSE raw {before:.3f} m, corrected {after:.3f} m: "
+        f"{round(100.0 * (after - before) / before):+d} %"
+    )
+    worse = (
+        "; this correction does not fit this flight: other anchors, another day, another IMU. Do "
+        "not fly with it; diagnose finds one that fits"
+    )
     return change + (worse if after > before else "")
 
 
 def _all_in_time(flight: Flight, became: dict[str, int]) -> bool:
     """Print what became of every message. Returns whether all were there in time."""
-    counts = ", ".join(f"{count} {name}" for name, count in became.items() if not name.startswith("imu_"))
+    counts = ", ".join(
+        f"{count} {name}" for name, count in became.items() if not name.startswith("imu_")
+    )
     cli.show(f"nodes      TDOAs {len(flight.tdoa)}: {counts}")
     samples = 0 if flight.imu is None else len(flight.imu)
-    cli.show(f"nodes      IMU samples {samples}: {became['imu_late']} late, {became['imu_lost']} lost")
+    cli.show(
+        f"nodes      IMU samples {samples}: {became['imu_late']} late, {became['imu_lost']} lost"
+    )
     return not any(became[name] for name in ("lost", "late", "imu_late", "imu_lost"))
 
 

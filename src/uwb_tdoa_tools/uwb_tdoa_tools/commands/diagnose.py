@@ -12,19 +12,20 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.files import write_text
 
 from .. import cli, command_lines, options, parallel
-from ..outputs import OutputFolder
 from ..checking.remarks import remarks_on
 from ..diagnosis import diagnose, output
 from ..diagnosis.noise import write_parameters
 from ..diagnosis.references import REFERENCES
 from ..diagnosis.self_calibration.equations import measured_noise
 from ..localizing.rerun_file import write_diagnosis
+from ..outputs import OutputFolder
 from ..progress import Progress
 from ..readers import inputs
 from ..surveying.paths import DRIFT, read_paths
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
+
     from ..diagnosis.constraints.distance import Distance
     from ..diagnosis.constraints.mark import Mark
     from ..diagnosis.references.path import OdometryPath
@@ -39,9 +40,12 @@ assume with them; --config of evaluate) and report.html."""
 MOST = 300_000  # TDOAs; what they take: docs/speed.md
 FEW = 20  # flights; what fewer gain by other processes, these take to start (docs/speed.md)
 UNUSED = {  # by references, of the options of what is known
-    "truth": ("marks", "distances", "odometry"), "heights": ("marks", "distances", "odometry"), "odometry": ("distances",),
-    "marks": ("odometry",), "nothing": ("odometry",),
-}  # fmt: skip
+    "truth": ("marks", "distances", "odometry"),
+    "heights": ("marks", "distances", "odometry"),
+    "odometry": ("distances",),
+    "marks": ("odometry",),
+    "nothing": ("odometry",),
+}
 
 
 def parser() -> ArgumentParser:
@@ -50,49 +54,89 @@ def parser() -> ArgumentParser:
         "diagnose",
         DESCRIPTION,
         "diagnose flight.bag --out diagnosis/",
-        "diagnose 0425-traj1 0425-traj2 --survey anchor_0425.txt --holdout 0425-traj3 --out diagnosis/",
+        (
+            "diagnose 0425-traj1 0425-traj2 --survey anchor_0425.txt --holdout 0425-traj3 --out "
+            "diagnosis/"
+        ),
         "diagnose flight.bag --effects effects.yaml --out second/",
         "diagnose flight.bag --rerun flight.rrd --out diagnosis/",
         "diagnose flight.bag --reference heights --out by-height/",
-        "diagnose flight.bag --reference odometry --odometry /vio/odometry --marks marks.yaml --out by-odometry/",
+        (
+            "diagnose flight.bag --reference odometry --odometry /vio/odometry --marks marks.yaml "
+            "--out by-odometry/"
+        ),
         "diagnose flight.bag --no-truth --out without/",
         "diagnose today.bag --no-truth --effects last-week/effects.yaml --out today/",
     )
     options.add_recordings(made)
-    options.add_filter(made, "effects.yaml: what is in the model already; without ground truth its covariance is the prior")
+    options.add_filter(
+        made,
+        (
+            "effects.yaml: what is in the model already; without ground truth its covariance is "
+            "the prior"
+        ),
+    )
     add = made.add_argument
     options.add_holdout(made)
     known = made.add_mutually_exclusive_group().add_argument
     known(
-        "--reference", choices=tuple(REFERENCES), default="truth",
-        help="what flights are compared with: their ground truth (default), the heights of a range finder, --marks, "
+        "--reference",
+        choices=tuple(REFERENCES),
+        default="truth",
+        help="what flights are compared with: their ground truth (default), the heights of a range "
+        "finder, --marks, "
         "--odometry, or nothing; what is not named is not read",
-    )  # fmt: skip
-    known("--no-truth", dest="reference", action="store_const", const="nothing", help="short for --reference nothing")
+    )
+    known(
+        "--no-truth",
+        dest="reference",
+        action="store_const",
+        const="nothing",
+        help="short for --reference nothing",
+    )
     options.add_known(made)
     add(
-        "--odometry", metavar="CSV|TOPIC",
-        help="path of another odometry or SLAM, in a frame of its own with z up: a CSV file with columns flight, t, x, y, z, or a "
-        "topic (nav_msgs/Odometry) of the bags; with --marks, e.g. where it took off and landed, it goes through them",
-    )  # fmt: skip
-    add("--drift", type=float, default=DRIFT, metavar="M", help="of that, m per square root of a second (default %(default)s)")
+        "--odometry",
+        metavar="CSV|TOPIC",
+        help="path of another odometry or SLAM, in a frame of its own with z up: a CSV file with "
+        "columns flight, t, x, y, z, or a "
+        "topic (nav_msgs/Odometry) of the bags; with --marks, e.g. where it took off and "
+        "landed, it goes through them",
+    )
+    add(
+        "--drift",
+        type=float,
+        default=DRIFT,
+        metavar="M",
+        help="of that, m per square root of a second (default %(default)s)",
+    )
     options.add_most(made, MOST)
     options.add_align(made)
     options.add_rerun(made)
     parallel.add_options(made)
-    add("--out", metavar="DIR", type=OutputFolder, required=True, help="where to write; made if it is not there")
+    add(
+        "--out",
+        metavar="DIR",
+        type=OutputFolder,
+        required=True,
+        help="where to write; made if it is not there",
+    )
     return made
 
 
 def _diagnose(args: Namespace) -> None:
     out = args.out
-    options.refuse(args, UNUSED[args.reference], f"no part of it is used with --reference {args.reference}")
+    options.refuse(
+        args, UNUSED[args.reference], f"no part of it is used with --reference {args.reference}"
+    )
     config, effects = options.filter_of(args)
     reading = options.reading_of(args)
     found = reading.find(args.flights)
     rerun = options.rerun_of(args, len(found), partial(cli.say, "diagnose"))
     jobs, dask = parallel.asked(args, len(found), FEW)
-    flights, holdout = (reading.flights(paths, args.most, jobs, dask) for paths in (args.flights, args.holdout))
+    flights, holdout = (
+        reading.flights(paths, args.most, jobs, dask) for paths in (args.flights, args.holdout)
+    )
     options.check_holdout((flight.name for flight in flights), (flight.name for flight in holdout))
     if args.reference in ("heights", "odometry"):
         inputs.need_tdoas([*flights, *holdout], f"--reference {args.reference}")
@@ -103,22 +147,35 @@ def _diagnose(args: Namespace) -> None:
             raise InputError(f"--reference {option}: --{option} says which, and is missing.")
     known: tuple[Mark | Distance | OdometryPath, ...] = options.known_of(args, (*flights, *holdout))
     if args.odometry is not None:
-        known = (*known, *read_paths(args.odometry, (*flights, *holdout), args.drift, args.namespace))
-    reference = REFERENCES[args.reference](config, known, *[args.align][: args.reference == "truth"])
-    over = partial(parallel.over, jobs=jobs, dask=dask, unit=None)  # no bar beside the line of Progress
+        known = (
+            *known,
+            *read_paths(args.odometry, (*flights, *holdout), args.drift, args.namespace),
+        )
+    reference = REFERENCES[args.reference](
+        config, known, *[args.align][: args.reference == "truth"]
+    )
+    over = partial(
+        parallel.over, jobs=jobs, dask=dask, unit=None
+    )  # no bar beside the line of Progress
     with Progress("diagnose") as progress:
-        result = diagnose(flights, holdout, effects or EffectSet(), config, reference, progress, over)
+        result = diagnose(
+            flights, holdout, effects or EffectSet(), config, reference, progress, over
+        )
         progress("measuring the noise")
         tdoa_std = None  # of no TDOAs
         if all(len(flight.tdoa) for flight in result.flights):
-            tdoa_std = measured_noise(result.flights, result.effects, config, over, partial(cli.say, "diagnose"))
+            tdoa_std = measured_noise(
+                result.flights, result.effects, config, over, partial(cli.say, "diagnose")
+            )
     from ..diagnosis.report.page import html  # here, because drawing takes a second to import
 
     out.mkdir(parents=True, exist_ok=True)
     (_, its_survey), *_ = found
     truth = all(flight.truth is not None for flight in holdout or flights)
     judged_on = args.holdout or args.flights
-    applying = command_lines.applying(out, judged_on, args.survey, its_survey, tdoa_std is not None, truth)
+    applying = command_lines.applying(
+        out, judged_on, args.survey, its_survey, tdoa_std is not None, truth
+    )
     result = replace(result, applying=applying)
     cli.write_json(out / "diagnosis.json", output.as_json(result))
     result.effects.to_yaml(out / "effects.yaml")
@@ -127,7 +184,10 @@ def _diagnose(args: Namespace) -> None:
     if rerun is not None:
         write_diagnosis(rerun, result, effects or EffectSet(), config)
     cli.show(output.as_text(result))
-    cli.show(f"wrote diagnosis.json, effects.yaml, {'ekf_node.yaml ' if tdoa_std is not None else ''}and report.html to {out}")
+    cli.show(
+        "wrote diagnosis.json, effects.yaml, "
+        f"{'ekf_node.yaml ' if tdoa_std is not None else ''}and report.html to {out}"
+    )
 
 
 main = cli.executable(_diagnose, parser)

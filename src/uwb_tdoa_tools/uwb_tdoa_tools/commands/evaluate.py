@@ -1,4 +1,7 @@
-"""How good is the estimate? Errors against ground truth, of the filter run here or of a recorded odometry."""
+"""How good is the estimate?
+
+Errors against ground truth, of the filter run here or of a recorded odometry.
+"""
 
 from __future__ import annotations
 
@@ -11,17 +14,26 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.files import write_text
 
 from .. import cli, options, parallel
-from ..outputs import OutputFile, OutputFolder
-from ..results_file import asked_of
 from ..evaluating import table
 from ..evaluating.evaluator import Evaluator, results
 from ..json_values import as_json
+from ..outputs import OutputFile, OutputFolder
+from ..results_file import asked_of
 from ..scoring.metrics import FIGURES, Pool
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
 
-NO_MATTER = ("flights", "survey", "json", "markdown", "beside", "resume", "jobs", "dask")  # to what is kept of a flight
+NO_MATTER = (
+    "flights",
+    "survey",
+    "json",
+    "markdown",
+    "beside",
+    "resume",
+    "jobs",
+    "dask",
+)  # to what is kept of a flight
 NOT_OF_ODOMETRY = "effects", "config", "model", "no_bias", "parameters", "without", "smooth"
 
 
@@ -29,10 +41,14 @@ def parser() -> ArgumentParser:
     """Its options."""
     made = cli.parser(
         "evaluate",
-        "Errors of the estimate against ground truth, in metres: in the air (truth z > 0.3 m), and in each phase of the recording,\n"
-        "at rest before and after too (without: s with no estimate; step: the largest jump of the error between two estimates).\n"
-        "Runs bias correction and filter here, as the nodes would, or takes a recorded odometry.\n\n"
-        "Exit code: 0 done, 1 a run DIVERGED, or TDOAs were late for a recorded odometry (as far as uwb/residual was recorded too),\n"
+        "Errors of the estimate against ground truth, in metres: in the air (truth z > 0.3 "
+        "m), and in each phase of the recording,\n"
+        "at rest before and after too (without: s with no estimate; step: the largest jump of "
+        "the error between two estimates).\n"
+        "Runs bias correction and filter here, as the nodes would, or takes a recorded "
+        "odometry.\n\n"
+        "Exit code: 0 done, 1 a run DIVERGED, or TDOAs were late for a recorded odometry (as "
+        "far as uwb/residual was recorded too),\n"
         "2 bad input.",
         "evaluate flight.bag",
         "evaluate 0425-traj2 --survey anchor_0425.txt --plot error.png",
@@ -48,60 +64,101 @@ def parser() -> ArgumentParser:
     options.add_recordings(made)
     options.add_estimator(made)
     options.add_align(made, judges=True)
-    add("--odometry", metavar="BAG", help="judge the odometry of this bag; needs exactly one FLIGHT")
+    add(
+        "--odometry", metavar="BAG", help="judge the odometry of this bag; needs exactly one FLIGHT"
+    )
     add("--json", metavar="FILE", type=OutputFile, help="write all figures: runs, pooled")
     add("--markdown", metavar="FILE", type=OutputFile, help="write the table as Markdown")
     add(
-        "--beside", metavar="CSV",
-        help="add the 3D RMSE that others reach to that table: columns flight, peer, mode, rmse_3d, diverged",
-    )  # fmt: skip
-    add("--plot", metavar="FILE", type=OutputFile, help="picture of the errors over time (one FLIGHT)")
-    add("--tum", metavar="DIR", type=OutputFolder, help="write estimates and truths as TUM trajectories, e.g. for evo")
+        "--beside",
+        metavar="CSV",
+        help=(
+            "add the 3D RMSE that others reach to that table: columns flight, peer, mode, "
+            "rmse_3d, diverged"
+        ),
+    )
+    add(
+        "--plot",
+        metavar="FILE",
+        type=OutputFile,
+        help="picture of the errors over time (one FLIGHT)",
+    )
+    add(
+        "--tum",
+        metavar="DIR",
+        type=OutputFolder,
+        help="write estimates and truths as TUM trajectories, e.g. for evo",
+    )
     options.add_rerun(made)
     add(
-        "--resume", metavar="FILE", type=OutputFile,
-        help="keep each flight's figures there as soon as it is judged, a line of JSON each; what is there is not judged again",
-    )  # fmt: skip
+        "--resume",
+        metavar="FILE",
+        type=OutputFile,
+        help=(
+            "keep each flight's figures there as soon as it is judged, a line of JSON each; what "
+            "is there is not judged again"
+        ),
+    )
     parallel.add_options(made)
     return made
 
 
 def _evaluate(args: Namespace) -> int:
     if args.odometry:
-        options.refuse(args, NOT_OF_ODOMETRY, "has no part in an odometry that was recorded, which is judged as it is (--odometry)")
+        options.refuse(
+            args,
+            NOT_OF_ODOMETRY,
+            "has no part in an odometry that was recorded, which is judged as it is (--odometry)",
+        )
     estimator = options.estimator_of(args, partial(cli.say, "evaluate"))
     reading = options.reading_of(args)
-    found = (replace(reading, topics={}, namespace="") if args.odometry else reading).find(args.flights, bool(args.dask))
+    found = (replace(reading, topics={}, namespace="") if args.odometry else reading).find(
+        args.flights, bool(args.dask)
+    )
     for option in ("odometry", "plot"):
         if getattr(args, option) and len(found) != 1:
             raise InputError(f"--{option}: needs exactly one flight, got {len(found)}.")
     trajectories = args.tum.absolute() if args.tum else None
     rerun = options.rerun_of(args, len(found), partial(cli.say, "evaluate"))
-    evaluator = Evaluator(reading, estimator, args.odometry, args.plot, trajectories, rerun, args.align)
+    evaluator = Evaluator(
+        reading, estimator, args.odometry, args.plot, trajectories, rerun, args.align
+    )
     if not args.odometry:
         cli.show(f"correcting with: {estimator.correction}")
     cli.show(table.head())
     kept, pool = [], Pool()
-    asked = asked_of(args, NO_MATTER, ("effects", "config", "model")) | {"version of the figures": FIGURES}
+    asked = asked_of(args, NO_MATTER, ("effects", "config", "model")) | {
+        "version of the figures": FIGURES
+    }
     for result in results(evaluator, found, args.resume, asked, args.jobs, args.dask):
         pool.add(result)
-        kept += [result] if args.json or args.markdown else []  # else nothing grows with the number of flights
+        kept += (
+            [result] if args.json or args.markdown else []
+        )  # else nothing grows with the number of flights
         cli.show(table.line(result.row))
     together = pool.figures()
     if len(found) > 1:
         cli.show(table.line(together))
-        cli.show(f"mean 3D RMSE of the runs {together['rmse_3d_mean_of_runs']:.3f} m, largest "
-                 f"{together['rmse_3d_max_of_runs']:.3f} m, diverged {together['diverged']}")  # fmt: skip
+        cli.show(
+            f"mean 3D RMSE of the runs {together['rmse_3d_mean_of_runs']:.3f} m, largest "
+            f"{together['rmse_3d_max_of_runs']:.3f} m, diverged {together['diverged']}"
+        )
     cli.show("", *table.lines_of_phases(together["phases"] if len(found) > 1 else result.phases))
     cli.show("", *table.lines_of_alignment(result.aligned if len(found) == 1 else {}, pool.aligned))
     if args.json:
-        cli.write_json(args.json, {"runs": [one.as_json() for one in kept], "pooled": as_json(together)})
+        cli.write_json(
+            args.json, {"runs": [one.as_json() for one in kept], "pooled": as_json(together)}
+        )
     if args.markdown:
         others = table.read_others(args.beside) if args.beside else {}
         write_text(args.markdown, table.markdown_of(kept, pool, others))
     if late := evaluator.late_tdoas():
-        cli.say("evaluate", f"{args.odometry}: {late} TDOAs came too late for that filter: this is not what it can do; "
-                "replay it in step with the odometry (replay --follow odometry).")  # fmt: skip
+        cli.say(
+            "evaluate",
+            f"{args.odometry}: {late} TDOAs came too late for that filter: this is not what "
+            "it can do; "
+            "replay it in step with the odometry (replay --follow odometry).",
+        )
     return int(late > 0 or together["diverged"] > together["late_start"])
 
 

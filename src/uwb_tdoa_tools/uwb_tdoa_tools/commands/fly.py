@@ -9,7 +9,6 @@ from uwb_tdoa_bias.correction.network import load_network
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, options, parallel
-from ..outputs import OutputFile, OutputFolder
 from ..flying import fleet
 from ..flying.path import Circles
 from ..flying.plots import plot
@@ -17,9 +16,20 @@ from ..flying.report import summary, text
 from ..flying.sensors import AIDS
 from ..flying.trial import Task
 from ..flying.world import MOMENTS, WORLDS, world_of
+from ..outputs import OutputFile, OutputFolder
 from ..results_file import asked_of
 
-NO_MATTER = "flights", "seed", "jobs", "dask", "at_least", "json", "plot", "record", "resume"  # to what becomes of a flight
+NO_MATTER = (
+    "flights",
+    "seed",
+    "jobs",
+    "dask",
+    "at_least",
+    "json",
+    "plot",
+    "record",
+    "resume",
+)  # to what becomes of a flight
 DESCRIPTION = """Fly a simulated quadrotor in closed loop, in lockstep and without ROS: its controller gets position, velocity and
 attitude from nothing but the estimate, by the very code of ekf_node, and its rates from the gyroscope. Four seconds at rest, up to
 1.2 m, two circles, down, land. The verdict is by ground truth alone.
@@ -43,28 +53,118 @@ def parser() -> argparse.ArgumentParser:
         "fly --flights 1000 --resume flown.jsonl --dask tcp://10.0.0.1:8786",
     )
     add = made.add_argument
-    add("--flights", metavar="N", type=parallel.whole_number, default=10, help="how many (default: 10)")
-    add("--seed", metavar="S", type=parallel.whole_number, default=1, help="of the first; the others have the next ones (default: 1)")
-    add("--world", choices=WORLDS, default="hall", help="what it flies in (default: hall; docs/flying.md)")
-    add("--installation", metavar="N", type=parallel.whole_number, help="the same anchors' errors in every flight (default: its own)")
-    add("--told", choices=("nothing", "place"), default="nothing", help="at the start: its place, to 0.1 m (default: nothing)")
-    add("--yaw", choices=("known", "unknown"), default="known", help="at the start, to 0.1 rad (default: known)")
-    add("--aid", action="append", default=[], choices=AIDS, help="what else it measures: a range finder, a barometer, its velocity, distances to anchors")
-    add("--floor-effect", action=argparse.BooleanOptionalAction, help="low anchors are late near the floor (default: the world's)")
-    add("--silence", metavar="MOMENT:S", help=f"nothing is heard for S seconds: MOMENT is one of {', '.join(MOMENTS)}")
+    add(
+        "--flights",
+        metavar="N",
+        type=parallel.whole_number,
+        default=10,
+        help="how many (default: 10)",
+    )
+    add(
+        "--seed",
+        metavar="S",
+        type=parallel.whole_number,
+        default=1,
+        help="of the first; the others have the next ones (default: 1)",
+    )
+    add(
+        "--world",
+        choices=WORLDS,
+        default="hall",
+        help="what it flies in (default: hall; docs/flying.md)",
+    )
+    add(
+        "--installation",
+        metavar="N",
+        type=parallel.whole_number,
+        help="the same anchors' errors in every flight (default: its own)",
+    )
+    add(
+        "--told",
+        choices=("nothing", "place"),
+        default="nothing",
+        help="at the start: its place, to 0.1 m (default: nothing)",
+    )
+    add(
+        "--yaw",
+        choices=("known", "unknown"),
+        default="known",
+        help="at the start, to 0.1 rad (default: known)",
+    )
+    add(
+        "--aid",
+        action="append",
+        default=[],
+        choices=AIDS,
+        help=(
+            "what else it measures: a range finder, a barometer, its velocity, distances to anchors"
+        ),
+    )
+    add(
+        "--floor-effect",
+        action=argparse.BooleanOptionalAction,
+        help="low anchors are late near the floor (default: the world's)",
+    )
+    add(
+        "--silence",
+        metavar="MOMENT:S",
+        help=f"nothing is heard for S seconds: MOMENT is one of {', '.join(MOMENTS)}",
+    )
     add("--hover", action="store_true", help="instead of circles")
-    add("--again", action="store_true", help="a minute later, carried by 2 m meanwhile, fly once more, without a restart")
-    add("--inject", nargs="+", action="append", default=[], metavar=("EFFECT", "KEY=NUMBER"), help="an effect, as of inject")
+    add(
+        "--again",
+        action="store_true",
+        help="a minute later, carried by 2 m meanwhile, fly once more, without a restart",
+    )
+    add(
+        "--inject",
+        nargs="+",
+        action="append",
+        default=[],
+        metavar=("EFFECT", "KEY=NUMBER"),
+        help="an effect, as of inject",
+    )
     options.add_filter(made)
-    add("--model", metavar="FILE", help="ONNX bias network to correct with, e.g. one that train wrote (default: none)")
-    add("--set", metavar="NAME:=VALUE", action="append", default=[], help="a filter parameter; may be repeated")
-    add("--peer", metavar="LIBRARY", help="fly by this shared library of another filter (docs/flying.md), which is told its yaw")
+    add(
+        "--model",
+        metavar="FILE",
+        help="ONNX bias network to correct with, e.g. one that train wrote (default: none)",
+    )
+    add(
+        "--set",
+        metavar="NAME:=VALUE",
+        action="append",
+        default=[],
+        help="a filter parameter; may be repeated",
+    )
+    add(
+        "--peer",
+        metavar="LIBRARY",
+        help="fly by this shared library of another filter (docs/flying.md), which is told its yaw",
+    )
     parallel.add_options(made)
-    add("--at-least", metavar="N", type=int, default=0, help="flights that are to land (default: 0)")
-    add("--record", metavar="DIR", type=OutputFolder, help="write every flight as a bag, DIR/flown-SEED, e.g. for diagnose")
-    add("--resume", metavar="FILE", type=OutputFile, help="keep the verdict of each flight in this file, and go on from what is there")
+    add(
+        "--at-least", metavar="N", type=int, default=0, help="flights that are to land (default: 0)"
+    )
+    add(
+        "--record",
+        metavar="DIR",
+        type=OutputFolder,
+        help="write every flight as a bag, DIR/flown-SEED, e.g. for diagnose",
+    )
+    add(
+        "--resume",
+        metavar="FILE",
+        type=OutputFile,
+        help="keep the verdict of each flight in this file, and go on from what is there",
+    )
     add("--json", metavar="FILE", type=OutputFile, help="write the summary and every verdict")
-    add("--plot", metavar="FILE", type=OutputFile, help="draw a map of all flights, and the errors of the worst with three sigma")
+    add(
+        "--plot",
+        metavar="FILE",
+        type=OutputFile,
+        help="draw a map of all flights, and the errors of the worst with three sigma",
+    )
     return made
 
 
@@ -72,17 +172,40 @@ def _fly(args: argparse.Namespace) -> int:
     if args.record is not None:
         args.record.mkdir(parents=True, exist_ok=True)
     if args.resume and (args.plot or args.record):
-        raise InputError("--resume: keeps verdicts alone; leave it out with --plot and --record, which need the flights themselves.")
+        raise InputError(
+            "--resume: keeps verdicts alone; leave it out with --plot and --record, which "
+            "need the flights themselves."
+        )
     config, effects = options.filter_of(args)
     load_network(args.model)  # or say what is wrong with it, before the first flight
     config = options.with_parameters(config, args.set)
-    world = world_of(args.world, args.floor_effect, args.aid, args.silence, args.inject, args.installation)
+    world = world_of(
+        args.world, args.floor_effect, args.aid, args.silence, args.inject, args.installation
+    )
     path = Circles(radius=0.0) if args.hover else Circles()
     seeds = range(args.seed, args.seed + args.flights)
-    tasks = [Task(world, seed, args.told, args.yaw, config, effects, args.model, args.again, args.peer, path) for seed in seeds]
+    tasks = [
+        Task(
+            world,
+            seed,
+            args.told,
+            args.yaw,
+            config,
+            effects,
+            args.model,
+            args.again,
+            args.peer,
+            path,
+        )
+        for seed in seeds
+    ]
     verdicts, pictures = [], []
-    with fleet.kept(args.resume, asked_of(args, NO_MATTER, ("config", "effects", "model", "peer"))) as done:
-        for verdict, picture in fleet.flown(tasks, done, args.record, args.plot is not None, args.jobs, args.dask):
+    with fleet.kept(
+        args.resume, asked_of(args, NO_MATTER, ("config", "effects", "model", "peer"))
+    ) as done:
+        for verdict, picture in fleet.flown(
+            tasks, done, args.record, args.plot is not None, args.jobs, args.dask
+        ):
             verdicts.append(verdict)
             pictures += [] if picture is None else [picture]
     summed = summary(verdicts)

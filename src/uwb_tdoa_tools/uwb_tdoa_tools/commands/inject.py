@@ -28,14 +28,21 @@ def parser() -> ArgumentParser:
     made = cli.parser(
         "inject",
         DESCRIPTION,
-        "inject 0425-traj2 --survey anchor_0425.txt --effect anchor_delay --value 3=0.3 --out late.bag",
+        (
+            "inject 0425-traj2 --survey anchor_0425.txt --effect anchor_delay --value 3=0.3 --out "
+            "late.bag"
+        ),
         "inject flight.bag --effect tag_lever_arm --value x=0.05 z=0.1 --out arm.bag",
         "inject flight.bag --effect nlos --value 2.delay=0.4 2.start=20 2.end=35 --out blocked.bag",
         "inject --list",
     )
     add = made.add_argument
     add("flight", metavar="FLIGHT", nargs="?", help="a raw log, a UTIL CSV file or a bag")
-    add("--list", action="store_true", help="list effects, parameters and units, and do nothing else")
+    add(
+        "--list",
+        action="store_true",
+        help="list effects, parameters and units, and do nothing else",
+    )
     options.add_reading(made)
     add("--effect", metavar="NAME", choices=EFFECTS, help="the effect to add")
     add("--value", metavar="KEY=NUMBER", nargs="+", default=[], help="its parameters")
@@ -54,7 +61,15 @@ def _inject(args: Namespace) -> None:
             raise InputError(f"{option}: is missing; see inject --help.")
     effect = parse_effect(args.effect, args.value)
     with Progress("inject", what="reading and writing"):
-        name = inject(effect, args.flight, options.reading_of(args), args.out, args.seed, args.storage, args.force)
+        name = inject(
+            effect,
+            args.flight,
+            options.reading_of(args),
+            args.out,
+            args.seed,
+            args.storage,
+            args.force,
+        )
     added = ", ".join(f"{key} = {value:g}" for key, value in effect.values.items())
     cli.show(f"{name}: added {effect.name} ({added}, in {effect.unit}) -> {args.out}")
 

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, options, parallel
-from ..outputs import OutputFile, OutputFolder
 from ..localizing.localize import Localizer, all_good, check_names
+from ..outputs import OutputFile, OutputFolder
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
@@ -35,7 +35,10 @@ def parser() -> ArgumentParser:
         DESCRIPTION,
         "localize flight.bag --out out/",
         "localize flight.log --survey anchors.yaml --smooth --residuals --out out/",
-        "localize flights/ --survey calibrated/anchors.yaml --effects calibrated/effects.yaml --config calibrated/ekf_node.yaml --out out/",
+        (
+            "localize flights/ --survey calibrated/anchors.yaml --effects calibrated/effects.yaml "
+            "--config calibrated/ekf_node.yaml --out out/"
+        ),
         "localize flight.bag --bag --json located.json --out out/",
         "localize flight.bag --rerun flight.rrd --out out/",
         "localize hall.bag --zones 20 --out out/",
@@ -44,19 +47,36 @@ def parser() -> ArgumentParser:
     options.add_estimator(made)
     add = made.add_argument
     add("--bag", action="store_true", help="write the odometry as a bag, too")
-    add("--residuals", action="store_true", help="write what is left of each TDOA, too: a table, and a picture")
-    add("--zones", metavar="M", type=float, help="write who is heard in squares of that size, and how well, too: a table, and a map")
+    add(
+        "--residuals",
+        action="store_true",
+        help="write what is left of each TDOA, too: a table, and a picture",
+    )
+    add(
+        "--zones",
+        metavar="M",
+        type=float,
+        help="write who is heard in squares of that size, and how well, too: a table, and a map",
+    )
     options.add_rerun(made)
     add("--json", metavar="FILE", type=OutputFile, help="write all figures")
     parallel.add_options(made)
-    add("--out", metavar="DIR", type=OutputFolder, required=True, help="where to write; made if it is not there")
+    add(
+        "--out",
+        metavar="DIR",
+        type=OutputFolder,
+        required=True,
+        help="where to write; made if it is not there",
+    )
     return made
 
 
 def _localize(args: Namespace) -> int:
     out = args.out
     if args.zones is not None and not args.zones > 0.0:
-        raise InputError(f"--zones: {args.zones:g} m is no size of a square; give one above 0, e.g. 20.")
+        raise InputError(
+            f"--zones: {args.zones:g} m is no size of a square; give one above 0, e.g. 20."
+        )
     say = partial(cli.say, "localize")
     estimator = options.estimator_of(args, say)
     reading = options.reading_of(args, truth=False)
@@ -66,7 +86,9 @@ def _localize(args: Namespace) -> int:
     out.mkdir(parents=True, exist_ok=True)
     cli.show(f"correcting with: {estimator.correction}")
     folder, located = out.absolute() if args.dask else out, []
-    localizer = Localizer(reading, estimator, folder, args.bag, args.residuals, rerun, args.zones, args.effects)
+    localizer = Localizer(
+        reading, estimator, folder, args.bag, args.residuals, rerun, args.zones, args.effects
+    )
     for one in parallel.over(localizer, found, args.jobs, args.dask):
         located.append(one)
         first, *others = one.belief.sentences()

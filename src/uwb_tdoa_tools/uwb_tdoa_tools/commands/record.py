@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli
-from ..outputs import OutputBag, OutputFile
 from ..bags.files import STORAGES
 from ..live.record import record
 from ..live.session import PACKAGE
+from ..outputs import OutputBag, OutputFile
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
@@ -37,17 +37,33 @@ def parser() -> ArgumentParser:
         "record -o run.bag --rerun run.rrd odometry uwb/residual uwb/anchors uwb/tdoa",
     )
     made.add_argument("topics", nargs="*", metavar="TOPIC", help="topics to record")
-    made.add_argument("-a", "--all", action="store_true", help="record all topics, except hidden ones")
-    made.add_argument("-o", "--output", required=True, metavar="BAG", type=OutputBag, help="the bag to write, a new directory")
+    made.add_argument(
+        "-a", "--all", action="store_true", help="record all topics, except hidden ones"
+    )
+    made.add_argument(
+        "-o",
+        "--output",
+        required=True,
+        metavar="BAG",
+        type=OutputBag,
+        help="the bag to write, a new directory",
+    )
     made.add_argument("--package", **PACKAGE)
     made.add_argument("-s", "--storage", choices=STORAGES, default="mcap", help="default: mcap")
-    made.add_argument("--rerun", metavar="FILE", type=OutputFile, help="write a recording for the viewer Rerun, too (.rrd; needs pip install rerun-sdk)")
+    made.add_argument(
+        "--rerun",
+        metavar="FILE",
+        type=OutputFile,
+        help="write a recording for the viewer Rerun, too (.rrd; needs pip install rerun-sdk)",
+    )
     return made
 
 
 def _record(args: Namespace) -> int:
     if bool(args.topics) == args.all:
-        raise InputError("topics: name the topics to record, or give --all for all of them, not both.")
+        raise InputError(
+            "topics: name the topics to record, or give --all for all of them, not both."
+        )
     say = partial(cli.say, "record")
     rerun = _rerun_of(args, say)
     recorded = record(args.topics, args.output, args.storage, args.ros_arguments, say, args.package)
@@ -67,7 +83,10 @@ def _record(args: Namespace) -> int:
 
 
 def _rerun_of(args: Namespace, say: Callable[[str], object]) -> Path | None:
-    """See options.rerun_of. What it imports takes a third of a second, in which messages would pass."""
+    """See options.rerun_of.
+
+    What it imports takes a third of a second, in which messages would pass.
+    """
     if not args.rerun:
         return None
     from .. import options

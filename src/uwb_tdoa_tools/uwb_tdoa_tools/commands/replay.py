@@ -40,17 +40,30 @@ def parser() -> argparse.ArgumentParser:
     add("-r", "--rate", type=_positive, default=1.0, help="times as fast as recorded (default 1)")
     add("-l", "--loop", action="store_true", help="start again at the end, until stopped")
     add(
-        "--clock", type=_positive, nargs="?", const=40.0, metavar="HZ",
+        "--clock",
+        type=_positive,
+        nargs="?",
+        const=40.0,
+        metavar="HZ",
         help="publish the bag's time on /clock (default 40 Hz)",
-    )  # fmt: skip
+    )
     add(
-        "--wait-matched", type=_positive, default=ReplayOptions.wait, metavar="SECONDS",
-        help=f"wait at most this long until somebody subscribes, or fail (default {ReplayOptions.wait:g})",
-    )  # fmt: skip
+        "--wait-matched",
+        type=_positive,
+        default=ReplayOptions.wait,
+        metavar="SECONDS",
+        help=(
+            "wait at most this long until somebody subscribes, or fail (default "
+            f"{ReplayOptions.wait:g})"
+        ),
+    )
     add(
-        "--wait-topics", nargs="+", default=[], metavar="TOPIC",
+        "--wait-topics",
+        nargs="+",
+        default=[],
+        metavar="TOPIC",
         help="wait until somebody subscribes to each of these topics",
-    )  # fmt: skip
+    )
     add("--follow", metavar="TOPIC", help="keep in step with this topic, e.g. odometry")
     add("--package", **PACKAGE)
     return made
@@ -60,7 +73,16 @@ def _replay(args: argparse.Namespace) -> int:
     say = partial(cli.say, "replay")
     done = replay(
         args.bag,
-        ReplayOptions(args.rate, args.loop, args.clock, args.wait_matched, args.wait_topics, args.follow, args.ros_arguments, args.package),
+        ReplayOptions(
+            args.rate,
+            args.loop,
+            args.clock,
+            args.wait_matched,
+            args.wait_topics,
+            args.follow,
+            args.ros_arguments,
+            args.package,
+        ),
         say,
     )
     played = done.played
@@ -68,7 +90,8 @@ def _replay(args: argparse.Namespace) -> int:
         cli.show(f"{topic}: {count} messages")
     waited = f", waited {played.waited:.2f} s for {args.follow}" if args.follow else ""
     cli.show(
-        f"{sum(played.counts.values())} messages in {done.took:.2f} s, at most {1e3 * played.behind:.1f} ms late, "
+        f"{sum(played.counts.values())} messages in {done.took:.2f} s, at most "
+        f"{1e3 * played.behind:.1f} ms late, "
         f"stretched by {1e3 * played.stretched:.1f} ms{waited}"
     )
     if done.stopped_by is not None:
@@ -77,7 +100,10 @@ def _replay(args: argparse.Namespace) -> int:
     if not done.acknowledged:
         say(f"not every subscription acknowledged every message within {ACKNOWLEDGE_LIMIT:g} s")
     for what, count in done.wrong.items():
-        say(f"{count} {what}; the result is not that of the bag: look at /diagnostics, or replay slower (--rate)")
+        say(
+            f"{count} {what}; the result is not that of the bag: look at /diagnostics, or "
+            "replay slower (--rate)"
+        )
     return int(bool(done.wrong) or not done.acknowledged)
 
 

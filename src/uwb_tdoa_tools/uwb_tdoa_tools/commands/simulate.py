@@ -1,4 +1,6 @@
-"""simulate: fly, drive or carry a tag along a path among anchors, and write what IMU, UWB tag and motion capture would record."""
+"""simulate: fly, drive or carry a tag along a path among anchors, and write what IMU, UWB tag and
+motion capture would record.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +8,9 @@ import sys
 from typing import TYPE_CHECKING
 
 from .. import cli
-from ..outputs import OutputBag, OutputFile
 from ..bags.bag import check_output, write_bag
 from ..bags.files import STORAGES
+from ..outputs import OutputBag, OutputFile
 from ..progress import Progress
 from ..simulation import simulate
 from ..simulation.options import add_options, config_of
@@ -23,23 +25,49 @@ def parser() -> ArgumentParser:
     """Its options."""
     made = cli.parser(
         "simulate",
-        "Simulate a quadrotor, a rover or a person with a UWB tag among fixed anchors, and write it as a ROS 2 bag.",
+        (
+            "Simulate a quadrotor, a rover or a person with a UWB tag among fixed anchors, and "
+            "write it as a ROS 2 bag."
+        ),
         "simulate --out flight.bag",
-        "simulate --trajectory circle --protocol tdoa3 --height-noise 0.01 --seed 7 --out circle.bag --plot circle.png",
+        (
+            "simulate --trajectory circle --protocol tdoa3 --height-noise 0.01 --seed 7 --out "
+            "circle.bag --plot circle.png"
+        ),
         "simulate --vehicle rover --duration 90 --out rover.bag",
         'simulate --vehicle hand --path "-2,-3 2,-3 2,3 -2,3" --out walk.bag',
         "simulate --constellation random-12-16 --duration 120 --out unseen.bag --json unseen.json",
-        "simulate --anchors hall.yaml --radio-reach 18 --protocol tdoa3 --duration 300 --out hall.bag",
-        "simulate --anchors hall.yaml --radio-reach 18 --walls walls.yaml --cell-ids 256 --protocol tdoa3 --out cells.bag",
+        (
+            "simulate --anchors hall.yaml --radio-reach 18 --protocol tdoa3 --duration 300 --out "
+            "hall.bag"
+        ),
+        (
+            "simulate --anchors hall.yaml --radio-reach 18 --walls walls.yaml --cell-ids 256 "
+            "--protocol tdoa3 --out cells.bag"
+        ),
         "simulate --no-bias --no-multipath --no-outliers --noise 0 --perfect-imu --out exact.bag",
         "simulate --list",
     )
     add = made.add_argument
-    add("--list", action="store_true", help="list trajectories and constellations, and do nothing else")
-    add("--out", metavar="BAG", type=OutputBag, help="the bag to write: a new directory; without it, nothing is written")
+    add(
+        "--list",
+        action="store_true",
+        help="list trajectories and constellations, and do nothing else",
+    )
+    add(
+        "--out",
+        metavar="BAG",
+        type=OutputBag,
+        help="the bag to write: a new directory; without it, nothing is written",
+    )
     add("--storage", choices=STORAGES, default="mcap", help="kind of bag (default: mcap)")
     add("--force", action="store_true", help="replace an existing bag")
-    add("--json", metavar="FILE", type=OutputFile, help="write the configuration, the true parameters and the counts")
+    add(
+        "--json",
+        metavar="FILE",
+        type=OutputFile,
+        help="write the configuration, the true parameters and the counts",
+    )
     add("--plot", metavar="FILE", type=OutputFile, help="draw the path and the errors of the TDOAs")
 
     add_options(made)
@@ -57,7 +85,10 @@ def _simulate(args: Namespace) -> None:
         progress("flying")
         flight = simulate(config_of(args))
         content = summary(flight)
-    cli.show(f"{flight.name}: {content['tdoas']} TDOAs, {content['imu_samples']} IMU samples, {content['poses']} poses")
+    cli.show(
+        f"{flight.name}: {content['tdoas']} TDOAs, {content['imu_samples']} IMU samples, "
+        f"{content['poses']} poses"
+    )
     cli.show(
         f"errors of the TDOAs, standard deviation: bias {content['bias_std']:.3f} m, "
         f"multipath {content['multipath_std']:.3f} m, noise {content['noise_std']:.3f} m; "

@@ -24,6 +24,7 @@ from ..surveying.report import as_dict, as_text, picture
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
     from collections.abc import Sequence
+
     from ..readers.inputs import Reading
 
 DESCRIPTION = """Make a tape-measured survey better, from flights alone.
@@ -49,17 +50,38 @@ def parser() -> ArgumentParser:
         "survey",
         DESCRIPTION,
         "survey flight.bag --survey tape.yaml --trusted 0 4 1.z 2.z --out surveyed/",
-        "survey first.bag second.bag third.bag --survey tape.csv --std 0.3 --height-std 0.05 --out surveyed/",
+        (
+            "survey first.bag second.bag third.bag --survey tape.csv --std 0.3 --height-std 0.05 "
+            "--out surveyed/"
+        ),
         "survey flight.bag --survey tape.yaml --unknown 5 --out surveyed/",
-        "survey flight.bag --survey tape.yaml --marks marks.yaml --distances laser.csv --out surveyed/",
-        "survey today.bag --survey surveyed/anchors.yaml --effects surveyed/effects.yaml --out today/",
+        (
+            "survey flight.bag --survey tape.yaml --marks marks.yaml --distances laser.csv --out "
+            "surveyed/"
+        ),
+        (
+            "survey today.bag --survey surveyed/anchors.yaml --effects surveyed/effects.yaml "
+            "--out today/"
+        ),
     )
     options.add_recordings(made)
-    options.add_filter(made, "effects.yaml: what is in the model already; that of a survey is its prior, and tells what changed")
+    options.add_filter(
+        made,
+        (
+            "effects.yaml: what is in the model already; that of a survey is its prior, and tells "
+            "what changed"
+        ),
+    )
     add = made.add_argument
     options.add_tape(made)
     options.add_known(made)
-    add("--out", metavar="DIR", type=OutputFolder, required=True, help="where to write; made if it is not there")
+    add(
+        "--out",
+        metavar="DIR",
+        type=OutputFolder,
+        required=True,
+        help="where to write; made if it is not there",
+    )
     return made
 
 
@@ -68,14 +90,24 @@ def _survey(args: Namespace) -> int:
     config, effects = options.filter_of(args)
     base, tape = effects or EffectSet(), options.tape_of(args, effects)
     reading = options.reading_of(args)
-    if not args.unknown and not _ids_are_right(reading, args.flights, FlightEstimator(config, base)):
-        cli.say("survey", "stopped, and nothing is written: ids, signs and units first, as said above; then anchors.")
+    if not args.unknown and not _ids_are_right(
+        reading, args.flights, FlightEstimator(config, base)
+    ):
+        cli.say(
+            "survey",
+            (
+                "stopped, and nothing is written: ids, signs and units first, as said above; then "
+                "anchors."
+            ),
+        )
         return 1
     flights = reading.flights(args.flights)
     known = options.known_of(args, flights)
     with Progress("survey") as progress:
         result = self_calibrate(flights, tape, base, config, known, lambda: progress("solving"))
-        result = with_blocked(result, flights, config, lambda: progress("looking for what blocks anchors"))
+        result = with_blocked(
+            result, flights, config, lambda: progress("looking for what blocks anchors")
+        )
     out.mkdir(parents=True, exist_ok=True)
     anchors = result.anchors
     anchors.to_yaml(out / "anchors.yaml")
@@ -86,15 +118,23 @@ def _survey(args: Namespace) -> int:
     cli.write_json(out / "survey.json", as_dict(result))
     picture(result, out / "survey.png")
     cli.show(as_text(result))
-    cli.show(f"wrote anchors.yaml, anchors.csv, effects.yaml, {'ekf_node.yaml, ' if config_file else ''}survey.json and survey.png to {out}")
+    cli.show(
+        "wrote anchors.yaml, anchors.csv, effects.yaml, "
+        f"{'ekf_node.yaml, ' if config_file else ''}survey.json and survey.png to {out}"
+    )
     if result.why_not is None:
         files = out / "anchors.yaml", out / "effects.yaml", config_file
-        cli.show(f"next: {command_lines.judging(args.flights, *files, all(flight.truth is not None for flight in flights))}")
+        cli.show(
+            "next: "
+            f"{command_lines.judging(args.flights, *files, all(flight.truth is not None for flight in flights))}"
+        )
     return 0 if result.why_not is None else 1
 
 
 def _ids_are_right(reading: Reading, paths: Sequence[str], estimator: FlightEstimator) -> bool:
-    """Whether `check` finds none of the mistakes in recordings that look like anchors elsewhere; says which it finds."""
+    """Whether `check` finds none of the mistakes in recordings that look like anchors elsewhere;
+    says which it finds.
+    """
     found = []
     with Progress("survey") as progress:
         for path, survey in progress.over(reading.find(paths), "checking recordings"):

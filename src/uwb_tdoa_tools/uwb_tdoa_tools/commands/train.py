@@ -13,17 +13,28 @@ from ..progress import Progress
 from ..readers import inputs
 from ..results_file import ResultsFile, asked_of, resumed, state_of
 from ..scoring.settling import with_settled_truth
-from ..training import labels as labelling, models, shrinking
+from ..training import labels as labelling
+from ..training import models, shrinking
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
     from collections.abc import Sequence
     from contextlib import AbstractContextManager
+
     from uwb_tdoa_bias.foundation.flight import Flight
+
     from ..parallel import MapFunction
     from ..readers.inputs import Reading
 
-NO_MATTER = ("flights", "survey", "name", "out", "resume", "jobs", "dask")  # to what is kept of a training, beside states of recordings
+NO_MATTER = (
+    "flights",
+    "survey",
+    "name",
+    "out",
+    "resume",
+    "jobs",
+    "dask",
+)  # to what is kept of a training, beside states of recordings
 MOST = 1_500_000  # TDOAs; what they take: docs/speed.md
 
 
@@ -31,16 +42,24 @@ def parser() -> ArgumentParser:
     """Its options."""
     made = cli.parser(
         "train",
-        "Learn the systematic error of TDOAs from flights with ground truth. Writes to --out: model.onnx, for\n"
-        "bias_node and evaluate --model (not for physics); effects.yaml, for both nodes and evaluate --effects (for\n"
-        "both physics); training.png, the learning curve; training.json, all figures. Without measured attitude a\n"
-        "flight counts as level, at yaw 0. What differs between days or vehicles is best trained apart. Every flight is left out\n"
-        "once to judge: as much of a model is applied as that bears out, and the gain to be expected is told.\n\n"
+        "Learn the systematic error of TDOAs from flights with ground truth. Writes to --out: "
+        "model.onnx, for\n"
+        "bias_node and evaluate --model (not for physics); effects.yaml, for both nodes and "
+        "evaluate --effects (for\n"
+        "both physics); training.png, the learning curve; training.json, all figures. Without "
+        "measured attitude a\n"
+        "flight counts as level, at yaw 0. What differs between days or vehicles is best "
+        "trained apart. Every flight is left out\n"
+        "once to judge: as much of a model is applied as that bears out, and the gain to be "
+        "expected is told.\n\n"
         "models:\n"
-        "  paper                 the network of Zhao et al. (RA-L 2021), with the orientations of the anchors\n"
+        "  paper                 the network of Zhao et al. (RA-L 2021), with the "
+        "orientations of the anchors\n"
         "  paper_no_orientation  the same without them\n"
-        "  structured            the difference of two one-anchor errors, robust, with an honest standard deviation\n"
-        "  physics               the effects that diagnose can name; of several constellations, those that carry over\n"
+        "  structured            the difference of two one-anchor errors, robust, with an "
+        "honest standard deviation\n"
+        "  physics               the effects that diagnose can name; of several "
+        "constellations, those that carry over\n"
         "  physics+structured    these, and the structured model on what they leave",
         "train flights/0425 --survey surveys/ --model physics+structured --out model/",
         "train flights/ util/ --survey surveys/ --model structured --out model/ --seed 1",
@@ -53,25 +72,41 @@ def parser() -> ArgumentParser:
     options.add_most(made, MOST)
     options.add_align(made)
     add("--out", metavar="DIR", type=OutputFolder, required=True, help="where to write")
-    add("--validation", metavar="NAME", nargs="+", help="flights to validate on (default: one in five)")
+    add(
+        "--validation",
+        metavar="NAME",
+        nargs="+",
+        help="flights to validate on (default: one in five)",
+    )
     add("--name", help="of the model, goes into every corrected message (default: the kind)")
     add("--seed", metavar="N", type=int, default=0, help="of everything random (default: 0)")
     add(
-        "--resume", metavar="FILE", type=OutputFile,
-        help="keep there, a line of JSON each, what is found of flights left out; what is there is not done again",
-    )  # fmt: skip
+        "--resume",
+        metavar="FILE",
+        type=OutputFile,
+        help=(
+            "keep there, a line of JSON each, what is found of flights left out; what is there is "
+            "not done again"
+        ),
+    )
     parallel.add_options(made)
     return made
 
 
 def _train(args: Namespace) -> None:
     reading = options.reading_of(args)
-    jobs, dask = parallel.asked(args, len(reading.find(args.flights)), 2)  # as many for folds as for flights: else all start anew
+    jobs, dask = parallel.asked(
+        args, len(reading.find(args.flights)), 2
+    )  # as many for folds as for flights: else all start anew
     with _kept(args, reading) as done:
-        over = partial(parallel.over, jobs=jobs, dask=dask, unit=None)  # no line beside that of Progress
+        over = partial(
+            parallel.over, jobs=jobs, dask=dask, unit=None
+        )  # no line beside that of Progress
         flights = reading.flights(args.flights, args.most, jobs, dask)
         inputs.need_tdoas(flights, "train")
-        flights = list(parallel.over(partial(with_settled_truth, align=args.align), flights, jobs, dask))
+        flights = list(
+            parallel.over(partial(with_settled_truth, align=args.align), flights, jobs, dask)
+        )
         with Progress("train") as progress:
             _write(args, flights, resumed(over, done) if done else over, progress)
 
@@ -84,8 +119,12 @@ def _kept(args: Namespace, reading: Reading) -> AbstractContextManager[ResultsFi
     return ResultsFile(args.resume, {**asked_of(args, NO_MATTER), "flights": recordings})
 
 
-def _write(args: Namespace, several: Sequence[Flight], over: MapFunction, progress: Progress) -> None:
-    """Train on several Flights, and write all of it. over : as of `shrinking.train`; progress : Progress."""
+def _write(
+    args: Namespace, several: Sequence[Flight], over: MapFunction, progress: Progress
+) -> None:
+    """Train on several Flights, and write all of it. over : as of `shrinking.train`; progress :
+    Progress.
+    """
     flights = {flight.name: flight for flight in several}
     names = labelling.split(list(flights), args.seed, args.validation)
     for what, some in zip(("training on", "validating on"), names):
@@ -94,7 +133,9 @@ def _write(args: Namespace, several: Sequence[Flight], over: MapFunction, progre
     name = args.name or args.model
     progress(f"training on {len(training)} flights, then without each")
     recipe = models.Recipe(args.model, args.seed)
-    result, shrinkage = shrinking.train(recipe, training, validation, name, progress=cli.show, map_function=over)
+    result, shrinkage = shrinking.train(
+        recipe, training, validation, name, progress=cli.show, map_function=over
+    )
     args.out.mkdir(parents=True, exist_ok=True)
     models.save(result, args.out)
     label, x, of_training, of_validation = result.curve
@@ -102,10 +143,18 @@ def _write(args: Namespace, several: Sequence[Flight], over: MapFunction, progre
 
     plot_curve(label, x, of_training, of_validation, args.out / "training.png")
     for name, (before, after) in result.errors.items():
-        cli.show(f"{name:26s} error of the TDOAs {before:.3f} m, after correction {after:.3f} m (root mean square)")
+        cli.show(
+            f"{name:26s} error of the TDOAs {before:.3f} m, after correction {after:.3f} m "
+            "(root mean square)"
+        )
     curve = {label: x, "training": of_training, "validation": of_validation}
     cli.show(shrinkage.as_text())
-    content = {**result.meta, "curve": curve, "validation": result.errors, "borne_out": shrinkage.as_dict()}
+    content = {
+        **result.meta,
+        "curve": curve,
+        "validation": result.errors,
+        "borne_out": shrinkage.as_dict(),
+    }
     cli.write_json(args.out / "training.json", content)
     cli.show(f"wrote {', '.join(sorted(path.name for path in args.out.iterdir()))} in {args.out}")
 

@@ -4,8 +4,8 @@
     measured = block.take(message.timestamp, message.values)     # of a crazyflie_interfaces/LogDataGeneric
     stamp = clock.stamp(t, arrival)                               # one VehicleClock for all blocks of a vehicle
 
-A variable holds the last value there was: it is sampled when the block is sent, repeats until there is another, and is
-on average half a period old. Nothing here knows ROS.
+A variable holds the last value there was: it is sampled when the block is sent, repeats until there
+is another, and is on average half a period old. Nothing here knows ROS.
 """
 
 from __future__ import annotations
@@ -29,12 +29,16 @@ class LogBlock:
     """One log block: the variables that it holds, in their order."""
 
     def __init__(self, variables: Sequence[str], period: float = PERIOD) -> None:
-        """variables : names of log variables; those that are neither TDOAs nor acc and gyro are passed over.
-        period : s."""
+        """variables : names of log variables; those that are neither TDOAs nor acc and gyro are
+        passed over.
+        period : s.
+        """
         found = [(place, _PAIR.fullmatch(name)) for place, name in enumerate(variables)]
         self._pairs = [(place, int(match[1]), int(match[2])) for place, match in found if match]
         there, needed = list(variables), [*RATES, *FORCES]
-        self._inertial = [there.index(name) for name in needed] if set(needed) <= set(there) else None
+        self._inertial = (
+            [there.index(name) for name in needed] if set(needed) <= set(there) else None
+        )
         self._age = 0.5 * period
         self._last: dict[int, float] = {}
 
@@ -43,9 +47,12 @@ class LogBlock:
     ) -> tuple[list[tuple[float, int, int, float]], tuple[float, np.ndarray, np.ndarray] | None]:
         """([(t, a, b, d)], (t, gyro (3,), accel (3,)) or None) of one message.
 
-        timestamp : ms of the vehicle's clock; values : of the variables. t in s of that clock; d in m, of the sign of
-        uwb_tdoa_msgs/Tdoa (the firmware's distanceDiff of the pair A, B is |p - B| - |p - A|); rad/s and m/s^2. A value
-        that is 0 (nothing received yet), not finite, or the same as before is no measurement."""
+        timestamp : ms of the vehicle's clock; values : of the variables. t in s of that clock; d in
+            m, of the sign of
+        uwb_tdoa_msgs/Tdoa (the firmware's distanceDiff of the pair A, B is |p - B| - |p - A|);
+        rad/s and m/s^2. A value that is 0 (nothing received yet), not finite, or the same as before
+        is no measurement.
+        """
         t, tdoas = 1e-3 * timestamp, []
         for place, a, b in self._pairs:
             d = float(values[place])
@@ -59,13 +66,17 @@ class LogBlock:
 
 
 class VehicleClock:
-    """The vehicle's clock against ours: messages arrive late, never early, so that the least delay tells the offset."""
+    """The vehicle's clock against ours: messages arrive late, never early, so that the least delay
+    tells the offset.
+    """
 
     def __init__(self) -> None:
         self._offset, self._at = np.inf, 0.0
 
     def stamp(self, t: float, arrival: float) -> float:
-        """Our time, s, of t, s of the vehicle's clock, in a message that arrived at `arrival`, s of ours."""
+        """Our time, s, of t, s of the vehicle's clock, in a message that arrived at `arrival`, s of
+        ours.
+        """
         self._offset = min(self._offset + DRIFT * max(arrival - self._at, 0.0), arrival - t)
         self._at = arrival
         return t + self._offset

@@ -13,13 +13,14 @@ from uwb_tdoa_ekf.results import Odometry
 
 from ..readers.inputs import Reading
 from ..scoring.alignment import NONE
-from ..scoring.evaluation import evaluate, corrected_truth
+from ..scoring.evaluation import corrected_truth, evaluate
 from ..scoring.metrics import Score
 from ..scoring.settling import with_settled_truth
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
     from pathlib import Path
+
     from uwb_tdoa_ekf.debias import BiasMap
 
 
@@ -27,20 +28,28 @@ Scored = tuple[Flight, Score, Odometry]  # a flight with its errors and the esti
 
 
 def debiased(odometry: Odometry, bias_map: BiasMap) -> Odometry:
-    """The Odometry, of run_offline, that debias_node would make of it: another position and its covariance."""
+    """The Odometry, of run_offline, that debias_node would make of it: another position and its
+    covariance.
+    """
     covariance = odometry.covariance.copy()
     p, covariance[:, :3, :3], _ = bias_map.correct(odometry.p, covariance[:, :3, :3])
     return replace(odometry, p=p, covariance=covariance)
 
 
 def fly(
-    flight: Flight, config: FilterConfig | None = None, effects: EffectSet | None = None, align: str = NONE
+    flight: Flight,
+    config: FilterConfig | None = None,
+    effects: EffectSet | None = None,
+    align: str = NONE,
 ) -> Scored:
-    """(Flight, Score, odometry) of a Flight with ground truth, run through the filter. Raises InputError: what diagnose finds with
-    less, heights, odometry or marks, is corrected before the filter, and a map of that path would only repeat the filter's own error."""
+    """(Flight, Score, odometry) of a Flight with ground truth, run through the filter. Raises
+    InputError: what diagnose finds with less, heights, odometry or marks, is corrected before the
+    filter, and a map of that path would only repeat the filter's own error.
+    """
     if flight.truth is None:
         raise InputError(
-            f"{flight.name}: it holds no ground truth to map the bias with; diagnose --reference heights, odometry or marks finds what is "
+            f"{flight.name}: it holds no ground truth to map the bias with; diagnose "
+            "--reference heights, odometry or marks finds what is "
             "wrong without it, and --effects takes that."
         )
     flight = with_settled_truth(flight, effects, config, align)
@@ -50,9 +59,11 @@ def fly(
 
 @dataclass(frozen=True)
 class PositionEstimator:
-    """What positions are estimated with; estimator((path, survey)) is what `fly` gives. Can be pickled.
+    """What positions are estimated with; estimator((path, survey)) is what `fly` gives. Can be
+    pickled.
 
-    reading : Reading; config : FilterConfig; effects : EffectSet or None, of the TDOAs before the filter; align : as of
+    reading : Reading; config : FilterConfig; effects : EffectSet or None, of the TDOAs before the
+        filter; align : as of
     `settled`.
     """
 
@@ -66,16 +77,21 @@ class PositionEstimator:
 
 
 def of_its_anchors(flown: Iterable[Scored], bias_map: BiasMap) -> Iterator[Scored]:
-    """Yield what `fly` gave; raises InputError for a flight among other anchors than those of a BiasMap."""
+    """Yield what `fly` gave; raises InputError for a flight among other anchors than those of a
+    BiasMap.
+    """
     for one in flown:
         if not bias_map.belongs_to(one[0].anchors):
             raise InputError(
-                f"{one[0].name}: its anchors are not those that the map was made for, and elsewhere it does harm; make one for them with debias fit."
+                f"{one[0].name}: its anchors are not those that the map was made for, and "
+                "elsewhere it does harm; make one for them with debias fit."
             )
         yield one
 
 
 def evaluate_map(flown: Scored, bias_map: BiasMap, effects: EffectSet | None = None) -> Score:
-    """Score of a flight from `fly` with its positions corrected by a BiasMap. effects : those it was flown with."""
+    """Score of a flight from `fly` with its positions corrected by a BiasMap. effects : those it
+    was flown with.
+    """
     flight, _, odometry = flown
     return Score(flight.name, debiased(odometry, bias_map), corrected_truth(flight, effects))

@@ -1,4 +1,6 @@
-"""Pairs of measured and true positions, to fit a bias map to: from flights, and from places where a tag stood still."""
+"""Pairs of measured and true positions, to fit a bias map to: from flights, and from places where a
+tag stood still.
+"""
 
 from __future__ import annotations
 
@@ -20,6 +22,7 @@ from .evaluation import PositionEstimator
 
 if TYPE_CHECKING:
     from uwb_tdoa_ekf.results import Odometry
+
     from ..scoring.metrics import Score
 
 LEAST = 10  # positions of flights, 5 ms apart, that make a marker
@@ -35,19 +38,27 @@ def part_of(score: Score, odometry: Odometry) -> Part:
     return Part(measured, measured - score.error, score.covariance)
 
 
-def static_parts(path: str | Path, estimator: PositionEstimator = PositionEstimator(), planar: bool = False) -> list[Part]:
+def static_parts(
+    path: str | Path, estimator: PositionEstimator = PositionEstimator(), planar: bool = False
+) -> list[Part]:
     """List of Part of a tag that stood still, one for each place.
 
-    path : a CSV file with the columns true_x, true_y, true_z, x, y, z (m; without the z if planar), one row for each
-        measured position; or any recording with ground truth, through which the filter is run, and of which the time at
-        rest counts, but for the first SETTLE s at each place. Raises InputError.
+    path : a CSV file with the columns true_x, true_y, true_z, x, y, z (m; without the z if planar),
+        one row for each
+        measured position; or any recording with ground truth, through which the filter is run, and
+        of which the time at rest counts, but for the first SETTLE s at each place. Raises
+        InputError.
     """
     if is_table(path):
         return _from_table(path, planar)
     flight = estimator.reading.one(path)
     if flight.truth is None:
-        raise InputError(f"{path}: holds no ground truth; record where the tag stood as ground_truth/pose.")
-    odometry = run_offline(flight, estimator.config, Corrector(flight.anchors, estimator.effects)).odometry
+        raise InputError(
+            f"{path}: holds no ground truth; record where the tag stood as ground_truth/pose."
+        )
+    odometry = run_offline(
+        flight, estimator.config, Corrector(flight.anchors, estimator.effects)
+    ).odometry
     truth = corrected_truth(flight, estimator.effects)
     true, t = position_at(odometry.t, truth), odometry.t
     moved = np.linalg.norm(true - position_at(t - SETTLE, truth), axis=1)
@@ -55,7 +66,10 @@ def static_parts(path: str | Path, estimator: PositionEstimator = PositionEstima
     stays = np.split(np.arange(len(t)), np.flatnonzero(np.diff(resting)) + 1)
     stays = [rows for rows in stays if len(rows) >= SHORTEST and resting[rows[0]]]
     if not stays:
-        raise InputError(f"{path}: the tag never stands still for long enough; give it as a flight, not with --static.")
+        raise InputError(
+            f"{path}: the tag never stands still for long enough; give it as a flight, not "
+            "with --static."
+        )
     return [Part(odometry.p[rows], true[rows], odometry.covariance[rows, :3, :3]) for rows in stays]
 
 
@@ -72,4 +86,7 @@ def _from_table(path: str | Path, planar: bool) -> list[Part]:
     d = len(names) // 2
     _, place, counts = np.unique(table[:, :d], axis=0, return_inverse=True, return_counts=True)
     true, measured = (np.pad(side, ((0, 0), (0, 3 - d))) for side in (table[:, :d], table[:, d:]))
-    return [Part(measured[rows], true[rows]) for rows in np.split(np.argsort(place.ravel(), kind="stable"), np.cumsum(counts)[:-1])]
+    return [
+        Part(measured[rows], true[rows])
+        for rows in np.split(np.argsort(place.ravel(), kind="stable"), np.cumsum(counts)[:-1])
+    ]

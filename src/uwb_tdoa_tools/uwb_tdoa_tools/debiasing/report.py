@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -11,8 +11,10 @@ from .evaluation import evaluate_map
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
+
     from uwb_tdoa_bias.effects import EffectSet
     from uwb_tdoa_ekf.debias import BiasMap
+
     from .evaluation import Scored
 
 WORTH = 0.01  # of the 3D RMSE: less is neither gain nor harm
@@ -45,16 +47,25 @@ def about_figures(bias_map: BiasMap) -> dict[str, Any]:
     }
 
 
-def rows(flown: Iterable[Scored], bias_map: BiasMap, effects: EffectSet | None = None) -> list[dict[str, Any]]:
-    """[{"flight", "before": figures, "after": figures, "known"}] of what `fly` gave. known : share of the positions
-    that the map knows."""
+def rows(
+    flown: Iterable[Scored], bias_map: BiasMap, effects: EffectSet | None = None
+) -> list[dict[str, Any]]:
+    """[{"flight", "before": figures, "after": figures, "known"}] of what `fly` gave. known : share
+    of the positions that the map knows.
+    """
     out = []
     for flight, score, odometry in flown:
         after = evaluate_map((flight, score, odometry), bias_map, effects)
         sides = {"before": score.row(), "after": after.row()}
         airborne = odometry.p[(odometry.t >= score.first) & (odometry.t <= score.last)]
         figures = {side: {name: row[name] for name in _RUN} for side, row in sides.items()}
-        out.append({"flight": flight.name, **figures, "known": float(np.mean(bias_map.validity(airborne) == 1.0))})
+        out.append(
+            {
+                "flight": flight.name,
+                **figures,
+                "known": float(np.mean(bias_map.validity(airborne) == 1.0)),
+            }
+        )
     return out
 
 
@@ -62,18 +73,27 @@ def say_rows(title: str, found: Sequence[Mapping[str, Any]]) -> None:
     """Print rows, and their mean."""
     if not found:
         return
-    print(f"{title:24s}   before: x       y       z      3D    NEES   after: x       y       z      3D    NEES   known")
+    print(
+        f"{title:24s}   before: x       y       z      3D    NEES   after: x       y       z  "
+        "    3D    NEES   known"
+    )
     for row in found:
         print(
-            f"{row['flight']:24s}" + "".join(_side(row[side]) for side in ("before", "after")) + f"{row['known']:8.0%}"
+            f"{row['flight']:24s}"
+            + "".join(_side(row[side]) for side in ("before", "after"))
+            + f"{row['known']:8.0%}"
         )
-    before, after = (np.mean([row[side]["rmse_3d"] for row in found]) for side in ("before", "after"))
+    before, after = (
+        np.mean([row[side]["rmse_3d"] for row in found]) for side in ("before", "after")
+    )
     print(f"mean 3D RMSE {before:.3f} m before, {after:.3f} m after: it {change_of(before, after)}")
 
 
 def gain_of(found: Sequence[Mapping[str, Any]]) -> float:
     """The `gain` of rows, of their mean 3D RMSE."""
-    return gain(*(float(np.mean([row[side]["rmse_3d"] for row in found])) for side in ("before", "after")))
+    return gain(
+        *(float(np.mean([row[side]["rmse_3d"] for row in found])) for side in ("before", "after"))
+    )
 
 
 def verdict(gained: float, on: str) -> str:
@@ -89,4 +109,6 @@ def does_harm(gained: float) -> bool:
 
 
 def _side(figures: Mapping[str, float]) -> str:
-    return "  " + "".join(f"{figures[name]:8.3f}" for name in ("rmse_x", "rmse_y", "rmse_z", "rmse_3d", "nees_mean"))
+    return "  " + "".join(
+        f"{figures[name]:8.3f}" for name in ("rmse_x", "rmse_y", "rmse_z", "rmse_3d", "nees_mean")
+    )

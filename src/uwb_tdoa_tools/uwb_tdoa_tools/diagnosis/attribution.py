@@ -21,7 +21,17 @@ from .deviations import with_deviations
 from .domains import Seen
 from .findings import EffectFinding, Refused
 from .over_flights import of_one, shares
-from .refinement import ROUNDS, cross_validated, effects_of, entry_of, inflation_of, linearised, relinearised, with_maps, with_smooth
+from .refinement import (
+    ROUNDS,
+    cross_validated,
+    effects_of,
+    entry_of,
+    inflation_of,
+    linearised,
+    relinearised,
+    with_maps,
+    with_smooth,
+)
 from .regression.confounding import alternatives
 from .regression.fit import in_common, prior_sizes
 from .regression.held_out import held_out
@@ -33,27 +43,36 @@ from .self_calibration.prior import to_keep
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Hashable, Sequence
+
     from uwb_tdoa_bias.effects import Covariance, Effect
     from uwb_tdoa_bias.foundation.flight import Flight
+
     from ..parallel import MapFunction
+    from .channels import ChannelResidual, ChannelResiduals
     from .channels.views import CovariateView
     from .detectors import Detection, Detector
     from .references import Reference
     from .regression.fit import Fit
     from .regression.table import RegressionTable
-    from .channels import ChannelResidual, ChannelResiduals
 
-FOR_MAPS = 3  # flights: a map of fewer is of their paths, and misleads others; two with like paths validate each other
+# flights: a map of fewer is of their paths, and misleads others; two with like paths validate each
+# other
+FOR_MAPS = 3
 ON_FLOOR = 0.5  # m by which a function of UPWARDS changes at least near the floor, to be reported
-RANGED = tuple(name for name, kind in RADIO.items() if kind.ends == 1)  # streams of distances to anchors
+RANGED = tuple(
+    name for name, kind in RADIO.items() if kind.ends == 1
+)  # streams of distances to anchors
 
 
 @dataclass(frozen=True, eq=False)
 class Attribution:
     """residuals : [{channel: ChannelResidual}] under the base model; selection : Selection;
-    detections : (Detection, ...); candidates : all declared Candidates; refused : (Refused, ...); names : of the flights; alone :
-    ((name of a flight, Selection), ...) of what one flight shows and the others do not; floor : Selection of what there is near the
-    floor, beside what is found in the air; None if nobody knows; floor_names : of the flights of its RegressionTable."""
+    detections : (Detection, ...); candidates : all declared Candidates; refused : (Refused, ...);
+        names : of the flights; alone :
+    ((name of a flight, Selection), ...) of what one flight shows and the others do not; floor :
+    Selection of what there is near the floor, beside what is found in the air; None if nobody
+    knows; floor_names : of the flights of its RegressionTable.
+    """
 
     residuals: list[ChannelResiduals]
     selection: Selection
@@ -73,23 +92,37 @@ class Attribution:
     @property
     def effects(self) -> tuple[Effect, ...]:
         """All Effects found that may be taken out: tuple."""
-        in_the_air = self.seen.limited((*effects_of(self.selection), *(detection.effect for detection in self.detections)))
+        in_the_air = self.seen.limited(
+            (*effects_of(self.selection), *(detection.effect for detection in self.detections))
+        )
         return (*in_the_air, *self.of_floor)
 
     @property
     def of_floor(self) -> tuple[Effect, ...]:
-        """Effects found near the floor that the filter may get: tuple. Functions without a name would go on in the air."""
+        """Effects found near the floor that the filter may get: tuple.
+
+        Functions without a name would go on in the air.
+        """
         return effects_of(self.floor.where(lambda effect: effect.weighed)) if self.floor else ()
 
     @property
     def covariance(self) -> Covariance | None:
-        """Of the positions and delays of anchors in the selection: the prior of the next calibration; None without any."""
-        columns = [column for candidate in self.selection.chosen if candidate.name in OF_ANCHORS for column in candidate.columns]
+        """Of the positions and delays of anchors in the selection: the prior of the next
+        calibration; None without any.
+        """
+        columns = [
+            column
+            for candidate in self.selection.chosen
+            if candidate.name in OF_ANCHORS
+            for column in candidate.columns
+        ]
         if not columns:
             return None
         places = [self.selection.fit.columns.index(column) for column in columns]
         covariance = self.selection.fit.cov[np.ix_(places, places)]
-        covariance = covariance + in_common(self.selection.table, columns) * prior_sizes(columns) ** 2.0  # nothing is known of that
+        covariance = (
+            covariance + in_common(self.selection.table, columns) * prior_sizes(columns) ** 2.0
+        )  # nothing is known of that
         return to_keep(tuple((str(column.effect[0]), column.key) for column in columns), covariance)
 
     def findings(self) -> list[EffectFinding]:
@@ -99,22 +132,31 @@ class Attribution:
         if self.floor:
             written = {entry_of(effect): effect for effect in self.of_floor}
             near = _findings(self.floor, [], self.floor_names)
-            out += [replace(one, effect=written.get(entry_of(one.effect), one.effect), on_floor=True) for one in near]
+            out += [
+                replace(one, effect=written.get(entry_of(one.effect), one.effect), on_floor=True)
+                for one in near
+            ]
         for name, selection in self.alone:
             out += [replace(finding, flight=name) for finding in _findings(selection, [], (name,))]
         return out
 
 
 def attribute(
-    flights: Sequence[Flight], reference: Reference, base: EffectSet = EffectSet(),
-    kinds: Collection[str] | None = None, undeclared: bool = True, progress: Callable[[], object] = lambda: None,
+    flights: Sequence[Flight],
+    reference: Reference,
+    base: EffectSet = EffectSet(),
+    kinds: Collection[str] | None = None,
+    undeclared: bool = True,
+    progress: Callable[[], object] = lambda: None,
     map_function: MapFunction = map,
-) -> Attribution:  # fmt: skip
-    """Attribution of the residuals of Flights, which the Reference has prepared, to effects beyond `base`.
+) -> Attribution:
+    """Attribution of the residuals of Flights, which the Reference has prepared, to effects beyond
+    `base`.
 
-    kinds : names of the declared effects to look for, None for all; undeclared : look for functions without a name too;
-    progress() is called now and then; map_function(function, items) : as map, but for the time and the process in
-    which each is done.
+    kinds : names of the declared effects to look for, None for all; undeclared : look for functions
+        without a name too;
+    progress() is called now and then; map_function(function, items) : as map, but for the time and
+    the process in which each is done.
     """
     known: list[tuple[tuple[Effect, ...], list[ChannelResiduals]]] = []
 
@@ -122,13 +164,21 @@ def attribute(
         """Those beside a model; of the last one, and of none, they are kept."""
         again = [residuals for other, residuals in known if other == tuple(model)]
         if not again:
-            again = [residuals_of(flights, reference, EffectSet((*base.effects, *model)), progress, map_function)]
+            again = [
+                residuals_of(
+                    flights, reference, EffectSet((*base.effects, *model)), progress, map_function
+                )
+            ]
             known[1:] = [(tuple(model), again[0])]
         return again[0]
 
     under_base = at(())
     shown = {name for flight in under_base for name in flight}
-    wanted = [one for name, one in DETECTORS.items() if (kinds is None or name in kinds) and shown & set(one.effect.channels)]
+    wanted = [
+        one
+        for name, one in DETECTORS.items()
+        if (kinds is None or name in kinds) and shown & set(one.effect.channels)
+    ]
     detectors = [detector for detector in wanted if not detector.on_floor]
     search = partial(_search, detectors)
     installation = _installation(flights)
@@ -144,14 +194,18 @@ def attribute(
             break
         current = at(found)
         progress()
-        selection = select(linearised(current, declared, found), declared, inflation, search, progress=progress)
+        selection = select(
+            linearised(current, declared, found), declared, inflation, search, progress=progress
+        )
         found = effects_of(selection)
     refused: list[Refused] = []
     selection = cross_validated(selection, refused)
     smooth: list[Candidate] = []
     scans: dict[int, Scan] = {}
 
-    def scan_of(table: RegressionTable) -> Scan:  # one for each number of rows, which other stamps can change
+    def scan_of(
+        table: RegressionTable,
+    ) -> Scan:  # one for each number of rows, which other stamps can change
         if len(table.y) not in scans:
             scans[len(table.y)] = Scan(table, _views(table))
         return scans[len(table.y)]
@@ -161,7 +215,9 @@ def attribute(
         selection = with_smooth(selection, unmoved, declared, smooth, search, scan_of, progress)
         selection = relinearised(selection, at, declared + smooth)
         selection = cross_validated(selection, refused)
-    selection = with_rivals(selection, declared + smooth, scan_of(selection.table) if undeclared else None, progress)
+    selection = with_rivals(
+        selection, declared + smooth, scan_of(selection.table) if undeclared else None, progress
+    )
     if undeclared and len(flights) >= FOR_MAPS:
         selection = with_maps(selection, smooth, refused)
     remaining, selection = at(effects_of(selection)), with_deviations(selection)
@@ -170,34 +226,68 @@ def attribute(
     names = tuple(flight.name for flight in flights)
     alone: tuple[tuple[str, Selection], ...] = ()
     if undeclared and len(flights) > 1 and all(reference.positions_known):
-        alone = tuple((names[k], own) for k, own in of_one(remaining, inflation, _views, search, map_function))
+        alone = tuple(
+            (names[k], own) for k, own in of_one(remaining, inflation, _views, search, map_function)
+        )
     near = [(name, part) for name, part in zip(names, map(near_floor, remaining)) if part]
     floor = None
     if near:
-        floor = on_floor([part for _, part in near], [one for one in wanted if one.on_floor], undeclared, refused, progress)
+        floor = on_floor(
+            [part for _, part in near],
+            [one for one in wanted if one.on_floor],
+            undeclared,
+            refused,
+            progress,
+        )
     floor_names = tuple(name for name, _ in near)
-    return Attribution(under_base, selection, detections, declared, tuple(refused), names, alone, floor, floor_names)
+    return Attribution(
+        under_base,
+        selection,
+        detections,
+        declared,
+        tuple(refused),
+        names,
+        alone,
+        floor,
+        floor_names,
+    )
 
 
 def near_floor(residuals: ChannelResiduals) -> ChannelResiduals:
-    """{channel: ChannelResidual} of what is near the floor in the residuals of a flight; {} of nothing."""
+    """{channel: ChannelResidual} of what is near the floor in the residuals of a flight; {} of
+    nothing.
+    """
     parts = {name: part.of_floor() for name, part in residuals.items()}
     return {name: part for name, part in parts.items() if part is not None}
 
 
 def on_floor(
-    residuals: Sequence[ChannelResiduals], detectors: Sequence[Detector], undeclared: bool, refused: list[Refused],
+    residuals: Sequence[ChannelResiduals],
+    detectors: Sequence[Detector],
+    undeclared: bool,
+    refused: list[Refused],
     progress: Callable[[], object] = lambda: None,
-) -> Selection:  # fmt: skip
-    """Selection of what [{channel: ChannelResidual}] near the floor show: effects with a name, or, where there is none, functions of what
-    changes with the height: at one place all else is the same.
+) -> Selection:
+    """Selection of what [{channel: ChannelResidual}] near the floor show: effects with a name, or,
+    where there is none, functions of what changes with the height: at one place all else is the
+    same.
 
-    A few seconds, of errors of metres, are looked at by themselves: among all that is in the air they would pass for outliers, or pull
-    at what is fitted there."""
+    A few seconds, of errors of metres, are looked at by themselves: among all that is in the air
+    they would pass for outliers, or pull at what is fitted there.
+    """
     table = table_of(residuals)
-    found = select(table, [], inflation_of(table, [], partial(_search, detectors)), partial(_search, detectors), progress=progress)
+    found = select(
+        table,
+        [],
+        inflation_of(table, [], partial(_search, detectors)),
+        partial(_search, detectors),
+        progress=progress,
+    )
     if undeclared and not found.chosen:
-        views = {name: [view for view in views if view.covariate in UPWARDS] for name, views in _views(table).items()}
+        views = {
+            name: [view for view in views if view.covariate in UPWARDS]
+            for name, views in _views(table).items()
+        }
         scan = Scan(table, views)
         inflation = inflation_of(table, [], lambda *fitted: scan(*fitted)[:1])
         found = select(table, [], inflation, scan=scan, progress=progress)
@@ -206,35 +296,53 @@ def on_floor(
 
 
 def residuals_of(
-    flights: Sequence[Flight], reference: Reference, effects: EffectSet,
-    progress: Callable[[], object] = lambda: None, map_function: MapFunction = map,
-) -> list[ChannelResiduals]:  # fmt: skip
+    flights: Sequence[Flight],
+    reference: Reference,
+    effects: EffectSet,
+    progress: Callable[[], object] = lambda: None,
+    map_function: MapFunction = map,
+) -> list[ChannelResiduals]:
     """[`channels.residuals`] of Flights. progress, map_function : as of `attribute`."""
     if not all(reference.positions_known):
-        map_function = map  # with all that the filter knows of the path, they take as long to send as to find
+        map_function = (
+            map  # with all that the filter knows of the path, they take as long to send as to find
+        )
     out = []
-    for of_flight in map_function(partial(residuals, reference=reference, effects=effects), flights):
+    for of_flight in map_function(
+        partial(residuals, reference=reference, effects=effects), flights
+    ):
         out.append(of_flight)
         progress()
     return out
 
 
-def _search(detectors: Sequence[Detector], table: RegressionTable, model: Fit, chosen: Sequence[Candidate]) -> list[Candidate]:
-    return [candidate for detector in detectors for candidate in detector.search(table, model, chosen)]
+def _search(
+    detectors: Sequence[Detector], table: RegressionTable, model: Fit, chosen: Sequence[Candidate]
+) -> list[Candidate]:
+    return [
+        candidate for detector in detectors for candidate in detector.search(table, model, chosen)
+    ]
 
 
 def _installation(flights: Sequence[Flight]) -> tuple[Anchors, np.ndarray]:
-    """(Anchors with every id that the flights have heard, each at the first of its places; (m, 2) ids of the MOST_LINKS pairs that were
-    heard most, the most frequent first)."""
+    """(Anchors with every id that the flights have heard, each at the first of its places; (m, 2)
+    ids of the MOST_LINKS pairs that were heard most, the most frequent first).
+    """
     several = [flight.anchors for flight in flights]
     ids, positions, orientations = (
-        np.concatenate([getattr(anchors, name) for anchors in several]) for name in ("ids", "positions", "orientations")
+        np.concatenate([getattr(anchors, name) for anchors in several])
+        for name in ("ids", "positions", "orientations")
     )
     heard = np.concatenate([np.column_stack([flight.tdoa.a, flight.tdoa.b]) for flight in flights])
     heard = heard[np.isin(heard, ids).all(axis=1) & (heard[:, 0] != heard[:, 1])]
     pairs, count = np.unique(heard, axis=0, return_counts=True)
     first = np.unique(ids, return_index=True)[1]
-    ranged = [stream.anchor for flight in flights for name in RANGED if (stream := getattr(flight, name)) is not None]
+    ranged = [
+        stream.anchor
+        for flight in flights
+        for name in RANGED
+        if (stream := getattr(flight, name)) is not None
+    ]
     alone = np.concatenate([heard.ravel(), *ranged])
     first = first[np.isin(ids[first], alone)] if len(alone) else first
     anchors = Anchors(ids[first], positions[first], orientations[first], several[0].frame)
@@ -242,12 +350,18 @@ def _installation(flights: Sequence[Flight]) -> tuple[Anchors, np.ndarray]:
 
 
 def _declared(
-    found: Sequence[ChannelResiduals], reference: Reference, kinds: Collection[str] | None,
+    found: Sequence[ChannelResiduals],
+    reference: Reference,
+    kinds: Collection[str] | None,
     installation: tuple[Anchors, np.ndarray],
-) -> list[Candidate]:  # fmt: skip
-    """[Candidate] of the catalogue, of effects that a channel shows, and that are observable with the reference."""
+) -> list[Candidate]:
+    """[Candidate] of the catalogue, of effects that a channel shows, and that are observable with
+    the reference.
+    """
     shown = {name for flight in found for name in flight}
-    effects = [effect for effect in EFFECTS.values() if effect.fitted and shown & set(effect.channels)]
+    effects = [
+        effect for effect in EFFECTS.values() if effect.fitted and shown & set(effect.channels)
+    ]
     chosen = [
         effect
         for effect in effects
@@ -258,8 +372,12 @@ def _declared(
     return [candidate for effect in chosen for candidate in candidates_of(effect(), *installation)]
 
 
-def _smooth(found: Sequence[ChannelResiduals], installation: tuple[Anchors, np.ndarray]) -> list[Candidate]:
-    """[Candidate] of functions of whatever each channel may depend on, of all anchors alike or each with its own."""
+def _smooth(
+    found: Sequence[ChannelResiduals], installation: tuple[Anchors, np.ndarray]
+) -> list[Candidate]:
+    """[Candidate] of functions of whatever each channel may depend on, of all anchors alike or each
+    with its own.
+    """
     out = []
     for name, channel in CHANNELS.items():
         parts = [flight[name] for flight in found if name in flight]
@@ -277,34 +395,56 @@ def _views(table: RegressionTable) -> dict[str, list[CovariateView]]:
 
 
 def _is_large(candidate: Candidate, selection: Selection) -> bool:
-    """Whether a chosen Candidate moves what it moves by ON_FLOOR: less is of the place, of which a few seconds tell nothing."""
+    """Whether a chosen Candidate moves what it moves by ON_FLOOR: less is of the place, of which a
+    few seconds tell nothing.
+    """
     part = selection.table.matrix(candidate.columns) @ selection.fit.values(candidate.columns)
     return np.ptp(part) > ON_FLOOR
 
 
-def _findings(selection: Selection, candidates: Sequence[Candidate], names: Sequence[str]) -> list[EffectFinding]:
+def _findings(
+    selection: Selection, candidates: Sequence[Candidate], names: Sequence[str]
+) -> list[EffectFinding]:
     effects = {entry_of(effect): effect for effect in effects_of(selection)}
     out: dict[Hashable, EffectFinding] = {}
     for candidate, score, loss in zip(selection.chosen, held_out(selection), selection.loss):
-        evidence = {"criterion": round(float(loss), 1), "held_out_gain": round(score.gain, 1), "held_out_t": round(score.t, 1)}
+        evidence = {
+            "criterion": round(float(loss), 1),
+            "held_out_gain": round(score.gain, 1),
+            "held_out_t": round(score.t, 1),
+        }
         others = tuple(alternatives(selection, candidate, candidates))
         for term in candidate.terms:
             identity = entry_of(term.effect)
-            beside = [other.function for other in candidate.terms if other is not term] if term.function else []
+            beside = (
+                [other.function for other in candidate.terms if other is not term]
+                if term.function
+                else []
+            )
             covariates = tuple(function.covariate for function in beside if function)
             finding = EffectFinding(
-                effects[identity], _shown_on(candidate, selection), evidence, score.explained, others, (candidate,),
-                together_with=covariates, shares=shares(selection, candidate, names),
-            )  # fmt: skip
+                effects[identity],
+                _shown_on(candidate, selection),
+                evidence,
+                score.explained,
+                others,
+                (candidate,),
+                together_with=covariates,
+                shares=shares(selection, candidate, names),
+            )
             out[identity] = _merged(out[identity], finding) if identity in out else finding
     return list(out.values())
 
 
 def _merged(finding: EffectFinding, other: EffectFinding) -> EffectFinding:
     """One EffectFinding of two of one effect."""
-    evidence = {key: round(finding.evidence[key] + other.evidence[key], 1) for key in other.evidence}
+    evidence = {
+        key: round(finding.evidence[key] + other.evidence[key], 1) for key in other.evidence
+    }
     named = {alternative.effect for alternative in finding.alternatives}
-    more = tuple(alternative for alternative in other.alternatives if alternative.effect not in named)
+    more = tuple(
+        alternative for alternative in other.alternatives if alternative.effect not in named
+    )
     return replace(
         finding,
         evidence=evidence,

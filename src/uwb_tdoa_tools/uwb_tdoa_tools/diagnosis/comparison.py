@@ -1,10 +1,12 @@
-"""The filter with the model before and after, on flights: errors, or innovations where nobody knows these, and how sure a gain is."""
+"""The filter with the model before and after, on flights: errors, or innovations where nobody knows
+these, and how sure a gain is.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,32 +19,38 @@ from uwb_tdoa_ekf.results import OF_ROW, VERDICTS
 from uwb_tdoa_ekf.sensitivity import RANGES
 
 from ..clock import numbered
-from ..scoring.by_phase import EVERYTHING
 from ..json_values import as_json
+from ..scoring.by_phase import EVERYTHING
 from ..scoring.metrics import Score, pooled
 from .regression.table import BLOCK
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
+
     from uwb_tdoa_bias.foundation.flight import Flight
     from uwb_tdoa_ekf.core.config import FilterConfig
     from uwb_tdoa_ekf.offline import Run
+
     from ..parallel import MapFunction
 
     Spans = tuple[tuple[float, float], ...]  # (first, last) s
 
 BOOTSTRAPS = 400
 Z95 = 1.96  # standard deviations from the middle of a 95 % interval to its ends
-# Standard deviations by which a gain must be above zero where the reference itself may be off. What is fitted follows what the
-# references have in common, in whatever direction that is: chi with three degrees of freedom, 99.9 %.
+# Standard deviations by which a gain must be above zero where the reference itself may be off. What
+# is fitted follows what the
+# references have in common, in whatever direction that is: chi with three degrees of freedom, 99.9
+# %.
 SURE = 4.0
 USED = next(value for value, name in VERDICTS.items() if name == "used")
 
 
 @dataclass(frozen=True, eq=False)
 class ValidationCase:
-    """A flight to judge on, and an EffectSet that it took no part in fitting. spans : ((first, last), ...) s, None for all; reach : the
-    same for phases, which those at either end of the flight go on to its begin and its end for."""
+    """A flight to judge on, and an EffectSet that it took no part in fitting. spans : ((first,
+    last), ...) s, None for all; reach : the same for phases, which those at either end of the
+    flight go on to its begin and its end for.
+    """
 
     flight: Flight
     effects: EffectSet
@@ -63,7 +71,12 @@ class Baseline:
         self.prepare([flight])
         return self._runs[id(flight)][1]
 
-    def prepare(self, flights: Sequence[Flight], progress: Callable[[], object] = lambda: None, map_function: MapFunction = map) -> None:
+    def prepare(
+        self,
+        flights: Sequence[Flight],
+        progress: Callable[[], object] = lambda: None,
+        map_function: MapFunction = map,
+    ) -> None:
         """Make the runs of Flights that there are none of yet. map_function : as of `attribute`."""
         missing = [flight for flight in flights if id(flight) not in self._runs]
         missing = list({id(flight): flight for flight in missing}.values())
@@ -74,13 +87,17 @@ class Baseline:
 
 
 def compare(
-    cases: Sequence[ValidationCase], baseline: Baseline, progress: Callable[[], object] = lambda: None,
-    shift_std: Callable[[str], np.ndarray] = lambda name: np.zeros(3), map_function: MapFunction = map,
-) -> tuple[dict[str, Any], dict[str, Any]]:  # fmt: skip
-    """(before, after) of Cases: {"runs": [...], "pooled": {...}, "scores": [Score]}, keys as in evaluate, phases too, besides
-    residual_spread (m, 1.48 MAD of the innovations) and rmse_3d_ci (95 %, bootstrap over blocks of 5 s); rmse_3d_gain_ci counts
-    what the references of whole flights may be off by too. shift_std : of a Reference; map_function : as of
-    `attribute`."""
+    cases: Sequence[ValidationCase],
+    baseline: Baseline,
+    progress: Callable[[], object] = lambda: None,
+    shift_std: Callable[[str], np.ndarray] = lambda name: np.zeros(3),
+    map_function: MapFunction = map,
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """(before, after) of Cases: {"runs": [...], "pooled": {...}, "scores": [Score]}, keys as in
+    evaluate, phases too, besides residual_spread (m, 1.48 MAD of the innovations) and rmse_3d_ci
+    (95 %, bootstrap over blocks of 5 s); rmse_3d_gain_ci counts what the references of whole
+    flights may be off by too. shift_std : of a Reference; map_function : as of `attribute`.
+    """
     sides: list[dict[str, Any]] = []
     draws = []
     for runs in _both_sides(cases, baseline, progress, map_function):
@@ -89,10 +106,21 @@ def compare(
             scores.append(score(case, run))
             blocks.append(_blocks(scores[-1]))
             row = {**as_json(scores[-1].row()), "phases": as_json(scores[-1].phases())}
-            rows.append({**row, "residual_spread": _spread(run), "rmse_3d_ci": _interval(blocks[-1:])})
+            rows.append(
+                {**row, "residual_spread": _spread(run), "rmse_3d_ci": _interval(blocks[-1:])}
+            )
         spreads = [row["residual_spread"] for row in rows if row["residual_spread"] is not None]
-        together = {**as_json(pooled(scores)), "residual_spread": float(np.mean(spreads)) if spreads else None}
-        sides.append({"runs": rows, "pooled": {**together, "rmse_3d_ci": _interval(blocks)}, "scores": scores})
+        together = {
+            **as_json(pooled(scores)),
+            "residual_spread": float(np.mean(spreads)) if spreads else None,
+        }
+        sides.append(
+            {
+                "runs": rows,
+                "pooled": {**together, "rmse_3d_ci": _interval(blocks)},
+                "scores": scores,
+            }
+        )
         draws.append(blocks)
     names = [case.flight.name for case in cases]
     sides[1]["pooled"]["rmse_3d_gain_ci"] = _gain_interval(draws[0], draws[1], names, shift_std)
@@ -100,18 +128,28 @@ def compare(
 
 
 def innovations(
-    cases: Sequence[ValidationCase], baseline: Baseline, progress: Callable[[], object] = lambda: None,
+    cases: Sequence[ValidationCase],
+    baseline: Baseline,
+    progress: Callable[[], object] = lambda: None,
     map_function: MapFunction = map,
-) -> tuple[dict[str, Any], dict[str, Any]]:  # fmt: skip
-    """What `compare` gives, where nobody knows the errors: figures of the filter's own innovations alone."""
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What `compare` gives, where nobody knows the errors: figures of the filter's own innovations
+    alone.
+    """
     sides = []
     for runs in _both_sides(cases, baseline, progress, map_function):
         rows = []
         for case, run in runs:
             innovation, variance = _used(run)
-            figures: dict[str, Any] = {"nis_mean": float(np.mean(innovation**2 / variance)), "residual_spread": _scale(innovation)}
+            figures: dict[str, Any] = {
+                "nis_mean": float(np.mean(innovation**2 / variance)),
+                "residual_spread": _scale(innovation),
+            }
             rows.append({"flight": case.flight.name, "rmse_3d": None, **figures})
-        means = {key: float(np.mean([row[key] for row in rows])) for key in ("nis_mean", "residual_spread")}
+        means = {
+            key: float(np.mean([row[key] for row in rows]))
+            for key in ("nis_mean", "residual_spread")
+        }
         sides.append({"runs": rows, "pooled": dict(means, rmse_3d=None), "scores": []})
     return sides[0], sides[1]
 
@@ -120,34 +158,57 @@ def score(case: ValidationCase, run: Run) -> Score:
     """Score of a Run on a ValidationCase. Raises InputError where there is no estimate."""
     truth = shifted(case.flight, "truth", -case.effects.stamp_offset("truth")).truth
     assert truth is not None  # of a Reference that tells errors
-    out = Score(case.flight.name, run.odometry, truth, run.residuals, case.flight.tdoa.t, case.spans, case.reach)
+    out = Score(
+        case.flight.name,
+        run.odometry,
+        truth,
+        run.residuals,
+        case.flight.tdoa.t,
+        case.spans,
+        case.reach,
+    )
     if not len(out.t):
-        raise InputError(f"{case.flight.name}: the filter gives no estimate in the part to judge on; see what evaluate says.")
+        raise InputError(
+            f"{case.flight.name}: the filter gives no estimate in the part to judge on; see "
+            "what evaluate says."
+        )
     return out
 
 
 def why_not(before: dict[str, Any], after: dict[str, Any], shift_std: float) -> str | None:
-    """Why what was found must not be applied, after `compare`; None if it may. shift_std : m, what a reference may be off by in all
-    of a flight; the gain must be SURE standard deviations of what that can feign."""
-    gain, interval = after["pooled"]["rmse_3d"] < before["pooled"]["rmse_3d"], after["pooled"]["rmse_3d_gain_ci"]
+    """Why what was found must not be applied, after `compare`; None if it may. shift_std : m, what
+    a reference may be off by in all of a flight; the gain must be SURE standard deviations of what
+    that can feign.
+    """
+    gain, interval = (
+        after["pooled"]["rmse_3d"] < before["pooled"]["rmse_3d"],
+        after["pooled"]["rmse_3d_gain_ci"],
+    )
     if not gain:
         return "together they do not make the error smaller on held-out data"
-    if shift_std > 0.0 and (interval is None or sum(interval) < SURE / Z95 * (interval[1] - interval[0])):
+    if shift_std > 0.0 and (
+        interval is None or sum(interval) < SURE / Z95 * (interval[1] - interval[0])
+    ):
         return (
-            f"all of a flight may be {100 * shift_std:.0f} cm from where the reference says, on each axis, and the gain is less than that "
+            f"all of a flight may be {100 * shift_std:.0f} cm from where the reference says, "
+            "on each axis, and the gain is less than that "
             "can feign; measure more marks, or better ones"
         )
     if interval is not None and interval[0] <= 0.0:
         share = 1.0 - after["pooled"]["rmse_3d"] / before["pooled"]["rmse_3d"]
         return (
-            f"together they make the error {share:.0%} smaller on held-out data, which may be chance: the 95 % interval is {interval[0]:.0%} to "
+            f"together they make the error {share:.0%} smaller on held-out data, which may be "
+            f"chance: the 95 % interval is {interval[0]:.0%} to "
             f"{interval[1]:.0%}; fly more"
         )
     return None
 
 
 def _both_sides(
-    cases: Sequence[ValidationCase], baseline: Baseline, progress: Callable[[], object], map_function: MapFunction
+    cases: Sequence[ValidationCase],
+    baseline: Baseline,
+    progress: Callable[[], object],
+    map_function: MapFunction,
 ) -> Iterator[Iterator[tuple[ValidationCase, Run]]]:
     """Cases with the runs of a baseline, then with their own, each run made when it is asked for."""
     baseline.prepare([case.flight for case in cases], progress, map_function)
@@ -175,9 +236,15 @@ def _scale(innovation: np.ndarray) -> float:
 
 
 def _used(run: Run) -> tuple[np.ndarray, np.ndarray]:
-    """Innovations (n,) m of the TDOAs that a Run used, or, without any TDOAs, of its ranges, and their variances (n,) m^2."""
+    """Innovations (n,) m of the TDOAs that a Run used, or, without any TDOAs, of its ranges, and
+    their variances (n,) m^2.
+    """
     residuals, ranges = run.residuals, run.aids.get(RANGES)
-    rows = {name: getattr(residuals, name) for name in OF_ROW} if len(residuals) or ranges is None else ranges
+    rows = (
+        {name: getattr(residuals, name) for name in OF_ROW}
+        if len(residuals) or ranges is None
+        else ranges
+    )
     used = rows["verdict"] == USED
     return rows["innovation"][used], rows["variance"][used]
 
@@ -188,18 +255,29 @@ def _blocks(judged: Score) -> np.ndarray:
         return np.zeros((1, 5))
     block = numbered(judged.t, BLOCK)
     power = np.sum(judged.error**2, axis=1)
-    return np.stack([np.bincount(block, power), np.bincount(block), *(np.bincount(block, e) for e in judged.error.T)], axis=1)
+    return np.stack(
+        [
+            np.bincount(block, power),
+            np.bincount(block),
+            *(np.bincount(block, e) for e in judged.error.T),
+        ],
+        axis=1,
+    )
 
 
 def _interval(blocks: Sequence[np.ndarray]) -> list[float] | None:
     """95 % interval of the 3D RMSE: [low, high], m."""
     together = np.concatenate(blocks)
     draws = _draws(together, np.zeros((BOOTSTRAPS, len(together), 3)))
-    return [float(x) for x in np.quantile(draws, [0.025, 0.975])] if np.isfinite(draws).all() else None
+    return (
+        [float(x) for x in np.quantile(draws, [0.025, 0.975])] if np.isfinite(draws).all() else None
+    )
 
 
 def _draws(blocks: np.ndarray, shifts: np.ndarray) -> np.ndarray:
-    """(BOOTSTRAPS,) m: the 3D RMSE of blocks (b, 5) drawn at random, whose errors are all off by shifts (BOOTSTRAPS, b, 3), m."""
+    """(BOOTSTRAPS,) m: the 3D RMSE of blocks (b, 5) drawn at random, whose errors are all off by
+    shifts (BOOTSTRAPS, b, 3), m.
+    """
     chosen = np.random.default_rng(0).integers(0, len(blocks), (BOOTSTRAPS, len(blocks)))
     power, count, error = blocks[chosen, 0], blocks[chosen, 1], blocks[chosen, 2:]
     off = np.take_along_axis(shifts, chosen[:, :, None], axis=1)
@@ -208,16 +286,28 @@ def _draws(blocks: np.ndarray, shifts: np.ndarray) -> np.ndarray:
 
 
 def _gain_interval(
-    before: Sequence[np.ndarray], after: Sequence[np.ndarray], names: Sequence[str],
+    before: Sequence[np.ndarray],
+    after: Sequence[np.ndarray],
+    names: Sequence[str],
     shift_std: Callable[[str], np.ndarray],
-) -> list[float] | None:  # fmt: skip
-    """95 % interval of the share of the 3D RMSE that is gone, the same blocks drawn for both, with references that are off by what
-    they may be, alike in all of a flight. before, after : [(b, 5)], blocks of each case; names : of their flights."""
+) -> list[float] | None:
+    """95 % interval of the share of the 3D RMSE that is gone, the same blocks drawn for both, with
+    references that are off by what they may be, alike in all of a flight. before, after : [(b, 5)],
+    blocks of each case; names : of their flights.
+    """
     blocks, others = np.concatenate(before), np.concatenate(after)
     if len(blocks) != len(others):
         return None
     rng = np.random.default_rng(1)
-    off = {name: rng.standard_normal((BOOTSTRAPS, 3)) * shift_std(name) for name in dict.fromkeys(names)}
-    shifts = np.concatenate([np.repeat(off[name][:, None], len(some), axis=1) for name, some in zip(names, before)], axis=1)
+    off = {
+        name: rng.standard_normal((BOOTSTRAPS, 3)) * shift_std(name)
+        for name in dict.fromkeys(names)
+    }
+    shifts = np.concatenate(
+        [np.repeat(off[name][:, None], len(some), axis=1) for name, some in zip(names, before)],
+        axis=1,
+    )
     gain = 1.0 - _draws(others, shifts) / np.maximum(_draws(blocks, shifts), 1e-12)
-    return [float(x) for x in np.quantile(gain, [0.025, 0.975])] if np.isfinite(gain).all() else None
+    return (
+        [float(x) for x in np.quantile(gain, [0.025, 0.975])] if np.isfinite(gain).all() else None
+    )

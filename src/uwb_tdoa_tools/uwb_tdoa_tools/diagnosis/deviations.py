@@ -1,11 +1,12 @@
 """How far anchors may be from where a fit with ground truth puts them: deviations that hold.
 
-A fit states how well the data determine its values, if its model is the right one. Positions and delays of anchors take what other
-systematic errors leave unexplained, in the same way at every place, so that no scatter between blocks of time shows it. So they
-are fitted once more, with the information that errors leave which last as long as the flight, beside what can take their place: a
-smooth function of the place for every anchor, as large as the evidence says, as what an antenna adds in each direction is; and
-coordinates and delays of anchors that the fit takes for zero. All these are integrated out. What a value is away from that counts as its
-error.
+A fit states how well the data determine its values, if its model is the right one. Positions and
+delays of anchors take what other systematic errors leave unexplained, in the same way at every
+place, so that no scatter between blocks of time shows it. So they are fitted once more, with the
+information that errors leave which last as long as the flight, beside what can take their place: a
+smooth function of the place for every anchor, as large as the evidence says, as what an antenna
+adds in each direction is; and coordinates and delays of anchors that the fit takes for zero. All
+these are integrated out. What a value is away from that counts as its error.
 """
 
 from __future__ import annotations
@@ -30,15 +31,21 @@ if TYPE_CHECKING:
     from .regression.terms import Column
     from .self_calibration.prior import Solution
 
-LENGTH = 4.0  # m over which functions of the place change; the shift of an anchor makes errors that change as slowly
+# m over which functions of the place change; the shift of an anchor makes errors that change as
+# slowly
+LENGTH = 4.0
 UNSAID = 0.03  # m, that coordinates and delays may be off by, of which no anchor has any in the fit
-LASTS = (*OF_ANCHORS, "tag_lever_arm")  # take what other errors leave that last as long as the flight
+LASTS = (
+    *OF_ANCHORS,
+    "tag_lever_arm",
+)  # take what other errors leave that last as long as the flight
 LASTING = 14.0  # by which errors that are alike for a while are alike for longer than blocks tell
 
 
 def with_deviations(selection: Selection) -> Selection:
-    """The Selection with standard deviations of positions and delays of anchors, and of the place of the antenna, that hold; as it is where
-    there are none, or where the path is not known."""
+    """The Selection with standard deviations of positions and delays of anchors, and of the place
+    of the antenna, that hold; as it is where there are none, or where the path is not known.
+    """
     table, model = selection.table, selection.fit
     places = [k for k, column in enumerate(model.columns) if column.effect[0] in LASTS]
     if not places or any(part.innovations is not None for part in table.radio_parts):
@@ -52,11 +59,20 @@ def with_deviations(selection: Selection) -> Selection:
 
 
 def _beside_others(table: RegressionTable, model: Fit) -> tuple[np.ndarray, np.ndarray]:
-    """(by how much the values are others (k,), their covariance (k, k)) of the columns of a Fit, with what can take the place of anchors
-    integrated out."""
-    rows, known, near = table.radio_rows, {column.effect for column in model.columns}, _heard_with(table, model)
+    """(by how much the values are others (k,), their covariance (k, k)) of the columns of a Fit,
+    with what can take the place of anchors integrated out.
+    """
+    rows, known, near = (
+        table.radio_rows,
+        {column.effect for column in model.columns},
+        _heard_with(table, model),
+    )
     mine = table.matrix(model.columns, rows)
-    beside = [column for column in table.columns if column.effect in ((POSITION,), (DELAY,)) and (near is None or _anchor(column) in near)]
+    beside = [
+        column
+        for column in table.columns
+        if column.effect in ((POSITION,), (DELAY,)) and (near is None or _anchor(column) in near)
+    ]
     others = [column for column in beside if column not in model.columns]
     sizes = [column.typical if column.effect in known else UNSAID for column in others]
     late = table.matrix([column for column in beside if column.effect == (DELAY,)], rows)
@@ -72,7 +88,9 @@ def _beside_others(table: RegressionTable, model: Fit) -> tuple[np.ndarray, np.n
     prior = np.diag(prior_sizes(model.columns) ** 2.0)
 
     def solution(size: float) -> Solution:
-        part = Part(*eliminated(gram, vector, n, np.append(sizes, np.full(functions.shape[1], size))), size)
+        part = Part(
+            *eliminated(gram, vector, n, np.append(sizes, np.full(functions.shape[1], size))), size
+        )
         return posterior(part, prior, np.zeros(n))
 
     best = max(map(solution, FUNCTION_STDS), key=lambda one: one.evidence)
@@ -85,13 +103,22 @@ def _anchor(column: Column) -> str:
 
 
 def _heard_with(table: RegressionTable, model: Fit) -> set[str] | None:
-    """Ids of the anchors whose positions or delays a Fit determines, and of all that are heard in the same blocks as any of them: set of
-    texts. None for all anchors: of few, or of several installations."""
+    """Ids of the anchors whose positions or delays a Fit determines, and of all that are heard in
+    the same blocks as any of them: set of texts. None for all anchors: of few, or of several
+    installations.
+    """
     parts = table.radio_parts
     ids = parts[0].samples.anchors.ids
     if not table.sparse or not all(np.array_equal(part.samples.anchors.ids, ids) for part in parts):
         return None
-    known, rows = {_anchor(column) for column in model.columns if column.effect[0] in OF_ANCHORS}, table.radio_rows
-    ends, block, names = np.stack(parts[0].arrivals(table.series[rows])), table.block[rows], ids.astype(str)
+    known, rows = (
+        {_anchor(column) for column in model.columns if column.effect[0] in OF_ANCHORS},
+        table.radio_rows,
+    )
+    ends, block, names = (
+        np.stack(parts[0].arrivals(table.series[rows])),
+        table.block[rows],
+        ids.astype(str),
+    )
     mine = np.isin(names, list(known))[ends].any(axis=0)
     return known | set(names[np.unique(ends[:, np.isin(block, block[mine])])].tolist())

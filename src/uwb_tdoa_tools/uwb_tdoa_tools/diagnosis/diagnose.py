@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -30,7 +30,9 @@ from .self_calibration.solve import same_anchors
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
+
     from uwb_tdoa_bias.foundation.flight import Flight
+
     from ..parallel import MapFunction
     from .detectors import Detection
     from .regression.terms import Candidate
@@ -38,21 +40,30 @@ if TYPE_CHECKING:
 
     Flights = tuple[Flight, ...]
 
-EXPLAINED = 0.1  # share of the slow innovations that a self-calibration must explain, to be a finding
+EXPLAINED = (
+    0.1  # share of the slow innovations that a self-calibration must explain, to be a finding
+)
 CANNOT_JUDGE = "without ground truth nobody can tell whether taking it out helps the position"
 
 
 def diagnose(
-    flights: Sequence[Flight], holdout: Sequence[Flight] = (), base: EffectSet = EffectSet(),
-    config: FilterConfig | None = None, reference: Reference | None = None,
-    progress: Callable[[str], object] = lambda what: None, map_function: MapFunction = map,
-) -> Diagnosis:  # fmt: skip
+    flights: Sequence[Flight],
+    holdout: Sequence[Flight] = (),
+    base: EffectSet = EffectSet(),
+    config: FilterConfig | None = None,
+    reference: Reference | None = None,
+    progress: Callable[[str], object] = lambda what: None,
+    map_function: MapFunction = map,
+) -> Diagnosis:
     """Diagnosis of Flights.
 
-    holdout : Flights to judge on; base : EffectSet that is in the model already; config : FilterConfig; reference :
-    Reference, by default the recorded ground truth; progress(what) is called every few seconds at least;
+    holdout : Flights to judge on; base : EffectSet that is in the model already; config :
+        FilterConfig; reference :
+    Reference, by default the recorded ground truth; progress(what) is called every few seconds at
+    least;
     map_function : as of `attribute`, of work on single flights.
-    Raises InputError where a flight cannot be used: flights of different anchors, or without the reference.
+    Raises InputError where a flight cannot be used: flights of different anchors, or without the
+    reference.
     """
     reference = reference or GroundTruth()
     same_anchors([*flights, *holdout])
@@ -66,11 +77,23 @@ def diagnose(
         looking()
     of_truth = {flight.name: said for flight, said in settled if said}
     count = len(flights)
-    fitted, held_out = (tuple(flight for flight, _ in some) for some in (settled[:count], settled[count:]))
+    fitted, held_out = (
+        tuple(flight for flight, _ in some) for some in (settled[:count], settled[count:])
+    )
 
-    repairs = repairing.repaired(fitted, base, config, work.saying("looking at ids and signs")) if reference.tells_errors else {}
+    repairs = (
+        repairing.repaired(fitted, base, config, work.saying("looking at ids and signs"))
+        if reference.tells_errors
+        else {}
+    )
     sound, rest = repairing.sound(fitted, base, repairs)
-    found = attribute(sound, reference, rest, progress=work.saying("tracing residuals to effects"), map_function=map_function)
+    found = attribute(
+        sound,
+        reference,
+        rest,
+        progress=work.saying("tracing residuals to effects"),
+        map_function=map_function,
+    )
     if reference.tells_errors:
         outcome = _by_error(work, found, (fitted, sound), held_out, rest, repairs)
     else:
@@ -96,7 +119,11 @@ def diagnose(
         health(found.residuals, runs, scores),
         outcome.attribution,
         remaining,
-        {flight.name: faults for faults, flight in zip(map_function(numbers, fitted), fitted) if faults},
+        {
+            flight.name: faults
+            for faults, flight in zip(map_function(numbers, fitted), fitted)
+            if faults
+        },
         outcome.changes,
         of_truth=of_truth,
     )
@@ -118,8 +145,11 @@ class _Work(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Outcome:
-    """What becomes of an Attribution: findings : [EffectFinding]; effects : EffectSet, the base and what is added; refused : [Refused];
-    sides : (before, after), as of Diagnosis; judged_on; attribution : with what was known beside; baseline : Baseline; changes."""
+    """What becomes of an Attribution: findings : [EffectFinding]; effects : EffectSet, the base and
+    what is added; refused : [Refused];
+    sides : (before, after), as of Diagnosis; judged_on; attribution : with what was known beside;
+        baseline : Baseline; changes.
+    """
 
     findings: list[EffectFinding]
     effects: EffectSet
@@ -132,95 +162,164 @@ class _Outcome:
 
 
 def _by_error(
-    work: _Work, found: Attribution, flights: tuple[Flights, Flights], held_out: Flights, rest: EffectSet,
+    work: _Work,
+    found: Attribution,
+    flights: tuple[Flights, Flights],
+    held_out: Flights,
+    rest: EffectSet,
     repairs: dict[Detection, float],
-) -> _Outcome:  # fmt: skip
-    """_Outcome where the reference tells errors of the position: what makes them smaller. flights : as they are, and without wrong ids and
-    signs, whose effects are not in `rest`, but in `repairs`."""
+) -> _Outcome:
+    """_Outcome where the reference tells errors of the position: what makes them smaller. flights :
+    as they are, and without wrong ids and signs, whose effects are not in `rest`, but in `repairs`.
+    """
     (fitted, sound), base, config, map_function = flights, work.base, work.config, work.map_function
     trying = work.saying("running the filter without each")
     # A finding stays one even if the filter does without it; it is only not added.
     model = replace(found, selection=written(found.selection, found.candidates))
-    selected = validation.select_by_error(model, sound, comparison.Baseline(rest, config), trying, map_function)
+    selected = validation.select_by_error(
+        model, sound, comparison.Baseline(rest, config), trying, map_function
+    )
     attribution, selected = repairing.before_others(found, selected, repairs)
     model = selected.applied(attribution)
-    effects, baseline = with_calibration(base, usable(model.effects).effects, model.covariance), comparison.Baseline(base, config)
+    effects, baseline = (
+        with_calibration(base, usable(model.effects).effects, model.covariance),
+        comparison.Baseline(base, config),
+    )
     work.progress("judging")
     cases, judged_on = validation.validation_cases(model, fitted, held_out, base, effects)
-    before, after = comparison.compare(cases, baseline, work.saying("judging"), work.reference.shift_std, map_function)
+    before, after = comparison.compare(
+        cases, baseline, work.saying("judging"), work.reference.shift_std, map_function
+    )
     refused = list(selected.refused)
     shift_std = max(work.reference.shift_std(flight.name).max() for flight in fitted)
     why_not = comparison.why_not(before, after, shift_std)
-    if why_not and len(effects) > len(base) + len(attribution.of_floor):  # of those it tells nothing
+    if why_not and len(effects) > len(base) + len(
+        attribution.of_floor
+    ):  # of those it tells nothing
         refused.append(Refused("all", why_not))
-        selected = validation.ValidatedSelection(attribution.selection.only(()), (), (), selected.worth)
+        selected = validation.ValidatedSelection(
+            attribution.selection.only(()), (), (), selected.worth
+        )
         model, after = selected.applied(attribution), before
         effects = with_calibration(base, attribution.of_floor, None)
-    findings = _findings(model.findings(), attribution.findings(), attribution.detections, selected.worth)
+    findings = _findings(
+        model.findings(), attribution.findings(), attribution.detections, selected.worth
+    )
     return _Outcome(findings, effects, refused, (before, after), judged_on, attribution, baseline)
 
 
-def _by_self_calibration(work: _Work, found: Attribution, flights: tuple[Flights, Flights], held_out: Flights, rest: EffectSet) -> _Outcome:
-    """_Outcome where nobody knows errors of the position: positions and delays of anchors together, or nothing.
+def _by_self_calibration(
+    work: _Work,
+    found: Attribution,
+    flights: tuple[Flights, Flights],
+    held_out: Flights,
+    rest: EffectSet,
+) -> _Outcome:
+    """_Outcome where nobody knows errors of the position: positions and delays of anchors together,
+    or nothing.
 
-    A model that is wrong makes innovations smaller too, by pushing the path to where they are. On measured flights
-    functions of the place, fitted to some, made innovations of others smaller and doubled the error of the position.
+    A model that is wrong makes innovations smaller too, by pushing the path to where they are. On
+    measured flights functions of the place, fitted to some, made innovations of others smaller and
+    doubled the error of the position.
     """
-    (fitted, sound), effects, baseline = flights, work.base, comparison.Baseline(work.base, work.config)
+    (fitted, sound), effects, baseline = (
+        flights,
+        work.base,
+        comparison.Baseline(work.base, work.config),
+    )
     added: list[EffectFinding] = []
     refused: list[Refused] = []
     changes: tuple[str, ...] = ()
     chosen, others = found.selection.chosen, found.findings()
     config = work.config or FilterConfig()
-    ranged = any(may_have_offset(flight, config) for flight in sound)  # then the delay of the tag was taken out of the innovations
+    ranged = any(
+        may_have_offset(flight, config) for flight in sound
+    )  # then the delay of the tag was taken out of the innovations
     if chosen or ranged or rest.covariance is not None or work.reference.constraints:
         calibration = _calibrated(work, sound, rest)
         if isinstance(calibration, str):
-            refused = [Refused(" + ".join([candidate.label for candidate in chosen] or OF_ANCHORS), calibration)]
+            refused = [
+                Refused(
+                    " + ".join([candidate.label for candidate in chosen] or OF_ANCHORS), calibration
+                )
+            ]
         else:
             several = calibration.found(calibration.shifts)
             effects = with_calibration(effects, several, calibration.covariance)
-            evidence = {"slow_before": round(calibration.before, 4), "slow_left": round(calibration.left, 4)}
+            evidence = {
+                "slow_before": round(calibration.before, 4),
+                "slow_left": round(calibration.left, 4),
+            }
             alternatives = {other.effect.name: other.alternatives for other in others}
             added = [
                 EffectFinding(
-                    effect, effect.channels[0], evidence, calibration.explained, alternatives.get(effect.name, ()),
+                    effect,
+                    effect.channels[0],
+                    evidence,
+                    calibration.explained,
+                    alternatives.get(effect.name, ()),
                     shares=calibration.shares.get(effect.name, ()),
                 )
                 for effect in several
-            ]  # fmt: skip
+            ]
             labels = [candidate.label for candidate in chosen if candidate.name not in OF_ANCHORS]
-            refused = [Refused(label, CANNOT_JUDGE) for label in (*labels, *(one.effect.label for one in found.detections))]
+            refused = [
+                Refused(label, CANNOT_JUDGE)
+                for label in (*labels, *(one.effect.label for one in found.detections))
+            ]
             changes = tuple(change.as_text() for change in calibration.changes)
-    judged_on = validation.HELD_OUT if held_out else "the flights that were fitted, by their innovations alone"
+    judged_on = (
+        validation.HELD_OUT
+        if held_out
+        else "the flights that were fitted, by their innovations alone"
+    )
     work.progress("judging")
     cases = [comparison.ValidationCase(flight, effects) for flight in held_out or fitted]
     sides = comparison.innovations(cases, baseline, work.saying("judging"), work.map_function)
-    return _Outcome(_findings(added, others, (), {}), effects, refused, sides, judged_on, found, baseline, changes)
+    return _Outcome(
+        _findings(added, others, (), {}),
+        effects,
+        refused,
+        sides,
+        judged_on,
+        found,
+        baseline,
+        changes,
+    )
 
 
 def _calibrated(work: _Work, flights: Flights, base: EffectSet) -> SelfCalibration | str:
-    """SelfCalibration of Flights beside the EffectSet `base`, or why nothing of one is to be applied."""
+    """SelfCalibration of Flights beside the EffectSet `base`, or why nothing of one is to be
+    applied.
+    """
     known, trying = work.reference.constraints, work.saying("calibrating anchors")
     try:
         found = self_calibrate(flights, Tape(), base, work.config, known, trying, work.map_function)
     except InputError as error:  # flights that are too short for that alone
         return str(error).rstrip(".")
     if found.why_not is None and found.explained < EXPLAINED:
-        return f"positions and delays of anchors explain {found.explained:.0%} of what is slow in the innovations"
+        return (
+            f"positions and delays of anchors explain {found.explained:.0%} of what is slow in "
+            "the innovations"
+        )
     return found.why_not or found
 
 
 def _findings(
-    model: Sequence[EffectFinding], others: Sequence[EffectFinding], detections: Sequence[Detection],
+    model: Sequence[EffectFinding],
+    others: Sequence[EffectFinding],
+    detections: Sequence[Detection],
     worth: dict[Candidate | Detection, float],
-) -> list[EffectFinding]:  # fmt: skip
-    """[EffectFinding]: those of the model that is written, with the values that are written, then others that were found. worth : as of
-    ValidatedSelection, of candidates and of detections."""
+) -> list[EffectFinding]:
+    """[EffectFinding]: those of the model that is written, with the values that are written, then
+    others that were found. worth : as of ValidatedSelection, of candidates and of detections.
+    """
     detected = {detection.effect.name: detection for detection in detections}
 
     def with_worth(finding: EffectFinding, added: bool) -> EffectFinding:
-        tried = finding.candidates or [detected[name] for name in (finding.effect.name,) if name in detected]
+        tried = finding.candidates or [
+            detected[name] for name in (finding.effect.name,) if name in detected
+        ]
         known = [worth[each] for each in tried if each in worth]
         return replace(finding, added=added, worth=float(np.sum(known)) if known else None)
 

@@ -9,7 +9,9 @@ import numpy as np
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
+
     from uwb_tdoa_bias.effects import Effect
+
     from .channels import ChannelResiduals
 
 
@@ -21,16 +23,26 @@ class Seen:
         self._residuals = residuals
         self._ranges: dict[tuple[int, str, str], tuple[float, float] | None] = {}
 
-    def limited(self, effects: Iterable[Effect], flights: Sequence[int] | None = None) -> list[Effect]:
-        """Effects with the domain in which some flights, by their numbers, saw them; default: all. What is not a function of
-        anything, and what has a domain already, stays as it is: list."""
+    def limited(
+        self, effects: Iterable[Effect], flights: Sequence[int] | None = None
+    ) -> list[Effect]:
+        """Effects with the domain in which some flights, by their numbers, saw them; default: all.
+        What is not a function of anything, and what has a domain already, stays as it is: list.
+        """
         numbers = range(len(self._residuals)) if flights is None else flights
-        return [effect if effect.domain else replace(effect, domain=self._domain(effect, numbers)) for effect in effects]
+        return [
+            effect if effect.domain else replace(effect, domain=self._domain(effect, numbers))
+            for effect in effects
+        ]
 
     def _domain(self, effect: Effect, numbers: Sequence[int]) -> dict[str, tuple[float, float]]:
         out = {}
         for covariate in effect.covariates:
-            asked = [self._range(number, channel, covariate) for number in numbers for channel in effect.channels]
+            asked = [
+                self._range(number, channel, covariate)
+                for number in numbers
+                for channel in effect.channels
+            ]
             ranges = [one for one in asked if one is not None]
             if ranges:
                 out[covariate] = min(low for low, _ in ranges), max(high for _, high in ranges)

@@ -9,6 +9,7 @@ from uwb_tdoa_bias.effects import Effect, EffectSet, SmoothTerm
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Iterable
+
     from .over_flights import Share
     from .regression.confounding import Alternative
     from .regression.terms import Candidate
@@ -21,12 +22,15 @@ LEAST_WORTH = 0.005  # m that a finding may be worth, to come before one that is
 class EffectFinding:
     """An effect that was found.
 
-    effect : Effect with values and std; channel : where it shows most; evidence : {figure: number}; explained : share of
-    the channel's variance on held-out rows; alternatives : (Alternative, ...); candidates : the (Candidate, ...) it was, ()
-    for what a detector found in what is left; added : is in the model that is written; worth : m by which the filter's 3D
-    RMSE is larger without it, None if nobody tried; together_with : covariates of the same candidate; shares : (Share, ...) of
-    `over_flights`, how much of it each flight shows; flight : name of the only flight that shows it, None for what was fitted to
-    all; on_floor : was found near the floor, beside all that was found in the air.
+    effect : Effect with values and std; channel : where it shows most; evidence : {figure: number};
+        explained : share of
+    the channel's variance on held-out rows; alternatives : (Alternative, ...); candidates : the
+    (Candidate, ...) it was, () for what a detector found in what is left; added : is in the model
+    that is written; worth : m by which the filter's 3D RMSE is larger without it, None if nobody
+    tried; together_with : covariates of the same candidate; shares : (Share, ...) of
+    `over_flights`, how much of it each flight shows; flight : name of the only flight that shows
+    it, None for what was fitted to all; on_floor : was found near the floor, beside all that was
+    found in the air.
     """
 
     effect: Effect
@@ -54,7 +58,9 @@ class EffectFinding:
 
     @property
     def prominence(self) -> float:
-        """How sure and how large it is, to put findings in order: what it gains in likelihood, times what it is worth."""
+        """How sure and how large it is, to put findings in order: what it gains in likelihood,
+        times what it is worth.
+        """
         return self.evidence.get("criterion", 1.0) * (max(self.worth or 0.0, 0.0) + LEAST_WORTH)
 
     @property

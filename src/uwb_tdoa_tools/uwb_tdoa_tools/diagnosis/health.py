@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,7 +13,9 @@ from .channels import CHANNELS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from uwb_tdoa_ekf.offline import Run
+
     from ..scoring.metrics import Score
     from .channels import ChannelResiduals
     from .channels.base import Figures
@@ -22,9 +24,12 @@ KEYS = ("pairs", "anchors", "axes", "cross_correlation")  # of what channels tel
 REACHED = [value for value, name in VERDICTS.items() if name in ("used", "rejected")]
 
 
-def health(residuals: Sequence[ChannelResiduals], runs: Sequence[Run] = (), scores: Sequence[Score] = ()) -> Figures:
-    """What [{channel: ChannelResidual}] look like: {"pairs", "anchors", "axes", "cross_correlation", "filter"}, each a list
-    of dicts. runs, scores : Run and Score of each flight, for NIS (1 is honest) and NEES (3 is honest).
+def health(
+    residuals: Sequence[ChannelResiduals], runs: Sequence[Run] = (), scores: Sequence[Score] = ()
+) -> Figures:
+    """What [{channel: ChannelResidual}] look like: {"pairs", "anchors", "axes",
+    "cross_correlation", "filter"}, each a list of dicts. runs, scores : Run and Score of each
+    flight, for NIS (1 is honest) and NEES (3 is honest).
     """
     out: Figures = {key: [] for key in KEYS}
     for name, channel in CHANNELS.items():
@@ -36,7 +41,11 @@ def health(residuals: Sequence[ChannelResiduals], runs: Sequence[Run] = (), scor
 
 def _filter(run: Run, score: Score) -> dict[str, Any]:
     of_tdoas = run.residuals.verdict, run.residuals.innovation, run.residuals.variance
-    of_aids = [[run.aids[name][field] for field in ("verdict", "innovation", "variance")] for name in LOCATING if name in run.aids]
+    of_aids = [
+        [run.aids[name][field] for field in ("verdict", "innovation", "variance")]
+        for name in LOCATING
+        if name in run.aids
+    ]
     verdict, innovation, variance = map(np.concatenate, zip(of_tdoas, *of_aids))
     reached = np.isin(verdict, REACHED)
     nis = innovation[reached] ** 2 / variance[reached]

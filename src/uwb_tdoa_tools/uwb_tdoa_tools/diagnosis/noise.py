@@ -16,8 +16,9 @@ PARAMETERS = """/**:
 
 
 def write_parameters(path: Path, tdoa_std: float | None) -> Path | None:
-    """Write the parameters of ekf_node, and return the path. tdoa_std : m; where that is None nothing is written, and what was there is
-    removed."""
+    """Write the parameters of ekf_node, and return the path. tdoa_std : m; where that is None
+    nothing is written, and what was there is removed.
+    """
     if tdoa_std is None:
         path.unlink(missing_ok=True)
         return None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,9 +17,10 @@ from .report.unclear import by_remedy, undetermined
 from .report.verdict import faults_in_words, truth_in_words, verdict
 
 if TYPE_CHECKING:
-    from .result import Diagnosis
-    from .findings import EffectFinding
     from uwb_tdoa_bias.effects import SmoothTerm
+
+    from .findings import EffectFinding
+    from .result import Diagnosis
 
 WIDTH, LABEL = 120, 10  # columns of the screen, and of them for what a line is
 
@@ -32,14 +33,19 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
             "flights": [flight.name for flight in diagnosis.flights],
             "rests_on": diagnosis.reference.words,
             "findings": [_finding(finding) for finding in diagnosis.findings if finding.declared],
-            "numbers": {name: [vars(item) for item in found] for name, found in diagnosis.numbers.items()},
+            "numbers": {
+                name: [vars(item) for item in found] for name, found in diagnosis.numbers.items()
+            },
             "ground_truth": {name: list(said) for name, said in diagnosis.of_truth.items()},
-            "unattributed": [_function(item, item.function) for item in diagnosis.findings if item.function],
+            "unattributed": [
+                _function(item, item.function) for item in diagnosis.findings if item.function
+            ],
             "ambiguous": _ambiguous(diagnosis),
             "unobservable": [
                 {
                     "effect": item.effect,
-                    "direction": item.direction or "the flights lack the channel, or the reference, that shows it",
+                    "direction": item.direction
+                    or "the flights lack the channel, or the reference, that shows it",
                     "told_by": words.remedy,
                 }
                 for item, words in zip(diagnosis.unobservable, undetermined(diagnosis))
@@ -55,18 +61,33 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
 
 
 def as_text(diagnosis: Diagnosis) -> str:
-    """Lines for the screen: verdict, what to do, what was found and its worth, what was not determined, what to run."""
+    """Lines for the screen: verdict, what to do, what was found and its worth, what was not
+    determined, what to run.
+    """
     found = entries(diagnosis)
-    lines = [("" if k else "verdict", sentence) for k, sentence in enumerate(verdict(diagnosis).sentences)]
+    lines = [
+        ("" if k else "verdict", sentence)
+        for k, sentence in enumerate(verdict(diagnosis).sentences)
+    ]
     lines += [("truth", sentence) for sentence in truth_in_words(diagnosis)]
     lines += [("numbers", sentence) for sentence in faults_in_words(diagnosis)]
-    lines += [("changed", f"since the last calibration, {sentence}") for sentence in diagnosis.changes]
+    lines += [
+        ("changed", f"since the last calibration, {sentence}") for sentence in diagnosis.changes
+    ]
     lines += [("do", sentence) for entry in found if entry.matters for sentence in entry.advice]
     for entry in found:
-        judged = f"not added: {entry.why_not}" if entry.why_not else f"worth {worth_in_words(entry)}"
-        what = f"{entry.title}: {entry.values}; {judged}." if entry.findings[0].declared else f"{entry.title}; {judged}."
+        judged = (
+            f"not added: {entry.why_not}" if entry.why_not else f"worth {worth_in_words(entry)}"
+        )
+        what = (
+            f"{entry.title}: {entry.values}; {judged}."
+            if entry.findings[0].declared
+            else f"{entry.title}; {judged}."
+        )
         lines.append(("found" if entry.findings[0].declared else "no name", what))
-        lines += [("", sentence) for sentence in [entry.over_flights, *doubt_in_words(entry)] if sentence]
+        lines += [
+            ("", sentence) for sentence in [entry.over_flights, *doubt_in_words(entry)] if sentence
+        ]
     for remedy, several in by_remedy(undetermined(diagnosis)).items():
         lines.append(("not told", f"{listed(several)}; what would tell: {remedy}."))
     if any(entry.added for entry in found):
@@ -76,9 +97,13 @@ def as_text(diagnosis: Diagnosis) -> str:
 
 def _wrapped(label: str, text: str) -> str:
     return textwrap.fill(
-        text, WIDTH, initial_indent=label.ljust(LABEL), subsequent_indent=" " * LABEL, break_on_hyphens=False,
+        text,
+        WIDTH,
+        initial_indent=label.ljust(LABEL),
+        subsequent_indent=" " * LABEL,
+        break_on_hyphens=False,
         break_long_words=False,
-    )  # fmt: skip
+    )
 
 
 def _finding(finding: EffectFinding) -> dict[str, Any]:
@@ -120,7 +145,10 @@ def _function(finding: EffectFinding, effect: SmoothTerm) -> dict[str, Any]:
         "alternatives": _alternatives(finding),
         "evidence": finding.evidence,
         "together_with": list(finding.together_with),
-        "shape": {"at": at, "values": {prefix.rstrip("."): effect.curve(at, prefix) for prefix in prefixes}},
+        "shape": {
+            "at": at,
+            "values": {prefix.rstrip("."): effect.curve(at, prefix) for prefix in prefixes},
+        },
         "usable": effect.usable,
         **_over_flights(finding),
         "added": finding.added,
@@ -129,12 +157,21 @@ def _function(finding: EffectFinding, effect: SmoothTerm) -> dict[str, Any]:
 
 
 def _over_flights(finding: EffectFinding) -> dict[str, Any]:
-    return {"shares": [vars(share) for share in finding.shares], "over_flights": course(finding.shares), "flight": finding.flight}
+    return {
+        "shares": [vars(share) for share in finding.shares],
+        "over_flights": course(finding.shares),
+        "flight": finding.flight,
+    }
 
 
 def _alternatives(finding: EffectFinding) -> list[dict[str, Any]]:
     return [
-        {"effect": other.effect, "share": other.share, "criterion_gap": other.gap, "tell_apart": other.tell_apart}
+        {
+            "effect": other.effect,
+            "share": other.share,
+            "criterion_gap": other.gap,
+            "tell_apart": other.tell_apart,
+        }
         for other in finding.alternatives
     ]
 
@@ -145,7 +182,8 @@ def _ambiguous(diagnosis: Diagnosis) -> list[dict[str, Any]]:
         {
             "found": entry.title,
             "alternatives": [
-                {"effect": other.effect, "criterion_gap": other.gap, "tell_apart": other.tell_apart} for other in entry.undecided
+                {"effect": other.effect, "criterion_gap": other.gap, "tell_apart": other.tell_apart}
+                for other in entry.undecided
             ],
         }
         for entry in entries(diagnosis)

@@ -17,33 +17,44 @@ from .validation import TRIAL_FLIGHTS, WORSE, error_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
+
     from uwb_tdoa_bias.effects import Effect
     from uwb_tdoa_bias.foundation.flight import Flight
     from uwb_tdoa_ekf.core.config import FilterConfig
+
     from .attribution import Attribution
-    from .validation import ValidatedSelection
     from .regression.terms import Candidate
+    from .validation import ValidatedSelection
 
 
 def repaired(
-    flights: Sequence[Flight], base: EffectSet, config: FilterConfig | None = None,
+    flights: Sequence[Flight],
+    base: EffectSet,
+    config: FilterConfig | None = None,
     progress: Callable[[], object] = lambda: None,
-) -> dict[Detection, float]:  # fmt: skip
-    """{Detection: m by which the mean 3D RMSE of the filter is larger without it, and those before it} of the LabelEffects that all
-    Flights need beyond the EffectSet `base`, and that make the filter better."""
+) -> dict[Detection, float]:
+    """{Detection: m by which the mean 3D RMSE of the filter is larger without it, and those before
+    it} of the LabelEffects that all Flights need beyond the EffectSet `base`, and that make the
+    filter better.
+    """
     out, effects, error = {}, base.effects, None
     for effect in _common([repairs(base.correct_streams(flight)) for flight in flights]):
         error = _error(flights, effects, config, progress) if error is None else error
         less = _error(flights, (*effects, effect), config, progress)
         if less < error * (1.0 - WORSE):
-            out[Detection(effect, effect.channels[0], _evidence(flights[0], effects, effect))] = error - less
+            out[Detection(effect, effect.channels[0], _evidence(flights[0], effects, effect))] = (
+                error - less
+            )
             effects, error = (*effects, effect), less
     return out
 
 
-def sound(flights: Sequence[Flight], base: EffectSet, found: Iterable[Detection]) -> tuple[tuple[Flight, ...], EffectSet]:
-    """(Flights without wrong ids and signs, EffectSet of the rest): what `base` and Detections have of these is taken out of the
-    flights, so that pairs and anchors are called by their names."""
+def sound(
+    flights: Sequence[Flight], base: EffectSet, found: Iterable[Detection]
+) -> tuple[tuple[Flight, ...], EffectSet]:
+    """(Flights without wrong ids and signs, EffectSet of the rest): what `base` and Detections have
+    of these is taken out of the flights, so that pairs and anchors are called by their names.
+    """
     labels = [effect for effect in base.effects if isinstance(effect, LabelEffect)]
     undo = EffectSet((*labels, *(detection.effect for detection in found)))
     rest = tuple(effect for effect in base.effects if not isinstance(effect, LabelEffect))
@@ -57,26 +68,42 @@ def before_others(
     worth: dict[Candidate | Detection, float] = dict(found.items())
     return (
         replace(attribution, detections=(*found, *attribution.detections)),
-        replace(validated, detections=(*found, *validated.detections), worth=worth | validated.worth),
+        replace(
+            validated, detections=(*found, *validated.detections), worth=worth | validated.worth
+        ),
     )
 
 
 def _common(several: Sequence[Sequence[LabelEffect]]) -> list[LabelEffect]:
-    """Effects with the values that those of every flight have; ids that are not the same in all are left."""
+    """Effects with the values that those of every flight have; ids that are not the same in all are
+    left.
+    """
     out = []
     for effect in several[0]:
-        same = [next((other for other in others if other.name == effect.name), None) for others in several]
+        same = [
+            next((other for other in others if other.name == effect.name), None)
+            for others in several
+        ]
         known = [other for other in same if other is not None]
         if len(known) < len(same):
             continue
-        keys = [key for key, value in effect.values.items() if all(one.values.get(key) == value for one in known)]
+        keys = [
+            key
+            for key, value in effect.values.items()
+            if all(one.values.get(key) == value for one in known)
+        ]
         shared = {key: effect.values[key] for key in keys}
         if shared and (effect.separable or all(other.values == effect.values for other in known)):
             out.append(replace(effect, values=shared, source="diagnose"))
     return out
 
 
-def _error(flights: Sequence[Flight], effects: Iterable[Effect], config: FilterConfig | None, progress: Callable[[], object]) -> float:
+def _error(
+    flights: Sequence[Flight],
+    effects: Iterable[Effect],
+    config: FilterConfig | None,
+    progress: Callable[[], object],
+) -> float:
     """Mean 3D RMSE, m, of some of the flights."""
     errors = []
     for flight in flights[:: -(-len(flights) // TRIAL_FLIGHTS)]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from .findings import EffectFinding, Refused
 
@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.effects import EffectSet
     from uwb_tdoa_bias.foundation.flight import Flight
     from uwb_tdoa_ekf.streams.finding import Finding as NumbersFinding
+
     from .attribution import Attribution
     from .channels import ChannelResiduals
     from .channels.base import Figures
@@ -22,13 +23,16 @@ if TYPE_CHECKING:
 class Diagnosis:
     """What was found in some flights, and what it is worth.
 
-    flights : (Flight, ...), as the reference leaves them; reference : Reference; findings : [EffectFinding]; effects :
-    EffectSet, the base and what is added; refused : [Refused]; unobservable : [Unobservable]; before, after : dicts of
-    `comparison.compare`; judged_on : sentence; health : dict; attribution : Attribution; remaining : [{channel:
-    ChannelResidual}] under `effects`; numbers : {name of a flight: [Finding of checking]}, what is wrong with its numbers; changes :
-    sentences, what is not as in the last calibration;
+    flights : (Flight, ...), as the reference leaves them; reference : Reference; findings :
+        [EffectFinding]; effects :
+    EffectSet, the base and what is added; refused : [Refused]; unobservable : [Unobservable];
+    before, after : dicts of `comparison.compare`; judged_on : sentence; health : dict; attribution
+    : Attribution; remaining : [{channel: ChannelResidual}] under `effects`; numbers : {name of a
+    flight: [Finding of checking]}, what is wrong with its numbers; changes : sentences, what is not
+    as in the last calibration;
     applying : ((command line, what it does), ...), how the effects are put to use;
-    of_truth : {name of a flight: sentences}, what was wrong with the clock or the frame of its ground truth.
+    of_truth : {name of a flight: sentences}, what was wrong with the clock or the frame of its
+        ground truth.
     """
 
     flights: tuple[Flight, ...]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from .. import parallel
 from ..bags.bag import late_tdoas, read_odometry
@@ -17,16 +17,18 @@ from ..estimate import FlightEstimator
 from ..localizing.rerun_file import write_rerun
 from ..readers.inputs import Reading, report_remarks
 from ..results_file import ResultsFile, state_of
-from . import table
 from ..scoring.alignment import ALIGN, NONE, alignment_of, need_truth
 from ..scoring.evaluation import corrected_truth
 from ..scoring.metrics import Pool, Result, Score
 from ..scoring.tum import write_tum
+from . import table
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
+
     from uwb_tdoa_bias.foundation.flight import Flight
     from uwb_tdoa_ekf.results import Odometry, Residuals
+
     from ..bags.bag import RecordedOdometry
     from ..readers.inputs import Recording
     from ..scoring.alignment import Alignment
@@ -34,12 +36,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Evaluator:
-    """evaluator((path, survey)) is the Result of a recording: of the filter run over it, or of the odometry in a bag.
+    """evaluator((path, survey)) is the Result of a recording: of the filter run over it, or of the
+    odometry in a bag.
 
-    reading : Reading; estimator : FlightEstimator; odometry : path of a bag whose odometry is judged instead, or None; picture :
-    file to draw the errors to, or None; trajectories : folder for TUM files, or None; rerun : file for Rerun, or None; align : of
-    ALIGN, what of the ground truth is moved onto the estimate before it judges.
-    Raises InputError. Can be pickled.
+    reading : Reading; estimator : FlightEstimator; odometry : path of a bag whose odometry is
+        judged instead, or None; picture :
+    file to draw the errors to, or None; trajectories : folder for TUM files, or None; rerun : file
+    for Rerun, or None; align : of ALIGN, what of the ground truth is moved onto the estimate before
+    it judges. Raises InputError. Can be pickled.
     """
 
     reading: Reading = Reading()
@@ -69,7 +73,10 @@ class Evaluator:
         found = alignment_of(flight, odometry)
         found_wrong = list(self._of_truth(flight, found))
         truths = {how: found.applied(flight.truth, how) for how in ALIGN}
-        scores = {how: Score(flight.name, odometry, one, residuals, flight.tdoa.t) for how, one in truths.items()}
+        scores = {
+            how: Score(flight.name, odometry, one, residuals, flight.tdoa.t)
+            for how, one in truths.items()
+        }
         score, truth = scores[self.align], truths[self.align]
         if found_wrong or (score.row()["diverged"] and not score.row()["late_start"]):
             causes = self._of_anchors(flight)  # ids and anchors first: the truth is measured better
@@ -86,20 +93,34 @@ class Evaluator:
             lines = [f"{name}: {value}" for name, value in score.row().items()]
             write_rerun(self.rerun, flight, odometry, residuals, lines, truth)
         aligned = {**found.as_dict(), "align": self.align, "words": found.frame_in_words()}
-        return replace(score.result(), aligned=aligned | {f"rmse_3d_{how}": one.row()["rmse_3d"] for how, one in scores.items()})
+        return replace(
+            score.result(),
+            aligned=aligned
+            | {f"rmse_3d_{how}": one.row()["rmse_3d"] for how, one in scores.items()},
+        )
 
     def _of_anchors(self, flight: Flight) -> list[str]:
-        """Sentences on ids, signs, units and anchors that are wrong in a Flight; of a recorded odometry nobody can tell."""
+        """Sentences on ids, signs, units and anchors that are wrong in a Flight; of a recorded
+        odometry nobody can tell.
+        """
         if self.odometry:
             return []
         found = check(of_flight(flight), (), self.estimator).findings
-        return [f"{one.cause}: {one.evidence}; {one.remedy}." for one in found if one.rule in BEFORE_TRUTH]
+        return [
+            f"{one.cause}: {one.evidence}; {one.remedy}."
+            for one in found
+            if one.rule in BEFORE_TRUTH
+        ]
 
     def _of_truth(self, flight: Flight, found: Alignment) -> Iterator[str]:
         """Sentences on the ground truth of a Flight, by its Alignment and by itself."""
         for how, words in (("time", found.of_clock()), ("frame", found.of_frame())):
             if words:
-                yield words + (f"; judge with --align {how}, and put it right where it comes from." if self.align == NONE else ".")
+                yield words + (
+                    f"; judge with --align {how}, and put it right where it comes from."
+                    if self.align == NONE
+                    else "."
+                )
         for finding in of_truth(flight):
             yield f"{finding.cause}: {finding.evidence}; {finding.remedy}."
 
@@ -113,12 +134,18 @@ class Evaluator:
 
 
 def results(
-    evaluator: Evaluator, recordings: Sequence[Recording], path: str | Path | None, asked: dict[str, Any],
-    jobs: int | None = None, dask: str | None = None,
-) -> Iterator[Result]:  # fmt: skip
-    """Generator of the Result of each of some recordings, in turn; those that are in the file `path` are not made again.
+    evaluator: Evaluator,
+    recordings: Sequence[Recording],
+    path: str | Path | None,
+    asked: dict[str, Any],
+    jobs: int | None = None,
+    dask: str | None = None,
+) -> Iterator[Result]:
+    """Generator of the Result of each of some recordings, in turn; those that are in the file
+    `path` are not made again.
 
-    path : of a ResultsFile, or None to keep none; asked : all that results depend on besides the recording, see there; jobs,
+    path : of a ResultsFile, or None to keep none; asked : all that results depend on besides the
+        recording, see there; jobs,
     dask : as of `parallel.over`.
     """
     if path is None:
@@ -126,6 +153,7 @@ def results(
         return
     keys = [" ".join(map(state_of, recording)) for recording in recordings]
     with ResultsFile(path, asked) as done:
+
         def make(missing: Iterable[Recording]) -> Iterator[dict[str, Any]]:
             return (result.as_dict() for result in parallel.over(evaluator, missing, jobs, dask))
 

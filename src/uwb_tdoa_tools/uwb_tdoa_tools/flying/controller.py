@@ -1,16 +1,17 @@
-"""A cascade that flies a quadrotor by an estimate of position, velocity and attitude, and by its gyroscope, and by nothing else.
+"""A cascade that flies a quadrotor by an estimate of position, velocity and attitude, and by its
+gyroscope, and by nothing else.
 
-Position and velocity to a wanted acceleration, that to thrust and attitude (geometric control on SE(3): Lee, Leok and McClamroch, CDC
-2010), attitude to body rates, rates to rotor speeds. The outer part runs as often as there are estimates, the inner one at each sample
-of the gyroscope. Between estimates the attitude turns as the gyroscope says. Compiled, without ROS.
+Position and velocity to a wanted acceleration, that to thrust and attitude (geometric control on
+SE(3): Lee, Leok and McClamroch, CDC 2010), attitude to body rates, rates to rotor speeds. The outer
+part runs as often as there are estimates, the inner one at each sample of the gyroscope. Between
+estimates the attitude turns as the gyroscope says. Compiled, without ROS.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from dataclasses import asdict, dataclass, fields
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -26,10 +27,14 @@ FELT = 0.1  # s over which the accelerometer tells what carries the vehicle
 
 @dataclass(frozen=True)
 class Gains:
-    """position : 1/s, from an error of position, at most `reach` m of it, to a velocity; velocity : 1/s, to an acceleration;
-    integral : 1/s^2, of the velocity's error, at most `most_integral` m/s^2; attitude, yaw : 1/s, to body rates; rate, yaw_rate : 1/s,
-    to angular accelerations; damping : of the angular acceleration that is felt; most_tilt : rad; most_rate : rad/s;
-    least_thrust, most_thrust : of the weight."""
+    """position : 1/s, from an error of position, at most `reach` m of it, to a velocity; velocity :
+    1/s, to an acceleration;
+    integral : 1/s^2, of the velocity's error, at most `most_integral` m/s^2; attitude, yaw : 1/s,
+        to body rates; rate, yaw_rate : 1/s,
+    to angular accelerations; damping : of the angular acceleration that is felt; most_tilt : rad;
+    most_rate : rad/s;
+    least_thrust, most_thrust : of the weight.
+    """
 
     position: float = 1.5
     reach: float = 0.75
@@ -51,8 +56,9 @@ NUMBERS = np.dtype([(field.name, float) for field in fields(Gains)], align=True)
 
 
 class Controller:
-    """thrust : N, wanted of all rotors together; lift : N, what they have come to, as felt over FELT; rates : (3,) rad/s, wanted; integral
-    : (3,) m/s^2, world."""
+    """thrust : N, wanted of all rotors together; lift : N, what they have come to, as felt over
+    FELT; rates : (3,) rad/s, wanted; integral : (3,) m/s^2, world.
+    """
 
     def __init__(self, gains: Gains | None = None, vehicle: Vehicle | None = None) -> None:
         """gains : Gains; vehicle : Vehicle, as far as the controller knows it."""
@@ -62,14 +68,24 @@ class Controller:
         self.rates, self.integral = np.zeros(3), np.zeros(3)
         self.thrust = self.lift = 0.0
 
-    def fly(self, p: np.ndarray, v: np.ndarray, q: np.ndarray, wanted: np.ndarray, yaw: float, dt: float) -> None:
-        """Set thrust and rates. p (3,) m, v (3,) m/s, q (4,) x y z w: the estimate; wanted (3, 3): position, velocity and
-        acceleration, NaN in the position where only the velocity counts; yaw : rad; dt : s since the last call."""
-        self.lift += min(1.0, dt / (self.vehicle.motor_time + 0.5 * FELT)) * (self.thrust - self.lift)
-        self.thrust = outer((p, v, q), wanted, yaw, dt, (self.weight, self.numbers), self.integral, self.rates)
+    def fly(
+        self, p: np.ndarray, v: np.ndarray, q: np.ndarray, wanted: np.ndarray, yaw: float, dt: float
+    ) -> None:
+        """Set thrust and rates. p (3,) m, v (3,) m/s, q (4,) x y z w: the estimate; wanted (3, 3):
+        position, velocity and acceleration, NaN in the position where only the velocity counts; yaw
+        : rad; dt : s since the last call.
+        """
+        self.lift += min(1.0, dt / (self.vehicle.motor_time + 0.5 * FELT)) * (
+            self.thrust - self.lift
+        )
+        self.thrust = outer(
+            (p, v, q), wanted, yaw, dt, (self.weight, self.numbers), self.integral, self.rates
+        )
 
     def support(self, force: float) -> float:
-        """Share of the weight that something else than the rotors carries. force : m/s^2, specific, along the body's z, as felt."""
+        """Share of the weight that something else than the rotors carries. force : m/s^2, specific,
+        along the body's z, as felt.
+        """
         return force / GRAVITY - self.lift / (self.weight * (1.0 + self.integral[2] / GRAVITY))
 
     def stop(self) -> None:
@@ -80,11 +96,17 @@ class Controller:
 
 @compiled
 def outer(
-    estimate: tuple[np.ndarray, np.ndarray, np.ndarray], wanted: np.ndarray, yaw: float, dt: float,
-    known: tuple[float, Record], integral: np.ndarray, rates: np.ndarray,
-) -> float:  # fmt: skip
-    """See Controller.fly. estimate : (p, v, q); known : (weight, N, gains). integral (3,) and rates (3,) are written to. Returns the
-    thrust, N."""
+    estimate: tuple[np.ndarray, np.ndarray, np.ndarray],
+    wanted: np.ndarray,
+    yaw: float,
+    dt: float,
+    known: tuple[float, Record],
+    integral: np.ndarray,
+    rates: np.ndarray,
+) -> float:
+    """See Controller.fly. estimate : (p, v, q); known : (weight, N, gains). integral (3,) and rates
+    (3,) are written to. Returns the thrust, N.
+    """
     p, v, q = estimate[0], estimate[1], estimate[2]
     weight, gains = known[0], known[1]
     a, error = np.empty(3), np.empty(3)
@@ -97,7 +119,9 @@ def outer(
     for k in range(3):
         slow = wanted[1, k] + shorter * error[k] - v[k]
         most = gains.most_integral
-        integral[k] = min(max(integral[k] + gains.integral * min(max(slow, -0.5), 0.5) * dt, -most), most)
+        integral[k] = min(
+            max(integral[k] + gains.integral * min(max(slow, -0.5), 0.5) * dt, -most), most
+        )
         a[k] = wanted[2, k] + gains.velocity * slow + integral[k]
     a[2] = max(a[2] + GRAVITY, gains.least_thrust * GRAVITY)
     level, most = math.hypot(a[0], a[1]), math.tan(gains.most_tilt) * a[2]
@@ -126,20 +150,35 @@ def outer(
     for k in range(3):
         rates[k] = min(max(rates[k], -gains.most_rate), gains.most_rate)
     along = a[0] * r02 + a[1] * r12 + a[2] * r22
-    return weight / GRAVITY * min(max(along, gains.least_thrust * GRAVITY), gains.most_thrust * GRAVITY)
+    return (
+        weight
+        / GRAVITY
+        * min(max(along, gains.least_thrust * GRAVITY), gains.most_thrust * GRAVITY)
+    )
 
 
 @compiled
 def inner(
-    thrust: float, rates: np.ndarray, gyro: np.ndarray, dt: float, gains: Record, vehicle: Record, speeds: np.ndarray
+    thrust: float,
+    rates: np.ndarray,
+    gyro: np.ndarray,
+    dt: float,
+    gains: Record,
+    vehicle: Record,
+    speeds: np.ndarray,
 ) -> None:
-    """From thrust, N, and rates (3,) rad/s, both wanted, to rotor speeds (4,) rad/s. gyro : (2, 3) rad/s, felt now and
-    dt s ago; gains, vehicle : numbers of both."""
+    """From thrust, N, and rates (3,) rad/s, both wanted, to rotor speeds (4,) rad/s. gyro : (2, 3)
+    rad/s, felt now and dt s ago; gains, vehicle : numbers of both.
+    """
     if thrust <= 0.0:
         speeds[:] = 0.0
         return
-    mx = vehicle.inertia_xy * (gains.rate * (rates[0] - gyro[0, 0]) - gains.damping * (gyro[0, 0] - gyro[1, 0]) / dt)
-    my = vehicle.inertia_xy * (gains.rate * (rates[1] - gyro[0, 1]) - gains.damping * (gyro[0, 1] - gyro[1, 1]) / dt)
+    mx = vehicle.inertia_xy * (
+        gains.rate * (rates[0] - gyro[0, 0]) - gains.damping * (gyro[0, 0] - gyro[1, 0]) / dt
+    )
+    my = vehicle.inertia_xy * (
+        gains.rate * (rates[1] - gyro[0, 1]) - gains.damping * (gyro[0, 1] - gyro[1, 1]) / dt
+    )
     mz = vehicle.inertia_z * gains.yaw_rate * (rates[2] - gyro[0, 2])
     most = vehicle.thrust * vehicle.top_speed**2
     for k in range(ROTORS):

@@ -11,8 +11,8 @@ from uwb_tdoa_bias.correction.network import SHIPPED, UNPROVEN, load_network
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Flight
-from uwb_tdoa_ekf.results import Odometry
 from uwb_tdoa_ekf.offline import Run, run_offline
+from uwb_tdoa_ekf.results import Odometry
 
 from .. import command_lines
 from ..bags.bag import read_odometry, write_bag
@@ -27,6 +27,7 @@ from .world import HALL
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
+
     from ..bags.bag import RecordedOdometry
     from ..readers.inputs import Reading
     from ..scoring.metrics import Estimate
@@ -36,8 +37,9 @@ SIMULATED = trial.Task(HALL, seed=1, yaw="unknown")  # place and yaw are not giv
 
 @dataclass(frozen=True)
 class DemoFlight:
-    """What is flown. flight : Flight; effects_file, model : what corrects it, or None; SHIPPED is a model; became : what became of a flight
-    that was simulated, in words."""
+    """What is flown. flight : Flight; effects_file, model : what corrects it, or None; SHIPPED is a
+    model; became : what became of a flight that was simulated, in words.
+    """
 
     flight: Flight
     effects_file: str | Path | None
@@ -55,41 +57,63 @@ class DemoFlight:
         """What corrects the flight, from where and why, in words."""
         corrector = self.corrector()
         if corrector is None:
-            return "nothing: neither --effects nor --model is given, and what other flights needed may harm this one"
-        sources = [f"the network shipped: {UNPROVEN}" if path == SHIPPED else str(path) for path in (self.effects_file, self.model) if path]
+            return (
+                "nothing: neither --effects nor --model is given, and what other flights needed "
+                "may harm this one"
+            )
+        sources = [
+            f"the network shipped: {UNPROVEN}" if path == SHIPPED else str(path)
+            for path in (self.effects_file, self.model)
+            if path
+        ]
         return f"{corrector.model} ({', '.join(sources)})"
 
 
-def simulated(folder: str | Path, effects_file: str | Path | None = None, model: str | None = None) -> DemoFlight:
-    """DemoFlight by nothing but its estimate, among anchors that are late; corrected, if nothing else is given, with
-    their true delays as a calibration would find them: an effects.yaml in the folder. Raises InputError."""
+def simulated(
+    folder: str | Path, effects_file: str | Path | None = None, model: str | None = None
+) -> DemoFlight:
+    """DemoFlight by nothing but its estimate, among anchors that are late; corrected, if nothing
+    else is given, with their true delays as a calibration would find them: an effects.yaml in the
+    folder. Raises InputError.
+    """
     if not (effects_file or model):
         delays = Radio(SIMULATED.world, SIMULATED.seed, 1.0).constants[:, 0]
         values = dict(zip(SIMULATED.world.anchors.ids.tolist(), delays.round(4).tolist()))
         effects_file = Path(folder) / "effects.yaml"
-        EffectSet((AnchorDelay(values, source="the simulation's own values"),)).to_yaml(effects_file)
+        EffectSet((AnchorDelay(values, source="the simulation's own values"),)).to_yaml(
+            effects_file
+        )
     effects = EffectSet.from_yaml(effects_file) if effects_file else None
     flown = trial.fly(replace(SIMULATED, effects=effects))
     return DemoFlight(flown.flight, effects_file, model, sentence(verdict_of(flown)))
 
 
 def measured(
-    path: str | Path, reading: Reading, effects_file: str | Path | None = None, model: str | None = None
+    path: str | Path,
+    reading: Reading,
+    effects_file: str | Path | None = None,
+    model: str | None = None,
 ) -> DemoFlight:
-    """DemoFlight of a recording, read by a Reading, corrected with what is given and nothing else. Raises
-    InputError."""
+    """DemoFlight of a recording, read by a Reading, corrected with what is given and nothing else.
+    Raises InputError.
+    """
     flight = reading.one(path)
     if flight.truth is None:
-        raise InputError(f"{path}: holds no ground truth to compare with; take a flight that has it.")
+        raise InputError(
+            f"{path}: holds no ground truth to compare with; take a flight that has it."
+        )
     return DemoFlight(flight, effects_file, model)
 
 
 @dataclass(frozen=True)
 class DemoResult:
-    """became : {what became of the messages: count}, see `accounts`; scores : [Score], of the filter without correction, of the nodes, and
-    of the filter with correction; or, if nothing corrects, of the nodes and of the filter; nodes : RecordedOdometry;
-    without_ros : Run of the filter with what the nodes correct with; raw : Odometry of the filter without correction, or None if nothing
-    corrects."""
+    """became : {what became of the messages: count}, see `accounts`; scores : [Score], of the
+    filter without correction, of the nodes, and of the filter with correction; or, if nothing
+    corrects, of the nodes and of the filter; nodes : RecordedOdometry;
+    without_ros : Run of the filter with what the nodes correct with; raw : Odometry of the filter
+        without correction, or None if nothing
+    corrects.
+    """
 
     became: dict[str, int]
     scores: list[Score]
@@ -99,14 +123,25 @@ class DemoResult:
 
     def show(self, path: Path, flight: Flight, sentences: Sequence[str]) -> None:
         """Write a file for Rerun: what the nodes said, and sentences."""
-        write_rerun(path, flight, self.nodes, self.without_ros.residuals, list(sentences), flight.truth, self.raw)
+        write_rerun(
+            path,
+            flight,
+            self.nodes,
+            self.without_ros.residuals,
+            list(sentences),
+            flight.truth,
+            self.raw,
+        )
 
 
-def fly(planned: DemoFlight, folder: Path, rate: float = 1.0, say: Callable[[str], object] = print) -> DemoResult:
-    """Write the flight of a DemoFlight as a bag, play it to both nodes, and run the filter without ROS beside them:
-    DemoResult.
+def fly(
+    planned: DemoFlight, folder: Path, rate: float = 1.0, say: Callable[[str], object] = print
+) -> DemoResult:
+    """Write the flight of a DemoFlight as a bag, play it to both nodes, and run the filter without
+    ROS beside them: DemoResult.
 
-    The bags and the output of the nodes go to the folder. Raises InputError, LiveError. say(text) : called with what happens.
+    The bags and the output of the nodes go to the folder. Raises InputError, LiveError. say(text) :
+    called with what happens.
     """
     flight, bag, correction = planned.flight, folder / "flight.bag", planned.corrector()
     assert flight.truth is not None
@@ -119,14 +154,20 @@ def fly(planned: DemoFlight, folder: Path, rate: float = 1.0, say: Callable[[str
     estimates: dict[str, Estimate] = {"nodes": nodes, "without ROS": raw.odometry}
     if correction:
         corrected = run_offline(flight, corrector=correction)
-        estimates = {"raw": raw.odometry, "corrected": nodes, "corrected, without ROS": corrected.odometry}
+        estimates = {
+            "raw": raw.odometry,
+            "corrected": nodes,
+            "corrected, without ROS": corrected.odometry,
+        }
     scores = [Score(name, one, flight.truth) for name, one in estimates.items()]
     without_ros, before = (corrected, raw.odometry) if correction else (raw, None)
     return DemoResult(accounts(live.bias, live.ekf, flight), scores, nodes, without_ros, before)
 
 
 def next_steps(recording: str | Path, survey: str | Path | None = None) -> list[str]:
-    """[command line] to copy after the demo: check a recording, localize it, calibrate the tag by it."""
+    """[command line] to copy after the demo: check a recording, localize it, calibrate the tag by
+    it.
+    """
     words = [recording, *(("--survey", survey) if survey else ())]
     lines = [("check",), ("localize", "--out", "localized/"), ("calibrate", "--out", "calibrated/")]
     return [command_lines.tool(name, *words, *more) for name, *more in lines]

@@ -1,9 +1,11 @@
-"""Who tells the controller where it is: our filter, as the nodes run it, or somebody else's, built as a shared library."""
+"""Who tells the controller where it is: our filter, as the nodes run it, or somebody else's, built
+as a shared library.
+"""
 
 from __future__ import annotations
 
 import math
-from typing import Any, Protocol, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -17,26 +19,38 @@ from ..benchmark.peer import Peer, events
 
 if TYPE_CHECKING:
     from pathlib import Path
+
     from uwb_tdoa_bias.correction.network import Network
     from uwb_tdoa_bias.foundation.anchors import Anchors
     from uwb_tdoa_ekf.core.config import FilterConfig
+
     from .mission import Pose
     from .simulator import SensorReadings
 
 NOTHING = Odometry(
-    np.empty(0), np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 4)), np.empty((0, 3)), np.empty((0, 3)),
-    np.empty((0, 9, 9)), np.empty((0, 3, 3)),
-)  # fmt: skip
+    np.empty(0),
+    np.empty((0, 3)),
+    np.empty((0, 3)),
+    np.empty((0, 4)),
+    np.empty((0, 3)),
+    np.empty((0, 3)),
+    np.empty((0, 9, 9)),
+    np.empty((0, 3, 3)),
+)
 
 
 class EstimateSource(Protocol):
-    """Who tells where a vehicle is. why : what keeps it from being flown by, in words, "" for nothing."""
+    """Who tells where a vehicle is. why : what keeps it from being flown by, in words, "" for
+    nothing.
+    """
 
     @property
     def why(self) -> str: ...
 
     def set_pose(self, t: float, p: np.ndarray, std: float, yaw: float) -> None:
-        """Tell that it is at p (3,) m at t, s, to so many m, and points along yaw, to as many rad; NaN: nobody knows."""
+        """Tell that it is at p (3,) m at t, s, to so many m, and points along yaw, to as many rad;
+        NaN: nobody knows.
+        """
 
     def take(self, measured: SensorReadings) -> None:
         """Take what arrived."""
@@ -55,24 +69,37 @@ class EstimateSource(Protocol):
 
 
 class OurFilter:
-    """`Corrector` and `Estimator`, as in bias_node and ekf_node, behind the calls that a flight needs: an EstimateSource. estimator :
-    Estimator; newest : Odometry, the last that came out, or None."""
+    """`Corrector` and `Estimator`, as in bias_node and ekf_node, behind the calls that a flight
+    needs: an EstimateSource. estimator : Estimator; newest : Odometry, the last that came out, or
+    None.
+    """
 
     why = ""
 
     def __init__(
-        self, anchors: Anchors, config: FilterConfig, effects: EffectSet | None = None, network: Network | None = None
+        self,
+        anchors: Anchors,
+        config: FilterConfig,
+        effects: EffectSet | None = None,
+        network: Network | None = None,
     ) -> None:
-        """anchors : Anchors; config : FilterConfig; effects : EffectSet, and network : Network, to correct what was measured with, or
-        None."""
+        """anchors : Anchors; config : FilterConfig; effects : EffectSet, and network : Network, to
+        correct what was measured with, or None.
+        """
         effects = effects or EffectSet()
-        self._anchors, self._streams, self._corrector = anchors, StreamCorrector(effects.effects), Corrector(anchors, effects, network)
+        self._anchors, self._streams, self._corrector = (
+            anchors,
+            StreamCorrector(effects.effects),
+            Corrector(anchors, effects, network),
+        )
         self.estimator = Estimator(anchors, config, effects=effects)
         self._parts = [NOTHING]
         self.newest: Odometry | None = None
 
     def set_pose(self, t: float, p: np.ndarray, std: float, yaw: float) -> None:
-        """Tell that it is at p (3,) m at t, s, to so many m, and points along yaw, to as many rad; NaN: nobody knows."""
+        """Tell that it is at p (3,) m at t, s, to so many m, and points along yaw, to as many rad;
+        NaN: nobody knows.
+        """
         self.estimator.set_pose(t, p, std**2 * np.eye(3), yaw, std)
 
     def take(self, measured: SensorReadings) -> None:
@@ -92,8 +119,18 @@ class OurFilter:
         if name == "imu":
             self.estimator.add_imu(part.t, part.gyro, part.accel)
         elif name == "tdoa":
-            known = self._corrector.correct(part.t, self._anchors.index(part.a), self._anchors.index(part.b), part.d)
-            self.estimator.add_tdoa(part.t, part.a, part.b, known.corrected, known.std**2 + part.variance, known.slope, known.state)
+            known = self._corrector.correct(
+                part.t, self._anchors.index(part.a), self._anchors.index(part.b), part.d
+            )
+            self.estimator.add_tdoa(
+                part.t,
+                part.a,
+                part.b,
+                known.corrected,
+                known.std**2 + part.variance,
+                known.slope,
+                known.state,
+            )
         else:
             self.estimator.add(name, part)
 
@@ -119,13 +156,21 @@ class OurFilter:
 
 
 class TheirFilter:
-    """A Peer behind the same calls. It gets place and yaw at the start, knows no effects, and says nothing of its covariance."""
+    """A Peer behind the same calls.
+
+    It gets place and yaw at the start, knows no effects, and says nothing of its covariance.
+    """
 
     deviation = 0.0  # m; nobody knows
     why = ""
 
-    def __init__(self, library: str | Path, anchors: Anchors, yaw: float, place: np.ndarray | None = None) -> None:
-        """library : path; anchors : Anchors; yaw : rad; place : (3,) m, or None. Raises InputError."""
+    def __init__(
+        self, library: str | Path, anchors: Anchors, yaw: float, place: np.ndarray | None = None
+    ) -> None:
+        """library : path; anchors : Anchors; yaw : rad; place : (3,) m, or None.
+
+        Raises InputError.
+        """
         self._peer, self._anchors = Peer(library, own=True), anchors
         q = np.array([0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw)])
         self._peer.start(anchors.positions, np.full(3, np.nan) if place is None else place, q)
@@ -152,4 +197,13 @@ class TheirFilter:
         if not self._states:
             return NOTHING
         t, p, v, q = map(np.array, zip(*self._states))
-        return Odometry(t, p, v, q, np.zeros(p.shape), np.zeros(p.shape), np.full((len(t), 9, 9), np.nan), np.zeros((len(t), 3, 3)))
+        return Odometry(
+            t,
+            p,
+            v,
+            q,
+            np.zeros(p.shape),
+            np.zeros(p.shape),
+            np.full((len(t), 9, 9), np.nan),
+            np.zeros((len(t), 3, 3)),
+        )

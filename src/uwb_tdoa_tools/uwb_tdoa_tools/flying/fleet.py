@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from .. import parallel
 from ..bags.bag import write_bag
@@ -18,6 +18,7 @@ from .verdict import verdict_of
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from contextlib import AbstractContextManager
+
     from .plots import Drawn
     from .trial import Task
 
@@ -25,17 +26,26 @@ if TYPE_CHECKING:
 
 
 def kept(path: str | Path | None, asked: dict[str, Any]) -> AbstractContextManager[Verdicts]:
-    """Context of a ResultsFile, or of a dict where path is None. asked : as of ResultsFile. Raises InputError."""
+    """Context of a ResultsFile, or of a dict where path is None. asked : as of ResultsFile.
+
+    Raises InputError.
+    """
     return nullcontext({}) if path is None else ResultsFile(path, asked)
 
 
 def flown(
-    tasks: Sequence[Task], done: Verdicts, record: str | Path | None = None, draw: bool = False,
-    jobs: int | None = None, dask: str | None = None,
-) -> Iterator[tuple[dict[str, Any], Drawn | None]]:  # fmt: skip
-    """Generator of (verdict, Drawn or None), of Tasks in turn; those that are in `done`, by their seeds, are not flown again.
+    tasks: Sequence[Task],
+    done: Verdicts,
+    record: str | Path | None = None,
+    draw: bool = False,
+    jobs: int | None = None,
+    dask: str | None = None,
+) -> Iterator[tuple[dict[str, Any], Drawn | None]]:
+    """Generator of (verdict, Drawn or None), of Tasks in turn; those that are in `done`, by their
+    seeds, are not flown again.
 
-    record : folder for a bag of each, or None; draw : give what is drawn; jobs, dask : as of `parallel.over`.
+    record : folder for a bag of each, or None; draw : give what is drawn; jobs, dask : as of
+        `parallel.over`.
     """
     missing = [task for task in tasks if str(task.seed) not in done]
     made = parallel.over(partial(fly_one, record, draw), missing, jobs, dask)
@@ -53,7 +63,9 @@ def _sound(verdict: dict[str, Any]) -> dict[str, Any]:
     return verdict
 
 
-def fly_one(record: str | Path | None, draw: bool, task: Task) -> tuple[dict[str, Any], Drawn | None]:
+def fly_one(
+    record: str | Path | None, draw: bool, task: Task
+) -> tuple[dict[str, Any], Drawn | None]:
     """(verdict, Drawn or None) of a Task that is flown; record, draw : as of `flown`."""
     one = fly(task)
     verdict = verdict_of(one)

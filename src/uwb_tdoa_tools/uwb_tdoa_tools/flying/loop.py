@@ -1,10 +1,11 @@
-"""From one estimate to the next: gyroscope, rates, rotors, body, and what the sensors of the vehicle felt meanwhile. Compiled."""
+"""From one estimate to the next: gyroscope, rates, rotors, body, and what the sensors of the
+vehicle felt meanwhile. Compiled.
+"""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -23,17 +24,24 @@ TURNING = 50.0  # rad/s of a rotor, above which it shakes the vehicle
 
 @compiled
 def interval(
-    state: np.ndarray, gyro: np.ndarray, wanted: tuple[float, np.ndarray], controller: tuple[Record, Record],
-    vehicle: Record, disturbances: tuple[np.ndarray, np.ndarray, np.ndarray],
+    state: np.ndarray,
+    gyro: np.ndarray,
+    wanted: tuple[float, np.ndarray],
+    controller: tuple[Record, Record],
+    vehicle: Record,
+    disturbances: tuple[np.ndarray, np.ndarray, np.ndarray],
     felt: tuple[np.ndarray, np.ndarray, np.ndarray],
-) -> None:  # fmt: skip
+) -> None:
     """Fly n samples of the inertial sensor long.
 
-    state (17,) and gyro (2, 3) rad/s, as felt last and before that, are updated; wanted : thrust, N, and rates (3,) rad/s;
+    state (17,) and gyro (2, 3) rad/s, as felt last and before that, are updated; wanted : thrust,
+    N, and rates (3,) rad/s;
     controller : its gains, and the vehicle that it knows; vehicle : NUMBERS, the true ones;
-    disturbances : wind (n, 3) m/s; errors (n, 6), what the sensor adds to rates, rad/s, and specific force, m/s^2;
+    disturbances : wind (n, 3) m/s; errors (n, 6), what the sensor adds to rates, rad/s, and
+        specific force, m/s^2;
     shaking (n, 3) m/s^2, what rotors add that turn.
-    felt, written to : truth (n, 17), the states at the samples; samples (n, 6), rates and specific force: means since the sample
+    felt, written to : truth (n, 17), the states at the samples; samples (n, 6), rates and specific
+        force: means since the sample
     before; contact (n,): the number of feet on the ground.
     """
     thrust, rates = wanted[0], wanted[1]
@@ -41,7 +49,12 @@ def interval(
     wind, errors, shaking = disturbances[0], disturbances[1], disturbances[2]
     truth, samples, contact = felt[0], felt[1], felt[2]
     dt = STEP * STEPS
-    speeds, scratch, force, earlier = np.empty(4), np.empty((2, STATE)), np.empty(3), np.empty(STATE)
+    speeds, scratch, force, earlier = (
+        np.empty(4),
+        np.empty((2, STATE)),
+        np.empty(3),
+        np.empty(STATE),
+    )
     for i in range(len(truth)):
         inner(thrust, rates, gyro, dt, gains, known, speeds)
         earlier[:] = state
@@ -63,8 +76,12 @@ def interval(
 
 
 @compiled
-def poses_at(t: np.ndarray, times: np.ndarray, states: np.ndarray, p: np.ndarray, q: np.ndarray) -> None:
-    """Positions p (n, 3) and attitudes q (n, 4) at t (n,) s, between states (m, 17) at times (m,) s; written to."""
+def poses_at(
+    t: np.ndarray, times: np.ndarray, states: np.ndarray, p: np.ndarray, q: np.ndarray
+) -> None:
+    """Positions p (n, 3) and attitudes q (n, 4) at t (n,) s, between states (m, 17) at times (m,)
+    s; written to.
+    """
     j = 0
     for i in range(len(t)):
         while j < len(times) - 2 and times[j + 1] < t[i]:

@@ -1,26 +1,32 @@
-"""Wait, take off, fly, land: decided by nothing but the estimate, its deviation, and what the accelerometer feels."""
+"""Wait, take off, fly, land: decided by nothing but the estimate, its deviation, and what the
+accelerometer feels.
+"""
 
 from __future__ import annotations
 
-from typing import Protocol, TYPE_CHECKING
-
 from dataclasses import dataclass
 import math
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 if TYPE_CHECKING:
-    Pose = tuple[float, np.ndarray, np.ndarray, np.ndarray]  # t s, p (3,) m, v (3,) m/s, world, q (4,) x y z w
+    Pose = tuple[
+        float, np.ndarray, np.ndarray, np.ndarray
+    ]  # t s, p (3,) m, v (3,) m/s, world, q (4,) x y z w
 
 WAITING, FLYING, LOST, DONE, REFUSED = "waiting", "flying", "lost", "done", "refused"
 
 
 @dataclass(frozen=True)
 class Rules:
-    """When to do what. rest : s before the rotors start at the earliest; patience : s after that, to wait for an estimate that is good
-    enough; arm, lost : m, largest standard deviation of a coordinate to start with, and beyond which it is lost; stale : s, an older
-    estimate is none; sink : m/s, while it is lost; carried : of the weight: it stands where it feels that much more support than usual;
-    near_end : s before the path's end from which on it may; longest_sink : s."""
+    """When to do what. rest : s before the rotors start at the earliest; patience : s after that,
+    to wait for an estimate that is good enough; arm, lost : m, largest standard deviation of a
+    coordinate to start with, and beyond which it is lost; stale : s, an older estimate is none;
+    sink : m/s, while it is lost; carried : of the weight: it stands where it feels that much more
+    support than usual;
+    near_end : s before the path's end from which on it may; longest_sink : s.
+    """
 
     rest: float = 4.0
     patience: float = 10.0
@@ -56,34 +62,53 @@ class Route(Protocol):
         """The Way from `place` (2,) m; ground : m, height at which the body stands."""
 
 
-PULL = 0.15  # m, most by which the height that is wanted while it comes down is below the estimated height
-USUAL = 2.0  # s over which it learns what support it feels in the air, where there is none: its accelerometer has an offset
+# m, most by which the height that is wanted while it comes down is below the estimated height
+PULL = 0.15
+# s over which it learns what support it feels in the air, where there is none: its accelerometer
+# has an offset
+USUAL = 2.0
 
 
 class Mission:
-    """One flight along a path. state : of WAITING ...; started, ended : s, when the rotors started and stopped, or None; lost : s, when
-    its estimate first said that it was lost, or None: then it stops, sinks, and goes on with its path only if its place is given while
-    it is still in the air; yaw : rad, wanted now."""
+    """One flight along a path. state : of WAITING ...; started, ended : s, when the rotors started
+    and stopped, or None; lost : s, when its estimate first said that it was lost, or None: then it
+    stops, sinks, and goes on with its path only if its place is given while it is still in the air;
+    yaw : rad, wanted now.
+    """
 
     def __init__(
-        self, path: Route, place: np.ndarray, ground: float, rules: Rules | None = None, begin: float = 0.0
+        self,
+        path: Route,
+        place: np.ndarray,
+        ground: float,
+        rules: Rules | None = None,
+        begin: float = 0.0,
     ) -> None:
-        """path : Circles, or what else has `along`; place (2,) m; ground : m, of the body's origin; begin : s, when it was switched on."""
+        """path : Circles, or what else has `along`; place (2,) m; ground : m, of the body's origin;
+        begin : s, when it was switched on.
+        """
         self.ground, self.rules, self.begin = ground, rules or Rules(), begin
         self._path = path.along(place, ground)
-        self._clock: list[tuple[float, float]] = []  # (s, s since the start of the path) of each call
+        self._clock: list[
+            tuple[float, float]
+        ] = []  # (s, s since the start of the path) of each call
         self.state = WAITING
         self.started: float | None = None
         self.ended: float | None = None
         self.lost: float | None = None
         self.yaw = self._first_yaw = 0.0
         self._usual = 0.0  # support, of the weight
-        self._descent: tuple[float, float] | None = None  # (s, m) where it began to come down on whatever is there
+        self._descent: tuple[float, float] | None = (
+            None  # (s, m) where it began to come down on whatever is there
+        )
 
-    def decide(self, t: float, pose: Pose | None, deviation: float, support: float) -> np.ndarray | None:
-        """What the controller is to do at t, s: (3, 3) position, velocity, acceleration, NaN where it does not matter; None for rotors
-        off. pose : as of an estimate, or None; deviation : m; support : of the weight, that something else than the rotors carries, as
-        felt."""
+    def decide(
+        self, t: float, pose: Pose | None, deviation: float, support: float
+    ) -> np.ndarray | None:
+        """What the controller is to do at t, s: (3, 3) position, velocity, acceleration, NaN where
+        it does not matter; None for rotors off. pose : as of an estimate, or None; deviation : m;
+        support : of the weight, that something else than the rotors carries, as felt.
+        """
         rules = self.rules
         good = pose is not None and t - pose[0] <= rules.stale
         if self.state == WAITING and t >= self.begin + rules.rest:
@@ -106,7 +131,9 @@ class Mission:
             self._usual += min(1.0, (t - self._last) / USUAL) * (support - self._usual)
         self._last = t
         near_end = self.state == LOST or along > self._path.duration - rules.near_end
-        if near_end and (support - self._usual > rules.carried or t - self._sinking > rules.longest_sink):
+        if near_end and (
+            support - self._usual > rules.carried or t - self._sinking > rules.longest_sink
+        ):
             self.state, self.ended = DONE, t
             return None
         if self.state != LOST:
@@ -120,8 +147,10 @@ class Mission:
         return wanted
 
     def _descend(self, t: float, wanted: np.ndarray, height: float) -> np.ndarray:
-        """Wanted, with a height, m, that falls at half of the wanted velocity, where the estimated height does not fall as fast: an
-        estimated velocity that is wrong by a constant does not keep it in the air."""
+        """Wanted, with a height, m, that falls at half of the wanted velocity, where the estimated
+        height does not fall as fast: an estimated velocity that is wrong by a constant does not
+        keep it in the air.
+        """
         begun, first = self._descent = self._descent or (t, height)
         wanted[0, 2] = min(height, max(first + 0.5 * wanted[1, 2] * (t - begun), height - PULL))
         return wanted

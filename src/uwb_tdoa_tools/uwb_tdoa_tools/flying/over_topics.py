@@ -1,12 +1,14 @@
-"""A filter that is reached over topics, behind the calls that a flight needs: what is measured goes out, odometry and status come in."""
+"""A filter that is reached over topics, behind the calls that a flight needs: what is measured goes
+out, odometry and status come in.
+"""
 
 from __future__ import annotations
 
 import math
-from builtin_interfaces.msg import Time
 from types import SimpleNamespace
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from builtin_interfaces.msg import Time
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import Odometry as OdometryMessage
 import numpy as np
@@ -14,12 +16,13 @@ from rclpy.duration import Duration
 from rosgraph_msgs.msg import Clock
 from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu
+
 from uwb_tdoa_bias.anchors_node import markers, transforms
 from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS, anchors_to_message
 from uwb_tdoa_bias.foundation.ros_cdr import CdrCodec, message_class
 from uwb_tdoa_bias.foundation.ros_frames import TF_STATIC_QOS
 from uwb_tdoa_bias.foundation.ros_streams import StreamOutput
-from uwb_tdoa_bias.foundation.ros_topics import Input, OUTPUT_QOS, StreamInput
+from uwb_tdoa_bias.foundation.ros_topics import OUTPUT_QOS, Input, StreamInput
 from uwb_tdoa_bias.foundation.sensors import SENSORS
 from uwb_tdoa_ekf.results import Odometry
 from uwb_tdoa_msgs.msg import EstimatorStatus, Tdoa
@@ -30,8 +33,10 @@ from .vehicle import ATTITUDE, POSITION
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
     from uwb_tdoa_bias.foundation.ros_cdr import Template
     from uwb_tdoa_bias.foundation.ros_node import StreamNode
+
     from .mission import Pose
     from .pace import Lockstep, RealTime
     from .simulator import SensorReadings
@@ -43,27 +48,44 @@ LATCHED_LIMIT = 5.0  # s that somebody may take to acknowledge what is latched
 MARKER_SIZE = 0.12  # m
 # {stream: (topic, class of its messages, {field: values} of its part)}
 STREAMS: dict[str, tuple[str, type, Callable[[Any], dict[str, Any]]]] = {
-    "imu": ("imu/data", Imu, lambda imu: {"angular_velocity": imu.gyro, "linear_acceleration": imu.accel}),
+    "imu": (
+        "imu/data",
+        Imu,
+        lambda imu: {"angular_velocity": imu.gyro, "linear_acceleration": imu.accel},
+    ),
     "tdoa": (
-        "uwb/tdoa", Tdoa, lambda of: {"anchor_a": of.a, "anchor_b": of.b, "distance_difference": of.d, "variance": of.variance}
+        "uwb/tdoa",
+        Tdoa,
+        lambda of: {
+            "anchor_a": of.a,
+            "anchor_b": of.b,
+            "distance_difference": of.d,
+            "variance": of.variance,
+        },
     ),
     "truth": ("ground_truth/pose", PoseStamped, lambda truth: {"pose": truth.pose}),
-} | {name: (of.topics[0][0], message_class(of.message), of.content) for name, of in SENSORS.items()}  # fmt: skip
+} | {name: (of.topics[0][0], message_class(of.message), of.content) for name, of in SENSORS.items()}
 
 
 class OverTopics:
-    """See `estimates.OurFilter`. deviation : m, as there; inf unless the filter says that it is running; status : EstimatorStatus, the
-    newest, or None."""
+    """See `estimates.OurFilter`. deviation : m, as there; inf unless the filter says that it is
+    running; status : EstimatorStatus, the newest, or None.
+    """
 
-    def __init__(self, node: StreamNode, world: World, pace: RealTime | Lockstep, clock: bool) -> None:
-        """node : StreamNode; world : World; pace : of `pace`, which hears of all that goes and comes; clock : publish /clock, and count
-        stamps from 0, not from now."""
+    def __init__(
+        self, node: StreamNode, world: World, pace: RealTime | Lockstep, clock: bool
+    ) -> None:
+        """node : StreamNode; world : World; pace : of `pace`, which hears of all that goes and
+        comes; clock : publish /clock, and count stamps from 0, not from now.
+        """
         self._node, self._pace, self._anchors = node, pace, world.anchors
         self._begin = 0 if clock else None  # ns, stamp of the start; of now without /clock
         self._now = 0.0
         self._pending_pose: tuple[float, np.ndarray, float, float] | None = None
         self.status: EstimatorStatus | None = None
-        self._outputs = {name: _Output(node, *STREAMS[name]) for name in ("imu", "tdoa", *world.aids)}
+        self._outputs = {
+            name: _Output(node, *STREAMS[name]) for name in ("imu", "tdoa", *world.aids)
+        }
         self._truth = _Output(node, *STREAMS["truth"], frame=self._anchors.frame)
         self._clock = node.create_publisher(Clock, "/clock", 10) if clock else None
         self._pose = node.create_publisher(PoseWithCovarianceStamped, "initialpose", OUTPUT_QOS)
@@ -106,9 +128,14 @@ class OverTopics:
             self._outputs[name].publish(*self._parts(part.t), part)
 
     def turned(self, t: float, state: np.ndarray) -> None:
-        """Publish what is true at t, s, up to which everything was published: state (17,), as of `vehicle`; and on /clock the time."""
+        """Publish what is true at t, s, up to which everything was published: state (17,), as of
+        `vehicle`; and on /clock the time.
+        """
         self._now = t
-        self._truth.publish(*self._parts(np.array([t])), SimpleNamespace(pose=np.concatenate([state[POSITION], state[ATTITUDE]])[None]))
+        self._truth.publish(
+            *self._parts(np.array([t])),
+            SimpleNamespace(pose=np.concatenate([state[POSITION], state[ATTITUDE]])[None]),
+        )
         if self._clock is not None:
             self._clock.publish(Clock(clock=self._stamp(t)))
         self._pace.sent(t, self._measured)
@@ -119,7 +146,11 @@ class OverTopics:
             if self._begin is None:  # nothing was measured yet: whose odometry is that?
                 continue
             t = 1e-9 * (rows["sec"].astype(np.int64) * 10**9 + rows["nanosec"] - self._begin)
-            usable = np.isfinite(rows["pose"]).all(axis=1) & np.isfinite(rows["twist"]).all(axis=1) & (frame == self._anchors.frame)
+            usable = (
+                np.isfinite(rows["pose"]).all(axis=1)
+                & np.isfinite(rows["twist"]).all(axis=1)
+                & (frame == self._anchors.frame)
+            )
             for k in np.flatnonzero(usable & (t <= self._now)):
                 self._hear(t[k], rows["pose"][k], rows["twist"][k])
 
@@ -134,14 +165,18 @@ class OverTopics:
         self._rows.append((float(t), p, Rotation.from_quat(q).apply(twist[:3]), q, covariance))
         self._pace.heard(float(t))
 
-    def _pose_of(self, t: float, p: np.ndarray, std: float, yaw: float) -> PoseWithCovarianceStamped:
+    def _pose_of(
+        self, t: float, p: np.ndarray, std: float, yaw: float
+    ) -> PoseWithCovarianceStamped:
         """PoseWithCovarianceStamped, see `set_pose`; a variance of 0 says that nobody knows."""
         message, known = PoseWithCovarianceStamped(), not math.isnan(yaw)
         message.header.stamp, message.header.frame_id = self._stamp(t), self._anchors.frame
         at, turn = message.pose.pose.position, message.pose.pose.orientation
         at.x, at.y, at.z = p.tolist()
         turn.z, turn.w = (math.sin(0.5 * yaw), math.cos(0.5 * yaw)) if known else (0.0, 1.0)
-        message.pose.covariance = np.diag([*[std**2] * 3, 0.0, 0.0, std**2 if known else 0.0]).ravel()
+        message.pose.covariance = np.diag(
+            [*[std**2] * 3, 0.0, 0.0, std**2 if known else 0.0]
+        ).ravel()
         return message
 
     def _on_status(self, message: EstimatorStatus) -> None:
@@ -154,9 +189,14 @@ class OverTopics:
 
     @property
     def deviation(self) -> float:
-        """Largest standard deviation of a coordinate of the newest estimate, m; inf without one, or where the filter says that it is
-        lost."""
-        if not self._rows or self.status is None or self.status.status != EstimatorStatus.STATUS_RUNNING:
+        """Largest standard deviation of a coordinate of the newest estimate, m; inf without one, or
+        where the filter says that it is lost.
+        """
+        if (
+            not self._rows
+            or self.status is None
+            or self.status.status != EstimatorStatus.STATUS_RUNNING
+        ):
             return math.inf
         return math.sqrt(np.diag(self._rows[-1][4]).max())
 
@@ -175,7 +215,9 @@ class OverTopics:
         t, p, v, q, covariance = map(np.array, zip(*self._rows))
         whole = np.zeros((len(t), 9, 9))
         whole[:, :3, :3] = covariance
-        return Odometry(t, p, v, q, np.zeros(p.shape), np.zeros(p.shape), whole, np.zeros((len(t), 3, 3)))
+        return Odometry(
+            t, p, v, q, np.zeros(p.shape), np.zeros(p.shape), whole, np.zeros((len(t), 3, 3))
+        )
 
     def _parts(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Seconds and nanoseconds of the stamps, (n,) each, of t (n,) s."""
@@ -191,9 +233,13 @@ class _Output:
     """A stream of which only some fields are not 0. subscribers : how many hear it."""
 
     def __init__(
-        self, node: StreamNode, topic: str, kind: type, content: Callable[[Any], dict[str, np.ndarray]],
+        self,
+        node: StreamNode,
+        topic: str,
+        kind: type,
+        content: Callable[[Any], dict[str, np.ndarray]],
         frame: str = BODY_FRAME,
-    ) -> None:  # fmt: skip
+    ) -> None:
         self._content, self._kind, self._frame = content, kind, frame
         self._template: Template | None = None
         self._output = StreamOutput(node, kind, topic)
@@ -203,7 +249,9 @@ class _Output:
         return self._output.publisher.get_subscription_count()
 
     def publish(self, seconds: np.ndarray, nanoseconds: np.ndarray, part: Any) -> None:
-        """Publish the rows of a part of a stream, with stamps of these seconds and nanoseconds (n,) each."""
+        """Publish the rows of a part of a stream, with stamps of these seconds and nanoseconds (n,)
+        each.
+        """
         content = self._content(part)
         if self._template is None:
             blank = self._kind()

@@ -1,4 +1,6 @@
-"""When the next turn of a vehicle on topics may come: at its time, or, where time is simulated, when the estimate is there."""
+"""When the next turn of a vehicle on topics may come: at its time, or, where time is simulated,
+when the estimate is there.
+"""
 
 from __future__ import annotations
 
@@ -13,12 +15,19 @@ from .simulator import DT
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
     from .simulator import SensorReadings
 
 LARGEST_CATCH_UP = 0.1  # s: a longer delay shifts all that follows
-LONGEST_GAP = 0.3  # s of stamps after which the filter goes on without a stream: more than ekf_node's `lag`
-UNTRUSTED = 0.005  # s that it waits for what is out of order, until it knows that nothing is: more than its `reorder`
-PATIENCE, IMPATIENCE = 5.0, 0.05  # s of the wall clock for an estimate that is due, and for one after another that did not come
+LONGEST_GAP = (
+    0.3  # s of stamps after which the filter goes on without a stream: more than ekf_node's `lag`
+)
+# s that it waits for what is out of order, until it knows that nothing is: more than its `reorder`
+UNTRUSTED = 0.005
+PATIENCE, IMPATIENCE = (
+    5.0,
+    0.05,
+)  # s of the wall clock for an estimate that is due, and for one after another that did not come
 REMEMBERED = 9  # odometries by which their period is known
 
 
@@ -44,8 +53,10 @@ class RealTime:
 
 
 class Lockstep:
-    """The next turn comes when the odometry is there that the filter makes of what was sent: whatever else the computer does, the
-    same seed gives the same flight. One that does not come is waited for PATIENCE, and the next ones IMPATIENCE until one does."""
+    """The next turn comes when the odometry is there that the filter makes of what was sent:
+    whatever else the computer does, the same seed gives the same flight. One that does not come is
+    waited for PATIENCE, and the next ones IMPATIENCE until one does.
+    """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock, self._reach, self._since = clock, 0.0, 0.0
@@ -56,7 +67,9 @@ class Lockstep:
 
     def sent(self, now: float, measured: SensorReadings) -> None:
         """SensorReadings, all up to `now`, s, were published."""
-        self._newest |= {stream: part.t[-1] for stream, part in measured.streams.items() if len(part.t)}
+        self._newest |= {
+            stream: part.t[-1] for stream, part in measured.streams.items() if len(part.t)
+        }
         self._first = now if self._first is None else self._first
         settled = 0.0 if now > self._first + TRIAL + UNTRUSTED else UNTRUSTED
         self._reach = max(min(self._newest.values(), default=now), now - LONGEST_GAP) - settled

@@ -16,8 +16,9 @@ SINK = 0.2  # m/s
 
 @dataclass(frozen=True)
 class Circles:
-    """Up, circles, down to where it began. height, radius : m; rise, fall : s, up and down; turns; turn_time : s each; swing : m, by which
-    the height goes up and down again in each turn."""
+    """Up, circles, down to where it began. height, radius : m; rise, fall : s, up and down; turns;
+    turn_time : s each; swing : m, by which the height goes up and down again in each turn.
+    """
 
     height: float = 1.2
     radius: float = 1.0
@@ -33,8 +34,9 @@ class Circles:
         return self.rise + self.turns * self.turn_time + self.fall
 
     def along(self, place: np.ndarray, ground: float) -> ReferenceTrajectory:
-        """The ReferenceTrajectory from `place` (2,) m, where the circle is entered at its point nearest to +x; ground : m, height at which
-        the body stands."""
+        """The ReferenceTrajectory from `place` (2,) m, where the circle is entered at its point
+        nearest to +x; ground : m, height at which the body stands.
+        """
         knots = np.arange(0.0, self.duration + KNOT, KNOT)
         up = cruise(knots / self.rise, CLIMB)
         down = cruise((knots - self.duration + self.fall) / self.fall, CLIMB)
@@ -43,14 +45,17 @@ class Circles:
         p = np.empty((len(knots), 3))
         p[:, 0] = place[0] + self.radius * (np.cos(angle) - 1.0)
         p[:, 1] = place[1] + self.radius * np.sin(angle)
-        p[:, 2] = ground + self.height * up - (self.height - SETTLE) * down + self.swing * np.sin(angle)
+        p[:, 2] = (
+            ground + self.height * up - (self.height - SETTLE) * down + self.swing * np.sin(angle)
+        )
         return ReferenceTrajectory(p)
 
 
 class ReferenceTrajectory:
-    """Position, velocity and acceleration, (n, 3, 3), m and s, wanted since the rotors started; at its end it sinks, and no height is
-    wanted.
-    duration : s until then; end (2,) m, where."""
+    """Position, velocity and acceleration, (n, 3, 3), m and s, wanted since the rotors started; at
+    its end it sinks, and no height is wanted.
+    duration : s until then; end (2,) m, where.
+    """
 
     def __init__(self, p: np.ndarray, turning: float = 0.0) -> None:
         """p : (m, 3) m, each KNOT s, from the start on; turning : rad/s."""
@@ -58,7 +63,9 @@ class ReferenceTrajectory:
         spline = make_interp_spline(knots, p, k=5)
         self.duration, self.end, fine = knots[-1], p[-1, :2], np.arange(0.0, knots[-1], FINE)
         self._turning = turning
-        self._grid = np.stack([spline(fine), spline.derivative(1)(fine), spline.derivative(2)(fine)], axis=1)
+        self._grid = np.stack(
+            [spline(fine), spline.derivative(1)(fine), spline.derivative(2)(fine)], axis=1
+        )
 
     def at(self, t: np.ndarray) -> np.ndarray:
         """At t (n,) s; (n, 3, 3)."""
@@ -72,7 +79,9 @@ class ReferenceTrajectory:
 
 def sinking(wanted: np.ndarray, after: np.ndarray) -> np.ndarray:
     """Of what is wanted, (n, 3, 3), have it sink where `after`, (n,) bool."""
-    wanted[after, 0, 2] = np.nan  # as fast as that, from wherever it is: the ground is where it is felt
+    wanted[after, 0, 2] = (
+        np.nan
+    )  # as fast as that, from wherever it is: the ground is where it is felt
     wanted[after, 1:] = 0.0
     wanted[after, 1, 2] = -SINK
     return wanted

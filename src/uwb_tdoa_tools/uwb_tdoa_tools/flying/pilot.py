@@ -1,4 +1,7 @@
-"""Does what is asked for piece by piece, with the vehicle of a Trial: take off, go to, land. Refuses, with why, what it cannot do."""
+"""Does what is asked for piece by piece, with the vehicle of a Trial: take off, go to, land.
+
+Refuses, with why, what it cannot do.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +15,16 @@ from .mission import FLYING, LOST, yaw_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from .mission import Mission
     from .trial import Trial
 
 
 class Pilot:
-    """Of a Trial, whose source also says `why` it is not to be flown by. Seconds, metres and rad; raises InputError."""
+    """Of a Trial, whose source also says `why` it is not to be flown by.
+
+    Seconds, metres and rad; raises InputError.
+    """
 
     def __init__(self, trial: Trial) -> None:
         """trial : Trial."""
@@ -41,14 +48,17 @@ class Pilot:
             raise InputError(f"there is no odometry to fly by: {source.why or 'none came lately'}.")
         if source.deviation > rules.arm:
             raise InputError(
-                f"it does not know where it is: {source.why or f'to {source.deviation:.1f} m, where {rules.arm:g} m is wanted'}."
+                "it does not know where it is: "
+                f"{source.why or f'to {source.deviation:.1f} m, where {rules.arm:g} m is wanted'}."
             )
         path = Commanded(pose[1], yaw_of(pose[3]), self._trial.task.world.size)
         path.take_off(height, seconds)
         self._path = path
         self._trial.begin(path, replace(rules, rest=0.0, patience=0.0))
 
-    def go_to(self, group_mask: int, relative: bool, goal: Sequence[float], yaw: float, seconds: float) -> None:
+    def go_to(
+        self, group_mask: int, relative: bool, goal: Sequence[float], yaw: float, seconds: float
+    ) -> None:
         """Go to goal (3,) m."""
         mission, path = self._in_air(group_mask)
         path.go_to(mission.along, relative, goal, yaw, seconds)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,7 +15,9 @@ from ..scoring.metrics import position_at
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
+
     from uwb_tdoa_bias.foundation.anchors import Anchors
+
     from .trial import TrialResult
 
 SPACING = 0.05  # s
@@ -23,8 +25,10 @@ SPACING = 0.05  # s
 
 @dataclass(frozen=True)
 class Drawn:
-    """What is drawn of a flight: t (n,) s, p (n, 3) m, the truth; wanted (n, 3) m, NaN where nothing was; error and sigma (k, 3) m of the
-    estimate at stamps (k,) s; verdict : as of `verdict_of`."""
+    """What is drawn of a flight: t (n,) s, p (n, 3) m, the truth; wanted (n, 3) m, NaN where
+    nothing was; error and sigma (k, 3) m of the estimate at stamps (k,) s; verdict : as of
+    `verdict_of`.
+    """
 
     t: np.ndarray
     p: np.ndarray
@@ -47,7 +51,9 @@ def drawn(flown: TrialResult, verdict: dict[str, Any]) -> Drawn:
         wanted[inside] = mission.wanted(t[inside])[:, 0]
     rows: np.ndarray = np.empty(0, int)
     if len(odometry):
-        rows = np.unique(np.searchsorted(odometry.t, np.arange(odometry.t[0], odometry.t[-1], SPACING)))
+        rows = np.unique(
+            np.searchsorted(odometry.t, np.arange(odometry.t[0], odometry.t[-1], SPACING))
+        )
     stamps = odometry.t[rows]
     error = odometry.p[rows] - position_at(stamps, truth)
     sigma = np.sqrt(np.einsum("nii->ni", odometry.covariance[rows, :3, :3]))
@@ -55,7 +61,9 @@ def drawn(flown: TrialResult, verdict: dict[str, Any]) -> Drawn:
 
 
 def plot(flights: Sequence[Drawn], anchors: Anchors, path: str | Path) -> None:
-    """Draw [Drawn] among Anchors to an image file: a map and the heights of all, and the errors of the worst."""
+    """Draw [Drawn] among Anchors to an image file: a map and the heights of all, and the errors of
+    the worst.
+    """
     from matplotlib.figure import Figure  # takes a second to import
 
     figure = Figure(figsize=(14, 8), layout="constrained")
@@ -76,7 +84,13 @@ def plot(flights: Sequence[Drawn], anchors: Anchors, path: str | Path) -> None:
     for k, (axes, axis) in enumerate(zip(right.subplots(3, 1, sharex=True), "xyz")):
         axes.plot(worst.t, worst.wanted[:, k] - worst.p[:, k], "0.6", label="wanted - true")
         axes.plot(worst.stamps, worst.error[:, k], label="estimated - true")
-        axes.fill_between(worst.stamps, -3 * worst.sigma[:, k], 3 * worst.sigma[:, k], alpha=0.2, label="three sigma")
+        axes.fill_between(
+            worst.stamps,
+            -3 * worst.sigma[:, k],
+            3 * worst.sigma[:, k],
+            alpha=0.2,
+            label="three sigma",
+        )
         axes.set(ylabel=f"{axis}, m")
     axes.set(xlabel="t, s")
     axes.legend()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,19 +17,25 @@ MEDIANS = "tracking", "estimation", "place", "touchdown"
 
 
 def summary(verdicts: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """dict for JSON, of verdicts as of `verdict_of`: counts, medians and largest of the figures, per phase too."""
+    """dict for JSON, of verdicts as of `verdict_of`: counts, medians and largest of the figures,
+    per phase too.
+    """
     out = {"flights": len(verdicts), "landed": sum(one["landed"] for one in verdicts)}
     out["why"] = dict(Counter(one["why"] for one in verdicts if one["why"]).most_common())
     out["safe"] = sum(one["safe"] for one in verdicts)
     out["armed"] = sum(one["started"] is not None for one in verdicts)
     known = [one["armed_deviations"] for one in verdicts if one["armed_deviations"] is not None]
-    out["armed_beyond_three_deviations"] = sum(value > DISHONEST for value in known) if known else None  # a peer tells none
+    out["armed_beyond_three_deviations"] = (
+        sum(value > DISHONEST for value in known) if known else None
+    )  # a peer tells none
     out["said_lost"] = sum(one["said_lost"] is not None for one in verdicts)
     for name in (*MEDIANS, "armed_off"):
         out[name] = _spread([one[name] for one in verdicts])
     for phase in PHASES:
         mine = [one["phases"][phase] for one in verdicts if phase in one["phases"]]
-        out[phase] = {name: _spread([one[name] for one in mine]) for name in ("rmse", "largest", "nees")}
+        out[phase] = {
+            name: _spread([one[name] for one in mine]) for name in ("rmse", "largest", "nees")
+        }
     return out
 
 
@@ -37,7 +43,11 @@ def _spread(values: Iterable[float | None]) -> dict[str, float] | None:
     known = [value for value in values if value is not None]
     if not known:
         return None
-    return {"median": float(np.median(known)), "least": float(min(known)), "most": float(max(known))}
+    return {
+        "median": float(np.median(known)),
+        "least": float(min(known)),
+        "most": float(max(known)),
+    }
 
 
 def text(summed: dict[str, Any]) -> str:
@@ -46,7 +56,8 @@ def text(summed: dict[str, Any]) -> str:
     lines += [f"  {count} {why}" for why, count in summed["why"].items()]
     beyond = summed["armed_beyond_three_deviations"]
     lines.append(
-        f"armed {summed['armed']}, of these {'?' if beyond is None else beyond} while the estimate was more than three of its "
+        f"armed {summed['armed']}, of these {'?' if beyond is None else beyond} while the "
+        "estimate was more than three of its "
         f"deviations off; {summed['said_lost']} said that they were lost"
     )
     for name, what in (
@@ -58,7 +69,10 @@ def text(summed: dict[str, Any]) -> str:
         lines.append(f"{what:34s}{_range(summed[name])}")
     lines.append(f"{'estimate':10s}{'rmse, m':>24s}{'largest, m':>24s}{'NEES':>24s}")
     for phase in PHASES:
-        lines.append(f"{phase:10s}" + "".join(f"{_range(summed[phase][name]):>24s}" for name in ("rmse", "largest", "nees")))
+        lines.append(
+            f"{phase:10s}"
+            + "".join(f"{_range(summed[phase][name]):>24s}" for name in ("rmse", "largest", "nees"))
+        )
     return "\n".join(lines)
 
 
@@ -71,4 +85,8 @@ def sentence(verdict: dict[str, Any]) -> str:
 
 
 def _range(spread: dict[str, float] | None) -> str:
-    return "-" if spread is None else f"{spread['median']:.2f} ({spread['least']:.2f} - {spread['most']:.2f})"
+    return (
+        "-"
+        if spread is None
+        else f"{spread['median']:.2f} ({spread['least']:.2f} - {spread['most']:.2f})"
+    )

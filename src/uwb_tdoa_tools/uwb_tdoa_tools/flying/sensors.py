@@ -1,4 +1,6 @@
-"""What radio, inertial sensor and the others of one flight say: all that does not depend on the path is drawn beforehand, by seed."""
+"""What radio, inertial sensor and the others of one flight say: all that does not depend on the
+path is drawn beforehand, by seed.
+"""
 
 from __future__ import annotations
 
@@ -27,8 +29,15 @@ NEAR_FLOOR = 0.5  # m, above which the floor does nothing
 LOW = 1.0  # m, below which an anchor is one of the low ones
 GUST_TIME = 1.0  # s, correlation time of gusts
 PERSON = 0.25, 1.8, 1.0  # m, radius and height of a person; m/s
-BLOCKED, BLOCK_TIME = (0.2, 2.0), 0.5  # m, by which what passes through a person is late, drawn anew each so many s
-ALTITUDE_STD, VELOCITY_STD, RANGE_STD = 0.08, 0.05, 0.1  # m, m/s and m, noise of a barometer, a velocity and distances to anchors
+BLOCKED, BLOCK_TIME = (
+    (0.2, 2.0),
+    0.5,
+)  # m, by which what passes through a person is late, drawn anew each so many s
+ALTITUDE_STD, VELOCITY_STD, RANGE_STD = (
+    0.08,
+    0.05,
+    0.1,
+)  # m, m/s and m, noise of a barometer, a velocity and distances to anchors
 NEVER = np.inf, np.inf
 
 
@@ -38,8 +47,9 @@ def random(seed: int, part: str) -> np.random.Generator:
 
 
 class Radio:
-    """The TDOAs of one flight. t (n,) s; a, b (n,) rows of the anchors; silent : (begin, end) s, in which none is heard; changed : s, from
-    which on anchor `other` is silent or late."""
+    """The TDOAs of one flight. t (n,) s; a, b (n,) rows of the anchors; silent : (begin, end) s, in
+    which none is heard; changed : s, from which on anchor `other` is silent or late.
+    """
 
     def __init__(self, world: World, seed: int, duration: float) -> None:
         """world : World; duration : s."""
@@ -47,23 +57,45 @@ class Radio:
         self.positions, n = anchors.positions, len(anchors)
         schedule = make_schedule(world.protocol, n, duration, random(seed, "schedule"), world.rate)
         self.t, self.a, self.b = schedule.t, schedule.a, schedule.b
-        self.silent, self.changed, self.other = NEVER, np.inf, int(random(seed, "change").integers(n))
-        self._world, rng = world, random(seed if world.installation is None else world.installation, "anchors")
-        self._error = tdoa_noise(schedule, np.full(n, world.noise / math.sqrt(2.0)), False, random(seed, "tdoa noise"))
+        self.silent, self.changed, self.other = (
+            NEVER,
+            np.inf,
+            int(random(seed, "change").integers(n)),
+        )
+        self._world, rng = (
+            world,
+            random(seed if world.installation is None else world.installation, "anchors"),
+        )
+        self._error = tdoa_noise(
+            schedule, np.full(n, world.noise / math.sqrt(2.0)), False, random(seed, "tdoa noise")
+        )
         self._error += _outliers(world, len(self.t), random(seed, "outliers"))
         # per anchor: constant delay; amplitude and phase of the bias over the bearing
         self.constants = np.stack(
-            [world.delay * rng.standard_normal(n), world.bearing_bias * rng.random(n), 2.0 * np.pi * rng.random(n)], axis=1
+            [
+                world.delay * rng.standard_normal(n),
+                world.bearing_bias * rng.random(n),
+                2.0 * np.pi * rng.random(n),
+            ],
+            axis=1,
         )
         late, height = rng.uniform(*world.floor_delay, n), rng.uniform(*world.floor_height, n)
         low = anchors.ids[self.positions[:, 2] < LOW].tolist() if world.floor_effect else ()
         self.floor = FloorMultipath(
-            {f"{i}.{part}": of[anchors.index(i)] for i in low for part, of in (("delay", late), ("height", height))}
+            {
+                f"{i}.{part}": of[anchors.index(i)]
+                for i in low
+                for part, of in (("delay", late), ("height", height))
+            }
         )
         self._link = tag_link(seed) if world.antennas else None
         self._anchors, self._at_times = anchors, random(seed, "floor").random((len(self.t), 2))
-        self._way = _walk(world, duration, random(seed, "person")) if world.person else np.empty((0, 2))
-        self._blocked = random(seed, "blocked").uniform(*BLOCKED, (int(duration / BLOCK_TIME) + 1, n))
+        self._way = (
+            _walk(world, duration, random(seed, "person")) if world.person else np.empty((0, 2))
+        )
+        self._blocked = random(seed, "blocked").uniform(
+            *BLOCKED, (int(duration / BLOCK_TIME) + 1, n)
+        )
 
     def happens(self, silent: float, changed: float) -> None:
         """Say when its world's silence begins, and from when on its world's change holds, s."""
@@ -71,13 +103,17 @@ class Radio:
         self.changed = changed
 
     def measured(self, rows: slice, p: np.ndarray, q: np.ndarray) -> np.ndarray:
-        """d (k,) m, NaN where nothing was heard, of the TDOAs in a slice of rows, taken by a tag at p (k, 3) m with q (k, 4)."""
+        """d (k,) m, NaN where nothing was heard, of the TDOAs in a slice of rows, taken by a tag at
+        p (k, 3) m with q (k, 4).
+        """
         t, a, b, d = self.t[rows], self.a[rows], self.b[rows], np.empty(len(p))
         _measure(p, a, b, self.positions, self.constants, d)
         d += self._error[rows]
         if self._link is not None:
             both = np.stack([b, a])
-            late = arrival_bias(p, q, self.positions[both], self._anchors.orientations[both], self._link)
+            late = arrival_bias(
+                p, q, self.positions[both], self._anchors.orientations[both], self._link
+            )
             d += late[0] - late[1]
         if self.floor.values and p[:, 2].min(initial=NEAR_FLOOR) < NEAR_FLOOR:
             d += self._near_floor(rows, p)
@@ -98,36 +134,58 @@ class Radio:
     def _near_floor(self, rows: slice, p: np.ndarray) -> np.ndarray:
         """What the floor adds, (k,) m: an anchor is late or not, as often as FloorMultipath says."""
         t, a, b = self.t[rows], self.a[rows], self.b[rows]
-        samples, both = Samples(t, a, b, p, np.full((len(p), 4), np.nan), self._anchors), np.concatenate([a, b])
+        samples, both = (
+            Samples(t, a, b, p, np.full((len(p), 4), np.nan), self._anchors),
+            np.concatenate([a, b]),
+        )
         late = self.floor.of_each(self._anchors)[0][both]
-        late = np.where(self._at_times[rows].T.ravel() * late < self.floor.delays(samples, both), late, 0.0)
+        late = np.where(
+            self._at_times[rows].T.ravel() * late < self.floor.delays(samples, both), late, 0.0
+        )
         return late[len(p) :] - late[: len(p)]
 
 
 @compiled
 def _measure(
-    p: np.ndarray, a: np.ndarray, b: np.ndarray, positions: np.ndarray, constants: np.ndarray, out: np.ndarray
+    p: np.ndarray,
+    a: np.ndarray,
+    b: np.ndarray,
+    positions: np.ndarray,
+    constants: np.ndarray,
+    out: np.ndarray,
 ) -> None:
     """Geometry and what is late at each of two anchors, (k,) m. constants (n, 3): see Radio."""
     for i in range(len(p)):
-        out[i] = _heard(p[i], positions[b[i]], constants[b[i]]) - _heard(p[i], positions[a[i]], constants[a[i]])
+        out[i] = _heard(p[i], positions[b[i]], constants[b[i]]) - _heard(
+            p[i], positions[a[i]], constants[a[i]]
+        )
 
 
 @compiled
 def _heard(p: np.ndarray, anchor: np.ndarray, late: np.ndarray) -> float:
     x, y, z = p[0] - anchor[0], p[1] - anchor[1], p[2] - anchor[2]
-    return math.sqrt(x * x + y * y + z * z) + late[0] + late[1] * math.sin(2.0 * math.atan2(y, x) + late[2])
+    return (
+        math.sqrt(x * x + y * y + z * z)
+        + late[0]
+        + late[1] * math.sin(2.0 * math.atan2(y, x) + late[2])
+    )
 
 
 def _outliers(world: World, n: int, rng: np.random.Generator) -> np.ndarray:
     """(n,) m, zero but for the given share."""
     if not world.outlier_size:
         return outliers(n, world.outlier_share, rng)
-    return np.where(rng.random(n) < world.outlier_share, rng.uniform(-world.outlier_size, world.outlier_size, n), 0.0)
+    return np.where(
+        rng.random(n) < world.outlier_share,
+        rng.uniform(-world.outlier_size, world.outlier_size, n),
+        0.0,
+    )
 
 
 def _walk(world: World, duration: float, rng: np.random.Generator) -> np.ndarray:
-    """Where somebody is who walks from one place at a wall to the next: (n, 2) m, at each sample of the inertial sensor."""
+    """Where somebody is who walks from one place at a wall to the next: (n, 2) m, at each sample of
+    the inertial sensor.
+    """
     half, stamps = 0.5 * np.array(world.size[:2]), [0.0]
     places: list[np.ndarray] = []
     while stamps[-1] <= duration:
@@ -142,15 +200,23 @@ def _walk(world: World, duration: float, rng: np.random.Generator) -> np.ndarray
 
 
 def _passes(p: np.ndarray, anchor: np.ndarray, person: np.ndarray) -> np.ndarray:
-    """Whether the ways from p (k, 3) to anchors (k, 3) lead through a person at (k, 2), all m: (k,) bool."""
+    """Whether the ways from p (k, 3) to anchors (k, 3) lead through a person at (k, 2), all m: (k,)
+    bool.
+    """
     way = anchor - p
-    share = np.sum((person - p[:, :2]) * way[:, :2], axis=1) / np.maximum(np.sum(way[:, :2] ** 2, axis=1), 1e-9)
+    share = np.sum((person - p[:, :2]) * way[:, :2], axis=1) / np.maximum(
+        np.sum(way[:, :2] ** 2, axis=1), 1e-9
+    )
     nearest = p + np.clip(share, 0.0, 1.0)[:, None] * way
-    return (np.linalg.norm(nearest[:, :2] - person, axis=1) < PERSON[0]) & (nearest[:, 2] < PERSON[1])
+    return (np.linalg.norm(nearest[:, :2] - person, axis=1) < PERSON[0]) & (
+        nearest[:, 2] < PERSON[1]
+    )
 
 
 class InertialErrors:
-    """Errors of the inertial sensor at each of its samples: errors (n, 6) rad/s and m/s^2; shaking (n, 3) m/s^2, of turning rotors."""
+    """Errors of the inertial sensor at each of its samples: errors (n, 6) rad/s and m/s^2; shaking
+    (n, 3) m/s^2, of turning rotors.
+    """
 
     def __init__(self, world: World, seed: int, duration: float) -> None:
         of, n, dt = world.imu, int(duration * IMU_RATE) + 1, 1.0 / IMU_RATE
@@ -160,7 +226,9 @@ class InertialErrors:
             (slice(3, 6), "accel", of.accel_bias, of.accel_bias_walk, of.accel_noise),
         ):
             rng = random(seed, name)
-            bias = start * rng.standard_normal(3) + np.cumsum(walk * math.sqrt(dt) * rng.standard_normal((n, 3)), axis=0)
+            bias = start * rng.standard_normal(3) + np.cumsum(
+                walk * math.sqrt(dt) * rng.standard_normal((n, 3)), axis=0
+            )
             self.errors[:, columns] = bias + noise / math.sqrt(dt) * rng.standard_normal((n, 3))
         rng, band = random(seed, "vibration"), world.vibration_band
         self.shaking = rng.standard_normal((n, 3))
@@ -169,7 +237,9 @@ class InertialErrors:
 
             self.shaking = lfilter(*butter(2, band, fs=IMU_RATE), self.shaking, axis=0)
             self.shaking /= self.shaking.std(axis=0)
-        self.shaking = np.array(world.vibration) * (self.shaking + world.rectified * np.sign(rng.standard_normal(3)))
+        self.shaking = np.array(world.vibration) * (
+            self.shaking + world.rectified * np.sign(rng.standard_normal(3))
+        )
 
 
 def gusts(world: World, seed: int, duration: float) -> np.ndarray:
@@ -200,8 +270,9 @@ class AidSensor:
     def measured(
         self, rows: slice, p: np.ndarray, q: np.ndarray, v: np.ndarray, height: np.ndarray
     ) -> tuple[np.ndarray, ...]:
-        """Columns of the measurements in a slice of rows, of a body at p (k, 3) m, q (k, 4), with v (k, 3) m/s in its own frame, `height`
-        (k,) m above what is below it: tuple."""
+        """Columns of the measurements in a slice of rows, of a body at p (k, 3) m, q (k, 4), with v
+        (k, 3) m/s in its own frame, `height` (k,) m above what is below it: tuple.
+        """
         raise NotImplementedError
 
 
@@ -216,7 +287,9 @@ class RangeFinder(AidSensor):
     ) -> tuple[np.ndarray, ...]:
         up = 1.0 - 2.0 * (q[:, 0] ** 2 + q[:, 1] ** 2)
         seen = height / np.maximum(up, 1e-3) + self.world.height_noise * self.noise[rows, 0]
-        return (np.where((up > 0.0) & (seen <= self.world.height_range), np.maximum(seen, 0.0), np.inf),)
+        return (
+            np.where((up > 0.0) & (seen <= self.world.height_range), np.maximum(seen, 0.0), np.inf),
+        )
 
 
 class Barometer(AidSensor):
@@ -240,7 +313,10 @@ class Speedometer(AidSensor):
 
 
 class TwoWayRanging(AidSensor):
-    """Distances to the anchors, each in its turn: ids, m, and a variance of 0, as nobody knows it. Nothing blocks them."""
+    """Distances to the anchors, each in its turn: ids, m, and a variance of 0, as nobody knows it.
+
+    Nothing blocks them.
+    """
 
     rate = SENSORS["range"].rate
 
@@ -253,4 +329,9 @@ class TwoWayRanging(AidSensor):
         return anchors.ids[row], np.maximum(d, 0.0), np.zeros(len(d))
 
 
-AIDS = {"height": RangeFinder, "pressure": Barometer, "velocity": Speedometer, "range": TwoWayRanging}
+AIDS = {
+    "height": RangeFinder,
+    "pressure": Barometer,
+    "velocity": Speedometer,
+    "range": TwoWayRanging,
+}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -18,6 +18,7 @@ from .vehicle import ATTITUDE, GRAVITY, POSITION, STATE, VELOCITY, Vehicle, grou
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.sensors.sensor import Stream
+
     from .controller import Controller
     from .sensors import AidSensor
     from .world import World
@@ -33,7 +34,9 @@ RECENT = round(0.3 * IMU_RATE)  # samples of the truth that effects see
 
 @dataclass(frozen=True)
 class SensorReadings:
-    """What came in one turn. imu : Imu; tdoa : Tdoas; aids : {name: Stream}, of those that the world has."""
+    """What came in one turn. imu : Imu; tdoa : Tdoas; aids : {name: Stream}, of those that the
+    world has.
+    """
 
     imu: Imu
     tdoa: Tdoas
@@ -46,30 +49,49 @@ class SensorReadings:
 
 
 class Simulator:
-    """One vehicle for so many seconds. state (17,), as of `vehicle`; vehicle : the true Vehicle; believed : the one that its controller
-    knows; times (n,) s, states (n, 17), contact (n,) number of feet on the ground: at each sample of the inertial sensor, up to `done`."""
+    """One vehicle for so many seconds. state (17,), as of `vehicle`; vehicle : the true Vehicle;
+    believed : the one that its controller knows; times (n,) s, states (n, 17), contact (n,) number
+    of feet on the ground: at each sample of the inertial sensor, up to `done`.
+    """
 
     def __init__(self, world: World, seed: int, duration: float, radius: float = 0.0) -> None:
-        """world : World; duration : s; radius : m, of the circle whose point nearest to +x it starts from."""
+        """world : World; duration : s; radius : m, of the circle whose point nearest to +x it
+        starts from.
+        """
         self.world, rng = world, random(seed, "place")
         middle, yaw = rng.uniform(-STARTS, STARTS, 2), rng.uniform(-np.pi, np.pi)
         mass = rng.uniform(*world.mass)
         x, y = middle[0] + radius, middle[1]
-        table = {"table": world.table, "table_x": x, "table_y": y, "table_radius": TABLE_RADIUS} if world.table else {}
+        table = (
+            {"table": world.table, "table_x": x, "table_y": y, "table_radius": TABLE_RADIUS}
+            if world.table
+            else {}
+        )
         self.vehicle = Vehicle(mass=mass, **table)
         self.believed = Vehicle(mass=mass * (1.0 + rng.uniform(-WEIGHED, WEIGHED)))
         self.yaw, self.state = yaw, self.vehicle.at_rest(x, y, yaw)
         self._numbers, self._known = self.vehicle.numbers(), self.believed.numbers()
-        self.radio, self._inertial = Radio(world, seed, duration), InertialErrors(world, seed, duration)
+        self.radio, self._inertial = (
+            Radio(world, seed, duration),
+            InertialErrors(world, seed, duration),
+        )
         self._aids = {name: AIDS[name](world, seed, duration) for name in world.aids}
         self._wind, self._rng = gusts(world, seed, duration), random(seed, "effects")
         n = len(self._wind)
-        self.times, self.states, self.contact = np.arange(n) / IMU_RATE, np.empty((n, STATE)), np.zeros(n)
+        self.times, self.states, self.contact = (
+            np.arange(n) / IMU_RATE,
+            np.empty((n, STATE)),
+            np.zeros(n),
+        )
         self.samples = np.zeros((n, 6))
         self.done, self.states[0], self._gyro = 0, self.state, np.zeros((2, 3))
-        self._hands: tuple[np.ndarray, float, float, np.ndarray] | None = None  # state and s at first, s at last, way
+        self._hands: tuple[np.ndarray, float, float, np.ndarray] | None = (
+            None  # state and s at first, s at last, way
+        )
         self._heard = dict.fromkeys(("tdoa", *world.aids), 0)
-        self._first: tuple[Tdoas, np.ndarray] | None = None  # what was heard first, and the state then
+        self._first: tuple[Tdoas, np.ndarray] | None = (
+            None  # what was heard first, and the state then
+        )
 
     @property
     def now(self) -> float:
@@ -87,15 +109,22 @@ class Simulator:
         return ground_at(self._numbers, self.state[0], self.state[1])
 
     def advance(self, controller: Controller) -> SensorReadings:
-        """Fly one turn by what a Controller wants, or be carried on by hands. Returns SensorReadings."""
+        """Fly one turn by what a Controller wants, or be carried on by hands.
+
+        Returns SensorReadings.
+        """
         k = self.done
         rows, lately = slice(k + 1, k + TICK + 1), slice(k, k + TICK + 1)
         if self._hands is None:
             interval(
-                self.state, self._gyro, (controller.thrust, controller.rates), (controller.numbers, self._known), self._numbers,
+                self.state,
+                self._gyro,
+                (controller.thrust, controller.rates),
+                (controller.numbers, self._known),
+                self._numbers,
                 (self._wind[rows], self._inertial.errors[rows], self._inertial.shaking[rows]),
                 (self.states[rows], self.samples[rows], self.contact[rows]),
-            )  # fmt: skip
+            )
         else:
             self._be_carried(rows)
         self.done += TICK
@@ -104,7 +133,9 @@ class Simulator:
         radio, ids = self.radio, self.world.anchors.ids
         d = radio.measured(new, p, q)
         heard = np.isfinite(d)
-        tdoa = Tdoas(radio.t[new][heard], ids[radio.a[new][heard]], ids[radio.b[new][heard]], d[heard])
+        tdoa = Tdoas(
+            radio.t[new][heard], ids[radio.a[new][heard]], ids[radio.b[new][heard]], d[heard]
+        )
         aids = {name: self._felt(name, sensor, lately) for name, sensor in self._aids.items()}
         return self._disturbed(SensorReadings(imu, tdoa, aids))
 
@@ -118,7 +149,10 @@ class Simulator:
         assert self._hands is not None
         begin, since, until, way = self._hands
         t, h = self.times[rows], 0.5 / IMU_RATE
-        at = [begin[POSITION] + _along(way, (t + shift - since) / (until - since)) for shift in (-2.0 * h, 0.0, 2.0 * h)]
+        at = [
+            begin[POSITION] + _along(way, (t + shift - since) / (until - since))
+            for shift in (-2.0 * h, 0.0, 2.0 * h)
+        ]
         v, a = (at[2] - at[0]) / (4.0 * h), (at[2] - 2.0 * at[1] + at[0]) / (2.0 * h) ** 2
         states = np.tile(begin, (len(t), 1))
         states[:, POSITION], states[:, VELOCITY], states[:, 10:] = at[1], v, 0.0
@@ -132,8 +166,12 @@ class Simulator:
             self._hands = None
             self.state[VELOCITY] = 0.0
 
-    def _poses(self, stream: str, t: np.ndarray, lately: slice) -> tuple[slice, np.ndarray, np.ndarray]:
-        """(slice, p (k, 3) m, q (k, 4)): what of a stream with stamps t (n,) s is new, and the poses then."""
+    def _poses(
+        self, stream: str, t: np.ndarray, lately: slice
+    ) -> tuple[slice, np.ndarray, np.ndarray]:
+        """(slice, p (k, 3) m, q (k, 4)): what of a stream with stamps t (n,) s is new, and the
+        poses then.
+        """
         first = self._heard[stream]
         new = slice(first, int(np.searchsorted(t, self.now, side="right")))
         p, q = np.empty((new.stop - first, 3)), np.empty((new.stop - first, 4))
@@ -145,7 +183,9 @@ class Simulator:
         new, p, q = self._poses(name, sensor.t, lately)
         v = np.broadcast_to(self.state[VELOCITY], p.shape)
         inside = Rotation.from_quat(q).inv().apply(v) if len(q) else v
-        return SENSORS[name].stream(sensor.t[new], *sensor.measured(new, p, q, inside, p[:, 2] - self.ground))
+        return SENSORS[name].stream(
+            sensor.t[new], *sensor.measured(new, p, q, inside, p[:, 2] - self.ground)
+        )
 
     def _disturbed(self, measured: SensorReadings) -> SensorReadings:
         """SensorReadings, with the world's effects in it, put there as `inject` does."""
@@ -154,9 +194,15 @@ class Simulator:
         tdoa = measured.tdoa
         self._first = self._first if self._first is not None else (tdoa, self.states[0])
         first, at = self._first  # of the flight: times count from it
-        columns = (np.concatenate([getattr(first, name)[:1], getattr(tdoa, name)]) for name in ("t", "a", "b", "d"))
+        columns = (
+            np.concatenate([getattr(first, name)[:1], getattr(tdoa, name)])
+            for name in ("t", "a", "b", "d")
+        )
         recent = slice(max(self.done - RECENT, 0), self.done + 1)
-        states, t = np.concatenate([at[None], self.states[recent]]), np.concatenate([first.t[:1] - 1e-3, self.times[recent]])
+        states, t = (
+            np.concatenate([at[None], self.states[recent]]),
+            np.concatenate([first.t[:1] - 1e-3, self.times[recent]]),
+        )
         truth = Truth(t, states[:, POSITION], states[:, ATTITUDE])
         aids: dict[str, Any] = measured.aids
         flight = Flight("turn", self.world.anchors, Tdoas(*columns), measured.imu, truth, **aids)
@@ -164,11 +210,15 @@ class Simulator:
             flight = effect.inject(flight, self._rng)
         assert flight.imu is not None  # as no effect takes it away
         aids = {name: getattr(flight, name) for name in measured.aids}
-        return replace(measured, tdoa=rows_of(flight.tdoa, slice(1, None)), imu=flight.imu, aids=aids)
+        return replace(
+            measured, tdoa=rows_of(flight.tdoa, slice(1, None)), imu=flight.imu, aids=aids
+        )
 
 
 def _along(way: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """(n, 3) m, along places (m, 3), smoothly from each to the next, at shares (n,) of the whole time."""
+    """(n, 3) m, along places (m, 3), smoothly from each to the next, at shares (n,) of the whole
+    time.
+    """
     part = np.clip(share, 0.0, 1.0) * (len(way) - 1)
     k = np.minimum(part.astype(int), len(way) - 2)
     x = (part - k)[:, None]

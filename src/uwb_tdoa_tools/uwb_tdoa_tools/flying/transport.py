@@ -1,4 +1,6 @@
-"""The way from the sensors to the estimate: it takes time, the same for all streams and more for some messages."""
+"""The way from the sensors to the estimate: it takes time, the same for all streams and more for
+some messages.
+"""
 
 from __future__ import annotations
 
@@ -29,10 +31,18 @@ class Transport:
 
     def _due(self, stream: str, part: Any, now: float) -> Any:
         held, arrival, last = self._waiting.get(stream, (None, np.empty(0), 0.0))
-        delay = self._latency + self._rng.exponential(self._jitter, len(part)) if self._jitter else np.full(len(part), self._latency)
+        delay = (
+            self._latency + self._rng.exponential(self._jitter, len(part))
+            if self._jitter
+            else np.full(len(part), self._latency)
+        )
         came = np.maximum.accumulate(np.maximum(part.t + delay, last))
         part = part if held is None else concatenated([held, part])
         arrival = np.concatenate([arrival, came])
         due = int(np.searchsorted(arrival, now, side="right"))
-        self._waiting[stream] = rows_of(part, slice(due, None)), arrival[due:], came[-1] if len(came) else last
+        self._waiting[stream] = (
+            rows_of(part, slice(due, None)),
+            arrival[due:],
+            came[-1] if len(came) else last,
+        )
         return rows_of(part, slice(0, due))

@@ -1,10 +1,12 @@
-"""One flight in lockstep: the same task gives the same flight, whatever the computer does beside it."""
+"""One flight in lockstep: the same task gives the same flight, whatever the computer does beside
+it.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 import math
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -31,18 +33,29 @@ if TYPE_CHECKING:
     from .simulator import SensorReadings
 
 REST_AFTER = 3.0  # s of the recording after the rotors have stopped
-PAUSE, CARRIED, CARRY_TIME = 60.0, 2.0, 6.0  # s at rest between two flights, m and s by which it is carried then
+PAUSE, CARRIED, CARRY_TIME = (
+    60.0,
+    2.0,
+    6.0,
+)  # s at rest between two flights, m and s by which it is carried then
 OUTSIDE = 0.5  # m beyond the hall, where a flight ends
 TIPPED = math.radians(75.0)  # tilt of a vehicle that touches something, and does not get up again
-GIVEN_AT, GIVEN_STD = 0.3, 0.1  # s after switching on; m and rad, standard deviation of the place and yaw that are given
+GIVEN_AT, GIVEN_STD = (
+    0.3,
+    0.1,
+)  # s after switching on; m and rad, standard deviation of the place and yaw that are given
 
 
 @dataclass(frozen=True)
 class Task:
-    """One flight. world : World; seed : of all that is random; told : "place" or "nothing"; yaw : "known", to 0.1 rad, or "unknown";
-    config : FilterConfig; effects : EffectSet, and model : path of a bias network, to correct what is measured with, or None; again : fly
+    """One flight. world : World; seed : of all that is random; told : "place" or "nothing"; yaw :
+    "known", to 0.1 rad, or "unknown";
+    config : FilterConfig; effects : EffectSet, and model : path of a bias network, to correct what
+        is measured with, or None; again : fly
     twice, carried by hand in between;
-    peer : path of a library to fly by instead of our filter, always with a known yaw; path, rules, gains : of the vehicle."""
+    peer : path of a library to fly by instead of our filter, always with a known yaw; path, rules,
+        gains : of the vehicle.
+    """
 
     world: World
     seed: int = 0
@@ -60,9 +73,11 @@ class Task:
 
 @dataclass(frozen=True)
 class TrialResult:
-    """What became of it. flight : Flight, all that arrived, its truth at every sample of the inertial sensor; states (n, 17) and
-    contact (n,), number of feet on the ground, beside that; odometry : Odometry, all that came out; missions : [Mission], one for each
-    take-off; crash : what ended it, text, or ""."""
+    """What became of it. flight : Flight, all that arrived, its truth at every sample of the
+    inertial sensor; states (n, 17) and contact (n,), number of feet on the ground, beside that;
+    odometry : Odometry, all that came out; missions : [Mission], one for each take-off; crash :
+    what ended it, text, or "".
+    """
 
     task: Task
     flight: Flight
@@ -74,22 +89,34 @@ class TrialResult:
 
 
 class Trial:
-    """A Task under way. simulator : Simulator; source : who tells where it is; missions : [Mission], the last one under way; crash : as of
-    TrialResult."""
+    """A Task under way. simulator : Simulator; source : who tells where it is; missions :
+    [Mission], the last one under way; crash : as of TrialResult.
+    """
 
-    def __init__(self, task: Task, source: EstimateSource | None = None, lasts: float | None = None) -> None:
-        """source : something like OurFilter, default: what the Task says; lasts : s, default: as long as it can take."""
+    def __init__(
+        self, task: Task, source: EstimateSource | None = None, lasts: float | None = None
+    ) -> None:
+        """source : something like OurFilter, default: what the Task says; lasts : s, default: as
+        long as it can take.
+        """
         world, seed, rules = task.world, task.seed, task.rules
         longest = rules.rest + rules.patience + task.path.duration + rules.longest_sink + REST_AFTER
-        duration = lasts or longest * (2 if task.again else 1) + (PAUSE + CARRY_TIME if task.again else 0.0)
+        duration = lasts or longest * (2 if task.again else 1) + (
+            PAUSE + CARRY_TIME if task.again else 0.0
+        )
         self.task, self.simulator = task, Simulator(world, seed, duration, task.path.radius)
         self._rng = random(seed, "task")
         rng = random(seed, "told")
-        place, off = self.simulator.state[POSITION] + GIVEN_STD * rng.standard_normal(3), GIVEN_STD * rng.standard_normal()
+        place, off = (
+            self.simulator.state[POSITION] + GIVEN_STD * rng.standard_normal(3),
+            GIVEN_STD * rng.standard_normal(),
+        )
         yaw = self.simulator.yaw + off
         self.source: EstimateSource | TheirFilter = source or _filter_of(task, place, yaw)
         if task.told == "place" and not isinstance(self.source, TheirFilter):
-            self.source.set_pose(GIVEN_AT, place, GIVEN_STD, yaw if task.yaw == "known" else math.nan)
+            self.source.set_pose(
+                GIVEN_AT, place, GIVEN_STD, yaw if task.yaw == "known" else math.nan
+            )
         self.controller = Controller(task.gains, self.simulator.believed)
         self.transport = Transport(world.latency, world.jitter, random(seed, "transport"))
         self.missions: list[Mission] = []
@@ -97,7 +124,9 @@ class Trial:
         self._arrived: list[SensorReadings] = []
 
     def fly(self) -> None:
-        """One mission from where it stands, until it has rested for a while after it, or has come to an end."""
+        """One mission from where it stands, until it has rested for a while after it, or has come
+        to an end.
+        """
         self.begin()
         while not self.over:
             self.turn()
@@ -105,14 +134,26 @@ class Trial:
     def begin(self, path: Route | None = None, rules: Rules | None = None) -> None:
         """Begin a mission from where it stands; path, rules : default: those of the Task."""
         state, task = self.simulator.state, self.task
-        self.missions.append(Mission(path or task.path, state[:2].copy(), state[2], rules or task.rules, self.simulator.now))
+        self.missions.append(
+            Mission(
+                path or task.path,
+                state[:2].copy(),
+                state[2],
+                rules or task.rules,
+                self.simulator.now,
+            )
+        )
         self._moment = _moment(task.world.silence, task.path, task.rules, self._rng)
 
     @property
     def over(self) -> bool:
         """True when the mission under way has come to an end, or nothing more can come."""
         mission = self.missions[-1]
-        rested = mission.state == DONE and mission.ended is not None and self.simulator.now > mission.ended + REST_AFTER
+        rested = (
+            mission.state == DONE
+            and mission.ended is not None
+            and self.simulator.now > mission.ended + REST_AFTER
+        )
         return bool(rested or mission.state == REFUSED or self.crash or self.simulator.over)
 
     def turn(self) -> None:
@@ -124,7 +165,9 @@ class Trial:
             pose = self.source.pose
             assert pose is not None  # as the mission has begun by it
             since, p, v, q = pose
-            self.controller.fly(p, v, self._turned_since(q, since), wanted, self.missions[-1].yaw, DT)
+            self.controller.fly(
+                p, v, self._turned_since(q, since), wanted, self.missions[-1].yaw, DT
+            )
         self._turn()
 
     def _decide(self, mission: Mission) -> np.ndarray | None:
@@ -133,7 +176,9 @@ class Trial:
         started = mission.begin + mission.rules.rest if mission.started is None else mission.started
         simulator.radio.happens(started + self._moment, started + 0.5 * self.task.path.duration)
         force = float(np.mean(simulator.samples[max(k - int(FELT * IMU_RATE), 0) : k + 1, 5]))
-        return mission.decide(simulator.now, self.source.pose, self.source.deviation, self.controller.support(force))
+        return mission.decide(
+            simulator.now, self.source.pose, self.source.deviation, self.controller.support(force)
+        )
 
     def rest(self, seconds: float) -> None:
         """Stand, or be carried, with rotors off."""
@@ -143,14 +188,21 @@ class Trial:
             self._turn()
 
     def _turn(self) -> None:
-        measured = self.transport.arrived(self.simulator.advance(self.controller), self.simulator.now)
+        measured = self.transport.arrived(
+            self.simulator.advance(self.controller), self.simulator.now
+        )
         self._arrived.append(measured)
         self.source.take(measured)
         self.crash = _crash(self.simulator, self.task.world)
 
     def _turned_since(self, attitude: np.ndarray, since: float) -> np.ndarray:
         """An attitude (4,) of `since`, s, turned by the rates that were felt until now."""
-        times, samples, k, attitude = self.simulator.times, self.simulator.samples, self.simulator.done, attitude.copy()
+        times, samples, k, attitude = (
+            self.simulator.times,
+            self.simulator.samples,
+            self.simulator.done,
+            attitude.copy(),
+        )
         for j in range(max(int(np.searchsorted(times[: k + 1], since, side="right")), 1), k + 1):
             turned(attitude, samples[j, :3], times[j] - max(times[j - 1], since))
         return attitude
@@ -161,12 +213,26 @@ class Trial:
         simulator, world = self.simulator, self.task.world
         end = simulator.done + 1
         states = simulator.states[:end]
-        parts = [concatenated([getattr(one, name) for one in self._arrived]) for name in ("imu", "tdoa")]
-        aids: dict[str, Any] = {name: concatenated([one.aids[name] for one in self._arrived]) for name in world.aids}
+        parts = [
+            concatenated([getattr(one, name) for one in self._arrived]) for name in ("imu", "tdoa")
+        ]
+        aids: dict[str, Any] = {
+            name: concatenated([one.aids[name] for one in self._arrived]) for name in world.aids
+        }
         truth = Truth(simulator.times[:end], states[:, POSITION], states[:, ATTITUDE])
         meta = {"source": "fly", "format": "simulation", "protocol": world.protocol}
-        flight = Flight(f"flown-{self.task.seed}", world.anchors, parts[1], parts[0], truth, meta=meta, **aids)
-        return TrialResult(self.task, flight, states, simulator.contact[:end], self.source.odometry, self.missions, self.crash)
+        flight = Flight(
+            f"flown-{self.task.seed}", world.anchors, parts[1], parts[0], truth, meta=meta, **aids
+        )
+        return TrialResult(
+            self.task,
+            flight,
+            states,
+            simulator.contact[:end],
+            self.source.odometry,
+            self.missions,
+            self.crash,
+        )
 
 
 def fly(task: Task) -> TrialResult:
@@ -183,22 +249,32 @@ def fly(task: Task) -> TrialResult:
 
 
 def _filter_of(task: Task, place: np.ndarray, yaw: float) -> OurFilter | TheirFilter:
-    """Who tells where it is, of a Task; place (3,) m and yaw, rad: what is given at the start, if it is."""
+    """Who tells where it is, of a Task; place (3,) m and yaw, rad: what is given at the start, if
+    it is.
+    """
     anchors = task.world.anchors
     if task.peer is not None:
         return TheirFilter(task.peer, anchors, yaw, place if task.told == "place" else None)
-    known: dict[str, Any] = {"initial_yaw": yaw, "initial_yaw_std": GIVEN_STD} if task.yaw == "known" else {}
+    known: dict[str, Any] = (
+        {"initial_yaw": yaw, "initial_yaw_std": GIVEN_STD} if task.yaw == "known" else {}
+    )
     return OurFilter(anchors, replace(task.config, **known), task.effects, load_network(task.model))
 
 
-def _moment(silence: tuple[str, float] | None, path: Circles, rules: Rules, rng: np.random.Generator) -> float:
+def _moment(
+    silence: tuple[str, float] | None, path: Circles, rules: Rules, rng: np.random.Generator
+) -> float:
     """s since the rotors started, at which a silence begins; inf without one."""
     anywhere = rng.uniform(-0.5 * rules.rest, path.duration)
     if silence is None:
         return math.inf
     return {
-        "rest": -0.5 * rules.rest, "lift-off": 0.5, "circle": path.rise + 4.0, "landing": path.duration - 2.0, "anywhere": anywhere,
-    }[silence[0]]  # fmt: skip
+        "rest": -0.5 * rules.rest,
+        "lift-off": 0.5,
+        "circle": path.rise + 4.0,
+        "landing": path.duration - 2.0,
+        "anywhere": anywhere,
+    }[silence[0]]
 
 
 def _crash(simulator: Simulator, world: World) -> str:

@@ -1,9 +1,11 @@
 """A small quadrotor: rigid body, motors, drag, gusts, and a floor to stand on. Compiled.
 
-Equations: Newton and Euler for a rigid body; thrust and yaw moment with the square of a rotor's speed, rotor drag with its speed and the
-air's (Foerster, System Identification of the Crazyflie 2.0 Nano Quadrocopter, ETH 2015, whose values these are, as rotorpy has them);
-first-order motors; ground effect of each rotor after Cheeseman and Bennett (ARC R&M 3021, 1955); feet on springs with dampers, and
-Coulomb friction. Frames: world z up, body x forward, y left, z up; quaternions x y z w, body to world.
+Equations: Newton and Euler for a rigid body; thrust and yaw moment with the square of a rotor's
+speed, rotor drag with its speed and the air's (Foerster, System Identification of the Crazyflie 2.0
+Nano Quadrocopter, ETH 2015, whose values these are, as rotorpy has them); first-order motors;
+ground effect of each rotor after Cheeseman and Bennett (ARC R&M 3021, 1955); feet on springs with
+dampers, and Coulomb friction. Frames: world z up, body x forward, y left, z up; quaternions x y z
+w, body to world.
 """
 
 from __future__ import annotations
@@ -17,14 +19,24 @@ import numpy as np
 from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.geometry import rotate
 
-Record = Any  # row of a structured array, whose fields compiled code reads as attributes: Python has no type for it
+# row of a structured array, whose fields compiled code reads as attributes: Python has no type for
+# it
+Record = Any
 
 GRAVITY = 9.81  # m/s^2
 STEP = 0.625e-3  # s, of the integration (midpoint)
 ROTORS = 4
-POSITION, VELOCITY, ATTITUDE, RATE, SPEED = slice(0, 3), slice(3, 6), slice(6, 10), slice(10, 13), slice(13, 17)  # of a state
+POSITION, VELOCITY, ATTITUDE, RATE, SPEED = (
+    slice(0, 3),
+    slice(3, 6),
+    slice(6, 10),
+    slice(10, 13),
+    slice(13, 17),
+)  # of a state
 STATE = 17  # numbers in it: m, m/s, x y z w, rad/s in the body frame, rad/s of each rotor
-CORNERS = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]]) * math.sqrt(0.5)  # directions of arms, body frame
+CORNERS = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]]) * math.sqrt(
+    0.5
+)  # directions of arms, body frame
 SPIN = np.array([1.0, -1.0, 1.0, -1.0])  # sign of the yaw moment on the body
 
 
@@ -32,11 +44,16 @@ SPIN = np.array([1.0, -1.0, 1.0, -1.0])  # sign of the yaw moment on the body
 class Vehicle:
     """A Crazyflie 2.x with its deck.
 
-    mass : kg; inertia_xy, inertia_z : kg m^2; arm : m, from the middle to each rotor; thrust : N/(rad/s)^2 of a rotor;
-    moment : Nm/(rad/s)^2, its yaw moment; rotor_drag, inflow : N/(rad/s)/(m/s), across and along the body's z; body_drag : N/(m/s)^2;
-    motor_time : s, of the motors; top_speed : rad/s of a rotor; radius : m, of a rotor, for the ground effect, 0 for none;
-    leg : m, from the middle down to the feet; stiffness, damping, friction_damping : N/m, N/(m/s), N/(m/s), of a foot;
-    friction : coefficient; floor : m, height of the ground; table, table_x, table_y, table_radius : m, height of a round table above
+    mass : kg; inertia_xy, inertia_z : kg m^2; arm : m, from the middle to each rotor; thrust :
+        N/(rad/s)^2 of a rotor;
+    moment : Nm/(rad/s)^2, its yaw moment; rotor_drag, inflow : N/(rad/s)/(m/s), across and along
+        the body's z; body_drag : N/(m/s)^2;
+    motor_time : s, of the motors; top_speed : rad/s of a rotor; radius : m, of a rotor, for the
+        ground effect, 0 for none;
+    leg : m, from the middle down to the feet; stiffness, damping, friction_damping : N/m, N/(m/s),
+        N/(m/s), of a foot;
+    friction : coefficient; floor : m, height of the ground; table, table_x, table_y, table_radius :
+        m, height of a round table above
     the floor, its place and size; 0 for none.
     """
 
@@ -82,18 +99,28 @@ NUMBERS = np.dtype([(field.name, float) for field in fields(Vehicle)], align=Tru
 @compiled
 def ground_at(numbers: Record, x: float, y: float) -> float:
     """Height of what is below (x, y), m."""
-    if numbers.table_radius > 0.0 and math.hypot(x - numbers.table_x, y - numbers.table_y) <= numbers.table_radius:
+    if (
+        numbers.table_radius > 0.0
+        and math.hypot(x - numbers.table_x, y - numbers.table_y) <= numbers.table_radius
+    ):
         return numbers.floor + numbers.table
     return numbers.floor
 
 
 @compiled
 def step(
-    state: np.ndarray, speeds: np.ndarray, wind: np.ndarray, dt: float, numbers: Record, scratch: np.ndarray
+    state: np.ndarray,
+    speeds: np.ndarray,
+    wind: np.ndarray,
+    dt: float,
+    numbers: Record,
+    scratch: np.ndarray,
 ) -> int:
-    """Advance `state` (17,) by dt, s, with the commanded rotor `speeds` (4,) rad/s in a `wind` (3,) m/s, world.
+    """Advance `state` (17,) by dt, s, with the commanded rotor `speeds` (4,) rad/s in a `wind` (3,)
+    m/s, world.
 
-    numbers : of a Vehicle; scratch : (2, 17), is written to. Returns the number of feet on the ground.
+    numbers : of a Vehicle; scratch : (2, 17), is written to. Returns the number of feet on the
+        ground.
     """
     _derivative(state, speeds, wind, numbers, scratch[0])
     for k in range(STATE):
@@ -108,7 +135,9 @@ def step(
 
 
 @compiled
-def _derivative(state: np.ndarray, speeds: np.ndarray, wind: np.ndarray, numbers: Record, out: np.ndarray) -> int:
+def _derivative(
+    state: np.ndarray, speeds: np.ndarray, wind: np.ndarray, numbers: Record, out: np.ndarray
+) -> int:
     """Time derivative of a state, to `out` (17,). Returns the number of feet on the ground."""
     q, w = state[6:10], state[10:13]
     # columns of the rotation matrix are the body's axes in the world
@@ -117,7 +146,11 @@ def _derivative(state: np.ndarray, speeds: np.ndarray, wind: np.ndarray, numbers
     r10, r11, r12 = 2.0 * (x * y + z * s), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * s)
     r20, r21, r22 = 2.0 * (x * z - y * s), 2.0 * (y * z + x * s), 1.0 - 2.0 * (x * x + y * y)
     ax, ay, az = state[3] - wind[0], state[4] - wind[1], state[5] - wind[2]
-    air_x, air_y, air_z = r00 * ax + r10 * ay + r20 * az, r01 * ax + r11 * ay + r21 * az, r02 * ax + r12 * ay + r22 * az
+    air_x, air_y, air_z = (
+        r00 * ax + r10 * ay + r20 * az,
+        r01 * ax + r11 * ay + r21 * az,
+        r02 * ax + r12 * ay + r22 * az,
+    )
     drag = -numbers.body_drag * math.sqrt(air_x**2 + air_y**2 + air_z**2)
     fx, fy, fz = drag * air_x, drag * air_y, drag * air_z  # force and moment, body frame
     mx, my, mz = 0.0, 0.0, 0.0
@@ -146,7 +179,11 @@ def _derivative(state: np.ndarray, speeds: np.ndarray, wind: np.ndarray, numbers
         if foot_z < 0.0:
             feet += 1
             # velocity of the foot: v + R (w x foot), foot = (px, py, -leg)
-            bx, by, bz = -w[1] * numbers.leg - w[2] * py, w[2] * px + w[0] * numbers.leg, w[0] * py - w[1] * px
+            bx, by, bz = (
+                -w[1] * numbers.leg - w[2] * py,
+                w[2] * px + w[0] * numbers.leg,
+                w[0] * py - w[1] * px,
+            )
             vx = state[3] + r00 * bx + r01 * by + r02 * bz
             vy = state[4] + r10 * bx + r11 * by + r12 * bz
             vz = state[5] + r20 * bx + r21 * by + r22 * bz
@@ -157,7 +194,11 @@ def _derivative(state: np.ndarray, speeds: np.ndarray, wind: np.ndarray, numbers
             world_x += gx
             world_y += gy
             world_z += gz
-            cx, cy, cz = r00 * gx + r10 * gy + r20 * gz, r01 * gx + r11 * gy + r21 * gz, r02 * gx + r12 * gy + r22 * gz
+            cx, cy, cz = (
+                r00 * gx + r10 * gy + r20 * gz,
+                r01 * gx + r11 * gy + r21 * gz,
+                r02 * gx + r12 * gy + r22 * gz,
+            )
             mx += py * cz + numbers.leg * cy
             my += -numbers.leg * cx - px * cz
             mz += px * cy - py * cx
@@ -178,7 +219,9 @@ def _derivative(state: np.ndarray, speeds: np.ndarray, wind: np.ndarray, numbers
 
 @compiled
 def specific_force(before: np.ndarray, after: np.ndarray, dt: float, out: np.ndarray) -> None:
-    """Mean specific force (3,) m/s^2, in the body frame of the state `after`, over the dt s from the state `before`: to `out`."""
+    """Mean specific force (3,) m/s^2, in the body frame of the state `after`, over the dt s from
+    the state `before`: to `out`.
+    """
     back = np.empty(4)
     back[0], back[1], back[2], back[3] = -after[6], -after[7], -after[8], after[9]
     a = np.empty(3)

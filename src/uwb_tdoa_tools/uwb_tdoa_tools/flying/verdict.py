@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from .vehicle import POSITION, VELOCITY
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.flight import Truth
     from uwb_tdoa_ekf.results import Odometry
+
     from .mission import Mission
     from .trial import TrialResult
 
@@ -31,14 +32,18 @@ PHASES = "before", "lift_off", "air", "landing", "after"
 
 
 def verdict_of(flown: TrialResult) -> dict[str, Any]:
-    """dict for JSON, of a TrialResult: the verdict and its figures; None where there is nothing to say. Of several flights the last one's;
-    what kept an earlier one from landing counts for all.
+    """dict for JSON, of a TrialResult: the verdict and its figures; None where there is nothing to
+    say. Of several flights the last one's; what kept an earlier one from landing counts for all.
 
-    landed : took off, and stood upright in the end within NEAR of the wanted place, having touched it at less than SLOW; why : what was
-    missing, "" where it landed; safe : it never left the ground, or came down upright at less than GENTLE, wherever; place : m, from the
-    wanted one; touchdown : m/s; tracking : m, root mean square of the distance to the wanted path in the air; armed_off : m, of the
-    estimate when the rotors started, armed_deviations : the same of its coordinates in their standard deviations, the largest; lost : s,
-    first instant in the air at which the estimate is more than LOST off, and said_lost : s, when it said so itself; phases : {phase:
+    landed : took off, and stood upright in the end within NEAR of the wanted place, having touched
+        it at less than SLOW; why : what was
+    missing, "" where it landed; safe : it never left the ground, or came down upright at less than
+    GENTLE, wherever; place : m, from the wanted one; touchdown : m/s; tracking : m, root mean
+    square of the distance to the wanted path in the air; armed_off : m, of the
+    estimate when the rotors started, armed_deviations : the same of its coordinates in their
+        standard deviations, the largest; lost : s,
+    first instant in the air at which the estimate is more than LOST off, and said_lost : s, when it
+        said so itself; phases : {phase:
     figures of the estimate}.
     """
     ends = [(mission.ended or math.inf) + REST_AFTER for mission in flown.missions]
@@ -59,7 +64,9 @@ def _of_mission(flown: TrialResult, mission: Mission, end: float) -> dict[str, A
     inside = slice(*np.searchsorted(truth.t, (mission.begin, end)))
     truth = rows_of(truth, inside)
     states, contact = flown.states[inside], flown.contact[inside]
-    odometry = rows_of(flown.odometry, slice(*np.searchsorted(flown.odometry.t, (mission.begin, end))))
+    odometry = rows_of(
+        flown.odometry, slice(*np.searchsorted(flown.odometry.t, (mission.begin, end)))
+    )
     crash = flown.crash if mission is flown.missions[-1] else ""
     t, height = truth.t, states[:, 2] - mission.ground
     tilt = np.arccos(np.clip(1.0 - 2.0 * (states[:, 6] ** 2 + states[:, 7] ** 2), -1.0, 1.0))
@@ -78,7 +85,9 @@ def _of_mission(flown: TrialResult, mission: Mission, end: float) -> dict[str, A
             touchdown = float(speeds[np.maximum(onset - 1 - last, 0)].max())
         inside = slice(first, last + 1, 8)
         wanted = mission.wanted(t[inside])[:, 0]
-        off = np.nan_to_num(states[inside, POSITION] - wanted)  # no height is wanted where it sinks to the ground
+        off = np.nan_to_num(
+            states[inside, POSITION] - wanted
+        )  # no height is wanted where it sinks to the ground
         tracking = rms(np.linalg.norm(off, axis=1))
     place = float(np.linalg.norm(states[-1, :2] - mission.place))
     figures = {
@@ -95,7 +104,9 @@ def _of_mission(flown: TrialResult, mission: Mission, end: float) -> dict[str, A
         **_estimation(odometry, truth, mission, first, last),
     }
     figures["why"] = _why(crash, mission, figures)
-    gentle = not took_off or (mission.state == DONE and touchdown is not None and touchdown < GENTLE)
+    gentle = not took_off or (
+        mission.state == DONE and touchdown is not None and touchdown < GENTLE
+    )
     figures["safe"] = bool(gentle and figures["upright"] and not crash)
     return figures
 
@@ -125,7 +136,10 @@ def _armed(odometry: Odometry, truth: Truth, mission: Mission) -> dict[str, floa
     k = int(np.searchsorted(odometry.t, started, side="right")) - 1
     error = odometry.p[k] - position_at(odometry.t[k : k + 1], truth)[0]
     deviations = float(np.max(np.abs(error) / np.sqrt(np.diag(odometry.covariance[k])[:3])))
-    return {"armed_off": float(np.linalg.norm(error)), "armed_deviations": deviations if math.isfinite(deviations) else None}
+    return {
+        "armed_off": float(np.linalg.norm(error)),
+        "armed_deviations": deviations if math.isfinite(deviations) else None,
+    }
 
 
 def _estimation(
@@ -136,11 +150,15 @@ def _estimation(
         return {"lost": None, "estimation": None, "phases": {}}
     stamps = np.arange(odometry.t[0], odometry.t[-1], SPACING)
     rows = np.unique(np.searchsorted(odometry.t, stamps))
-    rows = rows[np.isfinite(odometry.p[rows]).all(axis=1)]  # a peer's may be no numbers: then it gave nothing
+    rows = rows[
+        np.isfinite(odometry.p[rows]).all(axis=1)
+    ]  # a peer's may be no numbers: then it gave nothing
     t = odometry.t[rows]
     error = odometry.p[rows] - position_at(t, truth)
     distance, covariance = np.linalg.norm(error, axis=1), odometry.covariance[rows, :3, :3]
-    normalised = nees(error, covariance) if np.isfinite(covariance).all() else np.full(len(error), np.nan)  # a peer tells none
+    normalised = (
+        nees(error, covariance) if np.isfinite(covariance).all() else np.full(len(error), np.nan)
+    )  # a peer tells none
     end = truth.t[-1]
     started, ended = mission.started or end, mission.ended or end
     up, down = (truth.t[first], truth.t[last]) if first is not None else (ended, ended)
@@ -152,7 +170,11 @@ def _estimation(
     }
     far = np.flatnonzero((distance > LOST) & (t >= started) & (t < ended))
     air = phases.get("air")
-    return {"lost": float(t[far[0]]) if len(far) else None, "estimation": air and air["rmse"], "phases": phases}
+    return {
+        "lost": float(t[far[0]]) if len(far) else None,
+        "estimation": air and air["rmse"],
+        "phases": phases,
+    }
 
 
 def _figures(distance: np.ndarray, normalised: np.ndarray) -> dict[str, float | None]:

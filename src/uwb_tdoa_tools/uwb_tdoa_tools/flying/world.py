@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 import math
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,7 +20,13 @@ from ..simulation.inject import parse_effect
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-MOMENTS = "rest", "lift-off", "circle", "landing", "anywhere"  # in a flight; on a circle of no radius it hovers
+MOMENTS = (
+    "rest",
+    "lift-off",
+    "circle",
+    "landing",
+    "anywhere",
+)  # in a flight; on a circle of no radius it hovers
 LONGEST_SILENCE = 60.0  # s
 
 
@@ -32,19 +38,25 @@ class World:
     ---------
     size : of the hall, whose low anchors are at 0.18 m
     layout : Anchors that are there, None for a low and a high one in each corner
-    low_first : of those in corners, 0 to 3 are the low ones; else low and high ones alternate, as in the measured flights, but for two
-    floor_effect : low anchors are late while the tag is near the floor, each by one of `floor_delay`, up to about one of `floor_height`, as
+    low_first : of those in corners, 0 to 3 are the low ones; else low and high ones alternate, as
+        in the measured flights, but for two
+    floor_effect : low anchors are late while the tag is near the floor, each by one of
+        `floor_delay`, up to about one of `floor_height`, as
         the effect floor_multipath has it
     protocol, rate : of TDOAs
     noise : of a TDOA, its standard deviation
-    outlier_share, outlier_size : share of TDOAs that are wrong by anything up to that size; 0: of the three kinds of physics
-    installation : seed of what belongs to the hall (delays, biases, the floor), None for that of the flight: another hall each time
+    outlier_share, outlier_size : share of TDOAs that are wrong by anything up to that size; 0: of
+        the three kinds of physics
+    installation : seed of what belongs to the hall (delays, biases, the floor), None for that of
+        the flight: another hall each time
     delay : standard deviation of the anchors' constant delays
     bearing_bias : largest amplitude of a bias over the bearing, two waves per turn
-    antennas : received power and both antennas make signals late, as in `simulate`; each flight has another specimen of the tag
+    antennas : received power and both antennas make signals late, as in `simulate`; each flight has
+        another specimen of the tag
     silence : (one of MOMENTS, s) when and for how long nothing is heard; or None
     person : somebody walks through the hall and blocks what passes through him
-    change : "silent" or "late", what one anchor, drawn by seed, is from the middle of the path on; or ""
+    change : "silent" or "late", what one anchor, drawn by seed, is from the middle of the path on;
+        or ""
     lateness : by how much it is late then
     effects : EffectSet, what `inject` puts into flights
     latency, jitter : of everything on its way to the estimate, least, and mean of what comes on top
@@ -52,14 +64,17 @@ class World:
     The vehicle
     -----------
     imu : ImuErrors
-    vibration : (3,) m/s^2, root mean square of what turning rotors add to the accelerometer, per axis
+    vibration : (3,) m/s^2, root mean square of what turning rotors add to the accelerometer, per
+        axis
     vibration_band : below which it is; 0 for white
     rectified : offset of the accelerometer while rotors turn, of its vibration
     mass : kg, least and most
     gust : m/s, standard deviation of the wind along each axis
     table : height of a table, 0.4 m around, from which it starts and on which it lands; 0 for none
-    aids : of "height" (a range finder along the body's -z), "pressure", "velocity", "range" (distances to anchors); rates and noises as
-        `simulate` has them, but for height_rate, height_noise, and height_range, beyond which the range finder sees nothing
+    aids : of "height" (a range finder along the body's -z), "pressure", "velocity", "range"
+        (distances to anchors); rates and noises as
+        `simulate` has them, but for height_rate, height_noise, and height_range, beyond which the
+        range finder sees nothing
     """
 
     size: tuple[float, float, float] = (6.4, 6.2, 3.0)
@@ -124,18 +139,28 @@ WORLDS = {
     "jitter": replace(HALL, latency=0.01, jitter=0.01),
     "tdoa3": replace(HALL, protocol="tdoa3", rate=240.0),
     "gusts": replace(HALL, gust=0.5),
-    "measured-vibration": replace(HALL, vibration=(0.4, 0.5, 0.35), vibration_band=30.0),  # as on 0426
-    "rectifying": replace(HALL, vibration=(3.4, 2.0, 0.55), vibration_band=30.0, rectified=1.0),  # as on 0425
+    "measured-vibration": replace(
+        HALL, vibration=(0.4, 0.5, 0.35), vibration_band=30.0
+    ),  # as on 0426
+    "rectifying": replace(
+        HALL, vibration=(3.4, 2.0, 0.55), vibration_band=30.0, rectified=1.0
+    ),  # as on 0425
     "table": replace(HALL, table=0.75),
 }
 
 
 def world_of(
-    name: str, floor_effect: bool | None = None, aids: Iterable[str] = (), silence: str | None = None,
-    injected: Iterable[Sequence[str]] = (), installation: int | None = None,
-) -> World:  # fmt: skip
-    """The World `name`, with what options change: floor_effect bool or None; installation int or None; aids, names; silence "MOMENT:S" or
-    None; injected [[effect, "KEY=NUMBER", ...]]. Raises InputError."""
+    name: str,
+    floor_effect: bool | None = None,
+    aids: Iterable[str] = (),
+    silence: str | None = None,
+    injected: Iterable[Sequence[str]] = (),
+    installation: int | None = None,
+) -> World:
+    """The World `name`, with what options change: floor_effect bool or None; installation int or
+    None; aids, names; silence "MOMENT:S" or None; injected [[effect, "KEY=NUMBER", ...]]. Raises
+    InputError.
+    """
     changed: dict[str, Any] = {"aids": tuple(dict.fromkeys(aids)), "installation": installation}
     if floor_effect is not None:
         changed["floor_effect"] = floor_effect
@@ -144,7 +169,10 @@ def world_of(
     effects = []
     for effect, *values in injected:
         if effect not in EFFECTS or not values:
-            raise InputError(f"--inject: {effect!r} needs the name of an effect and KEY=NUMBER; inject --list shows them.")
+            raise InputError(
+                f"--inject: {effect!r} needs the name of an effect and KEY=NUMBER; inject "
+                "--list shows them."
+            )
         effects.append(parse_effect(effect, values))
     return replace(WORLDS[name], effects=EffectSet(tuple(effects)), **changed)
 
@@ -158,6 +186,7 @@ def _moment(text: str) -> tuple[str, float]:
         length = math.nan
     if moment not in MOMENTS or not 0.0 < length <= LONGEST_SILENCE:
         raise InputError(
-            f"--silence: {text!r} is not MOMENT:S, where MOMENT is one of {', '.join(MOMENTS)}, and S at most {LONGEST_SILENCE:g} s."
+            f"--silence: {text!r} is not MOMENT:S, where MOMENT is one of "
+            f"{', '.join(MOMENTS)}, and S at most {LONGEST_SILENCE:g} s."
         )
     return moment, length

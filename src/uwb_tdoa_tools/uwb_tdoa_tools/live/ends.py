@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class End:
-    """A publisher or a subscription. topic, node : absolute names; kind : type of its messages; reliable, latched : its
-    QoS, best effort and volatile otherwise."""
+    """A publisher or a subscription. topic, node : absolute names; kind : type of its messages;
+    reliable, latched : its QoS, best effort and volatile otherwise.
+    """
 
     topic: str
     node: str
@@ -20,8 +21,13 @@ class End:
     @property
     def qos(self) -> str:
         """In words."""
-        return f"{'reliable' if self.reliable else 'best effort'}, {'transient local' if self.latched else 'volatile'}"
+        return (
+            f"{'reliable' if self.reliable else 'best effort'}, "
+            f"{'transient local' if self.latched else 'volatile'}"
+        )
 
     def gets(self, publisher: End) -> bool:
-        """Whether a subscription gets what a publisher of its topic sends (DDS: it may not ask for more than is offered)."""
+        """Whether a subscription gets what a publisher of its topic sends (DDS: it may not ask for
+        more than is offered).
+        """
         return publisher.reliable >= self.reliable and publisher.latched >= self.latched

@@ -6,7 +6,7 @@ from collections import deque
 import math
 import struct
 import time
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
@@ -17,14 +17,18 @@ from .session import READER_DEPTH, message_class, subscription_qos
 if TYPE_CHECKING:
     from rclpy.node import Node
     from rclpy.subscription import Subscription
+
     from .session import Stop
 
 LEAD = 2_000_000_000  # ns of stamps that may be played ahead
-STEP = 80_000_000  # ns: a TDOA that is older than the newest by more has come out of the filter, or is waited for
-# (STEP is more than ekf_node's `reorder`, so that it can have come out, and less than bias_node's `hold` and ekf_node's
+# ns: a TDOA that is older than the newest by more has come out of the filter, or is waited for
+STEP = 80_000_000
+# (STEP is more than ekf_node's `reorder`, so that it can have come out, and less than bias_node's
+# `hold` and ekf_node's
 # `lag`, so that neither goes on without what is still on its way.)
 START_STEP, START = 40_000_000, 1_000_000_000
-# ns: the same for so long after the first pose: less than bias_node's `pose_lag`. Before it knows of a pose it passes TDOAs on.
+# ns: the same for so long after the first pose: less than bias_node's `pose_lag`. Before it knows
+# of a pose it passes TDOAs on.
 LOOK_PERIOD = LEAD // 20  # ns of stamps between two looks at a topic that is in step or silent
 AID_SILENT = 1_000_000_000  # ns after which ekf_node does without one of the SENSORS: its SILENT
 AID_SHARE = 0.5  # of its `lag`, for which it waits for them, and all TDOAs with it: its OF_AIDS
@@ -38,19 +42,27 @@ LEARNED = 20  # TDOAs that tell by how much bias_node shifts their stamps
 class Follower:
     """Watches a topic whose messages have a header, and says when to wait for it.
 
-    Where somebody also publishes uwb/residual, one message for each TDOA, TDOAs are followed too (`add_tdoa`).
+    Where somebody also publishes uwb/residual, one message for each TDOA, TDOAs are followed too
+    (`add_tdoa`).
     """
 
     def __init__(self, node: Node, topic: str, lag: float = LAG) -> None:
-        """lag : s, of ekf_node. Raises InputError if nobody publishes the topic, or its messages have no header."""
+        """lag : s, of ekf_node.
+
+        Raises InputError if nobody publishes the topic, or its messages have no header.
+        """
         topic = node.resolve_topic_name(topic)
         types = dict(node.get_topic_names_and_types()).get(topic)
         if not types or not node.count_publishers(topic):
             raise InputError(f"--follow: nobody publishes {topic}; start the node that does first.")
         if not is_stamped(cls := message_class(types[0])):
-            raise InputError(f"--follow: messages on {topic} are {types[0]}: not installed, or without a header.")
+            raise InputError(
+                f"--follow: messages on {topic} are {types[0]}: not installed, or without a header."
+            )
         qos = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-        self._subscription = node.create_subscription(cls, topic, lambda _: None, qos, raw=True)  # taken, never spun
+        self._subscription = node.create_subscription(
+            cls, topic, lambda _: None, qos, raw=True
+        )  # taken, never spun
         self._newest: int | None = None  # ns, as those that follow
         self._looked: int | None = None
         self._started: int | None = None
@@ -66,9 +78,9 @@ class Follower:
         self._tdoas.add_aid(topic, stamp)
 
     def wait(self, stamp: int, stop: Stop) -> float:
-        """Wait while the topic is more than LEAD behind a message stamped so, ns, which is about to be played, and
-        until every TDOA has come out of the filter that is older by STEP than what it goes to by now: the newest, or less while it
-        waits for an aid.
+        """Wait while the topic is more than LEAD behind a message stamped so, ns, which is about to
+        be played, and until every TDOA has come out of the filter that is older by STEP than what
+        it goes to by now: the newest, or less while it waits for an aid.
 
         Returns how long that took, s; stop : true once the wait shall end.
         """
@@ -76,7 +88,9 @@ class Follower:
 
     def _is_starting(self, stamp: int) -> bool:
         """Whether bias_node may not know yet that there are poses, for what is stamped so, ns."""
-        if self._started is not None and stamp < self._started - LEAD:  # a recording that starts again
+        if (
+            self._started is not None and stamp < self._started - LEAD
+        ):  # a recording that starts again
             self._started = None
         if self._started is None:
             self._hear()
@@ -118,7 +132,9 @@ class _Tdoas:
         if cls is not None:
             qos = subscription_qos([publisher.qos_profile for publisher in publishers])
             qos.depth = 10 * READER_DEPTH
-            self._subscription = node.create_subscription(cls, RESIDUAL, lambda _: None, qos, raw=True)
+            self._subscription = node.create_subscription(
+                cls, RESIDUAL, lambda _: None, qos, raw=True
+            )
         self._start_over()
 
     def _start_over(self) -> None:
@@ -128,10 +144,15 @@ class _Tdoas:
         self._first: deque[int] = deque()  # stamps that were played first
         self._shift = 0  # by how much those that come out are less
         self._aids: dict[str, int] = {}  # {topic: ns, newest stamp that was played}
-        self._learned, self._behind = 0, False  # whether START_STEP is too little, because the recorded IMU is behind its TDOAs
+        self._learned, self._behind = (
+            0,
+            False,
+        )  # whether START_STEP is too little, because the recorded IMU is behind its TDOAs
 
     def add(self, stamp: int) -> None:
-        if self._newest is not None and stamp < self._newest - LEAD:  # a recording that starts again
+        if (
+            self._newest is not None and stamp < self._newest - LEAD
+        ):  # a recording that starts again
             self._start_over()
         if self._newest is None:
             self._begin, self._newest = stamp - 1, stamp
@@ -163,11 +184,16 @@ class _Tdoas:
     def _is_in_step(self, step: int) -> bool:
         assert self._newest is not None
         aids = [stamp for stamp in self._aids.values() if stamp > self._newest - AID_SILENT]
-        reach = max(min((self._newest, *aids)), self._newest - self._aid_wait)  # how far the filter goes
+        reach = max(
+            min((self._newest, *aids)), self._newest - self._aid_wait
+        )  # how far the filter goes
         return reach - step <= max(self._begin, self._out + self._shift)
 
     def _learn(self, stamps: list[int]) -> None:
-        """Note stamps that have come out. An effect may have shifted them: the first ones tell by how much."""
+        """Note stamps that have come out.
+
+        An effect may have shifted them: the first ones tell by how much.
+        """
         self._out = max(self._out, *stamps)
         for stamp in stamps[: len(self._first)]:
             if self._learned < LEARNED:
@@ -186,7 +212,10 @@ def _taken(subscription: Subscription) -> list[bytes]:
 
 def is_stamped(cls: Any) -> bool:
     """Whether messages of a class, or None, begin with a header."""
-    return cls is not None and next(iter(cls.get_fields_and_field_types().values()), None) == "std_msgs/Header"
+    return (
+        cls is not None
+        and next(iter(cls.get_fields_and_field_types().values()), None) == "std_msgs/Header"
+    )
 
 
 def stamp_of(data: bytes) -> int:

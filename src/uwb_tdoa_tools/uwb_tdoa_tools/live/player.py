@@ -19,14 +19,17 @@ from .follow import is_stamped, stamp_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
+
     from rclpy.node import Node
     from rclpy.publisher import Publisher
     from rosbags.interfaces import Connection
+
     from .follow import Follower
     from .session import Stop
 
 RCLError = rclpy_implementation.RCLError
-LARGEST_CATCH_UP = 0.1  # s: a longer delay shifts all that follows, instead of a burst that a subscription cannot take
+# s: a longer delay shifts all that follows, instead of a burst that a subscription cannot take
+LARGEST_CATCH_UP = 0.1
 LATCHED_LIMIT = 5.0  # s that somebody may take to acknowledge what is latched
 LONGEST_SLEEP = 0.05  # s: how soon a signal is seen
 ACKNOWLEDGE_LIMIT = 30.0  # s; longer than the 20 s after which DDS forgets a subscription that died
@@ -36,9 +39,10 @@ ACKNOWLEDGE_LIMIT = 30.0  # s; longer than the 20 s after which DDS forgets a su
 class Played:
     """What was published.
 
-    counts : messages by topic in the bag; behind : s, the latest that a message was; stretched : s, by how much the
-    time of the replay was stretched, so that a stall was not followed by a burst that nobody can take; waited : s, for
-    the topic that is followed.
+    counts : messages by topic in the bag; behind : s, the latest that a message was; stretched : s,
+        by how much the
+    time of the replay was stretched, so that a stall was not followed by a burst that nobody can
+    take; waited : s, for the topic that is followed.
     """
 
     counts: Counter[str] = field(default_factory=Counter)
@@ -59,7 +63,9 @@ def is_tdoa(publisher: Publisher) -> bool:
 
 def is_aid(publisher: Publisher) -> bool:
     """Whether it publishes what one of the SENSORS measures, for ekf_node."""
-    return publisher.topic_name.endswith(tuple(f"/{topic}" for sensor in SENSORS.values() for topic, _ in sensor.topics))
+    return publisher.topic_name.endswith(
+        tuple(f"/{topic}" for sensor in SENSORS.values() for topic, _ in sensor.topics)
+    )
 
 
 def _kind(publisher: Publisher) -> str:
@@ -68,20 +74,30 @@ def _kind(publisher: Publisher) -> str:
 
 
 class Player:
-    """Publishes to {topic in the bag: publisher}, `rate` times as fast as recorded, with /clock if it has a rate, Hz.
+    """Publishes to {topic in the bag: publisher}, `rate` times as fast as recorded, with /clock if
+    it has a rate, Hz.
 
     stop : true once the process was asked to end; follower : Follower or None; played : Played.
     """
 
     def __init__(
-        self, node: Node, publishers: dict[str, Publisher], rate: float, clock_rate: float | None, stop: Stop
+        self,
+        node: Node,
+        publishers: dict[str, Publisher],
+        rate: float,
+        clock_rate: float | None,
+        stop: Stop,
     ) -> None:
         self.played = Played()
         self.follower: Follower | None = None
         self._publishers, self._rate, self._stop = publishers, rate, stop
-        self._clock = node.create_publisher(Clock, "/clock", QoSProfile(depth=10)) if clock_rate else None
+        self._clock = (
+            node.create_publisher(Clock, "/clock", QoSProfile(depth=10)) if clock_rate else None
+        )
         self._clock_period = 1.0 / clock_rate if clock_rate else 0.0
-        self._stamped = {topic for topic, publisher in publishers.items() if is_stamped(publisher.msg_type)}
+        self._stamped = {
+            topic for topic, publisher in publishers.items() if is_stamped(publisher.msg_type)
+        }
         self._tdoas = {topic for topic, publisher in publishers.items() if is_tdoa(publisher)}
         self._aids = {topic for topic, publisher in publishers.items() if is_aid(publisher)}
         self._latched = [publisher for publisher in publishers.values() if is_latched(publisher)]
@@ -91,7 +107,9 @@ class Player:
     def count(self, what: str) -> int:
         """How many "TDOAs" or "IMU samples" have been played."""
         kind = {"TDOAs": "Tdoa", "IMU samples": "Imu"}[what]
-        return sum(n for topic, n in self.played.counts.items() if _kind(self._publishers[topic]) == kind)
+        return sum(
+            n for topic, n in self.played.counts.items() if _kind(self._publishers[topic]) == kind
+        )
 
     def play(self, recorded: Iterable[tuple[Connection, int, bytes]]) -> None:
         """Publish an iterable of (connection, stamp ns, bytes), from the beginning."""
@@ -115,15 +133,20 @@ class Player:
                 self.played.counts[topic] += 1
                 if self.follower is not None and topic in self._tdoas:
                     self.follower.add_tdoa(stamp_of(data))
-                elif self.follower is not None and topic in self._aids and publisher.get_subscription_count():
+                elif (
+                    self.follower is not None
+                    and topic in self._aids
+                    and publisher.get_subscription_count()
+                ):
                     self.follower.add_aid(topic, stamp_of(data))
 
     def _wait_for_latched(self) -> float:
-        """Wait, before the first message of a stream, until what is latched (the anchors) has been acknowledged.
-        Returns the s that took.
+        """Wait, before the first message of a stream, until what is latched (the anchors) has been
+        acknowledged. Returns the s that took.
 
-        Their publishers were made last, and a participant hears of our publishers in the order in which they were made:
-        who acknowledges a message of theirs listens to all the others too, the best-effort ones among them.
+        Their publishers were made last, and a participant hears of our publishers in the order in
+        which they were made: who acknowledges a message of theirs listens to all the others too,
+        the best-effort ones among them.
         """
         began = time.perf_counter()
         for publisher in self._latched:
@@ -159,8 +182,9 @@ class Player:
             self.played.stretched += behind - LARGEST_CATCH_UP
 
     def _publish(self, publisher: Publisher, data: bytes) -> bool:
-        """Publish, after waiting until reliable subscriptions have acknowledged what the history is full of. Returns
-        False if stopped while it waited."""
+        """Publish, after waiting until reliable subscriptions have acknowledged what the history is
+        full of. Returns False if stopped while it waited.
+        """
         until = time.monotonic() + ACKNOWLEDGE_LIMIT
         while True:
             try:
@@ -172,5 +196,6 @@ class Player:
                 if time.monotonic() > until:
                     raise InputError(
                         f"{publisher.topic_name}: a subscription has not acknowledged anything for "
-                        f"{ACKNOWLEDGE_LIMIT:g} s ({error}); stop it, or let it subscribe best effort."
+                        f"{ACKNOWLEDGE_LIMIT:g} s ({error}); stop it, or let it subscribe "
+                        "best effort."
                     ) from error

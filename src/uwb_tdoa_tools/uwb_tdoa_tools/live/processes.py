@@ -1,39 +1,50 @@
-"""Executables of our packages as processes in a ROS domain of their own, and what they say on /diagnostics."""
+"""Executables of our packages as processes in a ROS domain of their own, and what they say on
+/diagnostics.
+"""
 
 from __future__ import annotations
 
+from contextlib import contextmanager
 import os
+from pathlib import Path
 import random
 import re
 import signal
 import subprocess
 import time
-from contextlib import contextmanager
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-import rclpy
 from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 from diagnostic_msgs.msg import DiagnosticArray
 from domain_coordinator import domain_id
+import rclpy
 
 from uwb_tdoa_bias.foundation.errors import Failure
 from uwb_tdoa_bias.foundation.files import refuse_output
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
+
     from rclpy.node import Node
+
     from .session import Stop
 
-STOP_LIMIT, PATIENCE = 10.0, 60.0  # s until what was interrupted is killed; the latter if it must end well
+STOP_LIMIT, PATIENCE = (
+    10.0,
+    60.0,
+)  # s until what was interrupted is killed; the latter if it must end well
 LOOK = 5.0  # s between two looks at what the processes do, and between two lines about it
 READY = re.compile(r"\]: ready\b")  # in the log of a node
 TAIL = 8192  # bytes of a log that are looked at
-BUSY = 0.2  # of the time: a process that runs, or waits for a core, for more than that works; nodes that wait for messages take 0.02
+# of the time: a process that runs, or waits for a core, for more than that works; nodes that wait
+# for messages take 0.02
+BUSY = 0.2
 
 
 class LiveError(Failure):
-    """A process of the run failed, or did not get where it should; the message says which and where its output is."""
+    """A process of the run failed, or did not get where it should; the message says which and where
+    its output is.
+    """
 
 
 @contextmanager
@@ -53,21 +64,32 @@ def variables(values: dict[str, str]) -> Iterator[None]:
 
 @contextmanager
 def own_domain() -> Iterator[None]:
-    """A ROS domain that nobody else has, on this machine only, for the block and what it starts. Any of those that are free: in the
-    first of them DDS may still list nodes that have just ended."""
+    """A ROS domain that nobody else has, on this machine only, for the block and what it starts.
+    Any of those that are free: in the first of them DDS may still list nodes that have just ended.
+    """
     with domain_id(lambda: random.randint(1, 100)) as number:
-        with variables({"ROS_DOMAIN_ID": str(number), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}):
+        with variables(
+            {"ROS_DOMAIN_ID": str(number), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+        ):
             yield
 
 
 def wait(
-    limit: float | None, what: str, processes: Processes, node: Node, condition: Callable[[], object],
-    say: Callable[[str], object] = lambda text: None, goes_on: Callable[[], object] = lambda: None,
-) -> None:  # fmt: skip
-    """Serve the node until condition(). Raises LiveError if a process has ended that should not, or after `limit` s in which nothing
-    went on: what goes_on() gives stayed the same, and no process that is still starting worked, as a node that compiles does.
+    limit: float | None,
+    what: str,
+    processes: Processes,
+    node: Node,
+    condition: Callable[[], object],
+    say: Callable[[str], object] = lambda text: None,
+    goes_on: Callable[[], object] = lambda: None,
+) -> None:
+    """Serve the node until condition(). Raises LiveError if a process has ended that should not, or
+    after `limit` s in which nothing went on: what goes_on() gives stayed the same, and no process
+    that is still starting worked, as a node that compiles does.
 
-    limit : s, or None; say(text) : called every few seconds with what it waits and what the processes do."""
+    limit : s, or None; say(text) : called every few seconds with what it waits and what the
+        processes do.
+    """
     looked = moved = time.monotonic()
     worked, sign = processes.worked(), goes_on()
     while not condition():
@@ -82,7 +104,8 @@ def wait(
                 moved, sign = now, goes_on()
         if limit is not None and now - moved > limit:
             raise LiveError(
-                f"waited {limit:g} s for {what}, and nothing went on ({processes.doing()}); their output is in {processes.folder}/*.log."
+                f"waited {limit:g} s for {what}, and nothing went on ({processes.doing()}); "
+                f"their output is in {processes.folder}/*.log."
             )
         rclpy.spin_once(node, timeout_sec=0.05)
     processes.check()
@@ -94,7 +117,9 @@ class DiagnosticsListener:
     def __init__(self, node: Node) -> None:
         self._newest: dict[str, dict[str, str]] = {}
         self._repeated: dict[str, int] = {}
-        self._subscription = node.create_subscription(DiagnosticArray, "/diagnostics", self._take, 10)
+        self._subscription = node.create_subscription(
+            DiagnosticArray, "/diagnostics", self._take, 10
+        )
 
     def _take(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -110,8 +135,10 @@ class DiagnosticsListener:
         return self._newest.get(name, {})
 
     def forget(self) -> None:
-        """Count anew how often a status repeats, from what is said from here on. What still waits to be read is older: of a node
-        that was not spun it would seem settled before anything happened."""
+        """Count anew how often a status repeats, from what is said from here on. What still waits
+        to be read is older: of a node that was not spun it would seem settled before anything
+        happened.
+        """
         handle = self._subscription.handle
         with handle:
             while handle.take_message(DiagnosticArray, True) is not None:
@@ -123,7 +150,9 @@ class DiagnosticsListener:
         return {name: _counts(values) for name, values in self._newest.items()}
 
     def is_settled(self) -> bool:
-        """Whether each node has said the same counts twice in a row: nothing is on its way any more."""
+        """Whether each node has said the same counts twice in a row: nothing is on its way any
+        more.
+        """
         return len(self._repeated) == len(self._newest) and all(self._repeated.values())
 
 
@@ -132,7 +161,10 @@ def _counts(values: dict[str, str]) -> dict[str, str]:
 
 
 class Processes:
-    """Executables of our packages, each in a process group of its own, output in a file. Ends what it started."""
+    """Executables of our packages, each in a process group of its own, output in a file.
+
+    Ends what it started.
+    """
 
     def __init__(self, folder: str | Path, stop: Stop) -> None:
         self.folder = Path(folder)
@@ -148,21 +180,33 @@ class Processes:
             self._end(title, STOP_LIMIT)
 
     def start(
-        self, package: str, name: str, *arguments: object, title: str | None = None, may_end_with: Sequence[int] = ()
+        self,
+        package: str,
+        name: str,
+        *arguments: object,
+        title: str | None = None,
+        may_end_with: Sequence[int] = (),
     ) -> subprocess.Popen[bytes]:
-        """The Popen of the executable; title : to tell it from others, default its name, output in `file(title)`;
-        may_end_with : exit codes with which it is no failure that it ends."""
+        """The Popen of the executable; title : to tell it from others, default its name, output in
+        `file(title)`;
+        may_end_with : exit codes with which it is no failure that it ends.
+        """
         try:
             program = Path(get_package_prefix(package)) / "lib" / package / name
         except PackageNotFoundError as error:
-            raise LiveError(f"{package} is not installed; build and source the workspace.") from error
+            raise LiveError(
+                f"{package} is not installed; build and source the workspace."
+            ) from error
         title = title or name
         refuse_output(self.file(title))
         with open(self.file(title), "wb") as log:
             self._running[title] = subprocess.Popen(
                 [str(part) for part in (program, *arguments)],
-                stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
-            )  # fmt: skip
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+            )
         self._may_end[title] = may_end_with
         return self._running[title]
 
@@ -175,7 +219,9 @@ class Processes:
         return self.folder / f"{title.replace('/', '.')}.log"
 
     def check(self) -> None:
-        """Raise LiveError if a process ended that should not have, KeyboardInterrupt if we are asked to end."""
+        """Raise LiveError if a process ended that should not have, KeyboardInterrupt if we are
+        asked to end.
+        """
         if self._stop:
             raise KeyboardInterrupt
         for title, process in self._running.items():
@@ -184,12 +230,20 @@ class Processes:
                 raise self._failure(title, code)
 
     def worked(self) -> dict[str, float]:
-        """{title: s that its threads have run, or waited for a core} of those that are starting: they have not said that they are ready."""
-        return {title: _worked(process.pid) for title, process in self._running.items() if not READY.search(self._said(title))}
+        """{title: s that its threads have run, or waited for a core} of those that are starting:
+        they have not said that they are ready.
+        """
+        return {
+            title: _worked(process.pid)
+            for title, process in self._running.items()
+            if not READY.search(self._said(title))
+        }
 
     def doing(self) -> str:
         """What each that is starting said last, in words; of all if none is."""
-        titles = [title for title in self._running if not READY.search(self._said(title))] or list(self._running)
+        titles = [title for title in self._running if not READY.search(self._said(title))] or list(
+            self._running
+        )
         return "; ".join(f"{title}: {_bare(self._said(title)) or 'starting'}" for title in titles)
 
     def stop(self, title: str) -> None:
@@ -217,7 +271,9 @@ class Processes:
 
     def _failure(self, title: str, code: int) -> LiveError:
         last = " ".join(self._said(title).splitlines()[-1:])
-        return LiveError(f"{title} ended with code {code} ({last}); all of its output is in {self.file(title)}.")
+        return LiveError(
+            f"{title} ended with code {code} ({last}); all of its output is in {self.file(title)}."
+        )
 
 
 def _bare(said: str) -> str:
@@ -226,7 +282,9 @@ def _bare(said: str) -> str:
 
 
 def _worked(pid: int) -> float:
-    """s that the threads of a process have run or were ready to run: on a loaded machine that of one that works is still about all."""
+    """s that the threads of a process have run or were ready to run: on a loaded machine that of
+    one that works is still about all.
+    """
     total = 0
     for file in Path(f"/proc/{pid}/task").glob("*/schedstat"):
         try:

@@ -16,7 +16,10 @@ BATCHES_AHEAD = 100
 
 
 def read_ahead(messages: Iterable[Item]) -> Generator[Item, None, None]:
-    """Yield what the iterable yields, read by a thread up to 50,000 items ahead. Its exceptions are raised here."""
+    """Yield what the iterable yields, read by a thread up to 50,000 items ahead.
+
+    Its exceptions are raised here.
+    """
     batches: queue.Queue[list[Item] | BaseException | None] = queue.Queue(BATCHES_AHEAD)
     closed = threading.Event()
 

@@ -17,6 +17,7 @@ from .session import message_class, recorded_qos, session, subscription_qos
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
+
     from rclpy.node import Node
     from rclpy.qos import QoSProfile
     from rclpy.subscription import Subscription
@@ -25,13 +26,16 @@ if TYPE_CHECKING:
 
 REMEDY = "build and source the workspace that has it, and name the package with --package"
 DISCOVERY_PERIOD = 0.1  # s between two looks for new topics
-POLL_PERIOD = 0.005  # s between two looks for messages; the subscriptions hold what comes in between
+POLL_PERIOD = (
+    0.005  # s between two looks for messages; the subscriptions hold what comes in between
+)
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """counts : {topic: messages}; missing : topics, asked for by name, that brought none; error : what ended the
-    recording, or None."""
+    """counts : {topic: messages}; missing : topics, asked for by name, that brought none; error :
+    what ended the recording, or None.
+    """
 
     counts: dict[str, int]
     missing: list[str]
@@ -39,12 +43,18 @@ class Recorded:
 
 
 def record(
-    topics: Sequence[str], output: str | Path, storage: str = "mcap", ros_arguments: Sequence[str] = (),
-    say: Callable[[str], object] = print, packages: Sequence[str] = (),
-) -> Recorded:  # fmt: skip
-    """Record topics, or all that are not hidden if the list is empty, until SIGINT or SIGTERM. Returns Recorded.
+    topics: Sequence[str],
+    output: str | Path,
+    storage: str = "mcap",
+    ros_arguments: Sequence[str] = (),
+    say: Callable[[str], object] = print,
+    packages: Sequence[str] = (),
+) -> Recorded:
+    """Record topics, or all that are not hidden if the list is empty, until SIGINT or SIGTERM.
+    Returns Recorded.
 
-    output : path of the bag, which appears when the recording ends; say(sentence) : called with what happens; packages : of message types,
+    output : path of the bag, which appears when the recording ends; say(sentence) : called with
+        what happens; packages : of message types,
         beside those that are known, that may be imported.
     Raises InputError, and Failure if no message came at all: then there is no bag.
     """
@@ -68,13 +78,18 @@ def record(
 class Recorder:
     """Subscriptions, and the connections of the bag that they write to.
 
-    wanted : set of absolute topic names, or None for all; packages : see `record`. counts : {topic: messages recorded so far}.
+    wanted : set of absolute topic names, or None for all; packages : see `record`. counts : {topic:
+        messages recorded so far}.
     """
 
     def __init__(
-        self, node: Node, writer: Writer, wanted: set[str] | None, say: Callable[[str], object],
+        self,
+        node: Node,
+        writer: Writer,
+        wanted: set[str] | None,
+        say: Callable[[str], object],
         packages: Sequence[str] = (),
-    ) -> None:  # fmt: skip
+    ) -> None:
         self.counts: dict[str, int] = {}
         self._packages = packages
         self._node, self._writer, self._wanted, self._say = node, writer, wanted, say
@@ -88,11 +103,21 @@ class Recorder:
                 continue
             publishers = self._node.get_publishers_info_by_topic(topic)
             if publishers:
-                msgtype = next(filter(self._class, types), types[0])  # others may tell other types of it
-                self._subscribe(topic, msgtype, [each.qos_profile for each in publishers if each.topic_type == msgtype])
+                msgtype = next(
+                    filter(self._class, types), types[0]
+                )  # others may tell other types of it
+                self._subscribe(
+                    topic,
+                    msgtype,
+                    [each.qos_profile for each in publishers if each.topic_type == msgtype],
+                )
 
-    def run(self, enough: Callable[[], object], taken: Callable[[int], object] = lambda count: None) -> None:
-        """Discover topics and take messages until enough(). taken(count) : called with how many came."""
+    def run(
+        self, enough: Callable[[], object], taken: Callable[[int], object] = lambda count: None
+    ) -> None:
+        """Discover topics and take messages until enough(). taken(count) : called with how many
+        came.
+        """
         look_again = 0.0
         while not enough():
             if time.monotonic() >= look_again:
@@ -106,7 +131,9 @@ class Recorder:
         taken = 0
         for subscription, connection in self._pairs:
             with subscription.handle:
-                while (message := subscription.handle.take_message(subscription.msg_type, True)) is not None:
+                while (
+                    message := subscription.handle.take_message(subscription.msg_type, True)
+                ) is not None:
                     data, information = message
                     stamp = information["received_timestamp"] or time.time_ns()
                     self._writer.write(connection, stamp, data)
@@ -130,7 +157,9 @@ class Recorder:
         cls = self._class(msgtype)
         try:
             if cls is None:
-                raise InputError(f"{msgtype} is not installed, or of a package that is not known; {REMEDY}.")
+                raise InputError(
+                    f"{msgtype} is not installed, or of a package that is not known; {REMEDY}."
+                )
             add_type(typestore(), msgtype)
         except InputError as error:
             if self._wanted is not None:
@@ -139,10 +168,14 @@ class Recorder:
             self._refused.add(topic)
             return
         connection = self._writer.add_connection(
-            topic, msgtype, typestore=typestore(), offered_qos_profiles=[recorded_qos(qos) for qos in offered]
+            topic,
+            msgtype,
+            typestore=typestore(),
+            offered_qos_profiles=[recorded_qos(qos) for qos in offered],
         )
         qos = subscription_qos(offered)
-        # Never spun, so the callback never runs: messages are taken from the subscription as bytes, many at a time.
+        # Never spun, so the callback never runs: messages are taken from the subscription as bytes,
+        # many at a time.
         subscription = self._node.create_subscription(cls, topic, lambda _: None, qos, raw=True)
         self._pairs.append((subscription, connection))
         self.counts[topic] = 0

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
-import shutil
 from dataclasses import dataclass
+import json
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+import shutil
+from typing import TYPE_CHECKING, Any
 
 from uwb_tdoa_bias.foundation.sensors import SENSORS
 from uwb_tdoa_ekf.results import VERDICTS
@@ -17,7 +17,9 @@ from .session import session
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
     from rclpy.node import Node
+
     from uwb_tdoa_bias.foundation.flight import Flight
 
 INPUTS = ("/uwb/anchors", "/uwb/tdoa", "/imu/data")
@@ -29,24 +31,39 @@ MATCHED = {
     "/uwb/tdoa_corrected": (1, 1),
     "/odometry": (1, 2),
 }
-# A replay can wait, a robot cannot: here no link may lose a message, and a stream that falls behind is waited for.
-PATIENCE = {"bias_node": {"hold": 9.975}, "ekf_node": {"lag": 10.0}}  # s of stamps; hold: see config/bias_node.yaml
+# A replay can wait, a robot cannot: here no link may lose a message, and a stream that falls behind
+# is waited for.
+PATIENCE = {
+    "bias_node": {"hold": 9.975},
+    "ekf_node": {"lag": 10.0},
+}  # s of stamps; hold: see config/bias_node.yaml
 RELIABLE = {
-    "bias_node": ("/uwb/tdoa.subscription", "/odometry.subscription", "/uwb/tdoa_corrected.publisher"),
+    "bias_node": (
+        "/uwb/tdoa.subscription",
+        "/odometry.subscription",
+        "/uwb/tdoa_corrected.publisher",
+    ),
     "ekf_node": (
-        "/imu/data.subscription", "/uwb/tdoa_corrected.subscription", *(f"/{of.topics[0][0]}.subscription" for of in SENSORS.values()),
+        "/imu/data.subscription",
+        "/uwb/tdoa_corrected.subscription",
+        *(f"/{of.topics[0][0]}.subscription" for of in SENSORS.values()),
         "/odometry.publisher",
     ),
-}  # fmt: skip
+}
 DEPTH = 1_000_000  # messages that may wait in a subscription
-READY_LIMIT = 60.0  # s in which nothing goes on: the very first start compiles the filter, which takes as long as it takes
+# s in which nothing goes on: the very first start compiles the filter, which takes as long as it
+# takes
+READY_LIMIT = 60.0
 MATCH_LIMIT = 60.0  # s
-SETTLE_LIMIT = 60.0  # s in which no count of the nodes changes: a replay at a high rate may leave a lot to catch up with
+# s in which no count of the nodes changes: a replay at a high rate may leave a lot to catch up with
+SETTLE_LIMIT = 60.0
 
 
 @dataclass(frozen=True)
 class LiveRun:
-    """recorded : path of a bag with `odometry`; bias, ekf : {key: text}, the last diagnostics of each node."""
+    """recorded : path of a bag with `odometry`; bias, ekf : {key: text}, the last diagnostics of
+    each node.
+    """
 
     recorded: Path
     bias: dict[str, str]
@@ -54,20 +71,30 @@ class LiveRun:
 
 
 def run_live(
-    bag: str | Path, folder: str | Path, rate: float = 1.0, bias_parameters: dict[str, Any] | None = None,
-    ekf_parameters: dict[str, Any] | None = None, say: Callable[[str], object] = print,
-) -> LiveRun:  # fmt: skip
-    """Start bias_node, ekf_node and record, wait until they have found each other, replay the bag, stop them.
+    bag: str | Path,
+    folder: str | Path,
+    rate: float = 1.0,
+    bias_parameters: dict[str, Any] | None = None,
+    ekf_parameters: dict[str, Any] | None = None,
+    say: Callable[[str], object] = print,
+) -> LiveRun:
+    """Start bias_node, ekf_node and record, wait until they have found each other, replay the bag,
+    stop them.
 
-    bag : path of a bag; folder : where the recorded bag (`recorded.bag`) and the output of the processes (`*.log`) go;
-    rate : times as fast as recorded; bias_parameters, ekf_parameters : {name: value} for the nodes; say(text) : tells
-    what happens now.
-    In a ROS domain of its own, on this machine only. Returns a LiveRun. Raises LiveError, and KeyboardInterrupt after a
-    signal.
+    bag : path of a bag; folder : where the recorded bag (`recorded.bag`) and the output of the
+        processes (`*.log`) go;
+    rate : times as fast as recorded; bias_parameters, ekf_parameters : {name: value} for the nodes;
+        say(text) : tells
+    what happens now. In a ROS domain of its own, on this machine only. Returns a LiveRun. Raises
+    LiveError, and KeyboardInterrupt after a signal.
     """
     with open_bag(bag) as reader:
         present = {connection.topic for connection in reader.connections}
-        total = sum(connection.msgcount for connection in reader.connections if connection.topic == "/uwb/tdoa")
+        total = sum(
+            connection.msgcount
+            for connection in reader.connections
+            if connection.topic == "/uwb/tdoa"
+        )
     inputs = [topic for topic in INPUTS if topic in present]
     recorded = Path(folder) / "recorded.bag"
     if recorded.exists():
@@ -78,20 +105,52 @@ def run_live(
         processes.start("uwb_tdoa_ekf", "ekf_node", *_parameters("ekf_node", ekf_parameters))
         processes.start("uwb_tdoa_tools", "record", "--output", recorded, "odometry")
         say("starting the nodes")
-        wait(READY_LIMIT, "the nodes to find each other", processes, node, lambda: _is_ready(node, diagnostics), say)
+        wait(
+            READY_LIMIT,
+            "the nodes to find each other",
+            processes,
+            node,
+            lambda: _is_ready(node, diagnostics),
+            say,
+        )
         say(f"replaying {bag} at rate {rate:g}")
-        options = ("--rate", rate, "--follow", "odometry", "--wait-matched", MATCH_LIMIT, "--wait-topics", *inputs)
+        options = (
+            "--rate",
+            rate,
+            "--follow",
+            "odometry",
+            "--wait-matched",
+            MATCH_LIMIT,
+            "--wait-topics",
+            *inputs,
+        )
         replay = processes.start("uwb_tdoa_tools", "replay", bag, *options, may_end_with=(0, 1))
-        wait(None, "the end of the replay", processes, node, lambda: replay.poll() is not None, lambda _: say(_played(diagnostics, total)))
+        wait(
+            None,
+            "the end of the replay",
+            processes,
+            node,
+            lambda: replay.poll() is not None,
+            lambda _: say(_played(diagnostics, total)),
+        )
         diagnostics.forget()
-        wait(SETTLE_LIMIT, "the nodes to finish", processes, node, diagnostics.is_settled, say, diagnostics.counts)
+        wait(
+            SETTLE_LIMIT,
+            "the nodes to finish",
+            processes,
+            node,
+            diagnostics.is_settled,
+            say,
+            diagnostics.counts,
+        )
         for name in ("record", "ekf_node", "bias_node"):
             processes.stop(name)
     return LiveRun(recorded, diagnostics.newest("bias_node"), diagnostics.newest("ekf_node"))
 
 
 def accounts(bias: dict[str, str], ekf: dict[str, str], flight: Flight) -> dict[str, int]:
-    """What became of the messages of a Flight that was played, by the last diagnostics of bias_node and ekf_node.
+    """What became of the messages of a Flight that was played, by the last diagnostics of bias_node
+    and ekf_node.
 
     {verdict: TDOAs, "waiting", "lost": TDOAs, "imu_late", "imu_lost": samples}.
     """
@@ -99,15 +158,24 @@ def accounts(bias: dict[str, str], ekf: dict[str, str], flight: Flight) -> dict[
     counts["waiting"] += int(bias["waiting"])  # for poses, which end with the first of the streams
     counts["lost"] = len(flight.tdoa) - sum(counts.values())
     samples = 0 if flight.imu is None else len(flight.imu)
-    return counts | {"imu_late": int(ekf["imu_late"]), "imu_lost": samples - int(ekf["IMU samples received"])}
+    return counts | {
+        "imu_late": int(ekf["imu_late"]),
+        "imu_lost": samples - int(ekf["IMU samples received"]),
+    }
 
 
 def _parameters(name: str, values: dict[str, Any] | None) -> list[str]:
     """Command-line arguments for a node's parameters; JSON is also YAML."""
     values = PATIENCE[name] | (values or {})
     for end in RELIABLE[name]:
-        values |= {f"qos_overrides.{end}.reliability": "reliable", f"qos_overrides.{end}.depth": DEPTH}
-    return ["--ros-args", *(part for key, value in values.items() for part in ("-p", f"{key}:={json.dumps(value)}"))]
+        values |= {
+            f"qos_overrides.{end}.reliability": "reliable",
+            f"qos_overrides.{end}.depth": DEPTH,
+        }
+    return [
+        "--ros-args",
+        *(part for key, value in values.items() for part in ("-p", f"{key}:={json.dumps(value)}")),
+    ]
 
 
 def _played(diagnostics: DiagnosticsListener, total: int) -> str:
@@ -118,7 +186,12 @@ def _played(diagnostics: DiagnosticsListener, total: int) -> str:
 
 def _is_ready(node: Node, diagnostics: DiagnosticsListener) -> bool:
     found = diagnostics.newest("ekf_node").get("publishers of uwb/tdoa_corrected", "0") != "0"
-    return found and bool(diagnostics.newest("bias_node")) and all(
-        node.count_publishers(topic) >= publishers and node.count_subscribers(topic) >= subscriptions
-        for topic, (publishers, subscriptions) in MATCHED.items()
-    )  # fmt: skip
+    return (
+        found
+        and bool(diagnostics.newest("bias_node"))
+        and all(
+            node.count_publishers(topic) >= publishers
+            and node.count_subscribers(topic) >= subscriptions
+            for topic, (publishers, subscriptions) in MATCHED.items()
+        )
+    )

@@ -1,24 +1,34 @@
-"""What replay and record share: their life as a ROS node, message classes by name, QoS to and from bags."""
+"""What replay and record share: their life as a ROS node, message classes by name, QoS to and from
+bags.
+"""
 
 from __future__ import annotations
 
+from contextlib import contextmanager
+from importlib import import_module
 import math
 import signal
 import time
-from contextlib import contextmanager
-from importlib import import_module
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import rclpy
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
-from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.interfaces import (
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
+
     from rclpy.duration import Duration
     from rclpy.node import Node
     from rclpy.task import Future
@@ -29,11 +39,18 @@ KNOWN = frozenset(  # packages of message types: those of ROS that robots speak,
     visualization_msgs""".split()
 )
 PACKAGE: dict[str, Any] = {  # the option by which others are allowed
-    "action": "append", "default": [], "metavar": "NAME",
-    "help": "import message types of this package, too; those of ROS that robots speak, and ours, are known; may be repeated",
-}  # fmt: skip
+    "action": "append",
+    "default": [],
+    "metavar": "NAME",
+    "help": (
+        "import message types of this package, too; those of ROS that robots speak, and ours, are "
+        "known; may be repeated"
+    ),
+}
 AGAIN = 4.0  # s after which a node that has not answered is asked once more
-READER_DEPTH = 10_000  # messages that a subscription holds until they are taken: 10 s of a 1 kHz stream
+READER_DEPTH = (
+    10_000  # messages that a subscription holds until they are taken: 10 s of a 1 kHz stream
+)
 
 
 class Stop:
@@ -48,16 +65,19 @@ class Stop:
 
 @contextmanager
 def session(name: str, arguments: Sequence[str]) -> Iterator[tuple[Node, Stop]]:
-    """(node, Stop) while the block lasts. SIGINT and SIGTERM only set Stop: the block ends in its own order.
+    """(node, Stop) while the block lasts. SIGINT and SIGTERM only set Stop: the block ends in its
+    own order.
 
-    arguments : command line with the --ros-args that rclpy shall see. Raises InputError for what rclpy refuses.
+    arguments : command line with the --ros-args that rclpy shall see. Raises InputError for what
+        rclpy refuses.
     """
     stop = Stop()
 
     def asked(number: int, _: object) -> None:
         stop.signal = number
 
-    # Set here even where SIGINT was ignored, as it is in a job that a shell script put in the background.
+    # Set here even where SIGINT was ignored, as it is in a job that a shell script put in the
+    # background.
     previous = {number: signal.signal(number, asked) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         try:
@@ -65,7 +85,8 @@ def session(name: str, arguments: Sequence[str]) -> Iterator[tuple[Node, Stop]]:
         except (rclpy_implementation.RCLError, rclpy_implementation.UnknownROSArgsError) as error:
             raise InputError(f"ROS arguments: {error}") from error
         try:
-            # No parameters and no /rosout of its own: a recording of everything shall hold the others.
+            # No parameters and no /rosout of its own: a recording of everything shall hold the
+            # others.
             node = rclpy.create_node(name, start_parameter_services=False, enable_rosout=False)
             yield node, stop
         finally:
@@ -76,8 +97,10 @@ def session(name: str, arguments: Sequence[str]) -> Iterator[tuple[Node, Stop]]:
 
 
 def answer_of(ask: Callable[[], Future]) -> Callable[[], Future | None]:
-    """A function that returns the first Future of ask() that is done, or None so far. When it is called AGAIN s after the last time, it
-    asks again: the middleware drops an answer to a client that it has not met yet ("failed to send response (timeout)")."""
+    """A function that returns the first Future of ask() that is done, or None so far. When it is
+    called AGAIN s after the last time, it asks again: the middleware drops an answer to a client
+    that it has not met yet ("failed to send response (timeout)").
+    """
     asked: list[Future] = []
     due = -math.inf
 
@@ -92,8 +115,10 @@ def answer_of(ask: Callable[[], Future]) -> Callable[[], Future | None]:
 
 
 def message_class(msgtype: str, packages: Sequence[str] = ()) -> type | None:
-    """Class of a type like "pkg/msg/Name", or None if its package is not installed, or neither KNOWN nor one of `packages`: whoever
-    publishes, or made a bag, names the type, and importing a package runs it."""
+    """Class of a type like "pkg/msg/Name", or None if its package is not installed, or neither
+    KNOWN nor one of `packages`: whoever publishes, or made a bag, names the type, and importing a
+    package runs it.
+    """
     package, _, name = msgtype.partition("/msg/")
     if package not in KNOWN and package not in packages or not name.isidentifier():
         return None
@@ -104,14 +129,18 @@ def message_class(msgtype: str, packages: Sequence[str] = ()) -> type | None:
 
 
 def publisher_qos(recorded: Sequence[Qos], messages: int) -> QoSProfile:
-    """QoSProfile to replay a topic with. recorded : rosbags Qos of each recorded publisher; messages : how many.
+    """QoSProfile to replay a topic with. recorded : rosbags Qos of each recorded publisher;
+    messages : how many.
 
-    Durability as recorded. Always reliable: that serves reliable and best-effort subscriptions alike. A stream keeps
-    all that is not acknowledged, so that a reliable subscription that lags holds the replay up and loses nothing. On a
-    transient-local topic, a late subscription gets as many messages as the recorded publishers kept.
+    Durability as recorded. Always reliable: that serves reliable and best-effort subscriptions
+    alike. A stream keeps all that is not acknowledged, so that a reliable subscription that lags
+    holds the replay up and loses nothing. On a transient-local topic, a late subscription gets as
+    many messages as the recorded publishers kept.
     """
     if any(qos.durability == QosDurability.TRANSIENT_LOCAL for qos in recorded):
-        kept = sum(qos.depth for qos in recorded)  # discovery does not tell the depth: then 0 was recorded
+        kept = sum(
+            qos.depth for qos in recorded
+        )  # discovery does not tell the depth: then 0 was recorded
         return QoSProfile(
             depth=kept or max(1, min(messages, READER_DEPTH)),
             reliability=ReliabilityPolicy.RELIABLE,

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 import math
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from uwb_tdoa_bias.foundation.flight import Flight
-from uwb_tdoa_ekf.results import Odometry, Residuals
 from uwb_tdoa_ekf.frames import rotation_std
 from uwb_tdoa_ekf.monitoring.status import YAW_KNOWN
 from uwb_tdoa_ekf.offline import Run
+from uwb_tdoa_ekf.results import Odometry, Residuals
 from uwb_tdoa_ekf.streams import ERROR
 
 from ..checking.check import check
@@ -26,19 +26,26 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
 GOOD, DOUBTFUL, BAD = "good", "doubtful", "bad"
-SIGMAS = 2.0  # standard deviations of the 3D position within which it is for 95 % of the time, or longer: whatever the shape, 1.6 to 2.0
+# standard deviations of the 3D position within which it is for 95 % of the time, or longer:
+# whatever the shape, 1.6 to 2.0
+SIGMAS = 2.0
 GAP = 1.0  # s without an estimate, as long as which the tag is lost
 LONG = 0.05  # share of the time that the tag may be lost in an estimate that is good
 FEW = 0.9  # share of TDOAs that are explained, below which an estimate is not good
 TALL = 1.5  # times the deviations of x and y, beyond which the height is what is known worst
-OFFSET = 0.03  # m, of all ranges, from which on it is said: what the filter finds of ranges that have none is up to some 2 cm
-LASTING = 0.5  # share of the variance that errors which last make, above which a calibration is what helps
+# m, of all ranges, from which on it is said: what the filter finds of ranges that have none is up
+# to some 2 cm
+OFFSET = 0.03
+# share of the variance that errors which last make, above which a calibration is what helps
+LASTING = 0.5
 
 
 @dataclass(frozen=True)
 class Belief:
-    """level : GOOD, DOUBTFUL or BAD; figures : {name: number}; lost : [(begin, end)] s, spans in which the tag was lost; reasons :
-    sentences on why it is not good; remedies : sentences on what would make it better."""
+    """level : GOOD, DOUBTFUL or BAD; figures : {name: number}; lost : [(begin, end)] s, spans in
+    which the tag was lost; reasons : sentences on why it is not good; remedies : sentences on what
+    would make it better.
+    """
 
     level: str
     figures: dict[str, Any]
@@ -52,25 +59,54 @@ class Belief:
         if not figures["estimates"]:
             return [f"{self.level}: there is no estimate", *self.reasons, *self.remedies]
         spread = ", ".join(f"{axis} {100 * figures[f'std_{axis}']:.0f}" for axis in "xyz")
-        within = f"standard deviation {100 * figures['std']:.0f} cm ({spread}): the position is within {100 * figures['within']:.0f} cm for 95 % of the time"
-        fits = f"{figures['explained']:.1%} of {_counted(figures)} fit it within three standard deviations (NIS {figures['nis']:.2f}: with outliers in full, 1 if there were none)"
+        within = (
+            f"standard deviation {100 * figures['std']:.0f} cm ({spread}): the position is within "
+            f"{100 * figures['within']:.0f} cm for 95 % of the time"
+        )
+        fits = (
+            f"{figures['explained']:.1%} of {_counted(figures)} fit it within three standard "
+            f"deviations (NIS {figures['nis']:.2f}: with outliers in full, 1 if there were none)"
+        )
         off = figures.get("range_offset")
-        offset = [] if off is None or abs(off) < OFFSET else [f"all ranges are {100 * abs(off):.0f} cm too {'long' if off > 0.0 else 'short'}: that was found, and taken out"]
+        offset = (
+            []
+            if off is None or abs(off) < OFFSET
+            else [
+                (
+                    f"all ranges are {100 * abs(off):.0f} cm too "
+                    f"{'long' if off > 0.0 else 'short'}: that was found, and taken out"
+                )
+            ]
+        )
         return [f"{self.level}: {within}; {fits}", *offset, *self.reasons, *self.remedies]
 
 
-def believe(flight: Flight, run: Run, estimator: FlightEstimator = FlightEstimator(), line: str | None = None) -> Belief:
-    """Belief in a Run of a FlightEstimator over a Flight, whose ground truth is not used. line : as of `check`."""
+def believe(
+    flight: Flight,
+    run: Run,
+    estimator: FlightEstimator = FlightEstimator(),
+    line: str | None = None,
+) -> Belief:
+    """Belief in a Run of a FlightEstimator over a Flight, whose ground truth is not used. line : as
+    of `check`.
+    """
     odometry, left = run.odometry, residuals.of_run(flight, run)
     there = reached(left)
-    figures = {"seconds": _length(left), "estimates": len(odometry), "tdoas": len(flight.tdoa), "recoveries": run.recoveries}
+    figures = {
+        "seconds": _length(left),
+        "estimates": len(odometry),
+        "tdoas": len(flight.tdoa),
+        "recoveries": run.recoveries,
+    }
     if ranges := len(left) - len(flight.tdoa):
         figures["ranges"] = ranges
     if run.range_offset is not None:
         figures["range_offset"] = run.range_offset[0]
     found = check(of_flight(flight), (), estimator, line).findings
     faults = [finding for finding in found if finding.severity == ERROR]
-    moved = [finding for finding in found if finding.severity != ERROR and finding.rule in OF_ANCHORS]
+    moved = [
+        finding for finding in found if finding.severity != ERROR and finding.rule in OF_ANCHORS
+    ]
     reasons = [f"check: {finding.cause} ({finding.evidence})" for finding in faults + moved]
     remedies = [f"{finding.cause}: {finding.remedy}" for finding in faults + moved]
     if not len(odometry) or not there.any():
@@ -81,7 +117,9 @@ def believe(flight: Flight, run: Run, estimator: FlightEstimator = FlightEstimat
     figures["nis"] = float(nis(left).mean())
     lost = lost_spans(left.t, odometry)
     figures["lost"] = float(sum(end - begin for begin, end in lost))
-    worse = BAD if faults or figures["lost"] > 0.5 * figures["seconds"] else DOUBTFUL if moved else GOOD
+    worse = (
+        BAD if faults or figures["lost"] > 0.5 * figures["seconds"] else DOUBTFUL if moved else GOOD
+    )
     for reason in _doubts(flight, left, figures, lost):
         reasons.append(reason)
         worse = BAD if worse == BAD else DOUBTFUL
@@ -91,18 +129,30 @@ def believe(flight: Flight, run: Run, estimator: FlightEstimator = FlightEstimat
 
 def _measured(figures: Mapping[str, Any]) -> str:
     """What locates, in words."""
-    return "TDOAs" if not figures.get("ranges") else "TDOAs and ranges" if figures["tdoas"] else "ranges"
+    return (
+        "TDOAs"
+        if not figures.get("ranges")
+        else "TDOAs and ranges"
+        if figures["tdoas"]
+        else "ranges"
+    )
 
 
 def _counted(figures: Mapping[str, Any]) -> str:
     """The same with how many there are."""
-    counts = [f"{figures[name]} {words}" for name, words in (("tdoas", "TDOAs"), ("ranges", "ranges")) if figures.get(name)]
+    counts = [
+        f"{figures[name]} {words}"
+        for name, words in (("tdoas", "TDOAs"), ("ranges", "ranges"))
+        if figures.get(name)
+    ]
     return " and ".join(counts) or "0 TDOAs"
 
 
 def lost_spans(heard: np.ndarray, odometry: Odometry) -> list[tuple[float, float]]:
-    """[(begin, end)] s, between the first estimate and the last that was heard, of stamps (n,) s, in which there is no
-    estimate for GAP, or one whose deviation is more than LOST; spans that are less than GAP apart are one."""
+    """[(begin, end)] s, between the first estimate and the last that was heard, of stamps (n,) s,
+    in which there is no estimate for GAP, or one whose deviation is more than LOST; spans that are
+    less than GAP apart are one.
+    """
     t, std = odometry.t, np.sqrt(np.einsum("nii->n", odometry.covariance[:, :3, :3]))
     ends = np.append(t[1:], max(t[-1], heard.max(initial=-math.inf)))
     wide = (std > LOST) | (ends - t > GAP)
@@ -124,7 +174,9 @@ def _deviation(odometry: Odometry) -> dict[str, float]:
     known = np.einsum("nii->n", odometry.covariance[:, :3, :3]) <= LOST**2
     rows = known if known.any() else np.ones(len(known), bool)
     variance = np.einsum("nii->ni", odometry.covariance[rows, :3, :3]).mean(axis=0)
-    lasting = float(np.einsum("nii->n", odometry.persistent[rows]).mean() / max(variance.sum(), 1e-12))
+    lasting = float(
+        np.einsum("nii->n", odometry.persistent[rows]).mean() / max(variance.sum(), 1e-12)
+    )
     yaw = rotation_std(odometry.q[-1:], odometry.covariance[-1:])[0, 2]
     out = {f"std_{axis}": float(math.sqrt(value)) for axis, value in zip("xyz", variance)}
     std = float(math.sqrt(variance.sum()))
@@ -133,13 +185,21 @@ def _deviation(odometry: Odometry) -> dict[str, float]:
 
 def _doubts(
     flight: Flight, left: Residuals, figures: Mapping[str, Any], lost: Sequence[tuple[float, float]]
-) -> Iterator[str]:  # fmt: skip
+) -> Iterator[str]:
     """Yield sentences."""
     if figures["lost"] > LONG * figures["seconds"]:
-        spans = ", ".join(f"{begin - left.t.min():.0f} - {end - left.t.min():.0f} s" for begin, end in lost[:5])
-        yield f"the tag was lost for {figures['lost']:.0f} s of {figures['seconds']:.0f} s ({spans}{', ...' * (len(lost) > 5)})"
+        spans = ", ".join(
+            f"{begin - left.t.min():.0f} - {end - left.t.min():.0f} s" for begin, end in lost[:5]
+        )
+        yield (
+            f"the tag was lost for {figures['lost']:.0f} s of {figures['seconds']:.0f} s "
+            f"({spans}{', ...' * (len(lost) > 5)})"
+        )
     if figures["recoveries"]:
-        yield f"the filter found that it had been wrong, and began anew at another place, {figures['recoveries']} times"
+        yield (
+            "the filter found that it had been wrong, and began anew at another place, "
+            f"{figures['recoveries']} times"
+        )
     if figures["explained"] < FEW:
         yield f"{1.0 - figures['explained']:.0%} of the {_measured(figures)} speak against it"
     if figures["std"] > LOST:
@@ -148,15 +208,26 @@ def _doubts(
         yield f"the yaw is not known in the end: +-{math.degrees(figures['yaw_std']):.0f} degrees"
 
 
-def _remedies(flight: Flight, left: Residuals, figures: Mapping[str, Any], corrected: bool) -> Iterator[str]:
+def _remedies(
+    flight: Flight, left: Residuals, figures: Mapping[str, Any], corrected: bool
+) -> Iterator[str]:
     """Yield sentences."""
     ids = np.unique(np.concatenate([left.a, left.b]).astype(int))
     lacking = ids[flight.anchors.index(ids) < 0]
     if len(lacking):
-        yield f"survey anchor {', '.join(map(str, lacking.tolist()))}, which the tag hears: its {_measured(figures)} are not used"
+        yield (
+            f"survey anchor {', '.join(map(str, lacking.tolist()))}, which the tag hears: its "
+            f"{_measured(figures)} are not used"
+        )
     if flight.imu is None:
         yield "record the inertial sensor, too: the filter then knows the attitude, and bridges gaps"
     if figures["std_z"] > TALL * max(figures["std_x"], figures["std_y"]) and flight.height is None:
-        yield "the height is what is known worst: add a range finder that looks down, or put anchors further apart in height (plan says where)"
+        yield (
+            "the height is what is known worst: add a range finder that looks down, or put "
+            "anchors further apart in height (plan says where)"
+        )
     if not corrected and figures["lasting"] > LASTING:
-        yield f"{figures['lasting']:.0%} of the variance is of errors that last, as of delays and places of anchors: calibrate them"
+        yield (
+            f"{figures['lasting']:.0%} of the variance is of errors that last, as of delays and "
+            "places of anchors: calibrate them"
+        )

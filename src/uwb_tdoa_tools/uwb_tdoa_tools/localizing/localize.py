@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import command_lines
 from ..bags.bag import write_odometry
+from ..estimate import FlightEstimator
 from ..readers.inputs import Reading
 from ..scoring.tum import write_tum
 from . import files, pictures, rerun_file, residuals, zones
 from .belief import GOOD, Belief, believe
-from ..estimate import FlightEstimator
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -24,7 +24,9 @@ SUFFIXES = ".gz", ".csv", ".bag", ".mcap", ".db3", ".log"
 
 @dataclass(frozen=True)
 class Located:
-    """What became of a recording: what its files are called, how far it is to be believed, and the files that were written."""
+    """What became of a recording: what its files are called, how far it is to be believed, and the
+    files that were written.
+    """
 
     flight: str
     belief: Belief
@@ -34,18 +36,25 @@ class Located:
         """For JSON."""
         belief = self.belief
         return {
-            "flight": self.flight, "verdict": belief.level, **belief.figures, "lost_spans": belief.lost, "reasons": list(belief.reasons),
-            "remedies": list(belief.remedies), "files": [str(path) for path in self.written],
-        }  # fmt: skip
+            "flight": self.flight,
+            "verdict": belief.level,
+            **belief.figures,
+            "lost_spans": belief.lost,
+            "reasons": list(belief.reasons),
+            "remedies": list(belief.remedies),
+            "files": [str(path) for path in self.written],
+        }
 
 
 @dataclass(frozen=True)
 class Localizer:
-    """localizer((path, survey)) is the Located of a recording, whose ground truth is not read. Can be pickled.
+    """localizer((path, survey)) is the Located of a recording, whose ground truth is not read. Can
+    be pickled.
 
-    reading : Reading; estimator : FlightEstimator; folder : where to write; bag : write a bag, too; left : write residuals, too; rerun :
-    file for Rerun, or None; zones : m, write who is heard in squares of that size, or None; effects : file of those of the estimator, or
-    None. Raises InputError.
+    reading : Reading; estimator : FlightEstimator; folder : where to write; bag : write a bag, too;
+        left : write residuals, too; rerun :
+    file for Rerun, or None; zones : m, write who is heard in squares of that size, or None; effects
+    : file of those of the estimator, or None. Raises InputError.
     """
 
     reading: Reading
@@ -80,7 +89,13 @@ class Localizer:
             residuals.picture(path("_residuals.png"), left, name)
         if self.zones is not None and (found := zones.zones_of(odometry, left, self.zones)):
             zones.write_csv(path("_zones.csv"), found)
-            zones.draw(path("_zones.png"), found, flight.anchors, self.zones, f"{name}: squares of {self.zones:g} m")
+            zones.draw(
+                path("_zones.png"),
+                found,
+                flight.anchors,
+                self.zones,
+                f"{name}: squares of {self.zones:g} m",
+            )
         if self.rerun is not None:
             rerun_file.write_rerun(self.rerun, flight, odometry, left, belief.sentences())
             written.append(self.rerun)
@@ -96,12 +111,17 @@ def name_of(path: str | Path) -> str:
 
 
 def check_names(recordings: Sequence[tuple[Path, str | Path | None]]) -> None:
-    """Raise InputError if two of some recordings, (path, survey), would be written to the same files."""
+    """Raise InputError if two of some recordings, (path, survey), would be written to the same
+    files.
+    """
     seen: dict[str, Path] = {}
     for path, _ in recordings:
         other = seen.setdefault(name_of(path), path)
         if other is not path:
-            raise InputError(f"{path}: {other} has the same name, so that one would replace the other; localize them to two directories.")
+            raise InputError(
+                f"{path}: {other} has the same name, so that one would replace the other; "
+                "localize them to two directories."
+            )
 
 
 def all_good(located: Iterable[Located]) -> bool:

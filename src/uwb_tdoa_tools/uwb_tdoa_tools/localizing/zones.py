@@ -10,8 +10,8 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.files import write_filled, write_text
-from uwb_tdoa_ekf.results import Odometry, Residuals
 from uwb_tdoa_ekf.core.verdicts import USED
+from uwb_tdoa_ekf.results import Odometry, Residuals
 
 from ..scoring.plots import plt
 
@@ -21,9 +21,11 @@ LEAST = 0.5  # s in a zone, of which less tells nothing
 
 @dataclass(frozen=True)
 class Zone:
-    """A square in which the tag was. x, y : m, of its middle; seconds in it; heard : anchors in a second, median; tdoas_per_s; used : share
-    of them; left : m, 1.48 times the median of what is left of those used, NaN without; std : m, of the position, median; anchors : ((id,
-    share of the seconds in which it was heard), ...), those heard most first."""
+    """A square in which the tag was. x, y : m, of its middle; seconds in it; heard : anchors in a
+    second, median; tdoas_per_s; used : share of them; left : m, 1.48 times the median of what is
+    left of those used, NaN without; std : m, of the position, median; anchors : ((id, share of the
+    seconds in which it was heard), ...), those heard most first.
+    """
 
     x: float
     y: float
@@ -37,7 +39,9 @@ class Zone:
 
 
 def zones_of(odometry: Odometry, residuals: Residuals, size: float) -> list[Zone]:
-    """[Zone] of squares of some size, m, that the tag was in, by an Odometry and the Residuals that came with it."""
+    """[Zone] of squares of some size, m, that the tag was in, by an Odometry and the Residuals that
+    came with it.
+    """
     if len(odometry) < 2 or not len(residuals.t):
         return []
     near = (residuals.t >= odometry.t[0]) & (residuals.t <= odometry.t[-1])
@@ -63,12 +67,17 @@ def zones_of(odometry: Odometry, residuals: Residuals, size: float) -> list[Zone
         x, y = (float((part[here][0] + 0.5) * size) for part in places)
         out.append(
             Zone(
-                x, y, seconds, float(np.median(each)) if len(each) else 0.0,
-                mine.sum() / seconds, float(used[mine].mean()) if mine.any() else 0.0,
-                float(1.4826 * np.median(np.abs(left[good]))) if good.any() else np.nan, float(np.median(std[here])),
+                x,
+                y,
+                seconds,
+                float(np.median(each)) if len(each) else 0.0,
+                mine.sum() / seconds,
+                float(used[mine].mean()) if mine.any() else 0.0,
+                float(1.4826 * np.median(np.abs(left[good]))) if good.any() else np.nan,
+                float(np.median(std[here])),
                 tuple(zip(ids[most].tolist(), (count[most] / max(len(each), 1)).tolist())),
             )
-        )  # fmt: skip
+        )
     return out
 
 
@@ -77,7 +86,11 @@ def write_csv(path: Path, zones: list[Zone]) -> None:
     lines = [",".join(COLUMNS)]
     for zone in zones:
         numbers = [f"{getattr(zone, name):.3f}" for name in COLUMNS[:-1]]
-        lines.append(",".join([*numbers, " ".join(f"{anchor}:{share:.2f}" for anchor, share in zone.anchors)]))
+        lines.append(
+            ",".join(
+                [*numbers, " ".join(f"{anchor}:{share:.2f}" for anchor, share in zone.anchors)]
+            )
+        )
     write_text(path, "\n".join([*lines, ""]))
 
 
@@ -95,7 +108,9 @@ def draw(path: Path, zones: list[Zone], anchors: Anchors, size: float, title: st
         values = np.full((len(y), len(x)), np.nan)
         for zone in zones:
             value = getattr(zone, name)
-            values[round((zone.y - y[0]) / size), round((zone.x - x[0]) / size)] = value if name == "heard" else 100.0 * value
+            values[round((zone.y - y[0]) / size), round((zone.x - x[0]) / size)] = (
+                value if name == "heard" else 100.0 * value
+            )
         mesh = ax.pcolormesh(x, y, values, shading="nearest", cmap=colours)
         ax.plot(*anchors.positions[~silent, :2].T, "k^", ms=4, label="heard")
         ax.plot(*anchors.positions[silent, :2].T, "rx", ms=5, label="never heard")

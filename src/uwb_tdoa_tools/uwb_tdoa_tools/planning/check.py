@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,9 +12,12 @@ from .multistart import same_place, solutions
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
+
     from .installation import Installation
 
-    Wrap = Callable[[Iterable[Any]], Iterable[Any]]  # gives the same items, and tells how many are done
+    Wrap = Callable[
+        [Iterable[Any]], Iterable[Any]
+    ]  # gives the same items, and tells how many are done
 
 ACROSS = {2: 40, 3: 10}  # places along the longest side of a slice, of a volume, at most
 MOST_PAIRINGS = 8  # pairings that are solved, spread over all; each takes thousands of solutions
@@ -26,8 +29,10 @@ def brute_force(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
     """Solve all over a grid for the pairings of an Installation, from many starts.
 
-    Returns (unique (n,) bool: every pairing solved gave one position; agrees (n,) bool: each as predicted; points (n,
-    3) m; arrows ((m, 2), (m, 2)): some of the flips, from and to, within the grid)."""
+    Returns (unique (n,) bool: every pairing solved gave one position; agrees (n,) bool: each as
+    predicted; points (n, 3) m; arrows ((m, 2), (m, 2)): some of the flips, from and to, within the
+    grid).
+    """
     subsets = Subsets(installation.anchors, installation.unknowns)
     extent = np.array(grid.shape) * grid.step
     across = min(ACROSS[3 if grid.shape[2] > 1 else 2], max(grid.shape))
@@ -46,8 +51,12 @@ def brute_force(
         corners = installation.anchors.positions[subsets.rows[q]]
         for rows in np.array_split(np.arange(len(points)), max(1, len(points) // _BATCH)):
             found = solutions(points[rows], corners, installation.unknowns)
-            one = (np.isnan(found[..., 0]) | same_place(points[rows, None], found, corners)).all(axis=1)
+            one = (np.isnan(found[..., 0]) | same_place(points[rows, None], found, corners)).all(
+                axis=1
+            )
             unique[rows] &= one
             agrees[rows] &= one == predicted[rows, q]
-    near = np.flatnonzero(((mirror >= grid.lower) & (mirror <= grid.lower + extent)).all(axis=1))[::37]
+    near = np.flatnonzero(((mirror >= grid.lower) & (mirror <= grid.lower + extent)).all(axis=1))[
+        ::37
+    ]
     return unique, agrees, points, (points[row[near], :2], mirror[near, :2])

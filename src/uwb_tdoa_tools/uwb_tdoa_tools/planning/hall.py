@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,7 +15,9 @@ from .maps import Chart
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from uwb_tdoa_bias.foundation.anchors import Anchors
+
     from ..simulation.walls import Walls
     from .goal import Goal
     from .maps import Grid
@@ -27,7 +29,10 @@ TILES = 16  # parts of a hall that a process takes at once
 
 @dataclass(frozen=True)
 class Hall:
-    """goal : Goal, whose points are not used; anchors : Anchors; reach : m; walls : Walls, or None. Can be pickled."""
+    """goal : Goal, whose points are not used; anchors : Anchors; reach : m; walls : Walls, or None.
+
+    Can be pickled.
+    """
 
     goal: Goal
     anchors: Anchors
@@ -43,7 +48,13 @@ class Hall:
         points = grid.points
         tiles = self._tiles(points)
         batches = [tiles[at : at + TILES] for at in range(0, len(tiles), TILES)]
-        results = parallel.over(self, [[points[cells] for cells in batch] for batch in batches], jobs, dask, unit="part of the hall")
+        results = parallel.over(
+            self,
+            [[points[cells] for cells in batch] for batch in batches],
+            jobs,
+            dask,
+            unit="part of the hall",
+        )
         whole, heard = self.nothing(points), np.zeros(len(points), int)
         for cells, (found, counts) in zip(tiles, (each for batch in results for each in batch)):
             whole.put(cells, found)
@@ -67,10 +78,15 @@ class Hall:
         return whole, counts
 
     def _tiles(self, points: np.ndarray) -> list[np.ndarray]:
-        """Rows of points (n, 3) m that are near each other: list of (k,) arrays. One array where there are few points and anchors."""
+        """Rows of points (n, 3) m that are near each other: list of (k,) arrays.
+
+        One array where there are few points and anchors.
+        """
         if len(points) * len(self.anchors) <= FEW:
             return [np.arange(len(points))]
-        at = np.floor((points[:, :2] - points[:, :2].min(axis=0)) / max(0.5 * self.reach, 1e-3)).astype(int)
+        at = np.floor(
+            (points[:, :2] - points[:, :2].min(axis=0)) / max(0.5 * self.reach, 1e-3)
+        ).astype(int)
         _, tile = np.unique(at, axis=0, return_inverse=True)
         order = np.argsort(tile.ravel(), kind="stable")
         return np.split(order, np.flatnonzero(np.diff(tile.ravel()[order])) + 1)
@@ -84,8 +100,12 @@ class Hall:
         """The same Hall with other Anchors."""
         return replace(self, anchors=anchors)
 
-    def changed(self, before: Judged, points: np.ndarray, anchors: Anchors, places: np.ndarray) -> Judged:
-        """Judged of points (n, 3) m with other Anchors, which differ at places (m, 3) m only. before : Judged with those of this Hall."""
+    def changed(
+        self, before: Judged, points: np.ndarray, anchors: Anchors, places: np.ndarray
+    ) -> Judged:
+        """Judged of points (n, 3) m with other Anchors, which differ at places (m, 3) m only.
+        before : Judged with those of this Hall.
+        """
         away = np.min(np.linalg.norm(points[:, None] - places, axis=2), axis=1)
         near = np.flatnonzero(away <= self.reach)
         whole, other = before.part(np.arange(len(points))), self.of(anchors)
@@ -94,13 +114,25 @@ class Hall:
         return whole
 
     def side(self, points: np.ndarray) -> dict[str, Any] | None:
-        """{"share": of points (n, 3) m, "tag_side": values}: where those that are heard lie in a plane, so that the side of it must be
-        given; None where nowhere, or where the height is known and they have one height."""
+        """{"share": of points (n, 3) m, "tag_side": values}: where those that are heard lie in a
+        plane, so that the side of it must be given; None where nowhere, or where the height is
+        known and they have one height.
+        """
         sides = []
         for point, rows in zip(points, self.heard(points)):
             if len(rows) > self.goal.installation.unknowns:
                 positions = self.anchors.positions[rows]
-                sides.append(sides_of(positions[np.argsort(np.linalg.norm(positions - point, axis=1))[:NEAREST]]))
-        needed = [one for one in sides if len(one) == 2 or one and self.goal.installation.unknowns == 3]
+                sides.append(
+                    sides_of(
+                        positions[np.argsort(np.linalg.norm(positions - point, axis=1))[:NEAREST]]
+                    )
+                )
+        needed = [
+            one for one in sides if len(one) == 2 or one and self.goal.installation.unknowns == 3
+        ]
         most = max(sorted(set(needed)), key=needed.count, default=None)
-        return None if most is None else {"share": needed.count(most) / len(points), "tag_side": list(most)}
+        return (
+            None
+            if most is None
+            else {"share": needed.count(most) / len(points), "tag_side": list(most)}
+        )

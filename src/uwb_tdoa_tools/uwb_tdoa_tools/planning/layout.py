@@ -18,12 +18,14 @@ _STEP = 1e-6  # of x, for derivatives
 
 @dataclass(frozen=True)
 class Layout:
-    """What is free and what is not, as a vector x of numbers that matter alike: for each anchor to place those of
-    AnchorPlaces, times their length over an arm, then a rotation vector, rad.
+    """What is free and what is not, as a vector x of numbers that matter alike: for each anchor to
+    place those of AnchorPlaces, times their length over an arm, then a rotation vector, rad.
 
-    count : anchors to place; fixed : Anchors that stay, or None; target : (3,) m, what new antennas face, their axis
-    upright, before they are turned; turned : whether they are, or radiate alike in all directions, like anchors whose
-    orientation nobody surveyed."""
+    count : anchors to place; fixed : Anchors that stay, or None; target : (3,) m, what new antennas
+        face, their axis
+    upright, before they are turned; turned : whether they are, or radiate alike in all directions,
+    like anchors whose orientation nobody surveyed.
+    """
 
     places: AnchorPlaces
     count: int
@@ -39,7 +41,10 @@ class Layout:
     @property
     def bounds(self) -> list[tuple[float, float]]:
         """(low, high) of every number of x."""
-        return ([(0.0, length / _ARM) for length in self.places.lengths] + [(-np.pi, np.pi)] * 3 * self.turned) * self.count
+        return (
+            [(0.0, length / _ARM) for length in self.places.lengths]
+            + [(-np.pi, np.pi)] * 3 * self.turned
+        ) * self.count
 
     def start(self, numbers: np.ndarray) -> np.ndarray:
         """x of place numbers (count, places.numbers), antennas not turned."""
@@ -59,8 +64,10 @@ class Layout:
         )
 
     def nudged(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The fixed anchors, the free ones, and these again after a small step of each of their numbers in turn:
-        positions (F + (1 + width) count, 3) m, orientations likewise, steps (len(x),)."""
+        """The fixed anchors, the free ones, and these again after a small step of each of their
+        numbers in turn: positions (F + (1 + width) count, 3) m, orientations likewise, steps
+        (len(x),).
+        """
         rows = np.reshape(x, (self.count, self.width))
         upper = np.reshape(self.bounds, (self.count, self.width, 2))[:, :, 1]
         steps = np.where(rows > 0.5 * upper, -_STEP, _STEP)  # not over the upper end of a place
@@ -72,17 +79,22 @@ class Layout:
         return positions, orientations, steps.ravel()
 
     def free(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Of the positions of `nudged`: the free anchors (count, 3) m, and after each step (count, width, 3) m."""
+        """Of the positions of `nudged`: the free anchors (count, 3) m, and after each step (count,
+        width, 3) m.
+        """
         moved = positions[-self.count * (1 + self.width) :].reshape(1 + self.width, self.count, 3)
         return moved[0], moved[1:].swapaxes(0, 1)
 
     def columns(self) -> np.ndarray:
-        """Which rows of `nudged` make up each layout, first x, then x after the step of each number:
-        (1 + len(x), N)."""
+        """Which rows of `nudged` make up each layout, first x, then x after the step of each
+        number: (1 + len(x), N).
+        """
         fixed = 0 if self.fixed is None else len(self.fixed)
         chosen = np.tile(np.arange(fixed + self.count), (1 + self.count * self.width, 1))
         anchor, number = np.divmod(np.arange(self.count * self.width), self.width)
-        chosen[1 + np.arange(len(anchor)), fixed + anchor] = fixed + self.count * (1 + number) + anchor
+        chosen[1 + np.arange(len(anchor)), fixed + anchor] = (
+            fixed + self.count * (1 + number) + anchor
+        )
         return chosen
 
     def _placed(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -91,7 +103,9 @@ class Layout:
         new = facing(self.places.positions(rows[:, :n] * _ARM / self.places.lengths), self.target)
         if not self.turned:
             return new.positions, np.full((len(rows), 4), np.nan)
-        return new.positions, (Rotation.from_rotvec(rows[:, n:]) * Rotation.from_quat(new.orientations)).as_quat()
+        return new.positions, (
+            Rotation.from_rotvec(rows[:, n:]) * Rotation.from_quat(new.orientations)
+        ).as_quat()
 
 
 def free_ids(taken: np.ndarray, count: int) -> np.ndarray:

@@ -14,8 +14,11 @@ from .judging import Judged, judge
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from numpy.typing import ArrayLike
+
     from uwb_tdoa_bias.foundation.anchors import Anchors
+
     from .installation import Installation
     from .judging import Demand
 
@@ -24,7 +27,9 @@ MOST_CELLS = 4_000_000
 
 @dataclass(frozen=True)
 class Grid:
-    """Cubes side by side. lower (3,) corner of the first, m; step: size of a cube, m; shape (nx, ny, nz)."""
+    """Cubes side by side. lower (3,) corner of the first, m; step: size of a cube, m; shape (nx,
+    ny, nz).
+    """
 
     lower: np.ndarray
     step: float
@@ -32,20 +37,29 @@ class Grid:
 
     @classmethod
     def box(cls, lower: ArrayLike, upper: ArrayLike, step: float) -> Grid:
-        """Cubes of `step` m that cover the box from lower (3,) to upper (3,), m. Raises InputError."""
+        """Cubes of `step` m that cover the box from lower (3,) to upper (3,), m.
+
+        Raises InputError.
+        """
         lower, upper = np.asarray(lower, dtype=float), np.asarray(upper, dtype=float)
         if not 0.0 < step < np.inf:
-            raise InputError(f"step: {step!r} m is not the size of a cell; give one above 0, e.g. 0.1.")
+            raise InputError(
+                f"step: {step!r} m is not the size of a cell; give one above 0, e.g. 0.1."
+            )
         if not (upper > lower).all():
             raise InputError(
-                f"room: {lower.tolist()} to {upper.tolist()} m is empty; give X0 X1 Y0 Y1 (Z0 Z1), each rising."
+                f"room: {lower.tolist()} to {upper.tolist()} m is empty; give X0 X1 Y0 Y1 (Z0 "
+                "Z1), each rising."
             )
         shape = np.ceil((upper - lower) / step - 1e-6)
         if np.prod(shape) > MOST_CELLS:
             raise InputError(
-                f"step: {step:g} m makes {np.prod(shape):.0f} cells, more than {MOST_CELLS}; take it larger."
+                f"step: {step:g} m makes {np.prod(shape):.0f} cells, more than {MOST_CELLS}; "
+                "take it larger."
             )
-        return cls(0.5 * (lower + upper - step * shape), float(step), tuple(shape.astype(int).tolist()))
+        return cls(
+            0.5 * (lower + upper - step * shape), float(step), tuple(shape.astype(int).tolist())
+        )
 
     @classmethod
     def slice(cls, x: Sequence[float], y: Sequence[float], height: float, step: float) -> Grid:
@@ -69,7 +83,9 @@ class Grid:
 
 @dataclass(frozen=True)
 class Chart(Judged):
-    """What is true at every cell of a grid: Judged of n cells, k the dimensions of the installation. grid : Grid; heard : (n,) anchors."""
+    """What is true at every cell of a grid: Judged of n cells, k the dimensions of the
+    installation. grid : Grid; heard : (n,) anchors.
+    """
 
     grid: Grid
     heard: np.ndarray
@@ -97,4 +113,10 @@ def chart(installation: Installation, grid: Grid, demand: Demand) -> Chart:
     """Chart of an Installation all of whose anchors are heard, over a Grid."""
     points = grid.points
     found = judge(points, installation, demand)
-    return Chart(found.covariance, found.error, found.status, grid, np.full(len(points), len(installation.anchors)))
+    return Chart(
+        found.covariance,
+        found.error,
+        found.status,
+        grid,
+        np.full(len(points), len(installation.anchors)),
+    )

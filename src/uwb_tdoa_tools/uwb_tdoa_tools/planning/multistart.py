@@ -1,4 +1,6 @@
-"""The brute-force check of the bifurcation: solve for the position from many starts and see what comes out."""
+"""The brute-force check of the bifurcation: solve for the position from many starts and see what
+comes out.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +12,27 @@ SWEEPS = 40
 SOLVED = 1e-9  # m, residual of a solution
 APART = 3e-4  # of the anchors' extent: two solutions nearer than this are one
 DIRECTIONS = 12  # of the starts in a plane; in space three times as many
-RADII = (0.03, 0.1, 0.3, 0.7, 1.5, 4.0, 12.0, 40.0, 150.0)  # of the starts, over the anchors' extent
+RADII = (
+    0.03,
+    0.1,
+    0.3,
+    0.7,
+    1.5,
+    4.0,
+    12.0,
+    40.0,
+    150.0,
+)  # of the starts, over the anchors' extent
 
 
 def solutions(points: np.ndarray, corners: np.ndarray, dimensions: int) -> np.ndarray:
     """All positions that a solver finds with the TDOAs that k + 1 anchors have at each point.
 
-    points : (n, 3) m; corners : (k + 1, 3) anchors, m; dimensions : k. Levenberg-Marquardt on the k TDOAs from starts
-    in many directions and distances. Returns (n, s, k), a row per start, NaN where it did not end in a solution."""
+    points : (n, 3) m; corners : (k + 1, 3) anchors, m; dimensions : k. Levenberg-Marquardt on the k
+        TDOAs from starts
+    in many directions and distances. Returns (n, s, k), a row per start, NaN where it did not end
+    in a solution.
+    """
     centre = corners[:, :dimensions].mean(axis=0)
     extent = np.linalg.norm(corners - corners.mean(axis=0), axis=1).max()
     rays = _directions(dimensions)
@@ -32,7 +47,9 @@ def solutions(points: np.ndarray, corners: np.ndarray, dimensions: int) -> np.nd
     damping: np.ndarray = np.full(len(x), 1e-3)
     for _ in range(SWEEPS):
         scale = np.sqrt(np.maximum(np.einsum("nii->ni", normal), 1e-24))
-        damped = normal / (scale[:, :, None] * scale[:, None, :]) + damping[:, None, None] * np.eye(dimensions)
+        damped = normal / (scale[:, :, None] * scale[:, None, :]) + damping[:, None, None] * np.eye(
+            dimensions
+        )
         step = np.linalg.solve(damped, (gradient / scale)[..., None])[..., 0] / scale
         longest = extent + np.linalg.norm(x - centre, axis=1)
         step *= np.minimum(1.0, longest / np.maximum(np.linalg.norm(step, axis=1), 1e-300))[:, None]
@@ -51,7 +68,9 @@ def solutions(points: np.ndarray, corners: np.ndarray, dimensions: int) -> np.nd
 
 
 def same_place(points: np.ndarray, found: np.ndarray, anchors: np.ndarray) -> np.ndarray:
-    """Whether positions (..., k) are points (..., 3) but for what the solver leaves, on the scale of anchors (N, 3)."""
+    """Whether positions (..., k) are points (..., 3) but for what the solver leaves, on the scale
+    of anchors (N, 3).
+    """
     apart = APART * np.linalg.norm(np.ptp(anchors, axis=0))
     return np.linalg.norm(found - points[..., : found.shape[-1]], axis=-1) <= apart
 
@@ -72,10 +91,14 @@ def _tdoas(x: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _directions(dimensions: int) -> np.ndarray:
-    """Unit vectors spread evenly: (DIRECTIONS, 2) in the plane, or a Fibonacci sphere of (3 DIRECTIONS, 3)."""
+    """Unit vectors spread evenly: (DIRECTIONS, 2) in the plane, or a Fibonacci sphere of (3
+    DIRECTIONS, 3).
+    """
     if dimensions == 2:
         angle = 2.0 * np.pi * (np.arange(DIRECTIONS) + 0.31) / DIRECTIONS
         return np.stack([np.cos(angle), np.sin(angle)], axis=1)
     k = np.arange(3 * DIRECTIONS) + 0.5
     z, angle = 1.0 - 2.0 * k / (3 * DIRECTIONS), np.pi * (1.0 + np.sqrt(5.0)) * k
-    return np.column_stack([np.sqrt(1.0 - z**2) * np.cos(angle), np.sqrt(1.0 - z**2) * np.sin(angle), z])
+    return np.column_stack(
+        [np.sqrt(1.0 - z**2) * np.cos(angle), np.sqrt(1.0 - z**2) * np.sin(angle), z]
+    )

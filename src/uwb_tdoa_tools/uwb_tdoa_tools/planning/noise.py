@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from uwb_tdoa_bias.foundation.antenna import Antenna
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.safe_yaml import read_yaml
 from uwb_tdoa_bias.foundation.radio import SPEED_OF_LIGHT, RadioLink, received_power_dbm
+from uwb_tdoa_bias.foundation.safe_yaml import read_yaml
 
 if TYPE_CHECKING:
     from pathlib import Path
+
     from uwb_tdoa_bias.foundation.anchors import Anchors
 
 BOLTZMANN = 1.380649e-23  # J/K
@@ -37,17 +38,20 @@ class Omnidirectional:
 class RadioNoise:
     """Noise from the link budget: Friis, thermal noise and the anchors' radiation pattern.
 
-    Source: eqs. 9 - 14 of Grasso et al. (Sensors 2022, 22, 9136). The gain of the receiving antenna is left out, as
-    there.
+    Source: eqs. 9 - 14 of Grasso et al. (Sensors 2022, 22, 9136). The gain of the receiving antenna
+    is left out, as there.
 
     Attributes
     ----------
-    antenna : Antenna of the anchors (default DWM1000-like); an anchor without orientation radiates the mean of the
+    antenna : Antenna of the anchors (default DWM1000-like); an anchor without orientation radiates
+        the mean of the
         azimuth cut in all directions
-    tx_power_dbm : into the antenna, at the reference temperature and voltage, dBm (default: that of RadioLink)
+    tx_power_dbm : into the antenna, at the reference temperature and voltage, dBm (default: that of
+        RadioLink)
     temperature : degrees Celsius, of transmitter and thermal noise (default 25)
     voltage : supply of the transmitter, V (default 3.3)
-    tx_power_per_degree, tx_power_per_volt : dB (default: typical of the DW1000 data sheet, channel 2)
+    tx_power_per_degree, tx_power_per_volt : dB (default: typical of the DW1000 data sheet, channel
+        2)
     bandwidth : Hz (default 499.2e6, channels 1, 2, 3 and 5)
     full_strength : m, nearer than this a reception becomes no better: r_0 of eq. 9 (default 1.0)
     """
@@ -62,10 +66,16 @@ class RadioNoise:
     full_strength: float = 1.0
 
     def __post_init__(self) -> None:
-        for name, low, high in (("tx_power_dbm", -60, 30), ("temperature", -40, 85), ("voltage", 2.8, 3.6)):
+        for name, low, high in (
+            ("tx_power_dbm", -60, 30),
+            ("temperature", -40, 85),
+            ("voltage", 2.8, 3.6),
+        ):
             value = getattr(self, name)
             if not low <= value <= high:
-                raise InputError(f"{name}: {value!r} is outside {low} ... {high}, the range of a DW1000.")
+                raise InputError(
+                    f"{name}: {value!r} is outside {low} ... {high}, the range of a DW1000."
+                )
 
     @property
     def transmitted_dbm(self) -> float:
@@ -79,7 +89,9 @@ class RadioNoise:
         return 10.0 * np.log10(BOLTZMANN * (self.temperature + ZERO_CELSIUS) * self.bandwidth * 1e3)
 
     def variance(self, points: np.ndarray, anchors: Anchors) -> np.ndarray:
-        """Variance of the range that one reception gives: (n, N) m^2, for points (n, 3) m and N Anchors. Eqs. 9, 12."""
+        """Variance of the range that one reception gives: (n, N) m^2, for points (n, 3) m and N
+        Anchors. Eqs. 9, 12.
+        """
         snr_db = self._received(points, anchors) - self.thermal_noise_dbm
         return (SPEED_OF_LIGHT / self.bandwidth) ** 2 * 10.0 ** (-0.1 * snr_db)
 
@@ -94,10 +106,14 @@ class RadioNoise:
         for rows, antenna in ((turned, self.antenna), (~turned, mean)):
             if rows.any():
                 link = RadioLink(
-                    antenna, Omnidirectional(), tx_power_dbm=self.transmitted_dbm  # type: ignore[arg-type]  # has `gain`
+                    antenna,  # type: ignore[arg-type]  # has `gain`
+                    Omnidirectional(),  # type: ignore[arg-type]  # has `gain`
+                    tx_power_dbm=self.transmitted_dbm,
                 )
                 q = np.where(turned[rows, None], anchors.orientations[rows], _ANY_ATTITUDE)
-                power[:, rows] = received_power_dbm(away[:, rows], _ANY_ATTITUDE, np.zeros(3), q, link)
+                power[:, rows] = received_power_dbm(
+                    away[:, rows], _ANY_ATTITUDE, np.zeros(3), q, link
+                )
         return power
 
 
@@ -109,7 +125,9 @@ class FixedNoise:
 
     def __post_init__(self) -> None:
         if not 0.0 < self.std < 100.0:
-            raise InputError(f"noise: {self.std!r} m is not a standard deviation; give one above 0, e.g. 0.06.")
+            raise InputError(
+                f"noise: {self.std!r} m is not a standard deviation; give one above 0, e.g. 0.06."
+            )
 
     def variance(self, points: np.ndarray, anchors: Anchors) -> np.ndarray:
         """(n, N) m^2."""
@@ -117,28 +135,41 @@ class FixedNoise:
 
 
 def variance_gradient(
-    noise: RadioNoise | FixedNoise, points: np.ndarray, anchors: Anchors, variance: np.ndarray, dimensions: int
+    noise: RadioNoise | FixedNoise,
+    points: np.ndarray,
+    anchors: Anchors,
+    variance: np.ndarray,
+    dimensions: int,
 ) -> np.ndarray:
-    """Derivative of noise.variance along x, y (and z), by one-sided differences: (n, N, dimensions) m.
+    """Derivative of noise.variance along x, y (and z), by one-sided differences: (n, N, dimensions)
+    m.
 
     variance : (n, N) m^2, noise.variance at the points.
     """
     if isinstance(noise, FixedNoise):
         return np.zeros((*variance.shape, dimensions))
     steps = _STEP * np.eye(3)[:dimensions]
-    return np.stack([noise.variance(points + step, anchors) - variance for step in steps], axis=-1) / _STEP
+    return (
+        np.stack([noise.variance(points + step, anchors) - variance for step in steps], axis=-1)
+        / _STEP
+    )
 
 
 def antenna_from_yaml(path: str | Path) -> Antenna:
-    """Antenna of a YAML file with the fields of `uwb_tdoa_bias.foundation.antenna.Antenna`: azimuth, elevation_1,
-    elevation_2 (dBi, around the full circle), and optionally gain_offset. Raises InputError."""
+    """Antenna of a YAML file with the fields of `uwb_tdoa_bias.foundation.antenna.Antenna`:
+    azimuth, elevation_1, elevation_2 (dBi, around the full circle), and optionally gain_offset.
+    Raises InputError.
+    """
     content = read_yaml(path)
     try:
-        cuts: dict[str, Any] = {name: tuple(content.pop(name)) for name in ("azimuth", "elevation_1", "elevation_2")}
+        cuts: dict[str, Any] = {
+            name: tuple(content.pop(name)) for name in ("azimuth", "elevation_1", "elevation_2")
+        }
         return Antenna(**cuts, **content)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise InputError(
-            f"{path}: is no antenna ({error!r}); give lists azimuth, elevation_1 and elevation_2 of gains in dBi."
+            f"{path}: is no antenna ({error!r}); give lists azimuth, elevation_1 and "
+            "elevation_2 of gains in dBi."
         ) from error

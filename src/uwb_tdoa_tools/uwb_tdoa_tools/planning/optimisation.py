@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -33,15 +33,27 @@ CLOSE = 1.002  # worst error over the worst looked at, with which none are added
 
 
 def optimise(
-    goal: Goal, places: AnchorPlaces, count: int, fixed: Anchors | None = None, start: np.ndarray | None = None,
-    starts: int = 16, progress: Wrap = iter,
-) -> Anchors:  # fmt: skip
-    """Anchors at the `count` best places, turned in the best directions; after those of `fixed`, which stay.
+    goal: Goal,
+    places: AnchorPlaces,
+    count: int,
+    fixed: Anchors | None = None,
+    start: np.ndarray | None = None,
+    starts: int = 16,
+    progress: Wrap = iter,
+) -> Anchors:
+    """Anchors at the `count` best places, turned in the best directions; after those of `fixed`,
+    which stay.
 
-    goal : Goal; places : AnchorPlaces; start : (count, 3) m, a layout to begin with besides the quasi-random ones;
-    progress : wraps the starts. Descents from all starts at a few of the goal's points; the best of what
-    they lead to descend again, with the points that turn out to be the worst. The best score at all points wins."""
-    layout = Layout(places, count, fixed, goal.points.mean(axis=0), are_turned(goal.installation.anchors))
+    goal : Goal; places : AnchorPlaces; start : (count, 3) m, a layout to begin with besides the
+        quasi-random ones;
+    progress : wraps the starts. Descents from all starts at a few of the goal's points; the best of
+        what
+    they lead to descend again, with the points that turn out to be the worst. The best score at all
+    points wins.
+    """
+    layout = Layout(
+        places, count, fixed, goal.points.mean(axis=0), are_turned(goal.installation.anchors)
+    )
     rows = _some(goal, ROUGH)
     looked_at = replace(goal, points=goal.points[rows])
     from scipy.stats import qmc  # takes a second to import
@@ -61,18 +73,25 @@ def optimise(
     return best
 
 
-def one_more(goal: Goal, anchors: Anchors, places: AnchorPlaces, count: int = 400) -> tuple[np.ndarray, np.ndarray]:
-    """What one more anchor would give at places all over that are not beside another: (numbers (n, places.numbers), scores (n,) m), facing
-    the points."""
+def one_more(
+    goal: Goal, anchors: Anchors, places: AnchorPlaces, count: int = 400
+) -> tuple[np.ndarray, np.ndarray]:
+    """What one more anchor would give at places all over that are not beside another: (numbers (n,
+    places.numbers), scores (n,) m), facing the points.
+    """
     layout = Layout(places, 1, anchors, goal.points.mean(axis=0), are_turned(anchors))
     numbers = places.grid(count)
-    away = np.linalg.norm(places.positions(numbers)[:, None] - anchors.positions, axis=2).min(axis=1)
+    away = np.linalg.norm(places.positions(numbers)[:, None] - anchors.positions, axis=2).min(
+        axis=1
+    )
     numbers = numbers[away >= BESIDE]
     return numbers, np.array([goal.score(layout.anchors(layout.start(x))) for x in numbers])
 
 
 def are_turned(anchors: Anchors) -> bool:
-    """Whether the orientation of any of the Anchors is known: only then are directions part of a layout."""
+    """Whether the orientation of any of the Anchors is known: only then are directions part of a
+    layout.
+    """
     return bool(np.isfinite(anchors.orientations).all(axis=1).any())
 
 
@@ -87,8 +106,9 @@ def with_one(anchors: Anchors, position: np.ndarray) -> Anchors:
 
 
 def named(better: Anchors, before: Anchors) -> Anchors:
-    """Anchors of a layout with the ids that they have `before`: who is moved is moved as little as possible in all. New ids where there are
-    more than before."""
+    """Anchors of a layout with the ids that they have `before`: who is moved is moved as little as
+    possible in all. New ids where there are more than before.
+    """
     away = np.linalg.norm(better.positions[:, None] - before.positions, axis=2)
     rows, old = linear_sum_assignment(away)
     ids = np.empty(len(better), int)
@@ -99,8 +119,9 @@ def named(better: Anchors, before: Anchors) -> Anchors:
 
 
 def rounded(better: Anchors, before: Anchors) -> Anchors:
-    """The same Anchors as somebody can put them up: to the centimetre and the degree; those that stay as they are `before` are not
-    touched."""
+    """The same Anchors as somebody can put them up: to the centimetre and the degree; those that
+    stay as they are `before` are not touched.
+    """
     moved = _moved(better, before)
     positions, orientations = better.positions.copy(), better.orientations.copy()
     positions[moved] = positions[moved].round(2)
@@ -112,30 +133,41 @@ def rounded(better: Anchors, before: Anchors) -> Anchors:
 
 
 def placed(better: Anchors, before: Anchors) -> list[dict[str, Any]]:
-    """[{"id", "words"}] of the Anchors that are not where they are `before`: where to put them, and which way they face."""
+    """[{"id", "words"}] of the Anchors that are not where they are `before`: where to put them, and
+    which way they face.
+    """
     rows = before.index(better.ids)
     found = []
     for row in np.flatnonzero(_moved(better, before)).tolist():
         position, q = better.positions[row], better.orientations[row]
-        words = ("new, at" if rows[row] < 0 else "to") + " ({:.2f}, {:.2f}, {:.2f})".format(*position)
+        words = ("new, at" if rows[row] < 0 else "to") + " ({:.2f}, {:.2f}, {:.2f})".format(
+            *position
+        )
         if rows[row] >= 0:
             words += f", by {np.linalg.norm(position - before.positions[rows[row]]):.2f} m"
         if np.isfinite(q).all():
             yaw, pitch, roll = Rotation.from_quat(q).as_euler("ZYX", degrees=True).round()
-            words += f", its front turned {yaw:.0f} deg from x towards y, {pitch:.0f} deg downwards, rolled by {roll:.0f} deg"
+            words += (
+                f", its front turned {yaw:.0f} deg from x towards y, {pitch:.0f} deg downwards, "
+                f"rolled by {roll:.0f} deg"
+            )
         found.append({"id": int(better.ids[row]), "words": words})
     return found
 
 
 def _moved(better: Anchors, before: Anchors) -> np.ndarray:
-    """Which of the Anchors are new, or more than a millimetre from where they are `before`: (n,) bool."""
+    """Which of the Anchors are new, or more than a millimetre from where they are `before`: (n,)
+    bool.
+    """
     rows = before.index(better.ids)
     return (rows < 0) | (np.linalg.norm(better.positions - before.positions[rows], axis=1) > 1e-3)
 
 
 def _beside(anchors: Anchors, count: int) -> bool:
     """Whether any of the last `count` Anchors is beside another."""
-    away = np.linalg.norm(anchors.positions[:, None] - anchors.positions, axis=2) + 2.0 * BESIDE * np.eye(len(anchors))
+    away = np.linalg.norm(
+        anchors.positions[:, None] - anchors.positions, axis=2
+    ) + 2.0 * BESIDE * np.eye(len(anchors))
     return bool((away[-count:] < BESIDE).any())
 
 
@@ -147,7 +179,9 @@ def _some(goal: Goal, count: int) -> np.ndarray:
 
 
 def _refined(goal: Goal, layout: Layout, x: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """x after descents at these rows of the goal's points and at those that turn out to be worse; or x itself."""
+    """x after descents at these rows of the goal's points and at those that turn out to be worse;
+    or x itself.
+    """
     best, score = x, goal.score(layout.anchors(x))
     for _ in range(EXCHANGES):
         try:

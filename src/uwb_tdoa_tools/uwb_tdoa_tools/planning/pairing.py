@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,9 +18,11 @@ class Pairing:
     Attributes
     ----------
     a, b : (M,) rows of the anchors, d_ab = |p - b| - |p - a|
-    shared : the TDOAs of a round use one reception per anchor, whose error they share; otherwise every TDOA has its own
+    shared : the TDOAs of a round use one reception per anchor, whose error they share; otherwise
+        every TDOA has its own
     times : how often each TDOA comes in a round (default 1)
-    ranges : not differences but the distances to the anchors of `a` themselves, each measured once a round
+    ranges : not differences but the distances to the anchors of `a` themselves, each measured once
+        a round
     beside : Pairing, what the round holds besides, measured independently; or None
     """
 
@@ -39,7 +40,9 @@ class Pairing:
 
     @property
     def one_solution(self) -> bool:
-        """Whether it holds distances: among anchors that are not in a plane these are so from one place only."""
+        """Whether it holds distances: among anchors that are not in a plane these are so from one
+        place only.
+        """
         return any(part.ranges for part in self.parts)
 
     def incidence(self) -> np.ndarray:
@@ -52,9 +55,11 @@ class Pairing:
     def covariance(self, variance: np.ndarray, link_std: float = 0.0) -> np.ndarray:
         """Covariance of the TDOAs: (n, M, M) m^2.
 
-        variance : (n, N) m^2 of the receptions. link_std : m, error that every TDOA has of its own besides (the
-        anchor's reception of the other anchor's packet, which the tag's TDOA also contains). Source: eqs. 4 and 5 of
-        Grasso et al. (Sensors 2022, 22, 9136); A18 for a common reference."""
+        variance : (n, N) m^2 of the receptions. link_std : m, error that every TDOA has of its own
+            besides (the
+        anchor's reception of the other anchor's packet, which the tag's TDOA also contains).
+        Source: eqs. 4 and 5 of Grasso et al. (Sensors 2022, 22, 9136); A18 for a common reference.
+        """
         own = link_std**2 * np.eye(len(self.a))
         if self.ranges:
             return variance[:, self.a, None] * np.eye(len(self.a)) + own
@@ -75,7 +80,9 @@ def common_reference(n: int) -> Pairing:
 
 
 def all_pairs(n: int) -> Pairing:
-    """TDOA3: any anchor with any other, each TDOA with an error of its own; weighted to N TDOAs a round."""
+    """TDOA3: any anchor with any other, each TDOA with an error of its own; weighted to N TDOAs a
+    round.
+    """
     a, b = np.triu_indices(n, 1)
     return Pairing(a, b, False, 2.0 / (n - 1))
 
@@ -100,6 +107,9 @@ PAIRINGS: dict[str, Callable[[int], Pairing]] = {
     "all_pairs+every_range": _beside_ranges(all_pairs),
 }
 OF_PROTOCOL = {
-    "tdoa2": "ring", "tdoa3": "all_pairs", "ranges": "every_range", "tdoa2+ranges": "ring+every_range",
+    "tdoa2": "ring",
+    "tdoa3": "all_pairs",
+    "ranges": "every_range",
+    "tdoa2+ranges": "ring+every_range",
     "tdoa3+ranges": "all_pairs+every_range",
-}  # fmt: skip
+}

@@ -1,15 +1,17 @@
-"""Pictures of charts, each with one message, to be read at 700 pixels: precision, where it can be flown, accuracy, layouts."""
+"""Pictures of charts, each with one message, to be read at 700 pixels: precision, where it can be
+flown, accuracy, layouts.
+"""
 
 from __future__ import annotations
 
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import EllipseCollection
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
+import numpy as np
 from PIL import Image
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
@@ -25,9 +27,12 @@ from .precision import ellipses
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
+
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
     from uwb_tdoa_bias.foundation.anchors import Anchors
+
     from ..simulation.walls import Walls
     from .accuracy import AccuracyMap
     from .installation import Installation
@@ -49,11 +54,15 @@ _MOST_LAYERS = 3
 ACROSS = 9  # ellipses along the longer side of a map
 
 
-def plot_precision(anchors: Anchors, chart: Chart, path: str | Path, walls: Walls | None = None) -> None:
+def plot_precision(
+    anchors: Anchors, chart: Chart, path: str | Path, walls: Walls | None = None
+) -> None:
     """The bound of one round, with 99 % ellipses."""
     layers = _layers(chart.grid)
     figure, axes = _panels(chart.grid, len(layers))
-    flown = chart.error[chart.flyable] if chart.flyable.any() else chart.error[np.isfinite(chart.error)]
+    flown = (
+        chart.error[chart.flyable] if chart.flyable.any() else chart.error[np.isfinite(chart.error)]
+    )
     scale = _scale(100.0 * flown)
     times = _enlarged(chart)
     for ax, k in zip(axes, layers):
@@ -62,40 +71,83 @@ def plot_precision(anchors: Anchors, chart: Chart, path: str | Path, walls: Wall
         _ellipses(ax, chart, k, times)
         ax.set_title(_height(chart.grid, k), fontsize=10)
     _bar(axes, mesh, "bound of one round, cm", _beyond(100.0 * chart.error, scale))
-    ellipse = Line2D([], [], color="0.3", marker="o", mfc="none", ls="", label=f"99 % of the estimates, {times} times as large")
-    _finish(figure, "How precise one round is", [_hull_line(), _anchor_mark(anchors), ellipse], [(ax, anchors) for ax in axes], path)
+    ellipse = Line2D(
+        [],
+        [],
+        color="0.3",
+        marker="o",
+        mfc="none",
+        ls="",
+        label=f"99 % of the estimates, {times} times as large",
+    )
+    _finish(
+        figure,
+        "How precise one round is",
+        [_hull_line(), _anchor_mark(anchors), ellipse],
+        [(ax, anchors) for ax in axes],
+        path,
+    )
 
 
 def plot_flyable(
-    anchors: Anchors, chart: Chart, path: str | Path, walls: Walls | None = None, pairings: Installation | None = None
-) -> None:  # fmt: skip
-    """Where it can be flown, and why not elsewhere. pairings : Installation whose bifurcation curves are drawn, each choice of anchors by
-    itself, or None."""
+    anchors: Anchors,
+    chart: Chart,
+    path: str | Path,
+    walls: Walls | None = None,
+    pairings: Installation | None = None,
+) -> None:
+    """Where it can be flown, and why not elsewhere. pairings : Installation whose bifurcation
+    curves are drawn, each choice of anchors by itself, or None.
+    """
     layers, codes = _layers(chart.grid), [code for code in STATES if (chart.status == code).any()]
     figure, axes = _panels(chart.grid, len(layers))
     x, y, _ = chart.grid.axes
     for ax, k in zip(axes, layers):
         status = chart.grid.layer(chart.status, k)
         colours = ListedColormap([colour for _, colour in STATES.values()])
-        ax.pcolormesh(x, y, status, cmap=colours, vmin=-0.5, vmax=len(STATES) - 0.5, shading="nearest", rasterized=True)
+        ax.pcolormesh(
+            x,
+            y,
+            status,
+            cmap=colours,
+            vmin=-0.5,
+            vmax=len(STATES) - 0.5,
+            shading="nearest",
+            rasterized=True,
+        )
         if pairings is not None and min(len(x), len(y)) > 1:
             points = chart.grid.layer(chart.grid.points, k).reshape(-1, 3)
-            discriminant = Subsets(pairings.anchors, pairings.unknowns).discriminant(points).reshape(len(y), len(x), -1)
+            discriminant = (
+                Subsets(pairings.anchors, pairings.unknowns)
+                .discriminant(points)
+                .reshape(len(y), len(x), -1)
+            )
             for q in range(discriminant.shape[2]):
                 ax.contour(x, y, discriminant[:, :, q], levels=[0.0], colors="0.45", linewidths=0.6)
         _room(ax, anchors, chart.grid, k, walls)
-        ax.set_title(_height(chart.grid, k) + f": {np.mean(status == FLYABLE):.0%} can be flown".replace("%", " %"), fontsize=10)
+        ax.set_title(
+            _height(chart.grid, k)
+            + f": {np.mean(status == FLYABLE):.0%} can be flown".replace("%", " %"),
+            fontsize=10,
+        )
     shares = [(STATES[code], np.mean(chart.status == code)) for code in codes]
-    marks: list[Any] = [Patch(facecolor=colour, label=f"{name}: {100.0 * share:.0f} %") for (name, colour), share in shares]
+    marks: list[Any] = [
+        Patch(facecolor=colour, label=f"{name}: {100.0 * share:.0f} %")
+        for (name, colour), share in shares
+    ]
     marks += [_hull_line(), _anchor_mark(anchors)]
     if pairings is not None:
-        marks.append(Line2D([], [], color="0.45", lw=0.8, label="bifurcation curve of a choice of anchors"))
+        marks.append(
+            Line2D([], [], color="0.45", lw=0.8, label="bifurcation curve of a choice of anchors")
+        )
     whole = "this slice" if chart.grid.shape[2] == 1 else "the room"
     title = f"Where it can be flown: {100.0 * chart.flyable.mean():.0f} % of {whole}"
     _finish(figure, title, marks, [(ax, anchors) for ax in axes], path)
 
 
-def plot_heard(anchors: Anchors, chart: Chart, path: str | Path, walls: Walls | None = None) -> None:
+def plot_heard(
+    anchors: Anchors, chart: Chart, path: str | Path, walls: Walls | None = None
+) -> None:
     """How many anchors are heard, of the middle layer."""
     figure, (ax,) = _panels(chart.grid, 1)
     k = chart.grid.shape[2] // 2
@@ -105,34 +157,73 @@ def plot_heard(anchors: Anchors, chart: Chart, path: str | Path, walls: Walls | 
     mesh = ax.pcolormesh(x, y, layer, cmap="viridis", norm=norm, shading="nearest", rasterized=True)
     _bar([ax], mesh, "anchors heard", "max", HEARD_COLOURS)
     _room(ax, anchors, chart.grid, k, walls)
-    ax.set_title(_height(chart.grid, k) + f": {100.0 * np.mean(chart.heard >= 4):.0f} % hear 4 or more", fontsize=10)
-    _finish(figure, f"How many of {len(anchors)} anchors are heard", [_hull_line(), _anchor_mark(anchors)], [(ax, anchors)], path)
+    ax.set_title(
+        _height(chart.grid, k) + f": {100.0 * np.mean(chart.heard >= 4):.0f} % hear 4 or more",
+        fontsize=10,
+    )
+    _finish(
+        figure,
+        f"How many of {len(anchors)} anchors are heard",
+        [_hull_line(), _anchor_mark(anchors)],
+        [(ax, anchors)],
+        path,
+    )
 
 
 def plot_flips(
-    installation: Installation, points: np.ndarray, unique: np.ndarray, agrees: np.ndarray,
-    mirrors: tuple[np.ndarray, np.ndarray], path: str | Path,
-) -> None:  # fmt: skip
-    """Result of the brute-force check: points with one solution, with several, and where it contradicts the prediction.
+    installation: Installation,
+    points: np.ndarray,
+    unique: np.ndarray,
+    agrees: np.ndarray,
+    mirrors: tuple[np.ndarray, np.ndarray],
+    path: str | Path,
+) -> None:
+    """Result of the brute-force check: points with one solution, with several, and where it
+    contradicts the prediction.
 
-    points (n, 3); unique, agrees (n,) bool; mirrors : (from (m, 2), to (m, 2)), flips to draw as arrows.
+    points (n, 3); unique, agrees (n,) bool; mirrors : (from (m, 2), to (m, 2)), flips to draw as
+    arrows.
     """
     figure, ax = plt.subplots(figsize=(WIDTH, WIDTH), layout="constrained")
-    for chosen, state, label in ((unique, FLYABLE, "one solution"), (~unique, TWO_SOLUTIONS, "two solutions of a choice of anchors")):
+    for chosen, state, label in (
+        (unique, FLYABLE, "one solution"),
+        (~unique, TWO_SOLUTIONS, "two solutions of a choice of anchors"),
+    ):
         colour = STATES[state][1]
-        ax.plot(*points[chosen, :2].T, "s", color=colour, ms=4, label=f"{label}: {100.0 * np.mean(chosen):.0f} %")
-    ax.plot(*points[~agrees, :2].T, "kx", ms=6, label=f"not as predicted: {100.0 * np.mean(~agrees):.1f} %")
+        ax.plot(
+            *points[chosen, :2].T,
+            "s",
+            color=colour,
+            ms=4,
+            label=f"{label}: {100.0 * np.mean(chosen):.0f} %",
+        )
+    ax.plot(
+        *points[~agrees, :2].T,
+        "kx",
+        ms=6,
+        label=f"not as predicted: {100.0 * np.mean(~agrees):.1f} %",
+    )
     for (x0, y0), (x1, y1) in zip(*mirrors):
-        ax.annotate("", (x1, y1), (x0, y0), arrowprops={"arrowstyle": "->", "color": "0.3", "lw": 0.9})
+        ax.annotate(
+            "", (x1, y1), (x0, y0), arrowprops={"arrowstyle": "->", "color": "0.3", "lw": 0.9}
+        )
     ax.set(xlabel="x, m", ylabel="y, m", aspect="equal")
     _hull(ax, installation.anchors)
     _anchors(ax, installation.anchors)
     marks = [*ax.get_legend_handles_labels()[0], _hull_line(), _anchor_mark(installation.anchors)]
-    _finish(figure, "Solved from many starts; arrows lead to the other solution", marks, [(ax, installation.anchors)], path)
+    _finish(
+        figure,
+        "Solved from many starts; arrows lead to the other solution",
+        marks,
+        [(ax, installation.anchors)],
+        path,
+    )
 
 
 def plot_accuracy(installation: Installation, found: AccuracyMap, path: str | Path) -> None:
-    """Measured error beside what the filter claims and the bound, 3D, one colour scale; seen from above."""
+    """Measured error beside what the filter claims and the bound, 3D, one colour scale; seen from
+    above.
+    """
     columns = (
         ("measured error (RMSE)", found.rmse),
         ("of it bias", found.bias),
@@ -142,16 +233,38 @@ def plot_accuracy(installation: Installation, found: AccuracyMap, path: str | Pa
     flat = []
     for _, values in columns:
         weight = np.where(np.isfinite(values[:, 0]), found.count, 0)
-        squared = np.where(weight > 0, np.nan_to_num(np.sum(values**2, axis=1)) * weight, 0.0).reshape(found.grid.shape).sum(axis=2)
+        squared = (
+            np.where(weight > 0, np.nan_to_num(np.sum(values**2, axis=1)) * weight, 0.0)
+            .reshape(found.grid.shape)
+            .sum(axis=2)
+        )
         counted = weight.reshape(found.grid.shape).sum(axis=2)
-        flat.append(100.0 * np.sqrt(np.where(counted > 0, squared, np.nan) / np.maximum(counted, 1)).T)
+        flat.append(
+            100.0 * np.sqrt(np.where(counted > 0, squared, np.nan) / np.maximum(counted, 1)).T
+        )
     every = np.concatenate([values.ravel() for values in flat])
     scale = _scale(every[np.isfinite(every)])
     x, y, _ = found.grid.axes
     ratio = np.ptp(y) / max(np.ptp(x), 1e-9)
-    figure, axes = plt.subplots(2, 2, figsize=(WIDTH, 1.2 + 0.85 * WIDTH * ratio), layout="constrained", sharex=True, sharey=True)
+    figure, axes = plt.subplots(
+        2,
+        2,
+        figsize=(WIDTH, 1.2 + 0.85 * WIDTH * ratio),
+        layout="constrained",
+        sharex=True,
+        sharey=True,
+    )
     for ax, (label, _), values in zip(axes.ravel(), columns, flat):
-        mesh = ax.pcolormesh(x, y, values, cmap=COLOURS, vmin=scale[0], vmax=scale[1], shading="nearest", rasterized=True)
+        mesh = ax.pcolormesh(
+            x,
+            y,
+            values,
+            cmap=COLOURS,
+            vmin=scale[0],
+            vmax=scale[1],
+            shading="nearest",
+            rasterized=True,
+        )
         ax.set_title(label, fontsize=10)
         _room(ax, installation.anchors, found.grid, None)
     for ax in axes[0]:
@@ -163,15 +276,21 @@ def plot_accuracy(installation: Installation, found: AccuracyMap, path: str | Pa
     _finish(figure, "Measured error beside what is claimed and what is possible", marks, [], path)
 
 
-def plot_layouts(charts: Sequence[tuple[str, Installation, Chart]], flown: np.ndarray, path: str | Path) -> None:
-    """Bound before and after, of the middle layer, at one scale: that of where it is flown. charts : [(title, Installation, Chart)];
-    flown : (n, 3) m, places that are flown."""
+def plot_layouts(
+    charts: Sequence[tuple[str, Installation, Chart]], flown: np.ndarray, path: str | Path
+) -> None:
+    """Bound before and after, of the middle layer, at one scale: that of where it is flown. charts
+    : [(title, Installation, Chart)];
+    flown : (n, 3) m, places that are flown.
+    """
     grid = charts[0][2].grid
     k = grid.shape[2] // 2
     figure, axes = _panels(grid, len(charts))
     low, high = flown.min(axis=0)[:2], flown.max(axis=0)[:2]
     inside = ((grid.points[:, :2] >= low) & (grid.points[:, :2] <= high)).all(axis=1)
-    finite = np.concatenate([chart.error[inside & np.isfinite(chart.error)] for _, _, chart in charts])
+    finite = np.concatenate(
+        [chart.error[inside & np.isfinite(chart.error)] for _, _, chart in charts]
+    )
     scale = _scale(100.0 * finite)
     blocked = any((~chart.grid.layer(chart.flyable, k)).any() for _, _, chart in charts)
     for ax, (title, installation, chart) in zip(axes, charts):
@@ -179,30 +298,82 @@ def plot_layouts(charts: Sequence[tuple[str, Installation, Chart]], flown: np.nd
         _hatch(ax, chart, k)
         _room(ax, installation.anchors, grid, k)
         ax.add_patch(Rectangle(tuple(low), *(high - low).tolist(), fill=False, ec="r", lw=1.5))
-        share, median = 100.0 * chart.flyable.mean(), 100.0 * np.median(chart.error[inside]) if inside.any() else np.nan
-        ax.set_title(f"{title}: {share:.0f} % can be flown; median bound where it is flown {median:.1f} cm", fontsize=10)
-    _bar(axes, mesh, "bound of one round, cm", _beyond(100.0 * np.concatenate([chart.error for _, _, chart in charts]), scale))
-    marks: list[Any] = [_hull_line(), _anchor_mark(charts[0][1].anchors), Patch(fill=False, ec="r", label="where it is flown")]
+        share, median = (
+            100.0 * chart.flyable.mean(),
+            100.0 * np.median(chart.error[inside]) if inside.any() else np.nan,
+        )
+        ax.set_title(
+            f"{title}: {share:.0f} % can be flown; median bound where it is flown {median:.1f} cm",
+            fontsize=10,
+        )
+    _bar(
+        axes,
+        mesh,
+        "bound of one round, cm",
+        _beyond(100.0 * np.concatenate([chart.error for _, _, chart in charts]), scale),
+    )
+    marks: list[Any] = [
+        _hull_line(),
+        _anchor_mark(charts[0][1].anchors),
+        Patch(fill=False, ec="r", label="where it is flown"),
+    ]
     if blocked:
         marks.append(Patch(facecolor="white", edgecolor="k", hatch="////", label="cannot be flown"))
-    title = f"Before and after, {_height(grid, k)}" + ("; hatched: cannot be flown" if blocked else "; all can be flown")
-    _finish(figure, title, marks, [(ax, installation.anchors) for ax, (_, installation, _) in zip(axes, charts)], path)
+    title = f"Before and after, {_height(grid, k)}" + (
+        "; hatched: cannot be flown" if blocked else "; all can be flown"
+    )
+    _finish(
+        figure,
+        title,
+        marks,
+        [(ax, installation.anchors) for ax, (_, installation, _) in zip(axes, charts)],
+        path,
+    )
 
 
-def plot_places(places: AnchorPlaces, numbers: np.ndarray, scores: np.ndarray, path: str | Path) -> None:
-    """What one more anchor gives at places all over, the walls side by side. numbers : (n, places.numbers) of AnchorPlaces; scores : (n,)
-    m, of `Goal.score`."""
+def plot_places(
+    places: AnchorPlaces, numbers: np.ndarray, scores: np.ndarray, path: str | Path
+) -> None:
+    """What one more anchor gives at places all over, the walls side by side. numbers : (n,
+    places.numbers) of AnchorPlaces; scores : (n,) m, of `Goal.score`.
+    """
     figure, ax = plt.subplots(figsize=(WIDTH, 3.6), layout="constrained")
     at = places.positions(numbers)
     along, height = numbers[:, 0] * places.ends[-1], at[:, 2]
     scale = _scale(100.0 * scores[np.isfinite(scores)])
-    dots = ax.scatter(along, height, c=100.0 * scores, cmap=COLOURS, s=60, vmin=scale[0], vmax=scale[1], edgecolors="0.4", linewidths=0.3)
+    dots = ax.scatter(
+        along,
+        height,
+        c=100.0 * scores,
+        cmap=COLOURS,
+        s=60,
+        vmin=scale[0],
+        vmax=scale[1],
+        edgecolors="0.4",
+        linewidths=0.3,
+    )
     _bar([ax], dots, "worst bound that is flown, cm", _beyond(100.0 * scores, scale))
     for number, (start, end) in enumerate(zip(places.starts, places.ends)):
         ax.axvline(end, color="0.6", lw=0.8)
-        ax.text(0.5 * (start + end), ax.get_ylim()[1], f"place {number + 1}", ha="center", va="bottom", fontsize=9)
+        ax.text(
+            0.5 * (start + end),
+            ax.get_ylim()[1],
+            f"place {number + 1}",
+            ha="center",
+            va="bottom",
+            fontsize=9,
+        )
     best = int(np.argmin(scores))
-    ax.plot(along[best], height[best], "o", mfc="none", mec="r", ms=13, mew=1.6, label=f"best: ({', '.join(f'{v:.2f}' for v in at[best])})")
+    ax.plot(
+        along[best],
+        height[best],
+        "o",
+        mfc="none",
+        mec="r",
+        ms=13,
+        mew=1.6,
+        label=f"best: ({', '.join(f'{v:.2f}' for v in at[best])})",
+    )
     ax.set(xlabel="along the walls, one after the other, m", ylabel="z, m")
     title = "One more anchor, tried all over (times 1 to 2 for the share that cannot be flown)"
     _finish(figure, title, ax.get_legend_handles_labels()[0], [], path)
@@ -211,7 +382,11 @@ def plot_places(places: AnchorPlaces, numbers: np.ndarray, scores: np.ndarray, p
 def _layers(grid: Grid) -> list[int]:
     """Layers to draw: all, or three spread over the height."""
     n = grid.shape[2]
-    return list(range(n)) if n <= _MOST_LAYERS else [round(share * (n - 1)) for share in (0.2, 0.5, 0.8)]
+    return (
+        list(range(n))
+        if n <= _MOST_LAYERS
+        else [round(share * (n - 1)) for share in (0.2, 0.5, 0.8)]
+    )
 
 
 def _height(grid: Grid, k: int) -> str:
@@ -219,9 +394,17 @@ def _height(grid: Grid, k: int) -> str:
 
 
 def _panels(grid: Grid, count: int) -> tuple[Figure, np.ndarray]:
-    """Maps one above the other, each as wide as the picture, or as high as wide where the room is longer along y."""
+    """Maps one above the other, each as wide as the picture, or as high as wide where the room is
+    longer along y.
+    """
     ratio = min(1.0, grid.shape[1] / grid.shape[0])
-    figure, axes = plt.subplots(count, 1, figsize=(WIDTH, 1.0 + count * (0.75 * WIDTH * ratio + 0.7)), squeeze=False, layout="constrained")
+    figure, axes = plt.subplots(
+        count,
+        1,
+        figsize=(WIDTH, 1.0 + count * (0.75 * WIDTH * ratio + 0.7)),
+        squeeze=False,
+        layout="constrained",
+    )
     return figure, axes[:, 0]
 
 
@@ -236,19 +419,31 @@ def _beyond(values: np.ndarray, scale: tuple[float, float]) -> str:
     values = values[np.isfinite(values)]
     if not len(values):
         return "neither"
-    return {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[int(values.min() < scale[0]), int(values.max() > scale[1])]
+    return {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[
+        int(values.min() < scale[0]), int(values.max() > scale[1])
+    ]
 
 
 def _field(ax: Axes, grid: Grid, values: np.ndarray, k: int, scale: tuple[float, float]) -> Any:
     """Colours of the layer k of values (n,) between the ends of a scale; white where there is none."""
     x, y, _ = grid.axes
     layer = grid.layer(np.where(np.isfinite(values), values, np.nan), k)
-    return ax.pcolormesh(x, y, layer, cmap=COLOURS, vmin=scale[0], vmax=scale[1], shading="nearest", rasterized=True)
+    return ax.pcolormesh(
+        x, y, layer, cmap=COLOURS, vmin=scale[0], vmax=scale[1], shading="nearest", rasterized=True
+    )
 
 
-def _bar(axes: Sequence[Axes] | np.ndarray, drawn: Any, label: str, extend: str, ticks: Sequence[float] | None = None) -> None:
+def _bar(
+    axes: Sequence[Axes] | np.ndarray,
+    drawn: Any,
+    label: str,
+    extend: str,
+    ticks: Sequence[float] | None = None,
+) -> None:
     """A scale whose arrows say at which ends there is more."""
-    bar = axes[0].figure.colorbar(drawn, ax=list(axes), extend=extend, shrink=0.9 / len(axes) ** 0.5, pad=0.02, aspect=25)
+    bar = axes[0].figure.colorbar(
+        drawn, ax=list(axes), extend=extend, shrink=0.9 / len(axes) ** 0.5, pad=0.02, aspect=25
+    )
     if ticks is None:
         low, high = drawn.get_clim()
         even = np.linspace(low, high, 5).tolist()
@@ -259,14 +454,25 @@ def _bar(axes: Sequence[Axes] | np.ndarray, drawn: Any, label: str, extend: str,
 def _hatch(ax: Axes, chart: Chart, k: int) -> None:
     """Lines, on a lighter ground, over what is not flyable."""
     x, y, _ = chart.grid.axes
-    edges = [np.append(axis - 0.5 * chart.grid.step, axis[-1] + 0.5 * chart.grid.step) for axis in (x, y)]
+    edges = [
+        np.append(axis - 0.5 * chart.grid.step, axis[-1] + 0.5 * chart.grid.step) for axis in (x, y)
+    ]
     blocked = np.ma.masked_equal(~chart.grid.layer(chart.flyable, k), False)
     ax.pcolormesh(*edges, blocked.astype(float), cmap=ListedColormap(["white"]), alpha=0.6, lw=0)
     if min(blocked.shape) > 1 and blocked.any():
-        ax.contourf(x, y, blocked.filled(0).astype(float), levels=[0.5, 1.5], colors="none", hatches=["////"])
+        ax.contourf(
+            x,
+            y,
+            blocked.filled(0).astype(float),
+            levels=[0.5, 1.5],
+            colors="none",
+            hatches=["////"],
+        )
 
 
-def _room(ax: Axes, anchors: Anchors, grid: Grid, k: int | None, walls: Walls | None = None) -> None:
+def _room(
+    ax: Axes, anchors: Anchors, grid: Grid, k: int | None, walls: Walls | None = None
+) -> None:
     """Axes of a map, with walls, hull and anchors; a margin keeps anchors on its edge inside."""
     x, y, _ = grid.axes
     margin = 0.5 * grid.step + 0.03 * max(np.ptp(x), np.ptp(y), grid.step)
@@ -282,13 +488,31 @@ def _hull(ax: Axes, anchors: Anchors) -> None:
     above = anchors.positions[:, :2]
     if len(anchors) > 2 and np.linalg.matrix_rank(above - above[0], 1e-6) == 2:
         corners = ConvexHull(above).vertices
-        ax.plot(*above[np.append(corners, corners[0])].T, color=HULL, lw=1.2, ls="--", scalex=False, scaley=False)
+        ax.plot(
+            *above[np.append(corners, corners[0])].T,
+            color=HULL,
+            lw=1.2,
+            ls="--",
+            scalex=False,
+            scaley=False,
+        )
 
 
 def _anchors(ax: Axes, anchors: Anchors) -> None:
     p = anchors.positions
     size = float(np.clip(60.0 / np.sqrt(len(anchors)), 4.0, 8.0))
-    ax.plot(p[:, 0], p[:, 1], "^", color=ANCHOR, mec="w", mew=0.6, ms=size, zorder=5, scalex=False, scaley=False)
+    ax.plot(
+        p[:, 0],
+        p[:, 1],
+        "^",
+        color=ANCHOR,
+        mec="w",
+        mew=0.6,
+        ms=size,
+        zorder=5,
+        scalex=False,
+        scaley=False,
+    )
     turned = np.isfinite(anchors.orientations).all(axis=1)
     if turned.any():
         front = _directions(anchors)[turned]
@@ -333,7 +557,12 @@ def _enlarged(chart: Chart) -> int:
     if not rows.any():
         return 1
     every = max(1, max(chart.grid.shape[:2]) // ACROSS)
-    return max(1, round(0.35 * every * chart.grid.step / np.median(ellipses(chart.covariance[rows])[0][:, 0])))
+    return max(
+        1,
+        round(
+            0.35 * every * chart.grid.step / np.median(ellipses(chart.covariance[rows])[0][:, 0])
+        ),
+    )
 
 
 def _ellipses(ax: Axes, chart: Chart, k: int, times: int) -> None:
@@ -343,18 +572,37 @@ def _ellipses(ax: Axes, chart: Chart, k: int, times: int) -> None:
         semi, angle = ellipses(chart.covariance[rows])
         ax.add_collection(
             EllipseCollection(
-                2 * times * semi[:, 0], 2 * times * semi[:, 1], np.rad2deg(angle), units="xy", offsets=chart.grid.points[rows, :2],
-                offset_transform=ax.transData, facecolors="none", edgecolors="w", linewidths=1.2,
+                2 * times * semi[:, 0],
+                2 * times * semi[:, 1],
+                np.rad2deg(angle),
+                units="xy",
+                offsets=chart.grid.points[rows, :2],
+                offset_transform=ax.transData,
+                facecolors="none",
+                edgecolors="w",
+                linewidths=1.2,
             )
-        )  # fmt: skip
+        )
 
 
-def _finish(figure: Figure, title: str, marks: Sequence[Any], labelled: Sequence[tuple[Axes, Anchors]], path: str | Path) -> None:
+def _finish(
+    figure: Figure,
+    title: str,
+    marks: Sequence[Any],
+    labelled: Sequence[tuple[Axes, Anchors]],
+    path: str | Path,
+) -> None:
     """Title and legend, then the ids of anchors, once nothing else moves."""
     figure.suptitle(title, fontsize=12)
     if marks:
         wide = max(len(str(mark.get_label())) for mark in marks)
-        figure.legend(handles=marks, loc="outside lower center", ncols=3 if wide < 28 else 2, frameon=False, fontsize=9)
+        figure.legend(
+            handles=marks,
+            loc="outside lower center",
+            ncols=3 if wide < 28 else 2,
+            frameon=False,
+            fontsize=9,
+        )
     figure.set_dpi(DPI)
     figure.draw_without_rendering()
     for ax, anchors in labelled:

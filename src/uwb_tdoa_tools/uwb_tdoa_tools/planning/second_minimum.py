@@ -1,10 +1,13 @@
-"""Where a round of TDOAs has two solutions: a second minimum of its misfit, of all that is heard together.
+"""Where a round of TDOAs has two solutions: a second minimum of its misfit, of all that is heard
+together.
 
-With d(x) the distances from x to the N anchors that are heard at p, and Q = D' F^-1 D the weight of their errors in a round (`weigh`),
+With d(x) the distances from x to the N anchors that are heard at p, and Q = D' F^-1 D the weight of
+their errors in a round (`weigh`),
     f(x) = (d(x) - d(p))' Q (d(x) - d(p))
-is the squared misfit, in standard deviations, of a tag at x with what a tag at p measures. Its smallest minimum is p, with 0. A second one
-is searched by Levenberg-Marquardt, from the mirrored places of choices of k + 1 anchors (`bifurcation`). An estimator that weighs all TDOAs
-takes it for the right one with probability Phi(-sqrt(f) / 2).
+is the squared misfit, in standard deviations, of a tag at x with what a tag at p measures. Its
+smallest minimum is p, with 0. A second one is searched by Levenberg-Marquardt, from the mirrored
+places of choices of k + 1 anchors (`bifurcation`). An estimator that weighs all TDOAs takes it for
+the right one with probability Phi(-sqrt(f) / 2).
 """
 
 from __future__ import annotations
@@ -32,12 +35,18 @@ _FLAT = 1e-6  # of the volume of a cube; k + 1 anchors of less are in one plane 
 
 
 def second_minima(
-    points: np.ndarray, positions: np.ndarray, columns: np.ndarray, weights: np.ndarray, room: Room, unknowns: int
+    points: np.ndarray,
+    positions: np.ndarray,
+    columns: np.ndarray,
+    weights: np.ndarray,
+    room: Room,
+    unknowns: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the second minimum of least misfit inside a room: (misfit (n,) standard deviations, place (n, 3) m); inf and NaN where no
-    descent finds one that is more than FLIP away.
+    """Return the second minimum of least misfit inside a room: (misfit (n,) standard deviations,
+    place (n, 3) m); inf and NaN where no descent finds one that is more than FLIP away.
 
-    points : (n, 3) m; positions : (N, 3) m of anchors; columns : (n, K) rows of those that are heard; weights : (n, K, K) 1/m^2, Q; room :
+    points : (n, 3) m; positions : (N, 3) m of anchors; columns : (n, K) rows of those that are
+        heard; weights : (n, K, K) 1/m^2, Q; room :
     Room; unknowns : 2 where the height is known, else 3.
     """
     choices = np.array(list(combinations(range(min(NEAREST, columns.shape[1])), unknowns + 1)))
@@ -48,10 +57,17 @@ def second_minima(
 
 @compiled
 def _search(
-    points: np.ndarray, positions: np.ndarray, columns: np.ndarray, weights: np.ndarray, room: np.ndarray, choices: np.ndarray,
+    points: np.ndarray,
+    positions: np.ndarray,
+    columns: np.ndarray,
+    weights: np.ndarray,
+    room: np.ndarray,
+    choices: np.ndarray,
     out: np.ndarray,
-) -> None:  # fmt: skip
-    """Fill out (n, 4): misfit squared and place. room : (2, 3) m, its corners; choices : (C, k + 1) of the nearest anchors."""
+) -> None:
+    """Fill out (n, 4): misfit squared and place. room : (2, 3) m, its corners; choices : (C, k + 1)
+    of the nearest anchors.
+    """
     heard, unknowns = columns.shape[1], choices.shape[1] - 1
     anchors, true, end = np.empty((heard, 3)), np.empty(heard), np.empty(3)
     starts, values = np.empty((len(choices), 3)), np.empty(len(choices))
@@ -85,9 +101,12 @@ def _search(
 
 
 @compiled
-def _mirror(point: np.ndarray, anchors: np.ndarray, true: np.ndarray, rows: np.ndarray, out: np.ndarray) -> bool:
-    """Put into `out` the other place with the TDOAs of these k + 1 anchors, see `bifurcation`; of anchors in a plane (line) that on its
-    other side. Whether there is one."""
+def _mirror(
+    point: np.ndarray, anchors: np.ndarray, true: np.ndarray, rows: np.ndarray, out: np.ndarray
+) -> bool:
+    """Put into `out` the other place with the TDOAs of these k + 1 anchors, see `bifurcation`; of
+    anchors in a plane (line) that on its other side. Whether there is one.
+    """
     k, first = len(rows) - 1, anchors[rows[0]]
     matrix, q, p = np.zeros((3, 3)), np.zeros(3), np.zeros(3)
     size = 1e-9
@@ -100,7 +119,11 @@ def _mirror(point: np.ndarray, anchors: np.ndarray, true: np.ndarray, rows: np.n
         matrix[2, 2] = 1.0
     volume = _determinant(matrix)
     if abs(volume) < _FLAT * size**k:
-        normal = np.cross(matrix[0], matrix[1]) if k == 3 else np.array([matrix[0, 1], -matrix[0, 0], 0.0])
+        normal = (
+            np.cross(matrix[0], matrix[1])
+            if k == 3
+            else np.array([matrix[0, 1], -matrix[0, 0], 0.0])
+        )
         length = math.sqrt(np.sum(normal**2))
         if length < _FLAT * size**2 if k == 3 else length < _FLAT * size:
             return False
@@ -160,11 +183,23 @@ def _misfit(x: np.ndarray, anchors: np.ndarray, true: np.ndarray, weight: np.nda
 
 @compiled
 def _descend(
-    start: np.ndarray, point: np.ndarray, anchors: np.ndarray, true: np.ndarray, weight: np.ndarray, unknowns: int, end: np.ndarray
-) -> float:  # fmt: skip
-    """f at the end of a descent, whose place is put into `end`; inf where it did not come to an end, or came to the point itself."""
+    start: np.ndarray,
+    point: np.ndarray,
+    anchors: np.ndarray,
+    true: np.ndarray,
+    weight: np.ndarray,
+    unknowns: int,
+    end: np.ndarray,
+) -> float:
+    """f at the end of a descent, whose place is put into `end`; inf where it did not come to an
+    end, or came to the point itself.
+    """
     x, step, right = start.copy(), np.zeros(3), np.zeros(3)
-    unit, change, weighed = np.empty((len(anchors), 3)), np.empty(len(anchors)), np.empty((len(anchors), 4))
+    unit, change, weighed = (
+        np.empty((len(anchors), 3)),
+        np.empty(len(anchors)),
+        np.empty((len(anchors), 4)),
+    )
     normal, damped = np.zeros((3, 3)), np.zeros((3, 3))
     f, damping = _misfit(x, anchors, true, weight), 1e-2
     for _ in range(SWEEPS):
@@ -219,7 +254,9 @@ def _descend(
 
 @compiled
 def _solve(matrix: np.ndarray, right: np.ndarray, size: int, out: np.ndarray) -> float:
-    """Solve matrix out = right, of 2 or 3 rows, positive definite, by Cholesky in place; return right . out, inf where it is not."""
+    """Solve matrix out = right, of 2 or 3 rows, positive definite, by Cholesky in place; return
+    right . out, inf where it is not.
+    """
     for i in range(size):
         for j in range(i + 1):
             total = matrix[i, j]

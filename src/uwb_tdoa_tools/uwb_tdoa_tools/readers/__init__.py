@@ -1,4 +1,7 @@
-"""Readers: each turns one kind of recording into a Flight. `read_flight` finds out which kind it is."""
+"""Readers: each turns one kind of recording into a Flight.
+
+`read_flight` finds out which kind it is.
+"""
 
 from __future__ import annotations
 
@@ -21,21 +24,30 @@ __all__ = ["read_flight", "read_survey", "read_usd_log", "read_util_csv"]
 
 
 def read_flight(
-    path: str | Path, survey: str | Path | Anchors | None = None, namespace: str = "", salvage: bool = False,
-    topics: dict[str, str] | None = None, truth: bool = True,
-) -> Flight:  # fmt: skip
+    path: str | Path,
+    survey: str | Path | Anchors | None = None,
+    namespace: str = "",
+    salvage: bool = False,
+    topics: dict[str, str] | None = None,
+    truth: bool = True,
+) -> Flight:
     """Flight of a recording of any known kind, told apart by content, not by name.
 
-    path : micro-SD event log, UTIL CSV (plain or gzip), or ROS 2 bag (its directory or its .mcap or .db3 file).
-    survey : path of a survey file (see `read_survey`) or Anchors. Logs and CSV files need it; a bag brings its own
+    path : micro-SD event log, UTIL CSV (plain or gzip), or ROS 2 bag (its directory or its .mcap or
+        .db3 file).
+    survey : path of a survey file (see `read_survey`) or Anchors. Logs and CSV files need it; a bag
+        brings its own
         anchors, and a survey given with it replaces them.
     namespace, topics : where the tag's topics are in a bag, see `read_bag`.
-    salvage : read a cut or damaged recording up to there, without records that are no numbers; the Flight's
+    salvage : read a cut or damaged recording up to there, without records that are no numbers; the
+        Flight's
         `meta["remarks"]` tell what is missing. Otherwise it is refused.
     truth : read the ground truth, where there is one.
     Raises InputError.
     """
-    from ..bags.bag import read_bag  # here, because bags need the rosbags library and the others do not
+    from ..bags.bag import (
+        read_bag,
+    )  # here, because bags need the rosbags library and the others do not
 
     path = Path(path)
     if not path.exists():
@@ -43,10 +55,14 @@ def read_flight(
     if is_bag(path):
         return read_bag(path, namespace, _anchors(survey), salvage, topics, truth)
     if path.is_dir():
-        raise InputError(f"{path}: is a directory without metadata.yaml; give a bag directory or a file.")
+        raise InputError(
+            f"{path}: is a directory without metadata.yaml; give a bag directory or a file."
+        )
     reader, anchors = reader_of(path), _anchors(survey)
     if anchors is None:
-        raise InputError(f"{path}: does not say where the anchors are; give a survey file (--survey FILE).")
+        raise InputError(
+            f"{path}: does not say where the anchors are; give a survey file (--survey FILE)."
+        )
     return reader(path, anchors, salvage, truth)
 
 

@@ -1,7 +1,7 @@
 """CSV tables of other tools, whatever their columns are called and whatever they are measured in.
 
-    columns = parse_columns("time=t_ms:ms,anchor_a=from,anchor_b=to,tdoa=diff_mm:mm")
-    flight = read_columns(["ranging.csv", "imu.csv"], columns, anchors)
+columns = parse_columns("time=t_ms:ms,anchor_a=from,anchor_b=to,tdoa=diff_mm:mm")
+flight = read_columns(["ranging.csv", "imu.csv"], columns, anchors)
 """
 
 from __future__ import annotations
@@ -20,39 +20,70 @@ from .tables import read_table
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from uwb_tdoa_bias.foundation.flight import Flight
+
     from .names import Named
     from .streams import Streams
     from .tables import CsvTable
 
 TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-LENGTH = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "ticks": 299792458.0 / (128 * 499.2e6), "ns": 0.299792458}
+LENGTH = {
+    "m": 1.0,
+    "cm": 1e-2,
+    "mm": 1e-3,
+    "ticks": 299792458.0 / (128 * 499.2e6),
+    "ns": 0.299792458,
+}
 # As `make_flight` takes them, from a Crazyflie: deg/s and g.
 RATE = {"rad/s": 180.0 / np.pi, "deg/s": 1.0}
 FORCE = {"m/s^2": 1.0 / GRAVITY, "g": 1.0}
 NUMBER = {"": 1.0}
-STREAMS = {  # stream: {our column: (column of the stream, {unit: factor}, the first is the default)}
-    "tdoa": {"anchor_a": ("a", NUMBER), "anchor_b": ("b", NUMBER), "tdoa": ("d", LENGTH), "tdoa_std": ("std", LENGTH)},
+# stream: {our column: (column of the stream, {unit: factor}, the first is the default)}
+STREAMS = {
+    "tdoa": {
+        "anchor_a": ("a", NUMBER),
+        "anchor_b": ("b", NUMBER),
+        "tdoa": ("d", LENGTH),
+        "tdoa_std": ("std", LENGTH),
+    },
     "range": {"anchor": ("anchor", NUMBER), "range": ("d", LENGTH), "range_std": ("std", LENGTH)},
     "gyro": {f"gyro_{axis}": (axis, RATE) for axis in "xyz"},
     "acc": {f"accel_{axis}": (axis, FORCE) for axis in "xyz"},
-    "pose": {f"pose_{axis}": (axis, LENGTH) for axis in "xyz"} | {f"pose_q{k}": (f"q{k}", NUMBER) for k in "xyzw"},
+    "pose": {f"pose_{axis}": (axis, LENGTH) for axis in "xyz"}
+    | {f"pose_q{k}": (f"q{k}", NUMBER) for k in "xyzw"},
 }
 TIMES = {  # of each stream: the first that is given, else "time"
-    "tdoa": ("tdoa_time",), "range": ("range_time",), "gyro": ("gyro_time", "imu_time"), "acc": ("accel_time", "imu_time"),
+    "tdoa": ("tdoa_time",),
+    "range": ("range_time",),
+    "gyro": ("gyro_time", "imu_time"),
+    "acc": ("accel_time", "imu_time"),
     "pose": ("pose_time",),
-}  # fmt: skip
+}
 RADIO = "tdoa", "range"  # of which there must be one
 ANCHORS = "anchor_a", "anchor_b", "anchor"  # columns that name anchors
-EMPTY = {"", "-", "--", "n/a", "na", "nan", "none", "null"}  # what tools write where they have nothing
+EMPTY = {
+    "",
+    "-",
+    "--",
+    "n/a",
+    "na",
+    "nan",
+    "none",
+    "null",
+}  # what tools write where they have nothing
 MOST_SKIPPED = 0.25  # of the records of a stream, that are empty or no numbers
 ATTITUDE = {f"pose_q{k}" for k in "xyzw"}
 OPTIONAL = {*ATTITUDE, "tdoa_std", "range_std"}
 UNITS = {name: units for columns in STREAMS.values() for name, (_, units) in columns.items()}
-UNITS |= {name: TIME for name in ("time", *sorted({name for names in TIMES.values() for name in names}))}
+UNITS |= {
+    name: TIME for name in ("time", *sorted({name for names in TIMES.values() for name in names}))
+}
 HELP = (
-    "for CSV files of other tools: their columns, OURS=THEIRS[:UNIT],... (anchor_a, anchor_b, tdoa; or anchor, range; "
-    "gyro_x ...; accel_x ...; pose_x ...; time, or tdoa_time, range_time, imu_time, gyro_time, accel_time, pose_time where a sensor has its own)"
+    "for CSV files of other tools: their columns, OURS=THEIRS[:UNIT],... (anchor_a, anchor_b, "
+    "tdoa; or anchor, range; "
+    "gyro_x ...; accel_x ...; pose_x ...; time, or tdoa_time, range_time, imu_time, "
+    "gyro_time, accel_time, pose_time where a sensor has its own)"
 )
 
 
@@ -63,7 +94,8 @@ def parse_columns(text: str) -> dict[str, tuple[str, float]]:
         ours, given, theirs = (part.strip() for part in entry.partition("="))
         if not given or ours not in UNITS or not theirs or ours in columns:
             raise InputError(
-                f"--columns: {entry!r} is not OURS=THEIRS, where OURS, once, is one of {', '.join(UNITS)}."
+                f"--columns: {entry!r} is not OURS=THEIRS, where OURS, once, is one of "
+                f"{', '.join(UNITS)}."
             )
         units = UNITS[ours]
         name, colon, unit = theirs.rpartition(":")
@@ -77,23 +109,34 @@ def parse_columns(text: str) -> dict[str, tuple[str, float]]:
     for stream in wanted if {*RADIO} & {*wanted} else ["tdoa", *wanted]:
         needed = [*(name for name in STREAMS[stream] if name not in OPTIONAL)]
         if missing := [name for name in needed if name not in columns]:
-            raise InputError(f"--columns: {missing[0]} is missing; {', '.join(needed)} belong together.")
+            raise InputError(
+                f"--columns: {missing[0]} is missing; {', '.join(needed)} belong together."
+            )
         if not {*TIMES[stream], "time"} & columns.keys():
-            raise InputError(f"--columns: {TIMES[stream][-1]}, or time, is missing; name the column with the time.")
+            raise InputError(
+                f"--columns: {TIMES[stream][-1]}, or time, is missing; name the column with "
+                "the time."
+            )
     if len(ATTITUDE & columns.keys()) not in (0, 4):
         raise InputError(f"--columns: {', '.join(sorted(ATTITUDE))} belong together.")
     return columns
 
 
 def read_columns(
-    paths: Sequence[str | Path], columns: dict[str, tuple[str, float]], named: Named, salvage: bool = False
+    paths: Sequence[str | Path],
+    columns: dict[str, tuple[str, float]],
+    named: Named,
+    salvage: bool = False,
 ) -> Flight:
-    """Flight of CSV files with a header line each; each stream is taken from the one file that has its columns.
+    """Flight of CSV files with a header line each; each stream is taken from the one file that has
+    its columns.
 
-    A row counts for a stream if any of its cells is filled: rows of several sensors may be mixed in one file, and each may have a time
-    column of its own. A record with a cell that is empty or no number is left out and counted, in `meta["remarks"]`; if that is more than
-    MOST_SKIPPED of the records, the file is refused. columns : see `parse_columns`; named : Named, the anchors; salvage : leave out
-    records that are not finite, however many. Raises InputError, with the line of the first record that is left out.
+    A row counts for a stream if any of its cells is filled: rows of several sensors may be mixed in
+    one file, and each may have a time column of its own. A record with a cell that is empty or no
+    number is left out and counted, in `meta["remarks"]`; if that is more than MOST_SKIPPED of the
+    records, the file is refused. columns : see `parse_columns`; named : Named, the anchors; salvage
+    : leave out records that are not finite, however many. Raises InputError, with the line of the
+    first record that is left out.
     """
     tables = {path: read_table(path, most=TABLE_CELLS, complete=False) for path in paths}
     wanted: dict[str | Path, dict[str, dict[str, tuple[str, float]]]] = {path: {} for path in paths}
@@ -106,12 +149,21 @@ def read_columns(
             wanted[_having(tables, mine)][stream] = mine
     for path, of_file in wanted.items():
         for stream, values in _values(path, tables[path], of_file, named, remarks, salvage).items():
-            streams[stream] = {"t" if name == "t" else STREAMS[stream][name][0]: column for name, column in values.items()}
+            streams[stream] = {
+                "t" if name == "t" else STREAMS[stream][name][0]: column
+                for name, column in values.items()
+            }
     for ids in (streams.get("tdoa", {}), streams.get("range", {})):
         ids.update({name: ids[name].astype(np.int64) for name in ids.keys() & {"a", "b", "anchor"}})
     if "pose" in streams and "qx" not in streams["pose"]:
-        streams["pose"].update({f"q{k}": np.full(len(streams["pose"]["t"]), np.nan) for k in "xyzw"})
-    meta = {"source": ", ".join(map(str, paths)), "format": "CSV, columns as given", "remarks": remarks}
+        streams["pose"].update(
+            {f"q{k}": np.full(len(streams["pose"]["t"]), np.nan) for k in "xyzw"}
+        )
+    meta = {
+        "source": ", ".join(map(str, paths)),
+        "format": "CSV, columns as given",
+        "remarks": remarks,
+    }
     return make_flight(Path(paths[0]).stem, named.anchors, streams, {}, meta, salvage)
 
 
@@ -122,18 +174,31 @@ def _having(tables: dict[str | Path, CsvTable], mine: dict[str, tuple[str, float
     if len(having) == 1:
         return having[0]
     if having:
-        raise InputError(f"{having[1]}: has column {min(names)!r} as {having[0]} has; give one of them.")
+        raise InputError(
+            f"{having[1]}: has column {min(names)!r} as {having[0]} has; give one of them."
+        )
     path, table = next(iter(tables.items()))
-    raise InputError(f"{path}: has no column {min(names - {*table.names})!r}; its columns are {', '.join(table.names)}.")
+    raise InputError(
+        f"{path}: has no column {min(names - {*table.names})!r}; its columns are "
+        f"{', '.join(table.names)}."
+    )
 
 
 def _values(
-    path: str | Path, table: CsvTable, streams: dict[str, dict[str, tuple[str, float]]], named: Named, remarks: list[str],
+    path: str | Path,
+    table: CsvTable,
+    streams: dict[str, dict[str, tuple[str, float]]],
+    named: Named,
+    remarks: list[str],
     salvage: bool,
-) -> dict[str, dict[str, np.ndarray]]:  # fmt: skip
-    """{stream: {our name: (n,) array}}, in our units, of the rows in which a cell of the stream is filled and all are numbers, or names of
-    anchors. streams : {stream: columns} that the table has."""
-    values, rows = {stream: {name: array("d") for name in mine} for stream, mine in streams.items()}, 0
+) -> dict[str, dict[str, np.ndarray]]:
+    """{stream: {our name: (n,) array}}, in our units, of the rows in which a cell of the stream is
+    filled and all are numbers, or names of anchors. streams : {stream: columns} that the table has.
+    """
+    values, rows = (
+        {stream: {name: array("d") for name in mine} for stream, mine in streams.items()},
+        0,
+    )
     skipped = dict.fromkeys(streams, 0)
     first: dict[str, str] = {}
     for rows, (line, cells) in enumerate(table, start=1):
@@ -141,7 +206,10 @@ def _values(
             texts = {name: cells[theirs].strip() for name, (theirs, _) in mine.items()}
             if all(text.lower() in EMPTY for name, text in texts.items() if name != "t"):
                 continue
-            record = {name: named.id_of(text) if name in ANCHORS else _number(text) for name, text in texts.items()}
+            record = {
+                name: named.id_of(text) if name in ANCHORS else _number(text)
+                for name, text in texts.items()
+            }
             numbers = {name: value for name, value in record.items() if value is not None}
             if len(numbers) == len(record):
                 for name, number in numbers.items():
@@ -149,16 +217,32 @@ def _values(
             else:
                 wrong = next(name for name in record if name not in numbers)
                 skipped[stream] += 1
-                what = "an anchor of the survey, by its name, or an id 0 ... 65535" if wrong in ANCHORS else "a finite number"
-                first.setdefault(stream, f"line {line}: {mine[wrong][0]} is {texts[wrong][:40]!r}; it must be {what}")
+                what = (
+                    "an anchor of the survey, by its name, or an id 0 ... 65535"
+                    if wrong in ANCHORS
+                    else "a finite number"
+                )
+                first.setdefault(
+                    stream,
+                    f"line {line}: {mine[wrong][0]} is {texts[wrong][:40]!r}; it must be {what}",
+                )
     if streams and not rows:
         raise InputError(f"{path}: has no row below its header; record the flight again.")
     for stream, count in ((stream, count) for stream, count in skipped.items() if count):
-        n, names = count + len(values[stream]["t"]), ", ".join(name for name in streams[stream] if name != "t")
+        n, names = (
+            count + len(values[stream]["t"]),
+            ", ".join(name for name in streams[stream] if name != "t"),
+        )
         if count > MOST_SKIPPED * n and not salvage:
-            raise InputError(f"{path}: {first[stream]} ({count} of {n} records of {names} are like that: more than a gap).")
+            raise InputError(
+                f"{path}: {first[stream]} ({count} of {n} records of {names} are like that: "
+                "more than a gap)."
+            )
         remarks.append(f"{path}: {count} of {n} records left out, {first[stream]}.")
-    return {stream: {name: np.array(column) * streams[stream][name][1] for name, column in of.items()} for stream, of in values.items()}
+    return {
+        stream: {name: np.array(column) * streams[stream][name][1] for name, column in of.items()}
+        for stream, of in values.items()
+    }
 
 
 def _number(text: str) -> float | None:

@@ -1,4 +1,6 @@
-"""From the paths on a command line to flights: files or folders of recordings, one survey or a folder of them."""
+"""From the paths on a command line to flights: files or folders of recordings, one survey or a
+folder of them.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,7 @@ from tqdm import tqdm
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import AIDS
 from uwb_tdoa_bias.foundation.foreign_text import printable
-from uwb_tdoa_bias.foundation.limits import Budget, FOLDER_DEPTH, FOLDER_ENTRIES
+from uwb_tdoa_bias.foundation.limits import FOLDER_DEPTH, FOLDER_ENTRIES, Budget
 from uwb_tdoa_bias.foundation.sensors import LOCATING
 
 from .. import parallel
@@ -24,14 +26,17 @@ from . import read_flight
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
+
     from uwb_tdoa_bias.foundation.flight import Flight
 
     Recording = tuple[Path, str | Path | None]  # and its survey
 
 HELP = "recordings: raw logs, UTIL CSV files, bags, or folders that hold them"
 SURVEY_HELP = (
-    "anchor survey (total station .txt, const .csv or anchors .yaml), or a folder of them: then anchor_KEY.* serves "
-    "the recordings whose path contains KEY; counts in place of the anchors that bags hold, which keep their own where no KEY fits"
+    "anchor survey (total station .txt, const .csv or anchors .yaml), or a folder of them: "
+    "then anchor_KEY.* serves "
+    "the recordings whose path contains KEY; counts in place of the anchors that bags hold, "
+    "which keep their own where no KEY fits"
 )
 
 _REPORTED: set[str | Path | None] = set()  # surveys of which was printed that they count for bags
@@ -40,57 +45,82 @@ _REPORTED: set[str | Path | None] = set()  # surveys of which was printed that t
 def find_flights(
     paths: Iterable[str | Path], survey: str | Path | None = None, absolute: bool = False
 ) -> list[Recording]:
-    """Pairs (recording, survey or None), sorted within each folder. Raises InputError where nothing, or no one survey,
-    fits.
+    """Pairs (recording, survey or None), sorted within each folder. Raises InputError where
+    nothing, or no one survey, fits.
 
-    A bag takes the survey that is given, whatever anchors it holds, and says so once; out of a folder the one that fits, or its own.
+    A bag takes the survey that is given, whatever anchors it holds, and says so once; out of a
+    folder the one that fits, or its own.
     absolute : make them absolute paths, for processes that may have another working directory.
     """
     found = []
     for path in map(Path, paths):
         if not path.exists():
-            raise InputError(f"{path}: does not exist; give a recording or a folder that holds recordings.")
+            raise InputError(
+                f"{path}: does not exist; give a recording or a folder that holds recordings."
+            )
         inside = _recordings(path)
         if not inside:
             raise InputError(f"{path}: holds no recording; expected logs, CSV files or bags.")
         found += inside
     pairs = [(path, _survey_of(path, survey)) for path in found]
     if absolute:
-        pairs = [(path.absolute(), its_survey and Path(its_survey).absolute()) for path, its_survey in pairs]
+        pairs = [
+            (path.absolute(), its_survey and Path(its_survey).absolute())
+            for path, its_survey in pairs
+        ]
     return pairs
 
 
 def _survey_of(path: Path, survey: str | Path | None) -> str | Path | None:
-    """The survey of a recording, or None for a bag whose own anchors count; what counts for a bag is printed once."""
+    """The survey of a recording, or None for a bag whose own anchors count; what counts for a bag
+    is printed once.
+    """
     if survey is None or not is_bag(path):
         return survey_for(path, survey)
     try:
         its_survey = survey_for(path, survey)
     except InputError:
-        _report_once(f"{path}: no survey in {survey} fits; the anchors that it holds count, as in other bags that none fits.")
+        _report_once(
+            f"{path}: no survey in {survey} fits; the anchors that it holds count, as in "
+            "other bags that none fits."
+        )
         return None
     _report_once(
-        f"{path}: the anchors of {its_survey} count here, whatever anchors the bag holds; so in every bag that is read with it.", its_survey
+        (
+            f"{path}: the anchors of {its_survey} count here, whatever anchors the bag holds; so "
+            "in every bag that is read with it."
+        ),
+        its_survey,
     )
     return its_survey
 
 
 def _report_once(sentence: str, about: str | Path | None = None) -> None:
-    """Tell a sentence on stderr, and nothing more about the same survey, or about surveys that do not fit (None), in this process."""
+    """Tell a sentence on stderr, and nothing more about the same survey, or about surveys that do
+    not fit (None), in this process.
+    """
     if about not in _REPORTED:
         _REPORTED.add(about)
         tqdm.write(printable(sentence), file=sys.stderr)
 
 
 def survey_for(path: str | Path, survey: str | Path | None) -> str | Path | None:
-    """The survey of a recording: `survey` itself, or out of a folder the one whose KEY is the longest in the path."""
+    """The survey of a recording: `survey` itself, or out of a folder the one whose KEY is the
+    longest in the path.
+    """
     if survey is None or not Path(survey).is_dir():
         return survey
-    keys = {file.stem.removeprefix("anchor_"): file for file in sorted(Path(survey).glob("anchor_?*"))}
+    keys = {
+        file.stem.removeprefix("anchor_"): file for file in sorted(Path(survey).glob("anchor_?*"))
+    }
     name = str(Path(path).resolve())
-    fitting = sorted((key for key in keys if key in name), key=lambda key: (name.rfind(key) + len(key), len(key)))
+    fitting = sorted(
+        (key for key in keys if key in name), key=lambda key: (name.rfind(key) + len(key), len(key))
+    )
     if not fitting:
-        raise InputError(f"{path}: no survey in {survey} fits: its path holds none of {', '.join(keys)}.")
+        raise InputError(
+            f"{path}: no survey in {survey} fits: its path holds none of {', '.join(keys)}."
+        )
     return keys[fitting[-1]]
 
 
@@ -98,7 +128,11 @@ def need_tdoas(flights: Iterable[Flight], what: str) -> None:
     """Raise InputError for one of some Flights that holds no TDOAs. what : words, that needs them."""
     for flight in flights:
         if not len(flight.tdoa):
-            raise InputError(f"{flight.name}: holds no TDOAs, which {what} needs; with ranges alone do check, evaluate, localize, survey, calibrate, and diagnose with ground truth or with nothing.")
+            raise InputError(
+                f"{flight.name}: holds no TDOAs, which {what} needs; with ranges alone do "
+                "check, evaluate, localize, survey, calibrate, and diagnose with ground "
+                "truth or with nothing."
+            )
 
 
 def report_remarks(path: str | Path, remarks: Iterable[str]) -> None:
@@ -111,9 +145,10 @@ def report_remarks(path: str | Path, remarks: Iterable[str]) -> None:
 class Reading:
     """How recordings are read. Can be pickled.
 
-    survey : path of a survey or of a folder of them, or None; namespace : of the tag's topics in bags; topics : {our
-    name of a topic: its name in the bags}; salvage : read cut and damaged recordings as far as they are sound; truth : read the ground
-    truth, where there is one.
+    survey : path of a survey or of a folder of them, or None; namespace : of the tag's topics in
+        bags; topics : {our
+    name of a topic: its name in the bags}; salvage : read cut and damaged recordings as far as they
+    are sound; truth : read the ground truth, where there is one.
     """
 
     survey: str | Path | None = None
@@ -123,8 +158,9 @@ class Reading:
     truth: bool = True
 
     def find(self, paths: Iterable[str | Path], absolute: bool = False) -> list[Recording]:
-        """Pairs (recording, survey or None), see `find_flights`; none of no paths. Raises InputError where topics of bags are named, and
-        there is no bag."""
+        """Pairs (recording, survey or None), see `find_flights`; none of no paths. Raises
+        InputError where topics of bags are named, and there is no bag.
+        """
         found = find_flights(paths, self.survey, absolute)
         if found and not any(is_bag(path) for path, _ in found):
             self._refuse_topics(found[0][0])
@@ -133,14 +169,23 @@ class Reading:
     def _refuse_topics(self, path: Path) -> None:
         for option, given in (("--namespace", self.namespace), ("--topic", self.topics)):
             if given:
-                raise InputError(f"{option}: says where topics are in bags, and {path} is none; leave it out.")
+                raise InputError(
+                    f"{option}: says where topics are in bags, and {path} is none; leave it out."
+                )
 
     def read(self, recording: Recording) -> Flight:
-        """Flight of a pair (recording, survey or None); tells on stderr what is missing in it. Raises InputError."""
+        """Flight of a pair (recording, survey or None); tells on stderr what is missing in it.
+
+        Raises InputError.
+        """
         path, survey = recording
         flight = read_flight(path, survey, self.namespace, self.salvage, self.topics, self.truth)
         report_remarks(path, flight.meta.get("remarks", ()))
-        beside = {name: stream.t for name in ("tdoa", "imu", *AIDS) if (stream := getattr(flight, name)) is not None}
+        beside = {
+            name: stream.t
+            for name in ("tdoa", "imu", *AIDS)
+            if (stream := getattr(flight, name)) is not None
+        }
         report_remarks(path, (f"{sentence_on(*one)}." for one in apart(beside)))
         return flight
 
@@ -152,31 +197,47 @@ class Reading:
         return self.read((path, _survey_of(path, self.survey)))
 
     def flights(
-        self, paths: Iterable[str | Path], most: int | None = None, jobs: int | None = 1, dask: str | None = None
+        self,
+        paths: Iterable[str | Path],
+        most: int | None = None,
+        jobs: int | None = 1,
+        dask: str | None = None,
     ) -> list[Flight]:
-        """Flights of recordings and folders, with a progress bar: list. jobs, dask : as of `parallel.over`.
+        """Flights of recordings and folders, with a progress bar: list. jobs, dask : as of
+        `parallel.over`.
 
-        most : TDOAs and ranges that they may hold together, the first excepted; of more, as many whole flights as that are drawn at random,
+        most : TDOAs and ranges that they may hold together, the first excepted; of more, as many
+            whole flights as that are drawn at random,
         alike at every call, and the others not held, so that memory and time are bounded.
         """
         found, count = self.find(paths, bool(dask)), 0
         read: dict[int, Flight] = {}
-        order = range(len(found)) if most is None else np.random.default_rng(0).permutation(len(found)).tolist()
-        for flight, number in zip(parallel.over(self.read, [found[number] for number in order], jobs, dask), order):
+        order = (
+            range(len(found))
+            if most is None
+            else np.random.default_rng(0).permutation(len(found)).tolist()
+        )
+        for flight, number in zip(
+            parallel.over(self.read, [found[number] for number in order], jobs, dask), order
+        ):
             count += len(flight.tdoa) + sum(len(getattr(flight, name) or ()) for name in LOCATING)
             if most is not None and read and count > most:
                 tqdm.write(
-                    f"{len(read)} of {len(found)} flights, drawn at random, are taken: all would hold more than {most} TDOAs (--most); "
-                    "evaluate judges on all of them", sys.stderr,
-                )  # fmt: skip
+                    f"{len(read)} of {len(found)} flights, drawn at random, are taken: all "
+                    f"would hold more than {most} TDOAs (--most); "
+                    "evaluate judges on all of them",
+                    sys.stderr,
+                )
                 break
             read[number] = flight
         return [read[number] for number in sorted(read)]
 
 
 def _recordings(path: Path) -> list[Path]:
-    """Recordings in a folder, at any depth, or a path that is one. Bags that are files may lie in a folder, as other files do; what
-    SQLite leaves beside them is none. A folder to which several links lead is looked through once."""
+    """Recordings in a folder, at any depth, or a path that is one. Bags that are files may lie in a
+    folder, as other files do; what SQLite leaves beside them is none. A folder to which several
+    links lead is looked through once.
+    """
     budget, seen, found = Budget(path), set(), []
 
     def look(path: Path, depth: int) -> None:

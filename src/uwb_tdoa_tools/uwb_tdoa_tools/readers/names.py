@@ -1,4 +1,6 @@
-"""Anchors that have names: surveys and recordings call them "NE corner" or "A3", messages have numbers."""
+"""Anchors that have names: surveys and recordings call them "NE corner" or "A3", messages have
+numbers.
+"""
 
 from __future__ import annotations
 
@@ -25,7 +27,9 @@ class Named:
     ids: dict[str, int] = field(default_factory=dict)
 
     def id_of(self, text: str) -> int | None:
-        """The id of an anchor by its name, or by its id, decimal or as 0x1A2B; None if it is neither."""
+        """The id of an anchor by its name, or by its id, decimal or as 0x1A2B; None if it is
+        neither.
+        """
         if text in self.ids:
             return self.ids[text]
         folded = [number for name, number in self.ids.items() if name.casefold() == text.casefold()]
@@ -35,8 +39,10 @@ class Named:
 
 
 def read_named(path: str | Path) -> Named:
-    """Named of a survey file of any form of `survey.read_entries`, with ids or names of any text. The id is the number that a name ends
-    with, if all end with different ones; else the line of the survey, from 0 on. Raises InputError, also for a survey that is certainly wrong."""
+    """Named of a survey file of any form of `survey.read_entries`, with ids or names of any text.
+    The id is the number that a name ends with, if all end with different ones; else the line of the
+    survey, from 0 on. Raises InputError, also for a survey that is certainly wrong.
+    """
     named = _read_named(path)
     refuse_faulty(named.anchors, str(path))
     return named
@@ -49,7 +55,8 @@ def _read_named(path: str | Path) -> Named:
         return Named(survey.anchors_of(path, entries, [int(name) for name in names], frame))
     if len(set(names)) < len(names):
         raise InputError(
-            f"{path}: anchor {next(name for name in names if names.count(name) > 1)!r} is there twice; every anchor needs its own name."
+            f"{path}: anchor {next(name for name in names if names.count(name) > 1)!r} is "
+            "there twice; every anchor needs its own name."
         )
     ends = [re.search(r"(\d{1,5})$", name) for name in names]
     ids = [int(end[1]) for end in ends if end]
@@ -59,7 +66,9 @@ def _read_named(path: str | Path) -> Named:
 
 
 def read_survey(path: str | Path) -> Anchors:
-    """Anchors of a survey file, see `read_named`: of those with names, under the ids that these get."""
+    """Anchors of a survey file, see `read_named`: of those with names, under the ids that these
+    get.
+    """
     return read_named(path).anchors
 
 

@@ -1,8 +1,10 @@
-"""What the readers of recordings share: putting streams in order, making one IMU stream of two, naming the protocol."""
+"""What the readers of recordings share: putting streams in order, making one IMU stream of two,
+naming the protocol.
+"""
 
 from __future__ import annotations
 
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -11,9 +13,9 @@ from scipy.sparse.csgraph import connected_components
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
 from uwb_tdoa_bias.foundation.sensors import Height, Pressure
+from uwb_tdoa_bias.foundation.sensors.pressure import pressure_at
 from uwb_tdoa_bias.foundation.sensors.ranges import Ranges
 from uwb_tdoa_bias.foundation.sensors.sensor import LARGEST_NUMBER
-from uwb_tdoa_bias.foundation.sensors.pressure import pressure_at
 
 from ..clock import sentences, straightened
 from .optical_flow import velocity_of
@@ -24,36 +26,60 @@ if TYPE_CHECKING:
     Columns = dict[str, np.ndarray]  # of a stream, each (n,)
     Streams = dict[str, Columns]
 
-GRAVITY = 9.81  # m/s^2 in one g of the Crazyflie's accelerometer, as in its firmware and in the UTIL scripts
-NO_TARGET = 32.0  # m; the range finder writes 32.767 or more where it sees nothing, and sees 4 m at most
-LARGEST = {"tof": 1e9, "baro": 4e4}  # mm, and m: the formula of the standard atmosphere ends at 44 km
+# m/s^2 in one g of the Crazyflie's accelerometer, as in its firmware and in the UTIL scripts
+GRAVITY = 9.81
+NO_TARGET = (
+    32.0  # m; the range finder writes 32.767 or more where it sees nothing, and sees 4 m at most
+)
+LARGEST = {
+    "tof": 1e9,
+    "baro": 4e4,
+}  # mm, and m: the formula of the standard atmosphere ends at 44 km
 DAY = 86400.0  # s
 UNEQUAL, LOST = 1.1, 0.02  # ratio of two rates, and share of samples left out, that are told
 REFERENCE = 0.95  # of the TDOAs: an anchor that is in so many is what all others are compared with
 
 
 def make_flight(
-    name: str, anchors: Anchors, streams: Streams, extra: Streams, meta: dict[str, Any], salvage: bool = False,
+    name: str,
+    anchors: Anchors,
+    streams: Streams,
+    extra: Streams,
+    meta: dict[str, Any],
+    salvage: bool = False,
     truth: bool = True,
-) -> Flight:  # fmt: skip
-    """Flight of the streams of a Crazyflie recording: units to SI, stamps in order, empty streams left out.
+) -> Flight:
+    """Flight of the streams of a Crazyflie recording: units to SI, stamps in order, empty streams
+    left out.
 
-    streams : dict of stream name to dict of column name to (n,) array; "t" in s, the rest in the units of the file.
-        "tdoa": a, b, d (m), and std (m) if the tag knows it; "range": anchor, d (m), and std (m); "gyro": x, y, z (deg/s); "acc": x, y, z
-        (g); "pose": x, y, z (m), qx, qy, qz, qw. "tof": tof (mm); "baro": baro (m above the sea, from the pressure of the standard atmosphere). "flow": x, y (pixel counts),
-        which become a velocity where "tof" and IMU are.
+    streams : dict of stream name to dict of column name to (n,) array; "t" in s, the rest in the
+        units of the file.
+        "tdoa": a, b, d (m), and std (m) if the tag knows it; "range": anchor, d (m), and std (m);
+        "gyro": x, y, z (deg/s); "acc": x, y, z (g); "pose": x, y, z (m), qx, qy, qz, qw. "tof": tof
+        (mm); "baro": baro (m above the sea, from the pressure of the standard atmosphere). "flow":
+        x, y (pixel counts), which become a velocity where "tof" and IMU are.
     extra : the same of everything else, for `Flight.extra`.
-    meta : dict, completed here with "protocol" and, where there is something to tell, "clock" ([Jump] and {stream: outliers}, see
-        `clock.straightened`), "reordered" (how often the stamps of each stream fell before they were sorted), "imu_accel_interpolated",
-        "losses" ([(cause, evidence, remedy)], what is not used) and "remarks" (list of sentences).
-    salvage : leave out records that are not finite, or whose stamps are a day away from the others, with a remark.
+    meta : dict, completed here with "protocol" and, where there is something to tell, "clock"
+        ([Jump] and {stream: outliers}, see
+        `clock.straightened`), "reordered" (how often the stamps of each stream fell before they
+        were sorted), "imu_accel_interpolated", "losses" ([(cause, evidence, remedy)], what is not
+        used) and "remarks" (list of sentences).
+    salvage : leave out records that are not finite, or whose stamps are a day away from the others,
+        with a remark.
     truth : take "pose" as the ground truth; it is not looked at otherwise.
     Raises InputError; without salvage for such records too.
     """
     meta = {"remarks": [], **meta}
-    wanted = {key: columns for key, columns in streams.items() if len(columns["t"]) and (truth or key != "pose")}
+    wanted = {
+        key: columns
+        for key, columns in streams.items()
+        if len(columns["t"]) and (truth or key != "pose")
+    }
     clock = straightened({key: columns["t"] for key, columns in (extra | wanted).items()})
-    wanted, extra = ({key: clock.columns(key, columns) for key, columns in group.items()} for group in (wanted, extra))
+    wanted, extra = (
+        {key: clock.columns(key, columns) for key, columns in group.items()}
+        for group in (wanted, extra)
+    )
     meta["remarks"] += sentences(clock)
     if clock.jumps or clock.kept:
         meta["clock"] = clock.jumps, clock.outliers
@@ -71,7 +97,9 @@ def make_flight(
     if reordered:
         meta["reordered"] = reordered
     if not streams.keys() & {"tdoa", "range"}:
-        raise InputError(f"{meta['source']}: holds no TDOA measurement; record the tag's TDOAs with the flight.")
+        raise InputError(
+            f"{meta['source']}: holds no TDOA measurement; record the tag's TDOAs with the flight."
+        )
     tdoas, distances = Tdoas(*np.empty((4, 0))), None
     if "tdoa" in streams:
         tdoas = Tdoas(*_measured(streams["tdoa"], "a", "b"))
@@ -82,34 +110,57 @@ def make_flight(
     if "gyro" in streams and "acc" in streams:
         imu = _imu(streams["gyro"], streams["acc"], meta)
     elif alone := streams.keys() & {"gyro", "acc"}:
-        name, missing = ("gyroscope", "accelerometer") if alone == {"gyro"} else ("accelerometer", "gyroscope")
+        name, missing = (
+            ("gyroscope", "accelerometer") if alone == {"gyro"} else ("accelerometer", "gyroscope")
+        )
         evidence, remedy = f"there is no {missing}", f"record the {missing} too"
-        meta["losses"] = [(f"the {name} is not used: the filter needs both inertial sensors", evidence, remedy)]
+        meta["losses"] = [
+            (f"the {name} is not used: the filter needs both inertial sensors", evidence, remedy)
+        ]
     if "pose" in streams:
         pose = streams["pose"]
         poses = Truth(pose["t"], _stack(pose, "x", "y", "z"), _stack(pose, "qx", "qy", "qz", "qw"))
     height = pressure = velocity = None
     if "tof" in streams:
         tof = streams["tof"]
-        ranges = np.float32(1e-3 * np.asarray(tof["tof"], dtype=float)).astype(float)  # as a sensor_msgs/Range holds it
+        ranges = np.float32(1e-3 * np.asarray(tof["tof"], dtype=float)).astype(
+            float
+        )  # as a sensor_msgs/Range holds it
         height = Height(tof["t"], np.where(ranges < NO_TARGET, ranges, np.inf))
     if "baro" in streams:
         baro = _readings(streams["baro"], "baro")
         pressure = Pressure(baro["t"], pressure_at(baro["baro"]))
-    if "flow" in streams and imu is not None and height is not None and min(len(imu.t), np.isfinite(height.range).sum()) > 1:
+    if (
+        "flow" in streams
+        and imu is not None
+        and height is not None
+        and min(len(imu.t), np.isfinite(height.range).sum()) > 1
+    ):
         t, x, y = (np.asarray(streams["flow"][name], dtype=float) for name in "txy")
         velocity = velocity_of(t, x, y, height, imu)
         velocity = velocity if len(velocity.t) else None
     if not meta["remarks"]:
         del meta["remarks"]
     return Flight(
-        name, anchors, tdoas, imu, poses, extra, meta, clock.restarts,
-        height=height, pressure=pressure, velocity=velocity, range=distances,
-    )  # fmt: skip
+        name,
+        anchors,
+        tdoas,
+        imu,
+        poses,
+        extra,
+        meta,
+        clock.restarts,
+        height=height,
+        pressure=pressure,
+        velocity=velocity,
+        range=distances,
+    )
 
 
 def _measured(columns: Columns, *ids: str) -> tuple[np.ndarray, ...]:
-    """(stamps s, ids of each anchor, values m, variances m^2, 0 where the tag does not know them), (n,) each."""
+    """(stamps s, ids of each anchor, values m, variances m^2, 0 where the tag does not know them),
+    (n,) each.
+    """
     variance = columns["std"] ** 2 if "std" in columns else np.zeros(len(columns["t"]))
     return columns["t"], *(columns[name] for name in ids), columns["d"], variance
 
@@ -119,7 +170,9 @@ def _sound(key: str, columns: Columns, meta: dict[str, Any], salvage: bool) -> C
     columns = {name: np.asarray(values) for name, values in columns.items()}
     numbers = dict(columns)
     if key == "pose" and all(np.isnan(columns[name]).all() for name in ("qx", "qy", "qz", "qw")):
-        numbers = {name: values for name, values in columns.items() if not name.startswith("q")}  # not recorded
+        numbers = {
+            name: values for name, values in columns.items() if not name.startswith("q")
+        }  # not recorded
     bad = np.zeros(len(columns["t"]), dtype=bool)
     for name, values in numbers.items():
         values, largest = values.astype(float), LARGEST.get(name, LARGEST_NUMBER)
@@ -127,8 +180,10 @@ def _sound(key: str, columns: Columns, meta: dict[str, Any], salvage: bool) -> C
         if wrong.any() and not salvage:
             row = int(np.flatnonzero(wrong)[0])
             raise InputError(
-                f"{meta['source']}: {key}, record {row + 1} of {len(bad)} at {columns['t'][row]:.3f} s: {name} is "
-                f"{columns[name][row]}; it must be finite, within +-{largest:g}: leave such records out with --salvage."
+                f"{meta['source']}: {key}, record {row + 1} of {len(bad)} at "
+                f"{columns['t'][row]:.3f} s: {name} is "
+                f"{columns[name][row]}; it must be finite, within +-{largest:g}: leave such "
+                "records out with --salvage."
             )
         bad |= wrong
     if salvage and not bad.all():
@@ -136,25 +191,32 @@ def _sound(key: str, columns: Columns, meta: dict[str, Any], salvage: bool) -> C
         bad |= np.abs(columns["t"] - middle) > DAY
     if not bad.any():
         return columns
-    meta["remarks"].append(f"{key}: {np.count_nonzero(bad)} of {len(bad)} records left out, they are no numbers.")
+    meta["remarks"].append(
+        f"{key}: {np.count_nonzero(bad)} of {len(bad)} records left out, they are no numbers."
+    )
     return {name: values[~bad] for name, values in columns.items()}
 
 
 def _readings(columns: Columns, name: str) -> Columns:
-    """The rows of a sensor that is logged more often than it measures: where its value differs from the one before."""
+    """The rows of a sensor that is logged more often than it measures: where its value differs from
+    the one before.
+    """
     values = np.asarray(columns[name], dtype=float)
     new = np.flatnonzero(np.diff(values, prepend=np.nan) != 0.0)
     return {"t": columns["t"][new], name: values[new]}
 
 
 def protocol(tdoas: Tdoas) -> str:
-    """ "tdoa2", "tdoa3" or "tdoa, one reference", by which anchors are paired, whatever their ids and the order of the two.
+    """ "tdoa2", "tdoa3" or "tdoa, one reference", by which anchors are paired, whatever their ids
+    and the order of the two.
 
-    TDoA2 anchors send in turn in fixed slots, and the tag takes the difference of two that follow each other: the pairs are the sides of
-    one ring, and others occur only where a packet was missed. In TDoA3 any pair occurs (Bitcraze documentation). Where all anchors are
-    compared with the same one, neither says it. Measured, 37 recordings of eight anchors: 95 % and more are on one ring with the one, at
-    most 52 % on the eight most frequent pairs with the other. The sides of three anchors are all pairs there are: then it is a ring if the
-    order of the two never turns round.
+    TDoA2 anchors send in turn in fixed slots, and the tag takes the difference of two that follow
+    each other: the pairs are the sides of one ring, and others occur only where a packet was
+    missed. In TDoA3 any pair occurs (Bitcraze documentation). Where all anchors are compared with
+    the same one, neither says it. Measured, 37 recordings of eight anchors: 95 % and more are on
+    one ring with the one, at most 52 % on the eight most frequent pairs with the other. The sides
+    of three anchors are all pairs there are: then it is a ring if the order of the two never turns
+    round.
     """
     ids, rows = np.unique(np.concatenate([tdoas.a, tdoas.b]), return_inverse=True)
     n, (a, b) = len(ids), rows.reshape(2, -1)
@@ -167,22 +229,30 @@ def protocol(tdoas: Tdoas) -> str:
     often = pairs[np.argsort(-heard[tuple(pairs.T)], kind="stable")[:n]]
     share = heard[tuple(often.T)].sum() / max(len(a), 1)
     if n < 4:
-        return "tdoa2" if np.maximum(directed, directed.T)[tuple(often.T)].sum() == len(a) else "tdoa3"
+        return (
+            "tdoa2" if np.maximum(directed, directed.T)[tuple(often.T)].sum() == len(a) else "tdoa3"
+        )
     return "tdoa2" if share > 0.5 * (1.0 + n / len(pairs)) and _is_ring(often, n) else "tdoa3"
 
 
 def _is_ring(sides: np.ndarray, n: int) -> bool:
-    """Whether n sides (n, 2) of n corners close to one ring: each corner is on two of them, and all hang together."""
+    """Whether n sides (n, 2) of n corners close to one ring: each corner is on two of them, and all
+    hang together.
+    """
     meets = coo_array((np.ones(len(sides)), tuple(sides.T)), (n, n))
-    return bool((np.bincount(sides.ravel(), minlength=n) == 2).all() and connected_components(meets, directed=False)[0] == 1)
+    return bool(
+        (np.bincount(sides.ravel(), minlength=n) == 2).all()
+        and connected_components(meets, directed=False)[0] == 1
+    )
 
 
 def _imu(gyro: Columns, acc: Columns, meta: dict[str, Any]) -> Imu:
     """One stream of both sensors at the gyroscope's stamps.
 
-    The firmware reads both at one instant and logs one after the other, some 20 us apart: sample n goes with sample n
-    as long as all stamps agree to half a period. Where they do not (an event was lost), the accelerometer is
-    interpolated linearly between its own samples, and gyroscope samples outside of its time are left out.
+    The firmware reads both at one instant and logs one after the other, some 20 us apart: sample n
+    goes with sample n as long as all stamps agree to half a period. Where they do not (an event was
+    lost), the accelerometer is interpolated linearly between its own samples, and gyroscope samples
+    outside of its time are left out.
     """
     t, rate, force = gyro["t"], _stack(gyro, "x", "y", "z"), _stack(acc, "x", "y", "z")
     half_period = 0.5 * np.median(np.diff(t)) if len(t) > 1 else 0.0
@@ -194,25 +264,35 @@ def _imu(gyro: Columns, acc: Columns, meta: dict[str, Any]) -> Imu:
         t, rate = t[inside], rate[inside]
         if not len(t):
             raise InputError(
-                f"{meta['source']}: gyroscope ({gyro['t'][0]:.3f} ... {gyro['t'][-1]:.3f} s) and accelerometer "
-                f"({acc['t'][0]:.3f} ... {acc['t'][-1]:.3f} s) never overlap in time; they must be of one recording."
+                f"{meta['source']}: gyroscope ({gyro['t'][0]:.3f} ... {gyro['t'][-1]:.3f} s) "
+                "and accelerometer "
+                f"({acc['t'][0]:.3f} ... {acc['t'][-1]:.3f} s) never overlap in time; they "
+                "must be of one recording."
             )
         force = np.stack([np.interp(t, acc["t"], column) for column in force.T], axis=1)
     return Imu(t, np.deg2rad(rate), force * GRAVITY)
 
 
 def _losses_of(gyro: np.ndarray, acc: np.ndarray, inside: np.ndarray) -> list[tuple[str, str, str]]:
-    """[(cause, evidence, remedy)] of what is lost of sensors with stamps gyro (n,) and acc (m,) s; inside (n,) : whether a sample of
-    the gyroscope counts."""
+    """[(cause, evidence, remedy)] of what is lost of sensors with stamps gyro (n,) and acc (m,) s;
+    inside (n,) : whether a sample of the gyroscope counts.
+    """
     out = []
-    rates = [1.0 / max(float(np.median(np.diff(t))), 1e-9) if len(t) > 1 else 0.0 for t in (gyro, acc)]
+    rates = [
+        1.0 / max(float(np.median(np.diff(t))), 1e-9) if len(t) > 1 else 0.0 for t in (gyro, acc)
+    ]
     evidence = f"gyroscope {rates[0]:.0f} Hz, accelerometer {rates[1]:.0f} Hz"
     if max(rates) > UNEQUAL * min(rates):
-        cause = "gyroscope and accelerometer have different rates: only the stamps of the gyroscope are used"
+        cause = (
+            "gyroscope and accelerometer have different rates: only the stamps of the gyroscope "
+            "are used"
+        )
         out.append((cause, evidence, "log both at one rate, e.g. in one block of the log"))
     if (lost := float(np.mean(~inside))) > LOST:
         cause = "samples of the gyroscope are left out: the accelerometer was not recorded then"
-        out.append((cause, f"{100.0 * lost:.0f} % of them; {evidence}", "start and stop both together"))
+        out.append(
+            (cause, f"{100.0 * lost:.0f} % of them; {evidence}", "start and stop both together")
+        )
     return out
 
 

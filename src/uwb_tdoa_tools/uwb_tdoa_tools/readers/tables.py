@@ -1,4 +1,7 @@
-"""CSV tables with a header line. What is read at a time is a row: a file may have many more cells than memory would hold as text."""
+"""CSV tables with a header line.
+
+What is read at a time is a row: a file may have many more cells than memory would hold as text.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +10,19 @@ from collections.abc import Iterator
 import csv
 import io
 import math
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.files import read_bytes
-from uwb_tdoa_bias.foundation.limits import Budget, ROW_CHARACTERS, SMALL_TABLE_CELLS, TABLE_BYTES, TABLE_CELLS
+from uwb_tdoa_bias.foundation.limits import (
+    ROW_CHARACTERS,
+    SMALL_TABLE_CELLS,
+    TABLE_BYTES,
+    TABLE_CELLS,
+    Budget,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -21,8 +30,9 @@ if TYPE_CHECKING:
 
 
 class CsvRows:
-    """Lists of cells, row by row, of CSV content, bytes. line : how many lines were read. Raises csv.Error for what is no CSV, and
-    InputError for what is no text."""
+    """Lists of cells, row by row, of CSV content, bytes. line : how many lines were read. Raises
+    csv.Error for what is no CSV, and InputError for what is no text.
+    """
 
     def __init__(self, path: str | Path, content: bytes, **options: Any) -> None:
         self._path, self._content, self._read = path, content, 0
@@ -54,40 +64,68 @@ class CsvRows:
 class CsvTable:
     """(line, {column: text}) of each row of a CSV file. names : the columns of its header."""
 
-    def __init__(self, path: str | Path, columns: Sequence[str] | None, most: int, complete: bool = True) -> None:
+    def __init__(
+        self, path: str | Path, columns: Sequence[str] | None, most: int, complete: bool = True
+    ) -> None:
         self._path, self._most, self._complete = path, most, complete
         content = read_bytes(path, TABLE_BYTES)
         header = content[:ROW_CHARACTERS].lstrip().split(b"\n", 1)[0]
-        self._rows = CsvRows(path, content, skipinitialspace=True, delimiter=max(",;\t", key=lambda each: header.count(each.encode())))
+        self._rows = CsvRows(
+            path,
+            content,
+            skipinitialspace=True,
+            delimiter=max(",;\t", key=lambda each: header.count(each.encode())),
+        )
         self._cells = self._each()
         self.names = [name.strip() for name in next(self._cells, [])]
         self._columns = columns if columns is not None else [name for name in self.names if name]
         if missing := [name for name in self._columns if name not in self.names]:
-            raise InputError(f"{path}: has no column {missing[0]}; it needs columns {', '.join(self._columns)}.")
+            raise InputError(
+                f"{path}: has no column {missing[0]}; it needs columns {', '.join(self._columns)}."
+            )
 
     def __iter__(self) -> Iterator[tuple[int, dict[str, str]]]:
-        names, budget = {name: self.names.index(name) for name in self._columns}, Budget(self._path, TABLE_BYTES)
+        names, budget = (
+            {name: self.names.index(name) for name in self._columns},
+            Budget(self._path, TABLE_BYTES),
+        )
         for cells in self._cells:
             budget.spend("cells", len(cells), self._most)
             short = len(cells) <= max(names.values(), default=0)
             if short and self._complete:
-                raise InputError(f"{self._path}: line {self._rows.line}: has fewer cells than the header; complete it.")
-            yield self._rows.line, {name: cells[place] if not short or place < len(cells) else "" for name, place in names.items()}
+                raise InputError(
+                    f"{self._path}: line {self._rows.line}: has fewer cells than the header; "
+                    "complete it."
+                )
+            yield (
+                self._rows.line,
+                {
+                    name: cells[place] if not short or place < len(cells) else ""
+                    for name, place in names.items()
+                },
+            )
 
     def _each(self) -> Iterator[list[str]]:
         """The rows that are not empty."""
         try:
             yield from filter(None, self._rows)
         except csv.Error as error:
-            raise InputError(f"{self._path}: line {self._rows.line}: is no CSV ({error}); correct it there.") from error
+            raise InputError(
+                f"{self._path}: line {self._rows.line}: is no CSV ({error}); correct it there."
+            ) from error
 
 
 def read_table(
-    path: str | Path, columns: Sequence[str] | None = None, most: int = SMALL_TABLE_CELLS, complete: bool = True
+    path: str | Path,
+    columns: Sequence[str] | None = None,
+    most: int = SMALL_TABLE_CELLS,
+    complete: bool = True,
 ) -> CsvTable:
-    """The CsvTable of a CSV file that has at least the columns, others passed over; default: of all that it has. It may have `most`
-    cells, divided by what the header has most of: commas, semicolons or tabs. complete : a row with fewer cells than the header is refused;
-    otherwise those that are missing are empty. Raises InputError, also while it is iterated over."""
+    """The CsvTable of a CSV file that has at least the columns, others passed over; default: of all
+    that it has. It may have `most` cells, divided by what the header has most of: commas,
+    semicolons or tabs. complete : a row with fewer cells than the header is refused; otherwise
+    those that are missing are empty. Raises InputError, also while it is iterated over.
+    """
     return CsvTable(path, columns, most, complete)
 
 
@@ -106,7 +144,9 @@ def number(path: str | Path, line: int, row: dict[str, str], column: str) -> flo
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise InputError(f"{path}: line {line}: {column} is {row[column][:40]!r}; it must be a finite number.")
+        raise InputError(
+            f"{path}: line {line}: {column} is {row[column][:40]!r}; it must be a finite number."
+        )
     return value
 
 

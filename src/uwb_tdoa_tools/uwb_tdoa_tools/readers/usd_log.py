@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import zlib
 from pathlib import Path
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+import zlib
 
 import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.files import read_bytes
 from uwb_tdoa_bias.foundation.foreign_text import harmless
-from uwb_tdoa_bias.foundation.limits import Budget, USD_TYPES, USD_VARIABLES
+from uwb_tdoa_bias.foundation.limits import USD_TYPES, USD_VARIABLES, Budget
 
 from ..command_lines import SALVAGE
 from .streams import make_flight
@@ -20,6 +20,7 @@ from .usd_scan import scan
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.anchors import Anchors
     from uwb_tdoa_bias.foundation.flight import Flight
+
     from .streams import Columns
 
 MAGIC = 0xBC
@@ -27,34 +28,55 @@ _CRC_SIZE = 4
 _BLOCK = 100_000  # records that are taken out of the file at once
 _STAMP = {1: ("<u4", 1e3), 2: ("<u8", 1e6)}  # version: type of the time stamp, its ticks per second
 _NUMPY_OF_STRUCT = {  # codes of Python's struct module, little endian and packed
-    "b": "i1", "B": "u1", "?": "u1", "h": "<i2", "H": "<u2", "i": "<i4", "I": "<u4", "l": "<i4", "L": "<u4",
-    "q": "<i8", "Q": "<u8", "f": "<f4", "d": "<f8",
-}  # fmt: skip
+    "b": "i1",
+    "B": "u1",
+    "?": "u1",
+    "h": "<i2",
+    "H": "<u2",
+    "i": "<i4",
+    "I": "<u4",
+    "l": "<i4",
+    "L": "<u4",
+    "q": "<i8",
+    "Q": "<u8",
+    "f": "<f4",
+    "d": "<f8",
+}
 _CANDIDATES, _SELECTED = "estTdoaCand", "isSelected"
 _STREAMS = {  # event name: our stream, {column in the log: column of the stream}
     "estTDOA": ("tdoa", {"idA": "a", "idB": "b", "distanceDiff": "d"}),
-    _CANDIDATES: ("tdoa", {"idA": "b", "idB": "a", "distanceDiff": "d"}),  # its sign is the other one
+    _CANDIDATES: (
+        "tdoa",
+        {"idA": "b", "idB": "a", "distanceDiff": "d"},
+    ),  # its sign is the other one
     "estGyroscope": ("gyro", {"gyro.x": "x", "gyro.y": "y", "gyro.z": "z"}),
     "estAcceleration": ("acc", {"acc.x": "x", "acc.y": "y", "acc.z": "z"}),
-    "estPose": ("pose", {f"locSrv.{axis}": axis for axis in ("x", "y", "z", "qx", "qy", "qz", "qw")}),
+    "estPose": (
+        "pose",
+        {f"locSrv.{axis}": axis for axis in ("x", "y", "z", "qx", "qy", "qz", "qw")},
+    ),
     "estTOF": ("tof", {"range.zrange": "tof"}),
     "estBarometer": ("baro", {"baro.asl": "baro"}),
     "estFlow": ("flow", {"motion.deltaX": "x", "motion.deltaY": "y"}),
 }
 
 
-def read_usd_log(path: str | Path, anchors: Anchors, salvage: bool = False, truth: bool = True) -> Flight:
+def read_usd_log(
+    path: str | Path, anchors: Anchors, salvage: bool = False, truth: bool = True
+) -> Flight:
     """Flight of a micro-SD event log.
 
-    TDOAs come from estTDOA (d_B - d_A), or where there is none from the selected ones of estTdoaCand (d_A - d_B), the
-    IMU from estGyroscope (deg/s to rad/s) and estAcceleration (g to m/s^2), the ground truth from estPose, the height
-    from estTOF (mm to m), the pressure from estBarometer (altitude to Pa) and the velocity from estFlow (pixel counts,
-    with range and gyroscope). Other events that occur are in `Flight.extra` under the names and in the units of the
-    log.
-    Raises InputError for a file that is empty, foreign, cut or damaged (the checksum is always verified), and for
-    records that are not finite.
-    salvage : read a cut or damaged log up to there, as the power of a vehicle that fell leaves it; `meta["remarks"]`
-        tells what is missing. Single values may be damaged then: nothing but the checksum could tell.
+    TDOAs come from estTDOA (d_B - d_A), or where there is none from the selected ones of
+    estTdoaCand (d_A - d_B), the IMU from estGyroscope (deg/s to rad/s) and estAcceleration (g to
+    m/s^2), the ground truth from estPose, the height from estTOF (mm to m), the pressure from
+    estBarometer (altitude to Pa) and the velocity from estFlow (pixel counts, with range and
+    gyroscope). Other events that occur are in `Flight.extra` under the names and in the units of
+    the log. Raises InputError for a file that is empty, foreign, cut or damaged (the checksum is
+    always verified), and for records that are not finite.
+    salvage : read a cut or damaged log up to there, as the power of a vehicle that fell leaves it;
+        `meta["remarks"]`
+        tells what is missing. Single values may be damaged then: nothing but the checksum could
+        tell.
     Format: "uSD logger" of the Crazyflie firmware.
     """
     data = read_bytes(path)
@@ -66,7 +88,11 @@ def read_usd_log(path: str | Path, anchors: Anchors, salvage: bool = False, trut
         dtypes[name] = np.dtype([("id", "<u2"), ("t", stamp), ("values", np.dtype(fields))])
         size_of_id[number] = dtypes[name].itemsize
     raw = np.frombuffer(data, dtype=np.uint8)
-    meta: dict[str, Any] = {"source": str(path), "format": f"uSD log version {version}", "remarks": []}
+    meta: dict[str, Any] = {
+        "source": str(path),
+        "format": f"uSD log version {version}",
+        "remarks": [],
+    }
     whole = int.from_bytes(data[-_CRC_SIZE:], "little") == zlib.crc32(memoryview(data)[:-_CRC_SIZE])
     end = len(data) - _CRC_SIZE if whole or not salvage else len(data)
     offsets, ids, stopped = scan(raw, start, end, size_of_id)
@@ -120,18 +146,22 @@ def _tdoa(path: str | Path, columns: Columns) -> Columns:
         bad = ~((values >= 0) & (values <= 65535) & (values == np.floor(values)))
         if bad.any():
             raise InputError(
-                f"{path}: estTDOA, record {np.flatnonzero(bad)[0] + 1}: id{name.upper()} is {columns[name][bad][0]}; "
+                f"{path}: estTDOA, record {np.flatnonzero(bad)[0] + 1}: id{name.upper()} is "
+                f"{columns[name][bad][0]}; "
                 "it must be a whole number 0 ... 65535."
             )
     types = {"t": float, "a": np.int64, "b": np.int64, "d": float}
     return {column: np.asarray(values, dtype=types[column]) for column, values in columns.items()}
 
 
-def _read_header(path: str | Path, data: bytes) -> tuple[int, dict[int, tuple[str, list[tuple[str, str]]]], int]:
+def _read_header(
+    path: str | Path, data: bytes
+) -> tuple[int, dict[int, tuple[str, list[tuple[str, str]]]], int]:
     """Version, {id: (name, [(variable, numpy type), ...])} and where the events start."""
     if data[0] != MAGIC:
         raise InputError(
-            f"{path}: byte 0 is 0x{data[0]:02X}, a micro-SD event log starts with 0xBC; give the file as it is on "
+            f"{path}: byte 0 is 0x{data[0]:02X}, a micro-SD event log starts with 0xBC; give "
+            "the file as it is on "
             "the card."
         )
     at = 1
@@ -140,7 +170,8 @@ def _read_header(path: str | Path, data: bytes) -> tuple[int, dict[int, tuple[st
         nonlocal at
         if at + size > len(data) - _CRC_SIZE:
             raise InputError(
-                f"{path}: ends after {len(data)} bytes, inside the header ({what} expected at byte {at}); the file is "
+                f"{path}: ends after {len(data)} bytes, inside the header ({what} expected at "
+                f"byte {at}); the file is "
                 "cut: copy it from the card again."
             )
         at += size
@@ -154,13 +185,16 @@ def _read_header(path: str | Path, data: bytes) -> tuple[int, dict[int, tuple[st
         content = take((end if end >= 0 else len(data)) + 1 - at, what)[:-1]
         if not content or not content.isascii() or harmless(content.decode()) != content.decode():
             raise InputError(
-                f"{path}: byte {at - len(content) - 1}: expected {what}, found {content[:40]!r}; the file is damaged."
+                f"{path}: byte {at - len(content) - 1}: expected {what}, found "
+                f"{content[:40]!r}; the file is damaged."
             )
         return content.decode("ascii")
 
     version = number("the version")
     if version not in _STAMP:
-        raise InputError(f"{path}: is an event log of version {version}; versions 1 and 2 can be read.")
+        raise InputError(
+            f"{path}: is an event log of version {version}; versions 1 and 2 can be read."
+        )
     events, names, budget = {}, set(), Budget(path)
     for _ in range(number("the number of event types")):
         budget.spend("event types", 1, USD_TYPES)
@@ -171,16 +205,23 @@ def _read_header(path: str | Path, data: bytes) -> tuple[int, dict[int, tuple[st
             budget.spend("variables", 1, USD_VARIABLES)
             variable = string(f"a variable of {name}")
             field, code = variable[:-3], variable[-2:-1]
-            if variable[-3:] != f"({code})" or code not in _NUMPY_OF_STRUCT or not field or field in known:
+            if (
+                variable[-3:] != f"({code})"
+                or code not in _NUMPY_OF_STRUCT
+                or not field
+                or field in known
+            ):
                 raise InputError(
-                    f"{path}: byte {at - len(variable) - 1}: {variable!r} is not a new variable of {name} (expected "
+                    f"{path}: byte {at - len(variable) - 1}: {variable!r} is not a new "
+                    f"variable of {name} (expected "
                     f"'name(c)', c one of {' '.join(_NUMPY_OF_STRUCT)}); the file is damaged."
                 )
             fields.append((field, _NUMPY_OF_STRUCT[code]))
             known.add(field)
         if event in events or name in names:
             raise InputError(
-                f"{path}: byte {where}: event type {event} {name!r} is defined twice; the file is damaged."
+                f"{path}: byte {where}: event type {event} {name!r} is defined twice; the "
+                "file is damaged."
             )
         events[event] = (name, fields)
         names.add(name)
@@ -188,16 +229,28 @@ def _read_header(path: str | Path, data: bytes) -> tuple[int, dict[int, tuple[st
 
 
 def _damaged(path: str | Path, data: bytes, whole: bool, stopped: int) -> InputError:
-    """InputError of a log whose checksum is wrong, or whose events do not fill it. stopped: where they end, or -1."""
+    """InputError of a log whose checksum is wrong, or whose events do not fill it. stopped: where
+    they end, or -1.
+    """
     if whole:
         return InputError(
-            f"{path}: byte {stopped}: no event of a type that the header defines fits here, although the checksum is "
+            f"{path}: byte {stopped}: no event of a type that the header defines fits here, "
+            "although the checksum is "
             f"right; the log was written by a faulty logger: {SALVAGE}."
         )
-    stored, computed = int.from_bytes(data[-_CRC_SIZE:], "little"), zlib.crc32(memoryview(data)[:-_CRC_SIZE])
-    first = f"first event that cannot be read: byte {stopped}" if stopped >= 0 else "no event is visibly broken"
+    stored, computed = (
+        int.from_bytes(data[-_CRC_SIZE:], "little"),
+        zlib.crc32(memoryview(data)[:-_CRC_SIZE]),
+    )
+    first = (
+        f"first event that cannot be read: byte {stopped}"
+        if stopped >= 0
+        else "no event is visibly broken"
+    )
     return InputError(
-        f"{path}: the checksum in the last 4 bytes is 0x{stored:08X} but 0x{computed:08X} was expected for the "
-        f"{len(data) - _CRC_SIZE} bytes before it ({first}); the file is cut or damaged: copy it from the card again, "
+        f"{path}: the checksum in the last 4 bytes is 0x{stored:08X} but 0x{computed:08X} was "
+        "expected for the "
+        f"{len(data) - _CRC_SIZE} bytes before it ({first}); the file is cut or damaged: copy "
+        "it from the card again, "
         f"or {SALVAGE}."
     )

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
+
 from uwb_tdoa_bias.foundation.compiled import compiled
 
 
 @compiled
-def scan(raw: np.ndarray, start: int, end: int, size_of_id: np.ndarray) -> tuple[np.ndarray, np.ndarray, int]:
-    """Offsets and ids of the events in raw[start:end], and where the scan had to stop (-1: it ended at `end`).
+def scan(
+    raw: np.ndarray, start: int, end: int, size_of_id: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Offsets and ids of the events in raw[start:end], and where the scan had to stop (-1: it ended
+    at `end`).
 
     size_of_id : (65536,) bytes of a whole event (id, stamp, payload), -1 where no type has the id.
     """

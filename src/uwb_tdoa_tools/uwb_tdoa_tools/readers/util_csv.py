@@ -1,19 +1,21 @@
-"""CSV files of the UTIL dataset (Zhao et al., IJRR 2024), the full schema of 27 columns or a subset, plain or gzip."""
+"""CSV files of the UTIL dataset (Zhao et al., IJRR 2024), the full schema of 27 columns or a
+subset, plain or gzip.
+"""
 
 from __future__ import annotations
 
 import csv
 from gzip import GzipFile
 import io
-import zlib
 from pathlib import Path
 from typing import TYPE_CHECKING
+import zlib
 
 import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.files import read_bytes
-from uwb_tdoa_bias.foundation.limits import Budget, CSV_BYTES, CSV_CELLS, most_unpacked
+from uwb_tdoa_bias.foundation.limits import CSV_BYTES, CSV_CELLS, Budget, most_unpacked
 
 from ..command_lines import SALVAGE
 from .streams import make_flight
@@ -21,15 +23,20 @@ from .tables import CsvRows, check_text
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
+
     from uwb_tdoa_bias.foundation.anchors import Anchors
     from uwb_tdoa_bias.foundation.flight import Flight
+
     from .streams import Columns
 
 GZIP_MAGIC = b"\x1f\x8b"
 _BLOCK = 1 << 20  # bytes that are unpacked at once
-# Each sensor has its own time column and its own length: they are only set side by side, a row is not one instant.
-# Units: the authors' converter writes the columns as the micro-SD log has them, so acc is in g and gyro in deg/s
-# (utiasDSL/util-uwb-dataset, scripts/flight-dataset/sdcard_scripts/log_to_csv.py); stamps are in s from the start.
+# Each sensor has its own time column and its own length: they are only set side by side, a row is
+# not one instant.
+# Units: the authors' converter writes the columns as the micro-SD log has them, so acc is in g and
+# gyro in deg/s
+# (utiasDSL/util-uwb-dataset, scripts/flight-dataset/sdcard_scripts/log_to_csv.py); stamps are in s
+# from the start.
 _STREAMS = {  # our stream: {column of the file: column of the stream}, the time column first
     "tdoa": {"t_tdoa": "t", "idA": "a", "idB": "b", "tdoa_meas": "d"},
     "acc": {"t_acc": "t", "acc_x": "x", "acc_y": "y", "acc_z": "z"},
@@ -45,15 +52,20 @@ _KNOWN = {name for rename in _STREAMS.values() for name in rename} | {*_QUATERNI
 _ROWS = 4096  # that are text at a time
 
 
-def read_util_csv(path: str | Path, anchors: Anchors, salvage: bool = False, truth: bool = True) -> Flight:
-    """Flight of a CSV file in the UTIL schema; it must hold at least t_tdoa, idA, idB and tdoa_meas.
+def read_util_csv(
+    path: str | Path, anchors: Anchors, salvage: bool = False, truth: bool = True
+) -> Flight:
+    """Flight of a CSV file in the UTIL schema; it must hold at least t_tdoa, idA, idB and
+    tdoa_meas.
 
-    Acceleration g to m/s^2, rates deg/s to rad/s, tof mm to m, baro m of altitude to Pa, flow (pixel
-    counts) to velocity. Ground truth without quaternion columns has NaN for q; `meta["ignored_columns"]` names columns that the schema
-    does not know.
-    Raises InputError with the line for a file that is empty, foreign or cut and for a cell that is not a finite number.
-    A plain file that was cut exactly between two lines cannot be told from a shorter one; a gzip file can.
-    salvage : read a cut or damaged file up to there, and leave out records that are no numbers; `meta["remarks"]`
+    Acceleration g to m/s^2, rates deg/s to rad/s, tof mm to m, baro m of altitude to Pa, flow
+    (pixel counts) to velocity. Ground truth without quaternion columns has NaN for q;
+    `meta["ignored_columns"]` names columns that the schema does not know. Raises InputError with
+    the line for a file that is empty, foreign or cut and for a cell that is not a finite number. A
+    plain file that was cut exactly between two lines cannot be told from a shorter one; a gzip file
+    can.
+    salvage : read a cut or damaged file up to there, and leave out records that are no numbers;
+        `meta["remarks"]`
         tells what is missing.
     """
     remarks: list[str] = []
@@ -69,16 +81,21 @@ def read_util_csv(path: str | Path, anchors: Anchors, salvage: bool = False, tru
         missing = [name for name in rename if name not in cells]
         if missing:
             raise InputError(
-                f"{path}: the header has columns of {stream} but not {missing[0]}; all or none must be there."
+                f"{path}: the header has columns of {stream} but not {missing[0]}; all or "
+                "none must be there."
             )
-        streams[stream] = {rename[name]: values for name, values in _numbers(path, rename, cells, salvage).items()}
+        streams[stream] = {
+            rename[name]: values for name, values in _numbers(path, rename, cells, salvage).items()
+        }
     tdoa = streams["tdoa"]
     if salvage:
         sound = np.isfinite(tdoa["a"]) & np.isfinite(tdoa["b"])
         tdoa.update({name: values[sound] for name, values in tdoa.items()})
     tdoa["a"], tdoa["b"] = _ids(path, "idA", tdoa["a"]), _ids(path, "idB", tdoa["b"])
     if "pose" in streams and "qx" not in streams["pose"]:
-        streams["pose"].update({name: np.full(len(streams["pose"]["t"]), np.nan) for name in _QUATERNION.values()})
+        streams["pose"].update(
+            {name: np.full(len(streams["pose"]["t"]), np.nan) for name in _QUATERNION.values()}
+        )
 
     meta = {"source": str(path), "format": "UTIL CSV", "remarks": remarks}
     if ignored := [name for name in header if name not in _KNOWN]:
@@ -99,16 +116,25 @@ def _text(path: str | Path, remarks: list[str], salvage: bool) -> bytes:
         content = _unpacked(path, content, most, remarks, salvage)
     Budget(path).spend("bytes of text", len(content), most)
     if b"\0" in content:
-        raise InputError(f"{path}: byte {content.index(0)} is 0, not text; a UTIL CSV file was expected: copy it again.")
+        raise InputError(
+            f"{path}: byte {content.index(0)} is 0, not text; a UTIL CSV file was expected: "
+            "copy it again."
+        )
     if content.isspace():
         raise InputError(f"{path}: holds no text; a UTIL CSV file with a header line was expected.")
     return content
 
 
-def _unpacked(path: str | Path, content: bytes, most: int, remarks: list[str], salvage: bool) -> bytes:
-    """What gzip holds, somewhat more than `most` bytes at most: its header does not tell how much that is."""
+def _unpacked(
+    path: str | Path, content: bytes, most: int, remarks: list[str], salvage: bool
+) -> bytes:
+    """What gzip holds, somewhat more than `most` bytes at most: its header does not tell how much
+    that is.
+    """
     out, budget, problem = io.BytesIO(), Budget(path, len(content)), ""
-    with GzipFile(fileobj=io.BytesIO(content)) as unpacked:  # a file may have a million members: no copy of the rest for each
+    with GzipFile(
+        fileobj=io.BytesIO(content)
+    ) as unpacked:  # a file may have a million members: no copy of the rest for each
         try:
             while out.tell() <= most and (block := unpacked.read1(_BLOCK)):
                 out.write(block)
@@ -118,20 +144,24 @@ def _unpacked(path: str | Path, content: bytes, most: int, remarks: list[str], s
     if problem and out.tell() <= most:
         if not salvage:
             raise InputError(
-                f"{path}: the gzip data is cut or damaged ({problem}); copy the file again, or {SALVAGE}."
+                f"{path}: the gzip data is cut or damaged ({problem}); copy the file again, "
+                f"or {SALVAGE}."
             )
         remarks.append(f"the gzip data is cut or damaged ({problem}): read up to there.")
     return out.getvalue()
 
 
-def _table(path: str | Path, content: bytes, remarks: list[str], salvage: bool) -> tuple[list[str], dict[str, _Column]]:
+def _table(
+    path: str | Path, content: bytes, remarks: list[str], salvage: bool
+) -> tuple[list[str], dict[str, _Column]]:
     """Header, and {name: _Column} of the columns that are known, of rows of as many cells."""
     if not content.endswith((b"\n", b"\r")):
         check_text(path, content)
         line = content.count(b"\n") + content.count(b"\r") - content.count(b"\r\n") + 1
         if not salvage or line < 2:
             raise InputError(
-                f"{path}: line {line} has no line end: the file is cut; copy it again, end it with a new line if it is "
+                f"{path}: line {line} has no line end: the file is cut; copy it again, end it "
+                "with a new line if it is "
                 f"whole, or {SALVAGE}."
             )
         remarks.append(f"line {line} is cut and left out.")
@@ -154,7 +184,9 @@ def _table(path: str | Path, content: bytes, remarks: list[str], salvage: bool) 
             budget.spend("cells", len(row), CSV_CELLS)
     except csv.Error as error:
         if header is None or not salvage:
-            raise InputError(f"{path}: line {rows.line} {error}; copy the file again, or {SALVAGE}.") from error
+            raise InputError(
+                f"{path}: line {rows.line} {error}; copy the file again, or {SALVAGE}."
+            ) from error
         remarks.append(f"line {rows.line} {error}: read up to there.")
     if header is None:
         raise InputError(f"{path}: holds no line that is whole; copy the file again.")
@@ -171,10 +203,14 @@ def _add(block: list[list[str]], header: list[str], columns: dict[str, _Column])
 
 
 class _Column:
-    """What is needed of the cells of a column, of which there may be many more than memory would hold as text."""
+    """What is needed of the cells of a column, of which there may be many more than memory would
+    hold as text.
+    """
 
     def __init__(self) -> None:
-        self._parts: list[np.ndarray] = []  # numbers, NaN for what is none, up to the first empty cell
+        self._parts: list[
+            np.ndarray
+        ] = []  # numbers, NaN for what is none, up to the first empty cell
         self._count = 0
         self.end: int | None = None  # row of the first empty cell
         # (row, text, is a number) of the first cell that is no finite number
@@ -190,14 +226,23 @@ class _Column:
             if filled < len(cells):
                 self.end = self._count + filled
         if self.end is not None and self.after is None and any(cells):
-            self.after = next((self._count + k for k, cell in enumerate(cells) if cell and self._count + k > self.end), None)
+            self.after = next(
+                (
+                    self._count + k
+                    for k, cell in enumerate(cells)
+                    if cell and self._count + k > self.end
+                ),
+                None,
+            )
         self._count += len(cells)
 
     def _take(self, cells: list[str]) -> None:
         try:
             self._parts.append(np.array(cells, dtype=float))
         except ValueError:
-            self._parts.append(np.array([float(cell) if _is_number(cell) else np.nan for cell in cells]))
+            self._parts.append(
+                np.array([float(cell) if _is_number(cell) else np.nan for cell in cells])
+            )
         bad = np.flatnonzero(~np.isfinite(self._parts[-1]))
         if self.odd is None and len(bad):
             self.odd = self._count + bad[0], cells[bad[0]], _is_number(cells[bad[0]])
@@ -215,32 +260,43 @@ def _check_header(path: str | Path, header: list[str]) -> None:
     missing = [name for name in TDOA_COLUMNS if name not in header]
     if missing:
         raise InputError(
-            f"{path}: line 1: column {missing[0]} is missing from the header ({','.join(header)[:80]}); a UTIL CSV "
+            f"{path}: line 1: column {missing[0]} is missing from the header "
+            f"({','.join(header)[:80]}); a UTIL CSV "
             f"file has at least {','.join(TDOA_COLUMNS)}."
         )
     if len(set(header)) < len(header):
         twice = next(name for name in header if header.count(name) > 1)
-        raise InputError(f"{path}: line 1: column {twice!r} is there twice; every column must be there once.")
+        raise InputError(
+            f"{path}: line 1: column {twice!r} is there twice; every column must be there once."
+        )
 
 
-def _numbers(path: str | Path, names: Iterable[str], cells: dict[str, _Column], salvage: bool) -> Columns:
-    """{name: (n,) float array} of the columns of one sensor: the rows before the first empty cell. NaN for what is no
-    number, with salvage."""
+def _numbers(
+    path: str | Path, names: Iterable[str], cells: dict[str, _Column], salvage: bool
+) -> Columns:
+    """{name: (n,) float array} of the columns of one sensor: the rows before the first empty cell.
+    NaN for what is no number, with salvage.
+    """
     columns = {name: cells[name] for name in names}
     length = min(column.length for column in columns.values())
     for name, column in {} if salvage else columns.items():
         first = length if column.length > length else column.after
         if first is not None:
             raise InputError(
-                f"{path}: line {first + 2}: {name} is filled although {', '.join(names)} ended with an "
-                f"empty cell at line {length + 2}; fill the columns of one sensor from the top, without holes."
+                f"{path}: line {first + 2}: {name} is filled although {', '.join(names)} "
+                "ended with an "
+                f"empty cell at line {length + 2}; fill the columns of one sensor from the "
+                "top, without holes."
             )
         row, text, is_number = column.odd or (length, "", False)
         if row < length and not is_number:
-            raise InputError(f"{path}: line {row + 2}: {name} is {text[:40]!r}; it must be a number.")
+            raise InputError(
+                f"{path}: line {row + 2}: {name} is {text[:40]!r}; it must be a number."
+            )
         if row < length:
             raise InputError(
-                f"{path}: line {row + 2}: {name} is {text[:40]!r}; it must be finite: leave the cells after "
+                f"{path}: line {row + 2}: {name} is {text[:40]!r}; it must be finite: leave "
+                "the cells after "
                 "the end of a sensor empty, and delete broken measurements."
             )
     return {name: column.values(length) for name, column in columns.items()}
@@ -259,6 +315,7 @@ def _ids(path: str | Path, name: str, values: np.ndarray) -> np.ndarray:
     bad = np.flatnonzero((values != np.round(values)) | (values < 0) | (values > 65535))
     if len(bad):
         raise InputError(
-            f"{path}: line {bad[0] + 2}: {name} is {values[bad[0]]}; it must be a whole number 0 ... 65535."
+            f"{path}: line {bad[0] + 2}: {name} is {values[bad[0]]}; it must be a whole "
+            "number 0 ... 65535."
         )
     return values.astype(np.int64)

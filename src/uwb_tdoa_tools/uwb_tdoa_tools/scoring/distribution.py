@@ -1,11 +1,13 @@
-"""How samples of one quantity are distributed, of a size that does not depend on how many there are."""
+"""How samples of one quantity are distributed, of a size that does not depend on how many there
+are.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
 import math
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,7 +20,9 @@ SMALLEST = 1e-9  # what is smaller, counts as this
 
 @dataclass
 class Distribution:
-    """How many samples, their sum, their largest, and bins : {k: how many are from RATIO**k to RATIO**(k + 1)}."""
+    """How many samples, their sum, their largest, and bins : {k: how many are from RATIO**k to
+    RATIO**(k + 1)}.
+    """
 
     count: int
     total: float
@@ -31,12 +35,21 @@ class Distribution:
         if not len(values):
             return cls(0, 0.0, -math.inf, Counter())
         sizes = np.clip(np.nan_to_num(values), SMALLEST, 1.0 / SMALLEST)
-        places, counts = np.unique(np.floor(np.log(sizes) / math.log(RATIO)).astype(int), return_counts=True)
-        return cls(len(values), float(np.sum(values)), float(np.max(values)), Counter(dict(zip(places.tolist(), counts.tolist()))))
+        places, counts = np.unique(
+            np.floor(np.log(sizes) / math.log(RATIO)).astype(int), return_counts=True
+        )
+        return cls(
+            len(values),
+            float(np.sum(values)),
+            float(np.max(values)),
+            Counter(dict(zip(places.tolist(), counts.tolist()))),
+        )
 
     def __add__(self, other: Distribution) -> Distribution:
         largest = float(np.max([self.largest, other.largest]))  # NaN of NaN
-        return Distribution(self.count + other.count, self.total + other.total, largest, self.bins + other.bins)
+        return Distribution(
+            self.count + other.count, self.total + other.total, largest, self.bins + other.bins
+        )
 
     @property
     def mean(self) -> float:
@@ -57,7 +70,12 @@ class Distribution:
 
     def as_list(self) -> list[Any]:
         """Plain numbers; NaN and infinity are texts."""
-        return [self.count, repr(self.total), repr(self.largest), [number for item in sorted(self.bins.items()) for number in item]]
+        return [
+            self.count,
+            repr(self.total),
+            repr(self.largest),
+            [number for item in sorted(self.bins.items()) for number in item],
+        ]
 
     @classmethod
     def from_list(cls, numbers: list[Any]) -> Distribution:

@@ -18,23 +18,37 @@ if TYPE_CHECKING:
 
 
 def evaluate(
-    flight: Flight, config: FilterConfig | None = None, effects: EffectSet | None = None, network: Network | None = None
+    flight: Flight,
+    config: FilterConfig | None = None,
+    effects: EffectSet | None = None,
+    network: Network | None = None,
 ) -> tuple[Score, Run]:
-    """Run the filter over a Flight with ground truth. Returns (Score, Run). Raises InputError if there is no truth."""
+    """Run the filter over a Flight with ground truth.
+
+    Returns (Score, Run). Raises InputError if there is no truth.
+    """
     return score_of(flight, FlightEstimator(config, effects, network))
 
 
 def score_of(flight: Flight, estimator: FlightEstimator) -> tuple[Score, Run]:
-    """(Score, Run) of a Flight with ground truth, by a FlightEstimator. Raises InputError if there is no truth, or one on
-    another clock."""
+    """(Score, Run) of a Flight with ground truth, by a FlightEstimator. Raises InputError if there
+    is no truth, or one on another clock.
+    """
     need_truth(flight)
     run = estimator(flight)
-    return Score(flight.name, run.odometry, corrected_truth(flight, estimator.effects), run.residuals, flight.tdoa.t), run
+    return Score(
+        flight.name,
+        run.odometry,
+        corrected_truth(flight, estimator.effects),
+        run.residuals,
+        flight.tdoa.t,
+    ), run
 
 
 def corrected_truth(flight: Flight, effects: EffectSet | None = None) -> Truth:
-    """The Truth to compare estimates with: that of the Flight, which has one, without what the EffectSet says is wrong
-    with it."""
+    """The Truth to compare estimates with: that of the Flight, which has one, without what the
+    EffectSet says is wrong with it.
+    """
     truth = effects.correct_streams(replace(flight, imu=None)).truth if effects else flight.truth
     assert truth is not None
     return truth

@@ -1,4 +1,6 @@
-"""How an error changes, in words that have no sign to mistake: it falls, or rises, by so many per cent."""
+"""How an error changes, in words that have no sign to mistake: it falls, or rises, by so many per
+cent.
+"""
 
 from __future__ import annotations
 
@@ -17,4 +19,8 @@ def change_of(before: float, after: float) -> str:
 
 def by(gained: float) -> str:
     """Return the same of a `gain`."""
-    return "stays" if abs(gained) < SAME else f"{'falls' if gained > 0.0 else 'rises'} by {100.0 * abs(gained):.0f} %"
+    return (
+        "stays"
+        if abs(gained) < SAME
+        else f"{'falls' if gained > 0.0 else 'rises'} by {100.0 * abs(gained):.0f} %"
+    )

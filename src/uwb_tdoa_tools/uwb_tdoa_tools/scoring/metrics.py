@@ -6,7 +6,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from functools import cached_property
 import math
-from typing import Any, Protocol, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -21,13 +21,17 @@ from .phases import TITLES, in_the_air, motion, phases
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
+
     from uwb_tdoa_bias.foundation.flight import Truth
     from uwb_tdoa_ekf.results import Residuals
+
     from .by_phase import Spans
 
 
 class Estimate(PoseColumns, Protocol):
-    """Poses, and how far to trust them: covariance (n, k, k), its first three rows and columns of the position, m^2."""
+    """Poses, and how far to trust them: covariance (n, k, k), its first three rows and columns of
+    the position, m^2.
+    """
 
     @property
     def covariance(self) -> np.ndarray: ...
@@ -36,7 +40,8 @@ class Estimate(PoseColumns, Protocol):
 ALIGN = "none", "time", "frame"  # what of a ground truth is moved before it judges
 LOST = 1.0  # m; a larger error is no estimate
 LOST_SHARE = 0.25  # of the airborne time; more is a diverged run
-HOLE = 0.5  # s without a true pose, and SPARSE times their usual interval, over which none is interpolated
+# s without a true pose, and SPARSE times their usual interval, over which none is interpolated
+HOLE = 0.5
 SPARSE = 4.0
 START_GRACE = 1.0  # s into the airborne part by which the first estimate must have come
 FIGURES = 3  # version of what a Result holds
@@ -44,9 +49,14 @@ READY = 100  # TDOAs that a filter may take to begin with
 
 
 def judged_part(truth: Truth) -> tuple[str, float, float]:
-    """(name, first, last) of the phase that the figures of a whole run are of: in the air; moving, where that never is; or all, where
-    the tag does not move at all."""
-    found = {"in_the_air": in_the_air(truth), "moving": motion(truth), "whole": (truth.t[0], truth.t[-1])}
+    """(name, first, last) of the phase that the figures of a whole run are of: in the air; moving,
+    where that never is; or all, where the tag does not move at all.
+    """
+    found = {
+        "in_the_air": in_the_air(truth),
+        "moving": motion(truth),
+        "whole": (truth.t[0], truth.t[-1]),
+    }
     name, (first, last) = next((name, span) for name, span in found.items() if span)
     return name, first, last
 
@@ -59,7 +69,8 @@ def position_at(t: np.ndarray, truth: PoseColumns) -> np.ndarray:
 def position_errors(
     odometry: Estimate, truth: Truth, first: float, last: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Errors from `first` to `last`, s, the truth interpolated to the stamps of the estimate, except in holes of it.
+    """Errors from `first` to `last`, s, the truth interpolated to the stamps of the estimate,
+    except in holes of it.
 
     Returns (t (n,) s, error (n, 3) m, covariance (n, 3, 3) m^2 of the position).
     """
@@ -69,7 +80,9 @@ def position_errors(
 
 
 def _in_holes(t: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Which stamps t (n,) s lie in holes between the stamps `known` (m,), s, of the truth: (n,) bool."""
+    """Which stamps t (n,) s lie in holes between the stamps `known` (m,), s, of the truth: (n,)
+    bool.
+    """
     if len(known) < 2:
         return np.zeros(len(t), bool)
     k = np.clip(np.searchsorted(known, t, side="right") - 1, 0, len(known) - 2)
@@ -91,7 +104,9 @@ def _known_spans(known: np.ndarray) -> np.ndarray:
 def _inside(part: Any, spans: Spans) -> Any:
     """What of a Truth or an Odometry is stamped within spans ((first, last), ...), s."""
     if not (np.diff(part.t) >= 0.0).all():
-        return rows_of(part, np.any([(part.t >= first) & (part.t <= last) for first, last in spans], axis=0))
+        return rows_of(
+            part, np.any([(part.t >= first) & (part.t <= last) for first, last in spans], axis=0)
+        )
     inside = np.zeros(len(part.t), bool)
     for first, last in spans:
         inside[np.searchsorted(part.t, first) : np.searchsorted(part.t, last, side="right")] = True
@@ -99,8 +114,9 @@ def _inside(part: Any, spans: Spans) -> Any:
 
 
 def nees(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Normalised estimation error squared, e' P^-1 e: (n,), expected 3 for an honest 3D covariance (Bar-Shalom et al.,
-    Estimation with Applications to Tracking and Navigation, sec. 5.4)."""
+    """Normalised estimation error squared, e' P^-1 e: (n,), expected 3 for an honest 3D covariance
+    (Bar-Shalom et al., Estimation with Applications to Tracking and Navigation, sec. 5.4).
+    """
     out = np.full(len(error), np.nan)
     usable = np.linalg.det(covariance) > 0.0
     solved = np.linalg.solve(covariance[usable], error[usable, :, None])[:, :, 0]
@@ -109,7 +125,9 @@ def nees(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
 
 def nis(residuals: Residuals) -> np.ndarray:
-    """Normalised innovation squared of every measurement that reached the filter, outliers in full: (n,), expected 1."""
+    """Normalised innovation squared of every measurement that reached the filter, outliers in full:
+    (n,), expected 1.
+    """
     there = reached(residuals)
     return residuals.innovation[there] ** 2 / residuals.variance[there]
 
@@ -120,7 +138,10 @@ def reached(residuals: Residuals) -> np.ndarray:
 
 
 def summary(errors: np.ndarray, normalised: np.ndarray, innovations: np.ndarray) -> dict[str, Any]:
-    """The figures of one run, or of several pooled: errors (n, 3) m, NEES (n,), NIS (k,). A dict of floats."""
+    """The figures of one run, or of several pooled: errors (n, 3) m, NEES (n,), NIS (k,).
+
+    A dict of floats.
+    """
     distance = np.linalg.norm(errors, axis=1)
     finite = np.isfinite(distance)
     out = {f"rmse_{axis}": rms(errors[:, k]) for k, axis in enumerate("xyz")}
@@ -128,13 +149,21 @@ def summary(errors: np.ndarray, normalised: np.ndarray, innovations: np.ndarray)
     out["median_3d"], out["max_3d"] = or_nan(np.median, distance), or_nan(np.max, distance)
     out["frac_gt_1m"] = float(np.mean(~(distance <= LOST))) if len(distance) else 1.0
     out["diverged"] = bool(out["frac_gt_1m"] > LOST_SHARE or not finite.all())
-    out["nees_mean"], out["nees_median"] = or_nan(np.mean, normalised), or_nan(np.median, normalised)
-    out["nis_mean"], out["nis_median"] = or_nan(np.mean, innovations), or_nan(np.median, innovations)
+    out["nees_mean"], out["nees_median"] = (
+        or_nan(np.mean, normalised),
+        or_nan(np.median, normalised),
+    )
+    out["nis_mean"], out["nis_median"] = (
+        or_nan(np.mean, innovations),
+        or_nan(np.median, innovations),
+    )
     return out
 
 
 def coverage(error: np.ndarray, covariance: np.ndarray, sigmas: float = 3.0) -> np.ndarray:
-    """Share of errors within `sigmas` predicted standard deviations, per axis: (3,); honest and Gaussian: 0.997."""
+    """Share of errors within `sigmas` predicted standard deviations, per axis: (3,); honest and
+    Gaussian: 0.997.
+    """
     std = np.sqrt(np.einsum("nii->ni", covariance))
     return np.mean(np.abs(error) <= sigmas * std, axis=0) if len(error) else np.full(3, np.nan)
 
@@ -142,21 +171,34 @@ def coverage(error: np.ndarray, covariance: np.ndarray, sigmas: float = 3.0) -> 
 class Score:
     """Errors of one run against its ground truth.
 
-    part : what they are of, see judged_part; t (n,) s; p (n, 3) m, true positions; error (n, 3) m; covariance (n, 3, 3) m^2;
+    part : what they are of, see judged_part; t (n,) s; p (n, 3) m, true positions; error (n, 3) m;
+        covariance (n, 3, 3) m^2;
     first, last : s, of that part.
     """
 
     def __init__(
-        self, name: str, odometry: Estimate, truth: Truth, residuals: Residuals | None = None,
-        heard: np.ndarray | None = None, spans: Spans | None = None, reach: Spans = EVERYTHING,
-    ) -> None:  # fmt: skip
-        """name : of the flight; odometry : Odometry; truth : Truth; residuals : Residuals or None; heard : (n,) s, stamps of the
-        TDOAs, or None; spans : ((first, last), ...) s, what of the part counts, None for all; reach : the same of the phases."""
+        self,
+        name: str,
+        odometry: Estimate,
+        truth: Truth,
+        residuals: Residuals | None = None,
+        heard: np.ndarray | None = None,
+        spans: Spans | None = None,
+        reach: Spans = EVERYTHING,
+    ) -> None:
+        """name : of the flight; odometry : Odometry; truth : Truth; residuals : Residuals or None;
+        heard : (n,) s, stamps of the TDOAs, or None; spans : ((first, last), ...) s, what of the
+        part counts, None for all; reach : the same of the phases.
+        """
         self.name, self._whole, self._heard, self._reach = name, (odometry, truth), heard, reach
-        if spans is not None:  # both, as the truth would be interpolated over what lies between spans
+        if (
+            spans is not None
+        ):  # both, as the truth would be interpolated over what lies between spans
             truth, odometry = (_inside(part, spans) for part in (truth, odometry))
         self.part, self.first, self.last = judged_part(truth)
-        self.t, self.error, self.covariance = position_errors(odometry, truth, self.first, self.last)
+        self.t, self.error, self.covariance = position_errors(
+            odometry, truth, self.first, self.last
+        )
         self.p = position_at(self.t, truth)
         self.nis = nis(residuals) if residuals is not None else np.empty(0)
 
@@ -175,15 +217,22 @@ class Score:
         """ErrorSeries: the errors of all of the recording."""
         odometry, truth = self._whole
         t, error, covariance = position_errors(odometry, truth, truth.t[0], truth.t[-1])
-        return ErrorSeries(t, error, covariance, nees(error, covariance), odometry.t, _known_spans(truth.t))
+        return ErrorSeries(
+            t, error, covariance, nees(error, covariance), odometry.t, _known_spans(truth.t)
+        )
 
     def phases(self) -> dict[str, dict[str, Any]]:
         """The figures of each phase of this run: {name: dict of `ErrorSeries.figures`}."""
-        return {name: self.series.figures(*span, self._reach) for name, span in phases(self._whole[1]).items()}
+        return {
+            name: self.series.figures(*span, self._reach)
+            for name, span in phases(self._whole[1]).items()
+        }
 
     def row(self) -> dict[str, Any]:
-        """The figures of this run, of its part: a dict. "late_start": nothing but that has made it a diverged run; "ready_delay": s
-        from the 100th TDOA to the first estimate, below 0 if that came before."""
+        """The figures of this run, of its part: a dict. "late_start": nothing but that has made it
+        a diverged run; "ready_delay": s from the 100th TDOA to the first estimate, below 0 if that
+        came before.
+        """
         out = {"flight": self.name, "part": self.part, **summary(self.error, self.nees, self.nis)}
         late = not len(self.t) or self.t[0] > self.first + START_GRACE
         lost = out["diverged"] or not len(self.t) or self.t[-1] < self.last - START_GRACE
@@ -193,7 +242,9 @@ class Score:
         return {**out, **_named(coverage(self.error, self.covariance))}
 
     def _ready_delay(self) -> float:
-        """s from the 100th TDOA to the first estimate; NaN where nobody knows the TDOAs, or there are fewer, inf without an estimate."""
+        """s from the 100th TDOA to the first estimate; NaN where nobody knows the TDOAs, or there
+        are fewer, inf without an estimate.
+        """
         stamps = self._whole[0].t
         if self._heard is None or len(self._heard) < READY:
             return math.nan
@@ -202,19 +253,34 @@ class Score:
     def result(self) -> Result:
         """Result: this run as the figures of many need it."""
         distance, count = np.linalg.norm(self.error, axis=1), len(self.t)
-        sums = {f"square_{axis}": float(np.sum(self.error[:, k] ** 2)) for k, axis in enumerate("xyz")}
-        sums |= {"square_3d": float(np.sum(distance**2)), "lost": float(np.sum(~(distance <= LOST)))}
+        sums = {
+            f"square_{axis}": float(np.sum(self.error[:, k] ** 2)) for k, axis in enumerate("xyz")
+        }
+        sums |= {
+            "square_3d": float(np.sum(distance**2)),
+            "lost": float(np.sum(~(distance <= LOST))),
+        }
         if count:
-            sums |= {name: count * share for name, share in _named(coverage(self.error, self.covariance)).items()}
+            sums |= {
+                name: count * share
+                for name, share in _named(coverage(self.error, self.covariance)).items()
+            }
         samples = {"distance": distance, "nees": self.nees, "nis": self.nis}
-        return Result(self.row(), sums, {name: Distribution.of(values) for name, values in samples.items()}, self.phases())
+        return Result(
+            self.row(),
+            sums,
+            {name: Distribution.of(values) for name, values in samples.items()},
+            self.phases(),
+        )
 
 
 @dataclass(frozen=True)
 class Result:
-    """What a run leaves for the figures of many, of a size that does not depend on its length. row : Score.row; sums : {name: sum
-    over its samples}; distributions : {quantity: Distribution}; phases : Score.phases; aligned : where its ground truth is beside the
-    estimate, as of `Alignment.as_dict`, and its 3D RMSE with each of ALIGN, m; {} where nobody looked."""
+    """What a run leaves for the figures of many, of a size that does not depend on its length. row
+    : Score.row; sums : {name: sum over its samples}; distributions : {quantity: Distribution};
+    phases : Score.phases; aligned : where its ground truth is beside the estimate, as of
+    `Alignment.as_dict`, and its 3D RMSE with each of ALIGN, m; {} where nobody looked.
+    """
 
     row: dict[str, Any]
     sums: dict[str, float]
@@ -237,9 +303,18 @@ class Result:
     @classmethod
     def from_dict(cls, content: dict[str, Any]) -> Result:
         """Of what `as_dict` gives."""
-        parts = {name: Distribution.from_list(numbers) for name, numbers in content["distributions"].items()}
+        parts = {
+            name: Distribution.from_list(numbers)
+            for name, numbers in content["distributions"].items()
+        }
         of_phases = {name: _from_texts(figures) for name, figures in content["phases"].items()}
-        return cls(_from_texts(content["row"]), _from_texts(content["sums"]), parts, of_phases, content["aligned"])
+        return cls(
+            _from_texts(content["row"]),
+            _from_texts(content["sums"]),
+            parts,
+            of_phases,
+            content["aligned"],
+        )
 
     def as_json(self) -> dict[str, Any]:
         """All figures of the run, as JSON takes them."""
@@ -263,10 +338,18 @@ class Pool:
         row, known = result.row, self._distributions
         self._runs += 1
         self._sums.update(result.sums)
-        self._distributions = {name: known[name] + part if name in known else part for name, part in result.distributions.items()}
-        self._total, self._largest = self._total + row["rmse_3d"], float(np.max([self._largest, row["rmse_3d"]]))
+        self._distributions = {
+            name: known[name] + part if name in known else part
+            for name, part in result.distributions.items()
+        }
+        self._total, self._largest = (
+            self._total + row["rmse_3d"],
+            float(np.max([self._largest, row["rmse_3d"]])),
+        )
         self._row["start_delay"] = max(self._row["start_delay"], row["start_delay"])
-        self._ready = float(np.fmax(self._ready, row["ready_delay"]))  # NaN of those that cannot tell
+        self._ready = float(
+            np.fmax(self._ready, row["ready_delay"])
+        )  # NaN of those that cannot tell
         for key in ("diverged", "late_start"):
             self._row[key] += row[key]
 
@@ -278,7 +361,9 @@ class Pool:
 
     @property
     def aligned(self) -> dict[str, float]:
-        """{one of ALIGN: mean 3D RMSE of the runs, m, with that of their ground truth moved}; NaN where it is of another clock."""
+        """{one of ALIGN: mean 3D RMSE of the runs, m, with that of their ground truth moved}; NaN
+        where it is of another clock.
+        """
         return {how: total / self._runs for how, total in self._aligned.items()}
 
     def phases(self) -> dict[str, dict[str, Any]]:
@@ -286,19 +371,29 @@ class Pool:
         return {name: self._phases[name].figures() for name in TITLES if name in self._phases}
 
     def figures(self) -> dict[str, Any]:
-        """A dict: those of `summary`, coverage, mean and largest of the runs' 3D RMSE, phases. Medians are right to 1 %. Of one run at
-        least."""
+        """A dict: those of `summary`, coverage, mean and largest of the runs' 3D RMSE, phases.
+        Medians are right to 1 %. Of one run at least.
+        """
         distance, count = self._distributions["distance"], self._distributions["distance"].count
         shares = {name: total / count if count else math.nan for name, total in self._sums.items()}
         out: dict[str, Any] = {"flight": f"{self._runs} pooled"}
-        out |= {f"rmse_{name}": math.sqrt(shares[f"square_{name}"]) for name in ("x", "y", "z", "3d")}
+        out |= {
+            f"rmse_{name}": math.sqrt(shares[f"square_{name}"]) for name in ("x", "y", "z", "3d")
+        }
         out |= {"median_3d": distance.median, "max_3d": distance.largest if count else math.nan}
         out["frac_gt_1m"] = shares["lost"] if count else 1.0
         for name in ("nees", "nis"):
             part = self._distributions[name]
             out |= {f"{name}_mean": part.mean, f"{name}_median": part.median}
-        out |= {name: shares.get(name, math.nan) for name in _named(np.zeros(3))} | self._row | {"ready_delay": self._ready}
-        out["rmse_3d_mean_of_runs"], out["rmse_3d_max_of_runs"] = self._total / self._runs, self._largest
+        out |= (
+            {name: shares.get(name, math.nan) for name in _named(np.zeros(3))}
+            | self._row
+            | {"ready_delay": self._ready}
+        )
+        out["rmse_3d_mean_of_runs"], out["rmse_3d_max_of_runs"] = (
+            self._total / self._runs,
+            self._largest,
+        )
         return {**out, "phases": self.phases()}
 
 
@@ -312,12 +407,17 @@ def pooled(scores: Iterable[Score]) -> dict[str, Any]:
 
 def _as_texts(numbers: dict[str, Any]) -> dict[str, Any]:
     """Floats as texts: JSON has no NaN."""
-    return {key: repr(value) if isinstance(value, float) else value for key, value in numbers.items()}
+    return {
+        key: repr(value) if isinstance(value, float) else value for key, value in numbers.items()
+    }
 
 
 def _from_texts(numbers: dict[str, Any]) -> dict[str, Any]:
     """Of what `_as_texts` gives; those that were texts before stay."""
-    return {key: float(value) if isinstance(value, str) and key not in ("flight", "part") else value for key, value in numbers.items()}
+    return {
+        key: float(value) if isinstance(value, str) and key not in ("flight", "part") else value
+        for key, value in numbers.items()
+    }
 
 
 def _named(shares: np.ndarray) -> dict[str, float]:

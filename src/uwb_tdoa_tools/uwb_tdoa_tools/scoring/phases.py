@@ -1,4 +1,5 @@
-"""The phases of a recording, by what its ground truth tells of the motion. Together they are the whole recording; some overlap.
+"""The phases of a recording, by what its ground truth tells of the motion. Together they are the
+whole recording; some overlap.
 
     at_rest_earlier   what is before that
     at_rest_before    the last 2 s before the departure
@@ -10,13 +11,16 @@
     at_rest_after     from the arrival on
     whole             all that there is ground truth of
 
-Departure and arrival are the first and the last instant at which the tag is away from where it rests, which is the median of its
-positions in the first, and in the last, half second. Floors are not at z = 0 everywhere, and a tag sits above them as high as its
-vehicle is. So a tag that rests below 0.3 m in a recording that exceeds that departs when it is 0.07 m above its own height at rest: in the
-raw logs of the UTIL data, where that is 0.03 m, at z = 0.1 m; in their constellations, where it is 0.08 m, at 0.15 m, which is up to a
-second after z = 0.1 m. Any other tag, a rover that never leaves the floor, a person's, one that starts on a table, is away when it is 0.1 m
-from its place; one that gets there within a second began, or ended, in motion, and has no phase of rest there. A phase
-that a recording does not have is not reported; one that never moves is `at_rest_before` all the time.
+Departure and arrival are the first and the last instant at which the tag is away from where it
+rests, which is the median of its positions in the first, and in the last, half second. Floors are
+not at z = 0 everywhere, and a tag sits above them as high as its vehicle is. So a tag that rests
+below 0.3 m in a recording that exceeds that departs when it is 0.07 m above its own height at rest:
+in the raw logs of the UTIL data, where that is 0.03 m, at z = 0.1 m; in their constellations, where
+it is 0.08 m, at 0.15 m, which is up to a second after z = 0.1 m. Any other tag, a rover that never
+leaves the floor, a person's, one that starts on a table, is away when it is 0.1 m from its place;
+one that gets there within a second began, or ended, in motion, and has no phase of rest there. A
+phase that a recording does not have is not reported; one that never moves is `at_rest_before` all
+the time.
 """
 
 from __future__ import annotations
@@ -49,7 +53,12 @@ TITLES = {
     "at_rest_after": "at rest after",
     "whole": "whole recording",
 }
-NEAR_THE_FLOOR = "at_rest_before", "first_3_s", "last_3_s", "at_rest_after"  # reported of each run where several are
+NEAR_THE_FLOOR = (
+    "at_rest_before",
+    "first_3_s",
+    "last_3_s",
+    "at_rest_after",
+)  # reported of each run where several are
 
 
 def in_the_air(truth: Truth) -> Span | None:
@@ -59,7 +68,9 @@ def in_the_air(truth: Truth) -> Span | None:
 
 
 def motion(truth: Truth) -> Span | None:
-    """(departure, arrival) of a Truth, s, its first and last stamp where it begins or ends in motion; None if it never moves."""
+    """(departure, arrival) of a Truth, s, its first and last stamp where it begins or ends in
+    motion; None if it never moves.
+    """
     t, p = truth.t, truth.p
     flies = in_the_air(truth) is not None
 

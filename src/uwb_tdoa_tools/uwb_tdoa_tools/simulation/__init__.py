@@ -1,7 +1,8 @@
-"""Simulated flights: a room with anchors, a path through it, an inertial sensor, and the TDOAs of a UWB tag.
+"""Simulated flights: a room with anchors, a path through it, an inertial sensor, and the TDOAs of a
+UWB tag.
 
-    from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-    flight = simulate(SimulationConfig(trajectory="circle", protocol="tdoa3", seed=3))
+from uwb_tdoa_tools.simulation import SimulationConfig, simulate
+flight = simulate(SimulationConfig(trajectory="circle", protocol="tdoa3", seed=3))
 """
 
 from __future__ import annotations
@@ -24,18 +25,24 @@ __all__ = ["NO_IMU_ERRORS", "ImuErrors", "SimulationConfig", "simulate"]
 
 
 def simulate(config: SimulationConfig, trajectory: Flyable | None = None) -> Flight:
-    """Fly, drive or carry `config`, a SimulationConfig, and return the Flight. Raises InputError where it does not fit together.
+    """Fly, drive or carry `config`, a SimulationConfig, and return the Flight. Raises InputError
+    where it does not fit together.
 
-    trajectory : what has motion(t) and motors(t) of a Trajectory, to fly instead of the config's own.
+    trajectory : what has motion(t) and motors(t) of a Trajectory, to fly instead of the config's
+        own.
     truth : exact poses.
-    extra : "tdoa_truth" (t, bias, multipath, noise, outlier, m: what each TDOA holds besides geometry) and
-        "state_truth" (at the stamps of the truth: velocity vx, vy, vz in the world, m/s, and the biases of the inertial
-        sensor, gyro_bias_x ... rad/s, accel_bias_x ... m/s^2).
-    meta : source, format, protocol, config, and under "parameters" the constants that the errors were made with.
+    extra : "tdoa_truth" (t, bias, multipath, noise, outlier, m: what each TDOA holds besides
+        geometry) and
+        "state_truth" (at the stamps of the truth: velocity vx, vy, vz in the world, m/s, and the
+        biases of the inertial sensor, gyro_bias_x ... rad/s, accel_bias_x ... m/s^2).
+    meta : source, format, protocol, config, and under "parameters" the constants that the errors
+        were made with.
     """
     filled, room = config.complete()
     assert filled.anchors is not None
-    flown: Flyable = trajectory or VEHICLES[filled.vehicle](filled, room, filled.random("trajectory"))
+    flown: Flyable = trajectory or VEHICLES[filled.vehicle](
+        filled, room, filled.random("trajectory")
+    )
     t_imu = np.arange(1, int(filled.duration * filled.imu_rate) + 1) / filled.imu_rate
     samples, gyro_bias, accel_bias = imu.measure(t_imu, flown, filled.imu_errors, filled.random)
     t_truth = np.arange(1, int(filled.duration * filled.truth_rate) + 1) / filled.truth_rate
@@ -44,7 +51,11 @@ def simulate(config: SimulationConfig, trajectory: Flyable | None = None) -> Fli
 
     newest = np.maximum(np.searchsorted(t_imu, t_truth + 1e-9) - 1, 0)
     state = {"t": t_truth}
-    for name, values in (("v", motion.v), ("gyro_bias_", gyro_bias[newest]), ("accel_bias_", accel_bias[newest])):
+    for name, values in (
+        ("v", motion.v),
+        ("gyro_bias_", gyro_bias[newest]),
+        ("accel_bias_", accel_bias[newest]),
+    ):
         state.update({name + axis: values[:, k] for k, axis in enumerate("xyz")})
     parameters |= {name: getattr(flown, name, None) for name in ("take_off", "landing")}
     kind = "" if config.vehicle == "quadrotor" else f"{config.vehicle}-"

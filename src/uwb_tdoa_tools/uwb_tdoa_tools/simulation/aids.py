@@ -1,4 +1,6 @@
-"""What the SENSORS beside inertia and TDOAs say: what is true, white noise, and what the wheels of a rover do."""
+"""What the SENSORS beside inertia and TDOAs say: what is true, white noise, and what the wheels of
+a rover do.
+"""
 
 from __future__ import annotations
 
@@ -14,9 +16,10 @@ from .config import WHEELS_RATE
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.sensors import Stream
+
     from .config import SimulationConfig
-    from .room import Room
     from .motion import Flyable
+    from .room import Room
 
 YAW_RATE_STD = 0.02  # rad/s
 SLIP_EVERY, SLIP_TIME = 10.0, 0.5  # s
@@ -33,7 +36,11 @@ def measure(config: SimulationConfig, room: Room, trajectory: Flyable) -> dict[s
         t = np.arange(1, int(config.duration * rate) + 1) / rate
         motion, random = trajectory.motion(t), config.random(f"{name} noise")
         columns = sensor.simulated(
-            config, room, motion, Rotation.from_quat(motion.q), lambda *shape: random.standard_normal((len(t), *shape))
+            config,
+            room,
+            motion,
+            Rotation.from_quat(motion.q),
+            lambda *shape: random.standard_normal((len(t), *shape)),
         )
         stream = sensor.stream(t, *columns)
         out[name] = _of_wheels(stream, config, motion.body_rates[:, 2]) if wheels else stream
@@ -44,10 +51,14 @@ def _of_wheels(velocity: Stream, config: SimulationConfig, turning: np.ndarray) 
     """What two wheels make of a Velocity, and of the true turning rate (n,) rad/s."""
     assert isinstance(velocity, Velocity)
     n, t = len(velocity), velocity.t
-    too_fast = (1.0 + config.wheel_scale) * (1.0 + config.wheel_slip * _slips(t, config.random("slip")))
+    too_fast = (1.0 + config.wheel_scale) * (
+        1.0 + config.wheel_slip * _slips(t, config.random("slip"))
+    )
     ahead = np.zeros((n, 3))
     ahead[:, 0] = too_fast * velocity.v[:, 0]
-    yaw_rate = too_fast * turning + YAW_RATE_STD * config.random("yaw rate noise").standard_normal(n)
+    yaw_rate = too_fast * turning + YAW_RATE_STD * config.random("yaw rate noise").standard_normal(
+        n
+    )
     return replace(velocity, v=ahead, yaw_rate=yaw_rate, yaw_rate_std=np.full(n, YAW_RATE_STD))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field, make_dataclass, replace
 from types import MappingProxyType
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -26,14 +26,24 @@ YAW_PROFILES = ("fixed", "along_track", "rotating")
 WHEELS_RATE = 50.0  # Hz
 FARTHEST = 1e5  # m, of a point of a path
 
-OF_VEHICLE = MappingProxyType({  # what the configuration of each is, unless it is given
-    "quadrotor": {},
-    "rover": {
-        "constellation": "six_wide", "speed": 0.8, "protocol": "tdoa3", "tdoa_rate": 100.0, "imu_rate": 100.0, "truth_rate": 50.0,
-        "tag_lever_arm": (0.1, 0.0, 0.4), "velocity_noise": 0.02, "wheel_scale": 0.02, "wheel_slip": 0.2,
-    },
-    "hand": {"height": 1.1, "imu_rate": 100.0, "truth_rate": 50.0, "yaw": "along_track"},
-})  # fmt: skip
+OF_VEHICLE = MappingProxyType(
+    {  # what the configuration of each is, unless it is given
+        "quadrotor": {},
+        "rover": {
+            "constellation": "six_wide",
+            "speed": 0.8,
+            "protocol": "tdoa3",
+            "tdoa_rate": 100.0,
+            "imu_rate": 100.0,
+            "truth_rate": 50.0,
+            "tag_lever_arm": (0.1, 0.0, 0.4),
+            "velocity_noise": 0.02,
+            "wheel_scale": 0.02,
+            "wheel_slip": 0.2,
+        },
+        "hand": {"height": 1.1, "imu_rate": 100.0, "truth_rate": 50.0, "yaw": "along_track"},
+    }
+)
 
 
 NOISES = tuple(f"{name}_noise" for name in SENSORS)
@@ -44,25 +54,34 @@ _Noises: Any = make_dataclass(  # the names of its attributes are those of SENSO
 
 @dataclass(frozen=True)
 class SimulationConfig(_Noises):
-    """One simulated flight. The same config gives the same flight, bit for bit; every part draws from its own stream,
-    so that switching one error off leaves the others as they were. Raises InputError for what cannot be simulated.
+    """One simulated flight. The same config gives the same flight, bit for bit; every part draws
+    from its own stream, so that switching one error off leaves the others as they were. Raises
+    InputError for what cannot be simulated.
 
     The room and the path
     ---------------------
     seed : of all random streams, 0 or more (default 0)
-    vehicle : "quadrotor" takes off, flies and lands; "rover" drives on the floor, x ahead, and stops now and then; "hand": a person
-        carries the tag, and stands still before and after. `of` gives each its usual sensors (default "quadrotor")
+    vehicle : "quadrotor" takes off, flies and lands; "rover" drives on the floor, x ahead, and
+        stops now and then; "hand": a person
+        carries the tag, and stands still before and after. `of` gives each its usual sensors
+        (default "quadrotor")
     path : ((x, y), ...) or ((x, y, z), ...) m, waypoints, instead of a trajectory (default None)
-    area : ((x, y), (x, y)) m, lower and upper corner of where trajectories lie (default None: the room less a clearance)
-    constellation : name of an anchor constellation, or random-SEED[-COUNT] (default "corners": 8 in 7 x 8 x 3 m)
+    area : ((x, y), (x, y)) m, lower and upper corner of where trajectories lie (default None: the
+        room less a clearance)
+    constellation : name of an anchor constellation, or random-SEED[-COUNT] (default "corners": 8 in
+        7 x 8 x 3 m)
     anchors : Anchors to use instead of a named constellation (default None)
-    trajectory : "circle", "rising_circle", "sines", "square", "line_x", "line_y", "hover" or "spin" (default "sines")
+    trajectory : "circle", "rising_circle", "sines", "square", "line_x", "line_y", "hover" or "spin"
+        (default "sines")
     duration : of the recording, s (default 60)
     speed : along the path at cruise, m/s; root mean square for sines (default 1)
     place : (x, y) of the middle of the path, m (default None: the middle of the room or the area)
-    height : of the path, m; not used by sines of a quadrotor (default None: half the height that is flyable)
-    radius : of the circle, or half the side of the square or the line, m (default None: 70 % of what fits)
-    yaw : "fixed", "along_track" or "rotating"; spin always rotates; a rover has no choice (default "fixed")
+    height : of the path, m; not used by sines of a quadrotor (default None: half the height that is
+        flyable)
+    radius : of the circle, or half the side of the square or the line, m (default None: 70 % of
+        what fits)
+    yaw : "fixed", "along_track" or "rotating"; spin always rotates; a rover has no choice (default
+        "fixed")
     yaw_angle : yaw at the start, or added to the track, rad (default 0)
     yaw_rate : while rotating, rad/s (default 0.5)
     floor_time : at rest on the floor before take-off and after landing, s (default 3)
@@ -71,25 +90,34 @@ class SimulationConfig(_Noises):
     The inertial sensor and the truth
     ---------------------------------
     imu_rate : samples per second, Hz (default 1000)
-    imu_errors : ImuErrors; NO_IMU_ERRORS for a perfect sensor (default: a small quadrotor's MEMS sensor)
+    imu_errors : ImuErrors; NO_IMU_ERRORS for a perfect sensor (default: a small quadrotor's MEMS
+        sensor)
     truth_rate : ground-truth poses per second, Hz (default 250)
 
     The TDOA measurements
     ---------------------
-    protocol : "tdoa2" (ring, about 475 per second) or "tdoa3" (any pair, about 240 per second) (default "tdoa2")
+    protocol : "tdoa2" (ring, about 475 per second) or "tdoa3" (any pair, about 240 per second)
+        (default "tdoa2")
     tdoa_rate : TDOAs per second (default None: that of the protocol)
     radio_reach : m; anchors farther from the tag than that are not heard (default None: all are)
     walls : Walls that no signal comes through, with radio_reach (default None)
-    cell_ids : anchors of one cell, which have a clock of their own, have ids with the same id // cell_ids; TDOAs are of two anchors of one
+    cell_ids : anchors of one cell, which have a clock of their own, have ids with the same id //
+        cell_ids; TDOAs are of two anchors of one
         cell; with radio_reach (default None: all anchors have one clock)
     noise_std : standard deviation of the white noise of one TDOA, m; 0 for none (default 0.06)
-    anchor_noise_std : standard deviation of the arrival noise of each anchor, m, in the order of the anchors; a TDOA
-        then has the root of the summed squares of its two (default None: noise_std / sqrt(2) for every anchor)
-    shared_noise : two TDOAs made from the same reception share its noise, as in Grasso et al. (Sensors 2022, 22, 9136),
+    anchor_noise_std : standard deviation of the arrival noise of each anchor, m, in the order of
+        the anchors; a TDOA
+        then has the root of the summed squares of its two (default None: noise_std / sqrt(2) for
+        every anchor)
+    shared_noise : two TDOAs made from the same reception share its noise, as in Grasso et al.
+        (Sensors 2022, 22, 9136),
         eqs. 4 - 5 (default False: independent noise)
-    bias : received-power and antenna errors, which depend on the poses, and the anchors' own delays (default True)
-    anchor_delay_std : spread of the constant delays of the anchors that calibration left, m (default 0.05)
-    tag_unit : which specimen of the tag flies: 0 is nominal, others have seeded small differences in gain (0.7 dB) and
+    bias : received-power and antenna errors, which depend on the poses, and the anchors' own delays
+        (default True)
+    anchor_delay_std : spread of the constant delays of the anchors that calibration left, m
+        (default 0.05)
+    tag_unit : which specimen of the tag flies: 0 is nominal, others have seeded small differences
+        in gain (0.7 dB) and
         mounting (2 degrees) (default 0)
     tag_lever_arm : tag antenna in the body frame, m (default (0, 0, 0))
     multipath : late arrivals near the floor (default True)
@@ -99,7 +127,8 @@ class SimulationConfig(_Noises):
     ---------------------------
     <name>_noise : of each of SENSORS, standard deviation in its unit (default None: there is none)
     wheel_scale : of a rover, by which share its velocities and yaw rates are too large (default 0)
-    wheel_slip : of a rover, by which share its wheels turn faster than the floor passes, for half a second every ten (default 0)
+    wheel_slip : of a rover, by which share its wheels turn faster than the floor passes, for half a
+        second every ten (default 0)
     """
 
     seed: int = 0
@@ -145,18 +174,32 @@ class SimulationConfig(_Noises):
         return cls(vehicle=vehicle, **{**OF_VEHICLE.get(vehicle, {}), **given})
 
     def __post_init__(self) -> None:
-        for name, choices in (("vehicle", tuple(OF_VEHICLE)), ("yaw", YAW_PROFILES), ("protocol", PROTOCOLS)):
+        for name, choices in (
+            ("vehicle", tuple(OF_VEHICLE)),
+            ("yaw", YAW_PROFILES),
+            ("protocol", PROTOCOLS),
+        ):
             if getattr(self, name) not in choices:
-                raise InputError(f"{name}: {getattr(self, name)!r} is not known; choose {', '.join(choices)}.")
+                raise InputError(
+                    f"{name}: {getattr(self, name)!r} is not known; choose {', '.join(choices)}."
+                )
         for name in ("seed", "tag_unit"):
             value = getattr(self, name)
             if not (isinstance(value, (int, np.integer)) and 0 <= value < 2**32):
                 raise InputError(f"{name}: {value!r} is not a whole number from 0 to 4294967295.")
-        if self.cell_ids is not None and not (isinstance(self.cell_ids, (int, np.integer)) and self.cell_ids >= 2):
-            raise InputError(f"cell_ids: {self.cell_ids!r} is not a whole number of at least 2; give how many ids each cell may use, e.g. 256.")
+        if self.cell_ids is not None and not (
+            isinstance(self.cell_ids, (int, np.integer)) and self.cell_ids >= 2
+        ):
+            raise InputError(
+                f"cell_ids: {self.cell_ids!r} is not a whole number of at least 2; give how "
+                "many ids each cell may use, e.g. 256."
+            )
         for name in ("walls", "cell_ids"):
             if getattr(self, name) is not None and self.radio_reach is None:
-                raise InputError(f"{name}: says which anchors are heard together where not all are; give radio_reach too.")
+                raise InputError(
+                    f"{name}: says which anchors are heard together where not all are; give "
+                    "radio_reach too."
+                )
         for name, lowest, highest in (
             ("duration", 1.0, 3600.0),
             ("speed", 0.01, 20.0),
@@ -181,34 +224,52 @@ class SimulationConfig(_Noises):
                 raise InputError(f"{name}: {value!r} is outside {lowest:g} ... {highest:g}.")
         for name, length in (("place", 2), ("tag_lever_arm", 3)):
             value = getattr(self, name)
-            if value is not None and not (np.shape(value) == (length,) and np.isfinite(value).all()):
+            if value is not None and not (
+                np.shape(value) == (length,) and np.isfinite(value).all()
+            ):
                 raise InputError(f"{name}: {value!r} is not {length} finite numbers of metres.")
-        if self.path is not None and not (_are_points(self.path, (2, 3)) and len({*self.path}) >= 2):
-            raise InputError(f"path: {self.path!r} is not two different points or more, each x, y or x, y, z in metres.")
+        if self.path is not None and not (
+            _are_points(self.path, (2, 3)) and len({*self.path}) >= 2
+        ):
+            raise InputError(
+                f"path: {self.path!r} is not two different points or more, each x, y or x, y, "
+                "z in metres."
+            )
         if self.area is not None:
             good = _are_points(self.area, (2,)) and len(self.area) == 2
             if not good or not all(low < high for low, high in zip(*self.area)):
-                raise InputError(f"area: {self.area!r} is not a lower and an upper corner, each x, y in metres.")
+                raise InputError(
+                    f"area: {self.area!r} is not a lower and an upper corner, each x, y in metres."
+                )
 
     def complete(self) -> tuple[SimulationConfig, Room]:
-        """(config, Room): this config with anchors, place, height, radius and anchor_noise_std filled in."""
+        """(config, Room): this config with anchors, place, height, radius and anchor_noise_std
+        filled in.
+        """
         anchors = self.anchors if self.anchors is not None else constellation(self.constellation)
         if len(anchors) < 2:
             raise InputError(f"anchors: {len(anchors)} was given; the simulation takes 2 or more.")
         if len(anchors) > MOST_HEARD and self.radio_reach is None:
             raise InputError(
-                f"anchors: {len(anchors)} were given, and each is heard everywhere; give radio_reach, m, or at most {MOST_HEARD} of them."
+                f"anchors: {len(anchors)} were given, and each is heard everywhere; give "
+                f"radio_reach, m, or at most {MOST_HEARD} of them."
             )
         if self.bias and not np.isfinite(anchors.orientations).all():
             lost = anchors.ids[~np.isfinite(anchors.orientations).all(axis=1)][0]
             raise InputError(
-                f"anchors: anchor {lost} has no orientation, on which its bias depends; add it or switch bias off."
+                f"anchors: anchor {lost} has no orientation, on which its bias depends; add "
+                "it or switch bias off."
             )
         given = self.anchor_noise_std
-        std = np.full(len(anchors), self.noise_std / np.sqrt(2.0)) if given is None else np.asarray(given, dtype=float)
+        std = (
+            np.full(len(anchors), self.noise_std / np.sqrt(2.0))
+            if given is None
+            else np.asarray(given, dtype=float)
+        )
         if std.shape != (len(anchors),) or not (np.isfinite(std).all() and (std >= 0.0).all()):
             raise InputError(
-                f"anchor_noise_std: {self.anchor_noise_std!r} is not {len(anchors)} numbers of at least 0, in metres."
+                f"anchor_noise_std: {self.anchor_noise_std!r} is not {len(anchors)} numbers "
+                "of at least 0, in metres."
             )
         room = room_of(anchors)
         if self.area is not None:
@@ -239,7 +300,11 @@ class SimulationConfig(_Noises):
         """Plain numbers, strings and lists, for Flight.meta and JSON; the anchors by their ids."""
         content = asdict(replace(self, anchors=None))
         content["anchors"] = None if self.anchors is None else self.anchors.ids.tolist()
-        content["walls"] = None if self.walls is None else [[x for x in wall if x < np.inf] for wall in self.walls.segments]
+        content["walls"] = (
+            None
+            if self.walls is None
+            else [[x for x in wall if x < np.inf] for wall in self.walls.segments]
+        )
         return content
 
 

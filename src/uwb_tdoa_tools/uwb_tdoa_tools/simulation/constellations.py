@@ -17,11 +17,14 @@ if TYPE_CHECKING:
 LOW = 0.18  # m, height of an anchor on its stand on the floor
 
 
-def facing(positions: ArrayLike, target: ArrayLike, level: bool = True, inverted: ArrayLike | None = None) -> Anchors:
+def facing(
+    positions: ArrayLike, target: ArrayLike, level: bool = True, inverted: ArrayLike | None = None
+) -> Anchors:
     """Anchors whose front (antenna x) faces a point.
 
-    positions (N, 3) and target (3,), metres. level: turn about the vertical only, so that the antenna axis (z) stays
-    upright; otherwise tilt as well. inverted: (N,) bool, stands that hang upside down (z down), default none.
+    positions (N, 3) and target (3,), metres. level: turn about the vertical only, so that the
+    antenna axis (z) stays upright; otherwise tilt as well. inverted: (N,) bool, stands that hang
+    upside down (z down), default none.
     """
     positions = np.asarray(positions, dtype=float)
     inverted = np.zeros(len(positions), bool) if inverted is None else np.asarray(inverted, bool)
@@ -32,27 +35,47 @@ def facing(positions: ArrayLike, target: ArrayLike, level: bool = True, inverted
     front = np.where(length > 1e-9, front / np.maximum(length, 1e-9), [1.0, 0.0, 0.0])
     left = np.cross([0.0, 0.0, 1.0], front)
     left /= np.maximum(np.linalg.norm(left, axis=1, keepdims=True), 1e-9)
-    left[np.abs(front[:, 2]) > 1.0 - 1e-9] = [0.0, 1.0, 0.0]  # straight up or down: left is ours to choose
+    left[np.abs(front[:, 2]) > 1.0 - 1e-9] = [
+        0.0,
+        1.0,
+        0.0,
+    ]  # straight up or down: left is ours to choose
     left[inverted] *= -1.0
     axes = np.stack([front, left, np.cross(front, left)], axis=2)
     return Anchors(np.arange(len(positions)), positions, Rotation.from_matrix(axes).as_quat())
 
 
 def corners(x: float = 7.0, y: float = 8.0, z: float = 3.0, level: bool = True) -> Anchors:
-    """A low and a high anchor in each corner of x by y by z metres, in the order of the Toronto surveys: neighbours in
-    the TDOA2 ring lie far apart, 4 stand on the floor and 4 hang upside down under the ceiling."""
+    """A low and a high anchor in each corner of x by y by z metres, in the order of the Toronto
+    surveys: neighbours in the TDOA2 ring lie far apart, 4 stand on the floor and 4 hang upside down
+    under the ceiling.
+    """
     a, b = 0.5 * x, 0.5 * y
     positions = [
-        (-a, -b, LOW), (-a, b, z), (a, b, LOW), (a, -b, z), (-a, -b, z), (a, -b, LOW), (a, b, z), (-a, b, LOW)
-    ]  # fmt: skip
+        (-a, -b, LOW),
+        (-a, b, z),
+        (a, b, LOW),
+        (a, -b, z),
+        (-a, -b, z),
+        (a, -b, LOW),
+        (a, b, z),
+        (-a, b, LOW),
+    ]
     return facing(positions, (0.0, 0.0, 0.5 * z), level, np.array(positions)[:, 2] > 0.5 * z)
 
 
 def wall_middles() -> Anchors:
     """Four low ones at the middles of the walls, four high ones in the corners, 7 x 8 x 3 m."""
     positions = [
-        (-3.5, 0, LOW), (3.5, 4, 3), (0, -4, LOW), (-3.5, 4, 3), (3.5, 0, LOW), (-3.5, -4, 3), (0, 4, LOW), (3.5, -4, 3)
-    ]  # fmt: skip
+        (-3.5, 0, LOW),
+        (3.5, 4, 3),
+        (0, -4, LOW),
+        (-3.5, 4, 3),
+        (3.5, 0, LOW),
+        (-3.5, -4, 3),
+        (0, 4, LOW),
+        (3.5, -4, 3),
+    ]
     return facing(positions, (0.0, 0.0, 1.5), inverted=np.array(positions)[:, 2] > 1.5)
 
 
@@ -60,7 +83,9 @@ def staircase() -> Anchors:
     """Eight around the walls of 7 x 8 x 3 m, each higher than the one before, all upright."""
     x = [-3.5, 0.0, 3.5, 3.5, 3.5, 0.0, -3.5, -3.5]
     y = [-4.0, -4.0, -4.0, 0.0, 4.0, 4.0, 4.0, 0.0]
-    return facing(np.column_stack([x, y, np.linspace(LOW, 3.0, 8)[[0, 4, 1, 5, 2, 6, 3, 7]]]), (0.0, 0.0, 1.5))
+    return facing(
+        np.column_stack([x, y, np.linspace(LOW, 3.0, 8)[[0, 4, 1, 5, 2, 6, 3, 7]]]), (0.0, 0.0, 1.5)
+    )
 
 
 def pillars() -> Anchors:
@@ -74,12 +99,18 @@ def six() -> Anchors:
     """Six anchors, three low and three high, on two opposite triangles in 6 x 6 x 2.8 m."""
     angle = np.deg2rad([90, 270, 210, 30, 330, 150])
     z = np.array([LOW, 2.8, LOW, 2.8, LOW, 2.8])
-    return facing(np.column_stack([3 * np.cos(angle), 3 * np.sin(angle), z]), (0.0, 0.0, 1.4), inverted=z > 1)
+    return facing(
+        np.column_stack([3 * np.cos(angle), 3 * np.sin(angle), z]), (0.0, 0.0, 1.4), inverted=z > 1
+    )
 
 
 def six_wide() -> Anchors:
     """Six anchors on the walls of 12 x 8 m, at 0.8 and 2.8 m in turn: for what drives."""
-    x, y, z = np.array([-6.0, 0.0, 6.0, 6.0, 0.0, -6.0]), np.repeat([-4.0, 4.0], 3), np.tile([0.8, 2.8], 3)
+    x, y, z = (
+        np.array([-6.0, 0.0, 6.0, 6.0, 0.0, -6.0]),
+        np.repeat([-4.0, 4.0], 3),
+        np.tile([0.8, 2.8], 3),
+    )
     return facing(np.column_stack([x, y, z]), (0.0, 0.0, 1.0), inverted=z > 1)
 
 
@@ -92,21 +123,29 @@ def hall() -> Anchors:
 
 
 def planar() -> Anchors:
-    """Four at the corners of 4 x 4 m, 0.2 m high, facing the centre: Grasso et al. (Sensors 2022), section 2.1."""
+    """Four at the corners of 4 x 4 m, 0.2 m high, facing the centre: Grasso et al.
+
+    (Sensors 2022), section 2.1.
+    """
     return facing([(-2, -2, 0.2), (2, -2, 0.2), (2, 2, 0.2), (-2, 2, 0.2)], (0.0, 0.0, 0.2))
 
 
 def pair() -> Anchors:
-    """Two anchors 4.5 m apart at 1.25 m, facing each other, with the default hovering place half-way between them: the
-    bench of Zhao et al. (RA-L 2021), figure 4."""
+    """Two anchors 4.5 m apart at 1.25 m, facing each other, with the default hovering place
+    half-way between them: the bench of Zhao et al. (RA-L 2021), figure 4.
+    """
     return facing([(-2.25, 0, 1.25), (2.25, 0, 1.25)], (0.0, 0.0, 1.25))
 
 
 def random(seed: int, count: int = 8) -> Anchors:
-    """Seeded: `count` anchors (4 to 64) on the walls of a seeded room of 5 - 9 x 5 - 9 x 2.5 - 3.5 m, low ones and high
-    ones in turn, at least 0.5 m apart, facing the centre to within some 20 degrees."""
+    """Seeded: `count` anchors (4 to 64) on the walls of a seeded room of 5 - 9 x 5 - 9 x 2.5 - 3.5
+    m, low ones and high ones in turn, at least 0.5 m apart, facing the centre to within some 20
+    degrees.
+    """
     if not 4 <= count <= 64:
-        raise InputError(f"constellation: random-{seed}-{count} asks for {count} anchors; choose 4 to 64.")
+        raise InputError(
+            f"constellation: random-{seed}-{count} asks for {count} anchors; choose 4 to 64."
+        )
     rng = np.random.default_rng([seed, count])
     size = np.array([*rng.uniform(5.0, 9.0, 2), rng.uniform(2.5, 3.5)])
     positions = np.empty((0, 3))
@@ -120,7 +159,9 @@ def random(seed: int, count: int = 8) -> Anchors:
             positions = np.vstack([positions, place])
     straight = facing(positions, (0.0, 0.0, 0.5 * size[2]), inverted=np.arange(count) % 2 == 1)
     wobble = Rotation.from_rotvec(np.deg2rad(12.0) * rng.standard_normal((count, 3)))
-    return Anchors(straight.ids, positions, (wobble * Rotation.from_quat(straight.orientations)).as_quat())
+    return Anchors(
+        straight.ids, positions, (wobble * Rotation.from_quat(straight.orientations)).as_quat()
+    )
 
 
 CONSTELLATIONS = {
@@ -140,10 +181,14 @@ CONSTELLATIONS = {
 
 
 def constellation(name: str) -> Anchors:
-    """Anchors of a named constellation, or of `random-SEED` or `random-SEED-COUNT`; raises InputError."""
+    """Anchors of a named constellation, or of `random-SEED` or `random-SEED-COUNT`; raises
+    InputError.
+    """
     if name in CONSTELLATIONS:
         return CONSTELLATIONS[name]()
     if match := re.fullmatch(r"random-(\d{1,9})(?:-(\d{1,5}))?", str(name)):
         return random(int(match[1]), int(match[2] or 8))
     choices = ", ".join(CONSTELLATIONS)
-    raise InputError(f"constellation: {name!r} is not known; choose {choices} or random-SEED[-COUNT].")
+    raise InputError(
+        f"constellation: {name!r} is not known; choose {choices} or random-SEED[-COUNT]."
+    )

@@ -12,12 +12,14 @@ from uwb_tdoa_bias.foundation.flight import Imu
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+
     from .motion import Flyable
 
 
 @dataclass(frozen=True)
 class ImuErrors:
-    """White noise, a bias that starts somewhere and walks, vibration: the error model of the filter, and nothing else.
+    """White noise, a bias that starts somewhere and walks, vibration: the error model of the
+    filter, and nothing else.
 
     Defaults are of the size of a small quadrotor's MEMS sensor (BMI088 data sheet, rounded up).
 
@@ -29,7 +31,8 @@ class ImuErrors:
     accel_bias_walk : random walk density of the bias, m/s^3/sqrt(Hz) (default 2e-4)
     gyro_bias : standard deviation of each axis of the initial bias, rad/s (default 5e-3)
     accel_bias : standard deviation of each axis of the initial bias, m/s^2 (default 5e-2)
-    vibration : standard deviation of a further white noise on the accelerometer while the motors turn, m/s^2
+    vibration : standard deviation of a further white noise on the accelerometer while the motors
+        turn, m/s^2
         (default 0: off)
     """
 
@@ -44,19 +47,24 @@ class ImuErrors:
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if not (np.isfinite(value) and value >= 0.0):
-                raise InputError(f"imu_errors: {name}: {value!r} is not a finite number of at least 0.")
+                raise InputError(
+                    f"imu_errors: {name}: {value!r} is not a finite number of at least 0."
+                )
 
 
 NO_IMU_ERRORS = ImuErrors(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 
 
 def measure(
-    t: np.ndarray, trajectory: Flyable, errors: ImuErrors, random: Callable[[str], np.random.Generator]
+    t: np.ndarray,
+    trajectory: Flyable,
+    errors: ImuErrors,
+    random: Callable[[str], np.random.Generator],
 ) -> tuple[Imu, np.ndarray, np.ndarray]:
     """What the sensor reports at the stamps t, (n,) s, equally spaced.
 
-    random(part) gives the numpy Generator of a part. Returns (Imu, gyro bias (n, 3) rad/s, accel bias (n, 3) m/s^2).
-    The samples are values at an instant, not means over the sample time.
+    random(part) gives the numpy Generator of a part. Returns (Imu, gyro bias (n, 3) rad/s, accel
+    bias (n, 3) m/s^2). The samples are values at an instant, not means over the sample time.
     """
     n, dt = len(t), t[1] - t[0]
     motion = trajectory.motion(t)
@@ -72,7 +80,11 @@ def measure(
     accel_bias = bias_of("accel bias", errors.accel_bias, errors.accel_bias_walk)
     gyro_noise = errors.gyro_noise / np.sqrt(dt) * random("gyro noise").standard_normal((n, 3))
     accel_noise = errors.accel_noise / np.sqrt(dt) * random("accel noise").standard_normal((n, 3))
-    shaking = errors.vibration * trajectory.motors(t)[:, None] * random("vibration").standard_normal((n, 3))
+    shaking = (
+        errors.vibration
+        * trajectory.motors(t)[:, None]
+        * random("vibration").standard_normal((n, 3))
+    )
     gyro = motion.body_rates + gyro_bias + gyro_noise
     accel = motion.specific_force + accel_bias + accel_noise + shaking
     return Imu(t, gyro, accel), gyro_bias, accel_bias

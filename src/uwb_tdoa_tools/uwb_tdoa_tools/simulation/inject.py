@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,15 +15,20 @@ from ..bags.bag import check_output, write_bag
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
+
     from uwb_tdoa_bias.effects.base import Effect
     from uwb_tdoa_bias.foundation.flight import Flight
+
     from ..readers.inputs import Reading
 
 _ANCHORS = re.compile(r"(\d+)(?:-(\d+))?(?:\..+)?")  # of which a parameter is: 3, 3-5, 3.x
 
 
 def parse_effect(name: str, values: Sequence[str]) -> Effect:
-    """The Effect `name` with `values`, a list of texts "KEY=NUMBER", "KEY:NUMBER" or "NUMBER". Raises InputError."""
+    """The Effect `name` with `values`, a list of texts "KEY=NUMBER", "KEY:NUMBER" or "NUMBER".
+
+    Raises InputError.
+    """
     kind = EFFECTS[name]
     parameters: dict[str, Any] = {}  # texts, of which the Effect makes numbers
     for text in ",".join(values).split(","):
@@ -36,12 +41,19 @@ def parse_effect(name: str, values: Sequence[str]) -> Effect:
 
 
 def inject(
-    effect: Effect, recording: str | Path, reading: Reading, out: str | Path, seed: int = 0, storage: str = "mcap",
+    effect: Effect,
+    recording: str | Path,
+    reading: Reading,
+    out: str | Path,
+    seed: int = 0,
+    storage: str = "mcap",
     force: bool = False,
-) -> str:  # fmt: skip
-    """Write the flight that would have been recorded with an Effect as a bag. Returns the name of the flight.
+) -> str:
+    """Write the flight that would have been recorded with an Effect as a bag. Returns the name of
+    the flight.
 
-    recording, reading : a path, and a Reading to read it; seed : of effects that are random. Raises InputError.
+    recording, reading : a path, and a Reading to read it; seed : of effects that are random. Raises
+        InputError.
     """
     check_output(out, force)  # before the work, not after it
     flight = reading.one(recording)
@@ -58,11 +70,14 @@ def _check_anchors(effect: Effect, flight: Flight) -> None:
             if flight.anchors.row(int(anchor)) < 0:
                 known = ", ".join(map(str, flight.anchors.ids))
                 raise InputError(
-                    f"--value: {effect.name}: {key}: {flight.name} has no anchor {anchor}; it has {known}."
+                    f"--value: {effect.name}: {key}: {flight.name} has no anchor {anchor}; it "
+                    f"has {known}."
                 )
 
 
 def catalogue() -> str:
     """All effects with a parameter, the unit and the physics of each: text."""
-    lines = [f"{name:20s} e.g. {e.example}=NUMBER ({e.unit}): {e.physics}" for name, e in EFFECTS.items()]
+    lines = [
+        f"{name:20s} e.g. {e.example}=NUMBER ({e.unit}): {e.physics}" for name, e in EFFECTS.items()
+    ]
     return "\n".join(lines)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
     import numpy as np
@@ -13,7 +13,8 @@ if TYPE_CHECKING:
 class ExactMotion:
     """Exact motion at n instants, body frame x forward, y left, z up in a z-up world.
 
-    p, v, a : (n, 3) m, m/s, m/s^2, world; q : (n, 4) x y z w, body to world; body_rates : (n, 3) rad/s, body;
+    p, v, a : (n, 3) m, m/s, m/s^2, world; q : (n, 4) x y z w, body to world; body_rates : (n, 3)
+        rad/s, body;
     specific_force : (n, 3) m/s^2, body.
     """
 

@@ -12,6 +12,7 @@ from uwb_tdoa_bias.foundation.files import write_filled
 
 if TYPE_CHECKING:
     from pathlib import Path
+
     from uwb_tdoa_bias.foundation.flight import Flight
 
 SUFFIXES = (".png", ".pdf", ".svg")
@@ -24,7 +25,9 @@ def check_image(path: Path | None) -> None:
 
 
 def plot(flight: Flight, path: str | Path) -> None:
-    """Draw path and anchors from above, height, and the bias and full error of the TDOAs, to an image file."""
+    """Draw path and anchors from above, height, and the bias and full error of the TDOAs, to an
+    image file.
+    """
     assert flight.truth is not None
     from matplotlib.figure import Figure  # takes a second to import
 

@@ -1,4 +1,6 @@
-"""The room a flight takes place in: what the anchors span, and the part of it that is comfortable to fly in."""
+"""The room a flight takes place in: what the anchors span, and the part of it that is comfortable
+to fly in.
+"""
 
 from __future__ import annotations
 
@@ -17,8 +19,10 @@ REST_HEIGHT = 0.03  # m, height of the body frame when the vehicle stands on the
 
 @dataclass(frozen=True)
 class Room:
-    """A box. lower, upper : (3,) corners in the world frame, metres; the floor is at lower[2]. area : ((x, y), (x, y)) m, lower and upper
-    corner of the part that paths are sized to; None for all but a clearance."""
+    """A box. lower, upper : (3,) corners in the world frame, metres; the floor is at lower[2]. area
+    : ((x, y), (x, y)) m, lower and upper corner of the part that paths are sized to; None for all
+    but a clearance.
+    """
 
     lower: np.ndarray
     upper: np.ndarray
@@ -33,8 +37,12 @@ class Room:
 
     @property
     def flyable(self) -> tuple[np.ndarray, np.ndarray]:
-        """The box that paths are sized to, (lower, upper), each (3,) metres: the area, or else the room less a clearance."""
-        margin = np.minimum([CLEARANCE, CLEARANCE, FLOOR_CLEARANCE], 0.25 * (self.upper - self.lower))
+        """The box that paths are sized to, (lower, upper), each (3,) metres: the area, or else the
+        room less a clearance.
+        """
+        margin = np.minimum(
+            [CLEARANCE, CLEARANCE, FLOOR_CLEARANCE], 0.25 * (self.upper - self.lower)
+        )
         low, high = self.lower + margin, self.upper - margin
         if self.area is not None:
             low[:2], high[:2] = self.area
@@ -44,12 +52,17 @@ class Room:
         """The Room, grown to hold points (n, 2 or 3), m."""
         k = points.shape[1]
         lower, upper = self.lower.copy(), self.upper.copy()
-        lower[:k], upper[:k] = np.minimum(lower[:k], points.min(axis=0)), np.maximum(upper[:k], points.max(axis=0))
+        lower[:k], upper[:k] = (
+            np.minimum(lower[:k], points.min(axis=0)),
+            np.maximum(upper[:k], points.max(axis=0)),
+        )
         return replace(self, lower=lower, upper=upper)
 
 
 def room_of(anchors: Anchors) -> Room:
-    """The room that Anchors stand in: the box around them, at least 4 x 4 x 2.5 m, floor at 0 or the lowest anchor."""
+    """The room that Anchors stand in: the box around them, at least 4 x 4 x 2.5 m, floor at 0 or
+    the lowest anchor.
+    """
     lowest, highest = anchors.positions.min(axis=0), anchors.positions.max(axis=0)
     middle, half = 0.5 * (lowest + highest), np.maximum(0.5 * (highest - lowest), 2.0)
     floor = min(0.0, lowest[2])

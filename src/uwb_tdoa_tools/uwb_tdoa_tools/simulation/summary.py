@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,8 +15,9 @@ if TYPE_CHECKING:
 
 
 def summary(flight: Flight) -> dict[str, Any]:
-    """Plain values for JSON: name, counts, sizes of the parts of the TDOA errors (m), configuration, true
-    parameters."""
+    """Plain values for JSON: name, counts, sizes of the parts of the TDOA errors (m),
+    configuration, true parameters.
+    """
     assert flight.imu is not None and flight.truth is not None
     parts = flight.extra["tdoa_truth"]
     return {

@@ -1,7 +1,8 @@
 """Where the vehicle flies: trajectory families, and the smooth motion made of them.
 
-A family gives positions over "path time" s, which runs with the clock at cruise. A Trajectory adds take-off, speeding
-up, slowing down and landing, and fits one spline through it all, whose derivatives are then exact.
+A family gives positions over "path time" s, which runs with the clock at cruise. A Trajectory adds
+take-off, speeding up, slowing down and landing, and fits one spline through it all, whose
+derivatives are then exact.
 """
 
 from __future__ import annotations
@@ -20,12 +21,16 @@ from .room import REST_HEIGHT
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from numpy.typing import ArrayLike
+
     from .config import SimulationConfig
     from .room import Room
 
 GRAVITY = 9.81  # m/s^2
-DRAG = 0.2  # 1/s, rotor drag per mass: without it the lateral accelerometers would never feel anything
+DRAG = (
+    0.2  # 1/s, rotor drag per mass: without it the lateral accelerometers would never feel anything
+)
 KNOT = 0.05  # s, spacing of the spline's knots
 SPEED_UP = 2.0  # s, from rest to cruise and back
 CORNER_TIME = 1.2  # s, to turn a corner of the square
@@ -33,13 +38,19 @@ HEADING_TIME = 3.0  # s, over which a heading along the track is smoothed
 MAX_ACCELERATION = 8.0  # m/s^2, what a small quadrotor still flies
 SPIN_UP = 0.5  # s, the motors turn before take-off and after landing
 
-STEP = Polynomial([0, 0, 0, 0, 0, 126, -420, 540, -315, 70])  # 0 to 1 with four derivatives zero at both ends
+STEP = Polynomial(
+    [0, 0, 0, 0, 0, 126, -420, 540, -315, 70]
+)  # 0 to 1 with four derivatives zero at both ends
 _RAMP = STEP.integ()
 
 
-def circle(s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator) -> np.ndarray:
+def circle(
+    s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator
+) -> np.ndarray:
     """A level circle around the place, radius and speed as configured."""
-    assert config.radius is not None and config.place is not None and config.height is not None  # complete
+    assert (
+        config.radius is not None and config.place is not None and config.height is not None
+    )  # complete
     angle = config.speed * s / config.radius
     return np.column_stack(
         [
@@ -50,7 +61,9 @@ def circle(s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.G
     )
 
 
-def rising_circle(s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator) -> np.ndarray:
+def rising_circle(
+    s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator
+) -> np.ndarray:
     """The circle with a height that rises and falls in a sine, up to 0.6 m, 0.7 times per turn."""
     assert config.height is not None and config.radius is not None  # complete
     p = circle(s, config, room, rng)
@@ -60,10 +73,14 @@ def rising_circle(s: np.ndarray, config: SimulationConfig, room: Room, rng: np.r
     return p
 
 
-def sines(s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator) -> np.ndarray:
-    """Products of two sines per axis, of seeded amplitude, period and phase, through the flyable room.
+def sines(
+    s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator
+) -> np.ndarray:
+    """Products of two sines per axis, of seeded amplitude, period and phase, through the flyable
+    room.
 
-    Source: the training trajectories of Zhao et al. (RA-L 2021), section V-B. `speed` is the root mean square here.
+    Source: the training trajectories of Zhao et al. (RA-L 2021), section V-B. `speed` is the root
+    mean square here.
     """
     low, high = room.flyable
     reach = 0.5 * (high - low) * rng.uniform(0.75, 1.0, 3)
@@ -78,24 +95,38 @@ def sines(s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Ge
     return position(s * config.speed / np.sqrt(np.mean(np.sum(pace**2, axis=1))))
 
 
-def square(s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator) -> np.ndarray:
-    """A level square around the place, its edges `radius` away from it, at constant speed, with rounded corners."""
+def square(
+    s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator
+) -> np.ndarray:
+    """A level square around the place, its edges `radius` away from it, at constant speed, with
+    rounded corners.
+    """
     assert config.radius is not None  # complete
     return _laps(s, config, [[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]], config.radius)
 
 
-def line_x(s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator) -> np.ndarray:
-    """Back and forth along x through the place, `radius` to each side, at constant speed, with smooth turns."""
+def line_x(
+    s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator
+) -> np.ndarray:
+    """Back and forth along x through the place, `radius` to each side, at constant speed, with
+    smooth turns.
+    """
     return _laps(s, config, [[-1, 0], [1, 0], [-1, 0]], 0.0)
 
 
-def line_y(s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator) -> np.ndarray:
+def line_y(
+    s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator
+) -> np.ndarray:
     """The same along y."""
     return _laps(s, config, [[0, -1], [0, 1], [0, -1]], 0.0)
 
 
-def waypoints(s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator) -> np.ndarray:
-    """Through the points of `path` and back to the first, again and again, at constant speed, with rounded corners."""
+def waypoints(
+    s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator
+) -> np.ndarray:
+    """Through the points of `path` and back to the first, again and again, at constant speed, with
+    rounded corners.
+    """
     assert config.path is not None and config.height is not None  # complete
     points = np.array([(*point, config.height)[:3] for point in config.path])
     around = np.vstack([points, points[:1]])
@@ -103,17 +134,26 @@ def waypoints(s: np.ndarray, config: SimulationConfig, room: Room, rng: np.rando
     return _round(s, config.speed, around, ends, 0.0)
 
 
-def _laps(s: np.ndarray, config: SimulationConfig, corners: Sequence[Sequence[float]], ahead: float) -> np.ndarray:
-    """Round the corners, (n, 2) in units of the radius and as far apart each, level, `ahead` m further at the start."""
-    assert config.radius is not None and config.place is not None and config.height is not None  # complete
+def _laps(
+    s: np.ndarray, config: SimulationConfig, corners: Sequence[Sequence[float]], ahead: float
+) -> np.ndarray:
+    """Round the corners, (n, 2) in units of the radius and as far apart each, level, `ahead` m
+    further at the start.
+    """
+    assert (
+        config.radius is not None and config.place is not None and config.height is not None
+    )  # complete
     ends = 2.0 * config.radius * np.arange(len(corners))
     rounded = _round(s, config.speed, config.radius * np.asarray(corners), ends, ahead)
     return np.column_stack([rounded + config.place, np.full(len(s), config.height)])
 
 
-def _round(s: np.ndarray, speed: float, around: np.ndarray, ends: np.ndarray, ahead: float) -> np.ndarray:
-    """Positions at s along a closed line through the corners around (n, k) m, which are reached after ends (n,) m, `ahead` m further at
-    the start, with rounded corners."""
+def _round(
+    s: np.ndarray, speed: float, around: np.ndarray, ends: np.ndarray, ahead: float
+) -> np.ndarray:
+    """Positions at s along a closed line through the corners around (n, k) m, which are reached
+    after ends (n,) m, `ahead` m further at the start, with rounded corners.
+    """
     dt = 0.01
     s_fine = np.arange(-CORNER_TIME, s[-1] + CORNER_TIME + dt, dt)
     along = np.mod(speed * s_fine + ahead, ends[-1])
@@ -122,7 +162,9 @@ def _round(s: np.ndarray, speed: float, around: np.ndarray, ends: np.ndarray, ah
     return rounded
 
 
-def hover(s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator) -> np.ndarray:
+def hover(
+    s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator
+) -> np.ndarray:
     """Stay at the place."""
     assert config.place is not None and config.height is not None  # complete
     return np.tile([*config.place, config.height], (len(s), 1))
@@ -140,11 +182,21 @@ TRAJECTORIES = {
 }
 
 
-def path_of(s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator) -> np.ndarray:
-    """Positions (n, 3) m at path times s (n,), s, of the waypoints of a config, or else of its family. Raises InputError."""
+def path_of(
+    s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator
+) -> np.ndarray:
+    """Positions (n, 3) m at path times s (n,), s, of the waypoints of a config, or else of its
+    family. Raises InputError.
+    """
     if config.trajectory not in TRAJECTORIES:
-        raise InputError(f"trajectory: {config.trajectory!r} is not known; choose {', '.join(TRAJECTORIES)}.")
-    family, name = (TRAJECTORIES[config.trajectory], config.trajectory) if config.path is None else (waypoints, "the path")
+        raise InputError(
+            f"trajectory: {config.trajectory!r} is not known; choose {', '.join(TRAJECTORIES)}."
+        )
+    family, name = (
+        (TRAJECTORIES[config.trajectory], config.trajectory)
+        if config.path is None
+        else (waypoints, "the path")
+    )
     p = family(s, config, room, rng)
     outside = (p < room.lower).any(axis=0) | (p > room.upper).any(axis=0)
     if outside.any():
@@ -152,17 +204,21 @@ def path_of(s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.
         reach = f"{p[:, axis].min():.2f} ... {p[:, axis].max():.2f} m"
         walls = f"{room.lower[axis]:.2f} ... {room.upper[axis]:.2f} m"
         raise InputError(
-            f"trajectory: {name} reaches {reach} in {'xyz'[axis]}, outside the room's {walls}; change place, height or radius."
+            f"trajectory: {name} reaches {reach} in {'xyz'[axis]}, outside the room's "
+            f"{walls}; change place, height or radius."
         )
     return p
 
 
 class Trajectory:
-    """One flight over 0 ... config.duration: position and yaw as splines, attitude and rates from them.
+    """One flight over 0 ... config.duration: position and yaw as splines, attitude and rates from
+    them.
 
-    Parameters: config, a SimulationConfig with place, height and radius filled in; room, a Room; rng, a numpy Generator
-    for what the family draws. Raises InputError where the flight does not fit the room, the time or the vehicle.
-    take_off, landing : s, when it leaves the floor and is back on it; None when it starts and ends in the air.
+    Parameters: config, a SimulationConfig with place, height and radius filled in; room, a Room;
+    rng, a numpy Generator for what the family draws. Raises InputError where the flight does not
+    fit the room, the time or the vehicle.
+    take_off, landing : s, when it leaves the floor and is back on it; None when it starts and ends
+        in the air.
     """
 
     def __init__(self, config: SimulationConfig, room: Room, rng: np.random.Generator) -> None:
@@ -174,7 +230,8 @@ class Trajectory:
             shortest = 2.0 * (config.floor_time + rise + SPEED_UP)
             if config.duration < shortest:
                 raise InputError(
-                    f"duration: {config.duration:g} s is too short to take off and land; give {shortest:g} s or more, "
+                    f"duration: {config.duration:g} s is too short to take off and land; give "
+                    f"{shortest:g} s or more, "
                     "a shorter floor_time, or start in the air."
                 )
             start, end = config.floor_time, config.duration - config.floor_time
@@ -196,15 +253,18 @@ class Trajectory:
         hardest = np.linalg.norm(self._p.derivative(2)(start + tau), axis=1).max()
         if hardest > MAX_ACCELERATION:
             raise InputError(
-                f"speed: {config.speed:g} m/s asks for an acceleration of {hardest:.1f} m/s^2 on this path, "
+                f"speed: {config.speed:g} m/s asks for an acceleration of {hardest:.1f} m/s^2 "
+                "on this path, "
                 f"more than {MAX_ACCELERATION:g}; fly slower or wider."
             )
 
     def motion(self, t: ArrayLike) -> ExactMotion:
-        """The ExactMotion at the stamps t, (n,) s; before take-off and after landing it rests exactly.
+        """The ExactMotion at the stamps t, (n,) s; before take-off and after landing it rests
+        exactly.
 
-        The thrust, along body z, carries weight, acceleration and rotor drag (differential flatness of a quadrotor,
-        after Mellinger and Kumar, ICRA 2011); the body rates are the analytic derivative of that attitude.
+        The thrust, along body z, carries weight, acceleration and rotor drag (differential flatness
+        of a quadrotor, after Mellinger and Kumar, ICRA 2011); the body rates are the analytic
+        derivative of that attitude.
         """
         t = np.asarray(t, dtype=float)
         inside = np.clip(t, self._start, self._end)
@@ -220,31 +280,47 @@ class Trajectory:
         z = thrust / size
         z_rate = (thrust_rate - z * np.sum(z * thrust_rate, axis=1, keepdims=True)) / size
         heading = np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(len(t))])
-        heading_rate = yaw_rate[:, None] * np.column_stack([-np.sin(yaw), np.cos(yaw), np.zeros(len(t))])
+        heading_rate = yaw_rate[:, None] * np.column_stack(
+            [-np.sin(yaw), np.cos(yaw), np.zeros(len(t))]
+        )
         y = np.cross(z, heading)
         y_size = np.linalg.norm(y, axis=1, keepdims=True)
         y /= y_size
         x = np.cross(y, z)
-        y_rate = (np.cross(z_rate, heading) + np.cross(z, heading_rate)) / y_size  # up to a part along y itself
-        body_rates = np.column_stack([np.sum(u * w, axis=1) for u, w in ((-y, z_rate), (x, z_rate), (-x, y_rate))])
+        y_rate = (
+            np.cross(z_rate, heading) + np.cross(z, heading_rate)
+        ) / y_size  # up to a part along y itself
+        body_rates = np.column_stack(
+            [np.sum(u * w, axis=1) for u, w in ((-y, z_rate), (x, z_rate), (-x, y_rate))]
+        )
         axes = np.stack([x, y, z], axis=2)
         q = Rotation.from_matrix(axes).as_quat()
-        q[1:] *= np.cumprod(np.where(np.sum(q[1:] * q[:-1], axis=1) < 0.0, -1.0, 1.0))[:, None]  # no sign flips
+        q[1:] *= np.cumprod(np.where(np.sum(q[1:] * q[:-1], axis=1) < 0.0, -1.0, 1.0))[
+            :, None
+        ]  # no sign flips
         return ExactMotion(p, v, a, q, body_rates, np.einsum("nij,ni->nj", axes, a + gravity))
 
     def motors(self, t: ArrayLike) -> np.ndarray:
         """Whether the motors turn at the stamps t: (n,) bool."""
         t = np.asarray(t)
-        return (t >= self._start - SPIN_UP) & (t <= self._end + SPIN_UP) if self._clamped else np.ones(len(t), bool)
+        return (
+            (t >= self._start - SPIN_UP) & (t <= self._end + SPIN_UP)
+            if self._clamped
+            else np.ones(len(t), bool)
+        )
 
 
 def path_time(tau: np.ndarray, rise: float, air: float) -> np.ndarray:
-    """Path time after tau seconds in the air: still during rise and descent, with the clock in between, smoothly."""
+    """Path time after tau seconds in the air: still during rise and descent, with the clock in
+    between, smoothly.
+    """
 
     def since(x: np.ndarray) -> np.ndarray:  # integral of the smooth step, in units of SPEED_UP
         return _RAMP(np.clip(x, 0.0, 1.0)) + np.maximum(x - 1.0, 0.0)
 
-    return SPEED_UP * (since((tau - rise) / SPEED_UP) - since((tau - (air - rise - SPEED_UP)) / SPEED_UP))
+    return SPEED_UP * (
+        since((tau - rise) / SPEED_UP) - since((tau - (air - rise - SPEED_UP)) / SPEED_UP)
+    )
 
 
 def yaw_along(s: np.ndarray, p: np.ndarray, config: SimulationConfig) -> np.ndarray:
@@ -264,8 +340,12 @@ def yaw_along(s: np.ndarray, p: np.ndarray, config: SimulationConfig) -> np.ndar
 
 
 def _smoothed(values: np.ndarray, width: int) -> np.ndarray:
-    """Columns of (n, k) values averaged with a raised-cosine window of `width` samples; the ends go on as constants."""
+    """Columns of (n, k) values averaged with a raised-cosine window of `width` samples; the ends go
+    on as constants.
+    """
     window = np.hanning(width + 2)[1:-1]
     window /= window.sum()
     padded = np.pad(values, ((width, width), (0, 0)), mode="edge")
-    return np.column_stack([np.convolve(column, window, mode="same") for column in padded.T])[width:-width]
+    return np.column_stack([np.convolve(column, window, mode="same") for column in padded.T])[
+        width:-width
+    ]

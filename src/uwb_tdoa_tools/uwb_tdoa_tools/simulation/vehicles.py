@@ -17,6 +17,7 @@ from .trajectories import GRAVITY, KNOT, SPEED_UP, STEP, Trajectory, path_of, pa
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
+
     from .config import SimulationConfig
     from .room import Room
 
@@ -33,10 +34,11 @@ BOB, SWAY, TILT = 0.02, 0.01, np.deg2rad(6.0)  # m, m, rad: of a hand, by steps 
 
 
 class Rover:
-    """A rover with two driven wheels: it follows a point that moves along the path of a config, and stops where the point stops.
+    """A rover with two driven wheels: it follows a point that moves along the path of a config, and
+    stops where the point stops.
 
-    Base on the floor, x ahead. Parameters: as of Trajectory; the path may have any heights. It stands still for config.floor_time
-    before and after.
+    Base on the floor, x ahead. Parameters: as of Trajectory; the path may have any heights. It
+    stands still for config.floor_time before and after.
     """
 
     def __init__(self, config: SimulationConfig, room: Room, rng: np.random.Generator) -> None:
@@ -44,7 +46,9 @@ class Rover:
         self._floor = float(room.lower[2])
         tau = np.arange(0.0, config.duration + KNOT, KNOT)
         goes = _going(tau, config, rng)
-        target = path_of(np.concatenate([[0.0], np.cumsum(KNOT * goes)[:-1]]), config, room, rng)[:, :2]
+        target = path_of(np.concatenate([[0.0], np.cumsum(KNOT * goes)[:-1]]), config, room, rng)[
+            :, :2
+        ]
         start, heading, speed, turning = _followed(target, config.speed)
         knots = KNOT * np.arange(-2, len(tau) + 2)
         self._speed, self._turning = BSpline(knots, speed, 3), BSpline(knots, turning, 3)
@@ -53,7 +57,9 @@ class Rover:
         fine = np.arange(0.0, config.duration + FINE, FINE)
         velocity, between = self._velocity(fine), self._velocity(fine[:-1] + 0.5 * FINE)
         step = FINE / 6.0 * (velocity[:-1] + 4.0 * between + velocity[1:])  # Simpson
-        self._p = CubicHermiteSpline(fine, start + np.vstack([np.zeros((1, 2)), np.cumsum(step, axis=0)]), velocity)
+        self._p = CubicHermiteSpline(
+            fine, start + np.vstack([np.zeros((1, 2)), np.cumsum(step, axis=0)]), velocity
+        )
         self._last = fine[-1]
 
     def _velocity(self, t: np.ndarray) -> np.ndarray:
@@ -85,7 +91,9 @@ class Rover:
 
 
 def _going(tau: np.ndarray, config: SimulationConfig, rng: np.random.Generator) -> np.ndarray:
-    """How fast path time goes at tau (n,) s: 0 before and after the drive and at stops, 1 between them, with smooth changes."""
+    """How fast path time goes at tau (n,) s: 0 before and after the drive and at stops, 1 between
+    them, with smooth changes.
+    """
     ends = [0.0, config.floor_time]
     last = config.duration - config.floor_time - SPEED_UP
     while ends[-1] < last:
@@ -95,15 +103,20 @@ def _going(tau: np.ndarray, config: SimulationConfig, rng: np.random.Generator) 
     for begin, end in zip(ends[1::2], ends[2::2]):
         end = min(end, last)
         since, until = ((tau - begin) / SPEED_UP, (end - tau) / SPEED_UP)
-        out += np.asarray(STEP(np.clip(since, 0.0, 1.0)) * STEP(np.clip(until, 0.0, 1.0)), dtype=float)
+        out += np.asarray(
+            STEP(np.clip(since, 0.0, 1.0)) * STEP(np.clip(until, 0.0, 1.0)), dtype=float
+        )
     return out
 
 
 def _followed(target: np.ndarray, speed: float) -> tuple[np.ndarray, float, np.ndarray, np.ndarray]:
-    """(place (2,) m and heading, rad, at the start; forward speed (n,) m/s and turning rate (n,) rad/s) of a rover that follows a target
-    (n, 2) m, which moves at `speed` m/s, at steps of KNOT."""
+    """(place (2,) m and heading, rad, at the start; forward speed (n,) m/s and turning rate (n,)
+    rad/s) of a rover that follows a target (n, 2) m, which moves at `speed` m/s, at steps of KNOT.
+    """
     away = target - target[0]
-    ahead = away[np.argmax(np.hypot(*away.T) > 0.3)]  # of the path's beginning; east if it goes nowhere
+    ahead = away[
+        np.argmax(np.hypot(*away.T) > 0.3)
+    ]  # of the path's beginning; east if it goes nowhere
     heading = yaw = float(np.arctan2(ahead[1], ahead[0]))
     x, y = map(float, target[0])
     v = w = 0.0
@@ -112,8 +125,17 @@ def _followed(target: np.ndarray, speed: float) -> tuple[np.ndarray, float, np.n
         distance = np.hypot(goal_x - x, goal_y - y)
         bearing = (np.arctan2(goal_y - y, goal_x - x) - yaw + np.pi) % (2.0 * np.pi) - np.pi
         outside = distance > SLACK
-        wanted = min(PULL * (distance - SLACK) + SLOWEST, 1.5 * speed) * max(np.cos(bearing), 0.0) if outside else 0.0
-        turn = float(np.clip(TURN * bearing, -FASTEST_TURN, FASTEST_TURN)) * min(5.0 * (distance - SLACK), 1.0) if outside else 0.0
+        wanted = (
+            min(PULL * (distance - SLACK) + SLOWEST, 1.5 * speed) * max(np.cos(bearing), 0.0)
+            if outside
+            else 0.0
+        )
+        turn = (
+            float(np.clip(TURN * bearing, -FASTEST_TURN, FASTEST_TURN))
+            * min(5.0 * (distance - SLACK), 1.0)
+            if outside
+            else 0.0
+        )
         v += float(np.clip(wanted - v, -HARDEST * KNOT, HARDEST * KNOT))
         w += float(np.clip(turn - w, -HARDEST_TURN * KNOT, HARDEST_TURN * KNOT))
         middle = yaw + 0.5 * w * KNOT
@@ -124,8 +146,10 @@ def _followed(target: np.ndarray, speed: float) -> tuple[np.ndarray, float, np.n
 
 
 class Carried:
-    """A tag in the hand of a person who walks along the path of a config: it bobs with the steps, sways and tilts. Parameters: as of
-    Trajectory; the person stands for config.floor_time before and after."""
+    """A tag in the hand of a person who walks along the path of a config: it bobs with the steps,
+    sways and tilts. Parameters: as of Trajectory; the person stands for config.floor_time before
+    and after.
+    """
 
     def __init__(self, config: SimulationConfig, room: Room, rng: np.random.Generator) -> None:
         _check_time(config)
@@ -142,7 +166,9 @@ class Carried:
         p += SWAY * slow[:, :3]
         p[:, 2] += BOB * pace * np.sin(2.0 * np.pi * STEPS * tau)
         self._p = make_interp_spline(tau, p, k=7)
-        self._angles = CubicSpline(tau, np.column_stack([TILT * slow[:, 3:], yaw]))  # roll, pitch, yaw
+        self._angles = CubicSpline(
+            tau, np.column_stack([TILT * slow[:, 3:], yaw])
+        )  # roll, pitch, yaw
 
     def motion(self, t: ArrayLike) -> ExactMotion:
         """The ExactMotion at the stamps t, (n,) s."""
@@ -151,14 +177,25 @@ class Carried:
         roll, pitch, yaw = self._angles(t).T
         d_roll, d_pitch, d_yaw = self._angles.derivative()(t).T
         turn = Rotation.from_euler("ZYX", np.column_stack([yaw, pitch, roll]))
-        rates = np.column_stack([
-            d_roll - d_yaw * np.sin(pitch),
-            d_pitch * np.cos(roll) + d_yaw * np.sin(roll) * np.cos(pitch),
-            d_yaw * np.cos(roll) * np.cos(pitch) - d_pitch * np.sin(roll),
-        ])  # fmt: skip
+        rates = np.column_stack(
+            [
+                d_roll - d_yaw * np.sin(pitch),
+                d_pitch * np.cos(roll) + d_yaw * np.sin(roll) * np.cos(pitch),
+                d_yaw * np.cos(roll) * np.cos(pitch) - d_pitch * np.sin(roll),
+            ]
+        )
         q = turn.as_quat()
-        q[1:] *= np.cumprod(np.where(np.sum(q[1:] * q[:-1], axis=1) < 0.0, -1.0, 1.0))[:, None]  # no sign flips
-        return ExactMotion(self._p(t), self._p.derivative()(t), a, q, rates, turn.inv().apply(a + [0.0, 0.0, GRAVITY]))
+        q[1:] *= np.cumprod(np.where(np.sum(q[1:] * q[:-1], axis=1) < 0.0, -1.0, 1.0))[
+            :, None
+        ]  # no sign flips
+        return ExactMotion(
+            self._p(t),
+            self._p.derivative()(t),
+            a,
+            q,
+            rates,
+            turn.inv().apply(a + [0.0, 0.0, GRAVITY]),
+        )
 
     def motors(self, t: ArrayLike) -> np.ndarray:
         """No motor turns at any of the stamps t: (n,) bool."""
@@ -169,7 +206,8 @@ def _check_time(config: SimulationConfig) -> None:
     shortest = 2.0 * (config.floor_time + SPEED_UP)
     if config.duration < shortest:
         raise InputError(
-            f"duration: {config.duration:g} s is too short to start and stop; give {shortest:g} s or more, or a shorter floor_time."
+            f"duration: {config.duration:g} s is too short to start and stop; give "
+            f"{shortest:g} s or more, or a shorter floor_time."
         )
 
 

@@ -1,9 +1,11 @@
-"""ONNX files: a graph written node by node with plain operators, and the metadata that Network reads."""
+"""ONNX files: a graph written node by node with plain operators, and the metadata that Network
+reads.
+"""
 
 from __future__ import annotations
 
 import json
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from onnx import NodeProto, TensorProto, checker, helper, numpy_helper
@@ -12,6 +14,7 @@ from uwb_tdoa_bias.foundation.version import version
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
+
     from numpy.typing import ArrayLike
     from onnx import ModelProto
 
@@ -19,7 +22,10 @@ OPSET, IR_VERSION = 13, 8  # whose operators `trial.py` lists
 
 
 class GraphBuilder:
-    """An ONNX graph under construction. Values are the names of its tensors, (n, k) float unless said otherwise."""
+    """An ONNX graph under construction.
+
+    Values are the names of its tensors, (n, k) float unless said otherwise.
+    """
 
     def __init__(self) -> None:
         self._nodes: list[NodeProto] = []
@@ -28,11 +34,16 @@ class GraphBuilder:
 
     def constant(self, value: ArrayLike, kind: type[np.generic] = np.float32) -> str:
         """A tensor of fixed values."""
-        self._constants.append(numpy_helper.from_array(np.asarray(value, dtype=kind), f"c{len(self._constants)}"))
+        self._constants.append(
+            numpy_helper.from_array(np.asarray(value, dtype=kind), f"c{len(self._constants)}")
+        )
         return self._constants[-1].name
 
     def op(self, kind: str, *inputs: Any, **attributes: Any) -> str:
-        """Append an operator; inputs that are no names become constants. Returns the name of its output."""
+        """Append an operator; inputs that are no names become constants.
+
+        Returns the name of its output.
+        """
         names = [value if isinstance(value, str) else self.constant(value) for value in inputs]
         self._nodes.append(helper.make_node(kind, names, [f"v{len(self._nodes)}"], **attributes))
         return self._nodes[-1].output[0]
@@ -61,8 +72,9 @@ class GraphBuilder:
         return self.op("Max", far, [0.0])
 
     def model(self, width: int, outputs: Sequence[str], meta: Mapping[str, Any]) -> ModelProto:
-        """The onnx.ModelProto: `width` input columns, the named (n, 1) tensors beside each other as output,
-        metadata."""
+        """The onnx.ModelProto: `width` input columns, the named (n, 1) tensors beside each other as
+        output, metadata.
+        """
         self._nodes.append(helper.make_node("Concat", outputs, ["bias"], axis=1))
         graph = helper.make_graph(
             self._nodes,
@@ -72,7 +84,9 @@ class GraphBuilder:
             self._constants,
         )
         about = {"producer_name": "uwb_tdoa", "producer_version": version()}
-        made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION, **about)
+        made = helper.make_model(
+            graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION, **about
+        )
         helper.set_model_props(made, {key: json.dumps(value) for key, value in meta.items()})
         checker.check_model(made)
         return made

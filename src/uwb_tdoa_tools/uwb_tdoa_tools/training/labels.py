@@ -17,15 +17,21 @@ from ..scoring.metrics import judged_part
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
+
     from uwb_tdoa_bias.foundation.anchors import Anchors
     from uwb_tdoa_bias.foundation.flight import Flight, Truth
 
-MARGIN = 0.5  # s after take-off and before landing that are left out: near the floor TDOAs are metres off
+# s after take-off and before landing that are left out: near the floor TDOAs are metres off
+MARGIN = 0.5
 LARGEST = 1.0  # m; a larger error is an outlier, not bias (Zhao et al., section V-B)
 ZERO = 1e-3  # m; if no label is larger, the TDOAs were computed, not measured
 FEWEST = 100  # labels that a flight must give
-MEMORY = 1.0  # s over which the errors of one anchor are alike: so much time counts as one look at it
-SAME_PLACE = 0.1  # m by which an anchor may have moved and still be in its place, one standard deviation
+MEMORY = (
+    1.0  # s over which the errors of one anchor are alike: so much time counts as one look at it
+)
+SAME_PLACE = (
+    0.1  # m by which an anchor may have moved and still be in its place, one standard deviation
+)
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 
 
@@ -33,8 +39,10 @@ LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 class Labels:
     """Labelled TDOAs of one flight.
 
-    name : of the flight; samples : Samples, poses from ground truth; error : (n,) m, measured minus geometric;
-    looks : independent looks that one sample counts as, because errors are alike for a while; digest : hex, of
+    name : of the flight; samples : Samples, poses from ground truth; error : (n,) m, measured minus
+        geometric;
+    looks : independent looks that one sample counts as, because errors are alike for a while;
+        digest : hex, of
     everything above.
     """
 
@@ -59,8 +67,9 @@ class Labels:
 
 
 def labels(flight: Flight, effects: EffectSet = EffectSet()) -> Labels:
-    """Labels of a Flight, its airborne part without outliers; what `effects` explain is taken out. Raises InputError
-    where it cannot teach anything."""
+    """Labels of a Flight, its airborne part without outliers; what `effects` explain is taken out.
+    Raises InputError where it cannot teach anything.
+    """
     flight = effects.correct_streams(replace(level(flight), imu=None))
     truth, data, anchors = known_truth(flight), flight.tdoa, flight.anchors
     _, first, last = judged_part(truth)
@@ -68,23 +77,36 @@ def labels(flight: Flight, effects: EffectSet = EffectSet()) -> Labels:
     chosen = (data.t > first) & (data.t < last)
     unknown = np.setdiff1d(np.concatenate([data.a[chosen], data.b[chosen]]), anchors.ids)
     if len(unknown):
-        raise InputError(f"{flight.name}: anchor {unknown[0]} is heard but not in the survey; add it there.")
+        raise InputError(
+            f"{flight.name}: anchor {unknown[0]} is heard but not in the survey; add it there."
+        )
     lost = int(np.sum(~np.isfinite(data.d[chosen])))
     if lost:
-        raise InputError(f"{flight.name}: {lost} TDOAs are not finite; remove them from the recording.")
+        raise InputError(
+            f"{flight.name}: {lost} TDOAs are not finite; remove them from the recording."
+        )
     if not np.isfinite(truth.p).all():
-        raise InputError(f"{flight.name}: the ground truth has positions that are not finite; remove them.")
+        raise InputError(
+            f"{flight.name}: the ground truth has positions that are not finite; remove them."
+        )
     a, b = anchors.index(data.a[chosen]), anchors.index(data.b[chosen])
     samples = samples_at(data.t[chosen], a, b, truth, anchors, float(data.t[0]), lag=None)
-    error = data.d[chosen] - tdoa(samples.p, samples.position_a, samples.position_b) - effects.bias(samples)
+    error = (
+        data.d[chosen]
+        - tdoa(samples.p, samples.position_a, samples.position_b)
+        - effects.bias(samples)
+    )
     kept = (np.abs(error) <= LARGEST) & (samples.p[:, 2] > least_height(truth)) & (a != b)
     if kept.sum() < FEWEST:
         raise InputError(
-            f"{flight.name}: only {kept.sum()} TDOAs are right to {LARGEST:g} m; check that survey and "
+            f"{flight.name}: only {kept.sum()} TDOAs are right to {LARGEST:g} m; check that "
+            "survey and "
             "ground truth are in one frame."
         )
     if np.max(np.abs(error[kept])) < ZERO:
-        raise InputError(f"{flight.name}: all labels are zero: its TDOAs were made from the ground truth itself.")
+        raise InputError(
+            f"{flight.name}: all labels are zero: its TDOAs were made from the ground truth itself."
+        )
     looks = min(1.0, len(anchors) * (last - first) / MEMORY / kept.sum())
     samples = _rows(samples, kept)
     return Labels(flight.name, samples, error[kept], looks, _digest(samples, error[kept]))
@@ -98,32 +120,44 @@ def known_truth(flight: Flight) -> Truth:
 
 
 def level(flight: Flight) -> Flight:
-    """The Flight; if the attitudes of its ground truth are not all measured, they are level, at yaw 0."""
+    """The Flight; if the attitudes of its ground truth are not all measured, they are level, at yaw
+    0.
+    """
     truth = known_truth(flight)
     if np.isfinite(truth.q).all():
         return flight
     return replace(flight, truth=replace(truth, q=np.tile(LEVEL, (len(truth), 1))))
 
 
-def split(names: Sequence[str], seed: int, validation: Sequence[str] | None = None) -> tuple[list[str], list[str]]:
-    """(training, validation) names: whole flights, one in five validates, drawn with `seed`, or those that are
-    named."""
+def split(
+    names: Sequence[str], seed: int, validation: Sequence[str] | None = None
+) -> tuple[list[str], list[str]]:
+    """(training, validation) names: whole flights, one in five validates, drawn with `seed`, or
+    those that are named.
+    """
     if len(set(names)) != len(names):
         raise InputError(f"flights: {max(names, key=list(names).count)} is there twice.")
     if len(names) < 2:
         raise InputError(
-            f"flights: {len(names)} is too few; give at least two, as one must be held out to validate: samples of one "
+            f"flights: {len(names)} is too few; give at least two, as one must be held out to "
+            "validate: samples of one "
             "flight are too alike to validate each other."
         )
     if validation is None:
         count = max(1, round(0.2 * len(names)))
-        validation = np.random.default_rng(seed).choice(sorted(names), count, replace=False).tolist()
+        validation = (
+            np.random.default_rng(seed).choice(sorted(names), count, replace=False).tolist()
+        )
     unknown = set(validation) - set(names)
     if unknown:
-        raise InputError(f"validation: {sorted(unknown)[0]} is not one of the flights: {', '.join(names)}.")
+        raise InputError(
+            f"validation: {sorted(unknown)[0]} is not one of the flights: {', '.join(names)}."
+        )
     training = [name for name in names if name not in validation]
     if not training or not validation:
-        raise InputError("validation: leaves no flight to train, or none to validate; hold out some of them.")
+        raise InputError(
+            "validation: leaves no flight to train, or none to validate; hold out some of them."
+        )
     return training, sorted(validation)
 
 
@@ -138,7 +172,9 @@ def thinned(all_labels: Sequence[Labels], seconds: float, rng: np.random.Generat
 
 
 def white_noise(all_labels: Sequence[Labels]) -> float:
-    """Standard deviation of what changes from one TDOA of a pair to its next, m: no model of the pose can know it."""
+    """Standard deviation of what changes from one TDOA of a pair to its next, m: no model of the
+    pose can know it.
+    """
     steps = []
     for one in all_labels:
         pair = one.samples.a * len(one.anchors) + one.samples.b
@@ -149,22 +185,29 @@ def white_noise(all_labels: Sequence[Labels]) -> float:
 
 def digest(all_labels: Sequence[Labels]) -> str:
     """Hex digest of the data of several Labels, in any order."""
-    return hashlib.sha256("".join(sorted(one.digest for one in all_labels)).encode()).hexdigest()[:16]
+    return hashlib.sha256("".join(sorted(one.digest for one in all_labels)).encode()).hexdigest()[
+        :16
+    ]
 
 
 def constellations(some: Iterable[Flight | Labels]) -> list[dict[str, list[float]]]:
-    """The different anchor constellations of flights or labels: list of dicts of id (text) to position, m, to the
-    centimetre."""
+    """The different anchor constellations of flights or labels: list of dicts of id (text) to
+    position, m, to the centimetre.
+    """
     found: list[dict[str, list[float]]] = []
     for one in some:
-        layout = dict(zip(map(str, one.anchors.ids.tolist()), one.anchors.positions.round(2).tolist()))
+        layout = dict(
+            zip(map(str, one.anchors.ids.tolist()), one.anchors.positions.round(2).tolist())
+        )
         if not any(_same_place(layout, known) for known in found):
             found.append(layout)
     return found
 
 
 def _same_place(one: Mapping[str, list[float]], other: Mapping[str, list[float]]) -> bool:
-    return set(one) == set(other) and all(np.linalg.norm(np.subtract(one[i], other[i])) < SAME_PLACE for i in one)
+    return set(one) == set(other) and all(
+        np.linalg.norm(np.subtract(one[i], other[i])) < SAME_PLACE for i in one
+    )
 
 
 def _rows(s: Samples, rows: np.ndarray) -> Samples:
@@ -173,6 +216,14 @@ def _rows(s: Samples, rows: np.ndarray) -> Samples:
 
 def _digest(samples: Samples, error: np.ndarray) -> str:
     content = hashlib.sha256()
-    for array in (samples.t, samples.a, samples.b, samples.p, samples.q, error, samples.anchors.positions):
+    for array in (
+        samples.t,
+        samples.a,
+        samples.b,
+        samples.p,
+        samples.q,
+        error,
+        samples.anchors.positions,
+    ):
         content.update(np.ascontiguousarray(array, dtype="<f8").tobytes())
     return content.hexdigest()

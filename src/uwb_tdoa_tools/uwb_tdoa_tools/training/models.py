@@ -3,34 +3,45 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from uwb_tdoa_bias.correction.corrector import LARGEST_YAW_STD
+from uwb_tdoa_bias.correction.features import columns
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.correction.features import columns
 from uwb_tdoa_bias.foundation.files import write_bytes
 
-from . import labels as labelling, linear, paper, physics, structured
+from . import labels as labelling
+from . import linear, paper, physics, structured
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
     from pathlib import Path
+
     from onnx import ModelProto
+
     from uwb_tdoa_bias.foundation.flight import Flight
+
     from .labels import Labels
     from .paper import Paper
     from .structured import Structured
 
-    LearningCurve = tuple[str, list[int], list[float], list[float]]  # label, x, training and validation RMS, m
+    LearningCurve = tuple[
+        str, list[int], list[float], list[float]
+    ]  # label, x, training and validation RMS, m
 
 KINDS = ("paper", "paper_no_orientation", "structured", "physics", "physics+structured")
 SPACING = 0.01  # s between the samples that are learned from: nearer ones tell the same
 CLIP = 1.0  # m
-MARGINS = {"d": 1.0, "f": 2.0, "u": 0.5}  # trust fades over: positions m, forward (turned round: gone) and up axes
-SLACK = 0.2  # added to the box of attitudes on every side: that much is an estimated attitude off at times
+MARGINS = {
+    "d": 1.0,
+    "f": 2.0,
+    "u": 0.5,
+}  # trust fades over: positions m, forward (turned round: gone) and up axes
+# added to the box of attitudes on every side: that much is an estimated attitude off at times
+SLACK = 0.2
 SMALLEST_STD = 0.01  # m, of what remains
 POINTS = 4  # of a learning curve over flights
 HEADINGS = 1.0  # range of the forward axis in training from which on a model tells headings apart
@@ -38,7 +49,9 @@ _ATTITUDE = ("forward_x", "forward_y", "up_x", "up_y")
 
 
 class Recipe(NamedTuple):
-    """What is trained. kind : of KINDS; seed : of everything that is drawn; options : of structured models."""
+    """What is trained. kind : of KINDS; seed : of everything that is drawn; options : of structured
+    models.
+    """
 
     kind: str
     seed: int
@@ -47,8 +60,11 @@ class Recipe(NamedTuple):
 
 @dataclass(frozen=True)
 class Trained:
-    """model : Paper, Structured or None; effects : EffectSet or None; curve : (label, x, training RMS, validation RMS);
-    meta : metadata of the ONNX file; errors : {validation flight: (before, after)}, RMS of its TDOAs, m."""
+    """model : Paper, Structured or None; effects : EffectSet or None; curve : (label, x, training
+    RMS, validation RMS);
+    meta : metadata of the ONNX file; errors : {validation flight: (before, after)}, RMS of its
+        TDOAs, m.
+    """
 
     model: Paper | Structured | None
     effects: EffectSet | None
@@ -62,15 +78,21 @@ class Trained:
 
 
 def train(
-    recipe: Recipe, training: Sequence[Flight], validation: Sequence[Flight], name: str,
-    progress: Callable[[str], object] = lambda text: None, found: physics.Physics | None = None, curve: bool = True,
-) -> Trained:  # fmt: skip
+    recipe: Recipe,
+    training: Sequence[Flight],
+    validation: Sequence[Flight],
+    name: str,
+    progress: Callable[[str], object] = lambda text: None,
+    found: physics.Physics | None = None,
+    curve: bool = True,
+) -> Trained:
     """Train the model of a Recipe on lists of Flights. Returns Trained. Raises InputError.
 
-    name : of the model, goes into every corrected message; progress : called with a text now and then; found : Physics
-    of the training and then the validation flights, if somebody has looked for it already; curve : whether a learning
-    curve is wanted, beyond its last point. The validation
-    flights decide when the paper's network stops, and tell how far off a model is on flights that it has not seen; then
+    name : of the model, goes into every corrected message; progress : called with a text now and
+        then; found : Physics
+    of the training and then the validation flights, if somebody has looked for it already; curve :
+    whether a learning curve is wanted, beyond its last point. The validation flights decide when
+    the paper's network stops, and tell how far off a model is on flights that it has not seen; then
     the linear models are fitted anew to them too.
     """
     kind, seed, _ = recipe
@@ -92,24 +114,38 @@ def train(
     if kind.startswith("paper"):
         model, errors, left = _paper(recipe, groups[0], groups[1], progress)
     elif found is not None and kind == "physics" and not len(free):
-        errors, left = _evaluate_effects(found, raw[0], raw[1], _growing(len(training), seed, curve))
+        errors, left = _evaluate_effects(
+            found, raw[0], raw[1], _growing(len(training), seed, curve)
+        )
     else:
         growing = _growing(len(training), seed, curve)
-        model, free, errors, left = _structured(recipe, groups[0], groups[1], progress, growing, free)
+        model, free, errors, left = _structured(
+            recipe, groups[0], groups[1], progress, growing, free
+        )
         effects = None if effects is None else EffectSet((*free.effects, *effects.effects))
     everything = [*groups[0], *groups[1]]
     meta: dict[str, Any] = {
-        "name": name, "kind": kind, "clip": CLIP, "seed": seed, "data": labelling.digest([*raw[0], *raw[1]]),
-        "trained_on": sorted(one.name for one in training), "validated_on": sorted(one.name for one in validation),
+        "name": name,
+        "kind": kind,
+        "clip": CLIP,
+        "seed": seed,
+        "data": labelling.digest([*raw[0], *raw[1]]),
+        "trained_on": sorted(one.name for one in training),
+        "validated_on": sorted(one.name for one in validation),
         "constellations": labelling.constellations(everything),
-    }  # fmt: skip
+    }
     if model and effects:
         meta["trained_with"] = [effect.name for effect in effects.effects]
     if model:
         learned_from = groups[0] if kind.startswith("paper") else everything
-        meta |= {"validity": _validity(learned_from, model.validity_features), "fade_std": _rms(one.error for one in groups[1])}
+        meta |= {
+            "validity": _validity(learned_from, model.validity_features),
+            "fade_std": _rms(one.error for one in groups[1]),
+        }
         heads = [meta["validity"][name] for name in ("forward_x", "forward_y")]
-        if model.sees_attitude and any(high - low - 2.0 * SLACK > HEADINGS for low, high, _ in heads):
+        if model.sees_attitude and any(
+            high - low - 2.0 * SLACK > HEADINGS for low, high, _ in heads
+        ):
             meta["largest_yaw_std"] = LARGEST_YAW_STD  # before the yaw is known, it cannot tell
     of_flights = {one.name: (_rms([one.error]), _rms([after])) for one, after in zip(raw[1], left)}
     return Trained(model, effects, errors, meta, of_flights)
@@ -118,18 +154,30 @@ def train(
 def _labels(
     training: Sequence[Flight], validation: Sequence[Flight], effects: EffectSet = EffectSet()
 ) -> tuple[list[Labels], list[Labels]]:
-    first, second = ([labelling.labels(flight, effects) for flight in group] for group in (training, validation))
+    first, second = (
+        [labelling.labels(flight, effects) for flight in group] for group in (training, validation)
+    )
     return first, second
 
 
 def _paper(
-    recipe: Recipe, training: list[Labels], validation: list[Labels], progress: Callable[[str], object]
+    recipe: Recipe,
+    training: list[Labels],
+    validation: list[Labels],
+    progress: Callable[[str], object],
 ) -> tuple[paper.Paper, LearningCurve, list[np.ndarray]]:
     """(Paper, learning curve over epochs, what is left of the errors of each validation flight)."""
     kind, seed, _ = recipe
-    thin, held = (labelling.thinned(group, SPACING, np.random.default_rng(seed)) for group in (training, validation))
+    thin, held = (
+        labelling.thinned(group, SPACING, np.random.default_rng(seed))
+        for group in (training, validation)
+    )
     model, errors = paper.fit(
-        thin, held, kind == "paper", seed, lambda epoch, error: progress(f"epoch {epoch}: validation {error:.4f} m")
+        thin,
+        held,
+        kind == "paper",
+        seed,
+        lambda epoch, error: progress(f"epoch {epoch}: validation {error:.4f} m"),
     )
     left = [one.error - model.mean(one.samples) for one in validation]
     model.std = _deviation(left, 0.0, validation)
@@ -137,17 +185,26 @@ def _paper(
 
 
 def _structured(
-    recipe: Recipe, training: list[Labels], validation: list[Labels], progress: Callable[[str], object],
-    growing: Sequence[Sequence[int]], free: EffectSet,
-) -> tuple[structured.Structured | None, EffectSet, LearningCurve, list[np.ndarray]]:  # fmt: skip
-    """(Structured, EffectSet, learning curve over numbers of training flights, what is left of the errors of each
-    validation flight by a fit to the training flights). The model itself is then fitted to all flights.
+    recipe: Recipe,
+    training: list[Labels],
+    validation: list[Labels],
+    progress: Callable[[str], object],
+    growing: Sequence[Sequence[int]],
+    free: EffectSet,
+) -> tuple[structured.Structured | None, EffectSet, LearningCurve, list[np.ndarray]]:
+    """(Structured, EffectSet, learning curve over numbers of training flights, what is left of the
+    errors of each validation flight by a fit to the training flights). The model itself is then
+    fitted to all flights.
 
-    growing : as `_growing` gives; free : linear effects to fit together with the maps. Of physics alone the maps are only there so that
+    growing : as `_growing` gives; free : linear effects to fit together with the maps. Of physics
+        alone the maps are only there so that
     the effects do not take what belongs to a place; no model is returned.
     """
     (_, seed, options), alone = recipe, recipe.kind == "physics"
-    thin = [labelling.thinned(group, SPACING, np.random.default_rng(seed)) for group in (training, validation)]
+    thin = [
+        labelling.thinned(group, SPACING, np.random.default_rng(seed))
+        for group in (training, validation)
+    ]
 
     def remaining(one: Labels) -> np.ndarray:
         return one.error - fitted.bias(one.samples) - (0.0 if alone else model.mean(one.samples))
@@ -155,9 +212,14 @@ def _structured(
     curve: list[tuple[int, float, float]] = []
     for some in growing:
         model, fitted = fit_structured([thin[0][k] for k in some], seed, options, free)
-        fit_error, error = (_rms(map(remaining, group)) for group in ([thin[0][k] for k in some], thin[1]))
+        fit_error, error = (
+            _rms(map(remaining, group)) for group in ([thin[0][k] for k in some], thin[1])
+        )
         curve.append((len(some), fit_error, error))
-        progress(f"{len(some)} of {len(training)} flights: training {fit_error:.4f} m, validation {error:.4f} m")
+        progress(
+            f"{len(some)} of {len(training)} flights: training {fit_error:.4f} m, validation "
+            f"{error:.4f} m"
+        )
     left = [remaining(one) for one in validation]
     explained = np.concatenate([model.variance(one.samples) for one in validation])
     whole, fitted = fit_structured([*thin[0], *thin[1]], seed, options, free)
@@ -172,48 +234,73 @@ def _over_flights(curve: Sequence[tuple[int, float, float]]) -> LearningCurve:
 
 
 def fit_structured(
-    some: Sequence[Labels], seed: int, options: structured.StructuredPriors, free: EffectSet = EffectSet()
+    some: Sequence[Labels],
+    seed: int,
+    options: structured.StructuredPriors,
+    free: EffectSet = EffectSet(),
 ) -> tuple[structured.Structured, EffectSet]:
-    """(Structured, EffectSet with the values of the linear effects `free`), fitted together to Labels."""
+    """(Structured, EffectSet with the values of the linear effects `free`), fitted together to
+    Labels.
+    """
     model = structured.prepare(some, options, seed)
     parts = [model.design(one.samples, one.error, one.looks) for one in some]
     fields = ("phi", "a", "b", "dense", "y", "looks")
-    phi, a, b, dense, y, looks = (np.concatenate([getattr(part, name) for part in parts]) for name in fields)
+    phi, a, b, dense, y, looks = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in fields
+    )
     more = np.concatenate([physics.regressors(free, one.samples) for one in some])
     design = linear.Design(phi, a, b, np.concatenate([dense, more], axis=1), y, looks)
     posterior = linear.fit(design, len(model.site_ids), options.noise, physics.sizes(free))
     model.set_posterior(posterior)
     own = model.link_columns
-    return model, physics.with_values(free, posterior.dense[own:], posterior.dense_covariance[own:, own:])
+    return model, physics.with_values(
+        free, posterior.dense[own:], posterior.dense_covariance[own:, own:]
+    )
 
 
 def _evaluate_effects(
-    found: physics.Physics, training: list[Labels], validation: list[Labels], growing: Sequence[Sequence[int]]
+    found: physics.Physics,
+    training: list[Labels],
+    validation: list[Labels],
+    growing: Sequence[Sequence[int]],
 ) -> tuple[LearningCurve, list[np.ndarray]]:
-    """(Learning curve over numbers of training flights, what is left of the errors of each validation flight) of the
-    effects of a Physics, which counts training flights first. growing : as `_growing` gives."""
+    """(Learning curve over numbers of training flights, what is left of the errors of each
+    validation flight) of the effects of a Physics, which counts training flights first. growing :
+    as `_growing` gives.
+    """
     curve: list[tuple[int, float, float]] = []
     for some in growing:
         effects = found.fitted_to(some)
         groups = [training[k] for k in some], validation
-        left_of_fit, left = ([one.error - effects.bias(one.samples) for one in group] for group in groups)
+        left_of_fit, left = (
+            [one.error - effects.bias(one.samples) for one in group] for group in groups
+        )
         curve.append((len(some), _rms(left_of_fit), _rms(left)))
     return _over_flights(curve), left
 
 
 def _growing(count: int, seed: int, curve: bool) -> list[list[int]]:
-    """Growing subsets of `count` flights, in random order, the last one all of them, which is the only one without `curve`:
-    lists of numbers."""
+    """Growing subsets of `count` flights, in random order, the last one all of them, which is the
+    only one without `curve`: lists of numbers.
+    """
     order = np.random.default_rng(seed).permutation(count).tolist()
     if not curve:
         return [order]
-    return [order[:n] for n in sorted({int(round(n)) for n in np.geomspace(1, count, min(count, POINTS))})]
+    return [
+        order[:n]
+        for n in sorted({int(round(n)) for n in np.geomspace(1, count, min(count, POINTS))})
+    ]
 
 
-def _deviation(left: Sequence[np.ndarray], explained: np.ndarray | float, validation: Sequence[Labels]) -> float:
-    """Standard deviation of what is left of errors, without what maps explain, m^2, and what no model of poses can
-    know."""
-    variance = np.mean(np.concatenate(left) ** 2 - explained) - labelling.white_noise(validation) ** 2
+def _deviation(
+    left: Sequence[np.ndarray], explained: np.ndarray | float, validation: Sequence[Labels]
+) -> float:
+    """Standard deviation of what is left of errors, without what maps explain, m^2, and what no
+    model of poses can know.
+    """
+    variance = (
+        np.mean(np.concatenate(left) ** 2 - explained) - labelling.white_noise(validation) ** 2
+    )
     return float(np.sqrt(max(variance, SMALLEST_STD**2)))
 
 
@@ -235,7 +322,10 @@ def _validity(learned_from: Sequence[Labels], features: Sequence[str]) -> dict[s
 
 
 def save(result: Trained, folder: Path) -> tuple[Path | None, Path | None]:
-    """Write model.onnx and effects.yaml of a Trained, as far as it has them. Returns their paths, None for none."""
+    """Write model.onnx and effects.yaml of a Trained, as far as it has them.
+
+    Returns their paths, None for none.
+    """
     model, effects = folder / "model.onnx", folder / "effects.yaml"
     made = result.onnx()
     for path, content in ((model, made), (effects, result.effects)):

@@ -1,26 +1,31 @@
-"""The network of Zhao et al. (RA-L 2021): three layers of 30 neurons, with or without the orientations of the anchors.
+"""The network of Zhao et al. (RA-L 2021): three layers of 30 neurons, with or without the
+orientations of the anchors.
 
-As published (section V-B): scaled inputs, rectified linear units, mini-batch gradient descent on squared errors,
-stopped when the validation error has not fallen for five epochs in a row. Its deviation is that of the validation
-flights."""
+As published (section V-B): scaled inputs, rectified linear units, mini-batch gradient descent on
+squared errors, stopped when the validation error has not fallen for five epochs in a row. Its
+deviation is that of the validation flights.
+"""
 
 from __future__ import annotations
 
 import copy
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from sklearn.neural_network import MLPRegressor
 
-from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.correction.features import FEATURES, columns
+from uwb_tdoa_bias.foundation.errors import InputError
 
 from . import export
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
+
     from onnx import ModelProto
+
     from uwb_tdoa_bias.effects import Samples
+
     from .labels import Labels
 
 LAYERS = (30, 30, 30)
@@ -35,11 +40,23 @@ class Paper:
     sees_attitude = True
 
     def __init__(
-        self, names: Sequence[str], offset: np.ndarray, scale: np.ndarray,
-        layers: list[tuple[np.ndarray, np.ndarray]], std: float,
-    ) -> None:  # fmt: skip
-        """names : features; offset, scale : (k,); layers : list of (weights (i, o), biases (o,)); std : m."""
-        self.names, self.offset, self.scale, self.layers, self.std = names, offset, scale, layers, std
+        self,
+        names: Sequence[str],
+        offset: np.ndarray,
+        scale: np.ndarray,
+        layers: list[tuple[np.ndarray, np.ndarray]],
+        std: float,
+    ) -> None:
+        """names : features; offset, scale : (k,); layers : list of (weights (i, o), biases (o,));
+        std : m.
+        """
+        self.names, self.offset, self.scale, self.layers, self.std = (
+            names,
+            offset,
+            scale,
+            layers,
+            std,
+        )
         self.validity_features = tuple(name for name in names if name[0] == "d")
 
     def mean(self, samples: Samples) -> np.ndarray:
@@ -58,17 +75,27 @@ class Paper:
             x = graph.op("Gemm", x, weights, biases)
             x = graph.op("Relu", x) if k < len(self.layers) - 1 else x
         std = graph.op("Add", graph.op("Mul", x, [0.0]), [self.std])
-        meta = {**meta, "features": list(self.names), "offset": self.offset.tolist(), "scale": self.scale.tolist()}
+        meta = {
+            **meta,
+            "features": list(self.names),
+            "offset": self.offset.tolist(),
+            "scale": self.scale.tolist(),
+        }
         return graph.model(len(self.names), [x, std], meta)
 
 
 def fit(
-    training: Sequence[Labels], validation: Sequence[Labels], orientations: bool, seed: int,
+    training: Sequence[Labels],
+    validation: Sequence[Labels],
+    orientations: bool,
+    seed: int,
     progress: Callable[[int, float], object] = lambda epoch, error: None,
-) -> tuple[Paper, tuple[list[float], list[float]]]:  # fmt: skip
-    """Paper, and its learning curve: lists of training and validation error per epoch (RMS, m). Raises InputError.
+) -> tuple[Paper, tuple[list[float], list[float]]]:
+    """Paper, and its learning curve: lists of training and validation error per epoch (RMS, m).
+    Raises InputError.
 
-    training, validation : lists of Labels; orientations : use those of the anchors; progress : called after each epoch.
+    training, validation : lists of Labels; orientations : use those of the anchors; progress :
+        called after each epoch.
     """
     names = FEATURES if orientations else WITHOUT
     if orientations:
@@ -76,7 +103,8 @@ def fit(
             blind = one.anchors.ids[~np.isfinite(one.anchors.orientations).all(axis=1)]
             if len(blind):
                 raise InputError(
-                    f"{one.name}: anchor {blind[0]} has no orientation, which this model needs; survey it, or train "
+                    f"{one.name}: anchor {blind[0]} has no orientation, which this model "
+                    "needs; survey it, or train "
                     "paper_no_orientation or structured."
                 )
     (x, y), (x_held, y_held) = (_table(group, names) for group in (training, validation))
@@ -84,7 +112,11 @@ def fit(
     offset, scale = 0.5 * (low + high), np.maximum(0.5 * (high - low), 1e-6)
     x, x_held = (x - offset) / scale, (x_held - offset) / scale
     network = MLPRegressor(
-        hidden_layer_sizes=LAYERS, solver="sgd", batch_size=BATCH, learning_rate_init=RATE, random_state=seed
+        hidden_layer_sizes=LAYERS,
+        solver="sgd",
+        batch_size=BATCH,
+        learning_rate_init=RATE,
+        random_state=seed,
     )
     curve: tuple[list[float], list[float]] = ([], [])
     best: tuple[float, tuple[list[np.ndarray], list[np.ndarray]]] | None = None

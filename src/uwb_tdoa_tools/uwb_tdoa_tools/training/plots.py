@@ -15,9 +15,15 @@ if TYPE_CHECKING:
 
 
 def plot_curve(
-    label: str, x: Sequence[float], training: Sequence[float], validation: Sequence[float], path: Path
+    label: str,
+    x: Sequence[float],
+    training: Sequence[float],
+    validation: Sequence[float],
+    path: Path,
 ) -> None:
-    """Learning curve: RMS errors of training and validation flights, m, over epochs or number of flights."""
+    """Learning curve: RMS errors of training and validation flights, m, over epochs or number of
+    flights.
+    """
     figure, ax = plt.subplots(figsize=(7, 4), layout="constrained")
     for name, errors in (("training", training), ("validation", validation)):
         ax.plot(x, errors, "o-", ms=3, label=name)

@@ -1,22 +1,24 @@
 """The error of a pair as the difference of two one-anchor errors: e_ab = g(b) - g(a).
 
-So it is antisymmetric, and carries over to pairs, protocols and numbers of anchors that were never seen. g of one
-anchor is the sum of
-- a map of this anchor over the position of the tag ("site"): reflections and shadows of the room, and its own delay. It
+So it is antisymmetric, and carries over to pairs, protocols and numbers of anchors that were never
+seen. g of one anchor is the sum of
+- a map of this anchor over the position of the tag ("site"): reflections and shadows of the room,
+  and its own delay. It
   belongs to an anchor at a place; when the anchor is moved, or unknown, it is gone;
-- maps over the distance and the direction of the anchor in the frame of the tag, and over the distance and the
-  direction of the tag in the frame of the anchor if its orientation is known ("links"): the antennas and the received
-  power, the same for all anchors. In the power budget their gains add up, so the two are summed, which carries over to
-  combinations of directions that were never seen.
-All are Gaussian processes, on Nystroem features of some hundred centres (Williams and Seeger, NIPS 2000), so that the
-fit is one linear regression, the standard deviation is its posterior's, and away from the training data the mean goes
-to zero and the deviation to the prior's by itself.
+- maps over the distance and the direction of the anchor in the frame of the tag, and over the
+  distance and the
+  direction of the tag in the frame of the anchor if its orientation is known ("links"): the
+  antennas and the received power, the same for all anchors. In the power budget their gains add up,
+  so the two are summed, which carries over to combinations of directions that were never seen.
+All are Gaussian processes, on Nystroem features of some hundred centres (Williams and Seeger, NIPS
+2000), so that the fit is one linear regression, the standard deviation is its posterior's, and away
+from the training data the mean goes to zero and the deviation to the prior's by itself.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.cluster.vq import kmeans2
@@ -30,16 +32,22 @@ from .labels import SAME_PLACE, constellations
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+
     from onnx import ModelProto
+
     from uwb_tdoa_bias.effects import Samples
     from uwb_tdoa_bias.foundation.anchors import Anchors
+
     from .labels import Labels
 
 COARSE = 4.0  # ratio of the long to the short length of the site map
 NEAREST = 0.1  # m; all that is nearer counts as at this distance, which has a logarithm
 LINK_LENGTH = 0.5  # of the link maps, in unit vectors and logarithms of distance
-RANK = 64  # directions of the posterior that the deviation is computed from; the others count as unknown
-SITE_WEIGHTS = 2400  # at most, of all sites together: memory and time of the fit grow with its square and cube
+# directions of the posterior that the deviation is computed from; the others count as unknown
+RANK = 64
+SITE_WEIGHTS = (
+    2400  # at most, of all sites together: memory and time of the fit grow with its square and cube
+)
 _DELTA = ("dx", "dy", "dz")
 _PLACE = ("x", "y", "z")
 _END = ("id", "x", "y", "z")
@@ -47,9 +55,11 @@ _END = ("id", "x", "y", "z")
 
 @dataclass(frozen=True)
 class StructuredPriors:
-    """Priors of the structured model; the defaults were chosen on the validation flights of docs/bias.md.
+    """Priors of the structured model; the defaults were chosen on the validation flights of
+    docs/bias.md.
 
-    fine, coarse : m, standard deviation of the short and of the long part of a site map, before the data scale both
+    fine, coarse : m, standard deviation of the short and of the long part of a site map, before the
+        data scale both
     length : (3,) m, over which its short part changes
     link : m, standard deviation of each link map, before the data scale it
     noise : m, scale of what no map explains
@@ -67,8 +77,10 @@ class StructuredPriors:
 
 @dataclass(frozen=True)
 class Map:
-    """Nystroem features of a kernel: centres (m, k) of scaled inputs; whiten (m, m), kernel values to features;
-    amplitudes and lengths of the exponentials that the kernel is the sum of; squared: Gaussians instead."""
+    """Nystroem features of a kernel: centres (m, k) of scaled inputs; whiten (m, m), kernel values
+    to features; amplitudes and lengths of the exponentials that the kernel is the sum of; squared:
+    Gaussians instead.
+    """
 
     centres: np.ndarray
     whiten: np.ndarray
@@ -83,7 +95,9 @@ class Map:
 
     def scaled(self, factor: float) -> Map:
         """The Map of a process `factor` times as large."""
-        return replace(self, whiten=self.whiten / factor, amplitudes=tuple(factor * a for a in self.amplitudes))
+        return replace(
+            self, whiten=self.whiten / factor, amplitudes=tuple(factor * a for a in self.amplitudes)
+        )
 
     def kernel(self, x: np.ndarray) -> np.ndarray:
         """Kernel values between scaled inputs (n, k) and the centres: (n, m)."""
@@ -97,7 +111,12 @@ class Map:
 
 
 def make_map(
-    x: np.ndarray, count: int, amplitudes: Sequence[float], lengths: Sequence[float], squared: bool, seed: int
+    x: np.ndarray,
+    count: int,
+    amplitudes: Sequence[float],
+    lengths: Sequence[float],
+    squared: bool,
+    seed: int,
 ) -> Map:
     """Map with up to `count` centres spread over the scaled inputs x (n, k)."""
     rng = np.random.default_rng(seed)
@@ -115,17 +134,29 @@ class Structured:
 
     validity_features = ()  # it fades over positions by itself
 
-    def __init__(self, options: StructuredPriors, site: Map, site_ids: np.ndarray, site_positions: np.ndarray) -> None:
-        """site : Map over scaled positions; site_ids (s,), site_positions (s, 3) m : the anchors and where they
-        stand."""
-        self.options, self.site, self.site_ids, self.site_positions = options, site, site_ids, site_positions
-        # "T": Map as the tag sees the anchor, "A": as the anchor sees the tag; empty if not told apart
+    def __init__(
+        self, options: StructuredPriors, site: Map, site_ids: np.ndarray, site_positions: np.ndarray
+    ) -> None:
+        """site : Map over scaled positions; site_ids (s,), site_positions (s, 3) m : the anchors
+        and where they stand.
+        """
+        self.options, self.site, self.site_ids, self.site_positions = (
+            options,
+            site,
+            site_ids,
+            site_positions,
+        )
+        # "T": Map as the tag sees the anchor, "A": as the anchor sees the tag; empty if not told
+        # apart
         self.links: dict[str, Map] = {}
         self.floor = 0.0  # m, standard deviation of what remains where everything is known
 
-    def design(self, samples: Samples, error: np.ndarray | None = None, looks: float = 1.0) -> linear.Design:
-        """linear.Design of Samples: the sites of their anchors, one behind the last for those at none, and the link
-        maps as dense part."""
+    def design(
+        self, samples: Samples, error: np.ndarray | None = None, looks: float = 1.0
+    ) -> linear.Design:
+        """linear.Design of Samples: the sites of their anchors, one behind the last for those at
+        none, and the link maps as dense part.
+        """
         phi = self.site.features(samples.p / self.options.length)
         a, b = (self._site_of(samples.anchors)[rows] for rows in (samples.a, samples.b))
         dense = [np.zeros((len(samples), 0))]
@@ -133,12 +164,16 @@ class Structured:
             one, other = (link.features(link_inputs(samples, side, viewer)) for side in "ab")
             dense.append(other - one)
         y = np.zeros(len(samples)) if error is None else error
-        return linear.Design(phi, a, b, np.concatenate(dense, axis=1), y, np.broadcast_to(looks, len(samples)))
+        return linear.Design(
+            phi, a, b, np.concatenate(dense, axis=1), y, np.broadcast_to(looks, len(samples))
+        )
 
     def _site_of(self, anchors: Anchors) -> np.ndarray:
         far = np.linalg.norm(anchors.positions[:, None] - self.site_positions, axis=2)
         far[anchors.ids[:, None] != self.site_ids] = np.inf
-        return np.argmin(np.column_stack([far, np.full(len(far), SAME_PLACE)]), axis=1)  # the last: none is so near
+        return np.argmin(
+            np.column_stack([far, np.full(len(far), SAME_PLACE)]), axis=1
+        )  # the last: none is so near
 
     def set_posterior(self, posterior: linear.Posterior) -> None:
         """Take over weights and the sizes of the priors."""
@@ -180,7 +215,9 @@ class Structured:
         phi = self.site.features(samples.p / self.options.length)
         known, sites = _quadratic(phi, self.site_covariance), self._site_of(samples.anchors)
         at_site = sites < len(self.site_ids)
-        at_a, at_b = (np.where(at_site[rows], known, self.site.variance) for rows in (samples.a, samples.b))
+        at_a, at_b = (
+            np.where(at_site[rows], known, self.site.variance) for rows in (samples.a, samples.b)
+        )
         total = at_a + at_b
         for viewer, link in self.links.items():
             for side in "ab":
@@ -190,15 +227,23 @@ class Structured:
 
     def _end_inputs(self, side: str = "a") -> list[str]:
         sites = (*_PLACE, *(f"{name}_{side}" for name in _END)) if len(self.site_ids) else ()
-        angles = [f"{angle}_{viewer}_{side}" for angle in ("azimuth", "elevation") for viewer in self.links]
+        angles = [
+            f"{angle}_{viewer}_{side}"
+            for angle in ("azimuth", "elevation")
+            for viewer in self.links
+        ]
         return [*sites, *(f"{name}_{side}" for name in _DELTA if self.links), *angles]
 
     def inputs(self) -> list[str]:
-        """Names of the features that the network is fed, in order: those of one end, then those of the other."""
+        """Names of the features that the network is fed, in order: those of one end, then those of
+        the other.
+        """
         return [name for side in "ab" for name in self._end_inputs(side)]
 
     def onnx(self, meta: Mapping[str, Any]) -> ModelProto:
-        """The onnx.ModelProto: bias, standard deviation, share of what can be known. meta : further metadata."""
+        """The onnx.ModelProto: bias, standard deviation, share of what can be known. meta : further
+        metadata.
+        """
         graph, names = export.GraphBuilder(), self.inputs()
         end = graph.rows(graph.input, len(names) // 2)  # (2n, ...): what follows is said of one end
         maps = [self._site_graph(graph, end)] if len(self.site_ids) else []
@@ -210,7 +255,12 @@ class Structured:
         std = graph.op("Sqrt", graph.op("Add", graph.row_sum(variances), [self.floor**2]))
         worst = graph.op("ReduceMax", variances, axes=[1])
         known = graph.op("Sub", [1.0], graph.op("Mul", worst, [1.0 / self.prior]))
-        meta = {**meta, "features": names, "offset": [0.0] * len(names), "scale": [1.0] * len(names)}
+        meta = {
+            **meta,
+            "features": names,
+            "offset": [0.0] * len(names),
+            "scale": [1.0] * len(names),
+        }
         return graph.model(len(names), [bias, std, known], meta)
 
     def _site_graph(self, graph: export.GraphBuilder, end: str) -> tuple[str, str]:
@@ -219,8 +269,12 @@ class Structured:
         place = graph.op("Div", place, [self.options.length])
         far = graph.op("Sqrt", graph.distance2(place, self.site.centres))
         parts = [graph.op("Exp", graph.op("Mul", far, [-1.0 / s])) for s in self.site.lengths]
-        values = graph.total([graph.op("Mul", part, [a**2]) for part, a in zip(parts, self.site.amplitudes)])
-        other = graph.op("Mul", graph.op("Abs", graph.op("Sub", who, self.site_ids[None])), [1e3])  # ids count as far
+        values = graph.total(
+            [graph.op("Mul", part, [a**2]) for part, a in zip(parts, self.site.amplitudes)]
+        )
+        other = graph.op(
+            "Mul", graph.op("Abs", graph.op("Sub", who, self.site_ids[None])), [1e3]
+        )  # ids count as far
         far = graph.op("Add", graph.distance2(where, self.site_positions), other)
         here = graph.op("Exp", graph.op("Mul", far, [-0.5 / SAME_PLACE**2]))  # (2n, sites)
         weights = graph.op("MatMul", here, self.weights @ self.site.whiten.T)
@@ -231,18 +285,23 @@ class Structured:
     def _link_graph(self, graph: export.GraphBuilder, end: str) -> tuple[str, str]:
         """(mean, variance explained) by the link maps together, each (2n, 1).
 
-        A Gaussian of the distance of x = (log distance, unit vector) from a centre c is an exponential of what is linear
-        in x and |x|^2 = (log distance)^2 + 1, so that one matrix product serves all centres.
+        A Gaussian of the distance of x = (log distance, unit vector) from a centre c is an
+        exponential of what is linear in x and |x|^2 = (log distance)^2 + 1, so that one matrix
+        product serves all centres.
         """
         n = len(self.links)
-        first = len(self._end_inputs()) - 2 * n - 3  # the columns: 3 of the distance, n azimuths, n elevations
+        first = (
+            len(self._end_inputs()) - 2 * n - 3
+        )  # the columns: 3 of the distance, n azimuths, n elevations
         delta = graph.take(end, range(first, first + 3))
         far = graph.op("Max", graph.row_sum(graph.op("Mul", delta, delta)), [NEAREST**2])
         far = graph.op("Mul", graph.op("Log", far), [0.5])
         azimuth, elevation = (graph.take(end, range(k, k + n)) for k in (first + 3, first + 3 + n))
         flat = graph.op("Cos", elevation)
         seen = [graph.op("Mul", flat, graph.op(turn, azimuth)) for turn in ("Cos", "Sin")]
-        x = graph.op("Concat", far, graph.op("Mul", far, far), *seen, graph.op("Sin", elevation), axis=1)
+        x = graph.op(
+            "Concat", far, graph.op("Mul", far, far), *seen, graph.op("Sin", elevation), axis=1
+        )
         slopes, levels, weights, factors = [], [], [], []
         for k, (viewer, link) in enumerate(self.links.items()):
             ((amplitude,), (length,)), c = (link.amplitudes, link.lengths), link.centres
@@ -263,18 +322,23 @@ def _quadratic(phi: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
 
 def link_inputs(samples: Samples, side: str, viewer: str) -> np.ndarray:
-    """Inputs of a link map: logarithm of the distance, unit vector to the other end as the viewer sees it. (n, 4).
+    """Inputs of a link map: logarithm of the distance, unit vector to the other end as the viewer
+    sees it. (n, 4).
 
-    side : "a" or "b"; viewer : "T", tag or "A", anchor."""
+    side : "a" or "b"; viewer : "T", tag or "A", anchor.
+    """
     names = [f"{name}_{side}" for name in (*_DELTA, f"azimuth_{viewer}", f"elevation_{viewer}")]
     dx, dy, dz, azimuth, elevation = columns(samples, names).T
     far, flat = np.log(np.maximum(np.sqrt(dx**2 + dy**2 + dz**2), NEAREST)), np.cos(elevation)
-    return np.stack([far, flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=1)
+    return np.stack(
+        [far, flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)], axis=1
+    )
 
 
 def _known_directions(of: Map, covariance: np.ndarray) -> np.ndarray:
-    """Of the kernel values of a Map (m,), the RANK directions that the data determine best, as large as what they determine:
-    (m, RANK)."""
+    """Of the kernel values of a Map (m,), the RANK directions that the data determine best, as
+    large as what they determine: (m, RANK).
+    """
     share, vector = np.linalg.eigh(np.eye(len(covariance)) - covariance)
     leading = np.argsort(share)[::-1][:RANK]
     return of.whiten @ (vector[:, leading] * np.sqrt(np.maximum(share[leading], 0.0)))
@@ -292,7 +356,9 @@ def prepare(all_labels: Sequence[Labels], options: StructuredPriors, seed: int) 
     positions: list[np.ndarray] = []
     for one in all_labels:
         for i, p in zip(one.anchors.ids, one.anchors.positions):
-            if not any(i == k and np.linalg.norm(p - at) < SAME_PLACE for k, at in zip(ids, positions)):
+            if not any(
+                i == k and np.linalg.norm(p - at) < SAME_PLACE for k, at in zip(ids, positions)
+            ):
                 ids.append(i)
                 positions.append(p)
     places = np.concatenate([one.samples.p for one in all_labels]) / options.length
@@ -302,6 +368,10 @@ def prepare(all_labels: Sequence[Labels], options: StructuredPriors, seed: int) 
     if len(constellations(all_labels)) > 1:  # in one alone, place and direction are the same thing
         oriented = all(np.isfinite(one.anchors.orientations).all() for one in all_labels)
         for viewer in "TA" if oriented else "T":
-            inputs = np.concatenate([link_inputs(one.samples, side, viewer) for one in all_labels for side in "ab"])
-            model.links[viewer] = make_map(inputs, options.link_centres, (options.link,), (LINK_LENGTH,), True, seed)
+            inputs = np.concatenate(
+                [link_inputs(one.samples, side, viewer) for one in all_labels for side in "ab"]
+            )
+            model.links[viewer] = make_map(
+                inputs, options.link_centres, (options.link,), (LINK_LENGTH,), True, seed
+            )
     return model

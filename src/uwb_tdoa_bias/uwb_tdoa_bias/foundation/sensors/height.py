@@ -9,12 +9,18 @@ import numpy as np
 
 from .sensor import Compared, Sensor, Stream, parameter
 
-INFRARED, FIELD_OF_VIEW, LONGEST_RANGE = 1, 0.47, 1000.0  # a kind; rad, m: typical, and a bound that bounds nothing
+INFRARED, FIELD_OF_VIEW, LONGEST_RANGE = (
+    1,
+    0.47,
+    1000.0,
+)  # a kind; rad, m: typical, and a bound that bounds nothing
 
 
 @dataclass(frozen=True)
 class Height(Stream):
-    """Ranges along the body's -z. t : (n,) s; range : (n,) m; inf or NaN where there was none (REP 117)."""
+    """Ranges along the body's -z. t : (n,) s; range : (n,) m; inf or NaN where there was none (REP
+    117).
+    """
 
     t: np.ndarray
     range: np.ndarray
@@ -23,17 +29,19 @@ class Height(Stream):
     def values(self) -> np.ndarray:
         return self.range[:, None]
 
-    def with_values(self, values: np.ndarray) -> "Height":
+    def with_values(self, values: np.ndarray) -> Height:
         return replace(self, range=values[:, 0])
 
-    def sensed(self, values: np.ndarray) -> "Height":
+    def sensed(self, values: np.ndarray) -> Height:
         return self.with_values(np.maximum(values, 0.0))
 
 
 def _columns(fields: dict) -> tuple:
     distance = np.asarray(fields["range"], dtype=float)
     inside = (fields["min_range"] <= distance) & (distance <= fields["max_range"])
-    return (np.where(np.isfinite(distance) & ~inside, np.inf, distance),)  # out of range, says REP 117
+    return (
+        np.where(np.isfinite(distance) & ~inside, np.inf, distance),
+    )  # out of range, says REP 117
 
 
 def _content(height: Height) -> dict:
@@ -52,7 +60,9 @@ def _simulated(config: Any, room: Any, motion: Any, turn: Any, noise: Any) -> tu
 
 def _reading(track: Any, t: np.ndarray) -> np.ndarray:
     q = track.attitudes(t)
-    return (track.positions(t)[:, 2] / (1.0 - 2.0 * (q[:, 0] ** 2 + q[:, 1] ** 2)))[:, None]  # over the ground at z = 0
+    return (track.positions(t)[:, 2] / (1.0 - 2.0 * (q[:, 0] ** 2 + q[:, 1] ** 2)))[
+        :, None
+    ]  # over the ground at z = 0
 
 
 SENSOR = Sensor(
@@ -66,18 +76,28 @@ SENSOR = Sensor(
     sound=lambda fields: {
         name: np.ones(values.shape, dtype=bool) for name, values in fields.items()
     },  # REP 117: what is not finite says that nothing was in range
-    measured=lambda height: ({"value": height.range[:, None]}, np.isfinite(height.range) & (height.range >= 0.0)),
+    measured=lambda height: (
+        {"value": height.range[:, None]},
+        np.isfinite(height.range) & (height.range >= 0.0),
+    ),
     simulated=_simulated,
     noise=("M", "write ranges to the floor, along the body's -z"),
     parameters={
         "use_height": parameter(
-            True, "use ranges of a range finder that looks down along the body's -z, if there are any", fixed=True
+            True,
+            "use ranges of a range finder that looks down along the body's -z, if there are any",
+            fixed=True,
         ),
         "height_std": parameter(
-            0.02, "m; of a range: unevenness of the ground and offset of the sensor, alike for 0.5 s", high=10.0
+            0.02,
+            "m; of a range: unevenness of the ground and offset of the sensor, alike for 0.5 s",
+            high=10.0,
         ),
         "height_arm": parameter(
-            0.0, "m; from the range finder up to the origin of the body, along the body's z", high=10.0, low=-10.0
+            0.0,
+            "m; from the range finder up to the origin of the body, along the body's z",
+            high=10.0,
+            low=-10.0,
         ),
         "ground_height": parameter(
             0.0, "m; height of the ground in the world, but for steps", high=10000.0, low=-10000.0
@@ -86,6 +106,8 @@ SENSOR = Sensor(
     invalid="out of range, or less than 0 m",
     remedy="its unit, height_arm and ground_height",
     compared=Compared(
-        _reading, "a range finder that looks down, and ground truth of height and attitude", negligible=0.005
+        _reading,
+        "a range finder that looks down, and ground truth of height and attitude",
+        negligible=0.005,
     ),
 )

@@ -37,7 +37,7 @@ class Pressure(Stream):
     def values(self) -> np.ndarray:
         return altitude_of(self.pressure)[:, None]
 
-    def with_values(self, values: np.ndarray) -> "Pressure":
+    def with_values(self, values: np.ndarray) -> Pressure:
         return replace(self, pressure=pressure_at(values[:, 0]))
 
 
@@ -63,17 +63,29 @@ SENSOR = Sensor(
     simulated=_simulated,
     noise=("M", "write pressures; in metres of altitude"),
     parameters={
-        "use_pressure": parameter(True, "use pressures of a barometer, if there are any", fixed=True),
+        "use_pressure": parameter(
+            True, "use pressures of a barometer, if there are any", fixed=True
+        ),
         "pressure_std": parameter(0.1, "m; noise of one pressure, as altitude", high=100.0),
         "pressure_walk": parameter(
-            0.1, "m/sqrt(s); how fast the offset of the altitude wanders: weather, prop wash, warming up", high=100.0
+            0.1,
+            (
+                "m/sqrt(s); how fast the offset of the altitude wanders: weather, prop wash, "
+                "warming up"
+            ),
+            high=100.0,
         ),
-        "pressure_drift": parameter(0.02, "m/s; how fast it drifts, as is known before it is measured", high=100.0),
+        "pressure_drift": parameter(
+            0.02, "m/s; how fast it drifts, as is known before it is measured", high=100.0
+        ),
     },
     invalid="give Pa, some 1e5 on the ground",
     remedy="and shield it from wind",
     compared=Compared(
-        lambda track, t: track.positions(t)[:, 2:], "a barometer, and ground truth of the height",
-        negligible=0.05, floating=True, of_attitude=False,
+        lambda track, t: track.positions(t)[:, 2:],
+        "a barometer, and ground truth of the height",
+        negligible=0.05,
+        floating=True,
+        of_attitude=False,
     ),
-)  # fmt: skip
+)

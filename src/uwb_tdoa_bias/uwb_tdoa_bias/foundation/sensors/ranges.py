@@ -18,8 +18,9 @@ MOST_NAMED = 8  # anchors in a sentence
 
 @dataclass(frozen=True)
 class Ranges(Stream):
-    """Distances to anchors. t : (n,) s; anchor : (n,) ids; d : (n,) m; variance : (n,) m^2, of the noise as the tag knows
-    it, 0 where it does not."""
+    """Distances to anchors. t : (n,) s; anchor : (n,) ids; d : (n,) m; variance : (n,) m^2, of the
+    noise as the tag knows it, 0 where it does not.
+    """
 
     t: np.ndarray
     anchor: np.ndarray
@@ -30,7 +31,7 @@ class Ranges(Stream):
     def values(self) -> np.ndarray:
         return self.d[:, None]
 
-    def with_values(self, values: np.ndarray) -> "Ranges":
+    def with_values(self, values: np.ndarray) -> Ranges:
         return replace(self, d=values[:, 0])
 
 
@@ -40,14 +41,19 @@ def _measured(ranges: Ranges) -> tuple[dict, np.ndarray]:
         "value": ranges.d[:, None],
         "std": np.sqrt(np.maximum(ranges.variance, 0.0))[:, None],
     }
-    return rows, (ranges.d >= 0.0) & (ranges.d < FARTHEST) & (ranges.variance >= 0.0) & np.isfinite(ranges.variance)
+    return rows, (ranges.d >= 0.0) & (ranges.d < FARTHEST) & (ranges.variance >= 0.0) & np.isfinite(
+        ranges.variance
+    )
 
 
 def _simulated(config: Any, room: Any, motion: Any, turn: Any, noise: Any) -> tuple:
     """Each anchor in its turn."""
     row = np.arange(len(motion.p)) % len(config.anchors)
     antenna = motion.p + turn.apply(config.tag_lever_arm)
-    d = np.linalg.norm(antenna - config.anchors.positions[row], axis=1) + config.range_noise * noise()
+    d = (
+        np.linalg.norm(antenna - config.anchors.positions[row], axis=1)
+        + config.range_noise * noise()
+    )
     return config.anchors.ids[row], np.maximum(d, 0.0), np.zeros(len(d))
 
 
@@ -56,22 +62,37 @@ def _unknown(ranges: Ranges, anchors: Anchors) -> Mistake | None:
     share = np.mean(~np.isin(ranges.anchor, anchors.ids))
     if share > 0.0:
         strange = np.setdiff1d(ranges.anchor, anchors.ids)
-        heard, known = (", ".join(map(str, ids)) for ids in (strange[:MOST_NAMED], anchors.ids[:MOST_NAMED]))
-        evidence = f"{100.0 * share:.0f} % of the ranges are to {heard}; the survey begins with {known}"
+        heard, known = (
+            ", ".join(map(str, ids)) for ids in (strange[:MOST_NAMED], anchors.ids[:MOST_NAMED])
+        )
+        evidence = (
+            f"{100.0 * share:.0f} % of the ranges are to {heard}; the survey begins with {known}"
+        )
         remedy = "--survey FILE  # with all anchors, under the ids that the tag reports"
         return Mistake(
-            "range_unknown", "ranges are to anchors that the survey does not list", evidence, remedy, float(share)
+            "range_unknown",
+            "ranges are to anchors that the survey does not list",
+            evidence,
+            remedy,
+            float(share),
         )
     return None
 
 
 def _unit(ranges: Ranges, anchors: Anchors) -> Mistake | None:
     """Another unit than metres."""
-    extent, middle = float(np.linalg.norm(np.ptp(anchors.positions, axis=0))), float(np.median(ranges.d))
+    extent, middle = (
+        float(np.linalg.norm(np.ptp(anchors.positions, axis=0))),
+        float(np.median(ranges.d)),
+    )
     if middle > BEYOND * extent or middle < 0.001 * extent:
-        evidence = f"their median is {middle:.4g} m, and the anchors are {extent:.1f} m apart at most"
+        evidence = (
+            f"their median is {middle:.4g} m, and the anchors are {extent:.1f} m apart at most"
+        )
         remedy = "publish metres: divide millimetres by 1000, multiply seconds by 299792458"
-        return Mistake("range_unit", "ranges are in another unit than metres", evidence, remedy, middle)
+        return Mistake(
+            "range_unit", "ranges are in another unit than metres", evidence, remedy, middle
+        )
     return None
 
 
@@ -79,8 +100,15 @@ def _impossible(ranges: Ranges, anchors: Anchors) -> Mistake | None:
     """Values that are no distances."""
     share = float(np.mean(~_measured(ranges)[1] | (ranges.d == 0.0)))
     if share > SOME:
-        evidence = f"{100.0 * share:.1f} % of the ranges are 0 or less, no numbers, or more than {FARTHEST:g} m"
-        cause = "most ranges cannot be distances" if share > MOST else "some ranges cannot be distances: they are lost"
+        evidence = (
+            f"{100.0 * share:.1f} % of the ranges are 0 or less, no numbers, or more than "
+            f"{FARTHEST:g} m"
+        )
+        cause = (
+            "most ranges cannot be distances"
+            if share > MOST
+            else "some ranges cannot be distances: they are lost"
+        )
         remedy = "publish |p - a| in metres, and nothing where the exchange has failed"
         return Mistake("range_invalid", cause, evidence, remedy, share, share > MOST)
     return None
@@ -92,23 +120,45 @@ SENSOR = Sensor(
     stream=Ranges,
     message="uwb_tdoa_msgs/msg/AnchorRange",
     fields={"anchor": 1, "distance": 1, "variance": 1},
-    columns=lambda fields: (np.asarray(fields["anchor"]).astype(np.int64), fields["distance"], fields["variance"]),
-    content=lambda ranges: {"anchor": ranges.anchor, "distance": ranges.d, "variance": ranges.variance},
+    columns=lambda fields: (
+        np.asarray(fields["anchor"]).astype(np.int64),
+        fields["distance"],
+        fields["variance"],
+    ),
+    content=lambda ranges: {
+        "anchor": ranges.anchor,
+        "distance": ranges.d,
+        "variance": ranges.variance,
+    },
     sound=finite,
     measured=_measured,
     simulated=_simulated,
     noise=("M", "write distances to anchors, as of two-way ranging"),
     parameters={
-        "use_range": parameter(True, "use distances to anchors, as of two-way ranging, if there are any", fixed=True),
-        "range_std": parameter(0.1, "m; of a distance to an anchor, uncorrected systematic part included", high=100.0),
+        "use_range": parameter(
+            True, "use distances to anchors, as of two-way ranging, if there are any", fixed=True
+        ),
+        "range_std": parameter(
+            0.1, "m; of a distance to an anchor, uncorrected systematic part included", high=100.0
+        ),
         "range_offset_std": parameter(
-            0.3, "m; standard deviation of the offset common to all ranges, which the filter finds; 0.0: there is none", high=100.0, with_low=True
+            0.3,
+            (
+                "m; standard deviation of the offset common to all ranges, which the filter "
+                "finds; 0.0: there is none"
+            ),
+            high=100.0,
+            with_low=True,
         ),
     },
     invalid="give ids of uwb/anchors, and distances in metres, 0 or more",
     remedy="its unit, and the anchors' positions",
     compared=Compared(
-        None, "ranges, and ground truth of the position", negligible=0.004, of_attitude=False, positions=(0, 1, 2)
+        None,
+        "ranges, and ground truth of the position",
+        negligible=0.004,
+        of_attitude=False,
+        positions=(0, 1, 2),
     ),
     topic="uwb/range",
     rate=100.0,

@@ -18,8 +18,10 @@ LEAST_STD = 0.01  # m/s, that a simulated velocity says of itself
 class Velocity(Stream):
     """Velocities in the body frame.
 
-    t : (n,) s; v : (n, 3) m/s; std : (n, 3) m/s, inf for a component that is not measured, 0 where the driver states none.
-    yaw_rate : (n,) rad/s about the body's z, as of wheels, NaN where it is not measured, which is everywhere unless it is given;
+    t : (n,) s; v : (n, 3) m/s; std : (n, 3) m/s, inf for a component that is not measured, 0 where
+        the driver states none.
+    yaw_rate : (n,) rad/s about the body's z, as of wheels, NaN where it is not measured, which is
+        everywhere unless it is given;
     yaw_rate_std : (n,) rad/s, inf and 0 as in std.
     """
 
@@ -39,19 +41,30 @@ class Velocity(Stream):
     def values(self) -> np.ndarray:
         return self.v
 
-    def with_values(self, values: np.ndarray) -> "Velocity":
+    def with_values(self, values: np.ndarray) -> Velocity:
         return replace(self, v=values)
 
 
 def _columns(fields: dict) -> tuple:
-    """Variances of 0 are those of a driver that states none; the yaw rate of one that states some for the velocity alone, and turns
-    nowhere, is not measured."""
-    variance, rate = fields["twist.covariance"][:, [0, 7, 14, 35]], fields["twist.twist.angular"][:, 2]
+    """Variances of 0 are those of a driver that states none; the yaw rate of one that states some
+    for the velocity alone, and turns nowhere, is not measured.
+    """
+    variance, rate = (
+        fields["twist.covariance"][:, [0, 7, 14, 35]],
+        fields["twist.twist.angular"][:, 2],
+    )
     std = np.sqrt(np.where((variance >= 0.0) & (variance < UNKNOWN_VARIANCE), variance, np.inf))
     linear = std[:, :3]
-    silent = (variance[:, 3] == 0.0) & (rate == 0.0) & (np.isfinite(linear) & (linear > 0.0)).any(axis=1)
+    silent = (
+        (variance[:, 3] == 0.0) & (rate == 0.0) & (np.isfinite(linear) & (linear > 0.0)).any(axis=1)
+    )
     rate_std = np.where(silent, np.inf, std[:, 3])
-    return fields["twist.twist.linear"], linear, np.where(np.isinf(rate_std), np.nan, rate), rate_std
+    return (
+        fields["twist.twist.linear"],
+        linear,
+        np.where(np.isinf(rate_std), np.nan, rate),
+        rate_std,
+    )
 
 
 def _content(velocity: Velocity) -> dict:
@@ -72,11 +85,18 @@ def _sound(fields: dict) -> dict:
     linear, angular, covariance = sound = finite(fields)
     of_rates = np.ones(sound[angular].shape, dtype=bool)  # those about x and y are not read
     of_rates[:, 2] = sound[angular][:, 2] | np.isinf(rate_std)
-    return {linear: sound[linear] | np.isinf(std), angular: of_rates, covariance: np.ones(sound[covariance].shape, dtype=bool)}
+    return {
+        linear: sound[linear] | np.isinf(std),
+        angular: of_rates,
+        covariance: np.ones(sound[covariance].shape, dtype=bool),
+    }
 
 
 def _measured(velocity: Velocity) -> tuple[dict, np.ndarray]:
-    v, std = np.column_stack([velocity.v, velocity.yaw_rate]), np.column_stack([velocity.std, velocity.yaw_rate_std])
+    v, std = (
+        np.column_stack([velocity.v, velocity.yaw_rate]),
+        np.column_stack([velocity.std, velocity.yaw_rate_std]),
+    )
     known = np.isfinite(std)
     sane = np.where(known, (np.abs(v) < FASTEST) & (std >= 0.0), True).all(axis=1)
     rows = {"value": np.where(known, v, 0.0), "std": np.where(known, std, UNKNOWN_STD)}
@@ -106,22 +126,42 @@ SENSOR = Sensor(
     simulated=_simulated,
     noise=("M/S", "write velocities in the body frame"),
     parameters={
-        "use_velocity": parameter(True, "use velocities in the body frame, if there are any", fixed=True),
+        "use_velocity": parameter(
+            True, "use velocities in the body frame, if there are any", fixed=True
+        ),
         "velocity_std": parameter(
-            0.03, "m/s; of a component of the velocity whose variance in the message is 0: the driver states none", high=100.0
+            0.03,
+            (
+                "m/s; of a component of the velocity whose variance in the message is 0: the "
+                "driver states none"
+            ),
+            high=100.0,
         ),
         "yaw_rate_std": parameter(
-            0.05, "rad/s; the same of the yaw rate in such a message; 0.0: yaw rates without a variance are not used",
-            high=100.0, with_low=True,
+            0.05,
+            (
+                "rad/s; the same of the yaw rate in such a message; 0.0: yaw rates without a "
+                "variance are not used"
+            ),
+            high=100.0,
+            with_low=True,
         ),
     },
     invalid="give m/s, rad/s, and a covariance that is not unknown for all components",
     remedy="its unit and how it is turned (velocity_misalignment in effects_file), and look for slip",
     compared=Compared(
-        lambda track, t: rotations.Rotation.from_quat(track.attitudes(t)).inv().apply(track.velocities(t)),
-        "a velocity (wheels, optical flow, visual odometry), and ground truth of position and attitude",
-        negligible=0.003, unit="m/s", axes=(".x", ".y", ".z"), positions=(0, 1, 2),
+        lambda track, t: (
+            rotations.Rotation.from_quat(track.attitudes(t)).inv().apply(track.velocities(t))
+        ),
+        (
+            "a velocity (wheels, optical flow, visual odometry), and ground truth of position and "
+            "attitude"
+        ),
+        negligible=0.003,
+        unit="m/s",
+        axes=(".x", ".y", ".z"),
+        positions=(0, 1, 2),
     ),
     others=(("velocity/odometry", "nav_msgs/msg/Odometry"),),
     assumed=_assumed,
-)  # fmt: skip
+)

@@ -18,8 +18,9 @@ SHIFT = 0.05  # s; the cells are those of the gyroscope
 
 
 class Accel(Inertial):
-    """Specific force, averaged with a triangular window, minus the second difference of the true positions, which is the
-    same average of the true acceleration."""
+    """Specific force, averaged with a triangular window, minus the second difference of the true
+    positions, which is the same average of the true acceleration.
+    """
 
     name = "accel"
     unit = "m/s^2"
@@ -29,7 +30,9 @@ class Accel(Inertial):
 
     def residual(self, comparison: Comparison) -> ImuResidual | None:
         imu = comparison.flight.imu
-        if imu is None or not (comparison.attitude_known and all(comparison.reference.positions_known)):
+        if imu is None or not (
+            comparison.attitude_known and all(comparison.reference.positions_known)
+        ):
             return None
         track, edges = comparison.track, cells_in_the_air(comparison, imu, SHIFT)
         middles = edges[1:-1]
@@ -47,8 +50,10 @@ class Accel(Inertial):
 
 
 def _triangular_means(t: np.ndarray, values: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Means of (n, 3) values with the triangular window over two intervals, for every inner edge. With it, the mean
-    of a second derivative is the second difference of the function: both sides of the residual see the same filter."""
+    """Means of (n, 3) values with the triangular window over two intervals, for every inner edge.
+    With it, the mean of a second derivative is the second difference of the function: both sides of
+    the residual see the same filter.
+    """
     place = np.searchsorted(edges, t, side="right") - 1
     out, total = np.zeros((len(edges), 3)), np.zeros(len(edges))
     inside = (place >= 0) & (place < len(edges) - 1)

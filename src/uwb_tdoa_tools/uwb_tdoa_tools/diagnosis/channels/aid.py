@@ -18,8 +18,10 @@ from .knots import knots_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from uwb_tdoa_bias.effects import Effect
     from uwb_tdoa_bias.foundation.sensors import Stream
+
     from .base import Comparison, Figures
 
 FEWEST_CELLS = 8
@@ -27,8 +29,10 @@ FEWEST_CELLS = 8
 
 @dataclass(frozen=True)
 class AidResidual(ChannelResidual):
-    """samples : AidSamples, cells; residual (n, k), NaN where an axis was not measured; labels : k texts, its axes; unit of
-    the channel; floating : whether a constant tells nothing, and its mean is taken out of rows and columns."""
+    """samples : AidSamples, cells; residual (n, k), NaN where an axis was not measured; labels : k
+    texts, its axes; unit of the channel; floating : whether a constant tells nothing, and its mean
+    is taken out of rows and columns.
+    """
 
     samples: AidSamples
     residual: np.ndarray
@@ -55,9 +59,17 @@ class AidResidual(ChannelResidual):
         return sensor_covariate(name, self.samples)
 
     def series(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        columns = {f"{label} [{self.unit}]": self.residual[:, k] for k, label in enumerate(self.labels)}
-        measured = {label: np.isfinite(column) for label, column in columns.items()}  # optical flow tells no vertical velocity
-        return {label: (self.samples.t[m], columns[label][m]) for label, m in measured.items() if m.any()}
+        columns = {
+            f"{label} [{self.unit}]": self.residual[:, k] for k, label in enumerate(self.labels)
+        }
+        measured = {
+            label: np.isfinite(column) for label, column in columns.items()
+        }  # optical flow tells no vertical velocity
+        return {
+            label: (self.samples.t[m], columns[label][m])
+            for label, m in measured.items()
+            if m.any()
+        }
 
     def _free(self, values: np.ndarray) -> np.ndarray:
         return values - values.mean(axis=0) if self.floating else values
@@ -96,7 +108,11 @@ class Aid(Channel[AidResidual]):
         middles = np.array([some.mean() for some in np.split(t, edges)])
         error = np.stack([_median(some) for some in np.split(error, edges)])
         samples = aid_samples(
-            self.name, middles, comparison.track, comparison.start, vibration_at(comparison.flight.imu, middles)
+            self.name,
+            middles,
+            comparison.track,
+            comparison.start,
+            vibration_at(comparison.flight.imu, middles),
         )
         error = error - comparison.effects.uncorrected(samples)
         return AidResidual(samples, error, self.labels, self.unit, self.floating)
@@ -105,12 +121,16 @@ class Aid(Channel[AidResidual]):
         out = []
         for name in OF_AIDS:
             if knots := knots_of(name, residuals):
-                out += [SmoothTerm(channel=label, covariate=name, knots=knots) for label in self.labels]
+                out += [
+                    SmoothTerm(channel=label, covariate=name, knots=knots) for label in self.labels
+                ]
         return out
 
     def health(self, residuals: Sequence[AidResidual]) -> Figures:
         out = []
-        t = np.concatenate([part.samples.t + APART * number for number, part in enumerate(residuals)])
+        t = np.concatenate(
+            [part.samples.t + APART * number for number, part in enumerate(residuals)]
+        )
         for k, label in enumerate(self.labels):
             r = np.concatenate([part.residual[:, k] for part in residuals])
             known = np.isfinite(r)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,8 +23,9 @@ def rows_by_value(values: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
 
 
 def figures(t: np.ndarray | None, r: np.ndarray) -> dict[str, Any]:
-    """Bias (median), spread (1.48 MAD), tails (share beyond 4 spreads), count, and with rising stamps t (n,), s,
-    autocorrelation at 0.1 to 2 s, of residuals r (n,): dict."""
+    """Bias (median), spread (1.48 MAD), tails (share beyond 4 spreads), count, and with rising
+    stamps t (n,), s, autocorrelation at 0.1 to 2 s, of residuals r (n,): dict.
+    """
     bias = float(np.median(r))
     spread = float(1.4826 * np.median(np.abs(r - bias)))
     out: dict[str, Any] = {
@@ -39,8 +40,13 @@ def figures(t: np.ndarray | None, r: np.ndarray) -> dict[str, Any]:
 
 
 def autocorrelation(t: np.ndarray, r: np.ndarray, lag: float) -> float | None:
-    """Correlation of a series r at rising stamps t with itself `lag` seconds later; None without such pairs."""
-    r = np.clip(r - np.median(r), *np.array([-5.0, 5.0]) * max(1.4826 * np.median(np.abs(r - np.median(r))), 1e-12))
+    """Correlation of a series r at rising stamps t with itself `lag` seconds later; None without
+    such pairs.
+    """
+    r = np.clip(
+        r - np.median(r),
+        *np.array([-5.0, 5.0]) * max(1.4826 * np.median(np.abs(r - np.median(r))), 1e-12),
+    )
     later = np.searchsorted(t, t + lag)
     inside = later < len(t)
     first, second = np.flatnonzero(inside), later[inside]

@@ -13,21 +13,26 @@ from .inertial import CELL, ImuResidual, Inertial, cells_in_the_air, features_of
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.flight import Imu, Truth
+
     from .base import Comparison
 
-SHIFT = 0.05  # s, for derivatives by time, of what was measured: noise of the truth would shrink what is fitted to them
+# s, for derivatives by time, of what was measured: noise of the truth would shrink what is fitted
+# to them
+SHIFT = 0.05
 STILL_FORCE, STILL_RATE = 0.3, 0.1  # m/s^2 of vibration and rad/s, below which the vehicle stands
 STILL_CHANGE = 0.02  # rad/s, the same of what is measured less what was measured at the start
 BEGINNING = 2  # cells before, in which it may begin to turn
 RATES = [column for column, name in enumerate(OF_IMU) if name.startswith("rate_")]
 TURNING = [OF_IMU.index("turning_rate"), *RATES]
-TRUE_SHARE = 0.5  # of the variance of a measured rate, that must be true turns: of a rover none of roll and pitch is
+# of the variance of a measured rate, that must be true turns: of a rover none of roll and pitch is
+TRUE_SHARE = 0.5
 FEWEST_CELLS = 4
 
 
 class Gyro(Inertial):
-    """Turning rates, averaged over cells, minus the mean of the true turns; before take-off alone where no attitude is
-    known: a vehicle that stands does not turn."""
+    """Turning rates, averaged over cells, minus the mean of the true turns; before take-off alone
+    where no attitude is known: a vehicle that stands does not turn.
+    """
 
     name = "gyro"
     unit = "rad/s"
@@ -49,24 +54,40 @@ class Gyro(Inertial):
         middles = 0.5 * (edges[:-1] + edges[1:])
         features, change = means(imu.t, features_of(imu), edges), (after - before) / (2.0 * SHIFT)
         still = ~_turns(measured, true)
-        reading = np.where(still, 0.0, measured)  # where it does not turn, what it measures is the residual: a function of itself
+        reading = np.where(
+            still, 0.0, measured
+        )  # where it does not turn, what it measures is the residual: a function of itself
         features[:, RATES], change[:, still] = np.where(still, 0.0, features[:, RATES]), 0.0
-        if not _turns(*(np.linalg.norm(rates, axis=1, keepdims=True) for rates in (measured, true)))[0]:
+        if not _turns(
+            *(np.linalg.norm(rates, axis=1, keepdims=True) for rates in (measured, true))
+        )[0]:
             features[:, OF_IMU.index("turning_rate")] = 0.0
         samples = self._samples(comparison, middles, reading, features, change)
-        return ImuResidual(samples, measured - true - comparison.effects.uncorrected(samples), self.unit)
+        return ImuResidual(
+            samples, measured - true - comparison.effects.uncorrected(samples), self.unit
+        )
 
     def _at_rest(self, comparison: Comparison, imu: Imu) -> ImuResidual | None:
         edges = np.arange(imu.t[0], imu.t[-1], CELL)
         features, measured = means(imu.t, features_of(imu), edges), means(imu.t, imu.gyro, edges)
         moving = features[:, OF_IMU.index("vibration")] > STILL_FORCE
         moving |= np.abs(measured).max(axis=1) > STILL_RATE
-        moving |= np.abs(measured - np.median(measured[:FEWEST_CELLS], axis=0)).max(axis=1) > STILL_CHANGE
+        moving |= (
+            np.abs(measured - np.median(measured[:FEWEST_CELLS], axis=0)).max(axis=1) > STILL_CHANGE
+        )
         still = np.flatnonzero(np.cumsum(moving) == 0)[:-BEGINNING]
         if len(still) < FEWEST_CELLS:
             return None
-        middles, measured, features = 0.5 * (edges[:-1] + edges[1:])[still], measured[still], features[still]
-        features[:, TURNING] = 0.0  # it does not turn: what it measures is the residual, which would be a function of itself
+        middles, measured, features = (
+            0.5 * (edges[:-1] + edges[1:])[still],
+            measured[still],
+            features[still],
+        )
+        features[:, TURNING] = (
+            # it does not turn: what it measures is the residual, which would be a function of
+            # itself
+            0.0
+        )
         nothing = np.zeros_like(measured)
         samples = self._samples(comparison, middles, nothing, features, nothing)
         return ImuResidual(samples, measured - comparison.effects.uncorrected(samples), self.unit)
@@ -80,7 +101,9 @@ def _turns(measured: np.ndarray, true: np.ndarray) -> np.ndarray:
 
 
 def _true_rates(truth: Truth, edges: np.ndarray) -> np.ndarray:
-    """Mean turning rates in body axes between edges, (n, 3) rad/s: sums of the turns from pose to pose."""
+    """Mean turning rates in body axes between edges, (n, 3) rad/s: sums of the turns from pose to
+    pose.
+    """
     known = np.isfinite(truth.q).all(axis=1)
     t, first = np.unique(truth.t[known], return_index=True)
     turns = Rotation.from_quat(truth.q[known][first])

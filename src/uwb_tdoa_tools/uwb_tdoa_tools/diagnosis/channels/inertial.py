@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar, TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -19,13 +19,22 @@ from .views import views_of_axes
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from uwb_tdoa_bias.effects import Effect
     from uwb_tdoa_bias.foundation.flight import Imu
+
     from .base import Comparison, Figures
     from .views import CovariateView
 
 CELL = 0.25  # s over which both sides of a residual are averaged
-OF_POSE = ("x", "y", "height", "speed", "climb_rate", "acceleration")  # covariates that TDOAs have too
+OF_POSE = (
+    "x",
+    "y",
+    "height",
+    "speed",
+    "climb_rate",
+    "acceleration",
+)  # covariates that TDOAs have too
 
 
 @dataclass(frozen=True)
@@ -51,7 +60,10 @@ class ImuResidual(ChannelResidual):
 
     def series(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         name = self.samples.channel
-        return {f"{name}.{axis} [{self.unit}]": (self.samples.t, self.residual[:, k]) for k, axis in enumerate("xyz")}
+        return {
+            f"{name}.{axis} [{self.unit}]": (self.samples.t, self.residual[:, k])
+            for k, axis in enumerate("xyz")
+        }
 
 
 class Inertial(Channel[ImuResidual]):
@@ -63,7 +75,10 @@ class Inertial(Channel[ImuResidual]):
         out = []
         for name in self._covariates(residuals):
             if knots := knots_of(name, residuals):
-                out += [SmoothTerm(channel=f"{self.name}.{axis}", covariate=name, knots=knots) for axis in self.axes]
+                out += [
+                    SmoothTerm(channel=f"{self.name}.{axis}", covariate=name, knots=knots)
+                    for axis in self.axes
+                ]
         return out
 
     def views(self, residuals: Sequence[ImuResidual]) -> list[CovariateView]:
@@ -80,14 +95,25 @@ class Inertial(Channel[ImuResidual]):
         return (*OF_IMU, *OF_POSE, *extra_names([part.samples for part in residuals]))
 
     def health(self, residuals: Sequence[ImuResidual]) -> Figures:
-        t = np.concatenate([part.samples.t + APART * number for number, part in enumerate(residuals)])
+        t = np.concatenate(
+            [part.samples.t + APART * number for number, part in enumerate(residuals)]
+        )
         r = np.concatenate([part.residual for part in residuals])
-        return {"axes": [{"axis": f"{self.name}.{axis}", **figures(t, r[:, k])} for k, axis in enumerate(self.axes)]}
+        return {
+            "axes": [
+                {"axis": f"{self.name}.{axis}", **figures(t, r[:, k])}
+                for k, axis in enumerate(self.axes)
+            ]
+        }
 
     def _samples(
-        self, comparison: Comparison, t: np.ndarray, reading: np.ndarray, features: np.ndarray,
+        self,
+        comparison: Comparison,
+        t: np.ndarray,
+        reading: np.ndarray,
+        features: np.ndarray,
         change: np.ndarray | None = None,
-    ) -> ImuSamples:  # fmt: skip
+    ) -> ImuSamples:
         """ImuSamples of this channel at the middles t (n,) of cells."""
         track = comparison.track
         q = track.attitudes(t)
@@ -97,7 +123,9 @@ class Inertial(Channel[ImuResidual]):
             up[known] = Rotation.from_quat(q[known]).inv().apply([0.0, 0.0, 1.0])
         place, motion = track.positions(t), track.motion(t)
         extra = extra_at(comparison.flight, t)
-        return ImuSamples(self.name, t, place, comparison.start, reading, change, up, features, motion, extra)
+        return ImuSamples(
+            self.name, t, place, comparison.start, reading, change, up, features, motion, extra
+        )
 
 
 def features_of(imu: Imu) -> np.ndarray:
@@ -107,11 +135,15 @@ def features_of(imu: Imu) -> np.ndarray:
 
 def vibration_at(imu: Imu | None, t: np.ndarray) -> np.ndarray | None:
     """(n,) m/s^2 at stamps t (n,) s; None without an IMU."""
-    return None if imu is None else np.interp(t, imu.t, features_of(imu)[:, OF_IMU.index("vibration")])
+    return (
+        None if imu is None else np.interp(t, imu.t, features_of(imu)[:, OF_IMU.index("vibration")])
+    )
 
 
 def cells_in_the_air(comparison: Comparison, imu: Imu, shift: float) -> np.ndarray:
-    """Edges of the cells, s, of what counts and is covered by Imu and reference, `shift` s more at both ends."""
+    """Edges of the cells, s, of what counts and is covered by Imu and reference, `shift` s more at
+    both ends.
+    """
     poses, (first, last) = comparison.poses, comparison.span
     low = max(first, imu.t[0], poses.t[0]) + CELL + shift
     high = min(last, imu.t[-1], poses.t[-1]) - CELL - shift
@@ -119,8 +151,12 @@ def cells_in_the_air(comparison: Comparison, imu: Imu, shift: float) -> np.ndarr
 
 
 def means(t: np.ndarray, values: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Means of (n, k) values over the intervals between edges: the integral of the linear interpolation."""
+    """Means of (n, k) values over the intervals between edges: the integral of the linear
+    interpolation.
+    """
     dt = np.diff(t)[:, None]
-    total = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(0.5 * (values[1:] + values[:-1]) * dt, axis=0)])
+    total = np.concatenate(
+        [np.zeros((1, values.shape[1])), np.cumsum(0.5 * (values[1:] + values[:-1]) * dt, axis=0)]
+    )
     at = np.stack([np.interp(edges, t, column) for column in total.T], axis=1)
     return np.diff(at, axis=0) / np.diff(edges)[:, None]

@@ -10,6 +10,7 @@ from uwb_tdoa_bias.effects.covariates import CATEGORIES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from .base import ChannelResidual
 
 PIECES = 4
@@ -17,9 +18,12 @@ FEWEST = 100  # values
 
 
 def knots_of(name: str, residuals: Sequence[ChannelResidual]) -> tuple[float, ...] | None:
-    """Quantiles of a covariate at all that is looked at in several ChannelResiduals, or for one of names these names: tuple; None if it
-    hardly varies, or one of them does not know it."""
-    known = [values for values in (part.covariate(name) for part in residuals) if values is not None]
+    """Quantiles of a covariate at all that is looked at in several ChannelResiduals, or for one of
+    names these names: tuple; None if it hardly varies, or one of them does not know it.
+    """
+    known = [
+        values for values in (part.covariate(name) for part in residuals) if values is not None
+    ]
     if len(known) < len(residuals):
         return None
     values = np.concatenate(known)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -11,6 +11,7 @@ from .figures import APART, FEWEST, figures, rows_by_value
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from .base import Figures
     from .radio import RadioResidual
 
@@ -18,7 +19,9 @@ STRONGEST = 10
 
 
 def health(parts: Sequence[RadioResidual]) -> Figures:
-    """{"pairs", "anchors", "cross_correlation"} of the residuals of TDOAs of some flights in the air."""
+    """{"pairs", "anchors", "cross_correlation"} of the residuals of TDOAs of some flights in the
+    air.
+    """
     ids = parts[0].samples.anchors.ids
     t, r, a, b = (np.concatenate(column) for column in zip(*map(_columns, enumerate(parts))))
     pairs, each = [], []
@@ -37,16 +40,24 @@ def _name(label: int, ids: np.ndarray) -> str:
     return "-".join(str(ids[row]) for row in divmod(label, len(ids)))
 
 
-def _columns(numbered: tuple[int, RadioResidual]) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _columns(
+    numbered: tuple[int, RadioResidual],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     number, part = numbered
     rows, samples = part.airborne, part.samples
     return samples.t[rows] + APART * number, part.residual[rows], samples.a[rows], samples.b[rows]
 
 
-def _crossed(t: np.ndarray, r: np.ndarray, label: np.ndarray, anchors: np.ndarray) -> list[dict[str, Any]]:
-    """The strongest correlations between half-second means of two pairs: [{"pairs", "correlation"}]."""
+def _crossed(
+    t: np.ndarray, r: np.ndarray, label: np.ndarray, anchors: np.ndarray
+) -> list[dict[str, Any]]:
+    """The strongest correlations between half-second means of two pairs: [{"pairs",
+    "correlation"}].
+    """
     cell = np.unique((t * 2.0).astype(int), return_inverse=True)[1]
-    together = np.unique(np.stack([label, cell]), axis=1)[0]  # once for every cell in which a pair was heard
+    together = np.unique(np.stack([label, cell]), axis=1)[
+        0
+    ]  # once for every cell in which a pair was heard
     often, times = np.unique(together, return_counts=True)
     rows = np.isin(label, often[times > FEWEST])  # nothing is said of the others
     r, cell = r[rows], cell[rows]

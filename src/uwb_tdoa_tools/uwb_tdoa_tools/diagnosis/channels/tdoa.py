@@ -18,6 +18,7 @@ from .views import views_of_pairs
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from .base import Comparison, Figures
     from .views import CovariateView
 
@@ -30,7 +31,9 @@ class TdoaResidual(RadioResidual):
     label = "TDOA [m]"
 
     def place_in_room(self, series: int) -> str:
-        return "-".join(str(self.samples.anchors.ids[row]) for row in divmod(series, len(self.samples.anchors)))
+        return "-".join(
+            str(self.samples.anchors.ids[row]) for row in divmod(series, len(self.samples.anchors))
+        )
 
 
 class Tdoa(Channel[TdoaResidual]):
@@ -54,19 +57,27 @@ class Tdoa(Channel[TdoaResidual]):
                     out.append(SmoothTerm(covariate=name, form="anchor", knots=knots))
         for name in OF_ARRIVAL:
             if knots := knots_of(name, residuals):
-                out += [SmoothTerm(covariate=name, form=form, knots=knots) for form in ("arrival", "anchor")[: 1 if many else 2]]
+                out += [
+                    SmoothTerm(covariate=name, form=form, knots=knots)
+                    for form in ("arrival", "anchor")[: 1 if many else 2]
+                ]
         return out
 
     def views(self, residuals: Sequence[TdoaResidual]) -> list[CovariateView]:
         if any(part.innovations is not None for part in residuals):
             return []  # what the path follows is not left in them
         cells, many = [part.cells for part in residuals], are_many(residuals)
-        ends = [np.stack([part.samples.anchors.ids[rows] for rows in part.arrivals(part.cells.pair)]) for part in residuals]
+        ends = [
+            np.stack([part.samples.anchors.ids[rows] for rows in part.arrivals(part.cells.pair)])
+            for part in residuals
+        ]
         of_tdoa, of_arrival, quick = {}, {}, {}
         for name in (*OF_TDOA, *extra_names([part.samples for part in residuals])):
             if many and name in CATEGORIES:
                 continue
-            known = [v for v in (covariate_at(name, part.samples) for part in residuals) if v is not None]
+            known = [
+                v for v in (covariate_at(name, part.samples) for part in residuals) if v is not None
+            ]
             if len(known) < len(residuals):
                 continue
             if name in QUICK:

@@ -12,9 +12,14 @@ from .velocity_slip import VelocitySlipDetector
 DETECTORS = {
     detector.effect.name: detector
     for detector in (
-        NlosDetector(), OutlierRateDetector(), NoiseLevelDetector(), NoiseCorrelationDetector(),
-        FloorMultipathDetector(), FloorStepDetector(), VelocitySlipDetector(),
+        NlosDetector(),
+        OutlierRateDetector(),
+        NoiseLevelDetector(),
+        NoiseCorrelationDetector(),
+        FloorMultipathDetector(),
+        FloorStepDetector(),
+        VelocitySlipDetector(),
     )
-}  # fmt: skip
+}
 
 __all__ = ["DETECTORS", "Detection", "Detector"]

@@ -16,6 +16,7 @@ from .intervals import LEAST_GAIN, LONGEST, best_interval
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from ..regression.fit import Fit
     from ..regression.table import RegressionTable
 
@@ -25,19 +26,32 @@ PRIOR = 4.0  # information, 1/m^2, of what delays are plausible
 
 
 class NlosDetector(Detector):
-    """Tries every anchor over all intervals of one flight, and over spheres about places that were flown."""
+    """Tries every anchor over all intervals of one flight, and over spheres about places that were
+    flown.
+    """
 
     effect = EFFECTS["nlos"]
 
-    def search(self, table: RegressionTable, model: Fit, chosen: Sequence[Candidate]) -> list[Candidate]:
+    def search(
+        self, table: RegressionTable, model: Fit, chosen: Sequence[Candidate]
+    ) -> list[Candidate]:
         rows = table.rows_of("tdoa")
         part = table.tdoa_parts[0]
         a, b = part.arrivals(table.series[rows])
         information, residual = model.information(table)[rows], model.residual[rows]
-        keys = {key for candidate in chosen if candidate.name == self.effect.name for key in candidate.terms[0].keys}
+        keys = {
+            key
+            for candidate in chosen
+            if candidate.name == self.effect.name
+            for key in candidate.terms[0].keys
+        }
         spheres, out, anchors = _Spheres(table.place[rows]), [], len(part.samples.anchors)
         heard = csr_array(  # TDOAs (n, anchors), 1 where the anchor is the later one
-            (np.repeat([-1.0, 1.0], len(a)), (np.tile(np.arange(len(a)), 2), np.concatenate([a, b]))), shape=(len(a), anchors)
+            (
+                np.repeat([-1.0, 1.0], len(a)),
+                (np.tile(np.arange(len(a)), 2), np.concatenate([a, b])),
+            ),
+            shape=(len(a), anchors),
         ).tocsc()
         in_spheres = spheres.best(heard, information, residual)
         for row, anchor in enumerate(part.samples.anchors.ids.tolist()):
@@ -51,12 +65,16 @@ class NlosDetector(Detector):
             for gain, limits, price in searches:
                 if gain > LEAST_GAIN:
                     values = {f"{anchor}.{name}": value for name, value in limits.items()}
-                    out.append(Candidate((Term(self.effect(values, source="diagnose"), (key,)),), price))
+                    out.append(
+                        Candidate((Term(self.effect(values, source="diagnose"), (key,)),), price)
+                    )
         return out
 
 
 class _Spheres:
-    """Spheres about some of the places (n, 3) m that were flown; the same for every anchor, so found once."""
+    """Spheres about some of the places (n, 3) m that were flown; the same for every anchor, so
+    found once.
+    """
 
     def __init__(self, place: np.ndarray) -> None:
         self._centres = place[:: max(1, len(place) // CENTRES)]
@@ -68,9 +86,12 @@ class _Spheres:
         self._inside = csr_array((np.ones(len(rows)), rows, ends), shape=(len(inside), len(place)))
         self._constant = np.diff(ends) / len(place) > LONGEST
 
-    def best(self, heard: csc_array, information: np.ndarray, residual: np.ndarray) -> list[tuple[float, dict[str, float], float]]:
-        """Best (gain, {limit: value}, price of the search) of each anchor, as `best_interval` gives them. heard : sparse (n, anchors), 1
-        and -1; information, residual (n,)."""
+    def best(
+        self, heard: csc_array, information: np.ndarray, residual: np.ndarray
+    ) -> list[tuple[float, dict[str, float], float]]:
+        """Best (gain, {limit: value}, price of the search) of each anchor, as `best_interval` gives
+        them. heard : sparse (n, anchors), 1 and -1; information, residual (n,).
+        """
         inside = self._inside.multiply(information[None, :]).tocsr()
         score, power = inside.multiply(residual[None, :]).tocsr() @ heard, inside @ abs(heard)
         gain = np.maximum(score.toarray(), 0.0) ** 2 / (power.toarray() + PRIOR)

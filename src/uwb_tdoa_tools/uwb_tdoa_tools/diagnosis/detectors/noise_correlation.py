@@ -13,11 +13,14 @@ from .series import series_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from ..channels import ChannelResiduals
     from .series import Series
 
 SURE = 4.0  # standard errors
-LAGS = np.array([0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5])  # s, edges of the bins of the autocovariance
+LAGS = np.array(
+    [0.05, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0, 1.5]
+)  # s, edges of the bins of the autocovariance
 CLIP = 5.0  # spreads that an outlier counts as
 TIMES = np.geomspace(0.05, 5.0, 60)  # s, that are tried
 FEWEST, FEWEST_BLOCKS = 50, 4
@@ -29,7 +32,9 @@ class NoiseCorrelationDetector(Detector):
     effect = EFFECTS["noise_correlation"]
 
     def detect(self, residuals: Sequence[ChannelResiduals]) -> Detection | None:
-        sums = [_products(series) for series in series_of(residuals)]  # per block: products and counts by lag
+        sums = [
+            _products(series) for series in series_of(residuals)
+        ]  # per block: products and counts by lag
         product, count = (np.concatenate([s[k] for s in sums]) for k in range(2))
         filled = count.sum(axis=0) > FEWEST
         if filled.sum() < 2:
@@ -48,14 +53,19 @@ class NoiseCorrelationDetector(Detector):
         std = np.sqrt(0.5 * power[best])
         if std < self.effect.negligible:
             return None
-        # The amplitude is known better than the time: rough figures from simulated flights of a minute.
+        # The amplitude is known better than the time: rough figures from simulated flights of a
+        # minute.
         errors = {"std": 0.1 * std, "time": 0.3 * TIMES[best]}
         effect = self.effect({"std": std, "time": TIMES[best]}, errors, "diagnose")
-        return Detection(effect, "tdoa", {"standard_errors": round(float(covariance[0] / error), 1)})
+        return Detection(
+            effect, "tdoa", {"standard_errors": round(float(covariance[0] / error), 1)}
+        )
 
 
 def _products(series: Series) -> tuple[np.ndarray, np.ndarray]:
-    """(blocks, bins) sums of products of residuals of one pair, and their counts, by the time between them."""
+    """(blocks, bins) sums of products of residuals of one pair, and their counts, by the time
+    between them.
+    """
     scale = 1.4826 * np.median(np.abs(series.residual))
     label = series.label()
     r = np.clip(series.residual, -CLIP * scale, CLIP * scale)

@@ -15,6 +15,7 @@ from .series import series_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from ..channels import ChannelResiduals
 
 NEAR = 0.3  # s, within which two TDOAs of a pair share their slow error
@@ -41,14 +42,18 @@ class NoiseLevelDetector(Detector):
                 steps.setdefault(number, []).append(step[rows])
         joined = {link: np.concatenate(several) for link, several in steps.items()}
         size = {
-            link: (1.4826 * np.median(np.abs(s)) / np.sqrt(2.0), len(s)) for link, s in joined.items() if len(s) >= FEWEST
+            link: (1.4826 * np.median(np.abs(s)) / np.sqrt(2.0), len(s))
+            for link, s in joined.items()
+            if len(s) >= FEWEST
         }
         if len(size) < FEWEST_LINKS:
             return None
         level = np.median([s for s, _ in size.values()])
         values, std, evidence = {}, {}, 0.0
         for link, (s, count) in size.items():
-            error = 1.17 * s / np.sqrt(count)  # of a MAD; steps share their samples, hence not sqrt(2 count)
+            error = (
+                1.17 * s / np.sqrt(count)
+            )  # of a MAD; steps share their samples, hence not sqrt(2 count)
             extra = np.sqrt(max(s**2 - level**2, 0.0))
             if s > RATIO * level and s - level > SURE * error and extra > self.effect.negligible:
                 key = f"{ids[link // len(ids)]}-{ids[link % len(ids)]}"

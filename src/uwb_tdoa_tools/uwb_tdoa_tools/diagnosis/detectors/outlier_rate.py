@@ -13,6 +13,7 @@ from .series import series_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from ..channels import ChannelResiduals
     from .series import Series
 
@@ -32,7 +33,9 @@ class OutlierRateDetector(Detector):
         if share - 2.0 * error < self.effect.negligible:
             return None
         effect = self.effect({"share": share}, {"share": error}, "diagnose")
-        return Detection(effect, "tdoa", {"standard_errors": round(float(share / max(error, 1e-9)), 1)})
+        return Detection(
+            effect, "tdoa", {"standard_errors": round(float(share / max(error, 1e-9)), 1)}
+        )
 
 
 def _shares(series: Series) -> list[float]:

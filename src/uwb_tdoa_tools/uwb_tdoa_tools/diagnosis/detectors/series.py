@@ -13,13 +13,16 @@ from ..regression.table import BLOCK
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from ..channels import ChannelResiduals
     from ..channels.tdoa import TdoaResidual
 
 
 @dataclass(frozen=True)
 class Series:
-    """t (n,) s; residual (n,) m; a, b (n,) anchor rows; pair (n,) a number for each ordered pair; block (n,) of 5 s."""
+    """t (n,) s; residual (n,) m; a, b (n,) anchor rows; pair (n,) a number for each ordered pair;
+    block (n,) of 5 s.
+    """
 
     t: np.ndarray
     residual: np.ndarray

@@ -1,4 +1,7 @@
-"""What a flight is compared with, and how well each coordinate of it is known. One kind of reference, one file."""
+"""What a flight is compared with, and how well each coordinate of it is known.
+
+One kind of reference, one file.
+"""
 
 from .base import Reference, ReferenceView
 from .ground_truth import GroundTruth
@@ -9,9 +12,22 @@ from .odometry import OdometryReference
 from .path import OdometryPath
 
 # Made of a FilterConfig and constraints
-REFERENCES = {"truth": GroundTruth, "heights": Heights, "marks": Marks, "odometry": OdometryReference, "nothing": Nothing}
+REFERENCES = {
+    "truth": GroundTruth,
+    "heights": Heights,
+    "marks": Marks,
+    "odometry": OdometryReference,
+    "nothing": Nothing,
+}
 
 __all__ = [
-    "REFERENCES", "GroundTruth", "Heights", "Marks", "Nothing", "OdometryReference", "OdometryPath", "Reference",
+    "REFERENCES",
+    "GroundTruth",
+    "Heights",
+    "Marks",
+    "Nothing",
+    "OdometryReference",
+    "OdometryPath",
+    "Reference",
     "ReferenceView",
-]  # fmt: skip
+]

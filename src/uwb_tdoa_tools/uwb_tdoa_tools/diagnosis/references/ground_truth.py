@@ -13,9 +13,11 @@ from .base import Reference, ReferenceView
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from uwb_tdoa_bias.effects import EffectSet
     from uwb_tdoa_bias.foundation.flight import Flight
     from uwb_tdoa_ekf.core.config import FilterConfig
+
     from ..constraints import Constraint
     from .path import OdometryPath
 
@@ -27,18 +29,26 @@ class GroundTruth(Reference):
     knows_floor = True
 
     def __init__(
-        self, config: FilterConfig | None = None, constraints: Sequence[Constraint | OdometryPath] = (),
+        self,
+        config: FilterConfig | None = None,
+        constraints: Sequence[Constraint | OdometryPath] = (),
         align: str = NONE,
-    ) -> None:  # fmt: skip
-        """config : FilterConfig and constraints, which no known pose needs; align : as of `settled`."""
+    ) -> None:
+        """config : FilterConfig and constraints, which no known pose needs; align : as of
+        `settled`.
+        """
         self._align = align
 
     def prepare(self, flight: Flight) -> Flight:
         if flight.truth is None or len(flight.truth) < 2:
-            raise InputError(f"{flight.name}: holds no ground truth to compare with; give --no-truth.")
+            raise InputError(
+                f"{flight.name}: holds no ground truth to compare with; give --no-truth."
+            )
         return flight
 
-    def settled(self, flight: Flight, base: EffectSet, config: FilterConfig | None = None) -> tuple[Flight, tuple[str, ...]]:
+    def settled(
+        self, flight: Flight, base: EffectSet, config: FilterConfig | None = None
+    ) -> tuple[Flight, tuple[str, ...]]:
         return settled(flight, base, config, self._align)
 
     def view(self, flight: Flight, effects: EffectSet) -> ReferenceView:

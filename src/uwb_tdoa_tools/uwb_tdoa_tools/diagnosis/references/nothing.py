@@ -16,8 +16,10 @@ from .base import Reference, ReferenceView
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from uwb_tdoa_bias.effects import EffectSet
     from uwb_tdoa_bias.foundation.flight import Flight
+
     from ..constraints import Constraint
 
 TRUTHS = "_truth"  # how streams are called in which a simulation tells what was true
@@ -30,9 +32,11 @@ def without_truth(flight: Flight) -> Flight:
 
 
 class Nothing(Reference):
-    """Residuals are the innovations of the filter, of TDOAs, or of ranges in a flight without any; what the path follows of an effect is
-    taken out of its regressors, with all that the filter knows of the path. An offset of all ranges is taken out before: it would bend the
-    path, and `self_calibrate` estimates it."""
+    """Residuals are the innovations of the filter, of TDOAs, or of ranges in a flight without any;
+    what the path follows of an effect is taken out of its regressors, with all that the filter
+    knows of the path. An offset of all ranges is taken out before: it would bend the path, and
+    `self_calibrate` estimates it.
+    """
 
     positions_known = (False, False, False)
     attitude_known = False
@@ -40,11 +44,20 @@ class Nothing(Reference):
     words = "nothing but the flights themselves"
 
     def __init__(
-        self, config: FilterConfig | None = None, constraints: Sequence[Constraint] = (), streams: Sequence[str] = ()
+        self,
+        config: FilterConfig | None = None,
+        constraints: Sequence[Constraint] = (),
+        streams: Sequence[str] = (),
     ) -> None:
-        """config : FilterConfig; constraints : what is known beside (`diagnosis/constraints`); streams : whose innovations are
-        residuals, as of `record_innovations`; their offset stays in the ranges then. None: as said above."""
-        self._config, self.constraints, self._streams = config or FilterConfig(), tuple(constraints), tuple(streams)
+        """config : FilterConfig; constraints : what is known beside (`diagnosis/constraints`);
+        streams : whose innovations are residuals, as of `record_innovations`; their offset stays in
+        the ranges then. None: as said above.
+        """
+        self._config, self.constraints, self._streams = (
+            config or FilterConfig(),
+            tuple(constraints),
+            tuple(streams),
+        )
 
     def prepare(self, flight: Flight) -> Flight:
         return without_truth(flight)

@@ -1,1 +1,3 @@
-"""Linear regression of residuals on effects: tables, robust fits, selection, held-out checks, confounding."""
+"""Linear regression of residuals on effects: tables, robust fits, selection, held-out checks,
+confounding.
+"""

@@ -1,8 +1,10 @@
-"""Products of matrices of columns: dense, or scipy's sparse ones where most of what they hold is zero."""
+"""Products of matrices of columns: dense, or scipy's sparse ones where most of what they hold is
+zero.
+"""
 
 from __future__ import annotations
 
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.sparse import csc_array, csr_array, hstack, issparse
@@ -15,9 +17,15 @@ Matrix = Any  # an array, or a sparse one of scipy
 
 def stacked(columns: Sequence[Any], n: int) -> Matrix:
     """Sparse matrix (n, k) of columns, each a pair (rows, values) or an array (n,)."""
-    pairs = [column if isinstance(column, tuple) else (np.flatnonzero(column), column[column != 0.0]) for column in columns]
+    pairs = [
+        column if isinstance(column, tuple) else (np.flatnonzero(column), column[column != 0.0])
+        for column in columns
+    ]
     ends = np.cumsum([0, *(len(rows) for rows, _ in pairs)])
-    rows, values = (np.concatenate([np.empty(0, kind), *(pair[k] for pair in pairs)]) for k, kind in enumerate((np.int64, float)))
+    rows, values = (
+        np.concatenate([np.empty(0, kind), *(pair[k] for pair in pairs)])
+        for k, kind in enumerate((np.int64, float))
+    )
     return csc_array((values, rows, ends), shape=(n, len(columns)))
 
 
@@ -44,14 +52,20 @@ def counts(x: Matrix, axis: int) -> np.ndarray:
 def sums_by(label: np.ndarray, x: Matrix, labels: int) -> np.ndarray:
     """Sums of the rows of x (n, k) that have each label (n,) of 0 ... labels - 1: (labels, k)."""
     if issparse(x):
-        members = csr_array((np.ones(len(label)), (label, np.arange(len(label)))), shape=(labels, len(label)))
+        members = csr_array(
+            (np.ones(len(label)), (label, np.arange(len(label)))), shape=(labels, len(label))
+        )
         return dense(members @ x)
     return np.stack([np.bincount(label, column, labels) for column in x.T], axis=1)
 
 
 def beside_each_other(several: Sequence[Matrix]) -> Matrix:
     """One matrix of the columns of several."""
-    return hstack(several, format="csc") if any(map(issparse, several)) else np.concatenate(several, axis=1)
+    return (
+        hstack(several, format="csc")
+        if any(map(issparse, several))
+        else np.concatenate(several, axis=1)
+    )
 
 
 def each_times(x: Matrix, functions: np.ndarray) -> Matrix:

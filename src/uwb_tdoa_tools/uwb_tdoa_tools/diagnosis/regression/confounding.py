@@ -1,4 +1,6 @@
-"""What a finding could be mistaken for in these very flights, and what is not observable in the flights at all."""
+"""What a finding could be mistaken for in these very flights, and what is not observable in the
+flights at all.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +17,7 @@ from .terms import columns_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from .select import Selection
     from .terms import Candidate, Column
 
@@ -25,9 +28,10 @@ ANY_FLIGHT = "a flight on which the two contributions differ: other places, head
 
 @dataclass(frozen=True)
 class Alternative:
-    """An effect that a finding could as well be. share : of the finding's contribution that it would explain, None if
-    less than ALIKE; gap : by how much its criterion is worse, None if more than undecided; tell_apart : which flight would
-    tell."""
+    """An effect that a finding could as well be. share : of the finding's contribution that it
+    would explain, None if less than ALIKE; gap : by how much its criterion is worse, None if more
+    than undecided; tell_apart : which flight would tell.
+    """
 
     effect: str
     share: float | None
@@ -37,8 +41,9 @@ class Alternative:
 
 @dataclass(frozen=True)
 class Unobservable:
-    """A combination of parameters, {key: weight}, of an effect that leaves no trace in the flights; None: the effect has
-    no channel there."""
+    """A combination of parameters, {key: weight}, of an effect that leaves no trace in the flights;
+    None: the effect has no channel there.
+    """
 
     effect: str
     direction: dict[str, float] | None
@@ -53,25 +58,36 @@ def flight_to_tell(effect: str, other: str) -> str:
     return ANY_FLIGHT
 
 
-def alternatives(selection: Selection, candidate: Candidate, candidates: Sequence[Candidate]) -> list[Alternative]:
-    """[Alternative] of a chosen Candidate, the nearest first: `candidates`, all declared ones, that explain at least ALIKE
-    of what it contributes beyond the rest of the model, and rivals whose criterion is as good."""
+def alternatives(
+    selection: Selection, candidate: Candidate, candidates: Sequence[Candidate]
+) -> list[Alternative]:
+    """[Alternative] of a chosen Candidate, the nearest first: `candidates`, all declared ones, that
+    explain at least ALIKE of what it contributes beyond the rest of the model, and rivals whose
+    criterion is as good.
+    """
     rivals = selection.rivals[selection.chosen.index(candidate)]
     gaps = {rival.candidate.title: rival.gap for rival in rivals}
     shares = _shares(selection, candidate, candidates)
-    names = sorted({*gaps, *shares}, key=lambda name: (gaps.get(name, np.inf), -shares.get(name, 0.0)))
+    names = sorted(
+        {*gaps, *shares}, key=lambda name: (gaps.get(name, np.inf), -shares.get(name, 0.0))
+    )
     return [
-        Alternative(name, shares.get(name), gaps.get(name), flight_to_tell(candidate.name, name)) for name in names
+        Alternative(name, shares.get(name), gaps.get(name), flight_to_tell(candidate.name, name))
+        for name in names
     ]
 
 
-def _shares(selection: Selection, candidate: Candidate, candidates: Sequence[Candidate]) -> dict[str, float]:
+def _shares(
+    selection: Selection, candidate: Candidate, candidates: Sequence[Candidate]
+) -> dict[str, float]:
     table, model = selection.table, selection.fit
     root = np.sqrt(model.information(table))
     others = columns_of([one for one in selection.chosen if one is not candidate])
     basis = None
     if others:
-        rest = np.vstack([dense(weighted(table.matrix(others), root)), np.diag(1.0 / prior_sizes(others))])
+        rest = np.vstack(
+            [dense(weighted(table.matrix(others), root)), np.diag(1.0 / prior_sizes(others))]
+        )
         basis = np.linalg.qr(rest)[0][: len(root)]
 
     def free(x: np.ndarray) -> np.ndarray:
@@ -86,7 +102,9 @@ def _shares(selection: Selection, candidate: Candidate, candidates: Sequence[Can
             continue
         x, sizes = weighted(table.matrix(columns), root), prior_sizes(columns)
         gram, vector = product(x, x), x.T @ part
-        if basis is not None:  # of what the basis leaves of them, without making a dense matrix of it
+        if (
+            basis is not None
+        ):  # of what the basis leaves of them, without making a dense matrix of it
             held = x.T @ basis
             gram = gram - held @ (2.0 * np.eye(len(held.T)) - basis.T @ basis) @ held.T
             vector = vector - held @ (basis.T @ part)
@@ -106,8 +124,10 @@ def _whole(candidates: Sequence[Candidate]) -> dict[str, Sequence[Column]]:
 
 
 def unobservable(selection: Selection, candidates: Sequence[Candidate]) -> list[Unobservable]:
-    """[Unobservable]: combinations of parameters of a declared effect that the flights determine less than plausibility
-    does, by the eigenvectors of the information of a fit of that effect alone."""
+    """[Unobservable]: combinations of parameters of a declared effect that the flights determine
+    less than plausibility does, by the eigenvectors of the information of a fit of that effect
+    alone.
+    """
     table, out = selection.table, []
     root, whole = selection.fit.information(table), _whole(candidates)
     for name, columns in whole.items():
@@ -117,7 +137,11 @@ def unobservable(selection: Selection, candidates: Sequence[Candidate]) -> list[
         for value, vector in zip(values, vectors.T):
             if value < 1.0:
                 strong = np.abs(vector) >= DISTINCT * np.abs(vector).max()
-                named = {column.key: round(float(w), 2) for column, w, s in zip(columns, vector, strong) if s}
+                named = {
+                    column.key: round(float(w), 2)
+                    for column, w, s in zip(columns, vector, strong)
+                    if s
+                }
                 out.append(Unobservable(name, named))
     missing = [name for name, effect in EFFECTS.items() if effect.fitted and name not in whole]
     return out + [Unobservable(name, None) for name in missing]

@@ -1,8 +1,9 @@
 """Robust linear fits of a RegressionTable, and what one is worth.
 
-Noise is Student's t with NU degrees of freedom, fitted by iteratively re-weighted least squares (Lange, Little and
-Taylor, JASA 1989). Rows are not independent: each axis of a channel has a scale, and the information of every
-channel is divided by an inflation that is measured on the residuals of blocks.
+Noise is Student's t with NU degrees of freedom, fitted by iteratively re-weighted least squares
+(Lange, Little and Taylor, JASA 1989). Rows are not independent: each axis of a channel has a scale,
+and the information of every channel is divided by an inflation that is measured on the residuals of
+blocks.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from .table import AXES
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from .table import RegressionTable
     from .terms import Column
 
@@ -31,8 +33,10 @@ LASTING = 0.1  # share of the rows in which a column must be, to tell what they 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """columns, beta (k,), cov (k, k): block sandwich, not below the model's; residual (n,), weight (n,) 0 to 1.25;
-    scale, inflation, size (groups,): spread of a row, loss of independence, effective number of rows."""
+    """columns, beta (k,), cov (k, k): block sandwich, not below the model's; residual (n,), weight
+    (n,) 0 to 1.25; scale, inflation, size (groups,): spread of a row, loss of independence,
+    effective number of rows.
+    """
 
     columns: tuple[Column, ...]
     beta: np.ndarray
@@ -44,14 +48,21 @@ class Fit:
     size: np.ndarray
 
     def information(self, table: RegressionTable) -> np.ndarray:
-        """What each row of the RegressionTable counts for, (n,), in independent rows per squared unit."""
+        """What each row of the RegressionTable counts for, (n,), in independent rows per squared
+        unit.
+        """
         return self.weight / (self.scale**2 * self.inflation)[table.group]
 
     def likelihood(self, table: RegressionTable) -> float:
-        """Twice the log-likelihood of Student's t, in independent rows, less what the prior says of beta."""
+        """Twice the log-likelihood of Student's t, in independent rows, less what the prior says of
+        beta.
+        """
         scale = self.scale[table.group]
         rows = 2.0 * np.log(scale) + (NU + 1.0) * np.log1p((self.residual / scale) ** 2 / NU)
-        return -float(np.sum(rows / self.inflation[table.group]) + np.sum((self.beta / prior_sizes(self.columns)) ** 2))
+        return -float(
+            np.sum(rows / self.inflation[table.group])
+            + np.sum((self.beta / prior_sizes(self.columns)) ** 2)
+        )
 
     def values(self, columns: Sequence[Column]) -> np.ndarray:
         """beta of some Columns, (k,)."""
@@ -59,10 +70,13 @@ class Fit:
         return self.beta[[place[column] for column in columns]]
 
 
-def solve(gram: np.ndarray, vector: np.ndarray, sizes: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Solution of normal equations with a Gaussian prior of standard deviations `sizes`: (beta, covariance, number of
-    parameters that the data determine: each counts by how little the prior says of it). What the data do not determine
-    stays 0."""
+def solve(
+    gram: np.ndarray, vector: np.ndarray, sizes: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, float]:
+    """Solution of normal equations with a Gaussian prior of standard deviations `sizes`: (beta,
+    covariance, number of parameters that the data determine: each counts by how little the prior
+    says of it). What the data do not determine stays 0.
+    """
     if len(vector) == 0:
         return vector, np.zeros((0, 0)), 0.0
     scaled = gram * np.outer(sizes, sizes) + np.eye(len(vector))
@@ -74,7 +88,12 @@ def solve(gram: np.ndarray, vector: np.ndarray, sizes: np.ndarray) -> tuple[np.n
 def _solution(gram: np.ndarray, vector: np.ndarray, sizes: np.ndarray) -> np.ndarray:
     """The first of `solve`, in a third of the time."""
     return sizes * cho_solve(
-        cho_factor(gram * np.outer(sizes, sizes) + np.eye(len(vector)), overwrite_a=True, check_finite=False), sizes * vector
+        cho_factor(
+            gram * np.outer(sizes, sizes) + np.eye(len(vector)),
+            overwrite_a=True,
+            check_finite=False,
+        ),
+        sizes * vector,
     )
 
 
@@ -84,10 +103,16 @@ def prior_sizes(columns: Sequence[Column]) -> np.ndarray:
 
 
 def fit(
-    table: RegressionTable, columns: Sequence[Column], inflation: np.ndarray | None = None, covariance: bool = True, near: Fit | None = None
+    table: RegressionTable,
+    columns: Sequence[Column],
+    inflation: np.ndarray | None = None,
+    covariance: bool = True,
+    near: Fit | None = None,
 ) -> Fit:
-    """Fit of some Columns of a RegressionTable. inflation : (groups,), measured on this very fit if None; covariance : whether
-    somebody asks for it; near : Fit of nearly the same Columns, from which that of a sparse RegressionTable begins."""
+    """Fit of some Columns of a RegressionTable. inflation : (groups,), measured on this very fit if
+    None; covariance : whether somebody asks for it; near : Fit of nearly the same Columns, from
+    which that of a sparse RegressionTable begins.
+    """
     x, group, sizes = table.matrix(columns), table.group, prior_sizes(columns)
     weight, beta = np.ones(len(table.y)), np.zeros(len(columns))
     residual = table.y.copy() if near is None or not table.sparse else near.residual.copy()
@@ -108,14 +133,19 @@ def fit(
     if inflation is None:
         inflation = measure_inflation(table, residual, weight, scale, columns)
     root = weight / (scale[group] ** 2 * inflation[group])
-    cov = _covariance(table, columns, residual, root) if columns and covariance else np.zeros((0, 0))
+    cov = (
+        _covariance(table, columns, residual, root) if columns and covariance else np.zeros((0, 0))
+    )
     size = np.bincount(group, minlength=len(scale)) / inflation
     return Fit(tuple(columns), beta, cov, residual, weight, scale, inflation, np.maximum(size, 1.0))
 
 
-def refit(table: RegressionTable, columns: Sequence[Column], model: Fit, rows: np.ndarray | None = None) -> Fit:
-    """Fit of some Columns with the weights and scales of another Fit; rows : (n,) bool, those that it is made to alone, with the
-    covariance of the model."""
+def refit(
+    table: RegressionTable, columns: Sequence[Column], model: Fit, rows: np.ndarray | None = None
+) -> Fit:
+    """Fit of some Columns with the weights and scales of another Fit; rows : (n,) bool, those that
+    it is made to alone, with the covariance of the model.
+    """
     x, sizes, root = table.matrix(columns), prior_sizes(columns), model.information(table)
     some = slice(None) if rows is None else rows
     xw = weighted(x[some], root[some])
@@ -152,18 +182,27 @@ def student_scale(r: np.ndarray) -> float:
 
 
 def in_common(table: RegressionTable, columns: Sequence[Column]) -> np.ndarray:
-    """(k, k), what makes of the values of one effect among some Columns the mean of all, where that cancels in every row, as that of the
-    delays of all anchors does in TDOAs; 0 elsewhere. A fit leaves that mean at 0, and its deviation would be that of the prior."""
+    """(k, k), what makes of the values of one effect among some Columns the mean of all, where that
+    cancels in every row, as that of the delays of all anchors does in TDOAs; 0 elsewhere. A fit
+    leaves that mean at 0, and its deviation would be that of the prior.
+    """
     out = np.zeros((len(columns), len(columns)))
     for effect in dict.fromkeys(column.effect for column in columns):
         places = [k for k, column in enumerate(columns) if column.effect == effect]
-        if len(places) > 1 and np.abs(table.matrix([columns[k] for k in places]).sum(axis=1)).max() < CANCELS:
+        if (
+            len(places) > 1
+            and np.abs(table.matrix([columns[k] for k in places]).sum(axis=1)).max() < CANCELS
+        ):
             out[np.ix_(places, places)] = 1.0 / len(places)
     return out
 
 
-def _covariance(table: RegressionTable, columns: Sequence[Column], residual: np.ndarray, root: np.ndarray) -> np.ndarray:
-    """Sandwich over blocks, at least the model's own; of delays apart from what all have `in_common`."""
+def _covariance(
+    table: RegressionTable, columns: Sequence[Column], residual: np.ndarray, root: np.ndarray
+) -> np.ndarray:
+    """Sandwich over blocks, at least the model's own; of delays apart from what all have
+    `in_common`.
+    """
     x, sizes = table.matrix(columns), prior_sizes(columns)
     _, bread, _ = solve(product(weighted(x, root), x), np.zeros(x.shape[1]), sizes)
     apart = np.eye(len(columns)) - in_common(table, columns)
@@ -180,14 +219,19 @@ def _covariance(table: RegressionTable, columns: Sequence[Column], residual: np.
 
 
 def measure_inflation(
-    table: RegressionTable, residual: np.ndarray, weight: np.ndarray, scale: np.ndarray, columns: Sequence[Column]
+    table: RegressionTable,
+    residual: np.ndarray,
+    weight: np.ndarray,
+    scale: np.ndarray,
+    columns: Sequence[Column],
 ) -> np.ndarray:
-    """By how much fewer the independent rows of each channel are: (groups,), at least 1. Of its axes the median: what one has that the
-    others have not is an effect.
+    """By how much fewer the independent rows of each channel are: (groups,), at least 1. Of its
+    axes the median: what one has that the others have not is an effect.
 
-    The larger of two: 1 + 2 sum(rho) over the autocorrelation of each series up to 3 s, and how much larger sums of
-    scores over blocks are than those of independent rows would be, averaged over the columns. The second sees
-    what series have in common. The residual should be that of a fit with all columns, or effects count as noise.
+    The larger of two: 1 + 2 sum(rho) over the autocorrelation of each series up to 3 s, and how
+    much larger sums of scores over blocks are than those of independent rows would be, averaged
+    over the columns. The second sees what series have in common. The residual should be that of a
+    fit with all columns, or effects count as noise.
     """
     out = _one_each(table)
     x = table.matrix(columns)
@@ -195,8 +239,12 @@ def measure_inflation(
         r = weight[rows] * residual[rows] / scale[k]
         raw = max(1.0, _temporal(table, rows, r), _clustered(table.block[rows], x[rows], r))
         spent = np.count_nonzero(counts(x[rows], 0)) * raw / len(r)
-        raw = raw / (1.0 - min(spent, 0.6)) if raw > 1.2 else raw  # the fit has followed some of the noise
-        out[k] = max(1.0, min(raw, len(r) / len(np.unique(table.block[rows]))))  # blocks are independent
+        raw = (
+            raw / (1.0 - min(spent, 0.6)) if raw > 1.2 else raw
+        )  # the fit has followed some of the noise
+        out[k] = max(
+            1.0, min(raw, len(r) / len(np.unique(table.block[rows])))
+        )  # blocks are independent
     for name in table.present:
         axes = np.unique(table.group[table.rows_of(name)])
         out[axes] = np.median(out[axes])

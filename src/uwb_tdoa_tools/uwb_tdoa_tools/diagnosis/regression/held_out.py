@@ -13,6 +13,7 @@ from .terms import columns_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from .fit import Fit
     from .select import Selection
     from .table import RegressionTable
@@ -24,8 +25,10 @@ CLIP = 5.0  # spreads that an outlier counts as
 
 @dataclass(frozen=True, order=True)
 class HeldOut:
-    """gain : twice the log-likelihood, in independent rows, that a Candidate brings on rows that it was not fitted to; t :
-    its t value over blocks; explained : share of the variance of the axis or channel that gains most."""
+    """gain : twice the log-likelihood, in independent rows, that a Candidate brings on rows that it
+    was not fitted to; t : its t value over blocks; explained : share of the variance of the axis or
+    channel that gains most.
+    """
 
     gain: float
     t: float
@@ -33,27 +36,40 @@ class HeldOut:
 
 
 def held_out(selection: Selection, by_flight: bool = False) -> list[HeldOut]:
-    """[HeldOut] of every chosen Candidate: fitted with and without it on the other folds, with the weights and scales of
-    the whole fit. by_flight : a fold is a flight; else blocks are dealt out in turn."""
+    """[HeldOut] of every chosen Candidate: fitted with and without it on the other folds, with the
+    weights and scales of the whole fit. by_flight : a fold is a flight; else blocks are dealt out
+    in turn.
+    """
     table, model, chosen = selection.table, selection.fit, selection.chosen
-    folds = _Folds(table, model, columns_of(chosen), table.flight if by_flight else table.block % FOLDS)
+    folds = _Folds(
+        table, model, columns_of(chosen), table.flight if by_flight else table.block % FOLDS
+    )
     whole = folds.residual(columns_of(chosen))
     out = []
     for k, candidate in enumerate(chosen):
         rest = folds.residual(columns_of(chosen[:k] + chosen[k + 1 :]))
         touched = counts(table.matrix(candidate.columns), 1) > 0
-        gain = (_loss(table, model, rest) - _loss(table, model, whole)) / model.inflation[table.group]
-        blocks, of_blocks = np.unique(table.block[touched]), np.bincount(table.block[touched], gain[touched])
+        gain = (_loss(table, model, rest) - _loss(table, model, whole)) / model.inflation[
+            table.group
+        ]
+        blocks, of_blocks = (
+            np.unique(table.block[touched]),
+            np.bincount(table.block[touched], gain[touched]),
+        )
         sums = of_blocks[blocks] if touched.any() else np.zeros(1)
         t = sums.sum() / max(np.sqrt(len(sums)) * sums.std(), 1e-9)
-        out.append(HeldOut(float(sums.sum()), float(t), _explained(table, model, rest, whole, touched)))
+        out.append(
+            HeldOut(float(sums.sum()), float(t), _explained(table, model, rest, whole, touched))
+        )
     return out
 
 
 class _Folds:
     """Normal equations of all columns, fold by fold."""
 
-    def __init__(self, table: RegressionTable, model: Fit, columns: Sequence[Column], folds: np.ndarray) -> None:
+    def __init__(
+        self, table: RegressionTable, model: Fit, columns: Sequence[Column], folds: np.ndarray
+    ) -> None:
         self.table, self.folds = table, folds
         self._place = {column: k for k, column in enumerate(columns)}
         self._x, self._sizes = table.matrix(columns), prior_sizes(columns)
@@ -71,7 +87,9 @@ class _Folds:
             return out
         at = np.array([self._place[column] for column in columns])
         for fold, (gram, vector) in self._parts.items():
-            beta, _, _ = solve((self._gram - gram)[np.ix_(at, at)], (self._vector - vector)[at], self._sizes[at])
+            beta, _, _ = solve(
+                (self._gram - gram)[np.ix_(at, at)], (self._vector - vector)[at], self._sizes[at]
+            )
             rows = self.folds == fold
             out[rows] -= self._x[rows][:, at] @ beta
         return out
@@ -82,9 +100,12 @@ def _loss(table: RegressionTable, model: Fit, residual: np.ndarray) -> np.ndarra
     return (NU + 1.0) * np.log1p((residual / model.scale[table.group]) ** 2 / NU)
 
 
-def _explained(table: RegressionTable, model: Fit, before: np.ndarray, after: np.ndarray, touched: np.ndarray) -> float:
-    """Share of the variance, with outliers at CLIP spreads, that goes from `before` to `after` in the group that gains most, over the
-    rows (n,) bool that are touched."""
+def _explained(
+    table: RegressionTable, model: Fit, before: np.ndarray, after: np.ndarray, touched: np.ndarray
+) -> float:
+    """Share of the variance, with outliers at CLIP spreads, that goes from `before` to `after` in
+    the group that gains most, over the rows (n,) bool that are touched.
+    """
     best = 0.0
     for k in np.unique(table.group[touched]):
         mine = (table.group == k) & touched

@@ -1,9 +1,11 @@
-"""A fast look at thousands of functions that nobody has declared: of one anchor, pair, direction or axis, over one covariate.
+"""A fast look at thousands of functions that nobody has declared: of one anchor, pair, direction or
+axis, over one covariate.
 
-Each is a level and one simple shape: a line, a rise beyond or below a point, a step, an interval, a wave. What the residual
-of a fit would gain by each is a score test: the products of a few columns with the residual and with each other, free of what the
-model holds already (Schur complement), give all shapes of a subset and a covariate in closed form. The best few become
-candidates and are judged like all others; they pay for the number that was looked at.
+Each is a level and one simple shape: a line, a rise beyond or below a point, a step, an interval, a
+wave. What the residual of a fit would gain by each is a score test: the products of a few columns
+with the residual and with each other, free of what the model holds already (Schur complement), give
+all shapes of a subset and a covariate in closed form. The best few become candidates and are judged
+like all others; they pay for the number that was looked at.
 """
 
 from __future__ import annotations
@@ -24,36 +26,51 @@ from .terms import Candidate, Term, columns_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+
     from ..channels.views import CovariateView
     from .fit import Fit
     from .table import RegressionTable
 
     _Held = tuple[np.ndarray, np.ndarray, np.ndarray]  # as `_held` gives it
-    _Item = tuple[float, "_Shapes", str, tuple[float, ...], int]  # gain, shapes, shape, knots, how many were tried
+    _Item = tuple[
+        float, "_Shapes", str, tuple[float, ...], int
+    ]  # gain, shapes, shape, knots, how many were tried
 
 BINS = 16  # between whose edges steps, intervals and rises begin and end
 PERIODS = (0.8, 1.0, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5, 3.0)  # of a wave between the ends
 WIDEST = 10  # bins of an interval; a longer one is two steps
-CROWDED = 0.02  # of the range; bins that are narrower would tell noise of the covariate, which the residual may share
+# of the range; bins that are narrower would tell noise of the covariate, which the residual may
+# share
+CROWDED = 0.02
 NOISY = 1.5  # times the noise of most series that any may have
 FINER = 9  # places between two bins where a knot is tried again
 FEWEST = 12  # values of a subset
-MANY_VALUES, LEVELS = 4096, 256  # of more values levels are told apart, where there are MANY anchors
+MANY_VALUES, LEVELS = (
+    4096,
+    256,
+)  # of more values levels are told apart, where there are MANY anchors
 PROPOSED = 16  # functions
 SHAPES_FIRST = 3  # of one CovariateView
-HUBER = 3.0  # scales; a larger residual counts as that of a heavy tail, but more than in Student's t
+HUBER = (
+    3.0  # scales; a larger residual counts as that of a heavy tail, but more than in Student's t
+)
 LEAST_GAIN = 20.0  # twice a log-likelihood
-_ENDS = np.array([(first, last) for first in range(3) for last in (-1, -2, -3)])  # edges between which a line rises
+_ENDS = np.array(
+    [(first, last) for first in range(3) for last in (-1, -2, -3)]
+)  # edges between which a line rises
 ANGLES = ("bearing", "bearing_in_tag", "bearing_in_anchor")
 
 
 class _Shapes:
-    """A CovariateView as columns x (k, columns) at `rows` of a RegressionTable; edges (bins + 1,). Of many values: x (levels, columns), of
-    every one of some levels of the covariate, and a sparse matrix `levels` (k, levels), whose product with x are the columns."""
+    """A CovariateView as columns x (k, columns) at `rows` of a RegressionTable; edges (bins + 1,).
+    Of many values: x (levels, columns), of every one of some levels of the covariate, and a sparse
+    matrix `levels` (k, levels), whose product with x are the columns.
+    """
 
     def __init__(self, view: CovariateView, offset: int, edges: np.ndarray, many: bool) -> None:
-        """offset : first row of the channel; many : whether the RegressionTable has so many rows that values which are nearly the same
-        count as the same."""
+        """offset : first row of the channel; many : whether the RegressionTable has so many rows
+        that values which are nearly the same count as the same.
+        """
         self.view, self.offset, self.edges, self.many, rows = view, offset, edges, many, view.rows
         self.levels: csr_array | None = None
         if many and len(rows) > MANY_VALUES:
@@ -66,7 +83,10 @@ class _Shapes:
             x = x + known[:, None] * _columns(np.nan_to_num(values), edges, view.covariate)
         if view.means:
             rows, cell = np.unique(rows, return_inverse=True)
-            x = np.stack([np.bincount(cell, column) for column in x.T], axis=1) / np.bincount(cell)[:, None]
+            x = (
+                np.stack([np.bincount(cell, column) for column in x.T], axis=1)
+                / np.bincount(cell)[:, None]
+            )
         self.x = x.astype(np.float32)  # of all views together the most that a diagnosis holds
         self.rows = rows + offset
 
@@ -74,21 +94,33 @@ class _Shapes:
 class Scan:
     """All shapes of all views of a RegressionTable's channels: called as `search` of `select`."""
 
-    def __init__(self, table: RegressionTable, views: Mapping[str, Sequence[CovariateView]]) -> None:
+    def __init__(
+        self, table: RegressionTable, views: Mapping[str, Sequence[CovariateView]]
+    ) -> None:
         """views : {channel: [CovariateView]}, of the rows of each channel."""
         groups: dict[tuple[int, bool, bool], list[_Shapes]] = {}
         for channel, some in views.items():
             for view, edges in ((view, _edges(view)) for view in some):
                 if edges is not None:
                     kind = len(edges), view.covariate in ANGLES, view.covariate in CATEGORIES
-                    groups.setdefault(kind, []).append(_Shapes(view, table.rows_of(channel).start, edges, table.sparse))
+                    groups.setdefault(kind, []).append(
+                        _Shapes(view, table.rows_of(channel).start, edges, table.sparse)
+                    )
         self._groups = [_Group(several, WIDEST) for several in groups.values()]
-        self.even = _noise_of_series(table) ** -2.0  # weights (n,) that are fair to noisy series, and know no outliers
-        self._price = SmoothTerm.price + 2.0 * np.log(max(sum(len(several) for several in groups.values()), 1))
+        self.even = (
+            _noise_of_series(table) ** -2.0
+        )  # weights (n,) that are fair to noisy series, and know no outliers
+        self._price = SmoothTerm.price + 2.0 * np.log(
+            max(sum(len(several) for several in groups.values()), 1)
+        )
 
-    def __call__(self, table: RegressionTable, model: Fit, chosen: Sequence[Candidate]) -> list[Candidate]:
-        """[Candidate], the best of what the residual of a Fit of the chosen Candidates shows. What looks like outliers to
-        the fit counts for more: it may be what acts on a few rows alone. Series that are noisier than others count for less."""
+    def __call__(
+        self, table: RegressionTable, model: Fit, chosen: Sequence[Candidate]
+    ) -> list[Candidate]:
+        """[Candidate], the best of what the residual of a Fit of the chosen Candidates shows. What
+        looks like outliers to the fit counts for more: it may be what acts on a few rows alone.
+        Series that are noisier than others count for less.
+        """
         scale = HUBER * model.scale[table.group] / np.sqrt(self.even)
         weight = np.minimum(1.0, scale / np.maximum(np.abs(model.residual), 1e-12)) * self.even
         everywhere = np.ones(len(table.y), dtype=bool)
@@ -105,30 +137,46 @@ class Scan:
             return item
         coarse = shapes.edges
         near = [coarse[max(k - 1, 0) : k + 2] for k in np.searchsorted(coarse, knots[1:-1])]
-        edges = np.unique(np.concatenate([coarse[[0, -1]], *(np.linspace(some[0], some[-1], FINER) for some in near)]))
+        edges = np.unique(
+            np.concatenate(
+                [coarse[[0, -1]], *(np.linspace(some[0], some[-1], FINER) for some in near)]
+            )
+        )
         group = _Group([_Shapes(shapes.view, shapes.offset, edges, shapes.many)], len(edges))
         moved = [each for each in group.best(*held) if each[2] == shape]
         best = max(moved, key=lambda each: each[0], default=item)
         return (*best[:4], tried * FINER) if best[0] > gain else item
 
     def gains(self, table: RegressionTable, held: _Held) -> list[_Item]:
-        """[(gain, _Shapes, shape, knots, how many were tried)], the best first after what its coefficients and its search cost: what a
-        Fit would gain, twice a log-likelihood, with the weights that it has."""
+        """[(gain, _Shapes, shape, knots, how many were tried)], the best first after what its
+        coefficients and its search cost: what a Fit would gain, twice a log-likelihood, with the
+        weights that it has.
+        """
         return _best_first(table, [item for group in self._groups for item in group.best(*held)])
 
-    def _candidate(self, shapes: _Shapes, shape: str, knots: tuple[float, ...], tried: int) -> Candidate:
+    def _candidate(
+        self, shapes: _Shapes, shape: str, knots: tuple[float, ...], tried: int
+    ) -> Candidate:
         view = shapes.view
-        effect = SmoothTerm(channel=view.channel, covariate=view.covariate, form=view.form, knots=knots, shape=shape)
+        effect = SmoothTerm(
+            channel=view.channel, covariate=view.covariate, form=view.form, knots=knots, shape=shape
+        )
         keys = effect.keys_of((view.key,))
         return Candidate((Term(effect, keys),), self._price + 2.0 * np.log(tried))
 
 
 def _noise_of_series(table: RegressionTable) -> np.ndarray:
-    """How much noisier the series of each row is than most of its group, (n,), at least 1: by differences of successive rows, of
-    which steps and trends are a small part."""
+    """How much noisier the series of each row is than most of its group, (n,), at least 1: by
+    differences of successive rows, of which steps and trends are a small part.
+    """
     order = np.lexsort((table.t, table.series, table.flight, table.channel))
-    label = np.unique(np.stack([table.channel, table.flight, table.series]), axis=1, return_inverse=True)[1].reshape(-1)
-    step, begins = np.abs(np.diff(table.y[order])), np.searchsorted(label[order], np.arange(label.max() + 1))
+    label = np.unique(
+        np.stack([table.channel, table.flight, table.series]), axis=1, return_inverse=True
+    )[1].reshape(-1)
+    step, begins = (
+        np.abs(np.diff(table.y[order])),
+        np.searchsorted(label[order], np.arange(label.max() + 1)),
+    )
     parts = (step[first:last] for first, last in zip(begins, [*begins[1:] - 1, len(step)]))
     scatter = np.array([np.median(part) if len(part) else 0.0 for part in parts])
     out = scatter[label]
@@ -138,8 +186,9 @@ def _noise_of_series(table: RegressionTable) -> np.ndarray:
 
 
 def _various(found: Iterable[_Item]) -> list[_Item]:
-    """Items of `gains` in their order, but of one CovariateView no more than SHAPES_FIRST before those of others: a
-    dozen shapes of one function are one idea."""
+    """Items of `gains` in their order, but of one CovariateView no more than SHAPES_FIRST before
+    those of others: a dozen shapes of one function are one idea.
+    """
     early: list[_Item] = []
     late: list[_Item] = []
     count: dict[int, int] = {}
@@ -168,7 +217,8 @@ class _Group:
         self._from, self._to = i[good], j[good]
 
     def best(self, held: np.ndarray, information: np.ndarray, residual: np.ndarray) -> list[_Item]:
-        """[(gain, _Shapes, shape, knots, tried)]: the best of each shape of each view, with how many were tried.
+        """[(gain, _Shapes, shape, knots, tried)]: the best of each shape of each view, with how
+        many were tried.
 
         held (n, k): an orthonormal base, weighted, of what the model holds.
         """
@@ -180,7 +230,9 @@ class _Group:
 
         def of_one(first: np.ndarray, crossed: np.ndarray, square: np.ndarray) -> np.ndarray:
             rest = square + prior - crossed**2 / power
-            return level**2 / power + (first - crossed * level / power) ** 2 / np.maximum(rest, 1e-9 * (square + prior))
+            return level**2 / power + (first - crossed * level / power) ** 2 / np.maximum(
+                rest, 1e-9 * (square + prior)
+            )
 
         def of_two(first: np.ndarray, second: np.ndarray) -> np.ndarray:
             small = np.empty((len(vector), len(first), 3, 3))
@@ -201,26 +253,48 @@ class _Group:
         square[:, 1:, 1:] = own[:, :n, :n].cumsum(axis=1).cumsum(axis=2)
         i, j = self._from, self._to
         inside = square[:, j, j] - 2.0 * square[:, i, j] + square[:, i, i]
-        total, crossed = (np.pad(np.cumsum(part[:, :n], axis=1), ((0, 0), (1, 0))) for part in (vector, cross))
+        total, crossed = (
+            np.pad(np.cumsum(part[:, :n], axis=1), ((0, 0), (1, 0))) for part in (vector, cross)
+        )
         spans = of_one(total[:, j] - total[:, i], crossed[:, j] - crossed[:, i], inside)
-        last, beyond, below = j == n, *np.split(single[:, len(_ENDS) : len(_ENDS) + 2 * bends], 2, axis=1)
+        last, beyond, below = (
+            j == n,
+            *np.split(single[:, len(_ENDS) : len(_ENDS) + 2 * bends], 2, axis=1),
+        )
         if self._several[0].view.covariate in CATEGORIES:
             spans = np.where(j == i + 1, spans, 0.0)
             return [
-                *self._pick("interval", spans[:, ~last], lambda edges, k: (edges[0], edges[i[~last][k]], edges[j[~last][k]], edges[-1]))
+                *self._pick(
+                    "interval",
+                    spans[:, ~last],
+                    lambda edges, k: (edges[0], edges[i[~last][k]], edges[j[~last][k]], edges[-1]),
+                )
             ]
         return [
             *self._pick("line", single[:, : len(_ENDS)], lambda edges, k: edges[_ENDS[k]]),
             *self._pick("beyond", beyond, lambda edges, k: (edges[0], edges[2 + k], edges[-1])),
             *self._pick("below", below, lambda edges, k: (edges[0], edges[2 + k], edges[-1])),
-            *self._pick("step", spans[:, last], lambda edges, k: (edges[0], edges[i[last][k]], edges[-1])),
-            *self._pick("interval", spans[:, ~last], lambda edges, k: (edges[0], edges[i[~last][k]], edges[j[~last][k]], edges[-1])),
-            *self._pick("parabola", of_two(lines, at[-1] + waves + 1 + np.arange(len(_ENDS))), lambda edges, k: edges[_ENDS[k]]),
+            *self._pick(
+                "step", spans[:, last], lambda edges, k: (edges[0], edges[i[last][k]], edges[-1])
+            ),
+            *self._pick(
+                "interval",
+                spans[:, ~last],
+                lambda edges, k: (edges[0], edges[i[~last][k]], edges[j[~last][k]], edges[-1]),
+            ),
+            *self._pick(
+                "parabola",
+                of_two(lines, at[-1] + waves + 1 + np.arange(len(_ENDS))),
+                lambda edges, k: edges[_ENDS[k]],
+            ),
             *self._pick("wave", of_two(at, at + waves), None),
         ]
 
     def _pick(
-        self, shape: str, gains: np.ndarray, knots: Callable[[np.ndarray, int], Iterable[float]] | None
+        self,
+        shape: str,
+        gains: np.ndarray,
+        knots: Callable[[np.ndarray, int], Iterable[float]] | None,
     ) -> Iterator[_Item]:
         """The best of the gains (views, tried) of each view."""
         if not gains.shape[1]:
@@ -228,31 +302,47 @@ class _Group:
         best = np.argmax(gains, axis=1)
         for row in np.flatnonzero(gains[np.arange(len(gains)), best] > LEAST_GAIN):
             shapes, edges, k = self._several[row], self._several[row].edges, best[row]
-            at = knots(edges, k) if knots else (edges[0], edges[0] + _periods(edges, shapes.view.covariate)[k])
+            at = (
+                knots(edges, k)
+                if knots
+                else (edges[0], edges[0] + _periods(edges, shapes.view.covariate)[k])
+            )
             yield float(gains[row, k]), shapes, shape, tuple(map(float, at)), gains.shape[1]
 
 
 def _prior(view: CovariateView) -> float:
     """Information that stands for plausible sizes of its functions."""
-    line = SmoothTerm(channel=view.channel, covariate=view.covariate, form=view.form, knots=(0.0, 1.0), shape="line")
+    line = SmoothTerm(
+        channel=view.channel,
+        covariate=view.covariate,
+        form=view.form,
+        knots=(0.0, 1.0),
+        shape="line",
+    )
     return line.typical_of("c0") ** -2
 
 
 def _products(
     shapes: _Shapes, held: np.ndarray, information: np.ndarray, residual: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Of the columns with the residual (columns,), and with each other (columns, columns) free of what is held."""
+    """Of the columns with the residual (columns,), and with each other (columns, columns) free of
+    what is held.
+    """
     if shapes.levels is not None:
         of_levels = shapes.levels.multiply(information[shapes.rows, None]).T.tocsr()
         half = (of_levels @ held[shapes.rows]).T @ shapes.x
-        return shapes.x.T @ (of_levels @ residual[shapes.rows]), shapes.x.T @ (of_levels @ shapes.levels @ shapes.x) - half.T @ half
+        return shapes.x.T @ (of_levels @ residual[shapes.rows]), shapes.x.T @ (
+            of_levels @ shapes.levels @ shapes.x
+        ) - half.T @ half
     weighted = shapes.x * information[shapes.rows, None]
     half = held[shapes.rows].T @ weighted
     return weighted.T @ residual[shapes.rows], weighted.T @ shapes.x - half.T @ half
 
 
 def _held(table: RegressionTable, model: Fit, chosen: Sequence[Candidate]) -> _Held:
-    """(orthonormal base, weighted, of what the chosen Candidates hold (n, k), information (n,), residual (n,))."""
+    """(orthonormal base, weighted, of what the chosen Candidates hold (n, k), information (n,),
+    residual (n,)).
+    """
     information, base = model.information(table), columns_of(chosen)
     b = dense(table.matrix(base))
     gram = (b * information[:, None]).T @ b + np.diag(1.0 / prior_sizes(base) ** 2)
@@ -277,22 +367,33 @@ def _edges(view: CovariateView) -> np.ndarray | None:
 
 
 def _levels(view: CovariateView, edges: np.ndarray) -> tuple[np.ndarray, csr_array, np.ndarray]:
-    """(values (l,) of a covariate, each of which stands for those of its level, whose levels lie between the edges; sums of signs of each
-    level (k, l); rows (k,) of a view)."""
+    """(values (l,) of a covariate, each of which stands for those of its level, whose levels lie
+    between the edges; sums of signs of each level (k, l); rows (k,) of a view).
+    """
     signs, values = (np.concatenate(each) for each in zip(*view.sides))
     known = np.isfinite(values) & (signs != 0.0)
     rows, place = np.unique(view.rows, return_inverse=True)
     signs, values, cell = signs[known], values[known], np.tile(place, len(view.sides))[known]
     finer = np.union1d(edges, np.quantile(values, np.linspace(0.0, 1.0, LEVELS + 1)))
-    _, first, level = np.unique(np.searchsorted(finer, values, side="right"), return_index=True, return_inverse=True)
-    return values[first], csr_array((signs / np.bincount(place)[cell], (cell, level)), shape=(len(rows), len(first))), rows
+    _, first, level = np.unique(
+        np.searchsorted(finer, values, side="right"), return_index=True, return_inverse=True
+    )
+    return (
+        values[first],
+        csr_array((signs / np.bincount(place)[cell], (cell, level)), shape=(len(rows), len(first))),
+        rows,
+    )
 
 
 def _columns(v: np.ndarray, edges: np.ndarray, covariate: str) -> np.ndarray:
-    """Bins, lines, rises beyond and below the inner edges, sines, cosines, squares of the lines: (n, columns)."""
+    """Bins, lines, rises beyond and below the inner edges, sines, cosines, squares of the lines:
+    (n, columns).
+    """
     low, high = edges[0], edges[-1]
     held = np.clip(v, low, high)
-    bins = np.eye(len(edges) - 1)[np.clip(np.searchsorted(edges, v, side="right") - 1, 0, len(edges) - 2)]
+    bins = np.eye(len(edges) - 1)[
+        np.clip(np.searchsorted(edges, v, side="right") - 1, 0, len(edges) - 2)
+    ]
     bends = edges[2:-2]
     first, last = edges[_ENDS[:, 0]], edges[_ENDS[:, 1]]
     rise = np.where(last > first, last - first, np.inf)

@@ -1,7 +1,8 @@
 """What sets of columns would gain, in closed form.
 
-All that candidates need of the rows is computed for all of them at once: products with the base of the model, group by group
-(an axis of a channel). A candidate is then a small system of equations on top of that of the base (Schur complement).
+All that candidates need of the rows is computed for all of them at once: products with the base of
+the model, group by group (an axis of a channel). A candidate is then a small system of equations on
+top of that of the base (Schur complement).
 """
 
 from __future__ import annotations
@@ -17,18 +18,26 @@ from .table import AXES
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Sequence
+
     from .fit import Fit
     from .table import RegressionTable
     from .terms import Candidate, Column
 
-FEW, NOTHING = 3, 3.0  # columns, and what they gain together, each alone, twice a log-likelihood, that is worth no price
-AT_ONCE = 128  # columns whose products with the base are made together, so that a copy of all of them is never held
+FEW, NOTHING = (
+    3,
+    3.0,
+    # columns, and what they gain together, each alone, twice a log-likelihood, that is worth no price
+)
+# columns whose products with the base are made together, so that a copy of all of them is never
+# held
+AT_ONCE = 128
 
 
 @dataclass(frozen=True, eq=False)
 class Gain:
-    """beta (k,) of the candidate's columns; determined : parameters that the data determine beyond the base; gain : twice what the
-    likelihood gains."""
+    """beta (k,) of the candidate's columns; determined : parameters that the data determine beyond
+    the base; gain : twice what the likelihood gains.
+    """
 
     beta: np.ndarray
     determined: float
@@ -38,15 +47,21 @@ class Gain:
 class Scorer:
     """Gains of sets of Columns on top of a base, with the weights, scales and inflation of one Fit."""
 
-    def __init__(self, table: RegressionTable, base: Sequence[Column], model: Fit, others: Sequence[Column]) -> None:
-        """base : Columns that are in the model already; model : Fit, whose weights count; others : Columns that may be
-        judged."""
+    def __init__(
+        self, table: RegressionTable, base: Sequence[Column], model: Fit, others: Sequence[Column]
+    ) -> None:
+        """base : Columns that are in the model already; model : Fit, whose weights count; others :
+        Columns that may be judged.
+        """
         self._place = {column: k for k, column in enumerate(dict.fromkeys([*base, *others]))}
         self._base = np.arange(len(base))
         columns, root = list(self._place), model.information(table)
         if table.sparse:
             effects = _effects(columns, len(base))
-            self._parts = [_sparse_part(table, columns, effects, len(base), root, rows) for _, rows in table.groups]
+            self._parts = [
+                _sparse_part(table, columns, effects, len(base), root, rows)
+                for _, rows in table.groups
+            ]
         else:
             self._parts = [self._part(table, columns, root, rows) for _, rows in table.groups]
         self._group_sizes = [model.size[group] for group, _ in table.groups]
@@ -56,12 +71,22 @@ class Scorer:
         gram = sum((part.cross[:, self._base] for part in self._parts), start=np.zeros(()))
         vector = sum((part.vector[self._base] for part in self._parts), start=np.zeros(()))
         beta, _, self._determined = solve(gram, vector, sizes)
-        self._inverse = np.linalg.inv(gram * np.outer(sizes, sizes) + np.eye(len(sizes))) if len(sizes) else gram
+        self._inverse = (
+            np.linalg.inv(gram * np.outer(sizes, sizes) + np.eye(len(sizes)))
+            if len(sizes)
+            else gram
+        )
         self._squares = [part.squares(beta, self._base) for part in self._parts]
         self._penalty = float(np.sum((beta / sizes) ** 2))
         self._alone = self._gains_alone(beta) if table.sparse else None
 
-    def _part(self, table: RegressionTable, columns: list[Column], root: np.ndarray, rows: np.ndarray | slice) -> _Part:
+    def _part(
+        self,
+        table: RegressionTable,
+        columns: list[Column],
+        root: np.ndarray,
+        rows: np.ndarray | slice,
+    ) -> _Part:
         root, y = root[rows], table.y[rows]
         base = weighted(table.matrix([columns[place] for place in self._base.tolist()], rows), root)
         cross, vector = np.empty((len(self._base), len(columns))), np.empty(len(columns))
@@ -77,12 +102,17 @@ class Scorer:
         cross = sum((part.cross for part in self._parts), start=np.zeros(()))
         left = (sum(part.vector for part in self._parts) - cross.T @ beta) * sizes
         cross = cross * np.outer(sizes[base], sizes)
-        own = sum((part.products.squares for part in self._parts if part.products is not None), start=np.zeros(()))
+        own = sum(
+            (part.products.squares for part in self._parts if part.products is not None),
+            start=np.zeros(()),
+        )
         own = own * sizes**2 + 1.0 - np.sum(cross * (self._inverse @ cross), axis=0)
         return left**2 / np.maximum(own, 1e-9)
 
     def may_gain(self, columns: Sequence[Column]) -> bool:
-        """Whether to judge some Columns; of few parameters among thousands most gain nothing, which is seen at a glance."""
+        """Whether to judge some Columns; of few parameters among thousands most gain nothing, which
+        is seen at a glance.
+        """
         if self._alone is None or len(columns) > FEW:
             return True
         return float(sum(self._alone[self._place[column]] for column in columns)) > NOTHING
@@ -99,26 +129,44 @@ class Scorer:
         own = [part.gram(new) for part in self._parts]
         vector = sum(part.vector[both] for part in self._parts) * sizes[both]
         half = self._inverse @ cross
-        schur = np.linalg.inv(sum(own) * np.outer(sizes[new], sizes[new]) + np.eye(len(new)) - cross.T @ half)
+        schur = np.linalg.inv(
+            sum(own) * np.outer(sizes[new], sizes[new]) + np.eye(len(new)) - cross.T @ half
+        )
         z_new = schur @ (vector[len(base) :] - half.T @ vector[: len(base)])
         z = np.concatenate([self._inverse @ (vector[: len(base)] - cross @ z_new), z_new])
-        determined = len(both) - np.trace(self._inverse) - np.trace(schur) - np.sum((half @ schur) * half)
+        determined = (
+            len(both) - np.trace(self._inverse) - np.trace(schur) - np.sum((half @ schur) * half)
+        )
         beta, gain = z * sizes[both], self._penalty - float(z @ z)
         for size, part, gram, before in zip(self._group_sizes, self._parts, own, self._squares):
             gain += size * np.log(before / part.squares(beta, both, gram))
         values = dict(zip(both.tolist(), beta.tolist()))
-        return Gain(np.array([values[place] for place in all_places.tolist()]), float(determined - self._determined), float(gain))
+        return Gain(
+            np.array([values[place] for place in all_places.tolist()]),
+            float(determined - self._determined),
+            float(gain),
+        )
 
     def price(self, candidate: Candidate, determined: float, choices: int) -> float:
-        """What the parameters of a Candidate, `determined` of them by the data, must at least gain, if it is one of `choices`."""
-        rows = sum(size for size, name in zip(self._group_sizes, self._channels) if name in candidate.channels)
-        return determined * np.log(max(rows, 10.0)) + 2.0 * np.log(max(choices, 2)) + candidate.price
+        """What the parameters of a Candidate, `determined` of them by the data, must at least gain,
+        if it is one of `choices`.
+        """
+        rows = sum(
+            size
+            for size, name in zip(self._group_sizes, self._channels)
+            if name in candidate.channels
+        )
+        return (
+            determined * np.log(max(rows, 10.0)) + 2.0 * np.log(max(choices, 2)) + candidate.price
+        )
 
 
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """One group: its rows in a RegressionTable of some columns, with weights root (n,); cross (base, k) and vector (k,): X' W X and X' W y;
-    power : y' W y; products : of columns of one effect, where they are sparse."""
+    """One group: its rows in a RegressionTable of some columns, with weights root (n,); cross
+    (base, k) and vector (k,): X' W X and X' W y;
+    power : y' W y; products : of columns of one effect, where they are sparse.
+    """
 
     table: RegressionTable
     columns: list[Column]
@@ -136,11 +184,16 @@ class _Part:
         return x.T @ (x * self.root[:, None])
 
     def squares(self, beta: np.ndarray, places: np.ndarray, own: np.ndarray | None = None) -> float:
-        """Weighted sum of squares that beta (k,) of the columns at `places`, those of the base first, leaves. own : gram
-        of those after the base."""
+        """Weighted sum of squares that beta (k,) of the columns at `places`, those of the base
+        first, leaves. own : gram of those after the base.
+        """
         base = self.cross.shape[0]
         first, last = beta[:base], beta[base:]
-        out = self.power - 2.0 * beta @ self.vector[places] + first @ self.cross[:, places[:base]] @ first
+        out = (
+            self.power
+            - 2.0 * beta @ self.vector[places]
+            + first @ self.cross[:, places[:base]] @ first
+        )
         if own is not None:
             out += 2.0 * first @ self.cross[:, places[base:]] @ last + last @ own @ last
         return max(float(out), 1e-12)
@@ -156,8 +209,10 @@ def _effects(columns: Sequence[Column], base: int) -> list[np.ndarray]:
 
 @dataclass(frozen=True, eq=False)
 class _Products:
-    """X' W X of sparse columns x (n, k), with weights (n,), made once for what is asked of many candidates: squares (k,), its diagonal;
-    effect, number (k,) : of each column that of its effect, and its own among these; grams : of every effect of several columns."""
+    """X' W X of sparse columns x (n, k), with weights (n,), made once for what is asked of many
+    candidates: squares (k,), its diagonal; effect, number (k,) : of each column that of its effect,
+    and its own among these; grams : of every effect of several columns.
+    """
 
     x: Matrix
     weights: np.ndarray
@@ -172,7 +227,9 @@ class _Products:
         for k, places in enumerate(effects):
             effect[places], number[places] = k, np.arange(len(places))
         squares = x.power(2).T @ weights
-        grams = {k: _gram(x[:, places], weights) for k, places in enumerate(effects) if len(places) > 1}
+        grams = {
+            k: _gram(x[:, places], weights) for k, places in enumerate(effects) if len(places) > 1
+        }
         return cls(x, weights, squares, effect, number, grams)
 
     def gram(self, places: np.ndarray) -> np.ndarray:
@@ -188,7 +245,9 @@ class _Products:
 
 def _gram(x: Matrix, weights: np.ndarray) -> np.ndarray:
     """X' W X of a sparse matrix (n, k), (k, k)."""
-    filled = np.flatnonzero(np.diff(x.indptr))  # most columns are of TDOAs, or of an axis of another sensor
+    filled = np.flatnonzero(
+        np.diff(x.indptr)
+    )  # most columns are of TDOAs, or of an axis of another sensor
     out = np.zeros((x.shape[1], x.shape[1]))
     if len(filled):
         some = x[:, filled]
@@ -197,10 +256,28 @@ def _gram(x: Matrix, weights: np.ndarray) -> np.ndarray:
 
 
 def _sparse_part(
-    table: RegressionTable, columns: list[Column], effects: Sequence[np.ndarray], base: int, root: np.ndarray, rows: np.ndarray | slice
+    table: RegressionTable,
+    columns: list[Column],
+    effects: Sequence[np.ndarray],
+    base: int,
+    root: np.ndarray,
+    rows: np.ndarray | slice,
 ) -> _Part:
-    """The _Part of some rows of a sparse RegressionTable, of all columns, the first `base` those of the base. effects : places of the
-    columns of each effect: of those of two effects products are made when they are asked for."""
+    """The _Part of some rows of a sparse RegressionTable, of all columns, the first `base` those of
+    the base. effects : places of the columns of each effect: of those of two effects products are
+    made when they are asked for.
+    """
     root, y, x = root[rows], table.y[rows], table.matrix(columns, rows)
-    cross = product(x, weighted(x[:, :base], root)).T  # in this order x is multiplied as it lies in memory
-    return _Part(table, columns, rows, root, cross, x.T @ (root * y), float(root @ y**2), _Products.of(x, root, effects))
+    cross = product(
+        x, weighted(x[:, :base], root)
+    ).T  # in this order x is multiplied as it lies in memory
+    return _Part(
+        table,
+        columns,
+        rows,
+        root,
+        cross,
+        x.T @ (root * y),
+        float(root @ y**2),
+        _Products.of(x, root, effects),
+    )

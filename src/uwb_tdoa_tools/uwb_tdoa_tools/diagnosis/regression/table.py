@@ -1,10 +1,12 @@
-"""Residuals of several flights and channels, and regressors, as one immutable table of a linear fit."""
+"""Residuals of several flights and channels, and regressors, as one immutable table of a linear
+fit.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.sparse import csc_array
@@ -17,7 +19,9 @@ from .algebra import stacked
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Iterable, Iterator, Sequence
+
     from uwb_tdoa_bias.effects import Effect
+
     from ..channels import ChannelResidual, ChannelResiduals
     from .terms import Column, Term
 
@@ -30,10 +34,12 @@ AT_ONCE = 32  # columns that are made together, where they are sparse
 class RegressionTable:
     """n rows of a linear model y = X beta + noise, those of one channel after the other.
 
-    channels : names; y (n,); channel (n,) place in `channels`; group (n,) number of an axis of a channel, AXES of each, what is alike
+    channels : names; y (n,); channel (n,) place in `channels`; group (n,) number of an axis of a
+        channel, AXES of each, what is alike
     in noise; series (n,) int, different in every flight; block (n,) number of an independent
     block; flight (n,); t (n,) s since the start; count (n,) samples averaged; place (n, 3) m.
-    parts : ((flight, name of the channel, first row, ChannelResidual), ...); columns : {Column: (n,)}, X, whose columns tables share;
+    parts : ((flight, name of the channel, first row, ChannelResidual), ...); columns : {Column:
+        (n,)}, X, whose columns tables share;
     sparse : whether they are kept as (rows, values), because of MANY anchors few are heard at once.
     """
 
@@ -63,7 +69,9 @@ class RegressionTable:
 
     @cached_property
     def groups(self) -> list[tuple[int, slice | np.ndarray]]:
-        """[(number, rows)] of the groups that have rows: a slice, where they lie together, or bool (n,)."""
+        """[(number, rows)] of the groups that have rows: a slice, where they lie together, or bool
+        (n,).
+        """
         return [(k, self._rows_of_group(k)) for k in np.unique(self.group).tolist()]
 
     def _rows_of_group(self, group: int) -> slice | np.ndarray:
@@ -97,7 +105,10 @@ class RegressionTable:
         if self.sparse and isinstance(rows, slice) and rows != slice(None):
             edges, several = (rows.start, rows.stop), [self.columns[column] for column in columns]
             parts = [(its, values, *np.searchsorted(its, edges)) for its, values in several]
-            return stacked([(its[i:j] - rows.start, values[i:j]) for its, values, i, j in parts], rows.stop - rows.start)
+            return stacked(
+                [(its[i:j] - rows.start, values[i:j]) for its, values, i, j in parts],
+                rows.stop - rows.start,
+            )
         if self.sparse:
             x = stacked([self.columns[column] for column in columns], len(self.y))
             return x if isinstance(rows, slice) else x[rows]
@@ -107,11 +118,15 @@ class RegressionTable:
         return out
 
     def with_terms(self, terms: Iterable[Term]) -> RegressionTable:
-        """A RegressionTable that has the columns of some Terms too, at the values that their effects have."""
+        """A RegressionTable that has the columns of some Terms too, at the values that their
+        effects have.
+        """
         wanted: dict[Hashable, tuple[Effect, dict[str, Column]]] = {}
         for term in terms:
             effect, keys = wanted.setdefault(term.effect.identity, (term.effect, {}))
-            keys.update((column.key, column) for column in term.columns if column not in self.columns)
+            keys.update(
+                (column.key, column) for column in term.columns if column not in self.columns
+            )
         wanted = {identity: item for identity, item in wanted.items() if item[1]}
         if not wanted:
             return self
@@ -125,9 +140,19 @@ class RegressionTable:
 
     def _values(self, effect: Effect, keys: tuple[str, ...]) -> Any:
         """What `columns` hold of parameters of an Effect: iterable."""
-        made = ((row, part.columns(effect, keys)) for _, channel, row, part in self.parts if channel in effect.channels)
+        made = (
+            (row, part.columns(effect, keys))
+            for _, channel, row, part in self.parts
+            if channel in effect.channels
+        )
         if self.sparse:
-            parts = [(row, csc_array(np.nan_to_num(values)) if isinstance(values, np.ndarray) else values) for row, values in made]
+            parts = [
+                (
+                    row,
+                    csc_array(np.nan_to_num(values)) if isinstance(values, np.ndarray) else values,
+                )
+                for row, values in made
+            ]
             return _joined(parts, len(keys))
         x = np.zeros((len(self.y), len(keys)), order="F")
         for row, values in made:
@@ -139,13 +164,24 @@ class RegressionTable:
         each = ("y", "channel", "group", "series", "block", "flight", "t", "count", "place")
         arrays = {name: getattr(self, name)[chosen] for name in each}
         if not self.sparse:
-            return replace(self, **arrays, columns={column: values[chosen] for column, values in self.columns.items()})
+            return replace(
+                self,
+                **arrays,
+                columns={column: values[chosen] for column, values in self.columns.items()},
+            )
         place = np.cumsum(chosen) - 1
-        kept = {column: (place[rows[chosen[rows]]], values[chosen[rows]]) for column, (rows, values) in self.columns.items()}
+        kept = {
+            column: (place[rows[chosen[rows]]], values[chosen[rows]])
+            for column, (rows, values) in self.columns.items()
+        }
         return replace(self, **arrays, columns=kept)
 
-    def with_contribution(self, effects: Iterable[tuple[Effect, Sequence[Column]]]) -> RegressionTable:
-        """A RegressionTable whose y also holds what Effects, at their values, contribute; it has their columns."""
+    def with_contribution(
+        self, effects: Iterable[tuple[Effect, Sequence[Column]]]
+    ) -> RegressionTable:
+        """A RegressionTable whose y also holds what Effects, at their values, contribute; it has
+        their columns.
+        """
         y = self.y.copy()
         for effect, columns in effects:
             values = np.array([effect.values[column.key] for column in columns])
@@ -154,20 +190,30 @@ class RegressionTable:
 
 
 def _joined(parts: Sequence[tuple[int, Any]], k: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """(rows, values) of each of k columns, of sparse matrices that begin at some rows, [(row, (n, k))]."""
+    """(rows, values) of each of k columns, of sparse matrices that begin at some rows, [(row, (n,
+    k))].
+    """
     for column in range(k):
         some = [(row, x, slice(*x.indptr[column : column + 2])) for row, x in parts]
         rows = [row + x.indices[its].astype(np.int64) for row, x, its in some]
-        yield np.concatenate([np.empty(0, np.int64), *rows]), np.concatenate([np.empty(0), *(x.data[its] for _, x, its in some)])
+        yield (
+            np.concatenate([np.empty(0, np.int64), *rows]),
+            np.concatenate([np.empty(0), *(x.data[its] for _, x, its in some)]),
+        )
 
 
 def table_of(residuals: Sequence[ChannelResiduals]) -> RegressionTable:
-    """RegressionTable without columns of [{name of a channel: ChannelResidual}], one dict for each flight."""
+    """RegressionTable without columns of [{name of a channel: ChannelResidual}], one dict for each
+    flight.
+    """
     parts, each = [], ("y", "channel", "group", "series", "block", "flight", "t", "count", "place")
     pieces: dict[str, list[np.ndarray]] = {key: [] for key in each}
     rows = [{name: part.rows() for name, part in flight.items()} for flight in residuals]
     start = [min(part.t.min() for part in flight.values()) for flight in rows]
-    blocks = [1 + max(int((part.t.max() - t) / BLOCK) for part in flight.values()) for flight, t in zip(rows, start)]
+    blocks = [
+        1 + max(int((part.t.max() - t) / BLOCK) for part in flight.values())
+        for flight, t in zip(rows, start)
+    ]
     offset, first = np.concatenate([[0], np.cumsum(blocks)]), 0
     channels = tuple(CHANNELS)
     for place, name in enumerate(channels):
@@ -185,5 +231,7 @@ def table_of(residuals: Sequence[ChannelResiduals]) -> RegressionTable:
             for key in ("y", "series", "t", "count", "place"):
                 pieces[key].append(getattr(part, key))
     merged = {key: np.concatenate(several) for key, several in pieces.items()}
-    many = any(len(part.samples.anchors) > MANY for *_, part in parts if isinstance(part, RadioResidual))
+    many = any(
+        len(part.samples.anchors) > MANY for *_, part in parts if isinstance(part, RadioResidual)
+    )
     return RegressionTable(channels, **merged, parts=tuple(parts), columns={}, sparse=many)

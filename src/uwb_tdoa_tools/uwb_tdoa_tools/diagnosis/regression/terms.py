@@ -4,19 +4,22 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 from uwb_tdoa_bias.effects import Effect, SmoothTerm
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterable
+
     import numpy as np
+
     from uwb_tdoa_bias.foundation.anchors import Anchors
 
 
 class Column(NamedTuple):
-    """A parameter of an effect, as a regressor. effect : identity of the Effect; key : name of the parameter; typical :
-    plausible size, in its unit: standard deviation of its prior."""
+    """A parameter of an effect, as a regressor. effect : identity of the Effect; key : name of the
+    parameter; typical : plausible size, in its unit: standard deviation of its prior.
+    """
 
     effect: tuple[Hashable, ...]
     key: str
@@ -25,7 +28,10 @@ class Column(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """An Effect and those of its parameters, `keys`, that a fit gives values. Values that it has already are fixed."""
+    """An Effect and those of its parameters, `keys`, that a fit gives values.
+
+    Values that it has already are fixed.
+    """
 
     effect: Effect
     keys: tuple[str, ...]
@@ -44,7 +50,9 @@ class Term:
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """Terms that come into a model together. price : of the search that found them, twice a log-likelihood."""
+    """Terms that come into a model together. price : of the search that found them, twice a
+    log-likelihood.
+    """
 
     terms: tuple[Term, ...]
     price: float = 0.0
@@ -81,7 +89,9 @@ class Candidate:
         return "".join((self.terms[0].effect.label_of(self.terms[0].keys), *more))
 
     def where(self, keeps: Callable[[Effect], bool]) -> Candidate | None:
-        """The Candidate with those of its terms alone whose Effects a function keeps; None if that is none."""
+        """The Candidate with those of its terms alone whose Effects a function keeps; None if that
+        is none.
+        """
         terms = tuple(term for term in self.terms if keeps(term.effect))
         return self if terms == self.terms else Candidate(terms, self.price) if terms else None
 
@@ -89,18 +99,25 @@ class Candidate:
         """Whether values of its columns, (k,), could be."""
         values = dict(zip(((column.effect, column.key) for column in self.columns), beta.tolist()))
         return all(
-            term.effect.plausible({key: values[term.effect.identity, key] for key in term.keys}) for term in self.terms
+            term.effect.plausible({key: values[term.effect.identity, key] for key in term.keys})
+            for term in self.terms
         )
 
     def sizable(self, beta: np.ndarray) -> bool:
-        """Whether at least half of the values of its columns, (k,), are worth having; a smaller group says as much."""
+        """Whether at least half of the values of its columns, (k,), are worth having; a smaller
+        group says as much.
+        """
         limits = [term.effect.negligible for term in self.terms for _ in term.keys]
-        return sum(abs(value) >= limit for value, limit in zip(beta.tolist(), limits)) >= 0.5 * len(limits)
+        return sum(abs(value) >= limit for value, limit in zip(beta.tolist(), limits)) >= 0.5 * len(
+            limits
+        )
 
 
 def candidates_of(effect: Effect, anchors: Anchors, pairs: np.ndarray) -> list[Candidate]:
-    """A Candidate for every set of parameters of an Effect that makes sense, the full set first. anchors : Anchors;
-    pairs : (m, 2) ids of the pairs that were heard."""
+    """A Candidate for every set of parameters of an Effect that makes sense, the full set first.
+    anchors : Anchors;
+    pairs : (m, 2) ids of the pairs that were heard.
+    """
     sets = [keys for keys in effect.groups(anchors, pairs) if keys]
     return [Candidate((Term(effect, tuple(keys)),), effect.price) for keys in sets]
 

@@ -1,4 +1,6 @@
-"""Positions and delays of anchors that were found: values that make the data fit, which is not the same as a survey."""
+"""Positions and delays of anchors that were found: values that make the data fit, which is not the
+same as a survey.
+"""
 
 from __future__ import annotations
 
@@ -19,15 +21,23 @@ SURE = 2.0  # standard deviations from which a value is marked
 
 
 def rows(diagnosis: Diagnosis) -> list[list[str]]:
-    """[[cell]] of a table, those of HEAD first that have any value, then a row for each anchor of which a position or a delay was found; []
-    without any."""
+    """[[cell]] of a table, those of HEAD first that have any value, then a row for each anchor of
+    which a position or a delay was found; [] without any.
+    """
     found: dict[str, dict[str, tuple[float, float]]] = {}
     for finding in diagnosis.findings:
-        if finding.effect.name in (POSITION, DELAY) and not finding.on_floor and finding.flight is None:
+        if (
+            finding.effect.name in (POSITION, DELAY)
+            and not finding.on_floor
+            and finding.flight is None
+        ):
             for key, value in finding.effect.values.items():
                 anchor, _, axis = key.partition(".")
                 found.setdefault(anchor, {})[axis] = value, finding.effect.std.get(key, np.nan)
-    cells = [[anchor, *(_cell(found[anchor].get(axis)) for axis in ("x", "y", "z", ""))] for anchor in sorted(found, key=int)]
+    cells = [
+        [anchor, *(_cell(found[anchor].get(axis)) for axis in ("x", "y", "z", ""))]
+        for anchor in sorted(found, key=int)
+    ]
     filled = [column for column in zip(HEAD, *cells) if any(column[1:])]
     return [list(row) for row in zip(*filled)]
 
@@ -45,7 +55,10 @@ def lines(diagnosis: Diagnosis) -> list[str]:
     several = rows(diagnosis)
     if not several:
         return []
-    return [f"{TITLE} (? less than {SURE:g} standard deviations):", *("".join(f"{cell:>12s}" for cell in row) for row in several)]
+    return [
+        f"{TITLE} (? less than {SURE:g} standard deviations):",
+        *("".join(f"{cell:>12s}" for cell in row) for row in several),
+    ]
 
 
 def table(diagnosis: Diagnosis) -> Table:

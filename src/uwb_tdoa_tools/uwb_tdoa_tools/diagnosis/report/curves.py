@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,8 +18,11 @@ from .runs import CM, labels
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+
     from matplotlib.figure import Figure
+
     from uwb_tdoa_bias.effects import SmoothTerm
+
     from ..channels import ChannelResiduals
     from ..result import Diagnosis
     from .room import Flown
@@ -31,19 +34,36 @@ MOST = 12  # flights whose errors are drawn
 PAIRS, FEWEST = 16, 20  # that are drawn, and measurements of each
 FUNCTIONS = 12  # that are drawn
 POINTS = 3000  # of a series of residuals
-ABOVE = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "ncols": 2, "frameon": False}  # of a legend
+ABOVE = {
+    "loc": "lower right",
+    "bbox_to_anchor": (1.0, 1.0),
+    "ncols": 2,
+    "frameon": False,
+}  # of a legend
 
 
 def errors_over_time(diagnosis: Diagnosis) -> tuple[list[Picture], int]:
-    """The 3D error of every judged flight before and after, the largest marked: (pictures, of how many flights)."""
-    sides = [("before", BEFORE, diagnosis.before), ("after", AFTER, diagnosis.after)] if changed(diagnosis) else []
+    """The 3D error of every judged flight before and after, the largest marked: (pictures, of how
+    many flights).
+    """
+    sides = (
+        [("before", BEFORE, diagnosis.before), ("after", AFTER, diagnosis.after)]
+        if changed(diagnosis)
+        else []
+    )
     sides = sides or [("error", AFTER, diagnosis.before)]
     curves = [
-        [(title, colour, run) for title, colour, side in sides for run in flown(side["scores"][k : k + 1])]
+        [
+            (title, colour, run)
+            for title, colour, side in sides
+            for run in flown(side["scores"][k : k + 1])
+        ]
         for k in range(len(diagnosis.before["scores"]))
     ]
     runs = [(name, each) for name, each in zip(labels(diagnosis), curves) if each]
-    top = CM * max((run.distance.max() for _, each in runs[:MOST] for _, _, run in each), default=0.0)
+    top = CM * max(
+        (run.distance.max() for _, each in runs[:MOST] for _, _, run in each), default=0.0
+    )
     return [_errors(name, each, top) for name, each in runs[:MOST]], len(runs)
 
 
@@ -66,11 +86,17 @@ def _drawn_errors(name: str, each: Sequence[_Curve], top: float, width: float) -
         near = [
             other
             for other in peaks
-            if other[1] != distance and abs(other[0] - t) < 0.15 * each[0][2].t[-1] and abs(other[1] - distance) < 0.2 * top
+            if other[1] != distance
+            and abs(other[0] - t) < 0.15 * each[0][2].t[-1]
+            and abs(other[1] - distance) < 0.2 * top
         ]
         below = any(other[1] > distance for other in near)  # of another label that would lie on it
         right = t > 0.5 * each[0][2].t[-1]
-        place = {"xytext": (-6 if right else 6, -11 if below else 3), "textcoords": "offset points", "ha": "right" if right else "left"}
+        place = {
+            "xytext": (-6 if right else 6, -11 if below else 3),
+            "textcoords": "offset points",
+            "ha": "right" if right else "left",
+        }
         ax.annotate(f"{distance:.0f} cm", (t, distance), color=colour, fontweight="bold", **place)
     ax.set(xlabel="time in the air [s]", ylabel="position error [cm]", ylim=(0.0, 1.35 * top))
     ax.set_title(name, loc="left", fontsize=10)
@@ -91,8 +117,14 @@ def _peaks(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def residual_series(diagnosis: Diagnosis) -> list[Picture]:
     """What every channel leaves in the first flight, before and after."""
-    before, after = (_series(found[0]) for found in (diagnosis.attribution.residuals, diagnosis.remaining))
-    return [_residuals(f"{name}, {diagnosis.flights[0].name}", before[name], after[name]) for name in before if name in after]
+    before, after = (
+        _series(found[0]) for found in (diagnosis.attribution.residuals, diagnosis.remaining)
+    )
+    return [
+        _residuals(f"{name}, {diagnosis.flights[0].name}", before[name], after[name])
+        for name in before
+        if name in after
+    ]
 
 
 def _series(flight: ChannelResiduals) -> dict[str, tuple[np.ndarray, np.ndarray]]:
@@ -111,34 +143,63 @@ def _residuals(name: str, *sides: tuple[np.ndarray, np.ndarray]) -> Picture:
     ax.grid(alpha=0.25, lw=0.5)
     ax.legend(**ABOVE, markerscale=5)
     scatter = " and ".join(
-        f"{np.std(np.clip(r, -limit, limit)):.2g} {title}" for (_, r), title in zip(sides, ("before", "after"))
+        f"{np.std(np.clip(r, -limit, limit)):.2g} {title}"
+        for (_, r), title in zip(sides, ("before", "after"))
     )
     return embedded(figure, f"Residual of {name} over time, standard deviation {scatter}")
 
 
 def pairs(diagnosis: Diagnosis) -> list[Picture]:
-    """Offset and scatter of every pair of anchors, before and after, in one picture, if there is any pair."""
+    """Offset and scatter of every pair of anchors, before and after, in one picture, if there is
+    any pair.
+    """
     after = {item["pair"]: item for item in health(diagnosis.remaining)["pairs"]}
     before = {
-        item["pair"]: item for item in diagnosis.health["pairs"] if item["count"] >= FEWEST and item["pair"] in after
+        item["pair"]: item
+        for item in diagnosis.health["pairs"]
+        if item["count"] >= FEWEST and item["pair"] in after
     }
     names = sorted(before, key=lambda name: -before[name]["count"])[:PAIRS]
     if not names:
         return []
     sides, of = (before, after), listed(flight.name for flight in diagnosis.flights)
     caption = (
-        f"Dots: by how much the measurements of a pair are off, their median; bars: how much they scatter about it. Of {of}."
+        "Dots: by how much the measurements of a pair are off, their median; bars: how much they "
+        f"scatter about it. Of {of}."
     )
     wide, narrow = (_drawn_pairs(names, sides, width) for width in (FULL, WIDTH))
-    return [embedded(wide, "Offset and scatter of the residual of every pair of anchors, before and after", caption, narrow)]
+    return [
+        embedded(
+            wide,
+            "Offset and scatter of the residual of every pair of anchors, before and after",
+            caption,
+            narrow,
+        )
+    ]
 
 
-def _drawn_pairs(names: Sequence[str], sides: tuple[dict[str, Any], dict[str, Any]], width: float) -> Figure:
+def _drawn_pairs(
+    names: Sequence[str], sides: tuple[dict[str, Any], dict[str, Any]], width: float
+) -> Figure:
     before, after = sides
     figure, ax = drawing(3.0, width)
-    for shift, side, colour, title in ((-0.15, before, BEFORE, "before"), (0.15, after, AFTER, "after")):
-        bias, spread = (CM * np.array([side[name][key] for name in names]) for key in ("bias", "spread"))
-        ax.errorbar(np.arange(len(names)) + shift, bias, spread, fmt="o", ms=4, color=colour, label=title, lw=1.2)
+    for shift, side, colour, title in (
+        (-0.15, before, BEFORE, "before"),
+        (0.15, after, AFTER, "after"),
+    ):
+        bias, spread = (
+            CM * np.array([side[name][key] for name in names]) for key in ("bias", "spread")
+        )
+        ax.errorbar(
+            np.arange(len(names)) + shift,
+            bias,
+            spread,
+            fmt="o",
+            ms=4,
+            color=colour,
+            label=title,
+            lw=1.2,
+        )
     ax.axhline(0.0, color="k", lw=0.6)
     ax.set(xticks=np.arange(len(names)), xlabel="pair of anchors", ylabel="residual [cm]")
     ax.set_xticklabels(names, rotation=0 if width == FULL else 90)
@@ -149,7 +210,9 @@ def _drawn_pairs(names: Sequence[str], sides: tuple[dict[str, Any], dict[str, An
 
 def functions(diagnosis: Diagnosis) -> list[Picture]:
     """Functions without a name, in the model or not."""
-    return [_function(finding.function) for finding in diagnosis.findings if finding.function][:FUNCTIONS]
+    return [_function(finding.function) for finding in diagnosis.findings if finding.function][
+        :FUNCTIONS
+    ]
 
 
 def _function(effect: SmoothTerm) -> Picture:
@@ -159,7 +222,12 @@ def _function(effect: SmoothTerm) -> Picture:
     for k, prefix in enumerate(prefixes):
         style = ("-", "--", ":", "-.")[k // len(COLOURS) % 4]
         ax.plot(
-            at, effect.curve(at, prefix), COLOURS[k % len(COLOURS)], ls=style, lw=1.4, label=prefix.rstrip(".") or None
+            at,
+            effect.curve(at, prefix),
+            COLOURS[k % len(COLOURS)],
+            ls=style,
+            lw=1.4,
+            label=prefix.rstrip(".") or None,
         )
     if len(prefixes) == 1:
         spread, course = effect.spread(at, prefixes[0]), effect.curve(at, prefixes[0])
@@ -174,7 +242,10 @@ def _function(effect: SmoothTerm) -> Picture:
         ax.legend(title="anchor", loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
     caption = f"What depends on {covariate} without having a name, a curve for each anchor."
     if len(prefixes) == 1:
-        caption = f"{described(effect, prefixes[0].rstrip('.'))}. The band is twice the standard deviation wide.".capitalize()
+        caption = (
+            f"{described(effect, prefixes[0].rstrip('.'))}. The band is twice the standard "
+            "deviation wide."
+        ).capitalize()
     return embedded(
         figure, f"Function of {covariate} in {effect.label.rpartition(' over ')[0]}", caption
     )

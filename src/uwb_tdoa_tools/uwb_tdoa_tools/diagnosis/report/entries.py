@@ -1,4 +1,6 @@
-"""Findings as a reader wants them: what came into the model together is one entry, with its worth and its doubts."""
+"""Findings as a reader wants them: what came into the model together is one entry, with its worth
+and its doubts.
+"""
 
 from __future__ import annotations
 
@@ -15,10 +17,12 @@ from ..over_flights import in_words
 
 if TYPE_CHECKING:
     from collections.abc import Hashable, Iterable, Sequence
+
     from uwb_tdoa_bias.effects import Effect
-    from ..result import Diagnosis
+
     from ..findings import EffectFinding, Refused
     from ..regression.confounding import Alternative
+    from ..result import Diagnosis
 
 CM = 100.0  # in a metre
 OR = "or"
@@ -34,7 +38,8 @@ LONGEST = 8.0  # em, of a bar
 class Entry:
     """Findings that came and went together.
 
-    title : of all of them; values : those that are significant, in words; why_not : reason for not being in the model,
+    title : of all of them; values : those that are significant, in words; why_not : reason for not
+        being in the model,
     "" for what is added; alternatives : (Alternative, ...).
     """
 
@@ -61,7 +66,9 @@ class Entry:
 
     @property
     def matters(self) -> bool:
-        """Whether it is worth doing something about: a fault, or the position gains from taking it out, as far as anybody knows."""
+        """Whether it is worth doing something about: a fault, or the position gains from taking it
+        out, as far as anybody knows.
+        """
         fault = any(
             isinstance(finding.effect, LabelEffect) for finding in self.findings
         )  # a plain mistake, to be put right whatever it is worth
@@ -71,7 +78,11 @@ class Entry:
     def physics(self) -> str:
         """Where it comes from, in words."""
         first = self.findings[0]
-        return first.effect.physics if first.declared else "structure that no effect of the catalogue explains"
+        return (
+            first.effect.physics
+            if first.declared
+            else "structure that no effect of the catalogue explains"
+        )
 
     @property
     def over_flights(self) -> str:
@@ -91,7 +102,9 @@ class Entry:
 
 
 def entries(diagnosis: Diagnosis) -> list[Entry]:
-    """[Entry] of a Diagnosis, the most prominent first; what all anchors share over the room after what is known of some."""
+    """[Entry] of a Diagnosis, the most prominent first; what all anchors share over the room after
+    what is known of some.
+    """
     groups: dict[Hashable, list[EffectFinding]] = {}
     for finding in diagnosis.findings:
         key = finding.key if finding.declared or not finding.candidates else finding.candidates[0]
@@ -106,19 +119,27 @@ def worth_in_words(entry: Entry) -> str:
         return "not told by errors in the air" if entry.findings[0].on_floor else "not known"
     if abs(entry.worth) < LEAST_WORTH:
         return "less than 0.1 cm"
-    return f"{entry.worth * CM:.1f} cm" if entry.worth > 0.0 else f"nothing ({entry.worth * CM:.1f} cm)"
+    return (
+        f"{entry.worth * CM:.1f} cm"
+        if entry.worth > 0.0
+        else f"nothing ({entry.worth * CM:.1f} cm)"
+    )
 
 
 def undecided_in_words(entry: Entry) -> list[str]:
     """What it could as well be, and how to tell, one sentence each: list."""
-    return [f"Could as well be {names}; to tell: {flight}." for names, flight in by_flight(entry.undecided)]
+    return [
+        f"Could as well be {names}; to tell: {flight}."
+        for names, flight in by_flight(entry.undecided)
+    ]
 
 
 def doubt_in_words(entry: Entry) -> list[str]:
     """What else it could be, and how to tell, one sentence each: list."""
     imitated = by_flight(entry.imitators)
     return undecided_in_words(entry) + [
-        f"Could be imitated by {names}, less plausibly; to tell: {flight}." for names, flight in imitated
+        f"Could be imitated by {names}, less plausibly; to tell: {flight}."
+        for names, flight in imitated
     ]
 
 
@@ -128,7 +149,10 @@ def certainty_in_words(entry: Entry) -> str:
     if first.candidates:
         return "Nothing else in the catalogue explains as much."
     like = first.effect.confounded_with
-    return f"Was not compared with others{f'; may be confused with {listed(like, OR)}' if like else ''}."
+    return (
+        "Was not compared with "
+        f"others{f'; may be confused with {listed(like, OR)}' if like else ''}."
+    )
 
 
 def known_with(entry: Entry) -> list[str]:
@@ -140,9 +164,15 @@ def known_with(entry: Entry) -> list[str]:
 
 
 def bar(entry: Entry, found: Iterable[Entry]) -> float:
-    """em, length of the bar that shows its worth beside the largest of those that are added; 0 for none."""
+    """em, length of the bar that shows its worth beside the largest of those that are added; 0 for
+    none.
+    """
     largest = max((other.worth or 0.0 for other in found if other.added), default=0.0)
-    return LONGEST * entry.worth / largest if entry.worth and entry.worth >= LEAST_WORTH and largest > 0.0 else 0.0
+    return (
+        LONGEST * entry.worth / largest
+        if entry.worth and entry.worth >= LEAST_WORTH and largest > 0.0
+        else 0.0
+    )
 
 
 def by_flight(alternatives: Iterable[Alternative]) -> list[tuple[str, str]]:
@@ -154,15 +184,19 @@ def by_flight(alternatives: Iterable[Alternative]) -> list[tuple[str, str]]:
 
 
 def for_people(unit: str, key: str = "") -> tuple[str, float]:
-    """(unit, factor) of a value of an effect: angles in degrees. Of units of several kinds, that of the key."""
+    """(unit, factor) of a value of an effect: angles in degrees.
+
+    Of units of several kinds, that of the key.
+    """
     if unit == "m, rad":
         unit = "m" if key in ("x", "y", "z") else "rad"
     return (unit.replace("rad", "degrees"), DEGREES) if unit in ("rad", "rad/s") else (unit, 1.0)
 
 
 def by_anchor(effect: Effect) -> dict[int, dict[str, tuple[float, float | None]]]:
-    """{anchor: {"x", "y", "z" or "": (value, std or None)}} of those values of an Effect that are significant, where each is of one anchor,
-    in the order of anchors; {} of other effects."""
+    """{anchor: {"x", "y", "z" or "": (value, std or None)}} of those values of an Effect that are
+    significant, where each is of one anchor, in the order of anchors; {} of other effects.
+    """
     out: dict[int, dict[str, tuple[float, float | None]]] = {}
     for key in effect.significant():
         parts = re.fullmatch(r"(\d+)(?:\.([xyz]))?", key)
@@ -175,7 +209,9 @@ def by_anchor(effect: Effect) -> dict[int, dict[str, tuple[float, float | None]]
 def _entry(findings: tuple[EffectFinding, ...], refused: Sequence[Refused]) -> Entry:
     first = findings[0]
     others = {other.effect: other for finding in findings for other in finding.alternatives}
-    return Entry(findings, _title(findings), _values(first), _why_not(first, refused), tuple(others.values()))
+    return Entry(
+        findings, _title(findings), _values(first), _why_not(first, refused), tuple(others.values())
+    )
 
 
 def _title(findings: Sequence[EffectFinding]) -> str:
@@ -195,7 +231,10 @@ def _values(finding: EffectFinding) -> str:
         return f"a function without a name ({finding.function.shape})"
     significant = effect.significant()
     fitted_first = sorted(effect.values.items(), key=lambda item: not effect.std.get(item[0]))
-    unit, factors = effect.unit.replace("rad", "degrees"), {key: for_people(effect.unit, key)[1] for key in effect.values}
+    unit, factors = (
+        effect.unit.replace("rad", "degrees"),
+        {key: for_people(effect.unit, key)[1] for key in effect.values},
+    )
     vague = len(effect.values) - len(significant)
     if not significant and vague > SHOWN:
         return f"{vague} values, none twice its standard deviation"

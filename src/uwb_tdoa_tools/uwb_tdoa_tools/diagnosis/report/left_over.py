@@ -10,10 +10,14 @@ from ..regression.table import BLOCK
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
+
     from ..channels import ChannelResidual
     from ..result import Diagnosis
 
-LARGE, ABOVE = 0.15, 3.0  # m, and times the root mean square of all, that a pair may be off for BLOCK s before it is named
+LARGE, ABOVE = (
+    0.15,
+    3.0,
+)  # m, and times the root mean square of all, that a pair may be off for BLOCK s before it is named
 NAMED = 3
 NEAR = 0.999  # of that limit, from which on a pair is looked at closely
 
@@ -31,7 +35,9 @@ def left_over(diagnosis: Diagnosis) -> tuple[str, ...]:
 def _of_part(part: ChannelResidual, of: str) -> Iterator[tuple[float, str]]:
     rows = part.rows()
     block = (rows.t / BLOCK).astype(int)
-    usual = np.sqrt(np.median(rows.y**2) / 0.455)  # the median of squares is 0.455 of their mean, for Gaussian noise
+    usual = np.sqrt(
+        np.median(rows.y**2) / 0.455
+    )  # the median of squares is 0.455 of their mean, for Gaussian noise
     label = rows.series * (block.max() + 1) + block
     number = np.unique(label, return_inverse=True)[1]
     power = np.bincount(number, rows.y**2) / np.bincount(number)
@@ -43,4 +49,10 @@ def _of_part(part: ChannelResidual, of: str) -> Iterator[tuple[float, str]]:
         if name and len(mine) >= 3 and size > max(LARGE, ABOVE * usual):
             first = block[mine][0] * BLOCK
             x, y, z = rows.place[mine].mean(axis=0)
-            yield size, f"{name} from {first:.0f} to {first + BLOCK:.0f} s{of}, around ({x:.1f}, {y:.1f}, {z:.1f}) m"
+            yield (
+                size,
+                (
+                    f"{name} from {first:.0f} to {first + BLOCK:.0f} s{of}, around ({x:.1f}, "
+                    f"{y:.1f}, {z:.1f}) m"
+                ),
+            )

@@ -1,15 +1,18 @@
-"""The room from above and from the side: anchors, what was found there, and where the estimate errs."""
+"""The room from above and from the side: anchors, what was found there, and where the estimate
+errs.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-import numpy as np
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Circle, Ellipse
+import numpy as np
+
 from uwb_tdoa_bias.effects.wording import listed
 
 from .pictures import FOUND, REGION, WIDTH, Picture, drawing, embedded, plt
@@ -17,8 +20,10 @@ from .room import CELL, VIEWS, changed, estimated, flown, mean_errors, shifts_an
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
+
     from matplotlib.axes import Axes
     from matplotlib.quiver import Quiver
+
     from ..result import Diagnosis
     from .room import Flown
 
@@ -30,14 +35,22 @@ LONGEST = 0.16  # of the room, of an arrow
 AWAY = 11.0  # points between an anchor and the middle of its label
 KEYS = (1, 2, 5, 10, 20, 50, 100, 200)  # cm
 ENLARGED = (1, 2, 3, 5, 10, 20, 50, 100)
-BRIGHT = 0.95  # quantile of the errors at the end of the colours, and of arrows that are to be seen whole
-COLOURS = LinearSegmentedColormap.from_list("error", plt.get_cmap("viridis_r")(np.linspace(0.06, 1.0, 64)))
+# quantile of the errors at the end of the colours, and of arrows that are to be seen whole
+BRIGHT = 0.95
+COLOURS = LinearSegmentedColormap.from_list(
+    "error", plt.get_cmap("viridis_r")(np.linspace(0.06, 1.0, 64))
+)
 ARROW = {"arrowstyle": "-|>", "color": FOUND, "lw": 1.8, "shrinkA": 0, "shrinkB": 0}
 
 
 def maps(diagnosis: Diagnosis) -> tuple[str, list[Picture]]:
-    """(caption of all, pictures): one map before and one after; one alone if nothing has changed, or nobody knows the errors."""
-    sides = [(name, flown(side["scores"])) for name, side in (("before", diagnosis.before), ("after", diagnosis.after))]
+    """(caption of all, pictures): one map before and one after; one alone if nothing has changed,
+    or nobody knows the errors.
+    """
+    sides = [
+        (name, flown(side["scores"]))
+        for name, side in (("before", diagnosis.before), ("after", diagnosis.after))
+    ]
     if not any(runs for _, runs in sides):
         arrows = Arrows.of(diagnosis, [])
         return _caption(diagnosis, [], arrows.enlarged), [_drawn(diagnosis, "", [], None, arrows)]
@@ -52,8 +65,9 @@ def maps(diagnosis: Diagnosis) -> tuple[str, list[Picture]]:
 
 @dataclass(frozen=True)
 class Arrows:
-    """How arrows are drawn, the same on every map. enlarged : times what they are; key : cm, length of the one that is
-    explained."""
+    """How arrows are drawn, the same on every map. enlarged : times what they are; key : cm, length
+    of the one that is explained.
+    """
 
     enlarged: int
     key: int
@@ -62,7 +76,9 @@ class Arrows:
     def of(cls, diagnosis: Diagnosis, sides: Sequence[Sequence[Flown]]) -> Arrows:
         """For a Diagnosis; sides : lists of Flown."""
         errors = [mean_errors(runs, view)[1] for runs in sides for view in VIEWS]
-        lengths = np.concatenate([np.zeros(1), *(np.linalg.norm(error, axis=1) for error in errors)])
+        lengths = np.concatenate(
+            [np.zeros(1), *(np.linalg.norm(error, axis=1) for error in errors)]
+        )
         longest = np.quantile(lengths, BRIGHT)  # not that of a start gone wrong
         shifts = [np.linalg.norm(by) for by, _ in shifts_and_regions(diagnosis)[0].values()]
         room = np.ptp(diagnosis.flights[0].anchors.positions, axis=0).max()
@@ -73,7 +89,9 @@ class Arrows:
         )
 
 
-def _drawn(diagnosis: Diagnosis, title: str, runs: Sequence[Flown], norm: Normalize | None, arrows: Arrows) -> Picture:
+def _drawn(
+    diagnosis: Diagnosis, title: str, runs: Sequence[Flown], norm: Normalize | None, arrows: Arrows
+) -> Picture:
     low, high = _limits(diagnosis, runs)
     size = high - low
     tall = WIDTH * 0.87 * (size[1] + size[2]) / size[0]
@@ -86,16 +104,36 @@ def _drawn(diagnosis: Diagnosis, title: str, runs: Sequence[Flown], norm: Normal
         _anchors(ax, diagnosis, view, arrows.enlarged)
         key = _arrows(ax, runs, view, arrows.enlarged)
         limits = [(low[k], high[k]) for k in view]
-        ax.set(aspect="equal", xlim=limits[0], ylim=limits[1], xlabel="x [m]", ylabel=f"{'xyz'[view[1]]} [m]")
+        ax.set(
+            aspect="equal",
+            xlim=limits[0],
+            ylim=limits[1],
+            xlabel="x [m]",
+            ylabel=f"{'xyz'[view[1]]} [m]",
+        )
         ax.grid(alpha=0.25, lw=0.5)
         if key is not None and ax is axes[0]:
-            ax.quiverkey(key, 0.8, 1.03, 0.01 * arrows.key, f"{arrows.key} cm", labelpos="E", coordinates="axes")
+            ax.quiverkey(
+                key,
+                0.8,
+                1.03,
+                0.01 * arrows.key,
+                f"{arrows.key} cm",
+                labelpos="E",
+                coordinates="axes",
+            )
     axes[0].set_title(f"{title}: from above".lstrip(": ").capitalize(), loc="left", fontsize=10)
     axes[1].set_title(f"{title}: from the side".lstrip(": ").capitalize(), loc="left", fontsize=10)
     if norm is not None:
         colours = plt.cm.ScalarMappable(norm, COLOURS)
         figure.colorbar(
-            colours, ax=axes, orientation="horizontal", label="position error [cm]", extend="max", aspect=40, pad=0.02
+            colours,
+            ax=axes,
+            orientation="horizontal",
+            label="position error [cm]",
+            extend="max",
+            aspect=40,
+            pad=0.02,
         )
     return embedded(figure, _alt(diagnosis, title, runs))
 
@@ -108,7 +146,9 @@ def _limits(diagnosis: Diagnosis, runs: Sequence[Flown]) -> tuple[np.ndarray, np
     return low - MARGIN, high + MARGIN
 
 
-def _path(ax: Axes, diagnosis: Diagnosis, runs: Sequence[Flown], view: list[int], norm: Normalize | None) -> None:
+def _path(
+    ax: Axes, diagnosis: Diagnosis, runs: Sequence[Flown], view: list[int], norm: Normalize | None
+) -> None:
     if not runs:
         for flight in diagnosis.remaining:
             path = estimated(flight)
@@ -120,7 +160,9 @@ def _path(ax: Axes, diagnosis: Diagnosis, runs: Sequence[Flown], view: list[int]
         near = np.diff(t) < max(GAP, 2.0 * np.median(np.diff(run.t)) * every)
         parts, colour = np.stack([p[:-1], p[1:]], axis=1)[near], distance[1:][near]
         order = np.argsort(colour)  # the worst on top
-        lines = LineCollection(parts[order], array=colour[order], cmap=COLOURS, norm=norm, lw=1.8, rasterized=True)
+        lines = LineCollection(
+            parts[order], array=colour[order], cmap=COLOURS, norm=norm, lw=1.8, rasterized=True
+        )
         ax.add_collection(lines)
 
 
@@ -130,7 +172,17 @@ def _anchors(ax: Axes, diagnosis: Diagnosis, view: list[int], enlarged: int) -> 
     shifts, regions = shifts_and_regions(diagnosis)
     for region in regions:
         centre = region.centre[view]
-        ax.add_patch(Circle((centre[0], centre[1]), region.radius, fill=False, ec=REGION, ls="--", lw=1.4, zorder=3))
+        ax.add_patch(
+            Circle(
+                (centre[0], centre[1]),
+                region.radius,
+                fill=False,
+                ec=REGION,
+                ls="--",
+                lw=1.4,
+                zorder=3,
+            )
+        )
         ax.plot(*zip(centre, places[region.anchor]), color=REGION, ls=":", lw=1.0, zorder=3)
     for anchor, (by, std) in shifts.items():
         tip = places[anchor] + enlarged * by[view]
@@ -142,11 +194,15 @@ def _anchors(ax: Axes, diagnosis: Diagnosis, view: list[int], enlarged: int) -> 
 
 
 def _names(ax: Axes, places: Mapping[int, np.ndarray], shifts: Mapping[int, np.ndarray]) -> None:
-    """Ids beside anchors, where their arrows do not point; those that stand one behind the other share a label."""
+    """Ids beside anchors, where their arrows do not point; those that stand one behind the other
+    share a label.
+    """
     middle = np.mean(list(places.values()), axis=0)
     labels: dict[tuple[float, ...], list[int]] = {}
     for anchor, place in places.items():
-        near = next((known for known in labels if np.linalg.norm(place - known) < BESIDE), tuple(place))
+        near = next(
+            (known for known in labels if np.linalg.norm(place - known) < BESIDE), tuple(place)
+        )
         labels.setdefault(near, []).append(anchor)
     for together in labels.values():
         own = np.array([places[anchor] for anchor in together])
@@ -155,9 +211,15 @@ def _names(ax: Axes, places: Mapping[int, np.ndarray], shifts: Mapping[int, np.n
             way = np.array([0.0, np.sign(own.mean(axis=0)[1] - middle[1]) or 1.0])
         way /= np.linalg.norm(way)
         ax.annotate(
-            ", ".join(map(str, together)), own[np.argmax(own @ way)], AWAY * way * [1.0 + 0.4 * (len(together) > 1), 1.0],
-            textcoords="offset points", ha="center", va="center", fontweight="bold", zorder=7,
-        )  # fmt: skip
+            ", ".join(map(str, together)),
+            own[np.argmax(own @ way)],
+            AWAY * way * [1.0 + 0.4 * (len(together) > 1), 1.0],
+            textcoords="offset points",
+            ha="center",
+            va="center",
+            fontweight="bold",
+            zorder=7,
+        )
 
 
 def _arrows(ax: Axes, runs: Sequence[Flown], view: list[int], enlarged: int) -> Quiver | None:
@@ -184,12 +246,15 @@ def _alt(diagnosis: Diagnosis, title: str, runs: Sequence[Flown]) -> str:
     if runs:
         worst = 100.0 * max(run.distance.max() for run in runs)
         out.append(
-            f"the path flown{f' {title}' if title else ''}, coloured by the position error, at most {worst:.0f} cm"
+            f"the path flown{f' {title}' if title else ''}, coloured by the position error, "
+            f"at most {worst:.0f} cm"
         )
     if shifts:
         out.append(f"shifts of {len(shifts)} anchors")
     if regions:
-        out.append(f"{len(regions)} region{'s' if len(regions) > 1 else ''} where an anchor is disturbed")
+        out.append(
+            f"{len(regions)} region{'s' if len(regions) > 1 else ''} where an anchor is disturbed"
+        )
     return "; ".join(out)
 
 
@@ -201,7 +266,8 @@ def _caption(diagnosis: Diagnosis, runs: Sequence[Flown], enlarged: int) -> str:
         judged = list(dict.fromkeys(run["flight"] for run in diagnosis.before["runs"]))
         out.append(f"Flight{'s' if len(judged) > 1 else ''}: {listed(judged)}.")
         out.append(
-            "Coloured: the true path, dark where the estimate errs most. Black arrows: mean error in cells of "
+            "Coloured: the true path, dark where the estimate errs most. Black arrows: mean "
+            "error in cells of "
             f"{CELL:g} m, from the true place towards the estimate{times}."
         )
     else:
@@ -212,5 +278,8 @@ def _caption(diagnosis: Diagnosis, runs: Sequence[Flown], enlarged: int) -> str:
             "ellipses: one standard deviation; an arrow shorter than twice that may be chance."
         )
     if regions:
-        out.append("Dashed circles: where the tag is when the anchor at the end of the dotted line is heard late.")
+        out.append(
+            "Dashed circles: where the tag is when the anchor at the end of the dotted line "
+            "is heard late."
+        )
     return " ".join(out)

@@ -11,21 +11,35 @@ from . import anchors, curves, entries, maps, tables, verdict, words
 if TYPE_CHECKING:
     from ..result import Diagnosis
 
-# Names and texts of a recording are a stranger's: everything that is not markup of a template is escaped.
+# Names and texts of a recording are a stranger's: everything that is not markup of a template is
+# escaped.
 _TEMPLATES = Environment(
-    loader=PackageLoader(__package__), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True,
-)  # fmt: skip
+    loader=PackageLoader(__package__),
+    autoescape=True,
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+)
 _TEMPLATES.globals |= {
-    "anchors": anchors, "curves": curves, "entries": entries, "maps": maps, "tables": tables, "verdict": verdict, "words": words,
-}  # fmt: skip
+    "anchors": anchors,
+    "curves": curves,
+    "entries": entries,
+    "maps": maps,
+    "tables": tables,
+    "verdict": verdict,
+    "words": words,
+}
 
 
 def html(diagnosis: Diagnosis, template: str = "page") -> str:
-    """The page of a Diagnosis: verdict, what to do, what each effect is worth, map, errors, what was not determined, and folded details.
+    """The page of a Diagnosis: verdict, what to do, what each effect is worth, map, errors, what
+    was not determined, and folded details.
 
     template : of the folder `templates`, the page or one of its parts.
     """
     names = ", ".join(flight.name for flight in diagnosis.flights)
     found = entries.entries(diagnosis)
-    text = _TEMPLATES.get_template(f"{template}.html").render(diagnosis=diagnosis, found=found, names=names)
+    text = _TEMPLATES.get_template(f"{template}.html").render(
+        diagnosis=diagnosis, found=found, names=names
+    )
     return text.replace("m/s^2", "m/s²")

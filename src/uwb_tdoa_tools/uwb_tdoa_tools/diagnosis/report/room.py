@@ -1,4 +1,6 @@
-"""What is known of places: where the estimate errs, where anchors seem to stand, from where they are blocked."""
+"""What is known of places: where the estimate errs, where anchors seem to stand, from where they
+are blocked.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +13,7 @@ from uwb_tdoa_bias.effects.marks import Region, Shift
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
+
     from ...scoring.metrics import Score
     from ..channels import ChannelResiduals
     from ..result import Diagnosis
@@ -22,7 +25,9 @@ FEWEST = 0.5  # s in a cell whose mean error is shown
 
 @dataclass(frozen=True)
 class Flown:
-    """A judged run where its estimate is finite: t (n,) s in the air; p (n, 3) m, true; error (n, 3) m."""
+    """A judged run where its estimate is finite: t (n,) s in the air; p (n, 3) m, true; error (n,
+    3) m.
+    """
 
     t: np.ndarray
     p: np.ndarray
@@ -45,19 +50,30 @@ def flown(scores: Iterable[Score]) -> list[Flown]:
 
 
 def mean_errors(runs: Sequence[Flown], view: list[int]) -> tuple[np.ndarray, np.ndarray]:
-    """Mean errors of [Flown] in cells of a view, two axes: (true places (k, 2) m, mean errors (k, 2) m)."""
+    """Mean errors of [Flown] in cells of a view, two axes: (true places (k, 2) m, mean errors (k,
+    2) m).
+    """
     if not runs:
         return np.empty((0, 2)), np.empty((0, 2))
-    p, error = (np.concatenate([getattr(run, name)[:, view] for run in runs]) for name in ("p", "error"))
+    p, error = (
+        np.concatenate([getattr(run, name)[:, view] for run in runs]) for name in ("p", "error")
+    )
     label = np.unique(np.floor(p / CELL), axis=0, return_inverse=True)[1].ravel()
     count = np.bincount(label)
-    means = [np.stack([np.bincount(label, values[:, k]) / count for k in range(2)], axis=1) for values in (p, error)]
+    means = [
+        np.stack([np.bincount(label, values[:, k]) / count for k in range(2)], axis=1)
+        for values in (p, error)
+    ]
     filled = count * np.median([np.median(np.diff(run.t)) for run in runs]) >= FEWEST
     return means[0][filled], means[1][filled]
 
 
-def shifts_and_regions(diagnosis: Diagnosis) -> tuple[dict[int, tuple[np.ndarray, np.ndarray]], list[Region]]:
-    """({anchor id: (by (3,), std (3,))} m, [Region]) of the model that is written, of anchors of the flights."""
+def shifts_and_regions(
+    diagnosis: Diagnosis,
+) -> tuple[dict[int, tuple[np.ndarray, np.ndarray]], list[Region]]:
+    """({anchor id: (by (3,), std (3,))} m, [Region]) of the model that is written, of anchors of
+    the flights.
+    """
     anchors = diagnosis.flights[0].anchors
     shifts: dict[int, tuple[np.ndarray, np.ndarray]] = {}
     regions = []
@@ -73,11 +89,15 @@ def shifts_and_regions(diagnosis: Diagnosis) -> tuple[dict[int, tuple[np.ndarray
 
 
 def changed(diagnosis: Diagnosis) -> bool:
-    """Whether errors in the air differ before and after: something was added that does not act near the floor alone."""
+    """Whether errors in the air differ before and after: something was added that does not act near
+    the floor alone.
+    """
     return any(finding.added and not finding.on_floor for finding in diagnosis.findings)
 
 
 def estimated(flight: ChannelResiduals) -> np.ndarray:
-    """(n, 3) m, the path in the air of {channel: ChannelResidual} as estimated, where nobody knows better."""
+    """(n, 3) m, the path in the air of {channel: ChannelResidual} as estimated, where nobody knows
+    better.
+    """
     rows = next(iter(flight.values())).rows()
     return rows.place[np.argsort(rows.t, kind="stable")]

@@ -15,4 +15,7 @@ def labels(diagnosis: Diagnosis) -> list[str]:
     runs = [run["flight"] for run in diagnosis.before["runs"]]
     if len(set(runs)) == len(runs):
         return runs
-    return [f"{score.name}, {score.first:.0f} to {score.last:.0f} s" for score in diagnosis.before["scores"]]
+    return [
+        f"{score.name}, {score.first:.0f} to {score.last:.0f} s"
+        for score in diagnosis.before["scores"]
+    ]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from uwb_tdoa_bias.effects.wording import listed, measured, rounded
 
@@ -14,7 +14,9 @@ from .unclear import by_remedy, undetermined
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
+
     from uwb_tdoa_bias.effects import Effect
+
     from ..channels.base import Figures
     from ..result import Diagnosis
     from .entries import Entry
@@ -32,10 +34,16 @@ EVIDENCE = {
     "scatter_over_air": "scatter over that in the air",
 }
 FIGURES = (  # key, title, factor
-    ("rmse_x", "x", CM), ("rmse_y", "y", CM), ("rmse_z", "z", CM), ("rmse_3d", "3D RMSE", CM),
-    ("median_3d", "median", CM), ("max_3d", "largest", CM), ("residual_spread", "scatter of innovations", CM),
-    ("nis_mean", "NIS", 1.0), ("nees_mean", "NEES", 1.0),
-)  # fmt: skip
+    ("rmse_x", "x", CM),
+    ("rmse_y", "y", CM),
+    ("rmse_z", "z", CM),
+    ("rmse_3d", "3D RMSE", CM),
+    ("median_3d", "median", CM),
+    ("max_3d", "largest", CM),
+    ("residual_spread", "scatter of innovations", CM),
+    ("nis_mean", "NIS", 1.0),
+    ("nees_mean", "NEES", 1.0),
+)
 
 
 class Table(NamedTuple):
@@ -47,7 +55,9 @@ class Table(NamedTuple):
 
 
 def advice(effect: Effect) -> tuple[Sequence[str], Table]:
-    """(sentences, values of more than MANY anchors, lengths in cm) on what a person can do about an Effect."""
+    """(sentences, values of more than MANY anchors, lengths in cm) on what a person can do about an
+    Effect.
+    """
     anchors, sentences = by_anchor(effect), effect.advice()
     if len(anchors) <= MANY or not sentences:
         return sentences, Table()
@@ -56,8 +66,13 @@ def advice(effect: Effect) -> tuple[Sequence[str], Table]:
     unit, factor = ("cm", 100.0) if effect.unit == "m" else for_people(effect.unit)
     parts = sorted({part for values in anchors.values() for part in values})
     head = ("anchor", *(f"{part} [{unit}]".lstrip() for part in parts))
-    rows = [(anchor, *(_signed(values.get(part), factor) for part in parts)) for anchor, values in anchors.items()]
-    return [f"{first}.", *filter(None, [last]), *sentences[1:]], Table(head, rows, range(1, len(head)))
+    rows = [
+        (anchor, *(_signed(values.get(part), factor) for part in parts))
+        for anchor, values in anchors.items()
+    ]
+    return [f"{first}.", *filter(None, [last]), *sentences[1:]], Table(
+        head, rows, range(1, len(head))
+    )
 
 
 def _signed(found: tuple[float, float | None] | None, factor: float) -> str:
@@ -77,7 +92,11 @@ def remedies(diagnosis: Diagnosis) -> Table:
 
 def untraced(diagnosis: Diagnosis) -> Table:
     """Every combination of parameters that leaves too little trace."""
-    rows = [(item.effect, item.what or "all of it", item.remedy) for item in undetermined(diagnosis) if item.what or not item.harmless]
+    rows = [
+        (item.effect, item.what or "all of it", item.remedy)
+        for item in undetermined(diagnosis)
+        if item.what or not item.harmless
+    ]
     return Table(("effect", "parameters", "what would tell"), rows)
 
 
@@ -92,14 +111,21 @@ def values(diagnosis: Diagnosis) -> Table:
             spread = None if std is None else factor * std
             error = "" if spread is None else rounded(spread, spread)
             rows.append((effect.name, key, rounded(factor * value, spread), error, unit, sure))
-    return Table(("effect", "parameter", "value", "standard deviation", "unit", "significant"), rows, (2, 3))
+    return Table(
+        ("effect", "parameter", "value", "standard deviation", "unit", "significant"), rows, (2, 3)
+    )
 
 
 def evidence(diagnosis: Diagnosis, found: Sequence[Entry]) -> Table:
     """How sure each finding is."""
-    used = [key for key in EVIDENCE if any(key in finding.evidence for finding in diagnosis.findings)]
+    used = [
+        key for key in EVIDENCE if any(key in finding.evidence for finding in diagnosis.findings)
+    ]
     firsts = [(entry.title, entry.findings[0]) for entry in found]
-    rows = [(title, first.channel, *(first.evidence.get(key) or "" for key in used)) for title, first in firsts]
+    rows = [
+        (title, first.channel, *(first.evidence.get(key) or "" for key in used))
+        for title, first in firsts
+    ]
     head = ("finding", "channel", *(EVIDENCE[key] for key in used))
     return Table(head, rows, range(2, len(head)))
 
@@ -110,9 +136,14 @@ def errors(diagnosis: Diagnosis) -> Table:
     shown = [item for item in FIGURES if before["pooled"].get(item[0]) is not None]
     names = [*labels(diagnosis), "all"]
     rows = []
-    for name, first, second in zip(names, [*before["runs"], before["pooled"]], [*after["runs"], after["pooled"]]):
+    for name, first, second in zip(
+        names, [*before["runs"], before["pooled"]], [*after["runs"], after["pooled"]]
+    ):
         intervals = [_interval(side) for side in (first, second)] if first.get("rmse_3d_ci") else []
-        figures = (f"{_figure(first, key, factor)} → {_figure(second, key, factor)}" for key, _, factor in shown)
+        figures = (
+            f"{_figure(first, key, factor)} → {_figure(second, key, factor)}"
+            for key, _, factor in shown
+        )
         rows.append((name, *figures, *intervals))
     bounds = ("95 % of 3D RMSE before", "after") if len(rows[0]) > 1 + len(shown) else ()
     head = ("run", *(title for _, title, _ in shown), *bounds)
@@ -120,10 +151,16 @@ def errors(diagnosis: Diagnosis) -> Table:
 
 
 def phases(diagnosis: Diagnosis) -> tuple[Table, Table]:
-    """The error in each phase of a recording, before and after: (of all runs where there are many, of each of these many)."""
+    """The error in each phase of a recording, before and after: (of all runs where there are many,
+    of each of these many).
+    """
     sides = [[*side["runs"], side["pooled"]] for side in (diagnosis.before, diagnosis.after)]
     found = [[row.get("phases", {}) for row in side] for side in sides]
-    names = [name for name in TITLES if any(phases.get(name, {}).get("rmse_3d") is not None for side in found for phases in side)]
+    names = [
+        name
+        for name in TITLES
+        if any(phases.get(name, {}).get("rmse_3d") is not None for side in found for phases in side)
+    ]
     runs = labels(diagnosis)
     columns = dict(zip([*runs, "all"], zip(*found)))
     if len(runs) == 1:
@@ -135,7 +172,13 @@ def phases(diagnosis: Diagnosis) -> tuple[Table, Table]:
 
 def _of_phases(names: Sequence[str], columns: Mapping[str, Sequence[dict[str, Any]]]) -> Table:
     """A row for each phase, a column for each run."""
-    rows = [(TITLES[name], *(_phase(first.get(name), second.get(name)) for first, second in columns.values())) for name in names]
+    rows = [
+        (
+            TITLES[name],
+            *(_phase(first.get(name), second.get(name)) for first, second in columns.values()),
+        )
+        for name in names
+    ]
     return Table(("", *columns), rows, numbers=range(1, 1 + len(columns)))
 
 
@@ -144,7 +187,8 @@ def _phase(before: dict[str, Any] | None, after: dict[str, Any] | None) -> str:
     if before is None or after is None:
         return ""
     errors, nees = (
-        " → ".join(_figure(side, key, factor) for side in (before, after)) for key, factor in (("rmse_3d", CM), ("nees_mean", 1.0))
+        " → ".join(_figure(side, key, factor) for side in (before, after))
+        for key, factor in (("rmse_3d", CM), ("nees_mean", 1.0))
     )
     return f"{errors}; NEES {nees}"
 
@@ -163,7 +207,10 @@ def refused(diagnosis: Diagnosis) -> Table:
     added = {finding.effect.label for finding in diagnosis.findings if finding.added}
     return Table(
         ("what", "why not"),
-        [(f"a further part of {item.what}" if item.what in added else item.what, item.why) for item in diagnosis.refused],
+        [
+            (f"a further part of {item.what}" if item.what in added else item.what, item.why)
+            for item in diagnosis.refused
+        ],
     )
 
 
@@ -172,16 +219,36 @@ def health(figures: Figures) -> Iterator[Table]:
     for group, name in (("pairs", "pair"), ("anchors", "anchor"), ("axes", "axis")):
         head = (name, "samples", "offset", "scatter", "far off", "likeness")
         yield Table(head, [_of_channel(item, name) for item in figures[group]], range(1, 6))
-    crossed = [(" and ".join(item["pairs"]), f"{item['correlation']:.2f}") for item in figures["cross_correlation"]]
+    crossed = [
+        (" and ".join(item["pairs"]), f"{item['correlation']:.2f}")
+        for item in figures["cross_correlation"]
+    ]
     yield Table(("pairs that err together", "correlation"), crossed, (1,))
     rows = []
     for item in figures["filter"]:
         means = [f"{item[key]:.2f}" for key in ("nis_mean", "nees_mean")]
-        rows.append((item["flight"], *means, *(f"{item[key]:.0%}" for key in ("nis_below_3.84", "nees_below_7.81"))))
-    yield Table(("flight", "NIS", "NEES", "NIS within its 95 % bound", "NEES within its 95 % bound"), rows, range(1, 5))
+        rows.append(
+            (
+                item["flight"],
+                *means,
+                *(f"{item[key]:.0%}" for key in ("nis_below_3.84", "nees_below_7.81")),
+            )
+        )
+    yield Table(
+        ("flight", "NIS", "NEES", "NIS within its 95 % bound", "NEES within its 95 % bound"),
+        rows,
+        range(1, 5),
+    )
 
 
 def _of_channel(item: dict[str, Any], name: str) -> tuple[Any, ...]:
     near = next(iter((item.get("autocorrelation") or {}).values()), None)
     offset, scatter = (f"{item[key]:.2g}" for key in ("bias", "spread"))
-    return item[name], item["count"], offset, scatter, f"{item['tails']:.1%}", "" if near is None else f"{near:.2f}"
+    return (
+        item[name],
+        item["count"],
+        offset,
+        scatter,
+        f"{item['tails']:.1%}",
+        "" if near is None else f"{near:.2f}",
+    )

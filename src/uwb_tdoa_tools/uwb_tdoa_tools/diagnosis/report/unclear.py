@@ -14,10 +14,13 @@ from ..channels import CHANNELS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
-    from ..result import Diagnosis
-    from ..regression.confounding import Unobservable
 
-NOTHING = 1e-9  # largest contribution, relative to those of its parts, of a combination that cancels
+    from ..regression.confounding import Unobservable
+    from ..result import Diagnosis
+
+NOTHING = (
+    1e-9  # largest contribution, relative to those of its parts, of a combination that cancels
+)
 NAMED = 6  # parameters of a combination that are named
 GROUND_TRUTH = "ground truth, from motion capture for example"
 ATTITUDE = "ground truth of the attitude"
@@ -28,8 +31,9 @@ CANCELS = "nothing: it cancels in every measurement, and hence does no harm"
 
 @dataclass(frozen=True)
 class Undetermined:
-    """effect : name; what : of it, in words, "" for all of it; remedy : which flight, mark or sensor would determine it,
-    in words; harmless : whether it cancels in every measurement."""
+    """effect : name; what : of it, in words, "" for all of it; remedy : which flight, mark or
+    sensor would determine it, in words; harmless : whether it cancels in every measurement.
+    """
 
     effect: str
     what: str
@@ -59,7 +63,9 @@ def _few(effect: str, whats: list[str]) -> str:
     if whats == [""]:
         return effect
     if len(whats) > 2 or "combination" in whats[0]:
-        return f"{effect} ({len(whats)} combination{'s' if len(whats) > 1 else ''} of its parameters)"
+        return (
+            f"{effect} ({len(whats)} combination{'s' if len(whats) > 1 else ''} of its parameters)"
+        )
     return f"{effect} ({'; '.join(whats)})"
 
 
@@ -70,7 +76,9 @@ def _what(item: Unobservable) -> str:
         return next(iter(item.direction))
     if len(item.direction) > NAMED and len({abs(weight) for weight in item.direction.values()}) > 1:
         return f"a combination of {len(item.direction)} parameters"
-    sides = [[key for key, weight in item.direction.items() if weight * sign > 0.0] for sign in (1, -1)]
+    sides = [
+        [key for key, weight in item.direction.items() if weight * sign > 0.0] for sign in (1, -1)
+    ]
     first, second = sorted(sides, key=len, reverse=True)
     together = f"{listed(first)} together" if len(first) > 1 else first[0]
     return f"{together} against {listed(second)}" if second else together
@@ -82,7 +90,10 @@ def _remedy(item: Unobservable, diagnosis: Diagnosis) -> str:
     if item.direction is None:
         if alone and effect.needs_reference:
             return GROUND_TRUTH
-        wanted, shown = (*effect.witnesses, *effect.channels), {name for flight in diagnosis.attribution.residuals for name in flight}
+        wanted, shown = (
+            (*effect.witnesses, *effect.channels),
+            {name for flight in diagnosis.attribution.residuals for name in flight},
+        )
         return _lacking(next((name for name in wanted if name not in shown), wanted[0]), diagnosis)
     size, parts = _contribution(item.effect, item.direction, diagnosis)
     if parts > 0.0 and size <= NOTHING * parts:
@@ -97,7 +108,9 @@ def _remedy(item: Unobservable, diagnosis: Diagnosis) -> str:
 def _knows_attitude(diagnosis: Diagnosis) -> bool:
     """Whether the reference has attitudes of each flight."""
     truths = [flight.truth for flight in diagnosis.flights]
-    return diagnosis.reference.attitude_known and all(truth is not None and np.isfinite(truth.q).any() for truth in truths)
+    return diagnosis.reference.attitude_known and all(
+        truth is not None and np.isfinite(truth.q).any() for truth in truths
+    )
 
 
 def _lacking(channel: str, diagnosis: Diagnosis) -> str:
@@ -111,9 +124,12 @@ def _lacking(channel: str, diagnosis: Diagnosis) -> str:
     return CHANNELS[channel].needs
 
 
-def _contribution(effect: str, direction: dict[str, float], diagnosis: Diagnosis) -> tuple[float, float]:
-    """Largest contribution of an effect to any row: of the combination of its parameters, {key: weight}, and of its
-    parts alone."""
+def _contribution(
+    effect: str, direction: dict[str, float], diagnosis: Diagnosis
+) -> tuple[float, float]:
+    """Largest contribution of an effect to any row: of the combination of its parameters, {key:
+    weight}, and of its parts alone.
+    """
     table = diagnosis.attribution.selection.table
     columns = {(column.effect[0], column.key): column for column in table.columns}
     x = table.matrix([columns[effect, key] for key in direction])

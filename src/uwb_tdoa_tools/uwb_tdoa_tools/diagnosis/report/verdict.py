@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from uwb_tdoa_bias.effects.wording import listed
 
@@ -13,8 +13,10 @@ from .left_over import left_over
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
-    from ..result import Diagnosis
+
     from uwb_tdoa_ekf.streams.finding import Finding as NumbersFinding
+
+    from ..result import Diagnosis
 
 CM = 100.0  # in a metre
 ERROR = "The position error (3D RMSE)"
@@ -22,8 +24,10 @@ ERROR = "The position error (3D RMSE)"
 
 @dataclass(frozen=True)
 class Verdict:
-    """headline : one sentence; more : (sentence, ...), what has to be known with it; kind : "better", "unsure" (it may
-    be chance), "same" (nothing is added, or on the floor alone), "nothing" (nothing was found) or "unknown" (no ground truth)."""
+    """headline : one sentence; more : (sentence, ...), what has to be known with it; kind :
+    "better", "unsure" (it may be chance), "same" (nothing is added, or on the floor alone),
+    "nothing" (nothing was found) or "unknown" (no ground truth).
+    """
 
     headline: str
     more: tuple[str, ...]
@@ -45,20 +49,27 @@ def verdict(diagnosis: Diagnosis) -> Verdict:
 
 
 def faults_in_words(diagnosis: Diagnosis) -> list[str]:
-    """What is wrong with the numbers of the flights: a sentence for each, with the flights and the evidence of the first."""
+    """What is wrong with the numbers of the flights: a sentence for each, with the flights and the
+    evidence of the first.
+    """
     groups: dict[str, list[tuple[str, NumbersFinding]]] = {}
     for name, found in diagnosis.numbers.items():
         for item in found:
             groups.setdefault(item.cause, []).append((name, item))
     return [
-        f"{cause[0].upper()}{cause[1:]} ({listed(name for name, _ in several)}): {several[0][1].evidence}; {several[0][1].remedy}."
+        (
+            f"{cause[0].upper()}{cause[1:]} ({listed(name for name, _ in several)}): "
+            f"{several[0][1].evidence}; {several[0][1].remedy}."
+        )
         for cause, several in groups.items()
     ]
 
 
 def truth_in_words(diagnosis: Diagnosis) -> list[str]:
     """What was wrong with clocks and frames of the ground truth: sentences."""
-    return [f"{name}: {sentence}." for name, said in diagnosis.of_truth.items() for sentence in said]
+    return [
+        f"{name}: {sentence}." for name, said in diagnosis.of_truth.items() for sentence in said
+    ]
 
 
 def centimetres(value: float) -> str:
@@ -83,7 +94,10 @@ def _with_errors(diagnosis: Diagnosis) -> Verdict:
     before, after = diagnosis.before["pooled"], diagnosis.after["pooled"]
     gain, interval = 1.0 - after["rmse_3d"] / before["rmse_3d"], after.get("rmse_3d_gain_ci")
     change = f"from {centimetres(before['rmse_3d'])} to {centimetres(after['rmse_3d'])}"
-    more = [_intervals(before, after, interval), f"Judged on {diagnosis.judged_on}: {_flights(diagnosis)}."]
+    more = [
+        _intervals(before, after, interval),
+        f"Judged on {diagnosis.judged_on}: {_flights(diagnosis)}.",
+    ]
     more += [
         *_over_phases(diagnosis),
         *_shared(diagnosis),
@@ -93,18 +107,31 @@ def _with_errors(diagnosis: Diagnosis) -> Verdict:
         *left_over(diagnosis),
     ]
     if all(finding.on_floor for finding in diagnosis.findings if finding.added):
-        stays = f"{ERROR} stays {centimetres(after['rmse_3d'])}: what is added acts near the floor alone, where the filter weighs it."
+        stays = (
+            f"{ERROR} stays {centimetres(after['rmse_3d'])}: what is added acts near the floor "
+            "alone, where the filter weighs it."
+        )
         return Verdict(stays, tuple(more), "same")
     if interval and interval[0] > 0.0:
-        return Verdict(f"{ERROR} falls {change}: {_share(gain)} of it is gone.", tuple(more), "better")
+        return Verdict(
+            f"{ERROR} falls {change}: {_share(gain)} of it is gone.", tuple(more), "better"
+        )
     more.append(
-        "More flights to judge on (--holdout) make that certain; until then compare before relying on effects.yaml."
+        "More flights to judge on (--holdout) make that certain; until then compare before "
+        "relying on effects.yaml."
     )
-    return Verdict(f"It is not certain that the position error (3D RMSE) falls: {change}.", tuple(more), "unsure")
+    return Verdict(
+        f"It is not certain that the position error (3D RMSE) falls: {change}.",
+        tuple(more),
+        "unsure",
+    )
 
 
 def _intervals(before: dict[str, Any], after: dict[str, Any], gain: Sequence[float] | None) -> str:
-    sides = [f"{_bounds(side['rmse_3d_ci'])} cm {name}" for side, name in ((before, "before"), (after, "after"))]
+    sides = [
+        f"{_bounds(side['rmse_3d_ci'])} cm {name}"
+        for side, name in ((before, "before"), (after, "after"))
+    ]
     share = 1.0 - after["rmse_3d"] / before["rmse_3d"]
     return (
         f"95 % intervals: {', '.join(sides)}; gain {_share(share)} ({percent(gain)})."
@@ -117,21 +144,33 @@ def _nothing_added(diagnosis: Diagnosis) -> Verdict:
     pooled, found = diagnosis.before["pooled"], len({finding.key for finding in diagnosis.findings})
     interval = f"95 % interval {_bounds(pooled['rmse_3d_ci'])} cm"
     error = f"{ERROR} is {centimetres(pooled['rmse_3d'])}, {interval}: {_flights(diagnosis)}."
-    more = (error, *_over_phases(diagnosis), *_shared(diagnosis), *_diverged(diagnosis), *left_over(diagnosis))
+    more = (
+        error,
+        *_over_phases(diagnosis),
+        *_shared(diagnosis),
+        *_diverged(diagnosis),
+        *left_over(diagnosis),
+    )
     if not found:
         return Verdict(
-            "Nothing was found: what the model leaves of the measurements looks like noise.", more, "nothing"
+            "Nothing was found: what the model leaves of the measurements looks like noise.",
+            more,
+            "nothing",
         )
     what = (
         "One effect was found, but taking it out does"
         if found == 1
         else f"{found} effects were found, but taking them out does"
     )
-    return Verdict(f"{what} not make the position better; nothing is added to the model.", more, "same")
+    return Verdict(
+        f"{what} not make the position better; nothing is added to the model.", more, "same"
+    )
 
 
 def _without_truth(diagnosis: Diagnosis) -> Verdict:
-    before, after = (side["pooled"]["residual_spread"] for side in (diagnosis.before, diagnosis.after))
+    before, after = (
+        side["pooled"]["residual_spread"] for side in (diagnosis.before, diagnosis.after)
+    )
     measured = "TDOAs" if any(len(flight.tdoa) for flight in diagnosis.flights) else "ranges"
     scatter = f"Innovations (measured minus predicted {measured}) scatter by {centimetres(before)}"
     if not diagnosis.findings:
@@ -139,15 +178,21 @@ def _without_truth(diagnosis: Diagnosis) -> Verdict:
         return Verdict(headline, (_UNKNOWN, f"{scatter}."), "nothing")
     if not any(finding.added for finding in diagnosis.findings):
         headline = (
-            "Nothing of what was found is added to the model: nobody can tell whether it would help the position."
+            "Nothing of what was found is added to the model: nobody can tell whether it would "
+            "help the position."
         )
         decided = diagnosis.refused[len(diagnosis.attribution.refused) :]
         why = tuple(f"Not added, {item.what}: {item.why}." for item in decided)
         return Verdict(headline, (_UNKNOWN, *why, f"{scatter}."), "unknown")
-    headline = "What was found makes measurements agree better; what that is worth for the position is unknown."
+    headline = (
+        "What was found makes measurements agree better; what that is worth for the position is "
+        "unknown."
+    )
     validated = (
-        "It is added because what is slow in the innovations becomes small: what it leaves is not above "
-        f"{100 * LEFT:.1f} cm, or {CLEARLY:g} times smaller than it was, limits that were set on measured flights."
+        "It is added because what is slow in the innovations becomes small: what it leaves is "
+        "not above "
+        f"{100 * LEFT:.1f} cm, or {CLEARLY:g} times smaller than it was, limits that were set "
+        "on measured flights."
     )
     change = f"{scatter} before and {centimetres(after)} after, on {diagnosis.judged_on}."
     return Verdict(headline, (_UNKNOWN, validated, change), "unknown")
@@ -162,7 +207,9 @@ def _names(diagnosis: Diagnosis) -> list[str]:
 
 
 def _flights(diagnosis: Diagnosis) -> str:
-    ends: dict[str, list[float]] = {}  # of each: parts of a flight that are judged by themselves lie within each other
+    ends: dict[
+        str, list[float]
+    ] = {}  # of each: parts of a flight that are judged by themselves lie within each other
     for score in diagnosis.before["scores"]:
         ends.setdefault(score.name, []).extend([score.first, score.last])
     count, seconds = len(_names(diagnosis)), sum(max(of) - min(of) for of in ends.values())
@@ -172,7 +219,9 @@ def _flights(diagnosis: Diagnosis) -> str:
 
 def _over_phases(diagnosis: Diagnosis) -> list[str]:
     """The errors outside of the air, which those above do not hold."""
-    before, after = (side["pooled"].get("phases", {}) for side in (diagnosis.before, diagnosis.after))
+    before, after = (
+        side["pooled"].get("phases", {}) for side in (diagnosis.before, diagnosis.after)
+    )
     parts = []
     for name in (name for name in NEAR_THE_FLOOR if name in before):
         sides = [_of_phase(side[name]) for side in (before, after)]
@@ -184,22 +233,32 @@ def _of_phase(figures: dict[str, Any]) -> str:
     """The 3D RMSE and the NEES of a phase."""
     if figures["rmse_3d"] is None:
         return "unknown"
-    return centimetres(figures["rmse_3d"]) + ("" if figures["nees_mean"] is None else f" (NEES {figures['nees_mean']:.1f})")
+    return centimetres(figures["rmse_3d"]) + (
+        "" if figures["nees_mean"] is None else f" (NEES {figures['nees_mean']:.1f})"
+    )
 
 
 def _shared(diagnosis: Diagnosis) -> list[str]:
     """What errors against a reference that knows only a part do not tell."""
     if all(diagnosis.reference.positions_known):
         return []
-    return [f"Errors are against {diagnosis.reference.words}: an error that both share is not in them."]
+    return [
+        f"Errors are against {diagnosis.reference.words}: an error that both share is not in them."
+    ]
 
 
 def _caveats(diagnosis: Diagnosis) -> list[str]:
     out, base = [], len(diagnosis.effects) - sum(finding.added for finding in diagnosis.findings)
     if base > 0:
-        out.append(f"Before is with the {base} effect{'s' if base > 1 else ''} that the model held already.")
+        out.append(
+            f"Before is with the {base} effect{'s' if base > 1 else ''} that the model held "
+            "already."
+        )
     if set(_names(diagnosis)) & {flight.name for flight in diagnosis.flights}:
-        out.append("Which effects to add was decided on these same flights; flights given as --holdout judge that too.")
+        out.append(
+            "Which effects to add was decided on these same flights; flights given as "
+            "--holdout judge that too."
+        )
     if len(_names(diagnosis)) == 1:
         out.append("One flight does not tell how much flights differ.")
     return out
@@ -207,7 +266,9 @@ def _caveats(diagnosis: Diagnosis) -> list[str]:
 
 def _worse(diagnosis: Diagnosis) -> list[str]:
     runs = list(zip(diagnosis.before["runs"], diagnosis.after["runs"]))
-    worse = [(b["rmse_3d"], a["rmse_3d"], b["flight"]) for b, a in runs if a["rmse_3d"] > b["rmse_3d"]]
+    worse = [
+        (b["rmse_3d"], a["rmse_3d"], b["flight"]) for b, a in runs if a["rmse_3d"] > b["rmse_3d"]
+    ]
     if not worse or len(runs) == 1:
         return []
     before, after, name = max(worse, key=lambda run: run[1] - run[0])
@@ -216,7 +277,9 @@ def _worse(diagnosis: Diagnosis) -> list[str]:
 
 
 def _diverged(diagnosis: Diagnosis) -> list[str]:
-    before, after = (sum(run["diverged"] for run in side["runs"]) for side in (diagnosis.before, diagnosis.after))
+    before, after = (
+        sum(run["diverged"] for run in side["runs"]) for side in (diagnosis.before, diagnosis.after)
+    )
     if not before and not after:
         return []
     return [f"Of {len(diagnosis.before['runs'])} runs, {before} diverged before and {after} after."]

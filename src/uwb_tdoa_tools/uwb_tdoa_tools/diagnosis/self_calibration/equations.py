@@ -1,9 +1,11 @@
-"""Normal equations of where anchors stand and how late they are, from flights of which nobody knows the path.
+"""Normal equations of where anchors stand and how late they are, from flights of which nobody knows
+the path.
 
-A run of the filter gives innovations and their derivatives by every position and delay, with the path integrated out
-(`uwb_tdoa_ekf/sensitivity.py`). Whatever else is systematic, by antennas, metal or floors, is a smooth function of the
-place for every anchor, integrated out as well: a Gaussian process, by random Fourier features (Rahimi and Recht, Random
-features for large-scale kernel machines, NIPS 2007). How large delays and functions are, the evidence says (`prior.py`). Where
+A run of the filter gives innovations and their derivatives by every position and delay, with the
+path integrated out (`uwb_tdoa_ekf/sensitivity.py`). Whatever else is systematic, by antennas, metal
+or floors, is a smooth function of the place for every anchor, integrated out as well: a Gaussian
+process, by random Fourier features (Rahimi and Recht, Random features for large-scale kernel
+machines, NIPS 2007). How large delays and functions are, the evidence says (`prior.py`). Where
 functions explain what shifts would, shifts stay where the prior is.
 """
 
@@ -41,9 +43,11 @@ from .prior import Prior
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
+
     from uwb_tdoa_bias.effects import Effect, Samples
     from uwb_tdoa_bias.foundation.flight import Flight
     from uwb_tdoa_ekf.results import Odometry
+
     from ...parallel import MapFunction
     from ..constraints import Constraint
 
@@ -52,26 +56,37 @@ SYSTEMATIC = 12.0  # by which the information is divided beside that: errors tha
 PRELIMINARY = 20.0  # the same for the solution about which that is measured
 DETERMINED = 1e-4  # share of the largest eigenvalue that a direction must have to count there
 FEWEST = 4  # measurements in a cell; noise of fewer hides what is slow
-RESIDUALS = {kind.channel: RangeResidual if kind.ends == 1 else TdoaResidual for kind in RADIO.values()}
+RESIDUALS = {
+    kind.channel: RangeResidual if kind.ends == 1 else TdoaResidual for kind in RADIO.values()
+}
 FEATURES, LENGTH = 20, 1.2  # of each function, and m over which it changes
 AT_ONCE = 32  # regressors that are made together
 
 
 def tdoa_std_of(
-    flights: Sequence[Flight], effects: EffectSet, config: FilterConfig | None = None, map_function: MapFunction = map
+    flights: Sequence[Flight],
+    effects: EffectSet,
+    config: FilterConfig | None = None,
+    map_function: MapFunction = map,
 ) -> float:
-    """m, the tdoa_std that the innovations of Flights call for beside the EffectSet `effects`; their ground truth is
-    not used. map_function : as of `attribution.attribute`."""
+    """m, the tdoa_std that the innovations of Flights call for beside the EffectSet `effects`;
+    their ground truth is not used. map_function : as of `attribution.attribute`.
+    """
     config, anchors = config or FilterConfig(), flights[0].anchors
     loose = Prior.of(anchors, np.full((len(anchors), 3), MOVED)).loose
     runs, no_delays = Runs(flights, effects, config, streams=(TDOAS,)), np.zeros(len(anchors))
-    return runs.equations(anchors, no_delays, loose, map_function=map_function, functions=False).tdoa_std(config)
+    return runs.equations(
+        anchors, no_delays, loose, map_function=map_function, functions=False
+    ).tdoa_std(config)
 
 
 def measured_noise(
-    flights: Sequence[Flight], effects: EffectSet, config: FilterConfig | None = None, map_function: MapFunction = map,
+    flights: Sequence[Flight],
+    effects: EffectSet,
+    config: FilterConfig | None = None,
+    map_function: MapFunction = map,
     say: Callable[[str], object] = lambda why: None,
-) -> float | None:  # fmt: skip
+) -> float | None:
     """The same; None where the flights are too short to tell, and say(why)."""
     try:
         return tdoa_std_of(flights, effects, config, map_function)
@@ -80,18 +95,27 @@ def measured_noise(
         return None
 
 
-def slow_innovations(flights: Sequence[Flight], effects: EffectSet, config: FilterConfig | None = None) -> float:
-    """m, scale of the innovations of Flights that are slow, averaged over half a second, beside the EffectSet `effects`: what anchors
-    that are elsewhere or late make. Their ground truth is not used. Raises InputError for a flight that is too short."""
+def slow_innovations(
+    flights: Sequence[Flight], effects: EffectSet, config: FilterConfig | None = None
+) -> float:
+    """m, scale of the innovations of Flights that are slow, averaged over half a second, beside the
+    EffectSet `effects`: what anchors that are elsewhere or late make. Their ground truth is not
+    used. Raises InputError for a flight that is too short.
+    """
     anchors = flights[0].anchors
-    return Runs(flights, effects, config or FilterConfig()).slow_innovations(anchors, np.zeros(len(anchors)))
+    return Runs(flights, effects, config or FilterConfig()).slow_innovations(
+        anchors, np.zeros(len(anchors))
+    )
 
 
 @dataclass(frozen=True, eq=False)
 class Equations:
-    """Normal equations of all flights: gram (k, k), vector (k,); marks : [_Mark] that are in them; slow : m, scale of
-    the slow innovations; inflation : by how much larger sums of scores are than those of independent errors;
-    seconds : s that tell; flights : [FlightEquations] of each, but for MANY anchors, of which they would take gigabytes."""
+    """Normal equations of all flights: gram (k, k), vector (k,); marks : [_Mark] that are in them;
+    slow : m, scale of the slow innovations; inflation : by how much larger sums of scores are than
+    those of independent errors;
+    seconds : s that tell; flights : [FlightEquations] of each, but for MANY anchors, of which they
+        would take gigabytes.
+    """
 
     gram: np.ndarray
     vector: np.ndarray
@@ -119,15 +143,27 @@ class FlightEquations:
 
 
 class Runs:
-    """Runs of Flights with anchors that are moved and late. spans : {flight: (first, last) s in the air}, as the first run of each
-    says: other anchors may move the path to the floor, but not the tag; grounded : how many marks are on the floor, and left out."""
+    """Runs of Flights with anchors that are moved and late. spans : {flight: (first, last) s in the
+    air}, as the first run of each says: other anchors may move the path to the floor, but not the
+    tag; grounded : how many marks are on the floor, and left out.
+    """
 
     def __init__(
-        self, flights: Sequence[Flight], base: EffectSet, config: FilterConfig | None,
-        constraints: Sequence[Constraint] = (), streams: Sequence[str] = tuple(RADIO),
-    ) -> None:  # fmt: skip
-        """base : EffectSet that is in the model; config : FilterConfig; constraints : what else is known; streams : of RADIO, that tell."""
-        self._base, self._config, self._reference = base, config or FilterConfig(), Nothing(config, streams=streams)
+        self,
+        flights: Sequence[Flight],
+        base: EffectSet,
+        config: FilterConfig | None,
+        constraints: Sequence[Constraint] = (),
+        streams: Sequence[str] = tuple(RADIO),
+    ) -> None:
+        """base : EffectSet that is in the model; config : FilterConfig; constraints : what else is
+        known; streams : of RADIO, that tell.
+        """
+        self._base, self._config, self._reference = (
+            base,
+            config or FilterConfig(),
+            Nothing(config, streams=streams),
+        )
         self.spans: dict[str, tuple[float, float]] = {}
         self.flights = [self._reference.prepare(flight) for flight in flights]
         self._of_anchors = [one for one in constraints if isinstance(one, Distance)]
@@ -136,25 +172,48 @@ class Runs:
         self.grounded = len(marks) - len(self._marks)
 
     def slow_innovations(self, anchors: Anchors, delays: np.ndarray) -> float:
-        """m, scale of the slow innovations of all flights with Anchors that are late by delays (N,) m; beside the offset of all ranges,
-        which the filter finds itself: nobody gains by it."""
-        about, by = (self._base, self._reference, anchors, delays), Corrector(anchors, _with_delays(self._base, anchors, delays))
-        found = [without_unknown_offset(replace(one, anchors=anchors), self._config, by) for one in self.flights]
-        return _scale([_slow(_residuals(*about, one, self.spans.get(one.name))[0]) for one in found])
+        """m, scale of the slow innovations of all flights with Anchors that are late by delays (N,)
+        m; beside the offset of all ranges, which the filter finds itself: nobody gains by it.
+        """
+        about, by = (
+            (self._base, self._reference, anchors, delays),
+            Corrector(anchors, _with_delays(self._base, anchors, delays)),
+        )
+        found = [
+            without_unknown_offset(replace(one, anchors=anchors), self._config, by)
+            for one in self.flights
+        ]
+        return _scale(
+            [_slow(_residuals(*about, one, self.spans.get(one.name))[0]) for one in found]
+        )
 
     def equations(
-        self, anchors: Anchors, delays: np.ndarray, loose: np.ndarray, progress: Callable[[], object] = lambda: None,
-        map_function: MapFunction = map, functions: bool = True,
-    ) -> Equations:  # fmt: skip
-        """Equations about Anchors and delays (N,) m. loose (4N,) m: standard deviations of what may be; functions : whether to have
-        those of the place, too, which the inflation does not ask for."""
+        self,
+        anchors: Anchors,
+        delays: np.ndarray,
+        loose: np.ndarray,
+        progress: Callable[[], object] = lambda: None,
+        map_function: MapFunction = map,
+        functions: bool = True,
+    ) -> Equations:
+        """Equations about Anchors and delays (N,) m. loose (4N,) m: standard deviations of what may
+        be; functions : whether to have those of the place, too, which the inflation does not ask
+        for.
+        """
         gram: np.ndarray = np.zeros(())
         vector: np.ndarray = np.zeros(())
         marks: list[_Mark] = []
         several: list[FlightEquations] = []
-        here = [[one for one in self._marks if one.flight == flight.name] for flight in self.flights]
-        items = [(flight, self.spans.get(flight.name), some) for flight, some in zip(self.flights, here)]
-        results = map_function(partial(_of_flight, self._base, self._reference, (anchors, delays), loose, functions), items)
+        here = [
+            [one for one in self._marks if one.flight == flight.name] for flight in self.flights
+        ]
+        items = [
+            (flight, self.spans.get(flight.name), some) for flight, some in zip(self.flights, here)
+        ]
+        results = map_function(
+            partial(_of_flight, self._base, self._reference, (anchors, delays), loose, functions),
+            items,
+        )
         for (one, span), flight in zip(results, self.flights):
             self.spans[flight.name] = span
             marks += one.marks
@@ -165,47 +224,72 @@ class Runs:
         for more, right in [*((mark.gram, mark.vector) for mark in marks), *of_anchors]:
             gram, vector = gram + more, vector + right
         slow = _scale([one.slow for one in several])
-        inflation, seconds = float(np.mean([one.inflation for one in several])), sum(one.seconds for one in several)
-        return Equations(gram, vector, marks, slow, inflation, seconds, several if len(anchors) <= MANY else [])
+        inflation, seconds = (
+            float(np.mean([one.inflation for one in several])),
+            sum(one.seconds for one in several),
+        )
+        return Equations(
+            gram, vector, marks, slow, inflation, seconds, several if len(anchors) <= MANY else []
+        )
 
 
 def _scale(slow: Sequence[np.ndarray]) -> float:
     """m, scale of the slow innovations of flights. Raises InputError where there are none."""
     together = np.concatenate(slow)
     if not len(together):
-        raise InputError(f"no pair of anchors, and no anchor, is measured {FEWEST} times in half a second: raise the rate of the radio.")
+        raise InputError(
+            f"no pair of anchors, and no anchor, is measured {FEWEST} times in half a second: "
+            "raise the rate of the radio."
+        )
     return student_scale(together)
 
 
 def _residuals(
-    base: EffectSet, reference: Nothing, anchors: Anchors, delays: np.ndarray, flight: Flight,
+    base: EffectSet,
+    reference: Nothing,
+    anchors: Anchors,
+    delays: np.ndarray,
+    flight: Flight,
     span: tuple[float, float] | None,
-) -> tuple[list[RadioResidual], tuple[float, float]]:  # fmt: skip
-    """([RadioResidual] of each stream in the air, span) of a Flight: the innovations of a run with Anchors that are late by delays (N,)
-    m."""
-    comparison = Comparison.of(replace(flight, anchors=anchors), reference, _with_delays(base, anchors, delays), span)
+) -> tuple[list[RadioResidual], tuple[float, float]]:
+    """([RadioResidual] of each stream in the air, span) of a Flight: the innovations of a run with
+    Anchors that are late by delays (N,) m.
+    """
+    comparison = Comparison.of(
+        replace(flight, anchors=anchors), reference, _with_delays(base, anchors, delays), span
+    )
     innovations = comparison.view.innovations
     assert innovations is not None  # as of a Reference that does not know the path
     found = [compared(comparison, RADIO[name], RESIDUALS[name]) for name in innovations.streams]
     parts = [part for part in found if part is not None]
     if not parts:
-        raise InputError(f"{flight.name}: has no TDOAs or ranges in the air to survey with; fly for half a minute at least.")
+        raise InputError(
+            f"{flight.name}: has no TDOAs or ranges in the air to survey with; fly for half a "
+            "minute at least."
+        )
     return parts, comparison.span
 
 
 def _of_flight(
-    base: EffectSet, reference: Nothing, about: tuple[Anchors, np.ndarray], loose: np.ndarray, functions: bool,
+    base: EffectSet,
+    reference: Nothing,
+    about: tuple[Anchors, np.ndarray],
+    loose: np.ndarray,
+    functions: bool,
     item: tuple[Flight, tuple[float, float] | None, list[Mark]],
-) -> tuple[FlightEquations, tuple[float, float]]:  # fmt: skip
-    """(FlightEquations, span) of (Flight, span or None, marks of it). about : Anchors, and by how much they are late, (N,) m; functions :
-    as of `Runs.equations`."""
+) -> tuple[FlightEquations, tuple[float, float]]:
+    """(FlightEquations, span) of (Flight, span or None, marks of it). about : Anchors, and by how
+    much they are late, (N,) m; functions : as of `Runs.equations`.
+    """
     flight, known_span, marks = item
     parts, span = _residuals(base, reference, *about, flight, known_span)
     gram, vector, blocks, known = _equations(parts, flight, marks, functions)
     n = len(loose)
     inflation = _inflation(gram[:n, :n], vector[:n], blocks, loose)
     less = SYSTEMATIC * inflation
-    return FlightEquations(gram / less, vector / less, known, _slow(parts), inflation, BLOCK * len(blocks)), span
+    return FlightEquations(
+        gram / less, vector / less, known, _slow(parts), inflation, BLOCK * len(blocks)
+    ), span
 
 
 def _with_delays(base: EffectSet, anchors: Anchors, delays: np.ndarray) -> EffectSet:
@@ -219,7 +303,9 @@ def delay_effect(anchors: Anchors, delays: np.ndarray) -> Effect:
 
 
 def _slow(parts: Sequence[RadioResidual]) -> np.ndarray:
-    """Innovations averaged over cells of half a second, (n,) m, those of which hold enough to hide the noise."""
+    """Innovations averaged over cells of half a second, (n,) m, those of which hold enough to hide
+    the noise.
+    """
     rows = [part.rows() for part in parts]
     return np.concatenate([one.y[one.count >= FEWEST] for one in rows])
 
@@ -227,11 +313,17 @@ def _slow(parts: Sequence[RadioResidual]) -> np.ndarray:
 def _equations(
     parts: Sequence[RadioResidual], flight: Flight, constraints: Sequence[Mark], functions: bool
 ) -> tuple[np.ndarray, np.ndarray, list[_BlockEquations], list[_Mark]]:
-    """(gram (k, k), vector (k,), [_BlockEquations]) of the normal equations that the RadioResiduals of a Flight give, and [_Mark] of
-    constraints of it. functions : as of `Runs.equations`."""
+    """(gram (k, k), vector (k,), [_BlockEquations]) of the normal equations that the RadioResiduals
+    of a Flight give, and [_Mark] of constraints of it. functions : as of `Runs.equations`.
+    """
     innovations = parts[0].innovations
     assert innovations is not None  # as of a Reference that does not know the path
-    n, t, air, placed = 4 * len(flight.anchors), innovations.t, np.zeros(len(innovations.t), bool), []
+    n, t, air, placed = (
+        4 * len(flight.anchors),
+        innovations.t,
+        np.zeros(len(innovations.t), bool),
+        [],
+    )
     for part in parts:
         places = innovations.places(part.samples.channel)
         air[places] = part.airborne
@@ -244,39 +336,54 @@ def _equations(
     scale = max(1.4826 * np.median(np.abs(error)), 1e-3)
     gram, vector, blocks = np.zeros((regressors.shape[1],) * 2), np.zeros(regressors.shape[1]), []
     number = np.floor((t - t[air][0]) / BLOCK).astype(int)
-    for rows, columns, derivative in innovations.in_blocks(regressors, number, np.sort(np.concatenate([[], *stamps])), moved):
+    for rows, columns, derivative in innovations.in_blocks(
+        regressors, number, np.sort(np.concatenate([[], *stamps])), moved
+    ):
         inside = air[rows]
         if not inside.any():
             continue
-        some, value, variance = derivative[inside], innovations.value[rows][inside], innovations.variance[rows][inside]
+        some, value, variance = (
+            derivative[inside],
+            innovations.value[rows][inside],
+            innovations.variance[rows][inside],
+        )
         weight = (NU + 1.0) / (NU + (value / np.sqrt(variance) / scale) ** 2) / variance
         more, right = (some * weight[:, None]).T @ some, some.T @ (weight * value)
         _add(gram, columns, more)
         vector[columns] += right
         last = np.searchsorted(columns, n)
-        blocks.append(_BlockEquations(columns[:last], more[:last, :last].copy(), right[:last]))  # the whole of `more` takes megabytes
+        blocks.append(
+            _BlockEquations(columns[:last], more[:last, :last].copy(), right[:last])
+        )  # the whole of `more` takes megabytes
     return gram, vector, blocks, _known(constraints, stamps, moved, innovations.run.odometry)
 
 
 @compiled
 def _add(gram: np.ndarray, columns: np.ndarray, more: np.ndarray) -> None:
-    """Add more (c, c) to the rows and columns (c,) of gram (k, k), row by row: as numpy does, without copies of them."""
+    """Add more (c, c) to the rows and columns (c,) of gram (k, k), row by row: as numpy does,
+    without copies of them.
+    """
     for i in range(len(columns)):
         for j in range(len(columns)):
             gram[columns[i], columns[j]] += more[i, j]
 
 
 def _regressors(samples: Samples, functions: bool) -> csr_array:
-    """Derivatives of TDOAs by coordinates and delays of anchors, and functions of the place of each, if they are wanted: sparse, in rows,
-    (n, 24 N) or (n, 4 N)."""
+    """Derivatives of TDOAs by coordinates and delays of anchors, and functions of the place of
+    each, if they are wanted: sparse, in rows, (n, 24 N) or (n, 4 N).
+    """
     ids = [str(i) for i in samples.anchors.ids]
     late = _sparse(AnchorDelay(), samples, ids)
     positions = _sparse(AnchorPosition(), samples, [f"{i}.{axis}" for i in ids for axis in "xyz"])
-    return hstack([positions, late, *([_of_places(late, samples.p)] if functions else [])], format="csr")
+    return hstack(
+        [positions, late, *([_of_places(late, samples.p)] if functions else [])], format="csr"
+    )
 
 
 def _of_places(late: csr_array, p: np.ndarray) -> csr_array:
-    """Every entry of `late` (n, N) times all functions of the places p (n, 3) m: as many columns in the place of one."""
+    """Every entry of `late` (n, N) times all functions of the places p (n, 3) m: as many columns in
+    the place of one.
+    """
     values = np.nan_to_num(features(p))
     n, times = late.shape[0], values.shape[1]
     return csr_array(
@@ -291,11 +398,16 @@ def _of_places(late: csr_array, p: np.ndarray) -> csr_array:
 
 def _selection(places: np.ndarray, n: int) -> csr_array:
     """What puts rows (m, ...) to places (m,) among n: (n, m)."""
-    return csr_array((np.ones(len(places)), (places, np.arange(len(places)))), shape=(n, len(places)))
+    return csr_array(
+        (np.ones(len(places)), (places, np.arange(len(places)))), shape=(n, len(places))
+    )
 
 
 def _sparse(effect: Effect, samples: Samples, keys: list[str]) -> csr_array:
-    """Regressors of an Effect of single anchors, sparse, in rows: (n, keys). What is of other anchors is zero, and not asked for."""
+    """Regressors of an Effect of single anchors, sparse, in rows: (n, keys).
+
+    What is of other anchors is zero, and not asked for.
+    """
     parts = []
     for first in range(0, len(keys), AT_ONCE):
         some = keys[first : first + AT_ONCE]
@@ -304,13 +416,20 @@ def _sparse(effect: Effect, samples: Samples, keys: list[str]) -> csr_array:
         values = csr_array(np.nan_to_num(effect.regressors(of_rows(samples, rows), some)))
         held = np.zeros(len(samples.t), np.int64)
         held[rows] = np.diff(values.indptr)
-        parts.append(csr_array((values.data, values.indices, np.append(0, np.cumsum(held))), shape=(len(held), len(some))))
+        parts.append(
+            csr_array(
+                (values.data, values.indices, np.append(0, np.cumsum(held))),
+                shape=(len(held), len(some)),
+            )
+        )
     return hstack(parts, format="csr")
 
 
 @dataclass(frozen=True, eq=False)
 class _BlockEquations:
-    """Normal equations of a block of TDOAs, of those coordinates and delays that matter there: columns (c,); gram (c, c); vector (c,)."""
+    """Normal equations of a block of TDOAs, of those coordinates and delays that matter there:
+    columns (c,); gram (c, c); vector (c,).
+    """
 
     columns: np.ndarray
     gram: np.ndarray
@@ -319,7 +438,9 @@ class _BlockEquations:
 
 @dataclass(frozen=True, eq=False)
 class _Mark:
-    """Normal equations of a constraint of a flight: gram (k, k), vector (k,); off (3,) m, columns (3, k): as of Mark.off."""
+    """Normal equations of a constraint of a flight: gram (k, k), vector (k,); off (3,) m, columns
+    (3, k): as of Mark.off.
+    """
 
     gram: np.ndarray
     vector: np.ndarray
@@ -327,9 +448,12 @@ class _Mark:
     columns: np.ndarray
 
 
-def _known(constraints: Sequence[Mark], stamps: Sequence[np.ndarray], moved: np.ndarray, odometry: Odometry) -> list[_Mark]:
-    """[_Mark] of constraints of a flight that ask for the estimate at stamps. moved (m, 3, k): its derivative at all of them in
-    turn."""
+def _known(
+    constraints: Sequence[Mark], stamps: Sequence[np.ndarray], moved: np.ndarray, odometry: Odometry
+) -> list[_Mark]:
+    """[_Mark] of constraints of a flight that ask for the estimate at stamps. moved (m, 3, k): its
+    derivative at all of them in turn.
+    """
     order = np.argsort(np.concatenate([[], *stamps]), kind="stable")
     moved = moved[np.argsort(order, kind="stable")]
     first, out = 0, []
@@ -337,26 +461,36 @@ def _known(constraints: Sequence[Mark], stamps: Sequence[np.ndarray], moved: np.
         estimate = np.stack([np.interp(t, odometry.t, odometry.p[:, k]) for k in range(3)], axis=1)
         rows = np.minimum(np.searchsorted(odometry.t, t), len(odometry.t) - 1)
         here = moved[first : first + len(t)]
-        covariance = odometry.covariance[rows, :3, :3] - odometry.persistent[rows]  # errors of anchors, which persist, are unknowns
+        covariance = (
+            odometry.covariance[rows, :3, :3] - odometry.persistent[rows]
+        )  # errors of anchors, which persist, are unknowns
         out.append(_Mark(*one.equations(t, estimate, covariance, here), *one.off(estimate, here)))
         first += len(t)
     return out
 
 
-def _inflation(gram: np.ndarray, vector: np.ndarray, blocks: Sequence[_BlockEquations], sizes: np.ndarray) -> float:
-    """By how much sums of scores over blocks, [_BlockEquations], whose sums are gram (k, k) and vector (k,), are larger than those of
-    independent errors, averaged over the directions that the data determine. sizes (k,): prior standard deviations."""
+def _inflation(
+    gram: np.ndarray, vector: np.ndarray, blocks: Sequence[_BlockEquations], sizes: np.ndarray
+) -> float:
+    """By how much sums of scores over blocks, [_BlockEquations], whose sums are gram (k, k) and
+    vector (k,), are larger than those of independent errors, averaged over the directions that the
+    data determine. sizes (k,): prior standard deviations.
+    """
     step = np.linalg.solve(gram / PRELIMINARY + np.diag(sizes**-2.0), vector / PRELIMINARY)
     scores = np.zeros((len(blocks), len(vector)))
     for score, block in zip(scores, blocks):
         score[block.columns] = block.vector - block.gram @ step[block.columns]
     values, directions = np.linalg.eigh(gram)
     determined = values > DETERMINED * values[-1]
-    return float(np.mean(np.sum((scores @ directions[:, determined]) ** 2, axis=0) / values[determined]))
+    return float(
+        np.mean(np.sum((scores @ directions[:, determined]) ** 2, axis=0) / values[determined])
+    )
 
 
 def features(p: np.ndarray, length: float = LENGTH) -> np.ndarray:
-    """Random Fourier features of a Gaussian kernel of some length, m, at places p (n, 3) m: (n, FEATURES)."""
+    """Random Fourier features of a Gaussian kernel of some length, m, at places p (n, 3) m: (n,
+    FEATURES).
+    """
     waves = np.random.default_rng(3).standard_normal((3, FEATURES // 2)) / length
     phase = p @ waves
     return np.concatenate([np.cos(phase), np.sin(phase)], axis=1) * np.sqrt(2.0 / FEATURES)

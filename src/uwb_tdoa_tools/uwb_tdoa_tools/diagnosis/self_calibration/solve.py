@@ -1,4 +1,6 @@
-"""The one way from flights and what is known of their anchors to better anchors, and whether these may be used."""
+"""The one way from flights and what is known of their anchors to better anchors, and whether these
+may be used.
+"""
 
 from __future__ import annotations
 
@@ -22,8 +24,10 @@ from .tape import Tape
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
+
     from uwb_tdoa_bias.foundation.anchors import Anchors
     from uwb_tdoa_bias.foundation.flight import Flight
+
     from ...parallel import MapFunction
     from ..constraints import Constraint
     from .equations import Equations
@@ -35,14 +39,17 @@ SAME_PLACE = 0.05  # m by which an anchor may differ between flights of one inst
 NOTHING_KNOWN = 1e3  # m, standard deviation of a coordinate of which nothing is known
 IMPROVED = 0.7  # of the standard deviation as given; less is an improvement
 LEFT = 0.055  # m that may be left of slow innovations
-CLEARLY = 2.6  # slow innovations as given over those that are left, beyond which the tape was worse than what else is wrong
+# slow innovations as given over those that are left, beyond which the tape was worse than what else
+# is wrong
+CLEARLY = 2.6
 NEARER = 0.75  # share of marks, each left out once, at which the estimate must come nearer
 
 
 @dataclass(frozen=True, eq=False)
 class AnchorChange:
-    """What is not as the last calibration had it: effect : name; anchor : id; values, std : (m,) m, by how much; rivals : names of
-    effects that the flights cannot tell from it."""
+    """What is not as the last calibration had it: effect : name; anchor : id; values, std : (m,) m,
+    by how much; rivals : names of effects that the flights cannot tell from it.
+    """
 
     effect: str
     anchor: str
@@ -52,10 +59,17 @@ class AnchorChange:
 
     def as_text(self) -> str:
         """One sentence."""
-        by = ", ".join(f"{100 * value:+.1f} +- {100 * std:.1f}" for value, std in zip(self.values, self.std))
+        by = ", ".join(
+            f"{100 * value:+.1f} +- {100 * std:.1f}" for value, std in zip(self.values, self.std)
+        )
         if self.effect == POSITION:
-            return f"anchor {self.anchor} has moved by {by} cm (x, y, z)" + ", or is later than it was" * bool(self.rivals)
-        return f"anchor {self.anchor} is later than it was by {by} cm" + ", or has moved" * bool(self.rivals)
+            return (
+                f"anchor {self.anchor} has moved by {by} cm (x, y, z)"
+                + ", or is later than it was" * bool(self.rivals)
+            )
+        return f"anchor {self.anchor} is later than it was by {by} cm" + ", or has moved" * bool(
+            self.rivals
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,16 +77,22 @@ class SelfCalibration:
     """What flights tell of their anchors.
 
     given : Anchors; prior : Prior of them; flights : names; base : EffectSet that was in the model;
-    surveyed : Anchors where the flights put them; delays (N,) m; solution : Solution, whose covariance is of positions, anchor by anchor,
+    surveyed : Anchors where the flights put them; delays (N,) m; solution : Solution, whose
+        covariance is of positions, anchor by anchor,
     and then of delays; seconds : s in the air that tell;
-    before, left : m, scale of the slow innovations with the anchors as given, and with these, beside the offset of all ranges;
-    tdoa_std : m, for the filter: so that it believes in as many independent TDOAs as there are; None without any;
+    before, left : m, scale of the slow innovations with the anchors as given, and with these,
+        beside the offset of all ranges;
+    tdoa_std : m, for the filter: so that it believes in as many independent TDOAs as there are;
+        None without any;
     changes : (AnchorChange, ...) since the last calibration;
-    marks : (before, after, nearer), root mean square of what estimates at marks in the air are off by, m, and share of marks that they
+    marks : (before, after, nearer), root mean square of what estimates at marks in the air are off
+        by, m, and share of marks that they
     come nearer to, each after a fit without it; None where there are none;
-    grounded : how many marks were left out, because they are on the floor: estimates there are metres off and do not know it;
+    grounded : how many marks were left out, because they are on the floor: estimates there are
+        metres off and do not know it;
     shares : {name of an effect: (Share, ...)}, how much of it each flight shows;
-    blocked : sentences on what makes anchors late somewhere, once somebody has looked (`surveying/blocked.py`).
+    blocked : sentences on what makes anchors late somewhere, once somebody has looked
+        (`surveying/blocked.py`).
     """
 
     given: Anchors
@@ -96,22 +116,27 @@ class SelfCalibration:
     def why_not(self) -> str | None:
         """Why it must not be used instead of what was given; None if it may.
 
-        Where something else is wrong as well, positions and delays take the place of what they look like, and the position gets
-        worse. That shows in what is left of the slow innovations, or at marks.
+        Where something else is wrong as well, positions and delays take the place of what they look
+        like, and the position gets worse. That shows in what is left of the slow innovations, or at
+        marks.
         """
         if self.marks:
             before, after, nearer = self.marks
             if after < before and nearer >= NEARER:
                 return None
             return (
-                f"at marks, each left out once, the estimate is off by {100 * before:.1f} cm with the anchors as given, and by {100 * after:.1f} cm with "
-                f"others, and nearer at {nearer:.0%} of them: the position would suffer; measure more marks, or fly where it is known"
+                f"at marks, each left out once, the estimate is off by {100 * before:.1f} cm "
+                f"with the anchors as given, and by {100 * after:.1f} cm with "
+                f"others, and nearer at {nearer:.0%} of them: the position would suffer; "
+                "measure more marks, or fly where it is known"
             )
         if self.left <= LEFT or self.before > CLEARLY * self.left:
             return None
         return (
-            f"{100 * self.before:.1f} cm of the innovations are slow with the anchors as given, and {100 * self.left:.1f} cm with others: more than "
-            f"{100 * LEFT:.1f} cm: something else is wrong too, and the position might suffer; give --marks, or fly where it is known"
+            f"{100 * self.before:.1f} cm of the innovations are slow with the anchors as "
+            f"given, and {100 * self.left:.1f} cm with others: more than "
+            f"{100 * LEFT:.1f} cm: something else is wrong too, and the position might "
+            "suffer; give --marks, or fly where it is known"
         )
 
     @property
@@ -126,7 +151,9 @@ class SelfCalibration:
 
     @property
     def effects(self) -> EffectSet:
-        """The EffectSet to use with them, with what was in the model; its covariance is the prior of the next calibration."""
+        """The EffectSet to use with them, with what was in the model; its covariance is the prior
+        of the next calibration.
+        """
         if self.why_not is not None:
             return self.base
         return with_calibration(self.base, self.found(np.zeros_like(self.shifts)), self.covariance)
@@ -136,17 +163,23 @@ class SelfCalibration:
         n, keys = shifts.size, [key for _, key in keys_of(self.given.ids)]
         values = np.concatenate([shifts.ravel(), self.delays]).tolist()
         std = np.sqrt(np.diag(self.solution.covariance)).tolist()
-        position, delay = ((dict(zip(keys[some], values[some])), dict(zip(keys[some], std[some]))) for some in (slice(n), slice(n, None)))
+        position, delay = (
+            (dict(zip(keys[some], values[some])), dict(zip(keys[some], std[some])))
+            for some in (slice(n), slice(n, None))
+        )
         return AnchorPosition(*position, source="survey"), AnchorDelay(*delay, source="survey")
 
     @property
     def tag_delay(self) -> tuple[float, float] | None:
-        """(m, m): what all ranges are too long by, which is in the delays of all anchors, and its standard deviation. None without
-        ranges."""
+        """(m, m): what all ranges are too long by, which is in the delays of all anchors, and its
+        standard deviation. None without ranges.
+        """
         if not self.prior.common:
             return None
         first = self.shifts.size
-        return float(self.delays.mean()), float(np.sqrt(self.solution.covariance[first:, first:].mean()))
+        return float(self.delays.mean()), float(
+            np.sqrt(self.solution.covariance[first:, first:].mean())
+        )
 
     @property
     def covariance(self) -> Covariance:
@@ -175,21 +208,39 @@ class SelfCalibration:
 
 
 def self_calibrate(
-    flights: Sequence[Flight], tape: Tape = Tape(), base: EffectSet = EffectSet(), config: FilterConfig | None = None,
-    constraints: Sequence[Constraint] = (), progress: Callable[[], object] = lambda: None, map_function: MapFunction = map,
-) -> SelfCalibration:  # fmt: skip
+    flights: Sequence[Flight],
+    tape: Tape = Tape(),
+    base: EffectSet = EffectSet(),
+    config: FilterConfig | None = None,
+    constraints: Sequence[Constraint] = (),
+    progress: Callable[[], object] = lambda: None,
+    map_function: MapFunction = map,
+) -> SelfCalibration:
     """SelfCalibration of Flights with the anchors that a Tape speaks of. Ground truth is not used.
 
-    base : EffectSet that is in the model already; its covariance, of the last calibration, counts where there is one, not the
-    Tape; config : FilterConfig; constraints : what else is known (`diagnosis/constraints`); map_function : as of
-    `attribution.attribute`. The frame is that of the coordinates with the smallest std. Raises InputError for flights of different
-    anchors or that are too short, and for a Tape that does not fit.
+    base : EffectSet that is in the model already; its covariance, of the last calibration, counts
+        where there is one, not the
+    Tape; config : FilterConfig; constraints : what else is known (`diagnosis/constraints`);
+    map_function : as of `attribution.attribute`. The frame is that of the coordinates with the
+    smallest std. Raises InputError for flights of different anchors or that are too short, and for
+    a Tape that does not fit.
     """
     same_anchors(flights)
-    given, config, names = flights[0].anchors, config or FilterConfig(), tuple(flight.name for flight in flights)
-    std, rows, tdoas = tape.position_std(given), tape.unknown_rows(given), any(len(flight.tdoa) for flight in flights)
+    given, config, names = (
+        flights[0].anchors,
+        config or FilterConfig(),
+        tuple(flight.name for flight in flights),
+    )
+    std, rows, tdoas = (
+        tape.position_std(given),
+        tape.unknown_rows(given),
+        any(len(flight.tdoa) for flight in flights),
+    )
     if rows and not tdoas:
-        raise InputError(f"--unknown {given.ids[rows[0]]}: only TDOAs place an anchor; measure it roughly, and give --std.")
+        raise InputError(
+            f"--unknown {given.ids[rows[0]]}: only TDOAs place an anchor; measure it roughly, "
+            "and give --std."
+        )
     start, start_std = given, std.copy()
     if rows:
         start = place(flights, rows, config)
@@ -203,7 +254,13 @@ def self_calibrate(
     mean = np.concatenate([start.positions.ravel(), np.zeros(n)])
 
     def linearised(about: np.ndarray) -> Equations:
-        return runs.equations(given.at(about[: 3 * n].reshape(n, 3)), about[3 * n :], prior.loose, progress, map_function)
+        return runs.equations(
+            given.at(about[: 3 * n].reshape(n, 3)),
+            about[3 * n :],
+            prior.loose,
+            progress,
+            map_function,
+        )
 
     best, first = mean, linearised(mean)
     last = first
@@ -213,27 +270,53 @@ def self_calibrate(
         last = linearised(best)
         found = solve(last.gram, last.vector, prior, best - mean)
     if last.seconds < LEAST:
-        raise InputError(f"the flights are {last.seconds:g} s in the air together; {LEAST:g} s are needed: fly for longer.")
+        raise InputError(
+            f"the flights are {last.seconds:g} s in the air together; {LEAST:g} s are needed: "
+            "fly for longer."
+        )
     shares = _shares(last, best - mean, found, names) if n <= MANY else {}
     best = best + found.step
-    moved, delays, tdoa_std = given.at(best[: 3 * n].reshape(n, 3)), best[3 * n :], last.tdoa_std(config) if tdoas else None
+    moved, delays, tdoa_std = (
+        given.at(best[: 3 * n].reshape(n, 3)),
+        best[3 * n :],
+        last.tdoa_std(config) if tdoas else None,
+    )
     before = runs.slow_innovations(start, np.zeros(n)) if ranged else first.slow
     return SelfCalibration(
-        given, Prior.of(given, std, base.covariance, common), names, base, moved, delays, found, last.seconds, before,
-        runs.slow_innovations(moved, delays), tdoa_std, _changes(prior, found, best - mean), _left_out(first, prior),
-        runs.grounded, shares,
-    )  # fmt: skip
+        given,
+        Prior.of(given, std, base.covariance, common),
+        names,
+        base,
+        moved,
+        delays,
+        found,
+        last.seconds,
+        before,
+        runs.slow_innovations(moved, delays),
+        tdoa_std,
+        _changes(prior, found, best - mean),
+        _left_out(first, prior),
+        runs.grounded,
+        shares,
+    )
 
 
 def same_anchors(flights: Sequence[Flight]) -> None:
-    """Raises InputError unless all of some Flights, at least one, were flown among the same anchors."""
+    """Raises InputError unless all of some Flights, at least one, were flown among the same
+    anchors.
+    """
     if not flights:
         raise InputError("give at least one flight.")
     first = flights[0]
     for flight in flights[1:]:
         same = np.array_equal(flight.anchors.ids, first.anchors.ids)
-        if not (same and np.allclose(flight.anchors.positions, first.anchors.positions, atol=SAME_PLACE)):
-            raise InputError(f"{flight.name}: its anchors are not those of {first.name}; take each installation and day alone.")
+        if not (
+            same and np.allclose(flight.anchors.positions, first.anchors.positions, atol=SAME_PLACE)
+        ):
+            raise InputError(
+                f"{flight.name}: its anchors are not those of {first.name}; take each "
+                "installation and day alone."
+            )
 
 
 def _of_positions(covariance: np.ndarray) -> np.ndarray:
@@ -247,10 +330,16 @@ def _left_out(equations: Equations, prior: Prior) -> tuple[float, float, float] 
         return None
     n, off = len(prior.covariance), []
     for one in equations.marks:
-        step = solve(equations.gram - one.gram, equations.vector - one.vector, prior, np.zeros(n)).step
+        step = solve(
+            equations.gram - one.gram, equations.vector - one.vector, prior, np.zeros(n)
+        ).step
         off.append((one.off, one.off - one.columns[:, :n] @ step))
     before, after = np.sum(np.square(off), axis=2).T
-    return float(np.sqrt(before.mean())), float(np.sqrt(after.mean())), float(np.mean(after < before))
+    return (
+        float(np.sqrt(before.mean())),
+        float(np.sqrt(after.mean())),
+        float(np.mean(after < before)),
+    )
 
 
 def _changes(prior: Prior, found: Solution, offset: np.ndarray) -> tuple[AnchorChange, ...]:
@@ -263,16 +352,25 @@ def _changes(prior: Prior, found: Solution, offset: np.ndarray) -> tuple[AnchorC
     return tuple(out)
 
 
-def _shares(equations: Equations, offset: np.ndarray, found: Solution, names: Sequence[str]) -> dict[str, tuple[Share, ...]]:
-    """SelfCalibration.shares: a fit of one factor to what each flight alone tells in Equations that were made an offset (4N,) from the
-    mean of the prior; with the information of `over_flights`, which errors that last do not make less."""
+def _shares(
+    equations: Equations, offset: np.ndarray, found: Solution, names: Sequence[str]
+) -> dict[str, tuple[Share, ...]]:
+    """SelfCalibration.shares: a fit of one factor to what each flight alone tells in Equations that
+    were made an offset (4N,) from the mean of the prior; with the information of `over_flights`,
+    which errors that last do not make less.
+    """
     n, whole, out = len(offset), offset + found.step, {}
-    reduced = [eliminated(SYSTEMATIC * one.gram, SYSTEMATIC * one.vector, n, found.function_std)[:2] for one in equations.flights]
+    reduced = [
+        eliminated(SYSTEMATIC * one.gram, SYSTEMATIC * one.vector, n, found.function_std)[:2]
+        for one in equations.flights
+    ]
     for name, columns in ((POSITION, slice(3 * n // 4)), (DELAY, slice(3 * n // 4, n))):
         part = np.zeros(n)
         part[columns] = whole[columns]
         out[name] = tuple(
-            Share.fitted(flight, part @ gram @ part, part @ (vector + gram @ (offset - whole + part)))
+            Share.fitted(
+                flight, part @ gram @ part, part @ (vector + gram @ (offset - whole + part))
+            )
             for flight, (gram, vector) in zip(names, reduced)
         )
     return out

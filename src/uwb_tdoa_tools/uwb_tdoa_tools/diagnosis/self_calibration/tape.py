@@ -17,8 +17,10 @@ AXES = "xyz"
 
 @dataclass(frozen=True)
 class Tape:
-    """std : m, of every coordinate; height_std : m, of z, None for std; trusted : names of anchors, "3", or coordinates,
-    "3.z", that are known within trusted_std, m; unknown : ids of anchors of which nothing is known."""
+    """std : m, of every coordinate; height_std : m, of z, None for std; trusted : names of anchors,
+    "3", or coordinates, "3.z", that are known within trusted_std, m; unknown : ids of anchors of
+    which nothing is known.
+    """
 
     std: float = 0.1
     height_std: float | None = None
@@ -30,10 +32,15 @@ class Tape:
         for name in ("std", "height_std", "trusted_std"):
             value = getattr(self, name)
             if value is not None and not 0.0 < value <= 5.0:
-                raise InputError(f"--{name.replace('_', '-')}: {value:g} must be above 0 and at most 5 m.")
+                raise InputError(
+                    f"--{name.replace('_', '-')}: {value:g} must be above 0 and at most 5 m."
+                )
 
     def position_std(self, anchors: Anchors) -> np.ndarray:
-        """(N, 3) m for Anchors. Raises InputError for a name that is no anchor, and where nothing tells the frame."""
+        """(N, 3) m for Anchors.
+
+        Raises InputError for a name that is no anchor, and where nothing tells the frame.
+        """
         out = np.full((len(anchors), 3), self.std)
         if self.height_std is not None:
             out[:, 2] = self.height_std
@@ -41,7 +48,10 @@ class Tape:
             anchor, _, axis = name.partition(".")
             row = self._row(anchors, anchor, f"--trusted {name}")
             if axis and axis not in AXES:
-                raise InputError(f"--trusted: {name!r} has no axis {axis!r}; write {anchor} or {anchor}.x, {anchor}.y, {anchor}.z.")
+                raise InputError(
+                    f"--trusted: {name!r} has no axis {axis!r}; write {anchor} or {anchor}.x, "
+                    f"{anchor}.y, {anchor}.z."
+                )
             out[row, AXES.index(axis) if axis else slice(None)] = self.trusted_std
         return out
 
@@ -49,12 +59,18 @@ class Tape:
         """Rows of the unknown anchors. Raises InputError where fewer than four others are left."""
         rows = [self._row(anchors, anchor, f"--unknown {anchor}") for anchor in self.unknown]
         if len(anchors) - len(rows) < 4:
-            raise InputError(f"--unknown: {len(anchors) - len(rows)} of {len(anchors)} anchors are left; four must be known roughly.")
+            raise InputError(
+                f"--unknown: {len(anchors) - len(rows)} of {len(anchors)} anchors are left; "
+                "four must be known roughly."
+            )
         return rows
 
     @staticmethod
     def _row(anchors: Anchors, text: str, option: str) -> int:
         if text not in [str(i) for i in anchors.ids]:
             known = ", ".join(str(i) for i in anchors.ids)
-            raise InputError(f"{option}: there is no anchor {text!r}; the survey has {known}: add it there, roughly.")
+            raise InputError(
+                f"{option}: there is no anchor {text!r}; the survey has {known}: add it "
+                "there, roughly."
+            )
         return [str(i) for i in anchors.ids].index(text)
