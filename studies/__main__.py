@@ -26,7 +26,7 @@ from studies.diagnosis import figures
 from studies.diagnosis import ranges as diagnosed_ranges
 from studies.faults import figures as faults
 from studies.faults import flown
-from studies.training import compare, default, spin, splits
+from studies.training import compare, spin, splits
 from uwb_tdoa_tools import cli
 
 STUDIES = {
@@ -38,7 +38,6 @@ STUDIES = {
     "crazyflie": crazyflie,
     "debias-measured": measured,
     "debias-set-up": set_up,
-    "default-model": default,
     "diagnose-ranges": diagnosed_ranges,
     "diagnosis": figures,
     "faults": faults,
@@ -68,7 +67,6 @@ of measured flights: flights/, util/, surveys/.
   crazyflie        measured logs put through the radio link of a Crazyflie (docs/connect.md)
   debias-measured  bias maps of positions on measured flights (docs/debiasing.md)
   debias-set-up    a simulated copy of the set-up of Grasso et al. (docs/debiasing.md)
-  default-model    the model that bias_node ships
   diagnose-ranges  errors put into simulated distances to anchors, and what diagnose makes of them (docs/sensors.md)
   diagnosis        effects put into flights, and found again (docs/diagnosis.md)
   faults           faults of streams, surveys, nodes and clocks, played to the real nodes over topics (docs/reliability.md)
@@ -111,7 +109,6 @@ def parser():
         "./dev study crazyflie DATA/flights/0425/TDOA2 DATA/flights/0422 --survey DATA/surveys",
         "./dev study debias-measured --data DATA --diagnosed bench/ --out measured/",
         "./dev study debias-set-up --out set_up/",
-        "./dev study default-model DATA/flights --survey DATA/surveys --out default.onnx",
         "./dev study diagnose-ranges --flights 5",
         "./dev study diagnosis bank --out bench/",
         "./dev study diagnosis measured --data DATA --out bench/",

@@ -24,15 +24,17 @@ setup(
         "scipy>=1.11",
     ],
     extras_require={
-        "models": ["onnx>=1.14"],  # to make known_answer.onnx anew
-        "test": ["hypothesis>=6.60", "pytest>=7.0"],  # colcon test runs pytest because of this
+        "test": [
+            "hypothesis>=6.60",
+            "onnx>=1.14",
+            "pytest>=7.0",
+        ],  # colcon test runs pytest because of this
     },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),
         (f"share/{NAME}/config", glob("config/*.yaml")),
     ],
-    package_data={NAME: ["correction/models/*.onnx"]},
     zip_safe=False,  # numba keeps its cache beside the modules
     entry_points={
         "console_scripts": [

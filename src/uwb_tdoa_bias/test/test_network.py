@@ -5,13 +5,19 @@ import pickle
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.correction import known_answer
-from uwb_tdoa_bias.correction.network import MODELS, SHIPPED, Network, load_network
+from uwb_tdoa_bias.correction.network import Network, load_network
 from uwb_tdoa_bias.effects import Samples
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 
-KNOWN = MODELS / "known_answer.onnx"
+known_answer = pytest.importorskip("known_answer")
+
+
+@pytest.fixture(scope="module")
+def network_file(tmp_path_factory):
+    return known_answer.write(tmp_path_factory.mktemp("model"))
+
+
 ANCHORS = Anchors.from_positions([[5, 0, 1], [-3, 2, 3], [0, -400, 2]])
 
 
@@ -50,43 +56,33 @@ def expected(s):
     return np.array(out)
 
 
-def test_shipped_model_says_the_known_answer():
+def test_predicts_what_is_computed_by_hand(network_file):
     s = batch()
-    bias, std, known = Network(KNOWN).predict(s)
+    bias, std, known = Network(network_file).predict(s)
     np.testing.assert_allclose(bias, expected(s), atol=1e-6)  # the model computes in float32
     assert np.ptp(bias) > 0.1  # an answer that says something
     np.testing.assert_array_equal(std, 0.0)
     np.testing.assert_array_equal(known, 1.0)
 
 
-def test_one_sample_gives_what_a_batch_gives():
-    network, s = Network(KNOWN), batch()
+def test_one_sample_gives_what_a_batch_gives(network_file):
+    network, s = Network(network_file), batch()
     one = samples(s.p[7:8], s.q[7:8], s.a[7:8], s.b[7:8])
     np.testing.assert_allclose(network.predict(one)[0], network.predict(s)[0][7:8], atol=1e-7)
 
 
-def test_output_is_clipped():
+def test_output_is_clipped(network_file):
     far = samples([[-80.0, 0, 0], [80.0, 0, 0]], [[0, 0, 0, 1]] * 2, [0, 0], [1, 1])
-    np.testing.assert_array_equal(Network(KNOWN).predict(far)[0], [1.0, -1.0])
+    np.testing.assert_array_equal(Network(network_file).predict(far)[0], [1.0, -1.0])
 
 
-def test_unknown_attitude_gives_nan():
+def test_unknown_attitude_gives_nan(network_file):
     s = samples([[0, 0, 1]] * 2, [[np.nan] * 4, [0, 0, 0, 1]], [0, 0], [1, 1])
-    np.testing.assert_array_equal(np.isnan(Network(KNOWN).predict(s)[0]), [True, False])
-
-
-def test_shipped_model_is_what_the_maker_makes(tmp_path):
-    pytest.importorskip("onnx")
-    path = tmp_path / "made.onnx"
-    path.write_bytes(known_answer.make().SerializeToString())
-    made, shipped, s = Network(path), Network(KNOWN), batch()
-    np.testing.assert_array_equal(made.predict(s)[0], shipped.predict(s)[0])
-    assert made.name == shipped.name == "known_answer"
+    np.testing.assert_array_equal(np.isnan(Network(network_file).predict(s)[0]), [True, False])
 
 
 def changed(tmp_path, **meta):
     """The model with other metadata; None removes an entry."""
-    pytest.importorskip("onnx")
     model = known_answer.make()
     for entry in list(model.metadata_props):
         if entry.key in meta:
@@ -136,16 +132,18 @@ def test_takes_nothing_out_before_the_yaw_is_known(tmp_path):
     np.testing.assert_array_equal(known, [1.0, 1.0, 0.0])
 
 
-def test_takes_out_the_share_that_is_borne_out_and_counts_the_rest_as_uncertainty(tmp_path):
+def test_takes_out_the_share_that_is_borne_out_and_counts_the_rest_as_uncertainty(
+    network_file, tmp_path
+):
     whole, part = (
-        Network(KNOWN).predict(batch(5)),
+        Network(network_file).predict(batch(5)),
         Network(changed(tmp_path, share="0.75")).predict(batch(5)),
     )
     np.testing.assert_allclose(part[0], 0.75 * whole[0])
     np.testing.assert_allclose(part[1], np.hypot(whole[1], 0.25 * np.abs(whole[0])))
 
 
-def test_fades_beyond_what_it_knows(tmp_path):
+def test_fades_beyond_what_it_knows(network_file, tmp_path):
     network = Network(
         changed(
             tmp_path, validity='{"z": [0.0, 2.0, 1.0], "up_x": [-0.2, 0.2, 0.5]}', fade_std="0.3"
@@ -158,7 +156,7 @@ def test_fades_beyond_what_it_knows(tmp_path):
         [0] * 6,
         [1] * 6,
     )
-    plain, (bias, std, known) = Network(KNOWN).predict(s)[0], network.predict(s)
+    plain, (bias, std, known) = Network(network_file).predict(s)[0], network.predict(s)
     trust = np.array([1.0, 1.0, 0.6, 0.0, 0.0, 1.0 - (np.sin(0.5) - 0.2) / 0.5])
     np.testing.assert_allclose(known, trust, atol=1e-12)
     np.testing.assert_allclose(bias, trust * plain, atol=1e-9)
@@ -174,17 +172,16 @@ def test_missing_file_and_no_model(tmp_path):
         Network(text)
 
 
-def test_a_pickled_network_says_the_same():
-    network = Network(KNOWN)
+def test_a_pickled_network_says_the_same(network_file):
+    network = Network(network_file)
     again = pickle.loads(pickle.dumps(network))
     for one, other in zip(network.predict(batch()), again.predict(batch())):
         np.testing.assert_array_equal(one, other)
 
 
-def test_a_model_is_named_by_its_file_or_as_the_one_shipped():
+def test_a_model_is_named_by_its_file(network_file):
     assert load_network("") is None and load_network(None) is None
-    assert load_network(str(KNOWN)).name == "known_answer"
-    assert load_network(SHIPPED).name == "default"
+    assert load_network(str(network_file)).name == "known_answer"
     with pytest.raises(InputError, match="other.onnx does not exist"):
         load_network("other.onnx")
 

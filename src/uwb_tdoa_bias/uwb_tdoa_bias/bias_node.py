@@ -65,10 +65,7 @@ PARAMETERS = {  # in the order of config/bias_node.yaml
     ),
     "model_file": Parameter(
         "",
-        (
-            'path of an ONNX bias model; "" for none; default: the one shipped, for DW1000 '
-            "modules, which helps some flights and harms others"
-        ),
+        'path of an ONNX bias model, as `train` writes it; "" for none',
     ),
     "pose_lag": Parameter(
         0.05,

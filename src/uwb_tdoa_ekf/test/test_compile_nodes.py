@@ -46,7 +46,7 @@ def test_after_it_no_node_compiles_anything(make_rig, monkeypatch):
     assert ended.returncode == 0 and ended.stdout.startswith("both nodes are compiled; ")
     monkeypatch.setitem(os.environ, "NUMBA_DEBUG_CACHE", "1")
     rig = make_rig()
-    processes = rig.start("bias_node", "ekf_node", bias_node=["-p", "model_file:=default"])
+    processes = rig.start("bias_node", "ekf_node")
     for process in processes:
         said = "".join(process.lines)
         assert "data loaded from" in said and "data saved to" not in said

@@ -14,6 +14,7 @@ import pytest
 pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
+import known_answer  # noqa: E402
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy  # noqa: E402
 from rig import OUTPUTS, make_rig, recording, seconds_of, stamp  # noqa: E402, F401
 from rosgraph_msgs.msg import Clock  # noqa: E402
@@ -29,7 +30,6 @@ from uwb_tdoa_ekf.offline import run_offline  # noqa: E402
 from uwb_tdoa_msgs.msg import TdoaCorrected, TdoaResidual  # noqa: E402
 
 SOURCES = Path(__file__).resolve().parents[2]
-MODEL = SOURCES / "uwb_tdoa_bias" / "uwb_tdoa_bias" / "correction" / "models" / "known_answer.onnx"
 EFFECTS = (
     "effects: {anchor_delay: {values: {10: 0.1, 14: -0.05}}, tag_lever_arm: {values: {x: 0.05, z: "
     "0.1}}}"
@@ -50,47 +50,38 @@ SLOW = pytest.mark.slow
 @pytest.mark.parametrize(
     ("what", "processes"),
     [
-        pytest.param("shipped", 2, marks=SLOW),
         ("effects", 2),
         pytest.param("network", 2, marks=SLOW),
         ("effects", 1),
-        pytest.param("shipped", 1, marks=SLOW),
+        pytest.param("network", 1, marks=SLOW),
     ],
 )
 def test_odometry_is_that_of_the_offline_engine(make_rig, tmp_path, what, processes):
     flight = recording()
-    level = np.tile(
-        [0.0, 0.0, 0.0, 1.0], (len(flight.anchors), 1)
-    )  # the shipped model needs orientations
     heard = np.abs(flight.tdoa.t - 2.0) > 0.06  # nothing, for longer than a pose lag
     doubt = np.where(np.arange(len(flight.tdoa)) % 5, 0.0, 0.5)  # m^2, that the tag tells
     columns = vars(replace(flight.tdoa, variance=doubt)).values()
     tdoa = Tdoas(*(column[heard] for column in columns))
-    flight = replace(flight, anchors=replace(flight.anchors, orientations=level), tdoa=tdoa)
+    flight = replace(flight, tdoa=tdoa)
+    model = known_answer.write(tmp_path)
     effects = tmp_path / "effects.yaml"
     effects.write_text(EFFECTS)
     parameters, corrector = {
-        "shipped": (
-            [
-                "--params-file",
-                f"{SOURCES}/uwb_tdoa_bias/config/bias_node.yaml",
-                "-p",
-                "model_file:=default",
-            ],
-            Corrector(flight.anchors, network=Network(MODEL.with_name("default.onnx"))),
-        ),
         "effects": (
             ["-p", f"effects_file:={effects}"],
             Corrector(flight.anchors, EffectSet.from_yaml(effects)),
         ),
         "network": (
-            ["-p", f"model_file:={MODEL}"],
-            Corrector(flight.anchors, network=Network(MODEL)),
+            [
+                "--params-file",
+                f"{SOURCES}/uwb_tdoa_bias/config/bias_node.yaml",
+                "-p",
+                f"model_file:={model}",
+            ],
+            Corrector(flight.anchors, network=Network(model)),
         ),
     }[what]
     config, told = FilterConfig(), ["--params-file", f"{SOURCES}/uwb_tdoa_ekf/config/ekf_node.yaml"]
-    if what == "shipped":  # takes nothing out before the yaw is known
-        config, told = FilterConfig(initial_yaw_std=0.1), ["-p", "initial_yaw_std:=0.1"]
     rig = make_rig()
     if processes == 2:
         rig.start("bias_node", "ekf_node", bias_node=parameters, ekf_node=told)
@@ -124,8 +115,8 @@ def test_odometry_is_that_of_the_offline_engine(make_rig, tmp_path, what, proces
     assert [m.variance for m in rig.corrected] == flight.tdoa.variance.tolist()
     assert [m.raw - m.bias for m in rig.corrected] == [m.corrected for m in rig.corrected]
     models = {"effects": {"anchor_delay+tag_lever_arm"}, "network": {"none", "known_answer"}}
-    assert {m.model for m in rig.corrected} == models.get(what, {"none", "default"})
-    assert np.ptp(expected.bias) > (0.005 if what == "shipped" else 0.05)
+    assert {m.model for m in rig.corrected} == models[what]
+    assert np.ptp(expected.bias) > 0.05
 
     # The odometry is the same, but for what still waits.
     odometry = expected.odometry
@@ -314,10 +305,11 @@ def ticking(publisher, epoch):
 
 
 @SLOW
-def test_a_recording_that_starts_again_gives_the_same_again(make_rig):
+def test_a_recording_that_starts_again_gives_the_same_again(make_rig, tmp_path):
+    model = known_answer.write(tmp_path)
     flight = recording(2.5)
     rig = make_rig()
-    rig.start("bias_node", "ekf_node", bias_node=["-p", f"model_file:={MODEL}"])
+    rig.start("bias_node", "ekf_node", bias_node=["-p", f"model_file:={model}"])
     rig.send_anchors(flight.anchors)
     rig.play(flight)
     ekf = rig.counts(
@@ -343,7 +335,7 @@ def test_a_recording_that_starts_again_gives_the_same_again(make_rig):
 def test_a_signal_ends_both_in_good_order(make_rig, number):
     flight = recording(1.0)
     rig = make_rig()
-    processes = rig.start("bias_node", "ekf_node", bias_node=["-p", f"model_file:={MODEL}"])
+    processes = rig.start("bias_node", "ekf_node")
     rig.send_anchors(flight.anchors)
     rig.play(flight)
     assert any(m.verdict == TdoaResidual.VERDICT_USED for m in rig.residuals)

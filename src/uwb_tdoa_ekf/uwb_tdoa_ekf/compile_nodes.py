@@ -3,7 +3,8 @@ other.
 
 Compiled code is kept in the folder that NUMBA_CACHE_DIR names, by default ~/.cache/uwb_tdoa, and
 used until the sources, numba or the processor change. `./dev build` and `./dev demo` call this;
-after a `colcon build` call it as the user who starts the nodes.
+after a `colcon build` call it as the user who starts the nodes. What a bias network needs is
+compiled at the first start of `bias_node` with one.
 """
 
 from __future__ import annotations
@@ -14,7 +15,6 @@ import time
 from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.correction import corrector
-from uwb_tdoa_bias.correction.network import SHIPPED, load_network
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.tag_lever_arm import TagLeverArm
 
@@ -42,7 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return int(ended.code or 0)
     began = time.monotonic()
     warm_up()
-    corrector.warm_up(EffectSet(), load_network(SHIPPED))
+    corrector.warm_up(EffectSet(), None)
     corrector.warm_up(
         EffectSet((TagLeverArm(values={"z": 0.1}),)), None
     )  # a frame on /tf_static brings one, while the node runs

@@ -1,6 +1,12 @@
 """Settings for the tests of this package."""
 
+from pathlib import Path
+import sys
+
 from hypothesis import settings
+
+# the network of a known answer lies beside the tests of the package below
+sys.path.append(str(Path(__file__).resolve().parents[2] / "uwb_tdoa_bias" / "test"))
 
 # The first call of a compiled function takes seconds, and a busy machine is no fault; every run
 # tries the same examples.

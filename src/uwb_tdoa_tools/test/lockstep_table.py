@@ -15,11 +15,13 @@ import tempfile
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
+sys.path.append(str(Path(__file__).resolve().parents[2] / "uwb_tdoa_bias" / "test"))
 
+import known_answer  # noqa: E402
 from test_lockstep import replayed  # noqa: E402
 from time_offset_table import cut  # noqa: E402
 
-from uwb_tdoa_bias.correction.network import SHIPPED, load_network  # noqa: E402
+from uwb_tdoa_bias.correction.network import load_network  # noqa: E402
 from uwb_tdoa_bias.foundation.flight import Truth  # noqa: E402
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag  # noqa: E402
 from uwb_tdoa_tools.readers import read_flight  # noqa: E402
@@ -56,7 +58,7 @@ def main():
             bag,
         )
         flight = read_bag(bag)
-        score, offline = evaluate(flight, network=load_network(SHIPPED))
+        score, offline = evaluate(flight, network=load_network(known_answer.write(Path(folder))))
         rmse = score.row()["rmse_3d"]
         print(
             f"offline {rmse:.4f} m, {len(offline.odometry)} poses; of all runs the largest "

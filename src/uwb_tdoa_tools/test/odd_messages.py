@@ -367,7 +367,7 @@ def _told(name, folder):
         ANCHORS.to_yaml(Path(folder) / "anchors.yaml")
     return {
         "ekf_node": ["-p", "publish_tf:=odom"],
-        "bias_node": ["-p", "model_file:=default"],
+        "bias_node": ["-p", f"model_file:={CORPUS / 'model' / '0'}"],
         "debias_node": ["-p", f"map:={CORPUS / 'bias_map' / '0'}"],
         "anchors_node": ["-p", f"anchors_file:={Path(folder) / 'anchors.yaml'}"],
         "vehicle_node": ["-p", "duration:=1800.0"],

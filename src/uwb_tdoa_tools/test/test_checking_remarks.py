@@ -122,9 +122,9 @@ def test_what_is_no_anchor_is_not_taken_for_one(flight):
 
 def test_a_model_without_its_effects_is_said(flight, tmp_path, capsys):
     onnx = pytest.importorskip("onnx")
-    from uwb_tdoa_bias.correction.known_answer import make
+    import known_answer
 
-    model = make()
+    model = known_answer.make()
     properties = {entry.key: entry.value for entry in model.metadata_props}
     onnx.helper.set_model_props(model, properties | {"trained_with": json.dumps(["anchor_delay"])})
     (tmp_path / "model.onnx").write_bytes(model.SerializeToString())

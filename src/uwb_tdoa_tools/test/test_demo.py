@@ -3,9 +3,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from uwb_tdoa_bias.correction.network import SHIPPED, UNPROVEN
-
 pytest.importorskip("rclpy")
+import known_answer  # noqa: E402
+
 from uwb_tdoa_tools.commands import calibrate, check, demo, localize  # noqa: E402
 from uwb_tdoa_tools.flying.demo import DemoFlight, next_steps  # noqa: E402
 from uwb_tdoa_tools.simulation.constellations import corners  # noqa: E402
@@ -55,7 +55,9 @@ def test_it_says_what_corrects_and_that_nothing_does_unless_it_is_asked_for(tmp_
     assert plain.corrector() is None and plain.correction().startswith(
         "nothing: neither --effects nor --model is given"
     )
-    assert UNPROVEN in DemoFlight(SimpleNamespace(anchors=corners()), None, SHIPPED).correction()
+    model = known_answer.write(tmp_path)
+    given = DemoFlight(SimpleNamespace(anchors=corners()), None, str(model)).correction()
+    assert given == f"known_answer ({model})"
 
 
 @pytest.mark.parametrize(

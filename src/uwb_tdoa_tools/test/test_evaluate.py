@@ -6,7 +6,7 @@ import pytest
 from scipy.stats import chi2
 import yaml
 
-from uwb_tdoa_bias.correction.network import SHIPPED, UNPROVEN, load_network
+from uwb_tdoa_bias.correction.network import load_network
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
 from uwb_tdoa_bias.effects.stamp_error import shifted
 from uwb_tdoa_bias.foundation.errors import InputError
@@ -251,23 +251,23 @@ def test_a_result_that_somebody_has_forged_is_refused(bag, tmp_path, capsys):
     assert main(options) == 0
 
 
-def test_corrects_with_nothing_unless_told_and_says_what_is_known_of_the_shipped_network(
-    flight, bag, tmp_path, capsys
-):
+def test_corrects_with_nothing_unless_effects_or_a_network_are_given(flight, bag, tmp_path, capsys):
+    known_answer = pytest.importorskip("known_answer")
+    model = known_answer.write(tmp_path)
     effects = tmp_path / "effects.yaml"
     EffectSet((AnchorDelay({int(flight.anchors.ids[0]): 0.1}),)).to_yaml(effects)
     (row,) = report([bag], tmp_path)["runs"]
     assert row["rmse_3d"] == pytest.approx(evaluate(flight)[0].row()["rmse_3d"], abs=1e-4)
     assert main([str(bag), "--effects", str(effects)]) == 0
-    (row,) = report([bag, "--model", SHIPPED], tmp_path)["runs"]
+    (row,) = report([bag, "--model", model], tmp_path)["runs"]
     assert row["rmse_3d"] == pytest.approx(
-        evaluate(flight, network=load_network(SHIPPED))[0].row()["rmse_3d"], abs=1e-4
+        evaluate(flight, network=load_network(model))[0].row()["rmse_3d"], abs=1e-4
     )
     lines = capsys.readouterr().out.splitlines()
     assert [line for line in lines if line.startswith("correcting")] == [
         "correcting with: nothing (neither effects nor a network are in use)",
         "correcting with: anchor_delay",
-        f"correcting with: default ({UNPROVEN})",
+        "correcting with: known_answer",
     ]
 
 

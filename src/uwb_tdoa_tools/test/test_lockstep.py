@@ -12,7 +12,9 @@ import pytest
 pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg", reason="needs the built workspace: ./dev build")
 
-from uwb_tdoa_bias.correction.network import SHIPPED, load_network  # noqa: E402
+import known_answer  # noqa: E402
+
+from uwb_tdoa_bias.correction.network import load_network  # noqa: E402
 from uwb_tdoa_ekf.core.verdicts import USED  # noqa: E402
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag  # noqa: E402
 from uwb_tdoa_tools.bags.files import messages, new_bag, open_bag  # noqa: E402
@@ -48,10 +50,8 @@ def replayed(bag, folder, *options, nodes=(), begin=lambda: None):
     """(exit code of a replay that follows the odometry, its output, diagnostics {node: {key:
     text}}, recorded bag).
     nodes : {node: arguments}; begin() : called when the nodes are there, before the replay."""
-    nodes, recorded = (
-        {"bias_node": ("--ros-args", "-p", f"model_file:={SHIPPED}"), **dict(nodes)},
-        folder / "recorded.bag",
-    )
+    model, recorded = known_answer.write(folder), folder / "recorded.bag"
+    nodes = {"bias_node": ("--ros-args", "-p", f"model_file:={model}"), **dict(nodes)}
     with own_domain(), session("test", []) as (node, stop), Processes(folder, stop) as processes:
         diagnostics = DiagnosticsListener(node)
         for package, name in (("uwb_tdoa_bias", "bias_node"), ("uwb_tdoa_ekf", "ekf_node")):
@@ -80,7 +80,7 @@ def replayed(bag, folder, *options, nodes=(), begin=lambda: None):
 
 
 def assert_equal_to_offline(flight, told, recorded):
-    offline, _ = evaluate(flight, network=load_network(SHIPPED))
+    offline, _ = evaluate(flight, network=load_network(recorded.with_name("known_answer.onnx")))
     live = Score("live", read_odometry(recorded), flight.truth)
     assert live.row()["rmse_3d"] == pytest.approx(offline.row()["rmse_3d"], abs=1e-3)
     assert told["bias_node"]["released before their pose"] == told["ekf_node"]["late"] == "0"
@@ -95,7 +95,7 @@ def test_ranges_beside_tdoas_are_played_and_used_as_off_line(tmp_path):
     flight = read_bag(tmp_path / "flight.bag")
     _, said, told, recorded = replayed(tmp_path / "flight.bag", tmp_path, "--rate", 4)
     assert_equal_to_offline(flight, told, recorded)
-    _, run = evaluate(flight, network=load_network(SHIPPED))
+    _, run = evaluate(flight, network=load_network(recorded.with_name("known_answer.onnx")))
     assert (
         told["ekf_node"]["range_received"] == str(len(flight.range))
         and told["ekf_node"]["range_late"] == "0"

@@ -5,8 +5,9 @@ and ground truth.
 import pytest
 
 pytest.importorskip("uwb_tdoa_msgs.msg", reason="needs the built workspace: ./dev build")
+import known_answer  # noqa: E402
 
-from uwb_tdoa_bias.correction.network import SHIPPED, load_network  # noqa: E402
+from uwb_tdoa_bias.correction.network import load_network  # noqa: E402
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag  # noqa: E402
 from uwb_tdoa_tools.benchmark.flights import first  # noqa: E402
 from uwb_tdoa_tools.live.run import run_live  # noqa: E402
@@ -24,13 +25,14 @@ def test_measured_flight_through_the_nodes_at_any_rate_is_the_offline_run(shared
     bag = tmp_path / "flight.bag"
     write_bag(first(read_flight(log, survey), SECONDS), bag)
     flight = read_bag(bag)
-    offline, _ = evaluate(flight, network=load_network(SHIPPED))
+    model = known_answer.write(tmp_path)
+    offline, _ = evaluate(flight, network=load_network(model))
     expected = offline.row()["rmse_3d"]
     assert expected < 0.35
     for rate in (1.0, 4.0):
         folder = tmp_path / f"rate{rate:g}"
         folder.mkdir()
-        live = run_live(bag, folder, rate, {"model_file": SHIPPED})
+        live = run_live(bag, folder, rate, {"model_file": str(model)})
         row = Score("live", read_odometry(live.recorded), flight.truth).row()
         assert row["rmse_3d"] == pytest.approx(expected, abs=1e-3)
         counts = {name: int(live.ekf[name]) for name in VERDICTS}

@@ -136,7 +136,7 @@ def test_a_recording_of_too_many_files_is_refused(tmp_path, monkeypatch):
 def test_what_was_asked_is_every_option_that_matters_and_what_stands_in_its_files(tmp_path):
     file = tmp_path / "effects.yaml"
     file.write_text("one")
-    args = SimpleNamespace(jobs=3, smooth=True, effects=str(file), model="default", config=None)
+    args = SimpleNamespace(jobs=3, smooth=True, effects=str(file), model=None, config=None)
     asked = asked_of(args, ["jobs"], ["effects", "model", "config"])
     file.write_text("two")
     changed = asked_of(args, ["jobs"], ["effects", "model", "config"])

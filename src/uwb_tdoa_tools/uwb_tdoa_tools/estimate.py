@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_bias.correction.network import SHIPPED, UNPROVEN, Network
+from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.tag_lever_arm import TagLeverArm
 from uwb_tdoa_bias.foundation.flight import Flight
@@ -37,11 +37,8 @@ class FlightEstimator:
     @property
     def correction(self) -> str:
         """What it corrects with, in words."""
-        names = (
-            "+".join(part.name for part in (self.effects, self.network) if part)
-            or "nothing (neither effects nor a network are in use)"
-        )
-        return names + (f" ({UNPROVEN})" if self.network and self.network.name == SHIPPED else "")
+        names = "+".join(part.name for part in (self.effects, self.network) if part)
+        return names or "nothing (neither effects nor a network are in use)"
 
 
 def with_antenna(effects: EffectSet | None, flight: Flight) -> EffectSet | None:

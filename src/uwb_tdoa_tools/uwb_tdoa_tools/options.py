@@ -19,7 +19,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from uwb_tdoa_bias.correction.network import UNPROVEN, load_network
+from uwb_tdoa_bias.correction.network import load_network
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.safe_yaml import parse_yaml
@@ -142,8 +142,7 @@ def add_estimator(parser: ArgumentParser) -> None:
 
 def add_model(parser: ArgumentParser) -> None:
     """--model."""
-    words = f'ONNX bias network to correct with; "default" is the one shipped: {UNPROVEN}'
-    parser.add_argument("--model", metavar="FILE", help=words.replace("%", "%%"))
+    parser.add_argument("--model", metavar="FILE", help="ONNX bias network to correct with")
 
 
 def estimator_of(args: Namespace, say: Callable[[str], object]) -> FlightEstimator:

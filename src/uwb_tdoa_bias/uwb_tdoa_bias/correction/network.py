@@ -38,24 +38,13 @@ if TYPE_CHECKING:
     from ..effects.samples import Samples
     from .session import Session
 
-MODELS = Path(__file__).parent / "models"
-SHIPPED = "default"  # instead of a path: the model that comes with the package
-UNPROVEN = (  # `study default-model`, and evaluate with and without it
-    "learned from simulated flights; on 22 measured ones, with their height sensors, it made "
-    "12 worse, by up to 14 %, and 8 better"
-)
 NO_NUMBERS = np.empty(0)
 _COLUMN = {name: column for column, name in enumerate(NAMES)}
 
 
 def load_network(name: str | Path | None) -> Network | None:
-    """The Network of a file; for "default" the one shipped; None for an empty name.
-
-    Raises InputError.
-    """
-    if not name:
-        return None
-    return Network(MODELS / "default.onnx" if str(name) == SHIPPED else name)
+    """Return the Network of a file, or None for an empty name. Raises InputError."""
+    return Network(name) if name else None
 
 
 class Validity(NamedTuple):

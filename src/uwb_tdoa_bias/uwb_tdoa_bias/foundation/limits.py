@@ -3,7 +3,7 @@ exception that names the limit.
 
 A reader compares what a header claims with these limits, and with the file, before it takes memory
 or does work. Limits are far above what is needed: a flight of an hour has 300 MB as a log, our YAML
-files have some kB, the model that is shipped 60 kB.
+files have some kB, models of `train` 60 kB.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ FOLDER_ENTRIES, FOLDER_DEPTH = 100_000, 20  # that are looked at for recordings
 # YAML.
 YAML_NODES, YAML_DEPTH = 200_000, 20
 
-# ONNX: of the process that tries a model out, beside what its libraries take. The shipped model
-# takes 0.02 s and 3 MB.
+# ONNX: of the process that tries a model out, beside what its libraries take. A model of
+# `train` takes 0.02 s and 3 MB.
 MODEL_SECONDS, MODEL_MEMORY = 3, 256 << 20  # processor time; bytes
 MODEL_WAIT = 60.0  # s until its end, on a busy machine too
 MODEL_ROW_SECONDS = 0.005  # of processor time for a row that comes alone

@@ -10,13 +10,14 @@ import sys
 import tempfile
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.append(str(Path(__file__).resolve().parents[3] / "uwb_tdoa_bias" / "test"))
 
+import known_answer  # noqa: E402
 import numpy as np  # noqa: E402
 from recordings import ROWS, SURVEY, csv_text, log_bytes, small_flight  # noqa: E402
 from targets import CORPUS, MESSAGES, bag_of  # noqa: E402
 from test_survey import survey_lines  # noqa: E402
 
-from uwb_tdoa_bias.correction.network import MODELS  # noqa: E402
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet  # noqa: E402
 from uwb_tdoa_bias.foundation.flyable import FlyableVolume  # noqa: E402
 from uwb_tdoa_bias.foundation.sensors import Height, Pressure, Velocity  # noqa: E402
@@ -123,7 +124,7 @@ def main():
         write("effects", 0, (folder / "effects.yaml").read_bytes())
         _bags(folder)
         _maps(folder)
-    write("model", 0, (MODELS / "known_answer.onnx").read_bytes())
+    write("model", 0, known_answer.make().SerializeToString())
     size = sum(path.stat().st_size for path in CORPUS.rglob("*") if path.is_file())
     print(f"{size / 1e3:.0f} kB in {CORPUS}")
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_bias.correction.network import SHIPPED, load_network
+from uwb_tdoa_bias.correction.network import load_network
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, TagLeverArm, samples_at
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.smoother import smooth
@@ -34,7 +34,7 @@ BATCHES = (1, 4, 16)  # TDOAs that arrive together
 def measure(
     progress: Callable[[str], object], quick: bool = False, model: str | Path | None = None
 ) -> Iterator[Figure]:
-    """Generator of Figures; model : path of an ONNX network, default the one shipped.
+    """Generator of Figures; model : path of an ONNX network, whose figures come too.
     progress(text).
     """
     repeats = 2 if quick else 7
@@ -43,24 +43,23 @@ def measure(
     progress("recording, first call")
     name = "first call: compiled, or compiled code read from numba's cache"
     yield Figure.of(section, name, "s", _seconds(run_offline, flight))
-    network = load_network(model or SHIPPED)
-    assert network is not None  # as a name is given
+    network = load_network(model)
     effects = EffectSet(
         (
             AnchorDelay(flight.meta["parameters"]["anchor_delays"]),
             TagLeverArm({"x": 0.01, "y": 0.0, "z": 0.05}),
         )
     )
-    ways = {
+    ways: dict[str, tuple[Callable[..., object], Corrector | None]] = {
         "no correction": (run_offline, None),
-        f"effects ({effects.name})": (run_offline, Corrector(flight.anchors, effects)),
-        f"network ({network.name})": (run_offline, Corrector(flight.anchors, network=network)),
-        f"effects and network ({network.name})": (
-            run_offline,
-            Corrector(flight.anchors, effects, network),
-        ),
         "no correction, smoothed": (smooth, None),
+        f"effects ({effects.name})": (run_offline, Corrector(flight.anchors, effects)),
     }
+    if network is not None:
+        alone = Corrector(flight.anchors, network=network)
+        both = Corrector(flight.anchors, effects, network)
+        ways[f"network ({network.name})"] = run_offline, alone
+        ways[f"effects and network ({network.name})"] = run_offline, both
     for name, (function, corrector) in ways.items():
         progress(f"recording, {name}")
         function(
@@ -73,19 +72,15 @@ def measure(
             yield Figure.of(
                 section, "the same per second of flight", "ms/s", [1e3 * s / SECONDS for s in taken]
             )
-    progress("single TDOAs")
-    name = f"prediction by the network ({network.name}), 1 at a time"
-    yield Figure.of(section, name, "us", _per_prediction(flight, network, repeats))
-    for batch in BATCHES:
-        name = f"correction of a TDOA by the network ({network.name}), {batch} at a time"
-        corrector = Corrector(flight.anchors, network=network)
-        yield Figure.of(
-            section,
-            name,
-            "us",
-            _per_tdoa(flight, corrector, batch, repeats),
-            CORRECTION_TARGET if batch == 1 else None,
-        )
+    if network is not None:
+        progress("single TDOAs")
+        name = f"prediction by the network ({network.name}), 1 at a time"
+        yield Figure.of(section, name, "us", _per_prediction(flight, network, repeats))
+        for batch in BATCHES:
+            name = f"correction of a TDOA by the network ({network.name}), {batch} at a time"
+            corrector = Corrector(flight.anchors, network=network)
+            taken = _per_tdoa(flight, corrector, batch, repeats)
+            yield Figure.of(section, name, "us", taken, CORRECTION_TARGET if batch == 1 else None)
     for anchors in () if quick else ANCHORS:
         progress(f"recording, {anchors} anchors")
         flight = make_flight(SECONDS, anchors)

@@ -32,8 +32,7 @@ def measure(
     """Measure some of PARTS. Returns (machine, list of Figure).
 
     folder : for bags and the output of the nodes; quick : fewer repetitions and cases; model : ONNX
-        file for "offline",
-    default the one shipped; other : Peer, to measure beside the core. machine : what the figures
+        file for "offline"; other : Peer, to measure beside the core. machine : what the figures
     depend on, dict. Raises InputError, LiveError.
     """
     folder.mkdir(parents=True, exist_ok=True)

@@ -54,7 +54,7 @@ def parser() -> ArgumentParser:
         metavar="PART",
         help=f"of {', '.join(PARTS)} (default: all)",
     )
-    add("--model", metavar="FILE", help="ONNX bias network for offline (default: the one shipped)")
+    add("--model", metavar="FILE", help="ONNX bias network whose figures offline prints, too")
     add(
         "--peer",
         metavar="LIBRARY",

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_bias.correction.network import SHIPPED, UNPROVEN, load_network
+from uwb_tdoa_bias.correction.network import load_network
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Flight
@@ -37,8 +37,8 @@ SIMULATED = trial.Task(HALL, seed=1, yaw="unknown")  # place and yaw are not giv
 
 @dataclass(frozen=True)
 class DemoFlight:
-    """What is flown. flight : Flight; effects_file, model : what corrects it, or None; SHIPPED is a
-    model; became : what became of a flight that was simulated, in words.
+    """What is flown. flight : Flight; effects_file, model : what corrects it, or None;
+    became : what became of a flight that was simulated, in words.
     """
 
     flight: Flight
@@ -61,11 +61,7 @@ class DemoFlight:
                 "nothing: neither --effects nor --model is given, and what other flights needed "
                 "may harm this one"
             )
-        sources = [
-            f"the network shipped: {UNPROVEN}" if path == SHIPPED else str(path)
-            for path in (self.effects_file, self.model)
-            if path
-        ]
+        sources = [str(path) for path in (self.effects_file, self.model) if path]
         return f"{corrector.model} ({', '.join(sources)})"
 
 
@@ -146,8 +142,10 @@ def fly(
     flight, bag, correction = planned.flight, folder / "flight.bag", planned.corrector()
     assert flight.truth is not None
     write_bag(flight, bag, force=True)
-    model = SHIPPED if planned.model == SHIPPED else _absolute(planned.model)
-    bias = {"effects_file": _absolute(planned.effects_file), "model_file": model}
+    bias = {
+        "effects_file": _absolute(planned.effects_file),
+        "model_file": _absolute(planned.model),
+    }
     ekf = {"use_imu": flight.imu is not None}
     live = run_live(bag, folder, rate, bias, ekf, say)
     nodes, raw = read_odometry(live.recorded), run_offline(flight)

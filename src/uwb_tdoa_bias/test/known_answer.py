@@ -1,23 +1,12 @@
-"""Makes models/known_answer.onnx, a model that proves the path: anyone can compute what it must
-say.
+"""A bias network for tests whose output can be computed by hand. Needs the onnx package.
 
-    bias = 0.05 m + 0.02 dx_a + 0.01 m elevation_T_b,  limited to +-1 m
-
-Re-make it, with the onnx package installed:  python -m uwb_tdoa_bias.correction.known_answer known_answer.onnx
+bias = 0.05 m + 0.02 dx_a + 0.01 m elevation_T_b,  limited to +-1 m
 """
 
-from __future__ import annotations
-
 import json
-import sys
-from typing import TYPE_CHECKING
 
 import numpy as np
-
-from ..foundation.files import write_bytes
-
-if TYPE_CHECKING:
-    from onnx import ModelProto
+from onnx import TensorProto, helper, numpy_helper
 
 # Neither the order of the features nor offset and scale are what a reader that ignores them would
 # assume.
@@ -29,17 +18,15 @@ SLOPES = (0.01, 0.02)  # m/rad, 1
 CONSTANT = 0.05  # m
 
 
-def known_answer(elevation: float, dx: float) -> float:
-    """What the model says, m: elevation of anchor b seen from the tag, rad; dx: anchor a minus tag
-    along x, m.
+def known_answer(elevation, dx):
+    """Return the bias, m, for the elevation of anchor b seen from the tag, rad, and dx: anchor a
+    minus tag along x, m.
     """
     return np.clip(CONSTANT + SLOPES[0] * elevation + SLOPES[1] * dx, -CLIP, CLIP)
 
 
-def make() -> ModelProto:
-    """The onnx.ModelProto."""
-    from onnx import TensorProto, helper, numpy_helper
-
+def make():
+    """Return the onnx.ModelProto."""
     weight = np.multiply(SLOPES, SCALE).astype(np.float32).reshape(2, 1)
     constant = np.array([CONSTANT + np.dot(SLOPES, OFFSET)], dtype=np.float32)
     graph = helper.make_graph(
@@ -61,5 +48,8 @@ def make() -> ModelProto:
     return model
 
 
-if __name__ == "__main__":
-    write_bytes(sys.argv[1], make().SerializeToString())
+def write(folder):
+    """Write the model into a folder. Returns the path of the file."""
+    path = folder / "known_answer.onnx"
+    path.write_bytes(make().SerializeToString())
+    return path
