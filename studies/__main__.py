@@ -11,6 +11,7 @@ from studies import (
     localizing,
     moved_anchors,
     noise,
+    odd_messages,
     ranges,
     recalibrating,
     rover,
@@ -18,6 +19,7 @@ from studies import (
     situations,
     surveying,
 )
+from studies.bench import soak, suite
 from studies.checking import figures as checking
 from studies.checking import in_flight
 from studies.closed_loop import experiment
@@ -31,6 +33,7 @@ from uwb_tdoa_tools import cli
 
 STUDIES = {
     "aids": aids,
+    "bench": suite,
     "calibrating": calibrating,
     "checking": checking,
     "closed-loop": experiment,
@@ -47,12 +50,14 @@ STUDIES = {
     "localizing": localizing,
     "moved-anchors": moved_anchors,
     "noise": noise,
+    "odd-messages": odd_messages,
     "random-splits": splits,
     "ranges": ranges,
     "recalibrating": recalibrating,
     "rover": rover,
     "scale": scale,
     "situations": situations,
+    "soak": soak,
     "spin": spin,
     "surveying": surveying,
 }
@@ -60,6 +65,7 @@ DESCRIPTION = """Make the figures of the documentation anew. Nothing here is nee
 of measured flights: flights/, util/, surveys/.
 
   aids             height, pressure and velocity on measured flights, and their faults (docs/aids.md)
+  bench            what the suite costs on this machine (docs/measured.md)
   calibrating      surveys shaken, calibrated without ground truth, judged on other flights (docs/calibration.md)
   checking         mistakes put into flights, and what check says of them (docs/connect.md)
   closed-loop      the flights of Zhao et al. by networks and by effects (docs/flying.md)
@@ -76,12 +82,14 @@ of measured flights: flights/, util/, surveys/.
   localizing       what localize says of flights, against their ground truth (docs/localizing.md)
   moved-anchors    anchors that were moved or exchanged, and who names them (docs/localizing.md)
   noise            whether covariances are honest after a calibration (docs/calibration.md)
+  odd-messages     messages that no driver should send, to every node (docs/reliability.md)
   random-splits    bias models trained on flights drawn at random, and judged on the others (docs/bias.md)
   ranges           simulated distances to anchors against the bound of plan (docs/sensors.md)
   recalibrating    surveys that start from the last one, after something changed (docs/calibration.md)
   rover            a simulated rover on wheels, and what diagnose finds on it (docs/rover.md)
   scale            processor time and memory over flights, anchors and effects (docs/speed.md)
   situations       where a tag can be and what can happen to it, simulated (docs/reliability.md)
+  soak             both nodes for hours: memory and lost messages (docs/reliability.md)
   spin             the error of a TDOA over the yaw of the tag (docs/bias.md)
   surveying        surveys shaken, and made better from flights alone (docs/calibration.md)
 """
@@ -98,6 +106,9 @@ def parser():
         "study",
         DESCRIPTION,
         "./dev study aids worth DATA/flights/0425 --survey DATA/surveys",
+        "./dev study bench --json bench.json",
+        "./dev study bench --only core --peer libpeer.so",
+        "./dev study bench --only offline --model network.onnx",
         "./dev study calibrating --data DATA --draws 3",
         "./dev study checking DATA/flights DATA/util --survey DATA/surveys --only nothing",
         "./dev study closed-loop --out paper/",
@@ -126,6 +137,7 @@ def parser():
         "./dev study localizing DATA/flights DATA/util --survey DATA/surveys --mistakes",
         "./dev study moved-anchors DATA/flights --survey DATA/surveys --draws 10 --json moved.json",
         "./dev study noise --data DATA --split const1",
+        "./dev study odd-messages 10000",
         "./dev study random-splits DATA/flights/0426 --survey DATA/surveys --out splits.jsonl",
         "./dev study ranges --flights 5",
         "./dev study recalibrating --data DATA --only const1",
@@ -133,6 +145,7 @@ def parser():
         "./dev study rover --diagnose 4",
         "./dev study scale --out scale/",
         "./dev study situations --resume situations.jsonl",
+        "./dev study soak --minutes 60",
         "./dev study spin --out spin.png",
         "./dev study surveying --data DATA --draws 5 --only const1",
     )

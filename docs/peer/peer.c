@@ -1,4 +1,4 @@
-/* The Kalman filter of the Crazyflie firmware as a peer of `bench --peer` and, with -DFLY, of `fly --peer` (docs/speed.md).
+/* The Kalman filter of the Crazyflie firmware as a peer of `study bench --peer` and, with -DFLY, of `fly --peer` (docs/speed.md).
    With -DROBUST=1 it is the M-estimation of the first paper, else the firmware's standard update. */
 #include <math.h>
 #include <stdint.h>

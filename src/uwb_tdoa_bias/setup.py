@@ -24,11 +24,7 @@ setup(
         "scipy>=1.11",
     ],
     extras_require={
-        "test": [
-            "hypothesis>=6.60",
-            "onnx>=1.14",
-            "pytest>=7.0",
-        ],  # colcon test runs pytest because of this
+        "test": ["hypothesis>=6.60", "pytest>=7.0"],  # colcon test runs pytest because of this
     },
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),

@@ -52,7 +52,6 @@ setup(
     zip_safe=False,  # numba keeps its cache beside the modules
     entry_points={
         "console_scripts": [
-            "bench = uwb_tdoa_tools.executables:bench",
             "calibrate = uwb_tdoa_tools.executables:calibrate",
             "check = uwb_tdoa_tools.executables:check",
             "convert = uwb_tdoa_tools.executables:convert",

@@ -1,22 +1,60 @@
 """Another filter to fly by: a tiny library, compiled here, that stays where it was told to be."""
 
+import ctypes
+import shutil
+import subprocess
+
+from documented import ROOT
 import numpy as np
 import pytest
-from test_benchmark_peer import SOURCE, built, pytestmark  # noqa: F401
 
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_tools.benchmark.peer import Peer
+from uwb_tdoa_tools.flying import peer
 from uwb_tdoa_tools.flying.path import Circles
 from uwb_tdoa_tools.flying.trial import Task, fly
 from uwb_tdoa_tools.flying.verdict import verdict_of
 from uwb_tdoa_tools.flying.world import HALL
 
+CC = shutil.which("cc")
+pytestmark = pytest.mark.skipif(CC is None, reason="no C compiler (cc)")
+SOURCE = """
+#include <math.h>
+#include <stdint.h>
+typedef struct { double t, gyro[3], accel[3], d; int32_t a, b; } tdoa_peer_event;
+static const double *anchors; static double p[3], sum; static int32_t rows, wrong;
+int32_t tdoa_peer_version(void) { return VERSION; }
+void tdoa_peer_start(const double *where, int32_t count, const double *at, const double *q) {
+  anchors = where; rows = count; wrong = 0; sum = q[3];
+  for (int k = 0; k < 3; k++) p[k] = at[k];
+}
+static double far(int32_t row) {
+  double s = 0; for (int k = 0; k < 3; k++) s += pow(anchors[3 * row + k] - p[k], 2);
+  return sqrt(s);
+}
+void tdoa_peer_run(const tdoa_peer_event *e, int32_t count) {
+  for (double last = e->t; count--; last = e++->t) {
+    wrong += e->t < last || e->a >= rows || e->b >= rows;
+    if (e->a < 0) sum += e->gyro[0] + e->accel[2]; else sum += far(e->b) - far(e->a) - e->d;
+  }
+}
+void tdoa_peer_position(double *out) { for (int k = 0; k < 3; k++) out[k] = wrong ? NAN : p[k]; }
+"""
 STATE = """
 void tdoa_peer_state(double *at, double *v, double *q) {
   for (int k = 0; k < 3; k++) { at[k] = wrong ? NAN : p[k]; v[k] = q[k] = 0; }
   q[3] = 1;
 }
 """
+
+
+def built(folder, source=SOURCE, version=peer.VERSION):
+    """Path of a library."""
+    (folder / "peer.c").write_text(source.replace("VERSION", str(version)))
+    subprocess.run(
+        [CC, "-O2", "-shared", "-fPIC", "-o", folder / "libpeer.so", folder / "peer.c", "-lm"],
+        check=True,
+    )
+    return folder / "libpeer.so"
 
 
 def test_it_is_flown_by_and_judged_like_ours(tmp_path):
@@ -77,8 +115,8 @@ def test_what_a_library_remembers_of_one_flight_is_not_in_the_next(tmp_path):
         "++calls; }"
     )
     library = built(tmp_path, SOURCE + counting)
-    first, second = Peer(library, own=True), Peer(library, own=True)
-    assert [peer.state()[0][0] for peer in (first, first, second)] == [1.0, 2.0, 1.0]
+    first, second = peer.Peer(library, own=True), peer.Peer(library, own=True)
+    assert [one.state()[0][0] for one in (first, first, second)] == [1.0, 2.0, 1.0]
 
 
 def test_one_that_does_not_tell_its_state_cannot_be_flown_by(tmp_path):
@@ -86,3 +124,47 @@ def test_one_that_does_not_tell_its_state_cannot_be_flown_by(tmp_path):
         InputError, match="does not export tdoa_peer_state; add it as docs/speed.md shows"
     ):
         fly(Task(HALL, seed=2, peer=str(built(tmp_path))))
+
+
+def test_libraries_that_are_none(tmp_path):
+    with pytest.raises(
+        InputError, match="nowhere.so cannot be loaded as a shared library .*; build it anew"
+    ):
+        peer.Peer(tmp_path / "nowhere.so")
+    (tmp_path / "text.so").write_text("no library")
+    with pytest.raises(InputError, match="text.so cannot be loaded"):
+        peer.Peer(tmp_path / "text.so")
+    with pytest.raises(InputError, match="is of version 7 of the interface, this is 1"):
+        peer.Peer(built(tmp_path, version=7))
+    (tmp_path / "less").mkdir()
+    with pytest.raises(InputError, match="does not export tdoa_peer_position; add it"):
+        peer.Peer(built(tmp_path / "less", SOURCE.replace("tdoa_peer_position", "position")))
+
+
+def test_the_documented_interface_is_the_one_that_is_called():
+    page = (ROOT / "docs" / "speed.md").read_text()
+    declared = [line for line in peer.__doc__.splitlines() if line.startswith("    ")]
+    assert len(declared) == 6 and all(
+        line.strip().partition(";  ")[0].split("(")[0] in page for line in declared
+    )
+
+
+def test_the_stand_in_for_matrices_inverts_and_multiplies(tmp_path):
+    (tmp_path / "inverse.c").write_text(
+        '#include "arm_math.h"\n'
+        "void product(float *a, float *out, int n) {\n"
+        "  float i[256], t[256];\n"
+        "  matrix A = {n, n, a}, I = {n, n, i}, T = {n, n, t}, O = {n, n, out};\n"
+        "  arm_mat_inverse_f32(&A, &I); arm_mat_trans_f32(&I, &T); arm_mat_trans_f32(&T, &I); "
+        "arm_mat_mult_f32(&A, &I, &O);\n"
+        "  arm_mat_scale_f32(&O, 2, &O);\n}"
+    )
+    library = tmp_path / "inverse.so"
+    include = f"-I{ROOT / 'docs' / 'peer'}"
+    subprocess.run(
+        [CC, "-shared", "-fPIC", include, "-o", library, tmp_path / "inverse.c", "-lm"], check=True
+    )
+    a = np.random.default_rng(1).normal(size=(9, 9)).astype(np.float32)
+    out = np.zeros((9, 9), np.float32)
+    ctypes.CDLL(str(library)).product(*(ctypes.c_void_p(x.ctypes.data) for x in (a, out)), 9)
+    assert np.allclose(out, 2.0 * np.eye(9), atol=1e-4)

@@ -19,7 +19,7 @@ from uwb_tdoa_ekf.core.verdicts import USED  # noqa: E402
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag  # noqa: E402
 from uwb_tdoa_tools.bags.files import messages, new_bag, open_bag  # noqa: E402
 from uwb_tdoa_tools.bags.message_types import typestore  # noqa: E402
-from uwb_tdoa_tools.benchmark.flights import first  # noqa: E402
+from uwb_tdoa_tools.calibrating.parts import between  # noqa: E402
 from uwb_tdoa_tools.live.processes import DiagnosticsListener, Processes, own_domain, wait  # noqa: E402
 from uwb_tdoa_tools.live.session import session  # noqa: E402
 from uwb_tdoa_tools.readers import read_flight  # noqa: E402
@@ -136,7 +136,8 @@ def test_at_any_rate_and_load_the_result_is_that_of_the_bag(tmp_path, load, rate
 @pytest.mark.slow
 def test_a_measured_flight_beside_three_busy_processes(shared_data, tmp_path, load):
     log, survey = shared_data / "flights/0426/0426-traj3", shared_data / "surveys/anchor_0426.txt"
-    write_bag(first(read_flight(log, survey), 24.0), tmp_path / "flight.bag")
+    flight = read_flight(log, survey)
+    write_bag(between(flight, -np.inf, flight.imu.t[0] + 24.0), tmp_path / "flight.bag")
     code, said, told, recorded = replayed(
         tmp_path / "flight.bag", tmp_path, "--rate", 4, begin=lambda: load(3)
     )

@@ -2,6 +2,7 @@
 and ground truth.
 """
 
+import numpy as np
 import pytest
 
 pytest.importorskip("uwb_tdoa_msgs.msg", reason="needs the built workspace: ./dev build")
@@ -9,7 +10,7 @@ import known_answer  # noqa: E402
 
 from uwb_tdoa_bias.correction.network import load_network  # noqa: E402
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag  # noqa: E402
-from uwb_tdoa_tools.benchmark.flights import first  # noqa: E402
+from uwb_tdoa_tools.calibrating.parts import between  # noqa: E402
 from uwb_tdoa_tools.live.run import run_live  # noqa: E402
 from uwb_tdoa_tools.readers import read_flight  # noqa: E402
 from uwb_tdoa_tools.scoring.evaluation import evaluate  # noqa: E402
@@ -23,7 +24,8 @@ VERDICTS = ("used", "rejected", "late", "invalid", "startup", "waiting")
 def test_measured_flight_through_the_nodes_at_any_rate_is_the_offline_run(shared_data, tmp_path):
     log, survey = shared_data / "flights/0426/0426-traj7", shared_data / "surveys/anchor_0426.txt"
     bag = tmp_path / "flight.bag"
-    write_bag(first(read_flight(log, survey), SECONDS), bag)
+    whole = read_flight(log, survey)
+    write_bag(between(whole, -np.inf, whole.imu.t[0] + SECONDS), bag)
     flight = read_bag(bag)
     model = known_answer.write(tmp_path)
     offline, _ = evaluate(flight, network=load_network(model))

@@ -30,7 +30,6 @@ PATIENCE = 120.0  # s for a command that is interrupted to end
 # of the time that a command has waited for a core, from which on others compute on the same ones
 CROWD = 0.05
 WORDS = {  # command: words after it
-    "bench": "--quick --only core",
     "calibrate": "flight.bag --out calibrated",
     "calibrate, no truth": "flight.bag --no-truth --out calibrated",
     "calibrate, quick": "flight.bag --no-truth --quick",

@@ -2,7 +2,6 @@
 
 from uwb_tdoa_bias.foundation.executable import executable, node_executable
 
-bench = executable("uwb_tdoa_tools.commands.bench")
 calibrate = executable("uwb_tdoa_tools.commands.calibrate")
 check = executable("uwb_tdoa_tools.commands.check")
 convert = executable("uwb_tdoa_tools.commands.convert")

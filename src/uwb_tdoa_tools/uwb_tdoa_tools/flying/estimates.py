@@ -15,7 +15,7 @@ from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.frames import poses_of
 from uwb_tdoa_ekf.results import Odometry, concatenated
 
-from ..benchmark.peer import Peer, events
+from .peer import Peer, events
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -7,8 +7,8 @@ pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from geometry_msgs.msg import PoseWithCovarianceStamped  # noqa: E402
-import odd_messages  # noqa: E402
 
+from studies import odd_messages  # noqa: E402
 from uwb_tdoa_msgs.msg import AnchorArray, Tdoa  # noqa: E402
 
 FEW = 100

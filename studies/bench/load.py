@@ -1,9 +1,9 @@
 """What else there is in a graph, as a process: a simulator's clock, a robot's transforms, a tag's
 streams.
 
-python -m uwb_tdoa_tools.benchmark.load clock 200
-python -m uwb_tdoa_tools.benchmark.load tf 500
-python -m uwb_tdoa_tools.benchmark.load streams 30
+python -m studies.bench.load clock 200
+python -m studies.bench.load tf 500
+python -m studies.bench.load streams 30
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 from tf2_msgs.msg import TFMessage
 
-from ..live.session import session
+from uwb_tdoa_tools.live.session import session
+
 from .flights import make_flight
 from .source import Source
 
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 
     from rclpy.node import Node
 
-    from ..live.session import Stop
+    from uwb_tdoa_tools.live.session import Stop
 
 WHEELS = "odom", "base_link"  # of the transform on /tf
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 import re
 import subprocess
 import sys
@@ -18,19 +19,19 @@ import numpy as np
 from rcl_interfaces.srv import GetParameters
 import rclpy
 
-from ..live.processes import LiveError
+from uwb_tdoa_tools.live.processes import LiveError
+
 from .figures import Figure
 from .nodes import PACKAGES, READY_LIMIT, ready_at, surroundings
 from .usage import cpu_seconds
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
-    from pathlib import Path
 
     from numpy.typing import ArrayLike
     from rclpy.node import Node
 
-    from ..live.processes import Processes
+    from uwb_tdoa_tools.live.processes import Processes
 
 CASES = (  # Hz of /clock, Hz of /tf, whether streams flow, busy loops beside
     (0.0, 0.0, False, 0),
@@ -42,6 +43,7 @@ CASES = (  # Hz of /clock, Hz of /tf, whether streams flow, busy loops beside
     (1000.0, 500.0, True, 2),
 )
 NODE = "ekf_node"
+ROOT = Path(__file__).resolve().parents[2]
 FLIGHT = 30.0  # s, over and over
 UNASKED = 5.0  # s in which its CPU is taken
 SILENCE = 20.0  # s without an answer, or without a report, after which there will be none
@@ -234,10 +236,9 @@ class _Asking:
 
 @contextmanager
 def _load(what: str, number: float) -> Iterator[subprocess.Popen[bytes]]:
-    command = [sys.executable, "-m", "uwb_tdoa_tools.benchmark.load", what, f"{number:g}"]
-    with _process(
-        command, stdout=subprocess.PIPE, cwd="/"
-    ) as process:  # -m looks for modules in the folder where it starts
+    command = [sys.executable, "-m", "studies.bench.load", what, f"{number:g}"]
+    # -m looks for modules in the folder where it starts
+    with _process(command, stdout=subprocess.PIPE, cwd=ROOT) as process:
         assert process.stdout is not None  # it is a pipe
         process.stdout.readline()  # it begins
         yield process

@@ -1,20 +1,18 @@
-"""Both nodes for hours at 1 kHz IMU and 400 Hz TDOAs: their memory, and whether their counters hold
-all that was published.
-
-python src/uwb_tdoa_tools/test/soak.py --minutes 60 [--together]
+"""soak: both nodes for hours at 1 kHz IMU and 400 Hz TDOAs: their memory, and whether their counters
+hold all that was published.
 """
 
-import argparse
 import math
 from pathlib import Path
 import tempfile
 import time
 
-from uwb_tdoa_tools.benchmark import nodes
-from uwb_tdoa_tools.benchmark.flights import make_flight
-from uwb_tdoa_tools.benchmark.source import Source
-from uwb_tdoa_tools.benchmark.usage import memory
 from uwb_tdoa_tools.live.processes import DiagnosticsListener, wait
+
+from . import nodes
+from .flights import make_flight
+from .source import Source
+from .usage import memory
 
 LAP = dict(
     trajectory="circle", radius=1.5, speed=1.0, start_in_air=True
@@ -56,16 +54,14 @@ def soak(minutes, starts, folder):
             print(name, diagnostics.newest(name))
 
 
-def main():
-    arguments = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    arguments.add_argument("--minutes", type=float, default=60.0)
-    arguments.add_argument("--together", action="store_true", help="in one localization_node")
-    args = arguments.parse_args()
+def add_options(add):
+    """The options of the study."""
+    add("--minutes", type=float, default=60.0, help="how long (default %(default)s)")
+    add("--together", action="store_true", help="in one localization_node")
+
+
+def run(args):
+    """Play, and print the memory."""
+    starts = nodes.pool([""], 1) if args.together else nodes.pairs([""])
     with tempfile.TemporaryDirectory() as folder:
-        soak(
-            args.minutes, nodes.pool([""], 1) if args.together else nodes.pairs([""]), Path(folder)
-        )
-
-
-if __name__ == "__main__":
-    main()
+        soak(args.minutes, starts, Path(folder))

@@ -1,5 +1,4 @@
-"""What nodes do with messages that no driver should send: python
-src/uwb_tdoa_tools/test/odd_messages.py 10000
+"""odd-messages: what nodes do with messages that no driver should send.
 
 Messages of every type that a node takes, so many on each topic, changed at random: numbers that are
 none, huge, tiny or negative, ids and stamps of anything, long names; then, as bytes, cut off,
@@ -10,14 +9,12 @@ every service of each node, those for parameters too, with values that are odd: 
 With them come odd messages to those nodes that count none.
 """
 
-import argparse
 from collections import Counter
 from dataclasses import dataclass
 from functools import partial
 import json
 from pathlib import Path
 import re
-import sys
 import tempfile
 import time
 
@@ -46,20 +43,21 @@ from sensor_msgs.msg import FluidPressure, Imu, Range
 from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
+from studies.bench import nodes
+from studies.bench.nodes import READY_LIMIT, ready_at, surroundings
+from studies.bench.usage import memory
 from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.errors import Failure
 from uwb_tdoa_bias.foundation.ros_anchors import anchors_to_message
 from uwb_tdoa_bias.foundation.ros_cdr import Unreadable, decode
 from uwb_tdoa_bias.foundation.ros_frames import read_transforms
 from uwb_tdoa_msgs.msg import AnchorArray, EstimatorStatus, Tdoa, TdoaCorrected
 from uwb_tdoa_msgs.srv import GoTo, Land, Takeoff
-from uwb_tdoa_tools.benchmark import nodes
-from uwb_tdoa_tools.benchmark.nodes import READY_LIMIT, ready_at, surroundings
-from uwb_tdoa_tools.benchmark.usage import memory
 from uwb_tdoa_tools.live.processes import DiagnosticsListener, LiveError, wait
 from uwb_tdoa_tools.live.session import answer_of
 
 RCLError = rclpy_implementation.RCLError
-CORPUS = Path(__file__).parent / "fuzz" / "corpus"
+CORPUS = Path(__file__).parents[1] / "src" / "uwb_tdoa_tools" / "test" / "fuzz" / "corpus"
 ALIGNED = 4  # bytes; the middleware fills up to that, so that other lengths arrive longer
 # bytes; after an empty message Fast DDS delivers nothing more of a reliable publisher, to whomever
 SHORTEST = 4
@@ -133,7 +131,8 @@ ANCHORS = Anchors.from_positions(
 class Account:
     """sent, received, unreadable, expected : messages by topic (received: streams; expected :
     unreadable ones of the others);
-    memory : bytes after each tenth; log : bytes."""
+    memory : bytes after each tenth; log : bytes.
+    """
 
     sent: dict
     received: dict
@@ -483,21 +482,17 @@ def clock_ordeal(count, folder, seed=1):
         return "Traceback" not in log.read_text(errors="replace")
 
 
-def main():
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("count", type=int, help="messages on each topic")
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument(
-        "--only",
-        nargs="+",
-        choices=SERVICES,
-        default=[*SERVICES],
-        metavar="NODE",
-        help="default: all",
-    )
-    args, bad = parser.parse_args(), False
+def add_options(add):
+    """The options of the study."""
+    nodes_help = f"of {', '.join(SERVICES)} (default: all)"
+    add("count", metavar="COUNT", type=int, help="messages on each topic")
+    add("--seed", metavar="N", type=int, default=1, help="of the messages (default %(default)s)")
+    add("--only", nargs="+", choices=SERVICES, default=[*SERVICES], metavar="NODE", help=nodes_help)
+
+
+def run(args):
+    """Send them, and print what became of them. Raises Failure if a node ends or counts wrong."""
+    bad = False
     with tempfile.TemporaryDirectory() as folder:
         for name in (name for name in STREAMS if name in args.only):
             began = time.monotonic()
@@ -525,8 +520,5 @@ def main():
             )
         fine = "ekf_node" not in args.only or clock_ordeal(args.count, Path(folder), args.seed)
         print("/clock:", "goes on" if fine else "ended")
-    return int(bad or not fine)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    if bad or not fine:
+        raise Failure("a node ended, or did not account for every message; see above.")

@@ -15,9 +15,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..live.processes import DiagnosticsListener, Processes, own_domain, variables, wait
-from ..live.run import accounts
-from ..live.session import session
+from uwb_tdoa_tools.live.processes import (
+    DiagnosticsListener,
+    Processes,
+    own_domain,
+    variables,
+    wait,
+)
+from uwb_tdoa_tools.live.run import accounts
+from uwb_tdoa_tools.live.session import session
+
 from .figures import Figure
 from .flights import among, make_flight
 from .source import Source, latencies

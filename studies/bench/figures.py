@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .. import json_values
+from uwb_tdoa_tools import json_values
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

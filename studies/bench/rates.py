@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..bags.bag import read_odometry, write_bag
-from ..bags.files import messages, open_bag
-from ..live.run import accounts, run_live
+from uwb_tdoa_tools.bags.bag import read_odometry, write_bag
+from uwb_tdoa_tools.bags.files import messages, open_bag
+from uwb_tdoa_tools.live.run import accounts, run_live
+
 from .figures import Figure
 from .flights import make_flight
 

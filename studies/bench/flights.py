@@ -9,9 +9,8 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_ekf.results import rows_of
-
-from ..calibrating.parts import between
-from ..simulation import SimulationConfig, simulate
+from uwb_tdoa_tools.calibrating.parts import between
+from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.flight import Flight
