@@ -25,7 +25,7 @@ OF_EVERY_NODE = {"/parameter_events", "/rosout"}
 
 DESCRIPTION = """Topics, nodes and parameters, as the command of ROS 2 shows them; for those who have no ROS.
 
-Bags, launch files and the rest need ROS 2; `./dev run uwb_tdoa_tools replay` and `record` play and record bags without."""
+Launch files, recording and the rest need ROS 2; `./dev run uwb_tdoa_tools replay` plays bags without."""
 
 
 def parser():

@@ -63,7 +63,6 @@ setup(
             "inject = uwb_tdoa_tools.executables:inject",
             "localize = uwb_tdoa_tools.executables:localize",
             "plan = uwb_tdoa_tools.executables:plan",
-            "record = uwb_tdoa_tools.executables:record",
             "replay = uwb_tdoa_tools.executables:replay",
             "simulate = uwb_tdoa_tools.executables:simulate",
             "survey = uwb_tdoa_tools.executables:survey",

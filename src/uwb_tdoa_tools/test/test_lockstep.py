@@ -21,6 +21,7 @@ from uwb_tdoa_tools.bags.files import messages, new_bag, open_bag  # noqa: E402
 from uwb_tdoa_tools.bags.message_types import typestore  # noqa: E402
 from uwb_tdoa_tools.calibrating.parts import between  # noqa: E402
 from uwb_tdoa_tools.live.processes import DiagnosticsListener, Processes, own_domain, wait  # noqa: E402
+from uwb_tdoa_tools.live.record import recorded_odometry  # noqa: E402
 from uwb_tdoa_tools.live.session import session  # noqa: E402
 from uwb_tdoa_tools.readers import read_flight  # noqa: E402
 from uwb_tdoa_tools.scoring.evaluation import evaluate  # noqa: E402
@@ -52,7 +53,12 @@ def replayed(bag, folder, *options, nodes=(), begin=lambda: None):
     nodes : {node: arguments}; begin() : called when the nodes are there, before the replay."""
     model, recorded = known_answer.write(folder), folder / "recorded.bag"
     nodes = {"bias_node": ("--ros-args", "-p", f"model_file:={model}"), **dict(nodes)}
-    with own_domain(), session("test", []) as (node, stop), Processes(folder, stop) as processes:
+    with (
+        own_domain(),
+        session("test", []) as (node, stop),
+        recorded_odometry(node, recorded),
+        Processes(folder, stop) as processes,
+    ):
         diagnostics = DiagnosticsListener(node)
         for package, name in (("uwb_tdoa_bias", "bias_node"), ("uwb_tdoa_ekf", "ekf_node")):
             processes.start(package, name, *nodes.get(name, ()))
@@ -63,9 +69,12 @@ def replayed(bag, folder, *options, nodes=(), begin=lambda: None):
             node,
             lambda: all(map(diagnostics.newest, ("bias_node", "ekf_node"))),
         )
-        processes.start("uwb_tdoa_tools", "record", "--output", recorded, "odometry")
         wait(
-            READY_LIMIT, "record", processes, node, lambda: node.count_subscribers("/odometry") == 2
+            READY_LIMIT,
+            "bias_node to listen",
+            processes,
+            node,
+            lambda: node.count_subscribers("/odometry") == 2,
         )
         begin()
         command = ("uwb_tdoa_tools", "replay", bag, "--follow", "odometry", *options)
@@ -73,8 +82,6 @@ def replayed(bag, folder, *options, nodes=(), begin=lambda: None):
         wait(None, None, processes, node, lambda: replay.poll() is not None)
         diagnostics.forget()
         wait(SETTLE_LIMIT, "the nodes to finish", processes, node, diagnostics.is_settled)
-        if replay.returncode != 2:
-            processes.stop("record")
         told = {name: diagnostics.newest(name) for name in ("bias_node", "ekf_node")}
         return replay.returncode, processes.file("replay").read_text(), told, recorded
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.effects import AnchorDelay
-from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands import diagnose, evaluate, localize
 from uwb_tdoa_tools.estimate import FlightEstimator
@@ -133,37 +132,6 @@ def test_it_is_left_out_with_a_sentence_where_it_is_not_installed(desk, capsys, 
         capsys.readouterr().err.count("pip install rerun-sdk") == 1
         and not (desk / "flight.rrd").exists()
     )
-
-
-@pytest.mark.parametrize("residuals", [True, False])
-def test_what_nodes_said_is_written_as_it_was_recorded(
-    desk, flight, viewer, monkeypatch, residuals
-):
-    run = FlightEstimator()(flight)
-    said = dict(
-        zip(
-            RESIDUAL_FIELDS,
-            (
-                getattr(run.residuals, name)
-                for name in ("t", "a", "b", "innovation", "variance", "weight", "verdict")
-            ),
-        )
-    )
-
-    def read_fields(bag, topic):
-        if not residuals:
-            raise InputError(f"{bag}: has no topic {topic}; record it.")
-        return said
-
-    monkeypatch.setattr(rerun_file, "read_odometry", lambda bag: run.odometry)
-    monkeypatch.setattr(rerun_file, "read_fields", read_fields)
-    rerun_file.write_recorded("live.rrd", "flight.bag")
-    found = names(viewer)
-    assert (
-        ALWAYS | {"world/truth", "error"} <= found
-        and any(name.startswith("residual/") for name in found) == residuals
-    )
-    assert f"{len(run.odometry.t)} odometry messages" in verdict(viewer)
 
 
 @pytest.mark.parametrize("name", ["localize", "evaluate", "diagnose"])

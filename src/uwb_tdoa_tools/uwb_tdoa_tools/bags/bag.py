@@ -289,7 +289,7 @@ def read_bag(
     topics: dict[str, str] | None = None,
     truth: bool = True,
 ) -> Flight:
-    """Flight of a bag that was written here, by `ros2 bag record` or by our `record`; other topics
+    """Flight of a bag that was written here or by `ros2 bag record`; other topics
     are ignored.
 
     namespace : where the tag's topics are in the bag, e.g. "tag1" for /tag1/uwb/tdoa.

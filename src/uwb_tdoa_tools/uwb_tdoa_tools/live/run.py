@@ -13,6 +13,7 @@ from uwb_tdoa_ekf.results import VERDICTS
 
 from ..bags.files import open_bag
 from .processes import DiagnosticsListener, Processes, own_domain, wait
+from .record import recorded_odometry
 from .session import session
 
 if TYPE_CHECKING:
@@ -78,8 +79,8 @@ def run_live(
     ekf_parameters: dict[str, Any] | None = None,
     say: Callable[[str], object] = print,
 ) -> LiveRun:
-    """Start bias_node, ekf_node and record, wait until they have found each other, replay the bag,
-    stop them.
+    """Start bias_node and ekf_node, wait until they have found each other, replay the bag, record
+    their odometry, stop them.
 
     bag : path of a bag; folder : where the recorded bag (`recorded.bag`) and the output of the
         processes (`*.log`) go;
@@ -99,11 +100,15 @@ def run_live(
     recorded = Path(folder) / "recorded.bag"
     if recorded.exists():
         shutil.rmtree(recorded)
-    with own_domain(), session("demo", []) as (node, stop), Processes(folder, stop) as processes:
+    with (
+        own_domain(),
+        session("demo", []) as (node, stop),
+        recorded_odometry(node, recorded),
+        Processes(folder, stop) as processes,
+    ):
         diagnostics = DiagnosticsListener(node)
         processes.start("uwb_tdoa_bias", "bias_node", *_parameters("bias_node", bias_parameters))
         processes.start("uwb_tdoa_ekf", "ekf_node", *_parameters("ekf_node", ekf_parameters))
-        processes.start("uwb_tdoa_tools", "record", "--output", recorded, "odometry")
         say("starting the nodes")
         wait(
             READY_LIMIT,
@@ -143,7 +148,7 @@ def run_live(
             say,
             diagnostics.counts,
         )
-        for name in ("record", "ekf_node", "bias_node"):
+        for name in ("ekf_node", "bias_node"):
             processes.stop(name)
     return LiveRun(recorded, diagnostics.newest("bias_node"), diagnostics.newest("ekf_node"))
 

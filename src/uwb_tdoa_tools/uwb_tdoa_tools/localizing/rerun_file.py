@@ -11,11 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Flight, Truth
 from uwb_tdoa_ekf.results import Residuals
 
-from ..bags.bag import read_bag, read_fields, read_odometry
 from ..diagnosis.output import as_text
 from ..estimate import FlightEstimator
 from ..scoring.metrics import position_at
@@ -129,37 +127,6 @@ def write_diagnosis(
         as_text(result).splitlines(),
         truth,
         before.odometry,
-    )
-
-
-def write_recorded(path: Path, bag: str) -> None:
-    """Write what was recorded of running nodes: `odometry` among `uwb/anchors`, with `uwb/residual`
-    and the ground truth where these were recorded, too. Raises InputError for a bag without
-    `odometry`, `uwb/tdoa` or `uwb/anchors`.
-    """
-    flight, odometry = read_bag(bag), read_odometry(bag)
-    try:
-        said = read_fields(bag, "uwb/residual")
-    except InputError:  # not recorded
-        residuals = None
-    else:
-        columns = (
-            "t",
-            "anchor_a",
-            "anchor_b",
-            "innovation",
-            "innovation_variance",
-            "weight",
-            "verdict",
-        )
-        residuals = Residuals(*(said[name] for name in columns)) if len(said["t"]) else None
-    write_rerun(
-        path,
-        flight,
-        odometry,
-        residuals,
-        [f"As the nodes said it: {len(odometry.t)} odometry messages"],
-        flight.truth,
     )
 
 

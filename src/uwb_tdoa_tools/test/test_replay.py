@@ -1,4 +1,4 @@
-"""Replay and record as real processes that talk over DDS.
+"""Replays as real processes that talk over DDS, and what is recorded of topics.
 
 No step waits for time to pass, only for what must happen.
 """
@@ -14,22 +14,23 @@ import time
 
 import numpy as np
 import pytest
-from recordings import differences, small_flight
+from recordings import small_flight
 
-from uwb_tdoa_tools.bags.bag import read_bag, read_fields, write_bag
+from uwb_tdoa_tools.bags.bag import read_odometry, write_bag
 
 rclpy = pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg", reason="uwb_tdoa_msgs is not built and sourced")
 
 from geometry_msgs.msg import PoseStamped  # noqa: E402
+from nav_msgs.msg import Odometry  # noqa: E402
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
-from rosbags.rosbag2 import Reader  # noqa: E402
 from rosgraph_msgs.msg import Clock  # noqa: E402
 from sensor_msgs.msg import Imu  # noqa: E402
 from tf2_msgs.msg import TFMessage  # noqa: E402
 
 from uwb_tdoa_msgs.msg import AnchorArray, Tdoa  # noqa: E402
-from uwb_tdoa_tools.commands import record, replay  # noqa: E402
+from uwb_tdoa_tools.commands import replay  # noqa: E402
+from uwb_tdoa_tools.live.record import recorded_odometry  # noqa: E402
 
 LIMIT = 180.0  # s: a step that takes longer has failed
 STREAMS = ["imu/data", "uwb/tdoa", "ground_truth/pose"]
@@ -126,49 +127,38 @@ def subscribe(node, message_type, topic, qos=DEEP):
     return node.create_subscription(message_type, topic, lambda _: None, qos)
 
 
-@pytest.mark.parametrize(
-    "storage, ending",
-    [("mcap", signal.SIGINT), pytest.param("sqlite3", signal.SIGTERM, marks=pytest.mark.slow)],
-)
-def test_recorded_replay_is_the_bag(tmp_path, start, storage, ending):
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_what_arrives_is_the_bag(tmp_path, start, node, storage):
     flight = small_flight(seconds=4.0)
     write_bag(flight, tmp_path / "flight.bag", storage)
-    again = tmp_path / "again.bag"
-    recording = start("record", "-o", again, "-s", storage, *STREAMS, "uwb/anchors", "/clock")
-    recording.until("waiting for")
-    replaying = start(
-        "replay",
-        tmp_path / "flight.bag",
-        "--rate",
-        4,
-        "--clock",
-        100,
-        "--wait-matched",
-        LIMIT,
-        "--wait-topics",
-        *STREAMS,
+    imu, tdoa = subscribe(node, Imu, "imu/data"), subscribe(node, Tdoa, "uwb/tdoa")
+    poses, clock = (
+        subscribe(node, PoseStamped, "ground_truth/pose"),
+        subscribe(node, Clock, "/clock"),
     )
-    code, out = replaying.end()
-    assert code == 0, replaying.said
-    assert "/imu/data: 4000 messages" in out and "/uwb/tdoa: 2000 messages" in out
+    options = ["--rate", 4, "--clock", 100, "--wait-matched", LIMIT, "--wait-topics", *STREAMS]
+    code, out = start("replay", tmp_path / "flight.bag", *options).end()
+    assert code == 0 and "/imu/data: 4000 messages" in out and "/uwb/tdoa: 2000 messages" in out
     took = float(re.search(r"messages in ([0-9.]+) s", out)[1])
     assert took > 0.99 * flight.imu.t[-1] / 4 - 10.0 / 4
-    assert not again.exists()  # not before it is complete
-    code, out = recording.end(ending)
-    assert code == 0, recording.said
-    assert "/imu/data: 4000 messages" in out
-    back = read_bag(again)
-    assert differences(flight, back) == []
-    assert {path.name for path in tmp_path.iterdir()} == {"flight.bag", "again.bag"}
-    with Reader(again) as reader:
-        clock = [data for connection, _, data in reader.messages() if connection.topic == "/clock"]
-    seconds = [
-        int.from_bytes(data[4:8], "little") + 1e-9 * int.from_bytes(data[8:12], "little")
-        for data in clock
-    ]
-    assert (np.diff(seconds) >= 0).all()
-    assert flight.imu.t[0] <= seconds[0] and seconds[-1] <= flight.imu.t[-1] + 0.001
-    assert len(seconds) > 20
+    samples = take(imu, lambda messages: len(messages) == 4000)
+    ranges = take(tdoa, lambda messages: len(messages) == 2000)
+    take(poses, lambda messages: len(messages) == len(flight.truth))
+    np.testing.assert_allclose(seconds_of(samples), flight.imu.t, atol=1e-9)
+    np.testing.assert_array_equal([m.angular_velocity.z for m in samples], flight.imu.gyro[:, 2])
+    np.testing.assert_allclose(seconds_of(ranges), flight.tdoa.t, atol=1e-9)
+    np.testing.assert_array_equal([m.distance_difference for m in ranges], flight.tdoa.d)
+    ticks = np.array([seconds(m.clock) for m in take(clock, lambda messages: len(messages) > 20)])
+    assert (np.diff(ticks) >= 0).all()
+    assert flight.imu.t[0] <= ticks[0] and ticks[-1] <= flight.imu.t[-1] + 0.001
+
+
+def seconds(stamp):
+    return stamp.sec + 1e-9 * stamp.nanosec
+
+
+def seconds_of(messages):
+    return [seconds(message.header.stamp) for message in messages]
 
 
 def test_anchors_reach_who_comes_late(tmp_path, start, node):
@@ -373,60 +363,44 @@ def test_who_listens_to_some_topics_gets_all_of_them(tmp_path, start, node):
     assert len(messages) == 300 and replaying.end()[0] == 0
 
 
-@pytest.mark.slow
-def test_record_everything(tmp_path, start, node):
-    flight = small_flight(seconds=0.5)
-    write_bag(flight, tmp_path / "flight.bag")
-    publisher = node.create_publisher(
-        Imu, "other/imu", DEEP
-    )  # any type, any time, before there is a message
-    recording = start("record", "-o", tmp_path / "all.bag", "--all")
-    recording.until("recording /other/imu (sensor_msgs/msg/Imu, reliable)")
-    deadline = time.monotonic() + LIMIT
-    while not publisher.get_subscription_count():  # each end learns of the other in its own time
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-    publisher.publish(Imu())
-    replaying = start(
-        "replay", tmp_path / "flight.bag", "--wait-matched", LIMIT, "--wait-topics", *STREAMS
-    )
-    assert replaying.end()[0] == 0
-    assert publisher.wait_for_all_acked(rclpy.duration.Duration(seconds=LIMIT))
-    assert recording.end(signal.SIGINT)[0] == 0
-    assert differences(flight, read_bag(tmp_path / "all.bag")) == []
-    assert len(read_fields(tmp_path / "all.bag", "other/imu")["t"]) == 1
-
-
-def test_nothing_came(tmp_path, start):
-    recording = start("record", "-o", tmp_path / "none.bag", "imu/data")
-    recording.until("waiting for /imu/data")
-    code, out = recording.end(signal.SIGTERM)
-    assert code == 1 and "no message came on /imu/data; there is no bag" in recording.said[-1]
-    assert list(tmp_path.iterdir()) == []
+def test_odometry_is_recorded_as_it_was_sent(tmp_path, node):
+    publisher = node.create_publisher(Odometry, "odometry", DEEP)
+    deadline, count = time.monotonic() + LIMIT, 200
+    with recorded_odometry(node, tmp_path / "odometry.bag"):
+        while not publisher.get_subscription_count():
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        for k in range(count):
+            message = Odometry()
+            message.header.stamp.sec, message.pose.pose.position.x = k, 0.5 * k
+            message.pose.pose.orientation.w = 1.0
+            publisher.publish(message)
+            if k < count // 2:
+                rclpy.spin_once(node, executor=None, timeout_sec=0.0)
+        assert publisher.wait_for_all_acked(rclpy.duration.Duration(seconds=LIMIT))
+    back = read_odometry(tmp_path / "odometry.bag")
+    np.testing.assert_array_equal(back.t, np.arange(count))
+    np.testing.assert_array_equal(back.p[:, 0], 0.5 * np.arange(count))
 
 
 @pytest.mark.parametrize(
     "arguments, sentence",
     [
-        (["replay", "nothing.bag"], "replay: error: nothing.bag: is not a bag"),
+        (["nothing.bag"], "replay: error: nothing.bag: is not a bag"),
         (
-            ["replay", "nothing.bag", "--rate", "0"],
+            ["nothing.bag", "--rate", "0"],
             "argument -r/--rate: '0' is not a number above 0",
         ),
         (
-            ["replay", "flight.bag", "--wait-topics", "uwb/nothing"],
+            ["flight.bag", "--wait-topics", "uwb/nothing"],
             "/uwb/nothing is not in the bag",
         ),
-        (["replay", "flight.bag", "--ros-args", "--nonsense"], "replay: error: ROS arguments: "),
-        (["record", "-o", "flight.bag", "imu/data"], "record: error: flight.bag: exists already"),
-        (["record", "-o", "new.bag"], "name the topics to record"),
-        (["record", "-o", "new.bag", "-a", "imu/data"], "name the topics to record"),
+        (["flight.bag", "--ros-args", "--nonsense"], "replay: error: ROS arguments: "),
     ],
 )
 def test_bad_usage(tmp_path, monkeypatch, capsys, arguments, sentence):
     monkeypatch.chdir(tmp_path)
     write_bag(small_flight(seconds=0.01), "flight.bag")
-    tool, *arguments = arguments
-    assert {"replay": replay, "record": record}[tool].main(arguments) == 2
+    assert replay.main(arguments) == 2
     assert sentence in capsys.readouterr().err.splitlines()[-1]
     assert [path.name for path in tmp_path.iterdir()] == ["flight.bag"]
