@@ -7,8 +7,13 @@ from studies import (
     aids,
     calibrating,
     crazyflie,
+    deviations,
+    domains,
+    drives,
     fuzz,
     localizing,
+    lockstep,
+    monitor,
     moved_anchors,
     noise,
     odd_messages,
@@ -18,6 +23,9 @@ from studies import (
     scale,
     situations,
     surveying,
+    two_errors,
+    two_machines,
+    warehouse,
 )
 from studies.bench import soak, suite
 from studies.checking import figures as checking
@@ -41,13 +49,18 @@ STUDIES = {
     "crazyflie": crazyflie,
     "debias-measured": measured,
     "debias-set-up": set_up,
+    "deviations": deviations,
     "diagnose-ranges": diagnosed_ranges,
     "diagnosis": figures,
+    "domains": domains,
+    "drives": drives,
     "faults": faults,
     "fly-faults": flown,
     "fuzz": fuzz,
     "in-flight": in_flight,
     "localizing": localizing,
+    "lockstep": lockstep,
+    "monitor": monitor,
     "moved-anchors": moved_anchors,
     "noise": noise,
     "odd-messages": odd_messages,
@@ -60,6 +73,9 @@ STUDIES = {
     "soak": soak,
     "spin": spin,
     "surveying": surveying,
+    "two-errors": two_errors,
+    "two-machines": two_machines,
+    "warehouse": warehouse,
 }
 DESCRIPTION = """Make the figures of the documentation anew. Nothing here is needed to use the suite. DATA is a folder
 of measured flights: flights/, util/, surveys/.
@@ -73,13 +89,18 @@ of measured flights: flights/, util/, surveys/.
   crazyflie        measured logs put through the radio link of a Crazyflie (docs/connect.md)
   debias-measured  bias maps of positions on measured flights (docs/debiasing.md)
   debias-set-up    a simulated copy of the set-up of Grasso et al. (docs/debiasing.md)
+  deviations       deviations of anchor positions against their errors (docs/diagnosis.md)
   diagnose-ranges  errors put into simulated distances to anchors, and what diagnose makes of them (docs/sensors.md)
   diagnosis        effects put into flights, and found again (docs/diagnosis.md)
+  domains          effects beyond where they were seen (docs/reliability.md)
+  drives           a rover on wheels, by which sensors the filter uses (docs/aids.md)
   faults           faults of streams, surveys, nodes and clocks, played to the real nodes over topics (docs/reliability.md)
   fly-faults       faults of streams while a simulated vehicle flies by the estimate (docs/reliability.md)
   fuzz             changed files of every kind, given to every reader (docs/reliability.md)
   in-flight        the same mistakes played to ekf_node, and what it says of them (docs/connect.md)
   localizing       what localize says of flights, against their ground truth (docs/localizing.md)
+  lockstep         replays that follow the nodes, at several rates (docs/reliability.md)
+  monitor          what the monitor of ekf_node names in flight (docs/reliability.md)
   moved-anchors    anchors that were moved or exchanged, and who names them (docs/localizing.md)
   noise            whether covariances are honest after a calibration (docs/calibration.md)
   odd-messages     messages that no driver should send, to every node (docs/reliability.md)
@@ -92,6 +113,9 @@ of measured flights: flights/, util/, surveys/.
   soak             both nodes for hours: memory and lost messages (docs/reliability.md)
   spin             the error of a TDOA over the yaw of the tag (docs/bias.md)
   surveying        surveys shaken, and made better from flights alone (docs/calibration.md)
+  two-errors       vibration that is rectified, and late anchors near the floor (docs/measured.md)
+  two-machines     who hears whom on two machines, takes root (docs/ros.md)
+  warehouse        starts, slow tags and walks in halls, and their cost (docs/warehouse.md)
 """
 
 
@@ -105,6 +129,14 @@ def parser():
     made = cli.parser(
         "study",
         DESCRIPTION,
+        "./dev study deviations DATA",
+        "./dev study domains DATA",
+        "./dev study drives",
+        "./dev study lockstep LOG SURVEY --from 10 --seconds 5",
+        "./dev study monitor DATA --days 0426 0607",
+        "./dev study two-errors DATA",
+        "./dev study two-machines",
+        './dev study warehouse --only "ten minutes" --seeds 20',
         "./dev study aids worth DATA/flights/0425 --survey DATA/surveys",
         "./dev study bench --json bench.json",
         "./dev study bench --only core --peer libpeer.so",

@@ -1,7 +1,5 @@
 """What watching the anchors in flight takes, by their number: memory, and time for each slice of
 half a second.
-
-python src/uwb_tdoa_ekf/test/monitor_cost.py
 """
 
 import time
@@ -82,11 +80,3 @@ def cost(n, heard, slices):
         fly(monitor, anchors, heard, 1, slices + k)
         took.append(time.process_time() - begin)
     return peak, float(np.median(took))
-
-
-if __name__ == "__main__":
-    cost(8, 8, 30)  # what is compiled, is
-    print("| anchors | heard at a time | memory, MB | ms each half second |\n|---:|---:|---:|---:|")
-    for n, heard in CASES:
-        peak, seconds = cost(n, heard, 60)
-        print(f"| {n} | {heard} | {peak / 1e6:.1f} | {1e3 * seconds:.1f} |", flush=True)

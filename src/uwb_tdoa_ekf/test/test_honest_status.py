@@ -1,7 +1,5 @@
 """`status`, its odometry and /diagnostics of a real ekf_node while what is measured is wrong: they
 agree, and say it in time.
-
-As a program it prints the rows of docs/reliability.md:  python src/uwb_tdoa_ekf/test/test_honest_status.py
 """
 
 import re
@@ -16,7 +14,7 @@ pytest.importorskip("uwb_tdoa_msgs.msg")
 from faults import ARRIVAL, FAULTS, FLIGHT, D, of_imu, of_tdoa, put  # noqa: E402
 from flights import position_at  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
-from rig import Rig, make_rig, seconds_of  # noqa: E402, F401
+from rig import make_rig, seconds_of  # noqa: E402, F401
 from stream_faults import lanes_of, play  # noqa: E402
 
 from uwb_tdoa_msgs.msg import EstimatorStatus  # noqa: E402
@@ -176,35 +174,3 @@ def test_status_odometry_and_diagnostics_agree_while_what_is_measured_is_wrong(
                 status.why in values["wrong with the streams"]
                 or status.why == values["not to be flown by"]
             )
-
-
-def main():
-    """Print a row for each fault."""
-    import rclpy
-
-    rclpy.init()
-    rigs = []
-
-    def make(**options):
-        rigs.append(Rig(f"honest{len(rigs)}", **options))
-        return rigs[-1]
-
-    FAULTS.update({name: (change, words) for name, (change, _, words) in CASES.items()})
-    (lane,) = lanes_of(make, 1)
-    try:
-        for name, first, (error, deviation), statuses, well in tried(lane, Heard(lane.rig), CASES):
-            print(
-                (
-                    f"| {name} | {first:.1f} | {sorted(set(statuses))} | {error:.2f}, "
-                    f"{deviation:.2f} | {well:.1f} |"
-                ),
-                flush=True,
-            )
-    finally:
-        for rig in rigs:
-            rig.close()
-        rclpy.shutdown()
-
-
-if __name__ == "__main__":
-    main()

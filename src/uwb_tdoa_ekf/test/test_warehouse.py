@@ -1,13 +1,12 @@
 """Tags in halls with many anchors, tags that hear few TDOAs, and anchors in a plane.
 
-The figures of many seeds: warehouse_table.py.
+The figures of many seeds: `./dev study warehouse`.
 """
 
 from halls import HALLS, fly, hall, room
 import numpy as np
 import pytest
-from warehouse_cost import cost
-from warehouse_table import after_gaps, heard_at_start, judge
+from warehouse_judge import after_gaps, cost, heard_at_start, judge
 
 from uwb_tdoa_ekf.core import workspace
 from uwb_tdoa_ekf.core.config import SIDES, FilterConfig

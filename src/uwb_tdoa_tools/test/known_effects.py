@@ -2,14 +2,19 @@
 them, places known on their paths, and what is found by name.
 """
 
+from dataclasses import replace
+
 import numpy as np
 
 from uwb_tdoa_bias.effects import EFFECTS
 from uwb_tdoa_bias.foundation.sensors import BY_POSE
+from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.constraints import Mark
+from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.scoring.metrics import judged_part
 from uwb_tdoa_tools.simulation import ImuErrors, SimulationConfig, simulate
 
+ANCHORS_FOUND = "anchor_position", "anchor_delay"
 PATHS = ("sines", "rising_circle", "square", "sines", "rising_circle")
 # Without effects: white noise, outliers within the nominal 2 %, an inertial sensor without bias.
 CLEAN = {"bias": False, "multipath": False, "imu_errors": ImuErrors(gyro_bias=0.0, accel_bias=0.0)}
@@ -136,3 +141,34 @@ def names_found(attribution):
     return [f.effect.name for f in declared] + [
         f"{effect.channel}/{effect.covariate}" for effect in unnamed
     ]
+
+
+def normalised(flight, std, seed):
+    """{effect: (errors over stated deviations (n,), over those of the fit alone (n,))} of what is
+    found in a Flight whose anchors are put off by std, m. What the survey and the delays should be
+    is what came with the flight, and zero.
+    """
+    off = std * np.random.default_rng(seed).standard_normal((len(flight.anchors), 3))
+    shaken = replace(flight, anchors=flight.anchors.at(flight.anchors.positions + off))
+    found = attribute([shaken], GroundTruth(), undeclared=False).selection
+    true = {
+        f"{i}.{axis}": -off[row, k]
+        for row, i in enumerate(flight.anchors.ids)
+        for k, axis in enumerate("xyz")
+    }
+    stated, alone = (
+        found.fit,
+        found.only(found.chosen).fit,
+    )  # the second is fitted anew: without the deviations that hold
+    out = {}
+    for kind in ANCHORS_FOUND:
+        rows = [k for k, column in enumerate(stated.columns) if column.effect == (kind,)]
+        error = stated.beta[rows] - np.array([true.get(stated.columns[k].key, 0.0) for k in rows])
+        out[kind] = tuple(error / np.sqrt(np.diag(fit.cov))[rows] for fit in (stated, alone))
+    return out
+
+
+def root(several):
+    """Root mean square of arrays together; NaN of none."""
+    together = np.concatenate(several)
+    return float(np.sqrt(np.mean(together**2))) if len(together) else np.nan

@@ -2,8 +2,7 @@
 large as they say.
 """
 
-from deviations_table import normalised, root
-from known_effects import clean_flight
+from known_effects import clean_flight, normalised, root
 import numpy as np
 import pytest
 

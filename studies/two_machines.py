@@ -1,8 +1,5 @@
-"""Who hears whom on two machines, by what each is told: the table of docs/ros.md. The machines are
-two network namespaces of this one, joined by a virtual cable, for which it takes root. In a shell
-with the workspace sourced (./dev shell):
-
-python src/uwb_tdoa_tools/test/network_table.py
+"""two-machines: who hears whom on two machines, by what each is told. The machines are two network
+namespaces of this one, joined by a virtual cable, for which it takes root.
 """
 
 from contextlib import contextmanager
@@ -94,7 +91,12 @@ def started(name, told, body):
     )
 
 
-if __name__ == "__main__":
+def add_options(add):
+    """The options of the study: none."""
+
+
+def run(args):
+    """Print the table."""
     print("| the robot is told | we are told | its TDOAs are |\n|---|---|---|")
     with cable():
         for robots, ours in CASES:

@@ -1,17 +1,13 @@
-"""What an effect does to flights beyond where it was seen: a clock's drift, fitted to the first
-seconds of one flight, taken out of the others, without its domain and with it. The figures of
-docs/reliability.md.
-
-python src/uwb_tdoa_tools/test/domain_table.py DATA
+"""domains: what an effect does to flights beyond where it was seen: a clock's drift, fitted to the first
+seconds of one flight, taken out of the others, without its domain and with it.
 """
 
-import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from monitor_table import flights_of
 import numpy as np
 
+from studies.monitor import flights_of
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf.offline import run_offline
@@ -40,21 +36,25 @@ def beginning(flight, seconds):
 
 def figures(flight, effects):
     """(3D RMSE in the air, m, mean NEES) of the filter with an EffectSet."""
-    run = run_offline(flight, None, Corrector(flight.anchors, effects))
-    row = Score(flight.name, run.odometry, flight.truth, run.residuals).row()
+    done = run_offline(flight, None, Corrector(flight.anchors, effects))
+    row = Score(flight.name, done.odometry, flight.truth, done.residuals).row()
     return row["rmse_3d"], row["nees_mean"]
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("data", type=Path)
-    data, reference = parser.parse_args().data, GroundTruth()
+def add_options(add):
+    """The options of the study."""
+    add("data", metavar="DATA", type=Path, help="folder of measured flights")
+
+
+def run(args):
+    """Print the table."""
+    reference = GroundTruth()
     print(
         "| flight | fitted to | no correction: error, m, NEES | without domain | with domain "
         "|\n|---|---|---|---|---|"
     )
     for constellation, (name, seconds) in FITTED.items():
-        flights = {flight.name: flight for flight in flights_of(data, [constellation])}
+        flights = {flight.name: flight for flight in flights_of(args.data, [constellation])}
         fitted = reference.prepare(beginning(flights.pop(name), seconds))
         found = attribute(
             [fitted], reference, undeclared=False, kinds=["anchor_clock_drift"]
@@ -73,7 +73,3 @@ def main():
             + " |",
             flush=True,
         )
-
-
-if __name__ == "__main__":
-    main()

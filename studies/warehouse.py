@@ -1,84 +1,22 @@
-"""The tables of docs/warehouse.md: starts in halls, slow tags, anchors in a plane, a walk of ten
-minutes.
-
-python src/uwb_tdoa_ekf/test/warehouse_table.py [--starts N] [--seeds N] [--first N] [--only WORD]
-[--bound]
+"""warehouse: starts in halls, slow tags, anchors in a plane, a walk of ten minutes, and what a tag
+costs by how many anchors are installed.
 """
 
-import argparse
-
-from driving import drive, state_for
 from flights import position_at
 from halls import DELAY, HALLS, HEIGHT, RATE, fly, hall, room, walk
 import numpy as np
 from scipy.spatial import cKDTree
+from warehouse_judge import after_gaps, cost, judge
 
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.core.verdicts import STARTUP
 
+INSTALLED = 20, 100, 1000, 10_000  # anchors
 LARGE = 0.5  # m
 WRONG, CERTAIN, AGAIN = (
     1.0,
     5.0,
     2.0,
 )  # m, deviations beyond which an estimate is wrong and certain, and s in which it is right again
-
-
-def judge(flight, config):
-    """Figures of one run. at_2 : m, error 2 s after the first TDOA, inf where there is no estimate;
-    rmse : m, from 10 s on; nees : mean of the position, 3 where it is honest; start : s after the
-    first TDOA; spent, stamps : TDOAs, and stamps of them, until then.
-    """
-    state = state_for(flight)
-    odometry, residuals = drive(flight, config, state)
-    began = residuals.verdict != STARTUP
-    spent = int(np.argmax(began)) if began.any() else len(began)
-    stamps = len(np.unique(flight.tdoa.t[: spent + 1]))
-    if not len(odometry):
-        return {
-            "at_2": np.inf,
-            "rmse": np.inf,
-            "nees": np.inf,
-            "start": np.inf,
-            "spent": spent,
-            "stamps": stamps,
-            "odometry": None,
-        }
-    error = odometry.x[:, :3] - position_at(flight, odometry.t)
-    off, covariance = np.linalg.norm(error, axis=1), odometry.covariance[:, :3, :3]
-    since = odometry.t - flight.tdoa.t[0]
-    nees = np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])
-    return {
-        "at_2": off[np.searchsorted(since, 2.0)] if since[-1] > 2.0 and since[0] < 2.0 else np.inf,
-        "rmse": float(np.sqrt(np.mean(off[since >= 10.0] ** 2)))
-        if (since >= 10.0).any()
-        else np.nan,
-        "nees": float(nees.mean()),
-        "start": float(since[0]),
-        "spent": spent,
-        "stamps": stamps,
-        "odometry": odometry,
-        "off": off,
-        "std": np.sqrt(np.trace(covariance, axis1=1, axis2=2)),
-    }
-
-
-def heard_at_start(flight, seconds=0.5):
-    """Anchors in the TDOAs of the first seconds."""
-    first = flight.tdoa.t < flight.tdoa.t[0] + seconds
-    return len(np.unique(np.concatenate([flight.tdoa.a[first], flight.tdoa.b[first]])))
-
-
-def after_gaps(flight, found, within=1.0, gap=1.0):
-    """For each silence of more than `gap` s, how long after it the error was above `within` m last,
-    s, of the 10 s that follow.
-    """
-    t, out = flight.tdoa.t, []
-    for k in np.flatnonzero(np.diff(t) > gap):
-        rows = (found["odometry"].t >= t[k + 1]) & (found["odometry"].t < t[k + 1] + 10.0)
-        wrong = found["odometry"].t[rows & (found["off"] > within)]
-        out.append(float(wrong.max() - t[k + 1]) if len(wrong) else 0.0)
-    return out
 
 
 def bound(where, seed, duration=20.0):
@@ -176,35 +114,41 @@ def say_walks(name, where, seeds, config):
     )
 
 
-def main():
+def say_costs():
+    """A row for each number of installed anchors."""
+    cost(20, 5.0, 1)  # what is compiled, is
+    print(
+        "| installed | of a core | over that of 20 | memory of a tag, MB | start, s "
+        "|\n|---:|---:|---:|---:|---:|"
+    )
+    least = None
+    for n in INSTALLED:
+        share, memory, start, _ = cost(n)
+        least = least or share
+        print(
+            f"| {n} | {share:.4f} | {share / least:.2f} | {memory / 1e6:.1f} | {start:.2f} |",
+            flush=True,
+        )
+
+
+def add_options(add):
+    """The options of the study."""
+    add("--starts", type=int, default=100, metavar="N", help="in each hall (default: %(default)s)")
+    seeds = "of each row in the room (default: %(default)s)"
+    add("--seeds", type=int, default=20, metavar="N", help=seeds)
+    first = "seed of the walks of ten minutes (default: %(default)s)"
+    add("--first", type=int, default=0, metavar="N", help=first)
+    add("--only", default="", metavar="WORD", help="rows with this in their name")
+    bounds = "instead: errors along the axes of the runs in halls where no estimate can be good"
+    add("--bound", action="store_true", help=bounds)
+    add("--cost", action="store_true", help="instead: what a tag costs")
+
+
+def run(args):
     """Print the rows whose names have a word in them."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument(
-        "--starts", type=int, default=100, metavar="N", help="in each hall (default: %(default)s)"
-    )
-    parser.add_argument(
-        "--seeds",
-        type=int,
-        default=20,
-        metavar="N",
-        help="of each row in the room (default: %(default)s)",
-    )
-    parser.add_argument(
-        "--first",
-        type=int,
-        default=0,
-        metavar="N",
-        help="seed of the walks of ten minutes (default: %(default)s)",
-    )
-    parser.add_argument("--only", default="", metavar="WORD", help="rows with this in their name")
-    parser.add_argument(
-        "--bound",
-        action="store_true",
-        help="instead: errors along the axes of the runs in halls where no estimate can be good",
-    )
-    args = parser.parse_args()
+    if args.cost:
+        say_costs()
+        return
     if args.bound:
         say_bounds(args.starts, args.only)
         return
@@ -263,7 +207,3 @@ def main():
             say_walks(
                 name, hall(first, floors=2), range(args.first, args.first + args.seeds), config
             )
-
-
-if __name__ == "__main__":
-    main()

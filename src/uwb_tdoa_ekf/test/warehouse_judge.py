@@ -1,7 +1,5 @@
-"""What a tag costs by how many anchors are installed, of which it hears the same 20: the table of
-docs/warehouse.md.
-
-python src/uwb_tdoa_ekf/test/warehouse_cost.py
+"""How runs of tags in halls are judged: their errors, and what they cost by how many anchors are
+installed, of which a tag hears the same 20.
 """
 
 from pathlib import Path
@@ -9,17 +7,76 @@ import tempfile
 import time
 import tracemalloc
 
+from driving import drive, state_for
+from flights import position_at
 from halls import Hall, fly
 import numpy as np
 
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_ekf.core.verdicts import STARTUP
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.monitoring.stream_watch import StreamWatch
 
-INSTALLED = 20, 100, 1000, 10_000
 SPACING = 8.0  # m
 TURN = 0.005  # s of stamps that a node takes at once
+
+
+def judge(flight, config):
+    """Figures of one run. at_2 : m, error 2 s after the first TDOA, inf where there is no estimate;
+    rmse : m, from 10 s on; nees : mean of the position, 3 where it is honest; start : s after the
+    first TDOA; spent, stamps : TDOAs, and stamps of them, until then.
+    """
+    state = state_for(flight)
+    odometry, residuals = drive(flight, config, state)
+    began = residuals.verdict != STARTUP
+    spent = int(np.argmax(began)) if began.any() else len(began)
+    stamps = len(np.unique(flight.tdoa.t[: spent + 1]))
+    if not len(odometry):
+        return {
+            "at_2": np.inf,
+            "rmse": np.inf,
+            "nees": np.inf,
+            "start": np.inf,
+            "spent": spent,
+            "stamps": stamps,
+            "odometry": None,
+        }
+    error = odometry.x[:, :3] - position_at(flight, odometry.t)
+    off, covariance = np.linalg.norm(error, axis=1), odometry.covariance[:, :3, :3]
+    since = odometry.t - flight.tdoa.t[0]
+    nees = np.einsum("ni,ni->n", error, np.linalg.solve(covariance, error[:, :, None])[:, :, 0])
+    return {
+        "at_2": off[np.searchsorted(since, 2.0)] if since[-1] > 2.0 and since[0] < 2.0 else np.inf,
+        "rmse": float(np.sqrt(np.mean(off[since >= 10.0] ** 2)))
+        if (since >= 10.0).any()
+        else np.nan,
+        "nees": float(nees.mean()),
+        "start": float(since[0]),
+        "spent": spent,
+        "stamps": stamps,
+        "odometry": odometry,
+        "off": off,
+        "std": np.sqrt(np.trace(covariance, axis1=1, axis2=2)),
+    }
+
+
+def heard_at_start(flight, seconds=0.5):
+    """Anchors in the TDOAs of the first seconds."""
+    first = flight.tdoa.t < flight.tdoa.t[0] + seconds
+    return len(np.unique(np.concatenate([flight.tdoa.a[first], flight.tdoa.b[first]])))
+
+
+def after_gaps(flight, found, within=1.0, gap=1.0):
+    """For each silence of more than `gap` s, how long after it the error was above `within` m last,
+    s, of the 10 s that follow.
+    """
+    t, out = flight.tdoa.t, []
+    for k in np.flatnonzero(np.diff(t) > gap):
+        rows = (found["odometry"].t >= t[k + 1]) & (found["odometry"].t < t[k + 1] + 10.0)
+        wrong = found["odometry"].t[rows & (found["off"] > within)]
+        out.append(float(wrong.max() - t[k + 1]) if len(wrong) else 0.0)
+    return out
 
 
 def installation(n):
@@ -101,19 +158,3 @@ def cost(n, duration=30.0, repeat=3):
     memory = tracemalloc.get_traced_memory()[0]
     tracemalloc.stop()
     return min(shares), memory, start, odometry[-1]
-
-
-if __name__ == "__main__":
-    cost(20, 5.0, 1)  # what is compiled, is
-    print(
-        "| installed | of a core | over that of 20 | memory of a tag, MB | start, s "
-        "|\n|---:|---:|---:|---:|---:|"
-    )
-    for n in INSTALLED:
-        share, memory, start, _ = cost(n)
-        if n == INSTALLED[0]:
-            least = share
-        print(
-            f"| {n} | {share:.4f} | {share / least:.2f} | {memory / 1e6:.1f} | {start:.2f} |",
-            flush=True,
-        )

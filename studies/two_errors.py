@@ -1,10 +1,7 @@
-"""How far accelerometers rectify vibration, and how late each anchor is over the height of the tag:
-the tables of docs/measured.md.
-
-python src/uwb_tdoa_tools/test/two_errors_table.py DATA
+"""two-errors: how far accelerometers rectify vibration, and how late each anchor is over the height of
+the tag.
 """
 
-import argparse
 from collections import defaultdict
 from pathlib import Path
 
@@ -75,11 +72,14 @@ def lateness(flight: Flight) -> dict[int, np.ndarray]:
     return out
 
 
-def main() -> None:
+def add_options(add):
+    """The options of the study."""
+    add("data", metavar="DATA", type=Path, help="folder of measured flights")
+
+
+def run(args):
     """Print both tables of the micro-SD logs below DATA/flights, by day."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("data", type=Path, metavar="DATA")
-    folder = parser.parse_args().data
+    folder = args.data
     shaking, late = defaultdict(list), defaultdict(lambda: defaultdict(list))
     for log in sorted(
         path for path in (folder / "flights").rglob("*") if path.is_file() and not path.suffix
@@ -109,7 +109,3 @@ def main() -> None:
                 " | ".join(f"{value:.2f}" for value in np.median(each, axis=0)),
                 "|",
             )
-
-
-if __name__ == "__main__":
-    main()

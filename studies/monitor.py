@@ -1,16 +1,12 @@
-"""What the monitor of ekf_node names on measured flights, and what it names on flights that nothing
-was put into: the figures of docs/reliability.md. The same filter and monitor as in the node, off
-line.
-
-python src/uwb_tdoa_tools/test/monitor_table.py DATA --days 0426 0607
+"""monitor: what the monitor of ekf_node names on measured flights, what it names on flights that
+nothing was put into, and what it costs. The same filter and monitor as in the node, off line.
 """
 
-import argparse
 from dataclasses import replace
 from pathlib import Path
 
+from monitor_cost import CASES, cost
 import numpy as np
-from time_offset_table import cut, measured
 
 from uwb_tdoa_bias.foundation import geometry
 from uwb_tdoa_ekf.core.config import FilterConfig
@@ -25,6 +21,27 @@ SIZES = {0.6: 5.0, 0.3: 10.0}  # m: s within which it is to be named
 MIDDLE = 0.4, 0.6  # of the time in the air, between which a fault begins
 SPAN = 6.0  # s over which delays at the ground truth are averaged
 JUDGED = 5.0  # s after the beginning of a fault from which errors count
+
+
+def measured(folder):
+    """The micro-SD logs below DATA/flights, without range finders and the like."""
+    for log in sorted(
+        path for path in (folder / "flights").rglob("*") if path.is_file() and not path.suffix
+    ):
+        day = log.relative_to(folder / "flights").parts[0]
+        flight = read_flight(log, folder / "surveys" / f"anchor_{day}.txt")
+        yield replace(flight, height=None, pressure=None, velocity=None)
+
+
+def cut(flight, low, high):
+    """The part of a Flight between two times after its first TDOA."""
+    begin = flight.tdoa.t[0]
+
+    def part(stream):
+        inside = (stream.t >= begin + low) & (stream.t < begin + high)
+        return type(stream)(*(column[inside] for column in vars(stream).values()))
+
+    return replace(flight, imu=part(flight.imu), tdoa=part(flight.tdoa))
 
 
 def airborne(flight):
@@ -81,7 +98,7 @@ EVENTS = {
 EVENT_LIMIT = 5.0  # s
 
 
-def run(flight, config):
+def watched(flight, config):
     """[(s, sentences)], every STEP, and (t (n,) s, p (n, 3) m) of a Flight: off line, which is what
     live gives.
     """
@@ -162,7 +179,7 @@ def clean(flights, config):
     """
     seconds = alarmed = grounded = 0
     for flight in flights:
-        said, _ = run(flight, config)
+        said, _ = watched(flight, config)
         begin, end = airborne(flight)
         seconds += end - begin
         first = next(((t, sentences[0]) for t, sentences in said if sentences), None)
@@ -204,14 +221,14 @@ def faults(flights, config, draws, seed):
                 begin, end = airborne(flight)
                 since = begin + (end - begin) * rng.uniform(*MIDDLE)
                 harmed = late(flight, row, size, since)
-                said, track = run(harmed, config)
+                said, track = watched(harmed, config)
                 name = f"anchor {flight.anchors.ids[row]}:"
                 told = next(((t, s[0]) for t, s in said if t > since and s), (np.inf, ""))
                 right = told[1].startswith(name) and told[0] - since <= limit + STEP
                 named += right
                 wrong += not told[1].startswith(name) and told[0] - since <= limit + STEP
                 after += [told[0] - since] if right else []
-                tracks = run(flight, config)[1], track, run(harmed, compensating)[1]
+                tracks = watched(flight, config)[1], track, watched(harmed, compensating)[1]
                 errors.append([error_of(flight, one, since + JUDGED, end) for one in tracks])
         ratios = np.array(errors)[:, 1:] / np.array(errors)[:, :1]
         cells = " | ".join(f"{value:.3f}" for value in np.sqrt(np.mean(np.square(errors), axis=0)))
@@ -245,7 +262,7 @@ def events(flights, config, draws, seed):
                 ids = flight.anchors.ids[
                     sorted([row, other]) if name == "exchanged" else [row, other]
                 ]
-                said, _ = run(
+                said, _ = watched(
                     cut(
                         change(flight, ids, since),
                         0.0,
@@ -270,31 +287,37 @@ def events(flights, config, draws, seed):
         )
 
 
-def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("data", type=Path)
-    parser.add_argument("--days", nargs="+", default=["0422", "0425", "0426", "0607"])
-    parser.add_argument(
-        "--draws",
-        type=int,
-        default=10,
-        help="of flight and time, for each anchor; 0: unharmed flights alone",
+def add_options(add):
+    """The options of the study."""
+    add("data", metavar="DATA", type=Path, help="folder of measured flights")
+    add(
+        "--days", nargs="+", default=["0422", "0425", "0426", "0607"], help="(default: raw flights)"
     )
-    parser.add_argument(
-        "--events",
-        action="store_true",
-        help="anchors that are silent or exchanged, instead of late ones",
-    )
-    parser.add_argument("--seed", type=int, default=1)
-    arguments = parser.parse_args()
-    flights = flights_of(arguments.data, arguments.days)
-    if arguments.events:
-        events(flights, FilterConfig(), arguments.draws, arguments.seed)
+    draws = "of flight and time, for each anchor; 0: unharmed flights alone (default: %(default)s)"
+    add("--draws", metavar="N", type=int, default=10, help=draws)
+    add("--events", action="store_true", help="anchors that are silent or exchanged, not late")
+    add("--seed", metavar="N", type=int, default=1, help="of the draws (default: %(default)s)")
+    add("--cost", action="store_true", help="memory and processor time by the number of anchors")
+
+
+def run(args):
+    """Print the tables."""
+    if args.cost:
+        costs()
+        return
+    flights = flights_of(args.data, args.days)
+    if args.events:
+        events(flights, FilterConfig(), args.draws, args.seed)
         return
     clean(flights, FilterConfig())
-    if arguments.draws:
-        faults(flights, FilterConfig(), arguments.draws, arguments.seed)
+    if args.draws:
+        faults(flights, FilterConfig(), args.draws, args.seed)
 
 
-if __name__ == "__main__":
-    main()
+def costs():
+    """Print what watching takes, by the number of anchors."""
+    cost(8, 8, 30)  # what is compiled, is
+    print("| anchors | heard at a time | memory, MB | ms each half second |\n|---:|---:|---:|---:|")
+    for n, heard in CASES:
+        peak, seconds = cost(n, heard, 60)
+        print(f"| {n} | {heard} | {peak / 1e6:.1f} | {1e3 * seconds:.1f} |", flush=True)

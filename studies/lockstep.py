@@ -1,10 +1,5 @@
-"""Makes the table of replays in step in docs/reliability.md, in a shell with the workspace sourced
-(./dev shell):
+"""lockstep: replays that follow the nodes, at several rates and loads, beside the run off line."""
 
-python src/uwb_tdoa_tools/test/lockstep_table.py LOG SURVEY --runs 10 --from 10 --seconds 8
-"""
-
-import argparse
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -12,41 +7,34 @@ import subprocess
 import sys
 import tempfile
 
+import known_answer
 import numpy as np
+from test_lockstep import replayed
 
-sys.path.insert(0, str(Path(__file__).resolve().parent))
-sys.path.append(str(Path(__file__).resolve().parents[2] / "uwb_tdoa_bias" / "test"))
-
-import known_answer  # noqa: E402
-from test_lockstep import replayed  # noqa: E402
-from time_offset_table import cut  # noqa: E402
-
-from uwb_tdoa_bias.correction.network import load_network  # noqa: E402
-from uwb_tdoa_bias.foundation.flight import Truth  # noqa: E402
-from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag  # noqa: E402
-from uwb_tdoa_tools.readers import read_flight  # noqa: E402
-from uwb_tdoa_tools.scoring.evaluation import evaluate  # noqa: E402
-from uwb_tdoa_tools.scoring.metrics import Score  # noqa: E402
+from studies.monitor import cut
+from uwb_tdoa_bias.correction.network import load_network
+from uwb_tdoa_bias.foundation.flight import Truth
+from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag
+from uwb_tdoa_tools.readers import read_flight
+from uwb_tdoa_tools.scoring.evaluation import evaluate
+from uwb_tdoa_tools.scoring.metrics import Score
 
 
-def main():
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("log")
-    parser.add_argument("survey")
-    parser.add_argument(
-        "--from", dest="begin", type=float, default=0.0, help="s after the first TDOA (default 0)"
-    )
-    parser.add_argument(
-        "--seconds", type=float, default=np.inf, help="of the flight (default: all)"
-    )
-    parser.add_argument("--runs", type=int, default=3, help="of each rate and load (default 3)")
-    parser.add_argument("--rates", type=float, nargs="+", default=[1, 2, 4, 8])
-    parser.add_argument(
-        "--loads", type=int, nargs="+", default=[0, 1, 3], help="busy processes beside it"
-    )
-    args = parser.parse_args()
+def add_options(add):
+    """The options of the study."""
+    add("log", metavar="LOG", help="recording")
+    add("survey", metavar="SURVEY", help="its survey")
+    begin = "s after the first TDOA (default: %(default)s)"
+    add("--from", dest="begin", metavar="S", type=float, default=0.0, help=begin)
+    add("--seconds", metavar="S", type=float, default=np.inf, help="of the flight (default: all)")
+    add("--runs", metavar="N", type=int, default=3, help="of each rate and load (default: 3)")
+    add("--rates", metavar="R", type=float, nargs="+", default=[1, 2, 4, 8], help="of the replay")
+    loads = "busy processes beside it (default: %(default)s)"
+    add("--loads", metavar="N", type=int, nargs="+", default=[0, 1, 3], help=loads)
+
+
+def run(args):
+    """Print the table."""
     with tempfile.TemporaryDirectory() as folder:
         bag = Path(folder) / "flight.bag"
         flight = cut(read_flight(args.log, args.survey), args.begin, args.begin + args.seconds)
@@ -72,7 +60,10 @@ def main():
         for load in args.loads:
             for rate in args.rates:
                 rows = np.array(
-                    [run(bag, flight, rate, load, rmse, offline.odometry) for _ in range(args.runs)]
+                    [
+                        replayed_once(bag, flight, rate, load, rmse, offline.odometry)
+                        for _ in range(args.runs)
+                    ]
                 )
                 codes, late, rmse_apart, missing, apart = np.abs(rows).max(axis=0)[:5]
                 cells = (
@@ -82,7 +73,7 @@ def main():
                 print(f"| {rate:g} | {load} | {args.runs} | {cells} |", flush=True)
 
 
-def run(bag, flight, rate, load, rmse, offline):
+def replayed_once(bag, flight, rate, load, rmse, offline):
     """(exit code, TDOAs late, mm of RMSE from the offline one, poses of the offline Odometry that
     were not recorded, mm of the others from it at most, s that the replay took) of one replay.
     """
@@ -101,7 +92,3 @@ def run(bag, flight, rate, load, rmse, offline):
         apart = np.linalg.norm(live.p - offline.p[nearest], axis=1).max()
         missing = len(offline) - len(np.unique(nearest))
         return code, int(told["ekf_node"]["late"]), 1e3 * (error - rmse), missing, 1e3 * apart, took
-
-
-if __name__ == "__main__":
-    main()

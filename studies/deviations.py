@@ -1,0 +1,72 @@
+"""deviations: whether errors of anchors are as large as `diagnose` says, on recordings on which
+nothing was chosen.
+"""
+
+from pathlib import Path
+
+from known_effects import ANCHORS_FOUND, clean_flight, normalised, root
+
+from uwb_tdoa_tools.readers.inputs import Reading
+
+UTIL = "util/const{}-tdoa2.csv.gz"
+SETS = {
+    "const1": ["util/const1-trial1-tdoa3.csv.gz", UTIL.format("1-trial2"), UTIL.format("1-trial3")],
+    "const3": [UTIL.format(f"3-trial{k}") for k in (2, 3, 4)],
+    "const4": [
+        f"util/const4-trial{k}.csv.gz"
+        for k in ("1-tdoa2-traj2", "3-tdoa2-traj2", "3-tdoa2-traj3", "5-tdoa2-traj1")
+    ],
+    "0425": [
+        f"flights/0425/{name}"
+        for name in ("TDOA2/0425-traj10", "TDOA3/0425-traj17", "TDOA2/0425-traj3")
+    ],
+    "0426": [f"flights/0426/0426-traj{k}" for k in (7, 13, 2)],
+    "simulated": [510, 511, 512, 513],
+}
+OFF, FIRST, SECONDS = (
+    (0.05, 0.1, 0.2),
+    700,
+    60.0,
+)  # m, that each coordinate is put off by; seed of the first recording of a set; s
+
+
+def add_options(add):
+    """The options of the study."""
+    add("data", metavar="DATA", type=Path, help="folder of measured flights")
+
+
+def run(args):
+    """Print the table."""
+    print(
+        (
+            "| recordings | off by, m | coordinates: fit alone | as stated | each | delays: fit "
+            "alone | as stated |\n|---|"
+        )
+        + 6 * "---:|"
+    )
+    for name, recordings in SETS.items():
+        flights = [
+            clean_flight(one, SECONDS)
+            if name == "simulated"
+            else Reading(args.data / "surveys").one(args.data / one)
+            for one in recordings
+        ]
+        for std in OFF:
+            told = [normalised(flight, std, FIRST + k) for k, flight in enumerate(flights)]
+            stated, alone = (
+                {kind: [one[kind][k] for one in told] for kind in ANCHORS_FOUND} for k in range(2)
+            )
+            each = [f"{root([one]):.2f}" for one in stated[ANCHORS_FOUND[0]] if len(one)]
+            cells = [
+                root(alone[ANCHORS_FOUND[0]]),
+                root(stated[ANCHORS_FOUND[0]]),
+                " - ".join(sorted({min(each), max(each)})),
+                root(alone[ANCHORS_FOUND[1]]),
+                root(stated[ANCHORS_FOUND[1]]),
+            ]
+            print(
+                f"| {name} | {std} | "
+                + " | ".join(cell if isinstance(cell, str) else f"{cell:.2f}" for cell in cells)
+                + " |",
+                flush=True,
+            )
