@@ -23,6 +23,7 @@ pytest.importorskip("uwb_tdoa_msgs.msg", reason="uwb_tdoa_msgs is not built and 
 
 from geometry_msgs.msg import PoseStamped  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
+from rclpy.executors import SingleThreadedExecutor  # noqa: E402
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
 from rosgraph_msgs.msg import Clock  # noqa: E402
 from sensor_msgs.msg import Imu  # noqa: E402
@@ -366,6 +367,8 @@ def test_who_listens_to_some_topics_gets_all_of_them(tmp_path, start, node):
 def test_odometry_is_recorded_as_it_was_sent(tmp_path, node):
     publisher = node.create_publisher(Odometry, "odometry", DEEP)
     deadline, count = time.monotonic() + LIMIT, 200
+    executor = SingleThreadedExecutor(context=node.context)
+    executor.add_node(node)
     with recorded_odometry(node, tmp_path / "odometry.bag"):
         while not publisher.get_subscription_count():
             assert time.monotonic() < deadline
@@ -376,7 +379,7 @@ def test_odometry_is_recorded_as_it_was_sent(tmp_path, node):
             message.pose.pose.orientation.w = 1.0
             publisher.publish(message)
             if k < count // 2:
-                rclpy.spin_once(node, executor=None, timeout_sec=0.0)
+                executor.spin_once(timeout_sec=0.0)
         assert publisher.wait_for_all_acked(rclpy.duration.Duration(seconds=LIMIT))
     back = read_odometry(tmp_path / "odometry.bag")
     np.testing.assert_array_equal(back.t, np.arange(count))
