@@ -470,12 +470,6 @@ def test_stamps_and_spread():
     np.testing.assert_allclose(late.correct_streams(flight).tdoa.t, samples.t - 0.03)
 
 
-def test_a_covariate_keeps_working_under_its_old_name():
-    with pytest.warns(FutureWarning, match="force_x is now accel_x"):
-        old = SmoothTerm(channel="gyro.x", covariate="force_x", knots=(0.0, 1.0))
-    assert old == SmoothTerm(channel="gyro.x", covariate="accel_x", knots=(0.0, 1.0))
-
-
 def test_several_effects_of_one_name_are_all_kept(tmp_path):
     curves = [SmoothTerm({"c0": value}, knots=(0.0, 1.0)) for value in (0.1, 0.2)]
     written = EffectSet((AnchorDelay({"0": 0.2}), *curves, AnchorDelay({"0": 0.1})))

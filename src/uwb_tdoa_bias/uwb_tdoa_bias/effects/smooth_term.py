@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
-import warnings
 
 import numpy as np
 
@@ -48,10 +47,6 @@ FORMS = ("common", "arrival", "anchor", "pair", "direction")
 OF_LINKS = ("pair", "direction")  # forms with a function for a pair of anchors
 TYPICAL = {"tdoa": 0.1, "gyro": 0.1, "accel": 0.5}  # m, rad/s, m/s^2
 ALONE = 0.3  # m, of what few have
-OLD_NAMES = {
-    "force": "accel",
-    **{f"force_{axis}": f"accel_{axis}" for axis in "xyz"},
-}  # of covariates, until 0.3
 
 
 @dataclass
@@ -92,16 +87,6 @@ class SmoothTerm(Effect):
     fitted: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        if self.covariate in OLD_NAMES:
-            warnings.warn(
-                (
-                    f"effects: smooth_term: covariate {self.covariate} is now "
-                    f"{OLD_NAMES[self.covariate]}"
-                ),
-                FutureWarning,
-                stacklevel=2,
-            )
-            self.covariate = OLD_NAMES[self.covariate]
         try:
             self.knots = tuple(float(knot) for knot in self.knots)
         except (TypeError, ValueError):
