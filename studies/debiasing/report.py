@@ -29,19 +29,6 @@ def set_up_tables(figures):
         _line([edge, *(f"{100 * row[name]:.1f}" for name in names)])
         for edge, row in figures["square"].items()
     ]
-    lines += [
-        "",
-        (
-            "Layers of appendix C before the map, square path: RMSE, and change of the error "
-            "between positions, cm."
-        ),
-        "",
-    ]
-    lines += _head(["layers", "RMSE", "change"])
-    lines += [
-        _line([name, f"{100 * row['rmse']:.2f}", f"{100 * row['step']:.3f}"])
-        for name, row in figures["layers"].items()
-    ]
     return "\n".join(lines) + "\n"
 
 

@@ -14,7 +14,7 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.files import write_text
 from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.debias import INTERPOLATORS, LayerConfig, Layers, Part, fit
+from uwb_tdoa_ekf.debias import INTERPOLATORS, Part, fit
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools import parallel
 from uwb_tdoa_tools.outputs import OutputFolder
@@ -43,9 +43,6 @@ EDGES = {
     "top": (1, 1.5),
     "left": (0, -1.5),
 }  # Table 2: fixed axis, its value
-LAYERS = LayerConfig(
-    saturate=True, max_speed=(1.0, 1.0, 1.0), max_acceleration=10.0, smooth=0.8, adams_moulton=True
-)
 FAR = 10.0  # m, of the anchors that hold the height
 
 
@@ -205,7 +202,6 @@ def copied(seed=0, jobs=None):
             _rail_figures(rail, measured, maps) for rail, measured in zip(RAILS, found["rails"])
         ],
         "square": {name: _edge_figures(square, maps, *edge) for name, edge in EDGES.items()},
-        "layers": _layer_figures(square, maps["static, thin_plate"]),
     }
     return figures, found, maps
 
@@ -257,29 +253,6 @@ def _edge_figures(measured, maps, axis, value):
             for name, error in errors.items()
         }
     )
-
-
-def _layer_figures(measured, bias_map):
-    """RMSE, and scatter from one position to the next, on the square with the layers of appendix C
-    before the map.
-    """
-    out = {}
-    none = LayerConfig()
-    for name, config in {
-        "map alone": none,
-        "saturation": replace(LAYERS, smooth=none.smooth, adams_moulton=False),
-        "smoothing": replace(none, smooth=LAYERS.smooth),
-        "Adams-Moulton": replace(none, adams_moulton=True),
-        "all": LAYERS,
-    }.items():
-        layers = Layers(config)
-        p = np.array([layers.filter(*row) for row in zip(measured.t, measured.p, measured.v)])
-        error = (bias_map.correct(p, measured.covariance)[0] - measured.true)[:, :2]
-        out[name] = {
-            "rmse": np.sqrt(np.mean(np.sum(error**2, axis=1))),
-            "step": np.sqrt(np.mean(np.sum(np.diff(error, axis=0) ** 2, axis=1))),
-        }
-    return _plain(out)
 
 
 def _plain(content):

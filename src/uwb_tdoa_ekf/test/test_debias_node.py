@@ -179,36 +179,12 @@ def test_a_map_of_other_anchors_is_refused_and_of_these_is_used(node):
     np.testing.assert_allclose(got[2], np.array(PLACES[0]) - [0.1, -0.2, 0.3], atol=1e-9)
 
 
-def test_layers_act_before_the_map(make_rig, file):
-    """A jump is spread over steps of the largest speed, and the velocity, of the body, is turned
-    into the world.
-    """
-    rig = make_rig()
-    limits = [
-        "-p",
-        "saturate:=true",
-        "-p",
-        "max_speed:=[0.5, 1.0, 0.5]",
-        "-p",
-        "max_acceleration:=1000.0",
-    ]
-    rig.start("debias_node", debias_node=[*parameters_of(file), *limits])
-    for k, y in enumerate((0.5, 0.7, 0.7, 0.7)):
-        rig.send("odometry", odometry([0.7, y, 0.7], speed=2.0), 0.1 * k, "map")
-    rig.send(
-        "odometry", odometry([0.7, 0.4, 0.7]), 10.0, "map"
-    )  # after a gap the past does not count
-    rig.wait(lambda: len(rig.debiased) == 5, "all of them")
-    y = [xyz(message)[1] - 0.2 for message in rig.debiased]
-    np.testing.assert_allclose(y, [0.5, 0.6, 0.7, 0.7, 0.4], atol=1e-6)
-
-
 @pytest.mark.parametrize(
     ("arguments", "named"),
     [
         ([], "map: is empty"),
         (["-p", "map:=nowhere.npz"], "nowhere.npz: is no position bias map"),
-        (["-p", "map:=MAP", "-p", "max_speed:=[1.0, 1.0]"], "max_speed: .* three numbers"),
+        (["-p", "map:=MAP", "-p", "smooth:=0.5"], "smooth"),
     ],
 )
 def test_bad_parameters_are_refused_in_one_sentence(file, arguments, named):

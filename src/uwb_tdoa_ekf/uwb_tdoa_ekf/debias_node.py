@@ -10,14 +10,12 @@ from __future__ import annotations
 
 from collections import Counter
 from copy import copy
-import math
 import sys
 from typing import TYPE_CHECKING, Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation import ros
 from uwb_tdoa_bias.foundation.errors import InputError
@@ -32,41 +30,20 @@ from uwb_tdoa_bias.foundation.ros_parameters import (
     refuse_unknown,
     say_unused,
 )
-from uwb_tdoa_bias.foundation.ros_stamps import Epoch, orientation_of
 from uwb_tdoa_bias.foundation.ros_topics import OVERRIDES, STREAM_QOS, Input, publish_stream
 
-from .debias import BiasMap, LayerConfig, Layers
+from .debias import BiasMap
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from uwb_tdoa_bias.foundation.anchors import Anchors
 
-GAP = 1.0  # s; after a longer silence, or when time goes back, the layers start anew
 LARGEST_OUTSIDE = 0.5  # share of positions outside of the map, before it becomes a warning
-# in the order of config/debias_node.yaml; the layers are those of Grasso et al., appendix C
+# in the order of config/debias_node.yaml
 PARAMETERS = {
     "map": Parameter("", "file that `debias` wrote; must be given"),
     "anchors_file": ANCHORS_FILE,
-    "saturate": Parameter(False, "limit the steps of velocity and position"),
-    "max_speed": Parameter(
-        [3.0, 3.0, 3.0], "m/s along x, y, z", constraint="three numbers above 0"
-    ),
-    "max_acceleration": Parameter(10.0, "m/s^2", 0.0, 1e6),
-    "smooth": Parameter(
-        1.0,
-        "share of the newest position in the weighted mean, above 0; 1.0 for no smoothing",
-        0.0,
-        1.0,
-    ),
-    "history": Parameter(4, "earlier positions in that mean", 1, 1000),
-    "adams_moulton": Parameter(False, "mix in what the velocities predict"),
-    "flipping_speed": Parameter(
-        [1.0, 1.0, 1.0],
-        "m/s along x, y, z at which the prediction begins to count",
-        constraint="three numbers above 0",
-    ),
-    "least_weight": Parameter(0.5, "share that the estimate keeps at high speed", 0.0, 1.0),
     "frozen": FROZEN,
 }
 
@@ -83,19 +60,12 @@ class DebiasNode(StreamNode):
         super().__init__(self.NAME)
         own = declare_all(self, PARAMETERS)
         refuse_unknown(self)
-        layers = {
-            name: value
-            for name, value in own.items()
-            if name not in ("map", "anchors_file", "frozen")
-        }
         file = own["map"]
         if not file:
             raise InputError("map: is empty; give a file that `debias` wrote.")
-        self._map, self._layers = BiasMap.load(file), Layers(LayerConfig(**layers))
-        self._epoch, self._rate = Epoch(), Rate()
+        self._map, self._rate = BiasMap.load(file), Rate()
         self._counts: Counter[str] = Counter()
         self._counts_before: Counter[str] = Counter()
-        self._newest = -math.inf
         self._map.correct(np.zeros((1, 3)), np.zeros((1, 3, 3)))  # what the first call prepares
         self._publisher = publish_stream(self, Odometry, "odometry/debiased")
         self._input = Input(
@@ -120,8 +90,6 @@ class DebiasNode(StreamNode):
         self._counts["received"] += 1
         point = message.pose.pose.position
         p = np.array([point.x, point.y, point.z])
-        if not self._layers.idle:
-            p = self._layered(message, p)
         if message.header.frame_id != self._map.frame or not np.isfinite(p).all():
             kind = "invalid"
         elif not self._belongs:
@@ -136,20 +104,6 @@ class DebiasNode(StreamNode):
             message.pose.covariance = covariance.ravel()
         self._counts[kind] += 1
         self._publisher.publish(message)
-
-    def _layered(self, message: Odometry, p: np.ndarray) -> np.ndarray:
-        """The position after the layers, which also need the velocity, in the world frame; NaN
-        where one is not known.
-        """
-        u = message.twist.twist.linear
-        state = np.array([*p, u.x, u.y, u.z, *orientation_of(message.pose.pose.orientation)])
-        if not np.isfinite(state).all():
-            return np.full(3, math.nan)
-        t = self._epoch.seconds(message.header.stamp)
-        if not 0.0 <= t - self._newest <= GAP:
-            self._layers.reset()
-        self._newest = t
-        return self._layers.filter(t, p, Rotation.from_quat(state[6:]).apply(state[3:6]))
 
     def _report(self) -> tuple[bytes, str, dict[str, str | int]]:
         kinds = ("corrected", "faded", "outside", "refused", "invalid")

@@ -9,6 +9,5 @@ Accuracy Improvement of UWB-TDoA-Based Indoor Positioning System* (Sensors 2022,
 
 from .bias_map import INTERPOLATORS, BiasMap
 from .fit import Part, fit
-from .layers import LayerConfig, Layers
 
-__all__ = ["INTERPOLATORS", "BiasMap", "LayerConfig", "Layers", "Part", "fit"]
+__all__ = ["INTERPOLATORS", "BiasMap", "Part", "fit"]
