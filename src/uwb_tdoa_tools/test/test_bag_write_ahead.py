@@ -2,7 +2,6 @@
 refused.
 """
 
-from pathlib import Path
 import shutil
 import sqlite3
 
@@ -80,28 +79,18 @@ def test_without_the_log_of_its_file_less_is_there(unclosed):
     assert len(read_bag(unclosed).tdoa) < 0.6 * len(FLIGHT.tdoa)
 
 
-def test_a_damaged_log_is_refused_or_read_up_to_there(unclosed):
+def test_a_damaged_log_is_read_up_to_there(unclosed):
     log = log_of(unclosed)
     content = bytearray(log.read_bytes())
     content[len(content) // 2] ^= 0xFF
     log.write_bytes(content)
-    with pytest.raises(
-        InputError, match=r"-wal: \d+ of \d+ transactions cannot be read.*--salvage"
-    ):
-        read_bag(unclosed)
-    flight = read_bag(unclosed, salvage=True)
+    if unclosed.is_dir():  # metadata.yaml tells how many messages there are
+        with pytest.raises(InputError, match="messages are missing"):
+            read_bag(unclosed)
+        return
+    flight = read_bag(unclosed)
     assert 0.3 * len(FLIGHT.tdoa) < len(flight.tdoa) < len(FLIGHT.tdoa)
-    assert any(
-        "transactions cannot be read: read up to there" in remark
-        for remark in flight.meta["remarks"]
-    )
-
-
-def test_a_log_without_its_head_is_refused(unclosed):
-    log = log_of(unclosed)
-    log.write_bytes(bytes(8) + log.read_bytes()[8:])
-    with pytest.raises(InputError, match="cannot be read"):
-        read_bag(unclosed)
+    assert "as far as SQLite can" in flight.meta["remarks"][0]
 
 
 def test_a_transaction_that_was_not_finished_costs_that_transaction(unclosed):
@@ -112,14 +101,22 @@ def test_a_transaction_that_was_not_finished_costs_that_transaction(unclosed):
     assert 0.8 * len(FLIGHT.tdoa) < len(read_bag(unclosed).tdoa) < len(FLIGHT.tdoa)
 
 
-def test_a_journal_of_an_unfinished_transaction_is_refused(tmp_path):
+def test_an_unfinished_transaction_is_undone(tmp_path):
     write_bag(FLIGHT, tmp_path / "bag", "sqlite3")
     (file,) = (tmp_path / "bag").glob("*.db3")
-    Path(f"{file}-journal").write_bytes(bytes.fromhex("d9d505f920a163d7") + bytes(504))
-    with pytest.raises(InputError, match="-journal holds a transaction that was not finished"):
-        read_bag(tmp_path / "bag")
-    Path(f"{file}-journal").write_bytes(bytes(512))  # of one that was
-    assert differences(FLIGHT, read_bag(tmp_path / "bag")) == []
+    connection = sqlite3.connect(file, isolation_level=None)
+    connection.execute("PRAGMA journal_mode=DELETE")
+    connection.execute("PRAGMA cache_size=2")  # pages: what is changed goes to the file
+    connection.execute("BEGIN")
+    connection.execute("UPDATE messages SET timestamp = 0, data = zeroblob(length(data))")
+    (tmp_path / "killed").mkdir()
+    for name in (file.name, f"{file.name}-journal"):
+        shutil.copyfile(file.with_name(name), tmp_path / "killed" / name)
+    connection.execute("ROLLBACK")
+    connection.close()
+    killed = tmp_path / "killed" / file.name
+    assert killed.read_bytes() != file.read_bytes()
+    assert differences(FLIGHT, read_bag(killed)) == []
 
 
 def test_what_sqlite_leaves_beside_a_file_is_no_recording(unclosed):

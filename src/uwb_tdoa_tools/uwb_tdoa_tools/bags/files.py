@@ -144,18 +144,18 @@ def _opened(path: Path, folder: Path, salvage: bool) -> BagReader:
     given, remarks = path, list[str]()
     try:
         if files := write_ahead.unclosed(path):
-            path = _with_log(path, folder, salvage, remarks)
+            (folder / "closed").mkdir()
+            path = write_ahead.closed(path, folder / "closed")
             names = " and ".join(file.name for file in files)
             remarks.append(
-                f"the recorder did not close {names}: what it left in the -wal file beside it "
-                "is read as well."
+                f"the recorder did not close {names}: what it left in the -wal or -journal file "
+                "beside it is read as far as SQLite can."
             )
         readable = path
         if salvage:
             readable = folder / "sound"
             remarks += write_sound_part(path, readable)
         else:
-            write_ahead.check_no_journal(path)
             check_whole(path)
             if path.is_dir() and is_packed(metadata(path)):
                 readable = folder
@@ -183,19 +183,6 @@ def _opened(path: Path, folder: Path, salvage: bool) -> BagReader:
     except Exception as error:  # rosbags raises whatever its parsers run into
         raise _damaged(given, error) from error
     return reader
-
-
-def _with_log(path: Path, folder: Path, salvage: bool, remarks: list[str]) -> Path:
-    """The bag with what its logs hold, in a folder.
-
-    Raises Damaged where a log cannot be read, or tells in remarks.
-    """
-    (folder / "closed").mkdir()
-    whole, lost = write_ahead.closed(path, folder / "closed")
-    if lost and not salvage:
-        raise Damaged(lost)
-    remarks += [f"{lost}: read up to there."] if lost else []
-    return whole
 
 
 @contextmanager

@@ -1,12 +1,13 @@
-"""SQLite files that the recorder did not close: what their -wal file holds is not yet in the file
-itself (sqlite.org/walformat.html).
+"""SQLite files that the recorder did not close.
+
+What their -wal file holds is not yet in the file itself (sqlite.org/walformat.html). A -journal
+file holds what an unfinished transaction has overwritten. SQLite merges both, in a copy.
 """
 
 from __future__ import annotations
 
 import shutil
 import sqlite3
-import struct
 from typing import TYPE_CHECKING
 
 from .mcap import Damaged
@@ -16,60 +17,45 @@ if TYPE_CHECKING:
 
 LOG, INDEX, JOURNAL = "-wal", "-shm", "-journal"  # beside a file, with its name before it
 BESIDE = LOG, INDEX, JOURNAL
-_HOT = bytes.fromhex("d9d505f920a163d7")  # a journal begins so while a transaction is not finished
-_HEAD, _FRAME_HEAD = 32, 24  # bytes, of a log and of each frame in it
 
 
 def unclosed(path: Path) -> list[Path]:
-    """SQLite files of a bag, a directory or a file, with a log of their own that is not empty."""
-    files = [path] if path.is_file() else sorted(path.glob("*.db3"))
-    return [file for file in files if (log := _beside(file, LOG)).is_file() and log.stat().st_size]
-
-
-def check_no_journal(path: Path) -> None:
-    """Raise Damaged if a file of a bag has a transaction that was begun and neither finished nor
-    undone.
+    """Return the SQLite files of a bag, a directory or a file, with a log or a journal of their own
+    that is not empty.
     """
-    for file in [path] if path.is_file() else sorted(path.glob("*.db3")):
-        journal = _beside(file, JOURNAL)
-        if journal.is_file():
-            with journal.open("rb") as opened:
-                if opened.read(len(_HOT)) == _HOT:
-                    raise Damaged(
-                        f"{journal.name} holds a transaction that was not finished: the "
-                        "recorder was ended while it wrote"
-                    )
+    files = [path] if path.is_file() else sorted(path.glob("*.db3"))
+    return [file for file in files if _left(file)]
 
 
-def closed(path: Path, folder: Path) -> tuple[Path, str]:
-    """(path of a copy of a bag, in a folder, whose files hold what their logs hold; what of the
-    logs cannot be read, "" for nothing).
+def closed(path: Path, folder: Path) -> Path:
+    """Return the path of a copy of a bag, in a folder, whose files hold what their logs hold.
 
     path : a bag with `unclosed` files; nothing is changed there. Raises Damaged.
     """
     whole = folder / path.name
     if path.is_dir():
         whole.mkdir()
-        for file in (
-            one
-            for one in path.iterdir()
-            if one.is_file() and not one.name.endswith((INDEX, JOURNAL))
-        ):
-            shutil.copyfile(file, whole / file.name)  # without its permissions: we write to it
+        files = [one for one in path.iterdir() if one.is_file() and not one.name.endswith(INDEX)]
     else:
-        shutil.copyfile(path, whole)
-        shutil.copyfile(_beside(path, LOG), _beside(whole, LOG))
-    problems = [_merge(whole / file.name if path.is_dir() else whole) for file in unclosed(path)]
-    return whole, "; ".join(filter(None, problems))
+        files = [path, *_left(path)]
+    for file in files:  # without their permissions: we write to them
+        shutil.copyfile(file, whole / file.name if path.is_dir() else folder / file.name)
+    for file in unclosed(whole):
+        _merge(file)
+    return whole
 
 
-def _merge(file: Path) -> str:
-    """Put what is sound of the log of a file into the file.
+def _left(file: Path) -> list[Path]:
+    """Logs and journals beside a file that are not empty."""
+    beside = (file.with_name(file.name + end) for end in (LOG, JOURNAL))
+    return [one for one in beside if one.is_file() and one.stat().st_size]
 
-    Returns what cannot be read, "" for nothing. Raises Damaged.
+
+def _merge(file: Path) -> None:
+    """Have SQLite put the log of a file into it, as far as it is sound, and undo what was not
+    finished. Raises Damaged.
     """
-    log = _beside(file, LOG)
-    size, commits = file.stat().st_size + log.stat().st_size, _commits(log)
+    size = sum(one.stat().st_size for one in (file, *_left(file)))
     try:
         connection = sqlite3.connect(file, isolation_level=None)
         try:
@@ -79,38 +65,13 @@ def _merge(file: Path) -> str:
             )
             if pages * of_page > size:  # SQLite would make a file of that size
                 raise Damaged(
-                    f"{log.name} claims {pages} pages of {of_page} bytes, more than there are"
+                    f"{file.name} claims {pages} pages of {of_page} bytes, more than there are"
                 )
             _, frames, merged = connection.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchone()
             if merged < frames:
-                raise Damaged(f"{log.name}: {frames - merged} of {frames} frames cannot be merged")
+                raise Damaged(f"{file.name}{LOG}: {frames - merged} of {frames} frames are lost")
             connection.execute("PRAGMA journal_mode=DELETE")  # of which there is none then
         finally:
             connection.close()
     except sqlite3.Error as error:
-        raise Damaged(f"{log.name} cannot be merged: {error}") from error
-    lost = sum(frame > frames for frame in commits)
-    return f"{log.name}: {lost} of {len(commits)} transactions cannot be read" if lost else ""
-
-
-def _commits(log: Path) -> list[int]:
-    """Numbers, from 1, of the frames of a log that end a transaction, as the log itself says."""
-    found = []
-    with log.open("rb") as file:
-        head = file.read(_HEAD)
-        if len(head) < _HEAD:
-            return []
-        (of_page,), salt = struct.unpack_from(">I", head, 8), head[16:24]
-        frames = (log.stat().st_size - _HEAD) // (_FRAME_HEAD + of_page)
-        for number in range(1, frames + 1):
-            file.seek(_HEAD + (number - 1) * (_FRAME_HEAD + of_page))
-            frame = file.read(_FRAME_HEAD)
-            if frame[8:16] == salt and frame[4:8] != bytes(
-                4
-            ):  # others are of a log that was used up before
-                found.append(number)
-    return found
-
-
-def _beside(file: Path, end: str) -> Path:
-    return file.with_name(file.name + end)
+        raise Damaged(f"what lies beside {file.name} cannot be merged: {error}") from error
