@@ -10,8 +10,7 @@ setup(
     name=NAME,
     version="0.1.0",
     description=(
-        "Reads, converts, simulates, replays, records and evaluates flights of UWB TDOA "
-        "measurements"
+        "Reads, converts, simulates, replays and evaluates flights of UWB TDOA measurements"
     ),
     maintainer="uwb_tdoa maintainers",
     maintainer_email="maintainers@uwb-tdoa.invalid",

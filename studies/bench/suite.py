@@ -1,6 +1,5 @@
-"""bench: what the suite costs on this machine, in one run: the compiled core, whole recordings, both
-nodes live, several tags, replays, and what else nodes answer. Figures are medians with their
-quartiles, beside their targets.
+"""bench: measure what the suite costs on this machine. Figures are medians with their quartiles,
+beside their targets.
 
 core : us per IMU prediction and per robust TDOA update, by anchors and kind of robustness.
 offline : s for a recording of 45 s, with correction, network and smoother.
@@ -12,9 +11,9 @@ replay : how fast a bag goes through both nodes without loss.
 graph : how long parameters, a told pose and a clock that stops wait while streams, /clock and /tf
 flow; idle CPU.
 
-With --peer, another filter, e.g. that of a firmware, runs over the same events in turn with ours,
-and the ratio is printed. Real nodes run in a ROS domain of their own. Whatever else the machine does
-shows in the figures, above all in the latencies: what others used is printed. To keep others away:
+With --peer, another filter runs over the same events in turn with ours, and the ratio is printed.
+Real nodes run in a ROS domain of their own. Other work on the machine changes the figures, above all
+the latencies; the study prints how much processor time others used. To keep others away:
 sudo -E env PATH=$PATH chrt --fifo 10 ./dev study bench --only nodes tags
 """
 

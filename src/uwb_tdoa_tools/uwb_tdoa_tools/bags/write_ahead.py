@@ -1,7 +1,8 @@
 """SQLite files that the recorder did not close.
 
-What their -wal file holds is not yet in the file itself (sqlite.org/walformat.html). A -journal
-file holds what an unfinished transaction has overwritten. SQLite merges both, in a copy.
+A -wal file holds transactions that are not yet in the file itself (sqlite.org/walformat.html). A
+-journal file holds the pages that an unfinished transaction has overwritten. SQLite merges both in
+a copy of the bag.
 """
 
 from __future__ import annotations
@@ -28,9 +29,9 @@ def unclosed(path: Path) -> list[Path]:
 
 
 def closed(path: Path, folder: Path) -> Path:
-    """Return the path of a copy of a bag, in a folder, whose files hold what their logs hold.
+    """Copy a bag to a folder, merge its logs into the copy, and return the path of the copy.
 
-    path : a bag with `unclosed` files; nothing is changed there. Raises Damaged.
+    path : a bag with `unclosed` files, which stays as it is. Raises Damaged.
     """
     whole = folder / path.name
     if path.is_dir():
@@ -46,14 +47,15 @@ def closed(path: Path, folder: Path) -> Path:
 
 
 def _left(file: Path) -> list[Path]:
-    """Logs and journals beside a file that are not empty."""
+    """Return the logs and journals beside a file that are not empty."""
     beside = (file.with_name(file.name + end) for end in (LOG, JOURNAL))
     return [one for one in beside if one.is_file() and one.stat().st_size]
 
 
 def _merge(file: Path) -> None:
-    """Have SQLite put the log of a file into it, as far as it is sound, and undo what was not
-    finished. Raises Damaged.
+    """Merge the sound part of the log into the file, and undo an unfinished transaction.
+
+    Raises Damaged.
     """
     size = sum(one.stat().st_size for one in (file, *_left(file)))
     try:

@@ -23,10 +23,10 @@ MSGTYPE = "nav_msgs/msg/Odometry"
 
 @contextmanager
 def recorded_odometry(node: Node, path: str | Path, topic: str = "/odometry") -> Iterator[None]:
-    """Record a topic while the block lasts and somebody serves the node.
+    """Record a topic of odometry while the block lasts. The caller must spin the node.
 
     The bag appears at `path` when the block ends without an exception. Raises InputError if
-    something is there.
+    a file is there.
     """
     with new_bag(path) as writer:
         connection = writer.add_connection(topic, MSGTYPE, typestore=typestore())
@@ -37,7 +37,7 @@ def recorded_odometry(node: Node, path: str | Path, topic: str = "/odometry") ->
         qos = QoSProfile(depth=READER_DEPTH, reliability=ReliabilityPolicy.RELIABLE)
         subscription = node.create_subscription(Odometry, topic, write, qos, raw=True)
         yield
-        with subscription.handle:  # what has arrived, and was not served yet
+        with subscription.handle:  # messages that arrived after the last spin
             while (message := subscription.handle.take_message(Odometry, True)) is not None:
                 write(*message)
         node.destroy_subscription(subscription)
