@@ -5,16 +5,9 @@ import pytest
 rclpy = pytest.importorskip("rclpy")
 
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy  # noqa: E402
-from rosbags.interfaces import (  # noqa: E402
-    Qos,
-    QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
-)
+from rosbags.interfaces import QosDurability, QosHistory, QosLiveliness, QosReliability  # noqa: E402
 
-from uwb_tdoa_tools.live.session import message_class, publisher_qos, subscription_qos  # noqa: E402
+from uwb_tdoa_tools.live.session import message_class, publisher_qos, recorded_qos, subscription_qos  # noqa: E402
 
 RELIABLE, BEST_EFFORT = ReliabilityPolicy.RELIABLE, ReliabilityPolicy.BEST_EFFORT
 LATCHED, VOLATILE = DurabilityPolicy.TRANSIENT_LOCAL, DurabilityPolicy.VOLATILE
@@ -24,23 +17,21 @@ def qos(reliability=RELIABLE, durability=VOLATILE, depth=5):
     return QoSProfile(depth=depth, reliability=reliability, durability=durability)
 
 
-def recorded_qos(qos):
-    """The rosbags Qos of a publisher's QoSProfile. (Both number the policies as rmw does.)"""
-
-    def time(duration):
-        return QosTime(*divmod(duration.nanoseconds, 10**9))
-
-    return Qos(
-        QosHistory(int(qos.history)),
-        qos.depth,
-        QosReliability(int(qos.reliability)),
-        QosDurability(int(qos.durability)),
-        time(qos.deadline),
-        time(qos.lifespan),
-        QosLiveliness(int(qos.liveliness)),
-        time(qos.liveliness_lease_duration),
-        qos.avoid_ros_namespace_conventions,
-    )
+@pytest.mark.parametrize(
+    "profile, expected",
+    [
+        (qos(), (QosReliability.RELIABLE, QosDurability.VOLATILE, 5)),
+        (
+            qos(BEST_EFFORT, LATCHED, 7),
+            (QosReliability.BEST_EFFORT, QosDurability.TRANSIENT_LOCAL, 7),
+        ),
+    ],
+)
+def test_recorded_qos_says_the_same(profile, expected):
+    recorded = recorded_qos(profile)
+    assert (recorded.reliability, recorded.durability, recorded.depth) == expected
+    assert recorded.history == QosHistory.KEEP_LAST
+    assert recorded.liveliness in (QosLiveliness.SYSTEM_DEFAULT, QosLiveliness.AUTOMATIC)
 
 
 def test_numbers_of_the_policies_are_those_of_rosbags():

@@ -18,6 +18,10 @@ from rclpy.signals import SignalHandlerOptions
 from rosbags.interfaces import (
     Qos,
     QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
 )
 
 from uwb_tdoa_bias.foundation.errors import InputError
@@ -25,6 +29,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
+    from rclpy.duration import Duration
     from rclpy.node import Node
     from rclpy.task import Future
 
@@ -152,4 +157,23 @@ def subscription_qos(offered: Sequence[QoSProfile]) -> QoSProfile:
         depth=READER_DEPTH,
         reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+def recorded_qos(qos: QoSProfile) -> Qos:
+    """The rosbags Qos of a publisher's QoSProfile. (Both number the policies as rmw does.)"""
+
+    def time(duration: Duration) -> QosTime:
+        return QosTime(*divmod(duration.nanoseconds, 10**9))
+
+    return Qos(
+        QosHistory(int(qos.history)),
+        qos.depth,
+        QosReliability(int(qos.reliability)),
+        QosDurability(int(qos.durability)),
+        time(qos.deadline),
+        time(qos.lifespan),
+        QosLiveliness(int(qos.liveliness)),
+        time(qos.liveliness_lease_duration),
+        qos.avoid_ros_namespace_conventions,
     )
