@@ -11,7 +11,7 @@ pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from rig import make_rig  # noqa: E402, F401
-from stream_faults import PUBLISHERS, lanes_of, process_of, publish_twice  # noqa: E402
+from stream_faults import PUBLISHERS, lanes_of, play, process_of, publish_twice  # noqa: E402
 
 
 def values_of(status):
@@ -20,6 +20,7 @@ def values_of(status):
 
 def test_publishers_and_lost_messages_are_named(make_rig):
     (lane,) = lanes_of(make_rig, 1)
+    play([lane], [[[(0.0, 2.0, ())]]])  # a loss shows between messages that arrive
     for name, topic in PUBLISHERS.items():
         publisher = publish_twice(lane, name)
         both = f"2 publish on {topic} \\(.*rig"
