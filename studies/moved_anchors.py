@@ -26,7 +26,7 @@ from uwb_tdoa_tools.outputs import OutputFile
 from uwb_tdoa_tools.parallel import whole_number
 from uwb_tdoa_tools.scoring.metrics import position_errors
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.simulation.trajectories import Trajectory
+from uwb_tdoa_tools.simulation.vehicles import Trajectory
 
 KINDS = "moved before", "moved on the way", "exchanged before", "exchanged on the way", "nothing"
 MOVED = 0.3, 1.0  # m

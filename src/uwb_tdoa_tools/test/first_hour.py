@@ -19,7 +19,7 @@ from uwb_tdoa_bias.foundation.flight import Flight
 from uwb_tdoa_bias.foundation.survey import read_survey
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools import command_lines
-from uwb_tdoa_tools.calibrating.parts import between
+from uwb_tdoa_tools.calibrating import between
 from uwb_tdoa_tools.estimate import FlightEstimator
 from uwb_tdoa_tools.readers.inputs import Reading
 from uwb_tdoa_tools.scoring.alignment import moved_frame

@@ -13,7 +13,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.scoring.alignment import alignment_of, moved_frame, need_truth, rigid
-from uwb_tdoa_tools.scoring.settling import on_one_clock, settled
+from uwb_tdoa_tools.scoring.evaluation import on_one_clock, settled
 
 EPOCH = 1.7e9 - 12.3
 TURN = Rotation.from_euler("z", 8.0, degrees=True).as_matrix()

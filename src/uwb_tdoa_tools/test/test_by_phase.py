@@ -4,10 +4,10 @@ from hand_made import flown, truth_of
 import numpy as np
 import pytest
 
-from uwb_tdoa_tools.evaluating.table import lines_of_phases, markdown_of
-from uwb_tdoa_tools.scoring.by_phase import PooledErrors
-from uwb_tdoa_tools.scoring.metrics import Pool, Score
+from uwb_tdoa_tools.evaluating import lines_of_phases, markdown_of
+from uwb_tdoa_tools.scoring.metrics import Score
 from uwb_tdoa_tools.scoring.phases import phases
+from uwb_tdoa_tools.scoring.pooling import Pool, PooledErrors
 
 STD = 0.5
 

@@ -11,11 +11,9 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_ekf.offline import without_offset
 from uwb_tdoa_ekf.streams import ERROR, Finding
+from uwb_tdoa_tools import calibrating as library
 from uwb_tdoa_tools.bags.bag import write_bag
-from uwb_tdoa_tools.calibrating import calibrate as library
-from uwb_tdoa_tools.calibrating.calibrate import Calibration, without_truth
-from uwb_tdoa_tools.calibrating.parts import between, split
-from uwb_tdoa_tools.calibrating.quick import prospect
+from uwb_tdoa_tools.calibrating import Calibration, between, prospect, split, without_truth
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.commands import calibrate
 from uwb_tdoa_tools.estimate import FlightEstimator

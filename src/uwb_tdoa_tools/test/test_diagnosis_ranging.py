@@ -13,7 +13,7 @@ from uwb_tdoa_tools.diagnosis.channels import residuals
 from uwb_tdoa_tools.diagnosis.diagnose import diagnose
 from uwb_tdoa_tools.diagnosis.references import GroundTruth, Nothing
 from uwb_tdoa_tools.diagnosis.report.page import html
-from uwb_tdoa_tools.scoring.settling import settled
+from uwb_tdoa_tools.scoring.evaluation import settled
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 DELAY, MOVED = (

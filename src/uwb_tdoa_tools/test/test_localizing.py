@@ -13,7 +13,7 @@ from uwb_tdoa_ekf.results import Odometry, Residuals
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag
 from uwb_tdoa_tools.commands import evaluate, localize
 from uwb_tdoa_tools.estimate import FlightEstimator
-from uwb_tdoa_tools.localizing import belief, residuals, zones
+from uwb_tdoa_tools.localizing import belief, residuals
 from uwb_tdoa_tools.localizing.localize import check_names, name_of
 from uwb_tdoa_tools.readers.inputs import Reading, find_flights
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
@@ -333,7 +333,7 @@ def walked(n=600):
 
 
 def test_zones_say_who_is_heard_where_and_how_well():
-    found = zones.zones_of(*walked(), 10.0)
+    found = residuals.zones_of(*walked(), 10.0)
     assert [(zone.x, zone.y) for zone in found[:4]] == [
         (5.0, 5.0),
         (15.0, 5.0),
@@ -353,7 +353,7 @@ def test_zones_say_who_is_heard_where_and_how_well():
         )
     assert found[3].used == pytest.approx(0.5, abs=0.05)
     assert (
-        zones.zones_of(
+        residuals.zones_of(
             *(part for part in (walked()[0], Residuals(*(np.empty(0) for _ in range(7))))), 10.0
         )
         == []
@@ -364,9 +364,9 @@ def test_zones_are_written_as_a_table_and_a_map(bags, tmp_path, capsys):
     run([bags / "none" / "flight.bag", "--zones", "2", "--out", tmp_path])
     lines = (tmp_path / "flight_zones.csv").read_text().splitlines()
     assert (
-        lines[0] == ",".join(zones.COLUMNS)
+        lines[0] == ",".join(residuals.ZONE_COLUMNS)
         and len(lines) > 3
-        and all(len(line.split(",")) == len(zones.COLUMNS) for line in lines)
+        and all(len(line.split(",")) == len(residuals.ZONE_COLUMNS) for line in lines)
     )
     assert (tmp_path / "flight_zones.png").stat().st_size > 10_000
     run([bags / "none" / "flight.bag", "--zones", "0", "--out", tmp_path], 2)

@@ -6,10 +6,8 @@ import pytest
 
 from uwb_tdoa_bias.foundation.flight import Truth
 from uwb_tdoa_ekf.core.verdicts import INVALID, LATE, REJECTED, STARTUP, USED
-from uwb_tdoa_tools.evaluating.table import line
+from uwb_tdoa_tools.evaluating import line_of_run
 from uwb_tdoa_tools.scoring.metrics import (
-    Pool,
-    Result,
     Score,
     coverage,
     judged_part,
@@ -19,6 +17,7 @@ from uwb_tdoa_tools.scoring.metrics import (
     position_errors,
     summary,
 )
+from uwb_tdoa_tools.scoring.pooling import Pool, Result
 
 UPRIGHT = [0.0, 0.0, 0.0, 1.0]
 
@@ -130,13 +129,15 @@ def test_a_late_start_is_told_and_too_late_is_a_diverged_run(begin, diverged):
     row = Score("flight", estimate(truth, constant(0.0, 0.0, 0.0), low=begin), truth).row()
     assert row["start_delay"] == pytest.approx(max(0.0, begin - 1.0), abs=0.011)
     assert row["diverged"] is row["late_start"] is diverged
-    assert line(row).endswith("LATE START") is diverged and "DIVERGED" not in line(row)
+    assert line_of_run(row).endswith("LATE START") is diverged and "DIVERGED" not in line_of_run(
+        row
+    )
 
 
 def test_a_late_start_does_not_hide_what_else_is_wrong():
     truth = straight()
     row = Score("flight", estimate(truth, constant(2.0, 0.0, 0.0), low=2.1), truth).row()
-    assert row["diverged"] and not row["late_start"] and line(row).endswith("DIVERGED")
+    assert row["diverged"] and not row["late_start"] and line_of_run(row).endswith("DIVERGED")
 
 
 def test_an_estimate_that_ends_in_mid_flight_has_diverged():

@@ -22,7 +22,7 @@ from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
 from uwb_tdoa_tools.estimate import FlightEstimator
 from uwb_tdoa_tools.localizing.belief import GOOD, believe
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.simulation.trajectories import Trajectory
+from uwb_tdoa_tools.simulation.vehicles import Trajectory
 from uwb_tdoa_tools.surveying.report import as_text
 
 SHIFT, ROW = np.array([0.4, -0.3, 0.3]), 3

@@ -8,7 +8,7 @@ import pytest
 
 from uwb_tdoa_bias.effects import Track, aid_samples
 from uwb_tdoa_bias.foundation.sensors import Height
-from uwb_tdoa_tools.readers.optical_flow import COUNTS, NEAREST_RANGE, velocity_of
+from uwb_tdoa_tools.readers.streams import FLOW_COUNTS, FLOW_NEAREST_RANGE, flow_velocity
 from uwb_tdoa_tools.scoring.metrics import judged_part
 
 
@@ -32,11 +32,11 @@ def pixel_counts(flight):
     )
     below = np.stack([0.0 * t, 0.0 * t, -depth], axis=1)
     passing = -(v + np.cross(omega, below))[:, :2] / depth[:, None]  # rad/s, of the ground
-    return t, COUNTS * passing[:, 1], COUNTS * passing[:, 0]
+    return t, FLOW_COUNTS * passing[:, 1], FLOW_COUNTS * passing[:, 0]
 
 
 def test_pixel_counts_become_the_velocity_that_made_them(flight):
-    made = velocity_of(*pixel_counts(flight), flight.height, flight.imu)
+    made = flow_velocity(*pixel_counts(flight), flight.height, flight.imu)
     _, first, last = judged_part(flight.truth)
     air = (made.t > first + 0.5) & (made.t < last - 0.5)
     true = aid_samples("velocity", made.t[air], Track(flight.truth)).reading
@@ -56,9 +56,9 @@ def test_no_velocity_where_no_range_or_gyroscope_is_near(flight):
     imu = replace(
         flight.imu, t=flight.imu.t[cut], gyro=flight.imu.gyro[cut], accel=flight.imu.accel[cut]
     )
-    made = velocity_of(t, x, y, height, imu)
-    missing = (made.t > begin + NEAREST_RANGE + 0.05) & (
-        made.t < begin + 5.0 - NEAREST_RANGE - 0.05
+    made = flow_velocity(t, x, y, height, imu)
+    missing = (made.t > begin + FLOW_NEAREST_RANGE + 0.05) & (
+        made.t < begin + 5.0 - FLOW_NEAREST_RANGE - 0.05
     )
     assert not missing.any() and made.t[-1] < begin + 20.0
     assert ((made.t > begin + 5.0) & (made.t < begin + 10.0)).sum() == pytest.approx(125, abs=3)

@@ -15,9 +15,8 @@ from uwb_tdoa_tools.planning.judging import IMPRECISE, Demand
 from uwb_tdoa_tools.planning.maps import Grid, chart
 from uwb_tdoa_tools.planning.optimisation import one_more
 from uwb_tdoa_tools.planning.places import AnchorPlaces, lattice
-from uwb_tdoa_tools.scoring.labels import put_labels
-from uwb_tdoa_tools.scoring.plots import plt
-from uwb_tdoa_tools.simulation.constellations import corners
+from uwb_tdoa_tools.scoring.plots import plt, put_labels
+from uwb_tdoa_tools.simulation.rooms import corners
 
 FLOWN = lattice((-1, -1, 0.5), (1, 1, 2), 1.0)
 

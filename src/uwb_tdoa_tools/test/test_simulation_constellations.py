@@ -3,8 +3,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_tools.simulation.constellations import CONSTELLATIONS, constellation, facing
-from uwb_tdoa_tools.simulation.room import room_of
+from uwb_tdoa_tools.simulation.rooms import CONSTELLATIONS, constellation, facing, room_of
 
 NAMES = [*CONSTELLATIONS, "random-5", "random-1-4", "random-2-64"]
 

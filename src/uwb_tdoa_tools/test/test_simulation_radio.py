@@ -11,8 +11,8 @@ from uwb_tdoa_bias.foundation.radio import (
     power_bias,
     received_power_dbm,
 )
-from uwb_tdoa_tools.simulation.constellations import pair
-from uwb_tdoa_tools.simulation.ranging import tag_link
+from uwb_tdoa_tools.simulation.rooms import pair
+from uwb_tdoa_tools.simulation.tdoas import tag_link
 
 ISOTROPIC = Antenna((0.0,) * 4, (0.0,) * 4, (0.0,) * 4)
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])

@@ -5,8 +5,7 @@ from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_bias.foundation.radio import arrival_bias
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.simulation.ranging import floor_multipath, outliers, tdoa_noise
-from uwb_tdoa_tools.simulation.schedule import make_schedule
+from uwb_tdoa_tools.simulation.tdoas import floor_multipath, make_schedule, outliers, tdoa_noise
 
 CLEAN = {"noise_std": 0.0, "bias": False, "multipath": False, "outlier_probability": 0.0}
 LEVER = np.array([-0.012, 0.001, 0.091])

@@ -3,8 +3,9 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from uwb_tdoa_tools.simulation.schedule import PROTOCOLS, among_heard, make_schedule
-from uwb_tdoa_tools.simulation.walls import heard_at
+from uwb_tdoa_tools.simulation.config import PROTOCOLS
+from uwb_tdoa_tools.simulation.rooms import heard_at
+from uwb_tdoa_tools.simulation.tdoas import among_heard, make_schedule
 
 
 def schedule(protocol, n_anchors=8, duration=60.0, seed=0):

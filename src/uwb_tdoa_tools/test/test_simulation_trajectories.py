@@ -6,7 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.simulation import SimulationConfig
-from uwb_tdoa_tools.simulation.trajectories import GRAVITY, TRAJECTORIES, Trajectory
+from uwb_tdoa_tools.simulation.paths import TRAJECTORIES
+from uwb_tdoa_tools.simulation.vehicles import GRAVITY, Trajectory
 
 CONFIG = SimulationConfig(duration=40.0, speed=1.2)
 YAWS = {"circle": "along_track", "sines": "along_track", "square": "rotating"}

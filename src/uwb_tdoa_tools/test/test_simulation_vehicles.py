@@ -14,8 +14,8 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.commands import simulate as command
 from uwb_tdoa_tools.simulation import NO_IMU_ERRORS, SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.config import OF_VEHICLE
-from uwb_tdoa_tools.simulation.trajectories import GRAVITY, TRAJECTORIES
-from uwb_tdoa_tools.simulation.vehicles import VEHICLES
+from uwb_tdoa_tools.simulation.paths import TRAJECTORIES
+from uwb_tdoa_tools.simulation.vehicles import GRAVITY, VEHICLES
 
 ON_FOOT_OR_WHEELS = [name for name in OF_VEHICLE if name != "quadrotor"]
 SQUARE = ((-2.0, -1.5), (2.0, -1.5), (2.0, 1.5), (-2.0, 1.5))

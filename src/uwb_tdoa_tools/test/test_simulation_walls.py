@@ -7,7 +7,7 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.simulation.walls import Walls, heard_at
+from uwb_tdoa_tools.simulation.rooms import Walls, heard_at
 
 ACROSS = Walls(((4.0, -10.0, 4.0, 2.0, np.inf),))
 SHELF = Walls(((4.0, -10.0, 4.0, 20.0, 3.0),))
@@ -56,7 +56,7 @@ def test_a_wall_stands_between(walls, p, q, blocked):
 
 
 def test_nothing_is_heard_through_a_wall(monkeypatch):
-    monkeypatch.setattr("uwb_tdoa_tools.simulation.walls.AT_ONCE", 100)
+    monkeypatch.setattr("uwb_tdoa_tools.simulation.rooms.AT_ONCE", 100)
     anchors, walls = hall(), Walls(((15.0, -1.0, 15.0, 20.0, np.inf),))
     p = np.random.default_rng(0).uniform((0.0, 0.0, 0.0), (28.0, 14.0, 3.0), (50, 3))
     far = np.linalg.norm(p[:, None] - anchors.positions, axis=2) > 12.0

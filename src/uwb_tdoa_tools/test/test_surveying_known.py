@@ -17,10 +17,8 @@ from uwb_tdoa_tools.commands.survey import main
 from uwb_tdoa_tools.diagnosis.constraints import Distance, Mark
 from uwb_tdoa_tools.diagnosis.references import OdometryPath, OdometryReference
 from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
-from uwb_tdoa_tools.surveying.blocked import large, with_blocked
-from uwb_tdoa_tools.surveying.distances import read_distances
-from uwb_tdoa_tools.surveying.paths import read_paths
-from uwb_tdoa_tools.surveying.report import as_text
+from uwb_tdoa_tools.surveying.known import read_distances, read_paths
+from uwb_tdoa_tools.surveying.report import as_text, large, with_blocked
 
 LATE = EFFECTS["anchor_delay"]({"3": 0.15})
 

@@ -1,6 +1,6 @@
 import numpy as np
 
-from uwb_tdoa_tools.scoring.tum import write_tum
+from uwb_tdoa_tools.localizing.localize import write_tum
 
 
 def test_one_line_per_pose(tmp_path):

@@ -43,10 +43,10 @@ from uwb_tdoa_bias.foundation.survey_faults import refuse_faulty
 from uwb_tdoa_bias.foundation.version import written_by
 
 from ..clock import sentences, straightened
+from . import frames
 from . import messages as bag_messages
-from . import placing
-from .anchor_sources import recorded_anchors
 from .files import check_output, connections_of, new_bag, open_bag, readable, remarks_of
+from .frames import recorded_anchors
 from .integrity import metadata
 from .mcap import Damaged
 from .message_types import typestore
@@ -369,16 +369,16 @@ def read_bag(
             anchors = refuse_faulty(recorded.anchors, f"{path}: {recorded.source}")
             remarks += recorded.remarks(name_of("uwb/anchors"))
         imu = stream("imu")
-        tree = placing.read_frames(path, reader)
+        tree = frames.read_frames(path, reader)
         places = {
-            kinds[name].topic: placing.placed(tree, kinds[name].topic, found[name].frames)
+            kinds[name].topic: frames.placed(tree, kinds[name].topic, found[name].frames)
             for name in ("imu", "tdoa")
         }
         remarks += [remark for _, remark in places.values() if remark]
         remarks = [*remarks_of(reader), *remarks]
         poses = stream("pose")
     if imu is not None and (place := places["imu/data"][0]):
-        imu = placing.imu_in_body(imu, place)
+        imu = frames.imu_in_body(imu, place)
     if place := places["uwb/tdoa"][0]:
         meta["antenna"] = place[1].tolist()
     if remarks:

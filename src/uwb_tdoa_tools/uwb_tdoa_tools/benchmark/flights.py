@@ -10,7 +10,7 @@ import numpy as np
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_ekf.results import rows_of
 
-from ..calibrating.parts import between
+from ..calibrating import between
 from ..simulation import SimulationConfig, simulate
 
 if TYPE_CHECKING:

@@ -16,7 +16,7 @@ from ..outputs import OutputBag
 from ..progress import Progress
 from ..readers import columns
 from ..readers.names import read_named
-from ..scoring.settling import on_one_clock
+from ..scoring.evaluation import on_one_clock
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace

@@ -17,11 +17,11 @@ from ..diagnosis import diagnose, output
 from ..diagnosis.noise import write_parameters
 from ..diagnosis.references import REFERENCES
 from ..diagnosis.self_calibration.equations import measured_noise
-from ..localizing.rerun_file import write_diagnosis
+from ..localizing.pictures import write_diagnosis
 from ..outputs import OutputFolder
 from ..progress import Progress
 from ..readers import inputs
-from ..surveying.paths import DRIFT, read_paths
+from ..surveying.known import DRIFT, read_paths
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace

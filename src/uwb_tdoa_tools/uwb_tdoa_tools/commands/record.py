@@ -73,7 +73,7 @@ def _record(args: Namespace) -> int:
     if recorded.error is not None:
         raise recorded.error
     if rerun:
-        from ..localizing.rerun_file import write_recorded
+        from ..localizing.pictures import write_recorded
 
         write_recorded(rerun, args.output)
     if recorded.missing:

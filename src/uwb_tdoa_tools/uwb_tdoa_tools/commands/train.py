@@ -12,7 +12,7 @@ from ..outputs import OutputFile, OutputFolder
 from ..progress import Progress
 from ..readers import inputs
 from ..results_file import ResultsFile, asked_of, resumed, state_of
-from ..scoring.settling import with_settled_truth
+from ..scoring.evaluation import with_settled_truth
 from ..training import labels as labelling
 from ..training import models, shrinking
 

@@ -13,9 +13,8 @@ from uwb_tdoa_ekf.results import Odometry
 
 from ..readers.inputs import Reading
 from ..scoring.alignment import NONE
-from ..scoring.evaluation import corrected_truth, evaluate
+from ..scoring.evaluation import corrected_truth, evaluate, with_settled_truth
 from ..scoring.metrics import Score
-from ..scoring.settling import with_settled_truth
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator

@@ -1,4 +1,4 @@
-"""Recordings to trajectories, one by one."""
+"""Recordings to trajectories, one by one, and the files of a trajectory."""
 
 from __future__ import annotations
 
@@ -6,18 +6,70 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.files import write_filled
+from uwb_tdoa_ekf.frames import rotation_std
+from uwb_tdoa_ekf.results import Odometry
 
 from .. import command_lines
 from ..bags.bag import write_odometry
 from ..estimate import FlightEstimator
 from ..readers.inputs import Reading
-from ..scoring.tum import write_tum
-from . import files, pictures, rerun_file, residuals, zones
+from . import pictures, residuals
 from .belief import GOOD, Belief, believe
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
+
+
+COLUMNS = (
+    "t",
+    "x",
+    "y",
+    "z",
+    "qx",
+    "qy",
+    "qz",
+    "qw",
+    "vx",
+    "vy",
+    "vz",
+    "std_x",
+    "std_y",
+    "std_z",
+    "std_vx",
+    "std_vy",
+    "std_vz",
+    "std_yaw",
+)
+
+
+def write_trajectory(path: Path, odometry: Odometry) -> None:
+    """Write an Odometry as CSV, a line for each estimate: s, m, quaternion from body to world, m/s,
+    and standard deviations, m, m/s and rad, all in the world frame.
+    """
+    std = np.sqrt(np.einsum("nii->ni", odometry.covariance))
+    yaw = rotation_std(odometry.q, odometry.covariance)[:, 2]
+    rows = np.column_stack([odometry.t, odometry.p, odometry.q, odometry.v, std[:, :6], yaw])
+    kinds = ["%.9f"] + ["%.6f"] * (len(COLUMNS) - 1)
+    write_filled(
+        path,
+        lambda file: np.savetxt(
+            file, rows, fmt=kinds, delimiter=",", header=",".join(COLUMNS), comments=""
+        ),
+    )
+
+
+def write_tum(path: str | Path, t: np.ndarray, p: np.ndarray, q: np.ndarray) -> None:
+    """Write t (n,) s, p (n, 3) m, q (n, 4) x y z w; an unknown attitude becomes the identity."""
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    q = np.where(np.isfinite(q), q, [0.0, 0.0, 0.0, 1.0])
+    write_filled(
+        path, lambda file: np.savetxt(file, np.column_stack([t, p, q]), fmt=["%.9f"] + ["%.6f"] * 7)
+    )
+
 
 SUFFIXES = ".gz", ".csv", ".bag", ".mcap", ".db3", ".log"
 
@@ -79,17 +131,17 @@ class Localizer:
 
         odometry, left = run.odometry, residuals.of_run(flight, run)
         write_tum(path(".tum"), odometry.t, odometry.p, odometry.q)
-        files.write_csv(path(".csv"), odometry)
+        write_trajectory(path(".csv"), odometry)
         title = f"{name}: {belief.sentences()[0].partition(';')[0]}"
         pictures.draw(path(".png"), odometry, flight.anchors, belief.lost, title)
         if self.bag and len(odometry):
             write_odometry(odometry, flight.anchors, path(".bag"), force=True)
         if self.left:
-            residuals.write_csv(path("_residuals.csv"), left)
-            residuals.picture(path("_residuals.png"), left, name)
-        if self.zones is not None and (found := zones.zones_of(odometry, left, self.zones)):
-            zones.write_csv(path("_zones.csv"), found)
-            zones.draw(
+            residuals.write_residuals(path("_residuals.csv"), left)
+            residuals.draw_residuals(path("_residuals.png"), left, name)
+        if self.zones is not None and (found := residuals.zones_of(odometry, left, self.zones)):
+            residuals.write_zones(path("_zones.csv"), found)
+            residuals.draw_zones(
                 path("_zones.png"),
                 found,
                 flight.anchors,
@@ -97,7 +149,7 @@ class Localizer:
                 f"{name}: squares of {self.zones:g} m",
             )
         if self.rerun is not None:
-            rerun_file.write_rerun(self.rerun, flight, odometry, left, belief.sentences())
+            pictures.write_rerun(self.rerun, flight, odometry, left, belief.sentences())
             written.append(self.rerun)
         return Located(name, belief, tuple(file for file in written if file.exists()))
 

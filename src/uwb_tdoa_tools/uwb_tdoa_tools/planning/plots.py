@@ -18,8 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.files import write_filled
 
-from ..scoring.labels import put_labels
-from ..scoring.plots import plt
+from ..scoring.plots import plt, put_labels
 from .bifurcation import Subsets
 from .judging import FLYABLE, IMPRECISE, OUTSIDE, TOO_FEW, TWO_SOLUTIONS
 from .precision import ellipses
@@ -33,7 +32,7 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.foundation.anchors import Anchors
 
-    from ..simulation.walls import Walls
+    from ..simulation.rooms import Walls
     from .accuracy import AccuracyMap
     from .installation import Installation
     from .maps import Chart, Grid

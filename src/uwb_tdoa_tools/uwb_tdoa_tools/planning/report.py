@@ -14,7 +14,7 @@ from .precision import NORMAL_99, dilution
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ..simulation.room import Room
+    from ..simulation.rooms import Room
     from .installation import Installation
     from .maps import Chart
 

@@ -19,7 +19,7 @@ from uwb_tdoa_bias.foundation.limits import FOLDER_DEPTH, FOLDER_ENTRIES, Budget
 from uwb_tdoa_bias.foundation.sensors import LOCATING
 
 from .. import parallel
-from ..bags.kind import is_bag
+from ..bags import is_bag
 from ..bags.write_ahead import BESIDE
 from ..clock import apart, sentence_on
 from . import read_flight

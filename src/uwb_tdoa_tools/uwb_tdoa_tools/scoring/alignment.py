@@ -24,7 +24,8 @@ from ..checking.imu_rules import ARRANGEMENTS, signed_axis
 from ..checking.known_path import KnownPath
 from ..checking.motion_rules import FEWEST, TrueMotion
 from ..clock import grid
-from .metrics import ALIGN, judged_part, position_at
+from .metrics import judged_part, position_at
+from .pooling import ALIGN
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from dataclasses import dataclass, field
 from functools import cached_property
 import math
 from typing import TYPE_CHECKING, Any, Protocol
@@ -14,18 +12,22 @@ from uwb_tdoa_bias.effects.samples import PoseColumns
 from uwb_tdoa_ekf.core.verdicts import COMPENSATED, REJECTED, USED
 from uwb_tdoa_ekf.results import rows_of
 
-from ..json_values import as_json
-from .by_phase import EVERYTHING, ErrorSeries, PooledErrors, or_nan, rms
-from .distribution import Distribution
-from .phases import TITLES, in_the_air, motion, phases
+from .phases import in_the_air, motion, phases
+from .pooling import Distribution, Pool, Result, coverage_figures
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable, Sequence
 
     from uwb_tdoa_bias.foundation.flight import Truth
     from uwb_tdoa_ekf.results import Residuals
 
-    from .by_phase import Spans
+    Spans = Sequence[tuple[float, float]]  # from when to when, s
+
+
+VALID_FOR = (
+    0.1  # s, and SPARSE times the usual interval of the odometry, that an estimate stands for
+)
+EVERYTHING = ((-math.inf, math.inf),)  # spans, s
 
 
 class Estimate(PoseColumns, Protocol):
@@ -37,15 +39,23 @@ class Estimate(PoseColumns, Protocol):
     def covariance(self) -> np.ndarray: ...
 
 
-ALIGN = "none", "time", "frame"  # what of a ground truth is moved before it judges
 LOST = 1.0  # m; a larger error is no estimate
 LOST_SHARE = 0.25  # of the airborne time; more is a diverged run
 # s without a true pose, and SPARSE times their usual interval, over which none is interpolated
 HOLE = 0.5
 SPARSE = 4.0
 START_GRACE = 1.0  # s into the airborne part by which the first estimate must have come
-FIGURES = 3  # version of what a Result holds
 READY = 100  # TDOAs that a filter may take to begin with
+
+
+def rms(values: np.ndarray) -> float:
+    """Root mean square; NaN of nothing."""
+    return or_nan(lambda v: np.sqrt(np.mean(v**2)), values)
+
+
+def or_nan(function: Callable[[np.ndarray], float], values: np.ndarray) -> float:
+    """function(values); NaN of nothing."""
+    return float(function(values)) if len(values) else math.nan
 
 
 def judged_part(truth: Truth) -> tuple[str, float, float]:
@@ -168,6 +178,72 @@ def coverage(error: np.ndarray, covariance: np.ndarray, sigmas: float = 3.0) -> 
     return np.mean(np.abs(error) <= sigmas * std, axis=0) if len(error) else np.full(3, np.nan)
 
 
+class ErrorSeries:
+    """Errors of an odometry wherever there is ground truth. t (n,) s; error (n, 3) m; nees (n,);
+    covariance (n, 3, 3) m^2; step (n,) m, by how much the error differs from that of the estimate
+    before, 0 for the first; known : [(begin, end)], s, with ground truth;
+    covered : [(begin, end)], s, for which there is an estimate.
+    """
+
+    def __init__(
+        self,
+        t: np.ndarray,
+        error: np.ndarray,
+        covariance: np.ndarray,
+        normalised: np.ndarray,
+        stamps: np.ndarray,
+        known: np.ndarray,
+    ) -> None:
+        """stamps (m,) : of the odometry, s, including those that cannot be judged."""
+        self.t, self.error, self.covariance, self.nees, self.known = (
+            t,
+            error,
+            covariance,
+            normalised,
+            known,
+        )
+        self.step = np.linalg.norm(np.diff(error, axis=0, prepend=error[:1]), axis=1)
+        usual = np.median(np.diff(stamps)) if len(stamps) > 1 else 0.0
+        ends = stamps + max(VALID_FOR, SPARSE * usual)
+        self.covered = np.column_stack([stamps, np.minimum(ends, np.append(stamps[1:], np.inf))])
+
+    def figures(self, begin: float, end: float, spans: Spans = EVERYTHING) -> dict[str, Any]:
+        """A dict of one phase, from `begin` to `end`, s; what is not in `spans`, ((first, last),
+        ...) s, does not count.
+        """
+        parts = [(max(begin, first), min(end, last)) for first, last in spans]
+        parts = [(first, last) for first, last in parts if last > first]
+        chosen = (
+            np.any([(self.t >= first) & (self.t <= last) for first, last in parts], axis=0)
+            if parts
+            else np.zeros(len(self.t), bool)
+        )
+        error, duration = self.error[chosen], sum(last - first for first, last in parts)
+        distance = np.linalg.norm(error, axis=1)
+        out: dict[str, Any] = {"begin": begin, "duration": duration, "count": int(chosen.sum())}
+        out |= {f"rmse_{axis}": rms(error[:, k]) for k, axis in enumerate("xyz")}
+        out |= {"rmse_3d": rms(distance), "max_3d": or_nan(np.max, distance)}
+        out["std_3d"] = or_nan(
+            lambda P: np.sqrt(np.mean(np.einsum("nii->n", P))), self.covariance[chosen]
+        )
+        out["nees_mean"], out["step"] = (
+            or_nan(np.mean, self.nees[chosen]),
+            or_nan(np.max, self.step[chosen]),
+        )
+        for name, covered in (("without_estimate", self.covered), ("without_truth", self.known)):
+            out[name] = max(
+                0.0, duration - sum(_overlap(covered, first, last) for first, last in parts)
+            )
+        return out
+
+
+def _overlap(spans: np.ndarray, begin: float, end: float) -> float:
+    """s of spans (n, 2) that lie from `begin` to `end`."""
+    return float(
+        np.sum(np.maximum(0.0, np.minimum(spans[:, 1], end) - np.maximum(spans[:, 0], begin)))
+    )
+
+
 class Score:
     """Errors of one run against its ground truth.
 
@@ -239,7 +315,7 @@ class Score:
         out["diverged"], out["late_start"] = bool(lost or late), bool(late and not lost)
         out["start_delay"] = float(max(0.0, self.t[0] - self.first)) if len(self.t) else math.inf
         out["ready_delay"] = self._ready_delay()
-        return {**out, **_named(coverage(self.error, self.covariance))}
+        return {**out, **coverage_figures(coverage(self.error, self.covariance))}
 
     def _ready_delay(self) -> float:
         """s from the 100th TDOA to the first estimate; NaN where nobody knows the TDOAs, or there
@@ -263,7 +339,7 @@ class Score:
         if count:
             sums |= {
                 name: count * share
-                for name, share in _named(coverage(self.error, self.covariance)).items()
+                for name, share in coverage_figures(coverage(self.error, self.covariance)).items()
             }
         samples = {"distance": distance, "nees": self.nees, "nis": self.nis}
         return Result(
@@ -274,151 +350,9 @@ class Score:
         )
 
 
-@dataclass(frozen=True)
-class Result:
-    """What a run leaves for the figures of many, of a size that does not depend on its length. row
-    : Score.row; sums : {name: sum over its samples}; distributions : {quantity: Distribution};
-    phases : Score.phases; aligned : where its ground truth is beside the estimate, as of
-    `Alignment.as_dict`, and its 3D RMSE with each of ALIGN, m; {} where nobody looked.
-    """
-
-    row: dict[str, Any]
-    sums: dict[str, float]
-    distributions: dict[str, Distribution]
-    phases: dict[str, dict[str, Any]]
-    aligned: dict[str, Any] = field(default_factory=dict)
-
-    def as_dict(self) -> dict[str, Any]:
-        """For JSON, without loss."""
-        parts = {name: part.as_list() for name, part in self.distributions.items()}
-        of_phases = {name: _as_texts(figures) for name, figures in self.phases.items()}
-        return {
-            "row": _as_texts(self.row),
-            "sums": _as_texts(self.sums),
-            "distributions": parts,
-            "phases": of_phases,
-            "aligned": as_json(self.aligned),
-        }
-
-    @classmethod
-    def from_dict(cls, content: dict[str, Any]) -> Result:
-        """Of what `as_dict` gives."""
-        parts = {
-            name: Distribution.from_list(numbers)
-            for name, numbers in content["distributions"].items()
-        }
-        of_phases = {name: _from_texts(figures) for name, figures in content["phases"].items()}
-        return cls(
-            _from_texts(content["row"]),
-            _from_texts(content["sums"]),
-            parts,
-            of_phases,
-            content["aligned"],
-        )
-
-    def as_json(self) -> dict[str, Any]:
-        """All figures of the run, as JSON takes them."""
-        return as_json({**self.row, "phases": self.phases, "aligned": self.aligned})
-
-
-class Pool:
-    """The figures of all samples of several runs together, one run after the other."""
-
-    def __init__(self) -> None:
-        self._sums: dict[str, Any] = Counter()  # of numbers, not all of them whole
-        self._distributions: dict[str, Distribution] = {}
-        self._runs, self._total, self._largest = 0, 0.0, 0.0
-        self._row: dict[str, Any] = {"start_delay": 0.0, "diverged": 0, "late_start": 0}
-        self._ready = math.nan
-        self._phases: dict[str, PooledErrors] = {}
-        self._aligned: dict[str, Any] = Counter()
-
-    def add(self, result: Result) -> None:
-        """Count a Result."""
-        row, known = result.row, self._distributions
-        self._runs += 1
-        self._sums.update(result.sums)
-        self._distributions = {
-            name: known[name] + part if name in known else part
-            for name, part in result.distributions.items()
-        }
-        self._total, self._largest = (
-            self._total + row["rmse_3d"],
-            float(np.max([self._largest, row["rmse_3d"]])),
-        )
-        self._row["start_delay"] = max(self._row["start_delay"], row["start_delay"])
-        self._ready = float(
-            np.fmax(self._ready, row["ready_delay"])
-        )  # NaN of those that cannot tell
-        for key in ("diverged", "late_start"):
-            self._row[key] += row[key]
-
-        for how in ALIGN if result.aligned else ():
-            error = result.aligned[f"rmse_3d_{how}"]
-            self._aligned[how] += math.nan if error is None else error
-        for name, figures in result.phases.items():
-            self._phases.setdefault(name, PooledErrors()).add(figures)
-
-    @property
-    def aligned(self) -> dict[str, float]:
-        """{one of ALIGN: mean 3D RMSE of the runs, m, with that of their ground truth moved}; NaN
-        where it is of another clock.
-        """
-        return {how: total / self._runs for how, total in self._aligned.items()}
-
-    def phases(self) -> dict[str, dict[str, Any]]:
-        """{name of a phase: dict of `PooledErrors.figures`}, of those that any of the runs has."""
-        return {name: self._phases[name].figures() for name in TITLES if name in self._phases}
-
-    def figures(self) -> dict[str, Any]:
-        """A dict: those of `summary`, coverage, mean and largest of the runs' 3D RMSE, phases.
-        Medians are right to 1 %. Of one run at least.
-        """
-        distance, count = self._distributions["distance"], self._distributions["distance"].count
-        shares = {name: total / count if count else math.nan for name, total in self._sums.items()}
-        out: dict[str, Any] = {"flight": f"{self._runs} pooled"}
-        out |= {
-            f"rmse_{name}": math.sqrt(shares[f"square_{name}"]) for name in ("x", "y", "z", "3d")
-        }
-        out |= {"median_3d": distance.median, "max_3d": distance.largest if count else math.nan}
-        out["frac_gt_1m"] = shares["lost"] if count else 1.0
-        for name in ("nees", "nis"):
-            part = self._distributions[name]
-            out |= {f"{name}_mean": part.mean, f"{name}_median": part.median}
-        out |= (
-            {name: shares.get(name, math.nan) for name in _named(np.zeros(3))}
-            | self._row
-            | {"ready_delay": self._ready}
-        )
-        out["rmse_3d_mean_of_runs"], out["rmse_3d_max_of_runs"] = (
-            self._total / self._runs,
-            self._largest,
-        )
-        return {**out, "phases": self.phases()}
-
-
 def pooled(scores: Iterable[Score]) -> dict[str, Any]:
     """The figures of all samples of several Scores together, see Pool: a dict."""
     pool = Pool()
     for score in scores:
         pool.add(score.result())
     return pool.figures()
-
-
-def _as_texts(numbers: dict[str, Any]) -> dict[str, Any]:
-    """Floats as texts: JSON has no NaN."""
-    return {
-        key: repr(value) if isinstance(value, float) else value for key, value in numbers.items()
-    }
-
-
-def _from_texts(numbers: dict[str, Any]) -> dict[str, Any]:
-    """Of what `_as_texts` gives; those that were texts before stay."""
-    return {
-        key: float(value) if isinstance(value, str) and key not in ("flight", "part") else value
-        for key, value in numbers.items()
-    }
-
-
-def _named(shares: np.ndarray) -> dict[str, float]:
-    return {f"coverage_3sigma_{axis}": float(share) for axis, share in zip("xyz", shares)}

@@ -13,13 +13,12 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.flight import Flight, Truth
 
-from . import aids, imu, ranging
-from .config import SimulationConfig
-from .imu import NO_IMU_ERRORS, ImuErrors
+from . import sensors, tdoas
+from .config import NO_IMU_ERRORS, ImuErrors, SimulationConfig
 from .vehicles import VEHICLES
 
 if TYPE_CHECKING:
-    from .motion import Flyable
+    from .vehicles import Flyable
 
 __all__ = ["NO_IMU_ERRORS", "ImuErrors", "SimulationConfig", "simulate"]
 
@@ -44,10 +43,12 @@ def simulate(config: SimulationConfig, trajectory: Flyable | None = None) -> Fli
         filled, room, filled.random("trajectory")
     )
     t_imu = np.arange(1, int(filled.duration * filled.imu_rate) + 1) / filled.imu_rate
-    samples, gyro_bias, accel_bias = imu.measure(t_imu, flown, filled.imu_errors, filled.random)
+    samples, gyro_bias, accel_bias = sensors.measure_imu(
+        t_imu, flown, filled.imu_errors, filled.random
+    )
     t_truth = np.arange(1, int(filled.duration * filled.truth_rate) + 1) / filled.truth_rate
     motion = flown.motion(t_truth)
-    tdoa, tdoa_truth, parameters = ranging.measure(filled, room, flown)
+    tdoa, tdoa_truth, parameters = tdoas.measure_tdoas(filled, room, flown)
 
     newest = np.maximum(np.searchsorted(t_imu, t_truth + 1e-9) - 1, 0)
     state = {"t": t_truth}
@@ -74,4 +75,4 @@ def simulate(config: SimulationConfig, trajectory: Flyable | None = None) -> Fli
             "config": filled.as_dict(),
             "parameters": parameters,
         },
-    ).replaced(**aids.measure(filled, room, flown))
+    ).replaced(**sensors.measure_sensors(filled, room, flown))

@@ -1,4 +1,4 @@
-"""What a simulated flight is: one frozen dataclass."""
+"""What a simulated flight is: one frozen record."""
 
 from __future__ import annotations
 
@@ -12,20 +12,16 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.sensors import SENSORS
 
-from .constellations import constellation
-from .imu import ImuErrors
-from .room import room_of
-from .schedule import PROTOCOLS
-from .walls import Walls
+from .rooms import Walls, constellation, room_of
 
 if TYPE_CHECKING:
-    from .room import Room
+    from .rooms import Room
+
 
 MOST_HEARD = 64  # anchors that a tag hears at once
 YAW_PROFILES = ("fixed", "along_track", "rotating")
 WHEELS_RATE = 50.0  # Hz
 FARTHEST = 1e5  # m, of a point of a path
-
 OF_VEHICLE = MappingProxyType(
     {  # what the configuration of each is, unless it is given
         "quadrotor": {},
@@ -44,9 +40,49 @@ OF_VEHICLE = MappingProxyType(
         "hand": {"height": 1.1, "imu_rate": 100.0, "truth_rate": 50.0, "yaw": "along_track"},
     }
 )
-
-
 NOISES = tuple(f"{name}_noise" for name in SENSORS)
+PROTOCOLS = ("tdoa2", "tdoa3")
+
+
+@dataclass(frozen=True)
+class ImuErrors:
+    """White noise, a bias that starts somewhere and walks, vibration: the error model of the
+    filter, and nothing else.
+
+    Defaults are of the size of a small quadrotor's MEMS sensor (BMI088 data sheet, rounded up).
+
+    Attributes
+    ----------
+    gyro_noise : white noise density, rad/s/sqrt(Hz) (default 3e-4)
+    accel_noise : white noise density, m/s^2/sqrt(Hz) (default 2e-3)
+    gyro_bias_walk : random walk density of the bias, rad/s^2/sqrt(Hz) (default 1e-5)
+    accel_bias_walk : random walk density of the bias, m/s^3/sqrt(Hz) (default 2e-4)
+    gyro_bias : standard deviation of each axis of the initial bias, rad/s (default 5e-3)
+    accel_bias : standard deviation of each axis of the initial bias, m/s^2 (default 5e-2)
+    vibration : standard deviation of a further white noise on the accelerometer while the motors
+        turn, m/s^2
+        (default 0: off)
+    """
+
+    gyro_noise: float = 3e-4
+    accel_noise: float = 2e-3
+    gyro_bias_walk: float = 1e-5
+    accel_bias_walk: float = 2e-4
+    gyro_bias: float = 5e-3
+    accel_bias: float = 5e-2
+    vibration: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not (np.isfinite(value) and value >= 0.0):
+                raise InputError(
+                    f"imu_errors: {name}: {value!r} is not a finite number of at least 0."
+                )
+
+
+NO_IMU_ERRORS = ImuErrors(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
 _Noises: Any = make_dataclass(  # the names of its attributes are those of SENSORS
     "_Noises", [(name, float | None, None) for name in NOISES], frozen=True
 )

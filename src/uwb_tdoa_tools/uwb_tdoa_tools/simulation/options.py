@@ -11,11 +11,9 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.sensors import SENSORS
 from uwb_tdoa_bias.foundation.survey_faults import refuse_faulty
 
-from .config import OF_VEHICLE, YAW_PROFILES, SimulationConfig
-from .imu import NO_IMU_ERRORS, ImuErrors
-from .schedule import PROTOCOLS
-from .trajectories import TRAJECTORIES
-from .walls import Walls
+from .config import NO_IMU_ERRORS, OF_VEHICLE, PROTOCOLS, YAW_PROFILES, ImuErrors, SimulationConfig
+from .paths import TRAJECTORIES
+from .rooms import Walls
 
 
 def add_options(made: argparse.ArgumentParser) -> None:

@@ -1,9 +1,10 @@
-"""What moves the tag along a path: a quadrotor, a rover on wheels, a person on foot."""
+"""Vehicles that carry the tag along a path: a quadrotor, a rover on wheels, a person on foot."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from scipy.interpolate import BSpline, CubicHermiteSpline, CubicSpline, make_interp_spline
@@ -11,16 +12,22 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
-from .config import OF_VEHICLE
-from .motion import ExactMotion, Flyable
-from .trajectories import GRAVITY, KNOT, SPEED_UP, STEP, Trajectory, path_of, path_time, yaw_along
+from .paths import KNOT, SPEED_UP, STEP, path_of, path_time, yaw_along
+from .rooms import REST_HEIGHT
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from .config import SimulationConfig
-    from .room import Room
+    from .rooms import Room
 
+
+GRAVITY = 9.81  # m/s^2
+DRAG = (
+    0.2  # 1/s, rotor drag per mass: without it the lateral accelerometers would never feel anything
+)
+MAX_ACCELERATION = 8.0  # m/s^2, what a small quadrotor still flies
+SPIN_UP = 0.5  # s, the motors turn before take-off and after landing
 PULL = 1.5  # 1/s, speed of the rover by its distance to the point that it follows
 TURN = 2.5  # 1/s, turning rate by the direction to that point
 SLACK = 0.03  # m, within which it stands still
@@ -31,6 +38,133 @@ DRIVES, STANDS = (8.0, 20.0), (6.0, 9.0)  # s, between stops and of a stop
 FINE = 0.01  # s, steps in which the position of the rover is summed up
 STEPS = 1.9  # Hz, of a person who walks
 BOB, SWAY, TILT = 0.02, 0.01, np.deg2rad(6.0)  # m, m, rad: of a hand, by steps and otherwise
+
+
+@dataclass(frozen=True)
+class ExactMotion:
+    """Exact motion at n instants, body frame x forward, y left, z up in a z-up world.
+
+    p, v, a : (n, 3) m, m/s, m/s^2, world; q : (n, 4) x y z w, body to world; body_rates : (n, 3)
+        rad/s, body;
+    specific_force : (n, 3) m/s^2, body.
+    """
+
+    p: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+    q: np.ndarray
+    body_rates: np.ndarray
+    specific_force: np.ndarray
+
+
+class Flyable(Protocol):
+    """What `simulate` moves."""
+
+    def motion(self, t: np.ndarray) -> ExactMotion:
+        """The ExactMotion at stamps t, (n,) s."""
+
+    def motors(self, t: np.ndarray) -> np.ndarray:
+        """Whether the motors turn at stamps t: (n,) bool."""
+
+
+class Trajectory:
+    """One flight over 0 ... config.duration: position and yaw as splines, attitude and rates from
+    them.
+
+    Parameters: config, a SimulationConfig with place, height and radius filled in; room, a Room;
+    rng, a numpy Generator for what the family draws. Raises InputError where the flight does not
+    fit the room, the time or the vehicle.
+    take_off, landing : s, when it leaves the floor and is back on it; None when it starts and ends
+        in the air.
+    """
+
+    def __init__(self, config: SimulationConfig, room: Room, rng: np.random.Generator) -> None:
+        assert config.height is not None  # complete
+        self.take_off = self.landing = None
+        start, end, clamp = 0.0, config.duration, None
+        if not config.start_in_air:
+            rise = max(3.0, 1.5 * config.height)
+            shortest = 2.0 * (config.floor_time + rise + SPEED_UP)
+            if config.duration < shortest:
+                raise InputError(
+                    f"duration: {config.duration:g} s is too short to take off and land; give "
+                    f"{shortest:g} s or more, "
+                    "a shorter floor_time, or start in the air."
+                )
+            start, end = config.floor_time, config.duration - config.floor_time
+            self.take_off, self.landing = start, end
+            clamp = ([(k, np.zeros(3)) for k in (1, 2, 3)],) * 2  # at rest, smoothly, at both ends
+        air = end - start
+        tau = np.linspace(0.0, air, max(int(np.ceil(air / KNOT)), 8) + 1)
+        s = tau if config.start_in_air else path_time(tau, rise, air)
+        p = path_of(s, config, room, rng)
+        if not config.start_in_air:
+            lift = STEP(np.clip(tau / rise, 0.0, 1.0)) * STEP(np.clip((air - tau) / rise, 0.0, 1.0))
+            ground = room.lower[2] + REST_HEIGHT
+            p[:, 2] = ground + lift * (p[:, 2] - ground)
+        yaw = yaw_along(s, p, config)
+        self._start, self._end, self._clamped = start, end, clamp is not None
+        self._p = make_interp_spline(start + tau, p, k=7, bc_type=clamp)
+        scalar = ([(k, 0.0) for k in (1, 2, 3)],) * 2 if clamp else None
+        self._yaw = make_interp_spline(start + tau, yaw, k=7, bc_type=scalar)
+        hardest = np.linalg.norm(self._p.derivative(2)(start + tau), axis=1).max()
+        if hardest > MAX_ACCELERATION:
+            raise InputError(
+                f"speed: {config.speed:g} m/s asks for an acceleration of {hardest:.1f} m/s^2 "
+                "on this path, "
+                f"more than {MAX_ACCELERATION:g}; fly slower or wider."
+            )
+
+    def motion(self, t: ArrayLike) -> ExactMotion:
+        """The ExactMotion at the stamps t, (n,) s; before take-off and after landing it rests
+        exactly.
+
+        The thrust, along body z, carries weight, acceleration and rotor drag (differential flatness
+        of a quadrotor, after Mellinger and Kumar, ICRA 2011); the body rates are the analytic
+        derivative of that attitude.
+        """
+        t = np.asarray(t, dtype=float)
+        inside = np.clip(t, self._start, self._end)
+        moving = ((t > self._start) & (t < self._end))[:, None] if self._clamped else 1.0
+        p = self._p(inside)
+        v, a, jerk = (self._p.derivative(k)(inside) * moving for k in (1, 2, 3))
+        yaw, yaw_rate = self._yaw(inside), self._yaw.derivative()(inside) * np.squeeze(moving)
+
+        gravity = np.array([0.0, 0.0, GRAVITY])
+        thrust = a + gravity + DRAG * v
+        thrust_rate = jerk + DRAG * a
+        size = np.linalg.norm(thrust, axis=1, keepdims=True)
+        z = thrust / size
+        z_rate = (thrust_rate - z * np.sum(z * thrust_rate, axis=1, keepdims=True)) / size
+        heading = np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(len(t))])
+        heading_rate = yaw_rate[:, None] * np.column_stack(
+            [-np.sin(yaw), np.cos(yaw), np.zeros(len(t))]
+        )
+        y = np.cross(z, heading)
+        y_size = np.linalg.norm(y, axis=1, keepdims=True)
+        y /= y_size
+        x = np.cross(y, z)
+        y_rate = (
+            np.cross(z_rate, heading) + np.cross(z, heading_rate)
+        ) / y_size  # up to a part along y itself
+        body_rates = np.column_stack(
+            [np.sum(u * w, axis=1) for u, w in ((-y, z_rate), (x, z_rate), (-x, y_rate))]
+        )
+        axes = np.stack([x, y, z], axis=2)
+        q = Rotation.from_matrix(axes).as_quat()
+        q[1:] *= np.cumprod(np.where(np.sum(q[1:] * q[:-1], axis=1) < 0.0, -1.0, 1.0))[
+            :, None
+        ]  # no sign flips
+        return ExactMotion(p, v, a, q, body_rates, np.einsum("nij,ni->nj", axes, a + gravity))
+
+    def motors(self, t: ArrayLike) -> np.ndarray:
+        """Whether the motors turn at the stamps t: (n,) bool."""
+        t = np.asarray(t)
+        return (
+            (t >= self._start - SPIN_UP) & (t <= self._end + SPIN_UP)
+            if self._clamped
+            else np.ones(len(t), bool)
+        )
 
 
 class Rover:
@@ -216,4 +350,3 @@ VEHICLES: dict[str, Callable[[SimulationConfig, Room, np.random.Generator], Flya
     "rover": Rover,
     "hand": Carried,
 }
-assert VEHICLES.keys() == OF_VEHICLE.keys()

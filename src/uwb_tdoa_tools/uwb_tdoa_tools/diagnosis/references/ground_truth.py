@@ -8,7 +8,7 @@ from uwb_tdoa_bias.effects.stamp_error import shifted
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from ...scoring.alignment import NONE
-from ...scoring.settling import settled
+from ...scoring.evaluation import settled
 from .base import Reference, ReferenceView
 
 if TYPE_CHECKING:

@@ -1,18 +1,24 @@
-"""Named anchor constellations for simulated flights, and seeded random ones."""
+"""Anchors, walls, and the room that they span."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
 import re
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.safe_yaml import read_yaml
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     from numpy.typing import ArrayLike
+
 
 LOW = 0.18  # m, height of an anchor on its stand on the floor
 
@@ -192,3 +198,151 @@ def constellation(name: str) -> Anchors:
     raise InputError(
         f"constellation: {name!r} is not known; choose {choices} or random-SEED[-COUNT]."
     )
+
+
+CLEARANCE = 0.8  # m from the walls
+FLOOR_CLEARANCE = 0.6  # m from floor and ceiling
+REST_HEIGHT = 0.03  # m, height of the body frame when the vehicle stands on the floor
+
+
+@dataclass(frozen=True)
+class Room:
+    """A box. lower, upper : (3,) corners in the world frame, metres; the floor is at lower[2]. area
+    : ((x, y), (x, y)) m, lower and upper corner of the part that paths are sized to; None for all
+    but a clearance.
+    """
+
+    lower: np.ndarray
+    upper: np.ndarray
+    area: tuple[tuple[float, ...], ...] | None = None
+
+    @property
+    def centre(self) -> np.ndarray:
+        """(3,) metres: of the area, if there is one."""
+        if self.area is None:
+            return 0.5 * (self.lower + self.upper)
+        return 0.5 * np.sum(self.flyable, axis=0)
+
+    @property
+    def flyable(self) -> tuple[np.ndarray, np.ndarray]:
+        """The box that paths are sized to, (lower, upper), each (3,) metres: the area, or else the
+        room less a clearance.
+        """
+        margin = np.minimum(
+            [CLEARANCE, CLEARANCE, FLOOR_CLEARANCE], 0.25 * (self.upper - self.lower)
+        )
+        low, high = self.lower + margin, self.upper - margin
+        if self.area is not None:
+            low[:2], high[:2] = self.area
+        return low, high
+
+    def around(self, points: np.ndarray) -> Room:
+        """The Room, grown to hold points (n, 2 or 3), m."""
+        k = points.shape[1]
+        lower, upper = self.lower.copy(), self.upper.copy()
+        lower[:k], upper[:k] = (
+            np.minimum(lower[:k], points.min(axis=0)),
+            np.maximum(upper[:k], points.max(axis=0)),
+        )
+        return replace(self, lower=lower, upper=upper)
+
+
+def room_of(anchors: Anchors) -> Room:
+    """The room that Anchors stand in: the box around them, at least 4 x 4 x 2.5 m, floor at 0 or
+    the lowest anchor.
+    """
+    lowest, highest = anchors.positions.min(axis=0), anchors.positions.max(axis=0)
+    middle, half = 0.5 * (lowest + highest), np.maximum(0.5 * (highest - lowest), 2.0)
+    floor = min(0.0, lowest[2])
+    return Room(
+        np.array([middle[0] - half[0], middle[1] - half[1], floor]),
+        np.array([middle[0] + half[0], middle[1] + half[1], max(highest[2], floor + 2.5)]),
+    )
+
+
+WALLS_FORM = (
+    "write walls: [[x0, y0, x1, y1], ...], in metres, and after these the height of a wall over "
+    "which signals go"
+)
+AT_ONCE = 200_000  # straight lines that are compared with all walls at once
+
+
+@dataclass(frozen=True)
+class Walls:
+    """Upright walls between two points seen from above. segments : ((x0, y0, x1, y1, height), ...)
+    m, in the frame of the anchors; a signal goes over a wall above its height, inf for none.
+    """
+
+    segments: tuple[tuple[float, ...], ...]
+
+    @classmethod
+    def from_yaml(cls, path: str | Path) -> Walls:
+        """Read `walls: [[x0, y0, x1, y1], [x0, y0, x1, y1, height], ...]`. Raises InputError."""
+        content = read_yaml(path)
+        entries = content.get("walls") if isinstance(content, dict) else None
+        if not isinstance(entries, list) or not entries:
+            raise InputError(f"{path}: has no list 'walls'; {WALLS_FORM}.")
+        return cls(
+            tuple(_segment(path, number, entry) for number, entry in enumerate(entries, start=1))
+        )
+
+    def between(self, p: np.ndarray, q: np.ndarray) -> np.ndarray:
+        """(n,) whether a wall stands on the straight line between points p and q, (n, 3) m each.
+
+        Their ends are on no wall.
+        """
+        out = np.zeros(len(p), bool)
+        with np.errstate(
+            divide="ignore", invalid="ignore"
+        ):  # lines along a wall, which cross it nowhere
+            for x0, y0, x1, y1, height in self.segments:
+                d, e, w = q - p, (x1 - x0, y1 - y0), (x0 - p[:, 0], y0 - p[:, 1])
+                crossed = d[:, 0] * e[1] - d[:, 1] * e[0]
+                along_line = (w[0] * e[1] - w[1] * e[0]) / crossed
+                along_wall = (w[0] * d[:, 1] - w[1] * d[:, 0]) / crossed
+                out |= (
+                    (along_line > 0.0)
+                    & (along_line < 1.0)
+                    & (along_wall >= 0.0)
+                    & (along_wall <= 1.0)
+                    & (p[:, 2] + along_line * d[:, 2] < height)
+                )
+        return out
+
+
+def heard_at(
+    p: np.ndarray, positions: np.ndarray, reach: float, walls: Walls | None = None
+) -> list[np.ndarray]:
+    """Rows of the anchors at positions (N, 3) m that are heard at each of p (n, 3) m: within reach,
+    m, and behind no wall. List of (k,).
+    """
+    near = cKDTree(positions).query_ball_point(p, reach, return_sorted=True)
+    if walls is None:
+        return [np.array(rows, int) for rows in near]
+    out: list[np.ndarray] = []
+    counts = np.array([len(rows) for rows in near], int)
+    ends = np.cumsum(counts)
+    for some in np.split(np.arange(len(p)), np.flatnonzero(np.diff(ends // AT_ONCE)) + 1):
+        rows = np.concatenate([np.empty(0, int), *(np.array(near[k], int) for k in some)])
+        free = ~walls.between(np.repeat(p[some], counts[some], axis=0), positions[rows])
+        out += [
+            part[kept]
+            for part, kept in zip(
+                *(np.split(each, np.cumsum(counts[some])[:-1]) for each in (rows, free))
+            )
+        ]
+    return out
+
+
+def _segment(path: str | Path, number: int, entry: Any) -> tuple[float, ...]:
+    good = (
+        isinstance(entry, list)
+        and len(entry) in (4, 5)
+        and all(type(value) in (int, float) for value in entry)
+    )
+    if not good or entry[:2] == entry[2:4]:
+        raise InputError(
+            f"{path}: walls: number {number} is {entry!r}, which is no wall from one point to "
+            f"another; {WALLS_FORM}."
+        )
+    return (*map(float, entry[:4]), float(entry[4]) if len(entry) == 5 else np.inf)

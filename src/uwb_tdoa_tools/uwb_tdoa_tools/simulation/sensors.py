@@ -1,6 +1,4 @@
-"""What the SENSORS beside inertia and TDOAs say: what is true, white noise, and what the wheels of
-a rover do.
-"""
+"""Simulated sensors besides TDOAs: the inertial sensor, and each of SENSORS."""
 
 from __future__ import annotations
 
@@ -10,22 +8,61 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from uwb_tdoa_bias.foundation.flight import Imu
 from uwb_tdoa_bias.foundation.sensors import SENSORS, Velocity
 
-from .config import WHEELS_RATE
+from .config import WHEELS_RATE, ImuErrors
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from uwb_tdoa_bias.foundation.sensors import Stream
 
     from .config import SimulationConfig
-    from .motion import Flyable
-    from .room import Room
+    from .rooms import Room
+    from .vehicles import Flyable
+
 
 YAW_RATE_STD = 0.02  # rad/s
 SLIP_EVERY, SLIP_TIME = 10.0, 0.5  # s
 
 
-def measure(config: SimulationConfig, room: Room, trajectory: Flyable) -> dict[str, Stream]:
+def measure_imu(
+    t: np.ndarray,
+    trajectory: Flyable,
+    errors: ImuErrors,
+    random: Callable[[str], np.random.Generator],
+) -> tuple[Imu, np.ndarray, np.ndarray]:
+    """What the sensor reports at the stamps t, (n,) s, equally spaced.
+
+    random(part) gives the numpy Generator of a part. Returns (Imu, gyro bias (n, 3) rad/s, accel
+    bias (n, 3) m/s^2). The samples are values at an instant, not means over the sample time.
+    """
+    n, dt = len(t), t[1] - t[0]
+    motion = trajectory.motion(t)
+
+    def bias_of(part: str, initial: float, walk: float) -> np.ndarray:
+        rng = random(part)
+        start = initial * rng.standard_normal(3)
+        steps = walk * np.sqrt(dt) * rng.standard_normal((n, 3))
+        steps[0] = 0.0
+        return start + np.cumsum(steps, axis=0)
+
+    gyro_bias = bias_of("gyro bias", errors.gyro_bias, errors.gyro_bias_walk)
+    accel_bias = bias_of("accel bias", errors.accel_bias, errors.accel_bias_walk)
+    gyro_noise = errors.gyro_noise / np.sqrt(dt) * random("gyro noise").standard_normal((n, 3))
+    accel_noise = errors.accel_noise / np.sqrt(dt) * random("accel noise").standard_normal((n, 3))
+    shaking = (
+        errors.vibration
+        * trajectory.motors(t)[:, None]
+        * random("vibration").standard_normal((n, 3))
+    )
+    gyro = motion.body_rates + gyro_bias + gyro_noise
+    accel = motion.specific_force + accel_bias + accel_noise + shaking
+    return Imu(t, gyro, accel), gyro_bias, accel_bias
+
+
+def measure_sensors(config: SimulationConfig, room: Room, trajectory: Flyable) -> dict[str, Stream]:
     """{name: Stream} of those that the SimulationConfig, from complete(), has a noise for."""
     out = {}
     for name, sensor in SENSORS.items():

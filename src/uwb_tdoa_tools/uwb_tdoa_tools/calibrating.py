@@ -1,4 +1,4 @@
-"""A calibration of a tag and its anchors, and what it is worth where it took no part."""
+"""Calibrate a tag and its anchors from recordings, and validate that on hold-out flights."""
 
 from __future__ import annotations
 
@@ -9,29 +9,30 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_bias.effects.wording import listed
 from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.flight import AIDS, Flight
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.streams import ERROR
 
-from ..checking.ordered import OrderedRecording
-from ..checking.survey_fit import displacement
-from ..diagnosis import diagnose, output
-from ..diagnosis.self_calibration import Tape, self_calibrate
-from ..diagnosis.self_calibration.equations import measured_noise, slow_innovations
-from ..diagnosis.self_calibration.solve import LEFT
-from ..estimate import FlightEstimator
-from ..scoring.evaluation import score_of
-from ..scoring.gains import change_of
-from ..surveying.report import as_text
-from .parts import split
+from .checking.ordered import OrderedRecording
+from .checking.survey_fit import displacement
+from .diagnosis import diagnose, output
+from .diagnosis.self_calibration import SelfCalibration, Tape, self_calibrate
+from .diagnosis.self_calibration.equations import measured_noise, slow_innovations
+from .diagnosis.self_calibration.solve import IMPROVED, LEFT
+from .estimate import FlightEstimator
+from .scoring.evaluation import score_of
+from .scoring.gains import change_of
+from .surveying.report import as_text
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-    from uwb_tdoa_bias.foundation.flight import Flight
     from uwb_tdoa_ekf.streams.finding import Finding
 
-    from ..checking.recording import Recording
+    from .checking.recording import Recording
+
 
 # the rule of `check` of a survey that does not fit, though no other mistake explains it
 MISFIT = "survey_misfit"
@@ -226,3 +227,142 @@ def _with_noise(config: FilterConfig | None, std: float | None) -> FilterConfig:
 
 def _names(flights: Sequence[Flight]) -> str:
     return ", ".join(flight.name for flight in flights)
+
+
+SECONDS = 60.0  # of a flight that are looked at
+MOVES = (
+    0.25  # of the extent of the anchors that a path must have along an axis to tell much of them
+)
+ENOUGH = 0.5  # of the coordinates that must become known better
+
+
+@dataclass(frozen=True, eq=False)
+class Prospect:
+    """seconds : s in the air that were looked at, and `total` that there are; given, expected : (N,
+    3) m, standard deviations of the anchors before, and as they are to be expected of all flights;
+    before, left : m, of the slow innovations; path : (3,) m, its extent;
+    hall : (3,) m, of the anchors; ids : of the anchors; why_not : what keeps a survey from being
+        applied so far, or None.
+    """
+
+    seconds: float
+    total: float
+    given: np.ndarray
+    expected: np.ndarray
+    before: float
+    left: float
+    path: np.ndarray
+    hall: np.ndarray
+    ids: tuple[int, ...]
+    why_not: str | None
+
+    @property
+    def better(self) -> np.ndarray:
+        """(N, 3) bool: coordinates that are to become known better."""
+        return self.expected < IMPROVED * self.given
+
+    @property
+    def exciting(self) -> bool:
+        """Whether the flights tell enough."""
+        return bool(self.better.mean() >= ENOUGH)
+
+    def sentences(self) -> list[str]:
+        """For people."""
+        lines = [
+            f"from {self.seconds:.0f} s of {self.total:.0f} s in the air: of the innovations "
+            f"{100 * self.before:.1f} cm are slow with the anchors as "
+            f"given, and {100 * self.left:.1f} cm with others",
+            f"all flights are likely to tell {int(self.better.sum())} of {self.better.size} "
+            "coordinates better: "
+            f"{100 * np.median(self.expected):.0f} cm in the median instead of "
+            f"{100 * np.median(self.given):.0f} cm",
+        ]
+        if self.why_not:
+            lines.append(f"so far nothing would be applied: {self.why_not}")
+        unseen = [str(i) for i, row in zip(self.ids, self.better) if not row.any()]
+        if unseen:
+            lines.append(
+                f"nothing is told of anchors {listed(unseen)}: fly closer to them, on all "
+                "sides, high and low"
+            )
+        for axis, size, room in zip("xyz", self.path, self.hall):
+            if size < MOVES * room:
+                lines.append(
+                    f"along {axis} the tag moves by {size:.1f} m among anchors that are "
+                    f"{room:.1f} m apart: fly more of it"
+                )
+        lines.append(
+            "the flights are exciting enough"
+            if self.exciting
+            else "the flights are not exciting enough: fly more, and elsewhere"
+        )
+        return lines
+
+
+def prospect(
+    flights: Sequence[Flight],
+    tape: Tape = Tape(),
+    base: EffectSet = EffectSet(),
+    config: FilterConfig | None = None,
+    progress: Callable[[], object] = lambda: None,
+) -> Prospect:
+    """Prospect of a calibration of Flights without their ground truth.
+
+    Raises InputError where they are too short to say.
+    """
+    longest = max(flights, key=_duration)
+    middle = 0.5 * (longest.start + longest.end)
+    part = between(longest, middle - 0.5 * SECONDS, middle + 0.5 * SECONDS)
+    found = self_calibrate([part], tape, base, config, (), progress)
+    seconds = found.seconds
+    total = max(seconds, sum(map(_duration, flights)) * seconds / max(_duration(part), 1e-9))
+    path = np.quantile(FlightEstimator(config, base)(part).odometry.p, [0.02, 0.98], axis=0)
+    anchors = longest.anchors
+    return Prospect(
+        seconds,
+        total,
+        found.given_std,
+        _expected(found, total / seconds),
+        found.before,
+        found.left,
+        np.ptp(path, axis=0),
+        np.ptp(anchors.positions, axis=0),
+        tuple(anchors.ids.tolist()),
+        found.why_not,
+    )
+
+
+def _duration(flight: Flight) -> float:
+    """s in which a Flight is located."""
+    return flight.end - flight.start
+
+
+def _expected(found: SelfCalibration, more: float) -> np.ndarray:
+    """(N, 3) m: standard deviations after `more` times what was looked at for a SelfCalibration, as
+    its information adds up.
+    """
+    prior = np.linalg.inv(found.prior.covariance)
+    values, vectors = np.linalg.eigh(np.linalg.inv(found.solution.covariance) - prior)
+    information = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    covariance = np.linalg.inv(prior + more * information)
+    return np.sqrt(np.diag(covariance))[: 3 * len(found.given)].reshape(-1, 3)
+
+
+STREAMS = "tdoa", "imu", "truth", *AIDS
+
+
+def between(flight: Flight, first: float, last: float) -> Flight:
+    """What of a Flight is stamped from `first` on and before `last`, s."""
+    cut = {}
+    for name in STREAMS:
+        stream = getattr(flight, name)
+        if stream is not None:
+            inside = (stream.t >= first) & (stream.t < last)
+            cut[name] = type(stream)(*(column[inside] for column in vars(stream).values()))
+    return replace(flight, extra={}, **cut)
+
+
+def split(flight: Flight, share: float) -> tuple[Flight, Flight]:
+    """A Flight until a share of the time in which it is located, and from there on."""
+    middle = flight.start + share * (flight.end - flight.start)
+    return between(flight, -np.inf, middle), between(flight, middle, np.inf)
