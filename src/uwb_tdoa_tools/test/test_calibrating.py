@@ -135,7 +135,7 @@ def test_what_makes_it_worse_where_it_took_no_part_is_not_to_be_used(flights, mo
     ],
 )
 def test_innovations_alone_must_speak_clearly(before, after, why):
-    told = library._why_not_blindly(replace(GOOD, before=before, after=after))
+    told = library._reason_against_unverified(replace(GOOD, before=before, after=after))
     assert told is why if why is None else why in told
 
 
@@ -252,14 +252,16 @@ def test_it_stops_where_check_finds_an_error(room, flights, monkeypatch, capsys)
 
 def test_a_tape_that_is_off_does_not_stop_it_and_another_room_does(flights):
     flight, findings = flights[0], [Finding(library.MISFIT, ERROR, "", "", "", 0.0)]
-    assert library.stopping(of_flight(flight), findings, 0.1) == []
+    assert library.blocking_errors(of_flight(flight), findings, 0.1) == []
     far = flight.anchors.at(
         flight.anchors.positions
         + np.random.default_rng(6).standard_normal(flight.anchors.positions.shape)
     )
-    assert library.stopping(of_flight(replace(flight, anchors=far)), findings, 0.1) == findings
+    assert (
+        library.blocking_errors(of_flight(replace(flight, anchors=far)), findings, 0.1) == findings
+    )
     other = Finding("tdoa_sign", ERROR, "", "", "", 0.0)
-    assert library.stopping(of_flight(flight), [other, *findings], 0.1) == [other]
+    assert library.blocking_errors(of_flight(flight), [other, *findings], 0.1) == [other]
 
 
 @pytest.mark.parametrize(

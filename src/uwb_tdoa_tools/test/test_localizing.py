@@ -13,7 +13,7 @@ from uwb_tdoa_ekf.results import Odometry, Residuals
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag
 from uwb_tdoa_tools.commands import evaluate, localize
 from uwb_tdoa_tools.estimate import FlightEstimator
-from uwb_tdoa_tools.localizing import belief, residuals
+from uwb_tdoa_tools.localizing import assessment, residuals
 from uwb_tdoa_tools.localizing.localize import check_names, name_of
 from uwb_tdoa_tools.readers.inputs import Reading, find_flights
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
@@ -144,12 +144,12 @@ def test_a_reading_without_truth_gives_a_flight_without_it(bags):
 
 
 def believed(flight):
-    return belief.believe(flight, FlightEstimator()(flight))
+    return assessment.assess(flight, FlightEstimator()(flight))
 
 
 def test_a_clean_flight_is_good_and_within_what_is_stated(flight):
     told = believed(replace(flight, truth=None))
-    assert told.level == belief.GOOD and not told.reasons and not told.lost
+    assert told.level == assessment.GOOD and not told.reasons and not told.lost
     odometry = FlightEstimator()(flight).odometry
     true = np.stack(
         [np.interp(odometry.t, flight.truth.t, flight.truth.p[:, k]) for k in range(3)], axis=1
@@ -168,7 +168,7 @@ def ranged():
 
 def test_ranges_alone_are_believed_as_tdoas_are(ranged, tmp_path):
     told = believed(ranged)
-    assert told.level == belief.GOOD and not told.reasons and not told.lost
+    assert told.level == assessment.GOOD and not told.reasons and not told.lost
     assert (
         f"% of {len(ranged.range)} ranges fit it" in told.sentences()[0]
         and told.figures["seconds"] > 12.0
@@ -188,7 +188,7 @@ def test_ranges_alone_are_believed_as_tdoas_are(ranged, tmp_path):
 
 
 def test_an_offset_of_ranges_that_was_found_is_told(ranged):
-    told = belief.believe(ranged, FlightEstimator(smoothed=True)(without_offset(ranged, -0.25)))
+    told = assessment.assess(ranged, FlightEstimator(smoothed=True)(without_offset(ranged, -0.25)))
     assert told.figures["range_offset"] == pytest.approx(0.25, abs=0.02)
     assert "all ranges are 25 cm too long: that was found, and taken out" in told.sentences()
     sound = believed(ranged)
@@ -200,7 +200,7 @@ def test_an_offset_of_ranges_that_was_found_is_told(ranged):
 def test_ranges_that_contradict_each_other_are_not_good(ranged):
     far = replace(ranged.range, d=ranged.range.d + 20.0 * (ranged.range.anchor % 3))
     told = believed(replace(ranged, range=far))
-    assert told.level != belief.GOOD and "ranges" in " ".join(told.reasons)
+    assert told.level != assessment.GOOD and "ranges" in " ".join(told.reasons)
 
 
 def test_silence_among_ranges_is_where_the_tag_was_lost(ranged):
@@ -212,17 +212,17 @@ def test_silence_among_ranges_is_where_the_tag_was_lost(ranged):
         range=type(ranged.range)(*(column[heard] for column in ranged.range.columns)),
     )
     told = believed(quiet)
-    assert told.level == belief.DOUBTFUL and told.lost[0][0] == pytest.approx(begin, abs=1.0)
+    assert told.level == assessment.DOUBTFUL and told.lost[0][0] == pytest.approx(begin, abs=1.0)
 
 
 def test_an_error_that_check_finds_is_bad_with_its_remedy(flight):
     told = believed(replace(flight, tdoa=replace(flight.tdoa, d=-flight.tdoa.d)))
-    assert told.level == belief.BAD and "sign" in " ".join(told.reasons) and told.remedies
+    assert told.level == assessment.BAD and "sign" in " ".join(told.reasons) and told.remedies
 
 
 def test_a_recording_without_an_estimate_is_bad(flight):
     told = believed(replace(flight, tdoa=replace(flight.tdoa, d=1000.0 * flight.tdoa.d)))
-    assert told.level == belief.BAD and told.sentences()[0].startswith("bad: ")
+    assert told.level == assessment.BAD and told.sentences()[0].startswith("bad: ")
 
 
 def test_silence_is_where_the_tag_was_lost(flight):
@@ -235,7 +235,7 @@ def test_silence_is_where_the_tag_was_lost(flight):
         tdoa=type(flight.tdoa)(*(column[heard] for column in vars(flight.tdoa).values())),
     )
     told = believed(quiet)
-    assert told.level != belief.GOOD and "the tag was lost for" in " ".join(told.reasons)
+    assert told.level != assessment.GOOD and "the tag was lost for" in " ".join(told.reasons)
     assert told.lost[0][0] == pytest.approx(begin, abs=2.1) and told.lost[-1][1] == pytest.approx(
         end, abs=1.0
     )

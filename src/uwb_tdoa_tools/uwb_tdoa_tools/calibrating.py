@@ -23,7 +23,7 @@ from .diagnosis.self_calibration.equations import measured_noise, slow_innovatio
 from .diagnosis.self_calibration.solve import IMPROVED, LEFT
 from .estimate import FlightEstimator
 from .scoring.evaluation import score_of
-from .scoring.gains import change_of
+from .scoring.gains import change_in_words
 from .surveying.report import as_text
 
 if TYPE_CHECKING:
@@ -76,14 +76,14 @@ class Calibration:
 
     def as_text(self) -> str:
         """What it is worth, in a line."""
-        change = f" (it {change_of(self.before, self.after)})" if self.before else ""
+        change = f" (it {change_in_words(self.before, self.after)})" if self.before else ""
         return (
             f"{self.measure} {100 * self.before:.1f} -> {100 * self.after:.1f} cm{change} on "
             f"{self.judged_on}"
         )
 
 
-def stopping(recording: Recording, findings: Iterable[Finding], std: float) -> list[Finding]:
+def blocking_errors(recording: Recording, findings: Iterable[Finding], std: float) -> list[Finding]:
     """Those Findings of `check` in a Recording that a calibration cannot put right: all errors, but
     for a survey that does not fit by as much as a tape may be off. std : m, of a coordinate.
     """
@@ -126,7 +126,7 @@ def with_truth(
             for side in ((base, config), (found.effects, _with_noise(config, std)))
         )
         calibration = replace(calibration, before=before, after=after, judged_on=_names(holdout))
-    return _assessed(calibration, len(found.effects) > len(base))
+    return _validated(calibration, len(found.effects) > len(base))
 
 
 def without_truth(
@@ -146,8 +146,8 @@ def without_truth(
         *fitted, last = flights
         first, rest = split(last, FITTED)
         judges, fitted, on = [rest], [*fitted, first], f"the last third of {last.name}"
-    said = partial(progress, "solving")
-    found = self_calibrate(fitted, tape, base, config, (), said)
+    report = partial(progress, "solving")
+    found = self_calibrate(fitted, tape, base, config, (), report)
     progress("judging")
     before = slow_innovations(judges, base, config)
     after = slow_innovations(
@@ -155,7 +155,7 @@ def without_truth(
     )
     if not holdout and found.why_not is None and after <= before:
         found = self_calibrate(
-            flights, tape, base, config, (), said
+            flights, tape, base, config, (), report
         )  # what was judged, of all of it
     calibration = Calibration(
         found.anchors,
@@ -168,15 +168,15 @@ def without_truth(
         found.why_not,
         as_text(found),
     )
-    calibration = _assessed(calibration, True)
+    calibration = _validated(calibration, True)
     return (
         calibration
         if calibration.why_not
-        else replace(calibration, why_not=_why_not_blindly(calibration))
+        else replace(calibration, why_not=_reason_against_unverified(calibration))
     )
 
 
-def _why_not_blindly(calibration: Calibration) -> str | None:
+def _reason_against_unverified(calibration: Calibration) -> str | None:
     """Why a Calibration that was judged by innovations alone may do harm, though they are smaller;
     or None.
     """
@@ -195,11 +195,11 @@ def _why_not_blindly(calibration: Calibration) -> str | None:
     return None
 
 
-def _assessed(calibration: Calibration, something: bool) -> Calibration:
-    """The Calibration with why it is not to be used; something : whether there is anything to use."""
+def _validated(calibration: Calibration, any_effect: bool) -> Calibration:
+    """The Calibration with why it is not to be used; any_effect : whether there is anything to use."""
     if calibration.why_not is not None:
         return calibration
-    if not something:
+    if not any_effect:
         return replace(
             calibration,
             why_not="nothing was found that makes the error smaller where it took no part",

@@ -24,7 +24,7 @@ from .localizing.pictures import write_rerun
 from .readers.inputs import Reading, report_remarks
 from .readers.tables import number, read_table
 from .results_file import ResultsFile, state_of
-from .scoring.alignment import ALIGN, NONE, alignment_of, need_truth
+from .scoring.alignment import ALIGN, NONE, estimate_alignment, require_truth
 from .scoring.evaluation import corrected_truth
 from .scoring.metrics import Score
 from .scoring.phases import NEAR_THE_FLOOR, TITLES
@@ -43,14 +43,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Evaluator:
-    """evaluator((path, survey)) is the Result of a recording: of the filter run over it, or of the
-    odometry in a bag.
+    """Return the Result of a recording (path, survey): score the filter, or a recorded odometry.
 
-    reading : Reading; estimator : FlightEstimator; odometry : path of a bag whose odometry is
-        judged instead, or None; picture :
-    file to draw the errors to, or None; trajectories : folder for TUM files, or None; rerun : file
-    for Rerun, or None; align : of ALIGN, what of the ground truth is moved onto the estimate before
-    it judges. Raises InputError. Can be pickled.
+    Can be pickled. Raises InputError.
+
+    Attributes
+    ----------
+    reading : how recordings are read.
+    estimator : filter with corrections.
+    odometry : bag whose odometry is scored instead, or None.
+    picture : image file of the errors, or None.
+    trajectories : folder for TUM files, or None.
+    rerun : file for Rerun, or None.
+    align : one of ALIGN, alignment of the ground truth before scoring.
     """
 
     reading: Reading = Reading()
@@ -63,9 +68,9 @@ class Evaluator:
 
     def __call__(self, recording: Recording) -> Result:
         flight = self.reading.read(recording)
-        need_truth(flight, self.align == NONE)
-        told = [] if self.odometry else list(survey_remarks(flight))
-        report_remarks(flight.name, told)
+        require_truth(flight, self.align == NONE)
+        survey_sentences = [] if self.odometry else list(survey_remarks(flight))
+        report_remarks(flight.name, survey_sentences)
         odometry: Odometry | RecordedOdometry
         residuals: Residuals | None
         if self.odometry:
@@ -76,10 +81,10 @@ class Evaluator:
             run = self.estimator(flight)
             odometry, residuals = run.odometry, run.residuals
             flight = replace(flight, truth=corrected_truth(flight, self.estimator.effects))
-        assert flight.truth is not None  # need_truth
-        found = alignment_of(flight, odometry)
+        assert flight.truth is not None  # require_truth
+        found = estimate_alignment(flight, odometry)
         found_wrong = list(self._of_truth(flight, found))
-        truths = {how: found.applied(flight.truth, how) for how in ALIGN}
+        truths = {how: found.applied_to(flight.truth, how) for how in ALIGN}
         scores = {
             how: Score(flight.name, odometry, one, residuals, flight.tdoa.t)
             for how, one in truths.items()
@@ -87,7 +92,9 @@ class Evaluator:
         score, truth = scores[self.align], truths[self.align]
         if found_wrong or (score.row()["diverged"] and not score.row()["late_start"]):
             causes = self._of_anchors(flight)  # ids and anchors first: the truth is measured better
-            report_remarks(flight.name, [one for one in causes or found_wrong if one not in told])
+            report_remarks(
+                flight.name, [one for one in causes or found_wrong if one not in survey_sentences]
+            )
         if self.picture:
             from ..scoring.plots import plot_error  # takes a second to import
 
@@ -107,8 +114,9 @@ class Evaluator:
         )
 
     def _of_anchors(self, flight: Flight) -> list[str]:
-        """Sentences on ids, signs, units and anchors that are wrong in a Flight; of a recorded
-        odometry nobody can tell.
+        """Return sentences on wrong ids, signs, units and anchors of a Flight.
+
+        Empty for a recorded odometry.
         """
         if self.odometry:
             return []
@@ -120,8 +128,8 @@ class Evaluator:
         ]
 
     def _of_truth(self, flight: Flight, found: Alignment) -> Iterator[str]:
-        """Sentences on the ground truth of a Flight, by its Alignment and by itself."""
-        for how, words in (("time", found.of_clock()), ("frame", found.of_frame())):
+        """Yield sentences on errors of the ground truth."""
+        for how, words in (("time", found.clock_sentence()), ("frame", found.frame_sentence())):
             if words:
                 yield words + (
                     f"; judge with --align {how}, and put it right where it comes from."
@@ -132,7 +140,7 @@ class Evaluator:
             yield f"{finding.cause}: {finding.evidence}; {finding.remedy}."
 
     def late_tdoas(self) -> int:
-        """How many TDOAs were late for the odometry that is judged."""
+        """Return the number of TDOAs that came too late for a recorded odometry."""
         return late_tdoas(self.odometry, *self._where) if self.odometry else 0
 
     @property
@@ -148,12 +156,13 @@ def results(
     jobs: int | None = None,
     dask: str | None = None,
 ) -> Iterator[Result]:
-    """Generator of the Result of each of some recordings, in turn; those that are in the file
-    `path` are not made again.
+    """Yield the Result of each recording; reuse those in the file `path`.
 
-    path : of a ResultsFile, or None to keep none; asked : all that results depend on besides the
-        recording, see there; jobs,
-    dask : as of `parallel.over`.
+    Parameters
+    ----------
+    path : of a ResultsFile, or None.
+    asked : everything else that results depend on, see ResultsFile.
+    jobs, dask : see `parallel.over`.
     """
     if path is None:
         yield from parallel.over(evaluator, recordings, jobs, dask)
@@ -169,7 +178,7 @@ def results(
 
 
 def _checked(content: dict[str, Any]) -> Result:
-    """The Result of what a file holds, of which all figures can be made."""
+    """Return the Result of a stored dict; raise if a figure is missing."""
     result, pool = Result.from_dict(content), Pool()
     pool.add(result)
     line_of_run({**result.row, **pool.figures()})
@@ -211,12 +220,12 @@ ERRORS = ("rmse_x", "rmse_y", "rmse_z", "rmse_3d", "median_3d", "max_3d")
 
 
 def head_line() -> str:
-    """The line_of_run above those of `line_of_run`."""
+    """Return the heading of the lines of `line_of_run`."""
     return _cells("flight", COLUMNS.values())
 
 
 def line_of_run(row: dict[str, Any]) -> str:
-    """One run, `Score.row`, or several, `pooled`."""
+    """Return the figures of one run, `Score.row`, or of several, `Pool.figures`, as a line."""
     word = ""
     if row["diverged"]:
         word = "  LATE START" if row["diverged"] == row["late_start"] else "  DIVERGED"
@@ -224,7 +233,7 @@ def line_of_run(row: dict[str, Any]) -> str:
 
 
 def lines_of_errors(scores: Sequence[Score]) -> list[str]:
-    """Lines of the errors alone, m, of several Scores of one flight."""
+    """Return lines of the errors, m, of several Scores of one flight."""
     titles = "".join(f"{COLUMNS[key]:>9s}" for key in ERRORS)
     rows = [
         f"{score.name:28s}" + "".join(f"{score.row()[key]:9.3f}" for key in ERRORS)
@@ -234,9 +243,7 @@ def lines_of_errors(scores: Sequence[Score]) -> list[str]:
 
 
 def markdown(rows: Sequence[dict[str, Any]], others: dict[str, dict[str, str]]) -> str:
-    """The table of rows, in metres, with one column per other estimator, as `read_others` gives
-    them.
-    """
+    """Return the table of rows, in metres, with one column per other estimator of `read_others`."""
     table = [["flight", *COLUMNS.values(), *others]]
     for row in rows:
         cells = [f"{row[key]:.3f}" for key in COLUMNS] + [
@@ -247,7 +254,11 @@ def markdown(rows: Sequence[dict[str, Any]], others: dict[str, dict[str, str]]) 
 
 
 def lines_of_alignment(aligned: dict[str, Any], means: dict[str, float]) -> Iterator[str]:
-    """Lines on ground truth beside estimates. aligned : of a single run, as of Result, else {};
+    """Yield lines on the alignment of ground truth and estimates.
+
+    Parameters
+    ----------
+    aligned : of a single run, see Result; empty for several.
     means : {one of ALIGN: 3D RMSE, m}.
     """
     if aligned:
@@ -264,7 +275,7 @@ def lines_of_alignment(aligned: dict[str, Any], means: dict[str, float]) -> Iter
 
 
 def lines_of_phases(phases: dict[str, dict[str, Any]]) -> list[str]:
-    """Lines of the phases of one run, `Score.phases`, or of several, `Pool.phases`."""
+    """Return lines on the phases of one run, `Score.phases`, or of several, `Pool.phases`."""
     head_line, *rows = _table_of_phases(phases)
     return [
         f"{row[0]:20s}"
@@ -276,9 +287,7 @@ def lines_of_phases(phases: dict[str, dict[str, Any]]) -> list[str]:
 
 
 def markdown_of(results: Sequence[Result], pool: Pool, others: dict[str, dict[str, str]]) -> str:
-    """All tables of Results, and of the Pool of them: those of `markdown`, and of phases of all and
-    of each.
-    """
+    """Return all tables of Results and their Pool: errors, phases of all, and phases of each."""
     rows = [result.row for result in results]
     if len(results) == 1:
         return f"{markdown(rows, others)}\n{_as_markdown(_table_of_phases(results[0].phases))}"
@@ -315,7 +324,7 @@ def _table_of_phases(phases: dict[str, dict[str, Any]]) -> list[list[str]]:
 
 
 def _cell(value: float | None) -> str:
-    """A number, or nothing where there is none."""
+    """Return a number as text; empty if there is none."""
     return (
         ""
         if value is None or math.isnan(value)
@@ -324,13 +333,13 @@ def _cell(value: float | None) -> str:
 
 
 def _as_markdown(table: Sequence[Sequence[str]]) -> str:
-    """A table, its head_line first, whose first column is text."""
+    """Return a table with its heading first; its first column is text."""
     ruled = [table[0], ["---"] + ["---:"] * (len(table[0]) - 1), *table[1:]]
     return "".join("| " + " | ".join(cells) + " |\n" for cells in ruled)
 
 
 def read_others(path: str | Path) -> dict[str, dict[str, str]]:
-    """{peer and mode: {flight: 3D RMSE as text, or "diverged"}} of a CSV file.
+    """Return {peer and mode: {flight: 3D RMSE as text, or "diverged"}} of a CSV file.
 
     Raises InputError.
     """

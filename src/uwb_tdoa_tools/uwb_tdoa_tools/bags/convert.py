@@ -72,7 +72,7 @@ def convert(
         tdoa_unknown_anchor=int(np.count_nonzero(~known) + np.count_nonzero(~ranges_known)),
         left_out={name: len(columns["t"]) for name, columns in flight.extra.items()},
         meta=flight.meta,
-        apart=_apart(flight),
+        apart=_disjoint_sensors(flight),
     )
 
 
@@ -96,17 +96,19 @@ def _from_zero_on(flight: Flight) -> Flight:
     """The Flight without what its other sensors say before 0 s, where what locates the tag is not:
     a clock that was moved may begin there, and a bag has no place for it.
     """
-    changed, said = {}, list(flight.meta.get("remarks", ()))
+    changed, remarks = {}, list(flight.meta.get("remarks", ()))
     for name in _held(flight) if flight.start >= 0.0 else ():
         stream = getattr(flight, name)
         inside = stream.t >= 0.0
         if inside.any() and not inside.all():
             changed[name] = rows_of(stream, inside)
-            said.append(
+            remarks.append(
                 f"{name}: {np.count_nonzero(~inside)} samples before 0 s, which a bag has no "
                 "place for, are left out"
             )
-    return replace(flight, **changed, meta={**flight.meta, "remarks": said}) if changed else flight
+    return (
+        replace(flight, **changed, meta={**flight.meta, "remarks": remarks}) if changed else flight
+    )
 
 
 def _held(flight: Flight) -> list[str]:
@@ -122,18 +124,18 @@ def _overlaps(one: Timed, flight: Flight) -> bool:
     return one.t[-1] >= flight.start and one.t[0] <= flight.end
 
 
-def _apart(flight: Flight) -> list[str]:
+def _disjoint_sensors(flight: Flight) -> list[str]:
     """Sentences on sensors whose stamps have no time in common with those of the TDOAs, or ranges:
     they are on another clock.
     """
-    begin, end, said = flight.start, flight.end, []
+    begin, end, remarks = flight.start, flight.end, []
     radio = "TDOAs" if len(flight.tdoa) else "ranges"
     for name in _held(flight):
         t = getattr(flight, name).t
         if not _overlaps(getattr(flight, name), flight):
-            said.append(
+            remarks.append(
                 f"{name} runs from {t[0]:.1f} to {t[-1]:.1f} s, the {radio} from {begin:.1f} "
                 f"to {end:.1f} s: clocks that have no time in common; "
                 f"--time-offset {name}={begin - t[0]:.3f} lets both begin together, if they did."
             )
-    return said
+    return remarks

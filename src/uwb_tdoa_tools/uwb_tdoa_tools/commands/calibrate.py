@@ -9,7 +9,7 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, command_lines, options
-from ..calibrating import prospect, stopping, with_truth, without_truth
+from ..calibrating import blocking_errors, prospect, with_truth, without_truth
 from ..checking import report
 from ..checking.check import check, different_surveys
 from ..checking.recording import read_recording
@@ -148,7 +148,7 @@ def _checked(
                 checked[-1], (), estimator, command_lines.surveying(path, survey, effects)
             )
             cli.show(report.text(result))
-            sound = sound and not stopping(checked[-1], result.findings, std)
+            sound = sound and not blocking_errors(checked[-1], result.findings, std)
             progress.update()
     for finding in different_surveys(checked):
         cli.show(*report.lines(finding))

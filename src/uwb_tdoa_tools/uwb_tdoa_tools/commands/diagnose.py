@@ -139,7 +139,7 @@ def _diagnose(args: Namespace) -> None:
     )
     options.check_holdout((flight.name for flight in flights), (flight.name for flight in holdout))
     if args.reference in ("heights", "odometry"):
-        inputs.need_tdoas([*flights, *holdout], f"--reference {args.reference}")
+        inputs.require_tdoas([*flights, *holdout], f"--reference {args.reference}")
     for remark in remarks_on([*flights, *holdout]):
         cli.say("diagnose", remark)
     for option in ("marks", "odometry"):

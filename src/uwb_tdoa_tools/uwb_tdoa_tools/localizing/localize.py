@@ -18,7 +18,7 @@ from ..bags.bag import write_odometry
 from ..estimate import FlightEstimator
 from ..readers.inputs import Reading
 from . import pictures, residuals
-from .belief import GOOD, Belief, believe
+from .assessment import GOOD, Assessment, assess
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -81,19 +81,19 @@ class Located:
     """
 
     flight: str
-    belief: Belief
+    assessment: Assessment
     written: tuple[Path, ...]
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
-        belief = self.belief
+        assessment = self.assessment
         return {
             "flight": self.flight,
-            "verdict": belief.level,
-            **belief.figures,
-            "lost_spans": belief.lost,
-            "reasons": list(belief.reasons),
-            "remedies": list(belief.remedies),
+            "verdict": assessment.level,
+            **assessment.figures,
+            "lost_spans": assessment.lost,
+            "reasons": list(assessment.reasons),
+            "remedies": list(assessment.remedies),
             "files": [str(path) for path in self.written],
         }
 
@@ -122,7 +122,7 @@ class Localizer:
         flight, name = self.reading.read(recording), name_of(recording[0])
         run = self.estimator(flight)
         line = command_lines.surveying(*recording, self.effects)
-        belief = believe(flight, run, self.estimator, line)
+        assessment = assess(flight, run, self.estimator, line)
         written = []
 
         def path(end: str) -> Path:
@@ -132,8 +132,8 @@ class Localizer:
         odometry, left = run.odometry, residuals.of_run(flight, run)
         write_tum(path(".tum"), odometry.t, odometry.p, odometry.q)
         write_trajectory(path(".csv"), odometry)
-        title = f"{name}: {belief.sentences()[0].partition(';')[0]}"
-        pictures.draw(path(".png"), odometry, flight.anchors, belief.lost, title)
+        title = f"{name}: {assessment.sentences()[0].partition(';')[0]}"
+        pictures.draw(path(".png"), odometry, flight.anchors, assessment.lost, title)
         if self.bag and len(odometry):
             write_odometry(odometry, flight.anchors, path(".bag"), force=True)
         if self.left:
@@ -149,9 +149,9 @@ class Localizer:
                 f"{name}: squares of {self.zones:g} m",
             )
         if self.rerun is not None:
-            pictures.write_rerun(self.rerun, flight, odometry, left, belief.sentences())
+            pictures.write_rerun(self.rerun, flight, odometry, left, assessment.sentences())
             written.append(self.rerun)
-        return Located(name, belief, tuple(file for file in written if file.exists()))
+        return Located(name, assessment, tuple(file for file in written if file.exists()))
 
 
 def name_of(path: str | Path) -> str:
@@ -178,4 +178,4 @@ def check_names(recordings: Sequence[tuple[Path, str | Path | None]]) -> None:
 
 def all_good(located: Iterable[Located]) -> bool:
     """Whether all of some Located are good."""
-    return all(one.belief.level == GOOD for one in located)
+    return all(one.assessment.level == GOOD for one in located)

@@ -258,7 +258,7 @@ def write_recorded(path: Path, bag: str) -> None:
     """
     flight, odometry = read_bag(bag), read_odometry(bag)
     try:
-        said = read_fields(bag, "uwb/residual")
+        fields = read_fields(bag, "uwb/residual")
     except InputError:  # not recorded
         residuals = None
     else:
@@ -271,7 +271,7 @@ def write_recorded(path: Path, bag: str) -> None:
             "weight",
             "verdict",
         )
-        residuals = Residuals(*(said[name] for name in columns)) if len(said["t"]) else None
+        residuals = Residuals(*(fields[name] for name in columns)) if len(fields["t"]) else None
     write_rerun(
         path,
         flight,

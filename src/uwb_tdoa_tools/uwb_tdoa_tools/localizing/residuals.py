@@ -33,7 +33,7 @@ SPREAD = 6.0
 
 
 @dataclass(frozen=True)
-class OfPair:
+class PairResiduals:
     """Residuals of the TDOAs between two anchors, a before b, or of the ranges to one, which is
     both. t (n,) s; value, std (n,) m, of d_ab or of the range; explained (n,) bool, within three
     standard deviations.
@@ -83,7 +83,7 @@ def explained(residuals: Residuals) -> np.ndarray:
         return reached(residuals) & (residuals.innovation**2 <= 9.0 * residuals.variance)
 
 
-def by_pair(residuals: Residuals) -> list[OfPair]:
+def by_pair(residuals: Residuals) -> list[PairResiduals]:
     """Residuals of each pair of anchors, in the order of their ids."""
     there, fits = reached(residuals), explained(residuals)
     low, high = np.minimum(residuals.a, residuals.b), np.maximum(residuals.a, residuals.b)
@@ -94,7 +94,7 @@ def by_pair(residuals: Residuals) -> list[OfPair]:
     for rows in np.split(order, begins) if len(order) else ():
         a, b = int(low[rows[0]]), int(high[rows[0]])
         value, std = (sign * residuals.innovation)[rows], np.sqrt(residuals.variance[rows])
-        pairs.append(OfPair(a, b, residuals.t[rows], value, std, fits[rows]))
+        pairs.append(PairResiduals(a, b, residuals.t[rows], value, std, fits[rows]))
     return pairs
 
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.foundation.flight import Flight
 
-    from .names import Named
+    from .names import NamedAnchors
     from .streams import Streams
     from .tables import CsvTable
 
@@ -125,7 +125,7 @@ def parse_columns(text: str) -> dict[str, tuple[str, float]]:
 def read_columns(
     paths: Sequence[str | Path],
     columns: dict[str, tuple[str, float]],
-    named: Named,
+    named: NamedAnchors,
     salvage: bool = False,
 ) -> Flight:
     """Flight of CSV files with a header line each; each stream is taken from the one file that has
@@ -134,7 +134,7 @@ def read_columns(
     A row counts for a stream if any of its cells is filled: rows of several sensors may be mixed in
     one file, and each may have a time column of its own. A record with a cell that is empty or no
     number is left out and counted, in `meta["remarks"]`; if that is more than MOST_SKIPPED of the
-    records, the file is refused. columns : see `parse_columns`; named : Named, the anchors; salvage
+    records, the file is refused. columns : see `parse_columns`; named : NamedAnchors, the anchors; salvage
     : leave out records that are not finite, however many. Raises InputError, with the line of the
     first record that is left out.
     """
@@ -188,7 +188,7 @@ def _values(
     path: str | Path,
     table: CsvTable,
     streams: dict[str, dict[str, tuple[str, float]]],
-    named: Named,
+    named: NamedAnchors,
     remarks: list[str],
     salvage: bool,
 ) -> dict[str, dict[str, np.ndarray]]:

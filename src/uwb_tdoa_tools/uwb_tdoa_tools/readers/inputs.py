@@ -124,7 +124,7 @@ def survey_for(path: str | Path, survey: str | Path | None) -> str | Path | None
     return keys[fitting[-1]]
 
 
-def need_tdoas(flights: Iterable[Flight], what: str) -> None:
+def require_tdoas(flights: Iterable[Flight], what: str) -> None:
     """Raise InputError for one of some Flights that holds no TDOAs. what : words, that needs them."""
     for flight in flights:
         if not len(flight.tdoa):

@@ -20,7 +20,7 @@ LARGEST_ID = 65535
 
 
 @dataclass(frozen=True)
-class Named:
+class NamedAnchors:
     """anchors : Anchors; ids : {name as in the survey: id}, empty if they are called by their ids."""
 
     anchors: Anchors
@@ -38,8 +38,8 @@ class Named:
         return None if self.ids else _whole(text)
 
 
-def read_named(path: str | Path) -> Named:
-    """Named of a survey file of any form of `survey.read_entries`, with ids or names of any text.
+def read_named_anchors(path: str | Path) -> NamedAnchors:
+    """NamedAnchors of a survey file of any form of `survey.read_entries`, with ids or names of any text.
     The id is the number that a name ends with, if all end with different ones; else the line of the
     survey, from 0 on. Raises InputError, also for a survey that is certainly wrong.
     """
@@ -48,11 +48,11 @@ def read_named(path: str | Path) -> Named:
     return named
 
 
-def _read_named(path: str | Path) -> Named:
+def _read_named(path: str | Path) -> NamedAnchors:
     entries, frame = survey.read_entries(path)
     names = [entry.name for entry in entries]
     if all(map(survey.is_id, names)):
-        return Named(survey.anchors_of(path, entries, [int(name) for name in names], frame))
+        return NamedAnchors(survey.anchors_of(path, entries, [int(name) for name in names], frame))
     if len(set(names)) < len(names):
         raise InputError(
             f"{path}: anchor {next(name for name in names if names.count(name) > 1)!r} is "
@@ -62,14 +62,14 @@ def _read_named(path: str | Path) -> Named:
     ids = [int(end[1]) for end in ends if end]
     if len(set(ids)) < len(names) or max(ids) > LARGEST_ID:
         ids = list(range(len(names)))
-    return Named(survey.anchors_of(path, entries, ids, frame), dict(zip(names, ids)))
+    return NamedAnchors(survey.anchors_of(path, entries, ids, frame), dict(zip(names, ids)))
 
 
 def read_survey(path: str | Path) -> Anchors:
-    """Anchors of a survey file, see `read_named`: of those with names, under the ids that these
+    """Anchors of a survey file, see `read_named_anchors`: of those with names, under the ids that these
     get.
     """
-    return read_named(path).anchors
+    return read_named_anchors(path).anchors
 
 
 def _whole(text: str) -> int | None:

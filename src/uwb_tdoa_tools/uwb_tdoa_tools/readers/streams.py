@@ -81,7 +81,7 @@ def make_flight(
     meta["remarks"] += sentences(clock)
     if clock.jumps or clock.kept:
         meta["clock"] = clock.jumps, clock.outliers
-    streams = {key: _sound(key, columns, meta, salvage) for key, columns in wanted.items()}
+    streams = {key: _valid_rows(key, columns, meta, salvage) for key, columns in wanted.items()}
     streams = {key: columns for key, columns in streams.items() if len(columns["t"])}
     extra = {key: columns for key, columns in extra.items() if len(columns["t"])}
     reordered = {}
@@ -163,7 +163,7 @@ def _measured(columns: Columns, *ids: str) -> tuple[np.ndarray, ...]:
     return columns["t"], *(columns[name] for name in ids), columns["d"], variance
 
 
-def _sound(key: str, columns: Columns, meta: dict[str, Any], salvage: bool) -> Columns:
+def _valid_rows(key: str, columns: Columns, meta: dict[str, Any], salvage: bool) -> Columns:
     """The columns of a stream without what is not finite."""
     columns = {name: np.asarray(values) for name, values in columns.items()}
     numbers = dict(columns)
@@ -257,7 +257,7 @@ def _imu(gyro: Columns, acc: Columns, meta: dict[str, Any]) -> Imu:
     if len(t) != len(acc["t"]) or (np.abs(t - acc["t"]) > half_period).any():
         meta["imu_accel_interpolated"] = True
         inside = (t >= acc["t"][0]) & (t <= acc["t"][-1])
-        if losses := _losses_of(t, acc["t"], inside):
+        if losses := _imu_losses(t, acc["t"], inside):
             meta["losses"] = losses
         t, rate = t[inside], rate[inside]
         if not len(t):
@@ -271,7 +271,9 @@ def _imu(gyro: Columns, acc: Columns, meta: dict[str, Any]) -> Imu:
     return Imu(t, np.deg2rad(rate), force * GRAVITY)
 
 
-def _losses_of(gyro: np.ndarray, acc: np.ndarray, inside: np.ndarray) -> list[tuple[str, str, str]]:
+def _imu_losses(
+    gyro: np.ndarray, acc: np.ndarray, inside: np.ndarray
+) -> list[tuple[str, str, str]]:
     """[(cause, evidence, remedy)] of what is lost of sensors with stamps gyro (n,) and acc (m,) s;
     inside (n,) : whether a sample of the gyroscope counts.
     """

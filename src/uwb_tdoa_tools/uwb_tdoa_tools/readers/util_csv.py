@@ -89,8 +89,8 @@ def read_util_csv(
         }
     tdoa = streams["tdoa"]
     if salvage:
-        sound = np.isfinite(tdoa["a"]) & np.isfinite(tdoa["b"])
-        tdoa.update({name: values[sound] for name, values in tdoa.items()})
+        valid = np.isfinite(tdoa["a"]) & np.isfinite(tdoa["b"])
+        tdoa.update({name: values[valid] for name, values in tdoa.items()})
     tdoa["a"], tdoa["b"] = _ids(path, "idA", tdoa["a"]), _ids(path, "idB", tdoa["b"])
     if "pose" in streams and "qx" not in streams["pose"]:
         streams["pose"].update(

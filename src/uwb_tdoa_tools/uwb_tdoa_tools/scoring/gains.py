@@ -17,17 +17,17 @@ SAME = 0.005  # of the error: what rounds to no per cent
 
 
 def gain(before: float, after: float) -> float:
-    """Return the share of an error that is gone: above 0 where it falls, below 0 where it rises."""
+    """Return the relative reduction of an error; negative if the error rises."""
     return 1.0 - after / before
 
 
-def change_of(before: float, after: float) -> str:
+def change_in_words(before: float, after: float) -> str:
     """Return how an error changes: "falls by 13 %", "rises by 20 %" or "stays"."""
-    return by(gain(before, after))
+    return gain_in_words(gain(before, after))
 
 
-def by(gained: float) -> str:
-    """Return the same of a `gain`."""
+def gain_in_words(gained: float) -> str:
+    """Return a `gain` in the same words."""
     return (
         "stays"
         if abs(gained) < SAME
@@ -40,8 +40,12 @@ SHARES = 0.0, 0.5, 0.75, 1.0
 
 @dataclass(frozen=True)
 class Shrinkage:
-    """What flights left out say. share : of the prediction that is to be taken out; errors :
-    {flight: {share: 3D RMSE of the filter, m}}, under None without any correction.
+    """Share of a correction that cross-validation over flights supports.
+
+    Attributes
+    ----------
+    share : share of the prediction to subtract.
+    errors : {flight: {share: 3D RMSE of the filter, m}}; the key None is without correction.
     """
 
     share: float
@@ -49,23 +53,21 @@ class Shrinkage:
 
     @property
     def gains(self) -> np.ndarray:
-        """(n,): by how much the error of each flight gets smaller with the share, relative to that
-        without correction.
-        """
+        """Return the `gain` of each flight with the share: (n,)."""
         return np.array([gain(of[None], of[self.share]) for of in self.errors.values()])
 
     def as_text(self) -> str:
-        """One sentence."""
+        """Return the expected gain as one sentence."""
         gains = self.gains
         return (
-            f"expected of flights like these: the 3D RMSE {by(gains.mean())} +- "
+            f"expected of flights like these: the 3D RMSE {gain_in_words(gains.mean())} +- "
             f"{100.0 * _spread(gains):.0f} % "
-            f"(of {len(gains)} flights, each left out; on the worst it {by(gains.min())}), "
+            f"(of {len(gains)} flights, each left out; on the worst it {gain_in_words(gains.min())}), "
             f"with {self.share:g} of what is predicted taken out"
         )
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the figures for JSON."""
         gains = self.gains
         errors = {
             name: {str(share): error for share, error in of.items()}
@@ -81,11 +83,12 @@ class Shrinkage:
 
 
 def best_share(errors: Errors) -> float:
-    """The share whose error, relative to that without correction, is smallest a standard deviation
-    above its mean over the flights left out. errors : as of Shrinkage.
+    """Return the share with the smallest error, relative to no correction, one deviation above the
+    mean.
 
-    The mean alone takes all of a model that gains much on three flights and loses a little on the
-    fourth; the flights to come are more varied than these.
+    Mean and standard deviation are over the left-out flights in `errors`, see Shrinkage. The mean
+    alone would favour a model that gains much on three flights and harms the fourth. Future flights
+    vary more than these.
     """
     ratios = {
         share: np.array([of[share] / of[None] for of in errors.values()])

@@ -24,16 +24,13 @@ if TYPE_CHECKING:
     Spans = Sequence[tuple[float, float]]  # from when to when, s
 
 
-VALID_FOR = (
-    0.1  # s, and SPARSE times the usual interval of the odometry, that an estimate stands for
-)
+# s that an estimate stands for; at least SPARSE times the usual interval of the odometry
+VALID_FOR = 0.1
 EVERYTHING = ((-math.inf, math.inf),)  # spans, s
 
 
 class Estimate(PoseColumns, Protocol):
-    """Poses, and how far to trust them: covariance (n, k, k), its first three rows and columns of
-    the position, m^2.
-    """
+    """Poses with the covariance (n, k, k), whose first three rows and columns are the position, m^2."""
 
     @property
     def covariance(self) -> np.ndarray: ...
@@ -41,7 +38,7 @@ class Estimate(PoseColumns, Protocol):
 
 LOST = 1.0  # m; a larger error is no estimate
 LOST_SHARE = 0.25  # of the airborne time; more is a diverged run
-# s without a true pose, and SPARSE times their usual interval, over which none is interpolated
+# s without a true pose, and SPARSE times the usual interval: the truth is not interpolated there
 HOLE = 0.5
 SPARSE = 4.0
 START_GRACE = 1.0  # s into the airborne part by which the first estimate must have come
@@ -49,18 +46,20 @@ READY = 100  # TDOAs that a filter may take to begin with
 
 
 def rms(values: np.ndarray) -> float:
-    """Root mean square; NaN of nothing."""
+    """Return the root mean square; NaN without values."""
     return or_nan(lambda v: np.sqrt(np.mean(v**2)), values)
 
 
 def or_nan(function: Callable[[np.ndarray], float], values: np.ndarray) -> float:
-    """function(values); NaN of nothing."""
+    """Return function(values); NaN without values."""
     return float(function(values)) if len(values) else math.nan
 
 
 def judged_part(truth: Truth) -> tuple[str, float, float]:
-    """(name, first, last) of the phase that the figures of a whole run are of: in the air; moving,
-    where that never is; or all, where the tag does not move at all.
+    """Return (name, first, last) of the phase that the figures of a whole run are from.
+
+    It is the time in the air. A tag that is never in the air is scored while it moves, a tag that
+    never moves over the whole recording. Stamps in s.
     """
     found = {
         "in_the_air": in_the_air(truth),
@@ -72,17 +71,22 @@ def judged_part(truth: Truth) -> tuple[str, float, float]:
 
 
 def position_at(t: np.ndarray, truth: PoseColumns) -> np.ndarray:
-    """True positions at stamps t (n,), s: (n, 3) m, linear in between."""
+    """Interpolate the position linearly at stamps t (n,), s: (n, 3) m."""
     return np.stack([np.interp(t, truth.t, truth.p[:, k]) for k in range(3)], axis=1)
 
 
 def position_errors(
     odometry: Estimate, truth: Truth, first: float, last: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Errors from `first` to `last`, s, the truth interpolated to the stamps of the estimate,
-    except in holes of it.
+    """Return the position errors from `first` to `last`, s.
 
-    Returns (t (n,) s, error (n, 3) m, covariance (n, 3, 3) m^2 of the position).
+    The truth is interpolated at the stamps of the estimate, except in holes of the truth.
+
+    Returns
+    -------
+    t : (n,) s.
+    error : (n, 3) m, estimate minus truth, in the world frame.
+    covariance : (n, 3, 3) m^2, of the position.
     """
     chosen = (odometry.t >= first) & (odometry.t <= last) & ~_in_holes(odometry.t, truth.t)
     t = odometry.t[chosen]
@@ -90,9 +94,7 @@ def position_errors(
 
 
 def _in_holes(t: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Which stamps t (n,) s lie in holes between the stamps `known` (m,), s, of the truth: (n,)
-    bool.
-    """
+    """Return which stamps t (n,) s lie in a hole of the truth with stamps `known` (m,) s: (n,) bool."""
     if len(known) < 2:
         return np.zeros(len(t), bool)
     k = np.clip(np.searchsorted(known, t, side="right") - 1, 0, len(known) - 2)
@@ -100,19 +102,19 @@ def _in_holes(t: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 
 def _holes(known: np.ndarray) -> np.ndarray:
-    """After which of the stamps `known` (m,), s, of a truth is a hole: (m - 1,) bool."""
+    """Return after which stamps `known` (m,) s of a truth a hole follows: (m - 1,) bool."""
     apart = np.diff(known)
     return apart > max(HOLE, SPARSE * np.median(apart)) if len(apart) else np.zeros(0, bool)
 
 
 def _known_spans(known: np.ndarray) -> np.ndarray:
-    """(k, 2) s: from where to where the stamps `known` (m,), s, of a truth have no holes."""
+    """Return the spans without holes, (k, 2) s, of the stamps `known` (m,) s of a truth."""
     last = np.append(_holes(known), True)
     return np.column_stack([known[np.append(True, last[:-1])], known[last]])
 
 
 def _inside(part: Any, spans: Spans) -> Any:
-    """What of a Truth or an Odometry is stamped within spans ((first, last), ...), s."""
+    """Return the rows of a Truth or an Odometry within spans ((first, last), ...), s."""
     if not (np.diff(part.t) >= 0.0).all():
         return rows_of(
             part, np.any([(part.t >= first) & (part.t <= last) for first, last in spans], axis=0)
@@ -124,8 +126,15 @@ def _inside(part: Any, spans: Spans) -> Any:
 
 
 def nees(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Normalised estimation error squared, e' P^-1 e: (n,), expected 3 for an honest 3D covariance
-    (Bar-Shalom et al., Estimation with Applications to Tracking and Navigation, sec. 5.4).
+    """Return the normalised estimation error squared, e' P^-1 e: (n,).
+
+    An honest 3D covariance gives 3 on average (Bar-Shalom et al., Estimation with Applications to
+    Tracking and Navigation, sec. 5.4). A singular covariance gives NaN.
+
+    Parameters
+    ----------
+    error : (n, 3) m.
+    covariance : (n, 3, 3) m^2.
     """
     out = np.full(len(error), np.nan)
     usable = np.linalg.det(covariance) > 0.0
@@ -135,22 +144,27 @@ def nees(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
 
 def nis(residuals: Residuals) -> np.ndarray:
-    """Normalised innovation squared of every measurement that reached the filter, outliers in full:
-    (n,), expected 1.
+    """Return the normalised innovation squared of every measurement in the filter: (n,).
+
+    Outliers count in full. An honest filter gives 1 on average.
     """
     there = reached(residuals)
     return residuals.innovation[there] ** 2 / residuals.variance[there]
 
 
 def reached(residuals: Residuals) -> np.ndarray:
-    """Which measurements had a residual in the filter: (n,) bool."""
+    """Return which measurements had an innovation in the filter: (n,) bool."""
     return np.isin(residuals.verdict, (USED, REJECTED, COMPENSATED))
 
 
 def summary(errors: np.ndarray, normalised: np.ndarray, innovations: np.ndarray) -> dict[str, Any]:
-    """The figures of one run, or of several pooled: errors (n, 3) m, NEES (n,), NIS (k,).
+    """Return the figures of one run, or of several pooled, as a dict of floats.
 
-    A dict of floats.
+    Parameters
+    ----------
+    errors : (n, 3) m.
+    normalised : (n,) NEES.
+    innovations : (k,) NIS.
     """
     distance = np.linalg.norm(errors, axis=1)
     finite = np.isfinite(distance)
@@ -171,18 +185,26 @@ def summary(errors: np.ndarray, normalised: np.ndarray, innovations: np.ndarray)
 
 
 def coverage(error: np.ndarray, covariance: np.ndarray, sigmas: float = 3.0) -> np.ndarray:
-    """Share of errors within `sigmas` predicted standard deviations, per axis: (3,); honest and
-    Gaussian: 0.997.
+    """Return the share of errors within `sigmas` predicted standard deviations, per axis: (3,).
+
+    An honest Gaussian estimate gives 0.997 for 3 sigmas.
     """
     std = np.sqrt(np.einsum("nii->ni", covariance))
     return np.mean(np.abs(error) <= sigmas * std, axis=0) if len(error) else np.full(3, np.nan)
 
 
 class ErrorSeries:
-    """Errors of an odometry wherever there is ground truth. t (n,) s; error (n, 3) m; nees (n,);
-    covariance (n, 3, 3) m^2; step (n,) m, by how much the error differs from that of the estimate
-    before, 0 for the first; known : [(begin, end)], s, with ground truth;
-    covered : [(begin, end)], s, for which there is an estimate.
+    """Errors of an odometry over the whole ground truth.
+
+    Attributes
+    ----------
+    t : (n,) s.
+    error : (n, 3) m.
+    nees : (n,).
+    covariance : (n, 3, 3) m^2.
+    step : (n,) m, change of the error from the previous estimate; 0 for the first.
+    known : (k, 2) s, spans with ground truth.
+    covered : (m, 2) s, spans with an estimate.
     """
 
     def __init__(
@@ -194,7 +216,7 @@ class ErrorSeries:
         stamps: np.ndarray,
         known: np.ndarray,
     ) -> None:
-        """stamps (m,) : of the odometry, s, including those that cannot be judged."""
+        """Keep the errors. `stamps` (m,) s also holds the estimates without ground truth."""
         self.t, self.error, self.covariance, self.nees, self.known = (
             t,
             error,
@@ -208,8 +230,9 @@ class ErrorSeries:
         self.covered = np.column_stack([stamps, np.minimum(ends, np.append(stamps[1:], np.inf))])
 
     def figures(self, begin: float, end: float, spans: Spans = EVERYTHING) -> dict[str, Any]:
-        """A dict of one phase, from `begin` to `end`, s; what is not in `spans`, ((first, last),
-        ...) s, does not count.
+        """Return the figures of one phase, from `begin` to `end`, s, as a dict.
+
+        Only the parts within `spans`, ((first, last), ...) s, count.
         """
         parts = [(max(begin, first), min(end, last)) for first, last in spans]
         parts = [(first, last) for first, last in parts if last > first]
@@ -238,7 +261,7 @@ class ErrorSeries:
 
 
 def _overlap(spans: np.ndarray, begin: float, end: float) -> float:
-    """s of spans (n, 2) that lie from `begin` to `end`."""
+    """Return the seconds of spans (n, 2) s that lie from `begin` to `end`."""
     return float(
         np.sum(np.maximum(0.0, np.minimum(spans[:, 1], end) - np.maximum(spans[:, 0], begin)))
     )
@@ -247,9 +270,15 @@ def _overlap(spans: np.ndarray, begin: float, end: float) -> float:
 class Score:
     """Errors of one run against its ground truth.
 
-    part : what they are of, see judged_part; t (n,) s; p (n, 3) m, true positions; error (n, 3) m;
-        covariance (n, 3, 3) m^2;
-    first, last : s, of that part.
+    Attributes
+    ----------
+    part : name of the scored phase, see `judged_part`.
+    first, last : s, of that phase.
+    t : (n,) s.
+    p : (n, 3) m, true positions.
+    error : (n, 3) m.
+    covariance : (n, 3, 3) m^2.
+    nis : (k,).
     """
 
     def __init__(
@@ -262,14 +291,17 @@ class Score:
         spans: Spans | None = None,
         reach: Spans = EVERYTHING,
     ) -> None:
-        """name : of the flight; odometry : Odometry; truth : Truth; residuals : Residuals or None;
-        heard : (n,) s, stamps of the TDOAs, or None; spans : ((first, last), ...) s, what of the
-        part counts, None for all; reach : the same of the phases.
+        """Compare an odometry with the truth.
+
+        Parameters
+        ----------
+        name : name of the flight.
+        heard : (n,) s, stamps of the TDOAs; gives the time to the first estimate.
+        spans : ((first, last), ...) s, parts of the scored phase that count; None for all.
+        reach : the same for the figures of all phases.
         """
         self.name, self._whole, self._heard, self._reach = name, (odometry, truth), heard, reach
-        if (
-            spans is not None
-        ):  # both, as the truth would be interpolated over what lies between spans
+        if spans is not None:  # the truth must not be interpolated between spans
             truth, odometry = (_inside(part, spans) for part in (truth, odometry))
         self.part, self.first, self.last = judged_part(truth)
         self.t, self.error, self.covariance = position_errors(
@@ -280,17 +312,17 @@ class Score:
 
     @cached_property
     def nees(self) -> np.ndarray:
-        """(n,), of each error."""
+        """Return the NEES of each error: (n,)."""
         return nees(self.error, self.covariance)
 
     @property
     def rmse_3d(self) -> float:
-        """m: that of `row`, alone."""
+        """Return the 3D RMSE, m, as in `row`."""
         return rms(np.linalg.norm(self.error, axis=1))
 
     @cached_property
     def series(self) -> ErrorSeries:
-        """ErrorSeries: the errors of all of the recording."""
+        """Return the errors of the whole recording."""
         odometry, truth = self._whole
         t, error, covariance = position_errors(odometry, truth, truth.t[0], truth.t[-1])
         return ErrorSeries(
@@ -298,16 +330,17 @@ class Score:
         )
 
     def phases(self) -> dict[str, dict[str, Any]]:
-        """The figures of each phase of this run: {name: dict of `ErrorSeries.figures`}."""
+        """Return {name of the phase: figures, see `ErrorSeries.figures`}."""
         return {
             name: self.series.figures(*span, self._reach)
             for name, span in phases(self._whole[1]).items()
         }
 
     def row(self) -> dict[str, Any]:
-        """The figures of this run, of its part: a dict. "late_start": nothing but that has made it
-        a diverged run; "ready_delay": s from the 100th TDOA to the first estimate, below 0 if that
-        came before.
+        """Return the figures of the scored phase as a dict.
+
+        "late_start": the run counts as diverged only because it started late. "ready_delay": s from
+        the 100th TDOA to the first estimate, negative if the estimate came first.
         """
         out = {"flight": self.name, "part": self.part, **summary(self.error, self.nees, self.nis)}
         late = not len(self.t) or self.t[0] > self.first + START_GRACE
@@ -318,8 +351,9 @@ class Score:
         return {**out, **coverage_figures(coverage(self.error, self.covariance))}
 
     def _ready_delay(self) -> float:
-        """s from the 100th TDOA to the first estimate; NaN where nobody knows the TDOAs, or there
-        are fewer, inf without an estimate.
+        """Return the seconds from the 100th TDOA to the first estimate.
+
+        NaN with fewer TDOAs or unknown TDOAs; inf without an estimate.
         """
         stamps = self._whole[0].t
         if self._heard is None or len(self._heard) < READY:
@@ -327,7 +361,7 @@ class Score:
         return float(stamps[0] - np.sort(self._heard)[READY - 1]) if len(stamps) else math.inf
 
     def result(self) -> Result:
-        """Result: this run as the figures of many need it."""
+        """Return the Result of this run, from which `Pool` makes the figures of many runs."""
         distance, count = np.linalg.norm(self.error, axis=1), len(self.t)
         sums = {
             f"square_{axis}": float(np.sum(self.error[:, k] ** 2)) for k, axis in enumerate("xyz")
@@ -351,7 +385,7 @@ class Score:
 
 
 def pooled(scores: Iterable[Score]) -> dict[str, Any]:
-    """The figures of all samples of several Scores together, see Pool: a dict."""
+    """Return the figures of all samples of several Scores together, see `Pool.figures`."""
     pool = Pool()
     for score in scores:
         pool.add(score.result())

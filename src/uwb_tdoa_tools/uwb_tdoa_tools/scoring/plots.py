@@ -1,4 +1,4 @@
-"""Pictures. Importing this chooses a drawing backend that needs no screen."""
+"""Pictures of errors, and labels of anchors. The import selects a backend without a screen."""
 
 from __future__ import annotations
 
@@ -37,9 +37,7 @@ SHADES = {  # of phases that follow one another
 
 
 def plot_error(score: Score, odometry: Estimate, truth: Truth, path: str | Path) -> None:
-    """Error per axis with its 3-sigma band over all of the recording, its phases shaded, and the
-    path from above and from the side, to an image file.
-    """
+    """Draw the error per axis with its 3-sigma band, phases, and the path, to an image file."""
     figure, axes = plt.subplots(3, 2, figsize=(13, 8), width_ratios=(3, 2), layout="constrained")
     series, found = score.series, score.phases()
     std = np.sqrt(np.einsum("nii->ni", series.covariance))
@@ -90,9 +88,7 @@ def plot_error(score: Score, odometry: Estimate, truth: Truth, path: str | Path)
 
 
 def plot_comparison(flight: Flight, scores: Sequence[Score], path: str | Path) -> None:
-    """3D error of several Scores of one Flight over time, and the paths they tell from above; to an
-    image file.
-    """
+    """Draw the 3D errors of several Scores of one Flight, and their paths, to an image file."""
     assert flight.truth is not None
     figure, (over_time, above) = plt.subplots(
         1, 2, figsize=(13, 5), width_ratios=(3, 2), layout="constrained"
@@ -134,7 +130,7 @@ _WIDE, _HIGH = 0.62, 1.15  # of the size of the letters: a letter, and a line
 
 
 def labels(ids: Sequence[int], places: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield (label, (2,) m) of ids at places (n, 2) m; those that would cover each other have one."""
+    """Yield (label, (2,) m) of ids at places (n, 2) m; labels that would overlap become one."""
     left = list(range(len(ids)))
     while left:
         here = [k for k in left if np.linalg.norm(places[k] - places[left[0]]) < TOGETHER]
@@ -142,12 +138,13 @@ def labels(ids: Sequence[int], places: np.ndarray) -> Iterator[tuple[str, np.nda
         left = [k for k in left if k not in here]
 
 
-def put_labels(
+def draw_labels(
     ax: Axes, ids: Sequence[int], places: np.ndarray, avoided: np.ndarray, colour: str = "k"
 ) -> None:
-    """Write ids beside places (n, 2) m: each label where it covers no place, none of the avoided
-    (m, 2) m, no other label and no edge of the axes, as far as there is room. The figure must have
-    its layout.
+    """Write ids beside places (n, 2) m.
+
+    A label avoids places, the points `avoided` (m, 2) m, other labels and the edges of the axes, as
+    far as there is room. The figure must have its layout.
     """
     if len(ids) > MOST:
         return

@@ -18,14 +18,18 @@ if TYPE_CHECKING:
     Spans = Sequence[tuple[float, float]]  # from when to when, s
 
 
-RATIO = 1.01  # of the limits of a bin of a histogram
-SMALLEST = 1e-9  # what is smaller, counts as this
+RATIO = 1.01  # ratio of the limits of a bin
+SMALLEST = 1e-9  # smaller samples count as this
 
 
 @dataclass
 class Distribution:
-    """How many samples, their sum, their largest, and bins : {k: how many are from RATIO**k to
-    RATIO**(k + 1)}.
+    """Distribution of samples as a histogram whose size does not depend on their number.
+
+    Attributes
+    ----------
+    count, total, largest : number, sum and maximum of the samples.
+    bins : {k: number of samples from RATIO**k to RATIO**(k + 1)}.
     """
 
     count: int
@@ -35,7 +39,7 @@ class Distribution:
 
     @classmethod
     def of(cls, values: np.ndarray | Sequence[float]) -> Distribution:
-        """Of values (n,), not below 0; NaN makes all figures NaN."""
+        """Count values (n,) of at least 0; NaN makes all figures NaN."""
         if not len(values):
             return cls(0, 0.0, -math.inf, Counter())
         sizes = np.clip(np.nan_to_num(values), SMALLEST, 1.0 / SMALLEST)
@@ -50,19 +54,19 @@ class Distribution:
         )
 
     def __add__(self, other: Distribution) -> Distribution:
-        largest = float(np.max([self.largest, other.largest]))  # NaN of NaN
+        largest = float(np.max([self.largest, other.largest]))  # NaN if one is NaN
         return Distribution(
             self.count + other.count, self.total + other.total, largest, self.bins + other.bins
         )
 
     @property
     def mean(self) -> float:
-        """NaN of nothing."""
+        """Return the mean; NaN without samples."""
         return self.total / self.count if self.count else math.nan
 
     @property
     def median(self) -> float:
-        """To 1 %; NaN of nothing."""
+        """Return the median to 1 %; NaN without samples."""
         if not self.count or math.isnan(self.total):
             return math.nan
         half, below = 0.5 * self.count, 0
@@ -73,7 +77,7 @@ class Distribution:
         raise AssertionError("the bins hold fewer than were counted")
 
     def as_list(self) -> list[Any]:
-        """Plain numbers; NaN and infinity are texts."""
+        """Return plain numbers for JSON; floats that may be NaN or infinite become texts."""
         return [
             self.count,
             repr(self.total),
@@ -83,21 +87,21 @@ class Distribution:
 
     @classmethod
     def from_list(cls, numbers: list[Any]) -> Distribution:
-        """Of what `as_list` gives."""
+        """Restore a Distribution from `as_list`."""
         count, total, largest, bins = numbers
         return cls(count, float(total), float(largest), Counter(dict(zip(bins[::2], bins[1::2]))))
 
 
 class PooledErrors:
-    """The figures of one phase of several runs, one run after the other."""
+    """The figures of one phase, pooled over runs."""
 
     def __init__(self) -> None:
         self._runs, self._largest = 0, {"max_3d": math.nan, "step": math.nan}
-        self._sums: dict[str, Any] = Counter()  # of numbers, not all of them whole
+        self._sums: dict[str, Any] = Counter()  # numbers, some of them float
         self._of_runs = {name: Distribution.of([]) for name in ("rmse_3d", "nees_mean")}
 
     def add(self, figures: dict[str, Any]) -> None:
-        """Count the figures of one run."""
+        """Count the figures of one run, see `ErrorSeries.figures`."""
         count, self._runs = figures["count"], self._runs + 1
         added = {
             name: figures[name]
@@ -119,8 +123,9 @@ class PooledErrors:
         self._sums.update(added)
 
     def figures(self) -> dict[str, Any]:
-        """A dict: those of `ErrorSeries.figures` of all samples, and median and largest of the
-        runs'. Medians are right to 1 %.
+        """Return the figures of all samples, and median and maximum over the runs, as a dict.
+
+        Medians are accurate to 1 %.
         """
         sums, count = self._sums, self._sums["count"]
         out: dict[str, Any] = {"runs": self._runs, "duration": sums["duration"], "count": count}
@@ -135,20 +140,25 @@ class PooledErrors:
 
 
 def _larger(one: float, other: float) -> float:
-    """The larger of two, of which the first is NaN where there was none."""
+    """Return the larger number; a NaN in `one` means that there was none yet."""
     return other if math.isnan(one) else float(np.max([one, other]))
 
 
-ALIGN = "none", "time", "frame"  # what of a ground truth is moved before it judges
-FIGURES = 3  # version of what a Result holds
+ALIGN = "none", "time", "frame"  # how far a ground truth is aligned before scoring
+FIGURES = 3  # version of the content of a Result
 
 
 @dataclass(frozen=True)
 class Result:
-    """What a run leaves for the figures of many, of a size that does not depend on its length. row
-    : Score.row; sums : {name: sum over its samples}; distributions : {quantity: Distribution};
-    phases : Score.phases; aligned : where its ground truth is beside the estimate, as of
-    `Alignment.as_dict`, and its 3D RMSE with each of ALIGN, m; {} where nobody looked.
+    """One run as a record whose size does not depend on its length.
+
+    Attributes
+    ----------
+    row : figures, see `Score.row`.
+    sums : {name: sum over the samples}.
+    distributions : {quantity: Distribution}.
+    phases : figures of each phase, see `Score.phases`.
+    aligned : `Alignment.as_dict` and the 3D RMSE, m, with each of ALIGN; empty if not computed.
     """
 
     row: dict[str, Any]
@@ -158,7 +168,7 @@ class Result:
     aligned: dict[str, Any] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON, without loss."""
+        """Return a dict for JSON, without loss."""
         parts = {name: part.as_list() for name, part in self.distributions.items()}
         of_phases = {name: _as_texts(figures) for name, figures in self.phases.items()}
         return {
@@ -171,7 +181,7 @@ class Result:
 
     @classmethod
     def from_dict(cls, content: dict[str, Any]) -> Result:
-        """Of what `as_dict` gives."""
+        """Restore a Result from `as_dict`."""
         parts = {
             name: Distribution.from_list(numbers)
             for name, numbers in content["distributions"].items()
@@ -186,15 +196,15 @@ class Result:
         )
 
     def as_json(self) -> dict[str, Any]:
-        """All figures of the run, as JSON takes them."""
+        """Return all figures of the run for JSON; NaN becomes null."""
         return as_json({**self.row, "phases": self.phases, "aligned": self.aligned})
 
 
 class Pool:
-    """The figures of all samples of several runs together, one run after the other."""
+    """Pool the samples of several runs, one run after the other."""
 
     def __init__(self) -> None:
-        self._sums: dict[str, Any] = Counter()  # of numbers, not all of them whole
+        self._sums: dict[str, Any] = Counter()  # numbers, some of them float
         self._distributions: dict[str, Distribution] = {}
         self._runs, self._total, self._largest = 0, 0.0, 0.0
         self._row: dict[str, Any] = {"start_delay": 0.0, "diverged": 0, "late_start": 0}
@@ -203,7 +213,7 @@ class Pool:
         self._aligned: dict[str, Any] = Counter()
 
     def add(self, result: Result) -> None:
-        """Count a Result."""
+        """Count the Result of one run."""
         row, known = result.row, self._distributions
         self._runs += 1
         self._sums.update(result.sums)
@@ -216,9 +226,7 @@ class Pool:
             float(np.max([self._largest, row["rmse_3d"]])),
         )
         self._row["start_delay"] = max(self._row["start_delay"], row["start_delay"])
-        self._ready = float(
-            np.fmax(self._ready, row["ready_delay"])
-        )  # NaN of those that cannot tell
+        self._ready = float(np.fmax(self._ready, row["ready_delay"]))  # NaN if unknown
         for key in ("diverged", "late_start"):
             self._row[key] += row[key]
 
@@ -230,18 +238,18 @@ class Pool:
 
     @property
     def aligned(self) -> dict[str, float]:
-        """{one of ALIGN: mean 3D RMSE of the runs, m, with that of their ground truth moved}; NaN
-        where it is of another clock.
-        """
+        """Return {one of ALIGN: mean 3D RMSE of the runs, m}; NaN for a truth on another clock."""
         return {how: total / self._runs for how, total in self._aligned.items()}
 
     def phases(self) -> dict[str, dict[str, Any]]:
-        """{name of a phase: dict of `PooledErrors.figures`}, of those that any of the runs has."""
+        """Return {name: figures, see `PooledErrors.figures`} of the phases that any run has."""
         return {name: self._phases[name].figures() for name in TITLES if name in self._phases}
 
     def figures(self) -> dict[str, Any]:
-        """A dict: those of `summary`, coverage, mean and largest of the runs' 3D RMSE, phases.
-        Medians are right to 1 %. Of one run at least.
+        """Return the figures of at least one run as a dict.
+
+        They are those of `summary`, the coverage, mean and maximum of the 3D RMSE over runs, and
+        the phases. Medians are accurate to 1 %.
         """
         distance, count = self._distributions["distance"], self._distributions["distance"].count
         shares = {name: total / count if count else math.nan for name, total in self._sums.items()}
@@ -267,14 +275,14 @@ class Pool:
 
 
 def _as_texts(numbers: dict[str, Any]) -> dict[str, Any]:
-    """Floats as texts: JSON has no NaN."""
+    """Return a dict with floats as texts, because JSON has no NaN."""
     return {
         key: repr(value) if isinstance(value, float) else value for key, value in numbers.items()
     }
 
 
 def _from_texts(numbers: dict[str, Any]) -> dict[str, Any]:
-    """Of what `_as_texts` gives; those that were texts before stay."""
+    """Restore floats from `_as_texts`."""
     return {
         key: float(value) if isinstance(value, str) and key not in ("flight", "part") else value
         for key, value in numbers.items()
@@ -282,4 +290,5 @@ def _from_texts(numbers: dict[str, Any]) -> dict[str, Any]:
 
 
 def coverage_figures(shares: np.ndarray) -> dict[str, float]:
+    """Name the shares (3,) of `coverage` for a dict of figures."""
     return {f"coverage_3sigma_{axis}": float(share) for axis, share in zip("xyz", shares)}

@@ -131,8 +131,8 @@ def read_paths(
                 "have such a topic."
             )
         found = read_odometry(flight.meta["bag"], namespace, topics={"odometry": source})
-        sound = np.isfinite(found.p).all(axis=1)
-        out.append(OdometryPath(flight.name, found.t[sound], found.p[sound], drift))
+        valid = np.isfinite(found.p).all(axis=1)
+        out.append(OdometryPath(flight.name, found.t[valid], found.p[valid], drift))
     return out
 
 

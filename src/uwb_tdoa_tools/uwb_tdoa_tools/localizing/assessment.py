@@ -41,7 +41,7 @@ LASTING = 0.5
 
 
 @dataclass(frozen=True)
-class Belief:
+class Assessment:
     """level : GOOD, DOUBTFUL or BAD; figures : {name: number}; lost : [(begin, end)] s, spans in
     which the tag was lost; reasons : sentences on why it is not good; remedies : sentences on what
     would make it better.
@@ -81,13 +81,13 @@ class Belief:
         return [f"{self.level}: {within}; {fits}", *offset, *self.reasons, *self.remedies]
 
 
-def believe(
+def assess(
     flight: Flight,
     run: Run,
     estimator: FlightEstimator = FlightEstimator(),
     line: str | None = None,
-) -> Belief:
-    """Belief in a Run of a FlightEstimator over a Flight, whose ground truth is not used. line : as
+) -> Assessment:
+    """Assessment in a Run of a FlightEstimator over a Flight, whose ground truth is not used. line : as
     of `check`.
     """
     odometry, left = run.odometry, residuals.of_run(flight, run)
@@ -111,7 +111,7 @@ def believe(
     remedies = [f"{finding.cause}: {finding.remedy}" for finding in faults + moved]
     if not len(odometry) or not there.any():
         reasons.append(f"the filter found no place that explains the {_measured(figures)}")
-        return Belief(BAD, figures, [], tuple(reasons), tuple(remedies))
+        return Assessment(BAD, figures, [], tuple(reasons), tuple(remedies))
     figures |= _deviation(odometry)
     figures["explained"] = float(residuals.explained(left)[there].mean())
     figures["nis"] = float(nis(left).mean())
@@ -124,7 +124,7 @@ def believe(
         reasons.append(reason)
         worse = BAD if worse == BAD else DOUBTFUL
     remedies += _remedies(flight, left, figures, estimator.effects is not None)
-    return Belief(worse, figures, lost, tuple(reasons), tuple(remedies))
+    return Assessment(worse, figures, lost, tuple(reasons), tuple(remedies))
 
 
 def _measured(figures: Mapping[str, Any]) -> str:
