@@ -34,22 +34,34 @@ if TYPE_CHECKING:
     from .checking.recording import Recording
 
 
-# the rule of `check` of a survey that does not fit, though no other mistake explains it
+# the rule of `check` for a survey that does not fit without another mistake
 MISFIT = "survey_misfit"
-# standard deviations of a coordinate that anchors may be off by, in the median, and be of the same
-# room
+# largest median shift of the anchors, in standard deviations, that a calibration can correct
 OFF = 3.0
-# slow innovations before over those after, where it took no part, that tell without ground truth
-# that a calibration does good
+# smallest ratio of the slow innovations before and after, on hold-out data without ground truth
 GAINED = 1.5
-FITTED = 2.0 / 3.0  # of the time of a single flight without ground truth; the rest judges
+FITTED = (
+    2.0 / 3.0
+)  # share of the last flight that is fitted without a hold-out flight; the rest validates
+SECONDS = 60.0  # of a flight that are looked at
+MOVES = 0.25  # smallest extent of a path along an axis, relative to the anchors
+ENOUGH = 0.5  # share of the coordinates that must improve
+STREAMS = "tdoa", "imu", "truth", *AIDS
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """anchors : Anchors; effects : EffectSet; tdoa_std : m, for the filter, or None; before, after
-    : m, of what `measure` says, on what `judged_on` says; why_not : a sentence on why it is not to
-    be used, or None; text : what the step that found it says.
+    """A calibration and its validation.
+
+    Attributes
+    ----------
+    anchors, effects : calibrated.
+    tdoa_std : m, for the filter, or None.
+    measure : name of the figure that validates it.
+    before, after : m, this figure on the hold-out data.
+    judged_on : names of the hold-out data.
+    why_not : sentence on why it must not be used, or None.
+    text : report of the step that found it.
     """
 
     anchors: Anchors
@@ -63,7 +75,7 @@ class Calibration:
     text: str
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the figures for JSON."""
         return {
             "offered": self.why_not is None,
             "why_not": self.why_not,
@@ -75,7 +87,7 @@ class Calibration:
         }
 
     def as_text(self) -> str:
-        """What it is worth, in a line."""
+        """Return the gain as one line."""
         change = f" (it {change_in_words(self.before, self.after)})" if self.before else ""
         return (
             f"{self.measure} {100 * self.before:.1f} -> {100 * self.after:.1f} cm{change} on "
@@ -84,8 +96,9 @@ class Calibration:
 
 
 def blocking_errors(recording: Recording, findings: Iterable[Finding], std: float) -> list[Finding]:
-    """Those Findings of `check` in a Recording that a calibration cannot put right: all errors, but
-    for a survey that does not fit by as much as a tape may be off. std : m, of a coordinate.
+    """Return the Findings of `check` that a calibration cannot correct.
+
+    These are all errors, except for a survey within the accuracy `std`, m, of a coordinate.
     """
     errors = [finding for finding in findings if finding.severity == ERROR]
     if any(finding.rule == MISFIT for finding in errors):
@@ -102,8 +115,9 @@ def with_truth(
     config: FilterConfig | None = None,
     progress: Callable[[str], object] = lambda what: None,
 ) -> Calibration:
-    """Calibration of Flights with ground truth, by `diagnose`, judged on Flights of `holdout`, or
-    on halves of a single flight.
+    """Calibrate with ground truth, by `diagnose`.
+
+    It is validated on `holdout`, or on halves of a single flight.
     """
     found = diagnose(flights, holdout, base, config, None, progress)
     progress("measuring the noise")
@@ -137,9 +151,10 @@ def without_truth(
     config: FilterConfig | None = None,
     progress: Callable[[str], object] = lambda what: None,
 ) -> Calibration:
-    """Calibration of Flights, whose ground truth is not used, by `self_calibrate`, judged on
-    Flights of `holdout`, or on the end of a single flight: by how much of the innovations is slow,
-    as anchors that are wrong make them.
+    """Calibrate without ground truth, by `self_calibrate`.
+
+    It is validated on `holdout`, or on the end of the last flight. Wrong anchors leave slowly
+    varying innovations: these must decrease.
     """
     judges, fitted, on = holdout, flights, _names(holdout)
     if not holdout:
@@ -154,9 +169,7 @@ def without_truth(
         [replace(one, anchors=found.anchors) for one in judges], found.effects, config
     )
     if not holdout and found.why_not is None and after <= before:
-        found = self_calibrate(
-            flights, tape, base, config, (), report
-        )  # what was judged, of all of it
+        found = self_calibrate(flights, tape, base, config, (), report)  # the same on all data
     calibration = Calibration(
         found.anchors,
         found.effects,
@@ -177,9 +190,7 @@ def without_truth(
 
 
 def _reason_against_unverified(calibration: Calibration) -> str | None:
-    """Why a Calibration that was judged by innovations alone may do harm, though they are smaller;
-    or None.
-    """
+    """Return why a Calibration may do harm although the innovations decrease, or None."""
     if calibration.after > LEFT:
         return (
             f"{100 * calibration.after:.1f} cm of the innovations are slow with it on "
@@ -196,7 +207,10 @@ def _reason_against_unverified(calibration: Calibration) -> str | None:
 
 
 def _validated(calibration: Calibration, any_effect: bool) -> Calibration:
-    """The Calibration with why it is not to be used; any_effect : whether there is anything to use."""
+    """Return the Calibration with the reason against its use, if there is one.
+
+    `any_effect` is whether the calibration changes anything.
+    """
     if calibration.why_not is not None:
         return calibration
     if not any_effect:
@@ -213,13 +227,13 @@ def _validated(calibration: Calibration, any_effect: bool) -> Calibration:
 
 
 def _rmse(flights: Sequence[Flight], effects: EffectSet, config: FilterConfig | None) -> float:
-    """m, 3D RMSE of all Flights together, by an estimate with an EffectSet."""
+    """Return the 3D RMSE of all Flights together, m."""
     errors = [score_of(flight, FlightEstimator(config, effects))[0].error for flight in flights]
     return float(np.sqrt(np.mean(np.sum(np.concatenate(errors) ** 2, axis=1))))
 
 
 def _with_noise(config: FilterConfig | None, std: float | None) -> FilterConfig:
-    """FilterConfig with tdoa_std, m, unless that is None."""
+    """Return the FilterConfig with tdoa_std, m, unless it is None."""
     config = config or FilterConfig()
     changed: dict[str, Any] = {} if std is None else {"tdoa_std": round(std, 3)}
     return replace(config, **changed)
@@ -229,20 +243,18 @@ def _names(flights: Sequence[Flight]) -> str:
     return ", ".join(flight.name for flight in flights)
 
 
-SECONDS = 60.0  # of a flight that are looked at
-MOVES = (
-    0.25  # of the extent of the anchors that a path must have along an axis to tell much of them
-)
-ENOUGH = 0.5  # of the coordinates that must become known better
-
-
 @dataclass(frozen=True, eq=False)
 class Prospect:
-    """seconds : s in the air that were looked at, and `total` that there are; given, expected : (N,
-    3) m, standard deviations of the anchors before, and as they are to be expected of all flights;
-    before, left : m, of the slow innovations; path : (3,) m, its extent;
-    hall : (3,) m, of the anchors; ids : of the anchors; why_not : what keeps a survey from being
-        applied so far, or None.
+    """Expected result of a calibration.
+
+    Attributes
+    ----------
+    seconds, total : s in the air, analysed and available.
+    given, expected : (N, 3) m, standard deviations of the anchors, as given and after all flights.
+    before, left : m, slow innovations before and after.
+    path, hall : (3,) m, extent of the path and of the anchors.
+    ids : of the anchors.
+    why_not : reason against the use of a survey so far, or None.
     """
 
     seconds: float
@@ -258,16 +270,16 @@ class Prospect:
 
     @property
     def better(self) -> np.ndarray:
-        """(N, 3) bool: coordinates that are to become known better."""
+        """Return the coordinates that will improve: (N, 3) bool."""
         return self.expected < IMPROVED * self.given
 
     @property
     def exciting(self) -> bool:
-        """Whether the flights tell enough."""
+        """Return whether the flights determine enough coordinates."""
         return bool(self.better.mean() >= ENOUGH)
 
     def sentences(self) -> list[str]:
-        """For people."""
+        """Return the prospect as sentences."""
         lines = [
             f"from {self.seconds:.0f} s of {self.total:.0f} s in the air: of the innovations "
             f"{100 * self.before:.1f} cm are slow with the anchors as "
@@ -306,9 +318,9 @@ def prospect(
     config: FilterConfig | None = None,
     progress: Callable[[], object] = lambda: None,
 ) -> Prospect:
-    """Prospect of a calibration of Flights without their ground truth.
+    """Predict the result of a calibration without ground truth from a part of the flights.
 
-    Raises InputError where they are too short to say.
+    Raises InputError if the flights are too short.
     """
     longest = max(flights, key=_duration)
     middle = 0.5 * (longest.start + longest.end)
@@ -333,13 +345,14 @@ def prospect(
 
 
 def _duration(flight: Flight) -> float:
-    """s in which a Flight is located."""
+    """Return the time in which a Flight has TDOAs or ranges, s."""
     return flight.end - flight.start
 
 
 def _expected(found: SelfCalibration, more: float) -> np.ndarray:
-    """(N, 3) m: standard deviations after `more` times what was looked at for a SelfCalibration, as
-    its information adds up.
+    """Return the standard deviations after `more` times the analysed data: (N, 3) m.
+
+    The information adds up.
     """
     prior = np.linalg.inv(found.prior.covariance)
     values, vectors = np.linalg.eigh(np.linalg.inv(found.solution.covariance) - prior)
@@ -348,11 +361,8 @@ def _expected(found: SelfCalibration, more: float) -> np.ndarray:
     return np.sqrt(np.diag(covariance))[: 3 * len(found.given)].reshape(-1, 3)
 
 
-STREAMS = "tdoa", "imu", "truth", *AIDS
-
-
 def between(flight: Flight, first: float, last: float) -> Flight:
-    """What of a Flight is stamped from `first` on and before `last`, s."""
+    """Return the part of a Flight stamped from `first` to before `last`, s."""
     cut = {}
     for name in STREAMS:
         stream = getattr(flight, name)
@@ -363,6 +373,6 @@ def between(flight: Flight, first: float, last: float) -> Flight:
 
 
 def split(flight: Flight, share: float) -> tuple[Flight, Flight]:
-    """A Flight until a share of the time in which it is located, and from there on."""
+    """Split a Flight at a share of its located time."""
     middle = flight.start + share * (flight.end - flight.start)
     return between(flight, -np.inf, middle), between(flight, middle, np.inf)

@@ -39,6 +39,37 @@ if TYPE_CHECKING:
     from .bags.bag import RecordedOdometry
     from .readers.inputs import Recording
     from .scoring.alignment import Alignment
+COLUMNS = {
+    "rmse_x": "x",
+    "rmse_y": "y",
+    "rmse_z": "z",
+    "rmse_3d": "3D",
+    "median_3d": "median",
+    "max_3d": "max",
+    "frac_gt_1m": ">1 m",
+    "nees_mean": "NEES",
+    "nis_mean": "NIS",
+    "start_delay": "delay",
+}
+PHASE = {  # of the figures of a phase
+    "duration": "s",
+    "rmse_x": "x",
+    "rmse_y": "y",
+    "rmse_z": "z",
+    "rmse_3d": "3D",
+    "max_3d": "max",
+    "std_3d": "stated",
+    "nees_mean": "NEES",
+    "step": "step",
+    "without_estimate": "without, s",
+}
+OF_RUNS = {
+    "rmse_3d_median_of_runs": "runs: median",
+    "rmse_3d_max_of_runs": "largest",
+    "nees_mean_max_of_runs": "largest NEES",
+}
+SHORT = {"rmse_3d": "3D", "max_3d": "max", "nees_mean": "NEES", "without_estimate": "without, s"}
+ERRORS = ("rmse_x", "rmse_y", "rmse_z", "rmse_3d", "median_3d", "max_3d")
 
 
 @dataclass(frozen=True)
@@ -184,39 +215,6 @@ def _checked(content: dict[str, Any]) -> Result:
     line_of_run({**result.row, **pool.figures()})
     lines_of_phases(result.phases)
     return result
-
-
-COLUMNS = {
-    "rmse_x": "x",
-    "rmse_y": "y",
-    "rmse_z": "z",
-    "rmse_3d": "3D",
-    "median_3d": "median",
-    "max_3d": "max",
-    "frac_gt_1m": ">1 m",
-    "nees_mean": "NEES",
-    "nis_mean": "NIS",
-    "start_delay": "delay",
-}
-PHASE = {  # of the figures of a phase
-    "duration": "s",
-    "rmse_x": "x",
-    "rmse_y": "y",
-    "rmse_z": "z",
-    "rmse_3d": "3D",
-    "max_3d": "max",
-    "std_3d": "stated",
-    "nees_mean": "NEES",
-    "step": "step",
-    "without_estimate": "without, s",
-}
-OF_RUNS = {
-    "rmse_3d_median_of_runs": "runs: median",
-    "rmse_3d_max_of_runs": "largest",
-    "nees_mean_max_of_runs": "largest NEES",
-}
-SHORT = {"rmse_3d": "3D", "max_3d": "max", "nees_mean": "NEES", "without_estimate": "without, s"}
-ERRORS = ("rmse_x", "rmse_y", "rmse_z", "rmse_3d", "median_3d", "max_3d")
 
 
 def head_line() -> str:

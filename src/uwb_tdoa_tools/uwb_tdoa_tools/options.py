@@ -304,7 +304,7 @@ def add_align(parser: ArgumentParser, judges: bool = False) -> None:
 
 def add_rerun(parser: ArgumentParser) -> None:
     """--rerun: a recording for the viewer Rerun."""
-    parser.add_argument("--rerun", metavar="FILE", type=OutputFile, help=pictures.HELP)
+    parser.add_argument("--rerun", metavar="FILE", type=OutputFile, help=pictures.RERUN_HELP)
 
 
 def rerun_of(args: Namespace, count: int, say: Callable[[str], object]) -> Path | None:

@@ -8,9 +8,7 @@ ROS_2 = b"\x89MCAP0\r\n", b"SQLite format 3\0"  # what a file of a bag begins wi
 
 
 def is_bag(path: str | Path) -> bool:
-    """Whether a path is meant as a bag: a directory with metadata.yaml, .mcap or .db3 files, or
-    such a file.
-    """
+    """Return whether a path is a bag: a .mcap or .db3 file, or a directory with one or metadata.yaml."""
     path = Path(path)
     if path.is_dir():
         return (

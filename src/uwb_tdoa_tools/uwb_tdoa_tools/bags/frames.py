@@ -1,4 +1,7 @@
-"""Where a bag places its sensors and anchors: /tf_static, uwb/anchors, markers."""
+"""Where a bag places sensors and anchors: /tf_static, uwb/anchors, markers for RViz.
+
+Sensors outside of the body frame are transformed as in the nodes.
+"""
 
 from __future__ import annotations
 
@@ -30,15 +33,23 @@ if TYPE_CHECKING:
 
 
 TF_STATIC = "/tf_static"
+ANCHORS, TRANSFORMS, MARKERS = (
+    "uwb_tdoa_msgs/msg/AnchorArray",
+    "tf2_msgs/msg/TFMessage",
+    "visualization_msgs/msg/MarkerArray",
+)
+FEWEST = 4  # frames or markers that are taken for anchors
+TEXT, ADD = 9, 0  # of Marker: the type of labels, and the action
+_FRAME = re.compile(r"^(?:.*[/_])?(?:anchor|anc|beacon)[_-]?([0-9]{1,5})$", re.IGNORECASE)
 
 
 def is_body(frame: str) -> bool:
-    """Whether a frame_id is that of the body, of whatever robot; an empty one is taken for it."""
+    """Return whether a frame_id is the body frame of any robot; an empty one counts as body."""
     return frame.rpartition("/")[2] in (BODY_FRAME, "")
 
 
 def read_frames(path: str | Path, reader: BagReader) -> Frames:
-    """Frames of all messages on /tf_static of an open bag. Raises InputError."""
+    """Read the Frames of all messages on /tf_static of an open bag. Raise InputError."""
     frames = Frames()
     connections = [
         c
@@ -57,8 +68,9 @@ def read_frames(path: str | Path, reader: BagReader) -> Frames:
 
 
 def place_of(frames: Frames, frame: str) -> Place | None:
-    """(Rotation, arm (3,) m) of a sensor's frame in the body: of the same robot, or of the only
-    one; None if not known.
+    """Return (Rotation, arm (3,) m) of a sensor's frame in the body; None if unknown.
+
+    The body belongs to the same robot, or is the only body frame.
     """
     robot = frame.lstrip("/").rpartition("/")[0]
     for body in ([f"{robot}/{BODY_FRAME}"] if robot else []) + [BODY_FRAME]:
@@ -68,15 +80,14 @@ def place_of(frames: Frames, frame: str) -> Place | None:
 
 
 def imu_in_body(imu: Imu, place: Place) -> Imu:
-    """The Imu with the samples of one that is at a place (see `place_of`), in the origin of the
-    body.
-    """
+    """Transform samples of an IMU at a place, see `place_of`, to the origin of the body."""
     return Imu(imu.t, *ImuMount(*place).in_body(imu.t, imu.gyro, imu.accel))
 
 
 def placed(frames: Frames, topic: str, counts: Counter[str]) -> tuple[Place | None, str | None]:
-    """(place or None, remark or None) of the one frame that the messages of a topic have. counts :
-    {frame_id: messages}. A place changes the result, so it is remarked on, too.
+    """Return (place or None, remark or None) of the single frame in the messages of a topic.
+
+    `counts` is {frame_id: messages}. A place changes the result, so it has a remark too.
     """
     others = sorted(frame for frame in counts if not is_body(frame))
     if not others:
@@ -108,26 +119,14 @@ def placed(frames: Frames, topic: str, counts: Counter[str]) -> tuple[Place | No
     )
 
 
-ANCHORS, TRANSFORMS, MARKERS = (
-    "uwb_tdoa_msgs/msg/AnchorArray",
-    "tf2_msgs/msg/TFMessage",
-    "visualization_msgs/msg/MarkerArray",
-)
-FEWEST = (
-    4  # anchors by which a tag is located: fewer frames or markers are taken for something else
-)
-TEXT, ADD = 9, 0  # of Marker: a type, whose place is beside that of the anchor, and an action
-_FRAME = re.compile(r"^(?:.*[/_])?(?:anchor|anc|beacon)[_-]?([0-9]{1,5})$", re.IGNORECASE)
-
-
 class Recorded(NamedTuple):
-    """anchors : Anchors; source : the topic that they are from."""
+    """Anchors in a bag, and the topic that they come from."""
 
     anchors: Anchors
     source: str
 
     def remarks(self, topic: str) -> list[str]:
-        """Sentences on where they are from, if that is another than this topic."""
+        """Return a sentence on the source of the anchors if it is not this topic."""
         return (
             []
             if self.source == topic
@@ -138,11 +137,11 @@ class Recorded(NamedTuple):
 
 
 def recorded_anchors(path: str | Path, reader: BagReader, topic: str) -> Recorded | None:
-    """Return the last Anchors on a topic of an open bag; without that, those that frames or markers
-    name; None without any.
+    """Return the last Anchors of an open bag, or None.
 
-    Frames count whose names are "anchor", or the like, and a number, and that have one parent;
-    markers of a topic or namespace with "anchor" in its name, by their ids. Raises InputError.
+    They are on `topic`, else in frames, else in markers. Frames count if their names are "anchor",
+    or similar, and a number, and if they have one parent. Markers count if their topic or namespace
+    contains "anchor"; the marker ids become anchor ids. Raises InputError.
     """
     last = None
     for _, _, last in readable(path, reader, connections_of(path, reader, topic, ANCHORS)):
@@ -166,9 +165,8 @@ def _of_frames(path: str | Path, reader: BagReader) -> Recorded | None:
         for each in message.transforms:
             if found := _FRAME.match(each.child_frame_id):
                 p, q = each.transform.translation, each.transform.rotation
-                turn = (
-                    [q.x, q.y, q.z, q.w] if abs(q.w) < 1.0 else [np.nan] * 4
-                )  # no turn is what a driver writes that knows none
+                # drivers without orientations write the identity
+                turn = [q.x, q.y, q.z, q.w] if abs(q.w) < 1.0 else [np.nan] * 4
                 by_parent[each.header.frame_id][int(found[1])] = [p.x, p.y, p.z, *turn]
     frames = [(parent, rows) for parent, rows in by_parent.items() if len(rows) >= FEWEST]
     if len(frames) != 1:
@@ -201,7 +199,7 @@ def _of_markers(path: str | Path, reader: BagReader) -> Recorded | None:
 
 
 def _recorded(path: str | Path, source: str, frame: str, rows: dict[int, list[float]]) -> Recorded:
-    """Of rows: {id: position and quaternion}."""
+    """Return the anchors of rows {id: position and quaternion}."""
     table = np.array(list(rows.values()))
     try:
         return Recorded(

@@ -1,4 +1,4 @@
-"""How far an estimate can be believed, from the recording and the run themselves: no ground truth."""
+"""Assess how reliable an estimate is, from the recording and the run, without ground truth."""
 
 from __future__ import annotations
 
@@ -26,25 +26,29 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
 GOOD, DOUBTFUL, BAD = "good", "doubtful", "bad"
-# standard deviations of the 3D position within which it is for 95 % of the time, or longer:
-# whatever the shape, 1.6 to 2.0
+# standard deviations that contain the 3D position for 95 % of the time; 1.6 to 2.0 by its shape
 SIGMAS = 2.0
-GAP = 1.0  # s without an estimate, as long as which the tag is lost
-LONG = 0.05  # share of the time that the tag may be lost in an estimate that is good
-FEW = 0.9  # share of TDOAs that are explained, below which an estimate is not good
-TALL = 1.5  # times the deviations of x and y, beyond which the height is what is known worst
-# m, of all ranges, from which on it is said: what the filter finds of ranges that have none is up
-# to some 2 cm
+GAP = 1.0  # s without an estimate: the tag is lost
+LONG = 0.05  # largest share of lost time in a good estimate
+FEW = 0.9  # smallest share of explained TDOAs in a good estimate
+TALL = 1.5  # ratio of the deviation of z to x and y that makes the height the weakest coordinate
+# m, smallest reported offset of all ranges; without an offset the filter estimates up to 2 cm
 OFFSET = 0.03
-# share of the variance that errors which last make, above which a calibration is what helps
+# share of lasting errors in the variance above which a calibration helps
 LASTING = 0.5
 
 
 @dataclass(frozen=True)
 class Assessment:
-    """level : GOOD, DOUBTFUL or BAD; figures : {name: number}; lost : [(begin, end)] s, spans in
-    which the tag was lost; reasons : sentences on why it is not good; remedies : sentences on what
-    would make it better.
+    """Reliability of an estimate.
+
+    Attributes
+    ----------
+    level : GOOD, DOUBTFUL or BAD.
+    figures : {name: number}.
+    lost : [(begin, end)] s, spans in which the tag was lost.
+    reasons : sentences on why it is not good.
+    remedies : sentences on what would improve it.
     """
 
     level: str
@@ -54,7 +58,7 @@ class Assessment:
     remedies: tuple[str, ...] = ()
 
     def sentences(self) -> list[str]:
-        """The verdict for people."""
+        """Return the verdict as sentences."""
         figures = self.figures
         if not figures["estimates"]:
             return [f"{self.level}: there is no estimate", *self.reasons, *self.remedies]
@@ -87,8 +91,9 @@ def assess(
     estimator: FlightEstimator = FlightEstimator(),
     line: str | None = None,
 ) -> Assessment:
-    """Assessment in a Run of a FlightEstimator over a Flight, whose ground truth is not used. line : as
-    of `check`.
+    """Assess a Run of a FlightEstimator over a Flight; its ground truth is not used.
+
+    `line` is the command that `check` suggests, see there.
     """
     odometry, left = run.odometry, residuals.of_run(flight, run)
     there = reached(left)
@@ -128,7 +133,7 @@ def assess(
 
 
 def _measured(figures: Mapping[str, Any]) -> str:
-    """What locates, in words."""
+    """Return the name of the measurements that locate the tag."""
     return (
         "TDOAs"
         if not figures.get("ranges")
@@ -139,7 +144,7 @@ def _measured(figures: Mapping[str, Any]) -> str:
 
 
 def _counted(figures: Mapping[str, Any]) -> str:
-    """The same with how many there are."""
+    """Return the measurements that locate the tag, with their numbers."""
     counts = [
         f"{figures[name]} {words}"
         for name, words in (("tdoas", "TDOAs"), ("ranges", "ranges"))
@@ -149,9 +154,10 @@ def _counted(figures: Mapping[str, Any]) -> str:
 
 
 def lost_spans(heard: np.ndarray, odometry: Odometry) -> list[tuple[float, float]]:
-    """[(begin, end)] s, between the first estimate and the last that was heard, of stamps (n,) s,
-    in which there is no estimate for GAP, or one whose deviation is more than LOST; spans that are
-    less than GAP apart are one.
+    """Return [(begin, end)] s, spans in which the tag is lost.
+
+    The tag is lost without an estimate for GAP, or with a deviation above LOST. Spans closer than
+    GAP are joined. They end with the last stamp in `heard` (n,) s.
     """
     t, std = odometry.t, np.sqrt(np.einsum("nii->n", odometry.covariance[:, :3, :3]))
     ends = np.append(t[1:], max(t[-1], heard.max(initial=-math.inf)))
@@ -170,7 +176,7 @@ def _length(left: Residuals) -> float:
 
 
 def _deviation(odometry: Odometry) -> dict[str, float]:
-    """{name: m, or rad} of what an Odometry says that it may be off by, and what of it lasts."""
+    """Return the mean standard deviations of an Odometry (m, rad), and the share of lasting errors."""
     known = np.einsum("nii->n", odometry.covariance[:, :3, :3]) <= LOST**2
     rows = known if known.any() else np.ones(len(known), bool)
     variance = np.einsum("nii->ni", odometry.covariance[rows, :3, :3]).mean(axis=0)
@@ -186,7 +192,7 @@ def _deviation(odometry: Odometry) -> dict[str, float]:
 def _doubts(
     flight: Flight, left: Residuals, figures: Mapping[str, Any], lost: Sequence[tuple[float, float]]
 ) -> Iterator[str]:
-    """Yield sentences."""
+    """Yield reasons against an estimate."""
     if figures["lost"] > LONG * figures["seconds"]:
         spans = ", ".join(
             f"{begin - left.t.min():.0f} - {end - left.t.min():.0f} s" for begin, end in lost[:5]
@@ -211,7 +217,7 @@ def _doubts(
 def _remedies(
     flight: Flight, left: Residuals, figures: Mapping[str, Any], corrected: bool
 ) -> Iterator[str]:
-    """Yield sentences."""
+    """Yield improvements for the next recording."""
     ids = np.unique(np.concatenate([left.a, left.b]).astype(int))
     lacking = ids[flight.anchors.index(ids) < 0]
     if len(lacking):

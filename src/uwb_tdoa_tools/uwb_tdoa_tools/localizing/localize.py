@@ -44,11 +44,13 @@ COLUMNS = (
     "std_vz",
     "std_yaw",
 )
+SUFFIXES = ".gz", ".csv", ".bag", ".mcap", ".db3", ".log"
 
 
 def write_trajectory(path: Path, odometry: Odometry) -> None:
-    """Write an Odometry as CSV, a line for each estimate: s, m, quaternion from body to world, m/s,
-    and standard deviations, m, m/s and rad, all in the world frame.
+    """Write an Odometry as CSV, one line per estimate, in the world frame.
+
+    Columns: s, m, quaternion from body to world, m/s, then standard deviations in m, m/s and rad.
     """
     std = np.sqrt(np.einsum("nii->ni", odometry.covariance))
     yaw = rotation_std(odometry.q, odometry.covariance)[:, 2]
@@ -63,7 +65,14 @@ def write_trajectory(path: Path, odometry: Odometry) -> None:
 
 
 def write_tum(path: str | Path, t: np.ndarray, p: np.ndarray, q: np.ndarray) -> None:
-    """Write t (n,) s, p (n, 3) m, q (n, 4) x y z w; an unknown attitude becomes the identity."""
+    """Write a TUM trajectory, `stamp x y z qx qy qz qw` per line, for evo and others.
+
+    Parameters
+    ----------
+    t : (n,) s.
+    p : (n, 3) m.
+    q : (n, 4) x y z w; an unknown attitude becomes the identity.
+    """
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     q = np.where(np.isfinite(q), q, [0.0, 0.0, 0.0, 1.0])
     write_filled(
@@ -71,21 +80,16 @@ def write_tum(path: str | Path, t: np.ndarray, p: np.ndarray, q: np.ndarray) -> 
     )
 
 
-SUFFIXES = ".gz", ".csv", ".bag", ".mcap", ".db3", ".log"
-
-
 @dataclass(frozen=True)
 class Located:
-    """What became of a recording: what its files are called, how far it is to be believed, and the
-    files that were written.
-    """
+    """Result of a recording: name of its files, assessment, and the written files."""
 
     flight: str
     assessment: Assessment
     written: tuple[Path, ...]
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the figures for JSON."""
         assessment = self.assessment
         return {
             "flight": self.flight,
@@ -100,13 +104,19 @@ class Located:
 
 @dataclass(frozen=True)
 class Localizer:
-    """localizer((path, survey)) is the Located of a recording, whose ground truth is not read. Can
-    be pickled.
+    """Localize a recording (path, survey) and return Located. Its ground truth is not read.
 
-    reading : Reading; estimator : FlightEstimator; folder : where to write; bag : write a bag, too;
-        left : write residuals, too; rerun :
-    file for Rerun, or None; zones : m, write who is heard in squares of that size, or None; effects
-    : file of those of the estimator, or None. Raises InputError.
+    Can be pickled. Raises InputError.
+
+    Attributes
+    ----------
+    reading : how recordings are read.
+    estimator : filter with corrections.
+    folder : output folder.
+    bag, left : also write a bag, residuals.
+    rerun : file for Rerun, or None.
+    zones : m, size of squares for a table of heard anchors, or None.
+    effects : file with the effects of the estimator, or None.
     """
 
     reading: Reading
@@ -155,7 +165,7 @@ class Localizer:
 
 
 def name_of(path: str | Path) -> str:
-    """What the files of a recording are called: its own name without what says of which kind it is."""
+    """Return the base name of the files of a recording: its name without known suffixes."""
     name = Path(path).name
     while Path(name).suffix in SUFFIXES:
         name = Path(name).stem
@@ -163,9 +173,7 @@ def name_of(path: str | Path) -> str:
 
 
 def check_names(recordings: Sequence[tuple[Path, str | Path | None]]) -> None:
-    """Raise InputError if two of some recordings, (path, survey), would be written to the same
-    files.
-    """
+    """Raise InputError if two recordings (path, survey) would be written to the same files."""
     seen: dict[str, Path] = {}
     for path, _ in recordings:
         other = seen.setdefault(name_of(path), path)
@@ -177,5 +185,5 @@ def check_names(recordings: Sequence[tuple[Path, str | Path | None]]) -> None:
 
 
 def all_good(located: Iterable[Located]) -> bool:
-    """Whether all of some Located are good."""
+    """Return whether all recordings are good."""
     return all(one.assessment.level == GOOD for one in located)

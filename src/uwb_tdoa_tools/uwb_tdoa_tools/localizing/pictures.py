@@ -20,7 +20,6 @@ from ..bags.bag import read_bag, read_fields, read_odometry
 from ..diagnosis.output import as_text
 from ..estimate import FlightEstimator
 from ..scoring.metrics import position_at
-from ..scoring.plots import labels
 from .residuals import by_pair
 
 if TYPE_CHECKING:
@@ -39,6 +38,17 @@ if TYPE_CHECKING:
 ELLIPSES = 60  # along the path
 SIGMAS = 3.0
 MARGIN = 0.5  # m around anchors and path
+RERUN_HELP = (
+    "write a recording for the viewer Rerun, too (.rrd; of one flight; needs pip install rerun-sdk)"
+)
+RERUN_RATE = 20.0  # Hz, of poses that are written
+BLUE, RED, GREY, BLACK, ORANGE = (
+    (31, 119, 180),
+    (214, 39, 40),
+    (120, 120, 120),
+    (40, 40, 40),
+    (255, 127, 14),
+)
 
 
 def draw(
@@ -48,8 +58,12 @@ def draw(
     spans: Sequence[tuple[float, float]],
     title: str,
 ) -> None:
-    """Draw an Odometry among Anchors. spans : [(begin, end)] s, in which the tag was lost; title :
-    a line.
+    """Draw an Odometry among Anchors, from above, from the side, and over time.
+
+    Parameters
+    ----------
+    spans : [(begin, end)] s, in which the tag was lost.
+    title : one line.
     """
     from matplotlib.figure import Figure  # takes a second to import
 
@@ -93,9 +107,11 @@ def draw(
 def _plane(
     ax: Axes, odometry: Odometry, anchors: Anchors, lost: np.ndarray, plane: tuple[int, int, str]
 ) -> None:
-    """Path, ellipses and anchors in a plane: (two axes, name)."""
+    """Draw path, ellipses and anchors in a plane: (two axes, name)."""
     from matplotlib.collections import EllipseCollection
     from matplotlib.lines import Line2D
+
+    from ..scoring.plots import labels
 
     u, v, name = plane
     known = odometry.p[~lost] if (~lost).any() else odometry.p
@@ -152,21 +168,8 @@ def _plane(
         )
 
 
-HELP = (
-    "write a recording for the viewer Rerun, too (.rrd; of one flight; needs pip install rerun-sdk)"
-)
-RATE = 20.0  # Hz, of poses that are written
-BLUE, RED, GREY, BLACK, ORANGE = (
-    (31, 119, 180),
-    (214, 39, 40),
-    (120, 120, 120),
-    (40, 40, 40),
-    (255, 127, 14),
-)
-
-
 def is_there(say: Callable[[str], object]) -> bool:
-    """Whether the library is installed; say(sentence) : called if not."""
+    """Return whether the library is installed; if not, call say(sentence)."""
     if find_spec("rerun") is not None:
         return True
     say(
@@ -185,9 +188,15 @@ def write_rerun(
     truth: Truth | None = None,
     before: Odometry | RecordedOdometry | None = None,
 ) -> None:
-    """Write a .rrd file: the Odometry of a Flight among its anchors, Residuals or None, sentences,
-    the ground truth where it is to be shown, and another Odometry, as it was before something was
-    corrected, or None. Time is s since the first TDOA.
+    """Write a .rrd file for the viewer Rerun. Time is s since the first TDOA.
+
+    Parameters
+    ----------
+    odometry : estimate among the anchors of the Flight.
+    residuals : shown per pair, or None.
+    verdict : sentences.
+    truth : ground truth, if it is to be shown.
+    before : estimate before a correction, or None.
     """
     import rerun
 
@@ -234,9 +243,7 @@ def write_rerun(
 def write_diagnosis(
     path: Path, result: Diagnosis, base: EffectSet, config: FilterConfig | None
 ) -> None:
-    """Write the single flight of a Diagnosis: estimates with the EffectSet `base` and with what was
-    found, what that is, and the ground truth as it was judged by.
-    """
+    """Write the single flight of a Diagnosis: estimates with `base` and with the found effects."""
     (flight,) = result.flights
     before, after = (FlightEstimator(config, effects)(flight) for effects in (base, result.effects))
     truth = flight.truth if result.reference.tells_errors else None
@@ -252,9 +259,10 @@ def write_diagnosis(
 
 
 def write_recorded(path: Path, bag: str) -> None:
-    """Write what was recorded of running nodes: `odometry` among `uwb/anchors`, with `uwb/residual`
-    and the ground truth where these were recorded, too. Raises InputError for a bag without
-    `odometry`, `uwb/tdoa` or `uwb/anchors`.
+    """Write the recording of running nodes: `odometry`, `uwb/anchors`, `uwb/residual`, ground truth.
+
+    Residuals and ground truth are optional. Raises InputError for a bag without `odometry`,
+    `uwb/tdoa` or `uwb/anchors`.
     """
     flight, odometry = read_bag(bag), read_odometry(bag)
     try:
@@ -285,8 +293,8 @@ def write_recorded(path: Path, bag: str) -> None:
 def _write_poses(
     rerun: ModuleType, stream: Any, odometry: Odometry | RecordedOdometry, begin: float
 ) -> None:
-    """The tag and its ellipsoid of three standard deviations, at most RATE times a second."""
-    cells = np.floor((odometry.t - begin) * RATE) if len(odometry.t) else np.zeros(0)
+    """Write the tag and its ellipsoid of three standard deviations, at most RERUN_RATE times per second."""
+    cells = np.floor((odometry.t - begin) * RERUN_RATE) if len(odometry.t) else np.zeros(0)
     rows = np.flatnonzero(np.diff(cells, prepend=-np.inf) > 0.0)
     values, vectors = np.linalg.eigh(odometry.covariance[rows, :3, :3])
     vectors *= np.sign(np.linalg.det(vectors))[:, None, None]  # right-handed
@@ -310,7 +318,7 @@ def _write_poses(
 def _write_scalars(
     rerun: ModuleType, stream: Any, name: str, t: np.ndarray, values: np.ndarray
 ) -> None:
-    """A curve over time, s."""
+    """Write a curve over time, s."""
     known = np.isfinite(values)
     stream.send_columns(
         name,

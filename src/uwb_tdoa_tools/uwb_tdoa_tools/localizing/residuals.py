@@ -16,7 +16,6 @@ from uwb_tdoa_ekf.core.verdicts import USED
 from uwb_tdoa_ekf.results import VERDICTS, Odometry, Residuals, concatenated
 
 from ..scoring.metrics import reached
-from ..scoring.plots import plt
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.flight import Flight
@@ -24,19 +23,23 @@ if TYPE_CHECKING:
 
 
 RESIDUAL_COLUMNS = "t", "a", "b", "residual", "std", "weight", "verdict"
-SHOWN, FEWEST = (
-    20,
-    20,
-)  # pairs in the draw_residuals at most, those with the most TDOAs; TDOAs of a pair that is shown at least
+SHOWN = 20  # pairs in the picture at most, those with the most TDOAs
+FEWEST = 20  # TDOAs of a pair in the picture
 # robust standard deviations that the draw_residuals reaches; what is farther off is drawn at its edge
 SPREAD = 6.0
+ZONE_COLUMNS = "x", "y", "seconds", "heard", "tdoas_per_s", "used", "left", "std", "anchors"
+SHORTEST = 0.5  # s in a zone that is listed
 
 
 @dataclass(frozen=True)
 class PairResiduals:
-    """Residuals of the TDOAs between two anchors, a before b, or of the ranges to one, which is
-    both. t (n,) s; value, std (n,) m, of d_ab or of the range; explained (n,) bool, within three
-    standard deviations.
+    """Residuals of the TDOAs between two anchors a < b, or of the ranges to one anchor, a = b.
+
+    Attributes
+    ----------
+    t : (n,) s.
+    value, std : (n,) m, of d_ab or of the range.
+    explained : (n,) bool, within three standard deviations.
     """
 
     a: int
@@ -48,11 +51,11 @@ class PairResiduals:
 
     @property
     def name(self) -> str:
-        """What it is called in pictures."""
+        """Return the name for pictures."""
         return f"{self.a} - {self.b}" if self.a != self.b else f"range {self.a}"
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the figures for JSON."""
         return {
             "a": self.a,
             "b": self.b,
@@ -64,9 +67,7 @@ class PairResiduals:
 
 
 def of_run(flight: Flight, run: Run) -> Residuals:
-    """Residuals of the TDOAs of a Run over a Flight, and of what else locates: of distances to
-    anchors, of which a and b are the same.
-    """
+    """Return the Residuals of the TDOAs and ranges of a Run; a range has a = b."""
     parts = [run.residuals]
     for name in LOCATING:
         if name in run.aids:
@@ -78,13 +79,13 @@ def of_run(flight: Flight, run: Run) -> Residuals:
 
 
 def explained(residuals: Residuals) -> np.ndarray:
-    """Which TDOAs were within three of the standard deviations that the filter expected: (n,) bool."""
-    with np.errstate(invalid="ignore"):  # NaN, of those without a residual, is not
+    """Return which innovations are within three expected standard deviations: (n,) bool."""
+    with np.errstate(invalid="ignore"):  # NaN without an innovation
         return reached(residuals) & (residuals.innovation**2 <= 9.0 * residuals.variance)
 
 
 def by_pair(residuals: Residuals) -> list[PairResiduals]:
-    """Residuals of each pair of anchors, in the order of their ids."""
+    """Return the residuals of each pair of anchors, in the order of their ids."""
     there, fits = reached(residuals), explained(residuals)
     low, high = np.minimum(residuals.a, residuals.b), np.maximum(residuals.a, residuals.b)
     sign = np.where(residuals.a <= residuals.b, 1.0, -1.0)
@@ -99,9 +100,9 @@ def by_pair(residuals: Residuals) -> list[PairResiduals]:
 
 
 def write_residuals(path: Path, residuals: Residuals) -> None:
-    """Write a line for each TDOA: s, ids of the anchors, m, m, 0 to 1, and what became of it.
+    """Write one CSV line per TDOA: s, ids, m, m, weight 0 to 1, verdict.
 
-    Empty where the filter had no residual.
+    Cells are empty if the filter had no innovation.
     """
     lines, std = [",".join(RESIDUAL_COLUMNS)], np.sqrt(residuals.variance)
     rows = zip(
@@ -120,9 +121,7 @@ def write_residuals(path: Path, residuals: Residuals) -> None:
 
 
 def draw_residuals(path: Path, residuals: Residuals, title: str) -> None:
-    """Residuals of each pair over time, a row each, those that the estimate does not explain in
-    red, with their median beside it.
-    """
+    """Draw the residuals of each pair over time, in one row each, with outliers in red."""
     from matplotlib.figure import Figure  # takes a second to import
 
     found = by_pair(residuals)
@@ -168,16 +167,20 @@ def draw_residuals(path: Path, residuals: Residuals, title: str) -> None:
     write_filled(path, partial(figure.savefig, dpi=110))
 
 
-ZONE_COLUMNS = "x", "y", "seconds", "heard", "tdoas_per_s", "used", "left", "std", "anchors"
-SHORTEST = 0.5  # s in a zone, of which less tells nothing
-
-
 @dataclass(frozen=True)
 class Zone:
-    """A square in which the tag was. x, y : m, of its middle; seconds in it; heard : anchors in a
-    second, median; tdoas_per_s; used : share of them; left : m, 1.48 times the median of what is
-    left of those used, NaN without; std : m, of the position, median; anchors : ((id, share of the
-    seconds in which it was heard), ...), those heard most first.
+    """A square in which the tag was.
+
+    Attributes
+    ----------
+    x, y : m, middle of the square.
+    seconds : time of the tag in it.
+    heard : anchors per second, median.
+    tdoas_per_s : TDOAs per second.
+    used : share of the TDOAs that the filter used.
+    left : m, 1.48 times the median absolute residual of these, or NaN.
+    std : m, standard deviation of the position, median.
+    anchors : ((id, share of the seconds with this anchor), ...), most heard first.
     """
 
     x: float
@@ -192,9 +195,7 @@ class Zone:
 
 
 def zones_of(odometry: Odometry, residuals: Residuals, size: float) -> list[Zone]:
-    """[Zone] of squares of some size, m, that the tag was in, by an Odometry and the Residuals that
-    came with it.
-    """
+    """Return [Zone] of the squares of some size, m, in which the tag was."""
     if len(odometry) < 2 or not len(residuals.t):
         return []
     near = (residuals.t >= odometry.t[0]) & (residuals.t <= odometry.t[-1])
@@ -235,7 +236,7 @@ def zones_of(odometry: Odometry, residuals: Residuals, size: float) -> list[Zone
 
 
 def write_zones(path: Path, zones: list[Zone]) -> None:
-    """Write [Zone] as CSV: a line for each, ZONE_COLUMNS; anchors as "id:share" one after the other."""
+    """Write one CSV line per Zone, with the columns ZONE_COLUMNS and anchors as "id:share"."""
     lines = [",".join(ZONE_COLUMNS)]
     for zone in zones:
         numbers = [f"{getattr(zone, name):.3f}" for name in ZONE_COLUMNS[:-1]]
@@ -248,7 +249,9 @@ def write_zones(path: Path, zones: list[Zone]) -> None:
 
 
 def draw_zones(path: Path, zones: list[Zone], anchors: Anchors, size: float, title: str) -> None:
-    """Maps of how many anchors are heard, and of the standard deviation of the position."""
+    """Draw maps of the number of heard anchors and of the standard deviation of the position."""
+    from ..scoring.plots import plt  # takes a second to import
+
     figure, axes = plt.subplots(1, 2, figsize=(13.0, 5.5), layout="constrained")
     heard = {anchor for zone in zones for anchor, _ in zone.anchors}
     silent = np.array([anchor not in heard for anchor in anchors.ids.tolist()])

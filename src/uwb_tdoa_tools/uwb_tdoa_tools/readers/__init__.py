@@ -29,7 +29,7 @@ ROS_1 = b"#ROSBAG V2.0"  # what a bag of ROS 1 begins with
 
 
 def reader_of(path: Path) -> Callable[[Path, Anchors, bool, bool], Flight]:
-    """What reads a file that is no bag. Raises InputError for one of no known kind."""
+    """Return the reader of a file that is not a bag. Raise InputError for an unknown kind."""
     head = read_head(path, 1 << 16)
     if head[0] == MAGIC:
         return read_usd_log
@@ -67,23 +67,21 @@ def read_flight(
     topics: dict[str, str] | None = None,
     truth: bool = True,
 ) -> Flight:
-    """Flight of a recording of any known kind, told apart by content, not by name.
+    """Read a recording of any known kind; its content decides, not its name.
 
-    path : micro-SD event log, UTIL CSV (plain or gzip), or ROS 2 bag (its directory or its .mcap or
-        .db3 file).
-    survey : path of a survey file (see `read_survey`) or Anchors. Logs and CSV files need it; a bag
-        brings its own
-        anchors, and a survey given with it replaces them.
-    namespace, topics : where the tag's topics are in a bag, see `read_bag`.
-    salvage : read a cut or damaged recording up to there, without records that are no numbers; the
-        Flight's
-        `meta["remarks"]` tell what is missing. Otherwise it is refused.
-    truth : read the ground truth, where there is one.
+    Parameters
+    ----------
+    path : micro-SD event log, UTIL CSV (plain or gzip), or ROS 2 bag (directory, .mcap or .db3).
+    survey : Anchors, or a survey file, see `read_survey`. Logs and CSV files need it. In a bag it
+        replaces the recorded anchors.
+    namespace, topics : topics of the tag in a bag, see `read_bag`.
+    salvage : read a damaged recording up to the damage and skip invalid records. `meta["remarks"]`
+        lists what is missing. Otherwise a damaged recording is refused.
+    truth : read the ground truth, if there is one.
+
     Raises InputError.
     """
-    from ..bags.bag import (
-        read_bag,
-    )  # here, because bags need the rosbags library and the others do not
+    from ..bags.bag import read_bag  # only bags need the rosbags library
 
     path = Path(path)
     if not path.exists():

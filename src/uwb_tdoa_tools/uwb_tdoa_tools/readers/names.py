@@ -1,6 +1,4 @@
-"""Anchors that have names: surveys and recordings call them "NE corner" or "A3", messages have
-numbers.
-"""
+"""Surveys whose anchors have names: surveys say "NE corner" or "A3", messages have numbers."""
 
 from __future__ import annotations
 
@@ -21,15 +19,19 @@ LARGEST_ID = 65535
 
 @dataclass(frozen=True)
 class NamedAnchors:
-    """anchors : Anchors; ids : {name as in the survey: id}, empty if they are called by their ids."""
+    """Anchors, and their names in the survey.
+
+    Attributes
+    ----------
+    anchors : Anchors.
+    ids : {name: id}; empty if the names are the ids.
+    """
 
     anchors: Anchors
     ids: dict[str, int] = field(default_factory=dict)
 
     def id_of(self, text: str) -> int | None:
-        """The id of an anchor by its name, or by its id, decimal or as 0x1A2B; None if it is
-        neither.
-        """
+        """Return the id of an anchor from its name or id (decimal or 0x1A2B); None if unknown."""
         if text in self.ids:
             return self.ids[text]
         folded = [number for name, number in self.ids.items() if name.casefold() == text.casefold()]
@@ -39,9 +41,10 @@ class NamedAnchors:
 
 
 def read_named_anchors(path: str | Path) -> NamedAnchors:
-    """NamedAnchors of a survey file of any form of `survey.read_entries`, with ids or names of any text.
-    The id is the number that a name ends with, if all end with different ones; else the line of the
-    survey, from 0 on. Raises InputError, also for a survey that is certainly wrong.
+    """Read a survey file of any form of `survey.read_entries`, with ids or any names.
+
+    Names that all end with different numbers get these as ids. Other names get their line number in
+    the survey, from 0. Raises InputError, also for a survey that is certainly wrong.
     """
     named = _read_named(path)
     refuse_faulty(named.anchors, str(path))
@@ -66,14 +69,12 @@ def _read_named(path: str | Path) -> NamedAnchors:
 
 
 def read_survey(path: str | Path) -> Anchors:
-    """Anchors of a survey file, see `read_named_anchors`: of those with names, under the ids that these
-    get.
-    """
+    """Read the Anchors of a survey file, see `read_named_anchors`."""
     return read_named_anchors(path).anchors
 
 
 def _whole(text: str) -> int | None:
-    """A whole number 0 ... 65535, decimal or hexadecimal as 0x1A2B, or None."""
+    """Return a whole number 0 ... 65535, decimal or 0x1A2B, or None."""
     try:
         value = float(int(text, 16)) if text[:2] in ("0x", "0X") else float(text)
     except (ValueError, OverflowError):

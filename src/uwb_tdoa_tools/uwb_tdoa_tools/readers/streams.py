@@ -26,16 +26,23 @@ if TYPE_CHECKING:
 
 # m/s^2 in one g of the Crazyflie's accelerometer, as in its firmware and in the UTIL scripts
 GRAVITY = 9.81
-NO_TARGET = (
-    32.0  # m; the range finder writes 32.767 or more where it sees nothing, and sees 4 m at most
-)
+NO_TARGET = 32.0  # m; the range finder writes 32.767 or more without a target, and sees 4 m at most
 LARGEST = {
     "tof": 1e9,
     "baro": 4e4,
 }  # mm, and m: the formula of the standard atmosphere ends at 44 km
 DAY = 86400.0  # s
-UNEQUAL, LOST = 1.1, 0.02  # ratio of two rates, and share of samples left out, that are told
-REFERENCE = 0.95  # of the TDOAs: an anchor that is in so many is what all others are compared with
+UNEQUAL, LOST = 1.1, 0.02  # smallest reported ratio of two rates, and share of dropped samples
+REFERENCE = 0.95  # share of the TDOAs of a common reference anchor
+# of one reading for 1 rad/s, median over 0425/TDOA2; 30 to 35 pixels in 41 degrees, given in
+# tenths: 4.2 to 4.9
+FLOW_COUNTS = 4.7
+FLOW_READING_TIME = 0.01  # s that one reading counts over
+FLOW_WILD = 40.0  # counts, beyond which a reading is clipped
+FLOW_RATE = 25.0  # Hz of the velocities, each of the mean of some readings
+FLOW_STD = 0.1  # m/s; measured over 0.25 s: 0.05 to 0.11
+FLOW_NEAREST_RANGE = 0.2  # s to the next range, beyond which the height is not known
+FLOW_TURN_TIME = 0.02  # s before and after, over which the gyroscope is averaged
 
 
 def make_flight(
@@ -47,25 +54,24 @@ def make_flight(
     salvage: bool = False,
     truth: bool = True,
 ) -> Flight:
-    """Flight of the streams of a Crazyflie recording: units to SI, stamps in order, empty streams
-    left out.
+    """Build a Flight from the streams of a recording: SI units, ordered stamps, no empty streams.
 
-    streams : dict of stream name to dict of column name to (n,) array; "t" in s, the rest in the
-        units of the file.
-        "tdoa": a, b, d (m), and std (m) if the tag knows it; "range": anchor, d (m), and std (m);
-        "gyro": x, y, z (deg/s); "acc": x, y, z (g); "pose": x, y, z (m), qx, qy, qz, qw. "tof": tof
-        (mm); "baro": baro (m above the sea, from the pressure of the standard atmosphere). "flow":
-        x, y (pixel counts), which become a velocity where "tof" and IMU are.
-    extra : the same of everything else, for `Flight.extra`.
-    meta : dict, completed here with "protocol" and, where there is something to tell, "clock"
-        ([Jump] and {stream: outliers}, see
-        `clock.straightened`), "reordered" (how often the stamps of each stream fell before they
-        were sorted), "imu_accel_interpolated", "losses" ([(cause, evidence, remedy)], what is not
-        used) and "remarks" (list of sentences).
-    salvage : leave out records that are not finite, or whose stamps are a day away from the others,
-        with a remark.
-    truth : take "pose" as the ground truth; it is not looked at otherwise.
-    Raises InputError; without salvage for such records too.
+    Parameters
+    ----------
+    streams : {stream: {column: (n,) array}}; "t" in s, other columns in the units of the file.
+        "tdoa": a, b, d (m), std (m, optional). "range": anchor, d (m), std (m, optional). "gyro":
+        x, y, z (deg/s). "acc": x, y, z (g). "pose": x, y, z (m), qx, qy, qz, qw. "tof": tof (mm).
+        "baro": baro (m above the sea in the standard atmosphere). "flow": x, y (pixel counts),
+        which become a velocity if "tof" and IMU exist.
+    extra : further streams for `Flight.extra`.
+    meta : dict with "source". Added are "protocol", "clock" ([Jump] and {stream: outliers}, see
+        `clock.straightened`), "reordered" ({stream: number of falling stamps}),
+        "imu_accel_interpolated", "losses" ([(cause, evidence, remedy)] of unused data) and
+        "remarks" (sentences).
+    salvage : skip records that are not finite, or whose stamps differ by a day, with a remark.
+    truth : use "pose" as ground truth; otherwise it is ignored.
+
+    Raises InputError; without `salvage` for invalid records too.
     """
     meta = {"remarks": [], **meta}
     wanted = {
@@ -121,9 +127,8 @@ def make_flight(
     height = pressure = velocity = None
     if "tof" in streams:
         tof = streams["tof"]
-        ranges = np.float32(1e-3 * np.asarray(tof["tof"], dtype=float)).astype(
-            float
-        )  # as a sensor_msgs/Range holds it
+        # the precision of a sensor_msgs/Range
+        ranges = np.float32(1e-3 * np.asarray(tof["tof"], dtype=float)).astype(float)
         height = Height(tof["t"], np.where(ranges < NO_TARGET, ranges, np.inf))
     if "baro" in streams:
         baro = _readings(streams["baro"], "baro")
@@ -156,15 +161,13 @@ def make_flight(
 
 
 def _measured(columns: Columns, *ids: str) -> tuple[np.ndarray, ...]:
-    """(stamps s, ids of each anchor, values m, variances m^2, 0 where the tag does not know them),
-    (n,) each.
-    """
+    """Return (stamps s, ids of each anchor, values m, variances m^2 or 0 if unknown), (n,) each."""
     variance = columns["std"] ** 2 if "std" in columns else np.zeros(len(columns["t"]))
     return columns["t"], *(columns[name] for name in ids), columns["d"], variance
 
 
 def _valid_rows(key: str, columns: Columns, meta: dict[str, Any], salvage: bool) -> Columns:
-    """The columns of a stream without what is not finite."""
+    """Return the columns of a stream without rows that are not finite."""
     columns = {name: np.asarray(values) for name, values in columns.items()}
     numbers = dict(columns)
     if key == "pose" and all(np.isnan(columns[name]).all() for name in ("qx", "qy", "qz", "qw")):
@@ -196,25 +199,22 @@ def _valid_rows(key: str, columns: Columns, meta: dict[str, Any], salvage: bool)
 
 
 def _readings(columns: Columns, name: str) -> Columns:
-    """The rows of a sensor that is logged more often than it measures: where its value differs from
-    the one before.
-    """
+    """Return the rows where the value changes, for a sensor that is logged faster than it measures."""
     values = np.asarray(columns[name], dtype=float)
     new = np.flatnonzero(np.diff(values, prepend=np.nan) != 0.0)
     return {"t": columns["t"][new], name: values[new]}
 
 
 def protocol(tdoas: Tdoas) -> str:
-    """ "tdoa2", "tdoa3" or "tdoa, one reference", by which anchors are paired, whatever their ids
-    and the order of the two.
+    """Return "tdoa2", "tdoa3" or "tdoa, one reference", from the pairs of anchors.
 
-    TDoA2 anchors send in turn in fixed slots, and the tag takes the difference of two that follow
-    each other: the pairs are the sides of one ring, and others occur only where a packet was
-    missed. In TDoA3 any pair occurs (Bitcraze documentation). Where all anchors are compared with
-    the same one, neither says it. Measured, 37 recordings of eight anchors: 95 % and more are on
-    one ring with the one, at most 52 % on the eight most frequent pairs with the other. The sides
-    of three anchors are all pairs there are: then it is a ring if the order of the two never turns
-    round.
+    TDoA2 anchors send in turn in fixed slots, and the tag subtracts two consecutive arrivals. So
+    the pairs are the sides of one ring, except where a packet was missed. In TDoA3 any pair occurs
+    (Bitcraze documentation). If all anchors are compared with the same anchor, it is neither.
+
+    In 37 recordings with eight anchors, TDoA2 has 95 % and more on one ring. TDoA3 has 52 % at most
+    on the eight most frequent pairs. Three anchors have only three pairs: they are a ring if the
+    order of the two never changes.
     """
     ids, rows = np.unique(np.concatenate([tdoas.a, tdoas.b]), return_inverse=True)
     n, (a, b) = len(ids), rows.reshape(2, -1)
@@ -234,9 +234,7 @@ def protocol(tdoas: Tdoas) -> str:
 
 
 def _is_ring(sides: np.ndarray, n: int) -> bool:
-    """Whether n sides (n, 2) of n corners close to one ring: each corner is on two of them, and all
-    hang together.
-    """
+    """Return whether n sides (n, 2) of n corners form one ring: two at each corner, all connected."""
     meets = coo_array((np.ones(len(sides)), tuple(sides.T)), (n, n))
     return bool(
         (np.bincount(sides.ravel(), minlength=n) == 2).all()
@@ -245,12 +243,11 @@ def _is_ring(sides: np.ndarray, n: int) -> bool:
 
 
 def _imu(gyro: Columns, acc: Columns, meta: dict[str, Any]) -> Imu:
-    """One stream of both sensors at the gyroscope's stamps.
+    """Return one stream of both sensors at the stamps of the gyroscope.
 
-    The firmware reads both at one instant and logs one after the other, some 20 us apart: sample n
-    goes with sample n as long as all stamps agree to half a period. Where they do not (an event was
-    lost), the accelerometer is interpolated linearly between its own samples, and gyroscope samples
-    outside of its time are left out.
+    The firmware reads both at one instant and logs one after the other, 20 us apart. Sample n
+    belongs to sample n if all stamps agree to half a period. Otherwise an event was lost: the
+    accelerometer is interpolated, and gyroscope samples outside of its time are dropped.
     """
     t, rate, force = gyro["t"], _stack(gyro, "x", "y", "z"), _stack(acc, "x", "y", "z")
     half_period = 0.5 * np.median(np.diff(t)) if len(t) > 1 else 0.0
@@ -274,8 +271,12 @@ def _imu(gyro: Columns, acc: Columns, meta: dict[str, Any]) -> Imu:
 def _imu_losses(
     gyro: np.ndarray, acc: np.ndarray, inside: np.ndarray
 ) -> list[tuple[str, str, str]]:
-    """[(cause, evidence, remedy)] of what is lost of sensors with stamps gyro (n,) and acc (m,) s;
-    inside (n,) : whether a sample of the gyroscope counts.
+    """Return [(cause, evidence, remedy)] of unused samples.
+
+    Parameters
+    ----------
+    gyro, acc : (n,) and (m,) s, stamps.
+    inside : (n,) bool, gyroscope samples that are used.
     """
     out = []
     rates = [
@@ -300,27 +301,19 @@ def _stack(columns: Columns, *names: str) -> np.ndarray:
     return np.stack([np.asarray(columns[name], dtype=float) for name in names], axis=1)
 
 
-# of one reading for 1 rad/s, median over 0425/TDOA2; 30 to 35 pixels in 41 degrees, given in
-# tenths: 4.2 to 4.9
-FLOW_COUNTS = 4.7
-FLOW_READING_TIME = 0.01  # s that one reading counts over
-FLOW_WILD = 40.0  # counts, beyond which a reading is clipped
-FLOW_RATE = 25.0  # Hz of the velocities, each of the mean of some readings
-FLOW_STD = 0.1  # m/s; measured over 0.25 s: 0.05 to 0.11
-FLOW_NEAREST_RANGE = 0.2  # s to the next range, beyond which the height is not known
-FLOW_TURN_TIME = 0.02  # s before and after, over which the gyroscope is averaged
-
-
 def flow_velocity(
     t: np.ndarray, x: np.ndarray, y: np.ndarray, height: Height, imu: Imu
 ) -> Velocity:
-    """Velocity in the body frame, x and y, at up to 25 Hz, where a range is near and the gyroscope
-    is there.
+    """Return the velocity in the body frame, x and y, from an optical flow sensor at up to 25 Hz.
 
-    t (n,) s, ascending; x, y (n,) counts of single readings; height : Height; imu : Imu. A sensor
-    that looks down sees the ground turn and pass: with the range h along its axis, x = -FLOW_COUNTS (v_y
-    / h + omega_x) and y = -FLOW_COUNTS (v_x / h - omega_y), the axes of the Crazyflie's flow deck
-    (flowdeck_v1v2.c of its firmware).
+    Needs a nearby range and the gyroscope. The sensor looks down and sees the ground rotate and
+    move. With the range h along its axis, x = -COUNTS (v_y / h + omega_x) and y = -COUNTS (v_x / h
+    - omega_y), in the axes of the Crazyflie's flow deck (flowdeck_v1v2.c of its firmware).
+
+    Parameters
+    ----------
+    t : (n,) s, ascending.
+    x, y : (n,) counts of single readings.
     """
     cell = np.unique((t * FLOW_RATE).astype(int), return_inverse=True)[1]
     columns = (t, *(np.clip(counts, -FLOW_WILD, FLOW_WILD) for counts in (x, y)))

@@ -48,9 +48,7 @@ YAW, TILT, LEVEL, HEIGHT = np.deg2rad(4.0), np.deg2rad(12.0), 0.25, 0.6
 COMMON = 0.6  # smallest overlap of two paths, as a share of the shorter path
 ALIKE = 1.3  # smallest ratio of the errors of the second best epoch and the best
 APART = 2.0  # s, smallest difference between two epochs
-AS_WELL = (
-    0.02  # relative difference of the errors below which rotation and delay are equally likely
-)
+AS_WELL = 0.02  # relative difference of the errors of equally likely rotation and delay
 FITS = 0.6  # largest distance at the best epoch, relative to the size of the path
 EPOCH_STEP = 0.1  # s, resolution of the search for the epoch
 

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 
 
 SAME = 0.005  # of the error: what rounds to no per cent
+SHARES = 0.0, 0.5, 0.75, 1.0
 
 
 def gain(before: float, after: float) -> float:
@@ -33,9 +34,6 @@ def gain_in_words(gained: float) -> str:
         if abs(gained) < SAME
         else f"{'falls' if gained > 0.0 else 'rises'} by {100.0 * abs(gained):.0f} %"
     )
-
-
-SHARES = 0.0, 0.5, 0.75, 1.0
 
 
 @dataclass(frozen=True)
@@ -83,12 +81,11 @@ class Shrinkage:
 
 
 def best_share(errors: Errors) -> float:
-    """Return the share with the smallest error, relative to no correction, one deviation above the
-    mean.
+    """Return the share with the smallest relative error, one standard deviation above its mean.
 
-    Mean and standard deviation are over the left-out flights in `errors`, see Shrinkage. The mean
-    alone would favour a model that gains much on three flights and harms the fourth. Future flights
-    vary more than these.
+    Mean and standard deviation are over the left-out flights in `errors`, see Shrinkage. Errors are
+    relative to no correction. The mean alone would favour a model that gains much on three flights
+    and harms the fourth. Future flights vary more than these.
     """
     ratios = {
         share: np.array([of[share] / of[None] for of in errors.values()])

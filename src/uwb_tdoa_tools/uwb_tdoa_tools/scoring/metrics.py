@@ -27,15 +27,6 @@ if TYPE_CHECKING:
 # s that an estimate stands for; at least SPARSE times the usual interval of the odometry
 VALID_FOR = 0.1
 EVERYTHING = ((-math.inf, math.inf),)  # spans, s
-
-
-class Estimate(PoseColumns, Protocol):
-    """Poses with the covariance (n, k, k), whose first three rows and columns are the position, m^2."""
-
-    @property
-    def covariance(self) -> np.ndarray: ...
-
-
 LOST = 1.0  # m; a larger error is no estimate
 LOST_SHARE = 0.25  # of the airborne time; more is a diverged run
 # s without a true pose, and SPARSE times the usual interval: the truth is not interpolated there
@@ -43,6 +34,13 @@ HOLE = 0.5
 SPARSE = 4.0
 START_GRACE = 1.0  # s into the airborne part by which the first estimate must have come
 READY = 100  # TDOAs that a filter may take to begin with
+
+
+class Estimate(PoseColumns, Protocol):
+    """Poses with the covariance (n, k, k), whose first three rows and columns are the position, m^2."""
+
+    @property
+    def covariance(self) -> np.ndarray: ...
 
 
 def rms(values: np.ndarray) -> float:

@@ -34,6 +34,20 @@ SHADES = {  # of phases that follow one another
     "last_3_s": "tab:orange",
     "at_rest_after": "tab:gray",
 }
+TOGETHER = 0.35  # m; anchors that are nearer to each other in a picture have one label
+SIZE, FEW = 10.0, 20  # points, of the letters of so many labels at most; of more they are smaller
+MOST = 80  # anchors that have labels: more could not be read
+AROUND = (
+    (1, 1),
+    (-1, 1),
+    (1, -1),
+    (-1, -1),
+    (0, 1),
+    (0, -1),
+    (1, 0),
+    (-1, 0),
+)  # where a label may be, as seen from its anchor
+_WIDE, _HIGH = 0.62, 1.15  # of the size of the letters: a letter, and a line
 
 
 def plot_error(score: Score, odometry: Estimate, truth: Truth, path: str | Path) -> None:
@@ -111,22 +125,6 @@ def plot_comparison(flight: Flight, scores: Sequence[Score], path: str | Path) -
     figure.suptitle(flight.name)
     write_filled(path, partial(figure.savefig, dpi=110))
     plt.close(figure)
-
-
-TOGETHER = 0.35  # m; anchors that are nearer to each other in a picture have one label
-SIZE, FEW = 10.0, 20  # points, of the letters of so many labels at most; of more they are smaller
-MOST = 80  # anchors that have labels: more could not be read
-AROUND = (
-    (1, 1),
-    (-1, 1),
-    (1, -1),
-    (-1, -1),
-    (0, 1),
-    (0, -1),
-    (1, 0),
-    (-1, 0),
-)  # where a label may be, as seen from its anchor
-_WIDE, _HIGH = 0.62, 1.15  # of the size of the letters: a letter, and a line
 
 
 def labels(ids: Sequence[int], places: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 RATIO = 1.01  # ratio of the limits of a bin
 SMALLEST = 1e-9  # smaller samples count as this
+ALIGN = "none", "time", "frame"  # how far a ground truth is aligned before scoring
+FIGURES = 3  # version of the content of a Result
 
 
 @dataclass
@@ -142,10 +144,6 @@ class PooledErrors:
 def _larger(one: float, other: float) -> float:
     """Return the larger number; a NaN in `one` means that there was none yet."""
     return other if math.isnan(one) else float(np.max([one, other]))
-
-
-ALIGN = "none", "time", "frame"  # how far a ground truth is aligned before scoring
-FIGURES = 3  # version of the content of a Result
 
 
 @dataclass(frozen=True)

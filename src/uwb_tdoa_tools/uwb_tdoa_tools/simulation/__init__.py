@@ -1,5 +1,4 @@
-"""Simulated flights: a room with anchors, a path through it, an inertial sensor, and the TDOAs of a
-UWB tag.
+"""Simulated flights: a room with anchors, a path, an inertial sensor, and the TDOAs of a UWB tag.
 
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 flight = simulate(SimulationConfig(trajectory="circle", protocol="tdoa3", seed=3))
@@ -24,18 +23,21 @@ __all__ = ["NO_IMU_ERRORS", "ImuErrors", "SimulationConfig", "simulate"]
 
 
 def simulate(config: SimulationConfig, trajectory: Flyable | None = None) -> Flight:
-    """Fly, drive or carry `config`, a SimulationConfig, and return the Flight. Raises InputError
-    where it does not fit together.
+    """Simulate a Flight with exact ground truth.
 
-    trajectory : what has motion(t) and motors(t) of a Trajectory, to fly instead of the config's
-        own.
-    truth : exact poses.
-    extra : "tdoa_truth" (t, bias, multipath, noise, outlier, m: what each TDOA holds besides
-        geometry) and
-        "state_truth" (at the stamps of the truth: velocity vx, vy, vz in the world, m/s, and the
-        biases of the inertial sensor, gyro_bias_x ... rad/s, accel_bias_x ... m/s^2).
-    meta : source, format, protocol, config, and under "parameters" the constants that the errors
-        were made with.
+    Parameters
+    ----------
+    trajectory : vehicle to use instead of the config's, see Flyable.
+
+    Returns
+    -------
+    Flight, with these additions.
+    extra["tdoa_truth"] : t s, and bias, multipath, noise, outlier m: the errors of each TDOA.
+    extra["state_truth"] : at the stamps of the truth. vx, vy, vz m/s, world frame; gyro_bias_x ...
+    rad/s; accel_bias_x ... m/s^2.
+    meta : source, format, protocol, config, and in "parameters" the constants of the errors.
+
+    Raises InputError if the parts of the config contradict each other.
     """
     filled, room = config.complete()
     assert filled.anchors is not None

@@ -1,4 +1,8 @@
-"""Paths: trajectory families and waypoints, over "path time", which runs with the clock at cruise."""
+"""Paths: trajectory families and waypoints.
+
+A family gives positions over "path time" s. Path time runs with the clock at cruise; vehicles slow
+it down at both ends.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +34,7 @@ _RAMP = STEP.integ()
 def circle(
     s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator
 ) -> np.ndarray:
-    """A level circle around the place, radius and speed as configured."""
+    """Fly a level circle around the place, radius and speed as configured."""
     assert (
         config.radius is not None and config.place is not None and config.height is not None
     )  # complete
@@ -47,7 +51,7 @@ def circle(
 def rising_circle(
     s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator
 ) -> np.ndarray:
-    """The circle with a height that rises and falls in a sine, up to 0.6 m, 0.7 times per turn."""
+    """Fly the circle with a height that rises and falls in a sine, up to 0.6 m, 0.7 times per turn."""
     assert config.height is not None and config.radius is not None  # complete
     p = circle(s, config, room, rng)
     low, high = room.flyable
@@ -59,11 +63,10 @@ def rising_circle(
 def sines(
     s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator
 ) -> np.ndarray:
-    """Products of two sines per axis, of seeded amplitude, period and phase, through the flyable
-    room.
+    """Fly products of two sines per axis, of seeded amplitude, period and phase.
 
-    Source: the training trajectories of Zhao et al. (RA-L 2021), section V-B. `speed` is the root
-    mean square here.
+    They fill the flyable room. `speed` is the root mean square here. Source: the training
+    trajectories of Zhao et al. (RA-L 2021), section V-B.
     """
     low, high = room.flyable
     reach = 0.5 * (high - low) * rng.uniform(0.75, 1.0, 3)
@@ -81,9 +84,7 @@ def sines(
 def square(
     s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator
 ) -> np.ndarray:
-    """A level square around the place, its edges `radius` away from it, at constant speed, with
-    rounded corners.
-    """
+    """Fly a level square around the place, its edges `radius` away, with rounded corners."""
     assert config.radius is not None  # complete
     return _laps(s, config, [[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]], config.radius)
 
@@ -91,25 +92,21 @@ def square(
 def line_x(
     s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator
 ) -> np.ndarray:
-    """Back and forth along x through the place, `radius` to each side, at constant speed, with
-    smooth turns.
-    """
+    """Fly back and forth along x through the place, `radius` to each side, with smooth turns."""
     return _laps(s, config, [[-1, 0], [1, 0], [-1, 0]], 0.0)
 
 
 def line_y(
     s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator
 ) -> np.ndarray:
-    """The same along y."""
+    """Fly back and forth along y in the same way."""
     return _laps(s, config, [[0, -1], [0, 1], [0, -1]], 0.0)
 
 
 def waypoints(
     s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator
 ) -> np.ndarray:
-    """Through the points of `path` and back to the first, again and again, at constant speed, with
-    rounded corners.
-    """
+    """Fly through the points of `path` and back to the first, repeatedly, with rounded corners."""
     assert config.path is not None and config.height is not None  # complete
     points = np.array([(*point, config.height)[:3] for point in config.path])
     around = np.vstack([points, points[:1]])
@@ -120,8 +117,9 @@ def waypoints(
 def _laps(
     s: np.ndarray, config: SimulationConfig, corners: Sequence[Sequence[float]], ahead: float
 ) -> np.ndarray:
-    """Round the corners, (n, 2) in units of the radius and as far apart each, level, `ahead` m
-    further at the start.
+    """Return positions along level corners, (n, 2) in units of the radius, equally far apart.
+
+    The start is `ahead` m further.
     """
     assert (
         config.radius is not None and config.place is not None and config.height is not None
@@ -134,8 +132,14 @@ def _laps(
 def _round(
     s: np.ndarray, speed: float, around: np.ndarray, ends: np.ndarray, ahead: float
 ) -> np.ndarray:
-    """Positions at s along a closed line through the corners around (n, k) m, which are reached
-    after ends (n,) m, `ahead` m further at the start, with rounded corners.
+    """Return positions along a closed line with rounded corners.
+
+    Parameters
+    ----------
+    s : (n,) s, path time.
+    around : (m, k) m, corners.
+    ends : (m,) m, path length at the corners.
+    ahead : m, path length at the start.
     """
     dt = 0.01
     s_fine = np.arange(-CORNER_TIME, s[-1] + CORNER_TIME + dt, dt)
@@ -168,8 +172,9 @@ TRAJECTORIES = {
 def path_of(
     s: np.ndarray, config: SimulationConfig, room: Room, rng: np.random.Generator
 ) -> np.ndarray:
-    """Positions (n, 3) m at path times s (n,), s, of the waypoints of a config, or else of its
-    family. Raises InputError.
+    """Return positions (n, 3) m at path times s (n,) s, of the waypoints or the family of a config.
+
+    Raises InputError if they leave the room.
     """
     if config.trajectory not in TRAJECTORIES:
         raise InputError(
@@ -194,11 +199,10 @@ def path_of(
 
 
 def path_time(tau: np.ndarray, rise: float, air: float) -> np.ndarray:
-    """Path time after tau seconds in the air: still during rise and descent, with the clock in
-    between, smoothly.
-    """
+    """Return path time after tau seconds in the air: at rest during rise and descent, smooth between."""
 
     def since(x: np.ndarray) -> np.ndarray:  # integral of the smooth step, in units of SPEED_UP
+        """Integrate the smooth step, in units of SPEED_UP."""
         return _RAMP(np.clip(x, 0.0, 1.0)) + np.maximum(x - 1.0, 0.0)
 
     return SPEED_UP * (
@@ -207,7 +211,7 @@ def path_time(tau: np.ndarray, rise: float, air: float) -> np.ndarray:
 
 
 def yaw_along(s: np.ndarray, p: np.ndarray, config: SimulationConfig) -> np.ndarray:
-    """Yaw at every knot, rad: "fixed", "along_track" or "rotating", from config.yaw_angle on."""
+    """Return the yaw at every knot, rad: "fixed", "along_track" or "rotating" from config.yaw_angle."""
     if config.trajectory == "spin" or config.yaw == "rotating":
         return config.yaw_angle + config.yaw_rate * s
     if config.yaw == "fixed" or np.ptp(s) == 0.0:
@@ -223,8 +227,9 @@ def yaw_along(s: np.ndarray, p: np.ndarray, config: SimulationConfig) -> np.ndar
 
 
 def _smoothed(values: np.ndarray, width: int) -> np.ndarray:
-    """Columns of (n, k) values averaged with a raised-cosine window of `width` samples; the ends go
-    on as constants.
+    """Average columns of (n, k) values with a raised-cosine window of `width` samples.
+
+    The ends are extended as constants.
     """
     window = np.hanning(width + 2)[1:-1]
     window /= window.sum()

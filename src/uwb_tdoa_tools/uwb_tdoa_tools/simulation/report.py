@@ -18,12 +18,11 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from uwb_tdoa_bias.foundation.flight import Flight
+SUFFIXES = (".png", ".pdf", ".svg")
 
 
 def summary(flight: Flight) -> dict[str, Any]:
-    """Plain values for JSON: name, counts, sizes of the parts of the TDOA errors (m),
-    configuration, true parameters.
-    """
+    """Return plain values for JSON: counts, sizes of the TDOA errors (m), config, true parameters."""
     assert flight.imu is not None and flight.truth is not None
     parts = flight.extra["tdoa_truth"]
     return {
@@ -39,7 +38,7 @@ def summary(flight: Flight) -> dict[str, Any]:
 
 
 def catalogue() -> str:
-    """All trajectories and constellations with a line on each, text."""
+    """List all trajectories and constellations with a line on each, as text."""
     lines = ["trajectories:"]
     for name, family in TRAJECTORIES.items():
         described = (inspect.getdoc(family) or name).splitlines()[0]
@@ -54,19 +53,14 @@ def catalogue() -> str:
     return "\n".join(lines)
 
 
-SUFFIXES = (".png", ".pdf", ".svg")
-
-
 def check_image(path: Path | None) -> None:
-    """Raises InputError for a path that is no image file; None is none."""
+    """Raise InputError for a path that is not an image file; None is accepted."""
     if path is not None and path.suffix.lower() not in SUFFIXES:
         raise InputError(f"plot: {path} is no image file; choose one of {', '.join(SUFFIXES)}.")
 
 
 def plot(flight: Flight, path: str | Path) -> None:
-    """Draw path and anchors from above, height, and the bias and full error of the TDOAs, to an
-    image file.
-    """
+    """Draw path and anchors from above, height, bias and error of the TDOAs, to an image file."""
     assert flight.truth is not None
     from matplotlib.figure import Figure  # takes a second to import
 

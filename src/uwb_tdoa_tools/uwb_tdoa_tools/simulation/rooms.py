@@ -21,16 +21,27 @@ if TYPE_CHECKING:
 
 
 LOW = 0.18  # m, height of an anchor on its stand on the floor
+CLEARANCE = 0.8  # m from the walls
+FLOOR_CLEARANCE = 0.6  # m from floor and ceiling
+REST_HEIGHT = 0.03  # m, height of the body frame when the vehicle stands on the floor
+WALLS_FORM = (
+    "write walls: [[x0, y0, x1, y1], ...], in metres, and after these the height of a wall over "
+    "which signals go"
+)
+AT_ONCE = 200_000  # straight lines that are compared with all walls at once
 
 
 def facing(
     positions: ArrayLike, target: ArrayLike, level: bool = True, inverted: ArrayLike | None = None
 ) -> Anchors:
-    """Anchors whose front (antenna x) faces a point.
+    """Return Anchors whose front (antenna x) faces a point.
 
-    positions (N, 3) and target (3,), metres. level: turn about the vertical only, so that the
-    antenna axis (z) stays upright; otherwise tilt as well. inverted: (N,) bool, stands that hang
-    upside down (z down), default none.
+    Parameters
+    ----------
+    positions : (N, 3) m.
+    target : (3,) m.
+    level : rotate about the vertical only, so that the antenna axis (z) stays upright.
+    inverted : (N,) bool, stands that hang upside down (z down); default none.
     """
     positions = np.asarray(positions, dtype=float)
     inverted = np.zeros(len(positions), bool) if inverted is None else np.asarray(inverted, bool)
@@ -52,9 +63,10 @@ def facing(
 
 
 def corners(x: float = 7.0, y: float = 8.0, z: float = 3.0, level: bool = True) -> Anchors:
-    """A low and a high anchor in each corner of x by y by z metres, in the order of the Toronto
-    surveys: neighbours in the TDOA2 ring lie far apart, 4 stand on the floor and 4 hang upside down
-    under the ceiling.
+    """Place a low and a high anchor in each corner of x by y by z metres.
+
+    The order is that in the Toronto surveys: neighbours in the TDOA2 ring are far apart. 4 anchors
+    stand on the floor and 4 hang upside down under the ceiling.
     """
     a, b = 0.5 * x, 0.5 * y
     positions = [
@@ -71,7 +83,7 @@ def corners(x: float = 7.0, y: float = 8.0, z: float = 3.0, level: bool = True) 
 
 
 def wall_middles() -> Anchors:
-    """Four low ones at the middles of the walls, four high ones in the corners, 7 x 8 x 3 m."""
+    """Place four low anchors at the middles of the walls, four high ones in the corners, 7 x 8 x 3 m."""
     positions = [
         (-3.5, 0, LOW),
         (3.5, 4, 3),
@@ -86,7 +98,7 @@ def wall_middles() -> Anchors:
 
 
 def staircase() -> Anchors:
-    """Eight around the walls of 7 x 8 x 3 m, each higher than the one before, all upright."""
+    """Place eight upright anchors around the walls of 7 x 8 x 3 m, each higher than the previous one."""
     x = [-3.5, 0.0, 3.5, 3.5, 3.5, 0.0, -3.5, -3.5]
     y = [-4.0, -4.0, -4.0, 0.0, 4.0, 4.0, 4.0, 0.0]
     return facing(
@@ -95,14 +107,14 @@ def staircase() -> Anchors:
 
 
 def pillars() -> Anchors:
-    """Three heights on each of four pillars that stand inside 7 x 8 x 3 m: 12 anchors."""
+    """Place anchors at three heights on each of four pillars inside 7 x 8 x 3 m: 12 anchors."""
     feet = [(-2.8, -2.6), (2.5, -3.2), (2.9, 2.7), (-2.4, 3.3)]
     positions = [(x, y, z) for z in (0.3, 1.6, 2.9) for x, y in feet]
     return facing(positions, (0.0, 0.0, 1.5), inverted=np.array(positions)[:, 2] > 2.0)
 
 
 def six() -> Anchors:
-    """Six anchors, three low and three high, on two opposite triangles in 6 x 6 x 2.8 m."""
+    """Place three low and three high anchors on two opposite triangles in 6 x 6 x 2.8 m."""
     angle = np.deg2rad([90, 270, 210, 30, 330, 150])
     z = np.array([LOW, 2.8, LOW, 2.8, LOW, 2.8])
     return facing(
@@ -111,7 +123,7 @@ def six() -> Anchors:
 
 
 def six_wide() -> Anchors:
-    """Six anchors on the walls of 12 x 8 m, at 0.8 and 2.8 m in turn: for what drives."""
+    """Place six anchors on the walls of 12 x 8 m, at 0.8 and 2.8 m in turn, for rovers."""
     x, y, z = (
         np.array([-6.0, 0.0, 6.0, 6.0, 0.0, -6.0]),
         np.repeat([-4.0, 4.0], 3),
@@ -121,7 +133,7 @@ def six_wide() -> Anchors:
 
 
 def hall() -> Anchors:
-    """Sixteen along the walls of a hall of 14 x 20 x 5 m, low and high in turn."""
+    """Place sixteen anchors along the walls of a hall of 14 x 20 x 5 m, low and high in turn."""
     rim = [(-7, -10), (-7, -5), (-7, 0), (-7, 5), (-7, 10), (-3.5, 10), (0, 10), (3.5, 10)]
     rim += [(-x, -y) for x, y in rim]
     z = np.where(np.arange(16) % 2, 5.0, 0.3)
@@ -129,24 +141,27 @@ def hall() -> Anchors:
 
 
 def planar() -> Anchors:
-    """Four at the corners of 4 x 4 m, 0.2 m high, facing the centre: Grasso et al.
+    """Place four anchors at the corners of 4 x 4 m, 0.2 m high, facing the centre.
 
-    (Sensors 2022), section 2.1.
+    Grasso et al. (Sensors 2022), section 2.1.
     """
     return facing([(-2, -2, 0.2), (2, -2, 0.2), (2, 2, 0.2), (-2, 2, 0.2)], (0.0, 0.0, 0.2))
 
 
 def pair() -> Anchors:
-    """Two anchors 4.5 m apart at 1.25 m, facing each other, with the default hovering place
-    half-way between them: the bench of Zhao et al. (RA-L 2021), figure 4.
+    """Place two anchors 4.5 m apart at 1.25 m, facing each other.
+
+    The default place of hovering is half-way between them: the bench of Zhao et al. (RA-L 2021),
+    figure 4.
     """
     return facing([(-2.25, 0, 1.25), (2.25, 0, 1.25)], (0.0, 0.0, 1.25))
 
 
 def random(seed: int, count: int = 8) -> Anchors:
-    """Seeded: `count` anchors (4 to 64) on the walls of a seeded room of 5 - 9 x 5 - 9 x 2.5 - 3.5
-    m, low ones and high ones in turn, at least 0.5 m apart, facing the centre to within some 20
-    degrees.
+    """Place `count` anchors (4 to 64) on the walls of a random room, low and high in turn.
+
+    The room has 5 - 9 x 5 - 9 x 2.5 - 3.5 m. Anchors are at least 0.5 m apart and face the centre
+    to within 20 degrees.
     """
     if not 4 <= count <= 64:
         raise InputError(
@@ -187,8 +202,9 @@ CONSTELLATIONS = {
 
 
 def constellation(name: str) -> Anchors:
-    """Anchors of a named constellation, or of `random-SEED` or `random-SEED-COUNT`; raises
-    InputError.
+    """Return the Anchors of a named constellation, `random-SEED` or `random-SEED-COUNT`.
+
+    Raises InputError.
     """
     if name in CONSTELLATIONS:
         return CONSTELLATIONS[name]()
@@ -200,16 +216,15 @@ def constellation(name: str) -> Anchors:
     )
 
 
-CLEARANCE = 0.8  # m from the walls
-FLOOR_CLEARANCE = 0.6  # m from floor and ceiling
-REST_HEIGHT = 0.03  # m, height of the body frame when the vehicle stands on the floor
-
-
 @dataclass(frozen=True)
 class Room:
-    """A box. lower, upper : (3,) corners in the world frame, metres; the floor is at lower[2]. area
-    : ((x, y), (x, y)) m, lower and upper corner of the part that paths are sized to; None for all
-    but a clearance.
+    """A box in the world frame.
+
+    Attributes
+    ----------
+    lower, upper : (3,) m, corners; the floor is at lower[2].
+    area : ((x, y), (x, y)) m, lower and upper corner of the part for paths; None for all but a
+        clearance.
     """
 
     lower: np.ndarray
@@ -218,15 +233,16 @@ class Room:
 
     @property
     def centre(self) -> np.ndarray:
-        """(3,) metres: of the area, if there is one."""
+        """Return the centre of the room, or of the area, if there is one: (3,) m."""
         if self.area is None:
             return 0.5 * (self.lower + self.upper)
         return 0.5 * np.sum(self.flyable, axis=0)
 
     @property
     def flyable(self) -> tuple[np.ndarray, np.ndarray]:
-        """The box that paths are sized to, (lower, upper), each (3,) metres: the area, or else the
-        room less a clearance.
+        """Return the box for paths, (lower, upper), (3,) m each.
+
+        It is the area, or the room less a clearance.
         """
         margin = np.minimum(
             [CLEARANCE, CLEARANCE, FLOOR_CLEARANCE], 0.25 * (self.upper - self.lower)
@@ -237,7 +253,7 @@ class Room:
         return low, high
 
     def around(self, points: np.ndarray) -> Room:
-        """The Room, grown to hold points (n, 2 or 3), m."""
+        """Return the Room, extended to points (n, 2 or 3) m."""
         k = points.shape[1]
         lower, upper = self.lower.copy(), self.upper.copy()
         lower[:k], upper[:k] = (
@@ -248,8 +264,9 @@ class Room:
 
 
 def room_of(anchors: Anchors) -> Room:
-    """The room that Anchors stand in: the box around them, at least 4 x 4 x 2.5 m, floor at 0 or
-    the lowest anchor.
+    """Return the Room of Anchors: the box around them, at least 4 x 4 x 2.5 m.
+
+    The floor is at 0 or at the lowest anchor.
     """
     lowest, highest = anchors.positions.min(axis=0), anchors.positions.max(axis=0)
     middle, half = 0.5 * (lowest + highest), np.maximum(0.5 * (highest - lowest), 2.0)
@@ -260,24 +277,21 @@ def room_of(anchors: Anchors) -> Room:
     )
 
 
-WALLS_FORM = (
-    "write walls: [[x0, y0, x1, y1], ...], in metres, and after these the height of a wall over "
-    "which signals go"
-)
-AT_ONCE = 200_000  # straight lines that are compared with all walls at once
-
-
 @dataclass(frozen=True)
 class Walls:
-    """Upright walls between two points seen from above. segments : ((x0, y0, x1, y1, height), ...)
-    m, in the frame of the anchors; a signal goes over a wall above its height, inf for none.
+    """Upright walls between two points seen from above.
+
+    Attributes
+    ----------
+    segments : ((x0, y0, x1, y1, height), ...) m, in the frame of the anchors. Signals pass above
+        the height; inf for none.
     """
 
     segments: tuple[tuple[float, ...], ...]
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> Walls:
-        """Read `walls: [[x0, y0, x1, y1], [x0, y0, x1, y1, height], ...]`. Raises InputError."""
+        """Read `walls: [[x0, y0, x1, y1], [x0, y0, x1, y1, height], ...]`. Raise InputError."""
         content = read_yaml(path)
         entries = content.get("walls") if isinstance(content, dict) else None
         if not isinstance(entries, list) or not entries:
@@ -287,9 +301,9 @@ class Walls:
         )
 
     def between(self, p: np.ndarray, q: np.ndarray) -> np.ndarray:
-        """(n,) whether a wall stands on the straight line between points p and q, (n, 3) m each.
+        """Return whether a wall stands between points p and q, (n, 3) m each: (n,) bool.
 
-        Their ends are on no wall.
+        The points are not on a wall.
         """
         out = np.zeros(len(p), bool)
         with np.errstate(
@@ -313,8 +327,16 @@ class Walls:
 def heard_at(
     p: np.ndarray, positions: np.ndarray, reach: float, walls: Walls | None = None
 ) -> list[np.ndarray]:
-    """Rows of the anchors at positions (N, 3) m that are heard at each of p (n, 3) m: within reach,
-    m, and behind no wall. List of (k,).
+    """Return the rows of the anchors within reach, m, and not behind a wall, at each point.
+
+    Parameters
+    ----------
+    p : (n, 3) m.
+    positions : (N, 3) m, of the anchors.
+
+    Returns
+    -------
+    List of n arrays (k,).
     """
     near = cKDTree(positions).query_ball_point(p, reach, return_sorted=True)
     if walls is None:

@@ -33,10 +33,12 @@ def measure_imu(
     errors: ImuErrors,
     random: Callable[[str], np.random.Generator],
 ) -> tuple[Imu, np.ndarray, np.ndarray]:
-    """What the sensor reports at the stamps t, (n,) s, equally spaced.
+    """Simulate the inertial sensor at equally spaced stamps t, (n,) s.
 
-    random(part) gives the numpy Generator of a part. Returns (Imu, gyro bias (n, 3) rad/s, accel
-    bias (n, 3) m/s^2). The samples are values at an instant, not means over the sample time.
+    Samples are values at an instant, not means over the sample time. `random(part)` returns the
+    numpy Generator of a part.
+
+    Returns (Imu, gyro bias (n, 3) rad/s, accel bias (n, 3) m/s^2).
     """
     n, dt = len(t), t[1] - t[0]
     motion = trajectory.motion(t)
@@ -63,7 +65,10 @@ def measure_imu(
 
 
 def measure_sensors(config: SimulationConfig, room: Room, trajectory: Flyable) -> dict[str, Stream]:
-    """{name: Stream} of those that the SimulationConfig, from complete(), has a noise for."""
+    """Simulate each of SENSORS that has a noise in the complete SimulationConfig: {name: Stream}.
+
+    Streams have white noise; the wheels of a rover also have scale and slip.
+    """
     out = {}
     for name, sensor in SENSORS.items():
         if getattr(config, f"{name}_noise") is None:
@@ -85,7 +90,7 @@ def measure_sensors(config: SimulationConfig, room: Room, trajectory: Flyable) -
 
 
 def _of_wheels(velocity: Stream, config: SimulationConfig, turning: np.ndarray) -> Velocity:
-    """What two wheels make of a Velocity, and of the true turning rate (n,) rad/s."""
+    """Apply the errors of two wheels to a Velocity and the true turning rate (n,) rad/s."""
     assert isinstance(velocity, Velocity)
     n, t = len(velocity), velocity.t
     too_fast = (1.0 + config.wheel_scale) * (
@@ -100,7 +105,7 @@ def _of_wheels(velocity: Stream, config: SimulationConfig, turning: np.ndarray) 
 
 
 def _slips(t: np.ndarray, random: np.random.Generator) -> np.ndarray:
-    """Whether the wheels slip at the stamps t: (n,) bool."""
+    """Return whether the wheels slip at stamps t (n,) s: (n,) bool."""
     begins = np.cumsum(random.exponential(SLIP_EVERY, int(2.0 * t[-1] / SLIP_EVERY) + 10))
     last = np.searchsorted(begins, t, "right") - 1
     slips: np.ndarray = (last >= 0) & (t < begins[last] + SLIP_TIME)

@@ -26,19 +26,13 @@ if TYPE_CHECKING:
 
 SLOT = 2.0e-3  # s, TDOA2: one packet per slot
 SLOT_JITTER = 1.0e-4  # s, standard deviation of a stamp around its slot
-PACKET_LOSS = (
-    0.025  # TDOA2: share of packets not received; each costs the two pairs that it belongs to
-)
+PACKET_LOSS = 0.025  # TDOA2: share of lost packets; each costs its two pairs
 TDOA3_DEAD_TIME = 0.5e-3  # s, the shortest time between two measurements
-TDOA3_MEAN_WAIT = (
-    3.6e-3  # s, mean of the exponential wait on top of it: about 240 measurements per second
-)
+TDOA3_MEAN_WAIT = 3.6e-3  # s, mean of the additional exponential wait: 240 TDOAs per second
 UNIT_GAIN_SPREAD = 0.7  # dB, tag to tag
 UNIT_MOUNT_SPREAD = np.deg2rad(2.0)  # rad, tag to tag
 MULTIPATH_HEIGHT = (0.1, 0.4)  # m, full strength below the first, none above the second
-MULTIPATH_SIZE = (
-    0.3  # m, standard deviation of the process whose positive part is the delay, at full strength
-)
+MULTIPATH_SIZE = 0.3  # m, standard deviation of the process at full strength
 MULTIPATH_TIME = 0.5  # s, correlation time
 # Outliers: share, smallest, largest size (m), of either sign. Three kinds are reported by users of
 # the Loco Positioning
@@ -50,12 +44,13 @@ OUTLIER_KINDS = ((0.6, 0.4, 0.6), (0.3, 3.0, 5.0), (0.1, 20.0, 250.0))
 class Schedule:
     """One row per measurement, of the ordered pair (a, b) at the arrival of b's packet.
 
-    t : (n,) s, rising
-    a, b : (n,) rows of the anchors
-    heard_a, heard_b : (n,) number of the reception that each arrival time was taken from; two
-        measurements that share a
-        reception share its noise
-    sender : (m,) row of the anchor of each reception
+    Attributes
+    ----------
+    t : (n,) s, rising.
+    a, b : (n,) rows of the anchors.
+    heard_a, heard_b : (n,) number of the reception of each arrival time. Two measurements with the
+        same reception share its noise.
+    sender : (m,) row of the anchor of each reception.
     """
 
     t: np.ndarray
@@ -73,9 +68,9 @@ def make_schedule(
     rng: np.random.Generator,
     rate: float | None = None,
 ) -> Schedule:
-    """The Schedule of `protocol` ("tdoa2" or "tdoa3") over 0 ... duration, s, for n_anchors (at
-    least 2) anchors. rate : TDOAs per second, which losses (tdoa2) or waits (tdoa3) are for;
-    default: what these give.
+    """Return the Schedule of "tdoa2" or "tdoa3" from 0 to `duration`, s, for at least 2 anchors.
+
+    `rate` is TDOAs per second, by losses (tdoa2) or waits (tdoa3); default: of the protocol.
     """
     if protocol == "tdoa2":
         return _tdoa2(
@@ -99,14 +94,17 @@ def among_heard(
     rng: np.random.Generator,
     cells: np.ndarray | None = None,
 ) -> Schedule:
-    """The Schedule among anchors of which the tag hears some. heard : rows of those at each
-    measurement, rising, n arrays; cells (N,) : number of the cell of each anchor, whose anchors
-    have a clock of their own, so that TDOAs are of two anchors of one cell; None for one clock.
-    Where fewer than two are heard there is nothing.
+    """Restrict a Schedule to the anchors that the tag hears.
 
-    TDOA2: those that are heard, in cells of one of them, send in turn, in the order of their rows,
-    as cells that are out of each other's reach use slots again. TDOA3: any two of those that are
-    heard, in cells of one of them. The cell is drawn, by how many are heard.
+    TDOA2: the heard anchors of a cell send in turn, in the order of their rows. Cells out of reach
+    of each other use the same slots. TDOA3: any two heard anchors of a cell. The cell is drawn,
+    weighted by its number of heard anchors. With fewer than two anchors there is no measurement.
+
+    Parameters
+    ----------
+    heard : n arrays of rising rows, the heard anchors at each measurement.
+    cells : (N,) number of the cell of each anchor. Each cell has a clock, and a TDOA needs two
+        anchors of a cell. None for a single clock.
     """
     rows, pairs, numbers = [], [], []  # of measurements, (a, b) and their receptions
     senders: list[int] = []  # row of the anchor of each reception
@@ -154,14 +152,12 @@ def among_heard(
 
 
 def _of_one_cell(near: np.ndarray, cells: np.ndarray, draw: float) -> np.ndarray:
-    """Those of the rows of anchors, (k,), that are in the cell of one of them, which a number 0 ...
-    1 draws.
-    """
+    """Return the rows of anchors, (k,), in the cell of the anchor that `draw`, 0 ... 1, selects."""
     return near[cells[near] == cells[near[int(draw * len(near))]]] if len(near) else near
 
 
 def _tdoa2(n_anchors: int, duration: float, rng: np.random.Generator, loss: float) -> Schedule:
-    """A ring: anchors send in turn, and every packet is compared with the one of the slot before."""
+    """Make a ring: anchors send in turn, and each packet is compared with the previous slot."""
     n = max(int(duration / SLOT), 2)
     sender = np.arange(n) % n_anchors
     jitter = np.clip(SLOT_JITTER * rng.standard_normal(n), -0.4 * SLOT, 0.4 * SLOT)
@@ -172,18 +168,14 @@ def _tdoa2(n_anchors: int, duration: float, rng: np.random.Generator, loss: floa
 
 
 def _tdoa3(n_anchors: int, duration: float, rng: np.random.Generator, wait: float) -> Schedule:
-    """Any order: a packet of a random anchor is compared with the newest packet of a random other
-    one.
-    """
+    """Make random pairs: a packet is compared with the newest packet of a random other anchor."""
     n = int(1.3 * duration / (TDOA3_DEAD_TIME + wait)) + 50
     t = np.cumsum(TDOA3_DEAD_TIME + rng.exponential(wait, n))
     b = rng.integers(0, n_anchors, n)
     a = (b + rng.integers(1, n_anchors, n)) % n_anchors
     n = int(np.searchsorted(t, duration))
     t, a, b = t[:n], a[:n], b[:n]
-    sender = np.concatenate(
-        [np.arange(n_anchors), b]
-    )  # everyone was heard once before the first measurement
+    sender = np.concatenate([np.arange(n_anchors), b])  # all anchors are heard once at the start
     heard_b = n_anchors + np.arange(n)
     heard_a = np.empty(n, dtype=np.int64)
     for anchor in range(n_anchors):
@@ -194,9 +186,7 @@ def _tdoa3(n_anchors: int, duration: float, rng: np.random.Generator, wait: floa
 
 
 def tag_link(unit: int) -> RadioLink:
-    """The RadioLink of specimen `unit` of the tag: 0 is nominal, others differ a little in gain and
-    mounting.
-    """
+    """Return the RadioLink of a tag specimen: 0 is nominal, others differ in gain and mounting."""
     if unit == 0:
         return RadioLink()
     rng = np.random.default_rng([unit, 20])
@@ -209,14 +199,15 @@ def tag_link(unit: int) -> RadioLink:
 def measure_tdoas(
     config: SimulationConfig, room: Room, trajectory: Flyable
 ) -> tuple[Tdoas, dict[str, np.ndarray], dict[str, Any]]:
-    """All TDOAs of a flight: (Tdoas, truth, parameters). config as from
-    SimulationConfig.complete().
+    """Simulate all TDOAs of a flight with a complete config: (Tdoas, truth, parameters).
 
-    d_ab = (rho_b + e_b) - (rho_a + e_a) + outlier, where e, the error of one arrival, is bias +
-    multipath + noise. Both distances are those at the stamp of the measurement.
-    truth : dict of "t" and the (n,) parts of each d besides the geometry: "bias", "multipath",
-        "noise", "outlier", m.
-    parameters : the constants that the errors were made with.
+    d_ab = (rho_b + e_b) - (rho_a + e_a) + outlier. The error e of an arrival is bias + multipath +
+    noise. Both distances are at the stamp of the measurement.
+
+    Returns
+    -------
+    truth : dict of "t" and the (n,) errors "bias", "multipath", "noise", "outlier", m.
+    parameters : the constants of the errors.
     """
     assert config.anchors is not None  # complete
     anchors, random = config.anchors, config.random
@@ -280,9 +271,10 @@ def measure_tdoas(
 def tdoa_noise(
     schedule: Schedule, anchor_std: np.ndarray, shared: bool, rng: np.random.Generator
 ) -> np.ndarray:
-    """White noise of every measurement, (n,) m. shared: the difference of the noises of its two
-    receptions, so that two TDOAs with the reception of anchor j in common have the covariance
-    -std_j^2 (Grasso et al. 2022, eqs. 4 - 5).
+    """Return the white noise of every measurement, (n,) m.
+
+    If `shared`, it is the difference of the noises of both receptions. Two TDOAs with the reception
+    of anchor j in common then have the covariance -std_j^2 (Grasso et al. 2022, eqs. 4 - 5).
     """
     if shared:
         arrival = anchor_std[schedule.sender] * rng.standard_normal(len(schedule.sender))
@@ -293,7 +285,7 @@ def tdoa_noise(
 
 
 def outliers(n: int, probability: float, rng: np.random.Generator) -> np.ndarray:
-    """(n,) m, zero but for the given share."""
+    """Return errors, (n,) m, that are zero except for the given share."""
     share, smallest, largest = np.array(OUTLIER_KINDS).T
     hit = rng.random(n) < probability
     kind = rng.choice(len(share), n, p=share)
@@ -309,12 +301,16 @@ def floor_multipath(
     rng: np.random.Generator,
     duration: float,
 ) -> np.ndarray:
-    """Delay of the signals of anchors by reflection near the floor, (k, n) m, never negative.
+    """Return delays of anchors by reflection near the floor, (k, n) m, never negative.
 
-    t : (n,) s in 0 ... duration; height : (n,) m of the tag above the floor; anchor : (k, n) rows
-        of k of n_anchors at each t.
-    Own model: the positive part of a Gaussian process with exponential correlation, one per anchor,
-    fading out linearly with height.
+    Own model: the positive part of a Gaussian process with exponential correlation, one per anchor.
+    It fades out linearly with height.
+
+    Parameters
+    ----------
+    t : (n,) s in 0 ... duration.
+    height : (n,) m, tag above the floor.
+    anchor : (k, n) rows of k of n_anchors at each t.
     """
     from scipy.signal import lfilter  # takes a second to import
 

@@ -23,9 +23,7 @@ if TYPE_CHECKING:
 
 
 GRAVITY = 9.81  # m/s^2
-DRAG = (
-    0.2  # 1/s, rotor drag per mass: without it the lateral accelerometers would never feel anything
-)
+DRAG = 0.2  # 1/s, rotor drag per mass: without it the lateral accelerometers would measure nothing
 MAX_ACCELERATION = 8.0  # m/s^2, what a small quadrotor still flies
 SPIN_UP = 0.5  # s, the motors turn before take-off and after landing
 PULL = 1.5  # 1/s, speed of the rover by its distance to the point that it follows
@@ -42,10 +40,13 @@ BOB, SWAY, TILT = 0.02, 0.01, np.deg2rad(6.0)  # m, m, rad: of a hand, by steps 
 
 @dataclass(frozen=True)
 class ExactMotion:
-    """Exact motion at n instants, body frame x forward, y left, z up in a z-up world.
+    """Exact motion at n instants. Body frame x forward, y left, z up; world z up.
 
-    p, v, a : (n, 3) m, m/s, m/s^2, world; q : (n, 4) x y z w, body to world; body_rates : (n, 3)
-        rad/s, body;
+    Attributes
+    ----------
+    p, v, a : (n, 3) m, m/s, m/s^2, world.
+    q : (n, 4) x y z w, body to world.
+    body_rates : (n, 3) rad/s, body.
     specific_force : (n, 3) m/s^2, body.
     """
 
@@ -58,27 +59,31 @@ class ExactMotion:
 
 
 class Flyable(Protocol):
-    """What `simulate` moves."""
+    """A vehicle that `simulate` moves."""
 
     def motion(self, t: np.ndarray) -> ExactMotion:
-        """The ExactMotion at stamps t, (n,) s."""
+        """Return the ExactMotion at stamps t, (n,) s."""
 
     def motors(self, t: np.ndarray) -> np.ndarray:
-        """Whether the motors turn at stamps t: (n,) bool."""
+        """Return whether the motors run at stamps t: (n,) bool."""
 
 
 class Trajectory:
-    """One flight over 0 ... config.duration: position and yaw as splines, attitude and rates from
-    them.
+    """A quadrotor flight over 0 ... config.duration.
 
-    Parameters: config, a SimulationConfig with place, height and radius filled in; room, a Room;
-    rng, a numpy Generator for what the family draws. Raises InputError where the flight does not
-    fit the room, the time or the vehicle.
-    take_off, landing : s, when it leaves the floor and is back on it; None when it starts and ends
-        in the air.
+    Position and yaw are splines with exact derivatives; attitude and rates follow from them. Around
+    the path the vehicle takes off, speeds up, slows down and lands.
+
+    Attributes
+    ----------
+    take_off, landing : s; None for a start in the air.
     """
 
     def __init__(self, config: SimulationConfig, room: Room, rng: np.random.Generator) -> None:
+        """Fit the splines to the path of a complete config in a room; `rng` draws the family.
+
+        Raises InputError if the flight does not fit the room, the time or the vehicle.
+        """
         assert config.height is not None  # complete
         self.take_off = self.landing = None
         start, end, clamp = 0.0, config.duration, None
@@ -116,11 +121,10 @@ class Trajectory:
             )
 
     def motion(self, t: ArrayLike) -> ExactMotion:
-        """The ExactMotion at the stamps t, (n,) s; before take-off and after landing it rests
-        exactly.
+        """Return the ExactMotion at stamps t, (n,) s; it rests before take-off and after landing.
 
         The thrust, along body z, carries weight, acceleration and rotor drag (differential flatness
-        of a quadrotor, after Mellinger and Kumar, ICRA 2011); the body rates are the analytic
+        of a quadrotor, after Mellinger and Kumar, ICRA 2011). The body rates are the analytic
         derivative of that attitude.
         """
         t = np.asarray(t, dtype=float)
@@ -151,14 +155,11 @@ class Trajectory:
             [np.sum(u * w, axis=1) for u, w in ((-y, z_rate), (x, z_rate), (-x, y_rate))]
         )
         axes = np.stack([x, y, z], axis=2)
-        q = Rotation.from_matrix(axes).as_quat()
-        q[1:] *= np.cumprod(np.where(np.sum(q[1:] * q[:-1], axis=1) < 0.0, -1.0, 1.0))[
-            :, None
-        ]  # no sign flips
+        q = _without_sign_flips(Rotation.from_matrix(axes).as_quat())
         return ExactMotion(p, v, a, q, body_rates, np.einsum("nij,ni->nj", axes, a + gravity))
 
     def motors(self, t: ArrayLike) -> np.ndarray:
-        """Whether the motors turn at the stamps t: (n,) bool."""
+        """Return whether the motors run at stamps t: (n,) bool."""
         t = np.asarray(t)
         return (
             (t >= self._start - SPIN_UP) & (t <= self._end + SPIN_UP)
@@ -168,14 +169,14 @@ class Trajectory:
 
 
 class Rover:
-    """A rover with two driven wheels: it follows a point that moves along the path of a config, and
-    stops where the point stops.
+    """A rover with two driven wheels that follows a point along the path of a config.
 
-    Base on the floor, x ahead. Parameters: as of Trajectory; the path may have any heights. It
-    stands still for config.floor_time before and after.
+    Its base is on the floor, x ahead. Heights of the path are ignored. It stops with the point, and
+    stands for config.floor_time before and after.
     """
 
     def __init__(self, config: SimulationConfig, room: Room, rng: np.random.Generator) -> None:
+        """Follow the path of a complete config in a room; `rng` draws stops and the family."""
         _check_time(config)
         self._floor = float(room.lower[2])
         tau = np.arange(0.0, config.duration + KNOT, KNOT)
@@ -202,7 +203,7 @@ class Rover:
         return velocity
 
     def motion(self, t: ArrayLike) -> ExactMotion:
-        """The ExactMotion at the stamps t, (n,) s."""
+        """Return the ExactMotion at stamps t, (n,) s."""
         t = np.clip(np.asarray(t, dtype=float), 0.0, self._last)
         zero, yaw = np.zeros(len(t)), self._yaw(t)
         speed, turning = self._speed(t), self._turning(t)
@@ -218,16 +219,14 @@ class Rover:
         )
 
     def motors(self, t: ArrayLike) -> np.ndarray:
-        """Whether the wheels turn at the stamps t: (n,) bool."""
+        """Return whether the wheels turn at stamps t: (n,) bool."""
         t = np.clip(np.asarray(t, dtype=float), 0.0, self._last)
         turns: np.ndarray = (self._speed(t) != 0.0) | (self._turning(t) != 0.0)
         return turns
 
 
 def _going(tau: np.ndarray, config: SimulationConfig, rng: np.random.Generator) -> np.ndarray:
-    """How fast path time goes at tau (n,) s: 0 before and after the drive and at stops, 1 between
-    them, with smooth changes.
-    """
+    """Return the rate of path time at tau (n,) s: 0 at rest and at stops, 1 between them, smooth."""
     ends = [0.0, config.floor_time]
     last = config.duration - config.floor_time - SPEED_UP
     while ends[-1] < last:
@@ -244,8 +243,11 @@ def _going(tau: np.ndarray, config: SimulationConfig, rng: np.random.Generator) 
 
 
 def _followed(target: np.ndarray, speed: float) -> tuple[np.ndarray, float, np.ndarray, np.ndarray]:
-    """(place (2,) m and heading, rad, at the start; forward speed (n,) m/s and turning rate (n,)
-    rad/s) of a rover that follows a target (n, 2) m, which moves at `speed` m/s, at steps of KNOT.
+    """Return how a rover follows a target (n, 2) m with `speed`, m/s, at steps of KNOT.
+
+    Returns
+    -------
+    place (2,) m and heading rad at the start, speed (n,) m/s, turning rate (n,) rad/s.
     """
     away = target - target[0]
     ahead = away[
@@ -280,12 +282,14 @@ def _followed(target: np.ndarray, speed: float) -> tuple[np.ndarray, float, np.n
 
 
 class Carried:
-    """A tag in the hand of a person who walks along the path of a config: it bobs with the steps,
-    sways and tilts. Parameters: as of Trajectory; the person stands for config.floor_time before
-    and after.
+    """A tag in the hand of a person who walks along the path of a config.
+
+    It bobs with the steps, sways and tilts. The person stands for config.floor_time before and
+    after.
     """
 
     def __init__(self, config: SimulationConfig, room: Room, rng: np.random.Generator) -> None:
+        """Fit the splines to the path of a complete config in a room; `rng` draws the sway."""
         _check_time(config)
         tau = np.linspace(0.0, config.duration, max(int(np.ceil(config.duration / KNOT)), 8) + 1)
         s = path_time(tau, config.floor_time, config.duration)
@@ -305,7 +309,7 @@ class Carried:
         )  # roll, pitch, yaw
 
     def motion(self, t: ArrayLike) -> ExactMotion:
-        """The ExactMotion at the stamps t, (n,) s."""
+        """Return the ExactMotion at stamps t, (n,) s."""
         t = np.asarray(t, dtype=float)
         a = self._p.derivative(2)(t)
         roll, pitch, yaw = self._angles(t).T
@@ -318,22 +322,25 @@ class Carried:
                 d_yaw * np.cos(roll) * np.cos(pitch) - d_pitch * np.sin(roll),
             ]
         )
-        q = turn.as_quat()
-        q[1:] *= np.cumprod(np.where(np.sum(q[1:] * q[:-1], axis=1) < 0.0, -1.0, 1.0))[
-            :, None
-        ]  # no sign flips
         return ExactMotion(
             self._p(t),
             self._p.derivative()(t),
             a,
-            q,
+            _without_sign_flips(turn.as_quat()),
             rates,
             turn.inv().apply(a + [0.0, 0.0, GRAVITY]),
         )
 
     def motors(self, t: ArrayLike) -> np.ndarray:
-        """No motor turns at any of the stamps t: (n,) bool."""
+        """Return False for all stamps t: (n,) bool."""
         return np.zeros(len(np.asarray(t)), bool)
+
+
+def _without_sign_flips(q: np.ndarray) -> np.ndarray:
+    """Return quaternions (n, 4) whose signs are continuous."""
+    signs = np.where(np.sum(q[1:] * q[:-1], axis=1) < 0.0, -1.0, 1.0)
+    q[1:] *= np.cumprod(signs)[:, None]
+    return q
 
 
 def _check_time(config: SimulationConfig) -> None:

@@ -26,14 +26,17 @@ if TYPE_CHECKING:
 
 MARK_KEYS = ("flight", "from", "to", "position", "std")
 MARK_EXAMPLE = "{flight: monday, from: 12.0, to: 14.0, position: [1.0, -2.0, 0.5], std: 0.05}"
+DISTANCE_COLUMNS = "a", "b", "distance", "std"
+PATH_COLUMNS = "t", "x", "y", "z"
+# m per square root of a second: 1 % after 200 m at 1 m/s, as visual-inertial odometry
+DRIFT = 0.02
 
 
 def read_marks(path: str | Path, flights: Sequence[Flight]) -> list[Mark]:
-    """[Mark] of a YAML file, for Flights. Raises InputError for one that is not as MARK_EXAMPLE, or of
-    no or too short a flight.
+    """Read [Mark] of Flights from a YAML file as in MARK_EXAMPLE.
 
-    `from` and `to`: s since the first TDOA of the flight, or its first range where it has no TDOAs;
-    position: m, of the tag, on average between them.
+    `from` and `to` are s since the first TDOA of the flight, or its first range without TDOAs.
+    `position` is the mean position of the tag between them, m. Raises InputError.
     """
     content = read_yaml(path)
     entries = content.get("marks") if isinstance(content, dict) else None
@@ -78,13 +81,10 @@ def _mark(where: str, entry: Any, lengths: Mapping[str, float]) -> Mark:
     return Mark(flight, first, last, position, std)
 
 
-DISTANCE_COLUMNS = "a", "b", "distance", "std"
-
-
 def read_distances(path: str | Path, anchors: Anchors) -> list[Distance]:
-    """[Distance] of a CSV file with the columns DISTANCE_COLUMNS: ids, m, m.
+    """Read [Distance] between Anchors from a CSV file with the columns DISTANCE_COLUMNS: ids, m, m.
 
-    Raises InputError for one that cannot be of Anchors.
+    Raises InputError.
     """
     out, known = [], ", ".join(str(i) for i in anchors.ids)
     for line, row in read_table(path, DISTANCE_COLUMNS):
@@ -106,18 +106,18 @@ def read_distances(path: str | Path, anchors: Anchors) -> list[Distance]:
     return out
 
 
-PATH_COLUMNS = "t", "x", "y", "z"
-# m per square root of a second: visual-inertial odometry that is off by 1 % of 200 m, flown at 1
-# m/s, after that
-DRIFT = 0.02
-
-
 def read_paths(
     source: str, flights: Sequence[Flight], drift: float = DRIFT, namespace: str = ""
 ) -> list[OdometryPath]:
-    """[OdometryPath], one for each of some Flights that it has. source : a CSV file with the
-    columns flight, t (s, clock of the recording), x, y, z (m), or the name of a nav_msgs/Odometry
-    topic of the bags; drift : m per square root of a second. Raises InputError.
+    """Read the OdometryPath of each Flight that the source contains.
+
+    Parameters
+    ----------
+    source : CSV file with the columns flight, t (s, clock of the recording), x, y, z (m), or the
+        name of a nav_msgs/Odometry topic in the bags.
+    drift : m per square root of a second.
+
+    Raises InputError.
     """
     if not 0.0 <= drift <= 10.0:
         raise InputError(f"--drift: {drift:g} must be from 0 to 10 m per square root of a second.")

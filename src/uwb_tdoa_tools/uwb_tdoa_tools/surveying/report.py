@@ -26,15 +26,16 @@ if TYPE_CHECKING:
     from ..diagnosis.self_calibration import SelfCalibration
 
 
-# standard deviations, and times what most others are off by, that an anchor must be off by to stand
-# apart
+# smallest shift of a misplaced anchor: standard deviations, and multiples of the usual shift
 SURE = 5.0
-KNOWN_WELL = 0.02  # m, standard deviation as given that leaves nothing to wish for
+KNOWN_WELL = 0.02  # m, standard deviation of a position that needs no survey
+BLOCKED_DELAY = 0.2  # m, smallest delay of a blocked anchor; antennas cause up to that
 
 
 def apart(found: SelfCalibration) -> list[int]:
-    """Rows of those of MANY anchors that the flights put plainly elsewhere than given, while they
-    leave the others about where they were.
+    """Return the rows of anchors that clearly stand elsewhere than given, while the others do not.
+
+    Empty for MANY anchors or fewer.
     """
     if len(found.given) <= MANY:
         return []
@@ -51,7 +52,7 @@ def apart(found: SelfCalibration) -> list[int]:
 
 
 def as_dict(found: SelfCalibration) -> dict[str, Any]:
-    """For JSON."""
+    """Return the figures for JSON."""
     return {
         "flights": list(found.flights),
         "frame": found.surveyed.frame,
@@ -92,7 +93,7 @@ def as_dict(found: SelfCalibration) -> dict[str, Any]:
 
 
 def as_text(found: SelfCalibration) -> str:
-    """A table of all coordinates, and what it means."""
+    """Return a table of all coordinates, and its interpretation."""
     lines = (
         ["values that make these data fit; measure again before you move an anchor:"]
         if found.why_not
@@ -166,7 +167,7 @@ def as_text(found: SelfCalibration) -> str:
 
 
 def picture(found: SelfCalibration, path: str | Path) -> None:
-    """Plan and elevation, before and after, with 95 % intervals."""
+    """Draw plan and elevation, before and after, with 95 % intervals."""
     from matplotlib.figure import Figure  # takes a second to import
 
     figure = Figure(figsize=(11.0, 5.0), layout="constrained")
@@ -204,17 +205,16 @@ def picture(found: SelfCalibration, path: str | Path) -> None:
     write_filled(path, partial(figure.savefig, dpi=110))
 
 
-BLOCKED_DELAY = 0.2  # m by which an anchor must be late there; antennas alone make up to that
-
-
 def with_blocked(
     result: SelfCalibration,
     flights: Sequence[Flight],
     config: FilterConfig | None = None,
     progress: Callable[[], object] = lambda: None,
 ) -> SelfCalibration:
-    """The SelfCalibration of Flights with what blocks its anchors, looked for in TDOAs beside all
-    that was found.
+    """Add blocked anchors to the SelfCalibration of Flights.
+
+    Obstacles delay the signals of an anchor in a region. Positions and delays of anchors do not
+    explain these residuals.
     """
     flights = [flight for flight in flights if len(flight.tdoa)]
     if not flights:
@@ -231,7 +231,7 @@ def with_blocked(
 
 
 def large(effect: Effect) -> Effect:
-    """The effect nlos with those of its anchors alone that are late by BLOCKED_DELAY."""
+    """Return the effect nlos with only the anchors whose delay reaches BLOCKED_DELAY."""
     late = {
         key.partition(".")[0]
         for key, value in effect.values.items()
