@@ -7,7 +7,7 @@ import numpy as np
 from uwb_tdoa_bias.effects import EFFECTS
 from uwb_tdoa_bias.foundation.sensors import BY_POSE
 from uwb_tdoa_tools.diagnosis.constraints import Mark
-from uwb_tdoa_tools.scoring.metrics import judged_part
+from uwb_tdoa_tools.scoring.metrics import scored_phase
 from uwb_tdoa_tools.simulation import ImuErrors, SimulationConfig, simulate
 
 PATHS = ("sines", "rising_circle", "square", "sines", "rising_circle")
@@ -115,7 +115,7 @@ def marks_of(flight, count, rng):
     """[Mark] at places of the ground truth, MARK_TIME long, evenly over the airborne part, MARK_STD
     off.
     """
-    truth, (begin, end) = flight.truth, judged_part(flight.truth)[1:]
+    truth, (begin, end) = flight.truth, scored_phase(flight.truth)[1:]
     out = []
     for first in np.linspace(begin + MARK_TIME, end - 2.0 * MARK_TIME, count):
         inside = (truth.t >= first) & (truth.t <= first + MARK_TIME)

@@ -1,5 +1,3 @@
-"""localize: trajectories without ground truth, and how far they are to be believed."""
-
 from dataclasses import replace
 import json
 
@@ -14,7 +12,7 @@ from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag
 from uwb_tdoa_tools.commands import evaluate, localize
 from uwb_tdoa_tools.estimate import FlightEstimator
 from uwb_tdoa_tools.localizing import assessment, residuals
-from uwb_tdoa_tools.localizing.localize import check_names, name_of
+from uwb_tdoa_tools.localizing.localize import check_names, name_of, write_tum
 from uwb_tdoa_tools.readers.inputs import Reading, find_flights
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
@@ -371,3 +369,28 @@ def test_zones_are_written_as_a_table_and_a_map(bags, tmp_path, capsys):
     assert (tmp_path / "flight_zones.png").stat().st_size > 10_000
     run([bags / "none" / "flight.bag", "--zones", "0", "--out", tmp_path], 2)
     assert "--zones: 0 m is no size" in capsys.readouterr().err
+
+
+def test_one_line_per_pose(tmp_path):
+    path = tmp_path / "made" / "for" / "it.tum"
+    t = np.array([1700000000.123456, 1700000000.128456])
+    p, q = (
+        np.array([[1.0, -2.0, 3.25], [0.0, 0.5, 1e-7]]),
+        np.array([[0.0, 0.0, 0.6, 0.8], [np.nan] * 4]),
+    )
+    write_tum(path, t, p, q)
+    lines = path.read_text().splitlines()
+    assert (
+        lines[0]
+        == "1700000000.123456001 1.000000 -2.000000 3.250000 0.000000 0.000000 0.600000 0.800000"
+    )
+    assert [len(line.split()) for line in lines] == [8, 8]
+    read = np.loadtxt(path)
+    np.testing.assert_allclose(read[:, 0], t, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(read[:, 1:4], p, atol=1e-6)
+    np.testing.assert_array_equal(read[1, 4:], [0, 0, 0, 1])  # unknown becomes the identity
+
+
+def test_no_poses(tmp_path):
+    write_tum(tmp_path / "none.tum", np.empty(0), np.empty((0, 3)), np.empty((0, 4)))
+    assert (tmp_path / "none.tum").read_text() == ""

@@ -16,10 +16,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .readers.streams import GRAVITY
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-GRAVITY = 9.81  # m/s^2 in one g of the Crazyflie's accelerometer
 PERIOD = 0.01  # s, the shortest of a log block
 RATES, FORCES = [f"gyro.{axis}" for axis in "xyz"], [f"acc.{axis}" for axis in "xyz"]  # deg/s, g
 DRIFT = 1e-3  # s/s by which the clock of a vehicle may run away from ours

@@ -342,11 +342,9 @@ def read_others(path: str | Path) -> dict[str, dict[str, str]]:
     Raises InputError.
     """
     others: dict[str, dict[str, str]] = {}
-    for line_of_run, row in read_table(path, ("flight", "peer", "mode", "rmse_3d", "diverged")):
+    for line, row in read_table(path, ("flight", "peer", "mode", "rmse_3d", "diverged")):
         cell = (
-            "diverged"
-            if row["diverged"] == "True"
-            else f"{number(path, line_of_run, row, 'rmse_3d'):.3f}"
+            "diverged" if row["diverged"] == "True" else f"{number(path, line, row, 'rmse_3d'):.3f}"
         )
         others.setdefault(harmless(f"{row['peer']} {row['mode']}"), {})[harmless(row["flight"])] = (
             cell

@@ -315,7 +315,7 @@ def rerun_of(args: Namespace, count: int, say: Callable[[str], object]) -> Path 
         return None
     if count != 1:
         raise InputError(f"--rerun: needs exactly one flight, got {count}.")
-    return args.rerun if pictures.is_there(say) else None
+    return args.rerun if pictures.rerun_is_installed(say) else None
 
 
 def add_known(parser: ArgumentParser) -> None:

@@ -371,7 +371,7 @@ def read_bag(
         imu = stream("imu")
         tree = frames.read_frames(path, reader)
         places = {
-            kinds[name].topic: frames.placed(tree, kinds[name].topic, found[name].frames)
+            kinds[name].topic: frames.sensor_place(tree, kinds[name].topic, found[name].frames)
             for name in ("imu", "tdoa")
         }
         remarks += [remark for _, remark in places.values() if remark]

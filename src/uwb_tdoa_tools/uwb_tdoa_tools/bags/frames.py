@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 import re
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from .messages import BODY_FRAME
 
 if TYPE_CHECKING:
     from collections import Counter
+    from collections.abc import Iterator
     from pathlib import Path
 
     from scipy.spatial.transform import Rotation
@@ -48,26 +49,29 @@ def is_body(frame: str) -> bool:
     return frame.rpartition("/")[2] in (BODY_FRAME, "")
 
 
-def read_frames(path: str | Path, reader: BagReader) -> Frames:
-    """Read the Frames of all messages on /tf_static of an open bag. Raise InputError."""
-    frames = Frames()
+def _static_transforms(path: str | Path, reader: BagReader) -> Iterator[Any]:
+    """Yield the transforms on /tf_static of an open bag. Raise InputError."""
     connections = [
-        c
-        for c in reader.connections
-        if c.topic == TF_STATIC and c.msgtype == "tf2_msgs/msg/TFMessage"
+        one for one in reader.connections if one.topic == TF_STATIC and one.msgtype == TRANSFORMS
     ]
     for connection in connections:
         check_type(path, connection)
     for _, _, message in readable(path, reader, connections):
-        for each in message.transforms:
-            q, p = each.transform.rotation, each.transform.translation
-            q, p = (q.x, q.y, q.z, q.w), (p.x, p.y, p.z)
-            if any(q) and np.isfinite([*q, *p]).all():
-                frames.set(each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/"), q, p)
+        yield from message.transforms
+
+
+def read_frames(path: str | Path, reader: BagReader) -> Frames:
+    """Read the Frames of all messages on /tf_static of an open bag. Raise InputError."""
+    frames = Frames()
+    for each in _static_transforms(path, reader):
+        q, p = each.transform.rotation, each.transform.translation
+        q, p = (q.x, q.y, q.z, q.w), (p.x, p.y, p.z)
+        if any(q) and np.isfinite([*q, *p]).all():
+            frames.set(each.header.frame_id.lstrip("/"), each.child_frame_id.lstrip("/"), q, p)
     return frames
 
 
-def place_of(frames: Frames, frame: str) -> Place | None:
+def place_in_body(frames: Frames, frame: str) -> Place | None:
     """Return (Rotation, arm (3,) m) of a sensor's frame in the body; None if unknown.
 
     The body belongs to the same robot, or is the only body frame.
@@ -80,11 +84,13 @@ def place_of(frames: Frames, frame: str) -> Place | None:
 
 
 def imu_in_body(imu: Imu, place: Place) -> Imu:
-    """Transform samples of an IMU at a place, see `place_of`, to the origin of the body."""
+    """Transform samples of an IMU at a place, see `place_in_body`, to the origin of the body."""
     return Imu(imu.t, *ImuMount(*place).in_body(imu.t, imu.gyro, imu.accel))
 
 
-def placed(frames: Frames, topic: str, counts: Counter[str]) -> tuple[Place | None, str | None]:
+def sensor_place(
+    frames: Frames, topic: str, counts: Counter[str]
+) -> tuple[Place | None, str | None]:
     """Return (place or None, remark or None) of the single frame in the messages of a topic.
 
     `counts` is {frame_id: messages}. A place changes the result, so it has a remark too.
@@ -100,7 +106,7 @@ def placed(frames: Frames, topic: str, counts: Counter[str]) -> tuple[Place | No
                 f"{BODY_FRAME}."
             ),
         )
-    place = place_of(frames, others[0])
+    place = place_in_body(frames, others[0])
     if place is None:
         return (
             None,
@@ -156,18 +162,12 @@ def recorded_anchors(path: str | Path, reader: BagReader, topic: str) -> Recorde
 
 def _of_frames(path: str | Path, reader: BagReader) -> Recorded | None:
     by_parent: dict[str, dict[int, list[float]]] = defaultdict(dict)
-    connections = [
-        one for one in reader.connections if one.topic == TF_STATIC and one.msgtype == TRANSFORMS
-    ]
-    for connection in connections:
-        check_type(path, connection)
-    for _, _, message in readable(path, reader, connections):
-        for each in message.transforms:
-            if found := _FRAME.match(each.child_frame_id):
-                p, q = each.transform.translation, each.transform.rotation
-                # drivers without orientations write the identity
-                turn = [q.x, q.y, q.z, q.w] if abs(q.w) < 1.0 else [np.nan] * 4
-                by_parent[each.header.frame_id][int(found[1])] = [p.x, p.y, p.z, *turn]
+    for each in _static_transforms(path, reader):
+        if found := _FRAME.match(each.child_frame_id):
+            p, q = each.transform.translation, each.transform.rotation
+            # drivers without orientations write the identity
+            turn = [q.x, q.y, q.z, q.w] if abs(q.w) < 1.0 else [np.nan] * 4
+            by_parent[each.header.frame_id][int(found[1])] = [p.x, p.y, p.z, *turn]
     frames = [(parent, rows) for parent, rows in by_parent.items() if len(rows) >= FEWEST]
     if len(frames) != 1:
         return None

@@ -190,7 +190,7 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
         anchors, str(survey) if survey or recorded is None else f"{path}: {recorded.source}"
     )
     samples = bag_messages.imu_of(imu.stamps / 1e9, imu.rows) if len(imu.stamps) else None
-    if samples is not None and (place := frames.placed(tree, IMU, imu.frames)[0]):
+    if samples is not None and (place := frames.sensor_place(tree, IMU, imu.frames)[0]):
         samples = frames.imu_in_body(samples, place)
     return Recording(
         name=path.stem,
@@ -207,7 +207,7 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
         places={
             frame: place
             for frame in {*tdoa.frames, *imu.frames}
-            if (place := frames.place_of(tree, frame))
+            if (place := frames.place_in_body(tree, frame))
         },
         topics=topics,
         read=frozenset(map(name_of, HEARD)),

@@ -19,7 +19,7 @@ from ..checking.check import check
 from ..checking.recording import of_flight
 from ..checking.watch import OF_ANCHORS
 from ..estimate import FlightEstimator
-from ..scoring.metrics import LOST, nis, reached
+from ..scoring.metrics import LOST, has_innovation, nis
 from . import residuals
 
 if TYPE_CHECKING:
@@ -95,8 +95,8 @@ def assess(
 
     `line` is the command that `check` suggests, see there.
     """
-    odometry, left = run.odometry, residuals.of_run(flight, run)
-    there = reached(left)
+    odometry, left = run.odometry, residuals.residuals_of(flight, run)
+    there = has_innovation(left)
     figures = {
         "seconds": _length(left),
         "estimates": len(odometry),

@@ -139,11 +139,11 @@ class Localizer:
             written.append(self.folder / f"{name}{end}")
             return written[-1]
 
-        odometry, left = run.odometry, residuals.of_run(flight, run)
+        odometry, left = run.odometry, residuals.residuals_of(flight, run)
         write_tum(path(".tum"), odometry.t, odometry.p, odometry.q)
         write_trajectory(path(".csv"), odometry)
         title = f"{name}: {assessment.sentences()[0].partition(';')[0]}"
-        pictures.draw(path(".png"), odometry, flight.anchors, assessment.lost, title)
+        pictures.draw_estimate(path(".png"), odometry, flight.anchors, assessment.lost, title)
         if self.bag and len(odometry):
             write_odometry(odometry, flight.anchors, path(".bag"), force=True)
         if self.left:

@@ -51,7 +51,7 @@ BLUE, RED, GREY, BLACK, ORANGE = (
 )
 
 
-def draw(
+def draw_estimate(
     path: Path,
     odometry: Odometry,
     anchors: Anchors,
@@ -168,7 +168,7 @@ def _plane(
         )
 
 
-def is_there(say: Callable[[str], object]) -> bool:
+def rerun_is_installed(say: Callable[[str], object]) -> bool:
     """Return whether the library is installed; if not, call say(sentence)."""
     if find_spec("rerun") is not None:
         return True

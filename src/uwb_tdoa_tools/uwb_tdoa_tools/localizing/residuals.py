@@ -15,7 +15,7 @@ from uwb_tdoa_bias.foundation.sensors import LOCATING
 from uwb_tdoa_ekf.core.verdicts import USED
 from uwb_tdoa_ekf.results import VERDICTS, Odometry, Residuals, concatenated
 
-from ..scoring.metrics import reached
+from ..scoring.metrics import has_innovation
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.flight import Flight
@@ -66,7 +66,7 @@ class PairResiduals:
         }
 
 
-def of_run(flight: Flight, run: Run) -> Residuals:
+def residuals_of(flight: Flight, run: Run) -> Residuals:
     """Return the Residuals of the TDOAs and ranges of a Run; a range has a = b."""
     parts = [run.residuals]
     for name in LOCATING:
@@ -81,12 +81,12 @@ def of_run(flight: Flight, run: Run) -> Residuals:
 def explained(residuals: Residuals) -> np.ndarray:
     """Return which innovations are within three expected standard deviations: (n,) bool."""
     with np.errstate(invalid="ignore"):  # NaN without an innovation
-        return reached(residuals) & (residuals.innovation**2 <= 9.0 * residuals.variance)
+        return has_innovation(residuals) & (residuals.innovation**2 <= 9.0 * residuals.variance)
 
 
 def by_pair(residuals: Residuals) -> list[PairResiduals]:
     """Return the residuals of each pair of anchors, in the order of their ids."""
-    there, fits = reached(residuals), explained(residuals)
+    there, fits = has_innovation(residuals), explained(residuals)
     low, high = np.minimum(residuals.a, residuals.b), np.maximum(residuals.a, residuals.b)
     sign = np.where(residuals.a <= residuals.b, 1.0, -1.0)
     pairs = []

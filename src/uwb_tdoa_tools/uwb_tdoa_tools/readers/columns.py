@@ -151,10 +151,6 @@ def read_columns(
             }
     for ids in (streams.get("tdoa", {}), streams.get("range", {})):
         ids.update({name: ids[name].astype(np.int64) for name in ids.keys() & {"a", "b", "anchor"}})
-    if "pose" in streams and "qx" not in streams["pose"]:
-        streams["pose"].update(
-            {f"q{k}": np.full(len(streams["pose"]["t"]), np.nan) for k in "xyzw"}
-        )
     meta = {
         "source": ", ".join(map(str, paths)),
         "format": "CSV, columns as given",

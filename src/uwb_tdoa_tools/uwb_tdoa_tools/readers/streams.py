@@ -60,7 +60,7 @@ def make_flight(
     ----------
     streams : {stream: {column: (n,) array}}; "t" in s, other columns in the units of the file.
         "tdoa": a, b, d (m), std (m, optional). "range": anchor, d (m), std (m, optional). "gyro":
-        x, y, z (deg/s). "acc": x, y, z (g). "pose": x, y, z (m), qx, qy, qz, qw. "tof": tof (mm).
+        x, y, z (deg/s). "acc": x, y, z (g). "pose": x, y, z (m), and qx, qy, qz, qw (optional). "tof": tof (mm).
         "baro": baro (m above the sea in the standard atmosphere). "flow": x, y (pixel counts),
         which become a velocity if "tof" and IMU exist.
     extra : further streams for `Flight.extra`.
@@ -79,6 +79,9 @@ def make_flight(
         for key, columns in streams.items()
         if len(columns["t"]) and (truth or key != "pose")
     }
+    if "pose" in wanted and "qx" not in wanted["pose"]:
+        unknown = np.full(len(wanted["pose"]["t"]), np.nan)
+        wanted["pose"] = {**wanted["pose"], **dict.fromkeys(("qx", "qy", "qz", "qw"), unknown)}
     clock = straightened({key: columns["t"] for key, columns in (extra | wanted).items()})
     wanted, extra = (
         {key: clock.columns(key, columns) for key, columns in group.items()}

@@ -94,10 +94,6 @@ def read_util_csv(
         valid = np.isfinite(tdoa["a"]) & np.isfinite(tdoa["b"])
         tdoa.update({name: values[valid] for name, values in tdoa.items()})
     tdoa["a"], tdoa["b"] = _ids(path, "idA", tdoa["a"]), _ids(path, "idB", tdoa["b"])
-    if "pose" in streams and "qx" not in streams["pose"]:
-        streams["pose"].update(
-            {name: np.full(len(streams["pose"]["t"]), np.nan) for name in _QUATERNION.values()}
-        )
 
     meta = {"source": str(path), "format": "UTIL CSV", "remarks": remarks}
     if ignored := [name for name in header if name not in _KNOWN]:

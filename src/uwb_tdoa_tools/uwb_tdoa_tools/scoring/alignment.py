@@ -23,7 +23,7 @@ from ..checking.imu_rules import ARRANGEMENTS, signed_axis
 from ..checking.known_path import KnownPath
 from ..checking.motion_rules import FEWEST, TrueMotion
 from ..clock import grid
-from .metrics import judged_part, position_at
+from .metrics import position_at, scored_phase
 from .pooling import ALIGN
 
 if TYPE_CHECKING:
@@ -364,7 +364,7 @@ def common_paths(truth: Truth, odometry: PoseColumns) -> tuple[np.ndarray, np.nd
     """Return (true (n, 3), estimated (n, 3)) m at the same instants, while the tag moves."""
     if len(odometry.t) < 2:
         return np.empty((0, 3)), np.empty((0, 3))
-    _, first, last = judged_part(truth)
+    _, first, last = scored_phase(truth)
     begin, end = max(first, odometry.t[0]) + LONGEST, min(last, odometry.t[-1]) - LONGEST
     t = grid(begin, end, 1.0 / RATE, odometry.t)
     return position_at(t, truth), position_at(t, odometry)

@@ -53,7 +53,7 @@ def or_nan(function: Callable[[np.ndarray], float], values: np.ndarray) -> float
     return float(function(values)) if len(values) else math.nan
 
 
-def judged_part(truth: Truth) -> tuple[str, float, float]:
+def scored_phase(truth: Truth) -> tuple[str, float, float]:
     """Return (name, first, last) of the phase that the figures of a whole run are from.
 
     It is the time in the air. A tag that is never in the air is scored while it moves, a tag that
@@ -146,11 +146,11 @@ def nis(residuals: Residuals) -> np.ndarray:
 
     Outliers count in full. An honest filter gives 1 on average.
     """
-    there = reached(residuals)
+    there = has_innovation(residuals)
     return residuals.innovation[there] ** 2 / residuals.variance[there]
 
 
-def reached(residuals: Residuals) -> np.ndarray:
+def has_innovation(residuals: Residuals) -> np.ndarray:
     """Return which measurements had an innovation in the filter: (n,) bool."""
     return np.isin(residuals.verdict, (USED, REJECTED, COMPENSATED))
 
@@ -270,7 +270,7 @@ class Score:
 
     Attributes
     ----------
-    part : name of the scored phase, see `judged_part`.
+    part : name of the scored phase, see `scored_phase`.
     first, last : s, of that phase.
     t : (n,) s.
     p : (n, 3) m, true positions.
@@ -301,7 +301,7 @@ class Score:
         self.name, self._whole, self._heard, self._reach = name, (odometry, truth), heard, reach
         if spans is not None:  # the truth must not be interpolated between spans
             truth, odometry = (_inside(part, spans) for part in (truth, odometry))
-        self.part, self.first, self.last = judged_part(truth)
+        self.part, self.first, self.last = scored_phase(truth)
         self.t, self.error, self.covariance = position_errors(
             odometry, truth, self.first, self.last
         )

@@ -64,16 +64,16 @@ def plot(flight: Flight, path: str | Path) -> None:
     assert flight.truth is not None
     from matplotlib.figure import Figure  # takes a second to import
 
+    from ..scoring.plots import labels
+
     parts, truth, tdoa = flight.extra["tdoa_truth"], flight.truth, flight.tdoa
     figure = Figure(figsize=(12, 7), layout="constrained")
     figure.suptitle(flight.name)
     (above, height), (bias, error) = figure.subplots(2, 2)
     above.plot(truth.p[:, 0], truth.p[:, 1])
     above.plot(*flight.anchors.positions[:, :2].T, "k^")
-    feet, foot = np.unique(flight.anchors.positions[:, :2], axis=0, return_inverse=True)
-    for k, at in enumerate(feet):
-        ids = ", ".join(str(anchor) for anchor in flight.anchors.ids[foot.ravel() == k])
-        above.annotate(ids, at, xytext=(4, 4), textcoords="offset points")
+    for text, at in labels(flight.anchors.ids.tolist(), flight.anchors.positions[:, :2]):
+        above.annotate(text, (at[0], at[1]), xytext=(4, 4), textcoords="offset points")
     above.margins(0.15)
     above.set(xlabel="x, m", ylabel="y, m", aspect="equal")
     height.plot(truth.t, truth.p[:, 2])

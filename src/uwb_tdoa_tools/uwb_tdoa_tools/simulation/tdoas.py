@@ -87,7 +87,7 @@ def make_schedule(
     )
 
 
-def among_heard(
+def restrict_to_heard(
     schedule: Schedule,
     heard: Sequence[np.ndarray],
     protocol: str,
@@ -219,7 +219,7 @@ def measure_tdoas(
             trajectory.motion(schedule.t).p, anchors.positions, config.radio_reach, config.walls
         )
         cells = None if config.cell_ids is None else anchors.ids // config.cell_ids
-        schedule = among_heard(schedule, heard, config.protocol, random("reach"), cells)
+        schedule = restrict_to_heard(schedule, heard, config.protocol, random("reach"), cells)
         if not len(schedule.t):
             raise InputError(
                 f"radio_reach: two anchors are nowhere heard within {config.radio_reach:g} m "

@@ -180,11 +180,11 @@ class Rover:
         _check_time(config)
         self._floor = float(room.lower[2])
         tau = np.arange(0.0, config.duration + KNOT, KNOT)
-        goes = _going(tau, config, rng)
+        goes = _path_rate(tau, config, rng)
         target = path_of(np.concatenate([[0.0], np.cumsum(KNOT * goes)[:-1]]), config, room, rng)[
             :, :2
         ]
-        start, heading, speed, turning = _followed(target, config.speed)
+        start, heading, speed, turning = _follow(target, config.speed)
         knots = KNOT * np.arange(-2, len(tau) + 2)
         self._speed, self._turning = BSpline(knots, speed, 3), BSpline(knots, turning, 3)
         turned = self._turning.antiderivative()
@@ -225,7 +225,7 @@ class Rover:
         return turns
 
 
-def _going(tau: np.ndarray, config: SimulationConfig, rng: np.random.Generator) -> np.ndarray:
+def _path_rate(tau: np.ndarray, config: SimulationConfig, rng: np.random.Generator) -> np.ndarray:
     """Return the rate of path time at tau (n,) s: 0 at rest and at stops, 1 between them, smooth."""
     ends = [0.0, config.floor_time]
     last = config.duration - config.floor_time - SPEED_UP
@@ -242,7 +242,7 @@ def _going(tau: np.ndarray, config: SimulationConfig, rng: np.random.Generator) 
     return out
 
 
-def _followed(target: np.ndarray, speed: float) -> tuple[np.ndarray, float, np.ndarray, np.ndarray]:
+def _follow(target: np.ndarray, speed: float) -> tuple[np.ndarray, float, np.ndarray, np.ndarray]:
     """Return how a rover follows a target (n, 2) m with `speed`, m/s, at steps of KNOT.
 
     Returns
@@ -281,7 +281,7 @@ def _followed(target: np.ndarray, speed: float) -> tuple[np.ndarray, float, np.n
     return target[0], heading, np.array(speeds), np.array(turnings)
 
 
-class Carried:
+class HandHeld:
     """A tag in the hand of a person who walks along the path of a config.
 
     It bobs with the steps, sways and tilts. The person stands for config.floor_time before and
@@ -355,5 +355,5 @@ def _check_time(config: SimulationConfig) -> None:
 VEHICLES: dict[str, Callable[[SimulationConfig, Room, np.random.Generator], Flyable]] = {
     "quadrotor": Trajectory,
     "rover": Rover,
-    "hand": Carried,
+    "hand": HandHeld,
 }

@@ -32,7 +32,7 @@ KNOWN_WELL = 0.02  # m, standard deviation of a position that needs no survey
 BLOCKED_DELAY = 0.2  # m, smallest delay of a blocked anchor; antennas cause up to that
 
 
-def apart(found: SelfCalibration) -> list[int]:
+def misplaced_anchors(found: SelfCalibration) -> list[int]:
     """Return the rows of anchors that clearly stand elsewhere than given, while the others do not.
 
     Empty for MANY anchors or fewer.
@@ -77,7 +77,7 @@ def as_dict(found: SelfCalibration) -> dict[str, Any]:
             }
             for one in found.changes
         ],
-        "apart": [str(found.given.ids[row]) for row in apart(found)],
+        "apart": [str(found.given.ids[row]) for row in misplaced_anchors(found)],
         "applied": found.why_not is None,
         "blocked": list(found.blocked),
         "marks_left_out": found.marks,
@@ -131,7 +131,7 @@ def as_text(found: SelfCalibration) -> str:
         lines += (
             [] if found.changes else ["no anchor has changed clearly since the last calibration"]
         )
-    for row in apart(found):
+    for row in misplaced_anchors(found):
         by = ", ".join(
             f"{100 * value:+.1f} +- {100 * std:.1f}"
             for value, std in zip(found.shifts[row], found.position_std[row])
@@ -226,11 +226,14 @@ def with_blocked(
         moved, reference, base, ("nlos",), undeclared=False, progress=progress
     ).effects
     return replace(
-        result, blocked=tuple(sentence for effect in effects for sentence in large(effect).advice())
+        result,
+        blocked=tuple(
+            sentence for effect in effects for sentence in with_large_delays(effect).advice()
+        ),
     )
 
 
-def large(effect: Effect) -> Effect:
+def with_large_delays(effect: Effect) -> Effect:
     """Return the effect nlos with only the anchors whose delay reaches BLOCKED_DELAY."""
     late = {
         key.partition(".")[0]
