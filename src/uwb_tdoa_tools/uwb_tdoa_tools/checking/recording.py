@@ -17,9 +17,9 @@ from uwb_tdoa_bias.foundation.survey_faults import refuse_faulty
 
 from ..bags import frames, is_bag
 from ..bags import messages as bag_messages
-from ..bags.bag import Names, arrivals, on_one_clock, read_sensor, read_topic
 from ..bags.files import open_bag, remarks_of
 from ..bags.frames import TF_STATIC, recorded_anchors
+from ..bags.topics import Names, arrivals, on_one_clock, read_sensor, read_topic
 from ..readers import read_survey
 
 if TYPE_CHECKING:
@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.flight import Flight
     from uwb_tdoa_bias.foundation.sensors.sensor import Sensor, Stream
 
-    from ..bags.bag import TopicMessages
     from ..bags.frames import Place
+    from ..bags.topics import TopicMessages
     from ..clock import Jump
     from ..live.ends import End
     from ..readers.inputs import Reading
