@@ -164,7 +164,7 @@ def test_a_path_that_repeats_itself_does_not_tell_the_epoch(bare):
         t=t,
         variance=None,
     )
-    with pytest.raises(InputError, match="its path does not tell on which"):
+    with pytest.raises(InputError, match="its path does not determine the offset"):
         estimate_alignment(replace(bare, truth=truth, tdoa=tdoa), path)
 
 

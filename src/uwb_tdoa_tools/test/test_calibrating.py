@@ -146,8 +146,7 @@ def test_quick_says_what_is_to_be_expected(flights):
     assert np.median(told.expected) < 0.7 * np.median(told.given)
     sentences = told.sentences()
     assert (
-        f"all flights are likely to tell {told.better.sum()} of 24 coordinates better"
-        in sentences[1]
+        f"all flights are likely to improve {told.better.sum()} of 24 coordinates" in sentences[1]
     )
     assert sentences[-1] == "the flights are exciting enough"
 

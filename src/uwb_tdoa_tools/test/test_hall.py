@@ -150,7 +150,7 @@ def test_an_anchor_that_stands_apart_from_the_others_is_named_even_if_the_tape_a
     )
     assert misplaced_anchors(found) == [
         MOVED
-    ] and f"anchor {MOVED} does not stand where it was given" in as_text(found)
+    ] and f"anchor {MOVED} is not at its given position" in as_text(found)
     still = np.delete(shifts, MOVED, axis=0)[[*range(MOVED), 0, *range(MOVED, len(given) - 1)]]
     assert not misplaced_anchors(replace(found, surveyed=given.at(given.positions + still)))
 

@@ -284,8 +284,8 @@ class Prospect:
             f"from {self.seconds:.0f} s of {self.total:.0f} s in the air: of the innovations "
             f"{100 * self.before:.1f} cm are slow with the anchors as "
             f"given, and {100 * self.left:.1f} cm with others",
-            f"all flights are likely to tell {int(self.better.sum())} of {self.better.size} "
-            "coordinates better: "
+            f"all flights are likely to improve {int(self.better.sum())} of {self.better.size} "
+            "coordinates: "
             f"{100 * np.median(self.expected):.0f} cm in the median instead of "
             f"{100 * np.median(self.given):.0f} cm",
         ]
@@ -294,14 +294,14 @@ class Prospect:
         unseen = [str(i) for i, row in zip(self.ids, self.better) if not row.any()]
         if unseen:
             lines.append(
-                f"nothing is told of anchors {listed(unseen)}: fly closer to them, on all "
+                f"the flights do not improve anchors {listed(unseen)}: fly closer to them, on all "
                 "sides, high and low"
             )
         for axis, size, room in zip("xyz", self.path, self.hall):
             if size < MOVES * room:
                 lines.append(
                     f"along {axis} the tag moves by {size:.1f} m among anchors that are "
-                    f"{room:.1f} m apart: fly more of it"
+                    f"{room:.1f} m apart: fly longer paths along it"
                 )
         lines.append(
             "the flights are exciting enough"

@@ -203,15 +203,14 @@ def _doubts(
         )
     if figures["recoveries"]:
         yield (
-            "the filter found that it had been wrong, and began anew at another place, "
-            f"{figures['recoveries']} times"
+            f"the filter was wrong and was reset to another position {figures['recoveries']} times"
         )
     if figures["explained"] < FEW:
         yield f"{1.0 - figures['explained']:.0%} of the {_measured(figures)} speak against it"
     if figures["std"] > LOST:
         yield f"the position is stated to no better than {figures['std']:.1f} m"
     if flight.imu is not None and figures["yaw_std"] > YAW_KNOWN:
-        yield f"the yaw is not known in the end: +-{math.degrees(figures['yaw_std']):.0f} degrees"
+        yield f"the yaw is unknown at the end: +-{math.degrees(figures['yaw_std']):.0f} degrees"
 
 
 def _remedies(
@@ -229,7 +228,7 @@ def _remedies(
         yield "record the inertial sensor, too: the filter then knows the attitude, and bridges gaps"
     if figures["std_z"] > TALL * max(figures["std_x"], figures["std_y"]) and flight.height is None:
         yield (
-            "the height is what is known worst: add a range finder that looks down, or put "
+            "the height is the weakest coordinate: add a range finder that looks down, or put "
             "anchors further apart in height (plan says where)"
         )
     if not corrected and figures["lasting"] > LASTING:

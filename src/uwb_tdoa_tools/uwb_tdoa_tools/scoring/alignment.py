@@ -153,22 +153,19 @@ class Alignment:
         if abs(self.late) > LONGEST:
             return (
                 f"the ground truth is on another clock: its stamps are {self.late:.2f} s ahead of "
-                "those of the TDOAs"
+                "the TDOAs"
             )
         by = f"{abs(self.late):.2f} s {'late' if self.late > 0.0 else 'early'}"
         if self.source == "inertial":
-            return (
-                f"the stamps of the ground truth are {by}, as the gyroscope and the accelerometer "
-                "tell"
-            )
+            return f"the stamps of the ground truth are {by}, as gyroscope and accelerometer show"
         turned = (
-            ", or the frame of the truth is turned: along this path one looks like the other"
+            ", or the frame of the truth is turned: on this path both explain the data"
             * self.ambiguous
         )
         apart_by = f"ground truth or TDOAs are {abs(self.late):.2f} s apart"
         return (
-            f"{apart_by} (the truth {by}, or the TDOAs the other way{turned}); no inertial sensor "
-            "tells which"
+            f"{apart_by} (the truth {by}, or the TDOAs the other way{turned}); an inertial "
+            "sensor would show which"
         )
 
     def frame_sentence(self) -> str | None:
@@ -402,7 +399,7 @@ def _epoch(flight: Flight, odometry: PoseColumns) -> float:
         tried.append(f"the nearest is {error[best]:.2f} m off, another one {others:.2f} m")
     raise InputError(
         f"{flight.name}: the ground truth is on another clock than the TDOAs, and its path "
-        f"does not tell on which ({tried[0]}; with other axes "
+        f"does not determine the offset ({tried[0]}; with other axes "
         f"{tried[1]}): write both on one clock."
     )
 

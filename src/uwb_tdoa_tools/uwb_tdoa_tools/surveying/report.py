@@ -118,7 +118,7 @@ def as_text(found: SelfCalibration) -> str:
     ]
     if unseen:
         lines.append(
-            f"nothing new is told of anchors {', '.join(unseen)}: fly closer to them, on all "
+            f"the flights do not improve anchors {', '.join(unseen)}: fly closer to them, on all "
             "sides, high and low"
         )
     since = (
@@ -137,16 +137,16 @@ def as_text(found: SelfCalibration) -> str:
             for value, std in zip(found.shifts[row], found.position_std[row])
         )
         lines.append(
-            f"anchor {found.given.ids[row]} does not stand where it was given, as the others "
-            f"do: off by {by} cm (x, y, z)"
+            f"anchor {found.given.ids[row]} is not at its given position, unlike the others: "
+            f"off by {by} cm (x, y, z)"
         )
     if found.tag_delay is not None:
         delay, its_std = found.tag_delay
         lines.append(
             f"all ranges are {100 * abs(delay):.1f} +- {100 * its_std:.1f} cm too "
-            f"{'long' if delay > 0.0 else 'short'}, beside what was known: the antenna "
-            "delay of the tag; another tag has its own: the filter finds what differs, by "
-            "range_offset_std"
+            f"{'long' if delay > 0.0 else 'short'}, in addition to known effects: the antenna "
+            "delay of the tag. For another tag the filter estimates the difference "
+            "(range_offset_std)"
         )
     lines += found.blocked
     if found.marks:
