@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.commands import simulate as command
 from uwb_tdoa_tools.simulation import NO_IMU_ERRORS, SimulationConfig, simulate
-from uwb_tdoa_tools.simulation.config import OF_VEHICLE
+from uwb_tdoa_tools.simulation.config import VEHICLE_DEFAULTS
 from uwb_tdoa_tools.simulation.paths import TRAJECTORIES
 from uwb_tdoa_tools.simulation.vehicles import GRAVITY, VEHICLES, Trajectory
 
@@ -180,7 +180,7 @@ def test_flights_that_do_not_fit_are_refused(change, field):
         fly(replace(CONFIG, **change))
 
 
-ON_FOOT_OR_WHEELS = [name for name in OF_VEHICLE if name != "quadrotor"]
+ON_FOOT_OR_WHEELS = [name for name in VEHICLE_DEFAULTS if name != "quadrotor"]
 SQUARE = ((-2.0, -1.5), (2.0, -1.5), (2.0, 1.5), (-2.0, 1.5))
 
 
@@ -258,7 +258,7 @@ def test_a_person_walks_at_the_height_of_a_hand():
     assert flight.velocity is None
 
 
-@pytest.mark.parametrize("vehicle", OF_VEHICLE)
+@pytest.mark.parametrize("vehicle", VEHICLE_DEFAULTS)
 def test_waypoints_are_passed_in_turn(vehicle):
     flight = simulate(SimulationConfig.of(vehicle, path=SQUARE, duration=80.0))
     away = np.linalg.norm(flight.truth.p[:, None, :2] - np.array(SQUARE), axis=2)
@@ -275,7 +275,7 @@ def test_waypoints_have_heights():
     assert np.ptp(flight.truth.p[(flight.truth.t > 8.0) & (flight.truth.t < 32.0), 2]) > 1.3
 
 
-@pytest.mark.parametrize("vehicle", OF_VEHICLE)
+@pytest.mark.parametrize("vehicle", VEHICLE_DEFAULTS)
 def test_a_trajectory_lies_in_its_area_even_beside_the_anchors(vehicle):
     area = ((-8.0, -3.0), (-5.0, 3.0))
     flight = simulate(SimulationConfig.of(vehicle, area=area, duration=60.0, speed=0.5))

@@ -37,15 +37,15 @@ if TYPE_CHECKING:
 # the rule of `check` for a survey that does not fit without another mistake
 MISFIT = "survey_misfit"
 # largest median shift of the anchors, in standard deviations, that a calibration can correct
-OFF = 3.0
+LARGEST_SHIFT = 3.0
 # smallest ratio of the slow innovations before and after, on hold-out data without ground truth
-GAINED = 1.5
-FITTED = (
+SMALLEST_RATIO = 1.5
+FITTED_SHARE = (
     2.0 / 3.0
 )  # share of the last flight that is fitted without a hold-out flight; the rest validates
 SECONDS = 60.0  # of a flight that are looked at
-MOVES = 0.25  # smallest extent of a path along an axis, relative to the anchors
-ENOUGH = 0.5  # share of the coordinates that must improve
+SMALLEST_EXTENT = 0.25  # smallest extent of a path along an axis, relative to the anchors
+SMALLEST_IMPROVED_SHARE = 0.5  # share of the coordinates that must improve
 STREAMS = "tdoa", "imu", "truth", *AIDS
 
 
@@ -103,7 +103,7 @@ def blocking_errors(recording: Recording, findings: Iterable[Finding], std: floa
     errors = [finding for finding in findings if finding.severity == ERROR]
     if any(finding.rule == MISFIT for finding in errors):
         fit = OrderedRecording.of(recording).survey_fit
-        if np.median(displacement(fit.positions, fit.all_moved[1])) <= OFF * std:
+        if np.median(displacement(fit.positions, fit.all_moved[1])) <= LARGEST_SHIFT * std:
             errors = [finding for finding in errors if finding.rule != MISFIT]
     return errors
 
@@ -159,7 +159,7 @@ def without_truth(
     judges, fitted, on = holdout, flights, _names(holdout)
     if not holdout:
         *fitted, last = flights
-        first, rest = split(last, FITTED)
+        first, rest = split(last, FITTED_SHARE)
         judges, fitted, on = [rest], [*fitted, first], f"the last third of {last.name}"
     report = partial(progress, "solving")
     found = self_calibrate(fitted, tape, base, config, (), report)
@@ -198,7 +198,7 @@ def _reason_against_unverified(calibration: Calibration) -> str | None:
             "else is wrong too, of which anchors may take the place; record ground truth, or "
             "give survey some --marks"
         )
-    if calibration.before < GAINED * calibration.after:
+    if calibration.before < SMALLEST_RATIO * calibration.after:
         return (
             f"it gains too little to be sure that it does no harm: {calibration.as_text()}; fly "
             "more, or keep what there is"
@@ -276,7 +276,7 @@ class Prospect:
     @property
     def exciting(self) -> bool:
         """Return whether the flights determine enough coordinates."""
-        return bool(self.better.mean() >= ENOUGH)
+        return bool(self.better.mean() >= SMALLEST_IMPROVED_SHARE)
 
     def sentences(self) -> list[str]:
         """Return the prospect as sentences."""
@@ -298,7 +298,7 @@ class Prospect:
                 "sides, high and low"
             )
         for axis, size, room in zip("xyz", self.path, self.hall):
-            if size < MOVES * room:
+            if size < SMALLEST_EXTENT * room:
                 lines.append(
                     f"along {axis} the tag moves by {size:.1f} m among anchors that are "
                     f"{room:.1f} m apart: fly longer paths along it"

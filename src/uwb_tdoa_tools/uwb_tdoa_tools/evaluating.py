@@ -114,17 +114,20 @@ class Evaluator:
             flight = replace(flight, truth=corrected_truth(flight, self.estimator.effects))
         assert flight.truth is not None  # require_truth
         found = estimate_alignment(flight, odometry)
-        found_wrong = list(self._of_truth(flight, found))
+        truth_findings = list(self._truth_findings(flight, found))
         truths = {how: found.applied_to(flight.truth, how) for how in ALIGN}
         scores = {
             how: Score(flight.name, odometry, one, residuals, flight.tdoa.t)
             for how, one in truths.items()
         }
         score, truth = scores[self.align], truths[self.align]
-        if found_wrong or (score.row()["diverged"] and not score.row()["late_start"]):
-            causes = self._of_anchors(flight)  # ids and anchors first: the truth is measured better
+        if truth_findings or (score.row()["diverged"] and not score.row()["late_start"]):
+            causes = self._anchor_findings(
+                flight
+            )  # ids and anchors first: the truth is measured better
             report_remarks(
-                flight.name, [one for one in causes or found_wrong if one not in survey_sentences]
+                flight.name,
+                [one for one in causes or truth_findings if one not in survey_sentences],
             )
         if self.picture:
             from ..scoring.plots import plot_error  # takes a second to import
@@ -144,7 +147,7 @@ class Evaluator:
             | {f"rmse_3d_{how}": one.row()["rmse_3d"] for how, one in scores.items()},
         )
 
-    def _of_anchors(self, flight: Flight) -> list[str]:
+    def _anchor_findings(self, flight: Flight) -> list[str]:
         """Return sentences on wrong ids, signs, units and anchors of a Flight.
 
         Empty for a recorded odometry.
@@ -158,7 +161,7 @@ class Evaluator:
             if one.rule in BEFORE_TRUTH
         ]
 
-    def _of_truth(self, flight: Flight, found: Alignment) -> Iterator[str]:
+    def _truth_findings(self, flight: Flight, found: Alignment) -> Iterator[str]:
         """Yield sentences on errors of the ground truth."""
         for how, words in (("time", found.clock_sentence()), ("frame", found.frame_sentence())):
             if words:

@@ -29,13 +29,15 @@ GOOD, DOUBTFUL, BAD = "good", "doubtful", "bad"
 # standard deviations that contain the 3D position for 95 % of the time; 1.6 to 2.0 by its shape
 SIGMAS = 2.0
 GAP = 1.0  # s without an estimate: the tag is lost
-LONG = 0.05  # largest share of lost time in a good estimate
-FEW = 0.9  # smallest share of explained TDOAs in a good estimate
-TALL = 1.5  # ratio of the deviation of z to x and y that makes the height the weakest coordinate
+LARGEST_LOST_SHARE = 0.05  # largest share of lost time in a good estimate
+SMALLEST_EXPLAINED_SHARE = 0.9  # smallest share of explained TDOAs in a good estimate
+WEAK_HEIGHT_RATIO = (
+    1.5  # ratio of the deviation of z to x and y that makes the height the weakest coordinate
+)
 # m, smallest reported offset of all ranges; without an offset the filter estimates up to 2 cm
-OFFSET = 0.03
+REPORTED_OFFSET = 0.03
 # share of lasting errors in the variance above which a calibration helps
-LASTING = 0.5
+LASTING_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,7 @@ class Assessment:
         off = figures.get("range_offset")
         offset = (
             []
-            if off is None or abs(off) < OFFSET
+            if off is None or abs(off) < REPORTED_OFFSET
             else [
                 (
                     f"all ranges are {100 * abs(off):.0f} cm too "
@@ -193,7 +195,7 @@ def _doubts(
     flight: Flight, left: Residuals, figures: Mapping[str, Any], lost: Sequence[tuple[float, float]]
 ) -> Iterator[str]:
     """Yield reasons against an estimate."""
-    if figures["lost"] > LONG * figures["seconds"]:
+    if figures["lost"] > LARGEST_LOST_SHARE * figures["seconds"]:
         spans = ", ".join(
             f"{begin - left.t.min():.0f} - {end - left.t.min():.0f} s" for begin, end in lost[:5]
         )
@@ -205,7 +207,7 @@ def _doubts(
         yield (
             f"the filter was wrong and was reset to another position {figures['recoveries']} times"
         )
-    if figures["explained"] < FEW:
+    if figures["explained"] < SMALLEST_EXPLAINED_SHARE:
         yield f"{1.0 - figures['explained']:.0%} of the {_measured(figures)} speak against it"
     if figures["std"] > LOST:
         yield f"the position is stated to no better than {figures['std']:.1f} m"
@@ -226,12 +228,15 @@ def _remedies(
         )
     if flight.imu is None:
         yield "record the inertial sensor, too: the filter then knows the attitude, and bridges gaps"
-    if figures["std_z"] > TALL * max(figures["std_x"], figures["std_y"]) and flight.height is None:
+    if (
+        figures["std_z"] > WEAK_HEIGHT_RATIO * max(figures["std_x"], figures["std_y"])
+        and flight.height is None
+    ):
         yield (
             "the height is the weakest coordinate: add a range finder that looks down, or put "
             "anchors further apart in height (plan says where)"
         )
-    if not corrected and figures["lasting"] > LASTING:
+    if not corrected and figures["lasting"] > LASTING_SHARE:
         yield (
             f"{figures['lasting']:.0%} of the variance is of errors that last, as of delays and "
             "places of anchors: calibrate them"

@@ -113,7 +113,7 @@ class Localizer:
     reading : how recordings are read.
     estimator : filter with corrections.
     folder : output folder.
-    bag, left : also write a bag, residuals.
+    bag, residuals : also write a bag, residuals.
     rerun : file for Rerun, or None.
     zones : m, size of squares for a table of heard anchors, or None.
     effects : file with the effects of the estimator, or None.
@@ -123,7 +123,7 @@ class Localizer:
     estimator: FlightEstimator
     folder: Path
     bag: bool = False
-    left: bool = False
+    residuals: bool = False
     rerun: Path | None = None
     zones: float | None = None
     effects: str | None = None
@@ -146,7 +146,7 @@ class Localizer:
         pictures.draw_estimate(path(".png"), odometry, flight.anchors, assessment.lost, title)
         if self.bag and len(odometry):
             write_odometry(odometry, flight.anchors, path(".bag"), force=True)
-        if self.left:
+        if self.residuals:
             residuals.write_residuals(path("_residuals.csv"), left)
             residuals.draw_residuals(path("_residuals.png"), left, name)
         if self.zones is not None and (found := residuals.zones_of(odometry, left, self.zones)):

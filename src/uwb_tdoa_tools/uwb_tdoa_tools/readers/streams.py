@@ -32,8 +32,11 @@ LARGEST = {
     "baro": 4e4,
 }  # mm, and m: the formula of the standard atmosphere ends at 44 km
 DAY = 86400.0  # s
-UNEQUAL, LOST = 1.1, 0.02  # smallest reported ratio of two rates, and share of dropped samples
-REFERENCE = 0.95  # share of the TDOAs of a common reference anchor
+UNEQUAL_RATES, DROPPED_SHARE = (
+    1.1,
+    0.02,
+)  # smallest reported ratio of two rates, and share of dropped samples
+REFERENCE_SHARE = 0.95  # share of the TDOAs of a common reference anchor
 # of one reading for 1 rad/s, median over 0425/TDOA2; 30 to 35 pixels in 41 degrees, given in
 # tenths: 4.2 to 4.9
 FLOW_COUNTS = 4.7
@@ -224,7 +227,7 @@ def protocol(tdoas: Tdoas) -> str:
     directed = np.zeros((n, n))
     np.add.at(directed, (a, b), 1.0)
     heard = directed + directed.T
-    if n > 2 and heard.sum(axis=1).max() > REFERENCE * len(a):
+    if n > 2 and heard.sum(axis=1).max() > REFERENCE_SHARE * len(a):
         return "tdoa, one reference"
     pairs = np.stack(np.triu_indices(n, 1), axis=1)
     often = pairs[np.argsort(-heard[tuple(pairs.T)], kind="stable")[:n]]
@@ -286,13 +289,13 @@ def _imu_losses(
         1.0 / max(float(np.median(np.diff(t))), 1e-9) if len(t) > 1 else 0.0 for t in (gyro, acc)
     ]
     evidence = f"gyroscope {rates[0]:.0f} Hz, accelerometer {rates[1]:.0f} Hz"
-    if max(rates) > UNEQUAL * min(rates):
+    if max(rates) > UNEQUAL_RATES * min(rates):
         cause = (
             "gyroscope and accelerometer have different rates: only the stamps of the gyroscope "
             "are used"
         )
         out.append((cause, evidence, "log both at one rate, e.g. in one block of the log"))
-    if (lost := float(np.mean(~inside))) > LOST:
+    if (lost := float(np.mean(~inside))) > DROPPED_SHARE:
         cause = "samples of the gyroscope are left out: the accelerometer was not recorded then"
         out.append(
             (cause, f"{100.0 * lost:.0f} % of them; {evidence}", "start and stop both together")

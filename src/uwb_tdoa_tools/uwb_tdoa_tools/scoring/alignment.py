@@ -46,9 +46,9 @@ LONGEST = 1.6  # s, largest delay in the search; left out at both ends of a path
 # rad, rad, m, m; filter errors reach 2.9 degrees, 8.2 degrees, 0.14 m and 0.35 m
 YAW, TILT, LEVEL, HEIGHT = np.deg2rad(4.0), np.deg2rad(12.0), 0.25, 0.6
 COMMON = 0.6  # smallest overlap of two paths, as a share of the shorter path
-ALIKE = 1.3  # smallest ratio of the errors of the second best epoch and the best
-APART = 2.0  # s, smallest difference between two epochs
-AS_WELL = 0.02  # relative difference of the errors of equally likely rotation and delay
+DISTINCT_ERROR_RATIO = 1.3  # smallest ratio of the errors of the second best epoch and the best
+DISTINCT_EPOCHS = 2.0  # s, smallest difference between two epochs
+EQUALLY_LIKELY = 0.02  # relative difference of the errors of equally likely rotation and delay
 FITS = 0.6  # largest distance at the best epoch, relative to the size of the path
 EPOCH_STEP = 0.1  # s, resolution of the search for the epoch
 
@@ -236,7 +236,7 @@ def estimate_alignment(flight: Flight, odometry: PoseColumns) -> Alignment:
     late, source = _truth_delay(flight, exact=epoch != 0.0)
     behind = _tdoa_delay(flight, late) if source == "inertial" else 0.0
     ratio = _rotation_to_delay_ratio(flight, odometry, late, behind)
-    if ratio < 1.0 - AS_WELL and source == "tdoa" and not epoch:
+    if ratio < 1.0 - EQUALLY_LIKELY and source == "tdoa" and not epoch:
         late = 0.0
     if ratio < 1.0:
         behind = 0.0
@@ -245,7 +245,7 @@ def estimate_alignment(flight: Flight, odometry: PoseColumns) -> Alignment:
         rigid_transform(true, estimated) if len(true) >= FEWEST else (np.eye(3), np.zeros(3))
     )
     middle = true.mean(axis=0) if len(true) else np.zeros(3)
-    ambiguous = bool(late and source == "tdoa" and ratio < 1.0 + AS_WELL)
+    ambiguous = bool(late and source == "tdoa" and ratio < 1.0 + EQUALLY_LIKELY)
     return Alignment(epoch + late, source, axes, turn, shift, middle, ambiguous)
 
 
@@ -393,8 +393,10 @@ def _epoch(flight: Flight, odometry: PoseColumns) -> float:
     ):
         error = _distance_by_lag(pair[0], pair[1], lags, arrangements)
         best = int(np.argmin(error))
-        others = np.min(error[np.abs(lags - lags[best]) > APART / EPOCH_STEP], initial=np.inf)
-        if error[best] < FITS * size and others >= ALIKE * error[best]:
+        others = np.min(
+            error[np.abs(lags - lags[best]) > DISTINCT_EPOCHS / EPOCH_STEP], initial=np.inf
+        )
+        if error[best] < FITS * size and others >= DISTINCT_ERROR_RATIO * error[best]:
             return float(truth.t[0] - odometry.t[0] - lags[best] * EPOCH_STEP)
         tried.append(f"the nearest is {error[best]:.2f} m off, another one {others:.2f} m")
     raise InputError(

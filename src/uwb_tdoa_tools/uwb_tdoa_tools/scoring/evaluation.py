@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from .alignment import Alignment
 
 # largest ratio of the distances with repaired ids and signs, and with another frame
-AS_WELL = 1.5
+LARGEST_LABEL_RATIO = 1.5
 
 
 def evaluate(
@@ -169,7 +169,7 @@ def _alignment(flight: Flight, effects: EffectSet, config: FilterConfig | None) 
     left = median_distance(*common_paths(found.applied_to(straight.truth, FRAME), odometry))
     return (
         estimate_alignment(repair.correct_streams(straight), of_labels)
-        if error < AS_WELL * left
+        if error < LARGEST_LABEL_RATIO * left
         else found
     )
 

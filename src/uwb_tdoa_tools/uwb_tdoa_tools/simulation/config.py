@@ -22,7 +22,7 @@ MOST_HEARD = 64  # largest number of anchors that a tag hears at once
 YAW_PROFILES = ("fixed", "along_track", "rotating")
 WHEELS_RATE = 50.0  # Hz
 FARTHEST = 1e5  # m, of a point of a path
-OF_VEHICLE = MappingProxyType(
+VEHICLE_DEFAULTS = MappingProxyType(
     {  # the usual configuration of each vehicle
         "quadrotor": {},
         "rover": {
@@ -203,11 +203,11 @@ class SimulationConfig(_Noises):
     @classmethod
     def of(cls, vehicle: str, **given: Any) -> SimulationConfig:
         """Return the usual config of a vehicle with the given changes."""
-        return cls(vehicle=vehicle, **{**OF_VEHICLE.get(vehicle, {}), **given})
+        return cls(vehicle=vehicle, **{**VEHICLE_DEFAULTS.get(vehicle, {}), **given})
 
     def __post_init__(self) -> None:
         for name, choices in (
-            ("vehicle", tuple(OF_VEHICLE)),
+            ("vehicle", tuple(VEHICLE_DEFAULTS)),
             ("yaw", YAW_PROFILES),
             ("protocol", PROTOCOLS),
         ):

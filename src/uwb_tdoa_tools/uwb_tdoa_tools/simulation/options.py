@@ -11,7 +11,14 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.sensors import SENSORS
 from uwb_tdoa_bias.foundation.survey_faults import refuse_faulty
 
-from .config import NO_IMU_ERRORS, OF_VEHICLE, PROTOCOLS, YAW_PROFILES, ImuErrors, SimulationConfig
+from .config import (
+    NO_IMU_ERRORS,
+    PROTOCOLS,
+    VEHICLE_DEFAULTS,
+    YAW_PROFILES,
+    ImuErrors,
+    SimulationConfig,
+)
 from .paths import TRAJECTORIES
 from .rooms import Walls
 
@@ -30,7 +37,7 @@ def add_options(made: argparse.ArgumentParser) -> None:
     )
     add(
         "--vehicle",
-        choices=OF_VEHICLE,
+        choices=VEHICLE_DEFAULTS,
         default=default.vehicle,
         help=f"{words} (default: quadrotor)",
     )

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 # smallest shift of a misplaced anchor: standard deviations, and multiples of the usual shift
-SURE = 5.0
+CLEAR_SHIFT = 5.0
 KNOWN_WELL = 0.02  # m, standard deviation of a position that needs no survey
 BLOCKED_DELAY = 0.2  # m, smallest delay of a blocked anchor; antennas cause up to that
 
@@ -47,7 +47,9 @@ def misplaced_anchors(found: SelfCalibration) -> list[int]:
         ]
     )
     return np.flatnonzero(
-        (improved & (off > SURE * found.position_std) & (off > SURE * others)).any(axis=1)
+        (improved & (off > CLEAR_SHIFT * found.position_std) & (off > CLEAR_SHIFT * others)).any(
+            axis=1
+        )
     ).tolist()
 
 
