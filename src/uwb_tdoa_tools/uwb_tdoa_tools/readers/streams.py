@@ -94,51 +94,71 @@ def make_flight(
     if clock.jumps or clock.kept:
         meta["clock"] = clock.jumps, clock.outliers
     streams = {key: _valid_rows(key, columns, meta, salvage) for key, columns in wanted.items()}
-    streams = {key: columns for key, columns in streams.items() if len(columns["t"])}
-    extra = {key: columns for key, columns in extra.items() if len(columns["t"])}
-    reordered = {}
-    for group in (streams, extra):
-        for key, columns in group.items():
-            falls = int((np.diff(columns["t"]) < 0).sum())
-            if falls:
-                order = np.argsort(columns["t"], kind="stable")
-                group[key] = {column: values[order] for column, values in columns.items()}
-                reordered[key] = falls
+    reordered: dict[str, int] = {}
+    streams, extra = (_in_order(group, reordered) for group in (streams, extra))
     if reordered:
         meta["reordered"] = reordered
     if not streams.keys() & {"tdoa", "range"}:
         raise InputError(
             f"{meta['source']}: holds no TDOA measurement; record the tag's TDOAs with the flight."
         )
-    tdoas, distances = Tdoas(*np.empty((4, 0))), None
+    tdoas, poses = Tdoas(*np.empty((4, 0))), None
     if "tdoa" in streams:
         tdoas = Tdoas(*_measured(streams["tdoa"], "a", "b"))
         meta["protocol"] = protocol(tdoas)
-    if "range" in streams:
-        distances = Ranges(*_measured(streams["range"], "anchor"))
-    imu = poses = None
-    if "gyro" in streams and "acc" in streams:
-        imu = _imu(streams["gyro"], streams["acc"], meta)
-    elif alone := streams.keys() & {"gyro", "acc"}:
-        name, missing = (
-            ("gyroscope", "accelerometer") if alone == {"gyro"} else ("accelerometer", "gyroscope")
-        )
-        evidence, remedy = f"there is no {missing}", f"record the {missing} too"
-        meta["losses"] = [
-            (f"the {name} is not used: the filter needs both inertial sensors", evidence, remedy)
-        ]
     if "pose" in streams:
         pose = streams["pose"]
         poses = Truth(pose["t"], _stack(pose, "x", "y", "z"), _stack(pose, "qx", "qy", "qz", "qw"))
-    height = pressure = velocity = None
+    imu = _inertial(streams, meta)
+    if not meta["remarks"]:
+        del meta["remarks"]
+    sensors = _sensors(streams, imu)
+    return Flight(name, anchors, tdoas, imu, poses, extra, meta, clock.restarts, **sensors)
+
+
+def _in_order(streams: Streams, reordered: dict[str, int]) -> Streams:
+    """Return the streams that are not empty, sorted by stamp; count falling stamps."""
+    out = {}
+    for key, columns in streams.items():
+        if not len(columns["t"]):
+            continue
+        falls = int((np.diff(columns["t"]) < 0).sum())
+        if falls:
+            order = np.argsort(columns["t"], kind="stable")
+            columns = {column: values[order] for column, values in columns.items()}
+            reordered[key] = falls
+        out[key] = columns
+    return out
+
+
+def _inertial(streams: Streams, meta: dict[str, Any]) -> Imu | None:
+    """Return the IMU stream; a single inertial sensor is a loss in `meta`."""
+    if "gyro" in streams and "acc" in streams:
+        return _imu(streams["gyro"], streams["acc"], meta)
+    alone = streams.keys() & {"gyro", "acc"}
+    if alone:
+        name, missing = (
+            ("gyroscope", "accelerometer") if alone == {"gyro"} else ("accelerometer", "gyroscope")
+        )
+        cause = f"the {name} is not used: the filter needs both inertial sensors"
+        meta["losses"] = [(cause, f"there is no {missing}", f"record the {missing} too")]
+    return None
+
+
+def _sensors(streams: Streams, imu: Imu | None) -> dict[str, Any]:
+    """Return the streams of other sensors, by their names in a Flight."""
+    out: dict[str, Any] = {}
+    if "range" in streams:
+        out["range"] = Ranges(*_measured(streams["range"], "anchor"))
     if "tof" in streams:
         tof = streams["tof"]
         # the precision of a sensor_msgs/Range
         ranges = np.float32(1e-3 * np.asarray(tof["tof"], dtype=float)).astype(float)
-        height = Height(tof["t"], np.where(ranges < NO_TARGET, ranges, np.inf))
+        out["height"] = Height(tof["t"], np.where(ranges < NO_TARGET, ranges, np.inf))
     if "baro" in streams:
         baro = _readings(streams["baro"], "baro")
-        pressure = Pressure(baro["t"], pressure_at(baro["baro"]))
+        out["pressure"] = Pressure(baro["t"], pressure_at(baro["baro"]))
+    height = out.get("height")
     if (
         "flow" in streams
         and imu is not None
@@ -147,23 +167,9 @@ def make_flight(
     ):
         t, x, y = (np.asarray(streams["flow"][name], dtype=float) for name in "txy")
         velocity = flow_velocity(t, x, y, height, imu)
-        velocity = velocity if len(velocity.t) else None
-    if not meta["remarks"]:
-        del meta["remarks"]
-    return Flight(
-        name,
-        anchors,
-        tdoas,
-        imu,
-        poses,
-        extra,
-        meta,
-        clock.restarts,
-        height=height,
-        pressure=pressure,
-        velocity=velocity,
-        range=distances,
-    )
+        if len(velocity.t):
+            out["velocity"] = velocity
+    return out
 
 
 def _measured(columns: Columns, *ids: str) -> tuple[np.ndarray, ...]:
