@@ -130,7 +130,7 @@ class Evaluator:
                 [one for one in causes or truth_findings if one not in survey_sentences],
             )
         if self.picture:
-            from ..scoring.plots import plot_error  # takes a second to import
+            from .scoring.plots import plot_error  # takes a second to import
 
             plot_error(score, odometry, truth, self.picture)
         if self.trajectories:
