@@ -21,7 +21,7 @@ from uwb_tdoa_tools.planning.installation import Installation
 from uwb_tdoa_tools.planning.precision import bound, information
 from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.scoring.evaluation import evaluate
-from uwb_tdoa_tools.scoring.metrics import judged_part, pooled, position_at
+from uwb_tdoa_tools.scoring.metrics import pooled, position_at, scored_phase
 from uwb_tdoa_tools.scoring.phases import NEAR_THE_FLOOR, TITLES
 
 SETS = (), ("height",), ("pressure",), ("height", "pressure"), ("velocity",), ("height", "velocity")
@@ -131,7 +131,7 @@ def bounds(flights, height_std):
     """
     rows = []
     for flight in flights:
-        _, first, last = judged_part(flight.truth)
+        _, first, last = scored_phase(flight.truth)
         places = position_at(np.arange(first, last, 0.5), flight.truth)
         covariance = bound(information(places, Installation(flight.anchors, height_std=height_std)))
         variance = np.diagonal(covariance, axis1=1, axis2=2).mean(axis=0)
@@ -184,7 +184,7 @@ def faults(flights, config):
     for name, (aid, from_start, change) in FAULTS.items():
         rows, named = [], []
         for flight, none in zip(flights, plain):
-            begin = judged_part(flight.truth)[1] + (0.0 if from_start else ONSET)
+            begin = scored_phase(flight.truth)[1] + (0.0 if from_start else ONSET)
             sound = only(flight, (aid,))
             faulty = replace(sound, **{aid: change(getattr(sound, aid), begin)})
             scores, runs = zip((none, None), *(evaluate(each, config) for each in (sound, faulty)))

@@ -10,8 +10,8 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_tools.simulation.motion import ExactMotion
-from uwb_tdoa_tools.simulation.trajectories import DRAG, GRAVITY, STEP
+from uwb_tdoa_tools.simulation.paths import STEP
+from uwb_tdoa_tools.simulation.vehicles import DRAG, GRAVITY, ExactMotion
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -14,7 +14,7 @@ from tqdm import tqdm
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
 from uwb_tdoa_bias.foundation.files import write_text
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_tools.calibrating.calibrate import without_truth
+from uwb_tdoa_tools.calibrating import without_truth
 from uwb_tdoa_tools.diagnosis.self_calibration import Tape
 from uwb_tdoa_tools.outputs import OutputFile
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate

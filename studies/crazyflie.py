@@ -6,7 +6,7 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.flight import Imu
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_tools.crazyflie.log_blocks import PERIOD
+from uwb_tdoa_tools.crazyflie import PERIOD
 from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.scoring.evaluation import evaluate
 

@@ -16,7 +16,7 @@ from uwb_tdoa_bias.foundation.files import write_text
 from uwb_tdoa_tools import options, parallel
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.estimate import FlightEstimator
-from uwb_tdoa_tools.localizing.belief import GOOD, believe
+from uwb_tdoa_tools.localizing.assessment import GOOD, assess
 from uwb_tdoa_tools.outputs import OutputFile
 from uwb_tdoa_tools.scoring.metrics import position_errors
 
@@ -102,7 +102,7 @@ def _with(flight, name):
 def _judged(flight):
     """What is said of a Flight, without its truth, and what is true."""
     run = FlightEstimator()(flight)
-    told = believe(replace(flight, truth=None), run)
+    told = assess(replace(flight, truth=None), run)
     t, error, _ = position_errors(run.odometry, flight.truth, flight.truth.t[0], flight.truth.t[-1])
     known = ~np.any(
         [(t >= begin) & (t <= end) for begin, end in told.lost] or [np.zeros(len(t), bool)], axis=0

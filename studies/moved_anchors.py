@@ -21,12 +21,12 @@ from uwb_tdoa_ekf.results import concatenated, rows_of
 from uwb_tdoa_tools import options, parallel
 from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
 from uwb_tdoa_tools.estimate import FlightEstimator
-from uwb_tdoa_tools.localizing.belief import GOOD, believe
+from uwb_tdoa_tools.localizing.assessment import GOOD, assess
 from uwb_tdoa_tools.outputs import OutputFile
 from uwb_tdoa_tools.parallel import whole_number
 from uwb_tdoa_tools.scoring.metrics import position_errors
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.simulation.trajectories import Trajectory
+from uwb_tdoa_tools.simulation.vehicles import Trajectory
 
 KINDS = "moved before", "moved on the way", "exchanged before", "exchanged on the way", "nothing"
 MOVED = 0.3, 1.0  # m
@@ -217,22 +217,22 @@ def _flown(seed, path, room, anchors=None):
 def said(flight, estimator):
     """{"check", "localize", "live": ids of the anchors that are named, and "verdict" of localize}."""
     flight = replace(flight, truth=None)
-    belief = believe(
+    assessment = assess(
         flight, estimator(flight), estimator
     )  # its reasons are the findings of `check`
     named = _ids(
         [
             sentence.removeprefix("check: ")
-            for sentence in belief.reasons
+            for sentence in assessment.reasons
             if _NAMED.match(sentence.removeprefix("check: "))
         ]
     )
-    localized = [] if belief.level == GOOD else named
+    localized = [] if assessment.level == GOOD else named
     return {
         "check": named,
         "localize": localized,
         "live": _ids(live(flight, estimator)),
-        "verdict": belief.level,
+        "verdict": assessment.level,
     }
 
 

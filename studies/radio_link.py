@@ -10,14 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.foundation.flight import Imu, Tdoas
-from uwb_tdoa_tools.crazyflie.log_blocks import (
-    FORCES,
-    GRAVITY,
-    PERIOD,
-    RATES,
-    LogBlock,
-    VehicleClock,
-)
+from uwb_tdoa_tools.crazyflie import FORCES, GRAVITY, PERIOD, RATES, LogBlock, VehicleClock
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.flight import Flight

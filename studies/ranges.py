@@ -20,7 +20,7 @@ from uwb_tdoa_tools.planning.noise import FixedNoise
 from uwb_tdoa_tools.planning.pairing import every_range
 from uwb_tdoa_tools.planning.precision import bound, information, position_error
 from uwb_tdoa_tools.scoring.evaluation import evaluate, score_of
-from uwb_tdoa_tools.scoring.metrics import judged_part, position_at
+from uwb_tdoa_tools.scoring.metrics import position_at, scored_phase
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 STD = 0.1  # m, of a range and of a TDOA, white
@@ -177,7 +177,7 @@ def bound_of(flight: Flight) -> float:
     """m: root mean square of the bound of `plan` for one range to each anchor, over the airborne
     part.
     """
-    _, first, last = judged_part(flight.truth)
+    _, first, last = scored_phase(flight.truth)
     places = position_at(np.arange(first, last, 0.5), flight.truth)
     installation = Installation(flight.anchors, FixedNoise(STD), every_range(len(flight.anchors)))
     return float(np.sqrt(np.mean(position_error(bound(information(places, installation))) ** 2)))

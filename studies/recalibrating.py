@@ -14,7 +14,7 @@ import numpy as np
 from uwb_tdoa_bias.effects import EFFECTS
 from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
 from uwb_tdoa_tools.diagnosis.self_calibration.prior import with_calibration
-from uwb_tdoa_tools.surveying.blocked import with_blocked
+from uwb_tdoa_tools.surveying.report import with_blocked
 
 from .surveying import at, measured_flights, rmse
 

@@ -23,10 +23,10 @@ from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools import cli, parallel
 from uwb_tdoa_tools.outputs import OutputFile
 from uwb_tdoa_tools.results_file import ResultsFile
-from uwb_tdoa_tools.scoring.by_phase import PooledErrors
 from uwb_tdoa_tools.scoring.metrics import READY, Score
+from uwb_tdoa_tools.scoring.pooling import PooledErrors
 from uwb_tdoa_tools.simulation import ImuErrors, SimulationConfig, simulate
-from uwb_tdoa_tools.simulation.constellations import corners, facing
+from uwb_tdoa_tools.simulation.rooms import corners, facing
 
 from .any_path import Path, between
 

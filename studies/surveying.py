@@ -22,7 +22,7 @@ from uwb_tdoa_tools.outputs import OutputFile
 from uwb_tdoa_tools.parallel import whole_number
 from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.scoring.evaluation import evaluate
-from uwb_tdoa_tools.surveying.paths import DRIFT
+from uwb_tdoa_tools.surveying.known import DRIFT
 
 from .diagnosis.measured import SPLITS
 

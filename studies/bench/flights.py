@@ -9,7 +9,7 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_ekf.results import rows_of
-from uwb_tdoa_tools.calibrating.parts import between
+from uwb_tdoa_tools.calibrating import between
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 if TYPE_CHECKING:

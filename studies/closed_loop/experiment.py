@@ -30,8 +30,7 @@ from uwb_tdoa_tools.flying.path import Circles
 from uwb_tdoa_tools.flying.trial import Task, fly
 from uwb_tdoa_tools.flying.world import World
 from uwb_tdoa_tools.outputs import OutputFolder
-from uwb_tdoa_tools.simulation.constellations import constellation
-from uwb_tdoa_tools.simulation.room import room_of
+from uwb_tdoa_tools.simulation.rooms import constellation, room_of
 from uwb_tdoa_tools.training import labels, models, physics
 
 from . import pictures

@@ -8,8 +8,8 @@ import numpy as np
 
 from uwb_tdoa_tools.flying.path import CLIMB, KNOT, SETTLE, ReferenceTrajectory, cruise, smooth
 from uwb_tdoa_tools.simulation.config import SimulationConfig
-from uwb_tdoa_tools.simulation.room import Room
-from uwb_tdoa_tools.simulation.trajectories import sines
+from uwb_tdoa_tools.simulation.paths import sines
+from uwb_tdoa_tools.simulation.rooms import Room
 
 AWAY = 6.0  # s, from the middle to the sines and back
 

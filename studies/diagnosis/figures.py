@@ -22,7 +22,7 @@ from uwb_tdoa_tools.outputs import OutputFolder
 from uwb_tdoa_tools.parallel import over, whole_number
 from uwb_tdoa_tools.results_file import ResultsFile
 from uwb_tdoa_tools.scoring.plots import plt
-from uwb_tdoa_tools.surveying.blocked import with_blocked
+from uwb_tdoa_tools.surveying.report import with_blocked
 
 from . import bank, blind, faults, floor, measured, referenced, undeclared
 

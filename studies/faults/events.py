@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.foundation.flight import AIDS, Truth
 from uwb_tdoa_bias.foundation.sensors import Height, Pressure, Ranges
 from uwb_tdoa_bias.foundation.sensors.pressure import SITE, pressure_at
-from uwb_tdoa_tools.scoring.metrics import judged_part, position_at
+from uwb_tdoa_tools.scoring.metrics import position_at, scored_phase
 
 from ..aids import with_velocity
 
@@ -67,7 +67,7 @@ def part_of(flight: Flight, seconds: float) -> Flight:
     """The first `seconds` of a flight from shortly before take-off on, on a clock that begins with
     them, with all sensors.
     """
-    begin = judged_part(flight.truth)[1] - BEFORE
+    begin = scored_phase(flight.truth)[1] - BEFORE
     flight = with_sensors(flight)
 
     def cut(stream: Any, every: int = 1) -> Any:

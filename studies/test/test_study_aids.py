@@ -17,7 +17,7 @@ from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 from uwb_tdoa_ekf.monitoring.health import OK, WARN, Health  # noqa: E402
 from uwb_tdoa_ekf.offline import run_offline  # noqa: E402
 from uwb_tdoa_ekf.results import VERDICTS  # noqa: E402
-from uwb_tdoa_tools.scoring.metrics import judged_part  # noqa: E402
+from uwb_tdoa_tools.scoring.metrics import scored_phase  # noqa: E402
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate  # noqa: E402
 
 # What the filter copes with is no reason to warn: steps, single wrong ranges, and a barometer that
@@ -65,7 +65,7 @@ def test_sound_sensors_are_not_complained_of(flight, monkeypatch):
 @pytest.mark.parametrize("name", [name for name in FAULTS if name not in COPED_WITH])
 def test_a_faulty_sensor_is_named(flight, monkeypatch, name):
     aid, from_start, change = FAULTS[name]
-    begin = judged_part(flight.truth)[1] + (0.0 if from_start else ONSET)
+    begin = scored_phase(flight.truth)[1] + (0.0 if from_start else ONSET)
     sound = only(flight, (aid,))
     told = [
         text
@@ -83,9 +83,9 @@ def test_a_faulty_sensor_is_named(flight, monkeypatch, name):
 def test_what_the_filter_copes_with_leaves_the_estimate_sound(flight, name):
     aid, from_start, change = FAULTS[name]
     sound = only(flight, (aid,))
-    begin = judged_part(flight.truth)[1] + (0.0 if from_start else ONSET)
+    begin = scored_phase(flight.truth)[1] + (0.0 if from_start else ONSET)
     run = run_offline(replace(sound, **{aid: change(getattr(sound, aid), begin)}))
-    inside = (run.odometry.t > begin + 3.0) & (run.odometry.t < judged_part(flight.truth)[2])
+    inside = (run.odometry.t > begin + 3.0) & (run.odometry.t < scored_phase(flight.truth)[2])
     true = np.interp(run.odometry.t[inside], flight.truth.t, flight.truth.p[:, 2])
     assert np.sqrt(np.mean((run.odometry.p[inside, 2] - true) ** 2)) < 0.05
 

@@ -14,7 +14,7 @@ import pytest
 
 from studies.radio_link import BLOCKS, PAIRS, Link, as_received, messages, streamed
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_tools.crazyflie.log_blocks import PERIOD, LogBlock
+from uwb_tdoa_tools.crazyflie import PERIOD, LogBlock
 from uwb_tdoa_tools.scoring.evaluation import evaluate
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 

@@ -5,8 +5,7 @@ import pytest
 
 from studies.closed_loop.sines import Sines
 from uwb_tdoa_tools.flying.path import SINK
-from uwb_tdoa_tools.simulation.constellations import constellation
-from uwb_tdoa_tools.simulation.room import room_of
+from uwb_tdoa_tools.simulation.rooms import constellation, room_of
 
 ROOM = room_of(constellation("corners"))
 GROUND = 0.03

@@ -5,7 +5,7 @@ import argparse
 from training_flights import flight
 
 from studies.training import splits
-from uwb_tdoa_tools.scoring.shrinkage import SHARES
+from uwb_tdoa_tools.scoring.gains import SHARES
 
 
 def errors(*ratios):

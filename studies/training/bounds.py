@@ -10,7 +10,7 @@ from uwb_tdoa_bias.correction.corrector import NETWORK, Correction
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_ekf.offline import run_offline
-from uwb_tdoa_tools.scoring.metrics import Score, judged_part, position_at
+from uwb_tdoa_tools.scoring.metrics import Score, position_at, scored_phase
 from uwb_tdoa_tools.training.labels import LARGEST
 
 CELL = 0.3  # m, size of the cells in which residuals of two flights are compared
@@ -34,7 +34,7 @@ def oracle(flight, window):
     a, b = anchors.index(data.a), anchors.index(data.b)
     p = position_at(data.t, truth)
     error = data.d - tdoa(p, anchors.positions[a], anchors.positions[b])
-    _, first, last = judged_part(truth)
+    _, first, last = scored_phase(truth)
     bias, sane = (
         np.zeros(len(data)),
         (np.abs(error) <= LARGEST) & (data.t >= first) & (data.t <= last),

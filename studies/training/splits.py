@@ -17,7 +17,7 @@ from uwb_tdoa_bias.foundation.flight import AIDS
 from uwb_tdoa_tools.outputs import OutputFile
 from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.results_file import ResultsFile
-from uwb_tdoa_tools.scoring.shrinkage import best_share
+from uwb_tdoa_tools.scoring.gains import best_share
 from uwb_tdoa_tools.training import models, physics, shrinking
 
 WORSE = 1.05  # ratio of errors beyond which a judged flight counts as harmed

@@ -19,10 +19,10 @@ from uwb_tdoa_bias.foundation.flight import Flight
 from uwb_tdoa_bias.foundation.survey import read_survey
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools import command_lines
-from uwb_tdoa_tools.calibrating.parts import between
+from uwb_tdoa_tools.calibrating import between
 from uwb_tdoa_tools.estimate import FlightEstimator
 from uwb_tdoa_tools.readers.inputs import Reading
-from uwb_tdoa_tools.scoring.alignment import moved_frame
+from uwb_tdoa_tools.scoring.alignment import transform_truth
 from uwb_tdoa_tools.scoring.evaluation import score_of
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
@@ -34,9 +34,9 @@ TURNED = Rotation.from_euler("z", 8.0, degrees=True).as_matrix()
 TRUTHS = {  # what may be wrong with a ground truth: function of a Truth
     "in time": lambda truth: truth,
     "late": lambda truth: replace(truth, t=truth.t + LATE),
-    "in another frame": lambda truth: moved_frame(truth, TURNED, np.array([0.5, -0.3, 0.0])),
+    "in another frame": lambda truth: transform_truth(truth, TURNED, np.array([0.5, -0.3, 0.0])),
     "on another epoch": lambda truth: replace(truth, t=truth.t + EPOCH),
-    "z down, on another epoch": lambda truth: moved_frame(
+    "z down, on another epoch": lambda truth: transform_truth(
         replace(truth, t=truth.t + EPOCH), np.diag([1.0, 1.0, -1.0]), np.zeros(3)
     ),
 }

@@ -11,7 +11,7 @@ from uwb_tdoa_bias.foundation.sensors import BY_POSE
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.constraints import Mark
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
-from uwb_tdoa_tools.scoring.metrics import judged_part
+from uwb_tdoa_tools.scoring.metrics import scored_phase
 from uwb_tdoa_tools.simulation import ImuErrors, SimulationConfig, simulate
 
 ANCHORS_FOUND = "anchor_position", "anchor_delay"
@@ -120,7 +120,7 @@ def marks_of(flight, count, rng):
     """[Mark] at places of the ground truth, MARK_TIME long, evenly over the airborne part, MARK_STD
     off.
     """
-    truth, (begin, end) = flight.truth, judged_part(flight.truth)[1:]
+    truth, (begin, end) = flight.truth, scored_phase(flight.truth)[1:]
     out = []
     for first in np.linspace(begin + MARK_TIME, end - 2.0 * MARK_TIME, count):
         inside = (truth.t >= first) & (truth.t <= first + MARK_TIME)

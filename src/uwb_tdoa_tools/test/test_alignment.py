@@ -12,8 +12,13 @@ from uwb_tdoa_bias.effects.stamp_error import shifted
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.readers import inputs
-from uwb_tdoa_tools.scoring.alignment import alignment_of, moved_frame, need_truth, rigid
-from uwb_tdoa_tools.scoring.settling import on_one_clock, settled
+from uwb_tdoa_tools.scoring.alignment import (
+    estimate_alignment,
+    require_truth,
+    rigid_transform,
+    transform_truth,
+)
+from uwb_tdoa_tools.scoring.evaluation import align_truth, on_one_clock
 
 EPOCH = 1.7e9 - 12.3
 TURN = Rotation.from_euler("z", 8.0, degrees=True).as_matrix()
@@ -42,7 +47,7 @@ def path_of_bare(bare):
 def in_frame(flight, axes=np.eye(3), shift=(0.0, 0.0, 0.0)):
     """The Flight whose ground truth is in another frame."""
     return replace(
-        flight, truth=moved_frame(flight.truth, np.asarray(axes, dtype=float), np.array(shift))
+        flight, truth=transform_truth(flight.truth, np.asarray(axes, dtype=float), np.array(shift))
     )
 
 
@@ -62,21 +67,21 @@ def test_a_rigid_motion_is_found_beside_outliers():
     path = rng.standard_normal((300, 3))
     there = path @ TURN.T + [1.0, -2.0, 0.5]
     there[::10] += rng.standard_normal((30, 3))
-    turn, shift = rigid(path, there)
+    turn, shift = rigid_transform(path, there)
     np.testing.assert_allclose(turn, TURN, atol=0.01)
     np.testing.assert_allclose(shift, [1.0, -2.0, 0.5], atol=0.02)
 
 
 def test_a_healthy_ground_truth_is_left_alone(flight, bare, odometry, path_of_bare):
     for one, path in ((flight, odometry), (bare, path_of_bare)):
-        found = alignment_of(one, path)
+        found = estimate_alignment(one, path)
         assert (
             found.late == 0.0
-            and not found.other_frame
-            and found.of_clock() is None
-            and found.of_frame() is None
+            and not found.frame_differs
+            and found.clock_sentence() is None
+            and found.frame_sentence() is None
         )
-        same, said = settled(one)
+        same, said = align_truth(one)
         assert (
             said == ()
             and np.array_equal(same.truth.p, one.truth.p)
@@ -85,17 +90,17 @@ def test_a_healthy_ground_truth_is_left_alone(flight, bare, odometry, path_of_ba
 
 
 def test_the_inertial_sensor_tells_that_the_ground_truth_is_late(flight):
-    put_right, said = settled(shifted(flight, "truth", 0.4))
+    put_right, said = align_truth(shifted(flight, "truth", 0.4))
     np.testing.assert_allclose(put_right.truth.t, flight.truth.t, atol=0.02)
     assert (
         len(said) == 1
         and "the stamps of the ground truth are 0.4" in said[0]
-        and "as the gyroscope" in said[0]
+        and "as gyroscope and accelerometer show" in said[0]
     )
 
 
 def test_the_inertial_sensor_tells_that_the_tdoas_are_late_and_not_the_ground_truth(flight):
-    same, said = settled(shifted(flight, "tdoa", 0.4))
+    same, said = align_truth(shifted(flight, "tdoa", 0.4))
     assert (
         said == ()
         and np.array_equal(same.truth.t, flight.truth.t)
@@ -105,7 +110,7 @@ def test_the_inertial_sensor_tells_that_the_tdoas_are_late_and_not_the_ground_tr
 
 def test_without_inertial_sensor_nothing_tells_which_is_late(bare):
     for stream, sign in (("truth", -1.0), ("tdoa", 1.0)):
-        put_right, said = settled(shifted(bare, stream, 0.4))
+        put_right, said = align_truth(shifted(bare, stream, 0.4))
         late = shifted(bare, stream, 0.4).truth.t
         np.testing.assert_allclose(put_right.truth.t, late + sign * 0.4, atol=0.03)
         assert (
@@ -126,8 +131,8 @@ def test_another_epoch_is_refused_or_found(name, request):
             "give --align"
         ),
     ):
-        settled(later)
-    for put_right in (settled(later, align="time")[0], on_one_clock(later, "time")):
+        align_truth(later)
+    for put_right in (align_truth(later, align="time")[0], on_one_clock(later, "time")):
         np.testing.assert_allclose(put_right.truth.t, one.truth.t, atol=0.03)
     assert on_one_clock(one) is one
 
@@ -137,7 +142,7 @@ def test_another_epoch_is_refused_or_found(name, request):
 )  # z down; y up, as Motive writes it
 def test_another_epoch_and_other_axes_at_once_are_found(flight, axes):
     later = shifted(in_frame(flight, np.transpose(axes)), "truth", EPOCH)
-    put_right, said = settled(later, align="time")
+    put_right, said = align_truth(later, align="time")
     np.testing.assert_allclose(put_right.truth.t, flight.truth.t, atol=0.03)
     flown = flight.truth.p[:, 2] > 0.3
     away = np.linalg.norm(put_right.truth.p - flight.truth.p, axis=1)[flown]
@@ -159,12 +164,12 @@ def test_a_path_that_repeats_itself_does_not_tell_the_epoch(bare):
         t=t,
         variance=None,
     )
-    with pytest.raises(InputError, match="its path does not tell on which"):
-        alignment_of(replace(bare, truth=truth, tdoa=tdoa), path)
+    with pytest.raises(InputError, match="its path does not determine the offset"):
+        estimate_alignment(replace(bare, truth=truth, tdoa=tdoa), path)
 
 
 def test_a_part_of_the_ground_truth_is_no_other_clock(flight):
-    need_truth(
+    require_truth(
         replace(
             flight,
             tdoa=replace(
@@ -198,7 +203,7 @@ def test_a_part_of_the_ground_truth_is_no_other_clock(flight):
 def test_another_frame_is_put_right(name, axes, shift, words, request):
     one = request.getfixturevalue(name)
     other = in_frame(one, axes, shift)
-    put_right, said = settled(other)
+    put_right, said = align_truth(other)
     assert len(said) == 1 and re.search(words, said[0]), said
     flown = one.truth.p[:, 2] > 0.3
     away = np.linalg.norm(put_right.truth.p - one.truth.p, axis=1)[flown]
@@ -211,7 +216,7 @@ def test_wrong_ids_and_signs_are_no_other_frame(name, request):
     first, second, *_, last = one.anchors.ids.tolist()
     opposite = replace(one, tdoa=replace(one.tdoa, d=-one.tdoa.d))
     for wrong in (opposite, mislabelled(one, first, second), mislabelled(one, second, last)):
-        same, said = settled(wrong)
+        same, said = align_truth(wrong)
         assert said == () and np.array_equal(same.truth.p, one.truth.p)
 
 
@@ -228,12 +233,12 @@ def test_no_healthy_recording_is_moved_and_every_late_one_is(shared_data):
     assert len(flights) == 13
     for one in flights:
         path = run_offline(one).odometry
-        found = alignment_of(one, path)
-        assert found.late == 0.0 and not found.other_frame, one.name
-        late = alignment_of(shifted(one, "truth", 0.4), path)
+        found = estimate_alignment(one, path)
+        assert found.late == 0.0 and not found.frame_differs, one.name
+        late = estimate_alignment(shifted(one, "truth", 0.4), path)
         assert abs(late.late - 0.4) < (0.03 if one.imu is None else 0.02), one.name
         assert late.source == ("tdoa" if one.imu is None else "inertial"), one.name
-        down = alignment_of(in_frame(one, np.diag([1, 1, -1])), path)
-        assert down.other_axes and np.array_equal(down.axes, np.diag([1, 1, -1])), one.name
-        epoch = alignment_of(shifted(one, "truth", EPOCH), path)
+        down = estimate_alignment(in_frame(one, np.diag([1, 1, -1])), path)
+        assert down.axes_differ and np.array_equal(down.axes, np.diag([1, 1, -1])), one.name
+        epoch = estimate_alignment(shifted(one, "truth", EPOCH), path)
         assert abs(epoch.late - EPOCH) < 0.03, one.name

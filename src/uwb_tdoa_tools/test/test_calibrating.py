@@ -11,11 +11,9 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_ekf.offline import without_offset
 from uwb_tdoa_ekf.streams import ERROR, Finding
+from uwb_tdoa_tools import calibrating as library
 from uwb_tdoa_tools.bags.bag import write_bag
-from uwb_tdoa_tools.calibrating import calibrate as library
-from uwb_tdoa_tools.calibrating.calibrate import Calibration, without_truth
-from uwb_tdoa_tools.calibrating.parts import between, split
-from uwb_tdoa_tools.calibrating.quick import prospect
+from uwb_tdoa_tools.calibrating import Calibration, between, prospect, split, without_truth
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.commands import calibrate
 from uwb_tdoa_tools.estimate import FlightEstimator
@@ -137,7 +135,7 @@ def test_what_makes_it_worse_where_it_took_no_part_is_not_to_be_used(flights, mo
     ],
 )
 def test_innovations_alone_must_speak_clearly(before, after, why):
-    told = library._why_not_blindly(replace(GOOD, before=before, after=after))
+    told = library._reason_against_unverified(replace(GOOD, before=before, after=after))
     assert told is why if why is None else why in told
 
 
@@ -148,8 +146,7 @@ def test_quick_says_what_is_to_be_expected(flights):
     assert np.median(told.expected) < 0.7 * np.median(told.given)
     sentences = told.sentences()
     assert (
-        f"all flights are likely to tell {told.better.sum()} of 24 coordinates better"
-        in sentences[1]
+        f"all flights are likely to improve {told.better.sum()} of 24 coordinates" in sentences[1]
     )
     assert sentences[-1] == "the flights are exciting enough"
 
@@ -254,14 +251,16 @@ def test_it_stops_where_check_finds_an_error(room, flights, monkeypatch, capsys)
 
 def test_a_tape_that_is_off_does_not_stop_it_and_another_room_does(flights):
     flight, findings = flights[0], [Finding(library.MISFIT, ERROR, "", "", "", 0.0)]
-    assert library.stopping(of_flight(flight), findings, 0.1) == []
+    assert library.blocking_errors(of_flight(flight), findings, 0.1) == []
     far = flight.anchors.at(
         flight.anchors.positions
         + np.random.default_rng(6).standard_normal(flight.anchors.positions.shape)
     )
-    assert library.stopping(of_flight(replace(flight, anchors=far)), findings, 0.1) == findings
+    assert (
+        library.blocking_errors(of_flight(replace(flight, anchors=far)), findings, 0.1) == findings
+    )
     other = Finding("tdoa_sign", ERROR, "", "", "", 0.0)
-    assert library.stopping(of_flight(flight), [other, *findings], 0.1) == [other]
+    assert library.blocking_errors(of_flight(flight), [other, *findings], 0.1) == [other]
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from uwb_tdoa_tools.checking.check import check, different_surveys, upright
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.readers import inputs, read_flight, read_survey
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.simulation.constellations import constellation
+from uwb_tdoa_tools.simulation.rooms import constellation
 
 OTHER_ROOM = constellation("random-5")
 NOTHING_TRIED = [

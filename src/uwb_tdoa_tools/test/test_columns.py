@@ -8,9 +8,9 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.commands.convert import main
 from uwb_tdoa_tools.readers import read_flight, read_survey
 from uwb_tdoa_tools.readers.columns import TIME, UNITS, parse_columns, read_columns
-from uwb_tdoa_tools.readers.names import Named, read_named
+from uwb_tdoa_tools.readers.names import NamedAnchors, read_named_anchors
 
-NAMED = Named(ANCHORS)
+NAMED = NamedAnchors(ANCHORS)
 TDOA = "time=t_ms:ms,anchor_a=from,anchor_b=to,tdoa=diff:mm"
 IMU = ",".join(
     f"{s}_{axis}={s[0]}{axis}{unit}"
@@ -219,7 +219,7 @@ def test_semicolons_commas_names_and_holes_of_a_spreadsheet(files, capsys):
 )
 def test_names_of_a_survey(files, survey, ids):
     (files / "named.yaml").write_text(survey)
-    named = read_named("named.yaml")
+    named = read_named_anchors("named.yaml")
     assert read_survey("named.yaml").ids.tolist() == named.anchors.ids.tolist()  # of every tool
     assert named.ids == ids and (not ids or set(named.anchors.ids) == set(ids.values()))
 

@@ -13,7 +13,7 @@ import yaml
 from uwb_tdoa_bias.effects import AnchorDelay
 from uwb_tdoa_tools.readers import read_survey
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.simulation.constellations import facing
+from uwb_tdoa_tools.simulation.rooms import facing
 
 WALK = section("connect.md", "From a CSV file and a tape measure to a diagnosed flight")
 LATE = 0.3  # m, anchor 3

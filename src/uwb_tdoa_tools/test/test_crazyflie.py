@@ -11,14 +11,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from uwb_tdoa_tools.crazyflie.log_blocks import (
-    FORCES,
-    GRAVITY,
-    PERIOD,
-    RATES,
-    LogBlock,
-    VehicleClock,
-)
+from uwb_tdoa_tools.crazyflie import FORCES, GRAVITY, PERIOD, RATES, LogBlock, VehicleClock
 
 
 def test_a_value_is_a_measurement_once():

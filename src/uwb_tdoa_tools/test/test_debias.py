@@ -10,7 +10,7 @@ from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands import debias as command
 from uwb_tdoa_tools.commands.debias import main
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.simulation.constellations import corners
+from uwb_tdoa_tools.simulation.rooms import corners
 
 BIAS = np.array([0.1, -0.2, 0.05])
 

@@ -8,7 +8,7 @@ import known_answer  # noqa: E402
 
 from uwb_tdoa_tools.commands import calibrate, check, demo, localize  # noqa: E402
 from uwb_tdoa_tools.flying.demo import DemoFlight, next_steps  # noqa: E402
-from uwb_tdoa_tools.simulation.constellations import corners  # noqa: E402
+from uwb_tdoa_tools.simulation.rooms import corners
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from uwb_tdoa_tools.diagnosis.channels import residuals
 from uwb_tdoa_tools.diagnosis.diagnose import diagnose
 from uwb_tdoa_tools.diagnosis.references import GroundTruth, Nothing
 from uwb_tdoa_tools.diagnosis.report.page import html
-from uwb_tdoa_tools.scoring.settling import settled
+from uwb_tdoa_tools.scoring.evaluation import align_truth
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 DELAY, MOVED = (
@@ -171,11 +171,11 @@ def test_delays_of_all_anchors_do_not_turn_the_ground_truth(both):
     """They bend an estimate from ranges by so much that the frame of the truth seems another one."""
     delays = EFFECTS["anchor_delay"]({str(i): 0.1 + 0.05 * i for i in range(8)})
     wrong = delays.inject(alone(both))
-    flight, said = settled(wrong)
+    flight, said = align_truth(wrong)
     np.testing.assert_array_equal(flight.truth.p, wrong.truth.p)
     assert said == ()
     turned = replace(wrong, truth=replace(wrong.truth, p=wrong.truth.p + [0.0, 2.0, 0.0]))
-    flight, said = settled(turned)
+    flight, said = align_truth(turned)
     assert (
         len(said) == 1
         and "another frame" in said[0]

@@ -53,6 +53,11 @@ def bag(flight, tmp_path_factory):
     return path
 
 
+@pytest.fixture(scope="module")
+def odometry(flight):
+    return run_offline(flight).odometry
+
+
 def write_odometry(path, odometry, covariance=None, space="", verdicts=()):
     """A bag with a nav_msgs/Odometry for each estimate on /odometry; covariance: 36 numbers,
     default the estimate's; space: before the topics; verdicts: one uwb/residual for each.
@@ -327,8 +332,7 @@ def test_an_interrupted_run_over_many_goes_on_where_it_was(tmp_path, capsys):
     assert "made with another no_bias and smooth" in capsys.readouterr().err
 
 
-def test_recorded_odometry_is_judged(flight, bag, tmp_path):
-    odometry = run_offline(flight).odometry
+def test_recorded_odometry_is_judged(odometry, bag, tmp_path):
     off = replace(odometry, p=odometry.p + [0.3, 0.0, 0.0])
     recorded = write_odometry(tmp_path / "recorded", off)
     own, judged = (
@@ -340,17 +344,15 @@ def test_recorded_odometry_is_judged(flight, bag, tmp_path):
     assert judged["nees_mean"] > own["nees_mean"]
 
 
-def test_recorded_odometry_without_covariance_is_judged(flight, bag, tmp_path):
-    recorded = write_odometry(tmp_path / "recorded", run_offline(flight).odometry, np.zeros(36))
+def test_recorded_odometry_without_covariance_is_judged(odometry, bag, tmp_path):
+    recorded = write_odometry(tmp_path / "recorded", odometry, np.zeros(36))
     assert report([bag, "--odometry", recorded], tmp_path)["runs"][0]["rmse_3d"] < 0.1
 
 
 def test_odometry_of_a_tag_is_judged_against_the_flight_of_a_bag_without_namespace(
-    flight, bag, tmp_path, capsys
+    odometry, bag, tmp_path, capsys
 ):
-    recorded = write_odometry(
-        tmp_path / "recorded", run_offline(flight).odometry, space="/tag1", verdicts=(0, 1)
-    )
+    recorded = write_odometry(tmp_path / "recorded", odometry, space="/tag1", verdicts=(0, 1))
     assert main([str(bag), "--odometry", str(recorded)]) == 2
     assert (
         "has no message on /odometry; say which to take (--topic odometry=/tag1/odometry)."
@@ -362,17 +364,15 @@ def test_odometry_of_a_tag_is_judged_against_the_flight_of_a_bag_without_namespa
     assert judged["rmse_3d"] < 0.1
 
 
-def test_odometry_of_late_tdoas_is_told_with_code_1(flight, bag, tmp_path, capsys):
-    recorded = write_odometry(
-        tmp_path / "recorded", run_offline(flight).odometry, verdicts=(0, 2, 1, 2)
-    )
+def test_odometry_of_late_tdoas_gives_exit_code_1(odometry, bag, tmp_path, capsys):
+    recorded = write_odometry(tmp_path / "recorded", odometry, verdicts=(0, 2, 1, 2))
     assert main([str(bag), "--odometry", str(recorded)]) == 1
     assert "2 TDOAs came too late for that filter" in capsys.readouterr().err
 
 
-def test_flights_without_truth_are_told_in_one_sentence(flight, tmp_path, capsys):
+def test_flights_without_truth_are_refused_in_one_sentence(flight, odometry, tmp_path, capsys):
     write_bag(replace(flight, truth=None), tmp_path / "blind")
-    recorded = write_odometry(tmp_path / "recorded", run_offline(flight).odometry)
+    recorded = write_odometry(tmp_path / "recorded", odometry)
     for more in ([], ["--odometry", str(recorded)]):
         assert main([str(tmp_path / "blind"), *more]) == 2
         assert "ground truth" in capsys.readouterr().err
@@ -390,28 +390,19 @@ def test_picture_and_trajectories(flight, bag, tmp_path):
         np.testing.assert_allclose(np.linalg.norm(rows[:, 4:], axis=1), 1.0, atol=1e-5)
 
 
-def test_the_picture_of_a_run_that_never_started(flight, tmp_path):
-    few = replace(
-        flight, tdoa=replace(flight.tdoa, **{c: getattr(flight.tdoa, c)[:5] for c in "tabd"})
-    )
-    write_bag(few, tmp_path / "few")
-    assert main([str(tmp_path / "few"), "--plot", str(tmp_path / "error.png")]) == 1  # it diverged
-    assert (tmp_path / "error.png").exists()
-
-
-def test_a_report_is_json_that_everybody_reads(flight, tmp_path):
-    """RFC 8259 has no NaN and no Infinity, which a run that never started could bring in."""
-    few = replace(
-        flight, tdoa=replace(flight.tdoa, **{c: getattr(flight.tdoa, c)[:5] for c in "tabd"})
-    )
-    write_bag(few, tmp_path / "few")
-    assert main([str(tmp_path / "few"), "--json", str(tmp_path / "report.json")]) == 1
+def test_a_run_that_never_starts_has_a_picture_and_a_report_in_strict_json(flight, tmp_path):
+    """RFC 8259 has no NaN and no Infinity, which such a run could bring in."""
+    few = {name: getattr(flight.tdoa, name)[:5] for name in "tabd"}
+    write_bag(replace(flight, tdoa=replace(flight.tdoa, **few)), tmp_path / "few")
+    picture, file = tmp_path / "error.png", tmp_path / "report.json"
+    assert main([str(tmp_path / "few"), "--plot", str(picture), "--json", str(file)]) == 1
+    assert picture.exists()
 
     def refuse(word):
         raise AssertionError(f"{word} is not JSON")
 
-    told = json.loads((tmp_path / "report.json").read_text(), parse_constant=refuse)
-    assert told["runs"][0]["diverged"] is True
+    found = json.loads(file.read_text(), parse_constant=refuse)
+    assert found["runs"][0]["diverged"] is True
 
 
 def test_table_beside_others(flight, bag, tmp_path):

@@ -25,7 +25,7 @@ from documented import PAGES, ROOT, commands  # noqa: E402
 from uwb_tdoa_tools import cli  # noqa: E402
 from uwb_tdoa_tools.bags.bag import write_bag  # noqa: E402
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate  # noqa: E402
-from uwb_tdoa_tools.simulation.constellations import corners  # noqa: E402
+from uwb_tdoa_tools.simulation.rooms import corners
 
 NODES = {
     "anchors_node": "uwb_tdoa_bias.anchors_node",

@@ -13,7 +13,7 @@ from uwb_tdoa_tools.flying.pilot import Pilot
 from uwb_tdoa_tools.flying.trial import Task, Trial
 from uwb_tdoa_tools.flying.verdict import verdict_of
 from uwb_tdoa_tools.flying.world import HALL
-from uwb_tdoa_tools.simulation.imu import NO_IMU_ERRORS
+from uwb_tdoa_tools.simulation.config import NO_IMU_ERRORS
 
 PERFECT = replace(
     HALL,

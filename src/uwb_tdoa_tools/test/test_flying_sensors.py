@@ -10,8 +10,8 @@ from uwb_tdoa_tools.flying.sensors import AIDS, InertialErrors, Radio, gusts
 from uwb_tdoa_tools.flying.simulator import SensorReadings
 from uwb_tdoa_tools.flying.transport import Transport
 from uwb_tdoa_tools.flying.world import HALL, WORLDS
-from uwb_tdoa_tools.simulation.constellations import constellation
-from uwb_tdoa_tools.simulation.ranging import tag_link
+from uwb_tdoa_tools.simulation.rooms import constellation
+from uwb_tdoa_tools.simulation.tdoas import tag_link
 
 CLEAN = replace(HALL, floor_effect=False, noise=0.0, outlier_share=0.0, delay=0.0, bearing_bias=0.0)
 HIGH, LEVEL = np.array([0.5, 0.3, 1.2]), np.array([0.0, 0.0, 0.0, 1.0])

@@ -10,7 +10,7 @@ from uwb_tdoa_tools.flying.trial import Task, fly
 from uwb_tdoa_tools.flying.verdict import verdict_of
 from uwb_tdoa_tools.flying.world import HALL, WORLDS
 from uwb_tdoa_tools.scoring.metrics import position_at
-from uwb_tdoa_tools.simulation.imu import NO_IMU_ERRORS
+from uwb_tdoa_tools.simulation.config import NO_IMU_ERRORS
 from uwb_tdoa_tools.simulation.inject import parse_effect
 
 SHORT = Circles(turns=1)

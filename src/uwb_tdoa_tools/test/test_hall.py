@@ -20,7 +20,7 @@ from uwb_tdoa_tools.diagnosis.self_calibration import SelfCalibration, Tape, sel
 from uwb_tdoa_tools.diagnosis.self_calibration.equations import _sparse
 from uwb_tdoa_tools.diagnosis.self_calibration.prior import Prior, Solution
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.surveying.report import apart, as_text
+from uwb_tdoa_tools.surveying.report import as_text, misplaced_anchors
 
 LATE, MOVED, SHIFT = 38, 50, {"x": 0.2, "y": -0.2, "z": 0.1}
 
@@ -148,11 +148,11 @@ def test_an_anchor_that_stands_apart_from_the_others_is_named_even_if_the_tape_a
         0,
         {},
     )
-    assert apart(found) == [
+    assert misplaced_anchors(found) == [
         MOVED
-    ] and f"anchor {MOVED} does not stand where it was given" in as_text(found)
+    ] and f"anchor {MOVED} is not at its given position" in as_text(found)
     still = np.delete(shifts, MOVED, axis=0)[[*range(MOVED), 0, *range(MOVED, len(given) - 1)]]
-    assert not apart(replace(found, surveyed=given.at(given.positions + still)))
+    assert not misplaced_anchors(replace(found, surveyed=given.at(given.positions + still)))
 
 
 def test_check_tries_few_exchanges_of_ids_in_a_hall(sound, monkeypatch):

@@ -21,8 +21,8 @@ from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.bags.files import messages, new_bag, open_bag
 from uwb_tdoa_tools.bags.message_types import typestore
 from uwb_tdoa_tools.readers import inputs, read_flight
-from uwb_tdoa_tools.readers.inputs import Reading, find_flights, need_tdoas, survey_for
-from uwb_tdoa_tools.readers.names import read_named
+from uwb_tdoa_tools.readers.inputs import Reading, find_flights, require_tdoas, survey_for
+from uwb_tdoa_tools.readers.names import read_named_anchors
 
 
 def make(folder, *names):
@@ -264,9 +264,9 @@ def test_ground_truth_that_is_not_wanted_is_not_read(tmp_path, kind):
 
 def test_a_recording_without_tdoas_is_refused_where_they_are_needed():
     flight = small_flight()
-    need_tdoas([flight], "survey")
+    require_tdoas([flight], "survey")
     with pytest.raises(InputError, match=f"{flight.name}: holds no TDOAs, which survey needs"):
-        need_tdoas([flight, replace(flight, tdoa=Tdoas(*np.empty((4, 0))))], "survey")
+        require_tdoas([flight, replace(flight, tdoa=Tdoas(*np.empty((4, 0))))], "survey")
 
 
 def test_folders_that_link_to_each_other_are_looked_through_once(tmp_path):
@@ -339,4 +339,4 @@ def test_a_folder_that_a_killed_process_left_is_removed_by_the_next(tmp_path, mo
 def test_a_position_that_is_no_numbers_is_refused(tmp_path, name, position):
     (tmp_path / "survey.yaml").write_text(f"anchors: {{{name}: {{position: {position}}}}}\n")
     with pytest.raises(InputError, match="survey.yaml: "):
-        read_named(tmp_path / "survey.yaml")
+        read_named_anchors(tmp_path / "survey.yaml")

@@ -120,6 +120,18 @@ def test_the_walk_sees_what_there_is():
     assert len(modules()) > 120
 
 
+def test_relative_imports_lead_to_modules():
+    """Those in functions too, which fail only when they run."""
+    for module, path in modules().items():
+        package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and node.level:
+                parts = package.split(".")[: len(package.split(".")) + 1 - node.level]
+                assert ".".join([*parts, *filter(None, [node.module])]) in modules(), (
+                    f"{module}: line {node.lineno}"
+                )
+
+
 def test_no_library_imports_a_command():
     for module in modules():
         if not module.startswith("uwb_tdoa_tools.commands."):

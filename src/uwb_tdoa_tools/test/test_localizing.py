@@ -1,5 +1,3 @@
-"""localize: trajectories without ground truth, and how far they are to be believed."""
-
 from dataclasses import replace
 import json
 
@@ -13,8 +11,8 @@ from uwb_tdoa_ekf.results import Odometry, Residuals
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag
 from uwb_tdoa_tools.commands import evaluate, localize
 from uwb_tdoa_tools.estimate import FlightEstimator
-from uwb_tdoa_tools.localizing import belief, residuals, zones
-from uwb_tdoa_tools.localizing.localize import check_names, name_of
+from uwb_tdoa_tools.localizing import assessment, residuals
+from uwb_tdoa_tools.localizing.localize import check_names, name_of, write_tum
 from uwb_tdoa_tools.readers.inputs import Reading, find_flights
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
@@ -106,11 +104,11 @@ def test_what_is_written_says_the_same(bags, flight, tmp_path, capsys):
     assert len(lines) == 1 + len(flight.tdoa) and lines[0] == "t,a,b,residual,std,weight,verdict"
     for picture in ("flight.png", "flight_residuals.png"):
         assert (tmp_path / picture).read_bytes().startswith(b"\x89PNG")
-    (told,) = json.loads((tmp_path / "all.json").read_text())["flights"]
+    (found,) = json.loads((tmp_path / "all.json").read_text())["flights"]
     assert (
-        told["verdict"] == "good"
-        and told["explained"] > 0.95
-        and told["estimates"] == len(odometry)
+        found["verdict"] == "good"
+        and found["explained"] > 0.95
+        and found["estimates"] == len(odometry)
     )
     assert "flight: good: standard deviation" in capsys.readouterr().out
 
@@ -140,21 +138,43 @@ def test_a_reading_without_truth_gives_a_flight_without_it(bags):
     assert Reading().one(bags / "true" / "flight.bag").truth is not None
 
 
-# --- how far it is to be believed ---
+def test_a_tum_file_has_one_line_per_pose(tmp_path):
+    path = tmp_path / "made" / "for" / "it.tum"
+    t = np.array([1700000000.123456, 1700000000.128456])
+    p, q = (
+        np.array([[1.0, -2.0, 3.25], [0.0, 0.5, 1e-7]]),
+        np.array([[0.0, 0.0, 0.6, 0.8], [np.nan] * 4]),
+    )
+    write_tum(path, t, p, q)
+    lines = path.read_text().splitlines()
+    assert (
+        lines[0]
+        == "1700000000.123456001 1.000000 -2.000000 3.250000 0.000000 0.000000 0.600000 0.800000"
+    )
+    assert [len(line.split()) for line in lines] == [8, 8]
+    read = np.loadtxt(path)
+    np.testing.assert_allclose(read[:, 0], t, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(read[:, 1:4], p, atol=1e-6)
+    np.testing.assert_array_equal(read[1, 4:], [0, 0, 0, 1])  # unknown becomes the identity
+    write_tum(tmp_path / "none.tum", np.empty(0), np.empty((0, 3)), np.empty((0, 4)))
+    assert (tmp_path / "none.tum").read_text() == ""
 
 
-def believed(flight):
-    return belief.believe(flight, FlightEstimator()(flight))
+# --- how reliable it is ---
+
+
+def assessed(flight):
+    return assessment.assess(flight, FlightEstimator()(flight))
 
 
 def test_a_clean_flight_is_good_and_within_what_is_stated(flight):
-    told = believed(replace(flight, truth=None))
-    assert told.level == belief.GOOD and not told.reasons and not told.lost
+    found = assessed(replace(flight, truth=None))
+    assert found.level == assessment.GOOD and not found.reasons and not found.lost
     odometry = FlightEstimator()(flight).odometry
     true = np.stack(
         [np.interp(odometry.t, flight.truth.t, flight.truth.p[:, k]) for k in range(3)], axis=1
     )
-    assert np.mean(np.linalg.norm(odometry.p - true, axis=1) <= told.figures["within"]) >= 0.95
+    assert np.mean(np.linalg.norm(odometry.p - true, axis=1) <= found.figures["within"]) >= 0.95
 
 
 @pytest.fixture(scope="module")
@@ -166,12 +186,12 @@ def ranged():
     )
 
 
-def test_ranges_alone_are_believed_as_tdoas_are(ranged, tmp_path):
-    told = believed(ranged)
-    assert told.level == belief.GOOD and not told.reasons and not told.lost
+def test_ranges_alone_are_assessed_like_tdoas(ranged, tmp_path):
+    found = assessed(ranged)
+    assert found.level == assessment.GOOD and not found.reasons and not found.lost
     assert (
-        f"% of {len(ranged.range)} ranges fit it" in told.sentences()[0]
-        and told.figures["seconds"] > 12.0
+        f"% of {len(ranged.range)} ranges fit it" in found.sentences()[0]
+        and found.figures["seconds"] > 12.0
     )
     write_bag(ranged, tmp_path / "ranged.bag")
     run([tmp_path / "ranged.bag", "--residuals", "--zones", "2", "--out", tmp_path / "out"])
@@ -187,11 +207,11 @@ def test_ranges_alone_are_believed_as_tdoas_are(ranged, tmp_path):
     ).exists()
 
 
-def test_an_offset_of_ranges_that_was_found_is_told(ranged):
-    told = belief.believe(ranged, FlightEstimator(smoothed=True)(without_offset(ranged, -0.25)))
-    assert told.figures["range_offset"] == pytest.approx(0.25, abs=0.02)
-    assert "all ranges are 25 cm too long: that was found, and taken out" in told.sentences()
-    sound = believed(ranged)
+def test_an_offset_of_all_ranges_is_reported(ranged):
+    found = assessment.assess(ranged, FlightEstimator(smoothed=True)(without_offset(ranged, -0.25)))
+    assert found.figures["range_offset"] == pytest.approx(0.25, abs=0.02)
+    assert "all ranges are 25 cm too long: that was found, and taken out" in found.sentences()
+    sound = assessed(ranged)
     assert abs(sound.figures["range_offset"]) < 0.02 and not any(
         "all ranges" in sentence for sentence in sound.sentences()
     )
@@ -199,8 +219,8 @@ def test_an_offset_of_ranges_that_was_found_is_told(ranged):
 
 def test_ranges_that_contradict_each_other_are_not_good(ranged):
     far = replace(ranged.range, d=ranged.range.d + 20.0 * (ranged.range.anchor % 3))
-    told = believed(replace(ranged, range=far))
-    assert told.level != belief.GOOD and "ranges" in " ".join(told.reasons)
+    found = assessed(replace(ranged, range=far))
+    assert found.level != assessment.GOOD and "ranges" in " ".join(found.reasons)
 
 
 def test_silence_among_ranges_is_where_the_tag_was_lost(ranged):
@@ -211,18 +231,22 @@ def test_silence_among_ranges_is_where_the_tag_was_lost(ranged):
         imu=None,
         range=type(ranged.range)(*(column[heard] for column in ranged.range.columns)),
     )
-    told = believed(quiet)
-    assert told.level == belief.DOUBTFUL and told.lost[0][0] == pytest.approx(begin, abs=1.0)
+    found = assessed(quiet)
+    assert found.level == assessment.DOUBTFUL and found.lost[0][0] == pytest.approx(begin, abs=1.0)
 
 
-def test_an_error_that_check_finds_is_bad_with_its_remedy(flight):
-    told = believed(replace(flight, tdoa=replace(flight.tdoa, d=-flight.tdoa.d)))
-    assert told.level == belief.BAD and "sign" in " ".join(told.reasons) and told.remedies
+def test_an_error_of_check_is_bad_with_a_remedy_and_exit_code_1(flight, tmp_path, capsys):
+    wrong = replace(flight, tdoa=replace(flight.tdoa, d=-flight.tdoa.d))
+    found = assessed(wrong)
+    assert found.level == assessment.BAD and "sign" in " ".join(found.reasons) and found.remedies
+    write_bag(wrong, tmp_path / "flight.bag")
+    run([tmp_path / "flight.bag", "--out", tmp_path / "out"], 1)
+    assert "flight: bad: " in capsys.readouterr().out
 
 
 def test_a_recording_without_an_estimate_is_bad(flight):
-    told = believed(replace(flight, tdoa=replace(flight.tdoa, d=1000.0 * flight.tdoa.d)))
-    assert told.level == belief.BAD and told.sentences()[0].startswith("bad: ")
+    found = assessed(replace(flight, tdoa=replace(flight.tdoa, d=1000.0 * flight.tdoa.d)))
+    assert found.level == assessment.BAD and found.sentences()[0].startswith("bad: ")
 
 
 def test_silence_is_where_the_tag_was_lost(flight):
@@ -234,12 +258,12 @@ def test_silence_is_where_the_tag_was_lost(flight):
         imu=None,
         tdoa=type(flight.tdoa)(*(column[heard] for column in vars(flight.tdoa).values())),
     )
-    told = believed(quiet)
-    assert told.level != belief.GOOD and "the tag was lost for" in " ".join(told.reasons)
-    assert told.lost[0][0] == pytest.approx(begin, abs=2.1) and told.lost[-1][1] == pytest.approx(
+    found = assessed(quiet)
+    assert found.level != assessment.GOOD and "the tag was lost for" in " ".join(found.reasons)
+    assert found.lost[0][0] == pytest.approx(begin, abs=2.1) and found.lost[-1][1] == pytest.approx(
         end, abs=1.0
     )
-    assert any("inertial" in sentence for sentence in told.remedies)
+    assert any("inertial" in sentence for sentence in found.remedies)
 
 
 def test_residuals_of_a_pair_are_of_one_sign_of_it():
@@ -273,12 +297,6 @@ def test_names_of_files_are_those_of_recordings_and_must_differ():
         check_names([("a/x.bag", None), ("b/x.csv", None)])
 
 
-def test_what_is_not_good_is_told_by_the_exit_code(flight, tmp_path, capsys):
-    write_bag(replace(flight, tdoa=replace(flight.tdoa, d=-flight.tdoa.d)), tmp_path / "flight.bag")
-    run([tmp_path / "flight.bag", "--out", tmp_path / "out"], 1)
-    assert "flight: bad: " in capsys.readouterr().out
-
-
 def test_a_recording_without_an_estimate_has_files_and_a_picture_too(flight, tmp_path, capsys):
     few = {name: getattr(flight.tdoa, name)[:5] for name in "tabd"}
     write_bag(
@@ -296,10 +314,10 @@ def test_a_recording_without_an_estimate_has_files_and_a_picture_too(flight, tmp
         ],
         1,
     )
-    (told,) = json.loads((tmp_path / "all.json").read_text())["flights"]
-    assert told["verdict"] == "bad" and told["estimates"] == 0
+    (found,) = json.loads((tmp_path / "all.json").read_text())["flights"]
+    assert found["verdict"] == "bad" and found["estimates"] == 0
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == sorted(
-        path.rpartition("/")[2] for path in told["files"]
+        path.rpartition("/")[2] for path in found["files"]
     )
     assert "flight: bad: there is no estimate" in capsys.readouterr().out
 
@@ -333,7 +351,7 @@ def walked(n=600):
 
 
 def test_zones_say_who_is_heard_where_and_how_well():
-    found = zones.zones_of(*walked(), 10.0)
+    found = residuals.zones_of(*walked(), 10.0)
     assert [(zone.x, zone.y) for zone in found[:4]] == [
         (5.0, 5.0),
         (15.0, 5.0),
@@ -353,7 +371,7 @@ def test_zones_say_who_is_heard_where_and_how_well():
         )
     assert found[3].used == pytest.approx(0.5, abs=0.05)
     assert (
-        zones.zones_of(
+        residuals.zones_of(
             *(part for part in (walked()[0], Residuals(*(np.empty(0) for _ in range(7))))), 10.0
         )
         == []
@@ -364,9 +382,9 @@ def test_zones_are_written_as_a_table_and_a_map(bags, tmp_path, capsys):
     run([bags / "none" / "flight.bag", "--zones", "2", "--out", tmp_path])
     lines = (tmp_path / "flight_zones.csv").read_text().splitlines()
     assert (
-        lines[0] == ",".join(zones.COLUMNS)
+        lines[0] == ",".join(residuals.ZONE_COLUMNS)
         and len(lines) > 3
-        and all(len(line.split(",")) == len(zones.COLUMNS) for line in lines)
+        and all(len(line.split(",")) == len(residuals.ZONE_COLUMNS) for line in lines)
     )
     assert (tmp_path / "flight_zones.png").stat().st_size > 10_000
     run([bags / "none" / "flight.bag", "--zones", "0", "--out", tmp_path], 2)

@@ -14,7 +14,7 @@ from uwb_tdoa_ekf.core.engine import feed
 from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, TDOA, Measurements, new_state, structured
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.readers.inputs import Reading
-from uwb_tdoa_tools.scoring.metrics import judged_part
+from uwb_tdoa_tools.scoring.metrics import scored_phase
 
 FLIGHTS = (
     "0422-log00",
@@ -77,7 +77,7 @@ def test_a_filter_put_aside_or_started_in_flight_is_back_within_three_seconds(fl
     )
     for flight in flights:
         usual = run_offline(flight).odometry
-        _, first, last = judged_part(flight.truth)
+        _, first, last = scored_phase(flight.truth)
         steady = rms(flight, usual.t, usual.p, first + 3.0, last)
         cells = []
         for at in TIMES:
@@ -103,7 +103,7 @@ def test_a_wrong_yaw_is_mended_or_honestly_doubted(flights):
     for flight in flights:
         cells = []
         for wrong in (0.5 * np.pi, -0.5 * np.pi):
-            _, first, _ = judged_part(flight.truth)
+            _, first, _ = scored_phase(flight.truth)
             true = Rotation.from_quat(
                 flight.truth.q[np.searchsorted(flight.truth.t, first)]
             ).as_euler("ZYX")[0]

@@ -6,19 +6,18 @@ import pytest
 
 from uwb_tdoa_bias.foundation.flight import Truth
 from uwb_tdoa_ekf.core.verdicts import INVALID, LATE, REJECTED, STARTUP, USED
-from uwb_tdoa_tools.evaluating.table import line
+from uwb_tdoa_tools.evaluating import line_of_run
 from uwb_tdoa_tools.scoring.metrics import (
-    Pool,
-    Result,
     Score,
     coverage,
-    judged_part,
     nees,
     nis,
     pooled,
     position_errors,
+    scored_phase,
     summary,
 )
+from uwb_tdoa_tools.scoring.pooling import Pool, Result
 
 UPRIGHT = [0.0, 0.0, 0.0, 1.0]
 
@@ -54,17 +53,17 @@ def residuals(innovation, variance, verdict):
 
 def test_what_is_judged_is_from_the_first_to_the_last_instant_above_the_limit():
     truth = straight()
-    assert judged_part(truth) == ("in_the_air", 1.0, 9.0)
+    assert scored_phase(truth) == ("in_the_air", 1.0, 9.0)
     truth.p[200:220, 2] = 0.1  # a touch of the floor in between counts
-    assert judged_part(truth)[1:] == (1.0, 9.0)
+    assert scored_phase(truth)[1:] == (1.0, 9.0)
     truth.p[:, 2] = np.where(truth.p[:, 2] > 0.5, 0.3, 0.0)  # at the limit is not above it
-    assert judged_part(truth)[0] == "moving"  # which never leaves the floor
+    assert scored_phase(truth)[0] == "moving"  # which never leaves the floor
 
 
 def test_errors_are_against_the_truth_interpolated_to_the_estimate():
     truth = straight(rate=2.0)  # much coarser than the estimate, which is off its grid
     odometry = estimate(truth, constant(0.1, -0.2, 0.3))
-    t, error, covariance = position_errors(odometry, truth, *judged_part(truth)[1:])
+    t, error, covariance = position_errors(odometry, truth, *scored_phase(truth)[1:])
     assert t[0] >= 1.0 and t[-1] <= 9.0 and len(t) == 801
     np.testing.assert_allclose(error, np.tile([0.1, -0.2, 0.3], (801, 1)), atol=1e-9)
     assert covariance.shape == (801, 3, 3)
@@ -75,7 +74,7 @@ def test_what_lies_in_a_hole_of_the_truth_has_no_error():
     odometry = estimate(truth, constant(0.1, -0.2, 0.3))
     known = (truth.t < 4.0) | (truth.t > 6.0)
     truth = Truth(truth.t[known], truth.p[known] ** 2, truth.q[known])  # nothing to be interpolated
-    t, _, _ = position_errors(odometry, truth, *judged_part(truth)[1:])
+    t, _, _ = position_errors(odometry, truth, *scored_phase(truth)[1:])
     assert np.sum(t <= 4.0) > 100 and np.sum(t >= 6.0) > 100 and not np.any((t > 4.02) & (t < 5.98))
 
 
@@ -130,13 +129,15 @@ def test_a_late_start_is_told_and_too_late_is_a_diverged_run(begin, diverged):
     row = Score("flight", estimate(truth, constant(0.0, 0.0, 0.0), low=begin), truth).row()
     assert row["start_delay"] == pytest.approx(max(0.0, begin - 1.0), abs=0.011)
     assert row["diverged"] is row["late_start"] is diverged
-    assert line(row).endswith("LATE START") is diverged and "DIVERGED" not in line(row)
+    assert line_of_run(row).endswith("LATE START") is diverged and "DIVERGED" not in line_of_run(
+        row
+    )
 
 
 def test_a_late_start_does_not_hide_what_else_is_wrong():
     truth = straight()
     row = Score("flight", estimate(truth, constant(2.0, 0.0, 0.0), low=2.1), truth).row()
-    assert row["diverged"] and not row["late_start"] and line(row).endswith("DIVERGED")
+    assert row["diverged"] and not row["late_start"] and line_of_run(row).endswith("DIVERGED")
 
 
 def test_an_estimate_that_ends_in_mid_flight_has_diverged():

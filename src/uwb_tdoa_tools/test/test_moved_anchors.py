@@ -20,9 +20,9 @@ from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.commands import evaluate, survey
 from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
 from uwb_tdoa_tools.estimate import FlightEstimator
-from uwb_tdoa_tools.localizing.belief import GOOD, believe
+from uwb_tdoa_tools.localizing.assessment import GOOD, assess
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.simulation.trajectories import Trajectory
+from uwb_tdoa_tools.simulation.vehicles import Trajectory
 from uwb_tdoa_tools.surveying.report import as_text
 
 SHIFT, ROW = np.array([0.4, -0.3, 0.3]), 3
@@ -118,7 +118,7 @@ def test_an_anchor_that_was_moved_before_the_start_is_named_with_the_command_tha
 def test_localize_doubts_a_flight_with_a_moved_anchor_and_says_why(sound, moved, calibrated):
     estimator = FlightEstimator(None, calibrated)
     good, doubtful = (
-        believe(replace(flight, truth=None), estimator(flight), estimator)
+        assess(replace(flight, truth=None), estimator(flight), estimator)
         for flight in (sound, moved)
     )
     assert (
@@ -190,7 +190,7 @@ def test_nothing_is_said_to_be_untold_of_an_anchor_that_has_moved(moved):
     found = self_calibrate([replace(moved, truth=None)], Tape(std=0.05))
     told = replace(found, solution=replace(found.solution, covariance=found.prior.covariance))
     (line,) = (
-        line for line in as_text(told).splitlines() if line.startswith("nothing new is told")
+        line for line in as_text(told).splitlines() if line.startswith("the flights do not improve")
     )
     assert "3" not in line and "anchor 3 has moved" in as_text(told)
 

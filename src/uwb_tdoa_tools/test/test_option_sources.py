@@ -26,7 +26,7 @@ from uwb_tdoa_tools.commands import (
 )  # noqa: E402
 from uwb_tdoa_tools.diagnosis.references import REFERENCES  # noqa: E402
 from uwb_tdoa_tools.estimate import with_antenna  # noqa: E402
-from uwb_tdoa_tools.evaluating.evaluator import Evaluator  # noqa: E402
+from uwb_tdoa_tools.evaluating import Evaluator
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate  # noqa: E402
 
 CLEAN = dict(

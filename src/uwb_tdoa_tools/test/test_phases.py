@@ -1,8 +1,15 @@
+"""Phases of a recording, and the errors in each."""
+
+from types import SimpleNamespace
+
 from hand_made import flown, truth_of
 import numpy as np
 import pytest
 
+from uwb_tdoa_tools.evaluating import lines_of_phases, markdown_of
+from uwb_tdoa_tools.scoring.metrics import Score
 from uwb_tdoa_tools.scoring.phases import TITLES, in_the_air, motion, phases
+from uwb_tdoa_tools.scoring.pooling import Pool, PooledErrors
 
 
 def test_phases_of_a_flight_are_those_of_the_data_and_leave_nothing_out():
@@ -146,3 +153,245 @@ def test_random_paths_have_phases_that_leave_nothing_out():
             assert covers(found), found
         else:
             assert not found
+
+
+STD = 0.5
+
+
+def odometry_of(truth, error, low=-np.inf, high=np.inf, rate=100.0, std=STD):
+    """Odometry of a Truth that is off by error(t) (n, 3) m, from `low` to `high`, s."""
+    t = np.arange(truth.t[0] + 0.5 / rate, truth.t[-1], 1.0 / rate)
+    t = t[(t >= low) & (t <= high)]
+    true = np.stack([np.interp(t, truth.t, truth.p[:, k]) for k in range(3)], axis=1)
+    return SimpleNamespace(
+        t=t, p=true + error(t), covariance=np.tile(np.diag([std**2] * 3), (len(t), 1, 1))
+    )
+
+
+def high_on_the_floor(truth, off=4.0):
+    """Right in the air, `off` m too high until z > 0.3 m, as estimates of measured flights are."""
+    begin = phases(truth)["in_the_air"][0]
+    return lambda t: np.where(t < begin, 1.0, 0.0)[:, None] * [0.0, 0.0, off]
+
+
+def test_an_error_on_the_floor_is_told_beside_the_figure_of_the_air():
+    truth = flown()
+    score = Score("flight", odometry_of(truth, high_on_the_floor(truth)), truth)
+    found = score.phases()
+    assert score.row()["rmse_3d"] == pytest.approx(0.0, abs=1e-9) and not score.row()["diverged"]
+    for name in ("at_rest_earlier", "at_rest_before", "to_0.3_m"):
+        assert (
+            found[name]["rmse_3d"]
+            == found[name]["rmse_z"]
+            == found[name]["max_3d"]
+            == pytest.approx(4.0)
+        )
+        assert found[name]["nees_mean"] == pytest.approx(64.0) and found[name][
+            "rmse_x"
+        ] == pytest.approx(0.0, abs=1e-9)
+        assert found[name]["std_3d"] == pytest.approx(STD * np.sqrt(3.0))
+    assert found["first_3_s"]["max_3d"] == pytest.approx(4.0)
+    for name in ("in_the_air", "last_3_s", "at_rest_after"):
+        assert found[name]["rmse_3d"] == pytest.approx(0.0, abs=1e-9), name
+    share = (phases(truth)["in_the_air"][0] - truth.t[0]) / 21.0
+    assert found["whole"]["rmse_3d"] == pytest.approx(4.0 * np.sqrt(share), rel=0.01)
+
+
+def test_the_figure_of_the_air_is_the_one_of_the_row():
+    truth, rng = flown(), np.random.default_rng(1)
+    made = odometry_of(truth, lambda t: rng.normal(0.0, 0.2, (len(t), 3)))
+    score = Score("flight", made, truth)
+    row, found = score.row(), score.phases()["in_the_air"]
+    for name in ("rmse_x", "rmse_y", "rmse_z", "rmse_3d", "max_3d", "nees_mean"):
+        assert row[name] == pytest.approx(found[name], rel=1e-12), name
+
+
+def test_the_step_is_the_largest_jump_between_estimates_and_where_it_is():
+    truth = flown()
+    found = Score(
+        "flight", odometry_of(truth, high_on_the_floor(truth, 1.5), rate=20.0), truth
+    ).phases()
+    assert found["first_3_s"]["step"] == found["whole"]["step"] == pytest.approx(1.5)
+    assert found["at_rest_before"]["step"] == pytest.approx(
+        0.0, abs=1e-9
+    )  # and the motion itself is none
+    assert found["last_3_s"]["step"] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_time_without_an_estimate_is_told_where_it_is():
+    truth = flown()  # departs at 5.07 s
+    made = odometry_of(truth, lambda t: np.zeros((len(t), 3)), low=4.0)
+    keep = (made.t < 10.0) | (made.t > 12.0)
+    made = SimpleNamespace(t=made.t[keep], p=made.p[keep], covariance=made.covariance[keep])
+    found = Score("flight", made, truth).phases()
+    assert found["at_rest_earlier"]["without_estimate"] == pytest.approx(
+        found["at_rest_earlier"]["duration"]
+    )
+    assert found["at_rest_earlier"]["count"] == 0 and np.isnan(found["at_rest_earlier"]["rmse_3d"])
+    assert found["at_rest_before"]["without_estimate"] == pytest.approx(4.0 - 3.07, abs=0.03)
+    assert found["in_the_air"]["without_estimate"] == pytest.approx(
+        1.9, abs=0.03
+    )  # one stands for 0.1 s
+    assert found["at_rest_after"]["without_estimate"] == pytest.approx(0.0, abs=0.03)
+    assert found["whole"]["without_estimate"] == pytest.approx(4.0 + 1.9, abs=0.05)
+
+
+def test_a_slow_odometry_has_no_gaps_and_an_end_is_one():
+    truth = flown()
+    made = odometry_of(truth, lambda t: np.zeros((len(t), 3)), high=18.0, rate=2.0)
+    found = Score("flight", made, truth).phases()
+    assert found["in_the_air"]["without_estimate"] == 0.0
+    assert found["at_rest_after"]["without_estimate"] == pytest.approx(
+        21.0 - 17.75 - 2.0, abs=0.01
+    )  # for 4 intervals the last one stands
+
+
+def test_time_without_truth_is_told():
+    truth = flown()
+    known = (truth.t < 8.0) | (truth.t > 10.0)
+    truth = SimpleNamespace(t=truth.t[known], p=truth.p[known])
+    found = Score("flight", odometry_of(truth, lambda t: np.zeros((len(t), 3))), truth).phases()
+    assert (
+        found["in_the_air"]["without_truth"]
+        == pytest.approx(2.0, abs=0.03)
+        == found["whole"]["without_truth"]
+    )
+    assert found["at_rest_before"]["without_truth"] == 0.0
+
+
+def test_only_what_is_in_the_spans_counts():
+    truth = flown()
+    reach = (-np.inf, 4.07), (17.0, np.inf)
+    found = Score(
+        "flight", odometry_of(truth, high_on_the_floor(truth)), truth, reach=reach
+    ).phases()
+    assert found["at_rest_before"]["duration"] == pytest.approx(1.0, abs=0.03) and found[
+        "at_rest_before"
+    ]["max_3d"] == pytest.approx(4.0)
+    assert (
+        found["in_the_air"]["duration"] == 0.0
+        and found["in_the_air"]["count"] == 0
+        and np.isnan(found["in_the_air"]["rmse_3d"])
+    )
+    assert found["at_rest_after"]["duration"] == pytest.approx(4.0, abs=0.03)
+
+
+def test_ready_is_counted_from_the_hundredth_tdoa():
+    truth, nothing = flown(), lambda t: np.zeros((len(t), 3))
+    heard = np.arange(0.0, 20.0, 0.01)
+    for low, expected in ((1.6, 0.615), (0.5, -0.485)):
+        score = Score("flight", odometry_of(truth, nothing, low=low), truth, heard=heard)
+        assert score.row()["ready_delay"] == pytest.approx(expected, abs=0.011)
+    assert np.isnan(
+        Score("flight", odometry_of(truth, nothing), truth, heard=heard[:99]).row()["ready_delay"]
+    )
+    assert np.isnan(Score("flight", odometry_of(truth, nothing), truth).row()["ready_delay"])
+    assert (
+        Score("flight", odometry_of(truth, nothing, low=99.0), truth, heard=heard).row()[
+            "ready_delay"
+        ]
+        == np.inf
+    )
+
+
+def test_a_rover_is_judged_over_its_motion():
+    truth = truth_of((0, 0, 0, 0.1), (4, 0, 0, 0.1), (14, 5, 0, 0.1), (20, 5, 0, 0.1))
+    made = odometry_of(truth, lambda t: np.where(t < 4.0, 1.0, 0.2)[:, None] * [1.0, 0.0, 0.0])
+    score = Score("rover", made, truth)
+    row, found = score.row(), score.phases()
+    assert row["part"] == "moving" and row["rmse_3d"] == pytest.approx(0.2) and not row["diverged"]
+    assert found["moving"]["rmse_3d"] == pytest.approx(0.2) and found["at_rest_before"][
+        "max_3d"
+    ] == pytest.approx(1.0)
+
+
+def test_a_tag_that_never_moves_is_judged_over_all():
+    truth = truth_of((0, 0, 0, 0.1), (20, 0, 0, 0.1))
+    row = Score(
+        "still", odometry_of(truth, lambda t: np.tile([0.3, 0.0, 0.0], (len(t), 1))), truth
+    ).row()
+    assert row["part"] == "whole" and row["rmse_3d"] == pytest.approx(0.3) and not row["diverged"]
+
+
+def test_figures_of_several_runs_are_those_of_all_their_samples():
+    together, runs = PooledErrors(), []
+    for seed, off in enumerate((0.3, 2.0, 0.5)):
+        truth, rng = flown(rest=3.0 + seed), np.random.default_rng(seed)
+        score = Score(
+            "flight", odometry_of(truth, lambda t: off * rng.standard_normal((len(t), 3))), truth
+        )
+        together.add(score.phases()["in_the_air"])
+        runs.append(score)
+    found, error = together.figures(), np.concatenate([score.error for score in runs])
+    assert found["runs"] == 3 and found["count"] == len(error)
+    assert found["rmse_3d"] == pytest.approx(np.sqrt(np.mean(np.sum(error**2, axis=1))), rel=1e-12)
+    assert found["rmse_y"] == pytest.approx(np.sqrt(np.mean(error[:, 1] ** 2)), rel=1e-12)
+    assert found["nees_mean"] == pytest.approx(
+        np.mean(np.concatenate([score.nees for score in runs])), rel=1e-12
+    )
+    assert found["max_3d"] == pytest.approx(np.linalg.norm(error, axis=1).max())
+    of_runs = [score.row()["rmse_3d"] for score in runs]
+    assert found["rmse_3d_median_of_runs"] == pytest.approx(np.median(of_runs), rel=0.011)
+    assert found["rmse_3d_max_of_runs"] == pytest.approx(max(of_runs))
+
+
+def test_a_pool_counts_the_runs_that_have_a_phase():
+    pool, zero = Pool(), lambda t: np.zeros((len(t), 3))
+    for truth in (flown(), flown(rest=1.0), truth_of((0, 0, 0, 1), (9, 8, 0, 1))):
+        pool.add(Score("flight", odometry_of(truth, zero), truth).result())
+    never = Score("never", odometry_of(flown(), zero, low=99.0), flown())
+    pool.add(never.result())
+    found = pool.figures()["phases"]
+    assert {name: figures["runs"] for name, figures in found.items()} == {
+        "at_rest_earlier": 2,
+        "at_rest_before": 3,
+        "first_3_s": 4,
+        "to_0.3_m": 3,
+        "in_the_air": 4,
+        "last_3_s": 4,
+        "at_rest_after": 3,
+        "whole": 4,
+    }
+    assert found["at_rest_before"]["without_estimate"] == pytest.approx(
+        2.0, abs=0.03
+    )  # of the one that never began
+
+
+def test_tables_tell_each_phase():
+    truth = flown()
+    made = odometry_of(truth, high_on_the_floor(truth))
+    score, pool = (
+        Score("flight", made, truth, heard=made.t[0] - 0.2 - np.arange(99.0, -1.0, -1.0)),
+        Pool(),
+    )
+    pool.add(score.result())
+    lines = lines_of_phases(score.phases())
+    assert [line[:20].strip() for line in lines[1:4]] == [
+        "at rest, earlier",
+        "at rest before, 2 s",
+        "first 3 s",
+    ]
+    assert (
+        lines[2].split()[5:11] == ["2.000", "0.000", "0.000", "4.000", "4.000", "4.000"]
+        and "64.00" in lines[2]
+    )
+    assert len({len(line) for line in lines}) == 1
+    text = markdown_of([score.result()] * 2, pool, {})
+    assert "| at rest before, 2 s | 2.000 |" in text and "runs: median" in text
+    row = text.splitlines()[-1]
+    assert row.startswith("| flight | 4.000") and row.endswith(
+        "| 0.000 | 0.200 |"
+    )  # the step comes at z > 0.3 m
+    assert "runs: median" not in markdown_of([score.result()], pool, {})
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_estimates_that_are_not_finite_spoil_their_phase_and_no_other(bad):
+    truth = flown()
+    made = odometry_of(truth, lambda t: np.zeros((len(t), 3)))
+    made.p[50] = bad
+    found = Score("flight", made, truth).phases()
+    assert not np.isfinite(found["at_rest_earlier"]["rmse_3d"]) and not np.isfinite(
+        found["whole"]["max_3d"]
+    )
+    assert found["at_rest_before"]["rmse_3d"] == pytest.approx(0.0, abs=1e-9)

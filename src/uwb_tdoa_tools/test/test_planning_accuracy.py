@@ -16,7 +16,7 @@ from uwb_tdoa_tools.planning.noise import FixedNoise
 from uwb_tdoa_tools.planning.precision import bound, information, position_error
 from uwb_tdoa_tools.readers import read_flight
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.simulation.constellations import corners
+from uwb_tdoa_tools.simulation.rooms import corners
 
 INSTALLATION = Installation(corners(), FixedNoise(0.06 / np.sqrt(2)))
 BIAS = np.array([0.1, -0.2, 0.3])

@@ -10,7 +10,7 @@ from uwb_tdoa_tools.planning.check import brute_force
 from uwb_tdoa_tools.planning.installation import Installation
 from uwb_tdoa_tools.planning.maps import Grid
 from uwb_tdoa_tools.planning.multistart import same_place, solutions
-from uwb_tdoa_tools.simulation.constellations import constellation, corners
+from uwb_tdoa_tools.simulation.rooms import constellation, corners
 
 SQUARE = Anchors.from_positions([[0, 0, 0.2], [4, 0, 0.2], [4, 4, 0.2], [0, 4, 0.2]])
 SKEW = Anchors.from_positions([[0.4, 0.3, 0.2], [3.9, 0.9, 0.2], [3.1, 3.7, 0.2], [0.7, 2.6, 0.2]])

@@ -13,7 +13,7 @@ from uwb_tdoa_tools.planning.installation import Installation
 from uwb_tdoa_tools.planning.judging import Demand
 from uwb_tdoa_tools.planning.layout import Layout
 from uwb_tdoa_tools.planning.places import AnchorPlaces, lattice
-from uwb_tdoa_tools.simulation.constellations import corners
+from uwb_tdoa_tools.simulation.rooms import corners
 
 ROOM = np.array([-4.0, -4.5, 0.0]), np.array([4.0, 4.5, 3.0])
 POINTS = lattice((-3.2, -3.1, 0.5), (2.9, 3.3, 2), 1.6)

@@ -16,8 +16,7 @@ from uwb_tdoa_tools.planning.maps import Grid, chart
 from uwb_tdoa_tools.planning.optimisation import with_one
 from uwb_tdoa_tools.planning.report import summary
 from uwb_tdoa_tools.planning.run import hall_advice
-from uwb_tdoa_tools.simulation.room import Room
-from uwb_tdoa_tools.simulation.walls import Walls
+from uwb_tdoa_tools.simulation.rooms import Room, Walls
 
 REACH = 15.0  # m
 

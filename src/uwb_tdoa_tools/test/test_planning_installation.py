@@ -4,7 +4,7 @@ import pytest
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.planning.installation import Installation
-from uwb_tdoa_tools.simulation.constellations import corners, hall, planar
+from uwb_tdoa_tools.simulation.rooms import corners, hall, planar
 
 
 @pytest.mark.parametrize(

@@ -9,8 +9,7 @@ from uwb_tdoa_tools.planning.installation import Installation
 from uwb_tdoa_tools.planning.judging import OUTSIDE, TWO_SOLUTIONS, Demand
 from uwb_tdoa_tools.planning.maps import MOST_CELLS, Grid, chart
 from uwb_tdoa_tools.planning.pairing import PAIRINGS
-from uwb_tdoa_tools.simulation.constellations import constellation, corners
-from uwb_tdoa_tools.simulation.room import Room
+from uwb_tdoa_tools.simulation.rooms import Room, constellation, corners
 
 
 def test_cells_are_cubes_that_cover_the_box():

@@ -7,7 +7,7 @@ from uwb_tdoa_tools.planning.installation import Installation
 from uwb_tdoa_tools.planning.judging import Demand
 from uwb_tdoa_tools.planning.maps import Grid, chart
 from uwb_tdoa_tools.planning.messages import TOPICS, messages, write
-from uwb_tdoa_tools.simulation.constellations import corners
+from uwb_tdoa_tools.simulation.rooms import corners
 
 INSTALLATION = Installation(corners())
 CHART = chart(INSTALLATION, Grid.box((-4, -4.5, 0), (4, 4.5, 3), 0.5), Demand(criterion="pairings"))

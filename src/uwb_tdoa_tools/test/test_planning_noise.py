@@ -10,7 +10,7 @@ from uwb_tdoa_tools.planning.noise import (
     antenna_from_yaml,
     variance_gradient,
 )
-from uwb_tdoa_tools.simulation.constellations import corners, facing
+from uwb_tdoa_tools.simulation.rooms import corners, facing
 
 ONE = Anchors.from_positions([[0.0, 0.0, 0.0]])  # no orientation: omnidirectional
 

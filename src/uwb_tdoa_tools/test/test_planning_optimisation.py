@@ -10,7 +10,7 @@ from uwb_tdoa_tools.planning.noise import FixedNoise
 from uwb_tdoa_tools.planning.optimisation import BESIDE, one_more, optimise
 from uwb_tdoa_tools.planning.places import AnchorPlaces, lattice
 from uwb_tdoa_tools.readers import read_survey
-from uwb_tdoa_tools.simulation.constellations import constellation, facing
+from uwb_tdoa_tools.simulation.rooms import constellation, facing
 
 ROOM = np.array([0.0, 0.0, 0.0]), np.array([6.0, 5.0, 3.0])
 MARGIN = np.array([0.8, 0.8, 0.6])  # m of a room that are not flown

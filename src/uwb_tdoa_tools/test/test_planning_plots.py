@@ -15,9 +15,8 @@ from uwb_tdoa_tools.planning.judging import IMPRECISE, Demand
 from uwb_tdoa_tools.planning.maps import Grid, chart
 from uwb_tdoa_tools.planning.optimisation import one_more
 from uwb_tdoa_tools.planning.places import AnchorPlaces, lattice
-from uwb_tdoa_tools.scoring.labels import put_labels
-from uwb_tdoa_tools.scoring.plots import plt
-from uwb_tdoa_tools.simulation.constellations import corners
+from uwb_tdoa_tools.scoring.plots import draw_labels, plt
+from uwb_tdoa_tools.simulation.rooms import corners
 
 FLOWN = lattice((-1, -1, 0.5), (1, 1, 2), 1.0)
 
@@ -108,7 +107,7 @@ def test_labels_cover_neither_each_other_nor_anchors():
     ax.set(xlim=(0, 20), ylim=(0, 14))
     places = np.vstack([[0, 0], [20, 0], [20, 14], [0, 14], rng.uniform([1, 1], [19, 13], (16, 2))])
     figure.draw_without_rendering()
-    put_labels(ax, list(range(20)), places, np.empty((0, 2)))
+    draw_labels(ax, list(range(20)), places, np.empty((0, 2)))
     figure.canvas.draw()
     boxes = [text.get_window_extent() for text in ax.texts]
     covered = sum(one.overlaps(other) for i, one in enumerate(boxes) for other in boxes[:i])

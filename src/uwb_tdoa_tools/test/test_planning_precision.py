@@ -32,8 +32,8 @@ from uwb_tdoa_tools.planning.precision import (
     weigh,
 )
 from uwb_tdoa_tools.readers import read_flight
-from uwb_tdoa_tools.simulation.constellations import constellation, corners, facing
-from uwb_tdoa_tools.simulation.schedule import make_schedule
+from uwb_tdoa_tools.simulation.rooms import constellation, corners, facing
+from uwb_tdoa_tools.simulation.tdoas import make_schedule
 
 SQUARE = facing([[0, 0, 0.2], [4, 0, 0.2], [4, 4, 0.2], [0, 4, 0.2]], (2, 2, 0.2))
 NOISY = RadioNoise(

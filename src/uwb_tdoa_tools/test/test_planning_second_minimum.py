@@ -28,9 +28,7 @@ from uwb_tdoa_tools.planning.judging import (
 from uwb_tdoa_tools.planning.noise import FixedNoise, RadioNoise
 from uwb_tdoa_tools.planning.pairing import all_pairs
 from uwb_tdoa_tools.planning.second_minimum import CLEAR, FLIP
-from uwb_tdoa_tools.simulation.constellations import constellation, corners
-from uwb_tdoa_tools.simulation.room import Room
-from uwb_tdoa_tools.simulation.walls import Walls
+from uwb_tdoa_tools.simulation.rooms import Room, Walls, constellation, corners
 
 STARTS = 40  # of the independent solver, for each place
 

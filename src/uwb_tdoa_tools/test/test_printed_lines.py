@@ -23,7 +23,7 @@ from uwb_tdoa_tools import command_lines
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.checking import report
 from uwb_tdoa_tools.commands import calibrate, diagnose, evaluate, survey
-from uwb_tdoa_tools.evaluating.evaluator import Evaluator
+from uwb_tdoa_tools.evaluating import Evaluator
 from uwb_tdoa_tools.readers.inputs import Reading
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 

@@ -11,7 +11,7 @@ from uwb_tdoa_bias.effects import AnchorDelay
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands import diagnose, evaluate, localize
 from uwb_tdoa_tools.estimate import FlightEstimator
-from uwb_tdoa_tools.localizing import rerun_file
+from uwb_tdoa_tools.localizing import pictures
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 CLEAN = dict(floor_time=1.0, imu_rate=100.0, bias=False, multipath=False, outlier_probability=0.0)
@@ -56,7 +56,7 @@ def viewer(monkeypatch):
     """A stand-in for the library, which takes notes."""
     library = MagicMock()
     monkeypatch.setitem(sys.modules, "rerun", library)
-    monkeypatch.setattr(rerun_file, "find_spec", lambda name: object())
+    monkeypatch.setattr(pictures, "find_spec", lambda name: object())
     return library
 
 
@@ -111,16 +111,14 @@ def test_demo_writes_what_the_nodes_said(flight, viewer, tmp_path):
 def test_errors_are_those_of_each_path(flight, viewer, tmp_path):
     run = FlightEstimator()(flight)
     off = replace(run.odometry, p=run.odometry.p + [0.0, 0.0, 1.0])
-    rerun_file.write_rerun(
-        tmp_path / "flight.rrd", flight, run.odometry, None, [], flight.truth, off
-    )
+    pictures.write_rerun(tmp_path / "flight.rrd", flight, run.odometry, None, [], flight.truth, off)
     told = [np.asarray(call.kwargs["scalars"]) for call in viewer.Scalars.columns.call_args_list]
     assert np.median(told[-2]) < 0.3 and np.median(told[-1]) > 0.7
 
 
 @pytest.mark.parametrize("name", ["localize", "evaluate", "diagnose"])
 def test_it_is_left_out_with_a_sentence_where_it_is_not_installed(desk, capsys, monkeypatch, name):
-    monkeypatch.setattr(rerun_file, "find_spec", lambda name: None)
+    monkeypatch.setattr(pictures, "find_spec", lambda name: None)
     monkeypatch.setattr(diagnose, "diagnose", lambda *_: pytest.skip("it goes on"))
     command = {"localize": localize, "evaluate": evaluate, "diagnose": diagnose}[name]
     out = [] if name == "evaluate" else ["--out", "out"]

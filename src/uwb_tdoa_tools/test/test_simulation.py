@@ -11,11 +11,9 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.sensors.pressure import altitude_of
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.simulation.config import YAW_PROFILES
-from uwb_tdoa_tools.simulation.constellations import CONSTELLATIONS
-from uwb_tdoa_tools.simulation.room import room_of
-from uwb_tdoa_tools.simulation.schedule import PROTOCOLS
-from uwb_tdoa_tools.simulation.trajectories import TRAJECTORIES
+from uwb_tdoa_tools.simulation.config import PROTOCOLS, YAW_PROFILES
+from uwb_tdoa_tools.simulation.paths import TRAJECTORIES
+from uwb_tdoa_tools.simulation.rooms import CONSTELLATIONS, room_of
 
 configs = st.builds(
     SimulationConfig,

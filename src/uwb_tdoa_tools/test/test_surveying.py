@@ -22,7 +22,7 @@ from uwb_tdoa_tools.diagnosis.self_calibration.equations import delay_effect, td
 from uwb_tdoa_tools.diagnosis.self_calibration.placing import place
 from uwb_tdoa_tools.scoring.evaluation import evaluate
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.surveying.marks import read_marks
+from uwb_tdoa_tools.surveying.known import read_marks
 from uwb_tdoa_tools.surveying.report import as_dict, as_text
 
 TRUSTED = ("0", "6", "1.z", "2.z")

@@ -17,10 +17,8 @@ from uwb_tdoa_tools.commands.survey import main
 from uwb_tdoa_tools.diagnosis.constraints import Distance, Mark
 from uwb_tdoa_tools.diagnosis.references import OdometryPath, OdometryReference
 from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
-from uwb_tdoa_tools.surveying.blocked import large, with_blocked
-from uwb_tdoa_tools.surveying.distances import read_distances
-from uwb_tdoa_tools.surveying.paths import read_paths
-from uwb_tdoa_tools.surveying.report import as_text
+from uwb_tdoa_tools.surveying.known import read_distances, read_paths
+from uwb_tdoa_tools.surveying.report import as_text, with_blocked, with_large_delays
 
 LATE = EFFECTS["anchor_delay"]({"3": 0.15})
 
@@ -248,7 +246,7 @@ def test_what_is_little_blocks_nothing():
         "4.start": 1.0,
         "4.end": 8.0,
     }
-    kept = large(EFFECTS["nlos"](both, {"3.delay": 0.01, "4.delay": 0.01}))
+    kept = with_large_delays(EFFECTS["nlos"](both, {"3.delay": 0.01, "4.delay": 0.01}))
     assert {key[0] for key in kept.values} == {key[0] for key in kept.std} == {"4"} and len(
         kept.values
     ) == 3

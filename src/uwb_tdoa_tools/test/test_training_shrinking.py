@@ -7,7 +7,7 @@ from training_flights import flight
 
 from uwb_tdoa_bias.effects import EFFECTS
 from uwb_tdoa_tools import parallel
-from uwb_tdoa_tools.scoring.shrinkage import SHARES, Shrinkage, best_share
+from uwb_tdoa_tools.scoring.gains import SHARES, Shrinkage, best_share
 from uwb_tdoa_tools.training import models, shrinking, structured
 
 RECIPE = models.Recipe("structured", 0, structured.StructuredPriors(centres=10, link_centres=10))

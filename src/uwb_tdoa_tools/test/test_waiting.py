@@ -19,7 +19,7 @@ import pytest
 from uwb_tdoa_tools import command_lines
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
-from uwb_tdoa_tools.simulation.constellations import corners
+from uwb_tdoa_tools.simulation.rooms import corners
 
 FIRST, EVERY, LONG_ENOUGH = (
     2.0,

@@ -29,13 +29,12 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from .bags.files import STORAGES
 from .diagnosis.self_calibration import Tape
 from .estimate import FlightEstimator
-from .localizing import rerun_file
+from .localizing import pictures
 from .outputs import OutputFile
 from .parallel import whole_number
 from .readers import inputs
 from .scoring.alignment import ALIGN, NONE
-from .surveying.distances import read_distances
-from .surveying.marks import read_marks
+from .surveying.known import read_distances, read_marks
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
@@ -304,7 +303,7 @@ def add_align(parser: ArgumentParser, judges: bool = False) -> None:
 
 def add_rerun(parser: ArgumentParser) -> None:
     """--rerun: a recording for the viewer Rerun."""
-    parser.add_argument("--rerun", metavar="FILE", type=OutputFile, help=rerun_file.HELP)
+    parser.add_argument("--rerun", metavar="FILE", type=OutputFile, help=pictures.RERUN_HELP)
 
 
 def rerun_of(args: Namespace, count: int, say: Callable[[str], object]) -> Path | None:
@@ -315,7 +314,7 @@ def rerun_of(args: Namespace, count: int, say: Callable[[str], object]) -> Path 
         return None
     if count != 1:
         raise InputError(f"--rerun: needs exactly one flight, got {count}.")
-    return args.rerun if rerun_file.is_there(say) else None
+    return args.rerun if pictures.rerun_is_installed(say) else None
 
 
 def add_known(parser: ArgumentParser) -> None:

@@ -205,7 +205,7 @@ class Effect:
         that needs a ground truth, or an attitude, that the flight does not have. rng : numpy
         Generator, for random effects.
         """
-        need_truth(self, flight)
+        require_truth(self, flight)
         for channel in [
             channel
             for channel in self.channels
@@ -366,7 +366,7 @@ class AnchorEffect(Effect):
         return sign * np.reshape(self.delay_per_unit(samples), (-1, 1))
 
 
-def need_truth(effect: Effect, flight: Flight) -> Truth:
+def require_truth(effect: Effect, flight: Flight) -> Truth:
     """The ground truth of a flight; raises InputError if it has none to compute `effect` at."""
     if flight.truth is None or len(flight.truth) == 0:
         raise InputError(f"{flight.name}: holds no ground truth, which {effect.name} needs.")

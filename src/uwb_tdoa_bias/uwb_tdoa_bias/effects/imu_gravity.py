@@ -9,7 +9,7 @@ import numpy as np
 
 from ..foundation.later import rotations
 from .affine import Affine
-from .base import need_truth
+from .base import require_truth
 from .imu_error import ImuEffect, need_imu
 from .samples import Track
 
@@ -64,7 +64,7 @@ class ImuGravity(ImuEffect):
         return Affine(np.eye(3), np.array([0.0, 0.0, self.excess]))
 
     def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
-        truth, imu = need_truth(self, flight), need_imu(self, flight)
+        truth, imu = require_truth(self, flight), need_imu(self, flight)
         q = Track(truth).attitudes(imu.t)
         up = (
             rotations.Rotation.from_quat(q).inv().apply([0.0, 0.0, self.excess])

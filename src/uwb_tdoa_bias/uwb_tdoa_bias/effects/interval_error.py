@@ -8,7 +8,7 @@ import numpy as np
 
 from ..foundation.errors import InputError
 from .aid_error import need_stream
-from .base import Effect, need_truth
+from .base import Effect, require_truth
 from .samples import Track, aid_samples
 from .wording import measured
 
@@ -82,7 +82,7 @@ class IntervalEffect(Effect):
     def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
         (stream,) = self.channels
         part = need_stream(self, flight, stream)
-        truth = need_truth(self, flight)
+        truth = require_truth(self, flight)
         samples = aid_samples(stream, part.t, Track(truth), float(flight.tdoa.t[0]))
         extra = self.uncorrected(samples)
         if not np.isfinite(extra).all():

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from ..foundation.sensors import DIAGNOSED
-from .base import need_truth
+from .base import require_truth
 from .stamp_error import StampEffect
 
 if TYPE_CHECKING:
@@ -42,5 +42,5 @@ class TruthTimeOffset(StampEffect):
         )  # the tag is already farther on its way than the truth of that stamp says
 
     def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
-        need_truth(self, flight)
+        require_truth(self, flight)
         return super().inject(flight, rng)

@@ -25,7 +25,7 @@ from uwb_tdoa_ekf.debias import BiasMap  # noqa: E402
 from uwb_tdoa_tools.bags.bag import write_bag  # noqa: E402
 from uwb_tdoa_tools.bags.files import open_bag  # noqa: E402
 from uwb_tdoa_tools.bags.integrity import NO_SUM, SUM_KEY, metadata  # noqa: E402
-from uwb_tdoa_tools.simulation.constellations import corners  # noqa: E402
+from uwb_tdoa_tools.simulation.rooms import corners
 
 TEXTS = {
     "yaml": [

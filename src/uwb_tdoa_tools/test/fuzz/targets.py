@@ -37,17 +37,16 @@ from uwb_tdoa_tools.bags import mcap
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry
 from uwb_tdoa_tools.bags.message_types import typestore
 from uwb_tdoa_tools.bags.messages import tdoa_messages
-from uwb_tdoa_tools.evaluating.table import read_others
+from uwb_tdoa_tools.evaluating import read_others
 from uwb_tdoa_tools.planning.noise import antenna_from_yaml
 from uwb_tdoa_tools.planning.places import AnchorPlaces
 from uwb_tdoa_tools.readers import read_survey, read_usd_log, read_util_csv
 from uwb_tdoa_tools.readers.columns import parse_columns, read_columns
-from uwb_tdoa_tools.readers.names import Named
+from uwb_tdoa_tools.readers.names import NamedAnchors
 from uwb_tdoa_tools.readers.tables import number, read_table
 from uwb_tdoa_tools.results_file import ResultsFile
-from uwb_tdoa_tools.simulation.walls import Walls
-from uwb_tdoa_tools.surveying.distances import read_distances
-from uwb_tdoa_tools.surveying.marks import read_marks
+from uwb_tdoa_tools.simulation.rooms import Walls
+from uwb_tdoa_tools.surveying.known import read_distances, read_marks
 
 CORPUS = Path(__file__).parent / "corpus"
 ANCHORS = Anchors(
@@ -208,7 +207,7 @@ def columns(data):
     asked = parse_columns(
         "time=t:ms,anchor_a=from,anchor_b=to,tdoa=d:mm,gyro_x=gx,gyro_y=gy,gyro_z=gz,accel_x=ax,accel_y=ay,accel_z=az"
     )
-    _finite(read_columns([_file(data)], asked, Named(ANCHORS)))
+    _finite(read_columns([_file(data)], asked, NamedAnchors(ANCHORS)))
 
 
 def marks(data):

@@ -1,1 +1,20 @@
-"""ROS 2 bags, read and written without ROS."""
+"""ROS 2 bags: read, write, convert."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+ROS_2 = b"\x89MCAP0\r\n", b"SQLite format 3\0"  # what a file of a bag begins with
+
+
+def is_bag(path: str | Path) -> bool:
+    """Return whether a path is a bag: a .mcap or .db3 file, or a directory with one or metadata.yaml."""
+    path = Path(path)
+    if path.is_dir():
+        return (
+            any(path.glob("metadata.yaml")) or any(path.glob("*.mcap")) or any(path.glob("*.db3"))
+        )
+    if not path.is_file():
+        return False
+    with path.open("rb") as file:
+        return file.read(16).startswith(ROS_2)

@@ -1,4 +1,4 @@
-"""A recording of any kind as a bag."""
+"""Convert a recording of any kind to a bag."""
 
 from __future__ import annotations
 
@@ -27,11 +27,18 @@ SENSORS = "tdoa", "imu", "truth", *AIDS  # streams of a Flight, each on its own 
 
 @dataclass(frozen=True)
 class Converted:
-    """flight : name; bag : path; messages : {topic: count}; start, end : s; anchors : how many;
-    tdoa_unknown_anchor : measurements of anchors that the survey does not have; left_out : {stream
-    that a bag has no place for: events};
-    meta : of the Flight; apart : sentences on sensors that never overlap with the TDOAs, or ranges,
-        in time.
+    """Summary of a conversion.
+
+    Attributes
+    ----------
+    flight, bag : name of the flight, path of the bag.
+    messages : {topic: count}.
+    start, end : s.
+    anchors : number of anchors.
+    tdoa_unknown_anchor : number of measurements of anchors outside of the survey.
+    left_out : {stream without a place in a bag: events}.
+    meta : of the Flight.
+    apart : sentences on sensors without common time with TDOAs or ranges.
     """
 
     flight: str
@@ -49,8 +56,9 @@ class Converted:
 def convert(
     read: Callable[[], Flight], out: str | Path, storage: str = "mcap", force: bool = False
 ) -> Converted:
-    """Write a recording as a bag, see `write_bag`. read : callable, gives the Flight. Returns
-    Converted. Raises InputError.
+    """Write a recording as a bag, see `write_bag`; `read` returns the Flight.
+
+    Raises InputError.
     """
     check_output(out, force)  # before the work, not after it
     flight = _from_zero_on(read())
@@ -72,13 +80,14 @@ def convert(
         tdoa_unknown_anchor=int(np.count_nonzero(~known) + np.count_nonzero(~ranges_known)),
         left_out={name: len(columns["t"]) for name, columns in flight.extra.items()},
         meta=flight.meta,
-        apart=_apart(flight),
+        apart=_disjoint_sensors(flight),
     )
 
 
 def shifted(flight: Flight, offsets: dict[str, float]) -> Flight:
-    """The Flight with offsets {of SENSORS: s} added to the stamps of what it holds. Raises
-    InputError for a sensor that it does not hold.
+    """Return the Flight with offsets {sensor: s} added to its stamps.
+
+    Raises InputError for a sensor that the Flight does not have.
     """
     changed = {}
     for sensor, offset in offsets.items():
@@ -93,20 +102,23 @@ def shifted(flight: Flight, offsets: dict[str, float]) -> Flight:
 
 
 def _from_zero_on(flight: Flight) -> Flight:
-    """The Flight without what its other sensors say before 0 s, where what locates the tag is not:
-    a clock that was moved may begin there, and a bag has no place for it.
+    """Return the Flight without samples before 0 s of sensors, if TDOAs and ranges start later.
+
+    A shifted clock may start there, and a bag has no negative stamps.
     """
-    changed, said = {}, list(flight.meta.get("remarks", ()))
+    changed, remarks = {}, list(flight.meta.get("remarks", ()))
     for name in _held(flight) if flight.start >= 0.0 else ():
         stream = getattr(flight, name)
         inside = stream.t >= 0.0
         if inside.any() and not inside.all():
             changed[name] = rows_of(stream, inside)
-            said.append(
+            remarks.append(
                 f"{name}: {np.count_nonzero(~inside)} samples before 0 s, which a bag has no "
                 "place for, are left out"
             )
-    return replace(flight, **changed, meta={**flight.meta, "remarks": said}) if changed else flight
+    return (
+        replace(flight, **changed, meta={**flight.meta, "remarks": remarks}) if changed else flight
+    )
 
 
 def _held(flight: Flight) -> list[str]:
@@ -118,22 +130,20 @@ def _held(flight: Flight) -> list[str]:
 
 
 def _overlaps(one: Timed, flight: Flight) -> bool:
-    """Whether a stream has time in common with what locates the tag."""
+    """Return whether a stream has a time in common with TDOAs or ranges."""
     return one.t[-1] >= flight.start and one.t[0] <= flight.end
 
 
-def _apart(flight: Flight) -> list[str]:
-    """Sentences on sensors whose stamps have no time in common with those of the TDOAs, or ranges:
-    they are on another clock.
-    """
-    begin, end, said = flight.start, flight.end, []
+def _disjoint_sensors(flight: Flight) -> list[str]:
+    """Return sentences on sensors without common time with TDOAs or ranges: another clock."""
+    begin, end, remarks = flight.start, flight.end, []
     radio = "TDOAs" if len(flight.tdoa) else "ranges"
     for name in _held(flight):
         t = getattr(flight, name).t
         if not _overlaps(getattr(flight, name), flight):
-            said.append(
+            remarks.append(
                 f"{name} runs from {t[0]:.1f} to {t[-1]:.1f} s, the {radio} from {begin:.1f} "
                 f"to {end:.1f} s: clocks that have no time in common; "
                 f"--time-offset {name}={begin - t[0]:.3f} lets both begin together, if they did."
             )
-    return said
+    return remarks

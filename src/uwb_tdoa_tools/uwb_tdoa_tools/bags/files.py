@@ -23,7 +23,7 @@ from uwb_tdoa_bias.foundation.limits import READ_BYTES, TooMuch, most_unpacked
 from uwb_tdoa_bias.foundation.stamps import LARGEST_STEP_BACK
 
 from ..command_lines import SALVAGE
-from . import mcap, write_ahead
+from . import is_bag, mcap, write_ahead
 from .integrity import (
     NO_SUM,
     SUM_KEY,
@@ -38,7 +38,6 @@ from .integrity import (
 from .integrity import (
     check as check_whole,
 )
-from .kind import is_bag
 from .mcap import Damaged, zstd
 from .message_types import check_type, earlier_types, typestore, upgraded
 from .salvage import as_written

@@ -1,4 +1,4 @@
-"""ROS 2 message types for reading and writing bags without a ROS installation."""
+"""Types of ROS 2 messages, to read and write bags without a ROS installation."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ _SOURCE_TREE = Path(__file__).resolve().parents[3]  # where our packages lie sid
 
 @lru_cache(maxsize=1)
 def typestore() -> Typestore:
-    """The types of ROS 2 Jazzy and of uwb_tdoa_msgs; `add_type` adds others."""
+    """Return the types of ROS 2 Jazzy and of uwb_tdoa_msgs; `add_type` adds others."""
     store = get_typestore(Stores.ROS2_JAZZY)
     for name in OUR_TYPES:
         add_type(store, f"{OUR_PACKAGE}/msg/{name}")
@@ -55,9 +55,7 @@ def typestore() -> Typestore:
 
 
 def add_type(store: Typestore, msgtype: str) -> None:
-    """Make a type like "pkg/msg/Name" known to a store, with the types it is made of, from
-    installed .msg files.
-    """
+    """Add a type like "pkg/msg/Name" and its parts to a store, from installed .msg files."""
     if msgtype in store.fielddefs:
         return
     types = get_types_from_msg(_definition(msgtype), msgtype)
@@ -71,7 +69,7 @@ def add_type(store: Typestore, msgtype: str) -> None:
 
 
 def check_type(path: str | Path, connection: Connection) -> None:
-    """Raise InputError unless we know the type of a topic, in the version in which it was recorded."""
+    """Raise InputError unless the type of a topic is known in the recorded version."""
     store = typestore()
     add_type(store, connection.msgtype)
     recorded = _recorded_hash(path, connection)
@@ -88,8 +86,9 @@ def check_type(path: str | Path, connection: Connection) -> None:
 
 
 def earlier_types(path: str | Path, connection: Connection) -> Typestore | None:
-    """The types as of when a topic was recorded, if its type has been ADDED fields since; None if
-    not. Raises InputError.
+    """Return the types at the time of the recording, if the type has ADDED fields since; else None.
+
+    Raises InputError.
     """
     versions = _earlier(connection.msgtype)
     recorded = _recorded_hash(path, connection) if versions else None
@@ -99,7 +98,7 @@ def earlier_types(path: str | Path, connection: Connection) -> Typestore | None:
 
 
 def upgraded(data: bytes, msgtype: str, store: Typestore) -> bytes:
-    """Bytes of a message of `earlier_types`, as of its type now."""
+    """Convert a message of `earlier_types` to its current type, as bytes."""
     message = store.deserialize_cdr(data, msgtype)
     defaults: dict[str, Any] = {}
     for fields in ADDED[msgtype]:
@@ -112,7 +111,7 @@ def upgraded(data: bytes, msgtype: str, store: Typestore) -> bytes:
 
 @cache
 def _earlier(msgtype: str) -> tuple[Typestore, ...]:
-    """The types as before each addition of fields to one of them: tuple of stores."""
+    """Return the types before each addition of fields to one of them."""
     out, added = [], ADDED.get(msgtype, ())
     for k in range(len(added)):
         lacking, store = (
@@ -128,7 +127,7 @@ def _earlier(msgtype: str) -> tuple[Typestore, ...]:
 
 
 def _recorded_hash(path: str | Path, connection: Connection) -> str:
-    """Hash of the type that a topic was recorded with; empty where the bag does not say.
+    """Return the hash of the recorded type of a topic; empty if the bag does not contain it.
 
     Raises InputError.
     """
@@ -153,7 +152,7 @@ def _recorded_hash(path: str | Path, connection: Connection) -> str:
 
 @lru_cache(maxsize=64)
 def _hash_of(definition: str, msgtype: str) -> str:
-    """Hash of a type by a definition that a bag holds."""
+    """Return the hash of a type from its definition in a bag."""
     of_bag = get_typestore(Stores.EMPTY)
     of_bag.register(get_types_from_msg(definition, msgtype))
     return of_bag.hash_rihs01(msgtype)

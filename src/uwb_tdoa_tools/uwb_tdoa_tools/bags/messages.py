@@ -1,7 +1,7 @@
-"""The arrays of a Flight as ROS messages (of a rosbags typestore), and back.
+"""Convert the arrays of a Flight to ROS messages of a rosbags typestore, and back.
 
-`sound`, or `<stream>_sound`, tells which numbers of rows (n, k) may be there: (n, k) bool. What was
-not measured is marked as the messages say: an orientation of (0, 0, 0, 0), an
+`valid`, or `<stream>_valid`, returns which numbers of rows (n, k) can be used: (n, k) bool.
+Unmeasured values follow the message definitions: an orientation of (0, 0, 0, 0), an
 orientation_covariance[0] of -1, covariances of 0 for unknown.
 """
 
@@ -31,14 +31,15 @@ if TYPE_CHECKING:
     # A message has no type here: rosbags makes the classes while it runs.
     RowOfMessage = Callable[[Any], tuple[float, ...]]
     StreamOfRows = Callable[[np.ndarray, np.ndarray], Stream]  # of stamps (n,) s and rows (n, k)
-    Sound = Callable[[np.ndarray], np.ndarray]  # of rows (n, k): (n, k) bool
+    Validity = Callable[[np.ndarray], np.ndarray]  # of rows (n, k): (n, k) bool
 
 BODY_FRAME, ANTENNA_FRAME = "base_link", "uwb_antenna"
 
 
 def nanoseconds(name: str, t: np.ndarray) -> np.ndarray:
-    """(n,) int stamps of (n,) s; raises InputError, with the name of the stream, for what a ROS
-    stamp cannot hold.
+    """Return (n,) int ns of stamps (n,) s.
+
+    Raises InputError, with the name of the stream, for a stamp that ROS cannot hold.
     """
     bad = np.flatnonzero(~((t >= 0) & (t < 2**31)))
     if len(bad):
@@ -50,15 +51,15 @@ def nanoseconds(name: str, t: np.ndarray) -> np.ndarray:
 
 
 def stamp_of(header: Any) -> int:
-    """Nanoseconds of a header's stamp.
+    """Return the stamp of a header in ns.
 
-    (Dividing them by 1e9 gives back the very float that was written.)
+    Dividing by 1e9 restores the written float exactly.
     """
     return header.stamp.sec * 10**9 + header.stamp.nanosec
 
 
-def sound(rows: np.ndarray) -> np.ndarray:
-    """Which numbers of rows (n, k) may be there: (n, k) bool."""
+def valid(rows: np.ndarray) -> np.ndarray:
+    """Return which numbers of rows (n, k) are finite and in range: (n, k) bool."""
     return np.abs(rows) <= LARGEST_NUMBER  # NaN is not
 
 
@@ -81,18 +82,18 @@ def imu_messages(imu: Imu, store: Typestore) -> Iterator[tuple[int, Any]]:
 
 
 def imu_row(message: Any) -> tuple[float, ...]:
-    """Of a sensor_msgs/Imu: its stamp, ns, rates (3), rad/s, and specific force (3), m/s^2."""
+    """Return stamp ns, rates (3) rad/s and specific force (3) m/s^2 of a sensor_msgs/Imu."""
     rate, force = message.angular_velocity, message.linear_acceleration
     return stamp_of(message.header), rate.x, rate.y, rate.z, force.x, force.y, force.z
 
 
 def imu_of(stamps: np.ndarray, rows: np.ndarray) -> Imu:
-    """The Imu of stamps (n,) s and rows (n, 6), of `imu_row` without the stamp."""
+    """Return the Imu of stamps (n,) s and rows (n, 6) of `imu_row` without the stamp."""
     return Imu(stamps, rows[:, 0:3], rows[:, 3:6])
 
 
 def sensor_messages(sensor: Sensor, stream: Stream, store: Typestore) -> Iterator[tuple[int, Any]]:
-    """Yield (stamp ns, message) of the Stream of a Sensor; what it says nothing of is 0."""
+    """Yield (stamp ns, message) of the Stream of a Sensor; other fields are 0."""
     content = {
         field: np.broadcast_to(values, (len(stream), *np.shape(values)[1:]))
         for field, values in sensor.content(stream).items()
@@ -107,7 +108,7 @@ def sensor_messages(sensor: Sensor, stream: Stream, store: Typestore) -> Iterato
 
 
 def _blank(store: Typestore, kind: str) -> Any:
-    """A message of a type with nothing but zeros."""
+    """Return a message of a type with all fields 0."""
     values: dict[str, Any] = {}
     fields: Any = store.get_msgdef(kind).fields  # nested, as each Nodetype says
     for name, (node, what) in fields:
@@ -121,7 +122,7 @@ def _blank(store: Typestore, kind: str) -> Any:
 
 
 def _set(holder: object, name: str, value: np.ndarray) -> None:
-    """Write a number, an array, or the numbers of a Vector3 into a field."""
+    """Write a number, an array, or the numbers of a Vector3 to a field."""
     old = getattr(holder, name)
     if hasattr(old, "x"):
         old.x, old.y, old.z = value.tolist()
@@ -129,10 +130,8 @@ def _set(holder: object, name: str, value: np.ndarray) -> None:
         setattr(holder, name, np.ascontiguousarray(value) if np.ndim(value) else value.item())
 
 
-def of_sensor(sensor: Sensor) -> tuple[RowOfMessage, StreamOfRows, Sound]:
-    """(row of a message, Stream of stamps and rows, which numbers of rows may be there), as
-    `read_bag` takes them, of a Sensor.
-    """
+def of_sensor(sensor: Sensor) -> tuple[RowOfMessage, StreamOfRows, Validity]:
+    """Return how to read a Sensor: (row of a message, Stream of stamps and rows, valid numbers)."""
 
     def row(message: Any) -> tuple[float, ...]:
         return stamp_of(message.header), *(
@@ -141,10 +140,10 @@ def of_sensor(sensor: Sensor) -> tuple[RowOfMessage, StreamOfRows, Sound]:
             for number in _numbers(reduce(getattr, field.split("."), message))
         )
 
-    def sound_ones(rows: np.ndarray) -> np.ndarray:
+    def valid_numbers(rows: np.ndarray) -> np.ndarray:
         return np.column_stack(list(sensor.sound(sensor.split(rows)).values()))
 
-    return row, lambda stamps, rows: sensor.read(stamps, sensor.split(rows)), sound_ones
+    return row, lambda stamps, rows: sensor.read(stamps, sensor.split(rows)), valid_numbers
 
 
 def _numbers(value: Any) -> Iterable[float]:
@@ -154,8 +153,9 @@ def _numbers(value: Any) -> Iterable[float]:
 def tdoa_messages(
     tdoa: Tdoas, store: Typestore, antenna: Sequence[float] | None = None
 ) -> Iterator[tuple[int, Any]]:
-    """Yield (stamp ns, uwb_tdoa_msgs/Tdoa). antenna : where it is on the body, see
-    `transforms_message`.
+    """Yield (stamp ns, uwb_tdoa_msgs/Tdoa).
+
+    `antenna` is its position in the body frame, see `transforms_message`.
     """
     Message, frame = store.types["uwb_tdoa_msgs/msg/Tdoa"], ANTENNA_FRAME if antenna else BODY_FRAME
     columns = (nanoseconds("tdoa", tdoa.t), tdoa.a, tdoa.b, tdoa.d, tdoa.variance)
@@ -164,7 +164,7 @@ def tdoa_messages(
 
 
 def tdoa_row(message: Any) -> tuple[float, ...]:
-    """Of a uwb_tdoa_msgs/Tdoa: its stamp, ns, ids a and b, d_ab, m, and variance, m^2."""
+    """Return stamp ns, ids a and b, d_ab m, and variance m^2 of a uwb_tdoa_msgs/Tdoa."""
     return (
         stamp_of(message.header),
         message.anchor_a,
@@ -175,7 +175,7 @@ def tdoa_row(message: Any) -> tuple[float, ...]:
 
 
 def tdoas_of(stamps: np.ndarray, rows: np.ndarray) -> Tdoas:
-    """The Tdoas of stamps (n,) s and rows (n, 4), of `tdoa_row` without the stamp."""
+    """Return the Tdoas of stamps (n,) s and rows (n, 4) of `tdoa_row` without the stamp."""
     return Tdoas(
         stamps, rows[:, 0].astype(np.int64), rows[:, 1].astype(np.int64), rows[:, 2], rows[:, 3]
     )
@@ -192,7 +192,7 @@ def pose_messages(truth: Truth, frame: str, store: Typestore) -> Iterator[tuple[
 
 
 def pose_row(message: Any) -> tuple[float, ...]:
-    """Of a geometry_msgs/PoseStamped: its stamp, ns, position (3), m, and quaternion x y z w."""
+    """Return stamp ns, position (3) m, and quaternion x y z w of a geometry_msgs/PoseStamped."""
     return (
         stamp_of(message.header),
         *_point(message.pose.position),
@@ -201,15 +201,16 @@ def pose_row(message: Any) -> tuple[float, ...]:
 
 
 def truth_of(stamps: np.ndarray, rows: np.ndarray) -> Truth:
-    """The Truth of stamps (n,) s and rows (n, 7), of `pose_row` without the stamp; a quaternion of
-    zeros is none.
+    """Return the Truth of stamps (n,) s and rows (n, 7) of `pose_row` without the stamp.
+
+    A quaternion of zeros is unknown.
     """
     q = rows[:, 3:7]
     return Truth(stamps, rows[:, 0:3], np.where((q == 0).all(axis=1, keepdims=True), np.nan, q))
 
 
 def anchors_message(anchors: Anchors, stamp: int, store: Typestore) -> tuple[int, Any]:
-    """(stamp ns, uwb_tdoa_msgs/AnchorArray)."""
+    """Return (stamp ns, uwb_tdoa_msgs/AnchorArray)."""
     Anchor = store.types["uwb_tdoa_msgs/msg/Anchor"]
     q_or_zero = np.where(np.isfinite(anchors.orientations), anchors.orientations, 0.0)
     array = [
@@ -226,10 +227,10 @@ def anchors_message(anchors: Anchors, stamp: int, store: Typestore) -> tuple[int
 def transforms_message(
     anchors: Anchors, stamp: int, store: Typestore, antenna: Sequence[float] | None = None
 ) -> tuple[int, Any]:
-    """(stamp ns, tf2_msgs/TFMessage) with the anchors as frames anchor_<id>, and the antenna, (3,)
-    m in the body frame.
+    """Return (stamp ns, tf2_msgs/TFMessage) with frames anchor_<id> and the antenna.
 
-    An unknown orientation is the identity here: tf has no word for "not known".
+    The antenna is at (3,) m in the body frame. An unknown orientation becomes the identity, because
+    tf cannot express it.
     """
     types = store.types
     q_or_identity = np.where(
@@ -259,9 +260,7 @@ def transforms_message(
 def odometry_messages(
     odometry: Odometry, frame: str, store: Typestore
 ) -> Iterator[tuple[int, Any]]:
-    """Yield (stamp ns, nav_msgs/Odometry) of an Odometry: its twist is in the body frame, and rates
-    are not known.
-    """
+    """Yield (stamp ns, nav_msgs/Odometry); the twist is in the body frame, rates are unknown."""
     types = store.types
     Message, Vector3 = types["nav_msgs/msg/Odometry"], types["geometry_msgs/msg/Vector3"]
     Pose, Twist = (
@@ -280,7 +279,7 @@ def odometry_messages(
 
 
 def odometry_row(message: Any) -> tuple[float, ...]:
-    """Stamp, position, velocity in the child frame, quaternion, pose covariance (36)."""
+    """Return stamp, position, velocity in the child frame, quaternion, pose covariance (36)."""
     return (
         stamp_of(message.header),
         *_point(message.pose.pose.position),
@@ -291,7 +290,7 @@ def odometry_row(message: Any) -> tuple[float, ...]:
 
 
 def header_of(store: Typestore, stamp: int, frame: str) -> Any:
-    """std_msgs/Header; stamp : ns."""
+    """Return a std_msgs/Header with a stamp in ns."""
     time = store.types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9))
     return store.types["std_msgs/msg/Header"](time, frame)
 
@@ -299,7 +298,7 @@ def header_of(store: Typestore, stamp: int, frame: str) -> Any:
 def pose_of(
     store: Typestore, p: Sequence[float] | np.ndarray, q: Sequence[float] = (0.0, 0.0, 0.0, 1.0)
 ) -> Any:
-    """geometry_msgs/Pose of p (3,) m and q x y z w."""
+    """Return a geometry_msgs/Pose of p (3,) m and q x y z w."""
     types = store.types
     return types["geometry_msgs/msg/Pose"](
         types["geometry_msgs/msg/Point"](*p), types["geometry_msgs/msg/Quaternion"](*q)

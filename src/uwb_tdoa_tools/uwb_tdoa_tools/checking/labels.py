@@ -10,8 +10,8 @@ import numpy as np
 
 from uwb_tdoa_ekf.streams import ERROR, NOTE, WARNING, Finding
 
+from ..bags.frames import is_body
 from ..bags.messages import BODY_FRAME
-from ..bags.placing import is_body
 from ..clock import SET, SILENCE, WORDS, WRAP, apart, in_words
 from .recording import IMU
 from .tdoa_rules import furthest, same_place
@@ -19,7 +19,7 @@ from .tdoa_rules import furthest, same_place
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from ..bags.placing import Place
+    from ..bags.frames import Place
     from .recording import Recording
 
 WHEELS = "velocity/odometry"

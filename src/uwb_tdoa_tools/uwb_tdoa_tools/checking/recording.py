@@ -15,13 +15,11 @@ from uwb_tdoa_bias.foundation.flight import Imu, Tdoas
 from uwb_tdoa_bias.foundation.sensors import LOCATING, SENSORS
 from uwb_tdoa_bias.foundation.survey_faults import refuse_faulty
 
+from ..bags import frames, is_bag
 from ..bags import messages as bag_messages
-from ..bags import placing
-from ..bags.anchor_sources import recorded_anchors
-from ..bags.bag import Names, arrivals, on_one_clock, read_sensor, read_topic
 from ..bags.files import open_bag, remarks_of
-from ..bags.kind import is_bag
-from ..bags.placing import TF_STATIC
+from ..bags.frames import TF_STATIC, recorded_anchors
+from ..bags.topics import Names, arrivals, on_one_clock, read_sensor, read_topic
 from ..readers import read_survey
 
 if TYPE_CHECKING:
@@ -30,8 +28,8 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.flight import Flight
     from uwb_tdoa_bias.foundation.sensors.sensor import Sensor, Stream
 
-    from ..bags.bag import TopicMessages
-    from ..bags.placing import Place
+    from ..bags.frames import Place
+    from ..bags.topics import TopicMessages
     from ..clock import Jump
     from ..live.ends import End
     from ..readers.inputs import Reading
@@ -175,7 +173,7 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
             if len(found[name].stamps)
         }
         recorded = recorded_anchors(path, reader, name_of("uwb/anchors"))
-        tree = placing.read_frames(path, reader)
+        tree = frames.read_frames(path, reader)
         remarks = tuple(remarks_of(reader))
     if not len(tdoa.stamps) and not sensors.keys() & set(LOCATING):
         there = sorted(topic for topic, kind in topics.items() if kind == _ROWS[TDOA][0])
@@ -192,8 +190,8 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
         anchors, str(survey) if survey or recorded is None else f"{path}: {recorded.source}"
     )
     samples = bag_messages.imu_of(imu.stamps / 1e9, imu.rows) if len(imu.stamps) else None
-    if samples is not None and (place := placing.placed(tree, IMU, imu.frames)[0]):
-        samples = placing.imu_in_body(samples, place)
+    if samples is not None and (place := frames.sensor_place(tree, IMU, imu.frames)[0]):
+        samples = frames.imu_in_body(samples, place)
     return Recording(
         name=path.stem,
         anchors=anchors,
@@ -209,7 +207,7 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
         places={
             frame: place
             for frame in {*tdoa.frames, *imu.frames}
-            if (place := placing.place_of(tree, frame))
+            if (place := frames.place_in_body(tree, frame))
         },
         topics=topics,
         read=frozenset(map(name_of, HEARD)),

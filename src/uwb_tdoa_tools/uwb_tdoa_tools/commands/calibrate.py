@@ -9,8 +9,7 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, command_lines, options
-from ..calibrating.calibrate import stopping, with_truth, without_truth
-from ..calibrating.quick import prospect
+from ..calibrating import blocking_errors, prospect, with_truth, without_truth
 from ..checking import report
 from ..checking.check import check, different_surveys
 from ..checking.recording import read_recording
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
-    from ..calibrating.calibrate import Calibration
+    from ..calibrating import Calibration
     from ..readers.inputs import Reading, Recording
 
 DESCRIPTION = """From recordings to a calibrated tag: check, find what is wrong, judge that where it took no part, write it.
@@ -149,7 +148,7 @@ def _checked(
                 checked[-1], (), estimator, command_lines.surveying(path, survey, effects)
             )
             cli.show(report.text(result))
-            sound = sound and not stopping(checked[-1], result.findings, std)
+            sound = sound and not blocking_errors(checked[-1], result.findings, std)
             progress.update()
     for finding in different_surveys(checked):
         cli.show(*report.lines(finding))

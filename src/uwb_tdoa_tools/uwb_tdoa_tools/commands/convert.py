@@ -15,8 +15,8 @@ from ..bags.convert import SENSORS, convert, shifted
 from ..outputs import OutputBag
 from ..progress import Progress
 from ..readers import columns
-from ..readers.names import read_named
-from ..scoring.settling import on_one_clock
+from ..readers.names import read_named_anchors
+from ..scoring.evaluation import on_one_clock
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.foundation.flight import Flight
 
-    from ..readers.names import Named
+    from ..readers.names import NamedAnchors
 
 DESCRIPTION = """Convert a recorded flight to a ROS 2 bag.
 
@@ -145,17 +145,17 @@ def _offsets(texts: Iterable[str]) -> dict[str, float]:
     return offsets
 
 
-def _named(args: Namespace) -> Named | None:
-    """Named anchors for --columns, or None. Raises InputError."""
+def _named(args: Namespace) -> NamedAnchors | None:
+    """NamedAnchors anchors for --columns, or None. Raises InputError."""
     if args.columns and not args.survey:
         raise InputError(
             "--columns: CSV files do not say where the anchors are; give a survey file "
             "(--survey FILE)."
         )
-    return read_named(args.survey) if args.columns else None
+    return read_named_anchors(args.survey) if args.columns else None
 
 
-def _read(args: Namespace, named: Named | None) -> Flight:
+def _read(args: Namespace, named: NamedAnchors | None) -> Flight:
     """The Flight."""
     if args.columns:
         options.refuse(

@@ -113,7 +113,7 @@ def _fit(args: Namespace) -> int:
     figures["borne_out"] = shrinkage.as_dict() if shrinkage else None
     report.say_rows("in sample", figures["fitted"])
     refusals = []
-    if shrinkage and not shrinkage.gains.mean() >= report.WORTH:
+    if shrinkage and not shrinkage.gains.mean() >= report.SMALLEST_GAIN:
         refusals.append(report.verdict(float(shrinkage.gains.mean()), "flights left out"))
     if held:
         figures["held out"] = _judged(args, estimator, held, made)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, options
-from ..evaluating.table import lines_of_errors
+from ..evaluating import lines_of_errors
 from ..flying import demo
 from ..outputs import OutputFolder
 

@@ -17,11 +17,11 @@ from ..diagnosis import diagnose, output
 from ..diagnosis.noise import write_parameters
 from ..diagnosis.references import REFERENCES
 from ..diagnosis.self_calibration.equations import measured_noise
-from ..localizing.rerun_file import write_diagnosis
+from ..localizing.pictures import write_diagnosis
 from ..outputs import OutputFolder
 from ..progress import Progress
 from ..readers import inputs
-from ..surveying.paths import DRIFT, read_paths
+from ..surveying.known import DRIFT, read_paths
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
@@ -139,7 +139,7 @@ def _diagnose(args: Namespace) -> None:
     )
     options.check_holdout((flight.name for flight in flights), (flight.name for flight in holdout))
     if args.reference in ("heights", "odometry"):
-        inputs.need_tdoas([*flights, *holdout], f"--reference {args.reference}")
+        inputs.require_tdoas([*flights, *holdout], f"--reference {args.reference}")
     for remark in remarks_on([*flights, *holdout]):
         cli.say("diagnose", remark)
     for option in ("marks", "odometry"):

@@ -13,13 +13,12 @@ from typing import TYPE_CHECKING
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.files import write_text
 
-from .. import cli, options, parallel
-from ..evaluating import table
-from ..evaluating.evaluator import Evaluator, results
+from .. import cli, evaluating, options, parallel
+from ..evaluating import Evaluator, results
 from ..json_values import as_json
 from ..outputs import OutputFile, OutputFolder
 from ..results_file import asked_of
-from ..scoring.metrics import FIGURES, Pool
+from ..scoring.pooling import FIGURES, Pool
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
@@ -125,7 +124,7 @@ def _evaluate(args: Namespace) -> int:
     )
     if not args.odometry:
         cli.show(f"correcting with: {estimator.correction}")
-    cli.show(table.head())
+    cli.show(evaluating.head_line())
     kept, pool = [], Pool()
     asked = asked_of(args, NO_MATTER, ("effects", "config", "model")) | {
         "version of the figures": FIGURES
@@ -135,23 +134,27 @@ def _evaluate(args: Namespace) -> int:
         kept += (
             [result] if args.json or args.markdown else []
         )  # else nothing grows with the number of flights
-        cli.show(table.line(result.row))
+        cli.show(evaluating.line_of_run(result.row))
     together = pool.figures()
     if len(found) > 1:
-        cli.show(table.line(together))
+        cli.show(evaluating.line_of_run(together))
         cli.show(
             f"mean 3D RMSE of the runs {together['rmse_3d_mean_of_runs']:.3f} m, largest "
             f"{together['rmse_3d_max_of_runs']:.3f} m, diverged {together['diverged']}"
         )
-    cli.show("", *table.lines_of_phases(together["phases"] if len(found) > 1 else result.phases))
-    cli.show("", *table.lines_of_alignment(result.aligned if len(found) == 1 else {}, pool.aligned))
+    cli.show(
+        "", *evaluating.lines_of_phases(together["phases"] if len(found) > 1 else result.phases)
+    )
+    cli.show(
+        "", *evaluating.lines_of_alignment(result.aligned if len(found) == 1 else {}, pool.aligned)
+    )
     if args.json:
         cli.write_json(
             args.json, {"runs": [one.as_json() for one in kept], "pooled": as_json(together)}
         )
     if args.markdown:
-        others = table.read_others(args.beside) if args.beside else {}
-        write_text(args.markdown, table.markdown_of(kept, pool, others))
+        others = evaluating.read_others(args.beside) if args.beside else {}
+        write_text(args.markdown, evaluating.markdown_of(kept, pool, others))
     if late := evaluator.late_tdoas():
         cli.say(
             "evaluate",

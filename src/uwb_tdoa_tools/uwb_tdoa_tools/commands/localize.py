@@ -91,7 +91,7 @@ def _localize(args: Namespace) -> int:
     )
     for one in parallel.over(localizer, found, args.jobs, args.dask):
         located.append(one)
-        first, *others = one.belief.sentences()
+        first, *others = one.assessment.sentences()
         cli.show(f"{one.flight}: {first}", *(f"  {sentence}" for sentence in others))
         cli.show(f"  wrote {', '.join(path.name for path in one.written)} to {out}")
     if args.json:

@@ -14,8 +14,7 @@ from ..outputs import OutputBag, OutputFile
 from ..progress import Progress
 from ..simulation import simulate
 from ..simulation.options import add_options, config_of
-from ..simulation.plots import check_image, plot
-from ..simulation.summary import catalogue, summary
+from ..simulation.report import catalogue, check_image, plot, summary
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace

@@ -18,8 +18,7 @@ from ..diagnosis.self_calibration import self_calibrate
 from ..estimate import FlightEstimator
 from ..outputs import OutputFolder
 from ..progress import Progress
-from ..surveying.blocked import with_blocked
-from ..surveying.report import as_dict, as_text, picture
+from ..surveying.report import as_dict, as_text, picture, with_blocked
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace

@@ -12,7 +12,7 @@ from ..outputs import OutputFile, OutputFolder
 from ..progress import Progress
 from ..readers import inputs
 from ..results_file import ResultsFile, asked_of, resumed, state_of
-from ..scoring.settling import with_settled_truth
+from ..scoring.evaluation import with_aligned_truth
 from ..training import labels as labelling
 from ..training import models, shrinking
 
@@ -103,9 +103,9 @@ def _train(args: Namespace) -> None:
             parallel.over, jobs=jobs, dask=dask, unit=None
         )  # no line beside that of Progress
         flights = reading.flights(args.flights, args.most, jobs, dask)
-        inputs.need_tdoas(flights, "train")
+        inputs.require_tdoas(flights, "train")
         flights = list(
-            parallel.over(partial(with_settled_truth, align=args.align), flights, jobs, dask)
+            parallel.over(partial(with_aligned_truth, align=args.align), flights, jobs, dask)
         )
         with Progress("train") as progress:
             _write(args, flights, resumed(over, done) if done else over, progress)

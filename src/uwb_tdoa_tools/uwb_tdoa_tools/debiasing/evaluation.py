@@ -13,9 +13,8 @@ from uwb_tdoa_ekf.results import Odometry
 
 from ..readers.inputs import Reading
 from ..scoring.alignment import NONE
-from ..scoring.evaluation import corrected_truth, evaluate
+from ..scoring.evaluation import corrected_truth, evaluate, with_aligned_truth
 from ..scoring.metrics import Score
-from ..scoring.settling import with_settled_truth
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator
@@ -52,7 +51,7 @@ def fly(
             "--reference heights, odometry or marks finds what is "
             "wrong without it, and --effects takes that."
         )
-    flight = with_settled_truth(flight, effects, config, align)
+    flight = with_aligned_truth(flight, effects, config, align)
     score, run = evaluate(flight, config, effects)
     return flight, score, run.odometry
 
@@ -64,7 +63,7 @@ class PositionEstimator:
 
     reading : Reading; config : FilterConfig; effects : EffectSet or None, of the TDOAs before the
         filter; align : as of
-    `settled`.
+    `align_truth`.
     """
 
     reading: Reading = Reading()

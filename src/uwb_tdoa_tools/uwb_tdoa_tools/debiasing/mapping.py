@@ -11,7 +11,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.debias import fit
 
 from ..readers import read_survey
-from ..scoring.shrinkage import SHARES, Shrinkage, best_share
+from ..scoring.gains import SHARES, Shrinkage, best_share
 from .evaluation import evaluate_map
 from .parts import LEAST, is_table, part_of, static_parts
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..scoring.gains import by, change_of, gain
+from ..scoring.gains import change_in_words, gain, gain_in_words
 from .evaluation import evaluate_map
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from .evaluation import Scored
 
-WORTH = 0.01  # of the 3D RMSE: less is neither gain nor harm
+SMALLEST_GAIN = 0.01  # of the 3D RMSE: less is neither gain nor harm
 _RUN = ("rmse_x", "rmse_y", "rmse_z", "rmse_3d", "max_3d", "nees_mean")
 
 
@@ -86,7 +86,9 @@ def say_rows(title: str, found: Sequence[Mapping[str, Any]]) -> None:
     before, after = (
         np.mean([row[side]["rmse_3d"] for row in found]) for side in ("before", "after")
     )
-    print(f"mean 3D RMSE {before:.3f} m before, {after:.3f} m after: it {change_of(before, after)}")
+    print(
+        f"mean 3D RMSE {before:.3f} m before, {after:.3f} m after: it {change_in_words(before, after)}"
+    )
 
 
 def gain_of(found: Sequence[Mapping[str, Any]]) -> float:
@@ -99,13 +101,13 @@ def gain_of(found: Sequence[Mapping[str, Any]]) -> float:
 def verdict(gained: float, on: str) -> str:
     """One sentence on a `gain`. on : what it was judged on."""
     if does_harm(gained):
-        return f"harm: the 3D RMSE {by(gained)} on {on}; do not use this map there"
-    return f"{'better' if gained >= WORTH else 'no gain'}: the 3D RMSE {by(gained)} on {on}"
+        return f"harm: the 3D RMSE {gain_in_words(gained)} on {on}; do not use this map there"
+    return f"{'better' if gained >= SMALLEST_GAIN else 'no gain'}: the 3D RMSE {gain_in_words(gained)} on {on}"
 
 
 def does_harm(gained: float) -> bool:
     """Whether a `gain` is a loss, or no number."""
-    return not gained > -WORTH
+    return not gained > -SMALLEST_GAIN
 
 
 def _side(figures: Mapping[str, float]) -> str:

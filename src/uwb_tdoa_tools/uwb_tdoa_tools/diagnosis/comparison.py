@@ -20,8 +20,7 @@ from uwb_tdoa_ekf.sensitivity import RANGES
 
 from ..clock import numbered
 from ..json_values import as_json
-from ..scoring.by_phase import EVERYTHING
-from ..scoring.metrics import Score, pooled
+from ..scoring.metrics import EVERYTHING, Score, pooled
 from .regression.table import BLOCK
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf.frames import poses_of
 from uwb_tdoa_ekf.offline import run_offline
 
-from ..scoring.by_phase import EVERYTHING
+from ..scoring.metrics import EVERYTHING
 from .comparison import Baseline, ValidationCase, score
 from .deviations import with_deviations
 from .findings import Refused, usable

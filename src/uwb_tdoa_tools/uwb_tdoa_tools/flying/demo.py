@@ -17,7 +17,7 @@ from uwb_tdoa_ekf.results import Odometry
 from .. import command_lines
 from ..bags.bag import read_odometry, write_bag
 from ..live.run import accounts, run_live
-from ..localizing.rerun_file import write_rerun
+from ..localizing.pictures import write_rerun
 from ..scoring.metrics import Score
 from . import trial
 from .report import sentence

@@ -18,8 +18,7 @@ from uwb_tdoa_bias.foundation.sensors.pressure import SITE, pressure_at
 from uwb_tdoa_bias.foundation.sensors.sensor import RATE
 from uwb_tdoa_bias.foundation.sensors.velocity import LEAST_STD
 
-from ..simulation.ranging import outliers, tag_link, tdoa_noise
-from ..simulation.schedule import make_schedule
+from ..simulation.tdoas import make_schedule, outliers, tag_link, tdoa_noise
 from .loop import IMU_RATE
 
 if TYPE_CHECKING:

@@ -9,8 +9,7 @@ import numpy as np
 
 from uwb_tdoa_ekf.results import rows_of
 
-from ..scoring.by_phase import rms
-from ..scoring.metrics import nees, position_at
+from ..scoring.metrics import nees, position_at, rms
 from .mission import DONE, REFUSED
 from .trial import REST_AFTER
 from .vehicle import POSITION, VELOCITY

@@ -13,9 +13,9 @@ from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 
-from ..simulation.constellations import corners
-from ..simulation.imu import ImuErrors
+from ..simulation.config import ImuErrors
 from ..simulation.inject import parse_effect
+from ..simulation.rooms import corners
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

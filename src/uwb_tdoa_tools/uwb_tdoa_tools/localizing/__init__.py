@@ -1,1 +1,1 @@
-"""Where the tag was: recordings to trajectories, without ground truth."""
+"""Localizing: trajectories of recordings without ground truth, and how reliable they are."""

@@ -1,6 +1,4 @@
-"""What is left of each TDOA and range after the estimate: a table, sums per pair of anchors or per
-anchor, a picture.
-"""
+"""Residuals of TDOAs and ranges: per pair of anchors, and per square of the floor."""
 
 from __future__ import annotations
 
@@ -11,30 +9,37 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.files import write_filled, write_text
 from uwb_tdoa_bias.foundation.sensors import LOCATING
-from uwb_tdoa_ekf.results import VERDICTS, Residuals, concatenated
+from uwb_tdoa_ekf.core.verdicts import USED
+from uwb_tdoa_ekf.results import VERDICTS, Odometry, Residuals, concatenated
 
-from ..scoring.metrics import reached
+from ..scoring.metrics import has_innovation
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.flight import Flight
     from uwb_tdoa_ekf.offline import Run
 
-COLUMNS = "t", "a", "b", "residual", "std", "weight", "verdict"
-SHOWN, FEWEST = (
-    20,
-    20,
-)  # pairs in the picture at most, those with the most TDOAs; TDOAs of a pair that is shown at least
-# robust standard deviations that the picture reaches; what is farther off is drawn at its edge
+
+RESIDUAL_COLUMNS = "t", "a", "b", "residual", "std", "weight", "verdict"
+SHOWN = 20  # pairs in the picture at most, those with the most TDOAs
+FEWEST = 20  # TDOAs of a pair in the picture
+# robust standard deviations that the draw_residuals reaches; what is farther off is drawn at its edge
 SPREAD = 6.0
+ZONE_COLUMNS = "x", "y", "seconds", "heard", "tdoas_per_s", "used", "left", "std", "anchors"
+SHORTEST = 0.5  # s in a zone that is listed
 
 
 @dataclass(frozen=True)
-class OfPair:
-    """Residuals of the TDOAs between two anchors, a before b, or of the ranges to one, which is
-    both. t (n,) s; value, std (n,) m, of d_ab or of the range; explained (n,) bool, within three
-    standard deviations.
+class PairResiduals:
+    """Residuals of the TDOAs between two anchors a < b, or of the ranges to one anchor, a = b.
+
+    Attributes
+    ----------
+    t : (n,) s.
+    value, std : (n,) m, of d_ab or of the range.
+    explained : (n,) bool, within three standard deviations.
     """
 
     a: int
@@ -46,11 +51,11 @@ class OfPair:
 
     @property
     def name(self) -> str:
-        """What it is called in pictures."""
+        """Return the name for pictures."""
         return f"{self.a} - {self.b}" if self.a != self.b else f"range {self.a}"
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the figures for JSON."""
         return {
             "a": self.a,
             "b": self.b,
@@ -61,10 +66,8 @@ class OfPair:
         }
 
 
-def of_run(flight: Flight, run: Run) -> Residuals:
-    """Residuals of the TDOAs of a Run over a Flight, and of what else locates: of distances to
-    anchors, of which a and b are the same.
-    """
+def residuals_of(flight: Flight, run: Run) -> Residuals:
+    """Return the Residuals of the TDOAs and ranges of a Run; a range has a = b."""
     parts = [run.residuals]
     for name in LOCATING:
         if name in run.aids:
@@ -76,14 +79,14 @@ def of_run(flight: Flight, run: Run) -> Residuals:
 
 
 def explained(residuals: Residuals) -> np.ndarray:
-    """Which TDOAs were within three of the standard deviations that the filter expected: (n,) bool."""
-    with np.errstate(invalid="ignore"):  # NaN, of those without a residual, is not
-        return reached(residuals) & (residuals.innovation**2 <= 9.0 * residuals.variance)
+    """Return which innovations are within three expected standard deviations: (n,) bool."""
+    with np.errstate(invalid="ignore"):  # NaN without an innovation
+        return has_innovation(residuals) & (residuals.innovation**2 <= 9.0 * residuals.variance)
 
 
-def by_pair(residuals: Residuals) -> list[OfPair]:
-    """Residuals of each pair of anchors, in the order of their ids."""
-    there, fits = reached(residuals), explained(residuals)
+def by_pair(residuals: Residuals) -> list[PairResiduals]:
+    """Return the residuals of each pair of anchors, in the order of their ids."""
+    there, fits = has_innovation(residuals), explained(residuals)
     low, high = np.minimum(residuals.a, residuals.b), np.maximum(residuals.a, residuals.b)
     sign = np.where(residuals.a <= residuals.b, 1.0, -1.0)
     pairs = []
@@ -92,16 +95,16 @@ def by_pair(residuals: Residuals) -> list[OfPair]:
     for rows in np.split(order, begins) if len(order) else ():
         a, b = int(low[rows[0]]), int(high[rows[0]])
         value, std = (sign * residuals.innovation)[rows], np.sqrt(residuals.variance[rows])
-        pairs.append(OfPair(a, b, residuals.t[rows], value, std, fits[rows]))
+        pairs.append(PairResiduals(a, b, residuals.t[rows], value, std, fits[rows]))
     return pairs
 
 
-def write_csv(path: Path, residuals: Residuals) -> None:
-    """Write a line for each TDOA: s, ids of the anchors, m, m, 0 to 1, and what became of it.
+def write_residuals(path: Path, residuals: Residuals) -> None:
+    """Write one CSV line per TDOA: s, ids, m, m, weight 0 to 1, verdict.
 
-    Empty where the filter had no residual.
+    Cells are empty if the filter had no innovation.
     """
-    lines, std = [",".join(COLUMNS)], np.sqrt(residuals.variance)
+    lines, std = [",".join(RESIDUAL_COLUMNS)], np.sqrt(residuals.variance)
     rows = zip(
         residuals.t,
         residuals.a,
@@ -117,10 +120,8 @@ def write_csv(path: Path, residuals: Residuals) -> None:
     write_text(path, "\n".join([*lines, ""]))
 
 
-def picture(path: Path, residuals: Residuals, title: str) -> None:
-    """Residuals of each pair over time, a row each, those that the estimate does not explain in
-    red, with their median beside it.
-    """
+def draw_residuals(path: Path, residuals: Residuals, title: str) -> None:
+    """Draw the residuals of each pair over time, in one row each, with outliers in red."""
     from matplotlib.figure import Figure  # takes a second to import
 
     found = by_pair(residuals)
@@ -164,3 +165,114 @@ def picture(path: Path, residuals: Residuals, title: str) -> None:
         fontsize=10,
     )
     write_filled(path, partial(figure.savefig, dpi=110))
+
+
+@dataclass(frozen=True)
+class Zone:
+    """A square in which the tag was.
+
+    Attributes
+    ----------
+    x, y : m, middle of the square.
+    seconds : time of the tag in it.
+    heard : anchors per second, median.
+    tdoas_per_s : TDOAs per second.
+    used : share of the TDOAs that the filter used.
+    left : m, 1.48 times the median absolute residual of these, or NaN.
+    std : m, standard deviation of the position, median.
+    anchors : ((id, share of the seconds with this anchor), ...), most heard first.
+    """
+
+    x: float
+    y: float
+    seconds: float
+    heard: float
+    tdoas_per_s: float
+    used: float
+    left: float
+    std: float
+    anchors: tuple[tuple[int, float], ...]
+
+
+def zones_of(odometry: Odometry, residuals: Residuals, size: float) -> list[Zone]:
+    """Return [Zone] of the squares of some size, m, in which the tag was."""
+    if len(odometry) < 2 or not len(residuals.t):
+        return []
+    near = (residuals.t >= odometry.t[0]) & (residuals.t <= odometry.t[-1])
+    t, used, left = residuals.t[near], residuals.verdict[near] == USED, residuals.innovation[near]
+    ends = np.stack([residuals.a[near], residuals.b[near]], axis=1)
+    places = [np.floor(odometry.p[:, k] / size).astype(int) for k in range(2)]
+    row = np.minimum(np.searchsorted(odometry.t, t), len(odometry) - 1)
+    std = np.sqrt(np.trace(odometry.covariance[:, :3, :3], axis1=1, axis2=2))
+    steps = np.minimum(np.diff(odometry.t, append=odometry.t[-1]), 1.0)
+    second = np.floor(t - t[0]).astype(int) if len(t) else np.empty(0, int)
+    label = np.unique(np.stack(places, axis=1), axis=0, return_inverse=True)[1].reshape(-1)
+    out = []
+    for k in range(label.max() + 1):
+        here, mine = label == k, label[row] == k
+        seconds = float(steps[here].sum())
+        if seconds < SHORTEST:
+            continue
+        heard = np.unique(np.column_stack([np.repeat(second[mine], 2), ends[mine].ravel()]), axis=0)
+        each = np.unique(heard[:, 0], return_counts=True)[1]
+        ids, count = np.unique(heard[:, 1], return_counts=True)
+        most = np.argsort(-count, kind="stable")
+        good = mine & used
+        x, y = (float((part[here][0] + 0.5) * size) for part in places)
+        out.append(
+            Zone(
+                x,
+                y,
+                seconds,
+                float(np.median(each)) if len(each) else 0.0,
+                mine.sum() / seconds,
+                float(used[mine].mean()) if mine.any() else 0.0,
+                float(1.4826 * np.median(np.abs(left[good]))) if good.any() else np.nan,
+                float(np.median(std[here])),
+                tuple(zip(ids[most].tolist(), (count[most] / max(len(each), 1)).tolist())),
+            )
+        )
+    return out
+
+
+def write_zones(path: Path, zones: list[Zone]) -> None:
+    """Write one CSV line per Zone, with the columns ZONE_COLUMNS and anchors as "id:share"."""
+    lines = [",".join(ZONE_COLUMNS)]
+    for zone in zones:
+        numbers = [f"{getattr(zone, name):.3f}" for name in ZONE_COLUMNS[:-1]]
+        lines.append(
+            ",".join(
+                [*numbers, " ".join(f"{anchor}:{share:.2f}" for anchor, share in zone.anchors)]
+            )
+        )
+    write_text(path, "\n".join([*lines, ""]))
+
+
+def draw_zones(path: Path, zones: list[Zone], anchors: Anchors, size: float, title: str) -> None:
+    """Draw maps of the number of heard anchors and of the standard deviation of the position."""
+    from ..scoring.plots import plt  # takes a second to import
+
+    figure, axes = plt.subplots(1, 2, figsize=(13.0, 5.5), layout="constrained")
+    heard = {anchor for zone in zones for anchor, _ in zone.anchors}
+    silent = np.array([anchor not in heard for anchor in anchors.ids.tolist()])
+    x, y = (np.unique([getattr(zone, name) for zone in zones]) for name in "xy")
+    x, y = (np.arange(some.min(), some.max() + 0.5 * size, size) for some in (x, y))
+    for ax, name, label, colours in (
+        (axes[0], "heard", "anchors heard in a second", "viridis"),
+        (axes[1], "std", "standard deviation, cm", "viridis_r"),
+    ):
+        values = np.full((len(y), len(x)), np.nan)
+        for zone in zones:
+            value = getattr(zone, name)
+            values[round((zone.y - y[0]) / size), round((zone.x - x[0]) / size)] = (
+                value if name == "heard" else 100.0 * value
+            )
+        mesh = ax.pcolormesh(x, y, values, shading="nearest", cmap=colours)
+        ax.plot(*anchors.positions[~silent, :2].T, "k^", ms=4, label="heard")
+        ax.plot(*anchors.positions[silent, :2].T, "rx", ms=5, label="never heard")
+        ax.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+        figure.colorbar(mesh, ax=ax, label=label)
+    axes[0].legend(loc="best")
+    figure.suptitle(title, fontsize=10)
+    write_filled(path, partial(figure.savefig, dpi=110))
+    plt.close(figure)

@@ -19,12 +19,12 @@ from scipy.special import expit
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 
-from ..simulation.constellations import facing
+from ..simulation.rooms import facing
 from .goal import UNUSABLE
 
 if TYPE_CHECKING:
     from ..progress import Progress
-    from ..simulation.room import Room
+    from ..simulation.rooms import Room
     from .hall import Hall
     from .judging import Judged
 

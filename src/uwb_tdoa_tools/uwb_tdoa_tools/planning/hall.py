@@ -9,7 +9,7 @@ import numpy as np
 
 from .. import parallel
 from ..checking.sides import sides_of
-from ..simulation.walls import heard_at
+from ..simulation.rooms import heard_at
 from .judging import TOO_FEW, Judged, judge
 from .maps import Chart
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.foundation.anchors import Anchors
 
-    from ..simulation.walls import Walls
+    from ..simulation.rooms import Walls
     from .goal import Goal
     from .maps import Grid
 

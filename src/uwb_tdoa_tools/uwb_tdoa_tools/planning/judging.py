@@ -11,7 +11,7 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
-from ..simulation.room import Room
+from ..simulation.rooms import Room
 from .bifurcation import Subsets
 from .precision import bound, information, position_error, range_weights
 from .second_minimum import CLEAR, second_minima

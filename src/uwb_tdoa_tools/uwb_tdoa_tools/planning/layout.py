@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 
-from ..simulation.constellations import facing
+from ..simulation.rooms import facing
 from .places import AnchorPlaces
 
 _ARM = 3.0  # m; to move an anchor so far changes about as much as to turn it by 1 rad

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..bags.bag import LATCHED_QOS
 from ..bags.files import new_bag
 from ..bags.message_types import typestore
 from ..bags.messages import anchors_message, header_of, pose_of
+from ..bags.topics import LATCHED_QOS
 from .judging import FLYABLE, IMPRECISE, OUTSIDE, TOO_FEW, TWO_SOLUTIONS
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ import numpy as np
 from uwb_tdoa_bias.foundation.antenna import Antenna
 from uwb_tdoa_bias.foundation.errors import InputError
 
-from ..simulation.room import Room, room_of
+from ..simulation.rooms import Room, room_of
 from .goal import Goal
 from .installation import Installation
 from .judging import Demand

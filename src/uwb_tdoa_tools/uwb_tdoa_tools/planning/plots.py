@@ -18,8 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.files import write_filled
 
-from ..scoring.labels import put_labels
-from ..scoring.plots import plt
+from ..scoring.plots import draw_labels, plt
 from .bifurcation import Subsets
 from .judging import FLYABLE, IMPRECISE, OUTSIDE, TOO_FEW, TWO_SOLUTIONS
 from .precision import ellipses
@@ -33,7 +32,7 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.foundation.anchors import Anchors
 
-    from ..simulation.walls import Walls
+    from ..simulation.rooms import Walls
     from .accuracy import AccuracyMap
     from .installation import Installation
     from .maps import Chart, Grid
@@ -606,7 +605,9 @@ def _finish(
     figure.set_dpi(DPI)
     figure.draw_without_rendering()
     for ax, anchors in labelled:
-        put_labels(ax, anchors.ids.tolist(), anchors.positions[:, :2], _fronts(ax, anchors), ANCHOR)
+        draw_labels(
+            ax, anchors.ids.tolist(), anchors.positions[:, :2], _fronts(ax, anchors), ANCHOR
+        )
     _save(figure, title, path)
 
 

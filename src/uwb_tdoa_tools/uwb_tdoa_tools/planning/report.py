@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..checking.sides import to_copy
-from ..scoring.gains import change_of
+from ..scoring.gains import change_in_words
 from .judging import FLYABLE, IMPRECISE, OUTSIDE, TOO_FEW, TWO_SOLUTIONS
 from .precision import NORMAL_99, dilution
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ..simulation.room import Room
+    from ..simulation.rooms import Room
     from .installation import Installation
     from .maps import Chart
 
@@ -243,7 +243,7 @@ def say_improvement(found: dict[str, Any]) -> None:
         ("failing", "of them not flyable, %", 100.0, 1),
     ):
         old, new = (factor * found[when][name] for when in ("before", "after"))
-        change = f"  {change_of(old, new)}" if old and factor == 1.0 else ""
+        change = f"  {change_in_words(old, new)}" if old and factor == 1.0 else ""
         print(f"{label:44s}{old:8.{digits}f}{new:8.{digits}f}{change}")
     for anchor in found["placed"]:
         print(f"anchor {anchor['id']}: {anchor['words']}")

@@ -13,7 +13,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from .. import cli, parallel
 from ..progress import Progress
 from ..readers.inputs import Reading
-from ..simulation.walls import Walls
+from ..simulation.rooms import Walls
 from . import accuracy, advice, design, hall, messages, optimisation, options, plots, report
 from .check import brute_force
 from .judging import judge
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.anchors import Anchors
 
     from ..readers.inputs import Recording
-    from ..simulation.room import Room
+    from ..simulation.rooms import Room
     from .goal import Goal
     from .installation import Installation
     from .judging import Demand

@@ -21,7 +21,7 @@ import numpy as np
 from uwb_tdoa_bias.foundation.compiled import compiled
 
 if TYPE_CHECKING:
-    from ..simulation.room import Room
+    from ..simulation.rooms import Room
 
 FLIP = 0.5  # m; a minimum nearer than this is no failure, but imprecision
 CLEAR = 4.65  # standard deviations of misfit from which on at most 1 % of the estimates flip

@@ -1,24 +1,60 @@
 """Readers: each turns one kind of recording into a Flight.
 
-`read_flight` finds out which kind it is.
+`read_flight` recognizes the kind.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
+import shlex
 from typing import TYPE_CHECKING
+import zlib
 
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.files import read_head
 
-from ..bags.kind import is_bag
-from .kind import reader_of
+from ..bags import is_bag
 from .names import read_survey
-from .usd_log import read_usd_log
-from .util_csv import read_util_csv
+from .usd_log import MAGIC, read_usd_log
+from .util_csv import GZIP_MAGIC, is_util_csv, read_util_csv
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from uwb_tdoa_bias.foundation.anchors import Anchors
     from uwb_tdoa_bias.foundation.flight import Flight
+
+
+ROS_1 = b"#ROSBAG V2.0"  # what a bag of ROS 1 begins with
+
+
+def reader_of(path: Path) -> Callable[[Path, Anchors, bool, bool], Flight]:
+    """Return the reader of a file that is not a bag. Raise InputError for an unknown kind."""
+    head = read_head(path, 1 << 16)
+    if head[0] == MAGIC:
+        return read_usd_log
+    if head.startswith(GZIP_MAGIC):
+        try:
+            head = zlib.decompressobj(zlib.MAX_WBITS | 16).decompress(head, 1 << 16)
+        except zlib.error as error:
+            raise InputError(
+                f"{path}: the gzip data is damaged ({error}); copy the file again."
+            ) from error
+    first = head.split(b"\n", 1)[0]
+    if is_util_csv(first.decode("utf-8", "replace")):
+        return read_util_csv
+    if head.startswith(ROS_1):
+        raise InputError(
+            f"{path}: is a bag of ROS 1: make a ROS 2 bag of it, rosbags-convert --src "
+            f"{shlex.quote(str(path))} --dst NAME, or of messages that only their makers "
+            "have CSV files for convert --columns."
+        )
+    raise InputError(
+        f"{path}: is of no known kind (it starts with {head[:16]!r}); a micro-SD log starts "
+        "with byte 0xBC, a UTIL CSV "
+        "file with a header line with t_tdoa, and a bag is a directory with metadata.yaml."
+    )
+
 
 __all__ = ["read_flight", "read_survey", "read_usd_log", "read_util_csv"]
 
@@ -31,23 +67,21 @@ def read_flight(
     topics: dict[str, str] | None = None,
     truth: bool = True,
 ) -> Flight:
-    """Flight of a recording of any known kind, told apart by content, not by name.
+    """Read a recording of any known kind; its content decides, not its name.
 
-    path : micro-SD event log, UTIL CSV (plain or gzip), or ROS 2 bag (its directory or its .mcap or
-        .db3 file).
-    survey : path of a survey file (see `read_survey`) or Anchors. Logs and CSV files need it; a bag
-        brings its own
-        anchors, and a survey given with it replaces them.
-    namespace, topics : where the tag's topics are in a bag, see `read_bag`.
-    salvage : read a cut or damaged recording up to there, without records that are no numbers; the
-        Flight's
-        `meta["remarks"]` tell what is missing. Otherwise it is refused.
-    truth : read the ground truth, where there is one.
+    Parameters
+    ----------
+    path : micro-SD event log, UTIL CSV (plain or gzip), or ROS 2 bag (directory, .mcap or .db3).
+    survey : Anchors, or a survey file, see `read_survey`. Logs and CSV files need it. In a bag it
+        replaces the recorded anchors.
+    namespace, topics : topics of the tag in a bag, see `read_bag`.
+    salvage : read a damaged recording up to the damage and skip invalid records. `meta["remarks"]`
+        lists what is missing. Otherwise a damaged recording is refused.
+    truth : read the ground truth, if there is one.
+
     Raises InputError.
     """
-    from ..bags.bag import (
-        read_bag,
-    )  # here, because bags need the rosbags library and the others do not
+    from ..bags.bag import read_bag  # only bags need the rosbags library
 
     path = Path(path)
     if not path.exists():

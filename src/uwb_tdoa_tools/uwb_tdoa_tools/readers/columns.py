@@ -1,4 +1,4 @@
-"""CSV tables of other tools, whatever their columns are called and whatever they are measured in.
+"""CSV tables of other tools, with any column names and units.
 
 columns = parse_columns("time=t_ms:ms,anchor_a=from,anchor_b=to,tdoa=diff_mm:mm")
 flight = read_columns(["ranging.csv", "imu.csv"], columns, anchors)
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.foundation.flight import Flight
 
-    from .names import Named
+    from .names import NamedAnchors
     from .streams import Streams
     from .tables import CsvTable
 
@@ -60,19 +60,11 @@ TIMES = {  # of each stream: the first that is given, else "time"
     "acc": ("accel_time", "imu_time"),
     "pose": ("pose_time",),
 }
-RADIO = "tdoa", "range"  # of which there must be one
+RADIO = "tdoa", "range"  # one of them is required
 ANCHORS = "anchor_a", "anchor_b", "anchor"  # columns that name anchors
-EMPTY = {
-    "",
-    "-",
-    "--",
-    "n/a",
-    "na",
-    "nan",
-    "none",
-    "null",
-}  # what tools write where they have nothing
-MOST_SKIPPED = 0.25  # of the records of a stream, that are empty or no numbers
+# cells of tools without a value
+EMPTY = {"", "-", "--", "n/a", "na", "nan", "none", "null"}
+MOST_SKIPPED = 0.25  # largest share of invalid records in a stream
 ATTITUDE = {f"pose_q{k}" for k in "xyzw"}
 OPTIONAL = {*ATTITUDE, "tdoa_std", "range_std"}
 UNITS = {name: units for columns in STREAMS.values() for name, (_, units) in columns.items()}
@@ -88,7 +80,7 @@ HELP = (
 
 
 def parse_columns(text: str) -> dict[str, tuple[str, float]]:
-    """{our column: (their column, factor)} of "OURS=THEIRS[:UNIT],...". Raises InputError."""
+    """Return {our column: (their column, factor)} of "OURS=THEIRS[:UNIT],...". Raise InputError."""
     columns = {}
     for entry in text.split(","):
         ours, given, theirs = (part.strip() for part in entry.partition("="))
@@ -125,18 +117,22 @@ def parse_columns(text: str) -> dict[str, tuple[str, float]]:
 def read_columns(
     paths: Sequence[str | Path],
     columns: dict[str, tuple[str, float]],
-    named: Named,
+    named: NamedAnchors,
     salvage: bool = False,
 ) -> Flight:
-    """Flight of CSV files with a header line each; each stream is taken from the one file that has
-    its columns.
+    """Read a Flight from CSV files with header lines; each stream comes from a single file.
 
-    A row counts for a stream if any of its cells is filled: rows of several sensors may be mixed in
-    one file, and each may have a time column of its own. A record with a cell that is empty or no
-    number is left out and counted, in `meta["remarks"]`; if that is more than MOST_SKIPPED of the
-    records, the file is refused. columns : see `parse_columns`; named : Named, the anchors; salvage
-    : leave out records that are not finite, however many. Raises InputError, with the line of the
-    first record that is left out.
+    A row counts for a stream if any cell of the stream is filled. So a file may mix rows of several
+    sensors, each with a time column. Records with empty or invalid cells are skipped and counted in
+    `meta["remarks"]`.
+
+    Parameters
+    ----------
+    columns : see `parse_columns`.
+    named : the anchors.
+    salvage : skip invalid records even if they exceed MOST_SKIPPED.
+
+    Raises InputError with the line of the first invalid record, if they exceed MOST_SKIPPED.
     """
     tables = {path: read_table(path, most=TABLE_CELLS, complete=False) for path in paths}
     wanted: dict[str | Path, dict[str, dict[str, tuple[str, float]]]] = {path: {} for path in paths}
@@ -155,10 +151,6 @@ def read_columns(
             }
     for ids in (streams.get("tdoa", {}), streams.get("range", {})):
         ids.update({name: ids[name].astype(np.int64) for name in ids.keys() & {"a", "b", "anchor"}})
-    if "pose" in streams and "qx" not in streams["pose"]:
-        streams["pose"].update(
-            {f"q{k}": np.full(len(streams["pose"]["t"]), np.nan) for k in "xyzw"}
-        )
     meta = {
         "source": ", ".join(map(str, paths)),
         "format": "CSV, columns as given",
@@ -168,7 +160,7 @@ def read_columns(
 
 
 def _having(tables: dict[str | Path, CsvTable], mine: dict[str, tuple[str, float]]) -> str | Path:
-    """The path of the one table that has all columns."""
+    """Return the path of the single table that has all columns."""
     names = {theirs for theirs, _ in mine.values()}
     having = [path for path, table in tables.items() if names <= {*table.names}]
     if len(having) == 1:
@@ -188,12 +180,14 @@ def _values(
     path: str | Path,
     table: CsvTable,
     streams: dict[str, dict[str, tuple[str, float]]],
-    named: Named,
+    named: NamedAnchors,
     remarks: list[str],
     salvage: bool,
 ) -> dict[str, dict[str, np.ndarray]]:
-    """{stream: {our name: (n,) array}}, in our units, of the rows in which a cell of the stream is
-    filled and all are numbers, or names of anchors. streams : {stream: columns} that the table has.
+    """Return {stream: {our name: (n,) array}} in our units.
+
+    A row counts if one cell of the stream is filled and all cells are valid. `streams` maps the
+    streams of this table to their columns.
     """
     values, rows = (
         {stream: {name: array("d") for name in mine} for stream, mine in streams.items()},
@@ -246,7 +240,7 @@ def _values(
 
 
 def _number(text: str) -> float | None:
-    """A finite number, with a point or a comma, or None."""
+    """Return a finite number, with a point or a comma; None if it is not one."""
     try:
         value = float(text.replace(",", "."))
     except ValueError:

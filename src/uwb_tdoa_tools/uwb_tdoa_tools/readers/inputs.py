@@ -1,6 +1,4 @@
-"""From the paths on a command line to flights: files or folders of recordings, one survey or a
-folder of them.
-"""
+"""Find and read the recordings on a command line: files, folders, and their surveys."""
 
 from __future__ import annotations
 
@@ -19,7 +17,7 @@ from uwb_tdoa_bias.foundation.limits import FOLDER_DEPTH, FOLDER_ENTRIES, Budget
 from uwb_tdoa_bias.foundation.sensors import LOCATING
 
 from .. import parallel
-from ..bags.kind import is_bag
+from ..bags import is_bag
 from ..bags.write_ahead import BESIDE
 from ..clock import apart, sentence_on
 from . import read_flight
@@ -39,18 +37,22 @@ SURVEY_HELP = (
     "which keep their own where no KEY fits"
 )
 
-_REPORTED: set[str | Path | None] = set()  # surveys of which was printed that they count for bags
+_REPORTED: set[str | Path | None] = set()  # surveys whose use for bags was printed
 
 
 def find_flights(
     paths: Iterable[str | Path], survey: str | Path | None = None, absolute: bool = False
 ) -> list[Recording]:
-    """Pairs (recording, survey or None), sorted within each folder. Raises InputError where
-    nothing, or no one survey, fits.
+    """Return pairs (recording, survey or None), sorted within each folder.
 
-    A bag takes the survey that is given, whatever anchors it holds, and says so once; out of a
-    folder the one that fits, or its own.
-    absolute : make them absolute paths, for processes that may have another working directory.
+    A given survey replaces the anchors in a bag, with a message. From a folder of surveys, the bag
+    takes the fitting file, or keeps its own anchors.
+
+    Parameters
+    ----------
+    absolute : return absolute paths, for processes with another working directory.
+
+    Raises InputError if a path has no recording, or if no survey fits.
     """
     found = []
     for path in map(Path, paths):
@@ -72,8 +74,9 @@ def find_flights(
 
 
 def _survey_of(path: Path, survey: str | Path | None) -> str | Path | None:
-    """The survey of a recording, or None for a bag whose own anchors count; what counts for a bag
-    is printed once.
+    """Return the survey of a recording; None for a bag that keeps its own anchors.
+
+    The choice for a bag is printed once.
     """
     if survey is None or not is_bag(path):
         return survey_for(path, survey)
@@ -96,18 +99,14 @@ def _survey_of(path: Path, survey: str | Path | None) -> str | Path | None:
 
 
 def _report_once(sentence: str, about: str | Path | None = None) -> None:
-    """Tell a sentence on stderr, and nothing more about the same survey, or about surveys that do
-    not fit (None), in this process.
-    """
+    """Print a sentence on stderr once per survey and process; None stands for surveys that do not fit."""
     if about not in _REPORTED:
         _REPORTED.add(about)
         tqdm.write(printable(sentence), file=sys.stderr)
 
 
 def survey_for(path: str | Path, survey: str | Path | None) -> str | Path | None:
-    """The survey of a recording: `survey` itself, or out of a folder the one whose KEY is the
-    longest in the path.
-    """
+    """Return the survey of a recording; from a folder, the survey with the longest KEY in the path."""
     if survey is None or not Path(survey).is_dir():
         return survey
     keys = {
@@ -124,8 +123,8 @@ def survey_for(path: str | Path, survey: str | Path | None) -> str | Path | None
     return keys[fitting[-1]]
 
 
-def need_tdoas(flights: Iterable[Flight], what: str) -> None:
-    """Raise InputError for one of some Flights that holds no TDOAs. what : words, that needs them."""
+def require_tdoas(flights: Iterable[Flight], what: str) -> None:
+    """Raise InputError for a Flight without TDOAs; `what` names the step that needs them."""
     for flight in flights:
         if not len(flight.tdoa):
             raise InputError(
@@ -136,19 +135,22 @@ def need_tdoas(flights: Iterable[Flight], what: str) -> None:
 
 
 def report_remarks(path: str | Path, remarks: Iterable[str]) -> None:
-    """Tell sentences on a recording, on stderr, beside a progress bar."""
+    """Print sentences on a recording on stderr, compatible with a progress bar."""
     for remark in remarks:
         tqdm.write(printable(f"{path}: {remark}"), file=sys.stderr)
 
 
 @dataclass(frozen=True)
 class Reading:
-    """How recordings are read. Can be pickled.
+    """Options of reading recordings. Can be pickled.
 
-    survey : path of a survey or of a folder of them, or None; namespace : of the tag's topics in
-        bags; topics : {our
-    name of a topic: its name in the bags}; salvage : read cut and damaged recordings as far as they
-    are sound; truth : read the ground truth, where there is one.
+    Attributes
+    ----------
+    survey : survey file, folder of surveys, or None.
+    namespace : of the topics of the tag in bags.
+    topics : {our name of a topic: its name in the bags}.
+    salvage : read damaged recordings up to the damage.
+    truth : read the ground truth, if there is one.
     """
 
     survey: str | Path | None = None
@@ -158,8 +160,9 @@ class Reading:
     truth: bool = True
 
     def find(self, paths: Iterable[str | Path], absolute: bool = False) -> list[Recording]:
-        """Pairs (recording, survey or None), see `find_flights`; none of no paths. Raises
-        InputError where topics of bags are named, and there is no bag.
+        """Return pairs (recording, survey or None), see `find_flights`; empty without paths.
+
+        Raises InputError if topics are given but no recording is a bag.
         """
         found = find_flights(paths, self.survey, absolute)
         if found and not any(is_bag(path) for path, _ in found):
@@ -174,7 +177,7 @@ class Reading:
                 )
 
     def read(self, recording: Recording) -> Flight:
-        """Flight of a pair (recording, survey or None); tells on stderr what is missing in it.
+        """Read the Flight of a pair (recording, survey or None); print missing parts on stderr.
 
         Raises InputError.
         """
@@ -190,7 +193,7 @@ class Reading:
         return flight
 
     def one(self, path: str | Path) -> Flight:
-        """Flight of one recording."""
+        """Read the Flight of one recording."""
         path = Path(path)
         if path.exists() and not is_bag(path):
             self._refuse_topics(path)
@@ -203,12 +206,13 @@ class Reading:
         jobs: int | None = 1,
         dask: str | None = None,
     ) -> list[Flight]:
-        """Flights of recordings and folders, with a progress bar: list. jobs, dask : as of
-        `parallel.over`.
+        """Read the Flights of recordings and folders, with a progress bar.
 
-        most : TDOAs and ranges that they may hold together, the first excepted; of more, as many
-            whole flights as that are drawn at random,
-        alike at every call, and the others not held, so that memory and time are bounded.
+        Parameters
+        ----------
+        most : largest total number of TDOAs and ranges, except for the first flight. Above it,
+            whole flights are drawn at random, with a fixed seed. This bounds memory and time.
+        jobs, dask : see `parallel.over`.
         """
         found, count = self.find(paths, bool(dask)), 0
         read: dict[int, Flight] = {}
@@ -234,9 +238,10 @@ class Reading:
 
 
 def _recordings(path: Path) -> list[Path]:
-    """Recordings in a folder, at any depth, or a path that is one. Bags that are files may lie in a
-    folder, as other files do; what SQLite leaves beside them is none. A folder to which several
-    links lead is looked through once.
+    """Return the recordings in a folder at any depth, or the path itself if it is one.
+
+    Bags that are single files may lie in a folder. Files that SQLite leaves next to them do not
+    count. A folder with several links to it is searched once.
     """
     budget, seen, found = Budget(path), set(), []
 

@@ -1,6 +1,4 @@
-"""Anchors that have names: surveys and recordings call them "NE corner" or "A3", messages have
-numbers.
-"""
+"""Surveys whose anchors have names: surveys say "NE corner" or "A3", messages have numbers."""
 
 from __future__ import annotations
 
@@ -20,16 +18,20 @@ LARGEST_ID = 65535
 
 
 @dataclass(frozen=True)
-class Named:
-    """anchors : Anchors; ids : {name as in the survey: id}, empty if they are called by their ids."""
+class NamedAnchors:
+    """Anchors, and their names in the survey.
+
+    Attributes
+    ----------
+    anchors : Anchors.
+    ids : {name: id}; empty if the names are the ids.
+    """
 
     anchors: Anchors
     ids: dict[str, int] = field(default_factory=dict)
 
     def id_of(self, text: str) -> int | None:
-        """The id of an anchor by its name, or by its id, decimal or as 0x1A2B; None if it is
-        neither.
-        """
+        """Return the id of an anchor from its name or id (decimal or 0x1A2B); None if unknown."""
         if text in self.ids:
             return self.ids[text]
         folded = [number for name, number in self.ids.items() if name.casefold() == text.casefold()]
@@ -38,21 +40,22 @@ class Named:
         return None if self.ids else _whole(text)
 
 
-def read_named(path: str | Path) -> Named:
-    """Named of a survey file of any form of `survey.read_entries`, with ids or names of any text.
-    The id is the number that a name ends with, if all end with different ones; else the line of the
-    survey, from 0 on. Raises InputError, also for a survey that is certainly wrong.
+def read_named_anchors(path: str | Path) -> NamedAnchors:
+    """Read a survey file of any form of `survey.read_entries`, with ids or any names.
+
+    Names that all end with different numbers get these as ids. Other names get their line number in
+    the survey, from 0. Raises InputError, also for a survey that is certainly wrong.
     """
     named = _read_named(path)
     refuse_faulty(named.anchors, str(path))
     return named
 
 
-def _read_named(path: str | Path) -> Named:
+def _read_named(path: str | Path) -> NamedAnchors:
     entries, frame = survey.read_entries(path)
     names = [entry.name for entry in entries]
     if all(map(survey.is_id, names)):
-        return Named(survey.anchors_of(path, entries, [int(name) for name in names], frame))
+        return NamedAnchors(survey.anchors_of(path, entries, [int(name) for name in names], frame))
     if len(set(names)) < len(names):
         raise InputError(
             f"{path}: anchor {next(name for name in names if names.count(name) > 1)!r} is "
@@ -62,18 +65,16 @@ def _read_named(path: str | Path) -> Named:
     ids = [int(end[1]) for end in ends if end]
     if len(set(ids)) < len(names) or max(ids) > LARGEST_ID:
         ids = list(range(len(names)))
-    return Named(survey.anchors_of(path, entries, ids, frame), dict(zip(names, ids)))
+    return NamedAnchors(survey.anchors_of(path, entries, ids, frame), dict(zip(names, ids)))
 
 
 def read_survey(path: str | Path) -> Anchors:
-    """Anchors of a survey file, see `read_named`: of those with names, under the ids that these
-    get.
-    """
-    return read_named(path).anchors
+    """Read the Anchors of a survey file, see `read_named_anchors`."""
+    return read_named_anchors(path).anchors
 
 
 def _whole(text: str) -> int | None:
-    """A whole number 0 ... 65535, decimal or hexadecimal as 0x1A2B, or None."""
+    """Return a whole number 0 ... 65535, decimal or 0x1A2B, or None."""
     try:
         value = float(int(text, 16)) if text[:2] in ("0x", "0X") else float(text)
     except (ValueError, OverflowError):

@@ -1,6 +1,4 @@
-"""What the readers of recordings share: putting streams in order, making one IMU stream of two,
-naming the protocol.
-"""
+"""What the readers share: order streams, join both inertial sensors, name the protocol."""
 
 from __future__ import annotations
 
@@ -12,13 +10,12 @@ from scipy.sparse.csgraph import connected_components
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
-from uwb_tdoa_bias.foundation.sensors import Height, Pressure
+from uwb_tdoa_bias.foundation.sensors import Height, Pressure, Velocity
 from uwb_tdoa_bias.foundation.sensors.pressure import pressure_at
 from uwb_tdoa_bias.foundation.sensors.ranges import Ranges
 from uwb_tdoa_bias.foundation.sensors.sensor import LARGEST_NUMBER
 
 from ..clock import sentences, straightened
-from .optical_flow import velocity_of
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.anchors import Anchors
@@ -26,18 +23,29 @@ if TYPE_CHECKING:
     Columns = dict[str, np.ndarray]  # of a stream, each (n,)
     Streams = dict[str, Columns]
 
+
 # m/s^2 in one g of the Crazyflie's accelerometer, as in its firmware and in the UTIL scripts
 GRAVITY = 9.81
-NO_TARGET = (
-    32.0  # m; the range finder writes 32.767 or more where it sees nothing, and sees 4 m at most
-)
+NO_TARGET = 32.0  # m; the range finder writes 32.767 or more without a target, and sees 4 m at most
 LARGEST = {
     "tof": 1e9,
     "baro": 4e4,
 }  # mm, and m: the formula of the standard atmosphere ends at 44 km
 DAY = 86400.0  # s
-UNEQUAL, LOST = 1.1, 0.02  # ratio of two rates, and share of samples left out, that are told
-REFERENCE = 0.95  # of the TDOAs: an anchor that is in so many is what all others are compared with
+UNEQUAL_RATES, DROPPED_SHARE = (
+    1.1,
+    0.02,
+)  # smallest reported ratio of two rates, and share of dropped samples
+REFERENCE_SHARE = 0.95  # share of the TDOAs of a common reference anchor
+# of one reading for 1 rad/s, median over 0425/TDOA2; 30 to 35 pixels in 41 degrees, given in
+# tenths: 4.2 to 4.9
+FLOW_COUNTS = 4.7
+FLOW_READING_TIME = 0.01  # s that one reading counts over
+FLOW_WILD = 40.0  # counts, beyond which a reading is clipped
+FLOW_RATE = 25.0  # Hz of the velocities, each of the mean of some readings
+FLOW_STD = 0.1  # m/s; measured over 0.25 s: 0.05 to 0.11
+FLOW_NEAREST_RANGE = 0.2  # s to the next range, beyond which the height is not known
+FLOW_TURN_TIME = 0.02  # s before and after, over which the gyroscope is averaged
 
 
 def make_flight(
@@ -49,25 +57,24 @@ def make_flight(
     salvage: bool = False,
     truth: bool = True,
 ) -> Flight:
-    """Flight of the streams of a Crazyflie recording: units to SI, stamps in order, empty streams
-    left out.
+    """Build a Flight from the streams of a recording: SI units, ordered stamps, no empty streams.
 
-    streams : dict of stream name to dict of column name to (n,) array; "t" in s, the rest in the
-        units of the file.
-        "tdoa": a, b, d (m), and std (m) if the tag knows it; "range": anchor, d (m), and std (m);
-        "gyro": x, y, z (deg/s); "acc": x, y, z (g); "pose": x, y, z (m), qx, qy, qz, qw. "tof": tof
-        (mm); "baro": baro (m above the sea, from the pressure of the standard atmosphere). "flow":
-        x, y (pixel counts), which become a velocity where "tof" and IMU are.
-    extra : the same of everything else, for `Flight.extra`.
-    meta : dict, completed here with "protocol" and, where there is something to tell, "clock"
-        ([Jump] and {stream: outliers}, see
-        `clock.straightened`), "reordered" (how often the stamps of each stream fell before they
-        were sorted), "imu_accel_interpolated", "losses" ([(cause, evidence, remedy)], what is not
-        used) and "remarks" (list of sentences).
-    salvage : leave out records that are not finite, or whose stamps are a day away from the others,
-        with a remark.
-    truth : take "pose" as the ground truth; it is not looked at otherwise.
-    Raises InputError; without salvage for such records too.
+    Parameters
+    ----------
+    streams : {stream: {column: (n,) array}}; "t" in s, other columns in the units of the file.
+        "tdoa": a, b, d (m), std (m, optional). "range": anchor, d (m), std (m, optional). "gyro":
+        x, y, z (deg/s). "acc": x, y, z (g). "pose": x, y, z (m), and qx, qy, qz, qw (optional). "tof": tof (mm).
+        "baro": baro (m above the sea in the standard atmosphere). "flow": x, y (pixel counts),
+        which become a velocity if "tof" and IMU exist.
+    extra : further streams for `Flight.extra`.
+    meta : dict with "source". Added are "protocol", "clock" ([Jump] and {stream: outliers}, see
+        `clock.straightened`), "reordered" ({stream: number of falling stamps}),
+        "imu_accel_interpolated", "losses" ([(cause, evidence, remedy)] of unused data) and
+        "remarks" (sentences).
+    salvage : skip records that are not finite, or whose stamps differ by a day, with a remark.
+    truth : use "pose" as ground truth; otherwise it is ignored.
+
+    Raises InputError; without `salvage` for invalid records too.
     """
     meta = {"remarks": [], **meta}
     wanted = {
@@ -75,6 +82,9 @@ def make_flight(
         for key, columns in streams.items()
         if len(columns["t"]) and (truth or key != "pose")
     }
+    if "pose" in wanted and "qx" not in wanted["pose"]:
+        unknown = np.full(len(wanted["pose"]["t"]), np.nan)
+        wanted["pose"] = {**wanted["pose"], **dict.fromkeys(("qx", "qy", "qz", "qw"), unknown)}
     clock = straightened({key: columns["t"] for key, columns in (extra | wanted).items()})
     wanted, extra = (
         {key: clock.columns(key, columns) for key, columns in group.items()}
@@ -83,53 +93,72 @@ def make_flight(
     meta["remarks"] += sentences(clock)
     if clock.jumps or clock.kept:
         meta["clock"] = clock.jumps, clock.outliers
-    streams = {key: _sound(key, columns, meta, salvage) for key, columns in wanted.items()}
-    streams = {key: columns for key, columns in streams.items() if len(columns["t"])}
-    extra = {key: columns for key, columns in extra.items() if len(columns["t"])}
-    reordered = {}
-    for group in (streams, extra):
-        for key, columns in group.items():
-            falls = int((np.diff(columns["t"]) < 0).sum())
-            if falls:
-                order = np.argsort(columns["t"], kind="stable")
-                group[key] = {column: values[order] for column, values in columns.items()}
-                reordered[key] = falls
+    streams = {key: _valid_rows(key, columns, meta, salvage) for key, columns in wanted.items()}
+    reordered: dict[str, int] = {}
+    streams, extra = (_in_order(group, reordered) for group in (streams, extra))
     if reordered:
         meta["reordered"] = reordered
     if not streams.keys() & {"tdoa", "range"}:
         raise InputError(
             f"{meta['source']}: holds no TDOA measurement; record the tag's TDOAs with the flight."
         )
-    tdoas, distances = Tdoas(*np.empty((4, 0))), None
+    tdoas, poses = Tdoas(*np.empty((4, 0))), None
     if "tdoa" in streams:
         tdoas = Tdoas(*_measured(streams["tdoa"], "a", "b"))
         meta["protocol"] = protocol(tdoas)
-    if "range" in streams:
-        distances = Ranges(*_measured(streams["range"], "anchor"))
-    imu = poses = None
-    if "gyro" in streams and "acc" in streams:
-        imu = _imu(streams["gyro"], streams["acc"], meta)
-    elif alone := streams.keys() & {"gyro", "acc"}:
-        name, missing = (
-            ("gyroscope", "accelerometer") if alone == {"gyro"} else ("accelerometer", "gyroscope")
-        )
-        evidence, remedy = f"there is no {missing}", f"record the {missing} too"
-        meta["losses"] = [
-            (f"the {name} is not used: the filter needs both inertial sensors", evidence, remedy)
-        ]
     if "pose" in streams:
         pose = streams["pose"]
         poses = Truth(pose["t"], _stack(pose, "x", "y", "z"), _stack(pose, "qx", "qy", "qz", "qw"))
-    height = pressure = velocity = None
+    imu = _inertial(streams, meta)
+    if not meta["remarks"]:
+        del meta["remarks"]
+    sensors = _sensors(streams, imu)
+    return Flight(name, anchors, tdoas, imu, poses, extra, meta, clock.restarts, **sensors)
+
+
+def _in_order(streams: Streams, reordered: dict[str, int]) -> Streams:
+    """Return the streams that are not empty, sorted by stamp; count falling stamps."""
+    out = {}
+    for key, columns in streams.items():
+        if not len(columns["t"]):
+            continue
+        falls = int((np.diff(columns["t"]) < 0).sum())
+        if falls:
+            order = np.argsort(columns["t"], kind="stable")
+            columns = {column: values[order] for column, values in columns.items()}
+            reordered[key] = falls
+        out[key] = columns
+    return out
+
+
+def _inertial(streams: Streams, meta: dict[str, Any]) -> Imu | None:
+    """Return the IMU stream; a single inertial sensor is a loss in `meta`."""
+    if "gyro" in streams and "acc" in streams:
+        return _imu(streams["gyro"], streams["acc"], meta)
+    alone = streams.keys() & {"gyro", "acc"}
+    if alone:
+        name, missing = (
+            ("gyroscope", "accelerometer") if alone == {"gyro"} else ("accelerometer", "gyroscope")
+        )
+        cause = f"the {name} is not used: the filter needs both inertial sensors"
+        meta["losses"] = [(cause, f"there is no {missing}", f"record the {missing} too")]
+    return None
+
+
+def _sensors(streams: Streams, imu: Imu | None) -> dict[str, Any]:
+    """Return the streams of other sensors, by their names in a Flight."""
+    out: dict[str, Any] = {}
+    if "range" in streams:
+        out["range"] = Ranges(*_measured(streams["range"], "anchor"))
     if "tof" in streams:
         tof = streams["tof"]
-        ranges = np.float32(1e-3 * np.asarray(tof["tof"], dtype=float)).astype(
-            float
-        )  # as a sensor_msgs/Range holds it
-        height = Height(tof["t"], np.where(ranges < NO_TARGET, ranges, np.inf))
+        # the precision of a sensor_msgs/Range
+        ranges = np.float32(1e-3 * np.asarray(tof["tof"], dtype=float)).astype(float)
+        out["height"] = Height(tof["t"], np.where(ranges < NO_TARGET, ranges, np.inf))
     if "baro" in streams:
         baro = _readings(streams["baro"], "baro")
-        pressure = Pressure(baro["t"], pressure_at(baro["baro"]))
+        out["pressure"] = Pressure(baro["t"], pressure_at(baro["baro"]))
+    height = out.get("height")
     if (
         "flow" in streams
         and imu is not None
@@ -137,36 +166,20 @@ def make_flight(
         and min(len(imu.t), np.isfinite(height.range).sum()) > 1
     ):
         t, x, y = (np.asarray(streams["flow"][name], dtype=float) for name in "txy")
-        velocity = velocity_of(t, x, y, height, imu)
-        velocity = velocity if len(velocity.t) else None
-    if not meta["remarks"]:
-        del meta["remarks"]
-    return Flight(
-        name,
-        anchors,
-        tdoas,
-        imu,
-        poses,
-        extra,
-        meta,
-        clock.restarts,
-        height=height,
-        pressure=pressure,
-        velocity=velocity,
-        range=distances,
-    )
+        velocity = flow_velocity(t, x, y, height, imu)
+        if len(velocity.t):
+            out["velocity"] = velocity
+    return out
 
 
 def _measured(columns: Columns, *ids: str) -> tuple[np.ndarray, ...]:
-    """(stamps s, ids of each anchor, values m, variances m^2, 0 where the tag does not know them),
-    (n,) each.
-    """
+    """Return (stamps s, ids of each anchor, values m, variances m^2 or 0 if unknown), (n,) each."""
     variance = columns["std"] ** 2 if "std" in columns else np.zeros(len(columns["t"]))
     return columns["t"], *(columns[name] for name in ids), columns["d"], variance
 
 
-def _sound(key: str, columns: Columns, meta: dict[str, Any], salvage: bool) -> Columns:
-    """The columns of a stream without what is not finite."""
+def _valid_rows(key: str, columns: Columns, meta: dict[str, Any], salvage: bool) -> Columns:
+    """Return the columns of a stream without rows that are not finite."""
     columns = {name: np.asarray(values) for name, values in columns.items()}
     numbers = dict(columns)
     if key == "pose" and all(np.isnan(columns[name]).all() for name in ("qx", "qy", "qz", "qw")):
@@ -198,32 +211,29 @@ def _sound(key: str, columns: Columns, meta: dict[str, Any], salvage: bool) -> C
 
 
 def _readings(columns: Columns, name: str) -> Columns:
-    """The rows of a sensor that is logged more often than it measures: where its value differs from
-    the one before.
-    """
+    """Return the rows where the value changes, for a sensor that is logged faster than it measures."""
     values = np.asarray(columns[name], dtype=float)
     new = np.flatnonzero(np.diff(values, prepend=np.nan) != 0.0)
     return {"t": columns["t"][new], name: values[new]}
 
 
 def protocol(tdoas: Tdoas) -> str:
-    """ "tdoa2", "tdoa3" or "tdoa, one reference", by which anchors are paired, whatever their ids
-    and the order of the two.
+    """Return "tdoa2", "tdoa3" or "tdoa, one reference", from the pairs of anchors.
 
-    TDoA2 anchors send in turn in fixed slots, and the tag takes the difference of two that follow
-    each other: the pairs are the sides of one ring, and others occur only where a packet was
-    missed. In TDoA3 any pair occurs (Bitcraze documentation). Where all anchors are compared with
-    the same one, neither says it. Measured, 37 recordings of eight anchors: 95 % and more are on
-    one ring with the one, at most 52 % on the eight most frequent pairs with the other. The sides
-    of three anchors are all pairs there are: then it is a ring if the order of the two never turns
-    round.
+    TDoA2 anchors send in turn in fixed slots, and the tag subtracts two consecutive arrivals. So
+    the pairs are the sides of one ring, except where a packet was missed. In TDoA3 any pair occurs
+    (Bitcraze documentation). If all anchors are compared with the same anchor, it is neither.
+
+    In 37 recordings with eight anchors, TDoA2 has 95 % and more on one ring. TDoA3 has 52 % at most
+    on the eight most frequent pairs. Three anchors have only three pairs: they are a ring if the
+    order of the two never changes.
     """
     ids, rows = np.unique(np.concatenate([tdoas.a, tdoas.b]), return_inverse=True)
     n, (a, b) = len(ids), rows.reshape(2, -1)
     directed = np.zeros((n, n))
     np.add.at(directed, (a, b), 1.0)
     heard = directed + directed.T
-    if n > 2 and heard.sum(axis=1).max() > REFERENCE * len(a):
+    if n > 2 and heard.sum(axis=1).max() > REFERENCE_SHARE * len(a):
         return "tdoa, one reference"
     pairs = np.stack(np.triu_indices(n, 1), axis=1)
     often = pairs[np.argsort(-heard[tuple(pairs.T)], kind="stable")[:n]]
@@ -236,9 +246,7 @@ def protocol(tdoas: Tdoas) -> str:
 
 
 def _is_ring(sides: np.ndarray, n: int) -> bool:
-    """Whether n sides (n, 2) of n corners close to one ring: each corner is on two of them, and all
-    hang together.
-    """
+    """Return whether n sides (n, 2) of n corners form one ring: two at each corner, all connected."""
     meets = coo_array((np.ones(len(sides)), tuple(sides.T)), (n, n))
     return bool(
         (np.bincount(sides.ravel(), minlength=n) == 2).all()
@@ -247,19 +255,18 @@ def _is_ring(sides: np.ndarray, n: int) -> bool:
 
 
 def _imu(gyro: Columns, acc: Columns, meta: dict[str, Any]) -> Imu:
-    """One stream of both sensors at the gyroscope's stamps.
+    """Return one stream of both sensors at the stamps of the gyroscope.
 
-    The firmware reads both at one instant and logs one after the other, some 20 us apart: sample n
-    goes with sample n as long as all stamps agree to half a period. Where they do not (an event was
-    lost), the accelerometer is interpolated linearly between its own samples, and gyroscope samples
-    outside of its time are left out.
+    The firmware reads both at one instant and logs one after the other, 20 us apart. Sample n
+    belongs to sample n if all stamps agree to half a period. Otherwise an event was lost: the
+    accelerometer is interpolated, and gyroscope samples outside of its time are dropped.
     """
     t, rate, force = gyro["t"], _stack(gyro, "x", "y", "z"), _stack(acc, "x", "y", "z")
     half_period = 0.5 * np.median(np.diff(t)) if len(t) > 1 else 0.0
     if len(t) != len(acc["t"]) or (np.abs(t - acc["t"]) > half_period).any():
         meta["imu_accel_interpolated"] = True
         inside = (t >= acc["t"][0]) & (t <= acc["t"][-1])
-        if losses := _losses_of(t, acc["t"], inside):
+        if losses := _imu_losses(t, acc["t"], inside):
             meta["losses"] = losses
         t, rate = t[inside], rate[inside]
         if not len(t):
@@ -273,22 +280,28 @@ def _imu(gyro: Columns, acc: Columns, meta: dict[str, Any]) -> Imu:
     return Imu(t, np.deg2rad(rate), force * GRAVITY)
 
 
-def _losses_of(gyro: np.ndarray, acc: np.ndarray, inside: np.ndarray) -> list[tuple[str, str, str]]:
-    """[(cause, evidence, remedy)] of what is lost of sensors with stamps gyro (n,) and acc (m,) s;
-    inside (n,) : whether a sample of the gyroscope counts.
+def _imu_losses(
+    gyro: np.ndarray, acc: np.ndarray, inside: np.ndarray
+) -> list[tuple[str, str, str]]:
+    """Return [(cause, evidence, remedy)] of unused samples.
+
+    Parameters
+    ----------
+    gyro, acc : (n,) and (m,) s, stamps.
+    inside : (n,) bool, gyroscope samples that are used.
     """
     out = []
     rates = [
         1.0 / max(float(np.median(np.diff(t))), 1e-9) if len(t) > 1 else 0.0 for t in (gyro, acc)
     ]
     evidence = f"gyroscope {rates[0]:.0f} Hz, accelerometer {rates[1]:.0f} Hz"
-    if max(rates) > UNEQUAL * min(rates):
+    if max(rates) > UNEQUAL_RATES * min(rates):
         cause = (
             "gyroscope and accelerometer have different rates: only the stamps of the gyroscope "
             "are used"
         )
         out.append((cause, evidence, "log both at one rate, e.g. in one block of the log"))
-    if (lost := float(np.mean(~inside))) > LOST:
+    if (lost := float(np.mean(~inside))) > DROPPED_SHARE:
         cause = "samples of the gyroscope are left out: the accelerometer was not recorded then"
         out.append(
             (cause, f"{100.0 * lost:.0f} % of them; {evidence}", "start and stop both together")
@@ -298,3 +311,46 @@ def _losses_of(gyro: np.ndarray, acc: np.ndarray, inside: np.ndarray) -> list[tu
 
 def _stack(columns: Columns, *names: str) -> np.ndarray:
     return np.stack([np.asarray(columns[name], dtype=float) for name in names], axis=1)
+
+
+def flow_velocity(
+    t: np.ndarray, x: np.ndarray, y: np.ndarray, height: Height, imu: Imu
+) -> Velocity:
+    """Return the velocity in the body frame, x and y, from an optical flow sensor at up to 25 Hz.
+
+    Needs a nearby range and the gyroscope. The sensor looks down and sees the ground rotate and
+    move. With the range h along its axis, x = -COUNTS (v_y / h + omega_x) and y = -COUNTS (v_x / h
+    - omega_y), in the axes of the Crazyflie's flow deck (flowdeck_v1v2.c of its firmware).
+
+    Parameters
+    ----------
+    t : (n,) s, ascending.
+    x, y : (n,) counts of single readings.
+    """
+    cell = np.unique((t * FLOW_RATE).astype(int), return_inverse=True)[1]
+    columns = (t, *(np.clip(counts, -FLOW_WILD, FLOW_WILD) for counts in (x, y)))
+    t, x, y = (np.bincount(cell, column) / np.bincount(cell) for column in columns)
+    t = t - 0.5 * FLOW_READING_TIME
+    seen = np.isfinite(height.range)
+    stamps, h = height.t[seen], np.interp(t, height.t[seen], height.range[seen])
+    near = np.abs(
+        t - stamps[np.clip(np.searchsorted(stamps, t), 1, len(stamps) - 1) - [[1], [0]]]
+    ).min(axis=0)
+    turns = np.cumsum(imu.gyro[:, :2] * np.gradient(imu.t)[:, None], axis=0)
+    ends = [
+        np.stack([np.interp(t + s, imu.t, turns[:, k]) for k in range(2)], axis=1)
+        for s in (-FLOW_TURN_TIME, FLOW_TURN_TIME)
+    ]
+    rate = (ends[1] - ends[0]) / (2.0 * FLOW_TURN_TIME)
+    v = np.stack(
+        [h * (rate[:, 1] - y / FLOW_COUNTS), -h * (rate[:, 0] + x / FLOW_COUNTS), np.zeros(len(t))],
+        axis=1,
+    )
+    known = (
+        (near < FLOW_NEAREST_RANGE)
+        & (t > imu.t[0] + FLOW_TURN_TIME)
+        & (t < imu.t[-1] - FLOW_TURN_TIME)
+    )
+    return Velocity(
+        t[known], v[known], np.tile([FLOW_STD, FLOW_STD, np.inf], (np.count_nonzero(known), 1))
+    )

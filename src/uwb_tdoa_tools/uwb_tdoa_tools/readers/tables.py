@@ -1,6 +1,6 @@
 """CSV tables with a header line.
 
-What is read at a time is a row: a file may have many more cells than memory would hold as text.
+Rows are read one by one, because the cells of a large file as text exceed the memory.
 """
 
 from __future__ import annotations
@@ -30,8 +30,9 @@ if TYPE_CHECKING:
 
 
 class CsvRows:
-    """Lists of cells, row by row, of CSV content, bytes. line : how many lines were read. Raises
-    csv.Error for what is no CSV, and InputError for what is no text.
+    """Iterate over the rows of CSV content (bytes), as lists of cells.
+
+    Raises csv.Error for invalid CSV, and InputError for bytes that are not text.
     """
 
     def __init__(self, path: str | Path, content: bytes, **options: Any) -> None:
@@ -41,7 +42,7 @@ class CsvRows:
 
     @property
     def line(self) -> int:
-        """Lines that were read."""
+        """Return the number of lines read so far."""
         return self._reader.line_num
 
     def __iter__(self) -> Iterator[list]:
@@ -62,7 +63,7 @@ class CsvRows:
 
 
 class CsvTable:
-    """(line, {column: text}) of each row of a CSV file. names : the columns of its header."""
+    """Iterate over (line, {column: text}) of the rows of a CSV file; `names` are its columns."""
 
     def __init__(
         self, path: str | Path, columns: Sequence[str] | None, most: int, complete: bool = True
@@ -106,7 +107,7 @@ class CsvTable:
             )
 
     def _each(self) -> Iterator[list[str]]:
-        """The rows that are not empty."""
+        """Yield the rows that are not empty."""
         try:
             yield from filter(None, self._rows)
         except csv.Error as error:
@@ -121,16 +122,22 @@ def read_table(
     most: int = SMALL_TABLE_CELLS,
     complete: bool = True,
 ) -> CsvTable:
-    """The CsvTable of a CSV file that has at least the columns, others passed over; default: of all
-    that it has. It may have `most` cells, divided by what the header has most of: commas,
-    semicolons or tabs. complete : a row with fewer cells than the header is refused; otherwise
-    those that are missing are empty. Raises InputError, also while it is iterated over.
+    """Return the CsvTable of a CSV file that has at least the columns; default: all of its columns.
+
+    The delimiter is the most frequent of comma, semicolon and tab in the header.
+
+    Parameters
+    ----------
+    most : largest number of cells.
+    complete : refuse rows with fewer cells than the header; otherwise missing cells are empty.
+
+    Raises InputError, also during the iteration.
     """
     return CsvTable(path, columns, most, complete)
 
 
 def read_numbers(path: str | Path, columns: Sequence[str]) -> np.ndarray:
-    """(n, k) float: the columns of a CSV file, all finite. Raises InputError."""
+    """Return the columns of a CSV file as finite numbers: (n, k). Raise InputError."""
     out = array("d")
     for line, row in read_table(path, columns, TABLE_CELLS):
         out.extend(number(path, line, row, name) for name in columns)
@@ -138,7 +145,7 @@ def read_numbers(path: str | Path, columns: Sequence[str]) -> np.ndarray:
 
 
 def number(path: str | Path, line: int, row: dict[str, str], column: str) -> float:
-    """A cell as a float. Raises InputError unless it is a finite number."""
+    """Return a cell as a float. Raise InputError unless it is finite."""
     try:
         value = float(row[column])
     except ValueError:
@@ -151,7 +158,7 @@ def number(path: str | Path, line: int, row: dict[str, str], column: str) -> flo
 
 
 def check_text(path: str | Path, content: bytes) -> None:
-    """Raises InputError for bytes that are no text."""
+    """Raise InputError for bytes that are not text."""
     try:
         content.decode()
     except UnicodeDecodeError as error:

@@ -8,6 +8,7 @@ import zlib
 
 import numpy as np
 
+from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.files import read_bytes
 from uwb_tdoa_bias.foundation.foreign_text import harmless
@@ -15,13 +16,13 @@ from uwb_tdoa_bias.foundation.limits import USD_TYPES, USD_VARIABLES, Budget
 
 from ..command_lines import SALVAGE
 from .streams import make_flight
-from .usd_scan import scan
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.anchors import Anchors
     from uwb_tdoa_bias.foundation.flight import Flight
 
     from .streams import Columns
+
 
 MAGIC = 0xBC
 _CRC_SIZE = 4
@@ -64,20 +65,21 @@ _STREAMS = {  # event name: our stream, {column in the log: column of the stream
 def read_usd_log(
     path: str | Path, anchors: Anchors, salvage: bool = False, truth: bool = True
 ) -> Flight:
-    """Flight of a micro-SD event log.
+    """Read a micro-SD event log ("uSD logger" of the Crazyflie firmware).
 
-    TDOAs come from estTDOA (d_B - d_A), or where there is none from the selected ones of
-    estTdoaCand (d_A - d_B), the IMU from estGyroscope (deg/s to rad/s) and estAcceleration (g to
-    m/s^2), the ground truth from estPose, the height from estTOF (mm to m), the pressure from
-    estBarometer (altitude to Pa) and the velocity from estFlow (pixel counts, with range and
-    gyroscope). Other events that occur are in `Flight.extra` under the names and in the units of
-    the log. Raises InputError for a file that is empty, foreign, cut or damaged (the checksum is
-    always verified), and for records that are not finite.
-    salvage : read a cut or damaged log up to there, as the power of a vehicle that fell leaves it;
-        `meta["remarks"]`
-        tells what is missing. Single values may be damaged then: nothing but the checksum could
-        tell.
-    Format: "uSD logger" of the Crazyflie firmware.
+    TDOAs come from estTDOA (d_B - d_A), else from the selected rows of estTdoaCand (d_A - d_B). The
+    IMU comes from estGyroscope (deg/s to rad/s) and estAcceleration (g to m/s^2), the ground truth
+    from estPose. The height comes from estTOF (mm to m), the pressure from estBarometer (altitude
+    to Pa), the velocity from estFlow (pixel counts, with range and gyroscope). `Flight.extra` keeps
+    other events, with the names and units of the log.
+
+    Parameters
+    ----------
+    salvage : read a damaged log up to the damage, e.g. after a crash. `meta["remarks"]` lists what
+        is missing. Single values may be wrong, because only the checksum could detect it.
+
+    Raises InputError for a file that is empty, foreign, cut or damaged (the checksum is always
+    verified), and for records that are not finite.
     """
     data = read_bytes(path)
     version, events, start = _read_header(path, data)
@@ -130,7 +132,7 @@ def read_usd_log(
 
 
 def _gather(raw: np.ndarray, at: np.ndarray, dtype: np.dtype) -> np.ndarray:
-    """Records of one kind at the offsets: (n,) structured array."""
+    """Return the records of one kind at the offsets: (n,) structured array."""
     rows = np.empty(len(at), dtype=dtype)
     inside = np.arange(dtype.itemsize)
     for first in range(0, len(at), _BLOCK):
@@ -140,7 +142,7 @@ def _gather(raw: np.ndarray, at: np.ndarray, dtype: np.dtype) -> np.ndarray:
 
 
 def _tdoa(path: str | Path, columns: Columns) -> Columns:
-    """The integers and doubles that `Tdoas` holds (the log has bytes and floats)."""
+    """Return the columns as the integers and doubles of `Tdoas`; the log has bytes and floats."""
     for name in ("a", "b"):
         values = columns[name].astype(float)
         bad = ~((values >= 0) & (values <= 65535) & (values == np.floor(values)))
@@ -157,7 +159,7 @@ def _tdoa(path: str | Path, columns: Columns) -> Columns:
 def _read_header(
     path: str | Path, data: bytes
 ) -> tuple[int, dict[int, tuple[str, list[tuple[str, str]]]], int]:
-    """Version, {id: (name, [(variable, numpy type), ...])} and where the events start."""
+    """Return version, {id: (name, [(variable, numpy type), ...])} and the offset of the events."""
     if data[0] != MAGIC:
         raise InputError(
             f"{path}: byte 0 is 0x{data[0]:02X}, a micro-SD event log starts with 0xBC; give "
@@ -229,9 +231,7 @@ def _read_header(
 
 
 def _damaged(path: str | Path, data: bytes, whole: bool, stopped: int) -> InputError:
-    """InputError of a log whose checksum is wrong, or whose events do not fill it. stopped: where
-    they end, or -1.
-    """
+    """Return the InputError of a log with a wrong checksum or a gap; `stopped` is its offset or -1."""
     if whole:
         return InputError(
             f"{path}: byte {stopped}: no event of a type that the header defines fits here, "
@@ -254,3 +254,33 @@ def _damaged(path: str | Path, data: bytes, whole: bool, stopped: int) -> InputE
         "it from the card again, "
         f"or {SALVAGE}."
     )
+
+
+@compiled
+def scan(
+    raw: np.ndarray, start: int, end: int, size_of_id: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, int]:
+    """Return the events in raw[start:end]: offsets, ids, and the offset of an invalid event or -1.
+
+    Parameters
+    ----------
+    size_of_id : (65536,) bytes of a whole event (id, stamp, payload), -1 for unknown ids.
+    """
+    smallest = 6  # id and version 1 stamp, no payload
+    room = max((end - start) // smallest, 0)
+    offsets = np.empty(room, dtype=np.int64)
+    ids = np.empty(room, dtype=np.uint16)
+    count = 0
+    at = start
+    while at < end:
+        if at + 2 > end:
+            return offsets[:count], ids[:count], at
+        number = raw[at] | (np.int64(raw[at + 1]) << 8)
+        size = size_of_id[number]
+        if size < 0 or at + size > end:
+            return offsets[:count], ids[:count], at
+        offsets[count] = at
+        ids[count] = number
+        count += 1
+        at += size
+    return offsets[:count], ids[:count], -1

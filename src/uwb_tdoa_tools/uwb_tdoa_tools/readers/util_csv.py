@@ -1,6 +1,4 @@
-"""CSV files of the UTIL dataset (Zhao et al., IJRR 2024), the full schema of 27 columns or a
-subset, plain or gzip.
-"""
+"""CSV files of the UTIL dataset (Zhao et al., IJRR 2024), plain or gzip, with all 27 columns or some."""
 
 from __future__ import annotations
 
@@ -55,18 +53,22 @@ _ROWS = 4096  # that are text at a time
 def read_util_csv(
     path: str | Path, anchors: Anchors, salvage: bool = False, truth: bool = True
 ) -> Flight:
-    """Flight of a CSV file in the UTIL schema; it must hold at least t_tdoa, idA, idB and
-    tdoa_meas.
+    """Read a CSV file in the UTIL schema; it needs at least t_tdoa, idA, idB and tdoa_meas.
 
-    Acceleration g to m/s^2, rates deg/s to rad/s, tof mm to m, baro m of altitude to Pa, flow
-    (pixel counts) to velocity. Ground truth without quaternion columns has NaN for q;
-    `meta["ignored_columns"]` names columns that the schema does not know. Raises InputError with
-    the line for a file that is empty, foreign or cut and for a cell that is not a finite number. A
-    plain file that was cut exactly between two lines cannot be told from a shorter one; a gzip file
-    can.
-    salvage : read a cut or damaged file up to there, and leave out records that are no numbers;
-        `meta["remarks"]`
-        tells what is missing.
+    Units change from g to m/s^2, deg/s to rad/s, tof from mm to m, baro from m of altitude to Pa,
+    flow from pixel counts to velocity. Ground truth without quaternion columns has NaN for q.
+    `meta["ignored_columns"]` lists columns outside of the schema.
+
+    A plain file that was cut exactly between two lines looks like a shorter one; a gzip file does
+    not.
+
+    Parameters
+    ----------
+    salvage : read a damaged file up to the damage and skip invalid records. `meta["remarks"]` lists
+        what is missing.
+
+    Raises InputError with the line for a file that is empty, foreign or cut, and for a cell that is
+    not a finite number.
     """
     remarks: list[str] = []
     content = _text(path, remarks, salvage)
@@ -89,13 +91,9 @@ def read_util_csv(
         }
     tdoa = streams["tdoa"]
     if salvage:
-        sound = np.isfinite(tdoa["a"]) & np.isfinite(tdoa["b"])
-        tdoa.update({name: values[sound] for name, values in tdoa.items()})
+        valid = np.isfinite(tdoa["a"]) & np.isfinite(tdoa["b"])
+        tdoa.update({name: values[valid] for name, values in tdoa.items()})
     tdoa["a"], tdoa["b"] = _ids(path, "idA", tdoa["a"]), _ids(path, "idB", tdoa["b"])
-    if "pose" in streams and "qx" not in streams["pose"]:
-        streams["pose"].update(
-            {name: np.full(len(streams["pose"]["t"]), np.nan) for name in _QUATERNION.values()}
-        )
 
     meta = {"source": str(path), "format": "UTIL CSV", "remarks": remarks}
     if ignored := [name for name in header if name not in _KNOWN]:
@@ -105,7 +103,7 @@ def read_util_csv(
 
 
 def is_util_csv(line: str) -> bool:
-    """Whether a first line of text is a header that `read_util_csv` can use or would explain."""
+    """Return whether a first line is a header that `read_util_csv` can use or explain."""
     return "t_tdoa" in line or "tdoa_meas" in line
 
 
@@ -128,8 +126,9 @@ def _text(path: str | Path, remarks: list[str], salvage: bool) -> bytes:
 def _unpacked(
     path: str | Path, content: bytes, most: int, remarks: list[str], salvage: bool
 ) -> bytes:
-    """What gzip holds, somewhat more than `most` bytes at most: its header does not tell how much
-    that is.
+    """Return the content of gzip data, limited to little more than `most` bytes.
+
+    The header of gzip data does not contain the size.
     """
     out, budget, problem = io.BytesIO(), Budget(path, len(content)), ""
     with GzipFile(
@@ -154,7 +153,7 @@ def _unpacked(
 def _table(
     path: str | Path, content: bytes, remarks: list[str], salvage: bool
 ) -> tuple[list[str], dict[str, _Column]]:
-    """Header, and {name: _Column} of the columns that are known, of rows of as many cells."""
+    """Return the header and {name: _Column} of the known columns."""
     if not content.endswith((b"\n", b"\r")):
         check_text(path, content)
         line = content.count(b"\n") + content.count(b"\r") - content.count(b"\r\n") + 1
@@ -203,14 +202,10 @@ def _add(block: list[list[str]], header: list[str], columns: dict[str, _Column])
 
 
 class _Column:
-    """What is needed of the cells of a column, of which there may be many more than memory would
-    hold as text.
-    """
+    """Numbers of a column; the cells as text would exceed the memory."""
 
     def __init__(self) -> None:
-        self._parts: list[
-            np.ndarray
-        ] = []  # numbers, NaN for what is none, up to the first empty cell
+        self._parts: list[np.ndarray] = []  # numbers or NaN, up to the first empty cell
         self._count = 0
         self.end: int | None = None  # row of the first empty cell
         # (row, text, is a number) of the first cell that is no finite number
@@ -218,7 +213,7 @@ class _Column:
         self.after: int | None = None  # row of the first cell after an empty one
 
     def add(self, cells: Sequence[str]) -> None:
-        """Take more cells, text."""
+        """Append cells."""
         cells = [cell.strip() for cell in cells]
         if self.end is None:
             filled = cells.index("") if "" in cells else len(cells)
@@ -249,10 +244,11 @@ class _Column:
 
     @property
     def length(self) -> int:
+        """Return the number of rows before the first empty cell."""
         return self._count if self.end is None else self.end
 
     def values(self, length: int) -> np.ndarray:
-        """The first numbers, (length,)."""
+        """Return the first numbers: (length,)."""
         return np.concatenate([np.empty(0), *self._parts])[:length]
 
 
@@ -274,8 +270,9 @@ def _check_header(path: str | Path, header: list[str]) -> None:
 def _numbers(
     path: str | Path, names: Iterable[str], cells: dict[str, _Column], salvage: bool
 ) -> Columns:
-    """{name: (n,) float array} of the columns of one sensor: the rows before the first empty cell.
-    NaN for what is no number, with salvage.
+    """Return {name: (n,) floats} of the columns of one sensor, up to the first empty cell.
+
+    With salvage, invalid cells become NaN.
     """
     columns = {name: cells[name] for name in names}
     length = min(column.length for column in columns.values())
@@ -311,7 +308,7 @@ def _is_number(cell: str) -> bool:
 
 
 def _ids(path: str | Path, name: str, values: np.ndarray) -> np.ndarray:
-    """Whole anchor ids 0 ... 65535 (the authors' converter writes them as 4 or 4.0)."""
+    """Return whole anchor ids 0 ... 65535; the authors' converter writes 4 or 4.0."""
     bad = np.flatnonzero((values != np.round(values)) | (values < 0) | (values > 65535))
     if len(bad):
         raise InputError(

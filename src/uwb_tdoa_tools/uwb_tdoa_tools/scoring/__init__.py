@@ -1,1 +1,1 @@
-"""Estimates against ground truth: figures, pictures, files for others."""
+"""Scoring: errors of estimates against ground truth."""

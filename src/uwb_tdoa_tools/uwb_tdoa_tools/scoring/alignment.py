@@ -1,12 +1,11 @@
-"""Ground truth is a sensor too: its clock and its frame beside those of an estimate.
+"""Align ground truth: compare its clock and its frame with those of an estimate.
 
-What is looked for, in this order, because one hides the next: other axes (z down, two exchanged),
-stamps that are late, or of another epoch, and a frame that is turned and shifted. Nothing is moved
-unless somebody asks for it.
+The search has an order, because one error hides the next: other axes (z down, two exchanged),
+delayed stamps or another epoch, then a rotated and shifted frame. Nothing is moved unless the
+caller asks for it.
 
-Stamps that are late by what the gyroscope and the accelerometer say are the fault of the ground
-truth. Where no inertial sensor shows it, only the difference of two clocks is known, that of the
-ground truth and that of the TDOAs.
+If gyroscope and accelerometer show the delay, the ground truth is late. Without an inertial sensor
+only the difference between the clocks of ground truth and TDOAs is known.
 """
 
 from __future__ import annotations
@@ -24,7 +23,8 @@ from ..checking.imu_rules import ARRANGEMENTS, signed_axis
 from ..checking.known_path import KnownPath
 from ..checking.motion_rules import FEWEST, TrueMotion
 from ..clock import grid
-from .metrics import ALIGN, judged_part, position_at
+from .metrics import position_at, scored_phase
+from .pooling import ALIGN
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -35,41 +35,36 @@ if TYPE_CHECKING:
     from ..checking.delays import Delays
 
 NONE, TIME, FRAME = ALIGN
+# Limits beside measured values were set on 37 recordings with a correct ground truth.
 OVERLAP = 1.0  # s that ground truth and TDOAs must have in common
-LATE, LEAST = (
-    0.965,
-    0.1,
-)  # of the power that is left with the stamps moved, and s; 37 measured recordings: 0.984 at least
-# of the median power over all delays: what tells a delay leaves less with the best one; measured:
-# 0.67 at most
-CONTRAST = 0.9
+LATE = 0.965  # largest ratio of the power after and before a delay is corrected; measured: >= 0.984
+LEAST = 0.1  # s, smallest delay that is reported
+CONTRAST = 0.9  # smallest power over the median power, over all delays; measured: <= 0.67
 RATE = 20.0  # Hz at which paths are compared
-AXES = 0.5  # of the error that must be left with other axes; measured recordings: 0.8 at least
-LONGEST = 1.6  # s at either end of a path that is left out, because stamps are moved by that much
-# rad and m that stand out; measured: 2.9, 8.2 degrees, 0.14, 0.35 m
+AXES = 0.5  # largest ratio of the errors with other axes and without; measured: >= 0.8
+LONGEST = 1.6  # s, largest delay in the search; left out at both ends of a path
+# rad, rad, m, m; filter errors reach 2.9 degrees, 8.2 degrees, 0.14 m and 0.35 m
 YAW, TILT, LEVEL, HEIGHT = np.deg2rad(4.0), np.deg2rad(12.0), 0.25, 0.6
-COMMON, ALIKE, APART = (
-    0.6,
-    1.3,
-    2.0,
-    # of the shorter path in common; error of the second best epoch over that of the best; s between
-    # them
-)
-# share by which a turned frame and stamps that are late may differ in what they leave, to be as
-# likely
-AS_WELL = 0.02
-FITS = 0.6  # of the size of the path, that may be left where an epoch is found
-EPOCH_STEP = 0.1  # s between epochs that are tried
+COMMON = 0.6  # smallest overlap of two paths, as a share of the shorter path
+DISTINCT_ERROR_RATIO = 1.3  # smallest ratio of the errors of the second best epoch and the best
+DISTINCT_EPOCHS = 2.0  # s, smallest difference between two epochs
+EQUALLY_LIKELY = 0.02  # relative difference of the errors of equally likely rotation and delay
+FITS = 0.6  # largest distance at the best epoch, relative to the size of the path
+EPOCH_STEP = 0.1  # s, resolution of the search for the epoch
 
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """Where a ground truth is beside an estimate. late : s, by which its stamps are late; source :
-    what shows that, "inertial" or "tdoa", None where nothing does; axes (3, 3) : what makes its
-    axes those of the survey; turn (3, 3), shift (3,) m : rotation and translation that bring it,
-    its axes put right, onto the estimate; middle (3,) m : of the path, at which a shift is given;
-    or_turned : whether a frame that is turned would explain as much as stamps that are late, as on
-    circles.
+    """Offset of a ground truth from an estimate, in time and space.
+
+    Attributes
+    ----------
+    late : s, delay of the stamps.
+    source : evidence for the delay: "inertial", "tdoa", or None.
+    axes : (3, 3), signed permutation to the axes of the survey.
+    turn, shift : (3, 3) and (3,) m, rotation and translation onto the estimate, after `axes`.
+    middle : (3,) m, middle of the path, at which the offset is given.
+    ambiguous : a rotated frame explains the data as well as a delay, as on circles.
     """
 
     late: float
@@ -78,48 +73,49 @@ class Alignment:
     turn: np.ndarray
     shift: np.ndarray
     middle: np.ndarray
-    or_turned: bool = False
+    ambiguous: bool = False
 
-    def applied(self, truth: Truth, how: str) -> Truth:
-        """The Truth with its clock put right ("time"), or its frame too ("frame"); "none" leaves it
-        as it is.
+    def applied_to(self, truth: Truth, how: str) -> Truth:
+        """Return the Truth with its clock corrected ("time"), or clock and frame ("frame").
+
+        "none" returns it unchanged.
         """
         if how == NONE:
             return truth
-        truth = _earlier(truth, self.late)
-        return truth if how == TIME else moved_frame(truth, self.turn @ self.axes, self.shift)
+        truth = _advanced(truth, self.late)
+        return truth if how == TIME else transform_truth(truth, self.turn @ self.axes, self.shift)
 
     @property
     def yaw(self) -> float:
-        """rad, by which the ground truth is turned against the estimate about the vertical."""
+        """Return the rotation of the ground truth against the estimate about the vertical, rad."""
         return float(
             np.arctan2(self.turn[0, 1] - self.turn[1, 0], self.turn[0, 0] + self.turn[1, 1])
         )
 
     @property
     def tilt(self) -> float:
-        """rad, between the verticals of the two."""
+        """Return the angle between the two verticals, rad."""
         return float(np.arccos(np.clip(self.turn[2, 2], -1.0, 1.0)))
 
     @property
-    def moved(self) -> np.ndarray:
-        """(3,) m, by which the ground truth is beside the estimate in the middle of its path."""
+    def offset(self) -> np.ndarray:
+        """Return the offset of the ground truth from the estimate in the middle of its path: (3,) m."""
         return self.middle - self.turn @ self.middle - self.shift
 
     @property
-    def other_axes(self) -> bool:
-        """Whether its axes are not those of the survey."""
+    def axes_differ(self) -> bool:
+        """Return whether its axes differ from those of the survey."""
         return not np.array_equal(self.axes, np.eye(3))
 
     @property
-    def other_frame(self) -> bool:
-        """Whether the frame is another one than what a filter errs by makes it seem."""
-        return self.other_axes or any(self._stands_out)
+    def frame_differs(self) -> bool:
+        """Return whether the frame differs by more than filter errors explain."""
+        return self.axes_differ or any(self._stands_out)
 
     @property
     def _stands_out(self) -> tuple[bool, bool, bool, bool]:
-        """Whether yaw, tilt, level shift and height are more than a filter errs by: (bool, ...)."""
-        x, y, z = np.abs(self.moved)
+        """Return whether yaw, tilt, level shift and height exceed usual errors of a filter."""
+        x, y, z = np.abs(self.offset)
         return (
             bool(abs(self.yaw) > YAW),
             bool(self.tilt > TILT),
@@ -127,10 +123,8 @@ class Alignment:
             bool(z > HEIGHT),
         )
 
-    def least(self) -> Alignment:
-        """The Alignment with those parts alone of turn and shift that stand out, and what goes with
-        a turn: the rest may be what the estimate errs by.
-        """
+    def significant(self) -> Alignment:
+        """Return the Alignment with only the parts of rotation and shift that exceed filter errors."""
         turned, tilted, level, height = self._stands_out
         level = level or turned or tilted
         turn = (
@@ -138,60 +132,57 @@ class Alignment:
             if tilted
             else Rotation.from_euler("z", -self.yaw if turned else 0.0).as_matrix()
         )
-        there = self.middle - self.moved * (level, level, height)
+        there = self.middle - self.offset * (level, level, height)
         return replace(self, turn=turn, shift=there - turn @ self.middle)
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON: s, degrees, m."""
+        """Return the figures for JSON: s, degrees, m."""
         return {
             "late": self.late,
             "told_by": self.source,
             "axes": self.axes.astype(int).tolist(),
             "yaw": float(np.rad2deg(self.yaw)),
             "tilt": float(np.rad2deg(self.tilt)),
-            "shift": self.moved.tolist(),
+            "shift": self.offset.tolist(),
         }
 
-    def of_clock(self) -> str | None:
-        """Sentence on a clock that is off; None if it is not."""
+    def clock_sentence(self) -> str | None:
+        """Return a sentence on a clock that differs, else None."""
         if not self.late:
             return None
         if abs(self.late) > LONGEST:
             return (
                 f"the ground truth is on another clock: its stamps are {self.late:.2f} s ahead of "
-                "those of the TDOAs"
+                "the TDOAs"
             )
         by = f"{abs(self.late):.2f} s {'late' if self.late > 0.0 else 'early'}"
         if self.source == "inertial":
-            return (
-                f"the stamps of the ground truth are {by}, as the gyroscope and the accelerometer "
-                "tell"
-            )
+            return f"the stamps of the ground truth are {by}, as gyroscope and accelerometer show"
         turned = (
-            ", or the frame of the truth is turned: along this path one looks like the other"
-            * self.or_turned
+            ", or the frame of the truth is turned: on this path both explain the data"
+            * self.ambiguous
         )
         apart_by = f"ground truth or TDOAs are {abs(self.late):.2f} s apart"
         return (
-            f"{apart_by} (the truth {by}, or the TDOAs the other way{turned}); no inertial sensor "
-            "tells which"
+            f"{apart_by} (the truth {by}, or the TDOAs the other way{turned}); an inertial "
+            "sensor would show which"
         )
 
-    def of_frame(self) -> str | None:
-        """Sentence on a frame that is another one; None if it is not."""
-        if not self.other_frame:
+    def frame_sentence(self) -> str | None:
+        """Return a sentence on a frame that differs, else None."""
+        if not self.frame_differs:
             return None
         parts = (
             [f"its axes x, y, z are {_axes_in_words(self.axes)} of the survey"]
-            if self.other_axes
+            if self.axes_differ
             else []
         )
         parts.append(self.frame_in_words())
         return "the ground truth is in another frame than the survey: " + "; ".join(parts)
 
     def frame_in_words(self) -> str:
-        """By how much the frames differ, as numbers."""
-        x, y, z = self.moved
+        """Return the difference of the frames as numbers."""
+        x, y, z = self.offset
         turned = (
             f"turned by {np.rad2deg(self.yaw):.1f} degrees about the vertical, tilted by "
             f"{np.rad2deg(self.tilt):.1f}"
@@ -199,9 +190,10 @@ class Alignment:
         return f"{turned}, shifted by ({x:.2f}, {y:.2f}, {z:.2f}) m"
 
 
-def need_truth(flight: Flight, one_clock: bool = True) -> None:
-    """Raise InputError if the Flight has no ground truth, or, unless `one_clock` is False, one on
-    another clock than its TDOAs.
+def require_truth(flight: Flight, one_clock: bool = True) -> None:
+    """Raise InputError if the Flight has no ground truth to compare with.
+
+    If `one_clock`, a ground truth on another clock than the TDOAs is refused too.
     """
     if flight.truth is None or len(flight.truth) < 2:
         raise InputError(f"{flight.name}: it holds no ground truth to compare with.")
@@ -216,9 +208,7 @@ def need_truth(flight: Flight, one_clock: bool = True) -> None:
 
 
 def on_another_clock(flight: Flight) -> bool:
-    """Whether the ground truth of a Flight, at least two poses, has hardly an instant in common
-    with its TDOAs.
-    """
+    """Return whether ground truth (at least two poses) and TDOAs have hardly a time in common."""
     assert flight.truth is not None
     truth, tdoa = flight.truth.t, flight.tdoa.t
     if not len(tdoa):
@@ -227,67 +217,73 @@ def on_another_clock(flight: Flight) -> bool:
     return bool(common < min(OVERLAP, 0.5 * (truth[-1] - truth[0]), 0.5 * (tdoa[-1] - tdoa[0])))
 
 
-def apart(path: np.ndarray, other: np.ndarray) -> float:
-    """m, root of the median square distance of two paths (n, 3)."""
+def median_distance(path: np.ndarray, other: np.ndarray) -> float:
+    """Return the root of the median square distance of two paths (n, 3) m, in m."""
     return float(np.sqrt(np.median(np.sum((path - other) ** 2, axis=1)))) if len(path) else np.inf
 
 
-def alignment_of(flight: Flight, odometry: PoseColumns) -> Alignment:
-    """Alignment of the ground truth of a Flight beside an Odometry. Raises InputError where it is
-    on another clock, and the paths do not tell on which.
+def estimate_alignment(flight: Flight, odometry: PoseColumns) -> Alignment:
+    """Estimate the Alignment of the ground truth of a Flight with an Odometry.
+
+    Raises InputError if the truth is on another clock and the paths do not determine the offset.
     """
     assert flight.truth is not None
     epoch = _epoch(flight, odometry) if on_another_clock(flight) else 0.0
-    truth = _earlier(flight.truth, epoch)
+    truth = _advanced(flight.truth, epoch)
     axes = _other_axes(truth, odometry)
-    truth = moved_frame(truth, axes, np.zeros(3))
+    truth = transform_truth(truth, axes, np.zeros(3))
     flight = replace(flight, truth=truth)
-    late, source = _late(flight, exact=epoch != 0.0)
-    behind = _behind(flight, late) if source == "inertial" else 0.0
-    ratio = _turned_or_late(flight, odometry, late, behind)
-    if ratio < 1.0 - AS_WELL and source == "tdoa" and not epoch:
+    late, source = _truth_delay(flight, exact=epoch != 0.0)
+    behind = _tdoa_delay(flight, late) if source == "inertial" else 0.0
+    ratio = _rotation_to_delay_ratio(flight, odometry, late, behind)
+    if ratio < 1.0 - EQUALLY_LIKELY and source == "tdoa" and not epoch:
         late = 0.0
     if ratio < 1.0:
         behind = 0.0
-    true, estimated = paths(_earlier(truth, late + behind), odometry)
-    turn, shift = rigid(true, estimated) if len(true) >= FEWEST else (np.eye(3), np.zeros(3))
+    true, estimated = common_paths(_advanced(truth, late + behind), odometry)
+    turn, shift = (
+        rigid_transform(true, estimated) if len(true) >= FEWEST else (np.eye(3), np.zeros(3))
+    )
     middle = true.mean(axis=0) if len(true) else np.zeros(3)
-    or_turned = bool(late and source == "tdoa" and ratio < 1.0 + AS_WELL)
-    return Alignment(epoch + late, source, axes, turn, shift, middle, or_turned)
+    ambiguous = bool(late and source == "tdoa" and ratio < 1.0 + EQUALLY_LIKELY)
+    return Alignment(epoch + late, source, axes, turn, shift, middle, ambiguous)
 
 
-def _turned_or_late(flight: Flight, odometry: PoseColumns, late: float, behind: float) -> float:
-    """What is left of the distance of the paths if the frame is turned, over what is left if ground
-    truth and TDOAs are apart in time too: below 1 the turn is all of it. Infinite where they are
-    not apart, or nobody can tell.
+def _rotation_to_delay_ratio(
+    flight: Flight, odometry: PoseColumns, late: float, behind: float
+) -> float:
+    """Return the remaining distance for a rotated frame over that for a delay.
+
+    Below 1, the rotation explains everything. Infinite if there is no delay or too little data.
     """
     assert flight.truth is not None
     if not (behind or late):
         return np.inf
     pairs = [
-        paths(_earlier(flight.truth, by), odometry)
+        common_paths(_advanced(flight.truth, by), odometry)
         for by in ((late, late + behind) if behind else (0.0, late))
     ]
     if min(len(true) for true, _ in pairs) < FEWEST:
         return np.inf
-    return _left(*pairs[0]) / max(_left(*pairs[1]), 1e-9)
+    return _aligned_rms(*pairs[0]) / max(_aligned_rms(*pairs[1]), 1e-9)
 
 
-def _earlier(truth: Truth, seconds: float) -> Truth:
-    """The Truth with stamps that much earlier."""
+def _advanced(truth: Truth, seconds: float) -> Truth:
+    """Return the Truth with earlier stamps."""
     return replace(truth, t=truth.t - seconds)
 
 
-def _left(path: np.ndarray, other: np.ndarray) -> float:
-    """m, root mean square distance of two paths (n, 3) after one was laid onto the other."""
-    turn, shift = rigid(path, other)
+def _aligned_rms(path: np.ndarray, other: np.ndarray) -> float:
+    """Return the root mean square distance of two paths (n, 3) m after alignment, in m."""
+    turn, shift = rigid_transform(path, other)
     return float(np.sqrt(np.mean(np.sum((path @ turn.T + shift - other) ** 2, axis=1))))
 
 
-def rigid(path: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(rotation (3, 3), translation (3,) m) that bring a path (n, 3) m onto another one, robustly
-    (Umeyama, Least-squares estimation of transformation parameters between two point patterns, IEEE
-    PAMI 1991, without scale).
+def rigid_transform(path: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Fit rotation (3, 3) and translation (3,) m from a path (n, 3) m to another, robustly.
+
+    Umeyama, Least-squares estimation of transformation parameters between two point patterns, IEEE
+    PAMI 1991, without scale, reweighted.
     """
     weight = np.ones(len(path))
     for _ in range(5):
@@ -299,10 +295,11 @@ def rigid(path: np.ndarray, other: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return turn, there - turn @ here
 
 
-def _late(flight: Flight, exact: bool) -> tuple[float, str | None]:
-    """(s, source) by which the ground truth of a Flight is late: by the inertial sensor if that
-    shows it, else against the TDOAs; (0, None) where neither does. exact : whether the least
-    counts.
+def _truth_delay(flight: Flight, exact: bool) -> tuple[float, str | None]:
+    """Return (delay s, source) of the ground truth of a Flight.
+
+    The inertial sensor decides if it shows a delay, otherwise the TDOAs. (0, None) if neither does.
+    With `exact`, the smallest delay counts.
     """
     assert flight.truth is not None
     found, source = _inertial(flight), "inertial"
@@ -310,33 +307,28 @@ def _late(flight: Flight, exact: bool) -> tuple[float, str | None]:
         found, source = of_tdoas(KnownPath(flight)), "tdoa"
     if found is None:
         return 0.0, None
-    if not exact and not _is_late(*found.constant()):
+    if not exact and not _is_significant(*found.constant()):
         return 0.0, source
     late = -found.exact()
-    moved = replace(
-        flight, truth=_earlier(flight.truth, late)
-    )  # once more from there: a parabola is off between what is tried
+    # a parabola between the tried delays is inexact: repeat from its minimum
+    moved = replace(flight, truth=_advanced(flight.truth, late))
     again = _inertial(moved) if source == "inertial" else of_tdoas(KnownPath(moved))
     return late - (again.exact() if again else 0.0), source
 
 
-def _behind(flight: Flight, late: float) -> float:
-    """s by which the ground truth of a Flight, with its own `late` taken out, is later than the
-    TDOAs, and so than an estimate.
-    """
+def _tdoa_delay(flight: Flight, late: float) -> float:
+    """Return the delay of the ground truth against the TDOAs, s, after its own delay `late`."""
     assert flight.truth is not None
-    found = of_tdoas(KnownPath(replace(flight, truth=_earlier(flight.truth, late))))
-    return -found.exact() if found and _is_late(*found.constant()) else 0.0
+    found = of_tdoas(KnownPath(replace(flight, truth=_advanced(flight.truth, late))))
+    return -found.exact() if found and _is_significant(*found.constant()) else 0.0
 
 
-def _is_late(ratio: float, delay: float) -> bool:
+def _is_significant(ratio: float, delay: float) -> bool:
     return ratio < LATE and abs(delay) >= LEAST
 
 
 def _inertial(flight: Flight) -> Delays | None:
-    """Delays of the inertial samples of a Flight against its ground truth; None where they do not
-    tell.
-    """
+    """Return the delays of the inertial samples against the ground truth; None without contrast."""
     assert flight.truth is not None
     if (
         flight.imu is None
@@ -353,33 +345,32 @@ def _inertial(flight: Flight) -> Delays | None:
 
 
 def _other_axes(truth: Truth, odometry: PoseColumns) -> np.ndarray:
-    """(3, 3) signed permutation after which the ground truth is much nearer to the estimate; the
-    identity if there is none.
-    """
-    true, estimated = paths(truth, odometry)
+    """Return the signed permutation (3, 3) that brings the truth much nearer, else the identity."""
+    true, estimated = common_paths(truth, odometry)
     if len(true) < FEWEST:
         return np.eye(3)
 
     def error(axes: np.ndarray) -> float:
-        return apart(true @ axes.T, estimated)
+        return median_distance(true @ axes.T, estimated)
 
     best = min(ARRANGEMENTS, key=error)
     return best if error(best) < AXES * error(np.eye(3)) else np.eye(3)
 
 
-def paths(truth: Truth, odometry: PoseColumns) -> tuple[np.ndarray, np.ndarray]:
-    """(true (n, 3), estimated (n, 3)) m at the same instants, while the tag moves."""
+def common_paths(truth: Truth, odometry: PoseColumns) -> tuple[np.ndarray, np.ndarray]:
+    """Return (true (n, 3), estimated (n, 3)) m at the same instants, while the tag moves."""
     if len(odometry.t) < 2:
         return np.empty((0, 3)), np.empty((0, 3))
-    _, first, last = judged_part(truth)
+    _, first, last = scored_phase(truth)
     begin, end = max(first, odometry.t[0]) + LONGEST, min(last, odometry.t[-1]) - LONGEST
     t = grid(begin, end, 1.0 / RATE, odometry.t)
     return position_at(t, truth), position_at(t, odometry)
 
 
 def _epoch(flight: Flight, odometry: PoseColumns) -> float:
-    """s by which the stamps of a ground truth on another clock are late: where its path is nearest
-    to that of the estimate, as it is, or else, about its middle, with other axes.
+    """Return the offset of the stamps of a ground truth on another clock, s.
+
+    It minimizes the distance between the paths: as they are, or about their middle with other axes.
     """
     assert flight.truth is not None
     truth = flight.truth
@@ -400,45 +391,49 @@ def _epoch(flight: Flight, odometry: PoseColumns) -> float:
         ((ours, theirs), (np.eye(3),)),
         ((ours - ours.mean(axis=0), theirs - theirs.mean(axis=0)), ARRANGEMENTS),
     ):
-        error = _apart_by_lag(pair[0], pair[1], lags, arrangements)
+        error = _distance_by_lag(pair[0], pair[1], lags, arrangements)
         best = int(np.argmin(error))
-        others = np.min(error[np.abs(lags - lags[best]) > APART / EPOCH_STEP], initial=np.inf)
-        if error[best] < FITS * size and others >= ALIKE * error[best]:
+        others = np.min(
+            error[np.abs(lags - lags[best]) > DISTINCT_EPOCHS / EPOCH_STEP], initial=np.inf
+        )
+        if error[best] < FITS * size and others >= DISTINCT_ERROR_RATIO * error[best]:
             return float(truth.t[0] - odometry.t[0] - lags[best] * EPOCH_STEP)
         tried.append(f"the nearest is {error[best]:.2f} m off, another one {others:.2f} m")
     raise InputError(
         f"{flight.name}: the ground truth is on another clock than the TDOAs, and its path "
-        f"does not tell on which ({tried[0]}; with other axes "
+        f"does not determine the offset ({tried[0]}; with other axes "
         f"{tried[1]}): write both on one clock."
     )
 
 
-def _apart_by_lag(
+def _distance_by_lag(
     ours: np.ndarray, theirs: np.ndarray, lags: np.ndarray, arrangements: Sequence[np.ndarray]
 ) -> np.ndarray:
-    """m, root mean square distance of two paths (n, 3), (m, 3) m at each lag (k,) of the second,
-    with the best of some arrangements (3, 3) of its axes; infinite where they have too little in
-    common.
+    """Return the root mean square distance of two paths at each lag (k,), m.
+
+    The paths are (n, 3) and (m, 3) m. The best arrangement (3, 3) of the axes counts. Too little
+    overlap gives inf.
     """
     common = np.minimum(lags + len(theirs), len(ours)) - np.maximum(lags, 0)
-    square = _over(np.sum(ours**2, axis=1), np.ones(len(theirs))) + _over(
+    square = _cross_correlation(np.sum(ours**2, axis=1), np.ones(len(theirs))) + _cross_correlation(
         np.ones(len(ours)), np.sum(theirs**2, axis=1)
     )
-    products = np.array([[_over(mine, its) for its in theirs.T] for mine in ours.T])
+    products = np.array([[_cross_correlation(mine, its) for its in theirs.T] for mine in ours.T])
     square -= 2.0 * np.max([np.tensordot(axes, products) for axes in arrangements], axis=0)
     error = np.sqrt(np.maximum(square, 0.0) / common)
     error[common < COMMON * min(len(ours), len(theirs))] = np.inf
     return error
 
 
-def _over(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
-    """Sums of products over what both have in common, with theirs moved by each lag."""
+def _cross_correlation(ours: np.ndarray, theirs: np.ndarray) -> np.ndarray:
+    """Return the sums of products over the overlap at each lag."""
     return np.correlate(ours, theirs, mode="full")
 
 
-def moved_frame(truth: Truth, axes: np.ndarray, shift: np.ndarray) -> Truth:
-    """The Truth in a frame whose axes are (3, 3) others, then shifted by (3,) m. Attitudes stay
-    where it is mirrored: whatever they are, turns of the body are the same.
+def transform_truth(truth: Truth, axes: np.ndarray, shift: np.ndarray) -> Truth:
+    """Return the Truth with axes (3, 3) and shift (3,) m applied.
+
+    A mirrored frame leaves the attitudes unchanged: rotations of the body are the same.
     """
     p, known = truth.p @ axes.T + shift, np.isfinite(truth.q).all(axis=1)
     q = truth.q.copy()
@@ -448,5 +443,5 @@ def moved_frame(truth: Truth, axes: np.ndarray, shift: np.ndarray) -> Truth:
 
 
 def _axes_in_words(axes: np.ndarray) -> str:
-    """Which axis of the survey each axis of the ground truth is: "x, y, -z"."""
+    """Return the survey axis of each axis of the ground truth: "x, y, -z"."""
     return ", ".join(map(signed_axis, axes.T))

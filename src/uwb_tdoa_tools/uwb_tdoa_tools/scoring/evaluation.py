@@ -1,20 +1,39 @@
-"""The filter run over a flight, and judged."""
+"""Run the filter over a flight and score it; align its ground truth before that."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
+from uwb_tdoa_bias.effects import RADIO, EffectSet, true_samples
+
+from ..checking.repairs import repairs
 from ..estimate import FlightEstimator
-from .alignment import need_truth
+from ..readers.inputs import report_remarks
+from .alignment import (
+    FRAME,
+    NONE,
+    TIME,
+    common_paths,
+    estimate_alignment,
+    median_distance,
+    on_another_clock,
+    require_truth,
+)
 from .metrics import Score
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.correction.network import Network
-    from uwb_tdoa_bias.effects.effect_set import EffectSet
     from uwb_tdoa_bias.foundation.flight import Flight, Truth
     from uwb_tdoa_ekf.core.config import FilterConfig
     from uwb_tdoa_ekf.offline import Run
+
+    from .alignment import Alignment
+
+# largest ratio of the distances with repaired ids and signs, and with another frame
+LARGEST_LABEL_RATIO = 1.5
 
 
 def evaluate(
@@ -25,16 +44,22 @@ def evaluate(
 ) -> tuple[Score, Run]:
     """Run the filter over a Flight with ground truth.
 
-    Returns (Score, Run). Raises InputError if there is no truth.
+    Returns
+    -------
+    score : Score.
+    run : Run.
+
+    Raises InputError without ground truth.
     """
     return score_of(flight, FlightEstimator(config, effects, network))
 
 
 def score_of(flight: Flight, estimator: FlightEstimator) -> tuple[Score, Run]:
-    """(Score, Run) of a Flight with ground truth, by a FlightEstimator. Raises InputError if there
-    is no truth, or one on another clock.
+    """Run a FlightEstimator over a Flight with ground truth and score it.
+
+    Returns (Score, Run). Raises InputError without ground truth, or with one on another clock.
     """
-    need_truth(flight)
+    require_truth(flight)
     run = estimator(flight)
     return Score(
         flight.name,
@@ -46,9 +71,130 @@ def score_of(flight: Flight, estimator: FlightEstimator) -> tuple[Score, Run]:
 
 
 def corrected_truth(flight: Flight, effects: EffectSet | None = None) -> Truth:
-    """The Truth to compare estimates with: that of the Flight, which has one, without what the
-    EffectSet says is wrong with it.
-    """
+    """Return the ground truth of a Flight without its errors that the EffectSet describes."""
     truth = effects.correct_streams(replace(flight, imu=None)).truth if effects else flight.truth
     assert truth is not None
     return truth
+
+
+def align_truth(
+    flight: Flight,
+    effects: EffectSet | None = None,
+    config: FilterConfig | None = None,
+    align: str = NONE,
+) -> tuple[Flight, tuple[str, ...]]:
+    """Move the ground truth to the clock and frame of the TDOAs where it clearly differs.
+
+    The moved truth only serves scoring and learning. Effects for the nodes do not contain the
+    difference.
+
+    Parameters
+    ----------
+    flight : Flight with ground truth.
+    effects : known effects, or None.
+    align : one of ALIGN. With "none", a ground truth on another clock is refused.
+
+    Returns
+    -------
+    flight : Flight with the moved truth.
+    sentences : what was found.
+
+    Raises InputError.
+    """
+    require_truth(flight, align == NONE)
+    assert flight.truth is not None
+    effects = effects or EffectSet()
+    found = _alignment(flight, effects, config)
+    sentences = [
+        f"{words}: it is moved to judge by, and nothing of that goes to the nodes"
+        for words in (found.clock_sentence(), found.frame_sentence())
+        if words
+    ]
+    return replace(
+        flight,
+        truth=found.significant().applied_to(flight.truth, FRAME if found.frame_differs else TIME),
+    ), tuple(sentences)
+
+
+def with_aligned_truth(
+    flight: Flight,
+    effects: EffectSet | None = None,
+    config: FilterConfig | None = None,
+    align: str = NONE,
+) -> Flight:
+    """Return the Flight of `align_truth` and print the findings on stderr.
+
+    Other processes can call it (it can be pickled).
+    """
+    flight, sentences = align_truth(flight, effects, config, align)
+    report_remarks(flight.name, (f"{sentence}." for sentence in sentences))
+    return flight
+
+
+def on_one_clock(flight: Flight, align: str = NONE) -> Flight:
+    """Move the ground truth, if there is one, to the clock of the TDOAs.
+
+    With align "none", a ground truth on another clock is refused. Raises InputError.
+    """
+    if flight.truth is None or len(flight.truth) < 2 or not on_another_clock(flight):
+        return flight
+    require_truth(flight, align == NONE)
+    found = estimate_alignment(flight, FlightEstimator()(flight).odometry)
+    report_remarks(flight.name, [f"{found.clock_sentence()}: they are moved."])
+    return replace(flight, truth=found.applied_to(flight.truth, TIME))
+
+
+def _alignment(flight: Flight, effects: EffectSet, config: FilterConfig | None) -> Alignment:
+    """Return the Alignment of a Flight.
+
+    If wrong ids and signs explain the difference of the frames as well, they are repaired first.
+    """
+    straight, odometry = (
+        effects.correct_streams(flight),
+        FlightEstimator(config, effects)(flight).odometry,
+    )
+    assert straight.truth is not None
+    found = estimate_alignment(straight, odometry)
+    if found.frame_differs and _ranges_fit(straight, effects, found):
+        found = replace(found, axes=np.eye(3), turn=np.eye(3), shift=np.zeros(3))
+    repair = (
+        EffectSet(repairs(replace(straight, truth=found.applied_to(straight.truth, TIME))))
+        if found.frame_differs
+        else EffectSet()
+    )
+    if not len(repair):
+        return found
+    of_labels = FlightEstimator(config, effects)(repair.correct_streams(flight)).odometry
+    error = median_distance(*common_paths(found.applied_to(straight.truth, TIME), of_labels))
+    left = median_distance(*common_paths(found.applied_to(straight.truth, FRAME), odometry))
+    return (
+        estimate_alignment(repair.correct_streams(straight), of_labels)
+        if error < LARGEST_LABEL_RATIO * left
+        else found
+    )
+
+
+def _ranges_fit(flight: Flight, effects: EffectSet, found: Alignment) -> bool:
+    """Return whether ranges to anchors support the frame of the ground truth as it is.
+
+    Delays of anchors distort the estimate, but are only constants in ranges. False without ranges.
+    """
+    assert flight.truth is not None
+    for channel in (
+        name for name, kind in RADIO.items() if kind.ends == 1 and getattr(flight, name) is not None
+    ):
+        stream = getattr(flight, channel)
+        away = []
+        for how in (TIME, FRAME):
+            samples, rows = true_samples(
+                replace(flight, truth=found.significant().applied_to(flight.truth, how)),
+                RADIO[channel],
+            )
+            left = stream.d[rows] - samples.true() - effects.bias(samples)
+            apart = [
+                np.abs(left[samples.b == anchor] - np.median(left[samples.b == anchor]))
+                for anchor in np.unique(samples.b)
+            ]
+            away.append(np.median(np.concatenate(apart)) if apart else np.nan)
+        return bool(away[0] <= away[1])
+    return False

@@ -1,26 +1,99 @@
-"""How an error changes, in words that have no sign to mistake: it falls, or rises, by so many per
-cent.
-"""
+"""How an error changes, and the share of a correction that flights support."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    Errors = dict[
+        str, dict[float | None, float]
+    ]  # {flight: {share, None for no correction: 3D RMSE of the filter, m}}
+
+
 SAME = 0.005  # of the error: what rounds to no per cent
+SHARES = 0.0, 0.5, 0.75, 1.0
 
 
 def gain(before: float, after: float) -> float:
-    """Return the share of an error that is gone: above 0 where it falls, below 0 where it rises."""
+    """Return the relative reduction of an error; negative if the error rises."""
     return 1.0 - after / before
 
 
-def change_of(before: float, after: float) -> str:
+def change_in_words(before: float, after: float) -> str:
     """Return how an error changes: "falls by 13 %", "rises by 20 %" or "stays"."""
-    return by(gain(before, after))
+    return gain_in_words(gain(before, after))
 
 
-def by(gained: float) -> str:
-    """Return the same of a `gain`."""
+def gain_in_words(gained: float) -> str:
+    """Return a `gain` in the same words."""
     return (
         "stays"
         if abs(gained) < SAME
         else f"{'falls' if gained > 0.0 else 'rises'} by {100.0 * abs(gained):.0f} %"
     )
+
+
+@dataclass(frozen=True)
+class Shrinkage:
+    """Share of a correction that cross-validation over flights supports.
+
+    Attributes
+    ----------
+    share : share of the prediction to subtract.
+    errors : {flight: {share: 3D RMSE of the filter, m}}; the key None is without correction.
+    """
+
+    share: float
+    errors: Errors
+
+    @property
+    def gains(self) -> np.ndarray:
+        """Return the `gain` of each flight with the share: (n,)."""
+        return np.array([gain(of[None], of[self.share]) for of in self.errors.values()])
+
+    def as_text(self) -> str:
+        """Return the expected gain as one sentence."""
+        gains = self.gains
+        return (
+            f"expected of flights like these: the 3D RMSE {gain_in_words(gains.mean())} +- "
+            f"{100.0 * _spread(gains):.0f} % "
+            f"(of {len(gains)} flights, each left out; on the worst it {gain_in_words(gains.min())}), "
+            f"with {self.share:g} of what is predicted taken out"
+        )
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the figures for JSON."""
+        gains = self.gains
+        errors = {
+            name: {str(share): error for share, error in of.items()}
+            for name, of in self.errors.items()
+        }
+        return {
+            "share": self.share,
+            "gain": gains.mean(),
+            "spread": _spread(gains),
+            "worst": gains.min(),
+            "left_out": errors,
+        }
+
+
+def best_share(errors: Errors) -> float:
+    """Return the share with the smallest relative error, one standard deviation above its mean.
+
+    Mean and standard deviation are over the left-out flights in `errors`, see Shrinkage. Errors are
+    relative to no correction. The mean alone would favour a model that gains much on three flights
+    and harms the fourth. Future flights vary more than these.
+    """
+    ratios = {
+        share: np.array([of[share] / of[None] for of in errors.values()])
+        for share in SHARES
+        if all(share in of for of in errors.values())
+    }
+    return min(ratios, key=lambda share: ratios[share].mean() + _spread(ratios[share]))
+
+
+def _spread(gains: np.ndarray) -> float:
+    return float(gains.std(ddof=1)) if len(gains) > 1 else 0.0

@@ -1,26 +1,30 @@
-"""The phases of a recording, by what its ground truth tells of the motion. Together they are the
-whole recording; some overlap.
+"""The phases of a recording, from the motion in its ground truth.
 
-    at_rest_earlier   what is before that
+Together the phases are the whole recording. Some overlap.
+
+    at_rest_earlier   rest more than 2 s before the departure
     at_rest_before    the last 2 s before the departure
-    first_3_s         from the departure on: lift-off
+    first_3_s         the first 3 s after the departure: lift-off
     to_0.3_m          from the departure to the first instant with z > 0.3 m
-    in_the_air        from the first to the last instant with z > 0.3 m, as it was always counted
-    moving            from the departure to the arrival, where the four around it leave out some of that
-    last_3_s          until the arrival: landing
-    at_rest_after     from the arrival on
-    whole             all that there is ground truth of
+    in_the_air        from the first to the last instant with z > 0.3 m
+    moving            from the departure to the arrival, if the four phases around it leave a part
+    out
+    last_3_s          the last 3 s before the arrival: landing
+    at_rest_after     from the arrival to the end
+    whole             the whole ground truth
 
-Departure and arrival are the first and the last instant at which the tag is away from where it
-rests, which is the median of its positions in the first, and in the last, half second. Floors are
-not at z = 0 everywhere, and a tag sits above them as high as its vehicle is. So a tag that rests
-below 0.3 m in a recording that exceeds that departs when it is 0.07 m above its own height at rest:
-in the raw logs of the UTIL data, where that is 0.03 m, at z = 0.1 m; in their constellations, where
-it is 0.08 m, at 0.15 m, which is up to a second after z = 0.1 m. Any other tag, a rover that never
-leaves the floor, a person's, one that starts on a table, is away when it is 0.1 m from its place;
-one that gets there within a second began, or ended, in motion, and has no phase of rest there. A
-phase that a recording does not have is not reported; one that never moves is `at_rest_before` all
-the time.
+Departure and arrival are the first and the last instant at which the tag is away from its place of
+rest. That place is the median of its positions in the first, and in the last, half second.
+
+Floors are not at z = 0 everywhere, and the tag sits on top of its vehicle. A tag that rests below
+0.3 m, in a recording that exceeds 0.3 m, departs 0.07 m above its own height at rest. In the raw
+logs of the UTIL data, with 0.03 m at rest, this is z = 0.1 m. In their constellations, with 0.08 m,
+it is 0.15 m, up to a second after z = 0.1 m.
+
+Any other tag departs 0.1 m from its place: a rover, a tag in the hand, a start on a table. If it
+departs within a second, the recording starts (or ends) in motion and has no phase of rest there. A
+phase that a recording does not have is not reported. A recording without motion is `at_rest_before`
+all the time.
 """
 
 from __future__ import annotations
@@ -36,9 +40,9 @@ if TYPE_CHECKING:
 
     Span = tuple[float, float]  # from when to when, s
 
-RISE = 0.07  # m above its height at rest: away from the floor
-MOVED = 0.1  # m from its place at rest: away, where height tells nothing
-SETTLED = 0.5  # s at either end, whose median is the place at rest
+RISE = 0.07  # m above its height at rest: away, for a tag on the floor
+MOVED = 0.1  # m from its place at rest: away, for a tag without a floor
+REST_TIME = 0.5  # s at either end, whose median is the place at rest
 SHORTEST = 1.0  # s within MOVED that are rest
 BEFORE, ENDS = 2.0, 3.0  # s of the phases before the departure; after it, and before the arrival
 
@@ -58,30 +62,31 @@ NEAR_THE_FLOOR = (
     "first_3_s",
     "last_3_s",
     "at_rest_after",
-)  # reported of each run where several are
+)  # reported for each run of several
 
 
 def in_the_air(truth: Truth) -> Span | None:
-    """(first, last) stamp of a Truth, s, with z above 0.3 m; None if there is none."""
+    """Return the (first, last) stamp with z above 0.3 m, s; None without any."""
     above = np.flatnonzero(truth.p[:, 2] > AIRBORNE)
     return (float(truth.t[above[0]]), float(truth.t[above[-1]])) if len(above) else None
 
 
 def motion(truth: Truth) -> Span | None:
-    """(departure, arrival) of a Truth, s, its first and last stamp where it begins or ends in
-    motion; None if it never moves.
+    """Return (departure, arrival), s; None without motion.
+
+    If the recording starts or ends in motion, the first or last stamp takes their place.
     """
     t, p = truth.t, truth.p
     flies = in_the_air(truth) is not None
 
     def away(place: np.ndarray) -> tuple[np.ndarray, float]:
-        """(which poses are away from it; s that they must stay there for a rest)."""
+        """Return (rows of the poses away from the place, seconds that a rest must last there)."""
         if flies and place[2] <= AIRBORNE:
             return np.flatnonzero(p[:, 2] - place[2] > RISE), 0.0
         return np.flatnonzero(np.linalg.norm(p - place, axis=1) > MOVED), SHORTEST
 
-    left, shortest = away(np.median(p[t <= t[0] + SETTLED], axis=0))
-    back, least = away(np.median(p[t >= t[-1] - SETTLED], axis=0))
+    left, shortest = away(np.median(p[t <= t[0] + REST_TIME], axis=0))
+    back, least = away(np.median(p[t >= t[-1] - REST_TIME], axis=0))
     if not len(left) and not len(back):
         return None
     departure = t[left[0]] if len(left) and t[left[0]] - t[0] >= shortest else t[0]
@@ -90,7 +95,7 @@ def motion(truth: Truth) -> Span | None:
 
 
 def phases(truth: Truth) -> dict[str, Span]:
-    """{name: (begin, end) s} of a Truth, in the order of TITLES, those alone that it has."""
+    """Return {name: (begin, end) s} of the phases that a Truth has, in the order of TITLES."""
     begin, end = float(truth.t[0]), float(truth.t[-1])
     moving, flown = motion(truth), in_the_air(truth)
     if moving is None:

@@ -1,5 +1,4 @@
-"""Simulated flights: a room with anchors, a path through it, an inertial sensor, and the TDOAs of a
-UWB tag.
+"""Simulated flights: a room with anchors, a path, an inertial sensor, and the TDOAs of a UWB tag.
 
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 flight = simulate(SimulationConfig(trajectory="circle", protocol="tdoa3", seed=3))
@@ -13,30 +12,32 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.flight import Flight, Truth
 
-from . import aids, imu, ranging
-from .config import SimulationConfig
-from .imu import NO_IMU_ERRORS, ImuErrors
+from . import sensors, tdoas
+from .config import NO_IMU_ERRORS, ImuErrors, SimulationConfig
 from .vehicles import VEHICLES
 
 if TYPE_CHECKING:
-    from .motion import Flyable
+    from .vehicles import Flyable
 
 __all__ = ["NO_IMU_ERRORS", "ImuErrors", "SimulationConfig", "simulate"]
 
 
 def simulate(config: SimulationConfig, trajectory: Flyable | None = None) -> Flight:
-    """Fly, drive or carry `config`, a SimulationConfig, and return the Flight. Raises InputError
-    where it does not fit together.
+    """Simulate a Flight with exact ground truth.
 
-    trajectory : what has motion(t) and motors(t) of a Trajectory, to fly instead of the config's
-        own.
-    truth : exact poses.
-    extra : "tdoa_truth" (t, bias, multipath, noise, outlier, m: what each TDOA holds besides
-        geometry) and
-        "state_truth" (at the stamps of the truth: velocity vx, vy, vz in the world, m/s, and the
-        biases of the inertial sensor, gyro_bias_x ... rad/s, accel_bias_x ... m/s^2).
-    meta : source, format, protocol, config, and under "parameters" the constants that the errors
-        were made with.
+    Parameters
+    ----------
+    trajectory : vehicle to use instead of the config's, see Flyable.
+
+    Returns
+    -------
+    Flight, with these additions.
+    extra["tdoa_truth"] : t s, and bias, multipath, noise, outlier m: the errors of each TDOA.
+    extra["state_truth"] : at the stamps of the truth. vx, vy, vz m/s, world frame; gyro_bias_x ...
+    rad/s; accel_bias_x ... m/s^2.
+    meta : source, format, protocol, config, and in "parameters" the constants of the errors.
+
+    Raises InputError if the parts of the config contradict each other.
     """
     filled, room = config.complete()
     assert filled.anchors is not None
@@ -44,10 +45,12 @@ def simulate(config: SimulationConfig, trajectory: Flyable | None = None) -> Fli
         filled, room, filled.random("trajectory")
     )
     t_imu = np.arange(1, int(filled.duration * filled.imu_rate) + 1) / filled.imu_rate
-    samples, gyro_bias, accel_bias = imu.measure(t_imu, flown, filled.imu_errors, filled.random)
+    samples, gyro_bias, accel_bias = sensors.measure_imu(
+        t_imu, flown, filled.imu_errors, filled.random
+    )
     t_truth = np.arange(1, int(filled.duration * filled.truth_rate) + 1) / filled.truth_rate
     motion = flown.motion(t_truth)
-    tdoa, tdoa_truth, parameters = ranging.measure(filled, room, flown)
+    tdoa, tdoa_truth, parameters = tdoas.measure_tdoas(filled, room, flown)
 
     newest = np.maximum(np.searchsorted(t_imu, t_truth + 1e-9) - 1, 0)
     state = {"t": t_truth}
@@ -74,4 +77,4 @@ def simulate(config: SimulationConfig, trajectory: Flyable | None = None) -> Fli
             "config": filled.as_dict(),
             "parameters": parameters,
         },
-    ).replaced(**aids.measure(filled, room, flown))
+    ).replaced(**sensors.measure_sensors(filled, room, flown))

@@ -1,4 +1,4 @@
-"""What a simulated flight is: one frozen dataclass."""
+"""What a simulated flight is: one frozen record."""
 
 from __future__ import annotations
 
@@ -12,22 +12,18 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.sensors import SENSORS
 
-from .constellations import constellation
-from .imu import ImuErrors
-from .room import room_of
-from .schedule import PROTOCOLS
-from .walls import Walls
+from .rooms import Walls, constellation, room_of
 
 if TYPE_CHECKING:
-    from .room import Room
+    from .rooms import Room
 
-MOST_HEARD = 64  # anchors that a tag hears at once
+
+MOST_HEARD = 64  # largest number of anchors that a tag hears at once
 YAW_PROFILES = ("fixed", "along_track", "rotating")
 WHEELS_RATE = 50.0  # Hz
 FARTHEST = 1e5  # m, of a point of a path
-
-OF_VEHICLE = MappingProxyType(
-    {  # what the configuration of each is, unless it is given
+VEHICLE_DEFAULTS = MappingProxyType(
+    {  # the usual configuration of each vehicle
         "quadrotor": {},
         "rover": {
             "constellation": "six_wide",
@@ -44,30 +40,70 @@ OF_VEHICLE = MappingProxyType(
         "hand": {"height": 1.1, "imu_rate": 100.0, "truth_rate": 50.0, "yaw": "along_track"},
     }
 )
-
-
 NOISES = tuple(f"{name}_noise" for name in SENSORS)
-_Noises: Any = make_dataclass(  # the names of its attributes are those of SENSORS
+PROTOCOLS = ("tdoa2", "tdoa3")
+
+
+@dataclass(frozen=True)
+class ImuErrors:
+    """Errors of an inertial sensor: white noise, a bias with a random walk, and vibration.
+
+    This is the error model of the filter. Defaults fit the MEMS sensor of a small quadrotor (BMI088
+    data sheet, rounded up).
+
+    Attributes
+    ----------
+    gyro_noise : white noise density, rad/s/sqrt(Hz) (default 3e-4)
+    accel_noise : white noise density, m/s^2/sqrt(Hz) (default 2e-3)
+    gyro_bias_walk : random walk density of the bias, rad/s^2/sqrt(Hz) (default 1e-5)
+    accel_bias_walk : random walk density of the bias, m/s^3/sqrt(Hz) (default 2e-4)
+    gyro_bias : standard deviation of each axis of the initial bias, rad/s (default 5e-3)
+    accel_bias : standard deviation of each axis of the initial bias, m/s^2 (default 5e-2)
+    vibration : standard deviation of a further white noise on the accelerometer while the motors
+        run, m/s^2 (default 0: off)
+    """
+
+    gyro_noise: float = 3e-4
+    accel_noise: float = 2e-3
+    gyro_bias_walk: float = 1e-5
+    accel_bias_walk: float = 2e-4
+    gyro_bias: float = 5e-3
+    accel_bias: float = 5e-2
+    vibration: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not (np.isfinite(value) and value >= 0.0):
+                raise InputError(
+                    f"imu_errors: {name}: {value!r} is not a finite number of at least 0."
+                )
+
+
+NO_IMU_ERRORS = ImuErrors(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+_Noises: Any = make_dataclass(  # one attribute per sensor
     "_Noises", [(name, float | None, None) for name in NOISES], frozen=True
 )
 
 
 @dataclass(frozen=True)
 class SimulationConfig(_Noises):
-    """One simulated flight. The same config gives the same flight, bit for bit; every part draws
-    from its own stream, so that switching one error off leaves the others as they were. Raises
-    InputError for what cannot be simulated.
+    """One simulated flight.
+
+    The same config gives the same flight, bit for bit. Every part draws from a stream of random
+    numbers, so switching an error off leaves the others unchanged. Raises InputError for values
+    that cannot be simulated.
 
     The room and the path
     ---------------------
     seed : of all random streams, 0 or more (default 0)
-    vehicle : "quadrotor" takes off, flies and lands; "rover" drives on the floor, x ahead, and
-        stops now and then; "hand": a person
-        carries the tag, and stands still before and after. `of` gives each its usual sensors
-        (default "quadrotor")
+    vehicle : "quadrotor" takes off, flies and lands; "rover" drives on the floor, x ahead, with
+        stops; "hand": a person carries the tag, and stands still before and after. `of` gives each
+        its usual sensors (default "quadrotor")
     path : ((x, y), ...) or ((x, y, z), ...) m, waypoints, instead of a trajectory (default None)
-    area : ((x, y), (x, y)) m, lower and upper corner of where trajectories lie (default None: the
-        room less a clearance)
+    area : ((x, y), (x, y)) m, lower and upper corner of the area for trajectories (default None:
+        the room less a clearance)
     constellation : name of an anchor constellation, or random-SEED[-COUNT] (default "corners": 8 in
         7 x 8 x 3 m)
     anchors : Anchors to use instead of a named constellation (default None)
@@ -76,10 +112,10 @@ class SimulationConfig(_Noises):
     duration : of the recording, s (default 60)
     speed : along the path at cruise, m/s; root mean square for sines (default 1)
     place : (x, y) of the middle of the path, m (default None: the middle of the room or the area)
-    height : of the path, m; not used by sines of a quadrotor (default None: half the height that is
-        flyable)
-    radius : of the circle, or half the side of the square or the line, m (default None: 70 % of
-        what fits)
+    height : of the path, m; not used by sines of a quadrotor (default None: half the flyable
+        height)
+    radius : of the circle, or half the side of the square or the line, m (default None: 70 % of the
+        largest)
     yaw : "fixed", "along_track" or "rotating"; spin always rotates; a rover has no choice (default
         "fixed")
     yaw_angle : yaw at the start, or added to the track, rad (default 0)
@@ -98,37 +134,33 @@ class SimulationConfig(_Noises):
     ---------------------
     protocol : "tdoa2" (ring, about 475 per second) or "tdoa3" (any pair, about 240 per second)
         (default "tdoa2")
-    tdoa_rate : TDOAs per second (default None: that of the protocol)
-    radio_reach : m; anchors farther from the tag than that are not heard (default None: all are)
-    walls : Walls that no signal comes through, with radio_reach (default None)
-    cell_ids : anchors of one cell, which have a clock of their own, have ids with the same id //
-        cell_ids; TDOAs are of two anchors of one
-        cell; with radio_reach (default None: all anchors have one clock)
+    tdoa_rate : TDOAs per second (default None: as the protocol)
+    radio_reach : m; the tag does not hear anchors farther away (default None: all are heard)
+    walls : Walls that block signals, with radio_reach (default None)
+    cell_ids : anchors with the same id // cell_ids form a cell with a common clock. A TDOA needs
+        two anchors of a cell; with radio_reach (default None: all anchors have one clock)
     noise_std : standard deviation of the white noise of one TDOA, m; 0 for none (default 0.06)
     anchor_noise_std : standard deviation of the arrival noise of each anchor, m, in the order of
-        the anchors; a TDOA
-        then has the root of the summed squares of its two (default None: noise_std / sqrt(2) for
-        every anchor)
+        the anchors. A TDOA has the root of the summed squares of its two (default None: noise_std /
+        sqrt(2) for every anchor)
     shared_noise : two TDOAs made from the same reception share its noise, as in Grasso et al.
-        (Sensors 2022, 22, 9136),
-        eqs. 4 - 5 (default False: independent noise)
-    bias : received-power and antenna errors, which depend on the poses, and the anchors' own delays
+        (Sensors 2022, 22, 9136), eqs. 4 - 5 (default False: independent noise)
+    bias : received-power and antenna errors, which depend on the poses, and the anchors' delays
         (default True)
-    anchor_delay_std : spread of the constant delays of the anchors that calibration left, m
-        (default 0.05)
-    tag_unit : which specimen of the tag flies: 0 is nominal, others have seeded small differences
-        in gain (0.7 dB) and
-        mounting (2 degrees) (default 0)
+    anchor_delay_std : spread of the constant delays of the anchors after calibration, m (default
+        0.05)
+    tag_unit : specimen of the tag. 0 is nominal; other specimens have seeded small differences in
+        gain (0.7 dB) and mounting (2 degrees) (default 0)
     tag_lever_arm : tag antenna in the body frame, m (default (0, 0, 0))
     multipath : late arrivals near the floor (default True)
     outlier_probability : share of TDOAs that are outliers, 0 for none (default 0.01)
 
-    What else the vehicle feels
-    ---------------------------
-    <name>_noise : of each of SENSORS, standard deviation in its unit (default None: there is none)
-    wheel_scale : of a rover, by which share its velocities and yaw rates are too large (default 0)
-    wheel_slip : of a rover, by which share its wheels turn faster than the floor passes, for half a
-        second every ten (default 0)
+    Other sensors
+    -------------
+    <name>_noise : for each of SENSORS, standard deviation in its unit (default None: no sensor)
+    wheel_scale : of a rover, relative excess of its velocities and yaw rates (default 0)
+    wheel_slip : of a rover, relative excess while its wheels slip, for half a second every ten
+        (default 0)
     """
 
     seed: int = 0
@@ -170,12 +202,12 @@ class SimulationConfig(_Noises):
 
     @classmethod
     def of(cls, vehicle: str, **given: Any) -> SimulationConfig:
-        """The usual config of a vehicle, with what is given instead."""
-        return cls(vehicle=vehicle, **{**OF_VEHICLE.get(vehicle, {}), **given})
+        """Return the usual config of a vehicle with the given changes."""
+        return cls(vehicle=vehicle, **{**VEHICLE_DEFAULTS.get(vehicle, {}), **given})
 
     def __post_init__(self) -> None:
         for name, choices in (
-            ("vehicle", tuple(OF_VEHICLE)),
+            ("vehicle", tuple(VEHICLE_DEFAULTS)),
             ("yaw", YAW_PROFILES),
             ("protocol", PROTOCOLS),
         ):
@@ -243,9 +275,7 @@ class SimulationConfig(_Noises):
                 )
 
     def complete(self) -> tuple[SimulationConfig, Room]:
-        """(config, Room): this config with anchors, place, height, radius and anchor_noise_std
-        filled in.
-        """
+        """Return (config, Room); place, height, radius, anchors and anchor_noise_std are filled in."""
         anchors = self.anchors if self.anchors is not None else constellation(self.constellation)
         if len(anchors) < 2:
             raise InputError(f"anchors: {len(anchors)} was given; the simulation takes 2 or more.")
@@ -293,11 +323,11 @@ class SimulationConfig(_Noises):
         return filled, room
 
     def random(self, part: str) -> np.random.Generator:
-        """The numpy Generator of the named part of the simulation."""
+        """Return the numpy Generator of the named part of the simulation."""
         return np.random.default_rng([self.seed, *part.encode()])
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain numbers, strings and lists, for Flight.meta and JSON; the anchors by their ids."""
+        """Return plain values for Flight.meta and JSON; anchors by their ids."""
         content = asdict(replace(self, anchors=None))
         content["anchors"] = None if self.anchors is None else self.anchors.ids.tolist()
         content["walls"] = (
@@ -309,7 +339,7 @@ class SimulationConfig(_Noises):
 
 
 def _are_points(points: Any, lengths: tuple[int, ...]) -> bool:
-    """Whether these are points of so many finite coordinates each, all of them as many."""
+    """Return whether these are points with equally many finite coordinates."""
     try:
         array = np.array(points, dtype=float)
     except (TypeError, ValueError):

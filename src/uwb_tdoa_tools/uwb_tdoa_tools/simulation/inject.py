@@ -1,4 +1,4 @@
-"""Declared effects put into flights."""
+"""Inject declared effects into flights."""
 
 from __future__ import annotations
 
@@ -21,16 +21,18 @@ if TYPE_CHECKING:
 
     from ..readers.inputs import Reading
 
-_ANCHORS = re.compile(r"(\d+)(?:-(\d+))?(?:\..+)?")  # of which a parameter is: 3, 3-5, 3.x
+_ANCHORS = re.compile(
+    r"(\d+)(?:-(\d+))?(?:\..+)?"
+)  # anchors in the name of a parameter: 3, 3-5, 3.x
 
 
 def parse_effect(name: str, values: Sequence[str]) -> Effect:
-    """The Effect `name` with `values`, a list of texts "KEY=NUMBER", "KEY:NUMBER" or "NUMBER".
+    """Parse the values "KEY=NUMBER", "KEY:NUMBER" or "NUMBER" of an Effect.
 
     Raises InputError.
     """
     kind = EFFECTS[name]
-    parameters: dict[str, Any] = {}  # texts, of which the Effect makes numbers
+    parameters: dict[str, Any] = {}  # the Effect converts the texts
     for text in ",".join(values).split(","):
         key, found, number = text.replace(":", "=").strip().rpartition("=")
         key = key.strip() if found else kind.example
@@ -49,11 +51,14 @@ def inject(
     storage: str = "mcap",
     force: bool = False,
 ) -> str:
-    """Write the flight that would have been recorded with an Effect as a bag. Returns the name of
-    the flight.
+    """Write the flight with an Effect as a bag. Return the name of the flight.
 
-    recording, reading : a path, and a Reading to read it; seed : of effects that are random. Raises
-        InputError.
+    Parameters
+    ----------
+    reading : how the recording is read.
+    seed : of random effects.
+
+    Raises InputError.
     """
     check_output(out, force)  # before the work, not after it
     flight = reading.one(recording)
@@ -63,7 +68,7 @@ def inject(
 
 
 def _check_anchors(effect: Effect, flight: Flight) -> None:
-    """Raise InputError if the Effect has a parameter of an anchor that the Flight does not have."""
+    """Raise InputError if the Effect has a parameter of an unknown anchor."""
     for key in effect.values if "tdoa" in effect.channels else ():
         named = _ANCHORS.fullmatch(key)
         for anchor in filter(None, named.groups() if named else ()):
@@ -76,7 +81,7 @@ def _check_anchors(effect: Effect, flight: Flight) -> None:
 
 
 def catalogue() -> str:
-    """All effects with a parameter, the unit and the physics of each: text."""
+    """List all effects with parameter, unit and physics, as text."""
     lines = [
         f"{name:20s} e.g. {e.example}=NUMBER ({e.unit}): {e.physics}" for name, e in EFFECTS.items()
     ]

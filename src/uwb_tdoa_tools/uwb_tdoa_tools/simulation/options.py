@@ -1,4 +1,4 @@
-"""Options of a simulated recording, and the SimulationConfig that they make."""
+"""Options of the command `simulate`, and the SimulationConfig that they give."""
 
 from __future__ import annotations
 
@@ -11,17 +11,24 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.sensors import SENSORS
 from uwb_tdoa_bias.foundation.survey_faults import refuse_faulty
 
-from .config import OF_VEHICLE, YAW_PROFILES, SimulationConfig
-from .imu import NO_IMU_ERRORS, ImuErrors
-from .schedule import PROTOCOLS
-from .trajectories import TRAJECTORIES
-from .walls import Walls
+from .config import (
+    NO_IMU_ERRORS,
+    PROTOCOLS,
+    VEHICLE_DEFAULTS,
+    YAW_PROFILES,
+    ImuErrors,
+    SimulationConfig,
+)
+from .paths import TRAJECTORIES
+from .rooms import Walls
 
 
 def add_options(made: argparse.ArgumentParser) -> None:
     """Add the options to a parser."""
     default = SimulationConfig()
-    unless: dict[str, Any] = {"default": argparse.SUPPRESS}  # given, what is usual of the vehicle
+    unless: dict[str, Any] = {
+        "default": argparse.SUPPRESS
+    }  # not given: the usual value of the vehicle
     made_path = made.add_argument_group("motion")
     add = made_path.add_argument
     words = (
@@ -30,7 +37,7 @@ def add_options(made: argparse.ArgumentParser) -> None:
     )
     add(
         "--vehicle",
-        choices=OF_VEHICLE,
+        choices=VEHICLE_DEFAULTS,
         default=default.vehicle,
         help=f"{words} (default: quadrotor)",
     )
@@ -199,7 +206,7 @@ def add_options(made: argparse.ArgumentParser) -> None:
 
 
 def config_of(args: argparse.Namespace) -> SimulationConfig:
-    """Return the SimulationConfig of the options, most of which have the names of its fields."""
+    """Return the SimulationConfig of the options; most have the names of its fields."""
     values = {
         field.name: getattr(args, field.name)
         for field in fields(SimulationConfig)
@@ -218,12 +225,12 @@ def config_of(args: argparse.Namespace) -> SimulationConfig:
 
 
 def _points(text: str) -> tuple[tuple[float, ...], ...]:
-    """Points of "X,Y X,Y ..."."""
+    """Parse "X,Y X,Y ..."."""
     return tuple(_point(each) for each in text.split())
 
 
 def _point(text: str) -> tuple[float, ...]:
-    """A point of "X,Y" or "X,Y,Z"."""
+    """Parse "X,Y" or "X,Y,Z"."""
     try:
         return tuple(float(each) for each in text.split(","))
     except ValueError:

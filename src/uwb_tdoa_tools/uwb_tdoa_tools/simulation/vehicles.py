@@ -1,9 +1,10 @@
-"""What moves the tag along a path: a quadrotor, a rover on wheels, a person on foot."""
+"""Vehicles that carry the tag along a path: a quadrotor, a rover on wheels, a person on foot."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from scipy.interpolate import BSpline, CubicHermiteSpline, CubicSpline, make_interp_spline
@@ -11,16 +12,20 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
-from .config import OF_VEHICLE
-from .motion import ExactMotion, Flyable
-from .trajectories import GRAVITY, KNOT, SPEED_UP, STEP, Trajectory, path_of, path_time, yaw_along
+from .paths import KNOT, SPEED_UP, STEP, path_of, path_time, yaw_along
+from .rooms import REST_HEIGHT
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from .config import SimulationConfig
-    from .room import Room
+    from .rooms import Room
 
+
+GRAVITY = 9.81  # m/s^2
+DRAG = 0.2  # 1/s, rotor drag per mass: without it the lateral accelerometers would measure nothing
+MAX_ACCELERATION = 8.0  # m/s^2, what a small quadrotor still flies
+SPIN_UP = 0.5  # s, the motors turn before take-off and after landing
 PULL = 1.5  # 1/s, speed of the rover by its distance to the point that it follows
 TURN = 2.5  # 1/s, turning rate by the direction to that point
 SLACK = 0.03  # m, within which it stands still
@@ -33,23 +38,153 @@ STEPS = 1.9  # Hz, of a person who walks
 BOB, SWAY, TILT = 0.02, 0.01, np.deg2rad(6.0)  # m, m, rad: of a hand, by steps and otherwise
 
 
-class Rover:
-    """A rover with two driven wheels: it follows a point that moves along the path of a config, and
-    stops where the point stops.
+@dataclass(frozen=True)
+class ExactMotion:
+    """Exact motion at n instants. Body frame x forward, y left, z up; world z up.
 
-    Base on the floor, x ahead. Parameters: as of Trajectory; the path may have any heights. It
-    stands still for config.floor_time before and after.
+    Attributes
+    ----------
+    p, v, a : (n, 3) m, m/s, m/s^2, world.
+    q : (n, 4) x y z w, body to world.
+    body_rates : (n, 3) rad/s, body.
+    specific_force : (n, 3) m/s^2, body.
+    """
+
+    p: np.ndarray
+    v: np.ndarray
+    a: np.ndarray
+    q: np.ndarray
+    body_rates: np.ndarray
+    specific_force: np.ndarray
+
+
+class Flyable(Protocol):
+    """A vehicle that `simulate` moves."""
+
+    def motion(self, t: np.ndarray) -> ExactMotion:
+        """Return the ExactMotion at stamps t, (n,) s."""
+
+    def motors(self, t: np.ndarray) -> np.ndarray:
+        """Return whether the motors run at stamps t: (n,) bool."""
+
+
+class Trajectory:
+    """A quadrotor flight over 0 ... config.duration.
+
+    Position and yaw are splines with exact derivatives; attitude and rates follow from them. Around
+    the path the vehicle takes off, speeds up, slows down and lands.
+
+    Attributes
+    ----------
+    take_off, landing : s; None for a start in the air.
     """
 
     def __init__(self, config: SimulationConfig, room: Room, rng: np.random.Generator) -> None:
+        """Fit the splines to the path of a complete config in a room; `rng` draws the family.
+
+        Raises InputError if the flight does not fit the room, the time or the vehicle.
+        """
+        assert config.height is not None  # complete
+        self.take_off = self.landing = None
+        start, end, clamp = 0.0, config.duration, None
+        if not config.start_in_air:
+            rise = max(3.0, 1.5 * config.height)
+            shortest = 2.0 * (config.floor_time + rise + SPEED_UP)
+            if config.duration < shortest:
+                raise InputError(
+                    f"duration: {config.duration:g} s is too short to take off and land; give "
+                    f"{shortest:g} s or more, "
+                    "a shorter floor_time, or start in the air."
+                )
+            start, end = config.floor_time, config.duration - config.floor_time
+            self.take_off, self.landing = start, end
+            clamp = ([(k, np.zeros(3)) for k in (1, 2, 3)],) * 2  # at rest, smoothly, at both ends
+        air = end - start
+        tau = np.linspace(0.0, air, max(int(np.ceil(air / KNOT)), 8) + 1)
+        s = tau if config.start_in_air else path_time(tau, rise, air)
+        p = path_of(s, config, room, rng)
+        if not config.start_in_air:
+            lift = STEP(np.clip(tau / rise, 0.0, 1.0)) * STEP(np.clip((air - tau) / rise, 0.0, 1.0))
+            ground = room.lower[2] + REST_HEIGHT
+            p[:, 2] = ground + lift * (p[:, 2] - ground)
+        yaw = yaw_along(s, p, config)
+        self._start, self._end, self._clamped = start, end, clamp is not None
+        self._p = make_interp_spline(start + tau, p, k=7, bc_type=clamp)
+        scalar = ([(k, 0.0) for k in (1, 2, 3)],) * 2 if clamp else None
+        self._yaw = make_interp_spline(start + tau, yaw, k=7, bc_type=scalar)
+        hardest = np.linalg.norm(self._p.derivative(2)(start + tau), axis=1).max()
+        if hardest > MAX_ACCELERATION:
+            raise InputError(
+                f"speed: {config.speed:g} m/s asks for an acceleration of {hardest:.1f} m/s^2 "
+                "on this path, "
+                f"more than {MAX_ACCELERATION:g}; fly slower or wider."
+            )
+
+    def motion(self, t: ArrayLike) -> ExactMotion:
+        """Return the ExactMotion at stamps t, (n,) s; it rests before take-off and after landing.
+
+        The thrust, along body z, carries weight, acceleration and rotor drag (differential flatness
+        of a quadrotor, after Mellinger and Kumar, ICRA 2011). The body rates are the analytic
+        derivative of that attitude.
+        """
+        t = np.asarray(t, dtype=float)
+        inside = np.clip(t, self._start, self._end)
+        moving = ((t > self._start) & (t < self._end))[:, None] if self._clamped else 1.0
+        p = self._p(inside)
+        v, a, jerk = (self._p.derivative(k)(inside) * moving for k in (1, 2, 3))
+        yaw, yaw_rate = self._yaw(inside), self._yaw.derivative()(inside) * np.squeeze(moving)
+
+        gravity = np.array([0.0, 0.0, GRAVITY])
+        thrust = a + gravity + DRAG * v
+        thrust_rate = jerk + DRAG * a
+        size = np.linalg.norm(thrust, axis=1, keepdims=True)
+        z = thrust / size
+        z_rate = (thrust_rate - z * np.sum(z * thrust_rate, axis=1, keepdims=True)) / size
+        heading = np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(len(t))])
+        heading_rate = yaw_rate[:, None] * np.column_stack(
+            [-np.sin(yaw), np.cos(yaw), np.zeros(len(t))]
+        )
+        y = np.cross(z, heading)
+        y_size = np.linalg.norm(y, axis=1, keepdims=True)
+        y /= y_size
+        x = np.cross(y, z)
+        y_rate = (
+            np.cross(z_rate, heading) + np.cross(z, heading_rate)
+        ) / y_size  # up to a part along y itself
+        body_rates = np.column_stack(
+            [np.sum(u * w, axis=1) for u, w in ((-y, z_rate), (x, z_rate), (-x, y_rate))]
+        )
+        axes = np.stack([x, y, z], axis=2)
+        q = _without_sign_flips(Rotation.from_matrix(axes).as_quat())
+        return ExactMotion(p, v, a, q, body_rates, np.einsum("nij,ni->nj", axes, a + gravity))
+
+    def motors(self, t: ArrayLike) -> np.ndarray:
+        """Return whether the motors run at stamps t: (n,) bool."""
+        t = np.asarray(t)
+        return (
+            (t >= self._start - SPIN_UP) & (t <= self._end + SPIN_UP)
+            if self._clamped
+            else np.ones(len(t), bool)
+        )
+
+
+class Rover:
+    """A rover with two driven wheels that follows a point along the path of a config.
+
+    Its base is on the floor, x ahead. Heights of the path are ignored. It stops with the point, and
+    stands for config.floor_time before and after.
+    """
+
+    def __init__(self, config: SimulationConfig, room: Room, rng: np.random.Generator) -> None:
+        """Follow the path of a complete config in a room; `rng` draws stops and the family."""
         _check_time(config)
         self._floor = float(room.lower[2])
         tau = np.arange(0.0, config.duration + KNOT, KNOT)
-        goes = _going(tau, config, rng)
+        goes = _path_rate(tau, config, rng)
         target = path_of(np.concatenate([[0.0], np.cumsum(KNOT * goes)[:-1]]), config, room, rng)[
             :, :2
         ]
-        start, heading, speed, turning = _followed(target, config.speed)
+        start, heading, speed, turning = _follow(target, config.speed)
         knots = KNOT * np.arange(-2, len(tau) + 2)
         self._speed, self._turning = BSpline(knots, speed, 3), BSpline(knots, turning, 3)
         turned = self._turning.antiderivative()
@@ -68,7 +203,7 @@ class Rover:
         return velocity
 
     def motion(self, t: ArrayLike) -> ExactMotion:
-        """The ExactMotion at the stamps t, (n,) s."""
+        """Return the ExactMotion at stamps t, (n,) s."""
         t = np.clip(np.asarray(t, dtype=float), 0.0, self._last)
         zero, yaw = np.zeros(len(t)), self._yaw(t)
         speed, turning = self._speed(t), self._turning(t)
@@ -84,16 +219,14 @@ class Rover:
         )
 
     def motors(self, t: ArrayLike) -> np.ndarray:
-        """Whether the wheels turn at the stamps t: (n,) bool."""
+        """Return whether the wheels turn at stamps t: (n,) bool."""
         t = np.clip(np.asarray(t, dtype=float), 0.0, self._last)
         turns: np.ndarray = (self._speed(t) != 0.0) | (self._turning(t) != 0.0)
         return turns
 
 
-def _going(tau: np.ndarray, config: SimulationConfig, rng: np.random.Generator) -> np.ndarray:
-    """How fast path time goes at tau (n,) s: 0 before and after the drive and at stops, 1 between
-    them, with smooth changes.
-    """
+def _path_rate(tau: np.ndarray, config: SimulationConfig, rng: np.random.Generator) -> np.ndarray:
+    """Return the rate of path time at tau (n,) s: 0 at rest and at stops, 1 between them, smooth."""
     ends = [0.0, config.floor_time]
     last = config.duration - config.floor_time - SPEED_UP
     while ends[-1] < last:
@@ -109,9 +242,12 @@ def _going(tau: np.ndarray, config: SimulationConfig, rng: np.random.Generator) 
     return out
 
 
-def _followed(target: np.ndarray, speed: float) -> tuple[np.ndarray, float, np.ndarray, np.ndarray]:
-    """(place (2,) m and heading, rad, at the start; forward speed (n,) m/s and turning rate (n,)
-    rad/s) of a rover that follows a target (n, 2) m, which moves at `speed` m/s, at steps of KNOT.
+def _follow(target: np.ndarray, speed: float) -> tuple[np.ndarray, float, np.ndarray, np.ndarray]:
+    """Return how a rover follows a target (n, 2) m with `speed`, m/s, at steps of KNOT.
+
+    Returns
+    -------
+    place (2,) m and heading rad at the start, speed (n,) m/s, turning rate (n,) rad/s.
     """
     away = target - target[0]
     ahead = away[
@@ -145,13 +281,15 @@ def _followed(target: np.ndarray, speed: float) -> tuple[np.ndarray, float, np.n
     return target[0], heading, np.array(speeds), np.array(turnings)
 
 
-class Carried:
-    """A tag in the hand of a person who walks along the path of a config: it bobs with the steps,
-    sways and tilts. Parameters: as of Trajectory; the person stands for config.floor_time before
-    and after.
+class HandHeld:
+    """A tag in the hand of a person who walks along the path of a config.
+
+    It bobs with the steps, sways and tilts. The person stands for config.floor_time before and
+    after.
     """
 
     def __init__(self, config: SimulationConfig, room: Room, rng: np.random.Generator) -> None:
+        """Fit the splines to the path of a complete config in a room; `rng` draws the sway."""
         _check_time(config)
         tau = np.linspace(0.0, config.duration, max(int(np.ceil(config.duration / KNOT)), 8) + 1)
         s = path_time(tau, config.floor_time, config.duration)
@@ -171,7 +309,7 @@ class Carried:
         )  # roll, pitch, yaw
 
     def motion(self, t: ArrayLike) -> ExactMotion:
-        """The ExactMotion at the stamps t, (n,) s."""
+        """Return the ExactMotion at stamps t, (n,) s."""
         t = np.asarray(t, dtype=float)
         a = self._p.derivative(2)(t)
         roll, pitch, yaw = self._angles(t).T
@@ -184,22 +322,25 @@ class Carried:
                 d_yaw * np.cos(roll) * np.cos(pitch) - d_pitch * np.sin(roll),
             ]
         )
-        q = turn.as_quat()
-        q[1:] *= np.cumprod(np.where(np.sum(q[1:] * q[:-1], axis=1) < 0.0, -1.0, 1.0))[
-            :, None
-        ]  # no sign flips
         return ExactMotion(
             self._p(t),
             self._p.derivative()(t),
             a,
-            q,
+            _without_sign_flips(turn.as_quat()),
             rates,
             turn.inv().apply(a + [0.0, 0.0, GRAVITY]),
         )
 
     def motors(self, t: ArrayLike) -> np.ndarray:
-        """No motor turns at any of the stamps t: (n,) bool."""
+        """Return False for all stamps t: (n,) bool."""
         return np.zeros(len(np.asarray(t)), bool)
+
+
+def _without_sign_flips(q: np.ndarray) -> np.ndarray:
+    """Return quaternions (n, 4) whose signs are continuous."""
+    signs = np.where(np.sum(q[1:] * q[:-1], axis=1) < 0.0, -1.0, 1.0)
+    q[1:] *= np.cumprod(signs)[:, None]
+    return q
 
 
 def _check_time(config: SimulationConfig) -> None:
@@ -214,6 +355,5 @@ def _check_time(config: SimulationConfig) -> None:
 VEHICLES: dict[str, Callable[[SimulationConfig, Room, np.random.Generator], Flyable]] = {
     "quadrotor": Trajectory,
     "rover": Rover,
-    "hand": Carried,
+    "hand": HandHeld,
 }
-assert VEHICLES.keys() == OF_VEHICLE.keys()

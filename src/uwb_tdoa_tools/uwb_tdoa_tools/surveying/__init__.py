@@ -1,1 +1,1 @@
-"""Better anchors from rough ones and flights."""
+"""Surveying: better anchors from rough positions and flights."""

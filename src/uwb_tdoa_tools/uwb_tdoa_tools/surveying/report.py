@@ -1,30 +1,41 @@
-"""What a self-calibration says for `survey`: figures, sentences, a picture."""
+"""What a self-calibration found: figures, sentences, a picture, and blocked anchors."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.files import write_filled
 
 from ..checking.known_path import MANY
+from ..diagnosis.attribution import attribute
+from ..diagnosis.references import Nothing
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Sequence
     from pathlib import Path
+
+    from uwb_tdoa_bias.effects import Effect
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_ekf.core.config import FilterConfig
 
     from ..diagnosis.self_calibration import SelfCalibration
 
-# standard deviations, and times what most others are off by, that an anchor must be off by to stand
-# apart
-SURE = 5.0
-KNOWN_WELL = 0.02  # m, standard deviation as given that leaves nothing to wish for
+
+# smallest shift of a misplaced anchor: standard deviations, and multiples of the usual shift
+CLEAR_SHIFT = 5.0
+KNOWN_WELL = 0.02  # m, standard deviation of a position that needs no survey
+BLOCKED_DELAY = 0.2  # m, smallest delay of a blocked anchor; antennas cause up to that
 
 
-def apart(found: SelfCalibration) -> list[int]:
-    """Rows of those of MANY anchors that the flights put plainly elsewhere than given, while they
-    leave the others about where they were.
+def misplaced_anchors(found: SelfCalibration) -> list[int]:
+    """Return the rows of anchors that clearly stand elsewhere than given, while the others do not.
+
+    Empty for MANY anchors or fewer.
     """
     if len(found.given) <= MANY:
         return []
@@ -36,12 +47,14 @@ def apart(found: SelfCalibration) -> list[int]:
         ]
     )
     return np.flatnonzero(
-        (improved & (off > SURE * found.position_std) & (off > SURE * others)).any(axis=1)
+        (improved & (off > CLEAR_SHIFT * found.position_std) & (off > CLEAR_SHIFT * others)).any(
+            axis=1
+        )
     ).tolist()
 
 
 def as_dict(found: SelfCalibration) -> dict[str, Any]:
-    """For JSON."""
+    """Return the figures for JSON."""
     return {
         "flights": list(found.flights),
         "frame": found.surveyed.frame,
@@ -66,7 +79,7 @@ def as_dict(found: SelfCalibration) -> dict[str, Any]:
             }
             for one in found.changes
         ],
-        "apart": [str(found.given.ids[row]) for row in apart(found)],
+        "apart": [str(found.given.ids[row]) for row in misplaced_anchors(found)],
         "applied": found.why_not is None,
         "blocked": list(found.blocked),
         "marks_left_out": found.marks,
@@ -82,7 +95,7 @@ def as_dict(found: SelfCalibration) -> dict[str, Any]:
 
 
 def as_text(found: SelfCalibration) -> str:
-    """A table of all coordinates, and what it means."""
+    """Return a table of all coordinates, and its interpretation."""
     lines = (
         ["values that make these data fit; measure again before you move an anchor:"]
         if found.why_not
@@ -107,7 +120,7 @@ def as_text(found: SelfCalibration) -> str:
     ]
     if unseen:
         lines.append(
-            f"nothing new is told of anchors {', '.join(unseen)}: fly closer to them, on all "
+            f"the flights do not improve anchors {', '.join(unseen)}: fly closer to them, on all "
             "sides, high and low"
         )
     since = (
@@ -120,22 +133,22 @@ def as_text(found: SelfCalibration) -> str:
         lines += (
             [] if found.changes else ["no anchor has changed clearly since the last calibration"]
         )
-    for row in apart(found):
+    for row in misplaced_anchors(found):
         by = ", ".join(
             f"{100 * value:+.1f} +- {100 * std:.1f}"
             for value, std in zip(found.shifts[row], found.position_std[row])
         )
         lines.append(
-            f"anchor {found.given.ids[row]} does not stand where it was given, as the others "
-            f"do: off by {by} cm (x, y, z)"
+            f"anchor {found.given.ids[row]} is not at its given position, unlike the others: "
+            f"off by {by} cm (x, y, z)"
         )
     if found.tag_delay is not None:
         delay, its_std = found.tag_delay
         lines.append(
             f"all ranges are {100 * abs(delay):.1f} +- {100 * its_std:.1f} cm too "
-            f"{'long' if delay > 0.0 else 'short'}, beside what was known: the antenna "
-            "delay of the tag; another tag has its own: the filter finds what differs, by "
-            "range_offset_std"
+            f"{'long' if delay > 0.0 else 'short'}, in addition to known effects: the antenna "
+            "delay of the tag. For another tag the filter estimates the difference "
+            "(range_offset_std)"
         )
     lines += found.blocked
     if found.marks:
@@ -156,7 +169,7 @@ def as_text(found: SelfCalibration) -> str:
 
 
 def picture(found: SelfCalibration, path: str | Path) -> None:
-    """Plan and elevation, before and after, with 95 % intervals."""
+    """Draw plan and elevation, before and after, with 95 % intervals."""
     from matplotlib.figure import Figure  # takes a second to import
 
     figure = Figure(figsize=(11.0, 5.0), layout="constrained")
@@ -192,3 +205,45 @@ def picture(found: SelfCalibration, path: str | Path) -> None:
         ax.grid(alpha=0.25)
     figure.axes[0].legend()
     write_filled(path, partial(figure.savefig, dpi=110))
+
+
+def with_blocked(
+    result: SelfCalibration,
+    flights: Sequence[Flight],
+    config: FilterConfig | None = None,
+    progress: Callable[[], object] = lambda: None,
+) -> SelfCalibration:
+    """Add blocked anchors to the SelfCalibration of Flights.
+
+    Obstacles delay the signals of an anchor in a region. Positions and delays of anchors do not
+    explain these residuals.
+    """
+    flights = [flight for flight in flights if len(flight.tdoa)]
+    if not flights:
+        return result
+    reference = Nothing(config)
+    moved = [reference.prepare(replace(flight, anchors=result.surveyed)) for flight in flights]
+    base = EffectSet((*result.base.effects, result.found(result.shifts)[1]))
+    effects = attribute(
+        moved, reference, base, ("nlos",), undeclared=False, progress=progress
+    ).effects
+    return replace(
+        result,
+        blocked=tuple(
+            sentence for effect in effects for sentence in with_large_delays(effect).advice()
+        ),
+    )
+
+
+def with_large_delays(effect: Effect) -> Effect:
+    """Return the effect nlos with only the anchors whose delay reaches BLOCKED_DELAY."""
+    late = {
+        key.partition(".")[0]
+        for key, value in effect.values.items()
+        if key.endswith(".delay") and value >= BLOCKED_DELAY
+    }
+    values, std = (
+        {key: some[key] for key in some if key.partition(".")[0] in late}
+        for some in (effect.values, effect.std)
+    )
+    return replace(effect, values=values, std=std)

@@ -13,7 +13,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.geometry import tdoa
 
 from ..checking.known_path import least_height
-from ..scoring.metrics import judged_part
+from ..scoring.metrics import scored_phase
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
@@ -72,7 +72,7 @@ def labels(flight: Flight, effects: EffectSet = EffectSet()) -> Labels:
     """
     flight = effects.correct_streams(replace(level(flight), imu=None))
     truth, data, anchors = known_truth(flight), flight.tdoa, flight.anchors
-    _, first, last = judged_part(truth)
+    _, first, last = scored_phase(truth)
     first, last = first + MARGIN, last - MARGIN
     chosen = (data.t > first) & (data.t < last)
     unknown = np.setdiff1d(np.concatenate([data.a[chosen], data.b[chosen]]), anchors.ids)

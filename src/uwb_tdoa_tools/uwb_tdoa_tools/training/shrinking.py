@@ -20,7 +20,7 @@ from uwb_tdoa_bias.foundation.files import temporary_folder
 from uwb_tdoa_bias.foundation.flight import AIDS
 
 from ..scoring.evaluation import evaluate
-from ..scoring.shrinkage import SHARES, Shrinkage, best_share
+from ..scoring.gains import SHARES, Shrinkage, best_share
 from . import models, physics
 
 if TYPE_CHECKING:

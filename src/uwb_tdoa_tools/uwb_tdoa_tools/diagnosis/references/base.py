@@ -10,7 +10,7 @@ import numpy as np
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Truth
 
-from ...scoring.metrics import judged_part
+from ...scoring.metrics import scored_phase
 from ...scoring.phases import TITLES
 
 if TYPE_CHECKING:
@@ -81,7 +81,7 @@ class Reference:
         """(first, last) stamp, s, of what is diagnosed: in the air, or in motion on the floor,
         without its ends. Raises InputError if that is short.
         """
-        part, first, last = judged_part(poses)
+        part, first, last = scored_phase(poses)
         first, last = first + MARGIN, last - MARGIN
         if last - first < SHORTEST:
             raise InputError(

@@ -8,7 +8,7 @@ from uwb_tdoa_bias.effects.stamp_error import shifted
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from ...scoring.alignment import NONE
-from ...scoring.settling import settled
+from ...scoring.evaluation import align_truth
 from .base import Reference, ReferenceView
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ class GroundTruth(Reference):
         align: str = NONE,
     ) -> None:
         """config : FilterConfig and constraints, which no known pose needs; align : as of
-        `settled`.
+        `align_truth`.
         """
         self._align = align
 
@@ -49,7 +49,7 @@ class GroundTruth(Reference):
     def settled(
         self, flight: Flight, base: EffectSet, config: FilterConfig | None = None
     ) -> tuple[Flight, tuple[str, ...]]:
-        return settled(flight, base, config, self._align)
+        return align_truth(flight, base, config, self._align)
 
     def view(self, flight: Flight, effects: EffectSet) -> ReferenceView:
         truth = shifted(flight, "truth", -effects.stamp_offset("truth")).truth

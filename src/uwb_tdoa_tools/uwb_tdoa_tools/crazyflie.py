@@ -1,11 +1,12 @@
-"""Log variables of a Crazyflie, as crazyswarm2 passes them on, to TDOAs and inertial samples.
+"""Convert log variables of a Crazyflie, as crazyswarm2 passes them on, to TDOAs and IMU samples.
 
     block = LogBlock(["tdoa2.d7-0", "tdoa2.d0-1", "acc.x", ...], PERIOD)
-    measured = block.take(message.timestamp, message.values)     # of a crazyflie_interfaces/LogDataGeneric
-    stamp = clock.stamp(t, arrival)                               # one VehicleClock for all blocks of a vehicle
+    measured = block.take(message.timestamp, message.values)  # of a
+    crazyflie_interfaces/LogDataGeneric
+    stamp = clock.stamp(t, arrival)                           # one VehicleClock per vehicle
 
-A variable holds the last value there was: it is sampled when the block is sent, repeats until there
-is another, and is on average half a period old. Nothing here knows ROS.
+A variable holds its last value. It is sampled when the block is sent, and repeats until a new value
+arrives. On average it is half a period old. Nothing here needs ROS.
 """
 
 from __future__ import annotations
@@ -15,10 +16,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .readers.streams import GRAVITY
+
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-GRAVITY = 9.81  # m/s^2 in one g of the Crazyflie's accelerometer
 PERIOD = 0.01  # s, the shortest of a log block
 RATES, FORCES = [f"gyro.{axis}" for axis in "xyz"], [f"acc.{axis}" for axis in "xyz"]  # deg/s, g
 DRIFT = 1e-3  # s/s by which the clock of a vehicle may run away from ours
@@ -26,12 +28,14 @@ _PAIR = re.compile(r"tdoa2\.d([0-7])-([0-7])")
 
 
 class LogBlock:
-    """One log block: the variables that it holds, in their order."""
+    """One log block: its variables in their order."""
 
     def __init__(self, variables: Sequence[str], period: float = PERIOD) -> None:
-        """variables : names of log variables; those that are neither TDOAs nor acc and gyro are
-        passed over.
-        period : s.
+        """Keep the names of the log variables; others than TDOAs, acc and gyro are ignored.
+
+        Parameters
+        ----------
+        period : s, of the block.
         """
         found = [(place, _PAIR.fullmatch(name)) for place, name in enumerate(variables)]
         self._pairs = [(place, int(match[1]), int(match[2])) for place, match in found if match]
@@ -45,13 +49,19 @@ class LogBlock:
     def take(
         self, timestamp: float, values: Sequence[float] | np.ndarray
     ) -> tuple[list[tuple[float, int, int, float]], tuple[float, np.ndarray, np.ndarray] | None]:
-        """([(t, a, b, d)], (t, gyro (3,), accel (3,)) or None) of one message.
+        """Return ([(t, a, b, d)], (t, gyro (3,), accel (3,)) or None) of one message.
 
-        timestamp : ms of the vehicle's clock; values : of the variables. t in s of that clock; d in
-            m, of the sign of
-        uwb_tdoa_msgs/Tdoa (the firmware's distanceDiff of the pair A, B is |p - B| - |p - A|);
-        rad/s and m/s^2. A value that is 0 (nothing received yet), not finite, or the same as before
-        is no measurement.
+        A value that is 0 (not received yet), not finite, or unchanged is not a measurement.
+
+        Parameters
+        ----------
+        timestamp : ms of the vehicle's clock.
+        values : of the variables.
+
+        Returns
+        -------
+        t in s of the vehicle's clock; d in m with the sign of uwb_tdoa_msgs/Tdoa (the firmware's
+        distanceDiff of the pair A, B is |p - B| - |p - A|); gyro in rad/s, accel in m/s^2.
         """
         t, tdoas = 1e-3 * timestamp, []
         for place, a, b in self._pairs:
@@ -66,16 +76,15 @@ class LogBlock:
 
 
 class VehicleClock:
-    """The vehicle's clock against ours: messages arrive late, never early, so that the least delay
-    tells the offset.
-    """
+    """The vehicle's clock relative to ours: the smallest delay of a message determines the offset."""
 
     def __init__(self) -> None:
         self._offset, self._at = np.inf, 0.0
 
     def stamp(self, t: float, arrival: float) -> float:
-        """Our time, s, of t, s of the vehicle's clock, in a message that arrived at `arrival`, s of
-        ours.
+        """Return t, s of the vehicle's clock, in s of our clock.
+
+        `arrival` is the arrival of the message, s of our clock.
         """
         self._offset = min(self._offset + DRIFT * max(arrival - self._at, 0.0), arrival - t)
         self._at = arrival

@@ -1,4 +1,4 @@
-"""How far an estimate can be believed, from the recording and the run themselves: no ground truth."""
+"""Assess how reliable an estimate is, from the recording and the run, without ground truth."""
 
 from __future__ import annotations
 
@@ -19,32 +19,38 @@ from ..checking.check import check
 from ..checking.recording import of_flight
 from ..checking.watch import OF_ANCHORS
 from ..estimate import FlightEstimator
-from ..scoring.metrics import LOST, nis, reached
+from ..scoring.metrics import LOST, has_innovation, nis
 from . import residuals
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
 GOOD, DOUBTFUL, BAD = "good", "doubtful", "bad"
-# standard deviations of the 3D position within which it is for 95 % of the time, or longer:
-# whatever the shape, 1.6 to 2.0
+# standard deviations that contain the 3D position for 95 % of the time; 1.6 to 2.0 by its shape
 SIGMAS = 2.0
-GAP = 1.0  # s without an estimate, as long as which the tag is lost
-LONG = 0.05  # share of the time that the tag may be lost in an estimate that is good
-FEW = 0.9  # share of TDOAs that are explained, below which an estimate is not good
-TALL = 1.5  # times the deviations of x and y, beyond which the height is what is known worst
-# m, of all ranges, from which on it is said: what the filter finds of ranges that have none is up
-# to some 2 cm
-OFFSET = 0.03
-# share of the variance that errors which last make, above which a calibration is what helps
-LASTING = 0.5
+GAP = 1.0  # s without an estimate: the tag is lost
+LARGEST_LOST_SHARE = 0.05  # largest share of lost time in a good estimate
+SMALLEST_EXPLAINED_SHARE = 0.9  # smallest share of explained TDOAs in a good estimate
+WEAK_HEIGHT_RATIO = (
+    1.5  # ratio of the deviation of z to x and y that makes the height the weakest coordinate
+)
+# m, smallest reported offset of all ranges; without an offset the filter estimates up to 2 cm
+REPORTED_OFFSET = 0.03
+# share of lasting errors in the variance above which a calibration helps
+LASTING_SHARE = 0.5
 
 
 @dataclass(frozen=True)
-class Belief:
-    """level : GOOD, DOUBTFUL or BAD; figures : {name: number}; lost : [(begin, end)] s, spans in
-    which the tag was lost; reasons : sentences on why it is not good; remedies : sentences on what
-    would make it better.
+class Assessment:
+    """Reliability of an estimate.
+
+    Attributes
+    ----------
+    level : GOOD, DOUBTFUL or BAD.
+    figures : {name: number}.
+    lost : [(begin, end)] s, spans in which the tag was lost.
+    reasons : sentences on why it is not good.
+    remedies : sentences on what would improve it.
     """
 
     level: str
@@ -54,7 +60,7 @@ class Belief:
     remedies: tuple[str, ...] = ()
 
     def sentences(self) -> list[str]:
-        """The verdict for people."""
+        """Return the verdict as sentences."""
         figures = self.figures
         if not figures["estimates"]:
             return [f"{self.level}: there is no estimate", *self.reasons, *self.remedies]
@@ -70,7 +76,7 @@ class Belief:
         off = figures.get("range_offset")
         offset = (
             []
-            if off is None or abs(off) < OFFSET
+            if off is None or abs(off) < REPORTED_OFFSET
             else [
                 (
                     f"all ranges are {100 * abs(off):.0f} cm too "
@@ -81,17 +87,18 @@ class Belief:
         return [f"{self.level}: {within}; {fits}", *offset, *self.reasons, *self.remedies]
 
 
-def believe(
+def assess(
     flight: Flight,
     run: Run,
     estimator: FlightEstimator = FlightEstimator(),
     line: str | None = None,
-) -> Belief:
-    """Belief in a Run of a FlightEstimator over a Flight, whose ground truth is not used. line : as
-    of `check`.
+) -> Assessment:
+    """Assess a Run of a FlightEstimator over a Flight; its ground truth is not used.
+
+    `line` is the command that `check` suggests, see there.
     """
-    odometry, left = run.odometry, residuals.of_run(flight, run)
-    there = reached(left)
+    odometry, left = run.odometry, residuals.residuals_of(flight, run)
+    there = has_innovation(left)
     figures = {
         "seconds": _length(left),
         "estimates": len(odometry),
@@ -111,7 +118,7 @@ def believe(
     remedies = [f"{finding.cause}: {finding.remedy}" for finding in faults + moved]
     if not len(odometry) or not there.any():
         reasons.append(f"the filter found no place that explains the {_measured(figures)}")
-        return Belief(BAD, figures, [], tuple(reasons), tuple(remedies))
+        return Assessment(BAD, figures, [], tuple(reasons), tuple(remedies))
     figures |= _deviation(odometry)
     figures["explained"] = float(residuals.explained(left)[there].mean())
     figures["nis"] = float(nis(left).mean())
@@ -124,11 +131,11 @@ def believe(
         reasons.append(reason)
         worse = BAD if worse == BAD else DOUBTFUL
     remedies += _remedies(flight, left, figures, estimator.effects is not None)
-    return Belief(worse, figures, lost, tuple(reasons), tuple(remedies))
+    return Assessment(worse, figures, lost, tuple(reasons), tuple(remedies))
 
 
 def _measured(figures: Mapping[str, Any]) -> str:
-    """What locates, in words."""
+    """Return the name of the measurements that locate the tag."""
     return (
         "TDOAs"
         if not figures.get("ranges")
@@ -139,7 +146,7 @@ def _measured(figures: Mapping[str, Any]) -> str:
 
 
 def _counted(figures: Mapping[str, Any]) -> str:
-    """The same with how many there are."""
+    """Return the measurements that locate the tag, with their numbers."""
     counts = [
         f"{figures[name]} {words}"
         for name, words in (("tdoas", "TDOAs"), ("ranges", "ranges"))
@@ -149,9 +156,10 @@ def _counted(figures: Mapping[str, Any]) -> str:
 
 
 def lost_spans(heard: np.ndarray, odometry: Odometry) -> list[tuple[float, float]]:
-    """[(begin, end)] s, between the first estimate and the last that was heard, of stamps (n,) s,
-    in which there is no estimate for GAP, or one whose deviation is more than LOST; spans that are
-    less than GAP apart are one.
+    """Return [(begin, end)] s, spans in which the tag is lost.
+
+    The tag is lost without an estimate for GAP, or with a deviation above LOST. Spans closer than
+    GAP are joined. They end with the last stamp in `heard` (n,) s.
     """
     t, std = odometry.t, np.sqrt(np.einsum("nii->n", odometry.covariance[:, :3, :3]))
     ends = np.append(t[1:], max(t[-1], heard.max(initial=-math.inf)))
@@ -170,7 +178,7 @@ def _length(left: Residuals) -> float:
 
 
 def _deviation(odometry: Odometry) -> dict[str, float]:
-    """{name: m, or rad} of what an Odometry says that it may be off by, and what of it lasts."""
+    """Return the mean standard deviations of an Odometry (m, rad), and the share of lasting errors."""
     known = np.einsum("nii->n", odometry.covariance[:, :3, :3]) <= LOST**2
     rows = known if known.any() else np.ones(len(known), bool)
     variance = np.einsum("nii->ni", odometry.covariance[rows, :3, :3]).mean(axis=0)
@@ -186,8 +194,8 @@ def _deviation(odometry: Odometry) -> dict[str, float]:
 def _doubts(
     flight: Flight, left: Residuals, figures: Mapping[str, Any], lost: Sequence[tuple[float, float]]
 ) -> Iterator[str]:
-    """Yield sentences."""
-    if figures["lost"] > LONG * figures["seconds"]:
+    """Yield reasons against an estimate."""
+    if figures["lost"] > LARGEST_LOST_SHARE * figures["seconds"]:
         spans = ", ".join(
             f"{begin - left.t.min():.0f} - {end - left.t.min():.0f} s" for begin, end in lost[:5]
         )
@@ -197,21 +205,20 @@ def _doubts(
         )
     if figures["recoveries"]:
         yield (
-            "the filter found that it had been wrong, and began anew at another place, "
-            f"{figures['recoveries']} times"
+            f"the filter was wrong and was reset to another position {figures['recoveries']} times"
         )
-    if figures["explained"] < FEW:
+    if figures["explained"] < SMALLEST_EXPLAINED_SHARE:
         yield f"{1.0 - figures['explained']:.0%} of the {_measured(figures)} speak against it"
     if figures["std"] > LOST:
         yield f"the position is stated to no better than {figures['std']:.1f} m"
     if flight.imu is not None and figures["yaw_std"] > YAW_KNOWN:
-        yield f"the yaw is not known in the end: +-{math.degrees(figures['yaw_std']):.0f} degrees"
+        yield f"the yaw is unknown at the end: +-{math.degrees(figures['yaw_std']):.0f} degrees"
 
 
 def _remedies(
     flight: Flight, left: Residuals, figures: Mapping[str, Any], corrected: bool
 ) -> Iterator[str]:
-    """Yield sentences."""
+    """Yield improvements for the next recording."""
     ids = np.unique(np.concatenate([left.a, left.b]).astype(int))
     lacking = ids[flight.anchors.index(ids) < 0]
     if len(lacking):
@@ -221,12 +228,15 @@ def _remedies(
         )
     if flight.imu is None:
         yield "record the inertial sensor, too: the filter then knows the attitude, and bridges gaps"
-    if figures["std_z"] > TALL * max(figures["std_x"], figures["std_y"]) and flight.height is None:
+    if (
+        figures["std_z"] > WEAK_HEIGHT_RATIO * max(figures["std_x"], figures["std_y"])
+        and flight.height is None
+    ):
         yield (
-            "the height is what is known worst: add a range finder that looks down, or put "
+            "the height is the weakest coordinate: add a range finder that looks down, or put "
             "anchors further apart in height (plan says where)"
         )
-    if not corrected and figures["lasting"] > LASTING:
+    if not corrected and figures["lasting"] > LASTING_SHARE:
         yield (
             f"{figures['lasting']:.0%} of the variance is of errors that last, as of delays and "
             "places of anchors: calibrate them"

@@ -1,0 +1,221 @@
+"""Topics of a bag: their names, types, QoS, and messages as arrays."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from rosbags.interfaces import (
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+
+from uwb_tdoa_bias.foundation.sensors import SENSORS
+
+from ..clock import straightened
+from . import messages as bag_messages
+from .files import connections_of, readable
+
+if TYPE_CHECKING:
+    from uwb_tdoa_bias.foundation.sensors import Sensor
+
+    from ..clock import Straightened
+    from .files import BagReader
+
+
+def _qos(durability: QosDurability, depth: int) -> Qos:
+    """Return a reliable QoS.
+
+    A reliable publisher serves reliable and best-effort subscriptions, and loses nothing.
+    """
+    endless = QosTime(9223372036, 854775807)
+    return Qos(
+        QosHistory.KEEP_LAST,
+        depth,
+        QosReliability.RELIABLE,
+        durability,
+        endless,
+        endless,
+        QosLiveliness.AUTOMATIC,
+        endless,
+        False,
+    )
+
+
+STREAM_QOS = _qos(QosDurability.VOLATILE, 1000)
+LATCHED_QOS = _qos(QosDurability.TRANSIENT_LOCAL, 1)
+
+
+class StreamKind(NamedTuple):
+    """How a stream of a Flight is read from a bag.
+
+    Attributes
+    ----------
+    topic, message : our topic and its type.
+    row : convert a message to numbers, see `read_topic`.
+    make : convert stamps s and rows to the stream.
+    valid : check which numbers of the rows are valid.
+    """
+
+    topic: str
+    message: str
+    row: Callable[[Any], tuple[float, ...]]
+    make: Callable[[np.ndarray, np.ndarray], Any]
+    valid: Callable[[np.ndarray], np.ndarray] = bag_messages.valid
+
+
+STREAMS = {
+    "tdoa": StreamKind(
+        "uwb/tdoa", "uwb_tdoa_msgs/msg/Tdoa", bag_messages.tdoa_row, bag_messages.tdoas_of
+    ),
+    "imu": StreamKind("imu/data", "sensor_msgs/msg/Imu", bag_messages.imu_row, bag_messages.imu_of),
+    **{
+        name: StreamKind(of.topics[0][0], of.message, *bag_messages.of_sensor(of))
+        for name, of in SENSORS.items()
+    },
+    "pose": StreamKind(
+        "ground_truth/pose",
+        "geometry_msgs/msg/PoseStamped",
+        bag_messages.pose_row,
+        bag_messages.truth_of,
+    ),
+}
+
+
+class Names:
+    """Absolute names of our topics in a bag."""
+
+    def __init__(self, namespace: str = "", topics: dict[str, str] | None = None) -> None:
+        """Keep namespace and topics, see `read_bag`."""
+        self._namespace, self._topics = namespace.strip("/"), topics or {}
+
+    def __call__(self, topic: str) -> str:
+        """Return the absolute name of one of our topics, e.g. "uwb/tdoa"."""
+        name = self._topics.get(topic, topic)
+        absolute = name.startswith("/") or not self._namespace
+        return f"/{name.strip('/')}" if absolute else f"/{self._namespace}/{name.strip('/')}"
+
+
+@dataclass(frozen=True)
+class TopicMessages:
+    """Messages of a topic in the order of the bag.
+
+    Attributes
+    ----------
+    stamps, arrived : (n,) int ns, of the headers and of the recording.
+    rows : (n, k), further numbers of each message.
+    frames : {frame_id: messages}.
+    """
+
+    stamps: np.ndarray
+    arrived: np.ndarray
+    rows: np.ndarray
+    frames: Counter[str]
+
+    def in_order(self) -> tuple[np.ndarray, np.ndarray, int]:
+        """Return (stamps (n,) s, rows (n, k)) in order of the stamps, and how often they fall."""
+        order = np.argsort(self.stamps, kind="stable")
+        return self.stamps[order] / 1e9, self.rows[order], int((np.diff(self.stamps) < 0).sum())
+
+
+def arrivals(found: Mapping[str, TopicMessages]) -> dict[str, np.ndarray]:
+    """Return {stream: (n,) s, times of recording}; NaN if all of them equal the stamps."""
+    known = any(bool((of.stamps != of.arrived).any()) for of in found.values())
+    return {
+        name: of.arrived / 1e9 if known else np.full(len(of.arrived), np.nan)
+        for name, of in found.items()
+    }
+
+
+def on_one_clock(
+    found: Mapping[str, TopicMessages],
+) -> tuple[dict[str, TopicMessages], Straightened]:
+    """Put the messages of a recording on a continuous time and remove outliers.
+
+    Returns the messages and the changes.
+    """
+    clock = straightened({name: of.stamps / 1e9 for name, of in found.items()}, arrivals(found))
+    out = dict(found)
+    for name in {*clock.shifts, *clock.kept}:
+        of, kept = found[name], clock.kept.get(name, slice(None))
+        stamps = of.stamps + np.round(1e9 * clock.shifts.get(name, np.zeros(1))).astype(np.int64)
+        out[name] = TopicMessages(stamps[kept], of.arrived[kept], of.rows[kept], of.frames)
+    return out, clock
+
+
+def read_topic(
+    path: str | Path,
+    reader: BagReader,
+    topic: str,
+    msgtype: str,
+    row: Callable[[Any], tuple[float, ...]],
+) -> TopicMessages:
+    """Read the messages of a topic; empty if the topic does not exist.
+
+    `row(message)` returns the stamp, ns, and k further numbers. Raises InputError for another type
+    than `msgtype`.
+    """
+    arrived, rows, frames = [], [], Counter[str]()
+    for _, received, message in readable(
+        path, reader, connections_of(path, reader, topic, msgtype)
+    ):
+        arrived.append(received)
+        rows.append(row(message))
+        frames[message.header.frame_id] += 1
+    stamps, table = (
+        np.array([values[0] for values in rows], dtype=np.int64),
+        np.array([values[1:] for values in rows], dtype=float),
+    )
+    return TopicMessages(stamps, np.array(arrived, dtype=np.int64), table, frames)
+
+
+def topics_of(name: str) -> tuple[tuple[str, str], ...]:
+    """Return ((topic, type of its messages), ...) of a stream of a Flight, by our names."""
+    return (
+        SENSORS[name].topics if name in SENSORS else ((STREAMS[name].topic, STREAMS[name].message),)
+    )
+
+
+def read_sensor(
+    path: str | Path, reader: BagReader, sensor: Sensor, name_of: Names
+) -> TopicMessages:
+    """Read all topics of a Sensor as a node receives them: in order of arrival.
+
+    Raises InputError as `read_topic`.
+    """
+    row, _, _ = bag_messages.of_sensor(sensor)
+    parts = [read_topic(path, reader, name_of(topic), kind, row) for topic, kind in sensor.topics]
+    filled = [part for part in parts if len(part.stamps)]
+    if len(filled) < 2:
+        return filled[0] if filled else parts[0]
+    order = np.argsort(np.concatenate([part.arrived for part in filled]), kind="stable")
+    stamps, arrived, rows = (
+        np.concatenate([getattr(part, name) for part in filled])[order]
+        for name in ("stamps", "arrived", "rows")
+    )
+    return TopicMessages(stamps, arrived, rows, sum((part.frames for part in filled), Counter()))
+
+
+def other_namespaces(reader: BagReader, namespace: str) -> str:
+    """Return a remedy for an error message: the namespace with such a topic, if there is one."""
+    places = sorted(
+        {
+            one.topic.removesuffix("/uwb/tdoa")
+            for one in reader.connections
+            if one.topic.endswith("/uwb/tdoa")
+        }
+    )
+    places = [place for place in places if place.strip("/") != namespace.strip("/")]
+    if places:
+        return (
+            f"give the namespace it was recorded in: {', '.join(place or '/' for place in places)}"
+        )
+    return "it is no recording of this suite"

@@ -1,1 +1,0 @@
-"""From recordings to a calibrated tag: check, diagnose or survey, judge, write."""

@@ -1,1 +1,0 @@
-"""What a Crazyflie sends over its radio link: log variables, sampled."""

@@ -1,0 +1,359 @@
+"""Score recordings one by one against their ground truth, and tabulate the errors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from uwb_tdoa_bias.foundation.foreign_text import harmless
+
+from . import parallel
+from .bags.bag import late_tdoas, read_odometry
+from .checking.against_truth import of_truth
+from .checking.check import check
+from .checking.recording import of_flight
+from .checking.remarks import survey_remarks
+from .checking.watch import BEFORE_TRUTH
+from .estimate import FlightEstimator
+from .localizing.localize import write_tum
+from .localizing.pictures import write_rerun
+from .readers.inputs import Reading, report_remarks
+from .readers.tables import number, read_table
+from .results_file import ResultsFile, state_of
+from .scoring.alignment import ALIGN, NONE, estimate_alignment, require_truth
+from .scoring.evaluation import corrected_truth
+from .scoring.metrics import Score
+from .scoring.phases import NEAR_THE_FLOOR, TITLES
+from .scoring.pooling import Pool, Result
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Iterator, Sequence
+
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_ekf.results import Odometry, Residuals
+
+    from .bags.bag import RecordedOdometry
+    from .readers.inputs import Recording
+    from .scoring.alignment import Alignment
+COLUMNS = {
+    "rmse_x": "x",
+    "rmse_y": "y",
+    "rmse_z": "z",
+    "rmse_3d": "3D",
+    "median_3d": "median",
+    "max_3d": "max",
+    "frac_gt_1m": ">1 m",
+    "nees_mean": "NEES",
+    "nis_mean": "NIS",
+    "start_delay": "delay",
+}
+PHASE = {  # of the figures of a phase
+    "duration": "s",
+    "rmse_x": "x",
+    "rmse_y": "y",
+    "rmse_z": "z",
+    "rmse_3d": "3D",
+    "max_3d": "max",
+    "std_3d": "stated",
+    "nees_mean": "NEES",
+    "step": "step",
+    "without_estimate": "without, s",
+}
+OF_RUNS = {
+    "rmse_3d_median_of_runs": "runs: median",
+    "rmse_3d_max_of_runs": "largest",
+    "nees_mean_max_of_runs": "largest NEES",
+}
+SHORT = {"rmse_3d": "3D", "max_3d": "max", "nees_mean": "NEES", "without_estimate": "without, s"}
+ERRORS = ("rmse_x", "rmse_y", "rmse_z", "rmse_3d", "median_3d", "max_3d")
+
+
+@dataclass(frozen=True)
+class Evaluator:
+    """Return the Result of a recording (path, survey): score the filter, or a recorded odometry.
+
+    Can be pickled. Raises InputError.
+
+    Attributes
+    ----------
+    reading : how recordings are read.
+    estimator : filter with corrections.
+    odometry : bag whose odometry is scored instead, or None.
+    picture : image file of the errors, or None.
+    trajectories : folder for TUM files, or None.
+    rerun : file for Rerun, or None.
+    align : one of ALIGN, alignment of the ground truth before scoring.
+    """
+
+    reading: Reading = Reading()
+    estimator: FlightEstimator = FlightEstimator()
+    odometry: str | None = None
+    picture: str | None = None
+    trajectories: Path | None = None
+    rerun: Path | None = None
+    align: str = NONE
+
+    def __call__(self, recording: Recording) -> Result:
+        flight = self.reading.read(recording)
+        require_truth(flight, self.align == NONE)
+        survey_sentences = [] if self.odometry else list(survey_remarks(flight))
+        report_remarks(flight.name, survey_sentences)
+        odometry: Odometry | RecordedOdometry
+        residuals: Residuals | None
+        if self.odometry:
+            recorded = read_odometry(self.odometry, *self._where)
+            odometry, residuals = recorded, None
+            report_remarks(self.odometry, recorded.remarks)
+        else:
+            run = self.estimator(flight)
+            odometry, residuals = run.odometry, run.residuals
+            flight = replace(flight, truth=corrected_truth(flight, self.estimator.effects))
+        assert flight.truth is not None  # require_truth
+        found = estimate_alignment(flight, odometry)
+        truth_findings = list(self._truth_findings(flight, found))
+        truths = {how: found.applied_to(flight.truth, how) for how in ALIGN}
+        scores = {
+            how: Score(flight.name, odometry, one, residuals, flight.tdoa.t)
+            for how, one in truths.items()
+        }
+        score, truth = scores[self.align], truths[self.align]
+        if truth_findings or (score.row()["diverged"] and not score.row()["late_start"]):
+            causes = self._anchor_findings(
+                flight
+            )  # ids and anchors first: the truth is measured better
+            report_remarks(
+                flight.name,
+                [one for one in causes or truth_findings if one not in survey_sentences],
+            )
+        if self.picture:
+            from .scoring.plots import plot_error  # takes a second to import
+
+            plot_error(score, odometry, truth, self.picture)
+        if self.trajectories:
+            folder = self.trajectories
+            write_tum(folder / f"{flight.name}.tum", odometry.t, odometry.p, odometry.q)
+            write_tum(folder / f"{flight.name}_truth.tum", truth.t, truth.p, truth.q)
+        if self.rerun:
+            lines = [f"{name}: {value}" for name, value in score.row().items()]
+            write_rerun(self.rerun, flight, odometry, residuals, lines, truth)
+        aligned = {**found.as_dict(), "align": self.align, "words": found.frame_in_words()}
+        return replace(
+            score.result(),
+            aligned=aligned
+            | {f"rmse_3d_{how}": one.row()["rmse_3d"] for how, one in scores.items()},
+        )
+
+    def _anchor_findings(self, flight: Flight) -> list[str]:
+        """Return sentences on wrong ids, signs, units and anchors of a Flight.
+
+        Empty for a recorded odometry.
+        """
+        if self.odometry:
+            return []
+        found = check(of_flight(flight), (), self.estimator).findings
+        return [
+            f"{one.cause}: {one.evidence}; {one.remedy}."
+            for one in found
+            if one.rule in BEFORE_TRUTH
+        ]
+
+    def _truth_findings(self, flight: Flight, found: Alignment) -> Iterator[str]:
+        """Yield sentences on errors of the ground truth."""
+        for how, words in (("time", found.clock_sentence()), ("frame", found.frame_sentence())):
+            if words:
+                yield words + (
+                    f"; judge with --align {how}, and put it right where it comes from."
+                    if self.align == NONE
+                    else "."
+                )
+        for finding in of_truth(flight):
+            yield f"{finding.cause}: {finding.evidence}; {finding.remedy}."
+
+    def late_tdoas(self) -> int:
+        """Return the number of TDOAs that came too late for a recorded odometry."""
+        return late_tdoas(self.odometry, *self._where) if self.odometry else 0
+
+    @property
+    def _where(self) -> tuple[str, bool, dict[str, str]]:
+        return self.reading.namespace, self.reading.salvage, self.reading.topics
+
+
+def results(
+    evaluator: Evaluator,
+    recordings: Sequence[Recording],
+    path: str | Path | None,
+    asked: dict[str, Any],
+    jobs: int | None = None,
+    dask: str | None = None,
+) -> Iterator[Result]:
+    """Yield the Result of each recording; reuse those in the file `path`.
+
+    Parameters
+    ----------
+    path : of a ResultsFile, or None.
+    asked : everything else that results depend on, see ResultsFile.
+    jobs, dask : see `parallel.over`.
+    """
+    if path is None:
+        yield from parallel.over(evaluator, recordings, jobs, dask)
+        return
+    keys = [" ".join(map(state_of, recording)) for recording in recordings]
+    with ResultsFile(path, asked) as done:
+
+        def make(missing: Iterable[Recording]) -> Iterator[dict[str, Any]]:
+            return (result.as_dict() for result in parallel.over(evaluator, missing, jobs, dask))
+
+        for key in done.keys_done(keys, recordings, make, "flights"):
+            yield done.read(key, _checked)
+
+
+def _checked(content: dict[str, Any]) -> Result:
+    """Return the Result of a stored dict; raise if a figure is missing."""
+    result, pool = Result.from_dict(content), Pool()
+    pool.add(result)
+    line_of_run({**result.row, **pool.figures()})
+    lines_of_phases(result.phases)
+    return result
+
+
+def head_line() -> str:
+    """Return the heading of the lines of `line_of_run`."""
+    return _cells("flight", COLUMNS.values())
+
+
+def line_of_run(row: dict[str, Any]) -> str:
+    """Return the figures of one run, `Score.row`, or of several, `Pool.figures`, as a line."""
+    word = ""
+    if row["diverged"]:
+        word = "  LATE START" if row["diverged"] == row["late_start"] else "  DIVERGED"
+    return _cells(row["flight"], (f"{row[key]:.3f}" for key in COLUMNS)) + word
+
+
+def lines_of_errors(scores: Sequence[Score]) -> list[str]:
+    """Return lines of the errors, m, of several Scores of one flight."""
+    titles = "".join(f"{COLUMNS[key]:>9s}" for key in ERRORS)
+    rows = [
+        f"{score.name:28s}" + "".join(f"{score.row()[key]:9.3f}" for key in ERRORS)
+        for score in scores
+    ]
+    return [f"{'error, m':28s}{titles}", *rows]
+
+
+def markdown(rows: Sequence[dict[str, Any]], others: dict[str, dict[str, str]]) -> str:
+    """Return the table of rows, in metres, with one column per other estimator of `read_others`."""
+    table = [["flight", *COLUMNS.values(), *others]]
+    for row in rows:
+        cells = [f"{row[key]:.3f}" for key in COLUMNS] + [
+            peer.get(row["flight"], "") for peer in others.values()
+        ]
+        table.append([row["flight"], *cells])
+    return _as_markdown(table)
+
+
+def lines_of_alignment(aligned: dict[str, Any], means: dict[str, float]) -> Iterator[str]:
+    """Yield lines on the alignment of ground truth and estimates.
+
+    Parameters
+    ----------
+    aligned : of a single run, see Result; empty for several.
+    means : {one of ALIGN: 3D RMSE, m}.
+    """
+    if aligned:
+        late = aligned["late"]
+        clock = (
+            f"its stamps {abs(late):.2f} s {'late' if late > 0.0 else 'early'}"
+            if late
+            else "its stamps in time"
+        )
+        yield f"ground truth beside the estimate: {clock}, {aligned['words']}"
+    figures = [f"{error:.3f} m --align {how}" for how, error in means.items() if np.isfinite(error)]
+    if figures:
+        yield f"{'3D RMSE' if aligned else 'mean 3D RMSE of the runs'}: {', '.join(figures)}"
+
+
+def lines_of_phases(phases: dict[str, dict[str, Any]]) -> list[str]:
+    """Return lines on the phases of one run, `Score.phases`, or of several, `Pool.phases`."""
+    head_line, *rows = _table_of_phases(phases)
+    return [
+        f"{row[0]:20s}"
+        + "".join(
+            f"{cell:>{max(8, len(title)) + 1}s}" for cell, title in zip(row[1:], head_line[1:])
+        )
+        for row in (head_line, *rows)
+    ]
+
+
+def markdown_of(results: Sequence[Result], pool: Pool, others: dict[str, dict[str, str]]) -> str:
+    """Return all tables of Results and their Pool: errors, phases of all, and phases of each."""
+    rows = [result.row for result in results]
+    if len(results) == 1:
+        return f"{markdown(rows, others)}\n{_as_markdown(_table_of_phases(results[0].phases))}"
+    together = pool.figures()
+    of_all, of_each = _table_of_phases(together["phases"]), _table_of_runs(results)
+    return f"{markdown([*rows, together], others)}\n{_as_markdown(of_all)}\n{_as_markdown(of_each)}"
+
+
+def _table_of_runs(results: Sequence[Result]) -> list[list[str]]:
+    titles = [
+        f"{TITLES[name]}: {first}" if first == "3D" else first
+        for name in NEAR_THE_FLOOR
+        for first in SHORT.values()
+    ]
+    table = [["flight", *titles, "step until z > 0.3 m", "ready, s"]]
+    for result in results:
+        cells = [
+            _cell(result.phases.get(phase, {}).get(key))
+            for phase in NEAR_THE_FLOOR
+            for key in SHORT
+        ]
+        step = result.phases.get("to_0.3_m", {}).get("step")
+        table.append([result.row["flight"], *cells, _cell(step), _cell(result.row["ready_delay"])])
+    return table
+
+
+def _table_of_phases(phases: dict[str, dict[str, Any]]) -> list[list[str]]:
+    columns = PHASE | (OF_RUNS if any("runs" in figures for figures in phases.values()) else {})
+    rows = [
+        [TITLES[name], *(_cell(figures[key]) for key in columns)]
+        for name, figures in phases.items()
+    ]
+    return [["phase", *columns.values()], *rows]
+
+
+def _cell(value: float | None) -> str:
+    """Return a number as text; empty if there is none."""
+    return (
+        ""
+        if value is None or math.isnan(value)
+        else f"{value:.{1 if abs(value) >= 100.0 else 2 if abs(value) >= 10.0 else 3}f}"
+    )
+
+
+def _as_markdown(table: Sequence[Sequence[str]]) -> str:
+    """Return a table with its heading first; its first column is text."""
+    ruled = [table[0], ["---"] + ["---:"] * (len(table[0]) - 1), *table[1:]]
+    return "".join("| " + " | ".join(cells) + " |\n" for cells in ruled)
+
+
+def read_others(path: str | Path) -> dict[str, dict[str, str]]:
+    """Return {peer and mode: {flight: 3D RMSE as text, or "diverged"}} of a CSV file.
+
+    Raises InputError.
+    """
+    others: dict[str, dict[str, str]] = {}
+    for line, row in read_table(path, ("flight", "peer", "mode", "rmse_3d", "diverged")):
+        cell = (
+            "diverged" if row["diverged"] == "True" else f"{number(path, line, row, 'rmse_3d'):.3f}"
+        )
+        others.setdefault(harmless(f"{row['peer']} {row['mode']}"), {})[harmless(row["flight"])] = (
+            cell
+        )
+    return others
+
+
+def _cells(first: str, cells: Iterable[str]) -> str:
+    return f"{first:20s}" + "".join(f"{cell:>9s}" for cell in cells)

@@ -1,0 +1,292 @@
+"""Figures of one run as a record of fixed size, and figures of several runs together."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..json_values import as_json
+from .phases import TITLES
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    Spans = Sequence[tuple[float, float]]  # from when to when, s
+
+
+RATIO = 1.01  # ratio of the limits of a bin
+SMALLEST = 1e-9  # smaller samples count as this
+ALIGN = "none", "time", "frame"  # how far a ground truth is aligned before scoring
+FIGURES = 3  # version of the content of a Result
+
+
+@dataclass
+class Distribution:
+    """Distribution of samples as a histogram whose size does not depend on their number.
+
+    Attributes
+    ----------
+    count, total, largest : number, sum and maximum of the samples.
+    bins : {k: number of samples from RATIO**k to RATIO**(k + 1)}.
+    """
+
+    count: int
+    total: float
+    largest: float
+    bins: Counter[int]
+
+    @classmethod
+    def of(cls, values: np.ndarray | Sequence[float]) -> Distribution:
+        """Count values (n,) of at least 0; NaN makes all figures NaN."""
+        if not len(values):
+            return cls(0, 0.0, -math.inf, Counter())
+        sizes = np.clip(np.nan_to_num(values), SMALLEST, 1.0 / SMALLEST)
+        places, counts = np.unique(
+            np.floor(np.log(sizes) / math.log(RATIO)).astype(int), return_counts=True
+        )
+        return cls(
+            len(values),
+            float(np.sum(values)),
+            float(np.max(values)),
+            Counter(dict(zip(places.tolist(), counts.tolist()))),
+        )
+
+    def __add__(self, other: Distribution) -> Distribution:
+        largest = float(np.max([self.largest, other.largest]))  # NaN if one is NaN
+        return Distribution(
+            self.count + other.count, self.total + other.total, largest, self.bins + other.bins
+        )
+
+    @property
+    def mean(self) -> float:
+        """Return the mean; NaN without samples."""
+        return self.total / self.count if self.count else math.nan
+
+    @property
+    def median(self) -> float:
+        """Return the median to 1 %; NaN without samples."""
+        if not self.count or math.isnan(self.total):
+            return math.nan
+        half, below = 0.5 * self.count, 0
+        for place in sorted(self.bins):
+            if below + self.bins[place] >= half:
+                return RATIO ** (place + (half - below) / self.bins[place])
+            below += self.bins[place]
+        raise AssertionError("the bins hold fewer than were counted")
+
+    def as_list(self) -> list[Any]:
+        """Return plain numbers for JSON; floats that may be NaN or infinite become texts."""
+        return [
+            self.count,
+            repr(self.total),
+            repr(self.largest),
+            [number for item in sorted(self.bins.items()) for number in item],
+        ]
+
+    @classmethod
+    def from_list(cls, numbers: list[Any]) -> Distribution:
+        """Restore a Distribution from `as_list`."""
+        count, total, largest, bins = numbers
+        return cls(count, float(total), float(largest), Counter(dict(zip(bins[::2], bins[1::2]))))
+
+
+class PooledErrors:
+    """The figures of one phase, pooled over runs."""
+
+    def __init__(self) -> None:
+        self._runs, self._largest = 0, {"max_3d": math.nan, "step": math.nan}
+        self._sums: dict[str, Any] = Counter()  # numbers, some of them float
+        self._of_runs = {name: Distribution.of([]) for name in ("rmse_3d", "nees_mean")}
+
+    def add(self, figures: dict[str, Any]) -> None:
+        """Count the figures of one run, see `ErrorSeries.figures`."""
+        count, self._runs = figures["count"], self._runs + 1
+        added = {
+            name: figures[name]
+            for name in ("duration", "count", "without_estimate", "without_truth")
+        }
+        if count:
+            added |= {
+                name: count * figures[name] ** 2
+                for name in ("rmse_x", "rmse_y", "rmse_z", "rmse_3d", "std_3d")
+            }
+            added["nees_mean"] = count * figures["nees_mean"]
+            self._largest = {
+                name: _larger(known, figures[name]) for name, known in self._largest.items()
+            }
+            self._of_runs = {
+                name: known + Distribution.of([figures[name]])
+                for name, known in self._of_runs.items()
+            }
+        self._sums.update(added)
+
+    def figures(self) -> dict[str, Any]:
+        """Return the figures of all samples, and median and maximum over the runs, as a dict.
+
+        Medians are accurate to 1 %.
+        """
+        sums, count = self._sums, self._sums["count"]
+        out: dict[str, Any] = {"runs": self._runs, "duration": sums["duration"], "count": count}
+        for name in ("rmse_x", "rmse_y", "rmse_z", "rmse_3d", "std_3d"):
+            out[name] = math.sqrt(sums[name] / count) if count else math.nan
+        out["nees_mean"] = sums["nees_mean"] / count if count else math.nan
+        out |= self._largest | {name: sums[name] for name in ("without_estimate", "without_truth")}
+        for name, part in self._of_runs.items():
+            out[f"{name}_median_of_runs"] = part.median
+            out[f"{name}_max_of_runs"] = part.largest if part.count else math.nan
+        return out
+
+
+def _larger(one: float, other: float) -> float:
+    """Return the larger number; a NaN in `one` means that there was none yet."""
+    return other if math.isnan(one) else float(np.max([one, other]))
+
+
+@dataclass(frozen=True)
+class Result:
+    """One run as a record whose size does not depend on its length.
+
+    Attributes
+    ----------
+    row : figures, see `Score.row`.
+    sums : {name: sum over the samples}.
+    distributions : {quantity: Distribution}.
+    phases : figures of each phase, see `Score.phases`.
+    aligned : `Alignment.as_dict` and the 3D RMSE, m, with each of ALIGN; empty if not computed.
+    """
+
+    row: dict[str, Any]
+    sums: dict[str, float]
+    distributions: dict[str, Distribution]
+    phases: dict[str, dict[str, Any]]
+    aligned: dict[str, Any] = field(default_factory=dict)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return a dict for JSON, without loss."""
+        parts = {name: part.as_list() for name, part in self.distributions.items()}
+        of_phases = {name: _as_texts(figures) for name, figures in self.phases.items()}
+        return {
+            "row": _as_texts(self.row),
+            "sums": _as_texts(self.sums),
+            "distributions": parts,
+            "phases": of_phases,
+            "aligned": as_json(self.aligned),
+        }
+
+    @classmethod
+    def from_dict(cls, content: dict[str, Any]) -> Result:
+        """Restore a Result from `as_dict`."""
+        parts = {
+            name: Distribution.from_list(numbers)
+            for name, numbers in content["distributions"].items()
+        }
+        of_phases = {name: _from_texts(figures) for name, figures in content["phases"].items()}
+        return cls(
+            _from_texts(content["row"]),
+            _from_texts(content["sums"]),
+            parts,
+            of_phases,
+            content["aligned"],
+        )
+
+    def as_json(self) -> dict[str, Any]:
+        """Return all figures of the run for JSON; NaN becomes null."""
+        return as_json({**self.row, "phases": self.phases, "aligned": self.aligned})
+
+
+class Pool:
+    """Pool the samples of several runs, one run after the other."""
+
+    def __init__(self) -> None:
+        self._sums: dict[str, Any] = Counter()  # numbers, some of them float
+        self._distributions: dict[str, Distribution] = {}
+        self._runs, self._total, self._largest = 0, 0.0, 0.0
+        self._row: dict[str, Any] = {"start_delay": 0.0, "diverged": 0, "late_start": 0}
+        self._ready = math.nan
+        self._phases: dict[str, PooledErrors] = {}
+        self._aligned: dict[str, Any] = Counter()
+
+    def add(self, result: Result) -> None:
+        """Count the Result of one run."""
+        row, known = result.row, self._distributions
+        self._runs += 1
+        self._sums.update(result.sums)
+        self._distributions = {
+            name: known[name] + part if name in known else part
+            for name, part in result.distributions.items()
+        }
+        self._total, self._largest = (
+            self._total + row["rmse_3d"],
+            float(np.max([self._largest, row["rmse_3d"]])),
+        )
+        self._row["start_delay"] = max(self._row["start_delay"], row["start_delay"])
+        self._ready = float(np.fmax(self._ready, row["ready_delay"]))  # NaN if unknown
+        for key in ("diverged", "late_start"):
+            self._row[key] += row[key]
+
+        for how in ALIGN if result.aligned else ():
+            error = result.aligned[f"rmse_3d_{how}"]
+            self._aligned[how] += math.nan if error is None else error
+        for name, figures in result.phases.items():
+            self._phases.setdefault(name, PooledErrors()).add(figures)
+
+    @property
+    def aligned(self) -> dict[str, float]:
+        """Return {one of ALIGN: mean 3D RMSE of the runs, m}; NaN for a truth on another clock."""
+        return {how: total / self._runs for how, total in self._aligned.items()}
+
+    def phases(self) -> dict[str, dict[str, Any]]:
+        """Return {name: figures, see `PooledErrors.figures`} of the phases that any run has."""
+        return {name: self._phases[name].figures() for name in TITLES if name in self._phases}
+
+    def figures(self) -> dict[str, Any]:
+        """Return the figures of at least one run as a dict.
+
+        They are those of `summary`, the coverage, mean and maximum of the 3D RMSE over runs, and
+        the phases. Medians are accurate to 1 %.
+        """
+        distance, count = self._distributions["distance"], self._distributions["distance"].count
+        shares = {name: total / count if count else math.nan for name, total in self._sums.items()}
+        out: dict[str, Any] = {"flight": f"{self._runs} pooled"}
+        out |= {
+            f"rmse_{name}": math.sqrt(shares[f"square_{name}"]) for name in ("x", "y", "z", "3d")
+        }
+        out |= {"median_3d": distance.median, "max_3d": distance.largest if count else math.nan}
+        out["frac_gt_1m"] = shares["lost"] if count else 1.0
+        for name in ("nees", "nis"):
+            part = self._distributions[name]
+            out |= {f"{name}_mean": part.mean, f"{name}_median": part.median}
+        out |= (
+            {name: shares.get(name, math.nan) for name in coverage_figures(np.zeros(3))}
+            | self._row
+            | {"ready_delay": self._ready}
+        )
+        out["rmse_3d_mean_of_runs"], out["rmse_3d_max_of_runs"] = (
+            self._total / self._runs,
+            self._largest,
+        )
+        return {**out, "phases": self.phases()}
+
+
+def _as_texts(numbers: dict[str, Any]) -> dict[str, Any]:
+    """Return a dict with floats as texts, because JSON has no NaN."""
+    return {
+        key: repr(value) if isinstance(value, float) else value for key, value in numbers.items()
+    }
+
+
+def _from_texts(numbers: dict[str, Any]) -> dict[str, Any]:
+    """Restore floats from `_as_texts`."""
+    return {
+        key: float(value) if isinstance(value, str) and key not in ("flight", "part") else value
+        for key, value in numbers.items()
+    }
+
+
+def coverage_figures(shares: np.ndarray) -> dict[str, float]:
+    """Name the shares (3,) of `coverage` for a dict of figures."""
+    return {f"coverage_3sigma_{axis}": float(share) for axis, share in zip("xyz", shares)}
