@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_bias.effects.tag_lever_arm import TagLeverArm
+from uwb_tdoa_bias.effects.tag import TagLeverArm
 from uwb_tdoa_bias.foundation.flight import Imu
 from uwb_tdoa_ekf.imu_mount import ImuMount
 from uwb_tdoa_ekf.offline import run_offline

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_bias.effects.wording import listed
+from uwb_tdoa_bias.effects.base import listed
 
 from ..diagnosis.self_calibration import SelfCalibration, Tape, self_calibrate
 from ..diagnosis.self_calibration.solve import IMPROVED

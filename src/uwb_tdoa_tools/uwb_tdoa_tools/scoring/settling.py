@@ -127,7 +127,7 @@ def _ranges_fit(flight: Flight, effects: EffectSet, found: Alignment) -> bool:
             samples, rows = true_samples(
                 replace(flight, truth=found.least().applied(flight.truth, how)), RADIO[channel]
             )
-            left = stream.d[rows] - samples.true() - effects.bias(samples)
+            left = stream.d[rows] - samples.predicted() - effects.bias(samples)
             apart = [
                 np.abs(left[samples.b == anchor] - np.median(left[samples.b == anchor]))
                 for anchor in np.unique(samples.b)

@@ -12,7 +12,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.limits import TABLE_CELLS
 
 from ..bags.bag import read_odometry
-from ..diagnosis.references.path import OdometryPath
+from ..diagnosis.constraints import OdometryPath
 from ..readers.tables import number, read_table
 
 if TYPE_CHECKING:
