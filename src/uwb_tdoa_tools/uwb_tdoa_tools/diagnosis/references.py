@@ -120,7 +120,7 @@ class GroundTruth(Reference):
         constraints: Sequence[Constraint | OdometryPath] = (),
         align: str = NONE,
     ) -> None:
-        """Take `align` as in `scoring.settling.settled`; the others are not needed."""
+        """Take `align` as in `scoring.settling.settled`; a known pose needs no more."""
         self._align = align
 
     def prepare(self, flight: Flight) -> Flight:
@@ -151,7 +151,7 @@ class Nothing(Reference):
     """No reference: the residuals are the innovations of the filter.
 
     They are of TDOAs, or of ranges in a flight without TDOAs. The estimate follows an effect in
-    part: regressors are those of innovations. A common offset of all ranges is corrected first,
+    part, so regressors are computed for innovations. A common offset of all ranges is corrected first,
     because it bends the path; `self_calibrate` estimates it.
     """
 
@@ -230,8 +230,8 @@ class Heights(GroundTruth):
 class OdometryReference(GroundTruth):
     """The path of another odometry, fitted to the path of the filter and to marks.
 
-    Without marks a common shift and yaw of a flight are not observable: they are those of the
-    filter. Marks at take-off and landing are enough.
+    Without marks a common shift and yaw of a flight are not observable: the filter sets
+    them. Marks at take-off and landing are enough.
     """
 
     attitude_known = False

@@ -75,7 +75,7 @@ class AidResidual(ChannelResidual):
 
 
 class Aid(Channel[AidResidual]):
-    """The channel of one of the SENSORS, with the fields of its Compared as attributes."""
+    """The channel of an auxiliary sensor, with the fields of its Compared as attributes."""
 
     axes: tuple[str, ...]
     positions: tuple[int, ...]

@@ -30,7 +30,7 @@ Figures = dict[
 
 @dataclass(frozen=True)
 class Comparison:
-    """A flight beside its reference.
+    """A flight and its reference.
 
     flight : Flight with streams corrected by `effects`; view : ReferenceView
     span : (first, last) s, the part that counts
@@ -145,7 +145,7 @@ Own = TypeVar("Own", bound=ChannelResidual)
 
 
 class Channel(Generic[Own]):
-    """A kind of measurement; CHANNELS lists all of them."""
+    """A kind of measurement; CHANNELS lists all channels."""
 
     name: str
     unit: str

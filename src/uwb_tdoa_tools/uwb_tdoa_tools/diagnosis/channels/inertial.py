@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from .views import CovariateView
 
 CELL = 0.25  # s, over which both sides of a residual are averaged
-# s, half the step of time derivatives of measured rates: those of the truth are noisy, and noise in
+# s, half the step of time derivatives of measured rates: true rates are noisy, and noise in
 # a regressor shrinks the estimate
 SHIFT = 0.05
 STILL_FORCE, STILL_RATE = 0.3, 0.1  # m/s^2 of vibration and rad/s, of a vehicle at rest
@@ -140,7 +140,7 @@ class Inertial(Channel[ImuResidual]):
 
 
 class Gyro(Inertial):
-    """Mean turning rates of cells minus those of the truth.
+    """Mean turning rates of cells minus the true rates.
 
     Without a known attitude only cells before take-off count: a vehicle at rest does not turn.
     """

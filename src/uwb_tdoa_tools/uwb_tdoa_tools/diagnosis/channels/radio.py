@@ -1,6 +1,6 @@
 """Channels of TDOAs and of distances to anchors: residuals, averaged over cells.
 
-Successive TDOAs of a pair err alike. They are averaged, pair by pair, over cells of half a second
+Successive TDOAs of a pair have correlated errors. They are averaged, pair by pair, over cells of half a second
 without outliers. Near the floor a cell has similar heights. The fit counts the correlation that
 remains between cells.
 """
@@ -156,7 +156,7 @@ class Cells:
     def means(self, values: np.ndarray, rows: np.ndarray | None = None) -> Matrix:
         """Return means of values (n, k) over the cells, (m, k).
 
-        rows : (r,) of the TDOAs that values (r, k) belong to; others are zero, the result sparse
+        rows : (r,) of the TDOAs that values (r, k) belong to; other values are zero, and the result is sparse
         """
         if rows is None:
             return np.stack([self.mean(column) for column in values.T], axis=1)
@@ -223,7 +223,7 @@ def _of_single_anchors(effect: Effect) -> bool:
 
 
 def are_many(residuals: Sequence[RadioResidual]) -> bool:
-    """Return whether there are too many anchors to search functions of each of them."""
+    """Return whether there are too many anchors to search functions of each anchor."""
     return any(len(part.samples.anchors) > MANY for part in residuals)
 
 
@@ -327,7 +327,7 @@ class RangeResidual(RadioResidual):
 
 
 class Ranging(Channel[RangeResidual]):
-    """The channel of one of the SENSORS that measure distances to anchors."""
+    """The channel of a sensor that measures distances to anchors."""
 
     unit: str
 

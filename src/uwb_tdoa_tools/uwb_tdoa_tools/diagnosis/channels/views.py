@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.flight import Flight
 
 
-MOST_LINKS = 400  # pairs, both directions, whose functions are searched: those of 20 anchors
+MOST_LINKS = 400  # pairs, both directions, whose functions are searched: as of 20 anchors
 OF_EACH = "time", "range"  # covariates of single anchors if there are many anchors
 PIECES = 4  # of a spline
 FEWEST_VALUES = 100  # of a covariate with knots

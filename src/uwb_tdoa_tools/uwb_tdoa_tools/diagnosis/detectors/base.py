@@ -30,9 +30,9 @@ class Detection:
 
 
 class Detector:
-    """The search for one effect with `fitted` False; DETECTORS lists all of them.
+    """The search for one effect with `fitted` False; DETECTORS lists all detectors.
 
-    If an effect is linear in some parameters once the others are given, `search` proposes
+    If an effect is linear in some parameters once all other parameters are given, `search` proposes
     candidates for the selection. Otherwise `detect` looks at the residual of the whole model.
     """
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 NEAR = 0.4  # m above z = 0; no flight showed the effect above
 HEIGHTS = np.geomspace(0.05, 0.3, 12)  # m, limits that are tried
 SWEEPS = 2  # over the anchors, to find one height per anchor
-FEWEST, FEWEST_ROWS = 2, 20  # late anchors (a single one is blocked); rows near the floor
+FEWEST, FEWEST_ROWS = 2, 20  # late anchors (a single anchor is blocked); rows near the floor
 ONE_PLACE = 0.5  # m, radius of a single place of take-off and landing
 LEAST, GOOD_PART = 0.5, 0.5  # m, and share of the largest delay, of the first anchors in a model
 SCALE, NU = 0.2, 4.0  # m and 1, Student's t of the residual of an anchor with several echoes

@@ -135,7 +135,7 @@ def _products(series: Series) -> tuple[np.ndarray, np.ndarray]:
 
 
 class NoiseLevelDetector(Detector):
-    """Compare the steps from one TDOA of a pair to the next with those of all pairs."""
+    """Compare the steps from one TDOA of a pair to the next with the steps of all pairs."""
 
     effect = EFFECTS["noise_level"]
 
