@@ -15,8 +15,8 @@ from uwb_tdoa_bias.foundation.files import write_text
 from uwb_tdoa_bias.foundation.flight import AIDS
 from uwb_tdoa_tools import parallel
 from uwb_tdoa_tools.diagnosis import diagnose
-from uwb_tdoa_tools.diagnosis.constraints import Mark
-from uwb_tdoa_tools.diagnosis.references import OdometryPath, OdometryReference
+from uwb_tdoa_tools.diagnosis.constraints import Mark, OdometryPath
+from uwb_tdoa_tools.diagnosis.references import OdometryReference
 from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
 from uwb_tdoa_tools.outputs import OutputFile
 from uwb_tdoa_tools.parallel import whole_number

@@ -14,8 +14,8 @@ import numpy as np
 
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import Effect, EffectSet
+from uwb_tdoa_bias.effects.base import SensorFunction
 from uwb_tdoa_bias.effects.covariates import OF_STATE, STATES
-from uwb_tdoa_bias.effects.sensor_function import SensorFunction
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.diagnosis import diagnose
 from uwb_tdoa_tools.diagnosis.attribution import attribute
@@ -127,7 +127,7 @@ class Told(Effect):
         self.undeclared = undeclared
 
     @property
-    def states(self):
+    def jacobian_states(self):
         return STATES.get(self.undeclared.covariate, ()) if self.undeclared.stream == "tdoa" else ()
 
     def bias(self, samples):
@@ -147,8 +147,7 @@ class Told(Effect):
                 effect.course,
                 f"{effect.stream}.{'xyz'[effect.who[0]]}",
                 effect.covariate,
-                low - beyond,
-                high + beyond,
+                (low - beyond, high + beyond),
             ),
         )
 

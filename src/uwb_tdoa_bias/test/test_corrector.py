@@ -82,7 +82,11 @@ def test_with_nothing_to_correct_with_measurements_pass():
 def test_what_the_filter_weighs_is_left_in():
     floor = CATALOGUE["floor_multipath"]({"4.delay": 3.3, "4.height": 5.0})
     corrector = Corrector(ANCHORS, EffectSet((*DELAYS, floor)))
-    assert floor.weighed and corrector.weighed.effects == (floor,) and corrector.effects == DELAYS
+    assert (
+        floor.is_hypothesis
+        and corrector.weighed.effects == (floor,)
+        and corrector.effects == DELAYS
+    )
     both = climbing(Corrector(ANCHORS, EffectSet((floor, *DELAYS))), [0.0, 1.0])
     alone = climbing(Corrector(ANCHORS, DELAYS), [0.0, 1.0])
     assert both.model == "anchor_delay"

@@ -27,7 +27,7 @@ from .correction.network import load_network
 from .correction.pose_queue import PoseQueue
 from .correction.poses import parts_of
 from .effects import EffectSet, LabelCorrector
-from .effects.tag_lever_arm import TagLeverArm
+from .effects.tag import TagLeverArm
 from .foundation import ros
 from .foundation.errors import InputError
 from .foundation.ros_anchors import ANCHORS_FILE, AnchorsInput

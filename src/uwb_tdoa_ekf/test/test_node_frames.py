@@ -23,8 +23,8 @@ from tf2_msgs.msg import TFMessage  # noqa: E402
 
 from uwb_tdoa_bias.correction.corrector import Corrector  # noqa: E402
 from uwb_tdoa_bias.effects import EffectSet, SmoothTerm  # noqa: E402
-from uwb_tdoa_bias.effects.accel_bias import AccelBias  # noqa: E402
-from uwb_tdoa_bias.effects.tag_lever_arm import TagLeverArm  # noqa: E402
+from uwb_tdoa_bias.effects.imu import AccelBias  # noqa: E402
+from uwb_tdoa_bias.effects.tag import TagLeverArm  # noqa: E402
 from uwb_tdoa_bias.foundation.flight import Imu  # noqa: E402
 from uwb_tdoa_bias.foundation.ros_frames import TF_QOS, TF_STATIC_QOS  # noqa: E402
 from uwb_tdoa_ekf.offline import run_offline  # noqa: E402

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.correction import corrector
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_bias.effects.tag_lever_arm import TagLeverArm
+from uwb_tdoa_bias.effects.tag import TagLeverArm
 
 from .warm_up import warm_up
 

@@ -26,7 +26,7 @@ from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
 from uwb_tdoa_bias.effects import AidCorrector, EffectSet, ImuCorrector
-from uwb_tdoa_bias.effects.tag_lever_arm import TagLeverArm
+from uwb_tdoa_bias.effects.tag import TagLeverArm
 from uwb_tdoa_bias.foundation import ros
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flyable import FlyableVolume

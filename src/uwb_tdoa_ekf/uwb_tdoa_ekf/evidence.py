@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-    from uwb_tdoa_bias.effects.covariance import Covariance
+    from uwb_tdoa_bias.effects.effect_set import Covariance
 
     ChangeKey = tuple[str, int]  # effect, number of an anchor
     Change = tuple[np.ndarray, float]  # places (m,) among the unknowns, m, standard deviation

@@ -15,7 +15,7 @@ from .core.memory import FilterState, Floor, new_state
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from uwb_tdoa_bias.effects.sensor_function import SensorFunction
+    from uwb_tdoa_bias.effects.base import SensorFunction
 
 MOST_ROWS = (
     20_000  # twice as many as a message may hold: after so many changes the filter starts anew

@@ -73,7 +73,7 @@ class Pipeline:
         return new_state_of(
             self._anchors,
             self._effects.sensor_functions,
-            self._effects.on_floor(self._anchors.anchors),
+            self._effects.near_ground_delays(self._anchors.anchors),
         )
 
     def change_anchors(self, gone: np.ndarray) -> None:

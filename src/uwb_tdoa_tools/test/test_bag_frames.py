@@ -10,7 +10,7 @@ from test_bag import write_topics
 
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_bias.effects.tag_lever_arm import TagLeverArm
+from uwb_tdoa_bias.effects.tag import TagLeverArm
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flight import Imu

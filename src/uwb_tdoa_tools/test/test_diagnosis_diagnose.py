@@ -5,7 +5,7 @@ from known_effects import clean_flight, effect_of
 import pytest
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
-from uwb_tdoa_bias.effects.stamp_error import shifted
+from uwb_tdoa_bias.effects.stamps import shifted
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.bags.bag import write_bag

@@ -7,7 +7,7 @@ import pytest
 from uwb_tdoa_bias.effects import EffectSet, SmoothTerm
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.channels import residuals
-from uwb_tdoa_tools.diagnosis.channels.extra import extra_at
+from uwb_tdoa_tools.diagnosis.channels.views import extra_at
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 
 

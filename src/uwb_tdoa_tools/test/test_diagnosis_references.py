@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
-from uwb_tdoa_bias.effects.truth_time_offset import TruthTimeOffset
+from uwb_tdoa_bias.effects.truth import TruthTimeOffset
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.diagnosis import diagnose, output
 from uwb_tdoa_tools.diagnosis.references import REFERENCES, GroundTruth, Heights, Marks, Nothing

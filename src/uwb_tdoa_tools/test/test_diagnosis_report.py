@@ -10,7 +10,7 @@ import pytest
 from reports import Tags, delay, finding, judged, keys_of, said
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, SmoothTerm
-from uwb_tdoa_bias.effects.wording import measured
+from uwb_tdoa_bias.effects.base import measured
 from uwb_tdoa_tools.command_lines import applying
 from uwb_tdoa_tools.diagnosis import diagnose, output
 from uwb_tdoa_tools.diagnosis.findings import EffectFinding, Refused

@@ -8,7 +8,7 @@ import pytest
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_tools.diagnosis.attribution import attribute
-from uwb_tdoa_tools.diagnosis.channels.gyro import _turns
+from uwb_tdoa_tools.diagnosis.channels.inertial import _turns
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
 from uwb_tdoa_tools.diagnosis.refinement import effects_of, written
 from uwb_tdoa_tools.diagnosis.regression.fit import refit

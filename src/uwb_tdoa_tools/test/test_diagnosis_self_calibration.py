@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, Covariance, EffectSet
-from uwb_tdoa_bias.effects.anchor_position import AnchorPosition
+from uwb_tdoa_bias.effects.anchor import AnchorPosition
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools.diagnosis import diagnose, output
 from uwb_tdoa_tools.diagnosis.diagnose import _calibrated, _Work

@@ -8,7 +8,7 @@ import yaml
 
 from uwb_tdoa_bias.correction.network import load_network
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
-from uwb_tdoa_bias.effects.stamp_error import shifted
+from uwb_tdoa_bias.effects.stamps import shifted
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import run_offline

@@ -61,7 +61,7 @@ def test_injected_effect_is_what_the_model_takes_out(flight, effect):
     for channel, kind in RADIO.items():
         samples, rows = true_samples(corrected, kind)
         d = getattr(corrected, channel).d[rows] - EffectSet((effect,)).bias(samples)
-        np.testing.assert_allclose(d, samples.true(), atol=2e-3)
+        np.testing.assert_allclose(d, samples.predicted(), atol=2e-3)
     np.testing.assert_allclose(corrected.imu.gyro, flight.imu.gyro, atol=1e-9)
     tilt = 0.2 if effect.name == "imu_gravity" else 0.0  # rad, which its correction neglects
     np.testing.assert_allclose(corrected.imu.accel, flight.imu.accel, atol=1e-9 + 0.05 * tilt)

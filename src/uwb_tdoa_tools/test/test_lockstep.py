@@ -19,7 +19,7 @@ from uwb_tdoa_ekf.core.verdicts import USED  # noqa: E402
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag  # noqa: E402
 from uwb_tdoa_tools.bags.files import messages, new_bag, open_bag  # noqa: E402
 from uwb_tdoa_tools.bags.message_types import typestore  # noqa: E402
-from uwb_tdoa_tools.calibrating.parts import between  # noqa: E402
+from uwb_tdoa_tools.calibrating import between  # noqa: E402
 from uwb_tdoa_tools.live.processes import DiagnosticsListener, Processes, own_domain, wait  # noqa: E402
 from uwb_tdoa_tools.live.record import recorded_odometry  # noqa: E402
 from uwb_tdoa_tools.live.session import session  # noqa: E402

@@ -10,7 +10,7 @@ import known_answer  # noqa: E402
 
 from uwb_tdoa_bias.correction.network import load_network  # noqa: E402
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag  # noqa: E402
-from uwb_tdoa_tools.calibrating.parts import between  # noqa: E402
+from uwb_tdoa_tools.calibrating import between  # noqa: E402
 from uwb_tdoa_tools.live.run import run_live  # noqa: E402
 from uwb_tdoa_tools.readers import read_flight  # noqa: E402
 from uwb_tdoa_tools.scoring.evaluation import evaluate  # noqa: E402

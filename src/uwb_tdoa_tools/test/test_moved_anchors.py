@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_bias.effects.anchor_delay import AnchorDelay
-from uwb_tdoa_bias.effects.anchor_position import AnchorPosition
-from uwb_tdoa_bias.effects.covariance import Covariance
+from uwb_tdoa_bias.effects.anchor import AnchorDelay, AnchorPosition
+from uwb_tdoa_bias.effects.effect_set import Covariance
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_ekf.evidence import keys_of
 from uwb_tdoa_ekf.results import concatenated, rows_of

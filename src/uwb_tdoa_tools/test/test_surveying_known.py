@@ -14,8 +14,8 @@ from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands.survey import main
-from uwb_tdoa_tools.diagnosis.constraints import Distance, Mark
-from uwb_tdoa_tools.diagnosis.references import OdometryPath, OdometryReference
+from uwb_tdoa_tools.diagnosis.constraints import Distance, Mark, OdometryPath
+from uwb_tdoa_tools.diagnosis.references import OdometryReference
 from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
 from uwb_tdoa_tools.surveying.known import read_distances, read_paths
 from uwb_tdoa_tools.surveying.report import as_text, with_blocked, with_large_delays

@@ -42,8 +42,7 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.foundation.flight import Flight
 
-    from .diagnosis.constraints.distance import Distance
-    from .diagnosis.constraints.mark import Mark
+    from .diagnosis.constraints import Distance, Mark
 
 TOPICS = (  # that are read from bags
     "uwb/tdoa",

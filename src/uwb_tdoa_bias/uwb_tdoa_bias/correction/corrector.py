@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..effects import EffectSet, Samples
-from ..effects.motion import POSE_LAG, motion_at
-from ..effects.slope import N_STATES, slope_of, state_of
+from ..effects.samples import N_STATES, POSE_LAG, motion_at
 from ..foundation.anchors import Anchors
 from ..foundation.compiled import compiled
 from .poses import POSE_NUMBERS, TWIST_NUMBERS, Poses, parts_of, rotated_in_yaw
@@ -86,10 +85,9 @@ class Corrector:
         lag : s; history : poses kept; start : s.
         """
         self.anchors = anchors
-        self.effects, self.weighed = (
-            EffectSet(tuple(e for e in effects or () if e.weighed == weighed))
-            for weighed in (False, True)
-        )
+        effects = EffectSet() if effects is None else effects
+        self.effects = effects.where(lambda effect: not effect.is_hypothesis)
+        self.weighed = effects.where(lambda effect: effect.is_hypothesis)
         self.network = network
         self.lag = lag
         parts = [self.effects.name] if len(self.effects) else []
@@ -177,11 +175,15 @@ class Corrector:
         slope = state = np.zeros((len(samples), N_STATES))
         if not len(self.effects):
             return np.zeros(len(samples)), np.zeros(len(samples)), slope, state
-        steep, others = self.effects.parted
-        bias, noise = others.bias(samples), self.effects.noise_std(samples)
+        steep = self.effects.state_dependent
+        bias, noise = self.effects.state_independent.bias(samples), self.effects.noise_std(samples)
         if len(steep):
-            of_steep, slope, curved = slope_of(steep.effects, samples)
-            bias, noise, state = bias + of_steep, np.hypot(noise, curved), state_of(samples)
+            of_steep, slope, curved = steep.bias_jacobian(samples)
+            bias, noise, state = (
+                bias + of_steep,
+                np.hypot(noise, curved),
+                samples.linearization_point,
+            )
         unknown = (
             np.zeros(len(samples), bool)
             if samples.yaw_std is None
@@ -196,9 +198,7 @@ class Corrector:
             bias = np.where(unknown, bias - known + np.mean(each, axis=0), bias)
             noise = np.where(unknown, np.hypot(noise, np.std(each, axis=0)), noise)
         if len(steep) and unknown.any():
-            level = slope_of(
-                [effect for effect in steep.effects if not effect.uses_attitude], samples
-            )[1]
+            level = steep.where(lambda effect: not effect.uses_attitude).bias_jacobian(samples)[1]
             slope[unknown] = level[unknown]
         return bias, noise, slope, state
 

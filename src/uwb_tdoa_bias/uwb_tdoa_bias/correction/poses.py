@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from ..effects.motion import precede
+from ..effects.samples import precede
 from ..foundation.compiled import compiled
 
 if TYPE_CHECKING:

@@ -15,21 +15,18 @@ The file, written by people and by the tools, read by the nodes:
         form: arrival
         knots: [1.0, 4.0, 9.0]
         values: {c0: 0.01, c1: 0.04, c2: -0.02, c3: 0.0}
-    covariance:                         # optional, written by survey and diagnose: the prior of the next calibration
+    covariance:                         # optional, from survey and diagnose: prior of a calibration
       parameters: [anchor_delay 0, anchor_delay 3]
       matrix:                           # lower triangle
       - [1.6e-5]
       - [0.4e-5, 1.6e-5]
 """
 
-from .aid_corrector import AidCorrector
-from .anchor_delay import AnchorDelay
-from .base import ArrivalEffect, Effect
-from .catalogue import EFFECTS
-from .covariance import Covariance
-from .effect_set import EffectSet
-from .imu_corrector import ImuCorrector
-from .label_error import LabelCorrector, LabelEffect
+from .aids import AidCorrector
+from .anchor import AnchorDelay
+from .base import ArrivalEffect, Effect, LabelCorrector, LabelEffect, Row
+from .effect_set import EFFECTS, Covariance, EffectSet, StreamCorrector
+from .imu import ImuCorrector
 from .samples import (
     RADIO,
     AidSamples,
@@ -42,8 +39,7 @@ from .samples import (
     true_samples,
 )
 from .smooth_term import SmoothTerm
-from .stream_corrector import StreamCorrector
-from .tag_lever_arm import TagLeverArm
+from .tag import TagLeverArm
 
 __all__ = [
     "EFFECTS",
@@ -60,6 +56,7 @@ __all__ = [
     "LabelCorrector",
     "LabelEffect",
     "RangeSamples",
+    "Row",
     "Samples",
     "SmoothTerm",
     "StreamCorrector",

@@ -1,8 +1,8 @@
-"""What a systematic effect is."""
+"""Effect, the base of all systematic effects, and the kinds of effects that families share."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import wraps
 import math
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
@@ -10,57 +10,198 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 import numpy as np
 
 from ..foundation.errors import InputError
-from .affine import IDENTITY
-from .domain import checked
+from .covariates import OF_ARRIVAL, OF_TDOA, UNITS, checked_domain, fade_weight
 from .samples import RADIO, Samples, true_samples
-from .wording import LARGEST, listed, measured
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterable, Sequence
 
     from ..foundation.anchors import Anchors
-    from ..foundation.flight import Flight, Truth
-    from .affine import Affine
-    from .marks import Region, Shift
-    from .sensor_function import SensorFunction
+    from ..foundation.flight import Flight
 
-__all__ = ["ArrivalEffect", "Effect", "Samples"]
+__all__ = ["ArrivalEffect", "Effect", "Row", "Samples"]
 
-SIGNIFICANT = 2.0  # standard deviations; a smaller value is not determined by the data
+SIGNIFICANT = 2.0  # standard deviations; the data do not determine a smaller value
+FADED_BELOW = 0.5  # weight of an effect below which nodes report it as faded
+ROUNDED = 0.1  # share by which a printed standard deviation may be rounded
+LARGEST = 3  # values in one sentence
+TABLE_STEPS = 256  # intervals in the table of a SensorFunction
+STREAM_WORDS = {"imu": "inertial samples", "truth": "ground truth"}  # others by their names
 
 Made = TypeVar("Made")
 
 
-def once_per_anchors(method: Callable[[Any, Anchors], Made]) -> Callable[[Any, Anchors], Made]:
-    """A method(self, anchors) that is computed once as long as it is asked for the same Anchors
-    object.
+def rounded(value: float, std: float | None = None) -> str:
+    """Return a number to the first digit of its standard deviation.
+
+    If rounding changes the standard deviation by more than ROUNDED, two digits are kept. Without a
+    standard deviation the number has three digits.
     """
+    if not std:
+        return f"{value:.3g}"
+    decimals = -math.floor(math.log10(std))
+    two_digits = abs(round(std, decimals) - std) > ROUNDED * std
+    return f"{value:.{max(0, decimals + two_digits)}f}"
+
+
+def measured(value: float, std: float | None = None, unit: str = "") -> str:
+    """Return a value with its standard deviation and unit, as "0.31 ± 0.01 m"."""
+    number = f"{rounded(value, std)} ± {rounded(std, std)}" if std else rounded(value)
+    return f"{number} {unit}".strip()
+
+
+def listed(words: Iterable[str], last: str = "and") -> str:
+    """Join words, as "a, b and c"."""
+    words = list(words)
+    return words[0] if len(words) == 1 else f"{', '.join(words[:-1])} {last} {words[-1]}"
+
+
+def counted(words: Iterable[str], noun: str) -> str:
+    """Join words after their noun, as "anchor 3" or "anchors 3 and 5"."""
+    words = list(words)
+    return f"{noun}{'s' if len(words) > 1 else ''} {listed(words)}"
+
+
+@dataclass(frozen=True)
+class Affine:
+    """A sensor model x -> matrix x + offset, for (n, k) rows of true values."""
+
+    matrix: np.ndarray
+    offset: np.ndarray
+
+    def __call__(self, x: np.ndarray) -> np.ndarray:
+        """Return measured values (n, k) for true ones (n, k)."""
+        return x @ self.matrix.T + self.offset
+
+    def after(self, first: Affine) -> Affine:
+        """Return the map that applies `first`, then this one."""
+        return Affine(self.matrix @ first.matrix, self.matrix @ first.offset + self.offset)
+
+    def inverse(self) -> Affine:
+        """Return the map that undoes this one."""
+        back = np.linalg.inv(self.matrix)
+        return Affine(back, -back @ self.offset)
+
+
+IDENTITY = Affine(np.eye(3), np.zeros(3))
+
+
+@dataclass(frozen=True, eq=False)
+class SensorFunction:
+    """A table of an inertial error over the state of the filter, for compiled code.
+
+    sensor : "gyro" or "accel"; axis : 0 to 2, body; covariate : a name of OF_STATE
+    low, high : first and last value of the covariate
+    values : (TABLE_STEPS + 1,) rad/s or m/s^2, evenly spaced between low and high
+    periodic : whether the table repeats beyond low and high; otherwise its ends are held
+    """
+
+    sensor: str
+    axis: int
+    covariate: str
+    low: float
+    high: float
+    values: np.ndarray
+    periodic: bool = False
+
+    @classmethod
+    def of(
+        cls,
+        function: Callable[[np.ndarray], np.ndarray],
+        channel: str,
+        covariate: str,
+        ends: tuple[float, float],
+        periodic: bool = False,
+    ) -> SensorFunction:
+        """Return the table of a function, (n,) to (n,), between two ends of the covariate.
+
+        channel : "gyro.x" ... "accel.z"
+        """
+        sensor, _, axis = channel.partition(".")
+        values = function(np.linspace(*ends, TABLE_STEPS + 1))
+        return cls(sensor, "xyz".index(axis), covariate, *ends, values, periodic)
+
+
+@dataclass(frozen=True, eq=False)
+class Shift:
+    """A shift of an anchor on a map: id, `by` (3,) m, world, and std (3,) m, NaN if unknown."""
+
+    anchor: int
+    by: np.ndarray
+    std: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """A sphere of tag positions in which an anchor is disturbed: centre (3,) m, world, radius m."""
+
+    anchor: int
+    centre: np.ndarray
+    radius: float
+
+
+def cached_by_anchors(method: Callable[[Any, Anchors], Made]) -> Callable[[Any, Anchors], Made]:
+    """Cache the result of a method(self, anchors) for the latest Anchors object."""
     name = f"_{method.__name__}_of"
 
     @wraps(method)
-    def remembered(self: Any, anchors: Anchors) -> Made:
+    def cached(self: Any, anchors: Anchors) -> Made:
         known = self.__dict__.get(name)
         if known is None or known[0] is not anchors:
             known = self.__dict__[name] = anchors, method(self, anchors)
         return known[1]
 
-    return remembered
+    return cached
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of the table of effects: its parameters, sizes, source and wording.
+
+    name : key in effects.yaml
+    unit : of the parameters; `bound`, `negligible` and `prior_std` are in this unit
+    bound : largest magnitude that is accepted
+    negligible : smallest magnitude that deserves a term in a model
+    prior_std : standard deviation that a fit assumes before it sees data
+    example : parameter that `inject --value NUMBER` sets
+    physics : the cause, one phrase
+    reference : source of the equation or of the sizes
+    confounded_with : effects that explain nearly the same residuals
+    distinguished_by : {such an effect: flight that distinguishes the two}
+    remedy : sentence of a report; {found} and {where} stand for the significant values
+    phrase : words of one significant value, of {size}, {value}, {way} and {key}
+    ways : {way} of a positive and of a negative value
+    shown : (unit, factor from `unit`) in which reports show values; None for `unit`
+    """
+
+    name: str
+    unit: str
+    bound: float
+    negligible: float
+    prior_std: float
+    example: str
+    physics: str
+    reference: str
+    confounded_with: tuple[str, ...] = ()
+    distinguished_by: dict[str, str] = field(default_factory=dict)
+    remedy: str = ""
+    phrase: str = "{size} {way}"
+    ways: tuple[str, str] = ("", "")
+    shown: tuple[str, float] | None = None
 
 
 @dataclass
 class Effect:
-    """A named systematic error with scalar parameters. One effect, one file: subclass and list it
-    in EFFECTS.
+    """A named systematic error with scalar parameters.
 
-    values : {parameter name: value in `unit`}; std : the same keys, standard errors, empty if
-        unknown;
-    source : where the values came from, free text; domain : {covariate: (low, high)}, where it was
-        seen, see `domain.py`.
-    An effect says what it does to measurements, and by that how it is undone, the same way in a
-    node, off line and in a recording: `bias` and `noise_std` of TDOAs, `stamp_offset` of streams,
-    `sensor_model` of inertial samples, heights and velocities, `sensor_bias` of inertial samples,
-    `sensor_functions` of what these do by the state of the filter. For `diagnose` it gives
-    `regressors` on the channels where it shows.
+    values : {parameter: value in `unit`}
+    std : {parameter: standard error in `unit`}, empty if unknown
+    source : where the values come from, free text
+    domain : {covariate: (low, high)}, where the effect was observed
+
+    A subclass declares its `row` and states its equation once: `bias` of TDOAs and ranges,
+    `model` of a sensor, or `stamp_offset` of a stream. Nodes, off-line runs and `inject` use that
+    equation. `regressors` are its derivatives by the parameters, for `diagnose`.
     """
 
     values: dict[str, float] = field(default_factory=dict)
@@ -68,45 +209,42 @@ class Effect:
     source: str = ""
     domain: dict[str, tuple[float, float]] = field(default_factory=dict, kw_only=True)
 
+    row: ClassVar[Row]  # its fields become attributes of the class
     name: ClassVar[str]
     unit: ClassVar[str]
-    bound: ClassVar[float]  # a larger magnitude is refused as a mistake, in `unit`
-    negligible: ClassVar[float]  # a smaller magnitude is not worth a term in the model, in `unit`
-    typical: ClassVar[
-        float
-    ]  # a plausible size, standard deviation of what fits expect before they see data, in `unit`
-    example: ClassVar[str]  # the parameter that a value without a name is for; see `from_text`
-    physics: ClassVar[str]  # one sentence for the catalogue
-    confounded_with: ClassVar[tuple[str, ...]] = ()
+    bound: ClassVar[float]
+    negligible: ClassVar[float]
+    prior_std: ClassVar[float]
+    example: ClassVar[str]
+    physics: ClassVar[str]
     reference: ClassVar[str]
-    channels: ClassVar[tuple[str, ...]] = ("tdoa",)  # where it shows: names of channels of diagnose
-    fitted: ClassVar[bool] = True  # False: found by a detector of its own, not by linear regression
-    portable: ClassVar[bool] = (
-        True  # goes with the tag, the vehicle and the anchors' modules to another installation
-    )
-    # what it is a function of, and must not be taken beyond: its domain is of these
-    covariates: ClassVar[tuple[str, ...]] = ()
-    settings: ClassVar[
-        tuple[str, ...]
-    ] = ()  # further entries in effects.yaml, constructor arguments
-    price: ClassVar[float] = (
-        0.0  # what it must gain beyond others, twice a log-likelihood, to be chosen by diagnose
-    )
-    distinguished_by: ClassVar[
-        dict[str, str]
-    ] = {}  # {other effect: which flight tells this one from it}
-    usable: ClassVar[bool] = True  # False: nodes cannot, or need not, take it out
-    unused: ClassVar[str] = (
-        "nodes cannot, or need not, take it out"  # why not, where it is not usable
-    )
-    # channels, one of which must be there too: else what it is compared with may be as wrong
-    witnesses: ClassVar[tuple[str, ...]] = ()
-    weighed: ClassVar[bool] = (
-        False  # may be there or not: the filter weighs that, and no Corrector takes it out
-    )
-    needs_reference: ClassVar[bool] = False  # not observable in the filter's innovations alone
-    needs_motion: ClassVar[bool] = False  # looks at more than the pose of the tag
-    uses_attitude: ClassVar[bool] = False  # its part of a TDOA changes with the attitude of the tag
+    confounded_with: ClassVar[tuple[str, ...]] = ()
+    distinguished_by: ClassVar[dict[str, str]] = {}
+    remedy: ClassVar[str] = ""
+    phrase: ClassVar[str]
+    ways: ClassVar[tuple[str, str]]
+    shown: ClassVar[tuple[str, float] | None] = None
+
+    channels: ClassVar[tuple[str, ...]] = ("tdoa",)  # channels of `diagnose` on which it shows
+    fitted: ClassVar[bool] = True  # False: a detector finds it, not linear regression
+    portable: ClassVar[bool] = True  # True: stays valid in another installation of anchors
+    covariates: ClassVar[tuple[str, ...]] = ()  # quantities that its domain limits
+    settings: ClassVar[tuple[str, ...]] = ()  # further constructor arguments in effects.yaml
+    penalty: ClassVar[float] = 0.0  # twice a log-likelihood that a selection must gain in addition
+    usable: ClassVar[bool] = True  # False: nodes do not correct it, for the following reason
+    why_unusable: ClassVar[str] = "nodes cannot, or need not, take it out"
+    # Channels, at least one of which must show: else the reference may have the error.
+    corroborating_channels: ClassVar[tuple[str, ...]] = ()
+    is_hypothesis: ClassVar[bool] = False  # True: the filter tests it, and no Corrector removes it
+    needs_reference: ClassVar[bool] = False  # True: innovations alone do not show it
+    needs_motion: ClassVar[bool] = False  # True: depends on more than the pose of the tag
+    uses_attitude: ClassVar[bool] = False  # True: its bias depends on the attitude of the tag
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        if "row" in vars(cls):
+            for part in fields(cls.row):
+                setattr(cls, part.name, getattr(cls.row, part.name))
 
     def __post_init__(self) -> None:
         for group in ("values", "std"):
@@ -122,123 +260,174 @@ class Effect:
                 if not np.isfinite(read[key]) or abs(read[key]) > bound:
                     raise InputError(
                         f"effects: {self.name}: {group}: {key} is {value!r}; expected a "
-                        f"number of {self.unit} "
-                        f"between -{bound:g} and {bound:g}."
+                        f"number of {self.unit} between -{bound:g} and {bound:g}."
                     )
             setattr(self, group, read)
-        self.domain = checked(self.name, self.domain)
+        self.domain = checked_domain(self.name, self.domain)
+
+    # Parameters
 
     @classmethod
     def check_key(cls, key: str) -> None:
         """Raise InputError if `key` is no parameter of this effect."""
-        if key not in cls.groups(None, None)[0]:
-            known = ", ".join(cls.groups(None, None)[0])
-            raise InputError(f"effects: {cls.name}: parameter {key!r} is not one of {known}.")
+        known = cls.groups(None, None)[0]
+        if key not in known:
+            raise InputError(
+                f"effects: {cls.name}: parameter {key!r} is not one of {', '.join(known)}."
+            )
 
     @classmethod
     def bound_of(cls, key: str) -> float:
-        """Largest magnitude of the parameter `key`, in its unit."""
+        """Return the largest magnitude of the parameter `key`, in its unit."""
         return cls.bound
 
     @classmethod
-    def typical_of(cls, key: str) -> float:
-        """Plausible size of the parameter `key`, in its unit."""
-        return cls.typical
+    def prior_std_of(cls, key: str) -> float:
+        """Return the prior standard deviation of the parameter `key`, in its unit."""
+        return cls.prior_std
+
+    @classmethod
+    def within_bounds(cls, values: dict[str, float]) -> bool:
+        """Return whether {parameter: value} is possible."""
+        return all(abs(value) <= cls.bound_of(key) for key, value in values.items())
 
     @classmethod
     def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
-        """Sets of parameters that make sense together, as tuples of names, the full set first; here
-        the one of `example`.
+        """Return sets of parameters that `diagnose` tries together, the full set first.
 
-        anchors : Anchors; pairs : (m, 2) ids of the pairs that were heard. Both may be None where
-            they do not matter.
+        anchors : Anchors; pairs : (m, 2) ids of the pairs that were heard. Both may be None.
         """
         return [(cls.example,)]
 
     @property
     def label(self) -> str:
-        """What reports call it."""
+        """Return the name that reports print."""
         return self.label_of(self.values)
 
     def label_of(self, keys: Iterable[str]) -> str:
-        """What reports call it if it has the parameters `keys` alone."""
+        """Return the name that reports print for the parameters `keys` alone."""
         return self.name
 
     @property
-    def identity(self) -> tuple[Hashable, ...]:
-        """Hashable: equal for effects whose parameters of one name are the same quantity, which can
-        hence be merged.
-        """
+    def merge_key(self) -> tuple[Hashable, ...]:
+        """Return a key that is equal for effects whose parameters may be merged by name."""
         return (self.name, *(getattr(self, name) for name in self.settings))
 
-    @classmethod
-    def plausible(cls, values: dict[str, float]) -> bool:
-        """Whether {parameter: value} could be: within bounds."""
-        return all(abs(value) <= cls.bound_of(key) for key, value in values.items())
+    # Equation
 
     def bias(self, samples: Samples) -> np.ndarray:
-        """Contribution to what `samples.channel` measures, (n,) metres: of Samples to d_ab, of
-        RangeSamples to the distance; NaN where it is not known (unknown pose).
-        """
+        """Return the error of `samples.channel`, (n,) m; NaN where the pose is unknown."""
         return np.zeros(len(samples))
 
-    @property
-    def states(self) -> tuple[int, ...]:
-        """Which of position (0, 1, 2) and velocity (3, 4, 5) its part of a TDOA may change steeply
-        with, so that the filter should follow it: tuple.
+    def noise_std(self, samples: Samples) -> np.ndarray:
+        """Return the standard deviation that it adds to d_ab, (n,) m."""
+        return np.zeros(len(samples))
+
+    def stamp_offset(self, stream: str) -> float:
+        """Return by how many seconds the stamps of a stream of a Flight are late."""
+        return 0.0
+
+    def sensor_model(self, channel: str) -> Affine:
+        """Return the Affine from true to measured values of a channel.
+
+        channel : "gyro" (rad/s, body), "accel" (m/s^2, body), "velocity" (m/s, body) or "height" (m)
         """
+        return IDENTITY
+
+    def sensor_bias(self, channel: str, features: np.ndarray) -> np.ndarray | None:
+        """Return what it adds to "gyro" or "accel", (n, 3), or None.
+
+        features : (n, len(OF_IMU)), as of ImuFeatures
+        """
+        return None
+
+    def sensor_functions(self) -> tuple[SensorFunction, ...]:
+        """Return inertial errors that depend on the state of the filter."""
         return ()
 
     def regressors(self, samples: Any, keys: Sequence[str]) -> np.ndarray:
-        """Derivative of what `samples.channel` measures by the parameters `keys`: of Samples (n,
-        len(keys)), metres per `unit`; of ImuSamples (n, 3, len(keys)), body axes; of AidSamples (n,
-        k, len(keys)). Asked for the channels in `channels` only.
+        """Return derivatives of the measurement by the parameters `keys`.
+
+        Of Samples (n, len(keys)), m per `unit`; of ImuSamples (n, 3, len(keys)), body; of
+        AidSamples (n, k, len(keys)).
         """
         return np.zeros((len(samples), len(keys)))
 
-    def noise_std(self, samples: Samples) -> np.ndarray:
-        """Standard deviation that it adds to d_ab, (n,) metres."""
-        return np.zeros(len(samples))
+    def uncorrected(self, samples: Any) -> np.ndarray | float:
+        """Return the part that nodes cannot remove from ImuSamples, (n, 3), or AidSamples, (n, k)."""
+        return 0.0
+
+    @property
+    def jacobian_states(self) -> tuple[int, ...]:
+        """Return the states by which the filter must differentiate the bias of a TDOA.
+
+        0 to 2 are the position, 3 to 5 the velocity.
+        """
+        return ()
+
+    def near_ground_delays(self, anchors: Anchors) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return delays of anchors near the ground, as FloorMultipath does."""
+        raise NotImplementedError
 
     def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
-        """The Flight that would have been recorded with this effect on top. Raises InputError where
-        that needs a ground truth, or an attitude, that the flight does not have. rng : numpy
-        Generator, for random effects.
+        """Return the Flight that would have been recorded with this effect in addition.
+
+        rng : numpy Generator, for random effects. Raises InputError if the flight lacks a stream,
+        the ground truth or an attitude that the effect needs.
         """
-        require_truth(self, flight)
-        for channel in [
-            channel
-            for channel in self.channels
-            if channel in RADIO and getattr(flight, channel) is not None
-        ]:
-            stream, (samples, rows) = getattr(flight, channel), true_samples(flight, RADIO[channel])
-            bias = self.bias(samples)
-            if not np.isfinite(bias).all():
-                raise InputError(
-                    f"{flight.name}: has no attitude in its ground truth, which {self.name} needs."
-                )
+        require(self, flight, "truth")
+        for channel in self.channels:
+            stream = getattr(flight, channel) if channel in RADIO else None
+            if stream is None:
+                continue
+            samples, rows = true_samples(flight, RADIO[channel])
             d = stream.d.copy()
-            d[rows] += bias
+            d[rows] += finite(self, flight, self.bias(samples))
             flight = flight.replaced(**{channel: replace(stream, d=d)})
         return flight
 
-    def advice(self) -> tuple[str, ...]:
-        """What a person can do about it in the hall: imperative sentences, the most important
-        first; () if nothing but taking it out of the measurements helps. They name `significant`
-        values alone.
+    # Domain
+
+    def faded_bias(
+        self, samples: Samples
+    ) -> tuple[np.ndarray, np.ndarray | float, np.ndarray | float]:
+        """Return the bias that is corrected within and beyond the domain.
+
+        Beyond its domain an effect fades, and the uncorrected rest counts as noise. A time is held
+        at the end of its domain: no growth beyond it was observed.
+
+        Returns (bias (n,) m, NaN where unknown; standard deviation of the uncorrected rest (n,) m;
+        weight (n,)). The last two are 0.0 and 1.0 without a domain.
         """
-        largest = list(self.significant().items())[:LARGEST]
-        if not largest:
-            return ()
-        values = listed(f"{key} = {measured(value, self.std.get(key))}" for key, value in largest)
-        return (
-            f"Look for the cause of {self.name}: {self.physics} (found: {values}, in {self.unit}).",
+        if not self.domain:
+            return self.bias(samples), 0.0, 1.0
+        weight, n = np.ones(len(samples)), len(samples)
+        for covariate, limits in self.domain.items():
+            if covariate in OF_ARRIVAL:
+                of_arrivals = fade_weight(OF_ARRIVAL[covariate](samples, samples.rows), limits)
+                weight *= of_arrivals.reshape(-1, n).min(axis=0)
+            elif (values := OF_TDOA[covariate](samples)) is not None:
+                weight *= fade_weight(values, limits)
+        if "time" in self.domain:
+            samples = samples.until(samples.start + self.domain["time"][1])
+        bias = self.bias(samples)
+        return weight * bias, (1.0 - weight) * np.abs(np.nan_to_num(bias)), weight
+
+    @property
+    def domain_words(self) -> str:
+        """Return its label and its domain as a phrase."""
+        limits = (
+            f"{name} {low:.3g} to {high:.3g} {UNITS[name]}"
+            for name, (low, high) in self.domain.items()
         )
+        return f"{self.label} ({', '.join(limits)})"
+
+    # Reports
 
     def significant(self) -> dict[str, float]:
-        """{parameter: value} of those values that the data determine, the largest first in standard
-        deviations; values without a standard deviation, or with none but 0, were set, not
-        estimated, and come last.
+        """Return {parameter: value} of the values that the data determine.
+
+        The most significant value comes first. Values without a standard deviation come last.
         """
         std = self.std
         known = {
@@ -250,79 +439,80 @@ class Effect:
             sorted(known.items(), key=lambda item: -abs(item[1]) / (std.get(item[0]) or math.inf))
         )
 
-    def size(self, key: str, unit: str | None = None, factor: float = 1.0) -> str:
-        """Magnitude of a parameter with its standard deviation, times `factor`, in `unit`."""
-        unit = self.unit if unit is None else unit
+    def advice(self) -> tuple[str, ...]:
+        """Return imperative sentences for people, the most important first.
+
+        They name significant values alone. Without any, or without a remedy, there is none.
+        """
+        significant = self.significant()
+        if not significant:
+            return ()
+        if self.remedy:
+            return (self.remedy.format(found=self.found(), where=self.where()),)
+        largest = list(significant.items())[:LARGEST]
+        values = listed(f"{key} = {measured(value, self.std.get(key))}" for key, value in largest)
+        return (
+            f"Look for the cause of {self.name}: {self.physics} (found: {values}, in {self.unit}).",
+        )
+
+    def found(self) -> str:
+        """Return all significant values in words, those of a fixed set in its order."""
+        order = {key: place for place, key in enumerate(self.groups(None, None)[0])}
+        keys = sorted(self.significant(), key=lambda key: order.get(key, 0))
+        return listed(
+            self.phrase.format(
+                size=self.size(key), value=self.signed(key), way=self.way(key), key=key
+            )
+            for key in keys
+        )
+
+    def where(self) -> str:
+        """Return the anchors or pairs of the significant values in words; "" if it has none."""
+        return ""
+
+    def way(self, key: str) -> str:
+        """Return the word of `ways` for the sign of a value."""
+        return self.ways[0] if self.values[key] > 0.0 else self.ways[1]
+
+    def shown_in(self, key: str) -> tuple[str, float]:
+        """Return (unit, factor) in which reports show a value."""
+        return self.shown or (self.unit, 1.0)
+
+    def size(self, key: str) -> str:
+        """Return the magnitude of a value with its standard deviation, as reports show it."""
+        unit, factor = self.shown_in(key)
         return measured(abs(self.values[key]) * factor, self.std.get(key, 0.0) * abs(factor), unit)
 
-    def directed(
-        self, key: str, above: str, below: str, unit: str | None = None, factor: float = 1.0
-    ) -> str:
-        """The `size` of a significant parameter, and which way it is off: "12.0 ± 0.3 ms late"; ""
-        if the data do not determine it.
-        """
-        if key not in self.significant():
-            return ""
-        return f"{self.size(key, unit, factor)} {above if self.values[key] > 0.0 else below}"
-
-    def on_floor(self, anchors: Anchors) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """What is given to the filter of an effect that is `weighed`, as of
-        `FloorMultipath.on_floor`.
-        """
-        raise NotImplementedError
+    def signed(self, key: str) -> str:
+        """Return a value with its standard deviation, as reports show it."""
+        unit, factor = self.shown_in(key)
+        return measured(self.values[key] * factor, self.std.get(key, 0.0) * abs(factor), unit)
 
     def marks(self, anchors: Anchors) -> tuple[Shift | Region, ...]:
-        """Shifts and Regions (`marks.py`) that show it on a map of some Anchors: tuple."""
+        """Return Shifts and Regions that show the effect on a map of some Anchors."""
         return ()
-
-    def stamp_offset(self, stream: str) -> float:
-        """Seconds by which the stamps of a stream of a Flight are late, by its name."""
-        return 0.0
-
-    def sensor_model(self, channel: str) -> Affine:
-        """Affine from the true to the measured values of "gyro" (rad/s), "accel" (m/s^2) or
-        "velocity" (m/s), body axes, or of "height" (m).
-        """
-        return IDENTITY
-
-    def sensor_bias(self, channel: str, features: np.ndarray) -> np.ndarray | None:
-        """What it adds to "gyro" or "accel" besides, (n, 3), given their features (n, len(OF_IMU));
-        None for nothing.
-        """
-        return None
-
-    def sensor_functions(self) -> tuple[SensorFunction, ...]:
-        """What it adds to inertial samples that changes with the state of the filter: tuple of
-        SensorFunction.
-        """
-        return ()
-
-    def uncorrected(self, samples: Any) -> np.ndarray | float:
-        """What taking it out of a stream leaves of it in ImuSamples, (n, 3), or AidSamples, (n, k),
-        because nodes know less than those.
-        """
-        return 0.0
 
 
 class ArrivalEffect(Effect):
-    """An effect that makes the signals of single anchors arrive late: bias of d_ab = delay_b -
-    delay_a, of a range to b delay_b.
+    """An effect that delays the signals of single anchors.
+
+    The bias of d_ab is delay_b - delay_a, that of a range to b is delay_b.
     """
 
     channels = tuple(RADIO)
 
     def delays(self, samples: Samples, rows: np.ndarray) -> np.ndarray:
-        """By how much the anchors in `rows` (k * n,), the samples repeated k times, seem too far:
-        (k * n,) m; here linear in all values.
+        """Return the delays of the anchors in `rows`, (k * n,) m; by default linear in all values.
+
+        rows : (k * n,) rows of anchors, with the samples repeated k times
         """
-        return self.delay_regressors(samples, rows, list(self.values)) @ np.array(
-            list(self.values.values())
-        )
+        keys = list(self.values)
+        return self.delay_regressors(samples, rows, keys) @ np.array([self.values[k] for k in keys])
 
     def delay_regressors(
         self, samples: Samples, rows: np.ndarray, keys: Sequence[str]
     ) -> np.ndarray:
-        """Its derivative with respect to `keys`, (k * n, len(keys))."""
+        """Return the derivatives of `delays` by the parameters `keys`, (k * n, len(keys))."""
         raise NotImplementedError
 
     def bias(self, samples: Samples) -> np.ndarray:
@@ -332,55 +522,143 @@ class ArrivalEffect(Effect):
         return samples.difference(self.delay_regressors(samples, samples.rows, keys))
 
 
-class AnchorEffect(Effect):
-    """An effect with one parameter for each anchor, named by its id, that makes its arrivals late
-    in proportion.
-    """
+class GeometryEffect(Effect):
+    """An effect that moves antennas: bias = predicted(where they are) - predicted(survey)."""
 
     channels = tuple(RADIO)
 
-    @classmethod
-    def check_key(cls, key: str) -> None:
-        check_anchor(cls.name, key, key)
+    def antennas(self, samples: Samples) -> dict[str, np.ndarray]:
+        """Return the arguments of `samples.predicted`: p (n, 3) m, or positions (N, 3) m."""
+        raise NotImplementedError
+
+    def bias(self, samples: Samples) -> np.ndarray:
+        return samples.predicted(**self.antennas(samples)) - samples.predicted()
+
+
+class SensorEffect(Effect):
+    """An effect with an affine sensor model, measured = matrix true + offset, on its channels."""
+
+    def model(self) -> Affine:
+        """Return the Affine from true to measured values."""
+        raise NotImplementedError
+
+    def sensor_model(self, channel: str) -> Affine:
+        return self.model() if channel in self.channels else IDENTITY
+
+    def regressors(self, samples: Any, keys: Sequence[str]) -> np.ndarray:
+        def measured_at(values: dict[str, float]) -> np.ndarray:
+            return type(self)(values).sensor_model(samples.channel)(samples.reading)
+
+        return central_differences(measured_at, self.values, keys, 1e-6)
+
+
+class LabelEffect(Effect):
+    """An effect on the ids or on the sign of TDOAs, a mistake of a driver or a survey.
+
+    A rule finds it; its values are whole numbers. It is corrected before all other effects.
+    """
+
+    fitted = False
+    portable = False
+    separable: ClassVar[bool] = True  # each value is meaningful without the others
+    expected: ClassVar[str]  # possible values, in words
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for key, value in self.values.items():
+            if not self.possible(value):
+                raise InputError(
+                    f"effects: {self.name}: values: {key} is {value:g}; expected {self.expected}."
+                )
 
     @classmethod
     def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
-        ids = known_anchors(anchors)
-        return [ids, *((key,) for key in ids)]
+        return [()]
 
-    def delay_per_unit(self, samples: Samples) -> np.ndarray | float:
-        """By how many metres an anchor is late for each unit of its parameter, (n,) or a scalar."""
-        return 1.0
+    @staticmethod
+    def possible(value: float) -> bool:
+        """Return whether a value is meaningful."""
+        raise NotImplementedError
 
-    def bias(self, samples: Samples) -> np.ndarray:
-        values = self._of_each(samples.anchors)
-        return samples.difference(values[samples.rows]) * self.delay_per_unit(samples)
+    def relabelled(
+        self, a: np.ndarray, b: np.ndarray, d: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return TDOAs without the mistake: ids a, b (n,) and d (n,) m."""
+        raise NotImplementedError
 
-    @once_per_anchors
-    def _of_each(self, anchors: Anchors) -> np.ndarray:
-        return np.array([self.values.get(str(i), 0.0) for i in anchors.ids.tolist()])
+    def mislabelled(
+        self, a: np.ndarray, b: np.ndarray, d: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return TDOAs with the mistake: ids a, b (n,) and d (n,) m."""
+        raise NotImplementedError
 
-    def regressors(self, samples: Samples, keys: Sequence[str]) -> np.ndarray:
-        ids, wanted = samples.anchors.ids, np.array([int(key) for key in keys])
-        sign = samples.difference((ids[samples.rows][:, None] == wanted).astype(float))
-        return sign * np.reshape(self.delay_per_unit(samples), (-1, 1))
+    def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
+        tdoa = flight.tdoa
+        a, b, d = self.mislabelled(tdoa.a, tdoa.b, tdoa.d)
+        return replace(flight, tdoa=replace(tdoa, a=a, b=b, d=d))
 
 
-def require_truth(effect: Effect, flight: Flight) -> Truth:
-    """The ground truth of a flight; raises InputError if it has none to compute `effect` at."""
-    if flight.truth is None or len(flight.truth) == 0:
-        raise InputError(f"{flight.name}: holds no ground truth, which {effect.name} needs.")
-    return flight.truth
+class LabelCorrector:
+    """Corrector of the LabelEffects of a set, in the order of the set."""
+
+    def __init__(self, effects: Iterable[Effect]) -> None:
+        """Select the LabelEffects among `effects`."""
+        self._effects = [effect for effect in effects if isinstance(effect, LabelEffect)]
+        self.idle = not self._effects
+
+    def correct(
+        self, a: np.ndarray, b: np.ndarray, d: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return corrected ids a, b (n,) and d (n,) m."""
+        for effect in self._effects:
+            a, b, d = effect.relabelled(a, b, d)
+        return a, b, d
+
+
+def central_differences(
+    function: Callable[[dict[str, float]], np.ndarray],
+    values: dict[str, float],
+    keys: Sequence[str],
+    step: float,
+) -> np.ndarray:
+    """Return numerical derivatives of function(values) by the parameters `keys`.
+
+    Returns the shape of function(values) with len(keys) columns appended.
+    """
+    columns = []
+    for key in keys:
+        here = values.get(key, 0.0)
+        low, high = (function({**values, key: here + shift}) for shift in (-step, step))
+        columns.append((high - low) / (2.0 * step))
+    return np.stack(columns, axis=-1)
+
+
+def require(effect: Effect, flight: Flight, stream: str) -> Any:
+    """Return a stream of a Flight by its name, "truth" and "imu" included; raise InputError."""
+    part = getattr(flight, stream)
+    if part is None or (stream == "truth" and len(part) == 0):
+        words = STREAM_WORDS.get(stream, stream)
+        raise InputError(f"{flight.name}: holds no {words}, which {effect.name} needs.")
+    return part
+
+
+def finite(effect: Effect, flight: Flight, error: np.ndarray) -> np.ndarray:
+    """Return an error of measurements; raise InputError if an attitude is missing for it."""
+    if not np.isfinite(error).all():
+        raise InputError(
+            f"{flight.name}: has no attitude in its ground truth, which {effect.name} needs."
+        )
+    return error
 
 
 def check_anchor(name: str, text: str, key: str) -> None:
-    """Raise InputError if `text`, of the parameter `key` of effect `name`, is not an anchor id."""
+    """Raise InputError if `text`, of the parameter `key` of effect `name`, is no anchor id."""
     if not (text.isdigit() and int(text) <= 65535):
         raise InputError(
             f"effects: {name}: parameter {key!r} is not an anchor id; write for example '3: 0.05'."
         )
 
 
-def known_anchors(anchors: Anchors | None) -> tuple[str, ...]:
-    """Ids as text; () without anchors."""
+def id_texts(anchors: Anchors | None) -> tuple[str, ...]:
+    """Return the ids of Anchors as text; () without anchors."""
     return () if anchors is None else tuple(str(i) for i in anchors.ids.tolist())

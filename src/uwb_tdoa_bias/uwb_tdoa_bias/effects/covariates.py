@@ -1,4 +1,4 @@
-"""What a systematic error may depend on: quantities that a node can compute, by name."""
+"""Covariates: quantities by name that a systematic error may depend on, and their domains."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..foundation.compiled import compiled
+from ..foundation.errors import InputError
 from ..foundation.radio import into_frame
 from ..foundation.vibration import VIBRATION_CORNER, low_pass, track_vibration
 from .samples import ImuSamples, tile
@@ -17,8 +18,9 @@ if TYPE_CHECKING:
 
     from .samples import AidSamples, Samples
 
+FADE = 0.5  # share of the width of a domain; this far beyond it, exp(-1/2) of an effect is left
 CATEGORIES = ("previous_anchor",)  # values are names, not sizes
-UPWARDS = ("height", "elevation")  # change where a tag leaves the floor
+UPWARDS = ("height", "elevation")  # change at take-off
 OF_MOTION = (
     "speed",
     "climb_rate",
@@ -26,14 +28,14 @@ OF_MOTION = (
     "turning_rate",
     "interval",
     "previous_anchor",
-)  # need a history
+)  # of a history of poses
 
 
 def _norm(v: np.ndarray) -> np.ndarray:
     return np.linalg.norm(v, axis=1)
 
 
-# One value per TDOA, of Samples: (n,), or None if the samples do not hold it.
+# One value per TDOA of Samples, (n,); None if the samples lack it
 OF_TDOA: dict[str, Callable[[Any], np.ndarray | None]] = {
     "time": lambda s: s.t - s.start,
     "x": lambda s: s.p[:, 0],
@@ -62,7 +64,7 @@ def _elevation(v: np.ndarray) -> np.ndarray:
     return np.arctan2(v[:, 2], np.hypot(v[:, 0], v[:, 1]))
 
 
-# One value per arrival: of the anchors in rows (2n,), the samples repeated twice.
+# One value per arrival at anchors in rows (ends * n,), with the samples repeated
 OF_ARRIVAL: dict[str, Callable[[Samples, np.ndarray], np.ndarray]] = {
     "range": lambda s, rows: np.linalg.norm(_to_anchor(s, rows), axis=1),
     "bearing": lambda s, rows: _bearing(_to_anchor(s, rows)),
@@ -77,7 +79,7 @@ OF_ARRIVAL: dict[str, Callable[[Samples, np.ndarray], np.ndarray]] = {
     ),
 }
 
-# One value per inertial sample: columns of what ImuFeatures gives.
+# Columns of ImuFeatures, one value per inertial sample
 OF_IMU = (
     "time",
     "vibration",
@@ -91,7 +93,7 @@ OF_IMU = (
     "accel_z",
 )
 
-# Those of OF_TDOA that samples of the other sensors of a vehicle hold too.
+# Names of OF_TDOA that AidSamples have too
 OF_AIDS = (
     "time",
     "x",
@@ -104,13 +106,12 @@ OF_AIDS = (
     "vibration",
 )
 
-# Which of position (0, 1, 2) and velocity (3, 4, 5) of the tag, as the filter estimates them,
-# change a covariate of TDOAs at once. Not
-# that of the speed: its direction is anybody's guess where a tag is slow, and following it did
-# harm.
+# States by which the filter differentiates a function of a covariate: position (0, 1, 2) and
+# velocity (3, 4, 5). Not the speed: the direction of a slow motion is unknown, and its Jacobian
+# made estimates worse.
 STATES = {**dict.fromkeys(("x", "y", "height", *OF_ARRIVAL), (0, 1, 2)), "climb_rate": (5,)}
 
-# What an inertial sensor may depend on that the filter knows when it takes a sample.
+# Covariates of inertial sensors that are states of the filter
 OF_STATE = ("x", "y", "height", "speed", "climb_rate")
 
 UNITS = {
@@ -131,52 +132,78 @@ UNITS = {
     **dict.fromkeys((name for name in OF_IMU if name.startswith("rate_")), "rad/s"),
     **dict.fromkeys((name for name in OF_IMU if name.startswith("accel")), "m/s^2"),
 }
-EXTRA = "extra."  # before the name of what else a log holds: "extra.STREAM.COLUMN"
+EXTRA = "extra."  # prefix of further columns of a log: "extra.STREAM.COLUMN"
 OF_ACCEL = ("accel", "accel_x", "accel_y", "accel_z")  # specific force, m/s^2
 
 
 def sensor_covariate(name: str, samples: ImuSamples | AidSamples) -> np.ndarray | None:
-    """Covariate `name`, one of OF_AIDS, of ImuSamples also one of OF_IMU or "extra.NAME": (n,);
-    None if the samples do not hold it.
+    """Return a covariate of ImuSamples or AidSamples, (n,); None if the samples lack it.
+
+    name : of OF_AIDS; for ImuSamples also of OF_IMU, or "extra.NAME"
     """
     if name.startswith(EXTRA):
-        return (
-            (samples.extra or {}).get(name.removeprefix(EXTRA))
-            if isinstance(samples, ImuSamples)
-            else None
-        )
-    if (
-        samples.channel == "accel" and name in OF_ACCEL
-    ):  # the measured one shares its noise with the residual
-        return (
-            _norm(samples.reading) if name == "accel" else samples.reading[:, "xyz".index(name[-1])]
-        )
+        if not isinstance(samples, ImuSamples):
+            return None
+        return (samples.extra or {}).get(name.removeprefix(EXTRA))
+    if samples.channel == "accel" and name in OF_ACCEL:
+        # The true force: the measured one shares its noise with the residual.
+        reading = samples.reading
+        return _norm(reading) if name == "accel" else reading[:, "xyz".index(name[-1])]
     if name in OF_IMU and isinstance(samples, ImuSamples):
         return samples.features[:, OF_IMU.index(name)]
     return OF_TDOA[name](samples)
 
 
-class ImuFeatures:
-    """The covariates OF_IMU along a stream of inertial samples; they depend on the past of the
-    stream alone.
+def has_domain(name: str) -> bool:
+    """Return whether a covariate has a domain: a number that nodes can compute."""
+    return name not in CATEGORIES and not name.startswith(EXTRA)
+
+
+def checked_domain(effect: str, domain: Any) -> dict[str, tuple[float, float]]:
+    """Return a domain of effects.yaml as {covariate: (low, high)}; raise InputError.
+
+    effect : its name, for messages
     """
+    out = {}
+    known = (*OF_TDOA, *OF_ARRIVAL, *OF_IMU)
+    for covariate, limits in (domain or {}).items():
+        name = str(covariate)
+        try:
+            low, high = map(float, limits)
+        except (TypeError, ValueError):
+            low = high = np.nan
+        if name not in known or not has_domain(name) or not -np.inf < low <= high < np.inf:
+            raise InputError(
+                f"effects: {effect}: domain: {covariate}: {limits!r}; expected a covariate "
+                "with the least and the largest value seen, as time: [0, 60]."
+            )
+        out[name] = low, high
+    return out
+
+
+def fade_weight(values: np.ndarray, limits: tuple[float, float]) -> np.ndarray:
+    """Return the weight of an effect at values (n,) of a covariate with a domain, (n,).
+
+    It is 1 within the limits, and 1 for an unknown value.
+    """
+    low, high = limits
+    beyond = np.maximum(np.maximum(low - values, values - high), 0.0)
+    return np.exp(-0.5 * (np.nan_to_num(beyond) / (FADE * max(high - low, 1e-6))) ** 2)
+
+
+class ImuFeatures:
+    """The covariates OF_IMU along a stream of inertial samples, from its past alone."""
 
     def __init__(self) -> None:
-        self._state = np.zeros(
-            (4, 3)
-        )  # last stamp and first stamp, slow rate, slow force, vibration power
+        # Rows: last and first stamp; low-passed rate; low-passed force; power of the vibration.
+        self._state = np.zeros((4, 3))
         self._state[0, :2] = np.nan
 
     def __call__(self, t: np.ndarray, gyro: np.ndarray, accel: np.ndarray) -> np.ndarray:
-        """t (n,) s; gyro (n, 3) rad/s; accel (n, 3) m/s^2. Returns (n, len(OF_IMU))."""
+        """Return features (n, len(OF_IMU)) of t (n,) s, gyro (n, 3) rad/s and accel (n, 3) m/s^2."""
         out = np.empty((len(t), len(OF_IMU)))
-        _features(
-            self._state,
-            np.ascontiguousarray(t),
-            np.ascontiguousarray(gyro),
-            np.ascontiguousarray(accel),
-            out,
-        )
+        t, gyro, accel = (np.ascontiguousarray(column) for column in (t, gyro, accel))
+        _features(self._state, t, gyro, accel, out)
         return out
 
 
@@ -187,7 +214,7 @@ def _features(
     rate, force, power = state[1], state[2], state[3]
     for i in range(len(t)):
         dt = t[i] - state[0, 0]
-        if not 0.0 <= dt < 1.0:  # the first sample, or one after a gap
+        if not 0.0 <= dt < 1.0:  # first sample, or after a gap
             if not (state[0, 1] <= t[i]):
                 state[0, 1] = t[i]
             rate[:], force[:], power[:] = gyro[i], accel[i], 0.0

@@ -1,8 +1,11 @@
-"""`effects.yaml`: which effects are in the model, with which values."""
+"""EffectSet and effects.yaml: the effects of a model with their values, and how well they are known.
+
+EFFECTS lists all declared effects.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,31 +15,219 @@ import yaml
 
 from ..foundation.errors import InputError
 from ..foundation.files import write_text
+from ..foundation.flight import AIDS
 from ..foundation.safe_yaml import read_yaml
 from ..foundation.version import written_by
-from .base import Effect
-from .catalogue import EFFECTS
-from .covariance import Covariance
-from .fading import LITTLE, faded, in_words
-from .samples import RADIO
+from .aids import (
+    AidCorrector,
+    BarometerDrift,
+    FloorStep,
+    HeightOffset,
+    HeightScale,
+    VelocityMisalignment,
+    VelocityScale,
+    VelocitySlip,
+)
+from .anchor import (
+    AnchorClockDrift,
+    AnchorDelay,
+    AnchorIds,
+    AnchorPosition,
+    Nlos,
+    RangeOffset,
+)
+from .base import FADED_BELOW, Effect, LabelCorrector, SensorFunction
+from .floor import FloorMultipath
+from .imu import (
+    AccelBias,
+    AccelScale,
+    GyroBias,
+    GyroScale,
+    ImuCorrector,
+    ImuGravity,
+    ImuMisalignment,
+)
+from .pair import NoiseCorrelation, NoiseLevel, OutlierRate, PairOffset, PairSign
+from .samples import N_STATES, RADIO, Motion
 from .smooth_term import SmoothTerm
-from .stream_corrector import STREAMS, StreamCorrector
+from .stamps import RangeDelay, TdoaTimeOffset, VelocityDelay
+from .tag import AntennaPattern, RangeBias, RangeScale, ReceivedPowerBias, TagLeverArm
+from .truth import TruthFrame, TruthTimeOffset
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Collection, Iterator, Sequence
 
     from ..foundation.anchors import Anchors
     from ..foundation.flight import Flight
     from .samples import AidSamples, ImuSamples, Samples
-    from .sensor_function import SensorFunction
 
-ENTRY = ("values", "std", "source", "domain")
+# In the order in which `diagnose` lists them
+EFFECTS: dict[str, type[Effect]] = {
+    effect.name: effect
+    for effect in (
+        AnchorDelay,
+        PairOffset,
+        AnchorPosition,
+        TagLeverArm,
+        TdoaTimeOffset,
+        TruthTimeOffset,
+        TruthFrame,
+        RangeScale,
+        RangeBias,
+        ReceivedPowerBias,
+        AntennaPattern,
+        AnchorClockDrift,
+        Nlos,
+        FloorMultipath,
+        GyroBias,
+        GyroScale,
+        AccelBias,
+        AccelScale,
+        ImuMisalignment,
+        ImuGravity,
+        NoiseLevel,
+        NoiseCorrelation,
+        OutlierRate,
+        HeightOffset,
+        HeightScale,
+        FloorStep,
+        BarometerDrift,
+        VelocityScale,
+        VelocityMisalignment,
+        VelocityDelay,
+        VelocitySlip,
+        RangeOffset,
+        RangeDelay,
+        AnchorIds,
+        PairSign,
+    )
+}
+STREAMS = ("tdoa", "imu", "truth", *AIDS)  # of a Flight
+ENTRY = ("values", "std", "source", "domain")  # of an effect in effects.yaml
+COVARIANCE_ENTRY = ("parameters", "matrix")
+REACH = 0.3  # m and m/s, half the step of the statistical linearization: an error of the filter
+
+
+@dataclass(frozen=True, eq=False)
+class Covariance:
+    """Covariance of the values of effects: the prior of the next calibration.
+
+    keys : ((name of an effect, parameter), ...)
+    matrix : (k, k), in the product of their units
+    """
+
+    keys: tuple[tuple[str, ...], ...]
+    matrix: np.ndarray
+
+    def of(self, keys: Sequence[tuple[str, ...]]) -> tuple[np.ndarray, np.ndarray]:
+        """Return (places (m,) of its keys among `keys`, their matrix (m, m))."""
+        known = {key: row for row, key in enumerate(self.keys)}
+        places = [place for place, key in enumerate(keys) if key in known]
+        rows = [known[keys[place]] for place in places]
+        return np.array(places, dtype=int), self.matrix[np.ix_(rows, rows)]
+
+    def of_each_anchor(self) -> Covariance:
+        """Return the Covariance without correlation between different anchors, anchor by anchor."""
+        anchors = np.array([key[1].partition(".")[0] for key in self.keys])
+        order = np.argsort(np.unique(anchors, return_inverse=True)[1], kind="stable")
+        matrix = np.where(anchors[:, None] == anchors, self.matrix, 0.0)[np.ix_(order, order)]
+        return Covariance(tuple(self.keys[place] for place in order), matrix)
+
+    def without(self, anchors: Collection[str]) -> Covariance:
+        """Return the Covariance without the parameters of anchors with these ids (text)."""
+        kept = [key for key in self.keys if key[1].partition(".")[0] not in anchors]
+        return Covariance(tuple(kept), self.of(kept)[1])
+
+    def as_dict(self) -> dict[str, list[str] | list[list[float]]]:
+        """Return what YAML holds: rows of the lower triangle, without their leading zeros."""
+        first = [min(int(np.argmax(row != 0.0)), k) for k, row in enumerate(self.matrix)]
+        rows = [
+            [float(f"{value:.6g}") for value in row[begin : k + 1]]
+            for k, (row, begin) in enumerate(zip(self.matrix, first))
+        ]
+        return {"parameters": [f"{name} {key}" for name, key in self.keys], "matrix": rows}
+
+    @classmethod
+    def from_dict(
+        cls, content: Any, values: dict[str, dict[str, float]], where: str | Path
+    ) -> Covariance:
+        """Return the Covariance of the content that `as_dict` gives; raise InputError.
+
+        values : {name of an effect: {parameter: number}}; where : file, for messages
+        """
+        if not isinstance(content, dict) or set(content) != set(COVARIANCE_ENTRY):
+            raise InputError(
+                f"{where}: covariance must hold {' and '.join(COVARIANCE_ENTRY)}, as the tools write it."
+            )
+        names, rows = content["parameters"], content["matrix"]
+        if not isinstance(names, list) or not isinstance(rows, list) or len(rows) != len(names):
+            raise InputError(
+                f"{where}: covariance: needs a row of the matrix for each of the parameters."
+            )
+        keys = tuple(tuple(str(name).split(" ", 1)) for name in names)
+        for key in keys:
+            if len(key) != 2 or key[1] not in values.get(key[0], {}) or keys.count(key) > 1:
+                raise InputError(
+                    f"{where}: covariance: {' '.join(key)!r} is no parameter above, or there twice."
+                )
+        matrix = np.zeros((len(keys), len(keys)))
+        for k, row in enumerate(rows):
+            numeric = isinstance(row, list) and all(
+                isinstance(value, (int, float)) for value in row
+            )
+            if not numeric or not 1 <= len(row) <= k + 1:
+                raise InputError(
+                    f"{where}: covariance: row {k + 1} must be {k + 1} numbers, or fewer: "
+                    "those before it are 0."
+                )
+            matrix[k, k + 1 - len(row) : k + 1] = matrix[k + 1 - len(row) : k + 1, k] = row
+        scale = np.sqrt(np.diag(matrix).clip(min=1e-300))
+        if not np.isfinite(matrix).all() or (
+            len(keys) and np.linalg.eigvalsh(matrix / np.outer(scale, scale))[0] < -1e-3
+        ):
+            raise InputError(
+                f"{where}: covariance: the matrix is none; it must be finite and positive "
+                "semidefinite."
+            )
+        return cls(keys, matrix)
+
+
+class StreamCorrector:
+    """Corrector of the streams of a recording: ids, signs, stamps and values of all sensors.
+
+    The biases of TDOAs and ranges are corrected by Corrector.
+    """
+
+    def __init__(self, effects: Collection[Effect]) -> None:
+        """Select the effects on streams among `effects`."""
+        self._late = {
+            stream: sum(effect.stamp_offset(stream) for effect in effects)
+            for stream in STREAMS
+            if stream not in AIDS
+        }
+        self._labels, self._imu = LabelCorrector(effects), ImuCorrector(effects)
+        self._aids = AidCorrector(effects)
+
+    def correct(self, name: str, stream: Any) -> Any:
+        """Return the corrected stream `name` of a Flight, or its next part."""
+        if name in AIDS:
+            return self._aids.correct(name, stream)
+        if self._late[name]:
+            stream = replace(stream, t=stream.t - self._late[name])
+        if name == "tdoa" and not self._labels.idle:
+            a, b, d = self._labels.correct(stream.a, stream.b, stream.d)
+            return replace(stream, a=a, b=b, d=d)
+        if name == "imu" and not self._imu.idle:
+            gyro, accel = self._imu.correct(stream.t, stream.gyro, stream.accel)
+            return replace(stream, gyro=gyro, accel=accel)
+        return stream
 
 
 @dataclass(frozen=True)
 class EffectSet:
-    """The effects that are in the model, in the order in which they are listed. covariance : of
-    some of their values together, or None; corrections do not need it.
+    """The effects of a model, in their order.
+
+    covariance : Covariance of some of their values, or None; no correction needs it
     """
 
     effects: tuple[Effect, ...] = ()
@@ -44,7 +235,7 @@ class EffectSet:
 
     @property
     def name(self) -> str:
-        """Names joined by '+', or "none"."""
+        """Return the names, joined by '+', or "none"."""
         return "+".join(effect.name for effect in self.effects) or "none"
 
     def __len__(self) -> int:
@@ -54,36 +245,67 @@ class EffectSet:
         return iter(self.effects)
 
     def bias(self, samples: Samples) -> np.ndarray:
-        """Sum of all contributions to what `samples.channel` measures, (n,) metres, faded where
-        they were not seen. An effect whose size is not known there (unknown attitude) adds nothing.
+        """Return the sum of all biases of `samples.channel`, (n,) m, faded beyond their domains.
+
+        An effect of unknown size, for want of an attitude, adds nothing.
         """
         total = np.zeros(len(samples))
-        for effect in (effect for effect in self.effects if samples.channel in effect.channels):
-            part = faded(effect, samples)[0]
-            total += np.where(np.isfinite(part), part, 0.0)
+        for effect in self.effects:
+            if samples.channel in effect.channels:
+                total += _finite_or_zero(effect.faded_bias(samples)[0])
         return total
 
-    @cached_property
-    def parted(self) -> tuple[EffectSet, EffectSet]:
-        """(EffectSet of those whose part of a TDOA changes steeply with the state of the filter,
-        EffectSet of the others).
+    def bias_jacobian(self, samples: Samples) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the state-dependent bias of TDOAs with its derivative by the state of the filter.
+
+        Statistical linearization over the error of the filter: central differences over REACH
+        (Sarkka, Bayesian Filtering and Smoothing, 2013, section 5.3; Norgaard, Poulsen and Ravn,
+        Automatica 2000).
+
+        Returns bias (n,) m; Jacobian (n, N_STATES), m per m of position and per m/s of velocity;
+        standard deviation of the deviation from the line, (n,) m. All are 0 where the state is
+        unknown.
         """
-        steep = tuple(effect for effect in self.effects if effect.states)
-        return EffectSet(steep), EffectSet(
-            tuple(effect for effect in self.effects if not effect.states)
-        )
+        groups: dict[tuple[int, ...], list[Effect]] = {}
+        n = len(samples)
+        bias, jacobian, power = np.zeros(n), np.zeros((n, N_STATES)), np.zeros(n)
+        for effect in self.effects:
+            if effect.jacobian_states:
+                groups.setdefault(effect.jacobian_states, []).append(effect)
+        for states, group in groups.items():
+            moved = _moved(samples, states)
+            parts = (_finite_or_zero(effect.faded_bias(moved)[0]) for effect in group)
+            here, *sides = sum(parts, np.zeros(len(moved))).reshape(-1, n)
+            bias += here
+            for k, (low, high) in zip(states, zip(sides[::2], sides[1::2])):
+                jacobian[:, k] += (high - low) / (2.0 * REACH)
+                power += 2.0 * (0.5 * (high + low) - here) ** 2
+        return bias, jacobian, np.sqrt(power)
+
+    def where(self, condition: Callable[[Effect], Any]) -> EffectSet:
+        """Return the EffectSet of the effects that meet a condition."""
+        return EffectSet(tuple(effect for effect in self.effects if condition(effect)))
+
+    @cached_property
+    def state_dependent(self) -> EffectSet:
+        """Return the effects that `bias_jacobian` differentiates."""
+        return self.where(lambda effect: effect.jacobian_states)
+
+    @cached_property
+    def state_independent(self) -> EffectSet:
+        """Return the other effects."""
+        return self.where(lambda effect: not effect.jacobian_states)
 
     def uncorrected(self, samples: ImuSamples | AidSamples) -> np.ndarray:
-        """What taking the effects out of a stream leaves of them in ImuSamples, (n, 3), or
-        AidSamples, (n, k).
-        """
+        """Return the error that remains in corrected ImuSamples, (n, 3), or AidSamples, (n, k)."""
         mine = (effect for effect in self.effects if samples.channel in effect.channels)
         parts: Iterator[Any] = (effect.uncorrected(samples) for effect in mine)
         return sum(parts, np.zeros(samples.reading.shape))
 
     def noise_std(self, samples: Samples) -> np.ndarray:
-        """Standard deviation that the effects add to what `samples.channel` measures, (n,) metres,
-        with what of them is not taken out because they were not seen there.
+        """Return the standard deviation that the effects add to `samples.channel`, (n,) m.
+
+        It includes the part that is not corrected beyond their domains.
         """
         total = np.zeros(len(samples))
         for effect in self._noisy:
@@ -91,18 +313,16 @@ class EffectSet:
                 total += effect.noise_std(samples) ** 2
         for effect in self._limited:
             if samples.channel in effect.channels:
-                total += faded(effect, samples)[1] ** 2
+                total += effect.faded_bias(samples)[1] ** 2
         return np.sqrt(total)
 
     def outside(self, samples: Samples) -> list[str]:
-        """Of Samples: phrases on those effects of which less than half is taken out of some,
-        because they were not seen there.
-        """
-        mine = (effect for effect in self._limited if samples.channel in effect.channels)
+        """Return phrases on the effects that fade below FADED_BELOW in some of the Samples."""
         return [
-            in_words(effect)
-            for effect in mine
-            if np.min(faded(effect, samples)[2], initial=1.0) < LITTLE
+            effect.domain_words
+            for effect in self._limited
+            if samples.channel in effect.channels
+            and np.min(effect.faded_bias(samples)[2], initial=1.0) < FADED_BELOW
         ]
 
     @cached_property
@@ -119,41 +339,40 @@ class EffectSet:
 
     @cached_property
     def of_attitude(self) -> EffectSet:
-        """EffectSet of those whose part of a TDOA changes with the attitude of the tag."""
-        return EffectSet(tuple(effect for effect in self.effects if effect.uses_attitude))
+        """Return the effects on TDOAs and ranges that depend on the attitude of the tag."""
+        return self.where(lambda effect: effect.uses_attitude)
 
     def acting_on(self, channel: str) -> EffectSet:
-        """EffectSet of those that add something to what a channel of RADIO measures."""
-        return EffectSet(
-            tuple(
-                effect
-                for effect in self.effects
-                if channel in effect.channels and type(effect).bias is not Effect.bias
-            )
+        """Return the effects that bias a channel of RADIO."""
+        return self.where(
+            lambda effect: channel in effect.channels and type(effect).bias is not Effect.bias
         )
 
     @cached_property
     def needs_motion(self) -> bool:
-        """True if an effect looks at more than poses."""
+        """Return whether an effect depends on more than poses."""
         return any(effect.needs_motion for effect in self.effects)
 
     @cached_property
     def sensor_functions(self) -> tuple[SensorFunction, ...]:
-        """All SensorFunctions: what the filter itself takes out of inertial samples."""
+        """Return all SensorFunctions: errors of inertial samples that the filter corrects."""
         return tuple(function for effect in self.effects for function in effect.sensor_functions())
 
-    def on_floor(self, anchors: Anchors) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """What is given to the filter of some Anchors at a tag on the floor, as of
-        `FloorMultipath.on_floor`; None if no effect knows.
-        """
-        return next((effect.on_floor(anchors) for effect in self.effects if effect.weighed), None)
+    def near_ground_delays(
+        self, anchors: Anchors
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """Return delays of some Anchors near the ground, as FloorMultipath does, or None."""
+        for effect in self.effects:
+            if effect.is_hypothesis:
+                return effect.near_ground_delays(anchors)
+        return None
 
     def stamp_offset(self, stream: str) -> float:
-        """Seconds by which the stamps of a stream of a Flight are late, by its name."""
+        """Return by how many seconds the stamps of a stream of a Flight are late."""
         return sum(effect.stamp_offset(stream) for effect in self.effects)
 
     def correct_streams(self, flight: Flight) -> Flight:
-        """The Flight without the effects' part in its streams, see StreamCorrector."""
+        """Return the Flight with its streams corrected, see StreamCorrector."""
         corrector = StreamCorrector(self.effects)
         parts = {name: part for name in STREAMS if (part := getattr(flight, name)) is not None}
         return flight.replaced(
@@ -162,7 +381,7 @@ class EffectSet:
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> EffectSet:
-        """Read effects.yaml; raises InputError."""
+        """Read effects.yaml; raise InputError."""
         content = read_yaml(path)
         entries = content.get("effects") if isinstance(content, dict) else None
         if not isinstance(entries, dict):
@@ -196,7 +415,7 @@ class EffectSet:
         return cls(tuple(effects), Covariance.from_dict(content["covariance"], values, path))
 
     def to_yaml(self, path: str | Path) -> None:
-        """Write what `from_yaml` reads."""
+        """Write the file that `from_yaml` reads."""
         entries: dict[str, dict[str, Any]] = {}
         for effect in self.effects:
             entry = {name: _plain(getattr(effect, name)) for name in (*effect.settings, *ENTRY)}
@@ -215,16 +434,34 @@ class EffectSet:
 
 
 def _plain(value: Any) -> Any:
-    """A value of a field of an Effect as YAML has it: lists for tuples."""
+    """Return a field of an Effect with lists for tuples, as YAML has them."""
     if isinstance(value, dict):
         return {key: _plain(one) for key, one in value.items()}
     return list(value) if isinstance(value, tuple) else value
 
 
 def _kind(name: str) -> type[Effect] | None:
-    """Class of an entry: a declared effect or smooth_term, with an optional _NUMBER; None if there
-    is none.
-    """
+    """Return the class of an entry, "NAME" or "NAME_NUMBER", or None."""
     head, _, number = name.rpartition("_")
     kinds: dict[str, type[Effect]] = {**EFFECTS, SmoothTerm.name: SmoothTerm}
     return kinds.get(name) or (kinds.get(head) if number.isdigit() else None)
+
+
+def _finite_or_zero(bias: np.ndarray) -> np.ndarray:
+    return np.where(np.isfinite(bias), bias, 0.0)
+
+
+def _moved(samples: Samples, states: tuple[int, ...]) -> Samples:
+    """Return the Samples, then all of them for each state lowered and raised by REACH."""
+    n, out = len(samples), samples.repeated(1 + 2 * len(states))
+    position = out.p.copy()
+    velocity = np.zeros_like(position) if out.motion is None else out.motion.velocity.copy()
+    for number, state in enumerate(states):
+        moved = position if state < 3 else velocity
+        for side, step in enumerate((-REACH, REACH)):
+            first = (1 + 2 * number + side) * n
+            moved[first : first + n, state % 3] += step
+    if out.motion is None:
+        return replace(out, p=position)
+    motion = Motion(velocity, out.motion.acceleration, out.motion.rate)
+    return replace(out, p=position, motion=motion)

@@ -1,4 +1,7 @@
-"""An effect without a name: a smooth function of something, found in residuals."""
+"""SmoothTerm, an effect without a name: a function of one covariate that residuals show.
+
+First the term, then its shapes, then its words.
+"""
 
 from __future__ import annotations
 
@@ -11,10 +14,20 @@ import numpy as np
 from ..foundation.compiled import compiled
 from ..foundation.errors import InputError
 from ..foundation.sensors import BY_POSE, SENSORS
-from .base import Effect, known_anchors, once_per_anchors
+from .base import (
+    Effect,
+    Row,
+    SensorFunction,
+    cached_by_anchors,
+    id_texts,
+    listed,
+    measured,
+    rounded,
+)
 from .covariates import (
     CATEGORIES,
     EXTRA,
+    FADE,
     OF_AIDS,
     OF_ARRIVAL,
     OF_IMU,
@@ -22,14 +35,13 @@ from .covariates import (
     OF_STATE,
     OF_TDOA,
     STATES,
+    UNITS,
+    fade_weight,
+    has_domain,
     sensor_covariate,
 )
-from .domain import FADE, bounded, share
+from .pair import of_pair
 from .samples import RADIO, tile
-from .sensor_function import SensorFunction
-from .shapes import SHAPES, functions
-from .smooth_words import sentences
-from .wording import listed
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -39,34 +51,41 @@ if TYPE_CHECKING:
     from ..foundation.anchors import Anchors
     from .samples import AidSamples, ImuSamples, Samples
 
-DEGREE = 2
-GONE = 4 * FADE  # share of the width of a domain beyond which nothing is left of a function
+DEGREE = 2  # of splines
+GONE = 4 * FADE  # widths of a domain beyond which nothing of a function is left
 IMU_CHANNELS = tuple(f"{sensor}.{axis}" for sensor in ("gyro", "accel") for axis in "xyz")
 AID_CHANNELS = tuple(name + axis for name in BY_POSE for axis in SENSORS[name].compared.axes)
 FORMS = ("common", "arrival", "anchor", "pair", "direction")
-OF_LINKS = ("pair", "direction")  # forms with a function for a pair of anchors
-TYPICAL = {"tdoa": 0.1, "gyro": 0.1, "accel": 0.5}  # m, rad/s, m/s^2
-ALONE = 0.3  # m, of what few have
+OF_LINKS = ("pair", "direction")  # forms with one function per pair of anchors
+# Prior standard deviations of functions with few coefficients: m, rad/s and m/s^2
+RADIO_PRIOR_STD, PRIOR_STD = 0.3, {"gyro": 0.1, "accel": 0.5}
+MOST_PARTS = 3  # anchors or pairs whose functions are described
+# {shape: (knots, coefficients)}. Knots are the ends, and between them where a part begins or ends;
+# those of a wave are one period apart.
+SHAPES = {
+    "line": (2, 2),
+    "beyond": (3, 2),
+    "below": (3, 2),
+    "step": (3, 2),
+    "interval": (4, 2),
+    "wave": (2, 3),
+    "parabola": (2, 3),
+}
 
 
 @dataclass
 class SmoothTerm(Effect):
-    """A function of one covariate, held constant beyond its knots; `values` are its coefficients
-    c0, c1, ...
+    """A function of one covariate, held constant beyond its knots, with coefficients c0, c1, ...
 
-    channel : one of RADIO, "gyro.x" ... "accel.z", or of AID_CHANNELS
-    covariate : of RADIO a name of covariates.OF_TDOA or OF_ARRIVAL, of "range" none that needs the
-        TDOAs before, for other
-        channels of OF_AIDS, for the inertial ones of OF_IMU too; or, but for AID_CHANNELS,
-        "extra.STREAM.COLUMN". Where a recording does not hold it, it adds nothing
-    form : of RADIO only: "common", the same f(covariate) on every d_ab; "arrival", f of each
-        anchor's own
-        covariate, as d_ab = f_b - f_a; "anchor", the same with a function for each anchor,
-        coefficients "3.c0", ...; of "tdoa" alone "pair": f on d_ab and -f on d_ba, coefficients
-        "0-1.c0", ...; "direction": f on d_ab alone
-    knots : where the pieces meet, ends included, rising; for a covariate of names: the names, one
-        coefficient each
-    shape : "spline", quadratic, or one of `shapes.SHAPES`
+    channel : of RADIO, "gyro.x" ... "accel.z", or of AID_CHANNELS
+    covariate : name that the channel has, see `known_covariates`, or "extra.STREAM.COLUMN" on RADIO
+        and inertial channels. Without its column in a recording the term is zero.
+    form : of RADIO. "common": f(covariate) on every d_ab. "arrival": f_b - f_a, with the covariate
+        of each arrival. "anchor": the same with one function per anchor, coefficients "3.c0".
+        "pair", TDOAs only: f on d_ab and -f on d_ba, coefficients "0-1.c0". "direction": f on d_ab
+        only.
+    knots : where pieces meet, rising, ends included; of a covariate of names the names
+    shape : "spline", quadratic, or a name of SHAPES
     """
 
     channel: str = "tdoa"
@@ -75,15 +94,18 @@ class SmoothTerm(Effect):
     knots: tuple[float, ...] = field(default_factory=tuple)
     shape: str = "spline"
 
-    name: ClassVar[str] = "smooth_term"
-    price: ClassVar[float] = 6.0  # of having no name: of equals, a declared effect is preferred
+    row = Row(
+        name="smooth_term",
+        unit="m, rad/s or m/s^2",
+        bound=100.0,
+        negligible=0.0,
+        prior_std=0.1,
+        example="c0",
+        physics="unknown: what is left when the declared effects are taken out",
+        reference="found in residuals by diagnose",
+    )
+    penalty: ClassVar[float] = 6.0  # a declared effect wins if it explains as much
     settings: ClassVar[tuple] = ("channel", "covariate", "form", "knots", "shape")
-    unit: ClassVar[str] = "m, rad/s or m/s^2"
-    bound: ClassVar[float] = 100.0
-    negligible: ClassVar[float] = 0.0
-    typical: ClassVar[float] = 0.1
-    physics: ClassVar[str] = "unknown: what is left when the declared effects are taken out"
-    reference: ClassVar[str] = "found in residuals by diagnose"
     fitted: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
@@ -95,14 +117,7 @@ class SmoothTerm(Effect):
             raise InputError(
                 f"effects: smooth_term: knots: {self.knots!r} are not two or more rising numbers."
             )
-        known: dict[str, tuple[str, ...]] = {"tdoa": (*OF_TDOA, *OF_ARRIVAL)}
-        known |= {
-            channel: (*(name for name in OF_TDOA if name not in OF_MOTION), *OF_ARRIVAL)
-            for channel in RADIO
-            if channel != "tdoa"
-        }
-        known |= dict.fromkeys(IMU_CHANNELS, tuple(dict.fromkeys((*OF_IMU, *OF_AIDS))))
-        known |= dict.fromkeys(AID_CHANNELS, OF_AIDS)
+        known = known_covariates()
         extra = self.covariate.startswith(EXTRA) and self.channel not in AID_CHANNELS
         if (
             self.form not in FORMS
@@ -123,8 +138,7 @@ class SmoothTerm(Effect):
             shapes = ", ".join(f"{shape} ({count})" for shape, (count, _) in SHAPES.items())
             raise InputError(
                 f"effects: smooth_term: shape: {self.shape!r} with {len(self.knots)} knots is "
-                "not spline or one of "
-                f"{shapes}."
+                f"not spline or one of {shapes}."
             )
         if self.form in OF_LINKS and self.channel in RADIO and RADIO[self.channel].ends < 2:
             raise InputError(
@@ -139,7 +153,7 @@ class SmoothTerm(Effect):
         super().__post_init__()
 
     @classmethod
-    def plausible(cls, values: dict[str, float]) -> bool:
+    def within_bounds(cls, values: dict[str, float]) -> bool:
         return True
 
     @classmethod
@@ -149,22 +163,18 @@ class SmoothTerm(Effect):
                 f"effects: smooth_term: parameter {key!r} is not a coefficient such as c0 or 3.c0."
             )
 
-    # In other effects the following are of the class; here they follow from the settings of each
-    # term.
-    def typical_of(self, key: str) -> float:  # type: ignore[override]  # of a term
-        if self.shape != "spline" or self.form in OF_LINKS:
-            return (
-                ALONE
-                if self.channel in RADIO
-                else TYPICAL.get(self.channel.partition(".")[0], self.typical)
-            )
-        return (
-            0.5 * self.typical if "." in key else self.typical
-        )  # a function for each anchor: many, hence small
+    # The following depend on the settings of a term; other effects have them as a class.
+    def prior_std_of(self, key: str) -> float:  # type: ignore[override]  # of a term
+        if self.shape == "spline" and self.form not in OF_LINKS:
+            # One function per anchor: many, hence small.
+            return 0.5 * self.prior_std if "." in key else self.prior_std
+        if self.channel in RADIO:
+            return RADIO_PRIOR_STD
+        return PRIOR_STD.get(self.channel.partition(".")[0], self.prior_std)
 
     @property
     def channels(self) -> tuple[str, ...]:  # type: ignore[override]  # of a term
-        """Where it acts."""
+        """Return the channel without its axis."""
         return (self.channel.partition(".")[0],)
 
     def label_of(self, keys: Iterable[str]) -> str:
@@ -174,14 +184,14 @@ class SmoothTerm(Effect):
 
     @property
     def covariates(self) -> tuple[str, ...]:  # type: ignore[override]  # of a term
-        return (self.covariate,) if bounded(self.covariate) else ()
+        return (self.covariate,) if has_domain(self.covariate) else ()
 
     @property
     def uses_attitude(self) -> bool:  # type: ignore[override]  # of a term
         return self.covariate.endswith("_in_tag") or self.covariate == "tilt"
 
     @property
-    def states(self) -> tuple[int, ...]:
+    def jacobian_states(self) -> tuple[int, ...]:
         return STATES.get(self.covariate, ()) if self.channel == "tdoa" else ()
 
     @property
@@ -190,28 +200,24 @@ class SmoothTerm(Effect):
 
     @property
     def usable(self) -> bool:  # type: ignore[override]  # of a term
-        """Whether the nodes, and the filter off line, have the covariate at hand."""
+        """Return whether nodes can compute the covariate."""
         if self.channel in RADIO:
             return self.covariate in (*OF_TDOA, *OF_ARRIVAL) and self.covariate != "vibration"
         return self.channel in IMU_CHANNELS and self.covariate in (*OF_IMU, *OF_STATE)
 
     def keys(self, anchors: Anchors | None = None) -> tuple[str, ...]:
-        """All coefficients: of every anchor for the form "anchor"."""
-        return (
-            self.keys_of(known_anchors(anchors)) if self.form == "anchor" else self.keys_of(("",))
-        )
+        """Return all coefficients, for the form "anchor" those of every anchor."""
+        return self.keys_of(id_texts(anchors) if self.form == "anchor" else ("",))
 
     def keys_of(self, parts: Iterable[str]) -> tuple[str, ...]:
-        """All coefficients of some anchors "3" or pairs "0-1": tuple."""
+        """Return all coefficients of some anchors, "3", or pairs, "0-1"."""
         return tuple(f"{part}.c{k}".lstrip(".") for part in parts for k in range(self.count))
 
     def basis(self, values: ArrayLike) -> np.ndarray:
-        """The functions that the coefficients c0, c1, ... multiply, at covariate values (n,): (n,
-        k), NaN stays NaN.
-        """
+        """Return the basis functions of c0, c1, ... at covariate values (n,), (n, k); NaN of NaN."""
         values = np.asarray(values, dtype=float)
         if self.shape != "spline":
-            return functions(self.shape, self.knots, values)
+            return shape_basis(self.shape, self.knots, values)
         if self.covariate in CATEGORIES:
             return (values[:, None] == self._at).astype(float)
         out = np.zeros((len(values), self.count))
@@ -219,18 +225,20 @@ class SmoothTerm(Effect):
         return out
 
     def curve(self, values: np.ndarray, prefix: str = "") -> np.ndarray:
-        """The function at covariate values (n,): (n,). prefix : "3." for that of anchor 3 of the
-        form "anchor".
+        """Return the function at covariate values (n,), (n,).
+
+        prefix : "3." for anchor 3 of the form "anchor", "0-1." for a pair
         """
-        weights = np.array([[self.values.get(f"{prefix}c{k}", 0.0) for k in range(self.count)]])
+        weights = np.array([self._coefficients(prefix)])
         return self._functions(values, weights, np.zeros(len(values), dtype=np.int64))
 
     def spread(self, values: np.ndarray, prefix: str = "") -> np.ndarray:
-        """Standard deviation of what `curve` gives beside a level, (n,), as if its coefficients
-        were independent.
+        """Return the standard deviation of `curve` without its level, (n,).
+
+        The coefficients count as independent.
         """
         std = np.array([self.std.get(f"{prefix}c{k}", 0.0) for k in range(self.count)])
-        std[0] *= self.shape == "spline"  # else the level
+        std[0] *= self.shape == "spline"  # c0 of another shape is the level
         return np.sqrt(self.basis(values) ** 2 @ std**2)
 
     @cached_property
@@ -239,32 +247,30 @@ class SmoothTerm(Effect):
 
     @property
     def count(self) -> int:
-        """Coefficients of each function."""
+        """Return the number of coefficients of each function."""
         if self.shape != "spline":
             return SHAPES[self.shape][1]
         return len(self.knots) if self.covariate in CATEGORIES else len(self.knots) + DEGREE - 1
 
     def _functions(self, values: np.ndarray, weights: np.ndarray, rows: np.ndarray) -> np.ndarray:
-        """Functions with weights (m, k) at values (n,), each that of its row (n,): (n,)."""
+        """Return functions of weights (m, k), for each value (n,) that of its row (n,), (n,)."""
         if self.shape != "spline" or self.covariate in CATEGORIES:
             return np.einsum("nk,nk->n", self.basis(values), weights[rows])
         out = np.empty(len(values))
         _curves(self._at, np.asarray(values, dtype=float), weights, rows, out)
         return out
 
-    @once_per_anchors
+    @cached_by_anchors
     def _weights(self, anchors: Anchors) -> np.ndarray:
-        """Coefficients of every anchor's function, (m, k); zero for an anchor without one."""
-        prefixes = [f"{i}." if self.form == "anchor" else "" for i in known_anchors(anchors)]
-        return np.array(
-            [
-                [self.values.get(f"{prefix}c{k}", 0.0) for k in range(self.count)]
-                for prefix in prefixes
-            ]
-        )
+        """Return the coefficients of the function of every anchor, (m, k), 0 if it has none."""
+        prefixes = [f"{i}." if self.form == "anchor" else "" for i in id_texts(anchors)]
+        return np.array([self._coefficients(prefix) for prefix in prefixes])
+
+    def _coefficients(self, prefix: str) -> list[float]:
+        return [self.values.get(f"{prefix}c{k}", 0.0) for k in range(self.count)]
 
     def _covariate(self, samples: Samples) -> tuple[Any, np.ndarray | None]:
-        """(values per TDOA or None, values per arrival or None)"""
+        """Return (values per measurement or None, values per arrival or None)."""
         if self.covariate in OF_ARRIVAL:
             return None, OF_ARRIVAL[self.covariate](samples, samples.rows)
         if self.covariate in OF_TDOA:
@@ -282,20 +288,16 @@ class SmoothTerm(Effect):
             return self.curve(values)
         if self.form in OF_LINKS:
             links = dict.fromkeys(key.rpartition(".")[0] for key in self.values)
-            return sum(
-                (self._of_link(samples, link) * self.curve(values, f"{link}.") for link in links),
-                np.zeros(n),
-            )
+            parts = (self._of_link(samples, k) * self.curve(values, f"{k}.") for k in links)
+            return sum(parts, np.zeros(n))
         return samples.difference(
             self._functions(both, self._weights(samples.anchors), samples.rows)
         )
 
     def _of_link(self, samples: Samples, link: str) -> np.ndarray:
-        """By how much the function of the pair "0-1" counts in each d_ab: (n,) 1, -1 or 0."""
-        ids, (first, second) = samples.anchors.ids, map(int, link.split("-"))
-        a, b = ids[samples.a], ids[samples.b]
-        forth = 1.0 * ((a == first) & (b == second))
-        return forth - ((a == second) & (b == first)) if self.form == "pair" else forth
+        """Return the sign of the function of the pair "0-1" in each d_ab, (n,) 1, -1 or 0."""
+        forth, back = of_pair(samples, link)
+        return 1.0 * forth - back if self.form == "pair" else 1.0 * forth
 
     def sensor_bias(self, channel: str, features: np.ndarray) -> np.ndarray | None:
         if channel not in self.channels or self.covariate not in OF_IMU:
@@ -305,9 +307,9 @@ class SmoothTerm(Effect):
         return out
 
     def _faded_curve(self, values: np.ndarray) -> np.ndarray:
-        """`curve`, faded where it was not seen."""
-        limits = self.domain.get(self.covariate)
-        return self.curve(values) if limits is None else self.curve(values) * share(values, limits)
+        """Return `curve`, faded beyond its domain."""
+        limits, curve = self.domain.get(self.covariate), self.curve(values)
+        return curve if limits is None else curve * fade_weight(values, limits)
 
     def sensor_functions(self) -> tuple[SensorFunction, ...]:
         if self.channel not in IMU_CHANNELS or self.covariate not in OF_STATE:
@@ -315,20 +317,12 @@ class SmoothTerm(Effect):
         low, high = self.domain.get(self.covariate, (self.knots[0], self.knots[-1]))
         beyond = GONE * (high - low) if self.domain else 0.0
         periodic = self.shape == "wave" and not self.domain
-        return (
-            SensorFunction.of(
-                self._faded_curve,
-                self.channel,
-                self.covariate,
-                low - beyond,
-                high + beyond,
-                periodic,
-            ),
-        )
+        ends = low - beyond, high + beyond
+        return (SensorFunction.of(self._faded_curve, self.channel, self.covariate, ends, periodic),)
 
     @property
     def _axis(self) -> int:
-        """Place of its axis in what the sensor reads."""
+        """Return the column of its axis in a reading."""
         return "xyz".index(self.channel.partition(".")[2] or "x")
 
     def uncorrected(self, samples: ImuSamples | AidSamples) -> np.ndarray | float:
@@ -375,13 +369,19 @@ class SmoothTerm(Effect):
         return [keys, *alone] if self.form == "anchor" else [keys]
 
     def advice(self) -> tuple[str, ...]:
-        return sentences(self)
+        parts = list(dict.fromkeys(key.rpartition(".")[0] for key in self.values))
+        if len(parts) > MOST_PARTS or not parts:
+            return ()
+        cause, trial = causes(self)
+        functions = listed(described(self, part) for part in parts)
+        return (f"Look for why {functions}: {cause}. To tell: {trial}.",)
 
 
 @compiled
 def _pieces(knots: np.ndarray, value: float) -> tuple[int, float, float, float]:
-    """(number of the first of three quadratic B-splines that are not zero at a value, held at the
-    ends of the knots, and their values): de Boor's recursion with clamped ends.
+    """Return (first of the three quadratic B-splines that are not zero at a value, their values).
+
+    de Boor's recursion with clamped ends; a value beyond the knots is held at their ends.
     """
     last = len(knots) - 1
     if not value > knots[0]:
@@ -416,3 +416,263 @@ def _curves(
         piece, first, second, third = _pieces(knots, values[i])
         w = weights[rows[i]]
         out[i] = first * w[piece] + second * w[piece + 1] + third * w[piece + 2]
+
+
+def known_covariates() -> dict[str, tuple[str, ...]]:
+    """Return {channel: covariates of a SmoothTerm on it}, without further columns of logs."""
+    without_motion = (name for name in OF_TDOA if name not in OF_MOTION)
+    return {
+        **dict.fromkeys(RADIO, (*without_motion, *OF_ARRIVAL)),
+        "tdoa": (*OF_TDOA, *OF_ARRIVAL),
+        **dict.fromkeys(IMU_CHANNELS, tuple(dict.fromkeys((*OF_IMU, *OF_AIDS)))),
+        **dict.fromkeys(AID_CHANNELS, OF_AIDS),
+    }
+
+
+def shape_basis(shape: str, knots: Sequence[float], values: np.ndarray) -> np.ndarray:
+    """Return the basis functions of a shape at covariate values (n,), (n, k); NaN of NaN.
+
+    The first is 1, the level. The second is, for
+    line, parabola : a rise from -1/2 to 1/2 between the knots; a parabola has its square too
+    beyond, below : a rise from 0 at the middle knot to 1 at the last, or at the first
+    step, interval : 1 beyond the middle knot, or between the two inner knots
+    wave : the sine of the period between the knots, and the cosine
+    """
+    v, one = np.asarray(values, dtype=float), np.ones(len(values))
+    if shape == "wave":
+        phase = 2.0 * np.pi * (v - knots[0]) / (knots[1] - knots[0])
+        return np.stack([one, np.sin(phase), np.cos(phase)], axis=1)
+    low, high = knots[0], knots[-1]
+    held = np.clip(v, low, high)
+    if shape in ("line", "parabola"):
+        second = (held - low) / (high - low) - 0.5
+        if shape == "parabola":
+            return np.stack([one, second, second**2], axis=1)
+    elif shape == "beyond":
+        second = np.maximum(held - knots[1], 0.0) / (high - knots[1])
+    elif shape == "below":
+        second = np.maximum(knots[1] - held, 0.0) / (knots[1] - low)
+    else:
+        inside = (v >= knots[1]) & (v < knots[2] if shape == "interval" else True)
+        second = np.where(np.isnan(v), np.nan, 1.0 * inside)
+    return np.stack([one, second], axis=1)
+
+
+AXES = {"gyro": "the gyroscope reads {} about {}", "accel": "the accelerometer reads {} along {}"}
+SENSOR_UNITS = {"gyro": "rad/s", "accel": "m/s^2"}
+OF_PLACE = (
+    "x",
+    "y",
+    "height",
+    "range",
+    "bearing",
+    "elevation",
+    "bearing_in_anchor",
+    "elevation_in_anchor",
+)
+OF_DIRECTION = ("bearing_in_tag", "elevation_in_tag", "tilt")
+# (forms, covariates, causes, trial that distinguishes them); the first row that fits is used.
+_CAUSES = (
+    (
+        ("pair", "direction"),
+        None,
+        (
+            "the time of flight that these anchors measured between them (Bitcraze documentation "
+            "of TDoA2), or something between them"
+        ),
+        (
+            "let them measure it again, then exchange one of the two modules: what stays is in "
+            "the room"
+        ),
+    ),
+    (
+        ("anchor",),
+        ("time",),
+        (
+            "something that came or went near it, its clock or its temperature (DW1000 user "
+            "manual: 2.15 mm per degree)"
+        ),
+        "leave the tag at one place for as long: what still changes is in the anchor or near it",
+    ),
+    (
+        ("anchor",),
+        OF_PLACE,
+        (
+            "an obstacle or a reflector on that side of it, its antenna's pattern (Qorvo support: "
+            "10 - 15 cm), or its place in the survey"
+        ),
+        (
+            "exchange its module with that of another anchor and fly there again: what stays is "
+            "in the room"
+        ),
+    ),
+    (
+        ("anchor", "arrival"),
+        OF_DIRECTION,
+        (
+            "the pattern of the tag's antenna, or a part of the vehicle in the way (Qorvo "
+            "support: 10 - 15 cm)"
+        ),
+        "turn the vehicle by hand on the spot",
+    ),
+    (
+        ("arrival",),
+        OF_PLACE,
+        (
+            "the detection of weak and strong signals (Decawave APS011), the antennas' pattern or "
+            "the frame of the survey"
+        ),
+        "fly to and fro along one line to an anchor",
+    ),
+    (
+        ("common",),
+        ("time",),
+        "the tag's clock, supply or temperature",
+        "leave the tag at one place for as long",
+    ),
+    (
+        None,
+        ("speed", "climb_rate", "acceleration", "turning_rate", "vibration", "tilt"),
+        "stamps that are late, the attitude of the antenna or its supply under load",
+        "fly one straight line slowly and fast, level and tilted",
+    ),
+    (
+        None,
+        ("interval", "previous_anchor"),
+        "the order in which packets come and how the tag handles them",
+        "change the order of the anchors",
+    ),
+    (
+        None,
+        None,
+        "nothing that is known to do this everywhere in the room",
+        "fly where this changes and all else does not",
+    ),
+)
+_SENSOR_CAUSES = {
+    "time": (
+        "warming up (BMI088 data sheet)",
+        "leave the vehicle switched on and at rest for as long",
+    ),
+    "vibration": ("vibration that it rectifies", "mount it softer and fly again"),
+    "turning": (
+        "its scale, its axes, or a place off the centre of turns",
+        "turn the vehicle by hand about one axis at a time",
+    ),
+    "force": (
+        "its scale, its axes, or acceleration that it takes for turning (BMI088 data sheet)",
+        "lay the vehicle on each side",
+    ),
+    "motion": (
+        "air flow, magnetism or load that go with the motion",
+        "carry the vehicle by hand along the same path",
+    ),
+}
+
+
+def described(term: SmoothTerm, part: str = "") -> str:
+    """Return the function of an anchor "3", of a pair "0-1" or of all, "", as a clause."""
+    prefix = f"{part}." if part else ""
+    name, unit = _named(term.covariate), UNITS.get(term.covariate, "")
+    level, *more = (term.values.get(f"{prefix}c{k}", 0.0) for k in range(term.count))
+    std = term.std.get(f"{prefix}c1")
+    knots = [f"{rounded(knot)} {unit}".strip() for knot in term.knots]
+    seen = f" (seen from {knots[0]} to {knots[-1]})" if term.shape != "wave" else ""
+    if term.shape == "step":
+        return _off(
+            term,
+            part,
+            more[0],
+            std,
+            f" {_where(name, f'above {knots[1]}', f'after {knots[1]}')}{seen}",
+        )
+    if term.shape == "interval":
+        return _off(
+            term,
+            part,
+            more[0],
+            std,
+            (
+                " "
+                f"{_where(name, f'between {knots[1]} and {knots[2]}', f'from {knots[1]} to {knots[2]}')}{seen}"
+            ),
+        )
+    if term.shape in ("line", "beyond", "below"):
+        first, last = {"line": (0, 1), "beyond": (1, 2), "below": (1, 0)}[term.shape]
+        slope = more[0] / (term.knots[last] - term.knots[first])
+        error = None if std is None else std / abs(term.knots[last] - term.knots[first])
+        reach = (
+            ""
+            if term.shape == "line"
+            else f", {'above' if term.shape == 'beyond' else 'below'} {knots[1]}"
+        )
+        return _off(
+            term, part, slope, error, f" for each {unit or 'unit'} more of {name}{reach}{seen}"
+        )
+    at = np.linspace(term.knots[0], term.knots[-1], 60)
+    course = term.curve(at, prefix)
+    top, bottom = int(np.argmax(course)), int(np.argmin(course))
+    swing = course[top] - course[bottom]
+    if term.shape == "wave":
+        length = f"{rounded(term.knots[1] - term.knots[0])} {unit}".strip()
+        return _off(term, part, swing, None, f" and less in turn, every {length} of {name}")
+    where = (
+        f" where {name} is {rounded(at[top])} {unit} than where it is {rounded(at[bottom])} {unit}"
+    )
+    return _off(term, part, swing, None, f"{where}{seen}")
+
+
+def causes(term: SmoothTerm) -> tuple[str, str]:
+    """Return (possible causes, trial that distinguishes them)."""
+    sensor = term.channel.partition(".")[0]
+    if term.covariate.startswith(EXTRA):
+        return (
+            "what warms, loads or supplies it",
+            f"keep the vehicle at rest and change {_named(term.covariate)} alone",
+        )
+    if sensor in SENSOR_UNITS:
+        return _SENSOR_CAUSES[_kind(term.covariate)]
+    for forms, covariates, cause, trial in _CAUSES:
+        if (forms is None or term.form in forms) and (
+            covariates is None or term.covariate in covariates
+        ):
+            return cause, trial
+    raise AssertionError
+
+
+def _named(covariate: str) -> str:
+    return covariate.removeprefix(EXTRA).replace("_", " ").replace(".", " ")
+
+
+def _where(name: str, over: str, during: str) -> str:
+    return during if name == "time" else f"where {name} is {over}"
+
+
+def _kind(covariate: str) -> str:
+    if covariate in ("time", "vibration"):
+        return covariate
+    if covariate.startswith("rate") or covariate == "turning_rate":
+        return "turning"
+    return "force" if covariate.startswith("accel") and covariate != "acceleration" else "motion"
+
+
+def _off(term: SmoothTerm, part: str, value: float, std: float | None, how: str) -> str:
+    sensor, _, axis = term.channel.partition(".")
+    if sensor in SENSOR_UNITS:
+        amount = (
+            f"{measured(abs(value), std, SENSOR_UNITS[sensor])} too "
+            f"{'much' if value > 0.0 else 'little'}"
+        )
+        return AXES[sensor].format(amount, axis) + how
+    amount = measured(abs(value), std, "m")
+    if term.form in ("anchor", "arrival"):
+        who = f"anchor {part}" if part else "each anchor"
+        return f"{who} seems {amount} {'farther' if value > 0.0 else 'nearer'}{how}"
+    subject = (
+        f"the TDOA of {part}"
+        if part
+        else f"each value of {term.channel}"
+        if sensor != "tdoa"
+        else "every TDOA"
+    )
+    return f"{subject} is {amount} {'larger' if value > 0.0 else 'smaller'}{how}"

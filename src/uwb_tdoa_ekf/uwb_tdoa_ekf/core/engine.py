@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from uwb_tdoa_bias.effects.slope import N_STATES
+from uwb_tdoa_bias.effects.samples import N_STATES
 from uwb_tdoa_bias.foundation.compiled import Record, compiled
 from uwb_tdoa_bias.foundation.geometry import linearized_tdoa
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from uwb_tdoa_bias.effects.slope import N_STATES
+from uwb_tdoa_bias.effects.samples import N_STATES
 from uwb_tdoa_bias.foundation.compiled import Record
 
 from .auxiliary import OFFSET_STATES
@@ -24,7 +24,7 @@ from .update import INNOVATION
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from uwb_tdoa_bias.effects.sensor_function import SensorFunction
+    from uwb_tdoa_bias.effects.base import SensorFunction
 
 YAWS, PLACES = (
     4,

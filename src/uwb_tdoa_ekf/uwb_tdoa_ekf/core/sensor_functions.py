@@ -9,8 +9,8 @@ import math
 
 import numpy as np
 
+from uwb_tdoa_bias.effects.base import TABLE_STEPS, SensorFunction
 from uwb_tdoa_bias.effects.covariates import OF_STATE
-from uwb_tdoa_bias.effects.sensor_function import STEPS, SensorFunction
 from uwb_tdoa_bias.foundation.compiled import Record, compiled
 
 SENSORS = ("gyro", "accel")
@@ -27,7 +27,7 @@ SENSOR_FUNCTION = np.dtype(
         ("covariate", np.int64),  # the first and the last by their places
         ("low", float),
         ("high", float),
-        ("values", float, STEPS + 1),
+        ("values", float, TABLE_STEPS + 1),
         ("periodic", np.bool_),
     ],
     align=True,
@@ -66,6 +66,6 @@ def subtract(functions: np.ndarray, x: np.ndarray, sample: Record) -> None:
 def _value(function: Record, at: float) -> float:
     place = (at - function.low) / (function.high - function.low)
     place = place - math.floor(place) if function.periodic else min(max(place, 0.0), 1.0)
-    first = min(int(place * STEPS), STEPS - 1)
-    share = place * STEPS - first
+    first = min(int(place * TABLE_STEPS), TABLE_STEPS - 1)
+    share = place * TABLE_STEPS - first
     return (1.0 - share) * function.values[first] + share * function.values[first + 1]

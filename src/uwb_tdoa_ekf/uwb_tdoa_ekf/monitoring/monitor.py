@@ -28,7 +28,7 @@ from .swap import clear_exchange, mean_of
 from .swap import residuals as residuals_of
 
 if TYPE_CHECKING:
-    from uwb_tdoa_bias.effects.covariance import Covariance
+    from uwb_tdoa_bias.effects.effect_set import Covariance
     from uwb_tdoa_bias.foundation.anchors import Anchors
 
     from ..installed import Installed

@@ -14,7 +14,7 @@ from .monitor import GAP, Event, Monitor
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from uwb_tdoa_bias.effects.covariance import Covariance
+    from uwb_tdoa_bias.effects.effect_set import Covariance
     from uwb_tdoa_bias.foundation.anchors import Anchors
 
     from ..results import Odometry, Residuals

@@ -31,7 +31,7 @@ from .slices import TDOA_VARIANCE
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from uwb_tdoa_bias.effects.covariance import Covariance
+    from uwb_tdoa_bias.effects.effect_set import Covariance
     from uwb_tdoa_bias.foundation.anchors import Anchors
 
     from ..installed import Installed

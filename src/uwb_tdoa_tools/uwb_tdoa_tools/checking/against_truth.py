@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.effects.anchor_ids import AnchorIds
+from uwb_tdoa_bias.effects.anchor import AnchorIds
 from uwb_tdoa_ekf.streams import WARNING, Finding
 
 from . import motion_rules, pair_rules, time_rules

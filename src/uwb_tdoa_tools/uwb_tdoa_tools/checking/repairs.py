@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from uwb_tdoa_bias.effects.anchor_ids import AnchorIds
-from uwb_tdoa_bias.effects.pair_sign import PairSign
+from uwb_tdoa_bias.effects.anchor import AnchorIds
+from uwb_tdoa_bias.effects.pair import PairSign
 
 from . import pair_rules
 from .known_path import KnownPath

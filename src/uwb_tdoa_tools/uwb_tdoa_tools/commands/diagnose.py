@@ -26,9 +26,7 @@ from ..surveying.known import DRIFT, read_paths
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
 
-    from ..diagnosis.constraints.distance import Distance
-    from ..diagnosis.constraints.mark import Mark
-    from ..diagnosis.references.path import OdometryPath
+    from ..diagnosis.constraints import Distance, Mark, OdometryPath
 
 DESCRIPTION = """Find out what is wrong with the measurements of some flights, and put it right.
 

@@ -103,7 +103,9 @@ class Attribution:
 
         Functions without a name would go on in the air.
         """
-        return effects_of(self.floor.where(lambda effect: effect.weighed)) if self.floor else ()
+        return (
+            effects_of(self.floor.where(lambda effect: effect.is_hypothesis)) if self.floor else ()
+        )
 
     @property
     def covariance(self) -> Covariance | None:
@@ -184,7 +186,7 @@ def attribute(
     installation = _installation(flights)
     declared = _declared(under_base, reference, kinds, installation)
     unmoved = linearised(under_base, declared, ())
-    disguises = partial(_search, [detector for detector in detectors if detector.disguises])
+    disguises = partial(_search, [detector for detector in detectors if detector.searched_first])
     inflation = inflation_of(unmoved, declared, disguises)
     progress()
     selection = select(unmoved, declared, inflation, search, progress=progress)
@@ -367,7 +369,7 @@ def _declared(
         for effect in effects
         if (kinds is None or effect.name in kinds)
         and (all(reference.positions_known) or not effect.needs_reference)
-        and (not effect.witnesses or shown & set(effect.witnesses))
+        and (not effect.corroborating_channels or shown & set(effect.corroborating_channels))
     ]
     return [candidate for effect in chosen for candidate in candidates_of(effect(), *installation)]
 

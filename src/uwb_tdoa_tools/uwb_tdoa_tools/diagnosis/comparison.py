@@ -12,7 +12,7 @@ import numpy as np
 
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_bias.effects.stamp_error import shifted
+from uwb_tdoa_bias.effects.stamps import shifted
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.results import OF_ROW, VERDICTS

@@ -324,7 +324,7 @@ def _findings(
         return replace(finding, added=added, worth=float(np.sum(known)) if known else None)
 
     def usable_there(finding: EffectFinding) -> bool:
-        return finding.effect.weighed if finding.on_floor else finding.effect.usable
+        return finding.effect.is_hypothesis if finding.on_floor else finding.effect.usable
 
     out = [with_worth(finding, usable_there(finding)) for finding in model]
     added = {finding.key for finding in out}

@@ -66,7 +66,7 @@ class EffectFinding:
     @property
     def key(self) -> tuple[Hashable, str | None]:
         """Hashable: equal for findings of one effect."""
-        return (self.effect.name if self.declared else self.effect.identity), self.flight
+        return (self.effect.name if self.declared else self.effect.merge_key), self.flight
 
 
 @dataclass(frozen=True)

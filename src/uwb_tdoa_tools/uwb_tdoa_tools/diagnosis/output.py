@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from uwb_tdoa_bias.effects.wording import listed
+from uwb_tdoa_bias.effects.base import listed
 
 from .. import json_values
 from .over_flights import course

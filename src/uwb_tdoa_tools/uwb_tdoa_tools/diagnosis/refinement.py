@@ -79,7 +79,7 @@ def written(selection: Selection, declared: Sequence[Candidate]) -> Selection:
 
 def entry_of(effect: Effect) -> Hashable:
     """Equal for Effects that are one entry of effects.yaml."""
-    return effect.identity if isinstance(effect, SmoothTerm) else effect.name
+    return effect.merge_key if isinstance(effect, SmoothTerm) else effect.name
 
 
 def linearised(
@@ -88,10 +88,10 @@ def linearised(
     """RegressionTable with the columns of all candidates about `model`, whose contribution is put
     back: a fit gives whole values, not increments.
     """
-    here = {effect.identity: effect for effect in model}
+    here = {effect.merge_key: effect for effect in model}
     terms = [term for candidate in candidates for term in candidate.terms]
     own = [Term(effect, tuple(effect.std)) for effect in model]
-    about = [Term(here.get(term.effect.identity, term.effect), term.keys) for term in terms]
+    about = [Term(here.get(term.effect.merge_key, term.effect), term.keys) for term in terms]
     table = table_of(found).with_terms([*own, *about])
     return table.with_contribution([(term.effect, term.columns) for term in own])
 
@@ -190,14 +190,14 @@ def with_maps(
     """Add functions of the place for every anchor, each too weak alone, if together they are
     plainly worth it on data that they were not fitted to.
     """
-    taken = {term.effect.identity for candidate in selection.chosen for term in candidate.terms}
+    taken = {term.effect.merge_key for candidate in selection.chosen for term in candidate.terms}
     for channel in CHANNELS.values():
         terms: dict[Hashable, Term] = {}
         for candidate in smooth:  # the first of a function is that of all anchors
             term = candidate.terms[0]
             function = term.function if channel.name in candidate.channels else None
             if function and function.form == "anchor" and function.covariate in channel.maps:
-                terms.setdefault(term.effect.identity, term)
+                terms.setdefault(term.effect.merge_key, term)
         maps = Candidate(tuple(term for identity, term in terms.items() if identity not in taken))
         if not maps.terms:
             continue

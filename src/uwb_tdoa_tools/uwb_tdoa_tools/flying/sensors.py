@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.effects import Samples
-from uwb_tdoa_bias.effects.floor_multipath import FloorMultipath
+from uwb_tdoa_bias.effects.floor import FloorMultipath
 from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.radio import arrival_bias
 from uwb_tdoa_bias.foundation.sensors import SENSORS

@@ -190,7 +190,7 @@ def _ranges_fit(flight: Flight, effects: EffectSet, found: Alignment) -> bool:
                 replace(flight, truth=found.significant().applied_to(flight.truth, how)),
                 RADIO[channel],
             )
-            left = stream.d[rows] - samples.true() - effects.bias(samples)
+            left = stream.d[rows] - samples.predicted() - effects.bias(samples)
             apart = [
                 np.abs(left[samples.b == anchor] - np.median(left[samples.b == anchor]))
                 for anchor in np.unique(samples.b)

@@ -13,8 +13,7 @@ from uwb_tdoa_bias.foundation.limits import TABLE_CELLS
 from uwb_tdoa_bias.foundation.safe_yaml import read_yaml
 
 from ..bags.bag import read_odometry
-from ..diagnosis.constraints import Distance, Mark
-from ..diagnosis.references.path import OdometryPath
+from ..diagnosis.constraints import Distance, Mark, OdometryPath
 from ..readers.tables import number, read_table
 
 if TYPE_CHECKING:

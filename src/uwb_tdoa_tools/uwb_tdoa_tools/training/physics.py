@@ -80,7 +80,9 @@ def sizes(effects: EffectSet) -> np.ndarray:
     """Plausible sizes of all parameters, (k,), each in its unit: standard deviations of their
     priors.
     """
-    return np.array([effect.typical_of(key) for effect in effects.effects for key in effect.values])
+    return np.array(
+        [effect.prior_std_of(key) for effect in effects.effects for key in effect.values]
+    )
 
 
 def with_values(effects: EffectSet, values: np.ndarray, covariance: np.ndarray) -> EffectSet:

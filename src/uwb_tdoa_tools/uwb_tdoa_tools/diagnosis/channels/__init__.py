@@ -1,7 +1,4 @@
-"""Kinds of measurement: each with its residual, its rows in a fit, and what it may depend on.
-
-One channel, one file.
-"""
+"""Channels, kinds of measurement: their residuals, rows of a fit, covariates and health."""
 
 from __future__ import annotations
 
@@ -9,13 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 from uwb_tdoa_bias.foundation.sensors import BY_POSE, DIAGNOSED
 
-from .accel import Accel
 from .aid import Aid
 from .base import Channel, ChannelResidual, ChannelResiduals, Comparison, Rows
-from .gyro import Gyro
-from .radio import RadioResidual
-from .ranging import Ranging
-from .tdoa import Tdoa, TdoaResidual
+from .inertial import Accel, Gyro
+from .radio import RadioResidual, Ranging, Tdoa, TdoaResidual
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -48,9 +42,10 @@ __all__ = [
 
 
 def residuals(flight: Flight, reference: Reference, effects: EffectSet) -> ChannelResiduals:
-    """{name of a channel: ChannelResidual} of a Flight that the Reference has prepared, under the
-    model `effects`, an EffectSet. Channels that the flight or the reference does not show are not
-    among them. Raises InputError where the flight is too short.
+    """Return {name of a channel: ChannelResidual} of a prepared Flight under a model of effects.
+
+    Channels that the flight or the reference lacks are left out. Raises InputError if the flight is
+    too short.
     """
     comparison = Comparison.of(flight, reference, effects)
     parts = {name: channel.residual(comparison) for name, channel in CHANNELS.items()}
@@ -58,7 +53,7 @@ def residuals(flight: Flight, reference: Reference, effects: EffectSet) -> Chann
 
 
 def tdoa_parts(residuals: Iterable[ChannelResiduals]) -> list[TdoaResidual]:
-    """The TdoaResiduals among the residuals of flights, of those that have one."""
+    """Return the TdoaResiduals among the residuals of flights."""
     return [
         part
         for of_flight in residuals

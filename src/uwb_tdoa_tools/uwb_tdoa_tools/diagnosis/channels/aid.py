@@ -1,4 +1,4 @@
-"""What the SENSORS beside inertia and TDOAs say: residuals of their medians over cells."""
+"""Channels of auxiliary sensors: residuals of their medians over cells."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from uwb_tdoa_bias.foundation.sensors import SENSORS
 from .base import Channel, ChannelResidual, Rows
 from .figures import APART, figures
 from .inertial import CELL, vibration_at
-from .knots import knots_of
+from .views import knots_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -29,9 +29,10 @@ FEWEST_CELLS = 8
 
 @dataclass(frozen=True)
 class AidResidual(ChannelResidual):
-    """samples : AidSamples, cells; residual (n, k), NaN where an axis was not measured; labels : k
-    texts, its axes; unit of the channel; floating : whether a constant tells nothing, and its mean
-    is taken out of rows and columns.
+    """Residual (n, k) of AidSamples of cells, NaN where an axis was not measured.
+
+    labels : of its k axes; unit : of the channel
+    floating : whether a constant has no meaning: rows and columns are without their mean
     """
 
     samples: AidSamples
@@ -62,21 +63,19 @@ class AidResidual(ChannelResidual):
         columns = {
             f"{label} [{self.unit}]": self.residual[:, k] for k, label in enumerate(self.labels)
         }
-        measured = {
-            label: np.isfinite(column) for label, column in columns.items()
-        }  # optical flow tells no vertical velocity
-        return {
-            label: (self.samples.t[m], columns[label][m])
-            for label, m in measured.items()
-            if m.any()
-        }
+        out = {}
+        for label, column in columns.items():
+            measured = np.isfinite(column)  # optical flow measures no vertical velocity
+            if measured.any():
+                out[label] = self.samples.t[measured], column[measured]
+        return out
 
     def _free(self, values: np.ndarray) -> np.ndarray:
         return values - values.mean(axis=0) if self.floating else values
 
 
 class Aid(Channel[AidResidual]):
-    """The channel of one of the SENSORS, with what its Compared says as attributes."""
+    """The channel of an auxiliary sensor, with the fields of its Compared as attributes."""
 
     axes: tuple[str, ...]
     positions: tuple[int, ...]
@@ -89,7 +88,7 @@ class Aid(Channel[AidResidual]):
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Of its axes: tuple."""
+        """Return the names of its axes."""
         return tuple(self.name + axis for axis in self.axes)
 
     def residual(self, comparison: Comparison) -> AidResidual | None:
@@ -120,7 +119,7 @@ class Aid(Channel[AidResidual]):
     def smooth_terms(self, residuals: Sequence[AidResidual]) -> list[SmoothTerm]:
         out = []
         for name in OF_AIDS:
-            if knots := knots_of(name, residuals):
+            if knots := knots_of(name, [part.covariate(name) for part in residuals]):
                 out += [
                     SmoothTerm(channel=label, covariate=name, knots=knots) for label in self.labels
                 ]
@@ -139,7 +138,7 @@ class Aid(Channel[AidResidual]):
         return {"axes": out}
 
     def _values(self, part: Stream) -> np.ndarray:
-        """(n, k) of a stream, NaN for what was not measured."""
+        """Return the values of a stream, (n, k), NaN where not measured."""
         values, std = part.values, getattr(part, "std", 0.0)
         return np.where(np.isfinite(values) & np.isfinite(std), values, np.nan)
 

@@ -1,4 +1,4 @@
-"""What a channel is, and what it makes of a flight."""
+"""Channel, a kind of measurement, and its residual in a flight."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ Figures = dict[
 
 @dataclass(frozen=True)
 class Comparison:
-    """A flight beside its reference.
+    """A flight and its reference.
 
-    flight : Flight, its streams corrected by `effects`; view : ReferenceView; span : (first, last)
-        s of what counts.
+    flight : Flight with streams corrected by `effects`; view : ReferenceView
+    span : (first, last) s, the part that counts
     """
 
     flight: Flight
@@ -50,8 +50,9 @@ class Comparison:
         effects: EffectSet,
         span: tuple[float, float] | None = None,
     ) -> Comparison:
-        """Comparison of a prepared Flight with a Reference. span : as another Comparison of it has
-        found.
+        """Return the Comparison of a prepared Flight with a Reference.
+
+        span : of another Comparison of the flight, None to compute it
         """
         view = reference.view(flight, effects)
         corrected = effects.correct_streams(replace(flight, truth=None))
@@ -59,12 +60,12 @@ class Comparison:
 
     @property
     def poses(self) -> Truth:
-        """Truth: where the flight was, or is believed to have been."""
+        """Return the known or estimated poses."""
         return self.view.poses
 
     @property
     def attitude_known(self) -> bool:
-        """Whether the reference knows attitudes, and of more than a few poses."""
+        """Return whether the reference has attitudes of more than a few poses."""
         return bool(
             self.reference.attitude_known
             and np.isfinite(self.poses.q).all(axis=1).sum() > FEWEST_ATTITUDES
@@ -72,20 +73,22 @@ class Comparison:
 
     @cached_property
     def track(self) -> Track:
-        """The poses, to be asked at any stamp."""
+        """Return the interpolated poses."""
         return Track(self.poses)
 
     @property
     def start(self) -> float:
-        """Stamp, s, from which slow changes count."""
+        """Return the stamp, s, of the origin of drifts."""
         return self.flight.start
 
 
 @dataclass(frozen=True)
 class Rows:
-    """m rows of a linear fit: y (m,); axis (m,) int, 0 to 2, of the sensor; series (m,) int, what
-    is one series in time; t (m,) s since the start; count (m,) samples averaged; place (m, 3) m,
-    world.
+    """The m rows of a linear fit.
+
+    y : (m,) residual; axis : (m,) int, 0 to 2, of the sensor
+    series : (m,) int, number of the time series of a row; t : (m,) s since the start
+    count : (m,) averaged samples; place : (m, 3) m, world
     """
 
     y: np.ndarray
@@ -97,46 +100,43 @@ class Rows:
 
 
 class ChannelResidual:
-    """The residual of a channel in one flight: measured minus what the model says at the poses of
-    the reference.
+    """The residual of a channel in one flight: measured minus predicted at the reference.
 
-    Subclasses hold `samples`, what effects take (Samples, ImuSamples), and `residual`, one per
-    sample.
+    samples : Samples, ImuSamples or AidSamples, the input of effects
+    residual : one per sample
     """
 
     samples: Samples | ImuSamples | AidSamples
     residual: np.ndarray
 
     def of_floor(self) -> ChannelResidual | None:
-        """The ChannelResidual of what is near the floor, which is not among its rows; None if there
-        is no telling of it.
-        """
+        """Return the ChannelResidual near the floor, which its rows leave out, or None."""
         return None
 
     def rows(self) -> Rows:
-        """Rows for a fit."""
+        """Return the Rows of a fit."""
         raise NotImplementedError
 
     def columns(self, effect: Effect, keys: Sequence[str]) -> Matrix:
-        """Regressors of an Effect for the parameters `keys`, averaged as the rows are: (m,
-        len(keys)), sparse where few are not zero.
+        """Return regressors of the parameters `keys`, averaged as rows are, (m, len(keys)).
+
+        They are sparse if few are not zero.
         """
         raise NotImplementedError
 
     def covariate(self, name: str) -> np.ndarray | None:
-        """Values (n,) of a covariate, of OF_TDOA, OF_ARRIVAL or OF_IMU, or "extra.STREAM.COLUMN",
-        at what is looked at; None where it is not known.
+        """Return values (n,) of a covariate of the fitted measurements; None if unknown.
+
+        name : of OF_TDOA, OF_ARRIVAL or OF_IMU, or "extra.STREAM.COLUMN"
         """
         raise NotImplementedError
 
     def place_in_room(self, series: int) -> str:
-        """What a series number of Rows is of in the room, such as a pair of anchors; "" if it is of
-        the vehicle.
-        """
+        """Return the pair or anchor of a series number of Rows; "" for the vehicle."""
         return ""
 
     def series(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        """{label with unit: (t (k,) s, residual (k,))}, to be plotted and judged."""
+        """Return {label with unit: (t (k,) s, residual (k,))} for plots and figures."""
         raise NotImplementedError
 
 
@@ -145,35 +145,29 @@ Own = TypeVar("Own", bound=ChannelResidual)
 
 
 class Channel(Generic[Own]):
-    """A kind of measurement. One channel, one file: subclass it and list it in CHANNELS."""
+    """A kind of measurement; CHANNELS lists all channels."""
 
     name: str
     unit: str
-    negligible: float  # root mean square, in `unit`, of a contribution that is not worth a term
-    needs: str  # what a recording must hold for it, in words
-    stream: str = ""  # attribute of a Flight that it is of; "" for its name
+    negligible: float  # root mean square, in `unit`, of a contribution that deserves no term
+    needs: str  # streams and truth that it needs, in words
+    stream: str = ""  # field of a Flight; "" for its name
     maps: ClassVar[
         tuple[str, ...]
     ] = ()  # covariates whose functions, each too weak alone, are tried together
 
     def residual(self, comparison: Comparison) -> Own | None:
-        """ChannelResidual of a Comparison; None if the flight or its reference does not show this
-        channel.
-        """
+        """Return the ChannelResidual of a Comparison; None if the flight or reference lacks it."""
         raise NotImplementedError
 
     def smooth_terms(self, residuals: Sequence[Own]) -> list[SmoothTerm]:
-        """SmoothTerms without values: whatever the ChannelResiduals of some flights may depend on."""
+        """Return SmoothTerms without values, the functions that `diagnose` tries."""
         return []
 
     def views(self, residuals: Sequence[Own]) -> list[CovariateView]:
-        """[CovariateView] of the rows of the ChannelResiduals of some flights: what a part of them
-        may depend on.
-        """
+        """Return CovariateViews of the rows of some flights, for the scan."""
         return []
 
     def health(self, residuals: Sequence[Own]) -> Figures:
-        """{"pairs", "anchors", "axes" or "cross_correlation": [dict of figures]} of the
-        ChannelResiduals of some flights.
-        """
+        """Return figures of some flights: {"pairs", "anchors", "axes" or "cross_correlation": rows}."""
         return {}

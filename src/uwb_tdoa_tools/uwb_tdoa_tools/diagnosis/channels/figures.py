@@ -1,30 +1,51 @@
-"""Figures of a series of residuals."""
+"""Figures of health: bias, spread, tails and correlations of residuals, and of pairs of anchors."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
+from scipy.sparse import csr_array
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
-APART = 1e4  # s between the stamps of two flights: nothing of one is near the other
+    from uwb_tdoa_bias.effects import Samples
+
+    from .base import Figures
+
+APART = 1e4  # s between the stamps of two flights, which must not correlate
 LAG_TIMES = (0.1, 0.5, 1.0, 2.0)  # s
 TAIL = 4.0  # spreads
-FEWEST = 20  # pairs of samples that a correlation is computed of
+FEWEST = 20  # pairs of samples of a correlation
+STRONGEST = 10  # correlations between pairs of anchors
+
+
+class RadioLike(Protocol):
+    """Residuals of TDOAs, as of TdoaResidual."""
+
+    @property
+    def samples(self) -> Samples: ...
+
+    @property
+    def residual(self) -> np.ndarray: ...
+
+    @property
+    def airborne(self) -> np.ndarray: ...
 
 
 def rows_by_value(values: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-    """(value, rows that have it, rising) of every whole number in values (n,), in their order."""
+    """Return (value, its rows, rising) for every whole number in values (n,), in their order."""
     order = np.argsort(values, kind="stable")
     names, first = np.unique(values[order], return_index=True)
     return zip(names.tolist(), np.split(order, first[1:]))
 
 
 def figures(t: np.ndarray | None, r: np.ndarray) -> dict[str, Any]:
-    """Bias (median), spread (1.48 MAD), tails (share beyond 4 spreads), count, and with rising
-    stamps t (n,), s, autocorrelation at 0.1 to 2 s, of residuals r (n,): dict.
+    """Return count, bias, spread, tails and autocorrelation of residuals r (n,).
+
+    The bias is the median, the spread 1.48 MAD, tails the share beyond 4 spreads. The
+    autocorrelation at 0.1 to 2 s needs rising stamps t (n,), s.
     """
     bias = float(np.median(r))
     spread = float(1.4826 * np.median(np.abs(r - bias)))
@@ -40,8 +61,9 @@ def figures(t: np.ndarray | None, r: np.ndarray) -> dict[str, Any]:
 
 
 def autocorrelation(t: np.ndarray, r: np.ndarray, lag: float) -> float | None:
-    """Correlation of a series r at rising stamps t with itself `lag` seconds later; None without
-    such pairs.
+    """Return the correlation of r (n,) with itself `lag` seconds later, None without such pairs.
+
+    t : (n,) s, rising
     """
     r = np.clip(
         r - np.median(r),
@@ -54,3 +76,60 @@ def autocorrelation(t: np.ndarray, r: np.ndarray, lag: float) -> float | None:
     if near.sum() < FEWEST or np.mean(r**2) == 0.0:
         return None
     return float(np.mean(r[first[near]] * r[second[near]]) / np.mean(r**2))
+
+
+def health_of_pairs(parts: Sequence[RadioLike]) -> Figures:
+    """Return {"pairs", "anchors", "cross_correlation"} of TDOA residuals of flights in the air."""
+    ids = parts[0].samples.anchors.ids
+    t, r, a, b = (np.concatenate(column) for column in zip(*map(_columns, enumerate(parts))))
+    pairs, each = [], []
+    label = a * len(ids) + b
+    for number, mine in rows_by_value(label):
+        pairs.append({"pair": _name(number, ids), **figures(t[mine], r[mine])})
+    for row, anchor in enumerate(ids.tolist()):
+        late = np.concatenate([r[b == row], -r[a == row]])
+        if len(late):
+            each.append({"anchor": anchor, **figures(None, late)})
+    return {"pairs": pairs, "anchors": each, "cross_correlation": _crossed(t, r, label, ids)}
+
+
+def _name(label: int, ids: np.ndarray) -> str:
+    """Return a pair, as "1-2", by its number among anchors with these ids."""
+    return "-".join(str(ids[row]) for row in divmod(label, len(ids)))
+
+
+def _columns(
+    numbered: tuple[int, RadioLike],
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    number, part = numbered
+    rows, samples = part.airborne, part.samples
+    return samples.t[rows] + APART * number, part.residual[rows], samples.a[rows], samples.b[rows]
+
+
+def _crossed(
+    t: np.ndarray, r: np.ndarray, label: np.ndarray, anchors: np.ndarray
+) -> list[dict[str, Any]]:
+    """Return [{"pairs", "correlation"}], the strongest of half-second means of two pairs."""
+    cell = np.unique((t * 2.0).astype(int), return_inverse=True)[1]
+    together = np.unique(np.stack([label, cell]), axis=1)[0]  # pair of each pair and cell
+    often, times = np.unique(together, return_counts=True)
+    rows = np.isin(label, often[times > FEWEST])
+    r, cell = r[rows], cell[rows]
+    if not len(r):
+        return []
+    labels, place = np.unique(label[rows], return_inverse=True)
+    shape = (cell.max() + 1, len(labels))
+    at = cell * len(labels) + place
+    count = np.bincount(at, minlength=shape[0] * shape[1]).reshape(shape)
+    mean = np.bincount(at, r, shape[0] * shape[1]).reshape(shape) / np.maximum(count, 1)
+    heard = csr_array(count > 0, dtype=float)
+    together = (heard.T @ heard).tocoo()  # half seconds with both pairs
+    often = np.flatnonzero((together.data > FEWEST) & (together.row > together.col))
+    out: list[dict[str, Any]] = []
+    for i, k in sorted(zip(together.row[often].tolist(), together.col[often].tolist())):
+        both = (count[:, i] > 0) & (count[:, k] > 0)
+        if mean[both, i].std() > 0.0 and mean[both, k].std() > 0.0:
+            rho = float(np.corrcoef(mean[both, i], mean[both, k])[0, 1])
+            names = [_name(x, anchors) for x in (labels[k], labels[i])]
+            out.append({"pairs": names, "correlation": round(rho, 3)})
+    return sorted(out, key=lambda item: -abs(item["correlation"]))[:STRONGEST]

@@ -1,4 +1,4 @@
-"""What gyroscope and accelerometer share: residuals of means over cells, axis by axis."""
+"""Channels of gyroscope and accelerometer: residuals of means over cells, axis by axis."""
 
 from __future__ import annotations
 
@@ -10,36 +10,38 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.effects import ImuSamples, SmoothTerm
 from uwb_tdoa_bias.effects.covariates import OF_IMU, ImuFeatures, sensor_covariate
+from uwb_tdoa_ekf.core.state import GRAVITY
 
 from .base import Channel, ChannelResidual, Rows
-from .extra import extra_at, extra_names
 from .figures import APART, figures
-from .knots import knots_of
-from .views import views_of_axes
+from .views import extra_at, extra_names, knots_of, views_of_axes
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from uwb_tdoa_bias.effects import Effect
-    from uwb_tdoa_bias.foundation.flight import Imu
+    from uwb_tdoa_bias.foundation.flight import Imu, Truth
 
     from .base import Comparison, Figures
     from .views import CovariateView
 
-CELL = 0.25  # s over which both sides of a residual are averaged
-OF_POSE = (
-    "x",
-    "y",
-    "height",
-    "speed",
-    "climb_rate",
-    "acceleration",
-)  # covariates that TDOAs have too
+CELL = 0.25  # s, over which both sides of a residual are averaged
+# s, half the step of time derivatives of measured rates: true rates are noisy, and noise in
+# a regressor shrinks the estimate
+SHIFT = 0.05
+STILL_FORCE, STILL_RATE = 0.3, 0.1  # m/s^2 of vibration and rad/s, of a vehicle at rest
+STILL_CHANGE = 0.02  # rad/s, the same for the change of the rate since the start
+BEGINNING = 2  # cells before a motion that do not count as rest
+RATES = [column for column, name in enumerate(OF_IMU) if name.startswith("rate_")]
+TURNING = [OF_IMU.index("turning_rate"), *RATES]
+TRUE_SHARE = 0.5  # of the variance of a measured rate; with a smaller true share it does not turn
+FEWEST_CELLS = 4
+OF_POSE = ("x", "y", "height", "speed", "climb_rate", "acceleration")  # covariates of TDOAs too
 
 
 @dataclass(frozen=True)
 class ImuResidual(ChannelResidual):
-    """samples : ImuSamples, cells; residual (n, 3), body axes; unit of the channel."""
+    """Residual (n, 3), body, of ImuSamples of cells, in the unit of the channel."""
 
     samples: ImuSamples
     residual: np.ndarray
@@ -67,14 +69,14 @@ class ImuResidual(ChannelResidual):
 
 
 class Inertial(Channel[ImuResidual]):
-    """A channel of an inertial sensor."""
+    """The channel of an inertial sensor."""
 
     axes: ClassVar[str] = "xyz"
 
     def smooth_terms(self, residuals: Sequence[ImuResidual]) -> list[SmoothTerm]:
         out = []
         for name in self._covariates(residuals):
-            if knots := knots_of(name, residuals):
+            if knots := knots_of(name, [part.covariate(name) for part in residuals]):
                 out += [
                     SmoothTerm(channel=f"{self.name}.{axis}", covariate=name, knots=knots)
                     for axis in self.axes
@@ -112,9 +114,9 @@ class Inertial(Channel[ImuResidual]):
         t: np.ndarray,
         reading: np.ndarray,
         features: np.ndarray,
-        change: np.ndarray | None = None,
+        time_derivative: np.ndarray | None = None,
     ) -> ImuSamples:
-        """ImuSamples of this channel at the middles t (n,) of cells."""
+        """Return ImuSamples of this channel at the middles t (n,), s, of cells."""
         track = comparison.track
         q = track.attitudes(t)
         up = np.full((len(t), 3), [0.0, 0.0, 1.0])
@@ -124,25 +126,160 @@ class Inertial(Channel[ImuResidual]):
         place, motion = track.positions(t), track.motion(t)
         extra = extra_at(comparison.flight, t)
         return ImuSamples(
-            self.name, t, place, comparison.start, reading, change, up, features, motion, extra
+            self.name,
+            t,
+            place,
+            comparison.start,
+            reading,
+            time_derivative,
+            up,
+            features,
+            motion,
+            extra,
         )
 
 
+class Gyro(Inertial):
+    """Mean turning rates of cells minus the true rates.
+
+    Without a known attitude only cells before take-off count: a vehicle at rest does not turn.
+    """
+
+    name = "gyro"
+    unit = "rad/s"
+    needs = "a gyroscope, and ground truth of the attitude or some seconds at rest before take-off"
+    stream = "imu"
+    negligible = 5e-4
+
+    def residual(self, comparison: Comparison) -> ImuResidual | None:
+        imu, poses = comparison.flight.imu, comparison.poses
+        if imu is None:
+            return None
+        if not comparison.reference.attitude_known:
+            return self._at_rest(comparison, imu)
+        if not comparison.attitude_known:
+            return None
+        edges = cells_in_the_air(comparison, imu, SHIFT)
+        measured, true = means(imu.t, imu.gyro, edges), _true_rates(poses, edges)
+        before, after = (means(imu.t, imu.gyro, edges + shift) for shift in (-SHIFT, SHIFT))
+        middles = 0.5 * (edges[:-1] + edges[1:])
+        features, derivative = means(imu.t, features_of(imu), edges), (after - before) / (2 * SHIFT)
+        # About an axis without turns the measured rate is the residual: a function of itself.
+        still = ~_turns(measured, true)
+        reading = np.where(still, 0.0, measured)
+        features[:, RATES], derivative[:, still] = np.where(still, 0.0, features[:, RATES]), 0.0
+        if not _turns(
+            *(np.linalg.norm(rates, axis=1, keepdims=True) for rates in (measured, true))
+        )[0]:
+            features[:, OF_IMU.index("turning_rate")] = 0.0
+        samples = self._samples(comparison, middles, reading, features, derivative)
+        return ImuResidual(
+            samples, measured - true - comparison.effects.uncorrected(samples), self.unit
+        )
+
+    def _at_rest(self, comparison: Comparison, imu: Imu) -> ImuResidual | None:
+        edges = np.arange(imu.t[0], imu.t[-1], CELL)
+        features, measured = means(imu.t, features_of(imu), edges), means(imu.t, imu.gyro, edges)
+        moving = features[:, OF_IMU.index("vibration")] > STILL_FORCE
+        moving |= np.abs(measured).max(axis=1) > STILL_RATE
+        moving |= (
+            np.abs(measured - np.median(measured[:FEWEST_CELLS], axis=0)).max(axis=1) > STILL_CHANGE
+        )
+        still = np.flatnonzero(np.cumsum(moving) == 0)[:-BEGINNING]
+        if len(still) < FEWEST_CELLS:
+            return None
+        middles = 0.5 * (edges[:-1] + edges[1:])[still]
+        measured, features = measured[still], features[still]
+        features[:, TURNING] = 0.0  # the measured rate is the residual
+        nothing = np.zeros_like(measured)
+        samples = self._samples(comparison, middles, nothing, features, nothing)
+        return ImuResidual(samples, measured - comparison.effects.uncorrected(samples), self.unit)
+
+
+def _turns(measured: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """Return whether measured rates (n, k) follow true ones (n, k), (k,) bool."""
+    one, other = measured - measured.mean(axis=0), true - true.mean(axis=0)
+    turns: np.ndarray = np.sum(one * other, axis=0) > TRUE_SHARE * np.sum(one**2, axis=0)
+    return turns
+
+
+def _true_rates(truth: Truth, edges: np.ndarray) -> np.ndarray:
+    """Return mean turning rates between edges, (n, 3) rad/s, body, from pose to pose."""
+    known = np.isfinite(truth.q).all(axis=1)
+    t, first = np.unique(truth.t[known], return_index=True)
+    turns = Rotation.from_quat(truth.q[known][first])
+    steps = (turns[:-1].inv() * turns[1:]).as_rotvec()
+    total = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    at = np.stack([np.interp(edges, t, column) for column in total.T], axis=1)
+    return np.diff(at, axis=0) / np.diff(edges)[:, None]
+
+
+class Accel(Inertial):
+    """Specific force, averaged with a triangular window, minus the true specific force.
+
+    The second difference of true positions is the same average of the true acceleration.
+    """
+
+    name = "accel"
+    unit = "m/s^2"
+    needs = "an accelerometer, and ground truth of position and attitude"
+    stream = "imu"
+    negligible = 0.01
+
+    def residual(self, comparison: Comparison) -> ImuResidual | None:
+        imu = comparison.flight.imu
+        if imu is None or not (
+            comparison.attitude_known and all(comparison.reference.positions_known)
+        ):
+            return None
+        track, edges = comparison.track, cells_in_the_air(comparison, imu, SHIFT)
+        middles = edges[1:-1]
+        to_body = Rotation.from_quat(track.attitudes(middles)).inv()
+        positions = track.positions(edges)
+        acceleration = (positions[2:] - 2.0 * positions[1:-1] + positions[:-2]) / CELL**2
+        true = to_body.apply(acceleration + [0.0, 0.0, GRAVITY])
+        flown = (imu.t >= edges[0]) & (imu.t <= edges[-1])
+        world = Rotation.from_quat(track.attitudes(imu.t[flown])).apply(imu.accel[flown])
+        measured = to_body.apply(_triangular_means(imu.t[flown], world, edges))
+        features = means(imu.t, features_of(imu), edges)
+        samples = self._samples(comparison, middles, true, 0.5 * (features[1:] + features[:-1]))
+        measured = measured - comparison.effects.uncorrected(samples)
+        return ImuResidual(samples, measured - true, self.unit)
+
+
+def _triangular_means(t: np.ndarray, values: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    """Return means of values (n, 3) with a triangular window about every inner edge.
+
+    The mean of a second derivative with this window is a second difference.
+    """
+    place = np.searchsorted(edges, t, side="right") - 1
+    out, total = np.zeros((len(edges), 3)), np.zeros(len(edges))
+    inside = (place >= 0) & (place < len(edges) - 1)
+    part = np.where(inside, (t - edges[np.clip(place, 0, len(edges) - 1)]) / CELL, 0.0)
+    for shift, weight in ((0, 1.0 - part), (1, part)):
+        rows = place[inside] + shift
+        total += np.bincount(rows, weight[inside], len(edges))
+        for k in range(3):
+            out[:, k] += np.bincount(rows, weight[inside] * values[inside, k], len(edges))
+    return out[1:-1] / np.maximum(total[1:-1, None], 1e-9)
+
+
 def features_of(imu: Imu) -> np.ndarray:
-    """Covariates OF_IMU along the stream: (n, len(OF_IMU))."""
+    """Return the covariates OF_IMU along the stream, (n, len(OF_IMU))."""
     return ImuFeatures()(imu.t, imu.gyro, imu.accel)
 
 
 def vibration_at(imu: Imu | None, t: np.ndarray) -> np.ndarray | None:
-    """(n,) m/s^2 at stamps t (n,) s; None without an IMU."""
-    return (
-        None if imu is None else np.interp(t, imu.t, features_of(imu)[:, OF_IMU.index("vibration")])
-    )
+    """Return the vibration, (n,) m/s^2, at stamps t (n,), s; None without an IMU."""
+    if imu is None:
+        return None
+    return np.interp(t, imu.t, features_of(imu)[:, OF_IMU.index("vibration")])
 
 
 def cells_in_the_air(comparison: Comparison, imu: Imu, shift: float) -> np.ndarray:
-    """Edges of the cells, s, of what counts and is covered by Imu and reference, `shift` s more at
-    both ends.
+    """Return the edges of cells, s, within the span, the Imu and the reference.
+
+    shift : s, that must be covered beyond both ends
     """
     poses, (first, last) = comparison.poses, comparison.span
     low = max(first, imu.t[0], poses.t[0]) + CELL + shift
@@ -151,9 +288,7 @@ def cells_in_the_air(comparison: Comparison, imu: Imu, shift: float) -> np.ndarr
 
 
 def means(t: np.ndarray, values: np.ndarray, edges: np.ndarray) -> np.ndarray:
-    """Means of (n, k) values over the intervals between edges: the integral of the linear
-    interpolation.
-    """
+    """Return means of interpolated values (n, k) over the intervals between edges."""
     dt = np.diff(t)[:, None]
     total = np.concatenate(
         [np.zeros((1, values.shape[1])), np.cumsum(0.5 * (values[1:] + values[:-1]) * dt, axis=0)]

@@ -1,8 +1,8 @@
-"""What TDOAs and distances to anchors share: residuals, and the cells that they are averaged over.
+"""Channels of TDOAs and of distances to anchors: residuals, averaged over cells.
 
-Neighbouring TDOAs are alike, so that hundreds a second are not hundreds of facts. They are
-averaged, pair by pair, over cells of half a second, near the floor of half the height at most,
-without the outliers of the cell; what likeness is left between cells is counted in the fit.
+Successive TDOAs of a pair have correlated errors. They are averaged, pair by pair, over cells of half a second
+without outliers. Near the floor a cell has similar heights. The fit counts the correlation that
+remains between cells.
 """
 
 from __future__ import annotations
@@ -14,38 +14,38 @@ from typing import TYPE_CHECKING, ClassVar, TypeVar
 import numpy as np
 from scipy.sparse import csc_array, csr_array
 
-from uwb_tdoa_bias.effects import Samples, SmoothTerm, samples_at
-from uwb_tdoa_bias.effects.covariates import EXTRA, OF_ARRIVAL, OF_TDOA
+from uwb_tdoa_bias.effects import RADIO, Samples, SmoothTerm, samples_at
+from uwb_tdoa_bias.effects.covariates import CATEGORIES, EXTRA, OF_ARRIVAL, OF_MOTION, OF_TDOA
 from uwb_tdoa_bias.effects.smooth_term import OF_LINKS
+from uwb_tdoa_bias.foundation.sensors import SENSORS
 from uwb_tdoa_ekf.sensitivity import Innovations
 
 from ...checking.known_path import MANY
 from ...scoring.phases import in_the_air
 from ..regression.algebra import Matrix
-from .base import ChannelResidual, Rows
-from .extra import extra_at
+from .base import Channel, ChannelResidual, Rows
+from .figures import APART, figures, health_of_pairs
 from .inertial import vibration_at
-from .views import OF_EACH
+from .views import OF_EACH, extra_at, extra_names, knots_of, views_of_anchors, views_of_pairs
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from uwb_tdoa_bias.effects import Effect
 
-    from .base import Comparison
+    from .base import Comparison, Figures
+    from .views import CovariateView
 
 CELL = 0.5  # s
-LOWEST, LEVEL = (
-    0.02,
-    0.5,
-    # m, and by how much the logarithm of a height may differ within a cell near the floor, where
-    # heights matter
-)
+LOWEST, LEVEL = 0.02, 0.5  # m, and span of the logarithm of the height of a cell near the floor
 OUTLIER = 4.0  # spreads within a cell
-# Effects, each of whose parameters acts on TDOAs of one or two anchors
+# Effects with parameters that act on TDOAs of one or two anchors only
 OF_ANCHORS = "anchor_delay", "anchor_position", "anchor_clock_drift", "pair_offset", "nlos"
 WILD = 20.0  # m; a larger residual is no measurement
 FEWEST_ON_FLOOR = 50  # TDOAs
+QUICK = ("interval", *CATEGORIES)  # covariates that change from one TDOA to the next
+# Covariates of ranges: a node corrects them without a history of the motion
+OF_RANGE = tuple(name for name in OF_TDOA if name not in OF_MOTION)
 
 
 Radio = TypeVar("Radio", bound="RadioResidual")
@@ -53,14 +53,17 @@ Radio = TypeVar("Radio", bound="RadioResidual")
 
 @dataclass(frozen=True)
 class RadioResidual(ChannelResidual):
-    """samples : Samples, of the whole recording; residual (n,) m; airborne (n,) bool, False for
-    those near the floor before and after; fitted (n,) bool, those that are looked at: in the air,
-    but for `of_floor`; floor_known : whether the reference knows the path near the floor too;
-    innovations : Innovations where the path is only an estimate: these are the residual, and what
-    the path follows is taken out of regressors.
+    """Residual of measurements between the tag and anchors.
+
+    samples : Samples of the whole recording; residual : (n,) m
+    airborne : (n,) bool, False near the floor before and after the flight
+    fitted : (n,) bool, measurements that a fit uses: those in the air, or of `of_floor`
+    floor_known : whether the reference is valid near the floor too
+    innovations : Innovations if the path is an estimate: they are the residual, and the part of an
+        effect that the path follows is removed from regressors
     """
 
-    label: ClassVar[str]  # of what is plotted, with unit
+    label: ClassVar[str]  # of plots, with unit
 
     samples: Samples
     residual: np.ndarray
@@ -70,19 +73,15 @@ class RadioResidual(ChannelResidual):
     innovations: Innovations | None = None
 
     def of_floor(self: Radio) -> Radio | None:
-        """The residual that looks at those near the floor alone; None if there is no telling of
-        them, or they are few.
-        """
+        """Return the residual near the floor; None if the path is unknown there, or TDOAs are few."""
         near = ~self.airborne & (np.abs(self.residual) < WILD)
-        return (
-            replace(self, fitted=near)
-            if self.floor_known and near.sum() >= FEWEST_ON_FLOOR
-            else None
-        )
+        if not self.floor_known or near.sum() < FEWEST_ON_FLOOR:
+            return None
+        return replace(self, fitted=near)
 
     @cached_property
     def cells(self) -> Cells:
-        """How the TDOAs that are looked at are averaged."""
+        """Return the cells of the fitted measurements."""
         return Cells(self)
 
     def rows(self) -> Rows:
@@ -99,13 +98,10 @@ class RadioResidual(ChannelResidual):
 
     def columns(self, effect: Effect, keys: Sequence[str]) -> Matrix:
         samples, rows = self.samples, None
-        if (
-            are_many([self]) and self.innovations is None and _of_single_anchors(effect)
-        ):  # nothing else has to do with these anchors
-            named = np.isin(
-                samples.anchors.ids,
-                [int(i) for key in keys for i in key.partition(".")[0].split("-")],
-            )
+        if are_many([self]) and self.innovations is None and _of_single_anchors(effect):
+            # Other measurements do not depend on these parameters.
+            ids = [int(i) for key in keys for i in key.partition(".")[0].split("-")]
+            named = np.isin(samples.anchors.ids, ids)
             rows = np.flatnonzero(named[samples.a] | named[samples.b])
             samples = of_rows(samples, rows)
         values = np.nan_to_num(effect.regressors(samples, list(keys)))
@@ -123,12 +119,12 @@ class RadioResidual(ChannelResidual):
         return {self.label: (self.samples.t[self.airborne], self.residual[self.airborne])}
 
     def arrivals(self, series: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Anchor rows (a, b) of series numbers (m,) in Rows."""
+        """Return the rows of anchors (a, b) for series numbers (m,) of Rows."""
         return np.divmod(series, len(self.samples.anchors))
 
 
 class Cells:
-    """The cells of one flight, and the averages over them."""
+    """The cells of one flight, and averages over them."""
 
     def __init__(self, part: RadioResidual) -> None:
         samples, chosen = part.samples, np.flatnonzero(part.fitted)
@@ -158,8 +154,9 @@ class Cells:
         self.pair = samples.a[self.chosen][start] * n + samples.b[self.chosen][start]
 
     def means(self, values: np.ndarray, rows: np.ndarray | None = None) -> Matrix:
-        """The same of several (n, k): (m, k). rows (r,) : the TDOAs that values (r, k) are of, the
-        others being zero; then it is sparse.
+        """Return means of values (n, k) over the cells, (m, k).
+
+        rows : (r,) of the TDOAs that values (r, k) belong to; other values are zero, and the result is sparse
         """
         if rows is None:
             return np.stack([self.mean(column) for column in values.T], axis=1)
@@ -174,14 +171,12 @@ class Cells:
         return (members @ csc_array(values)).tocsc()
 
     def mean(self, values: np.ndarray) -> np.ndarray:
-        """Means of values of all TDOAs (n,) over the cells: (m,)."""
+        """Return means of values of all TDOAs (n,) over the cells, (m,)."""
         return np.bincount(self.group, values[self.chosen]) / self.size
 
 
 def compared(comparison: Comparison, kind: type[Samples], made: type[Radio]) -> Radio | None:
-    """What measurements of a kind in the flight of a Comparison leave of the geometry; None without
-    any in the air.
-    """
+    """Return the residual of measurements of a kind in a Comparison; None without any in the air."""
     flight, anchors, poses = comparison.flight, comparison.flight.anchors, comparison.poses
     innovations = comparison.view.innovations
     if innovations is not None and kind.channel not in innovations.streams:
@@ -204,17 +199,16 @@ def compared(comparison: Comparison, kind: type[Samples], made: type[Radio]) -> 
         previous = np.concatenate([[-1], anchors.ids[b[:-1]]])
         samples = replace(samples, interval=np.diff(t, prepend=t[:1]), previous=previous)
     if innovations is None:
-        residual = raw.d[usable] - samples.true() - comparison.effects.bias(samples)
+        residual = raw.d[usable] - samples.predicted() - comparison.effects.bias(samples)
     else:
         residual = innovations.value[places]
-    floor_known = (
-        comparison.reference.knows_floor and in_the_air(poses) is not None
-    )  # what never leaves it has no time there apart
+    # A vehicle that never takes off has no separate time on the floor.
+    floor_known = comparison.reference.knows_floor and in_the_air(poses) is not None
     return made(samples, residual, airborne, airborne, floor_known, innovations)
 
 
 def of_rows(samples: Samples, rows: np.ndarray) -> Samples:
-    """Some of the Samples, with what effects of single anchors ask for."""
+    """Return some of the Samples, with the fields that effects of single anchors use."""
     t, a, b, p, q = (
         values[rows] for values in (samples.t, samples.a, samples.b, samples.p, samples.q)
     )
@@ -222,32 +216,180 @@ def of_rows(samples: Samples, rows: np.ndarray) -> Samples:
 
 
 def _of_single_anchors(effect: Effect) -> bool:
-    """Whether each parameter of an Effect acts on TDOAs of the anchors that its name begins with
-    alone, whatever the others are.
-    """
+    """Return whether each parameter acts only on TDOAs of the anchors in its name."""
     if isinstance(effect, SmoothTerm):
         return effect.form in ("anchor", *OF_LINKS) and effect.covariate in OF_EACH
     return effect.name in OF_ANCHORS
 
 
 def are_many(residuals: Sequence[RadioResidual]) -> bool:
-    """Whether functions of each anchor of some residuals are too many to be looked for: what a few
-    parameters tell is found, and those of all anchors alike.
-    """
+    """Return whether there are too many anchors to search functions of each anchor."""
     return any(len(part.samples.anchors) > MANY for part in residuals)
 
 
 def covariate_at(name: str, samples: Samples) -> np.ndarray | None:
-    """One of OF_TDOA, or "extra.STREAM.COLUMN": (n,); None where the samples do not hold it."""
-    return (
-        OF_TDOA[name](samples)
-        if name in OF_TDOA
-        else (samples.extra or {}).get(name.removeprefix(EXTRA))
-    )
+    """Return a covariate of OF_TDOA, or "extra.STREAM.COLUMN", (n,); None if samples lack it."""
+    if name in OF_TDOA:
+        return OF_TDOA[name](samples)
+    return (samples.extra or {}).get(name.removeprefix(EXTRA))
 
 
 def of_arrivals(
     function: Callable[[Samples, np.ndarray], np.ndarray], samples: Samples
 ) -> np.ndarray:
-    """(ends, n): of the first and, where there are two, of the second anchor."""
+    """Return a covariate of the first and, for TDOAs, of the second anchor, (ends, n)."""
     return function(samples, samples.rows).reshape(samples.ends, -1)
+
+
+class TdoaResidual(RadioResidual):
+    """Residuals of TDOAs."""
+
+    label = "TDOA [m]"
+
+    def place_in_room(self, series: int) -> str:
+        return "-".join(
+            str(self.samples.anchors.ids[row]) for row in divmod(series, len(self.samples.anchors))
+        )
+
+
+class Tdoa(Channel[TdoaResidual]):
+    """Differences of the distances to two anchors."""
+
+    name = "tdoa"
+    unit = "m"
+    needs = "TDOAs"
+    negligible = 0.004
+    maps = ("x", "y", "height", "range")
+
+    def residual(self, comparison: Comparison) -> TdoaResidual | None:
+        return compared(comparison, Samples, TdoaResidual)
+
+    def smooth_terms(self, residuals: Sequence[TdoaResidual]) -> list[SmoothTerm]:
+        out, many = [], are_many(residuals)
+        for name in (*OF_TDOA, *extra_names([part.samples for part in residuals])):
+            if knots := knots_of(name, [part.covariate(name) for part in residuals]):
+                out.append(SmoothTerm(covariate=name, form="common", knots=knots))
+                if name not in CATEGORIES and not name.startswith(EXTRA) and not many:
+                    out.append(SmoothTerm(covariate=name, form="anchor", knots=knots))
+        for name in OF_ARRIVAL:
+            if knots := knots_of(name, [part.covariate(name) for part in residuals]):
+                out += [
+                    SmoothTerm(covariate=name, form=form, knots=knots)
+                    for form in ("arrival", "anchor")[: 1 if many else 2]
+                ]
+        return out
+
+    def views(self, residuals: Sequence[TdoaResidual]) -> list[CovariateView]:
+        if any(part.innovations is not None for part in residuals):
+            return []  # what the path follows is not left in them
+        cells, many = [part.cells for part in residuals], are_many(residuals)
+        ends = [
+            np.stack([part.samples.anchors.ids[rows] for rows in part.arrivals(part.cells.pair)])
+            for part in residuals
+        ]
+        of_tdoa, of_arrival, quick = {}, {}, {}
+        for name in (*OF_TDOA, *extra_names([part.samples for part in residuals])):
+            if many and name in CATEGORIES:
+                continue
+            known = [
+                v for v in (covariate_at(name, part.samples) for part in residuals) if v is not None
+            ]
+            if len(known) < len(residuals):
+                continue
+            if name in QUICK:
+                quick[name] = np.concatenate([v[cell.chosen] for cell, v in zip(cells, known)])
+            else:
+                of_tdoa[name] = np.concatenate([cell.mean(v) for cell, v in zip(cells, known)])
+        for name, function in OF_ARRIVAL.items():
+            both = [of_arrivals(function, part.samples) for part in residuals]
+            means = [[cell.mean(v) for v in values] for cell, values in zip(cells, both)]
+            of_arrival[name] = np.concatenate(means, axis=1)
+        a, b = np.concatenate(ends, axis=1)
+        slow = views_of_pairs(a, b, of_tdoa, of_arrival, many=many)
+        first = np.cumsum([0, *(len(cell.size) for cell in cells)])
+        cell = np.concatenate([part.group + start for part, start in zip(cells, first)])
+        return slow + views_of_pairs(a[cell], b[cell], quick, {}, cell, many)
+
+    def health(self, residuals: Sequence[TdoaResidual]) -> Figures:
+        return health_of_pairs(residuals)
+
+
+class RangeResidual(RadioResidual):
+    """Residuals of distances to anchors."""
+
+    label = "range [m]"
+
+    def place_in_room(self, series: int) -> str:
+        return str(self.samples.anchors.ids[self.arrivals(np.array(series))[1]])
+
+    def of_floor(self) -> None:
+        """Return None: late anchors near the floor are searched in TDOAs only."""
+
+
+class Ranging(Channel[RangeResidual]):
+    """The channel of a sensor that measures distances to anchors."""
+
+    unit: str
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        vars(self).update(vars(SENSORS[name].compared))
+
+    def residual(self, comparison: Comparison) -> RangeResidual | None:
+        known = all(comparison.reference.positions_known) or comparison.view.innovations is not None
+        if getattr(comparison.flight, self.name) is None or not known:
+            return None
+        return compared(comparison, RADIO[self.name], RangeResidual)
+
+    def smooth_terms(self, residuals: Sequence[RangeResidual]) -> list[SmoothTerm]:
+        out = []
+        for name in (*OF_RANGE, *extra_names([part.samples for part in residuals]), *OF_ARRIVAL):
+            if knots := knots_of(name, [part.covariate(name) for part in residuals]):
+                forms = ("arrival" if name in OF_ARRIVAL else "common", "anchor")[
+                    : 1 if are_many(residuals) else 2
+                ]
+                out += [
+                    SmoothTerm(channel=self.name, covariate=name, form=form, knots=knots)
+                    for form in forms
+                ]
+        return out
+
+    def views(self, residuals: Sequence[RangeResidual]) -> list[CovariateView]:
+        if any(part.innovations is not None for part in residuals):
+            return []  # what the path follows is not left in them
+        cells = [part.cells for part in residuals]
+        anchor = np.concatenate(
+            [part.samples.anchors.ids[part.arrivals(part.cells.pair)[1]] for part in residuals]
+        )
+        common, of_each = {}, {}
+        for name in (*OF_RANGE, *extra_names([part.samples for part in residuals])):
+            known = [
+                v for v in (covariate_at(name, part.samples) for part in residuals) if v is not None
+            ]
+            if len(known) == len(residuals):
+                common[name] = np.concatenate([cell.mean(v) for cell, v in zip(cells, known)])
+        for name, function in OF_ARRIVAL.items():
+            of_each[name] = np.concatenate(
+                [
+                    cell.mean(of_arrivals(function, part.samples)[0])
+                    for cell, part in zip(cells, residuals)
+                ]
+            )
+        return views_of_anchors(self.name, anchor, common, of_each, are_many(residuals))
+
+    def health(self, residuals: Sequence[RangeResidual]) -> Figures:
+        flown = [part.airborne for part in residuals]
+        t = np.concatenate(
+            [part.samples.t[air] + APART * k for k, (part, air) in enumerate(zip(residuals, flown))]
+        )
+        r = np.concatenate([part.residual[air] for part, air in zip(residuals, flown)])
+        anchor = np.concatenate(
+            [part.samples.anchors.ids[part.samples.b[air]] for part, air in zip(residuals, flown)]
+        )
+        each = np.unique(anchor).tolist()
+        return {
+            "axes": [
+                {"axis": f"{self.name} {i}", **figures(t[anchor == i], r[anchor == i])}
+                for i in each
+            ]
+        }

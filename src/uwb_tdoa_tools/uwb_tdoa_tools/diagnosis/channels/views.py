@@ -1,6 +1,4 @@
-"""What a part of a channel may depend on: one covariate of an anchor, a pair, a direction, an axis,
-or of all.
-"""
+"""Covariates of a channel: views of its rows over one covariate, knots, and further columns of logs."""
 
 from __future__ import annotations
 
@@ -9,23 +7,31 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.effects.covariates import CATEGORIES, EXTRA
+
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-MOST_LINKS = (
-    400  # pairs of anchors, in both directions, whose functions are looked for: those of 20 anchors
-)
-OF_EACH = "time", "range"  # covariates of each of many anchors
+    from uwb_tdoa_bias.effects import ImuSamples, Samples
+    from uwb_tdoa_bias.foundation.flight import Flight
+
+
+MOST_LINKS = 400  # pairs, both directions, whose functions are searched: as of 20 anchors
+OF_EACH = "time", "range"  # covariates of single anchors if there are many anchors
+PIECES = 4  # of a spline
+FEWEST_VALUES = 100  # of a covariate with knots
+MOST_NAMES = 64  # of a covariate of names
+FEWEST_SAMPLES = 10  # of a further stream of a log
 
 
 @dataclass(frozen=True, eq=False)
 class CovariateView:
     """A covariate of a subset of the rows of a channel.
 
-    channel, form, covariate : as of a SmoothTerm; key : "" or an anchor or a pair; sides : ((signs
-        (m,), values (m,)), ...): a
-    function f of the covariate adds the sum of sign * f(value) to a row; rows (m,) : to which.
-    Where there is more than one value to a row, `means`, the sum is their mean.
+    channel, form, covariate : as of a SmoothTerm; key : "", an anchor or a pair
+    sides : ((signs (m,), values (m,)), ...); a function f adds the sum of sign * f(value) to a row
+    rows : (m,) these rows
+    means : whether rows have several values; then a row has the mean of their sums
     """
 
     channel: str
@@ -40,8 +46,9 @@ class CovariateView:
 def views_of_axes(
     channels: Sequence[str], covariates: Mapping[str, np.ndarray], axis: np.ndarray
 ) -> list[CovariateView]:
-    """[CovariateView] of SmoothTerm channels such as "gyro.x", one for each axis; covariates :
-    {name: (m,)}; axis (m,) number.
+    """Return the views of one channel per axis, such as "gyro.x".
+
+    covariates : {name: (m,)}; axis : (m,) number of the axis
     """
     return [
         CovariateView(channel, "common", "", name, ((np.ones(len(rows)), values[rows]),), rows)
@@ -59,8 +66,9 @@ def views_of_anchors(
     of_each: Mapping[str, np.ndarray],
     many: bool = False,
 ) -> list[CovariateView]:
-    """[CovariateView] of distances to anchors of ids `anchor` (n,). common, of_each : {name: (n,)},
-    of the tag, and of the anchor; many : as of `views_of_pairs`.
+    """Return the views of distances to anchors of ids `anchor` (n,).
+
+    common, of_each : {name: (n,)}, of the tag and of the anchor; many : as in `views_of_pairs`
     """
     everywhere, ones, both = np.arange(len(anchor)), np.ones(len(anchor)), {**common, **of_each}
     out = [
@@ -94,9 +102,11 @@ def views_of_pairs(
     cell: np.ndarray | None = None,
     many: bool = False,
 ) -> list[CovariateView]:
-    """[CovariateView] of TDOAs between anchors of ids a, b (n,). of_tdoa : {name: (n,)}; of_arrival
-    : {name: (2, n)}, of a and of b; cell (n,) : row of each, where there are several to a row; many
-    : whether there are so many anchors that single ones are looked at over OF_EACH alone.
+    """Return the views of TDOAs between anchors of ids a, b (n,).
+
+    of_tdoa : {name: (n,)}; of_arrival : {name: (2, n)}, at a and at b
+    cell : (n,) row of each TDOA, if rows have several
+    many : whether there are many anchors: single ones are viewed over OF_EACH only
     """
     out: list[CovariateView] = []
     n = len(a)
@@ -140,14 +150,15 @@ def views_of_pairs(
 
 
 def _members(a: np.ndarray, b: np.ndarray) -> Iterator[tuple[int, np.ndarray]]:
-    """(anchor, rows (m,) that it is in) of every anchor."""
+    """Return (anchor, its rows (m,)) for every anchor."""
     for anchor in np.unique(np.concatenate([a, b])).tolist():
         yield anchor, np.flatnonzero((a == anchor) | (b == anchor))
 
 
 def _links(a: np.ndarray, b: np.ndarray) -> Iterator[tuple[str, int, int, np.ndarray, np.ndarray]]:
-    """(form, a, b, rows, signs (m,)) of every pair, and of its directions where both were heard; of
-    MOST_LINKS that were heard most.
+    """Return (form, a, b, rows, signs (m,)) of every pair, and of its directions if both occur.
+
+    Only the MOST_LINKS most frequent ones count.
     """
     heard, count = np.unique(np.column_stack([a, b]), axis=0, return_counts=True)
     most = np.sort(np.argsort(-count, kind="stable")[:MOST_LINKS])
@@ -159,3 +170,54 @@ def _links(a: np.ndarray, b: np.ndarray) -> Iterator[tuple[str, int, int, np.nda
         if back.any():
             rows = np.flatnonzero(forth)
             yield "direction", first, second, rows, np.ones(len(rows))
+
+
+def knots_of(name: str, parts: Sequence[np.ndarray | None]) -> tuple[float, ...] | None:
+    """Return knots of a spline over a covariate, quantiles of its values.
+
+    For a covariate of names they are the names. None if the covariate hardly varies, or if a part
+    lacks it.
+
+    parts : values (n,) of the covariate in each flight, None if it is unknown there
+    """
+    known = [values for values in parts if values is not None]
+    if len(known) < len(parts):
+        return None
+    values = np.concatenate(known)
+    values = values[np.isfinite(values)]
+    if len(values) < FEWEST_VALUES:
+        return None
+    if name in CATEGORIES:
+        names = np.unique(values[values >= 0])
+        return tuple(names.tolist()) if 2 <= len(names) <= MOST_NAMES else None
+    low, high = np.quantile(values, [0.005, 0.995])
+    if high - low < 1e-3 * max(abs(low), abs(high), 1e-3):
+        return None
+    knots = np.quantile(values, np.linspace(0.005, 0.995, PIECES + 1))
+    if np.min(np.diff(knots)) < 0.02 * (high - low):  # crowded
+        knots = np.linspace(low, high, PIECES + 1)
+    return tuple(float(f"{knot:.6g}") for knot in knots)
+
+
+def extra_at(flight: Flight, t: np.ndarray) -> dict[str, np.ndarray]:
+    """Return {"stream.column": (n,)} of further streams of a Flight at stamps t (n,), s.
+
+    Such columns are temperatures, voltages or powers. Truth that a simulation logs is left out.
+    """
+    out = {}
+    for name, columns in flight.extra.items():
+        stamps = np.asarray(columns.get("t", ()), dtype=float)
+        if name.endswith("_truth") or len(stamps) < FEWEST_SAMPLES:
+            continue
+        for column, values in columns.items():
+            values = np.asarray(values)
+            numeric = column != "t" and values.dtype.kind in "fiu" and values.ndim == 1
+            if numeric and np.ptp(values) > 0:
+                out[f"{name}.{column}"] = np.interp(t, stamps, values.astype(float))
+    return out
+
+
+def extra_names(parts: Sequence[Samples] | Sequence[ImuSamples]) -> list[str]:
+    """Return the covariates "extra.STREAM.COLUMN" that all samples have."""
+    common = set.intersection(*(set(part.extra or ()) for part in parts))
+    return [EXTRA + name for name in sorted(common)]

@@ -1,13 +1,10 @@
-"""Searches for effects that no regression finds. One effect, one file of its name."""
+"""Searches for effects that linear regression does not find, by family of effects."""
 
+from .aids import FloorStepDetector, VelocitySlipDetector
+from .anchor import NlosDetector
 from .base import Detection, Detector
-from .floor_multipath import FloorMultipathDetector
-from .floor_step import FloorStepDetector
-from .nlos import NlosDetector
-from .noise_correlation import NoiseCorrelationDetector
-from .noise_level import NoiseLevelDetector
-from .outlier_rate import OutlierRateDetector
-from .velocity_slip import VelocitySlipDetector
+from .floor import FloorMultipathDetector
+from .pair import NoiseCorrelationDetector, NoiseLevelDetector, OutlierRateDetector
 
 DETECTORS = {
     detector.effect.name: detector

@@ -1,4 +1,4 @@
-"""What a detector is."""
+"""Detector, the search for an effect that linear regression does not find."""
 
 from __future__ import annotations
 
@@ -18,8 +18,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """effect : Effect with values and std; channel : where it shows; evidence : {figure: number},
-    how sure that is.
+    """An effect that a detector found.
+
+    effect : Effect with values and std; channel : name of the channel on which it shows
+    evidence : {figure: number}
     """
 
     effect: Effect
@@ -28,32 +30,31 @@ class Detection:
 
 
 class Detector:
-    """The search for one effect with `fitted` False. One effect, one file of its name: subclass and
-    list it in DETECTORS.
+    """The search for one effect with `fitted` False; DETECTORS lists all detectors.
 
-    An effect with a regressor at hand for some of its parameters, once the others are given, is
-    searched for among the candidates of the selection (`search`). One without any is judged on what
-    all others leave (`detect`).
+    If an effect is linear in some parameters once all other parameters are given, `search` proposes
+    candidates for the selection. Otherwise `detect` looks at the residual of the whole model.
     """
 
     effect: ClassVar[type[Effect]]
-    on_floor: ClassVar[bool] = (
-        False  # looks at what is near the floor, the others at what is in the air
-    )
-    disguises: ClassVar[bool] = (
-        False  # what it searches for dominates its channel: unless found first, it counts as noise
-    )
+    on_floor: ClassVar[bool] = False  # True: uses measurements near the floor, not in the air
+    searched_first: ClassVar[bool] = False  # True: the effect dominates its channel as noise
 
     def search(
         self, table: RegressionTable, model: Fit, chosen: Sequence[Candidate]
     ) -> list[Candidate]:
-        """[Candidate] for the residual of `model`, a Fit of the chosen Candidates to the
-        RegressionTable.
-        """
+        """Return Candidates for the residual of `model`, the Fit of the chosen ones to a table."""
         return []
 
     def detect(self, residuals: Sequence[ChannelResiduals]) -> Detection | None:
-        """Detection in what the whole model leaves, [{channel: ChannelResidual}], one dict a
-        flight; or None.
-        """
+        """Return the Detection in residuals of the whole model, one dict per flight, or None."""
         return None
+
+    def keys_chosen(self, chosen: Sequence[Candidate]) -> list[str]:
+        """Return the parameters of its effect among chosen Candidates."""
+        return [
+            key
+            for candidate in chosen
+            if candidate.name == self.effect.name
+            for key in candidate.terms[0].keys
+        ]

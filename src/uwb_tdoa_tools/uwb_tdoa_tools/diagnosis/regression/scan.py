@@ -18,7 +18,7 @@ from scipy.sparse import csr_array
 
 from uwb_tdoa_bias.effects import SmoothTerm
 from uwb_tdoa_bias.effects.covariates import CATEGORIES
-from uwb_tdoa_bias.effects.shapes import SHAPES
+from uwb_tdoa_bias.effects.smooth_term import SHAPES
 
 from .algebra import dense
 from .fit import prior_sizes, refit
@@ -110,7 +110,7 @@ class Scan:
         self.even = (
             _noise_of_series(table) ** -2.0
         )  # weights (n,) that are fair to noisy series, and know no outliers
-        self._price = SmoothTerm.price + 2.0 * np.log(
+        self._price = SmoothTerm.penalty + 2.0 * np.log(
             max(sum(len(several) for several in groups.values()), 1)
         )
 
@@ -319,7 +319,7 @@ def _prior(view: CovariateView) -> float:
         knots=(0.0, 1.0),
         shape="line",
     )
-    return line.typical_of("c0") ** -2
+    return line.prior_std_of("c0") ** -2
 
 
 def _products(

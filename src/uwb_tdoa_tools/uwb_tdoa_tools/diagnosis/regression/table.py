@@ -123,7 +123,7 @@ class RegressionTable:
         """
         wanted: dict[Hashable, tuple[Effect, dict[str, Column]]] = {}
         for term in terms:
-            effect, keys = wanted.setdefault(term.effect.identity, (term.effect, {}))
+            effect, keys = wanted.setdefault(term.effect.merge_key, (term.effect, {}))
             keys.update(
                 (column.key, column) for column in term.columns if column not in self.columns
             )

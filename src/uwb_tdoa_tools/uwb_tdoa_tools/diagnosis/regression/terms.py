@@ -40,7 +40,7 @@ class Term:
     def columns(self) -> tuple[Column, ...]:
         """A Column for each of the keys."""
         effect = self.effect
-        return tuple(Column(effect.identity, key, effect.typical_of(key)) for key in self.keys)
+        return tuple(Column(effect.merge_key, key, effect.prior_std_of(key)) for key in self.keys)
 
     @property
     def function(self) -> SmoothTerm | None:
@@ -99,7 +99,9 @@ class Candidate:
         """Whether values of its columns, (k,), could be."""
         values = dict(zip(((column.effect, column.key) for column in self.columns), beta.tolist()))
         return all(
-            term.effect.plausible({key: values[term.effect.identity, key] for key in term.keys})
+            term.effect.within_bounds(
+                {key: values[term.effect.merge_key, key] for key in term.keys}
+            )
             for term in self.terms
         )
 
@@ -119,7 +121,7 @@ def candidates_of(effect: Effect, anchors: Anchors, pairs: np.ndarray) -> list[C
     pairs : (m, 2) ids of the pairs that were heard.
     """
     sets = [keys for keys in effect.groups(anchors, pairs) if keys]
-    return [Candidate((Term(effect, tuple(keys)),), effect.price) for keys in sets]
+    return [Candidate((Term(effect, tuple(keys)),), effect.penalty) for keys in sets]
 
 
 def columns_of(candidates: Iterable[Candidate]) -> list[Column]:

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from uwb_tdoa_bias.effects.base import listed
 from uwb_tdoa_bias.effects.covariates import UNITS
-from uwb_tdoa_bias.effects.smooth_words import described
-from uwb_tdoa_bias.effects.wording import listed
+from uwb_tdoa_bias.effects.smooth_term import described
 
 from ..channels import CHANNELS
 from ..health import health

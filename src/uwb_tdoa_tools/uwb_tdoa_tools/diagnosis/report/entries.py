@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.effects import LabelEffect
-from uwb_tdoa_bias.effects.wording import listed, measured
+from uwb_tdoa_bias.effects.base import listed, measured
 
 from ..over_flights import in_words
 
@@ -263,7 +263,7 @@ def _why_not(finding: EffectFinding, refused: Sequence[Refused]) -> str:
     if label in reasons:
         return reasons[label]
     if not finding.effect.usable:
-        return finding.effect.unused
+        return finding.effect.why_unusable
     if any(f" + {label} + " in f" + {what} + " for what in reasons):
         return "judged together with others: see the verdict"
     return reasons.get("all", "the filter does as well without it")

@@ -13,7 +13,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Circle, Ellipse
 import numpy as np
 
-from uwb_tdoa_bias.effects.wording import listed
+from uwb_tdoa_bias.effects.base import listed
 
 from .pictures import FOUND, REGION, WIDTH, Picture, drawing, embedded, plt
 from .room import CELL, VIEWS, changed, estimated, flown, mean_errors, shifts_and_regions

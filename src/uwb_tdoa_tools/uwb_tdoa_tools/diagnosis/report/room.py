@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.effects.marks import Region, Shift
+from uwb_tdoa_bias.effects.base import Region, Shift
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence

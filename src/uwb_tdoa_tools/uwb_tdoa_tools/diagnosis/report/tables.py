@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from uwb_tdoa_bias.effects.wording import listed, measured, rounded
+from uwb_tdoa_bias.effects.base import listed, measured, rounded
 
 from ...scoring.phases import TITLES
 from ..channels import CHANNELS

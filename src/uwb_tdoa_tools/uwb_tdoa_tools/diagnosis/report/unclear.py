@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.effects import EFFECTS
-from uwb_tdoa_bias.effects.wording import listed
+from uwb_tdoa_bias.effects.base import listed
 
 from ..channels import CHANNELS
 
@@ -91,7 +91,7 @@ def _remedy(item: Unobservable, diagnosis: Diagnosis) -> str:
         if alone and effect.needs_reference:
             return GROUND_TRUTH
         wanted, shown = (
-            (*effect.witnesses, *effect.channels),
+            (*effect.corroborating_channels, *effect.channels),
             {name for flight in diagnosis.attribution.residuals for name in flight},
         )
         return _lacking(next((name for name in wanted if name not in shown), wanted[0]), diagnosis)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from uwb_tdoa_bias.effects.wording import listed
+from uwb_tdoa_bias.effects.base import listed
 
 from ...scoring.phases import NEAR_THE_FLOOR, TITLES
 from ..self_calibration.solve import CLEARLY, LEFT

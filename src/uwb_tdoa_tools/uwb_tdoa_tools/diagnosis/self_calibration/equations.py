@@ -20,7 +20,7 @@ from scipy.sparse import csr_array, hstack
 
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
-from uwb_tdoa_bias.effects.anchor_position import AnchorPosition
+from uwb_tdoa_bias.effects.anchor import AnchorPosition
 from uwb_tdoa_bias.effects.samples import RADIO
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.compiled import compiled
@@ -33,11 +33,9 @@ from uwb_tdoa_ekf.sensitivity import TDOAS
 from ...checking.known_path import MANY
 from ...scoring.phases import AIRBORNE
 from ..channels import Comparison, RadioResidual
-from ..channels.radio import compared, of_rows
-from ..channels.ranging import RangeResidual
-from ..channels.tdoa import TdoaResidual
+from ..channels.radio import RangeResidual, TdoaResidual, compared, of_rows
 from ..constraints import Distance, Mark
-from ..references.nothing import Nothing
+from ..references import Nothing
 from ..regression.fit import NU, student_scale
 from .prior import Prior
 

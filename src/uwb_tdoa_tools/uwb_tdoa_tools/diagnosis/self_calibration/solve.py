@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.effects import AnchorDelay, Covariance, EffectSet
-from uwb_tdoa_bias.effects.anchor_position import AnchorPosition
+from uwb_tdoa_bias.effects.anchor import AnchorPosition
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.evidence import DELAY, POSITION, eliminated, keys_of

@@ -1,0 +1,354 @@
+"""What single effects and their correctors do: delays, geometry, floor, labels, sensors, advice."""
+
+from hypothesis import given
+from hypothesis import strategies as st
+import numpy as np
+import pytest
+from random_samples import random_samples
+from scipy.spatial.transform import Rotation
+
+from uwb_tdoa_bias.effects import (
+    EFFECTS,
+    AidCorrector,
+    AnchorDelay,
+    EffectSet,
+    ImuCorrector,
+    LabelCorrector,
+    Samples,
+    SmoothTerm,
+    TagLeverArm,
+)
+from uwb_tdoa_bias.effects.base import counted, listed, measured
+from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.flight import Flight, Tdoas
+from uwb_tdoa_bias.foundation.geometry import tdoa
+from uwb_tdoa_bias.foundation.sensors import Velocity
+
+ANCHORS = Anchors.from_positions([[0, 0, 0], [8, 0, 3], [0, 7, 0], [8, 7, 3]], ids=[0, 1, 3, 7])
+A, B, D = np.array([1, 2, 4, 7]), np.array([2, 4, 7, 1]), np.array([0.5, -1.0, 2.0, -0.25])
+IDS, SIGN = EFFECTS["anchor_ids"]({"1": 4, "4": 1}), EFFECTS["pair_sign"]({"4-2": -1})
+seeds = st.integers(0, 2**32 - 1)
+
+
+def test_delay_of_an_anchor_makes_it_seem_farther_away():
+    anchors = Anchors.from_positions([[0, 0, 0], [10, 0, 0], [0, 10, 0]], ids=[5, 6, 7])
+    samples = Samples(
+        np.zeros(3),
+        np.array([0, 1, 1]),
+        np.array([1, 0, 2]),
+        np.ones((3, 3)),
+        np.full((3, 4), np.nan),
+        anchors,
+    )
+    ranges = np.linalg.norm(samples.p[0] - anchors.positions, axis=1) + [0.3, 0.0, -0.1]
+    late = ranges[samples.b] - ranges[samples.a]
+    clean = tdoa(samples.p, anchors.positions[samples.a], anchors.positions[samples.b])
+    effect = AnchorDelay({5: 0.3, "7": -0.1})
+    np.testing.assert_allclose(effect.bias(samples), late - clean, atol=1e-12)
+
+
+@given(seeds)
+def test_a_delay_that_all_anchors_share_is_not_seen(seed):
+    samples = random_samples(seed)
+    effect = AnchorDelay({str(i): 0.7 for i in samples.anchors.ids})
+    np.testing.assert_array_equal(effect.bias(samples), 0.0)
+
+
+@given(seeds)
+def test_lever_arm_is_where_the_antenna_is(seed):
+    samples = random_samples(seed)
+    effect = TagLeverArm({"x": -0.012, "z": 0.091})
+    antenna = samples.p + Rotation.from_quat(samples.q).apply([-0.012, 0.0, 0.091])
+    a, b = samples.anchors.positions[samples.a], samples.anchors.positions[samples.b]
+    np.testing.assert_allclose(
+        effect.bias(samples), tdoa(antenna, a, b) - tdoa(samples.p, a, b), atol=1e-12
+    )
+
+
+def test_lever_arm_without_attitude_cannot_tell_and_adds_nothing_to_the_set():
+    samples = random_samples(2, n=3)
+    samples.q[1] = np.nan
+    arm, delay = TagLeverArm({"z": 0.1}), AnchorDelay({str(samples.anchors.ids[0]): 0.2})
+    assert np.isnan(arm.bias(samples)).tolist() == [False, True, False]
+    together = EffectSet((arm, delay)).bias(samples)
+    expected = delay.bias(samples) + np.where([True, False, True], arm.bias(samples), 0.0)
+    np.testing.assert_array_equal(together, expected)
+
+
+def standing(heights, x=0.0):
+    """Samples at heights (n,), m, above (x, 0), of TDOAs from an anchor 0 that is on time to anchor
+    1.
+    """
+    anchors, n = Anchors.from_positions([[4, 4, 3], [5, 0, 0.2]], ids=[0, 1]), len(heights)
+    p = np.column_stack([np.full(n, x), np.zeros(n), heights])
+    return Samples(
+        np.arange(n) / 100.0, np.zeros(n, int), np.ones(n, int), p, np.full((n, 4), np.nan), anchors
+    )
+
+
+def test_on_the_floor_an_anchor_is_late_below_its_height_and_may_be_about_it():
+    floor = EFFECTS["floor_multipath"]({"1.delay": 3.0, "1.height": 0.12})
+    samples = standing(np.array([0.0, 0.03, 0.08, 0.12, 0.18, 1.0]))
+    bias, noise = floor.bias(samples), floor.noise_std(samples)
+    np.testing.assert_allclose(bias, [3.0, 3.0, 3.0, 1.5, 0.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(
+        noise, [0.0, 0.0, 0.0, 1.5, 0.0, 0.0], atol=2e-3
+    )  # late or not: 3 m times sqrt(p (1 - p))
+    hopping = EFFECTS["floor_multipath"]({"1.delay": 3.0, "1.height": 0.12, "1.noise": 0.4})
+    np.testing.assert_allclose(
+        hopping.noise_std(samples)[[0, 3, 5]], [0.4, np.sqrt(1.5**2 + 0.5 * 0.4**2), 0.0], atol=2e-3
+    )
+
+
+def test_away_from_where_the_floor_was_seen_it_is_not_taken_out_but_feared():
+    floor = EFFECTS["floor_multipath"]({"1.delay": 3.0, "1.height": 0.12, "x": 0.0, "y": 0.0})
+    near, far = (standing(np.array([0.03]), x) for x in (0.1, 4.0))
+    assert floor.bias(near)[0] == pytest.approx(3.0, abs=0.02) and floor.noise_std(near)[0] < 0.4
+    assert abs(floor.bias(far)[0]) < 0.01 and floor.noise_std(far)[0] == pytest.approx(
+        3.0, abs=0.01
+    )
+
+
+def test_regressors_of_the_floor_are_what_its_delays_do():
+    samples = random_samples(3)
+    ids, rng = samples.anchors.ids.tolist(), np.random.default_rng(3)
+    samples.p[:, 2] = rng.uniform(0.0, 0.3, len(samples))
+    delays = {f"{i}.delay": rng.uniform(0.0, 4.0) for i in ids}
+    floor = EFFECTS["floor_multipath"]({**delays, "x": 0.5, "y": -0.5})
+    np.testing.assert_allclose(
+        floor.regressors(samples, list(delays)) @ list(delays.values()),
+        floor.bias(samples),
+        atol=1e-9,
+    )
+
+
+def test_advice_on_the_floor_names_the_anchors_that_are_late_by_much():
+    values = {"0.delay": 3.3, "1.delay": 0.4, "2.delay": 2.8, "0.height": 0.1, "2.height": 0.13}
+    mount, hang = EFFECTS["floor_multipath"](
+        values, {key: 0.05 for key in values if key.endswith("delay")}
+    ).advice()
+    assert (
+        "0.13 m" in mount
+        and "anchors 0 and 2 are up to 3.30 ± 0.05 m late" in mount
+        and "anchors 0 and 2" in hang
+    )
+    assert EFFECTS["floor_multipath"]().advice() == ()
+
+
+def test_stamps_and_spread():
+    samples = random_samples(4)
+    ids = samples.anchors.ids
+    noisy = EFFECTS["noise_level"]({f"{ids[0]}-{ids[1]}": 0.3})
+    hit = np.isin(samples.a, (0, 1)) & np.isin(samples.b, (0, 1))
+    np.testing.assert_allclose(EffectSet((noisy,)).noise_std(samples), 0.3 * hit)
+    late = EffectSet((EFFECTS["tdoa_time_offset"]({"offset": 0.03}),))
+    flight = Flight(
+        "f", samples.anchors, Tdoas(samples.t, ids[samples.a], ids[samples.b], samples.t)
+    )
+    assert late.stamp_offset("tdoa") == 0.03 and late.stamp_offset("imu") == 0.0
+    np.testing.assert_allclose(late.correct_streams(flight).tdoa.t, samples.t - 0.03)
+
+
+def test_inertial_samples_are_corrected_the_same_at_once_and_one_by_one():
+    rng = np.random.default_rng(0)
+    effects = [
+        EFFECTS["gyro_bias"]({"z": 0.02}),
+        EFFECTS["imu_misalignment"]({"x": 0.1}),
+        EFFECTS["accel_scale"]({"y": 0.03}),
+    ]
+    effects += [
+        SmoothTerm(
+            {"c0": 0.1, "c3": 0.4}, {}, "", "accel.z", "vibration", "common", [0.0, 1.0, 2.0]
+        )
+    ]
+    t, gyro, accel = (
+        np.arange(200) / 1000.0,
+        rng.standard_normal((200, 3)),
+        rng.standard_normal((200, 3)),
+    )
+    together = ImuCorrector(effects).correct(t, gyro, accel)
+    corrector = ImuCorrector(effects)
+    single = [
+        corrector.correct(t[k : k + 1], gyro[k : k + 1], accel[k : k + 1]) for k in range(200)
+    ]
+    for sensor in range(2):
+        np.testing.assert_allclose(
+            np.concatenate([s[sensor] for s in single]), together[sensor], atol=1e-12
+        )
+
+
+def test_aids_are_corrected_the_same_at_once_and_one_by_one_whatever_was_not_measured():
+    rng, n = np.random.default_rng(0), 50
+    values = {
+        "velocity_scale": {"scale": 0.1},
+        "velocity_misalignment": {"yaw": 1.5},
+        "velocity_delay": {"offset": 0.02},
+    }
+    corrector = AidCorrector([EFFECTS[name](each) for name, each in values.items()])
+    t, v, std = np.arange(n) / 25.0, rng.standard_normal((n, 3)), rng.uniform(0.1, 0.2, (n, 3))
+    v[:, 2], std[:, 2] = np.nan, np.inf
+    rates = rng.standard_normal(n), np.where(rng.random(n) < 0.5, 0.0, 0.1)
+    late, turned, wider, *kept = corrector.correct("velocity", Velocity(t, v, std, *rates)).columns
+    for column, rate in zip(kept, rates):
+        np.testing.assert_array_equal(column, rate)
+    expected = Rotation.from_euler("z", 1.5).apply(np.where(np.isfinite(v), v, 0.0)) / 1.1
+    np.testing.assert_allclose(turned[:, :2], expected[:, :2], atol=1e-12)
+    np.testing.assert_allclose(late, t - 0.02)
+    assert np.isinf(wider[:, 2]).all() and (wider[:, :2] < 0.2).all()
+    unstated = corrector.correct(
+        "velocity", Velocity(t, v, np.where(np.isinf(std), std, 0.0))
+    ).columns[2]
+    np.testing.assert_array_equal(
+        unstated, np.where(np.isinf(std), std, 0.0)
+    )  # the driver still states none
+    single = [
+        corrector.correct(
+            "velocity", Velocity(*(column[k : k + 1] for column in (t, v, std)))
+        ).columns
+        for k in range(n)
+    ]
+    for column, whole in enumerate((late, turned, wider)):
+        np.testing.assert_allclose(
+            np.concatenate([each[column] for each in single]), whole, atol=1e-12
+        )
+
+
+def test_ids_are_exchanged_at_once_and_signs_after_them():
+    a, b, d = LabelCorrector([IDS, SIGN, EFFECTS["anchor_delay"]({"1": 0.3})]).correct(A, B, D)
+    assert (
+        a.tolist() == [4, 2, 1, 7]
+        and b.tolist() == [2, 1, 7, 4]
+        and d.tolist() == [-0.5, -1.0, 2.0, -0.25]
+    )
+    assert A.tolist() == [1, 2, 4, 7] and D[0] == 0.5  # what was given stays as it was
+    assert LabelCorrector([EFFECTS["anchor_delay"]({"1": 0.3})]).idle
+
+
+@pytest.mark.parametrize(
+    "name, values",
+    [("anchor_ids", {"1": 2.5}), ("anchor_ids", {"1": -2}), ("pair_sign", {"0-1": 0.5})],
+)
+def test_only_whole_numbers(name, values):
+    with pytest.raises(InputError, match=f"{name}: values"):
+        EFFECTS[name](values)
+
+
+@pytest.mark.parametrize(
+    "value, std, text",
+    [
+        (0.3123, 0.0104, "0.31 ± 0.01 m"),
+        (0.0507, 0.12, "0.05 ± 0.12 m"),
+        (1.26, 1.4, "1.3 ± 1.4 m"),
+        (0.3123, 0.0008, "0.3123 ± 0.0008 m"),
+        (-0.05, 0.096, "-0.05 ± 0.10 m"),
+        (16.74, 1.1, "17 ± 1 m"),
+        (1234.0, 40.0, "1234 ± 40 m"),
+        (0.28333, None, "0.283 m"),
+        (0.28333, 0.0, "0.283 m"),
+    ],
+)
+def test_values_are_rounded_to_their_standard_deviation(value, std, text):
+    assert measured(value, std, "m") == text
+    assert listed(["3"]) == "3" and listed("357") == "3, 5 and 7"
+    assert counted(["3"], "anchor") == "anchor 3" and counted("35", "anchor") == "anchors 3 and 5"
+
+
+@pytest.mark.parametrize(
+    "values, std, order",
+    [
+        ({0: 0.1, 1: -0.3, 3: 0.02}, {0: 0.05, 1: 0.02, 3: 0.011}, ["1", "0"]),
+        ({0: 0.3, 1: 0.2, 3: 0.4}, {0: 0.0, 1: 0.01}, ["1", "0", "3"]),  # unknown ones last
+    ],
+)
+def test_significant_values_come_in_the_order_of_their_significance(values, std, order):
+    assert list(EFFECTS["anchor_delay"](values, std).significant()) == order
+
+
+@given(st.floats(-100, 100), st.floats(1e-6, 10))
+def test_what_is_printed_is_the_value_within_half_a_digit_of_its_standard_deviation(value, std):
+    shown, error = (float(number) for number in measured(value, std).split(" ± "))
+    assert abs(shown - value) <= 0.5 * std * (1 + 1e-6) and error == pytest.approx(
+        std, rel=0.51 if std > 1.0 else 0.12
+    )
+
+
+@pytest.mark.parametrize(
+    "name, values, std, said",
+    [
+        ("anchor_delay", {3: 0.31}, {3: 0.01}, ["anchor 3", "0.31 ± 0.01 m late"]),
+        ("anchor_delay", {3: -0.31, 1: 0.01}, {3: 0.01, 1: 0.02}, ["0.31 ± 0.01 m early"]),
+        (
+            "anchor_position",
+            {"5.x": 0.2, "5.z": -0.1},
+            {"5.x": 0.01, "5.z": 0.01},
+            ["+x", "-z", "Measure anchor 5 again before you move it"],
+        ),
+        (
+            "nlos",
+            {"1.delay": 0.5, "1.start": 20, "1.end": 32},
+            {"1.delay": 0.02},
+            ["from 20 to 32 s", "anchor 1"],
+        ),
+        (
+            "imu_misalignment",
+            {"z": -0.0698},
+            {"z": 0.005},
+            ["Turn the IMU by 4.0 ± 0.3 degrees about z"],
+        ),
+        ("tdoa_time_offset", {"offset": 0.012}, {"offset": 0.001}, ["12 ± 1 ms late"]),
+        (
+            "accel_bias",
+            {"x": -2.181, "z": -0.04},
+            {"x": 0.092, "z": 0.055},
+            ["2.18 ± 0.09 m/s^2 too little along x"],
+        ),
+        ("anchor_ids", {"1": 4}, {}, ["Give the anchors", "called 1 is anchor 4 of the survey"]),
+        ("pair_sign", {"1-4": -1}, {}, ["Look in the driver", "the sign of the TDOA of 1-4"]),
+        ("gyro_scale", {"z": 0.03}, {"z": 0.001}, ["3.0 ± 0.1 % too much about z"]),
+    ],
+)
+def test_advice_names_place_size_and_sign(name, values, std, said):
+    (sentence,) = EFFECTS[name](values, std).advice()
+    for part in said:
+        assert part in sentence
+    for key in values:  # of what is not significant nothing is said
+        if key in std and abs(values[key]) < 2 * std[key]:
+            assert f"anchor {key}" not in sentence and f"along {key}" not in sentence
+
+
+def test_a_blocked_region_is_named_by_its_place_and_marked_on_the_map():
+    values = {"1.x": -0.9, "1.y": -1.2, "1.z": 2.0, "1.radius": 1.0, "1.delay": 0.53}
+    effect = EFFECTS["nlos"](values, {"1.delay": 0.04})
+    (sentence,) = effect.advice()
+    assert (
+        "anchor 1 and (-0.9, -1.2, 2.0) m" in sentence
+        and "within 1.0 m" in sentence
+        and "0.53 ± 0.04 m" in sentence
+    )
+    (region,) = effect.marks(ANCHORS)
+    assert (
+        region.anchor == 1 and region.radius == 1.0 and region.centre.tolist() == [-0.9, -1.2, 2.0]
+    )
+
+
+def test_shifts_on_the_map_are_those_of_the_values():
+    (shift,) = EFFECTS["anchor_position"]({"3.x": 0.2, "3.z": -0.1}, {"3.x": 0.03}).marks(ANCHORS)
+    assert shift.anchor == 3 and shift.by.tolist() == [0.2, 0.0, -0.1]
+    np.testing.assert_array_equal(shift.std, [0.03, np.nan, np.nan])
+    frame = EFFECTS["truth_frame"]({"x": 0.1, "yaw": 0.05}).marks(ANCHORS)
+    assert [mark.anchor for mark in frame] == [0, 1, 3, 7]
+    np.testing.assert_allclose(frame[0].by, [0.1, 0.0, 0.0], atol=1e-12)
+    assert np.linalg.norm(frame[3].by) > 0.4
+
+
+def test_an_effect_without_a_sentence_of_its_own_is_advised_on_by_its_physics():
+    class Rust(EFFECTS["anchor_delay"]):
+        """An effect that somebody adds."""
+
+        name, physics, remedy = "rust", "rusty connectors", ""
+
+    (sentence,) = Rust({3: 0.31, 1: 0.001}, {3: 0.01, 1: 0.002}).advice()
+    assert (
+        sentence == "Look for the cause of rust: rusty connectors (found: 3 = 0.31 ± 0.01, in m)."
+    )

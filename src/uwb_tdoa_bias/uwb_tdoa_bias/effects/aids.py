@@ -1,0 +1,366 @@
+"""Effects of auxiliary sensors (height, pressure, velocity), and the corrector of their streams."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+import math
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+
+from ..foundation.errors import InputError
+from ..foundation.flight import AIDS
+from ..foundation.sensors.sensor import UNKNOWN_STD, UNKNOWN_VARIANCE
+from .base import IDENTITY, Affine, Effect, Row, SensorEffect, finite, require
+from .samples import Track, aid_samples
+
+if TYPE_CHECKING:
+    from collections.abc import Collection, Hashable, Sequence
+
+    from ..foundation.anchors import Anchors
+    from ..foundation.flight import Flight
+    from ..foundation.sensors.sensor import Stream
+    from .samples import AidSamples
+
+LIMITS = ("start", "end")  # s after the first TDOA
+UNLIMITED = 1e6  # s, bound of these
+
+
+class AidEffect(SensorEffect):
+    """An effect with an affine sensor model on one stream, its only channel."""
+
+    def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
+        (name,) = self.channels
+        stream = require(self, flight, name)
+        return flight.replaced(**{name: stream.sensed(self.model()(stream.values))})
+
+
+class HeightOffset(AidEffect):
+    """Measured range = true range from the origin of the body frame + `offset`.
+
+    The parameter `height_arm` of the filter is -offset: set one of the two.
+    """
+
+    row = Row(
+        name="height_offset",
+        unit="m",
+        bound=2.0,
+        negligible=0.005,
+        prior_std=0.1,
+        example="offset",
+        physics=(
+            "the range finder reads too long, or is mounted above the origin of the body frame "
+            "along its z"
+        ),
+        reference="VL53L1X data sheet: offset calibration, up to some centimetres",
+        confounded_with=("height_scale",),
+        distinguished_by={
+            "height_scale": "a flight at several heights: an offset is the same at all of them"
+        },
+        remedy="Check where the range finder is mounted, and its offset: it reads {found}.",
+        ways=("too long", "too short"),
+    )
+    channels = ("height",)
+
+    def model(self) -> Affine:
+        return Affine(np.eye(1), np.array([self.values.get("offset", 0.0)]))
+
+
+class HeightScale(AidEffect):
+    """Measured range = (1 + `scale`) true range."""
+
+    row = Row(
+        name="height_scale",
+        unit="1",
+        bound=0.5,
+        negligible=0.005,
+        prior_std=0.05,
+        example="scale",
+        physics=(
+            "a wrong unit or speed of propagation: of ultrasound, with the temperature of the air"
+        ),
+        reference="speed of sound: 0.18 % per degree",
+        confounded_with=("height_offset",),
+        distinguished_by={
+            "height_offset": "a flight at several heights: a scale grows with height"
+        },
+        remedy="Check the unit and the calibration of the range finder: it reads {found}.",
+        ways=("too long", "too short"),
+        shown=("%", 100.0),
+    )
+    channels = ("height",)
+
+    def model(self) -> Affine:
+        return Affine((1.0 + self.values.get("scale", 0.0)) * np.eye(1), np.zeros(1))
+
+
+class VelocityScale(AidEffect):
+    """Measured velocity = (1 + `scale`) true velocity."""
+
+    row = Row(
+        name="velocity_scale",
+        unit="1",
+        bound=0.9,
+        negligible=0.005,
+        prior_std=0.1,
+        example="scale",
+        physics="a wheel of another radius, a wrong focal length or height of optical flow",
+        reference=(
+            "Borenstein and Feng, IEEE Trans. Robotics and Automation 12, 1996: systematic errors "
+            "of odometry"
+        ),
+        confounded_with=("velocity_slip",),
+        distinguished_by={"velocity_slip": "a longer flight: a scale stays, slip ends"},
+        remedy=(
+            "Calibrate the velocity over a known distance (radius of the wheels, focal length): "
+            "it is {found}."
+        ),
+        ways=("too fast", "too slow"),
+        shown=("%", 100.0),
+    )
+    channels = ("velocity",)
+
+    def model(self) -> Affine:
+        return Affine((1.0 + self.values.get("scale", 0.0)) * np.eye(3), np.zeros(3))
+
+
+class VelocityMisalignment(AidEffect):
+    """Measured velocity = R_z(yaw)^T true velocity, with `yaw` from body to sensor axes."""
+
+    row = Row(
+        name="velocity_misalignment",
+        unit="rad",
+        bound=math.pi,
+        negligible=0.005,
+        prior_std=0.1,
+        example="yaw",
+        physics=(
+            "the camera, the flow sensor or the axes of the wheels are turned against the body's "
+            "axes"
+        ),
+        reference=(
+            "Borenstein and Feng, IEEE Trans. Robotics and Automation 12, 1996: misalignment of "
+            "wheels"
+        ),
+        remedy="Turn the velocity sensor, or its frame: seen from above it is turned {found}.",
+        phrase="{way} by {size}",
+        ways=("counterclockwise", "clockwise"),
+        shown=("degrees", math.degrees(1.0)),
+    )
+    channels = ("velocity",)
+
+    def model(self) -> Affine:
+        yaw = self.values.get("yaw", 0.0)
+        cos, sin = math.cos(yaw), math.sin(yaw)
+        return Affine(np.array([[cos, sin, 0.0], [-sin, cos, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
+
+
+class BarometerDrift(Effect):
+    """The altitude of the barometer grows by `rate` metres per second from the first TDOA on.
+
+    The filter estimates offset and drift of a barometer.
+    """
+
+    row = Row(
+        name="barometer_drift",
+        unit="m/s",
+        bound=10.0,
+        negligible=0.002,
+        prior_std=0.02,
+        example="rate",
+        physics="the sensor warms up, the weather or the pressure in the hall changes",
+        reference=(
+            "BMP388 data sheet: 0.75 Pa/K, that is 6 cm per degree; 10 Pa, 0.8 m, a quarter of an "
+            "hour of weather"
+        ),
+        remedy="Let the barometer warm up, and shield it from wind and light: it drifts {found}.",
+        phrase="{way} by {size}",
+        ways=("upwards", "downwards"),
+        shown=("m a minute", 60.0),
+    )
+    portable = False
+    usable = False
+    channels = ("pressure",)
+
+    def uncorrected(self, samples: AidSamples) -> np.ndarray:
+        return self.values.get("rate", 0.0) * (samples.t - samples.start)[:, None]
+
+    def regressors(self, samples: AidSamples, keys: Sequence[str]) -> np.ndarray:
+        return np.repeat((samples.t - samples.start)[:, None, None], len(keys), axis=2)
+
+    def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
+        stream = require(self, flight, "pressure")
+        error = self.values.get("rate", 0.0) * (stream.t - float(flight.tdoa.t[0]))
+        return flight.replaced(pressure=stream.sensed(stream.values + error[:, None]))
+
+
+class IntervalEffect(Effect):
+    """An effect of the size "N.<part>" from "N.start" to "N.end", s after the first TDOA.
+
+    N counts from 1. A limit that is not given does not apply. It acts on one stream, its only
+    channel. Nodes do not correct it: another flight has other intervals.
+    """
+
+    part: ClassVar[str]
+    portable = False
+    fitted = False
+    usable = False
+
+    def per_unit(self, samples: AidSamples) -> np.ndarray:
+        """Return the error of the readings per unit of its size, (n, k)."""
+        raise NotImplementedError
+
+    @classmethod
+    def check_key(cls, key: str) -> None:
+        number, _, part = key.partition(".")
+        if not number.isdigit() or part not in (cls.part, *LIMITS):
+            raise InputError(
+                f"effects: {cls.name}: parameter {key!r} is not a number and {cls.part}, "
+                f"start or end, as 1.{cls.part}."
+            )
+
+    @classmethod
+    def bound_of(cls, key: str) -> float:
+        return UNLIMITED if key.endswith(LIMITS) else cls.bound
+
+    @classmethod
+    def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
+        return [()]
+
+    @property
+    def merge_key(self) -> tuple[Hashable, ...]:
+        return (
+            self.name,
+            *sorted(item for item in self.values.items() if item[0].endswith(LIMITS)),
+        )
+
+    def regressors(self, samples: AidSamples, keys: Sequence[str]) -> np.ndarray:
+        get, since, unit = self.values.get, samples.t - samples.start, self.per_unit(samples)
+        out = np.zeros((*unit.shape, len(keys)))
+        for column, key in enumerate(keys):
+            number = key.partition(".")[0]
+            inside = since >= get(f"{number}.start", -np.inf)
+            inside &= since <= get(f"{number}.end", np.inf)
+            out[inside, :, column] = unit[inside]
+        return out
+
+    def uncorrected(self, samples: AidSamples) -> np.ndarray:
+        keys = [key for key in self.values if not key.endswith(LIMITS)]
+        return self.regressors(samples, keys) @ np.array([self.values[key] for key in keys])
+
+    def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
+        (name,) = self.channels
+        stream, truth = require(self, flight, name), require(self, flight, "truth")
+        samples = aid_samples(name, stream.t, Track(truth), float(flight.tdoa.t[0]))
+        error = finite(self, flight, self.uncorrected(samples))
+        return flight.replaced(**{name: stream.sensed(stream.values + error)})
+
+    def advice(self) -> tuple[str, ...]:
+        keys = [key for key in self.significant() if not key.endswith(LIMITS)]
+        return tuple(
+            self.remedy.format(found=self.size(key), way=self.way(key), when=self._when(key))
+            for key in keys
+        )
+
+    def _when(self, key: str) -> str:
+        """Return the interval of a size as the end of a clause; "" if it is not limited."""
+        number = key.partition(".")[0]
+        start, end = (self.values.get(f"{number}.{limit}") for limit in LIMITS)
+        if start is None or end is None:
+            return ""
+        return f" from {start:.0f} to {end:.0f} s after the first TDOA"
+
+
+class FloorStep(IntervalEffect):
+    """The ground below the tag is "N.height" metres above z = 0 during an interval."""
+
+    row = Row(
+        name="floor_step",
+        unit="m, s",
+        bound=20.0,
+        negligible=0.02,
+        prior_std=0.3,
+        example="1.height",
+        physics="a step, a box, a table or a person below: the range finder measures down to that",
+        reference="geometry",
+        confounded_with=("height_offset",),
+        distinguished_by={
+            "height_offset": "a flight over other places: an offset is the same everywhere"
+        },
+        remedy="Look what lay below the tag{when}: the ground was {found} {way}.",
+        ways=("higher", "lower"),
+        shown=("m", 1.0),
+    )
+    part = "height"
+    channels = ("height",)
+
+    def per_unit(self, samples: AidSamples) -> np.ndarray:
+        return -1.0 / samples.up[:, None]
+
+
+class VelocitySlip(IntervalEffect):
+    """A share "N.share" of the velocity is lost during an interval."""
+
+    row = Row(
+        name="velocity_slip",
+        unit="1, s",
+        bound=10.0,
+        negligible=0.05,
+        prior_std=0.5,
+        example="1.share",
+        physics="wheels slip or spin, a camera loses its features and says that it stands still",
+        reference=(
+            "Borenstein and Feng, IEEE Trans. Robotics and Automation 12, 1996: non-systematic "
+            "errors of odometry"
+        ),
+        confounded_with=("velocity_scale",),
+        distinguished_by={"velocity_scale": "a longer flight: slip ends, a scale stays"},
+        remedy=(
+            "Look for slip of the wheels or lost features{when}: the velocity was {found} too {way}."
+        ),
+        ways=("small", "large"),
+        shown=("%", 100.0),
+    )
+    part = "share"
+    channels = ("velocity",)
+
+    def per_unit(self, samples: AidSamples) -> np.ndarray:
+        return -samples.reading
+
+
+class AidCorrector:
+    """Corrector of the streams of auxiliary sensors, whole or one measurement after the other."""
+
+    def __init__(self, effects: Collection[Effect]) -> None:
+        """Select the effects on these streams among `effects`; they are undone in their order."""
+        self._late = {
+            stream: sum(effect.stamp_offset(stream) for effect in effects) for stream in AIDS
+        }
+        self._undo = {stream: self._inverse(effects, stream) for stream in AIDS}
+        self.idle = not any(self._late.values()) and not any(self._undo.values())
+
+    @staticmethod
+    def _inverse(effects: Collection[Effect], stream: str) -> Affine | None:
+        undo = None
+        for effect in effects:
+            model = effect.sensor_model(stream)
+            if model is not IDENTITY:
+                undo = model.inverse() if undo is None else model.inverse().after(undo)
+        return undo
+
+    def correct(self, name: str, stream: Stream) -> Stream:
+        """Return the corrected Stream of the sensor `name`."""
+        undo = self._undo[name]
+        if self._late[name]:
+            stream = replace(stream, t=stream.t - self._late[name])
+        if undo is None:
+            return stream
+        std = getattr(stream, "std", None)
+        if std is None:
+            return stream.with_values(undo(stream.values))
+        known = np.isfinite(std)  # an axis that was not measured may hold any value
+        variance = np.where(known, std, UNKNOWN_STD) ** 2 @ undo.matrix.T**2
+        std = np.where(variance < UNKNOWN_VARIANCE, np.sqrt(variance), np.inf)
+        values = undo(np.where(known, stream.values, 0.0))
+        corrected: Any = stream.with_values(values)  # has a std, as `stream` has
+        return replace(corrected, std=std)

@@ -1,0 +1,144 @@
+"""Detector of anchors that are late near the floor, and of the height below which they are."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.optimize import nnls
+
+from uwb_tdoa_bias.effects import EFFECTS
+
+from ...checking.known_path import MANY
+from ..regression.terms import Candidate, Term
+from .base import Detector
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
+    from ..channels.radio import TdoaResidual
+    from ..regression.fit import Fit
+    from ..regression.table import RegressionTable
+
+NEAR = 0.4  # m above z = 0; no flight showed the effect above
+HEIGHTS = np.geomspace(0.05, 0.3, 12)  # m, limits that are tried
+SWEEPS = 2  # over the anchors, to find one height per anchor
+FEWEST, FEWEST_ROWS = 2, 20  # late anchors (a single anchor is blocked); rows near the floor
+ONE_PLACE = 0.5  # m, radius of a single place of take-off and landing
+LEAST, GOOD_PART = 0.5, 0.5  # m, and share of the largest delay, of the first anchors in a model
+SCALE, NU = 0.2, 4.0  # m and 1, Student's t of the residual of an anchor with several echoes
+ITERATIONS = 8
+LITTLE = 1e-3  # information, 1/m^2, of a delay of 0: TDOAs do not show a common delay
+LEAST_NOISE, WILD = 0.2, 3.0  # m: every anchor has less, an outlier has more
+ENOUGH = 5.0  # TDOAs of a row; more count as so many
+
+
+class FloorMultipathDetector(Detector):
+    """Fit delays of all anchors, below one height, then below one height per anchor.
+
+    Anchors with a large delay, two at least, enter the model first, the others afterwards.
+    """
+
+    effect = EFFECTS["floor_multipath"]
+    on_floor = True
+
+    def search(
+        self, table: RegressionTable, model: Fit, chosen: Sequence[Candidate]
+    ) -> list[Candidate]:
+        parts = table.tdoa_parts
+        rows = table.rows_of("tdoa")
+        place = table.place[rows]
+        low = np.flatnonzero(place[:, 2] < NEAR)
+        if len(low) < FEWEST_ROWS or any(part.innovations is not None for part in parts):
+            return []  # no data near the floor, or no known height
+        ids = parts[0].samples.anchors.ids.tolist()
+        mine = self.keys_chosen(chosen)
+        heard = (
+            np.unique(parts[0].arrivals(table.series[rows][low]))
+            if len(ids) > MANY
+            else np.arange(len(ids))
+        )
+        new = [k for k in heard.tolist() if f"{ids[k]}.delay" not in mine]
+        if not new:
+            return []
+        lowest = place[low[place[low, 2] < max(HEIGHTS[0], 2.0 * place[low, 2].min())], :2]
+        middle = np.median(lowest, axis=0)
+        one_place = np.hypot(*(lowest - middle).T).max() < ONE_PLACE
+        where = dict(zip("xy", middle.tolist())) if one_place else {}  # else it may hold anywhere
+        columns = [
+            np.concatenate([_below(height, part, new) for part in parts])[low] for height in HEIGHTS
+        ]
+        trials = _Trials(np.stack(columns), model.residual[rows][low], table.count[rows][low])
+        delays, at = trials.best()
+        late = delays > (self.effect.negligible if mine else max(LEAST, GOOD_PART * delays.max()))
+        late &= HEIGHTS[at] < HEIGHTS[-1]  # an effect above is not of the floor
+        if late.sum() < (1 if mine else FEWEST):
+            return []
+        some = [ids[new[k]] for k in np.flatnonzero(late)]
+        limits = {f"{i}.height": float(HEIGHTS[k]) for i, k in zip(some, at[late])}
+        limits |= {
+            f"{i}.noise": float(std)
+            for i, std in zip(some, trials.noises(at)[late])
+            if std > LEAST_NOISE
+        }
+        term = Term(
+            self.effect({**limits, **where}, source="diagnose"), tuple(f"{i}.delay" for i in some)
+        )
+        return [Candidate((term,), 2.0 * np.log(len(HEIGHTS)) * len(some))]
+
+
+def _below(height: float, part: TdoaResidual, anchors: Sequence[int]) -> np.ndarray:
+    """Return regressors of delays of anchors, by their rows, below a height, m: (n, anchors)."""
+    samples, low = part.samples, part.samples.p[:, 2] < height
+    return np.stack(
+        [part.cells.mean(low * (1.0 * (samples.b == k) - (samples.a == k))) for k in anchors],
+        axis=1,
+    )
+
+
+class _Trials:
+    """Robust fits of delays of anchors to a residual, for heights below which they are late.
+
+    columns : (heights, n, anchors) regressors; residual : (n,) m; count : (n,) TDOAs of a row
+    """
+
+    def __init__(self, columns: np.ndarray, residual: np.ndarray, count: np.ndarray) -> None:
+        self._columns, self._y, self._count = columns, residual, np.minimum(count, ENOUGH)
+        self._fits: dict[bytes, tuple[float, np.ndarray]] = {}  # by heights, for reuse
+
+    def best(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return (delays (anchors,) m, indices of the heights (anchors,))."""
+        count = self._columns.shape[2]
+        at = self._best(np.full(count, k) for k in range(len(self._columns)))
+        for _ in range(SWEEPS):
+            for anchor in range(count):
+                tried = np.repeat(at[None], len(self._columns), axis=0)
+                tried[:, anchor] = range(len(tried))
+                at = self._best(tried)
+        return self._fit(at)[1], at
+
+    def _best(self, tried: Iterable[np.ndarray]) -> np.ndarray:
+        return min(tried, key=lambda at: self._fit(at)[0])
+
+    def noises(self, at: np.ndarray) -> np.ndarray:
+        """Return the standard deviation of the residual of each late anchor, (anchors,) m."""
+        x = self._columns[at, :, np.arange(len(at))].T
+        power = np.minimum(np.abs(self._y - x @ self._fit(at)[1]), WILD) ** 2
+        root, both = np.sqrt(self._count), np.hstack([x**2, np.ones((len(x), 1))])
+        return np.sqrt(nnls(root[:, None] * both, root * power)[0][:-1])
+
+    def _fit(self, at: np.ndarray) -> tuple[float, np.ndarray]:
+        """Return (loss, delays) of robust least squares with delays of 0 or more."""
+        key = at.tobytes()
+        if key not in self._fits:
+            self._fits[key] = self._fitted(at)
+        return self._fits[key]
+
+    def _fitted(self, at: np.ndarray) -> tuple[float, np.ndarray]:
+        x, weight = self._columns[at, :, np.arange(len(at))].T, self._count
+        for _ in range(ITERATIONS):
+            root = np.linalg.cholesky((x * weight[:, None]).T @ x + LITTLE * np.eye(x.shape[1])).T
+            beta = nnls(root, np.linalg.solve(root.T, x.T @ (weight * self._y)))[0]
+            off = (self._y - x @ beta) / SCALE
+            weight = self._count * (NU + 1.0) / (NU + off**2)
+        return float(self._count @ np.log1p(off**2 / NU)), beta

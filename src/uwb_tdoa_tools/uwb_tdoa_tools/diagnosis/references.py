@@ -1,0 +1,295 @@
+"""References: the paths that flights are compared with, and which of their coordinates are known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+
+from uwb_tdoa_bias.correction.corrector import Corrector
+from uwb_tdoa_bias.effects.stamps import shifted
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.flight import AIDS, Truth
+from uwb_tdoa_ekf.core import auxiliary
+from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.offline import without_unknown_offset
+from uwb_tdoa_ekf.sensitivity import RANGES, TDOAS, record_innovations
+from uwb_tdoa_ekf.smoother import smooth
+
+from ..clock import grid
+from ..scoring.alignment import NONE
+from ..scoring.evaluation import align_truth
+from ..scoring.metrics import scored_phase
+from ..scoring.phases import TITLES
+from .constraints import Mark, OdometryPath
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from uwb_tdoa_bias.effects import EffectSet
+    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_ekf.sensitivity import Innovations
+
+    from .constraints import Constraint
+
+MARGIN = 0.5  # s left out at both ends
+SHORTEST = 5.0  # s that can be diagnosed
+TRUTHS = "_truth"  # end of the names of streams in which a simulation stores the truth
+SPACING = 2.0  # s between the stamps at which an odometry is fitted
+FEWEST = 5  # such stamps
+
+
+@dataclass(frozen=True)
+class ReferenceView:
+    """The path of a flight by a reference.
+
+    poses : Truth, known or estimated
+    innovations : Innovations of the run that estimated the poses, None if they are known
+    """
+
+    poses: Truth
+    innovations: Innovations | None = None
+
+
+class Reference:
+    """The path that flights are compared with; REFERENCES lists all kinds.
+
+    `prepare` removes from a recording all that the reference must not use, before anything else
+    reads it.
+    """
+
+    positions_known: ClassVar[tuple] = (True, True, True)  # x, y, z, world
+    attitude_known: ClassVar[bool] = True
+    knows_floor: ClassVar[bool] = False  # True: also before take-off and after landing
+    tells_errors: ClassVar[bool] = True  # errors of the filter's positions are known with it
+    constraints: tuple[Constraint, ...] = ()
+    words: str  # the reference, in reports
+
+    def prepare(self, flight: Flight) -> Flight:
+        """Return the Flight without all that must not be used.
+
+        Raises InputError if it lacks the reference.
+        """
+        return flight
+
+    def settled(
+        self, flight: Flight, base: EffectSet, config: FilterConfig | None = None
+    ) -> tuple[Flight, tuple[str, ...]]:
+        """Return (the prepared Flight with obvious errors of the reference corrected, sentences).
+
+        base : EffectSet of the model; config : FilterConfig
+        """
+        return flight, ()
+
+    def view(self, flight: Flight, effects: EffectSet) -> ReferenceView:
+        """Return the ReferenceView of a prepared Flight under the EffectSet `effects`."""
+        raise NotImplementedError
+
+    def shift_std(self, name: str) -> np.ndarray:
+        """Return the standard deviation of the common shift of a prepared flight, (3,) m.
+
+        name : of the flight
+        """
+        return np.zeros(3)
+
+    def span(self, flight: Flight, poses: Truth) -> tuple[float, float]:
+        """Return the (first, last) stamp, s, of the part that is diagnosed; raise InputError.
+
+        The part is in the air, or in motion on the floor, without its ends.
+        """
+        part, first, last = scored_phase(poses)
+        first, last = first + MARGIN, last - MARGIN
+        if last - first < SHORTEST:
+            raise InputError(
+                f"{flight.name}: only {last - first:.1f} s of it are {TITLES[part]}; "
+                f"{SHORTEST:g} s are needed."
+            )
+        return first, last
+
+
+class GroundTruth(Reference):
+    """The ground truth that the recording holds."""
+
+    words = "the recorded ground truth"
+    knows_floor = True
+
+    def __init__(
+        self,
+        config: FilterConfig | None = None,
+        constraints: Sequence[Constraint | OdometryPath] = (),
+        align: str = NONE,
+    ) -> None:
+        """Take `align` as in `scoring.evaluation.align_truth`; a known pose needs no more."""
+        self._align = align
+
+    def prepare(self, flight: Flight) -> Flight:
+        if flight.truth is None or len(flight.truth) < 2:
+            raise InputError(
+                f"{flight.name}: holds no ground truth to compare with; give --no-truth."
+            )
+        return flight
+
+    def settled(
+        self, flight: Flight, base: EffectSet, config: FilterConfig | None = None
+    ) -> tuple[Flight, tuple[str, ...]]:
+        return align_truth(flight, base, config, self._align)
+
+    def view(self, flight: Flight, effects: EffectSet) -> ReferenceView:
+        truth = shifted(flight, "truth", -effects.stamp_offset("truth")).truth
+        assert truth is not None  # `prepare` has refused a flight without
+        return ReferenceView(truth)
+
+
+def without_truth(flight: Flight) -> Flight:
+    """Return the Flight without its ground truth."""
+    extra = {name: stream for name, stream in flight.extra.items() if not name.endswith(TRUTHS)}
+    return replace(flight, truth=None, extra=extra)
+
+
+class Nothing(Reference):
+    """No reference: the residuals are the innovations of the filter.
+
+    They are of TDOAs, or of ranges in a flight without TDOAs. The estimate follows an effect in
+    part, so regressors are computed for innovations. A common offset of all ranges is corrected first,
+    because it bends the path; `self_calibrate` estimates it.
+    """
+
+    positions_known = (False, False, False)
+    attitude_known = False
+    tells_errors = False
+    words = "nothing but the flights themselves"
+
+    def __init__(
+        self,
+        config: FilterConfig | None = None,
+        constraints: Sequence[Constraint] = (),
+        streams: Sequence[str] = (),
+    ) -> None:
+        """Run the filter with a FilterConfig.
+
+        streams : with innovations that are residuals, as of `record_innovations`; the offset of
+            ranges is kept then. By default as described above.
+        """
+        self._config, self._streams = config or FilterConfig(), tuple(streams)
+        self.constraints = tuple(constraints)
+
+    def prepare(self, flight: Flight) -> Flight:
+        return without_truth(flight)
+
+    def view(self, flight: Flight, effects: EffectSet) -> ReferenceView:
+        config, streams, by = self._config, self._streams, Corrector(flight.anchors, effects)
+        if not streams:
+            flight = without_unknown_offset(flight, config, by)
+            config = replace(config, **auxiliary.NONE)  # the offset is corrected
+            streams = (TDOAS,) if len(flight.tdoa) else (RANGES,)
+        innovations = record_innovations(flight, config, by, streams)
+        estimate = innovations.run.odometry
+        return ReferenceView(Truth(estimate.t, estimate.p, estimate.q), innovations)
+
+
+class Marks(Nothing):
+    """Marks as constraints; the residuals are the innovations of the filter.
+
+    With marks, positions and delays of anchors are observable.
+    """
+
+    words = "places measured beforehand where the tag stood or passed, and the flights themselves"
+
+
+class Heights(GroundTruth):
+    """The smoothed path of a filter that uses the height; the diagnosed flight does not use it.
+
+    Anchors at walls err mostly in z, and a height shows that. x and y of the path follow from
+    uncorrected TDOAs: an error in x and y is not observable.
+    """
+
+    positions_known = (False, False, True)
+    attitude_known = False
+    words = "heights that a range finder measured; x and y are the filter's own"
+
+    def __init__(
+        self,
+        config: FilterConfig | None = None,
+        constraints: Sequence[Constraint | OdometryPath] = (),
+    ) -> None:
+        """Run the filter with a FilterConfig; constraints are not needed."""
+        self._config = config
+
+    def prepare(self, flight: Flight) -> Flight:
+        if flight.height is None or not len(flight.height):
+            raise InputError(
+                f"{flight.name}: holds no height to compare with; record a range finder, or "
+                "give --no-truth."
+            )
+        alone = without_truth(flight)
+        path = smooth(alone, self._config, Corrector(flight.anchors)).odometry
+        return replace(alone.without(*AIDS), truth=Truth(path.t, path.p, path.q))
+
+
+class OdometryReference(GroundTruth):
+    """The path of another odometry, fitted to the path of the filter and to marks.
+
+    Without marks a common shift and yaw of a flight are not observable: the filter sets
+    them. Marks at take-off and landing are enough.
+    """
+
+    attitude_known = False
+    knows_floor = False  # the path begins and ends above it
+
+    def __init__(
+        self,
+        config: FilterConfig | None = None,
+        constraints: Sequence[Constraint | OdometryPath] = (),
+    ) -> None:
+        """Run the filter with a FilterConfig.
+
+        constraints : OdometryPaths, and Marks on them
+        """
+        self._config = config
+        self._paths = {path.flight: path for path in constraints if isinstance(path, OdometryPath)}
+        self._marks = [mark for mark in constraints if isinstance(mark, Mark)]
+        through = (
+            "laid through marks"
+            if self._marks
+            else "laid beside the filter's path: a shift of all of a flight is not seen"
+        )
+        self._shift_std: dict[str, float] = {}
+        self.words = f"another odometry in a frame of its own, {through}"
+
+    def prepare(self, flight: Flight) -> Flight:
+        path = self._paths.get(flight.name)
+        if path is None:
+            raise InputError(
+                f"{flight.name}: --odometry holds no path of it; record one, or give --no-truth."
+            )
+        alone, begin = without_truth(flight), float(flight.tdoa.t[0])
+        own = smooth(alone, self._config, Corrector(flight.anchors)).odometry
+        # By the path alone: after a fit that is too high, the floor would count as air.
+        first, last = path.aloft or (0.0, 0.0)
+        chosen = (own.t >= first) & (own.t <= last)
+        t = own.t[chosen]
+        if len(t):
+            t = grid(t[0], t[-1], SPACING, t)
+        if len(t) < FEWEST:
+            raise InputError(
+                f"{flight.name}: its odometry is above the floor for {len(t)} stamps only; "
+                "fly for half a minute."
+            )
+        estimate = np.stack([np.interp(t, own.t, column) for column in own.p.T], axis=1)
+        marks = [mark for mark in self._marks if mark.flight == flight.name]
+        p, self._shift_std[flight.name] = path.laid(t, estimate, marks, begin, own.t[chosen])
+        return replace(alone, truth=Truth(own.t[chosen], p, own.q[chosen]))
+
+    def shift_std(self, name: str) -> np.ndarray:
+        return np.full(3, self._shift_std[name])
+
+
+# {value of --reference: kind}; each is made of a FilterConfig and constraints
+REFERENCES = {
+    "truth": GroundTruth,
+    "heights": Heights,
+    "marks": Marks,
+    "odometry": OdometryReference,
+    "nothing": Nothing,
+}
