@@ -10,7 +10,9 @@ from studies import (
     fuzz,
     localizing,
     moved_anchors,
+    moved_anchors_live,
     noise,
+    plans,
     ranges,
     recalibrating,
     rover,
@@ -47,7 +49,9 @@ STUDIES = {
     "in-flight": in_flight,
     "localizing": localizing,
     "moved-anchors": moved_anchors,
+    "moved-anchors-live": moved_anchors_live,
     "noise": noise,
+    "plans": plans,
     "random-splits": splits,
     "ranges": ranges,
     "recalibrating": recalibrating,
@@ -77,7 +81,9 @@ of measured flights: flights/, util/, surveys/.
   in-flight        the same mistakes played to ekf_node, and what it says of them (docs/connect.md)
   localizing       what localize says of flights, against their ground truth (docs/localizing.md)
   moved-anchors    anchors that were moved or exchanged, and who names them (docs/localizing.md)
+  moved-anchors-live  some of these recordings, played to the real nodes (docs/localizing.md)
   noise            whether covariances are honest after a calibration (docs/calibration.md)
+  plans            random rooms and halls against an independent solver, and against a rerun (docs/planning.md)
   random-splits    bias models trained on flights drawn at random, and judged on the others (docs/bias.md)
   ranges           simulated distances to anchors against the bound of plan (docs/sensors.md)
   recalibrating    surveys that start from the last one, after something changed (docs/calibration.md)
@@ -128,7 +134,9 @@ def parser():
         ),
         "./dev study localizing DATA/flights DATA/util --survey DATA/surveys --mistakes",
         "./dev study moved-anchors DATA/flights --survey DATA/surveys --draws 10 --json moved.json",
+        "./dev study moved-anchors-live --draws 3",
         "./dev study noise --data DATA --split const1",
+        "./dev study plans --json plans.json",
         "./dev study random-splits DATA/flights/0426 --survey DATA/surveys --out splits.jsonl",
         "./dev study ranges --flights 5",
         "./dev study recalibrating --data DATA --only const1",
