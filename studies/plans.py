@@ -22,11 +22,10 @@ from uwb_tdoa_tools import parallel
 from uwb_tdoa_tools.commands import plan
 from uwb_tdoa_tools.outputs import OutputFile
 from uwb_tdoa_tools.parallel import whole_number
-from uwb_tdoa_tools.planning.goal import Goal
 from uwb_tdoa_tools.planning.hall import Hall
-from uwb_tdoa_tools.planning.installation import Installation
-from uwb_tdoa_tools.planning.judging import FLYABLE, IMPRECISE, TOO_FEW, TWO_SOLUTIONS, Demand
-from uwb_tdoa_tools.planning.noise import FixedNoise, RadioNoise
+from uwb_tdoa_tools.planning.installation import FixedNoise, Installation, RadioNoise
+from uwb_tdoa_tools.planning.layout import Goal
+from uwb_tdoa_tools.planning.maps import FLYABLE, IMPRECISE, TOO_FEW, TWO_SOLUTIONS, Demand
 from uwb_tdoa_tools.planning.second_minimum import CLEAR, FLIP
 from uwb_tdoa_tools.simulation.room import Room
 from uwb_tdoa_tools.simulation.walls import Walls

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from studies import plans
-from uwb_tdoa_tools.planning.judging import FLYABLE, TOO_FEW, TWO_SOLUTIONS
-from uwb_tdoa_tools.planning.noise import FixedNoise, RadioNoise
+from uwb_tdoa_tools.planning.installation import FixedNoise, RadioNoise
+from uwb_tdoa_tools.planning.maps import FLYABLE, TOO_FEW, TWO_SOLUTIONS
 from uwb_tdoa_tools.simulation.room import Room
 
 

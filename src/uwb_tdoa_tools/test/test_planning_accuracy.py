@@ -1,19 +1,20 @@
 import numpy as np
 import pytest
 
-from uwb_tdoa_tools.planning import accuracy
-from uwb_tdoa_tools.planning.accuracy import (
-    FEW,
+from uwb_tdoa_tools.planning import precision
+from uwb_tdoa_tools.planning.installation import FixedNoise, Installation
+from uwb_tdoa_tools.planning.maps import Grid
+from uwb_tdoa_tools.planning.precision import (
+    FEWEST,
     ErrorSamples,
     accuracy_map,
+    bound,
     comparison,
-    fly,
-    together,
+    error_samples,
+    information,
+    pooled,
+    position_error,
 )
-from uwb_tdoa_tools.planning.installation import Installation
-from uwb_tdoa_tools.planning.maps import Grid
-from uwb_tdoa_tools.planning.noise import FixedNoise
-from uwb_tdoa_tools.planning.precision import bound, information, position_error
 from uwb_tdoa_tools.readers import read_flight
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.constellations import corners
@@ -47,10 +48,10 @@ def test_a_map_shows_bias_and_scatter_where_they_are():
 def test_few_estimates_tell_nothing_and_those_outside_are_left_out():
     grid = Grid.box((-9, -9, 0), (-7, -7, 1), 1.0)
     assert np.isnan(accuracy_map(samples(), INSTALLATION, grid).rmse).all()
-    far = samples(FEW - 1)
+    far = samples(FEWEST - 1)
     one = Grid.box((-2, -2, 0.5), (2, 2, 4.5), 4.0)
     assert np.isnan(accuracy_map(far, INSTALLATION, one).bias).all()
-    assert np.isfinite(accuracy_map(samples(FEW), INSTALLATION, one).bias).all()
+    assert np.isfinite(accuracy_map(samples(FEWEST), INSTALLATION, one).bias).all()
 
 
 def test_ratios_to_the_bound():
@@ -66,10 +67,8 @@ def test_ratios_to_the_bound():
 def test_flights_pool_without_mixing_their_seconds():
     one, other = samples(seed=1), samples(seed=2)
     shifted = ErrorSamples(other.t, other.place, other.error + 1.0, other.covariance)
-    pooled = comparison(together([one, shifted]), INSTALLATION)
-    assert pooled["samples"] == 8000 and pooled["scatter_over_bound"] == pytest.approx(
-        1.0, abs=0.03
-    )
+    both = comparison(pooled([one, shifted]), INSTALLATION)
+    assert both["samples"] == 8000 and both["scatter_over_bound"] == pytest.approx(1.0, abs=0.03)
 
 
 @pytest.mark.parametrize("trajectory", ["hover", "circle"])
@@ -85,7 +84,7 @@ def test_a_simulated_flight(trajectory):
             shared_noise=True,
         )
     )
-    flown = fly(flight)
+    flown = error_samples(flight)
     assert len(flown.t) > 1000 and flown.place[:, 2].min() > 0.29
     found = comparison(flown, INSTALLATION)
     limit = position_error(bound(information(flown.place, INSTALLATION)))
@@ -97,7 +96,7 @@ def test_a_static_grid_is_mapped_place_by_place():
     """Several hovers, as on the markers of the paper's Figure 1: one cell each."""
     places = [(-1.0, -1.0), (1.0, 1.0)]
     flights = [
-        fly(
+        error_samples(
             simulate(
                 SimulationConfig(
                     trajectory="hover",
@@ -112,7 +111,7 @@ def test_a_static_grid_is_mapped_place_by_place():
         for place in places
     ]
     grid = Grid.slice((-2, 2), (-2, 2), 1.2, 0.5)
-    found = accuracy.accuracy_map(accuracy.together(flights), INSTALLATION, grid)
+    found = precision.accuracy_map(precision.pooled(flights), INSTALLATION, grid)
     known = np.isfinite(found.rmse[:, 0])
     centres = grid.points[known]
     for place in places:
@@ -126,6 +125,6 @@ def test_a_measured_flight(shared_data):
         shared_data / "surveys/anchor_0425.txt",
     )
     flight = read_flight(path, survey)
-    found = comparison(fly(flight), Installation(flight.anchors))
+    found = comparison(error_samples(flight), Installation(flight.anchors))
     assert 0.10 < found["bound"] < 0.13
     assert 1.0 < found["achieved_over_bound"] < 4.0 and 0.05 < found["efficiency_achieved"] < 1.0

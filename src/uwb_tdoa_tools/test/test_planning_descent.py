@@ -5,14 +5,12 @@ import pytest
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_tools.planning import descent
+from uwb_tdoa_tools.planning import optimisation
 from uwb_tdoa_tools.planning.bifurcation import Subsets
-from uwb_tdoa_tools.planning.descent import descend, errors_and_slopes, failing_and_slopes
-from uwb_tdoa_tools.planning.goal import UNUSABLE, Goal
 from uwb_tdoa_tools.planning.installation import Installation
-from uwb_tdoa_tools.planning.judging import Demand
-from uwb_tdoa_tools.planning.layout import Layout
-from uwb_tdoa_tools.planning.places import AnchorPlaces, lattice
+from uwb_tdoa_tools.planning.layout import UNUSABLE, AnchorPlaces, Goal, Layout, lattice
+from uwb_tdoa_tools.planning.maps import Demand
+from uwb_tdoa_tools.planning.optimisation import descend, errors_and_slopes, failing_and_slopes
 from uwb_tdoa_tools.simulation.constellations import corners
 
 ROOM = np.array([-4.0, -4.5, 0.0]), np.array([4.0, 4.5, 3.0])
@@ -145,7 +143,7 @@ def test_a_descent_does_not_end_where_the_goal_cannot_be_told(objective, monkeyp
             raise InputError("too far")
         return failing_and_slopes(goal, layout, at, points)
 
-    monkeypatch.setattr(descent, "failing_and_slopes", told_near)
+    monkeypatch.setattr(optimisation, "failing_and_slopes", told_near)
     found = descend(goal, layout, POINTS, x, 15)
     assert 1e-4 < np.abs(found - x).max() <= 0.02
     assert goal.figures(layout.anchors(found))[objective] < before

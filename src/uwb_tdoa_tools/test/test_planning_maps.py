@@ -5,10 +5,8 @@ import pytest
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.planning.bifurcation import Subsets
-from uwb_tdoa_tools.planning.installation import Installation
-from uwb_tdoa_tools.planning.judging import OUTSIDE, TWO_SOLUTIONS, Demand
-from uwb_tdoa_tools.planning.maps import MOST_CELLS, Grid, chart
-from uwb_tdoa_tools.planning.pairing import PAIRINGS
+from uwb_tdoa_tools.planning.installation import PAIRINGS, Installation
+from uwb_tdoa_tools.planning.maps import MOST_CELLS, OUTSIDE, TWO_SOLUTIONS, Demand, Grid, chart
 from uwb_tdoa_tools.simulation.constellations import constellation, corners
 from uwb_tdoa_tools.simulation.room import Room
 

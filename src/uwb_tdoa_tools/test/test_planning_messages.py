@@ -4,9 +4,8 @@ import pytest
 from uwb_tdoa_tools.bags.files import open_bag
 from uwb_tdoa_tools.bags.message_types import typestore
 from uwb_tdoa_tools.planning.installation import Installation
-from uwb_tdoa_tools.planning.judging import Demand
-from uwb_tdoa_tools.planning.maps import Grid, chart
-from uwb_tdoa_tools.planning.messages import TOPICS, messages, write
+from uwb_tdoa_tools.planning.maps import Demand, Grid, chart
+from uwb_tdoa_tools.planning.report import TOPICS, map_messages, write_messages
 from uwb_tdoa_tools.simulation.constellations import corners
 
 INSTALLATION = Installation(corners())
@@ -14,7 +13,7 @@ CHART = chart(INSTALLATION, Grid.box((-4, -4.5, 0), (4, 4.5, 3), 0.5), Demand(cr
 
 
 def test_the_flyable_slice():
-    grid = messages(CHART, INSTALLATION.anchors)["plan/flyable"]
+    grid = map_messages(CHART, INSTALLATION.anchors)["plan/flyable"]
     assert (grid.info.width, grid.info.height, grid.info.resolution) == (16, 18, 0.5)
     origin = grid.info.origin.position
     assert (origin.x, origin.y, origin.z) == pytest.approx(
@@ -34,7 +33,7 @@ def test_the_flyable_slice():
 
 
 def test_the_precision_slice_is_in_centimetres():
-    found = messages(CHART, INSTALLATION.anchors)["plan/precision"]
+    found = map_messages(CHART, INSTALLATION.anchors)["plan/precision"]
     layer = CHART.grid.layer(CHART.error, 3)
     np.testing.assert_allclose(
         found.data.reshape(layer.shape), np.minimum(100 * layer, 100), atol=0.51
@@ -42,7 +41,7 @@ def test_the_precision_slice_is_in_centimetres():
 
 
 def test_markers_show_the_surface_and_the_anchors():
-    cubes, spheres, *texts = messages(CHART, INSTALLATION.anchors)["plan/markers"].markers
+    cubes, spheres, *texts = map_messages(CHART, INSTALLATION.anchors)["plan/markers"].markers
     assert [text.text for text in texts] == [str(i) for i in range(8)] and len(spheres.points) == 8
     shown = {(round(p.x, 6), round(p.y, 6), round(p.z, 6)) for p in cubes.points}
     flyable = CHART.flyable.reshape(CHART.grid.shape)
@@ -62,13 +61,13 @@ def test_nothing_flyable_is_no_error():
     outside = chart(
         INSTALLATION, Grid.box((10, 10, 0), (11, 11, 1), 0.5), Demand(criterion="pairings")
     )
-    assert messages(outside, INSTALLATION.anchors)["plan/markers"].markers[0].points == []
+    assert map_messages(outside, INSTALLATION.anchors)["plan/markers"].markers[0].points == []
 
 
 def test_a_bag_of_them(tmp_path):
-    found = messages(CHART, INSTALLATION.anchors)
+    found = map_messages(CHART, INSTALLATION.anchors)
     for _ in range(2):  # the second replaces the first
-        write(found, tmp_path / "plan.bag")
+        write_messages(found, tmp_path / "plan.bag")
     with open_bag(tmp_path / "plan.bag") as reader:
         assert {c.topic: c.msgtype for c in reader.connections} == {
             f"/{name}": kind for name, kind in TOPICS.items()

@@ -4,7 +4,7 @@ import pytest
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.antenna import DWM1000_AZIMUTH, Antenna
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_tools.planning.noise import (
+from uwb_tdoa_tools.planning.installation import (
     FixedNoise,
     RadioNoise,
     antenna_from_yaml,

@@ -3,12 +3,10 @@ import pytest
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_tools.planning.goal import Goal
-from uwb_tdoa_tools.planning.installation import Installation
-from uwb_tdoa_tools.planning.judging import Demand
-from uwb_tdoa_tools.planning.noise import FixedNoise
-from uwb_tdoa_tools.planning.optimisation import BESIDE, one_more, optimise
-from uwb_tdoa_tools.planning.places import AnchorPlaces, lattice
+from uwb_tdoa_tools.planning.installation import FixedNoise, Installation
+from uwb_tdoa_tools.planning.layout import AnchorPlaces, Goal, lattice
+from uwb_tdoa_tools.planning.maps import Demand
+from uwb_tdoa_tools.planning.optimisation import BESIDE, optimise, scores_of_one_more
 from uwb_tdoa_tools.readers import read_survey
 from uwb_tdoa_tools.simulation.constellations import constellation, facing
 
@@ -61,7 +59,7 @@ def test_one_more_anchor():
     fixed = Anchors([4, 0, 9, 2, 1], bad_anchors().positions, bad_anchors().orientations, "hall")
     aim = goal(Installation(fixed), "round")
     places = AnchorPlaces.walls(*ROOM)
-    numbers, scores = one_more(aim, fixed, places, count=60)
+    numbers, scores = scores_of_one_more(aim, fixed, places, count=60)
     positions = places.positions(numbers)
     assert 30 < len(positions) == len(scores) < 120
     assert np.linalg.norm(positions[:, None] - fixed.positions, axis=2).min() >= BESIDE

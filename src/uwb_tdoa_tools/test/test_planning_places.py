@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_tools.planning.places import AnchorPlaces, lattice, spread
+from uwb_tdoa_tools.planning.layout import AnchorPlaces, lattice, spread
 
 ROOM = np.array([0.0, 0.0, 0.0]), np.array([6.0, 5.0, 3.0])
 

@@ -10,17 +10,18 @@ from scipy.ndimage import median_filter
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.geometry import tdoa
-from uwb_tdoa_tools.planning.installation import Installation
-from uwb_tdoa_tools.planning.maps import Grid
-from uwb_tdoa_tools.planning.noise import FixedNoise, RadioNoise
-from uwb_tdoa_tools.planning.pairing import (
+from uwb_tdoa_tools.planning.installation import (
     PAIRINGS,
+    FixedNoise,
+    Installation,
     Pairing,
+    RadioNoise,
     all_pairs,
     common_reference,
     every_range,
     ring,
 )
+from uwb_tdoa_tools.planning.maps import Grid
 from uwb_tdoa_tools.planning.precision import (
     NORMAL_99,
     bound,

@@ -11,18 +11,16 @@ from scipy.stats import norm
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_tools.planning.goal import Goal
 from uwb_tdoa_tools.planning.hall import Hall
-from uwb_tdoa_tools.planning.installation import Installation
-from uwb_tdoa_tools.planning.judging import (
+from uwb_tdoa_tools.planning.installation import FixedNoise, Installation, RadioNoise, all_pairs
+from uwb_tdoa_tools.planning.layout import Goal
+from uwb_tdoa_tools.planning.maps import (
     IMPRECISE,
     TWO_SOLUTIONS,
     Demand,
     judge,
     other_solutions,
 )
-from uwb_tdoa_tools.planning.noise import FixedNoise, RadioNoise
-from uwb_tdoa_tools.planning.pairing import all_pairs
 from uwb_tdoa_tools.planning.second_minimum import CLEAR, FLIP
 from uwb_tdoa_tools.simulation.constellations import constellation, corners
 from uwb_tdoa_tools.simulation.room import Room
@@ -130,7 +128,7 @@ def test_in_a_hall_a_wall_or_a_missing_anchor_gains_a_place_only_by_a_lost_minim
     x, y = rng.uniform(room.lower, room.upper)[:2]
     found, heard = whole.judge(points)
     fewer = Anchors.from_positions(positions[:-1])
-    for less in (replace(whole, walls=Walls(((x, 0.0, x, y, np.inf),))), whole.of(fewer)):
+    for less in (replace(whole, walls=Walls(((x, 0.0, x, y, np.inf),))), whole.with_anchors(fewer)):
         other, count = less.judge(points)
         assert (count <= heard).all() and (found.error <= other.error * (1.0 + 1e-9)).all()
         for row in np.flatnonzero(other.flyable & ~found.flyable):
@@ -223,7 +221,7 @@ def test_more_anchors_leave_a_round_less_doubt():
 
 
 def test_ranges_have_one_solution():
-    from uwb_tdoa_tools.planning.pairing import every_range
+    from uwb_tdoa_tools.planning.installation import every_range
 
     installation = Installation(corners(), FixedNoise(0.1), every_range(8))
     points = np.random.default_rng(0).uniform([-3, -3, 0.3], [3, 3, 2.5], (300, 3))
