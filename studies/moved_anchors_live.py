@@ -66,13 +66,18 @@ def named(kind, seed):
         write_bag(flight, folder / "flight.bag")
         given = {"effects_file": str(folder / "effects.yaml")}
         said = run_live(folder / "flight.bag", folder, RATE, given, given, lambda text: None)
-    sentences = said.ekf["changed since the start"].split("; ")
     return {
         "kind": kind,
         "seed": seed,
         "ids": ids,
         "offline": offline,
-        "node": _ids([_about(sentence) for sentence in sentences if _about(sentence)]),
-        "said": sentences,
+        "node": ids_of(said.ekf["changed since the start"]),
+        "said": said.ekf["changed since the start"],
         "lost": accounts(said.bias, said.ekf, flight)["lost"],
     }
+
+
+def ids_of(text):
+    """Return the ids of changed anchors in the diagnostics of ekf_node, "changed since the start"."""
+    beginnings = map(_about, text.split("; "))
+    return _ids(filter(None, beginnings))

@@ -34,9 +34,8 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.anchors import Anchors
 
 
-FLAT_SUBSET = (
-    0.05  # thickness over length; anchors so close to a line (plane) mirror every position in it
-)
+# thickness over length: anchors so close to a line (plane) mirror each position in it
+FLAT_SUBSET = 0.05
 MOST_SUBSETS = 2000
 _CHUNK = 500_000  # numbers in the largest array of one step
 
@@ -157,17 +156,8 @@ SWEEPS = 40
 SOLVED = 1e-9  # m, residual of a solution
 APART = 3e-4  # of the anchors' extent: two solutions nearer than this are one
 DIRECTIONS = 12  # of the starts in a plane; in space three times as many
-RADII = (
-    0.03,
-    0.1,
-    0.3,
-    0.7,
-    1.5,
-    4.0,
-    12.0,
-    40.0,
-    150.0,
-)  # of the starts, over the anchors' extent
+# of the starts, over the anchors' extent
+RADII = (0.03, 0.1, 0.3, 0.7, 1.5, 4.0, 12.0, 40.0, 150.0)
 
 
 def solutions(points: np.ndarray, corners: np.ndarray, dimensions: int) -> np.ndarray:

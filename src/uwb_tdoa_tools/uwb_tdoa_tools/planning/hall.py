@@ -155,30 +155,20 @@ class Hall:
         )
 
 
-FIRST = (
-    0.4,
-    0.4,
-    0.1,
-    0.1,
-    0.85,
-)  # of the first pattern: margins, stagger and heights, see `_pattern`
+# margins, stagger and heights of the first pattern, see `_pattern`
+FIRST = (0.4, 0.4, 0.1, 0.1, 0.85)
 LOWEST = 0.5  # m above the floor, of an anchor
-SPACINGS = (
-    1.2,
-    0.25,
-    0.88,
-)  # of the reach: the first pattern, the densest, and each over the one before
+# of the reach: the first spacing, the densest, and the ratio of each to the one before
+SPACINGS = (1.2, 0.25, 0.88)
 MOST = 400  # anchors of a pattern that is tried
 SEARCH_CELLS = 500  # places that a search looks at
 # of the logarithm of the bound, over which a place turns from precise to imprecise while a search
 # goes on
 SOFT = 0.15
 FINE = 0.02  # weight of the mean logarithm of the bound beside the share
-TRIALS, MOVES, TURNS = (
-    60,
-    40,
-    10,
-)  # layouts of one pattern, of an anchor that is moved, directions of one
+TRIALS = 60  # layouts of one pattern
+MOVES = 40  # places of an anchor that is moved
+TURNS = 10  # directions of an anchor
 MOVED = 3  # neighbours of an anchor that is taken away
 FARTHEST = 4.0  # m that they are moved by, along each axis
 

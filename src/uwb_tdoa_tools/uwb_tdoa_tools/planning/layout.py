@@ -144,9 +144,8 @@ def spread(points: np.ndarray, count: int) -> np.ndarray:
 
 
 OBJECTIVES = ("worst", "mean")
-UNUSABLE = (
-    100.0  # m, what an infinite bound counts for, and a layout from which no position follows
-)
+# m, stands for an infinite bound, and for a layout that determines no position
+UNUSABLE = 100.0
 
 
 @dataclass(frozen=True)

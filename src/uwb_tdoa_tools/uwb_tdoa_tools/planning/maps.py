@@ -30,8 +30,7 @@ if TYPE_CHECKING:
     # gives the same items, and prints how many are done
     Wrap = Callable[[Iterable[Any]], Iterable[Any]]
 
-# m, of the bound of one round, beyond which a place counts as imprecise unless somebody asks for
-# another
+# m, of the bound of one round: the default of --accuracy
 ACCURACY = 0.5
 CRITERIA = {
     "round": "a whole round of all that is heard has one solution",
@@ -40,9 +39,8 @@ CRITERIA = {
         "sec. 2.3.2)"
     ),
 }
-FLYABLE, TWO_SOLUTIONS, IMPRECISE, TOO_FEW, OUTSIDE = range(
-    5
-)  # of a place; OUTSIDE of the hull counts with "pairings" only
+# States of a place. OUTSIDE of the hull counts with "pairings" only.
+FLYABLE, TWO_SOLUTIONS, IMPRECISE, TOO_FEW, OUTSIDE = range(5)
 _CHUNK = 2_000_000  # numbers in the largest array of one step
 _EVERYWHERE = Room(np.full(3, -np.inf), np.full(3, np.inf))
 

@@ -33,12 +33,8 @@ Result = TypeVar("Result")
 SOFT = 0.05  # of |q|^2 - 1, over which failure sets in where derivatives are needed
 EDGE = 0.05  # m over which the hull ends, likewise
 FAILED = 10.0  # of the objective, a logarithm
-SHAKEN = (
-    0.0,
-    1e-3,
-    1e-2,
-    0.1,
-)  # of the allowed range: random steps of a start without a defined goal
+# of the allowed range: random steps of a start without a defined goal
+SHAKEN = (0.0, 1e-3, 1e-2, 0.1)
 LEAST_GAIN = 1e-4  # of the objective: a step that gains less is the last
 _CHUNK = 1_000_000  # numbers in the largest array of one step
 
@@ -160,15 +156,15 @@ def descend(
         if not np.isfinite(x).all():
             raise InputError("layout: no numbers")  # SLSQP has been seen to ask for NaN
         x = np.clip(x, low, high)
-        if (key := x.tobytes()) not in seen:
+        key = x.tobytes()
+        if key not in seen:
             seen.clear()
             errors, slopes = errors_and_slopes(goal, layout, x, points)
             failing, more = failing_and_slopes(goal, layout, x, points)
             seen[key] = errors, slopes, failing, more
-            if (
-                value := (errors.mean() if goal.objective == "mean" else errors.max())
-                * (1.0 + failing)
-            ) < best[0]:
+            size_of_errors = errors.mean() if goal.objective == "mean" else errors.max()
+            value = size_of_errors * (1.0 + failing)
+            if value < best[0]:
                 best[:] = value, x
         return seen[key]
 
@@ -408,20 +404,18 @@ def _refined(goal: Goal, layout: Layout, x: np.ndarray, rows: np.ndarray) -> np.
         worst = np.argsort(-errors)[: 1 + len(errors) // 20]
         rows = np.union1d(rows, worst[spread(goal.points[worst], ADDED)])
         x = descend(goal, layout, goal.points[rows], x, SWEEPS)
-        if (found := goal.score(layout.anchors(x))) < score:
+        found = goal.score(layout.anchors(x))
+        if found < score:
             best, score = x, found
     return best
 
 
-LOOKED_AT, VERIFIED = (
-    600,
-    4,
-)  # cells that all places are tried on, and places that are judged on all cells
+LOOKED_AT = 600  # cells on which all places are tried
+VERIFIED = 4  # places that are judged on all cells
 PRECISION_WEIGHT = 0.2  # of the share of the room: what halving the bound is worth twice
-LEAST_SHARE, LEAST_PRECISION = (
-    0.01,
-    0.05,
-)  # share of the room, and of the bound: less than both is not worth an anchor
+# An anchor that gains less than both is not worth it.
+LEAST_SHARE = 0.01  # of the room
+LEAST_PRECISION = 0.05  # of the bound
 
 
 class JudgeAddition(Protocol):

@@ -540,7 +540,16 @@ def _anchors(ax: Axes, anchors: Anchors) -> None:
     turned = np.isfinite(anchors.orientations).all(axis=1)
     if turned.any():
         front = _directions(anchors)[turned]
-        ax.quiver(*p[turned, :2].T, *front.T, color=ANCHOR, width=0.004, scale=25, zorder=5)
+        ax.quiver(
+            *p[turned, :2].T,
+            *front.T,
+            color=ANCHOR,
+            width=0.005,
+            scale=25,
+            edgecolor="w",
+            linewidth=0.5,
+            zorder=5,
+        )
 
 
 def _directions(anchors: Anchors) -> np.ndarray:

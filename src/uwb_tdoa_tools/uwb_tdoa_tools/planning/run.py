@@ -39,13 +39,10 @@ if TYPE_CHECKING:
     from .maps import Chart
 
 FARTHEST = 30.0  # m, size of a room from which on the radio's reach must be given
-CELLS_ACROSS = {
-    "slice": 100,
-    "volume": 50,
-}  # cells along the longest side, unless --step says otherwise
-FLOWN_CELLS = (
-    300  # cells of the flown volume whose corners are looked at while better anchors are searched
-)
+# cells along the longest side, without --step
+CELLS_ACROSS = {"slice": 100, "volume": 50}
+# cells of the flown volume; a search for better anchors looks at their corners
+FLOWN_CELLS = 300
 
 
 @dataclass(frozen=True)
@@ -240,10 +237,9 @@ def _box(name: str, numbers: Sequence[float]) -> Room:
 
 
 PLACES_TRIED = 60  # places on the walls of a room that are tried for one more anchor, about
-IN_HALL = (
-    0.35,
-    (1.0, 4.0),
-)  # of the reach, between places that are tried in a hall; m above the floor
+# Places that are tried in a hall:
+HALL_SPACING = 0.35  # of the reach, between them
+HALL_HEIGHTS = (1.0, 4.0)  # m above the floor
 
 
 def plan_hall(
@@ -310,9 +306,8 @@ def _designed(
 
 def _places_in_hall(room: Room, reach: float) -> np.ndarray:
     """Return the places that are tried for one more anchor in a hall: (n, 3) m."""
-    step, heights = IN_HALL
-    z = [min(room.lower[2] + height, room.upper[2]) for height in heights]
-    across = lattice([*room.lower[:2], 0.0], [*room.upper[:2], 0.0], step * reach)[:, :2]
+    z = [min(room.lower[2] + height, room.upper[2]) for height in HALL_HEIGHTS]
+    across = lattice([*room.lower[:2], 0.0], [*room.upper[:2], 0.0], HALL_SPACING * reach)[:, :2]
     return np.unique(
         np.vstack([np.column_stack([across, np.full(len(across), height)]) for height in z]).round(
             1
