@@ -15,8 +15,10 @@ from studies import (
     lockstep,
     monitor,
     moved_anchors,
+    moved_anchors_live,
     noise,
     odd_messages,
+    plans,
     ranges,
     recalibrating,
     rover,
@@ -62,8 +64,10 @@ STUDIES = {
     "lockstep": lockstep,
     "monitor": monitor,
     "moved-anchors": moved_anchors,
+    "moved-anchors-live": moved_anchors_live,
     "noise": noise,
     "odd-messages": odd_messages,
+    "plans": plans,
     "random-splits": splits,
     "ranges": ranges,
     "recalibrating": recalibrating,
@@ -102,8 +106,10 @@ of measured flights: flights/, util/, surveys/.
   lockstep         replays that follow the nodes, at several rates (docs/reliability.md)
   monitor          what the monitor of ekf_node names in flight (docs/reliability.md)
   moved-anchors    anchors that were moved or exchanged, and who names them (docs/localizing.md)
+  moved-anchors-live  some of these recordings, played to the real nodes (docs/localizing.md)
   noise            whether covariances are honest after a calibration (docs/calibration.md)
   odd-messages     messages that no driver should send, to every node (docs/reliability.md)
+  plans            random rooms and halls against an independent solver, and against a rerun (docs/planning.md)
   random-splits    bias models trained on flights drawn at random, and judged on the others (docs/bias.md)
   ranges           simulated distances to anchors against the bound of plan (docs/sensors.md)
   recalibrating    surveys that start from the last one, after something changed (docs/calibration.md)
@@ -168,8 +174,10 @@ def parser():
         ),
         "./dev study localizing DATA/flights DATA/util --survey DATA/surveys --mistakes",
         "./dev study moved-anchors DATA/flights --survey DATA/surveys --draws 10 --json moved.json",
+        "./dev study moved-anchors-live --draws 3",
         "./dev study noise --data DATA --split const1",
         "./dev study odd-messages 10000",
+        "./dev study plans --json plans.json",
         "./dev study random-splits DATA/flights/0426 --survey DATA/surveys --out splits.jsonl",
         "./dev study ranges --flights 5",
         "./dev study recalibrating --data DATA --only const1",

@@ -15,9 +15,7 @@ from uwb_tdoa_bias.foundation.flight import Flight, Tdoas
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import without_offset
 from uwb_tdoa_tools.estimate import FlightEstimator
-from uwb_tdoa_tools.planning.installation import Installation
-from uwb_tdoa_tools.planning.noise import FixedNoise
-from uwb_tdoa_tools.planning.pairing import every_range
+from uwb_tdoa_tools.planning.installation import FixedNoise, Installation, every_range
 from uwb_tdoa_tools.planning.precision import bound, information, position_error
 from uwb_tdoa_tools.scoring.evaluation import evaluate, score_of
 from uwb_tdoa_tools.scoring.metrics import position_at, scored_phase

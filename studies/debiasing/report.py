@@ -85,8 +85,8 @@ def plot_set_up(found, maps, path):
         "network": maps["static, network"],
         "thin plate": maps["static, thin_plate"],
     }
-    figure, axes = plt.subplots(1, 3, figsize=(13, 5.7), layout="constrained", sharey=True)
-    for ax, (title, one) in zip(axes, sides.items()):
+    figure, axes = plt.subplots(2, 2, figsize=(7, 7.4), layout="constrained")
+    for ax, (title, one) in zip(axes.ravel(), sides.items()):
         for name, colour in (("calibration", "tab:gray"), ("validation", "tab:red")):
             true = np.array([stay.true[0, :2] for stay in found[name]])
             bias = np.array([_mean_error(stay, one) for stay in found[name]])
@@ -97,22 +97,25 @@ def plot_set_up(found, maps, path):
                 scale_units="xy",
                 scale=0.2,
                 color=colour,
-                width=0.004,
+                width=0.006,
                 label=name,
             )
         size = np.mean([np.hypot(*_mean_error(stay, one)) for stay in found["validation"]])
         ax.set(
-            title=f"{title}: {100 * size:.1f} cm at the validation points",
             xlabel="x, m",
+            ylabel="y, m",
             aspect="equal",
-            xlim=(-2.7, 2.9),
-            ylim=(-2.6, 3.3),
+            xlim=(-3.3, 3.3),
+            ylim=(-2.6, 2.6),
         )
-        ax.plot([-2, 2, 2, -2], [-2, -2, 2, 2], "k^")
-    axes[0].set_ylabel("y, m")
-    axes[0].legend(loc="upper right", fontsize="small")
-    figure.suptitle("Bias of the position, arrows five times as long as the bias")
-    write_filled(path, partial(figure.savefig, dpi=80))
+        ax.set_title(f"{title}: {100 * size:.1f} cm", fontsize=10)
+        ax.plot([-2, 2, 2, -2], [-2, -2, 2, 2], "k^", label="anchor")
+    axes[1, 1].axis("off")
+    axes[1, 1].legend(*axes[0, 0].get_legend_handles_labels(), loc="center left", frameon=False)
+    figure.suptitle(
+        "Bias of the position, five times as long, and its mean at the validation points"
+    )
+    write_filled(path, partial(figure.savefig, dpi=100))
     plt.close(figure)
 
 

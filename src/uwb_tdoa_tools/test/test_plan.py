@@ -12,7 +12,7 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.flyable import FlyableVolume
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands import plan
-from uwb_tdoa_tools.planning import advice, run
+from uwb_tdoa_tools.planning import optimisation, run
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.rooms import corners
 
@@ -223,8 +223,8 @@ def test_one_figure_of_the_room_and_an_anchor_that_makes_it_larger(tmp_path, cap
 
 
 def test_where_no_anchor_helps_it_says_so(anchors, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(run, "TRIED", 4)
-    monkeypatch.setattr(advice, "FINER", 0.9)
+    monkeypatch.setattr(run, "PLACES_TRIED", 4)
+    monkeypatch.setattr(optimisation, "LEAST_PRECISION", 0.9)
     assert (
         plan.main([anchors, "--step", "1", "--accuracy", "5", "--out", str(tmp_path / "out")]) == 0
     )

@@ -5,11 +5,14 @@ import pytest
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_tools.planning.bifurcation import MOST_SUBSETS, Subsets
-from uwb_tdoa_tools.planning.check import brute_force
+from uwb_tdoa_tools.planning.bifurcation import (
+    MOST_SUBSETS,
+    Subsets,
+    same_place,
+    solutions,
+)
 from uwb_tdoa_tools.planning.installation import Installation
-from uwb_tdoa_tools.planning.maps import Grid
-from uwb_tdoa_tools.planning.multistart import same_place, solutions
+from uwb_tdoa_tools.planning.maps import Grid, brute_force
 from uwb_tdoa_tools.simulation.rooms import constellation, corners
 
 SQUARE = Anchors.from_positions([[0, 0, 0.2], [4, 0, 0.2], [4, 4, 0.2], [0, 4, 0.2]])

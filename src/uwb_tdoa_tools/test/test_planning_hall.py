@@ -8,11 +8,10 @@ import pytest
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_tools.commands.plan import main
-from uwb_tdoa_tools.planning.goal import Goal
 from uwb_tdoa_tools.planning.hall import Hall
 from uwb_tdoa_tools.planning.installation import Installation
-from uwb_tdoa_tools.planning.judging import TOO_FEW, Demand
-from uwb_tdoa_tools.planning.maps import Grid, chart
+from uwb_tdoa_tools.planning.layout import Goal
+from uwb_tdoa_tools.planning.maps import TOO_FEW, Demand, Grid, chart
 from uwb_tdoa_tools.planning.optimisation import with_one
 from uwb_tdoa_tools.planning.report import summary
 from uwb_tdoa_tools.planning.run import hall_advice
@@ -97,7 +96,7 @@ def test_one_more_anchor_is_proposed_near_the_hole_and_gains_what_is_promised():
         added["gain"] > 0.02 and np.hypot(*(np.array(added["position"][:2]) - 28.0)) < 2.0 * REACH
     )
     assert np.linalg.norm(anchors.positions - added["position"], axis=1).min() >= 1.0
-    again = hall.of(with_one(anchors, np.array(added["position"]))).chart(grid, jobs=1)
+    again = hall.with_anchors(with_one(anchors, np.array(added["position"]))).chart(grid, jobs=1)
     assert again.flyable.mean() == pytest.approx(added["flyable_share"], abs=1e-12)
     assert summary(again)["bound_flyable"] == pytest.approx(added["bound_flyable"], abs=1e-12)
 
@@ -108,7 +107,7 @@ def test_what_differs_in_one_place_is_judged_as_the_whole_is():
     before, rest = hall.judge(points)[0], anchors.only(np.delete(np.arange(len(anchors)), 17))
     changed, anew = (
         hall.changed(before, points, rest, anchors.positions[[17]]),
-        hall.of(rest).judge(points)[0],
+        hall.with_anchors(rest).judge(points)[0],
     )
     np.testing.assert_array_equal(changed.status, anew.status)
     np.testing.assert_allclose(changed.error, anew.error, rtol=1e-9)

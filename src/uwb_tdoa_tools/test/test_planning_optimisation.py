@@ -1,18 +1,251 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_tools.planning.goal import Goal
-from uwb_tdoa_tools.planning.installation import Installation
-from uwb_tdoa_tools.planning.judging import Demand
-from uwb_tdoa_tools.planning.noise import FixedNoise
-from uwb_tdoa_tools.planning.optimisation import BESIDE, one_more, optimise
-from uwb_tdoa_tools.planning.places import AnchorPlaces, lattice
+from uwb_tdoa_tools.planning import optimisation
+from uwb_tdoa_tools.planning.bifurcation import Subsets
+from uwb_tdoa_tools.planning.installation import FixedNoise, Installation
+from uwb_tdoa_tools.planning.layout import UNUSABLE, AnchorPlaces, Goal, Layout, lattice, spread
+from uwb_tdoa_tools.planning.maps import Demand
+from uwb_tdoa_tools.planning.optimisation import (
+    BESIDE,
+    descend,
+    errors_and_slopes,
+    failing_and_slopes,
+    optimise,
+    scores_of_one_more,
+)
 from uwb_tdoa_tools.readers import read_survey
-from uwb_tdoa_tools.simulation.rooms import constellation, facing
+from uwb_tdoa_tools.simulation.rooms import constellation, corners, facing
 
 ROOM = np.array([0.0, 0.0, 0.0]), np.array([6.0, 5.0, 3.0])
+
+
+def test_places_on_walls():
+    places = AnchorPlaces.walls(*ROOM)
+    assert places.numbers == 2
+    p = places.positions(np.random.default_rng(0).random((2000, 2)))
+    on_x, on_y = np.isin(p[:, 0], (0.0, 6.0)), np.isin(p[:, 1], (0.0, 5.0))
+    assert (on_x | on_y).all() and 0.4 < on_y.mean() < 0.7
+    assert (p >= [0, 0, 0.2]).all() and (p <= ROOM[1]).all()
+    np.testing.assert_allclose(np.ptp(p, axis=0), [6, 5, 2.8], atol=0.02)
+
+
+def test_places_along_walls():
+    places = AnchorPlaces.walls(*ROOM, depth=0.5)
+    assert places.numbers == 3
+    np.testing.assert_allclose(places.lengths, [22.0, 2.8, 0.5])
+    p = places.positions(np.random.default_rng(0).random((2000, 3)))
+    away = np.minimum(p, ROOM[1] - p)[:, :2].min(axis=1)
+    assert (away <= 0.5).all() and away.max() > 0.45 and (p[:, 2] >= 0.2).all()
+
+
+def test_places_of_all_shapes():
+    places = AnchorPlaces([[0, 0, 0, 1, 2, 3], [5, 5, 5, 5, 5, 5], [7, 0, 1, 9, 0, 1]])
+    assert places.numbers == 3
+    p = places.positions(np.random.default_rng(0).random((4000, 3)))
+    block, post, rail = (
+        p[:, 0] <= 1,
+        (p == 5).all(axis=1),
+        (p[:, 0] >= 7) & (p[:, 1] == 0) & (p[:, 2] == 1),
+    )
+    assert (block | post | rail).all() and block.any() and rail.any()
+    np.testing.assert_allclose(p[block].max(axis=0), [1, 2, 3], atol=0.05)
+    np.testing.assert_allclose(
+        AnchorPlaces([[5, 5, 5, 5, 5, 5]]).positions(np.array([0.3, 0.9])), [5, 5, 5]
+    )
+
+
+def test_nearest_place():
+    places = AnchorPlaces.walls(*ROOM)
+    wanted = np.array([[6.3, 2.0, 1.0], [3.0, -0.5, 2.8], [0.0, 5.0, 0.2]])
+    got = places.positions(places.nearest(wanted))
+    np.testing.assert_allclose(got, [[6, 2, 1], [3, 0, 2.8], [0, 5, 0.2]], atol=0.15)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "places: []",
+        "places: [[1, 2, 3]]",
+        "walls: 4",
+        "- 1",
+        "places: [[0, 0, 0, 1, 1, -1]]",
+        "a: [",
+        "places: [[0, 0, 0, 1, 1, x]]",
+    ],
+)
+def test_bad_places(content, tmp_path):
+    (tmp_path / "places.yaml").write_text(content)
+    with pytest.raises(InputError, match="places"):
+        AnchorPlaces.from_yaml(tmp_path / "places.yaml")
+
+
+def test_a_lattice_holds_the_corners():
+    p = lattice((0, 0, 1), (2, 1, 1), 0.6)
+    assert {(0, 0, 1), (2, 1, 1), (0, 1, 1), (2, 0, 1)} <= set(map(tuple, p.tolist())) and len(
+        p
+    ) == 5 * 3
+    assert np.diff(np.unique(p[:, 0])).max() <= 0.6
+
+
+def test_a_spread_begins_with_the_corners_and_covers_the_rest():
+    p = lattice((0, 0, 1), (5, 4, 2), 0.5)
+    rows = spread(p, 40)
+    assert len(set(rows)) == 40
+    assert set(map(tuple, p[rows[:8]])) == {
+        (x, y, z) for x in (0, 5) for y in (0, 4) for z in (1, 2)
+    }
+    assert np.linalg.norm(p[:, None] - p[rows], axis=-1).min(axis=1).max() <= 1.0
+    assert sorted(spread(p[:5], 40)) == [0, 1, 2, 3, 4] and len(spread(p, 3)) == 3
+
+
+WIDE_ROOM = np.array([-4.0, -4.5, 0.0]), np.array([4.0, 4.5, 3.0])
+POINTS = lattice((-3.2, -3.1, 0.5), (2.9, 3.3, 2), 1.6)
+
+
+def case(
+    pairing="ring",
+    link_std=0.0,
+    dimensions=3,
+    fixed=None,
+    depth=0.0,
+    objective="worst",
+    criterion="pairings",
+):
+    installation = Installation(corners(), link_std=link_std, dimensions=dimensions)
+    count, places = 6 if fixed is None else 2, AnchorPlaces.walls(*WIDE_ROOM, depth=depth)
+    layout = Layout(places, count, fixed, np.array([0.0, 0.0, 1.5]))
+    x = layout.start(places.nearest(corners().positions[-count:]))
+    x += np.random.default_rng(4).uniform(-0.1, 0.1, len(x))
+    return (
+        Goal(POINTS, installation, pairing, objective, Demand(criterion=criterion)),
+        layout,
+        np.clip(x, *np.transpose(layout.bounds)),
+    )
+
+
+CASES = [
+    {},
+    {"pairing": "all_pairs", "depth": 0.5},
+    {"pairing": "ring_uncorrelated"},
+    {"link_std": 0.05},
+    {"dimensions": 2},
+    {"fixed": Anchors([3, 5, 1, 9, 2], corners().positions[:5], corners().orientations[:5])},
+]
+
+
+@pytest.mark.parametrize("options", CASES, ids=lambda options: "-".join(options) or "plain")
+def test_slopes_are_those_of_numerical_differentiation(options):
+    goal, layout, x = case(**options)
+
+    def bound(x):
+        return goal.errors(layout.anchors(x))
+
+    def failing(x):
+        return failing_and_slopes(goal, layout, x, POINTS)[0]
+
+    errors, slopes = errors_and_slopes(goal, layout, x, POINTS)
+    np.testing.assert_allclose(errors, bound(x), rtol=1e-9)
+    share, along = failing_and_slopes(goal, layout, x, POINTS)
+    assert 0.05 < share < 0.95
+    for k, step in enumerate(1e-5 * np.eye(len(x))):
+        np.testing.assert_allclose(
+            slopes[:, k], (bound(x + step) - bound(x - step)) / 2e-5, atol=2e-4 * slopes.max()
+        )
+        assert along[k] == pytest.approx(
+            (failing(x + step) - failing(x - step)) / 2e-5, abs=1e-3 * np.abs(along).max()
+        )
+
+
+@pytest.mark.parametrize("dimensions", [2, 3])
+def test_slopes_of_the_discriminant(dimensions):
+    rng = np.random.default_rng(0)
+    positions, weights = corners().positions + rng.normal(0.0, 0.2, (8, 3)), None
+
+    def weighed(p):
+        found = Subsets(Anchors.from_positions(p), dimensions).discriminant(POINTS)
+        return np.sum(weights * found)
+
+    subsets = Subsets(Anchors.from_positions(positions), dimensions)
+    weights = rng.random((len(POINTS), len(subsets.rows)))
+    got, step = subsets.slopes(POINTS, weights), 1e-6
+    for at in np.ndindex(8, 3):
+        moved = np.zeros((8, 3))
+        moved[at] = step
+        wanted = (weighed(positions + moved) - weighed(positions - moved)) / (2 * step)
+        assert got[at] == pytest.approx(wanted, rel=1e-4, abs=1e-4 * np.abs(got).max())
+
+
+@pytest.mark.parametrize("objective", ["worst", "mean"])
+def test_a_descent_goes_down_and_stays_in_bounds(objective):
+    goal, layout, x = case(objective=objective, criterion="round")
+    found = descend(goal, layout, POINTS, x, 15)
+    low, high = np.transpose(layout.bounds)
+    assert (found >= low).all() and (found <= high).all()
+    before, after = (goal.figures(layout.anchors(y))[objective] for y in (x, found))
+    assert after < 0.9 * before
+
+
+def test_anchors_that_locate_nothing_have_no_slopes():
+    goal, layout, x = case()
+    low = Layout(
+        AnchorPlaces([[0, 0, 1, 6, 5, 1]]), 6, None, np.zeros(3)
+    )  # all in one plane, with the points beside it
+    x, points = low.start(np.random.default_rng(0).random((6, 2))), POINTS * [1, 1, 0] + [0, 0, 1]
+    errors, slopes = errors_and_slopes(goal, low, x, points)
+    assert (errors == UNUSABLE).all() and not slopes.any()
+    with pytest.raises(InputError, match="plane"):
+        failing_and_slopes(goal, low, x, points)
+    with pytest.raises(InputError, match="hull"):
+        failing_and_slopes(goal, low, np.zeros(6 * low.width), points)  # all in one place
+
+
+@pytest.mark.parametrize("objective", ["worst", "mean"])
+def test_a_descent_leaves_a_start_at_which_the_goal_cannot_be_told(objective):
+    """A slope of zero that was made up there would be a valley: the descent would be over before it
+    began.
+    """
+    goal, layout, x = case(objective=objective)
+    level = np.column_stack(
+        [np.linspace(0.05, 0.95, 6), np.full(6, 0.5)]
+    )  # round the walls, half-way up
+    x = layout.start(level)
+    goal = replace(goal, points=POINTS * [1, 1, 0] + [0, 0, 1.5])
+    with pytest.raises(InputError):
+        failing_and_slopes(goal, layout, x, goal.points)
+    found = descend(goal, layout, goal.points, x, 15)
+    assert goal.score(layout.anchors(x)) >= UNUSABLE
+    assert goal.score(layout.anchors(found)) < 1.0
+
+
+@pytest.mark.parametrize("objective", ["worst", "mean"])
+def test_a_descent_does_not_end_where_the_goal_cannot_be_told(objective, monkeypatch):
+    """Told only within 0.02 of the start, which the first step leaves."""
+    goal, layout, x = case(objective=objective, criterion="round")
+    before = goal.figures(layout.anchors(x))[objective]
+
+    def told_near(goal, layout, at, points):
+        if np.abs(at - x).max() > 0.02:
+            raise InputError("too far")
+        return failing_and_slopes(goal, layout, at, points)
+
+    monkeypatch.setattr(optimisation, "failing_and_slopes", told_near)
+    found = descend(goal, layout, POINTS, x, 15)
+    assert 1e-4 < np.abs(found - x).max() <= 0.02
+    assert goal.figures(layout.anchors(found))[objective] < before
+
+
+def test_a_start_that_no_shaking_helps_is_given_back():
+    goal, _, _ = case()
+    low = Layout(AnchorPlaces([[0, 0, 1, 6, 5, 1]]), 6, None, np.zeros(3))
+    x = low.start(np.random.default_rng(0).random((6, 2)))
+    np.testing.assert_array_equal(descend(goal, low, POINTS, x, 15), x)
+
+
 MARGIN = np.array([0.8, 0.8, 0.6])  # m of a room that are not flown
 
 
@@ -61,7 +294,7 @@ def test_one_more_anchor():
     fixed = Anchors([4, 0, 9, 2, 1], bad_anchors().positions, bad_anchors().orientations, "hall")
     aim = goal(Installation(fixed), "round")
     places = AnchorPlaces.walls(*ROOM)
-    numbers, scores = one_more(aim, fixed, places, count=60)
+    numbers, scores = scores_of_one_more(aim, fixed, places, count=60)
     positions = places.positions(numbers)
     assert 30 < len(positions) == len(scores) < 120
     assert np.linalg.norm(positions[:, None] - fixed.positions, axis=2).min() >= BESIDE

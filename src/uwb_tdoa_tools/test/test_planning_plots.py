@@ -9,12 +9,10 @@ from PIL import Image
 import pytest
 
 from uwb_tdoa_tools.planning import plots
-from uwb_tdoa_tools.planning.goal import Goal
 from uwb_tdoa_tools.planning.installation import Installation
-from uwb_tdoa_tools.planning.judging import IMPRECISE, Demand
-from uwb_tdoa_tools.planning.maps import Grid, chart
-from uwb_tdoa_tools.planning.optimisation import one_more
-from uwb_tdoa_tools.planning.places import AnchorPlaces, lattice
+from uwb_tdoa_tools.planning.layout import AnchorPlaces, Goal, lattice
+from uwb_tdoa_tools.planning.maps import IMPRECISE, Demand, Grid, chart
+from uwb_tdoa_tools.planning.optimisation import scores_of_one_more
 from uwb_tdoa_tools.scoring.plots import draw_labels, plt
 from uwb_tdoa_tools.simulation.rooms import corners
 
@@ -87,6 +85,20 @@ def test_the_legend_states_the_share_of_each_state_that_there_is(found, figures)
     assert "75 % of the room" in title
 
 
+def test_anchors_a_little_beyond_a_map_are_inside_the_picture(figures):
+    anchors, near = corners(), corners().positions[:, :2] + [0.5, -0.5]
+    moved = anchors.at(np.column_stack([near, anchors.positions[:, 2]]))
+    low, high = anchors.positions.min(axis=0), anchors.positions.max(axis=0)
+    found = chart(Installation(anchors), Grid.box(low, high, 0.5), Demand())
+    plots.plot_heard(moved, found, None)
+    plots.plot_heard(anchors.at(moved.positions + [50.0, 0.0, 0.0]), found, None)
+    (figure, _), (far, _) = figures
+    ax, other = figure.axes[0], far.axes[0]
+    for values, ends in zip(near.T, (ax.get_xlim(), ax.get_ylim())):
+        assert ends[0] < values.min() and values.max() < ends[1]
+    assert np.ptp(other.get_xlim()) < 1.3 * (high - low)[0]
+
+
 def test_every_picture_is_700_pixels_wide(found, tmp_path):
     anchors, places = corners(), AnchorPlaces.walls((-3.5, -4, 0), (3.5, 4, 3))
     goal = Goal(FLOWN, Installation(anchors))
@@ -96,7 +108,8 @@ def test_every_picture_is_700_pixels_wide(found, tmp_path):
     plots.plot_layouts(
         [("before", Installation(anchors), found)] * 2, FLOWN, tmp_path / "layout.png"
     )
-    plots.plot_places(places, *one_more(goal, anchors, places, 40), tmp_path / "places.png")
+    scored = scores_of_one_more(goal, anchors, places, 40)
+    plots.plot_places(places, *scored, goal.objective, tmp_path / "places.png")
     for path in tmp_path.iterdir():
         assert Image.open(path).width == 700, path.name
 

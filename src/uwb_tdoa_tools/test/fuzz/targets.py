@@ -38,8 +38,8 @@ from uwb_tdoa_tools.bags.bag import read_bag, read_odometry
 from uwb_tdoa_tools.bags.message_types import typestore
 from uwb_tdoa_tools.bags.messages import tdoa_messages
 from uwb_tdoa_tools.evaluating import read_others
-from uwb_tdoa_tools.planning.noise import antenna_from_yaml
-from uwb_tdoa_tools.planning.places import AnchorPlaces
+from uwb_tdoa_tools.planning.installation import antenna_from_yaml
+from uwb_tdoa_tools.planning.layout import AnchorPlaces
 from uwb_tdoa_tools.readers import read_survey, read_usd_log, read_util_csv
 from uwb_tdoa_tools.readers.columns import parse_columns, read_columns
 from uwb_tdoa_tools.readers.names import NamedAnchors

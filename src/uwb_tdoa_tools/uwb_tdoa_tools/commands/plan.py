@@ -15,11 +15,10 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 
 from .. import cli, parallel
 from ..outputs import OutputFile, OutputFolder
-from ..planning import options, run
-from ..planning.goal import OBJECTIVES
-from ..planning.judging import ACCURACY, CRITERIA
-from ..planning.noise import RadioNoise
-from ..planning.pairing import OF_PROTOCOL, PAIRINGS
+from ..planning import run
+from ..planning.installation import OF_PROTOCOL, PAIRINGS, RadioNoise
+from ..planning.layout import OBJECTIVES
+from ..planning.maps import ACCURACY, CRITERIA
 from ..readers import inputs, read_survey
 
 if TYPE_CHECKING:
@@ -236,15 +235,15 @@ def parser() -> ArgumentParser:
 
 
 def _plan(args: Namespace) -> int:
-    options.check(args)
+    run.check_options(args)
     anchors = None if args.hall else read_survey(args.anchors)
-    room = options.room_for(args, anchors)
-    reach = options.reach_of(args, room)
-    installation = options.installation_of(
+    room = run.room_of_options(args, anchors)
+    reach = run.reach_of(args, room)
+    installation = run.installation_of(
         args, Anchors.from_positions([room.centre] * 2) if anchors is None else anchors
     )
-    demand = options.demand_of(args, installation, room)
-    grid = options.grid_of(args, room)
+    demand = run.demand_of(args, installation, room)
+    grid = run.grid_of(args, room)
     reading = inputs.Reading(args.anchors)
     recordings = reading.find(args.flights or [], bool(args.dask))
     if anchors is None or reach < np.inf:

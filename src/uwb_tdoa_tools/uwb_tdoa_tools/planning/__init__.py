@@ -1,5 +1,4 @@
-"""Where a tag can be located before a hole is drilled: precision, failure, accuracy, and better
-anchor layouts.
+"""Plan an installation: precision, failure, accuracy, and better anchor layouts.
 
     from uwb_tdoa_tools.planning.installation import Installation
     from uwb_tdoa_tools.planning.maps import Grid, chart

@@ -1,19 +1,21 @@
-"""Where positioning fails however precise it is: where the TDOAs of k + 1 anchors have two
-positions.
+"""Find where the TDOAs of k + 1 anchors have two solutions, by a formula and by a solver.
 
 With m_0 one of k + 1 anchors and r the tag's distance to it, the TDOAs D_i = |x - m_i| - r turn
     (r + D_i)^2 = |x - m_i|^2
 into k equations that are linear in x and r,
-    a_i . (x - m_0) + D_i r = (|a_i|^2 - D_i^2) / 2,   a_i = m_i - m_0:
-a line in the space of (x, r), x = m_0 + p + q r with A q = -D. It meets the cone |x - m_0| = r
-where
+    a_i . (x - m_0) + D_i r = (|a_i|^2 - D_i^2) / 2,   a_i = m_i - m_0.
+Their solution is a line in the space of (x, r): x = m_0 + p + q r with A q = -D. The line meets
+the cone |x - m_0| = r where
     (|q|^2 - 1) r^2 + 2 p.q r + |p|^2 = 0.
-One root is the tag. The product of the two is |p|^2 / (|q|^2 - 1): where |q| < 1 the other root is
-negative and belongs to no position, where |q| > 1 it is positive and belongs to a second position
-with the same TDOAs. So the position is unique where |q|^2 - 1 < 0, and |q| = 1 is the bifurcation
-curve (k = 2) or surface (k = 3). For k = 2, times det(A)^2, this is the polynomial of Compagnoni et
-al. (Inverse Problems 30, 2014, 035004) that Grasso et al. use in sec. 2.3.1. A tag of known height
-among anchors of other heights only adds constants to the right-hand sides, and nothing to |q|.
+One root is the tag. The product of both roots is |p|^2 / (|q|^2 - 1). If |q| < 1, the other root
+is negative and belongs to no position. If |q| > 1, it belongs to a second position with the same
+TDOAs. So |q| = 1 is the bifurcation curve (k = 2) or surface (k = 3).
+
+For k = 2, times det(A)^2, this is the polynomial of Compagnoni et al. (Inverse Problems 30, 2014,
+035004) that Grasso et al. use in sec. 2.3.1. If the height is known and the anchors have other
+heights, only the right-hand sides change, not |q|.
+
+The solver starts from many places and does not use this formula.
 """
 
 from __future__ import annotations
@@ -31,24 +33,26 @@ from .installation import principal_extents
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.anchors import Anchors
 
-FLAT_SUBSET = (
-    0.05  # thickness over length; anchors so close to a line (plane) mirror every position in it
-)
+
+# thickness over length: anchors so close to a line (plane) mirror each position in it
+FLAT_SUBSET = 0.05
 MOST_SUBSETS = 2000
 _CHUNK = 500_000  # numbers in the largest array of one step
 
 
 class Subsets:
-    """The pairings whose solutions are asked for: all choices of k + 1 anchors that are not flat.
+    """All choices of k + 1 anchors that are not flat.
 
-    rows : (Q, k + 1) rows of the anchors; left_out : number of flat ones, which mirror every
-        position and are no use.
-    Of more than MOST_SUBSETS choices, only those of anchors that come close together in the round
-    are taken.
+    rows : (Q, k + 1) rows of the anchors; left_out : number of flat choices. A flat choice mirrors
+    every position. If there are more than MOST_SUBSETS choices, only anchors that come close together
+    in the round are combined.
     """
 
     def __init__(self, anchors: Anchors, dimensions: int) -> None:
-        """anchors : Anchors; dimensions : k, 2 or 3. Raises InputError if all choices are flat."""
+        """Choose the subsets of Anchors for k dimensions, 2 or 3.
+
+        Raises InputError if all choices are flat.
+        """
         self.anchors, self.dimensions = anchors, dimensions
         candidates = _choices(len(anchors), dimensions + 1)
         corners = anchors.positions[candidates][:, :, :dimensions]
@@ -69,8 +73,7 @@ class Subsets:
         self._q[q[:, 0], :, self.rows[:, 0]] = inverse.sum(axis=2)
 
     def discriminant(self, points: np.ndarray) -> np.ndarray:
-        """|q|^2 - 1 of every subset: (n, Q), negative where the position is the only one with its
-        TDOAs.
+        """Return |q|^2 - 1 of each subset: (n, Q), negative where there is one solution.
 
         points : (n, 3) m.
         """
@@ -87,16 +90,15 @@ class Subsets:
         return out
 
     def ambiguous(self, points: np.ndarray) -> np.ndarray:
-        """Share of the subsets with two positions: (n,), 0 where every pairing has one."""
+        """Return the share of the subsets with two solutions: (n,)."""
         return np.mean(self.discriminant(points) > 0.0, axis=1)
 
     def slopes(self, points: np.ndarray, weights: np.ndarray) -> np.ndarray:
-        """Derivatives of the sum of weights (n, Q) times the discriminants along the anchors'
-        positions: (N, 3) 1/m.
+        """Return the derivatives of a weighted sum of discriminants along the anchors: (N, 3) 1/m.
 
-        With A q = -D and u_j the direction from anchor j to the tag, d|q|^2 / dm_j = 2 c_j (q -
-        u_j), where c_j is q times the column of j in q = columns @ distances; along a known height,
-        where q has no part, -2 c_j u_j.
+        weights : (n, Q), of each discriminant. With A q = -D and u_j the direction from anchor j to the
+        tag, d|q|^2 / dm_j = 2 c_j (q - u_j). Here c_j is q times the column of j in q = columns @
+        distances. Along a known height, where q has no part, the derivative is -2 c_j u_j.
         """
         distances, unit = ranges(points[:, None], self.anchors.positions)
         size, k = len(self.rows), self.dimensions
@@ -113,10 +115,9 @@ class Subsets:
         return total
 
     def mirrors(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The other positions with the same TDOAs: (row of the point (m,), subset (m,), position
-        (m, 3) m).
+        """Return the other positions with the same TDOAs: (point (m,), subset (m,), position (m, 3) m).
 
-        Only where there is one. The height stays, if known.
+        Only pairs of a point and a subset with two solutions are returned. A known height stays.
         """
         k = self.dimensions
         row, subset = np.nonzero(self.discriminant(points) > 0.0)
@@ -136,8 +137,10 @@ def _distances(points: np.ndarray, anchors: np.ndarray) -> np.ndarray:
 
 
 def _choices(n: int, k: int) -> np.ndarray:
-    """(Q, k) choices of k out of n, all within the shortest stretch of the ring that is needed to
-    keep within MOST_SUBSETS.
+    """Return choices of k out of n: (Q, k).
+
+    If there are more than MOST_SUBSETS, each choice lies within the longest stretch of the ring that
+    keeps their number below it.
     """
     every = np.array(list(combinations(range(min(n, 40)), k)))
     if n <= 40 and len(every) <= MOST_SUBSETS:
@@ -147,3 +150,87 @@ def _choices(n: int, k: int) -> np.ndarray:
         stretch += 1
     starts = np.array([(0, *rest) for rest in combinations(range(1, stretch), k - 1)])
     return (starts[None] + np.arange(n)[:, None, None]).reshape(-1, k) % n
+
+
+SWEEPS = 40
+SOLVED = 1e-9  # m, residual of a solution
+APART = 3e-4  # of the anchors' extent: two solutions nearer than this are one
+DIRECTIONS = 12  # of the starts in a plane; in space three times as many
+# of the starts, over the anchors' extent
+RADII = (0.03, 0.1, 0.3, 0.7, 1.5, 4.0, 12.0, 40.0, 150.0)
+
+
+def solutions(points: np.ndarray, corners: np.ndarray, dimensions: int) -> np.ndarray:
+    """Return the positions that a solver finds from many starts: (n, s, k) m.
+
+    points : (n, 3) m; corners : (k + 1, 3) m, anchors; dimensions : k. Each of the s starts is a
+    Levenberg-Marquardt descent on the k TDOAs of a point. NaN marks a descent without a solution.
+    """
+    centre = corners[:, :dimensions].mean(axis=0)
+    extent = np.linalg.norm(corners - corners.mean(axis=0), axis=1).max()
+    rays = _directions(dimensions)
+    starts = centre + extent * np.concatenate([radius * rays for radius in RADII])
+    x: np.ndarray = np.tile(starts, (len(points), 1))
+    heights = np.repeat(points[:, 2:], len(starts), axis=0)[:, : 3 - dimensions]
+    wanted = np.repeat(_tdoas(points, corners)[0], len(starts), axis=0)
+
+    found = np.full_like(x, np.nan)
+    row: np.ndarray = np.arange(len(x))  # of the points that are not solved yet
+    cost, gradient, normal = _normal_equations(x, heights, wanted, corners)
+    damping: np.ndarray = np.full(len(x), 1e-3)
+    for _ in range(SWEEPS):
+        scale = np.sqrt(np.maximum(np.einsum("nii->ni", normal), 1e-24))
+        damped = normal / (scale[:, :, None] * scale[:, None, :]) + damping[:, None, None] * np.eye(
+            dimensions
+        )
+        step = np.linalg.solve(damped, (gradient / scale)[..., None])[..., 0] / scale
+        longest = extent + np.linalg.norm(x - centre, axis=1)
+        step *= np.minimum(1.0, longest / np.maximum(np.linalg.norm(step, axis=1), 1e-300))[:, None]
+        new = _normal_equations(x + step, heights, wanted, corners)
+        better = new[0] < cost
+        x[better] += step[better]
+        for old, value in zip((cost, gradient, normal), new):
+            old[better] = value[better]
+        damping = np.clip(damping * np.where(better, 0.2, 5.0), 1e-14, 1e14)
+        solved = cost < SOLVED**2
+        found[row[solved]] = x[solved]
+        row, x, heights, wanted, damping, cost, gradient, normal = (
+            array[~solved] for array in (row, x, heights, wanted, damping, cost, gradient, normal)
+        )
+    return found.reshape(len(points), len(starts), dimensions)
+
+
+def same_place(points: np.ndarray, found: np.ndarray, anchors: np.ndarray) -> np.ndarray:
+    """Return whether positions (..., k) m are points (..., 3) m, within the solver's tolerance.
+
+    The tolerance is a share of the extent of anchors (N, 3) m.
+    """
+    apart = APART * np.linalg.norm(np.ptp(anchors, axis=0))
+    return np.linalg.norm(found - points[..., : found.shape[-1]], axis=-1) <= apart
+
+
+def _normal_equations(
+    x: np.ndarray, heights: np.ndarray, wanted: np.ndarray, corners: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    d, jacobian = _tdoas(np.hstack([x, heights]), corners)
+    jacobian, residual = jacobian[:, :, : x.shape[1]], wanted - d
+    cost = np.einsum("ni,ni->n", residual, residual)
+    return cost, np.einsum("nik,ni->nk", jacobian, residual), jacobian.swapaxes(1, 2) @ jacobian
+
+
+def _tdoas(x: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the TDOAs against the first corner and their derivatives: (n, k) m, (n, k, 3)."""
+    distance, unit = ranges(x[:, None], corners)
+    return distance[:, 1:] - distance[:, :1], unit[:, 1:] - unit[:, :1]
+
+
+def _directions(dimensions: int) -> np.ndarray:
+    """Return evenly spread unit vectors: (DIRECTIONS, 2), or a sphere of (3 DIRECTIONS, 3)."""
+    if dimensions == 2:
+        angle = 2.0 * np.pi * (np.arange(DIRECTIONS) + 0.31) / DIRECTIONS
+        return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    k = np.arange(3 * DIRECTIONS) + 0.5
+    z, angle = 1.0 - 2.0 * k / (3 * DIRECTIONS), np.pi * (1.0 + np.sqrt(5.0)) * k
+    return np.column_stack(
+        [np.sqrt(1.0 - z**2) * np.cos(angle), np.sqrt(1.0 - z**2) * np.sin(angle), z]
+    )

@@ -1,45 +1,306 @@
-"""What is planned with: anchors, their radio, which TDOAs they give, and whether height is known."""
+"""Describe an installation: anchors, the noise of their radio, and the TDOAs of a round."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.spatial import ConvexHull, Delaunay
+from scipy.spatial import Delaunay
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.antenna import Antenna
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.radio import SPEED_OF_LIGHT, RadioLink, received_power_dbm
+from uwb_tdoa_bias.foundation.safe_yaml import read_yaml
 
 from ..checking.sides import sides_of, to_copy
-from .noise import RadioNoise
-from .pairing import Pairing, ring
 
 if TYPE_CHECKING:
-    from .noise import FixedNoise
+    from collections.abc import Callable
+    from pathlib import Path
+
+BOLTZMANN = 1.380649e-23  # J/K
+ZERO_CELSIUS = 273.15  # K
+_ANY_ATTITUDE = (0.0, 0.0, 0.0, 1.0)  # the tag's antenna is taken as omnidirectional
+_STEP = 1e-5  # m, for numerical derivatives
+
+
+@dataclass(frozen=True)
+class Omnidirectional:
+    """An antenna with one gain, dBi, in all directions."""
+
+    dbi: float = 0.0
+
+    def gain(self, direction: np.ndarray) -> np.ndarray:
+        """Return the gain towards directions (..., 3): (...) dBi."""
+        return np.full(np.shape(direction)[:-1], self.dbi)
+
+
+@dataclass(frozen=True)
+class RadioNoise:
+    """Noise from the link budget: Friis, thermal noise and the anchors' radiation pattern.
+
+    Source: eqs. 9 - 14 of Grasso et al. (Sensors 2022, 22, 9136). The gain of the receiving antenna
+    is left out, as there.
+
+    Attributes
+    ----------
+    antenna : Antenna of the anchors (default DWM1000-like). An anchor without orientation radiates
+        the mean of the azimuth cut in all directions.
+    tx_power_dbm : into the antenna, at the reference temperature and voltage, dBm (default: that of
+        RadioLink)
+    temperature : degrees Celsius, of transmitter and thermal noise (default 25)
+    voltage : supply of the transmitter, V (default 3.3)
+    tx_power_per_degree, tx_power_per_volt : dB (default: typical of the DW1000 data sheet, channel
+        2)
+    bandwidth : Hz (default 499.2e6, channels 1, 2, 3 and 5)
+    full_strength : m, r_0 of eq. 9: nearer than this the noise does not fall (default 1.0)
+    """
+
+    antenna: Antenna = field(default_factory=Antenna)
+    tx_power_dbm: float = RadioLink.tx_power_dbm
+    temperature: float = 25.0
+    voltage: float = 3.3
+    tx_power_per_degree: float = -0.05
+    tx_power_per_volt: float = 2.73
+    bandwidth: float = 499.2e6
+    full_strength: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name, low, high in (
+            ("tx_power_dbm", -60, 30),
+            ("temperature", -40, 85),
+            ("voltage", 2.8, 3.6),
+        ):
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise InputError(
+                    f"{name}: {value!r} is outside {low} ... {high}, the range of a DW1000."
+                )
+
+    @property
+    def transmitted_dbm(self) -> float:
+        """Transmitted power at this temperature and voltage, dBm: eq. 13."""
+        warmer, more = self.temperature - 25.0, self.voltage - 3.3
+        return self.tx_power_dbm + self.tx_power_per_degree * warmer + self.tx_power_per_volt * more
+
+    @property
+    def thermal_noise_dbm(self) -> float:
+        """Power of thermal noise in the bandwidth, dBm."""
+        return 10.0 * np.log10(BOLTZMANN * (self.temperature + ZERO_CELSIUS) * self.bandwidth * 1e3)
+
+    def variance(self, points: np.ndarray, anchors: Anchors) -> np.ndarray:
+        """Return the variance of the range of one reception: (n, N) m^2.
+
+        points : (n, 3) m; anchors : N Anchors. Source: eqs. 9 and 12.
+        """
+        snr_db = self._received(points, anchors) - self.thermal_noise_dbm
+        return (SPEED_OF_LIGHT / self.bandwidth) ** 2 * 10.0 ** (-0.1 * snr_db)
+
+    def _received(self, points: np.ndarray, anchors: Anchors) -> np.ndarray:
+        """Return the received power at full_strength or farther: (n, N) dBm. Source: eq. 11."""
+        away = points[:, None, :] - anchors.positions
+        distance = np.linalg.norm(away, axis=-1, keepdims=True)
+        away *= np.maximum(self.full_strength / np.maximum(distance, 1e-9), 1.0)
+        power = np.empty(away.shape[:2])
+        turned = np.isfinite(anchors.orientations).all(axis=1)
+        mean = Omnidirectional(float(np.mean(self.antenna.azimuth)) + self.antenna.gain_offset)
+        for rows, antenna in ((turned, self.antenna), (~turned, mean)):
+            if rows.any():
+                link = RadioLink(
+                    antenna,  # type: ignore[arg-type]  # has `gain`
+                    Omnidirectional(),  # type: ignore[arg-type]  # has `gain`
+                    tx_power_dbm=self.transmitted_dbm,
+                )
+                q = np.where(turned[rows, None], anchors.orientations[rows], _ANY_ATTITUDE)
+                power[:, rows] = received_power_dbm(
+                    away[:, rows], _ANY_ATTITUDE, np.zeros(3), q, link
+                )
+        return power
+
+
+@dataclass(frozen=True)
+class FixedNoise:
+    """The same noise everywhere. std : m, standard deviation of one reception."""
+
+    std: float
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.std < 100.0:
+            raise InputError(
+                f"noise: {self.std!r} m is not a standard deviation; give one above 0, e.g. 0.06."
+            )
+
+    def variance(self, points: np.ndarray, anchors: Anchors) -> np.ndarray:
+        """Return the variance of the range of one reception: (n, N) m^2."""
+        return np.full((len(points), len(anchors)), self.std**2)
+
+
+def variance_gradient(
+    noise: RadioNoise | FixedNoise,
+    points: np.ndarray,
+    anchors: Anchors,
+    variance: np.ndarray,
+    dimensions: int,
+) -> np.ndarray:
+    """Return the derivative of noise.variance along x, y (and z): (n, N, dimensions) m.
+
+    One-sided differences. variance : (n, N) m^2, noise.variance at the points.
+    """
+    if isinstance(noise, FixedNoise):
+        return np.zeros((*variance.shape, dimensions))
+    steps = _STEP * np.eye(3)[:dimensions]
+    return (
+        np.stack([noise.variance(points + step, anchors) - variance for step in steps], axis=-1)
+        / _STEP
+    )
+
+
+def antenna_from_yaml(path: str | Path) -> Antenna:
+    """Read an Antenna from a YAML file. Raises InputError.
+
+    The fields are azimuth, elevation_1 and elevation_2 (dBi, around the full circle), and optionally
+    gain_offset, see `uwb_tdoa_bias.foundation.antenna.Antenna`.
+    """
+    content = read_yaml(path)
+    try:
+        cuts: dict[str, Any] = {
+            name: tuple(content.pop(name)) for name in ("azimuth", "elevation_1", "elevation_2")
+        }
+        return Antenna(**cuts, **content)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{path}: is no antenna ({error!r}); give lists azimuth, elevation_1 and "
+            "elevation_2 of gains in dBi."
+        ) from error
+
+
+@dataclass(frozen=True)
+class Pairing:
+    """The TDOAs and ranges of one round.
+
+    Attributes
+    ----------
+    a, b : (M,) rows of the anchors, d_ab = |p - b| - |p - a|
+    shared : True if the TDOAs of a round share one reception per anchor, and its error. False if
+        their errors are independent.
+    times : number of times that each TDOA comes in a round (default 1)
+    ranges : True for distances to the anchors of `a`, once a round
+    beside : Pairing that the round holds besides, measured independently; or None
+    """
+
+    a: np.ndarray
+    b: np.ndarray
+    shared: bool
+    times: float = 1.0
+    ranges: bool = False
+    beside: Pairing | None = None
+
+    @property
+    def parts(self) -> tuple[Pairing, ...]:
+        """The independent parts, each a Pairing."""
+        return (replace(self, beside=None), *(self.beside.parts if self.beside else ()))
+
+    @property
+    def one_solution(self) -> bool:
+        """Whether it holds distances.
+
+        Distances to anchors that are not in a plane have one solution.
+        """
+        return any(part.ranges for part in self.parts)
+
+    def incidence(self) -> np.ndarray:
+        """Return the (M, N) matrix with -1 at a and +1 at b; the identity for ranges."""
+        rows = np.arange(len(self.a))
+        matrix = np.zeros((len(rows), 1 + max(self.a.max(), self.b.max())))
+        matrix[rows, self.a], matrix[rows, self.b] = -1.0, 1.0
+        return matrix
+
+    def covariance(self, variance: np.ndarray, link_std: float = 0.0) -> np.ndarray:
+        """Return the covariance of the TDOAs: (n, M, M) m^2.
+
+        variance : (n, N) m^2 of the receptions. link_std : m, additional error of each TDOA. It
+        includes the anchor's reception of the other anchor's packet.
+        Source: eqs. 4 and 5 of Grasso et al. (Sensors 2022, 22, 9136); A18 for a common reference.
+        """
+        own = link_std**2 * np.eye(len(self.a))
+        if self.ranges:
+            return variance[:, self.a, None] * np.eye(len(self.a)) + own
+        if self.shared:
+            d = self.incidence()
+            return (d * variance[:, None, :]) @ d.T + own
+        return (variance[:, self.a] + variance[:, self.b])[:, :, None] * np.eye(len(self.a)) + own
+
+
+def ring(n: int, shared: bool = True) -> Pairing:
+    """Return the N TDOAs of TDOA2: each anchor with the next one, and the last with the first."""
+    return Pairing(np.arange(n), (np.arange(n) + 1) % n, shared)
+
+
+def common_reference(n: int) -> Pairing:
+    """Return the N - 1 TDOAs of each anchor with anchor 0: the case of eq. A18."""
+    return Pairing(np.zeros(n - 1, int), np.arange(1, n), True)
+
+
+def all_pairs(n: int) -> Pairing:
+    """Return the TDOAs of TDOA3: each anchor with each other, with independent errors.
+
+    A round counts as N TDOAs.
+    """
+    a, b = np.triu_indices(n, 1)
+    return Pairing(a, b, False, 2.0 / (n - 1))
+
+
+def every_range(n: int) -> Pairing:
+    """Return the N distances of two-way ranging."""
+    return Pairing(np.arange(n), np.arange(n), False, ranges=True)
+
+
+def _beside_ranges(make: Callable[[int], Pairing]) -> Callable[[int], Pairing]:
+    """Return a maker of Pairings that adds the distance to each anchor."""
+    return lambda n: replace(make(n), beside=every_range(n))
+
+
+PAIRINGS: dict[str, Callable[[int], Pairing]] = {
+    "ring": ring,
+    "ring_uncorrelated": lambda n: ring(n, shared=False),
+    "common_reference": common_reference,
+    "all_pairs": all_pairs,
+    "every_range": every_range,
+    "ring+every_range": _beside_ranges(ring),
+    "all_pairs+every_range": _beside_ranges(all_pairs),
+}
+OF_PROTOCOL = {
+    "tdoa2": "ring",
+    "tdoa3": "all_pairs",
+    "ranges": "every_range",
+    "tdoa2+ranges": "ring+every_range",
+    "tdoa3+ranges": "all_pairs+every_range",
+}
+
 
 SAME_PLACE = 0.01  # m; two anchors nearer than this are one
-# of the largest distance: anchors this close to one plane (line) cannot tell its two sides apart
+# of the largest distance: so close to one plane (line), its two sides are ambiguous
 FLAT = 0.01
 
 
 @dataclass(frozen=True)
 class Installation:
-    """Anchors and all that decides how well they locate a tag. Raises InputError for anchors that
-    cannot.
+    """Anchors, their radio, and what the tag measures. Raises InputError for useless anchors.
 
     Attributes
     ----------
     anchors : Anchors
-    noise : RadioNoise or FixedNoise: how well a reception is timed
+    noise : RadioNoise or FixedNoise of a reception
     pairing : Pairing, the TDOAs of one round (default: the ring of TDOA2)
-    link_std : m, error that every TDOA has of its own, besides those of the tag's receptions
-        (default 0)
-    dimensions : 3, or 2 for a tag whose height is known
-    height_std : m, of a height sensor on the tag beside every round of TDOAs; inf for none
-        (default)
-    hall : each place hears a part of the anchors, which may be few, or in a plane; `pairing` is
-        then of those (default False)
+    link_std : m, additional error of each TDOA (default 0)
+    dimensions : 3, or 2 for a tag at a known height
+    height_std : m, of a height sensor on the tag, used with each round; inf for none (default)
+    hall : True if each place hears only a part of the anchors, to which `pairing` belongs (default
+        False). The part may be small, or in a plane.
     """
 
     anchors: Anchors
@@ -67,42 +328,33 @@ class Installation:
                 "more, e.g. 0.05."
             )
 
-    def of(self, anchors: Anchors) -> Installation:
-        """The same with other Anchors, of which each place hears a part."""
+    def with_anchors(self, anchors: Anchors) -> Installation:
+        """Return a copy for a hall with other Anchors."""
         return replace(self, anchors=anchors, hall=True)
 
     @property
     def unknowns(self) -> int:
-        """Coordinates that TDOAs alone must determine: 2 where a height is known or measured, else
-        3.
-        """
+        """Coordinates that TDOAs must determine: 2 if the height is known or measured, else 3."""
         return 2 if self.height_std < np.inf else self.dimensions
 
     def with_height(self, information: np.ndarray) -> np.ndarray:
-        """Information (n, k, k) 1/m^2 of TDOAs about the position, with that of the height sensor
-        added.
-        """
+        """Return the information (n, k, k) 1/m^2 plus that of the height sensor."""
         if self.height_std < np.inf:
             information = information + np.diag([0.0, 0.0, self.height_std**-2])
         return information
 
     def inside_hull(self, points: np.ndarray) -> np.ndarray:
-        """Whether points (n, 3) are inside the convex hull of the anchors (seen from above if
-        height is known or measured): (n,).
+        """Return whether points (n, 3) m are inside the convex hull of the anchors: (n,).
+
+        The hull is two-dimensional, seen from above, if the height is known or measured.
         """
         k = self.unknowns
         hull = Delaunay(self.anchors.positions[:, :k])
         return hull.find_simplex(points[:, :k]) >= 0
 
-    def hull_outline(self) -> np.ndarray:
-        """Corners of the hull seen from above, in order and closed: (k + 1, 2) m."""
-        above = self.anchors.positions[:, :2]
-        corners = ConvexHull(above).vertices
-        return above[np.append(corners, corners[0])]
-
 
 def check_anchors(anchors: Anchors, dimensions: int) -> None:
-    """Raise InputError, with what to do, for anchors from which no position follows."""
+    """Raise InputError, with the remedy, for anchors that determine no position."""
     what = {2: "a position at known height", 3: "a position in space"}[dimensions]
     if len(anchors) < dimensions + 1:
         raise InputError(
@@ -135,7 +387,10 @@ def check_anchors(anchors: Anchors, dimensions: int) -> None:
 
 
 def principal_extents(positions: np.ndarray) -> np.ndarray:
-    """Extent of positions (..., N, k) along their principal axes, the longest first: (..., k) m."""
+    """Return the extents of positions (..., N, k) m along their principal axes: (..., k) m.
+
+    The longest comes first.
+    """
     centred = positions - positions.mean(axis=-2, keepdims=True)
     return np.ptp(
         centred @ np.linalg.svd(centred, full_matrices=False)[2].swapaxes(-1, -2), axis=-2

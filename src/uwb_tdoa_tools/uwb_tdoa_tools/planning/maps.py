@@ -1,34 +1,174 @@
-"""Precision and failure over a slice or a volume."""
+"""Judge places: whether a tag can be flown there, and if not, why.
+
+A place hears too few anchors, is imprecise, has two solutions, or can be flown.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.flyable import FlyableVolume
 
-from .judging import Judged, judge
+from ..simulation.rooms import Room
+from .bifurcation import Subsets, same_place, solutions
+from .precision import bound, information, position_error, range_weights
+from .second_minimum import CLEAR, second_minima
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Iterable, Sequence
 
     from numpy.typing import ArrayLike
 
     from uwb_tdoa_bias.foundation.anchors import Anchors
 
     from .installation import Installation
-    from .judging import Demand
+
+    # gives the same items, and prints how many are done
+    Wrap = Callable[[Iterable[Any]], Iterable[Any]]
+
+# m, of the bound of one round: the default of --accuracy
+ACCURACY = 0.5
+CRITERIA = {
+    "round": "a whole round of all that is heard has one solution",
+    "pairings": (
+        "every choice of k + 1 anchors alone has one solution, inside their hull (Grasso et al., "
+        "sec. 2.3.2)"
+    ),
+}
+# States of a place. OUTSIDE of the hull counts with "pairings" only.
+FLYABLE, TWO_SOLUTIONS, IMPRECISE, TOO_FEW, OUTSIDE = range(5)
+_CHUNK = 2_000_000  # numbers in the largest array of one step
+_EVERYWHERE = Room(np.full(3, -np.inf), np.full(3, np.inf))
+
+
+@dataclass(frozen=True)
+class Demand:
+    """What is asked of a place. Raises InputError.
+
+    room : Room in which a second solution counts; accuracy : m, largest bound of one round;
+    criterion : of CRITERIA; quick : True to look for no second solution, and to leave out the second
+    term of the bound. A search needs no more.
+    """
+
+    room: Room = _EVERYWHERE
+    accuracy: float = ACCURACY
+    criterion: str = "round"
+    quick: bool = False
+
+    def __post_init__(self) -> None:
+        if not 0.0 < self.accuracy < np.inf:
+            raise InputError(
+                f"accuracy: {self.accuracy!r} m is none; give the largest bound of one round, "
+                "above 0, e.g. 0.3."
+            )
+
+
+@dataclass(frozen=True)
+class Judged:
+    """States of n places.
+
+    covariance : (n, k, k) m^2, bound of one round; error : (n,) m, root of its trace; status : (n,)
+    int, FLYABLE or the reason.
+    """
+
+    covariance: np.ndarray
+    error: np.ndarray
+    status: np.ndarray
+
+    @property
+    def flyable(self) -> np.ndarray:
+        """Whether each place can be flown: (n,) bool."""
+        return self.status == FLYABLE
+
+    def subset(self, rows: np.ndarray) -> Judged:
+        """Return the Judged of some of its places."""
+        return Judged(self.covariance[rows], self.error[rows], self.status[rows])
+
+    def assign(self, rows: np.ndarray, found: Judged) -> None:
+        """Set the states of some of its places."""
+        self.covariance[rows], self.error[rows], self.status[rows] = (
+            found.covariance,
+            found.error,
+            found.status,
+        )
+
+
+def judge(
+    points: np.ndarray,
+    installation: Installation,
+    demand: Demand,
+    columns: np.ndarray | None = None,
+) -> Judged:
+    """Return the Judged of points (n, 3) m.
+
+    columns : (n, K) rows of the anchors that are heard at each point, in order; None for all.
+    """
+    heard = len(installation.anchors) if columns is None else columns.shape[1]
+    n, k = len(points), installation.dimensions
+    if heard <= installation.unknowns:
+        return Judged(np.full((n, k, k), np.inf), np.full(n, np.inf), np.full(n, TOO_FEW))
+    covariance = bound(information(points, installation, not demand.quick, columns))
+    error = position_error(covariance)
+    status = np.where(error <= demand.accuracy, FLYABLE, IMPRECISE)
+    if demand.quick:
+        return Judged(covariance, error, status)
+    if demand.criterion == "pairings":
+        status[Subsets(installation.anchors, installation.unknowns).ambiguous(points) > 0.0] = (
+            TWO_SOLUTIONS
+        )
+        status[~installation.inside_hull(points)] = OUTSIDE
+        return Judged(covariance, error, status)
+    misfit, _ = other_solutions(points, installation, demand.room, columns)
+    status[misfit <= CLEAR] = TWO_SOLUTIONS
+    return Judged(covariance, error, status)
+
+
+def other_solutions(
+    points: np.ndarray, installation: Installation, room: Room, columns: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the second minimum of a round: (misfit (n,) standard deviations, place (n, 3) m).
+
+    points : (n, 3) m; columns : as for `judge`. See `second_minima`.
+    """
+    anchors = installation.anchors
+    if columns is None:
+        columns = np.broadcast_to(np.arange(len(anchors)), (len(points), len(anchors)))
+    heard = columns.shape[1]
+    misfits, places = [np.empty(0)], [np.empty((0, 3))]
+    for rows in np.array_split(
+        np.arange(len(points)), max(1, len(points) * max(heard**2, len(anchors)) // _CHUNK)
+    ):
+        variance = np.take_along_axis(
+            installation.noise.variance(points[rows], anchors), columns[rows], axis=1
+        )
+        weights = np.ascontiguousarray(
+            range_weights(variance, installation.pairing, installation.link_std)
+        )
+        misfit, place = second_minima(
+            points[rows],
+            anchors.positions,
+            np.ascontiguousarray(columns[rows]),
+            weights,
+            room,
+            installation.unknowns,
+        )
+        misfits.append(misfit)
+        places.append(place)
+    return np.concatenate(misfits), np.concatenate(places)
+
 
 MOST_CELLS = 4_000_000
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Cubes side by side. lower (3,) corner of the first, m; step: size of a cube, m; shape (nx,
-    ny, nz).
+    """Cubes side by side.
+
+    lower : (3,) m, corner of the first; step : m, size of a cube; shape : (nx, ny, nz).
     """
 
     lower: np.ndarray
@@ -37,7 +177,7 @@ class Grid:
 
     @classmethod
     def box(cls, lower: ArrayLike, upper: ArrayLike, step: float) -> Grid:
-        """Cubes of `step` m that cover the box from lower (3,) to upper (3,), m.
+        """Return cubes of `step` m that cover the box from lower (3,) to upper (3,), m.
 
         Raises InputError.
         """
@@ -63,7 +203,7 @@ class Grid:
 
     @classmethod
     def slice(cls, x: Sequence[float], y: Sequence[float], height: float, step: float) -> Grid:
-        """One layer of cells, centred on `height`, m; x and y: (lower, upper), m."""
+        """Return one layer of cells, centred on `height`, m. x and y : (lower, upper), m."""
         return cls.box((x[0], y[0], height - 0.5 * step), (x[1], y[1], height + 0.5 * step), step)
 
     @property
@@ -77,14 +217,15 @@ class Grid:
         return np.stack(np.meshgrid(*self.axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
     def layer(self, values: np.ndarray, k: int) -> np.ndarray:
-        """The layer k of values (n, ...) of all cells, to draw: (ny, nx, ...)."""
+        """Return the layer k of values (n, ...) of all cells, to draw: (ny, nx, ...)."""
         return values.reshape(*self.shape, *values.shape[1:])[:, :, k].swapaxes(0, 1)
 
 
 @dataclass(frozen=True)
 class Chart(Judged):
-    """What is true at every cell of a grid: Judged of n cells, k the dimensions of the
-    installation. grid : Grid; heard : (n,) anchors.
+    """The Judged of all cells of a grid.
+
+    grid : Grid; heard : (n,) number of anchors.
     """
 
     grid: Grid
@@ -96,7 +237,7 @@ class Chart(Judged):
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
     def volume(self, anchors: Anchors, dimensions: int) -> FlyableVolume:
-        """The FlyableVolume of this chart, among Anchors."""
+        """Return the FlyableVolume of this chart, among Anchors."""
         return FlyableVolume(
             self.grid.lower,
             np.full(3, self.grid.step),
@@ -110,7 +251,7 @@ class Chart(Judged):
 
 
 def chart(installation: Installation, grid: Grid, demand: Demand) -> Chart:
-    """Chart of an Installation all of whose anchors are heard, over a Grid."""
+    """Return the Chart of a Grid if each cell hears all anchors of an Installation."""
     points = grid.points
     found = judge(points, installation, demand)
     return Chart(
@@ -120,3 +261,45 @@ def chart(installation: Installation, grid: Grid, demand: Demand) -> Chart:
         grid,
         np.full(len(points), len(installation.anchors)),
     )
+
+
+PLACES_ACROSS = {2: 40, 3: 10}  # places along the longest side of a slice, of a volume, at most
+MOST_PAIRINGS = 8  # pairings that are solved, spread over all; each takes thousands of solutions
+_BATCH = 200
+
+
+def brute_force(
+    installation: Installation, grid: Grid, progress: Wrap = iter
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray]]:
+    """Solve for the pairings of an Installation from many starts, all over a grid.
+
+    Returns (unique (n,) bool: each pairing has one solution; agrees (n,) bool: each is as predicted;
+    points (n, 3) m; arrows ((m, 2), (m, 2)) m: some of the flips within the grid, from and to).
+    """
+    subsets = Subsets(installation.anchors, installation.unknowns)
+    extent = np.array(grid.shape) * grid.step
+    across = min(PLACES_ACROSS[3 if grid.shape[2] > 1 else 2], max(grid.shape))
+    points = Grid.box(grid.lower, grid.lower + extent, extent.max() / across).points
+    if grid.shape[2] == 1:
+        points[:, 2] = grid.axes[2][0]
+    row, subset, mirror = subsets.mirrors(points)
+    other = ~same_place(
+        points[row], mirror, installation.anchors.positions
+    )  # on the lines through two anchors they meet
+    predicted = np.ones((len(points), len(subsets.rows)), bool)
+    predicted[row[other], subset[other]] = False
+    chosen = np.unique(np.linspace(0, len(subsets.rows) - 1, MOST_PAIRINGS).astype(int))
+    unique, agrees = np.ones(len(points), bool), np.ones(len(points), bool)
+    for q in progress(chosen):
+        corners = installation.anchors.positions[subsets.rows[q]]
+        for rows in np.array_split(np.arange(len(points)), max(1, len(points) // _BATCH)):
+            found = solutions(points[rows], corners, installation.unknowns)
+            one = (np.isnan(found[..., 0]) | same_place(points[rows, None], found, corners)).all(
+                axis=1
+            )
+            unique[rows] &= one
+            agrees[rows] &= one == predicted[rows, q]
+    near = np.flatnonzero(((mirror >= grid.lower) & (mirror <= grid.lower + extent)).all(axis=1))[
+        ::37
+    ]
+    return unique, agrees, points, (points[row[near], :2], mirror[near, :2])

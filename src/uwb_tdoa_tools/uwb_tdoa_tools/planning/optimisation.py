@@ -1,25 +1,241 @@
-"""Better places and directions for the anchors."""
+"""Search better anchors: gradients of the bound, descents from many layouts, and one more anchor."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
+from scipy.optimize import linear_sum_assignment, minimize
+from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
+from scipy.special import expit
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.geometry import ranges
 
-from .descent import descend
-from .goal import UNUSABLE
-from .layout import Layout, free_ids
-from .places import AnchorPlaces, spread
+from .bifurcation import Subsets
+from .installation import PAIRINGS
+from .layout import UNUSABLE, AnchorPlaces, Layout, free_ids, spread
+from .precision import bound, position_error, weigh
+from .report import quantiles
 
 if TYPE_CHECKING:
-    from .check import Wrap
-    from .goal import Goal
+    from collections.abc import Callable
+
+    from ..progress import Progress
+    from .layout import Goal
+    from .maps import Chart, Judged, Wrap
+
+Result = TypeVar("Result")
+
+SOFT = 0.05  # of |q|^2 - 1, over which failure sets in where derivatives are needed
+EDGE = 0.05  # m over which the hull ends, likewise
+FAILED = 10.0  # of the objective, a logarithm
+# of the allowed range: random steps of a start without a defined goal
+SHAKEN = (0.0, 1e-3, 1e-2, 0.1)
+LEAST_GAIN = 1e-4  # of the objective: a step that gains less is the last
+_CHUNK = 1_000_000  # numbers in the largest array of one step
+
+
+def errors_and_slopes(
+    goal: Goal, layout: Layout, x: np.ndarray, points: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the bound at points (n, 3) m and its derivatives along x: (n,) m, (n, len(x)).
+
+    A number of x changes one column of the ranges and variances. So each column is computed once,
+    and the information of all changed layouts in one batch. d sqrt(tr J^-1) = -tr(J^-2 dJ) / (2
+    sqrt(tr J^-1)).
+    """
+    installation, k = goal.installation, goal.installation.dimensions
+    positions, orientations, steps = layout.nudged(x)
+    every = Anchors(np.arange(len(positions)), positions, orientations)
+    variance = installation.noise.variance(points, every)
+    unit = ranges(points[:, None], positions)[1]
+    chosen = layout.columns()
+    pairing = PAIRINGS[goal.pairing](chosen.shape[1])
+    information = np.concatenate(
+        [
+            weigh(
+                unit[rows][:, chosen, :k].reshape(-1, chosen.shape[1], k),
+                variance[rows][:, chosen].reshape(-1, chosen.shape[1]),
+                pairing,
+                installation.link_std,
+            )
+            for rows in np.array_split(
+                np.arange(len(points)), max(1, len(points) * chosen.size * k // _CHUNK)
+            )
+        ]
+    ).reshape(len(points), -1, k, k)
+    covariance = bound(installation.with_height(information[:, 0]))
+    errors = position_error(covariance)
+    lost = ~(errors < UNUSABLE)
+    covariance[lost], errors[lost] = 0.0, UNUSABLE
+    change = (information[:, 1:] - information[:, :1]) / steps[:, None, None]
+    slopes = -0.5 * np.einsum("nij,nvji->nv", covariance @ covariance, change) / errors[:, None]
+    return errors, slopes
+
+
+def failing_and_slopes(
+    goal: Goal, layout: Layout, x: np.ndarray, points: np.ndarray
+) -> tuple[float, np.ndarray]:
+    """Return a smooth share of points (n, 3) m that fail, and its derivatives along x.
+
+    A point fails outside of the anchors' hull. With the criterion "pairings" it also fails if a
+    pairing has two solutions. Raises InputError if two anchors meet, or all are in a plane.
+    """
+    anchors = layout.anchors(x)
+    try:
+        good, along = _inside(anchors.positions, points, goal.installation.unknowns)
+    except QhullError as error:
+        raise InputError(
+            "anchors: they span no hull; take some of them out of the plane of the others."
+        ) from error
+    more: np.ndarray | float
+    if goal.demand.criterion == "pairings":
+        subsets = Subsets(anchors, goal.installation.unknowns)
+        excess = subsets.discriminant(points) / SOFT
+        single = expit(-excess).prod(axis=1)
+        along = along * single[:, None, None]
+        weights = (good * single)[:, None] * expit(excess) / SOFT
+        good, more = good * single, -subsets.slopes(points, weights)
+    else:
+        more = 0.0
+    along = -(along.sum(axis=0) + more) / len(points)
+    positions, _, steps = layout.nudged(x)
+    here, moved = layout.free(positions)
+    return 1.0 - good.mean(), np.einsum(
+        "imk,ik->im", moved - here[:, None], along[-len(here) :]
+    ).ravel() / steps
+
+
+def _inside(positions: np.ndarray, points: np.ndarray, k: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return how far inside the hull points are, 0 to 1, and derivatives along the anchors.
+
+    points : (n, 3) m; positions : (N, 3) m, anchors. Returns (n,) and (n, N, 3) 1/m. h is the
+    distance beyond the facet that is exceeded most. l_j are the barycentric coordinates of the
+    point's foot on that facet. A step dm of corner j moves the facet there by l_j dm: dh = -l_j
+    normal . dm.
+    """
+    hull = ConvexHull(positions[:, :k])
+    beyond = points[:, :k] @ hull.equations[:, :k].T + hull.equations[:, k]
+    facet = np.argmax(beyond, axis=1)
+    h, normal = beyond[np.arange(len(points)), facet], hull.equations[facet, :k]
+    corners = hull.simplices[facet]
+    foot = points[:, :k] - h[:, None] * normal
+    spanned = np.concatenate(
+        [positions[corners][:, :, :k], np.ones((*corners.shape, 1))], axis=2
+    ).swapaxes(1, 2)
+    share = np.einsum(
+        "nij,nj->ni", np.linalg.pinv(spanned), np.hstack([foot, np.ones((len(foot), 1))])
+    )
+    inside = expit(-h / EDGE)
+    along = np.zeros((len(points), len(positions), 3))
+    slope = (inside * (1.0 - inside) / EDGE)[:, None, None] * share[:, :, None] * normal[:, None]
+    along[np.arange(len(points))[:, None], corners, :k] = slope
+    return inside, along
+
+
+def descend(
+    goal: Goal, layout: Layout, points: np.ndarray, x: np.ndarray, sweeps: int
+) -> np.ndarray:
+    """Return x after at most `sweeps` steps of SLSQP towards the goal at points (n, 3) m.
+
+    The worst case is not smooth. The smallest s that no log error exceeds is smooth, with one
+    constraint per point. A step to a layout without a defined goal counts as FAILED and is taken
+    back. If SLSQP would continue from there, the best x is returned. A start without a defined goal
+    is shaken until the goal is defined; if it never is, the start is returned.
+    """
+    size, (low, high) = len(x), np.transpose(layout.bounds)
+    seen: dict[bytes, tuple[np.ndarray, np.ndarray, float, np.ndarray]] = {}  # of the last x
+    best: list[Any] = [np.inf, x]
+
+    def at(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
+        """Return (errors, slopes, failing, its slopes) at x. Raises InputError."""
+        if not np.isfinite(x).all():
+            raise InputError("layout: no numbers")  # SLSQP has been seen to ask for NaN
+        x = np.clip(x, low, high)
+        key = x.tobytes()
+        if key not in seen:
+            seen.clear()
+            errors, slopes = errors_and_slopes(goal, layout, x, points)
+            failing, more = failing_and_slopes(goal, layout, x, points)
+            seen[key] = errors, slopes, failing, more
+            size_of_errors = errors.mean() if goal.objective == "mean" else errors.max()
+            value = size_of_errors * (1.0 + failing)
+            if value < best[0]:
+                best[:] = value, x
+        return seen[key]
+
+    def tried(
+        function: Callable[[np.ndarray], Result], otherwise: Result
+    ) -> Callable[[np.ndarray], Result]:
+        def value(z: np.ndarray) -> Result:
+            try:
+                return function(z)
+            except InputError:
+                return otherwise
+
+        return value
+
+    def mean(x: np.ndarray) -> float:
+        errors, _, failing, _ = at(x)
+        return np.log(errors.mean() * (1.0 + failing))
+
+    def mean_slopes(x: np.ndarray) -> np.ndarray:
+        errors, slopes, failing, more = at(x)
+        return slopes.mean(axis=0) / errors.mean() + more / (1.0 + failing)
+
+    def worst_slopes(z: np.ndarray) -> np.ndarray:
+        _, _, failing, slopes = at(z[:size])
+        return np.append(slopes / (1.0 + failing), 1.0)
+
+    options = {"method": "SLSQP", "options": {"maxiter": sweeps, "ftol": LEAST_GAIN}}
+    try:
+        x = _defined_near(at, np.clip(x, low, high), low, high)
+        if goal.objective == "mean":
+            found = minimize(
+                tried(mean, FAILED), x, jac=mean_slopes, bounds=layout.bounds, **options
+            )
+        else:
+            below = {
+                "type": "ineq",
+                "fun": tried(
+                    lambda z: z[size] - np.log(at(z[:size])[0]), np.full(len(points), -FAILED)
+                ),
+                "jac": lambda z: np.column_stack(
+                    [-at(z[:size])[1] / at(z[:size])[0][:, None], np.ones(len(points))]
+                ),
+            }
+            worst = tried(lambda z: z[size] + np.log1p(at(z[:size])[2]), FAILED)
+            z, bounds = np.append(x, np.log(at(x)[0].max())), [*layout.bounds, (None, None)]
+            found = minimize(
+                worst, z, jac=worst_slopes, bounds=bounds, constraints=[below], **options
+            )
+        at(found.x[:size])
+    except InputError:
+        return best[1]
+    return np.clip(found.x[:size], low, high)
+
+
+def _defined_near(
+    at: Callable[[np.ndarray], object], x: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    """Return x, or an x near it at which `at` raises no InputError.
+
+    x is moved at random, by a growing share of the allowed range. Raises InputError.
+    """
+    rng = np.random.default_rng(0)
+    for share in SHAKEN:
+        shaken = np.clip(x + share * (high - low) * rng.uniform(-1.0, 1.0, len(x)), low, high)
+        try:
+            at(shaken)
+            return shaken
+        except InputError as error:
+            last = error
+    raise last
+
 
 BESIDE = 1.0  # m; no anchor is proposed nearer to another
 SEED = 0  # of the starts, and of the points at which they are judged
@@ -41,15 +257,12 @@ def optimise(
     starts: int = 16,
     progress: Wrap = iter,
 ) -> Anchors:
-    """Anchors at the `count` best places, turned in the best directions; after those of `fixed`,
-    which stay.
+    """Return Anchors at the `count` best places, in the best directions.
 
-    goal : Goal; places : AnchorPlaces; start : (count, 3) m, a layout to begin with besides the
-        quasi-random ones;
-    progress : wraps the starts. Descents from all starts at a few of the goal's points; the best of
-        what
-    they lead to descend again, with the points that turn out to be the worst. The best score at all
-    points wins.
+    goal : Goal; places : AnchorPlaces; fixed : Anchors that stay, which come first; start : (count, 3) m, a layout to
+    begin with besides the quasi-random ones; starts : number of these; progress : wraps the starts.
+    Each start descends at a few of the goal's points. The best ends descend again, with the worst
+    points added. The best score at all points wins.
     """
     layout = Layout(
         places, count, fixed, goal.points.mean(axis=0), are_turned(goal.installation.anchors)
@@ -73,11 +286,12 @@ def optimise(
     return best
 
 
-def one_more(
+def scores_of_one_more(
     goal: Goal, anchors: Anchors, places: AnchorPlaces, count: int = 400
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What one more anchor would give at places all over that are not beside another: (numbers (n,
-    places.numbers), scores (n,) m), facing the points.
+    """Return places for one more anchor and their scores: (n, places.numbers), (n,) m.
+
+    The places are evenly spread, at least BESIDE from other anchors. The anchor faces the points.
     """
     layout = Layout(places, 1, anchors, goal.points.mean(axis=0), are_turned(anchors))
     numbers = places.grid(count)
@@ -89,14 +303,15 @@ def one_more(
 
 
 def are_turned(anchors: Anchors) -> bool:
-    """Whether the orientation of any of the Anchors is known: only then are directions part of a
-    layout.
+    """Return whether any orientation of the Anchors is known.
+
+    Only then are directions part of a layout.
     """
     return bool(np.isfinite(anchors.orientations).all(axis=1).any())
 
 
 def with_one(anchors: Anchors, position: np.ndarray) -> Anchors:
-    """Anchors with one more, whose orientation is not known, at position (3,) m."""
+    """Return Anchors with one more at position (3,) m, of unknown orientation."""
     return Anchors(
         np.append(anchors.ids, free_ids(anchors.ids, 1)),
         np.vstack([anchors.positions, position]),
@@ -105,9 +320,10 @@ def with_one(anchors: Anchors, position: np.ndarray) -> Anchors:
     )
 
 
-def named(better: Anchors, before: Anchors) -> Anchors:
-    """Anchors of a layout with the ids that they have `before`: who is moved is moved as little as
-    possible in all. New ids where there are more than before.
+def with_old_ids(better: Anchors, before: Anchors) -> Anchors:
+    """Return Anchors with the ids of the nearest anchors before.
+
+    The assignment moves the anchors as little as possible in all. Additional anchors get new ids.
     """
     away = np.linalg.norm(better.positions[:, None] - before.positions, axis=2)
     rows, old = linear_sum_assignment(away)
@@ -119,9 +335,7 @@ def named(better: Anchors, before: Anchors) -> Anchors:
 
 
 def rounded(better: Anchors, before: Anchors) -> Anchors:
-    """The same Anchors as somebody can put them up: to the centimetre and the degree; those that
-    stay as they are `before` are not touched.
-    """
+    """Return the Anchors to the centimetre and the degree. Anchors that stay do not change."""
     moved = _moved(better, before)
     positions, orientations = better.positions.copy(), better.orientations.copy()
     positions[moved] = positions[moved].round(2)
@@ -132,10 +346,8 @@ def rounded(better: Anchors, before: Anchors) -> Anchors:
     return Anchors(better.ids, positions, orientations, better.frame)
 
 
-def placed(better: Anchors, before: Anchors) -> list[dict[str, Any]]:
-    """[{"id", "words"}] of the Anchors that are not where they are `before`: where to put them, and
-    which way they face.
-    """
+def placements(better: Anchors, before: Anchors) -> list[dict[str, Any]]:
+    """Return [{"id", "words"}] of the Anchors that move: their new place and direction."""
     rows = before.index(better.ids)
     found = []
     for row in np.flatnonzero(_moved(better, before)).tolist():
@@ -156,15 +368,13 @@ def placed(better: Anchors, before: Anchors) -> list[dict[str, Any]]:
 
 
 def _moved(better: Anchors, before: Anchors) -> np.ndarray:
-    """Which of the Anchors are new, or more than a millimetre from where they are `before`: (n,)
-    bool.
-    """
+    """Return which Anchors are new, or more than a millimetre from where they were: (n,) bool."""
     rows = before.index(better.ids)
     return (rows < 0) | (np.linalg.norm(better.positions - before.positions[rows], axis=1) > 1e-3)
 
 
 def _beside(anchors: Anchors, count: int) -> bool:
-    """Whether any of the last `count` Anchors is beside another."""
+    """Return whether one of the last `count` Anchors is nearer than BESIDE to another."""
     away = np.linalg.norm(
         anchors.positions[:, None] - anchors.positions, axis=2
     ) + 2.0 * BESIDE * np.eye(len(anchors))
@@ -172,15 +382,16 @@ def _beside(anchors: Anchors, count: int) -> bool:
 
 
 def _some(goal: Goal, count: int) -> np.ndarray:
-    """Rows of some of the goal's points."""
+    """Return the rows of some of the goal's points."""
     if goal.objective == "worst":
         return spread(goal.points, count)
     return np.random.default_rng(SEED).permutation(len(goal.points))[:count]
 
 
 def _refined(goal: Goal, layout: Layout, x: np.ndarray, rows: np.ndarray) -> np.ndarray:
-    """x after descents at these rows of the goal's points and at those that turn out to be worse;
-    or x itself.
+    """Return x after descents at these rows of the goal's points and at the worst others.
+
+    Returns x itself if no descent is better.
     """
     best, score = x, goal.score(layout.anchors(x))
     for _ in range(EXCHANGES):
@@ -193,6 +404,95 @@ def _refined(goal: Goal, layout: Layout, x: np.ndarray, rows: np.ndarray) -> np.
         worst = np.argsort(-errors)[: 1 + len(errors) // 20]
         rows = np.union1d(rows, worst[spread(goal.points[worst], ADDED)])
         x = descend(goal, layout, goal.points[rows], x, SWEEPS)
-        if (found := goal.score(layout.anchors(x))) < score:
+        found = goal.score(layout.anchors(x))
+        if found < score:
             best, score = x, found
     return best
+
+
+LOOKED_AT = 600  # cells on which all places are tried
+VERIFIED = 4  # places that are judged on all cells
+PRECISION_WEIGHT = 0.2  # of the share of the room: what halving the bound is worth twice
+# An anchor that gains less than both is not worth it.
+LEAST_SHARE = 0.01  # of the room
+LEAST_PRECISION = 0.05  # of the bound
+
+
+class JudgeAddition(Protocol):
+    """Judge points (n, 3) m with one more anchor at a place (3,) m."""
+
+    def __call__(
+        self, before: Judged, points: np.ndarray, anchors: Anchors, place: np.ndarray
+    ) -> Judged:
+        """Return the Judged of the points; `before` is without the anchor. Raises InputError."""
+
+
+def best_addition(
+    found: Chart, anchors: Anchors, places: np.ndarray, judge: JudgeAddition, progress: Progress
+) -> dict[str, Any] | None:
+    """Return the gain of one more anchor at the best of some places; None if it is not worth it.
+
+    places : (m, 3) m; found : Chart of Anchors. All places are tried on some cells, the best on all.
+    Returns {"position" (3,) m, "flyable_share", "bound_flyable": quantiles, m, of a plan with it;
+    "gain": share of the cells; "bound_before", "bound_after": m, median where it can be flown
+    without it}.
+    """
+    points = found.grid.points
+    away = np.linalg.norm(places[:, None] - anchors.positions, axis=2).min(axis=1)
+    places = places[away >= BESIDE]
+    rows = (
+        np.sort(spread(points, LOOKED_AT))
+        if len(points) <= 4 * LOOKED_AT
+        else _random_rows(len(points))
+    )
+    some, before = points[rows], found.subset(rows)
+    values = []
+    for place in progress.over(places, what="places for one more anchor"):
+        try:
+            values.append(_value(before, judge(before, some, with_one(anchors, place), place)))
+        except InputError:
+            values.append(-np.inf)
+    best: tuple[float, dict[str, Any]] | None = None
+    for number in np.argsort(-np.array(values), kind="stable")[:VERIFIED]:
+        if best is not None and values[number] <= best[0]:  # the others promise less than this gain
+            break
+        if not np.isfinite(values[number]):
+            continue
+        progress("judging the best place on the whole map")
+        after = judge(found, points, with_one(anchors, places[number]), places[number])
+        if best is None or _value(found, after) > best[0]:
+            best = _value(found, after), _gains(found, after, places[number])
+    return best[1] if best and is_worth_an_anchor(best[1]) else None
+
+
+def is_worth_an_anchor(gains: dict[str, Any]) -> bool:
+    """Return whether the gains of `best_addition` are large enough."""
+    finer = 1.0 - gains["bound_after"] / gains["bound_before"] if gains["bound_before"] else 0.0
+    return gains["gain"] >= LEAST_SHARE or finer >= LEAST_PRECISION
+
+
+def _random_rows(count: int) -> np.ndarray:
+    """Return LOOKED_AT of `count` rows, in order."""
+    return np.sort(np.random.default_rng(0).permutation(count)[:LOOKED_AT])
+
+
+def _value(before: Judged, after: Judged) -> float:
+    """Return the value of an anchor: gained share of the cells, and precision where it could be flown."""
+    gains = _gains(before, after, np.zeros(3))
+    finer = 1.0 - gains["bound_after"] / gains["bound_before"] if gains["bound_before"] else 0.0
+    return gains["gain"] + PRECISION_WEIGHT * finer
+
+
+def _gains(before: Judged, after: Judged, place: np.ndarray) -> dict[str, Any]:
+    flown = before.flyable
+    medians = [
+        float(np.median(one.error[flown])) if flown.any() else None for one in (before, after)
+    ]
+    return {
+        "position": place.tolist(),
+        "flyable_share": float(after.flyable.mean()),
+        "bound_flyable": quantiles(after.error[after.flyable]),
+        "gain": float(after.flyable.mean() - before.flyable.mean()),
+        "bound_before": medians[0],
+        "bound_after": medians[1],
+    }

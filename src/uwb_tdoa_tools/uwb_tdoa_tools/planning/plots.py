@@ -1,6 +1,4 @@
-"""Pictures of charts, each with one message, to be read at 700 pixels: precision, where it can be
-flown, accuracy, layouts.
-"""
+"""Draw maps and layouts, each with one message, to be read at 700 pixels."""
 
 from __future__ import annotations
 
@@ -11,6 +9,7 @@ from matplotlib.collections import EllipseCollection
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
+from matplotlib.patheffects import withStroke
 import numpy as np
 from PIL import Image
 from scipy.spatial import ConvexHull
@@ -20,7 +19,7 @@ from uwb_tdoa_bias.foundation.files import write_filled
 
 from ..scoring.plots import draw_labels, plt
 from .bifurcation import Subsets
-from .judging import FLYABLE, IMPRECISE, OUTSIDE, TOO_FEW, TWO_SOLUTIONS
+from .maps import FLYABLE, IMPRECISE, OUTSIDE, TOO_FEW, TWO_SOLUTIONS
 from .precision import ellipses
 
 if TYPE_CHECKING:
@@ -33,10 +32,10 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.anchors import Anchors
 
     from ..simulation.rooms import Walls
-    from .accuracy import AccuracyMap
     from .installation import Installation
+    from .layout import AnchorPlaces
     from .maps import Chart, Grid
-    from .places import AnchorPlaces
+    from .precision import AccuracyMap
 
 WIDTH, DPI = 7.0, 100  # inches, pixels an inch
 STATES = {  # of a cell: what it is called, and its colour
@@ -51,12 +50,13 @@ HEARD_COLOURS = [0, 1, 2, 3, 4, 5, 6, 8, 10, 13, 17, 25]  # bounds of the colour
 COLOURS = "viridis_r"
 _MOST_LAYERS = 3
 ACROSS = 9  # ellipses along the longer side of a map
+NEAR = 0.1  # of the size of a map: anchors so close to it are drawn too
 
 
 def plot_precision(
     anchors: Anchors, chart: Chart, path: str | Path, walls: Walls | None = None
 ) -> None:
-    """The bound of one round, with 99 % ellipses."""
+    """Draw the bound of one round, with 99 % ellipses."""
     layers = _layers(chart.grid)
     figure, axes = _panels(chart.grid, len(layers))
     flown = (
@@ -77,7 +77,7 @@ def plot_precision(
         marker="o",
         mfc="none",
         ls="",
-        label=f"99 % of the estimates, {times} times as large",
+        label="99 % of the estimates" + (f", {times} times as large" if times > 1 else ""),
     )
     _finish(
         figure,
@@ -95,8 +95,10 @@ def plot_flyable(
     walls: Walls | None = None,
     pairings: Installation | None = None,
 ) -> None:
-    """Where it can be flown, and why not elsewhere. pairings : Installation whose bifurcation
-    curves are drawn, each choice of anchors by itself, or None.
+    """Draw where it can be flown, and why not elsewhere.
+
+    pairings : Installation whose bifurcation curves are drawn, one for each choice of anchors; or
+    None.
     """
     layers, codes = _layers(chart.grid), [code for code in STATES if (chart.status == code).any()]
     figure, axes = _panels(chart.grid, len(layers))
@@ -147,7 +149,7 @@ def plot_flyable(
 def plot_heard(
     anchors: Anchors, chart: Chart, path: str | Path, walls: Walls | None = None
 ) -> None:
-    """How many anchors are heard, of the middle layer."""
+    """Draw how many anchors the middle layer hears."""
     figure, (ax,) = _panels(chart.grid, 1)
     k = chart.grid.shape[2] // 2
     x, y, _ = chart.grid.axes
@@ -177,11 +179,10 @@ def plot_flips(
     mirrors: tuple[np.ndarray, np.ndarray],
     path: str | Path,
 ) -> None:
-    """Result of the brute-force check: points with one solution, with several, and where it
-    contradicts the prediction.
+    """Draw the brute-force check: points with one solution, with two, and contradictions.
 
-    points (n, 3); unique, agrees (n,) bool; mirrors : (from (m, 2), to (m, 2)), flips to draw as
-    arrows.
+    points : (n, 3) m; unique, agrees : (n,) bool; mirrors : (from (m, 2), to (m, 2)) m, flips to draw
+    as arrows.
     """
     figure, ax = plt.subplots(figsize=(WIDTH, WIDTH), layout="constrained")
     for chosen, state, label in (
@@ -220,8 +221,9 @@ def plot_flips(
 
 
 def plot_accuracy(installation: Installation, found: AccuracyMap, path: str | Path) -> None:
-    """Measured error beside what the filter claims and the bound, 3D, one colour scale; seen from
-    above.
+    """Draw measured error, bias, stated error and bound, 3D, seen from above.
+
+    All have one colour scale.
     """
     columns = (
         ("measured error (RMSE)", found.rmse),
@@ -278,9 +280,10 @@ def plot_accuracy(installation: Installation, found: AccuracyMap, path: str | Pa
 def plot_layouts(
     charts: Sequence[tuple[str, Installation, Chart]], flown: np.ndarray, path: str | Path
 ) -> None:
-    """Bound before and after, of the middle layer, at one scale: that of where it is flown. charts
-    : [(title, Installation, Chart)];
-    flown : (n, 3) m, places that are flown.
+    """Draw the bound before and after, of the middle layer, at one scale.
+
+    charts : [(title, Installation, Chart)]; flown : (n, 3) m, places that are flown. The scale is
+    that of these places.
     """
     grid = charts[0][2].grid
     k = grid.shape[2] // 2
@@ -331,10 +334,16 @@ def plot_layouts(
 
 
 def plot_places(
-    places: AnchorPlaces, numbers: np.ndarray, scores: np.ndarray, path: str | Path
+    places: AnchorPlaces,
+    numbers: np.ndarray,
+    scores: np.ndarray,
+    objective: str,
+    path: str | Path,
 ) -> None:
-    """What one more anchor gives at places all over, the walls side by side. numbers : (n,
-    places.numbers) of AnchorPlaces; scores : (n,) m, of `Goal.score`.
+    """Draw the scores of one more anchor, with the walls side by side.
+
+    numbers : (n, places.numbers) of AnchorPlaces; scores : (n,) m, of `Goal.score`; objective :
+    of the Goal.
     """
     figure, ax = plt.subplots(figsize=(WIDTH, 3.6), layout="constrained")
     at = places.positions(numbers)
@@ -351,7 +360,7 @@ def plot_places(
         edgecolors="0.4",
         linewidths=0.3,
     )
-    _bar([ax], dots, "worst bound that is flown, cm", _beyond(100.0 * scores, scale))
+    _bar([ax], dots, f"score: {objective} bound, cm", _beyond(100.0 * scores, scale))
     for number, (start, end) in enumerate(zip(places.starts, places.ends)):
         ax.axvline(end, color="0.6", lw=0.8)
         ax.text(
@@ -374,12 +383,12 @@ def plot_places(
         label=f"best: ({', '.join(f'{v:.2f}' for v in at[best])})",
     )
     ax.set(xlabel="along the walls, one after the other, m", ylabel="z, m")
-    title = "One more anchor, tried all over (times 1 to 2 for the share that cannot be flown)"
+    title = "One more anchor: the bound that is flown, times 1 to 2 for what cannot be flown"
     _finish(figure, title, ax.get_legend_handles_labels()[0], [], path)
 
 
 def _layers(grid: Grid) -> list[int]:
-    """Layers to draw: all, or three spread over the height."""
+    """Return the layers to draw: all, or three spread over the height."""
     n = grid.shape[2]
     return (
         list(range(n))
@@ -393,8 +402,9 @@ def _height(grid: Grid, k: int) -> str:
 
 
 def _panels(grid: Grid, count: int) -> tuple[Figure, np.ndarray]:
-    """Maps one above the other, each as wide as the picture, or as high as wide where the room is
-    longer along y.
+    """Return a figure with maps one above the other.
+
+    Each is as wide as the picture, or as high as wide if the room is longer along y.
     """
     ratio = min(1.0, grid.shape[1] / grid.shape[0])
     figure, axes = plt.subplots(
@@ -408,13 +418,13 @@ def _panels(grid: Grid, count: int) -> tuple[Figure, np.ndarray]:
 
 
 def _scale(values: np.ndarray) -> tuple[float, float]:
-    """Ends of the colours for values (n,): what 98 % of them lie between."""
+    """Return the ends of the colours: 98 % of values (n,) lie between them."""
     low, high = np.quantile(values, [0.01, 0.99]) if len(values) else (0.0, 1.0)
     return float(low), float(high if high > low else low + 1.0)
 
 
 def _beyond(values: np.ndarray, scale: tuple[float, float]) -> str:
-    """Which ends of the colours values (n,) go beyond, as matplotlib calls it."""
+    """Return which ends of the colours values (n,) exceed, in matplotlib's words."""
     values = values[np.isfinite(values)]
     if not len(values):
         return "neither"
@@ -424,7 +434,10 @@ def _beyond(values: np.ndarray, scale: tuple[float, float]) -> str:
 
 
 def _field(ax: Axes, grid: Grid, values: np.ndarray, k: int, scale: tuple[float, float]) -> Any:
-    """Colours of the layer k of values (n,) between the ends of a scale; white where there is none."""
+    """Draw the colours of the layer k of values (n,) between the ends of a scale.
+
+    Cells without a value are white.
+    """
     x, y, _ = grid.axes
     layer = grid.layer(np.where(np.isfinite(values), values, np.nan), k)
     return ax.pcolormesh(
@@ -439,7 +452,7 @@ def _bar(
     extend: str,
     ticks: Sequence[float] | None = None,
 ) -> None:
-    """A scale whose arrows say at which ends there is more."""
+    """Draw a colour scale with an arrow at each end that some values exceed."""
     bar = axes[0].figure.colorbar(
         drawn, ax=list(axes), extend=extend, shrink=0.9 / len(axes) ** 0.5, pad=0.02, aspect=25
     )
@@ -451,7 +464,7 @@ def _bar(
 
 
 def _hatch(ax: Axes, chart: Chart, k: int) -> None:
-    """Lines, on a lighter ground, over what is not flyable."""
+    """Draw lines on a lighter ground over cells that cannot be flown."""
     x, y, _ = chart.grid.axes
     edges = [
         np.append(axis - 0.5 * chart.grid.step, axis[-1] + 0.5 * chart.grid.step) for axis in (x, y)
@@ -472,13 +485,23 @@ def _hatch(ax: Axes, chart: Chart, k: int) -> None:
 def _room(
     ax: Axes, anchors: Anchors, grid: Grid, k: int | None, walls: Walls | None = None
 ) -> None:
-    """Axes of a map, with walls, hull and anchors; a margin keeps anchors on its edge inside."""
+    """Draw the axes of a map, with walls, hull and anchors.
+
+    The margin keeps anchors at the edge of the map, or a little beyond it, inside the picture.
+    """
     x, y, _ = grid.axes
-    margin = 0.5 * grid.step + 0.03 * max(np.ptp(x), np.ptp(y), grid.step)
+    size = max(np.ptp(x), np.ptp(y), grid.step)
+    margin = 0.5 * grid.step + 0.03 * size
     for x0, y0, x1, y1, _ in walls.segments if walls else ():
         ax.plot([x0, x1], [y0, y1], "k-", lw=2.5)
     ax.set(xlabel="x, m", ylabel="y, m", aspect="equal")
-    ax.set(xlim=(x[0] - margin, x[-1] + margin), ylim=(y[0] - margin, y[-1] + margin))
+    low, high = np.array([x[0], y[0]]), np.array([x[-1], y[-1]])
+    above = anchors.positions[:, :2]
+    beyond = np.maximum(low - above, above - high).max(axis=1)
+    near = np.vstack([low, high, above[beyond < NEAR * size]])
+    left, bottom = near.min(axis=0) - margin
+    right, top = near.max(axis=0) + margin
+    ax.set(xlim=(left, right), ylim=(bottom, top))
     _hull(ax, anchors)
     _anchors(ax, anchors)
 
@@ -494,6 +517,7 @@ def _hull(ax: Axes, anchors: Anchors) -> None:
             ls="--",
             scalex=False,
             scaley=False,
+            path_effects=[withStroke(linewidth=2.4, foreground="w")],
         )
 
 
@@ -515,11 +539,20 @@ def _anchors(ax: Axes, anchors: Anchors) -> None:
     turned = np.isfinite(anchors.orientations).all(axis=1)
     if turned.any():
         front = _directions(anchors)[turned]
-        ax.quiver(*p[turned, :2].T, *front.T, color=ANCHOR, width=0.004, scale=25, zorder=5)
+        ax.quiver(
+            *p[turned, :2].T,
+            *front.T,
+            color=ANCHOR,
+            width=0.005,
+            scale=25,
+            edgecolor="w",
+            linewidth=0.5,
+            zorder=5,
+        )
 
 
 def _directions(anchors: Anchors) -> np.ndarray:
-    """(n, 2) from above, of the fronts of anchors; 0 of those whose orientation is not known."""
+    """Return the fronts of anchors from above: (n, 2), 0 without an orientation."""
     out = np.zeros((len(anchors), 2))
     turned = np.isfinite(anchors.orientations).all(axis=1)
     if turned.any():
@@ -528,7 +561,7 @@ def _directions(anchors: Anchors) -> np.ndarray:
 
 
 def _fronts(ax: Axes, anchors: Anchors) -> np.ndarray:
-    """(2 n, 2) m, middles and tips of the arrows that show the fronts of anchors."""
+    """Return middles and tips of the arrows of the fronts of anchors: (2 n, 2) m."""
     arrow = _directions(anchors) * np.ptp(ax.get_xlim()) / 25.0
     return np.vstack([anchors.positions[:, :2] + share * arrow for share in (0.5, 1.0)])
 
@@ -543,7 +576,7 @@ def _anchor_mark(anchors: Anchors) -> Line2D:
 
 
 def _some_cells(chart: Chart, k: int) -> np.ndarray:
-    """Which cells of the layer k have an ellipse: (n,) bool."""
+    """Return which cells of the layer k have an ellipse: (n,) bool."""
     every = max(1, max(chart.grid.shape[:2]) // ACROSS)
     rows = np.zeros(chart.grid.shape, bool)
     rows[every // 2 :: every, every // 2 :: every, k] = True
@@ -551,7 +584,7 @@ def _some_cells(chart: Chart, k: int) -> np.ndarray:
 
 
 def _enlarged(chart: Chart) -> int:
-    """By how much ellipses are drawn larger, so that they can be seen and hardly cover each other."""
+    """Return the enlargement at which ellipses can be seen and hardly cover each other."""
     rows = np.any([_some_cells(chart, k) for k in _layers(chart.grid)], axis=0)
     if not rows.any():
         return 1
@@ -565,7 +598,7 @@ def _enlarged(chart: Chart) -> int:
 
 
 def _ellipses(ax: Axes, chart: Chart, k: int, times: int) -> None:
-    """99 % ellipses of some cells that can be flown."""
+    """Draw 99 % ellipses of some cells that can be flown."""
     rows = _some_cells(chart, k)
     if rows.any():
         semi, angle = ellipses(chart.covariance[rows])
@@ -591,7 +624,7 @@ def _finish(
     labelled: Sequence[tuple[Axes, Anchors]],
     path: str | Path,
 ) -> None:
-    """Title and legend, then the ids of anchors, once nothing else moves."""
+    """Draw title and legend, then the ids of anchors, and write the picture."""
     figure.suptitle(title, fontsize=12)
     if marks:
         wide = max(len(str(mark.get_label())) for mark in marks)

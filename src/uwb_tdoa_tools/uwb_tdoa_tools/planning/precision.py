@@ -1,21 +1,30 @@
-"""How precise a position can be: Fisher information, the Cramer-Rao bound, dilution of precision
-and ellipses.
+"""Compute how precise a position can be, and how precise measured flights were.
+
+The first part computes Fisher information, the Cramer-Rao bound, dilution of precision and
+ellipses. The second part compares errors of flights with the bound at the same places.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from uwb_tdoa_bias.foundation.flight import AIDS
 from uwb_tdoa_bias.foundation.geometry import ranges
 
-from .noise import FixedNoise, variance_gradient
+from ..scoring.evaluation import evaluate
+from ..scoring.metrics import position_at
+from .installation import FixedNoise, variance_gradient
 
 if TYPE_CHECKING:
-    from .installation import Installation
-    from .pairing import Pairing
+    from collections.abc import Iterable, Sequence
+
+    from uwb_tdoa_bias.foundation.flight import Flight
+
+    from .installation import Installation, Pairing
+    from .maps import Grid
 
 # standard deviations of a normal variable that hold 99 %, as rounded in Grasso et al., sec. 2.2.3
 NORMAL_99 = 2.58
@@ -28,13 +37,13 @@ def information(
     correction: bool = True,
     columns: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Fisher information about the position from one round of TDOAs or ranges and, where the tag
-    measures it, a height: (n, k, k) 1/m^2, k the installation's dimensions.
+    """Return the Fisher information of one round about the position: (n, k, k) 1/m^2.
 
-    points : (n, 3) m. correction : with the second term of eq. 1, the information that lies in the
-        size of the errors. columns : (n, K)
-    rows of the anchors that are heard at each point, None for all; the installation's pairing is of
-    so many. Source: eq. 1 of Grasso et al. (Sensors 2022, 22, 9136).
+    A round holds TDOAs or ranges and, if the tag measures it, a height. points : (n, 3) m; k : the
+    dimensions of the installation. correction : True adds the second term of eq. 1, the information
+    in the size of the errors. columns : (n, K) rows of the anchors that are heard at each point,
+    None for all; the pairing of the installation is of K anchors.
+    Source: eq. 1 of Grasso et al. (Sensors 2022, 22, 9136).
     """
     anchors, pairing = len(installation.anchors), installation.pairing
     width = (
@@ -79,18 +88,15 @@ def _information(
 def weigh(
     ranges: np.ndarray, variance: np.ndarray, pairing: Pairing, link_std: float = 0.0
 ) -> np.ndarray:
-    """Squared size, in standard deviations, of what changes (n, N, k) of the ranges do to the TDOAs
-    of one round.
+    """Return V' F^-1 V, the squared size of changes of the ranges in a round: (n, k, k).
 
-    variance : (n, N) m^2 of the receptions; link_std : m, as for Installation. Returns (n, k, k),
-        V' F^-1 V with V
-    (n, M, k) the changes of the TDOAs; with the derivatives of the ranges along x, y, z it is the
-    first term of eq. 1.
+    ranges : (n, N, k) m, changes of the ranges; V : (n, M, k) m, the changes of the TDOAs that
+    follow. variance : (n, N) m^2 of the receptions; link_std : m, as for Installation. If the
+    changes are the derivatives along x, y, z, this is the first term of eq. 1.
 
-    For one shared reception per anchor, whichever N - 1 pairs D connect the anchors, D' (D S D')^-1
-    D is the same matrix: W - w w' / sum(w) with W = S^-1, that of N ranges with one unknown offset,
-    the tag's clock. A closed ring, whose covariance D S D' is singular, holds the same and nothing
-    more.
+    With one shared reception per anchor the result does not depend on the pairs D that connect the
+    anchors: D' (D S D')^-1 D = W - w w' / sum(w) with W = S^-1. N ranges with one unknown
+    offset, the tag's clock, have the same weight. A closed ring, whose D S D' is singular, has the same result.
     """
     if pairing.beside:
         return np.sum([weigh(ranges, variance, part, link_std) for part in pairing.parts], axis=0)
@@ -109,7 +115,10 @@ def weigh(
 
 
 def range_weights(variance: np.ndarray, pairing: Pairing, link_std: float = 0.0) -> np.ndarray:
-    """`weigh` of the ranges themselves: (n, N, N) 1/m^2. variance : (n, N) m^2."""
+    """Return D' F^-1 D, the weights of the ranges in a round: (n, N, N) 1/m^2.
+
+    variance : (n, N) m^2.
+    """
     n, anchors = variance.shape
     if pairing.beside or pairing.shared or pairing.ranges:
         if pairing.beside:
@@ -130,7 +139,7 @@ def range_weights(variance: np.ndarray, pairing: Pairing, link_std: float = 0.0)
 def _from_sizes(
     gradient: np.ndarray, variance: np.ndarray, pairing: Pairing, link_std: float
 ) -> np.ndarray:
-    """Second term of eq. 1, for the derivatives (n, N, k) of the variances.
+    """Return the second term of eq. 1, for the derivatives (n, N, k) m of the variances.
 
     With F = D S D' + own, dF_i = D diag(g_i) D' and P = D' F^-1 D, half the trace is g_i' (P o P)
     g_j / 2.
@@ -152,7 +161,7 @@ def _from_sizes(
 
 
 def _inverse(variance: np.ndarray, pairing: Pairing, link_std: float) -> np.ndarray:
-    """D' F^-1 D: (n, N, N)."""
+    """Return D' F^-1 D: (n, N, N) 1/m^2."""
     d = pairing.incidence()
     return d.T @ np.linalg.inv(pairing.covariance(variance, link_std)) @ d
 
@@ -162,9 +171,7 @@ def _product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
 
 
 def bound(information: np.ndarray) -> np.ndarray:
-    """The Cramer-Rao bound: smallest covariance of an unbiased estimate, (n, k, k) m^2; inf where
-    there is none.
-    """
+    """Return the Cramer-Rao bound: (n, k, k) m^2; inf where the information is singular."""
     finite = np.isfinite(information).all(axis=(1, 2))
     checked = np.where(finite[:, None, None], information, 0.0)
     values, vectors = np.linalg.eigh(checked)
@@ -176,15 +183,16 @@ def bound(information: np.ndarray) -> np.ndarray:
 
 
 def position_error(covariance: np.ndarray) -> np.ndarray:
-    """Root of the summed variances of x, y (and z): (n,) m."""
+    """Return the root of the summed variances of x, y (and z): (n,) m."""
     return np.sqrt(np.trace(covariance, axis1=1, axis2=2))
 
 
 def dilution(points: np.ndarray, installation: Installation) -> np.ndarray:
-    """Dilution of precision: (n, k), error along x, y (and z) over that of one reception, if all
-    are alike; k the coordinates that TDOAs must determine.
+    """Return the dilution of precision along each axis: (n, k).
 
-    Its squares add up: of x and y to the horizontal, of all to the position dilution (PDOP).
+    The error along an axis is the dilution times the error of one reception, if all have the same. k
+    is the number of coordinates that TDOAs must determine. Root sums of squares give the horizontal dilution (x
+    and y) and the position dilution, PDOP (all).
     """
     unit_noise = replace(
         installation,
@@ -198,9 +206,131 @@ def dilution(points: np.ndarray, installation: Installation) -> np.ndarray:
 
 
 def ellipses(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Ellipses that hold 99 % of the estimates in the xy plane: (semi-axes (n, 2) m, the longer
-    first; angle (n,) rad of the longer one from x).
+    """Return the 99 % ellipses in the xy plane: (semi-axes (n, 2) m, angle (n,) rad).
+
+    The longer semi-axis comes first; the angle is from x to it.
     """
     values, vectors = np.linalg.eigh(covariance[:, :2, :2])
     axes = np.sqrt(-2.0 * np.log(1.0 - 0.99) * values[:, ::-1])
     return axes, np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
+
+
+FEWEST = 20  # estimates; a cell with fewer has no figures
+
+
+@dataclass(frozen=True)
+class ErrorSamples:
+    """Estimates against ground truth.
+
+    t : (n,) s; place : (n, 3) m, true; error : (n, 3) m; covariance : (n, 3, 3) m^2, stated by the
+    filter.
+    """
+
+    t: np.ndarray
+    place: np.ndarray
+    error: np.ndarray
+    covariance: np.ndarray
+
+
+def error_samples(flight: Flight, aids: Iterable[str] = ()) -> ErrorSamples:
+    """Return the ErrorSamples of a Flight with ground truth. Raises InputError.
+
+    The filter uses TDOAs, IMU and `aids` (names of AIDS) alone.
+    """
+    assert flight.truth is not None
+    score, _ = evaluate(flight.without(*(name for name in AIDS if name not in aids)))
+    return ErrorSamples(score.t, position_at(score.t, flight.truth), score.error, score.covariance)
+
+
+def pooled(samples: Sequence[ErrorSamples]) -> ErrorSamples:
+    """Return one ErrorSamples of several, with their times moved apart."""
+    apart = max(s.t[-1] for s in samples) + 10.0
+    times = np.concatenate([s.t + k * apart for k, s in enumerate(samples)])
+    return ErrorSamples(
+        times,
+        *(
+            np.concatenate([getattr(s, name) for s in samples])
+            for name in ("place", "error", "covariance")
+        ),
+    )
+
+
+@dataclass(frozen=True)
+class AccuracyMap:
+    """Errors per cell of a grid; NaN in cells with fewer than FEWEST estimates.
+
+    count : (n,); bias, rmse : (n, 3) m, along x, y, z; bound, claimed : (n, 3) m, roots of the mean
+    variances of the bound of one round and of the filter at the same places.
+    """
+
+    grid: Grid
+    count: np.ndarray
+    bias: np.ndarray
+    rmse: np.ndarray
+    bound: np.ndarray
+    claimed: np.ndarray
+
+
+def accuracy_map(samples: ErrorSamples, installation: Installation, grid: Grid) -> AccuracyMap:
+    """Return the AccuracyMap of ErrorSamples. Estimates outside of the grid are left out."""
+    variances = np.diagonal(bound_along(samples, installation), axis1=1, axis2=2)
+    claimed = np.diagonal(samples.covariance, axis1=1, axis2=2)
+    cell = np.floor((samples.place - grid.lower) / grid.step).astype(int)
+    inside = ((cell >= 0) & (cell < grid.shape)).all(axis=1)
+    index = np.ravel_multi_index(cell[inside].T, grid.shape)
+    size = int(np.prod(grid.shape))
+    count = np.bincount(index, minlength=size)
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        sums = np.stack([np.bincount(index, column, size) for column in values[inside].T], axis=1)
+        return np.where(count[:, None] >= FEWEST, sums / np.maximum(count, 1)[:, None], np.nan)
+
+    return AccuracyMap(
+        grid,
+        count,
+        mean(samples.error),
+        *(np.sqrt(mean(v)) for v in (samples.error**2, variances, claimed)),
+    )
+
+
+def bound_along(samples: ErrorSamples, installation: Installation) -> np.ndarray:
+    """Return the bound of one round at the place of each sample: (n, 3, 3) m^2.
+
+    The installation must have three dimensions.
+    """
+    return bound(information(samples.place, installation))
+
+
+def comparison(samples: ErrorSamples, installation: Installation) -> dict[str, Any]:
+    """Return achieved and stated errors against the bound, over all samples: m and ratios.
+
+    rmse, bound, claimed : roots of the mean squares of the 3D error, of the bound of one round, and
+        of the filter's standard deviation
+    scatter : rmse without the mean error within each second; the bound limits this part
+    achieved_over_bound, scatter_over_bound : ratios
+    efficiency_claimed : variance of the bound over that of the filter
+    efficiency_achieved : variance of the bound over the mean squared error
+
+    The filter uses many rounds and the IMU. An efficiency of n means: as good as n rounds with
+    independent errors.
+    """
+    limit = np.trace(bound_along(samples, installation), axis1=1, axis2=2).mean()
+    claim = np.trace(samples.covariance, axis1=1, axis2=2).mean()
+    squared = np.mean(np.sum(samples.error**2, axis=1))
+    second = np.unique(np.floor(samples.t).astype(np.int64), return_inverse=True)[1]
+    means = (
+        np.stack([np.bincount(second, e) for e in samples.error.T], axis=1)
+        / np.bincount(second)[:, None]
+    )
+    scatter = np.mean(np.sum((samples.error - means[second]) ** 2, axis=1))
+    return {
+        "samples": len(samples.t),
+        "rmse": float(np.sqrt(squared)),
+        "scatter": float(np.sqrt(scatter)),
+        "claimed": float(np.sqrt(claim)),
+        "bound": float(np.sqrt(limit)),
+        "achieved_over_bound": float(np.sqrt(squared / limit)),
+        "scatter_over_bound": float(np.sqrt(scatter / limit)),
+        "efficiency_claimed": float(limit / claim),
+        "efficiency_achieved": float(limit / squared),
+    }

@@ -1,22 +1,32 @@
-"""What plan says: figures for plan.json, and lines for the screen."""
+"""Report a plan: figures for plan.json, lines for the screen, and ROS messages of the maps."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..bags.files import new_bag
+from ..bags.message_types import typestore
+from ..bags.messages import anchors_message, header_of, pose_of
+from ..bags.topics import LATCHED_QOS
 from ..checking.sides import to_copy
 from ..scoring.gains import change_in_words
-from .judging import FLYABLE, IMPRECISE, OUTSIDE, TOO_FEW, TWO_SOLUTIONS
+from .maps import FLYABLE, IMPRECISE, OUTSIDE, TOO_FEW, TWO_SOLUTIONS
 from .precision import NORMAL_99, dilution
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
+    from pathlib import Path
+
+    from rosbags.typesys.store import Typestore
+
+    from uwb_tdoa_bias.foundation.anchors import Anchors
 
     from ..simulation.rooms import Room
     from .installation import Installation
-    from .maps import Chart
+    from .maps import Chart, Grid
 
 SHARES = {
     "flyable": FLYABLE,
@@ -38,8 +48,9 @@ _COLUMNS = {
 
 
 def summary(chart: Chart) -> dict[str, Any]:
-    """Figures of a Chart: sizes in m, m^2 or m^3, shares 0 to 1 of all its cells, of the room or of
-    a slice of it; "heard": {anchors heard: share}; "bound_flyable": quantiles, m.
+    """Return the figures of a Chart: shares 0 to 1 of its cells, sizes in m, m^2 or m^3.
+
+    "heard" : {anchors heard: share}; "bound_flyable" : quantiles, m.
     """
     step = chart.grid.step
     cell = step**2 if chart.grid.shape[2] == 1 else step**3
@@ -56,7 +67,7 @@ def summary(chart: Chart) -> dict[str, Any]:
 
 
 def in_hull(chart: Chart, installation: Installation) -> dict[str, Any]:
-    """Figures of a Chart inside the anchors' hull, m; None where no cell is."""
+    """Return the figures of a Chart inside the anchors' hull, m; None if no cell is inside."""
     rows = installation.inside_hull(chart.grid.points) & np.isfinite(chart.error)
     pdop = (
         np.linalg.norm(dilution(chart.grid.points[rows], installation), axis=1)
@@ -72,7 +83,7 @@ def in_hull(chart: Chart, installation: Installation) -> dict[str, Any]:
     }
 
 
-def say_room(room: Room, given: bool) -> None:
+def print_room(room: Room, given: bool) -> None:
     """Print the Room, and whether it was given."""
     ends = ", ".join(
         f"{axis} {low:.2f} to {high:.2f}" for axis, low, high in zip("xyz", room.lower, room.upper)
@@ -87,8 +98,8 @@ def say_room(room: Room, given: bool) -> None:
     )
 
 
-def say_in_hull(about: dict[str, Any]) -> None:
-    """Print what `in_hull` found."""
+def print_in_hull(about: dict[str, Any]) -> None:
+    """Print the figures of `in_hull`."""
     if about["bound_in_hull"] is None:
         print("no cell is among the anchors with a bound; choose another --room or --height")
         return
@@ -104,8 +115,8 @@ def say_in_hull(about: dict[str, Any]) -> None:
         print(f"  {label:52s}" + _quantiles(values, 3))
 
 
-def say_heard(about: dict[str, Any]) -> None:
-    """Print how many anchors are heard where, in a hall."""
+def print_heard(about: dict[str, Any]) -> None:
+    """Print how many anchors the cells of a hall hear."""
     shares = {int(number): share for number, share in about["heard"].items()}
     for label, low, high in (
         ("fewer than 4", 0, 3),
@@ -120,9 +131,10 @@ def say_heard(about: dict[str, Any]) -> None:
         )
 
 
-def say_flyable(about: dict[str, Any], accuracy: float) -> None:
-    """Print how much can be flown, and what keeps it from the rest. about : of `summary`; accuracy
-    : m, that is asked for.
+def print_flyable(about: dict[str, Any], accuracy: float) -> None:
+    """Print how much can be flown, and the reasons for the rest.
+
+    about : of `summary`; accuracy : m, of the options.
     """
     unit, whole = (
         ("m^2", "this slice of your room") if about["cells"][2] == 1 else ("m^3", "your room")
@@ -148,36 +160,38 @@ def say_flyable(about: dict[str, Any], accuracy: float) -> None:
         )
 
 
-def say_addition(told: dict[str, Any] | None, before: float) -> None:
-    """Print what one more anchor gains. told : of `advice.one_more`; before : share that can be
-    flown without it.
+def print_addition(gains: dict[str, Any] | None, before: float) -> None:
+    """Print the gain of one more anchor.
+
+    gains : of `best_addition`; before : share that can be flown without it.
     """
-    if told is None:
+    if gains is None:
         print(
             "no place that was tried for one more anchor gains 1 % of the room, or 5 % of precision"
         )
         return
-    at = ", ".join(f"{x:.2f}" for x in told["position"])
+    at = ", ".join(f"{x:.2f}" for x in gains["position"])
     finer = ""
-    if told["bound_before"]:
+    if gains["bound_before"]:
         finer = (
-            f"; the bound where it can be flown now goes from {100.0 * told['bound_before']:.1f} "
-            f"to {100.0 * told['bound_after']:.1f} cm (median)"
+            f"; the bound where it can be flown now goes from {100.0 * gains['bound_before']:.1f} "
+            f"to {100.0 * gains['bound_after']:.1f} cm (median)"
         )
     print(
         f"add an anchor at ({at}): {100.0 * before:.1f} -> "
-        f"{100.0 * told['flyable_share']:.1f} % can be flown{finer}"
+        f"{100.0 * gains['flyable_share']:.1f} % can be flown{finer}"
     )
 
 
-def say_design(
+def print_design(
     steps: Sequence[dict[str, Any]],
     chosen: dict[str, Any],
     placed: Sequence[dict[str, Any]],
     share: float,
 ) -> None:
-    """Print what layouts give, the one that was chosen, and where its anchors are put. steps,
-    chosen : of design.Step; placed : of design.about.
+    """Print the steps of a design, the chosen one, and the places of its anchors.
+
+    steps, chosen : of `hall.Step`; placed : of `hall.placements`.
     """
     print(
         f"{'anchors':>8s}{'one for':>9s}{'spacing':>9s}{'flyable':>9s}  bound there, m: "
@@ -205,8 +219,8 @@ def say_design(
         )
 
 
-def say_side(side: dict[str, Any] | None) -> None:
-    """Print what `Hall.side` found."""
+def print_side(side: dict[str, Any] | None) -> None:
+    """Print the result of `Hall.side`."""
     if side:
         print(
             f"at {_percent(side['share'])} of the cells the anchors that are heard lie in a "
@@ -214,16 +228,16 @@ def say_side(side: dict[str, Any] | None) -> None:
         )
 
 
-def say_check(found: dict[str, Any]) -> None:
-    """Print what `run.check` found."""
+def print_check(found: dict[str, Any]) -> None:
+    """Print the result of `run.brute_force_check`."""
     print(
         f"check: {found['places']} places, agreement with the brute-force solver "
         f"{found['agreement']:.2%}"
     )
 
 
-def say_flights(rows: Sequence[dict[str, Any]]) -> None:
-    """Print the rows of accuracy.comparison, each with its "flight"."""
+def print_flights(rows: Sequence[dict[str, Any]]) -> None:
+    """Print the rows of `precision.comparison`, each with its "flight"."""
     print(
         "3D, root mean square, m; efficiency: variance of the bound of one round over that of "
         "the estimate"
@@ -233,8 +247,8 @@ def say_flights(rows: Sequence[dict[str, Any]]) -> None:
         print(f"{row['flight']:20s}" + "".join(f"{row[name]:10.3f}" for name in _COLUMNS))
 
 
-def say_improvement(found: dict[str, Any]) -> None:
-    """Print before and after in the terms of `summary`, and what is judged where it flies."""
+def print_improvement(found: dict[str, Any]) -> None:
+    """Print before and after: the shares of `summary`, and the bound of the flown places."""
     print(f"{'':44s}  before   after")
     for name, label, factor, digits in (
         ("flyable_share", "flyable, % of the room", 100.0, 1),
@@ -258,7 +272,7 @@ def _quantiles(values: dict[str, float], digits: int) -> str:
 
 
 def quantiles(values: np.ndarray) -> dict[str, float] | None:
-    """{"best", "median", "95 %", "worst"} of values (n,); None without any."""
+    """Return {"best", "median", "95 %", "worst"} of values (n,); None without any."""
     if not len(values):
         return None
     return dict(
@@ -266,3 +280,156 @@ def quantiles(values: np.ndarray) -> dict[str, float] | None:
             ("best", "median", "95 %", "worst"), np.quantile(values, [0.0, 0.5, 0.95, 1.0]).tolist()
         )
     )
+
+
+TOPICS = {
+    "plan/flyable": "nav_msgs/msg/OccupancyGrid",
+    "plan/precision": "nav_msgs/msg/OccupancyGrid",
+    "plan/markers": "visualization_msgs/msg/MarkerArray",
+    "uwb/anchors": "uwb_tdoa_msgs/msg/AnchorArray",
+}
+OCCUPIED = {FLYABLE: 0, TWO_SOLUTIONS: 50, IMPRECISE: 75, TOO_FEW: 100, OUTSIDE: 100}
+_CUBES, _SPHERES, _TEXT = 6, 7, 9  # visualization_msgs/msg/Marker
+
+
+def map_messages(chart: Chart, anchors: Anchors, stamp: int = 0) -> dict[str, Any]:
+    """Return {topic: rosbags message} of TOPICS. stamp : ns.
+
+    plan/flyable : the middle layer, with values of OCCUPIED
+    plan/precision : the same layer, the bound (root of its trace) in cm, at most 100; -1 without one
+    plan/markers : the surface of the flyable cells, from green (best bound) to red, and the anchors
+    """
+    store = typestore()
+    k = chart.grid.shape[2] // 2
+    status = np.array([OCCUPIED[one] for one in range(len(OCCUPIED))])[chart.status]
+    cm = np.where(
+        np.isfinite(chart.error), np.minimum(np.rint(100.0 * np.minimum(chart.error, 1e3)), 100), -1
+    )
+    return {
+        "plan/flyable": _occupancy(store, chart.grid, status, k, anchors.frame, stamp),
+        "plan/precision": _occupancy(store, chart.grid, cm, k, anchors.frame, stamp),
+        "plan/markers": _markers(store, chart, anchors, stamp),
+        "uwb/anchors": anchors_message(anchors, stamp, store)[1],
+    }
+
+
+def write_messages(found: dict[str, Any], path: str | Path) -> None:
+    """Write `map_messages` as a bag, transient local, one message per topic.
+
+    An existing bag is replaced.
+    """
+    store = typestore()
+    with new_bag(path, force=True) as writer:
+        for topic, message in found.items():
+            connection = writer.add_connection(
+                f"/{topic}", TOPICS[topic], typestore=store, offered_qos_profiles=[LATCHED_QOS]
+            )
+            writer.write(connection, 0, store.serialize_cdr(message, TOPICS[topic]))
+
+
+def publish_messages(found: dict[str, Any]) -> None:
+    """Publish `map_messages`, transient local, until SIGINT or SIGTERM. Needs rclpy."""
+    import rclpy
+    from rclpy.serialization import deserialize_message
+
+    from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS
+
+    from ..live.session import message_class, session
+
+    store = typestore()
+    with session("plan", []) as (node, stop):
+        for topic, message in found.items():
+            kind = message_class(TOPICS[topic])
+            data = bytes(store.serialize_cdr(message, TOPICS[topic]))
+            node.create_publisher(kind, topic, ANCHORS_QOS).publish(deserialize_message(data, kind))
+        while not stop:
+            rclpy.spin_once(node, timeout_sec=0.2)
+
+
+def _occupancy(
+    store: Typestore, grid: Grid, values: np.ndarray, k: int, frame: str, stamp: int
+) -> Any:
+    """Return values (n,) of layer k as an OccupancyGrid at the height of the layer's middle."""
+    types, (nx, ny, _) = store.types, grid.shape
+    header = header_of(store, stamp, frame)
+    corner = pose_of(store, (*grid.lower[:2], grid.axes[2][k]))
+    info = types["nav_msgs/msg/MapMetaData"](header.stamp, grid.step, nx, ny, corner)
+    data = np.ascontiguousarray(grid.layer(values, k).ravel(), dtype=np.int8)
+    return types["nav_msgs/msg/OccupancyGrid"](header, info, data)
+
+
+def _markers(store: Typestore, chart: Chart, anchors: Anchors, stamp: int) -> Any:
+    types, grid = store.types, chart.grid
+    surface = _surface(chart.flyable.reshape(grid.shape)).ravel()
+    error = chart.error[surface]
+    worse = (error - error.min(initial=np.inf)) / max(np.ptp(error) if len(error) else 0.0, 1e-9)
+    green_to_red = np.column_stack(
+        [np.minimum(2 * worse, 1), np.minimum(2 - 2 * worse, 1), 0 * worse, 0 * worse + 0.4]
+    )
+    shapes = [
+        _Shape("flyable", _CUBES, grid.step, points=grid.points[surface], colours=green_to_red)
+    ]
+    shapes.append(_Shape("anchors", _SPHERES, 0.15, points=anchors.positions))
+    for number, p in zip(anchors.ids.tolist(), anchors.positions):
+        shapes.append(_Shape("ids", _TEXT, 0.25, number, at=p + [0, 0, 0.25], text=str(number)))
+    header = header_of(store, stamp, anchors.frame)
+    return types["visualization_msgs/msg/MarkerArray"](
+        [_marker(store, header, one) for one in shapes]
+    )
+
+
+@dataclass(frozen=True)
+class _Shape:
+    """The content of a marker.
+
+    kind : of visualization_msgs/Marker; size : m; points : (n, 3) m of its parts; colours : (n, 4) of
+    these, red, green, blue and opacity; at : (3,) m, its place.
+    """
+
+    namespace: str
+    kind: int
+    size: float
+    number: int = 0
+    points: Sequence[float] | np.ndarray = ()
+    colours: Sequence[float] | np.ndarray = ()
+    at: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0)
+    text: str = ""
+
+
+def _marker(store: Typestore, header: Any, shapes: _Shape) -> Any:
+    types = store.types
+    colour, zero = types["std_msgs/msg/ColorRGBA"], types["builtin_interfaces/msg/Duration"](0, 0)
+    nothing = types["sensor_msgs/msg/CompressedImage"](
+        header_of(store, 0, ""), "", np.empty(0, np.uint8)
+    )
+    return types["visualization_msgs/msg/Marker"](
+        header,
+        shapes.namespace,
+        shapes.number,
+        shapes.kind,
+        0,
+        pose_of(store, shapes.at),
+        types["geometry_msgs/msg/Vector3"](*[shapes.size] * 3),
+        colour(0.1, 0.3, 0.9, 1.0),
+        zero,
+        False,
+        [types["geometry_msgs/msg/Point"](*p) for p in np.asarray(shapes.points).tolist()],
+        [colour(*c) for c in np.asarray(shapes.colours).tolist()],
+        "",
+        nothing,
+        [],
+        shapes.text,
+        "",
+        types["visualization_msgs/msg/MeshFile"]("", np.empty(0, np.uint8)),
+        False,
+    )
+
+
+def _surface(cells: np.ndarray) -> np.ndarray:
+    """Return the cells that are true and have a false neighbour, or the edge of the grid."""
+    padded = np.pad(cells, 1)
+    inner = np.ones_like(cells)
+    for axis in range(3):
+        for shift in (-1, 1):
+            inner &= np.roll(padded, shift, axis)[1:-1, 1:-1, 1:-1]
+    return cells & ~inner

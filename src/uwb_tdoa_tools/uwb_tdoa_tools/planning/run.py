@@ -1,53 +1,253 @@
-"""The parts of plan: each writes its pictures to a folder and returns its figures, plain values."""
+"""Run the parts of `plan`: read the options, compute, write the pictures, and return the figures."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from uwb_tdoa_bias.foundation.antenna import Antenna
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, parallel
 from ..progress import Progress
 from ..readers.inputs import Reading
-from ..simulation.rooms import Walls
-from . import accuracy, advice, design, hall, messages, optimisation, options, plots, report
-from .check import brute_force
-from .judging import judge
-from .maps import Grid, chart
-from .places import lattice
+from ..simulation.rooms import Room, Walls, room_of
+from . import hall, optimisation, plots, precision, report
+from .installation import (
+    OF_PROTOCOL,
+    PAIRINGS,
+    FixedNoise,
+    Installation,
+    RadioNoise,
+    antenna_from_yaml,
+)
+from .layout import AnchorPlaces, Goal, lattice
+from .maps import Demand, Grid, brute_force, chart, judge
 
 if TYPE_CHECKING:
     from argparse import Namespace
     from collections.abc import Iterable, Sequence
-    from pathlib import Path
 
     from uwb_tdoa_bias.foundation.anchors import Anchors
 
     from ..readers.inputs import Recording
-    from ..simulation.rooms import Room
-    from .goal import Goal
-    from .installation import Installation
-    from .judging import Demand
     from .maps import Chart
-    from .places import AnchorPlaces
 
-TRIED = 60  # places on the walls of a room that are tried for one more anchor, about
-IN_HALL = (
-    0.35,
-    (1.0, 4.0),
-)  # of the reach, between places that are tried in a hall; m above the floor
+FARTHEST = 30.0  # m, size of a room from which on the radio's reach must be given
+# cells along the longest side, without --step
+CELLS_ACROSS = {"slice": 100, "volume": 50}
+# cells of the flown volume; a search for better anchors looks at their corners
+FLOWN_CELLS = 300
+
+
+@dataclass(frozen=True)
+class Aim:
+    """What --improve asks for.
+
+    goal : Goal of the search; reported : Goal at more points, for the report; places : AnchorPlaces;
+    count : number of anchors.
+    """
+
+    goal: Goal
+    reported: Goal
+    places: AnchorPlaces
+    count: int
+
+
+def check_options(args: Namespace) -> None:
+    """Raise InputError for options that do not go together."""
+    if args.hall == (args.anchors is not None):
+        raise InputError(
+            "ANCHORS: give a file of the anchors that there are, or --hall where they are "
+            "asked for."
+        )
+    if not 0.0 < args.share <= 1.0:
+        raise InputError(
+            f"share: {args.share:g} is none; give more than 0 and at most 1, e.g. 0.95."
+        )
+    if args.walls is not None and args.radio_reach is None:
+        raise InputError(
+            "walls: are for a hall of which a tag hears a part; give --radio-reach too."
+        )
+    if args.flights and args.planar:
+        raise InputError("flights: are judged in three dimensions; leave out --planar.")
+
+
+def installation_of(args: Namespace, anchors: Anchors) -> Installation:
+    """Return the Installation of Anchors and the options. Raises InputError.
+
+    With a reach, each place hears a part of the anchors, as in a hall.
+    """
+    noise: RadioNoise | FixedNoise
+    if args.noise is not None:
+        noise = FixedNoise(args.noise)
+    else:
+        antenna = antenna_from_yaml(args.antenna) if args.antenna else Antenna()
+        noise = RadioNoise(antenna, args.tx_power, args.temperature, args.voltage)
+    # of a single anchor there is none, and Installation refuses it
+    pairing: Any = PAIRINGS[_pairing(args)](len(anchors)) if len(anchors) > 1 else None
+    height_std = args.height_std if "height" in args.aids else np.inf
+    return Installation(
+        anchors,
+        noise,
+        pairing,
+        args.link_noise,
+        2 if args.planar else 3,
+        height_std,
+        args.hall or args.radio_reach is not None,
+    )
+
+
+def demand_of(args: Namespace, installation: Installation, room: Room) -> Demand:
+    """Return the Demand of the options in a Room.
+
+    Raises InputError for a criterion that ranges, or a hall, do not have.
+    """
+    if installation.pairing is not None and installation.pairing.one_solution:
+        for name, asked in (("flyable", args.flyable == "pairings"), ("check", args.check)):
+            if asked:
+                raise InputError(
+                    f"{name}: looks for a second solution of TDOAs, and ranges have none; "
+                    "leave it out, or plan for --protocol tdoa2."
+                )
+    if installation.hall and args.flyable == "pairings":
+        raise InputError(
+            "flyable: pairings are of a room in which every anchor is heard; leave out "
+            "--flyable, or --radio-reach."
+        )
+    return Demand(room, args.accuracy, args.flyable)
+
+
+def reach_of(args: Namespace, room: Room) -> float:
+    """Return the radio's reach, m. Raises InputError if a large Room needs it."""
+    if args.radio_reach is not None:
+        if not args.radio_reach > 0.0:
+            raise InputError(
+                f"radio reach: {args.radio_reach:g} m is none; give one above 0, e.g. 18."
+            )
+        return float(args.radio_reach)
+    longest = (room.upper - room.lower).max()
+    if longest > FARTHEST:
+        raise InputError(
+            f"room: is {longest:.0f} m long, and a tag does not hear all of its anchors; give "
+            "what your radios reach, e.g. --radio-reach 25."
+        )
+    return np.inf
+
+
+def room_of_options(args: Namespace, anchors: Anchors | None) -> Room:
+    """Return the Room of --room, or the room that the anchors span. Raises InputError.
+
+    anchors : None if --hall asks for them.
+    """
+    if anchors is None:
+        if args.room is None or len(args.room) != 6:
+            raise InputError(
+                "room: --hall needs all of it, in metres; give --room X0 X1 Y0 Y1 Z0 Z1."
+            )
+        return _box("room", args.room)
+    room = room_of(anchors)
+    if args.room is None:
+        return room
+    if len(args.room) not in (4, 6):
+        raise InputError(
+            f"room: {len(args.room)} numbers were given; give X0 X1 Y0 Y1 or X0 X1 Y0 Y1 Z0 Z1."
+        )
+    return _box(
+        "room", args.room if len(args.room) == 6 else [*args.room, room.lower[2], room.upper[2]]
+    )
+
+
+def grid_of(args: Namespace, room: Room) -> Grid:
+    """Return the Grid of a slice or of the Room. Raises InputError."""
+    size = room.upper - room.lower
+    if args.volume and args.planar:
+        raise InputError(
+            "planar: with a known height there is no volume; leave out --volume, or --planar."
+        )
+    if args.volume:
+        return Grid.box(room.lower, room.upper, args.step or size.max() / CELLS_ACROSS["volume"])
+    height = room.centre[2] if args.height is None else args.height
+    step = args.step or size[:2].max() / CELLS_ACROSS["slice"]
+    return Grid.slice((room.lower[0], room.upper[0]), (room.lower[1], room.upper[1]), height, step)
+
+
+def aim_of(args: Namespace, installation: Installation, demand: Demand, height: float) -> Aim:
+    """Return the Aim of --improve. Raises InputError.
+
+    height : m, of the flown slice if the tag's height is known.
+    """
+    count = len(installation.anchors) if args.count is None else args.count
+    for name, value, least in (
+        ("count", count, installation.unknowns + 1),
+        ("starts", args.starts, 1),
+    ):
+        if value < least:
+            raise InputError(f"{name}: {value} is too few; give at least {least}.")
+    fly = _box("fly", args.fly) if args.fly else Room(*demand.room.flyable)
+    lower, upper, k = fly.lower.copy(), fly.upper.copy(), installation.dimensions
+    lower[k:] = upper[k:] = height
+    step = max(0.1, (np.prod((upper - lower)[:k]) / FLOWN_CELLS) ** (1.0 / k))
+
+    def goal(step: float) -> Goal:
+        return Goal(
+            lattice(lower, upper, step), installation, _pairing(args), args.objective, demand
+        )
+
+    return Aim(goal(step), goal(0.4 * step), places_of(args, demand.room), count)
+
+
+def goal_of(args: Namespace, installation: Installation, demand: Demand) -> Goal:
+    """Return a Goal without points. Its `installed` gives the Installation of other Anchors."""
+    return Goal(np.empty((0, 3)), installation, _pairing(args), demand=demand)
+
+
+def places_of(args: Namespace, room: Room) -> AnchorPlaces:
+    """Return the AnchorPlaces of --places, or the walls of the Room. Raises InputError."""
+    return (
+        AnchorPlaces.from_yaml(args.places)
+        if args.places
+        else AnchorPlaces.walls(room.lower, room.upper)
+    )
+
+
+def as_json(args: Namespace) -> dict[str, Any]:
+    """Return the options as JSON values."""
+    return {
+        name: str(value) if isinstance(value, Path) else value for name, value in vars(args).items()
+    }
+
+
+def _pairing(args: Namespace) -> str:
+    return args.covariance or OF_PROTOCOL[args.protocol]
+
+
+def _box(name: str, numbers: Sequence[float]) -> Room:
+    lower, upper = np.array(numbers[0::2]), np.array(numbers[1::2])
+    if not (upper > lower).all():
+        raise InputError(
+            f"{name}: {list(numbers)} is empty; give X0 X1 Y0 Y1 Z0 Z1, each pair rising."
+        )
+    return Room(lower, upper)
+
+
+PLACES_TRIED = 60  # places on the walls of a room that are tried for one more anchor, about
+# Places that are tried in a hall:
+HALL_SPACING = 0.35  # of the reach, between them
+HALL_HEIGHTS = (1.0, 4.0)  # m above the floor
 
 
 def plan_hall(
     args: Namespace, anchors: Anchors | None, installation: Installation, demand: Demand, grid: Grid
 ) -> tuple[dict[str, Any], dict[str, Any], bool]:
-    """All of plan with --radio-reach or --hall: (figures, messages, whether the wanted share can be
-    flown). args : the options; anchors : Anchors of the hall, None where they are asked for. Raises
-    InputError.
+    """Plan a hall, with --radio-reach or --hall. Raises InputError.
+
+    args : the options; anchors : Anchors of the hall, None if --hall asks for them. Returns (figures,
+    messages, whether the wanted share can be flown).
     """
     for name in ("check", "flights", "improve"):
         if getattr(args, name):
@@ -56,57 +256,57 @@ def plan_hall(
                 "or --radio-reach."
             )
     room, walls = demand.room, None if args.walls is None else Walls.from_yaml(args.walls)
-    goal, reach = options.goal_of(args, installation, demand), options.reach_of(args, demand.room)
+    goal, reach = goal_of(args, installation, demand), reach_of(args, demand.room)
     whole = hall.Hall(goal, installation.anchors, reach, walls)
     args.out.mkdir(parents=True, exist_ok=True)
-    report.say_room(room, args.room is not None)
-    figures: dict[str, Any] = {"arguments": options.plain(args)}
+    report.print_room(room, args.room is not None)
+    figures: dict[str, Any] = {"arguments": as_json(args)}
     if anchors is None:
         anchors, found, figures["design"] = _designed(args, whole, grid)
         anchors.to_yaml(args.out / "hall.yaml")
     else:
         found = whole.chart(grid, args.jobs, args.dask)
-    whole = whole.of(anchors)
+    whole = whole.with_anchors(anchors)
     figures |= {
         "anchors": len(anchors),
         "map": report.summary(found),
         "side": whole.side(grid.points),
     }
-    report.say_heard(figures["map"])
-    report.say_flyable(figures["map"], demand.accuracy)
-    report.say_side(figures["side"])
+    report.print_heard(figures["map"])
+    report.print_flyable(figures["map"], demand.accuracy)
+    report.print_side(figures["side"])
     figures["addition"] = hall_advice(whole, found)
-    report.say_addition(figures["addition"], figures["map"]["flyable_share"])
+    report.print_addition(figures["addition"], figures["map"]["flyable_share"])
     plots.plot_heard(anchors, found, args.out / "heard.png", walls)
-    outgoing = draw_map(found, installation.of(anchors), args.out, walls)
+    outgoing = draw_map(found, installation.with_anchors(anchors), args.out, walls)
     return figures, outgoing, bool(found.flyable.mean() >= args.share or not args.hall)
 
 
 def _designed(
     args: Namespace, whole: hall.Hall, grid: Grid
 ) -> tuple[Anchors, Chart, list[dict[str, Any]]]:
-    """(Anchors, Chart, rows of the table) of --hall: the fewest of which the wanted share can be
-    flown on all of the Grid.
+    """Return (Anchors, Chart, rows of the table) of --hall.
+
+    It is the layout with the fewest anchors that has the wanted share on all of the Grid.
     """
     room = whole.goal.demand.room
     with Progress("plan") as progress:
-        layouts, steps = design.design(whole, room, grid.points, args.share, progress)
+        layouts, steps = hall.design(whole, room, grid.points, args.share, progress)
     for anchors in layouts:
-        found = whole.of(anchors).chart(grid, args.jobs, args.dask)
+        found = whole.with_anchors(anchors).chart(grid, args.jobs, args.dask)
         if found.flyable.mean() >= args.share:
             break
     rows = [asdict(step) for step in steps]
-    report.say_design(
-        rows, asdict(design.step_of(found, anchors, room)), design.about(anchors), args.share
+    report.print_design(
+        rows, asdict(hall.step_of(found, anchors, room)), hall.placements(anchors), args.share
     )
     return anchors, found, rows
 
 
-def _places(room: Room, reach: float) -> np.ndarray:
-    """Places (n, 3) m all over a hall that are tried for one more anchor."""
-    step, heights = IN_HALL
-    z = [min(room.lower[2] + height, room.upper[2]) for height in heights]
-    across = lattice([*room.lower[:2], 0.0], [*room.upper[:2], 0.0], step * reach)[:, :2]
+def _places_in_hall(room: Room, reach: float) -> np.ndarray:
+    """Return the places that are tried for one more anchor in a hall: (n, 3) m."""
+    z = [min(room.lower[2] + height, room.upper[2]) for height in HALL_HEIGHTS]
+    across = lattice([*room.lower[:2], 0.0], [*room.upper[:2], 0.0], HALL_SPACING * reach)[:, :2]
     return np.unique(
         np.vstack([np.column_stack([across, np.full(len(across), height)]) for height in z]).round(
             1
@@ -124,13 +324,14 @@ def plan_room(
     reading: Reading,
     recordings: Sequence[Recording],
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    """All of plan of a room in which every anchor is heard: (figures, messages). args : the
-    options; recordings : of --flights, which Reading found. Raises InputError.
+    """Plan a room in which each place hears all anchors. Raises InputError.
+
+    args : the options; recordings : of --flights, by Reading. Returns (figures, messages).
     """
-    aim = options.aim_of(args, installation, demand, grid.axes[2][0]) if args.improve else None
+    aim = aim_of(args, installation, demand, grid.axes[2][0]) if args.improve else None
     if not np.isfinite(anchors.orientations).all():
         cli.show("anchors without orientation are taken to radiate alike in all directions")
-    report.say_room(demand.room, args.room is not None)
+    report.print_room(demand.room, args.room is not None)
     args.out.mkdir(parents=True, exist_ok=True)
     with Progress("plan") as progress:
         progress("mapping")
@@ -138,39 +339,41 @@ def plan_room(
     about = {**report.summary(found), **report.in_hull(found, installation)}
     figures: dict[str, Any] = {
         "anchors": len(anchors),
-        "arguments": options.plain(args),
+        "arguments": as_json(args),
         "map": about,
     }
-    report.say_in_hull(about)
-    report.say_flyable(about, demand.accuracy)
+    report.print_in_hull(about)
+    report.print_flyable(about, demand.accuracy)
     if demand.criterion == "round":
         goal, places = (
-            options.goal_of(args, installation, demand),
-            options.places_of(args, demand.room),
+            goal_of(args, installation, demand),
+            places_of(args, demand.room),
         )
         figures["addition"] = room_advice(found, anchors, goal, places)
-        report.say_addition(figures["addition"], about["flyable_share"])
+        report.print_addition(figures["addition"], about["flyable_share"])
     outgoing = draw_map(found, installation, args.out, pairings=demand.criterion == "pairings")
     if args.check:
-        figures["check"] = check(installation, grid, args.out)
-        report.say_check(figures["check"])
+        figures["check"] = brute_force_check(installation, grid, args.out)
+        report.print_check(figures["check"])
     if recordings:
-        flown = parallel.over(Fly(reading, tuple(args.aids)), recordings, args.jobs, args.dask)
+        flown = parallel.over(
+            FlightErrors(reading, tuple(args.aids)), recordings, args.jobs, args.dask
+        )
         figures["flights"] = evaluate_flights(
             flown, installation, demand.room, args.step or 0.4, args.out
         )
-        report.say_flights(figures["flights"])
+        report.print_flights(figures["flights"])
     if aim:
         figures["improve"] = improve(found, aim, args.improve, args.starts, args.out)
-        report.say_improvement(figures["improve"])
+        report.print_improvement(figures["improve"])
     return figures, outgoing
 
 
 def hall_advice(whole: hall.Hall, found: Chart) -> dict[str, Any] | None:
-    """What `advice.one_more` finds in a Hall. found : Chart of it."""
-    places = _places(whole.goal.demand.room, min(whole.reach, options.FARTHEST))
+    """Return the `best_addition` of a Hall. found : Chart of it."""
+    places = _places_in_hall(whole.goal.demand.room, min(whole.reach, FARTHEST))
     with Progress("plan") as progress:
-        return advice.one_more(
+        return optimisation.best_addition(
             found,
             whole.anchors,
             places,
@@ -182,12 +385,13 @@ def hall_advice(whole: hall.Hall, found: Chart) -> dict[str, Any] | None:
 def room_advice(
     found: Chart, anchors: Anchors, goal: Goal, places: AnchorPlaces
 ) -> dict[str, Any] | None:
-    """What `advice.one_more` finds on AnchorPlaces of a room in which all is heard, to the
-    centimetre. found : Chart of Anchors.
+    """Return the `best_addition` on AnchorPlaces, in a room in which all is heard.
+
+    Places are rounded to the centimetre. found : Chart of Anchors.
     """
-    tried = np.unique(places.positions(places.grid(TRIED)).round(2), axis=0)
+    tried = np.unique(places.positions(places.grid(PLACES_TRIED)).round(2), axis=0)
     with Progress("plan") as progress:
-        return advice.one_more(
+        return optimisation.best_addition(
             found,
             anchors,
             tried,
@@ -197,14 +401,14 @@ def room_advice(
 
 
 def end(args: Namespace, figures: dict[str, Any], outgoing: dict[str, Any]) -> None:
-    """Write the figures, say what was written, and publish the messages if that was asked for."""
+    """Write the figures, print the names of the files, and publish the messages if asked for."""
     for path in (args.out / "plan.json", args.json):
         if path is not None:
             cli.write_json(path, figures)
     cli.show(f"wrote {', '.join(sorted(path.name for path in args.out.iterdir()))} in {args.out}")
     if args.publish:
         cli.show(f"publishing {', '.join(outgoing)} until Ctrl-C")
-        messages.publish(outgoing)
+        report.publish_messages(outgoing)
 
 
 def draw_map(
@@ -214,8 +418,9 @@ def draw_map(
     walls: Walls | None = None,
     pairings: bool = False,
 ) -> dict[str, Any]:
-    """Pictures, flyable volume and bag of a Chart. Returns {topic: message}, see
-    `messages.messages`. pairings : with the curves of every choice of anchors.
+    """Write the pictures, flyable volume and bag of a Chart. Return {topic: message}.
+
+    pairings : True to draw the curves of each choice of anchors.
     """
     anchors = installation.anchors
     plots.plot_precision(anchors, found, out / "precision.png", walls)
@@ -223,13 +428,13 @@ def draw_map(
         anchors, found, out / "flyable.png", walls, installation if pairings else None
     )
     found.volume(anchors, installation.dimensions).save(out / "flyable.npz")
-    outgoing = messages.messages(found, anchors)
-    messages.write(outgoing, out / "plan.bag")
+    outgoing = report.map_messages(found, anchors)
+    report.write_messages(outgoing, out / "plan.bag")
     return outgoing
 
 
-def check(installation: Installation, grid: Grid, out: Path) -> dict[str, Any]:
-    """The failure map against a solver that is started from many places."""
+def brute_force_check(installation: Installation, grid: Grid, out: Path) -> dict[str, Any]:
+    """Compare the failure map with a solver that is started from many places."""
     with Progress("plan") as progress:
         unique, agrees, points, arrows = brute_force(
             installation, grid, partial(progress.over, what="solving")
@@ -243,48 +448,52 @@ def check(installation: Installation, grid: Grid, out: Path) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class Fly:
-    """fly((path, survey)) is the name of a recording and its ErrorSamples. reading : Reading; aids
-    : what it may use, as for accuracy.fly. Can be pickled. Raises InputError.
+class FlightErrors:
+    """Reads and estimates flights. It can be pickled.
+
+    reading : Reading; aids : names of AIDS that the filter uses.
     """
 
     reading: Reading
     aids: tuple[str, ...] = ()
 
-    def __call__(self, recording: Recording) -> tuple[str, accuracy.ErrorSamples]:
+    def __call__(self, recording: Recording) -> tuple[str, precision.ErrorSamples]:
+        """Return (name, ErrorSamples) of a recording (path, survey). Raises InputError."""
         flight = self.reading.read(recording)
         for name in self.aids:
             if getattr(flight, name) is None:
                 raise InputError(
                     f"{flight.name}: holds no {name}; leave out --with {name}, or this flight."
                 )
-        return flight.name, accuracy.fly(flight, self.aids)
+        return flight.name, precision.error_samples(flight, self.aids)
 
 
 def evaluate_flights(
-    flown: Iterable[tuple[str, accuracy.ErrorSamples]],
+    flown: Iterable[tuple[str, precision.ErrorSamples]],
     installation: Installation,
     room: Room,
     step: float,
     out: Path,
 ) -> list[dict[str, Any]]:
-    """Rows of `accuracy.comparison`, one for each of what a Fly gave, and one for all. step : m, of
-    the picture.
+    """Return rows of `comparison`: one for each flight, and one for all.
+
+    step : m, of the picture.
     """
     samples, rows = [], []
     for name, one in flown:
         samples.append(one)
-        rows.append({"flight": name, **accuracy.comparison(one, installation)})
-    pooled = accuracy.together(samples)
-    rows.append({"flight": f"{len(samples)} pooled", **accuracy.comparison(pooled, installation)})
-    found = accuracy.accuracy_map(pooled, installation, Grid.box(room.lower, room.upper, step))
+        rows.append({"flight": name, **precision.comparison(one, installation)})
+    pooled = precision.pooled(samples)
+    rows.append({"flight": f"{len(samples)} pooled", **precision.comparison(pooled, installation)})
+    found = precision.accuracy_map(pooled, installation, Grid.box(room.lower, room.upper, step))
     plots.plot_accuracy(installation, found, out / "accuracy.png")
     return rows
 
 
-def improve(before: Chart, aim: options.Aim, how: str, starts: int, out: Path) -> dict[str, Any]:
-    """Better places for the anchors, improved.yaml. before : Chart as it is; aim : options.Aim; how
-    : "move" or "add".
+def improve(before: Chart, aim: Aim, how: str, starts: int, out: Path) -> dict[str, Any]:
+    """Search better places for the anchors, and write improved.yaml.
+
+    before : Chart with the anchors as they are; aim : Aim; how : "move" or "add".
     """
     goal, places, installation = aim.goal, aim.places, aim.goal.installation
     anchors = installation.anchors
@@ -294,13 +503,13 @@ def improve(before: Chart, aim: options.Aim, how: str, starts: int, out: Path) -
             "progress": partial(progress.over, what="layouts"),
         }
         if how == "add":
-            numbers, scores = optimisation.one_more(goal, anchors, places)
-            plots.plot_places(places, numbers, scores, out / "places.png")
+            numbers, scores = optimisation.scores_of_one_more(goal, anchors, places)
+            plots.plot_places(places, numbers, scores, goal.objective, out / "places.png")
             start: np.ndarray | None = places.positions(numbers[[np.argmin(scores)]])
             better = optimisation.optimise(goal, places, 1, anchors, start, **search)
         else:
             start = anchors.positions if aim.count == len(anchors) else None
-            better = optimisation.named(
+            better = optimisation.with_old_ids(
                 optimisation.optimise(goal, places, aim.count, None, start, **search), anchors
             )
         better = optimisation.rounded(better, anchors)
@@ -319,5 +528,5 @@ def improve(before: Chart, aim: options.Aim, how: str, starts: int, out: Path) -
     return {
         "points": len(aim.reported.points),
         **judged,
-        "placed": optimisation.placed(better, anchors),
+        "placed": optimisation.placements(better, anchors),
     }

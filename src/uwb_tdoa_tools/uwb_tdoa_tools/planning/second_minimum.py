@@ -1,13 +1,16 @@
-"""Where a round of TDOAs has two solutions: a second minimum of its misfit, of all that is heard
-together.
+"""Find where a round of TDOAs has two solutions: a second minimum of its misfit.
 
 With d(x) the distances from x to the N anchors that are heard at p, and Q = D' F^-1 D the weight of
 their errors in a round (`weigh`),
     f(x) = (d(x) - d(p))' Q (d(x) - d(p))
-is the squared misfit, in standard deviations, of a tag at x with what a tag at p measures. Its
-smallest minimum is p, with 0. A second one is searched by Levenberg-Marquardt, from the mirrored
-places of choices of k + 1 anchors (`bifurcation`). An estimator that weighs all TDOAs takes it for
-the right one with probability Phi(-sqrt(f) / 2).
+is the squared misfit, in standard deviations, of a tag at x with the TDOAs of a tag at p. Its
+smallest minimum is p, with 0. Levenberg-Marquardt searches a second one, from the mirrored places
+of choices of k + 1 anchors (`bifurcation`). An estimator that weighs all TDOAs prefers the second
+minimum with probability Phi(-sqrt(f) / 2).
+
+One more anchor raises f everywhere, but it may also make a second minimum. A long valley may come
+apart in two minima, or a minimum outside of the room may move into it. That is a property of this
+definition, not of the search.
 """
 
 from __future__ import annotations
@@ -25,8 +28,8 @@ if TYPE_CHECKING:
 
 FLIP = 0.5  # m; a minimum nearer than this is no failure, but imprecision
 CLEAR = 4.65  # standard deviations of misfit from which on at most 1 % of the estimates flip
-NEAREST = 8  # anchors whose choices of k + 1 are mirrored; what all explain these explain as well
-DESCENTS = 12  # from mirrored places, those of the smallest misfit
+NEAREST = 8  # anchors whose choices of k + 1 are mirrored
+DESCENTS = 12  # from the mirrored places of least misfit
 SWEEPS = 60  # steps of a descent
 SETTLED = 0.01  # of f, that another step would gain at most where a descent has come to its end
 LONGEST = 5.0  # m, of a step
@@ -42,12 +45,11 @@ def second_minima(
     room: Room,
     unknowns: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the second minimum of least misfit inside a room: (misfit (n,) standard deviations,
-    place (n, 3) m); inf and NaN where no descent finds one that is more than FLIP away.
+    """Return the second minimum of least misfit inside a room: (misfit (n,), place (n, 3) m).
 
-    points : (n, 3) m; positions : (N, 3) m of anchors; columns : (n, K) rows of those that are
-        heard; weights : (n, K, K) 1/m^2, Q; room :
-    Room; unknowns : 2 where the height is known, else 3.
+    The misfit is in standard deviations; inf and NaN if no descent ends more than FLIP away.
+    points : (n, 3) m; positions : (N, 3) m of anchors; columns : (n, K) rows of the heard ones;
+    weights : (n, K, K) 1/m^2, Q; room : Room; unknowns : 2 if the height is known, else 3.
     """
     choices = np.array(list(combinations(range(min(NEAREST, columns.shape[1])), unknowns + 1)))
     out = np.empty((len(points), 4))
@@ -65,8 +67,9 @@ def _search(
     choices: np.ndarray,
     out: np.ndarray,
 ) -> None:
-    """Fill out (n, 4): misfit squared and place. room : (2, 3) m, its corners; choices : (C, k + 1)
-    of the nearest anchors.
+    """Fill out (n, 4): misfit squared and place, m.
+
+    room : (2, 3) m, its corners; choices : (C, k + 1) of the nearest anchors.
     """
     heard, unknowns = columns.shape[1], choices.shape[1] - 1
     anchors, true, end = np.empty((heard, 3)), np.empty(heard), np.empty(3)
@@ -104,8 +107,9 @@ def _search(
 def _mirror(
     point: np.ndarray, anchors: np.ndarray, true: np.ndarray, rows: np.ndarray, out: np.ndarray
 ) -> bool:
-    """Put into `out` the other place with the TDOAs of these k + 1 anchors, see `bifurcation`; of
-    anchors in a plane (line) that on its other side. Whether there is one.
+    """Put the other solution of k + 1 anchors into `out`; return whether there is one.
+
+    See `bifurcation`. If the anchors are in a plane (line), it is the place on its other side.
     """
     k, first = len(rows) - 1, anchors[rows[0]]
     matrix, q, p = np.zeros((3, 3)), np.zeros(3), np.zeros(3)
@@ -170,7 +174,7 @@ def _distance(p: np.ndarray, q: np.ndarray) -> float:
 
 @compiled
 def _misfit(x: np.ndarray, anchors: np.ndarray, true: np.ndarray, weight: np.ndarray) -> float:
-    """f at x."""
+    """Return f at x."""
     change, total = np.empty(len(anchors)), 0.0
     for i in range(len(anchors)):
         change[i] = _distance(x, anchors[i]) - true[i]
@@ -191,8 +195,9 @@ def _descend(
     unknowns: int,
     end: np.ndarray,
 ) -> float:
-    """f at the end of a descent, whose place is put into `end`; inf where it did not come to an
-    end, or came to the point itself.
+    """Return f at the end of a descent, and put the place into `end`.
+
+    Returns inf if the descent does not end, or ends at the point itself.
     """
     x, step, right = start.copy(), np.zeros(3), np.zeros(3)
     unit, change, weighed = (
@@ -254,8 +259,9 @@ def _descend(
 
 @compiled
 def _solve(matrix: np.ndarray, right: np.ndarray, size: int, out: np.ndarray) -> float:
-    """Solve matrix out = right, of 2 or 3 rows, positive definite, by Cholesky in place; return
-    right . out, inf where it is not.
+    """Solve matrix out = right by Cholesky in place; return right . out.
+
+    The matrix has 2 or 3 rows. Returns inf if it is not positive definite.
     """
     for i in range(size):
         for j in range(i + 1):
