@@ -47,6 +47,7 @@ def test_requests_are_those_that_users_of_crazyswarm2_know(name):
     "given, why",
     [
         ("aids:=[sonar]", "aids: 'sonar' is not one of height, pressure, velocity, range."),
+        ("vehicle:=rover", "vehicle: a rover takes no commands and no aids; set mission to true."),
         ("world:=moon", "world: 'moon' is not one of hall,"),
     ],
 )

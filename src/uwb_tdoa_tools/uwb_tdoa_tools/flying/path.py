@@ -1,4 +1,4 @@
-"""What is to be flown: a path from a place on the ground and back to it."""
+"""What is to be flown, a path from a place on the ground and back to it, or driven."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 
 KNOT, FINE = 0.02, 0.0025  # s, of the spline, and of the points at which it is looked up
+FINE_WAY = 0.02  # m, of the points of a polyline at which it is looked up
 SPEED_UP = 1.5  # s, from hovering to the circle and back
 CLIMB = 0.4  # of the time up, and of that down, to get as fast as it climbs, and the same to stop
 SETTLE = 0.4  # m above the ground from which it sinks slowly
@@ -33,6 +34,11 @@ class Circles:
         """s, from the rotors' start to where the slow sinking begins."""
         return self.rise + self.turns * self.turn_time + self.fall
 
+    @property
+    def middle(self) -> float:
+        """s after take-off, in which it is on the circle."""
+        return self.rise + 4.0
+
     def along(self, place: np.ndarray, ground: float) -> ReferenceTrajectory:
         """The ReferenceTrajectory from `place` (2,) m, where the circle is entered at its point
         nearest to +x; ground : m, height at which the body stands.
@@ -49,6 +55,63 @@ class Circles:
             ground + self.height * up - (self.height - SETTLE) * down + self.swing * np.sin(angle)
         )
         return ReferenceTrajectory(p)
+
+
+@dataclass(frozen=True)
+class Waypoints:
+    """Straight from one place to the next, on wheels. shares (n, 2) : of half the hall's length and
+    width, from its middle; speed : m/s; size (2,) m, of the hall.
+    """
+
+    size: tuple[float, float] = (6.4, 6.2)
+    shares: tuple[tuple[float, float], ...] = (
+        (0.5, 0.5),
+        (-0.5, 0.5),
+        (-0.5, -0.5),
+        (0.5, -0.5),
+        (0.5, 0.1),
+    )
+    speed: float = 0.6
+
+    @property
+    def duration(self) -> float:
+        """s, from departure to arrival at this speed."""
+        places = 0.5 * np.array(self.size) * self.shares
+        ways = np.linalg.norm(np.diff(places, axis=0, prepend=[[0.0, 0.0]]), axis=1)
+        return float(ways.sum()) / self.speed
+
+    @property
+    def middle(self) -> float:
+        """s after departure, in which it is on its way."""
+        return 0.5 * self.duration
+
+    def along(self, place: np.ndarray, ground: float) -> Polyline:
+        """The Polyline from `place` (2,) m, at height `ground`, m."""
+        return Polyline(np.vstack([place, 0.5 * np.array(self.size) * self.shares]), ground)
+
+
+class Polyline:
+    """Straight lines from place to place. length : m; end (2,) m, its last place."""
+
+    def __init__(self, places: np.ndarray, height: float) -> None:
+        """places : (n, 2) m."""
+        self._places, self._height = places, height
+        self._stamps = np.concatenate(
+            [[0.0], np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))]
+        )
+        self.length, self.end = float(self._stamps[-1]), places[-1]
+
+    def at(self, along: np.ndarray) -> np.ndarray:
+        """(n, 3) m, at `along` (n,) m from the start."""
+        x, y = (np.interp(along, self._stamps, column) for column in self._places.T)
+        return np.column_stack([x, y, np.full(len(x), self._height)])
+
+    def nearest(self, p: np.ndarray, first: float = 0.0, last: float = np.inf) -> np.ndarray:
+        """(n,) m along it: the points nearest to p (n, 2) m, between `first` and `last`, m."""
+        fine = np.arange(first, min(last, self.length) + FINE_WAY, FINE_WAY).clip(max=self.length)
+        off = np.linalg.norm(self.at(fine)[None, :, :2] - p[:, None], axis=2)
+        out: np.ndarray = fine[np.argmin(off, axis=1)]
+        return out
 
 
 class ReferenceTrajectory:
