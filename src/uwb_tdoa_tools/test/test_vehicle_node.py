@@ -2,6 +2,7 @@
 work.
 """
 
+from dataclasses import replace
 from pathlib import Path
 import re
 
@@ -17,7 +18,13 @@ from live_flights import hall  # noqa: E402
 from test_lockstep import load  # noqa: E402, F401
 
 from uwb_tdoa_bias.foundation.errors import InputError  # noqa: E402
+from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 from uwb_tdoa_msgs.srv import GoTo, Land, Takeoff  # noqa: E402
+from uwb_tdoa_tools.flying import rover  # noqa: E402
+from uwb_tdoa_tools.flying.path import Waypoints  # noqa: E402
+from uwb_tdoa_tools.flying.trial import Task  # noqa: E402
+from uwb_tdoa_tools.flying.verdict import verdict_of  # noqa: E402
+from uwb_tdoa_tools.flying.world import WORLDS  # noqa: E402
 from uwb_tdoa_tools.vehicle_node import PARAMETERS, VehicleNode  # noqa: E402
 
 CONFIG = Path(__file__).resolve().parents[1] / "config" / "vehicle_node.yaml"
@@ -85,3 +92,19 @@ def test_it_flies_by_services_beside_two_busy_processes(tmp_path, load):  # noqa
     (verdict,) = flown.verdicts
     assert verdict["landed"], verdict["why"]
     assert verdict["said_lost"] is None and verdict["phases"]["air"]["rmse"] < 0.3
+
+
+@pytest.mark.slow
+def test_a_rover_drives_by_the_nodes_as_it_does_in_lockstep(tmp_path):
+    own, told = ("seed:=3", "mission:=true", "vehicle:=rover"), []
+    for name, value in rover.FILTER.items():
+        told.append(f"{name}:={str(value).lower()}")
+    with hall(tmp_path, *own, ekf=told) as driven:
+        driven.wait(lambda: driven.verdicts, "the verdict")
+    (verdict,) = driven.verdicts
+    assert verdict["arrived"], verdict["why"]
+    world = replace(WORLDS["hall"], aids=rover.AIDS)
+    task = Task(world, 3, "place", config=FilterConfig(**rover.FILTER), path=Waypoints())
+    lockstep = verdict_of(rover.drive(task))
+    for name in ("tracking", "farthest", "place"):  # stamps are whole nanoseconds
+        assert verdict[name] == pytest.approx(lockstep[name], abs=2e-3)

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from .world import World
 
 MAST = 0.4  # m
-FILTER = {
+FILTER: dict[str, Any] = {
     "planar": True,
     "fixed_height": MAST,
     "non_holonomic_std": 0.05,

@@ -108,7 +108,7 @@ def _of_mission(flown: TrialResult, mission: Mission, end: float) -> dict[str, A
         "ended": mission.ended,
         "said_lost": mission.lost,
         "duration": float(t[-1]),
-        **_armed(flown.odometry, flown.flight.truth, mission),
+        **_armed(flown.odometry, flown.flight.truth, mission.started),
         **_estimation(odometry, truth, mission, first, last),
     }
     figures["why"] = _why(crash, mission, figures)
@@ -147,7 +147,7 @@ def _of_drive(flown: TrialResult) -> dict[str, Any]:
         "ended": mission.ended,
         "said_lost": mission.lost,
         "duration": end,
-        **_armed(flown.odometry, truth, mission),
+        **_armed(flown.odometry, truth, mission.started),
     }
     if not len(odometry):
         return {**figures, "estimation": None, "yaw": None, "yaw_nees": None, "phases": {}}
@@ -200,9 +200,8 @@ def _why(crash: str, mission: Mission, figures: dict[str, Any]) -> str:
     return "landed elsewhere" if figures["place"] >= NEAR else ""
 
 
-def _armed(odometry: Odometry, truth: Truth, mission: Mission) -> dict[str, float | None]:
+def _armed(odometry: Odometry, truth: Truth, started: float | None) -> dict[str, float | None]:
     """How far the estimate was off when the rotors started."""
-    started = mission.started
     if started is None:
         return {"armed_off": None, "armed_deviations": None}
     k = int(np.searchsorted(odometry.t, started, side="right")) - 1
@@ -233,8 +232,8 @@ def _estimation(
     )  # a peer tells none
     end = truth.t[-1]
     started, ended = mission.started or end, mission.ended or end
-    up, down = (truth.t[first], truth.t[last]) if first is not None else (ended, ended)
-    limits = -math.inf, started, max(up, started), max(down, started), max(ended, down)
+    up, down = (float(truth.t[k]) if k is not None else ended for k in (first, last))
+    limits = [-math.inf, started, max(up, started), max(down, started), max(ended, down)]
     phases = _by_phase(t, distance, normalised, dict(zip(PHASES, limits)))
     far = np.flatnonzero((distance > LOST) & (t >= started) & (t < ended))
     air = phases.get("air")
