@@ -57,7 +57,7 @@ def test_what_is_drawn_is_wanted_on_the_path(drives):
     path = drives[0].missions[0].path
     assert len(wanted) > 100
     off = np.linalg.norm(wanted - path.at(path.nearest(wanted[:, :2])), axis=1)
-    assert off.max() < 0.02
+    assert off.max() < 0.03  # of corners, between samples
 
 
 def test_the_same_task_is_the_same_drive(drives):
@@ -126,7 +126,7 @@ def test_the_nearest_point_of_a_polyline(along, off):
     nearest = path.at(path.nearest(p))[:, :2]
     every = path.at(np.linspace(0.0, path.length, 20001))[:, :2]
     best = np.linalg.norm(every - p, axis=1).min()
-    assert np.linalg.norm(nearest - p) <= best + 0.02
+    assert np.linalg.norm(nearest - p) <= best + 1e-9
 
 
 def test_it_drives_where_the_radio_is_silent_for_a_while():

@@ -8,7 +8,6 @@ import numpy as np
 from scipy.interpolate import make_interp_spline
 
 KNOT, FINE = 0.02, 0.0025  # s, of the spline, and of the points at which it is looked up
-FINE_WAY = 0.02  # m, of the points of a polyline at which it is looked up
 SPEED_UP = 1.5  # s, from hovering to the circle and back
 CLIMB = 0.4  # of the time up, and of that down, to get as fast as it climbs, and the same to stop
 SETTLE = 0.4  # m above the ground from which it sinks slowly
@@ -96,9 +95,9 @@ class Polyline:
     def __init__(self, places: np.ndarray, height: float) -> None:
         """places : (n, 2) m."""
         self._places, self._height = places, height
-        self._stamps = np.concatenate(
-            [[0.0], np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))]
-        )
+        self._ways = np.diff(places, axis=0)
+        self._lengths = np.linalg.norm(self._ways, axis=1)
+        self._stamps = np.concatenate([[0.0], np.cumsum(self._lengths)])
         self.length, self.end = float(self._stamps[-1]), places[-1]
 
     def at(self, along: np.ndarray) -> np.ndarray:
@@ -108,9 +107,13 @@ class Polyline:
 
     def nearest(self, p: np.ndarray, first: float = 0.0, last: float = np.inf) -> np.ndarray:
         """(n,) m along it: the points nearest to p (n, 2) m, between `first` and `last`, m."""
-        fine = np.arange(first, min(last, self.length) + FINE_WAY, FINE_WAY).clip(max=self.length)
-        off = np.linalg.norm(self.at(fine)[None, :, :2] - p[:, None], axis=2)
-        out: np.ndarray = fine[np.argmin(off, axis=1)]
+        since = p[:, None] - self._places[:-1]
+        shares = np.sum(since * self._ways, axis=2) / self._lengths**2
+        along = self._stamps[:-1] + np.clip(shares, 0.0, 1.0) * self._lengths  # of each line
+        along = np.clip(along, first, min(last, self.length))
+        off = self.at(along.ravel())[:, :2].reshape(since.shape) - p[:, None]
+        best = np.argmin(np.linalg.norm(off, axis=2), axis=1)
+        out: np.ndarray = along[np.arange(len(p)), best]
         return out
 
 
