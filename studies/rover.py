@@ -4,6 +4,11 @@ whether what diagnose writes is true.
 A rover drives for 90 s among six anchors in 12 x 8 m, with wheels (50 Hz, 2 % too fast, slip), an
 IMU (100 Hz) and 100 TDOAs a second with a noise of 0.1 m and delays of the anchors of 5 cm, which
 make up `tdoa_std`. Its antenna is on a mast 0.4 m above base_link, which is on the floor.
+
+The filter takes errors to persist, as measured ones do; `tdoa_correlation_length: 1.0` states that
+they are white, as here. In rows of a hall errors are those of real halls, and `tdoa_std` the
+default: anchors are surveyed to 3 cm, have delays of 10 cm, and errors by received power and by
+both antennas; 3 % of the TDOAs are outliers; and each of four places blocks one anchor.
 """
 
 from dataclasses import replace
@@ -30,6 +35,9 @@ LATE_ANCHORS, LATE_FROM, LATE_FOR, LATE_BY = (0, 3), 40.0, 5.0, 1.5  # s, s, m
 PLANAR = FilterConfig(
     planar=True, fixed_height=0.0, tdoa_std=float(np.hypot(NOISE, DELAY_STD * np.sqrt(2.0)))
 )
+# As in real halls: m, surveyed; m, of an anchor's delay; m; share of outliers
+SURVEY_STD, HALL_DELAY_STD, HALL_NOISE, OUTLIERS = 0.03, 0.1, 0.08, 0.03
+BLOCKED, RADIUS, METAL = 4, 1.5, (0.2, 0.6)  # places, m around each, m by which one anchor is late
 ROWS = {
     "wheels, IMU": (("imu", "velocity"), PLANAR, False),
     "wheels alone": (("velocity",), replace(PLANAR, use_imu=False), False),
@@ -89,7 +97,7 @@ def run(args):
         return
     print(f"| | {' | '.join(HEAD)} |", "| --- |" + " ---: |" * len(HEAD), sep="\n")
     results = list(parallel.over(judged, range(args.seeds), jobs=args.jobs, dask=None, unit=None))
-    for name in ROWS:
+    for name in results[0]:
         columns = np.array([result[name] for result in results])
         means = (
             np.sqrt(np.mean(columns[:, :2] ** 2, axis=0)),
@@ -114,6 +122,33 @@ def drive(seed):
     return _delayed(simulate(config), seed)
 
 
+def drive_of_hall(seed):
+    """(Flight, delays of its anchors (N,) m, which its TDOAs have) of a rover among errors as real
+    halls have them.
+    """
+    config = SimulationConfig.of(
+        "rover",
+        seed=seed,
+        duration=DURATION,
+        noise_std=HALL_NOISE,
+        anchor_delay_std=0.0,
+        tag_unit=1 + seed,
+        outlier_probability=OUTLIERS,
+        floor_time=5.0,
+    )
+    flight, delays = _delayed(simulate(config), seed, HALL_DELAY_STD)
+    rng, anchors = np.random.default_rng([seed, 50]), flight.anchors
+    values = {}
+    places = zip(rng.permutation(anchors.ids)[:BLOCKED], rng.uniform(-0.7, 0.7, (BLOCKED, 2)))
+    for anchor, place in places:
+        x, y = place * np.abs(anchors.positions[:, :2]).max(axis=0)
+        values |= {f"{anchor}.x": x, f"{anchor}.y": y, f"{anchor}.radius": RADIUS}
+        values[f"{anchor}.delay"] = rng.uniform(*METAL)
+    flight = EFFECTS["nlos"](values).inject(flight)
+    off = SURVEY_STD * rng.standard_normal(anchors.positions.shape)
+    return replace(flight, anchors=replace(anchors, positions=anchors.positions + off)), delays
+
+
 def flown(seed):
     """The same of a quadrotor, with an antenna beside its middle."""
     config = SimulationConfig(
@@ -133,8 +168,8 @@ def flown(seed):
     return EFFECTS["velocity_scale"]({"scale": 0.02}).inject(flight), delays
 
 
-def _delayed(flight, seed):
-    delays = DELAY_STD * np.random.default_rng([seed, 48]).standard_normal(len(flight.anchors))
+def _delayed(flight, seed, std=DELAY_STD):
+    delays = std * np.random.default_rng([seed, 48]).standard_normal(len(flight.anchors))
     return EFFECTS["anchor_delay"](
         dict(zip(map(str, flight.anchors.ids.tolist()), delays.tolist()))
     ).inject(flight), delays
@@ -153,20 +188,32 @@ def judged(seed):
 
     The filter knows where the antenna is, as /tf_static says it.
     """
-    flight, _ = drive(seed)
+    out = {}
+    for block, (made, changed) in BLOCKS.items():
+        flight, _ = made(seed)
+        for name, (streams, config, is_late) in ROWS.items():
+            told = replace(config, **changed)
+            out[block + name] = _figures(flight, seed, streams, told, is_late)
+    return out
+
+
+def _figures(flight, seed, streams, config, is_late):
+    """Figures of one row. streams : that are used; is_late : two anchors are."""
     arm = dict(zip("xyz", flight.meta["config"]["tag_lever_arm"]))
     corrector = Corrector(flight.anchors, EffectSet((EFFECTS["tag_lever_arm"](arm),)))
-    height = (
-        HEIGHT_STD * np.random.default_rng([seed, 49]).standard_normal()
-    )  # as somebody has measured it
-    out = {}
-    for name, (streams, config, is_late) in ROWS.items():
-        others = [stream for stream in ("imu", "velocity") if stream not in streams]
-        given = (late(flight) if is_late else flight).without(*others)
-        out[name] = figures(
-            flight, run_offline(given, replace(config, fixed_height=height), corrector).odometry
-        )
-    return out
+    off = HEIGHT_STD * np.random.default_rng([seed, 49]).standard_normal()  # as it was measured
+    others = [stream for stream in ("imu", "velocity") if stream not in streams]
+    given = (late(flight) if is_late else flight).without(*others)
+    return figures(
+        flight, run_offline(given, replace(config, fixed_height=off), corrector).odometry
+    )
+
+
+BLOCKS = {  # {beginning of a row's name: (what makes its drives, parameters)}
+    "": (drive, {}),
+    "white noise stated: ": (drive, {"tdoa_correlation_length": 1.0}),
+    "hall: ": (drive_of_hall, {"tdoa_std": FilterConfig().tdoa_std}),
+}
 
 
 def figures(flight, odometry):

@@ -6,7 +6,7 @@ import pytest
 from studies import plans
 from uwb_tdoa_tools.planning.installation import FixedNoise, RadioNoise
 from uwb_tdoa_tools.planning.maps import FLYABLE, TOO_FEW, TWO_SOLUTIONS
-from uwb_tdoa_tools.simulation.room import Room
+from uwb_tdoa_tools.simulation.rooms import Room
 
 
 def cube(side=6.0, noise=FixedNoise(0.05)):

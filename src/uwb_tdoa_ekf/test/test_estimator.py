@@ -26,7 +26,7 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.verdicts import INVALID, LATE, STARTUP, USED
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.offline import run_offline
-from uwb_tdoa_ekf.results import VERDICTS
+from uwb_tdoa_ekf.results import VERDICTS, rows_of
 
 seeds = st.integers(0, 2**32 - 1)
 REST = (0.0, 0.0, 0.0), (0.0, 0.0, 9.81)
@@ -394,14 +394,13 @@ def test_what_is_invalid_does_not_hold_up_the_others():
 def test_rates_are_those_measured_last():
     flight = fly(8, 1.0)
     estimator = Estimator(flight.anchors)
-    assert np.isnan(estimator.rates_at(np.array([0.0]))[0]).all()
-    feed(estimator, flight)
-    t = flight.imu.t[-1]
-    rates, variances = estimator.rates_at(np.array([t, t + 1.0]))
-    np.testing.assert_array_equal(rates, [flight.imu.gyro[-1], [np.nan] * 3])
-    assert variances == pytest.approx(
-        [FilterConfig().gyro_noise ** 2 * 200.0, np.nan], nan_ok=True
-    )  # of one sample at 200 Hz
+    odometry, _ = feed(estimator, flight)
+    last, t = rows_of(odometry, slice(-2, None)), flight.imu.t[-1]
+    assert np.isnan(Estimator(flight.anchors).rates_at(last)[0]).all()
+    rates, variances = estimator.rates_at(replace(last, t=np.array([t, t + 1.0])))
+    np.testing.assert_array_equal(rates, [flight.imu.gyro[-1] - last.gyro_bias[0], [np.nan] * 3])
+    one = FilterConfig().gyro_noise ** 2 * 200.0  # of one sample at 200 Hz
+    np.testing.assert_allclose(variances, [[one] * 3, [np.nan] * 3])
 
 
 @pytest.mark.parametrize("compensating", [False, True])
@@ -412,10 +411,10 @@ def test_rates_are_known_for_all_odometry_that_waited(compensating):
         send(estimator, flight, stream, i)
     for give in (estimator.advance, estimator.reset):
         odometry, _ = give()
-        rates, variances = estimator.rates_at(odometry.t)
+        rates, variances = estimator.rates_at(odometry)
         last = np.searchsorted(flight.imu.t, odometry.t, side="right") - 1
         assert len(odometry) and np.isfinite(variances).all()
-        np.testing.assert_array_equal(rates, flight.imu.gyro[last])
+        np.testing.assert_array_equal(rates, flight.imu.gyro[last] - odometry.gyro_bias)
 
 
 def test_finish_leaves_nothing_behind():

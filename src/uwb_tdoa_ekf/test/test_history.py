@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.core.engine import STALE_TURN_PSD, feed, most_records, run
+from uwb_tdoa_ekf.core.engine import feed, most_records, run
 from uwb_tdoa_ekf.core.history import RECORD, RESET, UPDATE
 from uwb_tdoa_ekf.core.memory import ODOMETRY, RESIDUAL, Output, new_state
 from uwb_tdoa_ekf.core.verdicts import USED
@@ -50,7 +50,7 @@ def test_a_record_leads_to_the_next():
         phi = np.eye(15)
         phi[:9] = record["transition"]
         prior = phi @ before["P"] @ phi.T
-        prior[8, 8] += STALE_TURN_PSD * (record["t"] - before["t"])
+        prior[8, 8] += FilterConfig().turn_noise ** 2 * (record["t"] - before["t"])
         gain, row = record["gain"], record["row"]
         np.testing.assert_allclose(
             record["P"], (np.eye(15) - np.outer(gain, row)) @ prior, atol=1e-9

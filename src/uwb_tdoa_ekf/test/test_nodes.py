@@ -18,6 +18,7 @@ import known_answer  # noqa: E402
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy  # noqa: E402
 from rig import OUTPUTS, make_rig, recording, seconds_of, stamp  # noqa: E402, F401
 from rosgraph_msgs.msg import Clock  # noqa: E402
+from rovers import HEIGHT, drive  # noqa: E402
 
 from uwb_tdoa_bias.correction.corrector import Corrector  # noqa: E402
 from uwb_tdoa_bias.correction.network import Network  # noqa: E402
@@ -27,6 +28,7 @@ from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 from uwb_tdoa_ekf.frames import to_odometry  # noqa: E402
 from uwb_tdoa_ekf.launching import tags  # noqa: E402
 from uwb_tdoa_ekf.offline import run_offline  # noqa: E402
+from uwb_tdoa_ekf.results import rows_of  # noqa: E402
 from uwb_tdoa_msgs.msg import TdoaCorrected, TdoaResidual  # noqa: E402
 
 SOURCES = Path(__file__).resolve().parents[2]
@@ -163,6 +165,47 @@ def test_odometry_is_that_of_the_offline_engine(make_rig, tmp_path, what, proces
         np.testing.assert_allclose(residual.innovation, expected.residuals.innovation[i], atol=1e-6)
         np.testing.assert_allclose(residual.weight, expected.residuals.weight[i], atol=1e-6)
     assert len(rig.residuals) + ekf["waiting"] == len(flight.tdoa)
+
+
+@pytest.mark.parametrize("bare", [False, pytest.param(True, marks=SLOW)])
+def test_a_rover_over_topics_is_that_of_the_offline_engine_to_the_bit(make_rig, bare):
+    """Wheels that come as nav_msgs/Odometry, TDOAs, and an IMU or none; a planar vehicle."""
+    flight = drive(1, 8.0, begin=0.0)
+    for name in ("imu", "tdoa", "velocity"):
+        part = getattr(flight, name)
+        as_read = np.array([seconds_of(stamp(t)) for t in part.t])
+        flight = replace(flight, **{name: replace(part, t=as_read)})
+    if bare:
+        flight = replace(flight, imu=rows_of(flight.imu, slice(0, 0)))
+    config = FilterConfig(planar=True, fixed_height=HEIGHT, use_imu=not bare)
+    told = {"planar": "true", "fixed_height": HEIGHT, "use_imu": str(not bare).lower()}
+    rig = make_rig()
+    rig.start(
+        "bias_node",
+        "ekf_node",
+        ekf_node=[word for name, value in told.items() for word in ("-p", f"{name}:={value}")],
+    )
+    rig.add_publisher("velocity/odometry")
+    rig.send_anchors(flight.anchors)
+    rig.play(flight, aids=["velocity/odometry"])
+    ekf = rig.counts("ekf_node", TDOAs_received=len(flight.tdoa))
+    assert ekf["velocity_used"] > 0.8 * len(flight.velocity) and ekf["velocity_late"] == 0
+    assert ekf["late"] == ekf["invalid"] == ekf["restarts"] == 0
+
+    odometry = run_offline(flight, config).odometry
+    n = len(rig.odometry)
+    assert len(odometry) - 10 <= n <= len(odometry) and n > 500
+    odometry = rows_of(odometry, slice(0, n))
+    stamps = [seconds_of(m.header.stamp) for m in rig.odometry]
+    np.testing.assert_array_equal(stamps, odometry.t)
+    poses, twists = [m.pose.pose for m in rig.odometry], [m.twist.twist for m in rig.odometry]
+    velocity, covariance = to_odometry(odometry.q, odometry.v, odometry.covariance)
+    np.testing.assert_array_equal([vector(p.position) for p in poses], odometry.p)
+    np.testing.assert_array_equal([quaternion(p.orientation) for p in poses], odometry.q)
+    np.testing.assert_array_equal([vector(t.linear) for t in twists], velocity)
+    stated = np.array([m.pose.covariance for m in rig.odometry]).reshape(n, 6, 6)
+    np.testing.assert_array_equal(stated, covariance[:, :6, :6])
+    assert np.ptp([t.angular.z for t in twists]) > 0.1  # of the gyroscope, or of the wheels
 
 
 def test_quality_of_service(make_rig):

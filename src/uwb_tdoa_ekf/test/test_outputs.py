@@ -73,7 +73,8 @@ def odometry(t, p, yaw, tilt=0.0):
 
 def publish(out, estimates, held=False):
     n = len(estimates)
-    out.publish_odometry(estimates, np.full((n, 3), np.nan), np.full(n, np.nan), held)
+    unknown = np.full((n, 3), np.nan)
+    out.publish_odometry(estimates, unknown, unknown, held)
 
 
 def test_world_to_odom_stays_while_the_position_is_unsure(monkeypatch):

@@ -22,6 +22,7 @@ from uwb_tdoa_ekf.core.verdicts import USED
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.monitoring.status import YAW_KNOWN
 from uwb_tdoa_ekf.offline import run_offline
+from uwb_tdoa_ekf.results import rows_of
 from uwb_tdoa_ekf.smoother import smooth
 
 SEEDS = 0, 3
@@ -70,6 +71,19 @@ def test_a_yaw_that_nothing_measures_is_not_known(rover):
         np.degrees(ANY_YAW), rel=0.05
     )
     assert rms(found.xy[found.t - found.t[0] > SETTLED]) < 0.12 and np.mean(found.nees_yaw) < 5.0
+
+
+def test_a_yaw_that_nothing_measures_grows_uncertain_as_the_parameter_says(rover):
+    told = FilterConfig(
+        use_imu=False,
+        turn_noise=0.05,
+        initial_yaw=float(yaw_of(rover.truth.q)[0]),
+        initial_yaw_std=0.1,
+    )
+    odometry = run_offline(rover.without("velocity"), told).odometry
+    squares = odometry.covariance[:, 8, 8]
+    grown = squares[-1] - squares[0]
+    assert grown == pytest.approx(0.05**2 * (odometry.t[-1] - odometry.t[0]), rel=0.1)
 
 
 def test_a_yaw_without_a_yaw_rate_is_known_by_motion_alone(rover):
@@ -183,6 +197,35 @@ def test_live_is_off_line(config):
     short = drive(1, 12.0)
     odometry, _ = feed(Estimator(short.anchors, config), short)
     assert_same(odometry, run_offline(short, config).odometry)
+
+
+def test_the_yaw_rate_of_wheels_is_that_of_the_odometry_where_they_predict():
+    """Without an IMU, and with one that falls silent, whose bias is not that of the wheels."""
+    short = drive(1, 8.0)
+    wheels, silent = short.velocity, short.truth.t[0] + 6.0
+    imu = rows_of(short.imu, short.imu.t < silent)
+    for flight, config, since in (
+        (short, WHEELS, 0.0),
+        (replace(short, imu=imu), PLANAR, silent + PLANAR.imu_timeout),
+    ):
+        estimator = Estimator(flight.anchors, config)
+        for _t, stream, i in messages(flight):
+            send(estimator, flight, stream, i)
+        odometry, _ = estimator.finish()
+        kept = odometry.t > max(since, flight.truth.t[0] + 3.0)
+        rates, variances = (of[kept] for of in estimator.rates_at(odometry))
+        last = np.searchsorted(wheels.t, odometry.t[kept], side="right") - 1
+        assert kept.sum() > 100 and np.isnan(rates[:, :2]).all()
+        same = rates[:, 2] == wheels.yaw_rate[last]
+        assert same.mean() > 0.95  # of the others the last wheels were refused
+        np.testing.assert_allclose(variances[same, 2], config.yaw_rate_std**2)
+
+
+def test_no_yaw_rate_is_stated_where_nothing_measures_one(rover):
+    estimator = Estimator(rover.anchors, WHEELS)
+    odometry, _ = feed(estimator, rover.without("velocity"), advance=lambda: False)
+    rates, variances = estimator.rates_at(odometry)
+    assert np.isnan(rates).all() and np.isnan(variances).all()
 
 
 def test_without_an_imu_time_goes_on_by_wheels_while_no_tdoas_come():

@@ -19,9 +19,10 @@ from .core.config import FilterConfig
 from .core.engine import LOST_TIME
 from .core.height import LONGEST_GAP
 from .core.measurements import aid_rows, imu_rows, usable_tdoas
-from .core.memory import IMU_SAMPLE, ODOMETRY, POSE, TDOA, YAWS, joined, structured
+from .core.memory import AID, IMU_SAMPLE, ODOMETRY, POSE, TDOA, YAWS, joined, structured
 from .core.startup import APART
-from .core.verdicts import INVALID
+from .core.velocity import HELD, LONGEST_STD, YAW_RATE
+from .core.verdicts import INVALID, USED
 from .installed import MOST_ROWS, Installed
 from .monitoring.clocks import clock_ahead, restarted
 from .monitoring.implausible import implausible
@@ -80,6 +81,7 @@ class Estimator:
         self._sensed = np.empty(
             0, IMU_SAMPLE
         )  # the inertial samples that were used last, and RATE_SAMPLES before them
+        self._wheels = np.empty(0, AID)  # yaw rates of wheels that were used last
         self._buffer = ReorderBuffer(
             reorder, lag, self.config.use_imu, self._refuse, self._start_anew
         )
@@ -372,21 +374,25 @@ class Estimator:
         self._buffer.finish()
         return self._use(math.inf)
 
-    def rates_at(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """(angular velocity as measured, (n, 3) rad/s, its variance per axis, (n,) rad^2/s^2) at
-        stamps t (n,) of the Odometry returned last; NaN where no sample is near. White noise of
-        density gyro_noise has, in samples that are dt apart, the variance gyro_noise^2 / dt; dt is
-        the mean of the last RATE_SAMPLES.
+    def rates_at(self, odometry: Odometry) -> tuple[np.ndarray, np.ndarray]:
+        """(angular velocity in the body frame, (n, 3) rad/s, its variances, (n, 3) rad^2/s^2) at
+        the stamps of the Odometry returned last; NaN where nothing near measures it. Of the
+        gyroscope less its bias; of wheels, where no inertial sample is used, the rate about z.
+        White noise of density gyro_noise has, in samples that are dt apart, the variance
+        gyro_noise^2 / dt; dt is the mean of the last RATE_SAMPLES.
         """
-        rates, variances = np.empty((len(t), 3)), np.empty(len(t))
-        _look_up(
-            np.ascontiguousarray(t),
-            self._sensed,
-            self.config.imu_timeout,
-            self.config.gyro_noise,
-            rates,
-            variances,
-        )
+        t = np.ascontiguousarray(odometry.t)
+        rates, variance = np.empty((len(t), 3)), np.empty(len(t))
+        sensed = self._sensed if self.config.use_imu else self._sensed[:0]
+        _look_up(t, sensed, self.config.imu_timeout, self.config.gyro_noise, rates, variance)
+        rates -= odometry.gyro_bias
+        variances = np.repeat(variance[:, None], 3, axis=1)
+        if len(self._wheels):
+            last = np.searchsorted(self._wheels["t"], t, side="right") - 1
+            near = t - self._wheels["t"][last] <= HELD
+            rows = np.isnan(rates[:, 2]) & (last >= 0) & near
+            rates[rows, 2] = self._wheels["value"][last[rows], YAW_RATE]
+            variances[rows, 2] = self._wheels["std"][last[rows], YAW_RATE] ** 2
         return rates, variances
 
     def _refuse(self, stream: int, rows: np.ndarray, verdict: int) -> None:
@@ -427,6 +433,7 @@ class Estimator:
         self._sensed = joined(
             IMU_SAMPLE, [self._sensed[-RATE_SAMPLES:], *(part.measured.imu for part in parts)]
         )
+        self._wheels = joined(AID, [self._wheels[-1:], *(_of_wheels(part) for part in parts)])
         residuals = concatenated([self._pipeline.residuals(parts), *self._refused])
         self._refused = []
         for verdict in residuals.verdict.tolist():
@@ -453,6 +460,14 @@ class Estimator:
 
     def _has_begun(self) -> bool:
         return self._buffer.began < math.inf
+
+
+def _of_wheels(part: Fed) -> np.ndarray:
+    """Of what was fed, (n,) of AID: velocities with a yaw rate that were used."""
+    rows = part.measured.aids
+    used = (rows["kind"] == aids.VELOCITY) & (part.aids["verdict"] == USED)
+    out: np.ndarray = rows[used & (rows["std"][:, YAW_RATE] <= LONGEST_STD)]
+    return out
 
 
 @compiled

@@ -131,12 +131,12 @@ def _fill(
     twist: np.ndarray,
 ) -> None:
     for n in range(len(pose)):
-        known = math.isfinite(rates[n, 0]) and math.isfinite(rate_variances[n])
         for i in range(6):
             for j in range(6):
                 pose[n, 7 + 6 * i + j] = covariance[n, i, j]
         for i in range(3):
+            known = math.isfinite(rates[n, i]) and math.isfinite(rate_variances[n, i])
             twist[n, 3 + i] = rates[n, i] if known else 0.0
-            twist[n, 6 + 7 * (3 + i)] = rate_variances[n] if known else UNKNOWN_VARIANCE
+            twist[n, 6 + 7 * (3 + i)] = rate_variances[n, i] if known else UNKNOWN_VARIANCE
             for j in range(3):
                 twist[n, 6 + 6 * i + j] = covariance[n, 6 + i, 6 + j]

@@ -142,7 +142,7 @@ class Outputs:
     def publish_odometry(
         self, odometry: Odometry, rates: np.ndarray, rate_variances: np.ndarray, held: bool = False
     ) -> None:
-        """Publish Odometry. rates (n, 3) rad/s and their variances (n,) rad^2/s^2, NaN where not
+        """Publish Odometry. rates (n, 3) rad/s and their variances (n, 3) rad^2/s^2, NaN where not
         known; held : world -> odom stays what it was last.
         """
         n = len(odometry)

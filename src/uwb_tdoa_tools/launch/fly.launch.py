@@ -17,6 +17,7 @@ from launch_ros.actions import Node
 
 from uwb_tdoa_ekf.launching import FROZEN, NETWORK, Start, discovery, tag, typed
 from uwb_tdoa_ekf.launching_actions import actions
+from uwb_tdoa_tools.flying.rover import FILTER
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from launch.launch_context import LaunchContext
 
 VALUES = {  # parameters of vehicle_node; one that is not given is its default
+    "vehicle": "quadrotor, or rover, which drives, with mission alone",
     "world": "what it flies in (docs/flying.md)",
     "seed": "of all that is random",
     "told": "place or nothing: what it tells the filter at the start",
@@ -70,6 +72,8 @@ def _nodes(context: LaunchContext) -> list[Action]:
     of_nodes = {"use_sim_time": simulated} | typed(
         {name: given[name] for name in ("effects_file", "frozen")}
     )
+    if values.get("vehicle") == "rover":
+        of_nodes |= FILTER
     starts = tag(given["namespace"], of_nodes, None, given["log_level"])
     vehicle = Start(
         "uwb_tdoa_tools", "vehicle_node", given["namespace"], [values], given["log_level"]

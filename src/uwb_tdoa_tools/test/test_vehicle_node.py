@@ -2,6 +2,7 @@
 work.
 """
 
+from dataclasses import replace
 from pathlib import Path
 import re
 
@@ -17,7 +18,14 @@ from live_flights import hall  # noqa: E402
 from test_lockstep import load  # noqa: E402, F401
 
 from uwb_tdoa_bias.foundation.errors import InputError  # noqa: E402
+from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 from uwb_tdoa_msgs.srv import GoTo, Land, Takeoff  # noqa: E402
+from uwb_tdoa_tools.flying import rover  # noqa: E402
+from uwb_tdoa_tools.flying.path import Waypoints  # noqa: E402
+from uwb_tdoa_tools.flying.simulator import DT  # noqa: E402
+from uwb_tdoa_tools.flying.trial import Task  # noqa: E402
+from uwb_tdoa_tools.flying.verdict import verdict_of  # noqa: E402
+from uwb_tdoa_tools.flying.world import WORLDS  # noqa: E402
 from uwb_tdoa_tools.vehicle_node import PARAMETERS, VehicleNode  # noqa: E402
 
 CONFIG = Path(__file__).resolve().parents[1] / "config" / "vehicle_node.yaml"
@@ -47,6 +55,7 @@ def test_requests_are_those_that_users_of_crazyswarm2_know(name):
     "given, why",
     [
         ("aids:=[sonar]", "aids: 'sonar' is not one of height, pressure, velocity, range."),
+        ("vehicle:=rover", "vehicle: a rover takes no commands and no aids; set mission to true."),
         ("world:=moon", "world: 'moon' is not one of hall,"),
     ],
 )
@@ -84,3 +93,20 @@ def test_it_flies_by_services_beside_two_busy_processes(tmp_path, load):  # noqa
     (verdict,) = flown.verdicts
     assert verdict["landed"], verdict["why"]
     assert verdict["said_lost"] is None and verdict["phases"]["air"]["rmse"] < 0.3
+
+
+@pytest.mark.slow
+def test_a_rover_drives_by_the_nodes_as_it_does_in_lockstep(tmp_path):
+    own, told = ("seed:=3", "mission:=true", "vehicle:=rover"), []
+    for name, value in rover.FILTER.items():
+        told.append(f"{name}:={str(value).lower()}")
+    with hall(tmp_path, *own, ekf=told) as driven:
+        driven.wait(lambda: driven.verdicts, "the verdict")
+    (verdict,) = driven.verdicts
+    assert verdict["arrived"], verdict["why"]
+    world = replace(WORLDS["hall"], aids=rover.AIDS)
+    task = Task(world, 3, "place", config=FilterConfig(**rover.FILTER), path=Waypoints())
+    lockstep = verdict_of(rover.drive(task))
+    one_turn = task.path.speed * DT  # m, by an odometry that came one turn later
+    for name in ("tracking", "farthest", "place"):
+        assert verdict[name] == pytest.approx(lockstep[name], abs=one_turn)

@@ -1,4 +1,4 @@
-"""vehicle_node: a simulated quadrotor that flies by the odometry of our nodes, or of others.
+"""vehicle_node: a simulated quadrotor or rover that goes by the odometry of our nodes, or of others.
 
 odometry (nav_msgs/Odometry), status (EstimatorStatus)
   -> imu/data (sensor_msgs/Imu), uwb/tdoa (Tdoa), uwb/anchors (AnchorArray, latched),
@@ -35,12 +35,14 @@ from uwb_tdoa_bias.foundation.ros_parameters import (
 from uwb_tdoa_bias.foundation.ros_streams import RoundRobin
 from uwb_tdoa_msgs.srv import GoTo, Land, Takeoff
 
+from .flying import rover
 from .flying.over_topics import OverTopics
 from .flying.pace import Lockstep, RealTime
+from .flying.path import Circles, Waypoints
 from .flying.pilot import Pilot
-from .flying.report import sentence
+from .flying.report import reached, sentence
 from .flying.sensors import AIDS
-from .flying.trial import Task, Trial
+from .flying.trial import VEHICLES, Task, Trial
 from .flying.verdict import verdict_of
 from .flying.world import WORLDS, world_of
 
@@ -48,6 +50,11 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
 PARAMETERS = {  # in the order of config/vehicle_node.yaml
+    "vehicle": Parameter(
+        "quadrotor",
+        "what it is; a rover drives, with mission alone, and publishes velocity",
+        choices=VEHICLES,
+    ),
     "world": Parameter("hall", "what it flies in (docs/flying.md)", choices=tuple(WORLDS)),
     "seed": Parameter(1, "of all that is random, as of fly", 0, 2**31 - 1),
     "told": Parameter(
@@ -85,11 +92,17 @@ class VehicleNode(StreamNode):
         self._mission, aids = own["mission"], [name for name in own["aids"] if name]
         if unknown := sorted(set(aids) - set(AIDS)):
             raise InputError(f"aids: {unknown[0]!r} is not one of {', '.join(AIDS)}.")
-        world, known = world_of(own["world"], aids=aids), own["told"] == "place"
-        task = Task(world, own["seed"], own["told"], "known" if known else "unknown")
+        drives = own["vehicle"] == "rover"
+        if drives and (aids or not self._mission):
+            raise InputError("vehicle: a rover takes no commands and no aids; set mission to true.")
+        world = world_of(own["world"], aids=rover.AIDS if drives else aids)
+        known = own["told"] == "place"
+        path = Waypoints() if drives else Circles()
+        task = Task(world, own["seed"], own["told"], "known" if known else "unknown", path=path)
         self._pace = Lockstep() if own["simulated_time"] else RealTime()
         self._topics = OverTopics(self, world, self._pace, own["simulated_time"])
-        self._trial = Trial(task, self._topics, None if self._mission else own["duration"])
+        lasts = None if self._mission else own["duration"]
+        self._trial = (rover.RoverTrial if drives else Trial)(task, self._topics, lasts)
         self._pilot, self._reported = Pilot(self._trial), 0  # missions that were judged
         self._verdict = self.create_publisher(String, "verdict", ANCHORS_QOS)
         self._offered = (
@@ -137,7 +150,7 @@ class VehicleNode(StreamNode):
         self.get_logger().info(sentence(verdict))
         if self._mission:
             self._verdict.wait_for_all_acked(Duration(seconds=SETTLE))
-            raise SystemExit(int(not verdict["landed"]))
+            raise SystemExit(int(not reached(verdict)))
 
     def _answer(self, response: Any, command: Callable[..., None], *values: object) -> Any:
         """Do what a request says, or say why not."""

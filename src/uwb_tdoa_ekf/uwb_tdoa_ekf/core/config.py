@@ -64,6 +64,11 @@ class _FilterParameters:
     motion_noise: float = parameter(
         1.5, "m/s^2/sqrt(Hz); random acceleration of the tag while no IMU says better", high=1000.0
     )
+    turn_noise: float = parameter(
+        0.5,
+        "rad/s/sqrt(Hz); random turn of the tag while neither an IMU nor wheels measure how it turns",
+        high=100.0,
+    )
     imu_timeout: float = parameter(
         0.1, "s without an IMU sample after which motion_noise takes over", high=10.0
     )

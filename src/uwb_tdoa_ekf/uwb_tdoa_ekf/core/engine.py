@@ -53,7 +53,6 @@ MAX_STEP = 0.05  # s, longest single prediction
 AVERAGED = (
     0.25  # s of inertial samples that tell how a sensor is mounted which comes when the filter runs
 )
-STALE_TURN_PSD = 0.25  # (rad/s)^2/Hz while nothing measures how the tag turns
 LINEAR_RANGE = (
     1.0  # m or m/s of the state, within which the slope of a bias tells what it is elsewhere
 )
@@ -409,14 +408,15 @@ def _coast(ekf: Record, hypothesis: Record, parameters: Record, dt: float) -> No
     wheels = ekf.velocity
     driven = velocity.drives(wheels, ekf.t)
     alike = 2.0 * velocity.CORRELATION_TIME
-    yaw_psd = alike * wheels.yaw_rate_variance if driven else STALE_TURN_PSD
+    turn_psd = parameters.turn_noise**2
+    yaw_psd = alike * wheels.yaw_rate_variance if driven else turn_psd
     if not parameters.use_imu and hypothesis.P[8, 8] > initialization.ANY_YAW**2:
         yaw_psd = 0.0
     coast(
         hypothesis,
         dt,
         parameters.motion_noise**2,
-        STALE_TURN_PSD if parameters.use_imu else 0.0,
+        turn_psd if parameters.use_imu else 0.0,
         yaw_psd,
     )
     if driven:

@@ -268,7 +268,8 @@ def odometry_messages(
         types["geometry_msgs/msg/TwistWithCovariance"],
     )
     n = len(odometry)
-    numbers = pose_and_twist(odometry, np.full((n, 3), np.nan), np.full(n, np.nan))
+    unknown = np.full((n, 3), np.nan)
+    numbers = pose_and_twist(odometry, unknown, unknown)
     for stamp, of_pose, of_twist in zip(nanoseconds("odometry", odometry.t).tolist(), *numbers):
         twist = types["geometry_msgs/msg/Twist"](Vector3(*of_twist[:3]), Vector3(*of_twist[3:6]))
         pose = Pose(pose_of(store, of_pose[:3], of_pose[3:7]), of_pose[7:])

@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 import sys
 
 from uwb_tdoa_bias.correction.network import load_network
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, options, parallel
-from ..flying import fleet
-from ..flying.path import Circles
+from ..flying import fleet, rover
+from ..flying.path import Circles, Waypoints
 from ..flying.plots import plot
-from ..flying.report import summary, text
+from ..flying.report import summary, text, wording_of
 from ..flying.sensors import AIDS
-from ..flying.trial import Task
+from ..flying.trial import VEHICLES, Task
 from ..flying.world import MOMENTS, WORLDS, world_of
 from ..outputs import OutputFile, OutputFolder
 from ..results_file import asked_of
@@ -30,12 +31,16 @@ NO_MATTER = (
     "record",
     "resume",
 )  # to what becomes of a flight
+NOT_OF_ROVERS = ("hover", "again", "peer", "aid")  # options
 DESCRIPTION = """Fly a simulated quadrotor in closed loop, in lockstep and without ROS: its controller gets position, velocity and
 attitude from nothing but the estimate, by the very code of ekf_node, and its rates from the gyroscope. Four seconds at rest, up to
 1.2 m, two circles, down, land. The verdict is by ground truth alone.
 
 A flight has landed if it took off, came down within 0.3 m of the wanted place at less than 0.6 m/s, and stands upright. Exit code 1
-if fewer than --at-least have."""
+if fewer than --at-least have.
+
+With --vehicle rover, a rover on wheels drives from place to place by the estimate. It has arrived if it stands within 0.3 m of the
+last place, and touched no wall. Its filter has planar, fixed_height and non_holonomic_std set."""
 
 
 def parser() -> argparse.ArgumentParser:
@@ -48,6 +53,7 @@ def parser() -> argparse.ArgumentParser:
         "fly --no-floor-effect --told place --yaw unknown --set robust:=m_estimation",
         "fly --aid height --flights 20 --seed 1000 --at-least 19",
         "fly --world person --again --inject anchor_delay 3=0.3",
+        "fly --vehicle rover --flights 20 --plot driven.png",
         "fly --silence circle:3 --effects effects.yaml",
         "fly --installation 7 --flights 3 --seed 101 --record flown/",
         "fly --flights 1000 --resume flown.jsonl --dask tcp://10.0.0.1:8786",
@@ -66,6 +72,12 @@ def parser() -> argparse.ArgumentParser:
         type=parallel.whole_number,
         default=1,
         help="of the first; the others have the next ones (default: 1)",
+    )
+    add(
+        "--vehicle",
+        choices=VEHICLES,
+        default="quadrotor",
+        help="what is flown, or driven (default: quadrotor)",
     )
     add(
         "--world",
@@ -144,7 +156,11 @@ def parser() -> argparse.ArgumentParser:
     )
     parallel.add_options(made)
     add(
-        "--at-least", metavar="N", type=int, default=0, help="flights that are to land (default: 0)"
+        "--at-least",
+        metavar="N",
+        type=int,
+        default=0,
+        help="flights that are to land, drives to arrive (default: 0)",
     )
     add(
         "--record",
@@ -178,11 +194,15 @@ def _fly(args: argparse.Namespace) -> int:
         )
     config, effects = options.filter_of(args)
     load_network(args.model)  # or say what is wrong with it, before the first flight
+    path: Circles | Waypoints = Circles(radius=0.0) if args.hover else Circles()
+    aids = args.aid
+    if args.vehicle == "rover":
+        _check_rover(args)
+        config, path, aids = replace(config, **rover.FILTER), Waypoints(), rover.AIDS
     config = options.with_parameters(config, args.set)
     world = world_of(
-        args.world, args.floor_effect, args.aid, args.silence, args.inject, args.installation
+        args.world, args.floor_effect, aids, args.silence, args.inject, args.installation
     )
-    path = Circles(radius=0.0) if args.hover else Circles()
     seeds = range(args.seed, args.seed + args.flights)
     tasks = [
         Task(
@@ -214,7 +234,16 @@ def _fly(args: argparse.Namespace) -> int:
         cli.write_json(args.json, {"summary": summed, "flights": verdicts})
     if args.plot is not None:
         plot(pictures, world.anchors, args.plot)
-    return int(summed["landed"] < args.at_least)
+    return int(summed[wording_of(summed).goal] < args.at_least)
+
+
+def _check_rover(args: argparse.Namespace) -> None:
+    """Refuse options that a rover has nothing to do with."""
+    for name in NOT_OF_ROVERS:
+        if getattr(args, name):
+            raise InputError(f"--{name}: is of the quadrotor; leave it out with --vehicle rover.")
+    if WORLDS[args.world].table:
+        raise InputError(f"--world {args.world}: a rover does not start from a table.")
 
 
 main = cli.executable(_fly, parser)

@@ -12,6 +12,7 @@ from ..bags.bag import write_bag
 from ..results_file import ResultsFile
 from .plots import drawn
 from .report import summary, text
+from .rover import drive
 from .trial import fly
 from .verdict import verdict_of
 
@@ -67,7 +68,7 @@ def fly_one(
     record: str | Path | None, draw: bool, task: Task
 ) -> tuple[dict[str, Any], Drawn | None]:
     """(verdict, Drawn or None) of a Task that is flown; record, draw : as of `flown`."""
-    one = fly(task)
+    one = drive(task) if task.vehicle == "rover" else fly(task)
     verdict = verdict_of(one)
     if record is not None:
         write_bag(one.flight, Path(record) / one.flight.name, "mcap", False)

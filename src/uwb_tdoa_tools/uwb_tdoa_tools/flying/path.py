@@ -1,4 +1,4 @@
-"""What is to be flown: a path from a place on the ground and back to it."""
+"""What is to be flown, a path from a place on the ground and back to it, or driven."""
 
 from __future__ import annotations
 
@@ -33,6 +33,11 @@ class Circles:
         """s, from the rotors' start to where the slow sinking begins."""
         return self.rise + self.turns * self.turn_time + self.fall
 
+    @property
+    def middle(self) -> float:
+        """s after take-off, in which it is on the circle."""
+        return self.rise + 4.0
+
     def along(self, place: np.ndarray, ground: float) -> ReferenceTrajectory:
         """The ReferenceTrajectory from `place` (2,) m, where the circle is entered at its point
         nearest to +x; ground : m, height at which the body stands.
@@ -49,6 +54,67 @@ class Circles:
             ground + self.height * up - (self.height - SETTLE) * down + self.swing * np.sin(angle)
         )
         return ReferenceTrajectory(p)
+
+
+@dataclass(frozen=True)
+class Waypoints:
+    """Straight from one place to the next, on wheels. shares (n, 2) : of half the hall's length and
+    width, from its middle; speed : m/s; size (2,) m, of the hall.
+    """
+
+    size: tuple[float, float] = (6.4, 6.2)
+    shares: tuple[tuple[float, float], ...] = (
+        (0.5, 0.5),
+        (-0.5, 0.5),
+        (-0.5, -0.5),
+        (0.5, -0.5),
+        (0.5, 0.1),
+    )
+    speed: float = 0.6
+
+    @property
+    def duration(self) -> float:
+        """s, from departure to arrival at this speed."""
+        places = 0.5 * np.array(self.size) * self.shares
+        ways = np.linalg.norm(np.diff(places, axis=0, prepend=[[0.0, 0.0]]), axis=1)
+        return float(ways.sum()) / self.speed
+
+    @property
+    def middle(self) -> float:
+        """s after departure, in which it is on its way."""
+        return 0.5 * self.duration
+
+    def along(self, place: np.ndarray, ground: float) -> Polyline:
+        """The Polyline from `place` (2,) m, at height `ground`, m."""
+        return Polyline(np.vstack([place, 0.5 * np.array(self.size) * self.shares]), ground)
+
+
+class Polyline:
+    """Straight lines from place to place. length : m; end (2,) m, its last place."""
+
+    def __init__(self, places: np.ndarray, height: float) -> None:
+        """places : (n, 2) m."""
+        self._places, self._height = places, height
+        self._ways = np.diff(places, axis=0)
+        self._lengths = np.linalg.norm(self._ways, axis=1)
+        self._stamps = np.concatenate([[0.0], np.cumsum(self._lengths)])
+        self.length, self.end = float(self._stamps[-1]), places[-1]
+
+    def at(self, along: np.ndarray) -> np.ndarray:
+        """(n, 3) m, at `along` (n,) m from the start."""
+        x, y = (np.interp(along, self._stamps, column) for column in self._places.T)
+        return np.column_stack([x, y, np.full(len(x), self._height)])
+
+    def nearest(self, p: np.ndarray, first: float = 0.0, last: float = np.inf) -> np.ndarray:
+        """(n,) m along it: the points nearest to p (n, 2) m, between `first` and `last`, m."""
+        since = p[:, None] - self._places[:-1]
+        shares = np.sum(since * self._ways, axis=2) / self._lengths**2
+        along = self._stamps[:-1] + np.clip(shares, 0.0, 1.0) * self._lengths  # of each line
+        along = np.clip(along, first, min(last, self.length))
+        off = self.at(along.ravel())[:, :2].reshape(since.shape) - p[:, None]
+        best = np.argmin(np.linalg.norm(off, axis=2), axis=1)
+        out: np.ndarray = along[np.arange(len(p)), best]
+        return out
 
 
 class ReferenceTrajectory:

@@ -11,6 +11,7 @@ import numpy as np
 from uwb_tdoa_bias.foundation.files import write_filled
 
 from ..scoring.metrics import position_at
+from .report import reached, wording_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -68,19 +69,19 @@ def plot(flights: Sequence[Drawn], anchors: Anchors, path: str | Path) -> None:
 
     figure = Figure(figsize=(14, 8), layout="constrained")
     left, right = figure.subfigures(1, 2)
-    landed = sum(one.verdict["landed"] for one in flights)
-    figure.suptitle(f"{landed} of {len(flights)} landed")
+    goal = wording_of(flights[0].verdict).goal
+    figure.suptitle(f"{sum(reached(one.verdict) for one in flights)} of {len(flights)} {goal}")
     above, height = left.subplots(2, 1, height_ratios=(3, 1))
     above.plot(*anchors.positions[:, :2].T, "k^")
     for one in flights:
-        colour = "tab:green" if one.verdict["landed"] else "tab:red"
+        colour = "tab:green" if reached(one.verdict) else "tab:red"
         above.plot(*one.p[:, :2].T, color=colour, linewidth=0.7, alpha=0.6)
         above.plot(*one.p[-1, :2], "x", color=colour)
         height.plot(one.t, one.p[:, 2], color=colour, linewidth=0.7, alpha=0.6)
     above.set(xlabel="x, m", ylabel="y, m", aspect="equal")
     height.set(xlabel="t, s", ylabel="z, m")
     worst = max(flights, key=_badness)
-    right.suptitle(f"seed {worst.verdict['seed']}: {worst.verdict['why'] or 'landed'}")
+    right.suptitle(f"seed {worst.verdict['seed']}: {worst.verdict['why'] or goal}")
     for k, (axes, axis) in enumerate(zip(right.subplots(3, 1, sharex=True), "xyz")):
         axes.plot(worst.t, worst.wanted[:, k] - worst.p[:, k], "0.6", label="wanted - true")
         axes.plot(worst.stamps, worst.error[:, k], label="estimated - true")
@@ -98,4 +99,4 @@ def plot(flights: Sequence[Drawn], anchors: Anchors, path: str | Path) -> None:
 
 
 def _badness(one: Drawn) -> tuple[bool, float]:
-    return not one.verdict["landed"], one.verdict["tracking"] or 0.0
+    return not reached(one.verdict), one.verdict["tracking"] or 0.0

@@ -19,7 +19,6 @@ from .vehicle import ATTITUDE, GRAVITY, POSITION, STATE, VELOCITY, Vehicle, grou
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.sensors.sensor import Stream
 
-    from .controller import Controller
     from .sensors import AidSensor
     from .world import World
 
@@ -108,23 +107,15 @@ class Simulator:
         """Height of what is below it, m."""
         return ground_at(self._numbers, self.state[0], self.state[1])
 
-    def advance(self, controller: Controller) -> SensorReadings:
-        """Fly one turn by what a Controller wants, or be carried on by hands.
+    def advance(self, controller: Any) -> SensorReadings:
+        """Move for one turn as a controller of this vehicle wants, or be carried on by hands.
 
         Returns SensorReadings.
         """
         k = self.done
         rows, lately = slice(k + 1, k + TICK + 1), slice(k, k + TICK + 1)
         if self._hands is None:
-            interval(
-                self.state,
-                self._gyro,
-                (controller.thrust, controller.rates),
-                (controller.numbers, self._known),
-                self._numbers,
-                (self._wind[rows], self._inertial.errors[rows], self._inertial.shaking[rows]),
-                (self.states[rows], self.samples[rows], self.contact[rows]),
-            )
+            self._move(controller, rows)
         else:
             self._be_carried(rows)
         self.done += TICK
@@ -138,6 +129,18 @@ class Simulator:
         )
         aids = {name: self._felt(name, sensor, lately) for name, sensor in self._aids.items()}
         return self._disturbed(SensorReadings(imu, tdoa, aids))
+
+    def _move(self, controller: Any, rows: slice) -> None:
+        """Fly the samples in `rows` by what a Controller wants."""
+        interval(
+            self.state,
+            self._gyro,
+            (controller.thrust, controller.rates),
+            (controller.numbers, self._known),
+            self._numbers,
+            (self._wind[rows], self._inertial.errors[rows], self._inertial.shaking[rows]),
+            (self.states[rows], self.samples[rows], self.contact[rows]),
+        )
 
     def lift(self, by: np.ndarray, seconds: float) -> None:
         """Be carried by (2,) m, lifted and put down, within so many s, from now on."""

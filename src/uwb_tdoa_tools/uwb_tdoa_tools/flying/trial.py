@@ -20,7 +20,7 @@ from .controller import FELT, Controller, Gains, turned
 from .estimates import OurFilter, TheirFilter
 from .loop import IMU_RATE
 from .mission import DONE, REFUSED, Mission, Rules
-from .path import Circles
+from .path import Circles, Waypoints
 from .sensors import random
 from .simulator import DT, Simulator
 from .transport import Transport
@@ -39,6 +39,7 @@ PAUSE, CARRIED, CARRY_TIME = (
     6.0,
 )  # s at rest between two flights, m and s by which it is carried then
 OUTSIDE = 0.5  # m beyond the hall, where a flight ends
+VEHICLES = "quadrotor", "rover"
 TIPPED = math.radians(75.0)  # tilt of a vehicle that touches something, and does not get up again
 GIVEN_AT, GIVEN_STD = (
     0.3,
@@ -54,7 +55,7 @@ class Task:
         is measured with, or None; again : fly
     twice, carried by hand in between;
     peer : path of a library to fly by instead of our filter, always with a known yaw; path, rules,
-        gains : of the vehicle.
+        gains : of the vehicle, a rover where the path is of Waypoints.
     """
 
     world: World
@@ -66,17 +67,22 @@ class Task:
     model: str | None = None
     again: bool = False
     peer: str | None = None
-    path: Circles = Circles()
+    path: Circles | Waypoints = Circles()
     rules: Rules = Rules()
     gains: Gains = Gains()
+
+    @property
+    def vehicle(self) -> str:
+        """One of VEHICLES."""
+        return "rover" if isinstance(self.path, Waypoints) else "quadrotor"
 
 
 @dataclass(frozen=True)
 class TrialResult:
     """What became of it. flight : Flight, all that arrived, its truth at every sample of the
     inertial sensor; states (n, 17) and contact (n,), number of feet on the ground, beside that;
-    odometry : Odometry, all that came out; missions : [Mission], one for each take-off; crash :
-    what ended it, text, or "".
+    odometry : Odometry, all that came out; missions : [Mission], one for each take-off, or
+    [rover.Drive]; crash : what ended it, text, or "".
     """
 
     task: Task
@@ -84,7 +90,7 @@ class TrialResult:
     states: np.ndarray
     contact: np.ndarray
     odometry: Odometry
-    missions: list[Mission]
+    missions: list[Any]
     crash: str
 
 
@@ -104,7 +110,8 @@ class Trial:
         duration = lasts or longest * (2 if task.again else 1) + (
             PAUSE + CARRY_TIME if task.again else 0.0
         )
-        self.task, self.simulator = task, Simulator(world, seed, duration, task.path.radius)
+        self.task = task
+        self.simulator = self._simulator(duration)
         self._rng = random(seed, "task")
         rng = random(seed, "told")
         place, off = (
@@ -117,11 +124,20 @@ class Trial:
             self.source.set_pose(
                 GIVEN_AT, place, GIVEN_STD, yaw if task.yaw == "known" else math.nan
             )
-        self.controller = Controller(task.gains, self.simulator.believed)
+        self.controller = self._controller()
         self.transport = Transport(world.latency, world.jitter, random(seed, "transport"))
-        self.missions: list[Mission] = []
+        self.missions: list[Any] = []
         self.crash = ""
         self._arrived: list[SensorReadings] = []
+
+    def _simulator(self, duration: float) -> Simulator:
+        """The vehicle, for so many s."""
+        assert isinstance(self.task.path, Circles)
+        return Simulator(self.task.world, self.task.seed, duration, self.task.path.radius)
+
+    def _controller(self) -> Any:
+        """What moves it."""
+        return Controller(self.task.gains, self.simulator.believed)
 
     def fly(self) -> None:
         """One mission from where it stands, until it has rested for a while after it, or has come
@@ -133,17 +149,13 @@ class Trial:
 
     def begin(self, path: Route | None = None, rules: Rules | None = None) -> None:
         """Begin a mission from where it stands; path, rules : default: those of the Task."""
-        state, task = self.simulator.state, self.task
-        self.missions.append(
-            Mission(
-                path or task.path,
-                state[:2].copy(),
-                state[2],
-                rules or task.rules,
-                self.simulator.now,
-            )
-        )
-        self._moment = _moment(task.world.silence, task.path, task.rules, self._rng)
+        self.missions.append(self._mission(path or self.task.path, rules or self.task.rules))
+        self._moment = _moment(self.task.world.silence, self.task.path, self.task.rules, self._rng)
+
+    def _mission(self, path: Any, rules: Rules) -> Any:
+        """A mission from where it stands now."""
+        state = self.simulator.state
+        return Mission(path, state[:2].copy(), state[2], rules, self.simulator.now)
 
     @property
     def over(self) -> bool:
@@ -173,11 +185,17 @@ class Trial:
     def _decide(self, mission: Mission) -> np.ndarray | None:
         """What a Mission wants now."""
         simulator, k = self.simulator, self.simulator.done
-        started = mission.begin + mission.rules.rest if mission.started is None else mission.started
-        simulator.radio.happens(started + self._moment, started + 0.5 * self.task.path.duration)
+        self._let_happen(mission)
         force = float(np.mean(simulator.samples[max(k - int(FELT * IMU_RATE), 0) : k + 1, 5]))
         return mission.decide(
             simulator.now, self.source.pose, self.source.deviation, self.controller.support(force)
+        )
+
+    def _let_happen(self, mission: Any) -> None:
+        """Have the silence and the change of its world come when they are due in a mission."""
+        started = mission.begin + mission.rules.rest if mission.started is None else mission.started
+        self.simulator.radio.happens(
+            started + self._moment, started + 0.5 * self.task.path.duration
         )
 
     def rest(self, seconds: float) -> None:
@@ -193,7 +211,11 @@ class Trial:
         )
         self._arrived.append(measured)
         self.source.take(measured)
-        self.crash = _crash(self.simulator, self.task.world)
+        self.crash = self._crash()
+
+    def _crash(self) -> str:
+        """What ends it, in words, or ""."""
+        return _crash(self.simulator, self.task.world)
 
     def _turned_since(self, attitude: np.ndarray, since: float) -> np.ndarray:
         """An attitude (4,) of `since`, s, turned by the rates that were felt until now."""
@@ -262,7 +284,10 @@ def _filter_of(task: Task, place: np.ndarray, yaw: float) -> OurFilter | TheirFi
 
 
 def _moment(
-    silence: tuple[str, float] | None, path: Circles, rules: Rules, rng: np.random.Generator
+    silence: tuple[str, float] | None,
+    path: Circles | Waypoints,
+    rules: Rules,
+    rng: np.random.Generator,
 ) -> float:
     """s since the rotors started, at which a silence begins; inf without one."""
     anywhere = rng.uniform(-0.5 * rules.rest, path.duration)
@@ -271,7 +296,7 @@ def _moment(
     return {
         "rest": -0.5 * rules.rest,
         "lift-off": 0.5,
-        "circle": path.rise + 4.0,
+        "circle": path.middle,
         "landing": path.duration - 2.0,
         "anywhere": anywhere,
     }[silence[0]]

@@ -11,6 +11,7 @@ from uwb_tdoa_ekf.results import rows_of
 
 from ..scoring.metrics import nees, position_at, rms
 from .mission import DONE, REFUSED
+from .rover import Drive
 from .trial import REST_AFTER
 from .vehicle import POSITION, VELOCITY
 
@@ -28,6 +29,7 @@ GENTLE = 1.0  # m/s at touchdown, of one that has not crashed
 LOST = 1.0  # m; an estimate that is further off is none
 SPACING = 0.02  # s between the estimates that are judged
 PHASES = "before", "lift_off", "air", "landing", "after"
+DRIVE_PHASES = "before", "drive", "after"
 
 
 def verdict_of(flown: TrialResult) -> dict[str, Any]:
@@ -44,7 +46,13 @@ def verdict_of(flown: TrialResult) -> dict[str, Any]:
     first instant in the air at which the estimate is more than LOST off, and said_lost : s, when it
         said so itself; phases : {phase:
     figures of the estimate}.
+
+    Of a rover, `arrived` instead: stood within NEAR of the last place, and touched no wall;
+    tracking, farthest : m, root mean square and largest distance to the path; yaw : degrees, root
+    mean square of its error, and yaw_nees, on the way.
     """
+    if flown.task.vehicle == "rover":
+        return _of_drive(flown)
     ends = [(mission.ended or math.inf) + REST_AFTER for mission in flown.missions]
     verdicts = [_of_mission(flown, mission, end) for mission, end in zip(flown.missions, ends)]
     failed = [one["why"] for one in verdicts if one["why"]]
@@ -99,7 +107,7 @@ def _of_mission(flown: TrialResult, mission: Mission, end: float) -> dict[str, A
         "ended": mission.ended,
         "said_lost": mission.lost,
         "duration": float(t[-1]),
-        **_armed(flown.odometry, flown.flight.truth, mission),
+        **_armed(flown.odometry, flown.flight.truth, mission.started),
         **_estimation(odometry, truth, mission, first, last),
     }
     figures["why"] = _why(crash, mission, figures)
@@ -108,6 +116,70 @@ def _of_mission(flown: TrialResult, mission: Mission, end: float) -> dict[str, A
     )
     figures["safe"] = bool(gentle and figures["upright"] and not crash)
     return figures
+
+
+def _of_drive(flown: TrialResult) -> dict[str, Any]:
+    """The verdict of a rover."""
+    mission, truth = flown.missions[-1], flown.flight.truth
+    assert isinstance(mission, Drive) and truth is not None
+    end = float(truth.t[-1])
+    started, ended = mission.started or end, mission.ended or end
+    way = truth.p[(truth.t >= started) & (truth.t <= ended)][::8, :2]
+    off = np.linalg.norm(way - mission.path.at(mission.path.nearest(way))[:, :2], axis=1)
+    place = float(np.linalg.norm(truth.p[-1, :2] - mission.place))
+    why = flown.crash or ("refused to start" if mission.state == REFUSED else "")
+    if not why and mission.state != DONE:
+        why = "did not arrive in time"
+    if not why and place >= NEAR:
+        why = "arrived elsewhere"
+    kept = flown.odometry.t <= end
+    odometry = rows_of(flown.odometry, kept)
+    figures = {
+        "seed": flown.task.seed,
+        "arrived": not why,
+        "why": why,
+        "safe": not flown.crash,
+        "place": place,
+        "tracking": rms(off) if len(off) else None,
+        "farthest": float(off.max()) if len(off) else None,
+        "started": mission.started,
+        "ended": mission.ended,
+        "said_lost": mission.lost,
+        "duration": end,
+        **_armed(flown.odometry, truth, mission.started),
+    }
+    if not len(odometry):
+        return {**figures, "estimation": None, "yaw": None, "yaw_nees": None, "phases": {}}
+    rows = np.unique(np.searchsorted(odometry.t, np.arange(odometry.t[0], odometry.t[-1], SPACING)))
+    odometry = rows_of(odometry, rows)
+    error = (odometry.p - position_at(odometry.t, truth))[:, :2]
+    normalised = nees(error, odometry.covariance[:, :2, :2])
+    phases = _by_phase(
+        odometry.t,
+        np.linalg.norm(error, axis=1),
+        normalised,
+        dict(zip(DRIVE_PHASES, (-math.inf, started, ended))),
+    )
+    under_way = (odometry.t >= started) & (odometry.t <= ended)
+    yaw = np.interp(odometry.t, truth.t, np.unwrap(yaws_of(truth.q)))
+    off_yaw = ((yaws_of(odometry.q) - yaw + np.pi) % (2.0 * np.pi) - np.pi)[under_way]
+    variance = odometry.covariance[under_way, 8, 8]  # of a planar vehicle: about the vertical
+    told = len(off_yaw) > 0 and bool((variance > 0.0).all())
+    drive = phases.get("drive")
+    return {
+        **figures,
+        "estimation": drive and drive["rmse"],
+        "yaw": math.degrees(rms(off_yaw)) if len(off_yaw) else None,
+        "yaw_nees": float(np.mean(off_yaw**2 / variance)) if told else None,
+        "phases": phases,
+    }
+
+
+def yaws_of(q: np.ndarray) -> np.ndarray:
+    """(n,) rad, of q (n, 4) x y z w."""
+    x, y, z, w = q.T
+    out: np.ndarray = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y**2 + z**2))
+    return out
 
 
 def _why(crash: str, mission: Mission, figures: dict[str, Any]) -> str:
@@ -127,9 +199,8 @@ def _why(crash: str, mission: Mission, figures: dict[str, Any]) -> str:
     return "landed elsewhere" if figures["place"] >= NEAR else ""
 
 
-def _armed(odometry: Odometry, truth: Truth, mission: Mission) -> dict[str, float | None]:
+def _armed(odometry: Odometry, truth: Truth, started: float | None) -> dict[str, float | None]:
     """How far the estimate was off when the rotors started."""
-    started = mission.started
     if started is None:
         return {"armed_off": None, "armed_deviations": None}
     k = int(np.searchsorted(odometry.t, started, side="right")) - 1
@@ -160,19 +231,28 @@ def _estimation(
     )  # a peer tells none
     end = truth.t[-1]
     started, ended = mission.started or end, mission.ended or end
-    up, down = (truth.t[first], truth.t[last]) if first is not None else (ended, ended)
-    limits = [-math.inf, started, max(up, started), max(down, started), max(ended, down), math.inf]
-    phases = {
-        name: _figures(distance[inside], normalised[inside])
-        for name, begin, stop in zip(PHASES, limits, limits[1:])
-        if (inside := (t >= begin) & (t < stop)).any()
-    }
+    up, down = (float(truth.t[k]) if k is not None else ended for k in (first, last))
+    limits = [-math.inf, started, max(up, started), max(down, started), max(ended, down)]
+    phases = _by_phase(t, distance, normalised, dict(zip(PHASES, limits)))
     far = np.flatnonzero((distance > LOST) & (t >= started) & (t < ended))
     air = phases.get("air")
     return {
         "lost": float(t[far[0]]) if len(far) else None,
         "estimation": air and air["rmse"],
         "phases": phases,
+    }
+
+
+def _by_phase(
+    t: np.ndarray, distance: np.ndarray, normalised: np.ndarray, begins: dict[str, float]
+) -> dict[str, dict[str, float | None]]:
+    """{phase: figures} of estimates at t (n,) s. begins : {phase: s}, each until the next."""
+    stops = [*list(begins.values())[1:], math.inf]
+    inside = {name: (t >= begins[name]) & (t < stop) for name, stop in zip(begins, stops)}
+    return {
+        name: _figures(distance[rows], normalised[rows])
+        for name, rows in inside.items()
+        if rows.any()
     }
 
 

@@ -94,7 +94,7 @@ def _of_wheels(velocity: Stream, config: SimulationConfig, turning: np.ndarray) 
     assert isinstance(velocity, Velocity)
     n, t = len(velocity), velocity.t
     too_fast = (1.0 + config.wheel_scale) * (
-        1.0 + config.wheel_slip * _slips(t, config.random("slip"))
+        1.0 + config.wheel_slip * slips(t, config.random("slip"))
     )
     ahead = np.zeros((n, 3))
     ahead[:, 0] = too_fast * velocity.v[:, 0]
@@ -104,9 +104,9 @@ def _of_wheels(velocity: Stream, config: SimulationConfig, turning: np.ndarray) 
     return replace(velocity, v=ahead, yaw_rate=yaw_rate, yaw_rate_std=np.full(n, YAW_RATE_STD))
 
 
-def _slips(t: np.ndarray, random: np.random.Generator) -> np.ndarray:
+def slips(t: np.ndarray, random: np.random.Generator) -> np.ndarray:
     """Return whether the wheels slip at stamps t (n,) s: (n,) bool."""
     begins = np.cumsum(random.exponential(SLIP_EVERY, int(2.0 * t[-1] / SLIP_EVERY) + 10))
     last = np.searchsorted(begins, t, "right") - 1
-    slips: np.ndarray = (last >= 0) & (t < begins[last] + SLIP_TIME)
-    return slips
+    slipping: np.ndarray = (last >= 0) & (t < begins[last] + SLIP_TIME)
+    return slipping

@@ -1,0 +1,245 @@
+"""A rover that drives by the estimate: two driven wheels, what these say, and a controller that has
+nothing but the newest odometry.
+
+The body's origin is the antenna, MAST above the floor.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from uwb_tdoa_bias.foundation.sensors import SENSORS
+
+from ..simulation.config import WHEELS_RATE
+from ..simulation.sensors import YAW_RATE_STD, slips
+from .loop import IMU_RATE
+from .mission import DONE, FLYING, LOST, REFUSED, WAITING, Rules, yaw_of
+from .path import Polyline, Waypoints
+from .sensors import AidSensor, random
+from .simulator import Simulator
+from .trial import REST_AFTER, Trial
+from .vehicle import GRAVITY
+
+if TYPE_CHECKING:
+    from uwb_tdoa_bias.foundation.sensors.sensor import Stream
+
+    from .estimates import EstimateSource
+    from .mission import Pose
+    from .trial import Task, TrialResult
+    from .world import World
+
+MAST = 0.4  # m
+FILTER: dict[str, Any] = {
+    "planar": True,
+    "fixed_height": MAST,
+    "non_holonomic_std": 0.05,
+}  # parameters that it sets
+AIDS = ("velocity",)  # what it measures beside inertia and TDOAs
+TRACK = 0.4  # m between its wheels
+SCALE, UNEQUAL = 0.03, 0.003  # largest common error of the wheels' scales; deviation of each
+SLIP = 0.1  # share by which a wheel turns faster than the floor passes, at times
+LAG = 0.1  # s, of a wheel behind what is wanted
+HARDEST = 1.0  # m/s^2
+SLOWEST = 0.005  # m/s; a wheel that is to stand and turns slower stands
+WHEEL_STD = 0.02  # m/s, noise of what they say
+BUMPER = 0.2  # m from its middle
+AHEAD = 0.4  # m, of the point of the path that it steers for
+TURN, FASTEST_TURN = 2.0, 1.2  # 1/s, turning rate by the direction to that point; rad/s
+PULL = 1.0  # 1/s, most of its speed by the distance to the end
+STOP = 0.06  # m from the end, where it stops
+WINDOW = 1.0  # m of the path in which it looks for where it is
+GIVE_UP = 30.0  # s for which it stands with an estimate that is lost
+
+
+class Steering:
+    """What a controller wants: speed, m/s, and turning, rad/s."""
+
+    def __init__(self) -> None:
+        self.stop()
+
+    def stop(self) -> None:
+        """Stand."""
+        self.speed = self.turning = 0.0
+
+
+class Wheels(AidSensor):
+    """Encoders of both wheels."""
+
+    rate, width = WHEELS_RATE, 2
+
+
+class RoverSimulator(Simulator):
+    """A rover for so many seconds, as Simulator. wheels (n, 2) : m/s, as the encoders see them."""
+
+    def __init__(self, world: World, seed: int, duration: float) -> None:
+        super().__init__(world, seed, duration)
+        x, y = self.state[:2]
+        self.state[:] = 0.0
+        self.state[:3] = x, y, MAST
+        self.state[8:10] = math.sin(0.5 * self.yaw), math.cos(0.5 * self.yaw)
+        self.states[0] = self.state
+        rng = random(seed, "wheels")
+        self._scale = 1.0 + rng.uniform(-SCALE, SCALE) + UNEQUAL * rng.standard_normal(2)
+        slipping = np.column_stack([slips(self.times, rng) for _ in range(2)])
+        self._per_turn = 1.0 / (self._scale * (1.0 + SLIP * slipping))
+        self._aids = {"velocity": Wheels(world, seed, duration)}
+        self.wheels = np.zeros((len(self.times), 2))
+
+    def _move(self, controller: Steering, rows: slice) -> None:
+        """Drive the samples in `rows` as a Steering wants."""
+        half, dt, state = 0.5 * TRACK * controller.turning, 1.0 / IMU_RATE, self.state
+        wanted = np.array([controller.speed - half, controller.speed + half])
+        for i in range(rows.start, rows.stop):
+            wheels = self.wheels[i - 1]
+            most = HARDEST * dt
+            wheels = wheels + np.clip((wanted - wheels) * dt / LAG, -most, most)
+            wheels[(wanted == 0.0) & (np.abs(wheels) < SLOWEST)] = 0.0
+            before, after = self.wheels[i - 1] * self._per_turn[i - 1], wheels * self._per_turn[i]
+            (speed, turning), (v, w) = _unicycle(0.5 * (before + after)), _unicycle(after)
+            yaw = self.yaw + 0.5 * turning * dt
+            state[:2] += speed * dt * np.array([math.cos(yaw), math.sin(yaw)])
+            self.yaw += turning * dt
+            state[3:5] = v * math.cos(self.yaw), v * math.sin(self.yaw)
+            state[8:10], state[12] = (math.sin(0.5 * self.yaw), math.cos(0.5 * self.yaw)), w
+            ahead = (v - _unicycle(before)[0]) / dt
+            felt = np.array([0.0, 0.0, turning, ahead, speed * turning, GRAVITY])
+            felt += self._inertial.errors[i]
+            if wheels.any():
+                felt[3:] += self._inertial.shaking[i]
+            self.wheels[i], self.states[i], self.samples[i] = wheels, state, felt
+            self.contact[i] = 2.0
+
+    def _felt(self, name: str, sensor: AidSensor, lately: slice) -> Stream:
+        new, _, _ = self._poses(name, sensor.t, lately)
+        t = sensor.t[new]
+        wheels = np.column_stack(
+            [np.interp(t, self.times[lately], column) for column in self.wheels[lately].T]
+        )
+        turns = wheels.any(axis=1)
+        speed, turning = _unicycle(wheels.T)
+        v, std = np.zeros((len(t), 3)), np.full((len(t), 3), WHEEL_STD)
+        v[:, 0] = speed + WHEEL_STD * turns * sensor.noise[new, 0]
+        turning = turning + YAW_RATE_STD * turns * sensor.noise[new, 1]
+        return SENSORS[name].stream(t, v, std, turning, np.full(len(t), YAW_RATE_STD))
+
+
+def _unicycle(wheels: Any) -> tuple[Any, Any]:
+    """Speed, m/s, and turning rate, rad/s, of wheels, left and right, m/s."""
+    left, right = wheels
+    return 0.5 * (left + right), (right - left) / TRACK
+
+
+class Drive:
+    """One drive along a Polyline, decided by nothing but the estimate and its deviation. state,
+    started, ended, lost : as of Mission: it stands while it is lost; path : Polyline.
+    """
+
+    def __init__(
+        self, path: Polyline, speed: float, rules: Rules | None = None, begin: float = 0.0
+    ) -> None:
+        """speed : m/s; begin : s, when it was switched on."""
+        self.path, self.rules, self.begin, self._speed = path, rules or Rules(), begin, speed
+        self.state = WAITING
+        self.started: float | None = None
+        self.ended: float | None = None
+        self.lost: float | None = None
+        self._last_good = begin
+        self._clock: list[tuple[float, float]] = []  # (s, m along the path) of each call
+
+    def decide(self, t: float, pose: Pose | None, deviation: float, steering: Steering) -> None:
+        """Have a Steering want what is to be done at t, s. pose : as of an estimate, or None;
+        deviation : m.
+        """
+        steering.stop()
+        rules, good = self.rules, pose is not None and t - pose[0] <= self.rules.stale
+        if self.state == WAITING and t >= self.begin + rules.rest:
+            if good and deviation <= rules.arm:
+                self.state, self.started = FLYING, t
+            elif t >= self.begin + rules.rest + rules.patience:
+                self.state = REFUSED
+        if self.state not in (FLYING, LOST):
+            return
+        if not good or deviation > rules.lost:
+            self.lost, self.state = t if self.lost is None else self.lost, LOST
+        elif deviation <= rules.arm:
+            self.state = FLYING
+        if self.state == LOST:
+            if t - self._last_good > GIVE_UP:
+                self.state, self.ended = DONE, t
+            return
+        self._last_good = t
+        assert pose is not None  # or it would be lost
+        self._steer(t, pose, steering)
+
+    def _steer(self, t: float, pose: Pose, steering: Steering) -> None:
+        p = pose[1][:2]
+        before = self._clock[-1][1] if self._clock else 0.0
+        along = float(self.path.nearest(p[None], before, before + WINDOW)[0])
+        self._clock.append((t, along))
+        left = float(np.linalg.norm(self.path.end - p))
+        if left < STOP or (along >= self.path.length and left < 2.0 * STOP):
+            self.state, self.ended = DONE, t
+            return
+        target = self.path.at(np.array([along + AHEAD]))[0, :2]
+        x, y = target - p
+        off = (math.atan2(y, x) - yaw_of(pose[3]) + math.pi) % (2.0 * math.pi) - math.pi
+        to_go = self.path.length - along + left if along < self.path.length - AHEAD else left
+        steering.speed = min(self._speed, PULL * to_go) * max(math.cos(off), 0.0)
+        steering.turning = min(max(TURN * off, -FASTEST_TURN), FASTEST_TURN)
+
+    @property
+    def place(self) -> np.ndarray:
+        """(2,) m, where it is to stop."""
+        return self.path.end
+
+    def wanted(self, t: np.ndarray) -> np.ndarray:
+        """The point of the path that it took for the nearest: (n, 1, 3) m, at t (n,) s."""
+        if not self._clock:
+            return np.full((len(t), 1, 3), np.nan)
+        return self.path.at(np.interp(t, *np.transpose(self._clock)))[:, None]
+
+
+class RoverTrial(Trial):
+    """A Task with Waypoints under way."""
+
+    def __init__(
+        self, task: Task, source: EstimateSource | None = None, lasts: float | None = None
+    ) -> None:
+        rules = task.rules
+        longest = rules.rest + rules.patience + 2.0 * task.path.duration + GIVE_UP + REST_AFTER
+        super().__init__(task, source, lasts or longest)
+
+    def _simulator(self, duration: float) -> RoverSimulator:
+        return RoverSimulator(self.task.world, self.task.seed, duration)
+
+    def _controller(self) -> Steering:
+        return Steering()
+
+    def _mission(self, path: Waypoints, rules: Rules) -> Any:
+        way = path.along(self.simulator.state[:2].copy(), MAST)
+        return Drive(way, path.speed, rules, self.simulator.now)
+
+    def turn(self) -> None:
+        """One turn of the controller, as the drive under way decides; it stands without one."""
+        self.controller.stop()
+        if self.missions:
+            drive: Any = self.missions[-1]
+            self._let_happen(drive)
+            source = self.source
+            drive.decide(self.simulator.now, source.pose, source.deviation, self.controller)
+        self._turn()
+
+    def _crash(self) -> str:
+        half = 0.5 * np.array(self.task.world.size[:2])
+        hit = (np.abs(self.simulator.state[:2]) > half - BUMPER).any()
+        return "drove into a wall" if hit else ""
+
+
+def drive(task: Task) -> TrialResult:
+    """TrialResult, of a Task with Waypoints."""
+    trial = RoverTrial(task)
+    trial.fly()
+    return trial.flown
