@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.flight import Flight
     from uwb_tdoa_ekf.core.config import FilterConfig
 
-TRIED = 3  # anchors that explain the most once they are placed; each is then calibrated as unknown
+TRIED = 2  # anchors that explain the most once they are placed; each is then calibrated as unknown
 
 
 @dataclass(frozen=True)

@@ -44,6 +44,7 @@ LEFT = 0.055  # m that may be left of slow innovations
 # slow innovations as given over those that are left, beyond which the tape was worse than what else
 # is wrong
 CLEARLY = 2.6
+PLAINLY = 5.0  # standard deviations that an anchor must be off by to be tried as the only one
 WELL_PLACED = 0.08  # m, 3D standard deviation of a moved anchor that leaves nothing to do
 NEARER = 0.75  # share of marks, each left out once, at which the estimate must come nearer
 
@@ -368,12 +369,14 @@ def _most_probable(found: dict[int | None, SelfCalibration], misfit: Misfit) -> 
     """Return the most probable of several SelfCalibrations.
 
     found : {row of the anchor that was tried alone, None of none: SelfCalibration}. One anchor
-        alone must be ODDS times as probable as the error spread over all.
+        alone must be ODDS times as probable as the error spread over all, and must stand plainly
+        elsewhere.
     """
-    alike = SYSTEMATIC * min(one.inflation for one in found.values())
+    alike = SYSTEMATIC * max(1.0, min(one.inflation for one in found.values()))
     evidence = {
         row: _log_evidence(one, row) - misfit.of(one.surveyed, _in_model(one)) / alike
         for row, one in found.items()
+        if row is None or _stands_elsewhere(one, row)
     }
     best = max(evidence, key=evidence.__getitem__)
     doubt = evidence[best] - np.log(ODDS)
@@ -381,6 +384,13 @@ def _most_probable(found: dict[int | None, SelfCalibration], misfit: Misfit) -> 
         return found[None]
     likely = {row: value for row, value in evidence.items() if row is not None and value > doubt}
     return _with_rivals(found, best, likely)
+
+
+def _stands_elsewhere(found: SelfCalibration, row: int) -> bool:
+    """Whether a SelfCalibration puts an anchor plainly elsewhere than it was given."""
+    places = slice(3 * row, 3 * row + 3)
+    covariance, shift = found.solution.covariance[places, places], found.shifts[row]
+    return bool(shift @ np.linalg.solve(covariance, shift) > PLAINLY**2)
 
 
 def _log_evidence(found: SelfCalibration, alone: int | None) -> float:
