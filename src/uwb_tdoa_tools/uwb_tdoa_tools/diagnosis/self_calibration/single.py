@@ -36,12 +36,14 @@ TRIED = 2  # anchors that explain the most once they are placed; each is then ca
 class Misfit:
     """How badly the filter explains Flights with some anchors.
 
-    flights, config : as of `self_calibrate`; scale : m, of an innovation that is explained.
+    flights, config : as of `self_calibrate`; scale : m, of an innovation that is explained; count :
+    innovations that each sum stands for, since a lost filter has fewer.
     """
 
     flights: Sequence[Flight]
     config: FilterConfig
     scale: float
+    count: int
 
     @classmethod
     def about(
@@ -49,7 +51,8 @@ class Misfit:
     ) -> Misfit:
         """Take the scale from the innovations with Anchors and an EffectSet."""
         innovations = _innovations(flights, config, anchors, effects)
-        return cls(flights, config, max(1.4826 * float(np.median(np.abs(innovations))), 1e-3))
+        scale = 1.4826 * float(np.median(np.abs(innovations))) if len(innovations) else 0.0
+        return cls(flights, config, max(scale, 1e-3), len(innovations))
 
     def of(self, anchors: Anchors, effects: EffectSet) -> float:
         """Return minus the logarithm of the likelihood of all innovations in the air (Student t).
@@ -58,7 +61,9 @@ class Misfit:
         how alike they are.
         """
         value = _innovations(self.flights, self.config, anchors, effects) / self.scale
-        return float(0.5 * (NU + 1.0) * np.sum(np.log1p(value**2 / NU)))
+        if not len(value):
+            return np.inf
+        return float(0.5 * (NU + 1.0) * self.count * np.mean(np.log1p(value**2 / NU)))
 
     def suspects(self, effects: EffectSet) -> list[int]:
         """Rows of the TRIED anchors that explain the most if they stand elsewhere, best first."""

@@ -261,7 +261,7 @@ def self_calibrate(
     if tape.unknown or many or not all(len(flight.tdoa) for flight in flights):
         return spread
     misfit = Misfit.about(flights, config, spread.surveyed, _in_model(spread))
-    found = {None: spread}
+    found: dict[int | None, SelfCalibration] = {None: spread}
     for row in misfit.suspects(base):
         progress()
         try:
@@ -420,7 +420,8 @@ def _with_rivals(
 
     likely : {row: logarithm of the evidence}. The covariance is that of all of them about the best.
     """
-    one, covariance, total = found[best], 0.0, 0.0
+    one, total = found[best], 0.0
+    covariance = np.zeros_like(one.solution.covariance)
     whole = {row: np.concatenate([found[row].shifts.ravel(), found[row].delays]) for row in likely}
     for row, value in likely.items():
         weight, off = np.exp(value - likely[best]), whole[row] - whole[best]
