@@ -38,7 +38,6 @@ Finds the residuals of every channel, traces them to effects that the model lack
 could be, adds what helps, and reports the error before and after on data that took no part in the fit.
 Writes diagnosis.json, effects.yaml (for evaluate, bias_node and ekf_node), ekf_node.yaml (the noise that the filter should
 assume with them; --config of evaluate) and report.html.
-
 Exit code: 0 done; 1 ids, signs or units are wrong and --no-truth or --reference marks is given; 2 bad input."""
 
 MOST = 300_000  # TDOAs; what they take: docs/speed.md
@@ -136,9 +135,8 @@ def _diagnose(args: Namespace) -> int:
     )
     config, effects = options.filter_of(args)
     reading = options.reading_of(args)
-    if args.reference in BLIND and not ids_are_right(
-        "diagnose", reading, args.flights, FlightEstimator(config, effects)
-    ):
+    judge = FlightEstimator(config, effects)
+    if args.reference in BLIND and not ids_are_right("diagnose", reading, args.flights, judge):
         return 1
     found = reading.find(args.flights)
     rerun = options.rerun_of(args, len(found), partial(cli.say, "diagnose"))
