@@ -75,6 +75,18 @@ def test_ground_truth_is_not_read_and_the_trajectory_is_that_of_evaluate_to_the_
     assert judged.read_bytes() == (tmp_path / "true" / "flight.tum").read_bytes()
 
 
+def test_evaluate_and_localize_state_the_same_nis(bags, tmp_path, capsys):
+    """They said 5.26 and 0.93 of one flight."""
+    recording = bags / "true" / "flight.bag"
+    run([recording, "--out", tmp_path, "--json", tmp_path / "localized.json"])
+    assert evaluate.main([str(recording), "--json", str(tmp_path / "judged.json")]) == 0
+    localized, judged = (
+        json.loads((tmp_path / f"{name}.json").read_text()) for name in ("localized", "judged")
+    )
+    (told,), (run_of_it,) = localized["flights"], judged["runs"]
+    assert run_of_it["nis_mean"] == pytest.approx(told["nis"], abs=1e-9)
+
+
 def test_what_is_written_says_the_same(bags, flight, tmp_path, capsys):
     run(
         [

@@ -16,8 +16,9 @@ from uwb_tdoa_ekf.results import concatenated, rows_of
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.checking.check import check
 from uwb_tdoa_tools.checking.recording import of_flight
-from uwb_tdoa_tools.commands import evaluate, survey
+from uwb_tdoa_tools.commands import calibrate, diagnose, evaluate, survey
 from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
+from uwb_tdoa_tools.diagnosis.self_calibration.solve import AnchorChange
 from uwb_tdoa_tools.estimate import FlightEstimator
 from uwb_tdoa_tools.localizing.assessment import GOOD, assess
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
@@ -75,6 +76,19 @@ def calibrated(sound):
     return EffectSet(
         (AnchorPosition(none["anchor_position"]), AnchorDelay(none["anchor_delay"])), known
     )
+
+
+def far_moved():
+    """(Flight, row of the anchor that was moved by half a metre, shift (3,) m), in a random room."""
+    config = SimulationConfig(seed=2, constellation="random-2-8", bias=False)
+    filled, room = config.complete()
+    anchors, row = filled.anchors, 6
+    positions = anchors.positions.copy()
+    shift = np.array([0.45, 0.1, 0.1])
+    positions[row] += shift
+    path = Trajectory(filled, room, np.random.default_rng([2, 1]))
+    flight = simulate(replace(config, anchors=anchors.at(positions)), path)
+    return replace(flight, anchors=anchors, truth=None), row, shift
 
 
 def from_the_middle_on(flight, other):
@@ -162,16 +176,18 @@ def test_a_run_that_diverges_is_no_success(sound, tmp_path, capsys):
     assert evaluate.main([str(tmp_path / "flight")]) == 1 and "DIVERGED" in capsys.readouterr().out
 
 
-def test_survey_asks_for_ids_before_anchors(exchanged, tmp_path, capsys):
-    """It moved a third anchor by 58, 56 and 91 cm."""
+@pytest.mark.parametrize(
+    ("command", "options"),
+    [(survey, ()), (calibrate, ("--no-truth",)), (diagnose, ("--no-truth",))],
+)
+def test_ids_are_asked_for_before_anchors(exchanged, tmp_path, capsys, command, options):
+    """`survey` moved a third anchor by 58, 56 and 91 cm."""
     write_bag(exchanged, tmp_path / "flight")
-    assert survey.main([str(tmp_path / "flight"), "--out", str(tmp_path / "surveyed")]) == 1
-    out, err = capsys.readouterr()
-    assert (
-        "swapped" in out
-        and "ids, signs and units first" in err
-        and not (tmp_path / "surveyed" / "anchors.yaml").exists()
-    )
+    out = tmp_path / "out"
+    assert command.main([str(tmp_path / "flight"), *options, "--out", str(out)]) == 1
+    said = capsys.readouterr()
+    assert "swapped" in said.out and "stopped, and nothing" in said.err
+    assert not (out / "anchors.yaml").exists() and not (out / "effects.yaml").exists()
 
 
 def test_one_moved_anchor_is_found_as_such_without_ground_truth(moved):
@@ -183,6 +199,31 @@ def test_one_moved_anchor_is_found_as_such_without_ground_truth(moved):
     assert (
         np.abs(np.delete(found.shifts, ROW, axis=0)) < np.delete(found.position_std, ROW, axis=0)
     ).all()
+
+
+def test_one_that_the_filter_rejects_is_placed_by_all_of_its_tdoas():
+    """Rejected TDOAs were not in the equations: nothing was named, and 0.4 m were left."""
+    flight, row, shift = far_moved()
+    found = self_calibrate([flight], Tape(std=0.05))
+    (change,) = found.changes
+    assert change.anchor == str(flight.anchors.ids[row]) and not change.others
+    off, std = found.shifts[row] - shift, found.position_std[row]
+    stated = np.linalg.norm(std)
+    assert np.linalg.norm(off) < max(0.08, stated) and (np.abs(off) < 3.0 * std).all()
+    assert ("The flights determine its place" in change.as_text()) == (stated > 0.08)
+    assert found.left < 0.5 * found.before
+
+
+def test_a_sound_flight_has_no_moved_anchor(sound):
+    assert not self_calibrate([replace(sound, truth=None)], Tape(std=0.05)).changes
+
+
+def test_a_place_that_is_hardly_determined_is_stated_as_such():
+    sure = AnchorChange("anchor_position", "3", np.full(3, 0.4), np.full(3, 0.02))
+    assert sure.as_text().endswith("cm (x, y, z)")
+    unsure = replace(sure, std=np.full(3, 0.1), others=("5",))
+    assert ", or anchor 5 has moved instead" in unsure.as_text()
+    assert "The flights determine its place to 17 cm only" in unsure.as_text()
 
 
 def test_nothing_is_said_to_be_untold_of_an_anchor_that_has_moved(moved):

@@ -12,11 +12,13 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.files import write_text
 
 from .. import cli, command_lines, options, parallel
+from ..checking.before_anchors import ids_are_right
 from ..checking.remarks import remarks_on
 from ..diagnosis import diagnose, output
 from ..diagnosis.noise import write_parameters
 from ..diagnosis.references import REFERENCES
 from ..diagnosis.self_calibration.equations import measured_noise
+from ..estimate import FlightEstimator
 from ..localizing.pictures import write_diagnosis
 from ..outputs import OutputFolder
 from ..progress import Progress
@@ -33,10 +35,12 @@ DESCRIPTION = """Find out what is wrong with the measurements of some flights, a
 Finds the residuals of every channel, traces them to effects that the model lacks, says how sure it is and what else it
 could be, adds what helps, and reports the error before and after on data that took no part in the fit.
 Writes diagnosis.json, effects.yaml (for evaluate, bias_node and ekf_node), ekf_node.yaml (the noise that the filter should
-assume with them; --config of evaluate) and report.html."""
+assume with them; --config of evaluate) and report.html.
+Exit code: 0 done; 1 ids, signs or units are wrong and --no-truth or --reference marks is given; 2 bad input."""
 
 MOST = 300_000  # TDOAs; what they take: docs/speed.md
 FEW = 20  # flights; what fewer gain by other processes, these take to start (docs/speed.md)
+BLIND = "nothing", "marks"  # references of which no path shows that ids are wrong
 UNUSED = {  # by references, of the options of what is known
     "truth": ("marks", "distances", "odometry"),
     "heights": ("marks", "distances", "odometry"),
@@ -122,13 +126,16 @@ def parser() -> ArgumentParser:
     return made
 
 
-def _diagnose(args: Namespace) -> None:
+def _diagnose(args: Namespace) -> int:
     out = args.out
     options.refuse(
         args, UNUSED[args.reference], f"no part of it is used with --reference {args.reference}"
     )
     config, effects = options.filter_of(args)
     reading = options.reading_of(args)
+    judge = FlightEstimator(config, effects)
+    if args.reference in BLIND and not ids_are_right("diagnose", reading, args.flights, judge):
+        return 1
     found = reading.find(args.flights)
     rerun = options.rerun_of(args, len(found), partial(cli.say, "diagnose"))
     jobs, dask = parallel.asked(args, len(found), FEW)
@@ -186,6 +193,7 @@ def _diagnose(args: Namespace) -> None:
         "wrote diagnosis.json, effects.yaml, "
         f"{'ekf_node.yaml ' if tdoa_std is not None else ''}and report.html to {out}"
     )
+    return 0
 
 
 main = cli.executable(_diagnose, parser)

@@ -9,10 +9,7 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.files import write_text
 
 from .. import cli, command_lines, options
-from ..checking import report
-from ..checking.check import check
-from ..checking.recording import read_recording
-from ..checking.watch import EXCHANGED, FIRST
+from ..checking.before_anchors import ids_are_right
 from ..diagnosis.noise import write_parameters
 from ..diagnosis.self_calibration import self_calibrate
 from ..estimate import FlightEstimator
@@ -22,9 +19,6 @@ from ..surveying.report import as_dict, as_text, picture, with_blocked
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
-    from collections.abc import Sequence
-
-    from ..readers.inputs import Reading
 
 DESCRIPTION = """Make a tape-measured survey better, from flights alone.
 
@@ -89,16 +83,9 @@ def _survey(args: Namespace) -> int:
     config, effects = options.filter_of(args)
     base, tape = effects or EffectSet(), options.tape_of(args, effects)
     reading = options.reading_of(args)
-    if not args.unknown and not _ids_are_right(
-        reading, args.flights, FlightEstimator(config, base)
+    if not args.unknown and not ids_are_right(
+        "survey", reading, args.flights, FlightEstimator(config, base)
     ):
-        cli.say(
-            "survey",
-            (
-                "stopped, and nothing is written: ids, signs and units first, as said above; then "
-                "anchors."
-            ),
-        )
         return 1
     flights = reading.flights(args.flights)
     known = options.known_of(args, flights)
@@ -128,20 +115,6 @@ def _survey(args: Namespace) -> int:
             f"{command_lines.judging(args.flights, *files, all(flight.truth is not None for flight in flights))}"
         )
     return 0 if result.why_not is None else 1
-
-
-def _ids_are_right(reading: Reading, paths: Sequence[str], estimator: FlightEstimator) -> bool:
-    """Whether `check` finds none of the mistakes in recordings that look like anchors elsewhere;
-    says which it finds.
-    """
-    found = []
-    with Progress("survey") as progress:
-        for path, survey in progress.over(reading.find(paths), "checking recordings"):
-            findings = check(read_recording(reading, path, survey), (), estimator).findings
-            found += [finding for finding in findings if finding.rule in (*FIRST, EXCHANGED)]
-    for finding in found:
-        cli.show(*report.lines(finding))
-    return not found
 
 
 main = cli.executable(_survey, parser)

@@ -76,6 +76,7 @@ def as_dict(found: SelfCalibration) -> dict[str, Any]:
                 "values": one.values.tolist(),
                 "std": one.std.tolist(),
                 "or": list(one.rivals),
+                "or_anchors": list(one.others),
             }
             for one in found.changes
         ],

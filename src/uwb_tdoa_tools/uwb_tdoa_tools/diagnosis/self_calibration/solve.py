@@ -5,6 +5,7 @@ may be used.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,13 +14,14 @@ from uwb_tdoa_bias.effects import AnchorDelay, Covariance, EffectSet
 from uwb_tdoa_bias.effects.anchor import AnchorPosition
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.evidence import DELAY, POSITION, eliminated, keys_of
+from uwb_tdoa_ekf.evidence import DELAY, ODDS, POSITION, eliminated, keys_of
 
 from ...checking.known_path import MANY
 from ..over_flights import Share
 from .equations import SYSTEMATIC, Runs
 from .placing import PLACED_STD, place
-from .prior import TAG_DELAY, Prior, solve, to_keep, with_calibration
+from .prior import ANYWHERE, TAG_DELAY, Prior, solve, to_keep, with_calibration
+from .single import Misfit
 from .tape import Tape
 
 if TYPE_CHECKING:
@@ -42,13 +44,16 @@ LEFT = 0.055  # m that may be left of slow innovations
 # slow innovations as given over those that are left, beyond which the tape was worse than what else
 # is wrong
 CLEARLY = 2.6
+PLAINLY = 5.0  # standard deviations that an anchor must be off by to be tried as the only one
+WELL_PLACED = 0.08  # m, 3D standard deviation of a moved anchor that leaves nothing to do
 NEARER = 0.75  # share of marks, each left out once, at which the estimate must come nearer
 
 
 @dataclass(frozen=True, eq=False)
 class AnchorChange:
     """What is not as the last calibration had it: effect : name; anchor : id; values, std : (m,) m,
-    by how much; rivals : names of effects that the flights cannot tell from it.
+    by how much; rivals : names of effects that the flights cannot tell from it; others : ids of
+    anchors, one of which may have moved instead.
     """
 
     effect: str
@@ -56,6 +61,7 @@ class AnchorChange:
     values: np.ndarray
     std: np.ndarray
     rivals: tuple[str, ...] = ()
+    others: tuple[str, ...] = ()
 
     def as_text(self) -> str:
         """One sentence."""
@@ -63,12 +69,23 @@ class AnchorChange:
             f"{100 * value:+.1f} +- {100 * std:.1f}" for value, std in zip(self.values, self.std)
         )
         if self.effect == POSITION:
-            return (
-                f"anchor {self.anchor} has moved by {by} cm (x, y, z)"
-                + ", or is later than it was" * bool(self.rivals)
-            )
+            text = f"anchor {self.anchor} has moved by {by} cm (x, y, z)"
+            text += ", or is later than it was" * bool(self.rivals)
+            text += "".join(f", or anchor {other} has moved instead" for other in self.others)
+            return text + self._doubt
         return f"anchor {self.anchor} is later than it was by {by} cm" + ", or has moved" * bool(
             self.rivals
+        )
+
+    @property
+    def _doubt(self) -> str:
+        """What to do where the flights hardly determine the place of the anchor."""
+        off = float(np.linalg.norm(self.std))
+        if off <= WELL_PLACED and not self.others:
+            return ""
+        return (
+            f". The flights determine its place to {100 * off:.0f} cm only: fly on all sides of "
+            "it, high and low, or measure it again"
         )
 
 
@@ -91,6 +108,7 @@ class SelfCalibration:
     grounded : how many marks were left out, because they are on the floor: estimates there are
         metres off and do not know it;
     shares : {name of an effect: (Share, ...)}, how much of it each flight shows;
+    inflation : as of Equations;
     blocked : sentences on what makes anchors late somewhere, once somebody has looked
         (`surveying/blocked.py`).
     """
@@ -110,6 +128,7 @@ class SelfCalibration:
     marks: tuple[float, float, float] | None
     grounded: int
     shares: dict[str, tuple[Share, ...]]
+    inflation: float = 1.0
     blocked: tuple[str, ...] = ()
 
     @property
@@ -222,15 +241,47 @@ def self_calibrate(
         where there is one, not the
     Tape; config : FilterConfig; constraints : what else is known (`diagnosis/constraints`);
     map_function : as of `attribution.attribute`. The frame is that of the coordinates with the
-    smallest std. Raises InputError for flights of different anchors or that are too short, and for
-    a Tape that does not fit.
+    smallest std. Each anchor is tried as the only one that has moved, as `Tape.unknown` has it,
+    before its error is spread. Raises InputError for flights of different anchors or that are too
+    short, and for a Tape that does not fit.
     """
     same_anchors(flights)
-    given, config, names = (
-        flights[0].anchors,
-        config or FilterConfig(),
-        tuple(flight.name for flight in flights),
+    config = config or FilterConfig()
+    calibrated = partial(
+        _calibrated,
+        flights,
+        base=base,
+        config=config,
+        constraints=constraints,
+        progress=progress,
+        map_function=map_function,
     )
+    spread = calibrated(tape)
+    many = len(flights[0].anchors) > MANY
+    if tape.unknown or many or not all(len(flight.tdoa) for flight in flights):
+        return spread
+    misfit = Misfit.about(flights, config, spread.surveyed, _in_model(spread))
+    found: dict[int | None, SelfCalibration] = {None: spread}
+    for row in misfit.suspects(base):
+        progress()
+        try:
+            found[row] = _alone(spread, calibrated(replace(tape, unknown=(spread.prior.ids[row],))))
+        except InputError:  # too few TDOAs tell of it, or too few anchors are left
+            continue
+    return _most_probable(found, misfit)
+
+
+def _calibrated(
+    flights: Sequence[Flight],
+    tape: Tape,
+    base: EffectSet,
+    config: FilterConfig,
+    constraints: Sequence[Constraint],
+    progress: Callable[[], object],
+    map_function: MapFunction,
+) -> SelfCalibration:
+    """Return the SelfCalibration with one solution, about the anchors that a Tape speaks of."""
+    given, names = flights[0].anchors, tuple(flight.name for flight in flights)
     std, rows, tdoas = (
         tape.position_std(given),
         tape.unknown_rows(given),
@@ -298,7 +349,90 @@ def self_calibrate(
         _left_out(first, prior),
         runs.grounded,
         shares,
+        last.inflation,
     )
+
+
+def _in_model(found: SelfCalibration) -> EffectSet:
+    """Return the EffectSet to use with the surveyed anchors, whether they are used or not."""
+    return with_calibration(found.base, found.found(np.zeros_like(found.shifts)), None)
+
+
+def _alone(spread: SelfCalibration, found: SelfCalibration) -> SelfCalibration:
+    """Return the SelfCalibration of one unknown anchor as one of a tape that knew it."""
+    return replace(
+        found, given=spread.given, prior=spread.prior, before=spread.before, base=spread.base
+    )
+
+
+def _most_probable(found: dict[int | None, SelfCalibration], misfit: Misfit) -> SelfCalibration:
+    """Return the most probable of several SelfCalibrations.
+
+    found : {row of the anchor that was tried alone, None of none: SelfCalibration}. One anchor
+        alone must be ODDS times as probable as the error spread over all, and must stand plainly
+        elsewhere.
+    """
+    alike = SYSTEMATIC * max(1.0, min(one.inflation for one in found.values()))
+    evidence = {
+        row: _log_evidence(one, row) - misfit.of(one.surveyed, _in_model(one)) / alike
+        for row, one in found.items()
+        if row is None or _stands_elsewhere(one, row)
+    }
+    best = max(evidence, key=evidence.__getitem__)
+    doubt = evidence[best] - np.log(ODDS)
+    if best is None or evidence[None] > doubt:
+        return found[None]
+    likely = {row: value for row, value in evidence.items() if row is not None and value > doubt}
+    return _with_rivals(found, best, likely)
+
+
+def _stands_elsewhere(found: SelfCalibration, row: int) -> bool:
+    """Whether a SelfCalibration puts an anchor plainly elsewhere than it was given."""
+    places = slice(3 * row, 3 * row + 3)
+    covariance, shift = found.solution.covariance[places, places], found.shifts[row]
+    return bool(shift @ np.linalg.solve(covariance, shift) > PLAINLY**2)
+
+
+def _log_evidence(found: SelfCalibration, alone: int | None) -> float:
+    """Return the logarithm of the evidence of a SelfCalibration beside the likelihood (Laplace).
+
+    alone : row of the anchor of which nothing was known.
+    """
+    prior = found.prior.covariance
+    if not found.prior.known.any():
+        prior = found.prior.with_delays(found.solution.delay_std)
+    prior = prior.copy()
+    free = {alone} if alone is not None else set()
+    free |= {found.prior.ids.index(one.anchor) for one in found.changes if one.effect == POSITION}
+    for row in free:
+        places = slice(3 * row, 3 * row + 3)
+        prior[places], prior[:, places] = 0.0, 0.0
+        prior[places, places] = ANYWHERE**2 * np.eye(3)
+    offset = np.concatenate([found.shifts.ravel(), found.delays])
+    volumes = [np.linalg.slogdet(one)[1] for one in (found.solution.covariance, prior)]
+    return float(0.5 * (volumes[0] - volumes[1] - offset @ np.linalg.solve(prior, offset)))
+
+
+def _with_rivals(
+    found: dict[int | None, SelfCalibration], best: int, likely: dict[int, float]
+) -> SelfCalibration:
+    """Return the best of several SelfCalibrations, with what the others leave open.
+
+    likely : {row: logarithm of the evidence}. The covariance is that of all of them about the best.
+    """
+    one, total = found[best], 0.0
+    covariance = np.zeros_like(one.solution.covariance)
+    whole = {row: np.concatenate([found[row].shifts.ravel(), found[row].delays]) for row in likely}
+    for row, value in likely.items():
+        weight, off = np.exp(value - likely[best]), whole[row] - whole[best]
+        covariance = covariance + weight * (found[row].solution.covariance + np.outer(off, off))
+        total += weight
+    solution = replace(one.solution, covariance=covariance / total)
+    places = slice(3 * best, 3 * best + 3)
+    others = tuple(one.prior.ids[row] for row in likely if row != best)
+    std = np.sqrt(np.diag(solution.covariance))[places]
+    change = AnchorChange(POSITION, one.prior.ids[best], one.shifts[best], std, (), others)
+    return replace(one, solution=solution, changes=(change, *one.changes))
 
 
 def same_anchors(flights: Sequence[Flight]) -> None:
