@@ -16,7 +16,7 @@ import numpy as np
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from ...estimate import FlightEstimator
-from ...scoring.metrics import reached
+from ...scoring.metrics import has_innovation
 from ...scoring.phases import AIRBORNE
 from ..regression.fit import NU
 from .placing import place
@@ -88,5 +88,5 @@ def _innovations(
         if not len(odometry):
             continue
         height = np.interp(t, odometry.t, odometry.p[:, 2])
-        out.append(run.residuals.innovation[reached(run.residuals) & (height > AIRBORNE)])
+        out.append(run.residuals.innovation[has_innovation(run.residuals) & (height > AIRBORNE)])
     return np.concatenate(out) if out else np.zeros(0)
