@@ -37,7 +37,7 @@ SETTLED, LANDING = 8.0, 5.0  # s after the start, and before the end, that are n
 TAPE = 0.05  # m
 STEP = 0.5  # s between two looks at what is said live
 _NAMED = re.compile(
-    r"two anchors are exchanged, \d+ and \d+|anchor \d+(?=: | is not where| does not stand| "
+    r"two anchors are exchanged, \d+ and \d+|anchor \d+(?=: | is not where| is not at| does not stand| "
     r"is later)|the ids of two"
 )
 
