@@ -39,7 +39,7 @@ TAPE = 0.05  # m
 NEAR = 0.08  # m, 3D, within which a moved anchor shall be found
 STEP = 0.5  # s between two looks at what is said live
 _NAMED = re.compile(
-    r"two anchors are exchanged, \d+ and \d+|anchor \d+(?=: | is not where| does not stand| "
+    r"two anchors are exchanged, \d+ and \d+|anchor \d+(?=: | is not where| is not at| does not stand| "
     r"is later)|the ids of two"
 )
 
