@@ -5,21 +5,21 @@ of numerical derivatives. It shares the noise model and the definitions with `pl
 Then `plan` runs as a user would run it, and once more with the anchor that it proposes.
 """
 
-import contextlib
 from dataclasses import dataclass
 from functools import partial
-import io
 import json
 from pathlib import Path
+import subprocess
+import sys
 import tempfile
 
 import numpy as np
 from scipy.optimize import least_squares
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.foundation.errors import Failure
 from uwb_tdoa_bias.foundation.files import write_text
 from uwb_tdoa_tools import parallel
-from uwb_tdoa_tools.commands import plan
 from uwb_tdoa_tools.outputs import OutputFile
 from uwb_tdoa_tools.parallel import whole_number
 from uwb_tdoa_tools.planning.hall import Hall
@@ -278,7 +278,8 @@ def _plan(one, anchors, folder):
         (x, y), path = one.wall, folder / "walls.yaml"
         write_text(path, f"walls: [[{x}, 0.0, {x}, {y}]]\n")
         words += ["--radio-reach", one.reach, "--walls", path]
-    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-        code = plan.main([str(word) for word in words])
-    assert code == 0, words
+    command = [sys.executable, "-m", "uwb_tdoa_tools.commands.plan", *map(str, words)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        raise Failure(f"plan: ended with code {done.returncode}: {done.stderr}")
     return json.loads((folder / "plan" / "plan.json").read_text())

@@ -105,7 +105,7 @@ def plot_set_up(found, maps, path):
             xlabel="x, m",
             ylabel="y, m",
             aspect="equal",
-            xlim=(-3.3, 3.3),
+            xlim=(-3.7, 3.7),
             ylim=(-2.6, 2.6),
         )
         ax.set_title(f"{title}: {100 * size:.1f} cm", fontsize=10)

@@ -37,10 +37,10 @@ def test_a_wall_hides_anchors_behind_it():
         np.array([[1.0, 1.0, 1.0], [9.0, 1.0, 1.0], [9.0, 9.0, 1.0], [1.0, 9.0, 1.0]]),
         FixedNoise(0.1),
         False,
-        10.0,
+        20.0,
         (5.0, 5.0),
     )
-    assert one.heard(np.array([2.0, 2.0, 1.0])).tolist() == [0, 2, 3]
+    assert one.heard(np.array([2.0, 2.5, 1.0])).tolist() == [0, 2, 3]
     assert one.heard(np.array([2.0, 9.0, 1.0])).tolist() == [0, 1, 2, 3]
 
 

@@ -86,7 +86,7 @@ def test_the_legend_states_the_share_of_each_state_that_there_is(found, figures)
 
 
 def test_anchors_a_little_beyond_a_map_are_inside_the_picture(figures):
-    anchors, near = corners(), corners().positions[:, :2] + [0.5, -0.5]
+    anchors, near = corners(), corners().positions[:, :2] + [0.2, -0.2]
     moved = anchors.at(np.column_stack([near, anchors.positions[:, 2]]))
     low, high = anchors.positions.min(axis=0), anchors.positions.max(axis=0)
     found = chart(Installation(anchors), Grid.box(low, high, 0.5), Demand())

@@ -10,7 +10,7 @@ from scipy.ndimage import median_filter
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.geometry import tdoa
-from uwb_tdoa_tools.planning import precision
+from uwb_tdoa_tools.planning import maps
 from uwb_tdoa_tools.planning.installation import (
     PAIRINGS,
     FixedNoise,
@@ -22,19 +22,21 @@ from uwb_tdoa_tools.planning.installation import (
     every_range,
     ring,
 )
-from uwb_tdoa_tools.planning.maps import Grid
-from uwb_tdoa_tools.planning.precision import (
+from uwb_tdoa_tools.planning.maps import (
     FEWEST,
-    NORMAL_99,
     ErrorSamples,
+    Grid,
     accuracy_map,
-    bound,
     comparison,
+    error_samples,
+    pooled,
+)
+from uwb_tdoa_tools.planning.precision import (
+    NORMAL_99,
+    bound,
     dilution,
     ellipses,
-    error_samples,
     information,
-    pooled,
     position_error,
     range_weights,
     weigh,
@@ -495,7 +497,7 @@ def test_a_static_grid_is_mapped_place_by_place():
         for place in places
     ]
     grid = Grid.slice((-2, 2), (-2, 2), 1.2, 0.5)
-    found = precision.accuracy_map(precision.pooled(flights), INSTALLATION, grid)
+    found = maps.accuracy_map(maps.pooled(flights), INSTALLATION, grid)
     known = np.isfinite(found.rmse[:, 0])
     centres = grid.points[known]
     for place in places:

@@ -34,8 +34,7 @@ if TYPE_CHECKING:
     from ..simulation.rooms import Walls
     from .installation import Installation
     from .layout import AnchorPlaces
-    from .maps import Chart, Grid
-    from .precision import AccuracyMap
+    from .maps import AccuracyMap, Chart, Grid
 
 WIDTH, DPI = 7.0, 100  # inches, pixels an inch
 STATES = {  # of a cell: what it is called, and its colour

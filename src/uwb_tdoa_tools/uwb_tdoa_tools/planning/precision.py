@@ -1,30 +1,21 @@
-"""Compute how precise a position can be, and how precise measured flights were.
+"""Compute how precise a position can be.
 
-The first part computes Fisher information, the Cramer-Rao bound, dilution of precision and
-ellipses. The second part compares errors of flights with the bound at the same places.
+Fisher information, the Cramer-Rao bound, dilution of precision and ellipses.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.flight import AIDS
 from uwb_tdoa_bias.foundation.geometry import ranges
 
-from ..scoring.evaluation import evaluate
-from ..scoring.metrics import position_at
 from .installation import FixedNoise, variance_gradient
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from uwb_tdoa_bias.foundation.flight import Flight
-
     from .installation import Installation, Pairing
-    from .maps import Grid
 
 # standard deviations of a normal variable that hold 99 %, as rounded in Grasso et al., sec. 2.2.3
 NORMAL_99 = 2.58
@@ -213,124 +204,3 @@ def ellipses(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     values, vectors = np.linalg.eigh(covariance[:, :2, :2])
     axes = np.sqrt(-2.0 * np.log(1.0 - 0.99) * values[:, ::-1])
     return axes, np.arctan2(vectors[:, 1, 1], vectors[:, 0, 1])
-
-
-FEWEST = 20  # estimates; a cell with fewer has no figures
-
-
-@dataclass(frozen=True)
-class ErrorSamples:
-    """Estimates against ground truth.
-
-    t : (n,) s; place : (n, 3) m, true; error : (n, 3) m; covariance : (n, 3, 3) m^2, stated by the
-    filter.
-    """
-
-    t: np.ndarray
-    place: np.ndarray
-    error: np.ndarray
-    covariance: np.ndarray
-
-
-def error_samples(flight: Flight, aids: Iterable[str] = ()) -> ErrorSamples:
-    """Return the ErrorSamples of a Flight with ground truth. Raises InputError.
-
-    The filter uses TDOAs, IMU and `aids` (names of AIDS) alone.
-    """
-    assert flight.truth is not None
-    score, _ = evaluate(flight.without(*(name for name in AIDS if name not in aids)))
-    return ErrorSamples(score.t, position_at(score.t, flight.truth), score.error, score.covariance)
-
-
-def pooled(samples: Sequence[ErrorSamples]) -> ErrorSamples:
-    """Return one ErrorSamples of several, with their times moved apart."""
-    apart = max(s.t[-1] for s in samples) + 10.0
-    times = np.concatenate([s.t + k * apart for k, s in enumerate(samples)])
-    return ErrorSamples(
-        times,
-        *(
-            np.concatenate([getattr(s, name) for s in samples])
-            for name in ("place", "error", "covariance")
-        ),
-    )
-
-
-@dataclass(frozen=True)
-class AccuracyMap:
-    """Errors per cell of a grid; NaN in cells with fewer than FEWEST estimates.
-
-    count : (n,); bias, rmse : (n, 3) m, along x, y, z; bound, claimed : (n, 3) m, roots of the mean
-    variances of the bound of one round and of the filter at the same places.
-    """
-
-    grid: Grid
-    count: np.ndarray
-    bias: np.ndarray
-    rmse: np.ndarray
-    bound: np.ndarray
-    claimed: np.ndarray
-
-
-def accuracy_map(samples: ErrorSamples, installation: Installation, grid: Grid) -> AccuracyMap:
-    """Return the AccuracyMap of ErrorSamples. Estimates outside of the grid are left out."""
-    variances = np.diagonal(bound_along(samples, installation), axis1=1, axis2=2)
-    claimed = np.diagonal(samples.covariance, axis1=1, axis2=2)
-    cell = np.floor((samples.place - grid.lower) / grid.step).astype(int)
-    inside = ((cell >= 0) & (cell < grid.shape)).all(axis=1)
-    index = np.ravel_multi_index(cell[inside].T, grid.shape)
-    size = int(np.prod(grid.shape))
-    count = np.bincount(index, minlength=size)
-
-    def mean(values: np.ndarray) -> np.ndarray:
-        sums = np.stack([np.bincount(index, column, size) for column in values[inside].T], axis=1)
-        return np.where(count[:, None] >= FEWEST, sums / np.maximum(count, 1)[:, None], np.nan)
-
-    return AccuracyMap(
-        grid,
-        count,
-        mean(samples.error),
-        *(np.sqrt(mean(v)) for v in (samples.error**2, variances, claimed)),
-    )
-
-
-def bound_along(samples: ErrorSamples, installation: Installation) -> np.ndarray:
-    """Return the bound of one round at the place of each sample: (n, 3, 3) m^2.
-
-    The installation must have three dimensions.
-    """
-    return bound(information(samples.place, installation))
-
-
-def comparison(samples: ErrorSamples, installation: Installation) -> dict[str, Any]:
-    """Return achieved and stated errors against the bound, over all samples: m and ratios.
-
-    rmse, bound, claimed : roots of the mean squares of the 3D error, of the bound of one round, and
-        of the filter's standard deviation
-    scatter : rmse without the mean error within each second; the bound limits this part
-    achieved_over_bound, scatter_over_bound : ratios
-    efficiency_claimed : variance of the bound over that of the filter
-    efficiency_achieved : variance of the bound over the mean squared error
-
-    The filter uses many rounds and the IMU. An efficiency of n means: as good as n rounds with
-    independent errors.
-    """
-    limit = np.trace(bound_along(samples, installation), axis1=1, axis2=2).mean()
-    claim = np.trace(samples.covariance, axis1=1, axis2=2).mean()
-    squared = np.mean(np.sum(samples.error**2, axis=1))
-    second = np.unique(np.floor(samples.t).astype(np.int64), return_inverse=True)[1]
-    means = (
-        np.stack([np.bincount(second, e) for e in samples.error.T], axis=1)
-        / np.bincount(second)[:, None]
-    )
-    scatter = np.mean(np.sum((samples.error - means[second]) ** 2, axis=1))
-    return {
-        "samples": len(samples.t),
-        "rmse": float(np.sqrt(squared)),
-        "scatter": float(np.sqrt(scatter)),
-        "claimed": float(np.sqrt(claim)),
-        "bound": float(np.sqrt(limit)),
-        "achieved_over_bound": float(np.sqrt(squared / limit)),
-        "scatter_over_bound": float(np.sqrt(scatter / limit)),
-        "efficiency_claimed": float(limit / claim),
-        "efficiency_achieved": float(limit / squared),
-    }

@@ -237,7 +237,7 @@ def print_check(found: dict[str, Any]) -> None:
 
 
 def print_flights(rows: Sequence[dict[str, Any]]) -> None:
-    """Print the rows of `precision.comparison`, each with its "flight"."""
+    """Print the rows of `maps.comparison`, each with its "flight"."""
     print(
         "3D, root mean square, m; efficiency: variance of the bound of one round over that of "
         "the estimate"

@@ -16,7 +16,7 @@ from .. import cli, parallel
 from ..progress import Progress
 from ..readers.inputs import Reading
 from ..simulation.rooms import Room, Walls, room_of
-from . import hall, optimisation, plots, precision, report
+from . import hall, maps, optimisation, plots, report
 from .installation import (
     OF_PROTOCOL,
     PAIRINGS,
@@ -457,7 +457,7 @@ class FlightErrors:
     reading: Reading
     aids: tuple[str, ...] = ()
 
-    def __call__(self, recording: Recording) -> tuple[str, precision.ErrorSamples]:
+    def __call__(self, recording: Recording) -> tuple[str, maps.ErrorSamples]:
         """Return (name, ErrorSamples) of a recording (path, survey). Raises InputError."""
         flight = self.reading.read(recording)
         for name in self.aids:
@@ -465,11 +465,11 @@ class FlightErrors:
                 raise InputError(
                     f"{flight.name}: holds no {name}; leave out --with {name}, or this flight."
                 )
-        return flight.name, precision.error_samples(flight, self.aids)
+        return flight.name, maps.error_samples(flight, self.aids)
 
 
 def evaluate_flights(
-    flown: Iterable[tuple[str, precision.ErrorSamples]],
+    flown: Iterable[tuple[str, maps.ErrorSamples]],
     installation: Installation,
     room: Room,
     step: float,
@@ -482,10 +482,10 @@ def evaluate_flights(
     samples, rows = [], []
     for name, one in flown:
         samples.append(one)
-        rows.append({"flight": name, **precision.comparison(one, installation)})
-    pooled = precision.pooled(samples)
-    rows.append({"flight": f"{len(samples)} pooled", **precision.comparison(pooled, installation)})
-    found = precision.accuracy_map(pooled, installation, Grid.box(room.lower, room.upper, step))
+        rows.append({"flight": name, **maps.comparison(one, installation)})
+    pooled = maps.pooled(samples)
+    rows.append({"flight": f"{len(samples)} pooled", **maps.comparison(pooled, installation)})
+    found = maps.accuracy_map(pooled, installation, Grid.box(room.lower, room.upper, step))
     plots.plot_accuracy(installation, found, out / "accuracy.png")
     return rows
 
