@@ -26,6 +26,7 @@ from studies.diagnosis import figures
 from studies.diagnosis import ranges as diagnosed_ranges
 from studies.faults import figures as faults
 from studies.faults import flown
+from studies.rules import figures as rules
 from studies.training import compare, default, spin, splits
 from uwb_tdoa_tools import cli
 
@@ -52,6 +53,7 @@ STUDIES = {
     "ranges": ranges,
     "recalibrating": recalibrating,
     "rover": rover,
+    "rules": rules,
     "scale": scale,
     "situations": situations,
     "spin": spin,
@@ -82,6 +84,7 @@ of measured flights: flights/, util/, surveys/.
   ranges           simulated distances to anchors against the bound of plan (docs/sensors.md)
   recalibrating    surveys that start from the last one, after something changed (docs/calibration.md)
   rover            a simulated rover on wheels, and what diagnose finds on it (docs/rover.md)
+  rules            rules and constants of the filter, switched off or changed one at a time (docs/notebook/rules.md)
   scale            processor time and memory over flights, anchors and effects (docs/speed.md)
   situations       where a tag can be and what can happen to it, simulated (docs/reliability.md)
   spin             the error of a TDOA over the yaw of the tag (docs/bias.md)
@@ -134,6 +137,7 @@ def parser():
         "./dev study recalibrating --data DATA --only const1",
         "./dev study rover --seeds 20",
         "./dev study rover --diagnose 4",
+        "./dev study rules --data DATA --results rules.jsonl",
         "./dev study scale --out scale/",
         "./dev study situations --resume situations.jsonl",
         "./dev study spin --out spin.png",
