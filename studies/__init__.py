@@ -7,4 +7,5 @@ from pathlib import Path
 import sys
 
 # Flights, faults and mistakes with which the tests work, too.
-sys.path.append(str(Path(__file__).resolve().parents[1] / "src" / "uwb_tdoa_tools" / "test"))
+for package in ("uwb_tdoa_tools", "uwb_tdoa_ekf"):
+    sys.path.append(str(Path(__file__).resolve().parents[1] / "src" / package / "test"))

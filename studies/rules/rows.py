@@ -10,7 +10,10 @@ from pathlib import Path
 import pickle
 from typing import Any
 
+import halls
 import numpy as np
+import rovers
+from scipy.spatial.transform import Rotation
 
 from studies import ranges, rover, situations
 from studies.faults.flown import FAULTS as FLOWN
@@ -61,7 +64,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Row:
-    """One row of the study. group : "measured", "flown", "starts", "faults" or "aids"; needs : sensors
+    """One row of the study. group : "measured", "flown", "starts", "halls", "faults" or "aids"; needs : sensors
     without whose rules it changes nothing; screen : it is of the screen.
     """
 
@@ -138,8 +141,10 @@ class Inputs:
             *self._starts(),
             *self._faults(),
             *self._aids(),
+            *_halls(),
+            *_rovers(),
         ]
-        order = "starts", "faults", "flown", "measured", "aids"
+        order = "starts", "halls", "faults", "measured", "aids", "flown"
         return sorted(made, key=lambda row: (not row.screen, order.index(row.group)))
 
     def _measured(self) -> Iterator[Row]:
@@ -213,10 +218,23 @@ class Inputs:
                 yield Row(f"{name}, one TDOA in {share}", "starts", make, share == 40)
             yield Row(f"{name} from the air", "starts", partial(self._from_the_air, name), True)
             yield Row(f"{name}, wrong yaw", "starts", partial(self._wrong_yaw, name), True)
+        for seed in range(3):
+            for late in (False, True):
+                words = ", low anchors 3.2 m late" if late else ""
+                make = partial(_silent_lift_off, seed, late)
+                yield Row(f"lift-off in a silence{words}, seed {seed}", "starts", make)
+            make = partial(_landing_after, seed, "imu: in degrees/s")
+            yield Row(f"landing after a gyroscope in degrees/s, seed {seed}", "faults", make)
+            make = partial(_landing_after, seed, "imu: in g")
+            yield Row(f"landing after an accelerometer in g, seed {seed}", "faults", make)
         hall = partial(_simulated, constellation="hall", radio_reach=15.0, duration=30.0)
         yield Row("a hall", "starts", hall, True)
         yield Row("40 s without both", "starts", _long_gap, False)
+        yield Row("45 s without TDOAs", "starts", _long_silence, False)
         yield Row("the IMU comes after 8 s", "starts", _late_imu, True)
+        for turn, angles in TURNS.items():
+            make = partial(_late_imu, angles)
+            yield Row(f"the IMU comes after 8 s, {turn}", "faults", make, False)
 
     def _few(self, name: str, share: int) -> Case:
         case = self._recording(self._path(name))
@@ -264,8 +282,10 @@ class Inputs:
             if stream in SENSORS and "ahead" not in name:
                 make = partial(self._faulty_aid, stream, fault.change)
                 yield Row(f"fly, {name}", "aids", make, True, (stream,))
+        make = partial(self._at_fixed_height)
+        yield Row("flying, with a fixed height", "aids", make, False, ("plane",))
         for name, (streams, config, late) in rover.ROWS.items():
-            for seed in range(2):
+            for seed in range(SEEDS):
                 make = partial(_driven, seed, streams, config, late)
                 yield Row(
                     f"rover, {name}, seed {seed}", "aids", make, seed == 0, ("velocity", "plane")
@@ -275,6 +295,10 @@ class Inputs:
         for name in ranges.FAULTS:
             make = partial(_ranged, "both", name)
             yield Row(f"ranges {name}", "aids", make, False, ("range",))
+
+    def _at_fixed_height(self) -> Case:
+        case = self._recording(self._path("0426-traj1"))
+        return replace(case, config={"fixed_height_std": 0.02})
 
     def _faulty_aid(self, stream: str, change: Callable[[Any], Any]) -> Case:
         flight = _cut(self.flight_of("aids", FIRST_SEED), -math.inf, CUT)
@@ -352,20 +376,123 @@ def _simulated(**config: Any) -> Case:
     return Case(flight, phases(flight.truth))
 
 
+def _gap(streams: tuple[str, ...], begin: float, end: float, until: float) -> Case:
+    make = partial(situations._flying, until)
+    made = partial(situations._without, streams, begin, end, make)
+    return _situation(situations.Situation("", made, (max(begin, 2.0), until), end), 0)
+
+
 def _long_gap() -> Case:
-    make = partial(situations._flying, 65.0)
-    one = situations.Situation(
-        "", partial(situations._without, ("tdoa", "imu"), 15.0, 55.0, make), (15.0, 65.0), 55.0
-    )
-    return _situation(one, 0)
+    return _gap(("tdoa", "imu"), 15.0, 55.0, 65.0)
 
 
-def _late_imu() -> Case:
-    make = partial(situations._flying, 20.0)
-    one = situations.Situation(
-        "", partial(situations._without, ("imu",), -1.0, 8.0, make), (8.0, 20.0), 8.0
+def _long_silence() -> Case:
+    return _gap(("tdoa",), 15.0, 60.0, 70.0)
+
+
+def _silent_lift_off(seed: int, late: bool) -> Case:
+    """It lifts off at 4 s; no TDOAs from 3 to 8 s."""
+    make = partial(situations._low_late, situations._hop) if late else situations._hop
+    made = partial(situations._without, ("tdoa",), 3.0, 8.0, make)
+    return _situation(situations.Situation("", made, (4.0, 11.0), 8.0), seed)
+
+
+def _landing_after(seed: int, fault: str) -> Case:
+    """The inertial sensor is wrong from 6 to 13 s; the tag lands at 14 s."""
+    case = _situation(situations.Situation("", situations._hop, (11.0, 18.0), 14.0), seed)
+    imu = case.flight.imu
+    wrong = (imu.t >= 6.0) & (imu.t < 13.0)
+    changed = VALUES[fault](imu)
+    gyro = np.where(wrong[:, None], changed.gyro, imu.gyro)
+    accel = np.where(wrong[:, None], changed.accel, imu.accel)
+    return replace(case, flight=replace(case.flight, imu=replace(imu, gyro=gyro, accel=accel)))
+
+
+def _late_imu(turn: tuple[float, ...] = (0.0, 0.0, 0.0)) -> Case:
+    case = _gap(("imu",), -1.0, 8.0, 20.0)
+    imu = _turned(case.flight.imu, Rotation.from_rotvec(turn).as_matrix())
+    return replace(case, flight=replace(case.flight, imu=imu), spans={"judged": (8.0, 20.0)})
+
+
+TURNS = {"on its side": (1.5, 0.0, 0.0), "upside down": (2.7, 0.4, 1.0)}  # rotation vectors
+SEEDS = 6  # of what is short
+HALL = "100 x 60 m, 77 anchors"
+
+
+def _halls() -> Iterator[Row]:
+    for seed in range(SEEDS):
+        yield Row(f"{HALL}, seed {seed}", "halls", partial(_in_hall, HALL, seed, 20.0))
+        for blinks in (0.5, 2.0):
+            make = partial(_in_room, "corners", seed, 12.0, blinks=blinks, speed=1.0)
+            yield Row(f"{blinks:g} blinks a second, seed {seed}", "halls", make)
+        for rate in (2.0, 10.0):
+            make = partial(_in_room, "corners", seed, 20.0, rate=rate, speed=1.0)
+            yield Row(f"{rate:g} TDOAs a second, seed {seed}", "halls", make)
+        for room in ("ceiling, 4", "ceiling, 8", "wall, 8", "line, 5"):
+            make = partial(_in_room, room, seed, 12.0, speed=1.0)
+            yield Row(f"{room}, seed {seed}", "halls", make)
+    for seed in (3, 4, 15, 18):
+        for imu in (True, False):
+            make = partial(_in_hall, HALL, seed, 20.0, imu, dead=[(3.0, 16.3)])
+            words = "" if imu else ", no IMU"
+            yield Row(f"{HALL}, silent from 3 to 16.3 s, seed {seed}{words}", "halls", make)
+    for seed in range(2):
+        make = partial(_in_room, "corners", seed, 40.0, rate=5.0, dead=[(10.0, 25.0)])
+        yield Row(f"5 TDOAs a second, silent for 15 s, seed {seed}", "halls", make)
+    for seed in range(3):
+        for room in ("ceiling, 8", "wall, 8"):
+            make = partial(_in_room, room, seed, 25.0, speed=1.0, dead=[(6.0, 16.0)])
+            yield Row(f"{room}, silent for 10 s, seed {seed}", "halls", make)
+    make = partial(_in_hall, HALL, 0, 120.0, dead=[(90.0, 103.3)])
+    yield Row(f"{HALL}, silent after 90 s", "halls", make)
+    make = partial(_in_hall, "300 x 200 m, 294 anchors", 0, 20.0)
+    yield Row("300 x 200 m, 294 anchors", "halls", make)
+    make = partial(_in_hall, HALL, 0, 60.0, floors=2, lift=20.0)
+    yield Row(f"{HALL}, carried one floor up", "halls", make)
+
+
+def _in_hall(
+    name: str, seed: int, duration: float, imu: bool = True, floors: int = 1, **more: Any
+) -> Case:
+    return _walked(halls.hall(name, floors), seed, duration, imu, more)
+
+
+def _in_room(name: str, seed: int, duration: float, **more: Any) -> Case:
+    return _walked(halls.room(name), seed, duration, True, more)
+
+
+def _walked(where: Any, seed: int, duration: float, imu: bool, more: dict[str, Any]) -> Case:
+    flight = halls.fly(where, seed, duration, **more)
+    ends = [end for _, end in more.get("dead", [])]
+    if "lift" in more:
+        ends.append(more["lift"] + 10.0)
+    spans = {"all": (0.0, duration)}
+    if ends:
+        spans |= {"after": (ends[-1], duration)}
+    over = ends[-1] if ends else 0.0
+    return Case(flight, spans, over, {} if imu else {"use_imu": False})
+
+
+def _rovers() -> Iterator[Row]:
+    needs = "velocity", "plane"
+    for seed, late in ((3, (0, 4)), (5, (4, 3)), (2, (1, 4))):
+        for imu in (True, False):
+            make = partial(_contradicted, seed, late, imu)
+            words = "wheels, IMU" if imu else "wheels alone"
+            yield Row(f"rover, {words}, two late, seed {seed}", "aids", make, False, needs)
+    yield Row(
+        "rover, wheels, then alone", "aids", partial(_contradicted, 1, (), False), False, needs
     )
-    return _situation(one, 0)
+
+
+def _contradicted(seed: int, late: tuple[int, ...], imu: bool) -> Case:
+    flight = rovers.drive(seed, 45.0)
+    if late:
+        flight = rovers.late(flight, late, since=33.0)
+    begin = float(flight.truth.t[0])
+    config = {"planar": True, "fixed_height": rovers.HEIGHT, "use_imu": imu}
+    spans = {"late": (begin + 33.0, begin + 38.0), "then": (begin + 38.0, begin + 45.0)}
+    return Case(flight, spans | {"before": (begin + 15.0, begin + 33.0)}, None, config)
 
 
 def _driven(seed: int, streams: tuple[str, ...], config: FilterConfig, late: bool) -> Case:

@@ -14,7 +14,7 @@ from uwb_tdoa_bias.foundation.sensors import SENSORS
 from uwb_tdoa_tools.results_file import ResultsFile
 
 from . import watching
-from .catalogue import OF_SENSORS
+from .catalogue import OF_SENSORS, RULES
 from .rows import Inputs, Row, judged
 from .tuned import Entry, Live, Tuned
 from .worth import worth
@@ -44,7 +44,8 @@ class Variant:
         if self.entry is None:
             return ""
         name = self.entry.name
-        return OF_SENSORS.get(name, MODULES.get(name.split(".")[0], ""))
+        module = next((rule.module for rule in RULES if rule.name == name), name.split(".")[0])
+        return OF_SENSORS.get(name, MODULES.get(module, ""))
 
     def concerns(self, row: Row) -> bool:
         """Whether it can change a Row in a way that rows without sensors do not show."""
@@ -92,7 +93,9 @@ def main(job: dict[str, Any]) -> None:
             found: dict[str, dict[str, list]] = {}
             for row in rows:
                 key = f"{variant.name} | {row.name}"
-                if not variant.concerns(row) or (worth(base, found).clear and job["stop"]):
+                if (job["screen"] and not variant.concerns(row)) or (
+                    worth(base, found).clear and job["stop"]
+                ):
                     continue
                 if key not in done:
                     case = inputs.case(row)  # is made by the filter as it is
