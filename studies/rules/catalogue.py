@@ -109,12 +109,6 @@ RULES = (
         "True",
     ),
     Rule(
-        "no lateness above a height",
-        "ground",
-        "find_lateness",
-        "hypothesis.x[2] - lower > ground + HIGHEST",
-    ),
-    Rule(
         "late anchors are alike at rest",
         "ground",
         "explain",
