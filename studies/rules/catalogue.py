@@ -152,12 +152,6 @@ RULES = (
         "",
     ),
     Rule(
-        "lift-off of a quiet tag to any side",
-        "rest",
-        "feel",
-        "ekf.quiet and max(aside, abs(ekf.lift[2])) > QUIET_LIFT",
-    ),
-    Rule(
         "rotors that have stopped are calm",
         "rest",
         "look",
