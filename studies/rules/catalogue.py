@@ -200,12 +200,6 @@ RULES = (
         "ekf.resting and (not ekf.quiet) and (t - ekf.last_tdoa > SILENT)",
     ),
     Rule(
-        "rest ends where samples contradict",
-        "rest",
-        "update_zero_velocity",
-        "ekf.resting and (not ekf.quiet) and _moves(ekf.hypotheses[ekf.best], std)",
-    ),
-    Rule(
         "a slow quiet tag stands",
         "rest",
         "update_zero_velocity",

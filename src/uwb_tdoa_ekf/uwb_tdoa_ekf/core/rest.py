@@ -156,8 +156,6 @@ def update_zero_velocity(ekf: Record, t: float, records: np.ndarray) -> None:
         return
     ekf.next_rest = t + PERIOD
     std = QUIET_STD if ekf.quiet else SHAKING_STD
-    if ekf.resting and not ekf.quiet and _moves(ekf.hypotheses[ekf.best], std):
-        ekf.resting, ekf.next_look = False, t + LOOK_WINDOW
     for h in range(HYPOTHESES):
         hypothesis = ekf.hypotheses[h]
         x, P = hypothesis.x, hypothesis.P
