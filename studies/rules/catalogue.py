@@ -186,12 +186,6 @@ RULES = (
         "look",
         "not landed and long and (not _moves(best, QUIET_STD))",
     ),
-    Rule(
-        "a tag that lies still is found anew",
-        "rest",
-        "look",
-        "not landed and ekf.stills >= LONG",
-    ),
     Rule("fewer looks soon after a start", "rest", "look", "t - ekf.rest_since > EARLY", "True"),
     Rule(
         "rest ends in a silence",

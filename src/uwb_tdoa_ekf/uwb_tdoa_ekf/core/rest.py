@@ -137,8 +137,6 @@ def look(
         ekf.resting = stands and landed
         if not landed and long and not _moves(best, QUIET_STD):
             ekf.resting, ekf.late_as_known = True, False
-        elif not landed and ekf.stills >= LONG:
-            standing.find_again(ekf, ekf.pairs[:count], window, anchors, parameters, t, records)
         if ekf.resting:
             ekf.rest_since = t
         if landed and not stands:
