@@ -38,6 +38,7 @@ from studies.diagnosis import figures
 from studies.diagnosis import ranges as diagnosed_ranges
 from studies.faults import figures as faults
 from studies.faults import flown
+from studies.rules import figures as rules
 from studies.training import compare, spin, splits
 from uwb_tdoa_tools import cli
 
@@ -72,6 +73,7 @@ STUDIES = {
     "ranges": ranges,
     "recalibrating": recalibrating,
     "rover": rover,
+    "rules": rules,
     "scale": scale,
     "situations": situations,
     "soak": soak,
@@ -114,6 +116,7 @@ of measured flights: flights/, util/, surveys/.
   ranges           simulated distances to anchors against the bound of plan (docs/sensors.md)
   recalibrating    surveys that start from the last one, after something changed (docs/calibration.md)
   rover            a simulated rover on wheels, and what diagnose finds on it (docs/rover.md)
+  rules            rules and constants of the filter, switched off or changed one at a time (docs/notebook/rules.md)
   scale            processor time and memory over flights, anchors and effects (docs/speed.md)
   situations       where a tag can be and what can happen to it, simulated (docs/reliability.md)
   soak             both nodes for hours: memory and lost messages (docs/reliability.md)
@@ -183,6 +186,7 @@ def parser():
         "./dev study recalibrating --data DATA --only const1",
         "./dev study rover --seeds 20",
         "./dev study rover --diagnose 4",
+        "./dev study rules --data DATA --results rules.jsonl",
         "./dev study scale --out scale/",
         "./dev study situations --resume situations.jsonl",
         "./dev study soak --minutes 60",

@@ -20,7 +20,6 @@ GRAZING = math.tan(
     math.radians(15.0)
 )  # elevation below which the ground turns the phase of what it reflects
 HALF_WAVE = 0.0375  # m, at 4 GHz: rays that differ by more do not cancel
-HIGHEST = 1.0  # m above the ground; above, no anchor near the ground can be late for that
 # m, lateness of an anchor is up to that, the more probable, the larger: the way by what reflects is
 # a detour
 LATEST = 6.0
@@ -132,9 +131,6 @@ def find_lateness(a: Record, b: Record, hypothesis: Record, t: float, ground: fl
     over level ground. Returns whether either can be.
     """
     lower = DEVIATIONS * math.sqrt(hypothesis.P[2, 2])
-    if hypothesis.x[2] - lower > ground + HIGHEST:
-        a.late = b.late = 0.0
-        return False
     _predict_lateness(a, hypothesis.x, lower, t, ground)
     _predict_lateness(b, hypothesis.x, lower, t, ground)
     return a.late > 0.0 or b.late > 0.0

@@ -7,8 +7,6 @@ ground. TDOAs can, whatever their systematic errors are: at rest they stay what 
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from uwb_tdoa_bias.foundation.compiled import Record, compiled
@@ -46,12 +44,7 @@ CALM, SHAKING_MEMORY = (
     # rotors or wheels have stopped when the vibration is below that share of its mean over so many
     # seconds
 )
-LIFT, QUIET_LIFT = (
-    0.25,
-    0.1,
-    # m/s that end a rest when the inertial sensor feels them: upwards, and to any side where it is
-    # quiet
-)
+LIFT = 0.25  # m/s upwards that end a rest when the inertial sensor measures them
 LIFT_MEMORY = 0.7  # s over which what it feels adds up
 AWAY = 1.5  # s after such an end, for which the tag is not taken for one at rest again
 SILENT = 0.5  # s without TDOAs after which a tag that shakes is not known to be at rest
@@ -83,8 +76,7 @@ def feel(ekf: Record, sample: Record, dt: float, records: np.ndarray) -> None:
         for j in range(3):
             force += R[k, j] * (sample.accel[j] - best.x[10 + j])
         ekf.lift[k] += dt * (force - ekf.lift[k] / LIFT_MEMORY)
-    aside = math.hypot(ekf.lift[0], ekf.lift[1])
-    if ekf.lift[2] < LIFT and not (ekf.quiet and max(aside, abs(ekf.lift[2])) > QUIET_LIFT):
+    if ekf.lift[2] < LIFT:
         return
     for h in range(HYPOTHESES):
         hypothesis = ekf.hypotheses[h]
@@ -145,8 +137,6 @@ def look(
         ekf.resting = stands and landed
         if not landed and long and not _moves(best, QUIET_STD):
             ekf.resting, ekf.late_as_known = True, False
-        elif not landed and ekf.stills >= LONG:
-            standing.find_again(ekf, ekf.pairs[:count], window, anchors, parameters, t, records)
         if ekf.resting:
             ekf.rest_since = t
         if landed and not stands:
@@ -164,8 +154,6 @@ def update_zero_velocity(ekf: Record, t: float, records: np.ndarray) -> None:
         return
     ekf.next_rest = t + PERIOD
     std = QUIET_STD if ekf.quiet else SHAKING_STD
-    if ekf.resting and not ekf.quiet and _moves(ekf.hypotheses[ekf.best], std):
-        ekf.resting, ekf.next_look = False, t + LOOK_WINDOW
     for h in range(HYPOTHESES):
         hypothesis = ekf.hypotheses[h]
         x, P = hypothesis.x, hypothesis.P

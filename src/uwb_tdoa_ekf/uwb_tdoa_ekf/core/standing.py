@@ -18,7 +18,7 @@ from .ground import Evidence, KnownHeight
 from .history import add_reset, add_update
 from .hypotheses import alive
 from .memory import HYPOTHESES
-from .startup import Places, locate, room_for
+from .startup import Places
 from .update import update_state
 from .workspace import surround
 
@@ -254,27 +254,6 @@ def hover(ekf: Record, place: np.ndarray, still: bool, t: float, records: np.nda
             update_state(ekf.hypotheses[h], ekf.innovation, state, value, std)
             if h == ekf.best:
                 add_update(ekf, t, records)
-
-
-@compiled
-def find_again(
-    ekf: Record,
-    pairs: np.ndarray,
-    window: np.ndarray,
-    anchors: np.ndarray,
-    parameters: Record,
-    t: float,
-    records: np.ndarray,
-) -> None:
-    """A tag lies still at stamp t, s, but inertial samples have shown that it moves: they were
-    wrong, and it may be anywhere.
-    """
-    places, nowhere = room_for(1), KnownHeight(np.nan, np.nan)
-    locate(window, anchors, ekf.workspace, parameters, nowhere, places)
-    weigh(ekf, pairs, anchors, parameters, nowhere, places.x[0], places.covariance[0])
-    put(ekf, places.x[0, :3], places.covariance[0, :3, :3], t, records)
-    ekf.resting, ekf.rest_since = True, t
-    ekf.recoveries += 1
 
 
 @compiled

@@ -1,0 +1,667 @@
+"""The rules of the compiled core, and which of its constants are no tuning."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+# Whole numbers that are tuned; all others say where something is
+COUNTS = {
+    "ground.FEWEST_PAIRS",
+    "ground.STILL_TDOAS",
+    "ground.STILL_SWEEPS",
+    "ground.SWEEPS",
+    "height.STEP_COUNT",
+    "initialization.MINIMUM",
+    "initialization.SLOW_TDOAS",
+    "initialization.SLOW_STAMPS",
+    "initialization.LATE_ANCHORS",
+    "initialization.AMONG_OTHERS",
+    "rest.MOST_DOUBTS",
+    "rest.LONG",
+    "rest.LONG_ENOUGH",
+    "startup.GRID_POINTS",
+    "startup.GRID_LEVELS",
+    "startup.GRID_TDOAS",
+    "startup.SWEEPS",
+    "velocity.STUCK_COUNT",
+}
+STRUCTURE = {"state.GRAVITY", "startup.NO_SCALE", "startup.SMALLEST", "velocity.LONGEST_STD"}
+
+
+@dataclass(frozen=True)
+class Rule:
+    """A rule of the core. place : expression in a compiled function of a module, as it stands there;
+    instead : what takes its place where the rule is off, "" for a call that is left out; function :
+    "" for all of the module.
+    """
+
+    name: str
+    module: str
+    function: str
+    place: str
+    instead: str = "False"
+
+
+RULES = (
+    # The noise of TDOAs
+    Rule("learn the noise of each anchor", "engine", "_update", "parameters.adapt_noise"),
+    Rule(
+        "one outlier teaches the noise little",
+        "noise",
+        "learn",
+        "min(innovation.value**2, LARGEST_OUTLIER**2 * noise)",
+        "innovation.value**2",
+    ),
+    Rule(
+        "more noise near the ground",
+        "engine",
+        "_update",
+        "ground.blur(ekf.hypotheses[ekf.best], parameters.ground_height)",
+        "0.0",
+    ),
+    Rule(
+        "curvature adds variance",
+        "engine",
+        "_compare",
+        "curvature.variance(hypothesis.x, hypothesis.P, a.position, b.position)",
+        "0.0",
+    ),
+    Rule("a TDOA heard at rest repeats", "rest", "repetition", "ekf.resting"),
+    Rule(
+        "robust weight",
+        "robust",
+        "update_innovation",
+        "weight(parameters.loss, innovation.value / math.sqrt(prior + noise), "
+        "parameters.measurement_scale)",
+        "1.0",
+    ),
+    Rule("a negligible weight is none", "robust", "update_innovation", "w < NEGLIGIBLE"),
+    Rule(
+        "a repeated TDOA is refused",
+        "engine",
+        "_on_tdoa",
+        "initialization.is_repeat(ekf, tdoa, anchors)",
+    ),
+    Rule("a repeated range is refused", "engine", "_on_range", "ranges.is_repeat(ekf, aid)"),
+    # Late anchors near the ground
+    Rule(
+        "anchors near the ground may be late",
+        "engine",
+        "_update",
+        "not on_floor and ground.find_lateness(a, b, ekf.hypotheses[ekf.best], tdoa.t, "
+        "parameters.ground_height)",
+    ),
+    Rule(
+        "a TDOA that is probably late is not used", "engine", "_update", "in_time < ground.NOT_USED"
+    ),
+    Rule(
+        "late only at a grazing angle",
+        "ground",
+        "may_be_late",
+        "tag + anchor < GRAZING * distance",
+        "True",
+    ),
+    Rule(
+        "late only where both are low",
+        "ground",
+        "may_be_late",
+        "2.0 * tag * anchor < HALF_WAVE * distance",
+        "True",
+    ),
+    Rule(
+        "late anchors are alike at rest",
+        "ground",
+        "explain",
+        "lateness == ALIKE and may_be_late(anchors[rows[i]].position, u, 0.0, "
+        "parameters.ground_height)",
+    ),
+    Rule(
+        "the lateness that is known on the floor",
+        "engine",
+        "_update",
+        "ekf.resting and ekf.late_as_known",
+    ),
+    # Rest
+    Rule(
+        "a quiet IMU",
+        "engine",
+        "_on_imu",
+        "parameters.zero_velocity and continuous and not ekf.distrusted "
+        "and inertial.is_quiet(ekf.imu)",
+    ),
+    Rule("rest by TDOAs", "engine", "_before_update", "t >= ekf.next_look"),
+    Rule(
+        "zero-velocity updates at samples",
+        "engine",
+        "_on_imu",
+        "rest.update_zero_velocity(ekf, sample.t, records)",
+        "",
+    ),
+    Rule(
+        "zero-velocity updates without samples",
+        "engine",
+        "_before_update",
+        "rest.update_zero_velocity(ekf, t, records)",
+        "",
+    ),
+    Rule(
+        "lift-off by the accelerometer",
+        "engine",
+        "_on_imu",
+        "rest.feel(ekf, sample, sample.t - ekf.imu.t, records)",
+        "",
+    ),
+    Rule(
+        "rotors that have stopped are calm",
+        "rest",
+        "look",
+        "np.sum(ekf.imu.vibration) < CALM * ekf.shaking",
+    ),
+    Rule(
+        "rest is looked for near the ground",
+        "rest",
+        "look",
+        "standing.is_near_ground(best, parameters)",
+    ),
+    Rule(
+        "too few TDOAs say nothing of rest",
+        "rest",
+        "look",
+        "motion == ground.UNKNOWN and ekf.quiet",
+    ),
+    Rule(
+        "one look ends a rest after some lift",
+        "rest",
+        "look",
+        "MOST_DOUBTS if np.abs(ekf.lift).max() < UNFELT else 1",
+        "MOST_DOUBTS",
+    ),
+    Rule("landing by late anchors", "rest", "look", "lateness >= 0"),
+    Rule(
+        "a low tag may hover", "rest", "look", "standing.hover(ekf, place, still, t, records)", ""
+    ),
+    Rule(
+        "a long quiet time is rest",
+        "rest",
+        "look",
+        "not landed and long and (not _moves(best, QUIET_STD))",
+    ),
+    Rule("fewer looks soon after a start", "rest", "look", "t - ekf.rest_since > EARLY", "True"),
+    Rule(
+        "rest ends in a silence",
+        "rest",
+        "update_zero_velocity",
+        "ekf.resting and (not ekf.quiet) and (t - ekf.last_tdoa > SILENT)",
+    ),
+    Rule(
+        "a slow quiet tag stands",
+        "rest",
+        "update_zero_velocity",
+        "slow and abs(x[state]) < SPEED and (P[state, state] < SPEED**2)",
+    ),
+    Rule(
+        "a quiet tag stands more exactly",
+        "rest",
+        "update_zero_velocity",
+        "QUIET_STD if ekf.quiet else SHAKING_STD",
+        "SHAKING_STD",
+    ),
+    Rule(
+        "landing by the lateness that is expected",
+        "standing",
+        "find_landed",
+        "_expected_late(pairs, anchors) > FEWEST_LATE",
+    ),
+    Rule("far above or below the anchors is absurd", "standing", "", "_absurdity(near, x)", "0.0"),
+    Rule(
+        "the spread of the explanations",
+        "standing",
+        "_mix",
+        "k != best and weights[k] > 0.0",
+    ),
+    Rule(
+        "changes that scatter show motion",
+        "ground",
+        "judge_motion",
+        "np.median(ratios[:n]) > EXPECTED_RATIO + LARGEST_RATIO / math.sqrt(n)",
+    ),
+    Rule("changes that fit a velocity show motion", "ground", "judge_motion", "size >= MOVING"),
+    Rule(
+        "changes are weighed robustly",
+        "ground",
+        "judge_motion",
+        "1.0 + r * r / (STILL_SCALE**2 * row[4])",
+        "1.0",
+    ),
+    Rule("a tag is rarely outside its workspace", "ground", "_equations", "outside != 0.0"),
+    # The inertial sensor
+    Rule(
+        "an axis rectifies as far as its mean shows",
+        "inertial",
+        "weigh",
+        "max(imu.rectified[k], LEAST_RECTIFIED)",
+        "1.0",
+    ),
+    Rule(
+        "a shaking axis weighs less",
+        "inertial",
+        "weigh",
+        "prior / (prior + error)",
+        "1.0",
+    ),
+    Rule(
+        "a tag on its side does not hover",
+        "inertial",
+        "weigh",
+        "slow[2] > UPRIGHT * math.sqrt(slow[0] ** 2 + slow[1] ** 2 + slow[2] ** 2)",
+        "True",
+    ),
+    Rule(
+        "far from hovering hovers less",
+        "inertial",
+        "weigh",
+        "max(usual, apart**2 - error)",
+        "usual",
+    ),
+    Rule(
+        "less noise of a quiet tag",
+        "inertial",
+        "weigh",
+        "QUIET_NOISE**2 if quiet else noise",
+        "noise",
+    ),
+    Rule("IMU fault detector", "plausibility", "update", "t - check.contradicted < CLEARED"),
+    Rule(
+        "IMU fault: weight",
+        "plausibility",
+        "update",
+        "t - check.weighed > TOO_LONG and (not LIGHTEST < weight < HEAVIEST)",
+    ),
+    Rule(
+        "IMU fault: direction of gravity",
+        "plausibility",
+        "update",
+        "t - check.weighed > TOO_LONG or upwards < DOWNWARDS",
+    ),
+    Rule("IMU fault: turning rate", "plausibility", "update", "check.spun == TOO_FAR"),
+    Rule(
+        "IMU fault: lying on a side",
+        "plausibility",
+        "update",
+        "lies and (distrusted or t - check.upright > LYING)",
+    ),
+    Rule("widen at an IMU fault", "engine", "_switch", "initialization.widen(ekf, records)", ""),
+    Rule(
+        "level after an IMU fault",
+        "engine",
+        "_switch",
+        "initialization.level_anew(ekf, parameters, 2.0 * math.pi, records)",
+        "",
+    ),
+    Rule(
+        "level at the first sample",
+        "engine",
+        "_on_imu",
+        "first and ekf.running and parameters.use_imu",
+    ),
+    # Hypotheses
+    Rule(
+        "four yaws at the start",
+        "initialization",
+        "_begin",
+        "unknown or offset == 0.0",
+        "offset == 0.0",
+    ),
+    Rule("two places at the start", "initialization", "_begin", "place < len(x)", "place < 1"),
+    Rule(
+        "hypotheses merge",
+        "hypotheses",
+        "select",
+        "turned < MERGED_BELOW**2 and away < MERGED_WITHIN**2",
+    ),
+    Rule(
+        "one innovation weighs hypotheses little",
+        "hypotheses",
+        "add_log_likelihood",
+        "min(innovation.value**2 / variance, LARGEST_NIS)",
+        "innovation.value**2 / variance",
+    ),
+    Rule(
+        "the spread of hypotheses",
+        "engine",
+        "_report",
+        "hypotheses.add_spread_of_means(ekf, row.covariance)",
+        "",
+    ),
+    Rule(
+        "a wrong yaw is opened again",
+        "engine",
+        "_after_update",
+        "alone and yaw_doubt.contradicts(ekf, t)",
+    ),
+    Rule("widen at a wrong yaw", "initialization", "open_yaw", "widen(ekf, history)", ""),
+    Rule(
+        "turns by updates doubt a yaw",
+        "yaw_doubt",
+        "evidence",
+        "0.5 * doubt.turned**2 / max(doubt.variance, 1e-9)",
+        "0.0",
+    ),
+    Rule(
+        "one innovation doubts a yaw little",
+        "yaw_doubt",
+        "observe",
+        "min(max(innovation.value, -largest), largest)",
+        "innovation.value",
+    ),
+    Rule(
+        "open the yaw of a tag without IMU",
+        "engine",
+        "_on_aid",
+        "aid.kind == aids.VELOCITY and (not parameters.use_imu)",
+    ),
+    Rule(
+        "a yaw that may be any grows no more",
+        "engine",
+        "_coast",
+        "not parameters.use_imu and hypothesis.P[8, 8] > initialization.ANY_YAW**2",
+    ),
+    # What is stated
+    Rule(
+        "covariance of persistent errors",
+        "systematic",
+        "fill",
+        "share == 0.0 or not solve(both)",
+        "True",
+    ),
+    Rule(
+        "curvature in the persistent errors",
+        "systematic",
+        "observe",
+        "innovation.curvature / SHARE",
+        "0.0",
+    ),
+    Rule(
+        "the circle about anchors in a line",
+        "engine",
+        "_report",
+        "workspace.add_circle(ekf, parameters.fixed_height_std > 0.0 or "
+        "t - ekf.height.used < height.LONGEST_GAP, best.x, row.covariance)",
+        "",
+    ),
+    Rule(
+        "TDOAs that contradict a fixed height",
+        "engine",
+        "_report",
+        "height.contradiction(ekf.height, parameters, t)",
+        "0.0",
+    ),
+    Rule("the place that wheels contradict", "engine", "_report", "t < ekf.rival_until"),
+    # The workspace
+    Rule(
+        "the workspace draws back",
+        "engine",
+        "_after_update",
+        "_stay_in_workspace(ekf, t, records)",
+        "",
+    ),
+    Rule(
+        "an unknown axis is that of the workspace",
+        "workspace",
+        "constrain",
+        "hypothesis.P[axis, axis] > size**2",
+    ),
+    Rule(
+        "a wall looks as far as it is long",
+        "workspace",
+        "set_bounds",
+        "k < 2 and high - low < FLAT",
+    ),
+    Rule("the surroundings follow the tag", "engine", "_before_update", "t >= ekf.next_bounds"),
+    # Start and recovery
+    Rule(
+        "weigh the ground at the start",
+        "initialization",
+        "start",
+        "standing.weigh(ekf, pairs, anchors, parameters, known, at_rest, its)",
+        "-np.inf",
+    ),
+    Rule(
+        "a start is inside the workspace",
+        "initialization",
+        "start",
+        "workspace.contains(ekf.workspace, x[0])",
+        "True",
+    ),
+    Rule(
+        "a wide start becomes two",
+        "initialization",
+        "start",
+        "np.trace(its[:3, :3]) > APART**2",
+    ),
+    Rule(
+        "a wide slow start becomes two",
+        "initialization",
+        "start_slowly",
+        "np.trace(places.covariance[0, :3, :3]) > APART**2",
+    ),
+    Rule(
+        "a start at rest has no velocity",
+        "initialization",
+        "start",
+        "PLACES if still else 0",
+        "0",
+    ),
+    Rule(
+        "a start by rest, not by motion",
+        "initialization",
+        "start",
+        "still or on_ground or (not (good or cost[1] < np.inf))",
+    ),
+    Rule(
+        "start anyhow after a while",
+        "engine",
+        "_wait_for_start",
+        "waited > parameters.start_timeout",
+    ),
+    Rule("start from few TDOAs", "engine", "_wait_for_start", "t >= ekf.next_search"),
+    Rule("no start over a gap", "initialization", "start_slowly", "gap > LONGEST_GAP * span"),
+    Rule(
+        "older TDOAs of a start count less",
+        "startup",
+        "locate",
+        "parameters.motion_noise**2 * age**3 / 3.0 / std**2",
+        "0.0",
+    ),
+    Rule(
+        "a grid over a large workspace",
+        "startup",
+        "locate",
+        "max(prior_std[0], prior_std[1]) > 0.5 * LARGE",
+    ),
+    Rule(
+        "other places widen a start",
+        "startup",
+        "locate",
+        "_hold_others(trials, losses - least, places)",
+        "",
+    ),
+    Rule(
+        "the loss narrows",
+        "startup",
+        "locate",
+        "max(COARSE * 0.7**sweep, FINE)",
+        "FINE",
+    ),
+    Rule(
+        "a start is probable in the middle",
+        "startup",
+        "locate",
+        "np.sum(((trial - mean) / prior_std) ** 2)",
+        "0.0",
+    ),
+    Rule(
+        "a start is as wide as its residuals",
+        "startup",
+        "locate",
+        "max(std, 1.5 * np.median(np.abs(residuals)))",
+        "std",
+    ),
+    Rule(
+        "recover",
+        "engine",
+        "_after_update",
+        "parameters.recover and (unsure or ekf.consistency < INCONSISTENT) "
+        "and t >= ekf.next_search",
+    ),
+    Rule(
+        "TDOAs wait after a silence",
+        "engine",
+        "_on_tdoa",
+        "parameters.recover and initialization.waits(ekf, anchors, parameters, t, "
+        "ekf.unsure_until > before, records)",
+    ),
+    Rule(
+        "relocate where few TDOAs come",
+        "engine",
+        "_on_tdoa",
+        "initialization.relocate(ekf, anchors, parameters, t, records)",
+        "",
+    ),
+    Rule(
+        "a lost tag is looked for anywhere",
+        "engine",
+        "_before_update",
+        "t - ekf.last_tdoa > parameters.start_window and initialization.is_unsure(ekf)",
+    ),
+    Rule(
+        "a recovery explains clearly more",
+        "initialization",
+        "recover",
+        "share < CLEARLY_MORE + explained",
+    ),
+    Rule("a recovery explains most", "initialization", "recover", "share < AGREE_ANYHOW"),
+    Rule(
+        "a recovery is within reach",
+        "initialization",
+        "recover",
+        "math.sqrt(away) > REACH + REACH_SPEED * since + REACH_ACCELERATION * since**2",
+    ),
+    Rule(
+        "a recovery goes to two places",
+        "initialization",
+        "recover",
+        "anywhere and cost[count - 1] < np.inf",
+    ),
+    Rule(
+        "wheels outweigh another place",
+        "initialization",
+        "recover",
+        "not anywhere and wheels and _outweighs(ekf, anchors, window, x[0], t)",
+    ),
+    Rule(
+        "two late anchors explain another place",
+        "initialization",
+        "_outweighs",
+        "_are_late(window, anchors, ekf.hypotheses[ekf.best].x[:6])",
+    ),
+    Rule(
+        "TDOAs of another place wait",
+        "engine",
+        "_update",
+        "tdoa.t < ekf.rival_until and _is_of_rival(ekf, a, b, tdoa, known, residual)",
+    ),
+    Rule("stop after a long pause", "engine", "_advance", "t - ekf.t > LOST_TIME"),
+    Rule(
+        "stop when the tag may be anywhere",
+        "engine",
+        "_advance",
+        "t - ekf.last_tdoa > LOST_TIME and workspace.is_filled(ekf.workspace, "
+        "ekf.hypotheses[ekf.best].P)",
+    ),
+    # Range finder, barometer, velocity
+    Rule(
+        "a range finder that repeats is stuck",
+        "height",
+        "observe",
+        "not ekf.quiet and aid.t - height.changed > STUCK_TIME",
+    ),
+    Rule(
+        "a range finder that pulls is ignored",
+        "height",
+        "observe",
+        "aid.t < height.ignored_until",
+    ),
+    Rule(
+        "a range weighs places",
+        "height",
+        "observe",
+        "_weigh_places(ekf, parameters, distance, share)",
+    ),
+    Rule("a gap in ranges", "height", "observe", "aid.t - height.used > LONGEST_GAP"),
+    Rule(
+        "errors of ranges last",
+        "height",
+        "observe",
+        "max(1.0, 2.0 * CORRELATION_TIME / max(min(since, LONGEST_GAP), 1e-3))",
+        "1.0",
+    ),
+    Rule(
+        "down from a step",
+        "height",
+        "_settle",
+        "height.level != parameters.ground_height and abs(base_innovation) < "
+        "min(limit, 2.0 * ALIKE)",
+    ),
+    Rule(
+        "steps of the ground",
+        "height",
+        "_settle",
+        "(height.agreed >= SETTLED or doubted) and abs(value) < HIGHEST_STEP",
+    ),
+    Rule("a worse barometer counts less", "barometer", "observe", "max(1.0, barometer.nis)", "1.0"),
+    Rule(
+        "the offset of a barometer is taken anew",
+        "barometer",
+        "observe",
+        "aid.t - barometer.agreed > LONGEST_DISAGREEMENT",
+    ),
+    Rule("a stuck velocity", "velocity", "observe", "_repeats(state, aid) and (not ekf.quiet)"),
+    Rule(
+        "a velocity that disagrees is refused",
+        "velocity",
+        "observe",
+        "state.nis > (AGREES if state.refused else DISAGREES)",
+    ),
+    Rule("a velocity that is an outlier", "velocity", "observe", "worst > GATE**2"),
+    Rule(
+        "errors of velocities last",
+        "velocity",
+        "observe",
+        "max(1.0, 2.0 * CORRELATION_TIME / dt)",
+        "1.0",
+    ),
+    Rule(
+        "velocities weigh hypotheses",
+        "velocity",
+        "observe",
+        "add_log_likelihood(hypothesis, innovation, inflation)",
+        "",
+    ),
+    Rule("wheels show the gyroscope's bias", "velocity", "observe", "of_wheels and ekf.sensed"),
+    Rule("wheels drive", "velocity", "drives", "not state.refused and t - state.agreed < HELD"),
+)
+# Rules and constants of other modules that only rows with a sensor can show
+OF_SENSORS = {
+    "a repeated range is refused": "range",
+    "open the yaw of a tag without IMU": "velocity",
+    "TDOAs that contradict a fixed height": "plane",
+    "the place that wheels contradict": "velocity",
+    "wheels outweigh another place": "velocity",
+    "two late anchors explain another place": "velocity",
+    "TDOAs of another place wait": "velocity",
+    "initialization.RIVAL_TIME": "velocity",
+    "initialization.RIVAL_HELD": "velocity",
+    "initialization.LATE_ANCHORS": "velocity",
+    "initialization.AMONG_OTHERS": "velocity",
+}

@@ -1,0 +1,140 @@
+"""rules: what each rule and each constant of the filter's core is worth, and with --watch those of
+the rules over streams and residuals.
+
+Each rule is switched off, and each constant is halved and doubled, one at a time. Recordings,
+flights of `fly`, starts and faults show what that changes. The filter is compiled once: see
+`studies/rules/tuned.py`. Interrupted work goes on where it was.
+"""
+
+from __future__ import annotations
+
+from argparse import Namespace
+from collections import defaultdict
+from collections.abc import Callable
+import json
+import os
+from pathlib import Path
+import pickle
+import subprocess
+import sys
+
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_tools.outputs import OutputFile
+
+from . import tuned, watching, work
+from .worth import NOTICED, worth
+
+
+def add_options(add: Callable) -> None:
+    """The options of the study."""
+    add("--data", required=True, type=Path, metavar="DATA", help="folder of measured flights")
+    add(
+        "--results",
+        required=True,
+        type=OutputFile,
+        metavar="FILE",
+        help="results line by line; what is there is not made again",
+    )
+    add("--cache", type=Path, metavar="DIR", default=Path("rules"), help="copy and inputs go there")
+    add("--full", action="store_true", help="all rows, not those of the screen alone")
+    add("--watch", action="store_true", help="rules over streams and residuals instead")
+    add("--only", nargs="+", metavar="WORD", default=[""], help="variants with one of these words")
+    add("--rows", nargs="+", metavar="WORD", default=[], help="rows with one of these words")
+    add("--stop", action="store_true", help="leave a variant when it is clearly worse")
+    add("--table", action="store_true", help="run nothing: print what FILE holds")
+
+
+def run(args: Namespace) -> None:
+    """Run what is missing, and print the table."""
+    cache = args.cache.absolute()
+    cache.mkdir(parents=True, exist_ok=True)
+    made = tuned.copy_to(cache)
+    if not args.table:
+        _work(args, cache, made)
+    if not Path(args.results).exists():
+        raise InputError(f"{args.results} is not there: run the study without --table first.")
+    found = read(Path(args.results))
+    print(table_of_watch(found) if args.watch else table(found))
+
+
+def _work(args: Namespace, cache: Path, made: tuned.Tuned) -> None:
+    job = {
+        "tuned": made,
+        "data": args.data.absolute(),
+        "cache": cache,
+        "results": Path(args.results).absolute(),
+        "screen": not args.full,
+        "watch": args.watch,
+        "stop": args.stop,
+        "only": args.only,
+        "rows": args.rows,
+    }
+    path = cache / f"job {os.getpid()}.pickle"
+    path.write_bytes(pickle.dumps(job))
+    before = [str(made.folder), *sys.path]
+    env = os.environ | {"PYTHONPATH": os.pathsep.join(part for part in before if part)}
+    try:
+        subprocess.run([sys.executable, "-m", work.__name__, str(path)], env=env, check=True)
+    finally:
+        path.unlink()
+
+
+Figures = dict[str, dict[str, dict[str, list]]]  # of each variant and row: spans, or what is said
+
+
+def read(path: Path) -> Figures:
+    """{variant: {row: {span: figures}}} of a file of results."""
+    found: Figures = defaultdict(dict)
+    for line in path.read_text().splitlines()[1:]:
+        kept = json.loads(line)
+        variant, row = kept["key"].split(" | ", 1)
+        result = kept["result"]
+        found[variant][row] = result["said"] if "said" in result else result["figures"]
+    return dict(found)
+
+
+def table(found: Figures) -> str:
+    """Markdown: each variant, those that change least first."""
+    base = found.get(work.BASE, {})
+    lines = [
+        "| variant | rows | changed | 3D RMSE, mean | NEES beyond 3 | largest loss | largest gain |",
+        "|---|---:|---:|---:|---:|---|---|",
+    ]
+    each = {name: worth(base, rows) for name, rows in found.items() if name != work.BASE}
+    for name, one in sorted(each.items(), key=lambda item: (item[1].changed, abs(item[1].mean))):
+        same = " (same to the bit)" if one.same else ""
+        lines.append(
+            f"| {name}{same} | {one.rows} | {one.changed} | {one.mean:+.2%} | {one.nees:+.2f} | "
+            f"{_largest(one.worse)} | {_largest(one.better)} |"
+        )
+    return "\n".join(lines)
+
+
+def _largest(of: tuple[float, str]) -> str:
+    share, row = of
+    return f"{share:+.0%}: {row}" if abs(share) > NOTICED else ""
+
+
+def table_of_watch(found: Figures) -> str:
+    """Markdown: of each variant, in how many rows something is said less, more, later or earlier."""
+    base = found.get(work.BASE, {})
+    kinds = "lost", "new", "late", "early"
+    lines = [f"| variant | rows | {' | '.join(kinds)} | which |", f"|---|{'---:|' * 5}---|"]
+    made = []
+    for name, rows in found.items():
+        if name == work.BASE:
+            continue
+        changes = {
+            row: watching.differs(base[row], said) for row, said in rows.items() if row in base
+        }
+        counts = [sum(kind in one.values() for one in changes.values()) for kind in kinds]
+        which = [
+            f"{row}: {', '.join(f'{rule} {kind}' for rule, kind in one.items())}"
+            for row, one in changes.items()
+            if one
+        ]
+        made.append((sum(counts), name, len(changes), counts, which))
+    for _, name, rows, counts, which in sorted(made):
+        cells = " | ".join(map(str, counts))
+        lines.append(f"| {name} | {rows} | {cells} | {'; '.join(which[:3])} |")
+    return "\n".join(lines)

@@ -1,0 +1,139 @@
+"""Run variants of the filter, in a process that imports its tuned copy: started by `figures`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+import pickle
+import sys
+from typing import Any
+
+from tqdm import tqdm
+
+from uwb_tdoa_bias.foundation.sensors import SENSORS
+from uwb_tdoa_tools.results_file import ResultsFile
+
+from . import watching
+from .catalogue import OF_SENSORS, RULES
+from .rows import Inputs, Row, judged
+from .tuned import Entry, Live, Tuned
+from .worth import worth
+
+BASE = "as it is"
+FACTORS = 0.5, 2.0
+MODULES = {
+    "height": "height",
+    "barometer": "pressure",
+    "velocity": "velocity",
+    "ranges": "range",
+    "plane": "plane",
+}
+
+
+@dataclass(frozen=True)
+class Variant:
+    """entry : None for the filter as it is; factor : of a constant, 0.0 for a rule that is off."""
+
+    name: str
+    entry: Entry | None
+    factor: float = 0.0
+
+    @property
+    def sensor(self) -> str:
+        """The sensor, or "plane", whose rows alone it can change; "" for all others."""
+        if self.entry is None:
+            return ""
+        name = self.entry.name
+        module = next((rule.module for rule in RULES if rule.name == name), name.split(".")[0])
+        return OF_SENSORS.get(name, MODULES.get(module, ""))
+
+    def concerns(self, row: Row) -> bool:
+        """Whether it can change a Row in a way that rows without sensors do not show."""
+        return self.entry is None or (self.sensor in row.needs if self.sensor else not row.needs)
+
+    def apply(self, live: Live) -> bool:
+        """Make the filter this one. Returns False if it stays what it is."""
+        live.restore()
+        if self.entry is None:
+            return True
+        if self.factor == 0.0:
+            live.switch_off(self.entry)
+            return True
+        return live.scale(self.entry, self.factor)
+
+
+def variants_of(tuned: Tuned) -> list[Variant]:
+    """All of them: as it is, without each rule, with each constant scaled."""
+    made = [Variant(BASE, None)]
+    made += [Variant(f"without: {rule.name}", rule) for rule in tuned.rules]
+    for factor in FACTORS:
+        for constant in tuned.constants:
+            made.append(Variant(f"{constant.name} x {factor:g}", constant, factor))
+    return made
+
+
+def main(job: dict[str, Any]) -> None:
+    """job : as of `figures.run`."""
+    tuned: Tuned = job["tuned"]
+    live = Live(tuned)
+    inputs = Inputs(job["data"], job["cache"])
+    rows = [row for row in inputs.rows() if row.screen or not job["screen"]]
+    rows = [row for row in rows if not job["rows"] or any(word in row.name for word in job["rows"])]
+    if job["watch"]:
+        _watch(job, inputs)
+        return
+    chosen = [
+        variant
+        for variant in variants_of(tuned)
+        if variant.entry is None or any(word in variant.name for word in job["only"])
+    ]
+    base: dict[str, dict[str, list]] = {}
+    with ResultsFile(job["results"], {"study": "rules"}) as done:
+        for variant in tqdm(chosen, unit="variant", disable=None, file=sys.stderr):
+            found: dict[str, dict[str, list]] = {}
+            for row in rows:
+                key = f"{variant.name} | {row.name}"
+                if (job["screen"] and not variant.concerns(row)) or (
+                    worth(base, found).clear and job["stop"]
+                ):
+                    continue
+                if key not in done:
+                    case = inputs.case(row)  # is made by the filter as it is
+                    if not variant.apply(live):
+                        break
+                    done[key] = {"figures": judged(case)}
+                    live.restore()
+                found[row.name] = done[key]["figures"]
+            if variant.entry is None:
+                base = found
+
+
+def _watch(job: dict[str, Any], inputs: Inputs) -> None:
+    """The rules over streams and residuals, by the filter as it is."""
+    rows = watching.rows(inputs)
+    rows = [row for row in rows if not job["rows"] or any(word in row.name for word in job["rows"])]
+    chosen = [watching.Patch(BASE, watching.PACKAGES, {}), *watching.patches()]
+    chosen = [
+        one for one in chosen if one.name == BASE or any(word in one.name for word in job["only"])
+    ]
+    with ResultsFile(job["results"], {"study": "rules, watch"}) as done:
+        for patch in tqdm(chosen, unit="variant", disable=None, file=sys.stderr):
+            for row in rows:
+                key = f"{patch.name} | {row.name}"
+                if key not in done and row.of in patch.of:
+                    done[key] = {"said": _said(patch, row)}
+
+
+def _said(patch: watching.Patch, row: watching.Watched) -> Any:
+    """What is said of a row, or the error that a variant makes."""
+    with patch.applied():
+        try:
+            return row.said()
+        except (ArithmeticError, IndexError, KeyError, TypeError, ValueError) as error:
+            return {f"{type(error).__name__}": [0.0, 0.0]}
+
+
+assert set(SENSORS) == {"height", "pressure", "velocity", "range"}  # as MODULES has them
+
+if __name__ == "__main__":
+    main(pickle.loads(Path(sys.argv[1]).read_bytes()))

@@ -1,0 +1,86 @@
+"""What a variant changes, row by row."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+import math
+
+import numpy as np
+
+NOTICED = 0.02  # share by which a figure must change to count
+LEAST = (0.002, 0.02, 0.05, 0.005, 0.05)  # m, NEES, s, rad, s: changes that never count
+HONEST = 3.0  # NEES of an honest filter
+
+CLEAR, CLEAR_ROWS, CLEAR_MEAN = (
+    0.05,
+    3,
+    0.01,
+)  # loss, in so many rows, and mean loss: it is worth it
+
+
+@dataclass
+class Worth:
+    """What a variant changes. rows : how many were run; changed : how many rows change by more than
+    NOTICED; lost : how many are worse by more than CLEAR; worse, better : (share, row), the largest; mean : share, of the 3D RMSE over all
+    spans; nees : of the mean excess over HONEST.
+    """
+
+    rows: int = 0
+    changed: int = 0
+    lost: int = 0
+    same: bool = True
+    worse: tuple[float, str] = (0.0, "")
+    better: tuple[float, str] = (0.0, "")
+    logs: list[float] = field(default_factory=list)
+    excess: list[float] = field(default_factory=list)
+
+    @property
+    def clear(self) -> bool:
+        """Whether the filter is clearly worse: more rows need not be run."""
+        return self.lost >= CLEAR_ROWS and self.mean > CLEAR_MEAN
+
+    @property
+    def mean(self) -> float:
+        """Share by which the 3D RMSE grows, geometric mean over all spans."""
+        return float(np.expm1(np.mean(self.logs))) if self.logs else 0.0
+
+    @property
+    def nees(self) -> float:
+        """By how much the NEES beyond HONEST grows, mean over all spans."""
+        return float(np.mean(self.excess)) if self.excess else 0.0
+
+
+def worth(base: dict, variant: dict) -> Worth:
+    """Worth of a variant, of {row: {span: figures}}."""
+    out = Worth()
+    for row, spans in variant.items():
+        if row not in base:
+            continue
+        out.rows += 1
+        changes = []
+        for span, new in spans.items():
+            old = base[row][span]
+            out.same &= new == old
+            is_time = span == "again"
+            for k, (before, after) in enumerate(zip(old, new)):
+                changes.append(_change(before, after, LEAST[4 if is_time else k], k == 1))
+            if not is_time and old[0] and new[0]:
+                out.logs.append(math.log(new[0] / old[0]))
+                out.excess.append(max(new[1] - HONEST, 0.0) - max(old[1] - HONEST, 0.0))
+        largest, smallest = max(changes), min(changes)
+        out.lost += largest > CLEAR
+        out.changed += largest > NOTICED or smallest < -NOTICED
+        out.worse = max(out.worse, (largest, row))
+        out.better = min(out.better, (smallest, row))
+    return out
+
+
+def _change(before: float | None, after: float | None, least: float, is_nees: bool) -> float:
+    """Share by which a figure grows, 0 where that does not count; of the NEES beyond HONEST only."""
+    if before is None or after is None:
+        return 0.0 if before == after else (math.inf if after is None else -math.inf)
+    if is_nees:
+        before, after = max(before, HONEST), max(after, HONEST)
+    if abs(after - before) < least:
+        return 0.0
+    return (after - before) / max(abs(before), least)

@@ -1,0 +1,123 @@
+"""The study of rules: the tuned copy is the filter, changes while it runs, and changes are judged."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from studies.rules import tuned, watching, work
+from studies.rules.catalogue import RULES, Rule
+from studies.rules.worth import worth
+from uwb_tdoa_ekf.core import curvature, noise
+
+# In another process, as the copy takes the place of the filter: a variance, and the noise that is
+# learned, as they are; with a constant doubled; without a rule; and as they are again
+SCRIPT = """
+import json, pickle, sys
+from pathlib import Path
+
+import numpy as np
+
+made = pickle.loads(Path(sys.argv[1]).read_bytes())
+from studies.rules.tuned import Live
+from uwb_tdoa_ekf.core import curvature
+
+live = Live(made)
+P, x = np.eye(15), np.zeros(3)
+a, b = np.array([1.0, 0.2, 0.0]), np.array([0.0, 2.0, 1.0])
+(smallest,) = [one for one in made.constants if one.name == "curvature.SMALLEST"]
+
+
+def now():
+    return curvature.variance(x, P, a, b)
+
+
+values = [now()]
+live.scale(smallest, 10.0)
+values.append(now())
+live.restore()
+values.append(now())
+print(json.dumps([curvature.__file__, *values]))
+"""
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    return tuned.copy_to(tmp_path_factory.mktemp("copy"))
+
+
+def test_every_rule_of_the_catalogue_stands_in_the_core_once_by_name(made):
+    assert [entry.name for entry in made.rules] and len({rule.name for rule in RULES}) == len(RULES)
+    assert {entry.name for entry in made.rules} == {rule.name for rule in RULES}
+
+
+def test_a_rule_that_is_not_there_is_named(tmp_path):
+    with pytest.raises(ValueError, match="no such place: wings"):
+        tuned.copy_to(tmp_path, (Rule("wings", "noise", "learn", "wings > 2"),))
+
+
+def test_the_constants_of_compiled_functions_are_in_the_table(made):
+    known = {entry.name: entry for entry in made.constants}
+    assert known["noise.LARGEST_OUTLIER"].values == (noise.LARGEST_OUTLIER,)
+    assert known["standing.LANDING_STD"].values == (0.2, 0.2, 0.5)
+    assert known["rest.LONG"].is_count and "state.GRAVITY" not in known
+    places = [entry.place + k for entry in made.constants for k in range(len(entry.values))]
+    assert len(set(places)) == len(places) and max(places) < tuned.FIRST_RULE
+
+
+def test_the_copy_changes_while_it_runs_and_is_the_filter_otherwise(made, tmp_path):
+    import pickle
+
+    import numpy as np
+
+    job = tmp_path / "made.pickle"
+    job.write_bytes(pickle.dumps(made))
+    env = os.environ | {"PYTHONPATH": os.pathsep.join([str(made.folder), *filter(None, sys.path)])}
+    run = [sys.executable, "-c", SCRIPT, str(job)]
+    out = subprocess.run(run, env=env, check=True, capture_output=True, text=True).stdout
+    file, before, doubled, after = json.loads(out)
+    place = np.array([1.0, 0.2, 0.0]), np.array([0.0, 2.0, 1.0])
+    assert file.startswith(str(made.folder))
+    assert before == after == curvature.variance(np.zeros(3), np.eye(15), *place) > 0.0
+    assert doubled == 0.0
+
+
+def test_each_rule_and_constant_is_a_variant(made):
+    variants = work.variants_of(made)
+    assert len(variants) == 1 + len(made.rules) + 2 * len(made.constants)
+    assert len({variant.name for variant in variants}) == len(variants)
+
+
+def test_a_loss_is_told_from_a_gain_and_from_what_does_not_matter():
+    base = {"a": {"air": [0.2, 4.0, 0.0, 0.1]}, "b": {"again": [2.0]}}
+    alike = {"a": {"air": [0.201, 4.01, 0.0, 0.101]}, "b": {"again": [2.04]}}
+    worse = {"a": {"air": [0.3, 2.0, 0.0, 0.1]}, "b": {"again": [None]}}
+    same = worth(base, base)
+    assert same.same and (same.rows, same.changed) == (2, 0)
+    small = worth(base, alike)
+    assert not small.same and small.changed == 0
+    large = worth(base, worse)
+    assert large.changed == 2 and large.worse == (float("inf"), "b")
+    assert large.better[1] == "a" and large.mean == pytest.approx(0.5)
+
+
+def test_what_is_said_less_more_or_later_is_told():
+    before = {"gap": [3.0, 9.0], "sign": [20.0, 30.0]}
+    after = {"gap": [6.0, 9.0], "rate": [4.0, 5.0]}
+    assert watching.differs(before, before) == {}
+    assert watching.differs(before, after) == {"sign": "lost", "rate": "new", "gap": "late"}
+
+
+def test_patches_change_modules_only_while_they_are_applied():
+    made = {patch.name: patch for patch in watching.patches()}
+    from uwb_tdoa_ekf.monitoring import monitor
+    from uwb_tdoa_ekf.streams import ranging_rules
+
+    rules = ranging_rules.RULES
+    with made["monitoring.monitor.LIMIT x 2"].applied():
+        assert monitor.LIMIT == 2 * 16.3
+    with made["without: ranging_rules.rounded"].applied():
+        assert len(ranging_rules.RULES) == len(rules) - 1
+    assert monitor.LIMIT == 16.3 and ranging_rules.RULES is rules
