@@ -27,9 +27,17 @@ from uwb_tdoa_bias.effects import (
 )
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.flight import AIDS, Flight, Tdoas, Truth
+from uwb_tdoa_bias.foundation.flight import Flight, Tdoas, Truth
 from uwb_tdoa_bias.foundation.geometry import tdoa
-from uwb_tdoa_bias.foundation.sensors import BY_POSE, Height, Pressure, Ranges, Velocity
+from uwb_tdoa_bias.foundation.sensors import (
+    BY_POSE,
+    STREAM_OF,
+    Height,
+    Pressure,
+    Ranges,
+    Velocity,
+    measured_on,
+)
 from uwb_tdoa_bias.foundation.sensors.pressure import pressure_at
 
 seeds = st.integers(0, 2**32 - 1)
@@ -170,7 +178,7 @@ def test_is_declared_in_full(effect):
         "tdoa",
         "gyro",
         "accel",
-        *AIDS,
+        *STREAM_OF,
     }
     np.testing.assert_array_equal(effect().bias(random_samples(1)), 0.0)  # no parameter, no effect
     np.testing.assert_array_equal(effect().noise_std(random_samples(1)), 0.0)
@@ -490,8 +498,8 @@ ON_AIDS = [effect for effect in EFFECTS.values() if set(effect.channels) <= set(
 
 
 def felt(seed, n=400):
-    """A Flight on a smooth path with true heights, pressures and velocities, and its AidSamples by
-    stream.
+    """A Flight on a smooth path with true heights, pressures, velocities and yaw rates, and its
+    AidSamples by channel.
     """
     rng, t = np.random.default_rng(seed), np.arange(n) / 25.0
     phase = rng.uniform(0.0, 6.0, 6)
@@ -506,11 +514,17 @@ def felt(seed, n=400):
     angles = np.stack([0.1 * np.sin(t + phase[3]), 0.1 * np.cos(t + phase[4]), 0.3 * t], axis=1)
     truth = Truth(t, p, Rotation.from_euler("xyz", angles).as_quat())
     track = Track(truth)
-    samples = {stream: aid_samples(stream, t, track, t[0]) for stream in BY_POSE}
+    samples = {channel: aid_samples(channel, t, track, t[0]) for channel in BY_POSE}
     streams = {
         "height": Height(t, samples["height"].reading[:, 0]),
         "pressure": Pressure(t, pressure_at(samples["pressure"].reading[:, 0])),
-        "velocity": Velocity(t, samples["velocity"].reading, np.full((n, 3), 0.1)),
+        "velocity": Velocity(
+            t,
+            samples["velocity"].reading,
+            np.full((n, 3), 0.1),
+            samples["yaw_rate"].reading[:, 0],
+            np.full(n, 0.1),
+        ),
     }
     tdoa = Tdoas(t, np.zeros(n, int), np.ones(n, int), np.zeros(n))
     return Flight("f", Anchors.from_positions(np.eye(3)), tdoa, truth=truth, **streams), samples
@@ -522,21 +536,26 @@ def some_values(effect, rng, size=1e-3):
     return {**limits, **{key: size * rng.uniform(0.5, 1.0) for key in keys}}
 
 
-@pytest.mark.parametrize("effect", ON_AIDS)
+OF_EACH_CHANNEL = pytest.mark.parametrize(
+    "effect, channel", [(effect, channel) for effect in ON_AIDS for channel in effect.channels]
+)
+
+
+@OF_EACH_CHANNEL
 @given(st.integers(0, 1000))
-def test_regressors_on_aids_are_what_inject_adds(effect, seed):
+def test_regressors_on_aids_are_what_inject_adds(effect, channel, seed):
     """To first order; at the ends of intervals and of the recording neither is defined."""
     (flight, samples), rng = felt(seed), np.random.default_rng(seed)
-    values, (stream,) = some_values(effect, rng), effect.channels
+    values = some_values(effect, rng)
     made, keys = effect(values), [key for key in values if not key.endswith(("start", "end"))]
-    changed = getattr(made.inject(flight), stream)
-    before, after = getattr(flight, stream).values, changed.values
+    changed = measured_on(made.inject(flight), channel)
+    before, after = measured_on(flight, channel).values, changed.values
     if not np.array_equal(changed.t, flight.truth.t):  # stamps moved: what it reads at the old ones
         after = np.stack(
             [np.interp(flight.truth.t, changed.t, column) for column in after.T], axis=1
         )
     predicted = effect({k: v for k, v in values.items() if k not in keys}).regressors(
-        samples[stream], keys
+        samples[channel], keys
     ) @ [values[key] for key in keys]
     inner, rough = (
         slice(5, -5),
@@ -545,19 +564,37 @@ def test_regressors_on_aids_are_what_inject_adds(effect, seed):
     np.testing.assert_allclose((after - before)[inner], predicted[inner], atol=rough)
 
 
-@pytest.mark.parametrize("effect", ON_AIDS)
-def test_what_is_put_into_an_aid_is_taken_out_of_it_or_out_of_the_residual(effect):
+@OF_EACH_CHANNEL
+def test_what_is_put_into_an_aid_is_taken_out_of_it_or_out_of_the_residual(effect, channel):
     flight, samples = felt(3)
-    (stream,), made = effect.channels, effect(some_values(effect, np.random.default_rng(0), 0.1))
-    back = getattr(EffectSet((made,)).correct_streams(made.inject(flight)), stream)
-    assert not np.array_equal(getattr(made.inject(flight), stream).t, back.t) == (
+    made = effect(some_values(effect, np.random.default_rng(0), 0.1))
+    back = measured_on(EffectSet((made,)).correct_streams(made.inject(flight)), channel)
+    assert not np.array_equal(measured_on(made.inject(flight), channel).t, back.t) == (
         effect.name == "velocity_delay"
     )
-    left = back.values - EffectSet((made,)).uncorrected(samples[stream])
-    np.testing.assert_allclose(left, getattr(flight, stream).values, atol=1e-6)
+    left = back.values - EffectSet((made,)).uncorrected(samples[channel])
+    np.testing.assert_allclose(left, measured_on(flight, channel).values, atol=1e-6)
     np.testing.assert_allclose(back.t, flight.truth.t, atol=1e-9)
-    with pytest.raises(InputError, match=f"holds no {stream}"):
-        made.inject(flight.without(stream))
+    with pytest.raises(InputError, match=f"holds no {effect.channels[0].replace('_', ' ')}"):
+        made.inject(flight.without(STREAM_OF[channel]))
+
+
+def test_a_yaw_rate_that_was_not_measured_has_no_scale():
+    flight, _ = felt(4)
+    silent = replace(flight.velocity, yaw_rate=None, yaw_rate_std=None)
+    with pytest.raises(InputError, match="f: holds no yaw rate, which yaw_rate_scale needs"):
+        EFFECTS["yaw_rate_scale"]({"scale": 0.03}).inject(flight.replaced(velocity=silent))
+    some = np.arange(len(flight.velocity)) % 3 == 0
+    std = np.where(some, np.inf, 0.0)
+    mixed = replace(
+        flight.velocity, yaw_rate=np.where(some, np.nan, flight.velocity.yaw_rate), yaw_rate_std=std
+    )
+    corrected = AidCorrector([EFFECTS["yaw_rate_scale"]({"scale": 0.25})]).correct(
+        "velocity", mixed
+    )
+    np.testing.assert_array_equal(corrected.yaw_rate_std, std)
+    np.testing.assert_allclose(corrected.yaw_rate[~some], flight.velocity.yaw_rate[~some] / 1.25)
+    np.testing.assert_array_equal(corrected.v, flight.velocity.v)
 
 
 def test_aids_are_corrected_the_same_at_once_and_one_by_one_whatever_was_not_measured():
@@ -566,14 +603,17 @@ def test_aids_are_corrected_the_same_at_once_and_one_by_one_whatever_was_not_mea
         "velocity_scale": {"scale": 0.1},
         "velocity_misalignment": {"yaw": 1.5},
         "velocity_delay": {"offset": 0.02},
+        "yaw_rate_scale": {"scale": 0.25},
     }
     corrector = AidCorrector([EFFECTS[name](each) for name, each in values.items()])
     t, v, std = np.arange(n) / 25.0, rng.standard_normal((n, 3)), rng.uniform(0.1, 0.2, (n, 3))
     v[:, 2], std[:, 2] = np.nan, np.inf
     rates = rng.standard_normal(n), np.where(rng.random(n) < 0.5, 0.0, 0.1)
-    late, turned, wider, *kept = corrector.correct("velocity", Velocity(t, v, std, *rates)).columns
-    for column, rate in zip(kept, rates):
-        np.testing.assert_array_equal(column, rate)
+    late, turned, wider, *slower = corrector.correct(
+        "velocity", Velocity(t, v, std, *rates)
+    ).columns
+    for column, rate in zip(slower, rates):
+        np.testing.assert_allclose(column, rate / 1.25, atol=1e-12)
     expected = Rotation.from_euler("z", 1.5).apply(np.where(np.isfinite(v), v, 0.0)) / 1.1
     np.testing.assert_allclose(turned[:, :2], expected[:, :2], atol=1e-12)
     np.testing.assert_allclose(late, t - 0.02)
@@ -586,11 +626,11 @@ def test_aids_are_corrected_the_same_at_once_and_one_by_one_whatever_was_not_mea
     )  # the driver still states none
     single = [
         corrector.correct(
-            "velocity", Velocity(*(column[k : k + 1] for column in (t, v, std)))
+            "velocity", Velocity(*(column[k : k + 1] for column in (t, v, std, *rates)))
         ).columns
         for k in range(n)
     ]
-    for column, whole in enumerate((late, turned, wider)):
+    for column, whole in enumerate((late, turned, wider, *slower)):
         np.testing.assert_allclose(
             np.concatenate([each[column] for each in single]), whole, atol=1e-12
         )
@@ -632,6 +672,6 @@ def test_a_function_of_what_its_channel_does_not_have_is_refused_when_it_is_read
 
 def test_a_function_of_no_channel_is_refused_with_those_that_there_are():
     with pytest.raises(
-        InputError, match="acts on 'gyro'; channels are tdoa, range, gyro.x, .* and velocity.z"
+        InputError, match="acts on 'gyro'; channels are tdoa, range, gyro.x, .* and yaw_rate"
     ):
         SmoothTerm(channel="gyro", covariate="time", knots=(0.0, 1.0))

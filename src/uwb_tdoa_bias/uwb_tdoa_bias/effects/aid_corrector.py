@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..foundation.flight import AIDS
+from ..foundation.sensors import STREAM_OF
 from ..foundation.sensors.sensor import UNKNOWN_STD, UNKNOWN_VARIANCE
 from .affine import IDENTITY
 
@@ -29,23 +30,28 @@ class AidCorrector:
         self._late = {
             stream: sum(effect.stamp_offset(stream) for effect in effects) for stream in AIDS
         }
-        self._undo = {stream: self._inverse(effects, stream) for stream in AIDS}
+        self._undo = {channel: self._inverse(effects, channel) for channel in STREAM_OF}
         self.idle = not any(self._late.values()) and not any(self._undo.values())
 
     @staticmethod
-    def _inverse(effects: Collection[Effect], stream: str) -> Affine | None:
+    def _inverse(effects: Collection[Effect], channel: str) -> Affine | None:
         undo = None
         for effect in effects:
-            model = effect.sensor_model(stream)
+            model = effect.sensor_model(channel)
             if model is not IDENTITY:
                 undo = model.inverse() if undo is None else model.inverse().after(undo)
         return undo
 
     def correct(self, name: str, stream: Stream) -> Stream:
         """The Stream of a sensor, corrected."""
-        undo = self._undo[name]
         if self._late[name]:
             stream = replace(stream, t=stream.t - self._late[name])
+        for channel, part in stream.parts.items():
+            stream = stream.with_part(channel, self._undone(channel, part))
+        return self._undone(name, stream)
+
+    def _undone(self, channel: str, stream: Stream) -> Stream:
+        undo = self._undo[channel]
         if undo is None:
             return stream
         std = getattr(stream, "std", None)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from ..foundation.errors import InputError
+from ..foundation.sensors import STREAM_OF, measured_on, with_measured
 from .affine import IDENTITY, regressors
 from .base import Effect
 
@@ -19,11 +20,14 @@ if TYPE_CHECKING:
     from .samples import AidSamples
 
 
-def need_stream(effect: Effect, flight: Flight, stream: str) -> Stream:
-    """The stream of a Flight; raises InputError if it has none."""
-    part = getattr(flight, stream)
+def need_stream(effect: Effect, flight: Flight, channel: str) -> Stream:
+    """What a Flight holds of a channel of one of the SENSORS, or its "truth"; raises InputError if
+    it has none.
+    """
+    part = measured_on(flight, channel) if channel in STREAM_OF else getattr(flight, channel)
     if part is None:
-        raise InputError(f"{flight.name}: holds no {stream}, which {effect.name} needs.")
+        name = channel.replace("_", " ")
+        raise InputError(f"{flight.name}: holds no {name}, which {effect.name} needs.")
     return part
 
 
@@ -46,6 +50,6 @@ class AidEffect(Effect):
         )
 
     def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
-        (stream,) = self.channels
-        part = need_stream(self, flight, stream)
-        return flight.replaced(**{stream: part.sensed(self.aid()(part.values))})
+        (channel,) = self.channels
+        part = need_stream(self, flight, channel)
+        return with_measured(flight, channel, part.sensed(self.aid()(part.values)))

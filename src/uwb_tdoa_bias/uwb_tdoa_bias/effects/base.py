@@ -281,7 +281,7 @@ class Effect:
 
     def sensor_model(self, channel: str) -> Affine:
         """Affine from the true to the measured values of "gyro" (rad/s), "accel" (m/s^2) or
-        "velocity" (m/s), body axes, or of "height" (m).
+        "velocity" (m/s), body axes, of "yaw_rate" (rad/s), or of "height" (m).
         """
         return IDENTITY
 

@@ -1,4 +1,4 @@
-"""All declared effects, by name. The file of each is named after it."""
+"""All declared effects, by name."""
 
 from .accel_bias import AccelBias
 from .accel_scale import AccelScale
@@ -33,7 +33,7 @@ from .truth_frame import TruthFrame
 from .truth_time_offset import TruthTimeOffset
 from .velocity_delay import VelocityDelay
 from .velocity_misalignment import VelocityMisalignment
-from .velocity_scale import VelocityScale
+from .velocity_scale import VelocityScale, YawRateScale
 from .velocity_slip import VelocitySlip
 
 EFFECTS = {
@@ -67,6 +67,7 @@ EFFECTS = {
         FloorStep,
         BarometerDrift,
         VelocityScale,
+        YawRateScale,
         VelocityMisalignment,
         VelocityDelay,
         VelocitySlip,

@@ -11,7 +11,7 @@ import numpy as np
 from ..foundation.anchors import Anchors
 from ..foundation.geometry import ranges, tdoa_each
 from ..foundation.later import rotations
-from ..foundation.sensors import SENSORS
+from ..foundation.sensors import COMPARED
 from .motion import POSE_LAG, Motion, motion_at, preceding
 
 if TYPE_CHECKING:
@@ -206,11 +206,12 @@ class ImuSamples:
 class AidSamples:
     """Measurements of a sensor, as effects see them.
 
-    channel : name of the stream; t (n,) s; p (n, 3) m, world; start : s, as of Samples.
-    reading (n, k): what it should have read: of a range finder over the ground at z = 0, m; of a
-    barometer the height, m; of a velocity that in the body frame, m/s. change (n, k): how fast that
-    changes, per s. up (n,): cosine of the tilt, NaN where the attitude is not known; motion :
-    Motion; vibration (n,) as of Samples, or None.
+    channel : name of the stream, or of one of its parts; t (n,) s; p (n, 3) m, world; start : s, as
+    of Samples. reading (n, k): what it should have read: of a range finder over the ground at
+    z = 0, m; of a barometer the height, m; of a velocity that in the body frame, m/s; of a yaw rate
+    that about the body's z, rad/s. change (n, k): how fast that changes, per s. up (n,): cosine of
+    the tilt, NaN where the attitude is not known; motion : Motion; vibration (n,) as of Samples, or
+    None.
     """
 
     channel: str
@@ -316,19 +317,19 @@ def true_samples(flight: Flight, kind: type[Samples] = Samples) -> tuple[Samples
 
 
 def aid_samples(
-    stream: str,
+    channel: str,
     t: np.ndarray,
     track: Track,
     start: float = 0.0,
     vibration: np.ndarray | None = None,
 ) -> AidSamples:
-    """AidSamples of a stream at stamps t (n,), s, of a Track. start, vibration : see there."""
+    """AidSamples of a channel at stamps t (n,), s, of a Track. start, vibration : see there."""
     before, reading, after = (
-        SENSORS[stream].compared.reading(track, t + late) for late in (-0.5 * STEP, 0.0, 0.5 * STEP)
+        COMPARED[channel].reading(track, t + late) for late in (-0.5 * STEP, 0.0, 0.5 * STEP)
     )
     change = (after - before) / STEP
     return AidSamples(
-        stream,
+        channel,
         t,
         track.positions(t),
         start,

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..foundation.compiled import compiled
 from ..foundation.errors import InputError
-from ..foundation.sensors import BY_POSE, SENSORS
+from ..foundation.sensors import BY_POSE, COMPARED
 from .base import Effect, known_anchors, once_per_anchors
 from .covariates import (
     CATEGORIES,
@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 DEGREE = 2
 GONE = 4 * FADE  # share of the width of a domain beyond which nothing is left of a function
 IMU_CHANNELS = tuple(f"{sensor}.{axis}" for sensor in ("gyro", "accel") for axis in "xyz")
-AID_CHANNELS = tuple(name + axis for name in BY_POSE for axis in SENSORS[name].compared.axes)
+AID_CHANNELS = tuple(name + axis for name in BY_POSE for axis in COMPARED[name].axes)
 FORMS = ("common", "arrival", "anchor", "pair", "direction")
 OF_LINKS = ("pair", "direction")  # forms with a function for a pair of anchors
 TYPICAL = {"tdoa": 0.1, "gyro": 0.1, "accel": 0.5}  # m, rad/s, m/s^2

@@ -25,4 +25,4 @@ class VelocityDelay(StampEffect):
         "Li and Mourikis, Int. J. Robotics Research 33, 2014: online temporal calibration of "
         "camera and IMU"
     )
-    channels = ("velocity",)
+    channels = ("velocity", "yaw_rate")

@@ -1,6 +1,8 @@
-"""The velocity is measured with a wrong length."""
+"""The velocity, or the yaw rate of wheels, is measured with a wrong length."""
 
 from __future__ import annotations
+
+from typing import ClassVar
 
 import numpy as np
 
@@ -25,19 +27,27 @@ class VelocityScale(AidEffect):
         "odometry"
     )
     channels = ("velocity",)
+    axes: ClassVar[int] = 3
+    remedy: ClassVar[str] = (
+        "Calibrate the velocity over a known distance (radius of the wheels, focal length)"
+    )
 
     def aid(self) -> Affine:
-        return Affine((1.0 + self.values.get("scale", 0.0)) * np.eye(3), np.zeros(3))
+        scale = 1.0 + self.values.get("scale", 0.0)
+        return Affine(scale * np.eye(self.axes), np.zeros(self.axes))
 
     def advice(self) -> tuple[str, ...]:
         off = self.directed("scale", "too fast", "too slow", "%", 100.0)
-        return (
-            (
-                (
-                    "Calibrate the velocity over a known distance (radius of the wheels, focal "
-                    f"length): it is {off}."
-                ),
-            )
-            if off
-            else ()
-        )
+        return (f"{self.remedy}: it is {off}.",) if off else ()
+
+
+class YawRateScale(VelocityScale):
+    """Measured yaw rate = (1 + `scale`) true one."""
+
+    name = "yaw_rate_scale"
+    physics = "the driver of the wheels assumes a wrong track width, or a wrong radius"
+    confounded_with = ()
+    distinguished_by = {}
+    channels = ("yaw_rate",)
+    axes = 1
+    remedy = "Calibrate the yaw rate over known turns (track width, radius of the wheels)"

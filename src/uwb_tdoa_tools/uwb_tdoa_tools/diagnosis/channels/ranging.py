@@ -9,7 +9,7 @@ import numpy as np
 from uwb_tdoa_bias.effects import SmoothTerm
 from uwb_tdoa_bias.effects.covariates import OF_ARRIVAL, OF_MOTION, OF_TDOA
 from uwb_tdoa_bias.effects.samples import RADIO
-from uwb_tdoa_bias.foundation.sensors import SENSORS
+from uwb_tdoa_bias.foundation.sensors import COMPARED
 
 from .base import Channel
 from .extra import extra_names
@@ -48,7 +48,7 @@ class Ranging(Channel[RangeResidual]):
 
     def __init__(self, name: str) -> None:
         self.name = name
-        vars(self).update(vars(SENSORS[name].compared))
+        vars(self).update(vars(COMPARED[name]))
 
     def residual(self, comparison: Comparison) -> RangeResidual | None:
         known = all(comparison.reference.positions_known) or comparison.view.innovations is not None
