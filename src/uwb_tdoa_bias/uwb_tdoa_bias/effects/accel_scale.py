@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from .affine import Affine
-from .imu_error import ImuEffect, readings
+from .imu_error import BESIDE_BIAS, ImuEffect, readings
 
 
 class AccelScale(ImuEffect):
@@ -24,6 +24,7 @@ class AccelScale(ImuEffect):
     }
     reference = "BMI088 data sheet: sensitivity tolerance 0.7 %"
     channels = ("accel",)
+    price = BESIDE_BIAS
 
     def accel(self) -> Affine:
         return Affine(np.eye(3) + np.diag(self.vector()), np.zeros(3))

@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from .samples import ImuSamples
 
 
+BESIDE_BIAS = 2.0  # price of what is a bias of the accelerometer, where nothing tilts or manoeuvres
+
+
 class ImuEffect(Effect):
     """An effect on inertial samples.
 

@@ -10,7 +10,7 @@ import numpy as np
 from ..foundation.later import rotations
 from .affine import Affine
 from .base import need_truth
-from .imu_error import ImuEffect, need_imu
+from .imu_error import BESIDE_BIAS, ImuEffect, need_imu
 from .samples import Track
 
 if TYPE_CHECKING:
@@ -42,6 +42,7 @@ class ImuGravity(ImuEffect):
     }
     reference = "gravity is 9.780 to 9.832 m/s^2 between equator and pole"
     channels = ("accel",)
+    price = BESIDE_BIAS
 
     @classmethod
     def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:
