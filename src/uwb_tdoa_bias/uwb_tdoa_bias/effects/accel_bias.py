@@ -21,6 +21,7 @@ class AccelBias(ImuEffect):
     confounded_with = ("imu_misalignment", "imu_gravity", "accel_scale")
     reference = "BMI088 data sheet: zero-g offset 20 mg"
     channels = ("accel",)
+    sizable_share = 0.3  # one axis: a scale of the others would take their place
 
     def accel(self) -> Affine:
         return Affine(np.eye(3), self.vector())

@@ -99,6 +99,9 @@ class Effect:
     unused: ClassVar[str] = (
         "nodes cannot, or need not, take it out"  # why not, where it is not usable
     )
+    # share of the parameters of a group that must not be negligible: of fewer a smaller group says
+    # as much
+    sizable_share: ClassVar[float] = 0.5
     # channels, one of which must be there too: else what it is compared with may be as wrong
     witnesses: ClassVar[tuple[str, ...]] = ()
     weighed: ClassVar[bool] = (
