@@ -188,8 +188,8 @@ def _why_not_blindly(calibration: Calibration) -> str | None:
         )
     if calibration.before < GAINED * calibration.after:
         return (
-            f"it gains too little to be sure that it does no harm: {calibration.as_text()}; fly "
-            "more, or keep what there is"
+            f"it gains too little to be sure that it does no harm: {calibration.as_text()}; "
+            "record more, or keep what there is"
         )
     return None
 

@@ -9,7 +9,9 @@ import numpy as np
 
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.wording import listed
+from uwb_tdoa_bias.foundation.flight import Truth
 
+from ..diagnosis.references import Nothing
 from ..diagnosis.self_calibration import SelfCalibration, Tape, self_calibrate
 from ..diagnosis.self_calibration.solve import IMPROVED
 from ..estimate import FlightEstimator
@@ -33,7 +35,8 @@ class Prospect:
     """seconds : s in the air that were looked at, and `total` that there are; given, expected : (N,
     3) m, standard deviations of the anchors before, and as they are to be expected of all flights;
     before, left : m, of the slow innovations; path : (3,) m, its extent;
-    hall : (3,) m, of the anchors; ids : of the anchors; why_not : what keeps a survey from being
+    hall : (3,) m, of the anchors; axes : names of those that it can move along, "xy" on a floor;
+    ids : of the anchors; why_not : what keeps a survey from being
         applied so far, or None.
     """
 
@@ -45,6 +48,7 @@ class Prospect:
     left: float
     path: np.ndarray
     hall: np.ndarray
+    axes: str
     ids: tuple[int, ...]
     why_not: str | None
 
@@ -61,7 +65,7 @@ class Prospect:
     def sentences(self) -> list[str]:
         """For people."""
         lines = [
-            f"from {self.seconds:.0f} s of {self.total:.0f} s in the air: of the innovations "
+            f"from {self.seconds:.0f} s of {self.total:.0f} s in motion: of the innovations "
             f"{100 * self.before:.1f} cm are slow with the anchors as "
             f"given, and {100 * self.left:.1f} cm with others",
             f"all flights are likely to tell {int(self.better.sum())} of {self.better.size} "
@@ -74,19 +78,19 @@ class Prospect:
         unseen = [str(i) for i, row in zip(self.ids, self.better) if not row.any()]
         if unseen:
             lines.append(
-                f"nothing is told of anchors {listed(unseen)}: fly closer to them, on all "
+                f"nothing is told of anchors {listed(unseen)}: move closer to them, on all "
                 "sides, high and low"
             )
-        for axis, size, room in zip("xyz", self.path, self.hall):
+        for axis, size, room in zip(self.axes, self.path, self.hall):
             if size < MOVES * room:
                 lines.append(
                     f"along {axis} the tag moves by {size:.1f} m among anchors that are "
-                    f"{room:.1f} m apart: fly more of it"
+                    f"{room:.1f} m apart: move over more of it"
                 )
         lines.append(
             "the flights are exciting enough"
             if self.exciting
-            else "the flights are not exciting enough: fly more, and elsewhere"
+            else "the flights are not exciting enough: move more, and elsewhere"
         )
         return lines
 
@@ -108,7 +112,9 @@ def prospect(
     found = self_calibrate([part], tape, base, config, (), progress)
     seconds = found.seconds
     total = max(seconds, sum(map(_duration, flights)) * seconds / max(_duration(part), 1e-9))
-    path = np.quantile(FlightEstimator(config, base)(part).odometry.p, [0.02, 0.98], axis=0)
+    estimate = FlightEstimator(config, base)(part).odometry
+    path = np.quantile(estimate.p, [0.02, 0.98], axis=0)
+    on_floor = Nothing(config).on_floor(Truth(estimate.t, estimate.p, estimate.q))
     anchors = longest.anchors
     return Prospect(
         seconds,
@@ -119,6 +125,7 @@ def prospect(
         found.left,
         np.ptp(path, axis=0),
         np.ptp(anchors.positions, axis=0),
+        "xy" if on_floor else "xyz",
         tuple(anchors.ids.tolist()),
         found.why_not,
     )

@@ -107,7 +107,7 @@ def as_text(found: SelfCalibration) -> str:
     ]
     if unseen:
         lines.append(
-            f"nothing new is told of anchors {', '.join(unseen)}: fly closer to them, on all "
+            f"nothing new is told of anchors {', '.join(unseen)}: move closer to them, on all "
             "sides, high and low"
         )
     since = (

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.foundation.flight import Truth
 from uwb_tdoa_ekf.core import auxiliary
@@ -12,6 +14,8 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import without_unknown_offset
 from uwb_tdoa_ekf.sensitivity import RANGES, TDOAS, record_innovations
 
+from ...scoring.metrics import judged_part
+from ...scoring.phases import AIRBORNE
 from .base import Reference, ReferenceView
 
 if TYPE_CHECKING:
@@ -22,6 +26,7 @@ if TYPE_CHECKING:
 
     from ..constraints import Constraint
 
+FLOWN_SHARE = 0.25  # of the time between the first and the last pose in the air; less is no flight
 TRUTHS = "_truth"  # how streams are called in which a simulation tells what was true
 
 
@@ -61,6 +66,20 @@ class Nothing(Reference):
 
     def prepare(self, flight: Flight) -> Flight:
         return without_truth(flight)
+
+    def on_floor(self, poses: Truth) -> bool:
+        """Return whether poses are those of a vehicle that never leaves the floor: an estimate of
+        its height is above that of a flight now and then, and not for long.
+        """
+        part, first, last = judged_part(poses)
+        if self._config.planar or part != "in_the_air":
+            return True
+        inside = (poses.t >= first) & (poses.t <= last)
+        return bool(np.mean(poses.p[inside, 2] > AIRBORNE) < FLOWN_SHARE)
+
+    def span(self, flight: Flight, poses: Truth) -> tuple[float, float]:
+        flat = replace(poses, p=poses.p * [1.0, 1.0, 0.0]) if self.on_floor(poses) else poses
+        return super().span(flight, flat)
 
     def view(self, flight: Flight, effects: EffectSet) -> ReferenceView:
         config, streams, by = self._config, self._streams, Corrector(flight.anchors, effects)
