@@ -52,4 +52,5 @@ class AidEffect(Effect):
     def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
         (channel,) = self.channels
         part = need_stream(self, flight, channel)
-        return with_measured(flight, channel, part.sensed(self.aid()(part.values)))
+        changed: Flight = with_measured(flight, channel, part.sensed(self.aid()(part.values)))
+        return changed

@@ -5,7 +5,7 @@ line here.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import Any
 
 from . import height, pressure, ranges, velocity
 from .height import Height
@@ -13,9 +13,6 @@ from .pressure import Pressure
 from .ranges import Ranges
 from .sensor import Sensor, Stream
 from .velocity import Velocity
-
-if TYPE_CHECKING:
-    from ..flight import Flight
 
 SENSORS = {
     each.SENSOR.name: each.SENSOR for each in (height, pressure, velocity, ranges)
@@ -39,14 +36,14 @@ BY_POSE = tuple(
 )  # these are compared with poses, others with anchors too
 
 
-def measured_on(flight: Flight, channel: str) -> Stream | None:
+def measured_on(flight: Any, channel: str) -> Stream | None:
     """What a Flight holds of a channel of the diagnosis; None if nothing."""
     name = STREAM_OF[channel]
     stream: Stream | None = getattr(flight, name)
     return stream if stream is None or channel == name else stream.parts.get(channel)
 
 
-def with_measured(flight: Flight, channel: str, part: Stream) -> Flight:
+def with_measured(flight: Any, channel: str, part: Stream) -> Any:
     """The Flight with another Stream of a channel."""
     name = STREAM_OF[channel]
     whole = part if channel == name else getattr(flight, name).with_part(channel, part)
