@@ -20,7 +20,7 @@ class VelocityScale(AidEffect):
     typical = 0.1
     example = "scale"
     physics = "a wheel of another radius, a wrong focal length or height of optical flow"
-    confounded_with = ("velocity_slip",)
+    confounded_with: ClassVar[tuple[str, ...]] = ("velocity_slip",)
     distinguished_by = {"velocity_slip": "a longer flight: a scale stays, slip ends"}
     reference = (
         "Borenstein and Feng, IEEE Trans. Robotics and Automation 12, 1996: systematic errors of "
