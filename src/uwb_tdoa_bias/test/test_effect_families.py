@@ -184,14 +184,16 @@ def test_aids_are_corrected_the_same_at_once_and_one_by_one_whatever_was_not_mea
         "velocity_scale": {"scale": 0.1},
         "velocity_misalignment": {"yaw": 1.5},
         "velocity_delay": {"offset": 0.02},
+        "yaw_rate_scale": {"scale": 0.25},
     }
     corrector = AidCorrector([EFFECTS[name](each) for name, each in values.items()])
     t, v, std = np.arange(n) / 25.0, rng.standard_normal((n, 3)), rng.uniform(0.1, 0.2, (n, 3))
     v[:, 2], std[:, 2] = np.nan, np.inf
     rates = rng.standard_normal(n), np.where(rng.random(n) < 0.5, 0.0, 0.1)
-    late, turned, wider, *kept = corrector.correct("velocity", Velocity(t, v, std, *rates)).columns
-    for column, rate in zip(kept, rates):
-        np.testing.assert_array_equal(column, rate)
+    velocity = Velocity(t, v, std, *rates)
+    late, turned, wider, *slower = corrector.correct("velocity", velocity).columns
+    for column, rate in zip(slower, rates):
+        np.testing.assert_allclose(column, rate / 1.25, atol=1e-12)
     expected = Rotation.from_euler("z", 1.5).apply(np.where(np.isfinite(v), v, 0.0)) / 1.1
     np.testing.assert_allclose(turned[:, :2], expected[:, :2], atol=1e-12)
     np.testing.assert_allclose(late, t - 0.02)
@@ -204,14 +206,30 @@ def test_aids_are_corrected_the_same_at_once_and_one_by_one_whatever_was_not_mea
     )  # the driver still states none
     single = [
         corrector.correct(
-            "velocity", Velocity(*(column[k : k + 1] for column in (t, v, std)))
+            "velocity", Velocity(*(column[k : k + 1] for column in (t, v, std, *rates)))
         ).columns
         for k in range(n)
     ]
-    for column, whole in enumerate((late, turned, wider)):
+    for column, whole in enumerate((late, turned, wider, *slower)):
         np.testing.assert_allclose(
             np.concatenate([each[column] for each in single]), whole, atol=1e-12
         )
+
+
+def test_a_yaw_rate_that_was_not_measured_has_no_scale():
+    n, scale = 30, EFFECTS["yaw_rate_scale"]({"scale": 0.25})
+    t, v = np.arange(n) / 25.0, np.ones((n, 3))
+    silent = Velocity(t, v, np.full((n, 3), 0.1))
+    flight = Flight("f", ANCHORS, Tdoas(t, t, t, t), velocity=silent)
+    with pytest.raises(InputError, match="f: holds no yaw rate, which yaw_rate_scale needs"):
+        scale.inject(flight)
+    some = np.arange(n) % 3 == 0
+    std, rate = np.where(some, np.inf, 0.0), np.where(some, np.nan, 0.5)
+    mixed = Velocity(t, v, np.full((n, 3), 0.1), rate, std)
+    corrected = AidCorrector([scale]).correct("velocity", mixed)
+    np.testing.assert_array_equal(corrected.yaw_rate_std, std)
+    np.testing.assert_allclose(corrected.yaw_rate[~some], 0.4)
+    np.testing.assert_array_equal(corrected.v, v)
 
 
 def test_ids_are_exchanged_at_once_and_signs_after_them():

@@ -27,8 +27,16 @@ from uwb_tdoa_bias.effects import (
 from uwb_tdoa_bias.effects.stamps import StampEffect
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.flight import AIDS, Flight, Imu, Tdoas, Truth
-from uwb_tdoa_bias.foundation.sensors import BY_POSE, Height, Pressure, Ranges, Velocity
+from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
+from uwb_tdoa_bias.foundation.sensors import (
+    BY_POSE,
+    STREAM_OF,
+    Height,
+    Pressure,
+    Ranges,
+    Velocity,
+    measured_on,
+)
 from uwb_tdoa_bias.foundation.sensors.pressure import pressure_at
 
 DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "effects.md"
@@ -73,7 +81,13 @@ def flight_with_all(seed, n=400):
         imu=Imu(t, rng.standard_normal((n, 3)), rng.standard_normal((n, 3)) + [0.0, 0.0, 9.8]),
         height=Height(t, reading["height"][:, 0]),
         pressure=Pressure(t, pressure_at(reading["pressure"][:, 0])),
-        velocity=Velocity(t, reading["velocity"], np.full((n, 3), 0.1)),
+        velocity=Velocity(
+            t,
+            reading["velocity"],
+            np.full((n, 3), 0.1),
+            reading["yaw_rate"][:, 0],
+            np.full(n, 0.1),
+        ),
         range=Ranges(late, row, d, np.zeros(len(late))),
     )
 
@@ -91,17 +105,24 @@ def made(effect, size=0.1, rng=None):
     return effect({**limits, **sizes})
 
 
+def part_of(flight, channel):
+    """The stream of a channel of a Flight, "truth" included."""
+    if channel in ("gyro", "accel"):
+        return flight.imu
+    return measured_on(flight, channel) if channel in STREAM_OF else getattr(flight, channel)
+
+
 def values_of(flight, channel):
     """Values of a channel of a Flight, "truth" included."""
+    part = part_of(flight, channel)
     if channel in ("gyro", "accel"):
-        return getattr(flight.imu, channel)
-    part = getattr(flight, channel)
+        return getattr(part, channel)
     return getattr(part, {"truth": "p", "tdoa": "d", "range": "d"}.get(channel, "values"))
 
 
 def labels_of(flight, channel):
     """Stamps and ids of a channel of a Flight."""
-    part = getattr(flight, {"gyro": "imu", "accel": "imu"}.get(channel, channel))
+    part = part_of(flight, channel)
     ids = {"tdoa": ("a", "b"), "range": ("anchor",)}.get(channel, ())
     return np.stack([part.t, *(getattr(part, name) for name in ids)])
 
@@ -110,7 +131,7 @@ def samples_of(flight, channel):
     """Samples of a sensor of a Flight for effects on it."""
     track = Track(flight.truth)
     if channel in BY_POSE:
-        return aid_samples(channel, getattr(flight, channel).t, track, flight.tdoa.t[0])
+        return aid_samples(channel, measured_on(flight, channel).t, track, flight.tdoa.t[0])
     t, reading = flight.imu.t, getattr(flight.imu, channel)
     up = Rotation.from_quat(track.attitudes(t)).inv().apply([0.0, 0.0, 1.0])
     unused = None
@@ -123,7 +144,7 @@ def test_is_declared_in_full(effect):
     assert effect.bound > effect.negligible > 0.0 and effect.prior_std > 0.0
     assert effect.unit and effect.reference and effect.physics
     assert set(effect.distinguished_by) <= set(effect.confounded_with) <= set(EFFECTS)
-    assert set(effect.channels) <= {"tdoa", "gyro", "accel", *AIDS}
+    assert set(effect.channels) <= {"tdoa", "gyro", "accel", *STREAM_OF}
     np.testing.assert_array_equal(effect().bias(random_samples(1)), 0.0)  # no parameter, no effect
     np.testing.assert_array_equal(effect().noise_std(random_samples(1)), 0.0)
     bound = effect.bound_of(effect.example)
@@ -209,9 +230,9 @@ def test_what_is_injected_is_corrected(effect):
 @pytest.mark.parametrize("effect", [effect for effect in ALL if effect not in NOISE])
 def test_a_flight_without_its_stream_is_refused(effect):
     flight, channel = flight_with_all(1), effect.channels[0]
-    stream = "imu" if channel in ("gyro", "accel") else channel
-    if stream in ("imu", *BY_POSE) or effect.name == "range_delay":
-        words = {"imu": "inertial samples"}.get(stream, stream)
+    stream = "imu" if channel in ("gyro", "accel") else STREAM_OF.get(channel, channel)
+    if stream == "imu" or channel in BY_POSE or effect.name == "range_delay":
+        words = "inertial samples" if stream == "imu" else channel.replace("_", " ")
         lacking = replace(flight, **{stream: None})
     elif issubclass(effect, (LabelEffect, StampEffect)):
         return

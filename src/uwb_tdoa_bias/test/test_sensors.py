@@ -13,6 +13,7 @@ from uwb_tdoa_bias.foundation.sensors import (
     DIAGNOSED,
     LOCATING,
     SENSORS,
+    STREAM_OF,
     Height,
     Ranges,
     Velocity,
@@ -100,7 +101,9 @@ def test_its_parameters_begin_with_the_switch(name):
 
 
 def test_registries_of_a_part():
-    assert LOCATING == ("range",) and set(BY_POSE) == {"height", "pressure", "velocity"}
+    assert LOCATING == ("range",)
+    assert set(BY_POSE) == {"height", "pressure", "velocity", "yaw_rate"}
+    assert STREAM_OF == {**dict(zip(SENSORS, SENSORS)), "yaw_rate": "velocity"}
     assert set(DIAGNOSED) - set(BY_POSE) == RADIO.keys() - {
         "tdoa"
     }  # distances to anchors, of which effects on arrivals know

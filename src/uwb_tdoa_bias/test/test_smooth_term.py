@@ -129,7 +129,7 @@ def test_a_function_of_what_its_channel_does_not_have_is_refused_when_it_is_read
 
 def test_a_function_of_no_channel_is_refused_with_those_that_there_are():
     with pytest.raises(
-        InputError, match="acts on 'gyro'; channels are tdoa, range, gyro.x, .* and velocity.z"
+        InputError, match="acts on 'gyro'; channels are tdoa, range, gyro.x, .* and yaw_rate"
     ):
         SmoothTerm(channel="gyro", covariate="time", knots=(0.0, 1.0))
 
@@ -219,6 +219,12 @@ def found_term(values, covariate, form, knots, shape, channel="tdoa"):
             "the gyroscope reads 0.20 ± 0.01 rad/s too little about y for each m/s^2 more of "
             "accel z, below 10 m/s^2 "
             "(seen from 8 m/s^2 to 12 m/s^2)",
+        ),
+        (
+            found_term({"c0": 0.0, "c1": 0.4}, "time", "common", (0.0, 4.0), "line", "yaw_rate"),
+            "",
+            "each value of yaw_rate is 0.100 ± 0.005 rad/s larger for each s more of time "
+            "(seen from 0 s to 4 s)",
         ),
     ],
 )

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from uwb_tdoa_bias.effects import EFFECTS
-from uwb_tdoa_bias.foundation.sensors import BY_POSE
+from uwb_tdoa_bias.effects import EFFECTS, Track
+from uwb_tdoa_bias.foundation.sensors import BY_POSE, COMPARED
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.constraints import Mark
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
@@ -69,6 +69,7 @@ SIZES = {
     ),
     "barometer_drift": ({"rate": 0.01}, {"rate": 0.05}),
     "velocity_scale": ({"scale": 0.03}, {"scale": 0.15}),
+    "yaw_rate_scale": ({"scale": 0.03}, {"scale": 0.15}),
     "velocity_misalignment": ({"yaw": 0.03}, {"yaw": 0.3}),
     "velocity_delay": ({"offset": 0.04}, {"offset": 0.15}),
     "velocity_slip": (
@@ -78,20 +79,21 @@ SIZES = {
 }
 AIDED = tuple(
     name for name in SIZES if set(EFFECTS[name].channels) <= set(BY_POSE)
-)  # effects on height, pressure, velocity
+)  # effects on height, pressure, velocity, yaw rate
 RANGED = (
     "range_offset",
     "range_delay",
 )  # effects on ranges alone, of which `study diagnose-ranges` tells
 MARK_TIME, MARK_STD = 2.0, 0.05  # s, m
 NOISES = {"height_noise": 0.01, "pressure_noise": 0.1, "velocity_noise": 0.05}
+YAW_RATE_NOISE = 0.02  # rad/s
 
 
 def clean_flight(seed, duration=50.0, aided=False, ranged=False):
-    """A simulated flight without any effect. aided : with height, pressure and velocity; ranged :
-    with distances to anchors.
+    """A simulated flight without any effect. aided : with height, pressure, velocity and yaw rate;
+    ranged : with distances to anchors.
     """
-    return simulate(
+    flight = simulate(
         SimulationConfig(
             seed=seed,
             duration=duration,
@@ -103,6 +105,18 @@ def clean_flight(seed, duration=50.0, aided=False, ranged=False):
             **({"range_noise": 0.1} if ranged else {}),
         )
     )
+    return with_yaw_rate(flight, YAW_RATE_NOISE, seed) if aided else flight
+
+
+def with_yaw_rate(flight, noise, seed=0):
+    """The Flight with yaw rates beside its velocities, those of its ground truth and white noise,
+    rad/s.
+    """
+    velocity = flight.velocity
+    true = COMPARED["yaw_rate"].reading(Track(flight.truth), velocity.t)[:, 0]
+    rate = true + noise * np.random.default_rng([seed, 35]).standard_normal(len(true))
+    std = np.full(len(true), noise)
+    return flight.replaced(velocity=replace(velocity, yaw_rate=rate, yaw_rate_std=std))
 
 
 def effect_of(name, large, seed):

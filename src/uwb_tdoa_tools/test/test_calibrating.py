@@ -5,10 +5,12 @@ import json
 
 import numpy as np
 import pytest
+from test_bag_odometry import ODOMETRY, bag_of
 
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
 from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.flight import Tdoas
+from uwb_tdoa_bias.foundation.flight import Tdoas, Truth
+from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import without_offset
 from uwb_tdoa_ekf.streams import ERROR, Finding
 from uwb_tdoa_tools import calibrating as library
@@ -16,6 +18,8 @@ from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.calibrating import Calibration, between, prospect, split, without_truth
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.commands import calibrate
+from uwb_tdoa_tools.diagnosis.noise import write_parameters
+from uwb_tdoa_tools.diagnosis.references import Nothing
 from uwb_tdoa_tools.estimate import FlightEstimator
 from uwb_tdoa_tools.scoring.evaluation import score_of
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
@@ -282,3 +286,48 @@ def test_bad_usage_is_one_sentence(room, monkeypatch, capsys, words, sentence):
     stub(monkeypatch, GOOD, [])
     assert calibrate.main(words) == 2
     assert sentence in capsys.readouterr().err
+
+
+# --- a vehicle that never leaves the floor ---
+
+
+@pytest.mark.slow
+def test_a_rover_with_odometry_of_its_wheels_is_calibrated(tmp_path):
+    flight = simulate(SimulationConfig.of("rover", seed=3, duration=60.0, wheel_scale=0.03))
+    path = bag_of(flight, tmp_path, ("/velocity/odometry", ODOMETRY, flight.velocity))
+    out = tmp_path / "calibrated"
+    words = [str(path), "-p", "planar:=true", "-p", "fixed_height:=0.0", "--out", str(out)]
+    assert calibrate.main(words) == 0
+    found = {one.name: one for one in EffectSet.from_yaml(out / "effects.yaml").effects}
+    for name in ("velocity_scale", "yaw_rate_scale"):
+        assert abs(found[name].values["scale"] - 0.03) < 3.0 * found[name].std["scale"]
+    config = FilterConfig.from_yaml(
+        out / "ekf_node.yaml"
+    )  # what the printed lines start the nodes by
+    assert config.planar and config.fixed_height == 0.0
+    told = json.loads((out / "calibration.json").read_text())
+    assert told["offered"] and told["after"] < 0.8 * told["before"]
+
+
+def test_parameters_that_were_given_are_written_beside_the_noise(tmp_path):
+    given = FilterConfig(planar=True, fixed_height=0.1, use_imu=False, tdoa_std=0.5)
+    read = FilterConfig.from_yaml(write_parameters(tmp_path / "ekf_node.yaml", 0.07, given))
+    assert read == replace(given, tdoa_std=0.07)
+
+
+@pytest.mark.parametrize(
+    ("height", "planar", "on_floor"),
+    [(0.0, False, True), (1.0, False, False), (1.0, True, True), (0.15, False, True)],
+)
+def test_a_height_that_is_estimated_above_the_floor_now_and_then_is_no_flight(
+    height, planar, on_floor
+):
+    t = np.linspace(0.0, 60.0, 3001)
+    along = np.clip(t - 5.0, 0.0, 50.0)
+    z = height * (along > 0.0) * (along < 50.0) + 0.1 * np.sin(7.0 * t) + 0.1 * np.cos(3.0 * t)
+    poses = Truth(t, np.column_stack([0.2 * along, np.zeros(len(t)), z]), None)
+    reference = Nothing(FilterConfig(planar=planar))
+    assert reference.on_floor(poses) == on_floor
+    flight = simulate(SimulationConfig.of("rover", duration=12.0))
+    first, last = reference.span(flight, poses)
+    assert 5.0 < first < 8.0 and 52.0 < last < 56.0

@@ -5,7 +5,7 @@ that are those of the written model.
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.effects import EffectSet
+from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.channels.inertial import _turns
@@ -18,14 +18,12 @@ from uwb_tdoa_tools.simulation import ImuErrors, SimulationConfig, simulate
 SCALE = 0.02
 NO_TDOAS = Tdoas(*(np.empty(0, kind) for kind in (float, int, int, float)))
 ERRORS = ImuErrors(gyro_bias=0.01)
+WALK = 2e-3  # m/s^2, of the bias of the accelerometer in 90 s
 
 
 def rover(seed, **changes):
-    return simulate(
-        SimulationConfig.of(
-            "rover", seed=seed, wheel_scale=SCALE, imu_errors=ERRORS, duration=90.0, **changes
-        )
-    )
+    settings = {"wheel_scale": SCALE, "imu_errors": ERRORS, "duration": 90.0, **changes}
+    return simulate(SimulationConfig.of("rover", seed=seed, **settings))
 
 
 def traced(flight, *streams):
@@ -65,6 +63,23 @@ def test_biases_of_a_gyroscope_that_turns_about_one_axis_have_their_signs(seed):
         )  # and it walks
 
 
+@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize(
+    "bias", [{"z": 0.1}, {"x": -0.1, "z": -0.1}, {"x": 0.025, "y": -0.02, "z": -0.062}]
+)
+def test_an_accelerometer_on_a_level_floor_has_a_bias_and_what_it_could_be_is_listed(bias, seed):
+    """There its z reads the same all the time: a bias, a scale and gravity cannot be told apart."""
+    still = rover(seed, imu_errors=ImuErrors(accel_bias=0.0))
+    made = traced(EFFECTS["accel_bias"](bias).inject(still), "imu")
+    findings = [one for one in made.findings() if one.channel == "accel"]
+    assert {one.effect.name for one in findings} == {"accel_bias"}
+    (found,) = findings
+    for key, value in bias.items():
+        assert abs(found.effect.values[key] - value) < 3.0 * np.hypot(found.effect.std[key], WALK)
+    if bias.keys() == {"z"}:
+        assert {"accel_scale", "imu_gravity"} <= {other.effect for other in found.alternatives}
+
+
 def test_a_rate_that_is_noise_explains_nothing():
     rng = np.random.default_rng(1)
     turning = np.column_stack([np.zeros(300), 0.3 * np.sin(np.linspace(0.0, 20.0, 300))])
@@ -87,5 +102,16 @@ def test_what_is_written_has_the_values_of_the_written_model(of_wheels):
     for effect in effects:
         for key, value in effect.values.items():
             assert value == pytest.approx(values[effect.name, key], rel=1e-2)
-    (scale,) = [effect for effect in effects if effect.name == "velocity_scale"]
-    assert abs(scale.values["scale"] - SCALE) < 3.0 * scale.std["scale"]
+    for name in ("velocity_scale", "yaw_rate_scale"):
+        (scale,) = [effect for effect in effects if effect.name == name]
+        assert abs(scale.values["scale"] - SCALE) < 3.0 * scale.std["scale"]
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_scale_of_the_yaw_rate_of_wheels_is_found_beside_that_of_their_speed(seed):
+    made = traced(EFFECTS["yaw_rate_scale"]({"scale": 0.03}).inject(rover(seed)), "velocity")
+    found = {one.name: one for one in effects_of(written(made.selection, made.candidates))}
+    true = {"velocity_scale": SCALE, "yaw_rate_scale": (1.0 + SCALE) * 1.03 - 1.0}
+    for name, value in true.items():
+        assert abs(found[name].values["scale"] - value) < 3.0 * found[name].std["scale"], name
+    assert found["yaw_rate_scale"].std["scale"] < 0.005

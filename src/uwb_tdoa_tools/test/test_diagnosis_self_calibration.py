@@ -113,7 +113,9 @@ def test_nothing_is_a_finding_in_a_flight_of_which_nothing_is_wrong():
 
 
 def test_flights_that_are_too_short_say_so():
-    assert why_not_of(flight_with(LATE, seconds=20.0)).endswith("30 s are needed: fly for longer")
+    assert why_not_of(flight_with(LATE, seconds=20.0)).endswith(
+        "30 s are needed: record motion for longer"
+    )
 
 
 def test_nothing_is_applied_if_something_else_is_wrong_too():

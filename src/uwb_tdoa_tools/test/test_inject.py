@@ -1,9 +1,10 @@
+from known_effects import with_yaw_rate
 import numpy as np
 import pytest
 
 from uwb_tdoa_bias.effects import EFFECTS, RADIO, EffectSet, true_samples
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.sensors import DIAGNOSED
+from uwb_tdoa_bias.foundation.sensors import DIAGNOSED, measured_on
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands.inject import main
 from uwb_tdoa_tools.readers import read_flight
@@ -13,7 +14,7 @@ from uwb_tdoa_tools.simulation.inject import parse_effect
 
 @pytest.fixture(scope="module")
 def flight():
-    return simulate(
+    flown = simulate(
         SimulationConfig(
             duration=20.0,
             yaw="along_track",
@@ -28,6 +29,7 @@ def flight():
             range_noise=0.0,
         )
     )
+    return with_yaw_rate(flown, 0.0)
 
 
 def example(effect):
@@ -52,8 +54,9 @@ def test_injected_effect_is_what_the_model_takes_out(flight, effect):
         (flight.imu.gyro, changed.imu.gyro),
         (flight.imu.accel, changed.imu.accel),
     ]
-    streams += [(getattr(flight, name).t, getattr(changed, name).t) for name in DIAGNOSED]
-    streams += [(getattr(flight, name).values, getattr(changed, name).values) for name in DIAGNOSED]
+    for channel in DIAGNOSED:
+        before, after = (measured_on(one, channel) for one in (flight, changed))
+        streams += [(before.t, after.t), (before.values, after.values)]
     assert any(not np.array_equal(before, after) for before, after in streams)
     if effect.name in ("noise_level", "noise_correlation", "outlier_rate"):
         return  # nothing to take out

@@ -11,7 +11,7 @@ import yaml
 from uwb_tdoa_bias.foundation.sensors import SENSORS
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.ekf_parameters import names_of_parameters
-from uwb_tdoa_tools.commands import check, diagnose, evaluate, simulate
+from uwb_tdoa_tools.commands import calibrate, check, diagnose, evaluate, simulate
 
 launching = pytest.importorskip("uwb_tdoa_ekf.launching", reason="needs rclpy")
 FILE = ROOT / "docs/connect/rover.yaml"
@@ -55,6 +55,7 @@ def test_yaml_of_the_page_can_be_read():
 def test_commands_of_the_page_are_command_lines():
     parsers = {
         "simulate": simulate.parser,
+        "calibrate": calibrate.parser,
         "check": check.parser,
         "evaluate": evaluate.parser,
         "diagnose": diagnose.parser,

@@ -146,7 +146,9 @@ def test_nothing_is_applied_where_something_else_is_wrong_too(flights, tmp_path,
 
 
 def test_flights_that_are_too_short_are_refused():
-    with pytest.raises(InputError, match="s in the air together; 30 s are needed"):
+    with pytest.raises(
+        InputError, match="s in the air, or in motion on the floor, together; 30 s are needed"
+    ):
         self_calibrate([clean_flight(203, 20.0)], Tape())
 
 

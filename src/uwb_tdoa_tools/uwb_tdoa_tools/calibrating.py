@@ -11,13 +11,14 @@ import numpy as np
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.base import listed
 from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.flight import AIDS, Flight
+from uwb_tdoa_bias.foundation.flight import AIDS, Flight, Truth
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.streams import ERROR
 
 from .checking.ordered import OrderedRecording
 from .checking.survey_fit import displacement
 from .diagnosis import diagnose, output
+from .diagnosis.references import Nothing
 from .diagnosis.self_calibration import SelfCalibration, Tape, self_calibrate
 from .diagnosis.self_calibration.equations import measured_noise, slow_innovations
 from .diagnosis.self_calibration.solve import IMPROVED, LEFT
@@ -200,8 +201,8 @@ def _reason_against_unverified(calibration: Calibration) -> str | None:
         )
     if calibration.before < SMALLEST_RATIO * calibration.after:
         return (
-            f"it gains too little to be sure that it does no harm: {calibration.as_text()}; fly "
-            "more, or keep what there is"
+            f"it gains too little to be sure that it does no harm: {calibration.as_text()}; "
+            "record more, or keep what there is"
         )
     return None
 
@@ -249,10 +250,11 @@ class Prospect:
 
     Attributes
     ----------
-    seconds, total : s in the air, analysed and available.
+    seconds, total : s in motion, analysed and available.
     given, expected : (N, 3) m, standard deviations of the anchors, as given and after all flights.
     before, left : m, slow innovations before and after.
     path, hall : (3,) m, extent of the path and of the anchors.
+    axes : names of the axes along which the tag can move, "xy" on a floor.
     ids : of the anchors.
     why_not : reason against the use of a survey so far, or None.
     """
@@ -265,6 +267,7 @@ class Prospect:
     left: float
     path: np.ndarray
     hall: np.ndarray
+    axes: str
     ids: tuple[int, ...]
     why_not: str | None
 
@@ -281,7 +284,7 @@ class Prospect:
     def sentences(self) -> list[str]:
         """Return the prospect as sentences."""
         lines = [
-            f"from {self.seconds:.0f} s of {self.total:.0f} s in the air: of the innovations "
+            f"from {self.seconds:.0f} s of {self.total:.0f} s in motion: of the innovations "
             f"{100 * self.before:.1f} cm are slow with the anchors as "
             f"given, and {100 * self.left:.1f} cm with others",
             f"all flights are likely to improve {int(self.better.sum())} of {self.better.size} "
@@ -294,19 +297,19 @@ class Prospect:
         unseen = [str(i) for i, row in zip(self.ids, self.better) if not row.any()]
         if unseen:
             lines.append(
-                f"the flights do not improve anchors {listed(unseen)}: fly closer to them, on all "
+                f"the flights do not improve anchors {listed(unseen)}: move closer to them, on all "
                 "sides, high and low"
             )
-        for axis, size, room in zip("xyz", self.path, self.hall):
+        for axis, size, room in zip(self.axes, self.path, self.hall):
             if size < SMALLEST_EXTENT * room:
                 lines.append(
                     f"along {axis} the tag moves by {size:.1f} m among anchors that are "
-                    f"{room:.1f} m apart: fly longer paths along it"
+                    f"{room:.1f} m apart: move farther along it"
                 )
         lines.append(
             "the flights are exciting enough"
             if self.exciting
-            else "the flights are not exciting enough: fly more, and elsewhere"
+            else "the flights are not exciting enough: move more, and elsewhere"
         )
         return lines
 
@@ -328,7 +331,9 @@ def prospect(
     found = self_calibrate([part], tape, base, config, (), progress)
     seconds = found.seconds
     total = max(seconds, sum(map(_duration, flights)) * seconds / max(_duration(part), 1e-9))
-    path = np.quantile(FlightEstimator(config, base)(part).odometry.p, [0.02, 0.98], axis=0)
+    estimate = FlightEstimator(config, base)(part).odometry
+    path = np.quantile(estimate.p, [0.02, 0.98], axis=0)
+    on_floor = Nothing(config).on_floor(Truth(estimate.t, estimate.p, estimate.q))
     anchors = longest.anchors
     return Prospect(
         seconds,
@@ -339,6 +344,7 @@ def prospect(
         found.left,
         np.ptp(path, axis=0),
         np.ptp(anchors.positions, axis=0),
+        "xy" if on_floor else "xyz",
         tuple(anchors.ids.tolist()),
         found.why_not,
     )

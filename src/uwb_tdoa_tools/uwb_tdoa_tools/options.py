@@ -105,9 +105,22 @@ def add_filter(
     )
 
 
+def add_parameters(parser: ArgumentParser) -> None:
+    """-p, beside --config."""
+    parser.add_argument(
+        "-p",
+        dest="parameters",
+        metavar="NAME:=VALUE",
+        action="append",
+        default=[],
+        help="one filter parameter, before --config",
+    )
+
+
 def filter_of(args: Namespace) -> tuple[FilterConfig, EffectSet | None]:
-    """(FilterConfig, EffectSet or None) that --config and --effects name. Raises InputError."""
+    """(FilterConfig, EffectSet or None) that --config, -p and --effects name. Raises InputError."""
     config = FilterConfig.from_yaml(args.config) if args.config else FilterConfig()
+    config = with_parameters(config, getattr(args, "parameters", ()))
     return config, EffectSet.from_yaml(args.effects) if args.effects else None
 
 
@@ -119,14 +132,7 @@ def add_estimator(parser: ArgumentParser) -> None:
     add_model(parser)
     add = parser.add_argument
     add("--no-bias", action="store_true", help="correct for nothing, whatever else is given")
-    add(
-        "-p",
-        dest="parameters",
-        metavar="NAME:=VALUE",
-        action="append",
-        default=[],
-        help="one filter parameter, before --config",
-    )
+    add_parameters(parser)
     add(
         "--without",
         metavar="AID",
@@ -149,9 +155,7 @@ def estimator_of(args: Namespace, say: Callable[[str], object]) -> FlightEstimat
     Raises InputError.
     """
     config, effects = filter_of(args)
-    config = with_parameters(
-        config, args.parameters + [f"use_{aid}:=false" for aid in args.without]
-    )
+    config = with_parameters(config, [f"use_{aid}:=false" for aid in args.without])
     if args.no_bias:
         return FlightEstimator(config, smoothed=args.smooth)
     network = load_network(args.model)

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..foundation.errors import InputError
 from ..foundation.flight import AIDS
+from ..foundation.sensors import STREAM_OF, with_measured
 from ..foundation.sensors.sensor import UNKNOWN_STD, UNKNOWN_VARIANCE
 from .base import IDENTITY, Affine, Effect, Row, SensorEffect, finite, require
 from .samples import Track, aid_samples
@@ -27,12 +28,13 @@ UNLIMITED = 1e6  # s, bound of these
 
 
 class AidEffect(SensorEffect):
-    """An effect with an affine sensor model on one stream, its only channel."""
+    """An effect with an affine sensor model on one channel, its only one."""
 
     def inject(self, flight: Flight, rng: np.random.Generator | None = None) -> Flight:
-        (name,) = self.channels
-        stream = require(self, flight, name)
-        return flight.replaced(**{name: stream.sensed(self.model()(stream.values))})
+        (channel,) = self.channels
+        part = require(self, flight, channel)
+        changed: Flight = with_measured(flight, channel, part.sensed(self.model()(part.values)))
+        return changed
 
 
 class HeightOffset(AidEffect):
@@ -122,6 +124,34 @@ class VelocityScale(AidEffect):
 
     def model(self) -> Affine:
         return Affine((1.0 + self.values.get("scale", 0.0)) * np.eye(3), np.zeros(3))
+
+
+class YawRateScale(AidEffect):
+    """Measured yaw rate = (1 + `scale`) true yaw rate."""
+
+    row = Row(
+        name="yaw_rate_scale",
+        unit="1",
+        bound=0.9,
+        negligible=0.005,
+        prior_std=0.1,
+        example="scale",
+        physics="the driver of the wheels assumes a wrong track width, or a wrong radius",
+        reference=(
+            "Borenstein and Feng, IEEE Trans. Robotics and Automation 12, 1996: systematic errors "
+            "of odometry"
+        ),
+        remedy=(
+            "Calibrate the yaw rate over known turns (track width, radius of the wheels): it is "
+            "{found}."
+        ),
+        ways=("too fast", "too slow"),
+        shown=("%", 100.0),
+    )
+    channels = ("yaw_rate",)
+
+    def model(self) -> Affine:
+        return Affine((1.0 + self.values.get("scale", 0.0)) * np.eye(1), np.zeros(1))
 
 
 class VelocityMisalignment(AidEffect):
@@ -336,23 +366,28 @@ class AidCorrector:
         self._late = {
             stream: sum(effect.stamp_offset(stream) for effect in effects) for stream in AIDS
         }
-        self._undo = {stream: self._inverse(effects, stream) for stream in AIDS}
+        self._undo = {channel: self._inverse(effects, channel) for channel in STREAM_OF}
         self.idle = not any(self._late.values()) and not any(self._undo.values())
 
     @staticmethod
-    def _inverse(effects: Collection[Effect], stream: str) -> Affine | None:
+    def _inverse(effects: Collection[Effect], channel: str) -> Affine | None:
         undo = None
         for effect in effects:
-            model = effect.sensor_model(stream)
+            model = effect.sensor_model(channel)
             if model is not IDENTITY:
                 undo = model.inverse() if undo is None else model.inverse().after(undo)
         return undo
 
     def correct(self, name: str, stream: Stream) -> Stream:
         """Return the corrected Stream of the sensor `name`."""
-        undo = self._undo[name]
         if self._late[name]:
             stream = replace(stream, t=stream.t - self._late[name])
+        for channel, part in stream.parts.items():
+            stream = stream.with_part(channel, self._undone(channel, part))
+        return self._undone(name, stream)
+
+    def _undone(self, channel: str, stream: Stream) -> Stream:
+        undo = self._undo[channel]
         if undo is None:
             return stream
         std = getattr(stream, "std", None)

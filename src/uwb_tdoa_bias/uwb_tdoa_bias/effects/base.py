@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 import numpy as np
 
 from ..foundation.errors import InputError
+from ..foundation.sensors import STREAM_OF, measured_on
 from .covariates import OF_ARRIVAL, OF_TDOA, UNITS, checked_domain, fade_weight
 from .samples import RADIO, Samples, true_samples
 
@@ -233,6 +234,8 @@ class Effect:
     penalty: ClassVar[float] = 0.0  # twice a log-likelihood that a selection must gain in addition
     usable: ClassVar[bool] = True  # False: nodes do not correct it, for the following reason
     why_unusable: ClassVar[str] = "nodes cannot, or need not, take it out"
+    # Share of the parameters of a group that must not be negligible; else a smaller group suffices
+    sizable_share: ClassVar[float] = 0.5
     # Channels, at least one of which must show: else the reference may have the error.
     corroborating_channels: ClassVar[tuple[str, ...]] = ()
     is_hypothesis: ClassVar[bool] = False  # True: the filter tests it, and no Corrector removes it
@@ -330,7 +333,8 @@ class Effect:
     def sensor_model(self, channel: str) -> Affine:
         """Return the Affine from true to measured values of a channel.
 
-        channel : "gyro" (rad/s, body), "accel" (m/s^2, body), "velocity" (m/s, body) or "height" (m)
+        channel : "gyro" (rad/s, body), "accel" (m/s^2, body), "velocity" (m/s, body), "yaw_rate"
+            (rad/s, body) or "height" (m)
         """
         return IDENTITY
 
@@ -633,11 +637,11 @@ def central_differences(
     return np.stack(columns, axis=-1)
 
 
-def require(effect: Effect, flight: Flight, stream: str) -> Any:
-    """Return a stream of a Flight by its name, "truth" and "imu" included; raise InputError."""
-    part = getattr(flight, stream)
-    if part is None or (stream == "truth" and len(part) == 0):
-        words = STREAM_WORDS.get(stream, stream)
+def require(effect: Effect, flight: Flight, name: str) -> Any:
+    """Return the Stream of a channel of a sensor, "tdoa", "imu" or "truth"; raise InputError."""
+    part = measured_on(flight, name) if name in STREAM_OF else getattr(flight, name)
+    if part is None or (name == "truth" and len(part) == 0):
+        words = STREAM_WORDS.get(name, name.replace("_", " "))
         raise InputError(f"{flight.name}: holds no {words}, which {effect.name} needs.")
     return part
 

@@ -27,6 +27,7 @@ from .aids import (
     VelocityMisalignment,
     VelocityScale,
     VelocitySlip,
+    YawRateScale,
 )
 from .anchor import (
     AnchorClockDrift,
@@ -93,6 +94,7 @@ EFFECTS: dict[str, type[Effect]] = {
         FloorStep,
         BarometerDrift,
         VelocityScale,
+        YawRateScale,
         VelocityMisalignment,
         VelocityDelay,
         VelocitySlip,

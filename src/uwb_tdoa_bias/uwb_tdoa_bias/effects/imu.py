@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from .samples import ImuSamples
 
 SENSORS = ("gyro", "accel")
+# `penalty` of effects that look like a bias of the accelerometer without tilt and manoeuvres
+BESIDE_BIAS = 2.0
 
 
 class ImuEffect(SensorEffect):
@@ -114,6 +116,7 @@ class AccelBias(SensorBias):
         ways=("too much", "too little"),
     )
     channels = ("accel",)
+    sizable_share = 0.3  # one axis suffices, else a scale replaces the bias of the others
 
 
 class AccelScale(SensorScale):
@@ -138,6 +141,7 @@ class AccelScale(SensorScale):
         shown=("%", 100.0),
     )
     channels = ("accel",)
+    penalty = BESIDE_BIAS
 
 
 class ImuMisalignment(ImuEffect):
@@ -200,6 +204,7 @@ class ImuGravity(ImuEffect):
         ways=("too much", "too little"),
     )
     channels = ("accel",)
+    penalty = BESIDE_BIAS
 
     @classmethod
     def groups(cls, anchors: Anchors | None, pairs: np.ndarray | None) -> list[tuple[str, ...]]:

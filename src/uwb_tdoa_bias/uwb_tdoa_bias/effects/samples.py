@@ -13,7 +13,7 @@ from ..foundation.anchors import Anchors
 from ..foundation.compiled import compiled
 from ..foundation.geometry import ranges, tdoa_each
 from ..foundation.later import rotations
-from ..foundation.sensors import SENSORS
+from ..foundation.sensors import COMPARED
 
 if TYPE_CHECKING:
     from ..foundation.flight import Flight
@@ -294,10 +294,10 @@ class ImuSamples:
 class AidSamples:
     """A batch of n measurements of an auxiliary sensor.
 
-    channel : name of the stream
+    channel : name of the stream, or of one of its parts
     t : (n,) s; p : (n, 3) m, world; start : s, as of Samples
     reading : (n, k) true value: range to the ground at z = 0, m; height for a barometer, m;
-        velocity, m/s, body
+        velocity, m/s, body; yaw rate, rad/s, body
     time_derivative : (n, k) derivative of the reading by time, per s
     up : (n,) cosine of the tilt, NaN if the attitude is unknown
     motion : Motion; vibration : (n,) as of Samples, or None
@@ -403,17 +403,17 @@ def true_samples(flight: Flight, kind: type[Samples] = Samples) -> tuple[Samples
 
 
 def aid_samples(
-    stream: str,
+    channel: str,
     t: np.ndarray,
     track: Track,
     start: float = 0.0,
     vibration: np.ndarray | None = None,
 ) -> AidSamples:
-    """Return AidSamples of a stream at stamps t (n,), s, of a Track."""
+    """Return AidSamples of a channel at stamps t (n,), s, of a Track."""
     before, reading, after = (
-        SENSORS[stream].compared.reading(track, t + late) for late in (-0.5 * STEP, 0.0, 0.5 * STEP)
+        COMPARED[channel].reading(track, t + late) for late in (-0.5 * STEP, 0.0, 0.5 * STEP)
     )
     rate, q = (after - before) / STEP, track.attitudes(t)
     up = 1.0 - 2.0 * (q[:, 0] ** 2 + q[:, 1] ** 2)
     p, motion = track.positions(t), track.motion(t)
-    return AidSamples(stream, t, p, start, reading, rate, up, motion, vibration)
+    return AidSamples(channel, t, p, start, reading, rate, up, motion, vibration)

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..foundation.compiled import compiled
 from ..foundation.errors import InputError
-from ..foundation.sensors import BY_POSE, SENSORS
+from ..foundation.sensors import BY_POSE, COMPARED
 from .base import (
     Effect,
     Row,
@@ -54,7 +54,7 @@ if TYPE_CHECKING:
 DEGREE = 2  # of splines
 GONE = 4 * FADE  # widths of a domain beyond which nothing of a function is left
 IMU_CHANNELS = tuple(f"{sensor}.{axis}" for sensor in ("gyro", "accel") for axis in "xyz")
-AID_CHANNELS = tuple(name + axis for name in BY_POSE for axis in SENSORS[name].compared.axes)
+AID_CHANNELS = tuple(name + axis for name in BY_POSE for axis in COMPARED[name].axes)
 FORMS = ("common", "arrival", "anchor", "pair", "direction")
 OF_LINKS = ("pair", "direction")  # forms with one function per pair of anchors
 # Prior standard deviations of functions with few coefficients: m, rad/s and m/s^2
@@ -664,7 +664,7 @@ def _off(term: SmoothTerm, part: str, value: float, std: float | None, how: str)
             f"{'much' if value > 0.0 else 'little'}"
         )
         return AXES[sensor].format(amount, axis) + how
-    amount = measured(abs(value), std, "m")
+    amount = measured(abs(value), std, COMPARED[sensor].unit if sensor in COMPARED else "m")
     if term.form in ("anchor", "arrival"):
         who = f"anchor {part}" if part else "each anchor"
         return f"{who} seems {amount} {'farther' if value > 0.0 else 'nearer'}{how}"

@@ -108,7 +108,7 @@ class VelocityDelay(StampEffect):
         remedy="Stamp the velocity when it is measured: it is stamped {found}.",
     )
     stream = "velocity"
-    channels = ("velocity",)
+    channels = ("velocity", "yaw_rate")
 
 
 def shifted(flight: Flight, stream: str, seconds: float) -> Flight:

@@ -23,6 +23,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
+    from uwb_tdoa_ekf.core.config import FilterConfig
+
     from ..calibrating import Calibration
     from ..readers.inputs import Reading, Recording
 
@@ -63,6 +65,7 @@ def parser() -> ArgumentParser:
             "the prior"
         ),
     )
+    options.add_parameters(made)
     add = made.add_argument
     options.add_holdout(made)
     add("--no-truth", action="store_true", help="do without ground truth, and leave it unread")
@@ -125,7 +128,9 @@ def _calibrate(args: Namespace) -> int:
     )
     judges = args.holdout or [path for path, _ in found[-1:]]
     return (
-        _stop(made.why_not) if made.why_not is not None else _write(made, out, judges, all(known))
+        _stop(made.why_not)
+        if made.why_not is not None
+        else _write(made, config, out, judges, all(known))
     )
 
 
@@ -161,22 +166,28 @@ def _stop(why: str) -> int:
     return 1
 
 
-def _write(made: Calibration, out: Path, recordings: Sequence[str | Path], truth: bool) -> int:
-    files = anchors, effects, config = (
+def _write(
+    made: Calibration,
+    config: FilterConfig,
+    out: Path,
+    recordings: Sequence[str | Path],
+    truth: bool,
+) -> int:
+    files = anchors, effects, parameters = (
         out / "anchors.yaml",
         out / "effects.yaml",
         out / "ekf_node.yaml",
     )
     made.anchors.to_yaml(anchors)
     made.effects.to_yaml(effects)
-    write_parameters(config, made.tdoa_std)
+    write_parameters(parameters, made.tdoa_std, config)
     survey, corrected, tuned = (file if file.exists() else None for file in files)
     cli.show(
         f"wrote {', '.join(file.name for file in files if file.exists())} and "
         f"calibration.json to {out}"
     )
     cli.show(f"judge it:   {command_lines.judging(recordings, survey, corrected, tuned, truth)}")
-    cli.show("fly by it:", *command_lines.nodes(survey, corrected, tuned))
+    cli.show("start the nodes with it:", *command_lines.nodes(survey, corrected, tuned))
     return 0
 
 

@@ -78,6 +78,7 @@ def parser() -> ArgumentParser:
             "the prior"
         ),
     )
+    options.add_parameters(made)
     add = made.add_argument
     options.add_holdout(made)
     known = made.add_mutually_exclusive_group().add_argument
@@ -185,7 +186,7 @@ def _diagnose(args: Namespace) -> int:
     cli.write_json(out / "diagnosis.json", output.as_json(result))
     result.effects.to_yaml(out / "effects.yaml")
     write_text(out / "report.html", html(result))
-    write_parameters(out / "ekf_node.yaml", tdoa_std)
+    write_parameters(out / "ekf_node.yaml", tdoa_std, config)
     if rerun is not None:
         write_diagnosis(rerun, result, effects or EffectSet(), config)
     cli.show(output.as_text(result))

@@ -65,6 +65,7 @@ def parser() -> ArgumentParser:
             "what changed"
         ),
     )
+    options.add_parameters(made)
     add = made.add_argument
     options.add_tape(made)
     options.add_known(made)
@@ -100,7 +101,7 @@ def _survey(args: Namespace) -> int:
     rows = (f"{i},{x:.4f},{y:.4f},{z:.4f}" for i, (x, y, z) in zip(anchors.ids, anchors.positions))
     write_text(out / "anchors.csv", "\n".join(["id,x,y,z", *rows, ""]))
     result.effects.to_yaml(out / "effects.yaml")
-    config_file = write_parameters(out / "ekf_node.yaml", result.tdoa_std)
+    config_file = write_parameters(out / "ekf_node.yaml", result.tdoa_std, config)
     cli.write_json(out / "survey.json", as_dict(result))
     picture(result, out / "survey.png")
     cli.show(as_text(result))

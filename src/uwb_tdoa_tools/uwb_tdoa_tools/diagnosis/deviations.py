@@ -5,8 +5,9 @@ delays of anchors take what other systematic errors leave unexplained, in the sa
 place, so that no scatter between blocks of time shows it. So they are fitted once more, with the
 information that errors leave which last as long as the flight, beside what can take their place: a
 smooth function of the place for every anchor, as large as the evidence says, as what an antenna
-adds in each direction is; and coordinates and delays of anchors that the fit takes for zero. All
-these are integrated out. What a value is away from that counts as its error.
+adds in each direction is; and coordinates and delays of anchors that the fit takes for zero.
+Coordinates may be off by COORDINATE_STDS, each as probable as the data make it, delays by UNSAID.
+All these are integrated out. What a value is away from that counts as its error.
 """
 
 from __future__ import annotations
@@ -25,6 +26,8 @@ from .self_calibration.equations import features
 from .self_calibration.prior import FUNCTION_STDS, posterior
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from .regression.fit import Fit
     from .regression.select import Selection
     from .regression.table import RegressionTable
@@ -35,6 +38,8 @@ if TYPE_CHECKING:
 # slowly
 LENGTH = 4.0
 UNSAID = 0.03  # m, that coordinates and delays may be off by, of which no anchor has any in the fit
+COORDINATE_STDS = 0.001, 0.003, 0.01, UNSAID  # m, the same of coordinates: the data show how much
+SAME = 1e-4  # m, by which that mean may differ from zero
 LASTS = (
     *OF_ANCHORS,
     "tag_lever_arm",
@@ -74,7 +79,10 @@ def _beside_others(table: RegressionTable, model: Fit) -> tuple[np.ndarray, np.n
         if column.effect in ((POSITION,), (DELAY,)) and (near is None or _anchor(column) in near)
     ]
     others = [column for column in beside if column not in model.columns]
-    sizes = [column.typical if column.effect in known else UNSAID for column in others]
+    free = np.array(
+        [column.effect == (POSITION,) and column.effect not in known for column in others]
+    )
+    sizes = np.array([column.typical if column.effect in known else UNSAID for column in others])
     late = table.matrix([column for column in beside if column.effect == (DELAY,)], rows)
     if table.sparse:  # other rows have nothing to do with these anchors
         ends = np.array([RADIO[name].ends if name in RADIO else 0 for name in table.channels])
@@ -85,16 +93,38 @@ def _beside_others(table: RegressionTable, model: Fit) -> tuple[np.ndarray, np.n
     weight = model.information(table)[rows] * (model.inflation[table.group[rows]] / lasting)
     x = beside_each_other([mine, table.matrix(others, rows), functions])
     gram, vector, n = product(weighted(x, weight), x), x.T @ (weight * table.y[rows]), mine.shape[1]
+    unwritten = _common_delay(table, [*model.columns, *others], n)
+    gram[: len(unwritten), : len(unwritten)] += np.outer(unwritten, unwritten) / SAME**2
     prior = np.diag(prior_sizes(model.columns) ** 2.0)
 
-    def solution(size: float) -> Solution:
-        part = Part(
-            *eliminated(gram, vector, n, np.append(sizes, np.full(functions.shape[1], size))), size
-        )
+    def solution(coordinate: float, function: float) -> Solution:
+        std = [np.where(free, coordinate, sizes), np.full(functions.shape[1], function)]
+        part = Part(*eliminated(gram, vector, n, np.concatenate(std)), function)
         return posterior(part, prior, np.zeros(n))
 
-    best = max(map(solution, FUNCTION_STDS), key=lambda one: one.evidence)
-    return best.step - model.beta, best.covariance
+    several = [
+        max((solution(std, size) for size in FUNCTION_STDS), key=lambda one: one.evidence)
+        for std in (COORDINATE_STDS if free.any() else (UNSAID,))
+    ]
+    evidences = np.array([one.evidence for one in several])
+    shares = np.exp(evidences - evidences.max()) / np.exp(evidences - evidences.max()).sum()
+    steps, covariances = (
+        np.stack([getattr(one, name) for one in several]) for name in ("step", "covariance")
+    )
+    step = shares @ steps
+    spread = (steps - step).T @ (shares[:, None] * (steps - step))
+    return step - model.beta, np.tensordot(shares, covariances, axes=1) + spread
+
+
+def _common_delay(table: RegressionTable, columns: Sequence[Column], n: int) -> np.ndarray:
+    """(k,), what makes of values of Columns the mean of the delays beyond the first n, those that a
+    fit takes for zero; 0 where the fit has none or all delays, or where what all have in common
+    does not cancel. A delay in the fit is the difference from this mean.
+    """
+    late = np.array([column.effect == (DELAY,) for column in columns])
+    beyond = late & (np.arange(len(columns)) >= n)
+    some = late[:n].any() and beyond.any() and in_common(table, columns)[late].any()
+    return beyond / max(beyond.sum(), 1) * some
 
 
 def _anchor(column: Column) -> str:

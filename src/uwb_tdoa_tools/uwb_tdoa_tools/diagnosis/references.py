@@ -21,7 +21,7 @@ from ..clock import grid
 from ..scoring.alignment import NONE
 from ..scoring.evaluation import align_truth
 from ..scoring.metrics import scored_phase
-from ..scoring.phases import TITLES
+from ..scoring.phases import AIRBORNE, TITLES
 from .constraints import Mark, OdometryPath
 
 if TYPE_CHECKING:
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 MARGIN = 0.5  # s left out at both ends
 SHORTEST = 5.0  # s that can be diagnosed
+FLOWN_SHARE = 0.25  # smallest share of the time in the air, between its ends, of a flight
 TRUTHS = "_truth"  # end of the names of streams in which a simulation stores the truth
 SPACING = 2.0  # s between the stamps at which an odometry is fitted
 FEWEST = 5  # such stamps
@@ -176,6 +177,21 @@ class Nothing(Reference):
 
     def prepare(self, flight: Flight) -> Flight:
         return without_truth(flight)
+
+    def on_floor(self, poses: Truth) -> bool:
+        """Return whether estimated poses are those of a vehicle that never leaves the floor.
+
+        The estimated height of such a vehicle exceeds AIRBORNE now and then, but not for long.
+        """
+        part, first, last = scored_phase(poses)
+        if self._config.planar or part != "in_the_air":
+            return True
+        inside = (poses.t >= first) & (poses.t <= last)
+        return bool(np.mean(poses.p[inside, 2] > AIRBORNE) < FLOWN_SHARE)
+
+    def span(self, flight: Flight, poses: Truth) -> tuple[float, float]:
+        flat = replace(poses, p=poses.p * [1.0, 1.0, 0.0]) if self.on_floor(poses) else poses
+        return super().span(flight, flat)
 
     def view(self, flight: Flight, effects: EffectSet) -> ReferenceView:
         config, streams, by = self._config, self._streams, Corrector(flight.anchors, effects)

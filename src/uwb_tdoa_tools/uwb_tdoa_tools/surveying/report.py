@@ -121,7 +121,7 @@ def as_text(found: SelfCalibration) -> str:
     ]
     if unseen:
         lines.append(
-            f"the flights do not improve anchors {', '.join(unseen)}: fly closer to them, on all "
+            f"the flights do not improve anchors {', '.join(unseen)}: move closer to them, on all "
             "sides, high and low"
         )
     since = (

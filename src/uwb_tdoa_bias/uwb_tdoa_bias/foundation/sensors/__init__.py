@@ -2,6 +2,11 @@
 line here.
 """
 
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
 from . import height, pressure, ranges, velocity
 from .height import Height
 from .pressure import Pressure
@@ -16,22 +21,48 @@ SENSORS = {
 LOCATING = tuple(
     name for name, sensor in SENSORS.items() if sensor.locates
 )  # from which alone the filter can start
-DIAGNOSED = tuple(
-    name for name, sensor in SENSORS.items() if sensor.compared is not None
-)  # channels of the diagnosis, of which
+COMPARED = {
+    channel: compared
+    for name, sensor in SENSORS.items()
+    for channel, compared in {name: sensor.compared, **sensor.parts}.items()
+    if compared is not None
+}  # by channel of the diagnosis: that of a sensor, and those of its parts
+STREAM_OF = {
+    channel: name for name, sensor in SENSORS.items() for channel in (name, *sensor.parts)
+}  # a Flight has the stream
+DIAGNOSED = tuple(COMPARED)  # channels of the diagnosis, of which
 BY_POSE = tuple(
-    name for name in DIAGNOSED if SENSORS[name].compared.reading
+    channel for channel, compared in COMPARED.items() if compared.reading
 )  # these are compared with poses, others with anchors too
+
+
+def measured_on(flight: Any, channel: str) -> Stream | None:
+    """What a Flight holds of a channel of the diagnosis; None if nothing."""
+    name = STREAM_OF[channel]
+    stream: Stream | None = getattr(flight, name)
+    return stream if stream is None or channel == name else stream.parts.get(channel)
+
+
+def with_measured(flight: Any, channel: str, part: Stream) -> Any:
+    """The Flight with another Stream of a channel."""
+    name = STREAM_OF[channel]
+    whole = part if channel == name else getattr(flight, name).with_part(channel, part)
+    return replace(flight, **{name: whole})
+
 
 __all__ = [
     "BY_POSE",
+    "COMPARED",
     "DIAGNOSED",
     "LOCATING",
     "SENSORS",
+    "STREAM_OF",
     "Height",
     "Pressure",
     "Ranges",
     "Sensor",
     "Stream",
     "Velocity",
+    "measured_on",
+    "with_measured",
 ]

@@ -49,6 +49,15 @@ class Stream:
         """The same with other values (n, k) as the sensor would give them."""
         return self.with_values(values)
 
+    @property
+    def parts(self) -> dict[str, Stream]:
+        """{channel of the diagnosis: Stream} of what its messages measure besides, if they do."""
+        return {}
+
+    def with_part(self, channel: str, part: Stream) -> Stream:
+        """The same with another one of its `parts`."""
+        raise NotImplementedError
+
 
 @dataclass(frozen=True)
 class Compared:
@@ -114,6 +123,7 @@ class Sensor:
     parameters : {name: `parameter`} of the filter; use_<name> is the first
     invalid, remedy : what a message must hold; what to check where it contradicts everything else
     compared : Compared, or None: it is not diagnosed
+    parts : {channel of the diagnosis: Compared} of the `parts` of its Stream
     topic : "" for its name; rate : Hz, when it is simulated; locates : the filter can start from it
         alone
     rules : of `check`: callables of (Stream, Anchors) -> Mistake or None
@@ -137,6 +147,7 @@ class Sensor:
     invalid: str
     remedy: str
     compared: Compared | None = None
+    parts: dict[str, Compared] = field(default_factory=dict)
     topic: str = ""
     rate: float = RATE
     locates: bool = False

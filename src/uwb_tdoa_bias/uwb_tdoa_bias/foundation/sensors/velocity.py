@@ -12,6 +12,26 @@ from .sensor import UNKNOWN_STD, UNKNOWN_VARIANCE, Compared, Sensor, Stream, fin
 
 FASTEST = 100.0  # m/s, and rad/s
 LEAST_STD = 0.01  # m/s, that a simulated velocity says of itself
+TURN_TIME = 0.1  # s over which the yaw rate at an instant is taken from attitudes
+
+
+@dataclass(frozen=True)
+class YawRate(Stream):
+    """The yaw rates of some Velocity.
+
+    t : (n,) s; rate : (n, 1) rad/s; std : (n, 1) rad/s, inf and 0 as in its std.
+    """
+
+    t: np.ndarray
+    rate: np.ndarray
+    std: np.ndarray
+
+    @property
+    def values(self) -> np.ndarray:
+        return self.rate
+
+    def with_values(self, values: np.ndarray) -> YawRate:
+        return replace(self, rate=values)
 
 
 @dataclass(frozen=True)
@@ -43,6 +63,14 @@ class Velocity(Stream):
 
     def with_values(self, values: np.ndarray) -> Velocity:
         return replace(self, v=values)
+
+    @property
+    def parts(self) -> dict[str, Stream]:
+        rate, std = self.yaw_rate[:, None], self.yaw_rate_std[:, None]
+        return {"yaw_rate": YawRate(self.t, rate, std)} if np.isfinite(std).any() else {}
+
+    def with_part(self, channel: str, part: Any) -> Velocity:
+        return replace(self, yaw_rate=part.rate[:, 0], yaw_rate_std=part.std[:, 0])
 
 
 def _columns(fields: dict) -> tuple:
@@ -113,6 +141,16 @@ def _simulated(config: Any, room: Any, motion: Any, turn: Any, noise: Any) -> tu
     return v, np.full(v.shape, max(config.velocity_noise, LEAST_STD))
 
 
+def _turning(track: Any, t: np.ndarray) -> np.ndarray:
+    """Rates about the body's z, (n, 1) rad/s, of a Track at stamps t (n,) s."""
+    before, after = (
+        rotations.Rotation.from_quat(track.attitudes(t + late))
+        for late in (-0.5 * TURN_TIME, 0.5 * TURN_TIME)
+    )
+    turns: np.ndarray = (before.inv() * after).as_rotvec()
+    return turns[:, 2:] / TURN_TIME
+
+
 SENSOR = Sensor(
     name="velocity",
     plural="velocities",
@@ -162,6 +200,15 @@ SENSOR = Sensor(
         axes=(".x", ".y", ".z"),
         positions=(0, 1, 2),
     ),
+    parts={
+        "yaw_rate": Compared(
+            _turning,
+            "a yaw rate (wheels), and ground truth of the attitude",
+            negligible=0.002,
+            unit="rad/s",
+            positions=(),
+        )
+    },
     others=(("velocity/odometry", "nav_msgs/msg/Odometry"),),
     assumed=_assumed,
 )

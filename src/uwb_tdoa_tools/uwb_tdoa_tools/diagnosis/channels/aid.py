@@ -1,4 +1,4 @@
-"""Channels of auxiliary sensors: residuals of their medians over cells."""
+"""Channels of auxiliary sensors and their parts: residuals of their medians over cells."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 from uwb_tdoa_bias.effects import AidSamples, SmoothTerm, aid_samples
 from uwb_tdoa_bias.effects.covariates import OF_AIDS, sensor_covariate
-from uwb_tdoa_bias.foundation.sensors import SENSORS
+from uwb_tdoa_bias.foundation.sensors import COMPARED, STREAM_OF, measured_on
 
 from .base import Channel, ChannelResidual, Rows
 from .figures import APART, figures
@@ -75,7 +75,7 @@ class AidResidual(ChannelResidual):
 
 
 class Aid(Channel[AidResidual]):
-    """The channel of an auxiliary sensor, with the fields of its Compared as attributes."""
+    """The channel of an auxiliary sensor or a part of it, with the fields of its Compared."""
 
     axes: tuple[str, ...]
     positions: tuple[int, ...]
@@ -83,8 +83,8 @@ class Aid(Channel[AidResidual]):
     floating: bool
 
     def __init__(self, name: str) -> None:
-        self.name = name
-        vars(self).update(vars(SENSORS[name].compared))
+        self.name, self.stream = name, STREAM_OF[name]
+        vars(self).update(vars(COMPARED[name]))
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -92,7 +92,7 @@ class Aid(Channel[AidResidual]):
         return tuple(self.name + axis for axis in self.axes)
 
     def residual(self, comparison: Comparison) -> AidResidual | None:
-        part, reference = getattr(comparison.flight, self.name), comparison.reference
+        part, reference = measured_on(comparison.flight, self.name), comparison.reference
         known = all(reference.positions_known[k] for k in self.positions)
         if part is None or not known or (self.of_attitude and not comparison.attitude_known):
             return None

@@ -17,7 +17,7 @@ from scipy.sparse import csc_array, csr_array
 from uwb_tdoa_bias.effects import RADIO, Samples, SmoothTerm, samples_at
 from uwb_tdoa_bias.effects.covariates import CATEGORIES, EXTRA, OF_ARRIVAL, OF_MOTION, OF_TDOA
 from uwb_tdoa_bias.effects.smooth_term import OF_LINKS
-from uwb_tdoa_bias.foundation.sensors import SENSORS
+from uwb_tdoa_bias.foundation.sensors import COMPARED
 from uwb_tdoa_ekf.sensitivity import Innovations
 
 from ...checking.known_path import MANY
@@ -333,7 +333,7 @@ class Ranging(Channel[RangeResidual]):
 
     def __init__(self, name: str) -> None:
         self.name = name
-        vars(self).update(vars(SENSORS[name].compared))
+        vars(self).update(vars(COMPARED[name]))
 
     def residual(self, comparison: Comparison) -> RangeResidual | None:
         known = all(comparison.reference.positions_known) or comparison.view.innovations is not None

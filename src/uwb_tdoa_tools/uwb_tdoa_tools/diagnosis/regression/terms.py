@@ -106,13 +106,12 @@ class Candidate:
         )
 
     def sizable(self, beta: np.ndarray) -> bool:
-        """Whether at least half of the values of its columns, (k,), are worth having; a smaller
-        group says as much.
+        """Whether the share of its effects of the values of its columns, (k,), is worth having; a
+        smaller group says as much.
         """
-        limits = [term.effect.negligible for term in self.terms for _ in term.keys]
-        return sum(abs(value) >= limit for value, limit in zip(beta.tolist(), limits)) >= 0.5 * len(
-            limits
-        )
+        effects = [term.effect for term in self.terms for _ in term.keys]
+        worth = [abs(value) >= one.negligible for value, one in zip(beta.tolist(), effects)]
+        return sum(worth) >= sum(one.sizable_share for one in effects)
 
 
 def candidates_of(effect: Effect, anchors: Anchors, pairs: np.ndarray) -> list[Candidate]:

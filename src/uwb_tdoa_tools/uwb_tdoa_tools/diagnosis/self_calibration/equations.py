@@ -138,12 +138,14 @@ class FlightEquations:
     slow: np.ndarray
     inflation: float
     seconds: float
+    grounded: int
 
 
 class Runs:
     """Runs of Flights with anchors that are moved and late. spans : {flight: (first, last) s in the
-    air}, as the first run of each says: other anchors may move the path to the floor, but not the
-    tag; grounded : how many marks are on the floor, and left out.
+    air, or in motion on the floor}, as the first run of each says: other anchors may move the path
+    to the floor, but not the tag; grounded : how many marks of flights are on the floor, and left
+    out: those of a vehicle that never leaves it count.
     """
 
     def __init__(
@@ -165,9 +167,8 @@ class Runs:
         self.spans: dict[str, tuple[float, float]] = {}
         self.flights = [self._reference.prepare(flight) for flight in flights]
         self._of_anchors = [one for one in constraints if isinstance(one, Distance)]
-        marks = [one for one in constraints if isinstance(one, Mark)]
-        self._marks = [one for one in marks if one.position[2] > AIRBORNE]
-        self.grounded = len(marks) - len(self._marks)
+        self._marks = [one for one in constraints if isinstance(one, Mark)]
+        self.grounded = 0
 
     def slow_innovations(self, anchors: Anchors, delays: np.ndarray) -> float:
         """m, scale of the slow innovations of all flights with Anchors that are late by delays (N,)
@@ -182,7 +183,7 @@ class Runs:
             for one in self.flights
         ]
         return _scale(
-            [_slow(_residuals(*about, one, self.spans.get(one.name))[0]) for one in found]
+            [_slow(_residuals(*about, one, self.spans.get(one.name))[1]) for one in found]
         )
 
     def equations(
@@ -200,6 +201,7 @@ class Runs:
         """
         gram: np.ndarray = np.zeros(())
         vector: np.ndarray = np.zeros(())
+        self.grounded = 0
         marks: list[_Mark] = []
         several: list[FlightEquations] = []
         here = [
@@ -215,6 +217,7 @@ class Runs:
         for (one, span), flight in zip(results, self.flights):
             self.spans[flight.name] = span
             marks += one.marks
+            self.grounded += one.grounded
             several.append(one)
             gram, vector = gram + one.gram, vector + one.vector
             progress()
@@ -249,9 +252,9 @@ def _residuals(
     delays: np.ndarray,
     flight: Flight,
     span: tuple[float, float] | None,
-) -> tuple[list[RadioResidual], tuple[float, float]]:
-    """([RadioResidual] of each stream in the air, span) of a Flight: the innovations of a run with
-    Anchors that are late by delays (N,) m.
+) -> tuple[Comparison, list[RadioResidual]]:
+    """(Comparison, [RadioResidual] of each stream in its span) of a Flight: the innovations of a
+    run with Anchors that are late by delays (N,) m.
     """
     comparison = Comparison.of(
         replace(flight, anchors=anchors), reference, _with_delays(base, anchors, delays), span
@@ -262,10 +265,10 @@ def _residuals(
     parts = [part for part in found if part is not None]
     if not parts:
         raise InputError(
-            f"{flight.name}: has no TDOAs or ranges in the air to survey with; fly for half a "
-            "minute at least."
+            f"{flight.name}: has no TDOAs or ranges in the air, or in motion on the floor, to "
+            "survey with; record motion for half a minute at least."
         )
-    return parts, comparison.span
+    return comparison, parts
 
 
 def _of_flight(
@@ -280,14 +283,17 @@ def _of_flight(
     much they are late, (N,) m; functions : as of `Runs.equations`.
     """
     flight, known_span, marks = item
-    parts, span = _residuals(base, reference, *about, flight, known_span)
-    gram, vector, blocks, known = _equations(parts, flight, marks, functions)
+    comparison, parts = _residuals(base, reference, *about, flight, known_span)
+    on_floor = reference.on_floor(comparison.poses)
+    some = [one for one in marks if on_floor or one.position[2] > AIRBORNE]
+    gram, vector, blocks, known = _equations(parts, flight, some, functions)
     n = len(loose)
     inflation = _inflation(gram[:n, :n], vector[:n], blocks, loose)
     less = SYSTEMATIC * inflation
+    slow, seconds, grounded = _slow(parts), BLOCK * len(blocks), len(marks) - len(some)
     return FlightEquations(
-        gram / less, vector / less, known, _slow(parts), inflation, BLOCK * len(blocks)
-    ), span
+        gram / less, vector / less, known, slow, inflation, seconds, grounded
+    ), comparison.span
 
 
 def _with_delays(base: EffectSet, anchors: Anchors, delays: np.ndarray) -> EffectSet:

@@ -48,7 +48,7 @@ def place(
         if len(p) < FEWEST:
             raise InputError(
                 f"--unknown {anchors.ids[row]}: {len(p)} TDOAs tell of it, {FEWEST} are "
-                "needed; fly for longer."
+                "needed; record motion for longer."
             )
 
         def residual(x: np.ndarray, p: np.ndarray = p, to: np.ndarray = to) -> np.ndarray:

@@ -322,8 +322,8 @@ def _calibrated(
         found = solve(last.gram, last.vector, prior, best - mean)
     if last.seconds < LEAST:
         raise InputError(
-            f"the flights are {last.seconds:g} s in the air together; {LEAST:g} s are needed: "
-            "fly for longer."
+            f"the flights are {last.seconds:g} s in the air, or in motion on the floor, together; "
+            f"{LEAST:g} s are needed: record motion for longer."
         )
     shares = _shares(last, best - mean, found, names) if n <= MANY else {}
     best = best + found.step
