@@ -5,13 +5,9 @@ tests of its own.
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.effects import RADIO
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.flight import AIDS, Flight, Tdoas
 from uwb_tdoa_bias.foundation.sensors import (
-    BY_POSE,
-    DIAGNOSED,
-    LOCATING,
     SENSORS,
     Height,
     Ranges,
@@ -87,23 +83,6 @@ def test_what_the_filter_gets(name):
     if name != "velocity":  # NaN is no measurement, wherever it stands
         *_, broken = SENSORS[name].measured(STREAMS[name].with_values(np.full((N, 1), np.nan)))
         assert not broken.any()
-
-
-@pytest.mark.parametrize("name", SENSORS)
-def test_its_parameters_begin_with_the_switch(name):
-    first, *_ = SENSORS[name].parameters.values()
-    assert (
-        next(iter(SENSORS[name].parameters)) == f"use_{name}"
-        and first.default is True
-        and first.metadata["fixed"]
-    )
-
-
-def test_registries_of_a_part():
-    assert LOCATING == ("range",) and set(BY_POSE) == {"height", "pressure", "velocity"}
-    assert set(DIAGNOSED) - set(BY_POSE) == RADIO.keys() - {
-        "tdoa"
-    }  # distances to anchors, of which effects on arrivals know
 
 
 # --- velocities and yaw rates ---
