@@ -296,17 +296,6 @@ def test_a_node_that_refuses_what_it_is_given_is_not_started_again(launch):
     assert launched.ended() == 1 and left_behind(launched) == []
 
 
-def test_a_node_that_crashes_without_respawn_ends_all(launch):
-    launched = launch("uwb_tdoa_ekf", "tdoa.launch.py", "respawn:=false")
-    launched.wait(READY)
-    os.kill(launched.pid_of("ekf_node"), signal.SIGKILL)
-    assert (
-        launched.ended() == 1
-        and "ekf_node has ended with exit code -9" in launched.said
-        and left_behind(launched) == []
-    )
-
-
 def test_arguments_are_listed_and_what_is_wrong_with_one_is_said(launch):
     wrong = {
         "tags:=/nowhere.yaml": "/nowhere.yaml: cannot be read as YAML",

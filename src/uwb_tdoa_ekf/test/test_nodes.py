@@ -153,6 +153,8 @@ def test_odometry_is_that_of_the_offline_engine(make_rig, tmp_path, what, proces
         np.testing.assert_allclose(residual.weight, expected.residuals.weight[i], atol=1e-6)
     assert len(rig.residuals) + ekf["waiting"] == len(flight.tdoa)
 
+    if what == "effects":
+        return
     # A recording that starts again gives the same again.
     rig.play(flight)
     again = rig.counts(

@@ -172,6 +172,7 @@ def test_ten_minutes_with_dead_zones_and_a_change_of_floor(config):
     assert np.quantile(found["off"] / found["std"], 0.999) < 4.0
 
 
+@pytest.mark.slow
 def test_memory_and_estimate_of_a_tag_do_not_depend_on_how_many_anchors_are_installed():
     (_, few, _, one), (_, many, _, other) = (cost(n, 3.0, 1) for n in (20, 10_000))
     assert (
