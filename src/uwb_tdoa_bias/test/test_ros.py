@@ -16,7 +16,7 @@ from geometry_msgs.msg import Quaternion  # noqa: E402
 from hypothesis import given  # noqa: E402
 from hypothesis import strategies as st  # noqa: E402
 import numpy as np  # noqa: E402
-from rclpy.qos import (  # noqa: E402  # noqa: E402
+from rclpy.qos import (  # noqa: E402
     QoSCompatibility,
     QoSPresetProfiles,
     QoSProfile,

@@ -14,10 +14,8 @@ from faults import ARRIVAL, FAULTS, FLIGHT, D, of_imu, of_tdoa, put  # noqa: E40
 from flights import position_at  # noqa: E402
 import numpy as np  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
-from rig import (  # noqa: E402
-    seconds_of,
-)
-from stream_faults import PUBLISHERS, lanes_of, play, process_of, publish_twice  # noqa: E402  # noqa: E402
+from rig import make_rig, seconds_of  # noqa: E402, F401
+from stream_faults import PUBLISHERS, lanes_of, play, process_of, publish_twice  # noqa: E402
 
 from uwb_tdoa_msgs.msg import EstimatorStatus  # noqa: E402
 
@@ -28,7 +26,7 @@ def values_of(status):
     return {entry.key: entry.value for entry in status.values}
 
 
-def test_publishers_and_lost_messages_are_named(make_rig):
+def test_publishers_and_lost_messages_are_named(make_rig):  # noqa: F811
     (lane,) = lanes_of(make_rig, 1)
     play([lane], [[[(0.0, 2.0, ())]]])  # a loss shows between messages that arrive
     for name, topic in PUBLISHERS.items():
@@ -175,7 +173,8 @@ def tried(lanes, heards, names):
 
 @pytest.mark.slow
 def test_status_odometry_and_diagnostics_agree_while_what_is_measured_is_wrong(
-    make_rig, monkeypatch
+    make_rig,  # noqa: F811
+    monkeypatch,
 ):  # noqa: F811
     for name, (change, _, words) in CASES.items():
         monkeypatch.setitem(FAULTS, name, (change, words))
