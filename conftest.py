@@ -24,8 +24,9 @@ _taken = (
     deque()
 )  # reservations of domains, oldest first; taken until this process ends, or KEPT others came
 LONGEST = """waiting checking_check lockstep first_hour diagnosis_diagnose launch_files hall first_hour_without_truth each_node study_bench
-    types flying_trial train surveying_known demo nodes packaging evaluate diagnosis_self_calibration measured_path printed_lines lint
-    study_closed_loop study_radio_link replay surveying rerun diagnosis_attribution diagnosis_references localizing
+    stream_faults estimator
+    types flying_trial train surveying_known demo nodes both_nodes strangers packaging evaluate diagnosis_self_calibration measured_path
+    printed_lines lint study_closed_loop study_radio_link replay surveying rerun diagnosis_attribution diagnosis_references localizing
     diagnosis_validation diagnosis_deviations plan connect executables training_shrinking training_structured study_blind training_compare
     study_localizing diagnosis_report study_checking checking_imu_rules""".split()  # files of tests: each takes half a minute or more
 KEPT = 3  # tests for which nobody gets the domain of a test that is over: others see a node that was killed for 20 s more

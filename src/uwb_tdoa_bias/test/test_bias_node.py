@@ -37,12 +37,6 @@ def test_every_parameter_is_in_the_parameter_file_with_its_default(node):
     assert parameters == declared
 
 
-def test_every_parameter_is_described_and_fixed(node):
-    for name in ("effects_file", "model_file", "pose_lag", "hold"):
-        descriptor = node.describe_parameter(name)
-        assert descriptor.description and descriptor.read_only
-
-
 def test_an_antenna_that_would_be_too_far_from_the_body_is_said_and_taken_as_the_body(node):
     assert not node._report()[1].startswith("uwb/tdoa:")
     node._frames.frames.set("base_link", "mast", (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 3.0))

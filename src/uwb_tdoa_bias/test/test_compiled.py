@@ -53,11 +53,6 @@ def test_the_named_folder_is_used_and_made_for_the_user_alone(named):
     assert place() == named / NAME
 
 
-def test_by_default_it_is_in_the_cache_of_the_user(named, monkeypatch):
-    monkeypatch.delenv("NUMBA_CACHE_DIR")
-    assert place() == named.parents[1] / "uwb_tdoa" / NAME
-
-
 @pytest.mark.parametrize("mode", [0o777, 0o1777, 0o757, 0o775, 0o755])
 def test_a_folder_into_which_others_get_is_not_used(named, capsys, mode):
     """Whatever is in it: somebody else may have put it there."""
@@ -89,13 +84,6 @@ def test_no_folder_of_the_present_folder_is_used(named, monkeypatch, capsys, var
     assert "the present folder may be another's, and holds" in capsys.readouterr().err
 
 
-def test_a_link_is_followed_once(named):
-    true = named.parents[1] / "true"
-    true.mkdir()
-    named.symlink_to(true)
-    assert place() == true / NAME
-
-
 def test_where_nothing_can_be_kept_there_is_a_temporary_folder(named, capsys):
     named.write_text("no folder")
     assert is_temporary(place()) and "nothing can be kept" in capsys.readouterr().err
@@ -121,3 +109,15 @@ def test_no_compiled_function_unpacks_an_argument_by_a_bare_name():
                     ):
                         unpacked.append(f"{path.relative_to(SOURCES)}:{node.lineno}")
     assert looked > 200 and not unpacked
+
+
+def test_by_default_it_is_in_the_cache_of_the_user(named, monkeypatch):
+    monkeypatch.delenv("NUMBA_CACHE_DIR")
+    assert place() == named.parents[1] / "uwb_tdoa" / NAME
+
+
+def test_a_link_is_followed_once(named):
+    true = named.parents[1] / "true"
+    true.mkdir()
+    named.symlink_to(true)
+    assert place() == true / NAME

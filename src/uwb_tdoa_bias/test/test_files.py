@@ -134,9 +134,3 @@ def test_readers_see_the_old_content_or_the_new_one(tmp_path):
     done.set()
     reader.join()
     assert sizes == {(1_000_000, 1)}
-
-
-def test_a_folder_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError) as raised:
-        write_text(tmp_path / "none" / "a.csv", "1")
-    assert raised.value.filename

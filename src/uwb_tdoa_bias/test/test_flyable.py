@@ -31,25 +31,6 @@ def test_contains_looks_into_the_right_cell(p):
     )
 
 
-def test_contains_takes_many_and_nothing_strange():
-    p = np.array(
-        [[[-0.75, 0.25, 0.6], [np.nan, 0.25, 0.6]], [[np.inf, 0.25, 0.6], [1e300, -1e300, 0.6]]]
-    )
-    assert volume(flyable=np.ones((5, 4, 3), bool)).contains(p).tolist() == [
-        [True, False],
-        [False, False],
-    ]
-
-
-def test_the_bound_is_that_of_the_cell():
-    p = np.stack(np.meshgrid(*[np.arange(n) + 0.5 for n in (5, 4, 3)], indexing="ij"), axis=-1) * [
-        0.5,
-        0.5,
-        0.25,
-    ]
-    np.testing.assert_array_equal(volume().bound_at(p + [-1.0, 0.0, 0.5]), BOUND)
-
-
 def test_a_planar_one_asks_for_no_height():
     flat = volume(flyable=np.ones((5, 4, 1), bool), planar=True)
     assert flat.contains([[0.0, 1.0, 99.0], [0.0, 9.0, 0.6]]).tolist() == [True, False]

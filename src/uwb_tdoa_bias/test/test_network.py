@@ -1,6 +1,5 @@
 from dataclasses import replace
 import json
-import pickle
 
 import numpy as np
 import pytest
@@ -65,12 +64,6 @@ def test_predicts_what_is_computed_by_hand(network_file):
     np.testing.assert_array_equal(known, 1.0)
 
 
-def test_one_sample_gives_what_a_batch_gives(network_file):
-    network, s = Network(network_file), batch()
-    one = samples(s.p[7:8], s.q[7:8], s.a[7:8], s.b[7:8])
-    np.testing.assert_allclose(network.predict(one)[0], network.predict(s)[0][7:8], atol=1e-7)
-
-
 def test_output_is_clipped(network_file):
     far = samples([[-80.0, 0, 0], [80.0, 0, 0]], [[0, 0, 0, 1]] * 2, [0, 0], [1, 1])
     np.testing.assert_array_equal(Network(network_file).predict(far)[0], [1.0, -1.0])
@@ -113,6 +106,12 @@ def changed(tmp_path, **meta):
         ({"validity": '{"x": [0, 1, 1]}'}, "fade_std"),
         ({"largest_yaw_std": '"wide"'}, "wide"),
         ({"share": "1.5"}, "share must be between 0 and 1"),
+        ({"offset": "[NaN, 0.0]"}, "finite"),
+        ({"clip": "-1"}, "clip must be above 0"),
+        ({"clip": "NaN"}, "clip must be above 0"),
+        ({"validity": "[1]", "fade_std": "1"}, "metadata"),
+        ({"validity": '{"x": [0, 1, 1]}', "fade_std": "Infinity"}, "fade_std"),
+        ({"offset": "[" * 10_000}, "metadata"),
     ],
 )
 def test_wrong_metadata_are_refused_by_name(tmp_path, meta, named):
@@ -172,34 +171,11 @@ def test_missing_file_and_no_model(tmp_path):
         Network(text)
 
 
-def test_a_pickled_network_says_the_same(network_file):
-    network = Network(network_file)
-    again = pickle.loads(pickle.dumps(network))
-    for one, other in zip(network.predict(batch()), again.predict(batch())):
-        np.testing.assert_array_equal(one, other)
-
-
 def test_a_model_is_named_by_its_file(network_file):
     assert load_network("") is None and load_network(None) is None
     assert load_network(str(network_file)).name == "known_answer"
     with pytest.raises(InputError, match="other.onnx does not exist"):
         load_network("other.onnx")
-
-
-@pytest.mark.parametrize(
-    ("meta", "named"),
-    [
-        ({"offset": "[NaN, 0.0]"}, "finite"),
-        ({"clip": "-1"}, "clip must be above 0"),
-        ({"clip": "NaN"}, "clip must be above 0"),
-        ({"validity": "[1]", "fade_std": "1"}, "metadata"),
-        ({"validity": '{"x": [0, 1, 1]}', "fade_std": "Infinity"}, "fade_std"),
-        ({"offset": "[" * 10_000}, "metadata"),
-    ],
-)
-def test_metadata_that_make_no_sense_are_refused(tmp_path, meta, named):
-    with pytest.raises(InputError, match=named):
-        Network(changed(tmp_path, **meta))
 
 
 def otherwise(tmp_path, nodes, constants=(), inputs=(("features", 1, ["n", 2]),)):

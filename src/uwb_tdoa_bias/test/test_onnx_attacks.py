@@ -46,15 +46,10 @@ def model(*nodes, constants=(), width=2, meta=META, **more):
     return made
 
 
-def doubling(count=30, *before):
-    """A kilobyte that becomes 2^count columns."""
-    return model(
-        *before,
-        *(
-            NODE("Concat", [f"v{k}" if k or before else "x"] * 2, [f"v{k + 1}"], axis=1)
-            for k in range(count)
-        ),
-    )
+def doubling():
+    """A kilobyte that becomes 2^30 columns."""
+    nodes = (NODE("Concat", [f"v{k}" if k else "x"] * 2, [f"v{k + 1}"], axis=1) for k in range(30))
+    return model(*nodes)
 
 
 def looping():
@@ -72,16 +67,6 @@ def looping():
     return model(NODE("Loop", ["count", "", "x"], ["y"], body=body), constants=[count])
 
 
-def branching():
-    branch = helper.make_graph(
-        [NODE("Exp", ["x"], ["z"])],
-        "branch",
-        [],
-        [helper.make_tensor_value_info("z", TensorProto.FLOAT, None)],
-    )
-    return model(NODE("Identity", ["x"], ["y"], then_branch=branch, else_branch=branch))
-
-
 def read_elsewhere():
     """The weights are bytes of a file of the user."""
     weights = onnx.TensorProto(
@@ -89,13 +74,6 @@ def read_elsewhere():
     )
     weights.external_data.add(key="location", value="../../etc/passwd")
     return model(NODE("MatMul", ["x", "column"], ["y"]), constants=[weights])
-
-
-def read_elsewhere_in_a_node():
-    weights = read_elsewhere().graph.initializer[0]
-    return model(
-        NODE("Constant", [], ["column"], value=weights), NODE("MatMul", ["x", "column"], ["y"])
-    )
 
 
 def recursive():
@@ -109,16 +87,6 @@ def recursive():
     )
     made = model(NODE("Twice", ["x"], ["y"], domain="own"), functions=[function])
     made.opset_import.add(domain="own", version=1)
-    return made
-
-
-def sparse():
-    made = model(SAME)
-    values, at = (
-        numpy_helper.from_array(np.ones(1, np.float32), "huge"),
-        numpy_helper.from_array(np.zeros((1, 2), np.int64), "at"),
-    )
-    made.graph.sparse_initializer.append(helper.make_sparse_tensor(values, at, [2**20, 2**20]))
     return made
 
 
@@ -144,13 +112,6 @@ def long():
     return model(*(NODE("Identity", [f"v{k}" if k else "x"], [f"v{k + 1}"]) for k in range(20_000)))
 
 
-def gathering(index):
-    return model(
-        NODE("Gather", ["x", "i"], ["y"], axis=1),
-        constants=[numpy_helper.from_array(np.array([index]), "i")],
-    )
-
-
 def branching_seldom():
     """It branches, and loops, only for other numbers than those of the trial."""
     far, text = (
@@ -167,21 +128,6 @@ def branching_seldom():
     )
 
 
-def unfolding_seldom():
-    """Its width follows from the numbers of the input."""
-    nodes = (
-        NODE("ReduceMax", ["x"], ["most"], keepdims=1),
-        NODE("Exp", ["most"], ["e"]),
-        NODE("Cast", ["e"], ["n"], to=TensorProto.INT64),
-    )
-    return model(
-        *nodes,
-        NODE("Reshape", ["n", "one"], ["m"]),
-        NODE("Expand", ["x", "m"], ["y"]),
-        constants=[numpy_helper.from_array(np.array([1]), "one")],
-    )
-
-
 def spent():
     """s of processor time of the processes that have ended."""
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
@@ -195,31 +141,16 @@ TOO_MUCH = "it takes more than 3 s or 256 MB|onnxruntime: .*(alloc|[Mm]emory|bfc
     ("made", "said"),
     [
         (doubling(), TOO_MUCH),
-        (doubling(22), TOO_MUCH),
-        (doubling(1000, NODE("Elu", ["x"], ["v0"])), "onnxruntime: |" + TOO_MUCH),
         (looping(), "operator 'Loop' is none of|" + TOO_MUCH),
-        (branching(), "onnxruntime: .*attribute"),
         (branching_seldom(), "operator '(If|Greater)' is none of"),
-        (unfolding_seldom(), "operator '(Cast|Expand)' is none of"),
         (read_elsewhere(), "onnxruntime: "),
-        (read_elsewhere_in_a_node(), "onnxruntime: "),
         (recursive(), "onnxruntime: |" + TOO_MUCH),
-        (sparse(), "onnxruntime: |" + TOO_MUCH),
-        (
-            model(NODE("Inverse", ["x"], ["y"], domain="com.microsoft")),
-            "onnxruntime: |operator 'Inverse' is none of",
-        ),
         (model(NODE("Dropout", ["x"], ["y"])), "operator 'Dropout' is none of Abs, Add, .*Concat"),
         (model(NODE("\x1b[2J", ["x"], ["y"])), r"onnxruntime: "),
         (claiming(2**31, 2**31), "onnxruntime: "),
-        (claiming(0, 2**62), "onnxruntime: |gives no"),
         (busy(), "a row takes .* ms, more than 5 ms|" + TOO_MUCH),
         (long(), "more than 2000 operators|" + TOO_MUCH),
         (model(SAME, width=2**40), TOO_MUCH),
-        (model(SAME, width=-1), "unknown width|onnxruntime: "),
-        (model(NODE("Add", [], ["y"])), "onnxruntime: "),
-        (model(NODE("LeakyRelu", ["x"], ["y"], alpha="x")), "onnxruntime: "),
-        (gathering(2), "onnxruntime: .*out of"),
     ],
 )
 def test_refused_at_once(tmp_path, made, said):
@@ -230,22 +161,6 @@ def test_refused_at_once(tmp_path, made, said):
         Network(path)
     assert spent() - before < START + MODEL_SECONDS + 1
     assert len(str(refused.value)) < 1000 and str(refused.value).isprintable()
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        b"\xff" * 1_000_000,
-        b"\x3a\x80\x80\x80\x80" + b"\xff" * 1_000_000,
-        b"\x08\x01" * (MODEL_BYTES // 2),
-        b"",
-        b"a",
-    ],
-)
-def test_bytes_that_are_no_model(tmp_path, content):
-    (tmp_path / "model.onnx").write_bytes(content)
-    with pytest.raises(InputError, match="onnxruntime: |is empty|no table|more than one input"):
-        Network(tmp_path / "model.onnx")
 
 
 def test_a_file_that_is_too_large_is_not_tried(tmp_path, monkeypatch):
@@ -338,3 +253,16 @@ def test_a_name_goes_into_messages_and_tables(tmp_path):
     path.write_bytes(made.SerializeToString())
     name = Network(path).name
     assert name.startswith("_b___31m__frac_x") and len(name) == 100
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"\xff" * 1_000_000,
+        b"",
+    ],
+)
+def test_bytes_that_are_no_model(tmp_path, content):
+    (tmp_path / "model.onnx").write_bytes(content)
+    with pytest.raises(InputError, match="onnxruntime: |is empty|no table|more than one input"):
+        Network(tmp_path / "model.onnx")

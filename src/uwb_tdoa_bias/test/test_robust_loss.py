@@ -20,14 +20,6 @@ RHO = {
 }
 
 
-def test_places_are_those_of_the_names():
-    assert [LOSSES.index(name) for name in ("geman_mcclure", "huber", "cauchy")] == [
-        GEMAN_MCCLURE,
-        HUBER,
-        CAUCHY,
-    ]
-
-
 @given(st.sampled_from(list(RHO)), st.floats(-30.0, 30.0), st.floats(0.5, 5.0))
 def test_weight_is_the_slope_of_the_textbook_loss(loss, e, scale):
     if (
@@ -57,3 +49,11 @@ def test_geman_mcclure_loss_is_the_textbook_one_over_its_limit(e, scale):
     assert geman_mcclure_loss(e, scale) == pytest.approx(
         2.0 * RHO[GEMAN_MCCLURE](e, scale) / scale**2, abs=1e-12
     )
+
+
+def test_places_are_those_of_the_names():
+    assert [LOSSES.index(name) for name in ("geman_mcclure", "huber", "cauchy")] == [
+        GEMAN_MCCLURE,
+        HUBER,
+        CAUCHY,
+    ]

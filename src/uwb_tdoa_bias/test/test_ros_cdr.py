@@ -170,20 +170,6 @@ def test_what_cannot_be_read_is_left_out_and_said(reason):
         wire.read([BAD[reason]])
 
 
-def test_a_wrong_version_in_another_encoding_is_none_either():
-    for data in (
-        tdoa_bytes(">", variance=False),
-        tdoa_bytes(">", more=bytes(8)),
-        tdoa_bytes("<", 1, variance=False),
-    ):
-        with pytest.raises(
-            Unreadable, match="another version|cannot be read as uwb_tdoa_msgs/Tdoa"
-        ):
-            CdrCodec(Tdoa, "anchor_a").read([data])
-    with pytest.raises(Unreadable, match="no UTF-8"):
-        CdrCodec(Tdoa, "anchor_a").read([tdoa_bytes(">", frame=b"t\xff")])
-
-
 def test_lists_are_bounded_before_anything_is_allocated():
     array = AnchorArray()
     array.header.frame_id = "map"
@@ -216,3 +202,17 @@ def test_noise_is_refused_or_read_and_nothing_else(way):
             data[place] ^= 1 << rng.integers(8)
         read += sum(len(rows) for _, rows, _ in wire.read([bytes(data)], refused.append))
     assert read + len(refused) == 300 and read > 50 and len(refused) > 50
+
+
+def test_a_wrong_version_in_another_encoding_is_none_either():
+    for data in (
+        tdoa_bytes(">", variance=False),
+        tdoa_bytes(">", more=bytes(8)),
+        tdoa_bytes("<", 1, variance=False),
+    ):
+        with pytest.raises(
+            Unreadable, match="another version|cannot be read as uwb_tdoa_msgs/Tdoa"
+        ):
+            CdrCodec(Tdoa, "anchor_a").read([data])
+    with pytest.raises(Unreadable, match="no UTF-8"):
+        CdrCodec(Tdoa, "anchor_a").read([tdoa_bytes(">", frame=b"t\xff")])

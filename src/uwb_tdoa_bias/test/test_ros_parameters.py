@@ -99,14 +99,6 @@ def test_an_unknown_name_is_refused_with_the_nearest_one(node_with):
         refuse_unknown(node, ["old"])
 
 
-def test_a_known_name_is_not_refused(node_with):
-    node = node_with(
-        "-p", "gate:=1.0", "-p", "use_sim_time:=true", "-p", "qos_overrides./x.publisher.depth:=3"
-    )
-    declare_all(node, PARAMETERS)
-    refuse_unknown(node)
-
-
 def test_what_changes_nothing_is_said(node_with, said, tmp_path):
     for name, key in (("mine", "/**"), ("other", "/**/other_node"), ("empty", None)):
         (tmp_path / name).write_text(

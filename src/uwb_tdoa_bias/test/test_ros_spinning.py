@@ -7,7 +7,6 @@ rclpy = pytest.importorskip("rclpy")
 from builtin_interfaces.msg import Time  # noqa: E402
 from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
 from rcl_interfaces.srv import GetParameters  # noqa: E402
-from rclpy.impl.implementation_singleton import rclpy_implementation  # noqa: E402
 from rclpy.qos import QoSProfile  # noqa: E402
 from rclpy.task import Future  # noqa: E402
 from rosgraph_msgs.msg import Clock  # noqa: E402
@@ -178,19 +177,6 @@ def test_turns_rest_as_long_as_they_took_and_only_if_there_was_something():
     )  # a busy computer takes its time
     assert 0.004 <= RoundRobin([Slow(0.005, True)]).take() <= 0.01
     assert RoundRobin([Slow(0.05, True)]).take() == 0.01
-
-
-def test_a_request_that_cannot_be_taken_ends_nothing(surroundings):
-    node, _ = surroundings
-    spinner = Spinner([node])
-
-    def refuse():
-        raise rclpy_implementation.RCLError("taking failed")
-
-    spinner._guarded(refuse)
-    with pytest.raises(ValueError):
-        spinner._guarded(lambda: int("a defect of ours"))
-    spinner.close()
 
 
 def test_a_flood_of_requests_does_not_keep_streams_waiting(surroundings, monkeypatch):

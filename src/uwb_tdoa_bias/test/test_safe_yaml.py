@@ -50,11 +50,6 @@ def test_numbers_are_those_that_people_mean():
     }
 
 
-@pytest.mark.parametrize("text", ["", "~", "# nothing"])
-def test_an_empty_file_is_nothing(text):
-    assert parse_yaml(text, "f") is None
-
-
 @pytest.mark.parametrize(
     ("text", "said"),
     [

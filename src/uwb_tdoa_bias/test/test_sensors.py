@@ -5,13 +5,9 @@ tests of its own.
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.effects import RADIO
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.flight import AIDS, Flight, Tdoas
 from uwb_tdoa_bias.foundation.sensors import (
-    BY_POSE,
-    DIAGNOSED,
-    LOCATING,
     SENSORS,
     STREAM_OF,
     Height,
@@ -90,23 +86,8 @@ def test_what_the_filter_gets(name):
         assert not broken.any()
 
 
-@pytest.mark.parametrize("name", SENSORS)
-def test_its_parameters_begin_with_the_switch(name):
-    first, *_ = SENSORS[name].parameters.values()
-    assert (
-        next(iter(SENSORS[name].parameters)) == f"use_{name}"
-        and first.default is True
-        and first.metadata["fixed"]
-    )
-
-
-def test_registries_of_a_part():
-    assert LOCATING == ("range",)
-    assert set(BY_POSE) == {"height", "pressure", "velocity", "yaw_rate"}
+def test_the_yaw_rate_is_a_part_of_the_velocity_stream():
     assert STREAM_OF == {**dict(zip(SENSORS, SENSORS)), "yaw_rate": "velocity"}
-    assert set(DIAGNOSED) - set(BY_POSE) == RADIO.keys() - {
-        "tdoa"
-    }  # distances to anchors, of which effects on arrivals know
 
 
 # --- velocities and yaw rates ---

@@ -48,14 +48,6 @@ def test_a_loop_ends():
     assert frames.between("c", "a") is None
 
 
-def test_whether_a_constant_transform_is_new():
-    frames = Frames()
-    assert frames.set("a", "b", IDENTITY, (1.0, 0.0, 0.0))
-    assert not frames.set("a", "b", (0.0, 0.0, 0.0, -1.0), (1.0, 0.0, 0.0))  # the same rotation
-    assert frames.set("a", "b", IDENTITY, (1.0, 0.0, 0.1))
-    assert frames.set("c", "b", IDENTITY, (1.0, 0.0, 0.1))
-
-
 def test_a_frame_that_moves_is_interpolated_and_held_for_a_while():
     frames = robot()
     frames.move("odom", "base_link", IDENTITY, (0.0, 0.0, 0.0), 1.0)

@@ -152,6 +152,25 @@ def with_ranges(flight, seed=0, rate=200.0, std=0.02):
     return replace(flight, range=Ranges(t, flight.anchors.ids[row], d, np.zeros(len(t))))
 
 
+def only_ranges(std=0.1, rate=100.0):
+    """A Flight of `fly` with distances to its anchors instead of TDOAs."""
+    flight = with_ranges(fly(seed=1), 3, rate, std)
+    return replace(flight, tdoa=kept(flight.tdoa, slice(0)))
+
+
+def kept(stream, rows):
+    """Some rows of an Imu, Tdoas or another stream of columns."""
+    columns = {name: column[rows] for name, column in vars(stream).items() if column is not None}
+    return replace(stream, **columns)
+
+
+def rms_error(flight, odometry, after=2.0):
+    """RMS error of positions, m, from `after` s after the first on."""
+    late = odometry.t > odometry.t[0] + after
+    error = (odometry.p - position_at(flight, odometry.t))[late]
+    return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
+
+
 def _inertial_error(rng, n, rate, noise, bias, walk):
     steps = walk / np.sqrt(rate) * rng.standard_normal((n, 3))
     white = noise * np.sqrt(rate) * rng.standard_normal((n, 3))

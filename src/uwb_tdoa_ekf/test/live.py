@@ -25,7 +25,7 @@ def send(estimator, flight, stream, i):
     if stream == IMU:
         estimator.add_imu(imu.t[i], imu.gyro[i], imu.accel[i])
     elif stream == TDOA:
-        estimator.add_tdoa(tdoa.t[i], int(tdoa.a[i]), int(tdoa.b[i]), tdoa.d[i])
+        estimator.add_tdoa(tdoa.t[i], tdoa.a[i], tdoa.b[i], tdoa.d[i])
     else:
         name = STREAMS[stream - FIRST_AID]
         part = getattr(flight, name)

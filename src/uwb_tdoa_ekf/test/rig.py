@@ -72,20 +72,24 @@ STREAMS = {
 }
 
 
-@pytest.fixture
-def make_rig():
+def _rigs():
     """make_rig() gives a Rig in a namespace of its own; what it started ends with the test."""
     rclpy.init()
-    rigs = []
+    rigs, domain = [], os.environ.get("ROS_DOMAIN_ID", "0")
 
     def make(**options):
         rigs.append(Rig(f"tag{len(rigs)}", **options))
+        rigs[-1].domain = domain
         return rigs[-1]
 
     yield make
     for rig in rigs:
         rig.close()
     rclpy.shutdown()
+
+
+make_rig = pytest.fixture(_rigs)
+make_shared_rig = pytest.fixture(scope="module", name="make_shared_rig")(_rigs)
 
 
 def recording(seconds=4.0, imu_rate=200.0, tdoa_rate=100.0):
@@ -150,7 +154,7 @@ class Rig:
         """listen : topics to keep; reliable : make the streams so, for a test that cannot bear the
         loss of a message;
         latched : have a latched publisher of anchors."""
-        self.namespace = namespace
+        self.namespace, self.domain = namespace, os.environ.get("ROS_DOMAIN_ID", "0")
         self.node = rclpy.create_node("rig", namespace=namespace)
         self._reliable, self._qos = reliable, copy(STREAM_QOS)
         if reliable:
@@ -223,6 +227,7 @@ class Rig:
                 stderr=subprocess.STDOUT,
                 text=True,
                 start_new_session=True,
+                env={**os.environ, "ROS_DOMAIN_ID": self.domain},
             )
             lines = []
             reader = threading.Thread(target=_collect, args=(process.stdout, lines), daemon=True)

@@ -35,7 +35,7 @@ class Lane:
 
 
 def lanes_of(make_rig, count):
-    """`count` Lanes whose nodes are ready; their poses are only kept if there is one."""
+    """`count` Lanes whose nodes are ready."""
     lanes = []
     for _ in range(count):
         rig = make_rig(listen=(), reliable=False)
@@ -49,10 +49,8 @@ def lanes_of(make_rig, count):
             ]
 
         rig.node.create_subscription(DiagnosticArray, "/diagnostics", hear, DIAGNOSTICS_QOS)
-        if count == 1:
-            rig.node.create_subscription(
-                Odometry, "odometry", lambda m: lane.poses.append((time.time(), m)), STREAM_QOS
-            )
+        keep = lambda m, poses=lane.poses: poses.append((time.time(), m))  # noqa: E731
+        rig.node.create_subscription(Odometry, "odometry", keep, STREAM_QOS)
         rig.send_anchors(FLIGHT.anchors)
         lanes.append(lane)
     return lanes

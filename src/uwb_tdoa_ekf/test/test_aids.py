@@ -182,14 +182,6 @@ def test_each_aid_helps(flight, without):
     assert np.linalg.norm(of_velocity) < np.linalg.norm(without)
 
 
-def test_a_fixed_height_is_kept():
-    low = fly(4, 8.0, hover=True, tdoa_std=0.3)
-    z = low.truth.p[0, 2]
-    odometry = run_offline(low, FilterConfig(fixed_height=float(z), fixed_height_std=0.02)).odometry
-    assert np.abs(odometry.p[:, 2] - z).max() < 0.05
-    assert np.abs(run_offline(low).odometry.p[:, 2] - z).max() > 0.05
-
-
 def changed(flight, change):
     """The flight with change(t, range) (n,) instead of its ranges."""
     return replace(

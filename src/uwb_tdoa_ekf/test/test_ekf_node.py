@@ -1,20 +1,31 @@
-from dataclasses import fields
-from pathlib import Path
-import re
+"""Parameters, initialpose and transforms of ekf_node."""
 
 import pytest
-import yaml
 
 rclpy = pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
+pytest.importorskip("rclpy")
 
-from flights import fly  # noqa: E402
+from dataclasses import fields  # noqa: E402
+import math  # noqa: E402
+from pathlib import Path  # noqa: E402
+import re  # noqa: E402
 
-from uwb_tdoa_ekf.core import engine, measurements  # noqa: E402
+from builtin_interfaces.msg import Time  # noqa: E402
+from geometry_msgs.msg import PoseWithCovarianceStamped  # noqa: E402
+import numpy as np  # noqa: E402
+from scipy.spatial.transform import Rotation  # noqa: E402
+import yaml  # noqa: E402
+
+from uwb_tdoa_bias.foundation.errors import InputError  # noqa: E402
+from uwb_tdoa_bias.foundation.ros_stamps import Epoch  # noqa: E402
+from uwb_tdoa_ekf import outputs  # noqa: E402
 from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 from uwb_tdoa_ekf.ekf_node import EkfNode  # noqa: E402
-from uwb_tdoa_ekf.estimator import Estimator  # noqa: E402
+from uwb_tdoa_ekf.pose_message import pose_from_message  # noqa: E402
+from uwb_tdoa_ekf.results import Odometry  # noqa: E402
 
+# --- ekf node ---
 CONFIG = Path(__file__).resolve().parents[1] / "config" / "ekf_node.yaml"
 
 
@@ -44,18 +55,161 @@ def test_every_parameter_is_in_the_parameter_file_with_its_default(node):
     assert comments == {name: node.describe_parameter(name).description for name in declared}
 
 
-@pytest.mark.parametrize("batch", [1, 3, 200])
-def test_a_node_that_is_ready_has_nothing_left_to_compile(node, batch):
-    before = [set(function.signatures) for function in (engine.run, measurements.usable)]
-    flight = fly(duration=1.0)
-    estimator = Estimator(flight.anchors)
-    for i in range(len(flight.imu)):
-        estimator.add_imu(
-            flight.imu.t[i].item(), flight.imu.gyro[i].tolist(), flight.imu.accel[i].tolist()
+# --- pose message ---
+
+
+def message(variances=(0.25, 0.25, 0.0, 0.0, 0.0, 0.07), frame="map", second=5):
+    """As RViz sends it: x, y and yaw, 90 degrees to the left."""
+    out = PoseWithCovarianceStamped()
+    out.header.frame_id, out.header.stamp.sec = frame, second
+    out.pose.pose.position.x, out.pose.pose.position.y, out.pose.pose.position.z = 1.0, 2.0, 0.0
+    out.pose.pose.orientation.z = out.pose.pose.orientation.w = math.sqrt(0.5)
+    out.pose.covariance = np.diag(variances).ravel()
+    return out
+
+
+def read(content, newest=3.0):
+    epoch = Epoch()
+    epoch.seconds(Time(sec=2))
+    return pose_from_message(content, "map", epoch, newest)
+
+
+def test_what_has_a_variance_is_told():
+    t, p, covariance, yaw, std = read(message())
+    assert (t, p[:2].tolist(), yaw, std) == (
+        3.0,
+        [1.0, 2.0],
+        pytest.approx(math.pi / 2),
+        pytest.approx(math.sqrt(0.07)),
+    )
+    assert math.isnan(p[2]) and covariance[0, 0] == 0.25
+    _, p, _, yaw, std = read(message((0.25, 0.25, 0.1, 0.0, 0.0, 0.0)))
+    assert p[2] == 0.0 and math.isnan(yaw) and math.isnan(std)
+
+
+def test_without_a_stamp_it_is_of_the_newest_measurement():
+    assert read(message(second=0), newest=7.5)[0] == 7.5
+    with pytest.raises(InputError, match="no stamp"):
+        read(message(second=0), newest=-math.inf)
+
+
+@pytest.mark.parametrize(
+    ("content", "named"),
+    [
+        (message(frame="odom"), "'odom', and the filter's is 'map'"),
+        (message((math.nan, 1.0, 1.0, 1.0, 1.0, 1.0)), "not finite"),
+        (message((-1.0, 1.0, 1.0, 1.0, 1.0, 1.0)), "negative"),
+    ],
+)
+def test_nonsense_is_refused(content, named):
+    with pytest.raises(InputError, match=named):
+        read(content)
+
+
+# --- outputs ---
+
+
+class Publisher:
+    """Keeps (translation, quaternion, stamp) of what is published."""
+
+    def __init__(self):
+        self.sent = []
+
+    def get_subscription_count(self):
+        return 1
+
+    def publish(self, message):
+        (one,) = message.transforms
+        v, q, stamp = one.transform.translation, one.transform.rotation, one.header.stamp
+        self.sent.append(
+            (
+                np.array([v.x, v.y, v.z]),
+                Rotation.from_quat([q.x, q.y, q.z, q.w]),
+                stamp.sec + 1e-9 * stamp.nanosec,
+            )
         )
-        a, b, d = (column[i].item() for column in (flight.tdoa.a, flight.tdoa.b, flight.tdoa.d))
-        estimator.add_tdoa(flight.tdoa.t[i].item(), a, b, d, 0.1)
-        if i % batch == 0:
-            estimator.advance()
-    estimator.finish()
-    assert [set(function.signatures) for function in (engine.run, measurements.usable)] == before
+
+
+class Stub:
+    """A node, and a frame odom that the body drives in: at t, s, it is at (t, 0, lift), tilted."""
+
+    def __init__(self, lift=0.0, tilt=0.0):
+        self.tf, self.lift, self.tilt = Publisher(), lift, tilt
+
+    def create_publisher(self, *_):
+        return self.tf
+
+    def between(self, parent, child, t):
+        return Rotation.from_euler("ZYX", [0.1, self.tilt, 0.0]), np.array([t, 0.0, self.lift])
+
+
+class Silent:
+    def __init__(self, *_):
+        self.publisher = self
+
+    def publish(self, *_):
+        pass
+
+
+def made(monkeypatch, node, planar):
+    monkeypatch.setattr(outputs, "StreamOutput", Silent)
+    epoch = Epoch()
+    epoch.seconds_of(np.array([100]), np.array([0]))
+    return outputs.Outputs(node, epoch, node, "base_link", "odom", "odom", planar)
+
+
+def odometry(t, p, yaw, tilt=0.0):
+    n, q = (
+        len(t),
+        Rotation.from_euler("ZYX", np.column_stack([yaw, np.full((len(t), 2), tilt)])).as_quat(),
+    )
+    zeros, covariance = np.zeros((n, 3)), np.tile(0.01 * np.eye(9), (n, 1, 1))
+    return Odometry(t, p, zeros, q, zeros, zeros, covariance, np.zeros((n, 3, 3)))
+
+
+def publish(out, estimates, held=False):
+    n = len(estimates)
+    out.publish_odometry(estimates, np.full((n, 3), np.nan), np.full((n, 3), np.nan), held)
+
+
+def test_world_to_odom_stays_while_the_position_is_unsure(monkeypatch):
+    node = Stub()
+    out = made(monkeypatch, node, False)
+    t = np.array([1.0, 1.1, 1.2])
+    p = np.column_stack([t + 1.0, [2.0, 2.0, 5.0], np.zeros(3)])
+    publish(out, odometry(t[:1], p[:1], np.array([0.5])))
+    publish(out, odometry(t[1:], p[1:], np.array([0.5, 2.0])), held=True)
+    (first, turn, _), *others = node.tf.sent
+    assert len(others) == 2 and [stamp for *_, stamp in others] == pytest.approx(
+        (t[1:] + 100.0).tolist()
+    )
+    for translation, rotation, _ in others:
+        np.testing.assert_array_equal(translation, first)
+        assert (rotation.inv() * turn).magnitude() == 0.0
+    publish(out, odometry(t[2:], p[2:], np.array([2.0])))
+    assert np.linalg.norm(node.tf.sent[-1][0] - first) > 1.0
+
+
+def test_the_first_transform_is_not_held(monkeypatch):
+    node = Stub()
+    publish(
+        made(monkeypatch, node, False),
+        odometry(np.array([1.0]), np.ones((1, 3)), np.array([0.5])),
+        held=True,
+    )
+    (_, turn, _) = node.tf.sent[0]
+    assert turn.as_euler("ZYX")[0] == pytest.approx(0.4)
+
+
+@pytest.mark.parametrize("planar", [False, True])
+def test_world_to_odom_of_a_planar_vehicle_turns_about_the_vertical_alone(monkeypatch, planar):
+    """odom -> base_link of an odometry in three dimensions tilts."""
+    node = Stub(lift=0.05, tilt=0.03)
+    publish(
+        made(monkeypatch, node, planar),
+        odometry(np.array([1.0]), np.array([[1.0, 2.0, 0.0]]), np.array([0.5])),
+    )
+    (translation, turn, _) = node.tf.sent[0]
+    yaw, pitch, roll = turn.as_euler("ZYX")
+    assert yaw == pytest.approx(0.4, abs=0.01) and (np.hypot(pitch, roll) < 1e-9) == planar
+    assert np.linalg.norm(turn.apply([1.0, 0.0, 0.05]) + translation - [1.0, 2.0, 0.0]) < 1e-9

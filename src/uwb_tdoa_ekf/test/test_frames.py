@@ -44,12 +44,3 @@ def test_rotation_std_is_that_of_the_odometry():
     np.testing.assert_allclose(
         rotation_std(q, covariance), np.sqrt(converted[:, [3, 4, 5], [3, 4, 5]]), rtol=1e-12
     )
-
-
-def test_many_rows_are_independent():
-    q, v, covariance = map(np.array, zip(*(state(seed) for seed in range(5))))
-    together = to_odometry(q, v, covariance)
-    for i in range(5):
-        one = to_odometry(q[i : i + 1], v[i : i + 1], covariance[i : i + 1])
-        for many, single in zip(together, one):
-            np.testing.assert_allclose(many[i], single[0], rtol=1e-12)

@@ -7,16 +7,12 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.hypotheses import (
-    LARGEST_NIS,
     MERGED_WITHIN,
     PRUNED_BELOW,
     YAW_STD,
-    add_log_likelihood,
-    add_spread_of_means,
     select,
-    yaw_offset,
 )
-from uwb_tdoa_ekf.core.memory import HYPOTHESES, PLACES, YAWS, new_state
+from uwb_tdoa_ekf.core.memory import HYPOTHESES, new_state
 from uwb_tdoa_ekf.offline import run_offline
 
 NOISE = dict(accel_noise=0.01, gyro_noise=0.001)  # a common sensor that does not vibrate
@@ -38,23 +34,6 @@ def ekf_with(yaws, log_weights):
     return ekf
 
 
-def test_directions_share_the_circle():
-    for place in range(PLACES):
-        offsets = [yaw_offset(YAWS * place + k) for k in range(YAWS)]
-        np.testing.assert_allclose(offsets, np.arange(YAWS) * 2.0 * np.pi / YAWS)
-
-
-def test_log_likelihood_is_the_logarithm_of_the_gaussian_density_and_bounded():
-    ekf = ekf_with(np.zeros(4), np.zeros(4))
-    ekf.innovation.prior_variance, ekf.innovation.noise_variance = 0.01, 0.015
-    for h, value in enumerate((0.3, 300.0)):
-        ekf.innovation.value = value
-        add_log_likelihood(ekf.hypotheses[h], ekf.innovation, 2.0)
-    log_weights = ekf.hypotheses["log_weight"]
-    assert log_weights[0] == pytest.approx(-0.5 * (0.3**2 / 0.04 + np.log(0.04)))
-    assert log_weights[1] == pytest.approx(-0.5 * (LARGEST_NIS + np.log(0.04)))
-
-
 def test_select_follows_the_best_and_prunes_the_improbable_and_the_same():
     ekf = ekf_with([0.0, 0.05, 2.0, 3.0], [-1.0, -2.0, -3.0, -1.0 + 1.1 * PRUNED_BELOW])
     select(ekf, 5.0)
@@ -67,22 +46,6 @@ def test_what_is_elsewhere_is_not_the_same_whichever_way_it_faces():
     ekf.hypotheses["x"][1, 2], ekf.hypotheses["x"][2, 2] = 1.5 * MERGED_WITHIN, 0.5 * MERGED_WITHIN
     select(ekf, 5.0)
     np.testing.assert_array_equal(ekf.hypotheses["log_weight"][:3], [0.0, -1.0, -np.inf])
-
-
-def test_two_that_have_become_the_same_are_one_though_neither_is_the_best():
-    ekf = ekf_with([0.0, 2.0, 2.0, -2.0], [0.0, -1.0, -1.0, -3.0])
-    select(ekf, 5.0)
-    np.testing.assert_array_equal(ekf.hypotheses["log_weight"][:4], [0.0, -1.0, -np.inf, -3.0])
-
-
-def test_spread_of_means_is_the_distance_to_the_others():
-    ekf = ekf_with([0.0, np.pi / 2, 0.0, 0.0], [0.0, np.log(0.25), -np.inf, -np.inf])
-    ekf.hypotheses["x"][1, 0] = 2.0
-    covariance = np.zeros((9, 9))
-    add_spread_of_means(ekf, covariance)
-    assert covariance[0, 0] == pytest.approx(0.2 * 2.0**2)
-    assert covariance[8, 8] == pytest.approx(0.2 * (np.pi / 2) ** 2)
-    assert covariance[0, 8] == pytest.approx(0.2 * 2.0 * np.pi / 2)
 
 
 @pytest.mark.parametrize("wrong", [0.5 * np.pi, -0.5 * np.pi, np.pi, 0.8])

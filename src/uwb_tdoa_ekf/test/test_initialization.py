@@ -9,8 +9,6 @@ from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
-from uwb_tdoa_ekf.core.initialization import remember
-from uwb_tdoa_ekf.core.memory import TDOA, WINDOW, new_state, structured
 from uwb_tdoa_ekf.core.verdicts import REJECTED, STARTUP, USED
 
 
@@ -78,19 +76,6 @@ def test_a_good_flight_needs_no_recovery():
         state = state_for(flight)
         drive(flight, state=state)
         assert state.record.recoveries == 0
-
-
-def test_the_window_keeps_the_latest_tdoas_in_order():
-    state, fed = new_state(np.zeros((4, 3))), 5 * WINDOW + 7
-    ekf = state.record
-    for k in range(fed):
-        remember(
-            ekf,
-            structured(TDOA, *np.array([[0.01 * k], [k % 4], [0], [k], [0.0]]))[0],
-            state.anchors,
-        )
-    assert WINDOW <= ekf.kept <= 2 * WINDOW
-    np.testing.assert_array_equal(ekf.window["d"][: ekf.kept], np.arange(fed - ekf.kept, fed))
 
 
 def beside(flight, positions):

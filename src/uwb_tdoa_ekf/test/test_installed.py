@@ -4,14 +4,12 @@ from dataclasses import replace
 
 from flights import corners, fly, position_at
 import numpy as np
-import pytest
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_ekf.core.verdicts import INVALID, USED
 from uwb_tdoa_ekf.estimator import Estimator
-from uwb_tdoa_ekf.installed import Installed
 
 BOX = corners()
 CHANGE = 4.0  # s
@@ -104,31 +102,6 @@ def test_one_that_is_gone_is_used_no_more():
     )
 
 
-def test_what_was_learned_of_those_that_stay_is_kept_and_of_one_that_moved_forgotten():
-    flight, estimator = flight_through(), Estimator(BOX)
-    fed(estimator, cut(flight, -np.inf, CHANGE))
-    before = estimator._pipeline.state.anchors.copy()
-    before["excess_variance"] = estimator._pipeline.state.anchors["excess_variance"] = 0.01 * (
-        1.0 + np.arange(len(BOX))
-    )
-    estimator.change_anchors(after())
-    np.testing.assert_array_equal(
-        estimator._pipeline.state.anchors["excess_variance"][: len(BOX)], before["excess_variance"]
-    )
-    moved, added = estimator._installed.index(np.array([MOVED, ADDED]))
-    assert estimator._pipeline.state.anchors["excess_variance"][[moved, added]].tolist() == [
-        0.0,
-        0.0,
-    ]
-    np.testing.assert_array_equal(
-        estimator._pipeline.state.anchors["position"][[moved, added]], [PLACE, NEW]
-    )
-    np.testing.assert_array_equal(
-        estimator._pipeline.state.record.extent,
-        [after().positions.min(axis=0), after().positions.max(axis=0)],
-    )
-
-
 def test_a_reset_afterwards_and_an_anchor_that_comes_back():
     estimator, flight, _, _ = flown()
     estimator.reset()
@@ -175,17 +148,3 @@ def test_nothing_is_said_of_an_anchor_that_was_taken_away():
         assert any(f"anchor {GONE} is not heard" in alarm for alarm in estimator.alarms) == (
             not taken
         )
-
-
-@pytest.mark.parametrize("times", [1, 3])
-def test_rows_stay_what_they_are(times):
-    installed = Installed(BOX)
-    for _ in range(times):
-        rows = installed.index(BOX.ids[2:])
-        gone = installed.change(after())
-        np.testing.assert_array_equal(installed.index(BOX.ids[2:]), rows)
-        assert installed.index(np.array([GONE]))[0] == -1 and len(gone) == 2
-        np.testing.assert_array_equal(installed.ids[installed.present], after().ids)
-        np.testing.assert_array_equal(installed.positions[installed.present], after().positions)
-        installed.change(BOX)
-    assert installed.index(np.array([1234])).tolist() == [-1]

@@ -43,11 +43,6 @@ def test_all_is_one_for_each():
     assert usable_all(a, b, d, variance, POSITIONS).tolist() == expected.tolist()
 
 
-def test_none():
-    none = np.empty(0)
-    assert usable_all(none.astype(int), none.astype(int), none, none, POSITIONS).tolist() == []
-
-
 @pytest.mark.parametrize(
     "slope, state, expected",
     [

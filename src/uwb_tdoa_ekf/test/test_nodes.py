@@ -6,7 +6,6 @@ import itertools
 from pathlib import Path
 import signal
 import threading
-import time
 
 import numpy as np
 import pytest
@@ -17,7 +16,6 @@ pytest.importorskip("uwb_tdoa_msgs.msg")
 import known_answer  # noqa: E402
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy  # noqa: E402
 from rig import OUTPUTS, make_rig, recording, seconds_of, stamp  # noqa: E402, F401
-from rosgraph_msgs.msg import Clock  # noqa: E402
 from rovers import HEIGHT, drive  # noqa: E402
 
 from uwb_tdoa_bias.correction.corrector import Corrector  # noqa: E402
@@ -26,10 +24,9 @@ from uwb_tdoa_bias.effects import EffectSet  # noqa: E402
 from uwb_tdoa_bias.foundation.flight import Tdoas  # noqa: E402
 from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 from uwb_tdoa_ekf.frames import to_odometry  # noqa: E402
-from uwb_tdoa_ekf.launching import tags  # noqa: E402
 from uwb_tdoa_ekf.offline import run_offline  # noqa: E402
 from uwb_tdoa_ekf.results import rows_of  # noqa: E402
-from uwb_tdoa_msgs.msg import TdoaCorrected, TdoaResidual  # noqa: E402
+from uwb_tdoa_msgs.msg import TdoaResidual  # noqa: E402
 
 SOURCES = Path(__file__).resolve().parents[2]
 EFFECTS = (
@@ -46,17 +43,9 @@ def quaternion(q):
     return q.x, q.y, q.z, q.w
 
 
-SLOW = pytest.mark.slow
-
-
 @pytest.mark.parametrize(
     ("what", "processes"),
-    [
-        ("effects", 2),
-        pytest.param("network", 2, marks=SLOW),
-        ("effects", 1),
-        pytest.param("network", 1, marks=SLOW),
-    ],
+    [("effects", 2), ("network", 1)],
 )
 def test_odometry_is_that_of_the_offline_engine(make_rig, tmp_path, what, processes):
     flight = recording()
@@ -166,8 +155,20 @@ def test_odometry_is_that_of_the_offline_engine(make_rig, tmp_path, what, proces
         np.testing.assert_allclose(residual.weight, expected.residuals.weight[i], atol=1e-6)
     assert len(rig.residuals) + ekf["waiting"] == len(flight.tdoa)
 
+    if what == "effects":
+        return
+    # A recording that starts again gives the same again.
+    rig.play(flight)
+    again = rig.counts(
+        "ekf_node", IMU_samples_received=2 * len(flight.imu), TDOAs_received=2 * len(flight.tdoa)
+    )
+    assert (again["restarts"], again["late"]) == (1, ekf["waiting"])  # what had been left waiting
+    first, second = rig.odometry[:n], rig.odometry[n:]
+    assert [m.header.stamp for m in first] == [m.header.stamp for m in second]
+    assert [m.pose.pose for m in first] == [m.pose.pose for m in second]
 
-@pytest.mark.parametrize("bare", [False, pytest.param(True, marks=SLOW)])
+
+@pytest.mark.parametrize("bare", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_a_rover_over_topics_is_that_of_the_offline_engine_to_the_bit(make_rig, bare):
     """Wheels that come as nav_msgs/Odometry, TDOAs, and an IMU or none; a planar vehicle."""
     flight = drive(1, 8.0, begin=0.0)
@@ -255,127 +256,8 @@ def test_quality_of_service(make_rig):
     rig.wait(arrived, "a measurement to pass")
 
 
-TAGS = """
-anchors_file: anchors.yaml
-world_frame: hall
-tags: {tag0: {}, tag1: {body_frame: drone, publish_tf: none}}
-"""
-
-
-@SLOW
-def test_two_tags_of_a_launch_file(make_rig, tmp_path):
-    """On simulated time, which stands still in between; the second begins in the middle of its
-    recording.
-    """
-    flight, epoch = (
-        recording(2.0),
-        int(time.time()) + 10**6,
-    )  # what a node says is newer than anything before
-    flight.anchors.to_yaml(tmp_path / "anchors.yaml")
-    (tmp_path / "tags.yaml").write_text(TAGS)
-    one, other = (
-        make_rig(listen=["odometry", "uwb/residual", "/tf"]),
-        make_rig(listen=["odometry", "uwb/residual"]),
-    )
-    clock = one.node.create_publisher(Clock, "/clock", 10)
-    starts = [
-        each
-        for each in tags(tmp_path / "tags.yaml", {"use_sim_time": True})
-        if each.executable in OUTPUTS
-    ]
-    with ticking(clock, epoch) as running:
-        for rig in (one, other):
-            arguments = {
-                each.executable: each.words for each in starts if each.namespace == rig.namespace
-            }
-            rig.start(*arguments, **arguments)
-        one.play(flight, epoch)
-        assert one.counts("ekf_node")["used"] > 0
-        idle = other.counts("ekf_node")
-        assert idle["TDOAs received"] == idle["IMU samples received"] == 0 and not other.odometry
-        late = np.searchsorted(flight.tdoa.t, 0.7)
-        tdoa = Tdoas(*(column[late:] for column in vars(flight.tdoa).values()))
-        other.play(replace(flight, tdoa=tdoa), epoch)
-        ekf = one.counts(
-            "ekf_node", TDOAs_received=len(flight.tdoa), IMU_samples_received=len(flight.imu)
-        )
-        assert ekf["late"] == ekf["restarts"] == 0
-        assert other.counts("ekf_node", TDOAs_received=len(tdoa))["used"] > 0
-        running.clear()  # the pause
-        for rig in (one, other):
-            rig.wait(
-                lambda rig=rig: (
-                    rig.fresh_status("ekf_node").message == "paused: /clock stands still"
-                ),
-                "it to be said",
-            )
-    expected = run_offline(flight).odometry
-    np.testing.assert_allclose(
-        [vector(m.pose.pose.position) for m in one.odometry],
-        expected.p[: len(one.odometry)],
-        atol=1e-6,
-    )
-    assert len(one.odometry) > 100 and seconds_of(other.odometry[0].header.stamp, epoch) > 0.7
-    assert {(m.header.frame_id, m.child_frame_id) for m in one.odometry} == {
-        ("hall", "tag0/base_link")
-    }
-    assert {(m.header.frame_id, m.child_frame_id) for m in other.odometry} == {("hall", "drone")}
-    frames = {
-        (t.header.frame_id, t.child_frame_id) for m in one.received["/tf"] for t in m.transforms
-    }
-    assert frames == {("hall", "tag0/base_link")}  # of both, on the one /tf that there is
-
-
-@contextmanager
-def ticking(publisher, epoch):
-    """Publish /clock from an epoch on; clear what it gives, and the clock stands still."""
-    over, running = threading.Event(), threading.Event()
-    running.set()
-
-    def tick():
-        t = 0.0
-        while not over.wait(0.05):
-            t += 0.05 * running.is_set()
-            publisher.publish(Clock(clock=stamp(t, epoch)))
-
-    thread = threading.Thread(target=tick)
-    thread.start()
-    try:
-        yield running
-    finally:
-        over.set()
-        thread.join()
-
-
-@SLOW
-def test_a_recording_that_starts_again_gives_the_same_again(make_rig, tmp_path):
-    model = known_answer.write(tmp_path)
-    flight = recording(2.5)
-    rig = make_rig()
-    rig.start("bias_node", "ekf_node", bias_node=["-p", f"model_file:={model}"])
-    rig.send_anchors(flight.anchors)
-    rig.play(flight)
-    ekf = rig.counts(
-        "ekf_node", TDOAs_received=len(flight.tdoa), IMU_samples_received=len(flight.imu)
-    )
-    first, waiting = list(rig.odometry), ekf["waiting"]
-    rig.play(flight)
-    ekf = rig.counts(
-        "ekf_node", TDOAs_received=2 * len(flight.tdoa), IMU_samples_received=2 * len(flight.imu)
-    )
-    assert ekf["restarts"] == 1
-    assert ekf["late"] == waiting  # what the first round left waiting
-    second = rig.odometry[len(first) :]
-    assert [m.header.stamp for m in first] == [m.header.stamp for m in second]
-    assert [m.pose.pose for m in first] == [m.pose.pose for m in second]
-    assert {m.status for m in rig.corrected[len(flight.tdoa) :]} == {
-        TdoaCorrected.STATUS_PASSED,
-        TdoaCorrected.STATUS_NETWORK,
-    }
-
-
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_both_in_good_order(make_rig, number):
+def test_a_signal_ends_both_in_good_order(make_rig, number=signal.SIGTERM):
+    """SIGINT: test_both_nodes.py."""
     flight = recording(1.0)
     rig = make_rig()
     processes = rig.start("bias_node", "ekf_node")

@@ -80,8 +80,7 @@ class Doubt:
         return 0.1 * np.sin(samples.p[:, 0]), std, np.ones(len(samples))
 
 
-@pytest.mark.parametrize("lag", [0.01, 0.05, 0.2])
-@pytest.mark.parametrize("network", [None, Doubt()])
+@pytest.mark.parametrize(("lag", "network"), [(0.01, None), (0.05, Doubt()), (0.2, Doubt())])
 def test_corrections_are_those_of_live_feeding(lag, network):
     flight = fly(1, 4.0, outliers=0.02)
     baseline = run_offline(flight, None, Corrector(flight.anchors, EFFECTS, network, lag))
@@ -216,15 +215,7 @@ def _baseline(flight):
     )
 
 
-def test_an_inertial_sample_that_is_not_finite_is_passed_over_as_on_line():
-    flight = fly(6, 3.0)
-    flight.imu.accel[350, 1] = np.nan
-    flight.imu.gyro[400, 0] = np.inf
-    result = run_offline(flight)
-    assert np.isfinite(result.odometry.p).all() and np.isfinite(result.odometry.covariance).all()
-
-
-@pytest.mark.parametrize("size", [1e3, 1e6, 1e30, 1e100, 1e200, 1e308])
+@pytest.mark.parametrize("size", [np.nan, np.inf, 1e3, 1e308])
 @pytest.mark.parametrize("stream", ["gyro", "accel"])
 def test_one_absurd_inertial_sample_does_not_poison_the_filter(stream, size):
     flight = fly(11, 3.0)
@@ -235,15 +226,14 @@ def test_one_absurd_inertial_sample_does_not_poison_the_filter(stream, size):
 
 
 @pytest.mark.parametrize("effects", [None, EFFECTS])
-@pytest.mark.parametrize("count", [0, 1, 11])
-@pytest.mark.parametrize("imu", [True, False])
-def test_flights_too_short_to_start(effects, count, imu):
+@pytest.mark.parametrize("count", [0, 11])
+def test_flights_too_short_to_start(effects, count):
     flight = fly(7, 2.0)
     tdoa = Tdoas(
         *(column[:count] for column in (flight.tdoa.t, flight.tdoa.a, flight.tdoa.b, flight.tdoa.d))
     )
     none = Imu(np.empty(0), np.empty((0, 3)), np.empty((0, 3)))
-    for samples in (flight.imu, None, none) if imu else (None,):
+    for samples in (flight.imu, None, none):
         short = Flight("short", flight.anchors, tdoa, samples)
         result = run_offline(short, None, Corrector(flight.anchors, effects))
         assert len(result.odometry) == 0 and result.odometry.covariance.shape == (0, 9, 9)
@@ -266,16 +256,6 @@ def test_leaves_the_flight_as_it_was_and_gives_the_same_twice():
     assert_same(one.odometry, two.odometry)
     np.testing.assert_array_equal(flight.tdoa.d, before[0])
     np.testing.assert_array_equal(flight.imu.accel, before[1])
-
-
-@pytest.mark.slow  # compiles the engine anew
-def test_arrays_of_any_layout_are_taken():
-    """What a reader hands over may be columns of one table, or read-only."""
-    flight = fly(10, 2.0)
-    table = np.column_stack([flight.imu.t, flight.imu.gyro, flight.imu.accel])
-    table.setflags(write=False)
-    other = replace(flight, imu=Imu(table[:, 0], table[:, 1:4], table[:, 4:7]))
-    assert_same(run_offline(other).odometry, run_offline(flight).odometry)
 
 
 def consistency(
@@ -349,7 +329,7 @@ def test_a_plain_update_is_consistent():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "robust, loss",
-    [("innovation", "geman_mcclure"), ("innovation", "huber"), ("m_estimation", "huber")],
+    [("innovation", "geman_mcclure"), ("m_estimation", "huber")],
 )
 def test_robust_updates_are_cautious_but_not_overconfident(robust, loss):
     """Weights throw information away that Gaussian noise does not ask them to: the covariance may

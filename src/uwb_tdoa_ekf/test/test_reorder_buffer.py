@@ -1,26 +1,35 @@
-from dataclasses import replace
+"""The reorder buffer: order, waiting, and clocks that jump or drift."""
+
+from dataclasses import dataclass, replace
 import math
 
 from flights import fly
-from hypothesis import given, settings
+from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 from live import IMU, TDOA, arriving, assert_same, assert_same_as_offline, feed, messages, send
 import numpy as np
+import pytest
 
 from uwb_tdoa_bias.foundation.flight import Tdoas
+from uwb_tdoa_bias.foundation.stamps import MOST_HELD
 from uwb_tdoa_ekf.core.memory import AID, IMU_SAMPLE
 from uwb_tdoa_ekf.core.memory import TDOA as TDOA_ROW
 from uwb_tdoa_ekf.core.verdicts import INVALID, LATE
 from uwb_tdoa_ekf.estimator import Estimator
+from uwb_tdoa_ekf.monitoring.clocks import clock_ahead, restarted
 from uwb_tdoa_ekf.reorder_buffer import (
     FIRST_AID,
     IMU_STREAM,
+    MOST_WAITING,
     SILENT,
+    STREAMS,
     TDOA_STREAM,
     TRIAL,
     LatenessPolicy,
     ReorderBuffer,
 )
+
+# --- reorder buffer ---
 
 
 def late(stamps):
@@ -30,17 +39,6 @@ def late(stamps):
         out.append(policy.is_late(t, newest))
         newest = max(newest, t)
     return out, policy.trusted(newest)
-
-
-def test_a_stream_is_trusted_when_it_has_been_in_order_for_a_while():
-    assert not LatenessPolicy().trusted(-math.inf)
-    assert late([5.0, 5.0, 5.0 + 0.9 * TRIAL]) == ([False] * 3, False)
-    assert late([5.0, 5.0, 5.0 + TRIAL]) == late([5.0, 6.0, 5.0 + TRIAL]) == ([False] * 3, True)
-
-
-def test_one_that_is_out_of_order_from_the_beginning_is_never_trusted_and_nothing_is_late():
-    stamps = [0.002 * k + 0.003 * (k % 2) for k in range(2000)]
-    assert late(stamps) == ([False] * 2000, False)
 
 
 def test_the_first_that_breaks_a_trusted_order_is_late_and_what_is_older_than_what_had_come():
@@ -53,12 +51,6 @@ def test_the_first_that_breaks_a_trusted_order_is_late_and_what_is_older_than_wh
     )  # some come twice
 
 
-@given(st.lists(st.floats(0.0, 3.0 * TRIAL), max_size=30))
-def test_nothing_is_late_in_order(stamps):
-    assert not any(late(sorted({*stamps}))[0])
-    assert not any(late([0.0, *sorted([0.0, *stamps])])[0])
-
-
 def test_a_stamp_that_has_never_come_twice_is_not_waited_for():
     policy, end = LatenessPolicy(), 2.0 * TRIAL
     for t, newest in ((0.0, -math.inf), (end, 0.0)):
@@ -67,11 +59,6 @@ def test_a_stamp_that_has_never_come_twice_is_not_waited_for():
     assert [policy.is_late(end, end) for _ in range(2)] == [True, True]  # whatever has been used
     assert end - 1e-9 < policy.watermark(end, 0.1) < end
     assert not policy.is_late(end + 1.0, end) and not policy.is_late(end + 1.0, end + 1.0)
-
-
-def test_where_stamps_come_twice_from_the_beginning_nothing_is_late():
-    stamps = [0.01 * (k // 2) for k in range(1000)]
-    assert late(stamps) == ([False] * 1000, True)
 
 
 def on_grid(flight, until):
@@ -216,3 +203,256 @@ def test_of_a_recording_nothing_is_late():
         [3.0, 3.0, 4.0],
         [1.5, 2.0, 2.0],
     )
+
+
+# --- clocks ---
+RANGE_STREAM, VELOCITY_STREAM, HEIGHT_STREAM = map(STREAMS.index, ("range", "velocity", "height"))
+KIND = {IMU_STREAM: IMU_SAMPLE, TDOA_STREAM: TDOA_ROW}
+RATE = {
+    IMU_STREAM: 50.0,
+    TDOA_STREAM: 40.0,
+    RANGE_STREAM: 20.0,
+    VELOCITY_STREAM: 25.0,
+    HEIGHT_STREAM: 10.0,
+}  # Hz
+LAG, LATENCY, LENGTH, BEGIN, END = 0.25, 0.02, 14.0, 5.0, 9.0  # s; a fault lasts from BEGIN to END
+SCATTER = 0.1  # s, standard deviation of stamps that are given on arrival by a busy machine
+DECIDED = 1.1  # s, the longest time without a used TDOA, when any other stream fails, or all jump
+
+
+@dataclass
+class Fault:
+    """What happens to the stamps and to the messages of a stream from `begin` to `end`, s."""
+
+    kind: str
+    size: float = 0.0
+    begin: float = BEGIN
+    end: float = END
+
+    def apply(self, t, rng):
+        """(stamps, which messages come, delays of arrival) of messages measured at t (n,) s."""
+        at, stamps, kept, delays = (
+            (t >= self.begin) & (t < self.end),
+            t.copy(),
+            np.ones(len(t), bool),
+            np.zeros(len(t)),
+        )
+        if self.kind == "offset":
+            stamps[at] += self.size
+        elif self.kind == "drift":
+            stamps[at] += 1e-3 * self.size * (t[at] - self.begin)
+        elif self.kind == "lone":
+            stamps[np.flatnonzero(at)[:1]] += self.size
+        elif self.kind == "each":
+            stamps[np.flatnonzero(at)[:: int(np.sum(at) / (self.end - self.begin))]] += (
+                self.size
+            )  # one in a second
+        elif self.kind == "few":
+            stamps[np.flatnonzero(at)[: 1 + int(0.1 * np.sum(at) / (self.end - self.begin))]] += (
+                self.size
+            )  # 0.1 s of them
+        elif self.kind == "standing":
+            stamps[at] = self.begin + self.size
+        elif self.kind == "scattered":
+            stamps[at] += np.clip(self.size, -SCATTER, SCATTER) * rng.standard_normal(np.sum(at))
+        elif self.kind == "silent":
+            kept[at] = False
+        elif self.kind == "wrap":
+            stamps[at] -= 4294.967296
+        elif self.kind == "burst":
+            delays[at] = np.ceil(t[at] / 0.2) * 0.2 - t[at]
+        return stamps, kept, delays
+
+
+HEALTHY = Fault("healthy")
+sizes = (
+    st.floats(0.6, 3600.0)
+    | st.floats(-3600.0, -0.6)
+    | st.sampled_from([-5.0, 5.0, 60.0, 2.5, -1.5])
+)
+kinds = st.sampled_from(
+    ["offset", "drift", "lone", "each", "few", "standing", "scattered", "silent", "wrap", "burst"]
+)
+faults = st.builds(Fault, kinds, sizes) | st.builds(
+    Fault, kinds, sizes, st.just(0.0), st.just(LENGTH)
+)
+seeds = st.integers(0, 2**32 - 1)
+
+
+class Played:
+    """Streams with faults, played to a ReorderBuffer. used : {stream: [(measured at, given out
+    at)], s}, by arrival; refused : how many of each; restarts : their causes.
+    """
+
+    def __init__(self, streams, seed, everything=None):
+        """streams : {place: Fault}; everything : Fault of all of them."""
+        rng, self.refused, self.restarts, self.used = (
+            np.random.default_rng(seed),
+            dict.fromkeys(streams, 0),
+            [],
+            {k: [] for k in streams},
+        )
+        self.buffer = ReorderBuffer(
+            0.003, LAG, True, self._refuse, lambda cause: self.restarts.append((self.now, cause))
+        )
+        arrivals, self.sent = [], dict.fromkeys(streams, 0)
+        for place, fault in streams.items():
+            measured = np.arange(0.0, LENGTH, 1.0 / RATE[place])
+            measured += 0.3 / RATE[place] * rng.random() + 1e-4 * rng.random(
+                len(measured)
+            )  # no stamp comes twice, whatever the fault
+            stamps, kept, delays = fault.apply(measured, rng)
+            if everything is not None:
+                stamps = stamps + everything.apply(measured, rng)[0] - measured
+            arrival = np.maximum.accumulate(measured + delays + LATENCY * rng.random(len(measured)))
+            arrivals += [
+                (a, place, t, m) for a, t, m, k in zip(arrival, stamps, measured, kept) if k
+            ]
+            self.sent[place] = int(kept.sum())
+        self.most_waiting, self.lowest_lead, self._measured = 0, 0.0, {}
+        for self.now, place, t, measured in sorted(arrivals):
+            rows = np.zeros(1, KIND.get(place, AID))
+            rows["t"] = t
+            if place >= 2:
+                rows["kind"] = place - 2
+            self._measured.setdefault((place, t), []).append(measured)
+            self.buffer.add(place, rows, np.ones(1, bool))
+            self._take(self.buffer.watermark)
+            self.most_waiting = max(self.most_waiting, *self.buffer.waiting)
+            self.lowest_lead = min(self.lowest_lead, *self.buffer.leads)
+        self.buffer.finish()
+        self._take(np.inf)
+
+    def _refuse(self, place, rows, verdict):
+        if len(rows):
+            self.refused[place] += len(rows)
+
+    def _take(self, until):
+        imu, tdoa, aids = self.buffer.take(until)
+        parts = [
+            (IMU_STREAM, imu),
+            (TDOA_STREAM, tdoa),
+            *((2 + kind, aids[aids["kind"] == kind]) for kind in np.unique(aids["kind"])),
+        ]
+        for place, rows in parts:
+            assert (np.diff(rows["t"]) >= 0.0).all()
+            if len(rows):
+                self.used[place] += [
+                    (self._measured[place, t].pop(0), self.now) for t in rows["t"].tolist()
+                ]
+
+    def gap(self, place):
+        """Longest time between two moments at which rows of a stream were given out, s."""
+        return float(np.diff([0.0, *(given for _, given in self.used[place]), LENGTH]).max())
+
+    def check_accounts(self):
+        for place, sent in self.sent.items():
+            assert len(self.used[place]) + self.refused[place] == sent
+        assert self.most_waiting <= MOST_WAITING + MOST_HELD
+
+
+@settings(max_examples=20, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))
+@given(st.sampled_from([VELOCITY_STREAM, HEIGHT_STREAM]), faults, seeds)
+def test_no_clock_of_a_sensor_costs_a_tdoa_or_an_inertial_sample(place, fault, seed):
+    played = Played({IMU_STREAM: HEALTHY, TDOA_STREAM: HEALTHY, place: fault}, seed)
+    played.check_accounts()
+    assert not played.restarts and played.refused[TDOA_STREAM] == played.refused[IMU_STREAM] == 0
+    assert played.gap(TDOA_STREAM) < LAG and all(
+        given - measured < LAG for measured, given in played.used[TDOA_STREAM]
+    )
+
+
+@settings(max_examples=20, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))
+@given(faults, seeds)
+def test_ranges_beside_tdoas_cost_no_tdoa(fault, seed):
+    played = Played({IMU_STREAM: HEALTHY, TDOA_STREAM: HEALTHY, RANGE_STREAM: fault}, seed)
+    played.check_accounts()
+    assert (
+        not played.restarts
+        and played.refused[TDOA_STREAM] == 0
+        and played.gap(TDOA_STREAM) < DECIDED
+    )
+
+
+@settings(max_examples=20, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))
+@given(faults, seeds, st.booleans())
+def test_a_clock_of_the_imu_starts_the_filter_anew_once_at_most_and_costs_no_second_of_tdoas(
+    fault, seed, sensor
+):
+    streams = {IMU_STREAM: fault, TDOA_STREAM: HEALTHY} | (
+        {VELOCITY_STREAM: HEALTHY} if sensor else {}
+    )
+    played = Played(streams, seed)
+    played.check_accounts()
+    assert len(played.restarts) <= 1 and played.gap(TDOA_STREAM) < DECIDED
+    assert played.refused[TDOA_STREAM] <= DECIDED * RATE[TDOA_STREAM]
+    if fault.end < LENGTH:
+        used = [measured for measured, _ in played.used[IMU_STREAM] if measured >= END + DECIDED]
+        assert len(used) >= (LENGTH - END - DECIDED) * RATE[IMU_STREAM] - 1.0
+
+
+@settings(max_examples=20, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))
+@given(kinds, sizes, seeds)
+def test_a_clock_of_the_tdoas_costs_them_no_more_than_the_fault_and_a_second(kind, size, seed):
+    played = Played(
+        {IMU_STREAM: HEALTHY, TDOA_STREAM: Fault(kind, size), VELOCITY_STREAM: HEALTHY}, seed
+    )
+    played.check_accounts()
+    after = [measured for measured, _ in played.used[TDOA_STREAM] if measured >= END + DECIDED]
+    assert len(after) >= (LENGTH - END - DECIDED) * RATE[TDOA_STREAM] - 1.0
+    if kind in ("lone", "each", "few"):
+        assert (
+            not played.restarts
+            and played.refused[TDOA_STREAM] <= 10
+            and played.refused[IMU_STREAM] == 0
+        )
+    elif kind == "offset":
+        assert len(played.restarts) <= 2 and played.gap(TDOA_STREAM) < DECIDED  # there and back
+
+
+@settings(max_examples=20, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))
+@given(sizes, seeds)
+def test_a_jump_of_all_clocks_starts_the_filter_anew_only_where_time_falls_back_and_costs_no_second(
+    size, seed
+):
+    jump = Fault("offset", size, BEGIN, LENGTH)
+    played = Played(
+        {IMU_STREAM: HEALTHY, TDOA_STREAM: HEALTHY, VELOCITY_STREAM: HEALTHY}, seed, jump
+    )
+    played.check_accounts()
+    assert len(played.restarts) == (size < -1.0) and played.gap(TDOA_STREAM) < DECIDED
+    for at, cause in played.restarts:
+        assert (
+            at < BEGIN + DECIDED
+            and cause.stream == "tdoa"
+            and cause.step == pytest.approx(size, abs=0.1)
+        )
+        assert (
+            f"the stamps of uwb/tdoa fell back by {-cause.step:.3g} s" in restarted(cause).sentence
+        )
+
+
+@pytest.mark.parametrize(
+    "place, most", [(VELOCITY_STREAM, 3600.0), (HEIGHT_STREAM, 60.0), (IMU_STREAM, 60.0)]
+)
+def test_a_clock_that_is_ahead_is_named_while_it_is(place, most):
+    leads = []
+    for end in (LENGTH, END):
+        played = Played(
+            {IMU_STREAM: HEALTHY, TDOA_STREAM: HEALTHY, place: Fault("offset", most, 0.0, end)}, 1
+        )
+        leads.append(played.buffer.leads[place])
+    assert leads == [pytest.approx(most, abs=0.1), 0.0] and played.lowest_lead == 0.0
+    assert f"{most:.3g} s ahead" in clock_ahead(STREAMS[place], most, 7).sentence
+
+
+def test_with_ranges_alone_nothing_waits_for_tdoas_and_after_the_imu_has_stopped_nothing_waits_for_it():
+    alone = Played({RANGE_STREAM: HEALTHY}, 2)
+    alone.check_accounts()
+    behind = [given - measured for measured, given in alone.used[RANGE_STREAM] if measured > 2.0]
+    assert max(behind) < LATENCY + 2.0 / RATE[RANGE_STREAM]
+    stopped = Played({IMU_STREAM: Fault("silent", 0.0, BEGIN, LENGTH), TDOA_STREAM: HEALTHY}, 3)
+    behind = [
+        given - measured for measured, given in stopped.used[TDOA_STREAM] if measured > BEGIN + 1.5
+    ]
+    assert max(behind) < LATENCY + 2.0 / RATE[TDOA_STREAM]

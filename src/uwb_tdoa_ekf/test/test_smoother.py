@@ -221,7 +221,7 @@ def test_the_unknown_yaw_is_known_from_the_beginning():
     assert np.abs(yaw).max() < np.radians(10.0)
 
 
-@pytest.mark.parametrize("yaw", [-6.9, -3.2, 3.0, 4.5, 6.0, 7.0])
+@pytest.mark.parametrize("yaw", [-6.9, 4.5, 7.0])
 def test_any_yaw_that_can_be_given_is_smoothed(yaw):
     """The direction that the filter followed is a multiple of 90 degrees from the given one: their
     sum may be more than a yaw may be.

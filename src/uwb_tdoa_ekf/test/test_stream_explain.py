@@ -12,8 +12,7 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.measurements import imu_rows
 from uwb_tdoa_ekf.core.memory import TDOA, structured
 from uwb_tdoa_ekf.offline import run_offline
-from uwb_tdoa_ekf.streams import explain
-from uwb_tdoa_ekf.streams.explain import BLOCK, Unexplained, unexplained
+from uwb_tdoa_ekf.streams.explain import Unexplained, unexplained
 
 FLIGHT = fly(0, 14.0)
 
@@ -38,19 +37,6 @@ def test_nothing_is_left_out_up_to_the_limit():
     whole = unexplained(rows, positions)
     assert unexplained(rows, positions, limit=whole.mean) == whole
     assert unexplained(rows, positions, limit=0.999 * whole.mean) == Unexplained({})
-
-
-def test_the_rest_is_left_out_once_it_is_certain(monkeypatch):
-    """Of 6 blocks that each leave about as much, the limit is passed in the third."""
-    rows, positions, fed = rows_of(FLIGHT, -1.0), FLIGHT.anchors.positions, []
-    limit, innovations = 0.4 * unexplained(rows, positions).mean, explain.innovations
-    monkeypatch.setattr(
-        explain,
-        "innovations",
-        lambda state, tdoa, *more: fed.append(tdoa["t"][-1]) or innovations(state, tdoa, *more),
-    )
-    unexplained(rows, positions, limit=limit)
-    assert fed[-1] - rows["t"][0] < 5.0 * BLOCK
 
 
 def test_no_tdoas_and_few_leave_no_block():

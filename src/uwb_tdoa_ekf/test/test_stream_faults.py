@@ -1,24 +1,32 @@
-"""Several publishers on a topic, and messages that are lost, live, through a real ekf_node."""
-
-import os
-import re
-import signal
-import time
+"""Faults of streams, live, through a real ekf_node."""
 
 import pytest
 
 pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
-from rig import make_rig  # noqa: E402, F401
+import os  # noqa: E402
+import re  # noqa: E402
+import signal  # noqa: E402
+import time  # noqa: E402
+
+from faults import ARRIVAL, FAULTS, FLIGHT, D, of_imu, of_tdoa, put  # noqa: E402
+from flights import position_at  # noqa: E402
+import numpy as np  # noqa: E402
+from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
+from rig import make_rig, seconds_of  # noqa: E402, F401
 from stream_faults import PUBLISHERS, lanes_of, play, process_of, publish_twice  # noqa: E402
+
+from uwb_tdoa_msgs.msg import EstimatorStatus  # noqa: E402
+
+# --- stream faults ---
 
 
 def values_of(status):
     return {entry.key: entry.value for entry in status.values}
 
 
-def test_publishers_and_lost_messages_are_named(make_rig):
+def test_publishers_and_lost_messages_are_named(make_rig):  # noqa: F811
     (lane,) = lanes_of(make_rig, 1)
     play([lane], [[[(0.0, 2.0, ())]]])  # a loss shows between messages that arrive
     for name, topic in PUBLISHERS.items():
@@ -48,3 +56,150 @@ def test_publishers_and_lost_messages_are_named(make_rig):
     counted = lambda: more("IMU samples received") + more("lost on imu/data") == sent  # noqa: E731
     lane.rig.wait(counted, "every sample to be received or counted as lost")
     assert more("lost on imu/data") > 0
+
+
+# --- honest status ---
+LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+RUNNING, FAULT, WAITING = (
+    EstimatorStatus.STATUS_RUNNING,
+    EstimatorStatus.STATUS_FAULT,
+    EstimatorStatus.STATUS_WAITING,
+)
+BEFORE, LONG, AFTER = 8.0, 5.0, 8.0  # s of flight before a fault, of it, and after it
+SOON = 4.5  # s within which it is said
+
+
+def unknown(columns, rng):
+    """TDOAs with ids that the survey does not have."""
+    t, arrival, a, b, d = columns
+    return t, arrival, a + 500, b + 500, d
+
+
+def silent(imu, tdoa, rng):
+    """Neither stream comes."""
+    return tuple(c[:0] for c in imu), tuple(c[:0] for c in tdoa)
+
+
+SIGNS = "all signs change"  # whose end takes a comparison of 12 s
+CASES = {  # name: (what it does to the columns of a flight, status, what `why` says)
+    SIGNS: (of_tdoa(lambda c, rng: put(c, D, -c[D])), FAULT, "the sign of all TDOAs has changed"),
+    "ids are not in the survey": (of_tdoa(unknown), FAULT, "anchors that the survey does not have"),
+    "TDOAs come 0.6 s late": (
+        of_tdoa(lambda c, rng: put(c, ARRIVAL, c[ARRIVAL] + 0.6)),
+        None,
+        "-p lag",
+    ),
+    "no TDOA comes": (
+        of_tdoa(lambda c, rng: tuple(column[:0] for column in c)),
+        RUNNING,
+        "no TDOA was used.*by the IMU alone",
+    ),
+    "neither TDOAs nor IMU come": (silent, WAITING, "there is no odometry"),
+    "the IMU is in g": (
+        of_imu(lambda c, rng: put(c, 3, c[3] / 9.81)),
+        RUNNING,
+        "goes without the IMU",
+    ),
+}
+
+
+class Heard:
+    """What a node says, with the s of the clock."""
+
+    def __init__(self, rig):
+        self.statuses, self.rig = [], rig
+        rig.node.create_subscription(
+            EstimatorStatus, "status", lambda m: self.statuses.append((time.time(), m)), LATCHED
+        )
+
+    def at(self, when):
+        """The EstimatorStatus that held at s of the clock."""
+        return [status for at, status in self.statuses if at <= when][-1]
+
+
+def tried(lanes, heards, names):
+    """Fly with a fault in each lane: [(name, s until it is said or nan, largest error and its
+    deviation since then, m, status in the end, s after the end of the fault until nothing keeps it
+    from being flown by)].
+    """
+    out, ends = [], np.cumsum([BEFORE, LONG, AFTER])
+    for lane in lanes:
+        lane.poses.clear()
+    parts = [list(zip([0.0, *ends], ends, ((), (name,), ()))) for name in names]
+    play(lanes, [[part] for part in parts])
+    for lane, heard, name in zip(lanes, heards, names):
+        begin = lane.plan[-1][0]
+        low, high, end = begin + BEFORE, begin + BEFORE + LONG, begin + BEFORE + LONG + AFTER
+        words = CASES[name][2]
+        said = [
+            at for at, status in heard.statuses if low < at < end and re.search(words, status.why)
+        ]
+        first = said[0] - low if said else np.nan
+        during = [status for at, status in heard.statuses if low + first <= at < high]
+        wrong = []
+        for at, pose in lane.poses:
+            if low + first + 0.4 < at < high:
+                stamp = seconds_of(pose.header.stamp, 0) - begin
+                p = pose.pose.pose.position
+                error = np.linalg.norm([p.x, p.y, p.z] - position_at(FLIGHT, np.array([stamp]))[0])
+                wrong.append(
+                    (
+                        error,
+                        np.sqrt(
+                            max(
+                                pose.pose.covariance[0],
+                                pose.pose.covariance[7],
+                                pose.pose.covariance[14],
+                            )
+                        ),
+                    )
+                )
+        well = [
+            at
+            for at, status in heard.statuses
+            if at > high and status.status == RUNNING and not re.search(words, status.why)
+        ]
+        out.append(
+            (
+                name,
+                first,
+                max(wrong, default=(0.0, 0.0)),
+                [s.status for s in during],
+                well[0] - high if well else np.nan,
+            )
+        )
+    return out
+
+
+@pytest.mark.slow
+def test_status_odometry_and_diagnostics_agree_while_what_is_measured_is_wrong(
+    make_rig,  # noqa: F811
+    monkeypatch,
+):  # noqa: F811
+    for name, (change, _, words) in CASES.items():
+        monkeypatch.setitem(FAULTS, name, (change, words))
+    lanes = lanes_of(make_rig, 2)
+    heards, names = [Heard(lane.rig) for lane in lanes], list(CASES)
+    found = [
+        each for k in range(0, len(names), 2) for each in tried(lanes, heards, names[k : k + 2])
+    ]
+    for name, first, (error, deviation), statuses, well in found:
+        _, status, words = CASES[name]
+        assert first < SOON, (name, first)
+        assert status is None or set(statuses) <= {status}, (name, statuses)
+        assert error < max(1.0, 3.0 * deviation), (name, error, deviation)
+        assert well < AFTER or name == SIGNS, name
+    agree = [
+        (status, s)
+        for lane, heard in zip(lanes, heards)
+        for at, status in lane.heard
+        for t, s in heard.statuses
+        if abs(t - at) < 0.02
+    ]
+    for diagnostics, status in agree:
+        values = {entry.key: entry.value for entry in diagnostics.values}
+        if status.status == FAULT:
+            assert (
+                status.why in values["wrong with the streams"]
+                or status.why == values["not to be flown by"]
+            )

@@ -1,7 +1,6 @@
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_ekf.core import systematic
 from uwb_tdoa_ekf.core.memory import new_state
 
@@ -9,14 +8,10 @@ ANCHORS = np.array([[x, y, z] for x in (0.0, 7.0) for y in (0.0, 8.0) for z in (
 STD = 0.25
 
 
-@compiled
-def _observe(ekf, anchors, a, b, t, last):
-    systematic.observe(ekf[0].information, anchors[a], anchors[b], ekf[0].innovation, t, last)
-
-
 def informed(p, seconds=5.0, rate=400.0, heard=range(8), state=None, begin=0.0):
     """A FilterState that has taken TDOAs round the ring of the anchors `heard` at a place p (3,)."""
     state, heard = state or new_state(ANCHORS), list(heard)
+    anchors, information = state.anchors, state.record.information
     way = np.array(p) - ANCHORS
     unit = way / np.linalg.norm(way, axis=1)[:, None]
     for k in range(int(seconds * rate)):
@@ -25,7 +20,8 @@ def informed(p, seconds=5.0, rate=400.0, heard=range(8), state=None, begin=0.0):
         innovation.row[:3] = unit[b] - unit[a]
         innovation.noise_variance, innovation.weight, innovation.curvature = STD**2, 1.0, 0.0
         t = begin + k / rate
-        _observe(state.ekf, state.anchors, a, b, t, t - 1.0 / rate if k else -np.inf)
+        last = t - 1.0 / rate if k else -np.inf
+        systematic.observe(information, anchors[a], anchors[b], innovation, t, last)
     return state
 
 

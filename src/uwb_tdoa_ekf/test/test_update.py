@@ -1,12 +1,27 @@
+"""One update of a hypothesis, plain and robust, against the textbook and the paper."""
+
 from covariances import assert_covariance
 from hypothesis import given
 from hypothesis import strategies as st
 import numpy as np
-from priors import Prior
+from priors import Prior, with_offset
+from priors import kalman as textbook
 import pytest
 
+from uwb_tdoa_bias.foundation.robust_loss import LOSSES, weight
+from uwb_tdoa_ekf.core.auxiliary import PRESSURE, RANGE, depend
+from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
+from uwb_tdoa_ekf.core.robust import (
+    NEGLIGIBLE,
+    SMALLEST_WEIGHT,
+    update,
+    update_gate,
+    update_innovation,
+    update_m_estimation,
+)
 from uwb_tdoa_ekf.core.update import LONGEST_ROW, kalman, update_state
 
+# --- update ---
 seeds = st.integers(0, 2**32 - 1)
 rows = st.lists(st.integers(0, 14), min_size=1, max_size=LONGEST_ROW, unique=True)
 
@@ -40,3 +55,151 @@ def test_update_state_is_the_textbook_update_with_a_unit_row(seed, state, std):
     expected = prior.textbook(std**2)
     update_state(prior.hypothesis, prior.innovation, state, 1.5, std)
     prior.assert_is(*expected)
+
+
+# --- robust ---
+losses = st.sampled_from(LOSSES)
+lengths = st.floats(1.0, 8.0)
+HUGE = 1e8
+
+
+def tuned(**config):
+    return FilterConfig(**config).parameters()[0]
+
+
+def m_estimation(prior, noise, parameters):
+    """Eqs. 8 - 13 of Zhao et al. (RA-L 2021) as they stand there, the Jacobian at the prior mean,
+    no weight of the measurement below SMALLEST_WEIGHT: error, covariance, weight.
+    """
+    S, error, value = np.linalg.cholesky(prior.hypothesis.P), np.zeros(15), prior.innovation.value
+    loss, state_scale, scale = (
+        parameters[name] for name in ("loss", "state_scale", "measurement_scale")
+    )
+    for _ in range(parameters["iterations"]):
+        scaled = np.linalg.solve(S, error)  # eq. 9
+        rescaled = S @ np.diag([1.0 / weight(loss, e, state_scale) for e in scaled]) @ S.T  # eq. 10
+        w = max(weight(loss, (value - prior.h @ error) / np.sqrt(noise), scale), SMALLEST_WEIGHT)
+        error, posterior = textbook(rescaled, prior.h, value, noise / w)  # eqs. 11, 13
+    return error, posterior, w
+
+
+@given(seeds, lengths)
+def test_gate_that_is_open_gives_the_textbook_update(seed, length):
+    prior = Prior(seed)
+    expected = prior.textbook(prior.innovation.noise_variance * length)
+    update_gate(
+        prior.hypothesis, prior.innovation, tuned(gate=HUGE, tdoa_correlation_length=length)
+    )
+    assert prior.innovation.weight == 1.0
+    prior.assert_is(*expected)
+
+
+@given(seeds, lengths)
+def test_gate_judges_with_the_variance_of_one_measurement_and_leaves_all_as_it_was(seed, length):
+    prior, gate = Prior(seed, surprise=3.0), 2.0
+    innovation, before = prior.innovation, prior.hypothesis.copy()
+    passed = abs(innovation.value) <= gate * np.sqrt(
+        innovation.prior_variance + innovation.noise_variance
+    )
+    update_gate(prior.hypothesis, innovation, tuned(gate=gate, tdoa_correlation_length=length))
+    assert innovation.weight == passed
+    assert passed or (prior.hypothesis == before and innovation.total_variance == np.inf)
+
+
+@given(seeds, losses, lengths)
+def test_innovation_divides_the_variance_by_the_weight_of_what_is_whitened(seed, loss, length):
+    prior = Prior(seed, surprise=3.0)
+    innovation, before = prior.innovation, prior.hypothesis.copy()
+    whitened = innovation.value / np.sqrt(innovation.prior_variance + innovation.noise_variance)
+    w = weight(LOSSES.index(loss), whitened, 2.5)
+    expected = prior.textbook(innovation.noise_variance * length / w)
+    parameters = tuned(loss=loss, measurement_scale=2.5, tdoa_correlation_length=length)
+    update_innovation(prior.hypothesis, innovation, parameters)
+    assert innovation.weight == (w if w >= NEGLIGIBLE else 0.0)
+    if w >= NEGLIGIBLE:
+        prior.assert_is(*expected)
+    else:
+        assert prior.hypothesis == before
+
+
+@given(seeds, losses, lengths, st.integers(1, 6), st.floats(1.0, 4.0), st.floats(1.0, 4.0))
+def test_m_estimation_is_that_of_the_paper(seed, loss, length, iterations, state_scale, scale):
+    prior = Prior(seed, surprise=2.0)
+    scales = dict(measurement_scale=scale, state_scale=state_scale, iterations=iterations)
+    parameters = tuned(loss=loss, tdoa_correlation_length=length, **scales)
+    error, covariance, expected = m_estimation(
+        prior, prior.innovation.noise_variance * length, parameters
+    )
+    posterior = prior.after(error, covariance)
+    update_m_estimation(prior.hypothesis, prior.innovation, parameters)
+    assert prior.innovation.weight == pytest.approx(expected, rel=1e-6)
+    prior.assert_is(*posterior, rtol=1e-6)
+
+
+def joint_m_estimation(prior, joint, h, noise, parameters):
+    """`m_estimation` of a joint state of any size: its error, its covariance."""
+    S, error, value = np.linalg.cholesky(joint), np.zeros(len(h)), prior.innovation.value
+    loss, state_scale, scale = (
+        parameters[name] for name in ("loss", "state_scale", "measurement_scale")
+    )
+    for _ in range(parameters["iterations"]):
+        scaled = np.linalg.solve(S, error)
+        rescaled = S @ np.diag([1.0 / weight(loss, e, state_scale) for e in scaled]) @ S.T
+        w = max(weight(loss, (value - h @ error) / np.sqrt(noise), scale), SMALLEST_WEIGHT)
+        gain = rescaled @ h / (h @ rescaled @ h + noise / w)
+        error, posterior = gain * value, rescaled - np.outer(gain, h @ rescaled)
+    return error, posterior
+
+
+MEASURED = {  # error states that a measurement depends on, and the auxiliary one
+    "tdoa": ((0, 1, 2), None),
+    "tdoa, slope on velocity": ((0, 1, 2, 3, 4, 5), None),
+    "height": ((2, 6, 7), None),
+    "velocity": ((3, 4, 5, 7, 8), None),
+    "barometer": ((2,), PRESSURE),
+    "range with an offset": ((0, 1, 2), RANGE),
+    "attitude": ((6, 7, 8), None),
+}
+
+
+@given(
+    seeds,
+    st.sampled_from(sorted(MEASURED)),
+    st.sampled_from(ROBUST),
+    losses,
+    st.integers(1, 4),
+    st.floats(0.0, 5.0),
+)
+def test_whatever_is_measured_the_joint_covariance_stays_one(
+    seed, name, robust, loss, iterations, surprise
+):
+    states, offset = MEASURED[name]
+    prior = Prior(seed, states, surprise)
+    joint, innovation = with_offset(prior), prior.innovation
+    if offset is not None:
+        depend(prior.hypothesis, innovation, offset)
+    h = np.zeros(18)
+    h[list(states)] = prior.h[list(states)]
+    if offset is not None:
+        h[15 + offset] = 1.0
+    parameters = tuned(robust=robust, loss=loss, iterations=iterations, tdoa_correlation_length=1.0)
+    x = prior.hypothesis.offset.copy()
+    if robust == "m_estimation":
+        error, expected = joint_m_estimation(prior, joint, h, innovation.noise_variance, parameters)
+    update(prior.hypothesis, innovation, parameters)
+    after = np.zeros((18, 18))
+    after[:15, :15], after[15:, :15], after[15:, 15:] = (
+        prior.hypothesis.P,
+        prior.hypothesis.offset_cross,
+        prior.hypothesis.offset_P,
+    )
+    after[:15, 15:] = after[15:, :15].T
+    assert_covariance(after, tolerance=1e-8)
+    if robust == "m_estimation":
+        std = np.sqrt(np.diag(expected))
+        np.testing.assert_allclose(
+            after / np.outer(std, std), expected / np.outer(std, std), atol=1e-6
+        )
+        np.testing.assert_allclose(
+            (prior.hypothesis.offset - x) / std[15:], error[15:] / std[15:], atol=1e-6
+        )

@@ -59,15 +59,6 @@ def test_a_side_that_is_told_bounds_the_search(name, side, axis, sign):
     assert state.ekf["flat"][0][axis]
 
 
-def test_a_side_of_anchors_that_are_in_no_plane_means_nothing():
-    positions = room("corners").anchors.positions
-    rows = np.arange(7)
-    np.testing.assert_array_equal(
-        surroundings(positions, rows, rows + 1, tag_side="below")[0],
-        surroundings(positions, rows, rows + 1)[0],
-    )
-
-
 @pytest.mark.parametrize("name", ["300 x 200 m, 294 anchors", "300 x 200 m, 988 anchors"])
 def test_a_tag_is_found_anywhere_in_a_hall(name):
     where = hall(name)
@@ -91,7 +82,7 @@ def test_starts_in_every_hall_are_right_and_honest(name):
 
 
 @pytest.mark.parametrize("config", [FilterConfig(), WITHOUT_IMU])
-@pytest.mark.parametrize("blinks", [0.5, 1.0, 2.0])
+@pytest.mark.parametrize("blinks", [0.5, 2.0])
 def test_a_tag_that_blinks_starts_within_three_blinks(blinks, config):
     for seed in range(3):
         found = judge(fly(room("corners"), seed, blinks=blinks, **SLOW), config)
@@ -99,7 +90,7 @@ def test_a_tag_that_blinks_starts_within_three_blinks(blinks, config):
 
 
 @pytest.mark.parametrize("config", [FilterConfig(), WITHOUT_IMU])
-@pytest.mark.parametrize("rate", [2.0, 5.0, 10.0])
+@pytest.mark.parametrize("rate", [2.0, 10.0])
 def test_a_tag_of_few_tdoas_starts_within_twenty(rate, config):
     for seed in range(3):
         found = judge(fly(room("corners"), seed, rate=rate, duration=20.0, speed=1.0), config)
@@ -181,6 +172,7 @@ def test_ten_minutes_with_dead_zones_and_a_change_of_floor(config):
     assert np.quantile(found["off"] / found["std"], 0.999) < 4.0
 
 
+@pytest.mark.slow
 def test_memory_and_estimate_of_a_tag_do_not_depend_on_how_many_anchors_are_installed():
     (_, few, _, one), (_, many, _, other) = (cost(n, 3.0, 1) for n in (20, 10_000))
     assert (
@@ -201,3 +193,12 @@ def test_a_tag_costs_what_it_hears_and_starts_with_ten_thousand_anchors_within_t
         (few, *_), (many, _, start, _) = (cost(n, 30.0, 1) for n in (20, 10_000))
         ratios.append(many / few)
     assert min(ratios) < 1.1 and start < 3.0, ratios
+
+
+def test_a_side_of_anchors_that_are_in_no_plane_means_nothing():
+    positions = room("corners").anchors.positions
+    rows = np.arange(7)
+    np.testing.assert_array_equal(
+        surroundings(positions, rows, rows + 1, tag_side="below")[0],
+        surroundings(positions, rows, rows + 1)[0],
+    )

@@ -52,32 +52,6 @@ def test_a_tag_outside_is_drawn_back_by_as_much_as_it_is_uncertain(axis, off):
     assert np.delete(hypothesis.x, axis) == pytest.approx(np.delete(before, axis))
 
 
-def test_a_tag_inside_is_left_alone():
-    bounds, ekf = (
-        bounds_of(np.array(corners().positions)),
-        new_state(np.array(corners().positions)).record,
-    )
-    hypothesis = ekf.hypotheses[0]
-    hypothesis.x[:3] = bounds[1]
-    before = hypothesis.copy()
-    assert not any(constrain(hypothesis, ekf.innovation, bounds, k) for k in range(3))
-    assert hypothesis == before
-
-
-def test_what_is_known_better_than_its_bounds_is_not_drawn_back():
-    """A tag outside whose TDOAs agree: every one of them used to tell the bound anew, and the
-    deviation fell with their rate.
-    """
-    bounds, ekf = (
-        bounds_of(np.array(corners().positions)),
-        new_state(np.array(corners().positions)).record,
-    )
-    hypothesis = ekf.hypotheses[0]
-    hypothesis.x[:3] = bounds[1] + 3.0
-    hypothesis.P[:3, :3] = 0.5 * np.eye(3)
-    assert not any(constrain(hypothesis, ekf.innovation, bounds, k) for k in range(3))
-
-
 @pytest.mark.parametrize("beyond", [1.0, 3.0])
 def test_a_tag_outside_is_right_or_says_how_wrong_it_is(beyond):
     found = []

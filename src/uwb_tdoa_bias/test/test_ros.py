@@ -1,0 +1,313 @@
+"""Stamps, quality of service, anchors, log and diagnostics on the ROS side."""
+
+import pytest
+
+pytest.importorskip("rclpy")
+pytest.importorskip("uwb_tdoa_msgs.msg")
+rclpy = pytest.importorskip("rclpy")
+
+from dataclasses import replace  # noqa: E402
+import math  # noqa: E402
+import time  # noqa: E402
+
+from builtin_interfaces.msg import Time  # noqa: E402
+from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
+from geometry_msgs.msg import Quaternion  # noqa: E402
+from hypothesis import given  # noqa: E402
+from hypothesis import strategies as st  # noqa: E402
+import numpy as np  # noqa: E402
+from rclpy.qos import (  # noqa: E402
+    QoSCompatibility,
+    QoSPresetProfiles,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_check_compatible,
+)
+from rosgraph_msgs.msg import Clock  # noqa: E402
+
+from uwb_tdoa_bias.foundation import ros_log  # noqa: E402
+from uwb_tdoa_bias.foundation.anchors import Anchors  # noqa: E402
+from uwb_tdoa_bias.foundation.errors import InputError  # noqa: E402
+from uwb_tdoa_bias.foundation.limits import LINE_LENGTH  # noqa: E402
+from uwb_tdoa_bias.foundation.ros_anchors import (  # noqa: E402
+    ANCHORS_QOS,
+    ANY_QOS,
+    anchors_to_message,
+    in_words,
+    same_anchors,
+)
+from uwb_tdoa_bias.foundation.ros_diagnostics import Saying, SimulatedClock  # noqa: E402
+from uwb_tdoa_bias.foundation.ros_log import BURST, REFILL, Log  # noqa: E402
+from uwb_tdoa_bias.foundation.ros_stamps import Epoch, orientation_of  # noqa: E402
+from uwb_tdoa_bias.foundation.ros_topics import OUTPUT_QOS, STREAM_QOS  # noqa: E402
+
+# --- ros stamps ---
+NANOSECONDS = st.integers(0, 10**9 - 1)
+MONTH = 30 * 86400
+
+
+@given(
+    st.integers(0, 2**31 - 1 - 2 * MONTH),
+    st.lists(st.tuples(st.integers(-MONTH, MONTH), NANOSECONDS), min_size=1),
+)
+def test_stamps_survive_to_the_nanosecond(first, others):
+    epoch = Epoch()
+    epoch.seconds(Time(sec=first, nanosec=999_999_999))
+    for second, nanosecond in others:
+        if first + second >= 0:
+            stamp = Time(sec=first + second, nanosec=nanosecond)
+            assert epoch.stamp(epoch.seconds(stamp)) == stamp
+
+
+@given(st.integers(0, 2**31 - 10), st.lists(st.tuples(st.integers(0, 9), NANOSECONDS), min_size=2))
+def test_seconds_do_not_depend_on_the_epoch(first, stamps):
+    now, long_ago = Epoch(), Epoch()
+    a = [now.seconds(Time(sec=first + second, nanosec=nanosecond)) for second, nanosecond in stamps]
+    b = [long_ago.seconds(Time(sec=second, nanosec=nanosecond)) for second, nanosecond in stamps]
+    assert a == b
+
+
+def test_an_orientation_of_zeros_is_not_known():
+    assert orientation_of(Quaternion(x=0.1, y=0.2, z=0.3, w=0.4)) == (0.1, 0.2, 0.3, 0.4)
+    assert orientation_of(Quaternion()) == (
+        0.0,
+        0.0,
+        0.0,
+        1.0,
+    )  # the default of ROS is the identity
+    assert all(map(math.isnan, orientation_of(Quaternion(w=0.0))))
+
+
+# --- ros topics ---
+
+
+def test_stream_subscriptions_match_every_usual_publisher():
+    usual = [
+        QoSPresetProfiles.SENSOR_DATA.value,
+        QoSPresetProfiles.SYSTEM_DEFAULT.value,
+        QoSProfile(depth=10),
+    ]
+    for publisher in [*usual, STREAM_QOS]:
+        assert qos_check_compatible(publisher, STREAM_QOS)[0] != QoSCompatibility.ERROR
+    assert STREAM_QOS.reliability == ReliabilityPolicy.BEST_EFFORT
+
+
+def test_every_usual_subscriber_matches_what_is_published():
+    usual = [
+        QoSPresetProfiles.SENSOR_DATA.value,
+        QoSPresetProfiles.SYSTEM_DEFAULT.value,
+        QoSProfile(depth=10),
+    ]
+    for subscriber in [*usual, STREAM_QOS]:
+        assert qos_check_compatible(OUTPUT_QOS, subscriber)[0] != QoSCompatibility.ERROR
+    assert OUTPUT_QOS.reliability == ReliabilityPolicy.RELIABLE
+
+
+# --- ros anchors ---
+
+
+def test_anchors_survive_the_message():
+    anchors = Anchors(
+        [7, 3], [[1, 2, 3], [4, 5, 6]], [[0, 0, 0.6, 0.8], [np.nan] * 4], frame="hall"
+    )
+    message = anchors_to_message(anchors)
+    unknown = message.anchors[1].pose.orientation
+    assert (unknown.x, unknown.y, unknown.z, unknown.w) == (0.0, 0.0, 0.0, 0.0)
+    assert same_anchors(Anchors.from_message(message), anchors)
+
+
+def test_what_has_changed_is_said_in_words():
+    before = Anchors.from_positions(np.arange(12.0).reshape(4, 3), ids=[5, 6, 7, 8])
+    after = Anchors.from_positions(
+        np.vstack([before.positions[1:3], before.positions[3] + 1.0, [1.0, 1.0, 1.0]]),
+        ids=[6, 7, 8, 9],
+    )
+    assert in_words(before, after) == "new: 9; gone: 5; elsewhere: 8; going on with the 2 that stay"
+    assert (
+        in_words(before, before.at(before.positions + 1.0))
+        == "elsewhere: 5, 6, 7, 8; starting over"
+    )
+    assert (
+        in_words(before, replace(after, frame="hall"))
+        == "they are in frame 'hall', and were in 'map': starting over"
+    )
+    many = Anchors.from_positions(np.arange(60.0).reshape(20, 3), ids=np.arange(5, 25))
+    assert (
+        in_words(before, many)
+        == "new: 9, 10, 11, 12, 13, 14, 15, 16, 17, 18, ...; going on with the 4 that stay"
+    )
+
+
+def test_same_anchors_notices_every_difference_but_jitter():
+    anchors = Anchors(
+        [7, 3], [[1, 2, 3], [4, 5, 6]], [[0, 0, 0.6, 0.8], [np.nan] * 4], frame="hall"
+    )
+    ids, positions, orientations = anchors.ids, anchors.positions, anchors.orientations
+    for other in (
+        Anchors([7, 4], positions, orientations, "hall"),
+        Anchors(ids, positions + [[0, 0, 0], [0, 0, 0.02]], orientations, "hall"),
+        Anchors(ids, positions, orientations[::-1], "hall"),
+        Anchors(ids, positions, orientations, "map"),
+        Anchors(ids[:1], positions[:1], orientations[:1], "hall"),
+    ):
+        assert not same_anchors(anchors, other)
+
+
+def test_bad_anchors_are_refused():
+    message = anchors_to_message(Anchors.from_positions(np.eye(3)))
+    message.anchors[1].id = 0
+    with pytest.raises(InputError, match="id 0 is given twice"):
+        Anchors.from_message(message)
+    message.anchors.clear()
+    with pytest.raises(InputError, match="empty"):
+        Anchors.from_message(message)
+
+
+def test_anchors_need_a_publisher_that_keeps_them():
+    assert qos_check_compatible(ANCHORS_QOS, ANCHORS_QOS)[0] != QoSCompatibility.ERROR
+    assert qos_check_compatible(QoSProfile(depth=1), ANCHORS_QOS)[0] == QoSCompatibility.ERROR
+    assert (
+        qos_check_compatible(QoSProfile(depth=1), ANY_QOS)[0] != QoSCompatibility.ERROR
+    )  # but takes them when repeated
+
+
+def test_a_message_without_a_frame_is_in_the_map():
+    message = anchors_to_message(Anchors.from_positions(np.eye(3)))
+    message.header.frame_id = ""
+    assert Anchors.from_message(message).frame == "map"
+
+
+# --- ros log ---
+
+
+class Written:
+    """Stands for a logger of rclpy."""
+
+    def __init__(self):
+        self.lines = []
+        self.info = self.warning = self.error = self.lines.append
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """The time, s, that a Log sees: a list of one."""
+    now = [1000.0]
+    monkeypatch.setattr(ros_log.time, "monotonic", lambda: now[0])
+    return now
+
+
+def test_a_flood_hides_no_other_statement_and_is_counted(clock):
+    written = Written()
+    log = Log(written)
+    for _k in range(1000):
+        log.info("flood")
+    log.error("another")
+    assert written.lines[-1] == "another" and len(written.lines) == BURST + 1
+
+
+def test_what_was_left_out_is_said_with_the_next_line(clock):
+    written = Written()
+    log = Log(written)
+    for k in range(BURST + 11):
+        if k == BURST + 10:
+            clock[0] += 3.0 * REFILL
+        log.info("flood")
+    assert (
+        written.lines[-1] == "flood (10 such lines were left out before)"
+        and len(written.lines) == BURST + 1
+    )
+
+
+@pytest.mark.parametrize("severity", ["info", "warning", "error"])
+def test_lines_are_printable_and_bounded(severity):
+    written = Written()
+    getattr(Log(written), severity)(
+        "frame '\x1b]52;c;eA==\x07\n[ERROR] forged " + "x" * 100_000 + "'; correct it"
+    )
+    (line,) = written.lines
+    assert line.isprintable() and len(line) < LINE_LENGTH + 20 and line.endswith("; correct it")
+
+
+# --- ros diagnostics ---
+
+
+def test_simulated_time_that_stands_still_or_is_missing_is_said():
+    rclpy.init(args=["--ros-args", "-p", "use_sim_time:=true"])
+    node, other = (
+        rclpy.create_node("on_simulated_time"),
+        rclpy.create_node("player", use_global_arguments=False),
+    )
+    try:
+        wall = [0.0]
+        clock, source = (
+            SimulatedClock(node, lambda: wall[0]),
+            other.create_publisher(Clock, "/clock", 10),
+        )
+        level, text = clock.status()
+        assert level == DiagnosticStatus.WARN and "nobody publishes /clock" in text
+        paused = DiagnosticStatus.OK, "paused: /clock stands still"
+        for wall[0], second, expected in (
+            (0.0, 5, None),
+            (0.2, 6, None),
+            (0.6, 6, None),
+            (0.8, 6, paused),
+            (9.0, 6, paused),
+            (9.2, 7, None),
+            (9.4, 7, None),
+            (10.2, 8, None),
+            (11.2, 9, None),
+            (12.2, 9, None),
+            (13.0, 9, None),
+            (13.3, 9, paused),  # once a second: runs, too
+        ):
+            for _ in range(200):
+                source.publish(Clock(clock=Time(sec=second)))
+                rclpy.spin_once(node, timeout_sec=0.05)
+                if node.get_clock().now().nanoseconds == second * 10**9:
+                    break
+            assert clock.status() == expected, wall
+    finally:
+        for each in (node, other):
+            each.destroy_node()
+        rclpy.shutdown()
+
+
+def test_the_log_says_each_kind_of_thing_once_in_a_while():
+    """38 warnings in 38 s, because a percentage changed."""
+    saying = Saying()
+    lines = [
+        saying.anew(
+            f"{40 + second} % of the TDOAs of anchor 3 are late by {0.1 * second:.2f} s",
+            1.0 * second,
+        )
+        for second in range(38)
+    ]
+    assert lines == [True] + 37 * [False]
+    assert saying.anew(
+        "40 % of the TDOAs of anchor 4 are late by 0.10 s", 38.0
+    )  # another anchor is another thing
+    flips = [
+        saying.anew(("running", "anchors 1 and 2 are exchanged")[second % 2], 40.0 + second)
+        for second in range(20)
+    ]
+    assert flips == [True, True] + 18 * [False]
+    assert saying.anew("running", 75.0)  # what stays is said in the end
+    assert not saying.anew("running", 200.0)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "9" * 20_000,
+        "9" * 20_000 + " m",
+        "1.5 " * 5_000,
+        "- " * 10_000,
+        "9" + " " * 20_000,
+        "9 " + "9" * 20_000 + "x",
+    ],
+)
+def test_long_numbers_take_no_time(text):
+    """A pattern that tried again at each of 20 000 digits took 8 s."""
+    began = time.process_time()
+    Saying().anew(text, 0.0)
+    assert time.process_time() - began < 0.2
