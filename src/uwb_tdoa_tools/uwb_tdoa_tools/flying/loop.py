@@ -12,12 +12,11 @@ import numpy as np
 from uwb_tdoa_bias.foundation.compiled import compiled
 
 from .controller import inner
-from .vehicle import STATE, STEP, specific_force, step
+from .vehicle import IMU_RATE, STATE, STEP, specific_force, step
 
 if TYPE_CHECKING:
     from .vehicle import Record
 
-IMU_RATE = 400.0  # Hz
 STEPS = round(1.0 / (IMU_RATE * STEP))  # of the integration, per sample
 TURNING = 50.0  # rad/s of a rotor, above which it shakes the vehicle
 

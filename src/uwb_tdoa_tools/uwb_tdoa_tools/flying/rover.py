@@ -15,13 +15,12 @@ from uwb_tdoa_bias.foundation.sensors import SENSORS
 
 from ..simulation.config import WHEELS_RATE
 from ..simulation.sensors import YAW_RATE_STD, slips
-from .loop import IMU_RATE
 from .mission import DONE, FLYING, LOST, REFUSED, WAITING, Rules, yaw_of
 from .path import Polyline, Waypoints
 from .sensors import AidSensor, random
 from .simulator import Simulator
 from .trial import REST_AFTER, Trial
-from .vehicle import GRAVITY
+from .vehicle import GRAVITY, IMU_RATE
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.sensors.sensor import Stream

@@ -19,7 +19,7 @@ from uwb_tdoa_bias.foundation.sensors.sensor import RATE
 from uwb_tdoa_bias.foundation.sensors.velocity import LEAST_STD
 
 from ..simulation.tdoas import make_schedule, outliers, tag_link, tdoa_noise
-from .loop import IMU_RATE
+from .vehicle import IMU_RATE
 
 if TYPE_CHECKING:
     from .world import World

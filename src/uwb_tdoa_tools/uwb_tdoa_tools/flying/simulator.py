@@ -12,9 +12,9 @@ from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
 from uwb_tdoa_bias.foundation.sensors import SENSORS
 from uwb_tdoa_ekf.results import rows_of
 
-from .loop import IMU_RATE, interval, poses_at
+from .loop import interval, poses_at
 from .sensors import AIDS, InertialErrors, Radio, gusts, random
-from .vehicle import ATTITUDE, GRAVITY, POSITION, STATE, VELOCITY, Vehicle, ground_at
+from .vehicle import ATTITUDE, GRAVITY, IMU_RATE, POSITION, STATE, VELOCITY, Vehicle, ground_at
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.sensors.sensor import Stream

@@ -18,13 +18,12 @@ from uwb_tdoa_ekf.results import Odometry, concatenated
 
 from .controller import FELT, Controller, Gains, turned
 from .estimates import OurFilter, TheirFilter
-from .loop import IMU_RATE
 from .mission import DONE, REFUSED, Mission, Rules
 from .path import Circles, Waypoints
 from .sensors import random
 from .simulator import DT, Simulator
 from .transport import Transport
-from .vehicle import ATTITUDE, POSITION
+from .vehicle import ATTITUDE, IMU_RATE, POSITION
 from .world import World
 
 if TYPE_CHECKING:

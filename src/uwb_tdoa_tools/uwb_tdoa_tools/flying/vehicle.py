@@ -25,6 +25,7 @@ Record = Any
 
 GRAVITY = 9.81  # m/s^2
 STEP = 0.625e-3  # s, of the integration (midpoint)
+IMU_RATE = 400.0  # Hz
 ROTORS = 4
 POSITION, VELOCITY, ATTITUDE, RATE, SPEED = (
     slice(0, 3),

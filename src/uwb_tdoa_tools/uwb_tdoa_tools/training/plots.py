@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.foundation.files import write_filled
 
-from ..scoring.plots import plt
-
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
@@ -24,6 +22,8 @@ def plot_curve(
     """Learning curve: RMS errors of training and validation flights, m, over epochs or number of
     flights.
     """
+    from ..scoring.plots import plt  # takes a second to import
+
     figure, ax = plt.subplots(figsize=(7, 4), layout="constrained")
     for name, errors in (("training", training), ("validation", validation)):
         ax.plot(x, errors, "o-", ms=3, label=name)
