@@ -26,7 +26,7 @@ from uwb_tdoa_bias.foundation.flight import Flight
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools import cli, parallel
 from uwb_tdoa_tools.flying import fleet
-from uwb_tdoa_tools.flying.path import Circles
+from uwb_tdoa_tools.flying.mission import Circles
 from uwb_tdoa_tools.flying.trial import Task, fly
 from uwb_tdoa_tools.flying.world import World
 from uwb_tdoa_tools.outputs import OutputFolder

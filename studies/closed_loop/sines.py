@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwb_tdoa_tools.flying.path import CLIMB, KNOT, SETTLE, ReferenceTrajectory, cruise, smooth
+from uwb_tdoa_tools.flying.mission import CLIMB, KNOT, SETTLE, ReferenceTrajectory, cruise, smooth
 from uwb_tdoa_tools.simulation.config import SimulationConfig
 from uwb_tdoa_tools.simulation.paths import sines
 from uwb_tdoa_tools.simulation.rooms import Room

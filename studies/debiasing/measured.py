@@ -14,9 +14,8 @@ from uwb_tdoa_bias.foundation.files import write_text
 from uwb_tdoa_bias.foundation.flight import AIDS
 from uwb_tdoa_ekf.debias import fit
 from uwb_tdoa_tools import parallel
-from uwb_tdoa_tools.debiasing.evaluation import evaluate_map, fly
-from uwb_tdoa_tools.debiasing.parts import LEAST, part_of
-from uwb_tdoa_tools.debiasing.report import about_figures
+from uwb_tdoa_tools.debiasing.evaluation import about_figures, evaluate_map, fly
+from uwb_tdoa_tools.debiasing.mapping import LEAST, part_of
 from uwb_tdoa_tools.outputs import OutputFolder
 from uwb_tdoa_tools.readers import inputs
 

@@ -21,7 +21,7 @@ from studies.closed_loop.experiment import (
 )
 from uwb_tdoa_bias.correction.network import load_network
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_tools.flying.plots import drawn
+from uwb_tdoa_tools.flying.fleet import drawn
 from uwb_tdoa_tools.flying.verdict import verdict_of
 
 OFF = dict(zip(ESTIMATORS, (0.4, 0.3, 0.24, 0.36, 0.1)))  # m, of the estimates of made-up flights

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from studies.closed_loop.sines import Sines
-from uwb_tdoa_tools.flying.path import SINK
+from uwb_tdoa_tools.flying.mission import SINK
 from uwb_tdoa_tools.simulation.rooms import constellation, room_of
 
 ROOM = room_of(constellation("corners"))

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_tools.flying.commanded import MOST_SPEED, Commanded
-from uwb_tdoa_tools.flying.path import SETTLE, SINK
+from uwb_tdoa_tools.flying.mission import SETTLE, SINK
+from uwb_tdoa_tools.flying.pilot import MOST_SPEED, Commanded
 
 SIZE = (6.0, 6.0, 3.0)
 

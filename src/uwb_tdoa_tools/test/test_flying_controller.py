@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_tools.flying.controller import Controller, turned
-from uwb_tdoa_tools.flying.loop import IMU_RATE, interval
+from uwb_tdoa_tools.flying.simulator import IMU_RATE, interval
 from uwb_tdoa_tools.flying.vehicle import ATTITUDE, GRAVITY, POSITION, VELOCITY, Vehicle
 
 TICK = 4

@@ -3,8 +3,17 @@ import math
 import numpy as np
 import pytest
 
-from uwb_tdoa_tools.flying.mission import DONE, FLYING, LOST, PULL, REFUSED, WAITING, Mission, Rules
-from uwb_tdoa_tools.flying.path import Circles
+from uwb_tdoa_tools.flying.mission import (
+    DONE,
+    FLYING,
+    LOST,
+    PULL,
+    REFUSED,
+    WAITING,
+    Circles,
+    Mission,
+    Rules,
+)
 
 LEVEL = np.array([0.0, 0.0, math.sin(0.2), math.cos(0.2)])  # yaw 0.4
 STEP = 0.01

@@ -5,7 +5,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from uwb_tdoa_tools.flying.pace import IMPATIENCE, LARGEST_CATCH_UP, PATIENCE, Lockstep, RealTime
+from uwb_tdoa_tools.flying.over_topics import (
+    IMPATIENCE,
+    LARGEST_CATCH_UP,
+    PATIENCE,
+    Lockstep,
+    RealTime,
+)
 from uwb_tdoa_tools.flying.simulator import SensorReadings
 
 TURN = 0.01

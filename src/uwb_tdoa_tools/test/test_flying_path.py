@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from uwb_tdoa_tools.flying.path import SINK, Circles
+from uwb_tdoa_tools.flying.mission import SINK, Circles
 
 GROUND = 0.03
 

@@ -11,15 +11,13 @@ from uwb_tdoa_bias.foundation.flight import Truth
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools.commands.fly import main
 from uwb_tdoa_tools.flying import rover
-from uwb_tdoa_tools.flying.mission import DONE, FLYING, LOST, REFUSED, Rules
-from uwb_tdoa_tools.flying.path import Waypoints
-from uwb_tdoa_tools.flying.plots import drawn
-from uwb_tdoa_tools.flying.report import summary, text
+from uwb_tdoa_tools.flying.fleet import drawn
+from uwb_tdoa_tools.flying.mission import DONE, FLYING, LOST, REFUSED, Rules, Waypoints
 from uwb_tdoa_tools.flying.trial import Task
-from uwb_tdoa_tools.flying.verdict import verdict_of
+from uwb_tdoa_tools.flying.verdict import summary, text, verdict_of
 from uwb_tdoa_tools.flying.world import HALL, WORLDS
 from uwb_tdoa_tools.scoring.metrics import position_at
-from uwb_tdoa_tools.simulation.imu import NO_IMU_ERRORS
+from uwb_tdoa_tools.simulation.config import NO_IMU_ERRORS
 
 SEEDS = 3, 4, 5
 WORLD = replace(HALL, aids=rover.AIDS)

@@ -5,10 +5,8 @@ import pytest
 
 from uwb_tdoa_bias.foundation.flight import Imu, Tdoas
 from uwb_tdoa_bias.foundation.radio import arrival_bias
-from uwb_tdoa_tools.flying.loop import IMU_RATE
 from uwb_tdoa_tools.flying.sensors import AIDS, InertialErrors, Radio, gusts
-from uwb_tdoa_tools.flying.simulator import SensorReadings
-from uwb_tdoa_tools.flying.transport import Transport
+from uwb_tdoa_tools.flying.simulator import IMU_RATE, SensorReadings, Transport
 from uwb_tdoa_tools.flying.world import HALL, WORLDS
 from uwb_tdoa_tools.simulation.rooms import constellation
 from uwb_tdoa_tools.simulation.tdoas import tag_link

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_tools.flying.mission import DONE, REFUSED, Rules
-from uwb_tdoa_tools.flying.path import Circles
+from uwb_tdoa_tools.flying.mission import DONE, REFUSED, Circles, Rules
 from uwb_tdoa_tools.flying.trial import Task, fly
 from uwb_tdoa_tools.flying.verdict import verdict_of
 from uwb_tdoa_tools.flying.world import HALL, WORLDS

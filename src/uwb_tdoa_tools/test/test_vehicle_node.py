@@ -21,7 +21,7 @@ from uwb_tdoa_bias.foundation.errors import InputError  # noqa: E402
 from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 from uwb_tdoa_msgs.srv import GoTo, Land, Takeoff  # noqa: E402
 from uwb_tdoa_tools.flying import rover  # noqa: E402
-from uwb_tdoa_tools.flying.path import Waypoints  # noqa: E402
+from uwb_tdoa_tools.flying.mission import Waypoints  # noqa: E402
 from uwb_tdoa_tools.flying.simulator import DT  # noqa: E402
 from uwb_tdoa_tools.flying.trial import Task  # noqa: E402
 from uwb_tdoa_tools.flying.verdict import verdict_of  # noqa: E402

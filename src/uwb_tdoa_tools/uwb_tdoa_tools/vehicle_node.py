@@ -36,14 +36,12 @@ from uwb_tdoa_bias.foundation.ros_streams import RoundRobin
 from uwb_tdoa_msgs.srv import GoTo, Land, Takeoff
 
 from .flying import rover
-from .flying.over_topics import OverTopics
-from .flying.pace import Lockstep, RealTime
-from .flying.path import Circles, Waypoints
+from .flying.mission import Circles, Waypoints
+from .flying.over_topics import Lockstep, OverTopics, RealTime
 from .flying.pilot import Pilot
-from .flying.report import reached, sentence
 from .flying.sensors import AIDS
 from .flying.trial import VEHICLES, Task, Trial
-from .flying.verdict import verdict_of
+from .flying.verdict import reached, sentence, verdict_of
 from .flying.world import WORLDS, world_of
 
 if TYPE_CHECKING:

@@ -11,11 +11,11 @@ from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, options, parallel
 from ..flying import fleet, rover
-from ..flying.path import Circles, Waypoints
-from ..flying.plots import plot
-from ..flying.report import summary, text, wording_of
+from ..flying.fleet import plot
+from ..flying.mission import Circles, Waypoints
 from ..flying.sensors import AIDS
 from ..flying.trial import VEHICLES, Task
+from ..flying.verdict import summary, text, wording_of
 from ..flying.world import MOMENTS, WORLDS, world_of
 from ..outputs import OutputFile, OutputFolder
 from ..results_file import asked_of

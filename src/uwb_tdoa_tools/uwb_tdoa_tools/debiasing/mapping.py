@@ -7,21 +7,101 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_ekf.debias import fit
+from uwb_tdoa_bias.foundation.files import read_head
+from uwb_tdoa_ekf.debias import Part, fit
+from uwb_tdoa_ekf.offline import run_offline
 
 from ..readers import read_survey
+from ..readers.tables import read_numbers
+from ..scoring.evaluation import corrected_truth
 from ..scoring.gains import SHARES, Shrinkage, best_share
-from .evaluation import evaluate_map
-from .parts import LEAST, is_table, part_of, static_parts
+from ..scoring.metrics import position_at
+from .evaluation import PositionEstimator, evaluate_map
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from uwb_tdoa_bias.foundation.anchors import Anchors
     from uwb_tdoa_ekf.debias import BiasMap
+    from uwb_tdoa_ekf.results import Odometry
 
+    from ..scoring.metrics import Score
     from .evaluation import PositionEstimator, Scored
+
+
+LEAST = 10  # positions of flights, 5 ms apart, that make a marker
+COLUMNS = ("true_x", "true_y", "true_z", "x", "y", "z")
+SETTLE = 1.0  # s at a place before positions count
+REST = 0.02  # m that a tag at rest may move in SETTLE
+SHORTEST = 100  # positions that make a stay
+
+
+def part_of(score: Score, odometry: Odometry) -> Part:
+    """Part of an evaluated flight: its airborne odometry, at the stamps that the Score has."""
+    measured = odometry.p[(odometry.t >= score.first) & (odometry.t <= score.last)]
+    return Part(measured, measured - score.error, score.covariance)
+
+
+def static_parts(
+    path: str | Path, estimator: PositionEstimator = PositionEstimator(), planar: bool = False
+) -> list[Part]:
+    """List of Part of a tag that stood still, one for each place.
+
+    path : a CSV file with the columns true_x, true_y, true_z, x, y, z (m; without the z if planar),
+        one row for each
+        measured position; or any recording with ground truth, through which the filter is run, and
+        of which the time at rest counts, but for the first SETTLE s at each place. Raises
+        InputError.
+    """
+    if is_table(path):
+        return _from_table(path, planar)
+    flight = estimator.reading.one(path)
+    if flight.truth is None:
+        raise InputError(
+            f"{path}: holds no ground truth; record where the tag stood as ground_truth/pose."
+        )
+    odometry = run_offline(
+        flight, estimator.config, Corrector(flight.anchors, estimator.effects)
+    ).odometry
+    truth = corrected_truth(flight, estimator.effects)
+    true, t = position_at(odometry.t, truth), odometry.t
+    moved = np.linalg.norm(true - position_at(t - SETTLE, truth), axis=1)
+    resting = (moved < REST) & (t > np.min(t, initial=np.inf) + SETTLE)
+    stays = np.split(np.arange(len(t)), np.flatnonzero(np.diff(resting)) + 1)
+    stays = [rows for rows in stays if len(rows) >= SHORTEST and resting[rows[0]]]
+    if not stays:
+        raise InputError(
+            f"{path}: the tag never stands still for long enough; give it as a flight, not "
+            "with --static."
+        )
+    return [Part(odometry.p[rows], true[rows], odometry.covariance[rows, :3, :3]) for rows in stays]
+
+
+def is_table(path: str | Path) -> bool:
+    """Whether a file is a CSV of positions, not a recording."""
+    return not Path(path).is_dir() and b"true_x" in read_head(path, 1000)
+
+
+def _from_table(path: str | Path, planar: bool) -> list[Part]:
+    names = [name for name in COLUMNS if not (planar and name.endswith("z"))]
+    table = read_numbers(path, names)
+    if not len(table):
+        raise InputError(f"{path}: holds no positions; give one row for each.")
+    d = len(names) // 2
+    _, place, counts = np.unique(table[:, :d], axis=0, return_inverse=True, return_counts=True)
+    true, measured = (np.pad(side, ((0, 0), (0, 3 - d))) for side in (table[:, :d], table[:, d:]))
+    return [
+        Part(measured[rows], true[rows])
+        for rows in np.split(np.argsort(place.ravel(), kind="stable"), np.cumsum(counts)[:-1])
+    ]
+
+
+pass
+
 
 FEWEST = 2  # flights; one alone leaves none to judge
 

@@ -20,9 +20,8 @@ from ..live.run import accounts, run_live
 from ..localizing.pictures import write_rerun
 from ..scoring.metrics import Score
 from . import trial
-from .report import sentence
 from .sensors import Radio
-from .verdict import verdict_of
+from .verdict import sentence, verdict_of
 from .world import HALL
 
 if TYPE_CHECKING:

@@ -3,27 +3,117 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from uwb_tdoa_bias.foundation.files import write_filled
+
 from .. import parallel
 from ..bags.bag import write_bag
 from ..results_file import ResultsFile
-from .plots import drawn
-from .report import summary, text
+from ..scoring.metrics import position_at
 from .rover import drive
 from .trial import fly
-from .verdict import verdict_of
+from .verdict import reached, summary, text, verdict_of, wording_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from contextlib import AbstractContextManager
+    from pathlib import Path
 
-    from .plots import Drawn
-    from .trial import Task
+    from uwb_tdoa_bias.foundation.anchors import Anchors
+
+    from .trial import Task, TrialResult
 
     Verdicts = ResultsFile | dict[str, dict[str, Any]]  # {seed: verdict}
+
+
+SPACING = 0.05  # s
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """What is drawn of a flight: t (n,) s, p (n, 3) m, the truth; wanted (n, 3) m, NaN where
+    nothing was; error and sigma (k, 3) m of the estimate at stamps (k,) s; verdict : as of
+    `verdict_of`.
+    """
+
+    t: np.ndarray
+    p: np.ndarray
+    wanted: np.ndarray
+    stamps: np.ndarray
+    error: np.ndarray
+    sigma: np.ndarray
+    verdict: dict[str, Any]
+
+
+def drawn(flown: TrialResult, verdict: dict[str, Any]) -> Drawn:
+    """Drawn, of a TrialResult."""
+    assert flown.flight.truth is not None
+    truth, odometry = flown.flight.truth, flown.odometry
+    every = max(1, round(SPACING / (truth.t[1] - truth.t[0])))
+    t, p = truth.t[::every], truth.p[::every]
+    wanted = np.full(p.shape, np.nan)
+    for mission in (mission for mission in flown.missions if mission.started is not None):
+        inside = (t >= mission.started) & (t <= (mission.ended or np.inf))
+        wanted[inside] = mission.wanted(t[inside])[:, 0]
+    rows: np.ndarray = np.empty(0, int)
+    if len(odometry):
+        rows = np.unique(
+            np.searchsorted(odometry.t, np.arange(odometry.t[0], odometry.t[-1], SPACING))
+        )
+    stamps = odometry.t[rows]
+    error = odometry.p[rows] - position_at(stamps, truth)
+    sigma = np.sqrt(np.einsum("nii->ni", odometry.covariance[rows, :3, :3]))
+    return Drawn(t, p, wanted, stamps, error, sigma, verdict)
+
+
+def plot(flights: Sequence[Drawn], anchors: Anchors, path: str | Path) -> None:
+    """Draw [Drawn] among Anchors to an image file: a map and the heights of all, and the errors of
+    the worst.
+    """
+    from matplotlib.figure import Figure  # takes a second to import
+
+    figure = Figure(figsize=(14, 8), layout="constrained")
+    left, right = figure.subfigures(1, 2)
+    goal = wording_of(flights[0].verdict).goal
+    figure.suptitle(f"{sum(reached(one.verdict) for one in flights)} of {len(flights)} {goal}")
+    above, height = left.subplots(2, 1, height_ratios=(3, 1))
+    above.plot(*anchors.positions[:, :2].T, "k^")
+    for one in flights:
+        colour = "tab:green" if reached(one.verdict) else "tab:red"
+        above.plot(*one.p[:, :2].T, color=colour, linewidth=0.7, alpha=0.6)
+        above.plot(*one.p[-1, :2], "x", color=colour)
+        height.plot(one.t, one.p[:, 2], color=colour, linewidth=0.7, alpha=0.6)
+    above.set(xlabel="x, m", ylabel="y, m", aspect="equal")
+    height.set(xlabel="t, s", ylabel="z, m")
+    worst = max(flights, key=_badness)
+    right.suptitle(f"seed {worst.verdict['seed']}: {worst.verdict['why'] or goal}")
+    for k, (axes, axis) in enumerate(zip(right.subplots(3, 1, sharex=True), "xyz")):
+        axes.plot(worst.t, worst.wanted[:, k] - worst.p[:, k], "0.6", label="wanted - true")
+        axes.plot(worst.stamps, worst.error[:, k], label="estimated - true")
+        axes.fill_between(
+            worst.stamps,
+            -3 * worst.sigma[:, k],
+            3 * worst.sigma[:, k],
+            alpha=0.2,
+            label="three sigma",
+        )
+        axes.set(ylabel=f"{axis}, m")
+    axes.set(xlabel="t, s")
+    axes.legend()
+    write_filled(path, partial(figure.savefig, dpi=120))
+
+
+def _badness(one: Drawn) -> tuple[bool, float]:
+    return not reached(one.verdict), one.verdict["tracking"] or 0.0
+
+
+pass
 
 
 def kept(path: str | Path | None, asked: dict[str, Any]) -> AbstractContextManager[Verdicts]:

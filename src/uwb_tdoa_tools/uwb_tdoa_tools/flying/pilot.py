@@ -6,18 +6,155 @@ Refuses, with why, what it cannot do.
 from __future__ import annotations
 
 from dataclasses import replace
+import math
 from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.interpolate import BPoly
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
-from .commanded import Commanded
-from .mission import FLYING, LOST, yaw_of
+from .mission import FLYING, LOST, SETTLE, sinking, yaw_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from .mission import Mission
     from .trial import Trial
+
+
+MOST_SPEED, MOST_ACCELERATION = 1.5, 1.2  # m/s and m/s^2, on the way to a goal
+PEAK_SPEED, PEAK_ACCELERATION = (
+    15.0 / 8.0,
+    10.0 / math.sqrt(3.0),
+)  # of a way of 1 m in 1 s, from rest to rest
+MOST_TURN = 1.5  # rad/s
+LONGEST = 600.0  # s
+HIGHEST = 1.0  # m, of what it lands on: from higher up it would sink for too long
+STILL = np.zeros(4)
+
+
+class Commanded:
+    """A Reference that grows by commands, each from where the last one has it by then. duration : s
+    since the start, inf before it is to land. Commands raise InputError, with why it does not do
+    that.
+    """
+
+    def __init__(self, p: np.ndarray, yaw: float, size: Sequence[float]) -> None:
+        """p (3,) m and yaw, rad: where it stands, as estimated; size (3,) m, of the hall, around
+        the origin in x and y.
+        """
+        self.duration, self._size, self._first_yaw = math.inf, size, yaw
+        self._goal = np.array([*p, yaw])
+        self._begins, self._ways = [0.0], [_way((self._goal, STILL, STILL), self._goal, 1.0)]
+
+    def along(self, place: np.ndarray, ground: float) -> Commanded:
+        """Itself, as it knows where it begins."""
+        return self
+
+    @property
+    def end(self) -> np.ndarray:
+        """(2,) m, where it stays, or lands."""
+        return self._goal[:2]
+
+    def take_off(self, height: float, seconds: float) -> None:
+        """Go straight up to a height, m, within so many s."""
+        self._go(0.0, [*self._goal[:2], height, self._goal[3]], seconds)
+
+    def go_to(
+        self,
+        now: float,
+        relative: bool,
+        goal: Sequence[float] | np.ndarray,
+        yaw: float,
+        seconds: float,
+    ) -> None:
+        """From `now`, s since the start, be at goal (3,) m with a yaw, rad, within so many s;
+        relative : both are counted from where it is going.
+        """
+        self._check_flying()
+        goal = np.array([*goal, yaw])
+        self._go(now, self._goal + goal if relative else goal, seconds)
+
+    def land(self, now: float, height: float, seconds: float) -> None:
+        """From `now` on come down to SETTLE above `height`, m, within so many s, and sink from
+        there.
+        """
+        self._check_flying()
+        if not 0.0 <= height <= HIGHEST:
+            raise InputError(
+                f"height: {height:g} m must be from 0 to {HIGHEST:g} m, that of the ground, "
+                "or of a table."
+            )
+        lowest = min(float(self._at(now)[0, 2]), height + SETTLE)
+        self._go(now, [*self._goal[:2], lowest, self._goal[3]], seconds)
+        self.duration = now + seconds
+
+    def at(self, t: np.ndarray) -> np.ndarray:
+        """Position, velocity and acceleration (n, 3, 3), m and s, at t (n,) s since the start."""
+        return sinking(np.stack([self._at(one)[:, :3] for one in t]), t > self.duration)
+
+    def turned(self, t: float) -> float:
+        """rad by which it is to be turned at t, s."""
+        return float(self._at(t)[0, 3]) - self._first_yaw
+
+    def _at(self, t: float) -> np.ndarray:
+        """(3, 4): x, y, z and yaw, and their derivatives."""
+        k = max(int(np.searchsorted(self._begins, t, side="right")) - 1, 0)
+        way = self._ways[k]
+        since = min(t - self._begins[k], way[0].x[-1])
+        return np.stack([function(since) for function in way])
+
+    def _check_flying(self) -> None:
+        if self.duration < math.inf:
+            raise InputError("it lands already; take off again when it has.")
+
+    def _go(self, now: float, goal: Sequence[float] | np.ndarray, seconds: float) -> None:
+        goal = np.array(goal, dtype=float)
+        if not np.isfinite(goal).all():
+            raise InputError(
+                f"goal: {goal.tolist()} holds numbers that are not finite; give finite ones."
+            )
+        x, y, z = self._size
+        if not (abs(goal[0]) <= 0.5 * x and abs(goal[1]) <= 0.5 * y and 0.0 <= goal[2] <= z):
+            place = ", ".join(f"{number:.2f}" for number in goal[:3])
+            raise InputError(
+                f"goal: ({place}) m is outside the hall, {x:g} x {y:g} x {z:g} m around (0, "
+                "0); give one inside."
+            )
+        if not 0.0 < seconds <= LONGEST:
+            raise InputError(f"duration: {seconds:g} s must be above 0 and at most {LONGEST:g} s.")
+        p, v, a = self._at(now)
+        goal[3] = p[3] + math.remainder(goal[3] - p[3], 2.0 * math.pi)  # the shorter way around
+        far = float(np.linalg.norm(goal[:3] - p[:3]))
+        needed = max(
+            PEAK_SPEED * far / MOST_SPEED,
+            math.sqrt(PEAK_ACCELERATION * far / MOST_ACCELERATION),
+            PEAK_SPEED * abs(goal[3] - p[3]) / MOST_TURN,
+        )
+        if seconds < needed:
+            raise InputError(
+                f"duration: {seconds:g} s is too short for {far:.2f} m; give at least "
+                f"{math.ceil(10.0 * needed) / 10.0:g} s."
+            )
+        self._goal = goal
+        self._begins.append(now)
+        self._ways.append(_way((p, v, a), goal, seconds))
+
+
+def _way(
+    begin: Sequence[np.ndarray], goal: np.ndarray, seconds: float
+) -> tuple[BPoly, BPoly, BPoly]:
+    """Functions of time, s, to (4,): from `begin`, value and derivatives, to a goal within so many
+    s, and staying there; its derivatives.
+    """
+    value = BPoly.from_derivatives(
+        [0.0, seconds, seconds + 1.0], [begin, (goal, STILL, STILL), (goal, STILL, STILL)]
+    )
+    return value, value.derivative(1), value.derivative(2)
+
+
+pass
 
 
 class Pilot:

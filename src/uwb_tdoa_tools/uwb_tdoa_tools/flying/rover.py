@@ -15,8 +15,7 @@ from uwb_tdoa_bias.foundation.sensors import SENSORS
 
 from ..simulation.config import WHEELS_RATE
 from ..simulation.sensors import YAW_RATE_STD, slips
-from .mission import DONE, FLYING, LOST, REFUSED, WAITING, Rules, yaw_of
-from .path import Polyline, Waypoints
+from .mission import DONE, FLYING, LOST, REFUSED, WAITING, Polyline, Rules, Waypoints, yaw_of
 from .sensors import AidSensor, random
 from .simulator import Simulator
 from .trial import REST_AFTER, Trial

@@ -3,24 +3,122 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
 from uwb_tdoa_bias.foundation.sensors import SENSORS
-from uwb_tdoa_ekf.results import rows_of
+from uwb_tdoa_ekf.results import concatenated, rows_of
 
-from .loop import interval, poses_at
+from .controller import inner
 from .sensors import AIDS, InertialErrors, Radio, gusts, random
-from .vehicle import ATTITUDE, GRAVITY, IMU_RATE, POSITION, STATE, VELOCITY, Vehicle, ground_at
+from .vehicle import (
+    ATTITUDE,
+    GRAVITY,
+    IMU_RATE,
+    POSITION,
+    STATE,
+    STEP,
+    VELOCITY,
+    Vehicle,
+    ground_at,
+    specific_force,
+    step,
+)
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.sensors.sensor import Stream
 
     from .sensors import AidSensor
+    from .vehicle import Record
     from .world import World
+
+
+STEPS = round(1.0 / (IMU_RATE * STEP))  # of the integration, per sample
+TURNING = 50.0  # rad/s of a rotor, above which it shakes the vehicle
+
+
+@compiled
+def interval(
+    state: np.ndarray,
+    gyro: np.ndarray,
+    wanted: tuple[float, np.ndarray],
+    controller: tuple[Record, Record],
+    vehicle: Record,
+    disturbances: tuple[np.ndarray, np.ndarray, np.ndarray],
+    felt: tuple[np.ndarray, np.ndarray, np.ndarray],
+) -> None:
+    """Fly n samples of the inertial sensor long.
+
+    state (17,) and gyro (2, 3) rad/s, as felt last and before that, are updated; wanted : thrust,
+    N, and rates (3,) rad/s;
+    controller : its gains, and the vehicle that it knows; vehicle : NUMBERS, the true ones;
+    disturbances : wind (n, 3) m/s; errors (n, 6), what the sensor adds to rates, rad/s, and
+        specific force, m/s^2;
+    shaking (n, 3) m/s^2, what rotors add that turn.
+    felt, written to : truth (n, 17), the states at the samples; samples (n, 6), rates and specific
+        force: means since the sample
+    before; contact (n,): the number of feet on the ground.
+    """
+    thrust, rates = wanted[0], wanted[1]
+    gains, known = controller[0], controller[1]
+    wind, errors, shaking = disturbances[0], disturbances[1], disturbances[2]
+    truth, samples, contact = felt[0], felt[1], felt[2]
+    dt = STEP * STEPS
+    speeds, scratch, force, earlier = (
+        np.empty(4),
+        np.empty((2, STATE)),
+        np.empty(3),
+        np.empty(STATE),
+    )
+    for i in range(len(truth)):
+        inner(thrust, rates, gyro, dt, gains, known, speeds)
+        earlier[:] = state
+        feet = 0
+        turn = np.zeros(3)
+        for _ in range(STEPS):
+            feet = max(feet, step(state, speeds, wind[i], STEP, vehicle, scratch))
+            for k in range(3):
+                turn[k] += state[10 + k] / STEPS
+        specific_force(earlier, state, dt, force)
+        turning = state[13] > TURNING
+        for k in range(3):
+            samples[i, k] = turn[k] + errors[i, k]
+            samples[i, 3 + k] = force[k] + errors[i, 3 + k] + (shaking[i, k] if turning else 0.0)
+        gyro[1] = gyro[0]
+        gyro[0] = samples[i, :3]
+        truth[i] = state
+        contact[i] = feet
+
+
+@compiled
+def poses_at(
+    t: np.ndarray, times: np.ndarray, states: np.ndarray, p: np.ndarray, q: np.ndarray
+) -> None:
+    """Positions p (n, 3) and attitudes q (n, 4) at t (n,) s, between states (m, 17) at times (m,)
+    s; written to.
+    """
+    j = 0
+    for i in range(len(t)):
+        while j < len(times) - 2 and times[j + 1] < t[i]:
+            j += 1
+        share = (t[i] - times[j]) / (times[j + 1] - times[j])
+        for k in range(3):
+            p[i, k] = states[j, k] + share * (states[j + 1, k] - states[j, k])
+        length = 0.0
+        for k in range(4):
+            q[i, k] = states[j, 6 + k] + share * (states[j + 1, 6 + k] - states[j, 6 + k])
+            length += q[i, k] ** 2
+        for k in range(4):
+            q[i, k] /= math.sqrt(length)
+
+
+pass
+
 
 TICK = 4  # samples of the inertial sensor, from one turn of the controller to the next
 DT = TICK / IMU_RATE  # s
@@ -226,3 +324,41 @@ def _along(way: np.ndarray, share: np.ndarray) -> np.ndarray:
     k = np.minimum(part.astype(int), len(way) - 2)
     x = (part - k)[:, None]
     return way[k] + x**3 * (10.0 - 15.0 * x + 6.0 * x**2) * (way[k + 1] - way[k])
+
+
+pass
+
+
+class Transport:
+    """Holds what was measured until it arrives; within a stream nothing overtakes."""
+
+    def __init__(self, latency: float, jitter: float, rng: np.random.Generator) -> None:
+        """latency : s, of everything; jitter : s, mean of what comes on top; rng : numpy Generator."""
+        self._latency, self._jitter, self._rng = latency, jitter, rng
+        # by stream: (what waits, when it arrives (n,) s, the last arrival)
+        self._waiting: dict[str, tuple[Any, np.ndarray, float]] = {}
+
+    def arrived(self, measured: SensorReadings, now: float) -> SensorReadings:
+        """SensorReadings that have arrived by `now`, s, after more of them were sent."""
+        if not self._latency and not self._jitter:
+            return measured
+        parts = {stream: self._due(stream, part, now) for stream, part in measured.streams.items()}
+        return SensorReadings(parts.pop("imu"), parts.pop("tdoa"), parts)
+
+    def _due(self, stream: str, part: Any, now: float) -> Any:
+        held, arrival, last = self._waiting.get(stream, (None, np.empty(0), 0.0))
+        delay = (
+            self._latency + self._rng.exponential(self._jitter, len(part))
+            if self._jitter
+            else np.full(len(part), self._latency)
+        )
+        came = np.maximum.accumulate(np.maximum(part.t + delay, last))
+        part = part if held is None else concatenated([held, part])
+        arrival = np.concatenate([arrival, came])
+        due = int(np.searchsorted(arrival, now, side="right"))
+        self._waiting[stream] = (
+            rows_of(part, slice(due, None)),
+            arrival[due:],
+            came[-1] if len(came) else last,
+        )
+        return rows_of(part, slice(0, due))

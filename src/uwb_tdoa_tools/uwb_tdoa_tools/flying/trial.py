@@ -18,11 +18,9 @@ from uwb_tdoa_ekf.results import Odometry, concatenated
 
 from .controller import FELT, Controller, Gains, turned
 from .estimates import OurFilter, TheirFilter
-from .mission import DONE, REFUSED, Mission, Rules
-from .path import Circles, Waypoints
+from .mission import DONE, REFUSED, Circles, Mission, Rules, Waypoints
 from .sensors import random
-from .simulator import DT, Simulator
-from .transport import Transport
+from .simulator import DT, Simulator, Transport
 from .vehicle import ATTITUDE, IMU_RATE, POSITION
 from .world import World
 

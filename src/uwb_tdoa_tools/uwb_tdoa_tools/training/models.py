@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -11,10 +12,10 @@ from uwb_tdoa_bias.correction.corrector import LARGEST_YAW_STD
 from uwb_tdoa_bias.correction.features import columns
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.files import write_bytes
+from uwb_tdoa_bias.foundation.files import write_bytes, write_filled
 
 from . import labels as labelling
-from . import linear, paper, physics, structured
+from . import linear, network, physics, structured
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -25,12 +26,13 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.flight import Flight
 
     from .labels import Labels
-    from .paper import Paper
+    from .network import Paper
     from .structured import Structured
 
     LearningCurve = tuple[
         str, list[int], list[float], list[float]
     ]  # label, x, training and validation RMS, m
+
 
 KINDS = ("paper", "paper_no_orientation", "structured", "physics", "physics+structured")
 SPACING = 0.01  # s between the samples that are learned from: nearer ones tell the same
@@ -165,14 +167,14 @@ def _paper(
     training: list[Labels],
     validation: list[Labels],
     progress: Callable[[str], object],
-) -> tuple[paper.Paper, LearningCurve, list[np.ndarray]]:
+) -> tuple[network.Paper, LearningCurve, list[np.ndarray]]:
     """(Paper, learning curve over epochs, what is left of the errors of each validation flight)."""
     kind, seed, _ = recipe
     thin, held = (
         labelling.thinned(group, SPACING, np.random.default_rng(seed))
         for group in (training, validation)
     )
-    model, errors = paper.fit(
+    model, errors = network.fit(
         thin,
         held,
         kind == "paper",
@@ -336,3 +338,25 @@ def save(result: Trained, folder: Path) -> tuple[Path | None, Path | None]:
     if result.effects is not None:
         result.effects.to_yaml(effects)
     return (model if made is not None else None), (effects if result.effects is not None else None)
+
+
+def plot_curve(
+    label: str,
+    x: Sequence[float],
+    training: Sequence[float],
+    validation: Sequence[float],
+    path: Path,
+) -> None:
+    """Learning curve: RMS errors of training and validation flights, m, over epochs or number of
+    flights.
+    """
+    from ..scoring.plots import plt  # takes a second to import
+
+    figure, ax = plt.subplots(figsize=(7, 4), layout="constrained")
+    for name, errors in (("training", training), ("validation", validation)):
+        ax.plot(x, errors, "o-", ms=3, label=name)
+    ax.set(xlabel=label, ylabel="error of the TDOAs, RMS [m]")
+    ax.grid(alpha=0.3)
+    ax.legend()
+    write_filled(path, partial(figure.savefig, dpi=110))
+    plt.close(figure)

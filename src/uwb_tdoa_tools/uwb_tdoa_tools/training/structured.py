@@ -27,7 +27,7 @@ from scipy.spatial.distance import cdist
 
 from uwb_tdoa_bias.correction.features import columns
 
-from . import export, linear
+from . import linear, network
 from .labels import SAME_PLACE, constellations
 
 if TYPE_CHECKING:
@@ -244,7 +244,7 @@ class Structured:
         """The onnx.ModelProto: bias, standard deviation, share of what can be known. meta : further
         metadata.
         """
-        graph, names = export.GraphBuilder(), self.inputs()
+        graph, names = network.GraphBuilder(), self.inputs()
         end = graph.rows(graph.input, len(names) // 2)  # (2n, ...): what follows is said of one end
         maps = [self._site_graph(graph, end)] if len(self.site_ids) else []
         maps += [self._link_graph(graph, end)] if self.links else []
@@ -263,7 +263,7 @@ class Structured:
         }
         return graph.model(len(names), [bias, std, known], meta)
 
-    def _site_graph(self, graph: export.GraphBuilder, end: str) -> tuple[str, str]:
+    def _site_graph(self, graph: network.GraphBuilder, end: str) -> tuple[str, str]:
         """(mean, variance explained) by the site maps, each (2n, 1). end : features of one end."""
         place, who, where = (graph.take(end, some) for some in ([0, 1, 2], [3], [4, 5, 6]))
         place = graph.op("Div", place, [self.options.length])
@@ -282,7 +282,7 @@ class Structured:
         known = _power(graph, values, _known_directions(self.site, self.site_covariance))
         return graph.row_sum(graph.op("Mul", weights, values)), graph.op("Mul", at_site, known)
 
-    def _link_graph(self, graph: export.GraphBuilder, end: str) -> tuple[str, str]:
+    def _link_graph(self, graph: network.GraphBuilder, end: str) -> tuple[str, str]:
         """(mean, variance explained) by the link maps together, each (2n, 1).
 
         A Gaussian of the distance of x = (log distance, unit vector) from a centre c is an
@@ -344,7 +344,7 @@ def _known_directions(of: Map, covariance: np.ndarray) -> np.ndarray:
     return of.whiten @ (vector[:, leading] * np.sqrt(np.maximum(share[leading], 0.0)))
 
 
-def _power(graph: export.GraphBuilder, values: str, directions: np.ndarray) -> str:
+def _power(graph: network.GraphBuilder, values: str, directions: np.ndarray) -> str:
     """Sum of the squares of values (n, m) along directions (m, k): (n, 1)."""
     part = graph.op("MatMul", values, directions)
     return graph.row_sum(graph.op("Mul", part, part))
