@@ -24,7 +24,7 @@ from uwb_tdoa_ekf.monitoring.use import Use
 from uwb_tdoa_ekf.results import concatenated, rows_of
 from uwb_tdoa_ekf.streams import most_severe_first
 from uwb_tdoa_tools import parallel
-from uwb_tdoa_tools.flying.estimates import OurFilter
+from uwb_tdoa_tools.flying.estimates import OwnFilter
 from uwb_tdoa_tools.flying.simulator import SensorReadings
 from uwb_tdoa_tools.flying.trial import Task, Trial
 from uwb_tdoa_tools.flying.verdict import verdict_of
@@ -134,7 +134,7 @@ class FaultyFilter:
     say.
     """
 
-    def __init__(self, ours: OurFilter, fault: FlownFault) -> None:
+    def __init__(self, ours: OwnFilter, fault: FlownFault) -> None:
         """ours : OurFilter; fault : FlownFault."""
         self._ours, self._fault, self._begun = ours, fault, False
         self._use, self._watch, self._findings = (
@@ -221,11 +221,11 @@ def flown(task: tuple[str, int]) -> dict[str, Any]:
     name, seed = task
     fault = FAULTS[name]
     trial = Trial(Task(world_of("hall", aids=fault.aids), seed))
-    assert isinstance(trial.source, OurFilter)
+    assert isinstance(trial.source, OwnFilter)
     trial.source = source = FaultyFilter(trial.source, fault)
     trial.fly()
-    verdict = verdict_of(trial.flown)
-    return {key: verdict[key] for key in ("landed", "safe", "why", "said_lost", "tracking")} | {
+    verdict = verdict_of(trial.result)
+    return {key: verdict[key] for key in ("landed", "safe", "why", "reported_lost", "tracking")} | {
         "fault": name,
         "seed": seed,
         "said": source.said,

@@ -69,7 +69,7 @@ def test_it_trains_flies_tells_and_draws(tmp_path, monkeypatch, capsys):
         one = made_up(off=OFF[by])
         return verdict_of(one), drawn(one, verdict_of(one))
 
-    monkeypatch.setattr(experiment.fleet, "fly_one", judged)
+    monkeypatch.setattr(experiment.fleet, "fly_task", judged)
     arguments = [
         "closed-loop",
         "--flights",

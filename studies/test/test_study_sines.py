@@ -41,5 +41,5 @@ def test_sines_fill_the_room_stay_inside_and_turn():
     )
     speed = np.linalg.norm(wanted[:, 1], axis=1)
     assert np.sqrt(np.mean(speed**2)) == pytest.approx(0.7, abs=0.2) and speed.max() < 2.0
-    assert reference.turned(10.0) == pytest.approx(3.0)
+    assert reference.yaw_offset(10.0) == pytest.approx(3.0)
     assert np.abs(followed(4, (0.0, 0.0))[2] - wanted).max() > 0.5

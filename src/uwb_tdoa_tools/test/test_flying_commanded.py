@@ -5,7 +5,7 @@ import pytest
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.flying.mission import SETTLE, SINK
-from uwb_tdoa_tools.flying.pilot import MOST_SPEED, Commanded
+from uwb_tdoa_tools.flying.pilot import MAX_SPEED, CommandedPath
 
 SIZE = (6.0, 6.0, 3.0)
 
@@ -13,7 +13,7 @@ SIZE = (6.0, 6.0, 3.0)
 @pytest.fixture
 def up():
     """One that takes off at (1, -1, 0.03) with a yaw of 3 rad, to 1.2 m within 2.5 s."""
-    made = Commanded(np.array([1.0, -1.0, 0.03]), 3.0, SIZE)
+    made = CommandedPath(np.array([1.0, -1.0, 0.03]), 3.0, SIZE)
     made.take_off(1.2, 2.5)
     return made
 
@@ -26,7 +26,7 @@ def test_it_goes_up_and_stays(up):
     )
     for wanted in (there, later):
         np.testing.assert_allclose(wanted, [[1.0, -1.0, 1.2], [0.0] * 3, [0.0] * 3], atol=1e-9)
-    assert up.duration == math.inf and up.turned(60.0) == pytest.approx(0.0)
+    assert up.duration == math.inf and up.yaw_offset(60.0) == pytest.approx(0.0)
 
 
 def test_each_command_goes_on_from_where_the_last_one_has_it(up):
@@ -34,10 +34,10 @@ def test_each_command_goes_on_from_where_the_last_one_has_it(up):
     up.go_to(1.3, False, (0.0, 0.0, 1.5), -3.0, 3.0)
     np.testing.assert_allclose(up.at(np.array([1.3])), before, atol=1e-9)
     np.testing.assert_allclose(up.at(np.array([4.3]))[0, 0], [0.0, 0.0, 1.5], atol=1e-9)
-    assert up.turned(4.3) == pytest.approx(2.0 * math.pi - 6.0)  # the shorter way around
+    assert up.yaw_offset(4.3) == pytest.approx(2.0 * math.pi - 6.0)  # the shorter way around
     up.go_to(5.0, True, (0.5, 0.0, 0.0), 0.1, 2.0)
     np.testing.assert_allclose(up.at(np.array([7.0]))[0, 0], [0.5, 0.0, 1.5], atol=1e-9)
-    assert up.turned(7.0) == pytest.approx(2.0 * math.pi - 5.9)
+    assert up.yaw_offset(7.0) == pytest.approx(2.0 * math.pi - 5.9)
     np.testing.assert_allclose(
         up.at(np.array([1.25]))[0, 0, 2], 0.615
     )  # the past stays what it was
@@ -79,4 +79,4 @@ def test_it_lands_on_no_such_height(up, height):
 def test_what_is_allowed_is_never_faster_than_it_says(up):
     up.go_to(3.0, False, (-2.0, 2.0, 1.2), 3.0, 5.4)
     speed = np.linalg.norm(up.at(np.arange(3.0, 8.4, 0.01))[:, 1], axis=1)
-    assert 0.9 * MOST_SPEED < speed.max() <= MOST_SPEED
+    assert 0.9 * MAX_SPEED < speed.max() <= MAX_SPEED

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_tools.flying.mission import (
+    DESCENT_LEAD,
     DONE,
     FLYING,
     LOST,
-    PULL,
     REFUSED,
     WAITING,
     Circles,
@@ -71,7 +71,7 @@ def test_it_is_up_flies_its_circles_and_sinks(said):
 def test_an_estimate_that_does_not_come_down_is_pulled_down_and_another_is_not(said):
     high = said.until(30.0)[0, 2]
     assert (
-        high == pytest.approx(-PULL) and said.until(31.0)[0, 2] == high
+        high == pytest.approx(-DESCENT_LEAD) and said.until(31.0)[0, 2] == high
     )  # of an estimate of 0: no lower than that
     falling = Said(Mission(Circles(), (1.0, 2.0), 0.03))
     falling.sinks = 0.15
@@ -90,7 +90,7 @@ def test_lost_it_stops_and_sinks_and_goes_on_where_it_was(said):
     before = said.until(12.0)
     wanted = said.until(13.0, deviation=1.6)
     assert said.mission.state == LOST and said.mission.lost == pytest.approx(12.0)
-    assert np.isnan(wanted[0]).all() and wanted[1, 2] == -Rules().sink
+    assert np.isnan(wanted[0]).all() and wanted[1, 2] == -Rules().descent_speed
     assert np.isnan(said.until(14.0, deviation=1.2)[0]).all()  # not yet good enough to go on
     after = said.until(14.01)
     assert said.mission.state == FLYING and said.mission.lost == pytest.approx(12.0)
@@ -106,7 +106,7 @@ def test_lost_it_lands_where_it_is(said):
 
 
 def test_what_never_feels_the_ground_stops_its_rotors_in_the_end(said):
-    said.until(4.0 + 23.0 + Rules().longest_sink - 0.1)
+    said.until(4.0 + 23.0 + Rules().longest_descent - 0.1)
     assert said.mission.state == FLYING
-    said.until(4.0 + 23.0 + Rules().longest_sink + 0.1)
+    said.until(4.0 + 23.0 + Rules().longest_descent + 0.1)
     assert said.mission.state == DONE

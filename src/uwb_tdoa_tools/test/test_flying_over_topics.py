@@ -45,7 +45,7 @@ def topics():
             Imu(none, np.empty((0, 3)), np.empty((0, 3))), Tdoas(none, none, none, none, none), {}
         )
     )
-    made.turned(5.0, np.zeros(STATE))
+    made.publish_truth(5.0, np.zeros(STATE))
     made.status = EstimatorStatus(status=EstimatorStatus.STATUS_RUNNING)
     yield made
     node.destroy_node()
@@ -78,7 +78,7 @@ def hear(topics, *messages):
         return [(frame, rows, None) for frame, rows, _ in wire.read(list(messages), lambda _: None)]
 
     topics._odometry = SimpleNamespace(fetch=fetch)
-    topics.listen()
+    topics.receive()
 
 
 def test_it_is_where_the_odometry_says_with_its_velocity_in_the_world(topics):

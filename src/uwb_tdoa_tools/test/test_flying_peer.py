@@ -61,7 +61,7 @@ def test_it_is_flown_by_and_judged_like_ours(tmp_path):
     """It says that it stands on the floor while it climbs: the vehicle goes up and up."""
     library = built(tmp_path, SOURCE + STATE)
     flown = fly(
-        Task(HALL, seed=2, told="place", peer=str(library), path=Circles(turns=1, turn_time=4.0))
+        Task(HALL, seed=2, given="place", peer=str(library), path=Circles(turns=1, turn_time=4.0))
     )
     place = flown.odometry.p[0]
     assert np.linalg.norm(place - flown.states[0, :3]) < 0.5 and (flown.odometry.p == place).all()
@@ -97,13 +97,13 @@ def test_one_whose_estimate_becomes_no_number_in_flight_is_lost_and_ends_nothing
         Task(
             HALL,
             seed=2,
-            told="place",
+            given="place",
             peer=str(built(tmp_path, SOURCE + ends)),
             path=Circles(turns=1, turn_time=4.0),
         )
     )
     assert (
-        verdict_of(flown)["said_lost"] is not None
+        verdict_of(flown)["reported_lost"] is not None
         and not verdict_of(flown)["landed"]
         and np.isnan(flown.odometry.p[-1]).all()
     )

@@ -7,7 +7,7 @@ import pytest
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_tools.flying.estimates import OurFilter
+from uwb_tdoa_tools.flying.estimates import OwnFilter
 from uwb_tdoa_tools.flying.mission import DONE
 from uwb_tdoa_tools.flying.pilot import Pilot
 from uwb_tdoa_tools.flying.trial import Task, Trial
@@ -26,7 +26,7 @@ PERFECT = replace(
 )
 
 
-class Said(OurFilter):
+class Said(OwnFilter):
     """Says why, and whether it is sure, as the test wants."""
 
     why, unsure = "", False
@@ -64,7 +64,7 @@ def test_up_to_a_place_and_down_twice(flight):
     pilot.land(0, 0.0, 2.0)
     while not trial.over:
         trial.turn()
-    verdict = verdict_of(trial.flown)
+    verdict = verdict_of(trial.result)
     assert verdict["landed"] and verdict["place"] < 0.15 and trial.missions[0].state == DONE
     assert verdict["started"] == pytest.approx(1.0, abs=0.02)
     pilot.take_off(0, 0.5, 2.0)
@@ -108,5 +108,5 @@ def test_lost_it_sinks_and_takes_no_commands(flight):
         pilot.land(0, 0.0, 2.0)
     while not trial.over:
         trial.turn()
-    verdict = verdict_of(trial.flown)
-    assert verdict["said_lost"] == pytest.approx(3.0, abs=0.05) and verdict["safe"]
+    verdict = verdict_of(trial.result)
+    assert verdict["reported_lost"] == pytest.approx(3.0, abs=0.05) and verdict["safe"]

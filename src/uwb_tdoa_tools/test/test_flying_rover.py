@@ -11,7 +11,7 @@ from uwb_tdoa_bias.foundation.flight import Truth
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools.commands.fly import main
 from uwb_tdoa_tools.flying import rover
-from uwb_tdoa_tools.flying.fleet import drawn
+from uwb_tdoa_tools.flying.fleet import drawn_flight
 from uwb_tdoa_tools.flying.mission import DONE, FLYING, LOST, REFUSED, Rules, Waypoints
 from uwb_tdoa_tools.flying.trial import Task
 from uwb_tdoa_tools.flying.verdict import summary, text, verdict_of
@@ -50,7 +50,7 @@ def test_it_arrives_and_the_verdict_is_that_of_its_truth(drives):
 
 
 def test_what_is_drawn_is_wanted_on_the_path(drives):
-    picture = drawn(drives[0], verdict_of(drives[0]))
+    picture = drawn_flight(drives[0], verdict_of(drives[0]))
     wanted = picture.wanted[np.isfinite(picture.wanted).all(axis=1)]
     path = drives[0].missions[0].path
     assert len(wanted) > 100
@@ -97,7 +97,7 @@ def test_it_stands_while_it_is_lost_and_goes_on():
     assert decide(1.5, 0.1, stamp=0.0) == (0.0, 0.0)  # no new estimate
     assert decide(2.0, 0.1) != (0.0, 0.0) and drive.state == FLYING and drive.lost == 1.0
     decide(3.0, 5.0)
-    assert decide(2.0 + rover.GIVE_UP + 0.1, 5.0) == (0.0, 0.0) and drive.state == DONE
+    assert decide(2.0 + rover.LOST_TIMEOUT + 0.1, 5.0) == (0.0, 0.0) and drive.state == DONE
 
 
 def test_it_refuses_to_start_where_it_does_not_know_where_it_is():

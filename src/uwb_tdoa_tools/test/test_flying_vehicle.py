@@ -12,9 +12,9 @@ def flown(vehicle, state, speeds, seconds, wind=STILL):
     """The state after so many seconds with constant commands, and the largest number of feet that
     touched the ground.
     """
-    state, scratch, numbers = np.array(state), np.empty((2, 17)), vehicle.numbers()
+    state, scratch, record = np.array(state), np.empty((2, 17)), vehicle.record()
     feet = max(
-        step(state, np.asarray(speeds, float), wind, STEP, numbers, scratch)
+        step(state, np.asarray(speeds, float), wind, STEP, record, scratch)
         for _ in range(round(seconds / STEP))
     )
     return state, feet

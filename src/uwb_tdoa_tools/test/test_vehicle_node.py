@@ -92,7 +92,7 @@ def test_it_flies_by_services_beside_two_busy_processes(tmp_path, load):  # noqa
         flown.wait(lambda: flown.verdicts, "the verdict")
     (verdict,) = flown.verdicts
     assert verdict["landed"], verdict["why"]
-    assert verdict["said_lost"] is None and verdict["phases"]["air"]["rmse"] < 0.3
+    assert verdict["reported_lost"] is None and verdict["phases"]["air"]["rmse"] < 0.3
 
 
 @pytest.mark.slow

@@ -24,11 +24,11 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 # in the bag's custom data: CRC-32 of its data file, 8 hexadecimal digits
-SUM_KEY = "uwb_tdoa_tools.crc32"
-NO_SUM = "--------"
+CHECKSUM_KEY = "uwb_tdoa_tools.crc32"
+NO_CHECKSUM = "--------"
 _BLOCK = 1 << 20  # bytes that are read at once
 _STEPS = 20_000  # instructions of SQLite from one look at the time to the next: some milliseconds
-_PLAIN = re.compile(
+_PLAIN_SCHEMA = re.compile(
     r"CREATE\s+(TABLE|INDEX)\s[^()]*\([\w\s,\"'`\[\]]*\)\s*", re.IGNORECASE
 )  # no bracket within: nothing is computed
 sqlite3.enable_callback_tracebacks(
@@ -52,15 +52,15 @@ def check(path: str | Path) -> None:
     if not path.is_dir():
         return _check_data(path)
     information = metadata(path)
-    stored = information["custom_data"].get(SUM_KEY, NO_SUM)
+    stored = information["custom_data"].get(CHECKSUM_KEY, NO_CHECKSUM)
     for file in data_files(path, information):
         if not file.is_file():
             raise Damaged(f"{file.name} is missing")
-        if stored != NO_SUM and _sum(file) != stored:
+        if stored != NO_CHECKSUM and _checksum(file) != stored:
             raise Damaged(
-                f"the checksum of {file.name} in metadata.yaml is {stored}, but it has {_sum(file)}"
+                f"the checksum of {file.name} in metadata.yaml is {stored}, but it has {_checksum(file)}"
             )
-        if not is_packed(information):
+        if not is_compressed(information):
             _check_data(file, packed_messages=information["compression_mode"] == "message")
 
 
@@ -69,12 +69,12 @@ def data_files(path: Path, information: dict[str, Any]) -> list[Path]:
     return [path / Path(name).name for name in information["relative_file_paths"]]
 
 
-def is_packed(information: dict[str, Any]) -> bool:
+def is_compressed(information: dict[str, Any]) -> bool:
     """Whether rosbag2 has compressed the data files as a whole."""
     return information["compression_mode"] == "file"
 
 
-def unpack(path: Path, folder: Path) -> None:
+def decompress(path: Path, folder: Path) -> None:
     """Write a bag whose files are compressed as a whole to an empty folder, unpacked.
 
     Raises Damaged, InputError.
@@ -98,7 +98,7 @@ def unpack(path: Path, folder: Path) -> None:
         "compression_format": "",
         "files": [],
     }
-    information["custom_data"].pop(SUM_KEY, None)
+    information["custom_data"].pop(CHECKSUM_KEY, None)
     content = yaml.safe_dump({"rosbag2_bagfile_information": information}, sort_keys=False)
     write_text(folder / "metadata.yaml", content)
 
@@ -149,17 +149,19 @@ def metadata(path: Path) -> dict[str, Any]:
     return information
 
 
-def seal(path: str | Path) -> None:
+def write_checksums(path: str | Path) -> None:
     """Put the checksums of a bag that rosbags has just written in their places.
 
     It must hold SUM_KEY: NO_SUM.
     """
     (data,) = (file for file in Path(path).iterdir() if file.name != "metadata.yaml")
     if data.suffix == ".mcap":
-        mcap.set_sums(data)
+        mcap.fill_checksums(data)
     file = Path(path) / "metadata.yaml"
     text = file.read_text(encoding="utf-8")
-    sealed = re.sub(rf"({re.escape(SUM_KEY)}: *['\"]?){NO_SUM}", rf"\g<1>{_sum(data)}", text)
+    sealed = re.sub(
+        rf"({re.escape(CHECKSUM_KEY)}: *['\"]?){NO_CHECKSUM}", rf"\g<1>{_checksum(data)}", text
+    )
     assert sealed != text
     write_text(file, sealed)
 
@@ -181,11 +183,11 @@ def open_sqlite(file: str | Path) -> sqlite3.Connection:
         for name, text in connection.execute(
             "SELECT name, sql FROM sqlite_master WHERE sql IS NOT NULL"
         ):
-            if not _PLAIN.fullmatch(text):
+            if not _PLAIN_SCHEMA.fullmatch(text):
                 raise Damaged(f"{name} in it is no table and no index of columns")
         return connection
     except (sqlite3.Error, UnicodeDecodeError, TypeError) as error:
-        raise damage(error) from error
+        raise as_damaged(error) from error
 
 
 def is_mcap(file: Path) -> bool:
@@ -197,7 +199,9 @@ def is_mcap(file: Path) -> bool:
 def _check_data(file: Path, packed_messages: bool = False) -> None:
     if is_mcap(file):
         mcap.check(file)
-        contents = (content[22:] for kind, content in mcap.sound(file) if kind == mcap.MESSAGE)
+        contents = (
+            content[22:] for kind, content in mcap.intact_records(file) if kind == mcap.MESSAGE
+        )
     else:
         _check_sqlite(file)
         contents = (data for _, _, _, data in sqlite_messages(file))
@@ -235,7 +239,7 @@ def sqlite_messages(file: Path) -> Iterator[tuple[int, int, int, bytes]]:
             yield row
             budget.restart()  # what was done with it is no affair of the file
     except (sqlite3.Error, UnicodeDecodeError, TypeError) as error:
-        raise damage(error) from error
+        raise as_damaged(error) from error
     finally:
         connection.close()
 
@@ -261,12 +265,12 @@ def _check_sqlite(file: Path) -> None:
                     "way round, or are too long"
                 )
     except (sqlite3.Error, UnicodeDecodeError) as error:
-        raise damage(error) from error
+        raise as_damaged(error) from error
     finally:
         connection.close()
 
 
-def damage(error: Exception) -> Damaged:
+def as_damaged(error: Exception) -> Damaged:
     """Of an error of SQLite, which calls a query whose time is up interrupted."""
     return Damaged(
         "it takes longer to read than a file of its size may"
@@ -275,7 +279,7 @@ def damage(error: Exception) -> Damaged:
     )
 
 
-def _sum(file: Path) -> str:
+def _checksum(file: Path) -> str:
     total = 0
     with file.open("rb") as opened:
         while block := opened.read(_BLOCK):

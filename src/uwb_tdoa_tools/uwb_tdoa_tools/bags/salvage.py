@@ -116,7 +116,7 @@ def _added(path: Path, connection: Connection, writer: Writer) -> Connection | N
 
 def _from_mcap(file: Path, lost: Counter[str]) -> Iterator[tuple[Connection, int, bytes]]:
     schemas, channels = {}, {}
-    for kind, content in mcap.sound(file):
+    for kind, content in mcap.intact_records(file):
         if kind == mcap.CHUNK:
             lost["chunks"] += 1
             continue
@@ -148,7 +148,7 @@ def _from_sqlite(file: Path, lost: Counter[str]) -> Iterator[tuple[Connection, i
                 number, str(topic), str(msgtype), *definitions.get(msgtype, ("", ""))
             )
     except (sqlite3.Error, UnicodeDecodeError) as error:
-        raise integrity.damage(error) from error
+        raise integrity.as_damaged(error) from error
     finally:
         connection.close()
     for _, topic, stamp, data in integrity.sqlite_messages(file):

@@ -28,7 +28,7 @@ def unclosed(path: Path) -> list[Path]:
     return [file for file in files if _left(file)]
 
 
-def closed(path: Path, folder: Path) -> Path:
+def merged_copy(path: Path, folder: Path) -> Path:
     """Copy a bag to a folder, merge its logs into the copy, and return the path of the copy.
 
     path : a bag with `unclosed` files, which stays as it is. Raises Damaged.

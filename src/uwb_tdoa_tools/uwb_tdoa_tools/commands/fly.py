@@ -220,10 +220,10 @@ def _fly(args: argparse.Namespace) -> int:
         for seed in seeds
     ]
     verdicts, pictures = [], []
-    with fleet.kept(
+    with fleet.verdict_store(
         args.resume, asked_of(args, NO_MATTER, ("config", "effects", "model", "peer"))
     ) as done:
-        for verdict, picture in fleet.flown(
+        for verdict, picture in fleet.fly_all(
             tasks, done, args.record, args.plot is not None, args.jobs, args.dask
         ):
             verdicts.append(verdict)

@@ -39,7 +39,7 @@ def debiased(odometry: Odometry, bias_map: BiasMap) -> Odometry:
     return replace(odometry, p=p, covariance=covariance)
 
 
-def fly(
+def estimate_flight(
     flight: Flight,
     config: FilterConfig | None = None,
     effects: EffectSet | None = None,
@@ -76,10 +76,10 @@ class PositionEstimator:
     align: str = NONE
 
     def __call__(self, recording: tuple[Path, str | Path | None]) -> Scored:
-        return fly(self.reading.read(recording), self.config, self.effects, self.align)
+        return estimate_flight(self.reading.read(recording), self.config, self.effects, self.align)
 
 
-def of_its_anchors(flown: Iterable[Scored], bias_map: BiasMap) -> Iterator[Scored]:
+def require_anchors(flown: Iterable[Scored], bias_map: BiasMap) -> Iterator[Scored]:
     """Yield what `fly` gave; raises InputError for a flight among other anchors than those of a
     BiasMap.
     """
@@ -107,9 +107,9 @@ SMALLEST_GAIN = 0.01  # of the 3D RMSE: less is neither gain nor harm
 _RUN = ("rmse_x", "rmse_y", "rmse_z", "rmse_3d", "max_3d", "nees_mean")
 
 
-def about(bias_map: BiasMap) -> str:
+def map_summary(bias_map: BiasMap) -> str:
     """One line on a BiasMap."""
-    figures = about_figures(bias_map)
+    figures = map_figures(bias_map)
     added = ", ".join(f"{std:.3f}" for std in figures["added_std"])
     return (
         f"{figures['markers']} markers {figures['step']:g} m apart, "
@@ -118,7 +118,7 @@ def about(bias_map: BiasMap) -> str:
     )
 
 
-def about_figures(bias_map: BiasMap) -> dict[str, Any]:
+def map_figures(bias_map: BiasMap) -> dict[str, Any]:
     """The same for JSON."""
     return {
         "markers": len(bias_map.at),
@@ -133,7 +133,7 @@ def about_figures(bias_map: BiasMap) -> dict[str, Any]:
     }
 
 
-def rows(
+def comparison_rows(
     flown: Iterable[Scored], bias_map: BiasMap, effects: EffectSet | None = None
 ) -> list[dict[str, Any]]:
     """[{"flight", "before": figures, "after": figures, "known"}] of what `fly` gave. known : share
@@ -155,7 +155,7 @@ def rows(
     return out
 
 
-def say_rows(title: str, found: Sequence[Mapping[str, Any]]) -> None:
+def print_rows(title: str, found: Sequence[Mapping[str, Any]]) -> None:
     """Print rows, and their mean."""
     if not found:
         return
@@ -177,7 +177,7 @@ def say_rows(title: str, found: Sequence[Mapping[str, Any]]) -> None:
     )
 
 
-def gain_of(found: Sequence[Mapping[str, Any]]) -> float:
+def mean_gain(found: Sequence[Mapping[str, Any]]) -> float:
     """The `gain` of rows, of their mean 3D RMSE."""
     return gain(
         *(float(np.mean([row[side]["rmse_3d"] for row in found])) for side in ("before", "after"))

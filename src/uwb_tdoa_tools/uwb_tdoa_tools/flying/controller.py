@@ -22,7 +22,7 @@ from .vehicle import CORNERS, GRAVITY, ROTORS, SPIN, Vehicle
 if TYPE_CHECKING:
     from .vehicle import Record
 
-FELT = 0.1  # s over which the accelerometer tells what carries the vehicle
+SUPPORT_TIME = 0.1  # s over which the accelerometer tells what carries the vehicle
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Gains:
     most_thrust: float = 1.8
 
 
-NUMBERS = np.dtype([(field.name, float) for field in fields(Gains)], align=True)
+RECORD = np.dtype([(field.name, float) for field in fields(Gains)], align=True)
 
 
 class Controller:
@@ -63,7 +63,7 @@ class Controller:
     def __init__(self, gains: Gains | None = None, vehicle: Vehicle | None = None) -> None:
         """gains : Gains; vehicle : Vehicle, as far as the controller knows it."""
         self.gains, self.vehicle = gains or Gains(), vehicle or Vehicle()
-        self.numbers = np.array([tuple(asdict(self.gains).values())], NUMBERS)[0]
+        self.record = np.array([tuple(asdict(self.gains).values())], RECORD)[0]
         self.weight = self.vehicle.mass * GRAVITY
         self.rates, self.integral = np.zeros(3), np.zeros(3)
         self.thrust = self.lift = 0.0
@@ -75,11 +75,11 @@ class Controller:
         position, velocity and acceleration, NaN in the position where only the velocity counts; yaw
         : rad; dt : s since the last call.
         """
-        self.lift += min(1.0, dt / (self.vehicle.motor_time + 0.5 * FELT)) * (
+        self.lift += min(1.0, dt / (self.vehicle.motor_time + 0.5 * SUPPORT_TIME)) * (
             self.thrust - self.lift
         )
         self.thrust = outer(
-            (p, v, q), wanted, yaw, dt, (self.weight, self.numbers), self.integral, self.rates
+            (p, v, q), wanted, yaw, dt, (self.weight, self.record), self.integral, self.rates
         )
 
     def support(self, force: float) -> float:
@@ -190,7 +190,7 @@ def inner(
 
 
 @compiled
-def turned(q: np.ndarray, rate: np.ndarray, dt: float) -> None:
+def rotate_attitude(q: np.ndarray, rate: np.ndarray, dt: float) -> None:
     """Turn the attitude q (4,) x y z w by a body rate (3,) rad/s for dt, s, in place."""
     angle = math.sqrt(rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2) * dt
     share = 0.5 * dt if angle < 1e-9 else math.sin(0.5 * angle) / angle * dt

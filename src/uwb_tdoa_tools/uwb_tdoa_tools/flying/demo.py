@@ -43,7 +43,7 @@ class DemoFlight:
     flight: Flight
     effects_file: str | Path | None
     model: str | None
-    became: str = ""
+    outcome: str = ""
 
     def corrector(self) -> Corrector | None:
         """Corrector of the flight, or None if nothing corrects it. Raises InputError."""
@@ -110,7 +110,7 @@ class DemoResult:
     corrects.
     """
 
-    became: dict[str, int]
+    outcome: dict[str, int]
     scores: list[Score]
     nodes: RecordedOdometry
     without_ros: Run

@@ -149,7 +149,7 @@ def _pointer(array: np.ndarray) -> ctypes.c_void_p:
 pass
 
 
-NOTHING = Odometry(
+NO_ODOMETRY = Odometry(
     np.empty(0),
     np.empty((0, 3)),
     np.empty((0, 3)),
@@ -190,7 +190,7 @@ class EstimateSource(Protocol):
         """All that came out."""
 
 
-class OurFilter:
+class OwnFilter:
     """`Corrector` and `Estimator`, as in bias_node and ekf_node, behind the calls that a flight
     needs: an EstimateSource. estimator : Estimator; newest : Odometry, the last that came out, or
     None.
@@ -215,7 +215,7 @@ class OurFilter:
             Corrector(anchors, effects, network),
         )
         self.estimator = Estimator(anchors, config, effects=effects)
-        self._parts = [NOTHING]
+        self._parts = [NO_ODOMETRY]
         self.newest: Odometry | None = None
 
     def set_pose(self, t: float, p: np.ndarray, std: float, yaw: float) -> None:
@@ -277,7 +277,7 @@ class OurFilter:
         return concatenated(self._parts)
 
 
-class TheirFilter:
+class PeerFilter:
     """A Peer behind the same calls.
 
     It gets place and yaw at the start, knows no effects, and says nothing of its covariance.
@@ -317,7 +317,7 @@ class TheirFilter:
     def odometry(self) -> Odometry:
         """Odometry, all that came out; covariances NaN."""
         if not self._states:
-            return NOTHING
+            return NO_ODOMETRY
         t, p, v, q = map(np.array, zip(*self._states))
         return Odometry(
             t,

@@ -36,7 +36,7 @@ SPACING = 0.05  # s
 
 
 @dataclass(frozen=True)
-class Drawn:
+class DrawnFlight:
     """What is drawn of a flight: t (n,) s, p (n, 3) m, the truth; wanted (n, 3) m, NaN where
     nothing was; error and sigma (k, 3) m of the estimate at stamps (k,) s; verdict : as of
     `verdict_of`.
@@ -51,14 +51,14 @@ class Drawn:
     verdict: dict[str, Any]
 
 
-def drawn(flown: TrialResult, verdict: dict[str, Any]) -> Drawn:
+def drawn_flight(fly_all: TrialResult, verdict: dict[str, Any]) -> DrawnFlight:
     """Drawn, of a TrialResult."""
-    assert flown.flight.truth is not None
-    truth, odometry = flown.flight.truth, flown.odometry
+    assert fly_all.flight.truth is not None
+    truth, odometry = fly_all.flight.truth, fly_all.odometry
     every = max(1, round(SPACING / (truth.t[1] - truth.t[0])))
     t, p = truth.t[::every], truth.p[::every]
     wanted = np.full(p.shape, np.nan)
-    for mission in (mission for mission in flown.missions if mission.started is not None):
+    for mission in (mission for mission in fly_all.missions if mission.started is not None):
         inside = (t >= mission.started) & (t <= (mission.ended or np.inf))
         wanted[inside] = mission.wanted(t[inside])[:, 0]
     rows: np.ndarray = np.empty(0, int)
@@ -69,10 +69,10 @@ def drawn(flown: TrialResult, verdict: dict[str, Any]) -> Drawn:
     stamps = odometry.t[rows]
     error = odometry.p[rows] - position_at(stamps, truth)
     sigma = np.sqrt(np.einsum("nii->ni", odometry.covariance[rows, :3, :3]))
-    return Drawn(t, p, wanted, stamps, error, sigma, verdict)
+    return DrawnFlight(t, p, wanted, stamps, error, sigma, verdict)
 
 
-def plot(flights: Sequence[Drawn], anchors: Anchors, path: str | Path) -> None:
+def plot(flights: Sequence[DrawnFlight], anchors: Anchors, path: str | Path) -> None:
     """Draw [Drawn] among Anchors to an image file: a map and the heights of all, and the errors of
     the worst.
     """
@@ -91,7 +91,7 @@ def plot(flights: Sequence[Drawn], anchors: Anchors, path: str | Path) -> None:
         height.plot(one.t, one.p[:, 2], color=colour, linewidth=0.7, alpha=0.6)
     above.set(xlabel="x, m", ylabel="y, m", aspect="equal")
     height.set(xlabel="t, s", ylabel="z, m")
-    worst = max(flights, key=_badness)
+    worst = max(flights, key=_error_key)
     right.suptitle(f"seed {worst.verdict['seed']}: {worst.verdict['why'] or goal}")
     for k, (axes, axis) in enumerate(zip(right.subplots(3, 1, sharex=True), "xyz")):
         axes.plot(worst.t, worst.wanted[:, k] - worst.p[:, k], "0.6", label="wanted - true")
@@ -109,14 +109,16 @@ def plot(flights: Sequence[Drawn], anchors: Anchors, path: str | Path) -> None:
     write_filled(path, partial(figure.savefig, dpi=120))
 
 
-def _badness(one: Drawn) -> tuple[bool, float]:
+def _error_key(one: DrawnFlight) -> tuple[bool, float]:
     return not reached(one.verdict), one.verdict["tracking"] or 0.0
 
 
 pass
 
 
-def kept(path: str | Path | None, asked: dict[str, Any]) -> AbstractContextManager[Verdicts]:
+def verdict_store(
+    path: str | Path | None, asked: dict[str, Any]
+) -> AbstractContextManager[Verdicts]:
     """Context of a ResultsFile, or of a dict where path is None. asked : as of ResultsFile.
 
     Raises InputError.
@@ -124,14 +126,14 @@ def kept(path: str | Path | None, asked: dict[str, Any]) -> AbstractContextManag
     return nullcontext({}) if path is None else ResultsFile(path, asked)
 
 
-def flown(
+def fly_all(
     tasks: Sequence[Task],
     done: Verdicts,
     record: str | Path | None = None,
     draw: bool = False,
     jobs: int | None = None,
     dask: str | None = None,
-) -> Iterator[tuple[dict[str, Any], Drawn | None]]:
+) -> Iterator[tuple[dict[str, Any], DrawnFlight | None]]:
     """Generator of (verdict, Drawn or None), of Tasks in turn; those that are in `done`, by their
     seeds, are not flown again.
 
@@ -139,27 +141,27 @@ def flown(
         `parallel.over`.
     """
     missing = [task for task in tasks if str(task.seed) not in done]
-    made = parallel.over(partial(fly_one, record, draw), missing, jobs, dask)
+    made = parallel.over(partial(fly_task, record, draw), missing, jobs, dask)
     for task in tasks:
         key, picture = str(task.seed), None
         if key not in done:
             done[key], picture = next(made)
-        yield (done.read(key, _sound) if isinstance(done, ResultsFile) else done[key]), picture
+        yield (done.read(key, _validated) if isinstance(done, ResultsFile) else done[key]), picture
     next(made, None)  # to its end, so that its processes are kept
 
 
-def _sound(verdict: dict[str, Any]) -> dict[str, Any]:
+def _validated(verdict: dict[str, Any]) -> dict[str, Any]:
     """A verdict that a file holds, of which a summary can be made."""
     text(summary([verdict]))
     return verdict
 
 
-def fly_one(
+def fly_task(
     record: str | Path | None, draw: bool, task: Task
-) -> tuple[dict[str, Any], Drawn | None]:
+) -> tuple[dict[str, Any], DrawnFlight | None]:
     """(verdict, Drawn or None) of a Task that is flown; record, draw : as of `flown`."""
     one = drive(task) if task.vehicle == "rover" else fly(task)
     verdict = verdict_of(one)
     if record is not None:
         write_bag(one.flight, Path(record) / one.flight.name, "mcap", False)
-    return verdict, drawn(one, verdict) if draw else None
+    return verdict, drawn_flight(one, verdict) if draw else None

@@ -146,14 +146,14 @@ class ReferenceTrajectory:
     def at(self, t: np.ndarray) -> np.ndarray:
         """At t (n,) s; (n, 3, 3)."""
         out = self._grid[np.clip(np.rint(t / FINE).astype(int), 0, len(self._grid) - 1)]
-        return sinking(out, t > self.duration)
+        return with_descent(out, t > self.duration)
 
-    def turned(self, t: float) -> float:
+    def yaw_offset(self, t: float) -> float:
         """rad by which it is to be turned t s after the start."""
         return self._turning * t
 
 
-def sinking(wanted: np.ndarray, after: np.ndarray) -> np.ndarray:
+def with_descent(wanted: np.ndarray, after: np.ndarray) -> np.ndarray:
     """Of what is wanted, (n, 3, 3), have it sink where `after`, (n,) bool."""
     wanted[after, 0, 2] = (
         np.nan
@@ -195,13 +195,13 @@ class Rules:
     arm: float = 1.0
     lost: float = 1.5
     stale: float = 0.6
-    sink: float = 0.25
-    carried: float = 0.09
+    descent_speed: float = 0.25
+    ground_support: float = 0.09
     near_end: float = 1.5
-    longest_sink: float = 10.0
+    longest_descent: float = 10.0
 
 
-class Way(Protocol):
+class TimedPath(Protocol):
     """What is to be flown from where a vehicle stands, by s since its rotors started."""
 
     duration: float  # s, until it begins to sink
@@ -213,22 +213,22 @@ class Way(Protocol):
     def at(self, t: np.ndarray) -> np.ndarray:
         """Position, velocity and acceleration wanted, (n, 3, 3), m and s, at t (n,) s."""
 
-    def turned(self, t: float) -> float:
+    def yaw_offset(self, t: float) -> float:
         """rad by which it is to be turned at t, s."""
 
 
-class Route(Protocol):
+class Plan(Protocol):
     """What is to be flown, wherever it begins."""
 
-    def along(self, place: np.ndarray, ground: float) -> Way:
+    def along(self, place: np.ndarray, ground: float) -> TimedPath:
         """The Way from `place` (2,) m; ground : m, height at which the body stands."""
 
 
 # m, most by which the height that is wanted while it comes down is below the estimated height
-PULL = 0.15
+DESCENT_LEAD = 0.15
 # s over which it learns what support it feels in the air, where there is none: its accelerometer
 # has an offset
-USUAL = 2.0
+SUPPORT_OFFSET_TIME = 2.0
 
 
 class Mission:
@@ -240,7 +240,7 @@ class Mission:
 
     def __init__(
         self,
-        path: Route,
+        path: Plan,
         place: np.ndarray,
         ground: float,
         rules: Rules | None = None,
@@ -259,7 +259,7 @@ class Mission:
         self.ended: float | None = None
         self.lost: float | None = None
         self.yaw = self._first_yaw = 0.0
-        self._usual = 0.0  # support, of the weight
+        self._support_offset = 0.0  # support, of the weight
         self._descent: tuple[float, float] | None = (
             None  # (s, m) where it began to come down on whatever is there
         )
@@ -275,7 +275,7 @@ class Mission:
         good = pose is not None and t - pose[0] <= rules.stale
         if self.state == WAITING and t >= self.begin + rules.rest:
             if pose is not None and good and deviation <= rules.arm:
-                self.state, self.started, self._last, self._sinking = FLYING, t, t, t
+                self.state, self.started, self._last, self._descent_began = FLYING, t, t, t
                 self._first_yaw = yaw_of(pose[3])
             elif t >= self.begin + rules.rest + rules.patience:
                 self.state = REFUSED
@@ -283,29 +283,32 @@ class Mission:
             return None
         if not good or deviation > rules.lost:
             self.lost = t if self.lost is None else self.lost
-            self._sinking = t if self.state != LOST else self._sinking
+            self._descent_began = t if self.state != LOST else self._descent_began
             self.state = LOST
         elif self.state == LOST and good and deviation <= rules.arm:
             self.state = FLYING
         along = self.along + (0.0 if self.state == LOST else t - self._last)
         self._clock.append((t, along))
         if self.state != LOST and along < self._path.duration - rules.near_end:
-            self._usual += min(1.0, (t - self._last) / USUAL) * (support - self._usual)
+            self._support_offset += min(1.0, (t - self._last) / SUPPORT_OFFSET_TIME) * (
+                support - self._support_offset
+            )
         self._last = t
         near_end = self.state == LOST or along > self._path.duration - rules.near_end
         if near_end and (
-            support - self._usual > rules.carried or t - self._sinking > rules.longest_sink
+            support - self._support_offset > rules.ground_support
+            or t - self._descent_began > rules.longest_descent
         ):
             self.state, self.ended = DONE, t
             return None
         if self.state != LOST:
             assert pose is not None  # or it would be lost
-            self._sinking = t if along < self._path.duration else self._sinking
-            self.yaw = self._first_yaw + self._path.turned(along)
+            self._descent_began = t if along < self._path.duration else self._descent_began
+            self.yaw = self._first_yaw + self._path.yaw_offset(along)
             wanted = self._path.at(np.array([along]))[0]
             return self._descend(t, wanted, pose[1][2]) if math.isnan(wanted[0, 2]) else wanted
         wanted = np.zeros((3, 3))
-        wanted[0], wanted[1, 2] = math.nan, -rules.sink
+        wanted[0], wanted[1, 2] = math.nan, -rules.descent_speed
         return wanted
 
     def _descend(self, t: float, wanted: np.ndarray, height: float) -> np.ndarray:
@@ -314,7 +317,9 @@ class Mission:
         keep it in the air.
         """
         begun, first = self._descent = self._descent or (t, height)
-        wanted[0, 2] = min(height, max(first + 0.5 * wanted[1, 2] * (t - begun), height - PULL))
+        wanted[0, 2] = min(
+            height, max(first + 0.5 * wanted[1, 2] * (t - begun), height - DESCENT_LEAD)
+        )
         return wanted
 
     @property

@@ -32,7 +32,7 @@ from uwb_tdoa_ekf.results import Odometry
 from uwb_tdoa_msgs.msg import EstimatorStatus, Tdoa
 
 from ..bags.messages import BODY_FRAME
-from .estimates import NOTHING
+from .estimates import NO_ODOMETRY
 from .simulator import DT
 from .vehicle import ATTITUDE, POSITION
 
@@ -100,8 +100,10 @@ class Lockstep:
             stream: part.t[-1] for stream, part in measured.streams.items() if len(part.t)
         }
         self._first = now if self._first is None else self._first
-        settled = 0.0 if now > self._first + TRIAL + UNTRUSTED else UNTRUSTED
-        self._reach = max(min(self._newest.values(), default=now), now - LONGEST_GAP) - settled
+        unordered_wait = 0.0 if now > self._first + TRIAL + UNTRUSTED else UNTRUSTED
+        self._reach = (
+            max(min(self._newest.values(), default=now), now - LONGEST_GAP) - unordered_wait
+        )
         self._since = self._clock()
 
     def heard(self, t: float) -> None:
@@ -168,7 +170,7 @@ class OverTopics:
         self._truth = _Output(node, *STREAMS["truth"], frame=self._anchors.frame)
         self._clock = node.create_publisher(Clock, "/clock", 10) if clock else None
         self._pose = node.create_publisher(PoseWithCovarianceStamped, "initialpose", OUTPUT_QOS)
-        self._wire = CdrCodec(OdometryMessage, "pose", "twist")
+        self._odometry_codec = CdrCodec(OdometryMessage, "pose", "twist")
         self._odometry = StreamInput(node, OdometryMessage, "odometry")
         self._status = Input(node, EstimatorStatus, "status", self._on_status, ANCHORS_QOS)
         anchors = anchors_to_message(self._anchors)
@@ -182,7 +184,7 @@ class OverTopics:
         # (t s, p, v, q, covariance (3, 3)) of each odometry
         self._rows: list[tuple[float, np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
 
-    def heard(self) -> bool:
+    def is_connected(self) -> bool:
         """Whether somebody listens to what is measured, and says what comes of it."""
         ends = [output.subscribers for output in (self._outputs["imu"], self._outputs["tdoa"])]
         return all(ends) and bool(self._odometry.get_publisher_count())
@@ -206,7 +208,7 @@ class OverTopics:
         for name, part in measured.streams.items():
             self._outputs[name].publish(*self._parts(part.t), part)
 
-    def turned(self, t: float, state: np.ndarray) -> None:
+    def publish_truth(self, t: float, state: np.ndarray) -> None:
         """Publish what is true at t, s, up to which everything was published: state (17,), as of
         `vehicle`; and on /clock the time.
         """
@@ -219,9 +221,9 @@ class OverTopics:
             self._clock.publish(Clock(clock=self._stamp(t)))
         self._pace.sent(t, self._measured)
 
-    def listen(self) -> None:
+    def receive(self) -> None:
         """Take the odometry that has come."""
-        for frame, rows, _ in self._odometry.fetch(self._wire):
+        for frame, rows, _ in self._odometry.fetch(self._odometry_codec):
             if self._begin is None:  # nothing was measured yet: whose odometry is that?
                 continue
             t = 1e-9 * (rows["sec"].astype(np.int64) * 10**9 + rows["nanosec"] - self._begin)
@@ -231,14 +233,14 @@ class OverTopics:
                 & (frame == self._anchors.frame)
             )
             for k in np.flatnonzero(usable & (t <= self._now)):
-                self._hear(t[k], rows["pose"][k], rows["twist"][k])
+                self._add_odometry(t[k], rows["pose"][k], rows["twist"][k])
 
-    def _hear(self, t: float, pose: np.ndarray, twist: np.ndarray) -> None:
+    def _add_odometry(self, t: float, pose: np.ndarray, twist: np.ndarray) -> None:
         p, q, covariance = pose[:3].copy(), pose[3:7].copy(), pose[7:].reshape(6, 6)[:3, :3].copy()
         length = np.linalg.norm(q)
-        sound = length > 0.5 and (np.diag(covariance) >= 0.0).all()
+        valid = length > 0.5 and (np.diag(covariance) >= 0.0).all()
         near = np.abs(p).max() < FARTHEST and np.abs(twist[:3]).max() < FASTEST
-        if not (sound and near) or (self._rows and t < self._rows[-1][0] + CLOSEST):
+        if not (valid and near) or (self._rows and t < self._rows[-1][0] + CLOSEST):
             return
         q /= length
         self._rows.append((float(t), p, Rotation.from_quat(q).apply(twist[:3]), q, covariance))
@@ -290,7 +292,7 @@ class OverTopics:
     def odometry(self) -> Odometry:
         """Odometry, all that came; of its covariance only that of the position, the rest 0."""
         if not self._rows:
-            return NOTHING
+            return NO_ODOMETRY
         t, p, v, q, covariance = map(np.array, zip(*self._rows))
         whole = np.zeros((len(t), 9, 9))
         whole[:, :3, :3] = covariance

@@ -14,7 +14,7 @@ from scipy.interpolate import BPoly
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
-from .mission import FLYING, LOST, SETTLE, sinking, yaw_of
+from .mission import FLYING, LOST, SETTLE, with_descent, yaw_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -23,18 +23,18 @@ if TYPE_CHECKING:
     from .trial import Trial
 
 
-MOST_SPEED, MOST_ACCELERATION = 1.5, 1.2  # m/s and m/s^2, on the way to a goal
+MAX_SPEED, MAX_ACCELERATION = 1.5, 1.2  # m/s and m/s^2, on the way to a goal
 PEAK_SPEED, PEAK_ACCELERATION = (
     15.0 / 8.0,
     10.0 / math.sqrt(3.0),
 )  # of a way of 1 m in 1 s, from rest to rest
-MOST_TURN = 1.5  # rad/s
+MAX_YAW_RATE = 1.5  # rad/s
 LONGEST = 600.0  # s
 HIGHEST = 1.0  # m, of what it lands on: from higher up it would sink for too long
 STILL = np.zeros(4)
 
 
-class Commanded:
+class CommandedPath:
     """A Reference that grows by commands, each from where the last one has it by then. duration : s
     since the start, inf before it is to land. Commands raise InputError, with why it does not do
     that.
@@ -48,7 +48,7 @@ class Commanded:
         self._goal = np.array([*p, yaw])
         self._begins, self._ways = [0.0], [_way((self._goal, STILL, STILL), self._goal, 1.0)]
 
-    def along(self, place: np.ndarray, ground: float) -> Commanded:
+    def along(self, place: np.ndarray, ground: float) -> CommandedPath:
         """Itself, as it knows where it begins."""
         return self
 
@@ -92,9 +92,9 @@ class Commanded:
 
     def at(self, t: np.ndarray) -> np.ndarray:
         """Position, velocity and acceleration (n, 3, 3), m and s, at t (n,) s since the start."""
-        return sinking(np.stack([self._at(one)[:, :3] for one in t]), t > self.duration)
+        return with_descent(np.stack([self._at(one)[:, :3] for one in t]), t > self.duration)
 
-    def turned(self, t: float) -> float:
+    def yaw_offset(self, t: float) -> float:
         """rad by which it is to be turned at t, s."""
         return float(self._at(t)[0, 3]) - self._first_yaw
 
@@ -128,9 +128,9 @@ class Commanded:
         goal[3] = p[3] + math.remainder(goal[3] - p[3], 2.0 * math.pi)  # the shorter way around
         far = float(np.linalg.norm(goal[:3] - p[:3]))
         needed = max(
-            PEAK_SPEED * far / MOST_SPEED,
-            math.sqrt(PEAK_ACCELERATION * far / MOST_ACCELERATION),
-            PEAK_SPEED * abs(goal[3] - p[3]) / MOST_TURN,
+            PEAK_SPEED * far / MAX_SPEED,
+            math.sqrt(PEAK_ACCELERATION * far / MAX_ACCELERATION),
+            PEAK_SPEED * abs(goal[3] - p[3]) / MAX_YAW_RATE,
         )
         if seconds < needed:
             raise InputError(
@@ -166,7 +166,7 @@ class Pilot:
     def __init__(self, trial: Trial) -> None:
         """trial : Trial."""
         self._trial = trial
-        self._path: Commanded | None = None
+        self._path: CommandedPath | None = None
 
     @property
     def _mission(self) -> Mission | None:
@@ -188,7 +188,7 @@ class Pilot:
                 "it does not know where it is: "
                 f"{source.why or f'to {source.deviation:.1f} m, where {rules.arm:g} m is wanted'}."
             )
-        path = Commanded(pose[1], yaw_of(pose[3]), self._trial.task.world.size)
+        path = CommandedPath(pose[1], yaw_of(pose[3]), self._trial.task.world.size)
         path.take_off(height, seconds)
         self._path = path
         self._trial.begin(path, replace(rules, rest=0.0, patience=0.0))
@@ -205,7 +205,7 @@ class Pilot:
         mission, path = self._in_air(group_mask)
         path.land(mission.along, height, seconds)
 
-    def _in_air(self, group_mask: int) -> tuple[Mission, Commanded]:
+    def _in_air(self, group_mask: int) -> tuple[Mission, CommandedPath]:
         _check(group_mask)
         mission, path = self._mission, self._path
         if mission is None or path is None:

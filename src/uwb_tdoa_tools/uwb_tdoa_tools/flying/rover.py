@@ -40,16 +40,16 @@ TRACK = 0.4  # m between its wheels
 SCALE, UNEQUAL = 0.03, 0.003  # largest common error of the wheels' scales; deviation of each
 SLIP = 0.1  # share by which a wheel turns faster than the floor passes, at times
 LAG = 0.1  # s, of a wheel behind what is wanted
-HARDEST = 1.0  # m/s^2
-SLOWEST = 0.005  # m/s; a wheel that is to stand and turns slower stands
+MAX_ACCELERATION = 1.0  # m/s^2
+MIN_WHEEL_SPEED = 0.005  # m/s; a wheel that is to stand and turns slower stands
 WHEEL_STD = 0.02  # m/s, noise of what they say
 BUMPER = 0.2  # m from its middle
-AHEAD = 0.4  # m, of the point of the path that it steers for
-TURN, FASTEST_TURN = 2.0, 1.2  # 1/s, turning rate by the direction to that point; rad/s
-PULL = 1.0  # 1/s, most of its speed by the distance to the end
+LOOK_AHEAD = 0.4  # m, of the point of the path that it steers for
+TURN, MAX_YAW_RATE = 2.0, 1.2  # 1/s, turning rate by the direction to that point; rad/s
+APPROACH_GAIN = 1.0  # 1/s, most of its speed by the distance to the end
 STOP = 0.06  # m from the end, where it stops
 WINDOW = 1.0  # m of the path in which it looks for where it is
-GIVE_UP = 30.0  # s for which it stands with an estimate that is lost
+LOST_TIMEOUT = 30.0  # s for which it stands with an estimate that is lost
 
 
 class Steering:
@@ -92,9 +92,9 @@ class RoverSimulator(Simulator):
         wanted = np.array([controller.speed - half, controller.speed + half])
         for i in range(rows.start, rows.stop):
             wheels = self.wheels[i - 1]
-            most = HARDEST * dt
+            most = MAX_ACCELERATION * dt
             wheels = wheels + np.clip((wanted - wheels) * dt / LAG, -most, most)
-            wheels[(wanted == 0.0) & (np.abs(wheels) < SLOWEST)] = 0.0
+            wheels[(wanted == 0.0) & (np.abs(wheels) < MIN_WHEEL_SPEED)] = 0.0
             before, after = self.wheels[i - 1] * self._per_turn[i - 1], wheels * self._per_turn[i]
             (speed, turning), (v, w) = _unicycle(0.5 * (before + after)), _unicycle(after)
             yaw = self.yaw + 0.5 * turning * dt
@@ -103,14 +103,14 @@ class RoverSimulator(Simulator):
             state[3:5] = v * math.cos(self.yaw), v * math.sin(self.yaw)
             state[8:10], state[12] = (math.sin(0.5 * self.yaw), math.cos(0.5 * self.yaw)), w
             ahead = (v - _unicycle(before)[0]) / dt
-            felt = np.array([0.0, 0.0, turning, ahead, speed * turning, GRAVITY])
-            felt += self._inertial.errors[i]
+            sample = np.array([0.0, 0.0, turning, ahead, speed * turning, GRAVITY])
+            sample += self._inertial.errors[i]
             if wheels.any():
-                felt[3:] += self._inertial.shaking[i]
-            self.wheels[i], self.states[i], self.samples[i] = wheels, state, felt
+                sample[3:] += self._inertial.shaking[i]
+            self.wheels[i], self.states[i], self.samples[i] = wheels, state, sample
             self.contact[i] = 2.0
 
-    def _felt(self, name: str, sensor: AidSensor, lately: slice) -> Stream:
+    def _aid_measured(self, name: str, sensor: AidSensor, lately: slice) -> Stream:
         new, _, _ = self._poses(name, sensor.t, lately)
         t = sensor.t[new]
         wheels = np.column_stack(
@@ -165,7 +165,7 @@ class Drive:
         elif deviation <= rules.arm:
             self.state = FLYING
         if self.state == LOST:
-            if t - self._last_good > GIVE_UP:
+            if t - self._last_good > LOST_TIMEOUT:
                 self.state, self.ended = DONE, t
             return
         self._last_good = t
@@ -181,12 +181,12 @@ class Drive:
         if left < STOP or (along >= self.path.length and left < 2.0 * STOP):
             self.state, self.ended = DONE, t
             return
-        target = self.path.at(np.array([along + AHEAD]))[0, :2]
+        target = self.path.at(np.array([along + LOOK_AHEAD]))[0, :2]
         x, y = target - p
         off = (math.atan2(y, x) - yaw_of(pose[3]) + math.pi) % (2.0 * math.pi) - math.pi
-        to_go = self.path.length - along + left if along < self.path.length - AHEAD else left
-        steering.speed = min(self._speed, PULL * to_go) * max(math.cos(off), 0.0)
-        steering.turning = min(max(TURN * off, -FASTEST_TURN), FASTEST_TURN)
+        to_go = self.path.length - along + left if along < self.path.length - LOOK_AHEAD else left
+        steering.speed = min(self._speed, APPROACH_GAIN * to_go) * max(math.cos(off), 0.0)
+        steering.turning = min(max(TURN * off, -MAX_YAW_RATE), MAX_YAW_RATE)
 
     @property
     def place(self) -> np.ndarray:
@@ -207,7 +207,7 @@ class RoverTrial(Trial):
         self, task: Task, source: EstimateSource | None = None, lasts: float | None = None
     ) -> None:
         rules = task.rules
-        longest = rules.rest + rules.patience + 2.0 * task.path.duration + GIVE_UP + REST_AFTER
+        longest = rules.rest + rules.patience + 2.0 * task.path.duration + LOST_TIMEOUT + REST_AFTER
         super().__init__(task, source, lasts or longest)
 
     def _simulator(self, duration: float) -> RoverSimulator:
@@ -240,4 +240,4 @@ def drive(task: Task) -> TrialResult:
     """TrialResult, of a Task with Waypoints."""
     trial = RoverTrial(task)
     trial.fly()
-    return trial.flown
+    return trial.result

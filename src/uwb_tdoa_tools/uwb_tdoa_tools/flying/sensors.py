@@ -90,13 +90,15 @@ class Radio:
         self._link = tag_link(seed) if world.antennas else None
         self._anchors, self._at_times = anchors, random(seed, "floor").random((len(self.t), 2))
         self._way = (
-            _walk(world, duration, random(seed, "person")) if world.person else np.empty((0, 2))
+            _person_path(world, duration, random(seed, "person"))
+            if world.person
+            else np.empty((0, 2))
         )
         self._blocked = random(seed, "blocked").uniform(
             *BLOCKED, (int(duration / BLOCK_TIME) + 1, n)
         )
 
-    def happens(self, silent: float, changed: float) -> None:
+    def schedule_faults(self, silent: float, changed: float) -> None:
         """Say when its world's silence begins, and from when on its world's change holds, s."""
         self.silent = (silent, silent + self._world.silence[1]) if self._world.silence else NEVER
         self.changed = changed
@@ -120,11 +122,13 @@ class Radio:
             late = self._blocked[(t / BLOCK_TIME).astype(int)]
             person = self._way[(t * IMU_RATE).astype(int)]
             for anchor, sign in ((b, 1.0), (a, -1.0)):
-                through = _passes(p, self.positions[anchor], person)
+                through = _blocked(p, self.positions[anchor], person)
                 d += sign * np.where(through, late[np.arange(len(t)), anchor], 0.0)
         mine = (t >= self.changed) & ((a == self.other) | (b == self.other))
         if self._world.change == "late":
-            d += np.where(mine, np.where(b == self.other, 1.0, -1.0) * self._world.lateness, 0.0)
+            d += np.where(
+                mine, np.where(b == self.other, 1.0, -1.0) * self._world.changed_delay, 0.0
+            )
         elif self._world.change == "silent":
             d[mine] = np.nan
         d[(t >= self.silent[0]) & (t < self.silent[1])] = np.nan
@@ -155,13 +159,13 @@ def _measure(
 ) -> None:
     """Geometry and what is late at each of two anchors, (k,) m. constants (n, 3): see Radio."""
     for i in range(len(p)):
-        out[i] = _heard(p[i], positions[b[i]], constants[b[i]]) - _heard(
+        out[i] = _apparent_distance(p[i], positions[b[i]], constants[b[i]]) - _apparent_distance(
             p[i], positions[a[i]], constants[a[i]]
         )
 
 
 @compiled
-def _heard(p: np.ndarray, anchor: np.ndarray, late: np.ndarray) -> float:
+def _apparent_distance(p: np.ndarray, anchor: np.ndarray, late: np.ndarray) -> float:
     x, y, z = p[0] - anchor[0], p[1] - anchor[1], p[2] - anchor[2]
     return (
         math.sqrt(x * x + y * y + z * z)
@@ -181,7 +185,7 @@ def _outliers(world: World, n: int, rng: np.random.Generator) -> np.ndarray:
     )
 
 
-def _walk(world: World, duration: float, rng: np.random.Generator) -> np.ndarray:
+def _person_path(world: World, duration: float, rng: np.random.Generator) -> np.ndarray:
     """Where somebody is who walks from one place at a wall to the next: (n, 2) m, at each sample of
     the inertial sensor.
     """
@@ -198,7 +202,7 @@ def _walk(world: World, duration: float, rng: np.random.Generator) -> np.ndarray
     return np.stack([np.interp(t, stamps, column) for column in np.transpose(places)], axis=1)
 
 
-def _passes(p: np.ndarray, anchor: np.ndarray, person: np.ndarray) -> np.ndarray:
+def _blocked(p: np.ndarray, anchor: np.ndarray, person: np.ndarray) -> np.ndarray:
     """Whether the ways from p (k, 3) to anchors (k, 3) lead through a person at (k, 2), all m: (k,)
     bool.
     """

@@ -50,7 +50,7 @@ def interval(
     controller: tuple[Record, Record],
     vehicle: Record,
     disturbances: tuple[np.ndarray, np.ndarray, np.ndarray],
-    felt: tuple[np.ndarray, np.ndarray, np.ndarray],
+    measured: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> None:
     """Fly n samples of the inertial sensor long.
 
@@ -67,7 +67,7 @@ def interval(
     thrust, rates = wanted[0], wanted[1]
     gains, known = controller[0], controller[1]
     wind, errors, shaking = disturbances[0], disturbances[1], disturbances[2]
-    truth, samples, contact = felt[0], felt[1], felt[2]
+    truth, samples, contact = measured[0], measured[1], measured[2]
     dt = STEP * STEPS
     speeds, scratch, force, earlier = (
         np.empty(4),
@@ -122,10 +122,12 @@ pass
 
 TICK = 4  # samples of the inertial sensor, from one turn of the controller to the next
 DT = TICK / IMU_RATE  # s
-STARTS = 0.5  # m from the middle of the hall, along each axis, to the middle of where it flies
-WEIGHED = 0.05  # largest relative error of the mass that its controller believes
+START_SPREAD = (
+    0.5  # m from the middle of the hall, along each axis, to the middle of where it flies
+)
+MASS_ERROR = 0.05  # largest relative error of the mass that its controller believes
 TABLE_RADIUS = 0.4  # m
-LIFTED = 0.5  # m, by which hands lift it
+CARRY_HEIGHT = 0.5  # m, by which hands lift it
 RECENT = round(0.3 * IMU_RATE)  # samples of the truth that effects see
 
 
@@ -156,7 +158,7 @@ class Simulator:
         starts from.
         """
         self.world, rng = world, random(seed, "place")
-        middle, yaw = rng.uniform(-STARTS, STARTS, 2), rng.uniform(-np.pi, np.pi)
+        middle, yaw = rng.uniform(-START_SPREAD, START_SPREAD, 2), rng.uniform(-np.pi, np.pi)
         mass = rng.uniform(*world.mass)
         x, y = middle[0] + radius, middle[1]
         table = (
@@ -165,9 +167,9 @@ class Simulator:
             else {}
         )
         self.vehicle = Vehicle(mass=mass, **table)
-        self.believed = Vehicle(mass=mass * (1.0 + rng.uniform(-WEIGHED, WEIGHED)))
+        self.nominal = Vehicle(mass=mass * (1.0 + rng.uniform(-MASS_ERROR, MASS_ERROR)))
         self.yaw, self.state = yaw, self.vehicle.at_rest(x, y, yaw)
-        self._numbers, self._known = self.vehicle.numbers(), self.believed.numbers()
+        self._record, self._nominal_record = self.vehicle.record(), self.nominal.record()
         self.radio, self._inertial = (
             Radio(world, seed, duration),
             InertialErrors(world, seed, duration),
@@ -182,7 +184,7 @@ class Simulator:
         )
         self.samples = np.zeros((n, 6))
         self.done, self.states[0], self._gyro = 0, self.state, np.zeros((2, 3))
-        self._hands: tuple[np.ndarray, float, float, np.ndarray] | None = (
+        self._carrying: tuple[np.ndarray, float, float, np.ndarray] | None = (
             None  # state and s at first, s at last, way
         )
         self._heard = dict.fromkeys(("tdoa", *world.aids), 0)
@@ -203,7 +205,7 @@ class Simulator:
     @property
     def ground(self) -> float:
         """Height of what is below it, m."""
-        return ground_at(self._numbers, self.state[0], self.state[1])
+        return ground_at(self._record, self.state[0], self.state[1])
 
     def advance(self, controller: Any) -> SensorReadings:
         """Move for one turn as a controller of this vehicle wants, or be carried on by hands.
@@ -212,10 +214,10 @@ class Simulator:
         """
         k = self.done
         rows, lately = slice(k + 1, k + TICK + 1), slice(k, k + TICK + 1)
-        if self._hands is None:
+        if self._carrying is None:
             self._move(controller, rows)
         else:
-            self._be_carried(rows)
+            self._carry(rows)
         self.done += TICK
         imu = Imu(self.times[rows], self.samples[rows, :3], self.samples[rows, 3:])
         new, p, q = self._poses("tdoa", self.radio.t, lately)
@@ -225,8 +227,10 @@ class Simulator:
         tdoa = Tdoas(
             radio.t[new][heard], ids[radio.a[new][heard]], ids[radio.b[new][heard]], d[heard]
         )
-        aids = {name: self._felt(name, sensor, lately) for name, sensor in self._aids.items()}
-        return self._disturbed(SensorReadings(imu, tdoa, aids))
+        aids = {
+            name: self._aid_measured(name, sensor, lately) for name, sensor in self._aids.items()
+        }
+        return self._with_effects(SensorReadings(imu, tdoa, aids))
 
     def _move(self, controller: Any, rows: slice) -> None:
         """Fly the samples in `rows` by what a Controller wants."""
@@ -234,21 +238,21 @@ class Simulator:
             self.state,
             self._gyro,
             (controller.thrust, controller.rates),
-            (controller.numbers, self._known),
-            self._numbers,
+            (controller.record, self._nominal_record),
+            self._record,
             (self._wind[rows], self._inertial.errors[rows], self._inertial.shaking[rows]),
             (self.states[rows], self.samples[rows], self.contact[rows]),
         )
 
-    def lift(self, by: np.ndarray, seconds: float) -> None:
+    def carry(self, by: np.ndarray, seconds: float) -> None:
         """Be carried by (2,) m, lifted and put down, within so many s, from now on."""
         begin, end = self.state.copy(), self.now + seconds
-        way = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, LIFTED], [*by, LIFTED], [*by, 0.0]])
-        self._hands = begin, self.now, end, way
+        way = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, CARRY_HEIGHT], [*by, CARRY_HEIGHT], [*by, 0.0]])
+        self._carrying = begin, self.now, end, way
 
-    def _be_carried(self, rows: slice) -> None:
-        assert self._hands is not None
-        begin, since, until, way = self._hands
+    def _carry(self, rows: slice) -> None:
+        assert self._carrying is not None
+        begin, since, until, way = self._carrying
         t, h = self.times[rows], 0.5 / IMU_RATE
         at = [
             begin[POSITION] + _along(way, (t + shift - since) / (until - since))
@@ -264,7 +268,7 @@ class Simulator:
         self.state[:] = states[-1]
         self._gyro[:] = self.samples[rows.stop - 1, :3]
         if t[-1] >= until:
-            self._hands = None
+            self._carrying = None
             self.state[VELOCITY] = 0.0
 
     def _poses(
@@ -280,7 +284,7 @@ class Simulator:
         self._heard[stream] = new.stop
         return new, p, q
 
-    def _felt(self, name: str, sensor: AidSensor, lately: slice) -> Stream:
+    def _aid_measured(self, name: str, sensor: AidSensor, lately: slice) -> Stream:
         new, p, q = self._poses(name, sensor.t, lately)
         v = np.broadcast_to(self.state[VELOCITY], p.shape)
         inside = Rotation.from_quat(q).inv().apply(v) if len(q) else v
@@ -288,7 +292,7 @@ class Simulator:
             sensor.t[new], *sensor.measured(new, p, q, inside, p[:, 2] - self.ground)
         )
 
-    def _disturbed(self, measured: SensorReadings) -> SensorReadings:
+    def _with_effects(self, measured: SensorReadings) -> SensorReadings:
         """SensorReadings, with the world's effects in it, put there as `inject` does."""
         if not len(self.world.effects) or not len(measured.tdoa):
             return measured

@@ -16,8 +16,8 @@ from uwb_tdoa_bias.foundation.flight import Flight, Truth
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.results import Odometry, concatenated
 
-from .controller import FELT, Controller, Gains, turned
-from .estimates import OurFilter, TheirFilter
+from .controller import SUPPORT_TIME, Controller, Gains, rotate_attitude
+from .estimates import OwnFilter, PeerFilter
 from .mission import DONE, REFUSED, Circles, Mission, Rules, Waypoints
 from .sensors import random
 from .simulator import DT, Simulator, Transport
@@ -26,7 +26,7 @@ from .world import World
 
 if TYPE_CHECKING:
     from .estimates import EstimateSource
-    from .mission import Route
+    from .mission import Plan
     from .simulator import SensorReadings
 
 REST_AFTER = 3.0  # s of the recording after the rotors have stopped
@@ -57,7 +57,7 @@ class Task:
 
     world: World
     seed: int = 0
-    told: str = "nothing"
+    given: str = "nothing"
     yaw: str = "known"
     config: FilterConfig = field(default_factory=FilterConfig)
     effects: EffectSet | None = None
@@ -103,7 +103,9 @@ class Trial:
         long as it can take.
         """
         world, seed, rules = task.world, task.seed, task.rules
-        longest = rules.rest + rules.patience + task.path.duration + rules.longest_sink + REST_AFTER
+        longest = (
+            rules.rest + rules.patience + task.path.duration + rules.longest_descent + REST_AFTER
+        )
         duration = lasts or longest * (2 if task.again else 1) + (
             PAUSE + CARRY_TIME if task.again else 0.0
         )
@@ -116,8 +118,8 @@ class Trial:
             GIVEN_STD * rng.standard_normal(),
         )
         yaw = self.simulator.yaw + off
-        self.source: EstimateSource | TheirFilter = source or _filter_of(task, place, yaw)
-        if task.told == "place" and not isinstance(self.source, TheirFilter):
+        self.source: EstimateSource | PeerFilter = source or _filter_of(task, place, yaw)
+        if task.given == "place" and not isinstance(self.source, PeerFilter):
             self.source.set_pose(
                 GIVEN_AT, place, GIVEN_STD, yaw if task.yaw == "known" else math.nan
             )
@@ -134,7 +136,7 @@ class Trial:
 
     def _controller(self) -> Any:
         """What moves it."""
-        return Controller(self.task.gains, self.simulator.believed)
+        return Controller(self.task.gains, self.simulator.nominal)
 
     def fly(self) -> None:
         """One mission from where it stands, until it has rested for a while after it, or has come
@@ -144,7 +146,7 @@ class Trial:
         while not self.over:
             self.turn()
 
-    def begin(self, path: Route | None = None, rules: Rules | None = None) -> None:
+    def begin(self, path: Plan | None = None, rules: Rules | None = None) -> None:
         """Begin a mission from where it stands; path, rules : default: those of the Task."""
         self.missions.append(self._mission(path or self.task.path, rules or self.task.rules))
         self._moment = _moment(self.task.world.silence, self.task.path, self.task.rules, self._rng)
@@ -175,23 +177,25 @@ class Trial:
             assert pose is not None  # as the mission has begun by it
             since, p, v, q = pose
             self.controller.fly(
-                p, v, self._turned_since(q, since), wanted, self.missions[-1].yaw, DT
+                p, v, self._predicted_attitude(q, since), wanted, self.missions[-1].yaw, DT
             )
         self._turn()
 
     def _decide(self, mission: Mission) -> np.ndarray | None:
         """What a Mission wants now."""
         simulator, k = self.simulator, self.simulator.done
-        self._let_happen(mission)
-        force = float(np.mean(simulator.samples[max(k - int(FELT * IMU_RATE), 0) : k + 1, 5]))
+        self._schedule_faults(mission)
+        force = float(
+            np.mean(simulator.samples[max(k - int(SUPPORT_TIME * IMU_RATE), 0) : k + 1, 5])
+        )
         return mission.decide(
             simulator.now, self.source.pose, self.source.deviation, self.controller.support(force)
         )
 
-    def _let_happen(self, mission: Any) -> None:
+    def _schedule_faults(self, mission: Any) -> None:
         """Have the silence and the change of its world come when they are due in a mission."""
         started = mission.begin + mission.rules.rest if mission.started is None else mission.started
-        self.simulator.radio.happens(
+        self.simulator.radio.schedule_faults(
             started + self._moment, started + 0.5 * self.task.path.duration
         )
 
@@ -214,7 +218,7 @@ class Trial:
         """What ends it, in words, or ""."""
         return _crash(self.simulator, self.task.world)
 
-    def _turned_since(self, attitude: np.ndarray, since: float) -> np.ndarray:
+    def _predicted_attitude(self, attitude: np.ndarray, since: float) -> np.ndarray:
         """An attitude (4,) of `since`, s, turned by the rates that were felt until now."""
         times, samples, k, attitude = (
             self.simulator.times,
@@ -223,11 +227,11 @@ class Trial:
             attitude.copy(),
         )
         for j in range(max(int(np.searchsorted(times[: k + 1], since, side="right")), 1), k + 1):
-            turned(attitude, samples[j, :3], times[j] - max(times[j - 1], since))
+            rotate_attitude(attitude, samples[j, :3], times[j] - max(times[j - 1], since))
         return attitude
 
     @property
-    def flown(self) -> TrialResult:
+    def result(self) -> TrialResult:
         """TrialResult."""
         simulator, world = self.simulator, self.task.world
         end = simulator.done + 1
@@ -261,23 +265,23 @@ def fly(task: Task) -> TrialResult:
     if task.again and not trial.crash and trial.missions[0].state == DONE:
         trial.rest(PAUSE)
         angle = random(task.seed, "carried").uniform(-np.pi, np.pi)
-        trial.simulator.lift(CARRIED * np.array([np.cos(angle), np.sin(angle)]), CARRY_TIME)
+        trial.simulator.carry(CARRIED * np.array([np.cos(angle), np.sin(angle)]), CARRY_TIME)
         trial.rest(CARRY_TIME)
         trial.fly()
-    return trial.flown
+    return trial.result
 
 
-def _filter_of(task: Task, place: np.ndarray, yaw: float) -> OurFilter | TheirFilter:
+def _filter_of(task: Task, place: np.ndarray, yaw: float) -> OwnFilter | PeerFilter:
     """Who tells where it is, of a Task; place (3,) m and yaw, rad: what is given at the start, if
     it is.
     """
     anchors = task.world.anchors
     if task.peer is not None:
-        return TheirFilter(task.peer, anchors, yaw, place if task.told == "place" else None)
+        return PeerFilter(task.peer, anchors, yaw, place if task.given == "place" else None)
     known: dict[str, Any] = (
         {"initial_yaw": yaw, "initial_yaw_std": GIVEN_STD} if task.yaw == "known" else {}
     )
-    return OurFilter(anchors, replace(task.config, **known), task.effects, load_network(task.model))
+    return OwnFilter(anchors, replace(task.config, **known), task.effects, load_network(task.model))
 
 
 def _moment(

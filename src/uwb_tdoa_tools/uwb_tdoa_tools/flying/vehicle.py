@@ -81,31 +81,31 @@ class Vehicle:
     table_y: float = 0.0
     table_radius: float = 0.0
 
-    def numbers(self) -> Record:
+    def record(self) -> Record:
         """The record, of NUMBERS, that compiled code takes."""
-        return np.array([tuple(asdict(self).values())], NUMBERS)[0]
+        return np.array([tuple(asdict(self).values())], RECORD)[0]
 
     def at_rest(self, x: float, y: float, yaw: float) -> np.ndarray:
         """A state (17,): standing on what is below (x, y), m, with its rotors still."""
         state = np.zeros(STATE)
         sag = self.mass * GRAVITY / (ROTORS * self.stiffness)
-        state[POSITION] = x, y, ground_at(self.numbers(), x, y) + self.leg - sag
+        state[POSITION] = x, y, ground_at(self.record(), x, y) + self.leg - sag
         state[ATTITUDE] = 0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw)
         return state
 
 
-NUMBERS = np.dtype([(field.name, float) for field in fields(Vehicle)], align=True)
+RECORD = np.dtype([(field.name, float) for field in fields(Vehicle)], align=True)
 
 
 @compiled
-def ground_at(numbers: Record, x: float, y: float) -> float:
+def ground_at(record: Record, x: float, y: float) -> float:
     """Height of what is below (x, y), m."""
     if (
-        numbers.table_radius > 0.0
-        and math.hypot(x - numbers.table_x, y - numbers.table_y) <= numbers.table_radius
+        record.table_radius > 0.0
+        and math.hypot(x - record.table_x, y - record.table_y) <= record.table_radius
     ):
-        return numbers.floor + numbers.table
-    return numbers.floor
+        return record.floor + record.table
+    return record.floor
 
 
 @compiled
@@ -114,7 +114,7 @@ def step(
     speeds: np.ndarray,
     wind: np.ndarray,
     dt: float,
-    numbers: Record,
+    record: Record,
     scratch: np.ndarray,
 ) -> int:
     """Advance `state` (17,) by dt, s, with the commanded rotor `speeds` (4,) rad/s in a `wind` (3,)
@@ -123,10 +123,10 @@ def step(
     numbers : of a Vehicle; scratch : (2, 17), is written to. Returns the number of feet on the
         ground.
     """
-    _derivative(state, speeds, wind, numbers, scratch[0])
+    _derivative(state, speeds, wind, record, scratch[0])
     for k in range(STATE):
         scratch[1, k] = state[k] + 0.5 * dt * scratch[0, k]
-    feet = _derivative(scratch[1], speeds, wind, numbers, scratch[0])
+    feet = _derivative(scratch[1], speeds, wind, record, scratch[0])
     for k in range(STATE):
         state[k] += dt * scratch[0, k]
     length = math.sqrt(state[6] ** 2 + state[7] ** 2 + state[8] ** 2 + state[9] ** 2)
@@ -137,7 +137,7 @@ def step(
 
 @compiled
 def _derivative(
-    state: np.ndarray, speeds: np.ndarray, wind: np.ndarray, numbers: Record, out: np.ndarray
+    state: np.ndarray, speeds: np.ndarray, wind: np.ndarray, record: Record, out: np.ndarray
 ) -> int:
     """Time derivative of a state, to `out` (17,). Returns the number of feet on the ground."""
     q, w = state[6:10], state[10:13]
@@ -152,45 +152,45 @@ def _derivative(
         r01 * ax + r11 * ay + r21 * az,
         r02 * ax + r12 * ay + r22 * az,
     )
-    drag = -numbers.body_drag * math.sqrt(air_x**2 + air_y**2 + air_z**2)
+    drag = -record.body_drag * math.sqrt(air_x**2 + air_y**2 + air_z**2)
     fx, fy, fz = drag * air_x, drag * air_y, drag * air_z  # force and moment, body frame
     mx, my, mz = 0.0, 0.0, 0.0
-    world_x, world_y, world_z = 0.0, 0.0, -GRAVITY * numbers.mass  # force, world frame
+    world_x, world_y, world_z = 0.0, 0.0, -GRAVITY * record.mass  # force, world frame
     feet = 0
     for k in range(ROTORS):
-        px, py = numbers.arm * CORNERS[k, 0], numbers.arm * CORNERS[k, 1]
+        px, py = record.arm * CORNERS[k, 0], record.arm * CORNERS[k, 1]
         speed = state[13 + k]
-        lift = numbers.thrust * speed * speed
-        height = state[2] + r20 * px + r21 * py - ground_at(numbers, state[0], state[1])
-        if numbers.radius > 0.0:
-            share = numbers.radius / (4.0 * max(height, numbers.radius))
+        lift = record.thrust * speed * speed
+        height = state[2] + r20 * px + r21 * py - ground_at(record, state[0], state[1])
+        if record.radius > 0.0:
+            share = record.radius / (4.0 * max(height, record.radius))
             lift /= 1.0 - share * share
-        hx = -numbers.rotor_drag * speed * (air_x - w[2] * py)
-        hy = -numbers.rotor_drag * speed * (air_y + w[2] * px)
-        hz = -numbers.inflow * speed * (air_z + w[0] * py - w[1] * px)
+        hx = -record.rotor_drag * speed * (air_x - w[2] * py)
+        hy = -record.rotor_drag * speed * (air_y + w[2] * px)
+        hz = -record.inflow * speed * (air_z + w[0] * py - w[1] * px)
         fx += hx
         fy += hy
         fz += lift + hz
         mx += py * (lift + hz)
         my -= px * (lift + hz)
-        mz += px * hy - py * hx + SPIN[k] * numbers.moment * speed * speed
-        out[13 + k] = (min(max(speeds[k], 0.0), numbers.top_speed) - speed) / numbers.motor_time
+        mz += px * hy - py * hx + SPIN[k] * record.moment * speed * speed
+        out[13 + k] = (min(max(speeds[k], 0.0), record.top_speed) - speed) / record.motor_time
 
-        foot_z = height - r22 * numbers.leg
+        foot_z = height - r22 * record.leg
         if foot_z < 0.0:
             feet += 1
             # velocity of the foot: v + R (w x foot), foot = (px, py, -leg)
             bx, by, bz = (
-                -w[1] * numbers.leg - w[2] * py,
-                w[2] * px + w[0] * numbers.leg,
+                -w[1] * record.leg - w[2] * py,
+                w[2] * px + w[0] * record.leg,
                 w[0] * py - w[1] * px,
             )
             vx = state[3] + r00 * bx + r01 * by + r02 * bz
             vy = state[4] + r10 * bx + r11 * by + r12 * bz
             vz = state[5] + r20 * bx + r21 * by + r22 * bz
-            normal = max(0.0, -numbers.stiffness * foot_z - numbers.damping * vz)
+            normal = max(0.0, -record.stiffness * foot_z - record.damping * vz)
             slip = math.hypot(vx, vy)
-            rub = min(numbers.friction_damping, numbers.friction * normal / max(slip, 1e-9))
+            rub = min(record.friction_damping, record.friction * normal / max(slip, 1e-9))
             gx, gy, gz = -rub * vx, -rub * vy, normal
             world_x += gx
             world_y += gy
@@ -200,18 +200,18 @@ def _derivative(
                 r01 * gx + r11 * gy + r21 * gz,
                 r02 * gx + r12 * gy + r22 * gz,
             )
-            mx += py * cz + numbers.leg * cy
-            my += -numbers.leg * cx - px * cz
+            mx += py * cz + record.leg * cy
+            my += -record.leg * cx - px * cz
             mz += px * cy - py * cx
     out[0], out[1], out[2] = state[3], state[4], state[5]
-    out[3] = (world_x + r00 * fx + r01 * fy + r02 * fz) / numbers.mass
-    out[4] = (world_y + r10 * fx + r11 * fy + r12 * fz) / numbers.mass
-    out[5] = (world_z + r20 * fx + r21 * fy + r22 * fz) / numbers.mass
+    out[3] = (world_x + r00 * fx + r01 * fy + r02 * fz) / record.mass
+    out[4] = (world_y + r10 * fx + r11 * fy + r12 * fz) / record.mass
+    out[5] = (world_z + r20 * fx + r21 * fy + r22 * fz) / record.mass
     out[6] = 0.5 * (s * w[0] + y * w[2] - z * w[1])
     out[7] = 0.5 * (s * w[1] + z * w[0] - x * w[2])
     out[8] = 0.5 * (s * w[2] + x * w[1] - y * w[0])
     out[9] = 0.5 * (-x * w[0] - y * w[1] - z * w[2])
-    ixy, iz = numbers.inertia_xy, numbers.inertia_z
+    ixy, iz = record.inertia_xy, record.inertia_z
     out[10] = (mx - (iz - ixy) * w[1] * w[2]) / ixy
     out[11] = (my - (ixy - iz) * w[2] * w[0]) / ixy
     out[12] = mz / iz

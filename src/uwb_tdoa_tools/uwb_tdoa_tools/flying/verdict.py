@@ -110,7 +110,7 @@ def _of_mission(flown: TrialResult, mission: Mission, end: float) -> dict[str, A
         "tracking": tracking,
         "started": mission.started,
         "ended": mission.ended,
-        "said_lost": mission.lost,
+        "reported_lost": mission.lost,
         "duration": float(t[-1]),
         **_armed(flown.odometry, flown.flight.truth, mission.started),
         **_estimation(odometry, truth, mission, first, last),
@@ -149,7 +149,7 @@ def _of_drive(flown: TrialResult) -> dict[str, Any]:
         "farthest": float(off.max()) if len(off) else None,
         "started": mission.started,
         "ended": mission.ended,
-        "said_lost": mission.lost,
+        "reported_lost": mission.lost,
         "duration": end,
         **_armed(flown.odometry, truth, mission.started),
     }
@@ -169,13 +169,13 @@ def _of_drive(flown: TrialResult) -> dict[str, Any]:
     yaw = np.interp(odometry.t, truth.t, np.unwrap(yaws_of(truth.q)))
     off_yaw = ((yaws_of(odometry.q) - yaw + np.pi) % (2.0 * np.pi) - np.pi)[under_way]
     variance = odometry.covariance[under_way, 8, 8]  # of a planar vehicle: about the vertical
-    told = len(off_yaw) > 0 and bool((variance > 0.0).all())
+    has_variance = len(off_yaw) > 0 and bool((variance > 0.0).all())
     drive = phases.get("drive")
     return {
         **figures,
         "estimation": drive and drive["rmse"],
         "yaw": math.degrees(rms(off_yaw)) if len(off_yaw) else None,
-        "yaw_nees": float(np.mean(off_yaw**2 / variance)) if told else None,
+        "yaw_nees": float(np.mean(off_yaw**2 / variance)) if has_variance else None,
         "phases": phases,
     }
 
@@ -273,7 +273,7 @@ def _figures(distance: np.ndarray, normalised: np.ndarray) -> dict[str, float | 
 pass
 
 
-DISHONEST = 3.0  # standard deviations of a coordinate
+OVERCONFIDENT = 3.0  # standard deviations of a coordinate
 
 
 @dataclass(frozen=True)
@@ -337,9 +337,9 @@ def summary(verdicts: Sequence[dict[str, Any]]) -> dict[str, Any]:
     out["armed"] = sum(one["started"] is not None for one in verdicts)
     known = [one["armed_deviations"] for one in verdicts if one["armed_deviations"] is not None]
     out["armed_beyond_three_deviations"] = (
-        sum(value > DISHONEST for value in known) if known else None
+        sum(value > OVERCONFIDENT for value in known) if known else None
     )  # a peer tells none
-    out["said_lost"] = sum(one["said_lost"] is not None for one in verdicts)
+    out["reported_lost"] = sum(one["reported_lost"] is not None for one in verdicts)
     for name in wording.figures:
         out[name] = _spread([one[name] for one in verdicts])
     for phase in wording.phases:
@@ -371,7 +371,7 @@ def text(summed: dict[str, Any]) -> str:
     lines.append(
         f"{wording.begun} {summed['armed']}, of these {'?' if beyond is None else beyond} while the "
         "estimate was more than three of its "
-        f"deviations off; {summed['said_lost']} said that they were lost"
+        f"deviations off; {summed['reported_lost']} said that they were lost"
     )
     for name, what in wording.figures.items():
         if what:

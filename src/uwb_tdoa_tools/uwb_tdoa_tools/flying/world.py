@@ -95,7 +95,7 @@ class World:
     silence: tuple[str, float] | None = None
     person: bool = False
     change: str = ""
-    lateness: float = 0.3
+    changed_delay: float = 0.3
     effects: EffectSet = EffectSet()
     latency: float = 0.0
     jitter: float = 0.0

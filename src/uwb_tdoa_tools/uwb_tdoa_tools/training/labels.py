@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 
 # s after take-off and before landing that are left out: near the floor TDOAs are metres off
 MARGIN = 0.5
-LARGEST = 1.0  # m; a larger error is an outlier, not bias (Zhao et al., section V-B)
-ZERO = 1e-3  # m; if no label is larger, the TDOAs were computed, not measured
-FEWEST = 100  # labels that a flight must give
-MEMORY = (
+LARGEST_ERROR = 1.0  # m; a larger error is an outlier, not bias (Zhao et al., section V-B)
+ZERO_ERROR = 1e-3  # m; if no label is larger, the TDOAs were computed, not measured
+FEWEST_LABELS = 100  # labels that a flight must give
+CORRELATION_TIME = (
     1.0  # s over which the errors of one anchor are alike: so much time counts as one look at it
 )
 SAME_PLACE = (
@@ -49,7 +49,7 @@ class Labels:
     name: str
     samples: Samples
     error: np.ndarray
-    looks: float
+    sample_weight: float
     digest: str
 
     def __len__(self) -> int:
@@ -62,16 +62,19 @@ class Labels:
 
     def take(self, rows: np.ndarray) -> Labels:
         """Labels of some rows, each counting for more, so that they count for as much together."""
-        part, looks = _rows(self.samples, rows), self.looks * len(self) / max(len(rows), 1)
-        return replace(self, samples=part, error=self.error[rows], looks=looks)
+        part, sample_weight = (
+            _rows(self.samples, rows),
+            self.sample_weight * len(self) / max(len(rows), 1),
+        )
+        return replace(self, samples=part, error=self.error[rows], sample_weight=sample_weight)
 
 
 def labels(flight: Flight, effects: EffectSet = EffectSet()) -> Labels:
     """Labels of a Flight, its airborne part without outliers; what `effects` explain is taken out.
     Raises InputError where it cannot teach anything.
     """
-    flight = effects.correct_streams(replace(level(flight), imu=None))
-    truth, data, anchors = known_truth(flight), flight.tdoa, flight.anchors
+    flight = effects.correct_streams(replace(with_level_attitude(flight), imu=None))
+    truth, data, anchors = required_truth(flight), flight.tdoa, flight.anchors
     _, first, last = scored_phase(truth)
     first, last = first + MARGIN, last - MARGIN
     chosen = (data.t > first) & (data.t < last)
@@ -96,34 +99,34 @@ def labels(flight: Flight, effects: EffectSet = EffectSet()) -> Labels:
         - tdoa(samples.p, samples.position_a, samples.position_b)
         - effects.bias(samples)
     )
-    kept = (np.abs(error) <= LARGEST) & (samples.p[:, 2] > least_height(truth)) & (a != b)
-    if kept.sum() < FEWEST:
+    kept = (np.abs(error) <= LARGEST_ERROR) & (samples.p[:, 2] > least_height(truth)) & (a != b)
+    if kept.sum() < FEWEST_LABELS:
         raise InputError(
-            f"{flight.name}: only {kept.sum()} TDOAs are right to {LARGEST:g} m; check that "
+            f"{flight.name}: only {kept.sum()} TDOAs are right to {LARGEST_ERROR:g} m; check that "
             "survey and "
             "ground truth are in one frame."
         )
-    if np.max(np.abs(error[kept])) < ZERO:
+    if np.max(np.abs(error[kept])) < ZERO_ERROR:
         raise InputError(
             f"{flight.name}: all labels are zero: its TDOAs were made from the ground truth itself."
         )
-    looks = min(1.0, len(anchors) * (last - first) / MEMORY / kept.sum())
+    sample_weight = min(1.0, len(anchors) * (last - first) / CORRELATION_TIME / kept.sum())
     samples = _rows(samples, kept)
-    return Labels(flight.name, samples, error[kept], looks, _digest(samples, error[kept]))
+    return Labels(flight.name, samples, error[kept], sample_weight, _digest(samples, error[kept]))
 
 
-def known_truth(flight: Flight) -> Truth:
+def required_truth(flight: Flight) -> Truth:
     """The ground truth of a Flight. Raises InputError where there is none."""
     if flight.truth is None:
         raise InputError(f"{flight.name}: it holds no ground truth to learn from.")
     return flight.truth
 
 
-def level(flight: Flight) -> Flight:
+def with_level_attitude(flight: Flight) -> Flight:
     """The Flight; if the attitudes of its ground truth are not all measured, they are level, at yaw
     0.
     """
-    truth = known_truth(flight)
+    truth = required_truth(flight)
     if np.isfinite(truth.q).all():
         return flight
     return replace(flight, truth=replace(truth, q=np.tile(LEVEL, (len(truth), 1))))

@@ -34,7 +34,7 @@ class Design:
     b: np.ndarray
     dense: np.ndarray
     y: np.ndarray
-    looks: np.ndarray
+    sample_weight: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,9 @@ def fit(
     prior = np.concatenate([np.ones(blocks[1].stop), np.asarray(known_std, dtype=float) ** -2.0])
     robust, groups = np.ones(len(design.y)), _groups(design.a, design.b, sites)
     for iteration in range(ITERATIONS):
-        left, right = _normal_equations(design, groups, size, robust * design.looks / noise**2)
+        left, right = _normal_equations(
+            design, groups, size, robust * design.sample_weight / noise**2
+        )
         left[np.diag_indices_from(left)] += prior
         factor, _ = cho_factor(left, overwrite_a=True)
         solution = cho_solve((factor, False), right)

@@ -107,20 +107,20 @@ def train(
     if kind.startswith("physics"):
         if found is None:
             progress("looking for effects")
-            found = physics.find([*training, *validation])
+            found = physics.find_effects([*training, *validation])
         effects = found.effects
         if len(labelling.constellations([*training, *validation])) > 1:
-            free, effects = physics.separate(effects)
+            free, effects = physics.split_linear(effects)
         progress(f"effects: {found.effects.name}")
         groups = _labels(training, validation, effects)
     if kind.startswith("paper"):
         model, errors, left = _paper(recipe, groups[0], groups[1], progress)
     elif found is not None and kind == "physics" and not len(free):
         errors, left = _evaluate_effects(
-            found, raw[0], raw[1], _growing(len(training), seed, curve)
+            found, raw[0], raw[1], _curve_subsets(len(training), seed, curve)
         )
     else:
-        growing = _growing(len(training), seed, curve)
+        growing = _curve_subsets(len(training), seed, curve)
         model, free, errors, left = _structured(
             recipe, groups[0], groups[1], progress, growing, free
         )
@@ -245,14 +245,14 @@ def fit_structured(
     Labels.
     """
     model = structured.prepare(some, options, seed)
-    parts = [model.design(one.samples, one.error, one.looks) for one in some]
-    fields = ("phi", "a", "b", "dense", "y", "looks")
-    phi, a, b, dense, y, looks = (
+    parts = [model.design(one.samples, one.error, one.sample_weight) for one in some]
+    fields = ("phi", "a", "b", "dense", "y", "sample_weight")
+    phi, a, b, dense, y, sample_weight = (
         np.concatenate([getattr(part, name) for part in parts]) for name in fields
     )
     more = np.concatenate([physics.regressors(free, one.samples) for one in some])
-    design = linear.Design(phi, a, b, np.concatenate([dense, more], axis=1), y, looks)
-    posterior = linear.fit(design, len(model.site_ids), options.noise, physics.sizes(free))
+    design = linear.Design(phi, a, b, np.concatenate([dense, more], axis=1), y, sample_weight)
+    posterior = linear.fit(design, len(model.site_ids), options.noise, physics.prior_stds(free))
     model.set_posterior(posterior)
     own = model.link_columns
     return model, physics.with_values(
@@ -281,7 +281,7 @@ def _evaluate_effects(
     return _over_flights(curve), left
 
 
-def _growing(count: int, seed: int, curve: bool) -> list[list[int]]:
+def _curve_subsets(count: int, seed: int, curve: bool) -> list[list[int]]:
     """Growing subsets of `count` flights, in random order, the last one all of them, which is the
     only one without `curve`: lists of numbers.
     """

@@ -17,7 +17,7 @@ from ..diagnosis.refinement import effects_of
 from ..diagnosis.regression.fit import refit
 from ..diagnosis.regression.terms import columns_of
 from ..diagnosis.validation import select_by_error
-from .labels import constellations, level
+from .labels import constellations, with_level_attitude
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -51,7 +51,7 @@ class Physics:
         return usable([*effects_of(replace(selection, fit=model)), *detected])
 
 
-def separate(effects: EffectSet) -> tuple[EffectSet, EffectSet]:
+def split_linear(effects: EffectSet) -> tuple[EffectSet, EffectSet]:
     """(EffectSet of those with parameters in which the error of a TDOA is linear, EffectSet of the
     others).
     """
@@ -76,7 +76,7 @@ def regressors(effects: EffectSet, samples: Samples) -> np.ndarray:
     return np.concatenate([np.zeros((len(samples), 0)), *parts], axis=1)
 
 
-def sizes(effects: EffectSet) -> np.ndarray:
+def prior_stds(effects: EffectSet) -> np.ndarray:
     """Plausible sizes of all parameters, (k,), each in its unit: standard deviations of their
     priors.
     """
@@ -98,14 +98,16 @@ def with_values(effects: EffectSet, values: np.ndarray, covariance: np.ndarray) 
     return EffectSet(tuple(out))
 
 
-def find(flights: Sequence[Flight], progress: Callable[[], object] = lambda: None) -> Physics:
+def find_effects(
+    flights: Sequence[Flight], progress: Callable[[], object] = lambda: None
+) -> Physics:
     """Physics of Flights with ground truth. progress() is called now and then.
 
     Of flights in one constellation, all that `diagnose` can name; of several, what goes from one to
     the other (PORTABLE). An effect stays if it helps the likelihood of flights that it was not
     fitted to, and the filter's error on them.
     """
-    flights, reference = [level(flight) for flight in flights], GroundTruth()
+    flights, reference = [with_level_attitude(flight) for flight in flights], GroundTruth()
     kinds = PORTABLE if len(constellations(flights)) > 1 else None
     attribution = attribute(flights, reference, kinds=kinds, undeclared=False, progress=progress)
     validated = select_by_error(attribution, flights, Baseline(EffectSet()), progress)

@@ -38,7 +38,7 @@ FOLDS = 5
 def cross_validated(
     recipe: Recipe,
     flights: Sequence[Flight],
-    plain: Mapping[str, float],
+    uncorrected_errors: Mapping[str, float],
     found: physics.Physics | None = None,
     progress: Callable[[str], object] = lambda text: None,
     map_function: MapFunction = map,
@@ -55,7 +55,7 @@ def cross_validated(
     rest = [[k for k in range(len(flights)) if k not in fold] for fold in folds]
     known = [found and physics.Physics(found.fitted_to(others)) for others in rest]
     for result in map_function(
-        partial(_left_out, recipe, flights, plain), list(zip(folds, rest, known))
+        partial(_left_out, recipe, flights, uncorrected_errors), list(zip(folds, rest, known))
     ):
         of_fold = {name: dict(pairs) for name, pairs in result.items()}
         for name, of in of_fold.items():
@@ -73,7 +73,7 @@ def uncorrected(flights: Sequence[Flight], map_function: MapFunction = map) -> d
 
 def errors_by_share(
     flight: Flight,
-    plain: Mapping[str, float],
+    uncorrected_errors: Mapping[str, float],
     effects: EffectSet | None,
     network: Network | None,
     shares: Sequence[float] = SHARES,
@@ -81,7 +81,7 @@ def errors_by_share(
     """{share: 3D RMSE of the filter on a Flight, m, from TDOAs and IMU alone}, under None without
     any correction, as `plain` says. Without a network there is one share, 1.
     """
-    out: dict[float | None, float] = {None: plain[flight.name]}
+    out: dict[float | None, float] = {None: uncorrected_errors[flight.name]}
     if network is None:
         return out | {1.0: _error(flight, effects)}
     for share in shares:
@@ -105,10 +105,10 @@ def train(
     found = None
     if recipe.kind.startswith("physics"):
         progress("looking for effects")
-        found = physics.find(flights)
+        found = physics.find_effects(flights)
     trained = models.train(recipe, training, validation, name, progress, found)
-    plain = uncorrected(flights, map_function)
-    shrinkage = cross_validated(recipe, flights, plain, found, progress, map_function)
+    uncorrected_errors = uncorrected(flights, map_function)
+    shrinkage = cross_validated(recipe, flights, uncorrected_errors, found, progress, map_function)
     if trained.model:
         trained = replace(trained, meta={**trained.meta, "share": shrinkage.share})
     return trained, shrinkage
@@ -117,7 +117,7 @@ def train(
 def _left_out(
     recipe: Recipe,
     flights: Sequence[Flight],
-    plain: Mapping[str, float],
+    uncorrected_errors: Mapping[str, float],
     fold: tuple[list[int], list[int], physics.Physics | None],
 ) -> dict[str, list[tuple[float | None, float]]]:
     """{flight: [(share, 3D RMSE), ...]}, JSON, of a fold: (numbers of the flights left out, of the
@@ -132,7 +132,7 @@ def _left_out(
         model, _ = models.save(trained, folder)
         network = Network(model) if model else None
     errors = {
-        flights[k].name: errors_by_share(flights[k], plain, trained.effects, network)
+        flights[k].name: errors_by_share(flights[k], uncorrected_errors, trained.effects, network)
         for k in left_out
     }
     return {name: list(of_flight.items()) for name, of_flight in errors.items()}

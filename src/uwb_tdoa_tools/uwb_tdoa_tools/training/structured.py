@@ -152,7 +152,7 @@ class Structured:
         self.floor = 0.0  # m, standard deviation of what remains where everything is known
 
     def design(
-        self, samples: Samples, error: np.ndarray | None = None, looks: float = 1.0
+        self, samples: Samples, error: np.ndarray | None = None, sample_weight: float = 1.0
     ) -> linear.Design:
         """linear.Design of Samples: the sites of their anchors, one behind the last for those at
         none, and the link maps as dense part.
@@ -165,7 +165,12 @@ class Structured:
             dense.append(other - one)
         y = np.zeros(len(samples)) if error is None else error
         return linear.Design(
-            phi, a, b, np.concatenate(dense, axis=1), y, np.broadcast_to(looks, len(samples))
+            phi,
+            a,
+            b,
+            np.concatenate(dense, axis=1),
+            y,
+            np.broadcast_to(sample_weight, len(samples)),
         )
 
     def _site_of(self, anchors: Anchors) -> np.ndarray:
