@@ -38,7 +38,7 @@ class Sines:
         """As of Circles."""
         return self.rise + self.seconds + self.fall
 
-    def along(self, place: np.ndarray, ground: float) -> ReferenceTrajectory:
+    def starting_at(self, place: np.ndarray, ground: float) -> ReferenceTrajectory:
         """The ReferenceTrajectory, as of Circles."""
         knots = np.arange(0.0, self.duration + KNOT, KNOT)
         up = cruise(knots / self.rise, CLIMB)

@@ -14,7 +14,7 @@ GROUND = 0.03
 def followed(seed, place):
     """(Reference, t (n,) s, wanted (n, 3, 3)) up to where it sinks."""
     path = Sines(ROOM, seed)
-    reference, t = path.along(np.array(place), GROUND), np.arange(0.0, path.duration, 0.01)
+    reference, t = path.starting_at(np.array(place), GROUND), np.arange(0.0, path.duration, 0.01)
     return reference, t, reference.at(t)
 
 

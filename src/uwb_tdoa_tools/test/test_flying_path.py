@@ -8,7 +8,7 @@ GROUND = 0.03
 
 def followed(path, place=(0.3, -0.2)):
     """(Reference, t (n,) s, wanted (n, 3, 3)) up to where it sinks."""
-    reference = path.along(np.array(place), GROUND)
+    reference = path.starting_at(np.array(place), GROUND)
     t = np.arange(0.0, path.duration, 0.01)
     return reference, t, reference.at(t)
 

@@ -84,7 +84,7 @@ def test_wheels_say_more_or_less_than_is_true_and_the_imu_what_is():
 
 
 def test_it_stands_while_it_is_lost_and_goes_on():
-    path = Waypoints().along(np.zeros(2), 0.4)
+    path = Waypoints().starting_at(np.zeros(2), 0.4)
     drive, steering = rover.Drive(path, 0.6, Rules(rest=0.0)), rover.Steering()
     pose = (0.0, np.array([0.0, 0.0, 0.4]), np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
 
@@ -119,7 +119,7 @@ def test_a_verdict_of_a_rover_that_stops_elsewhere(drives):
 
 @given(st.floats(0.0, 12.0), st.floats(-0.3, 0.3))
 def test_the_nearest_point_of_a_polyline(along, off):
-    path = Waypoints().along(np.array([0.2, -0.1]), 0.4)
+    path = Waypoints().starting_at(np.array([0.2, -0.1]), 0.4)
     p = path.at(np.array([along]))[:, :2] + off
     nearest = path.at(path.nearest(p))[:, :2]
     every = path.at(np.linspace(0.0, path.length, 20001))[:, :2]

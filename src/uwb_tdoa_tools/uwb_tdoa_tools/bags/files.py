@@ -28,11 +28,11 @@ from .integrity import (
     CHECKSUM_KEY,
     NO_CHECKSUM,
     data_files,
+    decompress,
     is_compressed,
     is_mcap,
     metadata,
     sqlite_messages,
-    unpack,
     write_checksums,
 )
 from .integrity import (
@@ -158,7 +158,7 @@ def _opened(path: Path, folder: Path, salvage: bool) -> BagReader:
             check_whole(path)
             if path.is_dir() and is_compressed(metadata(path)):
                 readable = folder
-                unpack(path, folder)
+                decompress(path, folder)
                 check_whole(folder)
         reader = BagReader(readable)
         with _closing_second_connections(reader):

@@ -50,14 +50,22 @@ SYMBOLS = ("version", "start", "run", "position")
 
 
 class Peer:
-    """The library at a path. name : of its file.
+    """Call the filter in a shared library.
 
-    Raises InputError if it cannot be loaded, or is not what this module says.
+    Raises
+    ------
+    InputError
+        If the library cannot be loaded or has another interface.
     """
 
     def __init__(self, path: str | Path, own: bool = False) -> None:
-        """own : load a copy, whose static variables are as they are when a program starts, whatever
-        was done with the library before.
+        """Load the library.
+
+        Parameters
+        ----------
+        path : str or Path
+        own : bool
+            Load a copy, so that its static variables start with their initial values.
         """
         self.name = Path(path).name
         try:
@@ -89,7 +97,7 @@ class Peer:
             )
 
     def start(self, anchors: np.ndarray, p: ArrayLike, q: ArrayLike) -> None:
-        """Begin anew at p (3,) m, q (4,) x y z w, among anchors (n, 3) m."""
+        """Restart at p (3,) m with attitude q (4,) x y z w, with anchors (n, 3) m."""
         self._anchors = np.ascontiguousarray(
             anchors, dtype=float
         )  # for as long as it may look at them
@@ -129,7 +137,7 @@ class Peer:
 
 
 def events(imu: Imu, tdoa: Tdoas, anchors: Anchors) -> tuple[np.ndarray, np.ndarray]:
-    """(inertial samples, TDOAs) between known Anchors: two arrays of EVENT."""
+    """Return the inertial samples and the TDOAs between known anchors as two arrays of EVENT."""
     samples: np.ndarray = np.zeros(len(imu), EVENT)
     ranges: np.ndarray = np.zeros(len(tdoa), EVENT)
     samples["t"], samples["gyro"], samples["accel"], samples["a"] = imu.t, imu.gyro, imu.accel, -1
@@ -162,38 +170,41 @@ NO_ODOMETRY = Odometry(
 
 
 class EstimateSource(Protocol):
-    """Who tells where a vehicle is. why : what keeps it from being flown by, in words, "" for
-    nothing.
+    """Provide the estimate that a vehicle flies by.
+
+    `why` is the reason for which the estimate cannot be used, or "".
     """
 
     @property
     def why(self) -> str: ...
 
     def set_pose(self, t: float, p: np.ndarray, std: float, yaw: float) -> None:
-        """Tell that it is at p (3,) m at t, s, to so many m, and points along yaw, to as many rad;
-        NaN: nobody knows.
-        """
+        """Set the initial position and yaw, see `OwnFilter.set_pose`."""
 
     def take(self, measured: SensorReadings) -> None:
-        """Take what arrived."""
+        """Process the samples that have arrived."""
 
     @property
     def pose(self) -> Pose | None:
-        """The newest estimate."""
+        """Return the newest estimate."""
 
     @property
     def deviation(self) -> float:
-        """Largest standard deviation of a coordinate of it, m; inf without one."""
+        """Return its largest standard deviation of a coordinate, m, or inf without an estimate."""
 
     @property
     def odometry(self) -> Odometry:
-        """All that came out."""
+        """Return all estimates."""
 
 
 class OwnFilter:
-    """`Corrector` and `Estimator`, as in bias_node and ekf_node, behind the calls that a flight
-    needs: an EstimateSource. estimator : Estimator; newest : Odometry, the last that came out, or
-    None.
+    """Run `Corrector` and `Estimator` as bias_node and ekf_node do.
+
+    Attributes
+    ----------
+    estimator : Estimator
+    newest : Odometry or None
+        The last output.
     """
 
     why = ""
@@ -205,8 +216,15 @@ class OwnFilter:
         effects: EffectSet | None = None,
         network: Network | None = None,
     ) -> None:
-        """anchors : Anchors; config : FilterConfig; effects : EffectSet, and network : Network, to
-        correct what was measured with, or None.
+        """Set up the filter and its corrections.
+
+        Parameters
+        ----------
+        anchors : Anchors
+        config : FilterConfig
+        effects : EffectSet, optional
+        network : Network, optional
+            Corrections of the measurements.
         """
         effects = effects or EffectSet()
         self._anchors, self._streams, self._corrector = (
@@ -219,13 +237,23 @@ class OwnFilter:
         self.newest: Odometry | None = None
 
     def set_pose(self, t: float, p: np.ndarray, std: float, yaw: float) -> None:
-        """Tell that it is at p (3,) m at t, s, to so many m, and points along yaw, to as many rad;
-        NaN: nobody knows.
+        """Set the position and the yaw at a time.
+
+        Parameters
+        ----------
+        t : float
+            s.
+        p : numpy.ndarray
+            (3,), m.
+        std : float
+            Standard deviation of position, m, and yaw, rad.
+        yaw : float
+            rad, NaN if unknown.
         """
         self.estimator.set_pose(t, p, std**2 * np.eye(3), yaw, std)
 
     def take(self, measured: SensorReadings) -> None:
-        """Take what arrived: SensorReadings."""
+        """Process the samples that have arrived."""
         for name, part in measured.streams.items():
             if len(part.t):
                 self._add(name, self._streams.correct(name, part))
@@ -237,7 +265,7 @@ class OwnFilter:
                 self._corrector.add_pose(*poses_of(odometry))
 
     def _add(self, name: str, part: Any) -> None:
-        """Give the filter a part of a stream that is corrected, but for the bias of TDOAs."""
+        """Give a part of one stream to the filter, and correct the bias of TDOAs."""
         if name == "imu":
             self.estimator.add_imu(part.t, part.gyro, part.accel)
         elif name == "tdoa":
@@ -258,14 +286,14 @@ class OwnFilter:
 
     @property
     def pose(self) -> Pose | None:
-        """(t s, p (3,) m, v (3,) m/s, q (4,)) of the newest estimate, or None."""
+        """Return (t s, p (3,) m, v (3,) m/s, q (4,)) of the newest estimate, or None."""
         if self.newest is None:
             return None
         return self.newest.t[-1], self.newest.p[-1], self.newest.v[-1], self.newest.q[-1]
 
     @property
     def deviation(self) -> float:
-        """Largest standard deviation of a coordinate of the newest estimate, m; inf without one."""
+        """Return the largest standard deviation of a coordinate, m, or inf without an estimate."""
         if self.newest is None:
             return math.inf
         P = self.newest.covariance[-1]
@@ -273,14 +301,14 @@ class OwnFilter:
 
     @property
     def odometry(self) -> Odometry:
-        """Odometry, all that came out."""
+        """Return all estimates."""
         return concatenated(self._parts)
 
 
 class PeerFilter:
-    """A Peer behind the same calls.
+    """Run a Peer as an estimate source.
 
-    It gets place and yaw at the start, knows no effects, and says nothing of its covariance.
+    It gets place and yaw at the start. It corrects no effects and gives no covariance.
     """
 
     deviation = 0.0  # m; nobody knows
@@ -289,9 +317,21 @@ class PeerFilter:
     def __init__(
         self, library: str | Path, anchors: Anchors, yaw: float, place: np.ndarray | None = None
     ) -> None:
-        """library : path; anchors : Anchors; yaw : rad; place : (3,) m, or None.
+        """Load and start the peer.
 
-        Raises InputError.
+        Parameters
+        ----------
+        library : str or Path
+        anchors : Anchors
+        yaw : float
+            rad.
+        place : numpy.ndarray, optional
+            (3,), m.
+
+        Raises
+        ------
+        InputError
+            If the library cannot be used.
         """
         self._peer, self._anchors = Peer(library, own=True), anchors
         q = np.array([0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw)])
@@ -300,7 +340,7 @@ class PeerFilter:
         self._newest: Pose | None = None
 
     def take(self, measured: SensorReadings) -> None:
-        """Take what arrived: SensorReadings, of which other sensors are passed over."""
+        """Process the inertial samples and TDOAs that have arrived."""
         both = np.concatenate(events(measured.imu, measured.tdoa, self._anchors))
         if len(both):
             self._peer.run(both[np.argsort(both["t"], kind="stable")])
@@ -310,12 +350,12 @@ class PeerFilter:
 
     @property
     def pose(self) -> Pose | None:
-        """(t s, p (3,) m, v (3,) m/s, q (4,)) of the newest estimate that is one, or None."""
+        """Return (t s, p (3,) m, v (3,) m/s, q (4,)) of the newest finite estimate, or None."""
         return self._newest
 
     @property
     def odometry(self) -> Odometry:
-        """Odometry, all that came out; covariances NaN."""
+        """Return all estimates, with covariances of NaN."""
         if not self._states:
             return NO_ODOMETRY
         t, p, v, q = map(np.array, zip(*self._states))

@@ -1,5 +1,6 @@
-"""A filter that is reached over topics, behind the calls that a flight needs: what is measured goes
-out, odometry and status come in.
+"""Fly by a filter that is reached over topics.
+
+Sensor samples are published. Odometry and status are received.
 """
 
 from __future__ import annotations
@@ -47,34 +48,31 @@ if TYPE_CHECKING:
     from .world import World
 
 
-LARGEST_CATCH_UP = 0.1  # s: a longer delay shifts all that follows
-LONGEST_GAP = (
-    0.3  # s of stamps after which the filter goes on without a stream: more than ekf_node's `lag`
-)
-# s that it waits for what is out of order, until it knows that nothing is: more than its `reorder`
+LARGEST_CATCH_UP = 0.1  # s: a longer delay shifts all later turns
+# s of stamps, more than the parameter `lag` of ekf_node: then the filter continues without a stream
+LONGEST_GAP = 0.3
+# s, more than the parameter `reorder` of ekf_node, which waits until streams are known to be ordered
 UNTRUSTED = 0.005
-PATIENCE, IMPATIENCE = (
-    5.0,
-    0.05,
-)  # s of the wall clock for an estimate that is due, and for one after another that did not come
-REMEMBERED = 9  # odometries by which their period is known
+# s of the wall clock: wait for an odometry, and for each further one after a missing odometry
+PATIENCE, IMPATIENCE = 5.0, 0.05
+REMEMBERED = 9  # odometries that determine their period
 
 
 class RealTime:
-    """Each turn at its time."""
+    """Allow each turn at its time."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock, self._began, self._now = clock, clock(), 0.0
 
     def sent(self, now: float, measured: SensorReadings) -> None:
-        """SensorReadings, all up to `now`, s, were published."""
+        """Note that all samples up to `now`, s, were published."""
         self._now = now
 
     def heard(self, t: float) -> None:
-        """An odometry stamped t, s, has come."""
+        """Note an odometry stamped t, s."""
 
     def may_go_on(self) -> bool:
-        """Whether it is time for the next turn."""
+        """Return whether the next turn is due."""
         behind = self._clock() - self._began - self._now
         if behind > LARGEST_CATCH_UP:
             self._began += behind - LARGEST_CATCH_UP
@@ -82,9 +80,10 @@ class RealTime:
 
 
 class Lockstep:
-    """The next turn comes when the odometry is there that the filter makes of what was sent:
-    whatever else the computer does, the same seed gives the same flight. One that does not come is
-    waited for PATIENCE, and the next ones IMPATIENCE until one does.
+    """Allow the next turn when the odometry of the published samples has come.
+
+    The same seed then gives the same flight on any computer. A missing odometry is awaited for PATIENCE.
+    Until the next one comes, the wait is IMPATIENCE.
     """
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
@@ -95,7 +94,7 @@ class Lockstep:
         self._periods, self._silent = deque([DT], REMEMBERED), True
 
     def sent(self, now: float, measured: SensorReadings) -> None:
-        """SensorReadings, all up to `now`, s, were published."""
+        """Note that all samples up to `now`, s, were published."""
         self._newest |= {
             stream: part.t[-1] for stream, part in measured.streams.items() if len(part.t)
         }
@@ -107,13 +106,13 @@ class Lockstep:
         self._since = self._clock()
 
     def heard(self, t: float) -> None:
-        """An odometry stamped t, s, has come."""
+        """Note an odometry stamped t, s."""
         if self._heard is not None:
             self._periods.append(t - self._heard)
         self._heard = t
 
     def may_go_on(self) -> bool:
-        """Whether what is due is there, or is not waited for any longer."""
+        """Return whether the odometry has come or the wait is over."""
         if self._heard is not None and self._heard + median_low(self._periods) > self._reach:
             self._silent = False
             return True
@@ -123,9 +122,9 @@ class Lockstep:
         return True
 
 
-FARTHEST, FASTEST = 1e3, 100.0  # m, m/s; what is beyond is no odometry of a hall
-CLOSEST = 0.5e-3  # s between odometries that are kept: anybody may publish one for each nanosecond
-LATCHED_LIMIT = 5.0  # s that somebody may take to acknowledge what is latched
+FARTHEST, FASTEST = 1e3, 100.0  # m, m/s: limits of plausible odometry
+CLOSEST = 0.5e-3  # s, least time between stored odometries: limits the memory
+LATCHED_LIMIT = 5.0  # s, wait for acknowledgement of latched messages
 MARKER_SIZE = 0.12  # m
 # {stream: (topic, class of its messages, {field: values} of its part)}
 STREAMS: dict[str, tuple[str, type, Callable[[Any], dict[str, Any]]]] = {
@@ -149,18 +148,30 @@ STREAMS: dict[str, tuple[str, type, Callable[[Any], dict[str, Any]]]] = {
 
 
 class OverTopics:
-    """See `estimates.OurFilter`. deviation : m, as there; inf unless the filter says that it is
-    running; status : EstimatorStatus, the newest, or None.
+    """Exchange samples and estimates with a filter over topics, as an EstimateSource.
+
+    Attributes
+    ----------
+    status : EstimatorStatus or None
+        The newest status of the filter.
     """
 
     def __init__(
         self, node: StreamNode, world: World, pace: RealTime | Lockstep, clock: bool
     ) -> None:
-        """node : StreamNode; world : World; pace : of `pace`, which hears of all that goes and
-        comes; clock : publish /clock, and count stamps from 0, not from now.
+        """Create publishers and subscriptions, and publish the anchors.
+
+        Parameters
+        ----------
+        node : StreamNode
+        world : World
+        pace : RealTime or Lockstep
+            It is informed of all messages.
+        clock : bool
+            Publish /clock and count stamps from 0. Otherwise stamps count from the present time.
         """
         self._node, self._pace, self._anchors = node, pace, world.anchors
-        self._begin = 0 if clock else None  # ns, stamp of the start; of now without /clock
+        self._begin = 0 if clock else None  # ns, stamp of the start
         self._now = 0.0
         self._pending_pose: tuple[float, np.ndarray, float, float] | None = None
         self.status: EstimatorStatus | None = None
@@ -177,7 +188,7 @@ class OverTopics:
         for topic, qos, content in (
             ("/tf_static", TF_STATIC_QOS, transforms(anchors)),
             ("uwb/anchors/markers", ANCHORS_QOS, markers(anchors, MARKER_SIZE)),
-            ("uwb/anchors", ANCHORS_QOS, anchors),  # the last one: who has it hears the others
+            ("uwb/anchors", ANCHORS_QOS, anchors),  # last: its acknowledgement implies the others
         ):
             self._latched = node.create_publisher(type(content), topic, qos)
             self._latched.publish(content)
@@ -185,20 +196,20 @@ class OverTopics:
         self._rows: list[tuple[float, np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
 
     def is_connected(self) -> bool:
-        """Whether somebody listens to what is measured, and says what comes of it."""
+        """Return whether a filter subscribes to the samples and publishes odometry."""
         ends = [output.subscribers for output in (self._outputs["imu"], self._outputs["tdoa"])]
         return all(ends) and bool(self._odometry.get_publisher_count())
 
     def wait_for_anchors(self) -> None:
-        """Wait until those who listen have the anchors, and hear everything else, too."""
+        """Wait until the subscribers have received the anchors."""
         self._latched.wait_for_all_acked(Duration(seconds=LATCHED_LIMIT))
 
     def set_pose(self, t: float, p: np.ndarray, std: float, yaw: float) -> None:
-        """See OurFilter; is said before what is measured first."""
+        """Set the initial pose. It is published before the next samples."""
         self._pending_pose = t, p, std, yaw
 
     def take(self, measured: SensorReadings) -> None:
-        """Publish SensorReadings."""
+        """Publish samples."""
         if self._begin is None:
             self._begin = self._node.get_clock().now().nanoseconds
         if self._pending_pose:
@@ -209,8 +220,9 @@ class OverTopics:
             self._outputs[name].publish(*self._parts(part.t), part)
 
     def publish_truth(self, t: float, state: np.ndarray) -> None:
-        """Publish what is true at t, s, up to which everything was published: state (17,), as of
-        `vehicle`; and on /clock the time.
+        """Publish the true state at t, s, and the time on /clock.
+
+        `state` (17,) is that of `vehicle`. All samples up to t are published already.
         """
         self._now = t
         self._truth.publish(
@@ -222,9 +234,9 @@ class OverTopics:
         self._pace.sent(t, self._measured)
 
     def receive(self) -> None:
-        """Take the odometry that has come."""
+        """Store the odometry that has come."""
         for frame, rows, _ in self._odometry.fetch(self._odometry_codec):
-            if self._begin is None:  # nothing was measured yet: whose odometry is that?
+            if self._begin is None:  # odometry of another vehicle: nothing was published yet
                 continue
             t = 1e-9 * (rows["sec"].astype(np.int64) * 10**9 + rows["nanosec"] - self._begin)
             usable = (
@@ -249,7 +261,7 @@ class OverTopics:
     def _pose_of(
         self, t: float, p: np.ndarray, std: float, yaw: float
     ) -> PoseWithCovarianceStamped:
-        """PoseWithCovarianceStamped, see `set_pose`; a variance of 0 says that nobody knows."""
+        """Return the message of an initial pose. A variance of 0 means unknown."""
         message, known = PoseWithCovarianceStamped(), not math.isnan(yaw)
         message.header.stamp, message.header.frame_id = self._stamp(t), self._anchors.frame
         at, turn = message.pose.pose.position, message.pose.pose.orientation
@@ -265,13 +277,14 @@ class OverTopics:
 
     @property
     def pose(self) -> Pose | None:
-        """(t s, p (3,) m, v (3,) m/s, q (4,)) of the newest estimate, or None."""
+        """Return (t s, p (3,) m, v (3,) m/s, q (4,)) of the newest estimate, or None."""
         return self._rows[-1][:4] if self._rows else None
 
     @property
     def deviation(self) -> float:
-        """Largest standard deviation of a coordinate of the newest estimate, m; inf without one, or
-        where the filter says that it is lost.
+        """Return the largest standard deviation of a coordinate, m.
+
+        It is inf without an estimate, and unless the filter reports STATUS_RUNNING.
         """
         if (
             not self._rows
@@ -283,14 +296,14 @@ class OverTopics:
 
     @property
     def why(self) -> str:
-        """What keeps it from being flown by, in words, "" if nothing is said."""
+        """Return the reason for which the estimate cannot be used, or ""."""
         if self.status is None:
             return "nothing came on status: start ekf_node"
         return self.status.why if self.status.status != EstimatorStatus.STATUS_RUNNING else ""
 
     @property
     def odometry(self) -> Odometry:
-        """Odometry, all that came; of its covariance only that of the position, the rest 0."""
+        """Return all estimates. Only the position has a covariance."""
         if not self._rows:
             return NO_ODOMETRY
         t, p, v, q, covariance = map(np.array, zip(*self._rows))
@@ -301,7 +314,7 @@ class OverTopics:
         )
 
     def _parts(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Seconds and nanoseconds of the stamps, (n,) each, of t (n,) s."""
+        """Return seconds and nanoseconds (n,) of the stamps t (n,) s."""
         assert self._begin is not None
         return np.divmod(self._begin + np.rint(t * 1e9).astype(np.int64), 10**9)
 
@@ -311,7 +324,7 @@ class OverTopics:
 
 
 class _Output:
-    """A stream of which only some fields are not 0. subscribers : how many hear it."""
+    """Publish a stream of messages with few nonzero fields."""
 
     def __init__(
         self,
@@ -327,11 +340,13 @@ class _Output:
 
     @property
     def subscribers(self) -> int:
+        """Return the number of subscribers."""
         return self._output.publisher.get_subscription_count()
 
     def publish(self, seconds: np.ndarray, nanoseconds: np.ndarray, part: Any) -> None:
-        """Publish the rows of a part of a stream, with stamps of these seconds and nanoseconds (n,)
-        each.
+        """Publish the rows of a part of a stream.
+
+        `seconds` and `nanoseconds` (n,) are its stamps.
         """
         content = self._content(part)
         if self._template is None:

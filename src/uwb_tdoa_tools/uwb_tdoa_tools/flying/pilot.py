@@ -1,6 +1,6 @@
-"""Does what is asked for piece by piece, with the vehicle of a Trial: take off, go to, land.
+"""Fly a vehicle by commands: take off, go to, land, as in crazyswarm2.
 
-Refuses, with why, what it cannot do.
+A command that cannot be executed raises an InputError with the reason.
 """
 
 from __future__ import annotations
@@ -23,42 +23,52 @@ if TYPE_CHECKING:
     from .trial import Trial
 
 
-MAX_SPEED, MAX_ACCELERATION = 1.5, 1.2  # m/s and m/s^2, on the way to a goal
-PEAK_SPEED, PEAK_ACCELERATION = (
-    15.0 / 8.0,
-    10.0 / math.sqrt(3.0),
-)  # of a way of 1 m in 1 s, from rest to rest
+MAX_SPEED, MAX_ACCELERATION = 1.5, 1.2  # m/s and m/s^2 of a motion to a goal
+# peaks of a motion over 1 m in 1 s from rest to rest
+PEAK_SPEED, PEAK_ACCELERATION = 15.0 / 8.0, 10.0 / math.sqrt(3.0)
 MAX_YAW_RATE = 1.5  # rad/s
 LONGEST = 600.0  # s
-HIGHEST = 1.0  # m, of what it lands on: from higher up it would sink for too long
+HIGHEST = 1.0  # m, largest height of a table: a longer descent takes too long
 STILL = np.zeros(4)
 
 
 class CommandedPath:
-    """A Reference that grows by commands, each from where the last one has it by then. duration : s
-    since the start, inf before it is to land. Commands raise InputError, with why it does not do
-    that.
+    """Extend a path by commands.
+
+    Each command starts at the position that the path has at that time. A command that cannot be executed
+    raises InputError.
+
+    Attributes
+    ----------
+    duration : float
+        Time from the start to the final descent, s. It is inf before `land`.
     """
 
     def __init__(self, p: np.ndarray, yaw: float, size: Sequence[float]) -> None:
-        """p (3,) m and yaw, rad: where it stands, as estimated; size (3,) m, of the hall, around
-        the origin in x and y.
+        """Start at rest.
+
+        Parameters
+        ----------
+        p, yaw
+            Estimated position (3,), m, and yaw, rad.
+        size : sequence of float
+            Size of the hall (3,), m, centered on the origin in x and y.
         """
         self.duration, self._size, self._first_yaw = math.inf, size, yaw
         self._goal = np.array([*p, yaw])
         self._begins, self._ways = [0.0], [_way((self._goal, STILL, STILL), self._goal, 1.0)]
 
-    def along(self, place: np.ndarray, ground: float) -> CommandedPath:
-        """Itself, as it knows where it begins."""
+    def starting_at(self, place: np.ndarray, ground: float) -> CommandedPath:
+        """Return the path itself: its start is known."""
         return self
 
     @property
     def end(self) -> np.ndarray:
-        """(2,) m, where it stays, or lands."""
+        """Return the place of the landing (2,), m."""
         return self._goal[:2]
 
     def take_off(self, height: float, seconds: float) -> None:
-        """Go straight up to a height, m, within so many s."""
+        """Go straight up to a height, m, within `seconds`."""
         self._go(0.0, [*self._goal[:2], height, self._goal[3]], seconds)
 
     def go_to(
@@ -69,17 +79,26 @@ class CommandedPath:
         yaw: float,
         seconds: float,
     ) -> None:
-        """From `now`, s since the start, be at goal (3,) m with a yaw, rad, within so many s;
-        relative : both are counted from where it is going.
+        """Go to a place within `seconds`.
+
+        Parameters
+        ----------
+        now : float
+            Time since the start, s.
+        relative : bool
+            Count goal and yaw from the goal before.
+        goal : array_like
+            (3,), m.
+        yaw : float
+            rad.
+        seconds : float
         """
         self._check_flying()
         goal = np.array([*goal, yaw])
         self._go(now, self._goal + goal if relative else goal, seconds)
 
     def land(self, now: float, height: float, seconds: float) -> None:
-        """From `now` on come down to SETTLE above `height`, m, within so many s, and sink from
-        there.
-        """
+        """Descend from `now`, s, to SETTLE above `height`, m, within `seconds`, and land."""
         self._check_flying()
         if not 0.0 <= height <= HIGHEST:
             raise InputError(
@@ -91,15 +110,15 @@ class CommandedPath:
         self.duration = now + seconds
 
     def at(self, t: np.ndarray) -> np.ndarray:
-        """Position, velocity and acceleration (n, 3, 3), m and s, at t (n,) s since the start."""
+        """Return position, velocity and acceleration (n, 3, 3), m and s, at t (n,) s."""
         return with_descent(np.stack([self._at(one)[:, :3] for one in t]), t > self.duration)
 
     def yaw_offset(self, t: float) -> float:
-        """rad by which it is to be turned at t, s."""
+        """Return the wanted turn since the start, rad, at t, s."""
         return float(self._at(t)[0, 3]) - self._first_yaw
 
     def _at(self, t: float) -> np.ndarray:
-        """(3, 4): x, y, z and yaw, and their derivatives."""
+        """Return x, y, z and yaw with two derivatives (3, 4)."""
         k = max(int(np.searchsorted(self._begins, t, side="right")) - 1, 0)
         way = self._ways[k]
         since = min(t - self._begins[k], way[0].x[-1])
@@ -145,8 +164,9 @@ class CommandedPath:
 def _way(
     begin: Sequence[np.ndarray], goal: np.ndarray, seconds: float
 ) -> tuple[BPoly, BPoly, BPoly]:
-    """Functions of time, s, to (4,): from `begin`, value and derivatives, to a goal within so many
-    s, and staying there; its derivatives.
+    """Return functions of time to (4,): the motion to a goal within `seconds`, and two derivatives.
+
+    `begin` holds the value and its derivatives at the start.
     """
     value = BPoly.from_derivatives(
         [0.0, seconds, seconds + 1.0], [begin, (goal, STILL, STILL), (goal, STILL, STILL)]
@@ -158,24 +178,24 @@ pass
 
 
 class Pilot:
-    """Of a Trial, whose source also says `why` it is not to be flown by.
+    """Execute the commands of a user with the vehicle of a Trial.
 
-    Seconds, metres and rad; raises InputError.
+    Times are in s, lengths in m, angles in rad. Commands raise InputError.
     """
 
     def __init__(self, trial: Trial) -> None:
-        """trial : Trial."""
+        """Control the vehicle of `trial`."""
         self._trial = trial
         self._path: CommandedPath | None = None
 
     @property
     def _mission(self) -> Mission | None:
-        """The mission in the air, or None."""
+        """Return the mission in the air, or None."""
         last = self._trial.missions[-1:]
         return last[0] if last and last[0].state in (FLYING, LOST) else None
 
     def take_off(self, group_mask: int, height: float, seconds: float) -> None:
-        """Take off from where it stands, if it knows where that is."""
+        """Take off from the present place if the estimate is good enough."""
         _check(group_mask)
         if self._mission is not None:
             raise InputError("it flies already; go to a place, or land.")
@@ -198,12 +218,12 @@ class Pilot:
     ) -> None:
         """Go to goal (3,) m."""
         mission, path = self._in_air(group_mask)
-        path.go_to(mission.along, relative, goal, yaw, seconds)
+        path.go_to(mission.path_time, relative, goal, yaw, seconds)
 
     def land(self, group_mask: int, height: float, seconds: float) -> None:
-        """Land where it is, on what is `height` m high."""
+        """Land at the present place, on ground of the given height."""
         mission, path = self._in_air(group_mask)
-        path.land(mission.along, height, seconds)
+        path.land(mission.path_time, height, seconds)
 
     def _in_air(self, group_mask: int) -> tuple[Mission, CommandedPath]:
         _check(group_mask)

@@ -217,7 +217,7 @@ class RoverTrial(Trial):
         return Steering()
 
     def _mission(self, path: Waypoints, rules: Rules) -> Any:
-        way = path.along(self.simulator.state[:2].copy(), MAST)
+        way = path.starting_at(self.simulator.state[:2].copy(), MAST)
         return Drive(way, path.speed, rules, self.simulator.now)
 
     def turn(self) -> None:
@@ -225,7 +225,7 @@ class RoverTrial(Trial):
         self.controller.stop()
         if self.missions:
             drive: Any = self.missions[-1]
-            self._let_happen(drive)
+            self._schedule_faults(drive)
             source = self.source
             drive.decide(self.simulator.now, source.pose, source.deviation, self.controller)
         self._turn()

@@ -1,4 +1,4 @@
-"""A vehicle in a world, turn by turn: what it does, and what its sensors say of that."""
+"""Move a vehicle turn by turn, simulate its sensors, and delay their messages."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 
 
 STEPS = round(1.0 / (IMU_RATE * STEP))  # of the integration, per sample
-TURNING = 50.0  # rad/s of a rotor, above which it shakes the vehicle
+TURNING = 50.0  # rad/s, rotor speed above which the vehicle vibrates
 
 
 @compiled
@@ -52,17 +52,26 @@ def interval(
     disturbances: tuple[np.ndarray, np.ndarray, np.ndarray],
     measured: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> None:
-    """Fly n samples of the inertial sensor long.
+    """Fly for n samples of the inertial sensor.
 
-    state (17,) and gyro (2, 3) rad/s, as felt last and before that, are updated; wanted : thrust,
-    N, and rates (3,) rad/s;
-    controller : its gains, and the vehicle that it knows; vehicle : NUMBERS, the true ones;
-    disturbances : wind (n, 3) m/s; errors (n, 6), what the sensor adds to rates, rad/s, and
-        specific force, m/s^2;
-    shaking (n, 3) m/s^2, what rotors add that turn.
-    felt, written to : truth (n, 17), the states at the samples; samples (n, 6), rates and specific
-        force: means since the sample
-    before; contact (n,): the number of feet on the ground.
+    Parameters
+    ----------
+    state : numpy.ndarray
+        State (17,), updated in place.
+    gyro : numpy.ndarray
+        The last two measured body rates (2, 3), rad/s, newest first, updated in place.
+    wanted : tuple
+        Thrust, N, and body rates (3,), rad/s.
+    controller : tuple
+        Records of the gains and of the vehicle that the controller assumes.
+    vehicle : Record
+        Record of the true vehicle.
+    disturbances : tuple
+        Wind (n, 3) m/s. Sensor errors (n, 6) of rates, rad/s, and specific force, m/s^2. Vibration
+        (n, 3) m/s^2 while rotors turn.
+    measured : tuple
+        Outputs: true states (n, 17); mean rates and specific force (n, 6) since the sample before;
+        number of feet on the ground (n,).
     """
     thrust, rates = wanted[0], wanted[1]
     gains, known = controller[0], controller[1]
@@ -99,8 +108,16 @@ def interval(
 def poses_at(
     t: np.ndarray, times: np.ndarray, states: np.ndarray, p: np.ndarray, q: np.ndarray
 ) -> None:
-    """Positions p (n, 3) and attitudes q (n, 4) at t (n,) s, between states (m, 17) at times (m,)
-    s; written to.
+    """Interpolate poses between true states.
+
+    Parameters
+    ----------
+    t : numpy.ndarray
+        Stamps (n,), s.
+    times, states : numpy.ndarray
+        Stamps (m,), s, and states (m, 17).
+    p, q : numpy.ndarray
+        Positions (n, 3), m, and attitudes (n, 4), x y z w. They are written.
     """
     j = 0
     for i in range(len(t)):
@@ -120,21 +137,25 @@ def poses_at(
 pass
 
 
-TICK = 4  # samples of the inertial sensor, from one turn of the controller to the next
+TICK = 4  # inertial samples per turn of the controller
 DT = TICK / IMU_RATE  # s
-START_SPREAD = (
-    0.5  # m from the middle of the hall, along each axis, to the middle of where it flies
-)
-MASS_ERROR = 0.05  # largest relative error of the mass that its controller believes
+START_SPREAD = 0.5  # m, largest offset of the path from the middle of the hall along each axis
+MASS_ERROR = 0.05  # largest relative error of the mass in the controller
 TABLE_RADIUS = 0.4  # m
-CARRY_HEIGHT = 0.5  # m, by which hands lift it
-RECENT = round(0.3 * IMU_RATE)  # samples of the truth that effects see
+CARRY_HEIGHT = 0.5  # m, height at which it is carried
+RECENT = round(0.3 * IMU_RATE)  # samples of the truth that effects use
 
 
 @dataclass(frozen=True)
 class SensorReadings:
-    """What came in one turn. imu : Imu; tdoa : Tdoas; aids : {name: Stream}, of those that the
-    world has.
+    """Hold the sensor samples of one turn.
+
+    Parameters
+    ----------
+    imu : Imu
+    tdoa : Tdoas
+    aids : dict of str to Stream
+        Streams of the other sensors of the world, by name.
     """
 
     imu: Imu
@@ -143,19 +164,35 @@ class SensorReadings:
 
     @property
     def streams(self) -> dict[str, Any]:
-        """{name: what came of it}, of all."""
+        """Return all streams by name."""
         return {"imu": self.imu, "tdoa": self.tdoa, **self.aids}
 
 
 class Simulator:
-    """One vehicle for so many seconds. state (17,), as of `vehicle`; vehicle : the true Vehicle;
-    believed : the one that its controller knows; times (n,) s, states (n, 17), contact (n,) number
-    of feet on the ground: at each sample of the inertial sensor, up to `done`.
+    """Simulate one quadrotor and its sensors for a given duration.
+
+    Attributes
+    ----------
+    state : numpy.ndarray
+        True state (17,), see `vehicle`.
+    vehicle, nominal : Vehicle
+        The true vehicle, and the vehicle that its controller assumes.
+    times, states, contact : numpy.ndarray
+        Stamps (n,) s, states (n, 17) and number of feet on the ground (n,) at each inertial sample.
+        Rows up to `done` are valid.
     """
 
     def __init__(self, world: World, seed: int, duration: float, radius: float = 0.0) -> None:
-        """world : World; duration : s; radius : m, of the circle whose point nearest to +x it
-        starts from.
+        """Draw the start, the errors and the disturbances.
+
+        Parameters
+        ----------
+        world : World
+        seed : int
+        duration : float
+            s.
+        radius : float
+            Radius of the circle whose point nearest to +x is the start, m.
         """
         self.world, rng = world, random(seed, "place")
         middle, yaw = rng.uniform(-START_SPREAD, START_SPREAD, 2), rng.uniform(-np.pi, np.pi)
@@ -185,32 +222,39 @@ class Simulator:
         self.samples = np.zeros((n, 6))
         self.done, self.states[0], self._gyro = 0, self.state, np.zeros((2, 3))
         self._carrying: tuple[np.ndarray, float, float, np.ndarray] | None = (
-            None  # state and s at first, s at last, way
+            None  # state and time at the start, time at the end, path
         )
         self._heard = dict.fromkeys(("tdoa", *world.aids), 0)
         self._first: tuple[Tdoas, np.ndarray] | None = (
-            None  # what was heard first, and the state then
+            None  # first TDOAs, and the state at that time
         )
 
     @property
     def now(self) -> float:
-        """s"""
+        """Return the time since switching on, s."""
         return self.times[self.done]
 
     @property
     def over(self) -> bool:
-        """True when there is no time left."""
+        """Return whether the duration is used up."""
         return self.done + TICK >= len(self.times)
 
     @property
     def ground(self) -> float:
-        """Height of what is below it, m."""
+        """Return the height of the ground or table below the vehicle, m."""
         return ground_at(self._record, self.state[0], self.state[1])
 
     def advance(self, controller: Any) -> SensorReadings:
-        """Move for one turn as a controller of this vehicle wants, or be carried on by hands.
+        """Move for one turn and return the sensor samples.
 
-        Returns SensorReadings.
+        Parameters
+        ----------
+        controller : Controller or Steering
+            Controller of this vehicle.
+
+        Returns
+        -------
+        SensorReadings
         """
         k = self.done
         rows, lately = slice(k + 1, k + TICK + 1), slice(k, k + TICK + 1)
@@ -233,7 +277,7 @@ class Simulator:
         return self._with_effects(SensorReadings(imu, tdoa, aids))
 
     def _move(self, controller: Any, rows: slice) -> None:
-        """Fly the samples in `rows` by what a Controller wants."""
+        """Fly the samples in `rows` with the outputs of a Controller."""
         interval(
             self.state,
             self._gyro,
@@ -245,12 +289,21 @@ class Simulator:
         )
 
     def carry(self, by: np.ndarray, seconds: float) -> None:
-        """Be carried by (2,) m, lifted and put down, within so many s, from now on."""
+        """Lift the vehicle, move it and put it down, from now on.
+
+        Parameters
+        ----------
+        by : numpy.ndarray
+            Displacement (2,), m.
+        seconds : float
+            Duration, s.
+        """
         begin, end = self.state.copy(), self.now + seconds
         way = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, CARRY_HEIGHT], [*by, CARRY_HEIGHT], [*by, 0.0]])
         self._carrying = begin, self.now, end, way
 
     def _carry(self, rows: slice) -> None:
+        """Move along the path of the hands, with the rotors off."""
         assert self._carrying is not None
         begin, since, until, way = self._carrying
         t, h = self.times[rows], 0.5 / IMU_RATE
@@ -274,8 +327,9 @@ class Simulator:
     def _poses(
         self, stream: str, t: np.ndarray, lately: slice
     ) -> tuple[slice, np.ndarray, np.ndarray]:
-        """(slice, p (k, 3) m, q (k, 4)): what of a stream with stamps t (n,) s is new, and the
-        poses then.
+        """Return the new rows of a stream with stamps t (n,) s, and their poses.
+
+        The result is (slice, p (k, 3) m, q (k, 4)).
         """
         first = self._heard[stream]
         new = slice(first, int(np.searchsorted(t, self.now, side="right")))
@@ -285,6 +339,7 @@ class Simulator:
         return new, p, q
 
     def _aid_measured(self, name: str, sensor: AidSensor, lately: slice) -> Stream:
+        """Return the new measurements of one sensor."""
         new, p, q = self._poses(name, sensor.t, lately)
         v = np.broadcast_to(self.state[VELOCITY], p.shape)
         inside = Rotation.from_quat(q).inv().apply(v) if len(q) else v
@@ -293,12 +348,12 @@ class Simulator:
         )
 
     def _with_effects(self, measured: SensorReadings) -> SensorReadings:
-        """SensorReadings, with the world's effects in it, put there as `inject` does."""
+        """Return the samples with the effects of the world added by `Effect.inject`."""
         if not len(self.world.effects) or not len(measured.tdoa):
             return measured
         tdoa = measured.tdoa
         self._first = self._first if self._first is not None else (tdoa, self.states[0])
-        first, at = self._first  # of the flight: times count from it
+        first, at = self._first  # effects count time from the first TDOA
         columns = (
             np.concatenate([getattr(first, name)[:1], getattr(tdoa, name)])
             for name in ("t", "a", "b", "d")
@@ -313,7 +368,7 @@ class Simulator:
         flight = Flight("turn", self.world.anchors, Tdoas(*columns), measured.imu, truth, **aids)
         for effect in self.world.effects.effects:
             flight = effect.inject(flight, self._rng)
-        assert flight.imu is not None  # as no effect takes it away
+        assert flight.imu is not None  # no effect removes it
         aids = {name: getattr(flight, name) for name in measured.aids}
         return replace(
             measured, tdoa=rows_of(flight.tdoa, slice(1, None)), imu=flight.imu, aids=aids
@@ -321,8 +376,9 @@ class Simulator:
 
 
 def _along(way: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """(n, 3) m, along places (m, 3), smoothly from each to the next, at shares (n,) of the whole
-    time.
+    """Return places (n, 3), m, on a smooth motion through `way` (m, 3).
+
+    `share` (n,) is the share of the whole duration.
     """
     part = np.clip(share, 0.0, 1.0) * (len(way) - 1)
     k = np.minimum(part.astype(int), len(way) - 2)
@@ -334,22 +390,35 @@ pass
 
 
 class Transport:
-    """Holds what was measured until it arrives; within a stream nothing overtakes."""
+    """Delay sensor messages on their way to the estimator.
+
+    Messages of one stream keep their order.
+    """
 
     def __init__(self, latency: float, jitter: float, rng: np.random.Generator) -> None:
-        """latency : s, of everything; jitter : s, mean of what comes on top; rng : numpy Generator."""
+        """Set the delays.
+
+        Parameters
+        ----------
+        latency : float
+            Delay of every message, s.
+        jitter : float
+            Mean of an additional exponential delay, s.
+        rng : numpy.random.Generator
+        """
         self._latency, self._jitter, self._rng = latency, jitter, rng
-        # by stream: (what waits, when it arrives (n,) s, the last arrival)
+        # by stream: (waiting rows, their arrivals (n,) s, the last arrival)
         self._waiting: dict[str, tuple[Any, np.ndarray, float]] = {}
 
     def arrived(self, measured: SensorReadings, now: float) -> SensorReadings:
-        """SensorReadings that have arrived by `now`, s, after more of them were sent."""
+        """Add new samples and return the samples that have arrived by `now`, s."""
         if not self._latency and not self._jitter:
             return measured
         parts = {stream: self._due(stream, part, now) for stream, part in measured.streams.items()}
         return SensorReadings(parts.pop("imu"), parts.pop("tdoa"), parts)
 
     def _due(self, stream: str, part: Any, now: float) -> Any:
+        """Return the rows of one stream that have arrived."""
         held, arrival, last = self._waiting.get(stream, (None, np.empty(0), 0.0))
         delay = (
             self._latency + self._rng.exponential(self._jitter, len(part))

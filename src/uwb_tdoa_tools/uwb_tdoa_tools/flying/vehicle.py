@@ -1,11 +1,12 @@
-"""A small quadrotor: rigid body, motors, drag, gusts, and a floor to stand on. Compiled.
+"""Simulate a small quadrotor: rigid body, motors, drag, wind, and ground contact.
 
-Equations: Newton and Euler for a rigid body; thrust and yaw moment with the square of a rotor's
-speed, rotor drag with its speed and the air's (Foerster, System Identification of the Crazyflie 2.0
-Nano Quadrocopter, ETH 2015, whose values these are, as rotorpy has them); first-order motors;
-ground effect of each rotor after Cheeseman and Bennett (ARC R&M 3021, 1955); feet on springs with
-dampers, and Coulomb friction. Frames: world z up, body x forward, y left, z up; quaternions x y z
-w, body to world.
+The rigid body follows Newton and Euler. Thrust and yaw moment grow with the square of the rotor
+speed. Rotor drag grows with the rotor speed and the air speed. The values are from Foerster, System
+Identification of the Crazyflie 2.0 Nano Quadrocopter, ETH 2015, as in rotorpy. Motors are first-order
+lags. The ground effect follows Cheeseman and Bennett (ARC R&M 3021, 1955). Feet are springs with
+dampers and Coulomb friction.
+
+Frames: world z up; body x forward, y left, z up. Quaternions are x y z w, body to world.
 """
 
 from __future__ import annotations
@@ -19,8 +20,7 @@ import numpy as np
 from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.geometry import rotate
 
-# row of a structured array, whose fields compiled code reads as attributes: Python has no type for
-# it
+# Compiled code reads the fields of a structured row as attributes. Python has no type for that.
 Record = Any
 
 GRAVITY = 9.81  # m/s^2
@@ -43,19 +43,36 @@ SPIN = np.array([1.0, -1.0, 1.0, -1.0])  # sign of the yaw moment on the body
 
 @dataclass(frozen=True)
 class Vehicle:
-    """A Crazyflie 2.x with its deck.
+    """Describe a Crazyflie 2.x with its deck.
 
-    mass : kg; inertia_xy, inertia_z : kg m^2; arm : m, from the middle to each rotor; thrust :
-        N/(rad/s)^2 of a rotor;
-    moment : Nm/(rad/s)^2, its yaw moment; rotor_drag, inflow : N/(rad/s)/(m/s), across and along
-        the body's z; body_drag : N/(m/s)^2;
-    motor_time : s, of the motors; top_speed : rad/s of a rotor; radius : m, of a rotor, for the
-        ground effect, 0 for none;
-    leg : m, from the middle down to the feet; stiffness, damping, friction_damping : N/m, N/(m/s),
-        N/(m/s), of a foot;
-    friction : coefficient; floor : m, height of the ground; table, table_x, table_y, table_radius :
-        m, height of a round table above
-    the floor, its place and size; 0 for none.
+    Parameters
+    ----------
+    mass : float
+        kg.
+    inertia_xy, inertia_z : float
+        kg m^2.
+    arm : float
+        From the center to each rotor, m.
+    thrust, moment : float
+        Thrust, N/(rad/s)^2, and yaw moment, Nm/(rad/s)^2, of a rotor.
+    rotor_drag, inflow : float
+        Drag of a rotor across and along the z axis of the body, N/(rad/s)/(m/s).
+    body_drag : float
+        N/(m/s)^2.
+    motor_time, top_speed : float
+        Time constant, s, and largest speed, rad/s, of a motor.
+    radius : float
+        Of a rotor for the ground effect, m. 0 switches the effect off.
+    leg : float
+        From the center down to the feet, m.
+    stiffness, damping, friction_damping : float
+        Of a foot, N/m, N/(m/s) and N/(m/s).
+    friction : float
+        Coefficient of friction.
+    floor : float
+        Height of the ground, m.
+    table, table_x, table_y, table_radius : float
+        Height above the floor, place and radius of a round table, m. A radius of 0 means no table.
     """
 
     mass: float = 0.030
@@ -82,11 +99,19 @@ class Vehicle:
     table_radius: float = 0.0
 
     def record(self) -> Record:
-        """The record, of NUMBERS, that compiled code takes."""
+        """Return the parameters as a record for compiled code."""
         return np.array([tuple(asdict(self).values())], RECORD)[0]
 
     def at_rest(self, x: float, y: float, yaw: float) -> np.ndarray:
-        """A state (17,): standing on what is below (x, y), m, with its rotors still."""
+        """Return the state (17,) of a vehicle that stands on the ground or the table.
+
+        Parameters
+        ----------
+        x, y : float
+            Place, m.
+        yaw : float
+            rad.
+        """
         state = np.zeros(STATE)
         sag = self.mass * GRAVITY / (ROTORS * self.stiffness)
         state[POSITION] = x, y, ground_at(self.record(), x, y) + self.leg - sag
@@ -99,7 +124,7 @@ RECORD = np.dtype([(field.name, float) for field in fields(Vehicle)], align=True
 
 @compiled
 def ground_at(record: Record, x: float, y: float) -> float:
-    """Height of what is below (x, y), m."""
+    """Return the height of the ground or the table at (x, y), m."""
     if (
         record.table_radius > 0.0
         and math.hypot(x - record.table_x, y - record.table_y) <= record.table_radius
@@ -117,11 +142,22 @@ def step(
     record: Record,
     scratch: np.ndarray,
 ) -> int:
-    """Advance `state` (17,) by dt, s, with the commanded rotor `speeds` (4,) rad/s in a `wind` (3,)
-    m/s, world.
+    """Integrate the state over one time step and return the number of feet on the ground.
 
-    numbers : of a Vehicle; scratch : (2, 17), is written to. Returns the number of feet on the
-        ground.
+    Parameters
+    ----------
+    state : numpy.ndarray
+        State (17,), updated in place.
+    speeds : numpy.ndarray
+        Commanded rotor speeds (4,), rad/s.
+    wind : numpy.ndarray
+        Wind (3,), m/s, world frame.
+    dt : float
+        Time step, s.
+    record : Record
+        Record of a Vehicle.
+    scratch : numpy.ndarray
+        Working memory (2, 17).
     """
     _derivative(state, speeds, wind, record, scratch[0])
     for k in range(STATE):
@@ -139,9 +175,9 @@ def step(
 def _derivative(
     state: np.ndarray, speeds: np.ndarray, wind: np.ndarray, record: Record, out: np.ndarray
 ) -> int:
-    """Time derivative of a state, to `out` (17,). Returns the number of feet on the ground."""
+    """Write the time derivative of a state to `out` (17,) and return the number of feet on the ground."""
     q, w = state[6:10], state[10:13]
-    # columns of the rotation matrix are the body's axes in the world
+    # columns of the rotation matrix: axes of the body in the world frame
     x, y, z, s = q[0], q[1], q[2], q[3]
     r00, r01, r02 = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * s), 2.0 * (x * z + y * s)
     r10, r11, r12 = 2.0 * (x * y + z * s), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * s)
@@ -220,8 +256,16 @@ def _derivative(
 
 @compiled
 def specific_force(before: np.ndarray, after: np.ndarray, dt: float, out: np.ndarray) -> None:
-    """Mean specific force (3,) m/s^2, in the body frame of the state `after`, over the dt s from
-    the state `before`: to `out`.
+    """Compute the mean specific force between two states.
+
+    Parameters
+    ----------
+    before, after : numpy.ndarray
+        States (17,).
+    dt : float
+        Time between them, s.
+    out : numpy.ndarray
+        Specific force (3,), m/s^2, body frame of `after`. It is written.
     """
     back = np.empty(4)
     back[0], back[1], back[2], back[3] = -after[6], -after[7], -after[8], after[9]
