@@ -39,7 +39,7 @@ class Said(OwnFilter):
 @pytest.fixture
 def flight():
     """(Trial, Pilot) of a vehicle that stands."""
-    trial = Trial(Task(PERFECT, 3, "place"), Said(PERFECT.anchors, FilterConfig()), lasts=40.0)
+    trial = Trial(Task(PERFECT, 3, "place"), Said(PERFECT.anchors, FilterConfig()), duration=40.0)
     return trial, Pilot(trial)
 
 

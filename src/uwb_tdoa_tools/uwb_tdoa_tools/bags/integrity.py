@@ -1,6 +1,4 @@
-"""Whether the files of a bag are whole, as far as their format can tell, before anything else is
-done with them.
-"""
+"""Check the files of a bag before they are used."""
 
 from __future__ import annotations
 
@@ -23,30 +21,41 @@ from .mcap import Damaged, zstd
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-# in the bag's custom data: CRC-32 of its data file, 8 hexadecimal digits
+# in the custom data of the bag: CRC-32 of the data file, 8 hexadecimal digits
 CHECKSUM_KEY = "uwb_tdoa_tools.crc32"
 NO_CHECKSUM = "--------"
-_BLOCK = 1 << 20  # bytes that are read at once
-_STEPS = 20_000  # instructions of SQLite from one look at the time to the next: some milliseconds
+_BLOCK = 1 << 20  # bytes per read
+_STEPS = 20_000  # instructions of SQLite between checks of the time: some milliseconds
 _PLAIN_SCHEMA = re.compile(
     r"CREATE\s+(TABLE|INDEX)\s[^()]*\([\w\s,\"'`\[\]]*\)\s*", re.IGNORECASE
-)  # no bracket within: nothing is computed
+)  # without inner brackets nothing is computed
 sqlite3.enable_callback_tracebacks(
     True
-)  # or Ctrl-C that comes while SQLite asks for the time is lost (foundation/executable.py)
-_TYPES = (  # columns of an SQLite bag and what they hold
+)  # else a Ctrl-C in a callback of SQLite is lost (foundation/executable.py)
+_TYPES = (  # columns of an SQLite bag and their types
     ("messages", {"timestamp": "integer", "topic_id": "integer", "data": "blob"}),
     ("topics", {"id": "integer", "name": "text", "type": "text", "serialization_format": "text"}),
 )
 
 
 def check(path: str | Path) -> None:
-    """Raise Damaged, or InputError for metadata.yaml, unless the files of a bag (directory or data
-    file) are whole.
+    """Check the files of a bag.
 
-    The checksums that MCAP files hold and that `seal` left in metadata.yaml, the structure of
-    SQLite files, and that metadata.yaml says what it must. Files that rosbag2 compressed as a whole
-    (see `is_packed`) are only there or not.
+    The check covers the checksums in MCAP files and in metadata.yaml (`write_checksums`), the structure of
+    SQLite files, and the entries of metadata.yaml. Files that rosbag2 has compressed as a whole only have
+    to exist.
+
+    Parameters
+    ----------
+    path : str or Path
+        Bag directory or data file.
+
+    Raises
+    ------
+    Damaged
+        If a file is damaged.
+    InputError
+        If metadata.yaml cannot be read.
     """
     path = Path(path)
     if not path.is_dir():
@@ -65,19 +74,22 @@ def check(path: str | Path) -> None:
 
 
 def data_files(path: Path, information: dict[str, Any]) -> list[Path]:
-    """Paths of the data files of a bag directory."""
+    """Return the paths of the data files of a bag directory."""
     return [path / Path(name).name for name in information["relative_file_paths"]]
 
 
 def is_compressed(information: dict[str, Any]) -> bool:
-    """Whether rosbag2 has compressed the data files as a whole."""
+    """Return whether rosbag2 has compressed whole data files."""
     return information["compression_mode"] == "file"
 
 
 def decompress(path: Path, folder: Path) -> None:
-    """Write a bag whose files are compressed as a whole to an empty folder, unpacked.
+    """Decompress a bag whose files are compressed as a whole into an empty folder.
 
-    Raises Damaged, InputError.
+    Raises
+    ------
+    Damaged, InputError
+        If a file or metadata.yaml cannot be read.
     """
     information = metadata(path)
     names, files = [], data_files(path, information)
@@ -104,8 +116,12 @@ def decompress(path: Path, folder: Path) -> None:
 
 
 def metadata(path: Path) -> dict[str, Any]:
-    """What metadata.yaml of a bag directory says, with what we use in it present and of the right
-    kind: dict. Raises InputError, and Damaged.
+    """Return the content of metadata.yaml with the needed entries of the right type.
+
+    Raises
+    ------
+    Damaged, InputError
+        If an entry is missing or wrong.
     """
     content = read_yaml(path / "metadata.yaml")
     information = content.get("rosbag2_bagfile_information") if isinstance(content, dict) else None
@@ -150,9 +166,9 @@ def metadata(path: Path) -> dict[str, Any]:
 
 
 def write_checksums(path: str | Path) -> None:
-    """Put the checksums of a bag that rosbags has just written in their places.
+    """Write the checksums of a bag that rosbags has just written.
 
-    It must hold SUM_KEY: NO_SUM.
+    Its metadata must hold CHECKSUM_KEY: NO_CHECKSUM.
     """
     (data,) = (file for file in Path(path).iterdir() if file.name != "metadata.yaml")
     if data.suffix == ".mcap":
@@ -167,19 +183,22 @@ def write_checksums(path: str | Path) -> None:
 
 
 def open_sqlite(file: str | Path) -> sqlite3.Connection:
-    """A connection that only reads, a file that is cut as well, in which nothing is but tables and
-    indexes of columns: what is computed (views, virtual tables, checks, expressions) may take for
-    ever. So may pages that share their children: each query ends when the time of the file is up.
-    Raises Damaged.
+    """Open an SQLite file for reading, even a cut one.
+
+    Views, virtual tables, checks and expressions are refused because they may take forever. Pages that
+    share children may do so too. Each query therefore ends when the time limit of the file is reached.
+
+    Raises
+    ------
+    Damaged
+        If the file has anything but plain tables and indexes.
     """
     connection = sqlite3.connect(
         f"file:{quote(str(Path(file).absolute()))}?mode=ro&immutable=1", uri=True
     )
     connection.set_progress_handler(Budget(file, Path(file).stat().st_size).is_late, _STEPS)
     try:
-        connection.execute(
-            "PRAGMA writable_schema=ON"
-        )  # else not one page of a file that has fewer than it says
+        connection.execute("PRAGMA writable_schema=ON")  # else SQLite reads no page of a cut file
         for name, text in connection.execute(
             "SELECT name, sql FROM sqlite_master WHERE sql IS NOT NULL"
         ):
@@ -191,7 +210,7 @@ def open_sqlite(file: str | Path) -> sqlite3.Connection:
 
 
 def is_mcap(file: Path) -> bool:
-    """Whether a data file is MCAP, by its first bytes; else it must be SQLite."""
+    """Return whether a data file is MCAP by its first bytes. Otherwise it must be SQLite."""
     with file.open("rb") as opened:
         return opened.read(len(mcap.MAGIC)) == mcap.MAGIC
 
@@ -220,9 +239,12 @@ def _check_data(file: Path, packed_messages: bool = False) -> None:
 
 
 def sqlite_messages(file: Path) -> Iterator[tuple[int, int, int, bytes]]:
-    """Yields (id, topic id, stamp, data) of an SQLite file in the order of the ids.
+    """Yield (id, topic id, stamp, data) of an SQLite file in the order of ids.
 
-    Raises Damaged where it is.
+    Raises
+    ------
+    Damaged
+        Where the file is damaged.
     """
     connection, last = open_sqlite(file), None
     budget = Budget(file, file.stat().st_size)
@@ -237,7 +259,7 @@ def sqlite_messages(file: Path) -> Iterator[tuple[int, int, int, bytes]]:
                 raise Damaged("its messages go round in a circle")
             last = row[0]
             yield row
-            budget.restart()  # what was done with it is no affair of the file
+            budget.restart()  # the time of the caller does not count
     except (sqlite3.Error, UnicodeDecodeError, TypeError) as error:
         raise as_damaged(error) from error
     finally:
@@ -271,7 +293,7 @@ def _check_sqlite(file: Path) -> None:
 
 
 def as_damaged(error: Exception) -> Damaged:
-    """Of an error of SQLite, which calls a query whose time is up interrupted."""
+    """Convert an error of SQLite. A query at its time limit is called interrupted."""
     return Damaged(
         "it takes longer to read than a file of its size may"
         if "interrupted" in str(error)

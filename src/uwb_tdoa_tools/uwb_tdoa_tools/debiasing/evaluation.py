@@ -1,4 +1,4 @@
-"""Flights before and after a bias map."""
+"""Estimate flights, apply a bias map, and report the change."""
 
 from __future__ import annotations
 
@@ -27,13 +27,11 @@ if TYPE_CHECKING:
     from uwb_tdoa_ekf.debias import BiasMap
 
 
-Scored = tuple[Flight, Score, Odometry]  # a flight with its errors and the estimate that has them
+Scored = tuple[Flight, Score, Odometry]  # flight, errors, and estimate
 
 
 def debiased(odometry: Odometry, bias_map: BiasMap) -> Odometry:
-    """The Odometry, of run_offline, that debias_node would make of it: another position and its
-    covariance.
-    """
+    """Return odometry with the positions and covariances that debias_node publishes."""
     covariance = odometry.covariance.copy()
     p, covariance[:, :3, :3], _ = bias_map.correct(odometry.p, covariance[:, :3, :3])
     return replace(odometry, p=p, covariance=covariance)
@@ -45,9 +43,25 @@ def estimate_flight(
     effects: EffectSet | None = None,
     align: str = NONE,
 ) -> Scored:
-    """(Flight, Score, odometry) of a Flight with ground truth, run through the filter. Raises
-    InputError: what diagnose finds with less, heights, odometry or marks, is corrected before the
-    filter, and a map of that path would only repeat the filter's own error.
+    """Run a flight with ground truth through the filter.
+
+    Parameters
+    ----------
+    flight : Flight
+    config : FilterConfig, optional
+    effects : EffectSet, optional
+    align : str
+        See `align_truth`.
+
+    Returns
+    -------
+    tuple of Flight, Score and Odometry
+
+    Raises
+    ------
+    InputError
+        If the flight has no ground truth. Other references serve `diagnose`, which corrects before the
+        filter. A map of the path of the filter would repeat its error.
     """
     if flight.truth is None:
         raise InputError(
@@ -62,12 +76,16 @@ def estimate_flight(
 
 @dataclass(frozen=True)
 class PositionEstimator:
-    """What positions are estimated with; estimator((path, survey)) is what `fly` gives. Can be
-    pickled.
+    """Estimate recordings with fixed settings. It can be pickled.
 
-    reading : Reading; config : FilterConfig; effects : EffectSet or None, of the TDOAs before the
-        filter; align : as of
-    `align_truth`.
+    Parameters
+    ----------
+    reading : Reading
+    config : FilterConfig, optional
+    effects : EffectSet, optional
+        Corrections of the TDOAs.
+    align : str
+        See `align_truth`.
     """
 
     reading: Reading = Reading()
@@ -76,12 +94,17 @@ class PositionEstimator:
     align: str = NONE
 
     def __call__(self, recording: tuple[Path, str | Path | None]) -> Scored:
+        """Return the result of `estimate_flight` for (path, survey)."""
         return estimate_flight(self.reading.read(recording), self.config, self.effects, self.align)
 
 
 def require_anchors(flown: Iterable[Scored], bias_map: BiasMap) -> Iterator[Scored]:
-    """Yield what `fly` gave; raises InputError for a flight among other anchors than those of a
-    BiasMap.
+    """Yield the flights.
+
+    Raises
+    ------
+    InputError
+        If the anchors of a flight are not those of the map.
     """
     for one in flown:
         if not bias_map.belongs_to(one[0].anchors):
@@ -93,9 +116,7 @@ def require_anchors(flown: Iterable[Scored], bias_map: BiasMap) -> Iterator[Scor
 
 
 def evaluate_map(flown: Scored, bias_map: BiasMap, effects: EffectSet | None = None) -> Score:
-    """Score of a flight from `fly` with its positions corrected by a BiasMap. effects : those it
-    was flown with.
-    """
+    """Return the Score of an estimated flight after the map. `effects` are those of the estimate."""
     flight, _, odometry = flown
     return Score(flight.name, debiased(odometry, bias_map), corrected_truth(flight, effects))
 
@@ -103,12 +124,12 @@ def evaluate_map(flown: Scored, bias_map: BiasMap, effects: EffectSet | None = N
 pass
 
 
-SMALLEST_GAIN = 0.01  # of the 3D RMSE: less is neither gain nor harm
+SMALLEST_GAIN = 0.01  # share of the 3D RMSE, least gain or harm
 _RUN = ("rmse_x", "rmse_y", "rmse_z", "rmse_3d", "max_3d", "nees_mean")
 
 
 def map_summary(bias_map: BiasMap) -> str:
-    """One line on a BiasMap."""
+    """Describe a map in one line."""
     figures = map_figures(bias_map)
     added = ", ".join(f"{std:.3f}" for std in figures["added_std"])
     return (
@@ -119,7 +140,7 @@ def map_summary(bias_map: BiasMap) -> str:
 
 
 def map_figures(bias_map: BiasMap) -> dict[str, Any]:
-    """The same for JSON."""
+    """Return the figures of a map for JSON."""
     return {
         "markers": len(bias_map.at),
         "step": bias_map.step,
@@ -136,8 +157,9 @@ def map_figures(bias_map: BiasMap) -> dict[str, Any]:
 def comparison_rows(
     flown: Iterable[Scored], bias_map: BiasMap, effects: EffectSet | None = None
 ) -> list[dict[str, Any]]:
-    """[{"flight", "before": figures, "after": figures, "known"}] of what `fly` gave. known : share
-    of the positions that the map knows.
+    """Return figures before and after the map for each flight.
+
+    `known` is the share of positions inside the map.
     """
     out = []
     for flight, score, odometry in flown:
@@ -156,7 +178,7 @@ def comparison_rows(
 
 
 def print_rows(title: str, found: Sequence[Mapping[str, Any]]) -> None:
-    """Print rows, and their mean."""
+    """Print rows and their mean."""
     if not found:
         return
     print(
@@ -178,21 +200,21 @@ def print_rows(title: str, found: Sequence[Mapping[str, Any]]) -> None:
 
 
 def mean_gain(found: Sequence[Mapping[str, Any]]) -> float:
-    """The `gain` of rows, of their mean 3D RMSE."""
+    """Return the gain of the mean 3D RMSE of rows."""
     return gain(
         *(float(np.mean([row[side]["rmse_3d"] for row in found])) for side in ("before", "after"))
     )
 
 
 def verdict(gained: float, on: str) -> str:
-    """One sentence on a `gain`. on : what it was judged on."""
+    """Return a sentence on a gain. `on` names the flights."""
     if does_harm(gained):
         return f"harm: the 3D RMSE {gain_in_words(gained)} on {on}; do not use this map there"
     return f"{'better' if gained >= SMALLEST_GAIN else 'no gain'}: the 3D RMSE {gain_in_words(gained)} on {on}"
 
 
 def does_harm(gained: float) -> bool:
-    """Whether a `gain` is a loss, or no number."""
+    """Return whether a gain is a loss or NaN."""
     return not gained > -SMALLEST_GAIN
 
 

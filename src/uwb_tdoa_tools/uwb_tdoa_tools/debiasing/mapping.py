@@ -1,5 +1,6 @@
-"""A bias map from flights and from places where a tag stood still, scaled to the share that
-cross-validation over flights supports.
+"""Fit a bias map to flights and to places where a tag stood still.
+
+Cross-validation over flights scales the map.
 """
 
 from __future__ import annotations
@@ -33,15 +34,15 @@ if TYPE_CHECKING:
     from .evaluation import PositionEstimator, Scored
 
 
-LEAST = 10  # positions of flights, 5 ms apart, that make a marker
+LEAST = 10  # positions of flights, 5 ms apart, least number for a marker
 COLUMNS = ("true_x", "true_y", "true_z", "x", "y", "z")
-SETTLE = 1.0  # s at a place before positions count
-REST = 0.02  # m that a tag at rest may move in SETTLE
-SHORTEST = 100  # positions that make a stay
+SETTLE = 1.0  # s, excluded at the start of each place
+REST = 0.02  # m, largest motion at rest within SETTLE
+SHORTEST = 100  # positions, least number at one place
 
 
 def part_of(score: Score, odometry: Odometry) -> Part:
-    """Part of an evaluated flight: its airborne odometry, at the stamps that the Score has."""
+    """Return airborne estimates of a flight with their true positions, at the stamps of the Score."""
     measured = odometry.p[(odometry.t >= score.first) & (odometry.t <= score.last)]
     return Part(measured, measured - score.error, score.covariance)
 
@@ -49,13 +50,20 @@ def part_of(score: Score, odometry: Odometry) -> Part:
 def static_parts(
     path: str | Path, estimator: PositionEstimator = PositionEstimator(), planar: bool = False
 ) -> list[Part]:
-    """List of Part of a tag that stood still, one for each place.
+    """Return one Part for each place where a tag stood still.
 
-    path : a CSV file with the columns true_x, true_y, true_z, x, y, z (m; without the z if planar),
-        one row for each
-        measured position; or any recording with ground truth, through which the filter is run, and
-        of which the time at rest counts, but for the first SETTLE s at each place. Raises
-        InputError.
+    Parameters
+    ----------
+    path : str or Path
+        A CSV file with the columns true_x, true_y, true_z, x, y, z in m, one row per measured position,
+        without z if planar. Or a recording with ground truth: the time at rest counts from SETTLE s on.
+    estimator : PositionEstimator
+    planar : bool
+
+    Raises
+    ------
+    InputError
+        If the file holds no position at rest.
     """
     if is_table(path):
         return _from_table(path, planar)
@@ -82,7 +90,7 @@ def static_parts(
 
 
 def is_table(path: str | Path) -> bool:
-    """Whether a file is a CSV of positions, not a recording."""
+    """Return whether a file is a CSV of positions."""
     return not Path(path).is_dir() and b"true_x" in read_head(path, 1000)
 
 
@@ -103,7 +111,7 @@ def _from_table(path: str | Path, planar: bool) -> list[Part]:
 pass
 
 
-FEWEST = 2  # flights; one alone leaves none to judge
+FEWEST = 2  # flights; a single one cannot be validated
 
 
 def fit_map(
@@ -114,11 +122,24 @@ def fit_map(
     planar: bool = False,
     interpolator: str = "thin_plate",
 ) -> BiasMap:
-    """BiasMap of flights, as a PositionEstimator gave them, and of files of a tag that stood still.
-    Raises InputError.
+    """Fit a bias map.
 
-    static : paths, see `static_parts`; step : m; planar, interpolator : see
-        `uwb_tdoa_ekf.debias.fit`.
+    Parameters
+    ----------
+    flown : iterable
+        Results of a PositionEstimator.
+    static : sequence of path
+        See `static_parts`.
+    estimator : PositionEstimator
+    step : float
+        Spacing of the markers, m.
+    planar, interpolator
+        See `uwb_tdoa_ekf.debias.fit`.
+
+    Raises
+    ------
+    InputError
+        If the anchors are unknown or differ.
     """
     parts = [part for path in static for part in static_parts(path, estimator, planar)]
     flown = list(flown)
@@ -133,9 +154,12 @@ def fit_map(
 def _anchors(
     of_flights: Sequence[Anchors], static: Sequence[str | Path], estimator: PositionEstimator
 ) -> Anchors:
-    """The Anchors of all flights and recordings.
+    """Return the anchors of all flights and recordings.
 
-    Raises InputError where they differ, or a table comes without.
+    Raises
+    ------
+    InputError
+        If they differ, or tables have none.
     """
     found = list(of_flights)
     found += [estimator.reading.one(path).anchors for path in static if not is_table(path)]
@@ -162,8 +186,9 @@ def cross_validated(
     estimator: PositionEstimator,
     **options: Any,
 ) -> Shrinkage | None:
-    """Shrinkage of maps, each made without one of the flights that a PositionEstimator gave and
-    judged on it; None for fewer than FEWEST. static, options : as of `fit_map`.
+    """Return the Shrinkage of maps, or None for fewer than FEWEST flights.
+
+    Each map is fitted without one flight and evaluated on it. `options` are those of `fit_map`.
     """
     if len(flown) < FEWEST:
         return None

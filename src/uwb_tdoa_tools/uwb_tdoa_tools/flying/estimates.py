@@ -1,5 +1,22 @@
-"""Who tells the controller where it is: our filter, as the nodes run it, or somebody else's, built
-as a shared library.
+"""Provide estimates: the own filter as the nodes run it, or a peer.
+
+A peer is a filter in a shared library that the user has built (docs/speed.md). It exports, in C:
+
+    typedef struct { double t, gyro[3], accel[3], d; int32_t a, b; } tdoa_peer_event;
+    int32_t tdoa_peer_version(void);                                           // VERSION
+    void tdoa_peer_start(const double *anchors, int32_t count, const double *p, const double *q);
+    void tdoa_peer_run(const tdoa_peer_event *events, int32_t count);
+    void tdoa_peer_position(double *p);
+
+An event with a < 0 is an inertial sample (s, rad/s, m/s^2). Every other event is a TDOA d = |p - b| -
+|p - a|, m, of the anchors in rows a and b of `anchors` (count, 3), m. The filter starts at rest at p,
+m, with the attitude q, x y z w, body to world. `fly --peer` needs one more function. It returns the
+state in m, m/s in the world frame, and x y z w:
+
+    void tdoa_peer_state(double *p, double *v, double *q);
+
+If no place is given, p is NaN at the start. A given place is accurate to 0.1 m. The attitude q is
+level, and its yaw is accurate to 0.1 rad.
 """
 
 from __future__ import annotations
@@ -100,7 +117,7 @@ class Peer:
         """Restart at p (3,) m with attitude q (4,) x y z w, with anchors (n, 3) m."""
         self._anchors = np.ascontiguousarray(
             anchors, dtype=float
-        )  # for as long as it may look at them
+        )  # kept: the library may read them later
         self._start(
             _pointer(self._anchors),
             ctypes.c_int32(len(anchors)),
@@ -109,7 +126,7 @@ class Peer:
         )
 
     def run(self, events: np.ndarray) -> float:
-        """s that events (n,) of EVENT take."""
+        """Process events (n,) of EVENT and return the duration, s."""
         data, count = _pointer(events), ctypes.c_int32(len(events))
         began = time.perf_counter()
         self._run(data, count)
@@ -311,7 +328,7 @@ class PeerFilter:
     It gets place and yaw at the start. It corrects no effects and gives no covariance.
     """
 
-    deviation = 0.0  # m; nobody knows
+    deviation = 0.0  # m; a peer gives none
     why = ""
 
     def __init__(

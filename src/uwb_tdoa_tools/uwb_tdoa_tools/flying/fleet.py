@@ -1,4 +1,4 @@
-"""Many flights, on all cores, with what they came to kept on the way."""
+"""Fly many tasks on all cores, keep their verdicts, and draw them."""
 
 from __future__ import annotations
 
@@ -37,9 +37,18 @@ SPACING = 0.05  # s
 
 @dataclass(frozen=True)
 class DrawnFlight:
-    """What is drawn of a flight: t (n,) s, p (n, 3) m, the truth; wanted (n, 3) m, NaN where
-    nothing was; error and sigma (k, 3) m of the estimate at stamps (k,) s; verdict : as of
-    `verdict_of`.
+    """Hold the figures of a flight that are drawn.
+
+    Parameters
+    ----------
+    t, p : numpy.ndarray
+        Stamps (n,), s, and true positions (n, 3), m.
+    wanted : numpy.ndarray
+        Wanted positions (n, 3), m, or NaN.
+    stamps, error, sigma : numpy.ndarray
+        Stamps (k,), s, errors and standard deviations (k, 3), m, of the estimate.
+    verdict : dict
+        See `verdict_of`.
     """
 
     t: np.ndarray
@@ -51,14 +60,14 @@ class DrawnFlight:
     verdict: dict[str, Any]
 
 
-def drawn_flight(fly_all: TrialResult, verdict: dict[str, Any]) -> DrawnFlight:
-    """Drawn, of a TrialResult."""
-    assert fly_all.flight.truth is not None
-    truth, odometry = fly_all.flight.truth, fly_all.odometry
+def drawn_flight(result: TrialResult, verdict: dict[str, Any]) -> DrawnFlight:
+    """Return the figures of a TrialResult to draw."""
+    assert result.flight.truth is not None
+    truth, odometry = result.flight.truth, result.odometry
     every = max(1, round(SPACING / (truth.t[1] - truth.t[0])))
     t, p = truth.t[::every], truth.p[::every]
     wanted = np.full(p.shape, np.nan)
-    for mission in (mission for mission in fly_all.missions if mission.started is not None):
+    for mission in (mission for mission in result.missions if mission.started is not None):
         inside = (t >= mission.started) & (t <= (mission.ended or np.inf))
         wanted[inside] = mission.wanted(t[inside])[:, 0]
     rows: np.ndarray = np.empty(0, int)
@@ -73,8 +82,13 @@ def drawn_flight(fly_all: TrialResult, verdict: dict[str, Any]) -> DrawnFlight:
 
 
 def plot(flights: Sequence[DrawnFlight], anchors: Anchors, path: str | Path) -> None:
-    """Draw [Drawn] among Anchors to an image file: a map and the heights of all, and the errors of
-    the worst.
+    """Draw a map, all heights, and the errors of the worst flight to an image file.
+
+    Parameters
+    ----------
+    flights : sequence of DrawnFlight
+    anchors : Anchors
+    path : str or Path
     """
     from matplotlib.figure import Figure  # takes a second to import
 
@@ -119,9 +133,18 @@ pass
 def verdict_store(
     path: str | Path | None, asked: dict[str, Any]
 ) -> AbstractContextManager[Verdicts]:
-    """Context of a ResultsFile, or of a dict where path is None. asked : as of ResultsFile.
+    """Return a context of a ResultsFile, or of a dict if `path` is None.
 
-    Raises InputError.
+    Parameters
+    ----------
+    path : str or Path or None
+    asked : dict
+        See `ResultsFile`.
+
+    Raises
+    ------
+    InputError
+        If the file belongs to other options.
     """
     return nullcontext({}) if path is None else ResultsFile(path, asked)
 
@@ -134,11 +157,19 @@ def fly_all(
     jobs: int | None = None,
     dask: str | None = None,
 ) -> Iterator[tuple[dict[str, Any], DrawnFlight | None]]:
-    """Generator of (verdict, Drawn or None), of Tasks in turn; those that are in `done`, by their
-    seeds, are not flown again.
+    """Fly tasks and yield (verdict, DrawnFlight or None) of each in turn.
 
-    record : folder for a bag of each, or None; draw : give what is drawn; jobs, dask : as of
-        `parallel.over`.
+    Parameters
+    ----------
+    tasks : sequence of Task
+    done : ResultsFile or dict
+        Verdicts by seed. Their tasks are not flown again.
+    record : str or Path, optional
+        Folder for a bag of each flight.
+    draw : bool
+        Whether to yield figures to draw.
+    jobs, dask
+        See `parallel.over`.
     """
     missing = [task for task in tasks if str(task.seed) not in done]
     made = parallel.over(partial(fly_task, record, draw), missing, jobs, dask)
@@ -147,11 +178,11 @@ def fly_all(
         if key not in done:
             done[key], picture = next(made)
         yield (done.read(key, _validated) if isinstance(done, ResultsFile) else done[key]), picture
-    next(made, None)  # to its end, so that its processes are kept
+    next(made, None)  # to its end: the processes can be used again
 
 
 def _validated(verdict: dict[str, Any]) -> dict[str, Any]:
-    """A verdict that a file holds, of which a summary can be made."""
+    """Return a stored verdict. Raise an error if `summary` cannot use it."""
     text(summary([verdict]))
     return verdict
 
@@ -159,7 +190,7 @@ def _validated(verdict: dict[str, Any]) -> dict[str, Any]:
 def fly_task(
     record: str | Path | None, draw: bool, task: Task
 ) -> tuple[dict[str, Any], DrawnFlight | None]:
-    """(verdict, Drawn or None) of a Task that is flown; record, draw : as of `flown`."""
+    """Fly a Task and return (verdict, DrawnFlight or None), see `fly_all`."""
     one = drive(task) if task.vehicle == "rover" else fly(task)
     verdict = verdict_of(one)
     if record is not None:

@@ -1,7 +1,6 @@
-"""A rover that drives by the estimate: two driven wheels, what these say, and a controller that has
-nothing but the newest odometry.
+"""Drive a rover by its estimate: two driven wheels with encoders, and a path controller.
 
-The body's origin is the antenna, MAST above the floor.
+The origin of the body is the antenna, MAST above the floor.
 """
 
 from __future__ import annotations
@@ -30,47 +29,50 @@ if TYPE_CHECKING:
     from .world import World
 
 MAST = 0.4  # m
-FILTER: dict[str, Any] = {
-    "planar": True,
-    "fixed_height": MAST,
-    "non_holonomic_std": 0.05,
-}  # parameters that it sets
-AIDS = ("velocity",)  # what it measures beside inertia and TDOAs
+# parameters of the filter of a rover
+FILTER: dict[str, Any] = {"planar": True, "fixed_height": MAST, "non_holonomic_std": 0.05}
+AIDS = ("velocity",)  # sensors besides the IMU and the radio
 TRACK = 0.4  # m between its wheels
-SCALE, UNEQUAL = 0.03, 0.003  # largest common error of the wheels' scales; deviation of each
-SLIP = 0.1  # share by which a wheel turns faster than the floor passes, at times
-LAG = 0.1  # s, of a wheel behind what is wanted
+SCALE, UNEQUAL = 0.03, 0.003  # largest common scale error; standard deviation of each wheel
+SLIP = 0.1  # share by which a slipping wheel turns too fast
+LAG = 0.1  # s, time constant of a wheel
 MAX_ACCELERATION = 1.0  # m/s^2
-MIN_WHEEL_SPEED = 0.005  # m/s; a wheel that is to stand and turns slower stands
-WHEEL_STD = 0.02  # m/s, noise of what they say
+MIN_WHEEL_SPEED = 0.005  # m/s; a braking wheel stops below this speed
+WHEEL_STD = 0.02  # m/s, noise of the encoders
 BUMPER = 0.2  # m from its middle
-LOOK_AHEAD = 0.4  # m, of the point of the path that it steers for
-TURN, MAX_YAW_RATE = 2.0, 1.2  # 1/s, turning rate by the direction to that point; rad/s
-APPROACH_GAIN = 1.0  # 1/s, most of its speed by the distance to the end
+LOOK_AHEAD = 0.4  # m, distance of the target point on the path
+TURN, MAX_YAW_RATE = 2.0, 1.2  # 1/s, yaw rate per direction error; rad/s
+APPROACH_GAIN = 1.0  # 1/s, largest speed per distance to the end
 STOP = 0.06  # m from the end, where it stops
-WINDOW = 1.0  # m of the path in which it looks for where it is
-LOST_TIMEOUT = 30.0  # s for which it stands with an estimate that is lost
+WINDOW = 1.0  # m of the path in which the nearest point is searched
+LOST_TIMEOUT = 30.0  # s, longest stop with a lost estimate
 
 
 class Steering:
-    """What a controller wants: speed, m/s, and turning, rad/s."""
+    """Hold the wanted speed, m/s, and yaw rate, rad/s."""
 
     def __init__(self) -> None:
         self.stop()
 
     def stop(self) -> None:
-        """Stand."""
+        """Stand still."""
         self.speed = self.turning = 0.0
 
 
 class Wheels(AidSensor):
-    """Encoders of both wheels."""
+    """Simulate the encoders of both wheels."""
 
     rate, width = WHEELS_RATE, 2
 
 
 class RoverSimulator(Simulator):
-    """A rover for so many seconds, as Simulator. wheels (n, 2) : m/s, as the encoders see them."""
+    """Simulate a rover and its sensors for a given duration.
+
+    Attributes
+    ----------
+    wheels : numpy.ndarray
+        Speeds (n, 2) that the encoders measure, left and right, m/s.
+    """
 
     def __init__(self, world: World, seed: int, duration: float) -> None:
         super().__init__(world, seed, duration)
@@ -87,7 +89,7 @@ class RoverSimulator(Simulator):
         self.wheels = np.zeros((len(self.times), 2))
 
     def _move(self, controller: Steering, rows: slice) -> None:
-        """Drive the samples in `rows` as a Steering wants."""
+        """Drive the samples in `rows` with the outputs of a Steering."""
         half, dt, state = 0.5 * TRACK * controller.turning, 1.0 / IMU_RATE, self.state
         wanted = np.array([controller.speed - half, controller.speed + half])
         for i in range(rows.start, rows.stop):
@@ -125,20 +127,31 @@ class RoverSimulator(Simulator):
 
 
 def _unicycle(wheels: Any) -> tuple[Any, Any]:
-    """Speed, m/s, and turning rate, rad/s, of wheels, left and right, m/s."""
+    """Return speed, m/s, and yaw rate, rad/s, of the wheel speeds, left and right, m/s."""
     left, right = wheels
     return 0.5 * (left + right), (right - left) / TRACK
 
 
 class Drive:
-    """One drive along a Polyline, decided by nothing but the estimate and its deviation. state,
-    started, ended, lost : as of Mission: it stands while it is lost; path : Polyline.
+    """Run one drive along a polyline.
+
+    The rover stands while its estimate is lost. State, started, ended and lost are those of Mission.
     """
 
     def __init__(
         self, path: Polyline, speed: float, rules: Rules | None = None, begin: float = 0.0
     ) -> None:
-        """speed : m/s; begin : s, when it was switched on."""
+        """Wait for the start.
+
+        Parameters
+        ----------
+        path : Polyline
+        speed : float
+            m/s.
+        rules : Rules, optional
+        begin : float
+            Time of switching on, s.
+        """
         self.path, self.rules, self.begin, self._speed = path, rules or Rules(), begin, speed
         self.state = WAITING
         self.started: float | None = None
@@ -148,8 +161,17 @@ class Drive:
         self._clock: list[tuple[float, float]] = []  # (s, m along the path) of each call
 
     def decide(self, t: float, pose: Pose | None, deviation: float, steering: Steering) -> None:
-        """Have a Steering want what is to be done at t, s. pose : as of an estimate, or None;
-        deviation : m.
+        """Set the wanted motion in `steering`.
+
+        Parameters
+        ----------
+        t : float
+            s.
+        pose : Pose or None
+            Newest estimate.
+        deviation : float
+            Its largest standard deviation of a coordinate, m.
+        steering : Steering
         """
         steering.stop()
         rules, good = self.rules, pose is not None and t - pose[0] <= self.rules.stale
@@ -169,10 +191,11 @@ class Drive:
                 self.state, self.ended = DONE, t
             return
         self._last_good = t
-        assert pose is not None  # or it would be lost
+        assert pose is not None  # without a pose the state is LOST
         self._steer(t, pose, steering)
 
     def _steer(self, t: float, pose: Pose, steering: Steering) -> None:
+        """Steer to a point ahead on the path (pure pursuit)."""
         p = pose[1][:2]
         before = self._clock[-1][1] if self._clock else 0.0
         along = float(self.path.nearest(p[None], before, before + WINDOW)[0])
@@ -190,7 +213,7 @@ class Drive:
 
     @property
     def place(self) -> np.ndarray:
-        """(2,) m, where it is to stop."""
+        """Return the last place of the path (2,), m."""
         return self.path.end
 
     def wanted(self, t: np.ndarray) -> np.ndarray:
@@ -201,14 +224,14 @@ class Drive:
 
 
 class RoverTrial(Trial):
-    """A Task with Waypoints under way."""
+    """Run a Task with Waypoints."""
 
     def __init__(
-        self, task: Task, source: EstimateSource | None = None, lasts: float | None = None
+        self, task: Task, source: EstimateSource | None = None, duration: float | None = None
     ) -> None:
         rules = task.rules
         longest = rules.rest + rules.patience + 2.0 * task.path.duration + LOST_TIMEOUT + REST_AFTER
-        super().__init__(task, source, lasts or longest)
+        super().__init__(task, source, duration or longest)
 
     def _simulator(self, duration: float) -> RoverSimulator:
         return RoverSimulator(self.task.world, self.task.seed, duration)
@@ -221,7 +244,7 @@ class RoverTrial(Trial):
         return Drive(way, path.speed, rules, self.simulator.now)
 
     def turn(self) -> None:
-        """One turn of the controller, as the drive under way decides; it stands without one."""
+        """Execute one turn of the controller."""
         self.controller.stop()
         if self.missions:
             drive: Any = self.missions[-1]
@@ -237,7 +260,7 @@ class RoverTrial(Trial):
 
 
 def drive(task: Task) -> TrialResult:
-    """TrialResult, of a Task with Waypoints."""
+    """Drive a Task with Waypoints and return the TrialResult."""
     trial = RoverTrial(task)
     trial.fly()
     return trial.result

@@ -1,4 +1,4 @@
-"""The kinds of models that can be trained, all by one call: `train`."""
+"""Train the different kinds of models by one call, `train`."""
 
 from __future__ import annotations
 
@@ -29,30 +29,34 @@ if TYPE_CHECKING:
     from .network import Paper
     from .structured import Structured
 
-    LearningCurve = tuple[
-        str, list[int], list[float], list[float]
-    ]  # label, x, training and validation RMS, m
+    # label, x, training and validation RMS, m
+    LearningCurve = tuple[str, list[int], list[float], list[float]]
 
 
 KINDS = ("paper", "paper_no_orientation", "structured", "physics", "physics+structured")
-SPACING = 0.01  # s between the samples that are learned from: nearer ones tell the same
+SPACING = 0.01  # s between training samples: closer samples hold no more information
 CLIP = 1.0  # m
-MARGINS = {
-    "d": 1.0,
-    "f": 2.0,
-    "u": 0.5,
-}  # trust fades over: positions m, forward (turned round: gone) and up axes
-# added to the box of attitudes on every side: that much is an estimated attitude off at times
+# the correction fades over: positions, m, components of the forward axis and of the up axis
+MARGINS = {"d": 1.0, "f": 2.0, "u": 0.5}
+# added to the box of attitudes on every side: occasional error of an estimated attitude
 SLACK = 0.2
-SMALLEST_STD = 0.01  # m, of what remains
+SMALLEST_STD = 0.01  # m, least standard deviation of the remaining error
 POINTS = 4  # of a learning curve over flights
-HEADINGS = 1.0  # range of the forward axis in training from which on a model tells headings apart
+HEADINGS = 1.0  # range of the forward axis in training, from which a model depends on the heading
 _ATTITUDE = ("forward_x", "forward_y", "up_x", "up_y")
 
 
 class Recipe(NamedTuple):
-    """What is trained. kind : of KINDS; seed : of everything that is drawn; options : of structured
-    models.
+    """Describe a training.
+
+    Parameters
+    ----------
+    kind : str
+        One of KINDS.
+    seed : int
+        Seed of all random numbers.
+    options : StructuredPriors
+        For structured models.
     """
 
     kind: str
@@ -62,10 +66,18 @@ class Recipe(NamedTuple):
 
 @dataclass(frozen=True)
 class Trained:
-    """model : Paper, Structured or None; effects : EffectSet or None; curve : (label, x, training
-    RMS, validation RMS);
-    meta : metadata of the ONNX file; errors : {validation flight: (before, after)}, RMS of its
-        TDOAs, m.
+    """Hold the result of a training.
+
+    Parameters
+    ----------
+    model : Paper or Structured or None
+    effects : EffectSet or None
+    curve : tuple
+        Label, x, RMS errors of training and validation, m.
+    meta : dict
+        Metadata of the ONNX file.
+    errors : dict
+        RMS errors of the TDOAs of each validation flight (before, after), m.
     """
 
     model: Paper | Structured | None
@@ -75,7 +87,7 @@ class Trained:
     errors: dict[str, tuple[float, float]]
 
     def onnx(self) -> ModelProto | None:
-        """The onnx.ModelProto, or None for a kind without a network."""
+        """Return the ONNX model, or None for a kind without a network."""
         return self.model.onnx(self.meta) if self.model else None
 
 
@@ -88,14 +100,32 @@ def train(
     found: physics.Physics | None = None,
     curve: bool = True,
 ) -> Trained:
-    """Train the model of a Recipe on lists of Flights. Returns Trained. Raises InputError.
+    """Train the model of a recipe.
 
-    name : of the model, goes into every corrected message; progress : called with a text now and
-        then; found : Physics
-    of the training and then the validation flights, if somebody has looked for it already; curve :
-    whether a learning curve is wanted, beyond its last point. The validation flights decide when
-    the paper's network stops, and tell how far off a model is on flights that it has not seen; then
-    the linear models are fitted anew to them too.
+    The validation flights stop the training of the paper's network. For all models they give the error on
+    unseen flights. Linear models are then fitted again to all flights.
+
+    Parameters
+    ----------
+    recipe : Recipe
+    training, validation : sequence of Flight
+    name : str
+        Name of the model, written to every corrected message.
+    progress : callable
+        Called with lines of text.
+    found : Physics, optional
+        Effects of the training and then the validation flights. The default is to find them.
+    curve : bool
+        Whether to compute a whole learning curve.
+
+    Returns
+    -------
+    Trained
+
+    Raises
+    ------
+    InputError
+        If the kind is unknown or a flight cannot be used.
     """
     kind, seed, _ = recipe
     if kind not in KINDS:
@@ -148,7 +178,7 @@ def train(
         if model.sees_attitude and any(
             high - low - 2.0 * SLACK > HEADINGS for low, high, _ in heads
         ):
-            meta["largest_yaw_std"] = LARGEST_YAW_STD  # before the yaw is known, it cannot tell
+            meta["largest_yaw_std"] = LARGEST_YAW_STD  # the model needs the yaw
     of_flights = {one.name: (_rms([one.error]), _rms([after])) for one, after in zip(raw[1], left)}
     return Trained(model, effects, errors, meta, of_flights)
 
@@ -168,7 +198,7 @@ def _paper(
     validation: list[Labels],
     progress: Callable[[str], object],
 ) -> tuple[network.Paper, LearningCurve, list[np.ndarray]]:
-    """(Paper, learning curve over epochs, what is left of the errors of each validation flight)."""
+    """Return (Paper, learning curve over epochs, remaining errors of each validation flight)."""
     kind, seed, _ = recipe
     thin, held = (
         labelling.thinned(group, SPACING, np.random.default_rng(seed))
@@ -194,13 +224,18 @@ def _structured(
     growing: Sequence[Sequence[int]],
     free: EffectSet,
 ) -> tuple[structured.Structured | None, EffectSet, LearningCurve, list[np.ndarray]]:
-    """(Structured, EffectSet, learning curve over numbers of training flights, what is left of the
-    errors of each validation flight by a fit to the training flights). The model itself is then
-    fitted to all flights.
+    """Return (Structured, EffectSet, learning curve, remaining errors of validation flights).
 
-    growing : as `_growing` gives; free : linear effects to fit together with the maps. Of physics
-        alone the maps are only there so that
-    the effects do not take what belongs to a place; no model is returned.
+    The remaining errors belong to a fit to the training flights. The model is a fit to all flights.
+
+    Parameters
+    ----------
+    recipe, training, validation, progress
+    growing : sequence
+        See `_curve_subsets`.
+    free : EffectSet
+        Linear effects that are fitted together with the maps. For the kind "physics" the maps only
+        separate effects from position-dependent errors, and no model is returned.
     """
     (_, seed, options), alone = recipe, recipe.kind == "physics"
     thin = [
@@ -230,7 +265,7 @@ def _structured(
 
 
 def _over_flights(curve: Sequence[tuple[int, float, float]]) -> LearningCurve:
-    """Of (number of training flights, RMS of training and validation, m)."""
+    """Return the learning curve of (number of flights, training RMS, validation RMS in m)."""
     counts, training, validation = zip(*curve)
     return "training flights", list(counts), list(training), list(validation)
 
@@ -241,9 +276,7 @@ def fit_structured(
     options: structured.StructuredPriors,
     free: EffectSet = EffectSet(),
 ) -> tuple[structured.Structured, EffectSet]:
-    """(Structured, EffectSet with the values of the linear effects `free`), fitted together to
-    Labels.
-    """
+    """Fit maps and the linear effects `free` together and return (Structured, EffectSet)."""
     model = structured.prepare(some, options, seed)
     parts = [model.design(one.samples, one.error, one.sample_weight) for one in some]
     fields = ("phi", "a", "b", "dense", "y", "sample_weight")
@@ -266,9 +299,9 @@ def _evaluate_effects(
     validation: list[Labels],
     growing: Sequence[Sequence[int]],
 ) -> tuple[LearningCurve, list[np.ndarray]]:
-    """(Learning curve over numbers of training flights, what is left of the errors of each
-    validation flight) of the effects of a Physics, which counts training flights first. growing :
-    as `_growing` gives.
+    """Return (learning curve, remaining errors of validation flights) of the effects.
+
+    `found` counts the training flights first.
     """
     curve: list[tuple[int, float, float]] = []
     for some in growing:
@@ -282,9 +315,7 @@ def _evaluate_effects(
 
 
 def _curve_subsets(count: int, seed: int, curve: bool) -> list[list[int]]:
-    """Growing subsets of `count` flights, in random order, the last one all of them, which is the
-    only one without `curve`: lists of numbers.
-    """
+    """Return growing subsets of `count` flights in random order. The last one holds all of them."""
     order = np.random.default_rng(seed).permutation(count).tolist()
     if not curve:
         return [order]
@@ -297,8 +328,9 @@ def _curve_subsets(count: int, seed: int, curve: bool) -> list[list[int]]:
 def _deviation(
     left: Sequence[np.ndarray], explained: np.ndarray | float, validation: Sequence[Labels]
 ) -> float:
-    """Standard deviation of what is left of errors, without what maps explain, m^2, and what no
-    model of poses can know.
+    """Return the standard deviation of remaining errors, m.
+
+    The variance `explained` by the maps, m^2, and white noise are subtracted.
     """
     variance = (
         np.mean(np.concatenate(left) ** 2 - explained) - labelling.white_noise(validation) ** 2
@@ -312,7 +344,7 @@ def _rms(parts: Iterable[np.ndarray]) -> float:
 
 
 def _validity(learned_from: Sequence[Labels], features: Sequence[str]) -> dict[str, list[float]]:
-    """{feature: [lowest, highest, margin]} of Labels."""
+    """Return {feature: [lowest, highest, margin]} of labels."""
     limits = {}
     for names, more in ((_ATTITUDE, SLACK), (features, 0.0)):
         if not names:
@@ -324,15 +356,15 @@ def _validity(learned_from: Sequence[Labels], features: Sequence[str]) -> dict[s
 
 
 def save(result: Trained, folder: Path) -> tuple[Path | None, Path | None]:
-    """Write model.onnx and effects.yaml of a Trained, as far as it has them.
+    """Write model.onnx and effects.yaml as far as they exist, and return their paths or None.
 
-    Returns their paths, None for none.
+    Files of an earlier training are removed.
     """
     model, effects = folder / "model.onnx", folder / "effects.yaml"
     made = result.onnx()
     for path, content in ((model, made), (effects, result.effects)):
         if content is None:
-            path.unlink(missing_ok=True)  # or an earlier training's would be taken for ours
+            path.unlink(missing_ok=True)  # else a file of an earlier training would stay
     if made is not None:
         write_bytes(model, made.SerializeToString(deterministic=True))
     if result.effects is not None:
@@ -347,8 +379,9 @@ def plot_curve(
     validation: Sequence[float],
     path: Path,
 ) -> None:
-    """Learning curve: RMS errors of training and validation flights, m, over epochs or number of
-    flights.
+    """Draw the learning curve: RMS errors of training and validation flights, m.
+
+    `label` names the x axis: epochs or number of flights.
     """
     from ..scoring.plots import plt  # takes a second to import
 

@@ -1,9 +1,9 @@
-"""The network of Zhao et al. (RA-L 2021): three layers of 30 neurons, with or without the
-orientations of the anchors.
+"""Write ONNX graphs, and train the network of Zhao et al. (RA-L 2021).
 
-As published (section V-B): scaled inputs, rectified linear units, mini-batch gradient descent on
-squared errors, stopped when the validation error has not fallen for five epochs in a row. Its
-deviation is that of the validation flights.
+The network has three layers of 30 neurons, with or without the orientations of the anchors. As
+published (section V-B), inputs are scaled, and mini-batch gradient descent minimizes squared errors.
+It stops if the validation error has not fallen for five epochs in a row. The standard deviation is
+that on the validation flights.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ if TYPE_CHECKING:
     from .labels import Labels
 
 
-OPSET, IR_VERSION = 13, 8  # whose operators `trial.py` lists
+OPSET, IR_VERSION = 13, 8  # `trial.py` lists the operators of this version
 
 
 class GraphBuilder:
-    """An ONNX graph under construction.
+    """Build an ONNX graph from plain operators.
 
-    Values are the names of its tensors, (n, k) float unless said otherwise.
+    Values are names of tensors. Tensors are (n, k) of float unless stated otherwise.
     """
 
     def __init__(self) -> None:
@@ -46,31 +46,31 @@ class GraphBuilder:
         self.input = "features"
 
     def constant(self, value: ArrayLike, kind: type[np.generic] = np.float32) -> str:
-        """A tensor of fixed values."""
+        """Add a constant tensor."""
         self._constants.append(
             numpy_helper.from_array(np.asarray(value, dtype=kind), f"c{len(self._constants)}")
         )
         return self._constants[-1].name
 
     def op(self, kind: str, *inputs: Any, **attributes: Any) -> str:
-        """Append an operator; inputs that are no names become constants.
+        """Append an operator and return the name of its output.
 
-        Returns the name of its output.
+        Inputs that are no names become constants.
         """
         names = [value if isinstance(value, str) else self.constant(value) for value in inputs]
         self._nodes.append(helper.make_node(kind, names, [f"v{len(self._nodes)}"], **attributes))
         return self._nodes[-1].output[0]
 
     def take(self, value: str, columns: Iterable[int]) -> str:
-        """Some columns of a tensor."""
+        """Select columns."""
         return self.op("Gather", value, self.constant(list(columns), np.int64), axis=1)
 
     def rows(self, value: str, width: int) -> str:
-        """A tensor with rows of another width, in the same order of numbers."""
+        """Reshape to rows of another width, with the same order of numbers."""
         return self.op("Reshape", value, self.constant([-1, width], np.int64))
 
     def total(self, values: Sequence[str]) -> str:
-        """Sum of tensors of one shape."""
+        """Sum tensors of one shape."""
         return values[0] if len(values) == 1 else self.op("Sum", *values)
 
     def row_sum(self, value: str) -> str:
@@ -78,15 +78,23 @@ class GraphBuilder:
         return self.op("ReduceSum", value, self.constant([1], np.int64), keepdims=1)
 
     def distance2(self, points: str, centres: np.ndarray) -> str:
-        """Squared distances (n, m) from points (n, k) to fixed centres, (m, k) array."""
+        """Return squared distances (n, m) from points (n, k) to fixed centres (m, k)."""
         cross = self.op("MatMul", points, -2.0 * centres.T)
         own = self.row_sum(self.op("Mul", points, points))
         far = self.op("Add", self.op("Add", cross, own), np.sum(centres**2, axis=1)[None])
         return self.op("Max", far, [0.0])
 
     def model(self, width: int, outputs: Sequence[str], meta: Mapping[str, Any]) -> ModelProto:
-        """The onnx.ModelProto: `width` input columns, the named (n, 1) tensors beside each other as
-        output, metadata.
+        """Return the ONNX model.
+
+        Parameters
+        ----------
+        width : int
+            Number of input columns.
+        outputs : sequence of str
+            Tensors (n, 1) that are concatenated as output.
+        meta : mapping
+            Metadata, stored as JSON.
         """
         self._nodes.append(helper.make_node("Concat", outputs, ["bias"], axis=1))
         graph = helper.make_graph(
@@ -115,7 +123,7 @@ WITHOUT = tuple(name for name in FEATURES if "_A_" not in name)  # without ancho
 
 
 class Paper:
-    """The network, fitted. `fit` makes one."""
+    """Hold the fitted network of the paper, see `fit`."""
 
     sees_attitude = True
 
@@ -127,8 +135,18 @@ class Paper:
         layers: list[tuple[np.ndarray, np.ndarray]],
         std: float,
     ) -> None:
-        """names : features; offset, scale : (k,); layers : list of (weights (i, o), biases (o,));
-        std : m.
+        """Store the network.
+
+        Parameters
+        ----------
+        names : sequence of str
+            Features.
+        offset, scale : numpy.ndarray
+            Scaling of the features (k,).
+        layers : list
+            (weights (i, o), biases (o,)) of each layer.
+        std : float
+            Standard deviation, m.
         """
         self.names, self.offset, self.scale, self.layers, self.std = (
             names,
@@ -140,7 +158,7 @@ class Paper:
         self.validity_features = tuple(name for name in names if name[0] == "d")
 
     def mean(self, samples: Samples) -> np.ndarray:
-        """Predicted error, (n,) m."""
+        """Return the predicted errors (n,), m."""
         x = (columns(samples, self.names) - self.offset) / self.scale
         for k, (weights, biases) in enumerate(self.layers):
             x = x @ weights + biases
@@ -148,7 +166,7 @@ class Paper:
         return x[:, 0]
 
     def onnx(self, meta: Mapping[str, Any]) -> ModelProto:
-        """The onnx.ModelProto: bias, standard deviation. meta : further metadata."""
+        """Return the ONNX model with the outputs bias and standard deviation."""
         graph = GraphBuilder()
         x = graph.input
         for k, (weights, biases) in enumerate(self.layers):
@@ -171,11 +189,26 @@ def fit(
     seed: int,
     progress: Callable[[int, float], object] = lambda epoch, error: None,
 ) -> tuple[Paper, tuple[list[float], list[float]]]:
-    """Paper, and its learning curve: lists of training and validation error per epoch (RMS, m).
-    Raises InputError.
+    """Train the network of the paper.
 
-    training, validation : lists of Labels; orientations : use those of the anchors; progress :
-        called after each epoch.
+    Parameters
+    ----------
+    training, validation : sequence of Labels
+    orientations : bool
+        Use the orientations of the anchors.
+    seed : int
+    progress : callable
+        Called with epoch and validation error, m.
+
+    Returns
+    -------
+    tuple
+        Paper, and RMS errors per epoch of training and validation, m.
+
+    Raises
+    ------
+    InputError
+        If an anchor has no orientation but the model needs it.
     """
     names = FEATURES if orientations else WITHOUT
     if orientations:

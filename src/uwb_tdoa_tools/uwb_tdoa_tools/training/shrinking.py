@@ -1,10 +1,9 @@
-"""The share of a correction that cross-validation over flights supports, and the gain that can be
-expected of it.
+"""Scale a correction to the share that cross-validation over flights supports.
 
-The flights are dealt to FOLDS; for each, a model is trained on the others, and the filter judges it
-there with several shares of its prediction. Whole flights: samples of one are too alike. The
-effects are those that were found in all flights, with values fitted to the others alone:
-`physics.find` has judged them on flights left out already.
+The flights are split into FOLDS. For each fold a model is trained on the other flights, and the filter
+runs with several shares of its prediction. Folds hold whole flights, since samples of one flight are
+correlated. The effects are those found in all flights. Their values are fitted without the fold.
+`physics.find_effects` has already validated them on excluded flights.
 """
 
 from __future__ import annotations
@@ -43,11 +42,20 @@ def cross_validated(
     progress: Callable[[str], object] = lambda text: None,
     map_function: MapFunction = map,
 ) -> Shrinkage:
-    """Shrinkage of the model of a Recipe trained on Flights.
+    """Return the Shrinkage of a recipe on flights.
 
-    plain : as `uncorrected` gives; found : Physics of these flights, in this order, for kinds with
-        effects;
-    map_function(function, folds) : as map, but for the time and the process in which each is done.
+    Parameters
+    ----------
+    recipe : Recipe
+    flights : sequence of Flight
+    uncorrected_errors : mapping
+        See `uncorrected`.
+    found : Physics, optional
+        Effects of these flights in this order, for kinds with effects.
+    progress : callable
+        Called with lines of text.
+    map_function : callable
+        Like `map`. It may use other processes.
     """
     order = np.random.default_rng(recipe.seed).permutation(len(flights))
     errors: dict[str, dict[float | None, float]] = {}
@@ -65,9 +73,7 @@ def cross_validated(
 
 
 def uncorrected(flights: Sequence[Flight], map_function: MapFunction = map) -> dict[str, float]:
-    """{name: 3D RMSE of the filter, m, from TDOAs and IMU alone} of Flights without any correction.
-    map_function : as of `cross_validated`.
-    """
+    """Return the 3D RMSE of the filter without correction, m, by flight name."""
     return {flight.name: error for error, flight in zip(map_function(_error, flights), flights)}
 
 
@@ -78,8 +84,9 @@ def errors_by_share(
     network: Network | None,
     shares: Sequence[float] = SHARES,
 ) -> dict[float | None, float]:
-    """{share: 3D RMSE of the filter on a Flight, m, from TDOAs and IMU alone}, under None without
-    any correction, as `plain` says. Without a network there is one share, 1.
+    """Return the 3D RMSE of the filter, m, by share of the network.
+
+    The key None means no correction. Without a network the only share is 1.
     """
     out: dict[float | None, float] = {None: uncorrected_errors[flight.name]}
     if network is None:
@@ -98,8 +105,11 @@ def train(
     progress: Callable[[str], object] = lambda text: None,
     map_function: MapFunction = map,
 ) -> tuple[models.Trained, Shrinkage]:
-    """(Trained, Shrinkage): `models.train`, scaled to the share that cross-validation supports.
-    map_function : as of `cross_validated`.
+    """Train with `models.train` and set the share that cross-validation supports.
+
+    Returns
+    -------
+    tuple of Trained and Shrinkage
     """
     flights = [*training, *validation]
     found = None
@@ -120,8 +130,9 @@ def _left_out(
     uncorrected_errors: Mapping[str, float],
     fold: tuple[list[int], list[int], physics.Physics | None],
 ) -> dict[str, list[tuple[float | None, float]]]:
-    """{flight: [(share, 3D RMSE), ...]}, JSON, of a fold: (numbers of the flights left out, of the
-    others, Physics fitted to those or None).
+    """Return {flight: [(share, 3D RMSE in m), ...]} of a fold, for JSON.
+
+    `fold` holds the numbers of the excluded flights, of the other flights, and their Physics or None.
     """
     left_out, others, known = fold
     with temporary_folder() as folder:
