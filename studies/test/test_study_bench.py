@@ -8,7 +8,7 @@ import time
 
 import numpy as np
 import pytest
-from test_flying_peer import CC, built
+from test_flying_estimates import CC, built
 
 pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")

@@ -38,9 +38,9 @@ def test_a_vehicle_that_stands_stays():
 
 
 def test_it_stands_on_a_table_and_beside_it_on_the_floor():
-    vehicle = Vehicle(floor=0.1, table=0.7, table_radius=0.5)
-    assert vehicle.at_rest(0.4, 0.0, 0.0)[2] == pytest.approx(0.8 + vehicle.leg, abs=2e-3)
-    assert vehicle.at_rest(0.6, 0.0, 0.0)[2] == pytest.approx(0.1 + vehicle.leg, abs=2e-3)
+    vehicle = Vehicle(table=0.7, table_radius=0.5)
+    assert vehicle.at_rest(0.4, 0.0, 0.0)[2] == pytest.approx(0.7 + vehicle.leg, abs=2e-3)
+    assert vehicle.at_rest(0.6, 0.0, 0.0)[2] == pytest.approx(vehicle.leg, abs=2e-3)
 
 
 def test_a_fall_is_a_fall():

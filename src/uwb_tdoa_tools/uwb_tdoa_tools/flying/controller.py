@@ -87,17 +87,16 @@ class Controller:
         Integral part of the acceleration (3,), m/s^2, world frame.
     """
 
-    def __init__(self, gains: Gains | None = None, vehicle: Vehicle | None = None) -> None:
+    def __init__(self, vehicle: Vehicle | None = None) -> None:
         """Start at rest.
 
         Parameters
         ----------
-        gains : Gains, optional
         vehicle : Vehicle, optional
             Vehicle as the controller assumes it.
         """
-        self.gains, self.vehicle = gains or Gains(), vehicle or Vehicle()
-        self.record = np.array([tuple(asdict(self.gains).values())], RECORD)[0]
+        self.vehicle = vehicle or Vehicle()
+        self.record = np.array([tuple(asdict(Gains()).values())], RECORD)[0]
         self.weight = self.vehicle.mass * GRAVITY
         self.rates, self.integral = np.zeros(3), np.zeros(3)
         self.thrust = self.lift = 0.0

@@ -174,15 +174,24 @@ def _pointer(array: np.ndarray) -> ctypes.c_void_p:
 pass
 
 
-NO_ODOMETRY = Odometry(
-    np.empty(0),
-    np.empty((0, 3)),
-    np.empty((0, 3)),
-    np.empty((0, 4)),
-    np.empty((0, 3)),
-    np.empty((0, 3)),
-    np.empty((0, 9, 9)),
-    np.empty((0, 3, 3)),
+def odometry_of(
+    t: np.ndarray, p: np.ndarray, v: np.ndarray, q: np.ndarray, covariance: np.ndarray
+) -> Odometry:
+    """Return odometry of poses and velocities, without rates.
+
+    Parameters
+    ----------
+    t, p, v, q : numpy.ndarray
+        Stamps (n,) s, positions (n, 3) m, velocities (n, 3) m/s and attitudes (n, 4) x y z w.
+    covariance : numpy.ndarray
+        Of position, velocity and attitude (n, 9, 9).
+    """
+    zero = np.zeros(p.shape)
+    return Odometry(t, p, v, q, zero, zero, covariance, np.zeros((len(t), 3, 3)))
+
+
+NO_ODOMETRY = odometry_of(
+    np.empty(0), np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 4)), np.empty((0, 9, 9))
 )
 
 
@@ -376,13 +385,4 @@ class PeerFilter:
         if not self._states:
             return NO_ODOMETRY
         t, p, v, q = map(np.array, zip(*self._states))
-        return Odometry(
-            t,
-            p,
-            v,
-            q,
-            np.zeros(p.shape),
-            np.zeros(p.shape),
-            np.full((len(t), 9, 9), np.nan),
-            np.zeros((len(t), 3, 3)),
-        )
+        return odometry_of(t, p, v, q, np.full((len(t), 9, 9), np.nan))

@@ -29,11 +29,10 @@ from uwb_tdoa_bias.foundation.ros_streams import StreamOutput
 from uwb_tdoa_bias.foundation.ros_topics import OUTPUT_QOS, Input, StreamInput
 from uwb_tdoa_bias.foundation.sensors import SENSORS
 from uwb_tdoa_ekf.reorder_buffer import TRIAL
-from uwb_tdoa_ekf.results import Odometry
 from uwb_tdoa_msgs.msg import EstimatorStatus, Tdoa
 
 from ..bags.messages import BODY_FRAME
-from .estimates import NO_ODOMETRY
+from .estimates import NO_ODOMETRY, odometry_of
 from .simulator import DT
 from .vehicle import ATTITUDE, POSITION
 
@@ -42,6 +41,7 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.foundation.ros_cdr import Template
     from uwb_tdoa_bias.foundation.ros_node import StreamNode
+    from uwb_tdoa_ekf.results import Odometry
 
     from .mission import Pose
     from .simulator import SensorReadings
@@ -309,9 +309,7 @@ class OverTopics:
         t, p, v, q, covariance = map(np.array, zip(*self._rows))
         whole = np.zeros((len(t), 9, 9))
         whole[:, :3, :3] = covariance
-        return Odometry(
-            t, p, v, q, np.zeros(p.shape), np.zeros(p.shape), whole, np.zeros((len(t), 3, 3))
-        )
+        return odometry_of(t, p, v, q, whole)
 
     def _parts(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return seconds and nanoseconds (n,) of the stamps t (n,) s."""

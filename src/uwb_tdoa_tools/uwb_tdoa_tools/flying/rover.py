@@ -217,7 +217,7 @@ class Drive:
         return self.path.end
 
     def wanted(self, t: np.ndarray) -> np.ndarray:
-        """The point of the path that it took for the nearest: (n, 1, 3) m, at t (n,) s."""
+        """Return the points of the path that were nearest (n, 1, 3), m, at t (n,) s."""
         if not self._clock:
             return np.full((len(t), 1, 3), np.nan)
         return self.path.at(np.interp(t, *np.transpose(self._clock)))[:, None]

@@ -17,7 +17,7 @@ from uwb_tdoa_bias.foundation.flight import Flight, Truth
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.results import Odometry, concatenated
 
-from .controller import SUPPORT_TIME, Controller, Gains, rotate_attitude
+from .controller import SUPPORT_TIME, Controller, rotate_attitude
 from .estimates import OwnFilter, PeerFilter
 from .mission import DONE, REFUSED, Circles, Mission, Rules, Waypoints
 from .sensors import random
@@ -64,7 +64,6 @@ class Task:
     path : Circles or Waypoints
         Waypoints make the vehicle a rover.
     rules : Rules
-    gains : Gains
     """
 
     world: World
@@ -78,7 +77,6 @@ class Task:
     peer: str | None = None
     path: Circles | Waypoints = Circles()
     rules: Rules = Rules()
-    gains: Gains = Gains()
 
     @property
     def vehicle(self) -> str:
@@ -176,7 +174,7 @@ class Trial:
 
     def _controller(self) -> Any:
         """Return the controller."""
-        return Controller(self.task.gains, self.simulator.nominal)
+        return Controller(self.simulator.nominal)
 
     def fly(self) -> None:
         """Run one mission until the vehicle has rested after it or has crashed."""
@@ -187,7 +185,9 @@ class Trial:
     def begin(self, path: Plan | None = None, rules: Rules | None = None) -> None:
         """Begin a mission at the present place. The defaults are path and rules of the task."""
         self.missions.append(self._mission(path or self.task.path, rules or self.task.rules))
-        self._moment = _moment(self.task.world.silence, self.task.path, self.task.rules, self._rng)
+        self._silence_begins = _silence_start(
+            self.task.world.silence, self.task.path, self.task.rules, self._rng
+        )
 
     def _mission(self, path: Any, rules: Rules) -> Any:
         """Return a mission from the present place."""
@@ -234,7 +234,7 @@ class Trial:
         """Set the times of the gap and of the anchor change for a mission."""
         started = mission.begin + mission.rules.rest if mission.started is None else mission.started
         self.simulator.radio.schedule_faults(
-            started + self._moment, started + 0.5 * self.task.path.duration
+            started + self._silence_begins, started + 0.5 * self.task.path.duration
         )
 
     def rest(self, seconds: float) -> None:
@@ -254,7 +254,15 @@ class Trial:
 
     def _crash(self) -> str:
         """Return the reason of a crash, or ""."""
-        return _crash(self.simulator, self.task.world)
+        simulator, size = self.simulator, self.task.world.size
+        x, y, z = simulator.state[POSITION]
+        qx, qy = simulator.state[ATTITUDE][:2]
+        tilt = math.acos(min(1.0, max(-1.0, 1.0 - 2.0 * (qx**2 + qy**2))))
+        if tilt > TIPPED and simulator.contact[simulator.done]:
+            return "tipped over"
+        if abs(x) > 0.5 * size[0] + OUTSIDE or abs(y) > 0.5 * size[1] + OUTSIDE:
+            return "flew into a wall"
+        return "flew into the ceiling" if z > size[2] + OUTSIDE else ""
 
     def _predicted_attitude(self, attitude: np.ndarray, since: float) -> np.ndarray:
         """Return an attitude (4,) of the time `since`, s, rotated by the gyroscope until now."""
@@ -320,7 +328,7 @@ def _filter_of(task: Task, place: np.ndarray, yaw: float) -> OwnFilter | PeerFil
     return OwnFilter(anchors, replace(task.config, **known), task.effects, load_network(task.model))
 
 
-def _moment(
+def _silence_start(
     silence: tuple[str, float] | None,
     path: Circles | Waypoints,
     rules: Rules,
@@ -337,17 +345,3 @@ def _moment(
         "landing": path.duration - 2.0,
         "anywhere": anywhere,
     }[silence[0]]
-
-
-def _crash(simulator: Simulator, world: World) -> str:
-    """Return the reason of a crash of the quadrotor, or ""."""
-    state = simulator.state
-    x, y, z = state[POSITION]
-    tilt = math.acos(min(1.0, max(-1.0, 1.0 - 2.0 * (state[6] ** 2 + state[7] ** 2))))
-    if tilt > TIPPED and simulator.contact[simulator.done]:
-        return "tipped over"
-    if abs(x) > 0.5 * world.size[0] + OUTSIDE or abs(y) > 0.5 * world.size[1] + OUTSIDE:
-        return "flew into a wall"
-    if z > world.size[2] + OUTSIDE:
-        return "flew into the ceiling"
-    return ""

@@ -57,8 +57,6 @@ class Vehicle:
         Thrust, N/(rad/s)^2, and yaw moment, Nm/(rad/s)^2, of a rotor.
     rotor_drag, inflow : float
         Drag of a rotor across and along the z axis of the body, N/(rad/s)/(m/s).
-    body_drag : float
-        N/(m/s)^2.
     motor_time, top_speed : float
         Time constant, s, and largest speed, rad/s, of a motor.
     radius : float
@@ -69,8 +67,6 @@ class Vehicle:
         Of a foot, N/m, N/(m/s) and N/(m/s).
     friction : float
         Coefficient of friction.
-    floor : float
-        Height of the ground, m.
     table, table_x, table_y, table_radius : float
         Height above the floor, place and radius of a round table, m. A radius of 0 means no table.
     """
@@ -83,7 +79,6 @@ class Vehicle:
     moment: float = 7.8e-10
     rotor_drag: float = 10.2506e-7
     inflow: float = 7.553e-7
-    body_drag: float = 0.0
     motor_time: float = 0.072
     top_speed: float = 2500.0
     radius: float = 0.023
@@ -92,7 +87,6 @@ class Vehicle:
     damping: float = 0.6
     friction_damping: float = 0.5
     friction: float = 0.6
-    floor: float = 0.0
     table: float = 0.0
     table_x: float = 0.0
     table_y: float = 0.0
@@ -129,8 +123,8 @@ def ground_at(record: Record, x: float, y: float) -> float:
         record.table_radius > 0.0
         and math.hypot(x - record.table_x, y - record.table_y) <= record.table_radius
     ):
-        return record.floor + record.table
-    return record.floor
+        return record.table
+    return 0.0
 
 
 @compiled
@@ -188,8 +182,7 @@ def _derivative(
         r01 * ax + r11 * ay + r21 * az,
         r02 * ax + r12 * ay + r22 * az,
     )
-    drag = -record.body_drag * math.sqrt(air_x**2 + air_y**2 + air_z**2)
-    fx, fy, fz = drag * air_x, drag * air_y, drag * air_z  # force and moment, body frame
+    fx, fy, fz = 0.0, 0.0, 0.0  # force and moment, body frame
     mx, my, mz = 0.0, 0.0, 0.0
     world_x, world_y, world_z = 0.0, 0.0, -GRAVITY * record.mass  # force, world frame
     feet = 0

@@ -1,3 +1,5 @@
+"""The network of Zhao et al."""
+
 from dataclasses import replace
 
 import numpy as np

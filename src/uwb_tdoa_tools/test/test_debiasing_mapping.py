@@ -1,3 +1,5 @@
+"""Positions from flights and from places at rest."""
+
 import numpy as np
 import pytest
 

@@ -1,4 +1,4 @@
-"""Another filter to fly by: a tiny library, compiled here, that stays where it was told to be."""
+"""A peer as estimate: a tiny library that is compiled here and returns its start."""
 
 import ctypes
 import shutil
