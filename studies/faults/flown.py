@@ -130,12 +130,12 @@ FAULTS = {
 
 
 class FaultyFilter:
-    """An EstimateSource: OurFilter, whose streams have a fault, and that obeys what `status` would
+    """An EstimateSource: OwnFilter, whose streams have a fault, and that obeys what `status` would
     say.
     """
 
     def __init__(self, ours: OwnFilter, fault: FlownFault) -> None:
-        """ours : OurFilter; fault : FlownFault."""
+        """ours : OwnFilter; fault : FlownFault."""
         self._ours, self._fault, self._begun = ours, fault, False
         self._use, self._watch, self._findings = (
             Use(LAG),
@@ -147,7 +147,7 @@ class FaultyFilter:
         self._restarts, self.why, self.said = 0, "", ""
 
     def set_pose(self, t: float, p: np.ndarray, std: float, yaw: float) -> None:
-        """As of OurFilter."""
+        """As of OwnFilter."""
         self._ours.set_pose(t, p, std, yaw)
 
     def take(self, measured: SensorReadings) -> None:
@@ -202,7 +202,7 @@ class FaultyFilter:
 
     @property
     def pose(self) -> Any:
-        """As of OurFilter."""
+        """As of OwnFilter."""
         return self._ours.pose
 
     @property
@@ -212,7 +212,7 @@ class FaultyFilter:
 
     @property
     def odometry(self) -> Any:
-        """As of OurFilter."""
+        """As of OwnFilter."""
         return self._ours.odometry
 
 
