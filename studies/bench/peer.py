@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_tools.flying.peer import Peer, events
+from uwb_tdoa_tools.flying.estimates import Peer, events
 
 from .core import BEFORE, MEASURED, RARELY, Core, sample_before
 from .figures import Figure

@@ -29,7 +29,7 @@ import numpy as np
 from tqdm import tqdm
 
 from uwb_tdoa_tools import cli
-from uwb_tdoa_tools.flying.peer import Peer
+from uwb_tdoa_tools.flying.estimates import Peer
 from uwb_tdoa_tools.outputs import OutputFile, OutputFolder
 
 from . import core, graph, nodes, peer, rates, recordings

@@ -26,7 +26,7 @@ from uwb_tdoa_bias.foundation.flight import Flight
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools import cli, parallel
 from uwb_tdoa_tools.flying import fleet
-from uwb_tdoa_tools.flying.path import Circles
+from uwb_tdoa_tools.flying.mission import Circles
 from uwb_tdoa_tools.flying.trial import Task, fly
 from uwb_tdoa_tools.flying.world import World
 from uwb_tdoa_tools.outputs import OutputFolder
@@ -134,14 +134,14 @@ def run(args: Namespace) -> None:
     ]
     seeds = range(args.seed, args.seed + args.flights)
     tasks = [task(kind, seed, trained) for kind in kinds for seed in seeds]
-    flown = list(parallel.over(partial(fleet.fly_one, None, True), tasks, args.jobs))
+    flown = list(parallel.over(partial(fleet.fly_task, None, True), tasks, args.jobs))
     of_kind = {kind: flown[k * len(seeds) : (k + 1) * len(seeds)] for k, kind in enumerate(kinds)}
     verdicts = {kind: [verdict for verdict, _ in some] for kind, some in of_kind.items()}
-    told = [
+    given = [
         dict(zip(("by", "constellation", "trajectory", "flights"), (*kind, some)))
         for kind, some in verdicts.items()
     ]
-    cli.write_json(out / "flights.json", {"kinds": told})
+    cli.write_json(out / "flights.json", {"kinds": given})
     lines = "\n".join(table(verdicts))
     write_text(out / "table.md", lines + "\n")
     print(lines)
@@ -232,7 +232,7 @@ def _train(parts: list[list[Flight]], some: list[Flight], folder: Path, name: st
     if name in NETWORKS:
         models.save(models.train(models.Recipe(name, 0), *parts, name), folder / name)
     else:
-        physics.find(some).effects.to_yaml(folder / name)
+        physics.find_effects(some).effects.to_yaml(folder / name)
     return name
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwb_tdoa_tools.flying.path import CLIMB, KNOT, SETTLE, ReferenceTrajectory, cruise, smooth
+from uwb_tdoa_tools.flying.mission import CLIMB, KNOT, SETTLE, ReferenceTrajectory, cruise, smooth
 from uwb_tdoa_tools.simulation.config import SimulationConfig
 from uwb_tdoa_tools.simulation.paths import sines
 from uwb_tdoa_tools.simulation.rooms import Room
@@ -38,7 +38,7 @@ class Sines:
         """As of Circles."""
         return self.rise + self.seconds + self.fall
 
-    def along(self, place: np.ndarray, ground: float) -> ReferenceTrajectory:
+    def starting_at(self, place: np.ndarray, ground: float) -> ReferenceTrajectory:
         """The ReferenceTrajectory, as of Circles."""
         knots = np.arange(0.0, self.duration + KNOT, KNOT)
         up = cruise(knots / self.rise, CLIMB)

@@ -14,9 +14,8 @@ from uwb_tdoa_bias.foundation.files import write_text
 from uwb_tdoa_bias.foundation.flight import AIDS
 from uwb_tdoa_ekf.debias import fit
 from uwb_tdoa_tools import parallel
-from uwb_tdoa_tools.debiasing.evaluation import evaluate_map, fly
-from uwb_tdoa_tools.debiasing.parts import LEAST, part_of
-from uwb_tdoa_tools.debiasing.report import about_figures
+from uwb_tdoa_tools.debiasing.evaluation import estimate_flight, evaluate_map, map_figures
+from uwb_tdoa_tools.debiasing.mapping import LEAST, part_of
 from uwb_tdoa_tools.outputs import OutputFolder
 from uwb_tdoa_tools.readers import inputs
 
@@ -124,7 +123,7 @@ def _case(task, data, diagnosed):
             row = rows.setdefault(run[1].name, {})
             row[words or "before"] = _figures(run[1])
             row |= {name: _figures(evaluate_map(run, one, effects)) for name, one in maps.items()}
-        about |= {name: about_figures(one) for name, one in maps.items()}
+        about |= {name: map_figures(one) for name, one in maps.items()}
     return {
         "case": case,
         "fitted": to_fit,
@@ -148,7 +147,7 @@ def _effects_file(diagnosed, split):
 def flown(data, path, effects=None):
     """What `fly` gives for a flight of the data, without height, pressure and velocity."""
     (flight,) = inputs.Reading(data / "surveys").flights([data / path])
-    return fly(flight.without(*AIDS), effects=effects)
+    return estimate_flight(flight.without(*AIDS), effects=effects)
 
 
 def _figures(score):

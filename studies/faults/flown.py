@@ -24,7 +24,7 @@ from uwb_tdoa_ekf.monitoring.use import Use
 from uwb_tdoa_ekf.results import concatenated, rows_of
 from uwb_tdoa_ekf.streams import most_severe_first
 from uwb_tdoa_tools import parallel
-from uwb_tdoa_tools.flying.estimates import OurFilter
+from uwb_tdoa_tools.flying.estimates import OwnFilter
 from uwb_tdoa_tools.flying.simulator import SensorReadings
 from uwb_tdoa_tools.flying.trial import Task, Trial
 from uwb_tdoa_tools.flying.verdict import verdict_of
@@ -130,12 +130,12 @@ FAULTS = {
 
 
 class FaultyFilter:
-    """An EstimateSource: OurFilter, whose streams have a fault, and that obeys what `status` would
+    """An EstimateSource: OwnFilter, whose streams have a fault, and that obeys what `status` would
     say.
     """
 
-    def __init__(self, ours: OurFilter, fault: FlownFault) -> None:
-        """ours : OurFilter; fault : FlownFault."""
+    def __init__(self, ours: OwnFilter, fault: FlownFault) -> None:
+        """ours : OwnFilter; fault : FlownFault."""
         self._ours, self._fault, self._begun = ours, fault, False
         self._use, self._watch, self._findings = (
             Use(LAG),
@@ -147,7 +147,7 @@ class FaultyFilter:
         self._restarts, self.why, self.said = 0, "", ""
 
     def set_pose(self, t: float, p: np.ndarray, std: float, yaw: float) -> None:
-        """As of OurFilter."""
+        """As of OwnFilter."""
         self._ours.set_pose(t, p, std, yaw)
 
     def take(self, measured: SensorReadings) -> None:
@@ -202,7 +202,7 @@ class FaultyFilter:
 
     @property
     def pose(self) -> Any:
-        """As of OurFilter."""
+        """As of OwnFilter."""
         return self._ours.pose
 
     @property
@@ -212,7 +212,7 @@ class FaultyFilter:
 
     @property
     def odometry(self) -> Any:
-        """As of OurFilter."""
+        """As of OwnFilter."""
         return self._ours.odometry
 
 
@@ -221,11 +221,11 @@ def flown(task: tuple[str, int]) -> dict[str, Any]:
     name, seed = task
     fault = FAULTS[name]
     trial = Trial(Task(world_of("hall", aids=fault.aids), seed))
-    assert isinstance(trial.source, OurFilter)
+    assert isinstance(trial.source, OwnFilter)
     trial.source = source = FaultyFilter(trial.source, fault)
     trial.fly()
-    verdict = verdict_of(trial.flown)
-    return {key: verdict[key] for key in ("landed", "safe", "why", "said_lost", "tracking")} | {
+    verdict = verdict_of(trial.result)
+    return {key: verdict[key] for key in ("landed", "safe", "why", "reported_lost", "tracking")} | {
         "fault": name,
         "seed": seed,
         "said": source.said,

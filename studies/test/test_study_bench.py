@@ -8,7 +8,7 @@ import time
 
 import numpy as np
 import pytest
-from test_flying_peer import CC, built
+from test_flying_estimates import CC, built
 
 pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
@@ -16,7 +16,7 @@ from studies.__main__ import main  # noqa: E402
 from studies.bench import core, graph, nodes, peer, source, suite, usage  # noqa: E402
 from studies.bench.figures import Figure, as_json, table  # noqa: E402
 from studies.bench.flights import TDOA_RATE, among, make_flight  # noqa: E402
-from uwb_tdoa_tools.flying.peer import Peer  # noqa: E402
+from uwb_tdoa_tools.flying.estimates import Peer  # noqa: E402
 
 OTHERS = 0.2  # of the CPU time, from which on nothing can be asked of what is played in real time
 LENIENT = 10.0  # times the target: on a loaded machine

@@ -57,7 +57,7 @@ def test_a_vehicle_lands_beside_one_wrong_stamp_and_sinks_where_the_status_says_
     assert lands["landed"] and lands["safe"] and lands["said"] == ""
     assert (
         not sinks["landed"]
-        and sinks["said_lost"] is not None
+        and sinks["reported_lost"] is not None
         and "two anchors are exchanged" in sinks["said"]
     )
     assert "| tdoa: one stamp 5 s ahead | 1 | 1 | 1 | nothing |" in table([lands, sinks])

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from studies.closed_loop.sines import Sines
-from uwb_tdoa_tools.flying.path import SINK
+from uwb_tdoa_tools.flying.mission import SINK
 from uwb_tdoa_tools.simulation.rooms import constellation, room_of
 
 ROOM = room_of(constellation("corners"))
@@ -14,7 +14,7 @@ GROUND = 0.03
 def followed(seed, place):
     """(Reference, t (n,) s, wanted (n, 3, 3)) up to where it sinks."""
     path = Sines(ROOM, seed)
-    reference, t = path.along(np.array(place), GROUND), np.arange(0.0, path.duration, 0.01)
+    reference, t = path.starting_at(np.array(place), GROUND), np.arange(0.0, path.duration, 0.01)
     return reference, t, reference.at(t)
 
 
@@ -41,5 +41,5 @@ def test_sines_fill_the_room_stay_inside_and_turn():
     )
     speed = np.linalg.norm(wanted[:, 1], axis=1)
     assert np.sqrt(np.mean(speed**2)) == pytest.approx(0.7, abs=0.2) and speed.max() < 2.0
-    assert reference.turned(10.0) == pytest.approx(3.0)
+    assert reference.yaw_offset(10.0) == pytest.approx(3.0)
     assert np.abs(followed(4, (0.0, 0.0))[2] - wanted).max() > 0.5

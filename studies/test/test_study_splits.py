@@ -19,7 +19,7 @@ def errors(*ratios):
 def test_splits_are_done_once_and_summed_up(tmp_path, monkeypatch, capsys):
     made, flights = [], [flight(seed) for seed in range(2)]
 
-    def split(flights, plain, seed, fit, kinds):
+    def split(flights, uncorrected_errors, seed, fit, kinds):
         for kind in kinds:
             made.append((kind, seed))
             told = {

@@ -11,7 +11,7 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.scoring.metrics import Score, position_at, scored_phase
-from uwb_tdoa_tools.training.labels import LARGEST
+from uwb_tdoa_tools.training.labels import LARGEST_ERROR
 
 CELL = 0.3  # m, size of the cells in which residuals of two flights are compared
 
@@ -37,7 +37,7 @@ def oracle(flight, window):
     _, first, last = scored_phase(truth)
     bias, sane = (
         np.zeros(len(data)),
-        (np.abs(error) <= LARGEST) & (data.t >= first) & (data.t <= last),
+        (np.abs(error) <= LARGEST_ERROR) & (data.t >= first) & (data.t <= last),
     )
     pair = a * len(anchors) + b
     for one in np.unique(pair):

@@ -97,7 +97,9 @@ def _trained(train, kinds, out, seed, validation):
     correctors, skipped = {"none": (None, None)}, {}
     parts = [[known[name] for name in group] for group in names]
     effects_found = (
-        physics.find(sum(parts, [])) if any(kind.startswith("physics") for kind in kinds) else None
+        physics.find_effects(sum(parts, []))
+        if any(kind.startswith("physics") for kind in kinds)
+        else None
     )
     for kind in kinds:
 

@@ -51,29 +51,36 @@ def run(args):
     flights = [
         flight.without(*AIDS) for flight in inputs.Reading(args.survey).flights(args.flights)
     ]
-    seeds, plain = range(args.first, args.first + args.splits), shrinking.uncorrected(flights)
+    seeds, uncorrected_errors = (
+        range(args.first, args.first + args.splits),
+        shrinking.uncorrected(flights),
+    )
     with ResultsFile(
         args.out, {"fit": args.fit, "flights": [flight.name for flight in flights]}
     ) as done:
         for seed in tqdm(seeds, unit="split", disable=None):
             missing = [kind for kind in args.models if f"{kind} {seed}" not in done]
-            for row in split(flights, plain, seed, args.fit, missing):
+            for row in split(flights, uncorrected_errors, seed, args.fit, missing):
                 done[f"{row['kind']} {seed}"] = row
         rows = [done[f"{kind} {seed}"] for kind in args.models for seed in seeds]
     print(table(rows, shrunk=False) + "\n" + table(rows, shrunk=True))
 
 
-def split(flights, plain, seed, fit, kinds):
+def split(flights, uncorrected_errors, seed, fit, kinds):
     """Yield, for each kind, a dict of one split: 3D RMSE of every left-out flight by share, and of
     every judged flight with the share that is borne out, and with all. plain : of
     `shrinking.uncorrected`.
     """
     order = np.random.default_rng([seed, fit]).permutation(len(flights))
     chosen, others = ([flights[k] for k in part] for part in (order[:fit], order[fit:]))
-    found = physics.find(chosen) if any(kind.startswith("physics") for kind in kinds) else None
+    found = (
+        physics.find_effects(chosen) if any(kind.startswith("physics") for kind in kinds) else None
+    )
     for kind in kinds:
         known = found if kind.startswith("physics") else None
-        borne_out = shrinking.cross_validated(models.Recipe(kind, seed), chosen, plain, known)
+        borne_out = shrinking.cross_validated(
+            models.Recipe(kind, seed), chosen, uncorrected_errors, known
+        )
         with TemporaryDirectory() as folder:
             trained = models.train(
                 models.Recipe(kind, seed), chosen[:-1], chosen[-1:], kind, found=known, curve=False
@@ -83,7 +90,7 @@ def split(flights, plain, seed, fit, kinds):
             shares = sorted({borne_out.share, 1.0})
             errors = {
                 flight.name: shrinking.errors_by_share(
-                    flight, plain, trained.effects, network, shares
+                    flight, uncorrected_errors, trained.effects, network, shares
                 )
                 for flight in others
             }

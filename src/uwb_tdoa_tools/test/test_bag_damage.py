@@ -22,7 +22,7 @@ from uwb_tdoa_bias.foundation.sensors import Height, Pressure, Velocity
 from uwb_tdoa_tools.bags import mcap
 from uwb_tdoa_tools.bags.bag import read_bag, write_bag
 from uwb_tdoa_tools.bags.files import messages, open_bag
-from uwb_tdoa_tools.bags.integrity import NO_SUM, SUM_KEY, metadata
+from uwb_tdoa_tools.bags.integrity import CHECKSUM_KEY, NO_CHECKSUM, metadata
 
 FLIGHT = small_flight(0.3)
 BOTH = pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
@@ -54,7 +54,9 @@ def copy(bags, tmp_path):
 def forget_sum(bag):
     """As if the bag were of somebody who leaves no checksum in metadata.yaml."""
     file = bag / "metadata.yaml"
-    file.write_text(file.read_text().replace(metadata(bag)["custom_data"][SUM_KEY], NO_SUM))
+    file.write_text(
+        file.read_text().replace(metadata(bag)["custom_data"][CHECKSUM_KEY], NO_CHECKSUM)
+    )
 
 
 def flip(file, at, mask=1):

@@ -182,9 +182,9 @@ def test_chunks_may_not_unfold_to_more_than_all_of_them_may(tmp_path, monkeypatc
     head, body, end = chunk[:29], chunk[29:-50], chunk[-50:]
     (tmp_path / "forged.mcap").write_bytes(head + 3 * body + end)
     unfolded = []
-    original = mcap.unpacked
+    original = mcap.chunk_data
     monkeypatch.setattr(
-        mcap, "unpacked", lambda *given: unfolded.append(original(*given)) or unfolded[-1]
+        mcap, "chunk_data", lambda *given: unfolded.append(original(*given)) or unfolded[-1]
     )
     with pytest.raises(
         InputError, match="a chunk claims 8388608 bytes, more than|no message that can be read"

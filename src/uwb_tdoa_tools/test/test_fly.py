@@ -11,36 +11,26 @@ from uwb_tdoa_tools.flying.verdict import verdict_of
 from uwb_tdoa_tools.readers import read_flight
 
 
-def test_flights_are_counted_told_and_drawn(tmp_path, capsys):
-    out, picture = tmp_path / "flown.json", tmp_path / "flown.png"
-    options = [
-        "--flights",
-        "1",
-        "--no-floor-effect",
-        "--told",
-        "place",
-        "--json",
-        str(out),
-        "--plot",
-        str(picture),
-    ]
-    code = main([*options, "--at-least", "1"])
+def test_a_flight_is_counted_drawn_and_recorded_for_the_other_tools(tmp_path, capsys):
+    out, picture, record = tmp_path / "flown.json", tmp_path / "flown.png", tmp_path / "flown"
+    options = ["--flights", "1", "--no-floor-effect", "--told", "place", "--aid", "height"]
+    written = ["--json", str(out), "--plot", str(picture), "--record", str(record)]
+    code = main([*options, *written, "--at-least", "1"])
     content = json.loads(out.read_text())
     assert [one["seed"] for one in content["flights"]] == [1]
-    assert content["summary"]["landed"] == sum(one["landed"] for one in content["flights"])
-    assert code == int(content["summary"]["landed"] < 1)
-    assert f"{content['summary']['landed']} of 1 landed" in capsys.readouterr().out
+    landed = content["summary"]["landed"]
+    assert landed == sum(one["landed"] for one in content["flights"])
+    assert code == int(landed < 1)
+    assert f"{landed} of 1 landed" in capsys.readouterr().out
     assert picture.read_bytes()[:4] == b"\x89PNG"
-
-
-def test_a_parameter_that_is_none_is_told(capsys):
-    assert main(["--set", "nonsense:=1"]) == 2
-    assert "nonsense" in capsys.readouterr().err
+    flight = read_flight(record / "flown-1")
+    assert len(flight.height) and len(flight.tdoa) > 5000 and flight.truth.p[:, 2].max() > 1.0
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
+        (["--set", "nonsense:=1"], "nonsense"),
         (["--silence", "noon:3"], "'noon:3' is not MOMENT:S"),
         (["--silence", "circle:x"], "'circle:x' is not MOMENT:S"),
         (["--inject", "gremlins", "1=2"], "'gremlins' needs the name of an effect"),
@@ -51,12 +41,12 @@ def test_a_parameter_that_is_none_is_told(capsys):
         (["--json", "nowhere/x.json"], "its directory does not exist"),
     ],
 )
-def test_what_cannot_be_is_told(options, said, capsys):
+def test_an_unusable_option_is_named(options, message, capsys):
     assert main([*options, "--flights", "1"]) == 2
-    assert said in capsys.readouterr().err
+    assert message in capsys.readouterr().err
 
 
-def test_it_goes_on_from_what_is_there(tmp_path, capsys, monkeypatch):
+def test_resume_skips_the_flights_in_the_file(tmp_path, capsys, monkeypatch):
     kept, out = tmp_path / "kept.jsonl", tmp_path / "flown.json"
     options = [
         "--no-floor-effect",
@@ -91,22 +81,3 @@ def test_it_goes_on_from_what_is_there(tmp_path, capsys, monkeypatch):
     )
     assert main(["--no-floor-effect", "--flights", "1", *options[3:]]) == 2
     assert "holds something else than results" in capsys.readouterr().err
-
-
-def test_a_flight_is_recorded_for_the_other_tools(tmp_path):
-    assert (
-        main(
-            [
-                "--no-floor-effect",
-                "--flights",
-                "1",
-                "--aid",
-                "height",
-                "--record",
-                str(tmp_path / "flown"),
-            ]
-        )
-        == 0
-    )
-    flight = read_flight(tmp_path / "flown" / "flown-1")
-    assert len(flight.height) and len(flight.tdoa) > 5000 and flight.truth.p[:, 2].max() > 1.0

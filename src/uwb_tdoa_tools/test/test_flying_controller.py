@@ -3,21 +3,21 @@ import math
 import numpy as np
 import pytest
 
-from uwb_tdoa_tools.flying.controller import Controller, turned
-from uwb_tdoa_tools.flying.loop import IMU_RATE, interval
+from uwb_tdoa_tools.flying.controller import Controller, rotate_attitude
+from uwb_tdoa_tools.flying.simulator import IMU_RATE, interval
 from uwb_tdoa_tools.flying.vehicle import ATTITUDE, GRAVITY, POSITION, VELOCITY, Vehicle
 
 TICK = 4
 
 
-def flown(wanted, yaw, seconds, turn=0.0, believed=None):
+def flown(wanted, yaw, seconds, turn=0.0, nominal=None):
     """States (n, 17) of a vehicle whose controller knows the truth, from (0, 0, 2) m and a yaw
     `turn`, rad, on.
     """
     vehicle, n = Vehicle(), int(seconds * IMU_RATE)
     state = vehicle.at_rest(0.0, 0.0, turn)
     state[2], state[13:] = 2.0, math.sqrt(vehicle.mass * GRAVITY / (4.0 * vehicle.thrust))
-    controller, gyro = Controller(vehicle=believed), np.zeros((2, 3))
+    controller, gyro = Controller(vehicle=nominal), np.zeros((2, 3))
     states, samples, contact, still = (
         np.empty((n, 17)),
         np.empty((n, 6)),
@@ -33,8 +33,8 @@ def flown(wanted, yaw, seconds, turn=0.0, believed=None):
             state,
             gyro,
             (controller.thrust, controller.rates),
-            (controller.numbers, controller.vehicle.numbers()),
-            vehicle.numbers(),
+            (controller.record, controller.vehicle.record()),
+            vehicle.record(),
             (still[rows, :3], still[rows], still[rows, :3]),
             (states[rows], samples[rows], contact[rows]),
         )
@@ -56,7 +56,7 @@ def test_it_goes_where_it_is_wanted_and_turns_there(turn):
 
 
 def test_it_learns_a_mass_that_it_was_told_wrong():
-    states = flown(at([0.0, 0.0, 2.0]), 0.0, 20.0, believed=Vehicle(mass=0.9 * Vehicle().mass))
+    states = flown(at([0.0, 0.0, 2.0]), 0.0, 20.0, nominal=Vehicle(mass=0.9 * Vehicle().mass))
     assert abs(states[:, 2] - 2.0).max() > 0.03 and states[-1, 2] == pytest.approx(2.0, abs=0.02)
 
 
@@ -82,7 +82,7 @@ def test_support_is_what_the_rotors_do_not_carry():
 def test_an_attitude_turns_as_the_gyroscope_says():
     q = np.array([0.0, 0.0, 0.0, 1.0])
     for _ in range(100):
-        turned(q, np.array([0.0, 0.0, math.pi / 2]), 0.01)
+        rotate_attitude(q, np.array([0.0, 0.0, math.pi / 2]), 0.01)
     np.testing.assert_allclose(
         q, [0.0, 0.0, math.sin(math.pi / 4), math.cos(math.pi / 4)], atol=1e-9
     )

@@ -1,10 +1,54 @@
+"""Paths, and what a mission decides along them."""
+
 import math
 
 import numpy as np
 import pytest
 
-from uwb_tdoa_tools.flying.mission import DONE, FLYING, LOST, PULL, REFUSED, WAITING, Mission, Rules
-from uwb_tdoa_tools.flying.path import Circles
+from uwb_tdoa_tools.flying.mission import (
+    DESCENT_LEAD,
+    DONE,
+    FLYING,
+    LOST,
+    REFUSED,
+    SINK,
+    WAITING,
+    Circles,
+    Mission,
+    Rules,
+)
+
+GROUND = 0.03
+
+
+def followed(path, place=(0.3, -0.2)):
+    """(Reference, t (n,) s, wanted (n, 3, 3)) up to where it sinks."""
+    reference = path.starting_at(np.array(place), GROUND)
+    t = np.arange(0.0, path.duration, 0.01)
+    return reference, t, reference.at(t)
+
+
+@pytest.mark.parametrize("path", [Circles(), Circles(swing=0.4), Circles(radius=0.0)])
+def test_it_begins_and_ends_at_rest_in_one_place_and_then_sinks(path):
+    reference, t, wanted = followed(path)
+    for k, height in ((0, GROUND), (-1, GROUND + 0.4)):
+        np.testing.assert_allclose(wanted[k, 0], [0.3, -0.2, height], atol=0.01)
+        np.testing.assert_allclose(wanted[k, 1], 0.0, atol=0.02)
+    np.testing.assert_allclose(
+        np.gradient(wanted[:, 0], t, axis=0)[1:-1], wanted[1:-1, 1], atol=0.02
+    )
+    after = reference.at(np.array([path.duration + 1.0]))[0]
+    assert np.isnan(after[0, 2]) and after[1, 2] == -SINK
+
+
+def test_a_swing_is_one_of_the_height_alone():
+    level, swung = (followed(Circles(swing=swing))[2] for swing in (0.0, 0.4))
+    off = swung[:, 0] - level[:, 0]
+    np.testing.assert_allclose(off[:, :2], 0.0, atol=1e-9)
+    assert off[:, 2].max() == pytest.approx(0.4, abs=1e-3) and off[:, 2].min() == pytest.approx(
+        -0.4, abs=1e-3
+    )
+
 
 LEVEL = np.array([0.0, 0.0, math.sin(0.2), math.cos(0.2)])  # yaw 0.4
 STEP = 0.01
@@ -62,7 +106,7 @@ def test_it_is_up_flies_its_circles_and_sinks(said):
 def test_an_estimate_that_does_not_come_down_is_pulled_down_and_another_is_not(said):
     high = said.until(30.0)[0, 2]
     assert (
-        high == pytest.approx(-PULL) and said.until(31.0)[0, 2] == high
+        high == pytest.approx(-DESCENT_LEAD) and said.until(31.0)[0, 2] == high
     )  # of an estimate of 0: no lower than that
     falling = Said(Mission(Circles(), (1.0, 2.0), 0.03))
     falling.sinks = 0.15
@@ -81,7 +125,7 @@ def test_lost_it_stops_and_sinks_and_goes_on_where_it_was(said):
     before = said.until(12.0)
     wanted = said.until(13.0, deviation=1.6)
     assert said.mission.state == LOST and said.mission.lost == pytest.approx(12.0)
-    assert np.isnan(wanted[0]).all() and wanted[1, 2] == -Rules().sink
+    assert np.isnan(wanted[0]).all() and wanted[1, 2] == -Rules().descent_speed
     assert np.isnan(said.until(14.0, deviation=1.2)[0]).all()  # not yet good enough to go on
     after = said.until(14.01)
     assert said.mission.state == FLYING and said.mission.lost == pytest.approx(12.0)
@@ -97,7 +141,7 @@ def test_lost_it_lands_where_it_is(said):
 
 
 def test_what_never_feels_the_ground_stops_its_rotors_in_the_end(said):
-    said.until(4.0 + 23.0 + Rules().longest_sink - 0.1)
+    said.until(4.0 + 23.0 + Rules().longest_descent - 0.1)
     assert said.mission.state == FLYING
-    said.until(4.0 + 23.0 + Rules().longest_sink + 0.1)
+    said.until(4.0 + 23.0 + Rules().longest_descent + 0.1)
     assert said.mission.state == DONE

@@ -1,4 +1,4 @@
-"""What comes over the topics that a vehicle flies by may be anything."""
+"""Flights over topics: messages of any content, and the time of each turn."""
 
 from types import SimpleNamespace
 
@@ -7,14 +7,20 @@ import pytest
 
 rclpy = pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg", reason="needs the built workspace: ./dev build")
-
 from nav_msgs.msg import Odometry  # noqa: E402
 from rclpy.serialization import serialize_message  # noqa: E402
 
 from uwb_tdoa_bias.foundation.flight import Imu, Tdoas  # noqa: E402
 from uwb_tdoa_bias.foundation.ros_node import StreamNode  # noqa: E402
 from uwb_tdoa_msgs.msg import EstimatorStatus  # noqa: E402
-from uwb_tdoa_tools.flying.over_topics import OverTopics  # noqa: E402
+from uwb_tdoa_tools.flying.over_topics import (  # noqa: E402
+    IMPATIENCE,
+    LARGEST_CATCH_UP,
+    PATIENCE,
+    Lockstep,
+    OverTopics,
+    RealTime,
+)
 from uwb_tdoa_tools.flying.simulator import SensorReadings  # noqa: E402
 from uwb_tdoa_tools.flying.vehicle import STATE  # noqa: E402
 from uwb_tdoa_tools.flying.world import HALL  # noqa: E402
@@ -45,7 +51,7 @@ def topics():
             Imu(none, np.empty((0, 3)), np.empty((0, 3))), Tdoas(none, none, none, none, none), {}
         )
     )
-    made.turned(5.0, np.zeros(STATE))
+    made.publish_truth(5.0, np.zeros(STATE))
     made.status = EstimatorStatus(status=EstimatorStatus.STATUS_RUNNING)
     yield made
     node.destroy_node()
@@ -78,7 +84,7 @@ def hear(topics, *messages):
         return [(frame, rows, None) for frame, rows, _ in wire.read(list(messages), lambda _: None)]
 
     topics._odometry = SimpleNamespace(fetch=fetch)
-    topics.listen()
+    topics.receive()
 
 
 def test_it_is_where_the_odometry_says_with_its_velocity_in_the_world(topics):
@@ -149,3 +155,96 @@ def test_odometry_from_before_anything_was_measured_is_not_taken(topics):
 def test_a_flood_of_odometry_does_not_fill_it(topics):
     hear(topics, *(odometry(4.0 + 1e-6 * k) for k in range(2000)))
     assert len(topics.odometry.t) <= 5
+
+
+TURN = 0.01
+
+
+@pytest.fixture
+def clock():
+    made = SimpleNamespace(t=100.0)
+    made.now = lambda: made.t
+    return made
+
+
+def stream(*t):
+    return SimpleNamespace(t=np.array(t), __len__=None)
+
+
+def measured(now, tdoa=True):
+    return SensorReadings(
+        stream(now - 0.005, now), stream(*([now - 0.004, now - 0.001] if tdoa else [])), {}
+    )
+
+
+@pytest.fixture
+def running(clock):
+    """A Lockstep in step with a filter of 200 Hz, at 5 s."""
+    made = Lockstep(clock.now)
+    for k in range(1, 501):
+        made.sent(TURN * k, measured(TURN * k))
+        for stamp in (TURN * k - 0.01, TURN * k - 0.005):
+            made.heard(stamp)
+        assert made.may_go_on()
+    return made
+
+
+def test_it_waits_for_the_odometry_that_is_due(running, clock):
+    running.sent(5.01, measured(5.01))
+    assert not running.may_go_on()
+    running.heard(5.0)
+    assert not running.may_go_on()  # 5.005 is before the newest TDOA, 5.009
+    clock.t += 0.9 * PATIENCE
+    assert not running.may_go_on()
+    running.heard(5.005)
+    assert running.may_go_on()
+
+
+def test_one_that_does_not_come_is_not_waited_for_any_longer(running, clock):
+    running.sent(5.01, measured(5.01))
+    clock.t += PATIENCE
+    assert running.may_go_on()
+    running.sent(5.02, measured(5.02))
+    assert not running.may_go_on()
+    clock.t += IMPATIENCE
+    assert running.may_go_on()
+    running.sent(5.03, measured(5.03))
+    running.heard(5.025)
+    assert running.may_go_on()
+    running.sent(5.04, measured(5.04))
+    clock.t += 2.0 * IMPATIENCE
+    assert not running.may_go_on()  # it is waited for again
+
+
+def test_in_a_silence_nothing_is_due_until_the_filter_goes_on_without(running):
+    for k in range(501, 530):
+        running.sent(TURN * k, measured(TURN * k, tdoa=False))
+        assert running.may_go_on()
+    running.sent(5.4, measured(5.4, tdoa=False))
+    assert not running.may_go_on()
+    running.heard(5.1)
+    assert running.may_go_on()
+
+
+def test_before_the_filter_starts_turns_are_slow(clock):
+    pace = Lockstep(clock.now)
+    assert pace.may_go_on()
+    pace.sent(TURN, measured(TURN))
+    assert not pace.may_go_on()
+    clock.t += IMPATIENCE
+    assert pace.may_go_on()
+
+
+def test_in_real_time_each_turn_has_its_time_and_a_delay_shifts_the_others(clock):
+    pace = RealTime(clock.now)
+    assert pace.may_go_on()
+    pace.sent(TURN, measured(TURN))
+    assert not pace.may_go_on()
+    clock.t += 1.01 * TURN
+    assert pace.may_go_on()
+    clock.t += 10.0
+    turns = 0
+    while pace.may_go_on():
+        turns += 1
+        pace.sent(TURN * (turns + 1), measured(TURN))
+    assert turns == pytest.approx(LARGEST_CATCH_UP / TURN, abs=1.5)

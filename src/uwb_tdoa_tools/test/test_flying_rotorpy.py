@@ -37,7 +37,7 @@ def flights(seed):
         rng.normal(0.0, 1.0, 3),
         hover,
     )
-    wind, numbers, scratch = rng.normal(0.0, 1.0, 3), ours.numbers(), np.empty((2, 17))
+    wind, record, scratch = rng.normal(0.0, 1.0, 3), ours.record(), np.empty((2, 17))
     theirs = {
         "x": state[POSITION],
         "v": state[VELOCITY],
@@ -54,7 +54,7 @@ def flights(seed):
     for _ in range(round(SECONDS / HELD)):
         speeds = hover + rng.normal(0.0, 100.0) + rng.normal(0.0, 150.0, 4)
         for _ in range(round(HELD / STEP)):
-            step(state, speeds, wind, STEP, numbers, scratch)
+            step(state, speeds, wind, STEP, record, scratch)
         theirs = oracle.step({**theirs, "wind": wind}, {"cmd_motor_speeds": speeds}, HELD)
         out.append(
             (

@@ -11,15 +11,13 @@ from uwb_tdoa_bias.foundation.flight import Truth
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools.commands.fly import main
 from uwb_tdoa_tools.flying import rover
-from uwb_tdoa_tools.flying.mission import DONE, FLYING, LOST, REFUSED, Rules
-from uwb_tdoa_tools.flying.path import Waypoints
-from uwb_tdoa_tools.flying.plots import drawn
-from uwb_tdoa_tools.flying.report import summary, text
+from uwb_tdoa_tools.flying.fleet import drawn_flight
+from uwb_tdoa_tools.flying.mission import DONE, FLYING, LOST, REFUSED, Rules, Waypoints
 from uwb_tdoa_tools.flying.trial import Task
-from uwb_tdoa_tools.flying.verdict import verdict_of
+from uwb_tdoa_tools.flying.verdict import summary, text, verdict_of
 from uwb_tdoa_tools.flying.world import HALL, WORLDS
 from uwb_tdoa_tools.scoring.metrics import position_at
-from uwb_tdoa_tools.simulation.imu import NO_IMU_ERRORS
+from uwb_tdoa_tools.simulation.config import NO_IMU_ERRORS
 
 SEEDS = 3, 4, 5
 WORLD = replace(HALL, aids=rover.AIDS)
@@ -52,7 +50,7 @@ def test_it_arrives_and_the_verdict_is_that_of_its_truth(drives):
 
 
 def test_what_is_drawn_is_wanted_on_the_path(drives):
-    picture = drawn(drives[0], verdict_of(drives[0]))
+    picture = drawn_flight(drives[0], verdict_of(drives[0]))
     wanted = picture.wanted[np.isfinite(picture.wanted).all(axis=1)]
     path = drives[0].missions[0].path
     assert len(wanted) > 100
@@ -86,7 +84,7 @@ def test_wheels_say_more_or_less_than_is_true_and_the_imu_what_is():
 
 
 def test_it_stands_while_it_is_lost_and_goes_on():
-    path = Waypoints().along(np.zeros(2), 0.4)
+    path = Waypoints().starting_at(np.zeros(2), 0.4)
     drive, steering = rover.Drive(path, 0.6, Rules(rest=0.0)), rover.Steering()
     pose = (0.0, np.array([0.0, 0.0, 0.4]), np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
 
@@ -99,7 +97,7 @@ def test_it_stands_while_it_is_lost_and_goes_on():
     assert decide(1.5, 0.1, stamp=0.0) == (0.0, 0.0)  # no new estimate
     assert decide(2.0, 0.1) != (0.0, 0.0) and drive.state == FLYING and drive.lost == 1.0
     decide(3.0, 5.0)
-    assert decide(2.0 + rover.GIVE_UP + 0.1, 5.0) == (0.0, 0.0) and drive.state == DONE
+    assert decide(2.0 + rover.LOST_TIMEOUT + 0.1, 5.0) == (0.0, 0.0) and drive.state == DONE
 
 
 def test_it_refuses_to_start_where_it_does_not_know_where_it_is():
@@ -121,7 +119,7 @@ def test_a_verdict_of_a_rover_that_stops_elsewhere(drives):
 
 @given(st.floats(0.0, 12.0), st.floats(-0.3, 0.3))
 def test_the_nearest_point_of_a_polyline(along, off):
-    path = Waypoints().along(np.array([0.2, -0.1]), 0.4)
+    path = Waypoints().starting_at(np.array([0.2, -0.1]), 0.4)
     p = path.at(np.array([along]))[:, :2] + off
     nearest = path.at(path.nearest(p))[:, :2]
     every = path.at(np.linspace(0.0, path.length, 20001))[:, :2]

@@ -5,10 +5,8 @@ import pytest
 
 from uwb_tdoa_bias.foundation.flight import Imu, Tdoas
 from uwb_tdoa_bias.foundation.radio import arrival_bias
-from uwb_tdoa_tools.flying.loop import IMU_RATE
 from uwb_tdoa_tools.flying.sensors import AIDS, InertialErrors, Radio, gusts
-from uwb_tdoa_tools.flying.simulator import SensorReadings
-from uwb_tdoa_tools.flying.transport import Transport
+from uwb_tdoa_tools.flying.simulator import IMU_RATE, SensorReadings, Transport
 from uwb_tdoa_tools.flying.world import HALL, WORLDS
 from uwb_tdoa_tools.simulation.rooms import constellation
 from uwb_tdoa_tools.simulation.tdoas import tag_link
@@ -17,10 +15,10 @@ CLEAN = replace(HALL, floor_effect=False, noise=0.0, outlier_share=0.0, delay=0.
 HIGH, LEVEL = np.array([0.5, 0.3, 1.2]), np.array([0.0, 0.0, 0.0, 1.0])
 
 
-def residual(world, p=HIGH, seed=0, duration=20.0, happens=(np.inf, np.inf)):
+def residual(world, p=HIGH, seed=0, duration=20.0, schedule_faults=(np.inf, np.inf)):
     """(Radio, what each TDOA has beside geometry (n,) m) at one place."""
     radio = Radio(world, seed, duration)
-    radio.happens(*happens)
+    radio.schedule_faults(*schedule_faults)
     d = radio.measured(
         slice(0, len(radio.t)), *(np.tile(one, (len(radio.t), 1)) for one in (p, LEVEL))
     )
@@ -95,14 +93,14 @@ def test_antennas_make_late_what_they_make_late_in_simulate():
 
 
 def test_a_silence_is_one():
-    radio, rest = residual(replace(CLEAN, silence=("circle", 3.0)), happens=(5.0, np.inf))
+    radio, rest = residual(replace(CLEAN, silence=("circle", 3.0)), schedule_faults=(5.0, np.inf))
     silent = (radio.t >= 5.0) & (radio.t < 8.0)
     assert np.isnan(rest[silent]).all() and np.isfinite(rest[~silent]).all()
 
 
 @pytest.mark.parametrize("change", ["late", "silent"])
 def test_one_anchor_changes_from_then_on(change):
-    radio, rest = residual(replace(CLEAN, change=change), happens=(np.inf, 10.0))
+    radio, rest = residual(replace(CLEAN, change=change), schedule_faults=(np.inf, 10.0))
     mine = (radio.t >= 10.0) & ((radio.a == radio.other) | (radio.b == radio.other))
     np.testing.assert_allclose(rest[~mine], 0.0, atol=1e-12)
     if change == "silent":

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_tools.flying.mission import DONE, REFUSED, Rules
-from uwb_tdoa_tools.flying.path import Circles
+from uwb_tdoa_tools.flying.mission import DONE, REFUSED, Circles, Rules
 from uwb_tdoa_tools.flying.trial import Task, fly
 from uwb_tdoa_tools.flying.verdict import verdict_of
 from uwb_tdoa_tools.flying.world import HALL, WORLDS
@@ -22,7 +21,7 @@ PERFECT = replace(
 
 @pytest.fixture(scope="module")
 def plain():
-    return fly(Task(PERFECT, seed=3, told="place", path=SHORT))
+    return fly(Task(PERFECT, seed=3, given="place", path=SHORT))
 
 
 def test_it_takes_off_follows_the_path_and_lands(plain):
@@ -59,7 +58,7 @@ def test_what_was_measured_is_a_flight_of_the_truth(plain):
 
 @pytest.fixture(scope="module")
 def silent():
-    return fly(Task(replace(PERFECT, silence=("circle", 3.0)), seed=3, told="place", path=SHORT))
+    return fly(Task(replace(PERFECT, silence=("circle", 3.0)), seed=3, given="place", path=SHORT))
 
 
 def test_in_a_silence_nothing_is_heard_and_it_lands(silent):
@@ -73,7 +72,7 @@ def test_in_a_silence_nothing_is_heard_and_it_lands(silent):
 
 
 def test_everything_comes_late_and_is_flown_by_all_the_same():
-    flown = fly(Task(replace(PERFECT, latency=0.05), seed=3, told="place", path=SHORT))
+    flown = fly(Task(replace(PERFECT, latency=0.05), seed=3, given="place", path=SHORT))
     assert verdict_of(flown)["safe"]
     truth = flown.flight.truth
     assert truth.t[-1] - flown.odometry.t[-1] >= 0.05 - 1e-9
@@ -83,7 +82,7 @@ def test_an_effect_is_in_the_loop_what_inject_makes_of_it(plain):
     """At the same true path it adds to each TDOA what it adds to a recording."""
     effect = parse_effect("nlos", ["2.delay=0.4", "2.start=1", "2.end=3"])
     rules = Rules(rest=3.5, patience=0.0, arm=1e-6)  # stays where it is
-    task = Task(PERFECT, seed=3, told="place", path=SHORT, rules=rules)
+    task = Task(PERFECT, seed=3, given="place", path=SHORT, rules=rules)
     without, with_it = (
         fly(task).flight,
         fly(replace(task, world=replace(PERFECT, effects=EffectSet((effect,))))).flight,
@@ -94,7 +93,7 @@ def test_an_effect_is_in_the_loop_what_inject_makes_of_it(plain):
 
 def test_after_a_minute_it_flies_once_more_from_where_it_was_carried():
     flown = fly(
-        Task(replace(PERFECT, outlier_share=0.01), seed=3, told="place", path=SHORT, again=True)
+        Task(replace(PERFECT, outlier_share=0.01), seed=3, given="place", path=SHORT, again=True)
     )
     first, second = flown.missions
     assert np.linalg.norm(first.place - second.place) == pytest.approx(2.0, abs=0.3)
@@ -115,7 +114,7 @@ def test_it_is_flown_by_what_a_network_corrects():
     world, path = replace(PERFECT, antennas=True), Circles(turns=1, turn_time=4.0)
     models = None, "default"
     plain, corrected = (
-        verdict_of(fly(Task(world, seed=1, told="place", model=model, path=path)))
+        verdict_of(fly(Task(world, seed=1, given="place", model=model, path=path)))
         for model in models
     )
     assert corrected["landed"] and corrected["estimation"] < 0.9 * plain["estimation"]
@@ -126,7 +125,9 @@ def test_it_is_flown_by_what_a_network_corrects():
 )
 def test_every_world_can_be_flown_in(name):
     world = replace(WORLDS[name], aids=("height", "pressure", "velocity"))
-    flown = fly(Task(world, seed=1, path=Circles(turns=1, turn_time=2.0, radius=0.0), told="place"))
+    flown = fly(
+        Task(world, seed=1, path=Circles(turns=1, turn_time=2.0, radius=0.0), given="place")
+    )
     assert (
         flown.missions[0].started is not None
         and len(flown.flight.height)

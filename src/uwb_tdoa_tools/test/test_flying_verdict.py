@@ -8,8 +8,7 @@ import pytest
 from uwb_tdoa_bias.foundation.flight import Truth
 from uwb_tdoa_ekf.results import Odometry
 from uwb_tdoa_tools.flying.mission import DONE, REFUSED
-from uwb_tdoa_tools.flying.report import summary, text
-from uwb_tdoa_tools.flying.verdict import verdict_of
+from uwb_tdoa_tools.flying.verdict import summary, text, verdict_of
 
 T = np.arange(0.0, 20.0, 0.0025)
 UP, DOWN = 4.0, 14.0  # s, between which it is in the air

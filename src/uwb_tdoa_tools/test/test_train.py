@@ -76,28 +76,6 @@ def test_trains_on_flights_with_and_without_attitude_in_one_command(folder, tmp_
     assert np.isfinite(network.predict(held.samples)[0]).all()
 
 
-def test_the_same_seed_gives_the_same_file(folder, tmp_path):
-    contents = []
-    for k in range(2):
-        out = tmp_path / str(k)
-        train.main(
-            [
-                str(folder),
-                "--model",
-                "structured",
-                "--out",
-                str(out),
-                "--validation",
-                "corners-1",
-                "--jobs",
-                "1",
-            ]
-        )
-        contents.append((out / "model.onnx").read_bytes())
-        assert files(out) == ["model.onnx", "training.json", "training.png"]
-    assert contents[0] == contents[1]
-
-
 def test_physics_alone_is_no_network_and_leaves_none_behind(folder, tmp_path):
     (tmp_path / "model.onnx").write_text("of an earlier training")
     assert (
@@ -123,7 +101,7 @@ def test_says_what_is_missing(folder, tmp_path, capsys, flights, model, message)
     assert message in capsys.readouterr().err and not (tmp_path / "out").exists()
 
 
-def test_what_was_interrupted_goes_on_and_gives_the_same(folder, tmp_path, monkeypatch, capsys):
+def test_a_resumed_training_writes_the_same_files(folder, tmp_path, monkeypatch, capsys):
     done, left = [], shrinking._left_out
 
     @wraps(left)
@@ -134,21 +112,13 @@ def test_what_was_interrupted_goes_on_and_gives_the_same(folder, tmp_path, monke
         return left(*args)
 
     def trained(out, *more):
-        code = train.main(
-            [
-                str(folder),
-                "--model",
-                "structured",
-                "--jobs",
-                "1",
-                "--out",
-                str(tmp_path / out),
-                *more,
-            ]
-        )
-        return code, [
-            (tmp_path / out / name).read_bytes() for name in ("model.onnx", "training.json")
-        ] if code == 0 else None
+        options = ["--model", "structured", "--validation", "corners-1", "--jobs", "1"]
+        code = train.main([str(folder), *options, "--out", str(tmp_path / out), *more])
+        if code:
+            return code, None
+        assert files(tmp_path / out) == ["model.onnx", "training.json", "training.png"]
+        names = "model.onnx", "training.json"
+        return code, [(tmp_path / out / name).read_bytes() for name in names]
 
     whole, resume = trained("whole"), ("--resume", str(tmp_path / "parts.jsonl"))
     monkeypatch.setattr(shrinking, "_left_out", interrupted)

@@ -37,7 +37,7 @@ def test_labels_are_measured_minus_geometry_at_the_true_pose(one):
     expected = one.tdoa.d[rows] - tdoa(at, found.samples.position_a, found.samples.position_b)
     np.testing.assert_allclose(found.error, expected, atol=1e-12)
     assert np.abs(found.error).max() <= 1.0 and found.samples.p[:, 2].min() > 0.3
-    assert 0.0 < found.looks < 0.1
+    assert 0.0 < found.sample_weight < 0.1
 
 
 def test_labels_without_effects_that_are_known():
@@ -111,7 +111,9 @@ def test_split_says_what_is_wrong(names, validation, message):
 def test_thinned_samples_count_for_as_much_together(one):
     (few,) = thinned([labels(one)], 0.05, np.random.default_rng(0))
     assert len(few) < 0.2 * len(labels(one)) and (np.diff(few.samples.t) >= 0.0).all()
-    assert few.looks * len(few) == pytest.approx(labels(one).looks * len(labels(one)))
+    assert few.sample_weight * len(few) == pytest.approx(
+        labels(one).sample_weight * len(labels(one))
+    )
 
 
 def test_white_noise_is_what_changes_from_one_tdoa_to_the_next(one):

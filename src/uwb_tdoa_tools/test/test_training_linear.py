@@ -47,7 +47,7 @@ def test_the_prior_is_as_large_as_the_weights():
 
 def test_without_a_dense_part():
     made, weights, _ = design(0.1, 0.0)
-    bare = Design(made.phi, made.a, made.b, np.zeros((len(made.y), 0)), made.y, made.looks)
+    bare = Design(made.phi, made.a, made.b, np.zeros((len(made.y), 0)), made.y, made.sample_weight)
     found = fit(bare, SITES, 0.1)
     assert found.dense.shape == (0,) and found.dense_std == 0.0
     np.testing.assert_allclose(found.site, weights, atol=0.3)

@@ -25,7 +25,7 @@ def one_place():
 
 
 def test_finds_what_is_wrong_with_anchors_and_imu(one_place):
-    found = physics.find(one_place)
+    found = physics.find_effects(one_place)
     values = {effect.name: effect.values for effect in found.effects.effects}
     assert values["anchor_delay"]["2"] == pytest.approx(0.3, abs=0.03)
     assert values["accel_bias"]["x"] == pytest.approx(0.8, abs=0.1)
@@ -39,7 +39,7 @@ def test_of_several_constellations_only_what_carries_over(one_place):
     elsewhere = [flight(seed, "pillars", **PLAIN) for seed in (3, 4)]
     flights = [*one_place[:2], *injected(elsewhere, DELAY, PUSHED)]
     flights = [*injected(flights[:2], MOVED), *flights[2:]]
-    names = {effect.name for effect in physics.find(flights).effects.effects}
+    names = {effect.name for effect in physics.find_effects(flights).effects.effects}
     assert "anchor_delay" in names and names <= {
         *physics.PORTABLE,
         "noise_level",
@@ -49,13 +49,15 @@ def test_of_several_constellations_only_what_carries_over(one_place):
 
 def test_does_without_attitude():
     flights = injected([without_attitude(flight(seed, **PLAIN)) for seed in range(2)], DELAY)
-    (effect,) = (e for e in physics.find(flights).effects.effects if e.name == "anchor_delay")
+    (effect,) = (
+        e for e in physics.find_effects(flights).effects.effects if e.name == "anchor_delay"
+    )
     assert effect.values["2"] == pytest.approx(0.3, abs=0.03)
 
 
 def test_network_learns_what_the_effects_leave(one_place):
     kinds = ("physics", "physics+structured")
-    found = physics.find(one_place)
+    found = physics.find_effects(one_place)
     options = StructuredPriors(centres=40)
     alone, both = (
         models.train(

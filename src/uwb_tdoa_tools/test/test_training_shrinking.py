@@ -63,6 +63,8 @@ def test_two_processes_give_the_same_to_the_bit():
     )
     for jobs in (1, 2):
         over = partial(parallel.over, jobs=jobs)
-        plain = shrinking.uncorrected(flights, over)
-        told.append(shrinking.cross_validated(RECIPE, flights, plain, map_function=over))
+        uncorrected_errors = shrinking.uncorrected(flights, over)
+        told.append(
+            shrinking.cross_validated(RECIPE, flights, uncorrected_errors, map_function=over)
+        )
     assert told[0] == told[1] and set(told[0].errors) == {one.name for one in flights}

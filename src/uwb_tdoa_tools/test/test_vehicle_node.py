@@ -21,7 +21,7 @@ from uwb_tdoa_bias.foundation.errors import InputError  # noqa: E402
 from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 from uwb_tdoa_msgs.srv import GoTo, Land, Takeoff  # noqa: E402
 from uwb_tdoa_tools.flying import rover  # noqa: E402
-from uwb_tdoa_tools.flying.path import Waypoints  # noqa: E402
+from uwb_tdoa_tools.flying.mission import Waypoints  # noqa: E402
 from uwb_tdoa_tools.flying.simulator import DT  # noqa: E402
 from uwb_tdoa_tools.flying.trial import Task  # noqa: E402
 from uwb_tdoa_tools.flying.verdict import verdict_of  # noqa: E402
@@ -92,7 +92,7 @@ def test_it_flies_by_services_beside_two_busy_processes(tmp_path, load):  # noqa
         flown.wait(lambda: flown.verdicts, "the verdict")
     (verdict,) = flown.verdicts
     assert verdict["landed"], verdict["why"]
-    assert verdict["said_lost"] is None and verdict["phases"]["air"]["rmse"] < 0.3
+    assert verdict["reported_lost"] is None and verdict["phases"]["air"]["rmse"] < 0.3
 
 
 @pytest.mark.slow

@@ -36,14 +36,12 @@ from uwb_tdoa_bias.foundation.ros_streams import RoundRobin
 from uwb_tdoa_msgs.srv import GoTo, Land, Takeoff
 
 from .flying import rover
-from .flying.over_topics import OverTopics
-from .flying.pace import Lockstep, RealTime
-from .flying.path import Circles, Waypoints
+from .flying.mission import Circles, Waypoints
+from .flying.over_topics import Lockstep, OverTopics, RealTime
 from .flying.pilot import Pilot
-from .flying.report import reached, sentence
 from .flying.sensors import AIDS
 from .flying.trial import VEHICLES, Task, Trial
-from .flying.verdict import verdict_of
+from .flying.verdict import reached, sentence, verdict_of
 from .flying.world import WORLDS, world_of
 
 if TYPE_CHECKING:
@@ -125,8 +123,8 @@ class VehicleNode(StreamNode):
 
     def take(self) -> bool:
         """A turn, if it may come. Returns True: another one is to come."""
-        self._topics.listen()
-        if self._starts is None and self._topics.heard():
+        self._topics.receive()
+        if self._starts is None and self._topics.is_connected():
             self._topics.wait_for_anchors()
             self._starts = time.monotonic() + SETTLE
         if self._starts is None or time.monotonic() < self._starts or not self._pace.may_go_on():
@@ -135,7 +133,7 @@ class VehicleNode(StreamNode):
         if self._mission and not trial.missions:
             trial.begin()
         trial.turn()
-        self._topics.turned(trial.simulator.now, trial.simulator.state)
+        self._topics.publish_truth(trial.simulator.now, trial.simulator.state)
         if len(trial.missions) > self._reported and trial.over:
             self._report_verdict()
         if trial.crash or trial.simulator.over:
@@ -145,7 +143,7 @@ class VehicleNode(StreamNode):
 
     def _report_verdict(self) -> None:
         """Say what became of the mission under way; of the standard one with the exit code."""
-        verdict, self._reported = verdict_of(self._trial.flown), len(self._trial.missions)
+        verdict, self._reported = verdict_of(self._trial.result), len(self._trial.missions)
         self._verdict.publish(String(data=json.dumps(verdict)))
         self.get_logger().info(sentence(verdict))
         if self._mission:

@@ -24,7 +24,7 @@ from uwb_tdoa_bias.foundation.sensors import Height, Pressure, Velocity  # noqa:
 from uwb_tdoa_ekf.debias import BiasMap  # noqa: E402
 from uwb_tdoa_tools.bags.bag import write_bag  # noqa: E402
 from uwb_tdoa_tools.bags.files import open_bag  # noqa: E402
-from uwb_tdoa_tools.bags.integrity import NO_SUM, SUM_KEY, metadata  # noqa: E402
+from uwb_tdoa_tools.bags.integrity import CHECKSUM_KEY, NO_CHECKSUM, metadata  # noqa: E402
 from uwb_tdoa_tools.simulation.rooms import corners
 
 TEXTS = {
@@ -141,7 +141,9 @@ def _bags(folder):
     )  # without chunks and QoS, which take long
     text = (folder / "small" / "metadata.yaml").read_text()
     write(
-        "bag_metadata", 0, text.replace(metadata(folder / "small")["custom_data"][SUM_KEY], NO_SUM)
+        "bag_metadata",
+        0,
+        text.replace(metadata(folder / "small")["custom_data"][CHECKSUM_KEY], NO_CHECKSUM),
     )
     write("bag_packed", "small", (folder / "small" / "small.mcap").read_bytes())
     write_bag(flight, folder / "tables", "sqlite3")

@@ -149,7 +149,7 @@ def bag_mcap(data):
 def bag_mcap_sealed(data):
     path = _file(data, "input.mcap")
     try:
-        mcap.set_sums(path)
+        mcap.fill_checksums(path)
     except mcap.Damaged:
         return
     _finite(read_bag(path, anchors=ANCHORS))

@@ -25,15 +25,15 @@ from uwb_tdoa_bias.foundation.stamps import LARGEST_STEP_BACK
 from ..command_lines import SALVAGE
 from . import is_bag, mcap, write_ahead
 from .integrity import (
-    NO_SUM,
-    SUM_KEY,
+    CHECKSUM_KEY,
+    NO_CHECKSUM,
     data_files,
+    decompress,
+    is_compressed,
     is_mcap,
-    is_packed,
     metadata,
-    seal,
     sqlite_messages,
-    unpack,
+    write_checksums,
 )
 from .integrity import (
     check as check_whole,
@@ -82,9 +82,9 @@ def new_bag(out: str | Path, storage: str = "mcap", force: bool = False) -> Iter
         with Writer(
             scratch / out.name, version=Writer.VERSION_LATEST, storage_plugin=STORAGES[storage]
         ) as writer:
-            writer.set_custom_data(SUM_KEY, NO_SUM)
+            writer.set_custom_data(CHECKSUM_KEY, NO_CHECKSUM)
             yield writer
-        seal(scratch / out.name)
+        write_checksums(scratch / out.name)
         if out.exists():
             check_output(out, force)
             out.rename(scratch / "replaced")
@@ -144,7 +144,7 @@ def _opened(path: Path, folder: Path, salvage: bool) -> BagReader:
     try:
         if files := write_ahead.unclosed(path):
             (folder / "closed").mkdir()
-            path = write_ahead.closed(path, folder / "closed")
+            path = write_ahead.merged_copy(path, folder / "closed")
             names = " and ".join(file.name for file in files)
             remarks.append(
                 f"the recorder did not close {names}: what it left in the -wal or -journal file "
@@ -156,9 +156,9 @@ def _opened(path: Path, folder: Path, salvage: bool) -> BagReader:
             remarks += write_sound_part(path, readable)
         else:
             check_whole(path)
-            if path.is_dir() and is_packed(metadata(path)):
+            if path.is_dir() and is_compressed(metadata(path)):
                 readable = folder
-                unpack(path, folder)
+                decompress(path, folder)
                 check_whole(folder)
         reader = BagReader(readable)
         with _closing_second_connections(reader):
@@ -240,7 +240,7 @@ def _falls_back(file: Path) -> bool:
     if is_mcap(file):
         times: Iterator[int] = (
             int.from_bytes(content[6:14], "little")
-            for kind, content in mcap.sound(file)
+            for kind, content in mcap.intact_records(file)
             if kind == mcap.MESSAGE and len(content) >= 14
         )
     else:

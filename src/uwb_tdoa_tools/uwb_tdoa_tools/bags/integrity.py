@@ -1,6 +1,4 @@
-"""Whether the files of a bag are whole, as far as their format can tell, before anything else is
-done with them.
-"""
+"""Check the files of a bag before they are used."""
 
 from __future__ import annotations
 
@@ -23,61 +21,75 @@ from .mcap import Damaged, zstd
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-# in the bag's custom data: CRC-32 of its data file, 8 hexadecimal digits
-SUM_KEY = "uwb_tdoa_tools.crc32"
-NO_SUM = "--------"
-_BLOCK = 1 << 20  # bytes that are read at once
-_STEPS = 20_000  # instructions of SQLite from one look at the time to the next: some milliseconds
-_PLAIN = re.compile(
+# in the custom data of the bag: CRC-32 of the data file, 8 hexadecimal digits
+CHECKSUM_KEY = "uwb_tdoa_tools.crc32"
+NO_CHECKSUM = "--------"
+_BLOCK = 1 << 20  # bytes per read
+_STEPS = 20_000  # instructions of SQLite between checks of the time: some milliseconds
+_PLAIN_SCHEMA = re.compile(
     r"CREATE\s+(TABLE|INDEX)\s[^()]*\([\w\s,\"'`\[\]]*\)\s*", re.IGNORECASE
-)  # no bracket within: nothing is computed
+)  # without inner brackets nothing is computed
 sqlite3.enable_callback_tracebacks(
     True
-)  # or Ctrl-C that comes while SQLite asks for the time is lost (foundation/executable.py)
-_TYPES = (  # columns of an SQLite bag and what they hold
+)  # else a Ctrl-C in a callback of SQLite is lost (foundation/executable.py)
+_TYPES = (  # columns of an SQLite bag and their types
     ("messages", {"timestamp": "integer", "topic_id": "integer", "data": "blob"}),
     ("topics", {"id": "integer", "name": "text", "type": "text", "serialization_format": "text"}),
 )
 
 
 def check(path: str | Path) -> None:
-    """Raise Damaged, or InputError for metadata.yaml, unless the files of a bag (directory or data
-    file) are whole.
+    """Check the files of a bag.
 
-    The checksums that MCAP files hold and that `seal` left in metadata.yaml, the structure of
-    SQLite files, and that metadata.yaml says what it must. Files that rosbag2 compressed as a whole
-    (see `is_packed`) are only there or not.
+    The check covers the checksums in MCAP files and in metadata.yaml (`write_checksums`), the structure of
+    SQLite files, and the entries of metadata.yaml. Files that rosbag2 has compressed as a whole only have
+    to exist.
+
+    Parameters
+    ----------
+    path : str or Path
+        Bag directory or data file.
+
+    Raises
+    ------
+    Damaged
+        If a file is damaged.
+    InputError
+        If metadata.yaml cannot be read.
     """
     path = Path(path)
     if not path.is_dir():
         return _check_data(path)
     information = metadata(path)
-    stored = information["custom_data"].get(SUM_KEY, NO_SUM)
+    stored = information["custom_data"].get(CHECKSUM_KEY, NO_CHECKSUM)
     for file in data_files(path, information):
         if not file.is_file():
             raise Damaged(f"{file.name} is missing")
-        if stored != NO_SUM and _sum(file) != stored:
+        if stored != NO_CHECKSUM and _checksum(file) != stored:
             raise Damaged(
-                f"the checksum of {file.name} in metadata.yaml is {stored}, but it has {_sum(file)}"
+                f"the checksum of {file.name} in metadata.yaml is {stored}, but it has {_checksum(file)}"
             )
-        if not is_packed(information):
+        if not is_compressed(information):
             _check_data(file, packed_messages=information["compression_mode"] == "message")
 
 
 def data_files(path: Path, information: dict[str, Any]) -> list[Path]:
-    """Paths of the data files of a bag directory."""
+    """Return the paths of the data files of a bag directory."""
     return [path / Path(name).name for name in information["relative_file_paths"]]
 
 
-def is_packed(information: dict[str, Any]) -> bool:
-    """Whether rosbag2 has compressed the data files as a whole."""
+def is_compressed(information: dict[str, Any]) -> bool:
+    """Return whether rosbag2 has compressed whole data files."""
     return information["compression_mode"] == "file"
 
 
-def unpack(path: Path, folder: Path) -> None:
-    """Write a bag whose files are compressed as a whole to an empty folder, unpacked.
+def decompress(path: Path, folder: Path) -> None:
+    """Decompress a bag whose files are compressed as a whole into an empty folder.
 
-    Raises Damaged, InputError.
+    Raises
+    ------
+    Damaged, InputError
+        If a file or metadata.yaml cannot be read.
     """
     information = metadata(path)
     names, files = [], data_files(path, information)
@@ -98,14 +110,18 @@ def unpack(path: Path, folder: Path) -> None:
         "compression_format": "",
         "files": [],
     }
-    information["custom_data"].pop(SUM_KEY, None)
+    information["custom_data"].pop(CHECKSUM_KEY, None)
     content = yaml.safe_dump({"rosbag2_bagfile_information": information}, sort_keys=False)
     write_text(folder / "metadata.yaml", content)
 
 
 def metadata(path: Path) -> dict[str, Any]:
-    """What metadata.yaml of a bag directory says, with what we use in it present and of the right
-    kind: dict. Raises InputError, and Damaged.
+    """Return the content of metadata.yaml with the needed entries of the right type.
+
+    Raises
+    ------
+    Damaged, InputError
+        If an entry is missing or wrong.
     """
     content = read_yaml(path / "metadata.yaml")
     information = content.get("rosbag2_bagfile_information") if isinstance(content, dict) else None
@@ -149,47 +165,52 @@ def metadata(path: Path) -> dict[str, Any]:
     return information
 
 
-def seal(path: str | Path) -> None:
-    """Put the checksums of a bag that rosbags has just written in their places.
+def write_checksums(path: str | Path) -> None:
+    """Write the checksums of a bag that rosbags has just written.
 
-    It must hold SUM_KEY: NO_SUM.
+    Its metadata must hold CHECKSUM_KEY: NO_CHECKSUM.
     """
     (data,) = (file for file in Path(path).iterdir() if file.name != "metadata.yaml")
     if data.suffix == ".mcap":
-        mcap.set_sums(data)
+        mcap.fill_checksums(data)
     file = Path(path) / "metadata.yaml"
     text = file.read_text(encoding="utf-8")
-    sealed = re.sub(rf"({re.escape(SUM_KEY)}: *['\"]?){NO_SUM}", rf"\g<1>{_sum(data)}", text)
+    sealed = re.sub(
+        rf"({re.escape(CHECKSUM_KEY)}: *['\"]?){NO_CHECKSUM}", rf"\g<1>{_checksum(data)}", text
+    )
     assert sealed != text
     write_text(file, sealed)
 
 
 def open_sqlite(file: str | Path) -> sqlite3.Connection:
-    """A connection that only reads, a file that is cut as well, in which nothing is but tables and
-    indexes of columns: what is computed (views, virtual tables, checks, expressions) may take for
-    ever. So may pages that share their children: each query ends when the time of the file is up.
-    Raises Damaged.
+    """Open an SQLite file for reading, even a cut one.
+
+    Views, virtual tables, checks and expressions are refused because they may take forever. Pages that
+    share children may do so too. Each query therefore ends when the time limit of the file is reached.
+
+    Raises
+    ------
+    Damaged
+        If the file has anything but plain tables and indexes.
     """
     connection = sqlite3.connect(
         f"file:{quote(str(Path(file).absolute()))}?mode=ro&immutable=1", uri=True
     )
     connection.set_progress_handler(Budget(file, Path(file).stat().st_size).is_late, _STEPS)
     try:
-        connection.execute(
-            "PRAGMA writable_schema=ON"
-        )  # else not one page of a file that has fewer than it says
+        connection.execute("PRAGMA writable_schema=ON")  # else SQLite reads no page of a cut file
         for name, text in connection.execute(
             "SELECT name, sql FROM sqlite_master WHERE sql IS NOT NULL"
         ):
-            if not _PLAIN.fullmatch(text):
+            if not _PLAIN_SCHEMA.fullmatch(text):
                 raise Damaged(f"{name} in it is no table and no index of columns")
         return connection
     except (sqlite3.Error, UnicodeDecodeError, TypeError) as error:
-        raise damage(error) from error
+        raise as_damaged(error) from error
 
 
 def is_mcap(file: Path) -> bool:
-    """Whether a data file is MCAP, by its first bytes; else it must be SQLite."""
+    """Return whether a data file is MCAP by its first bytes. Otherwise it must be SQLite."""
     with file.open("rb") as opened:
         return opened.read(len(mcap.MAGIC)) == mcap.MAGIC
 
@@ -197,7 +218,9 @@ def is_mcap(file: Path) -> bool:
 def _check_data(file: Path, packed_messages: bool = False) -> None:
     if is_mcap(file):
         mcap.check(file)
-        contents = (content[22:] for kind, content in mcap.sound(file) if kind == mcap.MESSAGE)
+        contents = (
+            content[22:] for kind, content in mcap.intact_records(file) if kind == mcap.MESSAGE
+        )
     else:
         _check_sqlite(file)
         contents = (data for _, _, _, data in sqlite_messages(file))
@@ -216,9 +239,12 @@ def _check_data(file: Path, packed_messages: bool = False) -> None:
 
 
 def sqlite_messages(file: Path) -> Iterator[tuple[int, int, int, bytes]]:
-    """Yields (id, topic id, stamp, data) of an SQLite file in the order of the ids.
+    """Yield (id, topic id, stamp, data) of an SQLite file in the order of ids.
 
-    Raises Damaged where it is.
+    Raises
+    ------
+    Damaged
+        Where the file is damaged.
     """
     connection, last = open_sqlite(file), None
     budget = Budget(file, file.stat().st_size)
@@ -233,9 +259,9 @@ def sqlite_messages(file: Path) -> Iterator[tuple[int, int, int, bytes]]:
                 raise Damaged("its messages go round in a circle")
             last = row[0]
             yield row
-            budget.restart()  # what was done with it is no affair of the file
+            budget.restart()  # the time of the caller does not count
     except (sqlite3.Error, UnicodeDecodeError, TypeError) as error:
-        raise damage(error) from error
+        raise as_damaged(error) from error
     finally:
         connection.close()
 
@@ -261,13 +287,13 @@ def _check_sqlite(file: Path) -> None:
                     "way round, or are too long"
                 )
     except (sqlite3.Error, UnicodeDecodeError) as error:
-        raise damage(error) from error
+        raise as_damaged(error) from error
     finally:
         connection.close()
 
 
-def damage(error: Exception) -> Damaged:
-    """Of an error of SQLite, which calls a query whose time is up interrupted."""
+def as_damaged(error: Exception) -> Damaged:
+    """Convert an error of SQLite. A query at its time limit is called interrupted."""
     return Damaged(
         "it takes longer to read than a file of its size may"
         if "interrupted" in str(error)
@@ -275,7 +301,7 @@ def damage(error: Exception) -> Damaged:
     )
 
 
-def _sum(file: Path) -> str:
+def _checksum(file: Path) -> str:
     total = 0
     with file.open("rb") as opened:
         while block := opened.read(_BLOCK):

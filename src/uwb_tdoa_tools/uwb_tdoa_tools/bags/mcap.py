@@ -1,9 +1,8 @@
-"""MCAP files record by record (https://mcap.dev/spec): what rosbags does not check, and what is
-left of a cut one.
+"""Check and repair MCAP files record by record (https://mcap.dev/spec).
 
-Sizes are compared with the file, or bounded, before anything is read or unpacked. The package
-`mcap` (1.6) does neither: it unpacks a chunk whatever it unpacks to, does not compare the index
-with the chunks, and cannot fill in the checksums that rosbags leaves out.
+Sizes are compared with the file, or limited, before data are read or unpacked. The package `mcap` (1.6)
+unpacks a chunk of any size, does not compare the index with the chunks, and cannot add the checksums
+that rosbags leaves out.
 """
 
 from __future__ import annotations
@@ -38,17 +37,25 @@ HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, CHUNK_INDEX, DATA_END = (
     0x08,
     0x0F,
 )
-_BLOCK = 1 << 20  # bytes that are read at once
+_BLOCK = 1 << 20  # bytes per read
 
 
 class Damaged(Exception):
-    """Where a file is not what it should be: the message says what, without the file's name."""
+    """Report damage of a file. The message does not name the file."""
 
 
 @dataclass(frozen=True)
 class Record:
-    """kind : opcode; start : of its opcode, bytes from the begin of the file; size : of its
-    content.
+    """Describe a record.
+
+    Parameters
+    ----------
+    kind : int
+        Opcode.
+    start : int
+        Byte of the opcode in the file.
+    size : int
+        Bytes of the content.
     """
 
     kind: int
@@ -57,24 +64,28 @@ class Record:
 
     @property
     def content(self) -> int:
-        """Where its content starts."""
+        """Return the first byte of the content."""
         return self.start + 9
 
     @property
     def end(self) -> int:
-        """Where the next one starts."""
+        """Return the first byte after the record."""
         return self.start + 9 + self.size
 
 
 def check(path: str | Path) -> None:
-    """Raise Damaged unless the file is whole: its records fill it, and the checksums that it has
-    are right.
+    """Check that records fill the file and that its checksums are right.
+
+    Raises
+    ------
+    Damaged
+        If they do not.
     """
     with open(path, "rb") as file:
         last = _size(file)
-        if _at(file, 0, 8) != MAGIC:
+        if _read(file, 0, 8) != MAGIC:
             raise Damaged("it does not start as MCAP does")
-        if last < 16 or _at(file, last - 8, 8) != MAGIC:
+        if last < 16 or _read(file, last - 8, 8) != MAGIC:
             raise Damaged("it does not end as MCAP does: the recording was cut")
         chunks: dict[int, tuple[int, bytes, int, int]] = {}
         footer, left = None, most_unpacked(last)
@@ -83,14 +94,10 @@ def check(path: str | Path) -> None:
             if footer is not None:
                 raise Damaged(f"byte {record.start}: a record follows the footer")
             if record.kind == HEADER:
-                begin = (
-                    0,
-                    8,
-                    record.end,
-                )  # where the data begin is not the same to all who write these files
+                begin = (0, 8, record.end)  # writers differ in where the data begin
             elif record.kind == CHUNK:
-                chunks[record.start] = _described(file, record)
-                left -= len(unpacked(file, record, left))
+                chunks[record.start] = _index_entry(file, record)
+                left -= len(chunk_data(file, record, left))
             elif record.kind == CHUNK_INDEX:
                 _check_index(file, record, chunks)
             elif record.kind == DATA_END:
@@ -99,28 +106,33 @@ def check(path: str | Path) -> None:
                 footer = record
         if footer is None or footer.size != 20:
             raise Damaged("it has no footer")
-        (start,) = struct.unpack("<Q", _at(file, footer.content, 8))
+        (start,) = struct.unpack("<Q", _read(file, footer.content, 8))
         _check_sum(file, footer, (start or footer.start,), footer.content + 16, 16)
 
 
-def sound(path: str | Path) -> Iterator[tuple[int, bytes]]:
-    """What is left of a file: yields (kind, content) of the schemas, channels and messages, and
-    (CHUNK, b"") for a chunk that is damaged, up to where no record follows, and raises Damaged
-    there.
+def intact_records(path: str | Path) -> Iterator[tuple[int, bytes]]:
+    """Yield (kind, content) of the readable schemas, channels and messages.
+
+    A damaged chunk gives (CHUNK, b"").
+
+    Raises
+    ------
+    Damaged
+        Where no record follows.
     """
     with open(path, "rb") as file:
         last = _size(file)
         left = most_unpacked(last)
-        if _at(file, 0, min(8, last)) != MAGIC:
+        if _read(file, 0, min(8, last)) != MAGIC:
             raise Damaged("it does not start as MCAP does")
         for record in records(file, 8, last):
             if record.kind in (SCHEMA, CHANNEL, MESSAGE):
-                yield record.kind, _at(file, record.content, record.size)
+                yield record.kind, _read(file, record.content, record.size)
             elif record.kind == CHUNK:
                 try:
-                    data = unpacked(file, record, left)
+                    data = chunk_data(file, record, left)
                     left -= len(data)
-                    yield from inner(data)
+                    yield from chunk_records(data)
                 except Damaged:
                     yield CHUNK, b""
             elif record.kind in (DATA_END, FOOTER):
@@ -129,11 +141,17 @@ def sound(path: str | Path) -> Iterator[tuple[int, bytes]]:
 
 
 def records(file: BinaryIO, start: int, end: int) -> Iterator[Record]:
-    """Records one after the other that fill file[start:end]. Raises Damaged where they do not."""
+    """Yield the records that fill file[start:end].
+
+    Raises
+    ------
+    Damaged
+        If a record does not fit.
+    """
     while start < end:
         if start + 9 > end:
             raise Damaged(f"byte {start}: it is cut within a record")
-        kind, size = struct.unpack("<BQ", _at(file, start, 9))
+        kind, size = struct.unpack("<BQ", _read(file, start, 9))
         record = Record(kind, start, size)
         if record.end > end or kind == 0:
             raise Damaged(
@@ -143,8 +161,14 @@ def records(file: BinaryIO, start: int, end: int) -> Iterator[Record]:
         start = record.end
 
 
-def inner(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """(kind, content) of the schemas, channels and messages within a chunk. Raises Damaged."""
+def chunk_records(data: bytes) -> Iterator[tuple[int, bytes]]:
+    """Yield (kind, content) of the schemas, channels and messages in a chunk.
+
+    Raises
+    ------
+    Damaged
+        If a record does not fit.
+    """
     at = 0
     while at < len(data):
         if at + 9 > len(data):
@@ -163,14 +187,20 @@ def inner(data: bytes) -> Iterator[tuple[int, bytes]]:
         at += size
 
 
-def unpacked(file: BinaryIO, record: Record, most: int = CHUNK_BYTES) -> bytes:
-    """Content of a chunk, at most so many bytes, its size and checksum verified. Raises Damaged."""
+def chunk_data(file: BinaryIO, record: Record, most: int = CHUNK_BYTES) -> bytes:
+    """Return the unpacked content of a chunk of at most `most` bytes.
+
+    Raises
+    ------
+    Damaged
+        If its size or its checksum is wrong.
+    """
     size, crc, compression, packed_at, packed_size = _chunk(file, record)
     if size > min(most, CHUNK_BYTES):
         raise Damaged(
             f"byte {record.start}: a chunk claims {size} bytes, more than {min(most, CHUNK_BYTES)}"
         )
-    data = _at(file, packed_at, packed_size)
+    data = _read(file, packed_at, packed_size)
     try:
         if compression == b"lz4":
             data = lz4.frame.LZ4FrameDecompressor().decompress(data, size + 1)
@@ -187,49 +217,45 @@ def unpacked(file: BinaryIO, record: Record, most: int = CHUNK_BYTES) -> bytes:
     return data
 
 
-def set_sums(path: str | Path) -> None:
-    """Fill in the checksums that rosbags leaves at zero: of each chunk, of the data and of the
-    summary.
-    """
+def fill_checksums(path: str | Path) -> None:
+    """Write the checksums of chunks, data and summary that rosbags leaves at zero."""
     with open(path, "r+b") as file:
         last = _size(file)
         found = list(records(file, 8, last - 8))
         for record in found:
             if record.kind == CHUNK:
-                _put(file, record.content + 24, zlib.crc32(unpacked(file, record)))
-        for record in found:  # what the chunks hold by now counts
+                _write_uint32(file, record.content + 24, zlib.crc32(chunk_data(file, record)))
+        for record in found:  # after the checksums of the chunks
             if record.kind == DATA_END:
-                _put(file, record.content, _sum(file, 0, record.start))
+                _write_uint32(file, record.content, _checksum(file, 0, record.start))
             elif record.kind == FOOTER:
-                (start,) = struct.unpack("<Q", _at(file, record.content, 8))
-                _put(
+                (start,) = struct.unpack("<Q", _read(file, record.content, 8))
+                _write_uint32(
                     file,
                     record.content + 16,
-                    _sum(file, start or record.start, record.content + 16),
+                    _checksum(file, start or record.start, record.content + 16),
                 )
 
 
 def _chunk(file: BinaryIO, record: Record) -> tuple[int, int, bytes, int, int]:
-    """(unpacked size, checksum or 0, compression, where the packed content starts, its size)."""
+    """Return (unpacked size, checksum or 0, compression, first packed byte, packed size)."""
     if record.size < 40:
         raise Damaged(f"byte {record.start}: a chunk has {record.size} bytes, too few")
-    _, _, size, crc, length = struct.unpack("<QQQII", _at(file, record.content, 32))
+    _, _, size, crc, length = struct.unpack("<QQQII", _read(file, record.content, 32))
     if length > record.size - 40:
         raise Damaged(
             f"byte {record.start}: the compression of a chunk has a name of {length} bytes"
         )
-    name = _at(file, record.content + 32, length)
-    (packed,) = struct.unpack("<Q", _at(file, record.content + 32 + length, 8))
+    name = _read(file, record.content + 32, length)
+    (packed,) = struct.unpack("<Q", _read(file, record.content + 32 + length, 8))
     at = record.content + 40 + length
     if at + packed != record.end:
         raise Damaged(f"byte {record.start}: a chunk does not end where it should")
     return size, crc, name, at, packed
 
 
-def _described(file: BinaryIO, record: Record) -> tuple[int, bytes, int, int]:
-    """What an index must say of a chunk: (start, size of the record, compression, packed and
-    unpacked size).
-    """
+def _index_entry(file: BinaryIO, record: Record) -> tuple[int, bytes, int, int]:
+    """Return (start, record size, compression, packed size, unpacked size) of a chunk."""
     size, _, compression, _, packed = _chunk(file, record)
     return record.end - record.start, compression, packed, size
 
@@ -237,8 +263,8 @@ def _described(file: BinaryIO, record: Record) -> tuple[int, bytes, int, int]:
 def _check_index(
     file: BinaryIO, record: Record, chunks: dict[int, tuple[int, bytes, int, int]]
 ) -> None:
-    """Raise Damaged unless a chunk index describes one of the chunks."""
-    data = _at(file, record.content, record.size)
+    """Raise Damaged unless an index entry describes one of the chunks."""
+    data = _read(file, record.content, record.size)
     try:
         start, length, offsets = struct.unpack_from("<QQI", data, 16)
         (name,) = struct.unpack_from("<I", data, 44 + offsets)
@@ -251,22 +277,22 @@ def _check_index(
 
 
 def _check_sum(file: BinaryIO, record: Record, starts: tuple[int, ...], last: int, at: int) -> None:
-    """Raise Damaged unless the checksum at `at` in a record is 0, none, or that of the file from
-    one of the starts to last.
-    """
-    (stored,) = struct.unpack("<I", _at(file, record.content + at, 4))
-    if stored and not any(_sum(file, first, last) == stored for first in starts if first <= last):
+    """Raise Damaged unless the checksum at `at` is 0 or that of the file from one of the starts to `last`."""
+    (stored,) = struct.unpack("<I", _read(file, record.content + at, 4))
+    if stored and not any(
+        _checksum(file, first, last) == stored for first in starts if first <= last
+    ):
         raise Damaged(f"byte {record.start}: the checksum of the bytes before it is wrong")
 
 
-def _sum(file: BinaryIO, first: int, last: int) -> int:
+def _checksum(file: BinaryIO, first: int, last: int) -> int:
     total = 0
     for start in range(first, last, _BLOCK):
-        total = zlib.crc32(_at(file, start, min(_BLOCK, last - start)), total)
+        total = zlib.crc32(_read(file, start, min(_BLOCK, last - start)), total)
     return total
 
 
-def _at(file: BinaryIO, start: int, size: int) -> bytes:
+def _read(file: BinaryIO, start: int, size: int) -> bytes:
     file.seek(start)
     data = file.read(size)
     if len(data) != size:
@@ -274,7 +300,7 @@ def _at(file: BinaryIO, start: int, size: int) -> bytes:
     return data
 
 
-def _put(file: BinaryIO, at: int, number: int) -> None:
+def _write_uint32(file: BinaryIO, at: int, number: int) -> None:
     file.seek(at)
     file.write(struct.pack("<I", number))
 

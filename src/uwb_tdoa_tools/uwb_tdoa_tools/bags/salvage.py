@@ -1,4 +1,4 @@
-"""What is sound of a cut or damaged bag, as another bag."""
+"""Copy the readable messages of a cut or damaged bag to another bag."""
 
 from __future__ import annotations
 
@@ -31,9 +31,25 @@ _FORMATS = {"ros2msg": MessageDefinitionFormat.MSG, "ros2idl": MessageDefinition
 
 
 def salvage(path: str | Path, out: str | Path) -> list[str]:
-    """Write what is sound of a bag (directory or data file, with or without metadata.yaml) to a new
-    bag `out`, without topics of types that are not installed. Returns remarks on what is missing,
-    list of sentences. Raises InputError.
+    """Write the readable messages of a bag to a new bag.
+
+    Topics of types that are not installed are left out.
+
+    Parameters
+    ----------
+    path : str or Path
+        Bag directory or data file, with or without metadata.yaml.
+    out : str or Path
+
+    Returns
+    -------
+    list of str
+        Sentences about missing messages.
+
+    Raises
+    ------
+    InputError
+        If no message can be read.
     """
     path = Path(path)
     remarks: list[str] = []
@@ -71,9 +87,18 @@ def _files(path: Path, remarks: list[str]) -> list[Path]:
 def _copy(
     path: Path, file: Path, writer: Writer, connections: dict[tuple[str, str], Connection | None]
 ) -> tuple[int, Counter[str], str | None]:
-    """Copy the messages of a data file. Returns (how many, {what cannot be read: how often}, where
-    they end, as text, or None).
-    connections : {(topic, type): Connection of the writer, or None}.
+    """Copy the messages of a data file.
+
+    Parameters
+    ----------
+    path, file, writer
+    connections : dict
+        Connection of the writer by (topic, type), or None.
+
+    Returns
+    -------
+    tuple
+        Number of messages, {unreadable part: count}, and the damage at the end or None.
     """
     count = 0
     lost: Counter[str] = Counter()
@@ -87,7 +112,7 @@ def _copy(
                 if earlier := earlier_types(path, connection):
                     try:
                         data = upgraded(data, connection.msgtype, earlier)
-                    except Exception:  # rosbags raises whatever its parsers run into
+                    except Exception:  # parsers of rosbags raise many types
                         lost[MESSAGES] += 1
                         continue
                 writer.write(target, stamp, data)
@@ -98,8 +123,14 @@ def _copy(
 
 
 def as_written(file: Path, lost: Counter[str]) -> Iterator[tuple[Connection, int, bytes]]:
-    """Yield (connection, stamp ns, bytes) of the messages of a data file in the order in which they
-    were written; lost : {what cannot be read: how often}, counted. Raises Damaged where they end.
+    """Yield (connection, stamp in ns, bytes) of a data file in the order of writing.
+
+    `lost` counts unreadable parts.
+
+    Raises
+    ------
+    Damaged
+        At the end of the readable part.
     """
     return (_from_mcap if integrity.is_mcap(file) else _from_sqlite)(file, lost)
 
@@ -109,14 +140,14 @@ def _added(path: Path, connection: Connection, writer: Writer) -> Connection | N
         check_type(path, connection)
     except InputError:
         if connection.msgtype in typestore().fielddefs:
-            raise  # it is another version of it
+            raise  # the installed type has another version
         return None
     return writer.add_connection(connection.topic, connection.msgtype, typestore=typestore())
 
 
 def _from_mcap(file: Path, lost: Counter[str]) -> Iterator[tuple[Connection, int, bytes]]:
     schemas, channels = {}, {}
-    for kind, content in mcap.sound(file):
+    for kind, content in mcap.intact_records(file):
         if kind == mcap.CHUNK:
             lost["chunks"] += 1
             continue
@@ -148,7 +179,7 @@ def _from_sqlite(file: Path, lost: Counter[str]) -> Iterator[tuple[Connection, i
                 number, str(topic), str(msgtype), *definitions.get(msgtype, ("", ""))
             )
     except (sqlite3.Error, UnicodeDecodeError) as error:
-        raise integrity.damage(error) from error
+        raise integrity.as_damaged(error) from error
     finally:
         connection.close()
     for _, topic, stamp, data in integrity.sqlite_messages(file):
@@ -164,7 +195,7 @@ def _from_sqlite(file: Path, lost: Counter[str]) -> Iterator[tuple[Connection, i
 
 
 def _definitions(connection: sqlite3.Connection) -> dict[str, tuple[str, str]]:
-    """{type: (encoding, text)}; rosbag2 writes them since ROS 2 Iron."""
+    """Return {type: (encoding, text)}. rosbag2 writes them since ROS 2 Iron."""
     query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
     try:
         return {
@@ -176,7 +207,13 @@ def _definitions(connection: sqlite3.Connection) -> dict[str, tuple[str, str]]:
 
 
 def _texts(content: bytes, at: int, count: int) -> list[str]:
-    """Texts, each after its length. Raises Damaged."""
+    """Return texts, each stored after its length.
+
+    Raises
+    ------
+    Damaged
+        If a text is cut.
+    """
     found = []
     for _ in range(count):
         (length,) = struct.unpack_from("<I", content, at)

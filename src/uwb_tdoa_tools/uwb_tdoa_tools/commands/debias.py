@@ -10,8 +10,8 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.debias import INTERPOLATORS, BiasMap
 
 from .. import cli, options, parallel
-from ..debiasing import report
-from ..debiasing.evaluation import PositionEstimator, of_its_anchors
+from ..debiasing import evaluation
+from ..debiasing.evaluation import PositionEstimator, require_anchors
 from ..debiasing.mapping import cross_validated, fit_map
 from ..outputs import OutputFile
 
@@ -100,27 +100,27 @@ def _fit(args: Namespace) -> int:
     shrinkage = cross_validated(fitted, args.static, estimator, **settings)
     made = fit_map(fitted, args.static, estimator, **settings)
     made = made.scaled(shrinkage.share) if shrinkage else made
-    cli.show(report.about(made))
+    cli.show(evaluation.map_summary(made))
     cli.show(
         shrinkage.as_text()
         if shrinkage
         else "how much of it flights to come bear out is not known: give several flights"
     )
     figures: dict[str, Any] = {
-        "map": report.about_figures(made),
-        "fitted": report.rows(fitted, made, estimator.effects),
+        "map": evaluation.map_figures(made),
+        "fitted": evaluation.comparison_rows(fitted, made, estimator.effects),
     }
     figures["borne_out"] = shrinkage.as_dict() if shrinkage else None
-    report.say_rows("in sample", figures["fitted"])
+    evaluation.print_rows("in sample", figures["fitted"])
     refusals = []
-    if shrinkage and not shrinkage.gains.mean() >= report.SMALLEST_GAIN:
-        refusals.append(report.verdict(float(shrinkage.gains.mean()), "flights left out"))
+    if shrinkage and not shrinkage.gains.mean() >= evaluation.SMALLEST_GAIN:
+        refusals.append(evaluation.verdict(float(shrinkage.gains.mean()), "flights left out"))
     if held:
         figures["held out"] = _judged(args, estimator, held, made)
-        report.say_rows("held out", figures["held out"])
-        gained = report.gain_of(figures["held out"])
-        cli.show(report.verdict(gained, "flights held out"))
-        refusals += [report.verdict(gained, "flights held out")] * report.does_harm(gained)
+        evaluation.print_rows("held out", figures["held out"])
+        gained = evaluation.mean_gain(figures["held out"])
+        cli.show(evaluation.verdict(gained, "flights held out"))
+        refusals += [evaluation.verdict(gained, "flights held out")] * evaluation.does_harm(gained)
     figures["written"] = not refusals
     _write(args.json, figures)
     if refusals:
@@ -137,18 +137,18 @@ def _judge(args: Namespace) -> int:
         BiasMap.load(args.map),
     )
     rows = _judged(args, estimator, estimator.reading.find(args.flights, bool(args.dask)), made)
-    report.say_rows("flight", rows)
-    gained = report.gain_of(rows)
-    cli.show(report.verdict(gained, "these flights"))
-    _write(args.json, {"map": report.about_figures(made), "runs": rows, "gain": gained})
-    return int(report.does_harm(gained))
+    evaluation.print_rows("flight", rows)
+    gained = evaluation.mean_gain(rows)
+    cli.show(evaluation.verdict(gained, "these flights"))
+    _write(args.json, {"map": evaluation.map_figures(made), "runs": rows, "gain": gained})
+    return int(evaluation.does_harm(gained))
 
 
 def _judged(
     args: Namespace, estimator: PositionEstimator, recordings: Sequence[Recording], made: BiasMap
 ) -> list[dict[str, Any]]:
     flown = parallel.over(estimator, recordings, args.jobs, args.dask)
-    return report.rows(of_its_anchors(flown, made), made, estimator.effects)
+    return evaluation.comparison_rows(require_anchors(flown, made), made, estimator.effects)
 
 
 def _write(path: str | Path | None, figures: dict[str, Any]) -> None:

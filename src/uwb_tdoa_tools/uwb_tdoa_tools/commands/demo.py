@@ -90,11 +90,11 @@ def _demo(args: Namespace) -> int:
         f"flight     {flight.name}: {length:.1f} s, {len(flight.tdoa)} TDOAs, "
         f"{len(flight.anchors)} anchors"
     )
-    if chosen.became:
-        cli.show(f"flown      by the estimate: {chosen.became}")
+    if chosen.outcome:
+        cli.show(f"flown      by the estimate: {chosen.outcome}")
     cli.show(f"correction {chosen.correction()}")
     flown = demo.fly(chosen, args.out, args.rate, lambda text: cli.show(f"nodes      {text}"))
-    scores, in_time = flown.scores, _all_in_time(flight, flown.became)
+    scores, in_time = flown.scores, _all_in_time(flight, flown.outcome)
     if not in_time:
         cli.say("demo", f"messages lost or late: too much load for --rate {args.rate:g}; try less.")
     cli.show(*lines_of_errors(scores))
@@ -104,7 +104,7 @@ def _demo(args: Namespace) -> int:
     plot_comparison(flight, scores[:-1], args.out / "error.png")
     cli.show(f"plot       {args.out / 'error.png'}")
     if rerun is not None:
-        flown.show(rerun, flight, [chosen.became, _change_in_words(scores)])
+        flown.show(rerun, flight, [chosen.outcome, _change_in_words(scores)])
         cli.show(f"rerun      {rerun}")
     cli.show(f"took {time.monotonic() - started:.0f} s")
     cli.show(
@@ -133,17 +133,17 @@ def _change_in_words(scores: Sequence[Score]) -> str:
     return change + (worse if after > before else "")
 
 
-def _all_in_time(flight: Flight, became: dict[str, int]) -> bool:
+def _all_in_time(flight: Flight, outcome: dict[str, int]) -> bool:
     """Print what became of every message. Returns whether all were there in time."""
     counts = ", ".join(
-        f"{count} {name}" for name, count in became.items() if not name.startswith("imu_")
+        f"{count} {name}" for name, count in outcome.items() if not name.startswith("imu_")
     )
     cli.show(f"nodes      TDOAs {len(flight.tdoa)}: {counts}")
     samples = 0 if flight.imu is None else len(flight.imu)
     cli.show(
-        f"nodes      IMU samples {samples}: {became['imu_late']} late, {became['imu_lost']} lost"
+        f"nodes      IMU samples {samples}: {outcome['imu_late']} late, {outcome['imu_lost']} lost"
     )
-    return not any(became[name] for name in ("lost", "late", "imu_late", "imu_lost"))
+    return not any(outcome[name] for name in ("lost", "late", "imu_late", "imu_lost"))
 
 
 main = cli.executable(_demo, parser)

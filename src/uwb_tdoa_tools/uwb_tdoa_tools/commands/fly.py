@@ -11,11 +11,11 @@ from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, options, parallel
 from ..flying import fleet, rover
-from ..flying.path import Circles, Waypoints
-from ..flying.plots import plot
-from ..flying.report import summary, text, wording_of
+from ..flying.fleet import plot
+from ..flying.mission import Circles, Waypoints
 from ..flying.sensors import AIDS
 from ..flying.trial import VEHICLES, Task
+from ..flying.verdict import summary, text, wording_of
 from ..flying.world import MOMENTS, WORLDS, world_of
 from ..outputs import OutputFile, OutputFolder
 from ..results_file import asked_of
@@ -220,10 +220,10 @@ def _fly(args: argparse.Namespace) -> int:
         for seed in seeds
     ]
     verdicts, pictures = [], []
-    with fleet.kept(
+    with fleet.verdict_store(
         args.resume, asked_of(args, NO_MATTER, ("config", "effects", "model", "peer"))
     ) as done:
-        for verdict, picture in fleet.flown(
+        for verdict, picture in fleet.fly_all(
             tasks, done, args.record, args.plot is not None, args.jobs, args.dask
         ):
             verdicts.append(verdict)

@@ -139,9 +139,7 @@ def _write(
     args.out.mkdir(parents=True, exist_ok=True)
     models.save(result, args.out)
     label, x, of_training, of_validation = result.curve
-    from ..training.plots import plot_curve  # takes a second to import
-
-    plot_curve(label, x, of_training, of_validation, args.out / "training.png")
+    models.plot_curve(label, x, of_training, of_validation, args.out / "training.png")
     for name, (before, after) in result.errors.items():
         cli.show(
             f"{name:26s} error of the TDOAs {before:.3f} m, after correction {after:.3f} m "

@@ -1,1 +1,1 @@
-"""What `debias` does: positions to fit a bias map to, and the map on flights."""
+"""Fit bias maps of positions, and evaluate them on flights."""

@@ -1,5 +1,6 @@
-"""A bias map from flights and from places where a tag stood still, scaled to the share that
-cross-validation over flights supports.
+"""Fit a bias map to flights and to places where a tag stood still.
+
+Cross-validation over flights scales the map.
 """
 
 from __future__ import annotations
@@ -7,23 +8,110 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_ekf.debias import fit
+from uwb_tdoa_bias.foundation.files import read_head
+from uwb_tdoa_ekf.debias import Part, fit
+from uwb_tdoa_ekf.offline import run_offline
 
 from ..readers import read_survey
+from ..readers.tables import read_numbers
+from ..scoring.evaluation import corrected_truth
 from ..scoring.gains import SHARES, Shrinkage, best_share
-from .evaluation import evaluate_map
-from .parts import LEAST, is_table, part_of, static_parts
+from ..scoring.metrics import position_at
+from .evaluation import PositionEstimator, evaluate_map
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
     from uwb_tdoa_bias.foundation.anchors import Anchors
     from uwb_tdoa_ekf.debias import BiasMap
+    from uwb_tdoa_ekf.results import Odometry
 
+    from ..scoring.metrics import Score
     from .evaluation import PositionEstimator, Scored
 
-FEWEST = 2  # flights; one alone leaves none to judge
+
+LEAST = 10  # positions of flights, 5 ms apart, least number for a marker
+COLUMNS = ("true_x", "true_y", "true_z", "x", "y", "z")
+SETTLE = 1.0  # s, excluded at the start of each place
+REST = 0.02  # m, largest motion at rest within SETTLE
+SHORTEST = 100  # positions, least number at one place
+
+
+def part_of(score: Score, odometry: Odometry) -> Part:
+    """Return airborne estimates of a flight with their true positions, at the stamps of the Score."""
+    measured = odometry.p[(odometry.t >= score.first) & (odometry.t <= score.last)]
+    return Part(measured, measured - score.error, score.covariance)
+
+
+def static_parts(
+    path: str | Path, estimator: PositionEstimator = PositionEstimator(), planar: bool = False
+) -> list[Part]:
+    """Return one Part for each place where a tag stood still.
+
+    Parameters
+    ----------
+    path : str or Path
+        A CSV file with the columns true_x, true_y, true_z, x, y, z in m, one row per measured position,
+        without z if planar. Or a recording with ground truth: the time at rest counts from SETTLE s on.
+    estimator : PositionEstimator
+    planar : bool
+
+    Raises
+    ------
+    InputError
+        If the file holds no position at rest.
+    """
+    if is_table(path):
+        return _from_table(path, planar)
+    flight = estimator.reading.one(path)
+    if flight.truth is None:
+        raise InputError(
+            f"{path}: holds no ground truth; record where the tag stood as ground_truth/pose."
+        )
+    odometry = run_offline(
+        flight, estimator.config, Corrector(flight.anchors, estimator.effects)
+    ).odometry
+    truth = corrected_truth(flight, estimator.effects)
+    true, t = position_at(odometry.t, truth), odometry.t
+    moved = np.linalg.norm(true - position_at(t - SETTLE, truth), axis=1)
+    resting = (moved < REST) & (t > np.min(t, initial=np.inf) + SETTLE)
+    stays = np.split(np.arange(len(t)), np.flatnonzero(np.diff(resting)) + 1)
+    stays = [rows for rows in stays if len(rows) >= SHORTEST and resting[rows[0]]]
+    if not stays:
+        raise InputError(
+            f"{path}: the tag never stands still for long enough; give it as a flight, not "
+            "with --static."
+        )
+    return [Part(odometry.p[rows], true[rows], odometry.covariance[rows, :3, :3]) for rows in stays]
+
+
+def is_table(path: str | Path) -> bool:
+    """Return whether a file is a CSV of positions."""
+    return not Path(path).is_dir() and b"true_x" in read_head(path, 1000)
+
+
+def _from_table(path: str | Path, planar: bool) -> list[Part]:
+    names = [name for name in COLUMNS if not (planar and name.endswith("z"))]
+    table = read_numbers(path, names)
+    if not len(table):
+        raise InputError(f"{path}: holds no positions; give one row for each.")
+    d = len(names) // 2
+    _, place, counts = np.unique(table[:, :d], axis=0, return_inverse=True, return_counts=True)
+    true, measured = (np.pad(side, ((0, 0), (0, 3 - d))) for side in (table[:, :d], table[:, d:]))
+    return [
+        Part(measured[rows], true[rows])
+        for rows in np.split(np.argsort(place.ravel(), kind="stable"), np.cumsum(counts)[:-1])
+    ]
+
+
+pass
+
+
+FEWEST = 2  # flights; a single one cannot be validated
 
 
 def fit_map(
@@ -34,11 +122,24 @@ def fit_map(
     planar: bool = False,
     interpolator: str = "thin_plate",
 ) -> BiasMap:
-    """BiasMap of flights, as a PositionEstimator gave them, and of files of a tag that stood still.
-    Raises InputError.
+    """Fit a bias map.
 
-    static : paths, see `static_parts`; step : m; planar, interpolator : see
-        `uwb_tdoa_ekf.debias.fit`.
+    Parameters
+    ----------
+    flown : iterable
+        Results of a PositionEstimator.
+    static : sequence of path
+        See `static_parts`.
+    estimator : PositionEstimator
+    step : float
+        Spacing of the markers, m.
+    planar, interpolator
+        See `uwb_tdoa_ekf.debias.fit`.
+
+    Raises
+    ------
+    InputError
+        If the anchors are unknown or differ.
     """
     parts = [part for path in static for part in static_parts(path, estimator, planar)]
     flown = list(flown)
@@ -53,9 +154,12 @@ def fit_map(
 def _anchors(
     of_flights: Sequence[Anchors], static: Sequence[str | Path], estimator: PositionEstimator
 ) -> Anchors:
-    """The Anchors of all flights and recordings.
+    """Return the anchors of all flights and recordings.
 
-    Raises InputError where they differ, or a table comes without.
+    Raises
+    ------
+    InputError
+        If they differ, or tables have none.
     """
     found = list(of_flights)
     found += [estimator.reading.one(path).anchors for path in static if not is_table(path)]
@@ -82,8 +186,9 @@ def cross_validated(
     estimator: PositionEstimator,
     **options: Any,
 ) -> Shrinkage | None:
-    """Shrinkage of maps, each made without one of the flights that a PositionEstimator gave and
-    judged on it; None for fewer than FEWEST. static, options : as of `fit_map`.
+    """Return the Shrinkage of maps, or None for fewer than FEWEST flights.
+
+    Each map is fitted without one flight and evaluated on it. `options` are those of `fit_map`.
     """
     if len(flown) < FEWEST:
         return None

@@ -1,7 +1,6 @@
-"""Flights in closed loop: a simulated vehicle whose controller knows its position, velocity and
-attitude from the estimate alone.
+"""Fly a simulated vehicle in closed loop by its estimate alone.
 
 from uwb_tdoa_tools.flying.trial import Task, fly
 from uwb_tdoa_tools.flying.world import WORLDS
-flown = fly(Task(WORLDS["hall"], seed=3))
+result = fly(Task(WORLDS["hall"], seed=3))
 """

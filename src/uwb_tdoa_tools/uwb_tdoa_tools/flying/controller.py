@@ -1,10 +1,10 @@
-"""A cascade that flies a quadrotor by an estimate of position, velocity and attitude, and by its
-gyroscope, and by nothing else.
+"""Fly a quadrotor by an estimate of position, velocity and attitude, and by its gyroscope.
 
-Position and velocity to a wanted acceleration, that to thrust and attitude (geometric control on
-SE(3): Lee, Leok and McClamroch, CDC 2010), attitude to body rates, rates to rotor speeds. The outer
-part runs as often as there are estimates, the inner one at each sample of the gyroscope. Between
-estimates the attitude turns as the gyroscope says. Compiled, without ROS.
+The controller is a cascade. Position and velocity give a wanted acceleration. The acceleration gives
+thrust and attitude (geometric control on SE(3): Lee, Leok and McClamroch, CDC 2010). The attitude
+gives body rates, and the rates give rotor speeds. The outer part runs once per estimate, the inner
+part at each sample of the gyroscope. Between estimates the gyroscope predicts the attitude. The code
+is compiled and needs no ROS.
 """
 
 from __future__ import annotations
@@ -22,18 +22,35 @@ from .vehicle import CORNERS, GRAVITY, ROTORS, SPIN, Vehicle
 if TYPE_CHECKING:
     from .vehicle import Record
 
-FELT = 0.1  # s over which the accelerometer tells what carries the vehicle
+SUPPORT_TIME = 0.1  # s over which the support by the ground is averaged
 
 
 @dataclass(frozen=True)
 class Gains:
-    """position : 1/s, from an error of position, at most `reach` m of it, to a velocity; velocity :
-    1/s, to an acceleration;
-    integral : 1/s^2, of the velocity's error, at most `most_integral` m/s^2; attitude, yaw : 1/s,
-        to body rates; rate, yaw_rate : 1/s,
-    to angular accelerations; damping : of the angular acceleration that is felt; most_tilt : rad;
-    most_rate : rad/s;
-    least_thrust, most_thrust : of the weight.
+    """Set the gains and limits of the controller.
+
+    Parameters
+    ----------
+    position : float
+        From a position error to a velocity, 1/s.
+    reach : float
+        Limit of the position error, m.
+    velocity : float
+        From a velocity error to an acceleration, 1/s.
+    integral : float
+        From the integrated velocity error to an acceleration, 1/s^2.
+    most_integral : float
+        Limit of the integral part, m/s^2.
+    attitude, yaw : float
+        From an attitude error to body rates, 1/s.
+    rate, yaw_rate : float
+        From a rate error to angular accelerations, 1/s.
+    damping : float
+        Share of the measured angular acceleration that is removed.
+    most_tilt, most_rate : float
+        Limits of tilt and body rate, rad and rad/s.
+    least_thrust, most_thrust : float
+        Limits of the thrust, in units of the weight.
     """
 
     position: float = 1.5
@@ -52,18 +69,34 @@ class Gains:
     most_thrust: float = 1.8
 
 
-NUMBERS = np.dtype([(field.name, float) for field in fields(Gains)], align=True)
+RECORD = np.dtype([(field.name, float) for field in fields(Gains)], align=True)
 
 
 class Controller:
-    """thrust : N, wanted of all rotors together; lift : N, what they have come to, as felt over
-    FELT; rates : (3,) rad/s, wanted; integral : (3,) m/s^2, world.
+    """Compute thrust and body rates from an estimate.
+
+    Attributes
+    ----------
+    thrust : float
+        Wanted thrust of all rotors together, N.
+    lift : float
+        Thrust that the rotors have reached, averaged over SUPPORT_TIME, N.
+    rates : numpy.ndarray
+        Wanted body rates (3,), rad/s.
+    integral : numpy.ndarray
+        Integral part of the acceleration (3,), m/s^2, world frame.
     """
 
-    def __init__(self, gains: Gains | None = None, vehicle: Vehicle | None = None) -> None:
-        """gains : Gains; vehicle : Vehicle, as far as the controller knows it."""
-        self.gains, self.vehicle = gains or Gains(), vehicle or Vehicle()
-        self.numbers = np.array([tuple(asdict(self.gains).values())], NUMBERS)[0]
+    def __init__(self, vehicle: Vehicle | None = None) -> None:
+        """Start at rest.
+
+        Parameters
+        ----------
+        vehicle : Vehicle, optional
+            Vehicle as the controller assumes it.
+        """
+        self.vehicle = vehicle or Vehicle()
+        self.record = np.array([tuple(asdict(Gains()).values())], RECORD)[0]
         self.weight = self.vehicle.mass * GRAVITY
         self.rates, self.integral = np.zeros(3), np.zeros(3)
         self.thrust = self.lift = 0.0
@@ -71,25 +104,38 @@ class Controller:
     def fly(
         self, p: np.ndarray, v: np.ndarray, q: np.ndarray, wanted: np.ndarray, yaw: float, dt: float
     ) -> None:
-        """Set thrust and rates. p (3,) m, v (3,) m/s, q (4,) x y z w: the estimate; wanted (3, 3):
-        position, velocity and acceleration, NaN in the position where only the velocity counts; yaw
-        : rad; dt : s since the last call.
+        """Set thrust and rates for one turn.
+
+        Parameters
+        ----------
+        p, v, q : numpy.ndarray
+            Estimated position (3,) m, velocity (3,) m/s and attitude (4,) x y z w, world frame.
+        wanted : numpy.ndarray
+            Position, velocity and acceleration (3, 3), m and s. NaN in a position leaves it to the velocity.
+        yaw : float
+            Wanted yaw, rad.
+        dt : float
+            Time since the last call, s.
         """
-        self.lift += min(1.0, dt / (self.vehicle.motor_time + 0.5 * FELT)) * (
+        self.lift += min(1.0, dt / (self.vehicle.motor_time + 0.5 * SUPPORT_TIME)) * (
             self.thrust - self.lift
         )
         self.thrust = outer(
-            (p, v, q), wanted, yaw, dt, (self.weight, self.numbers), self.integral, self.rates
+            (p, v, q), wanted, yaw, dt, (self.weight, self.record), self.integral, self.rates
         )
 
     def support(self, force: float) -> float:
-        """Share of the weight that something else than the rotors carries. force : m/s^2, specific,
-        along the body's z, as felt.
+        """Return the share of the weight that the ground carries.
+
+        Parameters
+        ----------
+        force : float
+            Measured specific force along the z axis of the body, m/s^2.
         """
         return force / GRAVITY - self.lift / (self.weight * (1.0 + self.integral[2] / GRAVITY))
 
     def stop(self) -> None:
-        """Rotors off."""
+        """Turn the rotors off."""
         self.thrust = self.lift = 0.0
         self.rates[:] = self.integral[:] = 0.0
 
@@ -104,8 +150,18 @@ def outer(
     integral: np.ndarray,
     rates: np.ndarray,
 ) -> float:
-    """See Controller.fly. estimate : (p, v, q); known : (weight, N, gains). integral (3,) and rates
-    (3,) are written to. Returns the thrust, N.
+    """Return the wanted thrust, N, and write `integral` and `rates`.
+
+    Parameters
+    ----------
+    estimate : tuple
+        Position, velocity and attitude, as in `Controller.fly`.
+    wanted, yaw, dt
+        As in `Controller.fly`.
+    known : tuple
+        Weight, N, and the record of the gains.
+    integral, rates : numpy.ndarray
+        Integral part (3,) m/s^2 and body rates (3,) rad/s. Both are written.
     """
     p, v, q = estimate[0], estimate[1], estimate[2]
     weight, gains = known[0], known[1]
@@ -130,7 +186,7 @@ def outer(
         a[1] *= most / level
     size = math.sqrt(a[0] ** 2 + a[1] ** 2 + a[2] ** 2)
     zx, zy, zz = a[0] / size, a[1] / size, a[2] / size
-    # the wanted axes: z along the thrust, x as near to the yaw as that allows
+    # wanted axes: z along the thrust, x toward the yaw
     cy, sy = math.cos(yaw), math.sin(yaw)
     yx, yy, yz = -zz * sy, zz * cy, zx * sy - zy * cy
     length = math.sqrt(yx * yx + yy * yy + yz * yz)
@@ -140,7 +196,7 @@ def outer(
     r00, r01, r02 = 1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * s), 2.0 * (x * z + y * s)
     r10, r11, r12 = 2.0 * (x * y + z * s), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * s)
     r20, r21, r22 = 2.0 * (x * z - y * s), 2.0 * (y * z + x * s), 1.0 - 2.0 * (x * x + y * y)
-    # e = (Rd' R - R' Rd) / 2, of which the three numbers
+    # the three numbers of e = (Rd' R - R' Rd) / 2
     yz_, zy_ = yx * r02 + yy * r12 + yz * r22, zx * r01 + zy * r11 + zz * r21
     zx_, xz_ = zx * r00 + zy * r10 + zz * r20, xx * r02 + xy * r12 + xz * r22
     xy_, yx_ = xx * r01 + xy * r11 + xz * r21, yx * r00 + yy * r10 + yz * r20
@@ -167,8 +223,22 @@ def inner(
     vehicle: Record,
     speeds: np.ndarray,
 ) -> None:
-    """From thrust, N, and rates (3,) rad/s, both wanted, to rotor speeds (4,) rad/s. gyro : (2, 3)
-    rad/s, felt now and dt s ago; gains, vehicle : numbers of both.
+    """Compute rotor speeds from thrust and body rates.
+
+    Parameters
+    ----------
+    thrust : float
+        Wanted thrust, N.
+    rates : numpy.ndarray
+        Wanted body rates (3,), rad/s.
+    gyro : numpy.ndarray
+        Measured body rates (2, 3), rad/s, now and `dt` ago.
+    dt : float
+        Time between samples, s.
+    gains, vehicle : Record
+        Records of Gains and Vehicle.
+    speeds : numpy.ndarray
+        Rotor speeds (4,), rad/s. They are written.
     """
     if thrust <= 0.0:
         speeds[:] = 0.0
@@ -184,14 +254,24 @@ def inner(
     for k in range(ROTORS):
         tilt = 0.25 * (CORNERS[k, 1] * mx - CORNERS[k, 0] * my) / (0.5 * vehicle.arm)
         turn = 0.25 * SPIN[k] * mz * vehicle.thrust / vehicle.moment
-        turn = min(max(turn, -0.1 * most), 0.1 * most)  # yaw comes last
+        turn = min(max(turn, -0.1 * most), 0.1 * most)  # the yaw has the lowest priority
         lift = 0.25 * thrust + tilt + turn
         speeds[k] = math.sqrt(min(max(lift, 0.01 * most), most) / vehicle.thrust)
 
 
 @compiled
-def turned(q: np.ndarray, rate: np.ndarray, dt: float) -> None:
-    """Turn the attitude q (4,) x y z w by a body rate (3,) rad/s for dt, s, in place."""
+def rotate_attitude(q: np.ndarray, rate: np.ndarray, dt: float) -> None:
+    """Rotate an attitude by a constant body rate, in place.
+
+    Parameters
+    ----------
+    q : numpy.ndarray
+        Attitude (4,) x y z w, body to world.
+    rate : numpy.ndarray
+        Body rate (3,), rad/s.
+    dt : float
+        Duration, s.
+    """
     angle = math.sqrt(rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2) * dt
     share = 0.5 * dt if angle < 1e-9 else math.sin(0.5 * angle) / angle * dt
     a, b, c, d = rate[0] * share, rate[1] * share, rate[2] * share, math.cos(0.5 * angle)

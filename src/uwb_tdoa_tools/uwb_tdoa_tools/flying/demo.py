@@ -1,4 +1,4 @@
-"""A flight through both nodes over topics, beside the same filter without ROS."""
+"""Run a flight through both nodes over topics, and compare with the same filter without ROS."""
 
 from __future__ import annotations
 
@@ -20,9 +20,8 @@ from ..live.run import accounts, run_live
 from ..localizing.pictures import write_rerun
 from ..scoring.metrics import Score
 from . import trial
-from .report import sentence
 from .sensors import Radio
-from .verdict import verdict_of
+from .verdict import sentence, verdict_of
 from .world import HALL
 
 if TYPE_CHECKING:
@@ -32,33 +31,46 @@ if TYPE_CHECKING:
     from ..readers.inputs import Reading
     from ..scoring.metrics import Estimate
 
-SIMULATED = trial.Task(HALL, seed=1, yaw="unknown")  # place and yaw are not given, as to the nodes
+SIMULATED = trial.Task(HALL, seed=1, yaw="unknown")  # the nodes get no place and no yaw either
 
 
 @dataclass(frozen=True)
 class DemoFlight:
-    """What is flown. flight : Flight; effects_file, model : what corrects it, or None;
-    became : what became of a flight that was simulated, in words.
+    """Describe the flight of a demo.
+
+    Parameters
+    ----------
+    flight : Flight
+    effects_file, model : str or None
+        Corrections.
+    outcome : str
+        Verdict of a simulated flight as a sentence, or "".
     """
 
     flight: Flight
     effects_file: str | Path | None
     model: str | None
-    became: str = ""
+    outcome: str = ""
 
     def corrector(self) -> Corrector | None:
-        """Corrector of the flight, or None if nothing corrects it. Raises InputError."""
+        """Return the Corrector of the flight, or None without corrections.
+
+        Raises
+        ------
+        InputError
+            If a file cannot be used.
+        """
         if not (self.effects_file or self.model):
             return None
         effects = EffectSet.from_yaml(self.effects_file) if self.effects_file else EffectSet()
         return Corrector(self.flight.anchors, effects, load_network(self.model))
 
     def correction(self) -> str:
-        """What corrects the flight, from where and why, in words."""
+        """Return the corrections of the flight as text."""
         corrector = self.corrector()
         if corrector is None:
             return (
-                "nothing: neither --effects nor --model is given, and what other flights needed "
+                "nothing: neither --effects nor --model is given, and corrections of other flights "
                 "may harm this one"
             )
         sources = [str(path) for path in (self.effects_file, self.model) if path]
@@ -68,9 +80,25 @@ class DemoFlight:
 def simulated(
     folder: str | Path, effects_file: str | Path | None = None, model: str | None = None
 ) -> DemoFlight:
-    """DemoFlight by nothing but its estimate, among anchors that are late; corrected, if nothing
-    else is given, with their true delays as a calibration would find them: an effects.yaml in the
-    folder. Raises InputError.
+    """Fly among anchors with delays, by the estimate alone.
+
+    Without `effects_file` and `model` the true delays are corrected. They are written to an effects.yaml
+    in the folder, as a calibration writes them.
+
+    Parameters
+    ----------
+    folder : str or Path
+    effects_file : str or Path, optional
+    model : str, optional
+
+    Returns
+    -------
+    DemoFlight
+
+    Raises
+    ------
+    InputError
+        If a file cannot be used.
     """
     if not (effects_file or model):
         delays = Radio(SIMULATED.world, SIMULATED.seed, 1.0).constants[:, 0]
@@ -90,8 +118,23 @@ def measured(
     effects_file: str | Path | None = None,
     model: str | None = None,
 ) -> DemoFlight:
-    """DemoFlight of a recording, read by a Reading, corrected with what is given and nothing else.
-    Raises InputError.
+    """Read a recording with the given corrections.
+
+    Parameters
+    ----------
+    path : str or Path
+    reading : Reading
+    effects_file : str or Path, optional
+    model : str, optional
+
+    Returns
+    -------
+    DemoFlight
+
+    Raises
+    ------
+    InputError
+        If the recording has no ground truth or a file cannot be used.
     """
     flight = reading.one(path)
     if flight.truth is None:
@@ -103,22 +146,31 @@ def measured(
 
 @dataclass(frozen=True)
 class DemoResult:
-    """became : {what became of the messages: count}, see `accounts`; scores : [Score], of the
-    filter without correction, of the nodes, and of the filter with correction; or, if nothing
-    corrects, of the nodes and of the filter; nodes : RecordedOdometry;
-    without_ros : Run of the filter with what the nodes correct with; raw : Odometry of the filter
-        without correction, or None if nothing
-    corrects.
+    """Hold the results of a demo.
+
+    Parameters
+    ----------
+    outcome : dict
+        Number of messages by outcome, see `accounts`.
+    scores : list of Score
+        With corrections: filter without correction, nodes, filter with correction. Without corrections:
+        nodes and filter.
+    nodes : RecordedOdometry
+        Output of the nodes.
+    without_ros : Run
+        Filter with the corrections of the nodes.
+    raw : Odometry or None
+        Filter without correction, if there are corrections.
     """
 
-    became: dict[str, int]
+    outcome: dict[str, int]
     scores: list[Score]
     nodes: RecordedOdometry
     without_ros: Run
     raw: Odometry | None
 
     def show(self, path: Path, flight: Flight, sentences: Sequence[str]) -> None:
-        """Write a file for Rerun: what the nodes said, and sentences."""
+        """Write a file for Rerun with the output of the nodes and sentences."""
         write_rerun(
             path,
             flight,
@@ -133,11 +185,26 @@ class DemoResult:
 def fly(
     planned: DemoFlight, folder: Path, rate: float = 1.0, say: Callable[[str], object] = print
 ) -> DemoResult:
-    """Write the flight of a DemoFlight as a bag, play it to both nodes, and run the filter without
-    ROS beside them: DemoResult.
+    """Play a flight to both nodes, and run the filter without ROS.
 
-    The bags and the output of the nodes go to the folder. Raises InputError, LiveError. say(text) :
-    called with what happens.
+    Parameters
+    ----------
+    planned : DemoFlight
+    folder : Path
+        For the bag and the output of the nodes.
+    rate : float
+        Speed of the replay.
+    say : callable
+        Called with lines of progress.
+
+    Returns
+    -------
+    DemoResult
+
+    Raises
+    ------
+    InputError, LiveError
+        If the flight cannot be played.
     """
     flight, bag, correction = planned.flight, folder / "flight.bag", planned.corrector()
     assert flight.truth is not None
@@ -163,14 +230,12 @@ def fly(
 
 
 def next_steps(recording: str | Path, survey: str | Path | None = None) -> list[str]:
-    """[command line] to copy after the demo: check a recording, localize it, calibrate the tag by
-    it.
-    """
+    """Return commands to copy after the demo: check, localize and calibrate."""
     words = [recording, *(("--survey", survey) if survey else ())]
     lines = [("check",), ("localize", "--out", "localized/"), ("calibrate", "--out", "calibrated/")]
     return [command_lines.tool(name, *words, *more) for name, *more in lines]
 
 
 def _absolute(path: str | Path | None) -> str:
-    """For a node, which runs elsewhere; "" for none."""
+    """Return an absolute path, or "" for None: a node runs in another directory."""
     return str(Path(path).resolve()) if path else ""

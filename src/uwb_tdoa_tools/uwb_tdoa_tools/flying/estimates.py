@@ -1,77 +1,236 @@
-"""Who tells the controller where it is: our filter, as the nodes run it, or somebody else's, built
-as a shared library.
+"""Provide estimates: the own filter as the nodes run it, or a peer.
+
+A peer is a filter in a shared library that the user has built (docs/speed.md). It exports, in C:
+
+    typedef struct { double t, gyro[3], accel[3], d; int32_t a, b; } tdoa_peer_event;
+    int32_t tdoa_peer_version(void);                                           // VERSION
+    void tdoa_peer_start(const double *anchors, int32_t count, const double *p, const double *q);
+    void tdoa_peer_run(const tdoa_peer_event *events, int32_t count);
+    void tdoa_peer_position(double *p);
+
+An event with a < 0 is an inertial sample (s, rad/s, m/s^2). Every other event is a TDOA d = |p - b| -
+|p - a|, m, of the anchors in rows a and b of `anchors` (count, 3), m. The filter starts at rest at p,
+m, with the attitude q, x y z w, body to world. `fly --peer` needs one more function. It returns the
+state in m, m/s in the world frame, and x y z w:
+
+    void tdoa_peer_state(double *p, double *v, double *q);
+
+If no place is given, p is NaN at the start. A given place is accurate to 0.1 m. The attitude q is
+level, and its yaw is accurate to 0.1 rad.
 """
 
 from __future__ import annotations
 
+import ctypes
 import math
+from pathlib import Path
+import shutil
+import time
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet, StreamCorrector
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.files import temporary_folder
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.frames import poses_of
 from uwb_tdoa_ekf.results import Odometry, concatenated
 
-from .peer import Peer, events
-
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from numpy.typing import ArrayLike
+
     from uwb_tdoa_bias.correction.network import Network
     from uwb_tdoa_bias.foundation.anchors import Anchors
+    from uwb_tdoa_bias.foundation.flight import Imu, Tdoas
     from uwb_tdoa_ekf.core.config import FilterConfig
 
     from .mission import Pose
     from .simulator import SensorReadings
 
-NOTHING = Odometry(
-    np.empty(0),
-    np.empty((0, 3)),
-    np.empty((0, 3)),
-    np.empty((0, 4)),
-    np.empty((0, 3)),
-    np.empty((0, 3)),
-    np.empty((0, 9, 9)),
-    np.empty((0, 3, 3)),
+
+VERSION = 1
+EVENT = np.dtype(
+    [
+        ("t", float),
+        ("gyro", float, 3),
+        ("accel", float, 3),
+        ("d", float),
+        ("a", np.int32),
+        ("b", np.int32),
+    ]
+)
+SYMBOLS = ("version", "start", "run", "position")
+
+
+class Peer:
+    """Call the filter in a shared library.
+
+    Raises
+    ------
+    InputError
+        If the library cannot be loaded or has another interface.
+    """
+
+    def __init__(self, path: str | Path, own: bool = False) -> None:
+        """Load the library.
+
+        Parameters
+        ----------
+        path : str or Path
+        own : bool
+            Load a copy, so that its static variables start with their initial values.
+        """
+        self.name = Path(path).name
+        try:
+            with temporary_folder() as folder:
+                library = ctypes.CDLL(
+                    str(shutil.copy(path, folder) if own else Path(path).absolute())
+                )
+        except OSError as error:
+            raise InputError(
+                f"--peer: {path} cannot be loaded as a shared library ({error}); build it "
+                "anew on this machine."
+            ) from error
+        functions: dict[str, Any] = {
+            name: getattr(library, f"tdoa_peer_{name}", None) for name in SYMBOLS
+        }
+        missing = [f"tdoa_peer_{name}" for name, function in functions.items() if function is None]
+        if missing:
+            raise InputError(
+                f"--peer: {path} does not export {missing[0]}; add it as docs/speed.md shows."
+            )
+        self._version, self._start, self._run, self._position = functions.values()
+        self._state = getattr(library, "tdoa_peer_state", None)
+        self._version.restype = ctypes.c_int32
+        version = self._version()
+        if version != VERSION:
+            raise InputError(
+                f"--peer: {path} is of version {version} of the interface, this is {VERSION}; "
+                "build it for that."
+            )
+
+    def start(self, anchors: np.ndarray, p: ArrayLike, q: ArrayLike) -> None:
+        """Restart at p (3,) m with attitude q (4,) x y z w, with anchors (n, 3) m."""
+        self._anchors = np.ascontiguousarray(
+            anchors, dtype=float
+        )  # kept: the library may read them later
+        self._start(
+            _pointer(self._anchors),
+            ctypes.c_int32(len(anchors)),
+            _pointer(np.array(p, float)),
+            _pointer(np.array(q, float)),
+        )
+
+    def run(self, events: np.ndarray) -> float:
+        """Process events (n,) of EVENT and return the duration, s."""
+        data, count = _pointer(events), ctypes.c_int32(len(events))
+        began = time.perf_counter()
+        self._run(data, count)
+        return time.perf_counter() - began
+
+    def position(self) -> np.ndarray:
+        """(3,) m."""
+        out = np.full(3, np.nan)
+        self._position(_pointer(out))
+        return out
+
+    def state(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """(p (3,) m, v (3,) m/s, world, q (4,) x y z w).
+
+        Raises InputError if the library does not tell.
+        """
+        if self._state is None:
+            raise InputError(
+                f"--peer: {self.name} does not export tdoa_peer_state; add it as "
+                "docs/speed.md shows."
+            )
+        p, v, q = np.full(3, np.nan), np.full(3, np.nan), np.full(4, np.nan)
+        self._state(*map(_pointer, (p, v, q)))
+        return p, v, q
+
+
+def events(imu: Imu, tdoa: Tdoas, anchors: Anchors) -> tuple[np.ndarray, np.ndarray]:
+    """Return the inertial samples and the TDOAs between known anchors as two arrays of EVENT."""
+    samples: np.ndarray = np.zeros(len(imu), EVENT)
+    ranges: np.ndarray = np.zeros(len(tdoa), EVENT)
+    samples["t"], samples["gyro"], samples["accel"], samples["a"] = imu.t, imu.gyro, imu.accel, -1
+    ranges["t"], ranges["a"], ranges["b"], ranges["d"] = (
+        tdoa.t,
+        anchors.index(tdoa.a),
+        anchors.index(tdoa.b),
+        tdoa.d,
+    )
+    return samples, ranges
+
+
+def _pointer(array: np.ndarray) -> ctypes.c_void_p:
+    return array.ctypes.data_as(ctypes.c_void_p)
+
+
+pass
+
+
+def odometry_of(
+    t: np.ndarray, p: np.ndarray, v: np.ndarray, q: np.ndarray, covariance: np.ndarray
+) -> Odometry:
+    """Return odometry of poses and velocities, without rates.
+
+    Parameters
+    ----------
+    t, p, v, q : numpy.ndarray
+        Stamps (n,) s, positions (n, 3) m, velocities (n, 3) m/s and attitudes (n, 4) x y z w.
+    covariance : numpy.ndarray
+        Of position, velocity and attitude (n, 9, 9).
+    """
+    zero = np.zeros(p.shape)
+    return Odometry(t, p, v, q, zero, zero, covariance, np.zeros((len(t), 3, 3)))
+
+
+NO_ODOMETRY = odometry_of(
+    np.empty(0), np.empty((0, 3)), np.empty((0, 3)), np.empty((0, 4)), np.empty((0, 9, 9))
 )
 
 
 class EstimateSource(Protocol):
-    """Who tells where a vehicle is. why : what keeps it from being flown by, in words, "" for
-    nothing.
+    """Provide the estimate that a vehicle flies by.
+
+    `why` is the reason for which the estimate cannot be used, or "".
     """
 
     @property
     def why(self) -> str: ...
 
     def set_pose(self, t: float, p: np.ndarray, std: float, yaw: float) -> None:
-        """Tell that it is at p (3,) m at t, s, to so many m, and points along yaw, to as many rad;
-        NaN: nobody knows.
-        """
+        """Set the initial position and yaw, see `OwnFilter.set_pose`."""
 
     def take(self, measured: SensorReadings) -> None:
-        """Take what arrived."""
+        """Process the samples that have arrived."""
 
     @property
     def pose(self) -> Pose | None:
-        """The newest estimate."""
+        """Return the newest estimate."""
 
     @property
     def deviation(self) -> float:
-        """Largest standard deviation of a coordinate of it, m; inf without one."""
+        """Return its largest standard deviation of a coordinate, m, or inf without an estimate."""
 
     @property
     def odometry(self) -> Odometry:
-        """All that came out."""
+        """Return all estimates."""
 
 
-class OurFilter:
-    """`Corrector` and `Estimator`, as in bias_node and ekf_node, behind the calls that a flight
-    needs: an EstimateSource. estimator : Estimator; newest : Odometry, the last that came out, or
-    None.
+class OwnFilter:
+    """Run `Corrector` and `Estimator` as bias_node and ekf_node do.
+
+    Attributes
+    ----------
+    estimator : Estimator
+    newest : Odometry or None
+        The last output.
     """
 
     why = ""
@@ -83,8 +242,15 @@ class OurFilter:
         effects: EffectSet | None = None,
         network: Network | None = None,
     ) -> None:
-        """anchors : Anchors; config : FilterConfig; effects : EffectSet, and network : Network, to
-        correct what was measured with, or None.
+        """Set up the filter and its corrections.
+
+        Parameters
+        ----------
+        anchors : Anchors
+        config : FilterConfig
+        effects : EffectSet, optional
+        network : Network, optional
+            Corrections of the measurements.
         """
         effects = effects or EffectSet()
         self._anchors, self._streams, self._corrector = (
@@ -93,17 +259,27 @@ class OurFilter:
             Corrector(anchors, effects, network),
         )
         self.estimator = Estimator(anchors, config, effects=effects)
-        self._parts = [NOTHING]
+        self._parts = [NO_ODOMETRY]
         self.newest: Odometry | None = None
 
     def set_pose(self, t: float, p: np.ndarray, std: float, yaw: float) -> None:
-        """Tell that it is at p (3,) m at t, s, to so many m, and points along yaw, to as many rad;
-        NaN: nobody knows.
+        """Set the position and the yaw at a time.
+
+        Parameters
+        ----------
+        t : float
+            s.
+        p : numpy.ndarray
+            (3,), m.
+        std : float
+            Standard deviation of position, m, and yaw, rad.
+        yaw : float
+            rad, NaN if unknown.
         """
         self.estimator.set_pose(t, p, std**2 * np.eye(3), yaw, std)
 
     def take(self, measured: SensorReadings) -> None:
-        """Take what arrived: SensorReadings."""
+        """Process the samples that have arrived."""
         for name, part in measured.streams.items():
             if len(part.t):
                 self._add(name, self._streams.correct(name, part))
@@ -115,7 +291,7 @@ class OurFilter:
                 self._corrector.add_pose(*poses_of(odometry))
 
     def _add(self, name: str, part: Any) -> None:
-        """Give the filter a part of a stream that is corrected, but for the bias of TDOAs."""
+        """Give a part of one stream to the filter, and correct the bias of TDOAs."""
         if name == "imu":
             self.estimator.add_imu(part.t, part.gyro, part.accel)
         elif name == "tdoa":
@@ -136,14 +312,14 @@ class OurFilter:
 
     @property
     def pose(self) -> Pose | None:
-        """(t s, p (3,) m, v (3,) m/s, q (4,)) of the newest estimate, or None."""
+        """Return (t s, p (3,) m, v (3,) m/s, q (4,)) of the newest estimate, or None."""
         if self.newest is None:
             return None
         return self.newest.t[-1], self.newest.p[-1], self.newest.v[-1], self.newest.q[-1]
 
     @property
     def deviation(self) -> float:
-        """Largest standard deviation of a coordinate of the newest estimate, m; inf without one."""
+        """Return the largest standard deviation of a coordinate, m, or inf without an estimate."""
         if self.newest is None:
             return math.inf
         P = self.newest.covariance[-1]
@@ -151,25 +327,37 @@ class OurFilter:
 
     @property
     def odometry(self) -> Odometry:
-        """Odometry, all that came out."""
+        """Return all estimates."""
         return concatenated(self._parts)
 
 
-class TheirFilter:
-    """A Peer behind the same calls.
+class PeerFilter:
+    """Run a Peer as an estimate source.
 
-    It gets place and yaw at the start, knows no effects, and says nothing of its covariance.
+    It gets place and yaw at the start. It corrects no effects and gives no covariance.
     """
 
-    deviation = 0.0  # m; nobody knows
+    deviation = 0.0  # m; a peer gives none
     why = ""
 
     def __init__(
         self, library: str | Path, anchors: Anchors, yaw: float, place: np.ndarray | None = None
     ) -> None:
-        """library : path; anchors : Anchors; yaw : rad; place : (3,) m, or None.
+        """Load and start the peer.
 
-        Raises InputError.
+        Parameters
+        ----------
+        library : str or Path
+        anchors : Anchors
+        yaw : float
+            rad.
+        place : numpy.ndarray, optional
+            (3,), m.
+
+        Raises
+        ------
+        InputError
+            If the library cannot be used.
         """
         self._peer, self._anchors = Peer(library, own=True), anchors
         q = np.array([0.0, 0.0, math.sin(0.5 * yaw), math.cos(0.5 * yaw)])
@@ -178,7 +366,7 @@ class TheirFilter:
         self._newest: Pose | None = None
 
     def take(self, measured: SensorReadings) -> None:
-        """Take what arrived: SensorReadings, of which other sensors are passed over."""
+        """Process the inertial samples and TDOAs that have arrived."""
         both = np.concatenate(events(measured.imu, measured.tdoa, self._anchors))
         if len(both):
             self._peer.run(both[np.argsort(both["t"], kind="stable")])
@@ -188,22 +376,13 @@ class TheirFilter:
 
     @property
     def pose(self) -> Pose | None:
-        """(t s, p (3,) m, v (3,) m/s, q (4,)) of the newest estimate that is one, or None."""
+        """Return (t s, p (3,) m, v (3,) m/s, q (4,)) of the newest finite estimate, or None."""
         return self._newest
 
     @property
     def odometry(self) -> Odometry:
-        """Odometry, all that came out; covariances NaN."""
+        """Return all estimates, with covariances of NaN."""
         if not self._states:
-            return NOTHING
+            return NO_ODOMETRY
         t, p, v, q = map(np.array, zip(*self._states))
-        return Odometry(
-            t,
-            p,
-            v,
-            q,
-            np.zeros(p.shape),
-            np.zeros(p.shape),
-            np.full((len(t), 9, 9), np.nan),
-            np.zeros((len(t), 3, 3)),
-        )
+        return odometry_of(t, p, v, q, np.full((len(t), 9, 9), np.nan))

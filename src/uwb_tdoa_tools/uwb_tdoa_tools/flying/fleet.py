@@ -1,75 +1,198 @@
-"""Many flights, on all cores, with what they came to kept on the way."""
+"""Fly many tasks on all cores, keep their verdicts, and draw them."""
 
 from __future__ import annotations
 
 from contextlib import nullcontext
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from uwb_tdoa_bias.foundation.files import write_filled
+
 from .. import parallel
 from ..bags.bag import write_bag
 from ..results_file import ResultsFile
-from .plots import drawn
-from .report import summary, text
+from ..scoring.metrics import position_at
 from .rover import drive
 from .trial import fly
-from .verdict import verdict_of
+from .verdict import reached, summary, text, verdict_of, wording_of
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
     from contextlib import AbstractContextManager
+    from pathlib import Path
 
-    from .plots import Drawn
-    from .trial import Task
+    from uwb_tdoa_bias.foundation.anchors import Anchors
+
+    from .trial import Task, TrialResult
 
     Verdicts = ResultsFile | dict[str, dict[str, Any]]  # {seed: verdict}
 
 
-def kept(path: str | Path | None, asked: dict[str, Any]) -> AbstractContextManager[Verdicts]:
-    """Context of a ResultsFile, or of a dict where path is None. asked : as of ResultsFile.
+SPACING = 0.05  # s
 
-    Raises InputError.
+
+@dataclass(frozen=True)
+class DrawnFlight:
+    """Hold the figures of a flight that are drawn.
+
+    Parameters
+    ----------
+    t, p : numpy.ndarray
+        Stamps (n,), s, and true positions (n, 3), m.
+    wanted : numpy.ndarray
+        Wanted positions (n, 3), m, or NaN.
+    stamps, error, sigma : numpy.ndarray
+        Stamps (k,), s, errors and standard deviations (k, 3), m, of the estimate.
+    verdict : dict
+        See `verdict_of`.
+    """
+
+    t: np.ndarray
+    p: np.ndarray
+    wanted: np.ndarray
+    stamps: np.ndarray
+    error: np.ndarray
+    sigma: np.ndarray
+    verdict: dict[str, Any]
+
+
+def drawn_flight(result: TrialResult, verdict: dict[str, Any]) -> DrawnFlight:
+    """Return the figures of a TrialResult to draw."""
+    assert result.flight.truth is not None
+    truth, odometry = result.flight.truth, result.odometry
+    every = max(1, round(SPACING / (truth.t[1] - truth.t[0])))
+    t, p = truth.t[::every], truth.p[::every]
+    wanted = np.full(p.shape, np.nan)
+    for mission in (mission for mission in result.missions if mission.started is not None):
+        inside = (t >= mission.started) & (t <= (mission.ended or np.inf))
+        wanted[inside] = mission.wanted(t[inside])[:, 0]
+    rows: np.ndarray = np.empty(0, int)
+    if len(odometry):
+        rows = np.unique(
+            np.searchsorted(odometry.t, np.arange(odometry.t[0], odometry.t[-1], SPACING))
+        )
+    stamps = odometry.t[rows]
+    error = odometry.p[rows] - position_at(stamps, truth)
+    sigma = np.sqrt(np.einsum("nii->ni", odometry.covariance[rows, :3, :3]))
+    return DrawnFlight(t, p, wanted, stamps, error, sigma, verdict)
+
+
+def plot(flights: Sequence[DrawnFlight], anchors: Anchors, path: str | Path) -> None:
+    """Draw a map, all heights, and the errors of the worst flight to an image file.
+
+    Parameters
+    ----------
+    flights : sequence of DrawnFlight
+    anchors : Anchors
+    path : str or Path
+    """
+    from matplotlib.figure import Figure  # takes a second to import
+
+    figure = Figure(figsize=(14, 8), layout="constrained")
+    left, right = figure.subfigures(1, 2)
+    goal = wording_of(flights[0].verdict).goal
+    figure.suptitle(f"{sum(reached(one.verdict) for one in flights)} of {len(flights)} {goal}")
+    above, height = left.subplots(2, 1, height_ratios=(3, 1))
+    above.plot(*anchors.positions[:, :2].T, "k^")
+    for one in flights:
+        colour = "tab:green" if reached(one.verdict) else "tab:red"
+        above.plot(*one.p[:, :2].T, color=colour, linewidth=0.7, alpha=0.6)
+        above.plot(*one.p[-1, :2], "x", color=colour)
+        height.plot(one.t, one.p[:, 2], color=colour, linewidth=0.7, alpha=0.6)
+    above.set(xlabel="x, m", ylabel="y, m", aspect="equal")
+    height.set(xlabel="t, s", ylabel="z, m")
+    worst = max(flights, key=_error_key)
+    right.suptitle(f"seed {worst.verdict['seed']}: {worst.verdict['why'] or goal}")
+    for k, (axes, axis) in enumerate(zip(right.subplots(3, 1, sharex=True), "xyz")):
+        axes.plot(worst.t, worst.wanted[:, k] - worst.p[:, k], "0.6", label="wanted - true")
+        axes.plot(worst.stamps, worst.error[:, k], label="estimated - true")
+        axes.fill_between(
+            worst.stamps,
+            -3 * worst.sigma[:, k],
+            3 * worst.sigma[:, k],
+            alpha=0.2,
+            label="three sigma",
+        )
+        axes.set(ylabel=f"{axis}, m")
+    axes.set(xlabel="t, s")
+    axes.legend()
+    write_filled(path, partial(figure.savefig, dpi=120))
+
+
+def _error_key(one: DrawnFlight) -> tuple[bool, float]:
+    return not reached(one.verdict), one.verdict["tracking"] or 0.0
+
+
+pass
+
+
+def verdict_store(
+    path: str | Path | None, asked: dict[str, Any]
+) -> AbstractContextManager[Verdicts]:
+    """Return a context of a ResultsFile, or of a dict if `path` is None.
+
+    Parameters
+    ----------
+    path : str or Path or None
+    asked : dict
+        See `ResultsFile`.
+
+    Raises
+    ------
+    InputError
+        If the file belongs to other options.
     """
     return nullcontext({}) if path is None else ResultsFile(path, asked)
 
 
-def flown(
+def fly_all(
     tasks: Sequence[Task],
     done: Verdicts,
     record: str | Path | None = None,
     draw: bool = False,
     jobs: int | None = None,
     dask: str | None = None,
-) -> Iterator[tuple[dict[str, Any], Drawn | None]]:
-    """Generator of (verdict, Drawn or None), of Tasks in turn; those that are in `done`, by their
-    seeds, are not flown again.
+) -> Iterator[tuple[dict[str, Any], DrawnFlight | None]]:
+    """Fly tasks and yield (verdict, DrawnFlight or None) of each in turn.
 
-    record : folder for a bag of each, or None; draw : give what is drawn; jobs, dask : as of
-        `parallel.over`.
+    Parameters
+    ----------
+    tasks : sequence of Task
+    done : ResultsFile or dict
+        Verdicts by seed. Their tasks are not flown again.
+    record : str or Path, optional
+        Folder for a bag of each flight.
+    draw : bool
+        Whether to yield figures to draw.
+    jobs, dask
+        See `parallel.over`.
     """
     missing = [task for task in tasks if str(task.seed) not in done]
-    made = parallel.over(partial(fly_one, record, draw), missing, jobs, dask)
+    made = parallel.over(partial(fly_task, record, draw), missing, jobs, dask)
     for task in tasks:
         key, picture = str(task.seed), None
         if key not in done:
             done[key], picture = next(made)
-        yield (done.read(key, _sound) if isinstance(done, ResultsFile) else done[key]), picture
-    next(made, None)  # to its end, so that its processes are kept
+        yield (done.read(key, _validated) if isinstance(done, ResultsFile) else done[key]), picture
+    next(made, None)  # to its end: the processes can be used again
 
 
-def _sound(verdict: dict[str, Any]) -> dict[str, Any]:
-    """A verdict that a file holds, of which a summary can be made."""
+def _validated(verdict: dict[str, Any]) -> dict[str, Any]:
+    """Return a stored verdict. Raise an error if `summary` cannot use it."""
     text(summary([verdict]))
     return verdict
 
 
-def fly_one(
+def fly_task(
     record: str | Path | None, draw: bool, task: Task
-) -> tuple[dict[str, Any], Drawn | None]:
-    """(verdict, Drawn or None) of a Task that is flown; record, draw : as of `flown`."""
+) -> tuple[dict[str, Any], DrawnFlight | None]:
+    """Fly a Task and return (verdict, DrawnFlight or None), see `fly_all`."""
     one = drive(task) if task.vehicle == "rover" else fly(task)
     verdict = verdict_of(one)
     if record is not None:
         write_bag(one.flight, Path(record) / one.flight.name, "mcap", False)
-    return verdict, drawn(one, verdict) if draw else None
+    return verdict, drawn_flight(one, verdict) if draw else None

@@ -1,5 +1,6 @@
-"""Wait, take off, fly, land: decided by nothing but the estimate, its deviation, and what the
-accelerometer feels.
+"""Define what is flown, and decide when to wait, take off, fly and land.
+
+A mission uses the estimate, its standard deviation and the accelerometer alone.
 """
 
 from __future__ import annotations
@@ -9,23 +10,242 @@ import math
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
+from scipy.interpolate import make_interp_spline
 
 if TYPE_CHECKING:
-    Pose = tuple[
-        float, np.ndarray, np.ndarray, np.ndarray
-    ]  # t s, p (3,) m, v (3,) m/s, world, q (4,) x y z w
+    # t s, p (3,) m, v (3,) m/s, both world frame, q (4,) x y z w
+    Pose = tuple[float, np.ndarray, np.ndarray, np.ndarray]
+
+
+KNOT, FINE = 0.02, 0.0025  # s, between knots of the spline and points of its table
+SPEED_UP = 1.5  # s, from hovering to the circle and back
+CLIMB = 0.4  # share of the ascent and the descent for each ramp
+SETTLE = 0.4  # m above the ground, start of the slow descent
+SINK = 0.2  # m/s
+
+
+@dataclass(frozen=True)
+class Circles:
+    """Fly up, along circles, and down to the start.
+
+    Parameters
+    ----------
+    height, radius : float
+        m.
+    rise, fall : float
+        Durations of ascent and descent, s.
+    turns : int
+    turn_time : float
+        Duration of a turn, s.
+    swing : float
+        Amplitude of the height in each turn, m.
+    """
+
+    height: float = 1.2
+    radius: float = 1.0
+    rise: float = 3.0
+    fall: float = 4.0
+    turns: int = 2
+    turn_time: float = 8.0
+    swing: float = 0.0
+
+    @property
+    def duration(self) -> float:
+        """Return the time from the start of the rotors to the final descent, s."""
+        return self.rise + self.turns * self.turn_time + self.fall
+
+    @property
+    def middle(self) -> float:
+        """Return a time on the circle, s after take-off."""
+        return self.rise + 4.0
+
+    def starting_at(self, place: np.ndarray, ground: float) -> ReferenceTrajectory:
+        """Return the trajectory from `place` (2,) m.
+
+        The circle is entered at its point nearest to +x. `ground` is the height of the body at rest, m.
+        """
+        knots = np.arange(0.0, self.duration + KNOT, KNOT)
+        up = cruise(knots / self.rise, CLIMB)
+        down = cruise((knots - self.duration + self.fall) / self.fall, CLIMB)
+        air = self.turns * self.turn_time
+        angle = 2.0 * np.pi * self.turns * cruise((knots - self.rise) / air, SPEED_UP / air)
+        p = np.empty((len(knots), 3))
+        p[:, 0] = place[0] + self.radius * (np.cos(angle) - 1.0)
+        p[:, 1] = place[1] + self.radius * np.sin(angle)
+        p[:, 2] = (
+            ground + self.height * up - (self.height - SETTLE) * down + self.swing * np.sin(angle)
+        )
+        return ReferenceTrajectory(p)
+
+
+@dataclass(frozen=True)
+class Waypoints:
+    """Drive straight from place to place.
+
+    Parameters
+    ----------
+    size : tuple
+        Length and width of the hall, m.
+    shares : tuple
+        Places (n, 2) in units of half the length and width, from the middle of the hall.
+    speed : float
+        m/s.
+    """
+
+    size: tuple[float, float] = (6.4, 6.2)
+    shares: tuple[tuple[float, float], ...] = (
+        (0.5, 0.5),
+        (-0.5, 0.5),
+        (-0.5, -0.5),
+        (0.5, -0.5),
+        (0.5, 0.1),
+    )
+    speed: float = 0.6
+
+    @property
+    def duration(self) -> float:
+        """Return the time from departure to arrival at this speed, s."""
+        places = 0.5 * np.array(self.size) * self.shares
+        ways = np.linalg.norm(np.diff(places, axis=0, prepend=[[0.0, 0.0]]), axis=1)
+        return float(ways.sum()) / self.speed
+
+    @property
+    def middle(self) -> float:
+        """Return a time on the way, s after departure."""
+        return 0.5 * self.duration
+
+    def starting_at(self, place: np.ndarray, ground: float) -> Polyline:
+        """Return the polyline from `place` (2,) m at the height `ground`, m."""
+        return Polyline(np.vstack([place, 0.5 * np.array(self.size) * self.shares]), ground)
+
+
+class Polyline:
+    """Connect places by straight lines.
+
+    Attributes
+    ----------
+    length : float
+        m.
+    end : numpy.ndarray
+        Last place (2,), m.
+    """
+
+    def __init__(self, places: np.ndarray, height: float) -> None:
+        """Store places (n, 2), m, and their height, m."""
+        self._places, self._height = places, height
+        self._ways = np.diff(places, axis=0)
+        self._lengths = np.linalg.norm(self._ways, axis=1)
+        self._stamps = np.concatenate([[0.0], np.cumsum(self._lengths)])
+        self.length, self.end = float(self._stamps[-1]), places[-1]
+
+    def at(self, along: np.ndarray) -> np.ndarray:
+        """Return the points (n, 3), m, at arc lengths `along` (n,), m."""
+        x, y = (np.interp(along, self._stamps, column) for column in self._places.T)
+        return np.column_stack([x, y, np.full(len(x), self._height)])
+
+    def nearest(self, p: np.ndarray, first: float = 0.0, last: float = np.inf) -> np.ndarray:
+        """Return the arc lengths (n,), m, nearest to p (n, 2) m, between `first` and `last`, m."""
+        since = p[:, None] - self._places[:-1]
+        shares = np.sum(since * self._ways, axis=2) / self._lengths**2
+        along = self._stamps[:-1] + np.clip(shares, 0.0, 1.0) * self._lengths  # of each line
+        along = np.clip(along, first, min(last, self.length))
+        off = self.at(along.ravel())[:, :2].reshape(since.shape) - p[:, None]
+        best = np.argmin(np.linalg.norm(off, axis=2), axis=1)
+        out: np.ndarray = along[np.arange(len(p)), best]
+        return out
+
+
+class ReferenceTrajectory:
+    """Give the wanted position, velocity and acceleration over time.
+
+    After its end the vehicle descends and no height is wanted.
+
+    Attributes
+    ----------
+    duration : float
+        s.
+    end : numpy.ndarray
+        Place of the landing (2,), m.
+    """
+
+    def __init__(self, p: np.ndarray, turning: float = 0.0) -> None:
+        """Fit a spline to positions.
+
+        Parameters
+        ----------
+        p : numpy.ndarray
+            Positions (m, 3), m, every KNOT s.
+        turning : float
+            Yaw rate, rad/s.
+        """
+        knots = KNOT * np.arange(len(p))
+        spline = make_interp_spline(knots, p, k=5)
+        self.duration, self.end, fine = knots[-1], p[-1, :2], np.arange(0.0, knots[-1], FINE)
+        self._turning = turning
+        self._grid = np.stack(
+            [spline(fine), spline.derivative(1)(fine), spline.derivative(2)(fine)], axis=1
+        )
+
+    def at(self, t: np.ndarray) -> np.ndarray:
+        """Return position, velocity and acceleration (n, 3, 3), m and s, at t (n,) s."""
+        out = self._grid[np.clip(np.rint(t / FINE).astype(int), 0, len(self._grid) - 1)]
+        return with_descent(out, t > self.duration)
+
+    def yaw_offset(self, t: float) -> float:
+        """Return the wanted turn since the start, rad, at t, s."""
+        return self._turning * t
+
+
+def with_descent(wanted: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Replace the wanted motion (n, 3, 3) by a descent where `after` (n,) is true.
+
+    The height is NaN because only the accelerometer detects the ground.
+    """
+    wanted[after, 0, 2] = np.nan
+    wanted[after, 1:] = 0.0
+    wanted[after, 1, 2] = -SINK
+    return wanted
+
+
+def smooth(x: np.ndarray) -> np.ndarray:
+    """Rise from 0 to 1 with three zero derivatives at both ends."""
+    x = np.clip(x, 0.0, 1.0)
+    return x**4 * (35.0 - 84.0 * x + 70.0 * x**2 - 20.0 * x**3)
+
+
+def cruise(x: np.ndarray, ramp: float) -> np.ndarray:
+    """Rise from 0 to 1 over x in 0 ... 1 at one speed, with smooth ramps of length `ramp`."""
+    fine = np.linspace(0.0, 1.0, 4001)
+    speed = smooth(fine / ramp) * smooth((1.0 - fine) / ramp)
+    way = np.concatenate([[0.0], np.cumsum(0.5 * (speed[1:] + speed[:-1]))])
+    return np.interp(x, fine, way / way[-1])  # held beyond
+
 
 WAITING, FLYING, LOST, DONE, REFUSED = "waiting", "flying", "lost", "done", "refused"
 
 
 @dataclass(frozen=True)
 class Rules:
-    """When to do what. rest : s before the rotors start at the earliest; patience : s after that,
-    to wait for an estimate that is good enough; arm, lost : m, largest standard deviation of a
-    coordinate to start with, and beyond which it is lost; stale : s, an older estimate is none;
-    sink : m/s, while it is lost; carried : of the weight: it stands where it feels that much more
-    support than usual;
-    near_end : s before the path's end from which on it may; longest_sink : s.
+    """Set the thresholds of a mission.
+
+    Parameters
+    ----------
+    rest : float
+        Least time before the rotors start, s.
+    patience : float
+        Further time to wait for a good estimate, s.
+    arm, lost : float
+        Largest standard deviation of a coordinate to start with, and to fly with, m.
+    stale : float
+        Largest age of an estimate, s.
+    descent_speed : float
+        Of a lost vehicle, m/s.
+    ground_support : float
+        Additional support, in units of the weight, that means ground contact.
+    near_end : float
+        Time before the end of the path from which ground contact counts, s.
+    longest_descent : float
+        s.
     """
 
     rest: float = 4.0
@@ -33,87 +253,113 @@ class Rules:
     arm: float = 1.0
     lost: float = 1.5
     stale: float = 0.6
-    sink: float = 0.25
-    carried: float = 0.09
+    descent_speed: float = 0.25
+    ground_support: float = 0.09
     near_end: float = 1.5
-    longest_sink: float = 10.0
+    longest_descent: float = 10.0
 
 
-class Way(Protocol):
-    """What is to be flown from where a vehicle stands, by s since its rotors started."""
+class TimedPath(Protocol):
+    """Give the wanted motion from a given start, by seconds since the rotors started."""
 
     duration: float  # s, until it begins to sink
 
     @property
     def end(self) -> np.ndarray:
-        """(2,) m, where it is to land."""
+        """Return the place of the landing (2,), m."""
 
     def at(self, t: np.ndarray) -> np.ndarray:
-        """Position, velocity and acceleration wanted, (n, 3, 3), m and s, at t (n,) s."""
+        """Return position, velocity and acceleration (n, 3, 3), m and s, at t (n,) s."""
 
-    def turned(self, t: float) -> float:
-        """rad by which it is to be turned at t, s."""
-
-
-class Route(Protocol):
-    """What is to be flown, wherever it begins."""
-
-    def along(self, place: np.ndarray, ground: float) -> Way:
-        """The Way from `place` (2,) m; ground : m, height at which the body stands."""
+    def yaw_offset(self, t: float) -> float:
+        """Return the wanted turn since the start, rad, at t, s."""
 
 
-# m, most by which the height that is wanted while it comes down is below the estimated height
-PULL = 0.15
-# s over which it learns what support it feels in the air, where there is none: its accelerometer
-# has an offset
-USUAL = 2.0
+class Plan(Protocol):
+    """Describe a path that can start anywhere."""
+
+    def starting_at(self, place: np.ndarray, ground: float) -> TimedPath:
+        """Return the path from `place` (2,) m with the body at rest at height `ground`, m."""
+
+
+# m, largest distance of the wanted height below the estimated height
+DESCENT_LEAD = 0.15
+# s, averaging time of the support in the air, where an offset of the accelerometer is all of it
+SUPPORT_OFFSET_TIME = 2.0
 
 
 class Mission:
-    """One flight along a path. state : of WAITING ...; started, ended : s, when the rotors started
-    and stopped, or None; lost : s, when its estimate first said that it was lost, or None: then it
-    stops, sinks, and goes on with its path only if its place is given while it is still in the air;
-    yaw : rad, wanted now.
+    """Run one flight along a path.
+
+    A lost mission stops and descends. It continues if the estimate recovers in the air.
+
+    Attributes
+    ----------
+    state : str
+        WAITING, FLYING, LOST, DONE or REFUSED.
+    started, ended : float or None
+        Times at which the rotors started and stopped, s.
+    lost : float or None
+        First time at which the estimate was too uncertain, s.
+    yaw : float
+        Wanted yaw, rad.
     """
 
     def __init__(
         self,
-        path: Route,
+        path: Plan,
         place: np.ndarray,
         ground: float,
         rules: Rules | None = None,
         begin: float = 0.0,
     ) -> None:
-        """path : Circles, or what else has `along`; place (2,) m; ground : m, of the body's origin;
-        begin : s, when it was switched on.
+        """Plan the path from the present place.
+
+        Parameters
+        ----------
+        path : Plan
+        place : numpy.ndarray
+            (2,), m.
+        ground : float
+            Height of the body at rest, m.
+        rules : Rules, optional
+        begin : float
+            Time of switching on, s.
         """
         self.ground, self.rules, self.begin = ground, rules or Rules(), begin
-        self._path = path.along(place, ground)
-        self._clock: list[
-            tuple[float, float]
-        ] = []  # (s, s since the start of the path) of each call
+        self._path = path.starting_at(place, ground)
+        self._clock: list[tuple[float, float]] = []  # (s, time on the path, s) of each call
         self.state = WAITING
         self.started: float | None = None
         self.ended: float | None = None
         self.lost: float | None = None
         self.yaw = self._first_yaw = 0.0
-        self._usual = 0.0  # support, of the weight
-        self._descent: tuple[float, float] | None = (
-            None  # (s, m) where it began to come down on whatever is there
-        )
+        self._support_offset = 0.0  # support, of the weight
+        self._descent: tuple[float, float] | None = None  # (s, m) at the start of the final descent
 
     def decide(
         self, t: float, pose: Pose | None, deviation: float, support: float
     ) -> np.ndarray | None:
-        """What the controller is to do at t, s: (3, 3) position, velocity, acceleration, NaN where
-        it does not matter; None for rotors off. pose : as of an estimate, or None; deviation : m;
-        support : of the weight, that something else than the rotors carries, as felt.
+        """Return the wanted position, velocity and acceleration (3, 3), or None for rotors off.
+
+        A value of NaN is free.
+
+        Parameters
+        ----------
+        t : float
+            s.
+        pose : Pose or None
+            Newest estimate.
+        deviation : float
+            Its largest standard deviation of a coordinate, m.
+        support : float
+            Share of the weight that the ground carries.
         """
         rules = self.rules
         good = pose is not None and t - pose[0] <= rules.stale
         if self.state == WAITING and t >= self.begin + rules.rest:
             if pose is not None and good and deviation <= rules.arm:
-                self.state, self.started, self._last, self._sinking = FLYING, t, t, t
+                self.state, self.started, self._last, self._descent_began = FLYING, t, t, t
                 self._first_yaw = yaw_of(pose[3])
             elif t >= self.begin + rules.rest + rules.patience:
                 self.state = REFUSED
@@ -121,56 +367,61 @@ class Mission:
             return None
         if not good or deviation > rules.lost:
             self.lost = t if self.lost is None else self.lost
-            self._sinking = t if self.state != LOST else self._sinking
+            self._descent_began = t if self.state != LOST else self._descent_began
             self.state = LOST
         elif self.state == LOST and good and deviation <= rules.arm:
             self.state = FLYING
-        along = self.along + (0.0 if self.state == LOST else t - self._last)
+        along = self.path_time + (0.0 if self.state == LOST else t - self._last)
         self._clock.append((t, along))
         if self.state != LOST and along < self._path.duration - rules.near_end:
-            self._usual += min(1.0, (t - self._last) / USUAL) * (support - self._usual)
+            self._support_offset += min(1.0, (t - self._last) / SUPPORT_OFFSET_TIME) * (
+                support - self._support_offset
+            )
         self._last = t
         near_end = self.state == LOST or along > self._path.duration - rules.near_end
         if near_end and (
-            support - self._usual > rules.carried or t - self._sinking > rules.longest_sink
+            support - self._support_offset > rules.ground_support
+            or t - self._descent_began > rules.longest_descent
         ):
             self.state, self.ended = DONE, t
             return None
         if self.state != LOST:
-            assert pose is not None  # or it would be lost
-            self._sinking = t if along < self._path.duration else self._sinking
-            self.yaw = self._first_yaw + self._path.turned(along)
+            assert pose is not None  # without a pose the state is LOST
+            self._descent_began = t if along < self._path.duration else self._descent_began
+            self.yaw = self._first_yaw + self._path.yaw_offset(along)
             wanted = self._path.at(np.array([along]))[0]
             return self._descend(t, wanted, pose[1][2]) if math.isnan(wanted[0, 2]) else wanted
         wanted = np.zeros((3, 3))
-        wanted[0], wanted[1, 2] = math.nan, -rules.sink
+        wanted[0], wanted[1, 2] = math.nan, -rules.descent_speed
         return wanted
 
     def _descend(self, t: float, wanted: np.ndarray, height: float) -> np.ndarray:
-        """Wanted, with a height, m, that falls at half of the wanted velocity, where the estimated
-        height does not fall as fast: an estimated velocity that is wrong by a constant does not
-        keep it in the air.
+        """Add a height, m, that falls at half of the wanted speed if the estimated height does not fall.
+
+        A constant error of the estimated velocity then cannot keep the vehicle in the air.
         """
         begun, first = self._descent = self._descent or (t, height)
-        wanted[0, 2] = min(height, max(first + 0.5 * wanted[1, 2] * (t - begun), height - PULL))
+        wanted[0, 2] = min(
+            height, max(first + 0.5 * wanted[1, 2] * (t - begun), height - DESCENT_LEAD)
+        )
         return wanted
 
     @property
     def place(self) -> np.ndarray:
-        """(2,) m, where it is to land."""
+        """Return the wanted place of the landing (2,), m."""
         return self._path.end
 
     @property
-    def along(self) -> float:
-        """s since the start of the path."""
+    def path_time(self) -> float:
+        """Return the time on the path, s."""
         return self._clock[-1][1] if self._clock else 0.0
 
     def wanted(self, t: np.ndarray) -> np.ndarray:
-        """Of the path, (n, 3, 3), at t (n,) s."""
+        """Return the wanted motion (n, 3, 3) at t (n,) s."""
         return self._path.at(np.interp(t, *np.transpose(self._clock)))
 
 
 def yaw_of(q: np.ndarray) -> float:
-    """rad, of q (4,) x y z w."""
+    """Return the yaw, rad, of an attitude (4,) x y z w."""
     x, y, z, w = q
     return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))

@@ -1,10 +1,14 @@
-"""A filter that is reached over topics, behind the calls that a flight needs: what is measured goes
-out, odometry and status come in.
+"""Fly by a filter that is reached over topics.
+
+Sensor samples are published. Odometry and status are received.
 """
 
 from __future__ import annotations
 
+from collections import deque
 import math
+from statistics import median_low
+import time
 from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
@@ -24,11 +28,12 @@ from uwb_tdoa_bias.foundation.ros_frames import TF_STATIC_QOS
 from uwb_tdoa_bias.foundation.ros_streams import StreamOutput
 from uwb_tdoa_bias.foundation.ros_topics import OUTPUT_QOS, Input, StreamInput
 from uwb_tdoa_bias.foundation.sensors import SENSORS
-from uwb_tdoa_ekf.results import Odometry
+from uwb_tdoa_ekf.reorder_buffer import TRIAL
 from uwb_tdoa_msgs.msg import EstimatorStatus, Tdoa
 
 from ..bags.messages import BODY_FRAME
-from .estimates import NOTHING
+from .estimates import NO_ODOMETRY, odometry_of
+from .simulator import DT
 from .vehicle import ATTITUDE, POSITION
 
 if TYPE_CHECKING:
@@ -36,15 +41,90 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.foundation.ros_cdr import Template
     from uwb_tdoa_bias.foundation.ros_node import StreamNode
+    from uwb_tdoa_ekf.results import Odometry
 
     from .mission import Pose
-    from .pace import Lockstep, RealTime
     from .simulator import SensorReadings
     from .world import World
 
-FARTHEST, FASTEST = 1e3, 100.0  # m, m/s; what is beyond is no odometry of a hall
-CLOSEST = 0.5e-3  # s between odometries that are kept: anybody may publish one for each nanosecond
-LATCHED_LIMIT = 5.0  # s that somebody may take to acknowledge what is latched
+
+LARGEST_CATCH_UP = 0.1  # s: a longer delay shifts all later turns
+# s of stamps, more than the parameter `lag` of ekf_node: then the filter continues without a stream
+LONGEST_GAP = 0.3
+# s, more than the parameter `reorder` of ekf_node, which waits until streams are known to be ordered
+UNTRUSTED = 0.005
+# s of the wall clock: wait for an odometry, and for each further one after a missing odometry
+PATIENCE, IMPATIENCE = 5.0, 0.05
+REMEMBERED = 9  # odometries that determine their period
+
+
+class RealTime:
+    """Allow each turn at its time."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock, self._began, self._now = clock, clock(), 0.0
+
+    def sent(self, now: float, measured: SensorReadings) -> None:
+        """Note that all samples up to `now`, s, were published."""
+        self._now = now
+
+    def heard(self, t: float) -> None:
+        """Note an odometry stamped t, s."""
+
+    def may_go_on(self) -> bool:
+        """Return whether the next turn is due."""
+        behind = self._clock() - self._began - self._now
+        if behind > LARGEST_CATCH_UP:
+            self._began += behind - LARGEST_CATCH_UP
+        return behind >= 0.0
+
+
+class Lockstep:
+    """Allow the next turn when the odometry of the published samples has come.
+
+    The same seed then gives the same flight on any computer. A missing odometry is awaited for PATIENCE.
+    Until the next one comes, the wait is IMPATIENCE.
+    """
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self._clock, self._reach, self._since = clock, 0.0, 0.0
+        self._newest: dict[str, float] = {}
+        self._first: float | None = None
+        self._heard: float | None = None
+        self._periods, self._silent = deque([DT], REMEMBERED), True
+
+    def sent(self, now: float, measured: SensorReadings) -> None:
+        """Note that all samples up to `now`, s, were published."""
+        self._newest |= {
+            stream: part.t[-1] for stream, part in measured.streams.items() if len(part.t)
+        }
+        self._first = now if self._first is None else self._first
+        unordered_wait = 0.0 if now > self._first + TRIAL + UNTRUSTED else UNTRUSTED
+        self._reach = (
+            max(min(self._newest.values(), default=now), now - LONGEST_GAP) - unordered_wait
+        )
+        self._since = self._clock()
+
+    def heard(self, t: float) -> None:
+        """Note an odometry stamped t, s."""
+        if self._heard is not None:
+            self._periods.append(t - self._heard)
+        self._heard = t
+
+    def may_go_on(self) -> bool:
+        """Return whether the odometry has come or the wait is over."""
+        if self._heard is not None and self._heard + median_low(self._periods) > self._reach:
+            self._silent = False
+            return True
+        if self._clock() < self._since + (IMPATIENCE if self._silent else PATIENCE):
+            return False
+        self._silent = True
+        return True
+
+
+FARTHEST, FASTEST = 1e3, 100.0  # m, m/s: limits of plausible odometry
+CLOSEST = 0.5e-3  # s, least time between stored odometries: limits the memory
+LATCHED_LIMIT = 5.0  # s, wait for acknowledgement of latched messages
 MARKER_SIZE = 0.12  # m
 # {stream: (topic, class of its messages, {field: values} of its part)}
 STREAMS: dict[str, tuple[str, type, Callable[[Any], dict[str, Any]]]] = {
@@ -68,18 +148,30 @@ STREAMS: dict[str, tuple[str, type, Callable[[Any], dict[str, Any]]]] = {
 
 
 class OverTopics:
-    """See `estimates.OurFilter`. deviation : m, as there; inf unless the filter says that it is
-    running; status : EstimatorStatus, the newest, or None.
+    """Exchange samples and estimates with a filter over topics, as an EstimateSource.
+
+    Attributes
+    ----------
+    status : EstimatorStatus or None
+        The newest status of the filter.
     """
 
     def __init__(
         self, node: StreamNode, world: World, pace: RealTime | Lockstep, clock: bool
     ) -> None:
-        """node : StreamNode; world : World; pace : of `pace`, which hears of all that goes and
-        comes; clock : publish /clock, and count stamps from 0, not from now.
+        """Create publishers and subscriptions, and publish the anchors.
+
+        Parameters
+        ----------
+        node : StreamNode
+        world : World
+        pace : RealTime or Lockstep
+            It is informed of all messages.
+        clock : bool
+            Publish /clock and count stamps from 0. Otherwise stamps count from the present time.
         """
         self._node, self._pace, self._anchors = node, pace, world.anchors
-        self._begin = 0 if clock else None  # ns, stamp of the start; of now without /clock
+        self._begin = 0 if clock else None  # ns, stamp of the start
         self._now = 0.0
         self._pending_pose: tuple[float, np.ndarray, float, float] | None = None
         self.status: EstimatorStatus | None = None
@@ -89,35 +181,35 @@ class OverTopics:
         self._truth = _Output(node, *STREAMS["truth"], frame=self._anchors.frame)
         self._clock = node.create_publisher(Clock, "/clock", 10) if clock else None
         self._pose = node.create_publisher(PoseWithCovarianceStamped, "initialpose", OUTPUT_QOS)
-        self._wire = CdrCodec(OdometryMessage, "pose", "twist")
+        self._odometry_codec = CdrCodec(OdometryMessage, "pose", "twist")
         self._odometry = StreamInput(node, OdometryMessage, "odometry")
         self._status = Input(node, EstimatorStatus, "status", self._on_status, ANCHORS_QOS)
         anchors = anchors_to_message(self._anchors)
         for topic, qos, content in (
             ("/tf_static", TF_STATIC_QOS, transforms(anchors)),
             ("uwb/anchors/markers", ANCHORS_QOS, markers(anchors, MARKER_SIZE)),
-            ("uwb/anchors", ANCHORS_QOS, anchors),  # the last one: who has it hears the others
+            ("uwb/anchors", ANCHORS_QOS, anchors),  # last: its acknowledgement implies the others
         ):
             self._latched = node.create_publisher(type(content), topic, qos)
             self._latched.publish(content)
         # (t s, p, v, q, covariance (3, 3)) of each odometry
         self._rows: list[tuple[float, np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
 
-    def heard(self) -> bool:
-        """Whether somebody listens to what is measured, and says what comes of it."""
+    def is_connected(self) -> bool:
+        """Return whether a filter subscribes to the samples and publishes odometry."""
         ends = [output.subscribers for output in (self._outputs["imu"], self._outputs["tdoa"])]
         return all(ends) and bool(self._odometry.get_publisher_count())
 
     def wait_for_anchors(self) -> None:
-        """Wait until those who listen have the anchors, and hear everything else, too."""
+        """Wait until the subscribers have received the anchors."""
         self._latched.wait_for_all_acked(Duration(seconds=LATCHED_LIMIT))
 
     def set_pose(self, t: float, p: np.ndarray, std: float, yaw: float) -> None:
-        """See OurFilter; is said before what is measured first."""
+        """Set the initial pose. It is published before the next samples."""
         self._pending_pose = t, p, std, yaw
 
     def take(self, measured: SensorReadings) -> None:
-        """Publish SensorReadings."""
+        """Publish samples."""
         if self._begin is None:
             self._begin = self._node.get_clock().now().nanoseconds
         if self._pending_pose:
@@ -127,9 +219,10 @@ class OverTopics:
         for name, part in measured.streams.items():
             self._outputs[name].publish(*self._parts(part.t), part)
 
-    def turned(self, t: float, state: np.ndarray) -> None:
-        """Publish what is true at t, s, up to which everything was published: state (17,), as of
-        `vehicle`; and on /clock the time.
+    def publish_truth(self, t: float, state: np.ndarray) -> None:
+        """Publish the true state at t, s, and the time on /clock.
+
+        `state` (17,) is that of `vehicle`. All samples up to t are published already.
         """
         self._now = t
         self._truth.publish(
@@ -140,10 +233,10 @@ class OverTopics:
             self._clock.publish(Clock(clock=self._stamp(t)))
         self._pace.sent(t, self._measured)
 
-    def listen(self) -> None:
-        """Take the odometry that has come."""
-        for frame, rows, _ in self._odometry.fetch(self._wire):
-            if self._begin is None:  # nothing was measured yet: whose odometry is that?
+    def receive(self) -> None:
+        """Store the odometry that has come."""
+        for frame, rows, _ in self._odometry.fetch(self._odometry_codec):
+            if self._begin is None:  # odometry of another vehicle: nothing was published yet
                 continue
             t = 1e-9 * (rows["sec"].astype(np.int64) * 10**9 + rows["nanosec"] - self._begin)
             usable = (
@@ -152,14 +245,14 @@ class OverTopics:
                 & (frame == self._anchors.frame)
             )
             for k in np.flatnonzero(usable & (t <= self._now)):
-                self._hear(t[k], rows["pose"][k], rows["twist"][k])
+                self._add_odometry(t[k], rows["pose"][k], rows["twist"][k])
 
-    def _hear(self, t: float, pose: np.ndarray, twist: np.ndarray) -> None:
+    def _add_odometry(self, t: float, pose: np.ndarray, twist: np.ndarray) -> None:
         p, q, covariance = pose[:3].copy(), pose[3:7].copy(), pose[7:].reshape(6, 6)[:3, :3].copy()
         length = np.linalg.norm(q)
-        sound = length > 0.5 and (np.diag(covariance) >= 0.0).all()
+        valid = length > 0.5 and (np.diag(covariance) >= 0.0).all()
         near = np.abs(p).max() < FARTHEST and np.abs(twist[:3]).max() < FASTEST
-        if not (sound and near) or (self._rows and t < self._rows[-1][0] + CLOSEST):
+        if not (valid and near) or (self._rows and t < self._rows[-1][0] + CLOSEST):
             return
         q /= length
         self._rows.append((float(t), p, Rotation.from_quat(q).apply(twist[:3]), q, covariance))
@@ -168,7 +261,7 @@ class OverTopics:
     def _pose_of(
         self, t: float, p: np.ndarray, std: float, yaw: float
     ) -> PoseWithCovarianceStamped:
-        """PoseWithCovarianceStamped, see `set_pose`; a variance of 0 says that nobody knows."""
+        """Return the message of an initial pose. A variance of 0 means unknown."""
         message, known = PoseWithCovarianceStamped(), not math.isnan(yaw)
         message.header.stamp, message.header.frame_id = self._stamp(t), self._anchors.frame
         at, turn = message.pose.pose.position, message.pose.pose.orientation
@@ -184,13 +277,14 @@ class OverTopics:
 
     @property
     def pose(self) -> Pose | None:
-        """(t s, p (3,) m, v (3,) m/s, q (4,)) of the newest estimate, or None."""
+        """Return (t s, p (3,) m, v (3,) m/s, q (4,)) of the newest estimate, or None."""
         return self._rows[-1][:4] if self._rows else None
 
     @property
     def deviation(self) -> float:
-        """Largest standard deviation of a coordinate of the newest estimate, m; inf without one, or
-        where the filter says that it is lost.
+        """Return the largest standard deviation of a coordinate, m.
+
+        It is inf without an estimate, and unless the filter reports STATUS_RUNNING.
         """
         if (
             not self._rows
@@ -202,25 +296,23 @@ class OverTopics:
 
     @property
     def why(self) -> str:
-        """What keeps it from being flown by, in words, "" if nothing is said."""
+        """Return the reason for which the estimate cannot be used, or ""."""
         if self.status is None:
             return "nothing came on status: start ekf_node"
         return self.status.why if self.status.status != EstimatorStatus.STATUS_RUNNING else ""
 
     @property
     def odometry(self) -> Odometry:
-        """Odometry, all that came; of its covariance only that of the position, the rest 0."""
+        """Return all estimates. Only the position has a covariance."""
         if not self._rows:
-            return NOTHING
+            return NO_ODOMETRY
         t, p, v, q, covariance = map(np.array, zip(*self._rows))
         whole = np.zeros((len(t), 9, 9))
         whole[:, :3, :3] = covariance
-        return Odometry(
-            t, p, v, q, np.zeros(p.shape), np.zeros(p.shape), whole, np.zeros((len(t), 3, 3))
-        )
+        return odometry_of(t, p, v, q, whole)
 
     def _parts(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Seconds and nanoseconds of the stamps, (n,) each, of t (n,) s."""
+        """Return seconds and nanoseconds (n,) of the stamps t (n,) s."""
         assert self._begin is not None
         return np.divmod(self._begin + np.rint(t * 1e9).astype(np.int64), 10**9)
 
@@ -230,7 +322,7 @@ class OverTopics:
 
 
 class _Output:
-    """A stream of which only some fields are not 0. subscribers : how many hear it."""
+    """Publish a stream of messages with few nonzero fields."""
 
     def __init__(
         self,
@@ -246,11 +338,13 @@ class _Output:
 
     @property
     def subscribers(self) -> int:
+        """Return the number of subscribers."""
         return self._output.publisher.get_subscription_count()
 
     def publish(self, seconds: np.ndarray, nanoseconds: np.ndarray, part: Any) -> None:
-        """Publish the rows of a part of a stream, with stamps of these seconds and nanoseconds (n,)
-        each.
+        """Publish the rows of a part of a stream.
+
+        `seconds` and `nanoseconds` (n,) are its stamps.
         """
         content = self._content(part)
         if self._template is None:

@@ -1,7 +1,6 @@
-"""A rover that drives by the estimate: two driven wheels, what these say, and a controller that has
-nothing but the newest odometry.
+"""Drive a rover by its estimate: two driven wheels with encoders, and a path controller.
 
-The body's origin is the antenna, MAST above the floor.
+The origin of the body is the antenna, MAST above the floor.
 """
 
 from __future__ import annotations
@@ -15,13 +14,11 @@ from uwb_tdoa_bias.foundation.sensors import SENSORS
 
 from ..simulation.config import WHEELS_RATE
 from ..simulation.sensors import YAW_RATE_STD, slips
-from .loop import IMU_RATE
-from .mission import DONE, FLYING, LOST, REFUSED, WAITING, Rules, yaw_of
-from .path import Polyline, Waypoints
+from .mission import DONE, FLYING, LOST, REFUSED, WAITING, Polyline, Rules, Waypoints, yaw_of
 from .sensors import AidSensor, random
 from .simulator import Simulator
 from .trial import REST_AFTER, Trial
-from .vehicle import GRAVITY
+from .vehicle import GRAVITY, IMU_RATE
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.sensors.sensor import Stream
@@ -32,47 +29,50 @@ if TYPE_CHECKING:
     from .world import World
 
 MAST = 0.4  # m
-FILTER: dict[str, Any] = {
-    "planar": True,
-    "fixed_height": MAST,
-    "non_holonomic_std": 0.05,
-}  # parameters that it sets
-AIDS = ("velocity",)  # what it measures beside inertia and TDOAs
+# parameters of the filter of a rover
+FILTER: dict[str, Any] = {"planar": True, "fixed_height": MAST, "non_holonomic_std": 0.05}
+AIDS = ("velocity",)  # sensors besides the IMU and the radio
 TRACK = 0.4  # m between its wheels
-SCALE, UNEQUAL = 0.03, 0.003  # largest common error of the wheels' scales; deviation of each
-SLIP = 0.1  # share by which a wheel turns faster than the floor passes, at times
-LAG = 0.1  # s, of a wheel behind what is wanted
-HARDEST = 1.0  # m/s^2
-SLOWEST = 0.005  # m/s; a wheel that is to stand and turns slower stands
-WHEEL_STD = 0.02  # m/s, noise of what they say
+SCALE, UNEQUAL = 0.03, 0.003  # largest common scale error; standard deviation of each wheel
+SLIP = 0.1  # share by which a slipping wheel turns too fast
+LAG = 0.1  # s, time constant of a wheel
+MAX_ACCELERATION = 1.0  # m/s^2
+MIN_WHEEL_SPEED = 0.005  # m/s; a braking wheel stops below this speed
+WHEEL_STD = 0.02  # m/s, noise of the encoders
 BUMPER = 0.2  # m from its middle
-AHEAD = 0.4  # m, of the point of the path that it steers for
-TURN, FASTEST_TURN = 2.0, 1.2  # 1/s, turning rate by the direction to that point; rad/s
-PULL = 1.0  # 1/s, most of its speed by the distance to the end
+LOOK_AHEAD = 0.4  # m, distance of the target point on the path
+TURN, MAX_YAW_RATE = 2.0, 1.2  # 1/s, yaw rate per direction error; rad/s
+APPROACH_GAIN = 1.0  # 1/s, largest speed per distance to the end
 STOP = 0.06  # m from the end, where it stops
-WINDOW = 1.0  # m of the path in which it looks for where it is
-GIVE_UP = 30.0  # s for which it stands with an estimate that is lost
+WINDOW = 1.0  # m of the path in which the nearest point is searched
+LOST_TIMEOUT = 30.0  # s, longest stop with a lost estimate
 
 
 class Steering:
-    """What a controller wants: speed, m/s, and turning, rad/s."""
+    """Hold the wanted speed, m/s, and yaw rate, rad/s."""
 
     def __init__(self) -> None:
         self.stop()
 
     def stop(self) -> None:
-        """Stand."""
+        """Stand still."""
         self.speed = self.turning = 0.0
 
 
 class Wheels(AidSensor):
-    """Encoders of both wheels."""
+    """Simulate the encoders of both wheels."""
 
     rate, width = WHEELS_RATE, 2
 
 
 class RoverSimulator(Simulator):
-    """A rover for so many seconds, as Simulator. wheels (n, 2) : m/s, as the encoders see them."""
+    """Simulate a rover and its sensors for a given duration.
+
+    Attributes
+    ----------
+    wheels : numpy.ndarray
+        Speeds (n, 2) that the encoders measure, left and right, m/s.
+    """
 
     def __init__(self, world: World, seed: int, duration: float) -> None:
         super().__init__(world, seed, duration)
@@ -89,14 +89,14 @@ class RoverSimulator(Simulator):
         self.wheels = np.zeros((len(self.times), 2))
 
     def _move(self, controller: Steering, rows: slice) -> None:
-        """Drive the samples in `rows` as a Steering wants."""
+        """Drive the samples in `rows` with the outputs of a Steering."""
         half, dt, state = 0.5 * TRACK * controller.turning, 1.0 / IMU_RATE, self.state
         wanted = np.array([controller.speed - half, controller.speed + half])
         for i in range(rows.start, rows.stop):
             wheels = self.wheels[i - 1]
-            most = HARDEST * dt
+            most = MAX_ACCELERATION * dt
             wheels = wheels + np.clip((wanted - wheels) * dt / LAG, -most, most)
-            wheels[(wanted == 0.0) & (np.abs(wheels) < SLOWEST)] = 0.0
+            wheels[(wanted == 0.0) & (np.abs(wheels) < MIN_WHEEL_SPEED)] = 0.0
             before, after = self.wheels[i - 1] * self._per_turn[i - 1], wheels * self._per_turn[i]
             (speed, turning), (v, w) = _unicycle(0.5 * (before + after)), _unicycle(after)
             yaw = self.yaw + 0.5 * turning * dt
@@ -105,14 +105,14 @@ class RoverSimulator(Simulator):
             state[3:5] = v * math.cos(self.yaw), v * math.sin(self.yaw)
             state[8:10], state[12] = (math.sin(0.5 * self.yaw), math.cos(0.5 * self.yaw)), w
             ahead = (v - _unicycle(before)[0]) / dt
-            felt = np.array([0.0, 0.0, turning, ahead, speed * turning, GRAVITY])
-            felt += self._inertial.errors[i]
+            sample = np.array([0.0, 0.0, turning, ahead, speed * turning, GRAVITY])
+            sample += self._inertial.errors[i]
             if wheels.any():
-                felt[3:] += self._inertial.shaking[i]
-            self.wheels[i], self.states[i], self.samples[i] = wheels, state, felt
+                sample[3:] += self._inertial.shaking[i]
+            self.wheels[i], self.states[i], self.samples[i] = wheels, state, sample
             self.contact[i] = 2.0
 
-    def _felt(self, name: str, sensor: AidSensor, lately: slice) -> Stream:
+    def _aid_measured(self, name: str, sensor: AidSensor, lately: slice) -> Stream:
         new, _, _ = self._poses(name, sensor.t, lately)
         t = sensor.t[new]
         wheels = np.column_stack(
@@ -127,20 +127,31 @@ class RoverSimulator(Simulator):
 
 
 def _unicycle(wheels: Any) -> tuple[Any, Any]:
-    """Speed, m/s, and turning rate, rad/s, of wheels, left and right, m/s."""
+    """Return speed, m/s, and yaw rate, rad/s, of the wheel speeds, left and right, m/s."""
     left, right = wheels
     return 0.5 * (left + right), (right - left) / TRACK
 
 
 class Drive:
-    """One drive along a Polyline, decided by nothing but the estimate and its deviation. state,
-    started, ended, lost : as of Mission: it stands while it is lost; path : Polyline.
+    """Run one drive along a polyline.
+
+    The rover stands while its estimate is lost. State, started, ended and lost are those of Mission.
     """
 
     def __init__(
         self, path: Polyline, speed: float, rules: Rules | None = None, begin: float = 0.0
     ) -> None:
-        """speed : m/s; begin : s, when it was switched on."""
+        """Wait for the start.
+
+        Parameters
+        ----------
+        path : Polyline
+        speed : float
+            m/s.
+        rules : Rules, optional
+        begin : float
+            Time of switching on, s.
+        """
         self.path, self.rules, self.begin, self._speed = path, rules or Rules(), begin, speed
         self.state = WAITING
         self.started: float | None = None
@@ -150,8 +161,17 @@ class Drive:
         self._clock: list[tuple[float, float]] = []  # (s, m along the path) of each call
 
     def decide(self, t: float, pose: Pose | None, deviation: float, steering: Steering) -> None:
-        """Have a Steering want what is to be done at t, s. pose : as of an estimate, or None;
-        deviation : m.
+        """Set the wanted motion in `steering`.
+
+        Parameters
+        ----------
+        t : float
+            s.
+        pose : Pose or None
+            Newest estimate.
+        deviation : float
+            Its largest standard deviation of a coordinate, m.
+        steering : Steering
         """
         steering.stop()
         rules, good = self.rules, pose is not None and t - pose[0] <= self.rules.stale
@@ -167,14 +187,15 @@ class Drive:
         elif deviation <= rules.arm:
             self.state = FLYING
         if self.state == LOST:
-            if t - self._last_good > GIVE_UP:
+            if t - self._last_good > LOST_TIMEOUT:
                 self.state, self.ended = DONE, t
             return
         self._last_good = t
-        assert pose is not None  # or it would be lost
+        assert pose is not None  # without a pose the state is LOST
         self._steer(t, pose, steering)
 
     def _steer(self, t: float, pose: Pose, steering: Steering) -> None:
+        """Steer to a point ahead on the path (pure pursuit)."""
         p = pose[1][:2]
         before = self._clock[-1][1] if self._clock else 0.0
         along = float(self.path.nearest(p[None], before, before + WINDOW)[0])
@@ -183,34 +204,34 @@ class Drive:
         if left < STOP or (along >= self.path.length and left < 2.0 * STOP):
             self.state, self.ended = DONE, t
             return
-        target = self.path.at(np.array([along + AHEAD]))[0, :2]
+        target = self.path.at(np.array([along + LOOK_AHEAD]))[0, :2]
         x, y = target - p
         off = (math.atan2(y, x) - yaw_of(pose[3]) + math.pi) % (2.0 * math.pi) - math.pi
-        to_go = self.path.length - along + left if along < self.path.length - AHEAD else left
-        steering.speed = min(self._speed, PULL * to_go) * max(math.cos(off), 0.0)
-        steering.turning = min(max(TURN * off, -FASTEST_TURN), FASTEST_TURN)
+        to_go = self.path.length - along + left if along < self.path.length - LOOK_AHEAD else left
+        steering.speed = min(self._speed, APPROACH_GAIN * to_go) * max(math.cos(off), 0.0)
+        steering.turning = min(max(TURN * off, -MAX_YAW_RATE), MAX_YAW_RATE)
 
     @property
     def place(self) -> np.ndarray:
-        """(2,) m, where it is to stop."""
+        """Return the last place of the path (2,), m."""
         return self.path.end
 
     def wanted(self, t: np.ndarray) -> np.ndarray:
-        """The point of the path that it took for the nearest: (n, 1, 3) m, at t (n,) s."""
+        """Return the points of the path that were nearest (n, 1, 3), m, at t (n,) s."""
         if not self._clock:
             return np.full((len(t), 1, 3), np.nan)
         return self.path.at(np.interp(t, *np.transpose(self._clock)))[:, None]
 
 
 class RoverTrial(Trial):
-    """A Task with Waypoints under way."""
+    """Run a Task with Waypoints."""
 
     def __init__(
-        self, task: Task, source: EstimateSource | None = None, lasts: float | None = None
+        self, task: Task, source: EstimateSource | None = None, duration: float | None = None
     ) -> None:
         rules = task.rules
-        longest = rules.rest + rules.patience + 2.0 * task.path.duration + GIVE_UP + REST_AFTER
-        super().__init__(task, source, lasts or longest)
+        longest = rules.rest + rules.patience + 2.0 * task.path.duration + LOST_TIMEOUT + REST_AFTER
+        super().__init__(task, source, duration or longest)
 
     def _simulator(self, duration: float) -> RoverSimulator:
         return RoverSimulator(self.task.world, self.task.seed, duration)
@@ -219,15 +240,15 @@ class RoverTrial(Trial):
         return Steering()
 
     def _mission(self, path: Waypoints, rules: Rules) -> Any:
-        way = path.along(self.simulator.state[:2].copy(), MAST)
+        way = path.starting_at(self.simulator.state[:2].copy(), MAST)
         return Drive(way, path.speed, rules, self.simulator.now)
 
     def turn(self) -> None:
-        """One turn of the controller, as the drive under way decides; it stands without one."""
+        """Execute one turn of the controller."""
         self.controller.stop()
         if self.missions:
             drive: Any = self.missions[-1]
-            self._let_happen(drive)
+            self._schedule_faults(drive)
             source = self.source
             drive.decide(self.simulator.now, source.pose, source.deviation, self.controller)
         self._turn()
@@ -239,7 +260,7 @@ class RoverTrial(Trial):
 
 
 def drive(task: Task) -> TrialResult:
-    """TrialResult, of a Task with Waypoints."""
+    """Drive a Task with Waypoints and return the TrialResult."""
     trial = RoverTrial(task)
     trial.fly()
-    return trial.flown
+    return trial.result

@@ -1,5 +1,6 @@
-"""What radio, inertial sensor and the others of one flight say: all that does not depend on the
-path is drawn beforehand, by seed.
+"""Simulate radio, inertial sensor and further sensors of one flight.
+
+Errors that do not depend on the path are drawn in advance, by seed.
 """
 
 from __future__ import annotations
@@ -19,39 +20,55 @@ from uwb_tdoa_bias.foundation.sensors.sensor import RATE
 from uwb_tdoa_bias.foundation.sensors.velocity import LEAST_STD
 
 from ..simulation.tdoas import make_schedule, outliers, tag_link, tdoa_noise
-from .loop import IMU_RATE
+from .vehicle import IMU_RATE
 
 if TYPE_CHECKING:
     from .world import World
 
-NEAR_FLOOR = 0.5  # m, above which the floor does nothing
-LOW = 1.0  # m, below which an anchor is one of the low ones
+NEAR_FLOOR = 0.5  # m, largest height at which the floor acts
+LOW = 1.0  # m, largest height of a low anchor
 GUST_TIME = 1.0  # s, correlation time of gusts
 PERSON = 0.25, 1.8, 1.0  # m, radius and height of a person; m/s
 BLOCKED, BLOCK_TIME = (
     (0.2, 2.0),
     0.5,
-)  # m, by which what passes through a person is late, drawn anew each so many s
+)  # m, delay behind a person; s, between draws of it
 ALTITUDE_STD, VELOCITY_STD, RANGE_STD = (
     0.08,
     0.05,
     0.1,
-)  # m, m/s and m, noise of a barometer, a velocity and distances to anchors
+)  # noise of barometer, m, velocity, m/s, and distances, m
 NEVER = np.inf, np.inf
 
 
 def random(seed: int, part: str) -> np.random.Generator:
-    """The numpy Generator of the named part of flight `seed`."""
+    """Return the random generator of one named part of a flight."""
     return np.random.default_rng([seed, *part.encode()])
 
 
 class Radio:
-    """The TDOAs of one flight. t (n,) s; a, b (n,) rows of the anchors; silent : (begin, end) s, in
-    which none is heard; changed : s, from which on anchor `other` is silent or late.
+    """Simulate the TDOAs of one flight.
+
+    Attributes
+    ----------
+    t, a, b : numpy.ndarray
+        Stamps (n,), s, and rows of both anchors (n,).
+    silent : tuple
+        Begin and end of a gap, s.
+    changed, other
+        Time, s, from which anchor row `other` is silent or late.
     """
 
     def __init__(self, world: World, seed: int, duration: float) -> None:
-        """world : World; duration : s."""
+        """Draw schedule, noise, delays and outliers.
+
+        Parameters
+        ----------
+        world : World
+        seed : int
+        duration : float
+            s.
+        """
         anchors = world.anchors
         self.positions, n = anchors.positions, len(anchors)
         schedule = make_schedule(world.protocol, n, duration, random(seed, "schedule"), world.rate)
@@ -69,7 +86,7 @@ class Radio:
             schedule, np.full(n, world.noise / math.sqrt(2.0)), False, random(seed, "tdoa noise")
         )
         self._error += _outliers(world, len(self.t), random(seed, "outliers"))
-        # per anchor: constant delay; amplitude and phase of the bias over the bearing
+        # per anchor: constant delay; amplitude and phase of the bearing bias
         self.constants = np.stack(
             [
                 world.delay * rng.standard_normal(n),
@@ -90,20 +107,34 @@ class Radio:
         self._link = tag_link(seed) if world.antennas else None
         self._anchors, self._at_times = anchors, random(seed, "floor").random((len(self.t), 2))
         self._way = (
-            _walk(world, duration, random(seed, "person")) if world.person else np.empty((0, 2))
+            _person_path(world, duration, random(seed, "person"))
+            if world.person
+            else np.empty((0, 2))
         )
         self._blocked = random(seed, "blocked").uniform(
             *BLOCKED, (int(duration / BLOCK_TIME) + 1, n)
         )
 
-    def happens(self, silent: float, changed: float) -> None:
-        """Say when its world's silence begins, and from when on its world's change holds, s."""
+    def schedule_faults(self, silent: float, changed: float) -> None:
+        """Set the begin of the gap and of the anchor change.
+
+        Parameters
+        ----------
+        silent, changed : float
+            s.
+        """
         self.silent = (silent, silent + self._world.silence[1]) if self._world.silence else NEVER
         self.changed = changed
 
     def measured(self, rows: slice, p: np.ndarray, q: np.ndarray) -> np.ndarray:
-        """d (k,) m, NaN where nothing was heard, of the TDOAs in a slice of rows, taken by a tag at
-        p (k, 3) m with q (k, 4).
+        """Return TDOAs (k,), m, with NaN where no TDOA is received.
+
+        Parameters
+        ----------
+        rows : slice
+            Rows of `t`.
+        p, q : numpy.ndarray
+            Tag positions (k, 3), m, and attitudes (k, 4), x y z w.
         """
         t, a, b, d = self.t[rows], self.a[rows], self.b[rows], np.empty(len(p))
         _measure(p, a, b, self.positions, self.constants, d)
@@ -120,18 +151,20 @@ class Radio:
             late = self._blocked[(t / BLOCK_TIME).astype(int)]
             person = self._way[(t * IMU_RATE).astype(int)]
             for anchor, sign in ((b, 1.0), (a, -1.0)):
-                through = _passes(p, self.positions[anchor], person)
+                through = _blocked(p, self.positions[anchor], person)
                 d += sign * np.where(through, late[np.arange(len(t)), anchor], 0.0)
         mine = (t >= self.changed) & ((a == self.other) | (b == self.other))
         if self._world.change == "late":
-            d += np.where(mine, np.where(b == self.other, 1.0, -1.0) * self._world.lateness, 0.0)
+            d += np.where(
+                mine, np.where(b == self.other, 1.0, -1.0) * self._world.changed_delay, 0.0
+            )
         elif self._world.change == "silent":
             d[mine] = np.nan
         d[(t >= self.silent[0]) & (t < self.silent[1])] = np.nan
         return d
 
     def _near_floor(self, rows: slice, p: np.ndarray) -> np.ndarray:
-        """What the floor adds, (k,) m: an anchor is late or not, as often as FloorMultipath says."""
+        """Return the error (k,), m, near the floor. Each anchor is late with the probability of FloorMultipath."""
         t, a, b = self.t[rows], self.a[rows], self.b[rows]
         samples, both = (
             Samples(t, a, b, p, np.full((len(p), 4), np.nan), self._anchors),
@@ -153,15 +186,16 @@ def _measure(
     constants: np.ndarray,
     out: np.ndarray,
 ) -> None:
-    """Geometry and what is late at each of two anchors, (k,) m. constants (n, 3): see Radio."""
+    """Write TDOAs (k,), m, from geometry, constant delays and bearing biases `constants` (n, 3)."""
     for i in range(len(p)):
-        out[i] = _heard(p[i], positions[b[i]], constants[b[i]]) - _heard(
+        out[i] = _apparent_distance(p[i], positions[b[i]], constants[b[i]]) - _apparent_distance(
             p[i], positions[a[i]], constants[a[i]]
         )
 
 
 @compiled
-def _heard(p: np.ndarray, anchor: np.ndarray, late: np.ndarray) -> float:
+def _apparent_distance(p: np.ndarray, anchor: np.ndarray, late: np.ndarray) -> float:
+    """Return the distance to an anchor, m, with its delay and its bearing bias."""
     x, y, z = p[0] - anchor[0], p[1] - anchor[1], p[2] - anchor[2]
     return (
         math.sqrt(x * x + y * y + z * z)
@@ -171,7 +205,7 @@ def _heard(p: np.ndarray, anchor: np.ndarray, late: np.ndarray) -> float:
 
 
 def _outliers(world: World, n: int, rng: np.random.Generator) -> np.ndarray:
-    """(n,) m, zero but for the given share."""
+    """Return the outliers (n,), m, and zero elsewhere."""
     if not world.outlier_size:
         return outliers(n, world.outlier_share, rng)
     return np.where(
@@ -181,9 +215,10 @@ def _outliers(world: World, n: int, rng: np.random.Generator) -> np.ndarray:
     )
 
 
-def _walk(world: World, duration: float, rng: np.random.Generator) -> np.ndarray:
-    """Where somebody is who walks from one place at a wall to the next: (n, 2) m, at each sample of
-    the inertial sensor.
+def _person_path(world: World, duration: float, rng: np.random.Generator) -> np.ndarray:
+    """Return the path (n, 2), m, of a person who walks from wall to wall.
+
+    There is one row per inertial sample.
     """
     half, stamps = 0.5 * np.array(world.size[:2]), [0.0]
     places: list[np.ndarray] = []
@@ -198,10 +233,8 @@ def _walk(world: World, duration: float, rng: np.random.Generator) -> np.ndarray
     return np.stack([np.interp(t, stamps, column) for column in np.transpose(places)], axis=1)
 
 
-def _passes(p: np.ndarray, anchor: np.ndarray, person: np.ndarray) -> np.ndarray:
-    """Whether the ways from p (k, 3) to anchors (k, 3) lead through a person at (k, 2), all m: (k,)
-    bool.
-    """
+def _blocked(p: np.ndarray, anchor: np.ndarray, person: np.ndarray) -> np.ndarray:
+    """Return whether a person at (k, 2) blocks the signal from an anchor (k, 3) to p (k, 3): (k,) bool."""
     way = anchor - p
     share = np.sum((person - p[:, :2]) * way[:, :2], axis=1) / np.maximum(
         np.sum(way[:, :2] ** 2, axis=1), 1e-9
@@ -213,11 +246,18 @@ def _passes(p: np.ndarray, anchor: np.ndarray, person: np.ndarray) -> np.ndarray
 
 
 class InertialErrors:
-    """Errors of the inertial sensor at each of its samples: errors (n, 6) rad/s and m/s^2; shaking
-    (n, 3) m/s^2, of turning rotors.
+    """Draw the errors of the inertial sensor.
+
+    Attributes
+    ----------
+    errors : numpy.ndarray
+        Errors (n, 6) of rates, rad/s, and specific force, m/s^2.
+    shaking : numpy.ndarray
+        Vibration (n, 3), m/s^2, while rotors turn.
     """
 
     def __init__(self, world: World, seed: int, duration: float) -> None:
+        """Draw biases, their random walks, noise and vibration for `duration`, s."""
         of, n, dt = world.imu, int(duration * IMU_RATE) + 1, 1.0 / IMU_RATE
         self.errors = np.empty((n, 6))
         for columns, name, start, walk, noise in (
@@ -242,7 +282,10 @@ class InertialErrors:
 
 
 def gusts(world: World, seed: int, duration: float) -> np.ndarray:
-    """Wind at each sample of the inertial sensor, (n, 3) m/s: exponentially correlated."""
+    """Return the wind (n, 3), m/s, at each inertial sample.
+
+    The wind is exponentially correlated over GUST_TIME.
+    """
     from scipy.signal import lfilter  # takes a second to import
 
     n = int(duration * IMU_RATE) + 1
@@ -253,30 +296,45 @@ def gusts(world: World, seed: int, duration: float) -> np.ndarray:
 
 
 class AidSensor:
-    """Another sensor of one flight. t (n,) s."""
+    """Simulate a further sensor of one flight.
+
+    Attributes
+    ----------
+    t : numpy.ndarray
+        Stamps (n,), s.
+    """
 
     rate, width = RATE, 1  # Hz; numbers per measurement
 
     def __init__(self, world: World, seed: int, duration: float) -> None:
+        """Draw stamps and noise for `duration`, s."""
         self.world, rate = world, self.rate_in(world)
         self.t = np.arange(0.5, duration * rate) / rate
         self.noise = random(seed, type(self).__name__).standard_normal((len(self.t), self.width))
 
     def rate_in(self, world: World) -> float:
-        """Hz."""
+        """Return the rate in a world, Hz."""
         return self.rate
 
     def measured(
         self, rows: slice, p: np.ndarray, q: np.ndarray, v: np.ndarray, height: np.ndarray
     ) -> tuple[np.ndarray, ...]:
-        """Columns of the measurements in a slice of rows, of a body at p (k, 3) m, q (k, 4), with v
-        (k, 3) m/s in its own frame, `height` (k,) m above what is below it: tuple.
+        """Return the columns of the measurements in a slice of rows.
+
+        Parameters
+        ----------
+        rows : slice
+            Rows of `t`.
+        p, q, v : numpy.ndarray
+            Position (k, 3) m, attitude (k, 4) x y z w, and velocity (k, 3) m/s in the body frame.
+        height : numpy.ndarray
+            Height above the ground or table (k,), m.
         """
         raise NotImplementedError
 
 
 class RangeFinder(AidSensor):
-    """The distance to what is below, along the body's -z, m; inf where it sees nothing."""
+    """Simulate a range finder along -z of the body, m, with inf beyond its range."""
 
     def rate_in(self, world: World) -> float:
         return world.height_rate
@@ -292,7 +350,7 @@ class RangeFinder(AidSensor):
 
 
 class Barometer(AidSensor):
-    """The pressure of the air, Pa."""
+    """Simulate a barometer, Pa."""
 
     def measured(
         self, rows: slice, p: np.ndarray, q: np.ndarray, v: np.ndarray, height: np.ndarray
@@ -301,7 +359,7 @@ class Barometer(AidSensor):
 
 
 class Speedometer(AidSensor):
-    """The velocity in the body frame, m/s, and its standard deviation."""
+    """Simulate a velocity sensor: velocity in the body frame and its standard deviation, m/s."""
 
     width = 3
 
@@ -312,9 +370,9 @@ class Speedometer(AidSensor):
 
 
 class TwoWayRanging(AidSensor):
-    """Distances to the anchors, each in its turn: ids, m, and a variance of 0, as nobody knows it.
+    """Simulate distances to the anchors in turn: ids, m, and an unknown variance of 0.
 
-    Nothing blocks them.
+    No obstacle blocks them.
     """
 
     rate = SENSORS["range"].rate

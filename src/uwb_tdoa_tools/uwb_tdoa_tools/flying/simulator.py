@@ -1,40 +1,161 @@
-"""A vehicle in a world, turn by turn: what it does, and what its sensors say of that."""
+"""Move a vehicle turn by turn, simulate its sensors, and delay their messages."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+import math
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from uwb_tdoa_bias.foundation.compiled import compiled
 from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
 from uwb_tdoa_bias.foundation.sensors import SENSORS
-from uwb_tdoa_ekf.results import rows_of
+from uwb_tdoa_ekf.results import concatenated, rows_of
 
-from .loop import IMU_RATE, interval, poses_at
+from .controller import inner
 from .sensors import AIDS, InertialErrors, Radio, gusts, random
-from .vehicle import ATTITUDE, GRAVITY, POSITION, STATE, VELOCITY, Vehicle, ground_at
+from .vehicle import (
+    ATTITUDE,
+    GRAVITY,
+    IMU_RATE,
+    POSITION,
+    STATE,
+    STEP,
+    VELOCITY,
+    Vehicle,
+    ground_at,
+    specific_force,
+    step,
+)
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.sensors.sensor import Stream
 
     from .sensors import AidSensor
+    from .vehicle import Record
     from .world import World
 
-TICK = 4  # samples of the inertial sensor, from one turn of the controller to the next
+
+STEPS = round(1.0 / (IMU_RATE * STEP))  # of the integration, per sample
+TURNING = 50.0  # rad/s, rotor speed above which the vehicle vibrates
+
+
+@compiled
+def interval(
+    state: np.ndarray,
+    gyro: np.ndarray,
+    wanted: tuple[float, np.ndarray],
+    controller: tuple[Record, Record],
+    vehicle: Record,
+    disturbances: tuple[np.ndarray, np.ndarray, np.ndarray],
+    measured: tuple[np.ndarray, np.ndarray, np.ndarray],
+) -> None:
+    """Fly for n samples of the inertial sensor.
+
+    Parameters
+    ----------
+    state : numpy.ndarray
+        State (17,), updated in place.
+    gyro : numpy.ndarray
+        The last two measured body rates (2, 3), rad/s, newest first, updated in place.
+    wanted : tuple
+        Thrust, N, and body rates (3,), rad/s.
+    controller : tuple
+        Records of the gains and of the vehicle that the controller assumes.
+    vehicle : Record
+        Record of the true vehicle.
+    disturbances : tuple
+        Wind (n, 3) m/s. Sensor errors (n, 6) of rates, rad/s, and specific force, m/s^2. Vibration
+        (n, 3) m/s^2 while rotors turn.
+    measured : tuple
+        Outputs: true states (n, 17); mean rates and specific force (n, 6) since the sample before;
+        number of feet on the ground (n,).
+    """
+    thrust, rates = wanted[0], wanted[1]
+    gains, known = controller[0], controller[1]
+    wind, errors, shaking = disturbances[0], disturbances[1], disturbances[2]
+    truth, samples, contact = measured[0], measured[1], measured[2]
+    dt = STEP * STEPS
+    speeds, scratch, force, earlier = (
+        np.empty(4),
+        np.empty((2, STATE)),
+        np.empty(3),
+        np.empty(STATE),
+    )
+    for i in range(len(truth)):
+        inner(thrust, rates, gyro, dt, gains, known, speeds)
+        earlier[:] = state
+        feet = 0
+        turn = np.zeros(3)
+        for _ in range(STEPS):
+            feet = max(feet, step(state, speeds, wind[i], STEP, vehicle, scratch))
+            for k in range(3):
+                turn[k] += state[10 + k] / STEPS
+        specific_force(earlier, state, dt, force)
+        turning = state[13] > TURNING
+        for k in range(3):
+            samples[i, k] = turn[k] + errors[i, k]
+            samples[i, 3 + k] = force[k] + errors[i, 3 + k] + (shaking[i, k] if turning else 0.0)
+        gyro[1] = gyro[0]
+        gyro[0] = samples[i, :3]
+        truth[i] = state
+        contact[i] = feet
+
+
+@compiled
+def poses_at(
+    t: np.ndarray, times: np.ndarray, states: np.ndarray, p: np.ndarray, q: np.ndarray
+) -> None:
+    """Interpolate poses between true states.
+
+    Parameters
+    ----------
+    t : numpy.ndarray
+        Stamps (n,), s.
+    times, states : numpy.ndarray
+        Stamps (m,), s, and states (m, 17).
+    p, q : numpy.ndarray
+        Positions (n, 3), m, and attitudes (n, 4), x y z w. They are written.
+    """
+    j = 0
+    for i in range(len(t)):
+        while j < len(times) - 2 and times[j + 1] < t[i]:
+            j += 1
+        share = (t[i] - times[j]) / (times[j + 1] - times[j])
+        for k in range(3):
+            p[i, k] = states[j, k] + share * (states[j + 1, k] - states[j, k])
+        length = 0.0
+        for k in range(4):
+            q[i, k] = states[j, 6 + k] + share * (states[j + 1, 6 + k] - states[j, 6 + k])
+            length += q[i, k] ** 2
+        for k in range(4):
+            q[i, k] /= math.sqrt(length)
+
+
+pass
+
+
+TICK = 4  # inertial samples per turn of the controller
 DT = TICK / IMU_RATE  # s
-STARTS = 0.5  # m from the middle of the hall, along each axis, to the middle of where it flies
-WEIGHED = 0.05  # largest relative error of the mass that its controller believes
+START_SPREAD = 0.5  # m, largest offset of the path from the middle of the hall along each axis
+MASS_ERROR = 0.05  # largest relative error of the mass in the controller
 TABLE_RADIUS = 0.4  # m
-LIFTED = 0.5  # m, by which hands lift it
-RECENT = round(0.3 * IMU_RATE)  # samples of the truth that effects see
+CARRY_HEIGHT = 0.5  # m, height at which it is carried
+RECENT = round(0.3 * IMU_RATE)  # samples of the truth that effects use
 
 
 @dataclass(frozen=True)
 class SensorReadings:
-    """What came in one turn. imu : Imu; tdoa : Tdoas; aids : {name: Stream}, of those that the
-    world has.
+    """Hold the sensor samples of one turn.
+
+    Parameters
+    ----------
+    imu : Imu
+    tdoa : Tdoas
+    aids : dict of str to Stream
+        Streams of the other sensors of the world, by name.
     """
 
     imu: Imu
@@ -43,22 +164,38 @@ class SensorReadings:
 
     @property
     def streams(self) -> dict[str, Any]:
-        """{name: what came of it}, of all."""
+        """Return all streams by name."""
         return {"imu": self.imu, "tdoa": self.tdoa, **self.aids}
 
 
 class Simulator:
-    """One vehicle for so many seconds. state (17,), as of `vehicle`; vehicle : the true Vehicle;
-    believed : the one that its controller knows; times (n,) s, states (n, 17), contact (n,) number
-    of feet on the ground: at each sample of the inertial sensor, up to `done`.
+    """Simulate one quadrotor and its sensors for a given duration.
+
+    Attributes
+    ----------
+    state : numpy.ndarray
+        True state (17,), see `vehicle`.
+    vehicle, nominal : Vehicle
+        The true vehicle, and the vehicle that its controller assumes.
+    times, states, contact : numpy.ndarray
+        Stamps (n,) s, states (n, 17) and number of feet on the ground (n,) at each inertial sample.
+        Rows up to `done` are valid.
     """
 
     def __init__(self, world: World, seed: int, duration: float, radius: float = 0.0) -> None:
-        """world : World; duration : s; radius : m, of the circle whose point nearest to +x it
-        starts from.
+        """Draw the start, the errors and the disturbances.
+
+        Parameters
+        ----------
+        world : World
+        seed : int
+        duration : float
+            s.
+        radius : float
+            Radius of the circle whose point nearest to +x is the start, m.
         """
         self.world, rng = world, random(seed, "place")
-        middle, yaw = rng.uniform(-STARTS, STARTS, 2), rng.uniform(-np.pi, np.pi)
+        middle, yaw = rng.uniform(-START_SPREAD, START_SPREAD, 2), rng.uniform(-np.pi, np.pi)
         mass = rng.uniform(*world.mass)
         x, y = middle[0] + radius, middle[1]
         table = (
@@ -67,9 +204,9 @@ class Simulator:
             else {}
         )
         self.vehicle = Vehicle(mass=mass, **table)
-        self.believed = Vehicle(mass=mass * (1.0 + rng.uniform(-WEIGHED, WEIGHED)))
+        self.nominal = Vehicle(mass=mass * (1.0 + rng.uniform(-MASS_ERROR, MASS_ERROR)))
         self.yaw, self.state = yaw, self.vehicle.at_rest(x, y, yaw)
-        self._numbers, self._known = self.vehicle.numbers(), self.believed.numbers()
+        self._record, self._nominal_record = self.vehicle.record(), self.nominal.record()
         self.radio, self._inertial = (
             Radio(world, seed, duration),
             InertialErrors(world, seed, duration),
@@ -84,40 +221,47 @@ class Simulator:
         )
         self.samples = np.zeros((n, 6))
         self.done, self.states[0], self._gyro = 0, self.state, np.zeros((2, 3))
-        self._hands: tuple[np.ndarray, float, float, np.ndarray] | None = (
-            None  # state and s at first, s at last, way
+        self._carrying: tuple[np.ndarray, float, float, np.ndarray] | None = (
+            None  # state and time at the start, time at the end, path
         )
         self._heard = dict.fromkeys(("tdoa", *world.aids), 0)
         self._first: tuple[Tdoas, np.ndarray] | None = (
-            None  # what was heard first, and the state then
+            None  # first TDOAs, and the state at that time
         )
 
     @property
     def now(self) -> float:
-        """s"""
+        """Return the time since switching on, s."""
         return self.times[self.done]
 
     @property
     def over(self) -> bool:
-        """True when there is no time left."""
+        """Return whether the duration is used up."""
         return self.done + TICK >= len(self.times)
 
     @property
     def ground(self) -> float:
-        """Height of what is below it, m."""
-        return ground_at(self._numbers, self.state[0], self.state[1])
+        """Return the height of the ground or table below the vehicle, m."""
+        return ground_at(self._record, self.state[0], self.state[1])
 
     def advance(self, controller: Any) -> SensorReadings:
-        """Move for one turn as a controller of this vehicle wants, or be carried on by hands.
+        """Move for one turn and return the sensor samples.
 
-        Returns SensorReadings.
+        Parameters
+        ----------
+        controller : Controller or Steering
+            Controller of this vehicle.
+
+        Returns
+        -------
+        SensorReadings
         """
         k = self.done
         rows, lately = slice(k + 1, k + TICK + 1), slice(k, k + TICK + 1)
-        if self._hands is None:
+        if self._carrying is None:
             self._move(controller, rows)
         else:
-            self._be_carried(rows)
+            self._carry(rows)
         self.done += TICK
         imu = Imu(self.times[rows], self.samples[rows, :3], self.samples[rows, 3:])
         new, p, q = self._poses("tdoa", self.radio.t, lately)
@@ -127,30 +271,41 @@ class Simulator:
         tdoa = Tdoas(
             radio.t[new][heard], ids[radio.a[new][heard]], ids[radio.b[new][heard]], d[heard]
         )
-        aids = {name: self._felt(name, sensor, lately) for name, sensor in self._aids.items()}
-        return self._disturbed(SensorReadings(imu, tdoa, aids))
+        aids = {
+            name: self._aid_measured(name, sensor, lately) for name, sensor in self._aids.items()
+        }
+        return self._with_effects(SensorReadings(imu, tdoa, aids))
 
     def _move(self, controller: Any, rows: slice) -> None:
-        """Fly the samples in `rows` by what a Controller wants."""
+        """Fly the samples in `rows` with the outputs of a Controller."""
         interval(
             self.state,
             self._gyro,
             (controller.thrust, controller.rates),
-            (controller.numbers, self._known),
-            self._numbers,
+            (controller.record, self._nominal_record),
+            self._record,
             (self._wind[rows], self._inertial.errors[rows], self._inertial.shaking[rows]),
             (self.states[rows], self.samples[rows], self.contact[rows]),
         )
 
-    def lift(self, by: np.ndarray, seconds: float) -> None:
-        """Be carried by (2,) m, lifted and put down, within so many s, from now on."""
-        begin, end = self.state.copy(), self.now + seconds
-        way = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, LIFTED], [*by, LIFTED], [*by, 0.0]])
-        self._hands = begin, self.now, end, way
+    def carry(self, by: np.ndarray, seconds: float) -> None:
+        """Lift the vehicle, move it and put it down, from now on.
 
-    def _be_carried(self, rows: slice) -> None:
-        assert self._hands is not None
-        begin, since, until, way = self._hands
+        Parameters
+        ----------
+        by : numpy.ndarray
+            Displacement (2,), m.
+        seconds : float
+            Duration, s.
+        """
+        begin, end = self.state.copy(), self.now + seconds
+        way = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, CARRY_HEIGHT], [*by, CARRY_HEIGHT], [*by, 0.0]])
+        self._carrying = begin, self.now, end, way
+
+    def _carry(self, rows: slice) -> None:
+        """Move along the path of the hands, with the rotors off."""
+        assert self._carrying is not None
+        begin, since, until, way = self._carrying
         t, h = self.times[rows], 0.5 / IMU_RATE
         at = [
             begin[POSITION] + _along(way, (t + shift - since) / (until - since))
@@ -166,14 +321,15 @@ class Simulator:
         self.state[:] = states[-1]
         self._gyro[:] = self.samples[rows.stop - 1, :3]
         if t[-1] >= until:
-            self._hands = None
+            self._carrying = None
             self.state[VELOCITY] = 0.0
 
     def _poses(
         self, stream: str, t: np.ndarray, lately: slice
     ) -> tuple[slice, np.ndarray, np.ndarray]:
-        """(slice, p (k, 3) m, q (k, 4)): what of a stream with stamps t (n,) s is new, and the
-        poses then.
+        """Return the new rows of a stream with stamps t (n,) s, and their poses.
+
+        The result is (slice, p (k, 3) m, q (k, 4)).
         """
         first = self._heard[stream]
         new = slice(first, int(np.searchsorted(t, self.now, side="right")))
@@ -182,7 +338,8 @@ class Simulator:
         self._heard[stream] = new.stop
         return new, p, q
 
-    def _felt(self, name: str, sensor: AidSensor, lately: slice) -> Stream:
+    def _aid_measured(self, name: str, sensor: AidSensor, lately: slice) -> Stream:
+        """Return the new measurements of one sensor."""
         new, p, q = self._poses(name, sensor.t, lately)
         v = np.broadcast_to(self.state[VELOCITY], p.shape)
         inside = Rotation.from_quat(q).inv().apply(v) if len(q) else v
@@ -190,13 +347,13 @@ class Simulator:
             sensor.t[new], *sensor.measured(new, p, q, inside, p[:, 2] - self.ground)
         )
 
-    def _disturbed(self, measured: SensorReadings) -> SensorReadings:
-        """SensorReadings, with the world's effects in it, put there as `inject` does."""
+    def _with_effects(self, measured: SensorReadings) -> SensorReadings:
+        """Return the samples with the effects of the world added by `Effect.inject`."""
         if not len(self.world.effects) or not len(measured.tdoa):
             return measured
         tdoa = measured.tdoa
         self._first = self._first if self._first is not None else (tdoa, self.states[0])
-        first, at = self._first  # of the flight: times count from it
+        first, at = self._first  # effects count time from the first TDOA
         columns = (
             np.concatenate([getattr(first, name)[:1], getattr(tdoa, name)])
             for name in ("t", "a", "b", "d")
@@ -211,7 +368,7 @@ class Simulator:
         flight = Flight("turn", self.world.anchors, Tdoas(*columns), measured.imu, truth, **aids)
         for effect in self.world.effects.effects:
             flight = effect.inject(flight, self._rng)
-        assert flight.imu is not None  # as no effect takes it away
+        assert flight.imu is not None  # no effect removes it
         aids = {name: getattr(flight, name) for name in measured.aids}
         return replace(
             measured, tdoa=rows_of(flight.tdoa, slice(1, None)), imu=flight.imu, aids=aids
@@ -219,10 +376,62 @@ class Simulator:
 
 
 def _along(way: np.ndarray, share: np.ndarray) -> np.ndarray:
-    """(n, 3) m, along places (m, 3), smoothly from each to the next, at shares (n,) of the whole
-    time.
+    """Return places (n, 3), m, on a smooth motion through `way` (m, 3).
+
+    `share` (n,) is the share of the whole duration.
     """
     part = np.clip(share, 0.0, 1.0) * (len(way) - 1)
     k = np.minimum(part.astype(int), len(way) - 2)
     x = (part - k)[:, None]
     return way[k] + x**3 * (10.0 - 15.0 * x + 6.0 * x**2) * (way[k + 1] - way[k])
+
+
+pass
+
+
+class Transport:
+    """Delay sensor messages on their way to the estimator.
+
+    Messages of one stream keep their order.
+    """
+
+    def __init__(self, latency: float, jitter: float, rng: np.random.Generator) -> None:
+        """Set the delays.
+
+        Parameters
+        ----------
+        latency : float
+            Delay of every message, s.
+        jitter : float
+            Mean of an additional exponential delay, s.
+        rng : numpy.random.Generator
+        """
+        self._latency, self._jitter, self._rng = latency, jitter, rng
+        # by stream: (waiting rows, their arrivals (n,) s, the last arrival)
+        self._waiting: dict[str, tuple[Any, np.ndarray, float]] = {}
+
+    def arrived(self, measured: SensorReadings, now: float) -> SensorReadings:
+        """Add new samples and return the samples that have arrived by `now`, s."""
+        if not self._latency and not self._jitter:
+            return measured
+        parts = {stream: self._due(stream, part, now) for stream, part in measured.streams.items()}
+        return SensorReadings(parts.pop("imu"), parts.pop("tdoa"), parts)
+
+    def _due(self, stream: str, part: Any, now: float) -> Any:
+        """Return the rows of one stream that have arrived."""
+        held, arrival, last = self._waiting.get(stream, (None, np.empty(0), 0.0))
+        delay = (
+            self._latency + self._rng.exponential(self._jitter, len(part))
+            if self._jitter
+            else np.full(len(part), self._latency)
+        )
+        came = np.maximum.accumulate(np.maximum(part.t + delay, last))
+        part = part if held is None else concatenated([held, part])
+        arrival = np.concatenate([arrival, came])
+        due = int(np.searchsorted(arrival, now, side="right"))
+        self._waiting[stream] = (
+            rows_of(part, slice(due, None)),
+            arrival[due:],
+            came[-1] if len(came) else last,
+        )
+        return rows_of(part, slice(0, due))

@@ -1,5 +1,6 @@
-"""One flight in lockstep: the same task gives the same flight, whatever the computer does beside
-it.
+"""Fly one task in lockstep, without ROS.
+
+The same task gives the same flight on any computer.
 """
 
 from __future__ import annotations
@@ -16,51 +17,58 @@ from uwb_tdoa_bias.foundation.flight import Flight, Truth
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.results import Odometry, concatenated
 
-from .controller import FELT, Controller, Gains, turned
-from .estimates import OurFilter, TheirFilter
-from .loop import IMU_RATE
-from .mission import DONE, REFUSED, Mission, Rules
-from .path import Circles, Waypoints
+from .controller import SUPPORT_TIME, Controller, rotate_attitude
+from .estimates import OwnFilter, PeerFilter
+from .mission import DONE, REFUSED, Circles, Mission, Rules, Waypoints
 from .sensors import random
-from .simulator import DT, Simulator
-from .transport import Transport
-from .vehicle import ATTITUDE, POSITION
+from .simulator import DT, Simulator, Transport
+from .vehicle import ATTITUDE, IMU_RATE, POSITION
 from .world import World
 
 if TYPE_CHECKING:
     from .estimates import EstimateSource
-    from .mission import Route
+    from .mission import Plan
     from .simulator import SensorReadings
 
-REST_AFTER = 3.0  # s of the recording after the rotors have stopped
-PAUSE, CARRIED, CARRY_TIME = (
-    60.0,
-    2.0,
-    6.0,
-)  # s at rest between two flights, m and s by which it is carried then
-OUTSIDE = 0.5  # m beyond the hall, where a flight ends
+REST_AFTER = 3.0  # s, recording after the rotors have stopped
+# s at rest between two flights, then distance, m, and duration, s, of carrying
+PAUSE, CARRIED, CARRY_TIME = 60.0, 2.0, 6.0
+OUTSIDE = 0.5  # m beyond the walls, end of a flight
 VEHICLES = "quadrotor", "rover"
-TIPPED = math.radians(75.0)  # tilt of a vehicle that touches something, and does not get up again
-GIVEN_AT, GIVEN_STD = (
-    0.3,
-    0.1,
-)  # s after switching on; m and rad, standard deviation of the place and yaw that are given
+TIPPED = math.radians(75.0)  # tilt on the ground from which it cannot recover
+# s after switching on, and standard deviation, m and rad, of the given place and yaw
+GIVEN_AT, GIVEN_STD = 0.3, 0.1
 
 
 @dataclass(frozen=True)
 class Task:
-    """One flight. world : World; seed : of all that is random; told : "place" or "nothing"; yaw :
-    "known", to 0.1 rad, or "unknown";
-    config : FilterConfig; effects : EffectSet, and model : path of a bias network, to correct what
-        is measured with, or None; again : fly
-    twice, carried by hand in between;
-    peer : path of a library to fly by instead of our filter, always with a known yaw; path, rules,
-        gains : of the vehicle, a rover where the path is of Waypoints.
+    """Describe one flight.
+
+    Parameters
+    ----------
+    world : World
+    seed : int
+        Seed of all random numbers.
+    given : str
+        "place" or "nothing": information at the start.
+    yaw : str
+        "known", to 0.1 rad, or "unknown".
+    config : FilterConfig
+    effects : EffectSet, optional
+    model : str, optional
+        Path of a bias network. Both correct the measurements.
+    again : bool
+        Fly twice. The vehicle is carried by hand in between.
+    peer : str, optional
+        Path of a library to fly by instead of the own filter. Its yaw is always known.
+    path : Circles or Waypoints
+        Waypoints make the vehicle a rover.
+    rules : Rules
     """
 
     world: World
     seed: int = 0
-    told: str = "nothing"
+    given: str = "nothing"
     yaw: str = "known"
     config: FilterConfig = field(default_factory=FilterConfig)
     effects: EffectSet | None = None
@@ -69,20 +77,32 @@ class Task:
     peer: str | None = None
     path: Circles | Waypoints = Circles()
     rules: Rules = Rules()
-    gains: Gains = Gains()
 
     @property
     def vehicle(self) -> str:
-        """One of VEHICLES."""
+        """Return "quadrotor" or "rover"."""
         return "rover" if isinstance(self.path, Waypoints) else "quadrotor"
 
 
 @dataclass(frozen=True)
 class TrialResult:
-    """What became of it. flight : Flight, all that arrived, its truth at every sample of the
-    inertial sensor; states (n, 17) and contact (n,), number of feet on the ground, beside that;
-    odometry : Odometry, all that came out; missions : [Mission], one for each take-off, or
-    [rover.Drive]; crash : what ended it, text, or "".
+    """Hold the outcome of a flight.
+
+    Parameters
+    ----------
+    task : Task
+    flight : Flight
+        All samples that arrived, with the true pose at every inertial sample.
+    states : numpy.ndarray
+        True states (n, 17) at the stamps of the truth.
+    contact : numpy.ndarray
+        Number of feet on the ground (n,).
+    odometry : Odometry
+        All estimates.
+    missions : list of Mission or Drive
+        One per start.
+    crash : str
+        Reason for which the flight ended early, or "".
     """
 
     task: Task
@@ -95,19 +115,36 @@ class TrialResult:
 
 
 class Trial:
-    """A Task under way. simulator : Simulator; source : who tells where it is; missions :
-    [Mission], the last one under way; crash : as of TrialResult.
+    """Run a Task turn by turn.
+
+    Attributes
+    ----------
+    simulator : Simulator
+    source : EstimateSource
+    missions : list of Mission or Drive
+        The last one is active.
+    crash : str
+        Reason for which the flight ended early, or "".
     """
 
     def __init__(
-        self, task: Task, source: EstimateSource | None = None, lasts: float | None = None
+        self, task: Task, source: EstimateSource | None = None, duration: float | None = None
     ) -> None:
-        """source : something like OurFilter, default: what the Task says; lasts : s, default: as
-        long as it can take.
+        """Set up vehicle, estimate and controller.
+
+        Parameters
+        ----------
+        task : Task
+        source : EstimateSource, optional
+            The default is the filter of the task.
+        duration : float, optional
+            s. The default is the longest duration of the task.
         """
         world, seed, rules = task.world, task.seed, task.rules
-        longest = rules.rest + rules.patience + task.path.duration + rules.longest_sink + REST_AFTER
-        duration = lasts or longest * (2 if task.again else 1) + (
+        longest = (
+            rules.rest + rules.patience + task.path.duration + rules.longest_descent + REST_AFTER
+        )
+        duration = duration or longest * (2 if task.again else 1) + (
             PAUSE + CARRY_TIME if task.again else 0.0
         )
         self.task = task
@@ -119,8 +156,8 @@ class Trial:
             GIVEN_STD * rng.standard_normal(),
         )
         yaw = self.simulator.yaw + off
-        self.source: EstimateSource | TheirFilter = source or _filter_of(task, place, yaw)
-        if task.told == "place" and not isinstance(self.source, TheirFilter):
+        self.source: EstimateSource | PeerFilter = source or _filter_of(task, place, yaw)
+        if task.given == "place" and not isinstance(self.source, PeerFilter):
             self.source.set_pose(
                 GIVEN_AT, place, GIVEN_STD, yaw if task.yaw == "known" else math.nan
             )
@@ -131,35 +168,35 @@ class Trial:
         self._arrived: list[SensorReadings] = []
 
     def _simulator(self, duration: float) -> Simulator:
-        """The vehicle, for so many s."""
+        """Return the simulated vehicle for `duration`, s."""
         assert isinstance(self.task.path, Circles)
         return Simulator(self.task.world, self.task.seed, duration, self.task.path.radius)
 
     def _controller(self) -> Any:
-        """What moves it."""
-        return Controller(self.task.gains, self.simulator.believed)
+        """Return the controller."""
+        return Controller(self.simulator.nominal)
 
     def fly(self) -> None:
-        """One mission from where it stands, until it has rested for a while after it, or has come
-        to an end.
-        """
+        """Run one mission until the vehicle has rested after it or has crashed."""
         self.begin()
         while not self.over:
             self.turn()
 
-    def begin(self, path: Route | None = None, rules: Rules | None = None) -> None:
-        """Begin a mission from where it stands; path, rules : default: those of the Task."""
+    def begin(self, path: Plan | None = None, rules: Rules | None = None) -> None:
+        """Begin a mission at the present place. The defaults are path and rules of the task."""
         self.missions.append(self._mission(path or self.task.path, rules or self.task.rules))
-        self._moment = _moment(self.task.world.silence, self.task.path, self.task.rules, self._rng)
+        self._silence_begins = _silence_start(
+            self.task.world.silence, self.task.path, self.task.rules, self._rng
+        )
 
     def _mission(self, path: Any, rules: Rules) -> Any:
-        """A mission from where it stands now."""
+        """Return a mission from the present place."""
         state = self.simulator.state
         return Mission(path, state[:2].copy(), state[2], rules, self.simulator.now)
 
     @property
     def over(self) -> bool:
-        """True when the mission under way has come to an end, or nothing more can come."""
+        """Return whether the active mission has ended."""
         mission = self.missions[-1]
         rested = (
             mission.state == DONE
@@ -169,37 +206,39 @@ class Trial:
         return bool(rested or mission.state == REFUSED or self.crash or self.simulator.over)
 
     def turn(self) -> None:
-        """One turn of the controller, as the mission under way decides; rotors off without one."""
+        """Execute one turn of the controller."""
         wanted = self._decide(self.missions[-1]) if self.missions else None
         if wanted is None:
             self.controller.stop()
         else:
             pose = self.source.pose
-            assert pose is not None  # as the mission has begun by it
+            assert pose is not None  # a mission starts with a pose
             since, p, v, q = pose
             self.controller.fly(
-                p, v, self._turned_since(q, since), wanted, self.missions[-1].yaw, DT
+                p, v, self._predicted_attitude(q, since), wanted, self.missions[-1].yaw, DT
             )
         self._turn()
 
     def _decide(self, mission: Mission) -> np.ndarray | None:
-        """What a Mission wants now."""
+        """Return the wanted motion of a mission."""
         simulator, k = self.simulator, self.simulator.done
-        self._let_happen(mission)
-        force = float(np.mean(simulator.samples[max(k - int(FELT * IMU_RATE), 0) : k + 1, 5]))
+        self._schedule_faults(mission)
+        force = float(
+            np.mean(simulator.samples[max(k - int(SUPPORT_TIME * IMU_RATE), 0) : k + 1, 5])
+        )
         return mission.decide(
             simulator.now, self.source.pose, self.source.deviation, self.controller.support(force)
         )
 
-    def _let_happen(self, mission: Any) -> None:
-        """Have the silence and the change of its world come when they are due in a mission."""
+    def _schedule_faults(self, mission: Any) -> None:
+        """Set the times of the gap and of the anchor change for a mission."""
         started = mission.begin + mission.rules.rest if mission.started is None else mission.started
-        self.simulator.radio.happens(
-            started + self._moment, started + 0.5 * self.task.path.duration
+        self.simulator.radio.schedule_faults(
+            started + self._silence_begins, started + 0.5 * self.task.path.duration
         )
 
     def rest(self, seconds: float) -> None:
-        """Stand, or be carried, with rotors off."""
+        """Wait with the rotors off."""
         self.controller.stop()
         end = self.simulator.now + seconds
         while self.simulator.now < end and not (self.simulator.over or self.crash):
@@ -214,11 +253,19 @@ class Trial:
         self.crash = self._crash()
 
     def _crash(self) -> str:
-        """What ends it, in words, or ""."""
-        return _crash(self.simulator, self.task.world)
+        """Return the reason of a crash, or ""."""
+        simulator, size = self.simulator, self.task.world.size
+        x, y, z = simulator.state[POSITION]
+        qx, qy = simulator.state[ATTITUDE][:2]
+        tilt = math.acos(min(1.0, max(-1.0, 1.0 - 2.0 * (qx**2 + qy**2))))
+        if tilt > TIPPED and simulator.contact[simulator.done]:
+            return "tipped over"
+        if abs(x) > 0.5 * size[0] + OUTSIDE or abs(y) > 0.5 * size[1] + OUTSIDE:
+            return "flew into a wall"
+        return "flew into the ceiling" if z > size[2] + OUTSIDE else ""
 
-    def _turned_since(self, attitude: np.ndarray, since: float) -> np.ndarray:
-        """An attitude (4,) of `since`, s, turned by the rates that were felt until now."""
+    def _predicted_attitude(self, attitude: np.ndarray, since: float) -> np.ndarray:
+        """Return an attitude (4,) of the time `since`, s, rotated by the gyroscope until now."""
         times, samples, k, attitude = (
             self.simulator.times,
             self.simulator.samples,
@@ -226,12 +273,12 @@ class Trial:
             attitude.copy(),
         )
         for j in range(max(int(np.searchsorted(times[: k + 1], since, side="right")), 1), k + 1):
-            turned(attitude, samples[j, :3], times[j] - max(times[j - 1], since))
+            rotate_attitude(attitude, samples[j, :3], times[j] - max(times[j - 1], since))
         return attitude
 
     @property
-    def flown(self) -> TrialResult:
-        """TrialResult."""
+    def result(self) -> TrialResult:
+        """Return the outcome so far."""
         simulator, world = self.simulator, self.task.world
         end = simulator.done + 1
         states = simulator.states[:end]
@@ -258,38 +305,36 @@ class Trial:
 
 
 def fly(task: Task) -> TrialResult:
-    """TrialResult, of a Task."""
+    """Fly a Task and return the TrialResult."""
     trial = Trial(task)
     trial.fly()
     if task.again and not trial.crash and trial.missions[0].state == DONE:
         trial.rest(PAUSE)
         angle = random(task.seed, "carried").uniform(-np.pi, np.pi)
-        trial.simulator.lift(CARRIED * np.array([np.cos(angle), np.sin(angle)]), CARRY_TIME)
+        trial.simulator.carry(CARRIED * np.array([np.cos(angle), np.sin(angle)]), CARRY_TIME)
         trial.rest(CARRY_TIME)
         trial.fly()
-    return trial.flown
+    return trial.result
 
 
-def _filter_of(task: Task, place: np.ndarray, yaw: float) -> OurFilter | TheirFilter:
-    """Who tells where it is, of a Task; place (3,) m and yaw, rad: what is given at the start, if
-    it is.
-    """
+def _filter_of(task: Task, place: np.ndarray, yaw: float) -> OwnFilter | PeerFilter:
+    """Return the estimate source of a Task. `place` (3,) m and `yaw`, rad, are given if the task says so."""
     anchors = task.world.anchors
     if task.peer is not None:
-        return TheirFilter(task.peer, anchors, yaw, place if task.told == "place" else None)
+        return PeerFilter(task.peer, anchors, yaw, place if task.given == "place" else None)
     known: dict[str, Any] = (
         {"initial_yaw": yaw, "initial_yaw_std": GIVEN_STD} if task.yaw == "known" else {}
     )
-    return OurFilter(anchors, replace(task.config, **known), task.effects, load_network(task.model))
+    return OwnFilter(anchors, replace(task.config, **known), task.effects, load_network(task.model))
 
 
-def _moment(
+def _silence_start(
     silence: tuple[str, float] | None,
     path: Circles | Waypoints,
     rules: Rules,
     rng: np.random.Generator,
 ) -> float:
-    """s since the rotors started, at which a silence begins; inf without one."""
+    """Return the begin of the gap, s after the start of the rotors, or inf without a gap."""
     anywhere = rng.uniform(-0.5 * rules.rest, path.duration)
     if silence is None:
         return math.inf
@@ -300,17 +345,3 @@ def _moment(
         "landing": path.duration - 2.0,
         "anywhere": anywhere,
     }[silence[0]]
-
-
-def _crash(simulator: Simulator, world: World) -> str:
-    """What ends a flight in the state of a Simulator, in words, or ""."""
-    state = simulator.state
-    x, y, z = state[POSITION]
-    tilt = math.acos(min(1.0, max(-1.0, 1.0 - 2.0 * (state[6] ** 2 + state[7] ** 2))))
-    if tilt > TIPPED and simulator.contact[simulator.done]:
-        return "tipped over"
-    if abs(x) > 0.5 * world.size[0] + OUTSIDE or abs(y) > 0.5 * world.size[1] + OUTSIDE:
-        return "flew into a wall"
-    if z > world.size[2] + OUTSIDE:
-        return "flew into the ceiling"
-    return ""

@@ -1,7 +1,9 @@
-"""What became of a flight, by ground truth alone."""
+"""Judge flights by ground truth, and report many of them."""
 
 from __future__ import annotations
 
+from collections import Counter
+from dataclasses import dataclass
 import math
 from typing import TYPE_CHECKING, Any
 
@@ -16,40 +18,54 @@ from .trial import REST_AFTER
 from .vehicle import POSITION, VELOCITY
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable, Sequence
+
     from uwb_tdoa_bias.foundation.flight import Truth
     from uwb_tdoa_ekf.results import Odometry
 
     from .mission import Mission
     from .trial import TrialResult
 
-AIR = 0.3  # m above the ground, from which on it is in the air
+
+AIR = 0.3  # m above the ground, least height in the air
 UPRIGHT = math.radians(30.0)
-NEAR, SLOW = 0.3, 0.6  # m from the wanted place and m/s at touchdown, of a flight that has landed
-GENTLE = 1.0  # m/s at touchdown, of one that has not crashed
-LOST = 1.0  # m; an estimate that is further off is none
-SPACING = 0.02  # s between the estimates that are judged
+NEAR, SLOW = 0.3, 0.6  # m from the wanted place and m/s at touchdown, limits of a landing
+GENTLE = 1.0  # m/s at touchdown, limit of a safe landing
+LOST = 1.0  # m, error of a lost estimate
+SPACING = 0.02  # s between judged estimates
 PHASES = "before", "lift_off", "air", "landing", "after"
 DRIVE_PHASES = "before", "drive", "after"
 
 
 def verdict_of(flown: TrialResult) -> dict[str, Any]:
-    """dict for JSON, of a TrialResult: the verdict and its figures; None where there is nothing to
-    say. Of several flights the last one's; what kept an earlier one from landing counts for all.
+    """Return the verdict of a flight and its figures, for JSON.
 
-    landed : took off, and stood upright in the end within NEAR of the wanted place, having touched
-        it at less than SLOW; why : what was
-    missing, "" where it landed; safe : it never left the ground, or came down upright at less than
-    GENTLE, wherever; place : m, from the wanted one; touchdown : m/s; tracking : m, root mean
-    square of the distance to the wanted path in the air; armed_off : m, of the
-    estimate when the rotors started, armed_deviations : the same of its coordinates in their
-        standard deviations, the largest; lost : s,
-    first instant in the air at which the estimate is more than LOST off, and said_lost : s, when it
-        said so itself; phases : {phase:
-    figures of the estimate}.
+    A figure is None if there is no value. Of two flights the figures are those of the last. A failure of
+    the first one counts for both.
 
-    Of a rover, `arrived` instead: stood within NEAR of the last place, and touched no wall;
-    tracking, farthest : m, root mean square and largest distance to the path; yaw : degrees, root
-    mean square of its error, and yaw_nees, on the way.
+    A quadrotor has `landed` if it took off, stands upright within NEAR of the wanted place, and touched
+    the ground slower than SLOW. A rover has `arrived` if it stands within NEAR of the last place and
+    touched no wall.
+
+    Parameters
+    ----------
+    flown : TrialResult
+
+    Returns
+    -------
+    dict
+        landed or arrived : bool.
+        why : reason of the failure, or "".
+        safe : no crash: it came down upright slower than GENTLE, or did not take off.
+        place : distance to the wanted place, m.
+        touchdown : speed, m/s.
+        tracking, farthest : root mean square and largest distance to the wanted path, m.
+        armed_off : error of the estimate at the start of the rotors, m.
+        armed_deviations : largest error of a coordinate there, in standard deviations.
+        lost : first time in the air with an error above LOST, s.
+        reported_lost : time at which the vehicle noticed, s.
+        yaw, yaw_nees : root mean square of the yaw error, degrees, and its NEES (rover).
+        phases : figures of the estimate per phase.
     """
     if flown.task.vehicle == "rover":
         return _of_drive(flown)
@@ -65,7 +81,7 @@ def verdict_of(flown: TrialResult) -> dict[str, Any]:
 
 
 def _of_mission(flown: TrialResult, mission: Mission, end: float) -> dict[str, Any]:
-    """Figures of one Mission, until `end`, s."""
+    """Return the figures of one Mission until `end`, s."""
     assert flown.flight.truth is not None
     truth = flown.flight.truth
     inside = slice(*np.searchsorted(truth.t, (mission.begin, end)))
@@ -92,9 +108,7 @@ def _of_mission(flown: TrialResult, mission: Mission, end: float) -> dict[str, A
             touchdown = float(speeds[np.maximum(onset - 1 - last, 0)].max())
         inside = slice(first, last + 1, 8)
         wanted = mission.wanted(t[inside])[:, 0]
-        off = np.nan_to_num(
-            states[inside, POSITION] - wanted
-        )  # no height is wanted where it sinks to the ground
+        off = np.nan_to_num(states[inside, POSITION] - wanted)  # the descent has no wanted height
         tracking = rms(np.linalg.norm(off, axis=1))
     place = float(np.linalg.norm(states[-1, :2] - mission.place))
     figures = {
@@ -105,7 +119,7 @@ def _of_mission(flown: TrialResult, mission: Mission, end: float) -> dict[str, A
         "tracking": tracking,
         "started": mission.started,
         "ended": mission.ended,
-        "said_lost": mission.lost,
+        "reported_lost": mission.lost,
         "duration": float(t[-1]),
         **_armed(flown.odometry, flown.flight.truth, mission.started),
         **_estimation(odometry, truth, mission, first, last),
@@ -119,7 +133,7 @@ def _of_mission(flown: TrialResult, mission: Mission, end: float) -> dict[str, A
 
 
 def _of_drive(flown: TrialResult) -> dict[str, Any]:
-    """The verdict of a rover."""
+    """Return the verdict of a rover."""
     mission, truth = flown.missions[-1], flown.flight.truth
     assert isinstance(mission, Drive) and truth is not None
     end = float(truth.t[-1])
@@ -144,7 +158,7 @@ def _of_drive(flown: TrialResult) -> dict[str, Any]:
         "farthest": float(off.max()) if len(off) else None,
         "started": mission.started,
         "ended": mission.ended,
-        "said_lost": mission.lost,
+        "reported_lost": mission.lost,
         "duration": end,
         **_armed(flown.odometry, truth, mission.started),
     }
@@ -163,27 +177,27 @@ def _of_drive(flown: TrialResult) -> dict[str, Any]:
     under_way = (odometry.t >= started) & (odometry.t <= ended)
     yaw = np.interp(odometry.t, truth.t, np.unwrap(yaws_of(truth.q)))
     off_yaw = ((yaws_of(odometry.q) - yaw + np.pi) % (2.0 * np.pi) - np.pi)[under_way]
-    variance = odometry.covariance[under_way, 8, 8]  # of a planar vehicle: about the vertical
-    told = len(off_yaw) > 0 and bool((variance > 0.0).all())
+    variance = odometry.covariance[under_way, 8, 8]  # about the vertical, for a planar vehicle
+    has_variance = len(off_yaw) > 0 and bool((variance > 0.0).all())
     drive = phases.get("drive")
     return {
         **figures,
         "estimation": drive and drive["rmse"],
         "yaw": math.degrees(rms(off_yaw)) if len(off_yaw) else None,
-        "yaw_nees": float(np.mean(off_yaw**2 / variance)) if told else None,
+        "yaw_nees": float(np.mean(off_yaw**2 / variance)) if has_variance else None,
         "phases": phases,
     }
 
 
 def yaws_of(q: np.ndarray) -> np.ndarray:
-    """(n,) rad, of q (n, 4) x y z w."""
+    """Return the yaws (n,), rad, of attitudes (n, 4) x y z w."""
     x, y, z, w = q.T
     out: np.ndarray = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y**2 + z**2))
     return out
 
 
 def _why(crash: str, mission: Mission, figures: dict[str, Any]) -> str:
-    """What kept it from having landed, in words, "" for nothing."""
+    """Return the reason of the failure, or ""."""
     if mission.state == REFUSED:
         return "refused to arm"
     if not figures["took_off"]:
@@ -200,7 +214,7 @@ def _why(crash: str, mission: Mission, figures: dict[str, Any]) -> str:
 
 
 def _armed(odometry: Odometry, truth: Truth, started: float | None) -> dict[str, float | None]:
-    """How far the estimate was off when the rotors started."""
+    """Return the error of the estimate at the start of the rotors."""
     if started is None:
         return {"armed_off": None, "armed_deviations": None}
     k = int(np.searchsorted(odometry.t, started, side="right")) - 1
@@ -215,20 +229,18 @@ def _armed(odometry: Odometry, truth: Truth, started: float | None) -> dict[str,
 def _estimation(
     odometry: Odometry, truth: Truth, mission: Mission, first: int | None, last: int | None
 ) -> dict[str, Any]:
-    """Figures of the estimate, per phase, and when it was lost."""
+    """Return the figures of the estimate per phase, and the time at which it was lost."""
     if not len(odometry):
         return {"lost": None, "estimation": None, "phases": {}}
     stamps = np.arange(odometry.t[0], odometry.t[-1], SPACING)
     rows = np.unique(np.searchsorted(odometry.t, stamps))
-    rows = rows[
-        np.isfinite(odometry.p[rows]).all(axis=1)
-    ]  # a peer's may be no numbers: then it gave nothing
+    rows = rows[np.isfinite(odometry.p[rows]).all(axis=1)]  # estimates of a peer may be NaN
     t = odometry.t[rows]
     error = odometry.p[rows] - position_at(t, truth)
     distance, covariance = np.linalg.norm(error, axis=1), odometry.covariance[rows, :3, :3]
     normalised = (
         nees(error, covariance) if np.isfinite(covariance).all() else np.full(len(error), np.nan)
-    )  # a peer tells none
+    )  # a peer gives no covariance
     end = truth.t[-1]
     started, ended = mission.started or end, mission.ended or end
     up, down = (float(truth.t[k]) if k is not None else ended for k in (first, last))
@@ -246,7 +258,10 @@ def _estimation(
 def _by_phase(
     t: np.ndarray, distance: np.ndarray, normalised: np.ndarray, begins: dict[str, float]
 ) -> dict[str, dict[str, float | None]]:
-    """{phase: figures} of estimates at t (n,) s. begins : {phase: s}, each until the next."""
+    """Return figures per phase of estimates at t (n,) s.
+
+    `begins` holds the start of each phase, s. A phase lasts until the next.
+    """
     stops = [*list(begins.values())[1:], math.inf]
     inside = {name: (t >= begins[name]) & (t < stop) for name, stop in zip(begins, stops)}
     return {
@@ -263,3 +278,151 @@ def _figures(distance: np.ndarray, normalised: np.ndarray) -> dict[str, float | 
         "largest": float(distance.max()),
         "nees": float(usable.mean()) if len(usable) else None,
     }
+
+
+pass
+
+
+OVERCONFIDENT = 3.0  # standard deviations of a coordinate
+
+
+@dataclass(frozen=True)
+class Wording:
+    """Hold the words for verdicts of a vehicle.
+
+    Parameters
+    ----------
+    goal, begun : str
+        Keys of success and start.
+    phases : tuple of str
+    figures : dict
+        Descriptions of the figures. "" hides a figure.
+    """
+
+    goal: str
+    begun: str
+    phases: tuple[str, ...]
+    figures: dict[str, str]
+
+
+QUADROTOR = Wording(
+    "landed",
+    "armed",
+    PHASES,
+    {
+        "armed_off": "estimate off when armed, m",
+        "tracking": "off the path in the air, m",
+        "estimation": "",
+        "place": "landed from the wanted place, m",
+        "touchdown": "touchdown, m/s",
+    },
+)
+ROVER = Wording(
+    "arrived",
+    "started",
+    DRIVE_PHASES,
+    {
+        "armed_off": "estimate off when started, m",
+        "tracking": "off the path, m",
+        "farthest": "largest distance to the path, m",
+        "estimation": "",
+        "place": "stopped from the wanted place, m",
+        "yaw": "yaw off, degrees",
+        "yaw_nees": "NEES of the yaw",
+    },
+)
+
+
+def wording_of(verdict: dict[str, Any]) -> Wording:
+    """Return the words for a verdict or a summary."""
+    return ROVER if ROVER.goal in verdict else QUADROTOR
+
+
+def reached(verdict: dict[str, Any]) -> bool:
+    """Return whether a vehicle has landed or arrived."""
+    return bool(verdict[wording_of(verdict).goal])
+
+
+def summary(verdicts: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Return counts, medians and extremes of the figures, for JSON.
+
+    Parameters
+    ----------
+    verdicts : sequence of dict
+        Verdicts of one vehicle, see `verdict_of`.
+    """
+    wording = wording_of(verdicts[0])
+    out = {"flights": len(verdicts), wording.goal: sum(one[wording.goal] for one in verdicts)}
+    out["why"] = dict(Counter(one["why"] for one in verdicts if one["why"]).most_common())
+    out["safe"] = sum(one["safe"] for one in verdicts)
+    out["armed"] = sum(one["started"] is not None for one in verdicts)
+    known = [one["armed_deviations"] for one in verdicts if one["armed_deviations"] is not None]
+    out["armed_beyond_three_deviations"] = (
+        sum(value > OVERCONFIDENT for value in known) if known else None
+    )  # a peer gives no covariance
+    out["reported_lost"] = sum(one["reported_lost"] is not None for one in verdicts)
+    for name in wording.figures:
+        out[name] = _spread([one[name] for one in verdicts])
+    for phase in wording.phases:
+        mine = [one["phases"][phase] for one in verdicts if phase in one["phases"]]
+        out[phase] = {
+            name: _spread([one[name] for one in mine]) for name in ("rmse", "largest", "nees")
+        }
+    return out
+
+
+def _spread(values: Iterable[float | None]) -> dict[str, float] | None:
+    known = [value for value in values if value is not None]
+    if not known:
+        return None
+    return {
+        "median": float(np.median(known)),
+        "least": float(min(known)),
+        "most": float(max(known)),
+    }
+
+
+def text(summed: dict[str, Any]) -> str:
+    """Return a summary as lines of text."""
+    wording = wording_of(summed)
+    goal = wording.goal
+    lines = [f"{summed[goal]} of {summed['flights']} {goal}; {summed['safe']} without a crash"]
+    lines += [f"  {count} {why}" for why, count in summed["why"].items()]
+    beyond = summed["armed_beyond_three_deviations"]
+    lines.append(
+        f"{wording.begun} {summed['armed']}, of these {'?' if beyond is None else beyond} while the "
+        "estimate was more than three of its "
+        f"deviations off; {summed['reported_lost']} said that they were lost"
+    )
+    for name, what in wording.figures.items():
+        if what:
+            lines.append(f"{what:34s}{_range(summed[name])}")
+    lines.append(f"{'estimate':10s}{'rmse, m':>24s}{'largest, m':>24s}{'NEES':>24s}")
+    for phase in wording.phases:
+        lines.append(
+            f"{phase:10s}"
+            + "".join(f"{_range(summed[phase][name]):>24s}" for name in ("rmse", "largest", "nees"))
+        )
+    return "\n".join(lines)
+
+
+def sentence(verdict: dict[str, Any]) -> str:
+    """Return a verdict as a sentence."""
+    goal = wording_of(verdict).goal
+    if not verdict[goal]:
+        return f"not {goal}: {verdict['why']}"
+    if goal == ROVER.goal:
+        return (
+            f"arrived {verdict['place']:.2f} m from the wanted place, "
+            f"{verdict['tracking']:.2f} m off the path"
+        )
+    figures = f"{verdict['place']:.2f} m from the wanted place at {verdict['touchdown']:.2f} m/s"
+    return f"landed {figures}, in the air {verdict['tracking']:.2f} m off the path"
+
+
+def _range(spread: dict[str, float] | None) -> str:
+    return (
+        "-"
+        if spread is None
+        else f"{spread['median']:.2f} ({spread['least']:.2f} - {spread['most']:.2f})"
+    )

@@ -1,4 +1,4 @@
-"""What the vehicle flies in: radio, inertial sensor and air, each as wrong as asked for."""
+"""Describe the world of a flight: radio, inertial sensor and air with their errors."""
 
 from __future__ import annotations
 
@@ -26,55 +26,71 @@ MOMENTS = (
     "circle",
     "landing",
     "anywhere",
-)  # in a flight; on a circle of no radius it hovers
+)  # of a flight; a circle of no radius is hovering
 LONGEST_SILENCE = 60.0  # s
 
 
 @dataclass(frozen=True)
 class World:
-    """A hall, its radio and its air. Metres, seconds and Hz where nothing else is said.
+    """Describe a hall, its radio, its air and the sensors of the vehicle.
 
-    The radio
-    ---------
-    size : of the hall, whose low anchors are at 0.18 m
-    layout : Anchors that are there, None for a low and a high one in each corner
-    low_first : of those in corners, 0 to 3 are the low ones; else low and high ones alternate, as
-        in the measured flights, but for two
-    floor_effect : low anchors are late while the tag is near the floor, each by one of
-        `floor_delay`, up to about one of `floor_height`, as
-        the effect floor_multipath has it
-    protocol, rate : of TDOAs
-    noise : of a TDOA, its standard deviation
-    outlier_share, outlier_size : share of TDOAs that are wrong by anything up to that size; 0: of
-        the three kinds of physics
-    installation : seed of what belongs to the hall (delays, biases, the floor), None for that of
-        the flight: another hall each time
-    delay : standard deviation of the anchors' constant delays
-    bearing_bias : largest amplitude of a bias over the bearing, two waves per turn
-    antennas : received power and both antennas make signals late, as in `simulate`; each flight has
-        another specimen of the tag
-    silence : (one of MOMENTS, s) when and for how long nothing is heard; or None
-    person : somebody walks through the hall and blocks what passes through him
-    change : "silent" or "late", what one anchor, drawn by seed, is from the middle of the path on;
-        or ""
-    lateness : by how much it is late then
-    effects : EffectSet, what `inject` puts into flights
-    latency, jitter : of everything on its way to the estimate, least, and mean of what comes on top
+    Lengths are in m, times in s and rates in Hz unless stated otherwise.
 
-    The vehicle
-    -----------
+    Parameters
+    ----------
+    size : tuple
+        Size of the hall. Low anchors are at 0.18 m.
+    layout : Anchors, optional
+        Anchors. The default is a low and a high anchor in each corner.
+    low_first : bool
+        Ids 0 to 3 are the low anchors. Otherwise low and high alternate, as in the measured flights.
+    floor_effect : bool
+        Low anchors are late while the tag is near the floor (effect floor_multipath). The delay is in
+        `floor_delay`, its limit in height near `floor_height`.
+    protocol, rate
+        Of the TDOAs.
+    noise : float
+        Standard deviation of a TDOA.
+    outlier_share, outlier_size : float
+        Share and largest size of wrong TDOAs. A size of 0 draws the three kinds of physics.
+    installation : int, optional
+        Seed of the hall: delays, biases, floor. None takes the seed of the flight.
+    delay : float
+        Standard deviation of the constant delays of anchors.
+    bearing_bias : float
+        Largest amplitude of a bias over the bearing, with two waves per turn.
+    antennas : bool
+        Received power and both antennas delay signals, as in `simulate`. Each flight has another tag.
+    silence : tuple, optional
+        (one of MOMENTS, duration) of a gap in the TDOAs.
+    person : bool
+        A person walks through the hall and blocks signals.
+    change : str
+        "silent" or "late": change of one random anchor from the middle of the path. "" for none.
+    changed_delay : float
+        Delay of that anchor if it is "late".
+    effects : EffectSet
+        Further effects, added as by `inject`.
+    latency, jitter : float
+        Least delay of all messages, and mean of an additional delay.
     imu : ImuErrors
-    vibration : (3,) m/s^2, root mean square of what turning rotors add to the accelerometer, per
-        axis
-    vibration_band : below which it is; 0 for white
-    rectified : offset of the accelerometer while rotors turn, of its vibration
-    mass : kg, least and most
-    gust : m/s, standard deviation of the wind along each axis
-    table : height of a table, 0.4 m around, from which it starts and on which it lands; 0 for none
-    aids : of "height" (a range finder along the body's -z), "pressure", "velocity", "range"
-        (distances to anchors); rates and noises as
-        `simulate` has them, but for height_rate, height_noise, and height_range, beyond which the
-        range finder sees nothing
+    vibration : tuple
+        Root mean square of the accelerometer vibration per axis while rotors turn, m/s^2.
+    vibration_band : float
+        Largest frequency of the vibration. 0 means white noise.
+    rectified : float
+        Accelerometer offset while rotors turn, in units of the vibration.
+    mass : tuple
+        Least and largest mass, kg.
+    gust : float
+        Standard deviation of the wind along each axis, m/s.
+    table : float
+        Height of a round table of 0.4 m radius at the start. 0 for none.
+    aids : tuple of str
+        Further sensors: "height" (a range finder along -z of the body), "pressure", "velocity",
+        "range" (distances to anchors). Rates and noises are those of `simulate`.
+    height_rate, height_noise, height_range : float
+        Rate, noise and largest distance of the range finder.
     """
 
     size: tuple[float, float, float] = (6.4, 6.2, 3.0)
@@ -95,7 +111,7 @@ class World:
     silence: tuple[str, float] | None = None
     person: bool = False
     change: str = ""
-    lateness: float = 0.3
+    changed_delay: float = 0.3
     effects: EffectSet = EffectSet()
     latency: float = 0.0
     jitter: float = 0.0
@@ -113,7 +129,7 @@ class World:
 
     @cached_property
     def anchors(self) -> Anchors:
-        """Where they are."""
+        """Return the anchors."""
         if self.layout is not None:
             return self.layout
         made = corners(*self.size)
@@ -141,10 +157,10 @@ WORLDS = {
     "gusts": replace(HALL, gust=0.5),
     "measured-vibration": replace(
         HALL, vibration=(0.4, 0.5, 0.35), vibration_band=30.0
-    ),  # as on 0426
+    ),  # values of the flights of 0426
     "rectifying": replace(
         HALL, vibration=(3.4, 2.0, 0.55), vibration_band=30.0, rectified=1.0
-    ),  # as on 0425
+    ),  # values of the flights of 0425
     "table": replace(HALL, table=0.75),
 }
 
@@ -157,9 +173,23 @@ def world_of(
     injected: Iterable[Sequence[str]] = (),
     installation: int | None = None,
 ) -> World:
-    """The World `name`, with what options change: floor_effect bool or None; installation int or
-    None; aids, names; silence "MOMENT:S" or None; injected [[effect, "KEY=NUMBER", ...]]. Raises
-    InputError.
+    """Return a world of WORLDS with the changes that options ask for.
+
+    Parameters
+    ----------
+    name : str
+    floor_effect : bool, optional
+    aids : iterable of str
+    silence : str, optional
+        "MOMENT:S".
+    injected : iterable
+        Lists of an effect and its "KEY=NUMBER" texts.
+    installation : int, optional
+
+    Raises
+    ------
+    InputError
+        If `silence` or `injected` cannot be read.
     """
     changed: dict[str, Any] = {"aids": tuple(dict.fromkeys(aids)), "installation": installation}
     if floor_effect is not None:
@@ -178,7 +208,7 @@ def world_of(
 
 
 def _moment(text: str) -> tuple[str, float]:
-    """(moment, s) of "MOMENT:S"."""
+    """Return (moment, duration in s) of "MOMENT:S"."""
     moment, _, seconds = text.partition(":")
     try:
         length = float(seconds)

@@ -1,4 +1,4 @@
-"""Labels: what each TDOA of a flight was wrong by, and the pose it was taken at."""
+"""Compute labels: the errors of the TDOAs of a flight at their true poses."""
 
 from __future__ import annotations
 
@@ -21,35 +21,38 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.anchors import Anchors
     from uwb_tdoa_bias.foundation.flight import Flight, Truth
 
-# s after take-off and before landing that are left out: near the floor TDOAs are metres off
+# s after take-off and before landing that are excluded: near the floor TDOAs are wrong by metres
 MARGIN = 0.5
-LARGEST = 1.0  # m; a larger error is an outlier, not bias (Zhao et al., section V-B)
-ZERO = 1e-3  # m; if no label is larger, the TDOAs were computed, not measured
-FEWEST = 100  # labels that a flight must give
-MEMORY = (
-    1.0  # s over which the errors of one anchor are alike: so much time counts as one look at it
-)
-SAME_PLACE = (
-    0.1  # m by which an anchor may have moved and still be in its place, one standard deviation
-)
+LARGEST_ERROR = 1.0  # m; a larger error is an outlier, not bias (Zhao et al., section V-B)
+ZERO_ERROR = 1e-3  # m; smaller labels mean that the TDOAs were computed, not measured
+FEWEST_LABELS = 100  # least number of labels of a flight
+CORRELATION_TIME = 1.0  # s over which the errors of one anchor count as one observation
+SAME_PLACE = 0.1  # m, standard deviation of the position of an anchor that was not moved
 LEVEL = np.array([0.0, 0.0, 0.0, 1.0])
 
 
 @dataclass(frozen=True)
 class Labels:
-    """Labelled TDOAs of one flight.
+    """Hold the labelled TDOAs of one flight.
 
-    name : of the flight; samples : Samples, poses from ground truth; error : (n,) m, measured minus
-        geometric;
-    looks : independent looks that one sample counts as, because errors are alike for a while;
-        digest : hex, of
-    everything above.
+    Parameters
+    ----------
+    name : str
+        Name of the flight.
+    samples : Samples
+        With poses from ground truth.
+    error : numpy.ndarray
+        Measured minus geometric TDOAs (n,), m.
+    sample_weight : float
+        Independent observations per sample. Errors are correlated over CORRELATION_TIME.
+    digest : str
+        Hexadecimal digest of the data.
     """
 
     name: str
     samples: Samples
     error: np.ndarray
-    looks: float
+    sample_weight: float
     digest: str
 
     def __len__(self) -> int:
@@ -57,21 +60,34 @@ class Labels:
 
     @property
     def anchors(self) -> Anchors:
-        """Anchors of the flight."""
+        """Return the anchors of the flight."""
         return self.samples.anchors
 
     def take(self, rows: np.ndarray) -> Labels:
-        """Labels of some rows, each counting for more, so that they count for as much together."""
-        part, looks = _rows(self.samples, rows), self.looks * len(self) / max(len(rows), 1)
-        return replace(self, samples=part, error=self.error[rows], looks=looks)
+        """Return some rows, weighted so that their total weight stays the same."""
+        part, sample_weight = (
+            _rows(self.samples, rows),
+            self.sample_weight * len(self) / max(len(rows), 1),
+        )
+        return replace(self, samples=part, error=self.error[rows], sample_weight=sample_weight)
 
 
 def labels(flight: Flight, effects: EffectSet = EffectSet()) -> Labels:
-    """Labels of a Flight, its airborne part without outliers; what `effects` explain is taken out.
-    Raises InputError where it cannot teach anything.
+    """Return the labels of the airborne part of a flight without outliers.
+
+    Parameters
+    ----------
+    flight : Flight
+    effects : EffectSet
+        Known effects. Their bias is subtracted.
+
+    Raises
+    ------
+    InputError
+        If the flight has too few usable TDOAs or no ground truth.
     """
-    flight = effects.correct_streams(replace(level(flight), imu=None))
-    truth, data, anchors = known_truth(flight), flight.tdoa, flight.anchors
+    flight = effects.correct_streams(replace(with_level_attitude(flight), imu=None))
+    truth, data, anchors = required_truth(flight), flight.tdoa, flight.anchors
     _, first, last = scored_phase(truth)
     first, last = first + MARGIN, last - MARGIN
     chosen = (data.t > first) & (data.t < last)
@@ -96,34 +112,38 @@ def labels(flight: Flight, effects: EffectSet = EffectSet()) -> Labels:
         - tdoa(samples.p, samples.position_a, samples.position_b)
         - effects.bias(samples)
     )
-    kept = (np.abs(error) <= LARGEST) & (samples.p[:, 2] > least_height(truth)) & (a != b)
-    if kept.sum() < FEWEST:
+    kept = (np.abs(error) <= LARGEST_ERROR) & (samples.p[:, 2] > least_height(truth)) & (a != b)
+    if kept.sum() < FEWEST_LABELS:
         raise InputError(
-            f"{flight.name}: only {kept.sum()} TDOAs are right to {LARGEST:g} m; check that "
+            f"{flight.name}: only {kept.sum()} TDOAs are right to {LARGEST_ERROR:g} m; check that "
             "survey and "
             "ground truth are in one frame."
         )
-    if np.max(np.abs(error[kept])) < ZERO:
+    if np.max(np.abs(error[kept])) < ZERO_ERROR:
         raise InputError(
             f"{flight.name}: all labels are zero: its TDOAs were made from the ground truth itself."
         )
-    looks = min(1.0, len(anchors) * (last - first) / MEMORY / kept.sum())
+    sample_weight = min(1.0, len(anchors) * (last - first) / CORRELATION_TIME / kept.sum())
     samples = _rows(samples, kept)
-    return Labels(flight.name, samples, error[kept], looks, _digest(samples, error[kept]))
+    return Labels(flight.name, samples, error[kept], sample_weight, _digest(samples, error[kept]))
 
 
-def known_truth(flight: Flight) -> Truth:
-    """The ground truth of a Flight. Raises InputError where there is none."""
+def required_truth(flight: Flight) -> Truth:
+    """Return the ground truth of a flight.
+
+    Raises
+    ------
+    InputError
+        If it has none.
+    """
     if flight.truth is None:
         raise InputError(f"{flight.name}: it holds no ground truth to learn from.")
     return flight.truth
 
 
-def level(flight: Flight) -> Flight:
-    """The Flight; if the attitudes of its ground truth are not all measured, they are level, at yaw
-    0.
-    """
-    truth = known_truth(flight)
+def with_level_attitude(flight: Flight) -> Flight:
+    """Return the flight with level attitudes at yaw 0 if some true attitudes are missing."""
+    truth = required_truth(flight)
     if np.isfinite(truth.q).all():
         return flight
     return replace(flight, truth=replace(truth, q=np.tile(LEVEL, (len(truth), 1))))
@@ -132,8 +152,20 @@ def level(flight: Flight) -> Flight:
 def split(
     names: Sequence[str], seed: int, validation: Sequence[str] | None = None
 ) -> tuple[list[str], list[str]]:
-    """(training, validation) names: whole flights, one in five validates, drawn with `seed`, or
-    those that are named.
+    """Split flights into (training, validation) names.
+
+    Parameters
+    ----------
+    names : sequence of str
+    seed : int
+        Draws a fifth of the flights for validation.
+    validation : sequence of str, optional
+        Names of the validation flights.
+
+    Raises
+    ------
+    InputError
+        If a part would be empty or a name is unknown or repeated.
     """
     if len(set(names)) != len(names):
         raise InputError(f"flights: {max(names, key=list(names).count)} is there twice.")
@@ -162,7 +194,7 @@ def split(
 
 
 def thinned(all_labels: Sequence[Labels], seconds: float, rng: np.random.Generator) -> list[Labels]:
-    """Each of a list of Labels with at most one sample per `seconds` on average, drawn at random."""
+    """Return labels with at most one random sample per `seconds` on average."""
     out = []
     for one in all_labels:
         duration = one.samples.t[-1] - one.samples.t[0]
@@ -172,8 +204,9 @@ def thinned(all_labels: Sequence[Labels], seconds: float, rng: np.random.Generat
 
 
 def white_noise(all_labels: Sequence[Labels]) -> float:
-    """Standard deviation of what changes from one TDOA of a pair to its next, m: no model of the
-    pose can know it.
+    """Return the standard deviation of successive TDOAs of a pair, m.
+
+    A model of the pose cannot explain it.
     """
     steps = []
     for one in all_labels:
@@ -184,16 +217,14 @@ def white_noise(all_labels: Sequence[Labels]) -> float:
 
 
 def digest(all_labels: Sequence[Labels]) -> str:
-    """Hex digest of the data of several Labels, in any order."""
+    """Return the hexadecimal digest of several Labels, in any order."""
     return hashlib.sha256("".join(sorted(one.digest for one in all_labels)).encode()).hexdigest()[
         :16
     ]
 
 
 def constellations(some: Iterable[Flight | Labels]) -> list[dict[str, list[float]]]:
-    """The different anchor constellations of flights or labels: list of dicts of id (text) to
-    position, m, to the centimetre.
-    """
+    """Return the different anchor constellations as {id: position in m}, rounded to 1 cm."""
     found: list[dict[str, list[float]]] = []
     for one in some:
         layout = dict(

@@ -1,9 +1,8 @@
-"""Robust Bayesian regression with a design of a sparse and a dense part.
+"""Robust Bayesian regression with a sparse and a dense design.
 
-A row says: y = w[site_b] . phi - w[site_a] . phi + dense . v + noise, with Gaussian priors on the
-weights. A site is one anchor at one place and has weights of its own on features phi that depend on
-the tag alone, so that only the blocks of two sites meet in a row and the normal equations are
-summed up block by block.
+The model of a row is y = w[site_b] . phi - w[site_a] . phi + dense . v + noise, with Gaussian priors
+on the weights. A site is one anchor at one place. It has its own weights on features phi of the tag.
+Only the blocks of two sites meet in a row, so the normal equations are summed block by block.
 """
 
 from __future__ import annotations
@@ -20,13 +19,25 @@ if TYPE_CHECKING:
 
 ITERATIONS = 8
 PRECISION = (1e-1, 1e4)  # limits of 1 / s^2
-DEGREES = 3.0  # of freedom of the Student t errors that the weights belong to
+DEGREES = 3.0  # of freedom of the Student t errors
 
 
 @dataclass(frozen=True)
 class Design:
-    """phi : (n, m); a, b : (n,) site of either end; dense : (n, q); y : (n,) m; looks : (n,)
-    independent looks of a row.
+    """Hold the rows of a regression.
+
+    Parameters
+    ----------
+    phi : numpy.ndarray
+        Features of the tag (n, m).
+    a, b : numpy.ndarray
+        Site of each end (n,).
+    dense : numpy.ndarray
+        Dense columns (n, q).
+    y : numpy.ndarray
+        Errors (n,), m.
+    sample_weight : numpy.ndarray
+        Independent observations per row (n,).
     """
 
     phi: np.ndarray
@@ -34,14 +45,21 @@ class Design:
     b: np.ndarray
     dense: np.ndarray
     y: np.ndarray
-    looks: np.ndarray
+    sample_weight: np.ndarray
 
 
 @dataclass(frozen=True)
 class Posterior:
-    """site : (sites, m) weights; dense : (q,); site_covariance : (m, m), mean over the sites;
-    dense_covariance : (q, q);
-    site_std, dense_std : standard deviations of the priors that the data called for.
+    """Hold the fitted weights.
+
+    Parameters
+    ----------
+    site, dense : numpy.ndarray
+        Weights (sites, m) and (q,).
+    site_covariance, dense_covariance : numpy.ndarray
+        Covariances (m, m), the mean over the sites, and (q, q).
+    site_std, dense_std : float
+        Standard deviations of the fitted priors.
     """
 
     site: np.ndarray
@@ -55,12 +73,25 @@ class Posterior:
 def fit(
     design: Design, sites: int, noise: float, known_std: Sequence[float] | np.ndarray = ()
 ) -> Posterior:
-    """Posterior of the weights of `sites` sites and of the dense ones.
+    """Fit the weights.
 
-    The priors are N(0, s^2): the last dense weights have the standard deviations known_std; the
-    others share one s, the sites' another, which maximise the evidence (MacKay, Neural Computation
-    4, 1992). Iteratively re-weighted least squares for Student t errors of scale `noise`, m (Lange,
-    Little and Taylor, JASA 84, 1989).
+    The priors are N(0, s^2). The last dense weights have the standard deviations `known_std`. The other
+    dense weights share one s, and the sites share another. Both maximize the evidence (MacKay, Neural
+    Computation 4, 1992). Iteratively re-weighted least squares give the weights for Student t errors
+    (Lange, Little and Taylor, JASA 84, 1989).
+
+    Parameters
+    ----------
+    design : Design
+    sites : int
+        Number of sites.
+    noise : float
+        Scale of the errors, m.
+    known_std : sequence of float
+
+    Returns
+    -------
+    Posterior
     """
     m, q = design.phi.shape[1], design.dense.shape[1]
     size = sites * m
@@ -68,7 +99,9 @@ def fit(
     prior = np.concatenate([np.ones(blocks[1].stop), np.asarray(known_std, dtype=float) ** -2.0])
     robust, groups = np.ones(len(design.y)), _groups(design.a, design.b, sites)
     for iteration in range(ITERATIONS):
-        left, right = _normal_equations(design, groups, size, robust * design.looks / noise**2)
+        left, right = _normal_equations(
+            design, groups, size, robust * design.sample_weight / noise**2
+        )
         left[np.diag_indices_from(left)] += prior
         factor, _ = cho_factor(left, overwrite_a=True)
         solution = cho_solve((factor, False), right)
@@ -80,7 +113,7 @@ def fit(
             for block in blocks:
                 determined = np.sum(
                     1.0 - prior[block] * variance[block]
-                )  # number of weights the data determine
+                )  # number of well-determined weights
                 prior[block] = np.clip(
                     determined / max(np.sum(solution[block] ** 2), 1e-12), *PRECISION
                 )
@@ -94,8 +127,9 @@ def fit(
 
 
 def _inverse_diagonal(factor: np.ndarray) -> np.ndarray:
-    """Diagonal (k,) of the inverse of a matrix, of its upper Cholesky factor (k, k), whose place is
-    taken: half the work of the whole inverse.
+    """Return the diagonal (k,) of an inverse from the upper Cholesky factor (k, k).
+
+    The factor is overwritten. This takes half the time of the whole inverse.
     """
     inverse, _ = dtrtri(factor, overwrite_c=True)
     return np.array([row[k:] @ row[k:] for k, row in enumerate(inverse)])
@@ -104,9 +138,7 @@ def _inverse_diagonal(factor: np.ndarray) -> np.ndarray:
 def _normal_equations(
     design: Design, groups: Sequence[tuple[int, int, np.ndarray]], size: int, row: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Left (k, k) and right (k,) side of the weighted least squares of all rows, weights of the
-    rows (n,).
-    """
+    """Return both sides (k, k) and (k,) of weighted least squares, with row weights `row` (n,)."""
     m, q = design.phi.shape[1], design.dense.shape[1]
     left, right = np.zeros((size + q, size + q)), np.zeros(size + q)
     for a, b, rows in groups:
@@ -131,7 +163,7 @@ def _normal_equations(
 
 
 def predict(design: Design, weights: np.ndarray, dense: np.ndarray) -> np.ndarray:
-    """What weights (sites, m) and dense (q,) say for every row: (n,)."""
+    """Return the prediction (n,) of weights (sites, m) and dense (q,)."""
     return (
         np.einsum("nm,nm->n", design.phi, weights[design.b] - weights[design.a])
         + design.dense @ dense

@@ -1,8 +1,9 @@
-"""The kinds of models that can be trained, all by one call: `train`."""
+"""Train the different kinds of models by one call, `train`."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -11,10 +12,10 @@ from uwb_tdoa_bias.correction.corrector import LARGEST_YAW_STD
 from uwb_tdoa_bias.correction.features import columns
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.files import write_bytes
+from uwb_tdoa_bias.foundation.files import write_bytes, write_filled
 
 from . import labels as labelling
-from . import linear, paper, physics, structured
+from . import linear, network, physics, structured
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -25,32 +26,37 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.flight import Flight
 
     from .labels import Labels
-    from .paper import Paper
+    from .network import Paper
     from .structured import Structured
 
-    LearningCurve = tuple[
-        str, list[int], list[float], list[float]
-    ]  # label, x, training and validation RMS, m
+    # label, x, training and validation RMS, m
+    LearningCurve = tuple[str, list[int], list[float], list[float]]
+
 
 KINDS = ("paper", "paper_no_orientation", "structured", "physics", "physics+structured")
-SPACING = 0.01  # s between the samples that are learned from: nearer ones tell the same
+SPACING = 0.01  # s between training samples: closer samples hold no more information
 CLIP = 1.0  # m
-MARGINS = {
-    "d": 1.0,
-    "f": 2.0,
-    "u": 0.5,
-}  # trust fades over: positions m, forward (turned round: gone) and up axes
-# added to the box of attitudes on every side: that much is an estimated attitude off at times
+# the correction fades over: positions, m, components of the forward axis and of the up axis
+MARGINS = {"d": 1.0, "f": 2.0, "u": 0.5}
+# added to the box of attitudes on every side: occasional error of an estimated attitude
 SLACK = 0.2
-SMALLEST_STD = 0.01  # m, of what remains
+SMALLEST_STD = 0.01  # m, least standard deviation of the remaining error
 POINTS = 4  # of a learning curve over flights
-HEADINGS = 1.0  # range of the forward axis in training from which on a model tells headings apart
+HEADINGS = 1.0  # range of the forward axis in training, from which a model depends on the heading
 _ATTITUDE = ("forward_x", "forward_y", "up_x", "up_y")
 
 
 class Recipe(NamedTuple):
-    """What is trained. kind : of KINDS; seed : of everything that is drawn; options : of structured
-    models.
+    """Describe a training.
+
+    Parameters
+    ----------
+    kind : str
+        One of KINDS.
+    seed : int
+        Seed of all random numbers.
+    options : StructuredPriors
+        For structured models.
     """
 
     kind: str
@@ -60,10 +66,18 @@ class Recipe(NamedTuple):
 
 @dataclass(frozen=True)
 class Trained:
-    """model : Paper, Structured or None; effects : EffectSet or None; curve : (label, x, training
-    RMS, validation RMS);
-    meta : metadata of the ONNX file; errors : {validation flight: (before, after)}, RMS of its
-        TDOAs, m.
+    """Hold the result of a training.
+
+    Parameters
+    ----------
+    model : Paper or Structured or None
+    effects : EffectSet or None
+    curve : tuple
+        Label, x, RMS errors of training and validation, m.
+    meta : dict
+        Metadata of the ONNX file.
+    errors : dict
+        RMS errors of the TDOAs of each validation flight (before, after), m.
     """
 
     model: Paper | Structured | None
@@ -73,7 +87,7 @@ class Trained:
     errors: dict[str, tuple[float, float]]
 
     def onnx(self) -> ModelProto | None:
-        """The onnx.ModelProto, or None for a kind without a network."""
+        """Return the ONNX model, or None for a kind without a network."""
         return self.model.onnx(self.meta) if self.model else None
 
 
@@ -86,14 +100,32 @@ def train(
     found: physics.Physics | None = None,
     curve: bool = True,
 ) -> Trained:
-    """Train the model of a Recipe on lists of Flights. Returns Trained. Raises InputError.
+    """Train the model of a recipe.
 
-    name : of the model, goes into every corrected message; progress : called with a text now and
-        then; found : Physics
-    of the training and then the validation flights, if somebody has looked for it already; curve :
-    whether a learning curve is wanted, beyond its last point. The validation flights decide when
-    the paper's network stops, and tell how far off a model is on flights that it has not seen; then
-    the linear models are fitted anew to them too.
+    The validation flights stop the training of the paper's network. For all models they give the error on
+    unseen flights. Linear models are then fitted again to all flights.
+
+    Parameters
+    ----------
+    recipe : Recipe
+    training, validation : sequence of Flight
+    name : str
+        Name of the model, written to every corrected message.
+    progress : callable
+        Called with lines of text.
+    found : Physics, optional
+        Effects of the training and then the validation flights. The default is to find them.
+    curve : bool
+        Whether to compute a whole learning curve.
+
+    Returns
+    -------
+    Trained
+
+    Raises
+    ------
+    InputError
+        If the kind is unknown or a flight cannot be used.
     """
     kind, seed, _ = recipe
     if kind not in KINDS:
@@ -105,20 +137,20 @@ def train(
     if kind.startswith("physics"):
         if found is None:
             progress("looking for effects")
-            found = physics.find([*training, *validation])
+            found = physics.find_effects([*training, *validation])
         effects = found.effects
         if len(labelling.constellations([*training, *validation])) > 1:
-            free, effects = physics.separate(effects)
+            free, effects = physics.split_linear(effects)
         progress(f"effects: {found.effects.name}")
         groups = _labels(training, validation, effects)
     if kind.startswith("paper"):
         model, errors, left = _paper(recipe, groups[0], groups[1], progress)
     elif found is not None and kind == "physics" and not len(free):
         errors, left = _evaluate_effects(
-            found, raw[0], raw[1], _growing(len(training), seed, curve)
+            found, raw[0], raw[1], _curve_subsets(len(training), seed, curve)
         )
     else:
-        growing = _growing(len(training), seed, curve)
+        growing = _curve_subsets(len(training), seed, curve)
         model, free, errors, left = _structured(
             recipe, groups[0], groups[1], progress, growing, free
         )
@@ -146,7 +178,7 @@ def train(
         if model.sees_attitude and any(
             high - low - 2.0 * SLACK > HEADINGS for low, high, _ in heads
         ):
-            meta["largest_yaw_std"] = LARGEST_YAW_STD  # before the yaw is known, it cannot tell
+            meta["largest_yaw_std"] = LARGEST_YAW_STD  # the model needs the yaw
     of_flights = {one.name: (_rms([one.error]), _rms([after])) for one, after in zip(raw[1], left)}
     return Trained(model, effects, errors, meta, of_flights)
 
@@ -165,14 +197,14 @@ def _paper(
     training: list[Labels],
     validation: list[Labels],
     progress: Callable[[str], object],
-) -> tuple[paper.Paper, LearningCurve, list[np.ndarray]]:
-    """(Paper, learning curve over epochs, what is left of the errors of each validation flight)."""
+) -> tuple[network.Paper, LearningCurve, list[np.ndarray]]:
+    """Return (Paper, learning curve over epochs, remaining errors of each validation flight)."""
     kind, seed, _ = recipe
     thin, held = (
         labelling.thinned(group, SPACING, np.random.default_rng(seed))
         for group in (training, validation)
     )
-    model, errors = paper.fit(
+    model, errors = network.fit(
         thin,
         held,
         kind == "paper",
@@ -192,13 +224,18 @@ def _structured(
     growing: Sequence[Sequence[int]],
     free: EffectSet,
 ) -> tuple[structured.Structured | None, EffectSet, LearningCurve, list[np.ndarray]]:
-    """(Structured, EffectSet, learning curve over numbers of training flights, what is left of the
-    errors of each validation flight by a fit to the training flights). The model itself is then
-    fitted to all flights.
+    """Return (Structured, EffectSet, learning curve, remaining errors of validation flights).
 
-    growing : as `_growing` gives; free : linear effects to fit together with the maps. Of physics
-        alone the maps are only there so that
-    the effects do not take what belongs to a place; no model is returned.
+    The remaining errors belong to a fit to the training flights. The model is a fit to all flights.
+
+    Parameters
+    ----------
+    recipe, training, validation, progress
+    growing : sequence
+        See `_curve_subsets`.
+    free : EffectSet
+        Linear effects that are fitted together with the maps. For the kind "physics" the maps only
+        separate effects from position-dependent errors, and no model is returned.
     """
     (_, seed, options), alone = recipe, recipe.kind == "physics"
     thin = [
@@ -228,7 +265,7 @@ def _structured(
 
 
 def _over_flights(curve: Sequence[tuple[int, float, float]]) -> LearningCurve:
-    """Of (number of training flights, RMS of training and validation, m)."""
+    """Return the learning curve of (number of flights, training RMS, validation RMS in m)."""
     counts, training, validation = zip(*curve)
     return "training flights", list(counts), list(training), list(validation)
 
@@ -239,18 +276,16 @@ def fit_structured(
     options: structured.StructuredPriors,
     free: EffectSet = EffectSet(),
 ) -> tuple[structured.Structured, EffectSet]:
-    """(Structured, EffectSet with the values of the linear effects `free`), fitted together to
-    Labels.
-    """
+    """Fit maps and the linear effects `free` together and return (Structured, EffectSet)."""
     model = structured.prepare(some, options, seed)
-    parts = [model.design(one.samples, one.error, one.looks) for one in some]
-    fields = ("phi", "a", "b", "dense", "y", "looks")
-    phi, a, b, dense, y, looks = (
+    parts = [model.design(one.samples, one.error, one.sample_weight) for one in some]
+    fields = ("phi", "a", "b", "dense", "y", "sample_weight")
+    phi, a, b, dense, y, sample_weight = (
         np.concatenate([getattr(part, name) for part in parts]) for name in fields
     )
     more = np.concatenate([physics.regressors(free, one.samples) for one in some])
-    design = linear.Design(phi, a, b, np.concatenate([dense, more], axis=1), y, looks)
-    posterior = linear.fit(design, len(model.site_ids), options.noise, physics.sizes(free))
+    design = linear.Design(phi, a, b, np.concatenate([dense, more], axis=1), y, sample_weight)
+    posterior = linear.fit(design, len(model.site_ids), options.noise, physics.prior_stds(free))
     model.set_posterior(posterior)
     own = model.link_columns
     return model, physics.with_values(
@@ -264,9 +299,9 @@ def _evaluate_effects(
     validation: list[Labels],
     growing: Sequence[Sequence[int]],
 ) -> tuple[LearningCurve, list[np.ndarray]]:
-    """(Learning curve over numbers of training flights, what is left of the errors of each
-    validation flight) of the effects of a Physics, which counts training flights first. growing :
-    as `_growing` gives.
+    """Return (learning curve, remaining errors of validation flights) of the effects.
+
+    `found` counts the training flights first.
     """
     curve: list[tuple[int, float, float]] = []
     for some in growing:
@@ -279,10 +314,8 @@ def _evaluate_effects(
     return _over_flights(curve), left
 
 
-def _growing(count: int, seed: int, curve: bool) -> list[list[int]]:
-    """Growing subsets of `count` flights, in random order, the last one all of them, which is the
-    only one without `curve`: lists of numbers.
-    """
+def _curve_subsets(count: int, seed: int, curve: bool) -> list[list[int]]:
+    """Return growing subsets of `count` flights in random order. The last one holds all of them."""
     order = np.random.default_rng(seed).permutation(count).tolist()
     if not curve:
         return [order]
@@ -295,8 +328,9 @@ def _growing(count: int, seed: int, curve: bool) -> list[list[int]]:
 def _deviation(
     left: Sequence[np.ndarray], explained: np.ndarray | float, validation: Sequence[Labels]
 ) -> float:
-    """Standard deviation of what is left of errors, without what maps explain, m^2, and what no
-    model of poses can know.
+    """Return the standard deviation of remaining errors, m.
+
+    The variance `explained` by the maps, m^2, and white noise are subtracted.
     """
     variance = (
         np.mean(np.concatenate(left) ** 2 - explained) - labelling.white_noise(validation) ** 2
@@ -310,7 +344,7 @@ def _rms(parts: Iterable[np.ndarray]) -> float:
 
 
 def _validity(learned_from: Sequence[Labels], features: Sequence[str]) -> dict[str, list[float]]:
-    """{feature: [lowest, highest, margin]} of Labels."""
+    """Return {feature: [lowest, highest, margin]} of labels."""
     limits = {}
     for names, more in ((_ATTITUDE, SLACK), (features, 0.0)):
         if not names:
@@ -322,17 +356,40 @@ def _validity(learned_from: Sequence[Labels], features: Sequence[str]) -> dict[s
 
 
 def save(result: Trained, folder: Path) -> tuple[Path | None, Path | None]:
-    """Write model.onnx and effects.yaml of a Trained, as far as it has them.
+    """Write model.onnx and effects.yaml as far as they exist, and return their paths or None.
 
-    Returns their paths, None for none.
+    Files of an earlier training are removed.
     """
     model, effects = folder / "model.onnx", folder / "effects.yaml"
     made = result.onnx()
     for path, content in ((model, made), (effects, result.effects)):
         if content is None:
-            path.unlink(missing_ok=True)  # or an earlier training's would be taken for ours
+            path.unlink(missing_ok=True)  # else a file of an earlier training would stay
     if made is not None:
         write_bytes(model, made.SerializeToString(deterministic=True))
     if result.effects is not None:
         result.effects.to_yaml(effects)
     return (model if made is not None else None), (effects if result.effects is not None else None)
+
+
+def plot_curve(
+    label: str,
+    x: Sequence[float],
+    training: Sequence[float],
+    validation: Sequence[float],
+    path: Path,
+) -> None:
+    """Draw the learning curve: RMS errors of training and validation flights, m.
+
+    `label` names the x axis: epochs or number of flights.
+    """
+    from ..scoring.plots import plt  # takes a second to import
+
+    figure, ax = plt.subplots(figsize=(7, 4), layout="constrained")
+    for name, errors in (("training", training), ("validation", validation)):
+        ax.plot(x, errors, "o-", ms=3, label=name)
+    ax.set(xlabel=label, ylabel="error of the TDOAs, RMS [m]")
+    ax.grid(alpha=0.3)
+    ax.legend()
+    write_filled(path, partial(figure.savefig, dpi=110))
+    plt.close(figure)

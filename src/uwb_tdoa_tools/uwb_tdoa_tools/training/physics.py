@@ -1,4 +1,4 @@
-"""Physical effects: what `diagnose` finds among the declared ones in the flights to train on."""
+"""Find the physical effects of the training flights, as `diagnose` does."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ..diagnosis.refinement import effects_of
 from ..diagnosis.regression.fit import refit
 from ..diagnosis.regression.terms import columns_of
 from ..diagnosis.validation import select_by_error
-from .labels import constellations, level
+from .labels import constellations, with_level_attitude
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -25,22 +25,29 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.effects import Samples
     from uwb_tdoa_bias.foundation.flight import Flight
 
-# What goes with the tag, the vehicle and the modules of the anchors to another installation.
+# effects of the tag, the vehicle and the anchor modules, valid in another installation
 PORTABLE = tuple(name for name, effect in EFFECTS.items() if effect.portable)
 
 
 @dataclass(frozen=True)
 class Physics:
-    """effects : EffectSet, fitted to all flights; attribution : where they come from, None where
-    their values are to stay.
+    """Hold the effects that were found.
+
+    Parameters
+    ----------
+    effects : EffectSet
+        Fitted to all flights.
+    attribution : Attribution or None
+        Its regression, or None to keep the values.
     """
 
     effects: EffectSet
     attribution: Attribution | None = None
 
     def fitted_to(self, flights: Iterable[int]) -> EffectSet:
-        """EffectSet of the same effects, fitted to the flights with these numbers alone; what
-        detectors found stays as it is.
+        """Return the same effects with values fitted to the flights of these numbers.
+
+        Effects of detectors keep their values.
         """
         if self.attribution is None:
             return self.effects
@@ -51,10 +58,8 @@ class Physics:
         return usable([*effects_of(replace(selection, fit=model)), *detected])
 
 
-def separate(effects: EffectSet) -> tuple[EffectSet, EffectSet]:
-    """(EffectSet of those with parameters in which the error of a TDOA is linear, EffectSet of the
-    others).
-    """
+def split_linear(effects: EffectSet) -> tuple[EffectSet, EffectSet]:
+    """Return (effects whose parameters change a TDOA linearly, other effects)."""
     linear = [
         bool(
             effect.fitted
@@ -71,22 +76,20 @@ def separate(effects: EffectSet) -> tuple[EffectSet, EffectSet]:
 
 
 def regressors(effects: EffectSet, samples: Samples) -> np.ndarray:
-    """Derivatives of the error of Samples by all parameters of linear effects, at zero: (n, k)."""
+    """Return the derivatives (n, k) of the errors by all parameters of linear effects, at zero."""
     parts = [type(effect)().regressors(samples, list(effect.values)) for effect in effects.effects]
     return np.concatenate([np.zeros((len(samples), 0)), *parts], axis=1)
 
 
-def sizes(effects: EffectSet) -> np.ndarray:
-    """Plausible sizes of all parameters, (k,), each in its unit: standard deviations of their
-    priors.
-    """
+def prior_stds(effects: EffectSet) -> np.ndarray:
+    """Return the standard deviations (k,) of the priors of all parameters, each in its unit."""
     return np.array(
         [effect.prior_std_of(key) for effect in effects.effects for key in effect.values]
     )
 
 
 def with_values(effects: EffectSet, values: np.ndarray, covariance: np.ndarray) -> EffectSet:
-    """The same effects with values (k,) of all parameters in turn, and their covariance (k, k)."""
+    """Return the effects with new values (k,) of all parameters, and their covariance (k, k)."""
     std, out, first = np.sqrt(np.diag(covariance)), [], 0
     for effect in effects.effects:
         rows = slice(first, first + len(effect.values))
@@ -98,14 +101,26 @@ def with_values(effects: EffectSet, values: np.ndarray, covariance: np.ndarray) 
     return EffectSet(tuple(out))
 
 
-def find(flights: Sequence[Flight], progress: Callable[[], object] = lambda: None) -> Physics:
-    """Physics of Flights with ground truth. progress() is called now and then.
+def find_effects(
+    flights: Sequence[Flight], progress: Callable[[], object] = lambda: None
+) -> Physics:
+    """Find the effects of flights with ground truth.
 
-    Of flights in one constellation, all that `diagnose` can name; of several, what goes from one to
-    the other (PORTABLE). An effect stays if it helps the likelihood of flights that it was not
-    fitted to, and the filter's error on them.
+    Flights of one constellation can have all effects of `diagnose`. Flights of several constellations can
+    have the PORTABLE ones. An effect stays if it improves the likelihood and the filter error on flights
+    that were excluded from its fit.
+
+    Parameters
+    ----------
+    flights : sequence of Flight
+    progress : callable
+        Called now and then.
+
+    Returns
+    -------
+    Physics
     """
-    flights, reference = [level(flight) for flight in flights], GroundTruth()
+    flights, reference = [with_level_attitude(flight) for flight in flights], GroundTruth()
     kinds = PORTABLE if len(constellations(flights)) > 1 else None
     attribution = attribute(flights, reference, kinds=kinds, undeclared=False, progress=progress)
     validated = select_by_error(attribution, flights, Baseline(EffectSet()), progress)

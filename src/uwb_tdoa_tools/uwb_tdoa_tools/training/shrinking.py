@@ -1,10 +1,9 @@
-"""The share of a correction that cross-validation over flights supports, and the gain that can be
-expected of it.
+"""Scale a correction to the share that cross-validation over flights supports.
 
-The flights are dealt to FOLDS; for each, a model is trained on the others, and the filter judges it
-there with several shares of its prediction. Whole flights: samples of one are too alike. The
-effects are those that were found in all flights, with values fitted to the others alone:
-`physics.find` has judged them on flights left out already.
+The flights are split into FOLDS. For each fold a model is trained on the other flights, and the filter
+runs with several shares of its prediction. Folds hold whole flights, since samples of one flight are
+correlated. The effects are those found in all flights. Their values are fitted without the fold.
+`physics.find_effects` has already validated them on excluded flights.
 """
 
 from __future__ import annotations
@@ -38,16 +37,25 @@ FOLDS = 5
 def cross_validated(
     recipe: Recipe,
     flights: Sequence[Flight],
-    plain: Mapping[str, float],
+    uncorrected_errors: Mapping[str, float],
     found: physics.Physics | None = None,
     progress: Callable[[str], object] = lambda text: None,
     map_function: MapFunction = map,
 ) -> Shrinkage:
-    """Shrinkage of the model of a Recipe trained on Flights.
+    """Return the Shrinkage of a recipe on flights.
 
-    plain : as `uncorrected` gives; found : Physics of these flights, in this order, for kinds with
-        effects;
-    map_function(function, folds) : as map, but for the time and the process in which each is done.
+    Parameters
+    ----------
+    recipe : Recipe
+    flights : sequence of Flight
+    uncorrected_errors : mapping
+        See `uncorrected`.
+    found : Physics, optional
+        Effects of these flights in this order, for kinds with effects.
+    progress : callable
+        Called with lines of text.
+    map_function : callable
+        Like `map`. It may use other processes.
     """
     order = np.random.default_rng(recipe.seed).permutation(len(flights))
     errors: dict[str, dict[float | None, float]] = {}
@@ -55,7 +63,7 @@ def cross_validated(
     rest = [[k for k in range(len(flights)) if k not in fold] for fold in folds]
     known = [found and physics.Physics(found.fitted_to(others)) for others in rest]
     for result in map_function(
-        partial(_left_out, recipe, flights, plain), list(zip(folds, rest, known))
+        partial(_left_out, recipe, flights, uncorrected_errors), list(zip(folds, rest, known))
     ):
         of_fold = {name: dict(pairs) for name, pairs in result.items()}
         for name, of in of_fold.items():
@@ -65,23 +73,22 @@ def cross_validated(
 
 
 def uncorrected(flights: Sequence[Flight], map_function: MapFunction = map) -> dict[str, float]:
-    """{name: 3D RMSE of the filter, m, from TDOAs and IMU alone} of Flights without any correction.
-    map_function : as of `cross_validated`.
-    """
+    """Return the 3D RMSE of the filter without correction, m, by flight name."""
     return {flight.name: error for error, flight in zip(map_function(_error, flights), flights)}
 
 
 def errors_by_share(
     flight: Flight,
-    plain: Mapping[str, float],
+    uncorrected_errors: Mapping[str, float],
     effects: EffectSet | None,
     network: Network | None,
     shares: Sequence[float] = SHARES,
 ) -> dict[float | None, float]:
-    """{share: 3D RMSE of the filter on a Flight, m, from TDOAs and IMU alone}, under None without
-    any correction, as `plain` says. Without a network there is one share, 1.
+    """Return the 3D RMSE of the filter, m, by share of the network.
+
+    The key None means no correction. Without a network the only share is 1.
     """
-    out: dict[float | None, float] = {None: plain[flight.name]}
+    out: dict[float | None, float] = {None: uncorrected_errors[flight.name]}
     if network is None:
         return out | {1.0: _error(flight, effects)}
     for share in shares:
@@ -98,17 +105,20 @@ def train(
     progress: Callable[[str], object] = lambda text: None,
     map_function: MapFunction = map,
 ) -> tuple[models.Trained, Shrinkage]:
-    """(Trained, Shrinkage): `models.train`, scaled to the share that cross-validation supports.
-    map_function : as of `cross_validated`.
+    """Train with `models.train` and set the share that cross-validation supports.
+
+    Returns
+    -------
+    tuple of Trained and Shrinkage
     """
     flights = [*training, *validation]
     found = None
     if recipe.kind.startswith("physics"):
         progress("looking for effects")
-        found = physics.find(flights)
+        found = physics.find_effects(flights)
     trained = models.train(recipe, training, validation, name, progress, found)
-    plain = uncorrected(flights, map_function)
-    shrinkage = cross_validated(recipe, flights, plain, found, progress, map_function)
+    uncorrected_errors = uncorrected(flights, map_function)
+    shrinkage = cross_validated(recipe, flights, uncorrected_errors, found, progress, map_function)
     if trained.model:
         trained = replace(trained, meta={**trained.meta, "share": shrinkage.share})
     return trained, shrinkage
@@ -117,11 +127,12 @@ def train(
 def _left_out(
     recipe: Recipe,
     flights: Sequence[Flight],
-    plain: Mapping[str, float],
+    uncorrected_errors: Mapping[str, float],
     fold: tuple[list[int], list[int], physics.Physics | None],
 ) -> dict[str, list[tuple[float | None, float]]]:
-    """{flight: [(share, 3D RMSE), ...]}, JSON, of a fold: (numbers of the flights left out, of the
-    others, Physics fitted to those or None).
+    """Return {flight: [(share, 3D RMSE in m), ...]} of a fold, for JSON.
+
+    `fold` holds the numbers of the excluded flights, of the other flights, and their Physics or None.
     """
     left_out, others, known = fold
     with temporary_folder() as folder:
@@ -132,7 +143,7 @@ def _left_out(
         model, _ = models.save(trained, folder)
         network = Network(model) if model else None
     errors = {
-        flights[k].name: errors_by_share(flights[k], plain, trained.effects, network)
+        flights[k].name: errors_by_share(flights[k], uncorrected_errors, trained.effects, network)
         for k in left_out
     }
     return {name: list(of_flight.items()) for name, of_flight in errors.items()}

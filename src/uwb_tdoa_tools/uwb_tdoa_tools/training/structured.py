@@ -1,18 +1,18 @@
-"""The error of a pair as the difference of two one-anchor errors: e_ab = g(b) - g(a).
+"""Model the error of a pair as the difference of two one-anchor errors: e_ab = g(b) - g(a).
 
-So it is antisymmetric, and carries over to pairs, protocols and numbers of anchors that were never
-seen. g of one anchor is the sum of
-- a map of this anchor over the position of the tag ("site"): reflections and shadows of the room,
-  and its own delay. It
-  belongs to an anchor at a place; when the anchor is moved, or unknown, it is gone;
-- maps over the distance and the direction of the anchor in the frame of the tag, and over the
-  distance and the
-  direction of the tag in the frame of the anchor if its orientation is known ("links"): the
-  antennas and the received power, the same for all anchors. In the power budget their gains add up,
-  so the two are summed, which carries over to combinations of directions that were never seen.
-All are Gaussian processes, on Nystroem features of some hundred centres (Williams and Seeger, NIPS
-2000), so that the fit is one linear regression, the standard deviation is its posterior's, and away
-from the training data the mean goes to zero and the deviation to the prior's by itself.
+The model is antisymmetric. It holds for pairs, protocols and numbers of anchors outside the training.
+g of an anchor is a sum of maps:
+
+- A "site" map over the position of the tag: reflections and shadows of the room, and the delay. It
+  belongs to an anchor at a place. It is zero for a moved or unknown anchor.
+- "Link" maps over distance and direction of the anchor in the frame of the tag. If orientations are
+  known, there is one over the direction of the tag in the frame of the anchor too. They model antennas
+  and received power and are shared by all anchors. Gains add up in the power budget, so both maps are
+  summed.
+
+All maps are Gaussian processes on Nystroem features of some hundred centres (Williams and Seeger, NIPS
+2000). The fit is one linear regression, and the standard deviation is that of its posterior. Away from
+the training data the mean tends to zero and the deviation to the prior.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from scipy.spatial.distance import cdist
 
 from uwb_tdoa_bias.correction.features import columns
 
-from . import export, linear
+from . import linear, network
 from .labels import SAME_PLACE, constellations
 
 if TYPE_CHECKING:
@@ -41,13 +41,12 @@ if TYPE_CHECKING:
     from .labels import Labels
 
 COARSE = 4.0  # ratio of the long to the short length of the site map
-NEAREST = 0.1  # m; all that is nearer counts as at this distance, which has a logarithm
+NEAREST = 0.1  # m; smaller distances are set to this value before the logarithm
 LINK_LENGTH = 0.5  # of the link maps, in unit vectors and logarithms of distance
-# directions of the posterior that the deviation is computed from; the others count as unknown
+# directions of the posterior that give the deviation; others count as unknown
 RANK = 64
-SITE_WEIGHTS = (
-    2400  # at most, of all sites together: memory and time of the fit grow with its square and cube
-)
+# limit for all sites together: memory and time of the fit grow with its square and cube
+SITE_WEIGHTS = 2400
 _DELTA = ("dx", "dy", "dz")
 _PLACE = ("x", "y", "z")
 _END = ("id", "x", "y", "z")
@@ -55,15 +54,22 @@ _END = ("id", "x", "y", "z")
 
 @dataclass(frozen=True)
 class StructuredPriors:
-    """Priors of the structured model; the defaults were chosen on the validation flights of
-    docs/bias.md.
+    """Set the priors of the structured model.
 
-    fine, coarse : m, standard deviation of the short and of the long part of a site map, before the
-        data scale both
-    length : (3,) m, over which its short part changes
-    link : m, standard deviation of each link map, before the data scale it
-    noise : m, scale of what no map explains
-    centres, link_centres : Nystroem centres of the site maps and of each link map, at most
+    The defaults were chosen on the validation flights of docs/bias.md.
+
+    Parameters
+    ----------
+    fine, coarse : float
+        Standard deviations of the short and the long part of a site map, m. The data scale both.
+    length : tuple
+        Length scale of the short part (3,), m.
+    link : float
+        Standard deviation of each link map, m. The data scale it.
+    noise : float
+        Scale of the remaining errors, m.
+    centres, link_centres : int
+        Largest number of Nystroem centres of a site map and of a link map.
     """
 
     fine: float = 0.1
@@ -77,9 +83,18 @@ class StructuredPriors:
 
 @dataclass(frozen=True)
 class Map:
-    """Nystroem features of a kernel: centres (m, k) of scaled inputs; whiten (m, m), kernel values
-    to features; amplitudes and lengths of the exponentials that the kernel is the sum of; squared:
-    Gaussians instead.
+    """Compute Nystroem features of a kernel.
+
+    Parameters
+    ----------
+    centres : numpy.ndarray
+        Centres (m, k) in scaled inputs.
+    whiten : numpy.ndarray
+        From kernel values to features (m, m).
+    amplitudes, lengths : tuple
+        Of the exponentials that add up to the kernel.
+    squared : bool
+        Gaussians instead of exponentials.
     """
 
     centres: np.ndarray
@@ -90,23 +105,23 @@ class Map:
 
     @property
     def variance(self) -> float:
-        """Of the process at one point, m^2."""
+        """Return the prior variance at one point, m^2."""
         return float(sum(a**2 for a in self.amplitudes))
 
     def scaled(self, factor: float) -> Map:
-        """The Map of a process `factor` times as large."""
+        """Return the map of a process that is `factor` times as large."""
         return replace(
             self, whiten=self.whiten / factor, amplitudes=tuple(factor * a for a in self.amplitudes)
         )
 
     def kernel(self, x: np.ndarray) -> np.ndarray:
-        """Kernel values between scaled inputs (n, k) and the centres: (n, m)."""
+        """Return kernel values (n, m) between scaled inputs (n, k) and the centres."""
         far = cdist(x, self.centres)
         parts = (-0.5 * (far / s) ** 2 if self.squared else -far / s for s in self.lengths)
         return sum(a**2 * np.exp(part) for a, part in zip(self.amplitudes, parts))
 
     def features(self, x: np.ndarray) -> np.ndarray:
-        """(n, m), uncorrelated and of unit variance under the prior."""
+        """Return features (n, m), uncorrelated with unit variance under the prior."""
         return self.kernel(x) @ self.whiten
 
 
@@ -118,7 +133,7 @@ def make_map(
     squared: bool,
     seed: int,
 ) -> Map:
-    """Map with up to `count` centres spread over the scaled inputs x (n, k)."""
+    """Return a map with up to `count` centres spread over the scaled inputs x (n, k)."""
     rng = np.random.default_rng(seed)
     some = x[rng.choice(len(x), min(len(x), 5000), replace=False)]
     centres, _ = kmeans2(some, min(count, len(some)), minit="++", seed=seed)
@@ -130,15 +145,22 @@ def make_map(
 
 
 class Structured:
-    """The model; `prepare` makes one without weights, `set_posterior` gives it them."""
+    """Predict errors from site and link maps. `prepare` and `set_posterior` make it."""
 
     validity_features = ()  # it fades over positions by itself
 
     def __init__(
         self, options: StructuredPriors, site: Map, site_ids: np.ndarray, site_positions: np.ndarray
     ) -> None:
-        """site : Map over scaled positions; site_ids (s,), site_positions (s, 3) m : the anchors
-        and where they stand.
+        """Store the site map.
+
+        Parameters
+        ----------
+        options : StructuredPriors
+        site : Map
+            Over scaled positions.
+        site_ids, site_positions : numpy.ndarray
+            Ids (s,) and positions (s, 3), m, of the anchors.
         """
         self.options, self.site, self.site_ids, self.site_positions = (
             options,
@@ -146,16 +168,16 @@ class Structured:
             site_ids,
             site_positions,
         )
-        # "T": Map as the tag sees the anchor, "A": as the anchor sees the tag; empty if not told
-        # apart
+        # "T": direction of the anchor in the frame of the tag, "A": the opposite. Empty for one place
         self.links: dict[str, Map] = {}
-        self.floor = 0.0  # m, standard deviation of what remains where everything is known
+        self.floor = 0.0  # m, standard deviation of the remaining error
 
     def design(
-        self, samples: Samples, error: np.ndarray | None = None, looks: float = 1.0
+        self, samples: Samples, error: np.ndarray | None = None, sample_weight: float = 1.0
     ) -> linear.Design:
-        """linear.Design of Samples: the sites of their anchors, one behind the last for those at
-        none, and the link maps as dense part.
+        """Return the design of samples.
+
+        Anchors at no known site get the row after the last. Link maps are the dense part.
         """
         phi = self.site.features(samples.p / self.options.length)
         a, b = (self._site_of(samples.anchors)[rows] for rows in (samples.a, samples.b))
@@ -165,7 +187,12 @@ class Structured:
             dense.append(other - one)
         y = np.zeros(len(samples)) if error is None else error
         return linear.Design(
-            phi, a, b, np.concatenate(dense, axis=1), y, np.broadcast_to(looks, len(samples))
+            phi,
+            a,
+            b,
+            np.concatenate(dense, axis=1),
+            y,
+            np.broadcast_to(sample_weight, len(samples)),
         )
 
     def _site_of(self, anchors: Anchors) -> np.ndarray:
@@ -173,10 +200,10 @@ class Structured:
         far[anchors.ids[:, None] != self.site_ids] = np.inf
         return np.argmin(
             np.column_stack([far, np.full(len(far), SAME_PLACE)]), axis=1
-        )  # the last: none is so near
+        )  # the last row: no site is near
 
     def set_posterior(self, posterior: linear.Posterior) -> None:
-        """Take over weights and the sizes of the priors."""
+        """Store the weights and the sizes of the priors."""
         s = posterior.site_std
         self.site = self.site.scaled(s)
         self.weights, self.site_covariance = posterior.site / s, posterior.site_covariance / s**2
@@ -191,27 +218,27 @@ class Structured:
 
     @property
     def sees_attitude(self) -> bool:
-        """Whether the mean depends on how the tag is turned."""
+        """Return whether the prediction depends on the attitude of the tag."""
         return bool(self.links)
 
     @property
     def link_columns(self) -> int:
-        """How many dense columns of `design` there are."""
+        """Return the number of dense columns of `design`."""
         return sum(link.whiten.shape[1] for link in self.links.values())
 
     @property
     def prior(self) -> float:
-        """Variance of the error of one arrival where nothing is known, m^2."""
+        """Return the prior variance of the error of one arrival, m^2."""
         return self.site.variance + sum(link.variance for link in self.links.values())
 
     def mean(self, samples: Samples) -> np.ndarray:
-        """Predicted error of Samples, (n,) m."""
+        """Return the predicted errors (n,), m."""
         sites = np.vstack([self.weights, np.zeros(self.weights.shape[1])])
         links = np.concatenate([np.zeros(0), *(self.link_weights[viewer] for viewer in self.links)])
         return linear.predict(self.design(samples), sites, links)
 
     def variance(self, samples: Samples) -> np.ndarray:
-        """Of the maps, for Samples: (n,) m^2, without the floor."""
+        """Return the variance of the maps (n,), m^2, without the floor."""
         phi = self.site.features(samples.p / self.options.length)
         known, sites = _quadratic(phi, self.site_covariance), self._site_of(samples.anchors)
         at_site = sites < len(self.site_ids)
@@ -235,17 +262,13 @@ class Structured:
         return [*sites, *(f"{name}_{side}" for name in _DELTA if self.links), *angles]
 
     def inputs(self) -> list[str]:
-        """Names of the features that the network is fed, in order: those of one end, then those of
-        the other.
-        """
+        """Return the names of the input features of one end, then of the other."""
         return [name for side in "ab" for name in self._end_inputs(side)]
 
     def onnx(self, meta: Mapping[str, Any]) -> ModelProto:
-        """The onnx.ModelProto: bias, standard deviation, share of what can be known. meta : further
-        metadata.
-        """
-        graph, names = export.GraphBuilder(), self.inputs()
-        end = graph.rows(graph.input, len(names) // 2)  # (2n, ...): what follows is said of one end
+        """Return the ONNX model with the outputs bias, standard deviation and known share."""
+        graph, names = network.GraphBuilder(), self.inputs()
+        end = graph.rows(graph.input, len(names) // 2)  # (2n, ...): each row is one end
         maps = [self._site_graph(graph, end)] if len(self.site_ids) else []
         maps += [self._link_graph(graph, end)] if self.links else []
         means, explained = zip(*maps)
@@ -263,8 +286,8 @@ class Structured:
         }
         return graph.model(len(names), [bias, std, known], meta)
 
-    def _site_graph(self, graph: export.GraphBuilder, end: str) -> tuple[str, str]:
-        """(mean, variance explained) by the site maps, each (2n, 1). end : features of one end."""
+    def _site_graph(self, graph: network.GraphBuilder, end: str) -> tuple[str, str]:
+        """Return (mean, explained variance) of the site maps, each (2n, 1), from features of one end."""
         place, who, where = (graph.take(end, some) for some in ([0, 1, 2], [3], [4, 5, 6]))
         place = graph.op("Div", place, [self.options.length])
         far = graph.op("Sqrt", graph.distance2(place, self.site.centres))
@@ -274,7 +297,7 @@ class Structured:
         )
         other = graph.op(
             "Mul", graph.op("Abs", graph.op("Sub", who, self.site_ids[None])), [1e3]
-        )  # ids count as far
+        )  # another id counts as far away
         far = graph.op("Add", graph.distance2(where, self.site_positions), other)
         here = graph.op("Exp", graph.op("Mul", far, [-0.5 / SAME_PLACE**2]))  # (2n, sites)
         weights = graph.op("MatMul", here, self.weights @ self.site.whiten.T)
@@ -282,12 +305,12 @@ class Structured:
         known = _power(graph, values, _known_directions(self.site, self.site_covariance))
         return graph.row_sum(graph.op("Mul", weights, values)), graph.op("Mul", at_site, known)
 
-    def _link_graph(self, graph: export.GraphBuilder, end: str) -> tuple[str, str]:
-        """(mean, variance explained) by the link maps together, each (2n, 1).
+    def _link_graph(self, graph: network.GraphBuilder, end: str) -> tuple[str, str]:
+        """Return (mean, explained variance) of the link maps, each (2n, 1).
 
-        A Gaussian of the distance of x = (log distance, unit vector) from a centre c is an
-        exponential of what is linear in x and |x|^2 = (log distance)^2 + 1, so that one matrix
-        product serves all centres.
+        The input x is the log distance and a unit vector. A Gaussian of the distance to a centre c is an
+        exponential of a linear function of x and |x|^2 = (log distance)^2 + 1. One matrix product therefore
+        serves all centres.
         """
         n = len(self.links)
         first = (
@@ -317,15 +340,20 @@ class Structured:
 
 
 def _quadratic(phi: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Variance of each row of phi (n, m) times weights with a covariance (m, m): (n,)."""
+    """Return the variance (n,) of phi (n, m) times weights with a covariance (m, m)."""
     return np.einsum("ni,ni->n", phi @ covariance, phi)
 
 
 def link_inputs(samples: Samples, side: str, viewer: str) -> np.ndarray:
-    """Inputs of a link map: logarithm of the distance, unit vector to the other end as the viewer
-    sees it. (n, 4).
+    """Return the inputs (n, 4) of a link map: log distance and unit vector to the other end.
 
-    side : "a" or "b"; viewer : "T", tag or "A", anchor.
+    Parameters
+    ----------
+    samples : Samples
+    side : str
+        "a" or "b".
+    viewer : str
+        "T" for the tag or "A" for the anchor.
     """
     names = [f"{name}_{side}" for name in (*_DELTA, f"azimuth_{viewer}", f"elevation_{viewer}")]
     dx, dy, dz, azimuth, elevation = columns(samples, names).T
@@ -336,22 +364,20 @@ def link_inputs(samples: Samples, side: str, viewer: str) -> np.ndarray:
 
 
 def _known_directions(of: Map, covariance: np.ndarray) -> np.ndarray:
-    """Of the kernel values of a Map (m,), the RANK directions that the data determine best, as
-    large as what they determine: (m, RANK).
-    """
+    """Return the RANK directions (m, RANK) of kernel values that the data determine best."""
     share, vector = np.linalg.eigh(np.eye(len(covariance)) - covariance)
     leading = np.argsort(share)[::-1][:RANK]
     return of.whiten @ (vector[:, leading] * np.sqrt(np.maximum(share[leading], 0.0)))
 
 
-def _power(graph: export.GraphBuilder, values: str, directions: np.ndarray) -> str:
-    """Sum of the squares of values (n, m) along directions (m, k): (n, 1)."""
+def _power(graph: network.GraphBuilder, values: str, directions: np.ndarray) -> str:
+    """Return the sum of squares (n, 1) of values (n, m) along directions (m, k)."""
     part = graph.op("MatMul", values, directions)
     return graph.row_sum(graph.op("Mul", part, part))
 
 
 def prepare(all_labels: Sequence[Labels], options: StructuredPriors, seed: int) -> Structured:
-    """Structured without weights: sites, centres and kernels for a list of Labels."""
+    """Return a model without weights: sites, centres and kernels for labels."""
     ids: list[int] = []
     positions: list[np.ndarray] = []
     for one in all_labels:
@@ -365,7 +391,7 @@ def prepare(all_labels: Sequence[Labels], options: StructuredPriors, seed: int) 
     centres = min(options.centres, SITE_WEIGHTS // len(ids))
     site = make_map(places, centres, (options.fine, options.coarse), (1.0, COARSE), False, seed)
     model = Structured(options, site, np.array(ids, dtype=float), np.array(positions))
-    if len(constellations(all_labels)) > 1:  # in one alone, place and direction are the same thing
+    if len(constellations(all_labels)) > 1:  # in a single one, place and direction are equivalent
         oriented = all(np.isfinite(one.anchors.orientations).all() for one in all_labels)
         for viewer in "TA" if oriented else "T":
             inputs = np.concatenate(

@@ -1,3 +1,5 @@
+"""The network of Zhao et al."""
+
 from dataclasses import replace
 
 import numpy as np
@@ -8,7 +10,7 @@ from uwb_tdoa_bias.correction.features import FEATURES
 from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_tools.training import paper
+from uwb_tdoa_tools.training import network
 from uwb_tdoa_tools.training.labels import labels, thinned
 
 
@@ -21,13 +23,13 @@ def data():
 
 def test_learns_stops_early_and_says_the_same_as_its_file(data, tmp_path):
     epochs = []
-    model, (training, validation) = paper.fit(
+    model, (training, validation) = network.fit(
         *data, True, 1, lambda epoch, error: epochs.append(error)
     )
     assert epochs == validation and len(training) == len(validation)
     assert model.names == FEATURES and len(FEATURES) == 14
     best = int(np.argmin(validation))
-    assert len(validation) in (best + 1 + paper.PATIENCE, paper.MOST_EPOCHS)
+    assert len(validation) in (best + 1 + network.PATIENCE, network.MOST_EPOCHS)
     (held,) = data[1]
     error = held.error - model.mean(held.samples)
     assert np.sqrt(np.mean(error**2)) == pytest.approx(
@@ -45,7 +47,7 @@ def test_learns_stops_early_and_says_the_same_as_its_file(data, tmp_path):
 
 
 def test_the_seed_decides(data):
-    models, curves = zip(*(paper.fit(*data, False, seed) for seed in (0, 0, 1)))
+    models, curves = zip(*(network.fit(*data, False, seed) for seed in (0, 0, 1)))
     assert curves[0] == curves[1] != curves[2]
     assert [name for name in FEATURES if name not in models[0].names] == [
         "azimuth_A_a",
@@ -59,4 +61,4 @@ def test_needs_orientations_of_anchors():
     blind = flight()
     blind = replace(blind, anchors=Anchors.from_positions(blind.anchors.positions))
     with pytest.raises(InputError, match="anchor 0 has no orientation"):
-        paper.fit([labels(without_attitude(blind))], [labels(blind)], True, 0)
+        network.fit([labels(without_attitude(blind))], [labels(blind)], True, 0)

@@ -1,4 +1,4 @@
-"""Another filter to fly by: a tiny library, compiled here, that stays where it was told to be."""
+"""A peer as estimate: a tiny library that is compiled here and returns its start."""
 
 import ctypes
 import shutil
@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_tools.flying import peer
-from uwb_tdoa_tools.flying.path import Circles
+from uwb_tdoa_tools.flying import estimates
+from uwb_tdoa_tools.flying.mission import Circles
 from uwb_tdoa_tools.flying.trial import Task, fly
 from uwb_tdoa_tools.flying.verdict import verdict_of
 from uwb_tdoa_tools.flying.world import HALL
@@ -47,7 +47,7 @@ void tdoa_peer_state(double *at, double *v, double *q) {
 """
 
 
-def built(folder, source=SOURCE, version=peer.VERSION):
+def built(folder, source=SOURCE, version=estimates.VERSION):
     """Path of a library."""
     (folder / "peer.c").write_text(source.replace("VERSION", str(version)))
     subprocess.run(
@@ -61,7 +61,7 @@ def test_it_is_flown_by_and_judged_like_ours(tmp_path):
     """It says that it stands on the floor while it climbs: the vehicle goes up and up."""
     library = built(tmp_path, SOURCE + STATE)
     flown = fly(
-        Task(HALL, seed=2, told="place", peer=str(library), path=Circles(turns=1, turn_time=4.0))
+        Task(HALL, seed=2, given="place", peer=str(library), path=Circles(turns=1, turn_time=4.0))
     )
     place = flown.odometry.p[0]
     assert np.linalg.norm(place - flown.states[0, :3]) < 0.5 and (flown.odometry.p == place).all()
@@ -97,13 +97,13 @@ def test_one_whose_estimate_becomes_no_number_in_flight_is_lost_and_ends_nothing
         Task(
             HALL,
             seed=2,
-            told="place",
+            given="place",
             peer=str(built(tmp_path, SOURCE + ends)),
             path=Circles(turns=1, turn_time=4.0),
         )
     )
     assert (
-        verdict_of(flown)["said_lost"] is not None
+        verdict_of(flown)["reported_lost"] is not None
         and not verdict_of(flown)["landed"]
         and np.isnan(flown.odometry.p[-1]).all()
     )
@@ -115,7 +115,7 @@ def test_what_a_library_remembers_of_one_flight_is_not_in_the_next(tmp_path):
         "++calls; }"
     )
     library = built(tmp_path, SOURCE + counting)
-    first, second = peer.Peer(library, own=True), peer.Peer(library, own=True)
+    first, second = estimates.Peer(library, own=True), estimates.Peer(library, own=True)
     assert [one.state()[0][0] for one in (first, first, second)] == [1.0, 2.0, 1.0]
 
 
@@ -130,20 +130,20 @@ def test_libraries_that_are_none(tmp_path):
     with pytest.raises(
         InputError, match="nowhere.so cannot be loaded as a shared library .*; build it anew"
     ):
-        peer.Peer(tmp_path / "nowhere.so")
+        estimates.Peer(tmp_path / "nowhere.so")
     (tmp_path / "text.so").write_text("no library")
     with pytest.raises(InputError, match="text.so cannot be loaded"):
-        peer.Peer(tmp_path / "text.so")
+        estimates.Peer(tmp_path / "text.so")
     with pytest.raises(InputError, match="is of version 7 of the interface, this is 1"):
-        peer.Peer(built(tmp_path, version=7))
+        estimates.Peer(built(tmp_path, version=7))
     (tmp_path / "less").mkdir()
     with pytest.raises(InputError, match="does not export tdoa_peer_position; add it"):
-        peer.Peer(built(tmp_path / "less", SOURCE.replace("tdoa_peer_position", "position")))
+        estimates.Peer(built(tmp_path / "less", SOURCE.replace("tdoa_peer_position", "position")))
 
 
 def test_the_documented_interface_is_the_one_that_is_called():
     page = (ROOT / "docs" / "speed.md").read_text()
-    declared = [line for line in peer.__doc__.splitlines() if line.startswith("    ")]
+    declared = [line for line in estimates.__doc__.splitlines() if line.startswith("    ")]
     assert len(declared) == 6 and all(
         line.strip().partition(";  ")[0].split("(")[0] in page for line in declared
     )

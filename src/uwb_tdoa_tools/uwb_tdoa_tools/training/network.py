@@ -1,0 +1,256 @@
+"""Write ONNX graphs, and train the network of Zhao et al. (RA-L 2021).
+
+The network has three layers of 30 neurons, with or without the orientations of the anchors. As
+published (section V-B), inputs are scaled, and mini-batch gradient descent minimizes squared errors.
+It stops if the validation error has not fallen for five epochs in a row. The standard deviation is
+that on the validation flights.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from onnx import NodeProto, TensorProto, checker, helper, numpy_helper
+from sklearn.neural_network import MLPRegressor
+
+from uwb_tdoa_bias.correction.features import FEATURES, columns
+from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.version import version
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Mapping, Sequence
+
+    from numpy.typing import ArrayLike
+    from onnx import ModelProto
+
+    from uwb_tdoa_bias.effects import Samples
+
+    from .labels import Labels
+
+
+OPSET, IR_VERSION = 13, 8  # `trial.py` lists the operators of this version
+
+
+class GraphBuilder:
+    """Build an ONNX graph from plain operators.
+
+    Values are names of tensors. Tensors are (n, k) of float unless stated otherwise.
+    """
+
+    def __init__(self) -> None:
+        self._nodes: list[NodeProto] = []
+        self._constants: list[TensorProto] = []
+        self.input = "features"
+
+    def constant(self, value: ArrayLike, kind: type[np.generic] = np.float32) -> str:
+        """Add a constant tensor."""
+        self._constants.append(
+            numpy_helper.from_array(np.asarray(value, dtype=kind), f"c{len(self._constants)}")
+        )
+        return self._constants[-1].name
+
+    def op(self, kind: str, *inputs: Any, **attributes: Any) -> str:
+        """Append an operator and return the name of its output.
+
+        Inputs that are no names become constants.
+        """
+        names = [value if isinstance(value, str) else self.constant(value) for value in inputs]
+        self._nodes.append(helper.make_node(kind, names, [f"v{len(self._nodes)}"], **attributes))
+        return self._nodes[-1].output[0]
+
+    def take(self, value: str, columns: Iterable[int]) -> str:
+        """Select columns."""
+        return self.op("Gather", value, self.constant(list(columns), np.int64), axis=1)
+
+    def rows(self, value: str, width: int) -> str:
+        """Reshape to rows of another width, with the same order of numbers."""
+        return self.op("Reshape", value, self.constant([-1, width], np.int64))
+
+    def total(self, values: Sequence[str]) -> str:
+        """Sum tensors of one shape."""
+        return values[0] if len(values) == 1 else self.op("Sum", *values)
+
+    def row_sum(self, value: str) -> str:
+        """Sum along each row: (n, 1)."""
+        return self.op("ReduceSum", value, self.constant([1], np.int64), keepdims=1)
+
+    def distance2(self, points: str, centres: np.ndarray) -> str:
+        """Return squared distances (n, m) from points (n, k) to fixed centres (m, k)."""
+        cross = self.op("MatMul", points, -2.0 * centres.T)
+        own = self.row_sum(self.op("Mul", points, points))
+        far = self.op("Add", self.op("Add", cross, own), np.sum(centres**2, axis=1)[None])
+        return self.op("Max", far, [0.0])
+
+    def model(self, width: int, outputs: Sequence[str], meta: Mapping[str, Any]) -> ModelProto:
+        """Return the ONNX model.
+
+        Parameters
+        ----------
+        width : int
+            Number of input columns.
+        outputs : sequence of str
+            Tensors (n, 1) that are concatenated as output.
+        meta : mapping
+            Metadata, stored as JSON.
+        """
+        self._nodes.append(helper.make_node("Concat", outputs, ["bias"], axis=1))
+        graph = helper.make_graph(
+            self._nodes,
+            "bias",
+            [helper.make_tensor_value_info(self.input, TensorProto.FLOAT, ["n", width])],
+            [helper.make_tensor_value_info("bias", TensorProto.FLOAT, ["n", len(outputs)])],
+            self._constants,
+        )
+        about = {"producer_name": "uwb_tdoa", "producer_version": version()}
+        made = helper.make_model(
+            graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION, **about
+        )
+        helper.set_model_props(made, {key: json.dumps(value) for key, value in meta.items()})
+        checker.check_model(made)
+        return made
+
+
+pass
+
+
+LAYERS = (30, 30, 30)
+PATIENCE, MOST_EPOCHS = 5, 200
+BATCH, RATE = 64, 0.005
+WITHOUT = tuple(name for name in FEATURES if "_A_" not in name)  # without anchor orientations
+
+
+class Paper:
+    """Hold the fitted network of the paper, see `fit`."""
+
+    sees_attitude = True
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        offset: np.ndarray,
+        scale: np.ndarray,
+        layers: list[tuple[np.ndarray, np.ndarray]],
+        std: float,
+    ) -> None:
+        """Store the network.
+
+        Parameters
+        ----------
+        names : sequence of str
+            Features.
+        offset, scale : numpy.ndarray
+            Scaling of the features (k,).
+        layers : list
+            (weights (i, o), biases (o,)) of each layer.
+        std : float
+            Standard deviation, m.
+        """
+        self.names, self.offset, self.scale, self.layers, self.std = (
+            names,
+            offset,
+            scale,
+            layers,
+            std,
+        )
+        self.validity_features = tuple(name for name in names if name[0] == "d")
+
+    def mean(self, samples: Samples) -> np.ndarray:
+        """Return the predicted errors (n,), m."""
+        x = (columns(samples, self.names) - self.offset) / self.scale
+        for k, (weights, biases) in enumerate(self.layers):
+            x = x @ weights + biases
+            x = np.maximum(x, 0.0) if k < len(self.layers) - 1 else x
+        return x[:, 0]
+
+    def onnx(self, meta: Mapping[str, Any]) -> ModelProto:
+        """Return the ONNX model with the outputs bias and standard deviation."""
+        graph = GraphBuilder()
+        x = graph.input
+        for k, (weights, biases) in enumerate(self.layers):
+            x = graph.op("Gemm", x, weights, biases)
+            x = graph.op("Relu", x) if k < len(self.layers) - 1 else x
+        std = graph.op("Add", graph.op("Mul", x, [0.0]), [self.std])
+        meta = {
+            **meta,
+            "features": list(self.names),
+            "offset": self.offset.tolist(),
+            "scale": self.scale.tolist(),
+        }
+        return graph.model(len(self.names), [x, std], meta)
+
+
+def fit(
+    training: Sequence[Labels],
+    validation: Sequence[Labels],
+    orientations: bool,
+    seed: int,
+    progress: Callable[[int, float], object] = lambda epoch, error: None,
+) -> tuple[Paper, tuple[list[float], list[float]]]:
+    """Train the network of the paper.
+
+    Parameters
+    ----------
+    training, validation : sequence of Labels
+    orientations : bool
+        Use the orientations of the anchors.
+    seed : int
+    progress : callable
+        Called with epoch and validation error, m.
+
+    Returns
+    -------
+    tuple
+        Paper, and RMS errors per epoch of training and validation, m.
+
+    Raises
+    ------
+    InputError
+        If an anchor has no orientation but the model needs it.
+    """
+    names = FEATURES if orientations else WITHOUT
+    if orientations:
+        for one in (*training, *validation):
+            blind = one.anchors.ids[~np.isfinite(one.anchors.orientations).all(axis=1)]
+            if len(blind):
+                raise InputError(
+                    f"{one.name}: anchor {blind[0]} has no orientation, which this model "
+                    "needs; survey it, or train "
+                    "paper_no_orientation or structured."
+                )
+    (x, y), (x_held, y_held) = (_table(group, names) for group in (training, validation))
+    low, high = x.min(axis=0), x.max(axis=0)
+    offset, scale = 0.5 * (low + high), np.maximum(0.5 * (high - low), 1e-6)
+    x, x_held = (x - offset) / scale, (x_held - offset) / scale
+    network = MLPRegressor(
+        hidden_layer_sizes=LAYERS,
+        solver="sgd",
+        batch_size=BATCH,
+        learning_rate_init=RATE,
+        random_state=seed,
+    )
+    curve: tuple[list[float], list[float]] = ([], [])
+    best: tuple[float, tuple[list[np.ndarray], list[np.ndarray]]] | None = None
+    since = 0
+    for epoch in range(MOST_EPOCHS):
+        network.partial_fit(x, y)
+        for errors, inputs, outputs in zip(curve, (x, x_held), (y, y_held)):
+            errors.append(float(np.sqrt(np.mean((network.predict(inputs) - outputs) ** 2))))
+        progress(epoch, curve[1][-1])
+        if best is None or curve[1][-1] < best[0]:
+            best, since = (curve[1][-1], copy.deepcopy((network.coefs_, network.intercepts_))), 0
+        else:
+            since += 1
+            if since == PATIENCE:
+                break
+    assert best is not None  # after one epoch at least
+    return Paper(names, offset, scale, list(zip(*best[1])), best[0]), curve
+
+
+def _table(group: Sequence[Labels], names: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
+    return (
+        np.concatenate([columns(one.samples, names) for one in group]),
+        np.concatenate([one.error for one in group]),
+    )
