@@ -14,7 +14,7 @@ from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.checking.recording import of_flight, read_live, read_recording
 from uwb_tdoa_tools.checking.wiring import RULES
 from uwb_tdoa_tools.commands.check import main
-from uwb_tdoa_tools.live.ends import End
+from uwb_tdoa_tools.live.record import End
 from uwb_tdoa_tools.readers.inputs import Reading
 
 IMU, TDOA = "sensor_msgs/msg/Imu", "uwb_tdoa_msgs/msg/Tdoa"
@@ -130,7 +130,7 @@ def process():
 def test_live_topics_of_a_faulty_driver(tmp_path, process, capsys, monkeypatch):
     pytest.importorskip("uwb_tdoa_msgs.msg")
     process(sys.executable, "-c", FAULTY)
-    listen = pytest.importorskip("uwb_tdoa_tools.live.listen")
+    listen = pytest.importorskip("uwb_tdoa_tools.live.record")
     monkeypatch.setattr(listen, "FIRST_LIMIT", 180.0)
     out = tmp_path / "live.json"
     code = main(
@@ -165,7 +165,7 @@ def test_what_is_live_is_judged_as_what_is_recorded(tmp_path, process, monkeypat
     say the same.
     """
     pytest.importorskip("uwb_tdoa_msgs.msg")
-    listen = pytest.importorskip("uwb_tdoa_tools.live.listen")
+    listen = pytest.importorskip("uwb_tdoa_tools.live.record")
     monkeypatch.setattr(listen, "FIRST_LIMIT", 180.0)
     flight = small_flight(4.0)
     write_bag(flight, tmp_path / "flight.bag")
@@ -196,7 +196,7 @@ def test_what_is_live_is_judged_as_what_is_recorded(tmp_path, process, monkeypat
 
 
 def test_nobody_publishes(capsys, monkeypatch):
-    listen = pytest.importorskip("uwb_tdoa_tools.live.listen")
+    listen = pytest.importorskip("uwb_tdoa_tools.live.record")
     monkeypatch.setattr(listen, "FIRST_LIMIT", 0.3)
     assert main(["--live", "3", "--namespace", "nowhere"]) == 2
     assert "no message on /nowhere/uwb/tdoa" in capsys.readouterr().err

@@ -7,8 +7,8 @@ import time
 
 import pytest
 
-from uwb_tdoa_tools import parallel, progress
-from uwb_tdoa_tools.progress import Progress
+from uwb_tdoa_tools import parallel
+from uwb_tdoa_tools.parallel import Progress
 
 
 class Lines(io.StringIO):
@@ -32,7 +32,7 @@ class Terminal(Lines):
 @pytest.fixture
 def often(monkeypatch):
     for name in ("FIRST", "EVERY", "OFTEN"):
-        monkeypatch.setattr(progress, name, 0.01)
+        monkeypatch.setattr(parallel, name, 0.01)
 
 
 def test_it_says_what_is_done_and_how_much_though_nobody_calls_it(often):
@@ -47,7 +47,7 @@ def test_it_says_what_is_done_and_how_much_though_nobody_calls_it(often):
 
 def test_short_work_says_nothing(monkeypatch):
     monkeypatch.setattr(
-        progress, "FIRST", 600.0
+        parallel, "FIRST", 600.0
     )  # beside which it is short on a loaded machine, too
     lines = Lines(1)
     with Progress("weigh", stream=lines):
@@ -56,7 +56,7 @@ def test_short_work_says_nothing(monkeypatch):
 
 
 def test_what_a_user_waits_for_is_said_in_time():
-    assert progress.FIRST <= 2.0 and progress.EVERY <= 5.0
+    assert parallel.FIRST <= 2.0 and parallel.EVERY <= 5.0
 
 
 @pytest.mark.parametrize("total", [None, 4])

@@ -16,6 +16,8 @@ from pathlib import Path
 import tempfile
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.files import keeping, refuse_output
 
@@ -111,3 +113,20 @@ def _check_writable(path: Path, folder: Path) -> None:
         raise InputError(
             f"{path}: cannot be written ({error.strerror}: {folder}); give another place."
         ) from error
+
+
+def as_json(value: Any) -> Any:
+    """A value, or dicts and sequences of values, as JSON has them: NaN and infinity are null,
+    arrays lists.
+    """
+    if isinstance(value, dict):
+        return {str(key): as_json(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return [as_json(item) for item in value]
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value)
+    if isinstance(value, (int, np.integer)):
+        return int(value)
+    if isinstance(value, (float, np.floating)):
+        return float(value) if np.isfinite(value) else None
+    return value

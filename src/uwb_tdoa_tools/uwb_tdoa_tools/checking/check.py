@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.foundation.anchors import Anchors
 
-    from ..live.ends import End
+    from ..live.record import End
     from .recording import Recording
     from .survey_fit import SurveyFit
     from .tdoa_rules import Survey

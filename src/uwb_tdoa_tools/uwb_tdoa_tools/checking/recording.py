@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from ..bags.bag import TopicMessages
     from ..bags.placing import Place
     from ..clock import Jump
-    from ..live.ends import End
+    from ..live.record import End
     from ..readers.inputs import Reading
 
 IMU, TDOA = "imu/data", "uwb/tdoa"
@@ -106,7 +106,7 @@ def read_live(
     """Recording of live topics, named as a Reading says, for so many seconds. say(sentence) :
     called with what happens. Raises InputError.
     """
-    from ..live.listen import listen  # needs ROS
+    from ..live.record import listen  # needs ROS
 
     name_of = Names(reading.namespace, reading.topics)
     with temporary_folder() as folder:

@@ -6,7 +6,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from .. import command_lines
-from ..json_values import as_json
+from ..outputs import as_json
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence

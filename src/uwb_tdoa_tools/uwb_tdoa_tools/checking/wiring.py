@@ -12,7 +12,7 @@ from uwb_tdoa_ekf.streams import ERROR, WARNING, Finding
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from ..live.ends import End
+    from ..live.record import End
     from .recording import Recording
 
 

@@ -17,7 +17,7 @@ from ..checking.recording import read_recording
 from ..diagnosis.noise import write_parameters
 from ..estimate import FlightEstimator
 from ..outputs import OutputFolder
-from ..progress import Progress
+from ..parallel import Progress
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace

@@ -18,7 +18,7 @@ from ..checking.check import check, different_surveys
 from ..checking.recording import read_live, read_recording
 from ..estimate import FlightEstimator
 from ..outputs import OutputFile
-from ..progress import Progress
+from ..parallel import Progress
 from ..readers import read_survey
 
 if TYPE_CHECKING:

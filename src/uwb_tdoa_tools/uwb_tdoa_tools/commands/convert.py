@@ -13,7 +13,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from .. import cli, options
 from ..bags.convert import SENSORS, convert, shifted
 from ..outputs import OutputBag
-from ..progress import Progress
+from ..parallel import Progress
 from ..readers import columns
 from ..readers.names import read_named
 from ..scoring.settling import on_one_clock

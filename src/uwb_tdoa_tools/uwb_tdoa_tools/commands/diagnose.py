@@ -19,7 +19,7 @@ from ..diagnosis.references import REFERENCES
 from ..diagnosis.self_calibration.equations import measured_noise
 from ..localizing.rerun_file import write_diagnosis
 from ..outputs import OutputFolder
-from ..progress import Progress
+from ..parallel import Progress
 from ..readers import inputs
 from ..surveying.paths import DRIFT, read_paths
 

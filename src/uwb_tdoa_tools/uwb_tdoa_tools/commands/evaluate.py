@@ -16,8 +16,7 @@ from uwb_tdoa_bias.foundation.files import write_text
 from .. import cli, options, parallel
 from ..evaluating import table
 from ..evaluating.evaluator import Evaluator, results
-from ..json_values import as_json
-from ..outputs import OutputFile, OutputFolder
+from ..outputs import OutputFile, OutputFolder, as_json
 from ..results_file import asked_of
 from ..scoring.metrics import FIGURES, Pool
 

@@ -11,7 +11,7 @@ from .. import cli
 from ..bags.bag import check_output, write_bag
 from ..bags.files import STORAGES
 from ..outputs import OutputBag, OutputFile
-from ..progress import Progress
+from ..parallel import Progress
 from ..simulation import simulate
 from ..simulation.options import add_options, config_of
 from ..simulation.plots import check_image, plot

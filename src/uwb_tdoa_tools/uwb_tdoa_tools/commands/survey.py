@@ -17,7 +17,7 @@ from ..diagnosis.noise import write_parameters
 from ..diagnosis.self_calibration import self_calibrate
 from ..estimate import FlightEstimator
 from ..outputs import OutputFolder
-from ..progress import Progress
+from ..parallel import Progress
 from ..surveying.blocked import with_blocked
 from ..surveying.report import as_dict, as_text, picture
 

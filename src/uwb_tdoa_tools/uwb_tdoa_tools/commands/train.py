@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from .. import cli, options, parallel
 from ..outputs import OutputFile, OutputFolder
-from ..progress import Progress
+from ..parallel import Progress
 from ..readers import inputs
 from ..results_file import ResultsFile, asked_of, resumed, state_of
 from ..scoring.settling import with_settled_truth

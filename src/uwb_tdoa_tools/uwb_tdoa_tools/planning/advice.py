@@ -17,7 +17,7 @@ from .report import quantiles
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.anchors import Anchors
 
-    from ..progress import Progress
+    from ..parallel import Progress
     from .judging import Judged
     from .maps import Chart
 

@@ -23,7 +23,7 @@ from ..simulation.constellations import facing
 from .goal import UNUSABLE
 
 if TYPE_CHECKING:
-    from ..progress import Progress
+    from ..parallel import Progress
     from ..simulation.room import Room
     from .hall import Hall
     from .judging import Judged

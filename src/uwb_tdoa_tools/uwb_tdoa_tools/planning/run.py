@@ -11,7 +11,7 @@ import numpy as np
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, parallel
-from ..progress import Progress
+from ..parallel import Progress
 from ..readers.inputs import Reading
 from ..simulation.walls import Walls
 from . import accuracy, advice, design, hall, messages, optimisation, options, plots, report

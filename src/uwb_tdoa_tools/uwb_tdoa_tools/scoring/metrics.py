@@ -14,7 +14,7 @@ from uwb_tdoa_bias.effects.samples import PoseColumns
 from uwb_tdoa_ekf.core.verdicts import COMPENSATED, REJECTED, USED
 from uwb_tdoa_ekf.results import rows_of
 
-from ..json_values import as_json
+from ..outputs import as_json
 from .by_phase import EVERYTHING, ErrorSeries, PooledErrors, or_nan, rms
 from .distribution import Distribution
 from .phases import TITLES, in_the_air, motion, phases
