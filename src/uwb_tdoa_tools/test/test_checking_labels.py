@@ -13,7 +13,7 @@ from uwb_tdoa_tools.checking.recording import IMU, TDOA, of_flight
 
 def said(**changes):
     made = replace(of_flight(small_flight()), **changes)
-    return {finding.rule: finding for rule in labels.RULES for finding in rule(made)}
+    return {finding.rule: finding for rule in labels.LABEL_RULES for finding in rule(made)}
 
 
 @pytest.mark.parametrize("frame", ["base_link", "tag1/base_link", ""])

@@ -99,7 +99,7 @@ def check(
     """
     streams = fed(recording)
     found = [*streams.findings(), *sensors(recording)]
-    for rule in (*labels.RULES, *wiring.RULES, *tag_delay.RULES):
+    for rule in recording_rules.RULES:
         found += rule(recording)
     if any(
         finding.rule == "clock_silence" for finding in found

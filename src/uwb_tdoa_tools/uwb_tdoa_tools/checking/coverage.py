@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 RARE = 0.2  # of what the anchors are heard in the middle; healthy 0.54 at least
 SILENT = 5.0  # s for which an anchor that is heard otherwise is not
-FLAT = 0.08  # thickness of the constellation over its size; the measured rooms have 0.2 and more
+FLAT_SHARE = 0.08  # thickness of the constellation over its size; the measured rooms have 0.2 and more
 OUTSIDE, MARGIN = 0.5, 0.5  # share of the places of the tag, and m beyond the box of the anchors
 SHORT = 10.0  # s
 FEWEST = 3  # anchors that tell no plane
@@ -141,7 +141,7 @@ def flat(view: CoverageView) -> Iterator[Finding]:
     p = view.anchors.positions
     together = [p[window.heard > 0] for window in view.windows] if len(p) > MANY else [p]
     sizes = [_size_and_thickness(some) for some in together if len(some) > FEWEST]
-    found = [(size, thickness) for size, thickness in sizes if thickness < FLAT * size]
+    found = [(size, thickness) for size, thickness in sizes if thickness < FLAT_SHARE * size]
     if len(found) > PART * len(sizes):
         size, thickness = np.median(found, axis=0)
         evidence = f"they are within {thickness:.2f} m (rms) of a plane and {size:.1f} m across"

@@ -252,4 +252,4 @@ def losses(recording: Recording) -> Iterator[Finding]:
         yield Finding("imu_lost", WARNING, cause, evidence, remedy, np.nan)
 
 
-RULES = (frames, senders, no_imu, odometry_unread, anchors, sorted_file, clock, other_time, losses)
+LABEL_RULES = (frames, senders, no_imu, odometry_unread, anchors, sorted_file, clock, other_time, losses)

@@ -89,4 +89,4 @@ def _offset(positions: np.ndarray, d: np.ndarray) -> float | None:
     return float(x[3]) if determined else None
 
 
-RULES = (tag_delay,)
+

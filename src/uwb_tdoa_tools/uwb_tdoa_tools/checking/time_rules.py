@@ -33,7 +33,7 @@ SHUFFLED, MORE = (
     0.15,
     2.2,
 )  # s, and times the scatter of successive errors that there is in quick motion; healthy 0.09, 1.85
-LIMIT = 4.0  # standard deviations, robust, beyond which an error counts no more
+STEP_LIMIT = 4.0  # standard deviations, robust, beyond which an error counts no more
 CLOCK = (
     "stamp with one clock, when it is measured; tdoa_time_offset and truth_time_offset take out "
     "what is constant"
@@ -118,7 +118,7 @@ def _reordered(path: KnownPath) -> Iterator[Finding]:
     speed = np.concatenate(
         [0.5 * np.abs(change[rows][1:] + change[rows][:-1]) for rows in path.pairs.values()]
     )
-    limit = LIMIT * 1.4826 * np.median(np.abs(step))
+    limit = STEP_LIMIT * 1.4826 * np.median(np.abs(step))
     power, (slow, quick) = (
         np.clip(step, -limit, limit) ** 2,
         (speed <= np.median(speed), speed >= np.quantile(speed, 0.9)),

@@ -91,7 +91,7 @@ def several(recording: Recording) -> Iterator[Finding]:
             )
 
 
-def anchors(recording: Recording) -> Iterator[Finding]:
+def volatile_anchors(recording: Recording) -> Iterator[Finding]:
     """Anchors that who comes later does not get, unless they are repeated."""
     for topic, publishers, _ in _by_topic(recording):
         for publisher in publishers:
@@ -109,4 +109,4 @@ def anchors(recording: Recording) -> Iterator[Finding]:
                 )
 
 
-RULES = (kinds, unmatched, several, anchors)
+WIRING_RULES = (kinds, unmatched, several, volatile_anchors)
