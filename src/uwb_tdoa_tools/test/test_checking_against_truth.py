@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.foundation.flight import Truth
-from uwb_tdoa_tools.checking.against_truth import against_truth, of_truth
+from uwb_tdoa_tools.checking.flight_rules import judge_against_truth, judge_truth
 
 
 @pytest.fixture(scope="module")
@@ -18,18 +18,20 @@ def flight():
 def test_holes_and_leaps_in_the_air(flight):
     of = flight.truth
     hidden = (of.t > 8.0) & (of.t < 10.5)
-    (hole,) = of_truth(replace(flight, truth=Truth(of.t[~hidden], of.p[~hidden], of.q[~hidden])))
+    (hole,) = judge_truth(replace(flight, truth=Truth(of.t[~hidden], of.p[~hidden], of.q[~hidden])))
     assert hole.rule == "truth_hole" and hole.value == pytest.approx(2.5, abs=0.1)
-    (leap,) = of_truth(replace(flight, truth=Truth(of.t, of.p + 0.5 * hidden[:, None], of.q)))
+    (leap,) = judge_truth(replace(flight, truth=Truth(of.t, of.p + 0.5 * hidden[:, None], of.q)))
     assert leap.rule == "truth_leap" and "0.87 m" in leap.evidence
-    assert list(of_truth(flight)) == []
+    assert list(judge_truth(flight)) == []
 
 
 def test_what_is_not_there_is_not_compared(flight):
-    assert against_truth(replace(flight, truth=None)) == []
+    assert judge_against_truth(replace(flight, truth=None)) == []
     bare = Truth(flight.truth.t, flight.truth.p, np.full_like(flight.truth.q, np.nan))
     assert (
-        against_truth(replace(flight, truth=bare)) == against_truth(replace(flight, imu=None)) == []
+        judge_against_truth(replace(flight, truth=bare))
+        == judge_against_truth(replace(flight, imu=None))
+        == []
     )
 
 
@@ -37,5 +39,5 @@ def test_ids_are_put_right_before_signs_are_judged(flight):
     of = flight.tdoa
     a, b = (np.where(ids == 2, 3, np.where(ids == 3, 2, ids)) for ids in (of.a, of.b))
     assert [
-        finding.rule for finding in against_truth(replace(flight, tdoa=replace(of, a=a, b=b)))
+        finding.rule for finding in judge_against_truth(replace(flight, tdoa=replace(of, a=a, b=b)))
     ] == ["ids_exchanged"]

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from uwb_tdoa_tools.checking.delays import delays
+from uwb_tdoa_tools.checking.time_rules import delays
 
 T = np.arange(0.0, 60.0, 0.02)
 SERIES = np.arange(len(T)) % 3

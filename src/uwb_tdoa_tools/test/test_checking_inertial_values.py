@@ -5,7 +5,7 @@ import pytest
 from scipy.signal import lfilter
 
 from uwb_tdoa_bias.foundation.flight import Flight, Imu
-from uwb_tdoa_tools.checking.inertial_values import saturated, smooth
+from uwb_tdoa_tools.checking.imu_rules import saturated, smooth
 
 T = np.arange(0.0, 20.0, 0.001)
 VALUES = np.random.default_rng(0).standard_normal((len(T), 3))

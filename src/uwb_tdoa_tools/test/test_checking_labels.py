@@ -7,13 +7,13 @@ import pytest
 from recordings import ANCHORS, small_flight
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_tools.checking import labels
+from uwb_tdoa_tools.checking import recording_rules
 from uwb_tdoa_tools.checking.recording import IMU, TDOA, of_flight
 
 
 def said(**changes):
     made = replace(of_flight(small_flight()), **changes)
-    return {finding.rule: finding for rule in labels.LABEL_RULES for finding in rule(made)}
+    return {finding.rule: finding for rule in recording_rules.RULES for finding in rule(made)}
 
 
 @pytest.mark.parametrize("frame", ["base_link", "tag1/base_link", ""])

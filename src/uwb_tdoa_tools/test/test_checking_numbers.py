@@ -5,7 +5,7 @@ from number_faults import FAULTS
 import numpy as np
 import pytest
 
-from uwb_tdoa_tools.checking.numbers import numbers
+from uwb_tdoa_tools.checking.flight_rules import judge_flight
 
 HARD = ("pair_late",)  # hidden by the noise in most draws
 QUICK = ("tdoa_rounded", "ids_exchanged", "truth_leap")
@@ -17,13 +17,13 @@ def flight():
 
 
 def of(flight, fault):
-    found = numbers(FAULTS[fault].put_in(flight, np.random.default_rng(1)))
+    found = judge_flight(FAULTS[fault].put_in(flight, np.random.default_rng(1)))
     assert all(finding.cause and finding.evidence and finding.remedy for finding in found)
     return [finding.rule for finding in found]
 
 
 def test_nothing_is_wrong_with_the_numbers_of_a_sound_flight(flight):
-    assert numbers(flight) == []
+    assert judge_flight(flight) == []
 
 
 @pytest.mark.parametrize("fault", QUICK)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_tools.checking import pair_rules
-from uwb_tdoa_tools.checking.known_path import KnownPath
+from uwb_tdoa_tools.checking.pair_rules import KnownPath
 
 T = np.arange(600) / 20.0
 TRUE = 3.0 * np.sin(0.5 * T)

@@ -10,7 +10,7 @@ from uwb_tdoa_bias.effects import EFFECTS
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.bags.bag import write_bag
-from uwb_tdoa_tools.checking.remarks import survey_remarks
+from uwb_tdoa_tools.checking.report import survey_remarks
 from uwb_tdoa_tools.commands import diagnose, evaluate, inject
 from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate

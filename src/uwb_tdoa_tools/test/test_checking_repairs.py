@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
-from uwb_tdoa_tools.checking.repairs import repairs
+from uwb_tdoa_tools.checking.pair_rules import repairs
 
 IDS, SIGN = EFFECTS["anchor_ids"]({"1": 4, "4": 1}), EFFECTS["pair_sign"]({"2-3": -1.0})
 

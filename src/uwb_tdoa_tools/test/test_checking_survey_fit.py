@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.geometry import tdoa
-from uwb_tdoa_tools.checking.survey_fit import SurveyFit, displacement
+from uwb_tdoa_tools.checking.ordered import SurveyFit, displacement
 from uwb_tdoa_tools.checking.tdoa_rules import SAME, gained
 
 BOX = np.array([[x, y, z] for x in (0.0, 6.0) for y in (0.0, 7.0) for z in (0.2, 3.0)])

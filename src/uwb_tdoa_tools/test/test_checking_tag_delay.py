@@ -8,7 +8,7 @@ import pytest
 from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_tools.checking.check import check
 from uwb_tdoa_tools.checking.recording import of_flight
-from uwb_tdoa_tools.checking.tag_delay import tag_delay, window_offsets
+from uwb_tdoa_tools.checking.recording_rules import tag_delay, window_offsets
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 

@@ -8,8 +8,7 @@ import pytest
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_tools.checking import tdoa_rules
-from uwb_tdoa_tools.checking.ordered import LONG, OrderedRecording
-from uwb_tdoa_tools.checking.survey_fit import SPREAD, spread
+from uwb_tdoa_tools.checking.ordered import LONG, SPREAD, OrderedRecording, spread
 
 
 @pytest.fixture(scope="module")

@@ -9,7 +9,7 @@ import pytest
 
 from uwb_tdoa_bias.effects import true_samples
 from uwb_tdoa_bias.foundation.geometry import tdoa
-from uwb_tdoa_tools.checking.known_path import KnownPath
+from uwb_tdoa_tools.checking.pair_rules import KnownPath
 from uwb_tdoa_tools.checking.time_rules import tdoas
 
 

@@ -12,7 +12,7 @@ from recordings import small_flight
 
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.checking.recording import of_flight, read_live, read_recording
-from uwb_tdoa_tools.checking.wiring import RULES
+from uwb_tdoa_tools.checking.recording_rules import RULES
 from uwb_tdoa_tools.commands.check import main
 from uwb_tdoa_tools.live.record import End
 from uwb_tdoa_tools.readers.inputs import Reading

@@ -15,7 +15,7 @@ from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.bags import bag
 from uwb_tdoa_tools.bags.files import messages, new_bag, open_bag
 from uwb_tdoa_tools.bags.message_types import typestore
-from uwb_tdoa_tools.checking import labels
+from uwb_tdoa_tools.checking import recording_rules
 from uwb_tdoa_tools.checking.check import fed
 from uwb_tdoa_tools.checking.recording import read_recording
 from uwb_tdoa_tools.readers.inputs import Reading
@@ -128,7 +128,10 @@ def test_check_judges_the_samples_of_the_body(flight, tmp_path):
     def rules(name, *static):
         (tmp_path / name).mkdir()
         recording = read_recording(Reading(), mounted(flight, tmp_path / name / "m.bag", *static))
-        return {finding.rule for finding in (*fed(recording).findings(), *labels.frames(recording))}
+        return {
+            finding.rule
+            for finding in (*fed(recording).findings(), *recording_rules.frames(recording))
+        }
 
     assert rules("placed", place) == {"frame_turned"}
     assert {"imu_turned", "frame_unknown"} <= rules("untold")

@@ -13,8 +13,7 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.streams import ERROR
 
-from ..checking.ordered import OrderedRecording
-from ..checking.survey_fit import displacement
+from ..checking.ordered import OrderedRecording, displacement
 from ..diagnosis import diagnose, output
 from ..diagnosis.self_calibration import Tape, self_calibrate
 from ..diagnosis.self_calibration.equations import measured_noise, slow_innovations

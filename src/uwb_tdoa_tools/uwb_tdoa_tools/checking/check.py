@@ -12,9 +12,8 @@ from uwb_tdoa_ekf.streams import ERROR, NOTE, WARNING, Finding, StreamRules, mos
 
 from ..estimate import FlightEstimator
 from ..readers.streams import protocol
-from . import coverage, imu_rules, labels, tag_delay, tdoa_rules, wiring
-from .ordered import OrderedRecording
-from .survey_fit import displacement
+from . import coverage, imu_rules, recording_rules, tdoa_rules
+from .ordered import OrderedRecording, displacement
 from .tdoa_rules import SAME, furthest
 from .watch import found_by_monitor, together
 
@@ -24,8 +23,8 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.anchors import Anchors
 
     from ..live.record import End
+    from .ordered import SurveyFit
     from .recording import Recording
-    from .survey_fit import SurveyFit
     from .tdoa_rules import Survey
 
 ROUNDS = 3  # mistakes that are undone one after the other

@@ -1,4 +1,4 @@
-"""What the anchors and the motion of the tag let anybody know.
+"""Judge which positions the anchors and the motion of the tag determine.
 
 A rule takes a CoverageView and yields Findings.
 """
@@ -11,21 +11,57 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_ekf.core.workspace import FLAT
 from uwb_tdoa_ekf.monitoring.monitor import NEARER
 from uwb_tdoa_ekf.streams import NOTE, WARNING, Finding
 
-from .known_path import MANY
-from .sides import sides_of, to_copy
-from .survey_fit import SPREAD, spread
+from .ordered import SPREAD, spread
+from .pair_rules import MANY
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from uwb_tdoa_ekf.streams.ranging import TdoaWindow
 
+
+CEILING = (
+    1.5  # m above the lowest thing that is known; anchors that all hang higher are at a ceiling
+)
+
+
+def sides_of(positions: np.ndarray) -> tuple[str, ...]:
+    """Values of `tag_side` that are possible for anchors at positions (n, 3) m: ("below",),
+    ("above",), ("+x", "-x"), ("+y", "-y"), or (), where they are in no plane across an axis of the
+    world, or in a line.
+    """
+    flat = np.ptp(positions, axis=0) < FLAT
+    if np.count_nonzero(flat) != 1:
+        return ()
+    if flat[2]:
+        return ("below",) if positions[:, 2].mean() > CEILING else ("above",)
+    axis = "xy"[int(np.argmax(flat))]
+    return f"+{axis}", f"-{axis}"
+
+
+def to_copy(sides: Sequence[str]) -> str:
+    """What to write, for some sides: a phrase."""
+    lines = " or ".join(f"-p tag_side:={side}" for side in sides)
+    which = (
+        ""
+        if len(sides) == 1
+        else f", whether the tag is at {'larger or smaller ' + sides[0][1:]} than they are"
+    )
+    return f"tell ekf_node the side, --ros-args {lines}{which} (tag_side in a file for --config)"
+
+
+pass
+
+
 RARE = 0.2  # of what the anchors are heard in the middle; healthy 0.54 at least
 SILENT = 5.0  # s for which an anchor that is heard otherwise is not
-FLAT_SHARE = 0.08  # thickness of the constellation over its size; the measured rooms have 0.2 and more
+FLAT_SHARE = (
+    0.08  # thickness of the constellation over its size; the measured rooms have 0.2 and more
+)
 OUTSIDE, MARGIN = 0.5, 0.5  # share of the places of the tag, and m beyond the box of the anchors
 SHORT = 10.0  # s
 FEWEST = 3  # anchors that tell no plane

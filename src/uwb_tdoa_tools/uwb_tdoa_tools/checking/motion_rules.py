@@ -14,17 +14,15 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from uwb_tdoa_ekf.streams import ERROR, Finding
 
-from .delays import BLOCK, LONGEST, delays
-from .imu_rules import ARRANGEMENTS, SCALES, scale_of, signed_axis
-from .inertial_values import smooth
-from .time_rules import changing
+from .imu_rules import ARRANGEMENTS, SCALES, scale_of, signed_axis, smooth
+from .time_rules import BLOCK, LONGEST, changing, delays
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from uwb_tdoa_bias.foundation.flight import Flight
 
-    from .delays import Delays
+    from .time_rules import Delays
 
 CELL, HALF = 0.05, 0.1  # s between cells, and half the time over which one is averaged
 BEYOND = round(LONGEST / CELL)  # cells at either end that are there for what is late

@@ -1,7 +1,12 @@
-"""A recording in order, as the rules that try things see it, and what is found unexplained in it."""
+"""Order a recording for the rules that try corrections, and fit its anchors.
+
+`SurveyFit` estimates positions of tag and anchors together, from windows of TDOAs alone. Systematic
+errors move the anchors by some decimetres. Only a larger gain speaks against a survey.
+"""
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 import math
@@ -11,17 +16,232 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas
-from uwb_tdoa_ekf.core.memory import TDOA, structured
+from uwb_tdoa_ekf.core import workspace
+from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.core.ground import KnownHeight
+from uwb_tdoa_ekf.core.memory import TDOA, new_state, structured
+from uwb_tdoa_ekf.core.startup import locate, room_for
 from uwb_tdoa_ekf.results import rows_of
-from uwb_tdoa_ekf.streams.explain import unexplained
+from uwb_tdoa_ekf.streams.explain import SCALE, unexplained
 from uwb_tdoa_ekf.streams.ranging import BEYOND
 
-from .survey_fit import SurveyFit
-
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    Window = tuple[np.ndarray, ...]  # t (n,) s, a and b (n,) rows of the anchors, d (n,) m
     from uwb_tdoa_ekf.streams.explain import Unexplained
 
     from .recording import Recording
+
+
+WINDOWS, LENGTH, FEWEST = (
+    40,
+    0.5,
+    30,
+)  # windows over the recording, s each, and TDOAs that one must have
+PRIOR = (
+    0.5  # m, by which an anchor may be off the survey; of no anchor in particular is more believed
+)
+TAG, SPEED = 5.0, 1.0  # m and m/s, the same for the tag about where it was located
+STD, TOGETHER = 0.15, 20.0  # m, of one TDOA; TDOAs of a window that count as independent at most
+ROBUST = 0.4  # m, scale of the Geman-McClure weight
+SWEEPS, STEP = 12, 1.0  # Gauss-Newton steps, and the longest of an anchor, m
+# m of `spread`; measured flights 0.50 at least, also with ids swapped, a hovering tag 0.16 at most
+SPREAD = 0.3
+
+
+class SurveyFit:
+    """Windows of TDOAs, located with the anchors as surveyed."""
+
+    def __init__(
+        self, t: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray, positions: np.ndarray
+    ) -> None:
+        """t (n,) s, rising; a, b (n,) rows of positions (N, 3) m; d (n,) m."""
+        self.positions = positions
+        self._windows, self._start = [], []
+        config, state, box = FilterConfig(), new_state(positions), np.empty((2, 3))
+        workspace.set_bounds(state.record.extent, config.workspace_margin, box)
+        rows = structured(TDOA, t, a, b, d, np.zeros(len(t)))
+        for begin in np.linspace(t[0], t[-1] - LENGTH, WINDOWS) if len(t) else ():
+            first, end = np.searchsorted(t, [begin, begin + LENGTH])
+            if end - first < FEWEST:
+                continue
+            window, places = tuple(column[first:end] for column in (t, a, b, d)), room_for(1)
+            locate(
+                rows[first:end],
+                state.anchors,
+                box,
+                config.parameters()[0],
+                KnownHeight(np.nan, np.nan),
+                places,
+            )
+            self._windows.append(window)
+            self._start.append(places.x[0])
+        self.before, _ = self.solve(
+            []
+        )  # where the tag fits best: a fast one is not where a start puts it
+
+    def __len__(self) -> int:
+        """Windows that tell something."""
+        return len(self._windows)
+
+    @property
+    def heard(self) -> list[int]:
+        """Rows of the anchors of which there are TDOAs in the windows."""
+        ends = [end for _, a, b, _ in self._windows for end in (a, b)]
+        return np.unique(np.concatenate(ends)).tolist() if ends else []
+
+    @property
+    def places(self) -> np.ndarray:
+        """(k, 3) m: where the tag was located in the windows."""
+        return np.array([x[:3] for x in self._start]).reshape(-1, 3)
+
+    @cached_property
+    def all_moved(self) -> tuple[float, np.ndarray]:
+        """`solve` with all anchors moved."""
+        return self.solve()
+
+    @cached_property
+    def held_out_gain(self) -> float:
+        """Loss that anchors moved as one half of the windows says leave less in the other half, the
+        mean of both halves: errors of places where the tag is for a while are no errors of the
+        survey.
+        """
+        half = len(self) // 2
+        parts = [self._part(slice(None, half)), self._part(slice(half, None))]
+        return float(
+            np.mean(
+                [
+                    test.before - test._at(fitted.all_moved[1])
+                    for fitted, test in (parts, parts[::-1])
+                ]
+            )
+        )
+
+    def _part(self, windows: slice) -> SurveyFit:
+        """The same of some of the windows."""
+        part = copy(self)
+        part.__dict__.pop("all_moved", None)
+        part._windows, part._start = self._windows[windows], self._start[windows]
+        part.before, _ = part.solve([])
+        return part
+
+    def _at(self, positions: np.ndarray) -> float:
+        """Loss with the anchors at positions (N, 3) m."""
+        elsewhere = copy(self)
+        elsewhere.positions = positions
+        return elsewhere.solve([])[0]
+
+    def solve(self, free: Sequence[int] | None = None) -> tuple[float, np.ndarray]:
+        """(loss that is left, 0 to 1; anchor positions (N, 3) m) with the anchors in `free` (rows;
+        None for all) moved, and the tag.
+        """
+        moved = (
+            np.ones(len(self.positions), dtype=bool)
+            if free is None
+            else np.isin(range(len(self.positions)), free)
+        )
+        columns = np.flatnonzero(np.repeat(moved, 3))  # of the coordinates that are free
+        anchors, start = self.positions.copy(), [x.copy() for x in self._start]
+        heard = [
+            moved & np.isin(np.arange(len(moved)), ends[1:3]) for ends in self._windows
+        ]  # in each window; of a hall few are
+        places = [
+            np.flatnonzero(np.repeat(some[moved], 3)) for some in heard
+        ]  # of their coordinates, among the free ones
+        for _ in range(SWEEPS):
+            H = np.eye(len(columns)) / PRIOR**2
+            g = (self.positions - anchors).reshape(-1)[columns] / PRIOR**2
+            eliminated = []
+            for x, window, some, its in zip(start, self._windows, heard, places):
+                by_tag, by_anchors, residual = _linearised(x, window, anchors, some)
+                weight = (
+                    min(1.0, TOGETHER / len(residual))
+                    / (STD * (1.0 + (residual / ROBUST) ** 2)) ** 2
+                )
+                left = by_tag * weight[:, None]
+                A = left.T @ by_tag + np.diag([TAG**-2] * 3 + [SPEED**-2] * 3)
+                B = left.T @ by_anchors
+                c = left.T @ residual - np.r_[np.zeros(3), x[3:] / SPEED**2]
+                solved = np.linalg.solve(A, np.column_stack([B, c]))
+                H[np.ix_(its, its)] += (
+                    by_anchors.T @ (weight[:, None] * by_anchors) - B.T @ solved[:, :-1]
+                )
+                g[its] += by_anchors.T @ (weight * residual) - B.T @ solved[:, -1]
+                eliminated.append(solved)
+            step = np.linalg.solve(H, g)
+            step *= min(1.0, STEP / max(np.abs(step).max(initial=0.0), 1e-9))
+            anchors.reshape(-1)[columns] += step
+            for x, solved, its in zip(start, eliminated, places):
+                x += np.clip(solved[:, -1] - solved[:, :-1] @ step[its], -2.0, 2.0)
+        return self._loss(start, anchors), anchors
+
+    def _loss(self, states: list[np.ndarray], anchors: np.ndarray) -> float:
+        """Mean Geman-McClure loss over the windows."""
+        squares = (
+            _residual(x, window, anchors)[0] ** 2 for x, window in zip(states, self._windows)
+        )
+        return (
+            float(np.mean([np.mean(square / (square + SCALE**2)) for square in squares]))
+            if states
+            else np.nan
+        )
+
+
+def displacement(surveyed: np.ndarray, fitted: np.ndarray) -> np.ndarray:
+    """(N,) m, how far each anchor has moved, after the best rotation and shift of all of them
+    (Kabsch, Acta Cryst. A 32, 1976).
+    """
+    one, two = surveyed - surveyed.mean(axis=0), fitted - fitted.mean(axis=0)
+    U, _, V = np.linalg.svd(two.T @ one)
+    turn = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ V))]) @ V
+    return np.linalg.norm(two @ turn - one, axis=1)
+
+
+def spread(places: np.ndarray) -> float:
+    """m by which places of a tag (k, 3) are off the straight line that fits them best (second
+    largest standard deviation): a tag that stands, or moves along one line, does not tell one
+    anchor from its mirror image.
+    """
+    if not len(places):
+        return 0.0
+    return float(
+        np.linalg.svd(places - places.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(places))
+    )
+
+
+def _residual(
+    x: np.ndarray, window: Window, anchors: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """(residuals (n,) m, unit vectors (n, 3) from a, and from b, to the tag, time (n,) before the
+    end, s).
+    """
+    t, a, b, d = window
+    before = t - t[-1]
+    tag = x[:3] + before[:, None] * x[3:]
+    from_a, from_b = tag - anchors[a], tag - anchors[b]
+    ra, rb = (np.maximum(np.linalg.norm(v, axis=1), 1e-6) for v in (from_a, from_b))
+    return d - (rb - ra), from_a / ra[:, None], from_b / rb[:, None], before
+
+
+def _linearised(
+    x: np.ndarray, window: Window, anchors: np.ndarray, moved: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Jacobians of the TDOAs by position and velocity (n, 6) and by the k anchors of which `moved`
+    (N,) is true (n, 3 k), and the residuals (n,).
+    """
+    residual, from_a, from_b, before = _residual(x, window, anchors)
+    by_position = from_b - from_a
+    by_anchors, number = np.zeros((len(residual), int(moved.sum()), 3)), np.cumsum(moved) - 1
+    for ends, by_end in ((window[1], from_a), (window[2], -from_b)):
+        rows = np.flatnonzero(moved[ends])
+        by_anchors[rows, number[ends[rows]]] += by_end[rows]
+    by_tag = np.column_stack([by_position, before[:, None] * by_position])
+    return by_tag, np.asfortranarray(by_anchors.reshape(len(residual), -1)), residual
+
+
+pass
+
 
 LONG, SHORT = (
     60.0,

@@ -1,8 +1,7 @@
-"""What is wrong with the TDOAs of single pairs, or of all: values, signs, ids. A rule takes a
-KnownPath and yields Findings.
+"""Compare the TDOAs of each pair with the geometry of the ground truth: values, signs, ids.
 
-Limits are shares, or what is left of an error. The healthy values beside them are the extremes of
-the pairs of 37 measured recordings.
+A rule takes a KnownPath and yields Findings. Limits are shares, or the part of an error that
+remains. The healthy values beside them are the extremes over the pairs of 37 measured recordings.
 """
 
 from __future__ import annotations
@@ -12,19 +11,77 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.effects import EffectSet, Track, true_samples
+from uwb_tdoa_bias.effects.anchor_ids import AnchorIds
+from uwb_tdoa_bias.effects.pair_sign import PairSign
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_ekf.streams import ERROR, Finding
-
-from .known_path import MANY
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from .known_path import KnownPath
+    from uwb_tdoa_bias.effects import LabelEffect
+    from uwb_tdoa_bias.foundation.flight import Flight, Truth
 
     Fault = tuple[
         str, str, str, float
     ]  # what the pair does, evidence, remedy, and the number that decided
+
+
+AIRBORNE = 0.3  # m of z
+# anchors, beyond which a tag hears a small part of them: a hall, most of which has nothing to do
+# with any of them
+MANY = 64
+FEWEST = 40  # TDOAs of a pair in the air, or of a vehicle that never is, of which something is said
+
+
+def least_height(truth: Truth) -> float:
+    """z, m, above which what is measured beside a Truth counts: 0.3, or minus infinity for a
+    vehicle that never leaves the floor.
+    """
+    return AIRBORNE if (truth.p[:, 2] > AIRBORNE).any() else -np.inf
+
+
+class KnownPath:
+    """d, true (n,) m, t (n,) s: the usable TDOAs and what they should be; samples : Samples; ids
+    (N,); track : Track of the truth;
+    start : s, stamp of the first TDOA; pairs {(a, b) ids: rows (k,)} of those in the air, of a
+        vehicle that
+    never is of all, that are often heard.
+    """
+
+    def __init__(self, flight: Flight) -> None:
+        """flight : Flight with ground truth."""
+        assert flight.truth is not None
+        self._flight = flight
+        self.samples, rows = true_samples(flight)
+        self.t, self.d = self.samples.t, flight.tdoa.d[rows]
+        self.true = tdoa(self.samples.p, self.samples.position_a, self.samples.position_b)
+        self.ids, self.track, self.start = (
+            self.samples.anchors.ids,
+            Track(flight.truth),
+            flight.start,
+        )
+        self.flown = np.flatnonzero(self.samples.p[:, 2] > least_height(flight.truth))
+        key = (self.samples.a * len(self.ids) + self.samples.b)[self.flown]
+        order = np.argsort(key, kind="stable")
+        parts = (
+            np.split(self.flown[order], np.flatnonzero(np.diff(key[order])) + 1)
+            if len(order)
+            else []
+        )
+        self.pairs = {self._named(part[0]): part for part in parts if len(part) >= FEWEST}
+
+    def without(self, *effects: LabelEffect) -> KnownPath:
+        """The same without some LabelEffects."""
+        return KnownPath(EffectSet(effects).correct_streams(self._flight))
+
+    def _named(self, row: int) -> tuple[int, int]:
+        return int(self.ids[self.samples.a[row]]), int(self.ids[self.samples.b[row]])
+
+
+pass
+
 
 # Of the median error that is left with the other sign, or with the ids exchanged: healthy 2.1 and
 # 0.68 at least.
@@ -268,3 +325,34 @@ def _median_errors(
     return tuple(
         float(np.median(np.abs(d - tdoa(p, at[table[a]], at[table[b]])))) for table in tables
     )
+
+
+pass
+pass
+
+
+SOURCE = "numbers"
+
+
+def repairs(flight: Flight) -> tuple[LabelEffect, ...]:
+    """(LabelEffect, ...) that undo wrong ids and signs of a Flight, in the order in which they are
+    undone; () without ground truth or TDOAs.
+    """
+    return (
+        ()
+        if flight.truth is None or len(flight.truth) < 2 or not len(flight.tdoa)
+        else repairs_of(KnownPath(flight))
+    )
+
+
+def repairs_of(path: KnownPath) -> tuple[LabelEffect, ...]:
+    """The same of a KnownPath. Where most signs are wrong, nothing is said of ids."""
+    out: list[LabelEffect] = []
+    signs = contrary(path)
+    table = {} if len(signs) >= MOST * max(len(path.pairs), 1) else renamed(path)[0]
+    if table:
+        out.append(AnchorIds({str(wrong): right for wrong, right in table.items()}, source=SOURCE))
+        signs = contrary(path.without(out[0]))
+    if signs:
+        out.append(PairSign({f"{a}-{b}": -1.0 for a, b in signs}, source=SOURCE))
+    return tuple(out)

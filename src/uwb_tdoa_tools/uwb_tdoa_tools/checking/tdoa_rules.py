@@ -20,10 +20,8 @@ from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.streams import ERROR, Finding
 from uwb_tdoa_ekf.streams.explain import SCALE, compare, innovations
 
-from .known_path import MANY
-from .ordered import LONG, SHORT, OrderedRecording
-from .pair_rules import OFF
-from .survey_fit import SPREAD, spread
+from .ordered import LONG, SHORT, SPREAD, OrderedRecording, spread
+from .pair_rules import MANY, OFF
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -31,7 +29,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.anchors import Anchors
     from uwb_tdoa_bias.foundation.flight import Tdoas
 
-    from .survey_fit import SurveyFit
+    from .ordered import SurveyFit
 
     Survey = tuple[str, Anchors]  # its name, and what it says
 

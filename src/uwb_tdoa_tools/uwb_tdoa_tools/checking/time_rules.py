@@ -1,26 +1,194 @@
-"""Does a stream come at the times that it says? Against the ground truth, by what its geometry, or
-its turns, leave.
+"""Find streams that are late, drift or jump against the ground truth.
 
-Limits are shares of the power that is left with a fault undone; healthy: the least of 37 measured
-recordings.
+Each delay is tried, and the power of the remaining error is compared. Slow changes, as systematic
+errors make them, are removed first: a mean for each pair, or axis, and block of time. Limits are
+shares of the power that remains with a fault undone. The healthy values are the least of 37
+measured recordings.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.geometry import tdoa_jacobian
+from uwb_tdoa_bias.foundation.geometry import tdoa, tdoa_jacobian
 from uwb_tdoa_ekf.streams import ERROR, Finding
 
-from .delays import of_tdoas
+from ..clock import numbered
+from .pair_rules import MANY
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
-    from .delays import Delays
-    from .known_path import KnownPath
+    from .pair_rules import KnownPath
+
+
+LONGEST, STEP = 1.5, 0.05  # s that are tried to both sides, and between them
+DELAYS = np.arange(-LONGEST, LONGEST + 0.5 * STEP, STEP)
+NONE = len(DELAYS) // 2  # place of the delay 0
+BLOCK, FEWEST = 5.0, 5  # s, and samples that a series must have in one
+# samples, about, of which a series has that many in a block, that it must have for anything to be
+# said of it
+TELLING = 30.0
+MOST = 15000  # TDOAs that are looked at, evenly taken
+# standard deviations of a series, robust, beyond which an error counts no more: what is behind
+# obstacles is many
+LIMIT = 2.0
+
+
+@dataclass(frozen=True)
+class Delays:
+    """power (series, blocks, len(DELAYS)) : sum of squares that is left of each series, in units of
+    its variance as it is, with each delay. All together tell nothing, and nothing is late, where
+    fewer than TELLING samples are in it.
+    """
+
+    power: np.ndarray
+
+    def of_series(self, k: int) -> tuple[float, float]:
+        """(ratio, s): what is left of a series with its best delay, over what is left with the best
+        one of all; and that delay. (1, 0) of a series that tells nothing.
+        """
+        own, common = self.power[k].sum(axis=0), self._common
+        if own[NONE] < TELLING:
+            return 1.0, 0.0
+        best = int(np.argmin(own))
+        return float(own[best] / max(own[common], 1e-12)), float(DELAYS[best] - DELAYS[common])
+
+    @cached_property
+    def _common(self) -> int:
+        """Place of the best delay of all."""
+        return int(np.argmin(self.power.sum(axis=(0, 1))))
+
+    def constant(self) -> tuple[float, float]:
+        """(ratio, s): what is left with the best delay of all, over what is left without any; and
+        that delay.
+        """
+        total = self.power.sum(axis=(0, 1))
+        best = int(np.argmin(total))
+        return (
+            (float(total[best] / total[NONE]), float(DELAYS[best])) if self._tells else (1.0, 0.0)
+        )
+
+    @property
+    def _tells(self) -> bool:
+        return bool(self.power[..., NONE].sum() >= TELLING)
+
+    def exact(self) -> float:
+        """s, the best delay of all, between those that are tried: the vertex of a parabola through
+        the three about it.
+        """
+        if not self._tells:
+            return 0.0
+        total = self.power.sum(axis=(0, 1))
+        k = int(np.clip(np.argmin(total), 1, len(total) - 2))
+        before, here, after = total[k - 1 : k + 2]
+        bend = before - 2.0 * here + after
+        return float(
+            DELAYS[k]
+            + (0.5 * STEP * np.clip((before - after) / bend, -1.0, 1.0) if bend > 0.0 else 0.0)
+        )
+
+    def drift(self) -> tuple[float, float]:
+        """(ratio, s): what is left if the delay changes evenly, over what is left with a constant
+        one; from first to last block.
+        """
+        if not self._tells:
+            return 1.0, 0.0
+        of = self.power.sum(axis=0)
+        blocks = np.arange(len(of))
+        start, end = np.meshgrid(np.arange(of.shape[1]), np.arange(of.shape[1]), indexing="ij")
+        share = blocks / max(len(of) - 1, 1)
+        place = np.rint(start[..., None] + (end - start)[..., None] * share).astype(int)
+        left = of[blocks, place].sum(axis=-1)
+        best = np.unravel_index(np.argmin(left), left.shape)
+        return float(left[best] / max(of.sum(axis=0).min(), 1e-12)), float(
+            DELAYS[best[1]] - DELAYS[best[0]]
+        )
+
+    def jump(self) -> tuple[float, float, int]:
+        """(ratio, s, block): what is left if the delay changes once, over what is left with a
+        constant one; by how much, and the first block after that.
+        """
+        if not self._tells:
+            return 1.0, 0.0, 0
+        of = self.power.sum(axis=0)
+        before = np.cumsum(of, axis=0)
+        after = before[-1] - before
+        left = before.min(axis=1) + after.min(axis=1)
+        k = int(np.argmin(left))
+        step = DELAYS[np.argmin(after[k])] - DELAYS[np.argmin(before[k])]
+        return float(left[k] / max(before[-1].min(), 1e-12)), float(step), k + 1
+
+
+def delays(
+    series: np.ndarray,
+    t: np.ndarray,
+    error: Callable[[float], np.ndarray],
+    count_of_series: int | None = None,
+) -> Delays:
+    """Delays of (n,) samples at t, s, of series numbered from 0; error(delay) -> (n,), what is left
+    of each. count_of_series : how many there are, where samples of the last may be missing.
+    """
+    block = numbered(t, BLOCK)
+    blocks = block.max() + 1
+    group = series * blocks + block
+    size = (count_of_series or series.max() + 1) * blocks
+    count = np.bincount(group, minlength=size)
+    counted = count[group] >= FEWEST
+    power, scale = np.zeros((size, len(DELAYS))), None
+    for k in np.roll(np.arange(len(DELAYS)), -NONE):  # as it is first
+        left = error(DELAYS[k])
+        left = left - (np.bincount(group, left, size) / np.maximum(count, 1))[group]
+        scale = (
+            _scatter(series, np.where(counted, left, np.nan))[series] if scale is None else scale
+        )
+        left = np.where(counted, np.clip(left / scale, -LIMIT, LIMIT), 0.0)
+        power[:, k] = np.bincount(group, left**2, size)
+    return Delays(power.reshape(-1, blocks, len(DELAYS)))
+
+
+def _scatter(series: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """(series,): robust standard deviation of each, of what is not NaN; 1 where there is none."""
+    known = [np.abs(values[(series == k) & np.isfinite(values)]) for k in range(series.max() + 1)]
+    return np.array([max(1.4826 * np.median(part), 1e-9) if len(part) else 1.0 for part in known])
+
+
+def of_tdoas(path: KnownPath) -> Delays | None:
+    """Delays of the pairs of a KnownPath, in their order; None without any."""
+    parts = _looked_at(path)
+    if not any(map(len, parts)):
+        return None
+    series, rows = (
+        np.repeat(np.arange(len(parts)), [len(part) for part in parts]),
+        np.concatenate(parts),
+    )
+    t, samples = path.t[rows], path.samples
+    a, b = samples.position_a[rows], samples.position_b[rows]
+    return delays(
+        series,
+        t,
+        lambda delay: path.d[rows] - tdoa(path.track.positions(t - delay), a, b),
+        len(parts),
+    )
+
+
+def _looked_at(path: KnownPath) -> list[np.ndarray]:
+    """Rows of each pair of a KnownPath that are looked at, about MOST of all together: of a room
+    some of each block, of a hall, of which few pairs are heard in a block, those of some blocks.
+    """
+    every = max(1, sum(map(len, path.pairs.values())) // MOST)
+    if len(path.ids) <= MANY:
+        return [part[::every] for part in path.pairs.values()]
+    chosen = ((path.t - path.start) / BLOCK).astype(int) % every == 0
+    return [part[chosen[part]] for part in path.pairs.values()]
+
+
+pass
+
 
 LATE, OF_ALL, DRIFTS, JUMPS = (
     0.53,

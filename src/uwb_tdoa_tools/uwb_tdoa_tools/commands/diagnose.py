@@ -12,7 +12,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.files import write_text
 
 from .. import cli, command_lines, options, parallel
-from ..checking.remarks import remarks_on
+from ..checking.report import remarks_on
 from ..diagnosis import diagnose, output
 from ..diagnosis.noise import write_parameters
 from ..diagnosis.references import REFERENCES

@@ -14,7 +14,6 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.evidence import OF_ANCHORS
 from uwb_tdoa_ekf.offline import may_have_offset
 
-from ..checking.numbers import numbers
 from ..scoring.metrics import Score
 from . import comparison, repairing, validation
 from .attribution import Attribution, attribute, residuals_of
@@ -121,7 +120,7 @@ def diagnose(
         remaining,
         {
             flight.name: faults
-            for faults, flight in zip(map_function(numbers, fitted), fitted)
+            for faults, flight in zip(map_function(judge_flight, fitted), fitted)
             if faults
         },
         outcome.changes,

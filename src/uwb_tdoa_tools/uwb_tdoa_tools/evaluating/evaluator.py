@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 from .. import parallel
 from ..bags.bag import late_tdoas, read_odometry
-from ..checking.against_truth import of_truth
 from ..checking.check import check
+from ..checking.flight_rules import judge_truth
 from ..checking.recording import of_flight
-from ..checking.remarks import survey_remarks
+from ..checking.report import survey_remarks
 from ..checking.watch import BEFORE_TRUTH
 from ..estimate import FlightEstimator
 from ..localizing.rerun_file import write_rerun
@@ -121,7 +121,7 @@ class Evaluator:
                     if self.align == NONE
                     else "."
                 )
-        for finding in of_truth(flight):
+        for finding in judge_truth(flight):
             yield f"{finding.cause}: {finding.evidence}; {finding.remedy}."
 
     def late_tdoas(self) -> int:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from .. import parallel
-from ..checking.sides import sides_of
+from ..checking.coverage import sides_of
 from ..simulation.walls import heard_at
 from .judging import TOO_FEW, Judged, judge
 from .maps import Chart

@@ -11,7 +11,7 @@ from scipy.spatial import ConvexHull, Delaunay
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 
-from ..checking.sides import sides_of, to_copy
+from ..checking.coverage import sides_of, to_copy
 from .noise import RadioNoise
 from .pairing import Pairing, ring
 

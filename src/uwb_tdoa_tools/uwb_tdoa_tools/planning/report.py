@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..checking.sides import to_copy
+from ..checking.coverage import to_copy
 from ..scoring.gains import change_of
 from .judging import FLYABLE, IMPRECISE, OUTSIDE, TOO_FEW, TWO_SOLUTIONS
 from .precision import NORMAL_99, dilution

@@ -19,10 +19,10 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
-from ..checking.delays import of_tdoas
 from ..checking.imu_rules import ARRANGEMENTS, signed_axis
-from ..checking.known_path import KnownPath
 from ..checking.motion_rules import FEWEST, TrueMotion
+from ..checking.pair_rules import KnownPath
+from ..checking.time_rules import of_tdoas
 from ..clock import grid
 from .metrics import ALIGN, judged_part, position_at
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.effects.samples import PoseColumns
     from uwb_tdoa_bias.foundation.flight import Flight, Truth
 
-    from ..checking.delays import Delays
+    from ..checking.time_rules import Delays
 
 NONE, TIME, FRAME = ALIGN
 OVERLAP = 1.0  # s that ground truth and TDOAs must have in common

@@ -9,7 +9,7 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.files import write_filled
 
-from ..checking.known_path import MANY
+from ..checking.pair_rules import MANY
 
 if TYPE_CHECKING:
     from pathlib import Path

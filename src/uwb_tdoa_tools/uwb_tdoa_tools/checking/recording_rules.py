@@ -1,13 +1,16 @@
-"""What the messages of a bag say about themselves: frames, topics, anchors. A rule takes a
-Recording and yields Findings.
+"""Judge a recording by what its messages state: frames, topics, anchors, clocks, publishers, ranges.
+
+A rule takes a Recording and yields Findings.
 """
 
 from __future__ import annotations
 
+from itertools import product
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.foundation.sensors import Ranges
 from uwb_tdoa_ekf.streams import ERROR, NOTE, WARNING, Finding
 
 from ..bags.messages import BODY_FRAME
@@ -19,8 +22,12 @@ from .tdoa_rules import furthest, same_place
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from uwb_tdoa_bias.foundation.anchors import Anchors
+
     from ..bags.placing import Place
+    from ..live.record import End
     from .recording import Recording
+
 
 WHEELS = "velocity/odometry"
 TURNED, SHIFTED = np.deg2rad(2.0), 0.02  # rad and m that a frame may be off the body frame
@@ -252,4 +259,183 @@ def losses(recording: Recording) -> Iterator[Finding]:
         yield Finding("imu_lost", WARNING, cause, evidence, remedy, np.nan)
 
 
-LABEL_RULES = (frames, senders, no_imu, odometry_unread, anchors, sorted_file, clock, other_time, losses)
+def _by_topic(recording: Recording) -> Iterator[tuple[str, list[End], list[End]]]:
+    """(topic, publishers, subscriptions) of each."""
+    for topic in sorted({end.topic for end in recording.ends}):
+        ends = [end for end in recording.ends if end.topic == topic]
+        yield (
+            topic,
+            [end for end in ends if end.publishes],
+            [end for end in ends if not end.publishes],
+        )
+
+
+def kinds(recording: Recording) -> Iterator[Finding]:
+    """Ends of one topic that speak of different types never meet."""
+    for topic, publishers, subscriptions in _by_topic(recording):
+        found = {end.kind for end in (*publishers, *subscriptions)}
+        if len(found) > 1:
+            evidence = ", ".join(
+                sorted(f"{end.node}: {end.kind}" for end in (*publishers, *subscriptions))
+            )
+            cause, line = (
+                f"{topic} has several types",
+                f"start the driver of the other type with --ros-args -r {topic}:={topic}_other",
+            )
+            yield Finding("type_other", ERROR, cause, evidence, line, float(len(found)))
+
+
+def unmatched(recording: Recording) -> Iterator[Finding]:
+    """A subscription that asks for more than a publisher offers gets nothing from it."""
+    for topic, publishers, subscriptions in _by_topic(recording):
+        deaf = {
+            (publisher.node, end.node): (publisher, end)
+            for publisher, end in product(publishers, subscriptions)
+            if not any(other.gets(publisher) for other in subscriptions if other.node == end.node)
+        }
+        for publisher, end in deaf.values():
+            cause = (
+                f"{end.node} hears nothing of what {publisher.node} publishes on {topic}: it asks "
+                "for more than is offered"
+            )
+            evidence = f"published {publisher.qos}; asked for: {end.qos}"
+            yield Finding(
+                "qos_unmatched", ERROR, cause, evidence, _stronger(publisher, end), np.nan
+            )
+
+
+def _stronger(publisher: End, end: End) -> str:
+    """What to write in the node that publishes."""
+    policies = ["reliability=ReliabilityPolicy.RELIABLE"] * end.reliable + [
+        "durability=DurabilityPolicy.TRANSIENT_LOCAL"
+    ] * end.latched
+    return (
+        f"qos = QoSProfile(depth=100, {', '.join(policies)})  # in {publisher.node}, or ask for "
+        f"less in {end.node}"
+    )
+
+
+def several(recording: Recording) -> Iterator[Finding]:
+    """Two that publish one stream."""
+    for topic, publishers, _ in _by_topic(recording):
+        if len(publishers) > 1 and not topic.startswith("/tf"):
+            names = ", ".join(sorted(end.node for end in publishers))
+            line = (
+                "give each tag a namespace of its own: start its driver with --ros-args -r "
+                "__ns:=/tag2, or stop all but one"
+            )
+            yield Finding(
+                "publishers_several",
+                ERROR,
+                f"{len(publishers)} publish on {topic}",
+                names,
+                line,
+                float(len(publishers)),
+            )
+
+
+def volatile_anchors(recording: Recording) -> Iterator[Finding]:
+    """Anchors that who comes later does not get, unless they are repeated."""
+    for topic, publishers, _ in _by_topic(recording):
+        for publisher in publishers:
+            if topic.endswith("uwb/anchors") and not publisher.latched:
+                yield Finding(
+                    "anchors_volatile",
+                    WARNING,
+                    "nodes that start later get no anchors, unless they are repeated",
+                    f"{publisher.node} publishes {topic} {publisher.qos}",
+                    (
+                        "qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)  "
+                        "# or anchors_file of both nodes"
+                    ),
+                    np.nan,
+                )
+
+
+WINDOW = 0.25  # s in which the tag hardly moves
+FEWEST_ANCHORS, FEWEST_WINDOWS, MOST_WINDOWS = 5, 10, 200
+LARGE, LARGEST = 0.1, 5.0  # m: from which on it is said, and more than which no antenna makes
+AGREE = 0.8  # share of the windows that say the same sign
+SCALE = 0.2  # m, beyond which a range counts less
+DILUTION = 5.0  # most that an error of the ranges may become in what they have in common
+STEPS, DAMPING = 20, 1e-3
+REMEDY = (
+    "calibrate it: survey, or diagnose where there is ground truth; until then leave "
+    "range_offset_std above 0.0: the filter finds it after each start"
+)
+
+
+def tag_delay(recording: Recording) -> Iterator[Finding]:
+    """All ranges are wrong by about as much: without `range_offset_std` the position is off by more
+    than that where anchors are on one side.
+    """
+    ranges = recording.sensors.get("range")
+    offsets = (
+        window_offsets(ranges, recording.anchors) if isinstance(ranges, Ranges) else np.empty(0)
+    )
+    if len(offsets) < FEWEST_WINDOWS:
+        return
+    offset = float(np.median(offsets))
+    if LARGE < abs(offset) < LARGEST and np.mean(np.sign(offsets) == np.sign(offset)) > AGREE:
+        cause = (
+            f"all ranges are too {'long' if offset > 0.0 else 'short'} by about as much: the "
+            "antenna delay of the tag"
+        )
+        low, high = np.quantile(offsets, [0.25, 0.75])
+        evidence = (
+            f"{offset:.2f} m in the median of {len(offsets)} windows of {WINDOW:g} s, {low:.2f} "
+            f"to {high:.2f} m in half of them"
+        )
+        yield Finding("tag_delay", NOTE, cause, evidence, REMEDY, offset)
+
+
+def window_offsets(ranges: Ranges, anchors: Anchors) -> np.ndarray:
+    """(k,) m: what the ranges of each window have in common beside the distances from one place,
+    where they tell.
+    """
+    row = anchors.index(ranges.anchor)
+    sound = (row >= 0) & np.isfinite(ranges.d) & np.isfinite(ranges.t)
+    row, d, t = row[sound], ranges.d[sound], ranges.t[sound]
+    if not len(t):
+        return np.empty(0)
+    _, first = np.unique(np.floor((t - t.min()) / WINDOW), return_index=True)
+    parts = list(zip(np.split(row, first[1:]), np.split(d, first[1:])))
+    parts = [(rows, some) for rows, some in parts if len(np.unique(rows)) >= FEWEST_ANCHORS]
+    chosen = np.unique(np.linspace(0, len(parts) - 1, min(len(parts), MOST_WINDOWS)).astype(int))
+    found = (_offset(anchors.positions[parts[k][0]], parts[k][1]) for k in chosen)
+    return np.array([one for one in found if one is not None])
+
+
+def _offset(positions: np.ndarray, d: np.ndarray) -> float | None:
+    """m, of ranges d (n,) m to anchors at positions (n, 3) m, by Gauss-Newton with Huber's weights;
+    None where they do not determine it.
+    """
+    x = np.append(positions.mean(axis=0), 0.0)
+    for _ in range(STEPS):
+        away = x[:3] - positions
+        distance = np.maximum(np.linalg.norm(away, axis=1), 1e-6)
+        error = d - distance - x[3]
+        weight = np.minimum(1.0, SCALE / np.maximum(np.abs(error), 1e-9))
+        jacobian = np.column_stack([away / distance[:, None], np.ones(len(d))])
+        gram = jacobian.T @ (weight[:, None] * jacobian) + DAMPING * np.eye(4)
+        x = x + np.linalg.solve(gram, jacobian.T @ (weight * error))
+    determined = float(np.sqrt(np.linalg.inv(gram)[3, 3])) < DILUTION and bool(np.isfinite(x).all())
+    return float(x[3]) if determined else None
+
+
+RULES = (
+    frames,
+    senders,
+    no_imu,
+    odometry_unread,
+    anchors,
+    sorted_file,
+    clock,
+    other_time,
+    losses,
+    kinds,
+    unmatched,
+    several,
+    volatile_anchors,
+    tag_delay,
+)

@@ -1,7 +1,6 @@
-"""What is wrong with the numbers of a flight whose ground truth is known: of pairs, of stamps, of
-the axes of the IMU, of the truth itself.
+"""Judge the numbers of a flight: its streams alone, and against its ground truth if it has one.
 
-What holds for whole streams is in `uwb_tdoa_ekf.streams`; here geometry and motion say what should
+The streams alone are judged by `uwb_tdoa_ekf.streams`. Here geometry and motion show what should
 have been measured.
 """
 
@@ -12,17 +11,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.effects.anchor_ids import AnchorIds
-from uwb_tdoa_ekf.streams import WARNING, Finding
+from uwb_tdoa_ekf.streams import NOTE, WARNING, Finding, most_severe_first
 
-from . import motion_rules, pair_rules, time_rules
-from .known_path import KnownPath, least_height
+from . import coverage, imu_rules, motion_rules, pair_rules, time_rules
+from .check import fed
 from .motion_rules import TrueMotion
-from .repairs import repairs_of
+from .pair_rules import KnownPath, least_height, repairs_of
+from .recording import of_flight
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from uwb_tdoa_bias.foundation.flight import Flight
+
 
 HOLE, LEAP, LEAST_LEAP = (
     1.0,
@@ -31,11 +32,11 @@ HOLE, LEAP, LEAST_LEAP = (
 )  # s without ground truth in the air; m/s, and m, between two poses; healthy 0.11
 
 
-def against_truth(flight: Flight) -> list[Finding]:
+def judge_against_truth(flight: Flight) -> list[Finding]:
     """[Finding] of a Flight; none without ground truth."""
     if flight.truth is None or len(flight.truth) < 2:
         return []
-    return [*of_truth(flight), *_of_tdoas(KnownPath(flight)), *_of_imu(flight)]
+    return [*judge_truth(flight), *_of_tdoas(KnownPath(flight)), *_of_imu(flight)]
 
 
 def _of_tdoas(path: KnownPath) -> list[Finding]:
@@ -68,7 +69,7 @@ def _of_imu(flight: Flight) -> list[Finding]:
     return found or [*motion_rules.filtered(motion), *motion_rules.stamps(motion)]
 
 
-def of_truth(flight: Flight) -> Iterator[Finding]:
+def judge_truth(flight: Flight) -> Iterator[Finding]:
     """Holes and leaps of the ground truth in the air."""
     assert flight.truth is not None
     of = flight.truth
@@ -104,3 +105,25 @@ def of_truth(flight: Flight) -> Iterator[Finding]:
             "look for exchanged or hidden markers",
             float(speed[k]),
         )
+
+
+pass
+
+
+def judge_flight(flight: Flight) -> list[Finding]:
+    """[Finding] of a Flight, most severe first: of its streams by themselves, and against its
+    ground truth if it has one. What several rules name by the same name is reported once.
+    """
+    streams, imu = fed(of_flight(flight)), flight.imu
+    found = streams.findings()
+    track = None if flight.truth is None else (flight.truth.t, flight.truth.p)
+    found += coverage.missing(
+        coverage.CoverageView(flight.anchors, list(streams.tdoa), np.empty((0, 3)), track=track)
+    )
+    if imu is not None and not any(finding.rule == "imu_clipped" for finding in found):
+        found += imu_rules.saturated(flight)
+    found = [finding for finding in found if finding.severity != NOTE]
+    known = {finding.rule for finding in found}
+    return most_severe_first(
+        found + [finding for finding in judge_against_truth(flight) if finding.rule not in known]
+    )
