@@ -14,6 +14,7 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.evidence import OF_ANCHORS
 from uwb_tdoa_ekf.offline import may_have_offset
 
+from ..checking.flight_rules import judge_flight
 from ..scoring.metrics import Score
 from . import comparison, repairing, validation
 from .attribution import Attribution, attribute, residuals_of
