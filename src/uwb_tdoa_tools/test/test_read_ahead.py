@@ -2,7 +2,7 @@ import threading
 
 import pytest
 
-from uwb_tdoa_tools.live.replay import BATCH, BATCHES_AHEAD, read_ahead
+from uwb_tdoa_tools.live.player import BATCH, BATCHES_AHEAD, read_ahead
 
 
 @pytest.mark.parametrize("count", [0, 1, BATCH, 3 * BATCH + 7, BATCH * (BATCHES_AHEAD + 5)])

@@ -29,35 +29,41 @@ if TYPE_CHECKING:
 
 
 LEAD = 2_000_000_000  # ns of stamps that may be played ahead
-# ns: a TDOA that is older than the newest by more has come out of the filter, or is waited for
+# ns; the replay waits for each TDOA that is older than the newest by more than STEP. STEP exceeds
+# `reorder` of ekf_node: the filter can have used that TDOA. STEP is below `hold` of bias_node and
+# `lag` of ekf_node: neither gives up data that are on the way.
 STEP = 80_000_000
-# (STEP is more than ekf_node's `reorder`, so that it can have come out, and less than bias_node's
-# `hold` and ekf_node's
-# `lag`, so that neither goes on without what is still on its way.)
+# ns; STEP for the time START after the first pose. START_STEP is below `pose_lag` of bias_node,
+# which passes TDOAs on until it has a pose.
 START_STEP, START = 40_000_000, 1_000_000_000
-# ns: the same for so long after the first pose: less than bias_node's `pose_lag`. Before it knows
-# of a pose it passes TDOAs on.
 LOOK_PERIOD = LEAD // 20  # ns of stamps between two looks at a topic that is in step or silent
-AID_SILENT = 1_000_000_000  # ns after which ekf_node does without one of the SENSORS: its SILENT
-AID_SHARE = 0.5  # of its `lag`, for which it waits for them, and all TDOAs with it: its OF_AIDS
-LAG = 0.25  # s, its `lag` if nothing else is known
-SILENCE = 5.0  # s after which a topic is not waited for any more, until it speaks again
+AID_SILENT = 1_000_000_000  # ns until ekf_node stops waiting for a silent sensor: its SILENT
+AID_SHARE = 0.5  # of `lag`: how long ekf_node holds TDOAs back for an aid: its OF_AIDS
+LAG = 0.25  # s, default of `lag`
+SILENCE = 5.0  # s without a message after which the replay waits for a topic no longer
 POLL_PERIOD = 0.001  # s
 RESIDUAL = "uwb/residual"
-LEARNED = 20  # TDOAs that tell by how much bias_node shifts their stamps
+LEARNED = 20  # TDOAs from which the shift of stamps by bias_node is estimated
 
 
 class Follower:
-    """Watches a topic whose messages have a header, and says when to wait for it.
+    """Watch a topic whose messages have a header, and hold a replay until the topic catches up.
 
-    Where somebody also publishes uwb/residual, one message for each TDOA, TDOAs are followed too
-    (`add_tdoa`).
+    If uwb/residual has a publisher, each TDOA is followed too (`add_tdoa`).
     """
 
     def __init__(self, node: Node, topic: str, lag: float = LAG) -> None:
-        """lag : s, of ekf_node.
+        """Subscribe to the topic.
 
-        Raises InputError if nobody publishes the topic, or its messages have no header.
+        Parameters
+        ----------
+        lag : float
+            Parameter `lag` of ekf_node, s.
+
+        Raises
+        ------
+        InputError
+            If the topic has no publisher, or its messages have no header.
         """
         topic = node.resolve_topic_name(topic)
         types = dict(node.get_topic_names_and_types()).get(topic)
@@ -78,24 +84,31 @@ class Follower:
         self._tdoas = _Tdoas(node, round(1e9 * AID_SHARE * lag))
 
     def add_tdoa(self, stamp: int) -> None:
-        """A TDOA with this stamp, ns, has been played."""
+        """Note that a TDOA with this stamp, ns, was published."""
         self._tdoas.add(stamp)
 
     def add_aid(self, topic: str, stamp: int) -> None:
-        """What one of the SENSORS measured, with this stamp, ns, has been played, for the filter."""
+        """Note that a measurement of one of the SENSORS with this stamp, ns, was published."""
         self._tdoas.add_aid(topic, stamp)
 
     def wait(self, stamp: int, stop: Stop) -> float:
-        """Wait while the topic is more than LEAD behind a message stamped so, ns, which is about to
-        be played, and until every TDOA has come out of the filter that is older by STEP than what
-        it goes to by now: the newest, or less while it waits for an aid.
+        """Wait until a message may be published, and return how long that took, s.
 
-        Returns how long that took, s; stop : true once the wait shall end.
+        The topic must not be more than LEAD behind the message. Each TDOA that is older by STEP than
+        the time of the filter must have left the filter. That time is the stamp of the newest TDOA, or
+        less while the filter waits for an aid.
+
+        Parameters
+        ----------
+        stamp : int
+            Stamp of the message, ns.
+        stop : Stop
+            True once the wait shall end.
         """
         return self._tdoas.wait(self._is_starting(stamp), stop) + self._wait_for_stamps(stamp, stop)
 
     def _is_starting(self, stamp: int) -> bool:
-        """Whether bias_node may not know yet that there are poses, for what is stamped so, ns."""
+        """Return whether bias_node may still lack poses at this stamp, ns."""
         if (
             self._started is not None and stamp < self._started - LEAD
         ):  # a recording that starts again
@@ -105,7 +118,7 @@ class Follower:
         return self._started is None or stamp < self._started + START
 
     def _hear(self) -> bool:
-        """Whether the topic has said something."""
+        """Read the topic, and return whether a message has come."""
         taken = _taken(self._subscription)
         if taken:
             self._newest, self._silent = stamp_of(taken[-1]), False
@@ -131,7 +144,7 @@ class Follower:
 
 
 class _Tdoas:
-    """How far the TDOAs that were played have come out of the filter, in the order of their stamps."""
+    """Count how far the published TDOAs have left the filter, in the order of their stamps."""
 
     def __init__(self, node: Node, aid_wait: int) -> None:
         self._subscription, self._aid_wait = None, aid_wait
@@ -198,10 +211,7 @@ class _Tdoas:
         return reach - step <= max(self._begin, self._out + self._shift)
 
     def _learn(self, stamps: list[int]) -> None:
-        """Note stamps that have come out.
-
-        An effect may have shifted them: the first ones tell by how much.
-        """
+        """Note stamps that left the filter. The first ones show by how much an effect shifts them."""
         self._out = max(self._out, *stamps)
         for stamp in stamps[: len(self._first)]:
             if self._learned < LEARNED:
@@ -210,7 +220,7 @@ class _Tdoas:
 
 
 def _taken(subscription: Subscription) -> list[bytes]:
-    """Take what has come: list of bytes."""
+    """Return the messages that have arrived, as bytes."""
     found = []
     with subscription.handle:
         while (taken := subscription.handle.take_message(subscription.msg_type, True)) is not None:
@@ -219,7 +229,7 @@ def _taken(subscription: Subscription) -> list[bytes]:
 
 
 def is_stamped(cls: Any) -> bool:
-    """Whether messages of a class, or None, begin with a header."""
+    """Return whether the messages of a class, or None, begin with a header."""
     return (
         cls is not None
         and next(iter(cls.get_fields_and_field_types().values()), None) == "std_msgs/Header"
@@ -227,7 +237,7 @@ def is_stamped(cls: Any) -> bool:
 
 
 def stamp_of(data: bytes) -> int:
-    """Stamp, ns, of a message that begins with a header, from its serialised bytes (CDR)."""
+    """Return the stamp, ns, of a serialized message (CDR) that begins with a header."""
     seconds, nanoseconds = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
     return seconds * 10**9 + nanoseconds
 
@@ -255,13 +265,23 @@ RECEIVED = {  # {node: {key in its diagnostics: what it counts}}
 
 
 class Nodes:
-    """bias_node and ekf_node in our namespace, as far as they are there. lag : s, ekf_node's."""
+    """Compare the counters of bias_node and ekf_node in our namespace before and after a replay.
+
+    Attributes
+    ----------
+    lag : float
+        Parameter `lag` of ekf_node, s.
+    """
 
     lag = LAG
 
     def __init__(self, node: Node) -> None:
-        """Raises InputError if their parameters do not allow to wait for what is on its way, or if
-        one says nothing on /diagnostics.
+        """Find the nodes and read their counters.
+
+        Raises
+        ------
+        InputError
+            If their parameters end a wait too early, or a node publishes no /diagnostics.
         """
         self._node, self._diagnostics = node, DiagnosticsListener(node)
         space = node.get_namespace()
@@ -314,7 +334,7 @@ class Nodes:
     def _counts(
         self, is_enough: Callable[[DiagnosticsListener], object]
     ) -> dict[str, dict[str, int]]:
-        """{node: {key: count}} when each has said something and is_enough(diagnostics)."""
+        """Return {node: {key: count}} when each node has published and is_enough(diagnostics) holds."""
         until = time.monotonic() + SETTLE_LIMIT
         self._diagnostics.forget()
         newest = {}
@@ -332,9 +352,7 @@ class Nodes:
         }
 
     def _check_patience(self) -> None:
-        """What may wait in the filter, for aids too, < hold < lag, or one of the nodes goes on
-        without what is still on its way.
-        """
+        """Require: longest wait in the filter < hold < lag. Else a node drops data that are on the way."""
         hold, self.lag = (self._parameter(name, parameter) for name, parameter in PATIENCE.items())
         least = 1e-9 * STEP + AID_SHARE * self.lag
         if not least < hold < self.lag:
@@ -345,9 +363,7 @@ class Nodes:
             )
 
     def _wait_for_names(self) -> None:
-        """Return when the node of every publisher and subscription is known: DDS tells that later
-        than that they are.
-        """
+        """Wait until the node of each publisher and subscription has a name: DDS sends names later."""
         node, until = self._node, time.monotonic() + ANSWER_LIMIT
         while time.monotonic() < until:
             ends = [node.get_publishers_info_by_topic, node.get_subscriptions_info_by_topic]

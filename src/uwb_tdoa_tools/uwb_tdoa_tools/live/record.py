@@ -29,8 +29,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class End:
-    """A publisher or a subscription. topic, node : absolute names; kind : type of its messages;
-    reliable, latched : its QoS, best effort and volatile otherwise.
+    """A publisher or a subscription of a topic.
+
+    Attributes
+    ----------
+    topic, node : str
+        Absolute names.
+    kind : str
+        Type of the messages.
+    publishes : bool
+        True for a publisher.
+    reliable, latched : bool
+        QoS; false means best effort and volatile.
     """
 
     topic: str
@@ -42,32 +52,35 @@ class End:
 
     @property
     def qos(self) -> str:
-        """In words."""
+        """Describe the QoS in words."""
         return (
             f"{'reliable' if self.reliable else 'best effort'}, "
             f"{'transient local' if self.latched else 'volatile'}"
         )
 
     def gets(self, publisher: End) -> bool:
-        """Whether a subscription gets what a publisher of its topic sends (DDS: it may not ask for
-        more than is offered).
+        """Return whether this subscription receives from a publisher of its topic.
+
+        A subscription may not request more than is offered (DDS).
         """
         return publisher.reliable >= self.reliable and publisher.latched >= self.latched
 
 
 REMEDY = "build and source the workspace that has it"
 DISCOVERY_PERIOD = 0.1  # s between two looks for new topics
-POLL_PERIOD = (
-    0.005  # s between two looks for messages; the subscriptions hold what comes in between
-)
+POLL_PERIOD = 0.005  # s between two reads of the subscriptions, which queue messages meanwhile
 
 
 @contextmanager
 def recorded_odometry(node: Node, path: str | Path) -> Iterator[None]:
     """Record the topic /odometry while the block lasts. The caller must spin the node.
 
-    The bag appears at `path` when the block ends without an exception. Raises InputError if a file
-    is there.
+    The bag appears at `path` when the block ends without an exception.
+
+    Raises
+    ------
+    InputError
+        If `path` exists.
     """
     with new_bag(path) as writer:
         recorder = Recorder(node, writer, {"/odometry"}, lambda sentence: None)
@@ -78,9 +91,12 @@ def recorded_odometry(node: Node, path: str | Path) -> Iterator[None]:
 
 
 class Recorder:
-    """Subscriptions, and the connections of the bag that they write to.
+    """Write the messages of wanted topics to a bag.
 
-    wanted : set of absolute topic names. counts : {topic: messages recorded so far}.
+    Attributes
+    ----------
+    counts : dict
+        {topic: messages recorded so far}.
     """
 
     def __init__(
@@ -95,15 +111,14 @@ class Recorder:
         self._pairs: list[tuple[Subscription, Connection]] = []
 
     def discover(self) -> None:
-        """Subscribe to wanted topics that have a publisher by now."""
+        """Subscribe to wanted topics that have a publisher now."""
         for topic, types in self._node.get_topic_names_and_types():
             if topic in self.counts or topic not in self._wanted:
                 continue
             publishers = self._node.get_publishers_info_by_topic(topic)
             if publishers:
-                msgtype = next(
-                    filter(message_class, types), types[0]
-                )  # others may tell other types of it
+                # A topic may be announced with several types: the first installed one is taken.
+                msgtype = next(filter(message_class, types), types[0])
                 self._subscribe(
                     topic,
                     msgtype,
@@ -121,7 +136,7 @@ class Recorder:
             time.sleep(POLL_PERIOD)
 
     def take(self) -> None:
-        """Move all messages that have arrived to the bag."""
+        """Write all messages that have arrived to the bag."""
         for subscription, connection in self._pairs:
             with subscription.handle:
                 while (
@@ -148,7 +163,7 @@ class Recorder:
             offered_qos_profiles=[recorded_qos(qos) for qos in offered],
         )
         qos = subscription_qos(offered)
-        # Of a node that is spun, the callback writes. Else `take` moves many messages at a time.
+        # In a node that spins, the callback writes. Else `take` moves many messages at a time.
         write = partial(self._write, connection)
         subscription = self._node.create_subscription(cls, topic, write, qos, raw=True)
         self._pairs.append((subscription, connection))
@@ -166,12 +181,32 @@ FIRST_LIMIT = 20.0  # s until there must be a message on the first topic
 def listen(
     topics: Sequence[str], bag: str | Path, seconds: float, say: Callable[[str], object] = print
 ) -> tuple[dict[str, str], list[End]]:
-    """Record topics to a new bag, from the first message on the first of them on for `seconds`, or
-    until SIGINT.
+    """Record topics to a new bag for some seconds, or until SIGINT.
 
-    topics : absolute names. Returns ({topic: type} of all that there are, [End] of topics, who is
-        not us).
-    Raises InputError if nothing comes on the first one.
+    The time starts with the first message on the first topic.
+
+    Parameters
+    ----------
+    topics : sequence of str
+        Absolute names.
+    bag : path
+        The bag to write.
+    seconds : float
+        Duration, s.
+    say : callable
+        Called with sentences about the progress.
+
+    Returns
+    -------
+    kinds : dict
+        {topic: type} of all topics in the system.
+    ends : list of End
+        Publishers and subscriptions of `topics`, without our own.
+
+    Raises
+    ------
+    InputError
+        If no message arrives on the first topic.
     """
     with session("check", []) as (node, stop), new_bag(bag) as writer:
         recorder = Recorder(node, writer, set(topics), say)
@@ -182,8 +217,7 @@ def listen(
         kinds = {topic: types[0] for topic, types in node.get_topic_names_and_types()}
         if not heard():
             raise InputError(
-                f"no message on {topics[0]} within {FIRST_LIMIT:g} s; "
-                f"{_elsewhere(topics[0], kinds)}."
+                f"no message on {topics[0]} within {FIRST_LIMIT:g} s; {_remedy(topics[0], kinds)}."
             )
         say(
             f"listening for {seconds:g} s; carry the tag through the room, turn, lift and "
@@ -218,8 +252,8 @@ def _ends(node: Node, topic: str) -> Iterator[End]:
             )
 
 
-def _elsewhere(topic: str, kinds: dict[str, str]) -> str:
-    """What to do about a topic that nobody publishes."""
+def _remedy(topic: str, kinds: dict[str, str]) -> str:
+    """Return the remedy for a topic without a publisher."""
     others = sorted(
         name for name, kind in kinds.items() if kind == "uwb_tdoa_msgs/msg/Tdoa" and name != topic
     )

@@ -2,291 +2,63 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from contextlib import closing
 from dataclasses import dataclass, field
 import itertools
-import queue
-import threading
 import time
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 from rclpy.duration import Duration
-from rclpy.impl.implementation_singleton import rclpy_implementation
-from rclpy.qos import DurabilityPolicy, QoSProfile
-from rosgraph_msgs.msg import Clock
+from rclpy.qos import DurabilityPolicy
 
 from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.sensors import SENSORS
 
 from ..bags.files import messages, open_bag
-from .follow import Follower, Nodes, is_stamped, stamp_of
+from .follow import Follower, Nodes
+from .player import ACKNOWLEDGE_LIMIT, LONGEST_SLEEP, Played, Player, is_tdoa, read_ahead
 from .session import message_class, publisher_qos, session
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Generator, Iterable, Sequence
+    from collections.abc import Callable, Iterable, Sequence
     from pathlib import Path
 
     from rclpy.node import Node
     from rclpy.publisher import Publisher
-    from rosbags.interfaces import Connection
 
     from ..bags.files import BagReader
-    from .follow import Follower
     from .session import Stop
 
 
-Item = TypeVar("Item")
-
-BATCH = 500
-BATCHES_AHEAD = 100
-
-
-def read_ahead(messages: Iterable[Item]) -> Generator[Item, None, None]:
-    """Yield what the iterable yields, read by a thread up to 50,000 items ahead.
-
-    Its exceptions are raised here.
-    """
-    batches: queue.Queue[list[Item] | BaseException | None] = queue.Queue(BATCHES_AHEAD)
-    closed = threading.Event()
-
-    def put(item: list[Item] | BaseException | None) -> None:
-        while not closed.is_set():
-            try:
-                return batches.put(item, timeout=0.1)
-            except queue.Full:
-                pass
-
-    def read() -> None:
-        batch: list[Item] = []
-        try:
-            for message in messages:
-                batch.append(message)
-                if len(batch) == BATCH:
-                    put(batch)
-                    batch = []
-                if closed.is_set():
-                    return
-            put(batch)
-            put(None)
-        except BaseException as error:
-            put(batch)
-            put(error)
-
-    thread = threading.Thread(target=read, daemon=True)
-    thread.start()
-    try:
-        while (batch := batches.get()) is not None:
-            if isinstance(batch, BaseException):
-                raise batch
-            yield from batch
-    finally:
-        closed.set()
-        thread.join()
-
-
-RCLError = rclpy_implementation.RCLError
-# s: a longer delay shifts all that follows, instead of a burst that a subscription cannot take
-LARGEST_CATCH_UP = 0.1
-LATCHED_LIMIT = 5.0  # s that somebody may take to acknowledge what is latched
-LONGEST_SLEEP = 0.05  # s: how soon a signal is seen
-ACKNOWLEDGE_LIMIT = 30.0  # s; longer than the 20 s after which DDS forgets a subscription that died
-
-
-@dataclass
-class Played:
-    """What was published.
-
-    counts : messages by topic in the bag; behind : s, the latest that a message was; stretched : s,
-        by how much the
-    time of the replay was stretched, so that a stall was not followed by a burst that nobody can
-    take; waited : s, for the topic that is followed.
-    """
-
-    counts: Counter[str] = field(default_factory=Counter)
-    behind: float = 0.0
-    stretched: float = 0.0
-    waited: float = 0.0
-
-
-def is_latched(publisher: Publisher) -> bool:
-    """Whether who subscribes late gets the last messages too."""
-    return publisher.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
-
-
-def is_tdoa(publisher: Publisher) -> bool:
-    """Whether it publishes raw TDOAs."""
-    return _kind(publisher) == "Tdoa"
-
-
-def is_aid(publisher: Publisher) -> bool:
-    """Whether it publishes what one of the SENSORS measures, for ekf_node."""
-    return publisher.topic_name.endswith(
-        tuple(f"/{topic}" for sensor in SENSORS.values() for topic, _ in sensor.topics)
-    )
-
-
-def _kind(publisher: Publisher) -> str:
-    """Name of the class of its messages."""
-    return publisher.msg_type.__name__  # type: ignore[attr-defined]  # rclpy says of the class that it is a message
-
-
-class Player:
-    """Publishes to {topic in the bag: publisher}, `rate` times as fast as recorded, with /clock if
-    it has a rate, Hz.
-
-    stop : true once the process was asked to end; follower : Follower or None; played : Played.
-    """
-
-    def __init__(
-        self,
-        node: Node,
-        publishers: dict[str, Publisher],
-        rate: float,
-        clock_rate: float | None,
-        stop: Stop,
-    ) -> None:
-        self.played = Played()
-        self.follower: Follower | None = None
-        self._publishers, self._rate, self._stop = publishers, rate, stop
-        self._clock = (
-            node.create_publisher(Clock, "/clock", QoSProfile(depth=10)) if clock_rate else None
-        )
-        self._clock_period = 1.0 / clock_rate if clock_rate else 0.0
-        self._stamped = {
-            topic for topic, publisher in publishers.items() if is_stamped(publisher.msg_type)
-        }
-        self._tdoas = {topic for topic, publisher in publishers.items() if is_tdoa(publisher)}
-        self._aids = {topic for topic, publisher in publishers.items() if is_aid(publisher)}
-        self._latched = [publisher for publisher in publishers.values() if is_latched(publisher)]
-        self._start: int | None = None  # ns, stamp of the first message
-        self._began = self._next_tick = 0.0
-
-    def count(self, what: str) -> int:
-        """How many "TDOAs" or "IMU samples" have been played."""
-        kind = {"TDOAs": "Tdoa", "IMU samples": "Imu"}[what]
-        return sum(
-            n for topic, n in self.played.counts.items() if _kind(self._publishers[topic]) == kind
-        )
-
-    def play(self, recorded: Iterable[tuple[Connection, int, bytes]]) -> None:
-        """Publish an iterable of (connection, stamp ns, bytes), from the beginning."""
-        self._start = None
-        for connection, stamp, data in recorded:
-            if self._start is None:
-                self._start, self._began = stamp, time.perf_counter()
-                self._next_tick = self._began
-            behind = self._sleep_until(self._began + (stamp - self._start) / (1e9 * self._rate))
-            if self._stop:
-                return
-            self._count_delay(behind)
-            publisher, topic = self._publishers[connection.topic], connection.topic
-            if self._latched and not is_latched(publisher):
-                self._began += self._wait_for_latched()
-            if self.follower is not None and topic in self._stamped:
-                waited = self.follower.wait(stamp_of(data), self._stop)
-                self.played.waited += waited
-                self._began += waited
-            if self._publish(publisher, data):
-                self.played.counts[topic] += 1
-                if self.follower is not None and topic in self._tdoas:
-                    self.follower.add_tdoa(stamp_of(data))
-                elif (
-                    self.follower is not None
-                    and topic in self._aids
-                    and publisher.get_subscription_count()
-                ):
-                    self.follower.add_aid(topic, stamp_of(data))
-
-    def _wait_for_latched(self) -> float:
-        """Wait, before the first message of a stream, until what is latched (the anchors) has been
-        acknowledged. Returns the s that took.
-
-        Their publishers were made last, and a participant hears of our publishers in the order in
-        which they were made: who acknowledges a message of theirs listens to all the others too,
-        the best-effort ones among them.
-        """
-        began = time.perf_counter()
-        for publisher in self._latched:
-            while time.perf_counter() < began + LATCHED_LIMIT and not self._stop:
-                if publisher.wait_for_all_acked(Duration(seconds=LONGEST_SLEEP)):
-                    break
-        self._latched = []
-        return time.perf_counter() - began
-
-    def _sleep_until(self, due: float) -> float:
-        """Sleep, and publish the clock meanwhile. Returns the s by which it is later than due."""
-        while True:
-            now = time.perf_counter()
-            if self._clock is not None and now >= self._next_tick:
-                self._tick(min(now, due))
-                self._next_tick = max(self._next_tick + self._clock_period, now)
-            if now >= due or self._stop:
-                return now - due
-            wake = due if self._clock is None else min(due, self._next_tick)
-            time.sleep(min(max(wake - now, 0.0), LONGEST_SLEEP))
-
-    def _tick(self, now: float) -> None:
-        assert self._clock is not None and self._start is not None
-        nanoseconds = self._start + int((now - self._began) * 1e9 * self._rate)
-        message = Clock()
-        message.clock.sec, message.clock.nanosec = divmod(nanoseconds, 10**9)
-        self._clock.publish(message)
-
-    def _count_delay(self, behind: float) -> None:
-        self.played.behind = max(self.played.behind, behind)
-        if behind > LARGEST_CATCH_UP:
-            self._began += behind - LARGEST_CATCH_UP
-            self.played.stretched += behind - LARGEST_CATCH_UP
-
-    def _publish(self, publisher: Publisher, data: bytes) -> bool:
-        """Publish, after waiting until reliable subscriptions have acknowledged what the history is
-        full of. Returns False if stopped while it waited.
-        """
-        until = time.monotonic() + ACKNOWLEDGE_LIMIT
-        while True:
-            try:
-                publisher.publish(data)
-                return True
-            except RCLError as error:  # full for longer than DDS waits by itself, 0.1 s
-                if self._stop:
-                    return False
-                if time.monotonic() > until:
-                    raise InputError(
-                        f"{publisher.topic_name}: a subscription has not acknowledged anything for "
-                        f"{ACKNOWLEDGE_LIMIT:g} s ({error}); stop it, or let it subscribe "
-                        "best effort."
-                    ) from error
-
-
-pass
-pass
-
-
-GLOBAL = (
-    "/tf",
-    "/tf_static",
-    "/clock",
-    "/diagnostics",
-    "/rosout",
-    "/parameter_events",
-)  # in no robot's namespace
-# s from the last match to the first message, and from the last message to the end: others are a
-# little later than we are
+# In no robot's namespace:
+GLOBAL = "/tf", "/tf_static", "/clock", "/diagnostics", "/rosout", "/parameter_events"
+# s from the last match to the first message, and from the last message to the end: the other side
+# discovers a little later
 SETTLE = 0.2
-DISCOVERY = 2.0  # s without anybody new after which who listens by now is enough
+DISCOVERY = 2.0  # s without a new subscription after which the present ones suffice
 
 
 @dataclass(frozen=True)
 class ReplayOptions:
-    """How to replay.
+    """Options of a replay.
 
-    rate : times as fast as recorded; loop : start again at the end; clock_rate : Hz of /clock, None
-        for none;
-    wait : s until somebody must subscribe; wait_topics : to all of these; follow : topic that is
-        kept in step with, or
-    None (the TDOAs of the bag are of the wait_topics then); ros_arguments : command line with
-    --ros-args; packages : of message types, beside those that are known, that may be imported.
+    Attributes
+    ----------
+    rate : float
+        Times as fast as recorded.
+    loop : bool
+        Start again at the end.
+    clock_rate : float or None
+        Hz of /clock.
+    wait : float
+        s until a subscription must exist.
+    wait_topics : sequence of str
+        Topics that each need a subscription.
+    follow : str or None
+        Topic to keep in step with. The TDOAs of the bag then need a subscription.
+    ros_arguments : sequence of str
+        Command line with --ros-args.
+    packages : sequence of str
+        Further packages of message types to import.
     """
 
     rate: float = 1.0
@@ -301,9 +73,20 @@ class ReplayOptions:
 
 @dataclass(frozen=True)
 class Replayed:
-    """played : Played; took : s; acknowledged : whether every subscription has everything;
-    stopped_by : number of the signal that ended it early, or None; wrong : {what went wrong with
-    what was followed: count}, empty if nothing did or nothing was followed.
+    """Result of a replay.
+
+    Attributes
+    ----------
+    played : Played
+        Counters.
+    took : float
+        Duration, s.
+    acknowledged : bool
+        Whether every subscription has every message.
+    stopped_by : int or None
+        Number of the signal that ended the replay early.
+    wrong : dict
+        {fault of the followed nodes: count}.
     """
 
     played: Played = field(default_factory=Played)
@@ -316,9 +99,25 @@ class Replayed:
 def replay(
     bag: str | Path, options: ReplayOptions = ReplayOptions(), say: Callable[[str], object] = print
 ) -> Replayed:
-    """Replay a bag.
+    """Replay a bag over ROS topics.
 
-    Returns Replayed. Raises InputError. say(sentence) : called with what happens.
+    Parameters
+    ----------
+    bag : path
+        The bag.
+    options : ReplayOptions
+        How to replay it.
+    say : callable
+        Called with sentences about the progress.
+
+    Returns
+    -------
+    Replayed
+
+    Raises
+    ------
+    InputError
+        If the bag has no message, or nobody subscribes in time.
     """
     with open_bag(bag) as reader, session("replay", list(options.ros_arguments)) as (node, stop):
         publishers = _publishers(node, bag, reader, say, options.packages)
@@ -355,9 +154,9 @@ def _publishers(
     say: Callable[[str], object],
     packages: Sequence[str],
 ) -> dict[str, Publisher]:
-    """{topic in the bag: publisher} of all topics whose type is installed, those that are latched
-    last. What belongs to one robot is published in the namespace of the node (--ros-args -r
-    __ns:=/tag1).
+    """Return {topic in the bag: publisher} of each topic of an installed type, latched ones last.
+
+    Topics of one robot are published in the namespace of the node (--ros-args -r __ns:=/tag1).
     """
     made = []
     by_topic = itertools.groupby(
@@ -402,10 +201,15 @@ def _wait_for_listeners(
     stop: Stop,
     say: Callable[[str], object],
 ) -> None:
-    """Return when somebody subscribes to each wanted topic: those that options name, or else all of
-    the bag, as far as they have any subscriber once nobody new has come for DISCOVERY s; and when
-    somebody publishes what is followed. InputError if after `options.wait` s nobody subscribes to
-    one that must have a subscriber, or to any.
+    """Wait until each wanted topic has a subscription, and the followed topic a publisher.
+
+    Wanted are the topics that the options name. Else all topics of the bag are wanted, and those
+    with a subscription suffice once no further one has come for DISCOVERY s.
+
+    Raises
+    ------
+    InputError
+        If after `options.wait` s a required topic, or every topic, has no subscription.
     """
     needed = [f"/{topic.lstrip('/')}" for topic in options.wait_topics]
     wanted = needed or list(publishers)
@@ -430,9 +234,10 @@ def _wait_for_listeners(
         missing = [topic for topic, count in zip(wanted, counts) if not count]
         if (counts, known) != heard:
             heard, changed = (counts, known), now
-        settled = now > changed + DISCOVERY
         enough = not missing or (
-            settled and len(missing) < len(wanted) and not set(missing) & set(needed)
+            now > changed + DISCOVERY
+            and len(missing) < len(wanted)
+            and not set(missing) & set(needed)
         )
         matched = all(count >= there for count, there in zip(counts, known))
         if (enough and followed and matched) or now > began + options.wait:
@@ -453,17 +258,12 @@ def _wait_for_listeners(
 
 
 def _wait_acknowledged(publishers: Iterable[Publisher], stop: Stop) -> bool:
-    """Whether every subscription has everything; waits at most ACKNOWLEDGE_LIMIT, in slices that
-    see a signal.
-    """
+    """Return whether every subscription has every message, after at most ACKNOWLEDGE_LIMIT."""
     until = time.monotonic() + ACKNOWLEDGE_LIMIT
     for publisher in publishers:
         while not publisher.wait_for_all_acked(Duration(seconds=LONGEST_SLEEP)):
             if stop or time.monotonic() > until:
                 return False
-    time.sleep(
-        SETTLE
-        # who listens by best effort acknowledges nothing, and may read the last messages from the
-        # memory of this process
-    )
+    # Best-effort subscriptions acknowledge nothing, and may read from the memory of this process.
+    time.sleep(SETTLE)
     return True
