@@ -52,33 +52,33 @@ PARAMETERS = {  # in the order of config/vehicle_node.yaml
     "seed": Parameter(1, "of all that is random, as of fly", 0, 2**31 - 1),
     "told": Parameter(
         "place",
-        "what it tells the filter at the start: its place and yaw, to 0.1 m and 0.1 rad",
+        "prior that the filter gets at the start: its place and yaw, to 0.1 m and 0.1 rad",
         choices=("nothing", "place"),
     ),
     "aids": Parameter([""], f'what else it measures, of {", ".join(AIDS)}; [""] for nothing'),
     "mission": Parameter(
         False,
         (
-            "fly the standard mission, say what became of it, and end, with exit code 1 unless it "
+            "fly the standard mission, publish the verdict, and end, with exit code 1 unless it "
             "has landed"
         ),
     ),
     "simulated_time": Parameter(
-        False, "publish /clock, and go on when the odometry is there; else in real time"
+        False, "publish /clock, and continue when the odometry is there; else in real time"
     ),
     "duration": Parameter(600.0, "s; how long it can be flown, without the mission", 10.0, 1800.0),
     "frozen": FROZEN,
 }
-SETTLE = 1.0  # s from when somebody listens until what they say to each other is heard, too
+SETTLE = 1.0  # s from the first subscription until the other nodes have discovered each other
 
 
 class VehicleNode(StreamNode):
-    """A Trial on topics, and services for who flies it."""
+    """A Trial on topics, with services to command it."""
 
     NAME = "vehicle_node"
 
     def __init__(self, arguments: Sequence[str] = ()) -> None:
-        """arguments : of the process."""
+        """Declare the parameters, and wait for listeners. arguments : of the process."""
         super().__init__(self.NAME)
         own = declare_all(self, PARAMETERS)
         refuse_unknown(self)
@@ -101,9 +101,7 @@ class VehicleNode(StreamNode):
                 self.create_service(Land, "land", self._on_land),
             ]
         )
-        self._starts: float | None = (
-            None  # time.monotonic(), s, when it begins, once somebody listens
-        )
+        self._starts: float | None = None  # time.monotonic() of the start, s, after a subscription
         say_unused([self], files_of(arguments))
         self.turns = RoundRobin([self])
         self.get_logger().info(
@@ -111,7 +109,7 @@ class VehicleNode(StreamNode):
         )
 
     def take(self) -> bool:
-        """A turn, if it may come. Returns True: another one is to come."""
+        """Do a step of the simulation if it is due. Returns True: another step follows."""
         self._topics.listen()
         if self._starts is None and self._topics.heard():
             self._topics.wait_for_anchors()
@@ -131,7 +129,7 @@ class VehicleNode(StreamNode):
         return True
 
     def _report_verdict(self) -> None:
-        """Say what became of the mission under way; of the standard one with the exit code."""
+        """Publish the verdict of the mission; after the standard mission, end with its exit code."""
         verdict, self._reported = verdict_of(self._trial.flown), len(self._trial.missions)
         self._verdict.publish(String(data=json.dumps(verdict)))
         self.get_logger().info(sentence(verdict))
@@ -140,7 +138,7 @@ class VehicleNode(StreamNode):
             raise SystemExit(int(not verdict["landed"]))
 
     def _answer(self, response: Any, command: Callable[..., None], *values: object) -> Any:
-        """Do what a request says, or say why not."""
+        """Execute a request, or state why not in the response."""
         try:
             command(*values)
             response.success = True
