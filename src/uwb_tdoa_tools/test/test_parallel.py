@@ -146,10 +146,10 @@ def test_options():
 
 
 def test_few_items_are_done_in_one_process_unless_more_are_asked_for():
-    assert parallel.asked(options(), 4, 5) == (1, None)
-    assert parallel.asked(options(), 5, 5) == (min(parallel.cpu_count(), 5), None)
-    assert parallel.asked(options("--jobs", "2"), 4, 5) == (2, None)
-    assert parallel.asked(options("--dask", "tcp://here:1"), 4, 5) == (None, "tcp://here:1")
+    assert parallel.workers_for(options(), 4, 5) == (1, None)
+    assert parallel.workers_for(options(), 5, 5) == (min(parallel.cpu_count(), 5), None)
+    assert parallel.workers_for(options("--jobs", "2"), 4, 5) == (2, None)
+    assert parallel.workers_for(options("--dask", "tcp://here:1"), 4, 5) == (None, "tcp://here:1")
 
 
 def test_other_calls_have_the_same_processes(importable):

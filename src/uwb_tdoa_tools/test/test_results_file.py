@@ -6,7 +6,7 @@ import pytest
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools import results_file
-from uwb_tdoa_tools.results_file import ResultsFile, asked_of, state_of
+from uwb_tdoa_tools.results_file import ResultsFile, fingerprint_of, settings_of
 
 
 def fill(path, keys, asked=None):
@@ -110,10 +110,10 @@ def test_another_file_is_left_alone(tmp_path, content):
 def test_the_state_of_a_recording_changes_with_it(tmp_path):
     (tmp_path / "bag").mkdir()
     (tmp_path / "bag" / "data").write_text("one")
-    before = state_of(tmp_path / "bag")
-    assert str(tmp_path) in before and state_of(tmp_path / "bag") == before
+    before = fingerprint_of(tmp_path / "bag")
+    assert str(tmp_path) in before and fingerprint_of(tmp_path / "bag") == before
     (tmp_path / "bag" / "data").write_text("two, longer")
-    assert state_of(tmp_path / "bag") != before and state_of(None) == "None"
+    assert fingerprint_of(tmp_path / "bag") != before and fingerprint_of(None) == "None"
 
 
 def test_a_pipe_and_a_link_hold_no_results(tmp_path):
@@ -130,16 +130,16 @@ def test_a_recording_of_too_many_files_is_refused(tmp_path, monkeypatch):
     for number in range(4):
         (tmp_path / str(number)).touch()
     with pytest.raises(InputError, match="more than 3 entries"):
-        state_of(tmp_path)
+        fingerprint_of(tmp_path)
 
 
 def test_what_was_asked_is_every_option_that_matters_and_what_stands_in_its_files(tmp_path):
     file = tmp_path / "effects.yaml"
     file.write_text("one")
     args = SimpleNamespace(jobs=3, smooth=True, effects=str(file), model=None, config=None)
-    asked = asked_of(args, ["jobs"], ["effects", "model", "config"])
+    asked = settings_of(args, ["jobs"], ["effects", "model", "config"])
     file.write_text("two")
-    changed = asked_of(args, ["jobs"], ["effects", "model", "config"])
+    changed = settings_of(args, ["jobs"], ["effects", "model", "config"])
     assert asked == {
         "smooth": True,
         "effects": asked["effects"],

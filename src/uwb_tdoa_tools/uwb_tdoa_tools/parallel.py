@@ -162,7 +162,7 @@ def add_options(parser: argparse._ActionsContainer) -> None:
     )
 
 
-def asked(args: argparse.Namespace, count: int, few: int) -> tuple[int | None, str | None]:
+def workers_for(args: argparse.Namespace, count: int, few: int) -> tuple[int | None, str | None]:
     """Return (jobs, dask) for several calls of `over`, about `count` items.
 
     Without options there are as many jobs as cores and items, and one for fewer items than `few`.

@@ -208,7 +208,7 @@ def resumed(over: MapFunction, done: ResultsFile) -> MapFunction:
     return over_missing
 
 
-def state_of(path: str | Path | None) -> str:
+def fingerprint_of(path: str | Path | None) -> str:
     """Return a text that changes if a file, or a folder of files, changes; "None" for None.
 
     Raises OSError and InputError.
@@ -226,7 +226,7 @@ def state_of(path: str | Path | None) -> str:
     )
 
 
-def asked_of(
+def settings_of(
     args: Namespace, besides: Iterable[str] = (), files: Iterable[str] = ()
 ) -> dict[str, Any]:
     """Return the settings of a command, {option: value} for JSON. Raises OSError.

@@ -1,4 +1,4 @@
-"""check: all rules over one recording, in the order in which one mistake hides another."""
+"""Apply all rules to one recording, in the order in which one mistake hides another."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from .tdoa_rules import Survey
 
 ROUNDS = 3  # mistakes that are undone one after the other
-# Where one of these stands, nothing, or not the IMU, can be tried.
+# After one of these findings no correction, or none of the IMU, can be tried.
 NOTHING_TO_TRY = {
     "stamps_zero",
     "stamps_stand",
@@ -44,10 +44,10 @@ WITHOUT_IMU = {"imu_silent", "imu_no_gravity", "imu_axis_dead", "imu_tilted", "i
 OTHER_SURVEY = (
     "give --survey a folder of all surveys: check says which one fits; or survey the anchors again"
 )
-# What a survey of another room is taken for: many things explain some of it, and it does not fit
-# with them undone either.
+# Findings that a survey of another room causes. Each explains a part, and with it undone the survey
+# still does not fit.
 BLAMED = {"tdoa_sign", "ids_swapped", "pair_sign", "tdoa_one_sign", "anchor_moved"}
-# What a finding explains that the stream itself only shows.
+# Findings of the streams that another finding explains.
 EXPLAINS = {
     "tdoa_unit": {"tdoa_unit", "tdoa_large", "tdoa_outliers", "tdoa_rounded"},
     "ids_renumbered": {"ids_unknown", "anchor_missing"},
@@ -60,7 +60,7 @@ EXPLAINS = {
 
 
 class NamedAnchors(Protocol):
-    """What has a name and Anchors: a Recording, or a Flight."""
+    """A Recording or a Flight: an object with a name and Anchors."""
 
     @property
     def name(self) -> str: ...
@@ -71,8 +71,18 @@ class NamedAnchors(Protocol):
 
 @dataclass(frozen=True)
 class Report:
-    """recording : its name; findings : [Finding], most severe first; facts : {what: text}, what was
-    heard; ends : [End] of live topics.
+    """Result of `check`.
+
+    Attributes
+    ----------
+    recording : str
+        Name of the recording.
+    findings : list of Finding
+        Most severe first.
+    facts : dict
+        {quantity: text}: rates, duration, anchors, protocol.
+    ends : tuple of End
+        Publishers and subscriptions of live topics.
     """
 
     recording: str
@@ -82,7 +92,7 @@ class Report:
 
     @property
     def faulty(self) -> bool:
-        """True if there is an error."""
+        """Return whether there is an error."""
         return any(finding.severity == ERROR for finding in self.findings)
 
 
@@ -92,11 +102,20 @@ def check(
     estimator: FlightEstimator = FlightEstimator(),
     line: str | None = None,
 ) -> Report:
-    """Report of a Recording. others : [(name, Anchors)] of other surveys that might be the right
-    one; estimator : FlightEstimator, with what is calibrated; line : command that surveys the
-    anchors with the recording, or None.
+    """Return the Report of a Recording.
+
+    Parameters
+    ----------
+    recording : Recording
+        The streams.
+    others : sequence of (name, Anchors)
+        Other surveys that may fit.
+    estimator : FlightEstimator
+        Estimator with the calibrated effects.
+    line : str or None
+        Command line that surveys the anchors with the recording.
     """
-    streams = fed(recording)
+    streams = processed_streams(recording)
     found = [*streams.findings(), *sensors(recording)]
     for rule in recording_rules.RULES:
         found += rule(recording)
@@ -119,8 +138,8 @@ def check(
             Finding("not_tried", NOTE, cause, "the streams are of no use for that", remedy, np.nan)
         )
     else:
-        ordered = _undone(OrderedRecording.of(recording), found)
-        tried, places = _tried(ordered, names, others)
+        ordered = _without_stream_mistakes(OrderedRecording.of(recording), found)
+        tried, places = _try_corrections(ordered, names, others)
         flight = ordered.flight().replaced(**recording.sensors)
         run = replace(estimator, smoothed=False)(flight)
         track = run.odometry.t, run.odometry.p
@@ -140,8 +159,8 @@ def check(
     )
 
 
-def fed(recording: Recording) -> StreamRules:
-    """StreamRules that have seen all of a Recording."""
+def processed_streams(recording: Recording) -> StreamRules:
+    """Return StreamRules that have processed a whole Recording."""
     streams, imu, tdoa = StreamRules(recording.anchors), recording.imu, recording.tdoa
     if imu is not None:
         streams.feed_imu(imu.t, recording.imu_arrival, imu.gyro, imu.accel)
@@ -151,7 +170,7 @@ def fed(recording: Recording) -> StreamRules:
 
 
 def sensors(recording: Recording) -> Iterator[Finding]:
-    """Findings about the Streams of a Recording, by the rules of their SENSORS."""
+    """Yield findings about the Streams of a Recording, by the rules of their SENSORS."""
     for name, stream in recording.sensors.items():
         for rule in SENSORS[name].rules:
             if (found := rule(stream, recording.anchors)) is not None:
@@ -165,10 +184,8 @@ def sensors(recording: Recording) -> Iterator[Finding]:
                 )
 
 
-def _undone(ordered: OrderedRecording, found: list[Finding]) -> OrderedRecording:
-    """The OrderedRecording without the mistakes that the streams show themselves, so that it can be
-    tried.
-    """
+def _without_stream_mistakes(ordered: OrderedRecording, found: list[Finding]) -> OrderedRecording:
+    """Return the OrderedRecording without the mistakes that the streams show directly."""
     for finding in found:
         if finding.rule == "survey_scale":
             ordered = replace(
@@ -191,19 +208,17 @@ def _undone(ordered: OrderedRecording, found: list[Finding]) -> OrderedRecording
 
 
 def upright(force: np.ndarray) -> np.ndarray:
-    """(3, 3) rotation by quarter turns that brings the axis along which `force` (3,) is largest to
-    +z.
-    """
+    """Return the rotation (3, 3) by quarter turns that moves the largest axis of `force` (3,) to +z."""
     k = int(np.argmax(np.abs(force)))
     up = np.sign(force[k]) * np.eye(3)[k]
     side = np.eye(3)[(k + 1) % 3]
     return np.stack([side, np.cross(up, side), up])
 
 
-def _tried(
+def _try_corrections(
     ordered: OrderedRecording, names: set[str], others: Sequence[Survey]
 ) -> tuple[list[Finding], np.ndarray]:
-    """([Finding], places of the tag (k, 3) m): what is found by undoing it."""
+    """Try corrections, and return ([Finding], positions of the tag (k, 3) m)."""
     found, given = [], ordered
     for _ in range(ROUNDS):
         finding, ordered = tdoa_rules.best(ordered, others)
@@ -214,7 +229,7 @@ def _tried(
     blamed = [finding for finding in found if finding.rule in BLAMED]
     if not found:
         found += _misfit(fit)
-    elif blamed and tdoa_rules.gained(fit) is not None:  # what was put right did not make it fit
+    elif blamed and tdoa_rules.gained(fit) is not None:  # the corrections did not make it fit
         found = [finding for finding in found if finding not in blamed]
         found += [*_misfit(given.survey_fit)] or [*_misfit(fit)]
     if (
@@ -234,8 +249,9 @@ def _tried(
 
 
 def _other_room(mixed: Finding) -> Finding:
-    """Many ids mixed up and a faulty inertial sensor at once: rather the survey of another room, of
-    which both are what it looks like.
+    """Return the finding of another room, instead of many exchanged ids and a faulty inertial sensor.
+
+    Both are what the survey of another room looks like.
     """
     cause = (
         "the survey is of another room, or its ids are mixed up: with many ids exchanged it "
@@ -245,7 +261,7 @@ def _other_room(mixed: Finding) -> Finding:
 
 
 def _misfit(fit: SurveyFit) -> Iterator[Finding]:
-    """A survey that fits much better with its anchors elsewhere, and not with one of them alone."""
+    """Yield a finding if the survey fits much better with several of its anchors moved."""
     gain = tdoa_rules.gained(fit)
     if gain is None and tdoa_rules.apparent_gain(fit) > tdoa_rules.GAIN:
         evidence = (
@@ -276,7 +292,7 @@ def _misfit(fit: SurveyFit) -> Iterator[Finding]:
 
 
 def _facts(recording: Recording, streams: StreamRules) -> dict[str, str]:
-    """What was heard, for people."""
+    """Return {quantity: text} of the received streams."""
     facts = {}
     for name, windows, unit in (("TDOAs", streams.tdoa, "Hz"), ("IMU", streams.imu, "Hz")):
         if windows:
@@ -301,8 +317,9 @@ def _facts(recording: Recording, streams: StreamRules) -> dict[str, str]:
 
 
 def different_surveys(recordings: Sequence[NamedAnchors]) -> Iterator[Finding]:
-    """Findings about Recordings whose surveys differ: anchors of one id that are elsewhere. Their
-    flights do not belong together.
+    """Yield findings about Recordings with different surveys: an id at two places.
+
+    Such flights do not belong together.
     """
     for one, two in zip(recordings, recordings[1:]):
         off = furthest(one.anchors, two.anchors)

@@ -14,7 +14,7 @@ from uwb_tdoa_bias.effects.anchor_ids import AnchorIds
 from uwb_tdoa_ekf.streams import NOTE, WARNING, Finding, most_severe_first
 
 from . import coverage, imu_rules, motion_rules, pair_rules, time_rules
-from .check import fed
+from .check import processed_streams
 from .motion_rules import TrueMotion
 from .pair_rules import KnownPath, least_height, repairs_of
 from .recording import of_flight
@@ -25,24 +25,19 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.flight import Flight
 
 
-HOLE, LEAP, LEAST_LEAP = (
-    1.0,
-    20.0,
-    0.2,
-)  # s without ground truth in the air; m/s, and m, between two poses; healthy 0.11
+HOLE = 1.0  # s without ground truth in the air
+LEAP, LEAST_LEAP = 20.0, 0.2  # m/s, and m, between two poses; healthy 0.11 m
 
 
 def judge_against_truth(flight: Flight) -> list[Finding]:
-    """[Finding] of a Flight; none without ground truth."""
+    """Return the findings of a Flight against its ground truth; none without ground truth."""
     if flight.truth is None or len(flight.truth) < 2:
         return []
     return [*judge_truth(flight), *_of_tdoas(KnownPath(flight)), *_of_imu(flight)]
 
 
 def _of_tdoas(path: KnownPath) -> list[Finding]:
-    """Ids, then what is wrong beside these, then stamps, where the values can say something of
-    these.
-    """
+    """Return findings about ids, then other values, then stamps if ids and values are right."""
     repairs = repairs_of(path)
     found = (
         list(pair_rules.ids(path))
@@ -70,7 +65,7 @@ def _of_imu(flight: Flight) -> list[Finding]:
 
 
 def judge_truth(flight: Flight) -> Iterator[Finding]:
-    """Holes and leaps of the ground truth in the air."""
+    """Yield holes and jumps of the ground truth in the air."""
     assert flight.truth is not None
     of = flight.truth
     up = np.flatnonzero(of.p[:, 2] > least_height(of))
@@ -111,10 +106,12 @@ pass
 
 
 def judge_flight(flight: Flight) -> list[Finding]:
-    """[Finding] of a Flight, most severe first: of its streams by themselves, and against its
-    ground truth if it has one. What several rules name by the same name is reported once.
+    """Return the findings of a Flight, most severe first, without notes.
+
+    The streams are judged alone, and against the ground truth if there is one. Findings of several
+    rules with one name are reported once.
     """
-    streams, imu = fed(of_flight(flight)), flight.imu
+    streams, imu = processed_streams(of_flight(flight)), flight.imu
     found = streams.findings()
     track = None if flight.truth is None else (flight.truth.t, flight.truth.p)
     found += coverage.missing(

@@ -34,16 +34,10 @@ if TYPE_CHECKING:
     from .recording import Recording
 
 
-WINDOWS, LENGTH, FEWEST = (
-    40,
-    0.5,
-    30,
-)  # windows over the recording, s each, and TDOAs that one must have
-PRIOR = (
-    0.5  # m, by which an anchor may be off the survey; of no anchor in particular is more believed
-)
-TAG, SPEED = 5.0, 1.0  # m and m/s, the same for the tag about where it was located
-STD, TOGETHER = 0.15, 20.0  # m, of one TDOA; TDOAs of a window that count as independent at most
+WINDOWS, LENGTH, FEWEST = 40, 0.5, 30  # windows over the recording; s each; least TDOAs in each
+PRIOR = 0.5  # m, standard deviation of the survey, for each anchor
+TAG, SPEED = 5.0, 1.0  # m and m/s, the same for the tag about its first position
+STD, TOGETHER = 0.15, 20.0  # m, of one TDOA; most TDOAs of a window that count as independent
 ROBUST = 0.4  # m, scale of the Geman-McClure weight
 SWEEPS, STEP = 12, 1.0  # Gauss-Newton steps, and the longest of an anchor, m
 # m of `spread`; measured flights 0.50 at least, also with ids swapped, a hovering tag 0.16 at most
@@ -51,12 +45,32 @@ SPREAD = 0.3
 
 
 class SurveyFit:
-    """Windows of TDOAs, located with the anchors as surveyed."""
+    """Fit of tag and anchors to windows of TDOAs, which starts from the anchors as surveyed.
+
+    Attributes
+    ----------
+    positions : (N, 3) array
+        Anchors as surveyed, m, world.
+    before : float
+        Loss with these anchors, 0 to 1.
+    """
 
     def __init__(
         self, t: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray, positions: np.ndarray
     ) -> None:
-        """t (n,) s, rising; a, b (n,) rows of positions (N, 3) m; d (n,) m."""
+        """Locate the tag in windows of TDOAs.
+
+        Parameters
+        ----------
+        t : (n,) array
+            Stamps, s, rising.
+        a, b : (n,) array
+            Rows of `positions`.
+        d : (n,) array
+            TDOAs, m.
+        positions : (N, 3) array
+            Anchors, m, world.
+        """
         self.positions = positions
         self._windows, self._start = [], []
         config, state, box = FilterConfig(), new_state(positions), np.empty((2, 3))
@@ -77,35 +91,35 @@ class SurveyFit:
             )
             self._windows.append(window)
             self._start.append(places.x[0])
-        self.before, _ = self.solve(
-            []
-        )  # where the tag fits best: a fast one is not where a start puts it
+        # The best fit of the tag: the start is off if the tag is fast.
+        self.before, _ = self.solve([])
 
     def __len__(self) -> int:
-        """Windows that tell something."""
+        """Return the number of windows in which the tag was located."""
         return len(self._windows)
 
     @property
     def heard(self) -> list[int]:
-        """Rows of the anchors of which there are TDOAs in the windows."""
+        """Return the rows of the anchors with TDOAs in the windows."""
         ends = [end for _, a, b, _ in self._windows for end in (a, b)]
         return np.unique(np.concatenate(ends)).tolist() if ends else []
 
     @property
     def places(self) -> np.ndarray:
-        """(k, 3) m: where the tag was located in the windows."""
+        """Return the positions of the tag in the windows, (k, 3) m."""
         return np.array([x[:3] for x in self._start]).reshape(-1, 3)
 
     @cached_property
     def all_moved(self) -> tuple[float, np.ndarray]:
-        """`solve` with all anchors moved."""
+        """Return `solve` with all anchors free."""
         return self.solve()
 
     @cached_property
     def held_out_gain(self) -> float:
-        """Loss that anchors moved as one half of the windows says leave less in the other half, the
-        mean of both halves: errors of places where the tag is for a while are no errors of the
-        survey.
+        """Return the fall of the loss in one half of the windows with anchors fitted to the other half.
+
+        It is the mean of both halves. Errors at positions where the tag stays for a while are no errors of
+        the survey.
         """
         half = len(self) // 2
         parts = [self._part(slice(None, half)), self._part(slice(half, None))]
@@ -119,7 +133,7 @@ class SurveyFit:
         )
 
     def _part(self, windows: slice) -> SurveyFit:
-        """The same of some of the windows."""
+        """Return the same fit for some of the windows."""
         part = copy(self)
         part.__dict__.pop("all_moved", None)
         part._windows, part._start = self._windows[windows], self._start[windows]
@@ -127,28 +141,37 @@ class SurveyFit:
         return part
 
     def _at(self, positions: np.ndarray) -> float:
-        """Loss with the anchors at positions (N, 3) m."""
-        elsewhere = copy(self)
-        elsewhere.positions = positions
-        return elsewhere.solve([])[0]
+        """Return the loss with the anchors at positions (N, 3) m."""
+        other = copy(self)
+        other.positions = positions
+        return other.solve([])[0]
 
     def solve(self, free: Sequence[int] | None = None) -> tuple[float, np.ndarray]:
-        """(loss that is left, 0 to 1; anchor positions (N, 3) m) with the anchors in `free` (rows;
-        None for all) moved, and the tag.
+        """Move the tag, and the anchors in `free`, to the least loss.
+
+        Parameters
+        ----------
+        free : sequence of int or None
+            Rows of the free anchors; None for all.
+
+        Returns
+        -------
+        loss : float
+            Remaining loss, 0 to 1.
+        anchors : (N, 3) array
+            Positions, m, world.
         """
         moved = (
             np.ones(len(self.positions), dtype=bool)
             if free is None
             else np.isin(range(len(self.positions)), free)
         )
-        columns = np.flatnonzero(np.repeat(moved, 3))  # of the coordinates that are free
+        columns = np.flatnonzero(np.repeat(moved, 3))  # free coordinates
         anchors, start = self.positions.copy(), [x.copy() for x in self._start]
-        heard = [
-            moved & np.isin(np.arange(len(moved)), ends[1:3]) for ends in self._windows
-        ]  # in each window; of a hall few are
-        places = [
-            np.flatnonzero(np.repeat(some[moved], 3)) for some in heard
-        ]  # of their coordinates, among the free ones
+        # In a hall each window has few of the anchors.
+        heard = [moved & np.isin(np.arange(len(moved)), ends[1:3]) for ends in self._windows]
+        # Their coordinates among the free ones:
+        places = [np.flatnonzero(np.repeat(some[moved], 3)) for some in heard]
         for _ in range(SWEEPS):
             H = np.eye(len(columns)) / PRIOR**2
             g = (self.positions - anchors).reshape(-1)[columns] / PRIOR**2
@@ -177,7 +200,7 @@ class SurveyFit:
         return self._loss(start, anchors), anchors
 
     def _loss(self, states: list[np.ndarray], anchors: np.ndarray) -> float:
-        """Mean Geman-McClure loss over the windows."""
+        """Return the mean Geman-McClure loss over the windows."""
         squares = (
             _residual(x, window, anchors)[0] ** 2 for x, window in zip(states, self._windows)
         )
@@ -189,8 +212,9 @@ class SurveyFit:
 
 
 def displacement(surveyed: np.ndarray, fitted: np.ndarray) -> np.ndarray:
-    """(N,) m, how far each anchor has moved, after the best rotation and shift of all of them
-    (Kabsch, Acta Cryst. A 32, 1976).
+    """Return how far each anchor moved, (N,) m, after the best common rotation and translation.
+
+    Source: Kabsch, Acta Cryst. A 32, 1976.
     """
     one, two = surveyed - surveyed.mean(axis=0), fitted - fitted.mean(axis=0)
     U, _, V = np.linalg.svd(two.T @ one)
@@ -199,9 +223,9 @@ def displacement(surveyed: np.ndarray, fitted: np.ndarray) -> np.ndarray:
 
 
 def spread(places: np.ndarray) -> float:
-    """m by which places of a tag (k, 3) are off the straight line that fits them best (second
-    largest standard deviation): a tag that stands, or moves along one line, does not tell one
-    anchor from its mirror image.
+    """Return the second largest standard deviation of positions (k, 3) m: the distance from a line.
+
+    A tag at rest, or on one line, cannot distinguish an anchor from its mirror image.
     """
     if not len(places):
         return 0.0
@@ -213,8 +237,9 @@ def spread(places: np.ndarray) -> float:
 def _residual(
     x: np.ndarray, window: Window, anchors: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """(residuals (n,) m, unit vectors (n, 3) from a, and from b, to the tag, time (n,) before the
-    end, s).
+    """Return residuals (n,) m, unit vectors (n, 3) from a and b to the tag, and times (n,) s.
+
+    The times are relative to the end of the window.
     """
     t, a, b, d = window
     before = t - t[-1]
@@ -227,8 +252,10 @@ def _residual(
 def _linearised(
     x: np.ndarray, window: Window, anchors: np.ndarray, moved: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Jacobians of the TDOAs by position and velocity (n, 6) and by the k anchors of which `moved`
-    (N,) is true (n, 3 k), and the residuals (n,).
+    """Return the Jacobians of the TDOAs and the residuals (n,).
+
+    The first Jacobian (n, 6) is by position and velocity of the tag. The second (n, 3 k) is by the k
+    anchors in `moved` (N,).
     """
     residual, from_a, from_b, before = _residual(x, window, anchors)
     by_position = from_b - from_a
@@ -243,16 +270,23 @@ def _linearised(
 pass
 
 
-LONG, SHORT = (
-    60.0,
-    14.0,
-)  # s of the recording that are tried: to be sure, and to choose what is worth being sure of
-PERIOD = 1.0  # s over which the motion is measured that says which part is tried
+LONG, SHORT = 60.0, 14.0  # s of the recording for trials: to decide, and to choose candidates
+PERIOD = 1.0  # s over which motion is measured, to choose that part
 
 
 @dataclass(frozen=True)
 class OrderedRecording:
-    """anchors : Anchors; tdoa : Tdoas and imu : Imu or None, in order of their stamps and finite."""
+    """Streams in the order of their stamps, without values that are not finite.
+
+    Attributes
+    ----------
+    anchors : Anchors
+        The survey.
+    tdoa : Tdoas
+        TDOAs.
+    imu : Imu or None
+        Inertial samples.
+    """
 
     anchors: Anchors
     tdoa: Tdoas
@@ -260,7 +294,7 @@ class OrderedRecording:
 
     @classmethod
     def of(cls, recording: Recording) -> OrderedRecording:
-        """OrderedRecording of a Recording."""
+        """Return the OrderedRecording of a Recording."""
         tdoa, imu = recording.tdoa, recording.imu
         good = np.flatnonzero(np.isfinite(tdoa.t) & np.isfinite(tdoa.d))
         tdoa = rows_of(tdoa, good[np.argsort(tdoa.t[good], kind="stable")])
@@ -272,7 +306,7 @@ class OrderedRecording:
         return cls(recording.anchors, tdoa, imu if imu is not None and len(imu) else None)
 
     def part(self, length: float) -> OrderedRecording:
-        """The `length` s in which the TDOAs move most; the whole if it is not longer."""
+        """Return the `length` s in which the TDOAs change most; the whole if it is not longer."""
         t = self.tdoa.t
         if not len(t) or t[-1] - t[0] <= length:
             return self
@@ -288,35 +322,36 @@ class OrderedRecording:
         )
 
     def with_tdoa(self, **columns: np.ndarray) -> OrderedRecording:
-        """The same with other columns of the TDOAs."""
+        """Return the same with other columns of the TDOAs."""
         return replace(self, tdoa=replace(self.tdoa, **columns))
 
     def with_imu(self, **columns: np.ndarray) -> OrderedRecording:
-        """The same with other columns of the inertial samples."""
+        """Return the same with other columns of the inertial samples."""
         assert self.imu is not None
         return replace(self, imu=replace(self.imu, **columns))
 
     def possible(self) -> OrderedRecording:
-        """The same without TDOAs that are longer than their anchors are apart."""
+        """Return the same without TDOAs that exceed the distance of their anchors."""
         a, b = self.rows()
         apart = np.linalg.norm(self.anchors.positions[a] - self.anchors.positions[b], axis=1)
         kept = (a < 0) | (b < 0) | (np.abs(self.tdoa.d) <= apart + BEYOND)
         return replace(self, tdoa=rows_of(self.tdoa, np.flatnonzero(kept)))
 
     def rows(self) -> tuple[np.ndarray, np.ndarray]:
-        """Rows of the anchors of each TDOA: two (n,) arrays, -1 where an id is unknown."""
+        """Return the rows of the anchors of each TDOA, two (n,) arrays, -1 for unknown ids."""
         return self.anchors.index(self.tdoa.a), self.anchors.index(self.tdoa.b)
 
     def unexplained(self, limit: float = math.inf) -> Unexplained:
-        """Unexplained of the TDOAs alone. limit : mean loss from which on it is of no interest (see
-        streams.explain).
+        """Return the Unexplained of the TDOAs alone.
+
+        limit : mean loss beyond which the result has no use (see streams.explain).
         """
         rows = structured(TDOA, self.tdoa.t, *self.rows(), self.tdoa.d)
         return unexplained(rows, self.anchors.positions, limit=limit)
 
     @cached_property
     def survey_fit(self) -> SurveyFit:
-        """SurveyFit of the TDOAs between known anchors."""
+        """Return the SurveyFit of the TDOAs between known anchors."""
         a, b = self.rows()
         known = (a >= 0) & (b >= 0) & (a != b)
         return SurveyFit(
@@ -324,14 +359,12 @@ class OrderedRecording:
         )
 
     def flight(self) -> Flight:
-        """Flight without ground truth."""
+        """Return a Flight without ground truth."""
         return Flight("checked", self.anchors, self.tdoa, self.imu)
 
 
 def _busiest(recording: OrderedRecording, length: float) -> float:
-    """Stamp at which the `length` s begin in which the TDOAs of each pair change most from second
-    to second.
-    """
+    """Return the stamp at which the `length` s begin in which the TDOAs of the pairs change most."""
     t, d = recording.tdoa.t, recording.tdoa.d
     pair = np.unique(recording.tdoa.a * 65536 + recording.tdoa.b, return_inverse=True)[1].reshape(
         -1

@@ -34,9 +34,7 @@ TURNED, SHIFTED = np.deg2rad(2.0), 0.02  # rad and m that a frame may be off the
 
 
 def frames(recording: Recording) -> Iterator[Finding]:
-    """A frame that is not the body's: placed by /tf_static, as the nodes and the tools take it, or
-    by nobody.
-    """
+    """Yield frames other than the body's: /tf_static places them on the body, or nothing does."""
     for topic, counts in recording.frames.items():
         for frame in sorted(counts):
             if not is_body(frame):
@@ -69,7 +67,7 @@ def _frame(topic: str, frame: str, place: Place | None) -> Iterator[Finding]:
 
 
 def senders(recording: Recording) -> Iterator[Finding]:
-    """Two frames on one topic: two tags, or two sensors."""
+    """Yield topics with two frames: two tags, or two sensors."""
     for topic, counts in recording.frames.items():
         if len(counts) > 1:
             names = ", ".join(
@@ -90,7 +88,7 @@ def senders(recording: Recording) -> Iterator[Finding]:
 
 
 def no_imu(recording: Recording) -> Iterator[Finding]:
-    """No inertial samples, or under another name."""
+    """Yield a finding if there are no inertial samples, or under another name."""
     if recording.imu is not None:
         return
     there = sorted(
@@ -121,9 +119,9 @@ def no_imu(recording: Recording) -> Iterator[Finding]:
 
 
 def odometry_unread(recording: Recording) -> Iterator[Finding]:
-    """Odometry, as of wheels, under a name that nothing reads.
+    """Yield odometry, as from wheels, on a topic that nothing reads.
 
-    What a filter of ours gave, for whatever tag, is none.
+    The odometry of our filter, for any tag, does not count.
     """
     tags = [
         topic.removesuffix("uwb/tdoa") for topic in recording.topics if topic.endswith("/uwb/tdoa")
@@ -150,7 +148,7 @@ def odometry_unread(recording: Recording) -> Iterator[Finding]:
 
 
 def anchors(recording: Recording) -> Iterator[Finding]:
-    """The anchors in the bag, which the nodes use, against the survey."""
+    """Yield a finding if the anchors in the bag, which the nodes use, differ from the survey."""
     if recording.recorded is None or same_place(recording.anchors, recording.recorded):
         return
     off = furthest(recording.anchors, recording.recorded)
@@ -175,7 +173,7 @@ def anchors(recording: Recording) -> Iterator[Finding]:
 
 
 def sorted_file(recording: Recording) -> Iterator[Finding]:
-    """A file whose stamps fall: the reader has put them in order."""
+    """Yield a finding if the stamps in the file fall. The reader has sorted them."""
     if recording.falls:
         yield Finding(
             "stamps_fall",
@@ -188,9 +186,7 @@ def sorted_file(recording: Recording) -> Iterator[Finding]:
 
 
 def clock(recording: Recording) -> Iterator[Finding]:
-    """A clock that started again, wrapped or was set while it was recorded, and single stamps of no
-    time at all.
-    """
+    """Yield restarts, wraps and settings of the clock, and single wrong stamps."""
     for jump in recording.jumps:
         cause, done = in_words(jump)
         if jump.kind == SILENCE:
@@ -228,8 +224,9 @@ def clock(recording: Recording) -> Iterator[Finding]:
 
 
 def other_time(recording: Recording) -> Iterator[Finding]:
-    """A sensor of which no message is stamped within the time of the TDOAs; what is about the IMU,
-    stream rules say, unless it is alone.
+    """Yield sensors without a message in the time of the TDOAs.
+
+    The rules of streams judge the IMU, unless it is alone.
     """
     for name, ahead, count in apart(
         {"tdoa": recording.tdoa.t, **{name: of.t for name, of in recording.sensors.items()}}
@@ -254,13 +251,13 @@ def other_time(recording: Recording) -> Iterator[Finding]:
 
 
 def losses(recording: Recording) -> Iterator[Finding]:
-    """What the reader of the recording has not used."""
+    """Yield data that the reader of the recording did not use."""
     for cause, evidence, remedy in recording.losses:
         yield Finding("imu_lost", WARNING, cause, evidence, remedy, np.nan)
 
 
 def _by_topic(recording: Recording) -> Iterator[tuple[str, list[End], list[End]]]:
-    """(topic, publishers, subscriptions) of each."""
+    """Yield (topic, publishers, subscriptions) of each live topic."""
     for topic in sorted({end.topic for end in recording.ends}):
         ends = [end for end in recording.ends if end.topic == topic]
         yield (
@@ -271,7 +268,7 @@ def _by_topic(recording: Recording) -> Iterator[tuple[str, list[End], list[End]]
 
 
 def kinds(recording: Recording) -> Iterator[Finding]:
-    """Ends of one topic that speak of different types never meet."""
+    """Yield topics with several types: such publishers and subscriptions never match."""
     for topic, publishers, subscriptions in _by_topic(recording):
         found = {end.kind for end in (*publishers, *subscriptions)}
         if len(found) > 1:
@@ -286,7 +283,7 @@ def kinds(recording: Recording) -> Iterator[Finding]:
 
 
 def unmatched(recording: Recording) -> Iterator[Finding]:
-    """A subscription that asks for more than a publisher offers gets nothing from it."""
+    """Yield subscriptions that request more than a publisher offers, and so receive nothing from it."""
     for topic, publishers, subscriptions in _by_topic(recording):
         deaf = {
             (publisher.node, end.node): (publisher, end)
@@ -305,7 +302,7 @@ def unmatched(recording: Recording) -> Iterator[Finding]:
 
 
 def _stronger(publisher: End, end: End) -> str:
-    """What to write in the node that publishes."""
+    """Return the QoS to write in the node that publishes."""
     policies = ["reliability=ReliabilityPolicy.RELIABLE"] * end.reliable + [
         "durability=DurabilityPolicy.TRANSIENT_LOCAL"
     ] * end.latched
@@ -316,7 +313,7 @@ def _stronger(publisher: End, end: End) -> str:
 
 
 def several(recording: Recording) -> Iterator[Finding]:
-    """Two that publish one stream."""
+    """Yield streams with two publishers."""
     for topic, publishers, _ in _by_topic(recording):
         if len(publishers) > 1 and not topic.startswith("/tf"):
             names = ", ".join(sorted(end.node for end in publishers))
@@ -335,7 +332,7 @@ def several(recording: Recording) -> Iterator[Finding]:
 
 
 def volatile_anchors(recording: Recording) -> Iterator[Finding]:
-    """Anchors that who comes later does not get, unless they are repeated."""
+    """Yield anchors that late subscriptions do not get, unless they are repeated."""
     for topic, publishers, _ in _by_topic(recording):
         for publisher in publishers:
             if topic.endswith("uwb/anchors") and not publisher.latched:
@@ -354,10 +351,10 @@ def volatile_anchors(recording: Recording) -> Iterator[Finding]:
 
 WINDOW = 0.25  # s in which the tag hardly moves
 FEWEST_ANCHORS, FEWEST_WINDOWS, MOST_WINDOWS = 5, 10, 200
-LARGE, LARGEST = 0.1, 5.0  # m: from which on it is said, and more than which no antenna makes
-AGREE = 0.8  # share of the windows that say the same sign
+LARGE, LARGEST = 0.1, 5.0  # m, limit of a finding, and more than any antenna delays
+AGREE = 0.8  # share of the windows with the same sign
 SCALE = 0.2  # m, beyond which a range counts less
-DILUTION = 5.0  # most that an error of the ranges may become in what they have in common
+DILUTION = 5.0  # largest ratio of standard deviations: common error over a single range
 STEPS, DAMPING = 20, 1e-3
 REMEDY = (
     "calibrate it: survey, or diagnose where there is ground truth; until then leave "
@@ -366,8 +363,10 @@ REMEDY = (
 
 
 def tag_delay(recording: Recording) -> Iterator[Finding]:
-    """All ranges are wrong by about as much: without `range_offset_std` the position is off by more
-    than that where anchors are on one side.
+    """Yield a finding if all ranges are wrong by about the same: the antenna delay of the tag.
+
+    TDOAs do not depend on it. Without `range_offset_std` the position error exceeds the delay where
+    the anchors are on one side.
     """
     ranges = recording.sensors.get("range")
     offsets = (
@@ -390,12 +389,23 @@ def tag_delay(recording: Recording) -> Iterator[Finding]:
 
 
 def window_offsets(ranges: Ranges, anchors: Anchors) -> np.ndarray:
-    """(k,) m: what the ranges of each window have in common beside the distances from one place,
-    where they tell.
+    """Return the common error of the ranges in each window.
+
+    Parameters
+    ----------
+    ranges : Ranges
+        Distances to anchors.
+    anchors : Anchors
+        The survey.
+
+    Returns
+    -------
+    (k,) array
+        Errors that the distances from one position do not explain, m, where they are determined.
     """
     row = anchors.index(ranges.anchor)
-    sound = (row >= 0) & np.isfinite(ranges.d) & np.isfinite(ranges.t)
-    row, d, t = row[sound], ranges.d[sound], ranges.t[sound]
+    usable = (row >= 0) & np.isfinite(ranges.d) & np.isfinite(ranges.t)
+    row, d, t = row[usable], ranges.d[usable], ranges.t[usable]
     if not len(t):
         return np.empty(0)
     _, first = np.unique(np.floor((t - t.min()) / WINDOW), return_index=True)
@@ -407,8 +417,9 @@ def window_offsets(ranges: Ranges, anchors: Anchors) -> np.ndarray:
 
 
 def _offset(positions: np.ndarray, d: np.ndarray) -> float | None:
-    """m, of ranges d (n,) m to anchors at positions (n, 3) m, by Gauss-Newton with Huber's weights;
-    None where they do not determine it.
+    """Return the common error of ranges d (n,) m to anchors (n, 3) m; None if it is not determined.
+
+    Gauss-Newton with Huber's weights.
     """
     x = np.append(positions.mean(axis=0), 0.0)
     for _ in range(STEPS):

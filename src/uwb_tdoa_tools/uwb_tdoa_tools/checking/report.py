@@ -30,7 +30,7 @@ SYMBOL = {"error": "ERROR", "warning": "warning", "note": "note"}
 
 
 def text(report: Report) -> str:
-    """Lines about one Report: the verdict first, then the findings, most severe first."""
+    """Return the lines about one Report: the verdict first, then the findings, most severe first."""
     facts = ", ".join(
         f"{name} {value}" if name in ("TDOAs", "IMU") else value
         for name, value in report.facts.items()
@@ -43,7 +43,7 @@ def text(report: Report) -> str:
 
 
 def verdict(findings: Sequence[Finding]) -> str:
-    """In a few words."""
+    """Return the verdict in a few words."""
     counts = {severity: sum(f.severity == severity for f in findings) for severity in SYMBOL}
     if not counts["error"] and not counts["warning"]:
         return "OK" if not counts["note"] else "OK, with a remark"
@@ -53,7 +53,7 @@ def verdict(findings: Sequence[Finding]) -> str:
 
 
 def lines(finding: Finding) -> Iterator[str]:
-    """Lines of text about one Finding."""
+    """Yield the lines of text about one Finding."""
     yield f"  {SYMBOL[finding.severity]}: {finding.cause}"
     yield f"      seen:   {finding.evidence}"
     first, *more = command_lines.as_it_runs(finding.remedy).splitlines()
@@ -63,8 +63,10 @@ def lines(finding: Finding) -> Iterator[str]:
 
 
 def as_dict(reports: Iterable[Report], together: Iterable[Finding]) -> dict[str, Any]:
-    """For JSON: {"recordings": [{"recording", "facts", "findings", "ends"}], "together": [findings
-    about several recordings]}; ends : who publishes and hears live topics.
+    """Return the content for JSON.
+
+    {"recordings": [{"recording", "facts", "findings", "ends"}], "together": [findings about several
+    recordings]}. "ends" are publishers and subscriptions of live topics.
     """
     return {
         "recordings": [
@@ -84,13 +86,18 @@ def _finding(finding: Finding) -> dict[str, Any]:
     return as_json(asdict(finding))
 
 
-SHORTEST = 10.0  # s; of shorter flights nothing is said
+SHORTEST = 10.0  # s; shorter flights get no remark
 
 
 def survey_remarks(flight: Flight) -> Iterator[str]:
-    """Sentences about the survey of a Flight: anchors that it lacks, and positions that cannot be
-    right, by what moving the anchors explains (see SurveyFit). Raises InputError where no TDOA is
-    between two anchors that it has.
+    """Yield sentences about the survey of a Flight: missing anchors, and positions that cannot be right.
+
+    The test is how much moving the anchors explains (see SurveyFit).
+
+    Raises
+    ------
+    InputError
+        If no TDOA is between two anchors of the survey.
     """
     tdoa, anchors = flight.tdoa, flight.anchors
     known = (anchors.index(tdoa.a) >= 0) & (anchors.index(tdoa.b) >= 0)
@@ -130,7 +137,7 @@ def _listed(ids: Iterable[int]) -> str:
 
 
 def remarks_on(flights: Sequence[Flight]) -> Iterator[str]:
-    """Sentences on the surveys of Flights, each by itself and beside one another."""
+    """Yield sentences on the surveys of Flights, each alone and in comparison."""
     for flight in flights:
         yield from (f"{flight.name}: {remark}" for remark in survey_remarks(flight))
     yield from (

@@ -26,31 +26,38 @@ if TYPE_CHECKING:
     from .pair_rules import KnownPath
 
 
-LONGEST, STEP = 1.5, 0.05  # s that are tried to both sides, and between them
+LONGEST, STEP = 1.5, 0.05  # s, largest delay to both sides, and steps between the trials
 DELAYS = np.arange(-LONGEST, LONGEST + 0.5 * STEP, STEP)
 NONE = len(DELAYS) // 2  # place of the delay 0
-BLOCK, FEWEST = 5.0, 5  # s, and samples that a series must have in one
-# samples, about, of which a series has that many in a block, that it must have for anything to be
-# said of it
-TELLING = 30.0
-MOST = 15000  # TDOAs that are looked at, evenly taken
-# standard deviations of a series, robust, beyond which an error counts no more: what is behind
-# obstacles is many
-LIMIT = 2.0
+BLOCK, FEWEST = 5.0, 5  # s, length of a block, and least samples of a series in it
+TELLING = 30.0  # least samples, about, in such blocks for a judgement
+MOST = 15000  # TDOAs that are used, evenly taken
+LIMIT = 2.0  # robust standard deviations at which errors are clipped: obstacles make many
 
 
 @dataclass(frozen=True)
 class Delays:
-    """power (series, blocks, len(DELAYS)) : sum of squares that is left of each series, in units of
-    its variance as it is, with each delay. All together tell nothing, and nothing is late, where
-    fewer than TELLING samples are in it.
+    """Remaining power of series for each delay.
+
+    Nothing is reported about series with fewer than TELLING samples.
+
+    Attributes
+    ----------
+    power : (series, blocks, len(DELAYS)) array
+        Sum of squares with each delay, in units of the variance of the series without delay.
     """
 
     power: np.ndarray
 
     def of_series(self, k: int) -> tuple[float, float]:
-        """(ratio, s): what is left of a series with its best delay, over what is left with the best
-        one of all; and that delay. (1, 0) of a series that tells nothing.
+        """Compare a series with the best common delay.
+
+        Returns
+        -------
+        ratio : float
+            Power with the best delay of series k, over power with the best common delay.
+        delay : float
+            Difference of these delays, s. (1, 0) if the series has too few samples.
         """
         own, common = self.power[k].sum(axis=0), self._common
         if own[NONE] < TELLING:
@@ -60,13 +67,11 @@ class Delays:
 
     @cached_property
     def _common(self) -> int:
-        """Place of the best delay of all."""
+        """Return the place of the best common delay."""
         return int(np.argmin(self.power.sum(axis=(0, 1))))
 
     def constant(self) -> tuple[float, float]:
-        """(ratio, s): what is left with the best delay of all, over what is left without any; and
-        that delay.
-        """
+        """Return (ratio, s): power with the best common delay over power without delay, and that delay."""
         total = self.power.sum(axis=(0, 1))
         best = int(np.argmin(total))
         return (
@@ -78,9 +83,7 @@ class Delays:
         return bool(self.power[..., NONE].sum() >= TELLING)
 
     def exact(self) -> float:
-        """s, the best delay of all, between those that are tried: the vertex of a parabola through
-        the three about it.
-        """
+        """Return the best common delay, s, interpolated by a parabola through the three best."""
         if not self._tells:
             return 0.0
         total = self.power.sum(axis=(0, 1))
@@ -93,8 +96,9 @@ class Delays:
         )
 
     def drift(self) -> tuple[float, float]:
-        """(ratio, s): what is left if the delay changes evenly, over what is left with a constant
-        one; from first to last block.
+        """Return (ratio, s): power with a linear delay over power with a constant delay, and its change.
+
+        The change is that from the first to the last block.
         """
         if not self._tells:
             return 1.0, 0.0
@@ -110,8 +114,9 @@ class Delays:
         )
 
     def jump(self) -> tuple[float, float, int]:
-        """(ratio, s, block): what is left if the delay changes once, over what is left with a
-        constant one; by how much, and the first block after that.
+        """Return (ratio, s, block): power with a delay that jumps once over power with a constant delay.
+
+        s is the size of the jump, and block the first one after it.
         """
         if not self._tells:
             return 1.0, 0.0, 0
@@ -130,8 +135,18 @@ def delays(
     error: Callable[[float], np.ndarray],
     count_of_series: int | None = None,
 ) -> Delays:
-    """Delays of (n,) samples at t, s, of series numbered from 0; error(delay) -> (n,), what is left
-    of each. count_of_series : how many there are, where samples of the last may be missing.
+    """Return the Delays of samples of several series.
+
+    Parameters
+    ----------
+    series : (n,) array of int
+        Number of the series of each sample, from 0.
+    t : (n,) array
+        Stamps, s.
+    error : callable
+        error(delay) is the error of each sample, (n,).
+    count_of_series : int or None
+        Number of series, if the last may have no samples.
     """
     block = numbered(t, BLOCK)
     blocks = block.max() + 1
@@ -152,13 +167,13 @@ def delays(
 
 
 def _scatter(series: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """(series,): robust standard deviation of each, of what is not NaN; 1 where there is none."""
+    """Return the robust standard deviation of each series, without NaN; 1 for an empty series."""
     known = [np.abs(values[(series == k) & np.isfinite(values)]) for k in range(series.max() + 1)]
     return np.array([max(1.4826 * np.median(part), 1e-9) if len(part) else 1.0 for part in known])
 
 
 def of_tdoas(path: KnownPath) -> Delays | None:
-    """Delays of the pairs of a KnownPath, in their order; None without any."""
+    """Return the Delays of the pairs of a KnownPath, in their order; None without any."""
     parts = _looked_at(path)
     if not any(map(len, parts)):
         return None
@@ -177,8 +192,10 @@ def of_tdoas(path: KnownPath) -> Delays | None:
 
 
 def _looked_at(path: KnownPath) -> list[np.ndarray]:
-    """Rows of each pair of a KnownPath that are looked at, about MOST of all together: of a room
-    some of each block, of a hall, of which few pairs are heard in a block, those of some blocks.
+    """Return about MOST rows of the pairs of a KnownPath, for each pair.
+
+    In a room these are some of each block. In a hall, where a block has few pairs, these are all of
+    some blocks.
     """
     every = max(1, sum(map(len, path.pairs.values())) // MOST)
     if len(path.ids) <= MANY:
@@ -190,18 +207,12 @@ def _looked_at(path: KnownPath) -> list[np.ndarray]:
 pass
 
 
-LATE, OF_ALL, DRIFTS, JUMPS = (
-    0.53,
-    0.965,
-    0.99,
-    0.985,
-)  # healthy: a pair 0.557; all together 0.984, drifting 0.9953, jumping 0.993
+# healthy: a pair 0.557, all together 0.984, drifting 0.9953, jumping 0.993
+LATE, OF_ALL, DRIFTS, JUMPS = 0.53, 0.965, 0.99, 0.985
 LEAST = 0.1  # s that count
-SHUFFLED, MORE = (
-    0.15,
-    2.2,
-)  # s, and times the scatter of successive errors that there is in quick motion; healthy 0.09, 1.85
-STEP_LIMIT = 4.0  # standard deviations, robust, beyond which an error counts no more
+# s, and ratio of the mean square change of errors in quick to slow motion; healthy 0.09 and 1.85
+SHUFFLED, MORE = 0.15, 2.2
+STEP_LIMIT = 4.0  # robust standard deviations at which a change of the error is clipped
 CLOCK = (
     "stamp with one clock, when it is measured; tdoa_time_offset and truth_time_offset take out "
     "what is constant"
@@ -209,9 +220,7 @@ CLOCK = (
 
 
 def tdoas(path: KnownPath) -> Iterator[Finding]:
-    """TDOAs that are late, of one pair or of all; whose stamps drift or jump; that come in another
-    order.
-    """
+    """Yield TDOAs that are late, for one pair or all, that drift or jump, or that are out of order."""
     of = of_tdoas(path)
     if of is None:
         return
@@ -245,7 +254,7 @@ def _late(rule: str, who: str, ratio: float, delay: float) -> Finding:
 
 
 def changing(stream: str, name: str, of: Delays) -> Iterator[Finding]:
-    """Stamps of a stream, "tdoa" or "imu", that drift or jump, by its Delays."""
+    """Yield a drift or a jump of the stamps of a stream, "tdoa" or "imu", from its Delays."""
     (drift, by), (jump, step, _) = of.drift(), of.jump()
     jumps = jump < JUMPS and abs(step) >= LEAST
     if (
@@ -275,8 +284,9 @@ def changing(stream: str, name: str, of: Delays) -> Iterator[Finding]:
 
 
 def _reordered(path: KnownPath) -> Iterator[Finding]:
-    """Errors of successive TDOAs of a pair differ by what the tag moves in the time by which they
-    are out of place.
+    """Yield a finding if TDOAs are out of order.
+
+    Errors of successive TDOAs of a pair then differ by the motion of the tag between the two instants.
     """
     samples, error = path.samples, path.d - path.true
     change = np.sum(

@@ -1,6 +1,4 @@
-"""check: what a driver may have got wrong, found in a recording before anything else is done with
-it.
-"""
+"""Check recordings for mistakes of drivers, before anything else uses them."""
 
 from __future__ import annotations
 
@@ -93,8 +91,9 @@ def _check(args: Namespace) -> int:
 def _recordings(
     args: Namespace, reading: Reading, survey: str | Path | None
 ) -> Iterator[tuple[Recording, Path | None, str | Path | None]]:
-    """Yield (Recording, its path, that of its survey) of each, or (Recording, None, None) of what
-    is live. survey : path of the one survey, or None.
+    """Yield each Recording with its path and that of its survey; (Recording, None, None) if live.
+
+    survey : path of the one survey, or None.
     """
     if args.live is not None:
         yield read_live(reading, args.live, survey, partial(cli.say, "check")), None, None
@@ -109,7 +108,7 @@ def _recordings(
 
 
 def _surveys(folder: Path) -> list[tuple[str, Anchors]]:
-    """[(path, Anchors)] of a folder of surveys."""
+    """Return [(path, Anchors)] of a folder of surveys."""
     return [(str(path), read_survey(path)) for path in sorted(folder.glob("anchor_?*"))]
 
 

@@ -71,7 +71,7 @@ def parser() -> ArgumentParser:
         default=[],
         metavar="SENSOR=SECONDS",
         help=(
-            f"add this to the stamps of a sensor with a clock of its own: {', '.join(SENSORS)}; "
+            f"add this to the stamps of a sensor with another clock: {', '.join(SENSORS)}; "
             "may be repeated"
         ),
     )
@@ -128,7 +128,7 @@ def _convert(args: Namespace) -> None:
 
 
 def _offsets(texts: Iterable[str]) -> dict[str, float]:
-    """{sensor: s} of "SENSOR=SECONDS" texts. Raises InputError."""
+    """Return {sensor: s} of "SENSOR=SECONDS" texts. Raises InputError."""
     offsets = {}
     for text in texts:
         sensor, given, seconds = text.partition("=")
@@ -146,7 +146,7 @@ def _offsets(texts: Iterable[str]) -> dict[str, float]:
 
 
 def _named(args: Namespace) -> Named | None:
-    """Named anchors for --columns, or None. Raises InputError."""
+    """Return the named anchors for --columns, or None. Raises InputError."""
     if args.columns and not args.survey:
         raise InputError(
             "--columns: CSV files do not say where the anchors are; give a survey file "
@@ -156,7 +156,7 @@ def _named(args: Namespace) -> Named | None:
 
 
 def _read(args: Namespace, named: Named | None) -> Flight:
-    """The Flight."""
+    """Return the Flight."""
     if args.columns:
         options.refuse(
             args,

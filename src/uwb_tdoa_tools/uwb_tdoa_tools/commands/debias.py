@@ -1,4 +1,4 @@
-"""debias: map the bias of estimated positions, take it out, and say what that is worth."""
+"""Map the bias of estimated positions, remove it, and show the gain."""
 
 from __future__ import annotations
 

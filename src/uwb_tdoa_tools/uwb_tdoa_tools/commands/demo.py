@@ -1,4 +1,4 @@
-"""demo: a flight through both nodes over ROS topics, and how far the estimate is from ground truth."""
+"""Send a flight through both nodes over ROS topics, and compare the estimate with ground truth."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def _demo(args: Namespace) -> int:
 
 
 def _change_in_words(scores: Sequence[Score]) -> str:
-    """What correction did to the error, in words."""
+    """State in words how correction changes the error."""
     before, after = (score.row()["rmse_3d"] for score in scores[:2])
     if len(scores) == 2:
         return (
@@ -134,7 +134,7 @@ def _change_in_words(scores: Sequence[Score]) -> str:
 
 
 def _all_in_time(flight: Flight, became: dict[str, int]) -> bool:
-    """Print what became of every message. Returns whether all were there in time."""
+    """Print the counts of all messages by outcome, and return whether all were in time."""
     counts = ", ".join(
         f"{count} {name}" for name, count in became.items() if not name.startswith("imu_")
     )

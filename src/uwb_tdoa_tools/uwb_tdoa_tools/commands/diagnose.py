@@ -1,4 +1,4 @@
-"""diagnose: from a residual to the missing effect to a smaller error."""
+"""Find missing effects from residuals, and reduce the error."""
 
 from __future__ import annotations
 
@@ -30,16 +30,16 @@ if TYPE_CHECKING:
     from ..diagnosis.constraints.mark import Mark
     from ..diagnosis.references.path import OdometryPath
 
-DESCRIPTION = """Find out what is wrong with the measurements of some flights, and put it right.
+DESCRIPTION = """Find systematic errors in the measurements of some flights, and correct them.
 
-Finds the residuals of every channel, traces them to effects that the model lacks, says how sure it is and what else it
-could be, adds what helps, and reports the error before and after on data that took no part in the fit.
+Computes the residuals of every channel, and traces them to effects that the model lacks, with their uncertainty and
+alternatives. Adds the effects that help, and reports the error before and after on hold-out data.
 Writes diagnosis.json, effects.yaml (for evaluate, bias_node and ekf_node), ekf_node.yaml (the noise that the filter should
 assume with them; --config of evaluate) and report.html."""
 
 MOST = 300_000  # TDOAs; what they take: docs/speed.md
 FEW = 20  # flights; what fewer gain by other processes, these take to start (docs/speed.md)
-UNUSED = {  # by references, of the options of what is known
+UNUSED = {  # {reference: options that it does not use}
     "truth": ("marks", "distances", "odometry"),
     "heights": ("marks", "distances", "odometry"),
     "odometry": ("distances",),
@@ -72,7 +72,7 @@ def parser() -> ArgumentParser:
     options.add_filter(
         made,
         (
-            "effects.yaml: what is in the model already; without ground truth its covariance is "
+            "effects.yaml: effects in the model already; without ground truth its covariance is "
             "the prior"
         ),
     )
@@ -85,7 +85,7 @@ def parser() -> ArgumentParser:
         default="truth",
         help="what flights are compared with: their ground truth (default), the heights of a range "
         "finder, --marks, "
-        "--odometry, or nothing; what is not named is not read",
+        "--odometry, or nothing; other references are not read",
     )
     known(
         "--no-truth",
@@ -133,7 +133,7 @@ def _diagnose(args: Namespace) -> None:
     reading = options.reading_of(args)
     found = reading.find(args.flights)
     rerun = options.rerun_of(args, len(found), partial(cli.say, "diagnose"))
-    jobs, dask = parallel.asked(args, len(found), FEW)
+    jobs, dask = parallel.workers_for(args, len(found), FEW)
     flights, holdout = (
         reading.flights(paths, args.most, jobs, dask) for paths in (args.flights, args.holdout)
     )
@@ -154,9 +154,8 @@ def _diagnose(args: Namespace) -> None:
     reference = REFERENCES[args.reference](
         config, known, *[args.align][: args.reference == "truth"]
     )
-    over = partial(
-        parallel.over, jobs=jobs, dask=dask, unit=None
-    )  # no bar beside the line of Progress
+    # Only Progress prints a line.
+    over = partial(parallel.over, jobs=jobs, dask=dask, unit=None)
     with Progress("diagnose") as progress:
         result = diagnose(
             flights, holdout, effects or EffectSet(), config, reference, progress, over

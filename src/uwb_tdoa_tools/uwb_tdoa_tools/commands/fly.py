@@ -1,4 +1,4 @@
-"""fly: a simulated vehicle takes off, flies and lands by the estimate, again and again."""
+"""Fly a simulated vehicle by the estimate, many times: take off, fly and land."""
 
 from __future__ import annotations
 
@@ -17,9 +17,10 @@ from ..flying.sensors import AIDS
 from ..flying.trial import Task
 from ..flying.world import MOMENTS, WORLDS, world_of
 from ..outputs import OutputFile, OutputFolder
-from ..results_file import asked_of
+from ..results_file import settings_of
 
-NO_MATTER = (
+# Options without influence on a flight.
+WITHOUT_INFLUENCE = (
     "flights",
     "seed",
     "jobs",
@@ -29,7 +30,7 @@ NO_MATTER = (
     "plot",
     "record",
     "resume",
-)  # to what becomes of a flight
+)
 DESCRIPTION = """Fly a simulated quadrotor in closed loop, in lockstep and without ROS: its controller gets position, velocity and
 attitude from nothing but the estimate, by the very code of ekf_node, and its rates from the gyroscope. Four seconds at rest, up to
 1.2 m, two circles, down, land. The verdict is by ground truth alone.
@@ -65,7 +66,7 @@ def parser() -> argparse.ArgumentParser:
         metavar="S",
         type=parallel.whole_number,
         default=1,
-        help="of the first; the others have the next ones (default: 1)",
+        help="of the first flight; each later one has the next seed (default: 1)",
     )
     add(
         "--world",
@@ -140,7 +141,7 @@ def parser() -> argparse.ArgumentParser:
     add(
         "--peer",
         metavar="LIBRARY",
-        help="fly by this shared library of another filter (docs/flying.md), which is told its yaw",
+        help="fly by this shared library of another filter (docs/flying.md), which gets its yaw",
     )
     parallel.add_options(made)
     add(
@@ -156,7 +157,7 @@ def parser() -> argparse.ArgumentParser:
         "--resume",
         metavar="FILE",
         type=OutputFile,
-        help="keep the verdict of each flight in this file, and go on from what is there",
+        help="keep the verdict of each flight in this file, and continue from there",
     )
     add("--json", metavar="FILE", type=OutputFile, help="write the summary and every verdict")
     add(
@@ -177,7 +178,7 @@ def _fly(args: argparse.Namespace) -> int:
             "need the flights themselves."
         )
     config, effects = options.filter_of(args)
-    load_network(args.model)  # or say what is wrong with it, before the first flight
+    load_network(args.model)  # raises before the first flight
     config = options.with_parameters(config, args.set)
     world = world_of(
         args.world, args.floor_effect, args.aid, args.silence, args.inject, args.installation
@@ -201,7 +202,7 @@ def _fly(args: argparse.Namespace) -> int:
     ]
     verdicts, pictures = [], []
     with fleet.kept(
-        args.resume, asked_of(args, NO_MATTER, ("config", "effects", "model", "peer"))
+        args.resume, settings_of(args, WITHOUT_INFLUENCE, ("config", "effects", "model", "peer"))
     ) as done:
         for verdict, picture in fleet.flown(
             tasks, done, args.record, args.plot is not None, args.jobs, args.dask

@@ -1,4 +1,4 @@
-"""inject: add a declared effect to a recorded or simulated flight."""
+"""Add a declared effect to a recorded or simulated flight."""
 
 from __future__ import annotations
 

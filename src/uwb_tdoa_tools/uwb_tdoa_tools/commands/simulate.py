@@ -1,6 +1,4 @@
-"""simulate: fly, drive or carry a tag along a path among anchors, and write what IMU, UWB tag and
-motion capture would record.
-"""
+"""Simulate a flight, a drive or a walk, and write it as a bag."""
 
 from __future__ import annotations
 

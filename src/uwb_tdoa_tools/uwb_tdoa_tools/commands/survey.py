@@ -1,4 +1,4 @@
-"""survey: better anchors from a tape measure and flights."""
+"""Improve surveyed anchors by flights."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ if TYPE_CHECKING:
 
     from ..readers.inputs import Reading
 
-DESCRIPTION = """Make a tape-measured survey better, from flights alone.
+DESCRIPTION = """Improve a tape-measured survey, from flights alone.
 
-Nobody needs to know where the tag flew: the flights tell which shifts of anchors, and which delays, make their TDOAs or
-ranges agree with each other and with the IMU (and with a range finder, where there is one). The frame is that of the
-coordinates that are known best: name some with --trusted, or all stays where it is on average. Ground truth is not used.
+Ground truth is not used. Shifts and delays of the anchors are estimated so that TDOAs or ranges agree with each other and
+with the IMU (and with a range finder, if there is one). The coordinates that are known best define the frame: name some
+with --trusted, or the anchors stay in place on average.
 
-With the anchors.yaml and effects.yaml (--effects) of last week it starts from what was known then, says what has changed
-since, and makes the rest better.
+With the anchors.yaml and effects.yaml (--effects) of last week it starts from that calibration, lists the changes since,
+and improves the rest.
 
 Writes anchors.yaml and anchors.csv (for --survey, anchors_file and the rest), effects.yaml (delays of the
 anchors, and how well all is known), ekf_node.yaml (noise of TDOAs that the filter should assume with them), survey.json
@@ -67,10 +67,7 @@ def parser() -> ArgumentParser:
     options.add_recordings(made)
     options.add_filter(
         made,
-        (
-            "effects.yaml: what is in the model already; that of a survey is its prior, and tells "
-            "what changed"
-        ),
+        "effects.yaml: effects in the model already; the file of an earlier survey is the prior",
     )
     add = made.add_argument
     options.add_tape(made)
@@ -132,9 +129,7 @@ def _survey(args: Namespace) -> int:
 
 
 def _ids_are_right(reading: Reading, paths: Sequence[str], estimator: FlightEstimator) -> bool:
-    """Whether `check` finds none of the mistakes in recordings that look like anchors elsewhere;
-    says which it finds.
-    """
+    """Print mistakes in recordings that look like moved anchors, and return whether there are none."""
     found = []
     with Progress("survey") as progress:
         for path, survey in progress.over(reading.find(paths), "checking recordings"):

@@ -16,7 +16,7 @@ from ..checking.watch import BEFORE_TRUTH
 from ..estimate import FlightEstimator
 from ..localizing.rerun_file import write_rerun
 from ..readers.inputs import Reading, report_remarks
-from ..results_file import ResultsFile, state_of
+from ..results_file import ResultsFile, fingerprint_of
 from ..scoring.alignment import ALIGN, NONE, alignment_of, need_truth
 from ..scoring.evaluation import corrected_truth
 from ..scoring.metrics import Pool, Result, Score
@@ -151,7 +151,7 @@ def results(
     if path is None:
         yield from parallel.over(evaluator, recordings, jobs, dask)
         return
-    keys = [" ".join(map(state_of, recording)) for recording in recordings]
+    keys = [" ".join(map(fingerprint_of, recording)) for recording in recordings]
     with ResultsFile(path, asked) as done:
 
         def make(missing: Iterable[Recording]) -> Iterator[dict[str, Any]]:

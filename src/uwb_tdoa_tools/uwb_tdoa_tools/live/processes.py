@@ -93,20 +93,20 @@ def wait(
         If a process ended that should run, or after `limit`.
     """
     looked = moved = time.monotonic()
-    worked, sign = processes.worked(), goes_on()
+    worked, sign = processes.busy_times(), goes_on()
     while not condition():
         processes.check()
         now = time.monotonic()
         if now - looked > LOOK:
-            working, before, work = now - looked, worked, processes.worked()
+            working, before, work = now - looked, worked, processes.busy_times()
             busy = any(work[title] - before.get(title, 0.0) > BUSY * working for title in work)
             looked, worked = now, work
-            say(f"waiting for {what}: {processes.doing()}")
+            say(f"waiting for {what}: {processes.describe()}")
             if busy or goes_on() != sign:
                 moved, sign = now, goes_on()
         if limit is not None and now - moved > limit:
             raise LiveError(
-                f"waited {limit:g} s for {what}, and nothing went on ({processes.doing()}); "
+                f"waited {limit:g} s for {what}, and nothing went on ({processes.describe()}); "
                 f"their output is in {processes.folder}/*.log."
             )
         rclpy.spin_once(node, timeout_sec=0.05)
@@ -233,20 +233,22 @@ class Processes:
             if code is not None and code not in self._may_end[title]:
                 raise self._failure(title, code)
 
-    def worked(self) -> dict[str, float]:
+    def busy_times(self) -> dict[str, float]:
         """Return {title: s of processor time, or of waiting for a core} of the starting processes."""
         return {
-            title: _worked(process.pid)
+            title: _busy_time(process.pid)
             for title, process in self._running.items()
-            if not READY.search(self._said(title))
+            if not READY.search(self._log_tail(title))
         }
 
-    def doing(self) -> str:
+    def describe(self) -> str:
         """Describe the last output of each starting process; of all if none is starting."""
-        titles = [title for title in self._running if not READY.search(self._said(title))] or list(
-            self._running
+        titles = [
+            title for title in self._running if not READY.search(self._log_tail(title))
+        ] or list(self._running)
+        return "; ".join(
+            f"{title}: {_last_line(self._log_tail(title)) or 'starting'}" for title in titles
         )
-        return "; ".join(f"{title}: {_bare(self._said(title)) or 'starting'}" for title in titles)
 
     def stop(self, title: str) -> None:
         """Interrupt a process and wait for it. Raises LiveError if its exit code is not 0."""
@@ -265,25 +267,25 @@ class Processes:
                     continue
         return process.returncode
 
-    def _said(self, title: str) -> str:
+    def _log_tail(self, title: str) -> str:
         """Return the end of the output."""
         with open(self.file(title), "rb") as log:
             log.seek(max(0, os.fstat(log.fileno()).st_size - TAIL))
             return log.read().decode(errors="replace").strip()
 
     def _failure(self, title: str, code: int) -> LiveError:
-        last = " ".join(self._said(title).splitlines()[-1:])
+        last = " ".join(self._log_tail(title).splitlines()[-1:])
         return LiveError(
             f"{title} ended with code {code} ({last}); all of its output is in {self.file(title)}."
         )
 
 
-def _bare(said: str) -> str:
+def _last_line(log: str) -> str:
     """Return the last line of a log, without level, time and name."""
-    return re.sub(r"^(\[[^]]*\] ?)+: ", "", (said.splitlines() or [""])[-1])
+    return re.sub(r"^(\[[^]]*\] ?)+: ", "", (log.splitlines() or [""])[-1])
 
 
-def _worked(pid: int) -> float:
+def _busy_time(pid: int) -> float:
     """Return the s that the threads of a process ran or were ready to run.
 
     On a loaded machine, a process that computes is ready nearly all the time.
