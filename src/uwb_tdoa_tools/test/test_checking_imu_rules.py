@@ -1,11 +1,40 @@
-"""Arrangements of the axes of the IMU, tried on a tag that turns."""
+"""Clipped and filtered samples, and axes of the IMU, tried on a tag that turns."""
 
 from checking_flights import recording
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
+from uwb_tdoa_bias.foundation.flight import Flight, Imu
 from uwb_tdoa_tools.checking import imu_rules
+from uwb_tdoa_tools.checking.imu_rules import saturated, smooth
 from uwb_tdoa_tools.checking.ordered import OrderedRecording
+
+T = np.arange(0.0, 20.0, 0.001)
+VALUES = np.random.default_rng(0).standard_normal((len(T), 3))
+
+
+def clipped_axes(gyro=VALUES, accel=VALUES):
+    return [finding.cause for finding in saturated(Flight("f", None, None, Imu(T, gyro, accel)))]
+
+
+def test_noise_is_not_clipped_even_if_quantized():
+    coarse = np.round(VALUES / 0.3) * 0.3
+    assert clipped_axes() == clipped_axes(coarse, np.zeros_like(VALUES)) == []
+
+
+@pytest.mark.parametrize("low, high", [(-2.0, 2.0), (-9.0, 1.5), (-1.8, 9.0)])
+def test_a_clipped_axis_is_found(low, high):
+    accel = VALUES.copy()
+    accel[:, 1] = np.clip(accel[:, 1], low, high)
+    assert clipped_axes(accel=accel) == ["accelerometer y is clipped"]
+
+
+def test_samples_behind_a_low_pass_are_smooth():
+    share = 0.001 / 0.051
+    filtered = lfilter([share], [1.0, share - 1.0], VALUES, axis=0)
+    assert smooth(T, np.cumsum(filtered, axis=0)) and not smooth(T, VALUES)
+    assert not smooth(20.0 * T, np.cumsum(filtered, axis=0))
 
 
 @pytest.fixture(scope="module")
@@ -13,13 +42,13 @@ def healthy():
     return OrderedRecording.of(recording())
 
 
-def test_a_right_imu_is_left_alone(healthy):
+def test_a_healthy_imu_has_no_finding(healthy):
     assert imu_rules.fit(healthy) is None
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("axis", range(3))
-def test_a_sign_of_the_gyroscope(healthy, axis):
+def test_a_wrong_sign_of_the_gyroscope_is_found(healthy, axis):
     signs = np.where(np.arange(3) == axis, -1.0, 1.0)
     finding = imu_rules.fit(healthy.with_imu(gyro=healthy.imu.gyro * signs))
     assert finding.rule == "imu_axes" and "gyroscope" in finding.cause
@@ -57,7 +86,7 @@ def test_the_remedy_is_the_matrix_in_words(accel, gyro, words):
     assert imu_rules._finding(accel, gyro, "", 0.5).remedy == words
 
 
-def test_simple_explanations_come_first():
+def test_simple_arrangements_come_first():
     simple = imu_rules._complexity(np.eye(3), np.diag([1.0, -1.0, 1.0]))
     both, odd = (
         imu_rules._complexity(imu_rules.MIRROR, imu_rules.MIRROR),

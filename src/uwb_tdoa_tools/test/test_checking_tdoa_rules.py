@@ -17,7 +17,7 @@ def healthy():
 
 
 @pytest.mark.slow
-def test_nothing_is_better_than_what_is_right(healthy):
+def test_a_healthy_recording_has_no_finding(healthy):
     shifted = Anchors(
         healthy.anchors.ids, healthy.anchors.positions * 1.3, healthy.anchors.orientations
     )
@@ -34,14 +34,14 @@ def test_nothing_is_better_than_what_is_right(healthy):
         (1e-6 / 299.792458, "seconds"),
     ],
 )
-def test_a_unit_is_undone(healthy, scale, unit):
+def test_a_unit_is_found_and_undone(healthy, scale, unit):
     finding, undone = tdoa_rules.best(healthy.with_tdoa(d=scale * healthy.tdoa.d))
     assert finding.rule == "tdoa_unit" and unit in finding.cause
     assert np.allclose(undone.tdoa.d, healthy.tdoa.d)
 
 
 @pytest.mark.slow
-def test_swapped_ids_are_undone(healthy):
+def test_swapped_ids_are_found_and_undone(healthy):
     one, two = healthy.anchors.ids[[2, 5]].tolist()
     swapped = tdoa_rules.relabelled(healthy, {one: two, two: one})
     finding, undone = tdoa_rules.best(swapped)
@@ -81,7 +81,7 @@ def test_ids_are_replaced_all_at_once(healthy, table):
     )
 
 
-def test_the_part_that_is_tried_is_where_the_tag_moves():
+def test_trials_use_the_part_with_the_most_motion():
     t = np.arange(0.0, 100.0, 0.01)
     d = np.where((t > 60.0) & (t < 80.0), np.sin(t), 0.0)
     zeros = np.zeros(len(t), dtype=int)
@@ -96,14 +96,14 @@ def test_the_part_that_is_tried_is_where_the_tag_moves():
     assert still.part(200.0) is still
 
 
-def test_ids_are_not_tried_where_the_tag_stands():
+def test_ids_are_not_tried_without_motion():
     hovering = OrderedRecording.of(recording(10, trajectory="hover"))
     assert spread(hovering.survey_fit.places) < SPREAD
     assert list(tdoa_rules.swapped(hovering)) == []
 
 
 @pytest.mark.parametrize("gain, believed", [(0.5, True), (2.0, False)])
-def test_what_systematic_errors_could_explain_is_no_evidence(healthy, monkeypatch, gain, believed):
+def test_a_gain_within_systematic_errors_is_no_evidence(healthy, monkeypatch, gain, believed):
     """The same trial, judged where systematic errors are said to be small, and where they are said
     to be large.
     """
