@@ -195,7 +195,11 @@ class _Stream:
         rising = steps[steps > 0.0]
         self.usual = float(np.median(rising)) if len(rising) else 0.0  # s
         self.limit = max(AHEAD, SLOW * self.usual)
-        self.arrived = arrived if arrived is not None and _is_rising(arrived) else None
+        # Arrivals count if they are known and never fall.
+        known = arrived is not None and bool(
+            np.isfinite(arrived).all() and (np.diff(arrived) >= 0.0).all()
+        )
+        self.arrived = arrived if known else None
         far = (steps < -LARGEST_STEP_BACK) | (
             steps > max(LARGEST_STEP_BACK, 1.5 * self.usual)
         )  # also back from where a stamp was wild
@@ -354,11 +358,6 @@ class _Stream:
             begin, shift = one.first, shift + one.shift
         if len(self.finite):
             yield float(self.t[begin]), self.end, shift
-
-
-def _is_rising(arrived: np.ndarray) -> bool:
-    """Return whether arrivals are known, and never fall."""
-    return bool(np.isfinite(arrived).all()) and bool((np.diff(arrived) >= 0.0).all())
 
 
 def _groups(streams: list[_Stream]) -> Iterator[list[tuple[_Stream, _Break]]]:

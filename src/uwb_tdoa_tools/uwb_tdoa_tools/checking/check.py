@@ -119,24 +119,31 @@ def check(
     found = [*streams.findings(), *sensors(recording)]
     for rule in recording_rules.RULES:
         found += rule(recording)
-    if any(
-        finding.rule == "clock_silence" for finding in found
-    ):  # which says the same of all streams
+    if any(finding.rule == "clock_silence" for finding in found):  # the gap of all streams
         found = [finding for finding in found if finding.rule != "gap"]
-    if not len(recording.tdoa):  # of ranges alone: nothing else is there to be tried
-        return Report(
-            recording.name, most_severe_first(found), _facts(recording, streams), recording.ends
-        )
+    if len(recording.tdoa):  # with ranges alone, nothing can be tried
+        found = _with_trials(recording, streams, found, others, estimator, line)
+    return Report(
+        recording.name, most_severe_first(found), _facts(recording, streams), recording.ends
+    )
+
+
+def _with_trials(
+    recording: Recording,
+    streams: StreamRules,
+    found: list[Finding],
+    others: Sequence[Survey],
+    estimator: FlightEstimator,
+    line: str | None,
+) -> list[Finding]:
+    """Return the findings of the streams, of trials, and about coverage, without those explained."""
     names = {finding.rule for finding in found}
     places, explained, track = np.empty((0, 3)), set(), None
     if names & NOTHING_TO_TRY:
-        cause, remedy = (
-            "sign, ids, survey and axes were not tried",
-            "put the errors right, record again, and check again",
-        )
-        found.append(
-            Finding("not_tried", NOTE, cause, "the streams are of no use for that", remedy, np.nan)
-        )
+        cause = "sign, ids, survey and axes were not tried"
+        evidence = "the streams are of no use for that"
+        remedy = "put the errors right, record again, and check again"
+        found.append(Finding("not_tried", NOTE, cause, evidence, remedy, np.nan))
     else:
         ordered = _without_stream_mistakes(OrderedRecording.of(recording), found)
         tried, places = _try_corrections(ordered, names, others)
@@ -152,11 +159,9 @@ def check(
     view = coverage.CoverageView(
         recording.anchors, list(streams.tdoa), places, "height" in recording.sensors, track
     )
-    for covered in coverage.RULES:
-        found += (finding for finding in covered(view) if finding.rule not in explained)
-    return Report(
-        recording.name, most_severe_first(found), _facts(recording, streams), recording.ends
-    )
+    for rule in coverage.RULES:
+        found += (finding for finding in rule(view) if finding.rule not in explained)
+    return found
 
 
 def processed_streams(recording: Recording) -> StreamRules:
@@ -173,7 +178,8 @@ def sensors(recording: Recording) -> Iterator[Finding]:
     """Yield findings about the Streams of a Recording, by the rules of their SENSORS."""
     for name, stream in recording.sensors.items():
         for rule in SENSORS[name].rules:
-            if (found := rule(stream, recording.anchors)) is not None:
+            found = rule(stream, recording.anchors)
+            if found is not None:
                 yield Finding(
                     found.rule,
                     ERROR if found.severe else WARNING,

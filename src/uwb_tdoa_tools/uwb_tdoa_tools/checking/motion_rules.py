@@ -225,24 +225,14 @@ def _explains(
 
 
 def _best_arrangement(motion: TrueMotion, sensor: str) -> tuple[float, np.ndarray]:
-    """Return (remaining power, (3, 3) matrix) of the best arrangement."""
-    return min(
-        (
-            (motion.power(sensor, motion.true[sensor], change), change)
-            for change in _arrangements(sensor)
-        ),
-        key=lambda x: x[0],
-    )
-
-
-def _arrangements(sensor: str) -> list[np.ndarray]:
-    """Return the (3, 3) matrices that undo the possible mistakes of a sensor."""
-    scales = (
-        [scale * np.eye(3) for unit in SCALES for scale in (unit, 1.0 / unit)]
-        if sensor == "gyro"
-        else []
-    )
-    return [*ARRANGEMENTS[1:], *scales]
+    """Return (remaining power, (3, 3) matrix) of the best correction of a sensor."""
+    changes = ARRANGEMENTS[1:]
+    if sensor == "gyro":
+        scales = [scale for unit in SCALES for scale in (unit, 1.0 / unit)]
+        changes = [*changes, *(scale * np.eye(3) for scale in scales)]
+    true = motion.true[sensor]
+    trials = ((motion.power(sensor, true, change), change) for change in changes)
+    return min(trials, key=lambda trial: trial[0])
 
 
 def _with_attitude(motion: TrueMotion, name: str) -> dict[str, float]:

@@ -79,8 +79,7 @@ def _simulate(args: Namespace) -> None:
     if args.out is not None:
         check_output(args.out, args.force)  # before the work, not after it
     check_image(args.plot)
-    with Progress("simulate") as progress:
-        progress("flying")
+    with Progress("simulate", what="flying"):
         flight = simulate(config_of(args))
         content = summary(flight)
     cli.show(
@@ -93,8 +92,7 @@ def _simulate(args: Namespace) -> None:
         f"{content['outliers']} outliers"
     )
     if args.out is not None:
-        with Progress("simulate") as progress:
-            progress("writing")
+        with Progress("simulate", what="writing"):
             write_bag(flight, args.out, args.storage, args.force)
         cli.show(f"wrote {args.out}")
     if args.json is not None:
