@@ -143,7 +143,7 @@ def test_what_was_asked_is_every_option_that_matters_and_what_stands_in_its_file
     assert asked == {
         "smooth": True,
         "effects": asked["effects"],
-        "model": "default",
+        "model": None,
         "config": None,
     }
     assert (
