@@ -116,7 +116,8 @@ def run(
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
     except (OSError, sqlite3.OperationalError) as error:
-        if full := _full(error):
+        full = _full(error)
+        if full:
             return _fail(
                 parser.prog,
                 f"{full}: what was being written is not whole; make room, or write elsewhere.",

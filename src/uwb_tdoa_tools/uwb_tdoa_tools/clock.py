@@ -141,7 +141,7 @@ def straightened(
     for name, stream in found.items():
         stream.cut([end for other, end in ends.items() if other != name])
     groups = _groups([stream for stream in found.values() if stream.breaks])
-    jumps = [jump for group in groups if (jump := _of_group(group, found)) is not None]
+    jumps = [jump for jump in (_of_group(group, found) for group in groups) if jump is not None]
     for stream in found.values():
         _join_late(stream, found)
     shifts = {name: of for name, stream in found.items() if (of := stream.shifts()) is not None}
@@ -200,9 +200,9 @@ class _Stream:
             np.isfinite(arrived).all() and (np.diff(arrived) >= 0.0).all()
         )
         self.arrived = arrived if known else None
-        far = (steps < -LARGEST_STEP_BACK) | (
-            steps > max(LARGEST_STEP_BACK, 1.5 * self.usual)
-        )  # also back from where a stamp was wild
+        # Steps forward count too: they lead back from a wild stamp.
+        forward = steps > max(LARGEST_STEP_BACK, 1.5 * self.usual)
+        far = (steps < -LARGEST_STEP_BACK) | forward
         self._edges = np.concatenate([[0], np.flatnonzero(far) + 1, [len(self.finite)]])
         self.steady = bool(
             len(self.finite) and (steps >= -LARGEST_STEP_BACK).all() and (steps <= self.limit).all()
@@ -214,10 +214,8 @@ class _Stream:
 
     def cut(self, ends: Sequence[float]) -> None:
         """Find the breaks and the outliers. ends : s, last stamps of other streams that are steady."""
-        few, pieces = (
-            min(FEW, max(2, len(self.finite) // 20)),
-            list(zip(self._edges[:-1].tolist(), self._edges[1:].tolist())),
-        )
+        few = min(FEW, max(2, len(self.finite) // 20))
+        pieces = list(zip(self._edges[:-1].tolist(), self._edges[1:].tolist()))
         if len(pieces) == 1:
             return
         last, breaks, kept = -1, list[_Break](), self.kept.copy()
@@ -296,10 +294,8 @@ class _Stream:
         if step <= self.limit:
             return True
         if many:
-            others = (
-                any(end > t[last] + self.limit for end in ends) and step <= PAUSE
-            )  # that went on meanwhile
-            return others and not self._sure(last, first, following, ends)
+            others_continued = any(end > t[last] + self.limit for end in ends) and step <= PAUSE
+            return others_continued and not self._sure(last, first, following, ends)
         if following is None:
             return any(end + self.limit > t[first] for end in ends)
         return (
@@ -447,14 +443,11 @@ def in_words(jump: Jump) -> tuple[str, str]:
     if jump.kind == WRAP:
         return f"the clock of {who} wraps at {jump.period} ({-jump.by:.3f} s) {where}", shifted
     if jump.kind == RESTART:
-        anew = (
-            ", and the filter starts anew there"
-            if not set(jump.streams).isdisjoint(LEADING)
-            else ""
-        )
+        leads = not set(jump.streams).isdisjoint(LEADING)
+        restart = ", and the filter starts anew there" if leads else ""
         return (
             f"the clock of {who} started again {where}: it fell back by {_long(-jump.by)}",
-            shifted + anew,
+            shifted + restart,
         )
     if jump.kind == SET:
         return f"the clock of {who} was set forward {where}, by {_long(jump.by)}", shifted

@@ -158,7 +158,8 @@ def estimator_of(args: Namespace, say: Callable[[str], object]) -> FlightEstimat
         return FlightEstimator(config, smoothed=args.smooth)
     network = load_network(args.model)
     given = {effect.name for effect in effects.effects} if effects else set()
-    if network and (lacking := sorted(set(network.trained_with) - given)):
+    lacking = sorted(set(network.trained_with) - given) if network else []
+    if lacking:
         say(
             f"{args.model} was trained with {', '.join(lacking)} taken out, which no "
             "--effects gives; give the effects.yaml that was "
@@ -200,7 +201,8 @@ def add_holdout(parser: ArgumentParser) -> None:
 
 def check_holdout(fitted: Iterable[str | Path], held: Iterable[str | Path]) -> None:
     """Raise InputError if a flight, by its name or its path, is both fitted and held out."""
-    if shared := set(fitted) & set(held):
+    shared = set(fitted) & set(held)
+    if shared:
         raise InputError(
             f"--holdout: {min(map(str, shared))} is also a FLIGHT to fit; leave it out of one "
             "of them."

@@ -83,7 +83,8 @@ class VehicleNode(StreamNode):
         own = declare_all(self, PARAMETERS)
         refuse_unknown(self)
         self._mission, aids = own["mission"], [name for name in own["aids"] if name]
-        if unknown := sorted(set(aids) - set(AIDS)):
+        unknown = sorted(set(aids) - set(AIDS))
+        if unknown:
             raise InputError(f"aids: {unknown[0]!r} is not one of {', '.join(AIDS)}.")
         world, known = world_of(own["world"], aids=aids), own["told"] == "place"
         task = Task(world, own["seed"], own["told"], "known" if known else "unknown")

@@ -199,7 +199,8 @@ def _without_stream_mistakes(ordered: OrderedRecording, found: list[Finding]) ->
             )
         elif finding.rule == "tdoa_wraps":
             ordered = ordered.possible()
-        if (imu := ordered.imu) is None:
+        imu = ordered.imu
+        if imu is None:
             continue
         if finding.rule == "imu_force_unit":
             ordered = ordered.with_imu(accel=imu.accel * finding.value)
@@ -244,13 +245,11 @@ def _try_corrections(
         and not any(f.rule == "survey_misfit" for f in found)
     ):
         finding = imu_rules.fit(ordered)
-        found += [finding] if finding else []
-        if finding and (
-            mixed := [other for other in found if other.cause.startswith(tdoa_rules.MIXED_UP)]
-        ):
-            found = [other for other in found if other is not finding and other not in mixed] + [
-                _other_room(*mixed)
-            ]
+        mixed = [other for other in found if other.cause.startswith(tdoa_rules.MIXED_UP)]
+        if finding and mixed:
+            found = [other for other in found if other not in mixed] + [_other_room(*mixed)]
+        elif finding:
+            found.append(finding)
     return found, fit.places
 
 

@@ -74,10 +74,8 @@ def smooth(t: np.ndarray, values: np.ndarray) -> bool:
     steps = round(FAR / max(np.median(np.diff(t)), 1e-6))
     if steps < FEWEST or len(t) <= steps:
         return False
-    one, far = (
-        np.mean(np.diff(values, axis=0) ** 2, axis=0),
-        np.mean((values[steps:] - values[:-steps]) ** 2, axis=0),
-    )
+    one = np.mean(np.diff(values, axis=0) ** 2, axis=0)
+    far = np.mean((values[steps:] - values[:-steps]) ** 2, axis=0)
     return bool((one * steps**2 < EVEN * far).all())
 
 

@@ -72,10 +72,8 @@ class TrueMotion:
         above = self._p[:, 2] > 0.3
         flown = self._t[above] if above.any() else self._t  # a rover
         margin = LONGEST + 0.5
-        start, end = (
-            max(flown[0], imu.t[0], self._t[0]) + margin,
-            min(flown[-1], imu.t[-1], self._t[-1]) - margin,
-        )
+        start = max(flown[0], imu.t[0], self._t[0]) + margin
+        end = min(flown[-1], imu.t[-1], self._t[-1]) - margin
         # After a pause of days only the time before it is used.
         cells = min(max(int((end - start) / CELL), 0), len(imu))
         self.t = start + CELL * np.arange(cells)

@@ -373,20 +373,17 @@ def _busiest(recording: OrderedRecording, length: float) -> float:
     order = np.lexsort((second, pair))
     begins = np.flatnonzero(np.diff(pair[order], prepend=-1) | np.diff(second[order], prepend=-1))
     mean = np.add.reduceat(d[order], begins) / np.diff(begins, append=len(order))
-    pair, second = (
-        pair[order][begins],
-        second[order][begins],
-    )  # a row for each pair and each second in which it has TDOAs
+    # One row for each pair and each second with TDOAs:
+    pair, second = pair[order][begins], second[order][begins]
     following = (np.diff(pair) == 0) & (np.diff(second) == 1)
-    seconds, place = np.unique(
-        second, return_inverse=True
-    )  # those with TDOAs: a pause takes no room
+    # Only seconds with TDOAs: a long pause needs no memory.
+    seconds, place = np.unique(second, return_inverse=True)
     motion = np.bincount(
         place[1:][following],
         np.minimum(np.abs(np.diff(mean))[following], 1.0),
         minlength=len(seconds),
     )
-    total, n = np.concatenate([[0.0], np.cumsum(motion)]), int(length / PERIOD)
-    until = np.searchsorted(seconds, seconds + n)
+    total = np.concatenate([[0.0], np.cumsum(motion)])
+    until = np.searchsorted(seconds, seconds + int(length / PERIOD))
     best = int(seconds[np.argmax(total[until] - total[:-1])])
     return t[0] + min(best * PERIOD, t[-1] - t[0] - length)

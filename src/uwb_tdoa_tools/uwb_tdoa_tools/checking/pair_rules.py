@@ -69,11 +69,9 @@ class KnownPath:
         self.samples, rows = true_samples(flight)
         self.t, self.d = self.samples.t, flight.tdoa.d[rows]
         self.true = tdoa(self.samples.p, self.samples.position_a, self.samples.position_b)
-        self.ids, self.track, self.start = (
-            self.samples.anchors.ids,
-            Track(flight.truth),
-            flight.start,
-        )
+        self.ids = self.samples.anchors.ids
+        self.track = Track(flight.truth)
+        self.start = flight.start
         self.flown = np.flatnonzero(self.samples.p[:, 2] > least_height(flight.truth))
         key = (self.samples.a * len(self.ids) + self.samples.b)[self.flown]
         order = np.argsort(key, kind="stable")

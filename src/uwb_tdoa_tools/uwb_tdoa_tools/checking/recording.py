@@ -228,7 +228,8 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
         anchors, str(survey) if survey or recorded is None else f"{path}: {recorded.source}"
     )
     samples = bag_messages.imu_of(imu.stamps / 1e9, imu.rows) if len(imu.stamps) else None
-    if samples is not None and (place := placing.placed(tree, IMU, imu.frames)[0]):
+    place = placing.placed(tree, IMU, imu.frames)[0]
+    if samples is not None and place:
         samples = placing.imu_in_body(samples, place)
     return Recording(
         name=path.stem,

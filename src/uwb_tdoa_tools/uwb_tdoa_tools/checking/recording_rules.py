@@ -140,10 +140,8 @@ def odometry_unread(recording: Recording) -> Iterator[Finding]:
             f"if it is of wheels or a camera: --topic {WHEELS}={there[0]} for tools, and -r "
             f"{WHEELS}:={there[0]} for ekf_node"
         )
-        cause, evidence = (
-            f"the odometry on {', '.join(there)} is not used",
-            f"velocities are read from velocity and {WHEELS}",
-        )
+        cause = f"the odometry on {', '.join(there)} is not used"
+        evidence = f"velocities are read from velocity and {WHEELS}"
         yield Finding("odometry_unread", WARNING, cause, evidence, line, float(len(there)))
 
 
@@ -275,10 +273,8 @@ def kinds(recording: Recording) -> Iterator[Finding]:
             evidence = ", ".join(
                 sorted(f"{end.node}: {end.kind}" for end in (*publishers, *subscriptions))
             )
-            cause, line = (
-                f"{topic} has several types",
-                f"start the driver of the other type with --ros-args -r {topic}:={topic}_other",
-            )
+            cause = f"{topic} has several types"
+            line = f"start the driver of the other type with --ros-args -r {topic}:={topic}_other"
             yield Finding("type_other", ERROR, cause, evidence, line, float(len(found)))
 
 

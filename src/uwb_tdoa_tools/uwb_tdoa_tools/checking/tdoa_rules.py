@@ -182,10 +182,8 @@ def furthest(one: Anchors, other: Anchors) -> float:
 
 def renumbered(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     """Yield the trial with renumbered ids: the same anchors in the same order, with other numbers."""
-    heard, known = (
-        np.unique(np.r_[recording.tdoa.a, recording.tdoa.b]),
-        np.sort(recording.anchors.ids),
-    )
+    heard = np.unique(np.r_[recording.tdoa.a, recording.tdoa.b])
+    known = np.sort(recording.anchors.ids)
     if len(heard) != len(known) or np.isin(heard, known).all():
         return
     table = dict(zip(heard.tolist(), known.tolist()))
@@ -285,11 +283,9 @@ def contrary(recording: OrderedRecording) -> Iterator[MistakeTrial]:
 
 def _contrary(recording: OrderedRecording, pairs: np.ndarray) -> list[tuple[int, int]]:
     """Return the pairs, [(a, b)], most of whose TDOAs are nearer to the negative of the prediction."""
-    tdoa, run = (
-        recording.tdoa,
-        run_offline(recording.flight(), FilterConfig(use_imu=False)).residuals,
-    )
-    predicted = tdoa.d - run.innovation
+    tdoa = recording.tdoa
+    run = run_offline(recording.flight(), FilterConfig(use_imu=False))
+    predicted = tdoa.d - run.residuals.innovation
     counted = np.isfinite(predicted) & (np.abs(tdoa.d) > FAR) & (np.abs(predicted) > FAR)
     other = np.abs(tdoa.d + predicted) < np.abs(tdoa.d - predicted)
     wrong = []

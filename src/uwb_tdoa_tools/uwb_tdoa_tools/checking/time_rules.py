@@ -177,10 +177,8 @@ def of_tdoas(path: KnownPath) -> Delays | None:
     parts = _looked_at(path)
     if not any(map(len, parts)):
         return None
-    series, rows = (
-        np.repeat(np.arange(len(parts)), [len(part) for part in parts]),
-        np.concatenate(parts),
-    )
+    series = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    rows = np.concatenate(parts)
     t, samples = path.t[rows], path.samples
     a, b = samples.position_a[rows], samples.position_b[rows]
     return delays(
@@ -257,9 +255,8 @@ def changing(stream: str, name: str, of: Delays) -> Iterator[Finding]:
     """Yield a drift or a jump of the stamps of a stream, "tdoa" or "imu", from its Delays."""
     (drift, by), (jump, step, _) = of.drift(), of.jump()
     jumps = jump < JUMPS and abs(step) >= LEAST
-    if (
-        drift < DRIFTS and abs(by) >= LEAST and not (jumps and jump / JUMPS < drift / DRIFTS)
-    ):  # a jump has a parameter more
+    # A jump has one more parameter, and needs a larger gain.
+    if drift < DRIFTS and abs(by) >= LEAST and not (jumps and jump / JUMPS < drift / DRIFTS):
         evidence = (
             f"{by:+.2f} s over the flight; {100 * (1 - drift):.0f} % less mean square error then"
         )
@@ -297,10 +294,8 @@ def _reordered(path: KnownPath) -> Iterator[Finding]:
         [0.5 * np.abs(change[rows][1:] + change[rows][:-1]) for rows in path.pairs.values()]
     )
     limit = STEP_LIMIT * 1.4826 * np.median(np.abs(step))
-    power, (slow, quick) = (
-        np.clip(step, -limit, limit) ** 2,
-        (speed <= np.median(speed), speed >= np.quantile(speed, 0.9)),
-    )
+    power = np.clip(step, -limit, limit) ** 2
+    slow, quick = speed <= np.median(speed), speed >= np.quantile(speed, 0.9)
     ratio = np.mean(power[quick]) / np.mean(power[slow])
     growth = (np.mean(power[quick]) - np.mean(power[slow])) / (
         np.mean(speed[quick] ** 2) - np.mean(speed[slow] ** 2)

@@ -132,10 +132,8 @@ def _fit(args: Namespace) -> int:
 
 
 def _judge(args: Namespace) -> int:
-    estimator, made = (
-        PositionEstimator(options.reading_of(args), *options.filter_of(args), args.align),
-        BiasMap.load(args.map),
-    )
+    estimator = PositionEstimator(options.reading_of(args), *options.filter_of(args), args.align)
+    made = BiasMap.load(args.map)
     rows = _judged(args, estimator, estimator.reading.find(args.flights, bool(args.dask)), made)
     report.say_rows("flight", rows)
     gained = report.gain_of(rows)

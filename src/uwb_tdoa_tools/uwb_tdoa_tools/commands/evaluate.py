@@ -139,7 +139,8 @@ def _evaluate(args: Namespace) -> int:
     if args.markdown:
         others = table.read_others(args.beside) if args.beside else {}
         write_text(args.markdown, table.markdown_of(kept, pool, others))
-    if late := evaluator.late_tdoas():
+    late = evaluator.late_tdoas()
+    if late:
         cli.say(
             "evaluate",
             f"{args.odometry}: {late} TDOAs came too late for that filter: this is not what "

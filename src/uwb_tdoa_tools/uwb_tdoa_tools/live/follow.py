@@ -69,17 +69,17 @@ class Follower:
         types = dict(node.get_topic_names_and_types()).get(topic)
         if not types or not node.count_publishers(topic):
             raise InputError(f"--follow: nobody publishes {topic}; start the node that does first.")
-        if not is_stamped(cls := message_class(types[0])):
+        cls = message_class(types[0])
+        if not is_stamped(cls):
             raise InputError(
                 f"--follow: messages on {topic} are {types[0]}: not installed, or without a header."
             )
         qos = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-        self._subscription = node.create_subscription(
-            cls, topic, lambda _: None, qos, raw=True
-        )  # taken, never spun
-        self._newest: int | None = None  # ns, as those that follow
-        self._looked: int | None = None
-        self._started: int | None = None
+        # Messages are taken, and the node does not spin.
+        self._subscription = node.create_subscription(cls, topic, lambda _: None, qos, raw=True)
+        self._newest: int | None = None  # ns, stamp of the newest message
+        self._looked: int | None = None  # ns, stamp of the replay at the last look
+        self._started: int | None = None  # ns, stamp of the first message
         self._silent = False
         self._tdoas = _Tdoas(node, round(1e9 * AID_SHARE * lag))
 
@@ -109,9 +109,7 @@ class Follower:
 
     def _is_starting(self, stamp: int) -> bool:
         """Return whether bias_node may still lack poses at this stamp, ns."""
-        if (
-            self._started is not None and stamp < self._started - LEAD
-        ):  # a recording that starts again
+        if self._started is not None and stamp < self._started - LEAD:  # the recording restarts
             self._started = None
         if self._started is None:
             self._hear()
@@ -159,21 +157,19 @@ class _Tdoas:
         self._start_over()
 
     def _start_over(self) -> None:
-        self._begin = -math.inf  # ns: none up to here is waited for
-        self._newest: int | None = None  # ns, newest stamp that was played
-        self._out, self._silent = -math.inf, False  # ns, newest stamp that has come out
-        self._first: deque[int] = deque()  # stamps that were played first
-        self._shift = 0  # by how much those that come out are less
-        self._aids: dict[str, int] = {}  # {topic: ns, newest stamp that was played}
-        self._learned, self._behind = (
-            0,
-            False,
-        )  # whether START_STEP is too little, because the recorded IMU is behind its TDOAs
+        self._begin = -math.inf  # ns; older TDOAs need not leave the filter
+        self._newest: int | None = None  # ns, newest stamp that was published
+        self._out = -math.inf  # ns, newest stamp that left the filter
+        self._silent = False
+        self._first: deque[int] = deque()  # first stamps that were published
+        self._shift = 0  # ns by which the same stamps are smaller when they leave the filter
+        self._learned = 0  # number of stamps from which `_shift` is known
+        self._aids: dict[str, int] = {}  # {topic: ns, newest stamp that was published}
+        # Whether START_STEP is too small, because the recorded IMU is behind the TDOAs.
+        self._behind = False
 
     def add(self, stamp: int) -> None:
-        if (
-            self._newest is not None and stamp < self._newest - LEAD
-        ):  # a recording that starts again
+        if self._newest is not None and stamp < self._newest - LEAD:  # the recording restarts
             self._start_over()
         if self._newest is None:
             self._begin, self._newest = stamp - 1, stamp
@@ -192,7 +188,8 @@ class _Tdoas:
             return 0.0
         began = heard = time.monotonic()
         while not stop:
-            if taken := _taken(self._subscription):
+            taken = _taken(self._subscription)
+            if taken:
                 self._learn(list(map(stamp_of, taken)))
                 heard, self._silent = time.monotonic(), False
             if self._is_in_step(step) or self._silent:
@@ -205,10 +202,8 @@ class _Tdoas:
     def _is_in_step(self, step: int) -> bool:
         assert self._newest is not None
         aids = [stamp for stamp in self._aids.values() if stamp > self._newest - AID_SILENT]
-        reach = max(
-            min((self._newest, *aids)), self._newest - self._aid_wait
-        )  # how far the filter goes
-        return reach - step <= max(self._begin, self._out + self._shift)
+        time_of_filter = max(min((self._newest, *aids)), self._newest - self._aid_wait)
+        return time_of_filter - step <= max(self._begin, self._out + self._shift)
 
     def _learn(self, stamps: list[int]) -> None:
         """Note stamps that left the filter. The first ones show by how much an effect shifts them."""

@@ -215,7 +215,8 @@ def _wait_for_listeners(
     wanted = needed or list(publishers)
     if options.follow and not needed:
         needed = [topic for topic, publisher in publishers.items() if is_tdoa(publisher)]
-    if missing := [topic for topic in wanted if topic not in publishers]:
+    missing = [topic for topic in wanted if topic not in publishers]
+    if missing:
         raise InputError(
             f"--wait-topics: {missing[0]} is not in the bag; it has {', '.join(publishers)}."
         )
