@@ -10,7 +10,7 @@ import pytest
 
 from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_tools.bags.bag import read_bag, write_bag
-from uwb_tdoa_tools.checking.check import check, different_surveys, sensors, upright
+from uwb_tdoa_tools.checking.check import check, different_surveys, sensor_findings, upright
 from uwb_tdoa_tools.checking.recording import of_flight, read_recording
 from uwb_tdoa_tools.readers import inputs, read_flight, read_survey
 from uwb_tdoa_tools.readers.inputs import Reading
@@ -196,7 +196,7 @@ def test_healthy_ranges_without_tdoas_have_no_error(ranged):
 def test_ranges_in_millimetres_are_named(ranged):
     wrong = replace(ranged, range=replace(ranged.range, d=1000.0 * ranged.range.d))
     assert "range_unit" in {finding.rule for finding in check(of_flight(wrong)).findings}
-    assert [finding.rule for finding in sensors(of_flight(wrong))][:1] == ["range_unit"]
+    assert [finding.rule for finding in sensor_findings(of_flight(wrong))][:1] == ["range_unit"]
 
 
 def test_a_bag_of_ranges_alone_is_read_and_checked(ranged, tmp_path):

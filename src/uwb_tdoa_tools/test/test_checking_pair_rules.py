@@ -76,7 +76,7 @@ def test_a_wrong_sign_is_found_in_motion():
 
 def test_a_fault_of_all_pairs_is_one_finding():
     path = KnownPath(FAULTS["tdoa_sign"].put_in(clean_flight(100, 20.0), None))
-    (found,) = pair_rules.values(path)
+    (found,) = pair_rules.wrong_values(path)
     assert found.rule == "tdoa_sign" and "pairs" in found.evidence
 
 
@@ -89,9 +89,9 @@ def test_exchanged_ids_are_found(cycle):
     renamed = KnownPath(
         type(flight)(flight.name, flight.anchors, type(of)(of.t, a, b, of.d), truth=flight.truth)
     )
-    found, before, after = pair_rules.renamed(renamed)
+    found, before, after = pair_rules.find_exchanges(renamed)
     assert found == {called: anchor for anchor, called in table.items()} and after < 0.4 * before
-    (finding,) = pair_rules.ids(renamed)
+    (finding,) = pair_rules.exchanged_ids(renamed)
     assert finding.rule == "ids_exchanged" and str(found[cycle[0]]) in finding.remedy
 
 

@@ -10,7 +10,7 @@ import pytest
 from uwb_tdoa_bias.effects import true_samples
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_tools.checking.pair_rules import KnownPath
-from uwb_tdoa_tools.checking.time_rules import delays, tdoas
+from uwb_tdoa_tools.checking.time_rules import delays, wrong_stamps
 
 T = np.arange(0.0, 60.0, 0.02)
 SERIES = np.arange(len(T)) % 3
@@ -89,7 +89,7 @@ def flight():
 
 
 def rules_found(flight):
-    return {finding.rule: finding.value for finding in tdoas(KnownPath(flight))}
+    return {finding.rule: finding.value for finding in wrong_stamps(KnownPath(flight))}
 
 
 def test_a_healthy_flight_has_no_finding(flight):

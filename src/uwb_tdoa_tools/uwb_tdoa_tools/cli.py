@@ -44,7 +44,7 @@ def parser(name: str, description: str, *examples: str) -> argparse.ArgumentPars
 
     Examples that begin with `name` are printed as they run where the user is.
     """
-    started = command_lines.started(name).removesuffix(name)
+    started = command_lines.line_start(name).removesuffix(name)
     lines = [
         f"  {started if example.partition(' ')[0] == name else ''}{example}" for example in examples
     ]

@@ -27,10 +27,10 @@ PACKAGES = {
 
 def tool(name: str, *words: object) -> str:
     """Return the line that starts an executable with words, quoted for a shell."""
-    return " ".join([started(name), *([shlex.join(map(str, words))] if words else [])])
+    return " ".join([line_start(name), *([shlex.join(map(str, words))] if words else [])])
 
 
-def started(name: str) -> str:
+def line_start(name: str) -> str:
     """Return the beginning of the line that starts an executable."""
     return f"{os.environ.get(RUN, 'ros2 run')} {PACKAGES.get(name, 'uwb_tdoa_tools')} {name}"
 
@@ -62,7 +62,7 @@ def node(name: str, parameters: Mapping[str, object], files: Iterable[str | Path
     )
 
 
-def judging(
+def evaluate_line(
     recordings: Iterable[str | Path],
     survey: str | Path | None = None,
     effects: str | Path | None = None,
@@ -81,7 +81,7 @@ def judging(
     return tool("evaluate", *words) if truth else tool("localize", *words, "--out", "localized/")
 
 
-def surveying(
+def survey_line(
     recording: str | Path, survey: str | Path | None = None, effects: str | Path | None = None
 ) -> str:
     """Return the line that surveys anchors with a recording; None for a file that does not exist."""
@@ -93,7 +93,7 @@ def surveying(
     return tool("survey", *words, "--out", "surveyed/")
 
 
-def nodes(
+def node_lines(
     anchors: str | Path | None = None,
     effects: str | Path | None = None,
     config: str | Path | None = None,
@@ -105,7 +105,7 @@ def nodes(
     return node("bias_node", parameters), node("ekf_node", parameters, [config] if config else ())
 
 
-def applying(
+def lines_of_use(
     folder: Path,
     recordings: Sequence[str | Path],
     survey: str | Path | None = None,
@@ -129,9 +129,9 @@ def applying(
         Whether the recordings hold ground truth.
     """
     effects, config = folder / "effects.yaml", folder / "ekf_node.yaml" if parameters else None
-    bias, ekf = nodes(anchors, effects, config)
+    bias, ekf = node_lines(anchors, effects, config)
     return (
-        (judging(recordings, survey, effects, config, truth), "judges it"),
+        (evaluate_line(recordings, survey, effects, config, truth), "judges it"),
         (bias, "in flight: takes it out of TDOAs"),
         (ekf, "in flight: takes it out of the IMU, and assumes the noise that is left"),
     )

@@ -14,7 +14,7 @@ from ..estimate import FlightEstimator
 from ..readers.streams import protocol
 from . import coverage, imu_rules, recording_rules, tdoa_rules
 from .ordered import OrderedRecording, displacement
-from .tdoa_rules import SAME, furthest
+from .tdoa_rules import SAME, largest_displacement
 from .watch import found_by_monitor, together
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ def check(
         Command line that surveys the anchors with the recording.
     """
     streams = processed_streams(recording)
-    found = [*streams.findings(), *sensors(recording)]
+    found = [*streams.findings(), *sensor_findings(recording)]
     for rule in recording_rules.RULES:
         found += rule(recording)
     if any(finding.rule == "clock_silence" for finding in found):  # the gap of all streams
@@ -174,7 +174,7 @@ def processed_streams(recording: Recording) -> StreamRules:
     return streams
 
 
-def sensors(recording: Recording) -> Iterator[Finding]:
+def sensor_findings(recording: Recording) -> Iterator[Finding]:
     """Yield findings about the Streams of a Recording, by the rules of their SENSORS."""
     for name, stream in recording.sensors.items():
         for rule in SENSORS[name].rules:
@@ -228,7 +228,7 @@ def _try_corrections(
     """Try corrections, and return ([Finding], positions of the tag (k, 3) m)."""
     found, given = [], ordered
     for _ in range(ROUNDS):
-        finding, ordered = tdoa_rules.best(ordered, others)
+        finding, ordered = tdoa_rules.best_trial(ordered, others)
         if finding is None:
             break
         found.append(finding)
@@ -244,7 +244,7 @@ def _try_corrections(
         and not names & WITHOUT_IMU
         and not any(f.rule == "survey_misfit" for f in found)
     ):
-        finding = imu_rules.fit(ordered)
+        finding = imu_rules.find_imu_mistake(ordered)
         mixed = [other for other in found if other.cause.startswith(tdoa_rules.MIXED_UP)]
         if finding and mixed:
             found = [other for other in found if other not in mixed] + [_other_room(*mixed)]
@@ -327,7 +327,7 @@ def different_surveys(recordings: Sequence[NamedAnchors]) -> Iterator[Finding]:
     Such flights do not belong together.
     """
     for one, two in zip(recordings, recordings[1:]):
-        off = furthest(one.anchors, two.anchors)
+        off = largest_displacement(one.anchors, two.anchors)
         if off > SAME:
             evidence = (
                 f"the same ids are up to {off:.2f} m apart"

@@ -122,7 +122,7 @@ class CoverageView:
         return away <= NEARER * np.max(away, where=heard > 0, initial=0.0)
 
 
-def missing(view: CoverageView) -> Iterator[Finding]:
+def unheard_anchors(view: CoverageView) -> Iterator[Finding]:
     """Yield anchors of the survey that are never, hardly ever, or for a while not heard."""
     if not view.windows:  # a recording of less than a second
         return
@@ -199,7 +199,7 @@ def _silence(windows: Sequence[TdoaWindow], heard: np.ndarray) -> tuple[float, f
     return longest
 
 
-def flat(view: CoverageView) -> Iterator[Finding]:
+def flat_anchors(view: CoverageView) -> Iterator[Finding]:
     """Yield a finding if the anchors lie in one plane: in a hall, those that are heard together.
 
     The distance from the plane is then poorly determined, and its sign not at all.
@@ -227,7 +227,7 @@ def _size_and_thickness(positions: np.ndarray) -> tuple[float, float]:
     return float(size), float(thickness)
 
 
-def side(view: CoverageView) -> Iterator[Finding]:
+def unknown_side(view: CoverageView) -> Iterator[Finding]:
     """Yield a finding if the anchors lie in a plane across an axis: the user must give the tag's side."""
     heard = [view.anchors.positions[window.heard > 0] for window in view.windows]
     sides = [
@@ -256,7 +256,7 @@ def side(view: CoverageView) -> Iterator[Finding]:
     )
 
 
-def below(view: CoverageView) -> Iterator[Finding]:
+def survey_below_zero(view: CoverageView) -> Iterator[Finding]:
     """Yield a finding if all anchors are below zero: z points down."""
     z = view.anchors.positions[:, 2]
     if z.max() <= 0.05 and np.ptp(z) > 0.5:
@@ -271,7 +271,7 @@ def below(view: CoverageView) -> Iterator[Finding]:
         )
 
 
-def outside(view: CoverageView) -> Iterator[Finding]:
+def tag_outside(view: CoverageView) -> Iterator[Finding]:
     """Yield a finding if the tag is outside of its anchors."""
     p = view.anchors.positions
     if not len(view.places):
@@ -292,7 +292,7 @@ def outside(view: CoverageView) -> Iterator[Finding]:
         )
 
 
-def still(view: CoverageView) -> Iterator[Finding]:
+def little_motion(view: CoverageView) -> Iterator[Finding]:
     """Yield a finding if the tag hardly moves."""
     if not len(view.places):
         return
@@ -314,4 +314,4 @@ def still(view: CoverageView) -> Iterator[Finding]:
         )
 
 
-RULES = (missing, flat, side, below, outside, still)
+RULES = (unheard_anchors, flat_anchors, unknown_side, survey_below_zero, tag_outside, little_motion)

@@ -40,15 +40,15 @@ def _of_tdoas(path: KnownPath) -> list[Finding]:
     """Return findings about ids, then other values, then stamps if ids and values are right."""
     repairs = repairs_of(path)
     found = (
-        list(pair_rules.ids(path))
+        list(pair_rules.exchanged_ids(path))
         if any(effect.name == AnchorIds.name for effect in repairs)
         else []
     )
-    found += pair_rules.values(path.without(repairs[0]) if found else path)
+    found += pair_rules.wrong_values(path.without(repairs[0]) if found else path)
     return (
         found
         if any(finding.rule.startswith(("ids", "tdoa")) for finding in found)
-        else [*found, *time_rules.tdoas(path)]
+        else [*found, *time_rules.wrong_stamps(path)]
     )
 
 
@@ -60,8 +60,8 @@ def _of_imu(flight: Flight) -> list[Finding]:
     motion = TrueMotion(flight)
     if len(motion) < motion_rules.FEWEST:
         return []
-    found = list(motion_rules.axes(motion))
-    return found or [*motion_rules.filtered(motion), *motion_rules.stamps(motion)]
+    found = list(motion_rules.wrong_axes(motion))
+    return found or [*motion_rules.low_passes(motion), *motion_rules.wrong_stamps(motion)]
 
 
 def judge_truth(flight: Flight) -> Iterator[Finding]:
@@ -114,11 +114,11 @@ def judge_flight(flight: Flight) -> list[Finding]:
     streams, imu = processed_streams(of_flight(flight)), flight.imu
     found = streams.findings()
     track = None if flight.truth is None else (flight.truth.t, flight.truth.p)
-    found += coverage.missing(
+    found += coverage.unheard_anchors(
         coverage.CoverageView(flight.anchors, list(streams.tdoa), np.empty((0, 3)), track=track)
     )
     if imu is not None and not any(finding.rule == "imu_clipped" for finding in found):
-        found += imu_rules.saturated(flight)
+        found += imu_rules.clipped_axes(flight)
     found = [finding for finding in found if finding.severity != NOTE]
     known = {finding.rule for finding in found}
     return most_severe_first(

@@ -40,7 +40,7 @@ FAR, EVEN = 0.02, 2.6
 FEWEST = 10  # samples within FAR that a judgement needs
 
 
-def saturated(flight: Flight) -> Iterator[Finding]:
+def clipped_axes(flight: Flight) -> Iterator[Finding]:
     """Yield a finding about an axis of a Flight with many samples at its largest or smallest value."""
     assert flight.imu is not None
     for name, column in zip(AXES, np.column_stack([flight.imu.gyro, flight.imu.accel]).T):
@@ -58,7 +58,7 @@ def saturated(flight: Flight) -> Iterator[Finding]:
                 return
 
 
-def smooth(t: np.ndarray, values: np.ndarray) -> bool:
+def is_smooth(t: np.ndarray, values: np.ndarray) -> bool:
     """Return whether a sensor changes so evenly, on all axes, as only behind a low pass.
 
     The mean square of a step is then at least 1/k^2 of the mean square change in FAR, which k steps
@@ -105,7 +105,7 @@ SCALES = {
 }
 
 
-def fit(recording: OrderedRecording) -> Finding | None:
+def find_imu_mistake(recording: OrderedRecording) -> Finding | None:
     """Return the Finding about axes or units of the IMU that do not fit the TDOAs, or None.
 
     The TDOAs of the OrderedRecording must be right.
@@ -114,8 +114,8 @@ def fit(recording: OrderedRecording) -> Finding | None:
     if (
         brief.imu is None
         or len(brief.imu) < SLOWEST * PART / 2.0
-        or stands(brief.imu)
-        or not moved(recording.survey_fit.places)
+        or is_at_rest(brief.imu)
+        or not has_moved(recording.survey_fit.places)
     ):
         return None
     base = _unexplained(brief)
@@ -136,7 +136,7 @@ def fit(recording: OrderedRecording) -> Finding | None:
     return _finding(accel, gyro, evidence, ratio)
 
 
-def moved(places: np.ndarray) -> bool:
+def has_moved(places: np.ndarray) -> bool:
     """Return whether a tag at positions (k, 3) m has moved.
 
     TDOAs of a tag at rest show nothing about the inertial sensor.
@@ -144,7 +144,7 @@ def moved(places: np.ndarray) -> bool:
     return len(places) > 0 and bool(np.sqrt(np.sum(np.var(places, axis=0))) > MOVED)
 
 
-def stands(imu: Imu) -> bool:
+def is_at_rest(imu: Imu) -> bool:
     """Return whether an inertial sensor neither shakes nor turns, whatever the unit of its rates.
 
     Nothing determines that unit then.

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from uwb_tdoa_ekf.streams import ERROR, Finding
 
-from .imu_rules import ARRANGEMENTS, SCALES, scale_of, signed_axis, smooth
-from .time_rules import BLOCK, LONGEST, changing, delays
+from .imu_rules import ARRANGEMENTS, SCALES, is_smooth, scale_of, signed_axis
+from .time_rules import BLOCK, LONGEST, delays, drift_or_jump
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -85,7 +85,7 @@ class TrueMotion:
             "accel": _triangle(imu.t, imu.accel, self.t),
         }
         self.true = self.with_attitude(None)
-        self.smooth = {"gyro": smooth(imu.t, imu.gyro), "accel": smooth(imu.t, imu.accel)}
+        self.smooth = {"gyro": is_smooth(imu.t, imu.gyro), "accel": is_smooth(imu.t, imu.accel)}
         self._scale = {}
         for sensor in SENSORS:
             left = _slowly_left(self.measured[sensor] - self.at(self.true[sensor]), self.block)
@@ -173,7 +173,7 @@ def _triangle(t: np.ndarray, values: np.ndarray, when: np.ndarray) -> np.ndarray
     return second / HALF**2 + values.mean(axis=0)
 
 
-def axes(motion: TrueMotion) -> Iterator[Finding]:
+def wrong_axes(motion: TrueMotion) -> Iterator[Finding]:
     """Yield exchanged or mirrored axes, another unit of the gyroscope, or a wrong attitude of the truth."""
     base = {sensor: motion.power(sensor, motion.true[sensor]) for sensor in SENSORS}
     best = {sensor: _best_arrangement(motion, sensor) for sensor in SENSORS}
@@ -267,7 +267,7 @@ def _of_axes(sensor: str, change: np.ndarray, evidence: str, power: float) -> Fi
     )
 
 
-def filtered(motion: TrueMotion) -> Iterator[Finding]:
+def low_passes(motion: TrueMotion) -> Iterator[Finding]:
     """Yield low passes of first order in a sensor: its output is late and too small.
 
     The noisy truth fits better behind any low pass. A low pass that runs backwards shows by how much.
@@ -312,6 +312,6 @@ def _slowed(values: np.ndarray, tau: float) -> np.ndarray:
     return lfilter([share], [1.0, share - 1.0], values - values[0], axis=0) + values[0]
 
 
-def stamps(motion: TrueMotion) -> Iterator[Finding]:
+def wrong_stamps(motion: TrueMotion) -> Iterator[Finding]:
     """Yield stamps that drift or jump."""
-    yield from changing("imu", "inertial samples", motion.delays())
+    yield from drift_or_jump("imu", "inertial samples", motion.delays())

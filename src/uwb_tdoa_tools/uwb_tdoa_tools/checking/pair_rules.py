@@ -106,7 +106,7 @@ OFF = 3.0  # times the median error of most anchors: an anchor with more may hav
 EXCHANGES = 4  # most pairs of anchors that are exchanged one after the other
 
 
-def values(path: KnownPath) -> Iterator[Finding]:
+def wrong_values(path: KnownPath) -> Iterator[Finding]:
     """Yield pairs with the other sign, rounded, interpolated, repeated, clipped or frozen TDOAs.
 
     A fault of most pairs is one finding.
@@ -142,7 +142,7 @@ def values(path: KnownPath) -> Iterator[Finding]:
             )
 
 
-def contrary(path: KnownPath) -> list[tuple[int, int]]:
+def inverted_pairs(path: KnownPath) -> list[tuple[int, int]]:
     """Return [(a, b)] of the pairs with the wrong sign."""
     return [
         pair
@@ -260,9 +260,9 @@ def _runs(d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 OF_PAIR = _sign, _rounded, _interpolated, _repeated, _clipped, _frozen
 
 
-def ids(path: KnownPath) -> Iterator[Finding]:
+def exchanged_ids(path: KnownPath) -> Iterator[Finding]:
     """Yield anchors with exchanged ids."""
-    table, before, after = renamed(path)
+    table, before, after = find_exchanges(path)
     if table:
         names = ", ".join(f"{wrong} is {right}" for wrong, right in table.items())
         evidence = f"median error of their TDOAs {before:.2f} m, exchanged {after:.2f} m"
@@ -280,7 +280,7 @@ def ids(path: KnownPath) -> Iterator[Finding]:
         )
 
 
-def renamed(path: KnownPath) -> tuple[dict[int, int], float, float]:
+def find_exchanges(path: KnownPath) -> tuple[dict[int, int], float, float]:
     """Return exchanged ids and the median error of their TDOAs before and after the exchange.
 
     Returns
@@ -360,11 +360,11 @@ def repairs(flight: Flight) -> tuple[LabelEffect, ...]:
 def repairs_of(path: KnownPath) -> tuple[LabelEffect, ...]:
     """Return the same for a KnownPath. If most signs are wrong, ids are not judged."""
     out: list[LabelEffect] = []
-    signs = contrary(path)
-    table = {} if len(signs) >= MOST * max(len(path.pairs), 1) else renamed(path)[0]
+    signs = inverted_pairs(path)
+    table = {} if len(signs) >= MOST * max(len(path.pairs), 1) else find_exchanges(path)[0]
     if table:
         out.append(AnchorIds({str(wrong): right for wrong, right in table.items()}, source=SOURCE))
-        signs = contrary(path.without(out[0]))
+        signs = inverted_pairs(path.without(out[0]))
     if signs:
         out.append(PairSign({f"{a}-{b}": -1.0 for a, b in signs}, source=SOURCE))
     return tuple(out)

@@ -17,7 +17,7 @@ from ..bags.messages import BODY_FRAME
 from ..bags.placing import is_body
 from ..clock import SET, SILENCE, WORDS, WRAP, apart, in_words
 from .recording import IMU
-from .tdoa_rules import furthest, same_place
+from .tdoa_rules import largest_displacement, same_place
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -145,11 +145,11 @@ def odometry_unread(recording: Recording) -> Iterator[Finding]:
         yield Finding("odometry_unread", WARNING, cause, evidence, line, float(len(there)))
 
 
-def anchors(recording: Recording) -> Iterator[Finding]:
+def other_anchors(recording: Recording) -> Iterator[Finding]:
     """Yield a finding if the anchors in the bag, which the nodes use, differ from the survey."""
     if recording.recorded is None or same_place(recording.anchors, recording.recorded):
         return
-    off = furthest(recording.anchors, recording.recorded)
+    off = largest_displacement(recording.anchors, recording.recorded)
     evidence = (
         f"the same ids are up to {off:.2f} m apart" if np.isfinite(off) else "no id in common"
     )
@@ -170,7 +170,7 @@ def anchors(recording: Recording) -> Iterator[Finding]:
     )
 
 
-def sorted_file(recording: Recording) -> Iterator[Finding]:
+def falling_stamps(recording: Recording) -> Iterator[Finding]:
     """Yield a finding if the stamps in the file fall. The reader has sorted them."""
     if recording.falls:
         yield Finding(
@@ -183,7 +183,7 @@ def sorted_file(recording: Recording) -> Iterator[Finding]:
         )
 
 
-def clock(recording: Recording) -> Iterator[Finding]:
+def clock_jumps(recording: Recording) -> Iterator[Finding]:
     """Yield restarts, wraps and settings of the clock, and single wrong stamps."""
     for jump in recording.jumps:
         cause, done = in_words(jump)
@@ -221,7 +221,7 @@ def clock(recording: Recording) -> Iterator[Finding]:
         )
 
 
-def other_time(recording: Recording) -> Iterator[Finding]:
+def sensors_apart(recording: Recording) -> Iterator[Finding]:
     """Yield sensors without a message in the time of the TDOAs.
 
     The rules of streams judge the IMU, unless it is alone.
@@ -248,7 +248,7 @@ def other_time(recording: Recording) -> Iterator[Finding]:
         )
 
 
-def losses(recording: Recording) -> Iterator[Finding]:
+def unused_data(recording: Recording) -> Iterator[Finding]:
     """Yield data that the reader of the recording did not use."""
     for cause, evidence, remedy in recording.losses:
         yield Finding("imu_lost", WARNING, cause, evidence, remedy, np.nan)
@@ -265,7 +265,7 @@ def _by_topic(recording: Recording) -> Iterator[tuple[str, list[End], list[End]]
         )
 
 
-def kinds(recording: Recording) -> Iterator[Finding]:
+def different_types(recording: Recording) -> Iterator[Finding]:
     """Yield topics with several types: such publishers and subscriptions never match."""
     for topic, publishers, subscriptions in _by_topic(recording):
         found = {end.kind for end in (*publishers, *subscriptions)}
@@ -278,7 +278,7 @@ def kinds(recording: Recording) -> Iterator[Finding]:
             yield Finding("type_other", ERROR, cause, evidence, line, float(len(found)))
 
 
-def unmatched(recording: Recording) -> Iterator[Finding]:
+def incompatible_qos(recording: Recording) -> Iterator[Finding]:
     """Yield subscriptions that request more than a publisher offers, and so receive nothing from it."""
     for topic, publishers, subscriptions in _by_topic(recording):
         deaf = {
@@ -308,7 +308,7 @@ def _stronger(publisher: End, end: End) -> str:
     )
 
 
-def several(recording: Recording) -> Iterator[Finding]:
+def several_publishers(recording: Recording) -> Iterator[Finding]:
     """Yield streams with two publishers."""
     for topic, publishers, _ in _by_topic(recording):
         if len(publishers) > 1 and not topic.startswith("/tf"):
@@ -435,14 +435,14 @@ RULES = (
     senders,
     no_imu,
     odometry_unread,
-    anchors,
-    sorted_file,
-    clock,
-    other_time,
-    losses,
-    kinds,
-    unmatched,
-    several,
+    other_anchors,
+    falling_stamps,
+    clock_jumps,
+    sensors_apart,
+    unused_data,
+    different_types,
+    incompatible_qos,
+    several_publishers,
     volatile_anchors,
     tag_delay,
 )

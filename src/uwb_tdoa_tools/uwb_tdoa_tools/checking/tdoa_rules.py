@@ -82,7 +82,7 @@ class MistakeTrial:
 
 def in_metres(recording: OrderedRecording) -> bool:
     """Return whether the TDOAs scatter as metres do. TDOAs of a quiet radio in nanoseconds do so too."""
-    return NOISE[0] <= successive(recording.tdoa) <= NOISE[1]
+    return NOISE[0] <= successive_difference(recording.tdoa) <= NOISE[1]
 
 
 def units(recording: OrderedRecording) -> Iterator[tuple[Finding, OrderedRecording]]:
@@ -90,7 +90,7 @@ def units(recording: OrderedRecording) -> Iterator[tuple[Finding, OrderedRecordi
 
     The noise of the radio is known, and a motion must explain most of the TDOAs.
     """
-    noise = successive(recording.tdoa)
+    noise = successive_difference(recording.tdoa)
     if not noise > 0.0 or (
         in_metres(recording) and recording.part(LONG).unexplained(WELL).mean < WELL
     ):
@@ -114,7 +114,7 @@ def units(recording: OrderedRecording) -> Iterator[tuple[Finding, OrderedRecordi
     )
 
 
-def successive(tdoa: Tdoas) -> float:
+def successive_difference(tdoa: Tdoas) -> float:
     """Return the median difference of successive TDOAs of a pair, in the unit of the file."""
     order = np.lexsort((tdoa.t, tdoa.b, tdoa.a))
     a, b, t, d = tdoa.a[order], tdoa.b[order], tdoa.t[order], tdoa.d[order]
@@ -122,7 +122,7 @@ def successive(tdoa: Tdoas) -> float:
     return float(np.median(np.abs(np.diff(d))[follows])) if follows.any() else 0.0
 
 
-def sign(recording: OrderedRecording) -> Iterator[MistakeTrial]:
+def inverted_signs(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     """Yield the trial with all signs inverted."""
     line = "message.distance_difference = distance_to_b - distance_to_a  # not a - b"
     yield MistakeTrial(
@@ -131,7 +131,7 @@ def sign(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     )
 
 
-def scaled(recording: OrderedRecording) -> Iterator[MistakeTrial]:
+def scaled_survey(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     """Yield trials with the survey in another unit.
 
     (If the TDOAs show it directly, the rules of streams have reported it before.)
@@ -148,7 +148,7 @@ def scaled(recording: OrderedRecording) -> Iterator[MistakeTrial]:
         )
 
 
-def survey(recording: OrderedRecording, others: Sequence[Survey]) -> Iterator[MistakeTrial]:
+def other_survey(recording: OrderedRecording, others: Sequence[Survey]) -> Iterator[MistakeTrial]:
     """Yield trials with other surveys, [(name, Anchors)].
 
     Surveys of one installation on different days count as one.
@@ -170,17 +170,21 @@ def survey(recording: OrderedRecording, others: Sequence[Survey]) -> Iterator[Mi
 def same_place(one: Anchors, other: Anchors) -> bool:
     """Return whether two Anchors have the same ids at the same places."""
     rows = other.index(one.ids)
-    return len(one) == len(other) and bool((rows >= 0).all()) and furthest(one, other) < SAME
+    return (
+        len(one) == len(other)
+        and bool((rows >= 0).all())
+        and largest_displacement(one, other) < SAME
+    )
 
 
-def furthest(one: Anchors, other: Anchors) -> float:
+def largest_displacement(one: Anchors, other: Anchors) -> float:
     """Return the largest distance between the two places of an id, m; infinite without a common id."""
     rows = other.index(one.ids)
     off = np.linalg.norm(one.positions - other.positions[rows], axis=1)[rows >= 0]
     return float(off.max()) if len(off) else np.inf
 
 
-def renumbered(recording: OrderedRecording) -> Iterator[MistakeTrial]:
+def renumbered_ids(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     """Yield the trial with renumbered ids: the same anchors in the same order, with other numbers."""
     heard = np.unique(np.r_[recording.tdoa.a, recording.tdoa.b])
     known = np.sort(recording.anchors.ids)
@@ -194,7 +198,7 @@ def renumbered(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     yield MistakeTrial(relabelled(recording, table), _finding_of("ids_renumbered", cause, line))
 
 
-def swapped(recording: OrderedRecording) -> Iterator[MistakeTrial]:
+def swapped_ids(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     """Yield the trial with the best exchange of two ids, then of two more, while more is explained.
 
     Not for motion along a line: in a room that is symmetrical about it, anchors differ by their
@@ -250,7 +254,7 @@ def _far_off(recording: OrderedRecording) -> list[int]:
     return recording.anchors.ids[rows[each > limit]].tolist()
 
 
-def contrary(recording: OrderedRecording) -> Iterator[MistakeTrial]:
+def inverted_pairs(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     """Yield trials with the sign of single pairs inverted, or of all pairs with the larger id first."""
     tdoa = recording.tdoa
     pairs = np.unique(np.column_stack([tdoa.a, tdoa.b]), axis=0)
@@ -300,7 +304,7 @@ def _flipped(recording: OrderedRecording, rows: np.ndarray) -> OrderedRecording:
     return recording.with_tdoa(d=np.where(rows, -recording.tdoa.d, recording.tdoa.d))
 
 
-def moved(recording: OrderedRecording) -> Iterator[MistakeTrial]:
+def moved_anchor(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     """Yield the trial with one anchor moved to where the TDOAs are explained."""
     fit = recording.survey_fit
     gain = gained(fit)
@@ -340,7 +344,7 @@ def apparent_gain(fit: SurveyFit) -> float:
     return fit.before - fit.all_moved[0] if len(fit) >= FEWEST else 0.0
 
 
-def best(
+def best_trial(
     recording: OrderedRecording, others: Sequence[Survey] = ()
 ) -> tuple[Finding | None, OrderedRecording]:
     """Return (Finding, OrderedRecording with it undone), or (None, recording).
@@ -353,7 +357,15 @@ def best(
         for found in units(recording):
             return found
     base, trials = recording.part(LONG).unexplained(), []
-    for rule in (sign, scaled, renumbered, swapped, contrary, moved, lambda c: survey(c, others)):
+    for rule in (
+        inverted_signs,
+        scaled_survey,
+        renumbered_ids,
+        swapped_ids,
+        inverted_pairs,
+        moved_anchor,
+        lambda c: other_survey(c, others),
+    ):
         for trial in rule(recording):
             most = min(RATIO * base.mean, base.mean - BY_ERRORS * trial.share)
             other = trial.recording.part(LONG).unexplained(most)

@@ -172,7 +172,7 @@ def _scatter(series: np.ndarray, values: np.ndarray) -> np.ndarray:
     return np.array([max(1.4826 * np.median(part), 1e-9) if len(part) else 1.0 for part in known])
 
 
-def of_tdoas(path: KnownPath) -> Delays | None:
+def delays_of_tdoas(path: KnownPath) -> Delays | None:
     """Return the Delays of the pairs of a KnownPath, in their order; None without any."""
     parts = _looked_at(path)
     if not any(map(len, parts)):
@@ -217,13 +217,13 @@ CLOCK = (
 )
 
 
-def tdoas(path: KnownPath) -> Iterator[Finding]:
+def wrong_stamps(path: KnownPath) -> Iterator[Finding]:
     """Yield TDOAs that are late, for one pair or all, that drift or jump, or that are out of order."""
-    of = of_tdoas(path)
+    of = delays_of_tdoas(path)
     if of is None:
         return
     ratio, delay = of.constant()
-    found = list(changing("tdoa", "TDOAs", of))
+    found = list(drift_or_jump("tdoa", "TDOAs", of))
     if not found and ratio < OF_ALL and abs(delay) >= LEAST:
         found = [_late("tdoa_late", "the TDOAs are", ratio, delay)]
     if found:
@@ -251,7 +251,7 @@ def _late(rule: str, who: str, ratio: float, delay: float) -> Finding:
     )
 
 
-def changing(stream: str, name: str, of: Delays) -> Iterator[Finding]:
+def drift_or_jump(stream: str, name: str, of: Delays) -> Iterator[Finding]:
     """Yield a drift or a jump of the stamps of a stream, "tdoa" or "imu", from its Delays."""
     (drift, by), (jump, step, _) = of.drift(), of.jump()
     jumps = jump < JUMPS and abs(step) >= LEAST

@@ -155,7 +155,7 @@ def _checked(
         for path, survey in recordings:
             checked.append(read_recording(reading, path, survey))
             result = check(
-                checked[-1], (), estimator, command_lines.surveying(path, survey, effects)
+                checked[-1], (), estimator, command_lines.survey_line(path, survey, effects)
             )
             cli.show(report.text(result))
             usable = usable and not stopping(checked[-1], result.findings, std)
@@ -185,8 +185,10 @@ def _write(made: Calibration, out: Path, recordings: Sequence[str | Path], truth
         f"wrote {', '.join(file.name for file in files if file.exists())} and "
         f"calibration.json to {out}"
     )
-    cli.show(f"judge it:   {command_lines.judging(recordings, survey, corrected, tuned, truth)}")
-    cli.show("fly by it:", *command_lines.nodes(survey, corrected, tuned))
+    cli.show(
+        f"judge it:   {command_lines.evaluate_line(recordings, survey, corrected, tuned, truth)}"
+    )
+    cli.show("fly by it:", *command_lines.node_lines(survey, corrected, tuned))
     return 0
 
 

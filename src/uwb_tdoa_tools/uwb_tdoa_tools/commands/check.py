@@ -77,7 +77,7 @@ def _check(args: Namespace) -> int:
     reports, recordings = [], []
     for recording, path, survey in _recordings(args, reading, alone):
         recordings.append(recording)
-        line = command_lines.surveying(path, survey, args.effects) if path else None
+        line = command_lines.survey_line(path, survey, args.effects) if path else None
         reports.append(check(recording, others, estimator, line))
         cli.show(report.text(reports[-1]))
     together = list(different_surveys(recordings))

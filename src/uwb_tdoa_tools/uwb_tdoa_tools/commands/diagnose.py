@@ -172,7 +172,7 @@ def _diagnose(args: Namespace) -> None:
     (_, its_survey), *_ = found
     truth = all(flight.truth is not None for flight in holdout or flights)
     judged_on = args.holdout or args.flights
-    applying = command_lines.applying(
+    applying = command_lines.lines_of_use(
         out, judged_on, args.survey, its_survey, tdoa_std is not None, truth
     )
     result = replace(result, applying=applying)

@@ -123,7 +123,7 @@ def _survey(args: Namespace) -> int:
         files = out / "anchors.yaml", out / "effects.yaml", config_file
         cli.show(
             "next: "
-            f"{command_lines.judging(args.flights, *files, all(flight.truth is not None for flight in flights))}"
+            f"{command_lines.evaluate_line(args.flights, *files, all(flight.truth is not None for flight in flights))}"
         )
     return 0 if result.why_not is None else 1
 

@@ -22,7 +22,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from ..checking.imu_rules import ARRANGEMENTS, signed_axis
 from ..checking.motion_rules import FEWEST, TrueMotion
 from ..checking.pair_rules import KnownPath
-from ..checking.time_rules import of_tdoas
+from ..checking.time_rules import delays_of_tdoas
 from ..clock import grid
 from .metrics import ALIGN, judged_part, position_at
 
@@ -307,7 +307,7 @@ def _late(flight: Flight, exact: bool) -> tuple[float, str | None]:
     assert flight.truth is not None
     found, source = _inertial(flight), "inertial"
     if found is None:
-        found, source = of_tdoas(KnownPath(flight)), "tdoa"
+        found, source = delays_of_tdoas(KnownPath(flight)), "tdoa"
     if found is None:
         return 0.0, None
     if not exact and not _is_late(*found.constant()):
@@ -316,7 +316,7 @@ def _late(flight: Flight, exact: bool) -> tuple[float, str | None]:
     moved = replace(
         flight, truth=_earlier(flight.truth, late)
     )  # once more from there: a parabola is off between what is tried
-    again = _inertial(moved) if source == "inertial" else of_tdoas(KnownPath(moved))
+    again = _inertial(moved) if source == "inertial" else delays_of_tdoas(KnownPath(moved))
     return late - (again.exact() if again else 0.0), source
 
 
@@ -325,7 +325,7 @@ def _behind(flight: Flight, late: float) -> float:
     TDOAs, and so than an estimate.
     """
     assert flight.truth is not None
-    found = of_tdoas(KnownPath(replace(flight, truth=_earlier(flight.truth, late))))
+    found = delays_of_tdoas(KnownPath(replace(flight, truth=_earlier(flight.truth, late))))
     return -found.exact() if found and _is_late(*found.constant()) else 0.0
 
 
