@@ -14,7 +14,7 @@ from uwb_tdoa_ekf.streams import ERROR
 from uwb_tdoa_tools import parallel
 from uwb_tdoa_tools.checking.check import check
 from uwb_tdoa_tools.checking.recording import of_flight
-from uwb_tdoa_tools.checking.tdoa_rules import furthest
+from uwb_tdoa_tools.checking.tdoa_rules import largest_displacement
 from uwb_tdoa_tools.outputs import OutputFile
 from uwb_tdoa_tools.readers import inputs, read_survey
 from uwb_tdoa_tools.readers.streams import protocol
@@ -79,7 +79,9 @@ def judge_flight(task, reading, surveys, only=None):
     flight = of_flight(reading.read(recording))
     other = of_flight(reading.read(partner)) if partner else None
     live = number % 2 == 0
-    rooms = [anchors for _, anchors in surveys if furthest(anchors, flight.anchors) > ANOTHER]
+    rooms = [
+        anchors for _, anchors in surveys if largest_displacement(anchors, flight.anchors) > ANOTHER
+    ]
     rows = []
     for name in ["nothing", *MISTAKES] if only is None else only:
         mistake = MISTAKES.get(name)

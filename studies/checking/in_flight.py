@@ -14,7 +14,7 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.files import write_text
 from uwb_tdoa_tools.checking.recording import of_flight
-from uwb_tdoa_tools.checking.tdoa_rules import furthest
+from uwb_tdoa_tools.checking.tdoa_rules import largest_displacement
 from uwb_tdoa_tools.outputs import OutputFile
 from uwb_tdoa_tools.readers import inputs, read_survey
 
@@ -55,7 +55,9 @@ def run(args):
     reading = inputs.Reading(args.survey)
     flight = of_flight(reading.one(args.flight))
     surveys = [read_survey(path) for path in sorted(Path(args.survey).glob("anchor_?*"))]
-    rooms = [anchors for anchors in surveys if furthest(anchors, flight.anchors) > ANOTHER]
+    rooms = [
+        anchors for anchors in surveys if largest_displacement(anchors, flight.anchors) > ANOTHER
+    ]
     part = middle(flight, args.seconds)
     rows = []
     print("| mistake | `check` | `ekf_node` |\n| --- | --- | --- |")

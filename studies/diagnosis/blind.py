@@ -20,7 +20,7 @@ from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.diagnosis import diagnose
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.references import GroundTruth
-from uwb_tdoa_tools.json_values import as_json
+from uwb_tdoa_tools.outputs import as_json
 from uwb_tdoa_tools.scoring.metrics import Score
 
 from . import grammar, measured

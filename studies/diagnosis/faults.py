@@ -4,7 +4,7 @@ from number_faults import FAULTS
 import numpy as np
 
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_tools.checking.numbers import numbers
+from uwb_tdoa_tools.checking.flight_rules import judge_flight
 
 from . import measured
 from .bank import share
@@ -41,7 +41,7 @@ def as_they_are(data):
     said = {}
     for path in _paths():
         flight = measured.load(data, [path])[0]
-        for finding in numbers(flight):
+        for finding in judge_flight(flight):
             said.setdefault(finding.rule, []).append(flight.name)
     return said
 
@@ -57,8 +57,8 @@ def draw(name, fault, flight, before, rng):
     which it grows, None where that says nothing.
     """
     faulty = fault.put_in(flight, rng)
-    found = [finding.rule for finding in numbers(faulty)]
-    cost = None if fault.of_truth else rmse(faulty, EffectSet()) - before
+    found = [finding.rule for finding in judge_flight(faulty)]
+    cost = None if fault.judge_truth else rmse(faulty, EffectSet()) - before
     return {
         "fault": name,
         "flight": flight.name,

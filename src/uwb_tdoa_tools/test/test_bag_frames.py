@@ -21,8 +21,8 @@ from uwb_tdoa_tools.bags.bag import read_bag
 from uwb_tdoa_tools.bags.files import messages, new_bag, open_bag
 from uwb_tdoa_tools.bags.message_types import typestore
 from uwb_tdoa_tools.bags.messages import header_of, pose_of, tdoa_messages, transforms_message
-from uwb_tdoa_tools.checking import labels
-from uwb_tdoa_tools.checking.check import fed
+from uwb_tdoa_tools.checking import recording_rules
+from uwb_tdoa_tools.checking.check import processed_streams
 from uwb_tdoa_tools.checking.recording import read_recording
 from uwb_tdoa_tools.readers.inputs import Reading
 from uwb_tdoa_tools.scoring.evaluation import evaluate
@@ -134,7 +134,13 @@ def test_check_judges_the_samples_of_the_body(flight, tmp_path):
     def rules(name, *static):
         (tmp_path / name).mkdir()
         recording = read_recording(Reading(), mounted(flight, tmp_path / name / "m.bag", *static))
-        return {finding.rule for finding in (*fed(recording).findings(), *labels.frames(recording))}
+        return {
+            finding.rule
+            for finding in (
+                *processed_streams(recording).findings(),
+                *recording_rules.frames(recording),
+            )
+        }
 
     assert rules("placed", place) == {"frame_turned"}
     assert {"imu_turned", "frame_unknown"} <= rules("untold")

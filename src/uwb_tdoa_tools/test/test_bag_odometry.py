@@ -13,7 +13,7 @@ from uwb_tdoa_tools.bags.bag import read_bag, write_bag
 from uwb_tdoa_tools.bags.files import new_bag
 from uwb_tdoa_tools.bags.message_types import typestore
 from uwb_tdoa_tools.bags.messages import sensor_messages
-from uwb_tdoa_tools.checking import labels
+from uwb_tdoa_tools.checking import recording_rules
 from uwb_tdoa_tools.checking.recording import read_recording
 from uwb_tdoa_tools.options import TOPICS
 from uwb_tdoa_tools.readers.inputs import Reading
@@ -73,13 +73,13 @@ def test_velocities_are_the_same_on_each_topic_that_the_node_hears(
         )  # variances, of which messages hold the square
     recording = read_recording(Reading(topics=renamed), path)
     np.testing.assert_array_equal(recording.sensors["velocity"].v, flight.velocity.v)
-    assert not list(labels.odometry_unread(recording))
+    assert not list(recording_rules.odometry_unread(recording))
 
 
 def test_odometry_that_nothing_reads_is_named(flight, tmp_path):
     path = bag_of(flight, tmp_path, ("/odom", ODOMETRY, flight.velocity))
     assert read_bag(path).velocity is None
-    (found,) = labels.odometry_unread(read_recording(Reading(), path))
+    (found,) = recording_rules.odometry_unread(read_recording(Reading(), path))
     assert "/odom" in found.cause and "velocity/odometry:=/odom" in found.remedy
 
 

@@ -18,7 +18,7 @@ from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_bias.foundation.sensors import Ranges
 from uwb_tdoa_bias.foundation.survey_faults import UNITS
 from uwb_tdoa_tools.checking import imu_rules
-from uwb_tdoa_tools.checking.check import check, sensors
+from uwb_tdoa_tools.checking.check import check, sensor_findings
 from uwb_tdoa_tools.checking.ordered import OrderedRecording
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.checking.tdoa_rules import GAIN, apparent_gain, gained
@@ -185,7 +185,7 @@ def standing(seed, bias, errors):
 @pytest.mark.parametrize("seed", range(8))
 @pytest.mark.parametrize("errors", [(0.1, 0.1), (0.3, 0.3)])
 def test_a_tag_that_stands_does_not_determine_the_unit_of_its_gyroscope(seed, errors):
-    assert imu_rules.fit(standing(seed, 0.1, errors)) is None
+    assert imu_rules.find_imu_mistake(standing(seed, 0.1, errors)) is None
 
 
 # Time stamps that wrap
@@ -253,7 +253,7 @@ def test_ranges_that_are_no_distances_are_told(value, share, severity):
     flight = Flight("ranged", ROOM, Tdoas(*np.empty((4, 0))), None, range=ranges)
     found = [
         finding.severity
-        for finding in sensors(of_flight(flight))
+        for finding in sensor_findings(of_flight(flight))
         if finding.rule == "range_invalid"
     ]
     assert found == ([severity] if severity else [])

@@ -1,6 +1,4 @@
-"""What `check` says of whole recordings: nothing of healthy ones, and the mistake where there is
-one.
-"""
+"""Findings of `check` about whole recordings: none if healthy, else the mistake."""
 
 from dataclasses import replace
 
@@ -10,9 +8,12 @@ from mistakes import MISTAKES
 import numpy as np
 import pytest
 
-from uwb_tdoa_tools.checking.check import check, different_surveys, upright
-from uwb_tdoa_tools.checking.recording import of_flight
+from uwb_tdoa_bias.foundation.flight import Tdoas
+from uwb_tdoa_tools.bags.bag import read_bag, write_bag
+from uwb_tdoa_tools.checking.check import check, different_surveys, sensor_findings, upright
+from uwb_tdoa_tools.checking.recording import of_flight, read_recording
 from uwb_tdoa_tools.readers import inputs, read_flight, read_survey
+from uwb_tdoa_tools.readers.inputs import Reading
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.rooms import constellation
 
@@ -49,14 +50,14 @@ def with_mistake(name, seed=0):
 @pytest.mark.slow
 @pytest.mark.parametrize("protocol", ["tdoa2", "tdoa3"])
 @pytest.mark.parametrize("live", [False, True])
-def test_nothing_is_said_of_a_healthy_flight(protocol, live):
+def test_a_healthy_flight_has_no_finding(protocol, live):
     assert check(recording(0, live=live, protocol=protocol)).findings == []
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("trajectory", ["circle", "square", "line_x", "rising_circle", "hover"])
 @pytest.mark.parametrize("room", ["corners", "random-3", "random-8-6"])
-def test_no_error_is_alleged_of_healthy_flights(trajectory, room):
+def test_healthy_flights_have_no_error(trajectory, room):
     report = check(
         recording(trajectory=trajectory, constellation=room), [("other.yaml", OTHER_ROOM)]
     )
@@ -84,7 +85,7 @@ def test_two_mistakes_at_once_are_both_named():
 
 
 @pytest.mark.slow
-def test_ground_truth_is_not_read():
+def test_ground_truth_does_not_count():
     flight = simulate(SimulationConfig(seed=3, **QUICK))
     wrong = replace(flight, truth=replace(flight.truth, p=flight.truth.p + 100.0))
     first, second, none = (
@@ -93,7 +94,7 @@ def test_ground_truth_is_not_read():
     assert first == second == none
 
 
-def test_the_errors_come_first():
+def test_errors_come_first():
     report = with_mistake("three_anchors")
     severities = [finding.severity for finding in report.findings]
     assert (
@@ -101,7 +102,7 @@ def test_the_errors_come_first():
     )
 
 
-def test_recordings_of_two_rooms_do_not_belong_together():
+def test_recordings_of_two_rooms_are_reported():
     one = recording()
     two = replace(one, anchors=OTHER_ROOM)
     (finding,) = different_surveys([one, one, two])
@@ -111,7 +112,7 @@ def test_recordings_of_two_rooms_do_not_belong_together():
 
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_what_brings_an_axis_upwards_is_a_rotation(axis, sign):
+def test_an_axis_is_turned_upwards_by_a_rotation(axis, sign):
     up = sign * 9.81 * np.eye(3)[axis] + 0.3
     turn = upright(up)
     assert np.allclose(turn @ turn.T, np.eye(3)) and np.linalg.det(turn) == pytest.approx(1.0)
@@ -144,7 +145,7 @@ OF_ANOTHER_ROOM = {
 }  # what it was taken for
 
 
-def test_a_survey_of_another_room_is_not_blamed_on_ids_nor_on_the_gyroscope():
+def test_a_survey_of_another_room_is_named():
     """Eight anchors elsewhere under the same ids: many of them exchanged explain most of it, and a
     slower gyroscope the rest.
     """
@@ -166,10 +167,43 @@ def test_a_survey_of_another_room_is_not_blamed_on_ids_nor_on_the_gyroscope():
         ("flights/0425/TDOA2/0425-traj2", "const1.csv"),
     ],
 )
-def test_a_measured_log_with_the_survey_of_another_room(log, survey, shared_data):
+def test_a_survey_of_another_room_is_named_with_a_measured_log(log, survey, shared_data):
     """The first was said to have the sign of all TDOAs wrong."""
     (flight,) = inputs.Reading(str(shared_data / "surveys" / f"anchor_{survey}")).flights(
         [str(shared_data / log)]
     )
     found = rules(check(of_flight(flight)))
     assert "survey_misfit" in found and not found & OF_ANOTHER_ROOM
+
+
+NONE = Tdoas(*(np.empty(0, kind) for kind in (float, int, int, float)))
+
+
+@pytest.fixture(scope="module")
+def ranged():
+    """A Flight of ranges alone."""
+    config = SimulationConfig(
+        duration=20.0, imu_rate=200.0, truth_rate=20.0, start_in_air=True, range_noise=0.1
+    )
+    return replace(simulate(config), tdoa=NONE)
+
+
+def test_healthy_ranges_without_tdoas_have_no_error(ranged):
+    report = check(of_flight(ranged))
+    assert not report.faulty and report.facts["range"] == "ranges 100 Hz"
+
+
+def test_ranges_in_millimetres_are_named(ranged):
+    wrong = replace(ranged, range=replace(ranged.range, d=1000.0 * ranged.range.d))
+    assert "range_unit" in {finding.rule for finding in check(of_flight(wrong)).findings}
+    assert [finding.rule for finding in sensor_findings(of_flight(wrong))][:1] == ["range_unit"]
+
+
+def test_a_bag_of_ranges_alone_is_read_and_checked(ranged, tmp_path):
+    write_bag(ranged, tmp_path / "ranged.bag")
+    back = read_bag(tmp_path / "ranged.bag")
+    assert len(back.tdoa) == 0
+    for one, other in zip(back.range.columns, ranged.range.columns):
+        np.testing.assert_array_equal(one, other)
+    made = read_recording(Reading(), tmp_path / "ranged.bag")
+    assert len(made.sensors["range"]) == len(ranged.range) and not check(made).faulty

@@ -52,7 +52,13 @@ def test_without_errors_the_code_is_zero(checked):
 
 
 @pytest.mark.parametrize(
-    "arguments, sentence", [(["nowhere.bag"], "does not exist"), ([], "give recordings, or --live")]
+    "arguments, sentence",
+    [
+        (["nowhere.bag"], "does not exist"),
+        ([], "give recordings, or --live"),
+        (["x.bag", "--live", "3"], "not both"),
+        (["--live", "-1"], "above 0"),
+    ],
 )
 def test_bad_input_is_two(arguments, sentence, capsys):
     assert main(arguments) == 2
@@ -60,7 +66,7 @@ def test_bad_input_is_two(arguments, sentence, capsys):
 
 
 @pytest.mark.slow
-def test_another_survey_than_the_bag_brings(checked, tmp_path, capsys):
+def test_a_survey_that_differs_from_the_bag_is_named(checked, tmp_path, capsys):
     rows = np.random.default_rng(0).uniform(0.0, 6.0, (8, 3))
     lines = "".join(f"{k},{x:.2f},{y:.2f},{z:.2f}\n" for k, (x, y, z) in enumerate(rows))
     (tmp_path / "wrong.csv").write_text("id,x,y,z\n" + lines)

@@ -90,7 +90,7 @@ def test_where_something_measures_the_height_no_side_is_needed():
     view = coverage.CoverageView(
         anchors, windows(anchors, lambda t, a, b: t >= 0.0), PLACES, height_known=True
     )
-    assert not list(coverage.side(view))
+    assert not list(coverage.unknown_side(view))
 
 
 def test_anchors_with_z_down():

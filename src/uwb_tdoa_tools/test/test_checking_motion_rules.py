@@ -23,7 +23,7 @@ def with_imu(flight, **columns):
 
 def said(flight):
     motion = TrueMotion(flight)
-    rules = motion_rules.axes, motion_rules.filtered, motion_rules.stamps
+    rules = motion_rules.wrong_axes, motion_rules.low_passes, motion_rules.wrong_stamps
     return {finding.rule: finding for rule in rules for finding in rule(motion)}
 
 

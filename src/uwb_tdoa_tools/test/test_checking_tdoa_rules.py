@@ -8,8 +8,7 @@ import pytest
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_tools.checking import tdoa_rules
-from uwb_tdoa_tools.checking.ordered import LONG, OrderedRecording
-from uwb_tdoa_tools.checking.survey_fit import SPREAD, spread
+from uwb_tdoa_tools.checking.ordered import LONG, SPREAD, OrderedRecording, spread
 
 
 @pytest.fixture(scope="module")
@@ -18,11 +17,11 @@ def healthy():
 
 
 @pytest.mark.slow
-def test_nothing_is_better_than_what_is_right(healthy):
+def test_a_healthy_recording_has_no_finding(healthy):
     shifted = Anchors(
         healthy.anchors.ids, healthy.anchors.positions * 1.3, healthy.anchors.orientations
     )
-    finding, same = tdoa_rules.best(healthy, [("other.yaml", shifted)])
+    finding, same = tdoa_rules.best_trial(healthy, [("other.yaml", shifted)])
     assert finding is None and same is healthy
 
 
@@ -35,17 +34,17 @@ def test_nothing_is_better_than_what_is_right(healthy):
         (1e-6 / 299.792458, "seconds"),
     ],
 )
-def test_a_unit_is_undone(healthy, scale, unit):
-    finding, undone = tdoa_rules.best(healthy.with_tdoa(d=scale * healthy.tdoa.d))
+def test_a_unit_is_found_and_undone(healthy, scale, unit):
+    finding, undone = tdoa_rules.best_trial(healthy.with_tdoa(d=scale * healthy.tdoa.d))
     assert finding.rule == "tdoa_unit" and unit in finding.cause
     assert np.allclose(undone.tdoa.d, healthy.tdoa.d)
 
 
 @pytest.mark.slow
-def test_swapped_ids_are_undone(healthy):
+def test_swapped_ids_are_found_and_undone(healthy):
     one, two = healthy.anchors.ids[[2, 5]].tolist()
     swapped = tdoa_rules.relabelled(healthy, {one: two, two: one})
-    finding, undone = tdoa_rules.best(swapped)
+    finding, undone = tdoa_rules.best_trial(swapped)
     assert finding.rule == "ids_swapped" and finding.severity == "error"
     assert np.array_equal(undone.tdoa.a, healthy.tdoa.a) and np.array_equal(
         undone.tdoa.b, healthy.tdoa.b
@@ -64,12 +63,12 @@ def test_surveys_of_one_room_are_named_together(healthy):
         healthy.anchors.ids, healthy.anchors.positions + 0.004, healthy.anchors.orientations
     )
     trials = list(
-        tdoa_rules.survey(
+        tdoa_rules.other_survey(
             wrong, [("monday.yaml", healthy.anchors), ("tuesday.yaml", by_millimetres)]
         )
     )
     assert len(trials) == 1 and "monday.yaml or tuesday.yaml" in trials[0].finding(0.5, 9.0).cause
-    assert list(tdoa_rules.survey(healthy, [("monday.yaml", by_millimetres)])) == []
+    assert list(tdoa_rules.other_survey(healthy, [("monday.yaml", by_millimetres)])) == []
 
 
 @pytest.mark.parametrize("table", [{1: 2, 2: 1}, {0: 3, 3: 5, 5: 0}])
@@ -82,7 +81,7 @@ def test_ids_are_replaced_all_at_once(healthy, table):
     )
 
 
-def test_the_part_that_is_tried_is_where_the_tag_moves():
+def test_trials_use_the_part_with_the_most_motion():
     t = np.arange(0.0, 100.0, 0.01)
     d = np.where((t > 60.0) & (t < 80.0), np.sin(t), 0.0)
     zeros = np.zeros(len(t), dtype=int)
@@ -97,21 +96,21 @@ def test_the_part_that_is_tried_is_where_the_tag_moves():
     assert still.part(200.0) is still
 
 
-def test_ids_are_not_tried_where_the_tag_stands():
+def test_ids_are_not_tried_without_motion():
     hovering = OrderedRecording.of(recording(10, trajectory="hover"))
     assert spread(hovering.survey_fit.places) < SPREAD
-    assert list(tdoa_rules.swapped(hovering)) == []
+    assert list(tdoa_rules.swapped_ids(hovering)) == []
 
 
 @pytest.mark.parametrize("gain, believed", [(0.5, True), (2.0, False)])
-def test_what_systematic_errors_could_explain_is_no_evidence(healthy, monkeypatch, gain, believed):
+def test_a_gain_within_systematic_errors_is_no_evidence(healthy, monkeypatch, gain, believed):
     """The same trial, judged where systematic errors are said to be small, and where they are said
     to be large.
     """
     flipped = tdoa_rules._flipped(healthy, np.ones(len(healthy.tdoa), dtype=bool))
     least = gain * (flipped.part(LONG).unexplained().mean - healthy.part(LONG).unexplained().mean)
     monkeypatch.setattr(tdoa_rules, "BY_ERRORS", least)
-    for rule in ("swapped", "contrary", "moved", "units"):
+    for rule in ("swapped_ids", "inverted_pairs", "moved_anchor", "units"):
         monkeypatch.setattr(tdoa_rules, rule, lambda *_: iter(()))
-    finding, _ = tdoa_rules.best(flipped)
+    finding, _ = tdoa_rules.best_trial(flipped)
     assert (finding is not None and finding.rule == "tdoa_sign") == believed

@@ -104,7 +104,7 @@ def test_a_long_sentence_is_cut(capsys):
     assert len(err) < 3000 and err.endswith("; give a shorter one.\n")
 
 
-def test_reader_that_goes_away_is_no_traceback():
+def test_a_closed_pipe_is_no_traceback():
     code = (
         "import sys; from uwb_tdoa_tools import cli;"
         "sys.exit(cli.run(lambda args: print('line\\n' * 100000), cli.parser('talk', 'Talk.'), []))"

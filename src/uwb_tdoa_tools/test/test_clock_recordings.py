@@ -76,7 +76,7 @@ def bag(path, clock, storage="mcap", arrivals=True, imu=lambda t: t):
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 @pytest.mark.parametrize("arrivals", [True, False])
 @pytest.mark.parametrize("name", KINDS)
-def test_a_bag_is_read_on_one_time_and_check_names_what_happened(tmp_path, name, arrivals, storage):
+def test_a_bag_is_read_on_one_time_and_check_names_the_jump(tmp_path, name, arrivals, storage):
     rule, clock = KINDS[name]
     path = bag(tmp_path / "bag", clock, storage, arrivals)
     flight = read_bag(path, anchors=FLIGHT.anchors)
@@ -94,7 +94,7 @@ def test_a_bag_is_read_on_one_time_and_check_names_what_happened(tmp_path, name,
     assert "at message" in finding.cause and "shifted by" in finding.evidence
 
 
-def test_the_filter_starts_anew_where_the_clock_did():
+def test_the_filter_restarts_with_the_clock():
     restart = float(FLIGHT.tdoa.t[len(FLIGHT.tdoa) // 2])
     run, whole = run_offline(replace(FLIGHT, restarts=(restart,))), run_offline(FLIGHT)
     before = whole.odometry.t < restart

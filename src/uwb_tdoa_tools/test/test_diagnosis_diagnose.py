@@ -104,7 +104,7 @@ def test_a_late_ground_truth_is_no_fault_of_the_robot(inertial):
     result = diagnose([shifted(fitted, "truth", 0.4)], [other])
     assert not {"tdoa_time_offset", "truth_frame"} & {effect.name for effect in result.effects}
     assert result.after["pooled"]["rmse_3d"] <= 1.05 * result.before["pooled"]["rmse_3d"]
-    (said,) = result.of_truth[fitted.name]
+    (said,) = result.judge_truth[fitted.name]
     assert ("gyroscope" in said) == inertial and said in output.as_text(result).replace(
         "\n          ", " "
     )

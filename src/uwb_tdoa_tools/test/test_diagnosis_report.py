@@ -11,7 +11,7 @@ from reports import Tags, delay, finding, judged, keys_of, said
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, SmoothTerm
 from uwb_tdoa_bias.effects.base import measured
-from uwb_tdoa_tools.command_lines import applying
+from uwb_tdoa_tools.command_lines import lines_of_use
 from uwb_tdoa_tools.diagnosis import diagnose, output
 from uwb_tdoa_tools.diagnosis.findings import EffectFinding, Refused
 from uwb_tdoa_tools.diagnosis.references import Heights, Nothing
@@ -43,7 +43,7 @@ def result():
     for effect in effects:
         flights = [effect.inject(flight) for flight in flights]
     return replace(
-        diagnose(flights[:1], flights[1:]), applying=applying(Path("out"), ["other.bag"])
+        diagnose(flights[:1], flights[1:]), applying=lines_of_use(Path("out"), ["other.bag"])
     )
 
 

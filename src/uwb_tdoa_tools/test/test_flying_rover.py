@@ -77,8 +77,8 @@ def test_wheels_say_more_or_less_than_is_true_and_the_imu_what_is():
     assert np.mean(np.abs(wheels.v[fast, 0] / true[fast] - share) > 0.07) < 0.3  # slips
     turned = np.cumsum(imu.gyro[:, 2]) / 400.0
     yaw = np.unwrap(2.0 * np.arctan2(truth.q[:, 2], truth.q[:, 3]))
-    of_truth = np.interp(imu.t, truth.t, yaw)
-    np.testing.assert_allclose(turned - turned[0], of_truth - of_truth[0], atol=2e-3)
+    judge_truth = np.interp(imu.t, truth.t, yaw)
+    np.testing.assert_allclose(turned - turned[0], judge_truth - judge_truth[0], atol=2e-3)
     ahead = np.cumsum(imu.accel[:, 0]) / 400.0
     np.testing.assert_allclose(ahead, np.interp(imu.t, truth.t, speed), atol=2e-2)
 

@@ -7,10 +7,10 @@ import pytest
 
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, SmoothTerm
 from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_tools.checking import delays, pair_rules, tdoa_rules
+from uwb_tdoa_tools.checking import pair_rules, tdoa_rules, time_rules
 from uwb_tdoa_tools.checking.check import check
-from uwb_tdoa_tools.checking.known_path import MANY, KnownPath
 from uwb_tdoa_tools.checking.ordered import SHORT, OrderedRecording
+from uwb_tdoa_tools.checking.pair_rules import MANY, KnownPath
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.checking.time_rules import DRIFTS, JUMPS, OF_ALL
 from uwb_tdoa_tools.diagnosis import diagnose
@@ -163,7 +163,7 @@ def test_check_tries_few_exchanges_of_ids_in_a_hall(sound, monkeypatch):
         "unexplained",
         lambda recording, *limit: runs.append(recording) or judged(recording, *limit),
     )
-    assert not list(tdoa_rules.swapped(whole)) and not runs
+    assert not list(tdoa_rules.swapped_ids(whole)) and not runs
     ids, times = np.unique(np.concatenate([brief.tdoa.a, brief.tdoa.b]), return_counts=True)
     one, two = ids[np.argsort(-times)][[0, 5]].tolist()
     swap = {one: two, two: one}
@@ -171,7 +171,7 @@ def test_check_tries_few_exchanges_of_ids_in_a_hall(sound, monkeypatch):
         np.array([swap.get(int(i), int(i)) for i in column])
         for column in (whole.tdoa.a, whole.tdoa.b)
     )
-    (trial,) = tdoa_rules.swapped(whole.with_tdoa(a=a, b=b))
+    (trial,) = tdoa_rules.swapped_ids(whole.with_tdoa(a=a, b=b))
     assert trial.finding(0.5, 5.0).cause.endswith(
         f"{min(one, two)} is {max(one, two)}, {max(one, two)} is {min(one, two)}"
     )
@@ -197,8 +197,10 @@ def test_a_hall_is_no_plane_unless_those_that_are_heard_together_lie_in_one(soun
 
 @pytest.mark.parametrize("late", [0.0, 0.3])
 def test_tdoas_that_are_late_in_a_hall_are_found_and_others_are_not(sound, late, monkeypatch):
-    monkeypatch.setattr(delays, "MOST", len(sound.tdoa) // 20)  # as of a recording of an hour
-    of = delays.of_tdoas(KnownPath(replace(sound, tdoa=replace(sound.tdoa, t=sound.tdoa.t + late))))
+    monkeypatch.setattr(time_rules, "MOST", len(sound.tdoa) // 20)  # as of a recording of an hour
+    of = time_rules.delays_of_tdoas(
+        KnownPath(replace(sound, tdoa=replace(sound.tdoa, t=sound.tdoa.t + late)))
+    )
     ratio, delay = of.constant()
     assert delay == pytest.approx(late) and (ratio < OF_ALL) == (late > 0.0)
     assert of.drift()[0] > DRIFTS and of.jump()[0] > JUMPS
@@ -223,5 +225,5 @@ def test_ids_that_are_exchanged_in_a_hall_are_found(sound):
     path = KnownPath(
         type(sound)(sound.name, sound.anchors, type(of)(of.t, a, b, of.d), truth=sound.truth)
     )
-    assert pair_rules.renamed(path)[0] == swap
-    assert not pair_rules.renamed(KnownPath(sound))[0]
+    assert pair_rules.find_exchanges(path)[0] == swap
+    assert not pair_rules.find_exchanges(KnownPath(sound))[0]

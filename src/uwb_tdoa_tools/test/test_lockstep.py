@@ -95,7 +95,7 @@ def assert_equal_to_offline(flight, told, recorded):
 
 
 @pytest.mark.slow
-def test_ranges_beside_tdoas_are_played_and_used_as_off_line(tmp_path):
+def test_ranges_are_used_as_off_line(tmp_path):
     write_bag(
         simulate(SimulationConfig(seed=4, duration=16.0, range_noise=0.1)), tmp_path / "flight.bag"
     )
@@ -113,7 +113,7 @@ def test_ranges_beside_tdoas_are_played_and_used_as_off_line(tmp_path):
 
 
 @pytest.mark.slow
-def test_heights_with_holes_are_no_reason_to_wait(tmp_path):
+def test_heights_with_holes_do_not_delay_the_replay(tmp_path):
     """In a hole ekf_node waits for a height, and with it all TDOAs."""
     flight = simulate(SimulationConfig(seed=3, duration=16.0, height_noise=0.01))
     heard = (flight.height.t - flight.height.t[0]) % 2.0 > 0.6
@@ -131,7 +131,7 @@ def test_heights_with_holes_are_no_reason_to_wait(tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("rate", "busy"), [(1, 0), (8, 1)])
-def test_at_any_rate_and_load_the_result_is_that_of_the_bag(tmp_path, load, rate, busy):
+def test_the_result_does_not_depend_on_rate_and_load(tmp_path, load, rate, busy):
     write_bag(simulate(SimulationConfig(seed=3, duration=16.0)), tmp_path / "flight.bag")
     code, said, told, recorded = replayed(
         tmp_path / "flight.bag", tmp_path, "--rate", rate, begin=lambda: load(busy)
@@ -193,7 +193,7 @@ def delayed(bag, out, count=10, delay=1_000_000_000):
 
 
 @pytest.mark.slow
-def test_what_was_late_is_told_with_code_1(tmp_path):
+def test_late_messages_give_code_1(tmp_path):
     write_bag(simulate(SimulationConfig(seed=3, duration=16.0)), tmp_path / "flight.bag")
     delayed(tmp_path / "flight.bag", tmp_path / "delayed.bag")
     code, said, told, _ = replayed(tmp_path / "delayed.bag", tmp_path, "--rate", 2)

@@ -175,7 +175,7 @@ def refused(command, words, sentence, capsys):
         ("--no-bias",),
     ],
 )
-def test_no_option_of_the_estimate_goes_with_an_odometry_that_was_recorded(desk, capsys, more):
+def test_options_of_the_estimate_are_refused_with_a_recorded_odometry(desk, capsys, more):
     sentence = f"{more[0]}: has no part in an odometry that was recorded"
     refused(evaluate, ["flight.bag", "--odometry", "flight.bag", *more], sentence, capsys)
 
@@ -187,7 +187,7 @@ KNOWN = {"marks": "m.yaml", "distances": "d.csv", "odometry": "/vio"}
     "reference, option",
     [(reference, option) for reference, some in diagnose.UNUSED.items() for option in some],
 )
-def test_what_a_reference_does_not_use_is_refused(desk, capsys, reference, option):
+def test_options_that_a_reference_does_not_use_are_refused(desk, capsys, reference, option):
     sentence = f"--{option}: no part of it is used with --reference {reference}"
     refused(
         diagnose,
@@ -197,7 +197,7 @@ def test_what_a_reference_does_not_use_is_refused(desk, capsys, reference, optio
     )
 
 
-def test_every_reference_says_which_options_it_does_not_use():
+def test_every_reference_lists_its_unused_options():
     assert diagnose.UNUSED.keys() == REFERENCES.keys()
 
 
@@ -205,7 +205,7 @@ def test_every_reference_says_which_options_it_does_not_use():
     "more",
     [("--std", "0.2"), ("--height-std", "0.1"), ("--trusted", "0"), ("--trusted-std", "0.01")],
 )
-def test_what_the_last_calibration_says_of_anchors_no_tape_says(desk, capsys, more):
+def test_options_of_the_tape_are_refused_with_a_calibration(desk, capsys, more):
     keys = (("anchor_position", "0.x"), ("anchor_delay", "0"))
     effects = (
         EFFECTS["anchor_position"]({"0.x": 0.0}, {"0.x": 0.1}),

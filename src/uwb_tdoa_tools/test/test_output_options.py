@@ -31,7 +31,7 @@ def test_every_option_that_takes_a_path_is_an_output_or_read(words):
     assert unknown(PARSERS[words]) == []
 
 
-def test_all_that_write_are_there():
+def test_every_writing_command_is_tested():
     assert len(OUTPUTS) > 25 and {words[0] for words, _ in OUTPUTS} == {*COMMANDS} - {"replay"}
     assert {action.type for _, action in OUTPUTS} == {OutputFile, OutputFolder, OutputBag}
 
@@ -53,7 +53,7 @@ def test_no_command_writes_through_a_link_or_over_what_it_reads(place, capsys, w
 
 
 @pytest.mark.parametrize("kind", [OutputFile, OutputFolder, OutputBag])
-def test_other_places_are_no_inputs(place, kind):
+def test_other_places_can_be_written(place, kind):
     inputs = [str(place / "bag"), str(place / "flights" / "one.log"), "x" * 5000, 3, None]
     for out in ("new", "flights/new", "home/new"):
         parser = cli.parser("write", "Write.")

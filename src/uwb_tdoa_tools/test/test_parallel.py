@@ -3,17 +3,20 @@
 (The functions are of this module, which the other processes import.)
 """
 
+import io
 import os
 from pathlib import Path
 import signal
 import subprocess
 import sys
+from threading import Event
 import time
 
 import pytest
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools import cli, parallel
+from uwb_tdoa_tools.parallel import Progress
 
 
 def times_ten(number):
@@ -50,14 +53,12 @@ def test_results_come_in_the_order_of_the_items(importable, count, jobs):
     assert list(parallel.over(times_ten, range(count), jobs)) == [10 * k for k in range(count)]
 
 
-def test_the_first_is_done_here_and_the_others_elsewhere(importable):
+def test_the_first_item_runs_in_this_process(importable):
     here, *others = parallel.over(process, range(6), 2)
     assert here == os.getpid() and here not in others and 1 <= len(set(others)) <= 2
 
 
-def test_what_draws_in_other_processes_takes_no_settings_of_the_present_folder(
-    importable, tmp_path, monkeypatch
-):
+def test_settings_in_the_present_folder_do_not_count(importable, tmp_path, monkeypatch):
     (tmp_path / "matplotlibrc").write_text("savefig.dpi: 100000\n")
     monkeypatch.chdir(tmp_path)
     assert list(parallel.over(resolution, range(4), 2))[1:] == ["figure"] * 3
@@ -68,7 +69,7 @@ def test_one_item_and_one_job_need_no_other_process():
     assert set(parallel.over(process, range(4), 1)) == {os.getpid()}
 
 
-def test_results_come_while_others_are_still_to_be_made():
+def test_results_come_before_all_are_computed():
     seen = []
     results = parallel.over(seen.append, range(5), 1)
     next(results)
@@ -76,7 +77,7 @@ def test_results_come_while_others_are_still_to_be_made():
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_bad_input_found_elsewhere_is_the_same_sentence(importable, jobs, capsys):
+def test_bad_input_in_another_process_is_the_same_sentence(importable, jobs, capsys):
     def command(args):
         for result in parallel.over(refuse_three, range(6), jobs):
             print(result)
@@ -87,7 +88,7 @@ def test_bad_input_found_elsewhere_is_the_same_sentence(importable, jobs, capsys
     assert err == "count: error: number: 3 is too few; give more.\n"
 
 
-def test_an_interrupt_ends_all_of_it_without_a_word(importable):
+def test_an_interrupt_ends_all_processes_silently(importable):
     code = (
         "import sys, time; from uwb_tdoa_tools import cli, parallel\n"
         "def work(args):\n"
@@ -112,7 +113,7 @@ def test_an_interrupt_ends_all_of_it_without_a_word(importable):
     )
 
 
-def test_a_folder_of_flights_does_not_say_what_the_others_run(tmp_path, importable):
+def test_modules_in_the_present_folder_do_not_run(tmp_path, importable):
     """Python looks for modules where it starts, if it is told to by -m, as joblib does: whatever
     lies there would run.
     """
@@ -145,11 +146,11 @@ def test_options():
     assert options("--dask", "tcp://here:1").dask == "tcp://here:1"
 
 
-def test_few_items_are_done_in_one_process_unless_more_are_asked_for():
-    assert parallel.asked(options(), 4, 5) == (1, None)
-    assert parallel.asked(options(), 5, 5) == (min(parallel.cpu_count(), 5), None)
-    assert parallel.asked(options("--jobs", "2"), 4, 5) == (2, None)
-    assert parallel.asked(options("--dask", "tcp://here:1"), 4, 5) == (None, "tcp://here:1")
+def test_few_items_run_in_one_process_by_default():
+    assert parallel.workers_for(options(), 4, 5) == (1, None)
+    assert parallel.workers_for(options(), 5, 5) == (min(parallel.cpu_count(), 5), None)
+    assert parallel.workers_for(options("--jobs", "2"), 4, 5) == (2, None)
+    assert parallel.workers_for(options("--dask", "tcp://here:1"), 4, 5) == (None, "tcp://here:1")
 
 
 def test_other_calls_have_the_same_processes(importable):
@@ -175,13 +176,13 @@ def test_bad_options(argv, sentence, capsys):
     assert sentence in capsys.readouterr().err
 
 
-def test_without_dask_it_is_told_what_to_install(monkeypatch):
+def test_without_dask_the_error_names_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "dask.distributed", None)
     with pytest.raises(InputError, match="--dask: needs dask.distributed, which is not installed"):
         list(parallel.over(times_ten, [1, 2], dask="tcp://127.0.0.1:1"))
 
 
-def test_an_address_that_is_none(monkeypatch):
+def test_an_address_without_a_scheduler_is_an_error(monkeypatch):
     pytest.importorskip("dask.distributed")
     with pytest.raises(InputError, match="--dask: no scheduler answers at nowhere"):
         list(parallel.over(times_ten, [1, 2], dask="nowhere"))
@@ -191,7 +192,7 @@ def test_an_address_that_is_none(monkeypatch):
     ("address", "said"),
     [("tcp://10.0.0.1:8786", 1), ("ucx://10.0.0.2:1", 1), ("tls://10.0.0.1:8786", 0)],
 )
-def test_whom_a_connection_trusts_is_said_once(address, said, capsys):
+def test_an_unencrypted_connection_is_reported_once(address, said, capsys):
     parallel._say_whom_it_trusts.cache_clear()
     for _ in range(2):
         parallel._say_whom_it_trusts(address)
@@ -203,37 +204,32 @@ def test_whom_a_connection_trusts_is_said_once(address, said, capsys):
     )
 
 
-@pytest.mark.parametrize("encrypted", [False, True])
-def test_a_cluster_is_asked_by_the_certificates_of_dask(importable, encrypted, monkeypatch, capsys):
+def test_an_encrypted_cluster_needs_the_certificates_of_dask(importable, capsys):
     distributed = pytest.importorskip("dask.distributed")
     dask = pytest.importorskip("dask")
-    if encrypted:
-        pytest.importorskip("cryptography")
-    security = distributed.Security.temporary() if encrypted else None
+    pytest.importorskip("cryptography")
+    security = distributed.Security.temporary()
     parallel._say_whom_it_trusts.cache_clear()
     with distributed.LocalCluster(
         1, threads_per_worker=1, dashboard_address=None, security=security
     ) as cluster:
         address = cluster.scheduler_address
-        if encrypted:
-            with pytest.raises(InputError, match="no scheduler answers"):  # a stranger without them
-                list(parallel.over(times_ten, range(3), dask=address))
-            tls = {
-                "ca-file": security.tls_ca_file,
-                "client.cert": security.tls_client_cert,
-                "client.key": security.tls_client_key,
-            }
-            with dask.config.set(
-                {f"distributed.comm.tls.{name}": value for name, value in tls.items()}
-            ):
-                assert list(parallel.over(times_ten, range(3), dask=address)) == [0, 10, 20]
-        else:
+        with pytest.raises(InputError, match="no scheduler answers"):  # without certificates
+            list(parallel.over(times_ten, range(3), dask=address))
+        tls = {
+            "ca-file": security.tls_ca_file,
+            "client.cert": security.tls_client_cert,
+            "client.key": security.tls_client_key,
+        }
+        names = {f"distributed.comm.tls.{name}": value for name, value in tls.items()}
+        with dask.config.set(names):
             assert list(parallel.over(times_ten, range(3), dask=address)) == [0, 10, 20]
-    assert ("is not encrypted" in capsys.readouterr().err) != encrypted
+    assert "is not encrypted" not in capsys.readouterr().err
 
 
-def test_on_a_dask_cluster(importable):
+def test_a_dask_cluster_gives_the_same_results_and_errors(importable, capsys):
     distributed = pytest.importorskip("dask.distributed")
+    parallel._say_whom_it_trusts.cache_clear()
     with distributed.LocalCluster(2, threads_per_worker=1, dashboard_address=None) as cluster:
         address = cluster.scheduler_address
         assert list(parallel.over(times_ten, range(7), dask=address)) == [10 * k for k in range(7)]
@@ -241,3 +237,86 @@ def test_on_a_dask_cluster(importable):
         assert here == os.getpid() and here not in others
         with pytest.raises(InputError, match="3 is too few"):
             list(parallel.over(refuse_three, range(6), dask=address))
+    assert "is not encrypted" in capsys.readouterr().err
+
+
+class Lines(io.StringIO):
+    """A stream without a terminal that tells when it holds so many lines."""
+
+    def __init__(self, wanted):
+        super().__init__()
+        self.wanted, self.full = wanted, Event()
+
+    def write(self, text):
+        super().write(text)
+        if self.getvalue().count("\n") >= self.wanted:
+            self.full.set()
+
+
+class Terminal(Lines):
+    def isatty(self):
+        return True
+
+
+@pytest.fixture
+def often(monkeypatch):
+    for name in ("FIRST", "EVERY", "OFTEN"):
+        monkeypatch.setattr(parallel, name, 0.01)
+
+
+def test_progress_shows_the_work_and_its_share(often):
+    lines = Lines(3)
+    with Progress("weigh", 8, "flight", lines) as told:
+        told("weighing")
+        told.update()
+        assert lines.full.wait(120.0)
+    first, *others = lines.getvalue().splitlines()
+    assert first.startswith("weigh: ") and "weigh: weighing, 1 of 8 flights done, 0 s" in others
+
+
+def test_short_work_prints_no_progress(monkeypatch):
+    monkeypatch.setattr(
+        parallel, "FIRST", 600.0
+    )  # beside which it is short on a loaded machine, too
+    lines = Lines(1)
+    with Progress("weigh", stream=lines):
+        pass
+    assert lines.getvalue() == ""
+
+
+def test_progress_appears_within_two_seconds():
+    assert parallel.FIRST <= 2.0 and parallel.EVERY <= 5.0
+
+
+@pytest.mark.parametrize("total", [None, 4])
+def test_progress_on_a_terminal_is_one_line_that_is_removed(often, total):
+    stream = Terminal(1)
+    with Progress("weigh", total, "flight", stream) as told:
+        told("weighing")
+        end = time.monotonic() + 120.0
+        while stream.getvalue().count("\r") < 4 and time.monotonic() < end:
+            told.update()
+            time.sleep(0.01)
+    assert (
+        "weigh" in stream.getvalue()
+        and stream.getvalue().endswith("\r")
+        and "\n" not in stream.getvalue().strip()
+    )
+
+
+def test_progress_counts_flights(often, monkeypatch):
+    lines = Lines(1)
+    monkeypatch.setattr(sys, "stderr", lines)
+
+    def work(item):
+        end = time.monotonic() + 120.0
+        while (
+            item == 2 and "2 of 3 flights done" not in lines.getvalue() and time.monotonic() < end
+        ):
+            time.sleep(0.01)
+
+    list(parallel.over(work, range(3), 1))
+    said = lines.getvalue()
+    assert "2 of 3 flights done" in said
+    list(parallel.over(lambda item: time.sleep(0.1), range(3), 1, unit=None))
+    assert lines.getvalue() == said

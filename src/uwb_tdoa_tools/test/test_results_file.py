@@ -6,7 +6,7 @@ import pytest
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools import results_file
-from uwb_tdoa_tools.results_file import ResultsFile, asked_of, state_of
+from uwb_tdoa_tools.results_file import ResultsFile, fingerprint_of, settings_of
 
 
 def fill(path, keys, asked=None):
@@ -21,7 +21,7 @@ def fill(path, keys, asked=None):
     return made
 
 
-def test_what_is_there_is_not_made_again(tmp_path):
+def test_present_results_are_not_computed_again(tmp_path):
     path = tmp_path / "results"
     assert fill(path, ["a", "bb"]) == ["a", "bb"]
     assert fill(path, ["bb", "a", "ccc"]) == ["ccc"]
@@ -33,7 +33,7 @@ def test_what_is_there_is_not_made_again(tmp_path):
 
 
 @pytest.mark.parametrize("left", [0, 1, 12, -1, -5])
-def test_a_file_cut_anywhere_goes_on(tmp_path, left):
+def test_a_cut_file_is_continued(tmp_path, left):
     path = tmp_path / "results"
     fill(path, ["a", "bb", "ccc"])
     whole = path.read_bytes()
@@ -42,7 +42,7 @@ def test_a_file_cut_anywhere_goes_on(tmp_path, left):
     assert path.read_bytes() == whole
 
 
-def test_results_are_there_as_soon_as_they_are_made(tmp_path):
+def test_results_are_written_at_once(tmp_path):
     with ResultsFile(tmp_path / "results", {}) as done:
         done["a"] = 1
         assert json.loads((tmp_path / "results").read_text().splitlines()[-1]) == {
@@ -51,7 +51,7 @@ def test_results_are_there_as_soon_as_they_are_made(tmp_path):
         }
 
 
-def test_what_was_asked_otherwise_is_not_mixed(tmp_path):
+def test_results_of_other_settings_are_refused(tmp_path):
     path = tmp_path / "results"
     fill(path, ["a"], {"seed": 1, "smooth": False, "effects": None})
     with pytest.raises(
@@ -61,7 +61,7 @@ def test_what_was_asked_otherwise_is_not_mixed(tmp_path):
         fill(path, ["a"], {"seed": 2, "smooth": False, "effects": "1f"})
 
 
-def test_a_result_that_somebody_has_written_is_one_or_is_refused(tmp_path):
+def test_forged_results_are_refused(tmp_path):
     path = tmp_path / "results"
     fill(path, ["a"])
     with ResultsFile(path, {"seed": 1}) as done:
@@ -96,7 +96,7 @@ def test_a_line_without_end_is_not_read(tmp_path, monkeypatch):
         "[" * 100_000 + "\n",
     ],
 )
-def test_another_file_is_left_alone(tmp_path, content):
+def test_a_file_of_another_kind_is_not_changed(tmp_path, content):
     path = tmp_path / "other"
     path.write_bytes(content if isinstance(content, bytes) else content.encode())
     before = path.read_bytes()
@@ -107,13 +107,13 @@ def test_another_file_is_left_alone(tmp_path, content):
         fill(tmp_path / "no" / "results", ["a"])
 
 
-def test_the_state_of_a_recording_changes_with_it(tmp_path):
+def test_the_fingerprint_of_a_recording_changes_with_it(tmp_path):
     (tmp_path / "bag").mkdir()
     (tmp_path / "bag" / "data").write_text("one")
-    before = state_of(tmp_path / "bag")
-    assert str(tmp_path) in before and state_of(tmp_path / "bag") == before
+    before = fingerprint_of(tmp_path / "bag")
+    assert str(tmp_path) in before and fingerprint_of(tmp_path / "bag") == before
     (tmp_path / "bag" / "data").write_text("two, longer")
-    assert state_of(tmp_path / "bag") != before and state_of(None) == "None"
+    assert fingerprint_of(tmp_path / "bag") != before and fingerprint_of(None) == "None"
 
 
 def test_a_pipe_and_a_link_hold_no_results(tmp_path):
@@ -130,20 +130,20 @@ def test_a_recording_of_too_many_files_is_refused(tmp_path, monkeypatch):
     for number in range(4):
         (tmp_path / str(number)).touch()
     with pytest.raises(InputError, match="more than 3 entries"):
-        state_of(tmp_path)
+        fingerprint_of(tmp_path)
 
 
-def test_what_was_asked_is_every_option_that_matters_and_what_stands_in_its_files(tmp_path):
+def test_settings_are_the_options_and_the_content_of_their_files(tmp_path):
     file = tmp_path / "effects.yaml"
     file.write_text("one")
     args = SimpleNamespace(jobs=3, smooth=True, effects=str(file), model=None, config=None)
-    asked = asked_of(args, ["jobs"], ["effects", "model", "config"])
+    asked = settings_of(args, ["jobs"], ["effects", "model", "config"])
     file.write_text("two")
-    changed = asked_of(args, ["jobs"], ["effects", "model", "config"])
+    changed = settings_of(args, ["jobs"], ["effects", "model", "config"])
     assert asked == {
         "smooth": True,
         "effects": asked["effects"],
-        "model": "default",
+        "model": None,
         "config": None,
     }
     assert (

@@ -22,7 +22,7 @@ def rules():
             for node in ast.walk(ast.parse(path.read_text())):
                 if (
                     isinstance(node, ast.Call)
-                    and _name(node.func) in ("Finding", "_says")
+                    and _name(node.func) in ("Finding", "_finding_of")
                     and node.args
                 ):
                     if isinstance(node.args[0], ast.Constant):

@@ -1,1 +1,1 @@
-"""The workbench: read, convert, simulate, replay, record, evaluate, and the demo that runs it all."""
+"""Tools: read, convert, simulate, replay, record and evaluate flights, and a demo that runs it all."""

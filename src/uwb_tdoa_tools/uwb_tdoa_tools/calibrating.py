@@ -15,8 +15,7 @@ from uwb_tdoa_bias.foundation.flight import AIDS, Flight, Truth
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.streams import ERROR
 
-from .checking.ordered import OrderedRecording
-from .checking.survey_fit import displacement
+from .checking.ordered import OrderedRecording, displacement
 from .diagnosis import diagnose, output
 from .diagnosis.references import Nothing
 from .diagnosis.self_calibration import SelfCalibration, Tape, self_calibrate

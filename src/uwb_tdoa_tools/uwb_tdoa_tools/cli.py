@@ -1,9 +1,9 @@
-"""What the mains of all executables share: the look of --help, and how a failure is reported and
-counted.
+"""Share the look of --help, and the handling of failures, between all executables.
 
 def parser():
-    made = cli.parser("convert", "Convert a log to a bag.", "convert flight.log --survey s.txt --out
-    flight.bag") made.add_argument("log") return made
+    made = cli.parser("convert", "Convert a log to a bag.", "convert flight.log --out flight.bag")
+    made.add_argument("log")
+    return made
 
 main = cli.executable(_convert, parser)          # _convert(args) -> exit code, None for 0
 """
@@ -40,10 +40,11 @@ FULL = {
 
 
 def parser(name: str, description: str, *examples: str) -> argparse.ArgumentParser:
-    """An ArgumentParser that keeps line breaks, and ends its help with the given example command
-    lines: those that begin with the name, as they run where the user is.
+    """Return an ArgumentParser that keeps line breaks and ends its help with example command lines.
+
+    Examples that begin with `name` are printed as they run where the user is.
     """
-    started = command_lines.started(name).removesuffix(name)
+    started = command_lines.line_start(name).removesuffix(name)
     lines = [
         f"  {started if example.partition(' ')[0] == name else ''}{example}" for example in examples
     ]
@@ -63,7 +64,7 @@ def executable(
     parser: Callable[[], argparse.ArgumentParser],
     ros: bool = False,
 ) -> Callable[..., int]:
-    """The function main(argv=None) of an executable: `run` with what parser() gives."""
+    """Return the function main(argv=None) of an executable: `run` with the result of parser()."""
     return lambda argv=None: run(command, parser(), argv, ros)
 
 
@@ -73,19 +74,26 @@ def run(
     argv: Sequence[str] | None = None,
     ros: bool = False,
 ) -> int:
-    """Parse argv (default: sys.argv[1:]), call command(args), and return the exit code of the
-    process.
+    """Parse a command line, call command(args), and return the exit code of the process.
 
-    0 or what command returned; 1 for a Failure; 2 for bad usage, an InputError or a file that
-    cannot be used, each reported in one sentence on stderr; 130 after Ctrl-C; 141 when whoever read
-    our output has gone.
-    ros : --ros-args are for rclpy and not parsed; args.ros_arguments is the whole command line,
-        with them.
+    Parameters
+    ----------
+    command : callable
+        Takes the parsed arguments, returns the exit code, or None for 0.
+    argv : sequence of str or None
+        Default: sys.argv[1:].
+    ros : bool
+        Leave --ros-args to rclpy; args.ros_arguments is then the whole command line.
+
+    Returns
+    -------
+    int
+        The code of `command`; 1 for a Failure; 2 for bad usage, an InputError or an unusable file, each
+        reported in one sentence on stderr; 130 after Ctrl-C; 141 if the reader of our output has gone.
     """
     arguments = sys.argv[1:] if argv is None else list(argv)
-    if isinstance(
-        sys.stdout, io.TextIOWrapper
-    ):  # a result must not end in an error because the locale has no letter for it
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        # The locale may lack a letter of the result.
         sys.stdout.reconfigure(errors="backslashreplace")
     try:
         args = parser.parse_args(without_ros_arguments(arguments) if ros else arguments)
@@ -95,7 +103,7 @@ def run(
             code = command(args) or 0
         sys.stdout.flush()
         return code
-    except SystemExit as stop:  # argparse has said it already: usage and error, or the help
+    except SystemExit as stop:  # argparse has printed usage and error, or the help
         return stop.code or 0  # type: ignore[return-value]  # argparse ends with a number
     except InputError as error:
         return _fail(parser.prog, error, 2)
@@ -104,12 +112,12 @@ def run(
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:
-        os.dup2(
-            os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno()
-        )  # or the flush at exit fails once more
+        # Else the flush at exit fails once more.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
     except (OSError, sqlite3.OperationalError) as error:
-        if full := _full(error):
+        full = _full(error)
+        if full:
             return _fail(
                 parser.prog,
                 f"{full}: what was being written is not whole; make room, or write elsewhere.",
@@ -121,16 +129,14 @@ def run(
 
 
 def _full(error: Exception) -> str | None:
-    """What of the disk has no room for what an OSError or an sqlite3.OperationalError was raised
-    about: text, or None.
-    """
+    """Return why the disk has no room, as text, or None if an error has another reason."""
     if isinstance(error, OSError):
         return FULL.get(error.errno) if error.errno is not None else None
     return FULL[errno.ENOSPC] if "disk is full" in str(error) else None
 
 
 def without_ros_arguments(arguments: Iterable[str]) -> list[str]:
-    """A command line without what is for ROS: from each --ros-args to the next -- or the end."""
+    """Return a command line without the part for ROS: from each --ros-args to the next -- or the end."""
     own, ours = [], True
     for argument in arguments:
         if argument == "--ros-args":
@@ -143,22 +149,18 @@ def without_ros_arguments(arguments: Iterable[str]) -> list[str]:
 
 
 def write_json(path: str | Path, content: dict[str, Any]) -> None:
-    """Write a dict as JSON, with the version of the suite; NaN must be None by now (ValueError
-    otherwise).
-    """
+    """Write a dict as JSON, with the version of the suite. Raises ValueError for NaN."""
     text = json.dumps({"written_by": written_by(), **content}, indent=1, allow_nan=False)
     write_text(path, text + "\n")
 
 
 def say(name: str, sentence: object) -> None:
-    """Tell what happens, on stderr: `name: sentence`, as a `line_of` text."""
+    """Print `name: sentence` on stderr, as a `line_of` text."""
     print(f"{name}: {line_of(sentence)}", file=sys.stderr, flush=True)
 
 
 def show(*lines: str) -> None:
-    """Print a result on stdout, line by line, each made `printable`, beside a progress bar if there
-    is one.
-    """
+    """Print lines of a result on stdout, each made `printable`, above a progress bar if there is one."""
     tqdm.write("\n".join(printable(line) for text in lines for line in text.split("\n")))
     sys.stdout.flush()
 

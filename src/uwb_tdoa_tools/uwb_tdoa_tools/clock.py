@@ -1,8 +1,7 @@
-"""One continuous time for the streams of a recording whose clock restarted, wrapped or was set
-while it was recorded.
+"""Put the streams of a recording on one time if its clock restarted, wrapped or was set.
 
-The evidence is the order in which messages stand in the file: sorted by stamp, a clock that starts
-again is two flights in one.
+The evidence is the order of the messages in the file: sorted by stamp, a clock that restarts makes
+one flight of two.
 """
 
 from __future__ import annotations
@@ -18,10 +17,10 @@ from uwb_tdoa_bias.foundation.stamps import LARGEST_STEP_BACK
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
-LEADING = "tdoa", "imu", "gyro", "acc", *LOCATING  # streams whose clock starts the filter anew
+LEADING = "tdoa", "imu", "gyro", "acc", *LOCATING  # streams whose clock restarts the filter
 AHEAD = 10.0  # s; a longer step forward of a quick stream is a pause, or a clock that was set
 SLOW = 20.0  # usual steps; the same of a slow one
-PAUSE = 3600.0  # s for which a recorder may pause, where no arrival times tell
+PAUSE = 3600.0  # s for which a recorder may pause if arrival times are unknown
 # messages that agree with each other and not with those before: another time; fewer are outliers
 FEW = 10
 NEAR = 20  # messages on both sides of a jump by whose arrivals its size is known
@@ -55,11 +54,24 @@ RESTART, WRAP, SET, SILENCE = "restart", "wrap", "set", "silence"
 
 
 class Jump(NamedTuple):
-    """kind : RESTART, WRAP, SET (forward) or SILENCE (of all streams; or SET, nothing tells);
-    streams : names of those that jumped;
-    message : number of the first one after it in the first of them, from 1, and `after`, s, since
-        the first one of all; by : s, of the
-    clock; at : s, stamp of the first message after it, as it is now; period : what wrapped, text.
+    """A jump of a clock.
+
+    Attributes
+    ----------
+    kind : str
+        RESTART, WRAP, SET (forward), or SILENCE (of all streams; a clock that was set looks the same).
+    streams : tuple of str
+        Names of the streams that jumped.
+    message : int
+        Number of the first message after the jump in the first of the streams, from 1.
+    after : float
+        Time from the first message of the recording to that message, s.
+    by : float
+        Size of the jump, s.
+    at : float
+        Corrected stamp of the first message after the jump, s.
+    period : str
+        Name of the period that wrapped.
     """
 
     kind: str
@@ -73,9 +85,18 @@ class Jump(NamedTuple):
 
 @dataclass(frozen=True)
 class Straightened:
-    """shifts : {stream: (n,) s, to be added to its stamps} of those with a jump; kept : {stream:
-    (n,) bool} of those with outliers; jumps : in the order of time; restarts : s, where a clock
-    that leads began anew.
+    """Result of `straightened`.
+
+    Attributes
+    ----------
+    shifts : dict
+        {stream: (n,) s to add to its stamps} of streams with a jump.
+    kept : dict
+        {stream: (n,) bool} of streams with outliers.
+    jumps : tuple of Jump
+        In the order of time.
+    restarts : tuple of float
+        Stamps, s, at which the clock of a leading stream restarted.
     """
 
     shifts: dict[str, np.ndarray]
@@ -84,7 +105,7 @@ class Straightened:
     restarts: tuple[float, ...] = ()
 
     def columns(self, name: str, columns: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """The columns of a stream, with "t", s, on the continuous time, without outliers."""
+        """Return the columns of a stream, with "t", s, on the continuous time, without outliers."""
         if name in self.shifts:
             columns = {**columns, "t": columns["t"] + self.shifts[name]}
         return (
@@ -95,7 +116,7 @@ class Straightened:
 
     @property
     def outliers(self) -> dict[str, int]:
-        """{stream: messages whose stamps are far from those of their neighbours}."""
+        """Return {stream: number of messages with stamps far from their neighbours}."""
         return {name: int(np.count_nonzero(~kept)) for name, kept in self.kept.items()}
 
 
@@ -104,18 +125,23 @@ def straightened(
 ) -> Straightened:
     """Put the streams of a recording on one continuous time.
 
-    stamps : {stream: (n,) s, in the order of the file}; arrived : {stream: (n,) s, when they were
-        recorded, NaN where that is not
-    known}. What follows a jump that persists is shifted, of all streams alike that jumped together:
-    by arrivals where they are known, else so that the next message follows at the usual step. A
-    pause moves nothing. Few stamps far from their neighbours are outliers.
+    The stamps after a persistent jump are shifted, by the same for all streams that jumped together:
+    by the arrivals where they are known, else to the usual step. A pause moves nothing. Few stamps
+    far from their neighbours are outliers.
+
+    Parameters
+    ----------
+    stamps : mapping
+        {stream: (n,) s, in the order of the file}.
+    arrived : mapping or None
+        {stream: (n,) s, when the messages were recorded, NaN where unknown}.
     """
     found = {name: _Stream(name, t, (arrived or {}).get(name)) for name, t in stamps.items()}
     ends = {name: stream.end for name, stream in found.items() if stream.steady}
     for name, stream in found.items():
         stream.cut([end for other, end in ends.items() if other != name])
     groups = _groups([stream for stream in found.values() if stream.breaks])
-    jumps = [jump for group in groups if (jump := _of_group(group, found)) is not None]
+    jumps = [jump for jump in (_of_group(group, found) for group in groups) if jump is not None]
     for stream in found.values():
         _join_late(stream, found)
     shifts = {name: of for name, stream in found.items() if (of := stream.shifts()) is not None}
@@ -140,9 +166,10 @@ def straightened(
 
 @dataclass
 class _Break:
-    """Where a stream goes on with another time. first, last : places of the message after and of
-    the last one before; by : s, of the clock;
-    sure : it is no silence.
+    """Place where the time of a stream jumps.
+
+    first, last : places of the message after and of the last one before; by : s, of the clock;
+    sure : false if the stream may also have been silent.
     """
 
     first: int
@@ -153,24 +180,29 @@ class _Break:
 
 
 class _Stream:
-    """Stamps t (n,) s of one stream, in the order of the file; arrived : (n,) s or None; steady :
-    whether they are of one time, without a pause.
+    """Stamps t (n,) s of one stream, in the order of the file, with its breaks.
+
+    arrived : (n,) s or None; steady : whether the stamps have neither jumps nor pauses.
     """
 
     def __init__(self, name: str, t: np.ndarray, arrived: np.ndarray | None) -> None:
         self.name, self.t = name, t
         self.kept = np.ones(len(t), bool)
         self.breaks: list[_Break] = []
-        self.offset = 0.0  # s, of all of it
+        self.offset = 0.0  # s, added to every stamp
         self.finite = np.flatnonzero(np.isfinite(t))
         steps = np.diff(t[self.finite])
         rising = steps[steps > 0.0]
         self.usual = float(np.median(rising)) if len(rising) else 0.0  # s
         self.limit = max(AHEAD, SLOW * self.usual)
-        self.arrived = arrived if arrived is not None and _sound(arrived) else None
-        far = (steps < -LARGEST_STEP_BACK) | (
-            steps > max(LARGEST_STEP_BACK, 1.5 * self.usual)
-        )  # also back from where a stamp was wild
+        # Arrivals count if they are known and never fall.
+        known = arrived is not None and bool(
+            np.isfinite(arrived).all() and (np.diff(arrived) >= 0.0).all()
+        )
+        self.arrived = arrived if known else None
+        # Steps forward count too: they lead back from a wild stamp.
+        forward = steps > max(LARGEST_STEP_BACK, 1.5 * self.usual)
+        far = (steps < -LARGEST_STEP_BACK) | forward
         self._edges = np.concatenate([[0], np.flatnonzero(far) + 1, [len(self.finite)]])
         self.steady = bool(
             len(self.finite) and (steps >= -LARGEST_STEP_BACK).all() and (steps <= self.limit).all()
@@ -181,13 +213,9 @@ class _Stream:
         return float(self.t[self.finite[-1]])
 
     def cut(self, ends: Sequence[float]) -> None:
-        """Find the breaks and the outliers. ends : s, stamps of the last messages of other streams,
-        which are steady.
-        """
-        few, pieces = (
-            min(FEW, max(2, len(self.finite) // 20)),
-            list(zip(self._edges[:-1].tolist(), self._edges[1:].tolist())),
-        )
+        """Find the breaks and the outliers. ends : s, last stamps of other streams that are steady."""
+        few = min(FEW, max(2, len(self.finite) // 20))
+        pieces = list(zip(self._edges[:-1].tolist(), self._edges[1:].tolist()))
         if len(pieces) == 1:
             return
         last, breaks, kept = -1, list[_Break](), self.kept.copy()
@@ -222,7 +250,7 @@ class _Stream:
         self.breaks, self.kept = breaks, kept
 
     def _follows(self, before: int, after: int) -> bool:
-        """Whether the message at one place of `finite` may follow that at another."""
+        """Return whether the message at place `after` of `finite` may follow the one at `before`."""
         return bool(
             -LARGEST_STEP_BACK
             <= self.t[self.finite[after]] - self.t[self.finite[before]]
@@ -230,8 +258,9 @@ class _Stream:
         )
 
     def _lasts(self, pieces: Sequence[tuple[int, int]], few: int, last: int) -> bool:
-        """Whether the first of some pieces, with those that follow it and are not of the time of
-        the message at `last`, is of many.
+        """Return whether the first piece, with the pieces that continue it, has many messages.
+
+        Pieces that belong to the time of the message at `last` are not counted.
         """
         count, behind = 0, pieces[0][1] - 1
         for begin, end in pieces:
@@ -251,9 +280,7 @@ class _Stream:
     def _continues(
         self, last: int, first: int, following: int | None, ends: Sequence[float], many: bool
     ) -> bool:
-        """Whether the message at `first` is of the time of the one at `last`, after a pause or
-        none.
-        """
+        """Return whether the message at `first` continues the time of the one at `last`."""
         t, step = self.t, self.t[first] - self.t[last]
         if step < -LARGEST_STEP_BACK:
             return False
@@ -267,10 +294,8 @@ class _Stream:
         if step <= self.limit:
             return True
         if many:
-            others = (
-                any(end > t[last] + self.limit for end in ends) and step <= PAUSE
-            )  # that went on meanwhile
-            return others and not self._sure(last, first, following, ends)
+            others_continued = any(end > t[last] + self.limit for end in ends) and step <= PAUSE
+            return others_continued and not self._sure(last, first, following, ends)
         if following is None:
             return any(end + self.limit > t[first] for end in ends)
         return (
@@ -284,8 +309,10 @@ class _Stream:
         )
 
     def _sure(self, last: int, first: int, following: int | None, ends: Sequence[float]) -> bool:
-        """Whether the step between two messages is certainly of the clock: by arrivals, because the
-        stamps fall back soon, or because the stream ends with others only without it.
+        """Return whether a step between two messages certainly comes from the clock.
+
+        That is so by the arrivals, if the stamps fall back soon, or if the stream ends with others only
+        without the step.
         """
         step = float(self.t[first] - self.t[last])
         if self.arrived is not None or step < 0.0 or self._falls(first, following):
@@ -294,7 +321,7 @@ class _Stream:
         return without and not any(abs(self.end - end) < 0.5 * step for end in ends)
 
     def _by_arrival(self, last: int, first: int) -> float:
-        """By how much the clock jumped, s, by the arrivals of the messages on both sides."""
+        """Return the size of a jump of the clock, s, from the arrivals on both sides."""
         assert self.arrived is not None
         ahead = self.t - self.arrived
         return float(
@@ -311,7 +338,7 @@ class _Stream:
         )
 
     def shifts(self) -> np.ndarray | None:
-        """(n,) s to be added to its stamps; None for nothing."""
+        """Return (n,) s to add to the stamps; None without a shift."""
         if not self.offset and not any(one.shift for one in self.breaks):
             return None
         out = np.full(len(self.t), self.offset)
@@ -320,7 +347,7 @@ class _Stream:
         return out
 
     def runs(self) -> Iterator[tuple[float, float, float]]:
-        """(first and last stamp s, shift s) of each time of the stream."""
+        """Yield (first and last stamp s, shift s) of each time of the stream."""
         begin, shift = int(self.finite[0]) if len(self.finite) else 0, self.offset
         for one in self.breaks:
             yield float(self.t[begin]), float(self.t[one.last]), shift
@@ -329,15 +356,8 @@ class _Stream:
             yield float(self.t[begin]), self.end, shift
 
 
-def _sound(arrived: np.ndarray) -> bool:
-    """Whether arrivals are known, and never fall."""
-    return bool(np.isfinite(arrived).all()) and bool((np.diff(arrived) >= 0.0).all())
-
-
 def _groups(streams: list[_Stream]) -> Iterator[list[tuple[_Stream, _Break]]]:
-    """Breaks of several streams that are one jump of their clock, each with its stream; the
-    quickest stream comes first.
-    """
+    """Yield the breaks of several streams that are one jump of their clock, the quickest stream first."""
     left = {stream.name: list(stream.breaks) for stream in streams}
     for stream in sorted(streams, key=lambda stream: (stream.name not in LEADING, stream.usual)):
         while left[stream.name]:
@@ -360,9 +380,7 @@ def _groups(streams: list[_Stream]) -> Iterator[list[tuple[_Stream, _Break]]]:
 def _of_group(
     group: list[tuple[_Stream, _Break]], every: Mapping[str, _Stream]
 ) -> tuple[Jump, list[tuple[_Stream, _Break]]] | None:
-    """The Jump of one clock, by whose size all its streams are shifted from there on; None where
-    some of them were silent, others not.
-    """
+    """Return the Jump of one clock, and shift its streams; None if only some streams were silent."""
     by = min(one.by for _, one in group)
     known = [(stream, one) for stream, one in group if stream.arrived is not None]
     if known:
@@ -385,7 +403,7 @@ def _of_group(
 
 
 def _join_late(stream: _Stream, every: Mapping[str, _Stream]) -> None:
-    """Shift a stream without a break that has only messages of a time after one, as others show it."""
+    """Shift a stream without a break that has only messages after a jump of the other streams."""
     if stream.breaks or not len(stream.finite):
         return
     first, last = float(stream.t[stream.finite[0]]), stream.end
@@ -402,7 +420,7 @@ def _join_late(stream: _Stream, every: Mapping[str, _Stream]) -> None:
 
 
 def sentences(clock: Straightened) -> Iterator[str]:
-    """What was done about the clock of a recording, a sentence each."""
+    """Yield a sentence for each correction of the clock of a recording."""
     for jump in clock.jumps:
         cause, done = in_words(jump)
         yield f"{cause}: {done}."
@@ -415,7 +433,7 @@ def sentences(clock: Straightened) -> Iterator[str]:
 
 
 def in_words(jump: Jump) -> tuple[str, str]:
-    """(what the clock did, what was done about it) of a Jump."""
+    """Return (cause, correction) of a Jump in words."""
     who = " and ".join(dict.fromkeys(WORDS.get(name, name) for name in jump.streams))
     where = (
         f"at message {jump.message} of {WORDS.get(jump.streams[0], jump.streams[0])}, "
@@ -425,14 +443,11 @@ def in_words(jump: Jump) -> tuple[str, str]:
     if jump.kind == WRAP:
         return f"the clock of {who} wraps at {jump.period} ({-jump.by:.3f} s) {where}", shifted
     if jump.kind == RESTART:
-        anew = (
-            ", and the filter starts anew there"
-            if not set(jump.streams).isdisjoint(LEADING)
-            else ""
-        )
+        leads = not set(jump.streams).isdisjoint(LEADING)
+        restart = ", and the filter starts anew there" if leads else ""
         return (
             f"the clock of {who} started again {where}: it fell back by {_long(-jump.by)}",
-            shifted + anew,
+            shifted + restart,
         )
     if jump.kind == SET:
         return f"the clock of {who} was set forward {where}, by {_long(jump.by)}", shifted
@@ -450,9 +465,24 @@ def _long(seconds: float) -> str:
 
 
 def apart(stamps: Mapping[str, np.ndarray]) -> Iterator[tuple[str, float, int]]:
-    """(stream, s by which its stamps are ahead, messages) of those of which no message is stamped
-    within the time of the TDOAs, or which begins and ends as much later, or earlier, than these.
-    stamps : {stream: (n,) s}; "tdoa" is one of them.
+    """Yield the streams whose stamps miss the time of the TDOAs.
+
+    No message lies within the time of the TDOAs, or the stream begins and ends later, or earlier, by
+    about as much.
+
+    Parameters
+    ----------
+    stamps : mapping
+        {stream: (n,) s}, including "tdoa".
+
+    Yields
+    ------
+    name : str
+        The stream.
+    ahead : float
+        s by which its stamps are ahead.
+    count : int
+        Number of its messages.
     """
     tdoa = stamps["tdoa"][np.isfinite(stamps["tdoa"])]
     if not len(tdoa):
@@ -474,7 +504,7 @@ def apart(stamps: Mapping[str, np.ndarray]) -> Iterator[tuple[str, float, int]]:
 
 
 def sentence_on(name: str, ahead: float, count: int, first: str = "TDOAs") -> str:
-    """What is to be said of a stream that is `apart`."""
+    """Return the sentence about a stream that `apart` yields."""
     return (
         f"the stamps of {WORDS.get(name, name)} are {abs(ahead):.3f} s "
         f"{'ahead of' if ahead > 0.0 else 'behind'} those of the {first}: "
@@ -483,9 +513,21 @@ def sentence_on(name: str, ahead: float, count: int, first: str = "TDOAs") -> st
 
 
 def numbered(t: np.ndarray, length: float) -> np.ndarray:
-    """(n,) number of the stretch of `length`, s, in which each of t (n,) s is, from 0: without the
-    empty ones where most would be empty, so that an array with a place for each takes no more room
-    than t.
+    """Return the number of the interval of each time, from 0.
+
+    Empty intervals have no number if most would be empty: an array with a place for each interval
+    is never larger than `t`.
+
+    Parameters
+    ----------
+    t : (n,) array
+        Times, s.
+    length : float
+        Length of an interval, s.
+
+    Returns
+    -------
+    (n,) array of int
     """
     number = (
         ((t - np.min(t, initial=np.inf)) / length).astype(np.int64)
@@ -498,8 +540,9 @@ def numbered(t: np.ndarray, length: float) -> np.ndarray:
 
 
 def grid(begin: float, end: float, step: float, t: np.ndarray) -> np.ndarray:
-    """Times from `begin` to before `end`, every `step`, s; only those up to `step` before one of t
-    (n,) s where they would be far more than these.
+    """Return times from `begin` to before `end`, every `step`, s.
+
+    Grid times far from every time of `t`, (n,) s, are left out if they would be most.
     """
     if end - begin <= step * SPARSE * max(len(t), 1000):
         return np.arange(begin, max(begin, end), step)

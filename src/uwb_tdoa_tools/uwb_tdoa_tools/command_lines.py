@@ -1,6 +1,6 @@
-"""Command lines that are printed to be copied, as they run where the user is.
+"""Make command lines to copy, as they run where the user is.
 
-tool("check", "flight.bag")                          # ./dev run uwb_tdoa_tools check flight.bag, or ros2 run ...
+tool("check", "flight.bag")          # ./dev run uwb_tdoa_tools check flight.bag, or ros2 run ...
 node("ekf_node", {"effects_file": "effects.yaml"})
 """
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 SALVAGE = "read what is sound of it with --salvage"
-RUN = "UWB_TDOA_RUN"  # variable of the environment in which ./dev says how the user started it
+RUN = "UWB_TDOA_RUN"  # environment variable in which ./dev passes how the user started it
 PACKAGES = {
     "bias_node": "uwb_tdoa_bias",
     "ekf_node": "uwb_tdoa_ekf",
@@ -26,19 +26,17 @@ PACKAGES = {
 
 
 def tool(name: str, *words: object) -> str:
-    """The line that starts an executable with words, which are quoted where a shell needs it."""
-    return " ".join([started(name), *([shlex.join(map(str, words))] if words else [])])
+    """Return the line that starts an executable with words, quoted for a shell."""
+    return " ".join([line_start(name), *([shlex.join(map(str, words))] if words else [])])
 
 
-def started(name: str) -> str:
-    """How an executable is started: the beginning of its line."""
+def line_start(name: str) -> str:
+    """Return the beginning of the line that starts an executable."""
     return f"{os.environ.get(RUN, 'ros2 run')} {PACKAGES.get(name, 'uwb_tdoa_tools')} {name}"
 
 
 def as_it_runs(line: str) -> str:
-    """A line that begins with what ./dev does as ros2 does, as it runs where the user is; any other
-    one as it is.
-    """
+    """Return a line as it runs where the user is: ./dev replaces ros2 where only ./dev exists."""
     if (
         line.startswith(("ros2 topic ", "ros2 node ", "ros2 param "))
         and RUN in os.environ
@@ -49,22 +47,31 @@ def as_it_runs(line: str) -> str:
 
 
 def node(name: str, parameters: Mapping[str, object], files: Iterable[str | Path] = ()) -> str:
-    """The line that starts a node. parameters : {name: value}; files : paths of parameter files."""
+    """Return the line that starts a node.
+
+    Parameters
+    ----------
+    parameters : mapping
+        {name: value}.
+    files : iterable of paths
+        Parameter files.
+    """
     words = [word for key, value in parameters.items() for word in ("-p", f"{key}:={value}")]
     return tool(
         name, "--ros-args", *words, *(word for file in files for word in ("--params-file", file))
     )
 
 
-def judging(
+def evaluate_line(
     recordings: Iterable[str | Path],
     survey: str | Path | None = None,
     effects: str | Path | None = None,
     config: str | Path | None = None,
     truth: bool = True,
 ) -> str:
-    """The line that judges an estimate on recordings with the files of a calibration, by ground
-    truth, or, where they hold none, by itself; None for files that there are not.
+    """Return the line that evaluates recordings with the files of a calibration; None for no file.
+
+    Without ground truth (`truth`), `localize` states how far the estimate can be trusted.
     """
     options = {"--survey": survey, "--effects": effects, "--config": config}
     words = [
@@ -74,12 +81,10 @@ def judging(
     return tool("evaluate", *words) if truth else tool("localize", *words, "--out", "localized/")
 
 
-def surveying(
+def survey_line(
     recording: str | Path, survey: str | Path | None = None, effects: str | Path | None = None
 ) -> str:
-    """The line that surveys the anchors with a recording, with the files of a calibration; None for
-    those that there are not.
-    """
+    """Return the line that surveys anchors with a recording; None for a file that does not exist."""
     options = {"--survey": survey, "--effects": effects}
     words = [
         recording,
@@ -88,21 +93,19 @@ def surveying(
     return tool("survey", *words, "--out", "surveyed/")
 
 
-def nodes(
+def node_lines(
     anchors: str | Path | None = None,
     effects: str | Path | None = None,
     config: str | Path | None = None,
 ) -> tuple[str, str]:
-    """The two lines that start the nodes with the files of a calibration; None for those that there
-    are not.
-    """
+    """Return the two lines that start the nodes with the files of a calibration; None for no file."""
     parameters = {
         name: file for name, file in (("anchors_file", anchors), ("effects_file", effects)) if file
     }
     return node("bias_node", parameters), node("ekf_node", parameters, [config] if config else ())
 
 
-def applying(
+def lines_of_use(
     folder: Path,
     recordings: Sequence[str | Path],
     survey: str | Path | None = None,
@@ -110,16 +113,25 @@ def applying(
     parameters: bool = False,
     truth: bool = True,
 ) -> tuple[tuple[str, str], ...]:
-    """((command line, what it does), ...): how the effects.yaml in a folder is put to use.
-    recordings : paths to judge on; survey,
-    anchors : files of anchors that were given, for evaluate and for the nodes, or None; parameters
-        : whether there is an ekf_node.yaml;
-    truth : whether the recordings hold ground truth.
+    """Return ((command line, purpose), ...) for the use of the effects.yaml in a folder.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder with effects.yaml.
+    recordings : sequence of paths
+        Recordings to evaluate.
+    survey, anchors : path or None
+        Files of anchors for evaluate and for the nodes.
+    parameters : bool
+        Whether the folder holds an ekf_node.yaml.
+    truth : bool
+        Whether the recordings hold ground truth.
     """
     effects, config = folder / "effects.yaml", folder / "ekf_node.yaml" if parameters else None
-    bias, ekf = nodes(anchors, effects, config)
+    bias, ekf = node_lines(anchors, effects, config)
     return (
-        (judging(recordings, survey, effects, config, truth), "judges it"),
+        (evaluate_line(recordings, survey, effects, config, truth), "judges it"),
         (bias, "in flight: takes it out of TDOAs"),
         (ekf, "in flight: takes it out of the IMU, and assumes the noise that is left"),
     )

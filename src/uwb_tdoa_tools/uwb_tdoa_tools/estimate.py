@@ -1,4 +1,4 @@
-"""The estimate of a recording: bias correction and filter as the nodes would run them, or smoothed."""
+"""Estimate a recording: bias correction and filter as in the nodes, or smoothed."""
 
 from dataclasses import dataclass
 
@@ -14,11 +14,18 @@ from uwb_tdoa_ekf.smoother import smooth
 
 @dataclass(frozen=True)
 class FlightEstimator:
-    """estimator(flight) is the Run over a Flight; its ground truth is not used. Can be pickled.
+    """Estimate a Flight without its ground truth: estimator(flight) is the Run. Can be pickled.
 
-    config : FilterConfig; effects, network : what the TDOAs are corrected with, or None; smoothed :
-        use what came after each
-    estimate too.
+    Attributes
+    ----------
+    config : FilterConfig or None
+        Parameters of the filter.
+    effects : EffectSet or None
+        Effects to correct the TDOAs for.
+    network : Network or None
+        Bias network to correct the TDOAs with.
+    smoothed : bool
+        Use later measurements for each estimate too.
     """
 
     config: FilterConfig | None = None
@@ -36,15 +43,13 @@ class FlightEstimator:
 
     @property
     def correction(self) -> str:
-        """What it corrects with, in words."""
+        """Describe the correction in words."""
         names = "+".join(part.name for part in (self.effects, self.network) if part)
         return names or "nothing (neither effects nor a network are in use)"
 
 
 def with_antenna(effects: EffectSet | None, flight: Flight) -> EffectSet | None:
-    """An EffectSet, or None, and the lever arm of the antenna that the recording of a Flight gives,
-    unless it holds one.
-    """
+    """Return an EffectSet with the lever arm of the antenna from the recording, unless it has one."""
     arm, known = flight.meta.get("antenna"), effects.effects if effects else ()
     if not arm or not any(arm) or any(effect.name == TagLeverArm.name for effect in known):
         return effects

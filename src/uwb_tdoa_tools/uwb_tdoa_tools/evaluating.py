@@ -13,17 +13,17 @@ from uwb_tdoa_bias.foundation.foreign_text import harmless
 
 from . import parallel
 from .bags.bag import late_tdoas, read_odometry
-from .checking.against_truth import of_truth
 from .checking.check import check
+from .checking.flight_rules import judge_truth
 from .checking.recording import of_flight
-from .checking.remarks import survey_remarks
+from .checking.report import survey_remarks
 from .checking.watch import BEFORE_TRUTH
 from .estimate import FlightEstimator
 from .localizing.localize import write_tum
 from .localizing.pictures import write_rerun
 from .readers.inputs import Reading, report_remarks
 from .readers.tables import number, read_table
-from .results_file import ResultsFile, state_of
+from .results_file import ResultsFile
 from .scoring.alignment import ALIGN, NONE, estimate_alignment, require_truth
 from .scoring.evaluation import corrected_truth
 from .scoring.metrics import Score
@@ -170,7 +170,7 @@ class Evaluator:
                     if self.align == NONE
                     else "."
                 )
-        for finding in of_truth(flight):
+        for finding in judge_truth(flight):
             yield f"{finding.cause}: {finding.evidence}; {finding.remedy}."
 
     def late_tdoas(self) -> int:
@@ -201,7 +201,7 @@ def results(
     if path is None:
         yield from parallel.over(evaluator, recordings, jobs, dask)
         return
-    keys = [" ".join(map(state_of, recording)) for recording in recordings]
+    keys = [" ".join(map(fingerprint_of, recording)) for recording in recordings]
     with ResultsFile(path, asked) as done:
 
         def make(missing: Iterable[Recording]) -> Iterator[dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""The entry points that setup.py names: one for each file in commands/."""
+"""Entry points that setup.py names: one for each file in commands/."""
 
 from uwb_tdoa_bias.foundation.executable import executable, node_executable
 

@@ -1,13 +1,13 @@
-"""Options that several commands share, and what they ask for.
+"""Options that several commands share, and the values that they give.
 
 options.add_recordings(parser)                  # FLIGHT..., --survey, --namespace, --topic, --salvage
 options.add_filter(parser)                      # --effects, --config
-options.add_estimator(parser)                   # these, --model, --no-bias, -p, --without, --smooth
+options.add_estimator(parser)                   # and --model, --no-bias, -p, --without, --smooth
 options.add_most(parser, 10**6)                 # --most
 options.add_bag(parser)                         # --storage, --force
 options.add_holdout(parser)                     # --holdout
 options.add_known(parser)                       # --marks, --distances
-options.add_tape(parser)                        # --std, --height-std, --trusted, --trusted-std, --unknown
+options.add_tape(parser)                        # --std, --height-std, --trusted, --unknown, ...
 options.add_align(parser)                       # --align
 options.add_rerun(parser)                       # --rerun
 reading, (config, effects) = options.reading_of(args), options.filter_of(args)
@@ -55,13 +55,13 @@ TOPICS = (  # that are read from bags
 
 
 def add_recordings(parser: ArgumentParser, nargs: str = "+") -> None:
-    """FLIGHT..., and how to read them."""
+    """Add FLIGHT... and the options of reading."""
     parser.add_argument("flights", nargs=nargs, metavar="FLIGHT", help=inputs.HELP)
     add_reading(parser)
 
 
 def add_reading(parser: ArgumentParser) -> None:
-    """--survey, --namespace, --topic and --salvage: how recordings are read."""
+    """Add --survey, --namespace, --topic and --salvage: how to read recordings."""
     add = parser.add_argument
     add("--survey", metavar="S", help=inputs.SURVEY_HELP)
     add("--namespace", default="", metavar="NS", help="of the tag's topics in bags, e.g. tag1")
@@ -81,7 +81,7 @@ def add_reading(parser: ArgumentParser) -> None:
 
 
 def reading_of(args: Namespace, truth: bool = True) -> inputs.Reading:
-    """The Reading that those options ask for. truth : as of Reading. Raises InputError."""
+    """Return the Reading for these options. truth : as in Reading. Raises InputError."""
     topics = {}
     for text in args.topics:
         ours, given, theirs = text.partition("=")
@@ -98,7 +98,7 @@ def add_filter(
     parser: ArgumentParser,
     effects: str = "effects.yaml to correct the TDOAs with, before the filter",
 ) -> None:
-    """--effects and --config. effects : help of the first."""
+    """Add --effects, with this help, and --config."""
     parser.add_argument("--effects", metavar="FILE", help=effects)
     parser.add_argument(
         "--config", metavar="FILE", help="filter parameters, as for ekf_node (ekf_node.yaml)"
@@ -125,9 +125,7 @@ def filter_of(args: Namespace) -> tuple[FilterConfig, EffectSet | None]:
 
 
 def add_estimator(parser: ArgumentParser) -> None:
-    """--effects, --config, --model, --no-bias, -p, --without and --smooth: how positions are
-    estimated.
-    """
+    """Add --effects, --config, --model, --no-bias, -p, --without and --smooth."""
     add_filter(parser, "effects.yaml: systematic effects to correct for")
     add_model(parser)
     add = parser.add_argument
@@ -141,18 +139,20 @@ def add_estimator(parser: ArgumentParser) -> None:
         choices=tuple(SENSORS),
         help=f"not to be used though it is there: {', '.join(SENSORS)}; may be repeated",
     )
-    add("--smooth", action="store_true", help="smooth: use what came after each estimate too")
+    add(
+        "--smooth", action="store_true", help="smooth: use later measurements for each estimate too"
+    )
 
 
 def add_model(parser: ArgumentParser) -> None:
-    """--model."""
+    """Add --model."""
     parser.add_argument("--model", metavar="FILE", help="ONNX bias network to correct with")
 
 
 def estimator_of(args: Namespace, say: Callable[[str], object]) -> FlightEstimator:
-    """The FlightEstimator that those options ask for. say(sentence) : called with what it lacks.
+    """Return the FlightEstimator for these options. Raises InputError.
 
-    Raises InputError.
+    say(sentence) is called if the network was trained with effects that --effects lacks.
     """
     config, effects = filter_of(args)
     config = with_parameters(config, [f"use_{aid}:=false" for aid in args.without])
@@ -160,7 +160,8 @@ def estimator_of(args: Namespace, say: Callable[[str], object]) -> FlightEstimat
         return FlightEstimator(config, smoothed=args.smooth)
     network = load_network(args.model)
     given = {effect.name for effect in effects.effects} if effects else set()
-    if network and (lacking := sorted(set(network.trained_with) - given)):
+    lacking = sorted(set(network.trained_with) - given) if network else []
+    if lacking:
         say(
             f"{args.model} was trained with {', '.join(lacking)} taken out, which no "
             "--effects gives; give the effects.yaml that was "
@@ -170,15 +171,13 @@ def estimator_of(args: Namespace, say: Callable[[str], object]) -> FlightEstimat
 
 
 def given(args: Namespace, name: str) -> bool:
-    """Whether the option of that name is given."""
+    """Return whether the user gave the option of that name."""
     value = getattr(args, name)
     return value is not False and value not in (None, "", [])
 
 
 def refuse(args: Namespace, names: Iterable[str], because: str) -> None:
-    """Raise InputError for the first of some options that is given and has no part in what is asked
-    for, rather than pass it over.
-    """
+    """Raise InputError for the first given option that has no effect here."""
     for name in names:
         if given(args, name):
             option = {"parameters": "-p", "topics": "--topic"}.get(
@@ -188,7 +187,7 @@ def refuse(args: Namespace, names: Iterable[str], because: str) -> None:
 
 
 def add_bag(parser: ArgumentParser) -> None:
-    """--storage and --force: how a bag is written."""
+    """Add --storage and --force: how to write a bag."""
     parser.add_argument(
         "--storage", choices=STORAGES, default="mcap", help="kind of bag (default: mcap)"
     )
@@ -196,15 +195,16 @@ def add_bag(parser: ArgumentParser) -> None:
 
 
 def add_holdout(parser: ArgumentParser) -> None:
-    """--holdout."""
+    """Add --holdout."""
     parser.add_argument(
         "--holdout", nargs="+", default=[], metavar="FLIGHT", help="flights to judge on, not to fit"
     )
 
 
 def check_holdout(fitted: Iterable[str | Path], held: Iterable[str | Path]) -> None:
-    """Raise InputError if a flight to judge on, by its name or its path, is also one to fit."""
-    if shared := set(fitted) & set(held):
+    """Raise InputError if a flight, by its name or its path, is both fitted and held out."""
+    shared = set(fitted) & set(held)
+    if shared:
         raise InputError(
             f"--holdout: {min(map(str, shared))} is also a FLIGHT to fit; leave it out of one "
             "of them."
@@ -212,7 +212,7 @@ def check_holdout(fitted: Iterable[str | Path], held: Iterable[str | Path]) -> N
 
 
 def add_most(parser: ArgumentParser, default: int) -> None:
-    """--most: how many TDOAs to learn from at most."""
+    """Add --most: the largest number of TDOAs to learn from."""
     parser.add_argument(
         "--most",
         metavar="N",
@@ -225,16 +225,12 @@ def add_most(parser: ArgumentParser, default: int) -> None:
     )
 
 
-OF_TAPE = (
-    "std",
-    "height_std",
-    "trusted",
-    "trusted_std",
-)  # fields of Tape, for which the covariance of the last calibration stands
+# fields of Tape, which the covariance of the last calibration replaces
+OF_TAPE = "std", "height_std", "trusted", "trusted_std"
 
 
 def add_tape(parser: ArgumentParser) -> None:
-    """--std, --height-std, --trusted, --trusted-std and --unknown: how well anchors are known."""
+    """Add --std, --height-std, --trusted, --trusted-std and --unknown: how well anchors are known."""
     add = parser.add_argument
     add(
         "--std",
@@ -271,8 +267,9 @@ def add_tape(parser: ArgumentParser) -> None:
 
 
 def tape_of(args: Namespace, effects: EffectSet | None) -> Tape:
-    """The Tape that those options speak of. effects : EffectSet of --effects, or None: what its
-    covariance says of all anchors stands against no option. Raises InputError.
+    """Return the Tape for these options. Raises InputError.
+
+    effects : EffectSet of --effects, or None. Its covariance of the anchors excludes the options of Tape.
     """
     if effects is not None and effects.covariance is not None:
         refuse(
@@ -287,19 +284,16 @@ def tape_of(args: Namespace, effects: EffectSet | None) -> Tape:
 
 
 def add_align(parser: ArgumentParser, judges: bool = False) -> None:
-    """--align. judges : of a tool that judges by ground truth, and may move its frame too; else of
-    what learns from it.
-    """
+    """Add --align. judges : for a tool that evaluates by ground truth, and may move its frame too."""
     words = (
-        "ground truth on another clock (another epoch): none refuses it (default), time finds how "
-        "far they are apart"
+        "ground truth on another clock (another epoch): none refuses it (default), time estimates "
+        "the offset"
     )
     if judges:
         words = (
-            "what of the ground truth to move onto the estimate before it is judged: none "
-            "(default); time, its stamps; frame, its frame too, "
-            "turned and shifted (as evo -a, without scale). What is found is told in any "
-            "case, with the error of each"
+            "move the ground truth onto the estimate before the evaluation: none (default); time, "
+            "its stamps; frame, its frame too, rotated and shifted (as evo -a, without scale). "
+            "The result is printed in any case, with the error of each"
         )
     parser.add_argument("--align", choices=ALIGN if judges else ALIGN[:2], default=NONE, help=words)
 
@@ -310,8 +304,9 @@ def add_rerun(parser: ArgumentParser) -> None:
 
 
 def rerun_of(args: Namespace, count: int, say: Callable[[str], object]) -> Path | None:
-    """Path of the file that --rerun asks for; None without it, or without the library, which
-    say(sentence) reports. count : of flights, of which it shows one. Raises InputError.
+    """Return the path of --rerun; None without it, or without the library. Raises InputError.
+
+    count : number of flights, which must be one; say(sentence) reports a missing library.
     """
     if not args.rerun:
         return None
@@ -321,7 +316,7 @@ def rerun_of(args: Namespace, count: int, say: Callable[[str], object]) -> Path 
 
 
 def add_known(parser: ArgumentParser) -> None:
-    """--marks and --distances: what is known beside a recording."""
+    """Add --marks and --distances: measured positions and distances."""
     add = parser.add_argument
     add(
         "--marks",
@@ -336,7 +331,7 @@ def add_known(parser: ArgumentParser) -> None:
 
 
 def known_of(args: Namespace, flights: Sequence[Flight]) -> tuple[Mark | Distance, ...]:
-    """Constraints on Flights that those options give: tuple. Raises InputError."""
+    """Return the constraints on Flights as a tuple. Raises InputError."""
     out: list[Mark | Distance] = []
     out += [] if args.marks is None else read_marks(args.marks, flights)
     out += [] if args.distances is None else read_distances(args.distances, flights[0].anchors)
@@ -344,12 +339,12 @@ def known_of(args: Namespace, flights: Sequence[Flight]) -> tuple[Mark | Distanc
 
 
 def with_parameters(config: FilterConfig, texts: Iterable[str]) -> FilterConfig:
-    """A FilterConfig with the values of texts "name:=value". Raises InputError."""
+    """Return a FilterConfig with the values of texts "name:=value". Raises InputError."""
     return replace(config, **dict(map(_parameter, texts)))
 
 
 def _parameter(text: str) -> tuple[str, Any]:
-    """(name, value) of "name:=value"."""
+    """Return (name, value) of "name:=value"."""
     name, assigned, value = text.partition(":=")
     names = [field.name for field in fields(FilterConfig)]
     if not assigned or name not in names:

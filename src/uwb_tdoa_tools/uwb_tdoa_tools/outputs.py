@@ -1,5 +1,6 @@
-"""What a command writes: its options have one of these types, and are checked before the work. No
-output follows a link, or changes an input or a bag.
+"""Check the outputs of a command before the work. An output must not change an input or a bag.
+
+The types below mark options that name outputs. No output follows a link.
 
     add("--json", metavar="FILE", type=OutputFile)
     add("--out", metavar="DIR", type=OutputFolder)
@@ -16,6 +17,8 @@ from pathlib import Path
 import tempfile
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.files import keeping, refuse_output
 
@@ -25,28 +28,31 @@ if TYPE_CHECKING:
 
 
 class Output(type(Path())):  # type: ignore[misc]  # the kind of path of this system: Path itself has no subclasses before Python 3.12
-    """Path of what a command writes."""
+    """Path of an output."""
 
 
 class OutputFile(Output):
-    """A file; its folder is there."""
+    """A file in an existing folder."""
 
 
 class OutputFolder(Output):
-    """A folder that is made where it is not there."""
+    """A folder, which the command makes if needed."""
 
 
 class OutputBag(Output):
-    """A bag, which `bags.files.check_output` looks at, too."""
+    """A bag, which `bags.files.check_output` checks too."""
 
 
 def checked(args: Namespace) -> AbstractContextManager[None]:
-    """A context in which nothing is written over what the other options name. Raises InputError for
-    an output that cannot be written, is reached over a link, or would change what is read or a bag.
+    """Check all outputs, and return a context that protects the paths of the other options.
+
+    Raises
+    ------
+    InputError
+        If an output cannot be written, is reached over a link, or would change an input or a bag.
     """
-    values = list(
-        _flat(value for name, value in vars(args).items() if name != "ros_arguments")
-    )  # which hold the whole command line
+    # ros_arguments hold the whole command line.
+    values = list(_flat(value for name, value in vars(args).items() if name != "ros_arguments"))
     outputs = [value for value in values if isinstance(value, Output)]
     inputs = [Path(value) for value in values if not isinstance(value, Output) and _is_there(value)]
     with keeping(inputs):
@@ -103,7 +109,7 @@ def _refuse_bag(path: Path, folder: Path) -> None:
 
 
 def _check_writable(path: Path, folder: Path) -> None:
-    """Raise InputError unless a file can be made in the folder, for the sake of path; leaves none."""
+    """Raise InputError unless a file can be made in the folder. Leaves no file."""
     try:
         with tempfile.TemporaryFile(dir=folder):
             pass
@@ -111,3 +117,18 @@ def _check_writable(path: Path, folder: Path) -> None:
         raise InputError(
             f"{path}: cannot be written ({error.strerror}: {folder}); give another place."
         ) from error
+
+
+def as_json(value: Any) -> Any:
+    """Convert a value, or nested dicts and sequences, to JSON: NaN and infinity are null, arrays lists."""
+    if isinstance(value, dict):
+        return {str(key): as_json(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return [as_json(item) for item in value]
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value)
+    if isinstance(value, (int, np.integer)):
+        return int(value)
+    if isinstance(value, (float, np.floating)):
+        return float(value) if np.isfinite(value) else None
+    return value

@@ -1,11 +1,13 @@
-"""One function over many flights, on every core of this machine or on a Dask cluster that is
-already there.
+"""Run one function over many flights, on every core or on an existing Dask cluster; show progress.
 
     parallel.add_options(parser)                                         # --jobs, --dask
     for row in parallel.over(judge, found, args.jobs, args.dask):        # in the order of `found`
+        ...
+    with Progress("diagnose") as progress:                               # a thread prints
+        progress("looking at ids")
 
-Processes are kept from one call to the next, if each ends of itself: whoever stops before the last
-result ends them too.
+The processes are kept for later calls if each call ends normally. A caller that stops before the
+last result ends them too.
 """
 
 from __future__ import annotations
@@ -16,29 +18,125 @@ from functools import cache
 import os
 import signal
 import sys
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from threading import Event, Thread
+import time
+from typing import TYPE_CHECKING, Any, Protocol, TextIO, TypeVar
 import warnings
 
 from joblib import Parallel, cpu_count, delayed, parallel_config
+from tqdm import tqdm
 
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.executable import elsewhere
 
-from .progress import Progress
-
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
 
-CONNECT_LIMIT = 10.0  # s for a Dask scheduler to answer
 
 Item = TypeVar("Item")
+
+FIRST, EVERY = 0.5, 4.0  # s until the first line where there is no terminal, and between two
+OFTEN = 0.5  # s between two changes of the line on a terminal
+
+
+class Progress:
+    """Show the current work, its share and its duration until the context ends.
+
+    On a terminal tqdm updates one line. Elsewhere a line appears every few seconds, which tqdm cannot
+    do. Work shorter than FIRST prints nothing. Call it with the current work as often as you like.
+    """
+
+    def __init__(
+        self,
+        name: str = "",
+        total: int | None = None,
+        unit: str = "",
+        stream: TextIO | None = None,
+        what: str = "",
+    ) -> None:
+        """Set the texts.
+
+        Parameters
+        ----------
+        name : str
+            Beginning of each line.
+        total : int or None
+            Number of units to process.
+        unit : str
+            Name of a unit.
+        stream : file or None
+            Default: stderr.
+        what : str
+            The first work.
+        """
+        self._name, self._total, self._unit, self._stream = name, total, unit, stream
+        self._what, self._done, self._ended = what, 0, Event()
+
+    def __call__(self, what: str) -> None:
+        self._what = what
+
+    def update(self) -> None:
+        """Count another unit as done."""
+        self._done += 1
+        if self._bar is not None and self._total is not None:
+            self._bar.update()
+
+    def over(self, items: Iterable[Item], what: str) -> Iterator[Item]:
+        """Yield the items, and show how many are done."""
+        items = list(items)
+        for done, item in enumerate(items):
+            self(f"{what}, {done} of {len(items)} done")
+            yield item
+        self(f"{what} done, finishing")
+
+    def __enter__(self) -> Progress:
+        stream = self._stream or sys.stderr
+        self._start, self._bar = time.monotonic(), None
+        if stream.isatty():
+            form = (
+                {"bar_format": "{desc}"}
+                if self._total is None
+                else {"desc": self._name or None, "unit": self._unit}
+            )
+            self._bar = tqdm(total=self._total, file=stream, leave=False, **form)
+        self._thread = Thread(target=self._tell, args=(stream,), daemon=True)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._thread.join()
+        if self._bar is not None:
+            self._bar.close()
+
+    def _tell(self, stream: TextIO) -> None:
+        """Print lines until the end, in a separate thread."""
+        pause = FIRST if self._bar is None else OFTEN
+        while not self._ended.wait(pause):
+            if self._bar is None:
+                pause = EVERY
+                print(self._line(), file=stream, flush=True)
+            elif self._total is None:
+                self._bar.set_description_str(self._line())
+            else:
+                self._bar.refresh()
+
+    def _line(self) -> str:
+        share = f"{self._done} of {self._total} {self._unit}s done" if self._total else ""
+        parts = filter(None, (self._what, share, f"{time.monotonic() - self._start:.0f} s"))
+        return f"{self._name}: " * bool(self._name) + ", ".join(parts)
+
+
+pass
+
+
+CONNECT_LIMIT = 10.0  # s for a Dask scheduler to answer
+
 Made = TypeVar("Made")
 
 
 class MapFunction(Protocol):
-    """What gives function(item) of every item, in their order: as `map` does, but for the time and
-    the process in which each is done.
-    """
+    """Compute function(item) of every item, in order, as `map` does; elsewhere or at the same time."""
 
     def __call__(
         self, function: Callable[[Item], Made], items: Iterable[Item], /
@@ -64,9 +162,10 @@ def add_options(parser: argparse._ActionsContainer) -> None:
     )
 
 
-def asked(args: argparse.Namespace, count: int, few: int) -> tuple[int | None, str | None]:
-    """(jobs, dask) for several calls of `over`, about `count` items: as args ask for; else as many
-    jobs as there are cores and items, one for fewer items than `few`.
+def workers_for(args: argparse.Namespace, count: int, few: int) -> tuple[int | None, str | None]:
+    """Return (jobs, dask) for several calls of `over`, about `count` items.
+
+    Without options there are as many jobs as cores and items, and one for fewer items than `few`.
     """
     if args.jobs or args.dask:
         return args.jobs, args.dask
@@ -80,13 +179,28 @@ def over(
     dask: str | None = None,
     unit: str | None = "flight",
 ) -> Iterator[Made]:
-    """Generator of function(item) for every item, in order; prints meanwhile how many are done.
+    """Yield function(item) for every item, in order, and show how many are done.
 
-    To be called in the main thread. function, items, results : what pickle takes; jobs : processes,
-    default one per core, and no more than items; dask : address of a scheduler; unit : of what is
-    printed, None to print nothing. The first item runs in this process, so that what has to be
-    compiled is compiled once, and is in numba's cache when the others start. What the function
-    raises is raised here. Raises InputError where there is no Dask.
+    Call it in the main thread. The first item runs in this process: numba compiles once, and its
+    cache is filled when the other processes start.
+
+    Parameters
+    ----------
+    function : callable
+        Can be pickled, as the items and the results. Its exceptions are raised here.
+    items : iterable
+        Arguments, one for each call.
+    jobs : int or None
+        Number of processes; default one per core, at most one per item.
+    dask : str or None
+        Address of a Dask scheduler.
+    unit : str or None
+        Name of an item in the progress; None shows no progress.
+
+    Raises
+    ------
+    InputError
+        If the Dask scheduler does not answer.
     """
     items = list(items)
     with Progress(total=len(items), unit=unit) if unit and items else nullcontext() as progress:
@@ -100,30 +214,21 @@ def _results(
     function: Callable[[Item], Made], items: list[Item], jobs: int | None, dask: str | None
 ) -> Iterator[Made]:
     first, rest = items[:1], items[1:]
-    count = jobs or min(
-        cpu_count(), len(rest)
-    )  # of `jobs` as many as asked for: with another number, all are started anew
+    # Always exactly `jobs` if given: with another number, joblib restarts all processes.
+    count = jobs or min(cpu_count(), len(rest))
     if not rest or (min(count, len(rest)) == 1 and dask is None):
         yield from map(function, items)
         return
-    os.environ["PYTHONSAFEPATH"] = (
-        # for processes that joblib starts later, as Python 3.11 and newer understand it; see
-        # `elsewhere`
-        "1"
-    )
+    # For processes that joblib starts later, with Python 3.11 and newer; see `elsewhere`.
+    os.environ["PYTHONSAFEPATH"] = "1"
     with _cluster(dask) as backend:
 
         def spread(calls: Iterable[Any]) -> Any:
-            with parallel_config(
-                **backend
-            ):  # not around the loop: the caller's own use of joblib is its own affair
-                # Arrays go as they are: numba compiles anew for those mapped from files, which
-                # cannot be written to.
+            with parallel_config(**backend):  # not around the loop: the caller may use joblib too
+                # Arrays are not mapped from files: numba compiles again for read-only arrays.
                 pool = Parallel(count, return_as="generator", batch_size=1, max_nbytes=None)
-            with (
-                _children_ignore_interrupts(),
-                elsewhere(),
-            ):  # joblib starts Python by -m, which looks for modules in the present folder
+            # joblib starts Python by -m, which looks for modules in the present folder.
+            with _children_ignore_interrupts(), elsewhere():
                 return pool(calls)
 
         folder = os.getcwd() if dask is None else None
@@ -141,9 +246,7 @@ def _results(
 
 
 def _import(function: Callable[..., object]) -> None:
-    """For a process that starts while the first item is done here: to have been handed `function`
-    has imported it.
-    """
+    """Import `function` by unpickling it, in a process that starts while the first item runs here."""
 
 
 @contextmanager
@@ -152,15 +255,16 @@ def _closing(outcomes: Any) -> Iterator[Any]:
         yield outcomes
     finally:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of what is not done and nobody wants any more
+            warnings.simplefilter("ignore")  # about cancelled work
             outcomes.close()
 
 
 def _attempt(
     function: Callable[[Item], Made], item: Item, folder: str | None
 ) -> tuple[Made | None, Exception | None]:
-    """(result, None), or (None, what cli tells in one sentence): else joblib would raise it before
-    earlier results. folder : in which paths of the item are, or None.
+    """Return (result, None), or (None, an error that cli reports): else joblib raises it too early.
+
+    folder : folder of relative paths in the item, or None.
     """
     try:
         if folder is not None:
@@ -172,12 +276,9 @@ def _attempt(
 
 @contextmanager
 def _children_ignore_interrupts() -> Iterator[None]:
-    """What is started in the block does not hear Ctrl-C: this process does, and ends them without
-    their tracebacks.
-    """
-    before = signal.signal(
-        signal.SIGINT, signal.SIG_IGN
-    )  # inherited; a mask would not do: joblib clears it
+    """Start processes that ignore Ctrl-C. This process handles it, and ends them without tracebacks."""
+    # Children inherit this; joblib would clear a mask.
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
         yield
     finally:
@@ -186,7 +287,7 @@ def _children_ignore_interrupts() -> Iterator[None]:
 
 @contextmanager
 def _cluster(address: str | None) -> Iterator[dict[str, Any]]:
-    """Arguments for parallel_config while the block lasts: none for this machine."""
+    """Yield arguments for parallel_config while the block lasts: none for this machine."""
     if address is None:
         yield {}
         return
@@ -198,9 +299,8 @@ def _cluster(address: str | None) -> Iterator[dict[str, Any]]:
             "--dask: needs dask.distributed, which is not installed; pip install distributed."
         ) from error
     try:
-        get_address_host_port(
-            address
-        )  # raises ValueError; Client would too, but not end well; TypeError without certificates
+        # Raises ValueError as Client does, which would not end well; TypeError: no certificates.
+        get_address_host_port(address)
         client = Client(address, timeout=CONNECT_LIMIT, set_as_default=False)
     except (OSError, TypeError, ValueError) as error:
         reason = str(error).splitlines()[0]
@@ -214,9 +314,7 @@ def _cluster(address: str | None) -> Iterator[dict[str, Any]]:
 
 @cache  # once
 def _say_whom_it_trusts(address: str) -> None:
-    """Say that a connection is not encrypted: what Dask sends are pickles, which run code where
-    they are read.
-    """
+    """Warn that a connection is not encrypted: Dask sends pickles, which run code where they are read."""
     if not address.startswith(("tls://", "wss://")):
         print(
             f"--dask: {address} is not encrypted: whoever reaches it, or can change what is "
@@ -227,7 +325,7 @@ def _say_whom_it_trusts(address: str) -> None:
 
 
 def whole_number(text: str) -> int:
-    """Above 0, for argparse."""
+    """Return a whole number above 0, for argparse."""
     if not text.isdecimal() or int(text) == 0:
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number above 0")
     return int(text)

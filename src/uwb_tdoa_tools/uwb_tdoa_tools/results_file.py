@@ -1,13 +1,12 @@
-"""Results of long work in a file, each as a line of JSON as soon as it is there: what was
-interrupted goes on where it was.
+"""Keep the results of long work in a file, a line of JSON each: interrupted work continues there.
 
-    with ResultsFile(path, {"seed": 1}) as done:            # what they depend on, besides their keys
+    with ResultsFile(path, {"seed": 1}) as done:            # the settings, besides the keys
         for key in (key for key in keys if key not in done):
             done[key] = work(key)
         results = [done[key] for key in keys]
 
-The first line is what was asked for; every other one is {"key": ..., "result": ...}. Results stay
-in the file: only the places of their lines are held.
+The first line holds the settings, each other line {"key": ..., "result": ...}. Results stay in the
+file; memory holds only the places of the lines.
 """
 
 from __future__ import annotations
@@ -41,15 +40,23 @@ LINE = 64 << 20  # bytes of one result
 
 
 class ResultsFile:
-    """Results by their keys, texts, in the file `path`; one that is not there is made.
+    """Results by keys (texts), in the file `path`, which is made if needed.
 
-    Results are what JSON takes, no NaN.
+    Results are values for JSON, without NaN.
     """
 
     def __init__(self, path: str | Path, asked: dict[str, Any]) -> None:
-        """asked : dict for JSON, all that results depend on besides their keys. Raises InputError
-        if the file holds something else, or results that were made by another version, or with
-        something else asked for.
+        """Open the file.
+
+        Parameters
+        ----------
+        asked : dict
+            Settings, for JSON: all that results depend on besides their keys.
+
+        Raises
+        ------
+        InputError
+            If the file holds other content, or results of another version or other settings.
         """
         self._path = Path(path)
         self._places: dict[str, int] = {}  # of the lines, by their keys
@@ -106,7 +113,7 @@ class ResultsFile:
         return self._parsed(self._file.readline())["result"]
 
     def read(self, key: str, parse: Callable[[Any], Made]) -> Made:
-        """parse(result). Raises InputError where that fails: anybody may have written the file."""
+        """Return parse(result). Raises InputError if that fails: anybody may have written the file."""
         try:
             return parse(self[key])
         except (
@@ -130,8 +137,16 @@ class ResultsFile:
         make: Callable[[Iterable[Item]], Iterable[object]],
         unit: str,
     ) -> Iterator[str]:
-        """Generator of keys, in turn, each when its result is here. make(items) : results of those
-        that are not there, in order; unit : what items are called, in words.
+        """Yield the keys in order, each when its result is in the file.
+
+        Parameters
+        ----------
+        keys, items : sequence
+            Keys, and the items from which `make` computes their results.
+        make : callable
+            make(items) yields the results of the missing items, in order.
+        unit : str
+            Name of the items, in words.
         """
         missing = {key: item for key, item in zip(keys, items) if key not in self}
         if len(missing) < len(items):
@@ -156,7 +171,7 @@ class ResultsFile:
         self._file.close()
 
     def _append(self, content: dict[str, Any]) -> int:
-        """Place of a line that is written at the end."""
+        """Write a line at the end, and return its place."""
         place = self._file.seek(0, os.SEEK_END)
         self._file.write(json.dumps(content, allow_nan=False).encode() + b"\n")
         self._file.flush()
@@ -178,8 +193,10 @@ class ResultsFile:
 
 
 def resumed(over: MapFunction, done: ResultsFile) -> MapFunction:
-    """over(function, items), as of `parallel.over`, that takes from a ResultsFile what is there, by
-    the name of the function and the place of the item, and keeps there what is not.
+    """Return a map function as `parallel.over` that takes present results from a ResultsFile.
+
+    Missing results are computed by `over` and kept in the file. The key is the name of the function
+    and the place of the item.
     """
 
     def over_missing(function: Callable[[Item], Made], items: Iterable[Item]) -> Iterator[Made]:
@@ -191,8 +208,8 @@ def resumed(over: MapFunction, done: ResultsFile) -> MapFunction:
     return over_missing
 
 
-def state_of(path: str | Path | None) -> str:
-    """What changes when a file or a folder of files does: a text; of None "None".
+def fingerprint_of(path: str | Path | None) -> str:
+    """Return a text that changes if a file, or a folder of files, changes; "None" for None.
 
     Raises OSError and InputError.
     """
@@ -209,11 +226,17 @@ def state_of(path: str | Path | None) -> str:
     )
 
 
-def asked_of(
+def settings_of(
     args: Namespace, besides: Iterable[str] = (), files: Iterable[str] = ()
 ) -> dict[str, Any]:
-    """What was asked of a command: {option: value}, JSON. besides : names of options that do not
-    matter; files : of those that name files, whose content counts. Raises OSError.
+    """Return the settings of a command, {option: value} for JSON. Raises OSError.
+
+    Parameters
+    ----------
+    besides : iterable of str
+        Options without influence on the results.
+    files : iterable of str
+        Options that name files whose content counts.
     """
     given = {name: value for name, value in vars(args).items() if name not in besides}
     asked = {

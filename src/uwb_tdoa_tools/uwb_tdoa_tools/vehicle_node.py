@@ -57,38 +57,39 @@ PARAMETERS = {  # in the order of config/vehicle_node.yaml
     "seed": Parameter(1, "of all that is random, as of fly", 0, 2**31 - 1),
     "told": Parameter(
         "place",
-        "what it tells the filter at the start: its place and yaw, to 0.1 m and 0.1 rad",
+        "prior that the filter gets at the start: its place and yaw, to 0.1 m and 0.1 rad",
         choices=("nothing", "place"),
     ),
     "aids": Parameter([""], f'what else it measures, of {", ".join(AIDS)}; [""] for nothing'),
     "mission": Parameter(
         False,
         (
-            "fly the standard mission, say what became of it, and end, with exit code 1 unless it "
+            "fly the standard mission, publish the verdict, and end, with exit code 1 unless it "
             "has landed"
         ),
     ),
     "simulated_time": Parameter(
-        False, "publish /clock, and go on when the odometry is there; else in real time"
+        False, "publish /clock, and continue when the odometry is there; else in real time"
     ),
     "duration": Parameter(600.0, "s; how long it can be flown, without the mission", 10.0, 1800.0),
     "frozen": FROZEN,
 }
-SETTLE = 1.0  # s from when somebody listens until what they say to each other is heard, too
+SETTLE = 1.0  # s from the first subscription until the other nodes have discovered each other
 
 
 class VehicleNode(StreamNode):
-    """A Trial on topics, and services for who flies it."""
+    """A Trial on topics, with services to command it."""
 
     NAME = "vehicle_node"
 
     def __init__(self, arguments: Sequence[str] = ()) -> None:
-        """arguments : of the process."""
+        """Declare the parameters, and wait for listeners. arguments : of the process."""
         super().__init__(self.NAME)
         own = declare_all(self, PARAMETERS)
         refuse_unknown(self)
         self._mission, aids = own["mission"], [name for name in own["aids"] if name]
-        if unknown := sorted(set(aids) - set(AIDS)):
+        unknown = sorted(set(aids) - set(AIDS))
+        if unknown:
             raise InputError(f"aids: {unknown[0]!r} is not one of {', '.join(AIDS)}.")
         drives = own["vehicle"] == "rover"
         if drives and (aids or not self._mission):
@@ -112,9 +113,7 @@ class VehicleNode(StreamNode):
                 self.create_service(Land, "land", self._on_land),
             ]
         )
-        self._starts: float | None = (
-            None  # time.monotonic(), s, when it begins, once somebody listens
-        )
+        self._starts: float | None = None  # time.monotonic() of the start, s, after a subscription
         say_unused([self], files_of(arguments))
         self.turns = RoundRobin([self])
         self.get_logger().info(
@@ -151,7 +150,7 @@ class VehicleNode(StreamNode):
             raise SystemExit(int(not reached(verdict)))
 
     def _answer(self, response: Any, command: Callable[..., None], *values: object) -> Any:
-        """Do what a request says, or say why not."""
+        """Execute a request, or state why not in the response."""
         try:
             command(*values)
             response.success = True

@@ -8,13 +8,13 @@ from . import inertial, labels, stamps, truth, values
 @dataclass(frozen=True)
 class Fault:
     """put_in(flight, rng) -> Flight; rules : that name it; inertial : needs a flight with inertial
-    samples; of_truth : spoils the ground truth, not the estimate.
+    samples; judge_truth : spoils the ground truth, not the estimate.
     """
 
     put_in: object
     rules: tuple
     inertial: bool = False
-    of_truth: bool = False
+    judge_truth: bool = False
 
 
 def _all_faults():
@@ -77,8 +77,8 @@ def _all_faults():
         Fault(inertial.of_sensor("gyro", inertial.in_degrees), ("imu_rate_unit",), True),
     )
     yield "accel_unit", Fault(inertial.of_sensor("accel", inertial.in_g), ("imu_force_unit",), True)
-    yield "truth_hole", Fault(truth.hole, ("truth_hole",), of_truth=True)
-    yield "truth_leap", Fault(truth.leap, ("truth_leap",), of_truth=True)
+    yield "truth_hole", Fault(truth.hole, ("truth_hole",), judge_truth=True)
+    yield "truth_leap", Fault(truth.leap, ("truth_leap",), judge_truth=True)
     yield "truth_attitude", Fault(truth.attitude, ("truth_attitude",), True, True)
 
 

@@ -1,1 +1,1 @@
-"""What a driver may get wrong, found in a recording before anything else is done with it."""
+"""Find mistakes of drivers, surveys and clocks in recordings, before anything else uses them."""

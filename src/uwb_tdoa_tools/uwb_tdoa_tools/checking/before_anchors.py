@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from .. import cli
-from ..progress import Progress
+from ..parallel import Progress
 from . import report
 from .check import check
 from .recording import read_recording

@@ -1,4 +1,4 @@
-"""check: all rules over one recording, in the order in which one mistake hides another."""
+"""Apply all rules to one recording, in the order in which one mistake hides another."""
 
 from __future__ import annotations
 
@@ -12,10 +12,9 @@ from uwb_tdoa_ekf.streams import ERROR, NOTE, WARNING, Finding, StreamRules, mos
 
 from ..estimate import FlightEstimator
 from ..readers.streams import protocol
-from . import coverage, imu_rules, labels, tag_delay, tdoa_rules, wiring
-from .ordered import OrderedRecording
-from .survey_fit import displacement
-from .tdoa_rules import SAME, furthest
+from . import coverage, imu_rules, recording_rules, tdoa_rules
+from .ordered import OrderedRecording, displacement
+from .tdoa_rules import SAME, largest_displacement
 from .watch import found_by_monitor, together
 
 if TYPE_CHECKING:
@@ -23,13 +22,13 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.foundation.anchors import Anchors
 
-    from ..live.ends import End
+    from ..live.record import End
+    from .ordered import SurveyFit
     from .recording import Recording
-    from .survey_fit import SurveyFit
     from .tdoa_rules import Survey
 
 ROUNDS = 3  # mistakes that are undone one after the other
-# Where one of these stands, nothing, or not the IMU, can be tried.
+# After one of these findings no correction, or none of the IMU, can be tried.
 NOTHING_TO_TRY = {
     "stamps_zero",
     "stamps_stand",
@@ -45,10 +44,10 @@ WITHOUT_IMU = {"imu_silent", "imu_no_gravity", "imu_axis_dead", "imu_tilted", "i
 OTHER_SURVEY = (
     "give --survey a folder of all surveys: check says which one fits; or survey the anchors again"
 )
-# What a survey of another room is taken for: many things explain some of it, and it does not fit
-# with them undone either.
+# Findings that a survey of another room causes. Each explains a part, and with it undone the survey
+# still does not fit.
 BLAMED = {"tdoa_sign", "ids_swapped", "pair_sign", "tdoa_one_sign", "anchor_moved"}
-# What a finding explains that the stream itself only shows.
+# Findings of the streams that another finding explains.
 EXPLAINS = {
     "tdoa_unit": {"tdoa_unit", "tdoa_large", "tdoa_outliers", "tdoa_rounded"},
     "ids_renumbered": {"ids_unknown", "anchor_missing"},
@@ -61,7 +60,7 @@ EXPLAINS = {
 
 
 class NamedAnchors(Protocol):
-    """What has a name and Anchors: a Recording, or a Flight."""
+    """A Recording or a Flight: an object with a name and Anchors."""
 
     @property
     def name(self) -> str: ...
@@ -72,8 +71,18 @@ class NamedAnchors(Protocol):
 
 @dataclass(frozen=True)
 class Report:
-    """recording : its name; findings : [Finding], most severe first; facts : {what: text}, what was
-    heard; ends : [End] of live topics.
+    """Result of `check`.
+
+    Attributes
+    ----------
+    recording : str
+        Name of the recording.
+    findings : list of Finding
+        Most severe first.
+    facts : dict
+        {quantity: text}: rates, duration, anchors, protocol.
+    ends : tuple of End
+        Publishers and subscriptions of live topics.
     """
 
     recording: str
@@ -83,7 +92,7 @@ class Report:
 
     @property
     def faulty(self) -> bool:
-        """True if there is an error."""
+        """Return whether there is an error."""
         return any(finding.severity == ERROR for finding in self.findings)
 
 
@@ -93,35 +102,51 @@ def check(
     estimator: FlightEstimator = FlightEstimator(),
     line: str | None = None,
 ) -> Report:
-    """Report of a Recording. others : [(name, Anchors)] of other surveys that might be the right
-    one; estimator : FlightEstimator, with what is calibrated; line : command that surveys the
-    anchors with the recording, or None.
+    """Return the Report of a Recording.
+
+    Parameters
+    ----------
+    recording : Recording
+        The streams.
+    others : sequence of (name, Anchors)
+        Other surveys that may fit.
+    estimator : FlightEstimator
+        Estimator with the calibrated effects.
+    line : str or None
+        Command line that surveys the anchors with the recording.
     """
-    streams = fed(recording)
-    found = [*streams.findings(), *sensors(recording)]
-    for rule in (*labels.RULES, *wiring.RULES, *tag_delay.RULES):
+    streams = processed_streams(recording)
+    found = [*streams.findings(), *sensor_findings(recording)]
+    for rule in recording_rules.RULES:
         found += rule(recording)
-    if any(
-        finding.rule == "clock_silence" for finding in found
-    ):  # which says the same of all streams
+    if any(finding.rule == "clock_silence" for finding in found):  # the gap of all streams
         found = [finding for finding in found if finding.rule != "gap"]
-    if not len(recording.tdoa):  # of ranges alone: nothing else is there to be tried
-        return Report(
-            recording.name, most_severe_first(found), _facts(recording, streams), recording.ends
-        )
+    if len(recording.tdoa):  # with ranges alone, nothing can be tried
+        found = _with_trials(recording, streams, found, others, estimator, line)
+    return Report(
+        recording.name, most_severe_first(found), _facts(recording, streams), recording.ends
+    )
+
+
+def _with_trials(
+    recording: Recording,
+    streams: StreamRules,
+    found: list[Finding],
+    others: Sequence[Survey],
+    estimator: FlightEstimator,
+    line: str | None,
+) -> list[Finding]:
+    """Return the findings of the streams, of trials, and about coverage, without those explained."""
     names = {finding.rule for finding in found}
     places, explained, track = np.empty((0, 3)), set(), None
     if names & NOTHING_TO_TRY:
-        cause, remedy = (
-            "sign, ids, survey and axes were not tried",
-            "put the errors right, record again, and check again",
-        )
-        found.append(
-            Finding("not_tried", NOTE, cause, "the streams are of no use for that", remedy, np.nan)
-        )
+        cause = "sign, ids, survey and axes were not tried"
+        evidence = "the streams are of no use for that"
+        remedy = "put the errors right, record again, and check again"
+        found.append(Finding("not_tried", NOTE, cause, evidence, remedy, np.nan))
     else:
-        ordered = _undone(OrderedRecording.of(recording), found)
-        tried, places = _tried(ordered, names, others)
+        ordered = _without_stream_mistakes(OrderedRecording.of(recording), found)
+        tried, places = _try_corrections(ordered, names, others)
         flight = ordered.flight().replaced(**recording.sensors)
         run = replace(estimator, smoothed=False)(flight)
         track = run.odometry.t, run.odometry.p
@@ -134,15 +159,13 @@ def check(
     view = coverage.CoverageView(
         recording.anchors, list(streams.tdoa), places, "height" in recording.sensors, track
     )
-    for covered in coverage.RULES:
-        found += (finding for finding in covered(view) if finding.rule not in explained)
-    return Report(
-        recording.name, most_severe_first(found), _facts(recording, streams), recording.ends
-    )
+    for rule in coverage.RULES:
+        found += (finding for finding in rule(view) if finding.rule not in explained)
+    return found
 
 
-def fed(recording: Recording) -> StreamRules:
-    """StreamRules that have seen all of a Recording."""
+def processed_streams(recording: Recording) -> StreamRules:
+    """Return StreamRules that have processed a whole Recording."""
     streams, imu, tdoa = StreamRules(recording.anchors), recording.imu, recording.tdoa
     if imu is not None:
         streams.feed_imu(imu.t, recording.imu_arrival, imu.gyro, imu.accel)
@@ -151,11 +174,12 @@ def fed(recording: Recording) -> StreamRules:
     return streams
 
 
-def sensors(recording: Recording) -> Iterator[Finding]:
-    """Findings about the Streams of a Recording, by the rules of their SENSORS."""
+def sensor_findings(recording: Recording) -> Iterator[Finding]:
+    """Yield findings about the Streams of a Recording, by the rules of their SENSORS."""
     for name, stream in recording.sensors.items():
         for rule in SENSORS[name].rules:
-            if (found := rule(stream, recording.anchors)) is not None:
+            found = rule(stream, recording.anchors)
+            if found is not None:
                 yield Finding(
                     found.rule,
                     ERROR if found.severe else WARNING,
@@ -166,10 +190,8 @@ def sensors(recording: Recording) -> Iterator[Finding]:
                 )
 
 
-def _undone(ordered: OrderedRecording, found: list[Finding]) -> OrderedRecording:
-    """The OrderedRecording without the mistakes that the streams show themselves, so that it can be
-    tried.
-    """
+def _without_stream_mistakes(ordered: OrderedRecording, found: list[Finding]) -> OrderedRecording:
+    """Return the OrderedRecording without the mistakes that the streams show directly."""
     for finding in found:
         if finding.rule == "survey_scale":
             ordered = replace(
@@ -177,7 +199,8 @@ def _undone(ordered: OrderedRecording, found: list[Finding]) -> OrderedRecording
             )
         elif finding.rule == "tdoa_wraps":
             ordered = ordered.possible()
-        if (imu := ordered.imu) is None:
+        imu = ordered.imu
+        if imu is None:
             continue
         if finding.rule == "imu_force_unit":
             ordered = ordered.with_imu(accel=imu.accel * finding.value)
@@ -192,22 +215,20 @@ def _undone(ordered: OrderedRecording, found: list[Finding]) -> OrderedRecording
 
 
 def upright(force: np.ndarray) -> np.ndarray:
-    """(3, 3) rotation by quarter turns that brings the axis along which `force` (3,) is largest to
-    +z.
-    """
+    """Return the rotation (3, 3) by quarter turns that moves the largest axis of `force` (3,) to +z."""
     k = int(np.argmax(np.abs(force)))
     up = np.sign(force[k]) * np.eye(3)[k]
     side = np.eye(3)[(k + 1) % 3]
     return np.stack([side, np.cross(up, side), up])
 
 
-def _tried(
+def _try_corrections(
     ordered: OrderedRecording, names: set[str], others: Sequence[Survey]
 ) -> tuple[list[Finding], np.ndarray]:
-    """([Finding], places of the tag (k, 3) m): what is found by undoing it."""
+    """Try corrections, and return ([Finding], positions of the tag (k, 3) m)."""
     found, given = [], ordered
     for _ in range(ROUNDS):
-        finding, ordered = tdoa_rules.best(ordered, others)
+        finding, ordered = tdoa_rules.best_trial(ordered, others)
         if finding is None:
             break
         found.append(finding)
@@ -215,7 +236,7 @@ def _tried(
     blamed = [finding for finding in found if finding.rule in BLAMED]
     if not found:
         found += _misfit(fit)
-    elif blamed and tdoa_rules.gained(fit) is not None:  # what was put right did not make it fit
+    elif blamed and tdoa_rules.gained(fit) is not None:  # the corrections did not make it fit
         found = [finding for finding in found if finding not in blamed]
         found += [*_misfit(given.survey_fit)] or [*_misfit(fit)]
     if (
@@ -223,20 +244,19 @@ def _tried(
         and not names & WITHOUT_IMU
         and not any(f.rule == "survey_misfit" for f in found)
     ):
-        finding = imu_rules.fit(ordered)
-        found += [finding] if finding else []
-        if finding and (
-            mixed := [other for other in found if other.cause.startswith(tdoa_rules.MIXED_UP)]
-        ):
-            found = [other for other in found if other is not finding and other not in mixed] + [
-                _other_room(*mixed)
-            ]
+        finding = imu_rules.find_imu_mistake(ordered)
+        mixed = [other for other in found if other.cause.startswith(tdoa_rules.MIXED_UP)]
+        if finding and mixed:
+            found = [other for other in found if other not in mixed] + [_other_room(*mixed)]
+        elif finding:
+            found.append(finding)
     return found, fit.places
 
 
 def _other_room(mixed: Finding) -> Finding:
-    """Many ids mixed up and a faulty inertial sensor at once: rather the survey of another room, of
-    which both are what it looks like.
+    """Return the finding of another room, instead of many exchanged ids and a faulty inertial sensor.
+
+    Both are what the survey of another room looks like.
     """
     cause = (
         "the survey is of another room, or its ids are mixed up: with many ids exchanged it "
@@ -246,7 +266,7 @@ def _other_room(mixed: Finding) -> Finding:
 
 
 def _misfit(fit: SurveyFit) -> Iterator[Finding]:
-    """A survey that fits much better with its anchors elsewhere, and not with one of them alone."""
+    """Yield a finding if the survey fits much better with several of its anchors moved."""
     gain = tdoa_rules.gained(fit)
     if gain is None and tdoa_rules.apparent_gain(fit) > tdoa_rules.GAIN:
         evidence = (
@@ -277,7 +297,7 @@ def _misfit(fit: SurveyFit) -> Iterator[Finding]:
 
 
 def _facts(recording: Recording, streams: StreamRules) -> dict[str, str]:
-    """What was heard, for people."""
+    """Return {quantity: text} of the received streams."""
     facts = {}
     for name, windows, unit in (("TDOAs", streams.tdoa, "Hz"), ("IMU", streams.imu, "Hz")):
         if windows:
@@ -302,11 +322,12 @@ def _facts(recording: Recording, streams: StreamRules) -> dict[str, str]:
 
 
 def different_surveys(recordings: Sequence[NamedAnchors]) -> Iterator[Finding]:
-    """Findings about Recordings whose surveys differ: anchors of one id that are elsewhere. Their
-    flights do not belong together.
+    """Yield findings about Recordings with different surveys: an id at two places.
+
+    Such flights do not belong together.
     """
     for one, two in zip(recordings, recordings[1:]):
-        off = furthest(one.anchors, two.anchors)
+        off = largest_displacement(one.anchors, two.anchors)
         if off > SAME:
             evidence = (
                 f"the same ids are up to {off:.2f} m apart"

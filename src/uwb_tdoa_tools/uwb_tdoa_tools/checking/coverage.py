@@ -1,4 +1,4 @@
-"""What the anchors and the motion of the tag let anybody know.
+"""Judge which positions the anchors and the motion of the tag determine.
 
 A rule takes a CoverageView and yields Findings.
 """
@@ -11,33 +11,87 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_ekf.core.workspace import FLAT
 from uwb_tdoa_ekf.monitoring.monitor import NEARER
 from uwb_tdoa_ekf.streams import NOTE, WARNING, Finding
 
-from .known_path import MANY
-from .sides import sides_of, to_copy
-from .survey_fit import SPREAD, spread
+from .ordered import SPREAD, spread
+from .pair_rules import MANY
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
     from uwb_tdoa_ekf.streams.ranging import TdoaWindow
 
-RARE = 0.2  # of what the anchors are heard in the middle; healthy 0.54 at least
+
+CEILING = 1.5  # m; anchors whose mean height is larger hang at a ceiling
+
+
+def sides_of(positions: np.ndarray) -> tuple[str, ...]:
+    """Return the possible values of `tag_side` for anchors in a plane across an axis of the world.
+
+    Parameters
+    ----------
+    positions : (n, 3) array
+        Anchors, m, world.
+
+    Returns
+    -------
+    tuple of str
+        ("below",), ("above",), ("+x", "-x"), ("+y", "-y"), or () if the anchors lie in no such plane or
+        in a line.
+    """
+    flat = np.ptp(positions, axis=0) < FLAT
+    if np.count_nonzero(flat) != 1:
+        return ()
+    if flat[2]:
+        return ("below",) if positions[:, 2].mean() > CEILING else ("above",)
+    axis = "xy"[int(np.argmax(flat))]
+    return f"+{axis}", f"-{axis}"
+
+
+def to_copy(sides: Sequence[str]) -> str:
+    """Return the remedy for possible sides, as a phrase."""
+    lines = " or ".join(f"-p tag_side:={side}" for side in sides)
+    which = (
+        ""
+        if len(sides) == 1
+        else f", whether the tag is at {'larger or smaller ' + sides[0][1:]} than they are"
+    )
+    return f"tell ekf_node the side, --ros-args {lines}{which} (tag_side in a file for --config)"
+
+
+pass
+
+
+RARE = 0.2  # share of the median rate of the anchors; healthy 0.54 at least
 SILENT = 5.0  # s for which an anchor that is heard otherwise is not
-FLAT = 0.08  # thickness of the constellation over its size; the measured rooms have 0.2 and more
+FLAT_SHARE = (
+    0.08  # thickness of the constellation over its size; the measured rooms have 0.2 and more
+)
 OUTSIDE, MARGIN = 0.5, 0.5  # share of the places of the tag, and m beyond the box of the anchors
 SHORT = 10.0  # s
-FEWEST = 3  # anchors that tell no plane
-SAID = 5  # anchors of many that are named
-PART = 0.2  # of the seconds in which the side is not known, beyond which that is said
+FEWEST = 3  # anchors, which always lie in a plane
+NAMED = 5  # missing anchors of a hall that the finding names
+PART = 0.2  # share of the seconds with an unknown side beyond which there is a finding
 
 
 @dataclass(frozen=True)
 class CoverageView:
-    """anchors : Anchors; windows : [TdoaWindow]; places (k, 3) m, where the tag was located, none
-    if that was not tried; height_known : whether something measures its height; track : (t (k,) s,
-    p (k, 3) m) of the tag, or None.
+    """Input of the rules.
+
+    Attributes
+    ----------
+    anchors : Anchors
+        The survey.
+    windows : list of TdoaWindow
+        Windows of a second.
+    places : (k, 3) array
+        Positions of the tag, m, world; empty if it was not located.
+    height_known : bool
+        Whether a sensor measures the height of the tag.
+    track : (t (k,) s, p (k, 3) m) or None
+        Trajectory of the tag.
     """
 
     anchors: Anchors
@@ -47,8 +101,18 @@ class CoverageView:
     track: tuple[np.ndarray, np.ndarray] | None = None
 
     def within_reach(self, heard: np.ndarray) -> np.ndarray:
-        """(W, N) bool: windows in which the tag is near enough to an anchor to hear it, by how far
-        away it hears others. heard (W, N) : TDOAs. All of them if the track is not known.
+        """Return in which windows the tag is near enough to each anchor to hear it.
+
+        The limit is the distance to the farthest anchor that it hears. Without a track, all are near.
+
+        Parameters
+        ----------
+        heard : (W, N) array
+            Number of TDOAs of each anchor in each window.
+
+        Returns
+        -------
+        (W, N) array of bool
         """
         if self.track is None or len(self.track[0]) < 2:
             return np.ones(heard.shape, bool)
@@ -58,20 +122,20 @@ class CoverageView:
         return away <= NEARER * np.max(away, where=heard > 0, initial=0.0)
 
 
-def missing(view: CoverageView) -> Iterator[Finding]:
-    """Anchors of the survey that are never, hardly ever or for a while not heard."""
+def unheard_anchors(view: CoverageView) -> Iterator[Finding]:
+    """Yield anchors of the survey that are never, hardly ever, or for a while not heard."""
     if not view.windows:  # a recording of less than a second
         return
     heard = np.array([window.heard for window in view.windows])
     counts = heard.sum(axis=0)
     near = view.within_reach(heard)
-    many = len(counts) > MANY  # a tag leaves most of them behind
+    many = len(counts) > MANY  # the tag passes out of the reach of most
     lost = view.anchors.ids[(counts == 0) & (many | near.any(axis=0))].tolist()
     if many:
         if lost:
             cause = (
                 f"the tag never hears {len(lost)} of {len(counts)} anchors, such as "
-                f"{', '.join(map(str, lost[:SAID]))}"
+                f"{', '.join(map(str, lost[:NAMED]))}"
             )
             remedy = (
                 "look whether they are on, if the tag was near them: localize --zones says who "
@@ -121,7 +185,8 @@ def missing(view: CoverageView) -> Iterator[Finding]:
 
 
 def _silence(windows: Sequence[TdoaWindow], heard: np.ndarray) -> tuple[float, float]:
-    """(first, last stamp or arrival) of the longest run of windows that are not `heard`, (W,) bool;
+    """Return (first, last stamp or arrival) of the longest run of windows that are not `heard` (W,).
+
     (0, 0) if there is none.
     """
     longest, begin = (0.0, 0.0), None
@@ -134,14 +199,15 @@ def _silence(windows: Sequence[TdoaWindow], heard: np.ndarray) -> tuple[float, f
     return longest
 
 
-def flat(view: CoverageView) -> Iterator[Finding]:
-    """Anchors in one plane, all or of a hall those that are heard at once, tell next to nothing
-    about the distance from it, and nothing about the side.
+def flat_anchors(view: CoverageView) -> Iterator[Finding]:
+    """Yield a finding if the anchors lie in one plane: in a hall, those that are heard together.
+
+    The distance from the plane is then poorly determined, and its sign not at all.
     """
     p = view.anchors.positions
     together = [p[window.heard > 0] for window in view.windows] if len(p) > MANY else [p]
     sizes = [_size_and_thickness(some) for some in together if len(some) > FEWEST]
-    found = [(size, thickness) for size, thickness in sizes if thickness < FLAT * size]
+    found = [(size, thickness) for size, thickness in sizes if thickness < FLAT_SHARE * size]
     if len(found) > PART * len(sizes):
         size, thickness = np.median(found, axis=0)
         evidence = f"they are within {thickness:.2f} m (rms) of a plane and {size:.1f} m across"
@@ -154,17 +220,15 @@ def flat(view: CoverageView) -> Iterator[Finding]:
 
 
 def _size_and_thickness(positions: np.ndarray) -> tuple[float, float]:
-    """m, largest and smallest standard deviation of positions (n, 3) along any direction."""
+    """Return the largest and smallest standard deviation of positions (n, 3) along a direction, m."""
     size, thickness = np.linalg.svd(positions - positions.mean(axis=0), compute_uv=False)[
         [0, 2]
     ] / np.sqrt(len(positions))
     return float(size), float(thickness)
 
 
-def side(view: CoverageView) -> Iterator[Finding]:
-    """Anchors in a plane across an axis of the world, all or those that are heard at once: the side
-    of it that the tag is on must be given.
-    """
+def unknown_side(view: CoverageView) -> Iterator[Finding]:
+    """Yield a finding if the anchors lie in a plane across an axis: the user must give the tag's side."""
     heard = [view.anchors.positions[window.heard > 0] for window in view.windows]
     sides = [
         sides_of(positions)
@@ -192,8 +256,8 @@ def side(view: CoverageView) -> Iterator[Finding]:
     )
 
 
-def below(view: CoverageView) -> Iterator[Finding]:
-    """Everything below zero: z down."""
+def survey_below_zero(view: CoverageView) -> Iterator[Finding]:
+    """Yield a finding if all anchors are below zero: z points down."""
     z = view.anchors.positions[:, 2]
     if z.max() <= 0.05 and np.ptp(z) > 0.5:
         evidence = f"heights from {z.min():.2f} to {z.max():.2f} m"
@@ -207,8 +271,8 @@ def below(view: CoverageView) -> Iterator[Finding]:
         )
 
 
-def outside(view: CoverageView) -> Iterator[Finding]:
-    """A tag beyond its anchors."""
+def tag_outside(view: CoverageView) -> Iterator[Finding]:
+    """Yield a finding if the tag is outside of its anchors."""
     p = view.anchors.positions
     if not len(view.places):
         return
@@ -228,8 +292,8 @@ def outside(view: CoverageView) -> Iterator[Finding]:
         )
 
 
-def still(view: CoverageView) -> Iterator[Finding]:
-    """A recording of which little can be learned."""
+def little_motion(view: CoverageView) -> Iterator[Finding]:
+    """Yield a finding if the tag hardly moves."""
     if not len(view.places):
         return
     moved = spread(view.places)
@@ -250,4 +314,4 @@ def still(view: CoverageView) -> Iterator[Finding]:
         )
 
 
-RULES = (missing, flat, side, below, outside, still)
+RULES = (unheard_anchors, flat_anchors, unknown_side, survey_below_zero, tag_outside, little_motion)

@@ -1,8 +1,8 @@
-"""Does the inertial sensor fit the TDOAs? Its axes are tried in every arrangement, its rates in
-other units: a filter that leans on the sensor says by its innovations what fits.
+"""Test whether the inertial sensor fits the TDOAs, and whether its values are clipped or smooth.
 
-What turns both sensors about the vertical cannot be seen, for the yaw is not known; nor can a sign
-about an axis about which the tag did not turn.
+Each arrangement of axes and each unit of the rates is tried: a filter that relies on the sensor
+shows by its innovations which one fits. A rotation of both sensors about the vertical cannot be
+seen, because the yaw is unknown. Nor can a sign about an axis about which the tag did not turn.
 """
 
 from __future__ import annotations
@@ -17,37 +17,80 @@ from uwb_tdoa_bias.foundation.flight import Imu
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.measurements import imu_rows
 from uwb_tdoa_ekf.core.memory import TDOA, structured
-from uwb_tdoa_ekf.streams import ERROR, Finding
+from uwb_tdoa_ekf.streams import ERROR, WARNING, Finding
 from uwb_tdoa_ekf.streams.explain import Unexplained, compare, unexplained
+from uwb_tdoa_ekf.streams.inertial_rules import AXES
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from uwb_tdoa_bias.foundation.flight import Flight
+
     from .ordered import OrderedRecording
 
-    # ratio of what stays unexplained, its standard errors; (3, 3) for the accelerometer, for the
-    # gyroscope
+    # ratio of the losses, its standard errors; (3, 3) for the accelerometer, for the gyroscope
     Arrangement = tuple[float, float, np.ndarray, np.ndarray]
+
+
+# samples at one end; factor over the mean count of the NEXT neighbouring values; healthy 1
+HITS, MORE, NEXT = 20, 5.0, 5
+# s; limit of the mean square of a step, over the least that the change in FAR permits. Healthy: 2.9
+# at least, except a smooth log of 0607, which fits its ground truth. Behind a low pass of 50 ms: 2.4.
+FAR, EVEN = 0.02, 2.6
+FEWEST = 10  # samples within FAR that a judgement needs
+
+
+def clipped_axes(flight: Flight) -> Iterator[Finding]:
+    """Yield a finding about an axis of a Flight with many samples at its largest or smallest value."""
+    assert flight.imu is not None
+    for name, column in zip(AXES, np.column_stack([flight.imu.gyro, flight.imu.accel]).T):
+        values, counts = np.unique(column, return_counts=True)
+        for ends, hits in ((values, counts), (values[::-1], counts[::-1])):
+            if len(ends) > NEXT and hits[0] >= HITS and hits[0] > MORE * hits[1 : 1 + NEXT].mean():
+                evidence = (
+                    f"{hits[0]} samples of {ends[0]:.2f}, {hits[1 : 1 + NEXT].mean():.0f} of each "
+                    "of the next values"
+                )
+                remedy = "set the sensor to a larger range"
+                yield Finding(
+                    "imu_clipped", WARNING, f"{name} is clipped", evidence, remedy, float(ends[0])
+                )
+                return
+
+
+def is_smooth(t: np.ndarray, values: np.ndarray) -> bool:
+    """Return whether a sensor changes so evenly, on all axes, as only behind a low pass.
+
+    The mean square of a step is then at least 1/k^2 of the mean square change in FAR, which k steps
+    span. False for a slow sensor, which does not show it.
+
+    Parameters
+    ----------
+    t : (n,) array
+        Stamps, s.
+    values : (n, 3) array
+        Readings.
+    """
+    steps = round(FAR / max(np.median(np.diff(t)), 1e-6))
+    if steps < FEWEST or len(t) <= steps:
+        return False
+    one = np.mean(np.diff(values, axis=0) ** 2, axis=0)
+    far = np.mean((values[steps:] - values[:-steps]) ** 2, axis=0)
+    return bool((one * steps**2 < EVEN * far).all())
+
 
 # s that are tried, to be sure and to choose; Hz to which the samples are averaged
 PART, BRIEF, RATE = 30.0, 14.0, 200.0
-SLOWEST = 50.0  # Hz; of fewer samples nothing is alleged
-# The filter leans on the IMU: TDOAs count for little, and the bias of the accelerometer may be
+SLOWEST = 50.0  # Hz; slower sensors are not judged
+# This filter relies on the IMU: TDOAs have little weight, and the bias of the accelerometer may be
 # large.
 LEANING = FilterConfig(tdoa_correlation_length=100.0, initial_accel_bias_std=0.5)
-RATIO, DEVIATIONS = (
-    0.9,
-    2.5,
-)  # of what stays unexplained; healthy flights: 0.98 at least for anything that is tried
-MOVED = (
-    0.3  # m, standard deviation of the places of a tag that moves; measured flights 1.2 at least
-)
-STEADY, TURNED = (
-    0.02,
-    0.3,
-    # share of the specific force by which it varies at rest; rad that a sensor in motion turns at least
-)
-TIE = 0.03  # ratios this close say the same: the simplest arrangement is taken
+# ratio of the remaining loss, and its standard errors; healthy flights: 0.98 at least in any trial
+RATIO, DEVIATIONS = 0.9, 2.5
+MOVED = 0.3  # m, standard deviation of positions in motion; measured flights 1.2 at least
+STEADY = 0.02  # share of the specific force by which it varies at rest
+TURNED = 0.3  # rad, least rotation in motion
+TIE = 0.03  # ratios this close are equal: the simplest arrangement is taken
 CHOSEN = 8  # arrangements that are tried on the longer part
 UPRIGHT, MIRROR = np.eye(3), np.diag([1.0, -1.0, 1.0])
 # Axes that are exchanged or mirrored, as (3, 3) matrices that undo it; the first is as it is.
@@ -55,23 +98,24 @@ ARRANGEMENTS = [
     np.diag(signs)[list(order)]
     for order, signs in product(permutations(range(3)), product((1.0, -1.0), repeat=3))
 ]
-# Of the gyroscope, and what it would be. (Degrees/s are seen in the stream itself.)
+# Factors of the gyroscope, and its unit then. (Degrees/s are seen in the stream itself.)
 SCALES = {
     180.0 / np.pi: "rad/s, divided by 57.3 once too often",
     2.0 * np.pi: "revolutions/s, not rad/s",
 }
 
 
-def fit(recording: OrderedRecording) -> Finding | None:
-    """What does not fit about the IMU: Finding or None. recording : OrderedRecording whose TDOAs
-    are right.
+def find_imu_mistake(recording: OrderedRecording) -> Finding | None:
+    """Return the Finding about axes or units of the IMU that do not fit the TDOAs, or None.
+
+    The TDOAs of the OrderedRecording must be right.
     """
     brief = replace(recording, imu=averaged(recording.imu)).part(PART)
     if (
         brief.imu is None
         or len(brief.imu) < SLOWEST * PART / 2.0
-        or stands(brief.imu)
-        or not moved(recording.survey_fit.places)
+        or is_at_rest(brief.imu)
+        or not has_moved(recording.survey_fit.places)
     ):
         return None
     base = _unexplained(brief)
@@ -92,16 +136,18 @@ def fit(recording: OrderedRecording) -> Finding | None:
     return _finding(accel, gyro, evidence, ratio)
 
 
-def moved(places: np.ndarray) -> bool:
-    """Whether a tag that was at places (k, 3) m has moved: of one that stands, TDOAs tell nothing
-    about the inertial sensor.
+def has_moved(places: np.ndarray) -> bool:
+    """Return whether a tag at positions (k, 3) m has moved.
+
+    TDOAs of a tag at rest show nothing about the inertial sensor.
     """
     return len(places) > 0 and bool(np.sqrt(np.sum(np.var(places, axis=0))) > MOVED)
 
 
-def stands(imu: Imu) -> bool:
-    """Whether an inertial sensor neither shakes nor turns, in whatever unit its rates are: nothing
-    determines that unit then.
+def is_at_rest(imu: Imu) -> bool:
+    """Return whether an inertial sensor neither shakes nor turns, whatever the unit of its rates.
+
+    Nothing determines that unit then.
     """
     turned = np.cumsum(imu.gyro - imu.gyro.mean(axis=0), axis=0) * float(np.median(np.diff(imu.t)))
     steady = np.linalg.norm(np.std(imu.accel, axis=0)) < STEADY * np.linalg.norm(
@@ -111,7 +157,7 @@ def stands(imu: Imu) -> bool:
 
 
 def averaged(imu: Imu | None) -> Imu | None:
-    """Imu with the means of as many samples each as make about RATE, or as it is; None stays None."""
+    """Return the Imu averaged to about RATE, or as it is; None stays None."""
     if imu is None or len(imu) < 2:
         return None
     count = max(1, round((len(imu) - 1) / max(imu.t[-1] - imu.t[0], 1e-9) / RATE))
@@ -124,9 +170,7 @@ def averaged(imu: Imu | None) -> Imu | None:
 
 
 def _usual() -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """The mistakes that are made most: (accelerometer, gyroscope) as (3, 3) matrices that undo
-    them.
-    """
+    """Yield the most frequent mistakes as (3, 3) matrices that undo them: accelerometer, gyroscope."""
     for signs in product((1.0, -1.0), repeat=3):
         if signs != (1.0, 1.0, 1.0):
             yield UPRIGHT, np.diag(signs)
@@ -140,14 +184,15 @@ def _usual() -> Iterator[tuple[np.ndarray, np.ndarray]]:
 
 
 def _scaled(trials: Sequence[Arrangement]) -> np.ndarray | None:
-    """The matrix of the gyroscope of the best trial if that is another unit, else None."""
+    """Return the matrix of the gyroscope of the best trial if that is another unit, else None."""
     gyro = min(trials, key=lambda trial: trial[0])[3]
     return gyro if abs(abs(np.linalg.det(gyro)) - 1.0) > 0.1 else None
 
 
 def _all(recording: OrderedRecording, base: Unexplained) -> list[Arrangement]:
-    """Trials of all arrangements of the gyroscope against the accelerometer, and its mirror image;
-    the yaw is free anyway.
+    """Return trials of all arrangements of the gyroscope, and of their mirror images.
+
+    The accelerometer is fixed, because the yaw is unknown anyway.
     """
     short = recording.part(BRIEF)
     of_short = _unexplained(short)
@@ -168,8 +213,9 @@ def _all(recording: OrderedRecording, base: Unexplained) -> list[Arrangement]:
 def _tried(
     base: Unexplained, recording: OrderedRecording, accel: np.ndarray, gyro: np.ndarray
 ) -> Arrangement:
-    """What an arrangement leaves of `base`; an infinite ratio if that is so much that it is neither
-    taken nor says the same as one that is.
+    """Return the loss of an arrangement in comparison with `base`.
+
+    The ratio is infinite if the loss is too large for the arrangement to be taken, or to tie.
     """
     ratio, z = compare(
         base, _unexplained(_arranged(recording, accel, gyro), (RATIO + TIE) * base.mean)
@@ -178,14 +224,17 @@ def _tried(
 
 
 def _arranged(recording: OrderedRecording, accel: np.ndarray, gyro: np.ndarray) -> OrderedRecording:
-    """The samples turned by (3, 3) matrices."""
+    """Return the recording with samples rotated by (3, 3) matrices."""
     assert recording.imu is not None
     forces, rates = recording.imu.accel @ accel.T, recording.imu.gyro @ gyro.T
     return recording.with_imu(accel=np.ascontiguousarray(forces), gyro=np.ascontiguousarray(rates))
 
 
 def _unexplained(recording: OrderedRecording, limit: float = np.inf) -> Unexplained:
-    """Unexplained of the TDOAs by a filter that leans on the IMU. limit : see streams.explain."""
+    """Return the Unexplained of the TDOAs by a filter that relies on the IMU.
+
+    limit : see streams.explain.
+    """
     tdoa, imu, (a, b) = recording.tdoa, recording.imu, recording.rows()
     assert imu is not None
     rows = structured(TDOA, tdoa.t, a, b, tdoa.d, tdoa.variance)[np.lexsort((tdoa.d, b, a, tdoa.t))]
@@ -194,7 +243,7 @@ def _unexplained(recording: OrderedRecording, limit: float = np.inf) -> Unexplai
 
 
 def _complexity(accel: np.ndarray, gyro: np.ndarray) -> float:
-    """How many things must have gone wrong."""
+    """Return how many mistakes an arrangement consists of."""
     if np.array_equal(accel, MIRROR) and (
         np.array_equal(gyro, MIRROR) or np.array_equal(gyro, -MIRROR)
     ):
@@ -236,11 +285,11 @@ def _finding(accel: np.ndarray, gyro: np.ndarray, evidence: str, ratio: float) -
 
 
 def scale_of(matrix: np.ndarray) -> float:
-    """By how much a (3, 3) matrix makes lengths larger."""
+    """Return the factor by which a (3, 3) matrix scales lengths."""
     return abs(np.linalg.det(matrix)) ** (1.0 / 3.0)
 
 
 def signed_axis(direction: np.ndarray, of: str = "") -> str:
-    """Which axis a (3,) direction is along: "y", or "-y"; of : written before its name."""
+    """Return the name of the axis along a direction (3,), "y" or "-y"; `of` is written before it."""
     k = int(np.argmax(np.abs(direction)))
     return f"{'-' if direction[k] < 0.0 else ''}{of}{'xyz'[k]}"

@@ -1,8 +1,7 @@
-"""Does the inertial sensor fit the turns and accelerations of the ground truth? A rule takes a
-TrueMotion and yields Findings.
+"""Test whether the inertial sensor fits the rotations and accelerations of the ground truth.
 
-Both sensors are compared over short cells; constant biases and what changes slowly are taken out
-first.
+A rule takes a TrueMotion and yields Findings. Both sensors are compared over short cells, after
+removal of constant biases and slow changes.
 """
 
 from __future__ import annotations
@@ -14,36 +13,29 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from uwb_tdoa_ekf.streams import ERROR, Finding
 
-from .delays import BLOCK, LONGEST, delays
-from .imu_rules import ARRANGEMENTS, SCALES, scale_of, signed_axis
-from .inertial_values import smooth
-from .time_rules import changing
+from .imu_rules import ARRANGEMENTS, SCALES, is_smooth, scale_of, signed_axis
+from .time_rules import BLOCK, LONGEST, delays, drift_or_jump
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from uwb_tdoa_bias.foundation.flight import Flight
 
-    from .delays import Delays
+    from .time_rules import Delays
 
-CELL, HALF = 0.05, 0.1  # s between cells, and half the time over which one is averaged
-BEYOND = round(LONGEST / CELL)  # cells at either end that are there for what is late
+CELL, HALF = 0.05, 0.1  # s between cells, and half the time over which a cell is averaged
+BEYOND = round(LONGEST / CELL)  # further cells at both ends, to try delays
 FEWEST = 200  # cells in the air
-LIMIT = 4.0  # standard deviations, robust, beyond which a difference counts no more
+LIMIT = 4.0  # robust standard deviations at which a difference is clipped
 GRAVITY = 9.81  # m/s^2
-# Of the power that is left with the axes of a sensor otherwise: healthy 1.22 and 0.92 at least; of
-# that, with another attitude of
-# the truth.
-AXES, ATTITUDE = {"gyro": 0.8, "accel": 0.75}, 1.2
-# Of the power that is left behind a low pass: healthy 0.87 at least, and where the sensor is too
-# smooth; and the time constants, s.
-FILTERED, FILTERED_TOO, SLOWNESS = (
-    0.8,
-    0.97,
-    (0.05, 0.1, 0.2, 0.4, 0.8),
-)  # of the power that is left with a low pass; s, its time constants
+# Share of the power that other axes of a sensor leave; healthy 1.22 and 0.92 at least.
+AXES = {"gyro": 0.8, "accel": 0.75}
+ATTITUDE = 1.2  # largest power with another attitude of the truth, over that with other axes
+# Share of the power that a low pass leaves (healthy 0.87 at least), and for a sensor that is smooth.
+FILTERED, FILTERED_SMOOTH = 0.8, 0.97
+SLOWNESS = 0.05, 0.1, 0.2, 0.4, 0.8  # s, time constants of the low pass
 SENSORS = {"gyro": "gyroscope", "accel": "accelerometer"}
-# What an attitude x, y, z, w may be instead: {words: places, signs}
+# Wrong attitudes x, y, z, w: {words: places, signs}
 ATTITUDES = {
     "of a frame that is mirrored along x": ([0, 1, 2, 3], (1, -1, -1, 1)),
     "of a frame that is mirrored along y": ([0, 1, 2, 3], (-1, 1, -1, 1)),
@@ -54,13 +46,24 @@ ATTITUDES = {
 
 
 class TrueMotion:
-    """measured {"gyro", "accel": (n, 3)}, means over cells at t (n,) s in the air, or of all of a
-    rover; block (n,), of BLOCK seconds; smooth {sensor: bool}, whether it changes too evenly for a
-    sensor that vibrates.
+    """Inertial samples and the motion of the ground truth over the same cells.
+
+    Attributes
+    ----------
+    t : (n,) array
+        Cells in the air, or all of a rover, s.
+    measured : dict
+        {"gyro", "accel": (n, 3)}, means over the cells, rad/s and m/s^2, body.
+    true : dict
+        The same from the ground truth, with BEYOND further cells at both ends.
+    block : (n,) array of int
+        Number of the block of BLOCK seconds.
+    smooth : dict
+        {sensor: whether it changes too evenly for a sensor that vibrates}.
     """
 
     def __init__(self, flight: Flight) -> None:
-        """flight : Flight with inertial samples and ground truth with attitudes."""
+        """Average the samples over cells. The ground truth of the Flight needs attitudes."""
         assert flight.imu is not None and flight.truth is not None
         imu, truth = flight.imu, flight.truth
         known = np.isfinite(truth.q).all(axis=1)
@@ -69,13 +72,10 @@ class TrueMotion:
         above = self._p[:, 2] > 0.3
         flown = self._t[above] if above.any() else self._t  # a rover
         margin = LONGEST + 0.5
-        start, end = (
-            max(flown[0], imu.t[0], self._t[0]) + margin,
-            min(flown[-1], imu.t[-1], self._t[-1]) - margin,
-        )
-        cells = min(
-            max(int((end - start) / CELL), 0), len(imu)
-        )  # of a pause of days, the time before it
+        start = max(flown[0], imu.t[0], self._t[0]) + margin
+        end = min(flown[-1], imu.t[-1], self._t[-1]) - margin
+        # After a pause of days only the time before it is used.
+        cells = min(max(int((end - start) / CELL), 0), len(imu))
         self.t = start + CELL * np.arange(cells)
         self.block = (CELL * np.arange(len(self.t)) / BLOCK).astype(int)
         if len(self) < FEWEST:
@@ -85,19 +85,20 @@ class TrueMotion:
             "accel": _triangle(imu.t, imu.accel, self.t),
         }
         self.true = self.with_attitude(None)
-        self.smooth = {"gyro": smooth(imu.t, imu.gyro), "accel": smooth(imu.t, imu.accel)}
+        self.smooth = {"gyro": is_smooth(imu.t, imu.gyro), "accel": is_smooth(imu.t, imu.accel)}
         self._scale = {}
         for sensor in SENSORS:
             left = _slowly_left(self.measured[sensor] - self.at(self.true[sensor]), self.block)
             self._scale[sensor] = 1.4826 * np.median(np.abs(left), axis=0) + 1e-9
 
     def __len__(self) -> int:
-        """How many cells there are."""
+        """Return the number of cells."""
         return len(self.t)
 
     def with_attitude(self, name: str | None) -> dict[str, np.ndarray]:
-        """{"gyro", "accel": (n + 2 BEYOND, 3)}, what the sensors should have measured at t and
-        LONGEST before and after, with an attitude of ATTITUDES, or the one that is written.
+        """Return {"gyro", "accel": (n + 2 BEYOND, 3)}, the true readings for one of ATTITUDES.
+
+        None is the attitude as written. The cells extend LONGEST beyond both ends of t.
         """
         order, signs = ATTITUDES[name] if name else ([0, 1, 2, 3], (1, 1, 1, 1))
         turn = Slerp(self._t, Rotation.from_quat(self._q[:, order] * signs))
@@ -108,19 +109,27 @@ class TrueMotion:
         return {"gyro": gyro, "accel": turn(t).inv().apply(force + (0.0, 0.0, GRAVITY))}
 
     def at(self, true: np.ndarray, late: int = 0) -> np.ndarray:
-        """(n, 3): the values of `true` so many cells before."""
+        """Return the rows (n, 3) of `true` that are so many cells earlier."""
         return true[BEYOND - late : len(true) - BEYOND - late]
 
     def power(self, sensor: str, true: np.ndarray, change: np.ndarray | None = None) -> float:
-        """Mean clipped square of measured, turned by `change`, minus true (n + 2 BEYOND, 3), in
-        units of its scatter as it is.
+        """Return the mean clipped square of measured minus true values, in units of the scatter as it is.
+
+        Parameters
+        ----------
+        sensor : str
+            "gyro" or "accel".
+        true : (n + 2 BEYOND, 3) array
+            True readings.
+        change : (3, 3) array or None
+            Rotation of the measured values.
         """
         measured = self.measured[sensor] if change is None else self.measured[sensor] @ change.T
         left = _slowly_left(measured - self.at(true), self.block) / self._scale[sensor]
         return float(np.mean(np.clip(left, -LIMIT, LIMIT) ** 2))
 
     def delays(self) -> Delays:
-        """Delays of the six axes together."""
+        """Return the Delays of both sensors, one series for each axis."""
         series, t = np.repeat(np.arange(6), len(self.t)), np.tile(self.t, 6)
 
         def error(late: float) -> np.ndarray:
@@ -149,24 +158,23 @@ def _at(t: np.ndarray, values: np.ndarray, when: np.ndarray) -> np.ndarray:
 
 
 def _mean(t: np.ndarray, values: np.ndarray, when: np.ndarray) -> np.ndarray:
-    """(n, 3): means over HALF to both sides."""
+    """Return means (n, 3) over HALF to both sides."""
     total = _integral(t, values)
     return (_at(t, total, when + HALF) - _at(t, total, when - HALF)) / (2.0 * HALF)
 
 
 def _triangle(t: np.ndarray, values: np.ndarray, when: np.ndarray) -> np.ndarray:
-    """(n, 3): means with a triangular weight, HALF to both sides, which is what a second difference
-    of places is of.
+    """Return means (n, 3) with a triangular weight, HALF to both sides.
+
+    A second difference of positions has the same weight.
     """
     total = _integral(t, _integral(t, values - values.mean(axis=0)))
     second = _at(t, total, when + HALF) - 2.0 * _at(t, total, when) + _at(t, total, when - HALF)
     return second / HALF**2 + values.mean(axis=0)
 
 
-def axes(motion: TrueMotion) -> Iterator[Finding]:
-    """Axes that are exchanged or mirrored, a gyroscope in another unit, or a truth whose attitude
-    is another one.
-    """
+def wrong_axes(motion: TrueMotion) -> Iterator[Finding]:
+    """Yield exchanged or mirrored axes, another unit of the gyroscope, or a wrong attitude of the truth."""
     base = {sensor: motion.power(sensor, motion.true[sensor]) for sensor in SENSORS}
     best = {sensor: _best_arrangement(motion, sensor) for sensor in SENSORS}
     wrong = [sensor for sensor in SENSORS if _explains(motion, sensor, base[sensor], *best[sensor])]
@@ -205,8 +213,9 @@ def axes(motion: TrueMotion) -> Iterator[Finding]:
 def _explains(
     motion: TrueMotion, sensor: str, base: float, power: float, change: np.ndarray
 ) -> bool:
-    """Whether a change of the axes explains much of what is left without; one that makes values
-    small, more than no values would.
+    """Return whether a change of the axes explains much of the remaining power.
+
+    A change that makes values small must explain more than values of zero do.
     """
     if scale_of(change) < 0.9:
         base = min(base, motion.power(sensor, motion.true[sensor], np.zeros((3, 3))))
@@ -214,24 +223,14 @@ def _explains(
 
 
 def _best_arrangement(motion: TrueMotion, sensor: str) -> tuple[float, np.ndarray]:
-    """(power that is left, (3, 3) matrix) of what explains most."""
-    return min(
-        (
-            (motion.power(sensor, motion.true[sensor], change), change)
-            for change in _arrangements(sensor)
-        ),
-        key=lambda x: x[0],
-    )
-
-
-def _arrangements(sensor: str) -> list[np.ndarray]:
-    """[(3, 3) matrix that undoes it] of what may be wrong with the axes of a sensor."""
-    scales = (
-        [scale * np.eye(3) for unit in SCALES for scale in (unit, 1.0 / unit)]
-        if sensor == "gyro"
-        else []
-    )
-    return [*ARRANGEMENTS[1:], *scales]
+    """Return (remaining power, (3, 3) matrix) of the best correction of a sensor."""
+    changes = ARRANGEMENTS[1:]
+    if sensor == "gyro":
+        scales = [scale for unit in SCALES for scale in (unit, 1.0 / unit)]
+        changes = [*changes, *(scale * np.eye(3) for scale in scales)]
+    true = motion.true[sensor]
+    trials = ((motion.power(sensor, true, change), change) for change in changes)
+    return min(trials, key=lambda trial: trial[0])
 
 
 def _with_attitude(motion: TrueMotion, name: str) -> dict[str, float]:
@@ -268,12 +267,13 @@ def _of_axes(sensor: str, change: np.ndarray, evidence: str, power: float) -> Fi
     )
 
 
-def filtered(motion: TrueMotion) -> Iterator[Finding]:
-    """A low pass of first order in a sensor: its output is late and too small. The truth is noisy,
-    and fits better behind any low pass: one that runs backwards tells by how much.
+def low_passes(motion: TrueMotion) -> Iterator[Finding]:
+    """Yield low passes of first order in a sensor: its output is late and too small.
+
+    The noisy truth fits better behind any low pass. A low pass that runs backwards shows by how much.
     """
     for sensor in SENSORS:
-        true, limit = motion.true[sensor], FILTERED_TOO if motion.smooth[sensor] else FILTERED
+        true, limit = motion.true[sensor], FILTERED_SMOOTH if motion.smooth[sensor] else FILTERED
         powers = [
             (
                 motion.power(sensor, _slowed(true, tau)),
@@ -305,13 +305,13 @@ def filtered(motion: TrueMotion) -> Iterator[Finding]:
 
 
 def _slowed(values: np.ndarray, tau: float) -> np.ndarray:
-    """Through a low pass of first order, of time constant tau, s."""
+    """Return values behind a low pass of first order with time constant tau, s."""
     from scipy.signal import lfilter  # takes a second to import
 
     share = 1.0 - np.exp(-CELL / tau)
     return lfilter([share], [1.0, share - 1.0], values - values[0], axis=0) + values[0]
 
 
-def stamps(motion: TrueMotion) -> Iterator[Finding]:
-    """Stamps that drift or jump."""
-    yield from changing("imu", "inertial samples", motion.delays())
+def wrong_stamps(motion: TrueMotion) -> Iterator[Finding]:
+    """Yield stamps that drift or jump."""
+    yield from drift_or_jump("imu", "inertial samples", motion.delays())

@@ -1,7 +1,12 @@
-"""A recording in order, as the rules that try things see it, and what is found unexplained in it."""
+"""Order a recording for the rules that try corrections, and fit its anchors.
+
+`SurveyFit` estimates positions of tag and anchors together, from windows of TDOAs alone. Systematic
+errors move the anchors by some decimetres. Only a larger gain speaks against a survey.
+"""
 
 from __future__ import annotations
 
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 import math
@@ -11,28 +16,277 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas
-from uwb_tdoa_ekf.core.memory import TDOA, structured
+from uwb_tdoa_ekf.core import workspace
+from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.core.ground import KnownHeight
+from uwb_tdoa_ekf.core.memory import TDOA, new_state, structured
+from uwb_tdoa_ekf.core.startup import locate, room_for
 from uwb_tdoa_ekf.results import rows_of
-from uwb_tdoa_ekf.streams.explain import unexplained
+from uwb_tdoa_ekf.streams.explain import SCALE, unexplained
 from uwb_tdoa_ekf.streams.ranging import BEYOND
 
-from .survey_fit import SurveyFit
-
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    Window = tuple[np.ndarray, ...]  # t (n,) s, a and b (n,) rows of the anchors, d (n,) m
     from uwb_tdoa_ekf.streams.explain import Unexplained
 
     from .recording import Recording
 
-LONG, SHORT = (
-    60.0,
-    14.0,
-)  # s of the recording that are tried: to be sure, and to choose what is worth being sure of
-PERIOD = 1.0  # s over which the motion is measured that says which part is tried
+
+WINDOWS, LENGTH, FEWEST = 40, 0.5, 30  # windows over the recording; s each; least TDOAs in each
+PRIOR = 0.5  # m, standard deviation of the survey, for each anchor
+TAG, SPEED = 5.0, 1.0  # m and m/s, the same for the tag about its first position
+STD, TOGETHER = 0.15, 20.0  # m, of one TDOA; most TDOAs of a window that count as independent
+ROBUST = 0.4  # m, scale of the Geman-McClure weight
+SWEEPS, STEP = 12, 1.0  # Gauss-Newton steps, and the longest of an anchor, m
+# m of `spread`; measured flights 0.50 at least, also with ids swapped, a hovering tag 0.16 at most
+SPREAD = 0.3
+
+
+class SurveyFit:
+    """Fit of tag and anchors to windows of TDOAs, which starts from the anchors as surveyed.
+
+    Attributes
+    ----------
+    positions : (N, 3) array
+        Anchors as surveyed, m, world.
+    before : float
+        Loss with these anchors, 0 to 1.
+    """
+
+    def __init__(
+        self, t: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray, positions: np.ndarray
+    ) -> None:
+        """Locate the tag in windows of TDOAs.
+
+        Parameters
+        ----------
+        t : (n,) array
+            Stamps, s, rising.
+        a, b : (n,) array
+            Rows of `positions`.
+        d : (n,) array
+            TDOAs, m.
+        positions : (N, 3) array
+            Anchors, m, world.
+        """
+        self.positions = positions
+        self._windows, self._start = [], []
+        config, state, box = FilterConfig(), new_state(positions), np.empty((2, 3))
+        workspace.set_bounds(state.record.extent, config.workspace_margin, box)
+        rows = structured(TDOA, t, a, b, d, np.zeros(len(t)))
+        for begin in np.linspace(t[0], t[-1] - LENGTH, WINDOWS) if len(t) else ():
+            first, end = np.searchsorted(t, [begin, begin + LENGTH])
+            if end - first < FEWEST:
+                continue
+            window, places = tuple(column[first:end] for column in (t, a, b, d)), room_for(1)
+            locate(
+                rows[first:end],
+                state.anchors,
+                box,
+                config.parameters()[0],
+                KnownHeight(np.nan, np.nan),
+                places,
+            )
+            self._windows.append(window)
+            self._start.append(places.x[0])
+        # The best fit of the tag: the start is off if the tag is fast.
+        self.before, _ = self.solve([])
+
+    def __len__(self) -> int:
+        """Return the number of windows in which the tag was located."""
+        return len(self._windows)
+
+    @property
+    def heard(self) -> list[int]:
+        """Return the rows of the anchors with TDOAs in the windows."""
+        ends = [end for _, a, b, _ in self._windows for end in (a, b)]
+        return np.unique(np.concatenate(ends)).tolist() if ends else []
+
+    @property
+    def places(self) -> np.ndarray:
+        """Return the positions of the tag in the windows, (k, 3) m."""
+        return np.array([x[:3] for x in self._start]).reshape(-1, 3)
+
+    @cached_property
+    def all_moved(self) -> tuple[float, np.ndarray]:
+        """Return `solve` with all anchors free."""
+        return self.solve()
+
+    @cached_property
+    def held_out_gain(self) -> float:
+        """Return the fall of the loss in one half of the windows with anchors fitted to the other half.
+
+        It is the mean of both halves. Errors at positions where the tag stays for a while are no errors of
+        the survey.
+        """
+        half = len(self) // 2
+        parts = [self._part(slice(None, half)), self._part(slice(half, None))]
+        return float(
+            np.mean(
+                [
+                    test.before - test._at(fitted.all_moved[1])
+                    for fitted, test in (parts, parts[::-1])
+                ]
+            )
+        )
+
+    def _part(self, windows: slice) -> SurveyFit:
+        """Return the same fit for some of the windows."""
+        part = copy(self)
+        part.__dict__.pop("all_moved", None)
+        part._windows, part._start = self._windows[windows], self._start[windows]
+        part.before, _ = part.solve([])
+        return part
+
+    def _at(self, positions: np.ndarray) -> float:
+        """Return the loss with the anchors at positions (N, 3) m."""
+        other = copy(self)
+        other.positions = positions
+        return other.solve([])[0]
+
+    def solve(self, free: Sequence[int] | None = None) -> tuple[float, np.ndarray]:
+        """Move the tag, and the anchors in `free`, to the least loss.
+
+        Parameters
+        ----------
+        free : sequence of int or None
+            Rows of the free anchors; None for all.
+
+        Returns
+        -------
+        loss : float
+            Remaining loss, 0 to 1.
+        anchors : (N, 3) array
+            Positions, m, world.
+        """
+        moved = (
+            np.ones(len(self.positions), dtype=bool)
+            if free is None
+            else np.isin(range(len(self.positions)), free)
+        )
+        columns = np.flatnonzero(np.repeat(moved, 3))  # free coordinates
+        anchors, start = self.positions.copy(), [x.copy() for x in self._start]
+        # In a hall each window has few of the anchors.
+        heard = [moved & np.isin(np.arange(len(moved)), ends[1:3]) for ends in self._windows]
+        # Their coordinates among the free ones:
+        places = [np.flatnonzero(np.repeat(some[moved], 3)) for some in heard]
+        for _ in range(SWEEPS):
+            H = np.eye(len(columns)) / PRIOR**2
+            g = (self.positions - anchors).reshape(-1)[columns] / PRIOR**2
+            eliminated = []
+            for x, window, some, its in zip(start, self._windows, heard, places):
+                by_tag, by_anchors, residual = _linearised(x, window, anchors, some)
+                weight = (
+                    min(1.0, TOGETHER / len(residual))
+                    / (STD * (1.0 + (residual / ROBUST) ** 2)) ** 2
+                )
+                left = by_tag * weight[:, None]
+                A = left.T @ by_tag + np.diag([TAG**-2] * 3 + [SPEED**-2] * 3)
+                B = left.T @ by_anchors
+                c = left.T @ residual - np.r_[np.zeros(3), x[3:] / SPEED**2]
+                solved = np.linalg.solve(A, np.column_stack([B, c]))
+                H[np.ix_(its, its)] += (
+                    by_anchors.T @ (weight[:, None] * by_anchors) - B.T @ solved[:, :-1]
+                )
+                g[its] += by_anchors.T @ (weight * residual) - B.T @ solved[:, -1]
+                eliminated.append(solved)
+            step = np.linalg.solve(H, g)
+            step *= min(1.0, STEP / max(np.abs(step).max(initial=0.0), 1e-9))
+            anchors.reshape(-1)[columns] += step
+            for x, solved, its in zip(start, eliminated, places):
+                x += np.clip(solved[:, -1] - solved[:, :-1] @ step[its], -2.0, 2.0)
+        return self._loss(start, anchors), anchors
+
+    def _loss(self, states: list[np.ndarray], anchors: np.ndarray) -> float:
+        """Return the mean Geman-McClure loss over the windows."""
+        squares = (
+            _residual(x, window, anchors)[0] ** 2 for x, window in zip(states, self._windows)
+        )
+        return (
+            float(np.mean([np.mean(square / (square + SCALE**2)) for square in squares]))
+            if states
+            else np.nan
+        )
+
+
+def displacement(surveyed: np.ndarray, fitted: np.ndarray) -> np.ndarray:
+    """Return how far each anchor moved, (N,) m, after the best common rotation and translation.
+
+    Source: Kabsch, Acta Cryst. A 32, 1976.
+    """
+    one, two = surveyed - surveyed.mean(axis=0), fitted - fitted.mean(axis=0)
+    U, _, V = np.linalg.svd(two.T @ one)
+    turn = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ V))]) @ V
+    return np.linalg.norm(two @ turn - one, axis=1)
+
+
+def spread(places: np.ndarray) -> float:
+    """Return the second largest standard deviation of positions (k, 3) m: the distance from a line.
+
+    A tag at rest, or on one line, cannot distinguish an anchor from its mirror image.
+    """
+    if not len(places):
+        return 0.0
+    return float(
+        np.linalg.svd(places - places.mean(axis=0), compute_uv=False)[1] / np.sqrt(len(places))
+    )
+
+
+def _residual(
+    x: np.ndarray, window: Window, anchors: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return residuals (n,) m, unit vectors (n, 3) from a and b to the tag, and times (n,) s.
+
+    The times are relative to the end of the window.
+    """
+    t, a, b, d = window
+    before = t - t[-1]
+    tag = x[:3] + before[:, None] * x[3:]
+    from_a, from_b = tag - anchors[a], tag - anchors[b]
+    ra, rb = (np.maximum(np.linalg.norm(v, axis=1), 1e-6) for v in (from_a, from_b))
+    return d - (rb - ra), from_a / ra[:, None], from_b / rb[:, None], before
+
+
+def _linearised(
+    x: np.ndarray, window: Window, anchors: np.ndarray, moved: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the Jacobians of the TDOAs and the residuals (n,).
+
+    The first Jacobian (n, 6) is by position and velocity of the tag. The second (n, 3 k) is by the k
+    anchors in `moved` (N,).
+    """
+    residual, from_a, from_b, before = _residual(x, window, anchors)
+    by_position = from_b - from_a
+    by_anchors, number = np.zeros((len(residual), int(moved.sum()), 3)), np.cumsum(moved) - 1
+    for ends, by_end in ((window[1], from_a), (window[2], -from_b)):
+        rows = np.flatnonzero(moved[ends])
+        by_anchors[rows, number[ends[rows]]] += by_end[rows]
+    by_tag = np.column_stack([by_position, before[:, None] * by_position])
+    return by_tag, np.asfortranarray(by_anchors.reshape(len(residual), -1)), residual
+
+
+pass
+
+
+LONG, SHORT = 60.0, 14.0  # s of the recording for trials: to decide, and to choose candidates
+PERIOD = 1.0  # s over which motion is measured, to choose that part
 
 
 @dataclass(frozen=True)
 class OrderedRecording:
-    """anchors : Anchors; tdoa : Tdoas and imu : Imu or None, in order of their stamps and finite."""
+    """Streams in the order of their stamps, without values that are not finite.
+
+    Attributes
+    ----------
+    anchors : Anchors
+        The survey.
+    tdoa : Tdoas
+        TDOAs.
+    imu : Imu or None
+        Inertial samples.
+    """
 
     anchors: Anchors
     tdoa: Tdoas
@@ -40,7 +294,7 @@ class OrderedRecording:
 
     @classmethod
     def of(cls, recording: Recording) -> OrderedRecording:
-        """OrderedRecording of a Recording."""
+        """Return the OrderedRecording of a Recording."""
         tdoa, imu = recording.tdoa, recording.imu
         good = np.flatnonzero(np.isfinite(tdoa.t) & np.isfinite(tdoa.d))
         tdoa = rows_of(tdoa, good[np.argsort(tdoa.t[good], kind="stable")])
@@ -52,7 +306,7 @@ class OrderedRecording:
         return cls(recording.anchors, tdoa, imu if imu is not None and len(imu) else None)
 
     def part(self, length: float) -> OrderedRecording:
-        """The `length` s in which the TDOAs move most; the whole if it is not longer."""
+        """Return the `length` s in which the TDOAs change most; the whole if it is not longer."""
         t = self.tdoa.t
         if not len(t) or t[-1] - t[0] <= length:
             return self
@@ -68,35 +322,36 @@ class OrderedRecording:
         )
 
     def with_tdoa(self, **columns: np.ndarray) -> OrderedRecording:
-        """The same with other columns of the TDOAs."""
+        """Return the same with other columns of the TDOAs."""
         return replace(self, tdoa=replace(self.tdoa, **columns))
 
     def with_imu(self, **columns: np.ndarray) -> OrderedRecording:
-        """The same with other columns of the inertial samples."""
+        """Return the same with other columns of the inertial samples."""
         assert self.imu is not None
         return replace(self, imu=replace(self.imu, **columns))
 
     def possible(self) -> OrderedRecording:
-        """The same without TDOAs that are longer than their anchors are apart."""
+        """Return the same without TDOAs that exceed the distance of their anchors."""
         a, b = self.rows()
         apart = np.linalg.norm(self.anchors.positions[a] - self.anchors.positions[b], axis=1)
         kept = (a < 0) | (b < 0) | (np.abs(self.tdoa.d) <= apart + BEYOND)
         return replace(self, tdoa=rows_of(self.tdoa, np.flatnonzero(kept)))
 
     def rows(self) -> tuple[np.ndarray, np.ndarray]:
-        """Rows of the anchors of each TDOA: two (n,) arrays, -1 where an id is unknown."""
+        """Return the rows of the anchors of each TDOA, two (n,) arrays, -1 for unknown ids."""
         return self.anchors.index(self.tdoa.a), self.anchors.index(self.tdoa.b)
 
     def unexplained(self, limit: float = math.inf) -> Unexplained:
-        """Unexplained of the TDOAs alone. limit : mean loss from which on it is of no interest (see
-        streams.explain).
+        """Return the Unexplained of the TDOAs alone.
+
+        limit : mean loss beyond which the result has no use (see streams.explain).
         """
         rows = structured(TDOA, self.tdoa.t, *self.rows(), self.tdoa.d)
         return unexplained(rows, self.anchors.positions, limit=limit)
 
     @cached_property
     def survey_fit(self) -> SurveyFit:
-        """SurveyFit of the TDOAs between known anchors."""
+        """Return the SurveyFit of the TDOAs between known anchors."""
         a, b = self.rows()
         known = (a >= 0) & (b >= 0) & (a != b)
         return SurveyFit(
@@ -104,14 +359,12 @@ class OrderedRecording:
         )
 
     def flight(self) -> Flight:
-        """Flight without ground truth."""
+        """Return a Flight without ground truth."""
         return Flight("checked", self.anchors, self.tdoa, self.imu)
 
 
 def _busiest(recording: OrderedRecording, length: float) -> float:
-    """Stamp at which the `length` s begin in which the TDOAs of each pair change most from second
-    to second.
-    """
+    """Return the stamp at which the `length` s begin in which the TDOAs of the pairs change most."""
     t, d = recording.tdoa.t, recording.tdoa.d
     pair = np.unique(recording.tdoa.a * 65536 + recording.tdoa.b, return_inverse=True)[1].reshape(
         -1
@@ -120,20 +373,17 @@ def _busiest(recording: OrderedRecording, length: float) -> float:
     order = np.lexsort((second, pair))
     begins = np.flatnonzero(np.diff(pair[order], prepend=-1) | np.diff(second[order], prepend=-1))
     mean = np.add.reduceat(d[order], begins) / np.diff(begins, append=len(order))
-    pair, second = (
-        pair[order][begins],
-        second[order][begins],
-    )  # a row for each pair and each second in which it has TDOAs
+    # One row for each pair and each second with TDOAs:
+    pair, second = pair[order][begins], second[order][begins]
     following = (np.diff(pair) == 0) & (np.diff(second) == 1)
-    seconds, place = np.unique(
-        second, return_inverse=True
-    )  # those with TDOAs: a pause takes no room
+    # Only seconds with TDOAs: a long pause needs no memory.
+    seconds, place = np.unique(second, return_inverse=True)
     motion = np.bincount(
         place[1:][following],
         np.minimum(np.abs(np.diff(mean))[following], 1.0),
         minlength=len(seconds),
     )
-    total, n = np.concatenate([[0.0], np.cumsum(motion)]), int(length / PERIOD)
-    until = np.searchsorted(seconds, seconds + n)
+    total = np.concatenate([[0.0], np.cumsum(motion)])
+    until = np.searchsorted(seconds, seconds + int(length / PERIOD))
     best = int(seconds[np.argmax(total[until] - total[:-1])])
     return t[0] + min(best * PERIOD, t[-1] - t[0] - length)

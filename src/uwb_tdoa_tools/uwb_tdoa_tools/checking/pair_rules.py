@@ -1,8 +1,7 @@
-"""What is wrong with the TDOAs of single pairs, or of all: values, signs, ids. A rule takes a
-KnownPath and yields Findings.
+"""Compare the TDOAs of each pair with the geometry of the ground truth: values, signs, ids.
 
-Limits are shares, or what is left of an error. The healthy values beside them are the extremes of
-the pairs of 37 measured recordings.
+A rule takes a KnownPath and yields Findings. Limits are shares, or the part of an error that
+remains. The healthy values in comments are the extremes over the pairs of 37 measured recordings.
 """
 
 from __future__ import annotations
@@ -12,54 +11,112 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.effects import EffectSet, Track, true_samples
+from uwb_tdoa_bias.effects.anchor import AnchorIds
+from uwb_tdoa_bias.effects.pair import PairSign
 from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_ekf.streams import ERROR, Finding
-
-from .known_path import MANY
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from .known_path import KnownPath
+    from uwb_tdoa_bias.effects import LabelEffect
+    from uwb_tdoa_bias.foundation.flight import Flight, Truth
 
-    Fault = tuple[
-        str, str, str, float
-    ]  # what the pair does, evidence, remedy, and the number that decided
+    Fault = tuple[str, str, str, float]  # fault of the pair, evidence, remedy, deciding number
 
-# Of the median error that is left with the other sign, or with the ids exchanged: healthy 2.1 and
-# 0.68 at least.
+
+AIRBORNE = 0.3  # m of z
+MANY = 64  # anchors beyond which a tag hears a small part of them, as in a hall
+FEWEST = 40  # least TDOAs of a pair in the air, or of a vehicle that never flies, to judge it
+
+
+def least_height(truth: Truth) -> float:
+    """Return the height above which measurements count, m.
+
+    0.3, or minus infinity for a vehicle that never leaves the floor.
+    """
+    return AIRBORNE if (truth.p[:, 2] > AIRBORNE).any() else -np.inf
+
+
+class KnownPath:
+    """Usable TDOAs of a Flight beside their true values.
+
+    Attributes
+    ----------
+    d, true : (n,) array
+        TDOAs and their true values, m.
+    t : (n,) array
+        Stamps, s.
+    samples : Samples
+        State of the tag at each TDOA.
+    ids : (N,) array
+        Ids of the anchors.
+    track : Track
+        Ground truth.
+    start : float
+        Stamp of the first TDOA, s.
+    flown : (k,) array of int
+        Rows in the air, or all of a vehicle that never flies.
+    pairs : dict
+        {(a, b) ids: rows in the air} of pairs with at least FEWEST of them.
+    """
+
+    def __init__(self, flight: Flight) -> None:
+        """Compare the TDOAs of a Flight with its ground truth."""
+        assert flight.truth is not None
+        self._flight = flight
+        self.samples, rows = true_samples(flight)
+        self.t, self.d = self.samples.t, flight.tdoa.d[rows]
+        self.true = tdoa(self.samples.p, self.samples.position_a, self.samples.position_b)
+        self.ids = self.samples.anchors.ids
+        self.track = Track(flight.truth)
+        self.start = flight.start
+        self.flown = np.flatnonzero(self.samples.p[:, 2] > least_height(flight.truth))
+        key = (self.samples.a * len(self.ids) + self.samples.b)[self.flown]
+        order = np.argsort(key, kind="stable")
+        parts = (
+            np.split(self.flown[order], np.flatnonzero(np.diff(key[order])) + 1)
+            if len(order)
+            else []
+        )
+        self.pairs = {self._named(part[0]): part for part in parts if len(part) >= FEWEST}
+
+    def without(self, *effects: LabelEffect) -> KnownPath:
+        """Return the same without some LabelEffects."""
+        return KnownPath(EffectSet(effects).correct_streams(self._flight))
+
+    def _named(self, row: int) -> tuple[int, int]:
+        return int(self.ids[self.samples.a[row]]), int(self.ids[self.samples.b[row]])
+
+
+pass
+
+
+# Share of the median error with the other sign, or the ids exchanged; healthy 2.1 and 0.68 at least
 CONTRARY = 0.4
-MOVED = 0.3  # m by which what a pair should measure varies, at least, for its sign to be determined
-GRID, ON_GRID = (
-    0.03,
-    1e-4,
-)  # m: least step of what counts as rounded, healthy 0.014 at most, and how near to it values are
+MOVED = 0.3  # m, least standard deviation of the true TDOA that determines the sign
+GRID, ON_GRID = 0.03, 1e-4  # m, least step of rounding (healthy 0.014 at most), and its tolerance
 BETWEEN = 0.2  # share of TDOAs on the line between their neighbours; healthy 0.04
-REPEATED, FROZEN = (
-    0.2,
-    8,
-    # share of TDOAs that equal the one before, healthy 0.06; how many together with one value, healthy
-    # 5
-)
-AT_END, HITS = (
-    0.04,
-    5,
-)  # share of TDOAs at the largest or smallest value, healthy 0.03, and how many
-MOST = 0.5  # share of the pairs with the same fault, from which on it is one of all
-OFF = 3.0  # times the median error of most anchors, of one that may be exchanged with another
-EXCHANGES = 4  # pairs of anchors that are exchanged one after the other
+REPEATED = 0.2  # share of TDOAs that equal the previous one; healthy 0.06
+FROZEN = 8  # equal TDOAs in a row; healthy 5
+AT_END, HITS = 0.04, 5  # share of TDOAs at the largest or smallest value (healthy 0.03), and count
+MOST = 0.5  # share of the pairs with the same fault, beyond which it is a fault of all
+OFF = 3.0  # times the median error of most anchors: an anchor with more may have a wrong id
+EXCHANGES = 4  # most pairs of anchors that are exchanged one after the other
 
 
-def values(path: KnownPath) -> Iterator[Finding]:
-    """Pairs with the other sign, rounded, interpolated, repeated, clipped or frozen; all of them
-    alike count as one finding.
+def wrong_values(path: KnownPath) -> Iterator[Finding]:
+    """Yield pairs with the other sign, rounded, interpolated, repeated, clipped or frozen TDOAs.
+
+    A fault of most pairs is one finding.
     """
     found: dict[str, dict[tuple[int, int], Fault]] = {}
     for pair, rows in path.pairs.items():
         for rule in OF_PAIR:
-            said = rule(path.d[rows], path.true[rows], path.t[rows] - path.start)
-            if said is not None:
-                found.setdefault(rule.__name__[1:], {})[pair] = said
+            fault = rule(path.d[rows], path.true[rows], path.t[rows] - path.start)
+            if fault is not None:
+                found.setdefault(rule.__name__[1:], {})[pair] = fault
                 break
     for name, of_pairs in found.items():
         if len(of_pairs) >= MOST * len(path.pairs):
@@ -85,8 +142,8 @@ def values(path: KnownPath) -> Iterator[Finding]:
             )
 
 
-def contrary(path: KnownPath) -> list[tuple[int, int]]:
-    """[(a, b)] of the pairs whose sign is the other one."""
+def inverted_pairs(path: KnownPath) -> list[tuple[int, int]]:
+    """Return [(a, b)] of the pairs with the wrong sign."""
     return [
         pair
         for pair, rows in path.pairs.items()
@@ -122,7 +179,7 @@ def _rounded(d: np.ndarray, true: np.ndarray, t: np.ndarray) -> Fault | None:
 
 
 def _interpolated(d: np.ndarray, true: np.ndarray, t: np.ndarray) -> Fault | None:
-    """On the line between its neighbours, over packets or over time."""
+    """Test whether TDOAs lie on the line between their neighbours, over packets or over time."""
     step = np.median(np.abs(np.diff(d)))
     moving = (d[1:-1] != d[:-2]) | (d[2:] != d[1:-1])
     share = 0.0
@@ -137,7 +194,10 @@ def _interpolated(d: np.ndarray, true: np.ndarray, t: np.ndarray) -> Fault | Non
 
 
 def _repeated(d: np.ndarray, true: np.ndarray, t: np.ndarray) -> Fault | None:
-    """Beside the longest run, which may stand still, and the ends, which may be clipped."""
+    """Test for repeated TDOAs.
+
+    The longest run may be a tag at rest, and the ends may be clipped: they do not count.
+    """
     first, length = _runs(d)
     length = length[(d[first] > d.min()) & (d[first] < d.max())]
     if not len(length):
@@ -156,8 +216,9 @@ def _repeated(d: np.ndarray, true: np.ndarray, t: np.ndarray) -> Fault | None:
 
 
 def _clipped(d: np.ndarray, true: np.ndarray, t: np.ndarray) -> Fault | None:
-    """Many at one end; if they are all together, there where the geometry is beyond it, or it
-    stands still.
+    """Test for many TDOAs at one end.
+
+    If they are consecutive, the geometry must be beyond that end, or the tag is at rest.
     """
     for end, outward in ((d.max(), 1.0), (d.min(), -1.0)):
         at = d == end
@@ -191,7 +252,7 @@ def _frozen(d: np.ndarray, true: np.ndarray, t: np.ndarray) -> Fault | None:
 
 
 def _runs(d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(first, length) of the runs of equal values: (k,) each."""
+    """Return (first, length) of the runs of equal values, (k,) each."""
     edges = np.flatnonzero(np.concatenate([[True], np.diff(d) != 0.0, [True]]))
     return edges[:-1], np.diff(edges)
 
@@ -199,9 +260,9 @@ def _runs(d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 OF_PAIR = _sign, _rounded, _interpolated, _repeated, _clipped, _frozen
 
 
-def ids(path: KnownPath) -> Iterator[Finding]:
-    """Anchors that are called by the names of others."""
-    table, before, after = renamed(path)
+def exchanged_ids(path: KnownPath) -> Iterator[Finding]:
+    """Yield anchors with exchanged ids."""
+    table, before, after = find_exchanges(path)
     if table:
         names = ", ".join(f"{wrong} is {right}" for wrong, right in table.items())
         evidence = f"median error of their TDOAs {before:.2f} m, exchanged {after:.2f} m"
@@ -219,15 +280,21 @@ def ids(path: KnownPath) -> Iterator[Finding]:
         )
 
 
-def renamed(path: KnownPath) -> tuple[dict[int, int], float, float]:
-    """({id as received: id of that anchor}, median error m of the TDOAs of these anchors as they
-    are, and then).
+def find_exchanges(path: KnownPath) -> tuple[dict[int, int], float, float]:
+    """Return exchanged ids and the median error of their TDOAs before and after the exchange.
+
+    Returns
+    -------
+    table : dict
+        {id as received: id of that anchor}.
+    before, after : float
+        Median errors, m.
     """
     rows = np.arange(len(path.ids))
     table: dict[int, int] = {}
     errors: tuple[float, ...] = (0.0, 0.0)
     doubtful: np.ndarray = rows
-    if len(rows) > MANY:  # only what is called by another's name is far off
+    if len(rows) > MANY:  # only anchors with a wrong id have large errors
         each = np.array([_median_errors(path, [row], rows)[0] for row in rows.tolist()])
         doubtful = np.flatnonzero(
             np.isfinite(each) & (each > OFF * np.median(each[np.isfinite(each)]))
@@ -253,8 +320,9 @@ def renamed(path: KnownPath) -> tuple[dict[int, int], float, float]:
 def _median_errors(
     path: KnownPath, anchors: Sequence[int] | np.ndarray, *tables: np.ndarray
 ) -> tuple[float, ...]:
-    """Median |error| m of the TDOAs in the air with some anchors (rows), under each table of the
-    rows of the anchors.
+    """Return the median |error| (m) in the air of the TDOAs with some anchors (rows).
+
+    There is one value for each table of the rows of the anchors.
     """
     samples, flown = path.samples, path.flown
     a, b = samples.a[flown], samples.b[flown]
@@ -268,3 +336,35 @@ def _median_errors(
     return tuple(
         float(np.median(np.abs(d - tdoa(p, at[table[a]], at[table[b]])))) for table in tables
     )
+
+
+pass
+pass
+
+
+SOURCE = "numbers"
+
+
+def repairs(flight: Flight) -> tuple[LabelEffect, ...]:
+    """Return the LabelEffects that undo wrong ids and signs of a Flight, in their order.
+
+    () without ground truth or TDOAs.
+    """
+    return (
+        ()
+        if flight.truth is None or len(flight.truth) < 2 or not len(flight.tdoa)
+        else repairs_of(KnownPath(flight))
+    )
+
+
+def repairs_of(path: KnownPath) -> tuple[LabelEffect, ...]:
+    """Return the same for a KnownPath. If most signs are wrong, ids are not judged."""
+    out: list[LabelEffect] = []
+    signs = inverted_pairs(path)
+    table = {} if len(signs) >= MOST * max(len(path.pairs), 1) else find_exchanges(path)[0]
+    if table:
+        out.append(AnchorIds({str(wrong): right for wrong, right in table.items()}, source=SOURCE))
+        signs = inverted_pairs(path.without(out[0]))
+    if signs:
+        out.append(PairSign({f"{a}-{b}": -1.0 for a, b in signs}, source=SOURCE))
+    return tuple(out)

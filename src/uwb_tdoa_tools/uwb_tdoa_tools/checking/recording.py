@@ -1,4 +1,4 @@
-"""What `check` judges: the streams of a recording as they came, in the order in which they arrived."""
+"""Read the streams of a recording as `check` judges them: in the order of arrival."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from ..bags.frames import Place
     from ..bags.topics import TopicMessages
     from ..clock import Jump
-    from ..live.ends import End
+    from ..live.record import End
     from ..readers.inputs import Reading
 
 IMU, TDOA = "imu/data", "uwb/tdoa"
@@ -45,23 +45,46 @@ _ROWS = {
 
 @dataclass(frozen=True)
 class Recording:
-    """Nothing here is sorted, and ground truth is not read. Stamps are on one continuous time (see
-    `clock.straightened`).
+    """Streams of a recording, not sorted and without ground truth.
 
-    name : short; anchors : Anchors to check against; tdoa : Tdoas; imu : Imu or None;
-    tdoa_arrival, imu_arrival : (n,) s, when the recorder received them, NaN where that is not
-        known;
-    frames : {topic: {frame_id: messages}}; places : {frame_id: (Rotation, arm (3,) m)} of those
-        that /tf_static connects
-    with the body, where the samples are those of an IMU in its origin;
-    topics : {topic: type} of a bag, or of all that are live; read : names of those that were read,
-        or are our own;
-    recorded : Anchors that the bag itself holds, or None; falls : how often the stamps fell in a
-        file whose reader has sorted them;
-    remarks : sentences on what could not be read of a damaged one; ends : [End] of live topics;
-    sensors : {name: Stream} of those of the SENSORS that there are; jumps : of the clock, which
-    is continuous here, and outliers : {stream: messages left out because of their stamps};
-    losses : ((cause, evidence, remedy), ...) of what a reader has not used.
+    Stamps are on one continuous time (see `clock.straightened`).
+
+    Attributes
+    ----------
+    name : str
+        Short name.
+    anchors : Anchors
+        Survey to check against.
+    tdoa : Tdoas
+        TDOAs.
+    imu : Imu or None
+        Inertial samples, as of an IMU in the origin of the body.
+    tdoa_arrival, imu_arrival : (n,) array
+        When the recorder received them, s, NaN where unknown.
+    frames : dict
+        {topic: {frame_id: messages}}.
+    places : dict
+        {frame_id: (Rotation, arm (3,) m)} of frames that /tf_static connects with the body.
+    topics : dict
+        {topic: type} of a bag, or of all live topics.
+    recorded : Anchors or None
+        Anchors that the bag holds.
+    read : frozenset of str
+        Names of the topics that were read, or are our own.
+    falls : int
+        How often the stamps fell in a file whose reader has sorted them.
+    remarks : tuple of str
+        Sentences about damaged parts.
+    ends : tuple of End
+        Publishers and subscriptions of live topics.
+    sensors : dict
+        {name: Stream} of the SENSORS.
+    jumps : tuple of Jump
+        Jumps of the clock, which are corrected.
+    outliers : dict
+        {stream: messages left out because of their stamps}.
+    losses : tuple of (cause, evidence, remedy)
+        Data that a reader did not use.
     """
 
     name: str
@@ -87,9 +110,7 @@ class Recording:
 def read_recording(
     reading: Reading, path: str | Path, survey: str | Path | None = None
 ) -> Recording:
-    """Recording of a log, a CSV file or a bag, as a Reading says; survey : path of a survey, or
-    None. Raises InputError.
-    """
+    """Read a log, a CSV file or a bag. survey : path of a survey, or None. Raises InputError."""
     if is_bag(path):
         return _read_bag(reading, Path(path), survey)
     return of_flight(reading.read((Path(path), survey)))
@@ -101,10 +122,25 @@ def read_live(
     survey: str | Path | None = None,
     say: Callable[[str], object] = print,
 ) -> Recording:
-    """Recording of live topics, named as a Reading says, for so many seconds. say(sentence) :
-    called with what happens. Raises InputError.
+    """Record live topics for some seconds, and return the Recording.
+
+    Parameters
+    ----------
+    reading : Reading
+        Names of the topics.
+    seconds : float
+        Duration, s.
+    survey : path or None
+        Survey to check against.
+    say : callable
+        Called with sentences about the progress.
+
+    Raises
+    ------
+    InputError
+        If no TDOA arrives.
     """
-    from ..live.listen import listen  # needs ROS
+    from ..live.record import listen  # needs ROS
 
     name_of = Names(reading.namespace, reading.topics)
     with temporary_folder() as folder:
@@ -115,7 +151,7 @@ def read_live(
         except InputError as error:
             raise InputError(str(error).replace(str(bag), "live topics")) from error
     recording = replace(recording, topics=topics, ends=tuple(ends))
-    if "/clock" in topics:  # simulated time: the arrivals are of another
+    if "/clock" in topics:  # simulated time, which arrivals do not follow
         tdoa, imu = (
             np.full_like(arrival, np.nan)
             for arrival in (recording.tdoa_arrival, recording.imu_arrival)
@@ -125,7 +161,7 @@ def read_live(
 
 
 def of_flight(flight: Flight) -> Recording:
-    """Recording of a Flight. When its messages arrived is not known."""
+    """Return the Recording of a Flight. The arrivals of its messages are unknown."""
     tdoa, imu = (
         np.full(len(stream) if stream is not None else 0, np.nan)
         for stream in (flight.tdoa, flight.imu)
@@ -220,7 +256,7 @@ def _read_bag(reading: Reading, path: Path, survey: str | Path | None) -> Record
 
 
 def _stream_of(found: TopicMessages, sensor: Sensor) -> Stream:
-    """Stream of a Sensor."""
+    """Return the Stream of a Sensor."""
     make = bag_messages.of_sensor(sensor)[1]
     return make(
         found.stamps / 1e9, found.rows.reshape(len(found.stamps), sum(sensor.fields.values()))

@@ -1,25 +1,36 @@
-"""What `check` says: text for people, a dict for machines."""
+"""Write the findings of `check` as text and JSON, and as remarks of tools that estimate."""
 
 from __future__ import annotations
 
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
+from uwb_tdoa_bias.foundation.errors import InputError
+
 from .. import command_lines
-from ..json_values import as_json
+from ..outputs import as_json
+from .check import check, different_surveys
+from .ordered import OrderedRecording
+from .recording import of_flight
+from .tdoa_rules import gained
+from .watch import BEFORE_TRUTH
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
+    from uwb_tdoa_bias.foundation.flight import Flight
     from uwb_tdoa_ekf.streams import Finding
 
     from .check import Report
+
 
 SYMBOL = {"error": "ERROR", "warning": "warning", "note": "note"}
 
 
 def text(report: Report) -> str:
-    """Lines about one Report: the verdict first, then the findings, most severe first."""
+    """Return the lines about one Report: the verdict first, then the findings, most severe first."""
     facts = ", ".join(
         f"{name} {value}" if name in ("TDOAs", "IMU") else value
         for name, value in report.facts.items()
@@ -32,7 +43,7 @@ def text(report: Report) -> str:
 
 
 def verdict(findings: Sequence[Finding]) -> str:
-    """In a few words."""
+    """Return the verdict in a few words."""
     counts = {severity: sum(f.severity == severity for f in findings) for severity in SYMBOL}
     if not counts["error"] and not counts["warning"]:
         return "OK" if not counts["note"] else "OK, with a remark"
@@ -42,7 +53,7 @@ def verdict(findings: Sequence[Finding]) -> str:
 
 
 def lines(finding: Finding) -> Iterator[str]:
-    """Lines of text about one Finding."""
+    """Yield the lines of text about one Finding."""
     yield f"  {SYMBOL[finding.severity]}: {finding.cause}"
     yield f"      seen:   {finding.evidence}"
     first, *more = command_lines.as_it_runs(finding.remedy).splitlines()
@@ -52,8 +63,10 @@ def lines(finding: Finding) -> Iterator[str]:
 
 
 def as_dict(reports: Iterable[Report], together: Iterable[Finding]) -> dict[str, Any]:
-    """For JSON: {"recordings": [{"recording", "facts", "findings", "ends"}], "together": [findings
-    about several recordings]}; ends : who publishes and hears live topics.
+    """Return the content for JSON.
+
+    {"recordings": [{"recording", "facts", "findings", "ends"}], "together": [findings about several
+    recordings]}. "ends" are publishers and subscriptions of live topics.
     """
     return {
         "recordings": [
@@ -71,3 +84,63 @@ def as_dict(reports: Iterable[Report], together: Iterable[Finding]) -> dict[str,
 
 def _finding(finding: Finding) -> dict[str, Any]:
     return as_json(asdict(finding))
+
+
+SHORTEST = 10.0  # s; shorter flights get no remark
+
+
+def survey_remarks(flight: Flight) -> Iterator[str]:
+    """Yield sentences about the survey of a Flight: missing anchors, and positions that cannot be right.
+
+    The test is how much moving the anchors explains (see SurveyFit).
+
+    Raises
+    ------
+    InputError
+        If no TDOA is between two anchors of the survey.
+    """
+    tdoa, anchors = flight.tdoa, flight.anchors
+    known = (anchors.index(tdoa.a) >= 0) & (anchors.index(tdoa.b) >= 0)
+    heard = np.unique([tdoa.a, tdoa.b])
+    lacking = heard[anchors.index(heard) < 0].tolist()
+    if len(tdoa) and not known.any():
+        raise InputError(
+            f"{flight.name}: the tag hears anchors {_listed(heard)}, the survey has "
+            f"{_listed(anchors.ids)}, and no "
+            "TDOA is between two that it has; give the survey of that room."
+        )
+    if lacking:
+        share = 100.0 * np.mean(~known)
+        yield (
+            f"the survey has no anchor {_listed(lacking)}: {share:.0f} % of the TDOAs are not "
+            "used; survey it, too."
+        )
+    if not (len(tdoa) and np.ptp(tdoa.t) > SHORTEST):
+        return
+    recording = of_flight(flight)
+    if gained(OrderedRecording.of(recording).survey_fit) is not None:
+        causes = [
+            f"{one.cause}: {one.evidence}; {one.remedy}."
+            for one in check(recording).findings
+            if one.rule in BEFORE_TRUTH
+        ]
+        yield from causes or [
+            (
+                "the survey does not fit the TDOAs: of another room, or anchors have been moved; "
+                "`check` says more."
+            )
+        ]
+
+
+def _listed(ids: Iterable[int]) -> str:
+    return ", ".join(map(str, ids))
+
+
+def remarks_on(flights: Sequence[Flight]) -> Iterator[str]:
+    """Yield sentences on the surveys of Flights, each alone and in comparison."""
+    for flight in flights:
+        yield from (f"{flight.name}: {remark}" for remark in survey_remarks(flight))
+    yield from (
+        f"{finding.cause}: {finding.evidence}; {finding.remedy}."
+        for finding in different_surveys(flights)
+    )

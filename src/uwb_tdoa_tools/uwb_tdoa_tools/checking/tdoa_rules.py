@@ -1,8 +1,7 @@
-"""What is wrong with all TDOAs, or with the ids of the anchors? Found by what fits: each mistake is
-undone, and the recording says whether more of it is explained then.
+"""Find mistakes of all TDOAs, or of the ids of anchors: undo each mistake, and compare the fit.
 
-A rule takes an OrderedRecording and yields Trials: that with one mistake undone, and the Finding if
-that was it.
+A rule takes an OrderedRecording and yields trials, each with one mistake undone, and the Finding to
+report if that explains much more.
 """
 
 from __future__ import annotations
@@ -20,10 +19,8 @@ from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.streams import ERROR, Finding
 from uwb_tdoa_ekf.streams.explain import SCALE, compare, innovations
 
-from .known_path import MANY
-from .ordered import LONG, SHORT, OrderedRecording
-from .pair_rules import OFF
-from .survey_fit import SPREAD, spread
+from .ordered import LONG, SHORT, SPREAD, OrderedRecording, spread
+from .pair_rules import MANY, OFF
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
@@ -31,14 +28,13 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.anchors import Anchors
     from uwb_tdoa_bias.foundation.flight import Tdoas
 
-    from .survey_fit import SurveyFit
+    from .ordered import SurveyFit
 
     Survey = tuple[str, Anchors]  # its name, and what it says
 
-RATIO, DEVIATIONS = (
-    0.93,
-    2.5,
-)  # of what stays unexplained; healthy recordings: 1.02 at least for anything that is tried
+# ratio of the remaining loss, and its standard errors; healthy recordings: 1.02 at least in any
+# trial
+RATIO, DEVIATIONS = 0.93, 2.5
 UNITS = {  # m in one
     "nanoseconds": 0.299792458,
     "centimetres": 0.01,
@@ -49,39 +45,34 @@ UNITS = {  # m in one
     "milliseconds": 299792.458,
     "seconds": 299792458.0,
 }
-NOISE, USUAL = (
-    (0.02, 0.2),
-    0.063,
-)  # m, median difference of successive TDOAs of a pair; healthy 0.047 - 0.084
-WELL = 0.4  # of the loss; healthy 0.31 at most
-BY_ERRORS = 0.1**2 / (
-    0.1**2 + SCALE**2
-)  # of the loss: what systematic errors of 0.1 m leave unexplained
-GAIN = 0.065  # of the loss by moving all anchors; healthy 0.056 at most, of measured flights
-# of the loss, as surveyed: beyond what the errors of any healthy recording leave; 0.28 at most
-POOR = 0.33
-# share of GAIN that must be left where the other half of the recording has moved the anchors
-HELD = 0.5
+# m, median difference of successive TDOAs of a pair: limits, and usual; healthy 0.047 - 0.084
+NOISE, USUAL = (0.02, 0.2), 0.063
+WELL = 0.4  # loss below which a motion explains the TDOAs; healthy 0.31 at most
+BY_ERRORS = 0.1**2 / (0.1**2 + SCALE**2)  # loss that systematic errors of 0.1 m cause
+GAIN = 0.065  # fall of the loss by moving all anchors; measured healthy flights 0.056 at most
+POOR = 0.33  # loss as surveyed beyond that of any healthy recording, which is 0.28 at most
+HELD = 0.5  # share of GAIN that must remain with anchors fitted to the other half
 ALONE = 0.85  # share of the gain that one anchor explains
-# windows in which the tag was located; TDOAs of an anchor that may be called by the id of another
-FEWEST = 10
-# m, by which TDOAs of such an anchor are off at least: anchors of a hall are farther from each
-# other
-APART = 1.0
-CONTRARY, FAR = (
-    0.7,
-    0.5,
-)  # share of a pair's TDOAs that fit the other sign, of those longer than that, m
-MOST_PAIRS = 4  # that may be wrong by themselves
-MIXED_UP = "the ids of anchors are mixed up"  # of more than two
+FEWEST = 10  # windows with a position; TDOAs of an anchor that may have the id of another
+APART = 1.0  # m, least error of such an anchor: anchors of a hall are farther from each other
+CONTRARY, FAR = 0.7, 0.5  # share of a pair's TDOAs longer than FAR, m, that fit the other sign
+MOST_PAIRS = 4  # pairs that may have a wrong sign each
+MIXED_UP = "the ids of anchors are mixed up"  # more than two
 SAME = 0.2  # m at most between the places of an anchor in two surveys of one installation
 
 
 @dataclass(frozen=True)
 class MistakeTrial:
-    """recording : OrderedRecording with a mistake undone; finding : callable of the ratio, its
-    standard errors -> Finding;
-    share : of the TDOAs that it changes.
+    """A recording with one mistake undone.
+
+    Attributes
+    ----------
+    recording : OrderedRecording
+        The corrected recording.
+    finding : callable
+        (ratio of the losses, its standard errors) -> Finding.
+    share : float
+        Share of the TDOAs that it changes.
     """
 
     recording: OrderedRecording
@@ -90,15 +81,16 @@ class MistakeTrial:
 
 
 def in_metres(recording: OrderedRecording) -> bool:
-    """Whether the TDOAs scatter as metres do. (In nanoseconds those of a quiet radio do, too.)"""
-    return NOISE[0] <= successive(recording.tdoa) <= NOISE[1]
+    """Return whether the TDOAs scatter as metres do. TDOAs of a quiet radio in nanoseconds do so too."""
+    return NOISE[0] <= successive_difference(recording.tdoa) <= NOISE[1]
 
 
 def units(recording: OrderedRecording) -> Iterator[tuple[Finding, OrderedRecording]]:
-    """In metres? The noise of the radio is known, and that a motion explains most of it. Yields
-    (Finding, OrderedRecording).
+    """Yield (Finding, OrderedRecording in metres) if the TDOAs have another unit.
+
+    The noise of the radio is known, and a motion must explain most of the TDOAs.
     """
-    noise = successive(recording.tdoa)
+    noise = successive_difference(recording.tdoa)
     if not noise > 0.0 or (
         in_metres(recording) and recording.part(LONG).unexplained(WELL).mean < WELL
     ):
@@ -122,27 +114,27 @@ def units(recording: OrderedRecording) -> Iterator[tuple[Finding, OrderedRecordi
     )
 
 
-def successive(tdoa: Tdoas) -> float:
-    """Median difference of successive TDOAs of a pair, in the unit of the file."""
+def successive_difference(tdoa: Tdoas) -> float:
+    """Return the median difference of successive TDOAs of a pair, in the unit of the file."""
     order = np.lexsort((tdoa.t, tdoa.b, tdoa.a))
     a, b, t, d = tdoa.a[order], tdoa.b[order], tdoa.t[order], tdoa.d[order]
     follows = (np.diff(a) == 0) & (np.diff(b) == 0) & (np.diff(t) < 0.1)
     return float(np.median(np.abs(np.diff(d))[follows])) if follows.any() else 0.0
 
 
-def sign(recording: OrderedRecording) -> Iterator[MistakeTrial]:
-    """All signs the other way."""
+def inverted_signs(recording: OrderedRecording) -> Iterator[MistakeTrial]:
+    """Yield the trial with all signs inverted."""
     line = "message.distance_difference = distance_to_b - distance_to_a  # not a - b"
     yield MistakeTrial(
         recording.with_tdoa(d=-recording.tdoa.d),
-        _says("tdoa_sign", "the sign of all TDOAs is wrong", line),
+        _finding_of("tdoa_sign", "the sign of all TDOAs is wrong", line),
     )
 
 
-def scaled(recording: OrderedRecording) -> Iterator[MistakeTrial]:
-    """The survey in another unit.
+def scaled_survey(recording: OrderedRecording) -> Iterator[MistakeTrial]:
+    """Yield trials with the survey in another unit.
 
-    (Where TDOAs show it at a glance, the streams have said so before.)
+    (If the TDOAs show it directly, the rules of streams have reported it before.)
     """
     for name, factor in SURVEY_UNITS.items():
         cause = (
@@ -151,13 +143,15 @@ def scaled(recording: OrderedRecording) -> Iterator[MistakeTrial]:
         )
         line = f"x, y, z = x / {factor:.6g}, y / {factor:.6g}, z / {factor:.6g}  # of every anchor"
         anchors = recording.anchors.at(recording.anchors.positions / factor)
-        yield MistakeTrial(replace(recording, anchors=anchors), _says("survey_scale", cause, line))
+        yield MistakeTrial(
+            replace(recording, anchors=anchors), _finding_of("survey_scale", cause, line)
+        )
 
 
-def survey(recording: OrderedRecording, others: Sequence[Survey]) -> Iterator[MistakeTrial]:
-    """Another survey. others : [(name, Anchors)].
+def other_survey(recording: OrderedRecording, others: Sequence[Survey]) -> Iterator[MistakeTrial]:
+    """Yield trials with other surveys, [(name, Anchors)].
 
-    Those of one installation, of different days, count as one.
+    Surveys of one installation on different days count as one.
     """
     while others:
         (name, anchors), *rest = others
@@ -168,31 +162,32 @@ def survey(recording: OrderedRecording, others: Sequence[Survey]) -> Iterator[Mi
         names = " or ".join([name, *duplicates])
         cause = f"the survey is of another room or day: {names} fits"
         yield MistakeTrial(
-            replace(recording, anchors=anchors), _says("survey_other", cause, f"--survey {name}")
+            replace(recording, anchors=anchors),
+            _finding_of("survey_other", cause, f"--survey {name}"),
         )
 
 
 def same_place(one: Anchors, other: Anchors) -> bool:
-    """True if two Anchors have the same ids at the same places."""
+    """Return whether two Anchors have the same ids at the same places."""
     rows = other.index(one.ids)
-    return len(one) == len(other) and bool((rows >= 0).all()) and furthest(one, other) < SAME
+    return (
+        len(one) == len(other)
+        and bool((rows >= 0).all())
+        and largest_displacement(one, other) < SAME
+    )
 
 
-def furthest(one: Anchors, other: Anchors) -> float:
-    """m between the two places of an id that two Anchors have furthest apart; infinite if they have
-    none in common.
-    """
+def largest_displacement(one: Anchors, other: Anchors) -> float:
+    """Return the largest distance between the two places of an id, m; infinite without a common id."""
     rows = other.index(one.ids)
     off = np.linalg.norm(one.positions - other.positions[rows], axis=1)[rows >= 0]
     return float(off.max()) if len(off) else np.inf
 
 
-def renumbered(recording: OrderedRecording) -> Iterator[MistakeTrial]:
-    """Ids that the survey does not have: the same anchors in the same order, with other numbers?"""
-    heard, known = (
-        np.unique(np.r_[recording.tdoa.a, recording.tdoa.b]),
-        np.sort(recording.anchors.ids),
-    )
+def renumbered_ids(recording: OrderedRecording) -> Iterator[MistakeTrial]:
+    """Yield the trial with renumbered ids: the same anchors in the same order, with other numbers."""
+    heard = np.unique(np.r_[recording.tdoa.a, recording.tdoa.b])
+    known = np.sort(recording.anchors.ids)
     if len(heard) != len(known) or np.isin(heard, known).all():
         return
     table = dict(zip(heard.tolist(), known.tolist()))
@@ -200,12 +195,13 @@ def renumbered(recording: OrderedRecording) -> Iterator[MistakeTrial]:
     line = f"id -= {shift}" if (heard - known == shift).all() else f"id = {table}[id]"
     cause = f"the ids of the survey are others: what the tag calls {heard[0]} ... {heard[-1]} "
     cause += f"is {known[0]} ... {known[-1]} there"
-    yield MistakeTrial(relabelled(recording, table), _says("ids_renumbered", cause, line))
+    yield MistakeTrial(relabelled(recording, table), _finding_of("ids_renumbered", cause, line))
 
 
-def swapped(recording: OrderedRecording) -> Iterator[MistakeTrial]:
-    """Anchors whose ids were mixed up: the best exchange of two, then of two more, as long as more
-    is explained. Not along a line: in a room that is symmetrical about it, anchors differ by their
+def swapped_ids(recording: OrderedRecording) -> Iterator[MistakeTrial]:
+    """Yield the trial with the best exchange of two ids, then of two more, while more is explained.
+
+    Not for motion along a line: in a room that is symmetrical about it, anchors differ by their
     systematic errors alone.
     """
     if spread(recording.survey_fit.places) < SPREAD:
@@ -231,14 +227,13 @@ def swapped(recording: OrderedRecording) -> Iterator[MistakeTrial]:
         table = {i: k for i, k in table.items() if i != k}
         brief, trial = relabelled(brief, best_swap), relabelled(trial, best_swap)
     if not table or (len(table) > 2 and gained(trial.survey_fit) is not None):
-        # a survey of another room is explained better by exchanging many ids, and still does not
-        # fit
+        # Exchanging many ids explains a survey of another room better, and it still does not fit.
         return
     names = ", ".join(f"{i} is {k}" for i, k in sorted(table.items()))
     cause = "the ids of two anchors are swapped" if len(table) == 2 else MIXED_UP
     yield MistakeTrial(
         trial,
-        _says(
+        _finding_of(
             "ids_swapped",
             f"{cause}: what is called {names}",
             f"id = {table}.get(id, id)  # or swap them in the survey",
@@ -247,9 +242,7 @@ def swapped(recording: OrderedRecording) -> Iterator[MistakeTrial]:
 
 
 def _far_off(recording: OrderedRecording) -> list[int]:
-    """Ids of the anchors whose TDOAs are far from what the filter expects, in comparison with those
-    of most anchors: what is called by the id of another anchor of a hall is.
-    """
+    """Return the ids of anchors with much larger innovations than most: their ids may be exchanged."""
     (a, b), tdoa, positions = recording.rows(), recording.tdoa, recording.anchors.positions
     off = np.abs(
         innovations(new_state(positions), structured(TDOA, tdoa.t, a, b, tdoa.d), positions)
@@ -261,10 +254,8 @@ def _far_off(recording: OrderedRecording) -> list[int]:
     return recording.anchors.ids[rows[each > limit]].tolist()
 
 
-def contrary(recording: OrderedRecording) -> Iterator[MistakeTrial]:
-    """Single pairs with the other sign: a filter that hardly believes them knows. Or all pairs that
-    name the larger id first.
-    """
+def inverted_pairs(recording: OrderedRecording) -> Iterator[MistakeTrial]:
+    """Yield trials with the sign of single pairs inverted, or of all pairs with the larger id first."""
     tdoa = recording.tdoa
     pairs = np.unique(np.column_stack([tdoa.a, tdoa.b]), axis=0)
     backward = tdoa.a > tdoa.b
@@ -274,7 +265,7 @@ def contrary(recording: OrderedRecording) -> Iterator[MistakeTrial]:
             "message's ids"
         )
         cause = "the sign of the TDOAs does not follow the order of the anchors"
-        yield MistakeTrial(_flipped(recording, backward), _says("tdoa_one_sign", cause, line))
+        yield MistakeTrial(_flipped(recording, backward), _finding_of("tdoa_one_sign", cause, line))
     wrong = _contrary(recording.part(LONG), pairs)
     if not 0 < len(wrong) <= MOST_PAIRS:
         return
@@ -283,25 +274,22 @@ def contrary(recording: OrderedRecording) -> Iterator[MistakeTrial]:
         flip |= (tdoa.a == a) & (tdoa.b == b)
     trial = _flipped(recording, flip)
     if gained(trial.survey_fit) is not None:
-        # of a survey of another room some pairs seem to have the other sign, and still it does not
-        # fit
+        # With a survey of another room some pairs seem to have the other sign, and it does not fit.
         return
     names = ", ".join(f"({a}, {b})" for a, b in wrong)
     line = f"if (a, b) in {{{names}}}: message.distance_difference *= -1.0  # and find out why"
     yield MistakeTrial(
-        trial, _says("pair_sign", f"the sign of the pairs {names} is wrong", line), flip.mean()
+        trial,
+        _finding_of("pair_sign", f"the sign of the pairs {names} is wrong", line),
+        flip.mean(),
     )
 
 
 def _contrary(recording: OrderedRecording, pairs: np.ndarray) -> list[tuple[int, int]]:
-    """The pairs, [(a, b)], most of whose TDOAs are nearer to the negative of what the filter
-    predicts.
-    """
-    tdoa, run = (
-        recording.tdoa,
-        run_offline(recording.flight(), FilterConfig(use_imu=False)).residuals,
-    )
-    predicted = tdoa.d - run.innovation
+    """Return the pairs, [(a, b)], most of whose TDOAs are nearer to the negative of the prediction."""
+    tdoa = recording.tdoa
+    run = run_offline(recording.flight(), FilterConfig(use_imu=False))
+    predicted = tdoa.d - run.residuals.innovation
     counted = np.isfinite(predicted) & (np.abs(tdoa.d) > FAR) & (np.abs(predicted) > FAR)
     other = np.abs(tdoa.d + predicted) < np.abs(tdoa.d - predicted)
     wrong = []
@@ -316,10 +304,8 @@ def _flipped(recording: OrderedRecording, rows: np.ndarray) -> OrderedRecording:
     return recording.with_tdoa(d=np.where(rows, -recording.tdoa.d, recording.tdoa.d))
 
 
-def moved(recording: OrderedRecording) -> Iterator[MistakeTrial]:
-    """An anchor that is not where the survey has it: there, TDOAs are explained that no motion
-    explains otherwise.
-    """
+def moved_anchor(recording: OrderedRecording) -> Iterator[MistakeTrial]:
+    """Yield the trial with one anchor moved to where the TDOAs are explained."""
     fit = recording.survey_fit
     gain = gained(fit)
     if gain is None:
@@ -338,38 +324,48 @@ def moved(recording: OrderedRecording) -> Iterator[MistakeTrial]:
         f"{number}: {{position: [x, y, z]}}  # measure it again; look for exchanged digits and axes"
     )
     anchors = recording.anchors.at(alone[row][1])
-    yield MistakeTrial(replace(recording, anchors=anchors), _says("anchor_moved", cause, line))
+    yield MistakeTrial(
+        replace(recording, anchors=anchors), _finding_of("anchor_moved", cause, line)
+    )
 
 
 def gained(fit: SurveyFit) -> float | None:
-    """How much less stays unexplained with all anchors moved; None if that is no more than in a
-    healthy recording, or if anchors that one half of the recording has moved do not fit the other
-    half, and errors of the TDOAs can explain it as well.
+    """Return by how much the loss falls with all anchors moved, or None if the survey may be right.
+
+    The survey may be right if the gain is no larger than in a healthy recording. Anchors fitted to one
+    half must also fit the other half, unless the loss exceeds that of any healthy recording.
     """
     gain = apparent_gain(fit)
     return gain if gain > GAIN and (fit.before > POOR or fit.held_out_gain > HELD * GAIN) else None
 
 
 def apparent_gain(fit: SurveyFit) -> float:
-    """The same without a look at both halves; 0.0 of too few windows."""
+    """Return the same without a comparison of both halves; 0.0 for too few windows."""
     return fit.before - fit.all_moved[0] if len(fit) >= FEWEST else 0.0
 
 
-def best(
+def best_trial(
     recording: OrderedRecording, others: Sequence[Survey] = ()
 ) -> tuple[Finding | None, OrderedRecording]:
-    """(Finding, OrderedRecording with it undone), or (None, recording): of all that can be tried,
-    what explains the most, if it is certain, and more than systematic errors could: along a line,
-    in a room that is symmetrical about it, swapped ids differ by these alone.
+    """Return (Finding, OrderedRecording with it undone), or (None, recording).
 
-    Smaller TDOAs are always explained better: another unit is believed at once where the noise
-    speaks against metres, and else only where nothing different helps.
+    It is the trial that explains most, if it is significant and gains more than systematic errors can.
+    Smaller TDOAs are always explained better. So another unit is accepted at once only if the noise
+    contradicts metres, else only if no other trial helps.
     """
     if not in_metres(recording):
         for found in units(recording):
             return found
     base, trials = recording.part(LONG).unexplained(), []
-    for rule in (sign, scaled, renumbered, swapped, contrary, moved, lambda c: survey(c, others)):
+    for rule in (
+        inverted_signs,
+        scaled_survey,
+        renumbered_ids,
+        swapped_ids,
+        inverted_pairs,
+        moved_anchor,
+        lambda c: other_survey(c, others),
+    ):
         for trial in rule(recording):
             most = min(RATIO * base.mean, base.mean - BY_ERRORS * trial.share)
             other = trial.recording.part(LONG).unexplained(most)
@@ -382,7 +378,7 @@ def best(
     return next(units(recording), (None, recording))
 
 
-def _says(rule: str, cause: str, line: str) -> Callable[[float, float], Finding]:
+def _finding_of(rule: str, cause: str, line: str) -> Callable[[float, float], Finding]:
     def finding(ratio: float, z: float) -> Finding:
         evidence = (
             f"{100.0 * (1.0 - ratio):.0f} % less stays unexplained then, {z:.1f} standard errors"
@@ -393,7 +389,7 @@ def _says(rule: str, cause: str, line: str) -> Callable[[float, float], Finding]
 
 
 def relabelled(recording: OrderedRecording, table: dict[int, int]) -> OrderedRecording:
-    """Ids replaced as the dict `table` says, all at once."""
+    """Return the recording with ids replaced by the dict `table`, all at once."""
     columns = {}
     for name, ids in (("a", recording.tdoa.a), ("b", recording.tdoa.b)):
         columns[name] = ids.copy()

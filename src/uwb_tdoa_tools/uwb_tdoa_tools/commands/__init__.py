@@ -1,1 +1,1 @@
-"""The executables, one file each: options, one call, what is printed. Nothing imports them."""
+"""Executables, one thin file each: options, one call, the printed result. Nothing imports them."""

@@ -1,4 +1,4 @@
-"""calibrate: from a recording to a calibrated tag, in one command."""
+"""Calibrate a tag from recordings, in one command."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ..checking.recording import read_recording
 from ..diagnosis.noise import write_parameters
 from ..estimate import FlightEstimator
 from ..outputs import OutputFolder
-from ..progress import Progress
+from ..parallel import Progress
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
@@ -28,14 +28,14 @@ if TYPE_CHECKING:
     from ..calibrating import Calibration
     from ..readers.inputs import Reading, Recording
 
-DESCRIPTION = """From recordings to a calibrated tag: check, find what is wrong, judge that where it took no part, write it.
+DESCRIPTION = """Calibrate a tag from recordings: check them, find systematic errors, and validate the correction on hold-out flights.
 
-With ground truth in every FLIGHT `diagnose` finds what is wrong; without it, or with --no-truth, which leaves it unread, `survey` finds
-better anchors and delays from the flights alone. The judge is --holdout; else the last of several flights, or parts of a single one.
-It took no part then. Stops where a step says so, and says why. A calibration that makes things worse there is not written.
+With ground truth in every FLIGHT, `diagnose` finds the errors. Without it, or with --no-truth, which leaves it unread, `survey` finds
+better anchors and delays from the flights alone. --holdout names the flights for the validation; else it uses the last of several
+flights, or parts of a single one. Stops at a step that fails, and prints why. A correction that increases the error is not written.
 
 Writes to --out: anchors.yaml, effects.yaml and ekf_node.yaml, for evaluate and for both nodes, and calibration.json; prints the two
-lines that start the nodes. --quick says within a minute what that is likely to bring, and writes nothing.
+lines that start the nodes. --quick predicts the gain within a minute, and writes nothing.
 
 Exit code: 0 calibrated (--quick: worth it), 1 stopped, 2 bad input."""
 
@@ -61,7 +61,7 @@ def parser() -> ArgumentParser:
     options.add_filter(
         made,
         (
-            "effects.yaml: what is in the model already; without ground truth its covariance is "
+            "effects.yaml: effects in the model already; without ground truth its covariance is "
             "the prior"
         ),
     )
@@ -141,24 +141,33 @@ def _checked(
     estimator: FlightEstimator,
     effects: str | None,
 ) -> bool:
-    """Whether check finds no error in recordings that stops a calibration; says what it finds. std
-    : m, of a coordinate of an anchor;
-    effects : file of those of the FlightEstimator, or None.
+    """Print what check finds, and return whether the recordings permit a calibration.
+
+    Parameters
+    ----------
+    recordings : sequence of (path, survey)
+        Recordings with the paths of their surveys.
+    std : float
+        Standard deviation of a coordinate of an anchor, m.
+    estimator : FlightEstimator
+        Estimator with the given effects.
+    effects : str or None
+        File of these effects.
     """
-    checked, sound = [], True
+    checked, usable = [], True
     with Progress("calibrate", len(recordings), "recording") as progress:
         for path, survey in recordings:
             checked.append(read_recording(reading, path, survey))
             result = check(
-                checked[-1], (), estimator, command_lines.surveying(path, survey, effects)
+                checked[-1], (), estimator, command_lines.survey_line(path, survey, effects)
             )
             cli.show(report.text(result))
-            sound = sound and not blocking_errors(checked[-1], result.findings, std)
+            usable = usable and not blocking_errors(checked[-1], result.findings, std)
             progress.update()
     for finding in different_surveys(checked):
         cli.show(*report.lines(finding))
-        sound = False
-    return sound
+        usable = False
+    return usable
 
 
 def _stop(why: str) -> int:
@@ -186,8 +195,10 @@ def _write(
         f"wrote {', '.join(file.name for file in files if file.exists())} and "
         f"calibration.json to {out}"
     )
-    cli.show(f"judge it:   {command_lines.judging(recordings, survey, corrected, tuned, truth)}")
-    cli.show("start the nodes with it:", *command_lines.nodes(survey, corrected, tuned))
+    cli.show(
+        f"judge it:   {command_lines.evaluate_line(recordings, survey, corrected, tuned, truth)}"
+    )
+    cli.show("start the nodes with it:", *command_lines.node_lines(survey, corrected, tuned))
     return 0
 
 

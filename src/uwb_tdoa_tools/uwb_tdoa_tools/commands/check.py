@@ -1,6 +1,4 @@
-"""check: what a driver may have got wrong, found in a recording before anything else is done with
-it.
-"""
+"""Check recordings for mistakes of drivers, before anything else uses them."""
 
 from __future__ import annotations
 
@@ -18,7 +16,7 @@ from ..checking.check import check, different_surveys
 from ..checking.recording import read_live, read_recording
 from ..estimate import FlightEstimator
 from ..outputs import OutputFile
-from ..progress import Progress
+from ..parallel import Progress
 from ..readers import read_survey
 
 if TYPE_CHECKING:
@@ -79,7 +77,7 @@ def _check(args: Namespace) -> int:
     reports, recordings = [], []
     for recording, path, survey in _recordings(args, reading, alone):
         recordings.append(recording)
-        line = command_lines.surveying(path, survey, args.effects) if path else None
+        line = command_lines.survey_line(path, survey, args.effects) if path else None
         reports.append(check(recording, others, estimator, line))
         cli.show(report.text(reports[-1]))
     together = list(different_surveys(recordings))
@@ -93,8 +91,9 @@ def _check(args: Namespace) -> int:
 def _recordings(
     args: Namespace, reading: Reading, survey: str | Path | None
 ) -> Iterator[tuple[Recording, Path | None, str | Path | None]]:
-    """Yield (Recording, its path, that of its survey) of each, or (Recording, None, None) of what
-    is live. survey : path of the one survey, or None.
+    """Yield each Recording with its path and that of its survey; (Recording, None, None) if live.
+
+    survey : path of the one survey, or None.
     """
     if args.live is not None:
         yield read_live(reading, args.live, survey, partial(cli.say, "check")), None, None
@@ -109,7 +108,7 @@ def _recordings(
 
 
 def _surveys(folder: Path) -> list[tuple[str, Anchors]]:
-    """[(path, Anchors)] of a folder of surveys."""
+    """Return [(path, Anchors)] of a folder of surveys."""
     return [(str(path), read_survey(path)) for path in sorted(folder.glob("anchor_?*"))]
 
 

@@ -13,7 +13,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from .. import cli, options
 from ..bags.convert import SENSORS, convert, shifted
 from ..outputs import OutputBag
-from ..progress import Progress
+from ..parallel import Progress
 from ..readers import columns
 from ..readers.names import read_named_anchors
 from ..scoring.evaluation import on_one_clock
@@ -71,7 +71,7 @@ def parser() -> ArgumentParser:
         default=[],
         metavar="SENSOR=SECONDS",
         help=(
-            f"add this to the stamps of a sensor with a clock of its own: {', '.join(SENSORS)}; "
+            f"add this to the stamps of a sensor with another clock: {', '.join(SENSORS)}; "
             "may be repeated"
         ),
     )
@@ -128,7 +128,7 @@ def _convert(args: Namespace) -> None:
 
 
 def _offsets(texts: Iterable[str]) -> dict[str, float]:
-    """{sensor: s} of "SENSOR=SECONDS" texts. Raises InputError."""
+    """Return {sensor: s} of "SENSOR=SECONDS" texts. Raises InputError."""
     offsets = {}
     for text in texts:
         sensor, given, seconds = text.partition("=")

@@ -1,4 +1,4 @@
-"""debias: map the bias of estimated positions, take it out, and say what that is worth."""
+"""Map the bias of estimated positions, remove it, and show the gain."""
 
 from __future__ import annotations
 
@@ -132,10 +132,8 @@ def _fit(args: Namespace) -> int:
 
 
 def _judge(args: Namespace) -> int:
-    estimator, made = (
-        PositionEstimator(options.reading_of(args), *options.filter_of(args), args.align),
-        BiasMap.load(args.map),
-    )
+    estimator = PositionEstimator(options.reading_of(args), *options.filter_of(args), args.align)
+    made = BiasMap.load(args.map)
     rows = _judged(args, estimator, estimator.reading.find(args.flights, bool(args.dask)), made)
     evaluation.print_rows("flight", rows)
     gained = evaluation.mean_gain(rows)

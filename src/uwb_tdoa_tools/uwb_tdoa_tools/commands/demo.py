@@ -1,4 +1,4 @@
-"""demo: a flight through both nodes over ROS topics, and how far the estimate is from ground truth."""
+"""Send a flight through both nodes over ROS topics, and compare the estimate with ground truth."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def _demo(args: Namespace) -> int:
 
 
 def _change_in_words(scores: Sequence[Score]) -> str:
-    """What correction did to the error, in words."""
+    """State in words how correction changes the error."""
     before, after = (score.row()["rmse_3d"] for score in scores[:2])
     if len(scores) == 2:
         return (

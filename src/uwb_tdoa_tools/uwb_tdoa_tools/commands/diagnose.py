@@ -1,4 +1,4 @@
-"""diagnose: from a residual to the missing effect to a smaller error."""
+"""Find missing effects from residuals, and reduce the error."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from uwb_tdoa_bias.foundation.files import write_text
 
 from .. import cli, command_lines, options, parallel
 from ..checking.before_anchors import ids_are_right
-from ..checking.remarks import remarks_on
+from ..checking.report import remarks_on
 from ..diagnosis import diagnose, output
 from ..diagnosis.noise import write_parameters
 from ..diagnosis.references import REFERENCES
@@ -21,7 +21,7 @@ from ..diagnosis.self_calibration.equations import measured_noise
 from ..estimate import FlightEstimator
 from ..localizing.pictures import write_diagnosis
 from ..outputs import OutputFolder
-from ..progress import Progress
+from ..parallel import Progress
 from ..readers import inputs
 from ..surveying.known import DRIFT, read_paths
 
@@ -30,10 +30,10 @@ if TYPE_CHECKING:
 
     from ..diagnosis.constraints import Distance, Mark, OdometryPath
 
-DESCRIPTION = """Find out what is wrong with the measurements of some flights, and put it right.
+DESCRIPTION = """Find systematic errors in the measurements of some flights, and correct them.
 
-Finds the residuals of every channel, traces them to effects that the model lacks, says how sure it is and what else it
-could be, adds what helps, and reports the error before and after on data that took no part in the fit.
+Computes the residuals of every channel, and traces them to effects that the model lacks, with their uncertainty and
+alternatives. Adds the effects that help, and reports the error before and after on hold-out data.
 Writes diagnosis.json, effects.yaml (for evaluate, bias_node and ekf_node), ekf_node.yaml (the noise that the filter should
 assume with them; --config of evaluate) and report.html.
 Exit code: 0 done; 1 ids, signs or units are wrong and --no-truth or --reference marks is given; 2 bad input."""
@@ -74,7 +74,7 @@ def parser() -> ArgumentParser:
     options.add_filter(
         made,
         (
-            "effects.yaml: what is in the model already; without ground truth its covariance is "
+            "effects.yaml: effects in the model already; without ground truth its covariance is "
             "the prior"
         ),
     )
@@ -88,7 +88,7 @@ def parser() -> ArgumentParser:
         default="truth",
         help="what flights are compared with: their ground truth (default), the heights of a range "
         "finder, --marks, "
-        "--odometry, or nothing; what is not named is not read",
+        "--odometry, or nothing; other references are not read",
     )
     known(
         "--no-truth",
@@ -139,7 +139,7 @@ def _diagnose(args: Namespace) -> int:
         return 1
     found = reading.find(args.flights)
     rerun = options.rerun_of(args, len(found), partial(cli.say, "diagnose"))
-    jobs, dask = parallel.asked(args, len(found), FEW)
+    jobs, dask = parallel.workers_for(args, len(found), FEW)
     flights, holdout = (
         reading.flights(paths, args.most, jobs, dask) for paths in (args.flights, args.holdout)
     )
@@ -160,9 +160,8 @@ def _diagnose(args: Namespace) -> int:
     reference = REFERENCES[args.reference](
         config, known, *[args.align][: args.reference == "truth"]
     )
-    over = partial(
-        parallel.over, jobs=jobs, dask=dask, unit=None
-    )  # no bar beside the line of Progress
+    # Only Progress prints a line.
+    over = partial(parallel.over, jobs=jobs, dask=dask, unit=None)
     with Progress("diagnose") as progress:
         result = diagnose(
             flights, holdout, effects or EffectSet(), config, reference, progress, over
@@ -179,7 +178,7 @@ def _diagnose(args: Namespace) -> int:
     (_, its_survey), *_ = found
     truth = all(flight.truth is not None for flight in holdout or flights)
     judged_on = args.holdout or args.flights
-    applying = command_lines.applying(
+    applying = command_lines.lines_of_use(
         out, judged_on, args.survey, its_survey, tdoa_std is not None, truth
     )
     result = replace(result, applying=applying)

@@ -1,7 +1,4 @@
-"""How good is the estimate?
-
-Errors against ground truth, of the filter run here or of a recorded odometry.
-"""
+"""Evaluate an estimate against ground truth: of the filter run here, or a recorded odometry."""
 
 from __future__ import annotations
 
@@ -15,24 +12,15 @@ from uwb_tdoa_bias.foundation.files import write_text
 
 from .. import cli, evaluating, options, parallel
 from ..evaluating import Evaluator, results
-from ..json_values import as_json
-from ..outputs import OutputFile, OutputFolder
-from ..results_file import asked_of
+from ..outputs import OutputFile, OutputFolder, as_json
+from ..results_file import settings_of
 from ..scoring.pooling import FIGURES, Pool
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
 
-NO_MATTER = (
-    "flights",
-    "survey",
-    "json",
-    "markdown",
-    "beside",
-    "resume",
-    "jobs",
-    "dask",
-)  # to what is kept of a flight
+# Options without influence on the figures of a flight.
+WITHOUT_INFLUENCE = "flights", "survey", "json", "markdown", "beside", "resume", "jobs", "dask"
 NOT_OF_ODOMETRY = "effects", "config", "model", "no_bias", "parameters", "without", "smooth"
 
 
@@ -94,8 +82,8 @@ def parser() -> ArgumentParser:
         metavar="FILE",
         type=OutputFile,
         help=(
-            "keep each flight's figures there as soon as it is judged, a line of JSON each; what "
-            "is there is not judged again"
+            "keep each flight's figures there as soon as they are computed, a line of JSON each; "
+            "flights in the file are not evaluated again"
         ),
     )
     parallel.add_options(made)
@@ -126,7 +114,7 @@ def _evaluate(args: Namespace) -> int:
         cli.show(f"correcting with: {estimator.correction}")
     cli.show(evaluating.head_line())
     kept, pool = [], Pool()
-    asked = asked_of(args, NO_MATTER, ("effects", "config", "model")) | {
+    asked = settings_of(args, WITHOUT_INFLUENCE, ("effects", "config", "model")) | {
         "version of the figures": FIGURES
     }
     for result in results(evaluator, found, args.resume, asked, args.jobs, args.dask):

@@ -1,4 +1,4 @@
-"""fly: a simulated vehicle takes off, flies and lands by the estimate, again and again."""
+"""Fly a simulated vehicle by the estimate, many times: take off, fly and land."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ from ..flying.trial import VEHICLES, Task
 from ..flying.verdict import summary, text, wording_of
 from ..flying.world import MOMENTS, WORLDS, world_of
 from ..outputs import OutputFile, OutputFolder
-from ..results_file import asked_of
+from ..results_file import settings_of
 
-NO_MATTER = (
+# Options without influence on a flight.
+WITHOUT_INFLUENCE = (
     "flights",
     "seed",
     "jobs",
@@ -71,7 +72,7 @@ def parser() -> argparse.ArgumentParser:
         metavar="S",
         type=parallel.whole_number,
         default=1,
-        help="of the first; the others have the next ones (default: 1)",
+        help="of the first flight; each later one has the next seed (default: 1)",
     )
     add(
         "--vehicle",
@@ -152,7 +153,7 @@ def parser() -> argparse.ArgumentParser:
     add(
         "--peer",
         metavar="LIBRARY",
-        help="fly by this shared library of another filter (docs/flying.md), which is told its yaw",
+        help="fly by this shared library of another filter (docs/flying.md), which gets its yaw",
     )
     parallel.add_options(made)
     add(
@@ -172,7 +173,7 @@ def parser() -> argparse.ArgumentParser:
         "--resume",
         metavar="FILE",
         type=OutputFile,
-        help="keep the verdict of each flight in this file, and go on from what is there",
+        help="keep the verdict of each flight in this file, and continue from there",
     )
     add("--json", metavar="FILE", type=OutputFile, help="write the summary and every verdict")
     add(
@@ -221,7 +222,7 @@ def _fly(args: argparse.Namespace) -> int:
     ]
     verdicts, pictures = [], []
     with fleet.verdict_store(
-        args.resume, asked_of(args, NO_MATTER, ("config", "effects", "model", "peer"))
+        args.resume, settings_of(args, WITHOUT_INFLUENCE, ("config", "effects", "model", "peer"))
     ) as done:
         for verdict, picture in fleet.fly_all(
             tasks, done, args.record, args.plot is not None, args.jobs, args.dask

@@ -1,4 +1,4 @@
-"""inject: add a declared effect to a recorded or simulated flight."""
+"""Add a declared effect to a recorded or simulated flight."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, options
 from ..outputs import OutputBag
-from ..progress import Progress
+from ..parallel import Progress
 from ..simulation.inject import catalogue, inject, parse_effect
 
 if TYPE_CHECKING:

@@ -1,4 +1,4 @@
-"""localize: where the tag was, and how far that is to be believed."""
+"""Estimate where the tag was, and how far that can be trusted."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NAME.bag (nav_msgs/Odometry), with --residuals what is left of each TDOA, as a t
 which anchors were heard where, and how well: a table and a map.
 
 It says how far each trajectory is to be believed, and what would make it better. good: the position is within what is stated for 95 %
-of the time; doubtful: the filter was lost, or began anew, or many TDOAs speak against it; bad: check finds an error, or there is none.
+of the time; doubtful: the filter was lost, or restarted, or many TDOAs contradict it; bad: check finds an error, or there is none.
 
 Exit code: 0 all are good, 1 some are not, 2 bad input."""
 

@@ -1,6 +1,4 @@
-"""plan: where a tag can be located among given anchors, how precisely, and where the anchors had
-better be.
-"""
+"""Plan an installation: where a tag can be located, how precisely, and better anchors."""
 
 from __future__ import annotations
 

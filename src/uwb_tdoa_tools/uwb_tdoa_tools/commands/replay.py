@@ -13,13 +13,13 @@ from ..live.session import PACKAGE
 DESCRIPTION = """Replay a bag over ROS topics with its own timing, like `ros2 bag play`.
 
 Every topic is published with the durability it was recorded with, and always reliably, which serves best-effort
-subscriptions too: a reliable subscription gets every message at any rate (the replay waits for it when it must), a
-best-effort one gets what it keeps up with. Nothing is played before somebody listens. With --follow, nothing is played
-more than 2 s ahead of what comes of it, and while ekf_node publishes uwb/residual no TDOA before those that are 0.1 s
-older have come out of the filter: a slow computer then takes longer, and gets the same. Ends when every reliable
-subscription has everything, and tells what was published and how late; with code 1 if what was followed was late all
-the same. ROS arguments put all topics (but /tf, /clock and the like) into the namespace of a tag, or move single ones,
-as in the last examples.
+subscriptions too. A reliable subscription gets every message at any rate: the replay waits for it. A best-effort
+one may miss messages. The replay starts with the first subscription. With --follow it stays within 2 s of the followed
+topic. While ekf_node publishes uwb/residual, it also waits until older TDOAs (0.1 s) have left the filter: a slow
+computer takes longer, and gets the same result. The replay ends when every reliable subscription has every message. It
+prints the counts and the largest delay, and ends with code 1 if the followed nodes were late or lost messages. ROS
+arguments move all topics (except /tf, /clock and the like) into the namespace of a tag, or single topics, as in the
+last examples.
 """
 
 

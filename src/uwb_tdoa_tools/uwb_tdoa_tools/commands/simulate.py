@@ -1,6 +1,4 @@
-"""simulate: fly, drive or carry a tag along a path among anchors, and write what IMU, UWB tag and
-motion capture would record.
-"""
+"""Simulate a flight, a drive or a walk, and write it as a bag."""
 
 from __future__ import annotations
 
@@ -11,7 +9,7 @@ from .. import cli
 from ..bags.bag import check_output, write_bag
 from ..bags.files import STORAGES
 from ..outputs import OutputBag, OutputFile
-from ..progress import Progress
+from ..parallel import Progress
 from ..simulation import simulate
 from ..simulation.options import add_options, config_of
 from ..simulation.report import catalogue, check_image, plot, summary
@@ -80,8 +78,7 @@ def _simulate(args: Namespace) -> None:
     if args.out is not None:
         check_output(args.out, args.force)  # before the work, not after it
     check_image(args.plot)
-    with Progress("simulate") as progress:
-        progress("flying")
+    with Progress("simulate", what="flying"):
         flight = simulate(config_of(args))
         content = summary(flight)
     cli.show(
@@ -94,8 +91,7 @@ def _simulate(args: Namespace) -> None:
         f"{content['outliers']} outliers"
     )
     if args.out is not None:
-        with Progress("simulate") as progress:
-            progress("writing")
+        with Progress("simulate", what="writing"):
             write_bag(flight, args.out, args.storage, args.force)
         cli.show(f"wrote {args.out}")
     if args.json is not None:

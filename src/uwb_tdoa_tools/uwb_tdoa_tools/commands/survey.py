@@ -1,4 +1,4 @@
-"""survey: better anchors from a tape measure and flights."""
+"""Improve surveyed anchors by flights."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from ..diagnosis.noise import write_parameters
 from ..diagnosis.self_calibration import self_calibrate
 from ..estimate import FlightEstimator
 from ..outputs import OutputFolder
-from ..progress import Progress
+from ..parallel import Progress
 from ..surveying.report import as_dict, as_text, picture, with_blocked
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
 
-DESCRIPTION = """Make a tape-measured survey better, from flights alone.
+DESCRIPTION = """Improve a tape-measured survey, from flights alone.
 
-Nobody needs to know where the tag flew: the flights tell which shifts of anchors, and which delays, make their TDOAs or
-ranges agree with each other and with the IMU (and with a range finder, where there is one). The frame is that of the
-coordinates that are known best: name some with --trusted, or all stays where it is on average. Ground truth is not used.
+Ground truth is not used. Shifts and delays of the anchors are estimated so that TDOAs or ranges agree with each other and
+with the IMU (and with a range finder, if there is one). The coordinates that are known best define the frame: name some
+with --trusted, or the anchors stay in place on average.
 
-With the anchors.yaml and effects.yaml (--effects) of last week it starts from what was known then, says what has changed
-since, and makes the rest better.
+With the anchors.yaml and effects.yaml (--effects) of last week it starts from that calibration, lists the changes since,
+and improves the rest.
 
 Writes anchors.yaml and anchors.csv (for --survey, anchors_file and the rest), effects.yaml (delays of the
 anchors, and how well all is known), ekf_node.yaml (noise of TDOAs that the filter should assume with them), survey.json
@@ -60,10 +60,7 @@ def parser() -> ArgumentParser:
     options.add_recordings(made)
     options.add_filter(
         made,
-        (
-            "effects.yaml: what is in the model already; that of a survey is its prior, and tells "
-            "what changed"
-        ),
+        "effects.yaml: effects in the model already; the file of an earlier survey is the prior",
     )
     options.add_parameters(made)
     add = made.add_argument
@@ -113,7 +110,7 @@ def _survey(args: Namespace) -> int:
         files = out / "anchors.yaml", out / "effects.yaml", config_file
         cli.show(
             "next: "
-            f"{command_lines.judging(args.flights, *files, all(flight.truth is not None for flight in flights))}"
+            f"{command_lines.evaluate_line(args.flights, *files, all(flight.truth is not None for flight in flights))}"
         )
     return 0 if result.why_not is None else 1
 

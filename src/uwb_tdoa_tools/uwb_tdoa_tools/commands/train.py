@@ -1,4 +1,4 @@
-"""train: learn the systematic error of TDOAs from flights with ground truth."""
+"""Learn the systematic error of TDOAs from flights with ground truth."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING
 
 from .. import cli, options, parallel
 from ..outputs import OutputFile, OutputFolder
-from ..progress import Progress
+from ..parallel import Progress
 from ..readers import inputs
-from ..results_file import ResultsFile, asked_of, resumed, state_of
+from ..results_file import ResultsFile, fingerprint_of, resumed, settings_of
 from ..scoring.evaluation import with_aligned_truth
 from ..training import labels as labelling
 from ..training import models, shrinking
@@ -26,15 +26,8 @@ if TYPE_CHECKING:
     from ..parallel import MapFunction
     from ..readers.inputs import Reading
 
-NO_MATTER = (
-    "flights",
-    "survey",
-    "name",
-    "out",
-    "resume",
-    "jobs",
-    "dask",
-)  # to what is kept of a training, beside states of recordings
+# Options without influence on the results of a training; recordings count by their state.
+WITHOUT_INFLUENCE = "flights", "survey", "name", "out", "resume", "jobs", "dask"
 MOST = 1_500_000  # TDOAs; what they take: docs/speed.md
 
 
@@ -50,8 +43,7 @@ def parser() -> ArgumentParser:
         "measured attitude a\n"
         "flight counts as level, at yaw 0. What differs between days or vehicles is best "
         "trained apart. Every flight is left out\n"
-        "once to judge: as much of a model is applied as that bears out, and the gain to be "
-        "expected is told.\n\n"
+        "once: the hold-out gain scales the correction, and is printed as the gain to expect.\n\n"
         "models:\n"
         "  paper                 the network of Zhao et al. (RA-L 2021), with the "
         "orientations of the anchors\n"
@@ -85,8 +77,8 @@ def parser() -> ArgumentParser:
         metavar="FILE",
         type=OutputFile,
         help=(
-            "keep there, a line of JSON each, what is found of flights left out; what is there is "
-            "not done again"
+            "keep results of flights left out there, a line of JSON each; results in the file are "
+            "not computed again"
         ),
     )
     parallel.add_options(made)
@@ -95,13 +87,11 @@ def parser() -> ArgumentParser:
 
 def _train(args: Namespace) -> None:
     reading = options.reading_of(args)
-    jobs, dask = parallel.asked(
-        args, len(reading.find(args.flights)), 2
-    )  # as many for folds as for flights: else all start anew
+    # As many for folds as for flights: with another number, joblib restarts all processes.
+    jobs, dask = parallel.workers_for(args, len(reading.find(args.flights)), 2)
     with _kept(args, reading) as done:
-        over = partial(
-            parallel.over, jobs=jobs, dask=dask, unit=None
-        )  # no line beside that of Progress
+        # Only Progress prints a line.
+        over = partial(parallel.over, jobs=jobs, dask=dask, unit=None)
         flights = reading.flights(args.flights, args.most, jobs, dask)
         inputs.require_tdoas(flights, "train")
         flights = list(
@@ -112,19 +102,19 @@ def _train(args: Namespace) -> None:
 
 
 def _kept(args: Namespace, reading: Reading) -> AbstractContextManager[ResultsFile | None]:
-    """The ResultsFile of --resume, or a context of None."""
+    """Return the ResultsFile of --resume, or a context of None."""
     if args.resume is None:
         return nullcontext()
-    recordings = [" ".join(map(state_of, recording)) for recording in reading.find(args.flights)]
-    return ResultsFile(args.resume, {**asked_of(args, NO_MATTER), "flights": recordings})
+    recordings = [
+        " ".join(map(fingerprint_of, recording)) for recording in reading.find(args.flights)
+    ]
+    return ResultsFile(args.resume, {**settings_of(args, WITHOUT_INFLUENCE), "flights": recordings})
 
 
 def _write(
     args: Namespace, several: Sequence[Flight], over: MapFunction, progress: Progress
 ) -> None:
-    """Train on several Flights, and write all of it. over : as of `shrinking.train`; progress :
-    Progress.
-    """
+    """Train on several Flights, and write all results. over : as in `shrinking.train`."""
     flights = {flight.name: flight for flight in several}
     names = labelling.split(list(flights), args.seed, args.validation)
     for what, some in zip(("training on", "validating on"), names):

@@ -19,7 +19,7 @@ from uwb_tdoa_ekf.results import OF_ROW, VERDICTS
 from uwb_tdoa_ekf.sensitivity import RANGES
 
 from ..clock import numbered
-from ..json_values import as_json
+from ..outputs import as_json
 from ..scoring.metrics import EVERYTHING, Score, pooled
 from .regression.table import BLOCK
 

@@ -14,7 +14,7 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.evidence import OF_ANCHORS
 from uwb_tdoa_ekf.offline import may_have_offset
 
-from ..checking.numbers import numbers
+from ..checking.flight_rules import judge_flight
 from ..scoring.metrics import Score
 from . import comparison, repairing, validation
 from .attribution import Attribution, attribute, residuals_of
@@ -75,7 +75,7 @@ def diagnose(
     for one in map_function(partial(reference.settled, base=base, config=config), prepared):
         settled.append(one)
         looking()
-    of_truth = {flight.name: said for flight, said in settled if said}
+    judge_truth = {flight.name: said for flight, said in settled if said}
     count = len(flights)
     fitted, held_out = (
         tuple(flight for flight, _ in some) for some in (settled[:count], settled[count:])
@@ -121,11 +121,11 @@ def diagnose(
         remaining,
         {
             flight.name: faults
-            for faults, flight in zip(map_function(numbers, fitted), fitted)
+            for faults, flight in zip(map_function(judge_flight, fitted), fitted)
             if faults
         },
         outcome.changes,
-        of_truth=of_truth,
+        judge_truth=judge_truth,
     )
 
 

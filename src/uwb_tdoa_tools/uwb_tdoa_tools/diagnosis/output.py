@@ -9,7 +9,7 @@ import numpy as np
 
 from uwb_tdoa_bias.effects.base import listed
 
-from .. import json_values
+from .. import outputs
 from .over_flights import course
 from .report import anchors
 from .report.entries import doubt_in_words, entries, worth_in_words
@@ -27,7 +27,7 @@ WIDTH, LABEL = 120, 10  # columns of the screen, and of them for what a line is
 
 def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
     """What diagnosis.json holds: plain values. Its keys are described in docs/diagnosis.md."""
-    return json_values.as_json(
+    return outputs.as_json(
         {
             "verdict": verdict(diagnosis).sentences,
             "flights": [flight.name for flight in diagnosis.flights],
@@ -36,7 +36,7 @@ def as_json(diagnosis: Diagnosis) -> dict[str, Any]:
             "numbers": {
                 name: [vars(item) for item in found] for name, found in diagnosis.numbers.items()
             },
-            "ground_truth": {name: list(said) for name, said in diagnosis.of_truth.items()},
+            "ground_truth": {name: list(said) for name, said in diagnosis.judge_truth.items()},
             "unattributed": [
                 _function(item, item.function) for item in diagnosis.findings if item.function
             ],

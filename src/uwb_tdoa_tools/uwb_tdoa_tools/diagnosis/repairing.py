@@ -9,8 +9,7 @@ import numpy as np
 
 from uwb_tdoa_bias.effects import EffectSet, LabelEffect
 
-from ..checking.known_path import KnownPath
-from ..checking.repairs import repairs
+from ..checking.pair_rules import KnownPath, repairs
 from .comparison import ValidationCase
 from .detectors import Detection
 from .validation import TRIAL_FLIGHTS, WORSE, error_of

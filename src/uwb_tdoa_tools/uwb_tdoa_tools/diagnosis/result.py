@@ -31,7 +31,7 @@ class Diagnosis:
     flight: [Finding of checking]}, what is wrong with its numbers; changes : sentences, what is not
     as in the last calibration;
     applying : ((command line, what it does), ...), how the effects are put to use;
-    of_truth : {name of a flight: sentences}, what was wrong with the clock or the frame of its
+    judge_truth : {name of a flight: sentences}, what was wrong with the clock or the frame of its
         ground truth.
     """
 
@@ -50,4 +50,4 @@ class Diagnosis:
     numbers: dict[str, list[NumbersFinding]]
     changes: tuple[str, ...] = ()
     applying: tuple[tuple[str, str], ...] = ()
-    of_truth: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    judge_truth: dict[str, tuple[str, ...]] = field(default_factory=dict)

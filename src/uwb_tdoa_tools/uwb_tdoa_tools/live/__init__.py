@@ -1,1 +1,1 @@
-"""Running nodes as processes, playing to them, and listening to them."""
+"""Run nodes as processes, replay recordings to them, and record their topics."""

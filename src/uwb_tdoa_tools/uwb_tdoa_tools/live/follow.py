@@ -1,103 +1,122 @@
-"""Let what is played keep in step with what comes of it."""
+"""Let a replay keep in step with the nodes that it feeds, and report what these have lost."""
 
 from __future__ import annotations
 
 from collections import deque
+from functools import partial
 import math
 import struct
 import time
 from typing import TYPE_CHECKING, Any
 
+import rclpy
+from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.foundation.sensors import SENSORS
 
-from .session import READER_DEPTH, message_class, subscription_qos
+from .processes import DiagnosticsListener
+from .session import READER_DEPTH, answer_of, message_class, subscription_qos
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from rclpy.node import Node
     from rclpy.subscription import Subscription
 
     from .session import Stop
 
+
 LEAD = 2_000_000_000  # ns of stamps that may be played ahead
-# ns: a TDOA that is older than the newest by more has come out of the filter, or is waited for
+# ns; the replay waits for each TDOA that is older than the newest by more than STEP. STEP exceeds
+# `reorder` of ekf_node: the filter can have used that TDOA. STEP is below `hold` of bias_node and
+# `lag` of ekf_node: neither gives up data that are on the way.
 STEP = 80_000_000
-# (STEP is more than ekf_node's `reorder`, so that it can have come out, and less than bias_node's
-# `hold` and ekf_node's
-# `lag`, so that neither goes on without what is still on its way.)
+# ns; STEP for the time START after the first pose. START_STEP is below `pose_lag` of bias_node,
+# which passes TDOAs on until it has a pose.
 START_STEP, START = 40_000_000, 1_000_000_000
-# ns: the same for so long after the first pose: less than bias_node's `pose_lag`. Before it knows
-# of a pose it passes TDOAs on.
 LOOK_PERIOD = LEAD // 20  # ns of stamps between two looks at a topic that is in step or silent
-AID_SILENT = 1_000_000_000  # ns after which ekf_node does without one of the SENSORS: its SILENT
-AID_SHARE = 0.5  # of its `lag`, for which it waits for them, and all TDOAs with it: its OF_AIDS
-LAG = 0.25  # s, its `lag` if nothing else is known
-SILENCE = 5.0  # s after which a topic is not waited for any more, until it speaks again
+AID_SILENT = 1_000_000_000  # ns until ekf_node stops waiting for a silent sensor: its SILENT
+AID_SHARE = 0.5  # of `lag`: how long ekf_node holds TDOAs back for an aid: its OF_AIDS
+LAG = 0.25  # s, default of `lag`
+SILENCE = 5.0  # s without a message after which the replay waits for a topic no longer
 POLL_PERIOD = 0.001  # s
 RESIDUAL = "uwb/residual"
-LEARNED = 20  # TDOAs that tell by how much bias_node shifts their stamps
+LEARNED = 20  # TDOAs from which the shift of stamps by bias_node is estimated
 
 
 class Follower:
-    """Watches a topic whose messages have a header, and says when to wait for it.
+    """Watch a topic whose messages have a header, and hold a replay until the topic catches up.
 
-    Where somebody also publishes uwb/residual, one message for each TDOA, TDOAs are followed too
-    (`add_tdoa`).
+    If uwb/residual has a publisher, each TDOA is followed too (`add_tdoa`).
     """
 
     def __init__(self, node: Node, topic: str, lag: float = LAG) -> None:
-        """lag : s, of ekf_node.
+        """Subscribe to the topic.
 
-        Raises InputError if nobody publishes the topic, or its messages have no header.
+        Parameters
+        ----------
+        lag : float
+            Parameter `lag` of ekf_node, s.
+
+        Raises
+        ------
+        InputError
+            If the topic has no publisher, or its messages have no header.
         """
         topic = node.resolve_topic_name(topic)
         types = dict(node.get_topic_names_and_types()).get(topic)
         if not types or not node.count_publishers(topic):
             raise InputError(f"--follow: nobody publishes {topic}; start the node that does first.")
-        if not is_stamped(cls := message_class(types[0])):
+        cls = message_class(types[0])
+        if not is_stamped(cls):
             raise InputError(
                 f"--follow: messages on {topic} are {types[0]}: not installed, or without a header."
             )
         qos = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-        self._subscription = node.create_subscription(
-            cls, topic, lambda _: None, qos, raw=True
-        )  # taken, never spun
-        self._newest: int | None = None  # ns, as those that follow
-        self._looked: int | None = None
-        self._started: int | None = None
+        # Messages are taken, and the node does not spin.
+        self._subscription = node.create_subscription(cls, topic, lambda _: None, qos, raw=True)
+        self._newest: int | None = None  # ns, stamp of the newest message
+        self._looked: int | None = None  # ns, stamp of the replay at the last look
+        self._started: int | None = None  # ns, stamp of the first message
         self._silent = False
         self._tdoas = _Tdoas(node, round(1e9 * AID_SHARE * lag))
 
     def add_tdoa(self, stamp: int) -> None:
-        """A TDOA with this stamp, ns, has been played."""
+        """Note that a TDOA with this stamp, ns, was published."""
         self._tdoas.add(stamp)
 
     def add_aid(self, topic: str, stamp: int) -> None:
-        """What one of the SENSORS measured, with this stamp, ns, has been played, for the filter."""
+        """Note that a measurement of one of the SENSORS with this stamp, ns, was published."""
         self._tdoas.add_aid(topic, stamp)
 
     def wait(self, stamp: int, stop: Stop) -> float:
-        """Wait while the topic is more than LEAD behind a message stamped so, ns, which is about to
-        be played, and until every TDOA has come out of the filter that is older by STEP than what
-        it goes to by now: the newest, or less while it waits for an aid.
+        """Wait until a message may be published, and return how long that took, s.
 
-        Returns how long that took, s; stop : true once the wait shall end.
+        The topic must not be more than LEAD behind the message. Each TDOA that is older by STEP than
+        the time of the filter must have left the filter. That time is the stamp of the newest TDOA, or
+        less while the filter waits for an aid.
+
+        Parameters
+        ----------
+        stamp : int
+            Stamp of the message, ns.
+        stop : Stop
+            True once the wait shall end.
         """
         return self._tdoas.wait(self._is_starting(stamp), stop) + self._wait_for_stamps(stamp, stop)
 
     def _is_starting(self, stamp: int) -> bool:
-        """Whether bias_node may not know yet that there are poses, for what is stamped so, ns."""
-        if (
-            self._started is not None and stamp < self._started - LEAD
-        ):  # a recording that starts again
+        """Return whether bias_node may still lack poses at this stamp, ns."""
+        if self._started is not None and stamp < self._started - LEAD:  # the recording restarts
             self._started = None
         if self._started is None:
             self._hear()
         return self._started is None or stamp < self._started + START
 
     def _hear(self) -> bool:
-        """Whether the topic has said something."""
+        """Read the topic, and return whether a message has come."""
         taken = _taken(self._subscription)
         if taken:
             self._newest, self._silent = stamp_of(taken[-1]), False
@@ -123,7 +142,7 @@ class Follower:
 
 
 class _Tdoas:
-    """How far the TDOAs that were played have come out of the filter, in the order of their stamps."""
+    """Count how far the published TDOAs have left the filter, in the order of their stamps."""
 
     def __init__(self, node: Node, aid_wait: int) -> None:
         self._subscription, self._aid_wait = None, aid_wait
@@ -138,21 +157,19 @@ class _Tdoas:
         self._start_over()
 
     def _start_over(self) -> None:
-        self._begin = -math.inf  # ns: none up to here is waited for
-        self._newest: int | None = None  # ns, newest stamp that was played
-        self._out, self._silent = -math.inf, False  # ns, newest stamp that has come out
-        self._first: deque[int] = deque()  # stamps that were played first
-        self._shift = 0  # by how much those that come out are less
-        self._aids: dict[str, int] = {}  # {topic: ns, newest stamp that was played}
-        self._learned, self._behind = (
-            0,
-            False,
-        )  # whether START_STEP is too little, because the recorded IMU is behind its TDOAs
+        self._begin = -math.inf  # ns; older TDOAs need not leave the filter
+        self._newest: int | None = None  # ns, newest stamp that was published
+        self._out = -math.inf  # ns, newest stamp that left the filter
+        self._silent = False
+        self._first: deque[int] = deque()  # first stamps that were published
+        self._shift = 0  # ns by which the same stamps are smaller when they leave the filter
+        self._learned = 0  # number of stamps from which `_shift` is known
+        self._aids: dict[str, int] = {}  # {topic: ns, newest stamp that was published}
+        # Whether START_STEP is too small, because the recorded IMU is behind the TDOAs.
+        self._behind = False
 
     def add(self, stamp: int) -> None:
-        if (
-            self._newest is not None and stamp < self._newest - LEAD
-        ):  # a recording that starts again
+        if self._newest is not None and stamp < self._newest - LEAD:  # the recording restarts
             self._start_over()
         if self._newest is None:
             self._begin, self._newest = stamp - 1, stamp
@@ -171,7 +188,8 @@ class _Tdoas:
             return 0.0
         began = heard = time.monotonic()
         while not stop:
-            if taken := _taken(self._subscription):
+            taken = _taken(self._subscription)
+            if taken:
                 self._learn(list(map(stamp_of, taken)))
                 heard, self._silent = time.monotonic(), False
             if self._is_in_step(step) or self._silent:
@@ -184,16 +202,11 @@ class _Tdoas:
     def _is_in_step(self, step: int) -> bool:
         assert self._newest is not None
         aids = [stamp for stamp in self._aids.values() if stamp > self._newest - AID_SILENT]
-        reach = max(
-            min((self._newest, *aids)), self._newest - self._aid_wait
-        )  # how far the filter goes
-        return reach - step <= max(self._begin, self._out + self._shift)
+        time_of_filter = max(min((self._newest, *aids)), self._newest - self._aid_wait)
+        return time_of_filter - step <= max(self._begin, self._out + self._shift)
 
     def _learn(self, stamps: list[int]) -> None:
-        """Note stamps that have come out.
-
-        An effect may have shifted them: the first ones tell by how much.
-        """
+        """Note stamps that left the filter. The first ones show by how much an effect shifts them."""
         self._out = max(self._out, *stamps)
         for stamp in stamps[: len(self._first)]:
             if self._learned < LEARNED:
@@ -202,7 +215,7 @@ class _Tdoas:
 
 
 def _taken(subscription: Subscription) -> list[bytes]:
-    """Take what has come: list of bytes."""
+    """Return the messages that have arrived, as bytes."""
     found = []
     with subscription.handle:
         while (taken := subscription.handle.take_message(subscription.msg_type, True)) is not None:
@@ -211,7 +224,7 @@ def _taken(subscription: Subscription) -> list[bytes]:
 
 
 def is_stamped(cls: Any) -> bool:
-    """Whether messages of a class, or None, begin with a header."""
+    """Return whether the messages of a class, or None, begin with a header."""
     return (
         cls is not None
         and next(iter(cls.get_fields_and_field_types().values()), None) == "std_msgs/Header"
@@ -219,6 +232,153 @@ def is_stamped(cls: Any) -> bool:
 
 
 def stamp_of(data: bytes) -> int:
-    """Stamp, ns, of a message that begins with a header, from its serialised bytes (CDR)."""
+    """Return the stamp, ns, of a serialized message (CDR) that begins with a header."""
     seconds, nanoseconds = struct.unpack_from("<iI" if data[1] & 1 else ">iI", data, 4)
     return seconds * 10**9 + nanoseconds
+
+
+pass
+
+
+SPIN = 0.05  # s
+ANSWER_LIMIT = 10.0  # s for a node's parameters
+SETTLE_LIMIT = 60.0  # s for the diagnostics of the nodes to settle
+UNKNOWN = "_NODE_NAME_UNKNOWN_"  # what rmw calls a node whose name has not come yet
+PATIENCE = {"bias_node": "hold", "ekf_node": "lag"}  # parameters, s of stamps
+TROUBLE = {  # {node: {key in its diagnostics: words}}
+    "bias_node": {"released before their pose": "TDOAs corrected before their pose was there"},
+    "ekf_node": {
+        "late": "TDOAs late",
+        "imu_late": "IMU samples late",
+        **{f"{name}_late": f"{of.plural} late" for name, of in SENSORS.items()},
+    },
+}
+RECEIVED = {  # {node: {key in its diagnostics: what it counts}}
+    "bias_node": {"received": "TDOAs"},
+    "ekf_node": {"TDOAs received": "TDOAs", "IMU samples received": "IMU samples"},
+}
+
+
+class Nodes:
+    """Compare the counters of bias_node and ekf_node in our namespace before and after a replay.
+
+    Attributes
+    ----------
+    lag : float
+        Parameter `lag` of ekf_node, s.
+    """
+
+    lag = LAG
+
+    def __init__(self, node: Node) -> None:
+        """Find the nodes and read their counters.
+
+        Raises
+        ------
+        InputError
+            If their parameters end a wait too early, or a node publishes no /diagnostics.
+        """
+        self._node, self._diagnostics = node, DiagnosticsListener(node)
+        space = node.get_namespace()
+        self._wait_for_names()
+        there = node.get_node_names_and_namespaces()
+        self._names = {
+            name: f"{space.rstrip('/')}/{name}" for name in TROUBLE if (name, space) in there
+        }
+        if len(self._names) == len(TROUBLE):
+            self._check_patience()
+        self._before = self._counts(bool)
+        for name in self._names:
+            if not self._before[name]:
+                raise InputError(
+                    f"--follow: {self._names[name]} says nothing on /diagnostics for "
+                    f"{SETTLE_LIMIT:g} s; start it again."
+                )
+
+    def faults(self, count_played: Callable[[str], int], stop: Stop) -> dict[str, int]:
+        """Return {fault since the start: count}, once the diagnostics have settled or on `stop`.
+
+        Parameters
+        ----------
+        count_played : callable
+            Number of messages of a kind ("TDOAs", "IMU samples") that the replay published.
+        stop : Stop
+            True once the process was asked to end.
+        """
+        after = self._counts(lambda _: stop or self._diagnostics.is_settled())
+        since = {
+            name: {
+                key: count - self._before[name].get(key, 0) for key, count in after[name].items()
+            }
+            for name in self._names
+        }
+        wrong = {}
+        for name, counts in since.items():
+            for key, what in TROUBLE[name].items():
+                wrong[what] = counts.get(key, 0)
+            for key, what in RECEIVED[name].items() if len(self._names) == len(TROUBLE) else ():
+                on_their_way = (
+                    since["bias_node"].get("waiting", 0)
+                    if (name, what) == ("ekf_node", "TDOAs")
+                    else 0
+                )
+                lost = count_played(what) - counts.get(key, 0) - on_their_way
+                wrong[f"{what} lost"] = max(lost, wrong.get(f"{what} lost", 0))
+        return {what: count for what, count in wrong.items() if count > 0}
+
+    def _counts(
+        self, is_enough: Callable[[DiagnosticsListener], object]
+    ) -> dict[str, dict[str, int]]:
+        """Return {node: {key: count}} when each node has published and is_enough(diagnostics) holds."""
+        until = time.monotonic() + SETTLE_LIMIT
+        self._diagnostics.forget()
+        newest = {}
+        while self._names and time.monotonic() < until:
+            rclpy.spin_once(self._node, timeout_sec=SPIN)
+            newest = {
+                name: self._diagnostics.newest(full.strip("/"))
+                for name, full in self._names.items()
+            }
+            if all(newest.values()) and is_enough(self._diagnostics):
+                break
+        return {
+            name: {key: int(text) for key, text in values.items() if text.isdigit()}
+            for name, values in newest.items()
+        }
+
+    def _check_patience(self) -> None:
+        """Require: longest wait in the filter < hold < lag. Else a node drops data that are on the way."""
+        hold, self.lag = (self._parameter(name, parameter) for name, parameter in PATIENCE.items())
+        least = 1e-9 * STEP + AID_SHARE * self.lag
+        if not least < hold < self.lag:
+            raise InputError(
+                f"--follow: bias_node's hold is {hold:g} s and ekf_node's lag {self.lag:g} s; "
+                "to be followed they need "
+                f"{least:g} s < hold < lag."
+            )
+
+    def _wait_for_names(self) -> None:
+        """Wait until the node of each publisher and subscription has a name: DDS sends names later."""
+        node, until = self._node, time.monotonic() + ANSWER_LIMIT
+        while time.monotonic() < until:
+            ends = [node.get_publishers_info_by_topic, node.get_subscriptions_info_by_topic]
+            topics = [topic for topic, _ in node.get_topic_names_and_types()]
+            if not any(
+                end.node_name == UNKNOWN for find in ends for topic in topics for end in find(topic)
+            ):
+                return
+            time.sleep(SPIN)
+
+    def _parameter(self, name: str, parameter: str) -> float:
+        client = AsyncParameterClient(self._node, self._names[name])
+        answered, future = answer_of(partial(client.get_parameters, [parameter])), None
+        if client.wait_for_services(ANSWER_LIMIT):
+            until = time.monotonic() + ANSWER_LIMIT
+            while (future := answered()) is None and time.monotonic() < until:
+                rclpy.spin_once(self._node, timeout_sec=SPIN)
+        if future is None or future.result() is None:
+            raise InputError(
+                f"--follow: {self._names[name]} does not answer for {ANSWER_LIMIT:g} s; start "
+                "it again."
+            )
+        return future.result().values[0].double_value

@@ -1,11 +1,13 @@
-"""Publishing recorded messages in the time between their stamps."""
+"""Publish recorded messages in the time between their stamps."""
 
 from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
+import queue
+import threading
 import time
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from rclpy.duration import Duration
 from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -18,7 +20,7 @@ from uwb_tdoa_bias.foundation.sensors import SENSORS
 from .follow import is_stamped, stamp_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Generator, Iterable
 
     from rclpy.node import Node
     from rclpy.publisher import Publisher
@@ -27,22 +29,77 @@ if TYPE_CHECKING:
     from .follow import Follower
     from .session import Stop
 
+
+Item = TypeVar("Item")
+
+BATCH = 500
+BATCHES_AHEAD = 100
+
+
+def read_ahead(messages: Iterable[Item]) -> Generator[Item, None, None]:
+    """Yield the items of an iterable, read by a thread up to 50,000 items ahead.
+
+    Decoding a chunk of a bag then delays no message. Exceptions of the iterable are raised here.
+    """
+    batches: queue.Queue[list[Item] | BaseException | None] = queue.Queue(BATCHES_AHEAD)
+    closed = threading.Event()
+
+    def put(item: list[Item] | BaseException | None) -> None:
+        while not closed.is_set():
+            try:
+                return batches.put(item, timeout=0.1)
+            except queue.Full:
+                pass
+
+    def read() -> None:
+        batch: list[Item] = []
+        try:
+            for message in messages:
+                batch.append(message)
+                if len(batch) == BATCH:
+                    put(batch)
+                    batch = []
+                if closed.is_set():
+                    return
+            put(batch)
+            put(None)
+        except BaseException as error:
+            put(batch)
+            put(error)
+
+    thread = threading.Thread(target=read, daemon=True)
+    thread.start()
+    try:
+        while (batch := batches.get()) is not None:
+            if isinstance(batch, BaseException):
+                raise batch
+            yield from batch
+    finally:
+        closed.set()
+        thread.join()
+
+
 RCLError = rclpy_implementation.RCLError
-# s: a longer delay shifts all that follows, instead of a burst that a subscription cannot take
-LARGEST_CATCH_UP = 0.1
-LATCHED_LIMIT = 5.0  # s that somebody may take to acknowledge what is latched
-LONGEST_SLEEP = 0.05  # s: how soon a signal is seen
+LARGEST_CATCH_UP = 0.1  # s; a longer delay shifts all later messages: a burst overruns queues
+LATCHED_LIMIT = 5.0  # s for the acknowledgement of latched messages
+LONGEST_SLEEP = 0.05  # s until a signal is seen
 ACKNOWLEDGE_LIMIT = 30.0  # s; longer than the 20 s after which DDS forgets a subscription that died
 
 
 @dataclass
 class Played:
-    """What was published.
+    """Counters of a replay.
 
-    counts : messages by topic in the bag; behind : s, the latest that a message was; stretched : s,
-        by how much the
-    time of the replay was stretched, so that a stall was not followed by a burst that nobody can
-    take; waited : s, for the topic that is followed.
+    Attributes
+    ----------
+    counts : Counter
+        Messages by topic of the bag.
+    behind : float
+        Largest delay of a message, s.
+    stretched : float
+        s by which the replay was stretched. After a stall it sends no burst that overruns a queue.
+    waited : float
+        s of waiting for the followed topic.
     """
 
     counts: Counter[str] = field(default_factory=Counter)
@@ -52,33 +109,29 @@ class Played:
 
 
 def is_latched(publisher: Publisher) -> bool:
-    """Whether who subscribes late gets the last messages too."""
+    """Return whether a late subscription gets the last messages too."""
     return publisher.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
 
 
 def is_tdoa(publisher: Publisher) -> bool:
-    """Whether it publishes raw TDOAs."""
+    """Return whether a publisher has raw TDOAs."""
     return _kind(publisher) == "Tdoa"
 
 
 def is_aid(publisher: Publisher) -> bool:
-    """Whether it publishes what one of the SENSORS measures, for ekf_node."""
+    """Return whether a publisher has measurements of one of the SENSORS, for ekf_node."""
     return publisher.topic_name.endswith(
         tuple(f"/{topic}" for sensor in SENSORS.values() for topic, _ in sensor.topics)
     )
 
 
 def _kind(publisher: Publisher) -> str:
-    """Name of the class of its messages."""
+    """Return the name of the class of the messages."""
     return publisher.msg_type.__name__  # type: ignore[attr-defined]  # rclpy says of the class that it is a message
 
 
 class Player:
-    """Publishes to {topic in the bag: publisher}, `rate` times as fast as recorded, with /clock if
-    it has a rate, Hz.
-
-    stop : true once the process was asked to end; follower : Follower or None; played : Played.
-    """
+    """Publish recorded messages at their stamps, and /clock if it has a rate."""
 
     def __init__(
         self,
@@ -88,6 +141,19 @@ class Player:
         clock_rate: float | None,
         stop: Stop,
     ) -> None:
+        """Store the publishers.
+
+        Parameters
+        ----------
+        publishers : dict
+            {topic in the bag: publisher}.
+        rate : float
+            Times as fast as recorded.
+        clock_rate : float or None
+            Hz of /clock.
+        stop : Stop
+            True once the process was asked to end.
+        """
         self.played = Played()
         self.follower: Follower | None = None
         self._publishers, self._rate, self._stop = publishers, rate, stop
@@ -105,14 +171,14 @@ class Player:
         self._began = self._next_tick = 0.0
 
     def count(self, what: str) -> int:
-        """How many "TDOAs" or "IMU samples" have been played."""
+        """Return how many "TDOAs" or "IMU samples" were published."""
         kind = {"TDOAs": "Tdoa", "IMU samples": "Imu"}[what]
         return sum(
             n for topic, n in self.played.counts.items() if _kind(self._publishers[topic]) == kind
         )
 
     def play(self, recorded: Iterable[tuple[Connection, int, bytes]]) -> None:
-        """Publish an iterable of (connection, stamp ns, bytes), from the beginning."""
+        """Publish an iterable of (connection, stamp ns, bytes) from the beginning."""
         self._start = None
         for connection, stamp, data in recorded:
             if self._start is None:
@@ -141,12 +207,11 @@ class Player:
                     self.follower.add_aid(topic, stamp_of(data))
 
     def _wait_for_latched(self) -> float:
-        """Wait, before the first message of a stream, until what is latched (the anchors) has been
-        acknowledged. Returns the s that took.
+        """Wait for the acknowledgement of latched messages (anchors), and return how long, s.
 
-        Their publishers were made last, and a participant hears of our publishers in the order in
-        which they were made: who acknowledges a message of theirs listens to all the others too,
-        the best-effort ones among them.
+        This comes before the first message of a stream. The latched publishers were made last, and a
+        participant discovers our publishers in the order of creation. So a participant that acknowledges
+        them receives all other topics too, including the best-effort ones.
         """
         began = time.perf_counter()
         for publisher in self._latched:
@@ -157,7 +222,7 @@ class Player:
         return time.perf_counter() - began
 
     def _sleep_until(self, due: float) -> float:
-        """Sleep, and publish the clock meanwhile. Returns the s by which it is later than due."""
+        """Sleep until `due`, publish the clock meanwhile, and return the delay, s."""
         while True:
             now = time.perf_counter()
             if self._clock is not None and now >= self._next_tick:
@@ -182,15 +247,16 @@ class Player:
             self.played.stretched += behind - LARGEST_CATCH_UP
 
     def _publish(self, publisher: Publisher, data: bytes) -> bool:
-        """Publish, after waiting until reliable subscriptions have acknowledged what the history is
-        full of. Returns False if stopped while it waited.
+        """Publish one message. Returns False if stopped while the queue was full.
+
+        The queue is full while reliable subscriptions have acknowledged nothing of its content.
         """
         until = time.monotonic() + ACKNOWLEDGE_LIMIT
         while True:
             try:
                 publisher.publish(data)
                 return True
-            except RCLError as error:  # full for longer than DDS waits by itself, 0.1 s
+            except RCLError as error:  # full for longer than DDS waits, 0.1 s
                 if self._stop:
                     return False
                 if time.monotonic() > until:
@@ -199,3 +265,7 @@ class Player:
                         f"{ACKNOWLEDGE_LIMIT:g} s ({error}); stop it, or let it subscribe "
                         "best effort."
                     ) from error
+
+
+pass
+pass

@@ -1,6 +1,4 @@
-"""Executables of our packages as processes in a ROS domain of their own, and what they say on
-/diagnostics.
-"""
+"""Start executables as processes in a private ROS domain, and read their /diagnostics."""
 
 from __future__ import annotations
 
@@ -29,27 +27,20 @@ if TYPE_CHECKING:
 
     from .session import Stop
 
-STOP_LIMIT, PATIENCE = (
-    10.0,
-    60.0,
-)  # s until what was interrupted is killed; the latter if it must end well
-LOOK = 5.0  # s between two looks at what the processes do, and between two lines about it
+STOP_LIMIT, PATIENCE = 10.0, 60.0  # s from SIGINT to SIGKILL; the latter if it must end well
+LOOK = 5.0  # s between two checks of the processes, and between two lines about them
 READY = re.compile(r"\]: ready\b")  # in the log of a node
 TAIL = 8192  # bytes of a log that are looked at
-# of the time: a process that runs, or waits for a core, for more than that works; nodes that wait
-# for messages take 0.02
-BUSY = 0.2
+BUSY = 0.2  # share of the time beyond which a process computes; nodes that wait take 0.02
 
 
 class LiveError(Failure):
-    """A process of the run failed, or did not get where it should; the message says which and where
-    its output is.
-    """
+    """A process failed or made no progress. The message names it and the file of its output."""
 
 
 @contextmanager
 def variables(values: dict[str, str]) -> Iterator[None]:
-    """Environment variables, for the block and what it starts."""
+    """Set environment variables for the block and the processes that it starts."""
     before = {name: os.environ.get(name) for name in values}
     os.environ.update(values)
     try:
@@ -64,8 +55,9 @@ def variables(values: dict[str, str]) -> Iterator[None]:
 
 @contextmanager
 def own_domain() -> Iterator[None]:
-    """A ROS domain that nobody else has, on this machine only, for the block and what it starts.
-    Any of those that are free: in the first of them DDS may still list nodes that have just ended.
+    """Use a free ROS domain on this machine only, for the block and the processes that it starts.
+
+    The domain is drawn at random: in the first free one DDS may still list nodes that ended just now.
     """
     with domain_id(lambda: random.randint(1, 100)) as number:
         with variables(
@@ -83,28 +75,38 @@ def wait(
     say: Callable[[str], object] = lambda text: None,
     goes_on: Callable[[], object] = lambda: None,
 ) -> None:
-    """Serve the node until condition(). Raises LiveError if a process has ended that should not, or
-    after `limit` s in which nothing went on: what goes_on() gives stayed the same, and no process
-    that is still starting worked, as a node that compiles does.
+    """Serve the node until condition().
 
-    limit : s, or None; say(text) : called every few seconds with what it waits and what the
-        processes do.
+    Parameters
+    ----------
+    limit : float or None
+        s without progress. Progress is a change of `goes_on()`, or a starting process that computes,
+        as a node that compiles does.
+    what : str
+        The awaited event, in words.
+    say : callable
+        Called every few seconds with the event and the state of the processes.
+
+    Raises
+    ------
+    LiveError
+        If a process ended that should run, or after `limit`.
     """
     looked = moved = time.monotonic()
-    worked, sign = processes.worked(), goes_on()
+    worked, sign = processes.busy_times(), goes_on()
     while not condition():
         processes.check()
         now = time.monotonic()
         if now - looked > LOOK:
-            working, before, work = now - looked, worked, processes.worked()
+            working, before, work = now - looked, worked, processes.busy_times()
             busy = any(work[title] - before.get(title, 0.0) > BUSY * working for title in work)
             looked, worked = now, work
-            say(f"waiting for {what}: {processes.doing()}")
+            say(f"waiting for {what}: {processes.describe()}")
             if busy or goes_on() != sign:
                 moved, sign = now, goes_on()
         if limit is not None and now - moved > limit:
             raise LiveError(
-                f"waited {limit:g} s for {what}, and nothing went on ({processes.doing()}); "
+                f"waited {limit:g} s for {what}, and nothing went on ({processes.describe()}); "
                 f"their output is in {processes.folder}/*.log."
             )
         rclpy.spin_once(node, timeout_sec=0.05)
@@ -112,7 +114,7 @@ def wait(
 
 
 class DiagnosticsListener:
-    """The newest status of each node on /diagnostics, and whether it still changes."""
+    """Hold the newest status of each node on /diagnostics, and whether it still changes."""
 
     def __init__(self, node: Node) -> None:
         self._newest: dict[str, dict[str, str]] = {}
@@ -131,13 +133,14 @@ class DiagnosticsListener:
             self._newest[name] = values
 
     def newest(self, name: str) -> dict[str, str]:
-        """{key: text}; empty before the first status."""
+        """Return {key: text} of a node; empty before its first status."""
         return self._newest.get(name, {})
 
     def forget(self) -> None:
-        """Count anew how often a status repeats, from what is said from here on. What still waits
-        to be read is older: of a node that was not spun it would seem settled before anything
-        happened.
+        """Start again to count repetitions of a status.
+
+        Messages that wait to be read are dropped. They are older than this call: a node that was not spun
+        would seem settled before anything happened.
         """
         handle = self._subscription.handle
         with handle:
@@ -146,13 +149,11 @@ class DiagnosticsListener:
         self._repeated.clear()
 
     def counts(self) -> dict[str, dict[str, str]]:
-        """Everything that the nodes counted, for comparison with what they had counted before."""
+        """Return all counters of the nodes, for comparison with earlier ones."""
         return {name: _counts(values) for name, values in self._newest.items()}
 
     def is_settled(self) -> bool:
-        """Whether each node has said the same counts twice in a row: nothing is on its way any
-        more.
-        """
+        """Return whether each node has published the same counters twice: no message is on the way."""
         return len(self._repeated) == len(self._newest) and all(self._repeated.values())
 
 
@@ -161,9 +162,9 @@ def _counts(values: dict[str, str]) -> dict[str, str]:
 
 
 class Processes:
-    """Executables of our packages, each in a process group of its own, output in a file.
+    """Run executables of our packages, each in a separate process group, with its output in a file.
 
-    Ends what it started.
+    The context manager ends each process that it started.
     """
 
     def __init__(self, folder: str | Path, stop: Stop) -> None:
@@ -187,9 +188,14 @@ class Processes:
         title: str | None = None,
         may_end_with: Sequence[int] = (),
     ) -> subprocess.Popen[bytes]:
-        """The Popen of the executable; title : to tell it from others, default its name, output in
-        `file(title)`;
-        may_end_with : exit codes with which it is no failure that it ends.
+        """Start an executable and return its Popen.
+
+        Parameters
+        ----------
+        title : str or None
+            Name of the process, default the name of the executable; its output goes to `file(title)`.
+        may_end_with : sequence of int
+            Exit codes that are no failure.
         """
         try:
             program = Path(get_package_prefix(package)) / "lib" / package / name
@@ -211,17 +217,15 @@ class Processes:
         return self._running[title]
 
     def pid(self, title: str) -> int:
-        """Process id of a running executable."""
+        """Return the process id of a running executable."""
         return self._running[title].pid
 
     def file(self, title: str) -> Path:
-        """Where the output of a process goes."""
+        """Return the file with the output of a process."""
         return self.folder / f"{title.replace('/', '.')}.log"
 
     def check(self) -> None:
-        """Raise LiveError if a process ended that should not have, KeyboardInterrupt if we are
-        asked to end.
-        """
+        """Raise LiveError if a process ended that should run, and KeyboardInterrupt after a signal."""
         if self._stop:
             raise KeyboardInterrupt
         for title, process in self._running.items():
@@ -229,25 +233,25 @@ class Processes:
             if code is not None and code not in self._may_end[title]:
                 raise self._failure(title, code)
 
-    def worked(self) -> dict[str, float]:
-        """{title: s that its threads have run, or waited for a core} of those that are starting:
-        they have not said that they are ready.
-        """
+    def busy_times(self) -> dict[str, float]:
+        """Return {title: s of processor time, or of waiting for a core} of the starting processes."""
         return {
-            title: _worked(process.pid)
+            title: _busy_time(process.pid)
             for title, process in self._running.items()
-            if not READY.search(self._said(title))
+            if not READY.search(self._log_tail(title))
         }
 
-    def doing(self) -> str:
-        """What each that is starting said last, in words; of all if none is."""
-        titles = [title for title in self._running if not READY.search(self._said(title))] or list(
-            self._running
+    def describe(self) -> str:
+        """Describe the last output of each starting process; of all if none is starting."""
+        titles = [
+            title for title in self._running if not READY.search(self._log_tail(title))
+        ] or list(self._running)
+        return "; ".join(
+            f"{title}: {_last_line(self._log_tail(title)) or 'starting'}" for title in titles
         )
-        return "; ".join(f"{title}: {_bare(self._said(title)) or 'starting'}" for title in titles)
 
     def stop(self, title: str) -> None:
-        """Interrupt a process and wait for it; raises LiveError if it does not end well."""
+        """Interrupt a process and wait for it. Raises LiveError if its exit code is not 0."""
         code = self._end(title, PATIENCE)
         if code != 0:
             raise self._failure(title, code)
@@ -263,27 +267,28 @@ class Processes:
                     continue
         return process.returncode
 
-    def _said(self, title: str) -> str:
-        """The end of its output."""
+    def _log_tail(self, title: str) -> str:
+        """Return the end of the output."""
         with open(self.file(title), "rb") as log:
             log.seek(max(0, os.fstat(log.fileno()).st_size - TAIL))
             return log.read().decode(errors="replace").strip()
 
     def _failure(self, title: str, code: int) -> LiveError:
-        last = " ".join(self._said(title).splitlines()[-1:])
+        last = " ".join(self._log_tail(title).splitlines()[-1:])
         return LiveError(
             f"{title} ended with code {code} ({last}); all of its output is in {self.file(title)}."
         )
 
 
-def _bare(said: str) -> str:
-    """The last line of a log, without level, time and name."""
-    return re.sub(r"^(\[[^]]*\] ?)+: ", "", (said.splitlines() or [""])[-1])
+def _last_line(log: str) -> str:
+    """Return the last line of a log, without level, time and name."""
+    return re.sub(r"^(\[[^]]*\] ?)+: ", "", (log.splitlines() or [""])[-1])
 
 
-def _worked(pid: int) -> float:
-    """s that the threads of a process have run or were ready to run: on a loaded machine that of
-    one that works is still about all.
+def _busy_time(pid: int) -> float:
+    """Return the s that the threads of a process ran or were ready to run.
+
+    On a loaded machine, a process that computes is ready nearly all the time.
     """
     total = 0
     for file in Path(f"/proc/{pid}/task").glob("*/schedstat"):

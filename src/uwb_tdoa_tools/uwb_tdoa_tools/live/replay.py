@@ -1,6 +1,4 @@
-"""Replaying a bag over topics: publishers as recorded, somebody to listen, and everything
-acknowledged.
-"""
+"""Replay a bag over topics: publishers as recorded, paced by the stamps, everything acknowledged."""
 
 from __future__ import annotations
 
@@ -16,10 +14,8 @@ from rclpy.qos import DurabilityPolicy
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from ..bags.files import messages, open_bag
-from .follow import Follower
-from .followed_nodes import Nodes
-from .player import ACKNOWLEDGE_LIMIT, LONGEST_SLEEP, Played, Player, is_tdoa
-from .read_ahead import read_ahead
+from .follow import Follower, Nodes
+from .player import ACKNOWLEDGE_LIMIT, LONGEST_SLEEP, Played, Player, is_tdoa, read_ahead
 from .session import message_class, publisher_qos, session
 
 if TYPE_CHECKING:
@@ -32,30 +28,37 @@ if TYPE_CHECKING:
     from ..bags.files import BagReader
     from .session import Stop
 
-GLOBAL = (
-    "/tf",
-    "/tf_static",
-    "/clock",
-    "/diagnostics",
-    "/rosout",
-    "/parameter_events",
-)  # in no robot's namespace
-# s from the last match to the first message, and from the last message to the end: others are a
-# little later than we are
+
+# In no robot's namespace:
+GLOBAL = "/tf", "/tf_static", "/clock", "/diagnostics", "/rosout", "/parameter_events"
+# s from the last match to the first message, and from the last message to the end: the other side
+# discovers a little later
 SETTLE = 0.2
-DISCOVERY = 2.0  # s without anybody new after which who listens by now is enough
+DISCOVERY = 2.0  # s without a new subscription after which the present ones suffice
 
 
 @dataclass(frozen=True)
 class ReplayOptions:
-    """How to replay.
+    """Options of a replay.
 
-    rate : times as fast as recorded; loop : start again at the end; clock_rate : Hz of /clock, None
-        for none;
-    wait : s until somebody must subscribe; wait_topics : to all of these; follow : topic that is
-        kept in step with, or
-    None (the TDOAs of the bag are of the wait_topics then); ros_arguments : command line with
-    --ros-args; packages : of message types, beside those that are known, that may be imported.
+    Attributes
+    ----------
+    rate : float
+        Times as fast as recorded.
+    loop : bool
+        Start again at the end.
+    clock_rate : float or None
+        Hz of /clock.
+    wait : float
+        s until a subscription must exist.
+    wait_topics : sequence of str
+        Topics that each need a subscription.
+    follow : str or None
+        Topic to keep in step with. The TDOAs of the bag then need a subscription.
+    ros_arguments : sequence of str
+        Command line with --ros-args.
+    packages : sequence of str
+        Further packages of message types to import.
     """
 
     rate: float = 1.0
@@ -70,9 +73,20 @@ class ReplayOptions:
 
 @dataclass(frozen=True)
 class Replayed:
-    """played : Played; took : s; acknowledged : whether every subscription has everything;
-    stopped_by : number of the signal that ended it early, or None; wrong : {what went wrong with
-    what was followed: count}, empty if nothing did or nothing was followed.
+    """Result of a replay.
+
+    Attributes
+    ----------
+    played : Played
+        Counters.
+    took : float
+        Duration, s.
+    acknowledged : bool
+        Whether every subscription has every message.
+    stopped_by : int or None
+        Number of the signal that ended the replay early.
+    wrong : dict
+        {fault of the followed nodes: count}.
     """
 
     played: Played = field(default_factory=Played)
@@ -85,9 +99,25 @@ class Replayed:
 def replay(
     bag: str | Path, options: ReplayOptions = ReplayOptions(), say: Callable[[str], object] = print
 ) -> Replayed:
-    """Replay a bag.
+    """Replay a bag over ROS topics.
 
-    Returns Replayed. Raises InputError. say(sentence) : called with what happens.
+    Parameters
+    ----------
+    bag : path
+        The bag.
+    options : ReplayOptions
+        How to replay it.
+    say : callable
+        Called with sentences about the progress.
+
+    Returns
+    -------
+    Replayed
+
+    Raises
+    ------
+    InputError
+        If the bag has no message, or nobody subscribes in time.
     """
     with open_bag(bag) as reader, session("replay", list(options.ros_arguments)) as (node, stop):
         publishers = _publishers(node, bag, reader, say, options.packages)
@@ -113,7 +143,7 @@ def replay(
                 break
         took = time.perf_counter() - began
         acknowledged = _wait_acknowledged(publishers.values(), stop)
-        wrong = nodes.wrong(player, stop) if nodes else {}
+        wrong = nodes.faults(player.count, stop) if nodes else {}
         return Replayed(player.played, took, acknowledged, stop.signal, wrong)
 
 
@@ -124,9 +154,9 @@ def _publishers(
     say: Callable[[str], object],
     packages: Sequence[str],
 ) -> dict[str, Publisher]:
-    """{topic in the bag: publisher} of all topics whose type is installed, those that are latched
-    last. What belongs to one robot is published in the namespace of the node (--ros-args -r
-    __ns:=/tag1).
+    """Return {topic in the bag: publisher} of each topic of an installed type, latched ones last.
+
+    Topics of one robot are published in the namespace of the node (--ros-args -r __ns:=/tag1).
     """
     made = []
     by_topic = itertools.groupby(
@@ -171,16 +201,22 @@ def _wait_for_listeners(
     stop: Stop,
     say: Callable[[str], object],
 ) -> None:
-    """Return when somebody subscribes to each wanted topic: those that options name, or else all of
-    the bag, as far as they have any subscriber once nobody new has come for DISCOVERY s; and when
-    somebody publishes what is followed. InputError if after `options.wait` s nobody subscribes to
-    one that must have a subscriber, or to any.
+    """Wait until each wanted topic has a subscription, and the followed topic a publisher.
+
+    Wanted are the topics that the options name. Else all topics of the bag are wanted, and those
+    with a subscription suffice once no further one has come for DISCOVERY s.
+
+    Raises
+    ------
+    InputError
+        If after `options.wait` s a required topic, or every topic, has no subscription.
     """
     needed = [f"/{topic.lstrip('/')}" for topic in options.wait_topics]
     wanted = needed or list(publishers)
     if options.follow and not needed:
         needed = [topic for topic, publisher in publishers.items() if is_tdoa(publisher)]
-    if missing := [topic for topic in wanted if topic not in publishers]:
+    missing = [topic for topic in wanted if topic not in publishers]
+    if missing:
         raise InputError(
             f"--wait-topics: {missing[0]} is not in the bag; it has {', '.join(publishers)}."
         )
@@ -199,9 +235,10 @@ def _wait_for_listeners(
         missing = [topic for topic, count in zip(wanted, counts) if not count]
         if (counts, known) != heard:
             heard, changed = (counts, known), now
-        settled = now > changed + DISCOVERY
         enough = not missing or (
-            settled and len(missing) < len(wanted) and not set(missing) & set(needed)
+            now > changed + DISCOVERY
+            and len(missing) < len(wanted)
+            and not set(missing) & set(needed)
         )
         matched = all(count >= there for count, there in zip(counts, known))
         if (enough and followed and matched) or now > began + options.wait:
@@ -222,17 +259,12 @@ def _wait_for_listeners(
 
 
 def _wait_acknowledged(publishers: Iterable[Publisher], stop: Stop) -> bool:
-    """Whether every subscription has everything; waits at most ACKNOWLEDGE_LIMIT, in slices that
-    see a signal.
-    """
+    """Return whether every subscription has every message, after at most ACKNOWLEDGE_LIMIT."""
     until = time.monotonic() + ACKNOWLEDGE_LIMIT
     for publisher in publishers:
         while not publisher.wait_for_all_acked(Duration(seconds=LONGEST_SLEEP)):
             if stop or time.monotonic() > until:
                 return False
-    time.sleep(
-        SETTLE
-        # who listens by best effort acknowledges nothing, and may read the last messages from the
-        # memory of this process
-    )
+    # Best-effort subscriptions acknowledge nothing, and may read from the memory of this process.
+    time.sleep(SETTLE)
     return True

@@ -1,4 +1,4 @@
-"""Run a bag through both nodes, as processes, over ROS topics, and record what they say."""
+"""Run a bag through both nodes, as processes, over ROS topics, and record their output."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.flight import Flight
 
 INPUTS = ("/uwb/anchors", "/uwb/tdoa", "/imu/data")
-# Who must have found whom before the first message: topic -> (publishers, subscriptions)
+# Matches that must exist before the first message: topic -> (publishers, subscriptions)
 MATCHED = {
     "/imu/data": (0, 1),
     "/uwb/tdoa": (0, 1),
@@ -32,8 +32,8 @@ MATCHED = {
     "/uwb/tdoa_corrected": (1, 1),
     "/odometry": (1, 2),
 }
-# A replay can wait, a robot cannot: here no link may lose a message, and a stream that falls behind
-# is waited for.
+# A replay can wait, a robot cannot: here no link may lose a message, and the replay waits for a
+# stream that falls behind.
 PATIENCE = {
     "bias_node": {"hold": 9.975},
     "ekf_node": {"lag": 10.0},
@@ -52,18 +52,21 @@ RELIABLE = {
     ),
 }
 DEPTH = 1_000_000  # messages that may wait in a subscription
-# s in which nothing goes on: the very first start compiles the filter, which takes as long as it
-# takes
-READY_LIMIT = 60.0
+READY_LIMIT = 60.0  # s without progress; the first start compiles the filter, which is progress
 MATCH_LIMIT = 60.0  # s
-# s in which no count of the nodes changes: a replay at a high rate may leave a lot to catch up with
-SETTLE_LIMIT = 60.0
+SETTLE_LIMIT = 60.0  # s without a change of the counters, while the nodes work off a fast replay
 
 
 @dataclass(frozen=True)
 class LiveRun:
-    """recorded : path of a bag with `odometry`; bias, ekf : {key: text}, the last diagnostics of
-    each node.
+    """Result of `run_live`.
+
+    Attributes
+    ----------
+    recorded : Path
+        Bag with `odometry`.
+    bias, ekf : dict
+        {key: text}, the last diagnostics of each node.
     """
 
     recorded: Path
@@ -79,15 +82,33 @@ def run_live(
     ekf_parameters: dict[str, Any] | None = None,
     say: Callable[[str], object] = print,
 ) -> LiveRun:
-    """Start bias_node and ekf_node, wait until they have found each other, replay the bag, record
-    their odometry, stop them.
+    """Replay a bag through bias_node and ekf_node, and record their odometry.
 
-    bag : path of a bag; folder : where the recorded bag (`recorded.bag`) and the output of the
-        processes (`*.log`) go;
-    rate : times as fast as recorded; bias_parameters, ekf_parameters : {name: value} for the nodes;
-        say(text) : tells
-    what happens now. In a ROS domain of its own, on this machine only. Returns a LiveRun. Raises
-    LiveError, and KeyboardInterrupt after a signal.
+    The nodes run in a ROS domain without other users, on this machine only.
+
+    Parameters
+    ----------
+    bag : path
+        The bag to replay.
+    folder : path
+        Where `recorded.bag` and the output of the processes (`*.log`) go.
+    rate : float
+        Times as fast as recorded.
+    bias_parameters, ekf_parameters : dict or None
+        {name: value} for the nodes.
+    say : callable
+        Called with sentences about the progress.
+
+    Returns
+    -------
+    LiveRun
+
+    Raises
+    ------
+    LiveError
+        If a process fails or makes no progress.
+    KeyboardInterrupt
+        After a signal.
     """
     with open_bag(bag) as reader:
         present = {connection.topic for connection in reader.connections}
@@ -154,10 +175,12 @@ def run_live(
 
 
 def accounts(bias: dict[str, str], ekf: dict[str, str], flight: Flight) -> dict[str, int]:
-    """What became of the messages of a Flight that was played, by the last diagnostics of bias_node
-    and ekf_node.
+    """Count the messages of a replayed Flight by outcome, from the last diagnostics of both nodes.
 
-    {verdict: TDOAs, "waiting", "lost": TDOAs, "imu_late", "imu_lost": samples}.
+    Returns
+    -------
+    dict
+        {verdict: TDOAs, "waiting": TDOAs, "lost": TDOAs, "imu_late": samples, "imu_lost": samples}.
     """
     counts = {name: int(ekf[name]) for name in (*VERDICTS.values(), "waiting")}
     counts["waiting"] += int(bias["waiting"])  # for poses, which end with the first of the streams
@@ -170,7 +193,7 @@ def accounts(bias: dict[str, str], ekf: dict[str, str], flight: Flight) -> dict[
 
 
 def _parameters(name: str, values: dict[str, Any] | None) -> list[str]:
-    """Command-line arguments for a node's parameters; JSON is also YAML."""
+    """Return command-line arguments for the parameters of a node. JSON is also YAML."""
     values = PATIENCE[name] | (values or {})
     for end in RELIABLE[name]:
         values |= {
@@ -184,7 +207,7 @@ def _parameters(name: str, values: dict[str, Any] | None) -> list[str]:
 
 
 def _played(diagnostics: DiagnosticsListener, total: int) -> str:
-    """How much of the TDOAs of the bag bias_node has, in words."""
+    """State in words how many TDOAs of the bag bias_node has received."""
     received = int(diagnostics.newest("bias_node").get("received", 0))
     return f"{100.0 * received / max(total, 1):.0f} % of the flight is through"
 

@@ -1,6 +1,4 @@
-"""What replay and record share: their life as a ROS node, message classes by name, QoS to and from
-bags.
-"""
+"""Common parts of replay and record: the ROS node, message classes by name, QoS of bags."""
 
 from __future__ import annotations
 
@@ -33,28 +31,26 @@ if TYPE_CHECKING:
     from rclpy.node import Node
     from rclpy.task import Future
 
-KNOWN = frozenset(  # packages of message types: those of ROS that robots speak, and ours
+KNOWN = frozenset(  # packages of message types: the usual ones of ROS, and ours
     """actionlib_msgs action_msgs builtin_interfaces diagnostic_msgs geometry_msgs lifecycle_msgs nav_msgs rcl_interfaces rosgraph_msgs
     sensor_msgs shape_msgs statistics_msgs std_msgs stereo_msgs tf2_msgs trajectory_msgs unique_identifier_msgs uwb_tdoa_msgs
     visualization_msgs""".split()
 )
-PACKAGE: dict[str, Any] = {  # the option by which others are allowed
+PACKAGE: dict[str, Any] = {  # the option that permits further packages
     "action": "append",
     "default": [],
     "metavar": "NAME",
     "help": (
-        "import message types of this package, too; those of ROS that robots speak, and ours, are "
-        "known; may be repeated"
+        "import message types of this package, too; the usual ones of ROS, and ours, are known; "
+        "may be repeated"
     ),
 }
 AGAIN = 4.0  # s after which a node that has not answered is asked once more
-READER_DEPTH = (
-    10_000  # messages that a subscription holds until they are taken: 10 s of a 1 kHz stream
-)
+READER_DEPTH = 10_000  # messages that a subscription queues: 10 s of a 1 kHz stream
 
 
 class Stop:
-    """True once the process was asked to end, with the number of the signal that asked."""
+    """True once the process was asked to end; holds the number of the signal."""
 
     def __init__(self) -> None:
         self.signal: int | None = None
@@ -65,11 +61,17 @@ class Stop:
 
 @contextmanager
 def session(name: str, arguments: Sequence[str]) -> Iterator[tuple[Node, Stop]]:
-    """(node, Stop) while the block lasts. SIGINT and SIGTERM only set Stop: the block ends in its
-    own order.
+    """Yield (node, Stop). SIGINT and SIGTERM only set Stop: the block ends in its own order.
 
-    arguments : command line with the --ros-args that rclpy shall see. Raises InputError for what
-        rclpy refuses.
+    Parameters
+    ----------
+    arguments : sequence of str
+        Command line with the --ros-args for rclpy.
+
+    Raises
+    ------
+    InputError
+        If rclpy refuses the arguments.
     """
     stop = Stop()
 
@@ -85,8 +87,7 @@ def session(name: str, arguments: Sequence[str]) -> Iterator[tuple[Node, Stop]]:
         except (rclpy_implementation.RCLError, rclpy_implementation.UnknownROSArgsError) as error:
             raise InputError(f"ROS arguments: {error}") from error
         try:
-            # No parameters and no /rosout of its own: a recording of everything shall hold the
-            # others.
+            # Without parameters and /rosout: a recording of all topics shall not hold our own.
             node = rclpy.create_node(name, start_parameter_services=False, enable_rosout=False)
             yield node, stop
         finally:
@@ -97,9 +98,10 @@ def session(name: str, arguments: Sequence[str]) -> Iterator[tuple[Node, Stop]]:
 
 
 def answer_of(ask: Callable[[], Future]) -> Callable[[], Future | None]:
-    """A function that returns the first Future of ask() that is done, or None so far. When it is
-    called AGAIN s after the last time, it asks again: the middleware drops an answer to a client
-    that it has not met yet ("failed to send response (timeout)").
+    """Return a function that returns the first Future of ask() that is done, or None so far.
+
+    It asks again AGAIN s after the last time: the middleware drops an answer to a client that it has
+    not met yet ("failed to send response (timeout)").
     """
     asked: list[Future] = []
     due = -math.inf
@@ -115,9 +117,10 @@ def answer_of(ask: Callable[[], Future]) -> Callable[[], Future | None]:
 
 
 def message_class(msgtype: str, packages: Sequence[str] = ()) -> type | None:
-    """Class of a type like "pkg/msg/Name", or None if its package is not installed, or neither
-    KNOWN nor one of `packages`: whoever publishes, or made a bag, names the type, and importing a
-    package runs it.
+    """Return the class of a type like "pkg/msg/Name", or None.
+
+    None if the package is not installed, or is neither in KNOWN nor in `packages`. Publishers and bags
+    choose the name of the type, and importing a package runs its code.
     """
     package, _, name = msgtype.partition("/msg/")
     if package not in KNOWN and package not in packages or not name.isidentifier():
@@ -129,18 +132,23 @@ def message_class(msgtype: str, packages: Sequence[str] = ()) -> type | None:
 
 
 def publisher_qos(recorded: Sequence[Qos], messages: int) -> QoSProfile:
-    """QoSProfile to replay a topic with. recorded : rosbags Qos of each recorded publisher;
-    messages : how many.
+    """Return the QoSProfile to replay a topic with.
 
-    Durability as recorded. Always reliable: that serves reliable and best-effort subscriptions
-    alike. A stream keeps all that is not acknowledged, so that a reliable subscription that lags
-    holds the replay up and loses nothing. On a transient-local topic, a late subscription gets as
-    many messages as the recorded publishers kept.
+    Durability is as recorded. Reliability is always reliable, which serves best-effort subscriptions
+    too. A stream keeps all messages that are not acknowledged: a slow reliable subscription delays the
+    replay and loses nothing. On a transient-local topic, a late subscription gets as many messages as
+    the recorded publishers kept.
+
+    Parameters
+    ----------
+    recorded : sequence of rosbags Qos
+        QoS of each recorded publisher.
+    messages : int
+        Number of recorded messages.
     """
     if any(qos.durability == QosDurability.TRANSIENT_LOCAL for qos in recorded):
-        kept = sum(
-            qos.depth for qos in recorded
-        )  # discovery does not tell the depth: then 0 was recorded
+        # Discovery does not transmit the depth: then 0 was recorded.
+        kept = sum(qos.depth for qos in recorded)
         return QoSProfile(
             depth=kept or max(1, min(messages, READER_DEPTH)),
             reliability=ReliabilityPolicy.RELIABLE,
@@ -150,7 +158,7 @@ def publisher_qos(recorded: Sequence[Qos], messages: int) -> QoSProfile:
 
 
 def subscription_qos(offered: Sequence[QoSProfile]) -> QoSProfile:
-    """QoSProfile that gets the most of all publishers of a topic. offered : their QoSProfiles."""
+    """Return the QoSProfile that receives the most from publishers with the offered QoSProfiles."""
     reliable = all(qos.reliability == ReliabilityPolicy.RELIABLE for qos in offered)
     latched = all(qos.durability == DurabilityPolicy.TRANSIENT_LOCAL for qos in offered)
     return QoSProfile(
@@ -161,7 +169,10 @@ def subscription_qos(offered: Sequence[QoSProfile]) -> QoSProfile:
 
 
 def recorded_qos(qos: QoSProfile) -> Qos:
-    """The rosbags Qos of a publisher's QoSProfile. (Both number the policies as rmw does.)"""
+    """Return the rosbags Qos of a QoSProfile.
+
+    Both number the policies as rmw does.
+    """
 
     def time(duration: Duration) -> QosTime:
         return QosTime(*divmod(duration.nanoseconds, 10**9))

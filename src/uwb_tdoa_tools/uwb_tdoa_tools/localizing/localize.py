@@ -131,7 +131,7 @@ class Localizer:
     def __call__(self, recording: tuple[Path, str | Path | None]) -> Located:
         flight, name = self.reading.read(recording), name_of(recording[0])
         run = self.estimator(flight)
-        line = command_lines.surveying(*recording, self.effects)
+        line = command_lines.survey_line(*recording, self.effects)
         assessment = assess(flight, run, self.estimator, line)
         written = []
 

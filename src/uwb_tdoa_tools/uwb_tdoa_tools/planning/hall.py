@@ -19,7 +19,7 @@ from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import parallel
-from ..checking.sides import sides_of
+from ..checking.coverage import sides_of
 from ..simulation.rooms import facing, heard_at
 from .layout import UNUSABLE
 from .maps import TOO_FEW, Chart, Judged, judge
@@ -27,7 +27,7 @@ from .maps import TOO_FEW, Chart, Judged, judge
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ..progress import Progress
+    from ..parallel import Progress
     from ..simulation.rooms import Room, Walls
     from .layout import Goal
     from .maps import Grid

@@ -14,7 +14,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.radio import SPEED_OF_LIGHT, RadioLink, received_power_dbm
 from uwb_tdoa_bias.foundation.safe_yaml import read_yaml
 
-from ..checking.sides import sides_of, to_copy
+from ..checking.coverage import sides_of, to_copy
 
 if TYPE_CHECKING:
     from collections.abc import Callable

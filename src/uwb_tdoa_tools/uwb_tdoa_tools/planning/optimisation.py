@@ -24,7 +24,7 @@ from .report import quantiles
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from ..progress import Progress
+    from ..parallel import Progress
     from .layout import Goal
     from .maps import Chart, Judged, Wrap
 

@@ -11,7 +11,7 @@ from ..bags.files import new_bag
 from ..bags.message_types import typestore
 from ..bags.messages import anchors_message, header_of, pose_of
 from ..bags.topics import LATCHED_QOS
-from ..checking.sides import to_copy
+from ..checking.coverage import to_copy
 from ..scoring.gains import change_in_words
 from .maps import FLYABLE, IMPRECISE, OUTSIDE, TOO_FEW, TWO_SOLUTIONS
 from .precision import NORMAL_99, dilution

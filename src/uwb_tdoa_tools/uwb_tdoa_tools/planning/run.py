@@ -13,7 +13,7 @@ from uwb_tdoa_bias.foundation.antenna import Antenna
 from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, parallel
-from ..progress import Progress
+from ..parallel import Progress
 from ..readers.inputs import Reading
 from ..simulation.rooms import Room, Walls, room_of
 from . import hall, maps, optimisation, plots, report

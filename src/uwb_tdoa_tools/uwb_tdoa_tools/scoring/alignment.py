@@ -18,10 +18,10 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.errors import InputError
 
-from ..checking.delays import of_tdoas
 from ..checking.imu_rules import ARRANGEMENTS, signed_axis
-from ..checking.known_path import KnownPath
 from ..checking.motion_rules import FEWEST, TrueMotion
+from ..checking.pair_rules import KnownPath
+from ..checking.time_rules import delays_of_tdoas
 from ..clock import grid
 from .metrics import position_at, scored_phase
 from .pooling import ALIGN
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.effects.samples import PoseColumns
     from uwb_tdoa_bias.foundation.flight import Flight, Truth
 
-    from ..checking.delays import Delays
+    from ..checking.time_rules import Delays
 
 NONE, TIME, FRAME = ALIGN
 # Limits beside measured values were set on 37 recordings with a correct ground truth.
@@ -304,7 +304,7 @@ def _truth_delay(flight: Flight, exact: bool) -> tuple[float, str | None]:
     assert flight.truth is not None
     found, source = _inertial(flight), "inertial"
     if found is None:
-        found, source = of_tdoas(KnownPath(flight)), "tdoa"
+        found, source = delays_of_tdoas(KnownPath(flight)), "tdoa"
     if found is None:
         return 0.0, None
     if not exact and not _is_significant(*found.constant()):
@@ -312,14 +312,14 @@ def _truth_delay(flight: Flight, exact: bool) -> tuple[float, str | None]:
     late = -found.exact()
     # a parabola between the tried delays is inexact: repeat from its minimum
     moved = replace(flight, truth=_advanced(flight.truth, late))
-    again = _inertial(moved) if source == "inertial" else of_tdoas(KnownPath(moved))
+    again = _inertial(moved) if source == "inertial" else delays_of_tdoas(KnownPath(moved))
     return late - (again.exact() if again else 0.0), source
 
 
 def _tdoa_delay(flight: Flight, late: float) -> float:
     """Return the delay of the ground truth against the TDOAs, s, after its own delay `late`."""
     assert flight.truth is not None
-    found = of_tdoas(KnownPath(replace(flight, truth=_advanced(flight.truth, late))))
+    found = delays_of_tdoas(KnownPath(replace(flight, truth=_advanced(flight.truth, late))))
     return -found.exact() if found and _is_significant(*found.constant()) else 0.0
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from uwb_tdoa_bias.effects import RADIO, EffectSet, true_samples
 
-from ..checking.repairs import repairs
+from ..checking.pair_rules import repairs
 from ..estimate import FlightEstimator
 from ..readers.inputs import report_remarks
 from .alignment import (

@@ -33,7 +33,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..checking.known_path import AIRBORNE
+from ..checking.pair_rules import AIRBORNE
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.foundation.flight import Truth

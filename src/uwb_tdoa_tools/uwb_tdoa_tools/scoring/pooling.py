@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..json_values import as_json
+from ..outputs import as_json
 from .phases import TITLES
 
 if TYPE_CHECKING:

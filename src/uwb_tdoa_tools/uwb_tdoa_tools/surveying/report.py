@@ -11,7 +11,7 @@ import numpy as np
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.foundation.files import write_filled
 
-from ..checking.known_path import MANY
+from ..checking.pair_rules import MANY
 from ..diagnosis.attribution import attribute
 from ..diagnosis.references import Nothing
 

@@ -12,7 +12,7 @@ from uwb_tdoa_bias.effects import EffectSet, Samples, samples_at
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_bias.foundation.geometry import tdoa
 
-from ..checking.known_path import least_height
+from ..checking.pair_rules import least_height
 from ..scoring.metrics import scored_phase
 
 if TYPE_CHECKING:

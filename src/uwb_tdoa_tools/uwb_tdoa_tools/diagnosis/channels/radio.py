@@ -20,7 +20,7 @@ from uwb_tdoa_bias.effects.smooth_term import OF_LINKS
 from uwb_tdoa_bias.foundation.sensors import COMPARED
 from uwb_tdoa_ekf.sensitivity import Innovations
 
-from ...checking.known_path import MANY
+from ...checking.pair_rules import MANY
 from ...scoring.phases import in_the_air
 from ..regression.algebra import Matrix
 from .base import Channel, ChannelResidual, Rows

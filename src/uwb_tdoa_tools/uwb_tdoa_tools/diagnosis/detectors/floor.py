@@ -9,7 +9,7 @@ from scipy.optimize import nnls
 
 from uwb_tdoa_bias.effects import EFFECTS
 
-from ...checking.known_path import MANY
+from ...checking.pair_rules import MANY
 from ..regression.terms import Candidate, Term
 from .base import Detector
 

@@ -13,7 +13,7 @@ from scipy.sparse import csc_array
 
 from uwb_tdoa_bias.effects.samples import RADIO
 
-from ...checking.known_path import MANY
+from ...checking.pair_rules import MANY
 from ..channels import CHANNELS, RadioResidual, TdoaResidual
 from .algebra import stacked
 

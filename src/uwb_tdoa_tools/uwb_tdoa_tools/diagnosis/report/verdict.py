@@ -68,7 +68,7 @@ def faults_in_words(diagnosis: Diagnosis) -> list[str]:
 def truth_in_words(diagnosis: Diagnosis) -> list[str]:
     """What was wrong with clocks and frames of the ground truth: sentences."""
     return [
-        f"{name}: {sentence}." for name, said in diagnosis.of_truth.items() for sentence in said
+        f"{name}: {sentence}." for name, said in diagnosis.judge_truth.items() for sentence in said
     ]
 
 

@@ -30,7 +30,7 @@ from uwb_tdoa_ekf.evidence import MOVED
 from uwb_tdoa_ekf.offline import without_unknown_offset
 from uwb_tdoa_ekf.sensitivity import TDOAS
 
-from ...checking.known_path import MANY
+from ...checking.pair_rules import MANY
 from ...scoring.phases import AIRBORNE
 from ..channels import Comparison, RadioResidual
 from ..channels.radio import RangeResidual, TdoaResidual, compared, of_rows

@@ -28,7 +28,7 @@ from uwb_tdoa_ekf.evidence import (
     most_probable,
 )
 
-from ...checking.known_path import MANY
+from ...checking.pair_rules import MANY
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -16,7 +16,7 @@ from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.evidence import DELAY, ODDS, POSITION, eliminated, keys_of
 
-from ...checking.known_path import MANY
+from ...checking.pair_rules import MANY
 from ..over_flights import Share
 from .equations import SYSTEMATIC, Runs
 from .placing import PLACED_STD, place

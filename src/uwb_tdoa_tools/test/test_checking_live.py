@@ -1,6 +1,5 @@
-"""Who publishes and hears what: the rules, and live topics of real processes."""
+"""Topics of real processes, checked live."""
 
-from dataclasses import replace
 import json
 import signal
 import subprocess
@@ -11,66 +10,9 @@ import pytest
 from recordings import small_flight
 
 from uwb_tdoa_tools.bags.bag import write_bag
-from uwb_tdoa_tools.checking.recording import of_flight, read_live, read_recording
-from uwb_tdoa_tools.checking.wiring import RULES
+from uwb_tdoa_tools.checking.recording import read_live, read_recording
 from uwb_tdoa_tools.commands.check import main
-from uwb_tdoa_tools.live.ends import End
 from uwb_tdoa_tools.readers.inputs import Reading
-
-IMU, TDOA = "sensor_msgs/msg/Imu", "uwb_tdoa_msgs/msg/Tdoa"
-DRIVER = End("/imu/data", "/driver", IMU, True, False, False)
-NODE = End("/imu/data", "/ekf_node", IMU, False, False, False)
-STRICT = replace(NODE, reliable=True)
-ANCHORS = End(
-    "/tag1/uwb/anchors", "/tag1/driver", "uwb_tdoa_msgs/msg/AnchorArray", True, True, False
-)
-
-
-@pytest.mark.parametrize(
-    "ends, expected",
-    [
-        ([DRIVER, NODE], set()),
-        ([DRIVER, STRICT], {"qos_unmatched"}),
-        ([DRIVER, STRICT, NODE], set()),  # one node that asks in both ways, as ours do for anchors
-        ([replace(DRIVER, reliable=True), STRICT], set()),
-        ([replace(DRIVER, reliable=True), replace(NODE, latched=True)], {"qos_unmatched"}),
-        ([DRIVER, replace(DRIVER, node="/other"), NODE], {"publishers_several"}),
-        (
-            [
-                replace(DRIVER, topic="/tf_static"),
-                replace(DRIVER, topic="/tf_static", node="/other"),
-            ],
-            set(),
-        ),
-        ([DRIVER, replace(NODE, kind=TDOA)], {"type_other"}),
-        ([ANCHORS], {"anchors_volatile"}),
-        ([replace(ANCHORS, latched=True)], set()),
-        ([], set()),
-    ],
-)
-def test_rules(ends, expected):
-    recording = replace(of_flight(small_flight()), ends=tuple(ends))
-    found = [finding for rule in RULES for finding in rule(recording)]
-    assert {finding.rule for finding in found} == expected
-    for finding in found:
-        assert all(
-            node in finding.sentence
-            for node in {end.node for end in ends if end.node != "/ekf_node"}
-        )
-
-
-@pytest.mark.parametrize(
-    "arguments, sentence",
-    [
-        ([], "give recordings, or --live"),
-        (["x.bag", "--live", "3"], "not both"),
-        (["--live", "-1"], "above 0"),
-    ],
-)
-def test_recordings_or_topics(arguments, sentence, capsys):
-    assert main(arguments) == 2
-    assert sentence in capsys.readouterr().err
-
 
 FAULTY = """
 import rclpy, tf2_msgs.msg, geometry_msgs.msg, sensor_msgs.msg, std_msgs.msg, uwb_tdoa_msgs.msg
@@ -127,10 +69,10 @@ def process():
         each.communicate(timeout=120)
 
 
-def test_live_topics_of_a_faulty_driver(tmp_path, process, capsys, monkeypatch):
+def test_mistakes_of_a_live_driver_are_found(tmp_path, process, capsys, monkeypatch):
     pytest.importorskip("uwb_tdoa_msgs.msg")
     process(sys.executable, "-c", FAULTY)
-    listen = pytest.importorskip("uwb_tdoa_tools.live.listen")
+    listen = pytest.importorskip("uwb_tdoa_tools.live.record")
     monkeypatch.setattr(listen, "FIRST_LIMIT", 180.0)
     out = tmp_path / "live.json"
     code = main(
@@ -160,12 +102,12 @@ def test_live_topics_of_a_faulty_driver(tmp_path, process, capsys, monkeypatch):
 
 
 @pytest.mark.slow
-def test_what_is_live_is_judged_as_what_is_recorded(tmp_path, process, monkeypatch):
+def test_live_streams_equal_the_recording(tmp_path, process, monkeypatch):
     """Played on simulated time, listened to for a part of it: the very samples, so that the rules
     say the same.
     """
     pytest.importorskip("uwb_tdoa_msgs.msg")
-    listen = pytest.importorskip("uwb_tdoa_tools.live.listen")
+    listen = pytest.importorskip("uwb_tdoa_tools.live.record")
     monkeypatch.setattr(listen, "FIRST_LIMIT", 180.0)
     flight = small_flight(4.0)
     write_bag(flight, tmp_path / "flight.bag")
@@ -195,8 +137,8 @@ def test_what_is_live_is_judged_as_what_is_recorded(tmp_path, process, monkeypat
     assert {end.topic for end in live.ends} >= {"/uwb/tdoa", "/imu/data", "/uwb/anchors"}
 
 
-def test_nobody_publishes(capsys, monkeypatch):
-    listen = pytest.importorskip("uwb_tdoa_tools.live.listen")
+def test_topics_without_a_publisher_are_an_error(capsys, monkeypatch):
+    listen = pytest.importorskip("uwb_tdoa_tools.live.record")
     monkeypatch.setattr(listen, "FIRST_LIMIT", 0.3)
     assert main(["--live", "3", "--namespace", "nowhere"]) == 2
     assert "no message on /nowhere/uwb/tdoa" in capsys.readouterr().err

@@ -10,7 +10,7 @@ from uwb_tdoa_bias.effects import EFFECTS
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.bags.bag import write_bag
-from uwb_tdoa_tools.checking.remarks import survey_remarks
+from uwb_tdoa_tools.checking.report import survey_remarks
 from uwb_tdoa_tools.commands import diagnose, evaluate, inject
 from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
@@ -33,21 +33,21 @@ def renamed(flight, ids):
     )
 
 
-def test_a_right_survey_is_passed_over(flight):
+def test_a_right_survey_has_no_remark(flight):
     assert list(survey_remarks(flight)) == []
 
 
-def test_anchors_that_the_survey_lacks(flight):
+def test_missing_anchors_are_named(flight):
     (remark,) = survey_remarks(renamed(flight, [0, 1, 2, 3, 4, 5, 6]))
     assert "no anchor 7: " in remark and "% of the TDOAs" in remark
 
 
-def test_the_survey_of_another_room(flight):
+def test_the_survey_of_another_room_does_not_fit(flight):
     (remark,) = survey_remarks(replace(flight, anchors=constellation("staircase")))
     assert "does not fit" in remark
 
 
-def test_no_anchor_in_common(flight):
+def test_no_common_anchor_is_an_error(flight):
     with pytest.raises(
         InputError,
         match="hears anchors 0, 1, .* the survey has 100, .* give the survey of that room",
@@ -56,14 +56,14 @@ def test_no_anchor_in_common(flight):
 
 
 @pytest.mark.slow
-def test_measured_flights_are_passed_over(shared_data):
+def test_measured_flights_have_no_remark(shared_data):
     for pair in inputs.find_flights(
         [shared_data / "flights" / "0426", shared_data / "util"], shared_data / "surveys"
     ):
         assert list(survey_remarks(inputs.Reading().read(pair))) == []
 
 
-def test_evaluate_says_so(flight, tmp_path, capsys):
+def test_evaluate_prints_remarks(flight, tmp_path, capsys):
     write_bag(renamed(flight, [0, 1, 2, 3, 4, 5, 6]), tmp_path / "f.bag")
     assert evaluate.main([str(tmp_path / "f.bag"), "--jobs", "1"]) == 0
     assert "the survey has no anchor 7" in capsys.readouterr().err
@@ -72,7 +72,7 @@ def test_evaluate_says_so(flight, tmp_path, capsys):
     assert "give the survey of that room" in capsys.readouterr().err
 
 
-def test_diagnose_says_so_before_it_begins(flight, tmp_path, capsys, monkeypatch):
+def test_diagnose_prints_remarks_first(flight, tmp_path, capsys, monkeypatch):
     write_bag(flight, tmp_path / "f.bag")
     other = replace(
         flight,
@@ -120,7 +120,7 @@ def test_what_is_no_anchor_is_not_taken_for_one(flight):
     )  # 1.height is of the first step, whatever anchors there are
 
 
-def test_a_model_without_its_effects_is_said(flight, tmp_path, capsys):
+def test_a_model_without_its_effects_is_reported(flight, tmp_path, capsys):
     onnx = pytest.importorskip("onnx")
     import known_answer
 

@@ -43,20 +43,20 @@ def wait_for_output(file, text):
         time.sleep(0.01)
 
 
-def test_a_process_that_dies_is_named_with_its_last_words(start, tmp_path):
+def test_a_process_that_dies_is_named_with_its_last_line(start, tmp_path):
     start("node", "echo starting", "echo no such file >&2", "exit 3").wait(120)
     said = r"node ended with code 3 \(no such file\); all of its output is in .*log"
     with pytest.raises(processes.LiveError, match=said):
         start.processes.check()
 
 
-def test_a_process_that_must_stay_may_not_even_end_well(start):
+def test_a_process_that_must_run_may_not_end(start):
     start("node", "exit 0").wait(120)
     with pytest.raises(processes.LiveError, match="node ended with code 0"):
         start.processes.check()
 
 
-def test_a_process_that_may_end_must_end_well(start):
+def test_a_process_that_may_end_must_end_with_a_permitted_code(start):
     start("player", "exit 0", may_end_with=(0,)).wait(120)
     start.processes.check()
     start("failing", "exit 1", may_end_with=(0,)).wait(120)
@@ -72,7 +72,7 @@ def test_stop_interrupts_the_whole_group(start, tmp_path):
     assert "interrupted" in (tmp_path / "node.log").read_text()
 
 
-def test_what_ignores_the_interrupt_is_killed(start, tmp_path, monkeypatch):
+def test_a_process_that_ignores_the_interrupt_is_killed(start, tmp_path, monkeypatch):
     monkeypatch.setattr(processes, "PATIENCE", 0.2)
     node = start("node", "trap '' INT", "echo ready", "while true; do sleep 1; done")
     wait_for_output(tmp_path / "node.log", "ready")
@@ -81,7 +81,7 @@ def test_what_ignores_the_interrupt_is_killed(start, tmp_path, monkeypatch):
     assert node.returncode == -signal.SIGKILL
 
 
-def test_a_domain_that_was_just_left_is_not_the_next_one():
+def test_domains_are_drawn_at_random():
     """Others would hear nodes of the run before."""
 
     def number():
@@ -119,7 +119,7 @@ COMPILING = ("echo 'compiling, which is done once: 40%, 20 s'", "while true; do 
 READY = "echo '[INFO] [1.5] [node]: ready; correcting with: none'"
 
 
-def test_who_starts_and_works_is_waited_for_however_long_that_takes(start, quick, tmp_path):
+def test_a_process_that_compiles_is_waited_for_without_limit(start, quick, tmp_path):
     start("node", *COMPILING)
     wait_for_output(tmp_path / "node.log", "compiling")
     until, told = time.monotonic() + 6.0, []
@@ -139,7 +139,7 @@ def test_who_starts_and_works_is_waited_for_however_long_that_takes(start, quick
     [["sleep 600"], [READY, *COMPILING[1:]]],
     ids=["it sleeps", "it is ready, and busy otherwise"],
 )
-def test_if_nothing_goes_on_it_is_not_waited_for_any_longer(start, quick, tmp_path, lines):
+def test_without_progress_the_wait_ends(start, quick, tmp_path, lines):
     start("node", *lines)
     if READY in lines:
         wait_for_output(tmp_path / "node.log", "ready")
@@ -149,13 +149,13 @@ def test_if_nothing_goes_on_it_is_not_waited_for_any_longer(start, quick, tmp_pa
         processes.wait(0.5, "the node", start.processes, None, lambda: False)
 
 
-def test_who_dies_is_reported_at_once(start, quick):
+def test_a_process_that_dies_ends_the_wait(start, quick):
     start("node", "echo no such file", "exit 3")
     with pytest.raises(processes.LiveError, match="node ended with code 3"):
         processes.wait(1000.0, "the node", start.processes, None, lambda: False)
 
 
-def test_signs_of_life_are_waited_for(start, quick):
+def test_changing_counters_extend_the_wait(start, quick):
     start("node", READY, "sleep 600")
     until = time.monotonic() + 2.0
     processes.wait(

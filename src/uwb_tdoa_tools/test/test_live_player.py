@@ -2,15 +2,15 @@ import threading
 
 import pytest
 
-from uwb_tdoa_tools.live.read_ahead import BATCH, BATCHES_AHEAD, read_ahead
+from uwb_tdoa_tools.live.player import BATCH, BATCHES_AHEAD, read_ahead
 
 
 @pytest.mark.parametrize("count", [0, 1, BATCH, 3 * BATCH + 7, BATCH * (BATCHES_AHEAD + 5)])
-def test_everything_in_order(count):
+def test_items_come_complete_and_in_order(count):
     assert list(read_ahead(iter(range(count)))) == list(range(count))
 
 
-def test_error_comes_after_what_was_read():
+def test_an_error_comes_after_the_items_before_it():
     def broken():
         yield from range(10)
         raise ValueError("worn out")

@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_bias.foundation.geometry import tdoa
-from uwb_tdoa_tools.checking.survey_fit import SurveyFit, displacement
+from uwb_tdoa_tools.checking.ordered import SurveyFit, displacement
 from uwb_tdoa_tools.checking.tdoa_rules import SAME, gained
 
 BOX = np.array([[x, y, z] for x in (0.0, 6.0) for y in (0.0, 7.0) for z in (0.2, 3.0)])
@@ -22,7 +22,7 @@ def measured(positions, seconds=40.0, noise=0.05, seed=0):
     return t, a, b, tdoa(p, positions[a], positions[b]) + noise * rng.normal(size=len(t))
 
 
-def test_a_right_survey_stays():
+def test_a_right_survey_is_not_moved():
     fit = SurveyFit(*measured(BOX), BOX)
     left, anchors = fit.solve()
     assert left <= fit.before and gained(fit) is None
@@ -32,7 +32,7 @@ def test_a_right_survey_stays():
 @pytest.mark.parametrize(
     "row, shift", [(0, [1.0, 0.0, 0.0]), (5, [0.0, -1.5, 0.0]), (7, [0.5, 0.5, -1.0])]
 )
-def test_one_anchor_is_found_where_it_is(row, shift):
+def test_a_moved_anchor_is_found(row, shift):
     surveyed = BOX.copy()
     surveyed[row] -= shift
     fit = SurveyFit(*measured(BOX), surveyed)
@@ -45,7 +45,7 @@ def test_one_anchor_is_found_where_it_is(row, shift):
 
 @settings(max_examples=50, deadline=None)
 @given(st.integers(0, 10_000))
-def test_turned_and_shifted_as_a_whole_is_no_displacement(seed):
+def test_rotation_and_translation_are_no_displacement(seed):
     rng = np.random.default_rng(seed)
     positions = rng.uniform(-5.0, 5.0, (6, 3))
     moved = Rotation.random(random_state=seed).apply(positions) + rng.normal(size=3)
@@ -54,7 +54,7 @@ def test_turned_and_shifted_as_a_whole_is_no_displacement(seed):
     assert displacement(positions, mirrored).max() > 1e-3  # a mirror image is another survey
 
 
-def test_too_little_is_no_window():
+def test_few_tdoas_make_no_window():
     t, a, b, d = (column[:20] for column in measured(BOX))
     assert len(SurveyFit(t, a, b, d, BOX)) == 0
     assert len(SurveyFit(*(column[:0] for column in (t, a, b, d)), BOX)) == 0

@@ -27,7 +27,7 @@ def qos(reliability=RELIABLE, durability=VOLATILE, depth=5):
         ),
     ],
 )
-def test_recorded_qos_says_the_same(profile, expected):
+def test_recorded_qos_equals_the_qos_of_the_publisher(profile, expected):
     recorded = recorded_qos(profile)
     assert (recorded.reliability, recorded.durability, recorded.depth) == expected
     assert recorded.history == QosHistory.KEEP_LAST
@@ -64,7 +64,7 @@ def test_replay_serves_every_subscription(recorded, messages, durability, depth)
 
 
 @pytest.mark.parametrize("messages, depth", [(4, 4), (0, 1)])
-def test_latched_topic_whose_depth_discovery_did_not_tell(messages, depth):
+def test_a_latched_topic_of_unknown_depth_keeps_its_messages(messages, depth):
     unknown = recorded_qos(qos(durability=LATCHED))._replace(history=QosHistory.UNKNOWN, depth=0)
     assert publisher_qos([unknown], messages).depth == depth
 
@@ -79,13 +79,13 @@ def test_latched_topic_whose_depth_discovery_did_not_tell(messages, depth):
         ([qos(durability=LATCHED), qos()], RELIABLE, VOLATILE),
     ],
 )
-def test_record_asks_for_what_all_publishers_offer(offered, reliability, durability):
+def test_a_recorder_requests_what_all_publishers_offer(offered, reliability, durability):
     profile = subscription_qos(offered)
     assert (profile.reliability, profile.durability) == (reliability, durability)
     assert profile.depth >= 1000
 
 
-def test_message_class():
+def test_types_of_installed_packages_are_found():
     from sensor_msgs.msg import Imu
 
     assert message_class("sensor_msgs/msg/Imu") is Imu
@@ -93,7 +93,7 @@ def test_message_class():
     assert message_class("nothing_msgs/msg/Nothing") is None
 
 
-def test_no_package_is_imported_because_a_stranger_names_it(tmp_path, monkeypatch):
+def test_unknown_packages_are_not_imported(tmp_path, monkeypatch):
     """Whoever publishes tells a name, and an import runs what it finds."""
     (tmp_path / "evil_msgs").mkdir()
     (tmp_path / "evil_msgs" / "__init__.py").write_text("")

@@ -17,13 +17,13 @@ def test_parameters_are_yaml_whatever_they_hold():
     assert {'file:="/a: b"', "use_imu:=false", "lag:=0.25"} <= set(arguments[2::2])
 
 
-def test_what_is_replayed_is_waited_for():
+def test_the_nodes_wait_for_a_slow_replay():
     arguments = live._parameters("bias_node", None)
     assert "hold:=9.975" in arguments
     assert 'qos_overrides./uwb/tdoa.subscription.reliability:="reliable"' in arguments
 
 
-def test_tdoas_that_wait_in_either_node_are_not_lost():
+def test_tdoas_that_wait_in_a_node_are_not_lost():
     ekf = {
         **dict.fromkeys((*VERDICTS.values(), "imu_late", "waiting"), "1"),
         "IMU samples received": "4",

@@ -70,7 +70,7 @@ def waits(follower, stamp):
     return stop.came
 
 
-def test_waits_until_the_topic_is_less_than_the_lead_behind(follower, speaker, monkeypatch):
+def test_the_replay_waits_for_a_topic_that_is_behind(follower, speaker, monkeypatch):
     monkeypatch.setattr(follow, "SILENCE", 1000.0)
     assert follower.wait(100 * SECOND, False) == 0.0
     assert not waits(follower, 100 * SECOND + LEAD)
@@ -100,7 +100,7 @@ def test_a_signal_ends_the_wait(follower, monkeypatch):
     assert follower.wait(9 * SECOND, True) < 90.0
 
 
-def test_what_cannot_be_followed_is_named(node):
+def test_topics_that_cannot_be_followed_are_named(node):
     with pytest.raises(InputError, match="nobody publishes /odometry"):
         Follower(node, "odometry")
     node.create_publisher(Float64, "number", 1)
@@ -171,7 +171,7 @@ class Soon:
 STAMPS = [10.0 + 0.01 * k for k in range(200)]
 
 
-def test_no_tdoa_is_played_while_those_a_step_older_are_in_the_filter(filtered):
+def test_the_replay_waits_for_tdoas_in_the_filter(filtered):
     follower, residuals = filtered
     assert play(follower, STAMPS) == 9  # the last of them is a step newer than the first
     residuals.say(*STAMPS[:6])
@@ -180,7 +180,7 @@ def test_no_tdoa_is_played_while_those_a_step_older_are_in_the_filter(filtered):
     assert play(follower, STAMPS[15:]) == 94
 
 
-def test_steps_are_shorter_while_bias_node_may_know_of_no_pose(starting, speaker, monkeypatch):
+def test_steps_are_shorter_until_bias_node_has_poses(starting, speaker, monkeypatch):
     follower, residuals = starting
     assert play(follower, STAMPS) == 5
     residuals.say(*STAMPS[:2])
@@ -197,7 +197,7 @@ def test_tdoas_that_are_lost_are_not_waited_for(filtered):
     assert play(follower, STAMPS[9:]) == 9
 
 
-def test_shifted_stamps_are_waited_for_as_little(filtered):
+def test_stamps_that_an_effect_shifts_are_followed(filtered):
     """bias_node takes tdoa_time_offset out of the stamps."""
     follower, residuals = filtered
     play(follower, STAMPS)
@@ -205,7 +205,7 @@ def test_shifted_stamps_are_waited_for_as_little(filtered):
     assert play(follower, STAMPS[9:]) == 10
 
 
-def test_a_recording_that_starts_again_is_followed_anew(filtered):
+def test_a_recording_that_starts_again_is_followed_again(filtered):
     follower, residuals = filtered
     play(follower, STAMPS)
     residuals.say(*STAMPS)
@@ -220,12 +220,12 @@ def test_a_filter_that_has_gone_silent_is_not_waited_for(filtered, monkeypatch):
     assert play(follower, STAMPS) == 200
 
 
-def test_the_filter_waits_for_aids_as_long_as_the_replay_takes_it_to():
+def test_the_constants_are_those_of_the_filter():
     found = follow.AID_SILENT, follow.AID_SHARE, follow.LAG
     assert found == (SILENT * SECOND, OF_AIDS, PARAMETERS["lag"].default)
 
 
-def test_tdoas_that_wait_with_the_filter_for_a_height_are_not_waited_for(filtered):
+def test_the_replay_does_not_wait_for_tdoas_that_wait_for_a_height(filtered):
     follower, residuals = filtered
     follower.add_aid("/height", 10 * SECOND)
     assert play(follower, STAMPS) == 22  # it waits for half of its lag

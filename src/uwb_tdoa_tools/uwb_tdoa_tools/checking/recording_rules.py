@@ -1,0 +1,448 @@
+"""Judge a recording by what its messages state: frames, topics, anchors, clocks, publishers, ranges.
+
+A rule takes a Recording and yields Findings.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from uwb_tdoa_bias.foundation.sensors import Ranges
+from uwb_tdoa_ekf.streams import ERROR, NOTE, WARNING, Finding
+
+from ..bags.frames import is_body
+from ..bags.messages import BODY_FRAME
+from ..clock import SET, SILENCE, WORDS, WRAP, apart, in_words
+from .recording import IMU
+from .tdoa_rules import largest_displacement, same_place
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from uwb_tdoa_bias.foundation.anchors import Anchors
+
+    from ..bags.frames import Place
+    from ..live.record import End
+    from .recording import Recording
+
+
+WHEELS = "velocity/odometry"
+TURNED, SHIFTED = np.deg2rad(2.0), 0.02  # rad and m that a frame may be off the body frame
+
+
+def frames(recording: Recording) -> Iterator[Finding]:
+    """Yield frames other than the body's: /tf_static places them on the body, or nothing does."""
+    for topic, counts in recording.frames.items():
+        for frame in sorted(counts):
+            if not is_body(frame):
+                yield from _frame(topic, frame, recording.places.get(frame))
+
+
+def _frame(topic: str, frame: str, place: Place | None) -> Iterator[Finding]:
+    if place is None:
+        cause = f"{topic} is in the frame {frame}, and nothing says how that sits on {BODY_FRAME}"
+        line = (
+            f"publish on /tf_static how {frame} sits on {BODY_FRAME}, or have the driver write "
+            f"frame_id {BODY_FRAME}"
+        )
+        yield Finding(
+            "frame_unknown", WARNING, cause, f"no transform to {frame} in /tf_static", line, np.nan
+        )
+        return
+    turn, arm = place
+    if turn.magnitude() < TURNED and np.linalg.norm(arm) < SHIFTED:
+        return
+    roll, pitch, yaw = turn.as_euler("xyz", degrees=True)
+    evidence = f"roll {roll:.0f}, pitch {pitch:.0f}, yaw {yaw:.0f} degrees and "
+    evidence += f"({arm[0]:.2f}, {arm[1]:.2f}, {arm[2]:.2f}) m on {BODY_FRAME}"
+    cause = (
+        f"{topic} is in the frame {frame}, which /tf_static places on {BODY_FRAME}; its samples "
+        "are taken there"
+    )
+    line = "ros2 topic echo /tf_static  # nothing to do if that is how it is mounted"
+    yield Finding("frame_turned", NOTE, cause, evidence, line, turn.magnitude())
+
+
+def senders(recording: Recording) -> Iterator[Finding]:
+    """Yield topics with two frames: two tags, or two sensors."""
+    for topic, counts in recording.frames.items():
+        if len(counts) > 1:
+            names = ", ".join(
+                f"{frame or '(none)'}: {count}" for frame, count in sorted(counts.items())
+            )
+            line = (
+                "give each tag a namespace of its own: start its driver with --ros-args -r "
+                "__ns:=/tag2"
+            )
+            yield Finding(
+                "senders",
+                ERROR,
+                f"{topic} comes from several senders",
+                f"messages by frame_id: {names}",
+                line,
+                float(len(counts)),
+            )
+
+
+def no_imu(recording: Recording) -> Iterator[Finding]:
+    """Yield a finding if there are no inertial samples, or under another name."""
+    if recording.imu is not None:
+        return
+    there = sorted(
+        topic for topic, kind in recording.topics.items() if kind == "sensor_msgs/msg/Imu"
+    )
+    if there:
+        line = (
+            f"give --topic {IMU}={there[0]} to tools that read the bag, and -r {IMU}:={there[0]} "
+            "to ekf_node"
+        )
+        yield Finding(
+            "imu_elsewhere",
+            WARNING,
+            f"no inertial samples on {IMU}",
+            f"but on {', '.join(there)}",
+            line,
+            0.0,
+        )
+    elif recording.topics:
+        yield Finding(
+            "imu_missing",
+            WARNING,
+            f"no inertial samples on {IMU}",
+            "no topic of the type sensor_msgs/Imu",
+            "-p use_imu:=false  # of ekf_node, if there is no IMU",
+            0.0,
+        )
+
+
+def odometry_unread(recording: Recording) -> Iterator[Finding]:
+    """Yield odometry, as from wheels, on a topic that nothing reads.
+
+    The odometry of our filter, for any tag, does not count.
+    """
+    tags = [
+        topic.removesuffix("uwb/tdoa") for topic in recording.topics if topic.endswith("/uwb/tdoa")
+    ]
+    known = {
+        *recording.read,
+        *(f"{tag}{ours}" for tag in tags for ours in ("odometry", "odometry/debiased")),
+    }
+    there = sorted(
+        topic
+        for topic, kind in recording.topics.items()
+        if kind == "nav_msgs/msg/Odometry" and topic not in known
+    )
+    if there and "velocity" not in recording.sensors:
+        line = (
+            f"if it is of wheels or a camera: --topic {WHEELS}={there[0]} for tools, and -r "
+            f"{WHEELS}:={there[0]} for ekf_node"
+        )
+        cause = f"the odometry on {', '.join(there)} is not used"
+        evidence = f"velocities are read from velocity and {WHEELS}"
+        yield Finding("odometry_unread", WARNING, cause, evidence, line, float(len(there)))
+
+
+def other_anchors(recording: Recording) -> Iterator[Finding]:
+    """Yield a finding if the anchors in the bag, which the nodes use, differ from the survey."""
+    if recording.recorded is None or same_place(recording.anchors, recording.recorded):
+        return
+    off = largest_displacement(recording.anchors, recording.recorded)
+    evidence = (
+        f"the same ids are up to {off:.2f} m apart" if np.isfinite(off) else "no id in common"
+    )
+    line = (
+        "give both nodes the survey as anchors_file, or replay a bag that `convert --survey` has "
+        "made of this bag"
+    )
+    yield Finding(
+        "survey_differs",
+        NOTE,
+        (
+            "the bag holds other anchors than the survey, which counts here; nodes without an "
+            "anchors_file take those of the bag"
+        ),
+        evidence,
+        line,
+        off,
+    )
+
+
+def falling_stamps(recording: Recording) -> Iterator[Finding]:
+    """Yield a finding if the stamps in the file fall. The reader has sorted them."""
+    if recording.falls:
+        yield Finding(
+            "stamps_fall",
+            WARNING,
+            "messages in the file are out of order",
+            f"the stamps fall {recording.falls} times",
+            "-p reorder:=0.02 -p lag:=0.3  # of ekf_node, for the same driver live",
+            float(recording.falls),
+        )
+
+
+def clock_jumps(recording: Recording) -> Iterator[Finding]:
+    """Yield restarts, wraps and settings of the clock, and single wrong stamps."""
+    for jump in recording.jumps:
+        cause, done = in_words(jump)
+        if jump.kind == SILENCE:
+            remedy = "record with ros2 bag record, whose arrival times tell one from the other"
+            yield Finding("clock_silence", WARNING, cause, done, remedy, jump.by)
+        elif jump.kind == WRAP:
+            remedy = "count the wraps in the driver: live, ekf_node starts anew at each of them"
+            yield Finding("clock_wrap", ERROR, cause, done, remedy, jump.by)
+        elif jump.kind == SET:
+            remedy = (
+                "set the clock before the recording begins (chronyc waitsync), or stamp with a "
+                "clock that nobody sets"
+            )
+            yield Finding("clock_set", ERROR, cause, done, remedy, jump.by)
+        else:
+            remedy = "record each start of the tag by itself; live, ekf_node starts anew there"
+            yield Finding("clock_restart", ERROR, cause, done, remedy, jump.by)
+    for name, count in recording.outliers.items():
+        cause = (
+            f"{count} messages of {WORDS.get(name, name)} have stamps far from those of their "
+            "neighbours"
+        )
+        remedy = (
+            "stamp when the sample is measured; look for a field that is not initialised, or a "
+            "transfer that is not checked"
+        )
+        yield Finding(
+            "stamps_wild",
+            WARNING,
+            cause,
+            "they are left out here, and by the nodes",
+            remedy,
+            float(count),
+        )
+
+
+def sensors_apart(recording: Recording) -> Iterator[Finding]:
+    """Yield sensors without a message in the time of the TDOAs.
+
+    The rules of streams judge the IMU, unless it is alone.
+    """
+    for name, ahead, count in apart(
+        {"tdoa": recording.tdoa.t, **{name: of.t for name, of in recording.sensors.items()}}
+    ):
+        topic = WORDS.get(name, name)
+        cause = (
+            f"the stamps of {topic} are {abs(ahead):.3f} s "
+            f"{'ahead of' if ahead > 0.0 else 'behind'} those of uwb/tdoa"
+        )
+        evidence = (
+            f"none of its {count} messages is stamped within the time of the TDOAs: none can be "
+            "used"
+        )
+        yield Finding(
+            "sensor_apart",
+            ERROR,
+            cause,
+            evidence,
+            "stamp all sensors with the clock of one machine",
+            ahead,
+        )
+
+
+def unused_data(recording: Recording) -> Iterator[Finding]:
+    """Yield data that the reader of the recording did not use."""
+    for cause, evidence, remedy in recording.losses:
+        yield Finding("imu_lost", WARNING, cause, evidence, remedy, np.nan)
+
+
+def _by_topic(recording: Recording) -> Iterator[tuple[str, list[End], list[End]]]:
+    """Yield (topic, publishers, subscriptions) of each live topic."""
+    for topic in sorted({end.topic for end in recording.ends}):
+        ends = [end for end in recording.ends if end.topic == topic]
+        yield (
+            topic,
+            [end for end in ends if end.publishes],
+            [end for end in ends if not end.publishes],
+        )
+
+
+def different_types(recording: Recording) -> Iterator[Finding]:
+    """Yield topics with several types: such publishers and subscriptions never match."""
+    for topic, publishers, subscriptions in _by_topic(recording):
+        found = {end.kind for end in (*publishers, *subscriptions)}
+        if len(found) > 1:
+            evidence = ", ".join(
+                sorted(f"{end.node}: {end.kind}" for end in (*publishers, *subscriptions))
+            )
+            cause = f"{topic} has several types"
+            line = f"start the driver of the other type with --ros-args -r {topic}:={topic}_other"
+            yield Finding("type_other", ERROR, cause, evidence, line, float(len(found)))
+
+
+def incompatible_qos(recording: Recording) -> Iterator[Finding]:
+    """Yield subscriptions that request more than a publisher offers, and so receive nothing from it."""
+    for topic, publishers, subscriptions in _by_topic(recording):
+        deaf = {
+            (publisher.node, end.node): (publisher, end)
+            for publisher, end in product(publishers, subscriptions)
+            if not any(other.gets(publisher) for other in subscriptions if other.node == end.node)
+        }
+        for publisher, end in deaf.values():
+            cause = (
+                f"{end.node} hears nothing of what {publisher.node} publishes on {topic}: it asks "
+                "for more than is offered"
+            )
+            evidence = f"published {publisher.qos}; asked for: {end.qos}"
+            yield Finding(
+                "qos_unmatched", ERROR, cause, evidence, _stronger(publisher, end), np.nan
+            )
+
+
+def _stronger(publisher: End, end: End) -> str:
+    """Return the QoS to write in the node that publishes."""
+    policies = ["reliability=ReliabilityPolicy.RELIABLE"] * end.reliable + [
+        "durability=DurabilityPolicy.TRANSIENT_LOCAL"
+    ] * end.latched
+    return (
+        f"qos = QoSProfile(depth=100, {', '.join(policies)})  # in {publisher.node}, or ask for "
+        f"less in {end.node}"
+    )
+
+
+def several_publishers(recording: Recording) -> Iterator[Finding]:
+    """Yield streams with two publishers."""
+    for topic, publishers, _ in _by_topic(recording):
+        if len(publishers) > 1 and not topic.startswith("/tf"):
+            names = ", ".join(sorted(end.node for end in publishers))
+            line = (
+                "give each tag a namespace of its own: start its driver with --ros-args -r "
+                "__ns:=/tag2, or stop all but one"
+            )
+            yield Finding(
+                "publishers_several",
+                ERROR,
+                f"{len(publishers)} publish on {topic}",
+                names,
+                line,
+                float(len(publishers)),
+            )
+
+
+def volatile_anchors(recording: Recording) -> Iterator[Finding]:
+    """Yield anchors that late subscriptions do not get, unless they are repeated."""
+    for topic, publishers, _ in _by_topic(recording):
+        for publisher in publishers:
+            if topic.endswith("uwb/anchors") and not publisher.latched:
+                yield Finding(
+                    "anchors_volatile",
+                    WARNING,
+                    "nodes that start later get no anchors, unless they are repeated",
+                    f"{publisher.node} publishes {topic} {publisher.qos}",
+                    (
+                        "qos = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)  "
+                        "# or anchors_file of both nodes"
+                    ),
+                    np.nan,
+                )
+
+
+WINDOW = 0.25  # s in which the tag hardly moves
+FEWEST_ANCHORS, FEWEST_WINDOWS, MOST_WINDOWS = 5, 10, 200
+LARGE, LARGEST = 0.1, 5.0  # m, limit of a finding, and more than any antenna delays
+AGREE = 0.8  # share of the windows with the same sign
+SCALE = 0.2  # m, beyond which a range counts less
+DILUTION = 5.0  # largest ratio of standard deviations: common error over a single range
+STEPS, DAMPING = 20, 1e-3
+REMEDY = (
+    "calibrate it: survey, or diagnose where there is ground truth; until then leave "
+    "range_offset_std above 0.0: the filter finds it after each start"
+)
+
+
+def tag_delay(recording: Recording) -> Iterator[Finding]:
+    """Yield a finding if all ranges are wrong by about the same: the antenna delay of the tag.
+
+    TDOAs do not depend on it. Without `range_offset_std` the position error exceeds the delay where
+    the anchors are on one side.
+    """
+    ranges = recording.sensors.get("range")
+    offsets = (
+        window_offsets(ranges, recording.anchors) if isinstance(ranges, Ranges) else np.empty(0)
+    )
+    if len(offsets) < FEWEST_WINDOWS:
+        return
+    offset = float(np.median(offsets))
+    if LARGE < abs(offset) < LARGEST and np.mean(np.sign(offsets) == np.sign(offset)) > AGREE:
+        cause = (
+            f"all ranges are too {'long' if offset > 0.0 else 'short'} by about as much: the "
+            "antenna delay of the tag"
+        )
+        low, high = np.quantile(offsets, [0.25, 0.75])
+        evidence = (
+            f"{offset:.2f} m in the median of {len(offsets)} windows of {WINDOW:g} s, {low:.2f} "
+            f"to {high:.2f} m in half of them"
+        )
+        yield Finding("tag_delay", NOTE, cause, evidence, REMEDY, offset)
+
+
+def window_offsets(ranges: Ranges, anchors: Anchors) -> np.ndarray:
+    """Return the common error of the ranges in each window.
+
+    Parameters
+    ----------
+    ranges : Ranges
+        Distances to anchors.
+    anchors : Anchors
+        The survey.
+
+    Returns
+    -------
+    (k,) array
+        Errors that the distances from one position do not explain, m, where they are determined.
+    """
+    row = anchors.index(ranges.anchor)
+    usable = (row >= 0) & np.isfinite(ranges.d) & np.isfinite(ranges.t)
+    row, d, t = row[usable], ranges.d[usable], ranges.t[usable]
+    if not len(t):
+        return np.empty(0)
+    _, first = np.unique(np.floor((t - t.min()) / WINDOW), return_index=True)
+    parts = list(zip(np.split(row, first[1:]), np.split(d, first[1:])))
+    parts = [(rows, some) for rows, some in parts if len(np.unique(rows)) >= FEWEST_ANCHORS]
+    chosen = np.unique(np.linspace(0, len(parts) - 1, min(len(parts), MOST_WINDOWS)).astype(int))
+    found = (_offset(anchors.positions[parts[k][0]], parts[k][1]) for k in chosen)
+    return np.array([one for one in found if one is not None])
+
+
+def _offset(positions: np.ndarray, d: np.ndarray) -> float | None:
+    """Return the common error of ranges d (n,) m to anchors (n, 3) m; None if it is not determined.
+
+    Gauss-Newton with Huber's weights.
+    """
+    x = np.append(positions.mean(axis=0), 0.0)
+    for _ in range(STEPS):
+        away = x[:3] - positions
+        distance = np.maximum(np.linalg.norm(away, axis=1), 1e-6)
+        error = d - distance - x[3]
+        weight = np.minimum(1.0, SCALE / np.maximum(np.abs(error), 1e-9))
+        jacobian = np.column_stack([away / distance[:, None], np.ones(len(d))])
+        gram = jacobian.T @ (weight[:, None] * jacobian) + DAMPING * np.eye(4)
+        x = x + np.linalg.solve(gram, jacobian.T @ (weight * error))
+    determined = float(np.sqrt(np.linalg.inv(gram)[3, 3])) < DILUTION and bool(np.isfinite(x).all())
+    return float(x[3]) if determined else None
+
+
+RULES = (
+    frames,
+    senders,
+    no_imu,
+    odometry_unread,
+    other_anchors,
+    falling_stamps,
+    clock_jumps,
+    sensors_apart,
+    unused_data,
+    different_types,
+    incompatible_qos,
+    several_publishers,
+    volatile_anchors,
+    tag_delay,
+)
