@@ -39,8 +39,8 @@ TAPE = 0.05  # m
 NEAR = 0.08  # m, 3D, within which a moved anchor shall be found
 STEP = 0.5  # s between two looks at what is said live
 _NAMED = re.compile(
-    r"two anchors are exchanged, \d+ and \d+|anchor \d+(?=: | is not where| is not at| does not stand| "
-    r"is later)|the ids of two"
+    r"two anchors are exchanged, \d+ and \d+|anchor \d+(?:(?:, \d+)* or \d+)?(?=: | is not where| "
+    r"is not at| does not stand| is later)|the ids of two"
 )
 
 
@@ -81,16 +81,20 @@ def run(args):
         ),
         end="",
     )
-    print("| the right one alone: check | localize | live |")
-    print("|---|---|" + 8 * "---:|")
+    print("| the right one alone: check | localize | live | of these in a pair: check | live |")
+    print("|---|---|" + 10 * "---:|")
     for kind, calibrated in dict.fromkeys((row["kind"], row["calibrated"]) for row in rows):
         some = [row for row in rows if (row["kind"], row["calibrated"]) == (kind, calibrated)]
         none = kind not in KINDS[:-1]
         asked = some if none else [row for row in some if row["cost"] > MATTERS]
         named = [sum(bool(row[how]) for row in asked) for how in ("check", "localize", "live")]
         right = [
-            "" if none else sum(row[how] == row["ids"] for row in asked)
+            "" if none else sum(_right(row[how], row["ids"]) for row in asked)
             for how in ("check", "localize", "live")
+        ]
+        pairs = [
+            "" if none else sum(_right(row[how], row["ids"], 2) for row in asked)
+            for how in ("check", "live")
         ]
         cells = [
             kind,
@@ -99,6 +103,7 @@ def run(args):
             "" if none else len(asked),
             *named,
             *right,
+            *pairs,
         ]
         print(f"| {' | '.join(map(str, cells))} |")
     print(
@@ -237,12 +242,14 @@ def _flown(seed, path, room, anchors=None, bias=True):
 
 
 def said(flight, estimator):
-    """{"check", "localize", "live": ids of the anchors that are named, and "verdict" of localize}."""
+    """{"check", "localize", "live": groups of the anchors that are named, see `_groups`, and
+    "verdict" of localize}.
+    """
     flight = replace(flight, truth=None)
     assessment = assess(
         flight, estimator(flight), estimator
     )  # its reasons are the findings of `check`
-    named = _ids(
+    named = _groups(
         [
             sentence.removeprefix("check: ")
             for sentence in assessment.reasons
@@ -253,7 +260,7 @@ def said(flight, estimator):
     return {
         "check": named,
         "localize": localized,
-        "live": _ids(live(flight, estimator)),
+        "live": _groups(live(flight, estimator)),
         "verdict": assessment.level,
     }
 
@@ -299,15 +306,36 @@ def _about(sentence):
     return found.group() if found else ""
 
 
+def _groups(sentences):
+    """Return the anchors that sentences name, in order: [ids, one of which has changed]."""
+    groups = set()
+    for sentence in sentences:
+        said = sentence.partition(" (")[0]
+        both = "exchanged" in said or "swapped" in said
+        named = said if both else _about(said) or said  # it may be the beginning alone
+        numbers = map(int, re.findall(r"\d+", named))
+        groups |= {(number,) for number in numbers} if both else {tuple(sorted(numbers))}
+    return [list(group) for group in sorted(groups)]
+
+
 def _ids(sentences):
     """Ids that sentences name, in order."""
-    ids = set()
-    for sentence in sentences:
-        numbers = re.findall(r"\d+", sentence.partition(" (")[0])
-        ids |= set(
-            map(int, numbers if "exchanged" in sentence or "swapped" in sentence else numbers[:1])
-        )
-    return sorted(ids)
+    return sorted({number for group in _groups(sentences) for number in group})
+
+
+def _right(groups, ids, size=None):
+    """Whether groups of at most two anchors name what has changed, and nothing else.
+
+    size : of the largest group; None for any.
+    """
+    largest = max(map(len, groups), default=0)
+    hit = [[number for number in group if number in ids] for group in groups]
+    right = largest <= 2 and len(groups) == len(ids) and all(hit)
+    return (
+        right
+        and {number for some in hit for number in some} == set(ids)
+        and size in (None, largest)
+    )
 
 
 def _rmse(flight, estimator, since):
