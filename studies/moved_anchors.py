@@ -57,6 +57,9 @@ def add_options(add):
         metavar="SEED",
         help="of the first draw (default 1000; limits were set on draws below 100)",
     )
+    words = "judge without a calibration, and survey nothing: in a tenth of the time"
+    add("--tape", action="store_true", help=words)
+    add("--only", nargs="+", choices=KINDS, default=KINDS, metavar="KIND", help="(default: all)")
     add("--json", metavar="FILE", type=OutputFile, help="write what was said of each")
     add("--jobs", type=whole_number, default=1, metavar="N", help="recordings at once (default 1)")
 
@@ -64,11 +67,12 @@ def add_options(add):
 def run(args):
     """Print two tables, of what is named, and of where moved anchors are found."""
     seeds = range(args.first, args.first + args.draws)
-    cases = [(kind, seed) for kind in KINDS[:-1] for seed in seeds]
-    cases += [(KINDS[-1], seed) for seed in range(args.first, args.first + 2 * args.draws)]
-    rows = [
-        row for told in parallel.over(judge, cases, args.jobs, unit="recording") for row in told
+    twice = range(args.first, args.first + 2 * args.draws)
+    cases = [
+        (kind, seed) for kind in args.only for seed in (seeds if kind in KINDS[:-1] else twice)
     ]
+    ask = without_calibration if args.tape else judge
+    rows = [row for told in parallel.over(ask, cases, args.jobs, unit="recording") for row in told]
     reading = options.reading_of(args)
     found = reading.find(args.flights) if args.flights else []
     rows += parallel.over(partial(measured, reading), found, args.jobs, unit="flight")
@@ -106,6 +110,8 @@ def run(args):
             *pairs,
         ]
         print(f"| {' | '.join(map(str, cells))} |")
+    if args.tape:
+        return
     print(
         "\n| surveyed from | moved anchors | named | within 8 cm | stated within 8 cm, and so | "
         "off by, median [m] | another by more than its deviation |"
@@ -137,18 +143,10 @@ def judge(case):
     for calibrated in (True, False):
         anchors = last.anchors if calibrated else week.anchors
         estimator = FlightEstimator(None, last.effects if calibrated else None)
-        flight, other = (replace(one, anchors=anchors) for one in (changed, sound))
-        cost = _rmse(flight, estimator, since) - _rmse(other, estimator, since)
-        rows.append(
-            {
-                "kind": kind,
-                "seed": seed,
-                "calibrated": calibrated,
-                "ids": ids,
-                "cost": cost,
-                **said(flight, estimator),
-            }
-        )
+        other = replace(sound, anchors=anchors)
+        flight = other if changed is sound else replace(changed, anchors=anchors)
+        row = {"kind": kind, "seed": seed, "calibrated": calibrated, "ids": ids}
+        rows.append(row | _judged(flight, other, estimator, since))
         if kind == "moved before":
             base = last.effects if calibrated else EffectSet()
             source = "the last calibration" if calibrated else "a tape"
@@ -160,6 +158,22 @@ def judge(case):
                     _surveyed("a tape, no errors of antennas", exact, moved)
                 )
     return rows
+
+
+def without_calibration(case):
+    """[{figures}] of a recording (kind, seed), with a tape alone."""
+    kind, seed = case
+    _, sound, changed, ids, _, since = recorded(kind, seed)
+    row = {"kind": kind, "seed": seed, "calibrated": False, "ids": ids}
+    return [row | _judged(changed, sound, FlightEstimator(), since)]
+
+
+def _judged(flight, sound, estimator, since):
+    """{"cost": m, and what is `said`} of a Flight, beside the one without a change."""
+    cost = 0.0
+    if flight is not sound:
+        cost = _rmse(flight, estimator, since) - _rmse(sound, estimator, since)
+    return {"cost": cost, **said(flight, estimator)}
 
 
 def _surveyed(source, flight, moved, base=EffectSet()):

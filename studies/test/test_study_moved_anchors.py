@@ -20,7 +20,8 @@ def judged(case):
 
 def test_what_is_named_and_what_is_placed_is_counted(monkeypatch, capsys):
     monkeypatch.setattr(moved_anchors, "judge", judged)
-    asked = SimpleNamespace(flights=[], draws=1, first=1, jobs=1, json=None)
+    given = {"flights": [], "draws": 1, "first": 1, "jobs": 1, "json": None}
+    asked = SimpleNamespace(**given, only=moved_anchors.KINDS, tape=False)
     monkeypatch.setattr(moved_anchors.options, "reading_of", lambda args: None)
     moved_anchors.run(asked)
     lines = capsys.readouterr().out.splitlines()
