@@ -39,8 +39,8 @@ TAPE = 0.05  # m
 NEAR = 0.08  # m, 3D, within which a moved anchor shall be found
 STEP = 0.5  # s between two looks at what is said live
 _NAMED = re.compile(
-    r"two anchors are exchanged, \d+ and \d+|anchor \d+(?=: | is not where| is not at| does not stand| "
-    r"is later)|the ids of two"
+    r"two anchors are exchanged, \d+ and \d+|anchor \d+(?:(?:, \d+)* or \d+)?(?=: | is not where| "
+    r"is not at| does not stand| is later)|the ids of two"
 )
 
 
@@ -57,6 +57,9 @@ def add_options(add):
         metavar="SEED",
         help="of the first draw (default 1000; limits were set on draws below 100)",
     )
+    words = "judge without a calibration, and survey nothing: in a tenth of the time"
+    add("--tape", action="store_true", help=words)
+    add("--only", nargs="+", choices=KINDS, default=KINDS, metavar="KIND", help="(default: all)")
     add("--json", metavar="FILE", type=OutputFile, help="write what was said of each")
     add("--jobs", type=whole_number, default=1, metavar="N", help="recordings at once (default 1)")
 
@@ -64,11 +67,12 @@ def add_options(add):
 def run(args):
     """Print two tables, of what is named, and of where moved anchors are found."""
     seeds = range(args.first, args.first + args.draws)
-    cases = [(kind, seed) for kind in KINDS[:-1] for seed in seeds]
-    cases += [(KINDS[-1], seed) for seed in range(args.first, args.first + 2 * args.draws)]
-    rows = [
-        row for told in parallel.over(judge, cases, args.jobs, unit="recording") for row in told
+    twice = range(args.first, args.first + 2 * args.draws)
+    cases = [
+        (kind, seed) for kind in args.only for seed in (seeds if kind in KINDS[:-1] else twice)
     ]
+    ask = without_calibration if args.tape else judge
+    rows = [row for told in parallel.over(ask, cases, args.jobs, unit="recording") for row in told]
     reading = options.reading_of(args)
     found = reading.find(args.flights) if args.flights else []
     rows += parallel.over(partial(measured, reading), found, args.jobs, unit="flight")
@@ -81,16 +85,20 @@ def run(args):
         ),
         end="",
     )
-    print("| the right one alone: check | localize | live |")
-    print("|---|---|" + 8 * "---:|")
+    print("| the right one alone: check | localize | live | of these in a pair: check | live |")
+    print("|---|---|" + 10 * "---:|")
     for kind, calibrated in dict.fromkeys((row["kind"], row["calibrated"]) for row in rows):
         some = [row for row in rows if (row["kind"], row["calibrated"]) == (kind, calibrated)]
         none = kind not in KINDS[:-1]
         asked = some if none else [row for row in some if row["cost"] > MATTERS]
         named = [sum(bool(row[how]) for row in asked) for how in ("check", "localize", "live")]
         right = [
-            "" if none else sum(row[how] == row["ids"] for row in asked)
+            "" if none else sum(_right(row[how], row["ids"]) for row in asked)
             for how in ("check", "localize", "live")
+        ]
+        pairs = [
+            "" if none else sum(_right(row[how], row["ids"], 2) for row in asked)
+            for how in ("check", "live")
         ]
         cells = [
             kind,
@@ -99,8 +107,11 @@ def run(args):
             "" if none else len(asked),
             *named,
             *right,
+            *pairs,
         ]
         print(f"| {' | '.join(map(str, cells))} |")
+    if args.tape:
+        return
     print(
         "\n| surveyed from | moved anchors | named | within 8 cm | stated within 8 cm, and so | "
         "off by, median [m] | another by more than its deviation |"
@@ -132,18 +143,10 @@ def judge(case):
     for calibrated in (True, False):
         anchors = last.anchors if calibrated else week.anchors
         estimator = FlightEstimator(None, last.effects if calibrated else None)
-        flight, other = (replace(one, anchors=anchors) for one in (changed, sound))
-        cost = _rmse(flight, estimator, since) - _rmse(other, estimator, since)
-        rows.append(
-            {
-                "kind": kind,
-                "seed": seed,
-                "calibrated": calibrated,
-                "ids": ids,
-                "cost": cost,
-                **said(flight, estimator),
-            }
-        )
+        other = replace(sound, anchors=anchors)
+        flight = other if changed is sound else replace(changed, anchors=anchors)
+        row = {"kind": kind, "seed": seed, "calibrated": calibrated, "ids": ids}
+        rows.append(row | _judged(flight, other, estimator, since))
         if kind == "moved before":
             base = last.effects if calibrated else EffectSet()
             source = "the last calibration" if calibrated else "a tape"
@@ -155,6 +158,22 @@ def judge(case):
                     _surveyed("a tape, no errors of antennas", exact, moved)
                 )
     return rows
+
+
+def without_calibration(case):
+    """[{figures}] of a recording (kind, seed), with a tape alone."""
+    kind, seed = case
+    _, sound, changed, ids, _, since = recorded(kind, seed)
+    row = {"kind": kind, "seed": seed, "calibrated": False, "ids": ids}
+    return [row | _judged(changed, sound, FlightEstimator(), since)]
+
+
+def _judged(flight, sound, estimator, since):
+    """{"cost": m, and what is `said`} of a Flight, beside the one without a change."""
+    cost = 0.0
+    if flight is not sound:
+        cost = _rmse(flight, estimator, since) - _rmse(sound, estimator, since)
+    return {"cost": cost, **said(flight, estimator)}
 
 
 def _surveyed(source, flight, moved, base=EffectSet()):
@@ -237,12 +256,14 @@ def _flown(seed, path, room, anchors=None, bias=True):
 
 
 def said(flight, estimator):
-    """{"check", "localize", "live": ids of the anchors that are named, and "verdict" of localize}."""
+    """{"check", "localize", "live": groups of the anchors that are named, see `_groups`, and
+    "verdict" of localize}.
+    """
     flight = replace(flight, truth=None)
     assessment = assess(
         flight, estimator(flight), estimator
     )  # its reasons are the findings of `check`
-    named = _ids(
+    named = _groups(
         [
             sentence.removeprefix("check: ")
             for sentence in assessment.reasons
@@ -253,7 +274,7 @@ def said(flight, estimator):
     return {
         "check": named,
         "localize": localized,
-        "live": _ids(live(flight, estimator)),
+        "live": _groups(live(flight, estimator)),
         "verdict": assessment.level,
     }
 
@@ -299,15 +320,36 @@ def _about(sentence):
     return found.group() if found else ""
 
 
+def _groups(sentences):
+    """Return the anchors that sentences name, in order: [ids, one of which has changed]."""
+    groups = set()
+    for sentence in sentences:
+        said = sentence.partition(" (")[0]
+        both = "exchanged" in said or "swapped" in said
+        named = said if both else _about(said) or said  # it may be the beginning alone
+        numbers = map(int, re.findall(r"\d+", named))
+        groups |= {(number,) for number in numbers} if both else {tuple(sorted(numbers))}
+    return [list(group) for group in sorted(groups)]
+
+
 def _ids(sentences):
     """Ids that sentences name, in order."""
-    ids = set()
-    for sentence in sentences:
-        numbers = re.findall(r"\d+", sentence.partition(" (")[0])
-        ids |= set(
-            map(int, numbers if "exchanged" in sentence or "swapped" in sentence else numbers[:1])
-        )
-    return sorted(ids)
+    return sorted({number for group in _groups(sentences) for number in group})
+
+
+def _right(groups, ids, size=None):
+    """Whether groups of at most two anchors name what has changed, and nothing else.
+
+    size : of the largest group; None for any.
+    """
+    largest = max(map(len, groups), default=0)
+    hit = [[number for number in group if number in ids] for group in groups]
+    right = largest <= 2 and len(groups) == len(ids) and all(hit)
+    return (
+        right
+        and {number for some in hit for number in some} == set(ids)
+        and size in (None, largest)
+    )
 
 
 def _rmse(flight, estimator, since):

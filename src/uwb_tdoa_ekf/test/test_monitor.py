@@ -1,5 +1,7 @@
 """The monitor of anchors and IMU biases in flight."""
 
+from dataclasses import replace
+
 from monitor_cost import cost, row_of
 import numpy as np
 import pytest
@@ -7,10 +9,11 @@ import pytest
 from uwb_tdoa_bias.effects import Covariance
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_ekf.core.verdicts import INVALID, REJECTED, USED
-from uwb_tdoa_ekf.evidence import keys_of
+from uwb_tdoa_ekf.evidence import POSITION, Part, changes_of, keys_of, most_likely_changes
 from uwb_tdoa_ekf.monitoring.change import CAPACITY, ChangeDetector
-from uwb_tdoa_ekf.monitoring.monitor import LIMIT, Monitor
+from uwb_tdoa_ekf.monitoring.monitor import LIMIT, Monitor, _surest
 from uwb_tdoa_ekf.monitoring.recorded import watched
+from uwb_tdoa_ekf.monitoring.reference import Displaced
 from uwb_tdoa_ekf.monitoring.slices import LENGTH, MOST, reduced
 from uwb_tdoa_ekf.results import Odometry, Residuals, concatenated
 
@@ -342,6 +345,70 @@ def test_an_anchor_that_is_late_for_the_last_calibration_is_named_and_what_the_c
         and known[0].startswith("anchor 9 ")
         and "--effects effects.yaml" in known[0]
     )
+
+
+def test_anchors_that_the_data_do_not_separate_are_named_together():
+    """One of them was named, and at times the wrong one."""
+    n, towards = 3, np.zeros((3, 12))
+    for k, row in enumerate((0, 1)):  # shifts of 0 and 1 along x look alike; of 2, nothing is heard
+        towards[:, 3 * row] = 1.0 + 1e-3 * k
+    part = Part(1e4 * towards.T @ towards, 1e4 * towards.T @ np.full(3, 0.5), 0.0, 0.1)
+    covariance = np.diag(np.full(4 * n, 0.02**2))
+    possible = {key: one for key, one in changes_of(n).items() if key[0] == POSITION}
+    found = most_likely_changes([part], covariance, np.zeros(4 * n), possible).found
+    ((best, (_, rivals)),) = found.items()
+    assert {best, *rivals} == {(POSITION, 0), (POSITION, 1)}
+
+
+def test_anchors_that_have_both_changed_are_no_doubt_about_each_other():
+    n, gram = 2, np.zeros((8, 8))
+    gram[[0, 3], [0, 3]] = 1e4
+    vector = np.zeros(8)
+    vector[[0, 3]] = 1e4 * 0.5
+    possible = {key: one for key, one in changes_of(n).items() if key[0] == POSITION}
+    covariance = np.diag(np.full(8, 0.02**2))
+    found = most_likely_changes(
+        [Part(gram, vector, 0.0, 0.1)], covariance, np.zeros(8), possible
+    ).found
+    assert set(found) == set(possible) and not any(rivals for _, rivals in found.values())
+
+
+def test_the_sentence_on_a_moved_anchor_names_those_that_are_as_probable():
+    monitor = Monitor(ANCHORS)
+    sure = Displaced(1, np.array([0.4, 0.0, 0.0]), np.full(3, 0.05), 0.0, 12.0, False)
+    doubtful = replace(sure, others=(3, 4))
+    said = [monitor._displacement(one) for one in (sure, doubtful)]
+    assert said[0].cause == (
+        "anchor 5 does not stand where the survey has it, but about (+0.40, +0.00, +0.00) m from there"
+    )
+    assert said[1].cause.startswith(
+        "anchor 5, 9 or 11 does not stand where the survey has it, but if it is anchor 5, about"
+    )
+    assert "do not separate" in said[1].evidence and said[1].remedy.endswith("measure them again")
+
+
+def test_a_comparison_that_is_sure_settles_the_doubt_of_another():
+    sure = Displaced(1, np.array([0.4, 0.0, 0.0]), np.full(3, 0.05), 0.0, 12.0, False)
+    other = replace(sure, row=4, others=(1,))
+    assert _surest([other, sure]) == {1: sure}
+    assert _surest([other]) == {4: other}
+    assert _surest([replace(sure, others=(4,)), other]) == {1: replace(sure, others=(4,))}
+
+
+def test_history_says_when_each_finding_stood():
+    said = watch(lambda t, p: only(0, 0.5 * (25.0 < t < 35.0)))
+    (event,) = watch.history
+    assert (
+        said[32][1]
+        and event.finding.rule == "anchor_changed"
+        and 25.0 < event.since < 33.0
+        and 34.0 < event.until < 42.0
+    )
+
+
+def test_who_is_moved_in_flight_is_not_said_to_have_been_elsewhere_before():
+    said = watch(lambda t, p: only(2, 0.5 * (t > 30.0)))
+    assert not any("does not stand" in alarm for _, alarms in said for alarm in alarms)
 
 
 def test_a_gap_of_any_length_is_passed_at_once():

@@ -41,9 +41,10 @@ class Part(NamedTuple):
 
 
 class Changes(NamedTuple):
-    """found : {key: (logarithm of the odds of that change, keys of others of its anchor that the
-    data cannot tell from it)}; covariance (n, n) m^2 : of the prior with them; number : of the Part
-    with the largest evidence.
+    """found : {key: (logarithm of the odds of that change, keys of other changes that the data
+    cannot tell from it, of its anchor or of others that are not found themselves, the most probable
+    first)}; covariance (n, n) m^2 : of the prior with them; number : of the Part with the largest
+    evidence.
     """
 
     found: dict[ChangeKey, tuple[float, list[ChangeKey]]]
@@ -180,14 +181,21 @@ def most_likely_changes(
         if trials[key] < evidence + np.log(odds):
             break
         doubt = trials[key] - np.log(odds)
-        rivals = [
-            other
-            for other in trials
-            if other[1] == key[1] and other != key and trials[other] > doubt
-        ]
-        found[key] = trials[key] - evidence, rivals
+        rivals = [other for other in trials if other != key and trials[other] > doubt]
+        found[key] = trials[key] - evidence, sorted(rivals, key=trials.__getitem__, reverse=True)
         covariance = unchanged.copy()
         for places, std in (possible[one] for one in found):
             covariance[places, places] += std**2
         evidence, number = most_probable(parts, covariance, offset)
-    return Changes(found, covariance, number)
+    return Changes(_without_named(found), covariance, number)
+
+
+def _without_named(
+    found: Mapping[ChangeKey, tuple[float, list[ChangeKey]]],
+) -> dict[ChangeKey, tuple[float, list[ChangeKey]]]:
+    """Return Changes.found without rivals of other anchors that are found themselves."""
+    rows = {row for _, row in found}
+    return {
+        key: (odds, [one for one in rivals if one[1] == key[1] or one[1] not in rows])
+        for key, (odds, rivals) in found.items()
+    }

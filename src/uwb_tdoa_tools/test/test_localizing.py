@@ -75,9 +75,13 @@ def test_ground_truth_is_not_read_and_the_trajectory_is_that_of_evaluate_to_the_
     assert judged.read_bytes() == (tmp_path / "true" / "flight.tum").read_bytes()
 
 
-def test_evaluate_and_localize_state_the_same_nis(bags, tmp_path, capsys):
-    """They said 5.26 and 0.93 of one flight."""
+@pytest.mark.parametrize("ranges", [False, True])
+def test_evaluate_and_localize_state_the_same_nis(bags, ranges, tmp_path, capsys):
+    """They said 5.26 and 0.93 of one flight; then `evaluate` left out ranges."""
     recording = bags / "true" / "flight.bag"
+    if ranges:
+        recording = tmp_path / "ranged.bag"
+        write_bag(simulate(SimulationConfig(seed=1, range_noise=0.1, **CLEAN)), recording)
     run([recording, "--out", tmp_path, "--json", tmp_path / "localized.json"])
     assert evaluate.main([str(recording), "--json", str(tmp_path / "judged.json")]) == 0
     localized, judged = (

@@ -13,7 +13,9 @@ from uwb_tdoa_bias.effects.effect_set import Covariance
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_ekf.evidence import keys_of
 from uwb_tdoa_ekf.results import concatenated, rows_of
+from uwb_tdoa_ekf.streams import ERROR, WARNING, Finding
 from uwb_tdoa_tools.bags.bag import write_bag
+from uwb_tdoa_tools.checking import watch
 from uwb_tdoa_tools.checking.check import check
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.commands import calibrate, diagnose, evaluate, survey
@@ -126,6 +128,20 @@ def test_an_anchor_that_was_moved_before_the_start_is_named_with_the_command_tha
         and "anchor 3 does not stand where the survey has it" in one.cause
     )
     assert one.remedy.startswith("survey flight.bag --effects effects.yaml")
+
+
+def test_what_check_says_of_an_anchor_holds_the_doubt_of_the_monitor():
+    """The monitor could not separate two anchors, and `check` named one of them alone."""
+    one = Finding(
+        "anchor_moved", ERROR, "anchor 5 is not where the survey has it", "explains", "", 0.0
+    )
+    cause = "anchor 3 or 5 does not stand where the survey has it, but if it is anchor 3, about"
+    remedy = "survey RECORDING --survey anchors.yaml  # or measure them again"
+    other = Finding("anchor_displaced", WARNING, cause, "standard deviations", remedy, 0.4)
+    assert watch._named(one) == ["5"] and watch._named(other) == ["3", "5"]
+    seen = watch._as_seen_by(one, other, "survey flight.bag")
+    assert seen.cause == cause and seen.severity == ERROR
+    assert seen.remedy == "survey flight.bag  # or measure them again"
 
 
 def test_localize_doubts_a_flight_with_a_moved_anchor_and_says_why(sound, moved, calibrated):

@@ -23,10 +23,10 @@ from .localizing.localize import write_tum
 from .localizing.pictures import write_rerun
 from .readers.inputs import Reading, report_remarks
 from .readers.tables import number, read_table
-from .results_file import ResultsFile
+from .results_file import ResultsFile, fingerprint_of
 from .scoring.alignment import ALIGN, NONE, estimate_alignment, require_truth
 from .scoring.evaluation import corrected_truth
-from .scoring.metrics import Score
+from .scoring.metrics import Score, radio_residuals
 from .scoring.phases import NEAR_THE_FLOOR, TITLES
 from .scoring.pooling import Pool, Result
 
@@ -110,7 +110,7 @@ class Evaluator:
             report_remarks(self.odometry, recorded.remarks)
         else:
             run = self.estimator(flight)
-            odometry, residuals = run.odometry, run.residuals
+            odometry, residuals = run.odometry, radio_residuals(flight, run)
             flight = replace(flight, truth=corrected_truth(flight, self.estimator.effects))
         assert flight.truth is not None  # require_truth
         found = estimate_alignment(flight, odometry)

@@ -28,6 +28,8 @@ from .swap import clear_exchange, mean_of
 from .swap import residuals as residuals_of
 
 if TYPE_CHECKING:
+    from collections.abc import Iterable
+
     from uwb_tdoa_bias.effects.effect_set import Covariance
     from uwb_tdoa_bias.foundation.anchors import Anchors
 
@@ -178,7 +180,9 @@ class Monitor:
         self._heard = {row: was for row, was in self._heard.items() if row not in rows}
         self._changes = {row: found for row, found in self._changes.items() if row not in rows}
         self._silent = tuple(row for row in self._silent if row not in rows)
-        self._displaced = {row: one for row, one in self._displaced.items() if row not in rows}
+        self._displaced = {
+            row: one.without(rows) for row, one in self._displaced.items() if row not in rows
+        }
         for comparison in self._comparisons:
             comparison.forget(rows)
         if self._latest_change is not None and self._latest_change.row in rows:
@@ -323,12 +327,12 @@ class Monitor:
         if self._compared % LOOK:
             return
         displaced = [
-            one
-            for comparison in reversed(self._comparisons[:2])
+            one.without(self._ever_changed)
+            for comparison in self._comparisons[:2]
             for one in comparison.find()
-            if _matters(one)
+            if _matters(one) and one.row not in self._ever_changed
         ]
-        found = {one.row: one for one in displaced if one.row not in self._ever_changed}
+        found = _surest(displaced)
         self._suspected = {row: self._suspected.get(row, 0) + 1 for row in found}
         self._displaced = {row: one for row, one in found.items() if self._suspected[row] >= NAMED}
 
@@ -514,25 +518,26 @@ class Monitor:
 
     def _displacement(self, one: Displaced) -> Finding:
         number = self._anchors.ids[one.row]
+        *some, last = self._anchors.ids[[one.row, *one.others]].tolist()
+        named = f"{', '.join(map(str, some))} or {last}" if some else str(last)
         off = float(np.linalg.norm(one.shift))
         by, std = (
             ", ".join(f"{value:{form}}" for value in values)
             for values, form in ((one.shift, "+.2f"), (one.std, ".2f"))
         )
-        what = (
-            f"anchor {number} does not stand where the survey has it, but about ({by}) m from there"
-        )
+        which = f" if it is anchor {number}," if some else ""
+        what = f"anchor {named} does not stand where the survey has it, but{which} about ({by}) m from there"
         if one.later and off < SMALLEST_CHANGE:
-            what = f"anchor {number} is later than it was calibrated, by {one.later:+.2f} m"
+            what = f"anchor {named} is later than it was calibrated,{which} by {one.later:+.2f} m"
         evidence = (
             f"standard deviations {std} m; {one.odds / math.log(10.0):.0f} powers of ten more "
             "probable than that it is not"
         )
         evidence += "; or it is later than it was calibrated" * one.either
+        evidence += "; the TDOAs do not separate these anchors" * bool(some)
         effects = " --effects effects.yaml" if self._calibrated is not None else ""
-        remedy = (
-            f"{SURVEYING} --survey anchors.yaml{effects} --out surveyed/  # or measure it again"
-        )
+        again = f"measure {'them' if some else 'it'} again"
+        remedy = f"{SURVEYING} --survey anchors.yaml{effects} --out surveyed/  # or {again}"
         return Finding("anchor_displaced", WARNING, what, evidence, remedy, off)
 
     def _axis_alarms(self) -> list:
@@ -548,6 +553,15 @@ class Monitor:
                         "the flight"
                     )
         return out
+
+
+def _surest(displaced: Iterable[Displaced]) -> dict[int, Displaced]:
+    """Return {row: Displaced} of several comparisons, without the doubts that another settles."""
+    found: dict[int, Displaced] = {}
+    for one in sorted(displaced, key=lambda one: len(one.others)):
+        if found.keys().isdisjoint((one.row, *one.others)):
+            found[one.row] = one
+    return found
 
 
 def _matters(one: Displaced) -> bool:

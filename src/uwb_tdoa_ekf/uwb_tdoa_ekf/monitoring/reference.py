@@ -10,7 +10,7 @@ ODDS times as probable, then the next (`..evidence`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.effects.effect_set import Covariance
     from uwb_tdoa_bias.foundation.anchors import Anchors
 
+    from ..evidence import ChangeKey
     from ..installed import Installed
     from .slices import Slice
 
@@ -67,7 +68,8 @@ MORE = TDOA_VARIANCE / TDOA_STD**2
 class Displaced:
     """row : of an anchor; shift, std : (3,) m, by how much it stands elsewhere than surveyed; later
     : m, by how much it is later than calibrated; odds : logarithm of those of the change; either :
-    whether its being later explains as much as its standing elsewhere.
+    whether its being later explains as much as its standing elsewhere; others : rows of anchors
+    whose change explains about as much, the most probable first.
     """
 
     row: int
@@ -76,6 +78,11 @@ class Displaced:
     later: float
     odds: float
     either: bool
+    others: tuple[int, ...] = ()
+
+    def without(self, rows: set[int]) -> Displaced:
+        """Return this one without some rows among the others."""
+        return replace(self, others=tuple(row for row in self.others if row not in rows))
 
 
 class _Cell:
@@ -163,10 +170,11 @@ class SurveyComparison:
         changes = most_likely_changes(parts, covariance, np.zeros(4 * n), possible, ODDS)
         if not changes.found:
             return []
-        named = {
-            (POSITION if (POSITION, k) in rivals else what, k): (odds, bool(rivals))
-            for (what, k), (odds, rivals) in changes.found.items()
-        }
+        named: dict[ChangeKey, tuple[float, bool, tuple[int, ...]]] = {}
+        for (what, k), (odds, rivals) in changes.found.items():
+            either = any(row == k for _, row in rivals)
+            others = dict.fromkeys(int(rows[row]) for _, row in rivals if row != k)
+            named[POSITION if (POSITION, k) in rivals else what, k] = odds, either, tuple(others)
         for some, size in (
             possible[key] for key in named
         ):  # who cannot be told from a late anchor has rather been moved
@@ -175,11 +183,11 @@ class SurveyComparison:
         inverse = np.linalg.inv(part.gram + prior)
         step, std = inverse @ part.vector, np.sqrt(np.diag(inverse))
         out: dict[int, Displaced] = {}
-        for (what, k), (odds, either) in named.items():
+        for (what, k), (odds, either, others) in named.items():
             places = slice(3 * k, 3 * k + 3)
             later = float(step[3 * n + k]) if what == DELAY else 0.0
             out.setdefault(
-                k, Displaced(int(rows[k]), step[places], std[places], later, odds, either)
+                k, Displaced(int(rows[k]), step[places], std[places], later, odds, either, others)
             )
         return list(out.values())
 

@@ -107,14 +107,13 @@ def together(
     if rules & FIRST:
         return list(found)
     displaced = {
-        event.finding.cause.split()[1]: event.finding
+        anchor: event.finding
         for event in events
         if event.finding.rule == DISPLACED
+        for anchor in _named(event.finding)
     }
     found = [
-        _as_seen_by(one, displaced.get(one.cause.split()[1]), line)
-        if one.rule == "anchor_moved"
-        else one
+        _as_seen_by(one, displaced.get(_named(one)[0]), line) if one.rule == "anchor_moved" else one
         for one in found
     ]
     if rules & TAKEN_FOR:
@@ -122,6 +121,11 @@ def together(
             return list(found)
         found = [one for one in found if one.rule not in TAKEN_FOR]
     return [*found, *(_with_times(event, begin, end, line) for event in events)]
+
+
+def _named(one: Finding) -> list[str]:
+    """Return the anchors that a Finding names, the most probable first."""
+    return re.findall(r"\d+", one.cause.partition(" is ")[0].partition(" does ")[0])
 
 
 def _as_seen_by(one: Finding, other: Finding | None, line: str | None) -> Finding:
@@ -139,11 +143,9 @@ def _as_seen_by(one: Finding, other: Finding | None, line: str | None) -> Findin
 
 
 def _remedy(one: Finding, line: str | None) -> str:
-    return (
-        one.remedy
-        if line is None or not one.remedy.startswith(SURVEYING)
-        else f"{line}  # or measure it again"
-    )
+    if line is None or not one.remedy.startswith(SURVEYING):
+        return one.remedy
+    return f"{line}  # {one.remedy.partition('  # ')[2]}"
 
 
 def _explains(ordered: OrderedRecording, event: Event) -> bool:

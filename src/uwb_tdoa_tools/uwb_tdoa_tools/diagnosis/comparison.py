@@ -20,7 +20,7 @@ from uwb_tdoa_ekf.sensitivity import RANGES
 
 from ..clock import numbered
 from ..outputs import as_json
-from ..scoring.metrics import EVERYTHING, Score, pooled
+from ..scoring.metrics import EVERYTHING, Score, nis, pooled, radio_residuals
 from .regression.table import BLOCK
 
 if TYPE_CHECKING:
@@ -139,10 +139,9 @@ def innovations(
     for runs in _both_sides(cases, baseline, progress, map_function):
         rows = []
         for case, run in runs:
-            innovation, variance = _used(run)
             figures: dict[str, Any] = {
-                "nis_mean": float(np.mean(innovation**2 / variance)),
-                "residual_spread": _scale(innovation),
+                "nis_mean": float(nis(radio_residuals(case.flight, run)).mean()),
+                "residual_spread": _scale(_used(run)),
             }
             rows.append({"flight": case.flight.name, "rmse_3d": None, **figures})
         means = {
@@ -161,7 +160,7 @@ def score(case: ValidationCase, run: Run) -> Score:
         case.flight.name,
         run.odometry,
         truth,
-        run.residuals,
+        radio_residuals(case.flight, run),
         case.flight.tdoa.t,
         case.spans,
         case.reach,
@@ -234,18 +233,15 @@ def _scale(innovation: np.ndarray) -> float:
     return float(1.4826 * np.median(np.abs(innovation)))
 
 
-def _used(run: Run) -> tuple[np.ndarray, np.ndarray]:
-    """Innovations (n,) m of the TDOAs that a Run used, or, without any TDOAs, of its ranges, and
-    their variances (n,) m^2.
-    """
+def _used(run: Run) -> np.ndarray:
+    """Innovations (n,) m of the TDOAs that a Run used, or, without any TDOAs, of its ranges."""
     residuals, ranges = run.residuals, run.aids.get(RANGES)
     rows = (
         {name: getattr(residuals, name) for name in OF_ROW}
         if len(residuals) or ranges is None
         else ranges
     )
-    used = rows["verdict"] == USED
-    return rows["innovation"][used], rows["variance"][used]
+    return np.asarray(rows["innovation"][rows["verdict"] == USED])
 
 
 def _blocks(judged: Score) -> np.ndarray:

@@ -15,7 +15,7 @@ from uwb_tdoa_ekf.evidence import OF_ANCHORS
 from uwb_tdoa_ekf.offline import may_have_offset
 
 from ..checking.flight_rules import judge_flight
-from ..scoring.metrics import Score
+from ..scoring.metrics import Score, radio_residuals
 from . import comparison, repairing, validation
 from .attribution import Attribution, attribute, residuals_of
 from .findings import EffectFinding, Refused, usable
@@ -103,7 +103,7 @@ def diagnose(
     outcome.baseline.prepare(fitted, judging, map_function)
     runs = [outcome.baseline.run(flight) for flight in fitted]
     scores = [
-        Score(flight.name, run.odometry, flight.truth, run.residuals)
+        Score(flight.name, run.odometry, flight.truth, radio_residuals(flight, run))
         for flight, run in zip(fitted, runs)
         if reference.tells_errors and flight.truth is not None
     ]
@@ -116,7 +116,7 @@ def diagnose(
         unobservable(found.selection, found.candidates),
         *outcome.sides,
         outcome.judged_on,
-        health(found.residuals, runs, scores),
+        health(found.residuals, scores),
         outcome.attribution,
         remaining,
         {

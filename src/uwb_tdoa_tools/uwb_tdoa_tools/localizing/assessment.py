@@ -19,7 +19,7 @@ from ..checking.check import check
 from ..checking.recording import of_flight
 from ..checking.watch import OF_ANCHORS
 from ..estimate import FlightEstimator
-from ..scoring.metrics import LOST, has_innovation, nis
+from ..scoring.metrics import LOST, has_innovation, nis, radio_residuals
 from . import residuals
 
 if TYPE_CHECKING:
@@ -97,7 +97,7 @@ def assess(
 
     `line` is the command that `check` suggests, see there.
     """
-    odometry, left = run.odometry, residuals.residuals_of(flight, run)
+    odometry, left = run.odometry, radio_residuals(flight, run)
     there = has_innovation(left)
     figures = {
         "seconds": _length(left),

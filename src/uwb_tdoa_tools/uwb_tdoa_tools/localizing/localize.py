@@ -17,6 +17,7 @@ from .. import command_lines
 from ..bags.bag import write_odometry
 from ..estimate import FlightEstimator
 from ..readers.inputs import Reading
+from ..scoring.metrics import radio_residuals
 from . import pictures, residuals
 from .assessment import GOOD, Assessment, assess
 
@@ -139,7 +140,7 @@ class Localizer:
             written.append(self.folder / f"{name}{end}")
             return written[-1]
 
-        odometry, left = run.odometry, residuals.residuals_of(flight, run)
+        odometry, left = run.odometry, radio_residuals(flight, run)
         write_tum(path(".tum"), odometry.t, odometry.p, odometry.q)
         write_trajectory(path(".csv"), odometry)
         title = f"{name}: {assessment.sentences()[0].partition(';')[0]}"

@@ -11,15 +11,13 @@ import numpy as np
 
 from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_bias.foundation.files import write_filled, write_text
-from uwb_tdoa_bias.foundation.sensors import LOCATING
 from uwb_tdoa_ekf.core.verdicts import USED
-from uwb_tdoa_ekf.results import VERDICTS, Odometry, Residuals, concatenated
+from uwb_tdoa_ekf.results import VERDICTS
 
 from ..scoring.metrics import has_innovation
 
 if TYPE_CHECKING:
-    from uwb_tdoa_bias.foundation.flight import Flight
-    from uwb_tdoa_ekf.offline import Run
+    from uwb_tdoa_ekf.results import Odometry, Residuals
 
 
 RESIDUAL_COLUMNS = "t", "a", "b", "residual", "std", "weight", "verdict"
@@ -64,18 +62,6 @@ class PairResiduals:
             "std": float(self.value.std()),
             "explained": float(self.explained.mean()),
         }
-
-
-def residuals_of(flight: Flight, run: Run) -> Residuals:
-    """Return the Residuals of the TDOAs and ranges of a Run; a range has a = b."""
-    parts = [run.residuals]
-    for name in LOCATING:
-        if name in run.aids:
-            stream = getattr(flight, name)
-            parts.append(
-                Residuals.from_rows(stream.t, stream.anchor, stream.anchor, run.aids[name])
-            )
-    return concatenated(parts)
 
 
 def explained(residuals: Residuals) -> np.ndarray:

@@ -22,7 +22,7 @@ from .alignment import (
     on_another_clock,
     require_truth,
 )
-from .metrics import Score
+from .metrics import Score, radio_residuals
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.correction.network import Network
@@ -65,7 +65,7 @@ def score_of(flight: Flight, estimator: FlightEstimator) -> tuple[Score, Run]:
         flight.name,
         run.odometry,
         corrected_truth(flight, estimator.effects),
-        run.residuals,
+        radio_residuals(flight, run),
         flight.tdoa.t,
     ), run
 

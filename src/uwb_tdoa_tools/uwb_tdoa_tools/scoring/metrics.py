@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from uwb_tdoa_bias.effects.samples import PoseColumns
+from uwb_tdoa_bias.foundation.sensors import LOCATING
 from uwb_tdoa_ekf.core.verdicts import COMPENSATED, REJECTED, USED
-from uwb_tdoa_ekf.results import rows_of
+from uwb_tdoa_ekf.results import Residuals, concatenated, rows_of
 
 from .phases import in_the_air, motion, phases
 from .pooling import Distribution, Pool, Result, coverage_figures
@@ -18,8 +19,8 @@ from .pooling import Distribution, Pool, Result, coverage_figures
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-    from uwb_tdoa_bias.foundation.flight import Truth
-    from uwb_tdoa_ekf.results import Residuals
+    from uwb_tdoa_bias.foundation.flight import Flight, Truth
+    from uwb_tdoa_ekf.offline import Run
 
     Spans = Sequence[tuple[float, float]]  # from when to when, s
 
@@ -141,10 +142,23 @@ def nees(error: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     return out
 
 
+def radio_residuals(flight: Flight, run: Run) -> Residuals:
+    """Return the Residuals of the TDOAs and ranges of a Run; a range has a = b."""
+    parts = [run.residuals]
+    for name in LOCATING:
+        if name in run.aids:
+            stream = getattr(flight, name)
+            parts.append(
+                Residuals.from_rows(stream.t, stream.anchor, stream.anchor, run.aids[name])
+            )
+    return concatenated(parts)
+
+
 def nis(residuals: Residuals) -> np.ndarray:
     """Return the normalised innovation squared of every measurement in the filter: (n,).
 
-    Outliers count in full. An honest filter gives 1 on average.
+    Outliers count in full. An honest filter gives 1 on average. All tools ask for it with
+    `radio_residuals`: of TDOAs and ranges.
     """
     there = has_innovation(residuals)
     return residuals.innovation[there] ** 2 / residuals.variance[there]

@@ -114,8 +114,8 @@ class Prior:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """step (4N,), covariance (4N, 4N); changed : {key of `Prior.changes`: keys of others of its
-    anchor that the flights cannot tell from it}; delay_std, function_std : m.
+    """step (4N,), covariance (4N, 4N); changed : {key of `Prior.changes`: keys of others that
+    the flights cannot tell from it}; delay_std, function_std : m.
     """
 
     evidence: float

@@ -73,9 +73,9 @@ class AnchorChange:
             text += ", or is later than it was" * bool(self.rivals)
             text += "".join(f", or anchor {other} has moved instead" for other in self.others)
             return text + self._doubt
-        return f"anchor {self.anchor} is later than it was by {by} cm" + ", or has moved" * bool(
-            self.rivals
-        )
+        text = f"anchor {self.anchor} is later than it was by {by} cm"
+        text += ", or has moved" * bool(self.rivals)
+        return text + "".join(f", or anchor {other} has changed instead" for other in self.others)
 
     @property
     def _doubt(self) -> str:
@@ -481,8 +481,11 @@ def _changes(prior: Prior, found: Solution, offset: np.ndarray) -> tuple[AnchorC
     std, out = np.sqrt(np.diag(found.covariance)), []
     for (effect, anchor), others in found.changed.items():
         places, _ = prior.changes()[effect, anchor]
-        rivals = tuple(other for other, _ in others)
-        out.append(AnchorChange(effect, prior.ids[anchor], offset[places], std[places], rivals))
+        rivals = tuple(other for other, row in others if row == anchor)
+        instead = tuple(dict.fromkeys(prior.ids[row] for _, row in others if row != anchor))
+        out.append(
+            AnchorChange(effect, prior.ids[anchor], offset[places], std[places], rivals, instead)
+        )
     return tuple(out)
 
 
