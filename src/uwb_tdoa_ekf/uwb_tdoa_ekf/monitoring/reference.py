@@ -173,8 +173,8 @@ class SurveyComparison:
         named: dict[ChangeKey, tuple[float, bool, tuple[int, ...]]] = {}
         for (what, k), (odds, rivals) in changes.found.items():
             either = any(row == k for _, row in rivals)
-            others = dict.fromkeys(int(rows[row]) for _, row in rivals if row != k)
-            named[POSITION if (POSITION, k) in rivals else what, k] = odds, either, tuple(others)
+            others = tuple(dict.fromkeys(int(rows[row]) for _, row in rivals if row != k))
+            named[POSITION if (POSITION, k) in rivals else what, k] = odds, either, others
         for some, size in (
             possible[key] for key in named
         ):  # who cannot be told from a late anchor has rather been moved
@@ -183,11 +183,12 @@ class SurveyComparison:
         inverse = np.linalg.inv(part.gram + prior)
         step, std = inverse @ part.vector, np.sqrt(np.diag(inverse))
         out: dict[int, Displaced] = {}
-        for (what, k), (odds, either, others) in named.items():
+        for (what, k), (odds, either, rival_rows) in named.items():
             places = slice(3 * k, 3 * k + 3)
             later = float(step[3 * n + k]) if what == DELAY else 0.0
             out.setdefault(
-                k, Displaced(int(rows[k]), step[places], std[places], later, odds, either, others)
+                k,
+                Displaced(int(rows[k]), step[places], std[places], later, odds, either, rival_rows),
             )
         return list(out.values())
 
