@@ -13,8 +13,8 @@ from rclpy.parameter import get_parameter_value, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 import yaml
 
-from uwb_tdoa_bias.foundation.errors import Failure
-from uwb_tdoa_bias.foundation.foreign_text import printable
+from uwb_tdoa_bias.common.errors import Failure
+from uwb_tdoa_bias.common.text import printable
 from uwb_tdoa_tools import cli
 from uwb_tdoa_tools.live.session import message_class, session, subscription_qos
 

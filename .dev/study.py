@@ -6,6 +6,6 @@ would.
 
 import sys
 
-from uwb_tdoa_bias.foundation.executable import executable
+from uwb_tdoa_bias.common.executable import executable
 
 sys.exit(executable("studies.__main__")())

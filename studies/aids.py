@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from uwb_tdoa_bias.common.flight import AIDS
+from uwb_tdoa_bias.common.sensors import Velocity
+from uwb_tdoa_bias.common.sensors.pressure import altitude_of, pressure_at
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
-from uwb_tdoa_bias.foundation.flight import AIDS
-from uwb_tdoa_bias.foundation.sensors import Velocity
-from uwb_tdoa_bias.foundation.sensors.pressure import altitude_of, pressure_at
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.results import VERDICTS
 from uwb_tdoa_tools import options

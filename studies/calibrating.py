@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
-from uwb_tdoa_bias.foundation.files import write_text
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools.calibrating import without_truth
 from uwb_tdoa_tools.diagnosis.self_calibration import Tape

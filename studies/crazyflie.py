@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.flight import Imu
+from uwb_tdoa_bias.common.flight import Imu
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools.crazyflie import PERIOD
 from uwb_tdoa_tools.readers import inputs

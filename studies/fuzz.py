@@ -22,8 +22,8 @@ import traceback
 from fuzz import mutations, targets
 from tqdm import tqdm
 
-from uwb_tdoa_bias.foundation.errors import Failure, InputError
-from uwb_tdoa_bias.foundation.files import write_bytes
+from uwb_tdoa_bias.common.errors import Failure, InputError
+from uwb_tdoa_bias.common.files import write_bytes
 from uwb_tdoa_tools.outputs import OutputFolder
 
 SECONDS, MEGABYTES = 5.0, 500  # processor time and memory of one file

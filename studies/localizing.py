@@ -12,7 +12,7 @@ import json
 from mistakes import MISTAKES
 import numpy as np
 
-from uwb_tdoa_bias.foundation.files import write_text
+from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_tools import options, parallel
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.estimate import FlightEstimator

@@ -12,8 +12,8 @@ import numpy as np
 from test_lockstep import replayed
 
 from studies.monitor import cut
+from uwb_tdoa_bias.common.flight import Truth
 from uwb_tdoa_bias.correction.network import load_network
-from uwb_tdoa_bias.foundation.flight import Truth
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag
 from uwb_tdoa_tools.readers import read_flight
 from uwb_tdoa_tools.scoring.evaluation import evaluate

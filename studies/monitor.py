@@ -8,7 +8,7 @@ from pathlib import Path
 from monitor_cost import CASES, cost
 import numpy as np
 
-from uwb_tdoa_bias.foundation import geometry
+from uwb_tdoa_bias.common import geometry
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.monitoring.monitor import Monitor
 from uwb_tdoa_ekf.monitoring.slices import LENGTH, reduced

@@ -14,8 +14,8 @@ import re
 
 import numpy as np
 
+from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_bias.foundation.files import write_text
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.results import concatenated, rows_of

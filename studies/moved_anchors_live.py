@@ -10,7 +10,7 @@ from pathlib import Path
 import tempfile
 
 from studies.moved_anchors import KINDS, TAPE, _about, _ids, live, recorded
-from uwb_tdoa_bias.foundation.files import write_text
+from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate
 from uwb_tdoa_tools.estimate import FlightEstimator

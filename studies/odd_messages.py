@@ -46,11 +46,11 @@ from tf2_msgs.msg import TFMessage
 from studies.bench import nodes
 from studies.bench.nodes import READY_LIMIT, ready_at, surroundings
 from studies.bench.usage import memory
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.errors import Failure
-from uwb_tdoa_bias.foundation.ros_anchors import anchors_to_message
-from uwb_tdoa_bias.foundation.ros_cdr import Unreadable, decode
-from uwb_tdoa_bias.foundation.ros_frames import read_transforms
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.errors import Failure
+from uwb_tdoa_bias.ros.anchors import anchors_to_message
+from uwb_tdoa_bias.ros.cdr import Unreadable, decode
+from uwb_tdoa_bias.ros.frames import read_transforms
 from uwb_tdoa_msgs.msg import AnchorArray, EstimatorStatus, Tdoa, TdoaCorrected
 from uwb_tdoa_msgs.srv import GoTo, Land, Takeoff
 from uwb_tdoa_tools.live.processes import DiagnosticsListener, LiveError, wait

@@ -16,9 +16,9 @@ import tempfile
 import numpy as np
 from scipy.optimize import least_squares
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.errors import Failure
-from uwb_tdoa_bias.foundation.files import write_text
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.errors import Failure
+from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_tools import parallel
 from uwb_tdoa_tools.outputs import OutputFile
 from uwb_tdoa_tools.parallel import whole_number

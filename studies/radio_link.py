@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.flight import Imu, Tdoas
+from uwb_tdoa_bias.common.flight import Imu, Tdoas
 from uwb_tdoa_tools.crazyflie import FORCES, GRAVITY, PERIOD, RATES, LogBlock, VehicleClock
 
 if TYPE_CHECKING:
-    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_bias.common.flight import Flight
 
 PAIRS = [f"tdoa2.d{k}-{(k + 1) % 8}" for k in (7, 0, 1, 2, 3, 4, 5, 6)]
 BLOCKS = PAIRS[:6], PAIRS[6:], [*RATES, *FORCES]  # 26 bytes each at most

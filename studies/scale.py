@@ -11,9 +11,9 @@ import os
 import subprocess
 import sys
 
+from uwb_tdoa_bias.common.errors import Failure
+from uwb_tdoa_bias.common.files import refuse_output
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
-from uwb_tdoa_bias.foundation.errors import Failure
-from uwb_tdoa_bias.foundation.files import refuse_output
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.outputs import OutputFolder
 from uwb_tdoa_tools.results_file import ResultsFile

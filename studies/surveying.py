@@ -11,8 +11,8 @@ from known_effects import clean_flight, marks_of
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.foundation.files import write_text
-from uwb_tdoa_bias.foundation.flight import AIDS
+from uwb_tdoa_bias.common.files import write_text
+from uwb_tdoa_bias.common.flight import AIDS
 from uwb_tdoa_tools import parallel
 from uwb_tdoa_tools.diagnosis import diagnose
 from uwb_tdoa_tools.diagnosis.constraints import Mark, OdometryPath

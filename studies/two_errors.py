@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 from scipy.signal import lfilter
 
-from uwb_tdoa_bias.foundation.flight import Flight
-from uwb_tdoa_bias.foundation.vibration import VIBRATION_AVERAGE, VIBRATION_CORNER
+from uwb_tdoa_bias.common.flight import Flight
+from uwb_tdoa_bias.common.vibration import VIBRATION_AVERAGE, VIBRATION_CORNER
 from uwb_tdoa_tools.readers import read_flight
 from uwb_tdoa_tools.scoring.metrics import position_at
 

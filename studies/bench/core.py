@@ -19,7 +19,7 @@ from .flights import make_flight
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_bias.common.flight import Flight
     from uwb_tdoa_ekf.core.memory import FilterState
 
 ANCHORS = (4, 8, 16, 32, 64)

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_ekf.results import rows_of
 from uwb_tdoa_tools.calibrating import between
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 
 if TYPE_CHECKING:
-    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_bias.common.flight import Flight
 
 SHORTEST = 16.0  # s that the simulation needs to take off and land
 TDOA_RATE = 400.0  # Hz

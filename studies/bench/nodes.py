@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
     from rclpy.node import Node
 
-    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_bias.common.flight import Flight
 
     Starts = dict[str, tuple[str, Sequence[str]]]  # {title: (executable, arguments)}
 

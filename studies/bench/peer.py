@@ -16,7 +16,7 @@ from .flights import make_flight
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_bias.common.flight import Flight
 
 REPEATS = 41
 

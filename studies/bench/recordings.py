@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
     from pathlib import Path
 
+    from uwb_tdoa_bias.common.flight import Flight
     from uwb_tdoa_bias.correction.network import Network
-    from uwb_tdoa_bias.foundation.flight import Flight
 
 SECONDS = 45.0
 TARGET, TARGET_CORRECTED = 0.1, 0.2  # s for such a flight, without and with corrections

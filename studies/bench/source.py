@@ -15,8 +15,8 @@ import numpy as np
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Imu
 
-from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS, anchors_to_message
-from uwb_tdoa_bias.foundation.ros_topics import OUTPUT_QOS, publish_stream
+from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS, anchors_to_message
+from uwb_tdoa_bias.ros.topics import OUTPUT_QOS, publish_stream
 from uwb_tdoa_msgs.msg import AnchorArray, Tdoa
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from rclpy.node import Node
     from rclpy.publisher import Publisher
 
-    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_bias.common.flight import Flight
 
 HEADER_STAMP = struct.Struct(
     "<iI"

@@ -9,7 +9,7 @@ from pathlib import Path
 from mistakes import MISTAKES, arriving
 import numpy as np
 
-from uwb_tdoa_bias.foundation.files import write_text
+from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_ekf.streams import ERROR
 from uwb_tdoa_tools import parallel
 from uwb_tdoa_tools.checking.check import check

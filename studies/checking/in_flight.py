@@ -12,7 +12,7 @@ import time
 from mistakes import MISTAKES, arriving
 import numpy as np
 
-from uwb_tdoa_bias.foundation.files import write_text
+from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_tools.checking.recording import of_flight
 from uwb_tdoa_tools.checking.tdoa_rules import largest_displacement
 from uwb_tdoa_tools.outputs import OutputFile
@@ -116,7 +116,7 @@ class _Nodes:
         from sensor_msgs.msg import Imu
         from std_srvs.srv import Trigger
 
-        from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS
+        from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS
         from uwb_tdoa_msgs.msg import AnchorArray, Tdoa
         from uwb_tdoa_tools.live.processes import DiagnosticsListener, Processes, own_domain, wait
         from uwb_tdoa_tools.live.session import session
@@ -167,7 +167,7 @@ class _Nodes:
         """
         from std_srvs.srv import Trigger
 
-        from uwb_tdoa_bias.foundation.ros_anchors import anchors_to_message
+        from uwb_tdoa_bias.ros.anchors import anchors_to_message
 
         self._anchors.publish(anchors_to_message(recording.anchors))
         self._reset.call_async(Trigger.Request())

@@ -19,10 +19,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.files import write_text
+from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.files import write_text
-from uwb_tdoa_bias.foundation.flight import Flight
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools import cli, parallel
 from uwb_tdoa_tools.flying import fleet

@@ -6,7 +6,7 @@ from pathlib import Path
 from matplotlib.figure import Figure
 import numpy as np
 
-from uwb_tdoa_bias.foundation.files import write_filled
+from uwb_tdoa_bias.common.files import write_filled
 from uwb_tdoa_tools.scoring.plots import plt
 
 COLOURS = "0.55", "tab:red", "tab:cyan", "tab:olive", "tab:green"

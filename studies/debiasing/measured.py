@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.files import write_text
+from uwb_tdoa_bias.common.flight import AIDS
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.files import write_text
-from uwb_tdoa_bias.foundation.flight import AIDS
 from uwb_tdoa_ekf.debias import fit
 from uwb_tdoa_tools import parallel
 from uwb_tdoa_tools.debiasing.evaluation import estimate_flight, evaluate_map, map_figures

@@ -4,7 +4,7 @@ from functools import partial
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.files import write_filled
+from uwb_tdoa_bias.common.files import write_filled
 from uwb_tdoa_tools.scoring.plots import plt
 
 

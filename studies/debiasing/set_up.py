@@ -9,10 +9,10 @@ import json
 
 import numpy as np
 
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.files import write_text
+from uwb_tdoa_bias.common.flight import Tdoas
 from uwb_tdoa_bias.effects import EFFECTS
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.files import write_text
-from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.debias import INTERPOLATORS, Part, fit
 from uwb_tdoa_ekf.offline import run_offline

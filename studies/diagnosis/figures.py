@@ -12,9 +12,9 @@ import time
 import numpy as np
 from tqdm import tqdm
 
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.files import write_filled, write_text
-from uwb_tdoa_bias.foundation.flight import AIDS
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.files import write_filled, write_text
+from uwb_tdoa_bias.common.flight import AIDS
 from uwb_tdoa_tools.diagnosis import diagnose
 from uwb_tdoa_tools.diagnosis.references import Heights, Nothing
 from uwb_tdoa_tools.diagnosis.self_calibration import Tape, self_calibrate

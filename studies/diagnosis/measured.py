@@ -7,8 +7,8 @@ from known_effects import AIDED as ON_AIDS
 from known_effects import RANGED, SIZES, effect_of
 import numpy as np
 
-from uwb_tdoa_bias.foundation.files import write_text
-from uwb_tdoa_bias.foundation.flight import AIDS
+from uwb_tdoa_bias.common.files import write_text
+from uwb_tdoa_bias.common.flight import AIDS
 from uwb_tdoa_tools.diagnosis import diagnose, output
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.findings import usable

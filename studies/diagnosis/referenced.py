@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from uwb_tdoa_bias.common.flight import AIDS
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_bias.foundation.flight import AIDS
 from uwb_tdoa_tools.diagnosis import diagnose
 from uwb_tdoa_tools.diagnosis.references import REFERENCES
 from uwb_tdoa_tools.scoring.evaluation import evaluate

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.common.anchors import Anchors
 
 from .events import NUMBERS, Event, Scene, in_order
 

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.foundation.flight import AIDS, Truth
-from uwb_tdoa_bias.foundation.sensors import Height, Pressure, Ranges
-from uwb_tdoa_bias.foundation.sensors.pressure import SITE, pressure_at
+from uwb_tdoa_bias.common.flight import AIDS, Truth
+from uwb_tdoa_bias.common.sensors import Height, Pressure, Ranges
+from uwb_tdoa_bias.common.sensors.pressure import SITE, pressure_at
 from uwb_tdoa_tools.scoring.metrics import position_at, scored_phase
 
 from ..aids import with_velocity
 
 if TYPE_CHECKING:
-    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_bias.common.flight import Flight
 
 BEFORE = 1.5  # s on the floor before take-off
 IMU_EVERY = 4  # of the inertial samples one is sent, so that the computer is not busy

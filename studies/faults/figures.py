@@ -12,8 +12,8 @@ import re
 import tempfile
 from typing import TYPE_CHECKING, Any
 
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.files import write_text
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_tools import parallel
 from uwb_tdoa_tools.outputs import OutputFile
 from uwb_tdoa_tools.readers import inputs
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     import argparse
     from collections.abc import Callable
 
-    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_bias.common.flight import Flight
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 FLIGHT = "flights/0426/0426-traj5"

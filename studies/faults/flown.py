@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from uwb_tdoa_bias.foundation.files import write_text
-from uwb_tdoa_bias.foundation.sensors import SENSORS
+from uwb_tdoa_bias.common.files import write_text
+from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_ekf.frames import rotation_std
 from uwb_tdoa_ekf.monitoring.status import RUNNING, status_of
 from uwb_tdoa_ekf.monitoring.stream_watch import StreamWatch

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.flight import AIDS
+from uwb_tdoa_bias.common.flight import AIDS
 from uwb_tdoa_tools.scoring.metrics import position_at
 
 from .events import Scene, yaws_at

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.flight import AIDS
+from uwb_tdoa_bias.common.flight import AIDS
 
 from .changes import (
     Change,

@@ -18,7 +18,7 @@ import pickle
 import subprocess
 import sys
 
-from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_tools.outputs import OutputFile
 
 from . import tuned, watching, work

@@ -17,10 +17,10 @@ from scipy.spatial.transform import Rotation
 
 from studies import ranges, rover, situations
 from studies.faults.flown import FAULTS as FLOWN
+from uwb_tdoa_bias.common.flight import AIDS, Flight, Imu
+from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
-from uwb_tdoa_bias.foundation.flight import AIDS, Flight, Imu
-from uwb_tdoa_bias.foundation.sensors import SENSORS
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_ekf.results import rows_of

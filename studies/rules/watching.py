@@ -17,8 +17,8 @@ from typing import Any
 from mistakes import MISTAKES, arriving
 import numpy as np
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.flight import AIDS
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.flight import AIDS
 import uwb_tdoa_ekf
 from uwb_tdoa_ekf.monitoring.recorded import watched
 from uwb_tdoa_ekf.monitoring.stream_watch import StreamWatch

@@ -10,7 +10,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from uwb_tdoa_bias.foundation.sensors import SENSORS
+from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_tools.results_file import ResultsFile
 
 from . import watching

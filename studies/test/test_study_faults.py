@@ -38,7 +38,7 @@ from studies.faults.changes import (  # noqa: E402
 from studies.faults.events import NUMBERS, Event, Scene, events_of, part_of, turned, yaws_at  # noqa: E402
 from studies.faults.play import Heard, message_of  # noqa: E402
 from studies.faults.table import FAULTS, STREAMS, Fault  # noqa: E402
-from uwb_tdoa_bias.foundation.flight import AIDS, Truth  # noqa: E402
+from uwb_tdoa_bias.common.flight import AIDS, Truth  # noqa: E402
 from uwb_tdoa_msgs.msg import EstimatorStatus  # noqa: E402
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate  # noqa: E402
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from studies.faults.flown import BEGIN, END, FAULTS, FaultyFilter, flown, table
-from uwb_tdoa_bias.foundation.flight import Imu, Tdoas
+from uwb_tdoa_bias.common.flight import Imu, Tdoas
 from uwb_tdoa_tools.flying.simulator import SensorReadings
 from uwb_tdoa_tools.flying.trial import Task, Trial
 from uwb_tdoa_tools.flying.world import world_of

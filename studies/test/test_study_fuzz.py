@@ -9,7 +9,7 @@ import pytest
 
 from studies import fuzz
 from studies.__main__ import main
-from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError
 
 SEED = b"seed"
 

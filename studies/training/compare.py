@@ -10,9 +10,9 @@ import json
 
 from tqdm import tqdm
 
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.files import write_text
-from uwb_tdoa_bias.foundation.flight import AIDS
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.files import write_text
+from uwb_tdoa_bias.common.flight import AIDS
 from uwb_tdoa_tools.outputs import OutputFolder
 from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.training import models

@@ -5,9 +5,9 @@ others.
 import numpy as np
 from tqdm import tqdm
 
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.scoring.evaluation import evaluate
 from uwb_tdoa_tools.scoring.metrics import pooled
 from uwb_tdoa_tools.training import labels as labelling

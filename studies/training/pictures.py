@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import norm
 
-from uwb_tdoa_bias.foundation.files import write_filled
+from uwb_tdoa_bias.common.files import write_filled
 from uwb_tdoa_tools.scoring.plots import plt
 
 COLOURS = {

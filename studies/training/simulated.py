@@ -10,7 +10,7 @@ from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_bias.common.flight import Flight
 
 TRAINING = ("corners", "wall_middles", "staircase")
 UNSEEN = ("pillars", "low_ceiling", "random-7")

@@ -8,10 +8,10 @@ from functools import partial
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.files import write_filled
+from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_bias.effects import true_samples
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.files import write_filled
-from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_tools.outputs import OutputFile
 from uwb_tdoa_tools.scoring.plots import plt
 from uwb_tdoa_tools.simulation import SimulationConfig, simulate

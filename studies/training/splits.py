@@ -12,8 +12,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from tqdm import tqdm
 
+from uwb_tdoa_bias.common.flight import AIDS
 from uwb_tdoa_bias.correction.network import Network
-from uwb_tdoa_bias.foundation.flight import AIDS
 from uwb_tdoa_tools.outputs import OutputFile
 from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.results_file import ResultsFile

@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.effects import RangeSamples, Samples
-from uwb_tdoa_bias.foundation.anchors import Anchors
 
 
 def random_rotation(rng):

@@ -12,10 +12,10 @@ from tf2_msgs.msg import TFMessage  # noqa: E402
 from visualization_msgs.msg import MarkerArray  # noqa: E402
 
 from uwb_tdoa_bias.anchors_node import PARAMETERS, AnchorsNode  # noqa: E402
-from uwb_tdoa_bias.foundation.anchors import Anchors  # noqa: E402
-from uwb_tdoa_bias.foundation.errors import InputError  # noqa: E402
-from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS, same_anchors  # noqa: E402
-from uwb_tdoa_bias.foundation.ros_frames import TF_STATIC_QOS  # noqa: E402
+from uwb_tdoa_bias.common.anchors import Anchors  # noqa: E402
+from uwb_tdoa_bias.common.errors import InputError  # noqa: E402
+from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS, same_anchors  # noqa: E402
+from uwb_tdoa_bias.ros.frames import TF_STATIC_QOS  # noqa: E402
 from uwb_tdoa_msgs.msg import AnchorArray  # noqa: E402
 
 CONFIG = Path(__file__).resolve().parents[1] / "config" / "anchors_node.yaml"

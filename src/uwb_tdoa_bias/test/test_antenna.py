@@ -3,13 +3,13 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.foundation.antenna import (
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.radio import (
     DWM1000_AZIMUTH,
     DWM1000_ELEVATION_1,
     DWM1000_ELEVATION_2,
     Antenna,
 )
-from uwb_tdoa_bias.foundation.errors import InputError
 
 angles = st.floats(-np.pi, np.pi)
 

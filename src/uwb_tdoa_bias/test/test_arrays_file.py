@@ -8,9 +8,9 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.foundation import arrays_file
-from uwb_tdoa_bias.foundation.arrays_file import read_arrays
-from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.common import files
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.files import read_arrays
 
 ARRAYS = {
     "a": np.arange(6.0).reshape(2, 3),
@@ -78,7 +78,7 @@ def test_refused_with_the_reason(read, content, said):
 
 
 def test_memory_is_not_taken_before_sizes_are_known(read, monkeypatch):
-    monkeypatch.setattr(arrays_file, "ARRAYS_BYTES", 1_000_000)
+    monkeypatch.setattr(files, "ARRAYS_BYTES", 1_000_000)
     tracemalloc.start()
     with pytest.raises(InputError, match="more than 1000000 bytes"):
         read(forged("(20000000,)", body=bytes(160_000_000)), {"a": "f"})

@@ -8,8 +8,8 @@ rclpy = pytest.importorskip("rclpy")
 pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from uwb_tdoa_bias.bias_node import MEASURED, BiasNode  # noqa: E402
-from uwb_tdoa_bias.foundation.anchors import Anchors  # noqa: E402
-from uwb_tdoa_bias.foundation.ros_cdr import CdrCodec  # noqa: E402
+from uwb_tdoa_bias.common.anchors import Anchors  # noqa: E402
+from uwb_tdoa_bias.ros.cdr import CdrCodec  # noqa: E402
 from uwb_tdoa_msgs.msg import Tdoa  # noqa: E402
 
 CONFIG = Path(__file__).resolve().parents[1] / "config" / "bias_node.yaml"

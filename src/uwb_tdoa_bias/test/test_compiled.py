@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from uwb_tdoa_bias.foundation import compiled
-from uwb_tdoa_bias.foundation.files import TEMPORARY
+from uwb_tdoa_bias.common import compiled
+from uwb_tdoa_bias.common.files import TEMPORARY
 
 SOURCES = Path(__file__).resolve().parents[2]
 NAME = "0123"  # of a state of the sources

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.correction.corrector import (
     EFFECTS,
     FADED,
@@ -21,7 +22,6 @@ from uwb_tdoa_bias.correction.corrector import (
 from uwb_tdoa_bias.correction.poses import known_yaw_std, parts_of, rotated_in_yaw
 from uwb_tdoa_bias.effects import EFFECTS as CATALOGUE
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, TagLeverArm
-from uwb_tdoa_bias.foundation.anchors import Anchors
 
 ANCHORS = Anchors.from_positions([[0, 0, 0], [8, 0, 0], [0, 8, 0], [0, 0, 3]], ids=[4, 5, 6, 7])
 Corrector = partial(LateCorrector, start=0.0)  # uses the first pose at once

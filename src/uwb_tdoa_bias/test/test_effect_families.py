@@ -7,6 +7,11 @@ import pytest
 from random_samples import random_samples
 from scipy.spatial.transform import Rotation
 
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flight import Flight, Tdoas
+from uwb_tdoa_bias.common.geometry import tdoa
+from uwb_tdoa_bias.common.sensors import Velocity
 from uwb_tdoa_bias.effects import (
     EFFECTS,
     AidCorrector,
@@ -19,11 +24,6 @@ from uwb_tdoa_bias.effects import (
     TagLeverArm,
 )
 from uwb_tdoa_bias.effects.base import counted, listed, measured
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.flight import Flight, Tdoas
-from uwb_tdoa_bias.foundation.geometry import tdoa
-from uwb_tdoa_bias.foundation.sensors import Velocity
 
 ANCHORS = Anchors.from_positions([[0, 0, 0], [8, 0, 3], [0, 7, 0], [8, 7, 3]], ids=[0, 1, 3, 7])
 A, B, D = np.array([1, 2, 4, 7]), np.array([2, 4, 7, 1]), np.array([0.5, -1.0, 2.0, -0.25])

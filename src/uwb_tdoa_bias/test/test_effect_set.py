@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from random_samples import random_samples
 
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import (
     EFFECTS,
@@ -23,8 +25,6 @@ from uwb_tdoa_bias.effects.covariates import OF_ARRIVAL, OF_TDOA, STATES
 from uwb_tdoa_bias.effects.effect_set import REACH
 from uwb_tdoa_bias.effects.samples import Motion
 from uwb_tdoa_bias.effects.tag import RangeBias
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.errors import InputError
 
 DELAYS = (EFFECTS["anchor_delay"]({"0": 0.1, "3": -0.2}), EFFECTS["anchor_position"]({"3.x": 0.0}))
 KEYS = ("anchor_delay", "0"), ("anchor_delay", "3"), ("anchor_position", "3.x")

@@ -13,6 +13,19 @@ import pytest
 from random_samples import random_samples, ranges_of
 from scipy.spatial.transform import Rotation
 
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas, Truth
+from uwb_tdoa_bias.common.sensors import (
+    BY_POSE,
+    STREAM_OF,
+    Height,
+    Pressure,
+    Ranges,
+    Velocity,
+    measured_on,
+)
+from uwb_tdoa_bias.common.sensors.pressure import pressure_at
 from uwb_tdoa_bias.effects import (
     EFFECTS,
     RADIO,
@@ -25,19 +38,6 @@ from uwb_tdoa_bias.effects import (
     true_samples,
 )
 from uwb_tdoa_bias.effects.stamps import StampEffect
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
-from uwb_tdoa_bias.foundation.sensors import (
-    BY_POSE,
-    STREAM_OF,
-    Height,
-    Pressure,
-    Ranges,
-    Velocity,
-    measured_on,
-)
-from uwb_tdoa_bias.foundation.sensors.pressure import pressure_at
 
 DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "effects.md"
 PAIRS = np.array([[0, 1], [3, 2]])

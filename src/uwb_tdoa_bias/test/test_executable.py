@@ -7,8 +7,8 @@ import sys
 
 import pytest
 
-from uwb_tdoa_bias.foundation import executable as module
-from uwb_tdoa_bias.foundation.executable import executable, node_executable
+from uwb_tdoa_bias.common import executable as module
+from uwb_tdoa_bias.common.executable import executable, node_executable
 
 SLOW = """
 import time
@@ -19,7 +19,7 @@ except BaseException:  # as some libraries do
     time.sleep(600)
 """
 START = (
-    "import sys; from uwb_tdoa_bias.foundation.executable import executable; "
+    "import sys; from uwb_tdoa_bias.common.executable import executable; "
     "sys.exit(executable('{}')())"
 )
 

@@ -4,9 +4,9 @@ import numpy as np
 from random_samples import random_samples
 from scipy.spatial.transform import Rotation
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.correction.features import FEATURES, NAMES, PLACE, columns, everything
 from uwb_tdoa_bias.effects import Samples
-from uwb_tdoa_bias.foundation.anchors import Anchors
 
 seeds = st.integers(0, 2**32 - 1)
 

@@ -7,8 +7,8 @@ import threading
 
 import pytest
 
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.files import keeping, write_bytes, write_filled, write_text
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.files import keeping, write_bytes, write_filled, write_text
 
 
 def test_text_is_utf8_whatever_the_locale(tmp_path):
@@ -88,9 +88,7 @@ def test_nothing_is_written_over_what_is_kept(tmp_path):
 
 
 def test_what_standard_output_goes_to_is_written_in_place(tmp_path):
-    code = (
-        "from uwb_tdoa_bias.foundation.files import write_text; write_text('/dev/stdout', 'said')"
-    )
+    code = "from uwb_tdoa_bias.common.files import write_text; write_text('/dev/stdout', 'said')"
     with open(tmp_path / "said", "wb") as said:
         subprocess.run([sys.executable, "-c", code], stdout=said, check=True)
     assert (tmp_path / "said").read_text() == "said" and os.path.islink("/dev/stdout")

@@ -3,9 +3,9 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.flyable import FlyableVolume
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flyable import FlyableVolume
 
 ANCHORS = Anchors.from_positions([[0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 0, 3]], ids=[3, 1, 7, 5])
 CELLS = np.random.default_rng(0).random((5, 4, 3)) < 0.5

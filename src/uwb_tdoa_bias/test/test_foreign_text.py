@@ -1,7 +1,7 @@
 import pytest
 
-from uwb_tdoa_bias.foundation.flight import Flight
-from uwb_tdoa_bias.foundation.foreign_text import harmless, printable
+from uwb_tdoa_bias.common.flight import Flight
+from uwb_tdoa_bias.common.text import harmless, printable
 
 ATTACK = "\x1b[2J\x1b]0;title\x07\r\nok \u202efdp.exe \ud800 \x9b31m"
 

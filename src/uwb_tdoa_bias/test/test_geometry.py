@@ -4,7 +4,7 @@ from hypothesis import strategies as st
 import numpy as np
 from random_samples import random_rotation
 
-from uwb_tdoa_bias.foundation.geometry import (
+from uwb_tdoa_bias.common.geometry import (
     linearized_tdoa,
     rotate,
     rotate_each,

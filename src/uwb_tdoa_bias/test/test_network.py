@@ -4,10 +4,10 @@ import json
 import numpy as np
 import pytest
 
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.correction.network import Network, load_network
 from uwb_tdoa_bias.effects import Samples
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.errors import InputError
 
 known_answer = pytest.importorskip("known_answer")
 

@@ -9,10 +9,10 @@ import sys
 import numpy as np
 import pytest
 
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.limits import MODEL_BYTES, MODEL_SECONDS
 from uwb_tdoa_bias.correction import trial
 from uwb_tdoa_bias.correction.network import Network
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.limits import MODEL_BYTES, MODEL_SECONDS
 
 onnx = pytest.importorskip("onnx")
 from onnx import TensorProto, helper, numpy_helper  # noqa: E402

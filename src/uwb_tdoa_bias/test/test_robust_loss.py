@@ -3,7 +3,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.foundation.robust_loss import (
+from uwb_tdoa_bias.common.robust_loss import (
     CAUCHY,
     GEMAN_MCCLURE,
     HUBER,

@@ -25,21 +25,20 @@ from rclpy.qos import (  # noqa: E402
 )
 from rosgraph_msgs.msg import Clock  # noqa: E402
 
-from uwb_tdoa_bias.foundation import ros_log  # noqa: E402
-from uwb_tdoa_bias.foundation.anchors import Anchors  # noqa: E402
-from uwb_tdoa_bias.foundation.errors import InputError  # noqa: E402
-from uwb_tdoa_bias.foundation.limits import LINE_LENGTH  # noqa: E402
-from uwb_tdoa_bias.foundation.ros_anchors import (  # noqa: E402
+from uwb_tdoa_bias.common.anchors import Anchors  # noqa: E402
+from uwb_tdoa_bias.common.errors import InputError  # noqa: E402
+from uwb_tdoa_bias.common.limits import LINE_LENGTH  # noqa: E402
+from uwb_tdoa_bias.ros import log  # noqa: E402
+from uwb_tdoa_bias.ros.anchors import (  # noqa: E402
     ANCHORS_QOS,
     ANY_QOS,
     anchors_to_message,
     in_words,
     same_anchors,
 )
-from uwb_tdoa_bias.foundation.ros_diagnostics import Saying, SimulatedClock  # noqa: E402
-from uwb_tdoa_bias.foundation.ros_log import BURST, REFILL, Log  # noqa: E402
-from uwb_tdoa_bias.foundation.ros_stamps import Epoch, orientation_of  # noqa: E402
-from uwb_tdoa_bias.foundation.ros_topics import OUTPUT_QOS, STREAM_QOS  # noqa: E402
+from uwb_tdoa_bias.ros.diagnostics import Saying, SimulatedClock  # noqa: E402
+from uwb_tdoa_bias.ros.log import BURST, REFILL, Log  # noqa: E402
+from uwb_tdoa_bias.ros.topics import OUTPUT_QOS, STREAM_QOS, Epoch, orientation_of  # noqa: E402  # noqa: E402
 
 # --- ros stamps ---
 NANOSECONDS = st.integers(0, 10**9 - 1)
@@ -192,7 +191,7 @@ class Written:
 def clock(monkeypatch):
     """The time, s, that a Log sees: a list of one."""
     now = [1000.0]
-    monkeypatch.setattr(ros_log.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(log.time, "monotonic", lambda: now[0])
     return now
 
 

@@ -11,8 +11,8 @@ from nav_msgs.msg import Odometry, Path  # noqa: E402
 from rclpy.serialization import deserialize_message, serialize_message  # noqa: E402
 from sensor_msgs.msg import FluidPressure, Imu, Range  # noqa: E402
 
-from uwb_tdoa_bias.foundation import ros_cdr  # noqa: E402
-from uwb_tdoa_bias.foundation.ros_cdr import (
+from uwb_tdoa_bias.ros import cdr  # noqa: E402
+from uwb_tdoa_bias.ros.cdr import (
     LONGEST_TEXT,
     MOST_ELEMENTS,
     CdrCodec,
@@ -106,11 +106,11 @@ def test_what_is_written_is_what_an_object_would_be(way):
 
 def test_a_middleware_that_serializes_otherwise_is_noticed(monkeypatch):
     monkeypatch.setattr(
-        ros_cdr, "serialize_message", lambda message: b"\0\0" + serialize_message(message)[2:]
+        cdr, "serialize_message", lambda message: b"\0\0" + serialize_message(message)[2:]
     )
     assert not CdrCodec(Tdoa, "distance_difference").fits
     monkeypatch.setattr(
-        ros_cdr, "serialize_message", lambda message: serialize_message(message)[:4] + b"\0" * 90
+        cdr, "serialize_message", lambda message: serialize_message(message)[:4] + b"\0" * 90
     )
     assert not CdrCodec(Tdoa, "distance_difference").fits
 

@@ -11,8 +11,8 @@ from geometry_msgs.msg import TransformStamped  # noqa: E402
 from rclpy.serialization import serialize_message  # noqa: E402
 from tf2_msgs.msg import TFMessage  # noqa: E402
 
-from uwb_tdoa_bias.foundation.ros_cdr import MOST_ELEMENTS, Unreadable  # noqa: E402
-from uwb_tdoa_bias.foundation.ros_frames import read_transforms  # noqa: E402
+from uwb_tdoa_bias.ros.cdr import MOST_ELEMENTS, Unreadable  # noqa: E402
+from uwb_tdoa_bias.ros.frames import read_transforms  # noqa: E402
 
 NAMES = st.text(st.characters(codec="utf-8", exclude_characters="\0"), max_size=20)
 NUMBERS = st.floats(allow_nan=False)

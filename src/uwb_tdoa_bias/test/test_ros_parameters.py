@@ -6,8 +6,8 @@ from rclpy.impl.implementation_singleton import rclpy_implementation  # noqa: E4
 from rclpy.impl.rcutils_logger import RcutilsLogger  # noqa: E402
 from rclpy.parameter import Parameter as Value  # noqa: E402
 
-from uwb_tdoa_bias.foundation.errors import InputError  # noqa: E402
-from uwb_tdoa_bias.foundation.ros_parameters import (  # noqa: E402
+from uwb_tdoa_bias.common.errors import InputError  # noqa: E402
+from uwb_tdoa_bias.ros.parameters import (  # noqa: E402
     Parameter,
     ParameterNode,
     declare_all,

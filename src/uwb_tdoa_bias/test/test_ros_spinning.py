@@ -12,13 +12,17 @@ from rclpy.task import Future  # noqa: E402
 from rosgraph_msgs.msg import Clock  # noqa: E402
 from sensor_msgs.msg import FluidPressure  # noqa: E402
 
-from uwb_tdoa_bias.foundation import ros_spinning  # noqa: E402
-from uwb_tdoa_bias.foundation.ros_cdr import CdrCodec  # noqa: E402
-from uwb_tdoa_bias.foundation.ros_node import StreamNode  # noqa: E402
-from uwb_tdoa_bias.foundation.ros_parameters import MOST_ASKED, MOST_REQUESTS  # noqa: E402
-from uwb_tdoa_bias.foundation.ros_spinning import Spinner  # noqa: E402
-from uwb_tdoa_bias.foundation.ros_stamps import Epoch  # noqa: E402
-from uwb_tdoa_bias.foundation.ros_streams import PERIOD, RoundRobin, Streams  # noqa: E402
+from uwb_tdoa_bias.ros import process  # noqa: E402
+from uwb_tdoa_bias.ros.cdr import CdrCodec  # noqa: E402
+from uwb_tdoa_bias.ros.node import (  # noqa: E402
+    PERIOD,
+    RoundRobin,
+    StreamNode,  # noqa: E402
+    Streams,
+)
+from uwb_tdoa_bias.ros.parameters import MOST_ASKED, MOST_REQUESTS  # noqa: E402
+from uwb_tdoa_bias.ros.process import Spinner  # noqa: E402
+from uwb_tdoa_bias.ros.topics import Epoch  # noqa: E402
 
 MANY = 300
 DEEP = QoSProfile(depth=1000)
@@ -28,8 +32,8 @@ DEEP = QoSProfile(depth=1000)
 def surroundings(request, monkeypatch):
     """(node of ours, another node); once with each of the executors."""
     if request.param == "single":
-        monkeypatch.setattr(ros_spinning, "EventsExecutor", None)
-    elif ros_spinning.EventsExecutor is None:
+        monkeypatch.setattr(process, "EventsExecutor", None)
+    elif process.EventsExecutor is None:
         pytest.skip("this rclpy has no EventsExecutor")
     rclpy.init()
     node, other = StreamNode("ours"), rclpy.create_node("other")

@@ -6,9 +6,9 @@ from hypothesis import strategies as st
 import pytest
 import yaml
 
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.limits import YAML_BYTES
-from uwb_tdoa_bias.foundation.safe_yaml import parse_yaml, read_yaml
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.limits import YAML_BYTES
+from uwb_tdoa_bias.common.safe_yaml import parse_yaml, read_yaml
 
 SCALARS = st.one_of(
     st.none(),

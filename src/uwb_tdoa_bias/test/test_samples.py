@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet, SmoothTerm, samples_at
 from uwb_tdoa_bias.effects.samples import motion_at, preceding
-from uwb_tdoa_bias.foundation.anchors import Anchors
 
 ANCHORS = Anchors.from_positions([[0, 0, 0], [8, 0, 0], [0, 8, 0], [0, 0, 3]], ids=[4, 5, 6, 7])
 RATE = np.array([0.3, -0.5, 0.8])  # rad/s, body

@@ -5,16 +5,16 @@ tests of its own.
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.flight import AIDS, Flight, Tdoas
-from uwb_tdoa_bias.foundation.sensors import (
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.flight import AIDS, Flight, Tdoas
+from uwb_tdoa_bias.common.sensors import (
     SENSORS,
     STREAM_OF,
     Height,
     Ranges,
     Velocity,
 )
-from uwb_tdoa_bias.foundation.sensors.sensor import Stream
+from uwb_tdoa_bias.common.sensors.sensor import Stream
 
 N = 5
 T = np.arange(N) / 25.0

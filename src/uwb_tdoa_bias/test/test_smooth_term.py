@@ -7,10 +7,10 @@ import pytest
 from random_samples import random_samples, ranges_of
 import yaml
 
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.effects import RADIO, EffectSet, SmoothTerm
 from uwb_tdoa_bias.effects.covariates import OF_AIDS, OF_ARRIVAL, OF_IMU, OF_TDOA, UNITS
 from uwb_tdoa_bias.effects.smooth_term import SHAPES, causes, described, shape_basis
-from uwb_tdoa_bias.foundation.errors import InputError
 
 KNOTS = {2: (1.0, 3.0), 3: (1.0, 2.0, 3.0), 4: (1.0, 1.5, 2.5, 3.0)}
 seeds = st.integers(0, 2**32 - 1)

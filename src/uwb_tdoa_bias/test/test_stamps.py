@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uwb_tdoa_bias.foundation.stamps import (
+from uwb_tdoa_bias.common.stamps import (
     CONTRADICTED,
     LARGEST_STEP_AHEAD,
     LARGEST_STEP_BACK,

@@ -7,10 +7,9 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.survey import read_survey
-from uwb_tdoa_bias.foundation.survey_faults import UNITS, refuse_faulty, survey_faults
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.survey import UNITS, read_survey, refuse_faulty, survey_faults
 
 # --- survey forms ---
 PLACES = {0: (-3.1062, -4.0031, 0.1832), 1: (-3.1907, 3.7809, 2.9519), 4: (3.7205, 3.6519, -0.1869)}

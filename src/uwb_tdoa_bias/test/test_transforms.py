@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.transforms import HELD, Frames
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.transforms import HELD, Frames
 
 QUARTER = Rotation.from_euler("z", 90.0, degrees=True)  # to the left
 IDENTITY = (0.0, 0.0, 0.0, 1.0)
@@ -81,7 +81,7 @@ def test_what_is_no_rotation_is_refused(q):
 
 
 def test_frames_are_bounded(monkeypatch):
-    monkeypatch.setattr("uwb_tdoa_bias.foundation.transforms.MOST", 3)
+    monkeypatch.setattr("uwb_tdoa_bias.common.transforms.MOST", 3)
     frames = Frames()
     for k in range(3):
         frames.set("a", f"b{k}", (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0))

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.foundation.vibration import (
+from uwb_tdoa_bias.common.vibration import (
     VIBRATION_AVERAGE,
     VIBRATION_CORNER,
     low_pass,

@@ -16,12 +16,13 @@ from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import Marker, MarkerArray
 
-from .foundation import ros
-from .foundation.errors import InputError
-from .foundation.ros_anchors import ANCHORS_FILE, ANCHORS_QOS, anchors_to_message
-from .foundation.ros_frames import TF_STATIC_QOS
-from .foundation.ros_node import StreamNode
-from .foundation.ros_parameters import (
+from .common.errors import InputError
+from .common.survey import read_survey, refuse_faulty
+from .ros import process
+from .ros.anchors import ANCHORS_FILE, ANCHORS_QOS, anchors_to_message
+from .ros.frames import TF_STATIC_QOS
+from .ros.node import StreamNode
+from .ros.parameters import (
     FROZEN,
     Parameter,
     declare_all,
@@ -29,8 +30,6 @@ from .foundation.ros_parameters import (
     refuse_unknown,
     say_unused,
 )
-from .foundation.survey import read_survey
-from .foundation.survey_faults import refuse_faulty
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -119,7 +118,7 @@ def _known(q: Quaternion) -> bool:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the node; returns the exit code."""
-    return ros.run(AnchorsNode, __doc__, argv)
+    return process.run(AnchorsNode, __doc__, argv)
 
 
 if __name__ == "__main__":

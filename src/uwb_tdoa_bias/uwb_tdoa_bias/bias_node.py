@@ -22,20 +22,21 @@ import numpy as np
 
 from uwb_tdoa_msgs.msg import Tdoa, TdoaCorrected
 
+from .common.errors import InputError
+from .common.stamps import LARGEST_STEP_BACK, StampGate
 from .correction.corrector import EFFECTS, FADED, NETWORK, PASSED, Correction, Corrector, warm_up
 from .correction.network import load_network
 from .correction.pose_queue import PoseQueue
 from .correction.poses import parts_of
 from .effects import EffectSet, LabelCorrector
 from .effects.tag import TagLeverArm
-from .foundation import ros
-from .foundation.errors import InputError
-from .foundation.ros_anchors import ANCHORS_FILE, AnchorsInput
-from .foundation.ros_cdr import CdrCodec
-from .foundation.ros_diagnostics import Diagnostics, Rate, Report
-from .foundation.ros_frames import FramesInput, unknown_frame
-from .foundation.ros_node import StreamNode
-from .foundation.ros_parameters import (
+from .ros import process
+from .ros.anchors import ANCHORS_FILE, AnchorsInput
+from .ros.cdr import CdrCodec
+from .ros.diagnostics import Diagnostics, Rate, Report
+from .ros.frames import FramesInput, unknown_frame
+from .ros.node import RoundRobin, StreamNode, StreamOutput, Streams
+from .ros.parameters import (
     FROZEN,
     Parameter,
     declare_all,
@@ -43,16 +44,13 @@ from .foundation.ros_parameters import (
     refuse_unknown,
     say_unused,
 )
-from .foundation.ros_stamps import Epoch
-from .foundation.ros_streams import RoundRobin, StreamOutput, Streams
-from .foundation.ros_topics import several_publishers
-from .foundation.stamps import LARGEST_STEP_BACK, StampGate
+from .ros.topics import Epoch, several_publishers
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Sequence
 
-    from .foundation.anchors import Anchors
-    from .foundation.ros_cdr import Template
+    from .common.anchors import Anchors
+    from .ros.cdr import Template
 
 PARAMETERS = {  # in the order of config/bias_node.yaml
     "anchors_file": ANCHORS_FILE,
@@ -547,7 +545,7 @@ class BiasNode(StreamNode):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the node; returns the exit code."""
-    return ros.run(BiasNode, __doc__, argv)
+    return process.run(BiasNode, __doc__, argv)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """The entry points that setup.py names."""
 
-from .foundation.executable import node_executable
+from .common.executable import node_executable
 
 anchors_node = node_executable("uwb_tdoa_bias.anchors_node")
 bias_node = node_executable("uwb_tdoa_bias.bias_node")

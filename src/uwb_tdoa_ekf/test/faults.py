@@ -8,8 +8,8 @@ from dataclasses import replace
 from flights import fly
 import numpy as np
 
-from uwb_tdoa_bias.foundation.flight import Tdoas
-from uwb_tdoa_bias.foundation.geometry import tdoa
+from uwb_tdoa_bias.common.flight import Tdoas
+from uwb_tdoa_bias.common.geometry import tdoa
 
 IMU_RATE, TDOA_RATE = 100.0, 100.0  # Hz
 T, ARRIVAL, GYRO, ACCEL = range(4)

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
-from uwb_tdoa_bias.foundation.geometry import tdoa
-from uwb_tdoa_bias.foundation.sensors import Height, Pressure, Ranges, Velocity
-from uwb_tdoa_bias.foundation.sensors.pressure import pressure_at
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas, Truth
+from uwb_tdoa_bias.common.geometry import tdoa
+from uwb_tdoa_bias.common.sensors import Height, Pressure, Ranges, Velocity
+from uwb_tdoa_bias.common.sensors.pressure import pressure_at
 from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, TDOA, Measurements, structured
 
 GRAVITY = 9.81

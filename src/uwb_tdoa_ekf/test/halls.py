@@ -8,9 +8,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
-from uwb_tdoa_bias.foundation.geometry import tdoa
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas, Truth
+from uwb_tdoa_bias.common.geometry import tdoa
 
 RATE = 100.0  # Hz, of inertial samples and of the truth
 HEIGHT = 1.2  # m, of the tag above its floor

@@ -25,10 +25,10 @@ from rclpy.qos import ReliabilityPolicy
 from sensor_msgs.msg import FluidPressure, Imu, Range
 from tf2_msgs.msg import TFMessage
 
-from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS, anchors_to_message
-from uwb_tdoa_bias.foundation.ros_diagnostics import DIAGNOSTICS_QOS
-from uwb_tdoa_bias.foundation.ros_topics import STREAM_QOS
-from uwb_tdoa_bias.foundation.sensors import SENSORS
+from uwb_tdoa_bias.common.sensors import SENSORS
+from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS, anchors_to_message
+from uwb_tdoa_bias.ros.diagnostics import DIAGNOSTICS_QOS
+from uwb_tdoa_bias.ros.topics import STREAM_QOS
 from uwb_tdoa_ekf.results import VERDICTS, rows_of
 from uwb_tdoa_msgs.msg import AnchorArray, Tdoa, TdoaCorrected, TdoaResidual
 

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
-from uwb_tdoa_bias.foundation.geometry import tdoa
-from uwb_tdoa_bias.foundation.sensors import Velocity
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas, Truth
+from uwb_tdoa_bias.common.geometry import tdoa
+from uwb_tdoa_bias.common.sensors import Velocity
 
 GRAVITY = 9.81
 HEIGHT, HEIGHT_STD, TILT_STD = (

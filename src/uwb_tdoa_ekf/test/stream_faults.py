@@ -11,8 +11,8 @@ from nav_msgs.msg import Odometry
 from rig import STREAMS, Rig
 from std_srvs.srv import Trigger
 
-from uwb_tdoa_bias.foundation.ros_diagnostics import DIAGNOSTICS_QOS
-from uwb_tdoa_bias.foundation.ros_topics import OUTPUT_QOS, STREAM_QOS
+from uwb_tdoa_bias.ros.diagnostics import DIAGNOSTICS_QOS
+from uwb_tdoa_bias.ros.topics import OUTPUT_QOS, STREAM_QOS
 
 PAUSE = 0.3  # s between two flights
 PUBLISHERS = {

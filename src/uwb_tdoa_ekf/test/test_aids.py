@@ -13,7 +13,7 @@ from priors import Prior, with_offset
 import pytest
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.foundation.robust_loss import LOSSES
+from uwb_tdoa_bias.common.robust_loss import LOSSES
 from uwb_tdoa_ekf.core import auxiliary, height, plane, update, velocity
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
 from uwb_tdoa_ekf.core.engine import feed

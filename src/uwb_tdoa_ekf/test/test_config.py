@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import yaml
 
-from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_ekf.core.config import CHOICES, PARAMETERS, FilterConfig
 
 CONFIG = Path(__file__).resolve().parents[1] / "config" / "ekf_node.yaml"

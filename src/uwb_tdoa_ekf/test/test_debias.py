@@ -11,8 +11,8 @@ from scipy.integrate import quad
 from scipy.interpolate import CubicSpline
 from scipy.stats import norm
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_ekf.debias import INTERPOLATORS, BiasMap, Part, fit
 from uwb_tdoa_ekf.debias.bias_map import FADE, INTERPOLATORS
 from uwb_tdoa_ekf.debias.markers import Markers, collect, corrected_bias, measured_places

@@ -13,7 +13,7 @@ from diagnostic_msgs.msg import DiagnosticStatus  # noqa: E402
 from nav_msgs.msg import Odometry  # noqa: E402
 from rig import MODULES, make_rig, stamp  # noqa: E402, F401
 
-from uwb_tdoa_bias.foundation.anchors import Anchors  # noqa: E402
+from uwb_tdoa_bias.common.anchors import Anchors  # noqa: E402
 from uwb_tdoa_ekf.debias import BiasMap  # noqa: E402
 from uwb_tdoa_ekf.debias_node import DebiasNode  # noqa: E402
 

@@ -17,10 +17,10 @@ from flights import corners, with_aids  # noqa: E402
 from rig import MODULES, PATIENCE, make_rig, recording, seconds_of, stamp  # noqa: E402, F401
 from sensor_msgs.msg import Imu  # noqa: E402
 
+from uwb_tdoa_bias.common.flyable import FlyableVolume  # noqa: E402
 from uwb_tdoa_bias.correction.corrector import Corrector  # noqa: E402
 from uwb_tdoa_bias.effects import EffectSet  # noqa: E402
-from uwb_tdoa_bias.foundation.flyable import FlyableVolume  # noqa: E402
-from uwb_tdoa_bias.foundation.ros_anchors import anchors_to_message  # noqa: E402
+from uwb_tdoa_bias.ros.anchors import anchors_to_message  # noqa: E402
 from uwb_tdoa_ekf.offline import run_offline  # noqa: E402
 from uwb_tdoa_msgs.msg import TdoaCorrected, TdoaResidual  # noqa: E402
 

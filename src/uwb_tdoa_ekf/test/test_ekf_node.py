@@ -17,8 +17,8 @@ import numpy as np  # noqa: E402
 from scipy.spatial.transform import Rotation  # noqa: E402
 import yaml  # noqa: E402
 
-from uwb_tdoa_bias.foundation.errors import InputError  # noqa: E402
-from uwb_tdoa_bias.foundation.ros_stamps import Epoch  # noqa: E402
+from uwb_tdoa_bias.common.errors import InputError  # noqa: E402
+from uwb_tdoa_bias.ros.topics import Epoch  # noqa: E402
 from uwb_tdoa_ekf import outputs  # noqa: E402
 from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 from uwb_tdoa_ekf.ekf_node import EkfNode  # noqa: E402

@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.foundation.flight import Imu, Tdoas
-from uwb_tdoa_bias.foundation.geometry import tdoa
+from uwb_tdoa_bias.common.flight import Imu, Tdoas
+from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_ekf.core import verdicts
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
 from uwb_tdoa_ekf.core.engine import feed, most_records, run

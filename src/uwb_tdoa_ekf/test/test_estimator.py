@@ -22,11 +22,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.flight import Imu
-from uwb_tdoa_bias.foundation.sensors import SENSORS
-from uwb_tdoa_bias.foundation.stamps import LARGEST_STEP_BACK
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flight import Imu
+from uwb_tdoa_bias.common.sensors import SENSORS
+from uwb_tdoa_bias.common.stamps import LARGEST_STEP_BACK
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.verdicts import COMPENSATED, INVALID, LATE, REPEATED, STARTUP
 from uwb_tdoa_ekf.estimator import Estimator

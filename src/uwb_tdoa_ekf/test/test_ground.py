@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.foundation.geometry import tdoa
+from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.ground import (
     BLUR_STD,

@@ -10,8 +10,8 @@ from types import SimpleNamespace  # noqa: E402
 
 import numpy as np  # noqa: E402
 
-from uwb_tdoa_bias.foundation.anchors import Anchors  # noqa: E402
-from uwb_tdoa_bias.foundation.flyable import FlyableVolume  # noqa: E402
+from uwb_tdoa_bias.common.anchors import Anchors  # noqa: E402
+from uwb_tdoa_bias.common.flyable import FlyableVolume  # noqa: E402
 from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 from uwb_tdoa_ekf.monitoring import health  # noqa: E402
 from uwb_tdoa_ekf.monitoring.health import ERROR, OK, WARN  # noqa: E402

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.foundation.flight import Tdoas
-from uwb_tdoa_bias.foundation.geometry import tdoa
+from uwb_tdoa_bias.common.flight import Tdoas
+from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
 from uwb_tdoa_ekf.core.verdicts import REJECTED, STARTUP, USED
 

@@ -5,9 +5,9 @@ from dataclasses import replace
 from flights import corners, fly, position_at
 import numpy as np
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.flight import Tdoas
-from uwb_tdoa_bias.foundation.geometry import tdoa
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.flight import Tdoas
+from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_ekf.core.verdicts import INVALID, USED
 from uwb_tdoa_ekf.estimator import Estimator
 

@@ -21,7 +21,7 @@ pytest.importorskip("uwb_tdoa_msgs.msg")
 from nav_msgs.msg import Odometry  # noqa: E402
 from real_launch import WHY_NOT  # noqa: E402
 
-from uwb_tdoa_bias.foundation.errors import InputError  # noqa: E402
+from uwb_tdoa_bias.common.errors import InputError  # noqa: E402
 from uwb_tdoa_ekf.launching import (
     NODES,
     RANGE,

@@ -6,8 +6,8 @@ from monitor_cost import cost, row_of
 import numpy as np
 import pytest
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.effects import Covariance
-from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_ekf.core.verdicts import INVALID, REJECTED, USED
 from uwb_tdoa_ekf.evidence import POSITION, Part, changes_of, keys_of, most_likely_changes
 from uwb_tdoa_ekf.monitoring.change import CAPACITY, ChangeDetector

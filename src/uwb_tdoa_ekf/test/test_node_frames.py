@@ -21,12 +21,12 @@ from scipy.spatial.transform import Rotation  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 from tf2_msgs.msg import TFMessage  # noqa: E402
 
+from uwb_tdoa_bias.common.flight import Imu  # noqa: E402
 from uwb_tdoa_bias.correction.corrector import Corrector  # noqa: E402
 from uwb_tdoa_bias.effects import EffectSet, SmoothTerm  # noqa: E402
 from uwb_tdoa_bias.effects.imu import AccelBias  # noqa: E402
 from uwb_tdoa_bias.effects.tag import TagLeverArm  # noqa: E402
-from uwb_tdoa_bias.foundation.flight import Imu  # noqa: E402
-from uwb_tdoa_bias.foundation.ros_frames import TF_QOS, TF_STATIC_QOS  # noqa: E402
+from uwb_tdoa_bias.ros.frames import TF_QOS, TF_STATIC_QOS  # noqa: E402
 from uwb_tdoa_ekf.offline import run_offline  # noqa: E402
 from uwb_tdoa_msgs.msg import AnchorArray  # noqa: E402
 

@@ -18,10 +18,10 @@ from rclpy.qos import DurabilityPolicy, ReliabilityPolicy  # noqa: E402
 from rig import OUTPUTS, make_rig, recording, seconds_of, stamp  # noqa: E402, F401
 from rovers import HEIGHT, drive  # noqa: E402
 
+from uwb_tdoa_bias.common.flight import Tdoas  # noqa: E402
 from uwb_tdoa_bias.correction.corrector import Corrector  # noqa: E402
 from uwb_tdoa_bias.correction.network import Network  # noqa: E402
 from uwb_tdoa_bias.effects import EffectSet  # noqa: E402
-from uwb_tdoa_bias.foundation.flight import Tdoas  # noqa: E402
 from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 from uwb_tdoa_ekf.frames import to_odometry  # noqa: E402
 from uwb_tdoa_ekf.offline import run_offline  # noqa: E402

@@ -8,10 +8,10 @@ from live import IMU, TDOA, assert_same, feed, messages
 import numpy as np
 import pytest
 
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.sensors import Ranges
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.sensors import Ranges
 from uwb_tdoa_ekf.core import ranges
 from uwb_tdoa_ekf.core.aids import STREAMS
 from uwb_tdoa_ekf.core.auxiliary import RANGE

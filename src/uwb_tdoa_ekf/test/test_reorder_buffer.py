@@ -10,8 +10,8 @@ from live import IMU, TDOA, arriving, assert_same, assert_same_as_offline, feed,
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.foundation.flight import Tdoas
-from uwb_tdoa_bias.foundation.stamps import MOST_HELD
+from uwb_tdoa_bias.common.flight import Tdoas
+from uwb_tdoa_bias.common.stamps import MOST_HELD
 from uwb_tdoa_ekf.core.memory import AID, IMU_SAMPLE
 from uwb_tdoa_ekf.core.memory import TDOA as TDOA_ROW
 from uwb_tdoa_ekf.core.verdicts import INVALID, LATE

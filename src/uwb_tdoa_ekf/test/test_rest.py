@@ -7,10 +7,10 @@ from live import assert_same
 import numpy as np
 import pytest
 
+from uwb_tdoa_bias.common.flight import Imu, Tdoas
+from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
-from uwb_tdoa_bias.foundation.flight import Imu, Tdoas
-from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.offline import run_offline

@@ -14,7 +14,7 @@ import pytest
 from rovers import HEIGHT, HEIGHT_STD, Errors, drive, late, yaw_of
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.foundation.sensors import Velocity
+from uwb_tdoa_bias.common.sensors import Velocity
 from uwb_tdoa_ekf.core.config import PLANAR_HEIGHT_STD, FilterConfig
 from uwb_tdoa_ekf.core.initialization import ANY_YAW, RIVAL_TIME
 from uwb_tdoa_ekf.core.state import turn_about_vertical

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.foundation.flight import Tdoas
+from uwb_tdoa_bias.common.flight import Tdoas
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
 from uwb_tdoa_ekf.offline import run_offline, without_offset
 from uwb_tdoa_ekf.smoother import smooth

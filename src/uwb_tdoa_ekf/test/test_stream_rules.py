@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.foundation.geometry import tdoa
+from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_ekf.streams import ERROR, NOTE, SEVERITIES, WARNING, Finding, Steady, StreamRules
 
 # --- stream rules ---

@@ -8,7 +8,7 @@ from priors import Prior, with_offset
 from priors import kalman as textbook
 import pytest
 
-from uwb_tdoa_bias.foundation.robust_loss import LOSSES, weight
+from uwb_tdoa_bias.common.robust_loss import LOSSES, weight
 from uwb_tdoa_ekf.core.auxiliary import PRESSURE, RANGE, depend
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
 from uwb_tdoa_ekf.core.robust import (

@@ -4,7 +4,7 @@ from flights import corners, fly
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.foundation.geometry import tdoa
+from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_ekf.core.memory import new_state
 from uwb_tdoa_ekf.core.workspace import SMALLEST, STD, constrain, contains, set_bounds
 from uwb_tdoa_ekf.offline import run_offline

@@ -12,8 +12,8 @@ from flights import position_at
 from halls import Hall, fly
 import numpy as np
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_ekf.core.verdicts import STARTUP
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.monitoring.stream_watch import StreamWatch

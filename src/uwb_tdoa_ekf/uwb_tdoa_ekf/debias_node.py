@@ -17,12 +17,12 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from nav_msgs.msg import Odometry
 import numpy as np
 
-from uwb_tdoa_bias.foundation import ros
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_FILE, AnchorsInput
-from uwb_tdoa_bias.foundation.ros_diagnostics import Diagnostics, Rate
-from uwb_tdoa_bias.foundation.ros_node import StreamNode
-from uwb_tdoa_bias.foundation.ros_parameters import (
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.ros import process
+from uwb_tdoa_bias.ros.anchors import ANCHORS_FILE, AnchorsInput
+from uwb_tdoa_bias.ros.diagnostics import Diagnostics, Rate
+from uwb_tdoa_bias.ros.node import StreamNode
+from uwb_tdoa_bias.ros.parameters import (
     FROZEN,
     Parameter,
     declare_all,
@@ -30,14 +30,14 @@ from uwb_tdoa_bias.foundation.ros_parameters import (
     refuse_unknown,
     say_unused,
 )
-from uwb_tdoa_bias.foundation.ros_topics import OVERRIDES, STREAM_QOS, Input, publish_stream
+from uwb_tdoa_bias.ros.topics import OVERRIDES, STREAM_QOS, Input, publish_stream
 
 from .debias import BiasMap
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from uwb_tdoa_bias.common.anchors import Anchors
 
 LARGEST_OUTSIDE = 0.5  # share of positions outside of the map, before it becomes a warning
 # in the order of config/debias_node.yaml
@@ -158,7 +158,7 @@ class DebiasNode(StreamNode):
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the node; returns the exit code."""
-    return ros.run(DebiasNode, __doc__, argv)
+    return process.run(DebiasNode, __doc__, argv)
 
 
 if __name__ == "__main__":

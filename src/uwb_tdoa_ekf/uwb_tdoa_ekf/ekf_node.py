@@ -25,21 +25,19 @@ from rclpy.time import Time
 from sensor_msgs.msg import Imu
 from std_srvs.srv import Trigger
 
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flyable import FlyableVolume
+from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_bias.effects import AidCorrector, EffectSet, ImuCorrector
 from uwb_tdoa_bias.effects.tag import TagLeverArm
-from uwb_tdoa_bias.foundation import ros
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.flyable import FlyableVolume
-from uwb_tdoa_bias.foundation.ros_anchors import AnchorsInput
-from uwb_tdoa_bias.foundation.ros_cdr import CdrCodec, message_class
-from uwb_tdoa_bias.foundation.ros_diagnostics import Diagnostics
-from uwb_tdoa_bias.foundation.ros_frames import FramesInput, unknown_frame
-from uwb_tdoa_bias.foundation.ros_node import StreamNode
-from uwb_tdoa_bias.foundation.ros_parameters import files_of, refuse_unknown, say_unused
-from uwb_tdoa_bias.foundation.ros_stamps import Epoch
-from uwb_tdoa_bias.foundation.ros_streams import RoundRobin, Streams
-from uwb_tdoa_bias.foundation.ros_topics import Input, Refusals, several_publishers
-from uwb_tdoa_bias.foundation.sensors import SENSORS
+from uwb_tdoa_bias.ros import process
+from uwb_tdoa_bias.ros.anchors import AnchorsInput
+from uwb_tdoa_bias.ros.cdr import CdrCodec, message_class
+from uwb_tdoa_bias.ros.diagnostics import Diagnostics
+from uwb_tdoa_bias.ros.frames import FramesInput, unknown_frame
+from uwb_tdoa_bias.ros.node import RoundRobin, StreamNode, Streams
+from uwb_tdoa_bias.ros.parameters import files_of, refuse_unknown, say_unused
+from uwb_tdoa_bias.ros.topics import Epoch, Input, Refusals, several_publishers
 from uwb_tdoa_msgs.msg import TdoaCorrected
 
 from .core.verdicts import INVALID
@@ -62,8 +60,8 @@ if TYPE_CHECKING:
 
     from rclpy.clock import ROSClock
 
-    from uwb_tdoa_bias.foundation.anchors import Anchors
-    from uwb_tdoa_bias.foundation.ros_diagnostics import Report
+    from uwb_tdoa_bias.common.anchors import Anchors
+    from uwb_tdoa_bias.ros.diagnostics import Report
 
     from .core.config import FilterConfig
     from .results import Odometry
@@ -587,7 +585,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         for sensor in SENSORS.values()
         for topic, kind in sensor.topics
     )
-    return ros.run(EkfNode, __doc__.replace("SENSORS", ",\n".join(topics)), argv)
+    return process.run(EkfNode, __doc__.replace("SENSORS", ",\n".join(topics)), argv)
 
 
 if __name__ == "__main__":

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.common.compiled import Record, compiled
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.stamps import LARGEST_STEP_BACK
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_bias.foundation.compiled import Record, compiled
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.stamps import LARGEST_STEP_BACK
 
 from .core import aids
 from .core.config import FilterConfig
@@ -34,8 +34,8 @@ from .streams import Steady
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
-    from uwb_tdoa_bias.foundation.anchors import Anchors
-    from uwb_tdoa_bias.foundation.sensors import Stream
+    from uwb_tdoa_bias.common.anchors import Anchors
+    from uwb_tdoa_bias.common.sensors import Stream
 
     from .pipeline import Fed
     from .reorder_buffer import Restart

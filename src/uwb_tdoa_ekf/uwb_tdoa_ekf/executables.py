@@ -1,6 +1,6 @@
 """The entry points that setup.py names."""
 
-from uwb_tdoa_bias.foundation.executable import node_executable
+from uwb_tdoa_bias.common.executable import node_executable
 
 compile_nodes = node_executable("uwb_tdoa_ekf.compile_nodes")
 debias_node = node_executable("uwb_tdoa_ekf.debias_node")

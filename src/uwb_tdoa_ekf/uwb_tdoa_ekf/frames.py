@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.common.compiled import compiled
+from uwb_tdoa_bias.common.sensors.sensor import UNKNOWN_VARIANCE
 from uwb_tdoa_bias.correction.poses import known_yaw_std
-from uwb_tdoa_bias.foundation.compiled import compiled
-from uwb_tdoa_bias.foundation.sensors.sensor import UNKNOWN_VARIANCE
 
 from .core.state import rotation
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.anchors import SAME_PLACE, Anchors
+from uwb_tdoa_bias.common.anchors import SAME_PLACE, Anchors
 
 from .core.memory import FilterState, Floor, new_state
 

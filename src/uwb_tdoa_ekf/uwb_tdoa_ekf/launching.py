@@ -17,9 +17,9 @@ import socket
 import yaml
 
 from uwb_tdoa_bias import anchors_node, bias_node
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.files import folder_of_process, write_text
-from uwb_tdoa_bias.foundation.safe_yaml import read_yaml
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.files import folder_of_process, write_text
+from uwb_tdoa_bias.common.safe_yaml import read_yaml
 
 from . import debias_node
 from .ekf_parameters import names_of_parameters

@@ -11,8 +11,8 @@ from launch.actions import LogInfo, OpaqueFunction, TimerAction
 import launch.logging
 from launch_ros.actions import Node
 
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.executable import leave_present_folder_out
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.executable import leave_present_folder_out
 
 from .launching import Lives, discovery, network
 

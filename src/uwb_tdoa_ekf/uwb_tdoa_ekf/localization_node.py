@@ -24,18 +24,17 @@ from diagnostic_msgs.msg import DiagnosticStatus
 
 from uwb_tdoa_bias import bias_node
 from uwb_tdoa_bias.bias_node import BiasNode
-from uwb_tdoa_bias.foundation import ros
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.ros_diagnostics import Diagnostics
-from uwb_tdoa_bias.foundation.ros_node import StreamNode
-from uwb_tdoa_bias.foundation.ros_parameters import (
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.ros import process
+from uwb_tdoa_bias.ros.diagnostics import Diagnostics
+from uwb_tdoa_bias.ros.node import Handed, RoundRobin, StreamNode
+from uwb_tdoa_bias.ros.parameters import (
     FROZEN,
     Parameter,
     declare_all,
     files_of,
     say_unused,
 )
-from uwb_tdoa_bias.foundation.ros_streams import Handed, RoundRobin
 
 from .ekf_node import EkfNode
 from .ekf_parameters import names_of_parameters
@@ -43,7 +42,7 @@ from .ekf_parameters import names_of_parameters
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from uwb_tdoa_bias.foundation.ros_diagnostics import Report
+    from uwb_tdoa_bias.ros.diagnostics import Report
 
 PARAMETERS = {
     "tags": Parameter(
@@ -247,7 +246,7 @@ def _for_all(arguments: list[str]) -> list[str]:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the node; returns the exit code."""
-    return ros.run(LocalizationNode, __doc__, argv)
+    return process.run(LocalizationNode, __doc__, argv)
 
 
 if __name__ == "__main__":

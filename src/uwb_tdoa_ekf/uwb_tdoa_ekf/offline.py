@@ -26,7 +26,7 @@ from .results import VERDICTS, Odometry, Residuals
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_bias.common.flight import Flight
 
     from .pipeline import Fed
 

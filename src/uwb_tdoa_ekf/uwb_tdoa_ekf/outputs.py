@@ -11,11 +11,11 @@ from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
 from tf2_msgs.msg import TFMessage
 
-from uwb_tdoa_bias.foundation.later import rotations
-from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS as STATUS_QOS
-from uwb_tdoa_bias.foundation.ros_cdr import CdrCodec
-from uwb_tdoa_bias.foundation.ros_frames import TF_QOS
-from uwb_tdoa_bias.foundation.ros_streams import StreamOutput
+from uwb_tdoa_bias.common.lazy import rotations
+from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS as STATUS_QOS
+from uwb_tdoa_bias.ros.cdr import CdrCodec
+from uwb_tdoa_bias.ros.frames import TF_QOS
+from uwb_tdoa_bias.ros.node import StreamOutput
 from uwb_tdoa_msgs.msg import EstimatorStatus, TdoaResidual
 
 from .ekf_parameters import NONE, ODOM
@@ -24,9 +24,9 @@ from .frames import pose_and_twist
 if TYPE_CHECKING:
     import numpy as np
 
-    from uwb_tdoa_bias.foundation.ros_node import StreamNode
-    from uwb_tdoa_bias.foundation.ros_stamps import Epoch
-    from uwb_tdoa_bias.foundation.transforms import Frames
+    from uwb_tdoa_bias.common.transforms import Frames
+    from uwb_tdoa_bias.ros.node import StreamNode
+    from uwb_tdoa_bias.ros.topics import Epoch
 
     from .monitoring.status import Status
     from .results import Residuals

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError
 
 if TYPE_CHECKING:
     from geometry_msgs.msg import PoseWithCovarianceStamped
 
-    from uwb_tdoa_bias.foundation.ros_stamps import Epoch
+    from uwb_tdoa_bias.ros.topics import Epoch
 
 LARGEST = 1e16  # the square of what is far for an anchor, m^2
 

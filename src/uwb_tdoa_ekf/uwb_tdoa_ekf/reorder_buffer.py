@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import compiled
-from uwb_tdoa_bias.foundation.sensors import LOCATING
-from uwb_tdoa_bias.foundation.stamps import (
+from uwb_tdoa_bias.common.compiled import compiled
+from uwb_tdoa_bias.common.sensors import LOCATING
+from uwb_tdoa_bias.common.stamps import (
     CONTRADICTED,
     LARGEST_STEP_BACK,
     StampGate,

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.lib.recfunctions import repack_fields
 
+from uwb_tdoa_bias.common.compiled import compiled
 from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_bias.foundation.compiled import compiled
 
 from .core import auxiliary
 from .core.config import FilterConfig
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
     from scipy.sparse import csr_array
 
-    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_bias.common.flight import Flight
 
 TDOAS, RANGES = (
     "tdoa",

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import compiled
+from uwb_tdoa_bias.common.compiled import compiled
 
 from .core import auxiliary, plane
 from .core.config import FilterConfig
@@ -26,9 +26,9 @@ from .offline import may_have_offset, run_offline, without_offset
 from .results import Odometry
 
 if TYPE_CHECKING:
+    from uwb_tdoa_bias.common.compiled import Record
+    from uwb_tdoa_bias.common.flight import Flight
     from uwb_tdoa_bias.correction.corrector import Corrector
-    from uwb_tdoa_bias.foundation.compiled import Record
-    from uwb_tdoa_bias.foundation.flight import Flight
 
     from .offline import Run
 

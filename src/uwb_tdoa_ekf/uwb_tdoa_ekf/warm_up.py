@@ -8,8 +8,8 @@ from functools import cache
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.sensors import SENSORS
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.sensors import SENSORS
 
 from .estimator import Estimator
 from .frames import pose_and_twist, rotation_std

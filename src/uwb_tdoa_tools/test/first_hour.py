@@ -14,9 +14,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from walking import blocks, section, write_tables
 
+from uwb_tdoa_bias.common.flight import Flight
+from uwb_tdoa_bias.common.survey import read_survey
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
-from uwb_tdoa_bias.foundation.flight import Flight
-from uwb_tdoa_bias.foundation.survey import read_survey
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools import command_lines
 from uwb_tdoa_tools.calibrating import between

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.flight import Truth
+from uwb_tdoa_bias.common.flight import Truth
 
 
 def truth_of(*legs, rate=100.0):

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from uwb_tdoa_bias.common.sensors import BY_POSE, COMPARED
 from uwb_tdoa_bias.effects import EFFECTS, Track
-from uwb_tdoa_bias.foundation.sensors import BY_POSE, COMPARED
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.constraints import Mark
 from uwb_tdoa_tools.diagnosis.references import GroundTruth

@@ -8,7 +8,7 @@ import json
 from nav_msgs.msg import Odometry
 from std_msgs.msg import String
 
-from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS
+from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS
 from uwb_tdoa_tools.live.processes import Processes, own_domain, wait
 from uwb_tdoa_tools.live.session import session
 

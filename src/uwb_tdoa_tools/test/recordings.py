@@ -5,8 +5,8 @@ import zlib
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas, Truth
 
 ANCHORS = Anchors(
     [0, 1, 5],

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.effects.stamps import shifted
-from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.readers import inputs
 from uwb_tdoa_tools.scoring.alignment import (

@@ -17,8 +17,8 @@ import pytest
 from recordings import differences, small_flight
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.sensors import Height, Pressure, Velocity
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.sensors import Height, Pressure, Velocity
 from uwb_tdoa_tools.bags import mcap
 from uwb_tdoa_tools.bags.bag import read_bag, write_bag
 from uwb_tdoa_tools.bags.files import messages, open_bag

@@ -17,8 +17,8 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from test_bag_damage import chunked, data_file, forget_sum
 import yaml
 
-from uwb_tdoa_bias.foundation import limits
-from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.common import limits
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_tools.bags import integrity, mcap
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag
 from uwb_tdoa_tools.bags.files import messages, open_bag
@@ -441,10 +441,10 @@ def test_an_interrupt_ends_a_walk_through_a_database(tables):
     bag, _ = tables
     shared_children(data_file(bag), "topics")
     code = (
-        "import sys; from uwb_tdoa_bias.foundation import limits; limits.SECONDS = 1e9\n"
+        "import sys; from uwb_tdoa_bias.common import limits; limits.SECONDS = 1e9\n"
         "from uwb_tdoa_tools.bags import integrity; integrity.Budget.is_late = lambda self: "
         "print('walks', flush=True)\n"
-        "from uwb_tdoa_bias.foundation.executable import executable\n"
+        "from uwb_tdoa_bias.common.executable import executable\n"
         "sys.exit(executable('uwb_tdoa_tools.commands.check')())"
     )
     check = subprocess.Popen(

@@ -8,12 +8,12 @@ from recordings import small_flight
 from scipy.spatial.transform import Rotation
 from test_bag import write_topics
 
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flight import Imu
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.tag import TagLeverArm
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.flight import Imu
 from uwb_tdoa_ekf.imu_mount import ImuMount
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.bags import bag

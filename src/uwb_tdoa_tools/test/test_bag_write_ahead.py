@@ -8,7 +8,7 @@ import sqlite3
 import pytest
 from recordings import differences, small_flight
 
-from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_tools.bags.bag import read_bag, write_bag
 from uwb_tdoa_tools.bags.files import messages, open_bag
 from uwb_tdoa_tools.readers import inputs

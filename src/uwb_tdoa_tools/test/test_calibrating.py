@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from test_bag_odometry import ODOMETRY, bag_of
 
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.flight import Tdoas, Truth
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.flight import Tdoas, Truth
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import without_offset
 from uwb_tdoa_ekf.streams import ERROR, Finding

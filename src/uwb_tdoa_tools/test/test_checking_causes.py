@@ -11,12 +11,12 @@ from checking_flights import recording
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas
-from uwb_tdoa_bias.foundation.geometry import tdoa
-from uwb_tdoa_bias.foundation.sensors import Ranges
-from uwb_tdoa_bias.foundation.survey_faults import UNITS
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas
+from uwb_tdoa_bias.common.geometry import tdoa
+from uwb_tdoa_bias.common.sensors import Ranges
+from uwb_tdoa_bias.common.survey import UNITS
 from uwb_tdoa_tools.checking import imu_rules
 from uwb_tdoa_tools.checking.check import check, sensor_findings
 from uwb_tdoa_tools.checking.ordered import OrderedRecording

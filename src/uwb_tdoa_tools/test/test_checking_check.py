@@ -8,7 +8,7 @@ from mistakes import MISTAKES
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.foundation.flight import Tdoas
+from uwb_tdoa_bias.common.flight import Tdoas
 from uwb_tdoa_tools.bags.bag import read_bag, write_bag
 from uwb_tdoa_tools.checking.check import check, different_surveys, sensor_findings, upright
 from uwb_tdoa_tools.checking.recording import of_flight, read_recording

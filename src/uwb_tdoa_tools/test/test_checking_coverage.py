@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_ekf.streams import StreamRules
 from uwb_tdoa_tools.checking import coverage
 

@@ -7,7 +7,7 @@ from number_faults import FAULTS
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.foundation.flight import Truth
+from uwb_tdoa_bias.common.flight import Truth
 from uwb_tdoa_tools.checking.flight_rules import judge_against_truth, judge_flight, judge_truth
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from uwb_tdoa_bias.foundation.flight import Flight, Imu
+from uwb_tdoa_bias.common.flight import Flight, Imu
 from uwb_tdoa_tools.checking import imu_rules
 from uwb_tdoa_tools.checking.imu_rules import clipped_axes, is_smooth
 from uwb_tdoa_tools.checking.ordered import OrderedRecording

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.foundation.geometry import tdoa
+from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_tools.checking.ordered import SurveyFit, displacement
 from uwb_tdoa_tools.checking.tdoa_rules import SAME, gained
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from recordings import SURVEY, csv_text, small_flight
 
-from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.checking.recording import IMU, TDOA, of_flight, read_recording
 from uwb_tdoa_tools.readers.inputs import Reading

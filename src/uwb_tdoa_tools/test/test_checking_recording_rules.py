@@ -7,7 +7,7 @@ import pytest
 from recordings import ANCHORS, small_flight
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.foundation.flight import Tdoas
+from uwb_tdoa_bias.common.flight import Tdoas
 from uwb_tdoa_tools.checking import recording_rules
 from uwb_tdoa_tools.checking.check import check
 from uwb_tdoa_tools.checking.recording import IMU, TDOA, of_flight

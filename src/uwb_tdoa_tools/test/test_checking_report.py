@@ -6,9 +6,9 @@ import json
 import numpy as np
 import pytest
 
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.effects import EFFECTS
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.checking.report import survey_remarks
 from uwb_tdoa_tools.commands import diagnose, evaluate, inject

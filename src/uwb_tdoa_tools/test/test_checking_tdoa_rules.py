@@ -6,7 +6,7 @@ from checking_flights import recording
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_tools.checking import tdoa_rules
 from uwb_tdoa_tools.checking.ordered import LONG, SPREAD, OrderedRecording, spread
 

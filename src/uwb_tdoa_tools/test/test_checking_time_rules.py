@@ -7,8 +7,8 @@ from number_faults import FAULTS
 import numpy as np
 import pytest
 
+from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_bias.effects import true_samples
-from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_tools.checking.pair_rules import KnownPath
 from uwb_tdoa_tools.checking.time_rules import delays, wrong_stamps
 

@@ -5,7 +5,7 @@ import sys
 
 import pytest
 
-from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_tools import cli
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from recordings import ANCHORS, SURVEY
 
-from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_tools.commands.convert import main
 from uwb_tdoa_tools.readers import read_flight, read_survey
 from uwb_tdoa_tools.readers.columns import TIME, UNITS, parse_columns, read_columns

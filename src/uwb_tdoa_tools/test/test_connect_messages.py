@@ -20,7 +20,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy  # noqa: E
 from sensor_msgs.msg import Imu  # noqa: E402
 from walking import blocks, section  # noqa: E402
 
-from uwb_tdoa_bias.foundation.anchors import Anchors  # noqa: E402
+from uwb_tdoa_bias.common.anchors import Anchors  # noqa: E402
 from uwb_tdoa_ekf.streams import ERROR, StreamRules  # noqa: E402
 from uwb_tdoa_msgs.msg import AnchorArray, Tdoa  # noqa: E402
 

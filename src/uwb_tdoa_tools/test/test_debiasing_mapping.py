@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.debiasing.mapping import part_of, static_parts
 from uwb_tdoa_tools.scoring.evaluation import evaluate

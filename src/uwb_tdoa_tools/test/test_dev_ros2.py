@@ -25,7 +25,7 @@ from rcl_interfaces.msg import (
 )  # noqa: E402
 from rclpy.qos import QoSProfile, ReliabilityPolicy  # noqa: E402
 
-from uwb_tdoa_bias.foundation.ros_parameters import Parameter, declare_all  # noqa: E402
+from uwb_tdoa_bias.ros.parameters import Parameter, declare_all  # noqa: E402
 from uwb_tdoa_msgs.msg import Tdoa, TdoaResidual  # noqa: E402
 
 ROOT = Path(__file__).resolve().parents[3]

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from test_diagnosis_regression import named, table_with
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.effects import EFFECTS
-from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_ekf.evidence import MOVED, POSITION, Part, eliminated, with_each_change
 from uwb_tdoa_tools.diagnosis import deviations
 from uwb_tdoa_tools.diagnosis.regression.confounding import alternatives, unobservable

@@ -4,8 +4,8 @@ from known_effects import clean_flight, effect_of
 import numpy as np
 import pytest
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
-from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_tools.diagnosis.attribution import attribute, near_floor, on_floor
 from uwb_tdoa_tools.diagnosis.channels import CHANNELS, residuals
 from uwb_tdoa_tools.diagnosis.detectors import DETECTORS

@@ -4,9 +4,9 @@ from known_effects import clean_flight, effect_of, marks_of
 import numpy as np
 import pytest
 
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_bias.effects.truth import TruthTimeOffset
-from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.diagnosis import diagnose, output
 from uwb_tdoa_tools.diagnosis.references import REFERENCES, GroundTruth, Heights, Marks, Nothing
 from uwb_tdoa_tools.scoring.evaluation import evaluate

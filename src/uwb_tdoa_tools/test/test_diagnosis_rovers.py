@@ -5,8 +5,8 @@ that are those of the written model.
 import numpy as np
 import pytest
 
+from uwb_tdoa_bias.common.flight import Tdoas
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
-from uwb_tdoa_bias.foundation.flight import Tdoas
 from uwb_tdoa_tools.diagnosis.attribution import attribute
 from uwb_tdoa_tools.diagnosis.channels.inertial import _turns
 from uwb_tdoa_tools.diagnosis.references import GroundTruth

@@ -6,10 +6,10 @@ import pytest
 from scipy.stats import chi2
 import yaml
 
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.correction.network import load_network
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
 from uwb_tdoa_bias.effects.stamps import shifted
-from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.bags.bag import write_bag

@@ -17,8 +17,8 @@ from first_hour import (
 import pytest
 from walking import blocks, commands, main, run
 
+from uwb_tdoa_bias.common.survey import read_survey
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_bias.foundation.survey import read_survey
 
 CHECKED = (
     ("simulated", "in time"),

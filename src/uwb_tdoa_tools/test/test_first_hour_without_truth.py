@@ -21,7 +21,7 @@ import pytest
 from recordings import log_bytes
 from walking import blocks, commands, main, run, section
 
-from uwb_tdoa_bias.foundation.survey import read_survey
+from uwb_tdoa_bias.common.survey import read_survey
 
 
 def ended(name, words):

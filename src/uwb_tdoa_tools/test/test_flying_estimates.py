@@ -8,7 +8,7 @@ from documented import ROOT
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_tools.flying import estimates
 from uwb_tdoa_tools.flying.mission import Circles
 from uwb_tdoa_tools.flying.trial import Task, fly

@@ -10,8 +10,8 @@ pytest.importorskip("uwb_tdoa_msgs.msg", reason="needs the built workspace: ./de
 from nav_msgs.msg import Odometry  # noqa: E402
 from rclpy.serialization import serialize_message  # noqa: E402
 
-from uwb_tdoa_bias.foundation.flight import Imu, Tdoas  # noqa: E402
-from uwb_tdoa_bias.foundation.ros_node import StreamNode  # noqa: E402
+from uwb_tdoa_bias.common.flight import Imu, Tdoas  # noqa: E402
+from uwb_tdoa_bias.ros.node import StreamNode  # noqa: E402
 from uwb_tdoa_msgs.msg import EstimatorStatus  # noqa: E402
 from uwb_tdoa_tools.flying.over_topics import (  # noqa: E402
     IMPATIENCE,

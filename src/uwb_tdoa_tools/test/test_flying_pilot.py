@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_tools.flying.estimates import OwnFilter
 from uwb_tdoa_tools.flying.mission import DONE, SETTLE, SINK

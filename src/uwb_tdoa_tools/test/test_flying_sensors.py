@@ -3,8 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.foundation.flight import Imu, Tdoas
-from uwb_tdoa_bias.foundation.radio import arrival_bias
+from uwb_tdoa_bias.common.flight import Imu, Tdoas
+from uwb_tdoa_bias.common.radio import arrival_bias
 from uwb_tdoa_tools.flying.sensors import AIDS, InertialErrors, Radio, gusts
 from uwb_tdoa_tools.flying.simulator import IMU_RATE, SensorReadings, Transport
 from uwb_tdoa_tools.flying.world import HALL, WORLDS

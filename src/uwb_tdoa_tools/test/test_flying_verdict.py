@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.foundation.flight import Truth
+from uwb_tdoa_bias.common.flight import Truth
 from uwb_tdoa_ekf.results import Odometry
 from uwb_tdoa_tools.flying.mission import DONE, REFUSED
 from uwb_tdoa_tools.flying.verdict import summary, text, verdict_of

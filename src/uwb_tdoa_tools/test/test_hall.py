@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet, SmoothTerm
-from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_tools.checking import pair_rules, tdoa_rules, time_rules
 from uwb_tdoa_tools.checking.check import check
 from uwb_tdoa_tools.checking.ordered import SHORT, OrderedRecording

@@ -2,9 +2,9 @@ from known_effects import with_yaw_rate
 import numpy as np
 import pytest
 
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.sensors import DIAGNOSED, measured_on
 from uwb_tdoa_bias.effects import EFFECTS, RADIO, EffectSet, true_samples
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.sensors import DIAGNOSED, measured_on
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands.inject import main
 from uwb_tdoa_tools.readers import read_flight

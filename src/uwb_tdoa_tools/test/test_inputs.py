@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 from recordings import ANCHORS, ROWS, SURVEY, log_bytes, small_flight
 
-from uwb_tdoa_bias.foundation.arrays_file import read_arrays
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.files import read_bytes, temporary_folder
-from uwb_tdoa_bias.foundation.flight import Tdoas
-from uwb_tdoa_bias.foundation.limits import FOLDER_DEPTH, TooMuch
-from uwb_tdoa_bias.foundation.safe_yaml import read_yaml
-from uwb_tdoa_bias.foundation.survey import read_survey
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.files import read_arrays, read_bytes, temporary_folder
+from uwb_tdoa_bias.common.flight import Tdoas
+from uwb_tdoa_bias.common.limits import FOLDER_DEPTH, TooMuch
+from uwb_tdoa_bias.common.safe_yaml import read_yaml
+from uwb_tdoa_bias.common.survey import read_survey
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.bags.files import messages, new_bag, open_bag
 from uwb_tdoa_tools.bags.message_types import typestore
@@ -312,7 +311,7 @@ def test_a_folder_that_a_killed_process_left_is_removed_by_the_next(tmp_path, mo
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     code = (
         "import tempfile, sys; tempfile.tempdir = sys.argv[1]\n"
-        "from uwb_tdoa_bias.foundation.files import temporary_folder\n"
+        "from uwb_tdoa_bias.common.files import temporary_folder\n"
         "with temporary_folder() as folder: print(folder, flush=True); sys.stdin.read()"
     )
     killed = subprocess.Popen(

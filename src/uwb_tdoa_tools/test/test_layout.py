@@ -23,11 +23,11 @@ PACKAGES = ORDER[1:]
 # Who talks ROS. Everything else can be imported and tested without it.
 ROS = """
     uwb_tdoa_bias.anchors_node uwb_tdoa_bias.bias_node
-    uwb_tdoa_bias.foundation.ros uwb_tdoa_bias.foundation.ros_anchors uwb_tdoa_bias.foundation.ros_cdr
-    uwb_tdoa_bias.foundation.ros_diagnostics uwb_tdoa_bias.foundation.ros_frames uwb_tdoa_bias.foundation.ros_node
-    uwb_tdoa_bias.foundation.ros_parameters
-    uwb_tdoa_bias.foundation.ros_spinning uwb_tdoa_bias.foundation.ros_stamps uwb_tdoa_bias.foundation.ros_streams
-    uwb_tdoa_bias.foundation.ros_topics
+    uwb_tdoa_bias.ros.process uwb_tdoa_bias.ros.anchors uwb_tdoa_bias.ros.cdr
+    uwb_tdoa_bias.ros.diagnostics uwb_tdoa_bias.ros.frames uwb_tdoa_bias.ros.node
+    uwb_tdoa_bias.ros.parameters
+    uwb_tdoa_bias.ros.process uwb_tdoa_bias.ros.topics uwb_tdoa_bias.ros.node
+    uwb_tdoa_bias.ros.topics
     uwb_tdoa_ekf.debias_node uwb_tdoa_ekf.ekf_node uwb_tdoa_ekf.ekf_parameters
     uwb_tdoa_ekf.launching
     uwb_tdoa_ekf.launching_actions uwb_tdoa_ekf.localization_node uwb_tdoa_ekf.outputs
@@ -112,7 +112,7 @@ def ours(module, top_only=False):
 
 
 def test_the_walk_sees_what_there_is():
-    assert "uwb_tdoa_bias.foundation.errors" in imports("uwb_tdoa_tools.cli")
+    assert "uwb_tdoa_bias.common.errors" in imports("uwb_tdoa_tools.cli")
     assert "uwb_tdoa_tools.options" in imports("uwb_tdoa_tools.commands.train")
     assert "rclpy" in imports("uwb_tdoa_tools.planning.report")
     assert "rclpy" not in imports("uwb_tdoa_tools.planning.report", True)
@@ -180,11 +180,11 @@ def folder_of(module):
     return ".".join(parts[:2]) if (SRC / parts[0] / Path(*parts[:2])).is_dir() else ""
 
 
-def test_the_foundation_stands_alone():
+def test_the_common_types_stand_alone():
     for module in modules():
-        if module.startswith("uwb_tdoa_bias.foundation"):
+        if module.startswith("uwb_tdoa_bias.common"):
             for name in ours(module):
-                assert name.startswith("uwb_tdoa_bias.foundation"), f"{module} imports {name}"
+                assert name.startswith("uwb_tdoa_bias.common"), f"{module} imports {name}"
 
 
 def test_nothing_imports_studies_and_they_import_no_command():

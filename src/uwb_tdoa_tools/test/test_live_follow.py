@@ -11,7 +11,7 @@ from rclpy.serialization import serialize_message  # noqa: E402
 from sensor_msgs.msg import Imu, TimeReference  # noqa: E402
 from std_msgs.msg import Float64  # noqa: E402
 
-from uwb_tdoa_bias.foundation.errors import InputError  # noqa: E402
+from uwb_tdoa_bias.common.errors import InputError  # noqa: E402
 from uwb_tdoa_ekf.ekf_parameters import PARAMETERS  # noqa: E402
 from uwb_tdoa_ekf.reorder_buffer import OF_AIDS, SILENT  # noqa: E402
 from uwb_tdoa_msgs.msg import TdoaResidual  # noqa: E402

@@ -4,7 +4,7 @@ import json
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_ekf.core.verdicts import REJECTED, USED
 from uwb_tdoa_ekf.offline import without_offset
 from uwb_tdoa_ekf.results import Odometry, Residuals

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
-from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_tools.bags.message_types import OUR_TYPES, add_type, typestore
 
 PREFIXES = [

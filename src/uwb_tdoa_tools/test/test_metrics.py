@@ -4,7 +4,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.foundation.flight import Truth
+from uwb_tdoa_bias.common.flight import Truth
 from uwb_tdoa_ekf.core.verdicts import INVALID, LATE, REJECTED, STARTUP, USED
 from uwb_tdoa_tools.evaluating import line_of_run
 from uwb_tdoa_tools.scoring.metrics import (

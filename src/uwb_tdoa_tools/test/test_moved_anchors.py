@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.anchor import AnchorDelay, AnchorPosition
 from uwb_tdoa_bias.effects.effect_set import Covariance
-from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_ekf.evidence import keys_of
 from uwb_tdoa_ekf.results import concatenated, rows_of
 from uwb_tdoa_ekf.streams import ERROR, WARNING, Finding

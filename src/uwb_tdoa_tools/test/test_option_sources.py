@@ -10,8 +10,8 @@ import yaml
 
 pytest.importorskip("rclpy")  # of demo
 
+from uwb_tdoa_bias.common.survey import read_survey  # noqa: E402
 from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, Covariance, EffectSet, TagLeverArm  # noqa: E402
-from uwb_tdoa_bias.foundation.survey import read_survey  # noqa: E402
 from uwb_tdoa_tools.bags.bag import read_bag, write_bag  # noqa: E402
 from uwb_tdoa_tools.commands import (
     check,

@@ -13,9 +13,9 @@ from documented import ROOT
 import pytest
 import yaml
 
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.text import version, written_by
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.version import version, written_by
 from uwb_tdoa_tools import cli
 
 PACKAGES = sorted(path.parent for path in (ROOT / "src").glob("*/package.xml"))

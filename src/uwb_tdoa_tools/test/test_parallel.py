@@ -14,7 +14,7 @@ import time
 
 import pytest
 
-from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_tools import cli, parallel
 from uwb_tdoa_tools.parallel import Progress
 

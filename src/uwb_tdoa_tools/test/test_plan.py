@@ -8,8 +8,8 @@ import time
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.flyable import FlyableVolume
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.flyable import FlyableVolume
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.commands import plan
 from uwb_tdoa_tools.planning import optimisation, run

@@ -6,7 +6,7 @@ import json
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_tools.commands.plan import main
 from uwb_tdoa_tools.planning.hall import Hall
 from uwb_tdoa_tools.planning.installation import Installation

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.antenna import DWM1000_AZIMUTH, Antenna
-from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.radio import DWM1000_AZIMUTH, Antenna
 from uwb_tdoa_tools.planning.installation import (
     FixedNoise,
     Installation,

@@ -3,7 +3,7 @@ import time
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_tools.bags.files import open_bag
 from uwb_tdoa_tools.bags.message_types import typestore
 from uwb_tdoa_tools.planning.bifurcation import Subsets

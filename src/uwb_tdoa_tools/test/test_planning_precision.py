@@ -8,8 +8,8 @@ import pytest
 from scipy.linalg import cho_factor, cho_solve
 from scipy.ndimage import median_filter
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.geometry import tdoa
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_tools.planning import maps
 from uwb_tdoa_tools.planning.installation import (
     PAIRINGS,

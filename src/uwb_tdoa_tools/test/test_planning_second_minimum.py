@@ -9,8 +9,8 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.stats import norm
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_tools.planning.hall import Hall
 from uwb_tdoa_tools.planning.installation import FixedNoise, Installation, RadioNoise, all_pairs
 from uwb_tdoa_tools.planning.layout import Goal

@@ -11,7 +11,7 @@ pytest.importorskip("uwb_tdoa_msgs.msg")
 
 from uwb_tdoa_bias.anchors_node import AnchorsNode  # noqa: E402
 from uwb_tdoa_bias.bias_node import BiasNode  # noqa: E402
-from uwb_tdoa_bias.foundation.anchors import Anchors  # noqa: E402
+from uwb_tdoa_bias.common.anchors import Anchors  # noqa: E402
 from uwb_tdoa_ekf.debias import BiasMap  # noqa: E402
 from uwb_tdoa_ekf.debias_node import DebiasNode  # noqa: E402
 from uwb_tdoa_ekf.ekf_node import EkfNode  # noqa: E402

@@ -11,13 +11,13 @@ import sys
 
 import pytest
 
-from uwb_tdoa_bias.foundation.executable import PATHS
+from uwb_tdoa_bias.common.executable import PATHS
 
 ROOT = Path(__file__).resolve().parents[3]
 CLEAN = {"HOME": os.environ.get("HOME", "/"), "PATH": "/usr/bin:/bin"}
 SHELLS = [shell for shell in ("bash", "zsh") if shutil.which(shell)]
 START = (
-    "import sys; from uwb_tdoa_bias.foundation.executable import executable; "
+    "import sys; from uwb_tdoa_bias.common.executable import executable; "
     "sys.exit(executable('{}')())"
 )
 PROFILES = """<?xml version="1.0" encoding="UTF-8" ?>

@@ -15,8 +15,8 @@ from documented import ROOT
 import numpy as np
 import pytest
 
+from uwb_tdoa_bias.common.survey import read_survey
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_bias.foundation.survey import read_survey
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.streams import Finding
 from uwb_tdoa_tools import command_lines

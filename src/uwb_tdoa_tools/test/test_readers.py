@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from recordings import ANCHORS, SURVEY, csv_text, log_bytes, small_flight
 
-from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.readers import read_flight
 

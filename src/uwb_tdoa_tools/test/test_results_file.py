@@ -4,7 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_tools import results_file
 from uwb_tdoa_tools.results_file import ResultsFile, fingerprint_of, settings_of
 

@@ -8,7 +8,7 @@ import pytest
 from walking import blocks, section
 import yaml
 
-from uwb_tdoa_bias.foundation.sensors import SENSORS
+from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.ekf_parameters import names_of_parameters
 from uwb_tdoa_tools.commands import calibrate, check, diagnose, evaluate, simulate

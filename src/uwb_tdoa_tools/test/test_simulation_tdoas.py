@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.antenna import Antenna
-from uwb_tdoa_bias.foundation.geometry import tdoa
-from uwb_tdoa_bias.foundation.radio import (
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.geometry import tdoa
+from uwb_tdoa_bias.common.radio import (
+    Antenna,
     RadioLink,
     arrival_bias,
     into_frame,

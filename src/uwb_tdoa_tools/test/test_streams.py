@@ -6,9 +6,9 @@ from known_effects import clean_flight
 import numpy as np
 import pytest
 
+from uwb_tdoa_bias.common.flight import Tdoas
+from uwb_tdoa_bias.common.sensors import Height
 from uwb_tdoa_bias.effects import Track, aid_samples
-from uwb_tdoa_bias.foundation.flight import Tdoas
-from uwb_tdoa_bias.foundation.sensors import Height
 from uwb_tdoa_tools.readers.streams import FLOW_COUNTS, FLOW_NEAREST_RANGE, flow_velocity, protocol
 from uwb_tdoa_tools.scoring.metrics import scored_phase
 

@@ -8,11 +8,11 @@ from known_effects import clean_flight
 import numpy as np
 import pytest
 
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flight import Tdoas
+from uwb_tdoa_bias.common.sensors import Ranges
+from uwb_tdoa_bias.common.survey import read_survey
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.flight import Tdoas
-from uwb_tdoa_bias.foundation.sensors import Ranges
-from uwb_tdoa_bias.foundation.survey import read_survey
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import without_offset
 from uwb_tdoa_tools.bags.bag import write_bag

@@ -3,7 +3,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_tools.readers.tables import number, read_numbers, read_table
 
 

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from training_flights import flight, without_attitude
 
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, TagLeverArm
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_tools.training.labels import (
     constellations,
     digest,

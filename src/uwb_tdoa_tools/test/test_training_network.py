@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from training_flights import flight, without_attitude
 
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.correction.features import FEATURES
 from uwb_tdoa_bias.correction.network import Network
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_tools.training import network
 from uwb_tdoa_tools.training.labels import labels, thinned
 

@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from training_flights import flight, without_attitude
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.correction.network import Network
-from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_tools.training import models, structured
 from uwb_tdoa_tools.training.labels import labels, thinned
 

@@ -7,7 +7,7 @@ import configparser
 from documented import ROOT
 import pytest
 
-WRONG = "from uwb_tdoa_bias.foundation.version import version; version() + 1"
+WRONG = "from uwb_tdoa_bias.common.text import version; version() + 1"
 
 
 def annotated():

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from recordings import ANCHORS, EVENTS, ROWS, log_bytes
 
-from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_tools.readers import read_usd_log
 
 
@@ -316,7 +316,7 @@ def test_a_folder_of_flights_does_not_say_where_compiled_code_is(tmp_path, setti
     } | {"XDG_CACHE_HOME": str(tmp_path)}
     reads = (
         "from recordings import ANCHORS; from uwb_tdoa_tools.readers import read_usd_log; "
-        "read_usd_log('flight.log', ANCHORS); from uwb_tdoa_bias.foundation import compiled; "
+        "read_usd_log('flight.log', ANCHORS); from uwb_tdoa_bias.common import compiled; "
         "assert not compiled.config.DISABLE_JIT"
     )
     environment["PYTHONPATH"] = os.pathsep.join(

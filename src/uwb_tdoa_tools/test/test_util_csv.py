@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from recordings import ANCHORS, FULL_HEADER, FULL_ROWS, csv_text
 
-from uwb_tdoa_bias.foundation import limits
-from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.common import limits
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_tools.readers import read_util_csv, util_csv
 
 SUBSET = "t_tdoa,idA,idB,tdoa_meas,t_pose,pose_x,pose_y,pose_z"

@@ -17,7 +17,7 @@ pytest.importorskip("uwb_tdoa_msgs.srv", reason="needs the built workspace: ./de
 from live_flights import hall  # noqa: E402
 from test_lockstep import load  # noqa: E402, F401
 
-from uwb_tdoa_bias.foundation.errors import InputError  # noqa: E402
+from uwb_tdoa_bias.common.errors import InputError  # noqa: E402
 from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 from uwb_tdoa_msgs.srv import GoTo, Land, Takeoff  # noqa: E402
 from uwb_tdoa_tools.flying import rover  # noqa: E402

@@ -1,4 +1,4 @@
-"""Whatever the suite writes goes through `foundation/files.py`: whole or not at all, and in UTF-8
+"""Whatever the suite writes goes through `common/files.py`: whole or not at all, and in UTF-8
 in any locale.
 """
 
@@ -21,7 +21,7 @@ SOURCES = [
     ROOT / "src" / name / name for name in ("uwb_tdoa_bias", "uwb_tdoa_ekf", "uwb_tdoa_tools")
 ] + [ROOT / "studies"]
 ELSEWHERE = {  # what is no file that a user gets at once
-    "uwb_tdoa_bias/foundation/files.py",
+    "uwb_tdoa_bias/common/files.py",
     "uwb_tdoa_tools/bags/integrity.py",  # a bag unpacked in a temporary folder
     "uwb_tdoa_tools/bags/mcap.py",  # checksums into a bag that is not yet in its place
     "uwb_tdoa_tools/results_file.py",  # grows line by line

@@ -22,10 +22,9 @@ from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
-from uwb_tdoa_bias.foundation.errors import Failure, InputError
-from uwb_tdoa_bias.foundation.files import write_text
-from uwb_tdoa_bias.foundation.foreign_text import line_of, printable
-from uwb_tdoa_bias.foundation.version import written_by
+from uwb_tdoa_bias.common.errors import Failure, InputError
+from uwb_tdoa_bias.common.files import write_text
+from uwb_tdoa_bias.common.text import line_of, printable, written_by
 
 from . import command_lines, outputs
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.sensors import LOCATING, SENSORS
-from uwb_tdoa_bias.foundation.stamps import LARGEST_STEP_BACK
+from uwb_tdoa_bias.common.sensors import LOCATING, SENSORS
+from uwb_tdoa_bias.common.stamps import LARGEST_STEP_BACK
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.foreign_text import harmless
+from uwb_tdoa_bias.common.text import harmless
 
 from . import parallel
 from .bags.bag import late_tdoas, read_odometry
@@ -33,7 +33,7 @@ from .scoring.pooling import Pool, Result
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_bias.common.flight import Flight
     from uwb_tdoa_ekf.results import Odometry, Residuals
 
     from .bags.bag import RecordedOdometry

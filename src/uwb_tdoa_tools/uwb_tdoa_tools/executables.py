@@ -1,6 +1,6 @@
 """Entry points that setup.py names: one for each file in commands/."""
 
-from uwb_tdoa_bias.foundation.executable import executable, node_executable
+from uwb_tdoa_bias.common.executable import executable, node_executable
 
 calibrate = executable("uwb_tdoa_tools.commands.calibrate")
 check = executable("uwb_tdoa_tools.commands.check")

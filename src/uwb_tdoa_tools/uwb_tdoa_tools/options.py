@@ -19,11 +19,11 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.safe_yaml import parse_yaml
+from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_bias.correction.network import load_network
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.safe_yaml import parse_yaml
-from uwb_tdoa_bias.foundation.sensors import SENSORS
 from uwb_tdoa_ekf.core.config import FilterConfig
 
 from .bags.files import STORAGES
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from argparse import ArgumentParser, Namespace
     from collections.abc import Callable, Iterable, Sequence
 
-    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_bias.common.flight import Flight
 
     from .diagnosis.constraints import Distance, Mark
 

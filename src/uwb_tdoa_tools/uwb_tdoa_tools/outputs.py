@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.files import keeping, refuse_output
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.files import keeping, refuse_output
 
 if TYPE_CHECKING:
     from argparse import Namespace

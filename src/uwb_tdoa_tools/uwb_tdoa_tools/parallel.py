@@ -26,8 +26,8 @@ import warnings
 from joblib import Parallel, cpu_count, delayed, parallel_config
 from tqdm import tqdm
 
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.executable import elsewhere
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.executable import elsewhere
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator

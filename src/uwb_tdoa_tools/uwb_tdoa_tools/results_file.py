@@ -21,10 +21,10 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 from tqdm import tqdm
 
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.files import read_bytes, refuse_output
-from uwb_tdoa_bias.foundation.limits import FOLDER_ENTRIES, Budget
-from uwb_tdoa_bias.foundation.version import written_by
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.files import read_bytes, refuse_output
+from uwb_tdoa_bias.common.limits import FOLDER_ENTRIES, Budget
+from uwb_tdoa_bias.common.text import written_by
 
 if TYPE_CHECKING:
     from argparse import Namespace

@@ -20,11 +20,11 @@ from typing import TYPE_CHECKING, Any
 from rclpy.duration import Duration
 from std_msgs.msg import String
 
-from uwb_tdoa_bias.foundation import ros
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS
-from uwb_tdoa_bias.foundation.ros_node import StreamNode
-from uwb_tdoa_bias.foundation.ros_parameters import (
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.ros import process
+from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS
+from uwb_tdoa_bias.ros.node import RoundRobin, StreamNode
+from uwb_tdoa_bias.ros.parameters import (
     FROZEN,
     Parameter,
     declare_all,
@@ -32,7 +32,6 @@ from uwb_tdoa_bias.foundation.ros_parameters import (
     refuse_unknown,
     say_unused,
 )
-from uwb_tdoa_bias.foundation.ros_streams import RoundRobin
 from uwb_tdoa_msgs.srv import GoTo, Land, Takeoff
 
 from .flying import rover
@@ -188,7 +187,7 @@ def _seconds(duration: Any) -> float:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the node; returns the exit code."""
-    return ros.run(VehicleNode, __doc__, argv)
+    return process.run(VehicleNode, __doc__, argv)
 
 
 if __name__ == "__main__":

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..foundation.compiled import compiled
-from ..foundation.geometry import rotate
+from ..common.compiled import compiled
+from ..common.geometry import rotate
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

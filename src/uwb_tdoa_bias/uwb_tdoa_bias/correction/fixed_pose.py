@@ -13,8 +13,8 @@ from .corrector import EFFECTS, Correction, Corrector
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from ..common.anchors import Anchors
     from ..effects.effect_set import EffectSet
-    from ..foundation.anchors import Anchors
 
 
 class FixedPoseCorrector(Corrector):

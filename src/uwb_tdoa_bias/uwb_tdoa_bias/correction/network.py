@@ -27,11 +27,11 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ..foundation.compiled import compiled
-from ..foundation.errors import InputError
-from ..foundation.files import read_bytes
-from ..foundation.foreign_text import harmless, printable
-from ..foundation.limits import MODEL_BYTES
+from ..common.compiled import compiled
+from ..common.errors import InputError
+from ..common.files import read_bytes
+from ..common.limits import MODEL_BYTES
+from ..common.text import harmless, printable
 from .features import NAMES, everything
 
 if TYPE_CHECKING:

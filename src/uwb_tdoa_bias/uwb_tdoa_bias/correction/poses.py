@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from ..common.compiled import compiled
 from ..effects.samples import precede
-from ..foundation.compiled import compiled
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike

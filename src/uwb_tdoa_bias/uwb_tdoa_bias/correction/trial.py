@@ -22,8 +22,8 @@ import time
 
 import numpy as np
 
-from ..foundation.files import temporary_folder
-from ..foundation.limits import (
+from ..common.files import temporary_folder
+from ..common.limits import (
     MODEL_MEMORY,
     MODEL_NODES,
     MODEL_ROW_SECONDS,

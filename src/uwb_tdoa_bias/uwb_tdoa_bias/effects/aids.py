@@ -8,19 +8,19 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from ..foundation.errors import InputError
-from ..foundation.flight import AIDS
-from ..foundation.sensors import STREAM_OF, with_measured
-from ..foundation.sensors.sensor import UNKNOWN_STD, UNKNOWN_VARIANCE
+from ..common.errors import InputError
+from ..common.flight import AIDS
+from ..common.sensors import STREAM_OF, with_measured
+from ..common.sensors.sensor import UNKNOWN_STD, UNKNOWN_VARIANCE
 from .base import IDENTITY, Affine, Effect, Row, SensorEffect, finite, require
 from .samples import Track, aid_samples
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Hashable, Sequence
 
-    from ..foundation.anchors import Anchors
-    from ..foundation.flight import Flight
-    from ..foundation.sensors.sensor import Stream
+    from ..common.anchors import Anchors
+    from ..common.flight import Flight
+    from ..common.sensors.sensor import Stream
     from .samples import AidSamples
 
 LIMITS = ("start", "end")  # s after the first TDOA

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
-from ..foundation.errors import InputError
-from ..foundation.geometry import ranges
+from ..common.errors import InputError
+from ..common.geometry import ranges
 from .base import (
     ArrivalEffect,
     Effect,
@@ -28,7 +28,7 @@ from .samples import RADIO, tile
 if TYPE_CHECKING:
     from collections.abc import Hashable, Sequence
 
-    from ..foundation.anchors import Anchors
+    from ..common.anchors import Anchors
     from .samples import Samples
 
 UNLIMITED = 1e6  # bound of stamps and places, s and m

@@ -9,16 +9,16 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
 
-from ..foundation.errors import InputError
-from ..foundation.sensors import STREAM_OF, measured_on
+from ..common.errors import InputError
+from ..common.sensors import STREAM_OF, measured_on
 from .covariates import OF_ARRIVAL, OF_TDOA, UNITS, checked_domain, fade_weight
 from .samples import RADIO, Samples, true_samples
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Hashable, Iterable, Sequence
 
-    from ..foundation.anchors import Anchors
-    from ..foundation.flight import Flight
+    from ..common.anchors import Anchors
+    from ..common.flight import Flight
 
 __all__ = ["ArrivalEffect", "Effect", "Row", "Samples"]
 

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..foundation.compiled import compiled
-from ..foundation.errors import InputError
-from ..foundation.radio import into_frame
-from ..foundation.vibration import VIBRATION_CORNER, low_pass, track_vibration
+from ..common.compiled import compiled
+from ..common.errors import InputError
+from ..common.radio import into_frame
+from ..common.vibration import VIBRATION_CORNER, low_pass, track_vibration
 from .samples import ImuSamples, tile
 
 if TYPE_CHECKING:

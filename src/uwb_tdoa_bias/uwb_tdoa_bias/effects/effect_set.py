@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import yaml
 
-from ..foundation.errors import InputError
-from ..foundation.files import write_text
-from ..foundation.flight import AIDS
-from ..foundation.safe_yaml import read_yaml
-from ..foundation.version import written_by
+from ..common.errors import InputError
+from ..common.files import write_text
+from ..common.flight import AIDS
+from ..common.safe_yaml import read_yaml
+from ..common.text import written_by
 from .aids import (
     AidCorrector,
     BarometerDrift,
@@ -58,8 +58,8 @@ from .truth import TruthFrame, TruthTimeOffset
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterator, Sequence
 
-    from ..foundation.anchors import Anchors
-    from ..foundation.flight import Flight
+    from ..common.anchors import Anchors
+    from ..common.flight import Flight
     from .samples import AidSamples, ImuSamples, Samples
 
 # In the order in which `diagnose` lists them

@@ -13,7 +13,7 @@ from .samples import tile
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ..foundation.anchors import Anchors
+    from ..common.anchors import Anchors
     from .samples import Samples
 
 PLACE = ("x", "y")

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..foundation.later import rotations
+from ..common.lazy import rotations
 from .base import FADED_BELOW, IDENTITY, Affine, Effect, Row, SensorEffect, require
 from .covariates import OF_IMU, ImuFeatures, fade_weight
 from .samples import Track
@@ -15,8 +15,8 @@ from .samples import Track
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
 
-    from ..foundation.anchors import Anchors
-    from ..foundation.flight import Flight
+    from ..common.anchors import Anchors
+    from ..common.flight import Flight
     from .samples import ImuSamples
 
 SENSORS = ("gyro", "accel")

@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..foundation.errors import InputError
+from ..common.errors import InputError
 from .base import Effect, LabelEffect, Row, listed
 from .samples import Samples
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ..foundation.anchors import Anchors
-    from ..foundation.flight import Flight
+    from ..common.anchors import Anchors
+    from ..common.flight import Flight
 
 OUTLIERS = 0.5, 5.0  # m, smallest and largest error of an injected outlier
 GRID = 0.01  # s, spacing of the random process of an injected noise_correlation

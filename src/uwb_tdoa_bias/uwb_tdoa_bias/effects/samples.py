@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 
 import numpy as np
 
-from ..foundation.anchors import Anchors
-from ..foundation.compiled import compiled
-from ..foundation.geometry import ranges, tdoa_each
-from ..foundation.later import rotations
-from ..foundation.sensors import COMPARED
+from ..common.anchors import Anchors
+from ..common.compiled import compiled
+from ..common.geometry import ranges, tdoa_each
+from ..common.lazy import rotations
+from ..common.sensors import COMPARED
 
 if TYPE_CHECKING:
-    from ..foundation.flight import Flight
+    from ..common.flight import Flight
 
 STEP = 0.1  # s, interval of the central difference that gives a velocity
 SPAN = 0.2  # s, interval of the backward differences of Motion

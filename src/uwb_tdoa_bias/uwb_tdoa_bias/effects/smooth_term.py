@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from ..foundation.compiled import compiled
-from ..foundation.errors import InputError
-from ..foundation.sensors import BY_POSE, COMPARED
+from ..common.compiled import compiled
+from ..common.errors import InputError
+from ..common.sensors import BY_POSE, COMPARED
 from .base import (
     Effect,
     Row,
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-    from ..foundation.anchors import Anchors
+    from ..common.anchors import Anchors
     from .samples import AidSamples, ImuSamples, Samples
 
 DEGREE = 2  # of splines

@@ -12,7 +12,7 @@ from .base import Effect, Row, require
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ..foundation.flight import Flight
+    from ..common.flight import Flight
     from .samples import AidSamples, Samples
 
 # The part of a row that all effects on stamps share

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..foundation.antenna import Antenna
-from ..foundation.geometry import rotate_each
-from ..foundation.radio import (
+from ..common.geometry import rotate_each
+from ..common.radio import (
     FLAT_MOUNT,
     NOMINAL_GAIN,
+    Antenna,
     RadioLink,
     into_frame,
     power_bias,
@@ -22,7 +22,7 @@ from .samples import RADIO, tile
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ..foundation.anchors import Anchors
+    from ..common.anchors import Anchors
     from .samples import Samples
 
 EXAMPLES = 4.0, 8.0  # m, distances in the advice of range_bias
@@ -223,7 +223,7 @@ class AntennaPattern(ArrivalEffect):
         ),
         reference=(
             "Qorvo support: 10 - 15 cm over direction for a module; the shape is that of "
-            "uwb_tdoa_bias.foundation.antenna"
+            "uwb_tdoa_bias.common.radio"
         ),
         confounded_with=("received_power_bias", "tag_lever_arm"),
         distinguished_by={

@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..foundation.later import rotations
-from ..foundation.sensors import DIAGNOSED
+from ..common.lazy import rotations
+from ..common.sensors import DIAGNOSED
 from .base import GeometryEffect, Row, Shift, central_differences
 from .stamps import STAMP, StampEffect
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ..foundation.anchors import Anchors
+    from ..common.anchors import Anchors
     from .samples import Samples
 
 KEYS = ("x", "y", "z", "roll", "pitch", "yaw")

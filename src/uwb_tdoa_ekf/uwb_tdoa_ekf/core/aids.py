@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import Record, compiled
-from uwb_tdoa_bias.foundation.sensors import SENSORS
+from uwb_tdoa_bias.common.compiled import Record, compiled
+from uwb_tdoa_bias.common.sensors import SENSORS
 
 from . import barometer, height, velocity
 

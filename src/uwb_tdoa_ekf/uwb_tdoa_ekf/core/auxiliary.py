@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from uwb_tdoa_bias.foundation.compiled import Record, compiled
+from uwb_tdoa_bias.common.compiled import Record, compiled
 
 from .state import ERROR_STATES
 

@@ -9,8 +9,8 @@ import math
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import Record, compiled
-from uwb_tdoa_bias.foundation.robust_loss import GEMAN_MCCLURE, weight
+from uwb_tdoa_bias.common.compiled import Record, compiled
+from uwb_tdoa_bias.common.robust_loss import GEMAN_MCCLURE, weight
 
 from .auxiliary import PRESSURE, PRESSURE_DRIFT, RANGE, depend
 from .hypotheses import alive

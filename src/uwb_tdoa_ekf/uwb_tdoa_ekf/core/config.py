@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.robust_loss import LOSSES
-from uwb_tdoa_bias.foundation.safe_yaml import read_yaml
-from uwb_tdoa_bias.foundation.sensors import SENSORS
-from uwb_tdoa_bias.foundation.sensors.sensor import parameter
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.robust_loss import LOSSES
+from uwb_tdoa_bias.common.safe_yaml import read_yaml
+from uwb_tdoa_bias.common.sensors import SENSORS
+from uwb_tdoa_bias.common.sensors.sensor import parameter
 
 ROBUST = ("innovation", "gate", "m_estimation")
 SIDES = "unknown", "below", "above", "-x", "+x", "-y", "+y"

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import compiled
+from uwb_tdoa_bias.common.compiled import compiled
 
 SMALLEST = 0.5  # m, 3D standard deviation below which it is negligible
 NEAREST = 0.1  # m, of an anchor, for its curvature

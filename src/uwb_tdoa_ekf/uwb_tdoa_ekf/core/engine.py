@@ -9,9 +9,9 @@ import math
 
 import numpy as np
 
+from uwb_tdoa_bias.common.compiled import Record, compiled
+from uwb_tdoa_bias.common.geometry import linearized_tdoa
 from uwb_tdoa_bias.effects.samples import N_STATES
-from uwb_tdoa_bias.foundation.compiled import Record, compiled
-from uwb_tdoa_bias.foundation.geometry import linearized_tdoa
 
 from . import (
     aids,

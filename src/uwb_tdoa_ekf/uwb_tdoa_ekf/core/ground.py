@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import Record, compiled
-from uwb_tdoa_bias.foundation.geometry import linearized_tdoa
+from uwb_tdoa_bias.common.compiled import Record, compiled
+from uwb_tdoa_bias.common.geometry import linearized_tdoa
 
 GRAZING = math.tan(
     math.radians(15.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import Record, compiled
+from uwb_tdoa_bias.common.compiled import Record, compiled
 
 from . import yaw_doubt
 from .state import ERROR_STATES, MOVING_STATES, NOMINAL_STATES, propagate

@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import Record, compiled
+from uwb_tdoa_bias.common.compiled import Record, compiled
 
 from .memory import HYPOTHESES, YAWS
 from .state import difference

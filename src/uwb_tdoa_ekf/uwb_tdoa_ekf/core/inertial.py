@@ -8,8 +8,8 @@ import math
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import Record, compiled
-from uwb_tdoa_bias.foundation.vibration import VIBRATION_AVERAGE, low_pass, track_vibration
+from uwb_tdoa_bias.common.compiled import Record, compiled
+from uwb_tdoa_bias.common.vibration import VIBRATION_AVERAGE, low_pass, track_vibration
 
 from .state import GRAVITY
 

@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import compiled
-from uwb_tdoa_bias.foundation.sensors import SENSORS
+from uwb_tdoa_bias.common.compiled import compiled
+from uwb_tdoa_bias.common.sensors import SENSORS
 
 from .aids import STREAMS
 from .memory import AID, IMU_SAMPLE, structured
 
 if TYPE_CHECKING:
-    from uwb_tdoa_bias.foundation.anchors import Anchors
-    from uwb_tdoa_bias.foundation.sensors import Stream
+    from uwb_tdoa_bias.common.anchors import Anchors
+    from uwb_tdoa_bias.common.sensors import Stream
 
     from ..installed import Installed
 

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from uwb_tdoa_bias.common.compiled import Record
 from uwb_tdoa_bias.effects.samples import N_STATES
-from uwb_tdoa_bias.foundation.compiled import Record
 
 from .auxiliary import OFFSET_STATES
 from .ground import MOST_PAIRS, PAIR

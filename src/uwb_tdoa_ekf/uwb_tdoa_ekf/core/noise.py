@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import Record, compiled
+from uwb_tdoa_bias.common.compiled import Record, compiled
 
 LARGEST_OUTLIER = 5.0  # standard deviations that one outlier counts as at most
 LARGEST_STEP = (

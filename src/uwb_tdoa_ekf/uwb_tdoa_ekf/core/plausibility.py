@@ -12,8 +12,8 @@ import math
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import Record, compiled
-from uwb_tdoa_bias.foundation.vibration import low_pass
+from uwb_tdoa_bias.common.compiled import Record, compiled
+from uwb_tdoa_bias.common.vibration import low_pass
 
 # m/s^2, mean specific force over VIBRATION_CORNER: upwards, and in all; a multirotor comes down
 # with 3, turns with 30

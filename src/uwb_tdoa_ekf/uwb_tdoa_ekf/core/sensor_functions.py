@@ -9,9 +9,9 @@ import math
 
 import numpy as np
 
+from uwb_tdoa_bias.common.compiled import Record, compiled
 from uwb_tdoa_bias.effects.base import TABLE_STEPS, SensorFunction
 from uwb_tdoa_bias.effects.covariates import OF_STATE
-from uwb_tdoa_bias.foundation.compiled import Record, compiled
 
 SENSORS = ("gyro", "accel")
 SPEED, CLIMB_RATE = (

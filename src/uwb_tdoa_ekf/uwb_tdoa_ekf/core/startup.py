@@ -12,9 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import Record, compiled
-from uwb_tdoa_bias.foundation.geometry import linearized_tdoa
-from uwb_tdoa_bias.foundation.robust_loss import GEMAN_MCCLURE, geman_mcclure_loss, weight
+from uwb_tdoa_bias.common.compiled import Record, compiled
+from uwb_tdoa_bias.common.geometry import linearized_tdoa
+from uwb_tdoa_bias.common.robust_loss import GEMAN_MCCLURE, geman_mcclure_loss, weight
 
 from .ground import KnownHeight, solve
 from .workspace import configured_side, reflect, rows_heard

@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import Record, compiled
+from uwb_tdoa_bias.common.compiled import Record, compiled
 
 GRAVITY = 9.81  # m/s^2, along -z of the world
 NOMINAL_STATES, ERROR_STATES = 16, 15

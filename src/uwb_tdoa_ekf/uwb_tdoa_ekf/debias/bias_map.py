@@ -11,10 +11,9 @@ import numpy as np
 from scipy.interpolate import RBFInterpolator
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-from uwb_tdoa_bias.foundation.arrays_file import read_arrays
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.files import write_filled
-from uwb_tdoa_bias.foundation.limits import MAP_MARKERS
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.files import read_arrays, write_filled
+from uwb_tdoa_bias.common.limits import MAP_MARKERS
 
 from .network import AngularNetwork
 
@@ -22,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from uwb_tdoa_bias.common.anchors import Anchors
 
 FORMAT, VERSION = "uwb_tdoa position bias map", 2
 UNITS = (

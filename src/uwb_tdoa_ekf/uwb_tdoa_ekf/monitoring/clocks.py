@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from uwb_tdoa_bias.foundation.sensors import SENSORS
+from uwb_tdoa_bias.common.sensors import SENSORS
 
 from ..streams import WARNING, Finding
 

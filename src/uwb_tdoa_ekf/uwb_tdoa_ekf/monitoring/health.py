@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from diagnostic_msgs.msg import DiagnosticStatus
 import numpy as np
 
-from uwb_tdoa_bias.foundation.ros_diagnostics import Rate
-from uwb_tdoa_bias.foundation.sensors import LOCATING, SENSORS
+from uwb_tdoa_bias.common.sensors import LOCATING, SENSORS
+from uwb_tdoa_bias.ros.diagnostics import Rate
 
 from ..streams import ERROR as SEVERE
 from .use import LARGEST_UNUSED, Use
@@ -19,8 +19,8 @@ from .volume import VolumeCheck
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from uwb_tdoa_bias.foundation.flyable import FlyableVolume
-    from uwb_tdoa_bias.foundation.ros_diagnostics import Report
+    from uwb_tdoa_bias.common.flyable import FlyableVolume
+    from uwb_tdoa_bias.ros.diagnostics import Report
 
     from ..core.config import FilterConfig
     from ..estimator import Estimator

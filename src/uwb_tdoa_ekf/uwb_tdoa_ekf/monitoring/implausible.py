@@ -8,7 +8,7 @@ from ..core.plausibility import RATE, TILT, TURN, WEIGHT
 from ..streams import ERROR, Finding
 
 if TYPE_CHECKING:
-    from uwb_tdoa_bias.foundation.compiled import Record
+    from uwb_tdoa_bias.common.compiled import Record
 
 SAID = {
     WEIGHT: (

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.geometry import tdoa
+from uwb_tdoa_bias.common.geometry import tdoa
 
 from ..core.verdicts import REJECTED
 from ..streams import ERROR, WARNING, Finding
@@ -30,8 +30,8 @@ from .swap import residuals as residuals_of
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from uwb_tdoa_bias.common.anchors import Anchors
     from uwb_tdoa_bias.effects.effect_set import Covariance
-    from uwb_tdoa_bias.foundation.anchors import Anchors
 
     from ..installed import Installed
     from ..results import Odometry, Residuals

@@ -14,8 +14,8 @@ from .monitor import GAP, Event, Monitor
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from uwb_tdoa_bias.common.anchors import Anchors
     from uwb_tdoa_bias.effects.effect_set import Covariance
-    from uwb_tdoa_bias.foundation.anchors import Anchors
 
     from ..results import Odometry, Residuals
 

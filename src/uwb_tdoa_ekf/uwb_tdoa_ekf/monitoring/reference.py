@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.geometry import ranges
+from uwb_tdoa_bias.common.geometry import ranges
 
 from ..evidence import (
     DELAY,
@@ -31,8 +31,8 @@ from .slices import TDOA_VARIANCE
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from uwb_tdoa_bias.common.anchors import Anchors
     from uwb_tdoa_bias.effects.effect_set import Covariance
-    from uwb_tdoa_bias.foundation.anchors import Anchors
 
     from ..evidence import ChangeKey
     from ..installed import Installed

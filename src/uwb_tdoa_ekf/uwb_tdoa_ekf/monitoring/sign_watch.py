@@ -13,7 +13,7 @@ from ..streams import ERROR, Finding
 from ..streams.explain import Unexplained, compare, innovations
 
 if TYPE_CHECKING:
-    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from uwb_tdoa_bias.common.anchors import Anchors
 
 # What must stay unexplained less, and by how many standard errors. On 37 measured flights, of any
 # 10 to 40 s from the start or

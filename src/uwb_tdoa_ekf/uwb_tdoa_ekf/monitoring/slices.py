@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.geometry import ranges
+from uwb_tdoa_bias.common.geometry import ranges
 
 LENGTH = 0.5  # s of stamps
 CLIP = 1.5  # m; a larger innovation counts as this

@@ -15,7 +15,7 @@ from .sign_watch import SignWatch
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from uwb_tdoa_bias.common.anchors import Anchors
 
     from ..streams.finding import Finding
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.geometry import ranges, tdoa
+from uwb_tdoa_bias.common.geometry import ranges, tdoa
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -8,7 +8,7 @@ from collections import deque
 import math
 from typing import TYPE_CHECKING
 
-from uwb_tdoa_bias.foundation.sensors import LOCATING
+from uwb_tdoa_bias.common.sensors import LOCATING
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

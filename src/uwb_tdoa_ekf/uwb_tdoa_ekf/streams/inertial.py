@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import compiled
-from uwb_tdoa_bias.foundation.vibration import VIBRATION_CORNER, low_pass
+from uwb_tdoa_bias.common.compiled import compiled
+from uwb_tdoa_bias.common.vibration import VIBRATION_CORNER, low_pass
 
 from .stamps import (
     LAST,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import compiled
+from uwb_tdoa_bias.common.compiled import compiled
 
 from .stamps import (
     LAST,
@@ -20,7 +20,7 @@ from .stamps import (
 )
 
 if TYPE_CHECKING:
-    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from uwb_tdoa_bias.common.anchors import Anchors
 
 ABSURD = 1e15  # in any unit: no number that a radio gives
 FOLLOWING = 0.1  # s between two TDOAs of a pair that count as successive

@@ -12,7 +12,7 @@ from .finding import ERROR, Finding, most_severe_first
 from .scale import KEPT, SurveyScale
 
 if TYPE_CHECKING:
-    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from uwb_tdoa_bias.common.anchors import Anchors
 
     from .inertial import ImuWindow
     from .ranging import TdoaWindow

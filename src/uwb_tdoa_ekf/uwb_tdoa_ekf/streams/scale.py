@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import compiled
-from uwb_tdoa_bias.foundation.survey_faults import UNITS
+from uwb_tdoa_bias.common.compiled import compiled
+from uwb_tdoa_bias.common.survey import UNITS
 
 from .finding import ERROR, Finding
 
 if TYPE_CHECKING:
-    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from uwb_tdoa_bias.common.anchors import Anchors
 
 PAIRS, HEARD = (
     32,

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import compiled
+from uwb_tdoa_bias.common.compiled import compiled
 
 LENGTH = 1.0  # s of a window
 # s by which a stamp is ahead of what the arrival allows, or behind the newest: no late packet

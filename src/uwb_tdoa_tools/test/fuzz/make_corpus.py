@@ -18,9 +18,9 @@ from recordings import ROWS, SURVEY, csv_text, log_bytes, small_flight  # noqa: 
 from targets import CORPUS, MESSAGES, bag_of  # noqa: E402
 from test_survey import survey_lines  # noqa: E402
 
+from uwb_tdoa_bias.common.flyable import FlyableVolume  # noqa: E402
+from uwb_tdoa_bias.common.sensors import Height, Pressure, Velocity  # noqa: E402
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet  # noqa: E402
-from uwb_tdoa_bias.foundation.flyable import FlyableVolume  # noqa: E402
-from uwb_tdoa_bias.foundation.sensors import Height, Pressure, Velocity  # noqa: E402
 from uwb_tdoa_ekf.debias import BiasMap  # noqa: E402
 from uwb_tdoa_tools.bags.bag import write_bag  # noqa: E402
 from uwb_tdoa_tools.bags.files import open_bag  # noqa: E402

@@ -21,15 +21,15 @@ import zlib
 
 import numpy as np
 
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flight import Flight, Tdoas
+from uwb_tdoa_bias.common.flyable import FlyableVolume
+from uwb_tdoa_bias.common.safe_yaml import parse_yaml
+from uwb_tdoa_bias.common.text import written_by
 from uwb_tdoa_bias.correction import trial
 from uwb_tdoa_bias.correction.network import Network
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.flight import Flight, Tdoas
-from uwb_tdoa_bias.foundation.flyable import FlyableVolume
-from uwb_tdoa_bias.foundation.safe_yaml import parse_yaml
-from uwb_tdoa_bias.foundation.version import written_by
 from uwb_tdoa_ekf import launching
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.debias import BiasMap

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.flight import Truth
+from uwb_tdoa_bias.common.flight import Truth
 
 
 def _middle(flight, rng):

@@ -24,14 +24,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.flight import Flight
-from uwb_tdoa_bias.foundation.foreign_text import printable
-from uwb_tdoa_bias.foundation.sensors import LOCATING, SENSORS
-from uwb_tdoa_bias.foundation.sensors.sensor import LARGEST_NUMBER
-from uwb_tdoa_bias.foundation.survey_faults import refuse_faulty
-from uwb_tdoa_bias.foundation.version import written_by
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flight import Flight
+from uwb_tdoa_bias.common.sensors import LOCATING, SENSORS
+from uwb_tdoa_bias.common.sensors.sensor import LARGEST_NUMBER
+from uwb_tdoa_bias.common.survey import refuse_faulty
+from uwb_tdoa_bias.common.text import printable, written_by
 
 from ..clock import sentences
 from . import frames

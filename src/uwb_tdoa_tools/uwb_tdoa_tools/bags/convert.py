@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.flight import AIDS
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flight import AIDS
 from uwb_tdoa_ekf.results import rows_of
 
 from .bag import check_output, write_bag
@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-    from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
-    from uwb_tdoa_bias.foundation.sensors import Stream
+    from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas, Truth
+    from uwb_tdoa_bias.common.sensors import Stream
 
     Timed = Tdoas | Imu | Truth | Stream
 

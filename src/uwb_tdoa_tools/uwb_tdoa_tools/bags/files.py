@@ -17,10 +17,10 @@ from typing import TYPE_CHECKING, Any
 
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.files import refuse_output, temporary_folder
-from uwb_tdoa_bias.foundation.limits import READ_BYTES, TooMuch, most_unpacked
-from uwb_tdoa_bias.foundation.stamps import LARGEST_STEP_BACK
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.files import refuse_output, temporary_folder
+from uwb_tdoa_bias.common.limits import READ_BYTES, TooMuch, most_unpacked
+from uwb_tdoa_bias.common.stamps import LARGEST_STEP_BACK
 
 from ..command_lines import SALVAGE
 from . import is_bag, mcap, write_ahead

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.flight import Imu
-from uwb_tdoa_bias.foundation.transforms import Frames
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flight import Imu
+from uwb_tdoa_bias.common.transforms import Frames
 from uwb_tdoa_ekf.imu_mount import ImuMount
 
 from .files import connections_of, readable

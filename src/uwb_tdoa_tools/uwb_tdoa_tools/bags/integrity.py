@@ -11,9 +11,9 @@ import zlib
 
 import yaml
 
-from uwb_tdoa_bias.foundation.files import write_text
-from uwb_tdoa_bias.foundation.limits import MESSAGE_BYTES, Budget, most_unpacked
-from uwb_tdoa_bias.foundation.safe_yaml import read_yaml
+from uwb_tdoa_bias.common.files import write_text
+from uwb_tdoa_bias.common.limits import MESSAGE_BYTES, Budget, most_unpacked
+from uwb_tdoa_bias.common.safe_yaml import read_yaml
 
 from . import mcap
 from .mcap import Damaged, zstd
@@ -31,7 +31,7 @@ _PLAIN_SCHEMA = re.compile(
 )  # without inner brackets nothing is computed
 sqlite3.enable_callback_tracebacks(
     True
-)  # else a Ctrl-C in a callback of SQLite is lost (foundation/executable.py)
+)  # else a Ctrl-C in a callback of SQLite is lost (common/executable.py)
 _TYPES = (  # columns of an SQLite bag and their types
     ("messages", {"timestamp": "integer", "topic_id": "integer", "data": "blob"}),
     ("topics", {"id": "integer", "name": "text", "type": "text", "serialization_format": "text"}),

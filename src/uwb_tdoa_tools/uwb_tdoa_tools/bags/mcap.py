@@ -16,7 +16,7 @@ import zlib
 
 import lz4.frame
 
-from uwb_tdoa_bias.foundation.limits import CHUNK_BYTES, most_unpacked
+from uwb_tdoa_bias.common.limits import CHUNK_BYTES, most_unpacked
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

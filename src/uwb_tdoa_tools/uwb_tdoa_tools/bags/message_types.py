@@ -11,9 +11,9 @@ import numpy as np
 from rosbags.interfaces import MessageDefinitionFormat, Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.limits import DEFINITION_BYTES
-from uwb_tdoa_bias.foundation.sensors import SENSORS
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.limits import DEFINITION_BYTES
+from uwb_tdoa_bias.common.sensors import SENSORS
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection

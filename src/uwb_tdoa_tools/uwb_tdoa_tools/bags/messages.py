@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from rosbags.interfaces import Nodetype
 
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.flight import Imu, Tdoas, Truth
-from uwb_tdoa_bias.foundation.sensors import Sensor, Stream
-from uwb_tdoa_bias.foundation.sensors.sensor import LARGEST_NUMBER
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flight import Imu, Tdoas, Truth
+from uwb_tdoa_bias.common.sensors import Sensor, Stream
+from uwb_tdoa_bias.common.sensors.sensor import LARGEST_NUMBER
 from uwb_tdoa_ekf.frames import pose_and_twist
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from rosbags.typesys.store import Typestore
 
-    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from uwb_tdoa_bias.common.anchors import Anchors
     from uwb_tdoa_ekf.results import Odometry
 
     # A message has no type here: rosbags makes the classes while it runs.

@@ -18,14 +18,14 @@ from rosbags.interfaces import (
     QosTime,
 )
 
-from uwb_tdoa_bias.foundation.sensors import SENSORS
+from uwb_tdoa_bias.common.sensors import SENSORS
 
 from ..clock import straightened
 from . import messages as bag_messages
 from .files import connections_of, readable
 
 if TYPE_CHECKING:
-    from uwb_tdoa_bias.foundation.sensors import Sensor
+    from uwb_tdoa_bias.common.sensors import Sensor
 
     from ..clock import Straightened
     from .files import BagReader

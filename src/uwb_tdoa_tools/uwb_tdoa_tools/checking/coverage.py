@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_ekf.core.workspace import FLAT
 from uwb_tdoa_ekf.monitoring.monitor import NEARER
 from uwb_tdoa_ekf.streams import NOTE, WARNING, Finding

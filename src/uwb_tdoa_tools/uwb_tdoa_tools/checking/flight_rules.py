@@ -22,7 +22,7 @@ from .recording import of_flight
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_bias.common.flight import Flight
 
 
 HOLE = 1.0  # s without ground truth in the air

@@ -19,7 +19,7 @@ from .time_rules import BLOCK, LONGEST, delays, drift_or_jump
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_bias.common.flight import Flight
 
     from .time_rules import Delays
 

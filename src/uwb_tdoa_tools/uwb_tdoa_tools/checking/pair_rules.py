@@ -11,17 +11,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_bias.effects import EffectSet, Track, true_samples
 from uwb_tdoa_bias.effects.anchor import AnchorIds
 from uwb_tdoa_bias.effects.pair import PairSign
-from uwb_tdoa_bias.foundation.geometry import tdoa
 from uwb_tdoa_ekf.streams import ERROR, Finding
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
+    from uwb_tdoa_bias.common.flight import Flight, Truth
     from uwb_tdoa_bias.effects import LabelEffect
-    from uwb_tdoa_bias.foundation.flight import Flight, Truth
 
     Fault = tuple[str, str, str, float]  # fault of the pair, evidence, remedy, deciding number
 

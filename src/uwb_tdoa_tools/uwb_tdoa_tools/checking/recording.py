@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.files import temporary_folder
-from uwb_tdoa_bias.foundation.flight import Imu, Tdoas
-from uwb_tdoa_bias.foundation.sensors import LOCATING, SENSORS
-from uwb_tdoa_bias.foundation.survey_faults import refuse_faulty
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.files import temporary_folder
+from uwb_tdoa_bias.common.flight import Imu, Tdoas
+from uwb_tdoa_bias.common.sensors import LOCATING, SENSORS
+from uwb_tdoa_bias.common.survey import refuse_faulty
 
 from ..bags import frames, is_bag
 from ..bags import messages as bag_messages
@@ -25,8 +25,8 @@ from ..readers import read_survey
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from uwb_tdoa_bias.foundation.flight import Flight
-    from uwb_tdoa_bias.foundation.sensors.sensor import Sensor, Stream
+    from uwb_tdoa_bias.common.flight import Flight
+    from uwb_tdoa_bias.common.sensors.sensor import Sensor, Stream
 
     from ..bags.frames import Place
     from ..bags.topics import TopicMessages

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.sensors import Ranges
+from uwb_tdoa_bias.common.sensors import Ranges
 from uwb_tdoa_ekf.streams import ERROR, NOTE, WARNING, Finding
 
 from ..bags.frames import is_body
@@ -22,7 +22,7 @@ from .tdoa_rules import largest_displacement, same_place
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from uwb_tdoa_bias.common.anchors import Anchors
 
     from ..bags.frames import Place
     from ..live.record import End

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError
 
 from .. import command_lines
 from ..outputs import as_json
@@ -20,7 +20,7 @@ from .watch import BEFORE_TRUTH
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
-    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_bias.common.flight import Flight
     from uwb_tdoa_ekf.streams import Finding
 
     from .check import Report

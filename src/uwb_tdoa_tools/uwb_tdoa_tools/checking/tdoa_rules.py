@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.survey_faults import UNITS as SURVEY_UNITS
+from uwb_tdoa_bias.common.survey import UNITS as SURVEY_UNITS
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.memory import TDOA, new_state, structured
 from uwb_tdoa_ekf.offline import run_offline
@@ -25,8 +25,8 @@ from .pair_rules import MANY, OFF
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence
 
-    from uwb_tdoa_bias.foundation.anchors import Anchors
-    from uwb_tdoa_bias.foundation.flight import Tdoas
+    from uwb_tdoa_bias.common.anchors import Anchors
+    from uwb_tdoa_bias.common.flight import Tdoas
 
     from .ordered import SurveyFit
 

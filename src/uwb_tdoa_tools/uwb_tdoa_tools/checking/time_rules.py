@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.geometry import tdoa, tdoa_jacobian
+from uwb_tdoa_bias.common.geometry import tdoa, tdoa_jacobian
 from uwb_tdoa_ekf.streams import ERROR, Finding
 
 from ..clock import numbered

@@ -16,7 +16,7 @@ from .tdoa_rules import FEWEST, POOR, gained, relabelled
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_bias.common.flight import Flight
     from uwb_tdoa_ekf.monitoring.monitor import Event
     from uwb_tdoa_ekf.offline import Run
     from uwb_tdoa_ekf.streams import Finding

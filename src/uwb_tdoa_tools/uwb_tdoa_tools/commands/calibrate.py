@@ -5,8 +5,8 @@ from __future__ import annotations
 import sys
 from typing import TYPE_CHECKING
 
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, command_lines, options
 from ..calibrating import blocking_errors, prospect, with_truth, without_truth

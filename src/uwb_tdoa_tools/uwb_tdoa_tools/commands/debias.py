@@ -6,7 +6,7 @@ from pathlib import Path
 import sys
 from typing import TYPE_CHECKING, Any
 
-from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_ekf.debias import INTERPOLATORS, BiasMap
 
 from .. import cli, options, parallel

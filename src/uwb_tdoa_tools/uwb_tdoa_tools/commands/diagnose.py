@@ -7,9 +7,9 @@ from functools import partial
 import sys
 from typing import TYPE_CHECKING
 
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.files import write_text
 
 from .. import cli, command_lines, options, parallel
 from ..checking.before_anchors import ids_are_right

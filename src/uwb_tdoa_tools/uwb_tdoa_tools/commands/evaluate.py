@@ -7,8 +7,8 @@ from functools import partial
 import sys
 from typing import TYPE_CHECKING
 
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.files import write_text
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.files import write_text
 
 from .. import cli, evaluating, options, parallel
 from ..evaluating import Evaluator, results

@@ -6,8 +6,8 @@ import argparse
 from dataclasses import replace
 import sys
 
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.correction.network import load_network
-from uwb_tdoa_bias.foundation.errors import InputError
 
 from .. import cli, options, parallel
 from ..flying import fleet, rover

@@ -6,7 +6,7 @@ from functools import partial
 import sys
 from typing import TYPE_CHECKING
 
-from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError
 
 from .. import cli, options, parallel
 from ..localizing.localize import Localizer, all_good, check_names

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_ekf.core.config import FilterConfig
 
 from .. import cli, parallel

@@ -5,8 +5,8 @@ from __future__ import annotations
 import sys
 from typing import TYPE_CHECKING
 
+from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_bias.foundation.files import write_text
 
 from .. import cli, command_lines, options
 from ..checking.before_anchors import ids_are_right

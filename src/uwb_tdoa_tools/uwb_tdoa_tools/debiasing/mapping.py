@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.files import read_head
 from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.files import read_head
 from uwb_tdoa_ekf.debias import Part, fit
 from uwb_tdoa_ekf.offline import run_offline
 
@@ -26,7 +26,7 @@ from .evaluation import PositionEstimator, evaluate_map
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from uwb_tdoa_bias.common.anchors import Anchors
     from uwb_tdoa_ekf.debias import BiasMap
     from uwb_tdoa_ekf.results import Odometry
 

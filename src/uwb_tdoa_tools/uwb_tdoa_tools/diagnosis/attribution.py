@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
 from uwb_tdoa_bias.effects.covariates import UPWARDS
 from uwb_tdoa_bias.effects.samples import RADIO
-from uwb_tdoa_bias.foundation.anchors import Anchors
 from uwb_tdoa_ekf.evidence import OF_ANCHORS
 
 from .channels import CHANNELS, residuals
@@ -44,8 +44,8 @@ from .self_calibration.prior import to_keep
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Hashable, Sequence
 
+    from uwb_tdoa_bias.common.flight import Flight
     from uwb_tdoa_bias.effects import Covariance, Effect
-    from uwb_tdoa_bias.foundation.flight import Flight
 
     from ..parallel import MapFunction
     from .channels import ChannelResidual, ChannelResiduals

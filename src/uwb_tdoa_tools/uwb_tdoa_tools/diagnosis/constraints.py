@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from uwb_tdoa_bias.common.anchors import Anchors
 
 WITHIN = 5  # stamps of a mark over which the estimate is averaged
 ALOFT = 0.3  # m above its lowest point, from which a path counts: on the floor TDOAs err by metres

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.evidence import OF_ANCHORS
 from uwb_tdoa_ekf.offline import may_have_offset
@@ -31,7 +31,7 @@ from .self_calibration.solve import same_anchors
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_bias.common.flight import Flight
 
     from ..parallel import MapFunction
     from .detectors import Detection

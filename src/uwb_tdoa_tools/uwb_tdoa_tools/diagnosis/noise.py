@@ -6,7 +6,7 @@ from dataclasses import fields
 import json
 from typing import TYPE_CHECKING
 
-from uwb_tdoa_bias.foundation.files import write_text
+from uwb_tdoa_bias.common.files import write_text
 from uwb_tdoa_ekf.core.config import FilterConfig
 
 if TYPE_CHECKING:

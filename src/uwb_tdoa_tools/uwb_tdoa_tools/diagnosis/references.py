@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flight import AIDS, Truth
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects.stamps import shifted
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.flight import AIDS, Truth
 from uwb_tdoa_ekf.core import auxiliary
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.offline import without_unknown_offset
@@ -27,8 +27,8 @@ from .constraints import Mark, OdometryPath
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from uwb_tdoa_bias.common.flight import Flight
     from uwb_tdoa_bias.effects import EffectSet
-    from uwb_tdoa_bias.foundation.flight import Flight
     from uwb_tdoa_ekf.sensitivity import Innovations
 
     from .constraints import Constraint

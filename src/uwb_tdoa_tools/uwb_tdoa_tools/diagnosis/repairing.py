@@ -17,8 +17,8 @@ from .validation import TRIAL_FLIGHTS, WORSE, error_of
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
+    from uwb_tdoa_bias.common.flight import Flight
     from uwb_tdoa_bias.effects import Effect
-    from uwb_tdoa_bias.foundation.flight import Flight
     from uwb_tdoa_ekf.core.config import FilterConfig
 
     from .attribution import Attribution

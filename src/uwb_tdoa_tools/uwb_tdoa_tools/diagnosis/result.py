@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 from .findings import EffectFinding, Refused
 
 if TYPE_CHECKING:
+    from uwb_tdoa_bias.common.flight import Flight
     from uwb_tdoa_bias.effects import EffectSet
-    from uwb_tdoa_bias.foundation.flight import Flight
     from uwb_tdoa_ekf.streams.finding import Finding as NumbersFinding
 
     from .attribution import Attribution

@@ -28,7 +28,7 @@ from .regression.terms import columns_of
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_bias.common.flight import Flight
     from uwb_tdoa_ekf.core.config import FilterConfig
     from uwb_tdoa_ekf.offline import Run
 

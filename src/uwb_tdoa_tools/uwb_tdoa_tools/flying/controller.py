@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import compiled
+from uwb_tdoa_bias.common.compiled import compiled
 
 from .vehicle import CORNERS, GRAVITY, ROTORS, SPIN, Vehicle
 

@@ -30,10 +30,10 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.files import temporary_folder
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet, StreamCorrector
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.files import temporary_folder
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.frames import poses_of
 from uwb_tdoa_ekf.results import Odometry, concatenated
@@ -43,9 +43,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
+    from uwb_tdoa_bias.common.anchors import Anchors
+    from uwb_tdoa_bias.common.flight import Imu, Tdoas
     from uwb_tdoa_bias.correction.network import Network
-    from uwb_tdoa_bias.foundation.anchors import Anchors
-    from uwb_tdoa_bias.foundation.flight import Imu, Tdoas
     from uwb_tdoa_ekf.core.config import FilterConfig
 
     from .mission import Pose

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.files import write_filled
+from uwb_tdoa_bias.common.files import write_filled
 
 from .. import parallel
 from ..bags.bag import write_bag
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from contextlib import AbstractContextManager
     from pathlib import Path
 
-    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from uwb_tdoa_bias.common.anchors import Anchors
 
     from .trial import Task, TrialResult
 

@@ -22,12 +22,12 @@ from scipy.spatial.transform import Rotation
 from sensor_msgs.msg import Imu
 
 from uwb_tdoa_bias.anchors_node import markers, transforms
-from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS, anchors_to_message
-from uwb_tdoa_bias.foundation.ros_cdr import CdrCodec, message_class
-from uwb_tdoa_bias.foundation.ros_frames import TF_STATIC_QOS
-from uwb_tdoa_bias.foundation.ros_streams import StreamOutput
-from uwb_tdoa_bias.foundation.ros_topics import OUTPUT_QOS, Input, StreamInput
-from uwb_tdoa_bias.foundation.sensors import SENSORS
+from uwb_tdoa_bias.common.sensors import SENSORS
+from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS, anchors_to_message
+from uwb_tdoa_bias.ros.cdr import CdrCodec, message_class
+from uwb_tdoa_bias.ros.frames import TF_STATIC_QOS
+from uwb_tdoa_bias.ros.node import StreamOutput
+from uwb_tdoa_bias.ros.topics import OUTPUT_QOS, Input, StreamInput
 from uwb_tdoa_ekf.reorder_buffer import TRIAL
 from uwb_tdoa_msgs.msg import EstimatorStatus, Tdoa
 
@@ -39,8 +39,8 @@ from .vehicle import ATTITUDE, POSITION
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from uwb_tdoa_bias.foundation.ros_cdr import Template
-    from uwb_tdoa_bias.foundation.ros_node import StreamNode
+    from uwb_tdoa_bias.ros.cdr import Template
+    from uwb_tdoa_bias.ros.node import StreamNode
     from uwb_tdoa_ekf.results import Odometry
 
     from .mission import Pose

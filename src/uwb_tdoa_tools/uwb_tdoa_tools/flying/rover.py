@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.sensors import SENSORS
+from uwb_tdoa_bias.common.sensors import SENSORS
 
 from ..simulation.config import WHEELS_RATE
 from ..simulation.sensors import YAW_RATE_STD, slips
@@ -21,7 +21,7 @@ from .trial import REST_AFTER, Trial
 from .vehicle import GRAVITY, IMU_RATE
 
 if TYPE_CHECKING:
-    from uwb_tdoa_bias.foundation.sensors.sensor import Stream
+    from uwb_tdoa_bias.common.sensors.sensor import Stream
 
     from .estimates import EstimateSource
     from .mission import Pose

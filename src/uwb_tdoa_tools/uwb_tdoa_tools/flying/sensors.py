@@ -10,14 +10,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.common.compiled import compiled
+from uwb_tdoa_bias.common.radio import arrival_bias
+from uwb_tdoa_bias.common.sensors import SENSORS
+from uwb_tdoa_bias.common.sensors.pressure import SITE, pressure_at
+from uwb_tdoa_bias.common.sensors.sensor import RATE
+from uwb_tdoa_bias.common.sensors.velocity import LEAST_STD
 from uwb_tdoa_bias.effects import Samples
 from uwb_tdoa_bias.effects.floor import FloorMultipath
-from uwb_tdoa_bias.foundation.compiled import compiled
-from uwb_tdoa_bias.foundation.radio import arrival_bias
-from uwb_tdoa_bias.foundation.sensors import SENSORS
-from uwb_tdoa_bias.foundation.sensors.pressure import SITE, pressure_at
-from uwb_tdoa_bias.foundation.sensors.sensor import RATE
-from uwb_tdoa_bias.foundation.sensors.velocity import LEAST_STD
 
 from ..simulation.tdoas import make_schedule, outliers, tag_link, tdoa_noise
 from .vehicle import IMU_RATE

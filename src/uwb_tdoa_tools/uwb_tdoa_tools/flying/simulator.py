@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.foundation.compiled import compiled
-from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
-from uwb_tdoa_bias.foundation.sensors import SENSORS
+from uwb_tdoa_bias.common.compiled import compiled
+from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas, Truth
+from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_ekf.results import concatenated, rows_of
 
 from .controller import inner
@@ -31,7 +31,7 @@ from .vehicle import (
 )
 
 if TYPE_CHECKING:
-    from uwb_tdoa_bias.foundation.sensors.sensor import Stream
+    from uwb_tdoa_bias.common.sensors.sensor import Stream
 
     from .sensors import AidSensor
     from .vehicle import Record

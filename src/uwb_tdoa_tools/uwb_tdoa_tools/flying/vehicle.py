@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import compiled
-from uwb_tdoa_bias.foundation.geometry import rotate
+from uwb_tdoa_bias.common.compiled import compiled
+from uwb_tdoa_bias.common.geometry import rotate
 
 # Compiled code reads the fields of a structured row as attributes. Python has no type for that.
 Record = Any

@@ -20,7 +20,7 @@ from .vehicle import POSITION, VELOCITY
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from uwb_tdoa_bias.foundation.flight import Truth
+    from uwb_tdoa_bias.common.flight import Truth
     from uwb_tdoa_ekf.results import Odometry
 
     from .mission import Mission

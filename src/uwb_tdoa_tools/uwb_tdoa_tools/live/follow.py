@@ -13,8 +13,8 @@ import rclpy
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.sensors import SENSORS
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.sensors import SENSORS
 
 from .processes import DiagnosticsListener
 from .session import READER_DEPTH, answer_of, message_class, subscription_qos

@@ -17,8 +17,8 @@ from diagnostic_msgs.msg import DiagnosticArray
 from domain_coordinator import domain_id
 import rclpy
 
-from uwb_tdoa_bias.foundation.errors import Failure
-from uwb_tdoa_bias.foundation.files import refuse_output
+from uwb_tdoa_bias.common.errors import Failure
+from uwb_tdoa_bias.common.files import refuse_output
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence

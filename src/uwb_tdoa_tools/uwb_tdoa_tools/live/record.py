@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 
-from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError
 
 from ..bags.files import new_bag
 from ..bags.message_types import add_type, typestore

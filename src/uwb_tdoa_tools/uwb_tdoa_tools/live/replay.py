@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy
 
-from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError
 
 from ..bags.files import messages, open_bag
 from .follow import Follower, Nodes

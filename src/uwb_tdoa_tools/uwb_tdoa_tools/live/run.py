@@ -8,7 +8,7 @@ from pathlib import Path
 import shutil
 from typing import TYPE_CHECKING, Any
 
-from uwb_tdoa_bias.foundation.sensors import SENSORS
+from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_ekf.results import VERDICTS
 
 from ..bags.files import open_bag
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from rclpy.node import Node
 
-    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_bias.common.flight import Flight
 
 INPUTS = ("/uwb/anchors", "/uwb/tdoa", "/imu/data")
 # Matches that must exist before the first message: topic -> (publishers, subscriptions)

@@ -22,7 +22,7 @@ from rosbags.interfaces import (
     QosTime,
 )
 
-from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Sequence

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.files import write_filled
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.files import write_filled
 from uwb_tdoa_ekf.frames import rotation_std
 from uwb_tdoa_ekf.results import Odometry
 

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.files import write_filled
-from uwb_tdoa_bias.foundation.flight import Flight, Truth
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.files import write_filled
+from uwb_tdoa_bias.common.flight import Flight, Truth
 from uwb_tdoa_ekf.results import Odometry, Residuals
 
 from ..diagnosis.output import as_text

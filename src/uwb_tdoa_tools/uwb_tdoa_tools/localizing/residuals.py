@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.files import write_filled, write_text
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.files import write_filled, write_text
 from uwb_tdoa_ekf.core.verdicts import USED
 from uwb_tdoa_ekf.results import VERDICTS
 

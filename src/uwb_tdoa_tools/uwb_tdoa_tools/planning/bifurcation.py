@@ -25,13 +25,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.geometry import ranges
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.geometry import ranges
 
 from .installation import principal_extents
 
 if TYPE_CHECKING:
-    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from uwb_tdoa_bias.common.anchors import Anchors
 
 
 # thickness over length: anchors so close to a line (plane) mirror each position in it

@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial import Delaunay
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.antenna import Antenna
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.radio import SPEED_OF_LIGHT, RadioLink, received_power_dbm
-from uwb_tdoa_bias.foundation.safe_yaml import read_yaml
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.radio import SPEED_OF_LIGHT, Antenna, RadioLink, received_power_dbm
+from uwb_tdoa_bias.common.safe_yaml import read_yaml
 
 from ..checking.coverage import sides_of, to_copy
 
@@ -161,7 +160,7 @@ def antenna_from_yaml(path: str | Path) -> Antenna:
     """Read an Antenna from a YAML file. Raises InputError.
 
     The fields are azimuth, elevation_1 and elevation_2 (dBi, around the full circle), and optionally
-    gain_offset, see `uwb_tdoa_bias.foundation.antenna.Antenna`.
+    gain_offset, see `uwb_tdoa_bias.common.radio.Antenna`.
     """
     content = read_yaml(path)
     try:

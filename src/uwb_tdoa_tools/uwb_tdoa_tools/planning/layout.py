@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.safe_yaml import read_yaml
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.safe_yaml import read_yaml
 
 from ..simulation.rooms import facing
 from .installation import PAIRINGS

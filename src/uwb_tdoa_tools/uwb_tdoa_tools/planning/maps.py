@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.flight import AIDS
-from uwb_tdoa_bias.foundation.flyable import FlyableVolume
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flight import AIDS
+from uwb_tdoa_bias.common.flyable import FlyableVolume
 
 from ..scoring.evaluation import evaluate
 from ..scoring.metrics import position_at
@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
     from numpy.typing import ArrayLike
 
-    from uwb_tdoa_bias.foundation.anchors import Anchors
-    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_bias.common.anchors import Anchors
+    from uwb_tdoa_bias.common.flight import Flight
 
     from .installation import Installation
 

@@ -15,7 +15,7 @@ from PIL import Image
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.foundation.files import write_filled
+from uwb_tdoa_bias.common.files import write_filled
 
 from ..scoring.plots import draw_labels, plt
 from .bifurcation import Subsets
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from uwb_tdoa_bias.common.anchors import Anchors
 
     from ..simulation.rooms import Walls
     from .installation import Installation

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.geometry import ranges
+from uwb_tdoa_bias.common.geometry import ranges
 
 from .installation import FixedNoise, variance_gradient
 

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
     from rosbags.typesys.store import Typestore
 
-    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from uwb_tdoa_bias.common.anchors import Anchors
 
     from ..simulation.rooms import Room
     from .installation import Installation
@@ -332,7 +332,7 @@ def publish_messages(found: dict[str, Any]) -> None:
     import rclpy
     from rclpy.serialization import deserialize_message
 
-    from uwb_tdoa_bias.foundation.ros_anchors import ANCHORS_QOS
+    from uwb_tdoa_bias.ros.anchors import ANCHORS_QOS
 
     from ..live.session import message_class, session
 

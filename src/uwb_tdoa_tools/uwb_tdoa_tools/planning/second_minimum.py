@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import compiled
+from uwb_tdoa_bias.common.compiled import compiled
 
 if TYPE_CHECKING:
     from ..simulation.rooms import Room

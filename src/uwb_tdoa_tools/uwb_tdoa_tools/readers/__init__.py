@@ -10,8 +10,8 @@ import shlex
 from typing import TYPE_CHECKING
 import zlib
 
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.files import read_head
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.files import read_head
 
 from ..bags import is_bag
 from .names import read_survey
@@ -21,8 +21,8 @@ from .util_csv import GZIP_MAGIC, is_util_csv, read_util_csv
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from uwb_tdoa_bias.foundation.anchors import Anchors
-    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_bias.common.anchors import Anchors
+    from uwb_tdoa_bias.common.flight import Flight
 
 
 ROS_1 = b"#ROSBAG V2.0"  # what a bag of ROS 1 begins with

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.limits import TABLE_CELLS
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.limits import TABLE_CELLS
 
 from .streams import GRAVITY, make_flight
 from .tables import read_table
@@ -21,7 +21,7 @@ from .tables import read_table
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_bias.common.flight import Flight
 
     from .names import NamedAnchors
     from .streams import Streams

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from tqdm import tqdm
 
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.flight import AIDS
-from uwb_tdoa_bias.foundation.foreign_text import printable
-from uwb_tdoa_bias.foundation.limits import FOLDER_DEPTH, FOLDER_ENTRIES, Budget
-from uwb_tdoa_bias.foundation.sensors import LOCATING
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flight import AIDS
+from uwb_tdoa_bias.common.limits import FOLDER_DEPTH, FOLDER_ENTRIES, Budget
+from uwb_tdoa_bias.common.sensors import LOCATING
+from uwb_tdoa_bias.common.text import printable
 
 from .. import parallel
 from ..bags import is_bag
@@ -25,7 +25,7 @@ from . import read_flight
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
-    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_bias.common.flight import Flight
 
     Recording = tuple[Path, str | Path | None]  # and its survey
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 import re
 from typing import TYPE_CHECKING
 
-from uwb_tdoa_bias.foundation import survey
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.survey_faults import refuse_faulty
+from uwb_tdoa_bias.common import survey
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.survey import refuse_faulty
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -8,17 +8,17 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.flight import Flight, Imu, Tdoas, Truth
-from uwb_tdoa_bias.foundation.sensors import Height, Pressure, Velocity
-from uwb_tdoa_bias.foundation.sensors.pressure import pressure_at
-from uwb_tdoa_bias.foundation.sensors.ranges import Ranges
-from uwb_tdoa_bias.foundation.sensors.sensor import LARGEST_NUMBER
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flight import Flight, Imu, Tdoas, Truth
+from uwb_tdoa_bias.common.sensors import Height, Pressure, Velocity
+from uwb_tdoa_bias.common.sensors.pressure import pressure_at
+from uwb_tdoa_bias.common.sensors.ranges import Ranges
+from uwb_tdoa_bias.common.sensors.sensor import LARGEST_NUMBER
 
 from ..clock import sentences, straightened
 
 if TYPE_CHECKING:
-    from uwb_tdoa_bias.foundation.anchors import Anchors
+    from uwb_tdoa_bias.common.anchors import Anchors
 
     Columns = dict[str, np.ndarray]  # of a stream, each (n,)
     Streams = dict[str, Columns]

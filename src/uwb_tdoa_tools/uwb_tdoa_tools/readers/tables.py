@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.files import read_bytes
-from uwb_tdoa_bias.foundation.limits import (
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.files import read_bytes
+from uwb_tdoa_bias.common.limits import (
     ROW_CHARACTERS,
     SMALL_TABLE_CELLS,
     TABLE_BYTES,

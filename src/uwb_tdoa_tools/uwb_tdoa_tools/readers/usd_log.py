@@ -8,18 +8,18 @@ import zlib
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.compiled import compiled
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.files import read_bytes
-from uwb_tdoa_bias.foundation.foreign_text import harmless
-from uwb_tdoa_bias.foundation.limits import USD_TYPES, USD_VARIABLES, Budget
+from uwb_tdoa_bias.common.compiled import compiled
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.files import read_bytes
+from uwb_tdoa_bias.common.limits import USD_TYPES, USD_VARIABLES, Budget
+from uwb_tdoa_bias.common.text import harmless
 
 from ..command_lines import SALVAGE
 from .streams import make_flight
 
 if TYPE_CHECKING:
-    from uwb_tdoa_bias.foundation.anchors import Anchors
-    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_bias.common.anchors import Anchors
+    from uwb_tdoa_bias.common.flight import Flight
 
     from .streams import Columns
 

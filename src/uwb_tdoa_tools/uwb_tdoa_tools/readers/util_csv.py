@@ -11,9 +11,9 @@ import zlib
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.files import read_bytes
-from uwb_tdoa_bias.foundation.limits import CSV_BYTES, CSV_CELLS, Budget, most_unpacked
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.files import read_bytes
+from uwb_tdoa_bias.common.limits import CSV_BYTES, CSV_CELLS, Budget, most_unpacked
 
 from ..command_lines import SALVAGE
 from .streams import make_flight
@@ -22,8 +22,8 @@ from .tables import CsvRows, check_text
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-    from uwb_tdoa_bias.foundation.anchors import Anchors
-    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_bias.common.anchors import Anchors
+    from uwb_tdoa_bias.common.flight import Flight
 
     from .streams import Columns
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError
 
 from ..checking.imu_rules import ARRANGEMENTS, signed_axis
 from ..checking.motion_rules import FEWEST, TrueMotion
@@ -29,8 +29,8 @@ from .pooling import ALIGN
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from uwb_tdoa_bias.common.flight import Flight, Truth
     from uwb_tdoa_bias.effects.samples import PoseColumns
-    from uwb_tdoa_bias.foundation.flight import Flight, Truth
 
     from ..checking.time_rules import Delays
 

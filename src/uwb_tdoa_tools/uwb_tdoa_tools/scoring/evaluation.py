@@ -25,8 +25,8 @@ from .alignment import (
 from .metrics import Score, radio_residuals
 
 if TYPE_CHECKING:
+    from uwb_tdoa_bias.common.flight import Flight, Truth
     from uwb_tdoa_bias.correction.network import Network
-    from uwb_tdoa_bias.foundation.flight import Flight, Truth
     from uwb_tdoa_ekf.core.config import FilterConfig
     from uwb_tdoa_ekf.offline import Run
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from uwb_tdoa_bias.common.sensors import LOCATING
 from uwb_tdoa_bias.effects.samples import PoseColumns
-from uwb_tdoa_bias.foundation.sensors import LOCATING
 from uwb_tdoa_ekf.core.verdicts import COMPENSATED, REJECTED, USED
 from uwb_tdoa_ekf.results import Residuals, concatenated, rows_of
 
@@ -19,7 +19,7 @@ from .pooling import Distribution, Pool, Result, coverage_figures
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-    from uwb_tdoa_bias.foundation.flight import Flight, Truth
+    from uwb_tdoa_bias.common.flight import Flight, Truth
     from uwb_tdoa_ekf.offline import Run
 
     Spans = Sequence[tuple[float, float]]  # from when to when, s

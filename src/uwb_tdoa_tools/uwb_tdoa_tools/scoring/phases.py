@@ -36,7 +36,7 @@ import numpy as np
 from ..checking.pair_rules import AIRBORNE
 
 if TYPE_CHECKING:
-    from uwb_tdoa_bias.foundation.flight import Truth
+    from uwb_tdoa_bias.common.flight import Truth
 
     Span = tuple[float, float]  # from when to when, s
 

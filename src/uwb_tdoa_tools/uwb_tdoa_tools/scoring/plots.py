@@ -12,7 +12,7 @@ from matplotlib.patheffects import withStroke  # noqa: E402
 import matplotlib.pyplot as plt  # noqa: E402
 import numpy as np  # noqa: E402
 
-from uwb_tdoa_bias.foundation.files import write_filled  # noqa: E402
+from uwb_tdoa_bias.common.files import write_filled  # noqa: E402
 
 from .metrics import position_at  # noqa: E402
 from .phases import TITLES  # noqa: E402
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
     from matplotlib.axes import Axes
 
-    from uwb_tdoa_bias.foundation.flight import Flight, Truth
+    from uwb_tdoa_bias.common.flight import Flight, Truth
 
     from .metrics import Estimate, Score
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.flight import Flight, Truth
+from uwb_tdoa_bias.common.flight import Flight, Truth
 
 from . import sensors, tdoas
 from .config import NO_IMU_ERRORS, ImuErrors, SimulationConfig

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.effects import EFFECTS
-from uwb_tdoa_bias.foundation.errors import InputError
 
 from ..bags.bag import check_output, write_bag
 
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
     from pathlib import Path
 
+    from uwb_tdoa_bias.common.flight import Flight
     from uwb_tdoa_bias.effects.base import Effect
-    from uwb_tdoa_bias.foundation.flight import Flight
 
     from ..readers.inputs import Reading
 

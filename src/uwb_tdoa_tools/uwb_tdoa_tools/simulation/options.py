@@ -7,9 +7,9 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from uwb_tdoa_bias.foundation.anchors import Anchors
-from uwb_tdoa_bias.foundation.sensors import SENSORS
-from uwb_tdoa_bias.foundation.survey_faults import refuse_faulty
+from uwb_tdoa_bias.common.anchors import Anchors
+from uwb_tdoa_bias.common.sensors import SENSORS
+from uwb_tdoa_bias.common.survey import refuse_faulty
 
 from .config import (
     NO_IMU_ERRORS,

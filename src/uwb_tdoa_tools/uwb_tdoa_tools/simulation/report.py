@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.files import write_filled
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.files import write_filled
 
 from .paths import TRAJECTORIES
 from .rooms import CONSTELLATIONS, constellation
@@ -17,7 +17,7 @@ from .rooms import CONSTELLATIONS, constellation
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_bias.common.flight import Flight
 SUFFIXES = (".png", ".pdf", ".svg")
 
 

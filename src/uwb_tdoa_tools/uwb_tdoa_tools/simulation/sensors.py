@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.foundation.flight import Imu
-from uwb_tdoa_bias.foundation.sensors import SENSORS, Velocity
+from uwb_tdoa_bias.common.flight import Imu
+from uwb_tdoa_bias.common.sensors import SENSORS, Velocity
 
 from .config import WHEELS_RATE, ImuErrors
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from uwb_tdoa_bias.foundation.sensors import Stream
+    from uwb_tdoa_bias.common.sensors import Stream
 
     from .config import SimulationConfig
     from .rooms import Room

@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.foundation.antenna import Antenna
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.flight import Tdoas
-from uwb_tdoa_bias.foundation.geometry import tdoa
-from uwb_tdoa_bias.foundation.radio import FLAT_MOUNT, RadioLink, arrival_bias
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.flight import Tdoas
+from uwb_tdoa_bias.common.geometry import tdoa
+from uwb_tdoa_bias.common.radio import FLAT_MOUNT, Antenna, RadioLink, arrival_bias
 
 from .rooms import heard_at
 

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.interpolate import BSpline, CubicHermiteSpline, CubicSpline, make_interp_spline
 from scipy.spatial.transform import Rotation
 
-from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError
 
 from .paths import KNOT, SPEED_UP, STEP, path_of, path_time, yaw_along
 from .rooms import REST_HEIGHT

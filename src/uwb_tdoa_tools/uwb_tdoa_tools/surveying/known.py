@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.limits import TABLE_CELLS
-from uwb_tdoa_bias.foundation.safe_yaml import read_yaml
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.limits import TABLE_CELLS
+from uwb_tdoa_bias.common.safe_yaml import read_yaml
 
 from ..bags.bag import read_odometry
 from ..diagnosis.constraints import Distance, Mark, OdometryPath
@@ -19,8 +19,8 @@ from ..readers.tables import number, read_table
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from uwb_tdoa_bias.foundation.anchors import Anchors
-    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_bias.common.anchors import Anchors
+    from uwb_tdoa_bias.common.flight import Flight
 
 
 MARK_KEYS = ("flight", "from", "to", "position", "std")

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from uwb_tdoa_bias.common.files import write_filled
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_bias.foundation.files import write_filled
 
 from ..checking.pair_rules import MANY
 from ..diagnosis.attribution import attribute
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
     from pathlib import Path
 
+    from uwb_tdoa_bias.common.flight import Flight
     from uwb_tdoa_bias.effects import Effect
-    from uwb_tdoa_bias.foundation.flight import Flight
     from uwb_tdoa_ekf.core.config import FilterConfig
 
     from ..diagnosis.self_calibration import SelfCalibration

@@ -16,9 +16,9 @@ import numpy as np
 from onnx import NodeProto, TensorProto, checker, helper, numpy_helper
 from sklearn.neural_network import MLPRegressor
 
+from uwb_tdoa_bias.common.errors import InputError
+from uwb_tdoa_bias.common.text import version
 from uwb_tdoa_bias.correction.features import FEATURES, columns
-from uwb_tdoa_bias.foundation.errors import InputError
-from uwb_tdoa_bias.foundation.version import version
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping, Sequence

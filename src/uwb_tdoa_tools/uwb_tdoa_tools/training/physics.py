@@ -22,8 +22,8 @@ from .labels import constellations, with_level_attitude
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
+    from uwb_tdoa_bias.common.flight import Flight
     from uwb_tdoa_bias.effects import Samples
-    from uwb_tdoa_bias.foundation.flight import Flight
 
 # effects of the tag, the vehicle and the anchor modules, valid in another installation
 PORTABLE = tuple(name for name, effect in EFFECTS.items() if effect.portable)

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.common.files import temporary_folder
+from uwb_tdoa_bias.common.flight import AIDS
 from uwb_tdoa_bias.correction.network import Network
-from uwb_tdoa_bias.foundation.files import temporary_folder
-from uwb_tdoa_bias.foundation.flight import AIDS
 
 from ..scoring.evaluation import evaluate
 from ..scoring.gains import SHARES, Shrinkage, best_share
@@ -25,8 +25,8 @@ from . import models, physics
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
+    from uwb_tdoa_bias.common.flight import Flight
     from uwb_tdoa_bias.effects import EffectSet
-    from uwb_tdoa_bias.foundation.flight import Flight
 
     from ..parallel import MapFunction
     from .models import Recipe

@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 
     from onnx import ModelProto
 
+    from uwb_tdoa_bias.common.anchors import Anchors
     from uwb_tdoa_bias.effects import Samples
-    from uwb_tdoa_bias.foundation.anchors import Anchors
 
     from .labels import Labels
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from uwb_tdoa_bias.foundation.sensors import BY_POSE, DIAGNOSED
+from uwb_tdoa_bias.common.sensors import BY_POSE, DIAGNOSED
 
 from .aid import Aid
 from .base import Channel, ChannelResidual, ChannelResiduals, Comparison, Rows
@@ -14,8 +14,8 @@ from .radio import RadioResidual, Ranging, Tdoa, TdoaResidual
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from uwb_tdoa_bias.common.flight import Flight
     from uwb_tdoa_bias.effects import EffectSet
-    from uwb_tdoa_bias.foundation.flight import Flight
 
     from ..references import Reference
 

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.common.sensors import COMPARED, STREAM_OF, measured_on
 from uwb_tdoa_bias.effects import AidSamples, SmoothTerm, aid_samples
 from uwb_tdoa_bias.effects.covariates import OF_AIDS, sensor_covariate
-from uwb_tdoa_bias.foundation.sensors import COMPARED, STREAM_OF, measured_on
 
 from .base import Channel, ChannelResidual, Rows
 from .figures import APART, figures
@@ -19,8 +19,8 @@ from .views import knots_of
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from uwb_tdoa_bias.common.sensors import Stream
     from uwb_tdoa_bias.effects import Effect
-    from uwb_tdoa_bias.foundation.sensors import Stream
 
     from .base import Comparison, Figures
 

@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
 import numpy as np
 
+from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_bias.effects import EffectSet, Track
-from uwb_tdoa_bias.foundation.flight import Flight
 
 from ..references import Reference, ReferenceView
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from uwb_tdoa_bias.common.flight import Truth
     from uwb_tdoa_bias.effects import AidSamples, Effect, ImuSamples, Samples, SmoothTerm
-    from uwb_tdoa_bias.foundation.flight import Truth
 
     from ..regression.algebra import Matrix
     from .views import CovariateView

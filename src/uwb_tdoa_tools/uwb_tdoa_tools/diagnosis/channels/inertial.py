@@ -19,8 +19,8 @@ from .views import extra_at, extra_names, knots_of, views_of_axes
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from uwb_tdoa_bias.common.flight import Imu, Truth
     from uwb_tdoa_bias.effects import Effect
-    from uwb_tdoa_bias.foundation.flight import Imu, Truth
 
     from .base import Comparison, Figures
     from .views import CovariateView

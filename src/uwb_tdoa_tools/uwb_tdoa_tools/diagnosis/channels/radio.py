@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING, ClassVar, TypeVar
 import numpy as np
 from scipy.sparse import csc_array, csr_array
 
+from uwb_tdoa_bias.common.sensors import COMPARED
 from uwb_tdoa_bias.effects import RADIO, Samples, SmoothTerm, samples_at
 from uwb_tdoa_bias.effects.covariates import CATEGORIES, EXTRA, OF_ARRIVAL, OF_MOTION, OF_TDOA
 from uwb_tdoa_bias.effects.smooth_term import OF_LINKS
-from uwb_tdoa_bias.foundation.sensors import COMPARED
 from uwb_tdoa_ekf.sensitivity import Innovations
 
 from ...checking.pair_rules import MANY

@@ -12,8 +12,8 @@ from uwb_tdoa_bias.effects.covariates import CATEGORIES, EXTRA
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
+    from uwb_tdoa_bias.common.flight import Flight
     from uwb_tdoa_bias.effects import ImuSamples, Samples
-    from uwb_tdoa_bias.foundation.flight import Flight
 
 
 MOST_LINKS = 400  # pairs, both directions, whose functions are searched: as of 20 anchors

@@ -33,8 +33,8 @@ from ...checking.pair_rules import MANY
 if TYPE_CHECKING:
     from collections.abc import Iterable
 
+    from uwb_tdoa_bias.common.anchors import Anchors
     from uwb_tdoa_bias.effects import Effect
-    from uwb_tdoa_bias.foundation.anchors import Anchors
     from uwb_tdoa_ekf.evidence import Change, ChangeKey
 
 DELAY_STDS = (

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from uwb_tdoa_bias.foundation.errors import InputError
+from uwb_tdoa_bias.common.errors import InputError
 
 from ...estimate import FlightEstimator
 from ...scoring.metrics import has_innovation
@@ -24,9 +24,9 @@ from .placing import place
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from uwb_tdoa_bias.common.anchors import Anchors
+    from uwb_tdoa_bias.common.flight import Flight
     from uwb_tdoa_bias.effects import EffectSet
-    from uwb_tdoa_bias.foundation.anchors import Anchors
-    from uwb_tdoa_bias.foundation.flight import Flight
     from uwb_tdoa_ekf.core.config import FilterConfig
 
 TRIED = 2  # anchors that explain the most once they are placed; each is then calibrated as unknown

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.effects import AnchorDelay, Covariance, EffectSet
 from uwb_tdoa_bias.effects.anchor import AnchorPosition
-from uwb_tdoa_bias.foundation.errors import InputError
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.evidence import DELAY, ODDS, POSITION, eliminated, keys_of
 
@@ -27,8 +27,8 @@ from .tape import Tape
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from uwb_tdoa_bias.foundation.anchors import Anchors
-    from uwb_tdoa_bias.foundation.flight import Flight
+    from uwb_tdoa_bias.common.anchors import Anchors
+    from uwb_tdoa_bias.common.flight import Flight
 
     from ...parallel import MapFunction
     from ..constraints import Constraint

@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .arrays_file import read_arrays
 from .errors import InputError
-from .files import write_filled
+from .files import read_arrays, write_filled
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from .anchors import Anchors
-from .foreign_text import harmless
 from .sensors import LOCATING, SENSORS
+from .text import harmless
 
 AIDS = tuple(SENSORS)  # streams of a Flight that the filter can do without
 

@@ -26,8 +26,8 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile
 import yaml
 
-from .errors import InputError
-from .ros_log import Log
+from ..common.errors import InputError
+from .log import Log
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Iterator, Sequence

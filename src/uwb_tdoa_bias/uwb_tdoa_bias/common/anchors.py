@@ -12,7 +12,7 @@ import yaml
 from .errors import InputError
 from .files import write_text
 from .safe_yaml import read_yaml
-from .version import written_by
+from .text import written_by
 
 if TYPE_CHECKING:
     from geometry_msgs.msg import Point, Quaternion

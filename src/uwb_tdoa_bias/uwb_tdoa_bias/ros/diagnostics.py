@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from rclpy.clock import ROSClock
     from rclpy.node import Node
 
-    from .ros_node import StreamNode
+    from .node import StreamNode
 
 BEHIND = 0.5  # s that something may wait until this process serves it
 AGAIN = 30.0  # s after which the log says what it has said before

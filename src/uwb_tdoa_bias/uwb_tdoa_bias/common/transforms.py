@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .errors import InputError
-from .later import rotations
+from .lazy import rotations
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence

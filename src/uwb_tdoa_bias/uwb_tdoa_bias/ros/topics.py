@@ -1,6 +1,4 @@
-"""The ends of topics: QoS, subscriptions of which messages are read as bytes, and what is wrong
-with them as ROS sees it.
-"""
+"""Publishers, subscriptions and stamps: QoS, messages that are read as bytes, faults of topics."""
 
 from __future__ import annotations
 
@@ -8,24 +6,72 @@ from copy import copy
 import time
 from typing import TYPE_CHECKING, Any
 
+from builtin_interfaces.msg import Time
 import numpy as np
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 
-from .ros_cdr import Unreadable, decode, name_of
+from .cdr import Unreadable, decode, name_of
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
+    from geometry_msgs.msg import Quaternion
     from rclpy.event_handler import QoSMessageLostInfo
     from rclpy.node import Node
     from rclpy.publisher import Publisher
     from rclpy.subscription import Subscription
     from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-    from .ros_cdr import CdrCodec
-    from .ros_parameters import ParameterNode
+    from .cdr import CdrCodec
+    from .parameters import ParameterNode
+
+
+class Epoch:
+    """Stamps as float seconds, exact to the nanosecond: counted from the whole second of the first
+    stamp.
+
+    Seconds since 1970 in a float64 are only good to 2e-7 s. Exact for 48 days before and after the
+    first stamp.
+    """
+
+    def __init__(self) -> None:
+        self._second: int = None  # type: ignore[assignment]  # of the first stamp, once there is one
+
+    def seconds(self, stamp: Time) -> float:
+        """Float s of a builtin_interfaces/Time."""
+        if self._second is None:
+            self._second = stamp.sec
+        return (stamp.sec - self._second) + 1e-9 * stamp.nanosec
+
+    def seconds_of(self, sec: np.ndarray, nanosec: np.ndarray) -> np.ndarray:
+        """Float s, (n,), of the two parts of stamps, (n,) each."""
+        if self._second is None:
+            self._second = int(sec[0])
+        return (sec.astype(np.int64) - self._second) + 1e-9 * nanosec
+
+    def parts(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What `seconds_of` was given, to the nanosecond, of t (n,) s."""
+        second, nanosecond = np.divmod(np.round(t * 1e9).astype(np.int64), 10**9)
+        return self._second + second, nanosecond
+
+    @property
+    def begin(self) -> int:
+        """Stamp, s, of what `seconds` gives as 0."""
+        return self._second or 0
+
+    def stamp(self, t: float) -> Time:
+        """builtin_interfaces/Time of float s: what `seconds` was given, to the nanosecond."""
+        second, nanosecond = divmod(round(t * 1e9), 10**9)
+        return Time(sec=self._second + second, nanosec=nanosecond)
+
+
+def orientation_of(q: Quaternion) -> tuple[float, float, float, float]:
+    """Tuple x y z w of a geometry_msgs/Quaternion; NaN for (0, 0, 0, 0), which says: not known."""
+    values = (q.x, q.y, q.z, q.w)
+    return values if any(values) else (np.nan, np.nan, np.nan, np.nan)
+
 
 # What comes in is sensor data: best effort, which hears every publisher. Deep, because a node that
 # was not scheduled for a

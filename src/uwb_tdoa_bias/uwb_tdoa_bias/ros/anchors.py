@@ -11,19 +11,18 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from uwb_tdoa_msgs.msg import Anchor, AnchorArray
 
-from .anchors import SAME_PLACE, Anchors
-from .errors import InputError
-from .ros_parameters import Parameter
-from .ros_topics import Input, Refusals
-from .survey import read_survey
-from .survey_faults import refuse_faulty
+from ..common.anchors import SAME_PLACE, Anchors
+from ..common.errors import InputError
+from ..common.survey import read_survey, refuse_faulty
+from .parameters import Parameter
+from .topics import Input, Refusals
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from rclpy.event_handler import QoSRequestedIncompatibleQoSInfo
 
-    from .ros_node import StreamNode
+    from .node import StreamNode
 
 ANCHORS_QOS = QoSProfile(
     depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL

@@ -6,7 +6,7 @@ import sys
 import time
 from typing import TYPE_CHECKING, Any
 
-from .foreign_text import line_of
+from ..common.text import line_of
 
 if TYPE_CHECKING:
     from types import CodeType

@@ -56,7 +56,7 @@ config._config_fname = "/dev/null/.numba_config.yaml"
 
 
 def compiled(function: Function) -> Function:
-    """Decorator: compile `function`, which may call others below its folder and of the foundation,
+    """Decorator: compile `function`, which may call others below its folder and of common/,
     and cache it.
     """
     before = config.CACHE_DIR  # type: ignore[attr-defined]  # numba puts its settings there while it is imported

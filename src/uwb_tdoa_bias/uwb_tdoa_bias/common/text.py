@@ -1,7 +1,8 @@
-"""Text of others, out of files and off topics, before it reaches a terminal, Markdown, a page or a
-picture.
-"""
+"""Sanitize texts of files and topics, and name the version that wrote a file."""
 
+from __future__ import annotations
+
+from functools import cache
 import re
 
 from .limits import LINE_LENGTH, NAME_LENGTH
@@ -35,3 +36,19 @@ def harmless(text: object) -> str:
     becomes _, and its end is cut.
     """
     return _OTHERS.sub("_", str(text))[:NAME_LENGTH]
+
+
+@cache
+def version() -> str:
+    """Its version, e.g. "0.1.0"; "unknown" where the packages are not installed."""
+    from importlib import metadata  # takes a twentieth of a second
+
+    try:
+        return metadata.version("uwb_tdoa_bias")
+    except metadata.PackageNotFoundError:
+        return "unknown"
+
+
+def written_by() -> str:
+    """For the files that we write: "uwb_tdoa 0.1.0"."""
+    return f"uwb_tdoa {version()}"

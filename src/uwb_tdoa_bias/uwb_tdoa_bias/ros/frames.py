@@ -9,8 +9,9 @@ from builtin_interfaces.msg import Time
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from tf2_msgs.msg import TFMessage
 
-from .errors import InputError
-from .ros_cdr import (
+from ..common.errors import InputError
+from ..common.transforms import Frames
+from .cdr import (
     ENCAPSULATION,
     LENGTH,
     MOST_ELEMENTS,
@@ -20,16 +21,15 @@ from .ros_cdr import (
     decode,
     read_text,
 )
-from .ros_parameters import LONGEST_NAME
-from .ros_topics import Input
-from .transforms import Frames
+from .parameters import LONGEST_NAME
+from .topics import Input
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from geometry_msgs.msg import TransformStamped
 
-    from .ros_node import StreamNode
+    from .node import StreamNode
 
 TF_QOS = QoSProfile(depth=100)  # what tf2 uses
 MOVING_QOS = QoSProfile(depth=1000)  # 2 s of a robot that publishes it at 500 Hz

@@ -1,0 +1,1 @@
+"""Types that all packages share: flights, anchors, geometry, radio, surveys, stamps, errors, files."""

@@ -1,3 +1,0 @@
-"""What everything else stands on: flights, anchors, geometry, antennas, stamps, errors, compiled
-code, and what talks ROS.
-"""

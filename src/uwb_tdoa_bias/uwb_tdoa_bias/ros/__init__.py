@@ -1,0 +1,1 @@
+"""Nodes, topics, parameters, frames and diagnostics: all that touches ROS."""
