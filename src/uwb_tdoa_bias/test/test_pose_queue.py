@@ -1,7 +1,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from uwb_tdoa_bias.correction.pose_queue import PoseQueue
+from uwb_tdoa_bias.correction.poses import PoseQueue
 
 
 def test_after_a_gap_what_counts_is_the_item_before_it():

@@ -26,8 +26,7 @@ from .common.errors import InputError
 from .common.stamps import LARGEST_STEP_BACK, StampGate
 from .correction.corrector import EFFECTS, FADED, NETWORK, PASSED, Correction, Corrector, warm_up
 from .correction.network import load_network
-from .correction.pose_queue import PoseQueue
-from .correction.poses import parts_of
+from .correction.poses import PoseQueue, parts_of
 from .effects import EffectSet, LabelCorrector
 from .effects.tag import TagLeverArm
 from .ros import process

@@ -22,7 +22,7 @@ from uwb_tdoa_bias.ros.topics import Epoch  # noqa: E402
 from uwb_tdoa_ekf import outputs  # noqa: E402
 from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 from uwb_tdoa_ekf.ekf_node import EkfNode  # noqa: E402
-from uwb_tdoa_ekf.pose_message import pose_from_message  # noqa: E402
+from uwb_tdoa_ekf.frames import pose_from_message  # noqa: E402
 from uwb_tdoa_ekf.results import Odometry  # noqa: E402
 
 # --- ekf node ---

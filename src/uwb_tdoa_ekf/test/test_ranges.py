@@ -12,6 +12,7 @@ from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.sensors import Ranges
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
+from uwb_tdoa_ekf.anchor_table import Installed
 from uwb_tdoa_ekf.core import ranges
 from uwb_tdoa_ekf.core.aids import STREAMS
 from uwb_tdoa_ekf.core.auxiliary import RANGE
@@ -20,9 +21,8 @@ from uwb_tdoa_ekf.core.memory import AID, IMU_SAMPLE, ODOMETRY, Measurements, ne
 from uwb_tdoa_ekf.core.memory import TDOA as TDOA_ROW
 from uwb_tdoa_ekf.core.verdicts import INVALID, REPEATED, USED
 from uwb_tdoa_ekf.estimator import Estimator
-from uwb_tdoa_ekf.installed import Installed
 from uwb_tdoa_ekf.offline import run_offline, without_offset
-from uwb_tdoa_ekf.radio_corrections import SLICE, RadioCorrections
+from uwb_tdoa_ekf.pipeline import SLICE, RadioCorrections
 from uwb_tdoa_ekf.smoother import smooth
 
 # --- ranges ---

@@ -40,20 +40,18 @@ from uwb_tdoa_bias.ros.parameters import files_of, refuse_unknown, say_unused
 from uwb_tdoa_bias.ros.topics import Epoch, Input, Refusals, several_publishers
 from uwb_tdoa_msgs.msg import TdoaCorrected
 
+from .compile_nodes import warm_up
 from .core.verdicts import INVALID
 from .ekf_parameters import ODOM, declare_parameters, follow_changes
 from .estimator import Estimator
-from .frames import rotation_std
-from .imu_mount import ImuMount
+from .frames import ImuMount, pose_from_message, rotation_std
 from .monitoring.health import OK, WARN, Health, together
 from .monitoring.status import FAULT, Status, doubted, status_of, yaw_in_words
 from .monitoring.stream_watch import FEW_ANCHORS, StreamWatch
 from .outputs import Outputs, StatusOutput
-from .pose_message import pose_from_message
 from .reorder_buffer import STREAMS
 from .results import VERDICTS, Residuals
 from .streams import most_severe_first
-from .warm_up import warm_up
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence

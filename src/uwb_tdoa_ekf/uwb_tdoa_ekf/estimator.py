@@ -14,6 +14,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.stamps import LARGEST_STEP_BACK
 from uwb_tdoa_bias.effects import EffectSet
 
+from .anchor_table import MOST_ROWS, Installed
 from .core import aids
 from .core.config import FilterConfig
 from .core.engine import LOST_TIME
@@ -23,7 +24,6 @@ from .core.memory import AID, IMU_SAMPLE, ODOMETRY, POSE, TDOA, YAWS, joined, st
 from .core.startup import APART
 from .core.velocity import HELD, LONGEST_STD, YAW_RATE
 from .core.verdicts import INVALID, USED
-from .installed import MOST_ROWS, Installed
 from .monitoring.clocks import clock_ahead, restarted
 from .monitoring.implausible import implausible
 from .pipeline import Pipeline, odometry_of

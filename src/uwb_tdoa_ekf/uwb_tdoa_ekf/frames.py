@@ -1,8 +1,6 @@
-"""From the filter's conventions to those of nav_msgs/Odometry (REP-105, and the comments of its
-definition).
+"""Convert between the conventions of the filter, of ROS messages, and of a turned IMU.
 
-The filter: position and velocity in the world, attitude error in the body frame. Odometry: pose in
-the parent (world) frame with rotations about its fixed axes, twist in the child (body) frame.
+nav_msgs/Odometry: REP-105, and the comments of its definition.
 """
 
 from __future__ import annotations
@@ -13,13 +11,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.common.compiled import compiled
+from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.sensors.sensor import UNKNOWN_VARIANCE
 from uwb_tdoa_bias.correction.poses import known_yaw_std
 
 from .core.state import rotation
 
 if TYPE_CHECKING:
+    from geometry_msgs.msg import PoseWithCovarianceStamped
+    from numpy.typing import ArrayLike
+    from scipy.spatial.transform import Rotation
+
+    from uwb_tdoa_bias.ros.topics import Epoch
+
     from .results import Odometry
+
 
 POSE, TWIST = 3 + 4 + 36, 3 + 3 + 36  # numbers in a PoseWithCovariance and in a TwistWithCovariance
 
@@ -140,3 +146,109 @@ def _fill(
             twist[n, 6 + 7 * (3 + i)] = rate_variances[n, i] if known else UNKNOWN_VARIANCE
             for j in range(3):
                 twist[n, 6 + 6 * i + j] = covariance[n, 6 + i, 6 + j]
+
+
+SLOW = (
+    0.02  # s; angular acceleration is the slope of the rate after a low pass of this time constant
+)
+LONGEST_STEP = 0.1  # s between samples, above which there is no slope
+
+
+class ImuMount:
+    """rotation : Rotation, IMU to body; arm (3,) m, of the IMU in the body.
+
+    Specific force of the origin: f - dw/dt x arm - w x (w x arm), with everything in the body frame
+    (rigid body kinematics, e.g. Groves, Principles of GNSS, Inertial, and Multisensor Integrated
+    Navigation Systems, 2013, section 2.3).
+    """
+
+    def __init__(self, rotation: Rotation, arm: ArrayLike) -> None:
+        self._matrix, self._arm = rotation.as_matrix(), np.asarray(arm, dtype=float)
+        self._centred = not self._arm.any()
+        self._t: float | None = None
+        self._slow: np.ndarray = np.zeros(
+            3
+        )  # s, stamp of the last sample, and slow part of its rate, rad/s
+
+    def __eq__(self, other: object) -> bool:
+        """Whether it sits in the same place."""
+        return (
+            isinstance(other, ImuMount)
+            and (self._matrix == other._matrix).all()
+            and (self._arm == other._arm).all()
+        )
+
+    def in_body(
+        self, t: np.ndarray, gyro: np.ndarray, accel: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """gyro (n, 3) rad/s and accel (n, 3) m/s^2 in the body frame, of samples at t (n,) s.
+
+        Stamps rise, but for outliers.
+        """
+        gyro, accel = gyro @ self._matrix.T, accel @ self._matrix.T
+        if not self._centred:
+            slopes = np.zeros_like(gyro)
+            for k in np.flatnonzero(np.isfinite(gyro).all(axis=1)):
+                slopes[k] = self._angular_acceleration(t[k], gyro[k])
+            accel = accel - np.cross(slopes, self._arm) - np.cross(gyro, np.cross(gyro, self._arm))
+        return gyro, accel
+
+    def _angular_acceleration(self, t: float, gyro: np.ndarray) -> np.ndarray:
+        """rad/s^2, (3,): slope of the slow part."""
+        dt = np.inf if self._t is None else t - self._t
+        if dt <= 0.0:
+            return np.zeros(3)
+        before, self._t = self._slow, t
+        if dt > LONGEST_STEP:
+            self._slow = gyro
+            return np.zeros(3)
+        self._slow = before + min(1.0, dt / SLOW) * (gyro - before)
+        return (self._slow - before) / dt
+
+
+LARGEST = 1e16  # the square of what is far for an anchor, m^2
+
+
+def pose_from_message(
+    message: PoseWithCovarianceStamped, world: str, epoch: Epoch, newest: float
+) -> tuple[float, np.ndarray, np.ndarray, float, float]:
+    """(t s, p (3,) m, covariance (3, 3) m^2, yaw rad, its standard deviation rad) of a
+    PoseWithCovarianceStamped.
+
+    world : name of the world frame; epoch : Epoch; newest : s, stamp of the newest measurement,
+        which a pose without
+    stamp has. A coordinate, or the yaw, whose variance is 0 is not given, and NaN. Raises
+    InputError.
+    """
+    frame = message.header.frame_id
+    if frame not in ("", world):
+        raise InputError(
+            f"its frame is '{frame}', and the filter's is '{world}'; give it in that (RViz: "
+            "Fixed Frame)."
+        )
+    stamp, p, q = message.header.stamp, message.pose.pose.position, message.pose.pose.orientation
+    covariance = np.reshape(message.pose.covariance, (6, 6))
+    variances = np.diag(covariance)
+    numbers = [p.x, p.y, p.z, q.x, q.y, q.z, q.w, *covariance.ravel()]
+    if not (np.abs(numbers) <= LARGEST).all() or (variances < 0.0).any():
+        raise InputError(
+            f"it holds numbers that are not finite or above {LARGEST:g}, or negative "
+            "variances; give others."
+        )
+    if np.linalg.eigvalsh(0.5 * (covariance + covariance.T)[:3, :3]).min() < -1e-9:
+        raise InputError(
+            "its covariance is none: the correlations are larger than 1; give a smaller "
+            "off-diagonal."
+        )
+    at = np.where(variances[:3] > 0.0, [p.x, p.y, p.z], math.nan)
+    t = epoch.seconds(stamp) if stamp.sec or stamp.nanosec else newest
+    if not math.isfinite(t):
+        raise InputError(
+            "it has no stamp, and there is no measurement whose time it could have; give it a "
+            "stamp."
+        )
+    length = math.hypot(q.x, q.y, q.z, q.w)
+    if not variances[5] > 0.0 or length < 0.5:
+        return t, at, covariance[:3, :3], math.nan, math.nan
+    yaw = math.atan2(2.0 * (q.w * q.z + q.x * q.y), length**2 - 2.0 * (q.y**2 + q.z**2))
+    return t, at, covariance[:3, :3], yaw, math.sqrt(variances[5])

@@ -11,6 +11,7 @@ import numpy as np
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet
 
+from .anchor_table import Installed
 from .core.aids import STREAMS as AIDS
 from .core.config import FilterConfig
 from .core.hypotheses import yaw_offset
@@ -18,7 +19,6 @@ from .core.measurements import aid_rows, imu_rows, usable_tdoas
 from .core.memory import AID, RESIDUAL, TDOA, joined, structured
 from .core.verdicts import INVALID
 from .frames import poses_of
-from .installed import Installed
 from .pipeline import Pipeline, odometry_of
 from .reorder_buffer import FIRST_AID, IMU_STREAM, TDOA_STREAM, ReorderBuffer
 from .results import VERDICTS, Odometry, Residuals

@@ -14,7 +14,7 @@ from uwb_tdoa_bias.common.flight import Imu
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.tag import TagLeverArm
-from uwb_tdoa_ekf.imu_mount import ImuMount
+from uwb_tdoa_ekf.frames import ImuMount
 from uwb_tdoa_ekf.offline import run_offline
 from uwb_tdoa_tools.bags import bag
 from uwb_tdoa_tools.bags.bag import read_bag

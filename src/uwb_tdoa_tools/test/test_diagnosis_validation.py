@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_bias.correction.fixed_pose import FixedPoseCorrector
+from uwb_tdoa_bias.correction.corrector import Corrector, FixedPoseCorrector
 from uwb_tdoa_bias.effects import EFFECTS, AnchorDelay, EffectSet, SmoothTerm, TagLeverArm
 from uwb_tdoa_bias.effects.samples import Track
 from uwb_tdoa_ekf.frames import poses_of

@@ -15,9 +15,14 @@ from ..effects.samples import N_STATES, POSE_LAG, motion_at
 from .poses import POSE_NUMBERS, TWIST_NUMBERS, Poses, parts_of, rotated_in_yaw
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import ArrayLike
 
+    from ..common.anchors import Anchors
+    from ..effects.effect_set import EffectSet
     from .network import Network
+
 
 # status of one correction; the values of TdoaCorrected.STATUS_*
 PASSED, EFFECTS, NETWORK, FADED = range(4)
@@ -251,3 +256,33 @@ def _add_learned(
             if math.isfinite(deviation[i]):
                 std[i] = math.hypot(std[i], deviation[i])
             status[i] = FADED if known[i] < FADED_BELOW else NETWORK
+
+
+pass
+
+
+class FixedPoseCorrector(Corrector):
+    """Corrects a recording at the poses that a run with another model has had."""
+
+    idle = True  # nothing of this run is waited for
+
+    def __init__(
+        self, anchors: Anchors, effects: EffectSet | None, poses: Sequence[np.ndarray]
+    ) -> None:
+        """poses : (t (k,) s, p (k, 3) m, q (k, 4), v (k, 3) m/s, yaw_std (k,) rad) of the other
+        run, as `add_pose` takes them.
+        """
+        self._known = poses
+        super().__init__(anchors, effects, history=max(len(poses[0]), 1))
+
+    def reset(self) -> None:
+        super().reset()
+        self.add_pose(*self._known)
+
+    def correct(self, t: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray) -> Correction:
+        if len(t) == 0:
+            return Correction.none(d)
+        bias, noise, slope, state = self.contribution(self.samples(t, a, b))
+        return Correction(
+            bias, noise, d - bias, np.full(len(t), EFFECTS, dtype=np.uint8), slope, state
+        )

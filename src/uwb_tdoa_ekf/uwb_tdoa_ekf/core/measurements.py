@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.common.anchors import Anchors
     from uwb_tdoa_bias.common.sensors import Stream
 
-    from ..installed import Installed
+    from ..anchor_table import Installed
 
 MAX_RATE, MAX_ACCEL = 100.0, 1000.0  # rad/s, m/s^2: beyond what any inertial sensor reads
 STEEPEST, FARTHEST = 1e3, 1e6  # m per m or m/s, and m or m/s, of what a bias changes with

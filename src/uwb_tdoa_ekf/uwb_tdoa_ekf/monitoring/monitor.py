@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.common.anchors import Anchors
     from uwb_tdoa_bias.effects.effect_set import Covariance
 
-    from ..installed import Installed
+    from ..anchor_table import Installed
     from ..results import Odometry, Residuals
     from .change import Change
     from .slices import Slice

@@ -34,8 +34,8 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.common.anchors import Anchors
     from uwb_tdoa_bias.effects.effect_set import Covariance
 
+    from ..anchor_table import Installed
     from ..evidence import ChangeKey
-    from ..installed import Installed
     from .slices import Slice
 
 CELL = 0.7  # m

@@ -15,7 +15,7 @@ from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.flight import Imu
 from uwb_tdoa_bias.common.transforms import Frames
-from uwb_tdoa_ekf.imu_mount import ImuMount
+from uwb_tdoa_ekf.frames import ImuMount
 
 from .files import connections_of, readable
 from .message_types import check_type

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_bias.correction.fixed_pose import FixedPoseCorrector
+from uwb_tdoa_bias.correction.corrector import Corrector, FixedPoseCorrector
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf.frames import poses_of
 from uwb_tdoa_ekf.offline import run_offline
