@@ -59,12 +59,12 @@ def test_tdoas_of_two_antennas_are_corrected_each_by_its_own_place_and_none_is_d
     node._publish = lambda items, correction, stamps=None: sent.extend(
         zip((item[0] for item in items), correction.bias.tolist())
     )
-    wire = CdrCodec(Tdoa, *MEASURED)
+    codec = CdrCodec(Tdoa, *MEASURED)
     for k in range(200):
         t, frame = 0.01 * k, ("left", "right")[k % 2]
         node._corrector.add_pose(t, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
         node._poses.take_all([t])
-        rows = wire.template(Tdoa(anchor_a=0, anchor_b=1)).rows(1)
+        rows = codec.template(Tdoa(anchor_a=0, anchor_b=1)).rows(1)
         rows["sec"], rows["nanosec"] = (
             node._epoch.parts(np.array([t])) if node._epoch._second is not None else (0, 0)
         )

@@ -1,7 +1,7 @@
 import pytest
 
 from uwb_tdoa_bias.common.flight import Flight
-from uwb_tdoa_bias.common.text import harmless, printable
+from uwb_tdoa_bias.common.text import printable, sanitize
 
 ATTACK = "\x1b[2J\x1b]0;title\x07\r\nok \u202efdp.exe \ud800 \x9b31m"
 
@@ -30,5 +30,5 @@ def test_a_terminal_shows_what_would_steer_it():
     ],
 )
 def test_a_name_means_nothing_anywhere(name, left):
-    assert harmless(name) == left and harmless(left) == left
+    assert sanitize(name) == left and sanitize(left) == left
     assert Flight(name, None, None).name == left

@@ -61,8 +61,8 @@ def test_the_definition_fits_the_types_of_our_topics():
 def test_messages_are_read_in_order_in_runs_of_one_frame(way):
     frames = ["tag", "tag", "gat", "longer", "longer", ""]
     messages = [corrected(k, frame, model="x" * (k % 2)) for k, frame in enumerate(frames)]
-    wire = CdrCodec(TdoaCorrected, "corrected", "anchor_b", "status")
-    parts = wire.read([serialize_message(message) for message in messages])
+    codec = CdrCodec(TdoaCorrected, "corrected", "anchor_b", "status")
+    parts = codec.read([serialize_message(message) for message in messages])
     assert [frame for frame, rows, _ in parts for _ in rows] == frames
     assert [k for *_, some in parts for k in range(6)[some]] == list(range(6))
     rows = np.concatenate(
@@ -86,10 +86,10 @@ def test_vectors_and_arrays_are_columns(way):
 
 
 def test_what_is_written_is_what_an_object_would_be(way):
-    wire = CdrCodec(
+    codec = CdrCodec(
         TdoaCorrected, "corrected", "anchor_b", "anchor_a", "raw"
     )  # not in the order of the definition
-    template = wire.template(corrected(7, model="effects"))
+    template = codec.template(corrected(7, model="effects"))
     wanted = [corrected(k, model="effects") for k in (7, 8, 300)]
     rows = template.rows(3)
     for name in ("anchor_a", "anchor_b", "raw", "corrected"):
@@ -132,9 +132,9 @@ def tdoa_bytes(order="<", options=0, frame=b"tag", variance=True, more=b""):
 @pytest.mark.parametrize("options", [0, 1, 3])
 @pytest.mark.parametrize("more", [b"", b"\0\0\0"])
 def test_every_encoding_that_means_something_is_read(way, order, options, more):
-    wire = CdrCodec(Tdoa, "anchor_a", "anchor_b", "distance_difference", "variance")
-    ((frame, rows, some),) = wire.read([tdoa_bytes(order, options, more=more)])
-    assert (frame, some) == ("tag", slice(0, 1)) and rows[list(wire.dtype.names)].tolist() == [
+    codec = CdrCodec(Tdoa, "anchor_a", "anchor_b", "distance_difference", "variance")
+    ((frame, rows, some),) = codec.read([tdoa_bytes(order, options, more=more)])
+    assert (frame, some) == ("tag", slice(0, 1)) and rows[list(codec.dtype.names)].tolist() == [
         (1, 2, 3, 4, 0.5, 0.25)
     ]
 
@@ -158,8 +158,8 @@ BAD = {
 
 @pytest.mark.parametrize("reason", BAD)
 def test_what_cannot_be_read_is_left_out_and_said(reason):
-    wire, refused = CdrCodec(Tdoa, "anchor_a"), []
-    parts = wire.read(
+    codec, refused = CdrCodec(Tdoa, "anchor_a"), []
+    parts = codec.read(
         [tdoa_bytes(), BAD[reason], tdoa_bytes(">"), BAD[reason], tdoa_bytes()], refused.append
     )
     assert [some.start for *_, some in parts] == [0, 2, 4] and [
@@ -167,7 +167,7 @@ def test_what_cannot_be_read_is_left_out_and_said(reason):
     ] == [[3]] * 3
     assert len(refused) == 2
     with pytest.raises(Unreadable, match=reason):
-        wire.read([BAD[reason]])
+        codec.read([BAD[reason]])
 
 
 def test_lists_are_bounded_before_anything_is_allocated():
@@ -189,7 +189,7 @@ def test_lists_are_bounded_before_anything_is_allocated():
 
 
 def test_noise_is_refused_or_read_and_nothing_else(way):
-    rng, wire, refused, read = (
+    rng, codec, refused, read = (
         np.random.default_rng(1),
         CdrCodec(TdoaCorrected, "corrected", "bias_slope"),
         [],
@@ -200,7 +200,7 @@ def test_noise_is_refused_or_read_and_nothing_else(way):
         data = bytearray(whole[: rng.integers(len(whole) + 1)] if rng.random() < 0.3 else whole)
         for place in rng.integers(len(data), size=rng.integers(1, 6)) if data else ():
             data[place] ^= 1 << rng.integers(8)
-        read += sum(len(rows) for _, rows, _ in wire.read([bytes(data)], refused.append))
+        read += sum(len(rows) for _, rows, _ in codec.read([bytes(data)], refused.append))
     assert read + len(refused) == 300 and read > 50 and len(refused) > 50
 
 

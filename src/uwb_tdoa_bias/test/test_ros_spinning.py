@@ -16,8 +16,8 @@ from uwb_tdoa_bias.ros import process  # noqa: E402
 from uwb_tdoa_bias.ros.cdr import CdrCodec  # noqa: E402
 from uwb_tdoa_bias.ros.node import (  # noqa: E402
     PERIOD,
-    RoundRobin,
     StreamNode,  # noqa: E402
+    StreamPoller,
     Streams,
 )
 from uwb_tdoa_bias.ros.parameters import MOST_ASKED, MOST_REQUESTS  # noqa: E402
@@ -129,7 +129,7 @@ def test_streams_are_taken_together_and_the_newest_of_the_clock(surroundings):
     )
     until(lambda: publisher.get_subscription_count() and clock.get_subscription_count())
     assert not {Clock, FluidPressure} & {each.msg_type for each in node.subscriptions}
-    spinner = Spinner([node], RoundRobin([streams]))
+    spinner = Spinner([node], StreamPoller([streams]))
     spinner._serve()
     for second in range(1, MANY + 1):
         publisher.publish(FluidPressure())
@@ -160,7 +160,7 @@ def test_a_stream_that_begins_after_a_silence_is_taken(surroundings):
     node.create_timer(
         0.1, lambda: publisher.publish(FluidPressure())
     )  # the process sleeps in its executor until then
-    spinner = Spinner([node], RoundRobin([streams]))
+    spinner = Spinner([node], StreamPoller([streams]))
     spinner.spin(stop)
     assert 0.0 <= heard[0] < 60.0
     spinner.close()
@@ -175,12 +175,12 @@ def test_turns_rest_as_long_as_they_took_and_only_if_there_was_something():
             time.sleep(self.seconds)
             return self.busy
 
-    assert RoundRobin([Slow(0.0, False)]).take() is None
+    assert StreamPoller([Slow(0.0, False)]).take() is None
     assert (
-        PERIOD <= RoundRobin([Slow(0.0, True), Slow(0.0, False)]).take() <= 0.01
+        PERIOD <= StreamPoller([Slow(0.0, True), Slow(0.0, False)]).take() <= 0.01
     )  # a busy computer takes its time
-    assert 0.004 <= RoundRobin([Slow(0.005, True)]).take() <= 0.01
-    assert RoundRobin([Slow(0.05, True)]).take() == 0.01
+    assert 0.004 <= StreamPoller([Slow(0.005, True)]).take() <= 0.01
+    assert StreamPoller([Slow(0.05, True)]).take() == 0.01
 
 
 def test_a_flood_of_requests_does_not_keep_streams_waiting(surroundings, monkeypatch):

@@ -34,7 +34,7 @@ from .ros.anchors import ANCHORS_FILE, AnchorsInput
 from .ros.cdr import CdrCodec
 from .ros.diagnostics import Diagnostics, Rate, Report
 from .ros.frames import FramesInput, unknown_frame
-from .ros.node import RoundRobin, StreamNode, StreamOutput, Streams
+from .ros.node import StreamNode, StreamOutput, StreamPoller, Streams
 from .ros.parameters import (
     FROZEN,
     Parameter,
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Sequence
 
     from .common.anchors import Anchors
-    from .ros.cdr import Template
+    from .ros.cdr import CdrTemplate
 
 PARAMETERS = {  # in the order of config/bias_node.yaml
     "anchors_file": ANCHORS_FILE,
@@ -159,8 +159,8 @@ class BiasNode(StreamNode):
         self._hold = PoseQueue(self._limit)
         self._tdoas, self._poses = StampGate(), StampGate()
         self._reported_unready = self._reported_received = self._reported_poses = 0
-        self._wire = CdrCodec(TdoaCorrected, *CORRECTED)
-        self._templates: dict[tuple[str, str], Template] = {}  # by frame and model, the latest
+        self._codec = CdrCodec(TdoaCorrected, *CORRECTED)
+        self._templates: dict[tuple[str, str], CdrTemplate] = {}  # by frame and model, the latest
         self._frames_said: set[str] = set()
         self.output = StreamOutput(self, TdoaCorrected, "uwb/tdoa_corrected")
         self._frames = FramesInput(self, self._epoch.seconds, self._on_frames)
@@ -174,7 +174,7 @@ class BiasNode(StreamNode):
         self._anchors.start()
         if member is None:
             say_unused([self], files_of(arguments))
-            self.turns = RoundRobin([self.streams])
+            self.turns = StreamPoller([self.streams])
         self.ready = f"ready; correcting with: {self._model}"
 
     @property
@@ -443,13 +443,13 @@ class BiasNode(StreamNode):
         self._counts["published"] += len(items)
         self._counts.update(STATUS[one] for one in status)
 
-    def _template(self, frame: str, model: str) -> Template:
+    def _template(self, frame: str, model: str) -> CdrTemplate:
         if (frame, model) not in self._templates:
             if len(self._templates) >= MOST_FRAMES:
                 self._templates.clear()
             message = TdoaCorrected(model=model)
             message.header.frame_id = frame
-            self._templates[frame, model] = self._wire.template(message)
+            self._templates[frame, model] = self._codec.template(message)
         return self._templates[frame, model]
 
     def _report(self) -> Report:

@@ -12,7 +12,7 @@ from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.sensors import Ranges
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EFFECTS, EffectSet
-from uwb_tdoa_ekf.anchor_table import Installed
+from uwb_tdoa_ekf.anchor_table import AnchorTable
 from uwb_tdoa_ekf.core import ranges
 from uwb_tdoa_ekf.core.aids import STREAMS
 from uwb_tdoa_ekf.core.auxiliary import RANGE
@@ -210,7 +210,7 @@ def odometry_at(t, p):
 
 
 def test_a_slice_is_corrected_at_the_last_pose_before_it():
-    corrections = RadioCorrections(EffectSet((MOVED,)), Installed(BOX))
+    corrections = RadioCorrections(EffectSet((MOVED,)), AnchorTable(BOX))
     moved = BOX.positions[1] + [0.6, 0.0, -0.4]
     places = [np.array([1.0, 1.0, 1.0]), np.array([3.0, 2.0, 1.0])]
     t = np.array([0.01, 0.02, SLICE + 0.01, SLICE + 0.02, 2 * SLICE + 0.01])
@@ -230,11 +230,11 @@ def test_a_slice_is_corrected_at_the_last_pose_before_it():
 
 
 def test_ranges_of_anchors_that_are_gone_stay_as_they_are_and_others_keep_their_rows():
-    installed = Installed(BOX)
+    anchor_table = AnchorTable(BOX)
     corrections = RadioCorrections(
-        EffectSet((EFFECTS["anchor_delay"]({"1": 0.3, "4": 0.1}),)), installed
+        EffectSet((EFFECTS["anchor_delay"]({"1": 0.3, "4": 0.1}),)), anchor_table
     )
-    installed.change(BOX.only(np.array([1, 2, 3])))
+    anchor_table.change(BOX.only(np.array([1, 2, 3])))
     (part,) = corrections.slices(
         measured(np.array([0.01, 0.02, 0.03]), np.array([0, 1, 3]), np.full(3, 4.0))
     )
@@ -244,21 +244,21 @@ def test_ranges_of_anchors_that_are_gone_stay_as_they_are_and_others_keep_their_
 def test_what_does_not_act_on_ranges_leaves_everything_in_one_piece():
     assert RadioCorrections(
         EffectSet((EFFECTS["pair_offset"]({"1-2": 0.3}), EFFECTS["range_delay"]({"offset": 0.1}))),
-        Installed(BOX),
+        AnchorTable(BOX),
     ).idle
-    assert not RadioCorrections(EffectSet((DELAY,)), Installed(BOX)).idle
+    assert not RadioCorrections(EffectSet((DELAY,)), AnchorTable(BOX)).idle
 
 
 def test_what_is_fed_is_not_changed():
     given = measured(np.array([0.01]), np.array([0]), np.array([4.0]))
-    (part,) = RadioCorrections(EffectSet((DELAY,)), Installed(BOX)).slices(given)
+    (part,) = RadioCorrections(EffectSet((DELAY,)), AnchorTable(BOX)).slices(given)
     assert given.aids["value"][0, 0] == 4.0 and part.aids["value"][0, 0] == pytest.approx(3.7)
 
 
 def test_what_comes_at_once_and_one_by_one_is_corrected_alike():
     """Also where the border between two slices is rounded."""
     t = 1.7e9 + np.arange(400) / 100.0
-    whole, single = (RadioCorrections(EffectSet((MOVED,)), Installed(BOX)) for _ in range(2))
+    whole, single = (RadioCorrections(EffectSet((MOVED,)), AnchorTable(BOX)) for _ in range(2))
 
     def corrected(corrections, parts):
         out = []
@@ -286,7 +286,7 @@ def test_what_holds_no_distances_is_one_part_and_distances_after_it_are_correcte
     later = [measured(t[-1:] + after, np.ones(1, int), np.full(1, 4.0)) for after in (0.001, SLICE)]
 
     def corrected(parts):
-        corrections, out = RadioCorrections(EffectSet((MOVED,)), Installed(BOX)), []
+        corrections, out = RadioCorrections(EffectSet((MOVED,)), AnchorTable(BOX)), []
         for part in parts:
             pieces = 0
             for piece in corrections.slices(part):

@@ -22,7 +22,7 @@ MOST_ROWS = (
 )
 
 
-class Installed:
+class AnchorTable:
     """The anchors that a filter has had so far, by rows, and which of them are there now.
 
     anchors : Anchors that are there; ids (M,), positions (M, 3) m: of all rows. An anchor that is
@@ -71,16 +71,16 @@ class Installed:
 
 
 def new_state_of(
-    installed: Installed, functions: Sequence[SensorFunction], floor: Floor | None
+    anchor_table: AnchorTable, functions: Sequence[SensorFunction], floor: Floor | None
 ) -> FilterState:
-    """`new_state` with a row for each row of Installed; functions, floor : of the anchors that are
+    """`new_state` with a row for each row of AnchorTable; functions, floor : of the anchors that are
     there. No TDOA comes of the other rows.
     """
     state, places = (
-        new_state(installed.anchors.positions, functions, floor),
-        np.zeros(len(installed), int),
+        new_state(anchor_table.anchors.positions, functions, floor),
+        np.zeros(len(anchor_table), int),
     )
-    places[installed.present] = np.arange(len(installed.present))
+    places[anchor_table.present] = np.arange(len(anchor_table.present))
     return state._replace(anchors=state.anchors[places])
 
 

@@ -14,7 +14,7 @@ from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.stamps import LARGEST_STEP_BACK
 from uwb_tdoa_bias.effects import EffectSet
 
-from .anchor_table import MOST_ROWS, Installed
+from .anchor_table import MOST_ROWS, AnchorTable
 from .core import aids
 from .core.config import FilterConfig
 from .core.engine import LOST_TIME
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.common.anchors import Anchors
     from uwb_tdoa_bias.common.sensors import Stream
 
-    from .pipeline import Fed
+    from .pipeline import PipelineOutput
     from .reorder_buffer import Restart
     from .streams import Finding
 
@@ -70,7 +70,7 @@ class Estimator:
         EffectSet that is known, as of a Pipeline; streams that are added are free of the rest
         (ImuCorrector, AidCorrector, bias_node).
         """
-        self._installed, self._effects = Installed(anchors), effects
+        self._anchor_table, self._effects = AnchorTable(anchors), effects
         self.config = config or FilterConfig()
         of_aids = [
             f"{stream}_{verdict}" for stream in aids.STREAMS for verdict in VERDICTS.values()
@@ -90,7 +90,7 @@ class Estimator:
         self._clear()
 
     def _clear(self) -> None:
-        self._pipeline = Pipeline(self._installed, self.config, self._effects)
+        self._pipeline = Pipeline(self._anchor_table, self.config, self._effects)
         self._poses: list[np.ndarray] = []  # (1,) of POSE, set and not reached yet
         self._begun = False  # there was a measurement
         self.refused_pose: str | None = (
@@ -101,7 +101,7 @@ class Estimator:
     @property
     def anchors(self) -> Anchors:
         """Anchors that are there."""
-        return self._installed.anchors
+        return self._anchor_table.anchors
 
     @property
     def _ekf(self) -> Record:
@@ -276,9 +276,16 @@ class Estimator:
         """
         t, a, b, d = map(np.atleast_1d, (t, a, b, d))
         rows = structured(
-            TDOA, t, self._installed.index(a), self._installed.index(b), d, variance, slope, state
+            TDOA,
+            t,
+            self._anchor_table.index(a),
+            self._anchor_table.index(b),
+            d,
+            variance,
+            slope,
+            state,
         )
-        usable = usable_tdoas(rows, self._installed.positions)
+        usable = usable_tdoas(rows, self._anchor_table.positions)
         if not usable.all():
             self._refused.append(Residuals.refused(t[~usable], a[~usable], b[~usable], INVALID))
         self._buffer.add(TDOA_STREAM, rows, usable)
@@ -286,7 +293,7 @@ class Estimator:
     def add(self, name: str, stream: Stream) -> None:
         """Take a Stream of one of the SENSORS, its rows in the order of their arrival."""
         if getattr(self.config, f"use_{name}"):
-            self._add(STREAMS.index(name), *aid_rows(name, stream, self._installed))
+            self._add(STREAMS.index(name), *aid_rows(name, stream, self._anchor_table))
 
     def _add(self, stream: int, rows: np.ndarray, usable: np.ndarray) -> None:
         self.counts[f"{STREAMS[stream]}_invalid"] += len(usable) - int(usable.sum())
@@ -337,11 +344,11 @@ class Estimator:
         """Whether it can go on among other Anchors: some of its own are there still, in the same
         frame.
         """
-        stay = self._installed.stay(anchors)
+        stay = self._anchor_table.stay(anchors)
         return (
             anchors.frame == self.anchors.frame
             and bool(stay.any())
-            and len(self._installed) + int(np.sum(~stay)) <= MOST_ROWS
+            and len(self._anchor_table) + int(np.sum(~stay)) <= MOST_ROWS
         )
 
     def change_anchors(self, anchors: Anchors) -> None:
@@ -349,7 +356,7 @@ class Estimator:
         no more, and one that stands elsewhere as a new one. Nothing is forgotten of those that
         stay. TDOAs that wait are used, as far as their anchors were there when they came.
         """
-        self._pipeline.change_anchors(self._installed.change(anchors))
+        self._pipeline.change_anchors(self._anchor_table.change(anchors))
 
     def reset(self) -> tuple[Odometry, Residuals]:
         """Use everything that still waits, and forget it: what comes next starts the filter anew.
@@ -357,7 +364,7 @@ class Estimator:
         """
         out = self.finish()
         self._buffer.clear()
-        self._installed = Installed(self.anchors)  # no row waits any more
+        self._anchor_table = AnchorTable(self.anchors)  # no row waits any more
         self.counts["restarts"] += 1
         self._clear()
         return out
@@ -398,7 +405,7 @@ class Estimator:
     def _refuse(self, stream: int, rows: np.ndarray, verdict: int) -> None:
         """Account for rows that will not be used."""
         if stream == TDOA_STREAM:
-            a, b = (self._installed.ids[rows[side]] for side in "ab")
+            a, b = (self._anchor_table.ids[rows[side]] for side in "ab")
             self._refused.append(Residuals.refused(rows["t"], a, b, verdict))
         else:
             self.counts[f"{STREAMS[stream]}_{VERDICTS[verdict]}"] += len(rows)
@@ -412,7 +419,7 @@ class Estimator:
     def _use(self, until: float) -> tuple[Odometry, Residuals]:
         """Use what is stamped up to `until`, s, and between it what poses were set."""
         self._check_early_poses()
-        parts: list[Fed] = []
+        parts: list[PipelineOutput] = []
         while self._poses and self._poses[0]["t"][0] <= until and self._has_begun():
             pose = self._poses.pop(0)
             pose["t"] = max(pose["t"][0], self._buffer.used_until)
@@ -422,7 +429,7 @@ class Estimator:
         parts += self._pipeline.run(self._buffer, until)
         return self._account(parts) if parts or self._refused else NOTHING
 
-    def _account(self, parts: list[Fed]) -> tuple[Odometry, Residuals]:
+    def _account(self, parts: list[PipelineOutput]) -> tuple[Odometry, Residuals]:
         """Count what was used in parts, and what was refused; returns what is said of it."""
         for part in parts:
             self.counts["imu_used"] += len(part.measured.imu)
@@ -462,7 +469,7 @@ class Estimator:
         return self._buffer.began < math.inf
 
 
-def _of_wheels(part: Fed) -> np.ndarray:
+def _of_wheels(part: PipelineOutput) -> np.ndarray:
     """Of what was fed, (n,) of AID: velocities with a yaw rate that were used."""
     rows = part.measured.aids
     used = (rows["kind"] == aids.VELOCITY) & (part.aids["verdict"] == USED)

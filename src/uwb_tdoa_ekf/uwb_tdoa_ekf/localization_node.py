@@ -27,7 +27,7 @@ from uwb_tdoa_bias.bias_node import BiasNode
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.ros import process
 from uwb_tdoa_bias.ros.diagnostics import Diagnostics
-from uwb_tdoa_bias.ros.node import Handed, RoundRobin, StreamNode
+from uwb_tdoa_bias.ros.node import InMemoryReceiver, StreamNode, StreamPoller
 from uwb_tdoa_bias.ros.parameters import (
     FROZEN,
     Parameter,
@@ -81,7 +81,7 @@ class LocalizationNode(StreamNode):
             raise refused[0]
         self.members = [node for tag in self._tags for node in tag.members]
         say_unused([self, *self.members], files_of(arguments))
-        self.turns = RoundRobin(self._tags)
+        self.turns = StreamPoller(self._tags)
         self._diagnostics = Diagnostics(self, self._report)
         self.ready = f"ready; tags: {', '.join(tags) or 'one'}"
 
@@ -214,10 +214,12 @@ class Pair:
             ekf.streams.inputs["uwb/tdoa_corrected"],
             bias.streams.inputs["odometry"],
         )
-        assert isinstance(corrected, Handed) and isinstance(odometry, Handed)  # as of members
+        assert isinstance(corrected, InMemoryReceiver) and isinstance(
+            odometry, InMemoryReceiver
+        )  # as of members
         self._odometry = odometry
-        bias.output.hand_to(corrected)
-        ekf.outputs.odometry.hand_to(odometry)
+        bias.output.deliver_to(corrected)
+        ekf.outputs.odometry.deliver_to(odometry)
         bias.streams.wait_for("uwb/tdoa", ekf.due)
 
     def take(self) -> bool:

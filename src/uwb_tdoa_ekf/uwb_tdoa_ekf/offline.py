@@ -11,7 +11,7 @@ import numpy as np
 from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet
 
-from .anchor_table import Installed
+from .anchor_table import AnchorTable
 from .core.aids import STREAMS as AIDS
 from .core.config import FilterConfig
 from .core.hypotheses import yaw_offset
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.common.flight import Flight
 
-    from .pipeline import Fed
+    from .pipeline import PipelineOutput
 
 RECORDED_AT_ONCE = (
     256  # TDOAs that are used together while a history is recorded: its room is for the worst case
@@ -85,11 +85,11 @@ def run_offline(
     tdoa, anchors = flight.tdoa, flight.anchors
     raw = tdoa.t, anchors.index(tdoa.a), anchors.index(tdoa.b), tdoa.d
     effects = EffectSet((*corrector.effects, *corrector.weighed))
-    installed = Installed(anchors)
-    pipeline = Pipeline(installed, config, effects, watched=False, records=records)
+    anchor_table = AnchorTable(anchors)
+    pipeline = Pipeline(anchor_table, config, effects, watched=False, records=records)
     buffer, places = loaded(flight, config)
     bias, std = np.zeros((2, len(tdoa)))
-    parts: list[Fed] = []
+    parts: list[PipelineOutput] = []
     of_tdoas: list[
         np.ndarray
     ] = []  # places in the flight of those that can be measurements, in the order of their stamps
@@ -99,7 +99,7 @@ def run_offline(
     ):
         if anew:  # as on line, when the stamps fall back
             recoveries += int(pipeline.state.record.recoveries)
-            pipeline = Pipeline(installed, config, effects, watched=False, records=records)
+            pipeline = Pipeline(anchor_table, config, effects, watched=False, records=records)
             corrector.reset()
         t, a, b, d = (column[batch] for column in raw)
         correction = corrector.correct(t, a, b, d)
@@ -115,10 +115,10 @@ def run_offline(
         parts += fed
         if not corrector.idle and fed:
             corrector.add_pose(*poses_of(odometry_of(fed)))
-    outcome = _became(len(tdoa), np.concatenate(of_tdoas), [part.tdoas for part in parts])
+    outcome = _verdicts(len(tdoa), np.concatenate(of_tdoas), [part.tdoas for part in parts])
     residuals = Residuals.from_rows(tdoa.t, tdoa.a, tdoa.b, outcome)
     of_aids = joined(RESIDUAL, [part.aids for part in parts])
-    aids = {name: _became(n, rows, [of_aids[ranks]]) for name, (n, rows, ranks) in places.items()}
+    aids = {name: _verdicts(n, rows, [of_aids[ranks]]) for name, (n, rows, ranks) in places.items()}
     ekf = pipeline.state.record
     offset, variance = ekf.range_offset.tolist()
     found = (offset, math.sqrt(variance)) if variance < math.inf else None
@@ -188,7 +188,7 @@ def loaded(
     }
 
 
-def _became(n: int, places: np.ndarray, outcomes: list[np.ndarray]) -> np.ndarray:
+def _verdicts(n: int, places: np.ndarray, outcomes: list[np.ndarray]) -> np.ndarray:
     """(n,) of RESIDUAL: what became of those that were used, at their places; the others are
     invalid.
     """

@@ -107,7 +107,7 @@ class Outputs:
         for message in messages:
             message.header.frame_id = frame
         self._odometry, self._residual = (
-            wire.template(message) for wire, message in zip(self._wires, messages)
+            codec.template(message) for codec, message in zip(self._wires, messages)
         )
 
     @property

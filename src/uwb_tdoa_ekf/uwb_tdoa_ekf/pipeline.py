@@ -13,7 +13,7 @@ from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.samples import RADIO
 
-from .anchor_table import Installed, forget, new_state_of
+from .anchor_table import AnchorTable, forget, new_state_of
 from .core.aids import STREAMS
 from .core.engine import feed, set_pose
 from .core.memory import ODOMETRY, RESIDUAL, TDOA, FilterState, Measurements, joined
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.effects import EffectSet
 
-    from .anchor_table import Installed
+    from .anchor_table import AnchorTable
     from .core.config import FilterConfig
     from .reorder_buffer import ReorderBuffer
 
@@ -45,13 +45,13 @@ class RadioCorrections:
     these come to the filter as they are.
     """
 
-    def __init__(self, effects: EffectSet, installed: Installed) -> None:
-        """effects : EffectSet; installed : Installed, which may change."""
+    def __init__(self, effects: EffectSet, anchor_table: AnchorTable) -> None:
+        """effects : EffectSet; installed : AnchorTable, which may change."""
         acting = ((kind, effects.acting_on(samples.channel)) for kind, samples in KINDS.items())
         self._correctors = {
-            kind: Corrector(installed.anchors, mine) for kind, mine in acting if len(mine)
+            kind: Corrector(anchor_table.anchors, mine) for kind, mine in acting if len(mine)
         }
-        self._installed, self._slice, self._start = installed, -math.inf, math.nan
+        self._anchor_table, self._slice, self._start = anchor_table, -math.inf, math.nan
         self._pose = self._latest = (
             _NOWHERE  # (1,) of ODOMETRY, of which nothing is computed before there are distances
         )
@@ -119,8 +119,8 @@ class RadioCorrections:
         self._begin(measured, self._ranged(aids))
         _, p, q, _, yaw_std = poses_of(Odometry.from_rows(self._pose))
         for kind, corrector in self._correctors.items():
-            anchors, (rows,) = self._installed.anchors, np.nonzero(aids["kind"] == kind)
-            at = anchors.index(self._installed.ids[aids["anchor"][rows]])
+            anchors, (rows,) = self._anchor_table.anchors, np.nonzero(aids["kind"] == kind)
+            at = anchors.index(self._anchor_table.ids[aids["anchor"][rows]])
             rows, at = rows[at >= 0], at[at >= 0]
             if not len(rows):
                 continue
@@ -139,7 +139,7 @@ class RadioCorrections:
 pass
 
 
-class Fed(NamedTuple):
+class PipelineOutput(NamedTuple):
     """measured : Measurements that were used at once; odometry : (n,) of ODOMETRY that came of
     them; tdoas, aids : (k,) and (m,) of RESIDUAL, what became of them.
     """
@@ -157,13 +157,13 @@ class Pipeline:
 
     def __init__(
         self,
-        anchors: Installed,
+        anchors: AnchorTable,
         config: FilterConfig,
         effects: EffectSet = EffectSet(),
         watched: bool = True,
         records: list[np.ndarray] | None = None,
     ) -> None:
-        """anchors : Installed; config : FilterConfig; effects : EffectSet that is known, of which
+        """anchors : AnchorTable; config : FilterConfig; effects : EffectSet that is known, of which
         the filter itself is told, or that is taken out of distances to anchors; watched : have a
         Monitor in any case; records : list to which the history is appended (see engine.feed), or
         None.
@@ -190,7 +190,7 @@ class Pipeline:
         )
 
     def change_anchors(self, gone: np.ndarray) -> None:
-        """Go on after a change of the Installed: with what is known of its new rows, and without
+        """Go on after a change of the AnchorTable: with what is known of its new rows, and without
         the rows `gone` (k,).
         """
         more, first = self._new_state(), len(self.state.anchors)
@@ -202,7 +202,7 @@ class Pipeline:
         if self.monitor is not None:
             self.monitor.forget(gone)
 
-    def run(self, buffer: ReorderBuffer, until: float) -> list[Fed]:
+    def run(self, buffer: ReorderBuffer, until: float) -> list[PipelineOutput]:
         """Use what a ReorderBuffer holds up to `until`, s; where delays are taken out, from the
         stamps on at which the monitor finds them.
         """
@@ -230,13 +230,13 @@ class Pipeline:
         """Put the filter at a pose, (1,) of POSE, that is not before what was used."""
         set_pose(self.state, self._parameters, pose)
 
-    def _feed(self, measured: Measurements) -> list[Fed]:
+    def _feed(self, measured: Measurements) -> list[PipelineOutput]:
         if not any(map(len, measured)):
             return []
         parts = []
         for part in [measured] if self._corrections.idle else self._corrections.slices(measured):
             used = part if self._config.use_imu else part._replace(imu=part.imu[:0])
-            fed = Fed(part, *feed(self.state, self._parameters, used, self._records))
+            fed = PipelineOutput(part, *feed(self.state, self._parameters, used, self._records))
             if not self._corrections.idle:
                 self._corrections.add_odometry(fed.odometry)
             parts.append(fed)
@@ -244,8 +244,8 @@ class Pipeline:
             self.monitor.add(odometry_of(parts), self.residuals(parts))
         return parts
 
-    def residuals(self, parts: Sequence[Fed]) -> Residuals:
-        """What became of the TDOAs of several Fed, in the order in which they were used."""
+    def residuals(self, parts: Sequence[PipelineOutput]) -> Residuals:
+        """What became of the TDOAs of several PipelineOutput, in the order in which they were used."""
         tdoa, rows = (
             joined(TDOA, [part.measured.tdoa for part in parts]),
             joined(RESIDUAL, [part.tdoas for part in parts]),
@@ -254,6 +254,6 @@ class Pipeline:
         return Residuals.from_rows(tdoa["t"], ids[tdoa["a"]], ids[tdoa["b"]], rows)
 
 
-def odometry_of(parts: Sequence[Fed]) -> Odometry:
-    """What came of several Fed."""
+def odometry_of(parts: Sequence[PipelineOutput]) -> Odometry:
+    """What came of several PipelineOutput."""
     return Odometry.from_rows(joined(ODOMETRY, [part.odometry for part in parts]))

@@ -80,8 +80,10 @@ def odometry(
 def hear(topics, *messages):
     """Have serialized messages come on odometry."""
 
-    def fetch(wire):
-        return [(frame, rows, None) for frame, rows, _ in wire.read(list(messages), lambda _: None)]
+    def fetch(codec):
+        return [
+            (frame, rows, None) for frame, rows, _ in codec.read(list(messages), lambda _: None)
+        ]
 
     topics._odometry = SimpleNamespace(fetch=fetch)
     topics.receive()

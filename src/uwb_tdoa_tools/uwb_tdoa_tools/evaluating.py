@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from uwb_tdoa_bias.common.text import harmless
+from uwb_tdoa_bias.common.text import sanitize
 
 from . import parallel
 from .bags.bag import late_tdoas, read_odometry
@@ -349,7 +349,7 @@ def read_others(path: str | Path) -> dict[str, dict[str, str]]:
         cell = (
             "diverged" if row["diverged"] == "True" else f"{number(path, line, row, 'rmse_3d'):.3f}"
         )
-        others.setdefault(harmless(f"{row['peer']} {row['mode']}"), {})[harmless(row["flight"])] = (
+        others.setdefault(sanitize(f"{row['peer']} {row['mode']}"), {})[sanitize(row["flight"])] = (
             cell
         )
     return others

@@ -27,7 +27,7 @@ from joblib import Parallel, cpu_count, delayed, parallel_config
 from tqdm import tqdm
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_bias.common.executable import elsewhere
+from uwb_tdoa_bias.common.executable import outside_present_folder
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Iterator
@@ -219,7 +219,7 @@ def _results(
     if not rest or (min(count, len(rest)) == 1 and dask is None):
         yield from map(function, items)
         return
-    # For processes that joblib starts later, with Python 3.11 and newer; see `elsewhere`.
+    # For processes that joblib starts later, with Python 3.11 and newer; see `outside_present_folder`.
     os.environ["PYTHONSAFEPATH"] = "1"
     with _cluster(dask) as backend:
 
@@ -228,7 +228,7 @@ def _results(
                 # Arrays are not mapped from files: numba compiles again for read-only arrays.
                 pool = Parallel(count, return_as="generator", batch_size=1, max_nbytes=None)
             # joblib starts Python by -m, which looks for modules in the present folder.
-            with _children_ignore_interrupts(), elsewhere():
+            with _children_ignore_interrupts(), outside_present_folder():
                 return pool(calls)
 
         folder = os.getcwd() if dask is None else None

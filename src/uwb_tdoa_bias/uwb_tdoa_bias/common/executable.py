@@ -71,7 +71,7 @@ def leave_present_folder_out() -> None:
 
 
 @contextmanager
-def elsewhere() -> Iterator[None]:
+def outside_present_folder() -> Iterator[None]:
     """In the root folder while the block lasts: the present folder may hold modules for `python
     -m`, and settings.
     """
@@ -94,7 +94,7 @@ class _ImportedElsewhere:
         """The ModuleSpec of such a module; None for all others."""
         spec = PathFinder.find_spec(name, path) if name in ("matplotlib", "numba") else None
         if spec is not None and spec.loader is not None:
-            spec.loader.exec_module = elsewhere()(spec.loader.exec_module)  # type: ignore[method-assign]  # of this one loader
+            spec.loader.exec_module = outside_present_folder()(spec.loader.exec_module)  # type: ignore[method-assign]  # of this one loader
         return spec
 
 
@@ -162,7 +162,7 @@ def _imported(module: str) -> ModuleType:
     slow.daemon = True
     slow.start()
     try:
-        with elsewhere():
+        with outside_present_folder():
             return import_module(module)
     finally:
         slow.cancel()

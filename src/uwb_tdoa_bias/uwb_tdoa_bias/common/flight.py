@@ -9,7 +9,7 @@ import numpy as np
 
 from .anchors import Anchors
 from .sensors import LOCATING, SENSORS
-from .text import harmless
+from .text import sanitize
 
 AIDS = tuple(SENSORS)  # streams of a Flight that the filter can do without
 
@@ -77,7 +77,7 @@ class Flight(_SensorStreams):
     """One recording. All stamps are of one clock, in s; every stream keeps its own; within a stream
     stamps never fall.
 
-    name : short and unique, e.g. "0425-traj1"; whatever is given, it is `harmless`
+    name : short and unique, e.g. "0425-traj1"; whatever is given, it is `sanitize`
     anchors : Anchors
     tdoa : Tdoas
     imu : Imu or None
@@ -100,7 +100,7 @@ class Flight(_SensorStreams):
     restarts: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "name", harmless(self.name))
+        object.__setattr__(self, "name", sanitize(self.name))
 
     @property
     def start(self) -> float:

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from types import ModuleType
 
 
-class Later:
+class LazyModule:
     """Stands for a module."""
 
     def __init__(self, load: Callable[[], ModuleType]) -> None:
@@ -22,7 +22,7 @@ class Later:
         return getattr(self._load(), name)
 
 
-@Later
+@LazyModule
 def interpolate() -> ModuleType:
     """scipy.interpolate"""
     from scipy import interpolate as module
@@ -30,7 +30,7 @@ def interpolate() -> ModuleType:
     return module
 
 
-@Later
+@LazyModule
 def rotations() -> ModuleType:
     """scipy.spatial.transform"""
     from scipy.spatial import transform as module

@@ -31,7 +31,7 @@ def line_of(text: object) -> str:
     return line if len(line) <= LINE_LENGTH else f"{line[:half]} ... {line[-half:]}"
 
 
-def harmless(text: object) -> str:
+def sanitize(text: object) -> str:
     """A name that means nothing anywhere: what is no letter, digit, space or one of .,:;+=()#-
     becomes _, and its end is cut.
     """

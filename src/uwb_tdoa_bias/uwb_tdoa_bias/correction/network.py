@@ -31,7 +31,7 @@ from ..common.compiled import compiled
 from ..common.errors import InputError
 from ..common.files import read_bytes
 from ..common.limits import MODEL_BYTES
-from ..common.text import harmless, printable
+from ..common.text import printable, sanitize
 from .features import NAMES, everything
 
 if TYPE_CHECKING:
@@ -123,8 +123,8 @@ class Network:
             np.array(self._scale, dtype=float),
         )
         self.clip = float(json.loads(meta["clip"]))
-        self.name = harmless(json.loads(meta["name"]))
-        self.trained_with = tuple(map(harmless, json.loads(meta.get("trained_with", "[]"))))
+        self.name = sanitize(json.loads(meta["name"]))
+        self.trained_with = tuple(map(sanitize, json.loads(meta.get("trained_with", "[]"))))
         limits = json.loads(meta.get("validity", "{}"))
         self._fade_std = float(json.loads(meta["fade_std"])) if limits else 0.0
         self._largest_yaw_std = float(json.loads(meta.get("largest_yaw_std", "Infinity")))

@@ -125,9 +125,9 @@ class CdrCodec:
             first = end
         return out
 
-    def template(self, message: Any) -> Template:
+    def template(self, message: Any) -> CdrTemplate:
         """Template of messages which are all like this one, but for the fields."""
-        return Template(self, message)
+        return CdrTemplate(self, message)
 
     def layout(self, data: bytes) -> _Layout:
         """Where the fields are in this serialized message, and in those that have the same texts.
@@ -200,16 +200,16 @@ class CdrCodec:
         )
 
 
-class Template:
+class CdrTemplate:
     """Messages that differ in the fields of a CdrCodec and in nothing else."""
 
-    def __init__(self, wire: CdrCodec, message: Any) -> None:
-        self._wire, self._message = wire, message
+    def __init__(self, codec: CdrCodec, message: Any) -> None:
+        self._codec, self._message = codec, message
         data = serialize_message(message)
-        if wire.fits:
-            self._data, self._dtype = data, wire.layout(data).dtype
+        if codec.fits:
+            self._data, self._dtype = data, codec.layout(data).dtype
         else:
-            self._data, self._dtype = wire._convert(data)[1].tobytes(), wire.dtype
+            self._data, self._dtype = codec._convert(data)[1].tobytes(), codec.dtype
 
     def rows(self, n: int) -> np.ndarray:
         """(n,) of them, whose fields are to be filled in."""
@@ -221,10 +221,10 @@ class Template:
         """Generator of what to give to a publisher, for each of the rows that `rows` made."""
         data, size = rows.tobytes(), self._dtype.itemsize
         for k in range(len(rows)):
-            yield data[k * size : (k + 1) * size] if self._wire.fits else self._filled(rows[k])
+            yield data[k * size : (k + 1) * size] if self._codec.fits else self._filled(rows[k])
 
     def _filled(self, row: np.void) -> Any:
-        for name, leaves in self._wire._paths.items():
+        for name, leaves in self._codec._paths.items():
             values, first = np.atleast_1d(row[name]), 0
             for leaf in leaves:
                 count = len(np.atleast_1d(_get(self._message, leaf)))

@@ -18,7 +18,7 @@ from .topics import Refusals, StreamInput, publish_stream, several_publishers, u
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection
 
-    from .cdr import CdrCodec, Template
+    from .cdr import CdrCodec, CdrTemplate
     from .topics import Epoch
 
     Take = Callable[
@@ -46,7 +46,7 @@ class Taking(Protocol):
     def take(self) -> bool: ...
 
 
-class RoundRobin:
+class StreamPoller:
     """Has nodes take what has arrived for them, one after the other.
 
     A node that has `turns` is given them by ros.run.
@@ -72,7 +72,7 @@ class Streams:
     def __init__(self, node: StreamNode, epoch: Epoch, on_taken: Callable[[], None]) -> None:
         """epoch : Epoch; on_taken() is called after anything was given to those that take it."""
         self.inputs: dict[
-            str, StreamInput | Handed
+            str, StreamInput | InMemoryReceiver
         ] = {}  # by topic, in the order in which they are taken
         self._node, self._epoch, self._on_taken = node, epoch, on_taken
         self._streams: list[_Stream] = []
@@ -92,14 +92,14 @@ class Streams:
         """
         self._awaited, self._due = self._by_topic[topic], due
 
-    def add(self, wire: CdrCodec, topic: str, take: Take, handed: bool = False) -> None:
+    def add(self, codec: CdrCodec, topic: str, take: Take, handed: bool = False) -> None:
         """Subscribe. wire : CdrCodec; take(frame, t, rows, arrival) gets successive messages of one
         frame: their stamps (n,) s, rows (n,) of the CdrCodec, and when they arrived, (n,) s since
         1970. handed : a node of this process hands them over.
         """
-        kind = Handed if handed else StreamInput
-        self.inputs[topic] = kind(self._node, wire.kind, topic)
-        stream = self._by_topic[topic] = _Stream(wire, take, self.inputs[topic])
+        kind = InMemoryReceiver if handed else StreamInput
+        self.inputs[topic] = kind(self._node, codec.kind, topic)
+        stream = self._by_topic[topic] = _Stream(codec, take, self.inputs[topic])
         self._streams.append(stream)
 
     def take(self, at_once: bool = False) -> bool:
@@ -135,13 +135,13 @@ class StreamOutput:
 
     def __init__(self, node: StreamNode, kind: type, topic: str) -> None:
         self.publisher = publish_stream(node, kind, topic)
-        self._receiver: Handed | None = None
+        self._receiver: InMemoryReceiver | None = None
 
-    def hand_to(self, receiver: Handed) -> None:
-        """Give everything to Handed, too."""
+    def deliver_to(self, receiver: InMemoryReceiver) -> None:
+        """Give everything to InMemoryReceiver, too."""
         self._receiver = receiver
 
-    def publish(self, frame: str, template: Template, rows: np.ndarray) -> None:
+    def publish(self, frame: str, template: CdrTemplate, rows: np.ndarray) -> None:
         """Publish rows (n,) of a Template, whose messages are of this frame."""
         if self._receiver is not None:
             self._receiver.hand(frame, rows)
@@ -150,7 +150,7 @@ class StreamOutput:
                 self.publisher.publish(message)
 
 
-class Handed:
+class InMemoryReceiver:
     """Stands for the subscription of a stream that a node of this process hands over in memory."""
 
     lost = 0
@@ -168,7 +168,7 @@ class Handed:
         """Parts that wait."""
         return len(self._parts)
 
-    def fetch(self, wire: CdrCodec) -> list[Part]:
+    def fetch(self, codec: CdrCodec) -> list[Part]:
         """[(frame, rows, arrivals)] since the last time."""
         parts, self._parts = self._parts, []
         return parts
@@ -187,14 +187,14 @@ class _Stream:
     have fallen back.
     """
 
-    def __init__(self, wire: CdrCodec, take: Take, source: StreamInput | Handed) -> None:
+    def __init__(self, codec: CdrCodec, take: Take, source: StreamInput | InMemoryReceiver) -> None:
         self.waiting: list[Part] = []
         self.fell = False
-        self._wire, self._take, self._source, self._newest = wire, take, source, -np.inf
+        self._codec, self._take, self._source, self._newest = codec, take, source, -np.inf
 
     def fetch(self) -> bool:
         """Returns whether anything has arrived since the last time."""
-        parts = self._source.fetch(self._wire)
+        parts = self._source.fetch(self._codec)
         if not parts:
             return False
         self.waiting += parts

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from rclpy import Future
 
-    from .node import RoundRobin, StreamNode
+    from .node import StreamNode, StreamPoller
 
 
 try:  # not in rclpy before 7.1.4; a message costs a quarter
@@ -59,7 +59,7 @@ class Spinner:
     longest_wait : s, the longest that anything has waited since this was set to 0.0.
     """
 
-    def __init__(self, nodes: list[StreamNode], turns: RoundRobin | None = None) -> None:
+    def __init__(self, nodes: list[StreamNode], turns: StreamPoller | None = None) -> None:
         """nodes : a list that is kept up to date."""
         self.longest_wait = 0.0
         self._nodes, self._turns = nodes, turns
@@ -157,7 +157,7 @@ def run(
 
     node_class(arguments) makes the StreamNode, in an initialised rclpy, of the arguments of the
     process; it has the executable's NAME, and may have `members` and `turns`,
-    ros_streams.RoundRobin. description : for --help.
+    StreamPoller. description : for --help.
     """
     name = node_class.NAME
     arguments = [name, *(sys.argv[1:] if argv is None else argv)]

@@ -218,7 +218,7 @@ class StreamInput:
             raw=True,
         )
 
-    def fetch(self, wire: CdrCodec) -> list[tuple[str, np.ndarray, np.ndarray]]:
+    def fetch(self, codec: CdrCodec) -> list[tuple[str, np.ndarray, np.ndarray]]:
         """What has arrived, by a CdrCodec: [(frame, rows (n,), arrivals (n,) s since 1970)], each
         of successive messages of one frame.
         """
@@ -231,7 +231,7 @@ class StreamInput:
         arrivals = 1e-9 * np.array(stamps)
         return [
             (frame, rows, arrivals[some])
-            for frame, rows, some in wire.read(messages, self.refusals.add)
+            for frame, rows, some in codec.read(messages, self.refusals.add)
         ]
 
     def _on_lost(self, status: QoSMessageLostInfo) -> None:

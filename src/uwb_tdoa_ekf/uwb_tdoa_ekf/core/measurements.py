@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.common.anchors import Anchors
     from uwb_tdoa_bias.common.sensors import Stream
 
-    from ..anchor_table import Installed
+    from ..anchor_table import AnchorTable
 
 MAX_RATE, MAX_ACCEL = 100.0, 1000.0  # rad/s, m/s^2: beyond what any inertial sensor reads
 STEEPEST, FARTHEST = 1e3, 1e6  # m per m or m/s, and m or m/s, of what a bias changes with
@@ -41,7 +41,7 @@ def usable_tdoas(rows: np.ndarray, positions: np.ndarray) -> np.ndarray:
 
 
 def aid_rows(
-    name: str, stream: Stream, anchors: Anchors | Installed
+    name: str, stream: Stream, anchors: Anchors | AnchorTable
 ) -> tuple[np.ndarray, np.ndarray]:
     """(n,) of AID, and (n,) bool: usable; of the Stream of a sensor among Anchors."""
     columns, usable = SENSORS[name].measured(stream)

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.common.anchors import Anchors
     from uwb_tdoa_bias.effects.effect_set import Covariance
 
-    from ..anchor_table import Installed
+    from ..anchor_table import AnchorTable
     from ..results import Odometry, Residuals
     from .change import Change
     from .slices import Slice
@@ -117,8 +117,10 @@ class Monitor:
     `delays`.
     """
 
-    def __init__(self, anchors: Anchors | Installed, calibrated: Covariance | None = None) -> None:
-        """anchors : Anchors, or Installed, of which others may be there later; calibrated :
+    def __init__(
+        self, anchors: Anchors | AnchorTable, calibrated: Covariance | None = None
+    ) -> None:
+        """anchors : Anchors, or AnchorTable, of which others may be there later; calibrated :
         Covariance of their positions and delays, as of their last calibration, or None.
         """
         self._anchors, self._calibrated = anchors, calibrated

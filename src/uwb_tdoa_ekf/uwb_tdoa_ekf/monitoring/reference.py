@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.common.anchors import Anchors
     from uwb_tdoa_bias.effects.effect_set import Covariance
 
-    from ..anchor_table import Installed
+    from ..anchor_table import AnchorTable
     from ..evidence import ChangeKey
     from .slices import Slice
 
@@ -129,8 +129,10 @@ class _Cell:
 class SurveyComparison:
     """Takes Slices; `find` says which anchors do not stand where they should."""
 
-    def __init__(self, anchors: Anchors | Installed, calibrated: Covariance | None = None) -> None:
-        """anchors : Anchors, or Installed; calibrated : Covariance of their positions and delays,
+    def __init__(
+        self, anchors: Anchors | AnchorTable, calibrated: Covariance | None = None
+    ) -> None:
+        """anchors : Anchors, or AnchorTable; calibrated : Covariance of their positions and delays,
         or None.
         """
         self._anchors, self._calibrated = anchors, calibrated

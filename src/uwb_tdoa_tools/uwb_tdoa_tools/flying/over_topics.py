@@ -39,7 +39,7 @@ from .vehicle import ATTITUDE, POSITION
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from uwb_tdoa_bias.ros.cdr import Template
+    from uwb_tdoa_bias.ros.cdr import CdrTemplate
     from uwb_tdoa_bias.ros.node import StreamNode
     from uwb_tdoa_ekf.results import Odometry
 
@@ -333,7 +333,7 @@ class _Output:
         frame: str = BODY_FRAME,
     ) -> None:
         self._content, self._kind, self._frame = content, kind, frame
-        self._template: Template | None = None
+        self._template: CdrTemplate | None = None
         self._output = StreamOutput(node, kind, topic)
 
     @property

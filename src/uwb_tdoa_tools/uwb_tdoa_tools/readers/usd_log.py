@@ -12,7 +12,7 @@ from uwb_tdoa_bias.common.compiled import compiled
 from uwb_tdoa_bias.common.errors import InputError
 from uwb_tdoa_bias.common.files import read_bytes
 from uwb_tdoa_bias.common.limits import USD_TYPES, USD_VARIABLES, Budget
-from uwb_tdoa_bias.common.text import harmless
+from uwb_tdoa_bias.common.text import sanitize
 
 from ..command_lines import SALVAGE
 from .streams import make_flight
@@ -185,7 +185,7 @@ def _read_header(
     def string(what: str) -> str:
         end = data.find(0, at)
         content = take((end if end >= 0 else len(data)) + 1 - at, what)[:-1]
-        if not content or not content.isascii() or harmless(content.decode()) != content.decode():
+        if not content or not content.isascii() or sanitize(content.decode()) != content.decode():
             raise InputError(
                 f"{path}: byte {at - len(content) - 1}: expected {what}, found "
                 f"{content[:40]!r}; the file is damaged."

@@ -105,7 +105,7 @@ def test_one_that_is_gone_is_used_no_more():
 def test_a_reset_afterwards_and_an_anchor_that_comes_back():
     estimator, flight, _, _ = flown()
     estimator.reset()
-    assert len(estimator._installed) == len(after())
+    assert len(estimator._anchor_table) == len(after())
     estimator.change_anchors(BOX)
     odometry, residuals = fed(estimator, cut(flight, -np.inf, CHANGE))
     off = np.linalg.norm(odometry.p - position_at(flight, odometry.t), axis=1)
@@ -129,7 +129,7 @@ def test_who_moves_anchors_again_and_again_fills_no_memory(monkeypatch):
         if estimator.stay(other):
             estimator.change_anchors(other)
             moved += 1
-    assert moved == 3 and len(estimator._installed) == len(BOX) + 3
+    assert moved == 3 and len(estimator._anchor_table) == len(BOX) + 3
 
 
 def test_nothing_is_said_of_an_anchor_that_was_taken_away():
