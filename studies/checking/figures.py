@@ -10,7 +10,7 @@ from mistakes import MISTAKES, arriving
 import numpy as np
 
 from uwb_tdoa_bias.common.files import write_text
-from uwb_tdoa_ekf.streams import ERROR
+from uwb_tdoa_ekf.monitoring.finding import ERROR
 from uwb_tdoa_tools import parallel
 from uwb_tdoa_tools.checking.check import check
 from uwb_tdoa_tools.checking.recording import of_flight

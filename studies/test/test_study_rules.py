@@ -112,8 +112,7 @@ def test_what_is_said_less_more_or_later_is_told():
 
 def test_patches_change_modules_only_while_they_are_applied():
     made = {patch.name: patch for patch in watching.patches()}
-    from uwb_tdoa_ekf.monitoring import monitor
-    from uwb_tdoa_ekf.streams import ranging_rules
+    from uwb_tdoa_ekf.monitoring import monitor, ranging_rules
 
     rules = ranging_rules.RULES
     with made["monitoring.monitor.LIMIT x 2"].applied():

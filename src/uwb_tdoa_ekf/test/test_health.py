@@ -14,9 +14,9 @@ from uwb_tdoa_bias.common.anchors import Anchors  # noqa: E402
 from uwb_tdoa_bias.common.flyable import FlyableVolume  # noqa: E402
 from uwb_tdoa_ekf.core.config import FilterConfig  # noqa: E402
 from uwb_tdoa_ekf.monitoring import health  # noqa: E402
+from uwb_tdoa_ekf.monitoring.finding import Finding  # noqa: E402
 from uwb_tdoa_ekf.monitoring.health import ERROR, OK, WARN  # noqa: E402
-from uwb_tdoa_ekf.monitoring.volume import VolumeCheck  # noqa: E402
-from uwb_tdoa_ekf.streams import Finding  # noqa: E402
+from uwb_tdoa_ekf.monitoring.status import VolumeCheck  # noqa: E402
 
 # --- health ---
 # The node looks five times a second; here a report is a look, once a second.

@@ -16,7 +16,7 @@ from uwb_tdoa_ekf.core.memory import AID, IMU_SAMPLE
 from uwb_tdoa_ekf.core.memory import TDOA as TDOA_ROW
 from uwb_tdoa_ekf.core.verdicts import INVALID, LATE
 from uwb_tdoa_ekf.estimator import Estimator
-from uwb_tdoa_ekf.monitoring.clocks import clock_ahead, restarted
+from uwb_tdoa_ekf.monitoring.filter_findings import clock_ahead, restarted
 from uwb_tdoa_ekf.reorder_buffer import (
     FIRST_AID,
     IMU_STREAM,

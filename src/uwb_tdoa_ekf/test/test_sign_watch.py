@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_ekf.estimator import Estimator
-from uwb_tdoa_ekf.monitoring.sign_watch import SignWatch
+from uwb_tdoa_ekf.monitoring.signs import SignWatch
 from uwb_tdoa_ekf.monitoring.stream_watch import StreamWatch
 
 

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 import numpy as np
 import pytest
 
+from uwb_tdoa_ekf.monitoring.finding import ERROR, WARNING, Finding
 from uwb_tdoa_ekf.monitoring.status import (
     FAULT,
     LOST,
@@ -17,13 +18,12 @@ from uwb_tdoa_ekf.monitoring.status import (
     STARTING,
     WAITING,
     Status,
+    Use,
     doubted,
     status_of,
     yaw_in_words,
 )
-from uwb_tdoa_ekf.monitoring.use import Use
 from uwb_tdoa_ekf.offline import run_offline
-from uwb_tdoa_ekf.streams import ERROR, WARNING, Finding
 
 # --- status ---
 STARTS = SimpleNamespace(

@@ -11,8 +11,8 @@ import pytest
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.measurements import imu_rows
 from uwb_tdoa_ekf.core.memory import TDOA, structured
+from uwb_tdoa_ekf.monitoring.explain import Unexplained, unexplained
 from uwb_tdoa_ekf.offline import run_offline
-from uwb_tdoa_ekf.streams.explain import Unexplained, unexplained
 
 FLIGHT = fly(0, 14.0)
 

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.common.geometry import tdoa
-from uwb_tdoa_ekf.streams import ERROR, NOTE, SEVERITIES, WARNING, Finding, Steady, StreamRules
+from uwb_tdoa_ekf.monitoring.finding import ERROR, NOTE, SEVERITIES, WARNING, Finding, Steady
+from uwb_tdoa_ekf.monitoring.stream_rules import StreamRules
 
 # --- stream rules ---
 GRAVITY = 9.81

@@ -15,8 +15,8 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.ground import KnownHeight
 from uwb_tdoa_ekf.core.memory import TDOA, new_state, structured
 from uwb_tdoa_ekf.core.startup import locate, room_for
-from uwb_tdoa_ekf.streams import StreamRules
-from uwb_tdoa_ekf.streams.scale import SurveyScale
+from uwb_tdoa_ekf.monitoring.stream_rules import StreamRules
+from uwb_tdoa_ekf.monitoring.survey_scale import SurveyScale
 
 ANCHORS = corners()
 RADIO, SYSTEMATIC = 0.07, 0.1  # m, noise of a TDOA, and error of each pair

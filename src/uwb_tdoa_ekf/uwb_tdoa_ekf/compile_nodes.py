@@ -28,7 +28,7 @@ from .frames import pose_and_twist, rotation_std
 from .monitoring.change import YOUNGEST, ChangeDetector
 from .monitoring.slices import LENGTH, Slice
 from .monitoring.stream_watch import StreamWatch
-from .streams.scale import SurveyScale
+from .monitoring.survey_scale import SurveyScale
 
 if TYPE_CHECKING:
     from argparse import ArgumentParser

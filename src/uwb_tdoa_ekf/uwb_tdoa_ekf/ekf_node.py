@@ -45,13 +45,13 @@ from .core.verdicts import INVALID
 from .ekf_parameters import ODOM, declare_parameters, follow_changes
 from .estimator import Estimator
 from .frames import ImuMount, pose_from_message, rotation_std
+from .monitoring.finding import most_severe_first
 from .monitoring.health import OK, WARN, Health, together
 from .monitoring.status import FAULT, Status, doubted, status_of, yaw_in_words
 from .monitoring.stream_watch import FEW_ANCHORS, StreamWatch
 from .outputs import Outputs, StatusOutput
 from .reorder_buffer import STREAMS
 from .results import VERDICTS, Residuals
-from .streams import most_severe_first
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Sequence
@@ -62,8 +62,8 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.ros.diagnostics import Report
 
     from .core.config import FilterConfig
+    from .monitoring.finding import Finding
     from .results import Odometry
-    from .streams.finding import Finding
 
 # Of each stream: topic, type and the fields of its messages that are read.
 TOPICS = {

@@ -24,12 +24,11 @@ from .core.memory import AID, IMU_SAMPLE, ODOMETRY, POSE, TDOA, YAWS, joined, st
 from .core.startup import APART
 from .core.velocity import HELD, LONGEST_STD, YAW_RATE
 from .core.verdicts import INVALID, USED
-from .monitoring.clocks import clock_ahead, restarted
-from .monitoring.implausible import implausible
+from .monitoring.filter_findings import clock_ahead, implausible, restarted
+from .monitoring.finding import Steady
 from .pipeline import Pipeline, odometry_of
 from .reorder_buffer import IMU_STREAM, STREAMS, TDOA_STREAM, ReorderBuffer
 from .results import VERDICTS, Odometry, Residuals, concatenated
-from .streams import Steady
 
 if TYPE_CHECKING:
     from numpy.typing import ArrayLike
@@ -37,9 +36,9 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.common.anchors import Anchors
     from uwb_tdoa_bias.common.sensors import Stream
 
+    from .monitoring.finding import Finding
     from .pipeline import PipelineOutput
     from .reorder_buffer import Restart
-    from .streams import Finding
 
 RATE_SAMPLES = 10  # inertial samples from whose stamps their rate is known
 LARGEST_POSE_AHEAD = 10.0  # s of a pose that is set, from the newest measurement

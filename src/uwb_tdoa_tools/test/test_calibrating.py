@@ -11,8 +11,8 @@ from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.flight import Tdoas, Truth
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet
 from uwb_tdoa_ekf.core.config import FilterConfig
+from uwb_tdoa_ekf.monitoring.finding import ERROR, Finding
 from uwb_tdoa_ekf.offline import without_offset
-from uwb_tdoa_ekf.streams import ERROR, Finding
 from uwb_tdoa_tools import calibrating as library
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.calibrating import Calibration, between, prospect, split, without_truth

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.common.anchors import Anchors
-from uwb_tdoa_ekf.streams import StreamRules
+from uwb_tdoa_ekf.monitoring.stream_rules import StreamRules
 from uwb_tdoa_tools.checking import coverage
 
 BOX = np.array([[x, y, z] for x in (0.0, 6.0) for y in (0.0, 7.0) for z in (0.2, 3.0)])

@@ -21,7 +21,8 @@ from sensor_msgs.msg import Imu  # noqa: E402
 from walking import blocks, section  # noqa: E402
 
 from uwb_tdoa_bias.common.anchors import Anchors  # noqa: E402
-from uwb_tdoa_ekf.streams import ERROR, StreamRules  # noqa: E402
+from uwb_tdoa_ekf.monitoring.finding import ERROR
+from uwb_tdoa_ekf.monitoring.stream_rules import StreamRules  # noqa: E402
 from uwb_tdoa_msgs.msg import AnchorArray, Tdoa  # noqa: E402
 
 STAND_IN = """

@@ -12,8 +12,8 @@ from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.anchor import AnchorDelay, AnchorPosition
 from uwb_tdoa_bias.effects.effect_set import Covariance
 from uwb_tdoa_ekf.evidence import keys_of
+from uwb_tdoa_ekf.monitoring.finding import ERROR, WARNING, Finding
 from uwb_tdoa_ekf.results import concatenated, rows_of
-from uwb_tdoa_ekf.streams import ERROR, WARNING, Finding
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.checking import watch
 from uwb_tdoa_tools.checking.check import check

@@ -18,7 +18,7 @@ import pytest
 from uwb_tdoa_bias.common.survey import read_survey
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.streams import Finding
+from uwb_tdoa_ekf.monitoring.finding import Finding
 from uwb_tdoa_tools import command_lines
 from uwb_tdoa_tools.bags.bag import write_bag
 from uwb_tdoa_tools.checking import report

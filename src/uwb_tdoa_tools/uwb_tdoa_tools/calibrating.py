@@ -13,7 +13,7 @@ from uwb_tdoa_bias.common.flight import AIDS, Flight, Truth
 from uwb_tdoa_bias.effects import EffectSet
 from uwb_tdoa_bias.effects.base import listed
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.streams import ERROR
+from uwb_tdoa_ekf.monitoring.finding import ERROR
 
 from .checking.ordered import OrderedRecording, displacement
 from .diagnosis import diagnose, output
@@ -29,7 +29,7 @@ from .surveying.report import as_text
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
 
-    from uwb_tdoa_ekf.streams.finding import Finding
+    from uwb_tdoa_ekf.monitoring.finding import Finding
 
     from .checking.recording import Recording
 

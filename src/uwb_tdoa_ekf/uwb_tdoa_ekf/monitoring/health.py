@@ -12,9 +12,8 @@ import numpy as np
 from uwb_tdoa_bias.common.sensors import LOCATING, SENSORS
 from uwb_tdoa_bias.ros.diagnostics import Rate
 
-from ..streams import ERROR as SEVERE
-from .use import LARGEST_UNUSED, Use
-from .volume import VolumeCheck
+from .finding import ERROR as SEVERE
+from .status import LARGEST_UNUSED, Use, VolumeCheck
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -24,7 +23,7 @@ if TYPE_CHECKING:
 
     from ..core.config import FilterConfig
     from ..estimator import Estimator
-    from ..streams.finding import Finding
+    from .finding import Finding
 
 START_TIMEOUT = 5.0  # s of data without a start position before it becomes a warning
 BEHIND = 1.0, 60.0  # s that the newest odometry is old: less is good, and more is of another time

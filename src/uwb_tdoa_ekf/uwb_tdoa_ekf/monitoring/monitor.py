@@ -19,10 +19,10 @@ import numpy as np
 from uwb_tdoa_bias.common.geometry import tdoa
 
 from ..core.verdicts import REJECTED
-from ..streams import ERROR, WARNING, Finding
 from .change import ChangeDetector
+from .finding import ERROR, WARNING, Finding
 from .reference import Displaced, SurveyComparison
-from .sign_turn import turned
+from .signs import turned
 from .slices import LENGTH, reduced
 from .swap import clear_exchange, mean_of
 from .swap import residuals as residuals_of

@@ -8,16 +8,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..streams import NOTE, Steady, StreamRules, most_severe_first
-from ..streams.stamp_rules import usual
-from .sign_watch import SignWatch
+from .finding import NOTE, Steady, most_severe_first
+from .signs import SignWatch
+from .stamp_rules import usual
+from .stream_rules import StreamRules
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from uwb_tdoa_bias.common.anchors import Anchors
 
-    from ..streams.finding import Finding
+    from .finding import Finding
 
 KEPT = 4  # windows of a second that are checked together
 FEWEST = 3  # of them, below which nothing is said

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 
 from uwb_tdoa_bias.common.sensors import SENSORS
-from uwb_tdoa_ekf.streams import ERROR, NOTE, WARNING, Finding, StreamRules, most_severe_first
+from uwb_tdoa_ekf.monitoring.finding import ERROR, NOTE, WARNING, Finding, most_severe_first
+from uwb_tdoa_ekf.monitoring.stream_rules import StreamRules
 
 from ..estimate import FlightEstimator
 from ..readers.streams import protocol

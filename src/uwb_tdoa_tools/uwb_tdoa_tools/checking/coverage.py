@@ -12,8 +12,8 @@ import numpy as np
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_ekf.core.workspace import FLAT
+from uwb_tdoa_ekf.monitoring.finding import NOTE, WARNING, Finding
 from uwb_tdoa_ekf.monitoring.monitor import NEARER
-from uwb_tdoa_ekf.streams import NOTE, WARNING, Finding
 
 from .ordered import SPREAD, spread
 from .pair_rules import MANY
@@ -21,7 +21,7 @@ from .pair_rules import MANY
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from uwb_tdoa_ekf.streams.ranging import TdoaWindow
+    from uwb_tdoa_ekf.monitoring.ranging_windows import TdoaWindow
 
 
 CEILING = 1.5  # m; anchors whose mean height is larger hang at a ceiling

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.effects.anchor import AnchorIds
-from uwb_tdoa_ekf.streams import NOTE, WARNING, Finding, most_severe_first
+from uwb_tdoa_ekf.monitoring.finding import NOTE, WARNING, Finding, most_severe_first
 
 from . import coverage, imu_rules, motion_rules, pair_rules, time_rules
 from .check import processed_streams

@@ -17,9 +17,9 @@ from uwb_tdoa_bias.common.flight import Imu
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.measurements import imu_rows
 from uwb_tdoa_ekf.core.memory import TDOA, structured
-from uwb_tdoa_ekf.streams import ERROR, WARNING, Finding
-from uwb_tdoa_ekf.streams.explain import Unexplained, compare, unexplained
-from uwb_tdoa_ekf.streams.inertial_rules import AXES
+from uwb_tdoa_ekf.monitoring.explain import Unexplained, compare, unexplained
+from uwb_tdoa_ekf.monitoring.finding import ERROR, WARNING, Finding
+from uwb_tdoa_ekf.monitoring.inertial_rules import AXES
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from uwb_tdoa_ekf.streams import ERROR, Finding
+from uwb_tdoa_ekf.monitoring.finding import ERROR, Finding
 
 from .imu_rules import ARRANGEMENTS, SCALES, is_smooth, scale_of, signed_axis
 from .time_rules import BLOCK, LONGEST, delays, drift_or_jump

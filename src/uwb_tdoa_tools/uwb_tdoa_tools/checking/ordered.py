@@ -21,15 +21,15 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.ground import KnownHeight
 from uwb_tdoa_ekf.core.memory import TDOA, new_state, structured
 from uwb_tdoa_ekf.core.startup import locate, room_for
+from uwb_tdoa_ekf.monitoring.explain import SCALE, unexplained
+from uwb_tdoa_ekf.monitoring.ranging_windows import BEYOND
 from uwb_tdoa_ekf.results import rows_of
-from uwb_tdoa_ekf.streams.explain import SCALE, unexplained
-from uwb_tdoa_ekf.streams.ranging import BEYOND
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     Window = tuple[np.ndarray, ...]  # t (n,) s, a and b (n,) rows of the anchors, d (n,) m
-    from uwb_tdoa_ekf.streams.explain import Unexplained
+    from uwb_tdoa_ekf.monitoring.explain import Unexplained
 
     from .recording import Recording
 

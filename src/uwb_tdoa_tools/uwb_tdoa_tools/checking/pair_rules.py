@@ -15,7 +15,7 @@ from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_bias.effects import EffectSet, Track, true_samples
 from uwb_tdoa_bias.effects.anchor import AnchorIds
 from uwb_tdoa_bias.effects.pair import PairSign
-from uwb_tdoa_ekf.streams import ERROR, Finding
+from uwb_tdoa_ekf.monitoring.finding import ERROR, Finding
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

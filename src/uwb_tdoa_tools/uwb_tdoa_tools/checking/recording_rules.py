@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.common.sensors import Ranges
-from uwb_tdoa_ekf.streams import ERROR, NOTE, WARNING, Finding
+from uwb_tdoa_ekf.monitoring.finding import ERROR, NOTE, WARNING, Finding
 
 from ..bags.frames import is_body
 from ..bags.messages import BODY_FRAME

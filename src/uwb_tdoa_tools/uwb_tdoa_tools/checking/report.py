@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Sequence
 
     from uwb_tdoa_bias.common.flight import Flight
-    from uwb_tdoa_ekf.streams import Finding
+    from uwb_tdoa_ekf.monitoring.finding import Finding
 
     from .check import Report
 

@@ -15,9 +15,9 @@ import numpy as np
 from uwb_tdoa_bias.common.survey import UNITS as SURVEY_UNITS
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.memory import TDOA, new_state, structured
+from uwb_tdoa_ekf.monitoring.explain import SCALE, compare, innovations
+from uwb_tdoa_ekf.monitoring.finding import ERROR, Finding
 from uwb_tdoa_ekf.offline import run_offline
-from uwb_tdoa_ekf.streams import ERROR, Finding
-from uwb_tdoa_ekf.streams.explain import SCALE, compare, innovations
 
 from .ordered import LONG, SHORT, SPREAD, OrderedRecording, spread
 from .pair_rules import MANY, OFF

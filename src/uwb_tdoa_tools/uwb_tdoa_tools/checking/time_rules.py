@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from uwb_tdoa_bias.common.geometry import tdoa, tdoa_jacobian
-from uwb_tdoa_ekf.streams import ERROR, Finding
+from uwb_tdoa_ekf.monitoring.finding import ERROR, Finding
 
 from ..clock import numbered
 from .pair_rules import MANY

@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from uwb_tdoa_bias.common.flight import Flight
+    from uwb_tdoa_ekf.monitoring.finding import Finding
     from uwb_tdoa_ekf.monitoring.monitor import Event
     from uwb_tdoa_ekf.offline import Run
-    from uwb_tdoa_ekf.streams import Finding
 
     from ..estimate import FlightEstimator
     from .ordered import OrderedRecording

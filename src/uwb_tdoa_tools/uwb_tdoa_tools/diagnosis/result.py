@@ -10,7 +10,7 @@ from .findings import EffectFinding, Refused
 if TYPE_CHECKING:
     from uwb_tdoa_bias.common.flight import Flight
     from uwb_tdoa_bias.effects import EffectSet
-    from uwb_tdoa_ekf.streams.finding import Finding as NumbersFinding
+    from uwb_tdoa_ekf.monitoring.finding import Finding as NumbersFinding
 
     from .attribution import Attribution
     from .channels import ChannelResiduals

@@ -10,10 +10,10 @@ import numpy as np
 
 from uwb_tdoa_bias.common.flight import Flight
 from uwb_tdoa_ekf.frames import rotation_std
+from uwb_tdoa_ekf.monitoring.finding import ERROR
 from uwb_tdoa_ekf.monitoring.status import YAW_KNOWN
 from uwb_tdoa_ekf.offline import Run
 from uwb_tdoa_ekf.results import Odometry, Residuals
-from uwb_tdoa_ekf.streams import ERROR
 
 from ..checking.check import check
 from ..checking.recording import of_flight

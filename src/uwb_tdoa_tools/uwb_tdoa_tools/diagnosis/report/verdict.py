@@ -14,7 +14,7 @@ from .left_over import left_over
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from uwb_tdoa_ekf.streams.finding import Finding as NumbersFinding
+    from uwb_tdoa_ekf.monitoring.finding import Finding as NumbersFinding
 
     from ..result import Diagnosis
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.compiled import compiled
 
-from .stamps import (
+from .stamp_rules import (
     LAST,
     StampWindow,
     complete,

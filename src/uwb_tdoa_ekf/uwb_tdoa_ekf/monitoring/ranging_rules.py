@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .finding import ERROR, NOTE, WARNING, Finding
-from .median import median
-from .ranging import GRIDS
+from .ranging_windows import GRIDS
+from .stamp_rules import median
 
 if TYPE_CHECKING:
-    from .ranging import TdoaWindow
+    from .ranging_windows import TdoaWindow
 
 LARGE = 0.2  # share of TDOAs longer than their anchors are apart; healthy 0.008 at most
 OUTLIERS = 0.05

@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from . import inertial, inertial_rules, ranging, ranging_rules, stamp_rules, stamps
+from . import inertial_rules, ranging_rules, ranging_windows, stamp_rules
 from .finding import ERROR, Finding, most_severe_first
-from .scale import KEPT, SurveyScale
+from .survey_scale import KEPT, SurveyScale
 
 if TYPE_CHECKING:
     from uwb_tdoa_bias.common.anchors import Anchors
 
-    from .inertial import ImuWindow
-    from .ranging import TdoaWindow
+    from .inertial_rules import ImuWindow
+    from .ranging_windows import TdoaWindow
 
 Window = TypeVar("Window", "ImuWindow", "TdoaWindow")
 
@@ -36,7 +36,7 @@ class StreamRules:
         self.imu: list[ImuWindow] = []
         self.tdoa: list[TdoaWindow] = []
         self.unknown: Counter[int] = Counter()  # ids that the survey does not have
-        self._imu, self._tdoa = inertial.new_imu(), ranging.new_tdoa(anchors)
+        self._imu, self._tdoa = inertial_rules.new_imu(), ranging_windows.new_tdoa(anchors)
         self._scale = SurveyScale(anchors, kept and KEPT)
 
     def feed_imu(
@@ -48,7 +48,7 @@ class StreamRules:
         )
         row = 0
         while row < len(t):
-            row, complete = inertial.feed_imu(self._imu, t, arrival, gyro, force, row)
+            row, complete = inertial_rules.feed_imu(self._imu, t, arrival, gyro, force, row)
             if complete:
                 self._close_imu()
 
@@ -63,14 +63,14 @@ class StreamRules:
         t, arrival, d = (np.ascontiguousarray(column, dtype=float) for column in (t, arrival, d))
         row = 0
         while row < len(t):
-            row, complete = ranging.feed_tdoa(self._tdoa, t, arrival, row_a, row_b, d, row)
+            row, complete = ranging_windows.feed_tdoa(self._tdoa, t, arrival, row_a, row_b, d, row)
             if complete:
                 self._close_tdoa()
 
     def finish(self) -> None:
         """Close the windows at the end of a recording, unless they hold next to nothing."""
         for counters, close in ((self._imu, self._close_imu), (self._tdoa, self._close_tdoa)):
-            if counters.stamps[stamps.COUNT] >= FULL:
+            if counters.stamps[stamp_rules.COUNT] >= FULL:
                 close()
 
     def findings(self, latest: int = 0) -> list[Finding]:
@@ -127,14 +127,14 @@ class StreamRules:
         )
 
     def _close_imu(self) -> None:
-        self._keep(self.imu, inertial.imu_window(self._imu))
-        inertial.restart_imu(self._imu)
+        self._keep(self.imu, inertial_rules.imu_window(self._imu))
+        inertial_rules.restart_imu(self._imu)
 
     def _close_tdoa(self) -> None:
-        window = ranging.tdoa_window(self._tdoa)
+        window = ranging_windows.tdoa_window(self._tdoa)
         self._keep(self.tdoa, window)
         self._scale.add(window.latest)
-        ranging.restart_tdoa(self._tdoa)
+        ranging_windows.restart_tdoa(self._tdoa)
 
     def _keep(self, windows: list[Window], window: Window) -> None:
         windows.append(window)

@@ -1,0 +1,86 @@
+"""Findings of the estimator itself: clocks of streams, and implausible inertial samples."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from uwb_tdoa_bias.common.sensors import SENSORS
+
+from ..core.plausibility import RATE, TILT, TURN, WEIGHT
+from .finding import ERROR, WARNING, Finding
+
+if TYPE_CHECKING:
+    from uwb_tdoa_bias.common.compiled import Record
+
+    from ..reorder_buffer import Restart
+
+
+TOPICS = {"imu": "imu/data", "tdoa": "uwb/tdoa"} | {
+    name: sensor.topics[0][0] for name, sensor in SENSORS.items()
+}  # by stream
+STAMP_LINE = (
+    "message.header.stamp = ...  # when the sample was measured, by the clock of the other streams"
+)
+
+
+def clock_ahead(stream: str, lead: float, count: int) -> Finding:
+    """Return the finding for a stream of STREAMS that is ahead of the others by `lead`, s; count :
+    its invalid messages so far.
+    """
+    what = (
+        f"the stamps of {TOPICS[stream]} are {lead:.3g} s ahead of those of the other streams; "
+        "its messages are not used"
+    )
+    return Finding(
+        "clock_ahead", WARNING, what, f"{count} invalid messages so far", STAMP_LINE, lead
+    )
+
+
+def restarted(cause: Restart) -> Finding:
+    """Return the finding for a Restart of the filter."""
+    topic = TOPICS[cause.stream]
+    how = "are before the time of the other streams" if cause.overtaken else "fell back"
+    evidence = f"the new time begins at {cause.at:.3f} s after the first stamp"
+    remedy = (
+        "keep the clocks of all drivers in step (chronyc tracking); a recording that is played "
+        "again does this, too"
+    )
+    what = (
+        f"the filter has started anew, because the stamps of {topic} {how} by {-cause.step:.3g} s"
+    )
+    return Finding("restarted", WARNING, what, evidence, remedy, cause.step)
+
+
+SAID = {
+    WEIGHT: (
+        "what the accelerometer reads is not gravity",
+        "a specific force of {:.3g} m/s^2, where 9.81 is expected",
+        "linear_acceleration = ...  # the specific force, with gravity, in m/s^2",
+    ),
+    TURN: (
+        "gyroscope and accelerometer contradict each other",
+        (
+            "where the gyroscope has turned upwards to, the specific force is {:+.1f} m/s^2, and "
+            "9.81 is expected"
+        ),
+        "angular_velocity = ...  # in rad/s, and the axes of both sensors x forward, y left, z up",
+    ),
+    RATE: (
+        "the gyroscope turns as nothing does",
+        "{:.0f} rad/s",
+        "angular_velocity = ...  # in rad/s",
+    ),
+    TILT: (
+        "the IMU is turned, or the tag lies on its side",
+        "the specific force along z is {:+.1f} m/s^2, where +9.81 is expected",
+        "x, y, z = ...  # of both sensors: x forward, y left, z up",
+    ),
+}
+
+
+def implausible(check: Record) -> Finding:
+    """The Finding of a PLAUSIBILITY by which inertial samples are left out."""
+    cause, evidence, remedy = SAID[int(check.reason)]
+    cause = f"{cause}: the filter goes without the IMU"
+    size = float(check["size"])  # of a numpy record, `.size` is how many it is
+    return Finding("imu_left_out", ERROR, cause, evidence.format(size), remedy, size)
