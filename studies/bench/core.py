@@ -10,7 +10,7 @@ import numpy as np
 
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
 from uwb_tdoa_ekf.core.engine import feed
-from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, TDOA, YAWS, Measurements, new_state, structured
+from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, N_YAWS, TDOA, Measurements, new_state, structured
 from uwb_tdoa_ekf.offline import loaded
 
 from .figures import Figure
@@ -48,7 +48,7 @@ def measure(progress: Callable[[str], object], quick: bool = False) -> Iterator[
         yield from _pair(f"8 anchors, {robust}", 8, robust, 1, repeats)
     progress("core, yaw unknown")
     yield from _pair(
-        f"8 anchors, {ROBUST[0]}, while {YAWS} yaws are followed", 8, ROBUST[0], YAWS, repeats
+        f"8 anchors, {ROBUST[0]}, while {N_YAWS} yaws are followed", 8, ROBUST[0], N_YAWS, repeats
     )
     for aid in NOISES:
         progress(f"core, {aid}")

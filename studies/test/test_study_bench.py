@@ -124,7 +124,9 @@ def test_the_core_is_measured_per_event():
 
 
 def test_the_core_is_measured_while_several_yaws_are_followed():
-    prediction, _ = core.per_event(8, "innovation", core.YAWS, 2)  # raises where fewer are followed
+    prediction, _ = core.per_event(
+        8, "innovation", core.N_YAWS, 2
+    )  # raises where fewer are followed
     assert (prediction > 0.0).all()
 
 

@@ -10,7 +10,7 @@ import pytest
 from studies.rules import tuned, watching, work
 from studies.rules.catalogue import RULES, Rule
 from studies.rules.worth import worth
-from uwb_tdoa_ekf.core import curvature, noise
+from uwb_tdoa_ekf.core import noise, update
 
 # In another process, as the copy takes the place of the filter: a variance, and the noise that is
 # learned, as they are; with a constant doubled; without a rule; and as they are again
@@ -80,7 +80,7 @@ def test_the_copy_changes_while_it_runs_and_is_the_filter_otherwise(made, tmp_pa
     file, before, doubled, after = json.loads(out)
     place = np.array([1.0, 0.2, 0.0]), np.array([0.0, 2.0, 1.0])
     assert file.startswith(str(made.folder))
-    assert before == after == curvature.variance(np.zeros(3), np.eye(15), *place) > 0.0
+    assert before == after == update.variance(np.zeros(3), np.eye(15), *place) > 0.0
     assert doubled == 0.0
 
 

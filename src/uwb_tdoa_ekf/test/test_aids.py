@@ -20,9 +20,8 @@ from uwb_tdoa_ekf.core.engine import feed
 from uwb_tdoa_ekf.core.history import NOTHING
 from uwb_tdoa_ekf.core.hypotheses import PRUNED_BELOW
 from uwb_tdoa_ekf.core.measurements import aid_rows
-from uwb_tdoa_ekf.core.memory import AID, RESIDUAL, YAWS, new_state
+from uwb_tdoa_ekf.core.memory import AID, N_YAWS, RESIDUAL, USED, new_state
 from uwb_tdoa_ekf.core.state import TRANSITION, inject
-from uwb_tdoa_ekf.core.verdicts import USED
 from uwb_tdoa_ekf.offline import run_offline
 
 seeds = st.integers(0, 2**32 - 1)
@@ -298,7 +297,7 @@ def test_a_range_finder_decides_between_mirrored_places(followed):
         state.record,
         np.zeros(1, AID)[0],
         np.zeros(1, RESIDUAL)[0],
-        (0, YAWS),
+        (0, N_YAWS),
     )
     ekf.workspace[:], ekf.running, ekf.best = (
         [[-1.0, -1.0, -1.0], [8.0, 9.0, 4.0]],

@@ -8,7 +8,7 @@ import numpy as np
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.flight import Tdoas
 from uwb_tdoa_bias.common.geometry import tdoa
-from uwb_tdoa_ekf.core.verdicts import INVALID, USED
+from uwb_tdoa_ekf.core.memory import INVALID, USED
 from uwb_tdoa_ekf.estimator import Estimator
 
 BOX = corners()

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.common.geometry import tdoa, tdoa_jacobian
-from uwb_tdoa_ekf.core.curvature import SMALLEST, variance
+from uwb_tdoa_ekf.core.update import SMALLEST, variance
 
 A, B = np.array([0.0, -3.0, 1.0]), np.array([1.0, 4.0, 2.0])
 

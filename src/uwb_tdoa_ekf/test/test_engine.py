@@ -15,12 +15,11 @@ import pytest
 
 from uwb_tdoa_bias.common.flight import Imu, Tdoas
 from uwb_tdoa_bias.common.geometry import tdoa
-from uwb_tdoa_ekf.core import verdicts
+from uwb_tdoa_ekf.core import memory
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
 from uwb_tdoa_ekf.core.engine import feed, most_records, run
 from uwb_tdoa_ekf.core.history import RECORD, RESET, UPDATE
-from uwb_tdoa_ekf.core.memory import ODOMETRY, RESIDUAL, Output, new_state
-from uwb_tdoa_ekf.core.verdicts import STARTUP, USED
+from uwb_tdoa_ekf.core.memory import ODOMETRY, RESIDUAL, STARTUP, USED, Output, new_state
 
 # --- engine ---
 MESSAGE = Path(__file__).resolve().parents[2] / "uwb_tdoa_msgs" / "msg" / "TdoaResidual.msg"
@@ -31,9 +30,7 @@ MESSAGE = Path(__file__).resolve().parents[2] / "uwb_tdoa_msgs" / "msg" / "TdoaR
 )
 def test_verdicts_are_those_of_the_message():
     declared = dict(re.findall(r"VERDICT_(\w+)=(\d)", MESSAGE.read_text()))
-    assert declared == {
-        name: str(value) for name, value in vars(verdicts).items() if name.isupper()
-    }
+    assert declared == {name: str(value) for name, value in vars(memory).items() if name.isupper()}
 
 
 def without_imu(flight, low=-np.inf, high=np.inf):

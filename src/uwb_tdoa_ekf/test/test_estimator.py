@@ -28,7 +28,7 @@ from uwb_tdoa_bias.common.flight import Imu
 from uwb_tdoa_bias.common.sensors import SENSORS
 from uwb_tdoa_bias.common.stamps import LARGEST_STEP_BACK
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.core.verdicts import COMPENSATED, INVALID, LATE, REPEATED, STARTUP
+from uwb_tdoa_ekf.core.memory import COMPENSATED, INVALID, LATE, REPEATED, STARTUP
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.frames import rotation_std
 from uwb_tdoa_ekf.offline import run_offline

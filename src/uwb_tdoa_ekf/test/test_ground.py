@@ -24,7 +24,7 @@ from uwb_tdoa_ekf.core.ground import (
     may_be_late,
 )
 from uwb_tdoa_ekf.core.memory import TDOA, new_state, structured
-from uwb_tdoa_ekf.core.standing import weigh
+from uwb_tdoa_ekf.core.stationary_position import weigh
 from uwb_tdoa_ekf.core.workspace import set_bounds
 
 # --- ground ---

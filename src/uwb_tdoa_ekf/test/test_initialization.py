@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from uwb_tdoa_bias.common.flight import Tdoas
 from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
-from uwb_tdoa_ekf.core.verdicts import REJECTED, STARTUP, USED
+from uwb_tdoa_ekf.core.memory import REJECTED, STARTUP, USED
 
 
 def test_starts_by_itself_within_its_window_and_knows_where_it_is():

@@ -8,7 +8,7 @@ import pytest
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.effects import Covariance
-from uwb_tdoa_ekf.core.verdicts import INVALID, REJECTED, USED
+from uwb_tdoa_ekf.core.memory import INVALID, REJECTED, USED
 from uwb_tdoa_ekf.evidence import POSITION, Part, changes_of, keys_of, most_likely_changes
 from uwb_tdoa_ekf.monitoring.change import CAPACITY, ChangeDetector
 from uwb_tdoa_ekf.monitoring.monitor import LIMIT, Monitor, _surest

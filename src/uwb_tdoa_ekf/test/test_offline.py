@@ -12,7 +12,7 @@ from uwb_tdoa_bias.correction.corrector import Corrector
 from uwb_tdoa_bias.correction.poses import known_yaw_std
 from uwb_tdoa_bias.effects import AnchorDelay, EffectSet, SmoothTerm, TagLeverArm
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.core.verdicts import INVALID, STARTUP, USED
+from uwb_tdoa_ekf.core.memory import INVALID, STARTUP, USED
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.frames import to_odometry
 from uwb_tdoa_ekf.offline import run_offline

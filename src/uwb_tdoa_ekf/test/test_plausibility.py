@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.engine import feed
+from uwb_tdoa_ekf.core.imu_fault_detector import CLEARED, RATE, TILT, TURN, WEIGHT
 from uwb_tdoa_ekf.core.memory import IMU_SAMPLE, TDOA, Measurements, new_state, structured
-from uwb_tdoa_ekf.core.plausibility import CLEARED, RATE, TILT, TURN, WEIGHT
 from uwb_tdoa_ekf.core.state import GRAVITY
 from uwb_tdoa_ekf.monitoring.filter_findings import implausible
 
@@ -39,8 +39,8 @@ def left_out(gyro, accel):
     state, parameters, out = new_state(np.zeros((4, 3))), FilterConfig().parameters(), []
     for row in structured(IMU_SAMPLE, T, gyro, accel)[:, None]:
         feed(state, parameters, Measurements(row, np.empty(0, TDOA)))
-        if state.record.distrusted:
-            out.append((row["t"][0], int(state.record.plausibility.reason)))
+        if state.record.imu_faulty:
+            out.append((row["t"][0], int(state.record.imu_fault_detector.reason)))
     return out
 
 
@@ -115,5 +115,5 @@ def test_what_is_said_has_the_number_of_the_sensor(turn, says):
     gyro, accel = (values * turn for values in swaying())
     state, parameters = new_state(np.zeros((4, 3))), FilterConfig().parameters()
     feed(state, parameters, Measurements(structured(IMU_SAMPLE, T, gyro, accel), np.empty(0, TDOA)))
-    found = implausible(state.record.plausibility)
+    found = implausible(state.record.imu_fault_detector)
     assert re.search(says, found.evidence), found.evidence

@@ -17,9 +17,17 @@ from uwb_tdoa_ekf.core import ranges
 from uwb_tdoa_ekf.core.aids import STREAMS
 from uwb_tdoa_ekf.core.auxiliary import RANGE
 from uwb_tdoa_ekf.core.config import FilterConfig
-from uwb_tdoa_ekf.core.memory import AID, IMU_SAMPLE, ODOMETRY, Measurements, new_state
+from uwb_tdoa_ekf.core.memory import (
+    AID,
+    IMU_SAMPLE,
+    INVALID,
+    ODOMETRY,
+    REPEATED,
+    USED,
+    Measurements,
+    new_state,
+)
 from uwb_tdoa_ekf.core.memory import TDOA as TDOA_ROW
-from uwb_tdoa_ekf.core.verdicts import INVALID, REPEATED, USED
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.offline import run_offline, without_offset
 from uwb_tdoa_ekf.pipeline import SLICE, RadioCorrections

@@ -12,9 +12,8 @@ import pytest
 
 from uwb_tdoa_bias.common.flight import Tdoas
 from uwb_tdoa_bias.common.stamps import MOST_HELD
-from uwb_tdoa_ekf.core.memory import AID, IMU_SAMPLE
+from uwb_tdoa_ekf.core.memory import AID, IMU_SAMPLE, INVALID, LATE
 from uwb_tdoa_ekf.core.memory import TDOA as TDOA_ROW
-from uwb_tdoa_ekf.core.verdicts import INVALID, LATE
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.monitoring.filter_findings import clock_ahead, restarted
 from uwb_tdoa_ekf.reorder_buffer import (

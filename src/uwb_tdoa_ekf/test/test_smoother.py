@@ -112,8 +112,10 @@ def test_its_covariance_holds_errors_that_do_not_average_out():
     filtered, smoothed = (engine(flight, config).odometry for engine in (run_offline, smooth))
     rows = np.searchsorted(filtered.t, smoothed.t, side="right") - 1
     known = (rows > 0) & (smoothed.t > 2.0)
-    expected = np.einsum("nii->n", filtered.persistent[rows[known]])
-    np.testing.assert_array_equal(np.einsum("nii->n", smoothed.persistent[known]), expected)
+    expected = np.einsum("nii->n", filtered.consider_covariance[rows[known]])
+    np.testing.assert_array_equal(
+        np.einsum("nii->n", smoothed.consider_covariance[known]), expected
+    )
     assert (
         np.einsum("nii->n", smoothed.covariance[known, :3, :3]) > expected
     ).all() and expected.min() > 0.0
@@ -146,7 +148,7 @@ def test_its_covariance_holds_what_an_offset_of_all_ranges_may_be_off_by():
             smoothed.p[middle] - position_at(flight, smoothed.t[middle]),
             smoothed.covariance[middle, :3, :3],
         )
-        both = covariance, covariance - smoothed.persistent[middle]
+        both = covariance, covariance - smoothed.consider_covariance[middle]
         nees.append(
             [np.einsum("ni,nij,nj->n", error, np.linalg.inv(one), error).mean() for one in both]
         )

@@ -138,6 +138,6 @@ def test_nothing_is_said_of_measured_flights(shared_data):
                 assert watch.findings() == [], (name, now - begin)
         assert estimator.sign_turns == estimator.yaw_doubts == 0, name
         # the filter never goes without its IMU
-        assert estimator._ekf.plausibility.contradicted == -np.inf, name
+        assert estimator._ekf.imu_fault_detector.contradicted == -np.inf, name
         count += 1
     assert count == 22

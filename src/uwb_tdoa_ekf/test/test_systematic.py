@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from uwb_tdoa_ekf.core import systematic
+from uwb_tdoa_ekf.core import noise
 from uwb_tdoa_ekf.core.memory import new_state
 
 ANCHORS = np.array([[x, y, z] for x in (0.0, 7.0) for y in (0.0, 8.0) for z in (0.2, 3.0)])
@@ -21,7 +21,7 @@ def informed(p, seconds=5.0, rate=400.0, heard=range(8), state=None, begin=0.0):
         innovation.noise_variance, innovation.weight, innovation.curvature = STD**2, 1.0, 0.0
         t = begin + k / rate
         last = t - 1.0 / rate if k else -np.inf
-        systematic.observe(information, anchors[a], anchors[b], innovation, t, last)
+        noise.observe(information, anchors[a], anchors[b], innovation, t, last)
     return state
 
 
@@ -29,7 +29,7 @@ def stated(state, P, correlation_length=np.inf, height_std=0.0):
     covariance = np.full((3, 3), np.nan)
     whole = np.zeros((15, 15))
     whole[:3, :3] = P
-    systematic.fill(state.record.information, whole, correlation_length, height_std, covariance)
+    noise.fill(state.record.information, whole, correlation_length, height_std, covariance)
     return covariance
 
 
@@ -39,7 +39,7 @@ def test_it_is_the_covariance_of_a_position_by_one_arrival_from_each_anchor(p):
     way = np.array(p) - ANCHORS
     unit = way / np.linalg.norm(way, axis=1)[:, None]
     centred = unit - unit.mean(axis=0)
-    of_anchor = systematic.SHARE * STD**2 / 2.0
+    of_anchor = noise.SHARE * STD**2 / 2.0
     expected = np.linalg.inv(centred.T @ centred) * of_anchor
     # a ring of neighbours weighs directions a little differently from all pairs
     found = stated(informed(p), 1e3 * np.eye(3))
@@ -71,7 +71,7 @@ def test_of_white_noise_nothing_persists():
 def test_it_is_bounded_by_what_the_filter_knows():
     P = np.diag([0.01, 0.02, 0.03])
     state = new_state(ANCHORS)
-    np.testing.assert_allclose(stated(state, P), systematic.MOST * P, rtol=1e-9)
+    np.testing.assert_allclose(stated(state, P), noise.MOST * P, rtol=1e-9)
     assert not stated(state, np.zeros((3, 3))).any()
 
 

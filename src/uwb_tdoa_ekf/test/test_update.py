@@ -9,7 +9,7 @@ from priors import kalman as textbook
 import pytest
 
 from uwb_tdoa_bias.common.robust_loss import LOSSES, weight
-from uwb_tdoa_ekf.core.auxiliary import PRESSURE, RANGE, depend
+from uwb_tdoa_ekf.core.auxiliary import PRESSURE, RANGE, add_offset_jacobian
 from uwb_tdoa_ekf.core.config import ROBUST, FilterConfig
 from uwb_tdoa_ekf.core.robust import (
     NEGLIGIBLE,
@@ -177,7 +177,7 @@ def test_whatever_is_measured_the_joint_covariance_stays_one(
     prior = Prior(seed, states, surprise)
     joint, innovation = with_offset(prior), prior.innovation
     if offset is not None:
-        depend(prior.hypothesis, innovation, offset)
+        add_offset_jacobian(prior.hypothesis, innovation, offset)
     h = np.zeros(18)
     h[list(states)] = prior.h[list(states)]
     if offset is not None:

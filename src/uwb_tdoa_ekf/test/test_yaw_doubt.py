@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from uwb_tdoa_ekf.core.config import FilterConfig
 from uwb_tdoa_ekf.core.memory import new_state
 from uwb_tdoa_ekf.core.state import ERROR_STATES
-from uwb_tdoa_ekf.core.yaw_doubt import evidence
+from uwb_tdoa_ekf.core.yaw_test import evidence
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.frames import rotation_std
 from uwb_tdoa_ekf.offline import run_offline
@@ -140,7 +140,7 @@ def test_a_tag_at_rest_doubts_nothing():
 
 
 def test_evidence_is_the_likelihood_ratio_of_the_best_angle():
-    doubt = new_state(np.zeros((4, 3))).record.yaw_doubt
+    doubt = new_state(np.zeros((4, 3))).record.yaw_test
     assert evidence(doubt) == 0.0 and doubt.response.shape == (2, ERROR_STATES)
     doubt.information[:] = 10.0 * np.eye(2)
     doubt.vector[:] = 10.0 * np.array(

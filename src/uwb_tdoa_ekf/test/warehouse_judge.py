@@ -14,7 +14,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.correction.corrector import Corrector
-from uwb_tdoa_ekf.core.verdicts import STARTUP
+from uwb_tdoa_ekf.core.memory import STARTUP
 from uwb_tdoa_ekf.estimator import Estimator
 from uwb_tdoa_ekf.monitoring.stream_watch import StreamWatch
 

@@ -41,7 +41,7 @@ from uwb_tdoa_bias.ros.topics import Epoch, Input, Refusals, several_publishers
 from uwb_tdoa_msgs.msg import TdoaCorrected
 
 from .compile_nodes import warm_up
-from .core.verdicts import INVALID
+from .core.memory import INVALID
 from .ekf_parameters import ODOM, declare_parameters, follow_changes
 from .estimator import Estimator
 from .frames import ImuMount, pose_from_message, rotation_std

@@ -20,10 +20,20 @@ from .core.config import FilterConfig
 from .core.engine import LOST_TIME
 from .core.height import LONGEST_GAP
 from .core.measurements import aid_rows, imu_rows, usable_tdoas
-from .core.memory import AID, IMU_SAMPLE, ODOMETRY, POSE, TDOA, YAWS, joined, structured
+from .core.memory import (
+    AID,
+    IMU_SAMPLE,
+    INVALID,
+    N_YAWS,
+    ODOMETRY,
+    POSE,
+    TDOA,
+    USED,
+    joined,
+    structured,
+)
 from .core.startup import APART
 from .core.velocity import HELD, LONGEST_STD, YAW_RATE
-from .core.verdicts import INVALID, USED
 from .monitoring.filter_findings import clock_ahead, implausible, restarted
 from .monitoring.finding import Steady
 from .pipeline import Pipeline, odometry_of
@@ -136,7 +146,7 @@ class Estimator:
             return None
         known = self.config.fixed_height_std > 0.0 or ekf.t - ekf.height.used < LONGEST_GAP
         places = {
-            h // YAWS for h in np.flatnonzero(ekf.hypotheses["log_weight"] > -np.inf).tolist()
+            h // N_YAWS for h in np.flatnonzero(ekf.hypotheses["log_weight"] > -np.inf).tolist()
         }
         flat, variances = ekf["flat"], np.diagonal(ekf.hypotheses["P"][ekf.best])
         for axis, (sides, where) in enumerate(
@@ -214,7 +224,7 @@ class Estimator:
     @property
     def yaw_doubts(self) -> int:
         """How often the yaw was found to be wrong, and opened again."""
-        return int(self._ekf.yaw_doubt["count"])
+        return int(self._ekf.yaw_test["count"])
 
     @property
     def without_imu(self) -> Finding | None:
@@ -223,7 +233,8 @@ class Estimator:
         """
         ekf = self._ekf
         return next(
-            iter(self._steady([implausible(ekf.plausibility)] if ekf.distrusted else [])), None
+            iter(self._steady([implausible(ekf.imu_fault_detector)] if ekf.imu_faulty else [])),
+            None,
         )
 
     @property

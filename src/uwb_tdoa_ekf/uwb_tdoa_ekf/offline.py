@@ -16,8 +16,7 @@ from .core.aids import STREAMS as AIDS
 from .core.config import FilterConfig
 from .core.hypotheses import yaw_offset
 from .core.measurements import aid_rows, imu_rows, usable_tdoas
-from .core.memory import AID, RESIDUAL, TDOA, joined, structured
-from .core.verdicts import INVALID
+from .core.memory import AID, INVALID, RESIDUAL, TDOA, joined, structured
 from .frames import poses_of
 from .pipeline import Pipeline, odometry_of
 from .reorder_buffer import FIRST_AID, IMU_STREAM, TDOA_STREAM, ReorderBuffer

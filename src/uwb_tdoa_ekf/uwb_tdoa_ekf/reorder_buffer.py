@@ -18,8 +18,7 @@ from uwb_tdoa_bias.common.stamps import (
 )
 
 from .core import aids
-from .core.memory import AID, IMU_SAMPLE, TDOA, Measurements, joined
-from .core.verdicts import INVALID, LATE
+from .core.memory import AID, IMU_SAMPLE, INVALID, LATE, TDOA, Measurements, joined
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

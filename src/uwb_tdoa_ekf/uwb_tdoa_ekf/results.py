@@ -9,7 +9,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from .core.verdicts import COMPENSATED, INVALID, LATE, REJECTED, REPEATED, STARTUP, USED
+from .core.memory import COMPENSATED, INVALID, LATE, REJECTED, REPEATED, STARTUP, USED
 
 VERDICTS = {
     USED: "used",
@@ -75,7 +75,7 @@ class Odometry:
     accel_bias: np.ndarray
     gyro_bias: np.ndarray
     covariance: np.ndarray
-    persistent: np.ndarray
+    consider_covariance: np.ndarray
 
     @classmethod
     def from_rows(cls, rows: np.ndarray) -> Odometry:
@@ -89,7 +89,7 @@ class Odometry:
             x[:, 10:13],
             x[:, 13:],
             rows["covariance"],
-            rows["persistent"],
+            rows["consider_covariance"],
         )
 
     def __len__(self) -> int:

@@ -21,9 +21,8 @@ from uwb_tdoa_bias.correction.corrector import Corrector
 from .core import auxiliary
 from .core.config import FilterConfig
 from .core.history import RESET
-from .core.memory import RESIDUAL, joined, structured
+from .core.memory import RESIDUAL, USED, joined, structured
 from .core.state import ERROR_STATES, MOVING_STATES
-from .core.verdicts import USED
 from .offline import Run, run_offline, without_unknown_offset
 from .results import OF_ROW
 

@@ -91,12 +91,12 @@ def _with_persistent(smoothed: Odometry, online: Odometry) -> Odometry:
     """
     if not len(online):
         return smoothed
-    persistent = online.persistent[
+    consider_covariance = online.consider_covariance[
         np.maximum(np.searchsorted(online.t, smoothed.t, side="right") - 1, 0)
     ]
     covariance = smoothed.covariance.copy()
-    covariance[:, :3, :3] += persistent
-    return replace(smoothed, covariance=covariance, persistent=persistent)
+    covariance[:, :3, :3] += consider_covariance
+    return replace(smoothed, covariance=covariance, consider_covariance=consider_covariance)
 
 
 def _with_common_error(smoothed: Odometry, beside: Odometry) -> Odometry:
@@ -111,7 +111,9 @@ def _with_common_error(smoothed: Odometry, beside: Odometry) -> Odometry:
     )
     common, covariance = off[:, :, None] * off[:, None, :], smoothed.covariance.copy()
     covariance[:, :3, :3] += common
-    return replace(smoothed, covariance=covariance, persistent=smoothed.persistent + common)
+    return replace(
+        smoothed, covariance=covariance, consider_covariance=smoothed.consider_covariance + common
+    )
 
 
 @compiled

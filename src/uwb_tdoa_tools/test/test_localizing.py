@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.common.errors import InputError
-from uwb_tdoa_ekf.core.verdicts import REJECTED, USED
+from uwb_tdoa_ekf.core.memory import REJECTED, USED
 from uwb_tdoa_ekf.offline import without_offset
 from uwb_tdoa_ekf.results import Odometry, Residuals
 from uwb_tdoa_tools.bags.bag import read_bag, read_odometry, write_bag

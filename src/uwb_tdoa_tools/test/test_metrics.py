@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from uwb_tdoa_bias.common.flight import Truth
-from uwb_tdoa_ekf.core.verdicts import INVALID, LATE, REJECTED, STARTUP, USED
+from uwb_tdoa_ekf.core.memory import INVALID, LATE, REJECTED, STARTUP, USED
 from uwb_tdoa_tools.evaluating import line_of_run
 from uwb_tdoa_tools.scoring.metrics import (
     Score,

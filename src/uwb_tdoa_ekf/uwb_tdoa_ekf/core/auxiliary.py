@@ -40,7 +40,7 @@ def forget(hypothesis: Record) -> None:
 
 
 @compiled
-def depend(hypothesis: Record, innovation: Record, state: int) -> None:
+def add_offset_jacobian(hypothesis: Record, innovation: Record, state: int) -> None:
     """After `update.project`: the measurement has one of them in it, whole."""
     cross, P = hypothesis.offset_cross, hypothesis.offset_P
     own = 0.0
@@ -49,7 +49,7 @@ def depend(hypothesis: Record, innovation: Record, state: int) -> None:
     for j in range(ERROR_STATES):
         innovation.cross_covariance[j] += cross[state, j]
     innovation.prior_variance += 2.0 * own + P[state, state]
-    innovation.on_offset[state] = 1.0
+    innovation.offset_jacobian[state] = 1.0
 
 
 @compiled
@@ -60,7 +60,7 @@ def correct(hypothesis: Record, innovation: Record) -> None:
     for k in range(OFFSET_STATES):
         covariance[k] = 0.0
         for m in range(OFFSET_STATES):
-            covariance[k] += innovation.on_offset[m] * P[k, m]
+            covariance[k] += innovation.offset_jacobian[m] * P[k, m]
         for n in range(innovation.entries):
             covariance[k] += innovation.row[n] * cross[k, innovation.states[n]]
     for k in range(OFFSET_STATES):

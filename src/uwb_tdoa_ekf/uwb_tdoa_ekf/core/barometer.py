@@ -12,11 +12,11 @@ import numpy as np
 from uwb_tdoa_bias.common.compiled import Record, compiled
 from uwb_tdoa_bias.common.robust_loss import GEMAN_MCCLURE, weight
 
-from .auxiliary import PRESSURE, PRESSURE_DRIFT, RANGE, depend
+from .auxiliary import PRESSURE, PRESSURE_DRIFT, RANGE, add_offset_jacobian
 from .hypotheses import alive
+from .memory import REJECTED, USED
 from .state import ERROR_STATES
 from .update import kalman, project
-from .verdicts import REJECTED, USED
 
 GATE = 4.0  # standard deviations beyond which an altitude is not used
 LONGEST_DISAGREEMENT = 1.0  # s, after which the offset is taken anew
@@ -73,7 +73,7 @@ def _compare(hypothesis: Record, altitude: float, parameters: Record, innovation
     innovation.value = altitude - hypothesis.x[2] - hypothesis.offset[PRESSURE]
     innovation.noise_variance = parameters.pressure_std**2
     project(hypothesis.P, innovation)
-    depend(hypothesis, innovation, PRESSURE)
+    add_offset_jacobian(hypothesis, innovation, PRESSURE)
 
 
 @compiled

@@ -16,30 +16,41 @@ from uwb_tdoa_bias.effects.samples import N_STATES
 from . import (
     aids,
     auxiliary,
-    curvature,
     ground,
     height,
     history,
     hypotheses,
+    imu_fault_detector,
     inertial,
     initialization,
     noise,
     plane,
-    plausibility,
     ranges,
-    rest,
     robust,
-    systematic,
+    stationarity,
+    update,
     velocity,
     workspace,
-    yaw_doubt,
+    yaw_test,
 )
-from .memory import HYPOTHESES, ODOMETRY, RESIDUAL, YAWS, FilterState, Measurements, Output
+from .memory import (
+    COMPENSATED,
+    HYPOTHESES,
+    N_YAWS,
+    ODOMETRY,
+    REJECTED,
+    REPEATED,
+    RESIDUAL,
+    STARTUP,
+    USED,
+    FilterState,
+    Measurements,
+    Output,
+)
 from .sensor_functions import subtract
 from .startup import INLIER
 from .state import coast, predict, turn_about_vertical
 from .update import project
-from .verdicts import COMPENSATED, REJECTED, REPEATED, STARTUP, USED
 
 CONSISTENCY_TIME = 0.3  # s over which the share of TDOAs that the filter explains is averaged
 INCONSISTENT = 0.5  # share below which the tag is looked for elsewhere
@@ -128,7 +139,7 @@ def most_records(measurements: Measurements) -> int:
     imu, tdoa, aid = measurements
     spans = [part["t"][-1] - part["t"][0] for part in measurements if len(part)]
     most, seconds = len(imu) + len(tdoa) + len(aid), max(spans, default=0.0)
-    periods = rest.PERIOD, plane.PERIOD, 0.5 * plausibility.CLEARED
+    periods = stationarity.PERIOD, plane.PERIOD, 0.5 * imu_fault_detector.CLEARED
     rests, floors, switches = (min(most, 2 + int(seconds / period)) for period in periods)
     of_events = RECORDS_OF_TDOA * len(tdoa) + RECORDS_OF_AID * len(aid)
     return of_events + RECORDS_OF_REST * rests + plane.RECORDS * floors + switches
@@ -137,27 +148,32 @@ def most_records(measurements: Measurements) -> int:
 @compiled
 def _on_imu(ekf: Record, parameters: Record, sample: Record, records: np.ndarray) -> None:
     continuous = inertial.observe(ekf.imu, sample, parameters.imu_timeout)
-    distrusted = plausibility.update(ekf.plausibility, ekf.imu, sample, continuous, ekf.distrusted)
-    if distrusted != ekf.distrusted:
-        ekf.distrusted = distrusted
+    imu_faulty = imu_fault_detector.update(
+        ekf.imu_fault_detector, ekf.imu, sample, continuous, ekf.imu_faulty
+    )
+    if imu_faulty != ekf.imu_faulty:
+        ekf.imu_faulty = imu_faulty
         _switch(ekf, parameters, records)
-    first, averaged = ekf.imu.t == -np.inf, ekf.levelled > -np.inf and sample.t >= ekf.levelled
+    first, averaged = (
+        ekf.imu.t == -np.inf,
+        ekf.attitude_averaged_until > -np.inf and sample.t >= ekf.attitude_averaged_until,
+    )
     if first and ekf.running and parameters.use_imu:
-        ekf.levelled = sample.t + AVERAGED
+        ekf.attitude_averaged_until = sample.t + AVERAGED
     elif averaged or not ekf.running:
-        ekf.levelled = -np.inf
+        ekf.attitude_averaged_until = -np.inf
     if ekf.running and _advance(ekf, parameters, sample.t, records):
-        if averaged and not ekf.distrusted:
+        if averaged and not ekf.imu_faulty:
             initialization.level_first(ekf, parameters, records)
-        if continuous and not ekf.distrusted:
-            rest.feel(ekf, sample, sample.t - ekf.imu.t, records)
+        if continuous and not ekf.imu_faulty:
+            stationarity.detect_liftoff(ekf, sample, sample.t - ekf.imu.t, records)
         ekf.quiet = (
             parameters.zero_velocity
             and continuous
-            and not ekf.distrusted
+            and not ekf.imu_faulty
             and inertial.is_quiet(ekf.imu)
         )
-        rest.update_zero_velocity(ekf, sample.t, records)
+        stationarity.update_zero_velocity(ekf, sample.t, records)
     inertial.store(ekf.imu, sample)
 
 
@@ -166,10 +182,10 @@ def _switch(ekf: Record, parameters: Record, records: np.ndarray) -> None:
     """Go without inertial samples from here on, or with them again: from the attitude that they
     then have.
     """
-    if ekf.running and ekf.distrusted:
+    if ekf.running and ekf.imu_faulty:
         initialization.widen(ekf, records)
     elif ekf.running:
-        initialization.level_anew(ekf, parameters, 2.0 * math.pi, records)
+        initialization.reset_attitude(ekf, parameters, 2.0 * math.pi, records)
 
 
 @compiled
@@ -190,10 +206,10 @@ def _on_tdoa(
     t = tdoa.t
     if not _reach(ekf, anchors, parameters, t, records):
         return
-    before = ekf.unsure_until
+    before = ekf.position_unknown_until
     _before_update(ekf, anchors, parameters, t, records)
     if parameters.recover and initialization.waits(
-        ekf, anchors, parameters, t, ekf.unsure_until > before, records
+        ekf, anchors, parameters, t, ekf.position_unknown_until > before, records
     ):
         ekf.last_tdoa = t
         return
@@ -230,11 +246,11 @@ def _on_range(
         if not hypotheses.alive(hypothesis):
             continue
         ranges.compare(hypothesis, anchor.position, aid, parameters, innovation)
-        innovation.repeated, innovation.curvature = rest.repetition(ekf, t), 0.0
+        innovation.variance_inflation, innovation.curvature = stationarity.repetition(ekf, t), 0.0
         _assimilate(ekf, h, parameters, t, residual, records, False)
         if h == ekf.best:
             ranges.keep_offset(ekf, hypothesis)
-            systematic.observe(ekf.information, anchor, anchor, innovation, t, ekf.last_tdoa)
+            noise.observe(ekf.information, anchor, anchor, innovation, t, ekf.last_tdoa)
     _after_update(ekf, anchors, parameters, t, True, abs(residual.innovation) < INLIER, records)
 
 
@@ -247,15 +263,20 @@ def _before_update(
     """
     if parameters.zero_velocity:
         if t >= ekf.next_look:
-            rest.look(
-                ekf, anchors, parameters, initialization.recent(ekf, rest.LOOK_WINDOW), t, records
+            stationarity.check_stationarity(
+                ekf,
+                anchors,
+                parameters,
+                initialization.recent(ekf, stationarity.LOOK_WINDOW),
+                t,
+                records,
             )
         if not parameters.use_imu or t - ekf.imu.t > parameters.imu_timeout:
-            rest.update_zero_velocity(ekf, t, records)
+            stationarity.update_zero_velocity(ekf, t, records)
     if t >= ekf.next_bounds:
         initialization.look_around(ekf, anchors, parameters, t)
     if t - ekf.last_tdoa > parameters.start_window and initialization.is_unsure(ekf):
-        ekf.unsure_until = t + UNSURE_TIME
+        ekf.position_unknown_until = t + UNSURE_TIME
 
 
 @compiled
@@ -276,23 +297,23 @@ def _after_update(
     alone = hypotheses.select(ekf, t) and parameters.use_imu and not (ekf.quiet or ekf.resting)
     # At another place. Or with another yaw, after one was opened again: the yaws of a start share
     # the history before the choice.
-    opened = ekf.yaw_doubt.count > 0 or not parameters.use_imu
-    if ekf.best // YAWS != followed // YAWS or (ekf.best != followed and opened):
+    opened = ekf.yaw_test.count > 0 or not parameters.use_imu
+    if ekf.best // N_YAWS != followed // N_YAWS or (ekf.best != followed and opened):
         history.add_reset(ekf, t, records)
-    if alone and yaw_doubt.contradicts(ekf, t):
+    if alone and yaw_test.contradicts(ekf, t):
         initialization.open_yaw(ekf, parameters, records)
         alone = False
     if not alone:
-        yaw_doubt.clear(ekf.yaw_doubt)
-    ekf.yaw_doubt.alone = alone
+        yaw_test.clear(ekf.yaw_test)
+    ekf.yaw_test.alone = alone
     if counts:
         ekf.consistency += min(1.0, (t - ekf.last_tdoa) / CONSISTENCY_TIME) * (
             (1.0 if agrees else 0.0) - ekf.consistency
         )
     ekf.last_tdoa = t
     if ekf.consistency > initialization.AGREE:
-        ekf.sure = t
-    unsure = t < ekf.unsure_until
+        ekf.last_agreement = t
+    unsure = t < ekf.position_unknown_until
     if parameters.recover and (unsure or ekf.consistency < INCONSISTENT) and t >= ekf.next_search:
         initialization.recover(ekf, anchors, parameters, t, unsure, records)
 
@@ -362,8 +383,8 @@ def _advance(ekf: Record, parameters: Record, t: float, records: np.ndarray) -> 
     sensed = (
         parameters.use_imu
         and t - ekf.imu.t < parameters.imu_timeout
-        and not ekf.distrusted
-        and t >= ekf.levelled
+        and not ekf.imu_faulty
+        and t >= ekf.attitude_averaged_until
     )
     ekf.sensed = sensed
     if sensed and ekf.t < t:
@@ -381,15 +402,15 @@ def _advance(ekf: Record, parameters: Record, t: float, records: np.ndarray) -> 
                     auxiliary.predict(hypothesis, ekf.transition)
                 if h == ekf.best:
                     history.add_prediction(ekf, records)
-                    if ekf.yaw_doubt.alone:
-                        yaw_doubt.predict(ekf, vx, vy)
+                    if ekf.yaw_test.alone:
+                        yaw_test.predict(ekf, vx, vy)
             else:
                 _coast(ekf, hypothesis, parameters, dt)
                 if auxiliary.present(hypothesis):
                     auxiliary.coast(hypothesis, dt)
                 if h == ekf.best:
                     history.add_coasting(ekf, dt, records)
-                    yaw_doubt.clear(ekf.yaw_doubt)
+                    yaw_test.clear(ekf.yaw_test)
         ekf.t = t if t - ekf.t <= MAX_STEP else ekf.t + dt
     if t >= ekf.next_floor and plane.is_given(parameters):
         plane.hold(ekf, parameters, t, records)
@@ -478,10 +499,10 @@ def _update(
         if not hypotheses.alive(hypothesis):
             continue
         _compare(hypothesis, a, b, tdoa, known, innovation)
-        innovation.repeated = rest.repetition(ekf, tdoa.t)
+        innovation.variance_inflation = stationarity.repetition(ekf, tdoa.t)
         _assimilate(ekf, h, parameters, tdoa.t, residual, records, True)
         if h == ekf.best:
-            systematic.observe(ekf.information, a, b, innovation, tdoa.t, ekf.last_tdoa)
+            noise.observe(ekf.information, a, b, innovation, tdoa.t, ekf.last_tdoa)
             height.update_pull(ekf.height, parameters, innovation, tdoa.t)
             if parameters.adapt_noise:
                 noise.learn(a, b, tdoa.t, innovation, parameters)
@@ -532,7 +553,7 @@ def _compare(
             innovation.row[k] += tdoa.slope[k]
             innovation.entries = max(innovation.entries, k + 1)
     project(hypothesis.P, innovation)
-    innovation.curvature = curvature.variance(hypothesis.x, hypothesis.P, a.position, b.position)
+    innovation.curvature = update.variance(hypothesis.x, hypothesis.P, a.position, b.position)
     innovation.prior_variance += innovation.curvature
 
 
@@ -552,7 +573,7 @@ def _assimilate(
     """
     hypothesis, innovation = ekf.hypotheses[h], ekf.innovation
     hypotheses.add_log_likelihood(
-        hypothesis, innovation, parameters.tdoa_correlation_length * innovation.repeated
+        hypothesis, innovation, parameters.tdoa_correlation_length * innovation.variance_inflation
     )
     robust.update(hypothesis, innovation, parameters)
     if h == ekf.best:
@@ -560,9 +581,9 @@ def _assimilate(
         residual.variance = innovation.prior_variance + innovation.noise_variance
         residual.weight = innovation.weight
         residual.verdict = USED if innovation.weight > 0.0 else REJECTED
-        if ekf.yaw_doubt.alone:
-            yaw_doubt.observe(
-                ekf, parameters.tdoa_correlation_length * innovation.repeated, of_tdoa
+        if ekf.yaw_test.alone:
+            yaw_test.observe(
+                ekf, parameters.tdoa_correlation_length * innovation.variance_inflation, of_tdoa
             )
         if residual.verdict == USED:
             history.add_update(ekf, t, records)
@@ -598,14 +619,14 @@ def _report(ekf: Record, parameters: Record, t: float, row: Record) -> None:
     )
     wrong = height.contradiction(ekf.height, parameters, t)
     row.covariance[2, 2] += wrong**2
-    systematic.fill(
+    noise.fill(
         ekf.information,
         best.P,
         parameters.tdoa_correlation_length,
         parameters.fixed_height_std,
-        row.persistent,
+        row.consider_covariance,
     )
-    row.covariance[:3, :3] += row.persistent
+    row.covariance[:3, :3] += row.consider_covariance
     if t < ekf.rival_until:
         _widen(ekf, best.x, row.covariance)
     if parameters.planar:

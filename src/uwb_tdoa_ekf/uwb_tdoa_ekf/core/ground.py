@@ -161,8 +161,8 @@ def in_time(a: Record, b: Record, innovation: Record) -> float:
     neither = (
         (1.0 - late_a) * (1.0 - late_b) * (gauss / math.sqrt(2.0 * math.pi * variance) + FARTHER)
     )
-    of_b = (1.0 - late_a) * late_b * _lateness(r)
-    of_a = (1.0 - late_b) * late_a * _lateness(-r)
+    of_b = (1.0 - late_a) * late_b * _nlos_delay(r)
+    of_a = (1.0 - late_b) * late_a * _nlos_delay(-r)
     both = late_a * late_b * max(FARTHER, (1.0 - abs(r) / LATEST) / LATEST)
     total = neither + of_a + of_b + both
     a.late, b.late = (of_a + both) / total, (of_b + both) / total
@@ -170,7 +170,7 @@ def in_time(a: Record, b: Record, innovation: Record) -> float:
 
 
 @compiled
-def _lateness(r: float) -> float:
+def _nlos_delay(r: float) -> float:
     """Density, 1/m, of an innovation r, m, by one late anchor."""
     return max(2.0 * r / LATEST**2, FARTHER) if r < LATEST else FARTHER
 

@@ -19,10 +19,9 @@ from uwb_tdoa_bias.common.robust_loss import GEMAN_MCCLURE, weight
 
 from .history import add_reset, add_update
 from .hypotheses import LARGEST_NIS, alive
-from .memory import YAWS
+from .memory import N_YAWS, REJECTED, USED
 from .state import rotation
 from .update import kalman, project
-from .verdicts import REJECTED, USED
 
 STEEPEST = 0.5  # cos(tilt) below which the beam meets the ground anywhere
 # s over which the error of a range stays alike: the ground is uneven, the sensor has an offset
@@ -152,7 +151,7 @@ def _weigh_places(ekf: Record, parameters: Record, distance: float, share: float
     """
     several = False
     for h in range(len(ekf.hypotheses)):
-        several = several or (h // YAWS != ekf.best // YAWS and alive(ekf.hypotheses[h]))
+        several = several or (h // N_YAWS != ekf.best // N_YAWS and alive(ekf.hypotheses[h]))
     for h in range(len(ekf.hypotheses) if several else 0):
         hypothesis, innovation = ekf.hypotheses[h], ekf.innovation
         if alive(hypothesis):

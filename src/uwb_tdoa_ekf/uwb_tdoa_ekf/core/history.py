@@ -6,7 +6,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.compiled import Record, compiled
 
-from . import yaw_doubt
+from . import yaw_test
 from .state import ERROR_STATES, MOVING_STATES, NOMINAL_STATES, propagate
 
 UPDATE, RESET = (
@@ -77,7 +77,7 @@ def add_reset(ekf: Record, t: float, history: np.ndarray) -> None:
     """After the state of the best hypothesis was replaced: nothing carries over, and no evidence
     against its yaw.
     """
-    yaw_doubt.clear(ekf.yaw_doubt)
+    yaw_test.clear(ekf.yaw_test)
     if len(history) > 0:
         record = _next(ekf, t, RESET, history)
         record.innovation, record.variance = 0.0, 1.0

@@ -15,7 +15,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.compiled import Record, compiled
 
-from .memory import HYPOTHESES, YAWS
+from .memory import HYPOTHESES, N_YAWS
 from .state import difference
 
 YAW_STD = 0.6  # rad, of each hypothesis: they start 90 degrees apart
@@ -28,7 +28,7 @@ LARGEST_NIS = 9.0  # normalised innovation squared that one measurement counts a
 @compiled
 def yaw_offset(h: int) -> float:
     """Angle of hypothesis h to initial_yaw, rad."""
-    return h % YAWS * 2.0 * math.pi / YAWS
+    return h % N_YAWS * 2.0 * math.pi / N_YAWS
 
 
 @compiled

@@ -14,14 +14,14 @@ from . import (
     height,
     hypotheses,
     inertial,
-    standing,
-    systematic,
+    noise,
+    stationary_position,
     velocity,
     workspace,
 )
 from .ground import KnownHeight
 from .history import add_reset
-from .memory import HYPOTHESES, PLACES, WINDOW, YAWS
+from .memory import HYPOTHESES, N_PLACES, N_YAWS, WINDOW
 from .startup import APART, SPEED, Places, inliers, level, locate, room_for, share_of_inliers, split
 from .state import GRAVITY
 
@@ -116,9 +116,9 @@ def _look_for_places(
     """
     _find_surroundings(ekf, window, anchors, parameters)
     share = locate(window, anchors, ekf.workspace, parameters, known, places)
-    workspace.surround(ekf, standing.NEAR, near)
+    workspace.surround(ekf, stationary_position.NEAR, near)
     near[0, 2] = min(near[0, 2], parameters.ground_height)
-    standing.sort(places, near)
+    stationary_position.sort(places, near)
     return share
 
 
@@ -138,15 +138,15 @@ def start(
     if len(window) < MINIMUM:
         return
     ekf.next_search = t + SEARCH_PERIOD
-    places, near, known = room_for(PLACES), np.empty((2, 3)), _height_at_start(ekf, parameters, t)
+    places, near, known = room_for(N_PLACES), np.empty((2, 3)), _height_at_start(ekf, parameters, t)
     share = _look_for_places(ekf, anchors, parameters, window, known, places, near)
     x, covariance, cost = places.x, places.covariance, places.cost
     pairs = ekf.pairs[: ground.find_pairs(window, ekf.pairs)]
     at_rest, its = x[0].copy(), covariance[0].copy()
     wide = np.trace(its[:3, :3]) > APART**2  # before it holds other explanations
-    lead = standing.weigh(ekf, pairs, anchors, parameters, known, at_rest, its)
+    lead = stationary_position.weigh(ekf, pairs, anchors, parameters, known, at_rest, its)
     still = ground.judge_motion(pairs, anchors, at_rest, ekf.still_covariance) == ground.STILL
-    on_ground = lead > (0.0 if still else standing.DECISIVE)
+    on_ground = lead > (0.0 if still else stationary_position.DECISIVE)
     good = still if on_ground else share >= AGREE and workspace.contains(ekf.workspace, x[0])
     if not (good or anyhow):
         return
@@ -156,9 +156,9 @@ def start(
         cost[1] = np.inf
     elif wide:
         split(places)
-        standing.sort(places, near)
-    for place in range(PLACES if still else 0):
-        standing.stop(x[place], covariance[place], ekf.still_covariance)
+        stationary_position.sort(places, near)
+    for place in range(N_PLACES if still else 0):
+        stationary_position.stop(x[place], covariance[place], ekf.still_covariance)
     _begin(
         ekf,
         parameters,
@@ -190,13 +190,13 @@ def start_slowly(
         or gap > LONGEST_GAP * span
     ):
         return
-    places, near, known = room_for(PLACES), np.empty((2, 3)), _height_at_start(ekf, parameters, t)
+    places, near, known = room_for(N_PLACES), np.empty((2, 3)), _height_at_start(ekf, parameters, t)
     share = _look_for_places(ekf, anchors, parameters, window, known, places, near)
     if not (enough or (share >= AGREE and workspace.contains(ekf.workspace, places.x[0]))):
         return
     if np.trace(places.covariance[0, :3, :3]) > APART**2:
         split(places)
-        standing.sort(places, near)
+        stationary_position.sort(places, near)
     _begin(
         ekf,
         parameters,
@@ -234,11 +234,11 @@ def waits(
     """
     first = ekf.kept - 1 - MINIMUM
     if silent and first >= 0 and ekf.window[first].t > ekf.last_tdoa - RECOVERY_WINDOW:
-        ekf.waits_until = t + RECOVERY_WINDOW
-    if t >= ekf.waits_until:
+        ekf.search_waits_until = t + RECOVERY_WINDOW
+    if t >= ekf.search_waits_until:
         return False
     if len(recent(ekf, min(parameters.start_window, RECOVERY_WINDOW))) >= MINIMUM:
-        ekf.waits_until = -np.inf
+        ekf.search_waits_until = -np.inf
         recover(ekf, anchors, parameters, t, True, history)
     return True
 
@@ -272,7 +272,7 @@ def relocate(
         hypothesis = ekf.hypotheses[h]
         hypothesis.P[:6, :] = 0.0
         hypothesis.P[:, :6] = 0.0
-        _put(hypothesis, x[0], covariance[0])
+        _set_state(hypothesis, x[0], covariance[0])
     add_reset(ekf, t, history)
 
 
@@ -363,7 +363,7 @@ def place(
             hypothesis = ekf.hypotheses[h]
             hypothesis.P[:6, 6:] = 0.0
             hypothesis.P[6:, :6] = 0.0
-            _put(hypothesis, x, covariance)
+            _set_state(hypothesis, x, covariance)
             if has_yaw:
                 _turn(hypothesis, pose.yaw, pose.yaw_std)
                 if h != ekf.best:
@@ -391,7 +391,7 @@ def _begin(
     for h in range(HYPOTHESES):
         hypothesis, offset = ekf.hypotheses[h], hypotheses.yaw_offset(h)
         nearest = min(offset, 2.0 * math.pi - offset)
-        place = h // YAWS
+        place = h // N_YAWS
         hypothesis.log_weight = -np.inf
         if place < len(x) and (unknown or offset == 0.0):
             hypothesis.log_weight = -0.5 * (nearest / yaw_std) ** 2 - cost[place]
@@ -400,13 +400,13 @@ def _begin(
         level(accel, yaw + offset, hypothesis.x)
         hypothesis.x[10:] = 0.0
         hypothesis.P[:] = 0.0
-        _put(hypothesis, x[place], covariance[place])
+        _set_state(hypothesis, x[place], covariance[place])
         _spread_attitude(
             hypothesis.P, parameters, min(yaw_std, hypotheses.YAW_STD if steered else ANY_YAW)
         )
     ekf.best = 0
-    systematic.begin(ekf.information, ekf.hypotheses[0].P)
-    ekf.t = ekf.last_tdoa = ekf.sure = t
+    noise.begin(ekf.information, ekf.hypotheses[0].P)
+    ekf.t = ekf.last_tdoa = ekf.last_agreement = t
     ekf.consistency = 1.0
     ekf.running = True
 
@@ -444,7 +444,7 @@ def recover(
     if len(window) < MINIMUM:
         return
     ekf.next_search = t + SEARCH_PERIOD
-    count = PLACES if anywhere else 1
+    count = N_PLACES if anywhere else 1
     places = room_for(count)
     q = ekf.hypotheses[ekf.best].x[6:10]
     known = _known_height(ekf, parameters, 1.0 - 2.0 * (q[0] ** 2 + q[1] ** 2), t)
@@ -462,22 +462,22 @@ def recover(
     elif share < CLEARLY_MORE + explained:
         return
     wheels = velocity.agrees(ekf.velocity, t)
-    felt = parameters.use_imu and not ekf.distrusted and t - ekf.imu.t < parameters.imu_timeout
+    felt = parameters.use_imu and not ekf.imu_faulty and t - ekf.imu.t < parameters.imu_timeout
     if not anywhere and wheels and _outweighs(ekf, anchors, window, x[0], t):
         return
     if not anywhere and (felt or wheels):
-        since, away = t - ekf.sure, 0.0
+        since, away = t - ekf.last_agreement, 0.0
         for k in range(3):
             away += (x[0, k] - ekf.hypotheses[ekf.best].x[k]) ** 2
         if math.sqrt(away) > REACH + REACH_SPEED * since + REACH_ACCELERATION * since**2:
             return
     for h in range(HYPOTHESES):
-        hypothesis, place = ekf.hypotheses[h], min(h // YAWS, count - 1)
+        hypothesis, place = ekf.hypotheses[h], min(h // N_YAWS, count - 1)
         if cost[place] == np.inf:
             place = 0
         hypothesis.P[:6, :] = 0.0
         hypothesis.P[:, :6] = 0.0
-        _put(hypothesis, x[place], covariance[place])
+        _set_state(hypothesis, x[place], covariance[place])
         if (
             not parameters.use_imu
         ):  # wheels have led to another place: by a wrong yaw, as likely as not
@@ -486,7 +486,7 @@ def recover(
             hypothesis.P[8, 8] = ANY_YAW**2
     ekf.rival_since = -np.inf
     if anywhere:  # what the anchors determined before the silence was another place
-        systematic.begin(ekf.information, ekf.hypotheses[ekf.best].P)
+        noise.begin(ekf.information, ekf.hypotheses[ekf.best].P)
     ekf.consistency, ekf.late_as_known = 1.0, False
     ekf.rest_since = t
     ekf.recoveries += 1
@@ -536,10 +536,10 @@ def _reopen(ekf: Record, cost: np.ndarray) -> None:
     """Follow the yaws of the best hypothesis at each place again, whose probabilities are
     exp(-cost) (PLACES,).
     """
-    of_best = ekf.best // YAWS
-    for yaw in range(YAWS):
-        one = ekf.hypotheses[of_best * YAWS + yaw]
-        other = ekf.hypotheses[(1 - of_best) * YAWS + yaw]
+    of_best = ekf.best // N_YAWS
+    for yaw in range(N_YAWS):
+        one = ekf.hypotheses[of_best * N_YAWS + yaw]
+        other = ekf.hypotheses[(1 - of_best) * N_YAWS + yaw]
         other.x[:], other.P[:], other.log_weight = one.x, one.P, one.log_weight - cost[1 - of_best]
         one.log_weight -= cost[of_best]
 
@@ -555,7 +555,7 @@ def widen(ekf: Record, history: np.ndarray) -> None:
 
 
 @compiled
-def level_anew(ekf: Record, parameters: Record, yaw_std: float, history: np.ndarray) -> None:
+def reset_attitude(ekf: Record, parameters: Record, yaw_std: float, history: np.ndarray) -> None:
     """Stay at position and velocity; attitude as at a start: level, the yaw as it is, to so many
     rad; biases as at a start too.
     """
@@ -572,9 +572,9 @@ def open_yaw(ekf: Record, parameters: Record, history: np.ndarray) -> None:
     """The yaw was wrong, and with it what was integrated lately: follow four yaws again, from a
     place that is less certain.
     """
-    ekf.yaw_doubt.count += 1
+    ekf.yaw_test.count += 1
     widen(ekf, history)
-    level_anew(ekf, parameters, 2.0 * math.pi, history)
+    reset_attitude(ekf, parameters, 2.0 * math.pi, history)
 
 
 @compiled
@@ -587,18 +587,18 @@ def open_unknown_yaw(ekf: Record, parameters: Record, history: np.ndarray) -> No
     for h in range(HYPOTHESES):
         alive += hypotheses.alive(ekf.hypotheses[h])
     if alive == 1 and ekf.hypotheses[ekf.best].P[8, 8] > hypotheses.YAW_STD**2:
-        level_anew(ekf, parameters, 2.0 * math.pi, history)
+        reset_attitude(ekf, parameters, 2.0 * math.pi, history)
 
 
 @compiled
 def level_first(ekf: Record, parameters: Record, history: np.ndarray) -> None:
-    """`level_anew` when inertial samples have come for the first time: the yaw is known as well as
+    """`reset_attitude` when inertial samples have come for the first time: the yaw is known as well as
     it was before.
     """
     alive = 0
     for h in range(HYPOTHESES):
         alive += hypotheses.alive(ekf.hypotheses[h])
-    level_anew(
+    reset_attitude(
         ekf,
         parameters,
         2.0 * math.pi if alive > 1 else math.sqrt(ekf.hypotheses[ekf.best].P[8, 8]),
@@ -638,7 +638,7 @@ def _mean_accel(imu: Record, parameters: Record) -> np.ndarray:
 
 
 @compiled
-def _put(hypothesis: Record, x: np.ndarray, covariance: np.ndarray) -> None:
+def _set_state(hypothesis: Record, x: np.ndarray, covariance: np.ndarray) -> None:
     """Position and velocity x (6,) and their covariance (6, 6)."""
     hypothesis.x[:6] = x
     auxiliary.forget(hypothesis)

@@ -26,11 +26,15 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.effects.base import SensorFunction
 
-YAWS, PLACES = (
+
+USED, REJECTED, LATE, INVALID, STARTUP, COMPENSATED, REPEATED = range(7)
+
+
+N_YAWS, N_PLACES = (
     4,
     2,
 )  # directions and places that a start follows at once while it is not known which is right
-HYPOTHESES = YAWS * PLACES
+HYPOTHESES = N_YAWS * N_PLACES
 Floor = tuple[np.ndarray, np.ndarray, np.ndarray]  # as of EffectSet.on_floor
 WINDOW = 512  # TDOAs kept for a start
 
@@ -89,7 +93,7 @@ IMU_STATE = _record(
 )
 
 # Whether an inertial sensor can be right, see plausibility.py.
-PLAUSIBILITY = _record(
+IMU_FAULT_DETECTOR = _record(
     ("up", float, 3),  # m/s^2, specific force as the gyroscope has turned it
     ("spun", float),  # rad, turned lately beyond what a tag may
     ("weighed", float),  # s, stamps: of the last sample in which it bore the tag,
@@ -163,7 +167,7 @@ VELOCITY = _record(
     ("speed_variance", float),  # and m^2/s^2, that of its velocity
 )
 
-YAW_DOUBT = _record(
+YAW_TEST = _record(
     (
         "response",
         float,
@@ -206,11 +210,11 @@ EKF = _record(
     ),
     ("rival_since", float),  # s, stamps: since when they do,
     ("rival_until", float),  # and until when the tag may be there
-    ("plausibility", PLAUSIBILITY),  # of the inertial samples,
-    ("distrusted", bool),  # which are not used, because they cannot be right
-    ("yaw_doubt", YAW_DOUBT),  # see yaw_doubt.py
+    ("imu_fault_detector", IMU_FAULT_DETECTOR),  # of the inertial samples,
+    ("imu_faulty", bool),  # which are not used, because they cannot be right
+    ("yaw_test", YAW_TEST),  # see yaw_doubt.py
     (
-        "levelled",
+        "attitude_averaged_until",
         float,
         # s, stamp until which they are averaged, where the filter ran before there were any; -inf: they
         # are used
@@ -236,7 +240,7 @@ EKF = _record(
     ),  # m^2/s^4, power of the vibration of a tag that is not at rest, over some seconds
     ("lift", float, 3),  # m/s, that the inertial sensor has felt lately at rest, in the world
     (
-        "sure",
+        "last_agreement",
         float,
     ),  # s, stamp at which the inertial sensor was sound and TDOAs agreed with the filter last
     ("extent", float, (2, 3)),  # m, lower and upper bounds: of all anchors,
@@ -259,10 +263,10 @@ EKF = _record(
         # 1/m^2, of the place, that one arrival from each anchor heard lately gives, see systematic.py
     ),
     (
-        "unsure_until",
+        "position_unknown_until",
         float,
     ),  # s, stamp until which the tag may be anywhere, as its place was hardly known before
-    ("waits_until", float),  # s, stamp until which its TDOAs wait for a search
+    ("search_waits_until", float),  # s, stamp until which its TDOAs wait for a search
     ("consistency", float),  # share of the latest TDOAs that agree with the best hypothesis
     ("recoveries", int),
     (
@@ -296,7 +300,11 @@ ODOMETRY = _record(
     ("t", float),
     ("x", float, NOMINAL_STATES),
     ("covariance", float, (9, 9)),  # of [p, v, attitude]
-    ("persistent", float, (3, 3)),  # what of it errors that persist make, see systematic.py
+    (
+        "consider_covariance",
+        float,
+        (3, 3),
+    ),  # what of it errors that persist make, see systematic.py
 )
 RESIDUAL = _record(
     ("innovation", float), ("variance", float), ("weight", float), ("verdict", np.uint8)
@@ -373,14 +381,14 @@ def new_state(
         "next_merge",
         "next_look",
         "next_bounds",
-        "sure",
-        "unsure_until",
-        "waits_until",
+        "last_agreement",
+        "position_unknown_until",
+        "search_waits_until",
         "rival_since",
         "rival_until",
     ):
         ekf[stamp] = -np.inf
-    ekf.imu.t = ekf.plausibility.contradicted = -np.inf
+    ekf.imu.t = ekf.imu_fault_detector.contradicted = -np.inf
     for stamp in ("heard", "changed", "used", "compared", "pulls_since", "ignored_until"):
         ekf.height[stamp] = -np.inf
     for stamp in ("heard", "changed", "agreed"):
@@ -393,7 +401,7 @@ def new_state(
     ekf.hypotheses["P"][:] = np.eye(ERROR_STATES)
     ekf.since_record[:] = np.eye(ERROR_STATES)
     ekf.consistency, ekf.range_offset[1] = 1.0, np.inf
-    ekf.levelled = ekf.yaw_doubt.t = ekf.yaw_doubt.next_look = -np.inf
+    ekf.attitude_averaged_until = ekf.yaw_test.t = ekf.yaw_test.next_look = -np.inf
     return state
 
 

@@ -108,8 +108,8 @@ def flatten(row: Record, parameters: Record, wrong: float) -> None:
         math.sin(0.5 * yaw),
         math.cos(0.5 * yaw),
     )
-    row.persistent[2, :] = 0.0
-    row.persistent[:, 2] = 0.0
+    row.consider_covariance[2, :] = 0.0
+    row.consider_covariance[:, 2] = 0.0
     for state in (2, 5, 6, 7):
         P[state, :] = 0.0
         P[:, state] = 0.0

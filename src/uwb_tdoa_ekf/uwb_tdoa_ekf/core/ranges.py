@@ -12,7 +12,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.compiled import Record, compiled
 
-from .auxiliary import RANGE, depend
+from .auxiliary import RANGE, add_offset_jacobian
 from .update import project
 
 APART = 0.2  # s; two ranges that are further apart are no TDOA
@@ -61,7 +61,7 @@ def compare(
         if P[RANGE, RANGE] == 0.0:
             hypothesis.offset[RANGE], P[RANGE, RANGE] = 0.0, parameters.range_offset_std**2
         innovation.value -= hypothesis.offset[RANGE]
-        depend(hypothesis, innovation, RANGE)
+        add_offset_jacobian(hypothesis, innovation, RANGE)
 
 
 @compiled

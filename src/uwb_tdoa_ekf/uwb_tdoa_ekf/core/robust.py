@@ -57,7 +57,7 @@ def update_innovation(hypothesis: Record, innovation: Record, parameters: Record
         return
     innovation.weight, innovation.total_variance = (
         w,
-        prior + noise * parameters.tdoa_correlation_length * innovation.repeated / w,
+        prior + noise * parameters.tdoa_correlation_length * innovation.variance_inflation / w,
     )
     kalman(hypothesis, innovation)
 
@@ -71,7 +71,7 @@ def update_gate(hypothesis: Record, innovation: Record, parameters: Record) -> N
         return
     innovation.weight, innovation.total_variance = (
         1.0,
-        prior + noise * parameters.tdoa_correlation_length * innovation.repeated,
+        prior + noise * parameters.tdoa_correlation_length * innovation.variance_inflation,
     )
     kalman(hypothesis, innovation)
 
@@ -93,7 +93,11 @@ def update_m_estimation(hypothesis: Record, innovation: Record, parameters: Reco
     columns = _columns(innovation)
     _factorize(hypothesis, innovation.factor, rows, columns)
     _scale(innovation, columns)
-    noise = innovation.noise_variance * parameters.tdoa_correlation_length * innovation.repeated
+    noise = (
+        innovation.noise_variance
+        * parameters.tdoa_correlation_length
+        * innovation.variance_inflation
+    )
     loss = parameters.loss
     e[:] = 0.0  # scaled error of the state, eq. 9
     for _ in range(parameters.iterations):
@@ -123,7 +127,7 @@ def _columns(innovation: Record) -> int:
         if innovation.row[n] != 0.0:
             columns = max(columns, innovation.states[n] + 1)
     for m in range(OFFSET_STATES):
-        if innovation.on_offset[m] != 0.0:
+        if innovation.offset_jacobian[m] != 0.0:
             columns = ERROR_STATES + m + 1
     return columns
 
@@ -164,7 +168,7 @@ def _scale(innovation: Record, columns: int) -> None:
         for n in range(innovation.entries):
             y[k] += factor[k, innovation.states[n]] * innovation.row[n]
         for m in range(max(0, columns - ERROR_STATES)):
-            y[k] += factor[k, ERROR_STATES + m] * innovation.on_offset[m]
+            y[k] += factor[k, ERROR_STATES + m] * innovation.offset_jacobian[m]
 
 
 @compiled

@@ -7,6 +7,8 @@ differs from what the state predicts, and the variance of its noise. The rest is
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from uwb_tdoa_bias.common.compiled import Record, compiled
@@ -39,13 +41,13 @@ INNOVATION = np.dtype(
             ERROR_STATES,
         ),  # P h', of state and prediction; the gain is this over total_variance
         (
-            "on_offset",
+            "offset_jacobian",
             float,
             auxiliary.OFFSET_STATES,
         ),  # entries of the Jacobian row for the auxiliary states: 0, but of their own sensors
         ("offset_covariance", float, auxiliary.OFFSET_STATES),  # scratch of auxiliary.correct
         (
-            "repeated",
+            "variance_inflation",
             float,
             # how often the same error is met, in tdoa_correlation_length: 1, but for a tag that does
             # not move
@@ -80,8 +82,8 @@ def project(P: np.ndarray, innovation: Record) -> None:
     variance = 0.0
     for n in range(innovation.entries):
         variance += innovation.row[n] * covariance[innovation.states[n]]
-    innovation.prior_variance, innovation.repeated = variance, 1.0
-    innovation.on_offset[:] = 0.0
+    innovation.prior_variance, innovation.variance_inflation = variance, 1.0
+    innovation.offset_jacobian[:] = 0.0
 
 
 @compiled
@@ -112,3 +114,34 @@ def update_state(
     project(hypothesis.P, innovation)
     innovation.total_variance = innovation.prior_variance + innovation.noise_variance
     kalman(hypothesis, innovation)
+
+
+SMALLEST = 0.5  # m, 3D standard deviation below which it is negligible
+NEAREST = 0.1  # m, of an anchor, for its curvature
+
+
+@compiled
+def variance(x: np.ndarray, P: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
+    """Mean square, m^2, of the second-order term of a TDOA between anchors at a and b (3,), of a
+    tag at x (3,), m, with covariance P (15, 15).
+    """
+    if P[0, 0] + P[1, 1] + P[2, 2] < SMALLEST**2:
+        return 0.0
+    product = np.zeros((3, 3))
+    for anchor, sign in ((a, -1.0), (b, 1.0)):
+        away = np.array([x[k] - anchor[k] for k in range(3)])
+        distance = max(math.sqrt(np.sum(away**2)), NEAREST)
+        for i in range(3):
+            along = 0.0
+            for k in range(3):
+                along += away[k] * P[k, i] / distance**2
+            for j in range(3):
+                product[j, i] += (
+                    sign * (P[j, i] - away[j] * along) / distance
+                )  # of Hessian and covariance
+    mean = squared = 0.0
+    for i in range(3):
+        mean += 0.5 * product[i, i]
+        for j in range(3):
+            squared += 0.5 * product[i, j] * product[j, i]
+    return mean**2 + squared

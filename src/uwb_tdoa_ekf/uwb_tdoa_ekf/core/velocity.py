@@ -18,9 +18,9 @@ from uwb_tdoa_bias.common.robust_loss import GEMAN_MCCLURE, weight
 
 from .history import add_update
 from .hypotheses import add_log_likelihood, alive
+from .memory import REJECTED, USED
 from .state import rotation
 from .update import kalman, project
-from .verdicts import REJECTED, USED
 
 GATE = 3.0  # standard deviations beyond which a component is not used
 CORRELATION_TIME = 1.0  # s over which its error stays alike
@@ -94,9 +94,9 @@ def observe(
             total = innovation.prior_variance + innovation.noise_variance
             w = weight(GEMAN_MCCLURE, innovation.value / math.sqrt(total), GATE)
             add_log_likelihood(hypothesis, innovation, inflation)
-            repeated = 1.0 if leads else inflation
+            variance_inflation = 1.0 if leads else inflation
             innovation.total_variance = (
-                innovation.prior_variance + innovation.noise_variance * repeated / w
+                innovation.prior_variance + innovation.noise_variance * variance_inflation / w
             )
             kalman(hypothesis, innovation)
             if h == ekf.best:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from uwb_tdoa_bias.common.sensors import SENSORS
 
-from ..core.plausibility import RATE, TILT, TURN, WEIGHT
+from ..core.imu_fault_detector import RATE, TILT, TURN, WEIGHT
 from .finding import ERROR, WARNING, Finding
 
 if TYPE_CHECKING:

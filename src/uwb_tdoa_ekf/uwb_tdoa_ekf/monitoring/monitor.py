@@ -18,7 +18,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.geometry import tdoa
 
-from ..core.verdicts import REJECTED
+from ..core.memory import REJECTED
 from .change import ChangeDetector
 from .finding import ERROR, WARNING, Finding
 from .reference import Displaced, SurveyComparison

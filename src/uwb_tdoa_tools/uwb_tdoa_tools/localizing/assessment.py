@@ -183,7 +183,7 @@ def _deviation(odometry: Odometry) -> dict[str, float]:
     rows = known if known.any() else np.ones(len(known), bool)
     variance = np.einsum("nii->ni", odometry.covariance[rows, :3, :3]).mean(axis=0)
     lasting = float(
-        np.einsum("nii->n", odometry.persistent[rows]).mean() / max(variance.sum(), 1e-12)
+        np.einsum("nii->n", odometry.consider_covariance[rows]).mean() / max(variance.sum(), 1e-12)
     )
     yaw = rotation_std(odometry.q[-1:], odometry.covariance[-1:])[0, 2]
     out = {f"std_{axis}": float(math.sqrt(value)) for axis, value in zip("xyz", variance)}

@@ -11,7 +11,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.anchors import Anchors
 from uwb_tdoa_bias.common.files import write_filled, write_text
-from uwb_tdoa_ekf.core.verdicts import USED
+from uwb_tdoa_ekf.core.memory import USED
 from uwb_tdoa_ekf.results import VERDICTS
 
 from ..scoring.metrics import has_innovation

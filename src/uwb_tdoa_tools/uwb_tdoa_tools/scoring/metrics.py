@@ -10,7 +10,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.sensors import LOCATING
 from uwb_tdoa_bias.effects.samples import PoseColumns
-from uwb_tdoa_ekf.core.verdicts import COMPENSATED, REJECTED, USED
+from uwb_tdoa_ekf.core.memory import COMPENSATED, REJECTED, USED
 from uwb_tdoa_ekf.results import Residuals, concatenated, rows_of
 
 from .phases import in_the_air, motion, phases

@@ -466,7 +466,7 @@ def _known(
         rows = np.minimum(np.searchsorted(odometry.t, t), len(odometry.t) - 1)
         here = moved[first : first + len(t)]
         covariance = (
-            odometry.covariance[rows, :3, :3] - odometry.persistent[rows]
+            odometry.covariance[rows, :3, :3] - odometry.consider_covariance[rows]
         )  # errors of anchors, which persist, are unknowns
         out.append(_Mark(*one.equations(t, estimate, covariance, here), *one.off(estimate, here)))
         first += len(t)

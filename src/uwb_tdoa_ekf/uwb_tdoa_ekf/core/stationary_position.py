@@ -235,7 +235,9 @@ def find_landed(
 
 
 @compiled
-def hover(ekf: Record, place: np.ndarray, still: bool, t: float, records: np.ndarray) -> None:
+def set_hovering_position(
+    ekf: Record, place: np.ndarray, still: bool, t: float, records: np.ndarray
+) -> None:
     """A tag near the ground that does not stand may hover low: its place (3,) m counts to
     HOVER_STD, of a tag that is not still the height alone.
     """
@@ -257,7 +259,7 @@ def hover(ekf: Record, place: np.ndarray, still: bool, t: float, records: np.nda
 
 
 @compiled
-def put(
+def set_position(
     ekf: Record, position: np.ndarray, covariance: np.ndarray, t: float, records: np.ndarray
 ) -> None:
     """Every hypothesis to a position (3,), m, with its covariance (3, 3), at rest; attitude and

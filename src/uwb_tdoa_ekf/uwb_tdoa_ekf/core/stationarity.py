@@ -11,7 +11,7 @@ import numpy as np
 
 from uwb_tdoa_bias.common.compiled import Record, compiled
 
-from . import ground, hypotheses, standing
+from . import ground, hypotheses, stationary_position
 from .history import add_update, replace_velocity
 from .memory import HYPOTHESES
 from .state import GRAVITY, rotation
@@ -62,7 +62,7 @@ def repetition(ekf: Record, t: float) -> float:
 
 
 @compiled
-def feel(ekf: Record, sample: Record, dt: float, records: np.ndarray) -> None:
+def detect_liftoff(ekf: Record, sample: Record, dt: float, records: np.ndarray) -> None:
     """Take an IMU_SAMPLE of a tag that is at rest, dt s after the one before: if it is lifted, it
     moves as fast as that has made it.
     """
@@ -91,7 +91,7 @@ def feel(ekf: Record, sample: Record, dt: float, records: np.ndarray) -> None:
 
 
 @compiled
-def look(
+def check_stationarity(
     ekf: Record,
     anchors: np.ndarray,
     parameters: Record,
@@ -105,7 +105,7 @@ def look(
     ekf.next_look = t + LOOK_PERIOD
     best = ekf.hypotheses[ekf.best]
     calm = ekf.quiet or np.sum(ekf.imu.vibration) < CALM * ekf.shaking
-    if not (ekf.resting or calm or standing.is_near_ground(best, parameters)):
+    if not (ekf.resting or calm or stationary_position.is_near_ground(best, parameters)):
         return
     count = ground.find_pairs(window, ekf.pairs)
     motion = ground.judge_motion(ekf.pairs[:count], anchors, best.x, ekf.still_covariance)
@@ -124,15 +124,15 @@ def look(
             ekf.stills = ekf.stills + 1 if still and ekf.quiet else 0
         stands = calm and (still or ekf.quiet)
         place, covariance = np.empty(3), np.empty((3, 3))
-        lateness = standing.find_landed(
+        lateness = stationary_position.find_landed(
             ekf, ekf.pairs[:count], anchors, parameters, still, place, covariance
         )
         landed = lateness >= 0
         if landed and stands:
             ekf.late_as_known = lateness == ground.KNOWN
-            standing.put(ekf, place, covariance, t, records)
+            stationary_position.set_position(ekf, place, covariance, t, records)
         elif landed:
-            standing.hover(ekf, place, still, t, records)
+            stationary_position.set_hovering_position(ekf, place, still, t, records)
         long = ekf.stills >= (LONG if t - ekf.rest_since > EARLY else LONG_ENOUGH)
         ekf.resting = stands and landed
         if not landed and long and not _moves(best, QUIET_STD):

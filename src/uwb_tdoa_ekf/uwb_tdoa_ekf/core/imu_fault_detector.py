@@ -34,7 +34,7 @@ WEIGHT, TURN, RATE, TILT = range(1, 5)  # what is impossible
 
 
 @compiled
-def update(check: Record, imu: Record, sample: Record, continuous: bool, distrusted: bool) -> bool:
+def update(check: Record, imu: Record, sample: Record, continuous: bool, imu_faulty: bool) -> bool:
     """Whether to go without inertial samples from this IMU_SAMPLE on. check : PLAUSIBILITY, which
     is updated; imu : IMU_STATE after `observe` of the sample and before `store`; continuous : what
     that returned; distrusted : what this returned before.
@@ -72,7 +72,7 @@ def update(check: Record, imu: Record, sample: Record, continuous: bool, distrus
         _contradict(check, force, t, TURN, upwards)
     elif check.spun == TOO_FAR:
         _contradict(check, force, t, RATE, rate)
-    elif lies and (distrusted or t - check.upright > LYING):
+    elif lies and (imu_faulty or t - check.upright > LYING):
         _contradict(check, force, t, TILT, force[2])
     return t - check.contradicted < CLEARED
 

@@ -59,7 +59,7 @@ def predict(ekf: Record, vx: float, vy: float) -> None:
     )
     along, across = x[3] - vx, x[4] - vy
     for c in range(2):
-        response = ekf.yaw_doubt.response[c]
+        response = ekf.yaw_test.response[c]
         t0, t1, t2 = response[6], response[7], response[8]
         b0, b1, b2 = response[9], response[10], response[11]
         for r in range(3):
@@ -85,7 +85,7 @@ def observe(ekf: Record, correlation_length: float, shows: bool) -> None:
     """Take the INNOVATION of the best hypothesis, after its update. correlation_length as in
     robust.py; shows : it is evidence; else the responses follow its update, and nothing more.
     """
-    doubt, innovation = ekf.yaw_doubt, ekf.innovation
+    doubt, innovation = ekf.yaw_test, ekf.innovation
     to_cosine, to_sine = doubt.response[0], doubt.response[1]
     cosine = sine = 0.0
     for n in range(innovation.entries):
@@ -150,7 +150,7 @@ def contradicts(ekf: Record, t: float) -> bool:
 
     Looks once in PERIOD.
     """
-    doubt = ekf.yaw_doubt
+    doubt = ekf.yaw_test
     if t < doubt.next_look:
         return False
     variance = _yaw_variance(ekf.hypotheses[ekf.best])
