@@ -13,16 +13,14 @@ import pytest
 signal.signal(signal.SIGINT, signal.default_int_handler)
 # Before anything imports rclpy: this session talks to itself only, beside others on the same machine.
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-os.environ.setdefault(
-    "OMP_NUM_THREADS", "1"
-)  # before anything imports numpy, as executables do: threads of BLAS only wait for each other
+# before anything imports numpy, as executables do: threads of BLAS only wait for each other
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 try:
     from domain_coordinator import domain_id
 except ImportError:  # no ROS: the tests of the cores need none
     domain_id = None
-_taken = (
-    deque()
-)  # reservations of domains, oldest first; taken until this process ends, or KEPT others came
+# reservations of domains, oldest first; taken until this process ends, or KEPT others came
+_taken = deque()
 LONGEST = """waiting checking_check lockstep first_hour diagnosis_diagnose launch_files hall first_hour_without_truth each_node study_bench
     stream_faults estimator
     types flying_trial train surveying_known demo nodes both_nodes strangers packaging evaluate diagnosis_self_calibration measured_path
@@ -37,9 +35,8 @@ def _take_domain():
     while len(_taken) > KEPT:
         _taken.popleft().__exit__(None, None, None)
     while True:
-        reservation = domain_id(
-            lambda: random.randint(1, 100)
-        )  # by chance none of the last seconds
+        # by chance none of the last seconds
+        reservation = domain_id(lambda: random.randint(1, 100))
         try:
             os.environ["ROS_DOMAIN_ID"] = str(reservation.__enter__())
         except RuntimeError:  # other sessions have those that are left

@@ -24,24 +24,16 @@ ROOT = Path(__file__).resolve().parents[1]
 VENV, BUILD, INSTALL, LOG = (ROOT / name for name in (".venv", "build", "install", "log"))
 PYTHON = VENV / "bin" / "python"
 STEPS = VENV / "steps.json"
-LOCK = (
-    ROOT / ".dev" / "requirements.lock"
-)  # requirements.txt and what they need in turn, with hashes
-AS_LOCKED = (
-    "--only-binary",
-    ":all:",
-    "--no-binary",
-    "empy",
-    "--require-hashes",
-    "-r",
-)  # empy has no wheel; of the rest nothing is run
+# requirements.txt and what they need in turn, with hashes
+LOCK = ROOT / ".dev" / "requirements.lock"
+# empy has no wheel; of the rest nothing is run
+AS_LOCKED = ("--only-binary", ":all:", "--no-binary", "empy", "--require-hashes", "-r")
 MESSAGES = ["uwb_tdoa_msgs"]
 PACKAGES = ["uwb_tdoa_bias", "uwb_tdoa_ekf", "uwb_tdoa_tools"]
 VERSION = f"{sys.version_info.major}.{sys.version_info.minor}"
 BASE_PYTHON = os.path.realpath(sys.executable)  # never the one of a virtual environment
-OWN_ROS = (
-    os.environ.get("ROS_DISTRO") == "jazzy"
-)  # the user has sourced one; else ROS comes from wheels
+# the user has sourced one; else ROS comes from wheels
+OWN_ROS = os.environ.get("ROS_DISTRO") == "jazzy"
 # What a ROS installation may lack: the name to import, and the one in requirements.txt.
 MODULES = {
     name: name
@@ -226,9 +218,8 @@ def build(done, compiled):
             )
         )
     if done.get("messages") != sources["messages"]:
-        running.append(
-            colcon(([] if OWN_ROS else ["tf2_msgs"]) + MESSAGES)
-        )  # the wheels lack tf2_msgs
+        # the wheels lack tf2_msgs
+        running.append(colcon(([] if OWN_ROS else ["tf2_msgs"]) + MESSAGES))
     finish(*running)
     write_steps({**done, **sources, **({"compiled": sources["packages"]} if compiled else {})})
 

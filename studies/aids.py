@@ -25,17 +25,14 @@ from uwb_tdoa_tools.scoring.metrics import pooled, position_at, scored_phase
 from uwb_tdoa_tools.scoring.phases import NEAR_THE_FLOOR, TITLES
 
 SETS = (), ("height",), ("pressure",), ("height", "pressure"), ("velocity",), ("height", "velocity")
-VELOCITY_RATE, VELOCITY_STD = (
-    25.0,
-    0.1,
-)  # Hz, m/s: of a velocity made of the ground truth, where none was recorded
+# Hz, m/s: of a velocity made of the ground truth, where none was recorded
+VELOCITY_RATE, VELOCITY_STD = (25.0, 0.1)
 TAKE_OFF = 0.2  # s into the airborne part, whose largest error is told
 GRACE = 3.0  # s after the beginning of a fault that do not count
 ONSET = 8.0  # s into the airborne part at which a fault begins that is not there from the start
 STEPS = 0.3, -0.5, 0.8  # m, of the ground below, one after the other,
-LARGEST_UNUSED = (
-    0.5  # share of the messages of each of two seconds, as the status of ekf_node judges them
-)
+# share of the messages of each of two seconds, as the status of ekf_node judges them
+LARGEST_UNUSED = 0.5
 NAMED = tuple(value for value, name in VERDICTS.items() if name in ("rejected", "invalid"))
 STEP_PERIOD, STEP_LENGTH = 6.0, 3.0  # s between their beginnings, and of each
 

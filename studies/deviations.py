@@ -23,11 +23,8 @@ SETS = {
     "0426": [f"flights/0426/0426-traj{k}" for k in (7, 13, 2)],
     "simulated": [510, 511, 512, 513],
 }
-OFF, FIRST, SECONDS = (
-    (0.05, 0.1, 0.2),
-    700,
-    60.0,
-)  # m, that each coordinate is put off by; seed of the first recording of a set; s
+# m, that each coordinate is put off by; seed of the first recording of a set; s
+OFF, FIRST, SECONDS = ((0.05, 0.1, 0.2), 700, 60.0)
 
 
 def add_options(add):

@@ -260,9 +260,8 @@ def said(flight, estimator):
     "verdict" of localize}.
     """
     flight = replace(flight, truth=None)
-    assessment = assess(
-        flight, estimator(flight), estimator
-    )  # its reasons are the findings of `check`
+    # its reasons are the findings of `check`
+    assessment = assess(flight, estimator(flight), estimator)
     named = _groups(
         [
             sentence.removeprefix("check: ")

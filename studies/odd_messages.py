@@ -86,9 +86,8 @@ SINGLE = {
     "bias_node": {"uwb/anchors": AnchorArray, "/tf_static": TFMessage},
     "debias_node": {},
 }
-UNCOUNTED = {
-    "vehicle_node": {"odometry": Odometry, "status": EstimatorStatus}
-}  # topics, beside requests
+# topics, beside requests
+UNCOUNTED = {"vehicle_node": {"odometry": Odometry, "status": EstimatorStatus}}
 PACKAGES = nodes.PACKAGES | {
     "debias_node": "uwb_tdoa_ekf",
     "anchors_node": "uwb_tdoa_bias",

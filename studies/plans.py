@@ -39,11 +39,8 @@ STARTS = 40  # of the solver, at each place
 ACCURACY = 0.5  # m, of the bound
 CELLS = 3000  # of a map
 HEIGHT = 1.2  # m, of the tag on a map with known height
-SHARE, GAIN, PRECISION = (
-    0.03,
-    0.02,
-    0.01,
-)  # allowed differences: of shares, of a gain, m of the bound
+# allowed differences: of shares, of a gain, m of the bound
+SHARE, GAIN, PRECISION = (0.03, 0.02, 0.01)
 
 
 @dataclass(frozen=True)

@@ -25,9 +25,8 @@ STD = 0.1  # m, of a range and of a TDOA, white
 FRESH = 300  # the first seed of flights among other anchors
 OFFSET = 0.25  # m, by which all ranges are too long
 PATHS = "sines", "circle", "square", "rising_circle", "sines"
-KNOWN = FilterConfig(
-    tdoa_std=STD, range_std=STD, tdoa_correlation_length=1.0, range_offset_std=0.0
-)  # of what is simulated
+# of what is simulated
+KNOWN = FilterConfig(tdoa_std=STD, range_std=STD, tdoa_correlation_length=1.0, range_offset_std=0.0)
 HIGH = 2.9  # m, of a ceiling
 CEILING = [(x, y, HIGH) for x, y in ((-3.5, -4.0), (3.5, -4.0), (3.5, 4.0), (-3.5, 4.0))]
 WALLS = {  # m, positions of few anchors, or of anchors in a plane

@@ -30,17 +30,12 @@ from uwb_tdoa_tools.simulation.rooms import corners, facing
 
 from .any_path import Path, between
 
-RIGHT, FOR = (
-    0.5,
-    2.0,
-)  # m: an estimate that is off by less for so many seconds, or to the end, is right again
+# m: an estimate that is off by less for so many seconds, or to the end, is right again
+RIGHT, FOR = (0.5, 2.0)
 FLYING = ImuErrors(vibration=1.0)
 REST = 0.03  # m, of a tag on its vehicle on the floor
-LATE, LOW, FADES = (
-    3.2,
-    0.5,
-    (0.06, 0.2),
-)  # m later are anchors below LOW for a tag on the floor, all of it below, none above these heights
+# m later are anchors below LOW for a tag on the floor, all of it below, none above these heights
+LATE, LOW, FADES = (3.2, 0.5, (0.06, 0.2))
 SHADOW, BEHIND = 0.4, 0.5  # m later is an anchor behind a person; cosine beyond which it is
 WALL = 3.5  # m, x of the wall of the room
 MARGIN = FilterConfig().workspace_margin
@@ -356,9 +351,8 @@ def _tumbling(rng, common):
 
     def attitude(t):
         inside = np.clip(t, 10.0, 15.0) - 10.0
-        about = inside - np.sin(2.0 * np.pi * inside / 5.0) * 5.0 / (
-            2.0 * np.pi
-        )  # begins and ends without a jerk
+        # begins and ends without a jerk
+        about = inside - np.sin(2.0 * np.pi * inside / 5.0) * 5.0 / (2.0 * np.pi)
         return Rotation.from_euler(
             "zyx", np.column_stack([np.zeros(len(t)), axes[1] * about, axes[0] * about])
         )
@@ -419,9 +413,8 @@ def _fast(rng, common):
     slow = 4.0
 
     def position(t):
-        along = np.where(
-            t < 2.0 * slow, t**2 / (4.0 * slow), t - slow
-        )  # of full speed, reached after 8 s
+        # of full speed, reached after 8 s
+        along = np.where(t < 2.0 * slow, t**2 / (4.0 * slow), t - slow)
         return np.array([0.0, 0.0, 1.4]) + 0.85 * np.stack(
             [np.cos(5.0 / 0.85 * along), np.sin(5.0 / 0.85 * along), np.zeros(len(t))], axis=1
         )

@@ -12,11 +12,8 @@ from uwb_tdoa_ekf.core.config import FilterConfig
 
 INSTALLED = 20, 100, 1000, 10_000  # anchors
 LARGE = 0.5  # m
-WRONG, CERTAIN, AGAIN = (
-    1.0,
-    5.0,
-    2.0,
-)  # m, deviations beyond which an estimate is wrong and certain, and s in which it is right again
+# m, deviations beyond which an estimate is wrong and certain, and s in which it is right again
+WRONG, CERTAIN, AGAIN = (1.0, 5.0, 2.0)
 
 
 def bound(where, seed, duration=20.0):

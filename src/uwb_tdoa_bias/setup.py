@@ -23,9 +23,8 @@ setup(
         "PyYAML>=6.0",
         "scipy>=1.11",
     ],
-    extras_require={
-        "test": ["hypothesis>=6.60", "pytest>=7.0"],  # colcon test runs pytest because of this
-    },
+    # colcon test runs pytest because of this
+    extras_require={"test": ["hypothesis>=6.60", "pytest>=7.0"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

@@ -22,9 +22,8 @@ setup(
         "scipy>=1.11",
         "uwb_tdoa_bias",
     ],
-    extras_require={
-        "test": ["hypothesis>=6.60", "pytest>=7.0"]
-    },  # colcon test runs pytest because of this
+    # colcon test runs pytest because of this
+    extras_require={"test": ["hypothesis>=6.60", "pytest>=7.0"]},
     data_files=[
         ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
         (f"share/{NAME}", ["package.xml"]),

@@ -47,11 +47,8 @@ ROOT = Path(__file__).resolve().parents[2]
 FLIGHT = 30.0  # s, over and over
 UNASKED = 5.0  # s in which its CPU is taken
 SILENCE = 20.0  # s without an answer, or without a report, after which there will be none
-TARGETS = {
-    "get_parameters p99": 0.2,
-    "initialpose, the longest": 0.2,
-    "a pause told after": 1.0,
-}  # s
+# s
+TARGETS = {"get_parameters p99": 0.2, "initialpose, the longest": 0.2, "a pause told after": 1.0}
 TARGET_IDLE = 1.0  # % of a core
 
 

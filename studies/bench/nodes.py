@@ -46,17 +46,11 @@ PACKAGES = {
     "localization_node": "uwb_tdoa_ekf",
 }
 NODES = "bias_node", "ekf_node"
-SHARED = (
-    "imu/data",
-    "uwb/tdoa",
-    "uwb/anchors",
-)  # published once for all tags, so that the source stays the same
+# published once for all tags, so that the source stays the same
+SHARED = ("imu/data", "uwb/tdoa", "uwb/anchors")
 BLOCK = 3.0  # s over which CPU and latencies are taken: their median and quartiles are of blocks
-READY_LIMIT, MATCH_LIMIT, SETTLE_LIMIT = (
-    300.0,
-    60.0,
-    60.0,
-)  # s; the very first start compiles the filter
+# s; the very first start compiles the filter
+READY_LIMIT, MATCH_LIMIT, SETTLE_LIMIT = (300.0, 60.0, 60.0)
 # Tags, Hz, Hz
 FLEETS = (
     (1, 1000.0, 400.0),

@@ -62,9 +62,8 @@ def measure(
         ways[f"effects and network ({network.name})"] = run_offline, both
     for name, (function, corrector) in ways.items():
         progress(f"recording, {name}")
-        function(
-            flight, None, corrector
-        )  # compiles, or loads, what the ways before it did not need
+        # compiles, or loads, what the ways before it did not need
+        function(flight, None, corrector)
         taken = [_seconds(function, flight, None, corrector) for _ in range(repeats)]
         target = TARGET if corrector is None else TARGET_CORRECTED
         yield Figure.of(section, name, "s", taken, None if function is smooth else target)

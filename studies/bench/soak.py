@@ -14,9 +14,8 @@ from .flights import make_flight
 from .source import Source
 from .usage import memory
 
-LAP = dict(
-    trajectory="circle", radius=1.5, speed=1.0, start_in_air=True
-)  # which ends where it begins
+# which ends where it begins
+LAP = dict(trajectory="circle", radius=1.5, speed=1.0, start_in_air=True)
 LAPS = 6  # of a flight, which is played again and again
 EVERY = 60.0  # s from one figure of the memory to the next
 

@@ -27,9 +27,8 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.common.flight import Flight
 
-HEADER_STAMP = struct.Struct(
-    "<iI"
-)  # of a little-endian CDR message that begins with a header, after 4 bytes
+# of a little-endian CDR message that begins with a header, after 4 bytes
+HEADER_STAMP = struct.Struct("<iI")
 AHEAD = 0.5  # s from the call to the first message
 SHORTEST_SLEEP = 5e-5  # s
 

@@ -12,9 +12,8 @@ TICK = 1.0 / os.sysconf("SC_CLK_TCK")  # s
 
 def cpu_seconds(pid: int) -> float:
     """CPU time of all threads so far, user and system, s; steps of 0.01 s."""
-    fields = (
-        Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    )  # its name may hold anything
+    # its name may hold anything
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return TICK * (int(fields[11]) + int(fields[12]))
 
 

@@ -20,9 +20,8 @@ from uwb_tdoa_tools.readers import inputs, read_survey
 
 from .figures import ANOTHER, possible
 
-BOOT = (
-    100.0  # s on the clock of the robot at which a part begins: no mistake makes a stamp negative
-)
+# s on the clock of the robot at which a part begins: no mistake makes a stamp negative
+BOOT = 100.0
 EVERY = 4  # of the inertial samples one is played, so that a busy computer is none of the mistakes
 SETTLED = 3.0  # s of flight before what is said counts
 NOT_PLAYED = {"turned_frame"}  # speaks of /tf_static

@@ -37,12 +37,8 @@ RAILS = (  # Table 1: direction, the other coordinate (m, from the middle), crui
     ("y", 1.0, 0.42),
 )
 PASSES = 10
-EDGES = {
-    "bottom": (1, -1.5),
-    "right": (0, 1.5),
-    "top": (1, 1.5),
-    "left": (0, -1.5),
-}  # Table 2: fixed axis, its value
+# Table 2: fixed axis, its value
+EDGES = {"bottom": (1, -1.5), "right": (0, 1.5), "top": (1, 1.5), "left": (0, -1.5)}
 FAR = 10.0  # m, of the anchors that hold the height
 
 
@@ -63,9 +59,8 @@ class Measured:
         return Part(self.p, self.true, self.covariance)
 
 
-AVERAGING = FilterConfig(
-    zero_velocity=False
-)  # a stay is measured: its noise is averaged, as that of a tag that may move
+# a stay is measured: its noise is averaged, as that of a tag that may move
+AVERAGING = FilterConfig(zero_velocity=False)
 
 
 def add_options(add):

@@ -111,9 +111,8 @@ def _right(effects, attribution):
             return False
         for key, value in effect.values.items():
             if effect.name == "outlier_rate":
-                value = (
-                    value + (1.0 - value) * SimulationConfig.outlier_probability
-                )  # on top of what is nominal
+                # on top of what is nominal
+                value = value + (1.0 - value) * SimulationConfig.outlier_probability
             limits = (
                 (".start", ".end", ".height")
                 if effect.name == "floor_multipath"

@@ -29,10 +29,8 @@ from .claims import claims, truth_of
 
 LEAST_COST = 0.02  # m of 3D RMSE that an effect costs in both flights
 GROW, GROWTHS = 1.7, 3  # an effect that costs less is made larger, so often
-DEVELOPED_ON, DRAWN_ONCE = (
-    0,
-    1_000_000,
-)  # first seeds: of cases that were looked at, and of those that are reported
+# first seeds: of cases that were looked at, and of those that are reported
+DEVELOPED_ON, DRAWN_ONCE = (0, 1_000_000)
 # {split of `measured`: places of its judged flights, in groups of one protocol}: each flight is
 # judged on the next.
 GROUPS = {

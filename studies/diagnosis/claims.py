@@ -25,16 +25,10 @@ CATALOGUE = {
     "range_bias": ("arrivals", ("range",), ("bend", "ramp")),
     "received_power_bias": ("arrivals", ("range",), ("bend", "trend")),
     "antenna_pattern": ("arrivals", ("elevation_in_tag",), ("bend",)),
-    "truth_frame": (
-        "arrivals",
-        ("elevation", "bearing"),
-        ("periodic",),
-    ),  # a shift is a function of the direction to each anchor,
-    "tag_lever_arm": (
-        "arrivals",
-        ("elevation_in_tag", "bearing_in_tag"),
-        ("periodic",),
-    ),  # and so is an arm, in the tag
+    # a shift is a function of the direction to each anchor,
+    "truth_frame": ("arrivals", ("elevation", "bearing"), ("periodic",)),
+    # and so is an arm, in the tag
+    "tag_lever_arm": ("arrivals", ("elevation_in_tag", "bearing_in_tag"), ("periodic",)),
     "floor_multipath": ("arrivals", ("height",), ("step", "transient")),
     "gyro_scale": ("axis", ("rate",), ("trend",)),
     "accel_scale": ("axis", ("accel",), ("trend",)),
@@ -171,9 +165,8 @@ def _declared(effect):
             _nlos(effect, who)
             for who in dict.fromkeys(key.partition(".")[0] for key in effect.values)
         ]
-    turned = effect.name == "truth_frame" and not set("xyz") & set(
-        effect.values
-    )  # no function of the direction alone
+    # no function of the direction alone
+    turned = effect.name == "truth_frame" and not set("xyz") & set(effect.values)
     subset, covariates, shapes = (
         ("all", (), ()) if turned else CATALOGUE.get(effect.name, ("all", (), ()))
     )

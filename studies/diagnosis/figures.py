@@ -41,10 +41,8 @@ PARTS = (
     "references",
     "speed",
 )
-SEVERAL_MEASURED, SEVERAL_SIMULATED = (
-    3,
-    4,
-)  # flights with the same effect: no measured group of one protocol has more
+# flights with the same effect: no measured group of one protocol has more
+SEVERAL_MEASURED, SEVERAL_SIMULATED = (3, 4)
 
 
 def add_options(add):
@@ -272,10 +270,8 @@ def _speed(args):
         "diagnose --reference heights, two of a minute": lambda: diagnose(two, reference=Heights()),
     }
     short = bank.clean_flight(501, 40.0, aided=True)
-    (
-        diagnose([short], reference=Heights()),
-        self_calibrate([short.without(*AIDS)], Tape()),
-    )  # compiles
+    # compiles
+    (diagnose([short], reference=Heights()), self_calibrate([short.without(*AIDS)], Tape()))
     figures = {}
     for name, call in calls.items():
         started = time.process_time()

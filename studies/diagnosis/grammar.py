@@ -14,22 +14,12 @@ from uwb_tdoa_bias.effects.covariates import OF_ARRIVAL, OF_IMU, OF_TDOA, ImuFea
 from uwb_tdoa_bias.effects.samples import Track
 
 SHAPES = ("trend", "step", "ramp", "periodic", "transient", "bend")
-SIZES = {
-    "tdoa": (0.15, 0.8),
-    "gyro": (0.03, 0.3),
-    "accel": (0.3, 2.0),
-}  # m, rad/s, m/s^2; drawn evenly in the logarithm
+# m, rad/s, m/s^2; drawn evenly in the logarithm
+SIZES = {"tdoa": (0.15, 0.8), "gyro": (0.03, 0.3), "accel": (0.3, 2.0)}
 STREAMS = ("tdoa", "tdoa", "tdoa", "tdoa", "gyro", "accel")
 SUBSETS = ("anchor", "anchor", "pair", "direction", "arrivals", "all")  # of TDOAs
-OF_POSE = (
-    "time",
-    "x",
-    "y",
-    "height",
-    "speed",
-    "climb_rate",
-    "acceleration",
-)  # of TDOAs and inertial samples alike
+# of TDOAs and inertial samples alike
+OF_POSE = ("time", "x", "y", "height", "speed", "climb_rate", "acceleration")
 OF_ATTITUDE = ("turning_rate", "tilt", "bearing_in_tag", "elevation_in_tag")
 ANGLES = ("bearing", "bearing_in_tag")
 NAMES = "previous_anchor"

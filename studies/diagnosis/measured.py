@@ -63,11 +63,8 @@ INTO = (
     "flights/0426/0426-traj3",
     "flights/0426/0426-traj5",
 )
-PRESENT = (
-    "outlier_rate",
-    "noise_correlation",
-    "floor_multipath",
-)  # in every measured flight
+# in every measured flight
+PRESENT = ("outlier_rate", "noise_correlation", "floor_multipath")
 
 
 def load(data, paths, aids=()):

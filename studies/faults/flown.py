@@ -35,9 +35,8 @@ LOOK, REPORT = 0.2, 1.0  # s between two looks at the status, and two at the str
 LAG = 0.25  # s
 AIDS = "height", "velocity"
 
-Change = Callable[
-    [Any], Any
-]  # of the part of a stream that came in one turn: Imu, Tdoas or another
+# of the part of a stream that came in one turn: Imu, Tdoas or another
+Change = Callable[[Any], Any]
 
 
 @dataclass(frozen=True)

@@ -19,20 +19,13 @@ if TYPE_CHECKING:
 
 RUNNING = 2  # EstimatorStatus
 STEP = 0.02  # s between two looks
-FRESH, FRESH_STATUS = (
-    0.5,
-    2.5,
-)  # s for which an odometry, and a status, count as new; the latter comes each second
+# s for which an odometry, and a status, count as new; the latter comes each second
+FRESH, FRESH_STATUS = (0.5, 2.5)
 OTHER_CLOCK = 1.0  # s between stamp and arrival, from which on the stamp is of another clock
-WRONG, SIGMAS, WRONG_LIMIT = (
-    1.0,
-    3.0,
-    2.0,
-)  # m; stated deviations; s for which both may be exceeded while nothing is said
-WRONG_YAW, YAW_LIMIT = (
-    math.radians(20.0),
-    5.0,
-)  # rad, s: the same for a yaw that is said to be known
+# m; stated deviations; s for which both may be exceeded while nothing is said
+WRONG, SIGMAS, WRONG_LIMIT = (1.0, 3.0, 2.0)
+# rad, s: the same for a yaw that is said to be known
+WRONG_YAW, YAW_LIMIT = (math.radians(20.0), 5.0)
 RECOVERED_LIMIT, STOP_LIMIT = 3.0, 5.0  # s
 # s by which events may be sent late before the row says that the machine was too busy for it
 LATE = 0.2

@@ -53,15 +53,11 @@ if TYPE_CHECKING:
     from rclpy.publisher import Publisher
 
 PACKAGES = {"bias_node": "uwb_tdoa_bias", "ekf_node": "uwb_tdoa_ekf"}
-READY, LEAD = (
-    180.0,
-    0.5,
-)  # s: the very first start compiles the filter; from ready nodes to the first message
+# s: the very first start compiles the filter; from ready nodes to the first message
+READY, LEAD = (180.0, 0.5)
 FETCH = 0.02  # s between two looks at what has arrived
-STAMP, HEADER = (
-    struct.Struct("<iI"),
-    4,
-)  # of a message that begins with a header, behind the bytes that say how it is encoded
+# of a message that begins with a header, behind the bytes that say how it is encoded
+STAMP, HEADER = (struct.Struct("<iI"), 4)
 RELIABLE = QoSProfile(depth=1000)
 KEPT = 3  # runs for which a domain stays reserved after its own
 _taken: deque[ExitStack] = deque()  # their reservations

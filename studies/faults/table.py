@@ -38,11 +38,8 @@ from .changes import (
     valued,
 )
 
-BEGIN, LASTS, AFTER = (
-    14.0,
-    6.0,
-    7.0,
-)  # s: from the first message to a fault, how long it lasts, and what follows
+# s: from the first message to a fault, how long it lasts, and what follows
+BEGIN, LASTS, AFTER = (14.0, 6.0, 7.0)
 EARLY, LONG = 5.0, 22.0  # s: begin and length of one whose effect needs long
 FEET, LIGHT = 3.280839895, 0.299792458  # in a metre; m in a nanosecond
 NORMAL = 9.80665  # m/s^2 in g

@@ -11,11 +11,8 @@ NOTICED = 0.02  # share by which a figure must change to count
 LEAST = (0.002, 0.02, 0.05, 0.005, 0.05)  # m, NEES, s, rad, s: changes that never count
 HONEST = 3.0  # NEES of an honest filter
 
-CLEAR, CLEAR_ROWS, CLEAR_MEAN = (
-    0.05,
-    3,
-    0.01,
-)  # loss, in so many rows, and mean loss: it is worth it
+# loss, in so many rows, and mean loss: it is worth it
+CLEAR, CLEAR_ROWS, CLEAR_MEAN = (0.05, 3, 0.01)
 
 
 @dataclass

@@ -124,9 +124,8 @@ def test_the_core_is_measured_per_event():
 
 
 def test_the_core_is_measured_while_several_yaws_are_followed():
-    prediction, _ = core.per_event(
-        8, "innovation", core.N_YAWS, 2
-    )  # raises where fewer are followed
+    # raises where fewer are followed
+    prediction, _ = core.per_event(8, "innovation", core.N_YAWS, 2)
     assert (prediction > 0.0).all()
 
 
@@ -134,9 +133,8 @@ def test_latency_is_that_of_the_first_odometry_that_contains_a_tdoa():
     ms = 1_000_000
     stamps = np.array([0, 10, 12, 20, 30, 90]) * ms
     sent = 1000 * ms + stamps
-    of = (
-        np.array([5, 15, 10, 30]) * ms
-    )  # stamps in order of arrival; the third is one that came late
+    # stamps in order of arrival; the third is one that came late
+    of = np.array([5, 15, 10, 30]) * ms
     arrivals = 1000 * ms + np.array([8, 18, 19, 37]) * ms
     found = source.latencies(sent, stamps, arrivals, of)
     # before the first arrival: unknown; 10 and 12 are in 15; 20 and 30 in 30; 90 in none

@@ -130,11 +130,8 @@ def test_bad_yaml_is_told_in_one_sentence(tmp_path, text):
 def test_leaves_the_arrays_of_the_caller_alone():
     ids, positions, orientations = np.arange(3), np.eye(3), np.tile([0.0, 0.0, 0.0, 1.0], (3, 1))
     anchors = Anchors(ids, positions, orientations)
-    positions[0, 0], ids[0], orientations[0, 3] = (
-        9.0,
-        9,
-        0.0,
-    )  # the caller's own, to do with as it likes
+    # the caller's own, to do with as it likes
+    positions[0, 0], ids[0], orientations[0, 3] = (9.0, 9, 0.0)
     assert (
         anchors.positions[0, 0] == 1.0 and anchors.ids[0] == 0 and anchors.orientations[0, 3] == 1.0
     )

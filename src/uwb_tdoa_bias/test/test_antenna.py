@@ -48,9 +48,8 @@ def test_blend_is_equation_14():
     a1, a2 = np.cos(theta) ** 2 * (1 - a3), (1 - np.cos(theta) ** 2) * (1 - a3)
     expected = a1 * DWM1000_ELEVATION_1[1] + a2 * DWM1000_ELEVATION_2[1] + a3 * DWM1000_AZIMUTH[1]
     assert antenna.gain(towards(theta, phi)) == pytest.approx(expected, abs=1e-9)
-    expected = (
-        a1 * DWM1000_ELEVATION_1[5] + a2 * DWM1000_ELEVATION_2[5] + a3 * DWM1000_AZIMUTH[7]
-    )  # x < 0, y < 0
+    # x < 0, y < 0
+    expected = a1 * DWM1000_ELEVATION_1[5] + a2 * DWM1000_ELEVATION_2[5] + a3 * DWM1000_AZIMUTH[7]
     assert antenna.gain(towards(np.pi + theta, phi)) == pytest.approx(expected, abs=1e-9)
 
 

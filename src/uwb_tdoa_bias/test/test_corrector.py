@@ -154,9 +154,8 @@ def test_a_batch_is_the_same_as_one_by_one():
 
 def test_where_the_network_cannot_tell_effects_remain():
     corrector = climbing(Corrector(ANCHORS, DELAYS, Height(), lag=0.0), [1.0, 2.5])
-    found = correct(
-        corrector, [0.0, 1.0, 2.5], dense=True
-    )  # no pose yet; a pose it knows; one it does not
+    # no pose yet; a pose it knows; one it does not
+    found = correct(corrector, [0.0, 1.0, 2.5], dense=True)
     np.testing.assert_allclose(found.bias, [-0.1, -0.2 + 1.0, 0.2])
     assert found.status.tolist() == [EFFECTS, NETWORK, EFFECTS]
     assert found.std.tolist() == [0.0, 0.05, 0.0]
@@ -202,9 +201,8 @@ def test_effects_are_those_of_the_mean_heading_while_the_yaw_is_unknown():
         told[yaw_std] = correct(corrector, [0.0])
     upright = Corrector(ANCHORS, EffectSet((TagLeverArm({"z": 0.2}),)), lag=0.0)
     upright.add_pose(0.0, np.array([1.0, 2.0, 1.0]), np.array([0.0, 0.0, 0.0, 1.0]))
-    np.testing.assert_allclose(
-        told[2.0].bias, correct(upright, [0.0]).bias, atol=0.01
-    )  # what is across averages out
+    # what is across averages out
+    np.testing.assert_allclose(told[2.0].bias, correct(upright, [0.0]).bias, atol=0.01)
     assert abs(told[0.1].bias[0] - told[2.0].bias[0]) > 0.03
     assert told[0.1].std[0] == 0.0 and told[2.0].std[0] > 0.03
 

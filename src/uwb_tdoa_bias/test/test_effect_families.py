@@ -92,9 +92,8 @@ def test_on_the_floor_an_anchor_is_late_below_its_height_and_may_be_about_it():
     samples = standing(np.array([0.0, 0.03, 0.08, 0.12, 0.18, 1.0]))
     bias, noise = floor.bias(samples), floor.noise_std(samples)
     np.testing.assert_allclose(bias, [3.0, 3.0, 3.0, 1.5, 0.0, 0.0], atol=1e-6)
-    np.testing.assert_allclose(
-        noise, [0.0, 0.0, 0.0, 1.5, 0.0, 0.0], atol=2e-3
-    )  # late or not: 3 m times sqrt(p (1 - p))
+    # late or not: 3 m times sqrt(p (1 - p))
+    np.testing.assert_allclose(noise, [0.0, 0.0, 0.0, 1.5, 0.0, 0.0], atol=2e-3)
     hopping = EFFECTS["floor_multipath"]({"1.delay": 3.0, "1.height": 0.12, "1.noise": 0.4})
     np.testing.assert_allclose(
         hopping.noise_std(samples)[[0, 3, 5]], [0.4, np.sqrt(1.5**2 + 0.5 * 0.4**2), 0.0], atol=2e-3
@@ -201,9 +200,8 @@ def test_aids_are_corrected_the_same_at_once_and_one_by_one_whatever_was_not_mea
     unstated = corrector.correct(
         "velocity", Velocity(t, v, np.where(np.isinf(std), std, 0.0))
     ).columns[2]
-    np.testing.assert_array_equal(
-        unstated, np.where(np.isinf(std), std, 0.0)
-    )  # the driver still states none
+    # the driver still states none
+    np.testing.assert_array_equal(unstated, np.where(np.isinf(std), std, 0.0))
     single = [
         corrector.correct(
             "velocity", Velocity(*(column[k : k + 1] for column in (t, v, std, *rates)))

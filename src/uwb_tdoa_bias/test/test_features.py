@@ -43,9 +43,8 @@ def test_places(seed):
 @given(seeds)
 def test_definitions(seed):
     samples = random_samples(seed)
-    np.testing.assert_allclose(
-        columns(samples, FEATURES), expected(samples), atol=1e-6
-    )  # arcsin is steep near the pole
+    # arcsin is steep near the pole
+    np.testing.assert_allclose(columns(samples, FEATURES), expected(samples), atol=1e-6)
 
 
 def test_a_case_worked_by_hand():

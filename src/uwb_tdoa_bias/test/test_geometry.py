@@ -71,9 +71,8 @@ def test_rotate_is_the_rotation_of_scipy(seed):
 def test_one_vector_turned_by_many_attitudes(seed):
     rng = np.random.default_rng(seed)
     turns, v = [random_rotation(rng) for _ in range(4)], rng.normal(size=3)
-    q = np.array([turn.as_quat() for turn in turns]) * rng.uniform(
-        0.5, 2.0, (4, 1)
-    )  # of any length
+    # of any length
+    q = np.array([turn.as_quat() for turn in turns]) * rng.uniform(0.5, 2.0, (4, 1))
     out = np.empty((6, 3))
     rotate_each(np.concatenate([q, [[0.0, 0.0, 0.0, 0.0], [np.nan, 0.0, 0.0, 1.0]]]), v, out)
     np.testing.assert_allclose(out[:4], [turn.apply(v) for turn in turns], atol=1e-12)

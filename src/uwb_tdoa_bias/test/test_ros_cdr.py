@@ -86,9 +86,8 @@ def test_vectors_and_arrays_are_columns(way):
 
 
 def test_what_is_written_is_what_an_object_would_be(way):
-    codec = CdrCodec(
-        TdoaCorrected, "corrected", "anchor_b", "anchor_a", "raw"
-    )  # not in the order of the definition
+    # not in the order of the definition
+    codec = CdrCodec(TdoaCorrected, "corrected", "anchor_b", "anchor_a", "raw")
     template = codec.template(corrected(7, model="effects"))
     wanted = [corrected(k, model="effects") for k in (7, 8, 300)]
     rows = template.rows(3)

@@ -103,9 +103,8 @@ def test_what_waits_is_measured(surroundings):
         spinner._serve()
         return spinner.longest_wait < 0.2
 
-    spin_until(
-        spinner, nothing_waited
-    )  # a loaded machine may have kept this process waiting in between
+    # a loaded machine may have kept this process waiting in between
+    spin_until(spinner, nothing_waited)
     publisher.publish(DiagnosticStatus())
     spin_until(spinner, lambda: spinner.longest_wait > 0.25)
     spinner.close()
@@ -157,9 +156,8 @@ def test_a_stream_that_begins_after_a_silence_is_taken(surroundings):
     streams.add(CdrCodec(FluidPressure, "fluid_pressure"), "pressure", take)
     publisher = other.create_publisher(FluidPressure, "pressure", DEEP)
     until(publisher.get_subscription_count)
-    node.create_timer(
-        0.1, lambda: publisher.publish(FluidPressure())
-    )  # the process sleeps in its executor until then
+    # the process sleeps in its executor until then
+    node.create_timer(0.1, lambda: publisher.publish(FluidPressure()))
     spinner = Spinner([node], StreamPoller([streams]))
     spinner.spin(stop)
     assert 0.0 <= heard[0] < 60.0

@@ -15,9 +15,8 @@ SCALARS = st.one_of(
     st.booleans(),
     st.integers(1 - 2**63, 2**63 - 1),
     st.floats(allow_nan=False, allow_infinity=False),
-    st.text(
-        st.characters(codec="utf-8", exclude_categories=["Cc", "Cs", "Nd"]), max_size=8
-    ),  # no 1e3: YAML 1.1
+    # no 1e3: YAML 1.1
+    st.text(st.characters(codec="utf-8", exclude_categories=["Cc", "Cs", "Nd"]), max_size=8),
 )
 KEYS = st.text("abcxyz01-", max_size=4)
 CONTENT = st.recursive(

@@ -58,10 +58,8 @@ def test_operators_of_one_value(tmp_path, kind, width):
 @pytest.mark.parametrize("other", ["one", "column"])
 @pytest.mark.parametrize("kind", ELEMENTWISE)
 def test_operators_of_two(tmp_path, kind, other):
-    nodes = [
-        ("Abs", ["column of x"], ["size"], {}),
-        ("Add", ["size", "one"], ["column"], {}),
-    ]  # not about 0: a quotient is then as exact
+    # not about 0: a quotient is then as exact
+    nodes = [("Abs", ["column of x"], ["size"], {}), ("Add", ["size", "one"], ["column"], {})]
     nodes = [("MatMul", ["x", "C"], ["column of x"], {}), *nodes, (kind, ["x", other], ["y"], {})]
     assert_plays(model(tmp_path / "model.onnx", nodes), atol=1e-5)
 

@@ -153,9 +153,8 @@ class BiasNode(StreamNode):
         self._epoch, self._rate = Epoch(), Rate()
         self._counts: Counter[str] = Counter()
         self._early: deque[Item] = deque()
-        self._early_poses: deque[tuple[str, np.ndarray, np.ndarray]] = (
-            deque()
-        )  # as of `_take_poses`
+        # as of `_take_poses`
+        self._early_poses: deque[tuple[str, np.ndarray, np.ndarray]] = deque()
         self._hold = PoseQueue(self._limit)
         self._tdoas, self._poses = StampGate(), StampGate()
         self._reported_unready = self._reported_received = self._reported_poses = 0

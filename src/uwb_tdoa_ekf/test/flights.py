@@ -191,9 +191,8 @@ def position_at(flight, t):
     return np.stack([np.interp(t, flight.truth.t, flight.truth.p[:, k]) for k in range(3)], axis=1)
 
 
-WORKSPACE = np.array(
-    [[-1.0, -1.0, -1.5], [8.0, 9.0, 4.5]]
-)  # m, its bounds with the anchors of corners()
+# m, its bounds with the anchors of corners()
+WORKSPACE = np.array([[-1.0, -1.0, -1.5], [8.0, 9.0, 4.5]])
 
 
 def leaving(flight):

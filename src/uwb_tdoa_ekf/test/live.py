@@ -77,9 +77,8 @@ def assert_same_as_offline(flight, config=None, **feeding):
     odometry, residuals = feed(estimator, flight, **feeding)
     expected = run_offline(flight, config)
     assert_same(odometry, expected.odometry)
-    assert_same(
-        by_stamp(residuals), by_stamp(expected.residuals)
-    )  # what is refused is told at once
+    # what is refused is told at once
+    assert_same(by_stamp(residuals), by_stamp(expected.residuals))
     assert {name: estimator.counts[name] for name in VERDICTS.values()} == expected.counts
 
 

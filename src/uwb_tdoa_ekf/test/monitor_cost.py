@@ -14,13 +14,8 @@ from uwb_tdoa_ekf.monitoring.slices import LENGTH
 from uwb_tdoa_ekf.results import Odometry, Residuals
 
 RATE = 400  # Hz, of TDOAs
-CASES = (
-    (8, 8),
-    (100, 30),
-    (100, 100),
-    (1000, 30),
-    (1000, 200),
-)  # anchors, and how many of them are heard at a time
+# anchors, and how many of them are heard at a time
+CASES = ((8, 8), (100, 30), (100, 100), (1000, 30), (1000, 200))
 
 
 def fly(monitor, anchors, heard, slices, first=0, seed=0):

@@ -99,9 +99,8 @@ class Launch:
             "PYTHONUNBUFFERED": "1",
         }
         variables["PATH"] = os.pathsep.join([*map(str, path), os.environ["PATH"]])
-        self._terminal, stdin = (
-            os.openpty()
-        )  # without one launch passes Ctrl-C on, and nodes that have it already get it twice
+        # without one launch passes Ctrl-C on, and nodes that have it already get it twice
+        self._terminal, stdin = os.openpty()
         self.process = subprocess.Popen(
             [*ros2(), "launch", *words],
             env={**os.environ, **variables},

@@ -33,9 +33,8 @@ from uwb_tdoa_ekf.results import VERDICTS, rows_of
 from uwb_tdoa_msgs.msg import AnchorArray, Tdoa, TdoaCorrected, TdoaResidual
 
 EPOCH = 1_700_000_000  # s; stamps of today's size
-PATIENCE = (
-    180.0  # s for anything that must happen; the very first start of ekf_node compiles the filter
-)
+# s for anything that must happen; the very first start of ekf_node compiles the filter
+PATIENCE = 180.0
 AGAIN = 10.0  # s after which a node that has not answered is asked once more
 MODULES = {
     "bias_node": "uwb_tdoa_bias.bias_node",
@@ -43,9 +42,8 @@ MODULES = {
     "debias_node": "uwb_tdoa_ekf.debias_node",
     "localization_node": "uwb_tdoa_ekf.localization_node",
 }
-MEMBERS = {
-    "localization_node": ("bias_node", "ekf_node")
-}  # nodes of one process, which hand over to each other
+# nodes of one process, which hand over to each other
+MEMBERS = {"localization_node": ("bias_node", "ekf_node")}
 OUTPUTS = {
     "bias_node": ("uwb/tdoa_corrected",),
     "ekf_node": ("odometry", "uwb/residual"),

@@ -13,11 +13,8 @@ from uwb_tdoa_bias.common.geometry import tdoa
 from uwb_tdoa_bias.common.sensors import Velocity
 
 GRAVITY = 9.81
-HEIGHT, HEIGHT_STD, TILT_STD = (
-    0.2,
-    0.02,
-    0.01,
-)  # m, m, rad: of the body over a floor that is not quite even
+# m, m, rad: of the body over a floor that is not quite even
+HEIGHT, HEIGHT_STD, TILT_STD = (0.2, 0.02, 0.01)
 FINE = 500.0  # Hz of the motion
 ANCHORS = [[0, 0, 2.4], [12, 0, 1.8], [12, 8, 2.4], [0, 8, 1.8], [6, 0, 0.9], [6, 8, 2.7]]
 STOPS = (25.0, 60.0)  # s, of the beginning of each; it lasts

@@ -63,9 +63,8 @@ def test_a_path_is_cut_into_cells_and_thin_ones_are_left_out():
 def test_corrected_bias_is_the_mean_of_the_integrals_along_the_axes(d):
     one = markers(d=d, std=np.linspace(0.05, 0.15, d))
     found = corrected_bias(one)
-    row = int(
-        np.flatnonzero((one.cell == 2).all(axis=1))[0]
-    )  # in the middle: 3 standard deviations stay on the line
+    # in the middle: 3 standard deviations stay on the line
+    row = int(np.flatnonzero((one.cell == 2).all(axis=1))[0])
     expected = np.zeros(d)
     for axis in range(d):
         on_line = (np.delete(one.cell, axis, axis=1) == 2).all(axis=1)

@@ -19,11 +19,8 @@ from uwb_tdoa_ekf.debias_node import DebiasNode  # noqa: E402
 
 CONFIG = Path(__file__).resolve().parents[1] / "config" / "debias_node.yaml"
 ANCHORS = Anchors.from_positions([[0, 0, 0], [4, 0, 2], [4, 4, 0], [0, 4, 2], [2, 2, 3]])
-PLACES = [
-    [0.7, 0.7, 0.7],
-    [2.0, 0.7, 0.7],
-    [9.0, 0.7, 0.7],
-]  # known, half a metre outside, far away
+# known, half a metre outside, far away
+PLACES = [[0.7, 0.7, 0.7], [2.0, 0.7, 0.7], [9.0, 0.7, 0.7]]
 
 
 @pytest.fixture

@@ -225,9 +225,8 @@ def test_height_pressure_and_velocity_are_used_where_they_are_there(
             flight.velocity, std=np.zeros((n, 3)), yaw_rate=gyro, yaw_rate_std=np.zeros(n)
         )
         flight = replace(flight, velocity=wheels)
-    flight.height.range[:] = np.float32(
-        flight.height.range
-    )  # a sensor_msgs/Range is not more precise
+    # a sensor_msgs/Range is not more precise
+    flight.height.range[:] = np.float32(flight.height.range)
     flight.height.range[20] = np.inf
     topics = ["height", "pressure", topic]
     for each in topics:

@@ -499,9 +499,8 @@ def test_a_stream_whose_stamps_do_not_go_on_is_used_and_does_not_grow(step=1e-9)
     imu, tdoa, n = flight.imu, flight.tdoa, MOST_WAITING + 500
     estimator = Estimator(flight.anchors)
     estimator.add_imu(imu.t, imu.gyro, imu.accel)
-    estimator.add_tdoa(
-        tdoa.t[[1, 0]], tdoa.a[:2], tdoa.b[:2], tdoa.d[:2]
-    )  # out of order: what is stamped alike is waited for
+    # out of order: what is stamped alike is waited for
+    estimator.add_tdoa(tdoa.t[[1, 0]], tdoa.a[:2], tdoa.b[:2], tdoa.d[:2])
     ids = flight.anchors.ids[np.arange(n) % len(flight.anchors)]
     for k in range(3):
         estimator.add_tdoa(100.0 + step * (k * n + np.arange(n)), ids, np.roll(ids, 1), np.zeros(n))

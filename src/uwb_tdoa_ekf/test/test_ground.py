@@ -28,11 +28,8 @@ from uwb_tdoa_ekf.core.stationary_position import weigh
 from uwb_tdoa_ekf.core.workspace import set_bounds
 
 # --- ground ---
-POSITIONS = np.array(corners((7.0, 8.0, 3.0)).positions) + [
-    0.0,
-    0.0,
-    0.15,
-]  # four at 0.15 m, four at 3.15 m
+# four at 0.15 m, four at 3.15 m
+POSITIONS = np.array(corners((7.0, 8.0, 3.0)).positions) + [0.0, 0.0, 0.15]
 LOW = POSITIONS[:, 2] < 1.0
 PARAMETERS = FilterConfig().parameters()
 

@@ -163,9 +163,8 @@ def test_a_tag_outside_of_the_flyable_volume_is_a_warning(clock):
     level, text, values = second(clock, judge, running)
     assert level == WARN and "outside of the flyable volume" in text and values["flyable"] == "no"
     for k in range(3):
-        level, text, values = second(
-            clock, judge, running, used=1, invalid=99 * (k + 1)
-        )  # what matters more is said
+        # what matters more is said
+        level, text, values = second(clock, judge, running, used=1, invalid=99 * (k + 1))
     assert level == WARN and "invalid" in text and values["flyable"] == "no"
     judge.last_position = np.array([0.5, 0.5, 0.5]), np.eye(3)
     for _ in range(2):

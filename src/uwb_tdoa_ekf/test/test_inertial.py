@@ -50,10 +50,8 @@ STILL = dict(gyro=(np.zeros(3), 0.002), accel=(UP, 0.02))
         ({"gyro": (np.zeros(3), 0.05)}, False),
         ({"gyro": (np.array([0.0, 0.0, 0.1]), 0.002)}, False),
         ({"accel": (UP, 0.3)}, False),
-        (
-            {"accel": (UP + [1.0, 0.0, 0.0], 0.02)},
-            True,
-        ),  # a metre per second squared sideways is a tilt of 6 degrees
+        # a metre per second squared sideways is a tilt of 6 degrees
+        ({"accel": (UP + [1.0, 0.0, 0.0], 0.02)}, True),
         ({"accel": (1.1 * UP, 0.02)}, False),
     ],
 )

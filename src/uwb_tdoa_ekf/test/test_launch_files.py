@@ -146,11 +146,8 @@ def tags_file(folder, text):
 
 
 def test_one_tag_on_simulated_time_from_start_to_ctrl_c(make_rig, launch, tmp_path):
-    flight, rig, epoch = (
-        recording(2.0),
-        make_rig(latched=False),
-        int(time.time()) + 10**6,
-    )  # diagnostics are newer than any before
+    # diagnostics are newer than any before
+    flight, rig, epoch = (recording(2.0), make_rig(latched=False), int(time.time()) + 10**6)
     file = reliable(tmp_path / "reliable.yaml", rig.namespace)
     clock = rig.node.create_publisher(Clock, "/clock", 10)
     launched = launch(
@@ -287,9 +284,8 @@ def test_a_node_that_crashes_is_started_again_each_time_later(make_rig, launch):
 
 def test_a_node_that_refuses_what_it_is_given_is_not_started_again(launch):
     launched = launch("uwb_tdoa_ekf", "tdoa.launch.py", "effects_file:=/nowhere.yaml")
-    launched.wait(
-        "_node: error: /nowhere.yaml"
-    )  # of either: with shutdown the first ends the other
+    # of either: with shutdown the first ends the other
+    launched.wait("_node: error: /nowhere.yaml")
     launched.wait(
         "_node refuses what it is given (see its message above), and is not started again"
     )

@@ -22,9 +22,8 @@ ANCHORS = Anchors.from_positions(
     np.random.default_rng(0).uniform(-4, 4, (6, 3)), ids=[3, 5, 7, 9, 11, 13]
 )
 IDS, RATE = ANCHORS.ids, 100  # Hz
-CALIBRATED = Covariance(
-    keys_of(IDS), np.diag(np.repeat([0.03**2, 0.02**2], [18, 6]))
-)  # coordinates within 3 cm, delays within 2
+# coordinates within 3 cm, delays within 2
+CALIBRATED = Covariance(keys_of(IDS), np.diag(np.repeat([0.03**2, 0.02**2], [18, 6])))
 
 
 def watch(

@@ -30,9 +30,8 @@ from uwb_tdoa_bias.ros.frames import TF_QOS, TF_STATIC_QOS  # noqa: E402
 from uwb_tdoa_ekf.offline import run_offline  # noqa: E402
 from uwb_tdoa_msgs.msg import AnchorArray  # noqa: E402
 
-TURN = Rotation.from_euler(
-    "ZYX", [90.0, 0.0, 180.0], degrees=True
-)  # of the IMU on the body: upside down
+# of the IMU on the body: upside down
+TURN = Rotation.from_euler("ZYX", [90.0, 0.0, 180.0], degrees=True)
 ARM = [0.05, 0.0, 0.1]  # m, of the antenna on the body
 
 
@@ -140,9 +139,8 @@ def test_sensors_in_frames_of_their_own_among_frames_that_move(make_rig, tmp_pat
         v, q = message.transform.translation, message.transform.rotation
         led = Rotation.from_quat([q.x, q.y, q.z, q.w]).apply([t, 0.5 * t, 0.0]) + [v.x, v.y, v.z]
         p = poses[message.header.stamp.sec, message.header.stamp.nanosec]
-        np.testing.assert_allclose(
-            led, [p.x, p.y, p.z], atol=0.02
-        )  # of when the course was not there yet: 50 ms later
+        # of when the course was not there yet: 50 ms later
+        np.testing.assert_allclose(led, [p.x, p.y, p.z], atol=0.02)
 
 
 def test_what_a_robot_does_to_a_running_filter(make_rig):

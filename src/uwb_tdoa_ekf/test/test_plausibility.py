@@ -82,9 +82,8 @@ def test_what_a_tag_may_do_is_no_fault():
         (T > 5.2) & (T < 5.25), 4.0 * GRAVITY, 0.0
     )
     bank = np.interp(T, [5.0, 5.5, 7.0, 7.5], np.deg2rad([0.0, 60.0, 60.0, 0.0]))
-    swing = (
-        np.where(np.sin(2.0 * np.pi * 0.6 * T) > 0.0, 0.3, 1.5) * GRAVITY
-    )  # as a controller that is pulled up and down
+    # as a controller that is pulled up and down
+    swing = np.where(np.sin(2.0 * np.pi * 0.6 * T) > 0.0, 0.3, 1.5) * GRAVITY
     turn = np.interp(T, [5.0, 5.5, 9.0, 9.5], [1.0, 3.3, 3.3, 1.0]) * GRAVITY
     over = np.interp(T, [5.0, 6.0, 8.0, 9.0], [0.0, np.pi, np.pi, 0.0])
     thrust = (GRAVITY / np.cos(bank))[:, None] * [0.0, 0.0, 1.0]

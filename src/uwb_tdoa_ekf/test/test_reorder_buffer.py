@@ -243,9 +243,8 @@ class Fault:
         elif self.kind == "lone":
             stamps[np.flatnonzero(at)[:1]] += self.size
         elif self.kind == "each":
-            stamps[np.flatnonzero(at)[:: int(np.sum(at) / (self.end - self.begin))]] += (
-                self.size
-            )  # one in a second
+            # one in a second
+            stamps[np.flatnonzero(at)[:: int(np.sum(at) / (self.end - self.begin))]] += self.size
         elif self.kind == "few":
             stamps[np.flatnonzero(at)[: 1 + int(0.1 * np.sum(at) / (self.end - self.begin))]] += (
                 self.size
@@ -297,9 +296,8 @@ class Played:
         arrivals, self.sent = [], dict.fromkeys(streams, 0)
         for place, fault in streams.items():
             measured = np.arange(0.0, LENGTH, 1.0 / RATE[place])
-            measured += 0.3 / RATE[place] * rng.random() + 1e-4 * rng.random(
-                len(measured)
-            )  # no stamp comes twice, whatever the fault
+            # no stamp comes twice, whatever the fault
+            measured += 0.3 / RATE[place] * rng.random() + 1e-4 * rng.random(len(measured))
             stamps, kept, delays = fault.apply(measured, rng)
             if everything is not None:
                 stamps = stamps + everything.apply(measured, rng)[0] - measured

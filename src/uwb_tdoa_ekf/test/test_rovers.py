@@ -92,9 +92,8 @@ def test_a_yaw_without_a_yaw_rate_is_known_by_motion_alone(rover):
     no_rate = rover.replaced(velocity=replace(rover.velocity, yaw_rate=None, yaw_rate_std=None))
     found = errors(no_rate, WHEELS)
     assert np.mean(found.nees_yaw) < 5.0
-    stands = (found.t - rover.truth.t[0] > 27.0) & (
-        found.t - rover.truth.t[0] < 28.5
-    )  # the last part of the stop
+    # the last part of the stop
+    stands = (found.t - rover.truth.t[0] > 27.0) & (found.t - rover.truth.t[0] < 28.5)
     assert (found.yaw_std[stands] > YAW_KNOWN).all()
 
 

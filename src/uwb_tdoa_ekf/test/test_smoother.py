@@ -106,9 +106,8 @@ def test_its_covariance_is_honest_and_never_larger_than_the_filters(use_imu):
 def test_its_covariance_holds_errors_that_do_not_average_out():
     """As much of them as the filter's: it averages no more of them out."""
     flight = fly(2, 14.0, **NOISE)
-    config = FilterConfig(
-        initial_yaw_std=0.1
-    )  # known: an unknown one the smoother finds first, and runs the filter with it
+    # known: an unknown one the smoother finds first, and runs the filter with it
+    config = FilterConfig(initial_yaw_std=0.1)
     filtered, smoothed = (engine(flight, config).odometry for engine in (run_offline, smooth))
     rows = np.searchsorted(filtered.t, smoothed.t, side="right") - 1
     known = (rows > 0) & (smoothed.t > 2.0)

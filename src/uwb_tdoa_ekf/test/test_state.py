@@ -120,9 +120,8 @@ def test_many_small_steps_solve_the_equations_of_motion(seed):
     P, after = np.eye(15), x
     for _ in range(400):
         after, _ = predicted(after, P, 0.0005, gyro, accel, np.ones(3))
-    np.testing.assert_allclose(
-        after[:6], exact, atol=0.005
-    )  # input held over each step: first order
+    # input held over each step: first order
+    np.testing.assert_allclose(after[:6], exact, atol=0.005)
     attitude = Rotation.from_quat(x[6:10]) * Rotation.from_rotvec(0.2 * rates)
     assert (attitude.inv() * Rotation.from_quat(after[6:10])).magnitude() < 1e-10
 
@@ -137,9 +136,8 @@ def test_no_weight_means_hovering_thrust():
 
 def documented_phi(x, dt, gyro, accel, weight):
     R = Rotation.from_quat(x[6:10]).as_matrix()
-    f = -DOWN + weight * (
-        accel - x[10:13] + DOWN
-    )  # share `weight` of what was measured, the rest is hovering
+    # share `weight` of what was measured, the rest is hovering
+    f = -DOWN + weight * (accel - x[10:13] + DOWN)
     phi = np.eye(15)
     phi[0:3, 3:6] = dt * np.eye(3)
     phi[3:6, 6:9] = -dt * R @ cross(f)

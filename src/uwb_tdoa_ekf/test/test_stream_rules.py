@@ -161,9 +161,8 @@ def test_a_fault_of_the_tdoas_is_named(rule):
     _is_whole(found[rule])
 
 
-TICKS = (
-    2.0**32 * 299792458.0 / (128 * 499.2e6)
-)  # m, after which 32 bits of the clock of a DW1000 begin anew
+# m, after which 32 bits of the clock of a DW1000 begin anew
+TICKS = 2.0**32 * 299792458.0 / (128 * 499.2e6)
 
 
 @pytest.mark.parametrize(

@@ -37,9 +37,8 @@ def test_in_a_hall_it_is_searched_within_reach_of_all_that_are_heard():
     positions = np.array([[0.0, 0.0, 3.0], [10.0, 0.0, 1.0], [300.0, 0.0, 3.0], [0.0, 200.0, 5.0]])
     bounds, _ = surroundings(positions, [0], [1])
     np.testing.assert_allclose(bounds[:, :2], [[-1.0, -1.0], [30.0, 30.0]])
-    bounds, _ = surroundings(
-        positions, [0], [1], reach=5.0
-    )  # they are farther apart than that: the radio reaches farther
+    # they are farther apart than that: the radio reaches farther
+    bounds, _ = surroundings(positions, [0], [1], reach=5.0)
     np.testing.assert_allclose(bounds[:, 0], [10.0 - np.hypot(10.0, 2.0), np.hypot(10.0, 2.0)])
 
 

@@ -17,9 +17,8 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.effects.base import SensorFunction
 
-MOST_ROWS = (
-    20_000  # twice as many as a message may hold: after so many changes the filter starts anew
-)
+# twice as many as a message may hold: after so many changes the filter starts anew
+MOST_ROWS = 20_000
 
 
 class AnchorTable:

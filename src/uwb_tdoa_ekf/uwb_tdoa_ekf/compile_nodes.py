@@ -105,9 +105,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     began = time.monotonic()
     warm_up()
     corrector.warm_up(EffectSet(), None)
-    corrector.warm_up(
-        EffectSet((TagLeverArm(values={"z": 0.1}),)), None
-    )  # a frame on /tf_static brings one, while the node runs
+    # a frame on /tf_static brings one, while the node runs
+    corrector.warm_up(EffectSet((TagLeverArm(values={"z": 0.1}),)), None)
     print(f"both nodes are compiled; {time.monotonic() - began:.0f} s")
     return 0
 

@@ -129,23 +129,19 @@ class EkfNode(StreamNode):
         self._estimator: Estimator = None  # type: ignore[assignment]  # until there are anchors
         self._said_restart: Finding | None = None
         self._epoch, self._ros_clock = Epoch(), cast("ROSClock", self.get_clock())
-        self._attitude: tuple[np.ndarray, np.ndarray] | None = (
-            None  # quaternion and covariance of the newest odometry
-        )
+        # quaternion and covariance of the newest odometry
+        self._attitude: tuple[np.ndarray, np.ndarray] | None = None
         self._findings: list[Finding] = []  # of the last report
         self._assumed: dict[
             str, tuple[str, ...]
         ] = {}  # parameters that count for deviations which messages do not state, by sensor
         self._fault = False  # one of these, or the use of TDOAs, makes the position wrong
         self._received_before: dict[str, int] = {}  # messages by topic, by the last report
-        self._early: deque[tuple[str, tuple[Any, ...]]] = (
-            deque()
-            # what came while there were no anchors: (stream, (frame, stamps, rows, arrivals)), one
-            # message each
-        )
-        self._past: Counter[str] = (
-            Counter()
-        )  # accounts of estimators that were replaced, and of messages that none received
+        # what came while there were no anchors: (stream, (frame, stamps, rows, arrivals)), one
+        # message each
+        self._early: deque[tuple[str, tuple[Any, ...]]] = deque()
+        # accounts of estimators that were replaced, and of messages that none received
+        self._past: Counter[str] = Counter()
         self._lately: list[
             str
         ] = []  # frames of the IMU since the last report, and the last one before it
@@ -371,10 +367,8 @@ class EkfNode(StreamNode):
         mount = self._place_imu(frame)
         if frame not in self._lately and len(self._lately) < MOST_FRAMES:
             self._lately.append(frame)
-        gyro, accel = (
-            rows["angular_velocity"].copy(),
-            rows["linear_acceleration"].copy(),
-        )  # the specific force, says REP 145
+        # the specific force, says REP 145
+        gyro, accel = (rows["angular_velocity"].copy(), rows["linear_acceleration"].copy())
         unmeasured = (rows["angular_velocity_covariance"][:, 0] == -1.0) | (
             rows["linear_acceleration_covariance"][:, 0] == -1.0
         )

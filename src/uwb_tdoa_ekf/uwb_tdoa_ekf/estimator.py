@@ -87,9 +87,8 @@ class Estimator:
         names = [*VERDICTS.values(), "imu_used", "imu_late", "imu_invalid", "restarts", *of_aids]
         self.counts = dict.fromkeys(names, 0)
         self._refused: list[Residuals] = []
-        self._sensed = np.empty(
-            0, IMU_SAMPLE
-        )  # the inertial samples that were used last, and RATE_SAMPLES before them
+        # the inertial samples that were used last, and RATE_SAMPLES before them
+        self._sensed = np.empty(0, IMU_SAMPLE)
         self._wheels = np.empty(0, AID)  # yaw rates of wheels that were used last
         self._buffer = ReorderBuffer(
             reorder, lag, self.config.use_imu, self._refuse, self._start_anew
@@ -102,10 +101,8 @@ class Estimator:
         self._pipeline = Pipeline(self._anchor_table, self.config, self._effects)
         self._poses: list[np.ndarray] = []  # (1,) of POSE, set and not reached yet
         self._begun = False  # there was a measurement
-        self.refused_pose: str | None = (
-            # sentence on a pose that was set before the first measurement, and is of another time
-            None
-        )
+        # sentence on a pose that was set before the first measurement, and is of another time
+        self.refused_pose: str | None = None
 
     @property
     def anchors(self) -> Anchors:

@@ -148,9 +148,8 @@ def _fill(
                 twist[n, 6 + 6 * i + j] = covariance[n, 6 + i, 6 + j]
 
 
-SLOW = (
-    0.02  # s; angular acceleration is the slope of the rate after a low pass of this time constant
-)
+# s; angular acceleration is the slope of the rate after a low pass of this time constant
+SLOW = 0.02
 LONGEST_STEP = 0.1  # s between samples, above which there is no slope
 
 
@@ -166,9 +165,8 @@ class ImuMount:
         self._matrix, self._arm = rotation.as_matrix(), np.asarray(arm, dtype=float)
         self._centred = not self._arm.any()
         self._t: float | None = None
-        self._slow: np.ndarray = np.zeros(
-            3
-        )  # s, stamp of the last sample, and slow part of its rate, rad/s
+        # s, stamp of the last sample, and slow part of its rate, rad/s
+        self._slow: np.ndarray = np.zeros(3)
 
     def __eq__(self, other: object) -> bool:
         """Whether it sits in the same place."""

@@ -72,10 +72,8 @@ WHO = {
     "SYSTEM_DEFAULT": "whom the settings of the middleware let through",
 }
 AUTO = "auto"  # processes: one for each core
-FIRST, LONGEST = (
-    1.0,
-    30.0,
-)  # s, until a node that has crashed is started again: twice as long each time
+# s, until a node that has crashed is started again: twice as long each time
+FIRST, LONGEST = (1.0, 30.0)
 SOUND = 60.0  # s; a node that lived for so long has crashed for the first time again
 ENDING = signal.SIGINT, signal.SIGTERM
 REFUSED = 2  # exit code of a node that cannot use what it is given

@@ -52,10 +52,8 @@ PARAMETERS = {
     "frozen": FROZEN,
 }
 OF_PROCESS = "__ns", "__node", "__name"  # of this node, not of all
-FIRST, LONGEST = (
-    1.0,
-    30.0,
-)  # s, until the nodes of a tag that have failed are started again: twice as long each time
+# s, until the nodes of a tag that have failed are started again: twice as long each time
+FIRST, LONGEST = (1.0, 30.0)
 SOUND = 60.0  # s; nodes that lived for so long have failed for the first time again
 
 

@@ -29,9 +29,8 @@ if TYPE_CHECKING:
 
     from .pipeline import PipelineOutput
 
-RECORDED_AT_ONCE = (
-    256  # TDOAs that are used together while a history is recorded: its room is for the worst case
-)
+# TDOAs that are used together while a history is recorded: its room is for the worst case
+RECORDED_AT_ONCE = 256
 
 
 @dataclass(frozen=True)
@@ -216,9 +215,8 @@ def _batches(
     """
     known = np.flatnonzero((a >= 0) & (b >= 0) & np.isfinite(d) & np.isfinite(t))
     if not (np.diff(t[known]) > 0.0).all():
-        known = known[
-            np.lexsort((d[known], b[known], a[known], t[known]))
-        ]  # siblings of one stamp as on line
+        # siblings of one stamp as on line
+        known = known[np.lexsort((d[known], b[known], a[known], t[known]))]
     stamps, lag, first = t[known], math.inf if corrector.idle else corrector.lag, 0
     for number, bound in enumerate([*sorted(restarts), math.inf]):
         last, anew = int(np.searchsorted(stamps, bound)), number > 0

@@ -83,15 +83,13 @@ class Outputs:
         """
         self._epoch, self._frames, self._body, self._planar = epoch, frames, body, planar
         self._odom = odom if publish_tf == ODOM else None
-        self.published = self._unplaced = (
-            0  # messages; those in a row for which /tf had no odom -> body
-        )
+        # messages; those in a row for which /tf had no odom -> body
+        self.published = self._unplaced = 0
         self._placed = False  # a transform was published
         self._wires = CdrCodec(Odometry, *ODOMETRY), CdrCodec(TdoaResidual, *RESIDUAL)
         self._transform = TransformStamped(child_frame_id=self._odom or body)
-        self._tf = TFMessage(
-            transforms=[self._transform]
-        )  # one for all: what is published is copied
+        # one for all: what is published is copied
+        self._tf = TFMessage(transforms=[self._transform])
         self.stamp = Time()  # of the newest odometry
         self.set_world("")
         self.odometry = StreamOutput(node, Odometry, "odometry")

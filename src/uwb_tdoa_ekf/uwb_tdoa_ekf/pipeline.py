@@ -52,9 +52,8 @@ class RadioCorrections:
             kind: Corrector(anchor_table.anchors, mine) for kind, mine in acting if len(mine)
         }
         self._anchor_table, self._slice, self._start = anchor_table, -math.inf, math.nan
-        self._pose = self._latest = (
-            _NOWHERE  # (1,) of ODOMETRY, of which nothing is computed before there are distances
-        )
+        # (1,) of ODOMETRY, of which nothing is computed before there are distances
+        self._pose = self._latest = _NOWHERE
         self._together = False  # whether the last part may hold several slices
 
     @property
@@ -208,9 +207,8 @@ class Pipeline:
         """
         parts = []
         while self._config.compensate_changes and self.monitor is not None and len(buffer):
-            end = min(
-                self.monitor.end, (math.floor(buffer.first / LENGTH) + 1.0) * LENGTH
-            )  # the first slice begins with the first TDOA
+            # the first slice begins with the first TDOA
+            end = min(self.monitor.end, (math.floor(buffer.first / LENGTH) + 1.0) * LENGTH)
             if end > until:
                 break
             parts += self._feed(buffer.take(math.nextafter(end, -math.inf)))

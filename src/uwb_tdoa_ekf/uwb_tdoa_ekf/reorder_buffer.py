@@ -26,18 +26,14 @@ if TYPE_CHECKING:
 STREAMS = "imu", "tdoa", *aids.STREAMS
 KINDS = IMU_SAMPLE, TDOA, *[AID] * len(aids.STREAMS)
 IMU_STREAM, TDOA_STREAM, FIRST_AID = range(3)  # places in STREAMS
-LOCATING_STREAMS = (
-    TDOA_STREAM,
-    *map(STREAMS.index, LOCATING),
-)  # one of these is the reference: its stamps are the time
+# one of these is the reference: its stamps are the time
+LOCATING_STREAMS = (TDOA_STREAM, *map(STREAMS.index, LOCATING))
 VELOCITY_STREAM = STREAMS.index("velocity")
 ROOM = 256  # rows of a stream, to begin with
-MOST_WAITING = (
-    2000  # messages of a stream: 2 s at 1 kHz; of one that stands still the first ones leave
-)
-LATELY = (
-    2.0  # s of stamps for which a stream counts as ahead after a row of it was refused for that
-)
+# messages of a stream: 2 s at 1 kHz; of one that stands still the first ones leave
+MOST_WAITING = 2000
+# s of stamps for which a stream counts as ahead after a row of it was refused for that
+LATELY = 2.0
 SILENT = 1.0  # s of stamps after which a stream is not waited for any more, until it is back
 # share of `lag` for which sensors are waited for: bias_node's `hold` must outlast that by far
 OF_AIDS = 0.5
@@ -94,9 +90,8 @@ class ReorderBuffer:
         """
         self.reorder, self.lag = reorder, lag
         self._awaited = TDOA_STREAM, *([IMU_STREAM] if use_imu else [])
-        self._moving = (
-            IMU_STREAM if use_imu else VELOCITY_STREAM
-        )  # by which time goes on while nothing locates
+        # by which time goes on while nothing locates
+        self._moving = IMU_STREAM if use_imu else VELOCITY_STREAM
         self._leading = self._moving, *LOCATING_STREAMS
         self._refuse, self._restart = refuse, restart
         self.clear()
@@ -111,9 +106,8 @@ class ReorderBuffer:
         self._streams = [_Stream(kind) for kind in KINDS]
         self._reference = TDOA_STREAM
         self.began = math.inf  # s, stamp of the first row of a leading stream
-        self._overtaken: tuple[float, float] | None = (
-            None  # s: stamps of the first reference row that is overtaken, and of the IMU then
-        )
+        # s: stamps of the first reference row that is overtaken, and of the IMU then
+        self._overtaken: tuple[float, float] | None = None
         self.used_until = -math.inf  # s, stamp of the last row that was taken
 
     def __len__(self) -> int:

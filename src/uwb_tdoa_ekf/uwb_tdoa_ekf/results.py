@@ -96,9 +96,8 @@ class Odometry:
         return len(self.t)
 
 
-Arrays = TypeVar(
-    "Arrays", bound=Sized
-)  # a dataclass of arrays of one length: Odometry, Residuals, a stream of a Flight
+# a dataclass of arrays of one length: Odometry, Residuals, a stream of a Flight
+Arrays = TypeVar("Arrays", bound=Sized)
 
 
 def rows_of(part: Arrays, rows: np.ndarray | slice) -> Arrays:

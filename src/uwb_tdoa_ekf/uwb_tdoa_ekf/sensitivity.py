@@ -34,14 +34,11 @@ if TYPE_CHECKING:
 
     from uwb_tdoa_bias.common.flight import Flight
 
-TDOAS, RANGES = (
-    "tdoa",
-    "range",
-)  # streams: that of TDOAs, which is none of the SENSORS, and that of ranges
+# streams: that of TDOAs, which is none of the SENSORS, and that of ranges
+TDOAS, RANGES = ("tdoa", "range")
 NEEDED = "t", "kind", "transition", "row", "gain", "innovation"  # of a record of the history
-FORGOTTEN = (
-    10.0  # s after which a parameter that no measurement depends on any more has left the estimate
-)
+# s after which a parameter that no measurement depends on any more has left the estimate
+FORGOTTEN = 10.0
 
 
 @dataclass(frozen=True, eq=False)

@@ -181,10 +181,8 @@ def _through_update(record: Record, adjoint: np.ndarray, information: np.ndarray
     for j in range(ERROR_STATES):
         for k in range(ERROR_STATES):
             information_gain[j] += information[j, k] * gain[k]
-    along, across = (
-        record.innovation / record.variance,
-        1.0 / record.variance,
-    )  # K' lambda + y / S, K' Lambda K + 1 / S
+    # K' lambda + y / S, K' Lambda K + 1 / S
+    along, across = (record.innovation / record.variance, 1.0 / record.variance)
     for k in range(ERROR_STATES):
         along += gain[k] * adjoint[k]
         across += gain[k] * information_gain[k]

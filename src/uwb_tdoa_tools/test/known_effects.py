@@ -80,10 +80,8 @@ SIZES = {
 AIDED = tuple(
     name for name in SIZES if set(EFFECTS[name].channels) <= set(BY_POSE)
 )  # effects on height, pressure, velocity, yaw rate
-RANGED = (
-    "range_offset",
-    "range_delay",
-)  # effects on ranges alone, of which `study diagnose-ranges` tells
+# effects on ranges alone, of which `study diagnose-ranges` tells
+RANGED = ("range_offset", "range_delay")
 MARK_TIME, MARK_STD = 2.0, 0.05  # s, m
 NOISES = {"height_noise": 0.01, "pressure_noise": 0.1, "velocity_noise": 0.05}
 YAW_RATE_NOISE = 0.02  # rad/s
@@ -170,10 +168,8 @@ def normalised(flight, std, seed):
         for row, i in enumerate(flight.anchors.ids)
         for k, axis in enumerate("xyz")
     }
-    stated, alone = (
-        found.fit,
-        found.only(found.chosen).fit,
-    )  # the second is fitted anew: without the deviations that hold
+    # the second is fitted anew: without the deviations that hold
+    stated, alone = (found.fit, found.only(found.chosen).fit)
     out = {}
     for kind in ANCHORS_FOUND:
         rows = [k for k, column in enumerate(stated.columns) if column.effect == (kind,)]

@@ -12,10 +12,8 @@ from uwb_tdoa_bias.common.flight import Imu, Tdoas
 from uwb_tdoa_tools.checking.recording import IMU, TDOA
 
 MISTAKES = {}
-LATENCY, JITTER = (
-    2e-3,
-    1e-3,
-)  # s, of a message on its way, the least and the mean of what comes on top
+# s, of a message on its way, the least and the mean of what comes on top
+LATENCY, JITTER = (2e-3, 1e-3)
 
 
 @dataclass(frozen=True)

@@ -82,9 +82,8 @@ def small_flight(seconds=2.0, rate=1000, name="small"):
     truth.
     """
     rng = np.random.default_rng(7)
-    ticks = (
-        10_000_000 + np.arange(round(seconds * rate)) * 1_000_000 // rate
-    )  # us, as a log has them
+    # us, as a log has them
+    ticks = 10_000_000 + np.arange(round(seconds * rate)) * 1_000_000 // rate
     n, k, m = len(ticks), len(ticks) // 2, len(ticks) // 4
     quaternions = rng.normal(size=(m, 4))
     quaternions[0] = np.nan

@@ -264,10 +264,8 @@ def test_namespace_other_topics_and_order_of_stamps(tmp_path):
     store = typestore()
     tdoa = small_flight(0.05).tdoa
     late = list(tdoa_messages(tdoa, store))
-    late[3], late[4] = (
-        (late[3][0], late[4][1]),
-        (late[4][0], late[3][1]),
-    )  # two arrive the wrong way round
+    # two arrive the wrong way round
+    late[3], late[4] = ((late[3][0], late[4][1]), (late[4][0], late[3][1]))
     text = store.types["std_msgs/msg/String"]("hello")
     write_topics(
         tmp_path / "bag",
@@ -345,9 +343,8 @@ def test_odometry(tmp_path):
     assert len(odometry) == 2
     np.testing.assert_array_equal(odometry.t, [1.0, 2.000000001])
     np.testing.assert_array_equal(odometry.p, [[1, 2, 3], [4, 5, 6]])
-    np.testing.assert_allclose(
-        odometry.v, [[0, 1, 0], [1, 0, 0]], atol=1e-12
-    )  # turned from body to world
+    # turned from body to world
+    np.testing.assert_allclose(odometry.v, [[0, 1, 0], [1, 0, 0]], atol=1e-12)
     np.testing.assert_allclose(odometry.q[0], [0, 0, half, half])
     np.testing.assert_array_equal(odometry.covariance[0], 2 * covariance.reshape(6, 6))
     with pytest.raises(InputError, match="no message on /tag1/odometry"):

@@ -395,9 +395,8 @@ def shared_children(file, table, levels=10):
     connection.close()
     data, root = bytearray(file.read_bytes()), roots[table]
     pages, leaf = len(data) // size, bytearray(data[(root - 1) * size : root * size])
-    of_file = (
-        100 if root == 1 else 0
-    )  # bytes of the file's own header, before that of its first page
+    # bytes of the file's own header, before that of its first page
+    of_file = 100 if root == 1 else 0
     leaf[: 300 - of_file] = leaf[of_file:300]
     for level in range(levels):
         numbers = [root, *range(pages + 1, pages + levels + 1)]

@@ -88,9 +88,8 @@ def test_sensors_are_taken_to_the_body(flight, tmp_path, robot):
         (body, plate, [0.0, 0.0, -0.05], [0, 0, 0, 1]),
         (body, f"{robot}uwb", ANTENNA, [0, 0, 0, 1]),
     ]
-    other = [
-        (plate, f"{robot}imu_link", [0.1, 0.0, 0.0], TURN.as_quat())
-    ]  # from another broadcaster
+    # from another broadcaster
+    other = [(plate, f"{robot}imu_link", [0.1, 0.0, 0.0], TURN.as_quat())]
     path = mounted(flight, tmp_path / "m.bag", half, other, robot=robot)
     read = bag.read_bag(path)
     of_sensor = (TURN.inv().apply(samples) for samples in (flight.imu.gyro, flight.imu.accel))

@@ -68,9 +68,8 @@ def test_velocities_are_the_same_on_each_topic_that_the_node_hears(
     for column, expected in zip(
         read_bag(path, topics=renamed).velocity.columns, flight.velocity.columns
     ):
-        np.testing.assert_allclose(
-            column, expected, rtol=1e-15
-        )  # variances, of which messages hold the square
+        # variances, of which messages hold the square
+        np.testing.assert_allclose(column, expected, rtol=1e-15)
     recording = read_recording(Reading(topics=renamed), path)
     np.testing.assert_array_equal(recording.sensors["velocity"].v, flight.velocity.v)
     assert not list(recording_rules.odometry_unread(recording))

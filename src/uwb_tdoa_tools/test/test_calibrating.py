@@ -301,9 +301,8 @@ def test_a_rover_with_odometry_of_its_wheels_is_calibrated(tmp_path):
     found = {one.name: one for one in EffectSet.from_yaml(out / "effects.yaml").effects}
     for name in ("velocity_scale", "yaw_rate_scale"):
         assert abs(found[name].values["scale"] - 0.03) < 3.0 * found[name].std["scale"]
-    config = FilterConfig.from_yaml(
-        out / "ekf_node.yaml"
-    )  # what the printed lines start the nodes by
+    # what the printed lines start the nodes by
+    config = FilterConfig.from_yaml(out / "ekf_node.yaml")
     assert config.planar and config.fixed_height == 0.0
     told = json.loads((out / "calibration.json").read_text())
     assert told["offered"] and told["after"] < 0.8 * told["before"]

@@ -18,11 +18,8 @@ from uwb_tdoa_tools.simulation import SimulationConfig, simulate
 from uwb_tdoa_tools.simulation.rooms import constellation
 
 OTHER_ROOM = constellation("random-5")
-NOTHING_TRIED = [
-    "stamp_zero",
-    "clipped",
-    "jump",
-]  # with these, nothing but the streams themselves is judged
+# with these, nothing but the streams themselves is judged
+NOTHING_TRIED = ["stamp_zero", "clipped", "jump"]
 LONGER = {"mirrored_survey": {"duration": 30.0}}  # shows once the yaw is known
 HARMLESS = "clipped_accel"  # nothing is cut off in a smooth simulated flight
 
@@ -136,13 +133,8 @@ def test_measured_flights_and_their_mistakes(shared_data, name):
         assert rules(check(made, surveys)) & set(MISTAKES[mistake].named)
 
 
-OF_ANOTHER_ROOM = {
-    "ids_swapped",
-    "pair_sign",
-    "imu_rate_unit",
-    "imu_axes",
-    "tdoa_sign",
-}  # what it was taken for
+# what it was taken for
+OF_ANOTHER_ROOM = {"ids_swapped", "pair_sign", "imu_rate_unit", "imu_axes", "tdoa_sign"}
 
 
 def test_a_survey_of_another_room_is_named():

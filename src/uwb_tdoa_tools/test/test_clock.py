@@ -223,9 +223,8 @@ def test_a_healthy_recording_is_not_changed(rate, seed, drop, late, pauses):
     for _ in range(pauses):
         t[rng.integers(400) :] += rng.uniform(0.0, 9.0)
     t = t[rng.random(400) >= drop]
-    order = np.argsort(
-        t + rng.uniform(0.0, late, len(t)), kind="stable"
-    )  # messages overtake each other
+    # messages overtake each other
+    order = np.argsort(t + rng.uniform(0.0, late, len(t)), kind="stable")
     stamps = {"tdoa": t[order], "imu": np.arange(t[0], t[-1], 0.05)} if len(t) else {"tdoa": t}
     found = straightened(stamps)
     assert not found.shifts and not found.kept and not found.restarts and not found.jumps

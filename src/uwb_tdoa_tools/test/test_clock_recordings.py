@@ -163,9 +163,8 @@ def test_a_gap_of_any_length_takes_no_more_memory(by):
     from pathlib import Path
 
     def bound():
-        resource.setrlimit(
-            resource.RLIMIT_AS, (6 << 30, 6 << 30)
-        )  # of addresses: libraries reserve many
+        # of addresses: libraries reserve many
+        resource.setrlimit(resource.RLIMIT_AS, (6 << 30, 6 << 30))
 
     there = {
         name: value for name, value in os.environ.items() if name != "PYTHONSAFEPATH"

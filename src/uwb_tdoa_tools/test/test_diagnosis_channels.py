@@ -84,10 +84,8 @@ def test_at_rest_the_gyroscope_is_no_function_of_what_it_measures_itself():
 
 
 def test_without_attitude_the_gyroscope_is_judged_at_rest_and_the_accelerometer_not_at_all():
-    reference, flight = (
-        Nothing(),
-        clean_flight(110, 30.0),
-    )  # turns slowly, soon after it has left the floor
+    # turns slowly, soon after it has left the floor
+    reference, flight = (Nothing(), clean_flight(110, 30.0))
     parts = residuals(reference.prepare(flight), reference, EffectSet())
     assert (
         "accel" not in parts

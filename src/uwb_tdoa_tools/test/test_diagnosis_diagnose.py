@@ -113,9 +113,8 @@ def test_a_late_ground_truth_is_no_fault_of_the_robot(inertial):
 
 @pytest.mark.slow
 def test_without_inertial_sensor_the_clock_of_the_tdoas_is_left_alone():
-    late = shifted(
-        clean_flight(100, 40.0).without("imu"), "tdoa", 0.06
-    )  # too little to be seen before anything else
+    # too little to be seen before anything else
+    late = shifted(clean_flight(100, 40.0).without("imu"), "tdoa", 0.06)
     result = diagnose([late])
     assert "tdoa_time_offset" not in {effect.name for effect in result.effects}
     assert "tdoa_time_offset" in {item.effect for item in result.unobservable}

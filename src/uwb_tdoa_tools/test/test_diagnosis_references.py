@@ -102,9 +102,8 @@ def test_marks_tell_which_anchor_is_late_without_the_truth():
         for effects in (found[0].effects, EffectSet())
     )
     assert after < 0.5 * before
-    again = diagnose(
-        [flight], base=found[0].effects, reference=Marks(None, marks)
-    )  # last week's as the prior
+    # last week's as the prior
+    again = diagnose([flight], base=found[0].effects, reference=Marks(None, marks))
     assert [effect.name for effect in again.effects.effects] == [
         effect.name for effect in found[0].effects.effects
     ]

@@ -85,9 +85,8 @@ def test_a_rate_that_is_noise_explains_nothing():
     turning = np.column_stack([np.zeros(300), 0.3 * np.sin(np.linspace(0.0, 20.0, 300))])
     measured = turning + 0.01 + 1e-3 * rng.standard_normal(turning.shape)
     assert _turns(measured, turning).tolist() == [False, True]
-    noisy = turning + 0.02 * rng.standard_normal(
-        turning.shape
-    )  # the ground truth is worse than the sensor
+    # the ground truth is worse than the sensor
+    noisy = turning + 0.02 * rng.standard_normal(turning.shape)
     assert _turns(measured, noisy).tolist() == [False, True]
 
 

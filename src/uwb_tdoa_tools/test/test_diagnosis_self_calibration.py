@@ -129,12 +129,8 @@ def test_nothing_is_applied_if_something_else_is_wrong_too():
     [
         (0.1, 0.9 * LEFT, None, True),
         (0.1, 1.1 * LEFT, None, False),
-        (
-            1.2 * CLEARLY * LEFT,
-            1.1 * LEFT,
-            None,
-            True,
-        ),  # the tape was worse than what else is wrong
+        # the tape was worse than what else is wrong
+        (1.2 * CLEARLY * LEFT, 1.1 * LEFT, None, True),
         (0.1, 1.1 * LEFT, (0.2, 0.1, 0.8), True),  # marks know better
         (0.1, 0.9 * LEFT, (0.2, 0.1, 0.7), False),
         (0.1, 0.9 * LEFT, (0.1, 0.2, 0.8), False),

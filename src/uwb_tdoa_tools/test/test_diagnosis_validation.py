@@ -270,10 +270,8 @@ def test_a_gain_that_a_shift_of_the_reference_can_feign_is_none():
     assert sure[0] > 0.5 and unsure[0] < 0.0 < unsure[1]
     sides = [{"pooled": {"rmse_3d": 0.15}}, {"pooled": {"rmse_3d": 0.04, "rmse_3d_gain_ci": sure}}]
     assert why_not(*sides, 0.0) is None and why_not(*sides, 0.1) is None
-    sides[1]["pooled"]["rmse_3d_gain_ci"] = [
-        0.02,
-        0.28,
-    ]  # above zero by 2.3 standard deviations alone
+    # above zero by 2.3 standard deviations alone
+    sides[1]["pooled"]["rmse_3d_gain_ci"] = [0.02, 0.28]
     assert "may be 10 cm from where" in why_not(*sides, 0.1)
     sides[1]["pooled"]["rmse_3d_gain_ci"] = unsure
     assert "may be chance" in why_not(*sides, 0.0) and "may be 10 cm from where" in why_not(

@@ -20,10 +20,8 @@ from walking import blocks, commands, main, run
 from uwb_tdoa_bias.common.survey import read_survey
 from uwb_tdoa_bias.effects import EffectSet
 
-CHECKED = (
-    ("simulated", "in time"),
-    ("measured", "late"),
-)  # check reads no ground truth, and says the same of the others
+# check reads no ground truth, and says the same of the others
+CHECKED = (("simulated", "in time"), ("measured", "late"))
 
 
 @pytest.mark.slow

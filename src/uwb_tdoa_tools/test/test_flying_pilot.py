@@ -47,9 +47,8 @@ def test_each_command_goes_on_from_where_the_last_one_has_it(up):
     up.go_to(5.0, True, (0.5, 0.0, 0.0), 0.1, 2.0)
     np.testing.assert_allclose(up.at(np.array([7.0]))[0, 0], [0.5, 0.0, 1.5], atol=1e-9)
     assert up.yaw_offset(7.0) == pytest.approx(2.0 * math.pi - 5.9)
-    np.testing.assert_allclose(
-        up.at(np.array([1.25]))[0, 0, 2], 0.615
-    )  # the past stays what it was
+    # the past stays what it was
+    np.testing.assert_allclose(up.at(np.array([1.25]))[0, 0, 2], 0.615)
 
 
 def test_it_comes_down_and_sinks_to_wherever_the_ground_is(up):

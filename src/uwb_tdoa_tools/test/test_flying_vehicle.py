@@ -53,9 +53,8 @@ def test_a_fall_is_a_fall():
 def test_at_the_right_speed_it_hovers():
     vehicle = Vehicle()
     state, feet = flown(vehicle, aloft(vehicle), np.full(4, hovering(vehicle)), 2.0)
-    np.testing.assert_allclose(
-        state, aloft(vehicle), atol=1e-3
-    )  # the ground effect is not quite nothing
+    # the ground effect is not quite nothing
+    np.testing.assert_allclose(state, aloft(vehicle), atol=1e-3)
     assert feet == 0
 
 

@@ -51,10 +51,8 @@ def surveys(tmp_path):
         ("0422/log00", "anchor_0422.txt"),  # the folder names it
         ("backup-0422/flights/0425/traj1", "anchor_0425.txt"),  # what is said last is meant
         ("util/const1-trial1-tdoa2.csv.gz", "anchor_const1.csv"),
-        (
-            "util/const10-trial1-tdoa2.csv.gz",
-            "anchor_const10.csv",
-        ),  # the longer key is the better fit
+        # the longer key is the better fit
+        ("util/const10-trial1-tdoa2.csv.gz", "anchor_const10.csv"),
         ("util/const3-trial2-tdoa3-traj1.csv", "anchor_const3.csv"),
     ],
 )

@@ -13,12 +13,8 @@ from xml.etree import ElementTree
 import pytest
 
 SRC = Path(__file__).resolve().parents[2]
-ORDER = (
-    "uwb_tdoa_msgs",
-    "uwb_tdoa_bias",
-    "uwb_tdoa_ekf",
-    "uwb_tdoa_tools",
-)  # imports go to the left
+# imports go to the left
+ORDER = ("uwb_tdoa_msgs", "uwb_tdoa_bias", "uwb_tdoa_ekf", "uwb_tdoa_tools")
 PACKAGES = ORDER[1:]
 # Who talks ROS. Everything else can be imported and tested without it.
 ROS = """
@@ -63,12 +59,10 @@ KEYS = {
     "tqdm": ("python3-tqdm", "tqdm"),
     "yaml": ("python3-yaml", "PyYAML"),
 }
-STARTED = {
-    "uwb_tdoa_ekf": {"ros2bag", "ros2launch", "rviz2"}
-}  # by launch files, and what starts these
-RUNNERS = {
-    "python3-pytest-xdist",
-}  # of the tests, which import them not, or where they are
+# by launch files, and what starts these
+STARTED = {"uwb_tdoa_ekf": {"ros2bag", "ros2launch", "rviz2"}}
+# of the tests, which import them not, or where they are
+RUNNERS = {"python3-pytest-xdist"}
 
 
 @cache

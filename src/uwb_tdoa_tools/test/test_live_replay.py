@@ -233,9 +233,8 @@ def test_loop_starts_again_until_stopped(tmp_path, start, node):
 
 @pytest.mark.slow
 def test_clock_ticks_between_messages(tmp_path, start, node):
-    write_bag(
-        small_flight(seconds=1.0, rate=10), tmp_path / "flight.bag"
-    )  # ticks come between messages too
+    # ticks come between messages too
+    write_bag(small_flight(seconds=1.0, rate=10), tmp_path / "flight.bag")
     clock = subscribe(node, Clock, "/clock")
     start(
         "replay",

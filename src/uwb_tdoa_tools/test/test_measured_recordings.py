@@ -58,9 +58,8 @@ def test_log(path):
     assert len(flight.imu) == counts.pop("estGyroscope") == counts.pop("estAcceleration") > 30_000
     assert len(flight.truth) == counts.pop("estPose") > 8000
     assert len(flight.height or ()) == counts.pop("estTOF", 0)
-    readings = len(
-        flight.pressure or ()
-    )  # the log repeats each of them, up to a thousand times a second
+    # the log repeats each of them, up to a thousand times a second
+    readings = len(flight.pressure or ())
     assert (readings > 500) == (counts.pop("estBarometer", 0) > 0)
     pixel_counts, velocities = (
         counts.pop("estFlow", 0),

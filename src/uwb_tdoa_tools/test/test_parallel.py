@@ -275,9 +275,8 @@ def test_progress_shows_the_work_and_its_share(often):
 
 
 def test_short_work_prints_no_progress(monkeypatch):
-    monkeypatch.setattr(
-        parallel, "FIRST", 600.0
-    )  # beside which it is short on a loaded machine, too
+    # beside which it is short on a loaded machine, too
+    monkeypatch.setattr(parallel, "FIRST", 600.0)
     lines = Lines(1)
     with Progress("weigh", stream=lines):
         pass

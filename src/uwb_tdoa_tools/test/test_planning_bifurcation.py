@@ -57,9 +57,8 @@ def test_the_order_of_the_anchors_does_not_matter(dimensions):
 @given(st.integers(0, 10**6), st.sampled_from([2, 3]))
 def test_a_mirrored_position_has_the_same_tdoas(seed, dimensions):
     rng = np.random.default_rng(seed)
-    anchors = Anchors.from_positions(
-        rng.uniform([-4, -4, 0], [4, 4, 3], (dimensions + 1, 3))
-    )  # of any heights
+    # of any heights
+    anchors = Anchors.from_positions(rng.uniform([-4, -4, 0], [4, 4, 3], (dimensions + 1, 3)))
     try:
         subsets = Subsets(anchors, dimensions)
     except InputError:
@@ -123,11 +122,8 @@ def test_brute_force_agrees_in_space():
 @pytest.mark.slow
 def test_brute_force_agrees_on_a_whole_grid():
     for anchors, dimensions, grid in (
-        (
-            SQUARE,
-            2,
-            Grid.slice((-1, 5), (-1, 5), 0.2, 0.2),
-        ),  # with the diagonals, on which two solutions meet in one
+        # with the diagonals, on which two solutions meet in one
+        (SQUARE, 2, Grid.slice((-1, 5), (-1, 5), 0.2, 0.2)),
         (corners(), 3, Grid.box((-4, -4.5, -0.5), (4, 4.5, 3.5), 1.5)),
     ):
         unique, agrees, points, _ = brute_force(Installation(anchors, dimensions=dimensions), grid)

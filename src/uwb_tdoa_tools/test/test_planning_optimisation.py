@@ -192,9 +192,8 @@ def test_a_descent_goes_down_and_stays_in_bounds(objective):
 
 def test_anchors_that_locate_nothing_have_no_slopes():
     goal, layout, x = case()
-    low = Layout(
-        AnchorPlaces([[0, 0, 1, 6, 5, 1]]), 6, None, np.zeros(3)
-    )  # all in one plane, with the points beside it
+    # all in one plane, with the points beside it
+    low = Layout(AnchorPlaces([[0, 0, 1, 6, 5, 1]]), 6, None, np.zeros(3))
     x, points = low.start(np.random.default_rng(0).random((6, 2))), POINTS * [1, 1, 0] + [0, 0, 1]
     errors, slopes = errors_and_slopes(goal, low, x, points)
     assert (errors == UNUSABLE).all() and not slopes.any()
@@ -210,9 +209,8 @@ def test_a_descent_leaves_a_start_at_which_the_goal_cannot_be_told(objective):
     began.
     """
     goal, layout, x = case(objective=objective)
-    level = np.column_stack(
-        [np.linspace(0.05, 0.95, 6), np.full(6, 0.5)]
-    )  # round the walls, half-way up
+    # round the walls, half-way up
+    level = np.column_stack([np.linspace(0.05, 0.95, 6), np.full(6, 0.5)])
     x = layout.start(level)
     goal = replace(goal, points=POINTS * [1, 1, 0] + [0, 0, 1.5])
     with pytest.raises(InputError):
@@ -315,10 +313,8 @@ def test_no_layout_at_all():
         optimise(aim, AnchorPlaces([[0, 0, 1, 6, 5, 1]]), 5, starts=2)
 
 
-FLIGHTS = (
-    (-1.6, -1.6, 0.3),
-    (1.6, 1.6, 2.1),
-)  # what holds all that was flown higher than 0.3 m on 0422, 0425 and 0426
+# what holds all that was flown higher than 0.3 m on 0422, 0425 and 0426
+FLIGHTS = ((-1.6, -1.6, 0.3), (1.6, 1.6, 2.1))
 
 
 @pytest.mark.parametrize("where", ["shared flights", "room"])

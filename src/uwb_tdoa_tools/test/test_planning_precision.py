@@ -47,9 +47,8 @@ from uwb_tdoa_tools.simulation.rooms import constellation, corners, facing
 from uwb_tdoa_tools.simulation.tdoas import make_schedule
 
 SQUARE = facing([[0, 0, 0.2], [4, 0, 0.2], [4, 4, 0.2], [0, 4, 0.2]], (2, 2, 0.2))
-NOISY = RadioNoise(
-    tx_power_dbm=-38.0, full_strength=0.1
-)  # metres of noise: the second term of eq. 1 counts
+# metres of noise: the second term of eq. 1 counts
+NOISY = RadioNoise(tx_power_dbm=-38.0, full_strength=0.1)
 PLACES = np.array([[0.4, -0.7, 1.3], [2.9, 3.1, 0.8], [-3.0, 1.0, 2.2], [3.2, 3.6, 0.5]])
 
 
@@ -105,9 +104,8 @@ CASES = {
 def test_information_is_the_curvature_of_the_likelihood(case, dimensions):
     make, link_std = CASES[case]
     installation = Installation(corners(), NOISY, make(8), link_std, dimensions)
-    pairing = (
-        without(ring(8), 3) if case == "ring" else installation.pairing
-    )  # the closed ring has no density
+    # the closed ring has no density
+    pairing = without(ring(8), 3) if case == "ring" else installation.pairing
     got = information(PLACES, installation)
     for point, matrix in zip(PLACES, got):
         wanted = numerical_information(point, installation, pairing)
@@ -351,9 +349,8 @@ def test_what_measured_tdoas_share(shared_data, name):
     noise = np.full(len(t), np.nan)
     for pair in set(zip(a.tolist(), b.tolist())):
         rows = np.flatnonzero((a == pair[0]) & (b == pair[1]))
-        noise[rows] = residual[rows] - median_filter(
-            residual[rows], 31
-        )  # without what lasts longer than about 0.5 s
+        # without what lasts longer than about 0.5 s
+        noise[rows] = residual[rows] - median_filter(residual[rows], 31)
     noise[np.abs(noise) > 0.4] = np.nan
 
     def correlation(lag):
@@ -425,9 +422,8 @@ def test_a_map_shows_bias_and_scatter_where_they_are():
     found = accuracy_map(samples(), INSTALLATION, grid)
     assert found.count.sum() == 4000 and found.count.min() > 200
     np.testing.assert_allclose(found.bias, np.tile(BIAS, (16, 1)), atol=0.015)
-    np.testing.assert_allclose(
-        np.sqrt(found.rmse**2 - found.bias**2), found.bound, rtol=0.15
-    )  # eq. 22 of Grasso et al.
+    # eq. 22 of Grasso et al.
+    np.testing.assert_allclose(np.sqrt(found.rmse**2 - found.bias**2), found.bound, rtol=0.15)
     np.testing.assert_allclose(found.claimed, 2.0 * found.bound, rtol=1e-9)
 
 

@@ -174,6 +174,5 @@ def test_height_pressure_and_velocity_are_true_without_noise_and_noisy_as_told()
     assert np.std(noisy.velocity.v - exact.velocity.v) == pytest.approx(0.05, rel=0.1)
     assert (noisy.velocity.std == 0.05).all() and (exact.velocity.std > 0.0).all()
     assert plain.height is None and plain.pressure is None and plain.velocity is None
-    np.testing.assert_array_equal(
-        noisy.tdoa.d, plain.tdoa.d
-    )  # every part draws from its own stream
+    # every part draws from its own stream
+    np.testing.assert_array_equal(noisy.tdoa.d, plain.tdoa.d)

@@ -43,17 +43,15 @@ def test_initial_bias_has_the_configured_spread():
     only_bias = replace(NO_IMU_ERRORS, gyro_bias=0.01, accel_bias=0.1)
     start = [errors_of(only_bias, seed=k, duration=1.0, start_in_air=True)[:2] for k in range(20)]
     for values, spread in zip(zip(*start), (0.01, 0.1)):
-        np.testing.assert_allclose(
-            np.ptp(values, axis=1), 0.0, atol=1e-12
-        )  # constant over each flight
+        # constant over each flight
+        np.testing.assert_allclose(np.ptp(values, axis=1), 0.0, atol=1e-12)
         assert np.std([v[0] for v in values]) == pytest.approx(spread, rel=0.3)
 
 
 def test_vibration_only_while_the_motors_turn():
     gyro, accel, flight = errors_of(replace(NO_IMU_ERRORS, vibration=2.0))
-    flying = (flight.imu.t >= 2.5) & (
-        flight.imu.t <= 27.5
-    )  # half a second before take-off and after landing
+    # half a second before take-off and after landing
+    flying = (flight.imu.t >= 2.5) & (flight.imu.t <= 27.5)
     assert accel[flying].std() == pytest.approx(2.0, rel=0.02)
     np.testing.assert_array_equal(accel[~flying], 0.0)
     np.testing.assert_array_equal(gyro, 0.0)

@@ -154,9 +154,8 @@ def test_without_errors_a_moving_tag_too():
         for ids in (flight.tdoa.a, flight.tdoa.b)
     )
     inside = flight.tdoa.t >= truth.t[0]
-    np.testing.assert_allclose(
-        flight.tdoa.d[inside], tdoa(p, a, b)[inside], atol=1e-8
-    )  # linear within 0.1 ms
+    # linear within 0.1 ms
+    np.testing.assert_allclose(flight.tdoa.d[inside], tdoa(p, a, b)[inside], atol=1e-8)
     for name in ("bias", "multipath", "noise", "outlier"):
         np.testing.assert_array_equal(parts[name], 0.0)
 

@@ -203,9 +203,8 @@ def test_rates_and_forces_are_those_of_the_motion(vehicle, trajectory, seed, spe
     t, h = np.linspace(0.1, 39.9, 2003), 1e-3
     before, here, after = (motion(t + k * h) for k in (-1, 0, 1))
     np.testing.assert_allclose((after.p - before.p) / (2 * h), here.v, atol=1e-4)
-    np.testing.assert_allclose(
-        (after.v - before.v) / (2 * h), here.a, atol=2e-2
-    )  # of a cubic, whose second derivative has corners
+    # of a cubic, whose second derivative has corners
+    np.testing.assert_allclose((after.v - before.v) / (2 * h), here.a, atol=2e-2)
     turned = (Rotation.from_quat(before.q).inv() * Rotation.from_quat(after.q)).as_rotvec() / (
         2 * h
     )

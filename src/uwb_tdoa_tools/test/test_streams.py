@@ -95,9 +95,8 @@ def test_pixel_counts_become_the_velocity_that_made_them(flight):
     air = (made.t > first + 0.5) & (made.t < last - 0.5)
     true = aid_samples("velocity", made.t[air], Track(flight.truth)).reading
     assert np.isinf(made.std[:, 2]).all() and np.isfinite(made.std[:, :2]).all()
-    error = np.sqrt(
-        np.mean((made.v[air, :2] - true[:, :2]) ** 2, axis=0)
-    )  # of ranges with 1 cm of noise
+    # of ranges with 1 cm of noise
+    error = np.sqrt(np.mean((made.v[air, :2] - true[:, :2]) ** 2, axis=0))
     assert (np.std(true[:, :2], axis=0) > 0.2).all() and (error < 0.015).all()
 
 

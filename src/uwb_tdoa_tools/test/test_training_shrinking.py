@@ -26,10 +26,8 @@ def errors(*ratios):
     [
         ([(1.0, 0.8, 0.7, 0.6), (1.0, 0.8, 0.7, 0.6)], 1.0),  # all gain
         ([(1.0, 1.0, 1.1, 1.2), (1.0, 1.1, 1.1, 1.1)], 0.0),  # none gains
-        (
-            [(1.0, 0.8, 0.7, 0.6), (1.0, 0.96, 1.0, 1.15)],
-            0.5,
-        ),  # the mean alone would take all but the last bit
+        # the mean alone would take all but the last bit
+        ([(1.0, 0.8, 0.7, 0.6), (1.0, 0.96, 1.0, 1.15)], 0.5),
     ],
 )
 def test_takes_what_gains_without_harm(ratios, share):

@@ -34,9 +34,8 @@ def test_streams_units_and_stamps(read):
     np.testing.assert_array_equal(flight.tdoa.a, [0, 1])
     np.testing.assert_array_equal(flight.tdoa.b, [1, 5])
     np.testing.assert_array_equal(flight.tdoa.d, [1.25, -0.5])
-    np.testing.assert_array_equal(
-        flight.imu.t, [1.0, 1.001, 1.002]
-    )  # the accelerometer's 20 us later belong to these
+    # the accelerometer's 20 us later belong to these
+    np.testing.assert_array_equal(flight.imu.t, [1.0, 1.001, 1.002])
     np.testing.assert_allclose(
         flight.imu.gyro, np.pi * np.array([[1, 0, -0.5], [0, 0.5, 0], [0, 0, 0.25]])
     )
@@ -76,9 +75,8 @@ def with_candidates(*but):
 def test_selected_candidates_have_the_other_sign(read):
     flight = read(with_candidates("estTDOA"))
     np.testing.assert_array_equal(flight.tdoa.t, [1.0005, 1.0025])
-    signs = np.where(
-        flight.tdoa.a == [0, 1], 1.0, -1.0
-    )  # the pair may come in either order, with its sign
+    # the pair may come in either order, with its sign
+    signs = np.where(flight.tdoa.a == [0, 1], 1.0, -1.0)
     np.testing.assert_array_equal(np.sort([flight.tdoa.a, flight.tdoa.b], axis=0), [[0, 1], [1, 5]])
     np.testing.assert_array_equal(signs * flight.tdoa.d, [1.25, -0.5])
     assert "estTdoaCand" not in flight.extra
@@ -102,9 +100,8 @@ def test_range_finder_and_barometer_in_si_units_one_row_for_each_reading(read):
     flight = read(log_bytes())
     np.testing.assert_array_equal(flight.height.t, [1.0012, 1.0013])
     np.testing.assert_array_equal(flight.height.range, [1.25, np.inf])  # 32767 mm: nothing in sight
-    np.testing.assert_array_equal(
-        flight.pressure.t, [1.0014, 1.0015]
-    )  # that of 1.00152 repeats the one before
+    # that of 1.00152 repeats the one before
+    np.testing.assert_array_equal(flight.pressure.t, [1.0014, 1.0015])
     np.testing.assert_allclose(
         flight.pressure.pressure, [101325.0, 101325.0 - 12.013 * 101.5], atol=6.0
     )  # 12 Pa/m
@@ -122,9 +119,8 @@ def test_lost_accelerometer_event_is_interpolated(read):
     rows = [row for row in ROWS if row[:2] != ("estAcceleration", 1_001_020)]
     flight = read(log_bytes(rows))
     assert flight.meta["imu_accel_interpolated"]
-    np.testing.assert_array_equal(
-        flight.imu.t, [1.001, 1.002]
-    )  # before the first accelerometer sample there is none
+    # before the first accelerometer sample there is none
+    np.testing.assert_array_equal(flight.imu.t, [1.001, 1.002])
     np.testing.assert_allclose(
         flight.imu.accel[0], 9.81 * np.array([0.49, 0.5 - 0.245, 1.0]), rtol=1e-6
     )

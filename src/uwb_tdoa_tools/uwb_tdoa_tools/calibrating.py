@@ -40,9 +40,8 @@ MISFIT = "survey_misfit"
 LARGEST_SHIFT = 3.0
 # smallest ratio of the slow innovations before and after, on hold-out data without ground truth
 SMALLEST_RATIO = 1.5
-FITTED_SHARE = (
-    2.0 / 3.0
-)  # share of the last flight that is fitted without a hold-out flight; the rest validates
+# share of the last flight that is fitted without a hold-out flight; the rest validates
+FITTED_SHARE = 2.0 / 3.0
 SECONDS = 60.0  # of a flight that are looked at
 SMALLEST_EXTENT = 0.25  # smallest extent of a path along an axis, relative to the anchors
 SMALLEST_IMPROVED_SHARE = 0.5  # share of the coordinates that must improve

@@ -122,9 +122,8 @@ class Evaluator:
         }
         score, truth = scores[self.align], truths[self.align]
         if truth_findings or (score.row()["diverged"] and not score.row()["late_start"]):
-            causes = self._anchor_findings(
-                flight
-            )  # ids and anchors first: the truth is measured better
+            # ids and anchors first: the truth is measured better
+            causes = self._anchor_findings(flight)
             report_remarks(
                 flight.name,
                 [one for one in causes or truth_findings if one not in survey_sentences],

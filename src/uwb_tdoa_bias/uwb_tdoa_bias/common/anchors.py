@@ -19,13 +19,11 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
 SAME_PLACE = 0.01  # m; an anchor that is sent again with less of a change is at the same place
-CONSTELLATION = (
-    0.1  # m within which each anchor must stand, for what was made for others to hold for these
-)
+# m within which each anchor must stand, for what was made for others to hold for these
+CONSTELLATION = 0.1
 MOST = 10_000  # anchors, as many as a message holds
-FARTHEST = (
-    1e8  # m along each axis: grid coordinates of a country fit, and their squares do not overflow
-)
+# m along each axis: grid coordinates of a country fit, and their squares do not overflow
+FARTHEST = 1e8
 
 
 @dataclass(frozen=True)

@@ -55,9 +55,8 @@ def leave_present_folder_out() -> None:
     present folder is no library, module, program or setting of any. To be called before rclpy is
     imported. A folder of recordings may hold anything.
     """
-    os.environ["SKIP_DEFAULT_XML_FILE"] = (
-        "1"  # or Fast DDS reads DEFAULT_FASTRTPS_PROFILES.xml there
-    )
+    # or Fast DDS reads DEFAULT_FASTRTPS_PROFILES.xml there
+    os.environ["SKIP_DEFAULT_XML_FILE"] = "1"
     for name in PATHS:
         entries = os.environ.get(name, "").split(os.pathsep)
         others = [entry for entry in entries if entry not in ("", ".")]

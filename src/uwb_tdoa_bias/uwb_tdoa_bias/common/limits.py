@@ -38,10 +38,8 @@ MAP_MARKERS = 5_000  # of a position bias map: memory takes their number squared
 NAME_LENGTH = 100  # characters of a flight, a model, ...
 LINE_LENGTH = 2_000  # characters of a sentence that is printed or logged
 
-USD_TYPES, USD_VARIABLES = (
-    1_000,
-    10_000,
-)  # of a micro-SD log: event types, and variables of all of them; the firmware has some 20 and 100
+# of a micro-SD log: event types, and variables of all of them; the firmware has some 20 and 100
+USD_TYPES, USD_VARIABLES = (1_000, 10_000)
 FOLDER_ENTRIES, FOLDER_DEPTH = 100_000, 20  # that are looked at for recordings
 
 # YAML.
@@ -59,9 +57,8 @@ MODEL_NODES = 2_000
 CHUNK_BYTES = 256 << 20  # of MCAP, unpacked; rosbag2 makes chunks of 0.75 MB
 MESSAGE_BYTES = 64 << 20  # of any topic: an image, a cloud of points
 READ_BYTES = 2 << 20  # of a message that is taken apart: 10 000 anchors
-DEFINITION_BYTES = (
-    64 << 10
-)  # of the text that defines a message type; those of ROS have up to 15 kB
+# of the text that defines a message type; those of ROS have up to 15 kB
+DEFINITION_BYTES = 64 << 10
 FILE_BYTES = 8 << 30  # of all data files that are unpacked
 UNPACKED_FREE, UNPACKED_RATIO = 16 << 20, 100  # see `most_unpacked`
 

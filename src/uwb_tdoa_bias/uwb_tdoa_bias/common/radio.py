@@ -31,48 +31,12 @@ if TYPE_CHECKING:
 # the upright module, two nulls of unequal depth along its axis, the deeper one where the board is
 # in the way), at the
 # level that Decawave's support quotes for the upright module (-2 to -5 dB).
-DWM1000_AZIMUTH = (
-    -2.0,
-    -2.2,
-    -3.0,
-    -4.0,
-    -3.6,
-    -2.8,
-    -3.0,
-    -4.2,
-    -5.0,
-    -4.4,
-    -3.2,
-    -2.3,
-)  # from +x through +y
-DWM1000_ELEVATION_1 = (
-    -2.0,
-    -2.5,
-    -5.0,
-    -11.0,
-    -6.5,
-    -3.5,
-    -3.0,
-    -4.5,
-    -9.0,
-    -20.0,
-    -8.0,
-    -3.0,
-)  # from +x through +z
-DWM1000_ELEVATION_2 = (
-    -4.0,
-    -3.5,
-    -5.5,
-    -11.0,
-    -7.0,
-    -5.0,
-    -4.4,
-    -5.5,
-    -10.0,
-    -20.0,
-    -9.0,
-    -5.0,
-)  # from +y through +z
+# from +x through +y
+DWM1000_AZIMUTH = (-2.0, -2.2, -3.0, -4.0, -3.6, -2.8, -3.0, -4.2, -5.0, -4.4, -3.2, -2.3)
+# from +x through +z
+DWM1000_ELEVATION_1 = (-2.0, -2.5, -5.0, -11.0, -6.5, -3.5, -3.0, -4.5, -9.0, -20.0, -8.0, -3.0)
+# from +y through +z
+DWM1000_ELEVATION_2 = (-4.0, -3.5, -5.5, -11.0, -7.0, -5.0, -4.4, -5.5, -10.0, -20.0, -9.0, -5.0)
 LARGEST_GAIN = 200.0  # dB, in magnitude; more is a mistake
 
 

@@ -155,10 +155,8 @@ _IMPLICIT = {
         r"yes|Yes|YES|no|No|NO|true|True|TRUE|false|False|FALSE|on|On|ON|off|Off|OFF",
         "yYnNtTfFoO",
     ),
-    "int": (
-        r"[-+]?(0|[1-9][0-9]*)",
-        "-+0123456789",
-    ),  # 010 is a text, or it would be 8 to some and 10 to others
+    # 010 is a text, or it would be 8 to some and 10 to others
+    "int": (r"[-+]?(0|[1-9][0-9]*)", "-+0123456789"),
     "float": (
         r"[-+]?(\.[0-9]+|(0|[1-9][0-9]*)(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
         "-+.0123456789",

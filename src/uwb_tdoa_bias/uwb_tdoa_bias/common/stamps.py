@@ -10,13 +10,10 @@ from .compiled import compiled
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-LARGEST_STEP_BACK = (
-    1.0  # s behind the newest stamp of a stream; messages of one clock are not out of order by more
-)
-STEP_AHEAD, LARGEST_STEP_AHEAD = (
-    0.25,
-    2.0,
-)  # s ahead of the newest stamp, that any stream and that a slow one may go at once
+# s behind the newest stamp of a stream; messages of one clock are not out of order by more
+LARGEST_STEP_BACK = 1.0
+# s ahead of the newest stamp, that any stream and that a slow one may go at once
+STEP_AHEAD, LARGEST_STEP_AHEAD = (0.25, 2.0)
 # times the usual step of a stream, that it may go at once; one lost message is twice, three are
 # four times
 USUAL = 4.0

@@ -39,16 +39,8 @@ IDS = (
     "index",
 )
 LENGTHS = {"": 1.0, "m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "ft": 0.3048, "in": 0.0254}  # m
-NESTED = (
-    "position",
-    "pos",
-    "pose",
-    "translation",
-    "location",
-    "coordinates",
-    "xyz",
-    "point",
-)  # keys that hold a position
+# keys that hold a position
+NESTED = ("position", "pos", "pose", "translation", "location", "coordinates", "xyz", "point")
 TURNED = ("orientation", "rotation", "quaternion")
 _UNIT = re.compile(
     r"^(.*?)[ (\[]+(m|dm|cm|mm|ft|in|metres|meters|metre|meter|feet|foot|inch|inches)[)\]]?$"
@@ -139,9 +131,8 @@ def is_table(text: str) -> bool:
     ]
     if not lines:
         return True
-    begins_tree = lines[0].lstrip()[0] in "{[%-" and not _is_number(
-        cells_of(lines[0])[0]
-    )  # a table may begin with -3.1
+    # a table may begin with -3.1
+    begins_tree = lines[0].lstrip()[0] in "{[%-" and not _is_number(cells_of(lines[0])[0])
     return not begins_tree and not any(map(_KEY.match, lines))
 
 

@@ -22,10 +22,8 @@ HELD = 0.5  # s for which the last transform of a frame that moves holds
 DEEPEST = 100  # frames between a frame and its root
 MOST, MOST_MOVING = 1000, 200  # frames that do not move, and that do
 SHORTEST, LONGEST = 1e-3, 1e3  # of a quaternion, which should be 1
-SAME_PLACE, SAME_TURN = (
-    1e-3,
-    1e-3,
-)  # m and rad; a constant transform that is sent again with less of a change is the same
+# m and rad; a constant transform that is sent again with less of a change is the same
+SAME_PLACE, SAME_TURN = (1e-3, 1e-3)
 FARTHEST = 1e8  # m; squares of what is off by more, and is turned by a gyroscope, may overflow
 
 _Moved = tuple[float, tuple[float, ...], tuple[float, ...]]  # t, q and p

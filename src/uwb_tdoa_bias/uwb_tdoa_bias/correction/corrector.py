@@ -29,9 +29,8 @@ PASSED, EFFECTS, NETWORK, FADED = range(4)
 # s after the first pose, before which no TDOA is corrected: what is not corrected there costs
 # accuracy
 START = 0.2
-LARGEST_YAW_STD = (
-    1.0  # rad; a yaw that is less certain is unknown: the filter follows four, 90 degrees apart
-)
+# rad; a yaw that is less certain is unknown: the filter follows four, 90 degrees apart
+LARGEST_YAW_STD = 1.0
 # share of what can be known that a network's prediction has at least, or it counts as faded
 FADED_BELOW = 0.5
 

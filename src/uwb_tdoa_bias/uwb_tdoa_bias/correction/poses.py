@@ -184,11 +184,8 @@ def _part(
             q[n] = np.nan
         x, y, z, w = q[n]
         a, b, c = twists[n, :3]
-        d, e, f = (
-            2.0 * (y * c - z * b),
-            2.0 * (z * a - x * c),
-            2.0 * (x * b - y * a),
-        )  # v + w d + (x, y, z) x d
+        # v + w d + (x, y, z) x d
+        d, e, f = (2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a))
         v[n, 0], v[n, 1], v[n, 2] = (
             a + w * d + y * f - z * e,
             b + w * e + z * d - x * f,

@@ -126,9 +126,8 @@ def _refuse_operators(content: bytes) -> None:
     options = onnxruntime.SessionOptions()
     options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
     options.enable_profiling, options.profile_file_prefix = True, "profile"
-    _let_open(
-        1
-    )  # the profile, which is opened first; a model whose weights are in another file finds no more
+    # the profile, which is opened first; a model whose weights are in another file finds no more
+    _let_open(1)
     session = Session(content, options=options)
     profile = session.end_profiling()
     _let_open(1)

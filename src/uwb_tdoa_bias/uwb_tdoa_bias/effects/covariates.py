@@ -21,14 +21,8 @@ if TYPE_CHECKING:
 FADE = 0.5  # share of the width of a domain; this far beyond it, exp(-1/2) of an effect is left
 CATEGORIES = ("previous_anchor",)  # values are names, not sizes
 UPWARDS = ("height", "elevation")  # change at take-off
-OF_MOTION = (
-    "speed",
-    "climb_rate",
-    "acceleration",
-    "turning_rate",
-    "interval",
-    "previous_anchor",
-)  # of a history of poses
+# of a history of poses
+OF_MOTION = ("speed", "climb_rate", "acceleration", "turning_rate", "interval", "previous_anchor")
 
 
 def _norm(v: np.ndarray) -> np.ndarray:

@@ -29,9 +29,8 @@ ANCHORS_QOS = QoSProfile(
 )
 MOST_NAMED = 10  # anchors that a sentence names
 SAME_TURN = 1e-3  # of a quaternion, by which orientations of the same anchor may differ
-ANY_QOS = QoSProfile(
-    depth=1, reliability=ReliabilityPolicy.BEST_EFFORT
-)  # gets from every publisher what is repeated
+# gets from every publisher what is repeated
+ANY_QOS = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 ANCHORS_FILE = Parameter(
     "",
     (

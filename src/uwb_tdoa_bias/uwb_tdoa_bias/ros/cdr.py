@@ -28,10 +28,8 @@ if TYPE_CHECKING:
 
 STAMP, FRAME = ("sec", "nanosec"), "header.frame_id"
 ENCAPSULATION = b"\x00\x01\x00\x00"  # plain CDR, little endian
-KNOWN_ENCAPSULATIONS = (
-    b"\x00\x00\x00",
-    b"\x00\x01\x00",
-)  # plain CDR in big and little endian; options are in the last byte
+# plain CDR in big and little endian; options are in the last byte
+KNOWN_ENCAPSULATIONS = (b"\x00\x00\x00", b"\x00\x01\x00")
 LONGEST_TEXT = 4096  # bytes of a frame_id, or of another text
 MOST_ELEMENTS = 10_000  # in a message that is a list: anchors, transforms
 LARGEST_ELEMENT = 512  # bytes, on the average

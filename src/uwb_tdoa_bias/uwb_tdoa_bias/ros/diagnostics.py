@@ -29,14 +29,10 @@ AGAIN = 30.0  # s after which the log says what it has said before
 NUMBER = re.compile(
     r"([-+]?)\d+(\.\d+)?(?=(\s*(?:%|s\b|ms\b|m\b|Hz|messages|samples|TDOAs|times))?)"
 )
-REPORT_PERIOD, LOOKS = (
-    1.0,
-    5,
-)  # s from one report to the next, and looks in between at what is to be reported at once
-PAUSED, SLOWEST_CLOCK = (
-    0.5,
-    2.0,
-)  # s without a new time on /clock; s from one time to the next of a clock that runs
+# s from one report to the next, and looks in between at what is to be reported at once
+REPORT_PERIOD, LOOKS = (1.0, 5)
+# s without a new time on /clock; s from one time to the next of a clock that runs
+PAUSED, SLOWEST_CLOCK = (0.5, 2.0)
 DIAGNOSTICS_QOS = QoSProfile(depth=10)
 
 Report = tuple[bytes, str, dict[str, Any]]  # level of a DiagnosticStatus, text, values

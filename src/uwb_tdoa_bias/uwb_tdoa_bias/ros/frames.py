@@ -38,9 +38,8 @@ TF_STATIC_QOS = QoSProfile(
     depth=100, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL
 )
 
-Transform = tuple[
-    int, int, str, str, tuple[float, ...], tuple[float, ...]
-]  # sec, nanosec, parent, child, q, p
+# sec, nanosec, parent, child, q, p
+Transform = tuple[int, int, str, str, tuple[float, ...], tuple[float, ...]]
 
 
 class FramesInput:

@@ -13,10 +13,8 @@ if TYPE_CHECKING:
 
     from rclpy.impl.rcutils_logger import RcutilsLogger
 
-BURST, REFILL = (
-    200,
-    10.0,
-)  # lines that one statement of the program may write at once, and s until it may write one more
+# lines that one statement of the program may write at once, and s until it may write one more
+BURST, REFILL = (200, 10.0)
 
 
 class Log:

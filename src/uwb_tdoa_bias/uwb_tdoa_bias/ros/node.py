@@ -21,9 +21,8 @@ if TYPE_CHECKING:
     from .cdr import CdrCodec, CdrTemplate
     from .topics import Epoch
 
-    Take = Callable[
-        [str, np.ndarray, np.ndarray, np.ndarray], None
-    ]  # frame, stamps, rows and arrivals
+    # frame, stamps, rows and arrivals
+    Take = Callable[[str, np.ndarray, np.ndarray, np.ndarray], None]
     from collections.abc import Callable, Iterable, Iterator, Sequence
 
     from rclpy.publisher import Publisher

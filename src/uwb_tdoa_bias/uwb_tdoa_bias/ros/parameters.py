@@ -45,10 +45,8 @@ KINDS = {
 QOS = "qos_overrides."
 SAY_AGAIN = 10.0  # s from one warning to the next of the same kind
 LONGEST_NAME = 100  # letters of what a stranger wrote, in a sentence
-MOST_ASKED, MOST_REQUESTS = (
-    100,
-    20,
-)  # parameters in a request, 0.1 ms each, and requests that wait: streams wait for all of them
+# parameters in a request, 0.1 ms each, and requests that wait: streams wait for all of them
+MOST_ASKED, MOST_REQUESTS = (100, 20)
 
 
 @dataclass(frozen=True)

@@ -36,12 +36,9 @@ except ImportError:
     EventsExecutor = None  # type: ignore[assignment]  # says that there is none
 
 LONGEST_SLEEP = 0.2  # s, until a process without streams sees a signal
-QUIET, LOOK = (
-    1.0,
-    0.05,
-    # s without a message of a stream, after which it is looked for each LOOK s, and not each
-    # millisecond
-)
+# s without a message of a stream, after which it is looked for each LOOK s, and not each
+# millisecond
+QUIET, LOOK = (1.0, 0.05)
 SERVED = 0.005  # s from one service of the graph to the next, while streams flow
 LONGEST_SERVICE = 0.05  # s; only with a SingleThreadedExecutor
 
@@ -83,11 +80,8 @@ class Spinner:
 
     def spin(self, stop: Future) -> None:
         """Live until the future `stop` is done, or the context ends."""
-        taken, sleep, quiet = (
-            -math.inf,
-            LONGEST_SLEEP if self._turns is None else LOOK,
-            True,
-        )  # taken : when a turn last took anything
+        # taken : when a turn last took anything
+        taken, sleep, quiet = (-math.inf, LONGEST_SLEEP if self._turns is None else LOOK, True)
         while not stop.done() and self._nodes[0].context.ok():
             if quiet or time.monotonic() >= self._served + SERVED:
                 self._guarded(self._serve)
@@ -111,9 +105,8 @@ class Spinner:
         if EventsExecutor is None:
             self._serve_each()
         else:
-            mark = self._executor.create_task(
-                _nothing
-            )  # tasks wait in the same queue as everything else
+            # tasks wait in the same queue as everything else
+            mark = self._executor.create_task(_nothing)
             while not mark.done():
                 self._executor.spin_once(timeout_sec=0.0)
         now = time.monotonic()

@@ -81,9 +81,8 @@ def orientation_of(q: Quaternion) -> tuple[float, float, float, float]:
 STREAM_QOS = QoSProfile(depth=10_000, reliability=ReliabilityPolicy.BEST_EFFORT)
 OUTPUT_QOS = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
 LARGEST_LOSS = 0.01  # share of the messages of a second
-OVERRIDES = QoSOverridingOptions(
-    [QoSPolicyKind.RELIABILITY, QoSPolicyKind.DEPTH]
-)  # written into the given profile
+# written into the given profile
+OVERRIDES = QoSOverridingOptions([QoSPolicyKind.RELIABILITY, QoSPolicyKind.DEPTH])
 
 
 def publish_stream(node: Node, kind: type, topic: str) -> Publisher:

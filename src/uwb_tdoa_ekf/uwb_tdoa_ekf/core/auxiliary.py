@@ -16,13 +16,10 @@ from .state import ERROR_STATES
 
 PRESSURE, PRESSURE_DRIFT, RANGE = 0, 1, 2  # m and m/s, of the barometer; m, of all ranges
 OFFSET_STATES = 3
-NO_PRESSURE: dict[str, Any] = {
-    "use_pressure": False
-}  # parameters of a filter without those of the barometer,
-NONE: dict[str, Any] = {
-    **NO_PRESSURE,
-    "range_offset_std": 0.0,
-}  # and of one without any: a history has none
+# parameters of a filter without those of the barometer,
+NO_PRESSURE: dict[str, Any] = {"use_pressure": False}
+# and of one without any: a history has none
+NONE: dict[str, Any] = {**NO_PRESSURE, "range_offset_std": 0.0}
 
 
 @compiled

@@ -20,9 +20,8 @@ from .update import kalman, project
 
 GATE = 4.0  # standard deviations beyond which an altitude is not used
 LONGEST_DISAGREEMENT = 1.0  # s, after which the offset is taken anew
-AVERAGE = (
-    3.0  # s of innovations that tell how much worse a barometer is than its standard deviation
-)
+# s of innovations that tell how much worse a barometer is than its standard deviation
+AVERAGE = 3.0
 UNTRIED, WORST = 10.0, 100.0  # at first, and at most, in standard deviations
 
 

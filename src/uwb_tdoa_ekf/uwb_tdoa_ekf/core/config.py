@@ -15,11 +15,8 @@ from uwb_tdoa_bias.common.sensors.sensor import parameter
 
 ROBUST = ("innovation", "gate", "m_estimation")
 SIDES = "unknown", "below", "above", "-x", "+x", "-y", "+y"
-CHOICES = {
-    "robust": ROBUST,
-    "loss": LOSSES,
-    "tag_side": SIDES,
-}  # parameters that are one of a few names
+# parameters that are one of a few names
+CHOICES = {"robust": ROBUST, "loss": LOSSES, "tag_side": SIDES}
 PLANAR_HEIGHT_STD = 0.02  # m
 
 

@@ -54,27 +54,23 @@ from .update import project
 
 CONSISTENCY_TIME = 0.3  # s over which the share of TDOAs that the filter explains is averaged
 INCONSISTENT = 0.5  # share below which the tag is looked for elsewhere
-UNSURE_TIME = (
-    0.5  # s of TDOAs, after a silence in which a tag got lost, in which it is looked for anew
-)
+# s of TDOAs, after a silence in which a tag got lost, in which it is looked for anew
+UNSURE_TIME = 0.5
 # s without a TDOA after which a tag that may be anywhere in its workspace is lost: the filter
 # starts anew
 LOST_TIME = 30.0
 MAX_STEP = 0.05  # s, longest single prediction
-AVERAGED = (
-    0.25  # s of inertial samples that tell how a sensor is mounted which comes when the filter runs
-)
-LINEAR_RANGE = (
-    1.0  # m or m/s of the state, within which the slope of a bias tells what it is elsewhere
-)
+# s of inertial samples that tell how a sensor is mounted which comes when the filter runs
+AVERAGED = 0.25
+# m or m/s of the state, within which the slope of a bias tells what it is elsewhere
+LINEAR_RANGE = 1.0
 
 # In a history, at most: its update, workspace, a place at rest, another hypothesis, starts or
 # recoveries, a yaw opened again
 RECORDS_OF_TDOA = 1 + 4 + 6 + 1 + 2 + 2
 RECORDS_OF_REST = 3  # one per axis
-RECORDS_OF_AID = (
-    RECORDS_OF_TDOA  # a range has as many, a velocity one per component, and a yaw opened again
-)
+# a range has as many, a velocity one per component, and a yaw opened again
+RECORDS_OF_AID = RECORDS_OF_TDOA
 
 
 @compiled

@@ -16,9 +16,8 @@ import numpy as np
 from uwb_tdoa_bias.common.compiled import Record, compiled
 from uwb_tdoa_bias.common.geometry import linearized_tdoa
 
-GRAZING = math.tan(
-    math.radians(15.0)
-)  # elevation below which the ground turns the phase of what it reflects
+# elevation below which the ground turns the phase of what it reflects
+GRAZING = math.tan(math.radians(15.0))
 HALF_WAVE = 0.0375  # m, at 4 GHz: rays that differ by more do not cancel
 # m, lateness of an anchor is up to that, the more probable, the larger: the way by what reflects is
 # a detour
@@ -28,11 +27,8 @@ RARE = 0.02  # probability that an anchor is late, and that it is not, at least,
 USUAL = 0.1  # and that it is late where nothing is known
 CHANGE_TIME = 2.0  # s after which what an anchor was does not tell what it is
 DEVIATIONS = 3.0  # standard deviations that a tag may be lower than the filter has it
-BLURRED, BLUR_STD = (
-    0.8,
-    0.25,
-    # m above the ground below which what it reflects blurs what arrives, and by how much at the ground
-)
+# m above the ground below which what it reflects blurs what arrives, and by how much at the ground
+BLURRED, BLUR_STD = (0.8, 0.25)
 NOT_USED = 0.2  # probability that both anchors of a TDOA are in time, below which it says nothing
 
 MOST_PAIRS, MOST_ANCHORS = 64, 24  # of a window that are looked at, those heard first
@@ -41,10 +37,8 @@ STILL_TDOAS = 2  # of a pair in each half of the window, at least
 SMALLEST_SPREAD = 0.02  # m, of the values of a pair
 STILL_SPEED = 0.3  # m/s; a velocity that is not known better than that may be none
 LIKELY_SPEED = 1.0  # m/s, of a tag of which nothing is known
-STILL_SCALE, STILL_SWEEPS = (
-    2.5,
-    5,
-)  # standard deviations of a change from which on it is the lateness that has changed
+# standard deviations of a change from which on it is the lateness that has changed
+STILL_SCALE, STILL_SWEEPS = (2.5, 5)
 MOVING = 12.0  # normalised square of a velocity that is not zero
 STILL, UNKNOWN, MOVES = range(3)  # what the TDOAs of a window show of the motion of a tag
 # Median normalised square of the changes at rest, and by how much one of n is larger, times sqrt(n)
@@ -52,24 +46,17 @@ EXPECTED_RATIO, LARGEST_RATIO = 0.45, 3.5
 
 GROUND_STD = 0.15  # m, of the height of the tag of a body that stands on the ground
 GROUND_HEIGHT = 0.05  # m, its mean
-PAIR_SHARE, ANCHOR_SHARE = (
-    0.4,
-    1.0,
-)  # of tdoa_std: standard deviation of a pair's own error, and of an anchor's
-USUAL_LATENESS, LATENESS_STD, ALIKE_STD = (
-    2.0,
-    2.0,
-    0.3,
-)  # m: what late anchors have in common, and by how much they differ from it
+# of tdoa_std: standard deviation of a pair's own error, and of an anchor's
+PAIR_SHARE, ANCHOR_SHARE = (0.4, 1.0)
+# m: what late anchors have in common, and by how much they differ from it
+USUAL_LATENESS, LATENESS_STD, ALIKE_STD = (2.0, 2.0, 0.3)
 OTHER, TIMELY = 0.1, 0.5  # how probable other lateness is, and none, beside one that is alike
 ABOVE_STD, BESIDE_STD = 0.2, 2.0  # m; a tag is not above the workspace, and not often beside it
 SWEEPS = 25
 KNOWN_STD = 0.1  # m, by which an anchor may be late beyond what is known
-IN_TIME, ALIKE, KNOWN = range(
-    3
-    # what an explanation takes anchors near the ground for: late by what they have in common; as is
-    # known
-)
+# what an explanation takes anchors near the ground for: late by what they have in common; as is
+# known
+IN_TIME, ALIKE, KNOWN = range(3)
 
 PAIR = np.dtype(
     [

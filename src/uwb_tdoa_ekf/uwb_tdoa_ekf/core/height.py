@@ -35,15 +35,10 @@ SETTLED = 1.0  # s of agreement that make the filter the one to be believed
 HIGHEST_STEP = 1.5  # m
 BEYOND = 1.0  # m beyond the workspace, up or down, where no tag is
 PULL_SCALE = 3.0  # m, of the loss that TDOAs are weighed with
-PULL_TIME, PULL_LIMIT, PULL_DELAY = (
-    1.0,
-    0.45,
-    3.0,
-)  # s, m, s: TDOAs averaged over the first disagree for the last
-IGNORE_TIME, LONGEST_IGNORED = (
-    3.0,
-    60.0,
-)  # s for which a range finder is not used, the first time and at most
+# s, m, s: TDOAs averaged over the first disagree for the last
+PULL_TIME, PULL_LIMIT, PULL_DELAY = (1.0, 0.45, 3.0)
+# s for which a range finder is not used, the first time and at most
+IGNORE_TIME, LONGEST_IGNORED = (3.0, 60.0)
 
 
 @compiled

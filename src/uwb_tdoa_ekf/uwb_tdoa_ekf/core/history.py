@@ -9,10 +9,8 @@ from uwb_tdoa_bias.common.compiled import Record, compiled
 from . import yaw_test
 from .state import ERROR_STATES, MOVING_STATES, NOMINAL_STATES, propagate
 
-UPDATE, RESET = (
-    0,
-    1,
-)  # kinds of records: a Kalman update, or another state was put in place of the one before
+# kinds of records: a Kalman update, or another state was put in place of the one before
+UPDATE, RESET = (0, 1)
 
 RECORD = np.dtype(
     [

@@ -23,10 +23,8 @@ DOWNWARDS = -2.0  # m/s^2, upwards, that nothing flies with
 FASTEST, TOO_FAR = 10.0, 4.0  # rad/s that a tag may turn, and rad beyond that for a moment
 # s after which upwards is what the accelerometer says, not what the gyroscope has made of it
 MEMORY = 2.0
-UPRIGHT, AXIS = (
-    math.cos(math.radians(35.0)),
-    math.cos(math.radians(25.0)),
-)  # tilt, and of an axis that points up instead
+# tilt, and of an axis that points up instead
+UPRIGHT, AXIS = (math.cos(math.radians(35.0)), math.cos(math.radians(25.0)))
 LYING = 3.0  # s for which a tag may lie on its side or its back
 CLEARED = 1.5  # s without evidence after which the samples are used again
 

@@ -14,10 +14,8 @@ from uwb_tdoa_bias.common.vibration import VIBRATION_AVERAGE, low_pass, track_vi
 from .state import GRAVITY
 
 PERSISTENCE = 0.2  # s over which the error of a vibrating accelerometer stays alike
-QUIET_ACCEL, QUIET_GYRO = (
-    0.05,
-    0.02,
-)  # m/s^2, rad/s, rms per axis: less is quiet; hovering has 0.1, 0.03, idling more
+# m/s^2, rad/s, rms per axis: less is quiet; hovering has 0.1, 0.03, idling more
+QUIET_ACCEL, QUIET_GYRO = (0.05, 0.02)
 # rad^2/s^2 that fades before a tag counts as quiet, about half a second after the first sample
 RESTLESS = 0.002
 QUIET_TILT = 0.5  # m/s^2 by which the mean specific force may differ from gravity
@@ -46,9 +44,8 @@ def observe(imu: Record, sample: Record, timeout: float) -> bool:
         imu.mean_accel[k] = low_pass(imu.mean_accel[k], imu.slow_accel[k], dt, VIBRATION_AVERAGE)
         imu.gyro_power[k] = low_pass(imu.gyro_power[k], sample.gyro[k] ** 2, dt, VIBRATION_AVERAGE)
         power, shakes = _from_hovering(imu.mean_accel, k) ** 2, imu.vibration[k] > QUIET_ACCEL**2
-        share = (
-            power / max(power, imu.vibration[k]) if shakes else 1.0
-        )  # what does not shake tells nothing
+        # what does not shake tells nothing
+        share = power / max(power, imu.vibration[k]) if shakes else 1.0
         imu.rectified[k] = low_pass(imu.rectified[k], share, dt, RECTIFYING_MEMORY)
         imu.gyro[k], imu.accel[k] = (
             0.5 * (imu.gyro[k] + sample.gyro[k]),

@@ -31,15 +31,10 @@ CLEARLY_MORE = 0.2  # share by which a recovery must explain more than the filte
 # s of TDOAs that a recovery rests on: a tag that leaves a floor must not wait for those of the
 # floor
 RECOVERY_WINDOW = 0.3
-SLOW_TDOAS, SLOW_STAMPS, SLOWEST = (
-    20,
-    3,
-    30.0,
-)  # TDOAs and stamps, and s, that a start looks back where few TDOAs come
-UNKNOWN, BETTER = (
-    2.0,
-    0.5,
-)  # m, deviation of a place that is hardly known; share of its variance that is clearly less
+# TDOAs and stamps, and s, that a start looks back where few TDOAs come
+SLOW_TDOAS, SLOW_STAMPS, SLOWEST = (20, 3, 30.0)
+# m, deviation of a place that is hardly known; share of its variance that is clearly less
+UNKNOWN, BETTER = (2.0, 0.5)
 # share of the time of these within which none came: beyond, they are those of a tag that has just
 # been switched on
 LONGEST_GAP = 0.6
@@ -49,19 +44,14 @@ TILT_STD = 0.1  # rad, at the start
 ANY_YAW = math.pi / math.sqrt(3.0)  # rad, deviation of a yaw that may be any
 WRONG_POSITION = 1.0  # m, that inertial samples which are wrong have made
 SMALLEST_STD = 0.03  # m, of a height that is known at the start
-REACH, REACH_SPEED, REACH_ACCELERATION = (
-    0.5,
-    0.5,
-    0.5,
-)  # m, m/s, m/s^2: how far from where it was right a filter may be found, by time
+# m, m/s, m/s^2: how far from where it was right a filter may be found, by time
+REACH, REACH_SPEED, REACH_ACCELERATION = (0.5, 0.5, 0.5)
 # that TDOAs which contradict wheels may be explained by: two that are late are as probable as a
 # rover that jumps
 LATE_ANCHORS = 2
 AMONG_OTHERS = 6, 3  # TDOAs and anchors, at least, that agree with wheels without these
-RIVAL_TIME, RIVAL_HELD = (
-    1.0,
-    0.5,
-)  # s for which TDOAs must agree on another place than wheels; s for which the tag may be there
+# s for which TDOAs must agree on another place than wheels; s for which the tag may be there
+RIVAL_TIME, RIVAL_HELD = (1.0, 0.5)
 
 
 @compiled

@@ -30,10 +30,8 @@ if TYPE_CHECKING:
 USED, REJECTED, LATE, INVALID, STARTUP, COMPENSATED, REPEATED = range(7)
 
 
-N_YAWS, N_PLACES = (
-    4,
-    2,
-)  # directions and places that a start follows at once while it is not known which is right
+# directions and places that a start follows at once while it is not known which is right
+N_YAWS, N_PLACES = (4, 2)
 HYPOTHESES = N_YAWS * N_PLACES
 Floor = tuple[np.ndarray, np.ndarray, np.ndarray]  # as of EffectSet.on_floor
 WINDOW = 512  # TDOAs kept for a start
@@ -44,9 +42,8 @@ def _record(*columns: tuple[Any, ...]) -> np.dtype:
 
 
 # What is measured. Rows of an anchor, not ids; both in the order of their stamps.
-IMU_SAMPLE = _record(
-    ("t", float), ("gyro", float, 3), ("accel", float, 3)
-)  # s, rad/s, m/s^2 (specific force); body
+# s, rad/s, m/s^2 (specific force); body
+IMU_SAMPLE = _record(("t", float), ("gyro", float, 3), ("accel", float, 3))
 TDOA = _record(
     ("t", float),
     ("a", int),
@@ -54,15 +51,11 @@ TDOA = _record(
     ("d", float),
     ("variance", float),  # s, rows, m (corrected), m^2 (beyond tdoa_std)
     ("slope", float, N_STATES),
-    (
-        "state",
-        float,
-        N_STATES,
-    ),  # of the bias taken out, with position and velocity, about a state; m, m/s
+    # of the bias taken out, with position and velocity, about a state; m, m/s
+    ("state", float, N_STATES),
 )
-AID = _record(
-    ("t", float), ("kind", int), ("value", float, 4), ("std", float, 4), ("anchor", int)
-)  # see aids.py
+# see aids.py
+AID = _record(("t", float), ("kind", int), ("value", float, 4), ("std", float, 4), ("anchor", int))
 
 # One estimate of the state, for one direction that the tag may have started in.
 HYPOTHESIS = _record(
@@ -82,11 +75,8 @@ IMU_STATE = _record(
     ("slow_accel", float, 3),  # m/s^2, low pass
     ("vibration", float, 3),  # m^2/s^4, power of what is faster
     ("mean_accel", float, 3),  # m/s^2, over a longer time
-    (
-        "rectified",
-        float,
-        3,
-    ),  # 0 to 1: power of what of it does not hover, lately, beside that of the vibration
+    # 0 to 1: power of what of it does not hover, lately, beside that of the vibration
+    ("rectified", float, 3),
     ("gyro_power", float, 3),  # rad^2/s^2
     ("accel_weight", float, 3),  # of the measurement against hovering, 0 to 1, by inertial.weigh
     ("accel_psd", float, 3),  # (m/s^2)^2/Hz, of the noise that this leaves
@@ -120,12 +110,9 @@ ANCHOR = _record(
     ("heard", float),  # s, stamp of the last TDOA that was used
     ("delay", float),  # m, that it is found to have since it changed in flight,
     ("delay_variance", float),  # and its variance, m^2;
-    (
-        "late",
-        float,
-        # probability that it is late because tag and anchor are near the ground, see ground.py, 0: it
-        # cannot be,
-    ),
+    # probability that it is late because tag and anchor are near the ground, see ground.py, 0: it
+    # cannot be,
+    ("late", float),
     ("predicted", float),  # s, stamp to which that was predicted;
     ("floor_delay", float),  # m, by which it was late at a tag on the ground, NaN: nobody knows,
     ("floor_std", float),  # m, and its standard deviation
@@ -168,11 +155,8 @@ VELOCITY = _record(
 )
 
 YAW_TEST = _record(
-    (
-        "response",
-        float,
-        (2, ERROR_STATES),
-    ),  # of the error state to cos(psi) - 1 and sin(psi), for a yaw that is wrong by psi
+    # of the error state to cos(psi) - 1 and sin(psi), for a yaw that is wrong by psi
+    ("response", float, (2, ERROR_STATES)),
     ("vector", float, 2),  # of the least squares of late innovations by these two,
     ("information", float, (2, 2)),  # and the upper triangle of its matrix
     ("turned", float),  # rad, by which updates have turned the yaw of late,
@@ -194,85 +178,53 @@ EKF = _record(
     ("barometer", BAROMETER),
     ("velocity", VELOCITY),
     ("ranged", AID, 1),  # the last distance to an anchor
-    (
-        "range_offset",
-        float,
-        2,
-        # m, of all distances, when it was known best, and its variance, m^2; inf: it was not looked for
-    ),
+    # m, of all distances, when it was known best, and its variance, m^2; inf: it was not looked for
+    ("range_offset", float, 2),
     ("next_floor", float),  # s, stamp before which not to hold the tag on its floor again
     ("sensed", bool),  # inertial samples drive the prediction
-    (
-        "rival",
-        float,
-        3,
-        # m, another place that late TDOAs agree on, and the motion that sensors feel does not lead to;
-    ),
+    # m, another place that late TDOAs agree on, and the motion that sensors feel does not lead to;
+    ("rival", float, 3),
     ("rival_since", float),  # s, stamps: since when they do,
     ("rival_until", float),  # and until when the tag may be there
     ("imu_fault_detector", IMU_FAULT_DETECTOR),  # of the inertial samples,
     ("imu_faulty", bool),  # which are not used, because they cannot be right
     ("yaw_test", YAW_TEST),  # see yaw_doubt.py
-    (
-        "attitude_averaged_until",
-        float,
-        # s, stamp until which they are averaged, where the filter ran before there were any; -inf: they
-        # are used
-    ),
+    # s, stamp until which they are averaged, where the filter ran before there were any; -inf: they
+    # are used
+    ("attitude_averaged_until", float),
     ("quiet", bool),  # the inertial sensor neither shakes nor turns
     ("resting", bool),  # the tag does not move, see rest.py,
-    (
-        "floor_place",
-        float,
-        2,
-    ),  # m, x and y of where anchors are known to be late on the ground, NaN: anywhere,
+    # m, x and y of where anchors are known to be late on the ground, NaN: anywhere,
+    ("floor_place", float, 2),
     ("late_as_known", bool),  # and they are, where the tag came to rest last
     ("rest_since", float),  # s, stamps: since when,
     ("next_look", float),  # and before which not to look again,
-    (
-        "doubts",
-        int,
-    ),  # looks in a row in which its TDOAs have changed, and in which it was not known to rest
+    # looks in a row in which its TDOAs have changed, and in which it was not known to rest
+    ("doubts", int),
     ("stills", int),  # but neither TDOAs nor inertial samples showed that it moves,
-    (
-        "shaking",
-        float,
-    ),  # m^2/s^4, power of the vibration of a tag that is not at rest, over some seconds
+    # m^2/s^4, power of the vibration of a tag that is not at rest, over some seconds
+    ("shaking", float),
     ("lift", float, 3),  # m/s, that the inertial sensor has felt lately at rest, in the world
-    (
-        "last_agreement",
-        float,
-    ),  # s, stamp at which the inertial sensor was sound and TDOAs agreed with the filter last
+    # s, stamp at which the inertial sensor was sound and TDOAs agreed with the filter last
+    ("last_agreement", float),
     ("extent", float, (2, 3)),  # m, lower and upper bounds: of all anchors,
     ("within", float, (2, 3)),  # of the reach of those that were heard lately,
     ("workspace", float, (2, 3)),  # and of where the tag is expected, see workspace.py
     ("side", float, 3),  # on which the tag is of anchors in a plane, see workspace.configured_side
-    (
-        "flat",
-        float,
-        3,
-        # 1.0 for axes along which these are at one coordinate, while it is not known on which side of
-        # that the tag is
-    ),
+    # 1.0 for axes along which these are at one coordinate, while it is not known on which side of
+    # that the tag is
+    ("flat", float, 3),
     ("middle", float, 3),  # m, of the anchors heard lately
     ("next_bounds", float),  # s, stamp before which not to look anew who is heard
-    (
-        "information",
-        float,
-        (3, 3),
-        # 1/m^2, of the place, that one arrival from each anchor heard lately gives, see systematic.py
-    ),
-    (
-        "position_unknown_until",
-        float,
-    ),  # s, stamp until which the tag may be anywhere, as its place was hardly known before
+    # 1/m^2, of the place, that one arrival from each anchor heard lately gives, see systematic.py
+    ("information", float, (3, 3)),
+    # s, stamp until which the tag may be anywhere, as its place was hardly known before
+    ("position_unknown_until", float),
     ("search_waits_until", float),  # s, stamp until which its TDOAs wait for a search
     ("consistency", float),  # share of the latest TDOAs that agree with the best hypothesis
     ("recoveries", int),
-    (
-        "first_tdoa",
-        float,
-    ),  # s, stamps: of the first TDOA since the filter stopped, and the last one
+    # s, stamps: of the first TDOA since the filter stopped, and the last one
+    ("first_tdoa", float),
     ("last_tdoa", float),
     ("next_search", float),  # s, stamps before which not to do again: look for the tag,
     ("next_odometry", float),
@@ -281,11 +233,8 @@ EKF = _record(
     ("kept", int),  # TDOAs in the window
     ("window", TDOA, 2 * WINDOW),  # recent TDOAs, oldest first
     ("recorded", int),  # records written to the history, see history.py
-    (
-        "since_record",
-        float,
-        (ERROR_STATES, ERROR_STATES),
-    ),  # transition of the best hypothesis since the last record
+    # transition of the best hypothesis since the last record
+    ("since_record", float, (ERROR_STATES, ERROR_STATES)),
     # Scratch: nothing below outlives an event.
     ("transition", TRANSITION),
     ("innovation", INNOVATION),
@@ -300,11 +249,8 @@ ODOMETRY = _record(
     ("t", float),
     ("x", float, NOMINAL_STATES),
     ("covariance", float, (9, 9)),  # of [p, v, attitude]
-    (
-        "consider_covariance",
-        float,
-        (3, 3),
-    ),  # what of it errors that persist make, see systematic.py
+    # what of it errors that persist make, see systematic.py
+    ("consider_covariance", float, (3, 3)),
 )
 RESIDUAL = _record(
     ("innovation", float), ("variance", float), ("weight", float), ("verdict", np.uint8)

@@ -9,9 +9,8 @@ from uwb_tdoa_bias.common.compiled import Record, compiled
 from .ground import solve
 
 LARGEST_OUTLIER = 5.0  # standard deviations that one outlier counts as at most
-LARGEST_STEP = (
-    0.1  # share of an anchor's variance that one innovation makes at most: ten say what one cannot
-)
+# share of an anchor's variance that one innovation makes at most: ten say what one cannot
+LARGEST_STEP = 0.1
 
 
 @compiled
@@ -77,9 +76,8 @@ def observe(
     stamp of the TDOA before.
     """
     fades = min(t - last, LONGEST_STEP) / MEMORY
-    apart = (
-        0.5 * (min(t - a.heard, MEMORY) + min(t - b.heard, MEMORY)) / MEMORY
-    )  # adds up to the number of anchors
+    # adds up to the number of anchors
+    apart = 0.5 * (min(t - a.heard, MEMORY) + min(t - b.heard, MEMORY)) / MEMORY
     a.heard = b.heard = t
     gain = apart * innovation.weight / (innovation.noise_variance + innovation.curvature / SHARE)
     for i in range(3):

@@ -14,10 +14,8 @@ from uwb_tdoa_bias.effects.base import TABLE_STEPS, SensorFunction
 from uwb_tdoa_bias.effects.covariates import OF_STATE
 
 SENSORS = ("gyro", "accel")
-SPEED, CLIMB_RATE = (
-    OF_STATE.index("speed"),
-    OF_STATE.index("climb_rate"),
-)  # those before them are the position
+# those before them are the position
+SPEED, CLIMB_RATE = (OF_STATE.index("speed"), OF_STATE.index("climb_rate"))
 
 # A SensorFunction, by its fields.
 SENSOR_FUNCTION = np.dtype(

@@ -26,10 +26,8 @@ LARGE = 20.0  # m, along x or y
 GRID_STEP, GRID_POINTS, GRID_LEVEL = 2.0, 600, 4.0
 GRID_LEVELS = 20  # heights at most: the work has a bound, however far the anchors are apart
 GRID_TDOAS = 60  # of the window, that it looks at
-GRID_LOSS, GRID_APART = (
-    1.5,
-    2.5,
-)  # grid steps: scale of the loss, and between two of the best places
+# grid steps: scale of the loss, and between two of the best places
+GRID_LOSS, GRID_APART = (1.5, 2.5)
 SWEEPS = 14  # Gauss-Newton steps per start
 COARSE, FINE = 5.0, 0.5  # m, scale of the Geman-McClure loss at the first and the last steps
 SPEED = 1.0  # m/s, standard deviation of the velocity before anything is known
@@ -37,9 +35,8 @@ LONGEST_STEP = 2.0  # m
 INLIER = 0.75  # m, a residual below this does not contradict a position
 NO_SCALE = 1e6  # m, of a loss that is quadratic
 APART = 1.0  # m between two places, and standard deviation of a place that becomes two
-IMPROBABLE = (
-    8.0  # minus the logarithm of the probability of a place beside another, beyond which it is none
-)
+# minus the logarithm of the probability of a place beside another, beyond which it is none
+IMPROBABLE = 8.0
 SMALLEST = 1e-300  # m^2, in place of a variance of 0
 SPLIT = 0.8  # standard deviations from the middle of a place to each of two that it becomes
 

@@ -26,11 +26,8 @@ TRANSITION = np.dtype(
         ("velocity_attitude", float, (3, 3)),  # -R [f]x dt
         ("velocity_accel_bias", float, (3, 3)),  # -R diag(accel_weight) dt
         ("attitude_attitude", float, (3, 3)),  # Exp(-w dt)
-        (
-            "product",
-            float,
-            (MOVING_STATES, ERROR_STATES),
-        ),  # room for the upper rows of a transition times a matrix
+        # room for the upper rows of a transition times a matrix
+        ("product", float, (MOVING_STATES, ERROR_STATES)),
     ],
     align=True,
 )

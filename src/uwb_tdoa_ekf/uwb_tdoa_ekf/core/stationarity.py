@@ -18,32 +18,24 @@ from .state import GRAVITY, rotation
 from .update import update_state
 
 PERIOD = 0.05  # s between zero-velocity updates
-QUIET_STD, SHAKING_STD = (
-    0.02,
-    0.15,
-)  # m/s, standard deviation of such an update: of a quiet inertial sensor, and of one that shakes
+# m/s, standard deviation of such an update: of a quiet inertial sensor, and of one that shakes
+QUIET_STD, SHAKING_STD = (0.02, 0.15)
 SPEED = 0.05  # m/s; a quiet tag that is known to be slower stands, a faster one may glide
 LOOK_PERIOD, LOOK_WINDOW = 0.1, 0.4  # s between two looks at the TDOAs, and s of TDOAs in each
 # looks in a row with changed TDOAs that end a rest: one look in twenty shows a change by chance
 MOST_DOUBTS = 3
-UNFELT = (
-    0.06  # m/s; where the inertial sensor has felt more lift than that, one such look ends the rest
-)
+# m/s; where the inertial sensor has felt more lift than that, one such look ends the rest
+UNFELT = 0.06
 # looks in a row without a change that begin the rest of a quiet tag: fewer may be a turning point
 LONG = 10
-EARLY, LONG_ENOUGH = (
-    1.5,
-    3,
-)  # s after the start, or after its last rest began, within which so many looks are enough
+# s after the start, or after its last rest began, within which so many looks are enough
+EARLY, LONG_ENOUGH = (1.5, 3)
 AGAIN = 0.3  # s between two corrections of a tag that is near the ground, and is not known to stand
 # standard deviations of the velocity that inertial samples tell, beyond which the tag moves
 GATE = 3.0
-CALM, SHAKING_MEMORY = (
-    0.1,
-    2.0,
-    # rotors or wheels have stopped when the vibration is below that share of its mean over so many
-    # seconds
-)
+# rotors or wheels have stopped when the vibration is below that share of its mean over so many
+# seconds
+CALM, SHAKING_MEMORY = (0.1, 2.0)
 LIFT = 0.25  # m/s upwards that end a rest when the inertial sensor measures them
 LIFT_MEMORY = 0.7  # s over which what it feels adds up
 AWAY = 1.5  # s after such an end, for which the tag is not taken for one at rest again
@@ -110,9 +102,8 @@ def check_stationarity(
     count = ground.find_pairs(window, ekf.pairs)
     motion = ground.judge_motion(ekf.pairs[:count], anchors, best.x, ekf.still_covariance)
     still = motion == ground.STILL
-    unshown = (
-        motion == ground.UNKNOWN and ekf.quiet
-    )  # too few TDOAs: no evidence, and neither has the inertial sensor any
+    # too few TDOAs: no evidence, and neither has the inertial sensor any
+    unshown = motion == ground.UNKNOWN and ekf.quiet
     if ekf.resting:
         if not unshown:
             ekf.doubts = 0 if still else ekf.doubts + 1

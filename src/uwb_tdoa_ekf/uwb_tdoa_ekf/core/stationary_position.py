@@ -33,11 +33,8 @@ REACH = 1.0  # m from where they are known to be late, over which echoes become 
 DECISIVE = 6.0
 HOVER_STD = 0.3  # m, of the place of a tag that seems to stand but may hover
 FEWEST_LATE = 1.5  # anchors that are late because the tag is low, where its TDOAs change
-LANDING_STD = (
-    0.2,
-    0.2,
-    0.5,
-)  # m, by which the filter may be wrong beyond what it says when a tag lands: mostly in height
+# m, by which the filter may be wrong beyond what it says when a tag lands: mostly in height
+LANDING_STD = (0.2, 0.2, 0.5)
 
 
 @compiled
@@ -248,9 +245,8 @@ def set_hovering_position(
             value, std = 0.0, HOVER_STD
             if state < 3:
                 value, P = place[state], ekf.hypotheses[h].P
-                P[state, state] = max(
-                    P[state, state], HOVER_STD**2
-                )  # a place that is measured again adds nothing new
+                # a place that is measured again adds nothing new
+                P[state, state] = max(P[state, state], HOVER_STD**2)
             else:
                 std = math.sqrt(ekf.still_covariance[state - 3, state - 3] + SPEED_STD**2)
             update_state(ekf.hypotheses[h], ekf.innovation, state, value, std)

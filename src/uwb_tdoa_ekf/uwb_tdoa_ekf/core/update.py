@@ -21,44 +21,27 @@ JOINT_STATES = ERROR_STATES + auxiliary.OFFSET_STATES
 
 INNOVATION = np.dtype(
     [
-        (
-            "states",
-            np.int64,
-            LONGEST_ROW,
-        ),  # the error states that the Jacobian row h has an entry for,
+        # the error states that the Jacobian row h has an entry for,
+        ("states", np.int64, LONGEST_ROW),
         ("row", float, LONGEST_ROW),  # the entries,
         ("entries", np.int64),  # and how many there are
         ("value", float),  # measured minus predicted
         ("noise_variance", float),  # of one measurement
         ("prior_variance", float),  # h P h', and
-        (
-            "curvature",
-            float,
-        ),  # what of it comes from a TDOA that is curved within P, see curvature.py
-        (
-            "cross_covariance",
-            float,
-            ERROR_STATES,
-        ),  # P h', of state and prediction; the gain is this over total_variance
-        (
-            "offset_jacobian",
-            float,
-            auxiliary.OFFSET_STATES,
-        ),  # entries of the Jacobian row for the auxiliary states: 0, but of their own sensors
+        # what of it comes from a TDOA that is curved within P, see curvature.py
+        ("curvature", float),
+        # P h', of state and prediction; the gain is this over total_variance
+        ("cross_covariance", float, ERROR_STATES),
+        # entries of the Jacobian row for the auxiliary states: 0, but of their own sensors
+        ("offset_jacobian", float, auxiliary.OFFSET_STATES),
         ("offset_covariance", float, auxiliary.OFFSET_STATES),  # scratch of auxiliary.correct
-        (
-            "variance_inflation",
-            float,
-            # how often the same error is met, in tdoa_correlation_length: 1, but for a tag that does
-            # not move
-        ),
+        # how often the same error is met, in tdoa_correlation_length: 1, but for a tag that does
+        # not move
+        ("variance_inflation", float),
         ("weight", float),  # 0 to 1, given by robust.update
         ("total_variance", float),  # of the value, as the update took it
-        (
-            "factor",
-            float,
-            (JOINT_STATES, JOINT_STATES),
-        ),  # scratch of the M-estimation: S', by rows the columns of S,
+        # scratch of the M-estimation: S', by rows the columns of S,
+        ("factor", float, (JOINT_STATES, JOINT_STATES)),
         ("scaled_row", float, JOINT_STATES),  # S' h',
         ("scaled_error", float, JOINT_STATES),  # and of the state scaled by S the error
         ("prior_weights", float, JOINT_STATES),  # and its weights
@@ -136,9 +119,8 @@ def variance(x: np.ndarray, P: np.ndarray, a: np.ndarray, b: np.ndarray) -> floa
             for k in range(3):
                 along += away[k] * P[k, i] / distance**2
             for j in range(3):
-                product[j, i] += (
-                    sign * (P[j, i] - away[j] * along) / distance
-                )  # of Hessian and covariance
+                # of Hessian and covariance
+                product[j, i] += sign * (P[j, i] - away[j] * along) / distance
     mean = squared = 0.0
     for i in range(3):
         mean += 0.5 * product[i, i]

@@ -25,19 +25,13 @@ from .update import kalman, project
 GATE = 3.0  # standard deviations beyond which a component is not used
 CORRELATION_TIME = 1.0  # s over which its error stays alike
 LONGEST_STD = 1e3  # m/s and rad/s; a component that is less precise is not measured
-STUCK_TIME, STUCK_COUNT = (
-    0.5,
-    5,
-)  # s, and velocities, all the same, after which the sensor of a tag that shakes is stuck
+# s, and velocities, all the same, after which the sensor of a tag that shakes is stuck
+STUCK_TIME, STUCK_COUNT = (0.5, 5)
 AVERAGE = 0.5  # s of innovations that tell whether it agrees with everything else
-DISAGREES, AGREES = (
-    4.0,
-    2.0,
-)  # mean normalised innovation squared above which it is not used any more, below which again
-YAW_RATE, GYRO_BIAS = (
-    3,
-    14,
-)  # place of the yaw rate in an AID, and error state of the gyroscope's bias about z
+# mean normalised innovation squared above which it is not used any more, below which again
+DISAGREES, AGREES = (4.0, 2.0)
+# place of the yaw rate in an AID, and error state of the gyroscope's bias about z
+YAW_RATE, GYRO_BIAS = (3, 14)
 SLIP = 2.0  # s for which wheels that disagree may slip
 HELD = 0.5  # s for which the last velocity of wheels drives the prediction
 STANDING = 0.1  # times its deviation is that of wheels that do not turn at all
@@ -61,9 +55,8 @@ def observe(
     inflation = max(1.0, 2.0 * CORRELATION_TIME / dt)
     worst = _worst(ekf, aid, residual)
     state.nis += min(1.0, dt / AVERAGE) * (min(worst, GATE**4) - state.nis)
-    stuck = frozen and (
-        state.refused or (np.any(state.value != 0.0) and not of_wheels)
-    )  # simulated wheels turn evenly
+    # simulated wheels turn evenly
+    stuck = frozen and (state.refused or (np.any(state.value != 0.0) and not of_wheels))
     state.refused = state.nis > (AGREES if state.refused else DISAGREES) or stuck
     residual.weight, residual.verdict = 0.0, REJECTED
     if state.refused or worst > GATE**2:

@@ -27,13 +27,10 @@ PERIOD = 0.1  # s between two tests
 # the worst of them 9.9 without its range
 # finder. See docs/reliability.md
 EVIDENCE = 12.0
-ANGLES = (
-    2.0 * math.pi * np.arange(1, 24) / 24.0
-)  # rad, by which the yaw may be wrong: those that are tried,
-COSINES, SINES = (
-    np.cos(ANGLES) - 1.0,
-    np.sin(ANGLES),
-)  # and what the error of the state is linear in
+# rad, by which the yaw may be wrong: those that are tried,
+ANGLES = 2.0 * math.pi * np.arange(1, 24) / 24.0
+# and what the error of the state is linear in
+COSINES, SINES = (np.cos(ANGLES) - 1.0, np.sin(ANGLES))
 
 
 @compiled

@@ -33,23 +33,16 @@ if TYPE_CHECKING:
 
 MEAN_STD = 0.15  # m, of a delay that is the same everywhere,
 PLACE_STD, PLACE_LENGTH = 0.2, 0.9  # m, of one that depends on the place, and how far it is alike,
-LOCAL_STD, LOCAL_LENGTH, LOCAL_TIME = (
-    0.05,
-    0.3,
-    2.0,
-)  # m, m, s, of one that lasts while the tag stays,
+# m, m, s, of one that lasts while the tag stays,
+LOCAL_STD, LOCAL_LENGTH, LOCAL_TIME = (0.05, 0.3, 2.0)
 NOISE_STD = 0.1  # m, and of what is new in every slice
-OUTLIER = (
-    3.0  # normalised square of a slice's error, above which its variance is raised until it is this
-)
-LARGEST_ERROR = (
-    8.0  # normalised square that a slice counts as at most when the scale of the flight is learned
-)
+# normalised square of a slice's error, above which its variance is raised until it is this
+OUTLIER = 3.0
+# normalised square that a slice counts as at most when the scale of the flight is learned
+LARGEST_ERROR = 8.0
 SMALLEST_SCALE = 1.0  # mean normalised square below which no flight counts as better
-SCALE, SCALE_SLICES = (
-    2.0,
-    20,
-)  # mean normalised square before there are any slices, and how many slices that is worth
+# mean normalised square before there are any slices, and how many slices that is worth
+SCALE, SCALE_SLICES = (2.0, 20)
 WINDOW, YOUNGEST = 24, 4  # slices in which an onset is looked for, and that it must have lasted
 FASTEST_DRIFT, CLEARLY = 0.1, 1.5  # m/s, of a clock; how much better than all steps a ramp must be
 CAPACITY = 240  # slices that are remembered
@@ -82,28 +75,21 @@ class ChangeDetector:
 
     def __init__(self) -> None:
         room = CAPACITY
-        self._rows: np.ndarray = np.empty(
-            0, int
-        )  # of the anchors with a column, and the column of each row
+        # of the anchors with a column, and the column of each row
+        self._rows: np.ndarray = np.empty(0, int)
         self._columns: dict[int, int] = {}
         self._t, self._p = np.zeros(room), np.zeros((room, 3))
         self._delays: np.ndarray
         self._white: np.ndarray
-        self._delays, self._freedom = (
-            np.zeros((room, 0)),
-            np.zeros(room),
-        )  # without what was taken out; combinations measured
-        self._factor, self._white = (
-            np.zeros((room, room)),
-            np.zeros((room, 0)),
-        )  # Cholesky factor; whitened errors
+        # without what was taken out; combinations measured
+        self._delays, self._freedom = (np.zeros((room, 0)), np.zeros(room))
+        # Cholesky factor; whitened errors
+        self._factor, self._white = (np.zeros((room, room)), np.zeros((room, 0)))
         self._squares = np.zeros(room)  # normalised squares
-        self._response: np.ndarray = np.zeros(
-            (WINDOW, 0, 0)
-        )  # of the latest slices, in turn, for the anchors that were heard,
-        self._place: np.ndarray = np.full(
-            (WINDOW, 0), -1
-        )  # and where the anchor of a column is among them
+        # of the latest slices, in turn, for the anchors that were heard,
+        self._response: np.ndarray = np.zeros((WINDOW, 0, 0))
+        # and where the anchor of a column is among them
+        self._place: np.ndarray = np.full((WINDOW, 0), -1)
         self._known: list[Change] = []
         self._count = self._added = 0
 
@@ -225,14 +211,11 @@ class ChangeDetector:
         n, turns = self._count - first, self._turn(np.arange(first, self._count))
         some = np.flatnonzero((self._place[turns] >= 0).any(axis=0))  # anchors that were heard
         inverse, white = _inverse(self._factor, first, n), self._white[first : self._count, some]
-        of_slices = (
-            np.ascontiguousarray(self._place[turns][:, some]),
-            self._response[turns],
-        )  # or it is compiled anew in flight
+        # or it is compiled anew in flight
+        of_slices = (np.ascontiguousarray(self._place[turns][:, some]), self._response[turns])
         scores, information = _seen(*of_slices, inverse.T @ white, inverse.T @ inverse)
-        age = (
-            np.arange(n) - np.arange(n - YOUNGEST)[:, None]
-        )  # of slices (columns) since each onset (rows)
+        # of slices (columns) since each onset (rows)
+        age = np.arange(n) - np.arange(n - YOUNGEST)[:, None]
         shapes = np.concatenate([(age >= 0).astype(float), LENGTH * np.maximum(age + 0.5, 0.0)])
         score = shapes @ scores
         power = np.sum(np.tensordot(shapes, information, axes=1) * shapes[:, :, None], axis=1)

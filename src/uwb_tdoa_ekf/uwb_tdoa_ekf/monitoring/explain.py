@@ -87,15 +87,11 @@ def unexplained(
     """
     t, state, parameters = tdoa["t"], new_state(positions), config.parameters()
     number = _numbers(t)
-    edges = np.append(
-        np.unique(number, return_index=True)[1], len(t)
-    )  # of blocks, and of what is before the first one
+    # of blocks, and of what is before the first one
+    edges = np.append(np.unique(number, return_index=True)[1], len(t))
     counted = (np.diff(edges) > FEW) & (number[edges[:-1]] >= 0)
-    of_imu = (
-        0,
-        *imu["t"].searchsorted(t[edges[1:-1]]),
-        len(imu),
-    )  # those before the first TDOA of each
+    # those before the first TDOA of each
+    of_imu = (0, *imu["t"].searchsorted(t[edges[1:-1]]), len(imu))
     most, loss, out = limit * (1.0 + 1e-9) * np.count_nonzero(counted), 0.0, np.empty(len(t))
     for k, (first, end) in enumerate(zip(edges, edges[1:])):
         out[first:end] = innovations(

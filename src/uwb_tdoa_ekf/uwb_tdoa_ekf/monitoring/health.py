@@ -43,16 +43,13 @@ class Health:
         self, config: FilterConfig, lag: float, volume: FlyableVolume | None = None
     ) -> None:
         """config : FilterConfig; lag : s; volume : FlyableVolume, or None."""
-        self.received: Counter[str] = (
-            Counter()
-        )  # messages of each stream: imu, tdoa, and those of aids
+        # messages of each stream: imu, tdoa, and those of aids
+        self.received: Counter[str] = Counter()
         self.last_odometry: float | None = None  # time.monotonic(), s
-        self.last_position: tuple[np.ndarray, np.ndarray] | None = (
-            None  # (3,) m and its covariance (3, 3) m^2
-        )
-        self.behind: float | None = (
-            None  # s from the stamp of the newest odometry to the present time of ROS
-        )
+        # (3,) m and its covariance (3, 3) m^2
+        self.last_position: tuple[np.ndarray, np.ndarray] | None = None
+        # s from the stamp of the newest odometry to the present time of ROS
+        self.behind: float | None = None
         self._use_imu, self._lag = config.use_imu, lag
         self._volume = VolumeCheck(volume)
         self._imu_rate, self._tdoa_rate, self._located_rate = Rate(), Rate(), Rate()

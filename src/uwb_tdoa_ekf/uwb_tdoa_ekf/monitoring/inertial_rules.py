@@ -164,24 +164,18 @@ FORCE_UNITS = {
     "mg": (1e-3 * GRAVITY, 700.0, 1500.0),
     "mm/s^2": (1e-3, 7e3, 14e3),
 }
-WEIGHTLESS = (
-    0.65  # of the deviation over the mean, m/s^2 over m/s^2: no gravity in it; healthy 0.41 at most
-)
-STEADY = (
-    0.8  # length of the mean specific force over the mean of its lengths; healthy 0.96 at least
-)
+# of the deviation over the mean, m/s^2 over m/s^2: no gravity in it; healthy 0.41 at most
+WEIGHTLESS = 0.65
+# length of the mean specific force over the mean of its lengths; healthy 0.96 at least
+STEADY = 0.8
 # Without gravity 29 measured and simulated flights deviate by 0.74 at least, or are steady to 0.64
 # at most.
 # rad/s of turning that gravity does not follow; healthy 0.02 at most, in degrees/s 0.7 at least
 TURN_EXCESS = 0.35
-REST_SHAKES, REST_TURNS = (
-    0.02,
-    0.02,
-)  # of the specific force: its deviation in a window, and rad of its direction, of a tag at rest
-UPRIGHT, AXIS = (
-    np.cos(np.deg2rad(35.0)),
-    np.cos(np.deg2rad(25.0)),
-)  # healthy: 22 degrees, from vibration, at most
+# of the specific force: its deviation in a window, and rad of its direction, of a tag at rest
+REST_SHAKES, REST_TURNS = (0.02, 0.02)
+# healthy: 22 degrees, from vibration, at most
+UPRIGHT, AXIS = (np.cos(np.deg2rad(35.0)), np.cos(np.deg2rad(25.0)))
 # m/s^2 rms of what is faster than 50 ms; healthy 0.6; where the accelerometer rectifies 1.4 at
 # least
 SHAKING = 1.0

@@ -56,20 +56,14 @@ SMALLEST_CHANGE = 0.15  # m; less does not matter, and what has come back to tha
 SILENT, FEWEST = 4, 40  # slices without an anchor, and the TDOAs of the others in them
 OFTEN = 0.5  # share of the slices in which it was heard before
 FORGET = 60  # slices between two looks at which of the anchors were passed long ago
-NEARER = (
-    0.8  # share of the distance of the farthest anchor that is heard, within which another must be
-)
+# share of the distance of the farthest anchor that is heard, within which another must be
+NEARER = 0.8
 TOGETHER = 4  # slices in which a swap is looked for
-NAMED, HELD = (
-    4,
-    8,
-    # slices or comparisons in a row that must say so until it is named, and something else until a swap
-    # is no longer
-)
-LOOK, YOUNG = (
-    4,
-    40,
-)  # slices between two comparisons with the survey; and of a comparison with the latest, at least
+# slices or comparisons in a row that must say so until it is named, and something else until a swap
+# is no longer
+NAMED, HELD = (4, 8)
+# slices between two comparisons with the survey; and of a comparison with the latest, at least
+LOOK, YOUNG = (4, 40)
 SURE = 2.0  # standard deviations by which an anchor must be off the survey, beside SMALLEST_CHANGE
 TURN_APART = 3.0  # s of stamps between two turns of all signs
 # Share of the TDOAs of a slice that the filter accepts where it is right, and s since then, within
@@ -78,20 +72,14 @@ TURN_APART = 3.0  # s of stamps between two turns of all signs
 MOST, AGREED = 0.5, 1.1
 MOST_EVENTS = 1000  # that are remembered
 CALIBRATE = 15.0  # s in motion that count as calibration of the IMU
-BIAS_LIMITS = {
-    "gyroscope": 0.03,
-    "accelerometer": 0.6,
-}  # rad/s and m/s^2, by which an estimated bias must have moved
+# rad/s and m/s^2, by which an estimated bias must have moved
+BIAS_LIMITS = {"gyroscope": 0.03, "accelerometer": 0.6}
 
 SURVEYING = "survey RECORDING"  # the command that says where it stands
 
 NO_ODOMETRY = [np.empty(0), *[np.empty((0, 3))] * 4]  # t, p, v, gyro_bias, accel_bias
-NO_RESIDUALS = [
-    np.empty(0),
-    *[np.empty(0, int)] * 2,
-    np.empty(0),
-    np.empty(0, bool),
-]  # t, a, b, innovation, whether it was accepted
+# t, a, b, innovation, whether it was accepted
+NO_RESIDUALS = [np.empty(0), *[np.empty(0, int)] * 2, np.empty(0), np.empty(0, bool)]
 
 
 class Heard(NamedTuple):
@@ -126,10 +114,8 @@ class Monitor:
         self._anchors, self._calibrated = anchors, calibrated
         self._past: deque[Event] = deque(maxlen=MOST_EVENTS)
         self._standing: dict[str, Event] = {}  # what stands at present, by its key
-        self.turns, self._turned = (
-            0,
-            -math.inf,
-        )  # of the signs of all TDOAs in flight, and the stamp of the last, s
+        # of the signs of all TDOAs in flight, and the stamp of the last, s
+        self.turns, self._turned = (0, -math.inf)
         self._agreed = -math.inf  # s, end of the last slice in which the filter accepted most TDOAs
         self._forget()
 
@@ -159,15 +145,12 @@ class Monitor:
         self._counts: list[int] = []  # TDOAs of the last slices
         self._swapped: tuple[int, ...] = ()  # rows
         self._silent: tuple[int, ...] = ()
-        self._instead: tuple[tuple[int, ...], int] = (
-            (),
-            0,
-        )  # rows of another swap, or of none, and slices in a row that say so
+        # rows of another swap, or of none, and slices in a row that say so
+        self._instead: tuple[tuple[int, ...], int] = ((), 0)
         self._moving_since = math.nan  # s, stamp
         self._bias: np.ndarray | None = None
-        self._bias_now: np.ndarray | None = (
-            None  # (6,): gyroscope, accelerometer; as calibrated, and the latest
-        )
+        # (6,): gyroscope, accelerometer; as calibrated, and the latest
+        self._bias_now: np.ndarray | None = None
         self._bias_calibration: list[np.ndarray] = []
 
     def forget(self, gone: np.ndarray) -> None:
@@ -213,9 +196,8 @@ class Monitor:
     def add(self, odometry: Odometry, residuals: Residuals) -> None:
         """Take Odometry and the Residuals that came with it."""
         if self._end is not None and len(residuals.t) and residuals.t[0] > self._last + GAP:
-            self.update(
-                math.inf
-            )  # of the flight before; no slice is tested for each half second of a gap
+            # of the flight before; no slice is tested for each half second of a gap
+            self.update(math.inf)
         if len(odometry):
             self._odometry.append(
                 [odometry.t, odometry.p, odometry.v, odometry.gyro_bias, odometry.accel_bias]
@@ -357,9 +339,8 @@ class Monitor:
 
     def _compare_anew(self) -> None:
         """What was not as it is now says nothing of the survey."""
-        self._comparisons = [
-            self._new_comparison()
-        ]  # with all slices, and with the last YOUNG to 2 YOUNG, and YOUNG at most
+        # with all slices, and with the last YOUNG to 2 YOUNG, and YOUNG at most
+        self._comparisons = [self._new_comparison()]
         self._displaced, self._suspected, self._compared = {}, {}, 0
 
     def _new_comparison(self) -> SurveyComparison:

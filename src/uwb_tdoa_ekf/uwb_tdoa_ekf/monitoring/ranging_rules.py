@@ -21,12 +21,8 @@ RETURNS = 0.08  # share of TDOAs that leap by more than 0.5 m and back; healthy 
 EVEN = 0.6  # share of the pairs, heard in both orders, that have one sign; healthy 0.1
 ON_GRID = 0.95  # share; healthy 0.005
 CLIPPED = 0.02  # share at the largest value
-STEP, ALIKE, NEAR, FEWEST = (
-    5.0,
-    0.6,
-    0.5,
-    10,
-)  # m, median leap; share of the leaps within NEAR, m, of that; leaps
+# m, median leap; share of the leaps within NEAR, m, of that; leaps
+STEP, ALIKE, NEAR, FEWEST = (5.0, 0.6, 0.5, 10)
 TICK = 299792458.0 / (128 * 499.2e6)  # m, of the clock of a DW1000
 WRAPS = {
     f"2^{bits} ticks of a DW1000": 2.0**bits * TICK for bits in (8, 16, 24, 31, 32, 39, 40)

@@ -25,19 +25,16 @@ if TYPE_CHECKING:
 ABSURD = 1e15  # in any unit: no number that a radio gives
 FOLLOWING = 0.1  # s between two TDOAs of a pair that count as successive
 LEAP = 0.5  # m between successive TDOAs of a pair that no tag flies in that time
-BEYOND = (
-    1.0  # m by which a TDOA may exceed the distance of its anchors before it counts as impossible
-)
-GRIDS = np.array(
-    [1.0, 0.5, 0.25, 0.1, 0.05, 0.02, 0.01]
-)  # m, to which a driver might round; the radio's tick is 4.69 mm
+# m by which a TDOA may exceed the distance of its anchors before it counts as impossible
+BEYOND = 1.0
+# m, to which a driver might round; the radio's tick is 4.69 mm
+GRIDS = np.array([1.0, 0.5, 0.25, 0.1, 0.05, 0.02, 0.01])
 ON_GRID = 1e-6  # m
 # Pairs that are remembered, of all that a tag hears in a minute; places that one may have, of which
 # it takes the oldest
 PAIRS, PROBES = 4096, 16
-FRESH = (
-    0.3  # s before the end of a window, whose TDOAs belong together: no tag gets far in that time
-)
+# s before the end of a window, whose TDOAs belong together: no tag gets far in that time
+FRESH = 0.3
 STEPS = 64  # leaps of a window whose size is kept
 
 # places in the counters; those of the grids come after

@@ -39,25 +39,13 @@ if TYPE_CHECKING:
     from .slices import Slice
 
 CELL = 0.7  # m
-MOST_CELLS, MOST_ANCHORS = (
-    150,
-    24,
-)  # that are compared, those where the tag was last; and the anchors that are heard in them
+# that are compared, those where the tag was last; and the anchors that are heard in them
+MOST_CELLS, MOST_ANCHORS = (150, 24)
 TDOA_STD = 0.1  # m, of one TDOA beside these
-ERROR_STDS = (
-    0.02,
-    0.05,
-    0.1,
-    0.15,
-    0.22,
-    0.32,
-    0.45,
-    0.65,
-)  # m, of errors of an anchor that last in a cell, of which the evidence chooses
-SURVEY_STD, DELAY_STD = (
-    0.05,
-    0.15,
-)  # m, of coordinates and of delays of anchors, where no calibration states them
+# m, of errors of an anchor that last in a cell, of which the evidence chooses
+ERROR_STDS = (0.02, 0.05, 0.1, 0.15, 0.22, 0.32, 0.45, 0.65)
+# m, of coordinates and of delays of anchors, where no calibration states them
+SURVEY_STD, DELAY_STD = (0.05, 0.15)
 ODDS = 1e3  # by how much more probable a change must make the flight
 FEWEST_CELLS, FEWEST_SLICES = 12, 40  # that must be compared
 SLOPES = 0.5  # 1/m, of such errors that go on from cell to cell
@@ -220,10 +208,8 @@ class SurveyComparison:
             towards = ranges(cell.place, positions[own])[1]
             axes = (3 * own[:, None] + np.arange(3)).ravel()
             columns = np.concatenate([axes, 3 * n + own, 4 * n + axes])
-            by, each = (
-                np.zeros((len(own), 7 * len(own))),
-                np.arange(len(own)),
-            )  # derivatives of delays by coordinates, delays and slopes
+            # derivatives of delays by coordinates, delays and slopes
+            by, each = (np.zeros((len(own), 7 * len(own))), np.arange(len(own)))
             for axis in range(3):
                 by[each, 3 * each + axis] = -towards[:, axis]
                 by[each, 4 * len(own) + 3 * each + axis] = cell.place[axis] - middle[axis]

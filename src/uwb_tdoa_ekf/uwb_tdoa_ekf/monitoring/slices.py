@@ -19,9 +19,8 @@ CLIP = 1.5  # m; a larger innovation counts as this
 TDOA_VARIANCE = 0.02  # m^2, noise of one TDOA about the errors that last
 PLACE_STD = 0.5  # m, by which the filter may be off
 DELAY_STD = 0.15  # m, of a delay, before anything is measured
-MOST = (
-    100  # anchors of a slice; where more are heard, those that are heard least are left out of it
-)
+# anchors of a slice; where more are heard, those that are heard least are left out of it
+MOST = 100
 
 
 @dataclass(frozen=True)

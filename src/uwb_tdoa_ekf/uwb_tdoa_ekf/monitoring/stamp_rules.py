@@ -190,19 +190,15 @@ STAMP_LINE = (
 SLOWEST = {"imu/data": 50.0, "uwb/tdoa": 20.0}  # Hz; healthy 946 and 191 at least
 LONGEST_GAP = {"imu/data": 0.1, "uwb/tdoa": 0.5}  # s; healthy 0.012 and 0.116 at most
 SCATTER = 3.0  # standard deviation of the steps over their mean; healthy 1.4 at most
-REPEATED, LEAP = (
-    0.3,
-    0.01,
-)  # share of stamps that equal the one before, healthy 0, and s between those that do not
+# share of stamps that equal the one before, healthy 0, and s between those that do not
+REPEATED, LEAP = (0.3, 0.01)
 PACE = 0.05  # by which the pace of the stamps may differ from that of the clock
 BLOCK = 0.1  # s between the soonest and the latest arrival of a window, beyond the lag of the first
 APART = 0.1  # s between two streams
 LATEST = 5.0  # s that TDOAs may come late; what is more is another clock
 DRIFT, DRIFTED = 3e-4, 0.03  # s/s, and s over the recording
-LAG, REORDER = (
-    0.25,
-    0.003,
-)  # s: what ekf_node waits for, as its parameters of these names say by default
+# s: what ekf_node waits for, as its parameters of these names say by default
+LAG, REORDER = (0.25, 0.003)
 UNITS = {1e3: "milliseconds", 1e6: "microseconds", 1e9: "nanoseconds"}
 
 
@@ -437,9 +433,8 @@ def offset(imu: list[StampWindow], tdoa: list[StampWindow]) -> Finding | None:
         begin, end = imu[0].begin - tdoa[0].begin, imu[-1].end - tdoa[-1].end
         ahead = 0.5 * (begin + end)
         evidence = f"the IMU begins {begin:+.3f} s and ends {end:+.3f} s after the TDOAs"
-        outside = (
-            imu[0].begin > tdoa[-1].end or imu[-1].end < tdoa[0].begin
-        )  # no sample is of the time of the TDOAs
+        # no sample is of the time of the TDOAs
+        outside = imu[0].begin > tdoa[-1].end or imu[-1].end < tdoa[0].begin
         alike = (
             min(abs(begin), abs(end)) >= APART
             and begin * end > 0.0

@@ -55,9 +55,8 @@ class Use:
     def __init__(self, lag: float) -> None:
         """lag : s, for which the filter waits."""
         self._lag = lag
-        self._looks: deque[tuple[float, dict[str, int]]] = (
-            deque()
-        )  # (time.monotonic(), counts) of the last seconds
+        # (time.monotonic(), counts) of the last seconds
+        self._looks: deque[tuple[float, dict[str, int]]] = deque()
         self._since: dict[
             str, float
         ] = {}  # time.monotonic() of the last look at which there was more, by kind
@@ -215,10 +214,8 @@ class VolumeCheck:
 pass
 
 
-YAW_KNOWN = math.radians(
-    20.0
-    # rad; while four yaws are followed it is 100 degrees, with one left below 20: docs/reliability.md
-)
+# rad; while four yaws are followed it is 100 degrees, with one left below 20: docs/reliability.md
+YAW_KNOWN = math.radians(20.0)
 ANY_YAW, ANY_SPEED = math.pi, 2.0  # rad and m/s, stated while a fault makes everything wrong
 WAITING, STARTING, RUNNING, LOST, FAULT = range(5)  # as in EstimatorStatus
 
@@ -340,9 +337,8 @@ def doubted(odometry: Odometry, size: np.ndarray) -> Odometry:
     """
     covariance = odometry.covariance.copy()
     x, y, z, w = odometry.q.T
-    up = np.stack(
-        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x**2 + y**2)], axis=1
-    )  # of the world, in the body
+    # of the world, in the body
+    up = np.stack([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x**2 + y**2)], axis=1)
     covariance[:, :3, :3] += np.diag(size**2)
     covariance[:, 3:6, 3:6] += ANY_SPEED**2 * np.eye(3)
     covariance[:, 6:, 6:] += ANY_YAW**2 * up[:, :, None] * up[:, None, :]

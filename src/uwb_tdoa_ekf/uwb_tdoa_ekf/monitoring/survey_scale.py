@@ -23,32 +23,18 @@ from .finding import ERROR, Finding
 if TYPE_CHECKING:
     from uwb_tdoa_bias.common.anchors import Anchors
 
-PAIRS, HEARD = (
-    32,
-    5,
-    # pairs of a snapshot at most; anchors at least: three coordinates and a scale take four differences
-)
+# pairs of a snapshot at most; anchors at least: three coordinates and a scale take four differences
+PAIRS, HEARD = (32, 5)
 SMALL = 0.05  # m, median size of TDOAs below which they are not in metres themselves
-FEWEST, MANY, KEPT = (
-    4,
-    20,
-    60,
-)  # snapshots that say something clear, and anything, and that are kept in flight
-SINGLE = (
-    12  # anchors at most, of which each by itself, and any two, are tried: the work has a bound
-)
-SMALLEST, RATIO, LARGEST = (
-    1.5,
-    1.25,
-    1500.0,
-)  # least factor that counts, ratio of successive ones, and the largest
-LOSS, STEPS, NEAR = (
-    0.5,
-    8,
-    0.3,
-    # m, scale of the Geman-McClure loss; Gauss-Newton steps; of the size of the room, the longest of
-    # them
-)
+# snapshots that say something clear, and anything, and that are kept in flight
+FEWEST, MANY, KEPT = (4, 20, 60)
+# anchors at most, of which each by itself, and any two, are tried: the work has a bound
+SINGLE = 12
+# least factor that counts, ratio of successive ones, and the largest
+SMALLEST, RATIO, LARGEST = (1.5, 1.25, 1500.0)
+# m, scale of the Geman-McClure loss; Gauss-Newton steps; of the size of the room, the longest of
+# them
+LOSS, STEPS, NEAR = (0.5, 8, 0.3)
 STARTS = np.array(
     [[0.0, 0.0, 0.0], [0.6, 0.6, 0.6], [-0.6, -0.6, 0.6], [0.6, -0.6, -0.6], [-0.6, 0.6, -0.6]]
 )
@@ -58,12 +44,9 @@ STARTS = np.array(
 # 0.50 is left on measured flights.
 LEFT, DEVIATIONS = 0.65, 3.5
 GOOD = 0.35  # loss of a survey that fits; healthy flights of three days have 0.10 to 0.25
-MOVED, CLEARLY = (
-    0.3,
-    0.5,
-    # m by which the tag must have moved; share of the loss that shows it after few seconds and at rest,
-    # too
-)
+# m by which the tag must have moved; share of the loss that shows it after few seconds and at rest,
+# too
+MOVED, CLEARLY = (0.3, 0.5)
 # m; TDOAs in this unit, and in feet, look like a survey that is too small by this factor
 NANOSECONDS = 0.299792458
 AS_IT_IS, SCALED, SIGN, EXCHANGED, ALONE = range(5)  # kinds of hypotheses

@@ -16,31 +16,21 @@ from uwb_tdoa_bias.common.geometry import ranges, tdoa
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    Residuals = dict[
-        tuple[int, ...], float
-    ]  # m, mean absolute residual by the rows of two exchanged anchors; () : of none
+    # m, mean absolute residual by the rows of two exchanged anchors; () : of none
+    Residuals = dict[tuple[int, ...], float]
 
 SUSPECTS = 8  # anchors with the largest innovations, whose exchanges are tried,
 LARGE = 0.3  # m, if the largest is as large as that
 PLACE_STD = 1.0  # m, by which the filter may be off
-STD, ROBUST, STEPS = (
-    0.15,
-    0.4,
-    3,
-)  # m, of one TDOA; m, scale of the Geman-McClure weight; solutions for the place
+# m, of one TDOA; m, scale of the Geman-McClure weight; solutions for the place
+STD, ROBUST, STEPS = (0.15, 0.4, 3)
 CLIP = 1.5  # m; a larger residual counts as this
 FEWEST = 10  # TDOAs of a slice
-SHARE, OF_OTHERS = (
-    0.4,
-    0.8,
-    # of the residuals that an exchange may leave, of those as surveyed and of those of any other
-    # exchange;
-)
-MOST_LEFT, LEAST, ALONE = (
-    0.65,
-    0.1,
-    2.5,
-)  # or more, if it explains so much, m, and so many times as much as any other
+# of the residuals that an exchange may leave, of those as surveyed and of those of any other
+# exchange;
+SHARE, OF_OTHERS = (0.4, 0.8)
+# or more, if it explains so much, m, and so many times as much as any other
+MOST_LEFT, LEAST, ALONE = (0.65, 0.1, 2.5)
 
 
 def residuals(
@@ -59,12 +49,8 @@ def residuals(
     that are tried in any case.
     """
     rows, both = np.unique(np.concatenate([a, b]), return_inverse=True)
-    a, b, positions, n = (
-        both[: len(a)],
-        both[len(a) :],
-        positions[rows],
-        len(rows),
-    )  # of those that are heard
+    # of those that are heard
+    a, b, positions, n = (both[: len(a)], both[len(a) :], positions[rows], len(rows))
     if len(a) < FEWEST:
         return {}
     error = np.abs(d - tdoa(p, positions[a], positions[b]))

@@ -136,9 +136,8 @@ def _bags(folder):
     flight = replace(small_flight(0.004), imu=None, truth=None)
     write_bag(flight, folder / "small")
     write("bag_mcap", "small", (folder / "small" / "small.mcap").read_bytes())
-    write(
-        "bag_mcap", "plain", bag_of("/odometry", MESSAGES["/odometry"], b"")
-    )  # without chunks and QoS, which take long
+    # without chunks and QoS, which take long
+    write("bag_mcap", "plain", bag_of("/odometry", MESSAGES["/odometry"], b""))
     text = (folder / "small" / "metadata.yaml").read_text()
     write(
         "bag_metadata",

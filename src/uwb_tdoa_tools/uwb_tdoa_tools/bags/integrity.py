@@ -29,9 +29,8 @@ _STEPS = 20_000  # instructions of SQLite between checks of the time: some milli
 _PLAIN_SCHEMA = re.compile(
     r"CREATE\s+(TABLE|INDEX)\s[^()]*\([\w\s,\"'`\[\]]*\)\s*", re.IGNORECASE
 )  # without inner brackets nothing is computed
-sqlite3.enable_callback_tracebacks(
-    True
-)  # else a Ctrl-C in a callback of SQLite is lost (common/executable.py)
+# else a Ctrl-C in a callback of SQLite is lost (common/executable.py)
+sqlite3.enable_callback_tracebacks(True)
 _TYPES = (  # columns of an SQLite bag and their types
     ("messages", {"timestamp": "integer", "topic_id": "integer", "data": "blob"}),
     ("topics", {"id": "integer", "name": "text", "type": "text", "serialization_format": "text"}),

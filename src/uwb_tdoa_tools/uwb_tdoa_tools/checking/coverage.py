@@ -66,9 +66,8 @@ pass
 
 RARE = 0.2  # share of the median rate of the anchors; healthy 0.54 at least
 SILENT = 5.0  # s for which an anchor that is heard otherwise is not
-FLAT_SHARE = (
-    0.08  # thickness of the constellation over its size; the measured rooms have 0.2 and more
-)
+# thickness of the constellation over its size; the measured rooms have 0.2 and more
+FLAT_SHARE = 0.08
 OUTSIDE, MARGIN = 0.5, 0.5  # share of the places of the tag, and m beyond the box of the anchors
 SHORT = 10.0  # s
 FEWEST = 3  # anchors, which always lie in a plane

@@ -119,9 +119,8 @@ def _evaluate(args: Namespace) -> int:
     }
     for result in results(evaluator, found, args.resume, asked, args.jobs, args.dask):
         pool.add(result)
-        kept += (
-            [result] if args.json or args.markdown else []
-        )  # else nothing grows with the number of flights
+        # else nothing grows with the number of flights
+        kept += [result] if args.json or args.markdown else []
         cli.show(evaluating.line_of_run(result.row))
     together = pool.figures()
     if len(found) > 1:

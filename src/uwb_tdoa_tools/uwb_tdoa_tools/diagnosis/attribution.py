@@ -306,9 +306,8 @@ def residuals_of(
 ) -> list[ChannelResiduals]:
     """[`channels.residuals`] of Flights. progress, map_function : as of `attribute`."""
     if not all(reference.positions_known):
-        map_function = (
-            map  # with all that the filter knows of the path, they take as long to send as to find
-        )
+        # with all that the filter knows of the path, they take as long to send as to find
+        map_function = map
     out = []
     for of_flight in map_function(
         partial(residuals, reference=reference, effects=effects), flights

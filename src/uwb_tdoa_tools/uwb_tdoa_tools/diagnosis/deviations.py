@@ -40,10 +40,8 @@ LENGTH = 4.0
 UNSAID = 0.03  # m, that coordinates and delays may be off by, of which no anchor has any in the fit
 COORDINATE_STDS = 0.001, 0.003, 0.01, UNSAID  # m, the same of coordinates: the data show how much
 SAME = 1e-4  # m, by which that mean may differ from zero
-LASTS = (
-    *OF_ANCHORS,
-    "tag_lever_arm",
-)  # take what other errors leave that last as long as the flight
+# take what other errors leave that last as long as the flight
+LASTS = (*OF_ANCHORS, "tag_lever_arm")
 LASTING = 14.0  # by which errors that are alike for a while are alike for longer than blocks tell
 
 

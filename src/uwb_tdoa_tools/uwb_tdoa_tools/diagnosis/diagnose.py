@@ -40,9 +40,8 @@ if TYPE_CHECKING:
 
     Flights = tuple[Flight, ...]
 
-EXPLAINED = (
-    0.1  # share of the slow innovations that a self-calibration must explain, to be a finding
-)
+# share of the slow innovations that a self-calibration must explain, to be a finding
+EXPLAINED = 0.1
 CANNOT_JUDGE = "without ground truth nobody can tell whether taking it out helps the position"
 
 

@@ -26,9 +26,8 @@ if TYPE_CHECKING:
 
 DETERMINED = 0.25  # standard deviation of a share, below which the flight determines it
 SURE = 4.0  # standard deviations
-ALIKE = (
-    0.3  # share by which flights may differ and count as the same: models are never right to less
-)
+# share by which flights may differ and count as the same: models are never right to less
+ALIKE = 0.3
 GROWN = 0.5  # share by which the last flight must be beyond the first, to call it growing
 
 ALL, ALONE, GROWS, DIFFERS = "all", "alone", "grows", "differs"

@@ -31,10 +31,8 @@ if TYPE_CHECKING:
 
 ROUNDS = 2  # of linearising about what was found
 LINEARITY_LIMIT = 0.1  # of the channel's scale: root mean square by which a linear model may be off
-MAPS_GAIN, MAPS_SURE = (
-    20.0,
-    3.0,
-)  # held-out log-likelihood, twice, and its t value over blocks, that maps must bring
+# held-out log-likelihood, twice, and its t value over blocks, that maps must bring
+MAPS_GAIN, MAPS_SURE = (20.0, 3.0)
 DISGUISED = 4  # times that what disguises itself as noise is searched for before noise is measured
 SAME_STORY = 0.05  # share of what a model explains that a simpler one may explain less
 MIN_GAIN = 2.0  # held-out log-likelihood, twice, that a term must bring

@@ -42,12 +42,8 @@ if TYPE_CHECKING:
 Made = TypeVar("Made")
 
 TRIAL_FLIGHTS = 3  # flights, or halves of one, on which trials are judged
-DRIFTS = (
-    "line",
-    "beyond",
-    "below",
-    "parabola",
-)  # shapes of a function of the time that may come again, as a clock warms up
+# shapes of a function of the time that may come again, as a clock warms up
+DRIFTS = ("line", "beyond", "below", "parabola")
 # share of the error by which leaving an effect out must make it smaller, for the effect to be left
 # out
 WORSE = 0.005

@@ -115,9 +115,8 @@ class Peer:
 
     def start(self, anchors: np.ndarray, p: ArrayLike, q: ArrayLike) -> None:
         """Restart at p (3,) m with attitude q (4,) x y z w, with anchors (n, 3) m."""
-        self._anchors = np.ascontiguousarray(
-            anchors, dtype=float
-        )  # kept: the library may read them later
+        # kept: the library may read them later
+        self._anchors = np.ascontiguousarray(anchors, dtype=float)
         self._start(
             _pointer(self._anchors),
             ctypes.c_int32(len(anchors)),

@@ -29,15 +29,10 @@ NEAR_FLOOR = 0.5  # m, largest height at which the floor acts
 LOW = 1.0  # m, largest height of a low anchor
 GUST_TIME = 1.0  # s, correlation time of gusts
 PERSON = 0.25, 1.8, 1.0  # m, radius and height of a person; m/s
-BLOCKED, BLOCK_TIME = (
-    (0.2, 2.0),
-    0.5,
-)  # m, delay behind a person; s, between draws of it
-ALTITUDE_STD, VELOCITY_STD, RANGE_STD = (
-    0.08,
-    0.05,
-    0.1,
-)  # noise of barometer, m, velocity, m/s, and distances, m
+# m, delay behind a person; s, between draws of it
+BLOCKED, BLOCK_TIME = ((0.2, 2.0), 0.5)
+# noise of barometer, m, velocity, m/s, and distances, m
+ALTITUDE_STD, VELOCITY_STD, RANGE_STD = (0.08, 0.05, 0.1)
 NEVER = np.inf, np.inf
 
 

@@ -221,13 +221,11 @@ class Simulator:
         )
         self.samples = np.zeros((n, 6))
         self.done, self.states[0], self._gyro = 0, self.state, np.zeros((2, 3))
-        self._carrying: tuple[np.ndarray, float, float, np.ndarray] | None = (
-            None  # state and time at the start, time at the end, path
-        )
+        # state and time at the start, time at the end, path
+        self._carrying: tuple[np.ndarray, float, float, np.ndarray] | None = None
         self._heard = dict.fromkeys(("tdoa", *world.aids), 0)
-        self._first: tuple[Tdoas, np.ndarray] | None = (
-            None  # first TDOAs, and the state at that time
-        )
+        # first TDOAs, and the state at that time
+        self._first: tuple[Tdoas, np.ndarray] | None = None
 
     @property
     def now(self) -> float:

@@ -35,9 +35,8 @@ POSITION, VELOCITY, ATTITUDE, RATE, SPEED = (
     slice(13, 17),
 )  # of a state
 STATE = 17  # numbers in it: m, m/s, x y z w, rad/s in the body frame, rad/s of each rotor
-CORNERS = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]]) * math.sqrt(
-    0.5
-)  # directions of arms, body frame
+# directions of arms, body frame
+CORNERS = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0]]) * math.sqrt(0.5)
 SPIN = np.array([1.0, -1.0, 1.0, -1.0])  # sign of the yaw moment on the body
 
 

@@ -20,13 +20,8 @@ from ..simulation.rooms import corners
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
 
-MOMENTS = (
-    "rest",
-    "lift-off",
-    "circle",
-    "landing",
-    "anywhere",
-)  # of a flight; a circle of no radius is hovering
+# of a flight; a circle of no radius is hovering
+MOMENTS = ("rest", "lift-off", "circle", "landing", "anywhere")
 LONGEST_SILENCE = 60.0  # s
 
 
@@ -155,12 +150,10 @@ WORLDS = {
     "jitter": replace(HALL, latency=0.01, jitter=0.01),
     "tdoa3": replace(HALL, protocol="tdoa3", rate=240.0),
     "gusts": replace(HALL, gust=0.5),
-    "measured-vibration": replace(
-        HALL, vibration=(0.4, 0.5, 0.35), vibration_band=30.0
-    ),  # values of the flights of 0426
-    "rectifying": replace(
-        HALL, vibration=(3.4, 2.0, 0.55), vibration_band=30.0, rectified=1.0
-    ),  # values of the flights of 0425
+    # values of the flights of 0426
+    "measured-vibration": replace(HALL, vibration=(0.4, 0.5, 0.35), vibration_band=30.0),
+    # values of the flights of 0425
+    "rectifying": replace(HALL, vibration=(3.4, 2.0, 0.55), vibration_band=30.0, rectified=1.0),
     "table": replace(HALL, table=0.75),
 }
 

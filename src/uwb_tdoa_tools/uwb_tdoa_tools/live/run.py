@@ -34,10 +34,8 @@ MATCHED = {
 }
 # A replay can wait, a robot cannot: here no link may lose a message, and the replay waits for a
 # stream that falls behind.
-PATIENCE = {
-    "bias_node": {"hold": 9.975},
-    "ekf_node": {"lag": 10.0},
-}  # s of stamps; hold: see config/bias_node.yaml
+# s of stamps; hold: see config/bias_node.yaml
+PATIENCE = {"bias_node": {"hold": 9.975}, "ekf_node": {"lag": 10.0}}
 RELIABLE = {
     "bias_node": (
         "/uwb/tdoa.subscription",

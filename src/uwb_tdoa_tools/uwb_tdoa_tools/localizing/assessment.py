@@ -31,9 +31,8 @@ SIGMAS = 2.0
 GAP = 1.0  # s without an estimate: the tag is lost
 LARGEST_LOST_SHARE = 0.05  # largest share of lost time in a good estimate
 SMALLEST_EXPLAINED_SHARE = 0.9  # smallest share of explained TDOAs in a good estimate
-WEAK_HEIGHT_RATIO = (
-    1.5  # ratio of the deviation of z to x and y that makes the height the weakest coordinate
-)
+# ratio of the deviation of z to x and y that makes the height the weakest coordinate
+WEAK_HEIGHT_RATIO = 1.5
 # m, smallest reported offset of all ranges; without an offset the filter estimates up to 2 cm
 REPORTED_OFFSET = 0.03
 # share of lasting errors in the variance above which a calibration helps

@@ -107,9 +107,8 @@ class Subsets:
             np.arange(len(points)), max(1, len(points) * size * len(total) // _CHUNK)
         ):
             q = (distances[chunk] @ self._q.reshape(size * k, -1).T).reshape(-1, size, k)
-            share = (
-                2.0 * weights[chunk, :, None] * np.einsum("nqk,qkj->nqj", q, self._q)
-            )  # 0 for anchors not in q
+            # 0 for anchors not in q
+            share = 2.0 * weights[chunk, :, None] * np.einsum("nqk,qkj->nqj", q, self._q)
             total[:, :k] += np.einsum("nqj,nqk->jk", share, q)
             total -= np.einsum("nqj,njk->jk", share, unit[chunk])
         return total

@@ -50,9 +50,8 @@ class AnchorPlaces:
         self.ends = np.cumsum(np.maximum(lengths[:, 0], 1e-3))
         self.starts = self.ends - np.maximum(lengths[:, 0], 1e-3)
         across = np.maximum(lengths[:, 1 : self.numbers].max(axis=0), 1e-3)
-        self.lengths = np.append(
-            self.ends[-1], across
-        )  # m, of what each number runs through, at most
+        # m, of what each number runs through, at most
+        self.lengths = np.append(self.ends[-1], across)
 
     @classmethod
     def walls(

@@ -288,9 +288,8 @@ def brute_force(
     if grid.shape[2] == 1:
         points[:, 2] = grid.axes[2][0]
     row, subset, mirror = subsets.mirrors(points)
-    other = ~same_place(
-        points[row], mirror, installation.anchors.positions
-    )  # on the lines through two anchors they meet
+    # on the lines through two anchors they meet
+    other = ~same_place(points[row], mirror, installation.anchors.positions)
     predicted = np.ones((len(points), len(subsets.rows)), bool)
     predicted[row[other], subset[other]] = False
     chosen = np.unique(np.linspace(0, len(subsets.rows) - 1, MOST_PAIRINGS).astype(int))

@@ -27,15 +27,11 @@ if TYPE_CHECKING:
 # m/s^2 in one g of the Crazyflie's accelerometer, as in its firmware and in the UTIL scripts
 GRAVITY = 9.81
 NO_TARGET = 32.0  # m; the range finder writes 32.767 or more without a target, and sees 4 m at most
-LARGEST = {
-    "tof": 1e9,
-    "baro": 4e4,
-}  # mm, and m: the formula of the standard atmosphere ends at 44 km
+# mm, and m: the formula of the standard atmosphere ends at 44 km
+LARGEST = {"tof": 1e9, "baro": 4e4}
 DAY = 86400.0  # s
-UNEQUAL_RATES, DROPPED_SHARE = (
-    1.1,
-    0.02,
-)  # smallest reported ratio of two rates, and share of dropped samples
+# smallest reported ratio of two rates, and share of dropped samples
+UNEQUAL_RATES, DROPPED_SHARE = (1.1, 0.02)
 REFERENCE_SHARE = 0.95  # share of the TDOAs of a common reference anchor
 # of one reading for 1 rad/s, median over 0425/TDOA2; 30 to 35 pixels in 41 degrees, given in
 # tenths: 4.2 to 4.9

@@ -46,10 +46,8 @@ _NUMPY_OF_STRUCT = {  # codes of Python's struct module, little endian and packe
 _CANDIDATES, _SELECTED = "estTdoaCand", "isSelected"
 _STREAMS = {  # event name: our stream, {column in the log: column of the stream}
     "estTDOA": ("tdoa", {"idA": "a", "idB": "b", "distanceDiff": "d"}),
-    _CANDIDATES: (
-        "tdoa",
-        {"idA": "b", "idB": "a", "distanceDiff": "d"},
-    ),  # its sign is the other one
+    # its sign is the other one
+    _CANDIDATES: ("tdoa", {"idA": "b", "idB": "a", "distanceDiff": "d"}),
     "estGyroscope": ("gyro", {"gyro.x": "x", "gyro.y": "y", "gyro.z": "z"}),
     "estAcceleration": ("acc", {"acc.x": "x", "acc.y": "y", "acc.z": "z"}),
     "estPose": (

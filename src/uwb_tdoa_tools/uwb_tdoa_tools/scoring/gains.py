@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 if TYPE_CHECKING:
-    Errors = dict[
-        str, dict[float | None, float]
-    ]  # {flight: {share, None for no correction: 3D RMSE of the filter, m}}
+    # {flight: {share, None for no correction: 3D RMSE of the filter, m}}
+    Errors = dict[str, dict[float | None, float]]
 
 
 SAME = 0.005  # of the error: what rounds to no per cent

@@ -57,12 +57,8 @@ TITLES = {
     "at_rest_after": "at rest after",
     "whole": "whole recording",
 }
-NEAR_THE_FLOOR = (
-    "at_rest_before",
-    "first_3_s",
-    "last_3_s",
-    "at_rest_after",
-)  # reported for each run of several
+# reported for each run of several
+NEAR_THE_FLOOR = ("at_rest_before", "first_3_s", "last_3_s", "at_rest_after")
 
 
 def in_the_air(truth: Truth) -> Span | None:

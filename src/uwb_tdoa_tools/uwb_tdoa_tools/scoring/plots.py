@@ -37,16 +37,8 @@ SHADES = {  # of phases that follow one another
 TOGETHER = 0.35  # m; anchors that are nearer to each other in a picture have one label
 SIZE, FEW = 10.0, 20  # points, of the letters of so many labels at most; of more they are smaller
 MOST = 80  # anchors that have labels: more could not be read
-AROUND = (
-    (1, 1),
-    (-1, 1),
-    (1, -1),
-    (-1, -1),
-    (0, 1),
-    (0, -1),
-    (1, 0),
-    (-1, 0),
-)  # where a label may be, as seen from its anchor
+# where a label may be, as seen from its anchor
+AROUND = ((1, 1), (-1, 1), (1, -1), (-1, -1), (0, 1), (0, -1), (1, 0), (-1, 0))
 _WIDE, _HIGH = 0.62, 1.15  # of the size of the letters: a letter, and a line
 
 

@@ -21,9 +21,8 @@ if TYPE_CHECKING:
 
     from ..readers.inputs import Reading
 
-_ANCHORS = re.compile(
-    r"(\d+)(?:-(\d+))?(?:\..+)?"
-)  # anchors in the name of a parameter: 3, 3-5, 3.x
+# anchors in the name of a parameter: 3, 3-5, 3.x
+_ANCHORS = re.compile(r"(\d+)(?:-(\d+))?(?:\..+)?")
 
 
 def parse_effect(name: str, values: Sequence[str]) -> Effect:

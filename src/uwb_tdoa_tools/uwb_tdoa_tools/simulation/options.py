@@ -26,9 +26,8 @@ from .rooms import Walls
 def add_options(made: argparse.ArgumentParser) -> None:
     """Add the options to a parser."""
     default = SimulationConfig()
-    unless: dict[str, Any] = {
-        "default": argparse.SUPPRESS
-    }  # not given: the usual value of the vehicle
+    # not given: the usual value of the vehicle
+    unless: dict[str, Any] = {"default": argparse.SUPPRESS}
     made_path = made.add_argument_group("motion")
     add = made_path.add_argument
     words = (

@@ -25,9 +25,8 @@ KNOT = 0.05  # s, spacing of the spline's knots
 SPEED_UP = 2.0  # s, from rest to cruise and back
 CORNER_TIME = 1.2  # s, to turn a corner of the square
 HEADING_TIME = 3.0  # s, over which a heading along the track is smoothed
-STEP = Polynomial(
-    [0, 0, 0, 0, 0, 126, -420, 540, -315, 70]
-)  # 0 to 1 with four derivatives zero at both ends
+# 0 to 1 with four derivatives zero at both ends
+STEP = Polynomial([0, 0, 0, 0, 0, 126, -420, 540, -315, 70])
 _RAMP = STEP.integ()
 
 

@@ -52,11 +52,8 @@ def facing(
     front = np.where(length > 1e-9, front / np.maximum(length, 1e-9), [1.0, 0.0, 0.0])
     left = np.cross([0.0, 0.0, 1.0], front)
     left /= np.maximum(np.linalg.norm(left, axis=1, keepdims=True), 1e-9)
-    left[np.abs(front[:, 2]) > 1.0 - 1e-9] = [
-        0.0,
-        1.0,
-        0.0,
-    ]  # straight up or down: left is ours to choose
+    # straight up or down: left is ours to choose
+    left[np.abs(front[:, 2]) > 1.0 - 1e-9] = [0.0, 1.0, 0.0]
     left[inverted] *= -1.0
     axes = np.stack([front, left, np.cross(front, left)], axis=2)
     return Anchors(np.arange(len(positions)), positions, Rotation.from_matrix(axes).as_quat())

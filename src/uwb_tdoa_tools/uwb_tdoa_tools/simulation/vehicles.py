@@ -250,9 +250,8 @@ def _follow(target: np.ndarray, speed: float) -> tuple[np.ndarray, float, np.nda
     place (2,) m and heading rad at the start, speed (n,) m/s, turning rate (n,) rad/s.
     """
     away = target - target[0]
-    ahead = away[
-        np.argmax(np.hypot(*away.T) > 0.3)
-    ]  # of the path's beginning; east if it goes nowhere
+    # of the path's beginning; east if it goes nowhere
+    ahead = away[np.argmax(np.hypot(*away.T) > 0.3)]
     heading = yaw = float(np.arctan2(ahead[1], ahead[0]))
     x, y = map(float, target[0])
     v = w = 0.0
@@ -304,9 +303,8 @@ class HandHeld:
         p += SWAY * slow[:, :3]
         p[:, 2] += BOB * pace * np.sin(2.0 * np.pi * STEPS * tau)
         self._p = make_interp_spline(tau, p, k=7)
-        self._angles = CubicSpline(
-            tau, np.column_stack([TILT * slow[:, 3:], yaw])
-        )  # roll, pitch, yaw
+        # roll, pitch, yaw
+        self._angles = CubicSpline(tau, np.column_stack([TILT * slow[:, 3:], yaw]))
 
     def motion(self, t: ArrayLike) -> ExactMotion:
         """Return the ExactMotion at stamps t, (n,) s."""

@@ -111,9 +111,8 @@ def fit(
         if iteration < ITERATIONS - 1:
             variance = _inverse_diagonal(factor)
             for block in blocks:
-                determined = np.sum(
-                    1.0 - prior[block] * variance[block]
-                )  # number of well-determined weights
+                # number of well-determined weights
+                determined = np.sum(1.0 - prior[block] * variance[block])
                 prior[block] = np.clip(
                     determined / max(np.sum(solution[block] ** 2), 1e-12), *PRECISION
                 )

@@ -295,9 +295,8 @@ class Structured:
         values = graph.total(
             [graph.op("Mul", part, [a**2]) for part, a in zip(parts, self.site.amplitudes)]
         )
-        other = graph.op(
-            "Mul", graph.op("Abs", graph.op("Sub", who, self.site_ids[None])), [1e3]
-        )  # another id counts as far away
+        # another id counts as far away
+        other = graph.op("Mul", graph.op("Abs", graph.op("Sub", who, self.site_ids[None])), [1e3])
         far = graph.op("Add", graph.distance2(where, self.site_positions), other)
         here = graph.op("Exp", graph.op("Mul", far, [-0.5 / SAME_PLACE**2]))  # (2n, sites)
         weights = graph.op("MatMul", here, self.weights @ self.site.whiten.T)
@@ -313,9 +312,8 @@ class Structured:
         serves all centres.
         """
         n = len(self.links)
-        first = (
-            len(self._end_inputs()) - 2 * n - 3
-        )  # the columns: 3 of the distance, n azimuths, n elevations
+        # the columns: 3 of the distance, n azimuths, n elevations
+        first = len(self._end_inputs()) - 2 * n - 3
         delta = graph.take(end, range(first, first + 3))
         far = graph.op("Max", graph.row_sum(graph.op("Mul", delta, delta)), [NEAREST**2])
         far = graph.op("Mul", graph.op("Log", far), [0.5])

@@ -9,11 +9,8 @@ import numpy as np
 
 from .sensor import Compared, Sensor, Stream, parameter
 
-INFRARED, FIELD_OF_VIEW, LONGEST_RANGE = (
-    1,
-    0.47,
-    1000.0,
-)  # a kind; rad, m: typical, and a bound that bounds nothing
+# a kind; rad, m: typical, and a bound that bounds nothing
+INFRARED, FIELD_OF_VIEW, LONGEST_RANGE = (1, 0.47, 1000.0)
 
 
 @dataclass(frozen=True)

@@ -10,14 +10,12 @@ from typing import Any
 
 import numpy as np
 
-UNKNOWN_VARIANCE = (
-    1e6  # in a message, whose covariances are to be finite: at which and above nothing was measured
-)
+# in a message, whose covariances are to be finite: at which and above nothing was measured
+UNKNOWN_VARIANCE = 1e6
 UNKNOWN_STD = 1e6  # that stands for an infinite one where it is computed with
 RATE = 25.0  # Hz, of simulated sensors
-LARGEST_NUMBER = (
-    1e30  # of anything in a recording, in whatever unit: what is computed of it stays finite
-)
+# of anything in a recording, in whatever unit: what is computed of it stays finite
+LARGEST_NUMBER = 1e30
 
 
 @dataclass(frozen=True)

@@ -23,9 +23,8 @@ if TYPE_CHECKING:
     from .views import CovariateView
 
 FEWEST_ATTITUDES = 10
-Figures = dict[
-    str, list[dict[str, Any]]
-]  # of the health of channels: {"pairs", "anchors", "axes", ...: rows}
+# of the health of channels: {"pairs", "anchors", "axes", ...: rows}
+Figures = dict[str, list[dict[str, Any]]]
 
 
 @dataclass(frozen=True)

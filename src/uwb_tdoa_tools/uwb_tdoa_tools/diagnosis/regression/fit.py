@@ -239,12 +239,10 @@ def measure_inflation(
         r = weight[rows] * residual[rows] / scale[k]
         raw = max(1.0, _temporal(table, rows, r), _clustered(table.block[rows], x[rows], r))
         spent = np.count_nonzero(counts(x[rows], 0)) * raw / len(r)
-        raw = (
-            raw / (1.0 - min(spent, 0.6)) if raw > 1.2 else raw
-        )  # the fit has followed some of the noise
-        out[k] = max(
-            1.0, min(raw, len(r) / len(np.unique(table.block[rows])))
-        )  # blocks are independent
+        # the fit has followed some of the noise
+        raw = raw / (1.0 - min(spent, 0.6)) if raw > 1.2 else raw
+        # blocks are independent
+        out[k] = max(1.0, min(raw, len(r) / len(np.unique(table.block[rows]))))
     for name in table.present:
         axes = np.unique(table.group[table.rows_of(name)])
         out[axes] = np.median(out[axes])

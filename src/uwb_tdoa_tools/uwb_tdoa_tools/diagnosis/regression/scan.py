@@ -32,9 +32,8 @@ if TYPE_CHECKING:
     from .table import RegressionTable
 
     _Held = tuple[np.ndarray, np.ndarray, np.ndarray]  # as `_held` gives it
-    _Item = tuple[
-        float, "_Shapes", str, tuple[float, ...], int
-    ]  # gain, shapes, shape, knots, how many were tried
+    # gain, shapes, shape, knots, how many were tried
+    _Item = tuple[float, "_Shapes", str, tuple[float, ...], int]
 
 BINS = 16  # between whose edges steps, intervals and rises begin and end
 PERIODS = (0.8, 1.0, 1.25, 1.5, 1.75, 2.0, 2.25, 2.5, 3.0)  # of a wave between the ends
@@ -45,15 +44,12 @@ CROWDED = 0.02
 NOISY = 1.5  # times the noise of most series that any may have
 FINER = 9  # places between two bins where a knot is tried again
 FEWEST = 12  # values of a subset
-MANY_VALUES, LEVELS = (
-    4096,
-    256,
-)  # of more values levels are told apart, where there are MANY anchors
+# of more values levels are told apart, where there are MANY anchors
+MANY_VALUES, LEVELS = (4096, 256)
 PROPOSED = 16  # functions
 SHAPES_FIRST = 3  # of one CovariateView
-HUBER = (
-    3.0  # scales; a larger residual counts as that of a heavy tail, but more than in Student's t
-)
+# scales; a larger residual counts as that of a heavy tail, but more than in Student's t
+HUBER = 3.0
 LEAST_GAIN = 20.0  # twice a log-likelihood
 _ENDS = np.array(
     [(first, last) for first in range(3) for last in (-1, -2, -3)]
@@ -107,9 +103,8 @@ class Scan:
                         _Shapes(view, table.rows_of(channel).start, edges, table.sparse)
                     )
         self._groups = [_Group(several, WIDEST) for several in groups.values()]
-        self.even = (
-            _noise_of_series(table) ** -2.0
-        )  # weights (n,) that are fair to noisy series, and know no outliers
+        # weights (n,) that are fair to noisy series, and know no outliers
+        self.even = _noise_of_series(table) ** -2.0
         self._price = SmoothTerm.penalty + 2.0 * np.log(
             max(sum(len(several) for several in groups.values()), 1)
         )

@@ -23,11 +23,8 @@ if TYPE_CHECKING:
     from .table import RegressionTable
     from .terms import Candidate, Column
 
-FEW, NOTHING = (
-    3,
-    3.0,
-    # columns, and what they gain together, each alone, twice a log-likelihood, that is worth no price
-)
+# columns, and what they gain together, each alone, twice a log-likelihood, that is worth no price
+FEW, NOTHING = (3, 3.0)
 # columns whose products with the base are made together, so that a copy of all of them is never
 # held
 AT_ONCE = 128
@@ -245,9 +242,8 @@ class _Products:
 
 def _gram(x: Matrix, weights: np.ndarray) -> np.ndarray:
     """X' W X of a sparse matrix (n, k), (k, k)."""
-    filled = np.flatnonzero(
-        np.diff(x.indptr)
-    )  # most columns are of TDOAs, or of an axis of another sensor
+    # most columns are of TDOAs, or of an axis of another sensor
+    filled = np.flatnonzero(np.diff(x.indptr))
     out = np.zeros((x.shape[1], x.shape[1]))
     if len(filled):
         some = x[:, filled]

@@ -29,11 +29,8 @@ if TYPE_CHECKING:
 
 MAX_STEPS = 14
 FITTED = 6  # of what a scan proposes
-FEW, LARGE, GOOD_PART = (
-    3,
-    6,
-    0.5,
-)  # columns of one and of a group, and the share of its criterion that the one must reach
+# columns of one and of a group, and the share of its criterion that the one must reach
+FEW, LARGE, GOOD_PART = (3, 6, 0.5)
 LEAST_DETERMINED = 0.3  # parameters that the data must determine of a candidate
 AMBIGUOUS = 10.0  # less difference in the criterion is no decision
 # share of the criterion by which a function may be worse than another one that it is much like
@@ -303,9 +300,8 @@ def with_rivals(
         others = chosen[:k] + chosen[k + 1 :]
         rest, found = fit(table, columns_of(others), model.inflation, near=model), []
         if scan and not candidate.declared:
-            rest = replace(
-                rest, weight=model.weight, scale=model.scale
-            )  # what it explains is measured, not outliers
+            # what it explains is measured, not outliers
+            rest = replace(rest, weight=model.weight, scale=model.scale)
             found = scan(table, rest, others)
         wider = table.with_terms([term for one in found for term in one.terms])
         several = [

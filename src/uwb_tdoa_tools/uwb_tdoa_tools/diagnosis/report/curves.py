@@ -34,12 +34,8 @@ MOST = 12  # flights whose errors are drawn
 PAIRS, FEWEST = 16, 20  # that are drawn, and measurements of each
 FUNCTIONS = 12  # that are drawn
 POINTS = 3000  # of a series of residuals
-ABOVE = {
-    "loc": "lower right",
-    "bbox_to_anchor": (1.0, 1.0),
-    "ncols": 2,
-    "frameon": False,
-}  # of a legend
+# of a legend
+ABOVE = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "ncols": 2, "frameon": False}
 
 
 def errors_over_time(diagnosis: Diagnosis) -> tuple[list[Picture], int]:

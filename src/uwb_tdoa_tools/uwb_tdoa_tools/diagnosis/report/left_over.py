@@ -14,10 +14,8 @@ if TYPE_CHECKING:
     from ..channels import ChannelResidual
     from ..result import Diagnosis
 
-LARGE, ABOVE = (
-    0.15,
-    3.0,
-)  # m, and times the root mean square of all, that a pair may be off for BLOCK s before it is named
+# m, and times the root mean square of all, that a pair may be off for BLOCK s before it is named
+LARGE, ABOVE = (0.15, 3.0)
 NAMED = 3
 NEAR = 0.999  # of that limit, from which on a pair is looked at closely
 
@@ -35,9 +33,8 @@ def left_over(diagnosis: Diagnosis) -> tuple[str, ...]:
 def _of_part(part: ChannelResidual, of: str) -> Iterator[tuple[float, str]]:
     rows = part.rows()
     block = (rows.t / BLOCK).astype(int)
-    usual = np.sqrt(
-        np.median(rows.y**2) / 0.455
-    )  # the median of squares is 0.455 of their mean, for Gaussian noise
+    # the median of squares is 0.455 of their mean, for Gaussian noise
+    usual = np.sqrt(np.median(rows.y**2) / 0.455)
     label = rows.series * (block.max() + 1) + block
     number = np.unique(label, return_inverse=True)[1]
     power = np.bincount(number, rows.y**2) / np.bincount(number)

@@ -20,10 +20,8 @@ if TYPE_CHECKING:
 # Told apart by colour-blind eyes (Okabe and Ito); the purple and the yellow are darker than theirs.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#a8437f", "#e69f00", "#56b4e9", "#000000", "#8c8c00")
 AFTER, FOUND, _, REGION, BEFORE = COLOURS[:5]
-WIDTH, FULL = (
-    4.4,
-    10.6,
-)  # in, of one picture: so that its letters can be read on a phone; and of one as wide as the page
+# in, of one picture: so that its letters can be read on a phone; and of one as wide as the page
+WIDTH, FULL = (4.4, 10.6)
 PIXELS = 96  # of a page in an inch
 LIGHT = 40_000  # bytes, of a picture that need not be smaller
 SHARP = 130  # dots in an inch of what is drawn as dots

@@ -18,9 +18,8 @@ if TYPE_CHECKING:
     from ..regression.confounding import Unobservable
     from ..result import Diagnosis
 
-NOTHING = (
-    1e-9  # largest contribution, relative to those of its parts, of a combination that cancels
-)
+# largest contribution, relative to those of its parts, of a combination that cancels
+NOTHING = 1e-9
 NAMED = 6  # parameters of a combination that are named
 GROUND_TRUTH = "ground truth, from motion capture for example"
 ATTITUDE = "ground truth of the attitude"

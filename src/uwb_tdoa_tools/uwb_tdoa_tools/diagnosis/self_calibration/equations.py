@@ -356,9 +356,8 @@ def _equations(
         _add(gram, columns, more)
         vector[columns] += right
         last = np.searchsorted(columns, n)
-        blocks.append(
-            _BlockEquations(columns[:last], more[:last, :last].copy(), right[:last])
-        )  # the whole of `more` takes megabytes
+        # the whole of `more` takes megabytes
+        blocks.append(_BlockEquations(columns[:last], more[:last, :last].copy(), right[:last]))
     return gram, vector, blocks, _known(constraints, stamps, moved, innovations.run.odometry)
 
 
@@ -465,9 +464,8 @@ def _known(
         estimate = np.stack([np.interp(t, odometry.t, odometry.p[:, k]) for k in range(3)], axis=1)
         rows = np.minimum(np.searchsorted(odometry.t, t), len(odometry.t) - 1)
         here = moved[first : first + len(t)]
-        covariance = (
-            odometry.covariance[rows, :3, :3] - odometry.consider_covariance[rows]
-        )  # errors of anchors, which persist, are unknowns
+        # errors of anchors, which persist, are unknowns
+        covariance = odometry.covariance[rows, :3, :3] - odometry.consider_covariance[rows]
         out.append(_Mark(*one.equations(t, estimate, covariance, here), *one.off(estimate, here)))
         first += len(t)
     return out

@@ -37,20 +37,14 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.effects import Effect
     from uwb_tdoa_ekf.evidence import Change, ChangeKey
 
-DELAY_STDS = (
-    0.02,
-    0.05,
-    0.1,
-    0.2,
-    0.4,
-)  # m, that the evidence chooses from where nothing is known of delays
+# m, that the evidence chooses from where nothing is known of delays
+DELAY_STDS = (0.02, 0.05, 0.1, 0.2, 0.4)
 DELAY_STD = 0.1  # m, of the delay of an anchor that the last calibration did not have
 # m, of what all ranges are too long by, the antenna delay of the tag: a TDOA does not know of it
 TAG_DELAY = 0.5
 FUNCTION_STDS = 0.003, 0.03, 0.06, 0.1, 0.15, 0.22, 0.3  # m, the same of functions of the place
-ANYWHERE = (
-    1.0  # m, standard deviation of a coordinate of an anchor that has moved, once that is plain
-)
+# m, standard deviation of a coordinate of an anchor that has moved, once that is plain
+ANYWHERE = 1.0
 LOOSE = 0.05  # m, standard deviation of delays in a preliminary solution
 
 
