@@ -82,7 +82,7 @@ IMU_STATE = _record(
     ("accel_psd", float, 3),  # (m/s^2)^2/Hz, of the noise that this leaves
 )
 
-# Whether an inertial sensor can be right, see plausibility.py.
+# Whether an inertial sensor can be right, see imu_fault_detector.py.
 IMU_FAULT_DETECTOR = _record(
     ("up", float, 3),  # m/s^2, specific force as the gyroscope has turned it
     ("spun", float),  # rad, turned lately beyond what a tag may
@@ -188,12 +188,12 @@ EKF = _record(
     ("rival_until", float),  # and until when the tag may be there
     ("imu_fault_detector", IMU_FAULT_DETECTOR),  # of the inertial samples,
     ("imu_faulty", bool),  # which are not used, because they cannot be right
-    ("yaw_test", YAW_TEST),  # see yaw_doubt.py
+    ("yaw_test", YAW_TEST),  # see yaw_test.py
     # s, stamp until which they are averaged, where the filter ran before there were any; -inf: they
     # are used
     ("attitude_averaged_until", float),
     ("quiet", bool),  # the inertial sensor neither shakes nor turns
-    ("resting", bool),  # the tag does not move, see rest.py,
+    ("resting", bool),  # the tag does not move, see stationarity.py,
     # m, x and y of where anchors are known to be late on the ground, NaN: anywhere,
     ("floor_place", float, 2),
     ("late_as_known", bool),  # and they are, where the tag came to rest last
@@ -216,7 +216,7 @@ EKF = _record(
     ("flat", float, 3),
     ("middle", float, 3),  # m, of the anchors heard lately
     ("next_bounds", float),  # s, stamp before which not to look anew who is heard
-    # 1/m^2, of the place, that one arrival from each anchor heard lately gives, see systematic.py
+    # 1/m^2, of the place, that one arrival from each anchor heard lately gives, see noise.py
     ("information", float, (3, 3)),
     # s, stamp until which the tag may be anywhere, as its place was hardly known before
     ("position_unknown_until", float),
@@ -249,7 +249,7 @@ ODOMETRY = _record(
     ("t", float),
     ("x", float, NOMINAL_STATES),
     ("covariance", float, (9, 9)),  # of [p, v, attitude]
-    # what of it errors that persist make, see systematic.py
+    # what of it errors that persist make, see noise.py
     ("consider_covariance", float, (3, 3)),
 )
 RESIDUAL = _record(
