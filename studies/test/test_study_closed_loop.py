@@ -21,7 +21,7 @@ from studies.closed_loop.experiment import (
 )
 from uwb_tdoa_bias.correction.network import load_network
 from uwb_tdoa_bias.effects import EffectSet
-from uwb_tdoa_tools.flying.fleet import drawn
+from uwb_tdoa_tools.flying.fleet import drawn_flight
 from uwb_tdoa_tools.flying.verdict import verdict_of
 
 OFF = dict(zip(ESTIMATORS, (0.4, 0.3, 0.24, 0.36, 0.1)))  # m, of the estimates of made-up flights
@@ -67,7 +67,7 @@ def test_it_trains_flies_tells_and_draws(tmp_path, monkeypatch, capsys):
         )
         flown.append((by, task.seed, task.path.swing))
         one = made_up(off=OFF[by])
-        return verdict_of(one), drawn(one, verdict_of(one))
+        return verdict_of(one), drawn_flight(one, verdict_of(one))
 
     monkeypatch.setattr(experiment.fleet, "fly_task", judged)
     arguments = [

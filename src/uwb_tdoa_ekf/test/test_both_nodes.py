@@ -13,7 +13,7 @@ pytest.importorskip("uwb_tdoa_msgs.msg")
 from flights import position_at  # noqa: E402
 from rclpy.qos import DurabilityPolicy, QoSProfile  # noqa: E402
 from rig import make_shared_rig, recording, seconds_of, stamp  # noqa: E402, F401
-from test_installed import BOX, CHANGE, after, cut, flight_through  # noqa: E402
+from test_anchor_table import BOX, CHANGE, after, cut, flight_through  # noqa: E402
 
 from uwb_tdoa_bias.ros.diagnostics import AGAIN  # noqa: E402
 from uwb_tdoa_msgs.msg import EstimatorStatus, TdoaCorrected  # noqa: E402
