@@ -210,7 +210,7 @@ def test_colcon_test_runs_what_pytest_runs(tmp_path):
     pytest.importorskip("colcon_core")
     if not (ROOT / "build" / "uwb_tdoa_bias").is_dir():
         pytest.skip("the workspace is not built here")
-    names = ["test_effects_wording.py", "test_geometry.py"]
+    names = ["test_stamps.py", "test_geometry.py"]
     done = subprocess.run(
         [
             sys.executable,

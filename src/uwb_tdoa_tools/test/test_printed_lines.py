@@ -155,7 +155,7 @@ def test_whoever_prints_lines_to_copy_is_tested_here():
         for node in ast.walk(tree)
         if isinstance(node, ast.Attribute)
         and getattr(node.value, "id", "") == "command_lines"
-        and node.attr in ("tool", "node", "nodes", "judging", "applying")
+        and node.attr in ("tool", "node", "node_lines", "evaluate_line", "lines_of_use")
     }
     assert made == PRINT
 

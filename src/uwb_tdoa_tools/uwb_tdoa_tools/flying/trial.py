@@ -169,8 +169,8 @@ class Trial:
 
     def _simulator(self, duration: float) -> Simulator:
         """Return the simulated vehicle for `duration`, s."""
-        assert isinstance(self.task.path, Circles)
-        return Simulator(self.task.world, self.task.seed, duration, self.task.path.radius)
+        radius = getattr(self.task.path, "radius", 0.0)  # m, of the start from the middle
+        return Simulator(self.task.world, self.task.seed, duration, radius)
 
     def _controller(self) -> Any:
         """Return the controller."""
