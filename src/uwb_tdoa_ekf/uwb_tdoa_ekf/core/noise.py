@@ -1,4 +1,7 @@
-"""Measurement noise of each anchor, learned from innovations, and the covariance of persisting errors."""
+"""Measurement noise of each anchor, and the covariance of persisting errors.
+
+The filter learns the noise of each anchor from its innovations.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""State-dependent errors of the inertial sensor, subtracted from each sample at the best hypothesis."""
+"""State-dependent errors of the inertial sensor.
+
+They are subtracted from each sample, evaluated at the state of the best hypothesis.
+"""
 
 from __future__ import annotations
 

@@ -58,7 +58,10 @@ def exponential(r0: float, r1: float, r2: float) -> tuple[float, float, float, f
 
 @compiled
 def turn(x: np.ndarray, bx: float, by: float, bz: float, bw: float) -> None:
-    """Multiply the attitude: q <- q * b, for a unit quaternion b of a rotation in the body frame."""
+    """Multiply the attitude: q <- q * b.
+
+    b is a unit quaternion (x, y, z, w) of a rotation in the body frame.
+    """
     ax, ay, az, aw = x[6], x[7], x[8], x[9]
     qx = aw * bx + ax * bw + ay * bz - az * by
     qy = aw * by - ax * bz + ay * bw + az * bx
@@ -102,7 +105,7 @@ def predict(
     _move(hypothesis.x, imu, dt, transition)
     P, T = hypothesis.P, transition.product
     propagate(P, transition)
-    A, B, E = (  # P <- T Phi', T = Phi P: one triangle is computed, the rest is mirrored
+    A, B, E = (  # P <- T Phi', T = Phi P: one triangle is computed, the rest is mirrored.
         transition.velocity_attitude,
         transition.velocity_accel_bias,
         transition.attitude_attitude,
@@ -179,7 +182,11 @@ def propagate(M: np.ndarray, transition: Record) -> None:
 def _add_noise(
     P: np.ndarray, R: np.ndarray, accel_psd: np.ndarray, parameters: Record, dt: float
 ) -> None:
-    """Add the process noise over dt: white noise of the sensors and random walks of their biases."""
+    """Add the process noise over dt (s) to the covariance P (15, 15).
+
+    It consists of the white noise of the sensors and the random walks of their biases. R (3, 3) is
+    body to world. accel_psd is (3,), (m/s^2)^2/Hz, body frame.
+    """
     s0, s1, s2 = dt * accel_psd[0], dt * accel_psd[1], dt * accel_psd[2]
     for r in range(3):
         for c in range(r, 3):
