@@ -55,8 +55,8 @@ from .update import project
 CONSISTENCY_TIME = 0.3  # s over which the share of TDOAs that agree with the filter is averaged
 INCONSISTENT = 0.5  # share below which the filter searches for the tag elsewhere
 UNSURE_TIME = 0.5  # s of TDOAs after a silence in which the filter searches for a lost tag
-# s without a TDOA after which a tag that may be anywhere in its workspace is lost and the filter
-# stops
+# s without a TDOA after which a tag that may be anywhere in its workspace is lost: the filter
+# stops, then starts again
 LOST_TIME = 30.0
 MAX_STEP = 0.05  # s, longest single prediction
 # s of inertial samples that determine the initial attitude if the IMU starts after the filter
@@ -564,10 +564,10 @@ def _update(
 def _is_of_rival(
     ekf: Record, a: Record, b: Record, tdoa: Record, known: float, residual: Record
 ) -> bool:
-    """Return whether a TDOA contradicts the position of a filter that follows wheels, and fill the residual.
+    """Return whether a TDOA contradicts the position of a filter that follows wheels.
 
-    Wheels then outweigh TDOAs that agree on another place. Even with small robust weights, many
-    such TDOAs would pull the position.
+    The residual is filled. Wheels outweigh TDOAs that agree on another place for a while. Even with
+    small robust weights, many such TDOAs would pull the position.
     """
     innovation = ekf.innovation
     noise_variance = innovation.noise_variance

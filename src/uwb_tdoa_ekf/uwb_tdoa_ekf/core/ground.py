@@ -20,8 +20,8 @@ from uwb_tdoa_bias.common.geometry import linearized_tdoa
 # tangent of the elevation below which the ground inverts the phase of a reflection
 GRAZING = math.tan(math.radians(15.0))
 HALF_WAVE = 0.0375  # m, at 4 GHz: rays with a larger path difference do not cancel
-# m, largest usual delay of an anchor. Larger delays are more probable up to it, because the path by
-# a reflector is a detour.
+# m, largest usual delay of a late anchor. Up to it, larger delays are more probable, because the
+# path by a reflector is a detour.
 LATEST = 6.0
 FARTHER = 1e-3  # 1/m, density of larger delays, and of outliers of any kind
 RARE = 0.02  # least probability that an anchor is late, and that it is in time
@@ -68,18 +68,20 @@ PAIR = np.dtype(
     [
         ("a", np.int64),
         ("b", np.int64),  # rows of the anchors
-        ("value", float),
-        ("change", float),
-        # m: value is the median, change the median of the second half minus the first half; m^2
-        ("change_variance", float),
-        ("apart", float),  # s between the two halves
+        ("value", float),  # m, median of its TDOAs
+        ("change", float),  # m, median of the second half minus median of the first half
+        ("change_variance", float),  # m^2, of `change`; inf if a half has too few TDOAs
+        ("apart", float),  # s between the mean stamps of the two halves
     ],
     align=True,
 )
 
 
 class KnownHeight(NamedTuple):
-    """Height of the tag by another source than TDOAs, and its standard deviation, in m; NaN if unknown."""
+    """Height of the tag by another source than TDOAs, and its standard deviation.
+
+    Both are in m, and NaN if unknown.
+    """
 
     z: float
     std: float
