@@ -157,7 +157,7 @@ class _FilterParameters:
     )
 
 
-# What else the tag feels
+# Parameters of the sensors other than IMU and TDOA.
 _PARAMETERS = [
     (name, type(each.default), each)
     for sensor in SENSORS.values()

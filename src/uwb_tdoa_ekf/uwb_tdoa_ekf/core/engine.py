@@ -129,6 +129,7 @@ def run(
     return rows
 
 
+# Compiled part of `set_pose`.
 @compiled
 def _set_pose(
     state: FilterState, parameters: np.ndarray, poses: np.ndarray, records: np.ndarray
@@ -165,6 +166,7 @@ def most_records(measurements: Measurements) -> int:
     return of_events + RECORDS_OF_REST * rests + plane.RECORDS * floors + switches
 
 
+# Process an IMU_SAMPLE: fault detection, prediction, rest and zero-velocity updates.
 @compiled
 def _on_imu(ekf: Record, parameters: Record, sample: Record, records: np.ndarray) -> None:
     continuous = inertial.observe(ekf.imu, sample, parameters.imu_timeout)
@@ -209,6 +211,7 @@ def _switch(ekf: Record, parameters: Record, records: np.ndarray) -> None:
         initialization.reset_attitude(ekf, parameters, 2.0 * math.pi, records)
 
 
+# Process a TDOA: reject a repeat, predict, update, and search for a lost tag.
 @compiled
 def _on_tdoa(
     ekf: Record,
@@ -359,6 +362,7 @@ def _after_update(
         initialization.recover(ekf, anchors, parameters, t, unsure, records)
 
 
+# Process an AID: update a running filter, or store the measurement.
 @compiled
 def _on_aid(
     ekf: Record,

@@ -50,10 +50,10 @@ EXPECTED_RATIO, LARGEST_RATIO = 0.45, 3.5
 
 GROUND_STD = 0.15  # m, of the height of the tag of a body that stands on the ground
 GROUND_HEIGHT = 0.05  # m, mean of this height
-# standard deviations of the error of a pair and of an anchor, in units of tdoa_std
+# standard deviation of the error of a pair, and of an anchor, in units of tdoa_std
 PAIR_SHARE, ANCHOR_SHARE = (0.4, 1.0)
-# m: mean and standard deviation of the delay that late anchors share, and standard deviation of
-# each anchor about it
+# m: mean of the delay that late anchors share, its standard deviation, and the deviation of each
+# anchor from it
 USUAL_LATENESS, LATENESS_STD, ALIKE_STD = (2.0, 2.0, 0.3)
 # probability ratio of any other delay, and of no delay, to the shared delay
 OTHER, TIMELY = 0.1, 0.5
@@ -154,6 +154,7 @@ def find_lateness(a: Record, b: Record, hypothesis: Record, t: float, ground: fl
     return a.late > 0.0 or b.late > 0.0
 
 
+# Predict the probability that an anchor is late, to stamp t, s. See `find_lateness`.
 @compiled
 def _predict_lateness(anchor: Record, x: np.ndarray, lower: float, t: float, ground: float) -> None:
     if not may_be_late(anchor.position, x, lower, ground):
@@ -257,6 +258,7 @@ def find_pairs(window: np.ndarray, pairs: np.ndarray) -> int:
     return count
 
 
+# Return whether a TDOA is between the anchors in rows a and b, in either order.
 @compiled
 def _is_of(tdoa: Record, a: int, b: int) -> bool:
     return (tdoa.a == a and tdoa.b == b) or (tdoa.a == b and tdoa.b == a)

@@ -67,6 +67,7 @@ def observe(imu: Record, sample: Record, timeout: float) -> bool:
     return True
 
 
+# Reset the statistics of an IMU_STATE to a single IMU_SAMPLE.
 @compiled
 def _restart(imu: Record, sample: Record) -> None:
     for k in range(3):

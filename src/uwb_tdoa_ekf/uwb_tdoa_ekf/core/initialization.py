@@ -36,8 +36,8 @@ SLOW_TDOAS, SLOW_STAMPS, SLOWEST = (20, 3, 30.0)
 # m, standard deviation of an unknown position; share of its variance below which another position
 # is better
 UNKNOWN, BETTER = (2.0, 0.5)
-# longest gap as a share of the duration of these TDOAs. A longer gap means that a tag has just been
-# switched on.
+# longest gap, as a share of the duration of all TDOAs above. A longer gap means that the tag has
+# just been switched on.
 LONGEST_GAP = 0.6
 LISTEN_PERIOD = 1.0  # s between two updates of the heard anchors
 SEARCH_PERIOD = 0.1  # s between two searches
@@ -52,7 +52,8 @@ REACH, REACH_SPEED, REACH_ACCELERATION = (0.5, 0.5, 0.5)
 # probable as a rover that jumps
 LATE_ANCHORS = 2
 AMONG_OTHERS = 6, 3  # least number of other TDOAs and anchors that agree with wheels
-# s for which TDOAs must agree on another place than wheels; s for which the tag may be there
+# s for which TDOAs must agree on another place than wheels; s for which the tag then counts as
+# possibly there
 RIVAL_TIME, RIVAL_HELD = (1.0, 0.5)
 
 
@@ -187,8 +188,8 @@ def start_slowly(
 ) -> None:
     """Start the filter if few TDOAs come, from the last SLOW_TDOAS or SLOW_STAMPS.
 
-    With fewer TDOAs, but at least MINIMUM, the filter starts only if they determine a single
-    position. With all of them, it starts in any case.
+    With this many TDOAs the filter starts in any case. With fewer, but at least MINIMUM, it starts
+    only if they determine a single position.
 
     Parameters
     ----------
@@ -524,9 +525,10 @@ def recover(
 ) -> None:
     """Move the filter to another position if the TDOAs of the window agree on it.
 
-    Attitude and biases stay the same. A tag with a sound inertial sensor does not jump. So a
-    recovery is limited to the distance that the tag can have moved since the filter agreed with
-    TDOAs.
+    The window must agree on the position clearly better than on the position of the filter.
+    Attitude and biases stay the same. A tag with a sound inertial sensor, or with wheels, does not
+    jump. So its recovery is limited to the distance that it can have moved since the filter agreed
+    with TDOAs.
 
     Parameters
     ----------
@@ -706,7 +708,8 @@ def open_unknown_yaw(ekf: Record, parameters: Record, history: np.ndarray) -> No
 def level_first(ekf: Record, parameters: Record, history: np.ndarray) -> None:
     """Reset the attitude when inertial samples come for the first time.
 
-    The standard deviation of the yaw stays the same.
+    If a single hypothesis is left, the standard deviation of its yaw stays the same. Otherwise the
+    yaw becomes unknown.
     """
     alive = 0
     for h in range(HYPOTHESES):

@@ -26,10 +26,11 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.effects.base import SensorFunction
 
 
+# Verdict of a measurement.
 USED, REJECTED, LATE, INVALID, STARTUP, COMPENSATED, REPEATED = range(7)
 
 
-N_YAWS, N_PLACES = (4, 2)  # yaws and places that a start follows while the right one is unknown
+N_YAWS, N_PLACES = (4, 2)  # numbers of yaws and places that a start follows in parallel
 HYPOTHESES = N_YAWS * N_PLACES
 Floor = tuple[np.ndarray, np.ndarray, np.ndarray]  # as in EffectSet.on_floor
 WINDOW = 512  # TDOAs kept for a start
@@ -43,15 +44,14 @@ def _record(*columns: tuple[Any, ...]) -> np.dtype:
 # rad/s, m/s^2 (specific force), body frame.
 IMU_SAMPLE = _record(("t", float), ("gyro", float, 3), ("accel", float, 3))
 TDOA = _record(
-    ("t", float),
+    ("t", float),  # s, stamp
     ("a", int),
-    ("b", int),
-    ("d", float),
-    ("variance", float),  # s; rows of anchors; m, corrected; m^2, beyond tdoa_std
+    ("b", int),  # rows of the anchors
+    ("d", float),  # m, |p - b| - |p - a|, after correction
+    ("variance", float),  # m^2, beyond tdoa_std
+    # of the subtracted bias over position and velocity, m per m and m per m/s
     ("slope", float, N_STATES),
-    # slope of the subtracted bias over position and velocity, and its linearization point, m and
-    # m/s
-    ("state", float, N_STATES),
+    ("state", float, N_STATES),  # linearization point of the bias, m and m/s
 )
 # Measurement of a sensor, see aids.py.
 AID = _record(("t", float), ("kind", int), ("value", float, 4), ("std", float, 4), ("anchor", int))
@@ -67,7 +67,8 @@ HYPOTHESIS = _record(
     ("offset_P", float, (OFFSET_STATES, OFFSET_STATES)),
 )
 
-IMU_STATE = _record(  # Statistics of the inertial sensor, body frame.
+# Statistics of the inertial sensor, body frame.
+IMU_STATE = _record(
     ("t", float),  # s, stamp of the last sample
     ("gyro", float, 3),  # rad/s
     ("accel", float, 3),  # m/s^2; both are the input of the prediction until the next sample
@@ -81,7 +82,8 @@ IMU_STATE = _record(  # Statistics of the inertial sensor, body frame.
     ("accel_psd", float, 3),  # (m/s^2)^2/Hz, of the remaining noise
 )
 
-IMU_FAULT_DETECTOR = _record(  # State of the IMU fault detector, see imu_fault_detector.py.
+# State of the IMU fault detector, see imu_fault_detector.py.
+IMU_FAULT_DETECTOR = _record(
     ("up", float, 3),  # m/s^2, specific force, rotated by the gyroscope
     ("spun", float),  # rad, recent turn beyond the limit
     ("weighed", float),  # s, stamp of the last sample in which the force bore the tag
@@ -91,15 +93,17 @@ IMU_FAULT_DETECTOR = _record(  # State of the IMU fault detector, see imu_fault_
     ("size", float),  # impossible value, in its own unit
 )
 
-POSE = _record(  # Pose given from outside, world frame. NaN: not given.
-    ("t", float),  # s
+# Pose given from outside, world frame. NaN: not given.
+POSE = _record(
+    ("t", float),  # s, stamp
     ("p", float, 3),  # m, position of the body
     ("covariance", float, (3, 3)),  # m^2, of p
-    ("yaw", float),  # rad,
+    ("yaw", float),  # rad, of the body
     ("yaw_std", float),  # rad, standard deviation of the yaw
 )
 
-ANCHOR = _record(  # State of an anchor.
+# State of an anchor.
+ANCHOR = _record(
     ("position", float, 3),  # m, world frame
     ("excess_variance", float),  # m^2, of its TDOAs beyond tdoa_std, see noise.py
     ("learned", float),  # s, stamp of the last update of this variance
@@ -114,6 +118,7 @@ ANCHOR = _record(  # State of an anchor.
     ("floor_std", float),  # m, standard deviation of this delay
 )
 
+# State of the downward range finder, see height.py.
 HEIGHT = _record(
     ("range", float),  # m, last range received
     ("heard", float),  # s, stamp of the last range
@@ -121,20 +126,21 @@ HEIGHT = _record(
     ("used", float),  # s, stamp of the last range that was used
     ("level", float),  # m, height of the ground below, world frame
     ("agreed", float),  # s for which the range finder has agreed with the filter
-    # number of consecutive ranges that disagree with the filter but not with each other
+    # number of consecutive ranges that disagree with the filter but agree with each other
     ("disagreeing", int),
     ("disagreement", float),  # m, their mean innovation
     ("disagrees_since", float),  # s, stamp of the first
-    # m, mean weighted innovation of z by recent TDOAs, see height.update_pull; its information (no
-    # unit) follows
+    # m, mean weighted innovation of z by recent TDOAs, see height.update_pull; its information
+    # follows
     ("pull", float),
-    ("pull_information", float),
-    ("compared", float),  # s, stamp of the last of these TDOAs
-    ("pulls_since", float),  # s, stamp since which they disagree
+    ("pull_information", float),  # no unit
+    ("compared", float),  # s, stamp of the last TDOA in this mean
+    ("pulls_since", float),  # s, stamp since which TDOAs disagree with z
     ("ignored_until", float),  # s, stamp until which no range is used
     ("ignore_time", float),  # s, duration of the last such interval
 )
 
+# State of the barometer, see barometer.py.
 BAROMETER = _record(
     ("heard", float),  # s, stamp of the last altitude
     ("agreed", float),  # s, stamp of the last altitude that was used
@@ -142,6 +148,7 @@ BAROMETER = _record(
     ("nis", float),
 )
 
+# State of the velocity sensor, see velocity.py.
 VELOCITY = _record(
     ("heard", float),  # s, stamp of the last velocity
     ("changed", float),  # s, stamp of the last velocity that differed from the one before
@@ -149,13 +156,14 @@ VELOCITY = _record(
     ("nis", float),  # recent mean of the normalized innovation squared, of the worst component
     ("refused", bool),  # the sensor disagrees with all others
     ("agreed", float),  # s, stamp of the last velocity of wheels that was used
-    ("yaw_rate", float),  # rad/s, of these wheels
+    ("yaw_rate", float),  # rad/s, of wheels
     ("yaw_rate_variance", float),  # rad^2/s^2, of this yaw rate
-    ("speed_variance", float),  # m^2/s^2, of the velocity of these wheels
+    ("speed_variance", float),  # m^2/s^2, of the velocity of wheels
 )
 
+# State of the yaw test, see yaw_test.py.
 YAW_TEST = _record(
-    # of the error state to cos(psi) - 1 and sin(psi), for a yaw error psi
+    # responses of the error state to cos(psi) - 1 and sin(psi), for a yaw error psi
     ("response", float, (2, ERROR_STATES)),
     ("vector", float, 2),  # right side of the least squares of recent innovations by both responses
     ("information", float, (2, 2)),  # upper triangle of its matrix
@@ -168,9 +176,10 @@ YAW_TEST = _record(
     ("count", int),  # number of times that the yaw was opened again
 )
 
+# State of the filter, except its anchors.
 EKF = _record(
     ("t", float),  # s, stamp of the hypotheses
-    ("running", bool),
+    ("running", bool),  # the filter has started
     ("best", int),  # index of the most probable hypothesis
     ("hypotheses", HYPOTHESIS, HYPOTHESES),
     ("imu", IMU_STATE),
@@ -210,7 +219,8 @@ EKF = _record(
     ("within", float, (2, 3)),  # m, bounds of the radio reach of the anchors heard lately
     # m, bounds of the place where the tag is expected, see workspace.py
     ("workspace", float, (2, 3)),
-    ("side", float, 3),  # of the tag relative to anchors in a plane, see workspace.configured_side
+    # side of the tag relative to anchors in a plane, see workspace.configured_side
+    ("side", float, 3),
     # 1.0 for axes along which the heard anchors share a coordinate, if the side of the tag is not
     # configured
     ("flat", float, 3),
@@ -222,32 +232,36 @@ EKF = _record(
     ("position_unknown_until", float),
     ("search_waits_until", float),  # s, stamp until which TDOAs wait for a search
     ("consistency", float),  # share of recent TDOAs that agree with the best hypothesis
-    ("recoveries", int),
+    ("recoveries", int),  # number of recoveries
     ("first_tdoa", float),  # s, stamp of the first TDOA since the filter stopped
-    ("last_tdoa", float),
-    ("next_search", float),  # s, stamps of the next search,
-    ("next_odometry", float),
-    ("next_rest", float),  # zero-velocity update,
-    ("next_merge", float),  # and merge of hypotheses
+    ("last_tdoa", float),  # s, stamp of the last TDOA or range
+    ("next_search", float),  # s, stamp of the next search
+    ("next_odometry", float),  # s, stamp of the next odometry
+    ("next_rest", float),  # s, stamp of the next zero-velocity update
+    ("next_merge", float),  # s, stamp of the next merge of hypotheses
     ("kept", int),  # number of TDOAs in the window
     ("window", TDOA, 2 * WINDOW),  # recent TDOAs, oldest first
     ("recorded", int),  # number of records written to the history, see history.py
     # transition of the best hypothesis since the last record
     ("since_record", float, (ERROR_STATES, ERROR_STATES)),
-    ("transition", TRANSITION),  # Scratch: nothing below is used after an event.
+    # Scratch: nothing below is used after an event.
+    ("transition", TRANSITION),
     ("innovation", INNOVATION),
     ("paired", TDOA, 1),
     ("pairs", PAIR, MOST_PAIRS),
     ("still_covariance", float, (3, 3)),
 )
-EKF = np.dtype((np.record, EKF))  # Python reads its fields as attributes.
+EKF = np.dtype((np.record, EKF))  # Python reads its fields as attributes
 
-ODOMETRY = _record(  # Results.
-    ("t", float),
-    ("x", float, NOMINAL_STATES),
+# Results: odometry, and a residual for each measurement.
+ODOMETRY = _record(
+    ("t", float),  # s, stamp
+    ("x", float, NOMINAL_STATES),  # nominal state, see state.py
     ("covariance", float, (9, 9)),  # of [p, v, attitude]
-    ("consider_covariance", float, (3, 3)),  # part of it that persisting errors cause, see noise.py
+    # m^2, share of the position covariance that persisting errors cause, see noise.py
+    ("consider_covariance", float, (3, 3)),
 )
+# Innovation and its variance in the unit of the measurement, weight 0 to 1, and verdict.
 RESIDUAL = _record(
     ("innovation", float), ("variance", float), ("weight", float), ("verdict", np.uint8)
 )

@@ -51,6 +51,7 @@ def learn(a: Record, b: Record, t: float, innovation: Record, parameters: Record
     _learn_one(b, t, (b.excess_variance + base) / whole * excess, parameters.noise_memory)
 
 
+# Update the excess variance of an ANCHOR by its share of the excess, m^2. memory is in s.
 @compiled
 def _learn_one(anchor: Record, t: float, excess: float, memory: float) -> None:
     step = (

@@ -130,7 +130,7 @@ def flatten(row: Record, parameters: Record, wrong: float) -> None:
     Parameters
     ----------
     row : ODOMETRY
-        Changed in place, including the covariance of these states.
+        Changed in place. The covariance gets the configured deviations of height, rise and tilt.
     parameters : PARAMETERS
         Tuning of the filter.
     wrong : float

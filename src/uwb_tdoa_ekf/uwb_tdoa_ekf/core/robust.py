@@ -122,7 +122,7 @@ def update_m_estimation(hypothesis: Record, innovation: Record, parameters: Reco
 
 @compiled
 def _columns(innovation: Record) -> int:
-    """Return the number of states up to the last one that an INNOVATION depends on.
+    """Return the number of states up to the last entry in the Jacobian of an INNOVATION.
 
     The order is error state, then auxiliary states.
     """

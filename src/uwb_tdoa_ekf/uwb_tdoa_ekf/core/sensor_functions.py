@@ -60,6 +60,7 @@ def subtract(functions: np.ndarray, x: np.ndarray, sample: Record) -> None:
         reading[function.axis] -= _value(function, at)
 
 
+# Return a SENSOR_FUNCTION at a covariate, by linear interpolation, rad/s or m/s^2.
 @compiled
 def _value(function: Record, at: float) -> float:
     place = (at - function.low) / (function.high - function.low)

@@ -22,8 +22,7 @@ from .workspace import configured_side, reflect, rows_heard
 STARTS = 9  # the middle of the workspace and the corners of the half-size box around it
 GRID_STARTS = 7  # best points of the grid in a large workspace
 LARGE = 20.0  # m along x or y, above which a workspace is large
-# least horizontal distance of grid points, m; most points at a height; largest distance of heights,
-# m
+# least horizontal distance of grid points, m; most points at a height; largest vertical distance, m
 GRID_STEP, GRID_POINTS, GRID_LEVEL = 2.0, 600, 4.0
 GRID_LEVELS = 20  # most heights: this limits the work, however far apart the anchors are
 GRID_TDOAS = 60  # TDOAs of the window that the grid search uses
@@ -32,7 +31,7 @@ GRID_LOSS, GRID_APART = (1.5, 2.5)
 SWEEPS = 14  # Gauss-Newton steps per start
 COARSE, FINE = 5.0, 0.5  # m, scale of the Geman-McClure loss at the first and the last steps
 SPEED = 1.0  # m/s, prior standard deviation of the velocity
-LONGEST_STEP = 2.0  # m
+LONGEST_STEP = 2.0  # m, longest change of the position in a Gauss-Newton step
 INLIER = 0.75  # m; a smaller residual agrees with a position
 NO_SCALE = 1e6  # m, scale of a loss that is quadratic in practice
 APART = 1.0  # m between two places; also the standard deviation above which a place is split
@@ -263,8 +262,8 @@ def split(places: Places) -> None:
     """Split an uncertain place into two places of equal probability.
 
     This applies to a single place with a standard deviation above APART along any direction. Mean
-    and covariance of both together stay the same. The TDOA model is nonlinear at the scale of the
-    distance to the anchors.
+    and covariance of both together stay the same. Over such distances the TDOA model may be
+    nonlinear: its curvature depends on the distance to the anchors.
     """
     x, covariance, cost = places.x, places.covariance, places.cost
     axis, variance = np.empty(3), 0.0

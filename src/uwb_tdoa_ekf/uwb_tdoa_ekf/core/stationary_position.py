@@ -103,6 +103,7 @@ def weigh(
     return explained.cost[0] - np.min(explained.cost[1:])
 
 
+# Return Places for EXPLANATIONS positions, to be filled in.
 @compiled
 def _explanations() -> Places:
     return Places(
@@ -129,6 +130,7 @@ def sort(places: Places, near: np.ndarray) -> None:
     cost -= cost[0]
 
 
+# Return the cost of a place x (3,), m, outside the heights `near` (2, 3), m.
 @compiled
 def _absurdity(near: np.ndarray, x: np.ndarray) -> float:
     return 0.0 if near[0, 2] <= x[2] <= near[1, 2] else ABSURD
