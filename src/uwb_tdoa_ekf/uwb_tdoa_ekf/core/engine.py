@@ -339,8 +339,9 @@ def _after_update(
     _stay_in_workspace(ekf, t, records)
     followed = ekf.best
     alone = hypotheses.select(ekf, t) and parameters.use_imu and not (ekf.quiet or ekf.resting)
-    # A record of a reset is needed at another place. It is also needed with another yaw after a yaw
-    # was opened again. The yaws of a start share the history before the choice.
+    # If the best hypothesis is at another place, the history needs a reset. If only the yaw
+    # differs, it needs a reset after a yaw was opened again. The yaws of a start share the history
+    # before the choice, so they need none.
     opened = ekf.yaw_test.count > 0 or not parameters.use_imu
     if ekf.best // N_YAWS != followed // N_YAWS or (ekf.best != followed and opened):
         history.add_reset(ekf, t, records)

@@ -1,10 +1,10 @@
 """Tag near the ground: anchors that may be late there, and the position of a tag at rest.
 
 The ground inverts the phase of a ray at grazing incidence. If tag and anchor are near the ground,
-direct and reflected ray are nearly equally long and cancel (two-ray ground-reflection model, e.g.
-Rappaport, Wireless Communications, ch. 4). The receiver then takes a later arrival for the first,
-metres late. The delay is unknown. The two heights and the distance determine whether the anchor can
-be late.
+direct and reflected ray are nearly equally long. Then they cancel (two-ray ground-reflection model,
+e.g. Rappaport, Wireless Communications, ch. 4). The receiver takes a later arrival for the first:
+the anchor is late, by metres. The delay is unknown. The two heights and the distance determine
+whether the anchor can be late.
 """
 
 from __future__ import annotations
