@@ -1,4 +1,4 @@
-"""The filter itself, compiled: states, prediction, robust updates, hypotheses, start.
+"""The compiled filter: states, prediction, robust updates, hypotheses and initialization.
 
-No ROS, no files.
+It uses no ROS and no files.
 """

@@ -1,9 +1,9 @@
-"""States beside the 15 of the error state: what is common to all measurements of one sensor, and is
-found with the position.
+"""Auxiliary states beyond the 15 error states: biases common to all measurements of a sensor.
 
-Each has its own covariance with the error state, and all of them one of their own. A variance of 0:
-there is no such state, and while there is none nothing is computed. What they are, and where they
-begin, `barometer` and `ranges` say.
+The filter estimates them together with the position. `offset_cross` is their covariance with the
+error state. `offset_P` is their own covariance. A variance of 0 means that the state does not
+exist. Without auxiliary states nothing is computed. `barometer` and `ranges` define their meaning
+and initialization.
 """
 
 from __future__ import annotations
@@ -14,23 +14,27 @@ from uwb_tdoa_bias.common.compiled import Record, compiled
 
 from .state import ERROR_STATES
 
-PRESSURE, PRESSURE_DRIFT, RANGE = 0, 1, 2  # m and m/s, of the barometer; m, of all ranges
+# offset of the barometer (m), its drift (m/s), offset of all ranges (m)
+PRESSURE, PRESSURE_DRIFT, RANGE = 0, 1, 2
 OFFSET_STATES = 3
-# parameters of a filter without those of the barometer,
+# Parameters of a filter without the states of the barometer.
 NO_PRESSURE: dict[str, Any] = {"use_pressure": False}
-# and of one without any: a history has none
+# Parameters of a filter without auxiliary states: a history has none.
 NONE: dict[str, Any] = {**NO_PRESSURE, "range_offset_std": 0.0}
 
 
 @compiled
 def present(hypothesis: Record) -> bool:
-    """Whether a HYPOTHESIS has any of them."""
+    """Return whether a HYPOTHESIS has any auxiliary state."""
     return hypothesis.offset_P[PRESSURE, PRESSURE] > 0.0 or hypothesis.offset_P[RANGE, RANGE] > 0.0
 
 
 @compiled
 def forget(hypothesis: Record) -> None:
-    """The state was replaced: all of them are to be found anew."""
+    """Remove all auxiliary states, because the state of the HYPOTHESIS was replaced.
+
+    The filter estimates them again from the next measurements.
+    """
     hypothesis.offset[:] = 0.0
     hypothesis.offset_cross[:] = 0.0
     hypothesis.offset_P[:] = 0.0
@@ -38,7 +42,19 @@ def forget(hypothesis: Record) -> None:
 
 @compiled
 def add_offset_jacobian(hypothesis: Record, innovation: Record, state: int) -> None:
-    """After `update.project`: the measurement has one of them in it, whole."""
+    """Add an auxiliary state to an innovation, with a Jacobian entry of 1.
+
+    Call after `update.project`.
+
+    Parameters
+    ----------
+    hypothesis : HYPOTHESIS
+        Hypothesis that has the state.
+    innovation : INNOVATION
+        Its prior_variance, cross_covariance and offset_jacobian are updated.
+    state : int
+        PRESSURE, PRESSURE_DRIFT or RANGE.
+    """
     cross, P = hypothesis.offset_cross, hypothesis.offset_P
     own = 0.0
     for n in range(innovation.entries):
@@ -51,9 +67,10 @@ def add_offset_jacobian(hypothesis: Record, innovation: Record, state: int) -> N
 
 @compiled
 def correct(hypothesis: Record, innovation: Record) -> None:
-    """The part of `update.kalman` for them."""
+    """Update the auxiliary states of a HYPOTHESIS: their part of `update.kalman`."""
     cross, P, total = hypothesis.offset_cross, hypothesis.offset_P, innovation.total_variance
-    covariance = innovation.offset_covariance  # with the prediction
+    # of the auxiliary states with the predicted measurement
+    covariance = innovation.offset_covariance
     for k in range(OFFSET_STATES):
         covariance[k] = 0.0
         for m in range(OFFSET_STATES):
@@ -72,8 +89,9 @@ def correct(hypothesis: Record, innovation: Record) -> None:
 
 @compiled
 def predict(hypothesis: Record, transition: Record) -> None:
-    """After `state.predict` of a HYPOTHESIS that has any: their covariance with the state, by the
-    same TRANSITION.
+    """Predict the auxiliary states and their covariance with the error state.
+
+    Call after `state.predict` of a HYPOTHESIS that has auxiliary states, with the same TRANSITION.
     """
     dt, cross = transition.dt, hypothesis.offset_cross
     A, B, E = (
@@ -94,7 +112,7 @@ def predict(hypothesis: Record, transition: Record) -> None:
 
 @compiled
 def coast(hypothesis: Record, dt: float) -> None:
-    """The same after `state.coast`."""
+    """Predict the auxiliary states over dt (s), after `state.coast` of the same HYPOTHESIS."""
     cross = hypothesis.offset_cross
     for k in range(OFFSET_STATES):
         for r in range(3):
@@ -104,7 +122,7 @@ def coast(hypothesis: Record, dt: float) -> None:
 
 @compiled
 def _drift(hypothesis: Record, dt: float) -> None:
-    """The barometer's offset moves by its drift; no other moves."""
+    """Predict the offset of the barometer by its drift over dt (s); no other state changes."""
     cross, P = hypothesis.offset_cross, hypothesis.offset_P
     hypothesis.offset[PRESSURE] += dt * hypothesis.offset[PRESSURE_DRIFT]
     for j in range(ERROR_STATES):

@@ -1,6 +1,6 @@
-"""A barometer: its altitude is the height of the body plus an offset that wanders and drifts.
+"""Barometer: its altitude is the height of the body plus an offset that wanders and drifts.
 
-Offset and drift are states beside the 15 of the error state, see auxiliary.py.
+Offset and drift are auxiliary states, see auxiliary.py.
 """
 
 from __future__ import annotations
@@ -18,19 +18,32 @@ from .memory import REJECTED, USED
 from .state import ERROR_STATES
 from .update import kalman, project
 
-GATE = 4.0  # standard deviations beyond which an altitude is not used
-LONGEST_DISAGREEMENT = 1.0  # s, after which the offset is taken anew
-# s of innovations that tell how much worse a barometer is than its standard deviation
-AVERAGE = 3.0
-UNTRIED, WORST = 10.0, 100.0  # at first, and at most, in standard deviations
+GATE = 4.0  # standard deviations; the gate of an altitude
+LONGEST_DISAGREEMENT = 1.0  # s without a used altitude, after which the offset is initialized again
+AVERAGE = 3.0  # s over which innovations are averaged to inflate the random walk of the offset
+UNTRIED, WORST = 10.0, 100.0  # standard deviations: initial and largest inflation
 
 
 @compiled
 def observe(
     ekf: Record, parameters: Record, aid: Record, residual: Record, records: np.ndarray
 ) -> None:
-    """Take an altitude of the standard atmosphere, one of AID, into a running filter; fills one of
-    RESIDUAL.
+    """Update a running filter with the altitude of a barometer.
+
+    The altitude is computed from the pressure in the standard atmosphere, in m.
+
+    Parameters
+    ----------
+    ekf : EKF
+        State of the filter, updated in place.
+    parameters : PARAMETERS
+        Tuning of the filter.
+    aid : AID
+        Measurement.
+    residual : RESIDUAL
+        Filled by this function.
+    records : (n,) RECORD
+        History for the smoother; empty for no recording.
     """
     barometer, innovation, altitude = ekf.barometer, ekf.innovation, aid.value[0]
     dt = min(max(aid.t - barometer.heard, 0.0), AVERAGE)
@@ -67,7 +80,7 @@ def observe(
 
 @compiled
 def _compare(hypothesis: Record, altitude: float, parameters: Record, innovation: Record) -> None:
-    """Fill in what an altitude (m) says to a HYPOTHESIS and its offset."""
+    """Fill in the innovation of an altitude (m) for a HYPOTHESIS with its offset."""
     innovation.entries, innovation.states[0], innovation.row[0] = 1, 2, 1.0
     innovation.value = altitude - hypothesis.x[2] - hypothesis.offset[PRESSURE]
     innovation.noise_variance = parameters.pressure_std**2
@@ -77,9 +90,7 @@ def _compare(hypothesis: Record, altitude: float, parameters: Record, innovation
 
 @compiled
 def _take_anew(hypothesis: Record, altitude: float, parameters: Record) -> None:
-    """The offset is what leads from the height of the filter to an altitude; the drift is not
-    known.
-    """
+    """Initialize the offset and drift of a HYPOTHESIS from an altitude, in m."""
     hypothesis.offset[PRESSURE], hypothesis.offset[PRESSURE_DRIFT] = altitude - hypothesis.x[2], 0.0
     cross, P = hypothesis.offset_cross, hypothesis.offset_P
     for j in range(ERROR_STATES):

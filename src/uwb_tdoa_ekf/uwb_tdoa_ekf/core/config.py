@@ -1,4 +1,4 @@
-"""Every number that tunes the filter, with its unit and why it is what it is."""
+"""Tuning parameters of the filter, with unit and reason."""
 
 from dataclasses import Field, dataclass, fields, make_dataclass
 import math
@@ -15,7 +15,7 @@ from uwb_tdoa_bias.common.sensors.sensor import parameter
 
 ROBUST = ("innovation", "gate", "m_estimation")
 SIDES = "unknown", "below", "above", "-x", "+x", "-y", "+y"
-# parameters that are one of a few names
+# parameters with a fixed set of names
 CHOICES = {"robust": ROBUST, "loss": LOSSES, "tag_side": SIDES}
 PLANAR_HEIGHT_STD = 0.02  # m
 
@@ -157,7 +157,7 @@ class _FilterParameters:
     )
 
 
-# What else the tag feels
+# Parameters of the sensors other than IMU and TDOA.
 _PARAMETERS = [
     (name, type(each.default), each)
     for sensor in SENSORS.values()
@@ -173,7 +173,7 @@ else:
 
 @dataclass(frozen=True)
 class FilterConfig(_SensorParameters):
-    """Tuning of the filter. The node's parameters have the same names."""
+    """Tuning of the filter; the parameters of the node have the same names."""
 
     # The floor
     fixed_height: float = parameter(
@@ -228,7 +228,7 @@ class FilterConfig(_SensorParameters):
 
     @classmethod
     def from_parameters(cls, parameters: dict[str, Any]) -> "FilterConfig":
-        """Of a dict by name; names that are no parameter of the filter are passed over.
+        """Return the configuration from a dict by name; other names are ignored.
 
         Raises InputError.
         """
@@ -236,8 +236,9 @@ class FilterConfig(_SensorParameters):
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> "FilterConfig":
-        """Read the ros__parameters of a node's parameter file; those that do not tune the filter
-        are passed over.
+        """Read the ros__parameters of a node's parameter file.
+
+        Parameters that do not tune the filter are ignored. Raises InputError.
         """
         content = read_yaml(path)
         try:
@@ -251,8 +252,9 @@ class FilterConfig(_SensorParameters):
             ) from error
 
     def parameters(self) -> np.ndarray:
-        """The numbers as the compiled core takes them: (1,) of PARAMETERS, for choices their places
-        in CHOICES.
+        """Return the configuration as the compiled core takes it: (1,) PARAMETERS.
+
+        A choice becomes its index in CHOICES.
         """
         values = ((each.name, getattr(self, each.name)) for each in fields(self))
         places = (
@@ -267,8 +269,9 @@ PARAMETERS = np.dtype(
 
 
 def _number(parameter: Field[Any], value: Any) -> float:
-    """`value` as the type of a field of FilterConfig; raises InputError if it is none, or out of
-    bounds.
+    """Return `value` in the type of a field of FilterConfig.
+
+    Raises InputError if it is not a number or out of bounds.
     """
     kind: Any = parameter.type
     low, high, with_low = (parameter.metadata[name] for name in ("low", "high", "with_low"))

@@ -1,6 +1,6 @@
 """The compiled filter: events in stamp order in, odometry and residuals out.
 
-Everything it remembers is in FilterState.
+FilterState holds the entire state between two calls.
 """
 
 from __future__ import annotations
@@ -52,24 +52,23 @@ from .startup import INLIER
 from .state import coast, predict, turn_about_vertical
 from .update import project
 
-CONSISTENCY_TIME = 0.3  # s over which the share of TDOAs that the filter explains is averaged
-INCONSISTENT = 0.5  # share below which the tag is looked for elsewhere
-# s of TDOAs, after a silence in which a tag got lost, in which it is looked for anew
-UNSURE_TIME = 0.5
+CONSISTENCY_TIME = 0.3  # s over which the share of TDOAs that agree with the filter is averaged
+INCONSISTENT = 0.5  # share below which the filter searches for the tag elsewhere
+UNSURE_TIME = 0.5  # s of TDOAs after a silence in which the filter searches for a lost tag
 # s without a TDOA after which a tag that may be anywhere in its workspace is lost: the filter
-# starts anew
+# stops, then starts again
 LOST_TIME = 30.0
 MAX_STEP = 0.05  # s, longest single prediction
-# s of inertial samples that tell how a sensor is mounted which comes when the filter runs
+# s of inertial samples that determine the initial attitude if the IMU starts after the filter
 AVERAGED = 0.25
-# m or m/s of the state, within which the slope of a bias tells what it is elsewhere
+# m or m/s from the linearization point, within which the slope of a bias is used
 LINEAR_RANGE = 1.0
 
-# In a history, at most: its update, workspace, a place at rest, another hypothesis, starts or
-# recoveries, a yaw opened again
+# Most records in a history per TDOA: its update, workspace, position at rest, another hypothesis,
+# starts or recoveries, an opened yaw.
 RECORDS_OF_TDOA = 1 + 4 + 6 + 1 + 2 + 2
 RECORDS_OF_REST = 3  # one per axis
-# a range has as many, a velocity one per component, and a yaw opened again
+# a range has the same number; a velocity has one per component, plus an opened yaw
 RECORDS_OF_AID = RECORDS_OF_TDOA
 
 
@@ -77,12 +76,30 @@ RECORDS_OF_AID = RECORDS_OF_TDOA
 def run(
     state: FilterState, parameters: np.ndarray, measurements: Measurements, output: Output
 ) -> int:
-    """Feed Measurements in stamp order, neither before what was fed earlier.
+    """Run the filter over measurements in stamp order and return the number of odometry rows.
 
-    state : FilterState, whose functions are taken out of the inertial samples where they lie;
-        parameters : (1,) of config.PARAMETERS;
-    output : Output, which is filled. Returns the number of odometry
-    rows. Raises IndexError if a history has less room than `most_records`.
+    No measurement may be earlier than measurements of the last call.
+
+    Parameters
+    ----------
+    state : FilterState
+        Updated in place. Its sensor functions are subtracted from the inertial samples in place.
+    parameters : (1,) PARAMETERS
+        Tuning of the filter.
+    measurements : Measurements
+        Inertial samples, TDOAs and other measurements, each by rising stamp.
+    output : Output
+        Filled by this function.
+
+    Returns
+    -------
+    int
+        Number of odometry rows.
+
+    Raises
+    ------
+    IndexError
+        If a history has less room than `most_records`.
     """
     ekf, anchors, values = state.ekf[0], state.anchors, parameters[0]
     imu, tdoa, aid = measurements.imu, measurements.tdoa, measurements.aids
@@ -112,6 +129,7 @@ def run(
     return rows
 
 
+# Compiled part of `set_pose`.
 @compiled
 def _set_pose(
     state: FilterState, parameters: np.ndarray, poses: np.ndarray, records: np.ndarray
@@ -123,15 +141,22 @@ def _set_pose(
 
 
 def set_pose(state: FilterState, parameters: np.ndarray, pose: np.ndarray) -> None:
-    """Put the filter at a pose, (1,) of POSE, that is not before what was fed earlier.
+    """Set the pose of the filter; the history does not record it.
 
-    Is not recorded in a history.
+    Parameters
+    ----------
+    state : FilterState
+        Updated in place.
+    parameters : (1,) PARAMETERS
+        Tuning of the filter.
+    pose : (1,) POSE
+        New pose. It must not be earlier than measurements of the last call.
     """
     _set_pose(state, parameters, pose, history.NOTHING)
 
 
 def most_records(measurements: Measurements) -> int:
-    """Room that a history needs for Measurements that are fed at once."""
+    """Return the number of history records that a call with these Measurements can need."""
     imu, tdoa, aid = measurements
     spans = [part["t"][-1] - part["t"][0] for part in measurements if len(part)]
     most, seconds = len(imu) + len(tdoa) + len(aid), max(spans, default=0.0)
@@ -141,6 +166,7 @@ def most_records(measurements: Measurements) -> int:
     return of_events + RECORDS_OF_REST * rests + plane.RECORDS * floors + switches
 
 
+# Process an IMU_SAMPLE: fault detection, prediction, rest and zero-velocity updates.
 @compiled
 def _on_imu(ekf: Record, parameters: Record, sample: Record, records: np.ndarray) -> None:
     continuous = inertial.observe(ekf.imu, sample, parameters.imu_timeout)
@@ -175,8 +201,9 @@ def _on_imu(ekf: Record, parameters: Record, sample: Record, records: np.ndarray
 
 @compiled
 def _switch(ekf: Record, parameters: Record, records: np.ndarray) -> None:
-    """Go without inertial samples from here on, or with them again: from the attitude that they
-    then have.
+    """Stop or resume the use of inertial samples, depending on ekf.imu_faulty.
+
+    A stop increases the covariance. A resumption resets the attitude.
     """
     if ekf.running and ekf.imu_faulty:
         initialization.widen(ekf, records)
@@ -184,6 +211,7 @@ def _switch(ekf: Record, parameters: Record, records: np.ndarray) -> None:
         initialization.reset_attitude(ekf, parameters, 2.0 * math.pi, records)
 
 
+# Process a TDOA: reject a repeat, predict, update, and search for a lost tag.
 @compiled
 def _on_tdoa(
     ekf: Record,
@@ -226,7 +254,10 @@ def _on_range(
     residual: Record,
     records: np.ndarray,
 ) -> None:
-    """The distance to an anchor, one of AID; as a TDOA with the one before it tells the start."""
+    """Process the distance to an anchor.
+
+    The TDOA with the distance before serves initialization and recovery.
+    """
     if ranges.is_repeat(ekf, aid):
         residual.verdict = REPEATED
         return
@@ -254,8 +285,9 @@ def _on_range(
 def _before_update(
     ekf: Record, anchors: np.ndarray, parameters: Record, t: float, records: np.ndarray
 ) -> None:
-    """Before an update stamped t, s: whether the tag is at rest, which anchors are heard, and
-    whether a silence left the place open.
+    """Prepare an update stamped t (s): detect rest, heard anchors, and an unknown position.
+
+    The position is unknown after a silence that has made it uncertain.
     """
     if parameters.zero_velocity:
         if t >= ekf.next_look:
@@ -285,14 +317,31 @@ def _after_update(
     agrees: bool,
     records: np.ndarray,
 ) -> None:
-    """After an update stamped t, s: what holds anyway, which hypothesis is best, and whether the
-    tag is elsewhere. counts : what was measured shows that; agrees : with the best hypothesis.
+    """Complete an update: apply constraints, select the best hypothesis, recover a lost tag.
+
+    Parameters
+    ----------
+    ekf : EKF
+        State of the filter, updated in place.
+    anchors : (N,) ANCHOR
+        All anchors, by row.
+    parameters : PARAMETERS
+        Tuning of the filter.
+    t : float
+        Stamp, s.
+    counts : bool
+        Whether the measurement shows if the filter is consistent.
+    agrees : bool
+        Whether the measurement agrees with the best hypothesis.
+    records : (n,) RECORD
+        History for the smoother; empty for no recording.
     """
     _stay_in_workspace(ekf, t, records)
     followed = ekf.best
     alone = hypotheses.select(ekf, t) and parameters.use_imu and not (ekf.quiet or ekf.resting)
-    # At another place. Or with another yaw, after one was opened again: the yaws of a start share
-    # the history before the choice.
+    # If the best hypothesis is at another place, the history needs a reset. If only the yaw
+    # differs, it needs a reset after a yaw was opened again. The yaws of a start share the history
+    # before the choice, so they need none.
     opened = ekf.yaw_test.count > 0 or not parameters.use_imu
     if ekf.best // N_YAWS != followed // N_YAWS or (ekf.best != followed and opened):
         history.add_reset(ekf, t, records)
@@ -314,6 +363,7 @@ def _after_update(
         initialization.recover(ekf, anchors, parameters, t, unsure, records)
 
 
+# Process an AID: update a running filter, or store the measurement.
 @compiled
 def _on_aid(
     ekf: Record,
@@ -339,9 +389,9 @@ def _on_aid(
 def _reach(
     ekf: Record, anchors: np.ndarray, parameters: Record, t: float, records: np.ndarray
 ) -> bool:
-    """A TDOA or range stamped t, s, has come: predict a filter that runs, or wait for its start.
+    """Predict a running filter to the stamp t (s) of a TDOA or range, or wait for its start.
 
-    Returns whether it runs at t.
+    Return whether the filter runs at t.
     """
     if not ekf.running:
         _wait_for_start(ekf, anchors, parameters, t, records)
@@ -353,7 +403,7 @@ def _reach(
 def _wait_for_start(
     ekf: Record, anchors: np.ndarray, parameters: Record, t: float, records: np.ndarray
 ) -> None:
-    """A TDOA stamped t has come while the filter does not run."""
+    """Try to start the filter after a TDOA or range stamped t (s)."""
     if t - ekf.last_tdoa > parameters.start_window:
         ekf.first_tdoa = t
     ekf.last_tdoa = t
@@ -370,9 +420,11 @@ def _wait_for_start(
 
 @compiled
 def _advance(ekf: Record, parameters: Record, t: float, records: np.ndarray) -> bool:
-    """Predict every hypothesis to stamp t, with the inertial sample at hand or, if it is too old,
-    with the last velocity of wheels, or without either. Returns False if the filter has stopped,
-    because nothing has shown for too long where the tag is.
+    """Predict every hypothesis to stamp t (s).
+
+    The prediction uses the last inertial sample. If it is too old, it uses the last velocity of
+    wheels. Without both, it uses constant velocity. Return False if the filter has stopped, because
+    its position has been unknown for too long.
     """
     if t - ekf.t > LOST_TIME:
         return _stop(ekf, t)
@@ -419,8 +471,10 @@ def _advance(ekf: Record, parameters: Record, t: float, records: np.ndarray) -> 
 
 @compiled
 def _coast(ekf: Record, hypothesis: Record, parameters: Record, dt: float) -> None:
-    """Advance a HYPOTHESIS by dt seconds without inertial samples: as wheels tell, or as it was.
-    Nothing measures a tilt where no IMU is used; then the tag is taken to be level.
+    """Predict a HYPOTHESIS over dt (s) without inertial samples.
+
+    The velocity of wheels drives it, or the last velocity. If no IMU is used, no sensor measures a
+    tilt. Then the tag counts as level.
     """
     wheels = ekf.velocity
     driven = velocity.drives(wheels, ekf.t)
@@ -444,7 +498,7 @@ def _coast(ekf: Record, hypothesis: Record, parameters: Record, dt: float) -> No
 
 @compiled
 def _stop(ekf: Record, t: float) -> bool:
-    """Go on as before the start. Returns False."""
+    """Stop the filter at stamp t (s), until the next start; return False."""
     ekf.running, ekf.first_tdoa, ekf.next_search = False, t, -np.inf
     return False
 
@@ -458,8 +512,10 @@ def _update(
     residual: Record,
     records: np.ndarray,
 ) -> bool:
-    """Every hypothesis with one TDOA; the best one's innovation becomes the residual. Returns
-    whether one of its anchors is late because it is near the ground: then it tells nothing.
+    """Update every hypothesis with a TDOA; the innovation of the best one becomes the residual.
+
+    Return whether the TDOA was rejected because an anchor is late near the ground. Then the TDOA
+    does not show if the filter is consistent.
     """
     a, b, innovation = anchors[tdoa.a], anchors[tdoa.b], ekf.innovation
     innovation.noise_variance = (
@@ -513,8 +569,10 @@ def _update(
 def _is_of_rival(
     ekf: Record, a: Record, b: Record, tdoa: Record, known: float, residual: Record
 ) -> bool:
-    """Whether a TDOA contradicts the place that wheels have gone to, while they outweigh those that
-    agree on another one; fills one of RESIDUAL. A robust weight would leave it some, and many pull.
+    """Return whether a TDOA contradicts the position of a filter that follows wheels.
+
+    The residual is filled. Wheels outweigh TDOAs that agree on another place for a while. Even with
+    small robust weights, many such TDOAs would pull the position.
     """
     innovation = ekf.innovation
     noise_variance = innovation.noise_variance
@@ -531,9 +589,23 @@ def _is_of_rival(
 def _compare(
     hypothesis: Record, a: Record, b: Record, tdoa: Record, known: float, innovation: Record
 ) -> None:
-    """Fill in what a TDOA between two of ANCHOR, `known` (m) too long, says to a HYPOTHESIS; its
-    Jacobian is that of the position, and of what its bias changes with, where the state is about as
-    it was when the bias was given.
+    """Fill in the innovation of a TDOA for a HYPOTHESIS.
+
+    The Jacobian contains the position, and the slope of the bias. The slope counts only within
+    LINEAR_RANGE of the state at which the bias was computed.
+
+    Parameters
+    ----------
+    hypothesis : HYPOTHESIS
+        Hypothesis, predicted to the stamp.
+    a, b : ANCHOR
+        Anchors of the TDOA.
+    tdoa : TDOA
+        Measurement, m.
+    known : float
+        Known error of the TDOA by delays of its anchors, m.
+    innovation : INNOVATION
+        Filled by this function.
     """
     innovation.value = (
         tdoa.d - known - linearized_tdoa(hypothesis.x, a.position, b.position, innovation.row)
@@ -563,9 +635,10 @@ def _assimilate(
     records: np.ndarray,
     of_tdoa: bool,
 ) -> None:
-    """Hypothesis h with ekf.innovation, of whatever kind; that of the best one becomes the
-    RESIDUAL. of_tdoa : it shows whether the yaw is right; ranges may be off by an offset, which
-    looks alike.
+    """Update hypothesis h with ekf.innovation of any kind.
+
+    The innovation of the best hypothesis becomes the RESIDUAL. of_tdoa is whether the innovation is
+    evidence for the yaw. Ranges are not: their common offset looks the same as a wrong yaw.
     """
     hypothesis, innovation = ekf.hypotheses[h], ekf.innovation
     hypotheses.add_log_likelihood(
@@ -587,7 +660,7 @@ def _assimilate(
 
 @compiled
 def _stay_in_workspace(ekf: Record, t: float, records: np.ndarray) -> None:
-    """Soft constraints of every axis, for each hypothesis that is outside."""
+    """Apply the soft constraints of the workspace to each hypothesis outside, for every axis."""
     for h in range(HYPOTHESES):
         if not hypotheses.alive(ekf.hypotheses[h]):
             continue
@@ -601,7 +674,7 @@ def _stay_in_workspace(ekf: Record, t: float, records: np.ndarray) -> None:
 
 @compiled
 def _report(ekf: Record, parameters: Record, t: float, row: Record) -> None:
-    """Write the best hypothesis to one of ODOMETRY."""
+    """Write the best hypothesis to an ODOMETRY row at stamp t (s)."""
     best = ekf.hypotheses[ekf.best]
     row.t = t
     row.x[:] = best.x
@@ -631,8 +704,9 @@ def _report(ekf: Record, parameters: Record, t: float, row: Record) -> None:
 
 @compiled
 def _widen(ekf: Record, x: np.ndarray, covariance: np.ndarray) -> None:
-    """Add to the (9, 9) covariance of a position x (3,), m, how far away the place is that TDOAs
-    agree on.
+    """Add to a covariance the squared distance to the rival place that TDOAs agree on.
+
+    x is the position (3,) in m, world frame. covariance is (9, 9), updated in place.
     """
     square = 0.0
     for k in range(3):
@@ -647,11 +721,23 @@ def feed(
     measurements: Measurements,
     records: list[np.ndarray] | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """`run`, with room for what it gives: (odometry of ODOMETRY, residuals of TDOAs and those of
-    aids, of RESIDUAL).
+    """Run the filter over measurements and return new arrays of odometry and residuals.
 
-    records : list to which the records of the history are appended, an array for each call; None:
-        nothing is recorded.
+    Parameters
+    ----------
+    state : FilterState
+        Updated in place.
+    parameters : (1,) PARAMETERS
+        Tuning of the filter.
+    measurements : Measurements
+        Measurements in stamp order, see `run`.
+    records : list, optional
+        A new array of history records is appended for each call. None: no recording.
+
+    Returns
+    -------
+    tuple
+        Odometry (ODOMETRY), residuals of TDOAs and residuals of other measurements (RESIDUAL).
     """
     imu, tdoa, aid = measurements
     room = (

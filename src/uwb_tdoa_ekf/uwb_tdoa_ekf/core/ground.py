@@ -1,9 +1,10 @@
-"""A tag near the ground: anchors that may be late there, and where a tag stands that does not move.
+"""Tag near the ground: anchors that may be late there, and the position of a tag at rest.
 
-Between two antennas near the ground the reflected ray, whose phase the ground turns, cancels the
-direct one where both are nearly equally long (two-ray ground-reflection model, e.g. Rappaport,
-Wireless Communications, ch. 4). The receiver then takes a later arrival for the first, metres late.
-By how much is not known; that it may be so follows from the two heights and the distance.
+The ground inverts the phase of a ray at grazing incidence. If tag and anchor are near the ground,
+direct and reflected ray are nearly equally long. Then they cancel (two-ray ground-reflection model,
+e.g. Rappaport, Wireless Communications, ch. 4). The receiver takes a later arrival for the first:
+the anchor is late, by metres. The delay is unknown. The two heights and the distance determine
+whether the anchor can be late.
 """
 
 from __future__ import annotations
@@ -16,64 +17,70 @@ import numpy as np
 from uwb_tdoa_bias.common.compiled import Record, compiled
 from uwb_tdoa_bias.common.geometry import linearized_tdoa
 
-# elevation below which the ground turns the phase of what it reflects
+# tangent of the elevation below which the ground inverts the phase of a reflection
 GRAZING = math.tan(math.radians(15.0))
-HALF_WAVE = 0.0375  # m, at 4 GHz: rays that differ by more do not cancel
-# m, lateness of an anchor is up to that, the more probable, the larger: the way by what reflects is
-# a detour
+HALF_WAVE = 0.0375  # m, at 4 GHz: rays with a larger path difference do not cancel
+# m, largest usual delay of a late anchor. Up to it, larger delays are more probable, because the
+# path by a reflector is a detour.
 LATEST = 6.0
-FARTHER = 1e-3  # 1/m, density of what is later still, and of outliers of any kind
-RARE = 0.02  # probability that an anchor is late, and that it is not, at least,
-USUAL = 0.1  # and that it is late where nothing is known
-CHANGE_TIME = 2.0  # s after which what an anchor was does not tell what it is
-DEVIATIONS = 3.0  # standard deviations that a tag may be lower than the filter has it
-# m above the ground below which what it reflects blurs what arrives, and by how much at the ground
+FARTHER = 1e-3  # 1/m, density of larger delays, and of outliers of any kind
+RARE = 0.02  # least probability that an anchor is late, and that it is in time
+USUAL = 0.1  # prior probability that it is late
+CHANGE_TIME = 2.0  # s after which the last state of an anchor does not predict the next
+DEVIATIONS = 3.0  # standard deviations by which a tag may be lower than the estimate
+# m above the ground below which reflections distort the pulse; m, standard deviation of the error
+# at the ground
 BLURRED, BLUR_STD = (0.8, 0.25)
-NOT_USED = 0.2  # probability that both anchors of a TDOA are in time, below which it says nothing
+NOT_USED = 0.2  # probability that both anchors of a TDOA are in time, below which it is rejected
 
-MOST_PAIRS, MOST_ANCHORS = 64, 24  # of a window that are looked at, those heard first
+MOST_PAIRS, MOST_ANCHORS = 64, 24  # limits for a window: the first pairs and anchors heard count
 FEWEST_PAIRS = 3
-STILL_TDOAS = 2  # of a pair in each half of the window, at least
-SMALLEST_SPREAD = 0.02  # m, of the values of a pair
-STILL_SPEED = 0.3  # m/s; a velocity that is not known better than that may be none
-LIKELY_SPEED = 1.0  # m/s, of a tag of which nothing is known
-# standard deviations of a change from which on it is the lateness that has changed
+STILL_TDOAS = 2  # least number of TDOAs of a pair in each half of the window
+SMALLEST_SPREAD = 0.02  # m, least standard deviation of the values of a pair
+STILL_SPEED = 0.3  # m/s; a velocity of zero is accepted only if its standard deviation is smaller
+LIKELY_SPEED = 1.0  # m/s, prior standard deviation of the velocity
+# scale of the loss, in standard deviations of a change: beyond, the lateness has changed; and
+# number of sweeps
 STILL_SCALE, STILL_SWEEPS = (2.5, 5)
-MOVING = 12.0  # normalised square of a velocity that is not zero
-STILL, UNKNOWN, MOVES = range(3)  # what the TDOAs of a window show of the motion of a tag
-# Median normalised square of the changes at rest, and by how much one of n is larger, times sqrt(n)
+MOVING = 12.0  # normalized square of the velocity above which the tag moves
+STILL, UNKNOWN, MOVES = range(3)  # motion of a tag, as the TDOAs of a window show it
+# Median normalized square of the changes at rest, and its largest deviation for n pairs, times
+# sqrt(n).
 EXPECTED_RATIO, LARGEST_RATIO = 0.45, 3.5
 
 GROUND_STD = 0.15  # m, of the height of the tag of a body that stands on the ground
-GROUND_HEIGHT = 0.05  # m, its mean
-# of tdoa_std: standard deviation of a pair's own error, and of an anchor's
+GROUND_HEIGHT = 0.05  # m, mean of this height
+# standard deviation of the error of a pair, and of an anchor, in units of tdoa_std
 PAIR_SHARE, ANCHOR_SHARE = (0.4, 1.0)
-# m: what late anchors have in common, and by how much they differ from it
+# m: mean of the delay that late anchors share, its standard deviation, and the deviation of each
+# anchor from it
 USUAL_LATENESS, LATENESS_STD, ALIKE_STD = (2.0, 2.0, 0.3)
-OTHER, TIMELY = 0.1, 0.5  # how probable other lateness is, and none, beside one that is alike
-ABOVE_STD, BESIDE_STD = 0.2, 2.0  # m; a tag is not above the workspace, and not often beside it
+# probability ratio of any other delay, and of no delay, to the shared delay
+OTHER, TIMELY = 0.1, 0.5
+# m; a tag is not above the workspace, and rarely to the side of it
+ABOVE_STD, BESIDE_STD = 0.2, 2.0
 SWEEPS = 25
-KNOWN_STD = 0.1  # m, by which an anchor may be late beyond what is known
-# what an explanation takes anchors near the ground for: late by what they have in common; as is
-# known
+KNOWN_STD = 0.1  # m, standard deviation of the delay of an anchor about the known delay
+# lateness of anchors near the ground: none, shared by all, or as known
 IN_TIME, ALIKE, KNOWN = range(3)
 
 PAIR = np.dtype(
     [
         ("a", np.int64),
-        ("b", np.int64),  # rows of its anchors
-        ("value", float),
-        ("change", float),
-        ("change_variance", float),  # m, median; median of the second half less that of the first
-        ("apart", float),  # s between the two halves
+        ("b", np.int64),  # rows of the anchors
+        ("value", float),  # m, median of its TDOAs
+        ("change", float),  # m, median of the second half minus median of the first half
+        ("change_variance", float),  # m^2, of `change`; inf if a half has too few TDOAs
+        ("apart", float),  # s between the mean stamps of the two halves
     ],
     align=True,
 )
 
 
 class KnownHeight(NamedTuple):
-    """A height of the tag that something else than TDOAs gives, and its standard deviation, m; NaN
-    for none.
+    """Height of the tag by another source than TDOAs, and its standard deviation.
+
+    Both are in m, and NaN if unknown.
     """
 
     z: float
@@ -81,9 +88,11 @@ class KnownHeight(NamedTuple):
 
 
 class Evidence(NamedTuple):
-    """What is known of a tag at rest: what pairs of anchors say, (k,) of PAIR; anchors (N,) of
-    ANCHOR; workspace (2, 3) m; prior (4, 3), position that is known before, m, and its information,
-    1/m^2; one of PARAMETERS.
+    """Measurements and prior of a tag at rest.
+
+    pairs : (k,) PAIR, from `find_pairs`. anchors : (N,) ANCHOR. workspace : (2, 3) bounds, m, world
+    frame. prior : (4, 3): prior position, m, and in the last three rows its information, 1/m^2.
+    parameters : PARAMETERS.
     """
 
     pairs: np.ndarray
@@ -95,8 +104,18 @@ class Evidence(NamedTuple):
 
 @compiled
 def may_be_late(position: np.ndarray, x: np.ndarray, lower: float, ground: float) -> bool:
-    """Whether an anchor at `position` (3,) may be late at a tag at x (3,), m, or up to `lower` m
-    below it, over level ground.
+    """Return whether an anchor may be late at a tag over level ground.
+
+    Parameters
+    ----------
+    position : (3,) array
+        Position of the anchor, m, world frame.
+    x : (3,) array
+        Position of the tag, m, world frame.
+    lower : float
+        The tag may be up to this distance below x, m.
+    ground : float
+        Height of the ground, m, world frame.
     """
     tag, anchor = max(x[2] - ground - lower, 0.0), max(position[2] - ground, 0.0)
     distance = math.hypot(x[0] - position[0], x[1] - position[1])
@@ -105,8 +124,10 @@ def may_be_late(position: np.ndarray, x: np.ndarray, lower: float, ground: float
 
 @compiled
 def blur(hypothesis: Record, ground: float) -> float:
-    """Variance, m^2, of a TDOA at a HYPOTHESIS over level ground beyond that in the air: the ray
-    that the ground reflects comes within the length of the pulse, and moves its leading edge.
+    """Return the additional variance of a TDOA near the ground, in m^2.
+
+    The ray that the ground reflects arrives within the length of the pulse and moves its leading
+    edge. ground is the height of the ground, m, world frame.
     """
     share = min(max(1.0 - (hypothesis.x[2] - ground) / BLURRED, 0.0), 1.0)
     return (BLUR_STD * share) ** 2
@@ -114,8 +135,18 @@ def blur(hypothesis: Record, ground: float) -> float:
 
 @compiled
 def find_lateness(a: Record, b: Record, hypothesis: Record, t: float, ground: float) -> bool:
-    """Predict to stamp t, s, how probable it is that each of two ANCHORs is late at a HYPOTHESIS
-    over level ground. Returns whether either can be.
+    """Predict the probability that each anchor is late, and return whether either can be.
+
+    Parameters
+    ----------
+    a, b : ANCHOR
+        Anchors of a TDOA; `late` is updated.
+    hypothesis : HYPOTHESIS
+        State of the tag.
+    t : float
+        Stamp, s.
+    ground : float
+        Height of the ground, m, world frame.
     """
     lower = DEVIATIONS * math.sqrt(hypothesis.P[2, 2])
     _predict_lateness(a, hypothesis.x, lower, t, ground)
@@ -123,6 +154,7 @@ def find_lateness(a: Record, b: Record, hypothesis: Record, t: float, ground: fl
     return a.late > 0.0 or b.late > 0.0
 
 
+# Predict the probability that an anchor is late, to stamp t, s. See `find_lateness`.
 @compiled
 def _predict_lateness(anchor: Record, x: np.ndarray, lower: float, t: float, ground: float) -> None:
     if not may_be_late(anchor.position, x, lower, ground):
@@ -135,12 +167,18 @@ def _predict_lateness(anchor: Record, x: np.ndarray, lower: float, t: float, gro
 
 @compiled
 def in_time(a: Record, b: Record, innovation: Record) -> float:
-    """Probability that a TDOA between two of ANCHOR, an INNOVATION after `project` of the best
-    HYPOTHESIS, is of two anchors in time.
+    """Return the probability that both anchors of a TDOA are in time, and update each anchor.
 
-    After `find_lateness`; what is known of each anchor becomes what it is after that TDOA (a filter
-    of four modes, Bar-Shalom et al., Estimation with Applications to Tracking and Navigation, 2001,
-    section 11.6, without an exchange of states: lateness shows no place).
+    This is a filter with four modes (Bar-Shalom et al., Estimation with Applications to Tracking
+    and Navigation, 2001, section 11.6). The modes do not exchange states, because lateness does not
+    show a position. Call after `find_lateness`.
+
+    Parameters
+    ----------
+    a, b : ANCHOR
+        Anchors of the TDOA; `late` becomes the posterior probability.
+    innovation : INNOVATION
+        TDOA after `project` of the best hypothesis.
     """
     late_a, late_b = a.late, b.late
     r, variance = innovation.value, innovation.prior_variance + innovation.noise_variance
@@ -158,16 +196,27 @@ def in_time(a: Record, b: Record, innovation: Record) -> float:
 
 @compiled
 def _nlos_delay(r: float) -> float:
-    """Density, 1/m, of an innovation r, m, by one late anchor."""
+    """Return the probability density of an innovation r (m) by a single late anchor, in 1/m."""
     return max(2.0 * r / LATEST**2, FARTHER) if r < LATEST else FARTHER
 
 
 @compiled
 def find_pairs(window: np.ndarray, pairs: np.ndarray) -> int:
-    """Fill in (k,) of PAIR what each pair of anchors, in either order, says in a window (n,) of
-    TDOA, n > 0. Returns how many there are.
+    """Collect the TDOAs of a window by pairs of anchors, in either order, and return their number.
 
-    The scatter within halves of the window is that of all pairs.
+    The variance of a change uses the scatter of all pairs within the halves of the window.
+
+    Parameters
+    ----------
+    window : (n,) TDOA
+        TDOAs, by rising stamp; n > 0.
+    pairs : (k,) PAIR
+        Filled: median value and change of each pair.
+
+    Returns
+    -------
+    int
+        Number of pairs.
     """
     n, count = len(window), 0
     middle = 0.5 * (window[0].t + window[n - 1].t)
@@ -209,6 +258,7 @@ def find_pairs(window: np.ndarray, pairs: np.ndarray) -> int:
     return count
 
 
+# Return whether a TDOA is between the anchors in rows a and b, in either order.
 @compiled
 def _is_of(tdoa: Record, a: int, b: int) -> bool:
     return (tdoa.a == a and tdoa.b == b) or (tdoa.a == b and tdoa.b == a)
@@ -218,13 +268,23 @@ def _is_of(tdoa: Record, a: int, b: int) -> bool:
 def judge_motion(
     pairs: np.ndarray, anchors: np.ndarray, x: np.ndarray, covariance: np.ndarray
 ) -> int:
-    """STILL if the TDOAs of most (k,) of PAIR stay what they are: whatever their anchors are late
-    by, the tag does not move. MOVES if they change, and UNKNOWN if they are too few, or too noisy,
-    to show either.
+    """Return whether a tag is STILL or MOVES, or UNKNOWN, from the changes of its TDOAs.
 
-    x : (3,) m, about where it is; covariance (3, 3) m^2/s^2 of the velocity that they would have
-        shown is filled, large where that is not
-    known. Least squares of the changes, robust against anchors whose lateness has changed.
+    STILL: the TDOAs of most pairs stay constant. Then the tag is at rest, whatever the delays of
+    its anchors are. MOVES: they change. UNKNOWN: they are too few or too noisy. The velocity
+    follows by least squares of the changes, robust against anchors with a changed delay.
+
+    Parameters
+    ----------
+    pairs : (k,) PAIR
+        Pairs of anchors, from `ground.find_pairs`.
+    anchors : (N,) ANCHOR
+        All anchors, by row.
+    x : (3,) array
+        Approximate position, m, world frame.
+    covariance : (3, 3) array
+        Covariance of the estimated velocity, m^2/s^2. Filled; large if the TDOAs do not determine
+        it.
     """
     n, changes, ratios = 0, np.empty((len(pairs), 5)), np.empty(len(pairs))
     for k in range(len(pairs)):
@@ -271,16 +331,30 @@ def judge_motion(
 def explain(
     evidence: Evidence, height: KnownHeight, lateness: int, x: np.ndarray, covariance: np.ndarray
 ) -> float:
-    """Where a tag at rest is, by the evidence, as far as anchors are alike.
+    """Estimate the position of a tag at rest, given an assumption about late anchors.
 
-    lateness : IN_TIME, ALIKE or KNOWN; x : (3,) m, where to begin, becomes the most probable
-        position; covariance (3, 3) m^2 is filled.
-    Returns minus the logarithm of its probability, up to a constant.
+    Each anchor and each pair has an error of its own, rarely large (Student's distribution). ALIKE:
+    most anchors near the ground share a delay, because the path by the reflector is the same. Some
+    have any other delay, and some are in time (a mixture). KNOWN: the error of an anchor is about
+    its floor_delay. The method is iteratively re-weighted least squares.
 
-    An error of its own for each anchor, and one for each pair, rarely large (Student's
-    distribution). ALIKE: of the anchors near the ground most are late by the same, as that is the
-    way by what reflects, some by anything, and some in time (a mixture). KNOWN: the error of an
-    anchor is about its floor_delay. Iteratively re-weighted least squares.
+    Parameters
+    ----------
+    evidence : Evidence
+        Measurements and prior.
+    height : KnownHeight
+        Height by another sensor.
+    lateness : int
+        IN_TIME, ALIKE or KNOWN.
+    x : (3,) array
+        Start position, m, world frame. It becomes the most probable position.
+    covariance : (3, 3) array
+        Covariance of the position, m^2. Filled.
+
+    Returns
+    -------
+    float
+        Minus the logarithm of the probability, up to a constant.
     """
     anchors, parameters = evidence.anchors, evidence.parameters
     rows, places = heard(evidence.pairs)
@@ -320,8 +394,9 @@ def explain(
 
 @compiled
 def heard(pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of the anchors that are heard, and for each pair the places of its two anchors among
-    these (k, 2).
+    """Return the rows of the heard anchors, and for each pair the indices into them, (k, 2).
+
+    An index is -1 beyond MOST_ANCHORS.
     """
     rows, places, count = np.empty(MOST_ANCHORS, np.int64), np.full((len(pairs), 2), -1), 0
     for k in range(len(pairs)):
@@ -347,10 +422,11 @@ def _equations(
     u: np.ndarray,
     system: np.ndarray,
 ) -> float:
-    """Normal equations of a step from u (n,): position, error of each anchor heard, what late ones
-    have in common; (n, n + 1) is filled.
-    errors : (k, 2) m, expected error of an anchor that is not late, and its standard deviation.
-        Returns the cost.
+    """Fill in the normal equations of a step from u (n,), and return the cost.
+
+    u contains the position (m), the error of each heard anchor (m), and the delay that late anchors
+    share (m). system is (n, n + 1). errors is (k, 2), in m: expected error of an anchor that is not
+    late, and its standard deviation.
     """
     pairs, anchors, workspace, prior, parameters = (
         evidence.pairs,
@@ -436,7 +512,7 @@ def _equations(
 def _add(
     system: np.ndarray, states: np.ndarray, entries: np.ndarray, r: float, weight: float
 ) -> None:
-    """One scalar equation: sum of entries * step of the states = r."""
+    """Add a scalar equation to the normal equations: sum of entries * step of the states = r."""
     last = system.shape[1] - 1
     for i in range(len(states)):
         for j in range(len(states)):
@@ -446,8 +522,10 @@ def _add(
 
 @compiled
 def solve(system: np.ndarray) -> bool:
-    """Turn the right sides of positive definite equations, (n, n + m), into their solutions;
-    returns False if they have none. (LAPACK is scipy's, whose import takes a fifth of a second.)
+    """Solve positive definite equations in place and return whether a solution exists.
+
+    system is (n, n + m): the matrix and m right sides, which become the solutions. LAPACK would
+    need scipy, whose import takes 0.2 s.
     """
     n, columns = system.shape
     for k in range(n):

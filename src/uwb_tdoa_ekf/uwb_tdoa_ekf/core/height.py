@@ -1,11 +1,11 @@
-"""A range finder that looks down along the body's -z, over ground that may have steps.
+"""Range finder that looks down along the body's -z, over ground that may have steps.
 
-The height of the body above the world's z = 0 is that of the ground below it plus (range +
-height_arm) * cos(tilt). The ground is level but for steps (boxes, edges), which show as a sudden
-disagreement that lasts and agrees with itself: then either the ground below has changed, or the
-filter is wrong. A filter that has agreed with the range finder until then is right, and the ground
-has changed; any other gives way. If the TDOAs in turn disagree with the result for long, the range
-finder is not used for a while, and longer each time.
+The height of the body above z = 0 of the world is the ground level plus (range + height_arm) *
+cos(tilt). The ground is level except for steps (boxes, edges). A step shows as a sudden, lasting
+and consistent disagreement. Then either the ground below has changed, or the filter is wrong. If
+the filter has agreed with the range finder until then, the ground has changed. Otherwise the filter
+changes its height. If the TDOAs disagree with the result for long, the range finder is ignored for
+a while, longer each time.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ from .memory import N_YAWS, REJECTED, USED
 from .state import rotation
 from .update import kalman, project
 
-STEEPEST = 0.5  # cos(tilt) below which the beam meets the ground anywhere
-# s over which the error of a range stays alike: the ground is uneven, the sensor has an offset
+STEEPEST = 0.5  # cos(tilt) below which the beam may hit the ground anywhere
+# s over which the error of a range persists: the ground is uneven, the sensor has an offset
 CORRELATION_TIME = 0.5
-LONGEST_GAP = 1.0  # s without a range that agrees, after which nobody knows what ground is below
-STUCK_TIME = 0.5  # s; a range finder in motion never repeats a value for so long
+LONGEST_GAP = 1.0  # s without an agreeing range, after which the ground level below is unknown
+STUCK_TIME = 0.5  # s; a working range finder in motion never repeats a value for this long
 GATE = 4.0  # standard deviations beyond which a range disagrees
 ALIKE = 0.15  # m within which disagreeing ranges agree with each other
-STEP_TIME, STEP_COUNT = 0.25, 7  # s for which they must, and how many of them
-SETTLED = 1.0  # s of agreement that make the filter the one to be believed
-HIGHEST_STEP = 1.5  # m
-BEYOND = 1.0  # m beyond the workspace, up or down, where no tag is
-PULL_SCALE = 3.0  # m, of the loss that TDOAs are weighed with
-# s, m, s: TDOAs averaged over the first disagree for the last
+STEP_TIME, STEP_COUNT = 0.25, 7  # s and number of consistent ranges that show a step
+SETTLED = 1.0  # s of agreement after which a disagreement means a step of the ground
+HIGHEST_STEP = 1.5  # m, of the ground
+BEYOND = 1.0  # m above or below the workspace that no tag reaches
+PULL_SCALE = 3.0  # m, scale of the loss that weighs the innovations of TDOAs
+# s over which TDOAs are averaged, m by which they disagree, s after which that counts
 PULL_TIME, PULL_LIMIT, PULL_DELAY = (1.0, 0.45, 3.0)
-# s for which a range finder is not used, the first time and at most
+# s for which the range finder is ignored, the first time and at most
 IGNORE_TIME, LONGEST_IGNORED = (3.0, 60.0)
 
 
@@ -45,7 +45,21 @@ IGNORE_TIME, LONGEST_IGNORED = (3.0, 60.0)
 def observe(
     ekf: Record, parameters: Record, aid: Record, residual: Record, records: np.ndarray
 ) -> None:
-    """Take a range, one of AID, into a running filter at its stamp; fills one of RESIDUAL."""
+    """Update a running filter with a range, at the stamp of the range.
+
+    Parameters
+    ----------
+    ekf : EKF
+        State of the filter, updated in place.
+    parameters : PARAMETERS
+        Tuning of the filter.
+    aid : AID
+        Measurement.
+    residual : RESIDUAL
+        Filled by this function.
+    records : (n,) RECORD
+        History for the smoother; empty for no recording.
+    """
     height, share = (
         ekf.height,
         min(max(aid.t - ekf.height.heard, 0.0) / (2.0 * CORRELATION_TIME), 1.0),
@@ -107,7 +121,7 @@ def observe(
 
 @compiled
 def record(ekf: Record, aid: Record) -> None:
-    """Remember a range, whatever becomes of it."""
+    """Store a range, whether or not it is used."""
     height = ekf.height
     if aid.value[0] != height.range:
         height.changed = aid.t
@@ -123,8 +137,22 @@ def compare(
     R: np.ndarray,
     innovation: Record,
 ) -> float:
-    """Fill in what a distance (m, along the body's -z to ground at `level`) says to a HYPOTHESIS,
-    and R (3, 3), body to world. Returns cos(tilt).
+    """Fill in the innovation of a distance to the ground and return cos(tilt).
+
+    Parameters
+    ----------
+    hypothesis : HYPOTHESIS
+        Hypothesis, predicted to the stamp of the measurement.
+    level : float
+        Height of the ground, m, world frame.
+    distance : float
+        Distance from the body to the ground along the body's -z, m.
+    parameters : PARAMETERS
+        Tuning of the filter.
+    R : (3, 3) array
+        Rotation from body to world. Filled.
+    innovation : INNOVATION
+        Filled by this function.
     """
     x = hypothesis.x
     rotation(x[6], x[7], x[8], x[9], R)
@@ -140,9 +168,11 @@ def compare(
 
 @compiled
 def _weigh_places(ekf: Record, parameters: Record, distance: float, share: float) -> bool:
-    """Weigh hypotheses at several places, where there are any, by a distance (m) to the ground
-    without steps. It counts as a share (0 to 1) of a distance with an error of its own. Returns
-    whether there are several places; then ekf.innovation is another.
+    """Update the weights of hypotheses at several places with a distance to the ground.
+
+    The ground counts as free of steps. distance is in m. The likelihood counts with a power `share`
+    (0 to 1), because errors of successive distances are correlated. Return whether there are
+    several places; then ekf.innovation was overwritten.
     """
     several = False
     for h in range(len(ekf.hypotheses)):
@@ -169,7 +199,7 @@ def _weigh_places(ekf: Record, parameters: Record, distance: float, share: float
 
 @compiled
 def _is_alike(height: Record, value: float) -> bool:
-    """Whether an innovation (m) is that of the ranges before it that disagreed."""
+    """Return whether an innovation (m) agrees with the disagreeing ranges before it."""
     return height.disagreeing > 0 and abs(value - height.disagreement) < ALIKE
 
 
@@ -182,9 +212,27 @@ def _settle(
     limit: float,
     records: np.ndarray,
 ) -> bool:
-    """A range disagrees: after a while that it does so alike, the ground or the filter changes.
+    """Handle a disagreeing range: change the ground level or the filter if the disagreement lasts.
 
-    Returns whether.
+    Parameters
+    ----------
+    ekf : EKF
+        State of the filter, updated in place.
+    parameters : PARAMETERS
+        Tuning of the filter.
+    t : float
+        Stamp, s.
+    base_innovation : float
+        Innovation of the height if there is no step below, m.
+    limit : float
+        Gate of the innovation, m.
+    records : (n,) RECORD
+        History for the smoother; empty for no recording.
+
+    Returns
+    -------
+    bool
+        Whether the ground level or the filter was changed.
     """
     height, value = ekf.height, ekf.innovation.value
     if not _is_alike(height, value):
@@ -218,8 +266,20 @@ def _settle(
 
 @compiled
 def update_pull(height: Record, parameters: Record, innovation: Record, t: float) -> None:
-    """What one TDOA (INNOVATION of the best hypothesis) says of z beyond the filter, while a range
-    finder or a fixed height holds that.
+    """Update the mean height error that TDOAs show, while a range finder or fixed height holds z.
+
+    If they disagree for PULL_DELAY, the range finder is ignored.
+
+    Parameters
+    ----------
+    height : HEIGHT
+        State of the range finder, updated in place.
+    parameters : PARAMETERS
+        Tuning of the filter.
+    innovation : INNOVATION
+        TDOA of the best hypothesis.
+    t : float
+        Stamp, s.
     """
     ranged = t - height.used < LONGEST_GAP and t >= height.ignored_until
     if not (ranged or parameters.fixed_height_std > 0.0):
@@ -243,9 +303,19 @@ def update_pull(height: Record, parameters: Record, innovation: Record, t: float
 
 @compiled
 def contradiction(height: Record, parameters: Record, t: float) -> float:
-    """By how much, m, TDOAs say that the tag is above its fixed height at stamp t, s; 0 if it has
-    none, or if TDOAs alone could be off by that. Low among anchors, noise alone makes them say so
-    for a moment.
+    """Return by how much TDOAs place the tag above its fixed height, in m.
+
+    The result is 0 without a fixed height, or if errors of TDOAs alone can explain the difference.
+    The difference must last for PULL_TIME: low among the anchors, noise alone causes short ones.
+
+    Parameters
+    ----------
+    height : HEIGHT
+        State of the range finder, with the averages of `update_pull`.
+    parameters : PARAMETERS
+        Tuning of the filter.
+    t : float
+        Stamp, s.
     """
     moment = t - height.pulls_since < PULL_TIME
     if (
@@ -259,8 +329,18 @@ def contradiction(height: Record, parameters: Record, t: float) -> float:
 
 @compiled
 def at_start(ekf: Record, parameters: Record, up: float, t: float) -> float:
-    """z of the body, m, that the last range tells with cos(tilt) `up` at stamp t (s); NaN if it
-    tells nothing.
+    """Return z of the body by the last range, in m; NaN if there is no usable range.
+
+    Parameters
+    ----------
+    ekf : EKF
+        State of the filter.
+    parameters : PARAMETERS
+        Tuning of the filter.
+    up : float
+        cos(tilt).
+    t : float
+        Stamp, s.
     """
     height = ekf.height
     if t - height.heard > LONGEST_GAP or t < height.ignored_until:
@@ -270,7 +350,10 @@ def at_start(ekf: Record, parameters: Record, up: float, t: float) -> float:
 
 @compiled
 def _plausible_z(ekf: Record, parameters: Record, up: float) -> float:
-    """z of the body, m, above the ground without steps, by the last range; NaN if that cannot be."""
+    """Return z of the body by the last range, in m; NaN if it is implausible.
+
+    The ground counts as free of steps. up is cos(tilt).
+    """
     z = parameters.ground_height + (ekf.height.range + parameters.height_arm) * up
     inside = ekf.workspace[0, 2] - BEYOND < z < ekf.workspace[1, 2] + BEYOND
     return z if inside and up > STEEPEST else np.nan

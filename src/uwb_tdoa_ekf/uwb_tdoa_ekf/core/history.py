@@ -1,4 +1,4 @@
-"""A recording of the filter's run, for the smoother: one record per update of the best hypothesis."""
+"""History of the filter for the smoother: a record for each update of the best hypothesis."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ from uwb_tdoa_bias.common.compiled import Record, compiled
 from . import yaw_test
 from .state import ERROR_STATES, MOVING_STATES, NOMINAL_STATES, propagate
 
-# kinds of records: a Kalman update, or another state was put in place of the one before
-UPDATE, RESET = (0, 1)
+UPDATE, RESET = (0, 1)  # kinds of records: a Kalman update, or a replaced state
 
 RECORD = np.dtype(
     [
         ("t", float),  # s
         ("kind", np.int64),
-        ("transition", float, (MOVING_STATES, ERROR_STATES)),  # upper rows, since the record before
+        # upper rows, since the previous record
+        ("transition", float, (MOVING_STATES, ERROR_STATES)),
         ("row", float, ERROR_STATES),  # Jacobian h
-        ("gain", float, ERROR_STATES),  # K
-        ("innovation", float),  # in the measurement's unit
-        ("variance", float),  # of the innovation, as used
-        ("x", float, NOMINAL_STATES),  # after the update
+        ("gain", float, ERROR_STATES),  # Kalman gain K
+        ("innovation", float),  # in the unit of the measurement
+        ("variance", float),  # of the innovation, as the update used it
+        ("x", float, NOMINAL_STATES),  # nominal state after the update
         ("P", float, (ERROR_STATES, ERROR_STATES)),
     ],
     align=True,
@@ -32,7 +32,7 @@ NOTHING = np.empty(0, RECORD)  # no recording
 
 @compiled
 def add_prediction(ekf: Record, history: np.ndarray) -> None:
-    """After `state.predict` of the best hypothesis."""
+    """Multiply the transition since the last record, after `state.predict` of the best one."""
     if len(history) > 0:
         propagate(ekf.since_record, ekf.transition)
         ekf.since_record[:MOVING_STATES] = ekf.transition.product
@@ -40,7 +40,10 @@ def add_prediction(ekf: Record, history: np.ndarray) -> None:
 
 @compiled
 def add_coasting(ekf: Record, dt: float, history: np.ndarray) -> None:
-    """After `state.coast` of the best hypothesis."""
+    """Multiply the transition since the last record, after `state.coast` of the best hypothesis.
+
+    dt is the duration in s.
+    """
     if len(history) > 0:
         for r in range(3):
             for j in range(ERROR_STATES):
@@ -51,7 +54,7 @@ def add_coasting(ekf: Record, dt: float, history: np.ndarray) -> None:
 def replace_velocity(ekf: Record, history: np.ndarray) -> None:
     """Record that the velocity of the best hypothesis was replaced.
 
-    The new one does not depend on what came before.
+    The new velocity does not depend on the state before.
     """
     if len(history) > 0:
         ekf.since_record[3:6, :] = 0.0
@@ -59,7 +62,7 @@ def replace_velocity(ekf: Record, history: np.ndarray) -> None:
 
 @compiled
 def add_update(ekf: Record, t: float, history: np.ndarray) -> None:
-    """After a Kalman update of the best hypothesis with ekf.innovation."""
+    """Record a Kalman update of the best hypothesis with ekf.innovation at stamp t (s)."""
     if len(history) > 0:
         record = _next(ekf, t, UPDATE, history)
         innovation = ekf.innovation
@@ -72,8 +75,9 @@ def add_update(ekf: Record, t: float, history: np.ndarray) -> None:
 
 @compiled
 def add_reset(ekf: Record, t: float, history: np.ndarray) -> None:
-    """After the state of the best hypothesis was replaced: nothing carries over, and no evidence
-    against its yaw.
+    """Record at stamp t (s) that the state of the best hypothesis was replaced.
+
+    The new state does not depend on the state before. Evidence against the yaw is cleared too.
     """
     yaw_test.clear(ekf.yaw_test)
     if len(history) > 0:
@@ -83,7 +87,7 @@ def add_reset(ekf: Record, t: float, history: np.ndarray) -> None:
 
 @compiled
 def _next(ekf: Record, t: float, kind: int, history: np.ndarray) -> Record:
-    """The next record, with all but what is particular to its kind.
+    """Return the next record, with all fields that every kind of record has.
 
     Raises IndexError if there is no room.
     """

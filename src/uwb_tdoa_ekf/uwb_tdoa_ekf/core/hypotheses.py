@@ -1,10 +1,10 @@
-"""Several yaws and places at once, while nobody knows which is right.
+"""Multiple hypotheses: several yaws and places, until the measurements decide.
 
-A tag that starts anywhere cannot see its yaw: only motion that its accelerometer feels and its
-TDOAs see makes it observable. Anchors in a plane do not determine on which side of it a tag is. One
-filter per direction and place runs until the TDOAs have decided (multiple model estimation, e.g.
-Bar-Shalom et al., Estimation with Applications to Tracking and Navigation, 2001, section 11.6.2,
-static case).
+A tag that starts anywhere cannot observe its yaw. The yaw becomes observable by motion that both
+accelerometer and TDOAs measure. Anchors in a plane leave a mirror ambiguity: the tag may be on
+either side. A filter for each yaw and place runs until the TDOAs have decided (multiple model
+estimation, e.g. Bar-Shalom et al., Estimation with Applications to Tracking and Navigation, 2001,
+section 11.6.2, static case).
 """
 
 from __future__ import annotations
@@ -18,28 +18,30 @@ from uwb_tdoa_bias.common.compiled import Record, compiled
 from .memory import HYPOTHESES, N_YAWS
 from .state import difference
 
-YAW_STD = 0.6  # rad, of each hypothesis: they start 90 degrees apart
-PRUNED_BELOW = -8.0  # log probability relative to the best at which a hypothesis is pruned
-MERGED_BELOW, MERGED_WITHIN = 0.1, 0.3  # rad and m between two hypotheses that have become one
-MERGE_PERIOD = 0.1  # s
-LARGEST_NIS = 9.0  # normalised innovation squared that one measurement counts as at most
+YAW_STD = 0.6  # rad, of the yaw of each hypothesis: their yaws start 90 degrees apart
+PRUNED_BELOW = -8.0  # log probability relative to the best, below which a hypothesis is pruned
+MERGED_BELOW, MERGED_WITHIN = 0.1, 0.3  # rad and m: two hypotheses that are closer are merged
+MERGE_PERIOD = 0.1  # s between two searches for hypotheses to merge
+LARGEST_NIS = 9.0  # normalized innovation squared; limits the weight of a single measurement
 
 
 @compiled
 def yaw_offset(h: int) -> float:
-    """Angle of hypothesis h to initial_yaw, rad."""
+    """Return the yaw of hypothesis h at the start, relative to initial_yaw, in rad."""
     return h % N_YAWS * 2.0 * math.pi / N_YAWS
 
 
 @compiled
 def alive(hypothesis: Record) -> bool:
-    """False once it was pruned."""
+    """Return False if a HYPOTHESIS was pruned."""
     return hypothesis.log_weight > -np.inf
 
 
 @compiled
 def add_log_likelihood(hypothesis: Record, innovation: Record, correlation_length: float) -> None:
-    """Weigh a HYPOTHESIS by the Gaussian density of an INNOVATION; correlation_length as in
+    """Add the Gaussian log likelihood of an INNOVATION to the weight of a HYPOTHESIS.
+
+    correlation_length is the number of measurements that count as a single independent one, see
     robust.py.
     """
     variance = innovation.prior_variance + innovation.noise_variance * correlation_length
@@ -49,8 +51,19 @@ def add_log_likelihood(hypothesis: Record, innovation: Record, correlation_lengt
 
 @compiled
 def select(ekf: Record, t: float) -> bool:
-    """Follow the most probable hypothesis at stamp t; prune those that are improbable, or have
-    become the same. Returns whether one is left.
+    """Select the most probable hypothesis, prune improbable ones and merge equal ones.
+
+    Parameters
+    ----------
+    ekf : EKF
+        State of the filter, updated in place.
+    t : float
+        Stamp, s.
+
+    Returns
+    -------
+    bool
+        Whether a single hypothesis is left.
     """
     best = followed = 0
     for h in range(HYPOTHESES):
@@ -84,8 +97,15 @@ def select(ekf: Record, t: float) -> bool:
 
 @compiled
 def add_spread_of_means(ekf: Record, covariance: np.ndarray) -> None:
-    """Add to the (9, 9) covariance of the best hypothesis what the others say: their mean square
-    distance from it.
+    """Add the spread of the means of all hypotheses to a covariance.
+
+    Parameters
+    ----------
+    ekf : EKF
+        State of the filter.
+    covariance : (9, 9) array
+        Covariance of position, velocity and attitude of the best hypothesis. The mean squared
+        distance of the other hypotheses is added in place.
     """
     best = ekf.hypotheses[ekf.best]
     weights = 0.0

@@ -1,9 +1,9 @@
-"""Can it be what an inertial sensor says? Gravity is 9.81 m/s^2 long and turns as the gyroscope
-says it does.
+"""IMU fault detector: gravity is 9.81 m/s^2 long and turns as the gyroscope measures.
 
-A sensor in another unit, or turned, is left out within tenths of a second, and used again after
-some time without evidence against it. Samples and their stamps alone decide. The limits are beyond
-what 22 measured flights show, a crash among them; a multirotor that flips is taken for a fault.
+A sensor in a wrong unit, or turned, is left out within tenths of a second. It is used again after
+CLEARED seconds without evidence against it. Samples and their stamps alone decide. The limits are
+beyond all values of 22 measured flights, including a crash. A multirotor that flips is taken for a
+fault.
 """
 
 from __future__ import annotations
@@ -15,27 +15,43 @@ import numpy as np
 from uwb_tdoa_bias.common.compiled import Record, compiled
 from uwb_tdoa_bias.common.vibration import low_pass
 
-# m/s^2, mean specific force over VIBRATION_CORNER: upwards, and in all; a multirotor comes down
-# with 3, turns with 30
+# m/s^2, mean specific force over VIBRATION_CORNER: least upward component, largest norm. A
+# multirotor descends with 3 and turns with 30.
 LIGHTEST, HEAVIEST = 2.5, 50.0
-TOO_LONG = 0.25  # s for which it may be beyond: falling, or landing
-DOWNWARDS = -2.0  # m/s^2, upwards, that nothing flies with
+TOO_LONG = 0.25  # s for which the force may be outside these limits: falling, or landing
+DOWNWARDS = -2.0  # m/s^2, upward specific force that no vehicle flies with
 FASTEST, TOO_FAR = 10.0, 4.0  # rad/s that a tag may turn, and rad beyond that for a moment
-# s after which upwards is what the accelerometer says, not what the gyroscope has made of it
-MEMORY = 2.0
-# tilt, and of an axis that points up instead
+MEMORY = 2.0  # s after which the accelerometer, not the gyroscope, determines the vertical
+# cosines: of the largest tilt of a tag that stands; of the angle within which a body axis counts as
+# vertical
 UPRIGHT, AXIS = (math.cos(math.radians(35.0)), math.cos(math.radians(25.0)))
 LYING = 3.0  # s for which a tag may lie on its side or its back
 CLEARED = 1.5  # s without evidence after which the samples are used again
 
-WEIGHT, TURN, RATE, TILT = range(1, 5)  # what is impossible
+WEIGHT, TURN, RATE, TILT = range(1, 5)  # reason of a fault
 
 
 @compiled
 def update(check: Record, imu: Record, sample: Record, continuous: bool, imu_faulty: bool) -> bool:
-    """Whether to go without inertial samples from this IMU_SAMPLE on. check : PLAUSIBILITY, which
-    is updated; imu : IMU_STATE after `observe` of the sample and before `store`; continuous : what
-    that returned; distrusted : what this returned before.
+    """Update the fault detector with an IMU_SAMPLE and return whether the IMU is faulty.
+
+    Parameters
+    ----------
+    check : IMU_FAULT_DETECTOR
+        State of the detector, updated in place.
+    imu : IMU_STATE
+        Statistics after `inertial.observe` of the sample, before `inertial.store`.
+    sample : IMU_SAMPLE
+        The new sample, in the body frame.
+    continuous : bool
+        Result of `inertial.observe`: the sample follows the last one without a gap.
+    imu_faulty : bool
+        The last result of this function.
+
+    Returns
+    -------
+    bool
+        Whether the filter must leave out inertial samples from this one on.
     """
     t, force, up = sample.t, imu.slow_accel, check.up
     if not continuous:
@@ -77,15 +93,20 @@ def update(check: Record, imu: Record, sample: Record, continuous: bool, imu_fau
 
 @compiled
 def _contradict(check: Record, force: np.ndarray, t: float, reason: int, size: float) -> None:
-    """Something is impossible; where upwards is, the accelerometer may say anew."""
+    """Note an impossible sample, and reset the vertical to the measured force.
+
+    force is the specific force (3,), m/s^2, body frame. size is the impossible value in its own
+    unit.
+    """
     check.contradicted, check.reason, check.size = t, reason, size
     check.up[:] = force
 
 
 @compiled
 def _turn(vector: np.ndarray, rate: np.ndarray, dt: float) -> None:
-    """Turn a constant vector of the world, given in the body frame, (3,), by -rate (3,) rad/s for
-    dt s (Rodrigues).
+    """Turn a constant vector of the world, given in the body frame, by -rate * dt (Rodrigues).
+
+    vector (3,) is updated in place. rate (3,) is the angular rate of the body in rad/s, dt is in s.
     """
     angle = dt * math.sqrt(rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2)
     if angle < 1e-12:

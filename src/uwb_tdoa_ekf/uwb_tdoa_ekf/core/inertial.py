@@ -1,6 +1,4 @@
-"""What the stream of inertial samples says of itself: how much it vibrates, whether the tag is
-quiet.
-"""
+"""Statistics of the inertial samples: vibration, rectification, and whether the tag is quiet."""
 
 from __future__ import annotations
 
@@ -13,27 +11,42 @@ from uwb_tdoa_bias.common.vibration import VIBRATION_AVERAGE, low_pass, track_vi
 
 from .state import GRAVITY
 
-PERSISTENCE = 0.2  # s over which the error of a vibrating accelerometer stays alike
-# m/s^2, rad/s, rms per axis: less is quiet; hovering has 0.1, 0.03, idling more
+PERSISTENCE = 0.2  # s, correlation time of the error of a vibrating accelerometer
+# m/s^2 and rad/s, rms per axis, below which a tag is quiet. Hovering has 0.1 and 0.03, idling
+# rotors have more.
 QUIET_ACCEL, QUIET_GYRO = (0.05, 0.02)
-# rad^2/s^2 that fades before a tag counts as quiet, about half a second after the first sample
+# rad^2/s^2, initial power of the gyroscope. It must fade before a tag counts as quiet, which takes
+# about half a second.
 RESTLESS = 0.002
-QUIET_TILT = 0.5  # m/s^2 by which the mean specific force may differ from gravity
-# cosine of the angle between the specific force and the body's z axis, below which a tag does not
-# hover
+QUIET_TILT = 0.5  # m/s^2; the norm of the mean specific force may differ from gravity by this
+# cosine of the angle between specific force and body z axis, below which a tag does not hover
 UPRIGHT = 0.5
-CARRIED_STD = 20.0  # m/s^2, of the specific force of such a tag, about that of hovering
-# s over which it is seen how far an axis rectifies: a vehicle does not accelerate one way for
-# longer
+CARRIED_STD = 20.0  # m/s^2, of the specific force of a tag that does not hover, about hovering
+# s of samples that show how far an axis rectifies: no vehicle accelerates one way for longer
 RECTIFYING_MEMORY = 2.0
-LEAST_RECTIFIED = 0.1  # share of the power of a vibration that counts as rectified at least
+LEAST_RECTIFIED = 0.1  # least share of the vibration power that counts as rectified
 QUIET_NOISE = 0.01  # m/s^2/sqrt(Hz), of the accelerometer of a quiet tag
 
 
 @compiled
 def observe(imu: Record, sample: Record, timeout: float) -> bool:
-    """Take an IMU_SAMPLE into the statistics of an IMU_STATE; its input becomes the mean of the
-    last sample and this one. Returns whether the last one was less than `timeout` s ago.
+    """Update the statistics of an IMU_STATE with an IMU_SAMPLE.
+
+    The input of the prediction becomes the mean of the last sample and this one.
+
+    Parameters
+    ----------
+    imu : IMU_STATE
+        Statistics of the inertial samples, updated in place.
+    sample : IMU_SAMPLE
+        Angular rate (rad/s) and specific force (m/s^2), body frame.
+    timeout : float
+        Longest gap, s. After a longer gap the statistics are reset.
+
+    Returns
+    -------
+    bool
+        Whether the last sample came less than `timeout` seconds ago.
     """
     dt = sample.t - imu.t
     if not dt < timeout:
@@ -44,7 +57,7 @@ def observe(imu: Record, sample: Record, timeout: float) -> bool:
         imu.mean_accel[k] = low_pass(imu.mean_accel[k], imu.slow_accel[k], dt, VIBRATION_AVERAGE)
         imu.gyro_power[k] = low_pass(imu.gyro_power[k], sample.gyro[k] ** 2, dt, VIBRATION_AVERAGE)
         power, shakes = _from_hovering(imu.mean_accel, k) ** 2, imu.vibration[k] > QUIET_ACCEL**2
-        # what does not shake tells nothing
+        # an axis that does not vibrate shows no rectification
         share = power / max(power, imu.vibration[k]) if shakes else 1.0
         imu.rectified[k] = low_pass(imu.rectified[k], share, dt, RECTIFYING_MEMORY)
         imu.gyro[k], imu.accel[k] = (
@@ -54,6 +67,7 @@ def observe(imu: Record, sample: Record, timeout: float) -> bool:
     return True
 
 
+# Reset the statistics of an IMU_STATE to a single IMU_SAMPLE.
 @compiled
 def _restart(imu: Record, sample: Record) -> None:
     for k in range(3):
@@ -64,7 +78,7 @@ def _restart(imu: Record, sample: Record) -> None:
 
 @compiled
 def store(imu: Record, sample: Record) -> None:
-    """Keep an IMU_SAMPLE as the input of what comes after it."""
+    """Store an IMU_SAMPLE as the input of the next prediction."""
     imu.t = sample.t
     for k in range(3):
         imu.gyro[k], imu.accel[k] = sample.gyro[k], sample.accel[k]
@@ -72,15 +86,23 @@ def store(imu: Record, sample: Record) -> None:
 
 @compiled
 def weigh(imu: Record, quiet: bool, parameters: Record) -> None:
-    """Fill in accel_weight and accel_psd of an IMU_STATE: how far each axis of the accelerometer
-    counts against hovering, and the noise that is left.
+    """Set the weight and the noise of each accelerometer axis: accel_weight and accel_psd.
 
-    A vibrating axis may rectify: its error then has vibration_gain times the variance of the
-    vibration. Whether it does shows in its mean: a vehicle that hovers and moves about feels
-    gravity alone in the mean. The weight is that of linear least squares of the measurement with
-    this variance, and of hovering with accel_prior_std. What is carried, and lies on its side or
-    upside down, does not hover; what is farther from hovering than both explain, hovers that much
-    less.
+    A vibrating axis may rectify. Its error then has vibration_gain times the variance of the
+    vibration. The mean shows the rectification: a vehicle that hovers and moves about measures
+    gravity alone in the mean. The weight is the linear least squares combination of two specific
+    forces. The first is the measurement with this error variance, the second is hovering with
+    accel_prior_std. A carried tag that lies on its side or upside down does not hover. If a force
+    is farther from hovering than both explain, the variance of hovering grows by the rest.
+
+    Parameters
+    ----------
+    imu : IMU_STATE
+        Statistics of the inertial samples; accel_weight and accel_psd are set.
+    quiet : bool
+        Whether the tag is quiet. Then the noise is QUIET_NOISE.
+    parameters : PARAMETERS
+        Tuning of the filter.
     """
     slow = imu.slow_accel
     hovers = slow[2] > UPRIGHT * math.sqrt(slow[0] ** 2 + slow[1] ** 2 + slow[2] ** 2)
@@ -98,16 +120,18 @@ def weigh(imu: Record, quiet: bool, parameters: Record) -> None:
 
 @compiled
 def _from_hovering(accel: np.ndarray, axis: int) -> float:
-    """By how much a specific force accel (3,), m/s^2, differs along an axis from that of a body
-    that hovers level.
+    """Return the specific force along an axis minus its value for a level hovering body, in m/s^2.
+
+    accel is the specific force (3,) in m/s^2, body frame.
     """
     return accel[axis] - (GRAVITY if axis == 2 else 0.0)
 
 
 @compiled
 def is_quiet(imu: Record) -> bool:
-    """True if the last VIBRATION_AVERAGE seconds of samples show neither vibration nor rotation nor
-    acceleration.
+    """Return True if the tag neither vibrates, nor rotates, nor accelerates.
+
+    The statistics cover the last VIBRATION_AVERAGE seconds.
     """
     squared = 0.0
     for k in range(3):

@@ -1,4 +1,4 @@
-"""The beginning of a run, and the new beginning of one that has lost its tag."""
+"""Initialization of the filter, and recovery of a lost tag."""
 
 from __future__ import annotations
 
@@ -25,38 +25,41 @@ from .memory import HYPOTHESES, N_PLACES, N_YAWS, WINDOW
 from .startup import APART, SPEED, Places, inliers, level, locate, room_for, share_of_inliers, split
 from .state import GRAVITY
 
-MINIMUM = 12  # TDOAs a search needs
+MINIMUM = 12  # least number of TDOAs for a search
 AGREE, AGREE_ANYHOW = 0.7, 0.6  # share of TDOAs that a start, and a recovery, must explain
-CLEARLY_MORE = 0.2  # share by which a recovery must explain more than the filter does
-# s of TDOAs that a recovery rests on: a tag that leaves a floor must not wait for those of the
-# floor
+CLEARLY_MORE = 0.2  # share of TDOAs by which a recovery must exceed the filter
+# s of TDOAs for a recovery. The window is short, because a tag that leaves the floor must not wait
+# until TDOAs of the floor have left it.
 RECOVERY_WINDOW = 0.3
-# TDOAs and stamps, and s, that a start looks back where few TDOAs come
+# if few TDOAs come, a start uses this number of TDOAs and of stamps, and this age at most, s
 SLOW_TDOAS, SLOW_STAMPS, SLOWEST = (20, 3, 30.0)
-# m, deviation of a place that is hardly known; share of its variance that is clearly less
+# m, standard deviation of an unknown position; share of its variance below which another position
+# is better
 UNKNOWN, BETTER = (2.0, 0.5)
-# share of the time of these within which none came: beyond, they are those of a tag that has just
-# been switched on
+# longest gap, as a share of the duration of all TDOAs above. A longer gap means that the tag has
+# just been switched on.
 LONGEST_GAP = 0.6
-LISTEN_PERIOD = 1.0  # s between two looks at who is heard
+LISTEN_PERIOD = 1.0  # s between two updates of the heard anchors
 SEARCH_PERIOD = 0.1  # s between two searches
-TILT_STD = 0.1  # rad, at the start
-ANY_YAW = math.pi / math.sqrt(3.0)  # rad, deviation of a yaw that may be any
-WRONG_POSITION = 1.0  # m, that inertial samples which are wrong have made
-SMALLEST_STD = 0.03  # m, of a height that is known at the start
-# m, m/s, m/s^2: how far from where it was right a filter may be found, by time
+TILT_STD = 0.1  # rad, roll and pitch at the start
+ANY_YAW = math.pi / math.sqrt(3.0)  # rad, standard deviation of an unknown yaw
+WRONG_POSITION = 1.0  # m, standard deviation of the position error after faulty inertial samples
+SMALLEST_STD = 0.03  # m, least standard deviation of a known height at the start
+# m, m/s, m/s^2: a recovery is limited to this distance, as a function of the time since the filter
+# agreed
 REACH, REACH_SPEED, REACH_ACCELERATION = (0.5, 0.5, 0.5)
-# that TDOAs which contradict wheels may be explained by: two that are late are as probable as a
-# rover that jumps
+# number of late anchors that may explain TDOAs that contradict wheels: two late anchors are as
+# probable as a rover that jumps
 LATE_ANCHORS = 2
-AMONG_OTHERS = 6, 3  # TDOAs and anchors, at least, that agree with wheels without these
-# s for which TDOAs must agree on another place than wheels; s for which the tag may be there
+AMONG_OTHERS = 6, 3  # least number of other TDOAs and anchors that agree with wheels
+# s for which TDOAs must agree on another place than wheels; s for which the tag then counts as
+# possibly there
 RIVAL_TIME, RIVAL_HELD = (1.0, 0.5)
 
 
 @compiled
 def remember(ekf: Record, tdoa: Record, anchors: np.ndarray) -> None:
-    """Append a TDOA to the window, without the delays of its anchors."""
+    """Append a TDOA to the window, after subtracting the delays of its anchors."""
     if ekf.kept == 2 * WINDOW:
         for i in range(WINDOW):
             ekf.window[i] = ekf.window[WINDOW + i]
@@ -68,8 +71,9 @@ def remember(ekf: Record, tdoa: Record, anchors: np.ndarray) -> None:
 
 @compiled
 def is_repeat(ekf: Record, tdoa: Record, anchors: np.ndarray) -> bool:
-    """Whether the window holds a TDOA already, with its stamp, anchors and value: somebody has sent
-    it twice.
+    """Return whether the window already holds a TDOA with this stamp, anchors and value.
+
+    Then a driver or network has sent it twice.
     """
     d = tdoa.d - (anchors[tdoa.b].delay - anchors[tdoa.a].delay)
     for k in range(ekf.kept - 1, -1, -1):
@@ -83,8 +87,9 @@ def is_repeat(ekf: Record, tdoa: Record, anchors: np.ndarray) -> bool:
 
 @compiled
 def _height_at_start(ekf: Record, parameters: Record, t: float) -> KnownHeight:
-    """The height that other sensors give at stamp t, s, of a tag whose attitude only the
-    accelerometer gives.
+    """Return the height by other sensors at stamp t (s), before the filter runs.
+
+    The accelerometer alone gives the attitude.
     """
     accel = _mean_accel(ekf.imu, parameters)
     return _known_height(ekf, parameters, accel[2] / max(math.sqrt(np.sum(accel**2)), 1e-9), t)
@@ -100,9 +105,10 @@ def _look_for_places(
     places: Places,
     near: np.ndarray,
 ) -> float:
-    """`locate` in the surroundings of the anchors of a window; the most probable place first. near
-    (2, 3) m: the box about these anchors is written to it. Returns the share of TDOAs that agree
-    with the first place.
+    """Search for the tag near the anchors of a window, and sort the places by probability.
+
+    The box around these anchors is written to near (2, 3), m, world frame. Return the share of
+    TDOAs that agree with the first place.
     """
     _find_surroundings(ekf, window, anchors, parameters)
     share = locate(window, anchors, ekf.workspace, parameters, known, places)
@@ -121,8 +127,22 @@ def start(
     anyhow: bool,
     history: np.ndarray,
 ) -> None:
-    """Begin if the window determines one position, or `anyhow` with the covariance that its
-    contradictions leave.
+    """Start the filter if the window determines a single position.
+
+    Parameters
+    ----------
+    ekf : EKF
+        State of the filter, updated in place.
+    anchors : (N,) ANCHOR
+        All anchors, by row.
+    parameters : PARAMETERS
+        Tuning of the filter.
+    t : float
+        Stamp, s.
+    anyhow : bool
+        Start also if the TDOAs contradict each other. Their residuals then widen the covariance.
+    history : (n,) RECORD
+        History for the smoother; empty for no recording.
     """
     window = recent(ekf, parameters.start_window)
     if len(window) < MINIMUM:
@@ -133,7 +153,7 @@ def start(
     x, covariance, cost = places.x, places.covariance, places.cost
     pairs = ekf.pairs[: ground.find_pairs(window, ekf.pairs)]
     at_rest, its = x[0].copy(), covariance[0].copy()
-    wide = np.trace(its[:3, :3]) > APART**2  # before it holds other explanations
+    wide = np.trace(its[:3, :3]) > APART**2  # before the covariance includes other explanations
     lead = stationary_position.weigh(ekf, pairs, anchors, parameters, known, at_rest, its)
     still = ground.judge_motion(pairs, anchors, at_rest, ekf.still_covariance) == ground.STILL
     on_ground = lead > (0.0 if still else stationary_position.DECISIVE)
@@ -166,8 +186,23 @@ def start(
 def start_slowly(
     ekf: Record, anchors: np.ndarray, parameters: Record, t: float, history: np.ndarray
 ) -> None:
-    """The same where few TDOAs come: from the last SLOW_TDOAS or SLOW_STAMPS of them, if these
-    determine one position, and in any case when there are so many.
+    """Start the filter if few TDOAs come, from the last SLOW_TDOAS or SLOW_STAMPS.
+
+    With this many TDOAs the filter starts in any case. With fewer, but at least MINIMUM, it starts
+    only if they determine a single position.
+
+    Parameters
+    ----------
+    ekf : EKF
+        State of the filter, updated in place.
+    anchors : (N,) ANCHOR
+        All anchors, by row.
+    parameters : PARAMETERS
+        Tuning of the filter.
+    t : float
+        Stamp, s.
+    history : (n,) RECORD
+        History for the smoother; empty for no recording.
     """
     window, stamps = _last(ekf, t)
     enough = len(window) >= SLOW_TDOAS or (stamps >= SLOW_STAMPS and len(window) > 2 * stamps)
@@ -202,7 +237,10 @@ def start_slowly(
 
 @compiled
 def is_unsure(ekf: Record) -> bool:
-    """Whether the place of the tag is hardly known."""
+    """Return whether the position of the best hypothesis is unknown.
+
+    Its 3D standard deviation then exceeds UNKNOWN.
+    """
     P = ekf.hypotheses[ekf.best].P
     return P[0, 0] + P[1, 1] + P[2, 2] > UNKNOWN**2
 
@@ -216,11 +254,26 @@ def waits(
     silent: bool,
     history: np.ndarray,
 ) -> bool:
-    """Whether a TDOA stamped t, s, of a tag that may be anywhere after a silence is kept for a
-    search; with the last that this needs, searches.
+    """Return whether a TDOA waits for a search, because the position is unknown after a silence.
 
-    Each by itself is linearized far from where the tag is, and the covariance would shrink about a
-    wrong place. Not of a tag that few TDOAs come from. silent : the silence ends with this TDOA.
+    With the last required TDOA, the function searches. A single TDOA would be linearized far from
+    the tag, and the covariance would shrink about a wrong position. If few TDOAs come, they do not
+    wait.
+
+    Parameters
+    ----------
+    ekf : EKF
+        State of the filter, updated in place.
+    anchors : (N,) ANCHOR
+        All anchors, by row.
+    parameters : PARAMETERS
+        Tuning of the filter.
+    t : float
+        Stamp, s.
+    silent : bool
+        Whether this TDOA ends the silence.
+    history : (n,) RECORD
+        History for the smoother; empty for no recording.
     """
     first = ekf.kept - 1 - MINIMUM
     if silent and first >= 0 and ekf.window[first].t > ekf.last_tdoa - RECOVERY_WINDOW:
@@ -237,9 +290,23 @@ def waits(
 def relocate(
     ekf: Record, anchors: np.ndarray, parameters: Record, t: float, history: np.ndarray
 ) -> None:
-    """Of a tag that few TDOAs come from, and whose place is hardly known by now: go to the place
-    that its last TDOAs determine, if better than the filter. So far from where the TDOAs are
-    linearized these do together what each of them does not alone.
+    """Move a tag with few TDOAs and an unknown position to the place that its last TDOAs determine.
+
+    The place must be better than the filter. Far from the linearization point, these TDOAs together
+    determine a place that single updates do not reach.
+
+    Parameters
+    ----------
+    ekf : EKF
+        State of the filter, updated in place.
+    anchors : (N,) ANCHOR
+        All anchors, by row.
+    parameters : PARAMETERS
+        Tuning of the filter.
+    t : float
+        Stamp, s.
+    history : (n,) RECORD
+        History for the smoother; empty for no recording.
     """
     if not is_unsure(ekf) or len(recent(ekf, parameters.start_window)) >= MINIMUM:
         return
@@ -268,8 +335,9 @@ def relocate(
 
 @compiled
 def _last(ekf: Record, t: float) -> tuple[np.ndarray, int]:
-    """The last SLOW_TDOAs, or as many more as have SLOW_STAMPS, none older than SLOWEST: (n,) of
-    TDOA, and how many stamps they have.
+    """Return the last SLOW_TDOAS, or more until they have SLOW_STAMPS, and their number of stamps.
+
+    None is older than SLOWEST.
     """
     first, stamps = ekf.kept - 1, 1
     while first > 0 and ekf.kept - first < WINDOW and ekf.window[first - 1].t > t - SLOWEST:
@@ -285,14 +353,17 @@ def _last(ekf: Record, t: float) -> tuple[np.ndarray, int]:
 def _find_surroundings(
     ekf: Record, window: np.ndarray, anchors: np.ndarray, parameters: Record
 ) -> None:
-    """Where a tag is expected that hears the anchors of a window (n,) of TDOA."""
+    """Update the workspace of a tag that hears the anchors of a window (n,) of TDOA."""
     workspace.listen(ekf, window, anchors, parameters.radio_reach, parameters.tag_side)
     workspace.surround(ekf, parameters.workspace_margin, ekf.workspace)
 
 
 @compiled
 def look_around(ekf: Record, anchors: np.ndarray, parameters: Record, t: float) -> None:
-    """Follow a running tag from the surroundings of some anchors to those of others, at stamp t, s."""
+    """Update the workspace of a running tag from the anchors heard up to stamp t (s).
+
+    The workspace thus follows the tag through a hall.
+    """
     ekf.next_bounds = t + LISTEN_PERIOD
     _find_surroundings(ekf, recent(ekf, LISTEN_PERIOD), anchors, parameters)
 
@@ -306,11 +377,26 @@ def place(
     pose: Record,
     history: np.ndarray,
 ) -> None:
-    """Go to the pose that one of POSE gives; begin there, if the filter does not run.
+    """Set the filter to a given pose, and start it if it does not run.
 
-    What is not given stays as it is; before the filter runs, it is anywhere in the workspace. Tilt,
-    velocity and biases stay as they are too: gravity and TDOAs know them better than who gives a
-    pose.
+    Coordinates that are not given stay the same. Before the start, they may be anywhere in the
+    workspace. Tilt, velocity and biases stay the same too, because gravity and TDOAs determine them
+    better than the user.
+
+    Parameters
+    ----------
+    ekf : EKF
+        State of the filter, updated in place.
+    anchors : (N,) ANCHOR
+        All anchors, by row.
+    parameters : PARAMETERS
+        Tuning of the filter.
+    t : float
+        Stamp, s.
+    pose : POSE
+        Given pose; NaN marks values that are not given.
+    history : (n,) RECORD
+        History for the smoother; empty for no recording.
     """
     x, covariance = np.zeros(6), np.zeros((6, 6))
     if ekf.running:
@@ -372,8 +458,22 @@ def _begin(
     yaw_std: float,
     steered: bool,
 ) -> None:
-    """Start hypotheses at places, level, with the yaws that are possible. steered : something
-    measures motion in the body frame, so that these can be told apart.
+    """Start level hypotheses at all places, with all possible yaws.
+
+    Parameters
+    ----------
+    ekf : EKF
+        State of the filter, updated in place.
+    parameters : PARAMETERS
+        Tuning of the filter.
+    t : float
+        Stamp, s.
+    places : Places
+        Positions and velocities.
+    yaw, yaw_std : float
+        Yaw of the body and its standard deviation, rad.
+    steered : bool
+        Whether a sensor measures motion in the body frame, so the yaws can be distinguished.
     """
     x, covariance, cost = places.x, places.covariance, places.cost
     accel = _mean_accel(ekf.imu, parameters)
@@ -403,7 +503,7 @@ def _begin(
 
 @compiled
 def _turn(hypothesis: Record, yaw: float, std: float) -> None:
-    """Give a hypothesis another yaw, rad, about the vertical, and its standard deviation."""
+    """Set the yaw of a HYPOTHESIS and its standard deviation, in rad, about the vertical."""
     x, y, z, w = hypothesis.x[6], hypothesis.x[7], hypothesis.x[8], hypothesis.x[9]
     half = 0.5 * (yaw - math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
     s, c = math.sin(half), math.cos(half)
@@ -423,12 +523,27 @@ def recover(
     anywhere: bool,
     history: np.ndarray,
 ) -> None:
-    """If the window agrees on a position and the filter on another one, go there; attitude and
-    biases stay.
+    """Move the filter to another position if the TDOAs of the window agree on it.
 
-    A tag whose inertial sensor is sound does not jump: as far as it can have come since the filter
-    was right, and no farther. One that may be `anywhere` does, and to several places, if there are
-    several.
+    The window must agree on the position clearly better than on the position of the filter.
+    Attitude and biases stay the same. A tag with a sound inertial sensor, or with wheels, does not
+    jump. So its recovery is limited to the distance that it can have moved since the filter agreed
+    with TDOAs.
+
+    Parameters
+    ----------
+    ekf : EKF
+        State of the filter, updated in place.
+    anchors : (N,) ANCHOR
+        All anchors, by row.
+    parameters : PARAMETERS
+        Tuning of the filter.
+    t : float
+        Stamp, s.
+    anywhere : bool
+        Whether the tag may be anywhere. Then no limit applies, and several places are followed.
+    history : (n,) RECORD
+        History for the smoother; empty for no recording.
     """
     window = recent(ekf, min(parameters.start_window, RECOVERY_WINDOW))
     if len(window) < MINIMUM:
@@ -470,12 +585,12 @@ def recover(
         _set_state(hypothesis, x[place], covariance[place])
         if (
             not parameters.use_imu
-        ):  # wheels have led to another place: by a wrong yaw, as likely as not
+        ):  # if wheels have led to a wrong place, a wrong yaw is a probable cause
             hypothesis.P[8, :] = 0.0
             hypothesis.P[:, 8] = 0.0
             hypothesis.P[8, 8] = ANY_YAW**2
     ekf.rival_since = -np.inf
-    if anywhere:  # what the anchors determined before the silence was another place
+    if anywhere:  # the information from before the silence belongs to another place
         noise.begin(ekf.information, ekf.hypotheses[ekf.best].P)
     ekf.consistency, ekf.late_as_known = 1.0, False
     ekf.rest_since = t
@@ -487,9 +602,11 @@ def recover(
 def _outweighs(
     ekf: Record, anchors: np.ndarray, window: np.ndarray, rival: np.ndarray, t: float
 ) -> bool:
-    """Whether the motion that wheels measure outweighs a window (n,) of TDOA that agree on a rival
-    place (3,), m, at stamp t, s: until they have agreed on it for a while, and no few late anchors
-    have explained them in that time. Until then the tag may be at either.
+    """Return whether the motion by wheels outweighs a window of TDOAs that agree on a rival place.
+
+    Wheels outweigh the TDOAs until the TDOAs have agreed on the place for RIVAL_TIME. Time in which
+    a few late anchors explain the TDOAs does not count. Until then the tag may be at either place.
+    rival is (3,), m, world frame; t is a stamp in s.
     """
     if t > ekf.rival_until or _are_late(window, anchors, ekf.hypotheses[ekf.best].x[:6]):
         ekf.rival_since = t
@@ -501,8 +618,9 @@ def _outweighs(
 
 @compiled
 def _are_late(window: np.ndarray, anchors: np.ndarray, x: np.ndarray) -> bool:
-    """Whether the TDOAs of a window (n,) agree with position and velocity x (6,) at its end, but
-    for those of LATE_ANCHORS anchors.
+    """Return whether TDOAs agree with a state, except for the TDOAs of LATE_ANCHORS anchors.
+
+    x is position (m) and velocity (m/s), (6,), at the end of the window (n,) of TDOA.
     """
     agree, rows = inliers(window, anchors, x), workspace.rows_heard(window)
     fewest, others = AMONG_OTHERS
@@ -523,8 +641,9 @@ def _are_late(window: np.ndarray, anchors: np.ndarray, x: np.ndarray) -> bool:
 
 @compiled
 def _reopen(ekf: Record, cost: np.ndarray) -> None:
-    """Follow the yaws of the best hypothesis at each place again, whose probabilities are
-    exp(-cost) (PLACES,).
+    """Copy the yaws of the best hypothesis to both places.
+
+    The probabilities of the places are exp(-cost), (N_PLACES,).
     """
     of_best = ekf.best // N_YAWS
     for yaw in range(N_YAWS):
@@ -536,7 +655,10 @@ def _reopen(ekf: Record, cost: np.ndarray) -> None:
 
 @compiled
 def widen(ekf: Record, history: np.ndarray) -> None:
-    """What was integrated lately was wrong: nobody knows by how much, but the TDOAs."""
+    """Widen the covariance of position and velocity after an integration of wrong samples.
+
+    Only TDOAs can show how large the error is.
+    """
     for h in range(HYPOTHESES):
         for k in range(3):
             ekf.hypotheses[h].P[k, k] += WRONG_POSITION**2
@@ -546,8 +668,9 @@ def widen(ekf: Record, history: np.ndarray) -> None:
 
 @compiled
 def reset_attitude(ekf: Record, parameters: Record, yaw_std: float, history: np.ndarray) -> None:
-    """Stay at position and velocity; attitude as at a start: level, the yaw as it is, to so many
-    rad; biases as at a start too.
+    """Reset attitude and biases to a start: level, with the present yaw and yaw_std (rad).
+
+    Position and velocity stay the same.
     """
     best = ekf.hypotheses[ekf.best]
     x, y, z, w = best.x[6], best.x[7], best.x[8], best.x[9]
@@ -559,8 +682,9 @@ def reset_attitude(ekf: Record, parameters: Record, yaw_std: float, history: np.
 
 @compiled
 def open_yaw(ekf: Record, parameters: Record, history: np.ndarray) -> None:
-    """The yaw was wrong, and with it what was integrated lately: follow four yaws again, from a
-    place that is less certain.
+    """Follow four yaws again after the yaw was found wrong.
+
+    The integrated motion was wrong too, so the covariance of position and velocity is widened.
     """
     ekf.yaw_test.count += 1
     widen(ekf, history)
@@ -569,9 +693,9 @@ def open_yaw(ekf: Record, parameters: Record, history: np.ndarray) -> None:
 
 @compiled
 def open_unknown_yaw(ekf: Record, parameters: Record, history: np.ndarray) -> None:
-    """Of a tag without an IMU, before a velocity: follow four yaws if it may have any.
+    """Follow four yaws before a velocity updates a tag without an IMU whose yaw is unknown.
 
-    From now on motion can show it.
+    From this velocity on, motion can determine the yaw.
     """
     alive = 0
     for h in range(HYPOTHESES):
@@ -582,8 +706,10 @@ def open_unknown_yaw(ekf: Record, parameters: Record, history: np.ndarray) -> No
 
 @compiled
 def level_first(ekf: Record, parameters: Record, history: np.ndarray) -> None:
-    """`reset_attitude` when inertial samples have come for the first time: the yaw is known as well as
-    it was before.
+    """Reset the attitude when inertial samples come for the first time.
+
+    If a single hypothesis is left, the standard deviation of its yaw stays the same. Otherwise the
+    yaw becomes unknown.
     """
     alive = 0
     for h in range(HYPOTHESES):
@@ -598,7 +724,7 @@ def level_first(ekf: Record, parameters: Record, history: np.ndarray) -> None:
 
 @compiled
 def _known_height(ekf: Record, parameters: Record, up: float, t: float) -> KnownHeight:
-    """Height of a tag with cos(tilt) `up`, as something else than TDOAs gives it."""
+    """Return the height that another source than TDOAs gives for a tag with cos(tilt) `up`."""
     if parameters.fixed_height_std > 0.0:
         return KnownHeight(parameters.fixed_height, parameters.fixed_height_std)
     return KnownHeight(
@@ -608,7 +734,7 @@ def _known_height(ekf: Record, parameters: Record, up: float, t: float) -> Known
 
 @compiled
 def recent(ekf: Record, seconds: float) -> np.ndarray:
-    """The TDOAs of the last `seconds`: (n,) of TDOA."""
+    """Return the TDOAs of the last `seconds`, (n,) TDOA."""
     first = ekf.kept - 1
     since = ekf.window[ekf.kept - 1].t - seconds
     while first > 0 and ekf.kept - first < WINDOW and ekf.window[first - 1].t > since:
@@ -618,7 +744,10 @@ def recent(ekf: Record, seconds: float) -> np.ndarray:
 
 @compiled
 def _mean_accel(imu: Record, parameters: Record) -> np.ndarray:
-    """Mean specific force (3,) m/s^2, each axis by how far it can be relied on."""
+    """Return the mean specific force (3,), m/s^2, body frame.
+
+    Each axis is weighted between the measurement and hovering.
+    """
     inertial.weigh(imu, False, parameters)
     accel = np.empty(3)
     for k in range(3):
@@ -629,7 +758,7 @@ def _mean_accel(imu: Record, parameters: Record) -> np.ndarray:
 
 @compiled
 def _set_state(hypothesis: Record, x: np.ndarray, covariance: np.ndarray) -> None:
-    """Position and velocity x (6,) and their covariance (6, 6)."""
+    """Set position and velocity x (6,) and their covariance (6, 6)."""
     hypothesis.x[:6] = x
     auxiliary.forget(hypothesis)
     hypothesis.P[:6, :6] = covariance
@@ -637,7 +766,7 @@ def _set_state(hypothesis: Record, x: np.ndarray, covariance: np.ndarray) -> Non
 
 @compiled
 def _spread_attitude(P: np.ndarray, parameters: Record, yaw_std: float) -> None:
-    """The variances of attitude and biases at the start."""
+    """Set the variances of attitude and biases at the start."""
     P[6, 6] = P[7, 7] = TILT_STD**2
     P[8, 8] = yaw_std**2
     for k in range(3):

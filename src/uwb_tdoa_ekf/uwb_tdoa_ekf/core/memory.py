@@ -1,9 +1,8 @@
-"""Everything one filter remembers between two events, by name. A copy of its arrays is a copy of
-the filter.
+"""State of a filter between two events: all record types, with named fields.
 
-The types are rows of numpy's structured arrays: compiled code reads and writes
-`ekf.imu.slow_accel[k]` where it lies in memory, a function takes a whole record as one pointer, and
-Python sees the same bytes (`FilterState.record`).
+A copy of its arrays is a copy of the filter. The types are rows of numpy's structured arrays.
+Compiled code reads and writes `ekf.imu.slow_accel[k]` in place, and a function takes an entire
+record as a single pointer. Python sees the same bytes (`FilterState.record`).
 """
 
 from __future__ import annotations
@@ -27,13 +26,13 @@ if TYPE_CHECKING:
     from uwb_tdoa_bias.effects.base import SensorFunction
 
 
+# Verdict of a measurement.
 USED, REJECTED, LATE, INVALID, STARTUP, COMPENSATED, REPEATED = range(7)
 
 
-# directions and places that a start follows at once while it is not known which is right
-N_YAWS, N_PLACES = (4, 2)
+N_YAWS, N_PLACES = (4, 2)  # numbers of yaws and places that a start follows in parallel
 HYPOTHESES = N_YAWS * N_PLACES
-Floor = tuple[np.ndarray, np.ndarray, np.ndarray]  # as of EffectSet.on_floor
+Floor = tuple[np.ndarray, np.ndarray, np.ndarray]  # as in EffectSet.on_floor
 WINDOW = 512  # TDOAs kept for a start
 
 
@@ -41,225 +40,238 @@ def _record(*columns: tuple[Any, ...]) -> np.dtype:
     return np.dtype(list(columns), align=True)
 
 
-# What is measured. Rows of an anchor, not ids; both in the order of their stamps.
-# s, rad/s, m/s^2 (specific force); body
+# Measurements, with rows of anchors, not ids. All are in the order of their stamps. Sample: s,
+# rad/s, m/s^2 (specific force), body frame.
 IMU_SAMPLE = _record(("t", float), ("gyro", float, 3), ("accel", float, 3))
 TDOA = _record(
-    ("t", float),
+    ("t", float),  # s, stamp
     ("a", int),
-    ("b", int),
-    ("d", float),
-    ("variance", float),  # s, rows, m (corrected), m^2 (beyond tdoa_std)
+    ("b", int),  # rows of the anchors
+    ("d", float),  # m, |p - b| - |p - a|, after correction
+    ("variance", float),  # m^2, beyond tdoa_std
+    # of the subtracted bias over position and velocity, m per m and m per m/s
     ("slope", float, N_STATES),
-    # of the bias taken out, with position and velocity, about a state; m, m/s
-    ("state", float, N_STATES),
+    ("state", float, N_STATES),  # linearization point of the bias, m and m/s
 )
-# see aids.py
+# Measurement of a sensor, see aids.py.
 AID = _record(("t", float), ("kind", int), ("value", float, 4), ("std", float, 4), ("anchor", int))
 
-# One estimate of the state, for one direction that the tag may have started in.
+# Estimate of the state, for a yaw and place that the tag may have started with.
 HYPOTHESIS = _record(
     ("log_weight", float),  # log probability relative to the best; -inf: pruned
-    ("x", float, NOMINAL_STATES),  # see state.py
+    ("x", float, NOMINAL_STATES),  # nominal state, see state.py
     ("P", float, (ERROR_STATES, ERROR_STATES)),  # symmetric to the bit
-    ("offset", float, OFFSET_STATES),  # m and m/s, auxiliary states, see auxiliary.py;
-    ("offset_cross", float, (OFFSET_STATES, ERROR_STATES)),  # covariance with the error state, and
-    ("offset_P", float, (OFFSET_STATES, OFFSET_STATES)),  # their own; 0: there is none
+    ("offset", float, OFFSET_STATES),  # auxiliary states, m and m/s, see auxiliary.py
+    ("offset_cross", float, (OFFSET_STATES, ERROR_STATES)),  # covariance with the error state
+    # their own covariance; 0: the state does not exist
+    ("offset_P", float, (OFFSET_STATES, OFFSET_STATES)),
 )
 
-# What is known of the inertial sensor.
+# Statistics of the inertial sensor, body frame.
 IMU_STATE = _record(
     ("t", float),  # s, stamp of the last sample
-    ("gyro", float, 3),  # rad/s and
-    ("accel", float, 3),  # m/s^2, held until the next sample: input of the prediction
-    ("slow_accel", float, 3),  # m/s^2, low pass
-    ("vibration", float, 3),  # m^2/s^4, power of what is faster
-    ("mean_accel", float, 3),  # m/s^2, over a longer time
-    # 0 to 1: power of what of it does not hover, lately, beside that of the vibration
+    ("gyro", float, 3),  # rad/s
+    ("accel", float, 3),  # m/s^2; both are the input of the prediction until the next sample
+    ("slow_accel", float, 3),  # m/s^2, after a low pass
+    ("vibration", float, 3),  # m^2/s^4, power above the low pass
+    ("mean_accel", float, 3),  # m/s^2, after a slower low pass
+    # 0 to 1: recent power of the mean beyond hovering, relative to the vibration
     ("rectified", float, 3),
     ("gyro_power", float, 3),  # rad^2/s^2
-    ("accel_weight", float, 3),  # of the measurement against hovering, 0 to 1, by inertial.weigh
-    ("accel_psd", float, 3),  # (m/s^2)^2/Hz, of the noise that this leaves
+    ("accel_weight", float, 3),  # 0 to 1, of the measurement against hovering, see inertial.weigh
+    ("accel_psd", float, 3),  # (m/s^2)^2/Hz, of the remaining noise
 )
 
-# Whether an inertial sensor can be right, see imu_fault_detector.py.
+# State of the IMU fault detector, see imu_fault_detector.py.
 IMU_FAULT_DETECTOR = _record(
-    ("up", float, 3),  # m/s^2, specific force as the gyroscope has turned it
-    ("spun", float),  # rad, turned lately beyond what a tag may
-    ("weighed", float),  # s, stamps: of the last sample in which it bore the tag,
-    ("upright", float),  # in which the tag did not lie on its side,
-    ("contradicted", float),  # and at which something was impossible;
-    ("reason", int),  # what,
-    ("size", float),  # and how large
+    ("up", float, 3),  # m/s^2, specific force, rotated by the gyroscope
+    ("spun", float),  # rad, recent turn beyond the limit
+    ("weighed", float),  # s, stamp of the last sample in which the force bore the tag
+    ("upright", float),  # s, stamp of the last sample in which the tag did not lie on its side
+    ("contradicted", float),  # s, stamp of the last impossible sample
+    ("reason", int),  # of the fault
+    ("size", float),  # impossible value, in its own unit
 )
 
-# A pose that is given from outside. NaN for what is not.
+# Pose given from outside, world frame. NaN: not given.
 POSE = _record(
-    ("t", float),  # s
-    ("p", float, 3),  # m, of the body in the world,
-    ("covariance", float, (3, 3)),  # m^2, and its covariance
-    ("yaw", float),  # rad,
-    ("yaw_std", float),  # rad, and its standard deviation
+    ("t", float),  # s, stamp
+    ("p", float, 3),  # m, position of the body
+    ("covariance", float, (3, 3)),  # m^2, of p
+    ("yaw", float),  # rad, of the body
+    ("yaw_std", float),  # rad, standard deviation of the yaw
 )
 
-# What is known of an anchor.
+# State of an anchor.
 ANCHOR = _record(
-    ("position", float, 3),  # m
-    ("excess_variance", float),  # m^2, of what is received of it beyond tdoa_std, see noise.py
-    ("learned", float),  # s, stamp of the last change
+    ("position", float, 3),  # m, world frame
+    ("excess_variance", float),  # m^2, of its TDOAs beyond tdoa_std, see noise.py
+    ("learned", float),  # s, stamp of the last update of this variance
     ("heard", float),  # s, stamp of the last TDOA that was used
-    ("delay", float),  # m, that it is found to have since it changed in flight,
-    ("delay_variance", float),  # and its variance, m^2;
-    # probability that it is late because tag and anchor are near the ground, see ground.py, 0: it
-    # cannot be,
+    ("delay", float),  # m, estimated after a change in flight
+    ("delay_variance", float),  # m^2, of the delay
+    # probability that it is late because tag and anchor are near the ground, see ground.py; 0: it
+    # cannot be
     ("late", float),
-    ("predicted", float),  # s, stamp to which that was predicted;
-    ("floor_delay", float),  # m, by which it was late at a tag on the ground, NaN: nobody knows,
-    ("floor_std", float),  # m, and its standard deviation
+    ("predicted", float),  # s, stamp to which this probability was predicted
+    ("floor_delay", float),  # m, known delay at a tag on the ground; NaN: unknown
+    ("floor_std", float),  # m, standard deviation of this delay
 )
 
+# State of the downward range finder, see height.py.
 HEIGHT = _record(
-    ("range", float),  # m, the last that was received,
-    ("heard", float),  # s, its stamp,
-    ("changed", float),  # that of the last one that differed from the one before,
-    ("used", float),  # and of the last one that was used
-    ("level", float),  # m, of the ground below
+    ("range", float),  # m, last range received
+    ("heard", float),  # s, stamp of the last range
+    ("changed", float),  # s, stamp of the last range that differed from the one before
+    ("used", float),  # s, stamp of the last range that was used
+    ("level", float),  # m, height of the ground below, world frame
     ("agreed", float),  # s for which the range finder has agreed with the filter
-    ("disagreeing", int),  # ranges in a row that do not, but with each other,
-    ("disagreement", float),  # m, their mean innovation,
-    ("disagrees_since", float),  # s, and the stamp of the first
-    ("pull", float),  # m and 1, what the TDOAs of late say of z, see height.update_pull,
-    ("pull_information", float),
-    ("compared", float),  # s, stamps: of the last of them,
-    ("pulls_since", float),  # and since when they disagree
-    ("ignored_until", float),  # s, stamp until which no range is used, and
-    ("ignore_time", float),  # s, for how long
+    # number of consecutive ranges that disagree with the filter but agree with each other
+    ("disagreeing", int),
+    ("disagreement", float),  # m, their mean innovation
+    ("disagrees_since", float),  # s, stamp of the first
+    # m, mean weighted innovation of z by recent TDOAs, see height.update_pull; its information
+    # follows
+    ("pull", float),
+    ("pull_information", float),  # no unit
+    ("compared", float),  # s, stamp of the last TDOA in this mean
+    ("pulls_since", float),  # s, stamp since which TDOAs disagree with z
+    ("ignored_until", float),  # s, stamp until which no range is used
+    ("ignore_time", float),  # s, duration of the last such interval
 )
 
+# State of the barometer, see barometer.py.
 BAROMETER = _record(
-    ("heard", float),  # s, stamps: of the last altitude,
-    ("agreed", float),  # and of the last one that was used
-    ("nis", float),  # mean normalised innovation squared of late, on the scale that is reported
+    ("heard", float),  # s, stamp of the last altitude
+    ("agreed", float),  # s, stamp of the last altitude that was used
+    # recent mean of the normalized innovation squared, relative to the reported variance
+    ("nis", float),
 )
 
+# State of the velocity sensor, see velocity.py.
 VELOCITY = _record(
-    ("heard", float),  # s, stamps: of the last one,
-    ("changed", float),  # and of the last one that differed from the one before;
-    ("value", float, 4),  # m/s and rad/s, the last one
-    ("nis", float),  # mean normalised innovation squared of late, of the worst component
-    ("refused", bool),  # it disagrees with everything else
-    ("agreed", float),  # s, stamp of the last one of wheels that was used,
-    ("yaw_rate", float),  # rad/s, its yaw rate,
-    ("yaw_rate_variance", float),  # rad^2/s^2, the variance of that,
-    ("speed_variance", float),  # and m^2/s^2, that of its velocity
+    ("heard", float),  # s, stamp of the last velocity
+    ("changed", float),  # s, stamp of the last velocity that differed from the one before
+    ("value", float, 4),  # m/s and rad/s, last velocity and yaw rate, body frame
+    ("nis", float),  # recent mean of the normalized innovation squared, of the worst component
+    ("refused", bool),  # the sensor disagrees with all others
+    ("agreed", float),  # s, stamp of the last velocity of wheels that was used
+    ("yaw_rate", float),  # rad/s, of wheels
+    ("yaw_rate_variance", float),  # rad^2/s^2, of this yaw rate
+    ("speed_variance", float),  # m^2/s^2, of the velocity of wheels
 )
 
+# State of the yaw test, see yaw_test.py.
 YAW_TEST = _record(
-    # of the error state to cos(psi) - 1 and sin(psi), for a yaw that is wrong by psi
+    # responses of the error state to cos(psi) - 1 and sin(psi), for a yaw error psi
     ("response", float, (2, ERROR_STATES)),
-    ("vector", float, 2),  # of the least squares of late innovations by these two,
-    ("information", float, (2, 2)),  # and the upper triangle of its matrix
-    ("turned", float),  # rad, by which updates have turned the yaw of late,
-    ("variance", float),  # rad^2, and the largest variance that it had
-    ("alone", bool),  # one hypothesis is followed
-    ("evidence", float),  # at the last look,
-    ("t", float),  # s, stamps: of the last look,
-    ("next_look", float),  # and before which not to look again
-    ("count", int),  # how often the yaw was opened again
+    ("vector", float, 2),  # right side of the least squares of recent innovations by both responses
+    ("information", float, (2, 2)),  # upper triangle of its matrix
+    ("turned", float),  # rad, recent turn of the yaw by updates
+    ("variance", float),  # rad^2, largest recent variance of the yaw
+    ("alone", bool),  # a single hypothesis is left
+    ("evidence", float),  # log likelihood ratio at the last test
+    ("t", float),  # s, stamp of the last test
+    ("next_look", float),  # s, stamp of the next test
+    ("count", int),  # number of times that the yaw was opened again
 )
 
+# State of the filter, except its anchors.
 EKF = _record(
     ("t", float),  # s, stamp of the hypotheses
-    ("running", bool),
-    ("best", int),  # the most probable hypothesis
+    ("running", bool),  # the filter has started
+    ("best", int),  # index of the most probable hypothesis
     ("hypotheses", HYPOTHESIS, HYPOTHESES),
     ("imu", IMU_STATE),
     ("height", HEIGHT),
     ("barometer", BAROMETER),
     ("velocity", VELOCITY),
-    ("ranged", AID, 1),  # the last distance to an anchor
-    # m, of all distances, when it was known best, and its variance, m^2; inf: it was not looked for
+    ("ranged", AID, 1),  # last distance to an anchor
+    # m, offset of all distances when its variance was smallest; m^2, this variance; inf: not
+    # estimated yet
     ("range_offset", float, 2),
-    ("next_floor", float),  # s, stamp before which not to hold the tag on its floor again
+    ("next_floor", float),  # s, stamp of the next floor constraint
     ("sensed", bool),  # inertial samples drive the prediction
-    # m, another place that late TDOAs agree on, and the motion that sensors feel does not lead to;
+    # m, another place that recent TDOAs agree on, but the motion by other sensors does not lead to
     ("rival", float, 3),
-    ("rival_since", float),  # s, stamps: since when they do,
-    ("rival_until", float),  # and until when the tag may be there
-    ("imu_fault_detector", IMU_FAULT_DETECTOR),  # of the inertial samples,
-    ("imu_faulty", bool),  # which are not used, because they cannot be right
+    ("rival_since", float),  # s, stamp since which they agree
+    ("rival_until", float),  # s, stamp until which the tag may be there
+    ("imu_fault_detector", IMU_FAULT_DETECTOR),  # of the inertial samples
+    ("imu_faulty", bool),  # inertial samples are not used, because they are implausible
     ("yaw_test", YAW_TEST),  # see yaw_test.py
-    # s, stamp until which they are averaged, where the filter ran before there were any; -inf: they
-    # are used
+    # s, stamp until which the first inertial samples of a running filter are averaged; -inf:
+    # samples are used
     ("attitude_averaged_until", float),
-    ("quiet", bool),  # the inertial sensor neither shakes nor turns
-    ("resting", bool),  # the tag does not move, see stationarity.py,
-    # m, x and y of where anchors are known to be late on the ground, NaN: anywhere,
+    ("quiet", bool),  # the inertial sensor neither vibrates nor turns
+    ("resting", bool),  # the tag is at rest, see stationarity.py
+    # m, x and y of the place on the ground where the lateness of anchors is known; NaN: anywhere
     ("floor_place", float, 2),
-    ("late_as_known", bool),  # and they are, where the tag came to rest last
-    ("rest_since", float),  # s, stamps: since when,
-    ("next_look", float),  # and before which not to look again,
-    # looks in a row in which its TDOAs have changed, and in which it was not known to rest
-    ("doubts", int),
-    ("stills", int),  # but neither TDOAs nor inertial samples showed that it moves,
-    # m^2/s^4, power of the vibration of a tag that is not at rest, over some seconds
-    ("shaking", float),
-    ("lift", float, 3),  # m/s, that the inertial sensor has felt lately at rest, in the world
-    # s, stamp at which the inertial sensor was sound and TDOAs agreed with the filter last
-    ("last_agreement", float),
-    ("extent", float, (2, 3)),  # m, lower and upper bounds: of all anchors,
-    ("within", float, (2, 3)),  # of the reach of those that were heard lately,
-    ("workspace", float, (2, 3)),  # and of where the tag is expected, see workspace.py
-    ("side", float, 3),  # on which the tag is of anchors in a plane, see workspace.configured_side
-    # 1.0 for axes along which these are at one coordinate, while it is not known on which side of
-    # that the tag is
+    ("late_as_known", bool),  # anchors are late as known at the last place of rest
+    ("rest_since", float),  # s, stamp of the beginning of the last rest
+    ("next_look", float),  # s, stamp of the next check of rest
+    ("doubts", int),  # consecutive checks at rest in which the TDOAs have changed
+    # consecutive checks before a rest in which neither TDOAs nor inertial samples showed a motion
+    ("stills", int),
+    ("shaking", float),  # m^2/s^4, power of the vibration while not at rest, averaged over seconds
+    ("lift", float, 3),  # m/s, recent change of velocity by inertial samples at rest, world frame
+    ("last_agreement", float),  # s, stamp at which TDOAs agreed with the filter last
+    ("extent", float, (2, 3)),  # m, lower and upper bounds of all anchors, world frame
+    ("within", float, (2, 3)),  # m, bounds of the radio reach of the anchors heard lately
+    # m, bounds of the place where the tag is expected, see workspace.py
+    ("workspace", float, (2, 3)),
+    # side of the tag relative to anchors in a plane, see workspace.configured_side
+    ("side", float, 3),
+    # 1.0 for axes along which the heard anchors share a coordinate, if the side of the tag is not
+    # configured
     ("flat", float, 3),
-    ("middle", float, 3),  # m, of the anchors heard lately
-    ("next_bounds", float),  # s, stamp before which not to look anew who is heard
-    # 1/m^2, of the place, that one arrival from each anchor heard lately gives, see noise.py
+    ("middle", float, 3),  # m, center of the anchors heard lately
+    ("next_bounds", float),  # s, stamp of the next update of the workspace
+    # 1/m^2, of the position, by a single TDOA of each anchor heard lately, see noise.py
     ("information", float, (3, 3)),
-    # s, stamp until which the tag may be anywhere, as its place was hardly known before
+    # s, stamp until which the tag may be anywhere, because its position was uncertain before
     ("position_unknown_until", float),
-    ("search_waits_until", float),  # s, stamp until which its TDOAs wait for a search
-    ("consistency", float),  # share of the latest TDOAs that agree with the best hypothesis
-    ("recoveries", int),
-    # s, stamps: of the first TDOA since the filter stopped, and the last one
-    ("first_tdoa", float),
-    ("last_tdoa", float),
-    ("next_search", float),  # s, stamps before which not to do again: look for the tag,
-    ("next_odometry", float),
-    ("next_rest", float),  # say that a quiet tag stands still,
-    ("next_merge", float),  # compare hypotheses
-    ("kept", int),  # TDOAs in the window
+    ("search_waits_until", float),  # s, stamp until which TDOAs wait for a search
+    ("consistency", float),  # share of recent TDOAs that agree with the best hypothesis
+    ("recoveries", int),  # number of recoveries
+    ("first_tdoa", float),  # s, stamp of the first TDOA since the filter stopped
+    ("last_tdoa", float),  # s, stamp of the last TDOA or range
+    ("next_search", float),  # s, stamp of the next search
+    ("next_odometry", float),  # s, stamp of the next odometry
+    ("next_rest", float),  # s, stamp of the next zero-velocity update
+    ("next_merge", float),  # s, stamp of the next merge of hypotheses
+    ("kept", int),  # number of TDOAs in the window
     ("window", TDOA, 2 * WINDOW),  # recent TDOAs, oldest first
-    ("recorded", int),  # records written to the history, see history.py
+    ("recorded", int),  # number of records written to the history, see history.py
     # transition of the best hypothesis since the last record
     ("since_record", float, (ERROR_STATES, ERROR_STATES)),
-    # Scratch: nothing below outlives an event.
+    # Scratch: nothing below is used after an event.
     ("transition", TRANSITION),
     ("innovation", INNOVATION),
     ("paired", TDOA, 1),
     ("pairs", PAIR, MOST_PAIRS),
     ("still_covariance", float, (3, 3)),
 )
-EKF = np.dtype((np.record, EKF))  # whose fields Python reads as attributes
+EKF = np.dtype((np.record, EKF))  # Python reads its fields as attributes
 
-# What comes out.
+# Results: odometry, and a residual for each measurement.
 ODOMETRY = _record(
-    ("t", float),
-    ("x", float, NOMINAL_STATES),
+    ("t", float),  # s, stamp
+    ("x", float, NOMINAL_STATES),  # nominal state, see state.py
     ("covariance", float, (9, 9)),  # of [p, v, attitude]
-    # what of it errors that persist make, see noise.py
+    # m^2, share of the position covariance that persisting errors cause, see noise.py
     ("consider_covariance", float, (3, 3)),
 )
+# Innovation and its variance in the unit of the measurement, weight 0 to 1, and verdict.
 RESIDUAL = _record(
     ("innovation", float), ("variance", float), ("weight", float), ("verdict", np.uint8)
 )
 
 
 class FilterState(NamedTuple):
-    """State of one filter. ekf : (1,) of EKF; anchors : (N,) of ANCHOR; functions : (k,) of
-    SENSOR_FUNCTION, errors of the inertial sensor that are known.
+    """State of a filter.
+
+    ekf : (1,) EKF. anchors : (N,) ANCHOR. functions : (k,) SENSOR_FUNCTION, known errors of the
+    inertial sensor.
     """
 
     ekf: np.ndarray
@@ -268,17 +280,18 @@ class FilterState(NamedTuple):
 
     @property
     def record(self) -> Record:
-        """The fields of EKF as attributes: a view."""
+        """Return the fields of EKF as attributes: a view."""
         return self.ekf[0]
 
     def copy(self) -> FilterState:
-        """Another filter that remembers the same."""
+        """Return a copy of the filter."""
         return FilterState(*(array.copy() for array in self))
 
 
 class Measurements(NamedTuple):
-    """What a filter is fed with at once. imu : (n,) of IMU_SAMPLE; tdoa : (k,) of TDOA; aids : (m,)
-    of AID.
+    """Input of a call of the filter.
+
+    imu : (n,) IMU_SAMPLE. tdoa : (k,) TDOA. aids : (m,) AID.
     """
 
     imu: np.ndarray
@@ -287,10 +300,10 @@ class Measurements(NamedTuple):
 
 
 class Output(NamedTuple):
-    """Room for what it makes of that. odometry : at least (n + k + m,) of ODOMETRY; residuals :
-    (k,) of RESIDUAL;
-    history : of history.RECORD, with room for engine.most_records, or empty for no recording; aids
-        : (m,) of RESIDUAL.
+    """Room for the results of a call of the filter.
+
+    odometry : at least (n + k + m,) ODOMETRY. residuals : (k,) RESIDUAL, of TDOAs. history :
+    RECORD, with room for engine.most_records, or empty for no recording. aids : (m,) RESIDUAL.
     """
 
     odometry: np.ndarray
@@ -302,8 +315,16 @@ class Output(NamedTuple):
 def new_state(
     positions: np.ndarray, functions: Sequence[SensorFunction] = (), floor: Floor | None = None
 ) -> FilterState:
-    """FilterState of a filter that has seen nothing; positions : (N, 3) m, of the anchors;
-    functions : SensorFunctions; floor : as of `EffectSet.on_floor`.
+    """Return the FilterState of a filter without measurements.
+
+    Parameters
+    ----------
+    positions : (N, 3) array
+        Positions of the anchors, m, world frame.
+    functions : sequence of SensorFunction
+        Known errors of the inertial sensor.
+    floor : tuple, optional
+        Known lateness of anchors at the ground, as in `EffectSet.on_floor`.
     """
     state = FilterState(np.zeros(1, EKF), np.zeros(len(positions), ANCHOR), rows_of(functions))
     state.anchors["position"] = positions
@@ -352,8 +373,9 @@ def new_state(
 
 
 def structured(kind: np.dtype, *columns: Any) -> np.ndarray:
-    """(n,) array of a type of this module; columns : one array for each of its fields, in their
-    order; of the last ones that are not given, 0.
+    """Return an (n,) array of a record type, from an array for each field in order.
+
+    Fields at the end without an array are 0.
     """
     out = np.zeros(len(columns[0]), kind)
     for name, column in zip(kind.names or (), columns):
@@ -362,8 +384,9 @@ def structured(kind: np.dtype, *columns: Any) -> np.ndarray:
 
 
 def joined(kind: np.dtype, parts: Sequence[np.ndarray]) -> np.ndarray:
-    """(n,) array of a type of this module, of several one after the other; numpy finds out anew for
-    each what the type of all is.
+    """Return the concatenation of several arrays of the same record type.
+
+    np.concatenate would determine the common type again for each array.
     """
     if len(parts) == 1:
         return parts[0]

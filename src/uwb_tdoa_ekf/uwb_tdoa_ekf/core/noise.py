@@ -1,4 +1,7 @@
-"""How noisy each anchor is, learned from the innovations while flying."""
+"""Measurement noise of each anchor, and the covariance of persisting errors.
+
+The filter learns the noise of each anchor from its innovations.
+"""
 
 from __future__ import annotations
 
@@ -8,25 +11,36 @@ from uwb_tdoa_bias.common.compiled import Record, compiled
 
 from .ground import solve
 
-LARGEST_OUTLIER = 5.0  # standard deviations that one outlier counts as at most
-# share of an anchor's variance that one innovation makes at most: ten say what one cannot
+LARGEST_OUTLIER = 5.0  # standard deviations; limits the effect of an outlier
+# largest share of a new innovation in the variance of an anchor: ten innovations show more than a
+# single one
 LARGEST_STEP = 0.1
 
 
 @compiled
 def excess_variance(a: Record, b: Record) -> float:
-    """Variance of a TDOA beyond tdoa_std, m^2: what was learned of its two anchors (of ANCHOR)."""
+    """Return the learned variance of a TDOA beyond tdoa_std, in m^2, for its two ANCHORs."""
     return a.excess_variance + b.excess_variance
 
 
 @compiled
 def learn(a: Record, b: Record, t: float, innovation: Record, parameters: Record) -> None:
-    """Learn from one INNOVATION, stamped t (s), what its noise_variance has too little, or too
-    much, of.
+    """Update the excess variance of two anchors with an innovation.
 
-    An anchor that is received late, e.g. around an obstacle, disturbs every pair it is in:
-    exponential average per anchor over noise_memory; a pair's excess is divided as the noise
-    learned so far.
+    An anchor that is received late, e.g. around an obstacle, disturbs every pair that contains it.
+    So the filter averages per anchor, exponentially over noise_memory. The excess of a pair is
+    divided between its anchors in proportion to the noise learned so far.
+
+    Parameters
+    ----------
+    a, b : ANCHOR
+        Anchors of the TDOA, updated in place.
+    t : float
+        Stamp of the TDOA, s.
+    innovation : INNOVATION
+        Innovation of the TDOA. It shows by how much noise_variance is too small or too large.
+    parameters : PARAMETERS
+        Tuning of the filter.
     """
     noise = innovation.noise_variance
     squared = min(innovation.value**2, LARGEST_OUTLIER**2 * noise)
@@ -37,6 +51,7 @@ def learn(a: Record, b: Record, t: float, innovation: Record, parameters: Record
     _learn_one(b, t, (b.excess_variance + base) / whole * excess, parameters.noise_memory)
 
 
+# Update the excess variance of an ANCHOR by its share of the excess, m^2. memory is in s.
 @compiled
 def _learn_one(anchor: Record, t: float, excess: float, memory: float) -> None:
     step = (
@@ -48,19 +63,27 @@ def _learn_one(anchor: Record, t: float, excess: float, memory: float) -> None:
     anchor.learned = t
 
 
-# of the variance of a TDOA that persists where its errors are correlated: delays and antennas, as
-# large as noise
+# share of the variance of a TDOA that persists where its errors are correlated: delays and antennas
+# cause errors as large as the noise
 SHARE = 0.5
-MEMORY = 1.0  # s of TDOAs that are looked at: an anchor that was not heard for so long is not there
-LONGEST_STEP = 0.1  # s; what anchors tell is not forgotten in silence
-# times the covariance of the filter is the most that is added: it does not hear anchors alone
+MEMORY = 1.0  # s of TDOAs that count; an anchor that was silent for longer counts as absent
+# s; limits the decay, because silence does not remove the information from anchors
+LONGEST_STEP = 0.1
+# largest ratio of the added covariance to the covariance of the filter, because anchors are not the
+# only source of position
 MOST = 400.0
 
 
 @compiled
 def begin(information: np.ndarray, P: np.ndarray) -> None:
-    """Fill in the information (3, 3), 1/m^2, of a start whose covariance P (15, 15) has counted
-    each anchor once, see `observe`.
+    """Initialize the information matrix of `observe` at the start of the filter.
+
+    Parameters
+    ----------
+    information : (3, 3) array
+        Information of the position, 1/m^2. Filled.
+    P : (15, 15) array
+        Covariance of the error state. The start has counted each anchor once.
     """
     both = np.concatenate((P[:3, :3], np.eye(3)), axis=1)
     solve(both)
@@ -71,12 +94,25 @@ def begin(information: np.ndarray, P: np.ndarray) -> None:
 def observe(
     information: np.ndarray, a: Record, b: Record, innovation: Record, t: float, last: float
 ) -> None:
-    """Take a TDOA stamped t, s, between two of ANCHOR, an INNOVATION, into the information (3, 3),
-    1/m^2, of a position by a single TDOA of each anchor that is heard, as noisy as it is; last : s,
-    stamp of the TDOA before.
+    """Update the information that a single TDOA from each heard anchor gives about the position.
+
+    Each TDOA counts with its own measurement noise.
+
+    Parameters
+    ----------
+    information : (3, 3) array
+        Information of the position, 1/m^2, updated in place.
+    a, b : ANCHOR
+        Anchors of the TDOA; `heard` is updated. For a range both are the same anchor.
+    innovation : INNOVATION
+        Innovation after the update.
+    t : float
+        Stamp of the TDOA, s.
+    last : float
+        Stamp of the last TDOA, s.
     """
     fades = min(t - last, LONGEST_STEP) / MEMORY
-    # adds up to the number of anchors
+    # the sum over all TDOAs in MEMORY is the number of anchors
     apart = 0.5 * (min(t - a.heard, MEMORY) + min(t - b.heard, MEMORY)) / MEMORY
     a.heard = b.heard = t
     gain = apart * innovation.weight / (innovation.noise_variance + innovation.curvature / SHARE)
@@ -95,10 +131,23 @@ def fill(
     height_std: float,
     covariance: np.ndarray,
 ) -> None:
-    """Fill in the covariance (3, 3), m^2, that errors which persist make of a position whose
-    covariance in the filter is P (15, 15). Of white noise, of correlation_length 1, nothing
-    persists. height_std : m, of a height that is held, 0: none is; what is held does not follow
-    these errors.
+    """Compute the covariance of the position caused by persisting errors (consider covariance).
+
+    White noise (correlation_length 1) leaves no persisting error. A held height does not follow
+    these errors, so it reduces them.
+
+    Parameters
+    ----------
+    information : (3, 3) array
+        From `observe`, 1/m^2.
+    P : (15, 15) array
+        Covariance of the error state.
+    correlation_length : float
+        Number of successive TDOAs that count as a single independent one.
+    height_std : float
+        Standard deviation of a held height, m; 0 if no height is held.
+    covariance : (3, 3) array
+        Consider covariance, m^2. Filled.
     """
     covariance[:, :] = 0.0
     share = SHARE * (1.0 - 1.0 / max(correlation_length, 1.0))
@@ -111,7 +160,7 @@ def fill(
     both[:, 3:] = np.eye(3)
     if solve(both):
         covariance[:, :] = both[:, 3:]
-    if height_std > 0.0:  # what the height adds to the information has no part in the error
+    if height_std > 0.0:  # a held height adds information but no persisting error
         share = 1.0 / height_std**2
         for i in range(3):
             for j in range(3):

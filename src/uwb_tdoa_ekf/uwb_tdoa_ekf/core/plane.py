@@ -1,8 +1,9 @@
-"""A vehicle on its floor: the height is known, and of a planar one also that it is level and does
-not rise. What cannot move sideways does not.
+"""Constraints of a vehicle on its floor: fixed height, planar motion and non-holonomic motion.
 
-What is given once is not known better by being repeated: a state is held where the filter knows
-less of it than that.
+The height is known. A planar vehicle is also level and does not rise. A vehicle that cannot move
+sideways has no velocity across its x axis. A constraint that is given once must not shrink the
+covariance again and again. So a state is constrained only while its variance exceeds the variance
+of the constraint.
 """
 
 from __future__ import annotations
@@ -20,20 +21,33 @@ from .memory import HYPOTHESES
 from .state import rotation
 from .update import kalman, project, update_state
 
-PERIOD = 0.05  # s between two times
+PERIOD = 0.05  # s between two applications of the constraints
 RISE_STD = 0.02  # m/s, of the vertical velocity of a planar vehicle
-RECORDS = 6  # of one time in a history: height, rise, tilt about two axes, velocity along two
+# records in a history per application: height, rise, tilt about two axes, velocity along two
+RECORDS = 6
 
 
 @compiled
 def is_given(parameters: Record) -> bool:
-    """Whether anything is to be held."""
+    """Return whether the user has set any constraint."""
     return parameters.fixed_height_std > 0.0 or parameters.non_holonomic_std > 0.0
 
 
 @compiled
 def hold(ekf: Record, parameters: Record, t: float, records: np.ndarray) -> None:
-    """Hold every hypothesis, predicted to stamp t, s, on its floor."""
+    """Apply the floor constraints to every hypothesis, predicted to stamp t.
+
+    Parameters
+    ----------
+    ekf : EKF
+        State of the filter, updated in place.
+    parameters : PARAMETERS
+        Tuning of the filter.
+    t : float
+        Stamp, s.
+    records : (n,) RECORD
+        History for the smoother; empty for no recording.
+    """
     ekf.next_floor = t + PERIOD
     innovation, R, std = ekf.innovation, ekf.transition.rotation, parameters.fixed_height_std
     rolls = parameters.non_holonomic_std > 0.0 and (ekf.sensed or velocity.drives(ekf.velocity, t))
@@ -75,10 +89,27 @@ def hold(ekf: Record, parameters: Record, t: float, records: np.ndarray) -> None
 def _is_tilted(
     hypothesis: Record, axis: int, std: float, R: np.ndarray, innovation: Record
 ) -> bool:
-    """Fill in that the vertical has no component along an axis of the body, 0 or 1, and R (3, 3),
-    body to world. Returns whether a HYPOTHESIS knows less of that.
+    """Fill in the constraint that a body axis is horizontal, and return whether to apply it.
 
-    u = R' e_z; with the true attitude R Exp(dtheta), du = u x dtheta.
+    Measurement model: u = R' e_z. With the true attitude R Exp(dtheta), du = u x dtheta.
+
+    Parameters
+    ----------
+    hypothesis : HYPOTHESIS
+        Hypothesis, predicted to the stamp.
+    axis : int
+        Body axis, 0 or 1.
+    std : float
+        Standard deviation of the tilt, rad.
+    R : (3, 3) array
+        Rotation from body to world. Filled.
+    innovation : INNOVATION
+        Filled by this function.
+
+    Returns
+    -------
+    bool
+        Whether the variance of the tilt exceeds std**2.
     """
     x, other = hypothesis.x, 1 - axis
     rotation(x[6], x[7], x[8], x[9], R)
@@ -94,9 +125,16 @@ def _is_tilted(
 
 @compiled
 def flatten(row: Record, parameters: Record, wrong: float) -> None:
-    """Make one of ODOMETRY that of a planar vehicle: at its height, level, neither rising nor
-    tilting; with the deviations that these have.
-    wrong : m, by which TDOAs contradict the height.
+    """Change an odometry row to a planar vehicle: fixed height, level, neither rising nor tilting.
+
+    Parameters
+    ----------
+    row : ODOMETRY
+        Changed in place. The covariance gets the configured deviations of height, rise and tilt.
+    parameters : PARAMETERS
+        Tuning of the filter.
+    wrong : float
+        Difference between the height that TDOAs show and the fixed height, m.
     """
     x, P = row.x, row.covariance
     yaw = math.atan2(2.0 * (x[9] * x[8] + x[6] * x[7]), 1.0 - 2.0 * (x[7] ** 2 + x[8] ** 2))
@@ -119,6 +157,6 @@ def flatten(row: Record, parameters: Record, wrong: float) -> None:
 
 @compiled
 def flatten_all(rows: np.ndarray, parameters: np.ndarray) -> None:
-    """`flatten` (n,) of ODOMETRY; parameters : (1,) of PARAMETERS."""
+    """Apply `flatten` to (n,) ODOMETRY; parameters is (1,) PARAMETERS."""
     for k in range(len(rows)):
         flatten(rows[k], parameters[0], 0.0)

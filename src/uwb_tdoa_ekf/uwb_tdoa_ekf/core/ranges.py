@@ -1,7 +1,7 @@
 """Two-way ranging: the distance to an anchor.
 
-Two distances, one after the other, are a TDOA: by such TDOAs the filter starts, and finds a tag
-again that it has lost.
+The difference of two successive distances is a TDOA. The filter uses such TDOAs for initialization
+and recovery.
 """
 
 from __future__ import annotations
@@ -15,12 +15,15 @@ from uwb_tdoa_bias.common.compiled import Record, compiled
 from .auxiliary import RANGE, add_offset_jacobian
 from .update import project
 
-APART = 0.2  # s; two ranges that are further apart are no TDOA
+APART = 0.2  # s; ranges with a larger time difference give no TDOA
 
 
 @compiled
 def pair(ekf: Record, aid: Record) -> bool:
-    """Make the TDOA of a range, one of AID, and the one before; returns whether they are one."""
+    """Compute a TDOA from a range and the range before, in ekf.paired.
+
+    Return whether the TDOA is valid: two anchors, within APART.
+    """
     before, made = ekf.ranged[0], ekf.paired[0]
     apart = before.anchor != aid.anchor and aid.t - before.t < APART
     made.t, made.a, made.b, made.d = (
@@ -37,7 +40,7 @@ def pair(ekf: Record, aid: Record) -> bool:
 
 @compiled
 def is_repeat(ekf: Record, aid: Record) -> bool:
-    """Whether a range, one of AID, is the one before: somebody has sent it twice."""
+    """Return whether a range repeats the range before: a driver or network has sent it twice."""
     before = ekf.ranged[0]
     return before.t == aid.t and before.anchor == aid.anchor and before.value[0] == aid.value[0]
 
@@ -46,7 +49,21 @@ def is_repeat(ekf: Record, aid: Record) -> bool:
 def compare(
     hypothesis: Record, position: np.ndarray, aid: Record, parameters: Record, innovation: Record
 ) -> None:
-    """Fill in what the distance to an anchor at `position` (3,) m says to a HYPOTHESIS."""
+    """Fill in the innovation of a distance to an anchor.
+
+    Parameters
+    ----------
+    hypothesis : HYPOTHESIS
+        Hypothesis, predicted to the stamp of the measurement.
+    position : (3,) array
+        Position of the anchor, m, world frame.
+    aid : AID
+        Measured distance, m.
+    parameters : PARAMETERS
+        Tuning of the filter.
+    innovation : INNOVATION
+        Filled by this function.
+    """
     x = hypothesis.x
     dx, dy, dz = x[0] - position[0], x[1] - position[1], x[2] - position[2]
     distance = max(math.sqrt(dx * dx + dy * dy + dz * dz), 1e-6)
@@ -66,8 +83,9 @@ def compare(
 
 @compiled
 def keep_offset(ekf: Record, hypothesis: Record) -> None:
-    """After the update of a HYPOTHESIS: its offset of all ranges, where it was never known better;
-    later it may be forgotten.
+    """Store the range offset of an updated HYPOTHESIS if its variance is the smallest so far.
+
+    The offset state may be removed later; the stored value remains.
     """
     variance = hypothesis.offset_P[RANGE, RANGE]
     if 0.0 < variance < ekf.range_offset[1]:

@@ -1,10 +1,10 @@
-"""Three ways not to be misled by an outlier.
+"""Three robust updates: weight from the whitened innovation, gate, and M-estimation.
 
-All work on a HYPOTHESIS and an INNOVATION after `update.project`, whose noise_variance is that of
-one measurement. The errors of successive ones are alike: as many as `correlation_length` tell as
-much as one independent of the others. The update therefore takes noise_variance times that.
-`innovation` and `gate` judge the weight with noise_variance itself, `m_estimation` with the
-variance that its update takes.
+Each takes a HYPOTHESIS and an INNOVATION after `update.project`. noise_variance is the variance of
+a single measurement. Errors of successive measurements are correlated: `correlation_length`
+measurements give the information of a single independent one. The update therefore uses
+noise_variance times this length. `innovation` and `gate` compute the weight with noise_variance.
+`m_estimation` computes it with the variance that its update uses.
 """
 
 from __future__ import annotations
@@ -23,15 +23,16 @@ from .state import ERROR_STATES
 from .update import kalman
 
 NEGLIGIBLE = 0.01  # weight below which a measurement is not used
-SMALLEST_WEIGHT = 1e-6  # of a measurement in the M-estimation
+SMALLEST_WEIGHT = 1e-6  # least weight of a measurement in the M-estimation
 _INNOVATION, _GATE = ROBUST.index("innovation"), ROBUST.index("gate")
 
 
 @compiled
 def update(hypothesis: Record, innovation: Record, parameters: Record) -> None:
-    """Robust update in the way that PARAMETERS says.
+    """Update a HYPOTHESIS with the robust method that PARAMETERS selects.
 
-    Sets weight, 0 for none, and total_variance, inf for none.
+    The function sets innovation.weight (0 if rejected) and innovation.total_variance (inf if
+    rejected).
     """
     if parameters.robust == _INNOVATION:
         update_innovation(hypothesis, innovation, parameters)
@@ -43,10 +44,11 @@ def update(hypothesis: Record, innovation: Record, parameters: Record) -> None:
 
 @compiled
 def update_innovation(hypothesis: Record, innovation: Record, parameters: Record) -> None:
-    """Weight from the whitened innovation, then one Kalman update with the variance divided by it.
+    """Compute the weight from the whitened innovation, then apply a Kalman update.
 
-    Because the prior's own uncertainty whitens the innovation, a filter that knows little listens
-    to everything: the redescending weight cannot lock it out.
+    The measurement noise is divided by the weight. The covariance of the prediction contributes to
+    the whitening. So an uncertain filter accepts large innovations, and the redescending weight
+    cannot lock it out.
     """
     prior, noise = innovation.prior_variance, innovation.noise_variance
     w = weight(
@@ -64,7 +66,7 @@ def update_innovation(hypothesis: Record, innovation: Record, parameters: Record
 
 @compiled
 def update_gate(hypothesis: Record, innovation: Record, parameters: Record) -> None:
-    """Kalman update if the innovation is within `gate` standard deviations."""
+    """Apply a Kalman update if the innovation is within `gate` standard deviations."""
     prior, noise = innovation.prior_variance, innovation.noise_variance
     if innovation.value**2 > parameters.gate**2 * (prior + noise):
         innovation.weight, innovation.total_variance = 0.0, np.inf
@@ -78,15 +80,16 @@ def update_gate(hypothesis: Record, innovation: Record, parameters: Record) -> N
 
 @compiled
 def update_m_estimation(hypothesis: Record, innovation: Record, parameters: Record) -> None:
-    """M-estimation update, Zhao et al. (RA-L 2021), eqs. 8 - 13; cross_covariance becomes that of
+    """Apply an M-estimation update, Zhao et al. (RA-L 2021), eqs. 8 - 13.
+
+    The error state, followed by the auxiliary states, is scaled by the Cholesky factor S of the
+    prior (eq. 9). Prior and measurement are re-weighted `iterations` times (eq. 10). The posterior
+    follows from the weighted gain (eqs. 11 - 13). cross_covariance becomes the cross covariance of
     the weighted prior.
 
-    The error state, with the auxiliary states behind it, is scaled by the Cholesky factor S of the
-    prior (eq. 9). Prior and measurement are re-weighted `iterations` times (eq. 10), and the
-    posterior follows from the weighted gain (eqs. 11 - 13). A measurement moves only those elements
-    of the scaled error that come before its last state, so as many columns of S suffice: three for
-    one of the position. The Jacobian is kept at the prior mean: over the centimetres of one update
-    it does not change.
+    A measurement moves only the scaled errors up to its last state. So that many columns of S
+    suffice: three for a measurement of position. The Jacobian stays at the prior mean, because it
+    does not change over the centimetres of an update.
     """
     y, e, w = innovation.scaled_row, innovation.scaled_error, innovation.prior_weights
     rows = ERROR_STATES + (OFFSET_STATES if auxiliary.present(hypothesis) else 0)
@@ -119,8 +122,9 @@ def update_m_estimation(hypothesis: Record, innovation: Record, parameters: Reco
 
 @compiled
 def _columns(innovation: Record) -> int:
-    """How many states, in the order of the error state and then of the auxiliary ones, come up to
-    the last one that an INNOVATION depends on.
+    """Return the number of states up to the last entry in the Jacobian of an INNOVATION.
+
+    The order is error state, then auxiliary states.
     """
     columns = 0
     for n in range(innovation.entries):
@@ -134,8 +138,10 @@ def _columns(innovation: Record) -> int:
 
 @compiled
 def _factorize(hypothesis: Record, factor: np.ndarray, rows: int, columns: int) -> None:
-    """factor (columns, rows) <- the first columns of the Cholesky factor S of the joint covariance
-    of error state and auxiliary states, each as a row: what is then done to it is contiguous.
+    """Compute the first columns of the Cholesky factor S of the joint covariance.
+
+    The joint covariance contains the error state, then the auxiliary states. factor is (columns,
+    rows). Each column of S is stored as a row, because contiguous memory is faster.
     """
     P, cross, of_offset = hypothesis.P, hypothesis.offset_cross, hypothesis.offset_P
     for k in range(columns):
@@ -161,7 +167,7 @@ def _factorize(hypothesis: Record, factor: np.ndarray, rows: int, columns: int) 
 
 @compiled
 def _scale(innovation: Record, columns: int) -> None:
-    """scaled_row <- S' h', whose other elements are zero."""
+    """Compute scaled_row = S' h'; all later elements are zero."""
     factor, y = innovation.factor, innovation.scaled_row
     for k in range(columns):
         y[k] = 0.0
@@ -173,8 +179,9 @@ def _scale(innovation: Record, columns: int) -> None:
 
 @compiled
 def _weigh_prior(hypothesis: Record, innovation: Record, rows: int, columns: int) -> None:
-    """Make the prior the weighted one, P + S (1/W - 1) S', with what it says of the INNOVATION in
-    cross_covariance. Of P the upper triangle: `update.kalman` mirrors it.
+    """Replace the prior by the weighted prior, P + S (1/W - 1) S', and update cross_covariance.
+
+    Only the upper triangle of P is computed, because `update.kalman` mirrors it.
     """
     P, cross, of_offset = hypothesis.P, hypothesis.offset_cross, hypothesis.offset_P
     y, w, covariance = innovation.scaled_row, innovation.prior_weights, innovation.cross_covariance

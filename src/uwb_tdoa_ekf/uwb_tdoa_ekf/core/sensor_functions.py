@@ -1,5 +1,6 @@
-"""Errors of the inertial sensor that change with the state of the filter: taken out of each sample
-at the best hypothesis.
+"""State-dependent errors of the inertial sensor.
+
+They are subtracted from each sample, evaluated at the state of the best hypothesis.
 """
 
 from __future__ import annotations
@@ -14,15 +15,14 @@ from uwb_tdoa_bias.effects.base import TABLE_STEPS, SensorFunction
 from uwb_tdoa_bias.effects.covariates import OF_STATE
 
 SENSORS = ("gyro", "accel")
-# those before them are the position
+# covariates with a smaller index are the position
 SPEED, CLIMB_RATE = (OF_STATE.index("speed"), OF_STATE.index("climb_rate"))
 
-# A SensorFunction, by its fields.
-SENSOR_FUNCTION = np.dtype(
+SENSOR_FUNCTION = np.dtype(  # A SensorFunction as a record with the same fields.
     [
         ("sensor", np.int64),
         ("axis", np.int64),
-        ("covariate", np.int64),  # the first and the last by their places
+        ("covariate", np.int64),  # this and `sensor` are indices into OF_STATE and SENSORS
         ("low", float),
         ("high", float),
         ("values", float, TABLE_STEPS + 1),
@@ -33,7 +33,7 @@ SENSOR_FUNCTION = np.dtype(
 
 
 def rows_of(functions: Sequence[SensorFunction]) -> np.ndarray:
-    """(k,) of SENSOR_FUNCTION, of SensorFunctions."""
+    """Return SensorFunctions as (k,) SENSOR_FUNCTION."""
     out = np.zeros(len(functions), SENSOR_FUNCTION)
     for row, function in zip(out, functions):
         row["sensor"], row["covariate"] = (
@@ -47,7 +47,7 @@ def rows_of(functions: Sequence[SensorFunction]) -> np.ndarray:
 
 @compiled
 def subtract(functions: np.ndarray, x: np.ndarray, sample: Record) -> None:
-    """Take (k,) of SENSOR_FUNCTION at a nominal state x out of an IMU_SAMPLE."""
+    """Subtract (k,) SENSOR_FUNCTION, evaluated at a nominal state x (16,), from an IMU_SAMPLE."""
     for k in range(len(functions)):
         function = functions[k]
         if function.covariate == SPEED:
@@ -60,6 +60,7 @@ def subtract(functions: np.ndarray, x: np.ndarray, sample: Record) -> None:
         reading[function.axis] -= _value(function, at)
 
 
+# Return a SENSOR_FUNCTION at a covariate, by linear interpolation, rad/s or m/s^2.
 @compiled
 def _value(function: Record, at: float) -> float:
     place = (at - function.low) / (function.high - function.low)

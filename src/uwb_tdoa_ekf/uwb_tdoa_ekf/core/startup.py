@@ -1,8 +1,8 @@
-"""Where is the tag? A position and velocity from a short window of TDOAs and nothing else.
+"""Position and velocity of a tag from a short window of TDOAs.
 
-In a room the search begins in the middle and the corners of its workspace. Where that is large a
-coarse grid over it says where else to begin. TDOAs that are older than a usual window, of a tag
-that hears few, tell less, as the tag may have moved by any acceleration since.
+In a room the search starts in the middle and the corners of the workspace. In a large workspace, a
+coarse grid gives more starts. If a tag hears few TDOAs, the window is longer than usual. Older
+TDOAs then count less, because the tag may have accelerated since.
 """
 
 from __future__ import annotations
@@ -19,32 +19,34 @@ from uwb_tdoa_bias.common.robust_loss import GEMAN_MCCLURE, geman_mcclure_loss, 
 from .ground import KnownHeight, solve
 from .workspace import configured_side, reflect, rows_heard
 
-STARTS = 9  # the middle of the workspace and the corners of the half-size box around it,
-GRID_STARTS = 7  # and the best places of a grid over one that is larger than
-LARGE = 20.0  # m, along x or y
-# m, between its places at least; how many at a height at most; m between heights at most
+STARTS = 9  # the middle of the workspace and the corners of the half-size box around it
+GRID_STARTS = 7  # best points of the grid in a large workspace
+LARGE = 20.0  # m along x or y, above which a workspace is large
+# least horizontal distance of grid points, m; most points at a height; largest vertical distance, m
 GRID_STEP, GRID_POINTS, GRID_LEVEL = 2.0, 600, 4.0
-GRID_LEVELS = 20  # heights at most: the work has a bound, however far the anchors are apart
-GRID_TDOAS = 60  # of the window, that it looks at
-# grid steps: scale of the loss, and between two of the best places
+GRID_LEVELS = 20  # most heights: this limits the work, however far apart the anchors are
+GRID_TDOAS = 60  # TDOAs of the window that the grid search uses
+# grid steps: scale of the loss; least distance of two best points
 GRID_LOSS, GRID_APART = (1.5, 2.5)
 SWEEPS = 14  # Gauss-Newton steps per start
 COARSE, FINE = 5.0, 0.5  # m, scale of the Geman-McClure loss at the first and the last steps
-SPEED = 1.0  # m/s, standard deviation of the velocity before anything is known
-LONGEST_STEP = 2.0  # m
-INLIER = 0.75  # m, a residual below this does not contradict a position
-NO_SCALE = 1e6  # m, of a loss that is quadratic
-APART = 1.0  # m between two places, and standard deviation of a place that becomes two
-# minus the logarithm of the probability of a place beside another, beyond which it is none
+SPEED = 1.0  # m/s, prior standard deviation of the velocity
+LONGEST_STEP = 2.0  # m, longest change of the position in a Gauss-Newton step
+INLIER = 0.75  # m; a smaller residual agrees with a position
+NO_SCALE = 1e6  # m, scale of a loss that is quadratic in practice
+APART = 1.0  # m between two places; also the standard deviation above which a place is split
+# minus the log probability ratio to the best place, above which a place is dropped
 IMPROBABLE = 8.0
-SMALLEST = 1e-300  # m^2, in place of a variance of 0
-SPLIT = 0.8  # standard deviations from the middle of a place to each of two that it becomes
+SMALLEST = 1e-300  # m^2, replaces a variance of 0
+SPLIT = 0.8  # standard deviations from the middle of a place to each half after a split
 
 
 class Places(NamedTuple):
-    """Places where a tag may be: positions and velocities x (k, 6) m, m/s (or positions alone, (k,
-    3)), their covariance (k, 6, 6), and minus the logarithm of the probability of each, up to a
-    constant, cost (k,): inf for a place that is none.
+    """Places where a tag may be, with their probabilities.
+
+    x : (k, 6) positions (m) and velocities (m/s), world frame, or (k, 3) positions. covariance :
+    (k, 6, 6), or (k, 3, 3). cost : (k,), minus the logarithm of each probability, up to a constant;
+    inf for an unused place.
     """
 
     x: np.ndarray
@@ -54,7 +56,7 @@ class Places(NamedTuple):
 
 @compiled
 def room_for(count: int) -> Places:
-    """Places to be filled in."""
+    """Return `count` Places to be filled in."""
     return Places(np.empty((count, 6)), np.empty((count, 6, 6)), np.empty(count))
 
 
@@ -67,20 +69,36 @@ def locate(
     height: KnownHeight,
     places: Places,
 ) -> float:
-    """Robust multilateration over a window, with constant velocity.
+    """Estimate the position and velocity of a tag by robust multilateration over a window.
 
-    window : (n,) of TDOA, stamps rising; anchors : (N,) of ANCHOR; workspace : (2, 3) m, see
-        workspace.py; parameters : one of
-    PARAMETERS. Fills in places, at the last stamp, with costs less that of the first: the most
-    probable one first, then others that are APART. In a large workspace the covariance of the last
-    one holds those for which there is no room. Returns the share of TDOAs that agree with the
-    first, 0 to 1.
+    The tag moves at constant velocity. The method is graduated Geman-McClure: Gauss-Newton from
+    several starts while the loss narrows. The start with the least final loss wins. The prior is
+    that a tag is in its workspace and slow. Without this prior, late arrivals on a floor are
+    explained best by a tag ten metres up. The covariance counts one independent error per heard
+    anchor, not per TDOA, because errors persist over the window. It grows with the remaining
+    residuals.
 
-    Graduated Geman-McClure: Gauss-Newton from several starts while the loss narrows; the start with
-    the least final loss wins. A tag is in its workspace and slow until proven otherwise: without
-    that prior, the late arrivals on a floor are explained best by a tag ten metres up. The
-    covariance counts one independent error per anchor heard, not per TDOA, because errors persist
-    over the window, and grows with the disagreement that is left.
+    Parameters
+    ----------
+    window : (n,) TDOA
+        TDOAs, by rising stamp.
+    anchors : (N,) ANCHOR
+        All anchors, by row.
+    workspace : (2, 3) array
+        Lower and upper bounds, m, world frame, see workspace.py.
+    parameters : PARAMETERS
+        Tuning of the filter.
+    height : KnownHeight
+        Height by another sensor.
+    places : Places
+        Filled with places at the last stamp, the most probable first, then others that are APART.
+        Costs are relative to the first. In a large workspace, the covariance of the last place
+        includes all remaining places.
+
+    Returns
+    -------
+    float
+        Share of TDOAs that agree with the first place, 0 to 1.
     """
     x, covariance, cost = places.x, places.covariance, places.cost
     std, ageing = parameters.tdoa_std, np.zeros(len(window))
@@ -150,8 +168,9 @@ def locate(
 
 @compiled
 def _hold_others(trials: np.ndarray, costs: np.ndarray, places: Places) -> None:
-    """Spread the last of the places that is one over the others (m, 6) that are left, whose costs
-    (m,) are inf where they are not.
+    """Widen the covariance of the last used place to include all remaining places.
+
+    trials (m, 6) are the remaining places, costs (m,) their costs; inf if already used.
     """
     x, covariance, cost = places.x, places.covariance, places.cost
     last = 0
@@ -181,8 +200,22 @@ def _best_of_grid(
     ageing: np.ndarray,
     places: np.ndarray,
 ) -> int:
-    """Fill in places (k, 6), at rest, of a grid over `mean` +- `prior_std` (6,) that explain a
-    window best, apart from each other. Returns how many.
+    """Fill in the grid points that explain a window best, and return their number.
+
+    The points are apart from each other by GRID_APART grid steps.
+
+    Parameters
+    ----------
+    window : (n,) TDOA
+        TDOAs, by rising stamp.
+    anchors : (N,) ANCHOR
+        All anchors, by row.
+    mean, prior_std : (6,) array
+        The grid covers mean +- prior_std.
+    ageing : (n,) array
+        Additional variance of each TDOA, see `_normal_equations`.
+    places : (k, 6) array
+        Positions (m, world frame), at rest. Filled.
     """
     step = max(
         GRID_STEP,
@@ -226,15 +259,17 @@ def _best_of_grid(
 
 @compiled
 def split(places: Places) -> None:
-    """Where there is a single one of two places, and it is less known than APART along any
-    direction, fill in two of equal probability that have the same mean and covariance together:
-    TDOAs are as curved there as the anchors are far.
+    """Split an uncertain place into two places of equal probability.
+
+    This applies to a single place with a standard deviation above APART along any direction. Mean
+    and covariance of both together stay the same. Over such distances the TDOA model may be
+    nonlinear: its curvature depends on the distance to the anchors.
     """
     x, covariance, cost = places.x, places.covariance, places.cost
     axis, variance = np.empty(3), 0.0
     for start in range(
         3
-    ):  # power iteration; the principal axis is not normal to all axes of the world
+    ):  # power iteration: at least one start is not normal to the principal axis
         trial, its = np.zeros(3), 0.0
         trial[start] = 1.0
         for _ in range(30):
@@ -246,7 +281,7 @@ def split(places: Places) -> None:
     if cost[1] < np.inf or variance < APART**2:
         return
     step, cost[1] = np.empty(6), cost[0]
-    for i in range(6):  # the velocity goes along, as far as it is correlated
+    for i in range(6):  # the velocity moves too, in proportion to its correlation
         step[i] = SPLIT / math.sqrt(variance) * np.sum(covariance[0, i, :3] * axis)
     for i in range(6):
         for j in range(6):
@@ -258,13 +293,19 @@ def split(places: Places) -> None:
 
 @compiled
 def share_of_inliers(window: np.ndarray, anchors: np.ndarray, x: np.ndarray) -> float:
-    """Share of the window's TDOAs that agree with position and velocity x (6,) at its end, 0 to 1."""
+    """Return the share of TDOAs of a window that agree with a state at its end, 0 to 1.
+
+    x is position (m) and velocity (m/s), (6,), world frame.
+    """
     return float(np.mean(inliers(window, anchors, x)))
 
 
 @compiled
 def inliers(window: np.ndarray, anchors: np.ndarray, x: np.ndarray) -> np.ndarray:
-    """(n,) bool, which of the window's TDOAs agree with position and velocity x (6,) at its end."""
+    """Return (n,) bool: which TDOAs of a window agree with a state at its end.
+
+    x is position (m) and velocity (m/s), (6,), world frame.
+    """
     residuals = np.empty(len(window))
     _normal_equations(
         window, anchors, x, np.zeros(len(window)), NO_SCALE, np.empty((6, 7)), residuals
@@ -274,8 +315,16 @@ def inliers(window: np.ndarray, anchors: np.ndarray, x: np.ndarray) -> np.ndarra
 
 @compiled
 def level(accel: np.ndarray, yaw: float, x: np.ndarray) -> None:
-    """Write to x the attitude in which `accel` (3,), the mean specific force, points up, and which
-    has this yaw.
+    """Set the attitude of a nominal state from the mean specific force and a yaw.
+
+    Parameters
+    ----------
+    accel : (3,) array
+        Mean specific force, m/s^2, body frame. It points up in the world.
+    yaw : float
+        Yaw, rad.
+    x : (16,) array
+        Nominal state; its quaternion is set.
     """
     roll = math.atan2(accel[1], accel[2])
     pitch = math.atan2(-accel[0], math.hypot(accel[1], accel[2]))
@@ -296,7 +345,7 @@ def level(accel: np.ndarray, yaw: float, x: np.ndarray) -> None:
 def _step(
     trial: np.ndarray, system: np.ndarray, prior_information: np.ndarray, mean: np.ndarray
 ) -> None:
-    """One Gauss-Newton step of `trial` (6,), with a prior about `mean` (6,)."""
+    """Apply a Gauss-Newton step to `trial` (6,), with a prior about `mean` (6,)."""
     for k in range(6):
         system[k, k] += prior_information[k]
         system[k, 6] += prior_information[k] * (mean[k] - trial[k])
@@ -316,12 +365,30 @@ def _normal_equations(
     system: np.ndarray,
     residuals: np.ndarray,
 ) -> float:
-    """Weighted normal equations of the window at x (6,): information matrix and gradient to
-    `system` (6, 7).
+    """Compute the weighted normal equations of a window at a state, and return the loss.
 
-    ageing : (n,) variance of where the tag was, per axis, beyond what x says, over that of a TDOA,
-        by which its residual counts less.
-    Returns the mean Geman-McClure loss, 0 to 1; writes the residuals (n,), m.
+    Parameters
+    ----------
+    window : (n,) TDOA
+        TDOAs, by rising stamp.
+    anchors : (N,) ANCHOR
+        All anchors, by row.
+    x : (6,) array
+        Position (m) and velocity (m/s) at the last stamp, world frame.
+    ageing : (n,) array
+        Ratio of two variances: position of the tag per axis beyond x, and TDOA. It reduces the
+        weight.
+    scale : float
+        Scale of the Geman-McClure loss, m.
+    system : (6, 7) array
+        Information matrix and gradient. Filled.
+    residuals : (n,) array
+        Residuals, m. Filled.
+
+    Returns
+    -------
+    float
+        Mean Geman-McClure loss, 0 to 1.
     """
     system[:, :] = 0.0
     loss, n = 0.0, len(window)

@@ -1,9 +1,9 @@
-"""The nominal state, its error state, and their prediction with one IMU sample.
+"""Nominal state, error state, and their prediction with an IMU sample.
 
 Nominal state x, (16,): position p (m) and velocity v (m/s) in the world, quaternion q (x y z w,
 body to world), accelerometer bias (m/s^2) and gyroscope bias (rad/s) in the body frame. Error
-state, (15,), with covariance P: [dp, dv, dtheta, dba, dbg], where the true attitude is q *
-Exp(dtheta), dtheta in the body frame. Motion model: eq. 14 of Zhao et al. (RA-L 2021).
+state, (15,), with covariance P: [dp, dv, dtheta, dba, dbg]. The true attitude is q * Exp(dtheta),
+with dtheta (rad) in the body frame. Motion model: eq. 14 of Zhao et al. (RA-L 2021).
 """
 
 from __future__ import annotations
@@ -16,17 +16,18 @@ from uwb_tdoa_bias.common.compiled import Record, compiled
 
 GRAVITY = 9.81  # m/s^2, along -z of the world
 NOMINAL_STATES, ERROR_STATES = 16, 15
-MOVING_STATES = 9  # the first of the error states; those behind them are biases, which only wander
+MOVING_STATES = 9  # first error states; the states behind are biases, which only random-walk
 
-# One step of the error state: what in its transition differs from the identity, see `propagate`.
+# Transition of the error state over a step: the blocks that differ from the identity, see
+# `propagate`.
 TRANSITION = np.dtype(
     [
         ("dt", float),  # s
-        ("rotation", float, (3, 3)),  # body to world at the beginning
+        ("rotation", float, (3, 3)),  # body to world, at the beginning of the step
         ("velocity_attitude", float, (3, 3)),  # -R [f]x dt
         ("velocity_accel_bias", float, (3, 3)),  # -R diag(accel_weight) dt
         ("attitude_attitude", float, (3, 3)),  # Exp(-w dt)
-        # room for the upper rows of a transition times a matrix
+        # scratch: upper rows of the transition times a matrix
         ("product", float, (MOVING_STATES, ERROR_STATES)),
     ],
     align=True,
@@ -35,7 +36,7 @@ TRANSITION = np.dtype(
 
 @compiled
 def rotation(qx: float, qy: float, qz: float, qw: float, R: np.ndarray) -> None:
-    """R (3, 3): body to world, from a unit quaternion."""
+    """Compute the rotation matrix R (3, 3), body to world, from a unit quaternion."""
     R[0, 0] = 1 - 2 * (qy * qy + qz * qz)
     R[0, 1] = 2 * (qx * qy - qz * qw)
     R[0, 2] = 2 * (qx * qz + qy * qw)
@@ -49,7 +50,7 @@ def rotation(qx: float, qy: float, qz: float, qw: float, R: np.ndarray) -> None:
 
 @compiled
 def exponential(r0: float, r1: float, r2: float) -> tuple[float, float, float, float]:
-    """Exp(r): the quaternion x y z w of a rotation vector (rad)."""
+    """Return Exp(r): the quaternion (x, y, z, w) of a rotation vector in rad."""
     angle = math.sqrt(r0 * r0 + r1 * r1 + r2 * r2)
     s = 0.5 if angle < 1e-8 else math.sin(0.5 * angle) / angle
     return s * r0, s * r1, s * r2, math.cos(0.5 * angle)
@@ -57,7 +58,10 @@ def exponential(r0: float, r1: float, r2: float) -> tuple[float, float, float, f
 
 @compiled
 def turn(x: np.ndarray, bx: float, by: float, bz: float, bw: float) -> None:
-    """q <- q * b, for a unit quaternion b of a rotation in the body frame."""
+    """Multiply the attitude: q <- q * b.
+
+    b is a unit quaternion (x, y, z, w) of a rotation in the body frame.
+    """
     ax, ay, az, aw = x[6], x[7], x[8], x[9]
     qx = aw * bx + ax * bw + ay * bz - az * by
     qy = aw * by - ax * bz + ay * bw + az * bx
@@ -69,7 +73,7 @@ def turn(x: np.ndarray, bx: float, by: float, bz: float, bw: float) -> None:
 
 @compiled
 def inject(x: np.ndarray, direction: np.ndarray, size: float) -> None:
-    """Add the error direction * size, (15,), to the nominal state."""
+    """Add the error direction * size, (15,), to the nominal state x (16,)."""
     for j in range(6):
         x[j] += direction[j] * size
     bx, by, bz, bw = exponential(direction[6] * size, direction[7] * size, direction[8] * size)
@@ -82,14 +86,26 @@ def inject(x: np.ndarray, direction: np.ndarray, size: float) -> None:
 def predict(
     hypothesis: Record, imu: Record, parameters: Record, dt: float, transition: Record
 ) -> None:
-    """Advance a HYPOTHESIS by dt seconds with the input that an IMU_STATE holds; fills the
-    TRANSITION.
+    """Predict a HYPOTHESIS over dt with an inertial sample.
+
+    Parameters
+    ----------
+    hypothesis : HYPOTHESIS
+        State and covariance, updated in place.
+    imu : IMU_STATE
+        Holds the input: angular rate (rad/s) and specific force (m/s^2) in the body frame, and its
+        noise.
+    parameters : PARAMETERS
+        Tuning of the filter.
+    dt : float
+        Duration, s.
+    transition : TRANSITION
+        Filled by this function.
     """
     _move(hypothesis.x, imu, dt, transition)
     P, T = hypothesis.P, transition.product
     propagate(P, transition)
-    # P <- T Phi', T = Phi P: the triangle is computed, the rest mirrored
-    A, B, E = (
+    A, B, E = (  # P <- T Phi', T = Phi P: one triangle is computed, the rest is mirrored.
         transition.velocity_attitude,
         transition.velocity_accel_bias,
         transition.attitude_attitude,
@@ -112,10 +128,10 @@ def predict(
 
 @compiled
 def _move(x: np.ndarray, imu: Record, dt: float, transition: Record) -> None:
-    """The nominal state; fills the TRANSITION.
+    """Predict the nominal state over dt (s) and fill in the TRANSITION.
 
-    The specific force that drives it is between hovering (gravity along body z) and what was
-    measured, by imu.accel_weight for each axis.
+    The specific force lies between hovering (gravity along body z) and the measurement.
+    imu.accel_weight sets the share of the measurement for each axis.
     """
     R, weight = transition.rotation, imu.accel_weight
     rotation(x[6], x[7], x[8], x[9], R)
@@ -140,11 +156,10 @@ def _move(x: np.ndarray, imu: Record, dt: float, transition: Record) -> None:
 
 @compiled
 def propagate(M: np.ndarray, transition: Record) -> None:
-    """transition.product <- the upper rows of Phi M for a matrix M (15, 15); its lower rows stay
-    what they are.
+    """Compute transition.product, the upper rows of Phi M, for a matrix M (15, 15).
 
-    Phi, by what of it differs from the identity: dp' = dp + dv dt;  dv' = dv - R ([f]x dtheta + W dba) dt;
-    dtheta' = Exp(-w dt) dtheta - dbg dt.
+    The lower rows of M stay the same. The blocks of Phi that differ from the identity follow from:
+    dp' = dp + dv dt; dv' = dv - R ([f]x dtheta + W dba) dt; dtheta' = Exp(-w dt) dtheta - dbg dt.
     """
     dt, out = transition.dt, transition.product
     A, B, E = (
@@ -167,7 +182,11 @@ def propagate(M: np.ndarray, transition: Record) -> None:
 def _add_noise(
     P: np.ndarray, R: np.ndarray, accel_psd: np.ndarray, parameters: Record, dt: float
 ) -> None:
-    """White noise of the sensors over dt, and the random walks of their biases."""
+    """Add the process noise over dt (s) to the covariance P (15, 15).
+
+    It consists of the white noise of the sensors and the random walks of their biases. R (3, 3) is
+    body to world. accel_psd is (3,), (m/s^2)^2/Hz, body frame.
+    """
     s0, s1, s2 = dt * accel_psd[0], dt * accel_psd[1], dt * accel_psd[2]
     for r in range(3):
         for c in range(r, 3):
@@ -182,10 +201,18 @@ def _add_noise(
 
 @compiled
 def coast(hypothesis: Record, dt: float, accel_psd: float, tilt_psd: float, yaw_psd: float) -> None:
-    """Advance by dt seconds with no inertial sample: constant velocity with random acceleration,
-    attitude held.
+    """Predict a HYPOTHESIS without inertial samples: constant velocity, constant attitude.
 
-    accel_psd (m/s^2)^2/Hz; tilt_psd, yaw_psd (rad/s)^2/Hz, growth of the attitude's uncertainty.
+    Parameters
+    ----------
+    hypothesis : HYPOTHESIS
+        State and covariance, updated in place.
+    dt : float
+        Duration, s.
+    accel_psd : float
+        Power spectral density of the random acceleration, (m/s^2)^2/Hz.
+    tilt_psd, yaw_psd : float
+        Growth of the variance of roll and pitch, and of yaw, (rad/s)^2/Hz.
     """
     x, P = hypothesis.x, hypothesis.P
     for i in range(3):
@@ -204,9 +231,9 @@ def coast(hypothesis: Record, dt: float, accel_psd: float, tilt_psd: float, yaw_
 
 @compiled
 def turn_about_vertical(x: np.ndarray, angle: float) -> None:
-    """Turn the attitude of a nominal state by an angle, rad, about the world's z.
+    """Rotate the attitude of a nominal state by an angle (rad) about the z axis of the world.
 
-    The attitude error, which is of the body, stays.
+    The attitude error stays the same, because it is in the body frame.
     """
     sine, cosine = math.sin(0.5 * angle), math.cos(0.5 * angle)
     qx, qy, qz, qw = x[6], x[7], x[8], x[9]
@@ -218,7 +245,7 @@ def turn_about_vertical(x: np.ndarray, angle: float) -> None:
 def difference(
     a: np.ndarray, b: np.ndarray
 ) -> tuple[float, float, float, float, float, float, float, float, float]:
-    """Error state that leads from nominal state a to b, its first nine elements: [dp, dv, dtheta]."""
+    """Return the error from nominal state a to b, without biases: [dp, dv, dtheta], 9 elements."""
     ax, ay, az, aw = -a[6], -a[7], -a[8], a[9]
     bx, by, bz, bw = b[6], b[7], b[8], b[9]
     x = aw * bx + ax * bw + ay * bz - az * by

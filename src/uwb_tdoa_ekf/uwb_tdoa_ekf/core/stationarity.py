@@ -1,8 +1,8 @@
-"""A tag that does not move: its velocity is zero, and what it hears from one place tells that place
-once.
+"""Detection of a tag at rest, and zero-velocity updates.
 
-Inertial samples alone cannot tell rest from a steady glide, and they shake while rotors idle on the
-ground. TDOAs can, whatever their systematic errors are: at rest they stay what they are.
+Inertial samples alone cannot distinguish rest from a steady glide, and they vibrate while rotors
+idle on the ground. TDOAs can, whatever their systematic errors are: at rest they do not change. All
+TDOAs from one place have the same errors, so they count once.
 """
 
 from __future__ import annotations
@@ -18,45 +18,56 @@ from .state import GRAVITY, rotation
 from .update import update_state
 
 PERIOD = 0.05  # s between zero-velocity updates
-# m/s, standard deviation of such an update: of a quiet inertial sensor, and of one that shakes
+# m/s, standard deviation of a zero-velocity update: with a quiet IMU, and with a vibrating one
 QUIET_STD, SHAKING_STD = (0.02, 0.15)
-SPEED = 0.05  # m/s; a quiet tag that is known to be slower stands, a faster one may glide
-LOOK_PERIOD, LOOK_WINDOW = 0.1, 0.4  # s between two looks at the TDOAs, and s of TDOAs in each
-# looks in a row with changed TDOAs that end a rest: one look in twenty shows a change by chance
+SPEED = 0.05  # m/s; a quiet tag that is known to be slower is at rest, a faster one may glide
+LOOK_PERIOD, LOOK_WINDOW = 0.1, 0.4  # s between two checks of the TDOAs, and s of TDOAs in each
+# checks in a row with changed TDOAs that end a rest: a check shows a change by chance in 1 of 20
+# cases
 MOST_DOUBTS = 3
-# m/s; where the inertial sensor has felt more lift than that, one such look ends the rest
+# m/s; if the IMU has measured a larger change of velocity, a single such check ends the rest
 UNFELT = 0.06
-# looks in a row without a change that begin the rest of a quiet tag: fewer may be a turning point
+# checks in a row without a change that begin the rest of a quiet tag: fewer may be a turning point
 LONG = 10
-# s after the start, or after its last rest began, within which so many looks are enough
+# s after the start, or after the beginning of its last rest, within which this number of checks
+# suffices
 EARLY, LONG_ENOUGH = (1.5, 3)
-AGAIN = 0.3  # s between two corrections of a tag that is near the ground, and is not known to stand
-# standard deviations of the velocity that inertial samples tell, beyond which the tag moves
-GATE = 3.0
-# rotors or wheels have stopped when the vibration is below that share of its mean over so many
-# seconds
+AGAIN = 0.3  # s between two corrections of a tag near the ground that is not known to stand
+GATE = 3.0  # standard deviations of the predicted velocity, beyond which the tag moves
+# rotors or wheels have stopped if the vibration is below this share of its mean over this time, s
 CALM, SHAKING_MEMORY = (0.1, 2.0)
-LIFT = 0.25  # m/s upwards that end a rest when the inertial sensor measures them
-LIFT_MEMORY = 0.7  # s over which what it feels adds up
-AWAY = 1.5  # s after such an end, for which the tag is not taken for one at rest again
-SILENT = 0.5  # s without TDOAs after which a tag that shakes is not known to be at rest
-# s; TDOAs of a tag at rest have the same errors: those of each such interval repeat what is known
-# once more
+LIFT = 0.25  # m/s upwards; a larger change of velocity, measured by the IMU, ends a rest
+LIFT_MEMORY = 0.7  # s over which the measured acceleration is integrated
+AWAY = 1.5  # s after such an end in which no new rest begins
+SILENT = 0.5  # s without TDOAs after which a vibrating tag is not known to be at rest
+# s; TDOAs of a tag at rest have the same errors, so each such interval adds one repetition
 SAME_ERROR = 0.01
 
 
 @compiled
 def repetition(ekf: Record, t: float) -> float:
-    """Factor on the variance of a TDOA stamped t, s: how many times over the TDOAs of this rest
-    have measured the same, errors included.
+    """Return the variance inflation of a TDOA stamped t (s) by repetition at rest.
+
+    It is the number of times that TDOAs of this rest have measured the same value, with the same
+    errors.
     """
     return 1.0 + (t - ekf.rest_since) / SAME_ERROR if ekf.resting else 1.0
 
 
 @compiled
 def detect_liftoff(ekf: Record, sample: Record, dt: float, records: np.ndarray) -> None:
-    """Take an IMU_SAMPLE of a tag that is at rest, dt s after the one before: if it is lifted, it
-    moves as fast as that has made it.
+    """Detect that a tag at rest is lifted, and set its velocity to the integrated acceleration.
+
+    Parameters
+    ----------
+    ekf : EKF
+        State of the filter, updated in place.
+    sample : IMU_SAMPLE
+        The new sample, body frame.
+    dt : float
+        Time since the last sample, s.
+    records : (n,) RECORD
+        History for the smoother; empty for no recording.
     """
     if not ekf.resting:
         ekf.shaking += min(1.0, dt / SHAKING_MEMORY) * (np.sum(ekf.imu.vibration) - ekf.shaking)
@@ -91,8 +102,25 @@ def check_stationarity(
     t: float,
     records: np.ndarray,
 ) -> None:
-    """Whether the tag is at rest, by a window (n,) of TDOA up to stamp t, s, where that can be; not
-    before ekf.next_look.
+    """Detect whether the tag is at rest, from a window of TDOAs.
+
+    Call not before ekf.next_look. The function sets ekf.resting. A tag that has landed is moved to
+    its estimated position on the ground.
+
+    Parameters
+    ----------
+    ekf : EKF
+        State of the filter, updated in place.
+    anchors : (N,) ANCHOR
+        All anchors, by row.
+    parameters : PARAMETERS
+        Tuning of the filter.
+    window : (n,) TDOA
+        TDOAs of the last LOOK_WINDOW seconds, up to stamp t.
+    t : float
+        Stamp, s.
+    records : (n,) RECORD
+        History for the smoother; empty for no recording.
     """
     ekf.next_look = t + LOOK_PERIOD
     best = ekf.hypotheses[ekf.best]
@@ -102,7 +130,7 @@ def check_stationarity(
     count = ground.find_pairs(window, ekf.pairs)
     motion = ground.judge_motion(ekf.pairs[:count], anchors, best.x, ekf.still_covariance)
     still = motion == ground.STILL
-    # too few TDOAs: no evidence, and neither has the inertial sensor any
+    # too few TDOAs and a quiet IMU give no evidence
     unshown = motion == ground.UNKNOWN and ekf.quiet
     if ekf.resting:
         if not unshown:
@@ -136,8 +164,18 @@ def check_stationarity(
 
 @compiled
 def update_zero_velocity(ekf: Record, t: float, records: np.ndarray) -> None:
-    """Zero velocity, one axis after the other, for a tag at rest, and for a quiet one that TDOAs
-    have shown to be slow.
+    """Apply a zero-velocity update to a tag at rest, and to a quiet tag with a slow velocity.
+
+    The three axes are updated in sequence, at most once per PERIOD.
+
+    Parameters
+    ----------
+    ekf : EKF
+        State of the filter, updated in place.
+    t : float
+        Stamp, s.
+    records : (n,) RECORD
+        History for the smoother; empty for no recording.
     """
     if ekf.resting and not ekf.quiet and t - ekf.last_tdoa > SILENT:
         ekf.resting = False
@@ -165,7 +203,7 @@ def update_zero_velocity(ekf: Record, t: float, records: np.ndarray) -> None:
 
 @compiled
 def _moves(hypothesis: Record, std: float) -> bool:
-    """Whether inertial samples contradict a velocity of zero, +- std m/s."""
+    """Return whether inertial samples contradict a velocity of zero within `std` (m/s)."""
     for state in range(3, 6):
         if hypothesis.x[state] ** 2 > GATE**2 * (hypothesis.P[state, state] + std**2):
             return True

@@ -1,8 +1,7 @@
-"""Where a tag is that does not move: on the ground, with anchors that are late there, or somewhere
-else.
+"""Position of a tag at rest: on the ground, with late anchors there, or somewhere else.
 
-Nothing is assumed: the explanations are weighed by their probability, and the covariance of the one
-that is taken is as wide as they are apart.
+The explanations are weighed by their probability. The covariance of the best explanation includes
+the spread of all explanations.
 """
 
 from __future__ import annotations
@@ -22,18 +21,20 @@ from .startup import Places
 from .update import update_state
 from .workspace import surround
 
-NEAR = 1.0  # m beyond the anchors
-EXPLANATIONS = 4  # elsewhere, and on the ground with each lateness of ground.explain
-SPEED_STD = 0.05  # m/s, of a tag at rest, beyond what its TDOAs tell
-# Minus the logarithm of the probability, before it is seen,
-ABSURD = 20.0  # that a tag that rests is more than NEAR above or below the anchors,
-UNUSUAL = 3.0  # that anchors are late because they are near the ground, by what nobody knows,
-REACH = 1.0  # m from where they are known to be late, over which echoes become others
-# and by how much the ground must be more probable than what the filter says of a tag that lands
+NEAR = 1.0  # m beyond the anchors that a tag is expected in
+EXPLANATIONS = 4  # somewhere else, and on the ground with each lateness of ground.explain
+SPEED_STD = 0.05  # m/s, of a tag at rest, in addition to the uncertainty from its TDOAs
+# Minus the logarithm of the prior probability that a tag at rest is more than NEAR above or below
+# the anchors,
+ABSURD = 20.0
+UNUSUAL = 3.0  # and that anchors are late by an unknown amount because they are near the ground.
+REACH = 1.0  # m from the place where the lateness of anchors is known, over which echoes change
+# log probability ratio by which the ground must exceed the state of the filter for a landing
 DECISIVE = 6.0
-HOVER_STD = 0.3  # m, of the place of a tag that seems to stand but may hover
-FEWEST_LATE = 1.5  # anchors that are late because the tag is low, where its TDOAs change
-# m, by which the filter may be wrong beyond what it says when a tag lands: mostly in height
+HOVER_STD = 0.3  # m, of the position of a tag that seems to stand but may hover
+# expected number of anchors that are late because the tag is low, if its TDOAs change
+FEWEST_LATE = 1.5
+# m, by which the filter may be wrong at a landing, in addition to its covariance: mostly in height
 LANDING_STD = (0.2, 0.2, 0.5)
 
 
@@ -47,12 +48,31 @@ def weigh(
     x: np.ndarray,
     covariance: np.ndarray,
 ) -> float:
-    """Weigh the explanations of (k,) of ground.PAIR by a tag at rest that may be anywhere in its
-    workspace: position x (6,) with its covariance (6, 6), and the ground, with each lateness of
-    ground.explain.
+    """Weigh the explanations of TDOAs by a tag at rest anywhere in its workspace.
 
-    The best one goes to x and covariance. Returns the logarithm of how much more probable the
-    ground is.
+    The explanations are the given position, and the ground with each lateness of ground.explain.
+
+    Parameters
+    ----------
+    ekf : EKF
+        State of the filter; late_as_known is set.
+    pairs : (k,) PAIR
+        Pairs of anchors, from `ground.find_pairs`.
+    anchors : (N,) ANCHOR
+        All anchors, by row.
+    parameters : PARAMETERS
+        Tuning of the filter.
+    height : KnownHeight
+        Height by another sensor.
+    x : (6,) array
+        Position (m) and velocity (m/s), world frame. The best position is written to it.
+    covariance : (6, 6) array
+        Covariance of x; it becomes the covariance of the best explanation.
+
+    Returns
+    -------
+    float
+        Logarithm of the probability ratio of the ground to the given position.
     """
     prior, bounds = np.zeros((4, 3)), ekf.workspace
     for k in range(3):
@@ -83,6 +103,7 @@ def weigh(
     return explained.cost[0] - np.min(explained.cost[1:])
 
 
+# Return Places for EXPLANATIONS positions, to be filled in.
 @compiled
 def _explanations() -> Places:
     return Places(
@@ -92,8 +113,14 @@ def _explanations() -> Places:
 
 @compiled
 def sort(places: Places, near: np.ndarray) -> None:
-    """Put the more probable of two places that explain TDOAs first; near : (2, 3) m, bounds of the
-    anchors.
+    """Order two places by probability, the most probable first.
+
+    Parameters
+    ----------
+    places : Places
+        Two places that explain the TDOAs; sorted in place, with costs relative to the first.
+    near : (2, 3) array
+        Lower and upper bounds of the anchors, m, world frame.
     """
     x, covariance, cost = places.x, places.covariance, places.cost
     for place in range(2):
@@ -103,6 +130,7 @@ def sort(places: Places, near: np.ndarray) -> None:
     cost -= cost[0]
 
 
+# Return the cost of a place x (3,), m, outside the heights `near` (2, 3), m.
 @compiled
 def _absurdity(near: np.ndarray, x: np.ndarray) -> float:
     return 0.0 if near[0, 2] <= x[2] <= near[1, 2] else ABSURD
@@ -112,7 +140,10 @@ def _absurdity(near: np.ndarray, x: np.ndarray) -> float:
 def _on_ground(
     ekf: Record, evidence: Evidence, height: KnownHeight, starts: np.ndarray, explained: Places
 ) -> None:
-    """Fill in the explanations from 1 on: on the ground, with each lateness, by starts (k, 2) m."""
+    """Fill in the explanations from 1 on: on the ground, with each lateness.
+
+    starts (k, 2) are the horizontal start positions of the search, m, world frame.
+    """
     position, each, cost = explained.x, explained.covariance, explained.cost
     if math.isnan(height.z):
         height = KnownHeight(
@@ -140,8 +171,9 @@ def _on_ground(
 
 @compiled
 def _mix(explained: Places) -> int:
-    """Place of the most probable explanation; its covariance becomes that of all of them about its
-    position (spread of the means).
+    """Return the index of the most probable explanation, and widen its covariance.
+
+    The covariance about its position includes all explanations (spread of the means).
     """
     position, each, cost = explained.x, explained.covariance, explained.cost
     best = int(np.argmin(cost))
@@ -161,8 +193,16 @@ def _mix(explained: Places) -> int:
 
 @compiled
 def stop(x: np.ndarray, covariance: np.ndarray, of_velocity: np.ndarray) -> None:
-    """Position and velocity x (6,) and their covariance (6, 6) become those of a tag at rest, as
-    far as of_velocity (3, 3) m^2/s^2 determines them.
+    """Set the velocity of a state and its covariance to a tag at rest.
+
+    Parameters
+    ----------
+    x : (6,) array
+        Position and velocity; the velocity becomes 0.
+    covariance : (6, 6) array
+        Covariance of x, updated in place.
+    of_velocity : (3, 3) array
+        Covariance of the velocity that TDOAs allow, m^2/s^2.
     """
     x[3:] = 0.0
     covariance[:, 3:] = 0.0
@@ -175,14 +215,14 @@ def stop(x: np.ndarray, covariance: np.ndarray, of_velocity: np.ndarray) -> None
 
 @compiled
 def is_near_ground(hypothesis: Record, parameters: Record) -> bool:
-    """Whether a tag may stand on the ground, by the height of a HYPOTHESIS."""
+    """Return whether a tag may stand on the ground, by the height of a HYPOTHESIS."""
     lowest = hypothesis.x[2] - ground.DEVIATIONS * math.sqrt(hypothesis.P[2, 2])
     return lowest < parameters.ground_height + ground.GROUND_HEIGHT + ground.GROUND_STD
 
 
 @compiled
 def _expected_late(pairs: np.ndarray, anchors: np.ndarray) -> float:
-    """How many anchors of (k,) of PAIR are expected to be late because the tag is low."""
+    """Return the expected number of late anchors in (k,) PAIR, because the tag is low."""
     late = 0.0
     for row in ground.heard(pairs)[0]:
         late += anchors[row].late
@@ -199,9 +239,29 @@ def find_landed(
     place: np.ndarray,
     covariance: np.ndarray,
 ) -> int:
-    """Whether (k,) of PAIR tell that a tag is on the ground: its lateness, as of ground.explain,
-    and -1 if not. Fills in place (3,) m and covariance (3, 3) m^2. still : TDOAs stay what they
-    are.
+    """Return the lateness of the anchors if a tag is on the ground, and -1 if it is not.
+
+    Parameters
+    ----------
+    ekf : EKF
+        State of the filter.
+    pairs : (k,) PAIR
+        Pairs of anchors, from `ground.find_pairs`.
+    anchors : (N,) ANCHOR
+        All anchors, by row.
+    parameters : PARAMETERS
+        Tuning of the filter.
+    still : bool
+        Whether the TDOAs do not change.
+    place : (3,) array
+        Position on the ground, m, world frame. Filled.
+    covariance : (3, 3) array
+        Covariance of the place, m^2. Filled.
+
+    Returns
+    -------
+    int
+        Lateness as in ground.explain, or -1.
     """
     best = ekf.hypotheses[ekf.best]
     if not is_near_ground(best, parameters) or not (
@@ -235,8 +295,22 @@ def find_landed(
 def set_hovering_position(
     ekf: Record, place: np.ndarray, still: bool, t: float, records: np.ndarray
 ) -> None:
-    """A tag near the ground that does not stand may hover low: its place (3,) m counts to
-    HOVER_STD, of a tag that is not still the height alone.
+    """Update every hypothesis with the place of a tag near the ground that may hover.
+
+    The place counts with HOVER_STD. If the tag is not still, only the height counts.
+
+    Parameters
+    ----------
+    ekf : EKF
+        State of the filter, updated in place.
+    place : (3,) array
+        Position on the ground, m, world frame.
+    still : bool
+        Whether the TDOAs do not change.
+    t : float
+        Stamp, s.
+    records : (n,) RECORD
+        History for the smoother; empty for no recording.
     """
     for h in range(HYPOTHESES):
         if not alive(ekf.hypotheses[h]):
@@ -245,7 +319,7 @@ def set_hovering_position(
             value, std = 0.0, HOVER_STD
             if state < 3:
                 value, P = place[state], ekf.hypotheses[h].P
-                # a place that is measured again adds nothing new
+                # a repeated measurement of a place adds no information
                 P[state, state] = max(P[state, state], HOVER_STD**2)
             else:
                 std = math.sqrt(ekf.still_covariance[state - 3, state - 3] + SPEED_STD**2)
@@ -258,8 +332,20 @@ def set_hovering_position(
 def set_position(
     ekf: Record, position: np.ndarray, covariance: np.ndarray, t: float, records: np.ndarray
 ) -> None:
-    """Every hypothesis to a position (3,), m, with its covariance (3, 3), at rest; attitude and
-    biases stay.
+    """Set every hypothesis to a position at rest; attitude and biases stay the same.
+
+    Parameters
+    ----------
+    ekf : EKF
+        State of the filter, updated in place.
+    position : (3,) array
+        New position, m, world frame.
+    covariance : (3, 3) array
+        Its covariance, m^2.
+    t : float
+        Stamp, s.
+    records : (n,) RECORD
+        History for the smoother; empty for no recording.
     """
     for h in range(HYPOTHESES):
         hypothesis = ekf.hypotheses[h]
@@ -275,7 +361,7 @@ def set_position(
 
 @compiled
 def _inverse(matrix: np.ndarray) -> np.ndarray:
-    """Inverse of a positive definite (3, 3)."""
+    """Return the inverse of a positive definite (3, 3) matrix."""
     both = np.concatenate((matrix, np.eye(3)), axis=1)
     ground.solve(both)
     return both[:, 3:]

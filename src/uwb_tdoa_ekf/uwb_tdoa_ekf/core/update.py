@@ -1,8 +1,8 @@
-"""One scalar measurement against the state, whatever it measures.
+"""Kalman update with a scalar measurement of any kind.
 
-A kind of measurement fills an INNOVATION: which error states it depends on and how, by how much it
-differs from what the state predicts, and the variance of its noise. The rest is the same for all:
-`project`, then `kalman`, by way of `robust.update` if the measurement may be an outlier.
+Each kind of measurement fills an INNOVATION: the Jacobian row with its error states, measured minus
+predicted value, and the variance of the measurement noise. `project` and `kalman` then work for all
+kinds. If the measurement may be an outlier, `robust.update` calls `kalman`.
 """
 
 from __future__ import annotations
@@ -16,35 +16,34 @@ from uwb_tdoa_bias.common.compiled import Record, compiled
 from . import auxiliary
 from .state import ERROR_STATES, inject
 
-LONGEST_ROW = 6  # error states that one measurement may depend on
+LONGEST_ROW = 6  # most error states that a measurement depends on
 JOINT_STATES = ERROR_STATES + auxiliary.OFFSET_STATES
 
 INNOVATION = np.dtype(
     [
-        # the error states that the Jacobian row h has an entry for,
-        ("states", np.int64, LONGEST_ROW),
-        ("row", float, LONGEST_ROW),  # the entries,
-        ("entries", np.int64),  # and how many there are
+        ("states", np.int64, LONGEST_ROW),  # error states with an entry in the Jacobian row h
+        ("row", float, LONGEST_ROW),  # the entries
+        ("entries", np.int64),  # number of entries
         ("value", float),  # measured minus predicted
-        ("noise_variance", float),  # of one measurement
-        ("prior_variance", float),  # h P h', and
-        # what of it comes from a TDOA that is curved within P, see curvature.py
+        ("noise_variance", float),  # of a single measurement
+        ("prior_variance", float),  # h P h', plus curvature
+        # variance of the second-order term of a TDOA within P, see `variance`
         ("curvature", float),
-        # P h', of state and prediction; the gain is this over total_variance
+        # P h', covariance of error state and prediction; the gain is this over total_variance
         ("cross_covariance", float, ERROR_STATES),
-        # entries of the Jacobian row for the auxiliary states: 0, but of their own sensors
+        # entries of the Jacobian row for the auxiliary states; nonzero only for their own sensors
         ("offset_jacobian", float, auxiliary.OFFSET_STATES),
         ("offset_covariance", float, auxiliary.OFFSET_STATES),  # scratch of auxiliary.correct
-        # how often the same error is met, in tdoa_correlation_length: 1, but for a tag that does
-        # not move
+        # factor on the variance by repetition of the same error, in units of
+        # tdoa_correlation_length; 1 unless the tag is at rest
         ("variance_inflation", float),
-        ("weight", float),  # 0 to 1, given by robust.update
-        ("total_variance", float),  # of the value, as the update took it
-        # scratch of the M-estimation: S', by rows the columns of S,
+        ("weight", float),  # 0 to 1, set by robust.update
+        ("total_variance", float),  # variance of the value, as the update used it
+        # scratch of the M-estimation: S', whose rows are the columns of S
         ("factor", float, (JOINT_STATES, JOINT_STATES)),
-        ("scaled_row", float, JOINT_STATES),  # S' h',
-        ("scaled_error", float, JOINT_STATES),  # and of the state scaled by S the error
-        ("prior_weights", float, JOINT_STATES),  # and its weights
+        ("scaled_row", float, JOINT_STATES),  # S' h'
+        ("scaled_error", float, JOINT_STATES),  # error of the state, scaled by S
+        ("prior_weights", float, JOINT_STATES),  # weights of the scaled error
     ],
     align=True,
 )
@@ -52,9 +51,7 @@ INNOVATION = np.dtype(
 
 @compiled
 def project(P: np.ndarray, innovation: Record) -> None:
-    """Fill in what the prior P (15, 15) makes of the Jacobian row: prior_variance and
-    cross_covariance.
-    """
+    """Compute prior_variance and cross_covariance of an INNOVATION from the prior P (15, 15)."""
     covariance = innovation.cross_covariance
     for j in range(ERROR_STATES):
         covariance[j] = 0.0
@@ -71,8 +68,9 @@ def project(P: np.ndarray, innovation: Record) -> None:
 
 @compiled
 def kalman(hypothesis: Record, innovation: Record) -> None:
-    """Kalman update of a HYPOTHESIS with an INNOVATION of value, cross_covariance and
-    total_variance.
+    """Update a HYPOTHESIS with an INNOVATION.
+
+    The function uses value, cross_covariance and total_variance.
     """
     P, covariance, total = hypothesis.P, innovation.cross_covariance, innovation.total_variance
     if auxiliary.present(hypothesis):
@@ -89,8 +87,18 @@ def kalman(hypothesis: Record, innovation: Record) -> None:
 def update_state(
     hypothesis: Record, innovation: Record, state: int, value: float, std: float
 ) -> None:
-    """Kalman update with a measurement of one of the first six states, position and velocity:
-    `value` +- `std`.
+    """Update a HYPOTHESIS with a direct measurement of a position or velocity state.
+
+    Parameters
+    ----------
+    hypothesis : HYPOTHESIS
+        Updated in place.
+    innovation : INNOVATION
+        Scratch.
+    state : int
+        Index of the state, 0 to 5.
+    value, std : float
+        Measured value and its standard deviation, m or m/s, world frame.
     """
     innovation.entries, innovation.states[0], innovation.row[0] = 1, state, 1.0
     innovation.value, innovation.noise_variance = value - hypothesis.x[state], std * std
@@ -99,14 +107,22 @@ def update_state(
     kalman(hypothesis, innovation)
 
 
-SMALLEST = 0.5  # m, 3D standard deviation below which it is negligible
-NEAREST = 0.1  # m, of an anchor, for its curvature
+SMALLEST = 0.5  # m, 3D standard deviation below which the second-order term is negligible
+NEAREST = 0.1  # m, least distance to an anchor, for the curvature of its range
 
 
 @compiled
 def variance(x: np.ndarray, P: np.ndarray, a: np.ndarray, b: np.ndarray) -> float:
-    """Mean square, m^2, of the second-order term of a TDOA between anchors at a and b (3,), of a
-    tag at x (3,), m, with covariance P (15, 15).
+    """Return the mean square of the second-order term of a TDOA, in m^2.
+
+    Parameters
+    ----------
+    x : (16,) array
+        Nominal state. Only the position is used, m, world frame.
+    P : (15, 15) array
+        Covariance of the error state.
+    a, b : (3,) array
+        Positions of the anchors, m, world frame.
     """
     if P[0, 0] + P[1, 1] + P[2, 2] < SMALLEST**2:
         return 0.0
@@ -119,7 +135,7 @@ def variance(x: np.ndarray, P: np.ndarray, a: np.ndarray, b: np.ndarray) -> floa
             for k in range(3):
                 along += away[k] * P[k, i] / distance**2
             for j in range(3):
-                # of Hessian and covariance
+                # Hessian times covariance
                 product[j, i] += sign * (P[j, i] - away[j] * along) / distance
     mean = squared = 0.0
     for i in range(3):

@@ -1,10 +1,10 @@
-"""A velocity in the body frame: wheels, optical flow, visual odometry. Slip and lost features show
-as innovations.
+"""Velocity in the body frame: wheels, optical flow, visual odometry.
 
-A velocity that comes with a yaw rate is that of wheels. While there is no inertial sample, wheels
-drive the prediction: the yaw turns by their yaw rate, the velocity of the state follows theirs, and
-their errors, alike for a while, are noise of the position and the yaw. With inertial samples,
-velocities are measurements, and the yaw rate shows the bias of the gyroscope.
+Slip and lost features show as innovations. A velocity with a yaw rate comes from wheels. Without
+inertial samples, wheels drive the prediction: the yaw turns by their yaw rate, and the velocity of
+the state follows theirs. Their errors persist for CORRELATION_TIME and become process noise of
+position and yaw. With inertial samples, velocities are measurements, and the yaw rate shows the
+bias of the gyroscope.
 """
 
 from __future__ import annotations
@@ -23,27 +23,41 @@ from .state import rotation
 from .update import kalman, project
 
 GATE = 3.0  # standard deviations beyond which a component is not used
-CORRELATION_TIME = 1.0  # s over which its error stays alike
-LONGEST_STD = 1e3  # m/s and rad/s; a component that is less precise is not measured
-# s, and velocities, all the same, after which the sensor of a tag that shakes is stuck
+CORRELATION_TIME = 1.0  # s over which the error of a velocity persists
+LONGEST_STD = 1e3  # m/s and rad/s; a component with a larger standard deviation is not measured
+# s, and number of equal velocities, after which the sensor of a vibrating tag is stuck
 STUCK_TIME, STUCK_COUNT = (0.5, 5)
-AVERAGE = 0.5  # s of innovations that tell whether it agrees with everything else
-# mean normalised innovation squared above which it is not used any more, below which again
+AVERAGE = 0.5  # s over which innovations are averaged to compare the sensor with all others
+# mean normalized innovation squared above which the sensor is refused, and below which it is used
+# again
 DISAGREES, AGREES = (4.0, 2.0)
-# place of the yaw rate in an AID, and error state of the gyroscope's bias about z
+# index of the yaw rate in an AID, and of the error state of the gyroscope bias about z
 YAW_RATE, GYRO_BIAS = (3, 14)
-SLIP = 2.0  # s for which wheels that disagree may slip
+SLIP = 2.0  # s for which disagreeing wheels may slip
 HELD = 0.5  # s for which the last velocity of wheels drives the prediction
-STANDING = 0.1  # times its deviation is that of wheels that do not turn at all
-GYRO_RATE = 100.0  # Hz, of samples of a gyroscope: their noise is gyro_noise times the root of this
+STANDING = 0.1  # factor on the standard deviations of wheels that do not turn at all
+# Hz, sample rate of a gyroscope: the noise of a sample is gyro_noise * sqrt(GYRO_RATE)
+GYRO_RATE = 100.0
 
 
 @compiled
 def observe(
     ekf: Record, parameters: Record, aid: Record, residual: Record, records: np.ndarray
 ) -> None:
-    """Take a velocity, one of AID, into a running filter; fills one of RESIDUAL with its worst
-    component.
+    """Update a running filter with a velocity.
+
+    Parameters
+    ----------
+    ekf : EKF
+        State of the filter, updated in place.
+    parameters : PARAMETERS
+        Tuning of the filter.
+    aid : AID
+        Velocity (m/s, body frame) and yaw rate (rad/s). Missing standard deviations are set.
+    residual : RESIDUAL
+        Filled with the component that has the largest normalized innovation.
+    records : (n,) RECORD
+        History for the smoother; empty for no recording.
     """
     state, innovation = ekf.velocity, ekf.innovation
     dt = min(max(aid.t - state.heard, 1e-3), AVERAGE)
@@ -55,7 +69,7 @@ def observe(
     inflation = max(1.0, 2.0 * CORRELATION_TIME / dt)
     worst = _worst(ekf, aid, residual)
     state.nis += min(1.0, dt / AVERAGE) * (min(worst, GATE**4) - state.nis)
-    # simulated wheels turn evenly
+    # simulated wheels turn evenly, so they may repeat values
     stuck = frozen and (state.refused or (np.any(state.value != 0.0) and not of_wheels))
     state.refused = state.nis > (AGREES if state.refused else DISAGREES) or stuck
     residual.weight, residual.verdict = 0.0, REJECTED
@@ -109,22 +123,24 @@ def observe(
 
 @compiled
 def drives(state: Record, t: float) -> bool:
-    """Whether wheels, by the state of a VELOCITY, tell the motion up to stamp t, s."""
+    """Return whether wheels, by their VELOCITY state, drive the prediction at stamp t (s)."""
     return not state.refused and t - state.agreed < HELD
 
 
 @compiled
 def agrees(state: Record, t: float) -> bool:
-    """Whether wheels, by the state of a VELOCITY, have agreed with everything else until lately, at
-    stamp t, s: slip ends soon.
+    """Return whether wheels, by their VELOCITY state, have agreed lately at stamp t (s).
+
+    Slip ends within SLIP seconds, so older agreement does not count.
     """
     return t - state.agreed < SLIP
 
 
 @compiled
 def _complete(aid: Record, parameters: Record) -> None:
-    """Give an AID the configured deviations, where the message states none, and smaller ones if the
-    wheels stand.
+    """Set missing standard deviations of an AID to the configured ones, and reduce them at rest.
+
+    The reduction by STANDING applies to wheels that do not turn.
     """
     for axis in range(3):
         if aid.std[axis] == 0.0:
@@ -145,8 +161,9 @@ def _complete(aid: Record, parameters: Record) -> None:
 
 @compiled
 def _repeats(state: Record, aid: Record) -> bool:
-    """Remember a velocity, one of AID; returns whether it has been the same for as long as a sensor
-    that works repeats none.
+    """Store a velocity and return whether the sensor has repeated it for too long.
+
+    A working sensor never repeats a value for this long.
     """
     since = aid.t - state.heard
     for k in range(4):
@@ -157,8 +174,9 @@ def _repeats(state: Record, aid: Record) -> bool:
 
 @compiled
 def _worst(ekf: Record, aid: Record, residual: Record) -> float:
-    """The largest normalised innovation squared of the components, for the best hypothesis; fills
-    the residual.
+    """Return the largest normalized innovation squared of the components, for the best hypothesis.
+
+    The residual is filled with this component.
     """
     innovation, worst = ekf.innovation, -1.0
     for axis in range(3):
@@ -183,10 +201,22 @@ def _worst(ekf: Record, aid: Record, residual: Record) -> float:
 def compare(
     hypothesis: Record, value: float, std: float, axis: int, R: np.ndarray, innovation: Record
 ) -> None:
-    """Fill in what one component of a velocity in the body frame, value +- std m/s, says to a
-    HYPOTHESIS, and R (3, 3), body to world.
+    """Fill in the innovation of a velocity component in the body frame.
 
-    u = R' v; with the true attitude q * Exp(dtheta), du = R' dv + [u]x dtheta.
+    Measurement model: u = R' v. With the true attitude q * Exp(dtheta), du = R' dv + [u]x dtheta.
+
+    Parameters
+    ----------
+    hypothesis : HYPOTHESIS
+        Hypothesis, predicted to the stamp of the measurement.
+    value, std : float
+        Measured component and its standard deviation, m/s.
+    axis : int
+        Body axis, 0 to 2.
+    R : (3, 3) array
+        Rotation from body to world. Filled.
+    innovation : INNOVATION
+        Filled by this function.
     """
     x = hypothesis.x
     rotation(x[6], x[7], x[8], x[9], R)
@@ -206,8 +236,9 @@ def compare(
 
 @compiled
 def _compare_yaw_rate(hypothesis: Record, aid: Record, imu: Record, innovation: Record) -> None:
-    """Fill in what the yaw rate of an AID says to a HYPOTHESIS beside the sample that an IMU_STATE
-    holds: the bias of the gyroscope.
+    """Fill in the innovation of a yaw rate: it measures the bias of the gyroscope.
+
+    imu is an IMU_STATE; its last angular rate is compared with the yaw rate of the AID.
     """
     innovation.entries, innovation.states[0], innovation.row[0] = 1, GYRO_BIAS, -1.0
     innovation.value = aid.value[YAW_RATE] - (imu.gyro[2] - hypothesis.x[GYRO_BIAS + 1])

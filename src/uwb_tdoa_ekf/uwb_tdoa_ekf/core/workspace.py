@@ -1,6 +1,7 @@
-"""The surroundings of the anchors, where a tag is expected: a box along the axes of the world.
+"""Workspace: the surroundings of the anchors, where a tag is expected.
 
-In a large hall that is not the hall, but what is near the anchors that are heard.
+It is a box along the axes of the world. In a large hall it is not the hall but the surroundings of
+the anchors heard.
 """
 
 from __future__ import annotations
@@ -14,32 +15,52 @@ from uwb_tdoa_bias.common.compiled import Record, compiled
 from .config import SIDES
 from .update import update_state
 
-SMALLEST = 3.0  # m from the middle of the anchors to each bound at least, however flat they lie
-# m along an axis that anchors lie in a plane across, which tells nothing of the side of it that the
-# tag is on
+# m, least distance from the middle of the anchors to each bound, however flat they lie
+SMALLEST = 3.0
+# m; if the anchors extend less along an axis, they lie in a plane across it. Then they do not
+# determine the side of the tag.
 FLAT = 0.6
 BELOW, ABOVE = SIDES.index("below"), SIDES.index("above")
-STD = 1.0  # m, of what is known before anything is measured: a tag outside is at the bound
+STD = 1.0  # m, prior standard deviation about the bound for a tag outside
 
 
 @compiled
 def set_bounds(extent: np.ndarray, margin: float, bounds: np.ndarray) -> None:
-    """Write the lower and upper bounds, m, to `bounds` (2, 3): `margin` beyond `extent` (2, 3) m,
-    that of all anchors.
+    """Compute the bounds of a box around the anchors.
+
+    Parameters
+    ----------
+    extent : (2, 3) array
+        Lower and upper bounds of all anchors, m, world frame.
+    margin : float
+        Distance from the anchors to the bounds, m.
+    bounds : (2, 3) array
+        Lower and upper bounds, m, world frame. Filled.
     """
     longest = max(extent[1, 0] - extent[0, 0], extent[1, 1] - extent[0, 1])
     for k in range(3):
         low, high = extent[0, k], extent[1, k]
         middle, half = 0.5 * (low + high), max(0.5 * (high - low) + margin, SMALLEST)
-        if k < 2 and high - low < FLAT:  # of a wall the tag may be as far as it is long
+        # a tag may be away from a wall of anchors by half the length of the wall
+        if k < 2 and high - low < FLAT:
             half = max(half, 0.5 * longest)
         bounds[0, k], bounds[1, k] = middle - half, middle + half
 
 
 @compiled
 def surround(ekf: Record, margin: float, bounds: np.ndarray) -> None:
-    """The same, as far as it is within the reach of the anchors heard lately, and on the side of
-    them that is configured.
+    """Compute the bounds of the workspace from the anchors heard lately and the configured side.
+
+    The bounds of `set_bounds` are limited to the radio reach of the heard anchors.
+
+    Parameters
+    ----------
+    ekf : EKF
+        State of the filter, after `listen`.
+    margin : float
+        Distance from the anchors to the bounds, m.
+    bounds : (2, 3) array
+        Lower and upper bounds, m, world frame. Filled.
     """
     set_bounds(ekf.extent, margin, bounds)
     for k in range(3):
@@ -58,9 +79,22 @@ def surround(ekf: Record, margin: float, bounds: np.ndarray) -> None:
 def configured_side(
     rows: np.ndarray, anchors: np.ndarray, tag_side: int
 ) -> tuple[float, float, float]:
-    """On which side of which plane a tag is that hears the anchors in rows (k,): the axis across
-    the plane, 1.0 or -1.0 for the side along that, 0.0 where none is configured or the anchors are
-    in no such plane, and its coordinate, m.
+    """Return the configured side of the tag relative to a plane of anchors.
+
+    Parameters
+    ----------
+    rows : (k,) array
+        Rows of the anchors heard.
+    anchors : (N,) ANCHOR
+        All anchors, by row.
+    tag_side : int
+        Index into config.SIDES.
+
+    Returns
+    -------
+    tuple
+        Axis across the plane, side (1.0 or -1.0 along the axis), coordinate of the plane (m). The
+        side is 0.0 if none is configured or the anchors are not in such a plane.
     """
     if tag_side == 0 or len(rows) == 0:
         return 2.0, 0.0, 0.0
@@ -75,8 +109,9 @@ def configured_side(
 
 @compiled
 def reflect(x: np.ndarray, side: np.ndarray | tuple[float, float, float]) -> bool:
-    """Put position and velocity x (6,) at the mirrored place, if they are on the other side than
-    `configured_side` says. Returns whether.
+    """Mirror position and velocity x (6,) if they are on the wrong side, and return whether.
+
+    side is the result of `configured_side`.
     """
     axis, sign, plane = int(side[0]), side[1], side[2]
     if (x[axis] - plane) * sign >= 0.0:
@@ -87,7 +122,10 @@ def reflect(x: np.ndarray, side: np.ndarray | tuple[float, float, float]) -> boo
 
 @compiled
 def stay_on_side(hypothesis: Record, side: np.ndarray) -> bool:
-    """The same for a HYPOTHESIS and its covariance."""
+    """Mirror a HYPOTHESIS and its covariance if it is on the wrong side, and return whether.
+
+    side is the result of `configured_side`.
+    """
     if not reflect(hypothesis.x, side):
         return False
     axis, P = int(side[0]), hypothesis.P
@@ -104,9 +142,24 @@ def stay_on_side(hypothesis: Record, side: np.ndarray) -> bool:
 def listen(
     ekf: Record, window: np.ndarray, anchors: np.ndarray, reach: float, tag_side: int
 ) -> None:
-    """Note where a tag can be that has heard the anchors of a window (n,) of TDOA: within `reach`,
-    m, of each of them, and where two of them are farther apart than that, within as much: they were
-    heard, so the radio reaches farther. Note its side of them too.
+    """Compute where a tag can be that has heard the anchors of a window.
+
+    The tag is within `reach` of each anchor heard. If two heard anchors are farther apart, the
+    radio reaches at least that far, and their distance replaces `reach`. The function sets side,
+    middle, flat and within of the EKF.
+
+    Parameters
+    ----------
+    ekf : EKF
+        State of the filter, updated in place.
+    window : (n,) TDOA
+        TDOAs of the tag.
+    anchors : (N,) ANCHOR
+        All anchors, by row.
+    reach : float
+        Radio reach, m.
+    tag_side : int
+        Index into config.SIDES.
     """
     rows = rows_heard(window)
     side = configured_side(rows, anchors, tag_side)
@@ -138,9 +191,20 @@ def listen(
 
 @compiled
 def add_circle(ekf: Record, height_known: bool, x: np.ndarray, covariance: np.ndarray) -> None:
-    """Add to the (9, 9) covariance of a position x (3,), m, what anchors along one axis of the
-    world leave open: the tag may be anywhere on a circle about them. height_known : whether
-    something else determines z.
+    """Add the uncertainty on a circle around anchors that lie along a world axis.
+
+    Such anchors leave the angle about their axis open, so the tag may be anywhere on the circle.
+
+    Parameters
+    ----------
+    ekf : EKF
+        State of the filter, after `listen`.
+    height_known : bool
+        Whether another sensor determines z.
+    x : (3,) array
+        Position, m, world frame.
+    covariance : (9, 9) array
+        Covariance of position, velocity and attitude, updated in place.
     """
     square, across = 0.0, 0
     for k in range(3):
@@ -158,7 +222,7 @@ def add_circle(ekf: Record, height_known: bool, x: np.ndarray, covariance: np.nd
 
 @compiled
 def rows_heard(window: np.ndarray) -> np.ndarray:
-    """Rows of the anchors in a window (n,) of TDOA, each once."""
+    """Return the rows of the anchors in a window (n,) of TDOA, each once."""
     rows, count = np.empty(2 * len(window), np.int64), 0
     for i in range(len(window)):
         for side in range(2):
@@ -174,14 +238,16 @@ def rows_heard(window: np.ndarray) -> np.ndarray:
 
 @compiled
 def contains(bounds: np.ndarray, x: np.ndarray) -> bool:
-    """True if position x (3,), m, is within `bounds` (2, 3)."""
+    """Return True if position x (3,), m, is within `bounds` (2, 3), m."""
     return outside(bounds, x) <= 0.0
 
 
 @compiled
 def outside(bounds: np.ndarray, x: np.ndarray) -> float:
-    """How far position x (3,), m, is beyond `bounds` (2, 3), along the axis along which it is
-    farthest, m; not above 0 within; inf where it is not a number.
+    """Return the distance by which position x (3,), m, is beyond `bounds` (2, 3), in m.
+
+    The axis with the largest distance counts. The result is not positive inside, and inf if x is
+    not a number.
     """
     farthest = -np.inf
     for k in range(3):
@@ -192,8 +258,9 @@ def outside(bounds: np.ndarray, x: np.ndarray) -> float:
 
 @compiled
 def is_filled(bounds: np.ndarray, P: np.ndarray) -> bool:
-    """True if a tag whose error has covariance P may be anywhere in `bounds` (2, 3): its standard
-    deviation exceeds their diagonal.
+    """Return True if a tag with position covariance P may be anywhere in `bounds` (2, 3), m.
+
+    The test is whether its 3D standard deviation exceeds the diagonal of the bounds.
     """
     spread = size = 0.0
     for k in range(3):
@@ -204,11 +271,28 @@ def is_filled(bounds: np.ndarray, P: np.ndarray) -> bool:
 
 @compiled
 def constrain(hypothesis: Record, innovation: Record, bounds: np.ndarray, axis: int) -> bool:
-    """Soft constraint of one axis: pull a tag that is outside towards its workspace, and one of
-    which less is known than that. Returns whether there was anything to do.
+    """Apply a soft constraint to an axis: pull a tag outside towards its workspace.
 
-    Only while less is known of the axis: what is given once is not known better by being repeated,
-    and TDOAs that agree on a place outside are right.
+    A tag with a standard deviation larger than the workspace is constrained too. Otherwise the
+    constraint applies only while the standard deviation of the axis exceeds STD. A constraint that
+    is given once must not shrink the covariance again and again. TDOAs that agree on a place
+    outside are right.
+
+    Parameters
+    ----------
+    hypothesis : HYPOTHESIS
+        Updated in place.
+    innovation : INNOVATION
+        Scratch.
+    bounds : (2, 3) array
+        Bounds of the workspace, m, world frame.
+    axis : int
+        Axis of the world, 0 to 2.
+
+    Returns
+    -------
+    bool
+        Whether the hypothesis was updated.
     """
     x, size = hypothesis.x[axis], bounds[1, axis] - bounds[0, axis]
     if hypothesis.P[axis, axis] > size**2:

@@ -1,12 +1,11 @@
-"""Is the yaw that the filter follows the right one? Innovations and the inertial sensor decide, as
-they do at a start.
+"""Test of the yaw that the filter follows, by innovations and the inertial sensor.
 
-A yaw that is wrong by psi turns each predicted change of velocity. The error of the state is linear
-in cos(psi) - 1 and sin(psi), and the filter's own predictions and updates carry it on: two
+A yaw error psi turns each predicted change of velocity. The resulting error of the state is linear
+in cos(psi) - 1 and sin(psi). The predictions and updates of the filter propagate it, as two
 responses of the error state. A generalized likelihood ratio (Willsky and Jones, IEEE Trans.
-Automatic Control 1976) tests the innovations of late against them, for any psi. If the updates have
-turned the yaw by more than its deviation allows, that is evidence too. Nothing here changes the
-filter before the evidence suffices.
+Automatic Control 1976) tests recent innovations against both responses, for any psi. A turn of the
+yaw by updates that exceeds its standard deviation is evidence too. The test changes the filter only
+if the evidence suffices.
 """
 
 from __future__ import annotations
@@ -20,22 +19,20 @@ from uwb_tdoa_bias.common.compiled import Record, compiled
 from .state import ERROR_STATES
 
 MEMORY, TURN_MEMORY = 6.0, 4.0  # s over which innovations, and turns by updates, count
-LARGEST = 3.0  # standard deviations that an innovation counts as at most
-KNOWN = 0.35**2  # rad^2, variance of a yaw that is said to be known: 20 degrees
+LARGEST = 3.0  # standard deviations; limits the effect of an innovation
+KNOWN = 0.35**2  # rad^2, variance below which the yaw counts as known: 20 degrees
 PERIOD = 0.1  # s between two tests
-# Log likelihood ratio above which the yaw is opened again. Of 22 measured flights 3.5 at most; in
-# the worst of them 9.9 without its range
-# finder. See docs/reliability.md
+# Log likelihood ratio above which the yaw is opened again. It trades false alarms against late
+# detection. Of 22 measured flights the largest ratio is 3.5; the worst flight has 9.9 without its
+# range finder. See docs/reliability.md.
 EVIDENCE = 12.0
-# rad, by which the yaw may be wrong: those that are tried,
-ANGLES = 2.0 * math.pi * np.arange(1, 24) / 24.0
-# and what the error of the state is linear in
-COSINES, SINES = (np.cos(ANGLES) - 1.0, np.sin(ANGLES))
+ANGLES = 2.0 * math.pi * np.arange(1, 24) / 24.0  # rad, yaw errors to test
+COSINES, SINES = (np.cos(ANGLES) - 1.0, np.sin(ANGLES))  # the error of the state is linear in both
 
 
 @compiled
 def clear(doubt: Record) -> None:
-    """Forget all evidence of a YAW_DOUBT: another state was put in place of the one before."""
+    """Clear all evidence of a YAW_TEST, because the state was replaced."""
     doubt.response[:] = 0.0
     doubt.vector[:] = 0.0
     doubt.information[:] = 0.0
@@ -44,8 +41,9 @@ def clear(doubt: Record) -> None:
 
 @compiled
 def predict(ekf: Record, vx: float, vy: float) -> None:
-    """Carry the responses on after `state.predict` of the best hypothesis; vx, vy : m/s, its
-    velocity before.
+    """Propagate the responses, after `state.predict` of the best hypothesis.
+
+    vx and vy are its horizontal velocity before the prediction, m/s, world frame.
     """
     transition, x = ekf.transition, ekf.hypotheses[ekf.best].x
     A, B, E, dt = (
@@ -79,8 +77,16 @@ def predict(ekf: Record, vx: float, vy: float) -> None:
 
 @compiled
 def observe(ekf: Record, correlation_length: float, shows: bool) -> None:
-    """Take the INNOVATION of the best hypothesis, after its update. correlation_length as in
-    robust.py; shows : it is evidence; else the responses follow its update, and nothing more.
+    """Update the test with the innovation of the best hypothesis, after its Kalman update.
+
+    Parameters
+    ----------
+    ekf : EKF
+        State of the filter; yaw_test is updated.
+    correlation_length : float
+        Number of measurements that count as a single independent one, see robust.py.
+    shows : bool
+        Whether the innovation is evidence. Otherwise only the responses follow the update.
     """
     doubt, innovation = ekf.yaw_test, ekf.innovation
     to_cosine, to_sine = doubt.response[0], doubt.response[1]
@@ -117,7 +123,10 @@ def observe(ekf: Record, correlation_length: float, shows: bool) -> None:
 
 @compiled
 def _forget(doubt: Record, variance: float, dt: float) -> None:
-    """Let the evidence of a YAW_DOUBT age by dt, s. variance : rad^2, that of the yaw now."""
+    """Discount the evidence of a YAW_TEST over dt (s).
+
+    variance is the present variance of the yaw, rad^2.
+    """
     kept, kept_turn = math.exp(-dt / MEMORY), math.exp(-dt / TURN_MEMORY)
     for i in range(2):
         doubt.vector[i] *= kept
@@ -129,7 +138,10 @@ def _forget(doubt: Record, variance: float, dt: float) -> None:
 
 @compiled
 def evidence(doubt: Record) -> float:
-    """Log likelihood ratio of the best other yaw, and what the turns by updates add."""
+    """Return the log likelihood ratio of the best other yaw.
+
+    Turns of the yaw by updates add to it.
+    """
     v, J = doubt.vector, doubt.information
     best = 0.0
     for k in range(len(ANGLES)):
@@ -143,9 +155,9 @@ def evidence(doubt: Record) -> float:
 
 @compiled
 def contradicts(ekf: Record, t: float) -> bool:
-    """Whether the yaw is said to be known, and the evidence at stamp t, s, is against it.
+    """Return whether the evidence at stamp t (s) contradicts a yaw that counts as known.
 
-    Looks once in PERIOD.
+    The test runs once per PERIOD.
     """
     doubt = ekf.yaw_test
     if t < doubt.next_look:
@@ -159,7 +171,7 @@ def contradicts(ekf: Record, t: float) -> bool:
 
 @compiled
 def _up(x: np.ndarray) -> tuple[float, float, float]:
-    """The vertical of the world in the body frame, of a nominal state."""
+    """Return the vertical of the world in the body frame, from a nominal state."""
     return (
         2.0 * (x[6] * x[8] - x[9] * x[7]),
         2.0 * (x[7] * x[8] + x[9] * x[6]),
@@ -169,7 +181,7 @@ def _up(x: np.ndarray) -> tuple[float, float, float]:
 
 @compiled
 def _yaw_variance(hypothesis: Record) -> float:
-    """rad^2, of the rotation about the vertical."""
+    """Return the variance of the rotation about the vertical of the world, in rad^2."""
     P, (u0, u1, u2) = hypothesis.P, _up(hypothesis.x)
     square = u0 * u0 * P[6, 6] + u1 * u1 * P[7, 7] + u2 * u2 * P[8, 8]
     return square + 2.0 * (u0 * u1 * P[6, 7] + u0 * u2 * P[6, 8] + u1 * u2 * P[7, 8])
