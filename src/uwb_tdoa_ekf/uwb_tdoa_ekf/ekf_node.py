@@ -137,7 +137,7 @@ class EkfNode(StreamNode):
         volume, effects_file = own["flyable_volume"], own["effects_file"]
         self._effects = EffectSet.from_yaml(effects_file) if effects_file else EffectSet()
         self._aid_corrector = AidCorrector(self._effects.effects)
-        self._estimator: Estimator = None  # type: ignore[assignment]  # until there are anchors
+        self._estimator: Estimator = None  # type: ignore[assignment]  # None until anchors arrive
         self._said_restart: Finding | None = None
         self._epoch, self._ros_clock = Epoch(), cast("ROSClock", self.get_clock())
         # quaternion and covariance of the newest odometry
@@ -522,7 +522,7 @@ class EkfNode(StreamNode):
         return counts
 
     def _yaw_std(self) -> float:
-        """Return the standard deviation of the yaw in the world frame, in rad; NaN without odometry."""
+        """Return the standard deviation of the yaw in the world frame, rad; NaN without odometry."""
         if self._estimator is None or not self._estimator.running or self._attitude is None:
             return math.nan
         return rotation_std(*self._attitude)[0, 2]
