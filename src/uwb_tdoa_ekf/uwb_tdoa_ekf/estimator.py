@@ -239,7 +239,7 @@ class Estimator:
 
     @property
     def without_imu(self) -> Finding | None:
-        """Return the Finding that makes the filter ignore the IMU; None while it uses inertial samples."""
+        """Return the Finding that makes the filter ignore the IMU, or None while it uses the IMU."""
         ekf = self._ekf
         return next(
             iter(self._steady([implausible(ekf.imu_fault_detector)] if ekf.imu_faulty else [])),
@@ -487,7 +487,7 @@ class Estimator:
         self._clear()
 
     def _use(self, until: float) -> tuple[Odometry, Residuals]:
-        """Process measurements up to the stamp `until`, in s, and the poses that were set up to then."""
+        """Process measurements and poses that the user set, up to the stamp `until`, in s."""
         self._check_early_poses()
         parts: list[PipelineOutput] = []
         while self._poses and self._poses[0]["t"][0] <= until and self._has_begun():

@@ -33,7 +33,7 @@ POSE, TWIST = 3 + 4 + 36, 3 + 3 + 36  # numbers in a PoseWithCovariance and in a
 def to_odometry(
     q: np.ndarray, v: np.ndarray, covariance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the velocity in the body frame and the covariance in the convention of nav_msgs/Odometry.
+    """Return the velocity in the body frame and the covariance as in nav_msgs/Odometry.
 
     The velocity is u = R(q)' v. An attitude error dtheta in the body frame is R dtheta in the world
     frame. With a velocity error dv, the error of u is R' dv + u x dtheta.

@@ -373,7 +373,7 @@ class Fleet:
         )
 
     def starts(self, values: Mapping, log_level: str = "info") -> list[Start]:
-        """Return the Starts of bias_node and ekf_node of each tag; raise InputError for a wrong value.
+        """Return the Starts of bias_node and ekf_node of each tag.
 
         Each tag has its own body frame NAMESPACE/base_link, unless the file names another.
 
@@ -383,6 +383,11 @@ class Fleet:
             {parameter: value} that overrides the file.
         log_level : str
             Log level of the nodes.
+
+        Raises
+        ------
+        InputError
+            If a value is wrong.
         """
         starts = []
         try:

@@ -207,9 +207,10 @@ class Outputs:
         self.published += n
 
     def _publish_transform(self, t: float, p: np.ndarray, q: np.ndarray, held: bool) -> None:
-        """Publish world -> body, or the world -> odom that gives the same pose with odom -> body of /tf.
+        """Publish world -> body, or world -> odom.
 
-        If `held` is true, publish the last world -> odom again.
+        With odom -> body of /tf, the transform world -> odom leads to the same pose of the body. If
+        `held` is true, the last world -> odom is published again.
         """
         if self._odom and not (held and self._placed):
             between = self._frames.between(self._odom, self._body, t)

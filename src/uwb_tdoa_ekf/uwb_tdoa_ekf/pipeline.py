@@ -110,7 +110,7 @@ class RadioCorrections:
         return np.isin(aids["kind"], list(KINDS))
 
     def _unchanged(self, measured: Measurements) -> Measurements:
-        """Return Measurements without distances as they are and remember the slice in which they end."""
+        """Return Measurements without distances unchanged and store the number of their last slice."""
         number = max(float(np.floor(part["t"][-1] / SLICE)) for part in measured if len(part))
         if number != self._slice:
             self._slice, self._pose, self._together = number, self._latest, True
