@@ -192,7 +192,7 @@ class Tag:
             return False
 
     def _fail(self, error: Exception) -> None:
-        """Store an exception; the nodes end at the next turn, when none of their callbacks is running."""
+        """Store an exception; the nodes end at the next turn, when none of their callbacks runs."""
         self._failure = error
 
     def _end(self, error: Exception) -> None:

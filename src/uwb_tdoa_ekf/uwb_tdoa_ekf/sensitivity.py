@@ -1,9 +1,9 @@
-"""Compute how constant errors of TDOAs and ranges change the innovations, with the path marginalized.
+"""Compute how constant errors of TDOAs and ranges change the innovations of a run.
 
-The derivative of the state by each parameter follows the recorded transitions and gains, as the
-state does (B. Friedland, Treatment of bias in recursive filtering, IEEE Trans. Automatic Control
-14, 1969). A fit of innovations to these derivatives therefore uses all that the filter used: IMU,
-process noise, and every other measurement.
+The path is marginalized. The derivative of the state by each parameter follows the recorded
+transitions and gains, as the state does (B. Friedland, Treatment of bias in recursive filtering,
+IEEE Trans. Automatic Control 14, 1969). A fit of innovations to these derivatives therefore uses
+all that the filter used: IMU, process noise, and every other measurement.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ class Innovations:
     def by_bias(self, regressors: np.ndarray) -> np.ndarray:
         """Return the derivative of the negative innovations by parameters, (n, k).
 
-        A bias that the position can follow gives no derivative.
+        A bias that the position can follow does not change the innovations.
 
         Parameters
         ----------

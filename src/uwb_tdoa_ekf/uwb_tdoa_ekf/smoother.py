@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 def smooth(
     flight: Flight, config: FilterConfig | None = None, corrector: Corrector | None = None
 ) -> Run:
-    """Run bias correction, filter and smoother on a Flight and return its Run with smoothed odometry.
+    """Run bias correction, filter and smoother on a Flight and return the smoothed Run.
 
     The odometry has the stamps of updates, thinned to odometry_rate. Pressures are not used. If the
     yaw is unknown, the smoother uses the final yaw hypothesis from the start. An unknown common

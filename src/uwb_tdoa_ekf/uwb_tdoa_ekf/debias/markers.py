@@ -109,5 +109,5 @@ def corrected_bias(markers: Markers) -> np.ndarray:
 
 
 def measured_places(markers: Markers, bias: np.ndarray) -> np.ndarray:
-    """Return the places where the markers are measured, (n, d) m: the deformed grid X + b* of eq. 19."""
+    """Return where the markers are measured, (n, d) m: the deformed grid X + b* of eq. 19."""
     return markers.true + bias
