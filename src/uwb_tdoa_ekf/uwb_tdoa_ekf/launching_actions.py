@@ -43,7 +43,7 @@ def actions(
     respawn, on_exit, discovery_range, rviz, use_sim_time : str
         Values of the launch arguments with these names. RViz starts if `rviz` is "true".
     """
-    leave_present_folder_out()  # launched processes inherit sys.path
+    leave_present_folder_out()  # launched processes inherit this environment
     of_nodes = discovery(os.environ, discovery_range)
     nodes = [
         _node(each, Lives(each.label, respawn == "true", on_exit), of_nodes) for each in starts

@@ -362,7 +362,7 @@ class ReorderBuffer:
         self._refuse(place, row, INVALID)
 
     def _is_heard(self, newest: float) -> bool:
-        """Return whether the reference has reached about the stamp `newest`, in s, of another stream."""
+        """Return whether the reference has reached the stamp `newest`, in s, within SILENT."""
         return self._streams[self._reference].gate.newest > newest - SILENT
 
     def _jump(self, place: int, accepted: list[tuple[float, np.ndarray]], newest: float) -> None:

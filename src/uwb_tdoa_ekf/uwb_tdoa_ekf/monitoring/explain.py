@@ -1,4 +1,4 @@
-"""Measure how well any motion explains a stream of TDOAs, by the innovations of a filter without IMU.
+"""Measure how well any motion explains a stream of TDOAs, by the innovations of an IMU-free filter.
 
 Two hypotheses about one stream, for example right and wrong signs, are compared block by block by
 their unexplained loss. Systematic errors affect both, so the difference is more significant than
