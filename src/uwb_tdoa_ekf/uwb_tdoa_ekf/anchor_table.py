@@ -67,7 +67,7 @@ class AnchorTable:
         )
 
     def change(self, anchors: Anchors) -> np.ndarray:
-        """Replace the present anchors and return the rows of those that are gone or moved."""
+        """Replace the present anchors and return the rows of anchors that are gone or moved."""
         stay, before = self.stay(anchors), self._rows
         rows = self._rows[self.anchors.index(anchors.ids)]
         rows[~stay] = len(self.ids) + np.arange(np.count_nonzero(~stay))

@@ -402,7 +402,7 @@ class EkfNode(StreamNode):
                 "samples are not used; without a whole IMU set use_imu to false",
             )
             gyro[unmeasured] = math.nan
-        if mount is not None:  # before effects: their axes are those of the body, as in `diagnose`
+        if mount is not None:  # before effects: these have the body axes, as in `diagnose`
             gyro, accel = mount.in_body(t, gyro, accel)
         if not self._imu_corrector.idle:
             gyro, accel = self._imu_corrector.correct(t, gyro, accel)
@@ -420,7 +420,7 @@ class EkfNode(StreamNode):
     def _take_sensor(
         self, name: str, frame: str, t: np.ndarray, rows: np.ndarray, arrival: np.ndarray
     ) -> None:
-        """Pass messages of one of the SENSORS to the filter."""
+        """Pass messages of a sensor in SENSORS to the filter."""
         sensor = SENSORS[name]
         stream = sensor.read(t, {field: rows[field] for field in sensor.fields})
         if sensor.assumed is not None:

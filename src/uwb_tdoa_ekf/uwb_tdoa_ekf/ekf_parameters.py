@@ -1,4 +1,4 @@
-"""Declare the parameters of ekf_node: those of FilterConfig, and the node's own."""
+"""Declare the parameters of ekf_node: FilterConfig, and the node's own."""
 
 from __future__ import annotations
 

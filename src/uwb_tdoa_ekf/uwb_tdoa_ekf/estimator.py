@@ -333,7 +333,7 @@ class Estimator:
         self._buffer.add(TDOA_STREAM, rows, usable)
 
     def add(self, name: str, stream: Stream) -> None:
-        """Add a Stream of one of the SENSORS, its rows in the order of their arrival."""
+        """Add a Stream of a sensor in SENSORS, its rows in the order of their arrival."""
         if getattr(self.config, f"use_{name}"):
             self._add(STREAMS.index(name), *aid_rows(name, stream, self._anchor_table))
 
@@ -442,9 +442,10 @@ class Estimator:
     def rates_at(self, odometry: Odometry) -> tuple[np.ndarray, np.ndarray]:
         """Return angular velocities at the stamps of the Odometry that was returned last.
 
-        The rate is that of the gyroscope minus its estimated bias. Where no inertial sample is
-        used, wheels give the rate about z. White noise of density gyro_noise has the variance
-        gyro_noise^2 / dt in samples dt apart. Here dt is the mean over the last RATE_SAMPLES.
+        The rate is the measured angular velocity minus the estimated gyroscope bias. Where no
+        inertial sample is used, wheels give the rate about z. White noise of density gyro_noise has
+        the variance gyro_noise^2 / dt in samples dt apart. Here dt is the mean over the last
+        RATE_SAMPLES.
 
         Parameters
         ----------

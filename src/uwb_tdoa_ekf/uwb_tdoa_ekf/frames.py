@@ -94,7 +94,7 @@ def _multiply(a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
 def rotation_std(q: np.ndarray, covariance: np.ndarray) -> np.ndarray:
     """Return standard deviations of the rotation about the world axes, (n, 3) rad.
 
-    They equal those of to_odometry, which also describes the parameters.
+    They equal the diagonal of the covariance from to_odometry, which describes the parameters.
     """
     out = np.empty((len(q), 3))
     _rotation_std(np.ascontiguousarray(q), np.ascontiguousarray(covariance), out)

@@ -290,7 +290,7 @@ class Fleet:
     """Store the content of a YAML file of tags.
 
     The file has the form `tags: {NAMESPACE: {parameter: value, host: HOST, remaps: {topic:
-    name}}}`. Keys beside `tags` hold for all tags.
+    name}}}`. Keys next to `tags` hold for all tags.
 
     Attributes
     ----------

@@ -58,7 +58,7 @@ def actions(
 def _node(start: Start, lives: Lives, variables: Mapping[str, str]) -> Node:
     """Return the launch action of a Start; its Lives decide whether it starts again.
 
-    Parameters go on the command line, because launch_ros leaves its parameter files behind.
+    Parameters go on the command line, because launch_ros does not delete its parameter files.
     """
     began = time.monotonic()
 

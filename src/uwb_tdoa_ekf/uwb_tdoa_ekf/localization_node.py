@@ -207,7 +207,7 @@ class Tag:
             node.destroy_node()
 
     def _replace(self, gone: list[StreamNode]) -> None:
-        """Let the executor serve the nodes that run now instead of those that are gone."""
+        """Let the executor serve the nodes that run now and drop the nodes that are gone."""
         assert self._node.spinner is not None  # a node that takes turns has a spinner
         self._node.spinner.replace(gone, self.members)
 

@@ -168,7 +168,7 @@ def without_unknown_offset(
 ) -> Flight:
     """Return a Flight without the common range offset that the filter estimates, if it does.
 
-    The parameters are those of run_offline.
+    The parameters are as for run_offline.
     """
     offset = (
         run_offline(flight, config, corrector).range_offset
@@ -195,8 +195,8 @@ def loaded(
     buffer : ReorderBuffer
         Contains all rows that can be measurements.
     places : dict
-        {stream: (number of rows, places of usable rows in the order of their stamps, ranks of these
-        among all rows of SENSORS that leave the buffer)}.
+        {stream: (number of rows, places of usable rows, their ranks)}. The places are in the order
+        of their stamps. The ranks are among all rows of SENSORS that leave the buffer.
     """
     buffer = ReorderBuffer.of_recording()
     if flight.imu is not None and config.use_imu:

@@ -113,7 +113,7 @@ class Outputs:
         body, odom : str
             Names of the body frame and of the odom frame.
         publish_tf : str
-            One of PUBLISH_TF.
+            Value from PUBLISH_TF.
         planar : bool
             Let world -> odom rotate about the vertical axis only.
         """

@@ -26,13 +26,13 @@ if TYPE_CHECKING:
 STREAMS = "imu", "tdoa", *aids.STREAMS
 KINDS = IMU_SAMPLE, TDOA, *[AID] * len(aids.STREAMS)
 IMU_STREAM, TDOA_STREAM, FIRST_AID = range(3)  # places in STREAMS
-# one of these streams is the reference, whose stamps define the time
+# the reference is among these streams; its stamps define the time
 LOCATING_STREAMS = (TDOA_STREAM, *map(STREAMS.index, LOCATING))
 VELOCITY_STREAM = STREAMS.index("velocity")
 ROOM = 256  # initial capacity of a stream, in rows
 # messages of a stream that may wait: 2 s at 1 kHz; beyond that, the oldest leave
 MOST_WAITING = 2000
-# s of stamps for which a stream counts as ahead after one of its rows was refused for that
+# s of stamps for which a stream counts as ahead after a refused row
 LATELY = 2.0
 SILENT = 1.0  # s of stamps after which the buffer stops waiting for a silent stream
 # share of `lag` for which the buffer waits for SENSORS; `hold` of bias_node must be much longer
@@ -72,7 +72,7 @@ class ReorderBuffer:
     """Sort rows of all STREAMS by their stamps.
 
     Rows are (n,) arrays of the type in KINDS. A live row waits until every stream has passed its
-    stamp. The buffer waits `lag` s of stamps for a silent stream, and half of that for one of the
+    stamp. The buffer waits `lag` s of stamps for a silent stream, and half of that for a sensor in
     SENSORS. After SILENT s it stops waiting. It waits `reorder` s for rows out of order, unless a
     stream has been in order so far (LatenessPolicy). A row older than the rows already used is
     refused as late.
@@ -81,10 +81,10 @@ class ReorderBuffer:
     define the time. While the reference is silent, inertial samples define the time, or velocities
     without an IMU.
 
-    Only the reference can restart the filter. It does so if its clock jumps back, or if another
-    stream has moved the time ahead of it. Every other stream is compared with the reference. Rows
-    too far ahead are refused as invalid, rows behind as late, and neither moves the time. A
-    recording is added with `load`.
+    Only the reference can restart the filter. The filter restarts if the reference clock jumps
+    back, or if another stream has moved the time ahead. Every other stream is compared with the
+    reference. Rows too far ahead are refused as invalid, rows behind as late, and neither moves the
+    time. A recording is added with `load`.
     """
 
     def __init__(
@@ -255,7 +255,7 @@ class ReorderBuffer:
         return Measurements(imu, tdoa, felt)
 
     def finish(self) -> None:
-        """Refuse rows that wait for a neighbor with a similar stamp, because no row follows."""
+        """Refuse rows that wait for a neighbour with a similar stamp, because no row follows."""
         for place, stream in enumerate(self._streams):
             self._refuse_outliers(place, stream.gate.finish())
 
@@ -439,7 +439,7 @@ class ReorderBuffer:
         return t - since >= CONTRADICTED and (seen - then >= CONTRADICTED or seen == then)
 
     def _refuse_outliers(self, place: int, outliers: Sequence[tuple[float, np.ndarray]]) -> None:
-        """Refuse rows whose stamps are far from those of their neighbors."""
+        """Refuse rows whose stamps are far from the neighbouring stamps."""
         for t, row in outliers:
             self._refuse(place, row, INVALID if t > self._streams[place].gate.newest else LATE)
 

@@ -95,8 +95,8 @@ def _smoothed_run(flight: Flight, config: FilterConfig, corrector: Corrector | N
 def _with_persistent(smoothed: Odometry, online: Odometry) -> Odometry:
     """Return the smoothed Odometry with the covariance of errors that do not average out.
 
-    The smoother averages no more of these errors than the filter does. The covariance is therefore
-    that of the online estimate at the last stamp before.
+    The smoother does not average these errors out any more than the filter does. The covariance is
+    therefore taken from the online estimate at the last stamp before.
     """
     if not len(online):
         return smoothed
@@ -228,8 +228,8 @@ def _through_prediction(
 ) -> None:
     """Step lambda and Lambda backwards through one prediction.
 
-    The equations are lambda <- Phi' lambda and Lambda <- Phi' Lambda Phi. The lower rows of Phi are
-    those of the identity.
+    The equations are lambda <- Phi' lambda and Lambda <- Phi' Lambda Phi. The lower rows of Phi
+    equal the identity.
     """
     before = adjoint.copy()
     product = np.zeros((ERROR_STATES, ERROR_STATES))  # Lambda Phi

@@ -18,20 +18,20 @@ CHUNK = 2000  # places per call, which limits the memory
 class AngularNetwork:
     """Interpolate with one Gaussian per node, whose width depends on the direction (eqs. A1 - A8).
 
-    The width makes the Gaussian fall to the neighbor's share of the neighbor's value at the place
-    of the neighbor (A3 - A5). It is interpolated over the direction (A6). At a node with all its
-    neighbors, the result is the value of the node plus the tails of more distant nodes.
+    The width makes the Gaussian fall to the neighbour's share of the neighbour's value at the place
+    of the neighbour (A3 - A5). It is interpolated over the direction (A6). At a node with all its
+    neighbours, the result is the value of the node plus the tails of more distant nodes.
 
-    In a plane a node has 8 neighbors, and the width is linear in the angle, as published. In space
-    it has 26 neighbors. The weight of each is the inverse of one minus the cosine (Shepard). In the
-    direction of a neighbor, the width is that of this neighbor.
+    In a plane a node has 8 neighbours, and the width is linear in the angle, as published. In space
+    it has 26 neighbours. The weight of each is the inverse of one minus the cosine (Shepard). In the
+    direction of a neighbour, the width is that of this neighbour.
 
     Where eq. A5 has no real positive width, two minimal repairs apply. c2 is not negative: it would
-    be if a neighbor's value exceeds 8 times the node's (26 times in space), and the "Gaussian"
-    would then grow with distance. A neighbor of value 0 counts as SMALLEST_RATIO of the node's
+    be if a neighbour's value exceeds 8 times the node's (26 times in space), and the "Gaussian"
+    would then grow with distance. A neighbour of value 0 counts as SMALLEST_RATIO of the node's
     value.
 
-    The number of neighbors in eq. A3 stays 8 (26) at the rim, as published. Values at the rim are
+    The number of neighbours in eq. A3 stays 8 (26) at the rim, as published. Values at the rim are
     therefore too close to the smallest value.
     """
 
@@ -67,7 +67,7 @@ class AngularNetwork:
         self._widths[~there] = 0.0
         self._there = there
         self._alone = ~there.any(axis=1)
-        self._width_alone = -np.log(c3) / step**2  # as if all neighbors had the value of the node
+        self._width_alone = -np.log(c3) / step**2  # as if all neighbours had the value of the node
         self._width_of = _over_angle if d == 2 else _over_direction
 
     def __call__(self, x: np.ndarray) -> np.ndarray:
@@ -94,21 +94,21 @@ class AngularNetwork:
 
 
 def _neighbours(cell: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the neighbors of each node.
+    """Return the neighbours of each node.
 
     Parameters
     ----------
     cell : (n, d) int array
         Place of each node in the grid.
     offsets : (K, d) int array
-        Steps to the K neighbors.
+        Steps to the K neighbours.
 
     Returns
     -------
     rows : (n, K) int array
-        Rows of the neighbors.
+        Rows of the neighbours.
     there : (n, K) bool array
-        Whether the neighbor exists.
+        Whether the neighbour exists.
     """
     shifted = cell - cell.min(axis=0) + 1
     shape = tuple(shifted.max(axis=0) + 2)
@@ -123,18 +123,18 @@ def _neighbours(cell: np.ndarray, offsets: np.ndarray) -> tuple[np.ndarray, np.n
 def _over_angle(
     away: np.ndarray, towards: np.ndarray, there: np.ndarray, widths: np.ndarray
 ) -> np.ndarray:
-    """Return widths (P, k) in the directions `away` (P, 2), linear in the angle between neighbors.
+    """Return widths (P, k) in the directions `away` (P, 2), linear in the angle between neighbours.
 
     Parameters
     ----------
     away : (P, 2) array
         Directions, of any length.
     towards : (P, K, 2) array
-        Unit vectors to the neighbors.
+        Unit vectors to the neighbours.
     there : (P, K) bool array
-        Whether the neighbor exists.
+        Whether the neighbour exists.
     widths : (P, K, k) array
-        Widths in the directions of the neighbors.
+        Widths in the directions of the neighbours.
     """
     full = 2.0 * np.pi
     angle = np.arctan2(away[:, 1], away[:, 0])[:, None] - np.arctan2(
@@ -157,7 +157,7 @@ def _over_direction(
 ) -> np.ndarray:
     """Return widths (P, k) in the directions `away` (P, 3), weighted by the cosine (Shepard).
 
-    The other parameters are those of `_over_angle`, in three dimensions.
+    The other parameters are as for `_over_angle`, in three dimensions.
     """
     length = np.linalg.norm(away, axis=1, keepdims=True)
     cosine = np.einsum("pd,pkd->pk", away / np.maximum(length, 1e-12), towards)

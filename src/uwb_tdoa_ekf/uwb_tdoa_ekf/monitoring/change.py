@@ -38,12 +38,13 @@ PLACE_STD, PLACE_LENGTH = 0.2, 0.9
 # m, m, s, of a delay that lasts while the tag stays: standard deviation, length, time,
 LOCAL_STD, LOCAL_LENGTH, LOCAL_TIME = (0.05, 0.3, 2.0)
 NOISE_STD = 0.1  # m, and of independent noise in each slice
-# normalized square of a slice's error above which its variance is raised until the square is this
+# normalised square of a slice's error above which its variance is raised until the square is this
 OUTLIER = 3.0
-# largest normalized square of a slice for the scale of the flight
+# largest normalised square of a slice for the scale of the flight
 LARGEST_ERROR = 8.0
-SMALLEST_SCALE = 1.0  # smallest scale: a flight with smaller errors is treated alike
-# prior scale (mean normalized square), and its weight in slices
+# smallest scale; a flight with smaller errors is treated as if it had this scale
+SMALLEST_SCALE = 1.0
+# prior scale (mean normalised square), and its weight in slices
 SCALE, SCALE_SLICES = (2.0, 20)
 # slices in which the test searches for an onset, and smallest age of an onset in slices
 WINDOW, YOUNGEST = 24, 4
@@ -71,7 +72,7 @@ class Change:
     rival : float
         Likelihood ratio of the best change of any other anchor.
     left : float
-        Mean square of the unexplained errors since the onset, divided by that of the errors before.
+        Mean square of the unexplained errors since the onset over that before it.
     """
 
     row: int
@@ -105,7 +106,7 @@ class ChangeDetector:
         self._delays, self._freedom = (np.zeros((room, 0)), np.zeros(room))
         # Cholesky factor; whitened errors
         self._factor, self._white = (np.zeros((room, room)), np.zeros((room, 0)))
-        self._squares = np.zeros(room)  # normalized squares
+        self._squares = np.zeros(room)  # normalised squares
         # ring buffer over the latest slices: responses of the anchors that were heard,
         self._response: np.ndarray = np.zeros((WINDOW, 0, 0))
         # and the place of each column's anchor among them
@@ -298,7 +299,7 @@ def _whiten(
     freedom: np.ndarray,
     whitened: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> None:
-    """Write row k of the Cholesky factor and its whitened error and normalized square.
+    """Write row k of the Cholesky factor and its whitened error and normalised square.
 
     Parameters
     ----------
@@ -313,7 +314,7 @@ def _whiten(
     freedom : (m,) array
         Number of independent combinations measured in each slice.
     whitened : tuple of arrays
-        Cholesky factor (m, m), whitened errors (m, N), normalized squares (m,).
+        Cholesky factor (m, m), whitened errors (m, N), normalised squares (m,).
     """
     factor, white, squares = whitened[0], whitened[1], whitened[2]
     row, error = factor[k], delays[k].copy()

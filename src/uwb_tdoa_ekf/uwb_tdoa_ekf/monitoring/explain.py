@@ -79,7 +79,7 @@ def compare(one: Unexplained, other: Unexplained) -> tuple[float, float]:
     Returns
     -------
     ratio : float
-        Mean loss of `other` divided by that of `one`.
+        Mean loss of `other` over the mean loss of `one`.
     z : float
         Number of standard errors by which the loss of `other` is smaller.
     """

@@ -29,7 +29,7 @@ def clock_ahead(stream: str, lead: float, count: int) -> Finding:
     Parameters
     ----------
     stream : str
-        One of STREAMS.
+        Name from STREAMS.
     lead : float
         Lead over the other streams, in s.
     count : int

@@ -58,9 +58,9 @@ class Finding:
     rule : str
         Name of the rule, for machines.
     severity : str
-        One of SEVERITIES.
+        Value from SEVERITIES.
     cause : str
-        What is wrong, a clause.
+        The problem, as a clause.
     evidence : str
         The numbers that show it.
     remedy : str

@@ -30,9 +30,9 @@ START_TIMEOUT = 5.0  # s of data without an initialization before a warning
 # unrelated
 BEHIND = 1.0, 60.0
 STOPPED = 2.0  # s without a message of a sensor that was received before, before a warning
-MOST_SAID = 3  # sentences in the status text; the values list all of them
-# reports in a row in which that is so of an aid; optical flow contradicts everything else for a
-# second at times
+MOST_SAID = 3  # sentences in the status text; the values contain all sentences
+# consecutive reports with mostly unused messages of a sensor before a warning; optical flow at
+# times contradicts all other sensors for 1 s
 REPEATS = 2
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
@@ -276,7 +276,7 @@ def _worst(wiring: Sequence[str], findings: Sequence[Finding]) -> tuple[bytes, s
 
 
 def together(sentences: Sequence[str]) -> str:
-    """Return one text of several sentences, with the first MOST_SAID of them."""
+    """Return one text with the first MOST_SAID of several sentences."""
     more = len(sentences) - MOST_SAID
     return " | ".join([*sentences[:MOST_SAID], *([f"and {more} more"] if more > 0 else [])])
 

@@ -47,7 +47,7 @@ GAP = 30.0  # s without TDOAs after which a new flight begins
 # likelihood ratio above which an anchor has changed: a tenth above the largest of sound flights of
 # two days, see docs/reliability.md
 LIMIT = 16.3
-CLEARLY = 1.4  # factor by which this ratio must exceed that of any other anchor,
+CLEARLY = 1.4  # factor by which this ratio must exceed the ratio of any other anchor,
 # and largest mean square of the unexplained errors since the onset, over that before; if more is
 # left, something else has happened too, as on a floor
 MOST_LEFT = 1.0
@@ -135,7 +135,7 @@ class Monitor:
         Parameters
         ----------
         anchors : Anchors or AnchorTable
-            Anchors; those of an AnchorTable may change later.
+            Anchors; an AnchorTable may change later.
         calibrated : Covariance or None
             Covariance of anchor positions and delays from the last calibration.
         """
@@ -161,12 +161,12 @@ class Monitor:
         ] = {}  # by row: anchors that differ from the survey or calibration,
         self._suspected: dict[int, int] = {}  # and consecutive comparisons that found them
         self._comparisons: list[SurveyComparison] = []
-        self._compared = 0  # slices
+        self._compared = 0  # slices compared since the last restart
         self._compare_anew()
         self._changes: dict[
             int, list[Change]
         ] = {}  # {row: Changes of an anchor in flight that still hold}
-        self._ever_changed: set[int] = set()  # rows
+        self._ever_changed: set[int] = set()  # rows of anchors that changed at any time
         self._latest_change: Change | None = None  # the newest change, whose size is refined
         self._latest: list[SwapResiduals] = []  # residuals of the last slices with large errors
         self._slices = 0  # slices so far
@@ -176,7 +176,7 @@ class Monitor:
         self._silent: tuple[int, ...] = ()
         # another exchange, or none, that slices suggest instead, and how many consecutive ones
         self._instead: tuple[tuple[int, ...], int] = ((), 0)
-        self._moving_since = math.nan  # s, stamp
+        self._moving_since = math.nan  # s, stamp of the first motion
         self._bias: np.ndarray | None = None
         # (6,) gyroscope, accelerometer: reference, and the latest
         self._bias_now: np.ndarray | None = None
@@ -417,7 +417,7 @@ class Monitor:
         return bool(found)
 
     def _listen(self, a: np.ndarray, b: np.ndarray, place: np.ndarray | None) -> None:
-        """Find anchors that are no longer heard while others are.
+        """Find anchors that the tag no longer hears although it hears other anchors.
 
         Anchors that the tag has left behind do not count. The tag must be closer to the anchor than
         when it was last heard, or than to other anchors that are heard.
@@ -588,7 +588,7 @@ class Monitor:
 
 
 def _surest(displaced: Iterable[Displaced]) -> dict[int, Displaced]:
-    """Return {row: Displaced} of several comparisons, without doubts that another comparison resolves."""
+    """Return {row: Displaced} of several comparisons, without doubts that another one resolves."""
     found: dict[int, Displaced] = {}
     for one in sorted(displaced, key=lambda one: len(one.others)):
         if found.keys().isdisjoint((one.row, *one.others)):

@@ -1,4 +1,7 @@
-"""Check windows of a TDOA stream for wrong values; a rule takes windows and returns a Finding or None."""
+"""Check windows of a TDOA stream for wrong values.
+
+Each rule takes windows and returns a Finding or None.
+"""
 
 from __future__ import annotations
 
@@ -15,13 +18,13 @@ if TYPE_CHECKING:
 
 LARGE = 0.2  # share of TDOAs longer than the distance of their anchors; healthy 0.008 at most
 OUTLIERS = 0.05
-DUPLICATES = 0.02  # share; healthy 0
+DUPLICATES = 0.02  # share of TDOAs that come twice; healthy 0
 REPEATS = 0.15  # share of TDOAs that repeat the value of their pair; healthy 0.026
 RETURNS = 0.08  # share of TDOAs that jump by more than 0.5 m and back; healthy 0.04 at most
 EVEN = 0.6  # share of the pairs, heard in both orders, with equal signs; healthy 0.1
 ON_GRID = 0.95  # share of TDOAs on a grid; healthy 0.005
 CLIPPED = 0.02  # share of TDOAs at the largest value
-# m, median jump; share of the jumps within NEAR, in m, of it; number of jumps
+# m, median jump; share of jumps that differ from it by less than NEAR, in m; number of jumps
 STEP, ALIKE, NEAR, FEWEST = (5.0, 0.6, 0.5, 10)
 TICK = 299792458.0 / (128 * 499.2e6)  # m, clock tick of a DW1000
 WRAPS = {

@@ -30,15 +30,15 @@ BEYOND = 1.0
 # m, resolutions to which a driver might round; the radio's tick is 4.69 mm
 GRIDS = np.array([1.0, 0.5, 0.25, 0.1, 0.05, 0.02, 0.01])
 ON_GRID = 1e-6  # m
-# capacity for pairs of anchors, enough for all that a tag hears in 1 min; places that a pair may
-# take, of which the oldest is replaced
+# capacity for pairs of anchors, enough for all that a tag hears in 1 min; number of places for a
+# pair, whose oldest entry is replaced
 PAIRS, PROBES = 4096, 16
 # s before the end of a window; TDOAs within it belong together, because no tag moves far in that
 # time
 FRESH = 0.3
 STEPS = 64  # jumps of a window whose size is stored
 
-# places in the counters; those of the grids follow
+# places in the counters; the grids follow
 (
     KNOWN,
     UNKNOWN,
@@ -239,7 +239,7 @@ def _count(counters: TdoaCounters, t: float, a: int, b: int, d: float) -> None:
 
 @compiled
 def _compare(counters: TdoaCounters, t: float, a: int, b: int, d: float) -> None:
-    """Compare a TDOA with the last one of its pair, and with the pair in the other order."""
+    """Compare a TDOA with the last TDOA of its pair, and with the pair in the other order."""
     c, pair, other = counters.counts, _place(counters, a, b), _find(counters, b, a)
     since = t - counters.t[pair]
     if since == 0.0 and d == counters.d[pair]:

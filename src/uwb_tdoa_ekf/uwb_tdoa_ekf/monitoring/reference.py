@@ -2,10 +2,10 @@
 
 The prior of an anchor position has the standard deviations of the survey. Each anchor also has a
 delay that depends on the place, because of antennas and reflections. Slices in one cell of the room
-share this error, so many of them count little more than one. A part of the error is a slope over
-all cells. The evidence selects the size of such errors. A change of an anchor is reported if it
-makes the flight ODDS times more probable. Then the search continues with the next change
-(`..evidence`).
+share this error. Many slices of a cell therefore count little more than a single slice. A part of
+the error is a slope over all cells. The evidence selects the size of such errors. A change of an
+anchor is reported if it makes the flight ODDS times more probable. Then the search continues with
+the next change (`..evidence`).
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from ..evidence import ChangeKey
     from .slices import Slice
 
-CELL = 0.7  # m
+CELL = 0.7  # m, size of a cell of the room
 # cells in a comparison, the latest ones; and anchors that are heard in them
 MOST_CELLS, MOST_ANCHORS = (150, 24)
 TDOA_STD = 0.1  # m, standard deviation of one TDOA without these errors
@@ -125,7 +125,7 @@ class _Cell:
 
     @property
     def parts(self) -> list[Part]:
-        """Return a Part of the delays for each of ERROR_STDS, with the errors of the cell marginalized."""
+        """Return a Part of the delays for each of ERROR_STDS; the cell's errors are marginalized."""
         if not self._parts:
             gram, vector, n = (
                 np.tile(self._information, (2, 2)),

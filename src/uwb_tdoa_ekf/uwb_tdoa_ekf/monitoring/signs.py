@@ -60,7 +60,7 @@ LONGEST = 40.0  # s of stamps after which an undecided comparison restarts
 
 
 class SignWatch:
-    """Compare both signs until the right one is certain, and again after a doubt.
+    """Compare both signs until the right sign is certain, and again after a doubt.
 
     After it finds wrong signs, the comparison continues and detects when they are right again.
 

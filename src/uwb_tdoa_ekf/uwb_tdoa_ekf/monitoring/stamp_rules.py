@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def median(values: Iterable[float]) -> float:
-    """Return the median; NaN for no values or if one is NaN.
+    """Return the median; NaN for no values or if any value is NaN.
 
     For so few values, numpy takes thirty times as long.
     """
@@ -30,7 +30,7 @@ LENGTH = 1.0  # s, length of a window
 # this
 JUMP_LIMIT = 1.0
 ABSURD = 1e12  # s; no clock has this value
-MINIMUM = 10  # messages of a window
+MINIMUM = 10  # messages of a window at least
 MAXIMUM = 5000  # messages of a window at most, for streams whose stamps stand still
 
 # places in the counters; the first three are kept between windows
@@ -414,7 +414,7 @@ def blocks(name: str, windows: list[StampWindow]) -> Finding | None:
 
 
 def drift(name: str, windows: list[StampWindow]) -> Finding | None:
-    """Return a Finding if the clock of the stamps drifts against that of the arrivals.
+    """Return a Finding if the clock of the stamps drifts against the clock of the arrivals.
 
     The drift is the Theil-Sen slope of the smallest latencies.
     """
@@ -499,7 +499,7 @@ def _late(by_arrival: float, tdoa: float, imu: float) -> bool:
     Parameters
     ----------
     by_arrival : float
-        Latency of the TDOAs minus that of the IMU, in s.
+        Latency of the TDOAs minus latency of the IMU, in s.
     tdoa, imu : float
         Latencies, in s. With a common clock, no stamp is ahead of its arrival.
     """
@@ -509,7 +509,7 @@ def _late(by_arrival: float, tdoa: float, imu: float) -> bool:
 
 
 def other_clock(imu: list[StampWindow], tdoa: list[StampWindow]) -> Finding | None:
-    """Return a Finding if both streams share one clock that is not that of the recorder."""
+    """Return a Finding if both streams share a clock that differs from the recorder's."""
     latency = usual(tdoa, "latency")
     if not (orderly(imu) and orderly(tdoa)):
         return None

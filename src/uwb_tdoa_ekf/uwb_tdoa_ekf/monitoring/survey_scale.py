@@ -1,9 +1,9 @@
-"""Detect whether the survey, or one anchor of it, has another unit.
+"""Detect whether the survey, or a single anchor, has another unit.
 
 TDOAs that are heard together locate the tag in surveys of every scale. TDOAs in metres have an
 absolute scale: with the tag among more than four anchors, only one scale of the survey fits. The
 same TDOAs also locate the tag with other errors corrected. A scale is reported only if it explains
-more than each of these hypotheses.
+more than every other correction.
 """
 
 from __future__ import annotations

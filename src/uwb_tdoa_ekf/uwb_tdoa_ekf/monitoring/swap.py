@@ -1,7 +1,7 @@
 """Detect two exchanged anchors: each transmits from the surveyed position of the other.
 
 The position of the filter may be wrong by then. Each hypothesis of an exchange therefore gets its
-own best position near that of the filter. The survey without an exchange gets one too.
+own best position near the filter's position. The survey without an exchange gets one too.
 """
 
 from __future__ import annotations
@@ -27,10 +27,11 @@ PLACE_STD = 1.0  # m, standard deviation of the position of the filter
 STD, ROBUST, STEPS = (0.15, 0.4, 3)
 CLIP = 1.5  # m; larger residuals are clipped to this
 FEWEST = 10  # fewest TDOAs of a slice
-# largest residual of an exchange relative to that of the survey, and to that of any other exchange;
+# largest ratio of the residual of an exchange to the residual of the survey, and of any other
+# exchange;
 SHARE, OF_OTHERS = (0.4, 0.8)
-# or larger relative to the survey, if the reduction exceeds this value, in m, and that of any other
-# exchange by this factor
+# or largest ratio to the survey if the reduction exceeds this value, in m, and the reduction by any
+# other exchange by this factor
 MOST_LEFT, LEAST, ALONE = (0.65, 0.1, 2.5)
 
 
@@ -84,7 +85,7 @@ def residuals(
 def _left(
     positions: np.ndarray, a: np.ndarray, b: np.ndarray, d: np.ndarray, p: np.ndarray
 ) -> np.ndarray:
-    """Return the mean absolute residual at the best position for each arrangement of anchors, (m,) m.
+    """Return the mean absolute residual of each anchor arrangement at its best position, (m,) m.
 
     Parameters
     ----------
@@ -110,7 +111,7 @@ def _left(
 
 
 def mean_of(slices: Sequence[Residuals]) -> Residuals:
-    """Return the mean of the Residuals of several slices, for exchanges tested in all of them."""
+    """Return the mean of the Residuals of several slices, for exchanges that all slices tested."""
     return {
         key: sum(one[key] for one in slices) / len(slices)
         for key in slices[0]
