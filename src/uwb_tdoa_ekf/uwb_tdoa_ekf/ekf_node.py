@@ -246,6 +246,8 @@ class EkfNode(StreamNode):
         )
 
     def _on_anchors(self, anchors: Anchors) -> None:
+        # Keep the filter if some anchors stay, else start a new filter with the messages kept so
+        # far.
         if self._estimator is not None and self._estimator.stay(anchors):
             self._estimator.change_anchors(anchors)
             self._watch = self._new_watch(anchors)
@@ -435,6 +437,8 @@ class EkfNode(StreamNode):
         self._said_restart = restarted
 
     def _publish(self, odometry: Odometry, residuals: Residuals) -> None:
+        # Publish odometry and residuals. While a fault holds, the covariance is that of an unknown
+        # pose.
         if len(odometry.t):
             if self._fault:
                 odometry = doubted(odometry, self._estimator.workspace)

@@ -150,8 +150,8 @@ class Estimator:
     def side_unknown(self) -> str | None:
         """Return a sentence on an unresolved mirror ambiguity of the anchors, or None.
 
-        The ambiguity exists if all anchors that are heard lie in a plane and the position is
-        uncertain across that plane. It is ignored where the height is known.
+        The ambiguity exists if all anchors that are heard lie in a plane and the position across it
+        is uncertain. It is ignored where the height is known.
         """
         ekf = self._ekf
         if not ekf.running:

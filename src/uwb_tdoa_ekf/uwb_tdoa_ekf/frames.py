@@ -65,6 +65,7 @@ def to_odometry(
 def _to_odometry(
     q: np.ndarray, v: np.ndarray, covariance: np.ndarray, u: np.ndarray, out: np.ndarray
 ) -> None:
+    # Fill u and out of to_odometry. The Jacobian maps [p, v, attitude] to [p, rotation, u].
     R, jacobian, half = np.empty((3, 3)), np.zeros((9, 9)), np.empty((9, 9))
     for n in range(len(q)):
         rotation(q[n, 0], q[n, 1], q[n, 2], q[n, 3], R)
@@ -83,6 +84,7 @@ def _to_odometry(
 
 @compiled
 def _multiply(a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
+    # Write the product of two (9, 9) matrices to out.
     for i in range(9):
         for j in range(9):
             total = 0.0
@@ -103,6 +105,7 @@ def rotation_std(q: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
 @compiled
 def _rotation_std(q: np.ndarray, covariance: np.ndarray, out: np.ndarray) -> None:
+    # Fill out, (n, 3) rad, with the roots of the diagonal of R P R'.
     R = np.empty((3, 3))
     for n in range(len(q)):
         rotation(q[n, 0], q[n, 1], q[n, 2], q[n, 3], R)
@@ -170,6 +173,8 @@ def _fill(
     pose: np.ndarray,
     twist: np.ndarray,
 ) -> None:
+    # Fill the covariances of pose and twist, (6, 6) by rows, and the angular rates. Unknown rates
+    # are 0 with UNKNOWN_VARIANCE, as the message has no other mark for them.
     for n in range(len(pose)):
         for i in range(6):
             for j in range(6):
@@ -190,9 +195,9 @@ LONGEST_STEP = 0.1  # s between samples above which the angular acceleration is 
 class ImuMount:
     """Convert samples of a rotated, off-center IMU to the origin and axes of the body.
 
-    The specific force at the origin is f - dw/dt x arm - w x (w x arm), all in the body frame. This
-    is rigid body kinematics (e.g. Groves, Principles of GNSS, Inertial, and Multisensor Integrated
-    Navigation Systems, 2013, section 2.3).
+    The specific force at the origin is f - dw/dt x arm - w x (w x arm). All vectors are in the body
+    frame. This is rigid body kinematics (e.g. Groves, Principles of GNSS, Inertial, and Multisensor
+    Integrated Navigation Systems, 2013, section 2.3).
 
     Parameters
     ----------

@@ -52,8 +52,9 @@ class Run:
     aids : dict
         {stream: (m,) of RESIDUAL}, one row per measurement, for the SENSORS in the flight.
     range_offset : (float, float) or None
-        Common offset of all ranges and its standard deviation from noise alone, in m, at the time
-        of the smallest variance. None if the filter did not estimate it.
+        Common offset of all ranges and its standard deviation, in m, when its variance was
+        smallest. Positive means that ranges are too long. The standard deviation covers noise
+        alone. None if the filter did not estimate the offset.
     """
 
     odometry: Odometry

@@ -278,6 +278,7 @@ class Pipeline:
         set_pose(self.state, self._parameters, pose)
 
     def _feed(self, measured: Measurements) -> list[PipelineOutput]:
+        # Run the filter on measurements, slice by slice if ranges are corrected.
         if not any(map(len, measured)):
             return []
         parts = []

@@ -658,6 +658,8 @@ def _append(
     after: float,
     limit: float,
 ) -> tuple[float, float]:
+    # Copy rows to room[end:] if all their stamps pass, see _Stream.append. Return the newest stamp
+    # and the usual step of the clock, in s; the stamp is NaN if a row fails.
     newest, usual = clock[0], clock[1]
     last = max(newest, room[end - 1].t) if end > first else newest
     if newest == -np.inf:

@@ -204,6 +204,7 @@ class BiasMap:
         return self._faded(p, self.validity(p))
 
     def _faded(self, p: np.ndarray, validity: np.ndarray) -> np.ndarray:
+        # Return the interpolated bias times its validity, (m, 3) m.
         out = np.zeros((len(p), 3))
         known = validity > 0.0
         if known.any():

@@ -158,6 +158,7 @@ def _needed(error: np.ndarray, covariance: np.ndarray, added: np.ndarray) -> flo
 
 
 def _fit(parts: list[Part], options: _Options, added: np.ndarray) -> BiasMap:
+    # Return the BiasMap of parts with a given `added`.
     markers = _markers(parts, options)
     bias = corrected_bias(markers)
     at = measured_places(markers, bias)
@@ -181,6 +182,7 @@ def _fit(parts: list[Part], options: _Options, added: np.ndarray) -> BiasMap:
 
 
 def _markers(parts: list[Part], options: _Options) -> Markers:
+    # Return the Markers of parts; raise InputError if there are none.
     parts = [part for part in parts if len(part)]
     if not parts:
         raise InputError(

@@ -18,18 +18,19 @@ CHUNK = 2000  # places per call, which limits the memory
 class AngularNetwork:
     """Interpolate with one Gaussian per node, whose width depends on the direction (eqs. A1 - A8).
 
-    The width makes the Gaussian fall to the neighbour's share of the neighbour's value at the place
-    of the neighbour (A3 - A5). It is interpolated over the direction (A6). At a node with all its
-    neighbours, the result is the value of the node plus the tails of more distant nodes.
+    At the place of a neighbour, the Gaussian has fallen to the neighbour's share of the neighbour's
+    value (A3 - A5). This determines the width in the direction of the neighbour. Between
+    neighbours, the width is interpolated over the direction (A6). At a node with all its
+    neighbours, the result is the node's value plus the tails of more distant nodes.
 
     In a plane a node has 8 neighbours, and the width is linear in the angle, as published. In space
-    it has 26 neighbours. The weight of each is the inverse of one minus the cosine (Shepard). In the
-    direction of a neighbour, the width is that of this neighbour.
+    it has 26 neighbours. The weight of each is the inverse of one minus the cosine (Shepard). In
+    the direction of a neighbour, the width is that of this neighbour.
 
-    Where eq. A5 has no real positive width, two minimal repairs apply. c2 is not negative: it would
-    be if a neighbour's value exceeds 8 times the node's (26 times in space), and the "Gaussian"
-    would then grow with distance. A neighbour of value 0 counts as SMALLEST_RATIO of the node's
-    value.
+    Where eq. A5 has no real positive width, two minimal repairs apply. First, c2 is not negative.
+    It would be negative if a neighbour's value exceeds 8 times the node's, or 26 times in space.
+    The "Gaussian" would then grow with distance. Second, a neighbour of value 0 counts as
+    SMALLEST_RATIO of the node's value.
 
     The number of neighbours in eq. A3 stays 8 (26) at the rim, as published. Values at the rim are
     therefore too close to the smallest value.
@@ -80,6 +81,7 @@ class AngularNetwork:
         )
 
     def _at_places(self, x: np.ndarray) -> np.ndarray:
+        # Sum the Gaussians of all nodes within the cutoff, eq. A7.
         away = x[:, None] - self._at
         squared = np.einsum("mnd,mnd->mn", away, away)
         place, node = np.nonzero(squared < self._cutoff**2)

@@ -2,17 +2,17 @@
 
 The delays of the anchors depend on the place, because of antennas, reflections and survey errors. A
 Gaussian process over the place (kernel below) learns the delays in flight. Its whitened one-step
-prediction errors contain the new information. For each anchor and each onset within the last
-seconds, the test is a generalized likelihood ratio (Willsky and Jones, IEEE Trans. Automatic
-Control 21, 1976). It compares a delay that begins at the onset, as a step or a ramp, with no delay.
-The response to the delay is whitened like the errors. The ratio is divided by the mean square of
-the errors before the onset. A flight with larger errors than the kernel expects therefore needs a
-larger change.
+prediction errors contain the new information.
+
+The test considers each anchor and each onset within the last seconds. It is a generalized
+likelihood ratio (Willsky and Jones, IEEE Trans. Automatic Control 21, 1976). It compares a delay
+that begins at the onset, as a step or a ramp, with no delay. The response to the delay is whitened
+like the errors. The ratio is divided by the mean square of the errors before the onset. A flight
+with larger errors than the kernel expects therefore needs a larger change.
 
 Memory and time grow with the anchors that are heard, not with those that are installed. An anchor
-has a column from the first slice in which it is heard until the last such slice is dropped.
-Responses are stored only for anchors heard in a slice, and for slices in which the test searches
-for an onset.
+has a column while any stored slice contains it. Responses are stored only for anchors heard in a
+slice, and only for slices that may hold an onset.
 """
 
 from __future__ import annotations
@@ -32,12 +32,12 @@ if TYPE_CHECKING:
 
     from .slices import Slice
 
-MEAN_STD = 0.15  # m, standard deviation of a delay that is constant,
-# m, of a delay that depends on the place, and its correlation length,
+MEAN_STD = 0.15  # m, standard deviation of the constant part of a delay
+# m, standard deviation of the place-dependent part, and its correlation length
 PLACE_STD, PLACE_LENGTH = 0.2, 0.9
-# m, m, s, of a delay that lasts while the tag stays: standard deviation, length, time,
+# m, m, s, standard deviation, length and time of the part that lasts while the tag stays
 LOCAL_STD, LOCAL_LENGTH, LOCAL_TIME = (0.05, 0.3, 2.0)
-NOISE_STD = 0.1  # m, and of independent noise in each slice
+NOISE_STD = 0.1  # m, standard deviation of independent noise in each slice
 # normalised square of a slice's error above which its variance is raised until the square is this
 OUTLIER = 3.0
 # largest normalised square of a slice for the scale of the flight
@@ -107,9 +107,9 @@ class ChangeDetector:
         # Cholesky factor; whitened errors
         self._factor, self._white = (np.zeros((room, room)), np.zeros((room, 0)))
         self._squares = np.zeros(room)  # normalised squares
-        # ring buffer over the latest slices: responses of the anchors that were heard,
+        # ring buffer over the latest slices: responses of the anchors that were heard
         self._response: np.ndarray = np.zeros((WINDOW, 0, 0))
-        # and the place of each column's anchor among them
+        # ring buffer: place of each column's anchor among those that were heard
         self._place: np.ndarray = np.full((WINDOW, 0), -1)
         self._known: list[Change] = []
         self._count = self._added = 0
@@ -207,6 +207,7 @@ class ChangeDetector:
         self._subtract(change)
 
     def _subtract(self, change: Change) -> None:
+        # Subtract a Change from the stored slices since its onset and whiten them again.
         column = self._columns[change.row]
         for k in range(
             self._first(change.since), self._count
@@ -272,6 +273,7 @@ class ChangeDetector:
         )
 
     def _forget_oldest(self, n: int) -> None:
+        # Drop the n oldest slices, and columns of anchors that no stored slice contains.
         for array in (self._t, self._p, self._delays, self._freedom):
             array[: CAPACITY - n] = array[n:].copy()
         self._count = CAPACITY - n

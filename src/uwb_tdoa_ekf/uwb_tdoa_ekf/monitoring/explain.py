@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ..core.memory import FilterState
 
 SCALE = 0.5  # m, scale of the Geman-McClure loss: an innovation of this size has a loss of one half
-BLOCK = 2.0  # s
+BLOCK = 2.0  # s, length of a block
 SETTLE = 2.0  # s after the first TDOA that do not count, because the filter initializes
 # a block with this many TDOAs or fewer does not count; smallest number of blocks
 FEW, LEAST = 10, 4

@@ -30,7 +30,7 @@ POSITION_WRONG = frozenset(
     ]
 )
 SURVEY = "survey"
-WRONG_WITH_IMU = frozenset(  # the same while the filter uses the IMU
+WRONG_WITH_IMU = frozenset(  # ERRORs that make the position wrong while the filter uses the IMU
     [
         "imu_force_unit",
         "imu_no_gravity",

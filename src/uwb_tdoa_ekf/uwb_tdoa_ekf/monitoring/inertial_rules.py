@@ -436,8 +436,8 @@ def resting(windows: list[ImuWindow]) -> bool:
 def turn_excess(windows: list[ImuWindow]) -> float:
     """Return the rotation rate that the specific force does not follow, in rad/s.
 
-    It is the median over pairs of successive windows of the rate about horizontal axes minus the
-    rotation of the specific force. It is NaN without such pairs.
+    For each pair of successive windows, it is the rate about horizontal axes minus the rotation
+    rate of the specific force. The result is the median over pairs, or NaN without pairs.
     """
     values = []
     for one, two in zip(windows, windows[1:]):

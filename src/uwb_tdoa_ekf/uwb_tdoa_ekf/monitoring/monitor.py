@@ -47,9 +47,9 @@ GAP = 30.0  # s without TDOAs after which a new flight begins
 # likelihood ratio above which an anchor has changed: a tenth above the largest of sound flights of
 # two days, see docs/reliability.md
 LIMIT = 16.3
-CLEARLY = 1.4  # factor by which this ratio must exceed the ratio of any other anchor,
-# and largest mean square of the unexplained errors since the onset, over that before; if more is
-# left, something else has happened too, as on a floor
+CLEARLY = 1.4  # factor by which this ratio must exceed the ratio of any other anchor
+# largest mean square of the unexplained errors since the onset, over that before. If more is left,
+# something else has happened too, as on a floor.
 MOST_LEFT = 1.0
 # smallest share of accepted TDOAs in a slice. If the filter rejects more, as on a floor, the cause
 # is no change of a single anchor.
@@ -148,18 +148,20 @@ class Monitor:
         self._forget()
 
     def _forget(self) -> None:
+        # Reset everything that belongs to one flight; the history stays.
         # data of the current slice and later
         self._odometry: list[list[np.ndarray]] = [NO_ODOMETRY]
         self._residuals: list[list[np.ndarray]] = [NO_RESIDUALS]
         self._past += self._standing.values()
         self._standing = {}
-        self._end: float | None = None  # s, end of the current slice, a stamp,
-        self._last = -math.inf  # and stamp of the newest TDOA
+        self._end: float | None = None  # s, stamp of the end of the current slice
+        self._last = -math.inf  # s, stamp of the newest TDOA
         self._detector = ChangeDetector()
         self._displaced: dict[
             int, Displaced
-        ] = {}  # by row: anchors that differ from the survey or calibration,
-        self._suspected: dict[int, int] = {}  # and consecutive comparisons that found them
+        ] = {}  # {row: anchor that differs from the survey or calibration}
+        # {row: consecutive comparisons that found this anchor}
+        self._suspected: dict[int, int] = {}
         self._comparisons: list[SurveyComparison] = []
         self._compared = 0  # slices compared since the last restart
         self._compare_anew()
@@ -172,7 +174,7 @@ class Monitor:
         self._slices = 0  # slices so far
         self._heard: dict[int, Heard] = {}  # by row of the anchor
         self._counts: list[int] = []  # TDOAs of the last slices
-        self._swapped: tuple[int, ...] = ()  # rows
+        self._swapped: tuple[int, ...] = ()  # rows of two exchanged anchors, or ()
         self._silent: tuple[int, ...] = ()
         # another exchange, or none, that slices suggest instead, and how many consecutive ones
         self._instead: tuple[tuple[int, ...], int] = ((), 0)
@@ -252,7 +254,7 @@ class Monitor:
             self._keep_one_slice()
 
     def _keep_one_slice(self) -> None:
-        """Drop odometry from before the first slice; without TDOAs, keep one slice length."""
+        """Drop odometry from before the current slice, or before the slice that a TDOA would start now."""
         odometry = [np.concatenate(columns) for columns in zip(*self._odometry)]
         if len(odometry[0]):
             begin = (
@@ -291,6 +293,7 @@ class Monitor:
         self._keep_history(end)
 
     def _judge(self, end: float, residuals: list[np.ndarray], odometry: list[np.ndarray]) -> None:
+        # Test one slice for exchanges, changes and deviations, and update the IMU biases.
         _, a, b, innovation, accepted = residuals
         a, b = self._anchors.index(a), self._anchors.index(b)
         t, p, v, gyro_bias, accel_bias = odometry
@@ -351,6 +354,7 @@ class Monitor:
         self._displaced = {row: one for row, one in found.items() if self._suspected[row] >= NAMED}
 
     def _look_for_change(self, end: float) -> None:
+        # Find a new Change or refine the last, and drop changes that are over.
         change = self._detector.find(self._moving_since + SETTLE)
         if change is not None and _is_clear(change) and abs(change.at(end)) > SMALLEST_CHANGE:
             self._detector.compensate(change)
@@ -419,8 +423,9 @@ class Monitor:
     def _listen(self, a: np.ndarray, b: np.ndarray, place: np.ndarray | None) -> None:
         """Find anchors that the tag no longer hears although it hears other anchors.
 
-        Anchors that the tag has left behind do not count. The tag must be closer to the anchor than
-        when it was last heard, or than to other anchors that are heard.
+        Anchors that the tag has left behind do not count. An anchor counts if it was heard at this
+        distance before. It also counts if it is clearly closer than the farthest anchor that is
+        heard.
 
         Parameters
         ----------
@@ -468,6 +473,7 @@ class Monitor:
         )
 
     def _follow_biases(self, end: float, bias: np.ndarray) -> None:
+        # Average the biases in the second half of CALIBRATE as reference, and keep the latest.
         if end < self._moving_since + CALIBRATE:
             self._bias_calibration.append(bias)
         elif self._bias is None and self._bias_calibration:
@@ -573,6 +579,7 @@ class Monitor:
         return Finding("anchor_displaced", WARNING, what, evidence, remedy, off)
 
     def _axis_alarms(self) -> list:
+        # Return sentences on IMU axes whose bias differs from the reference.
         if self._bias is None or self._bias_now is None:
             return []
         change, out = self._bias_now - self._bias, []
@@ -605,5 +612,5 @@ def _matters(one: Displaced) -> bool:
 
 
 def _is_clear(change: Change) -> bool:
-    """Return whether a Change is large, clearly of one anchor, and explains all errors."""
+    """Return whether a Change is large, clearly of one anchor, and explains most of the errors."""
     return change.ratio > max(LIMIT, CLEARLY * change.rival) and change.left < MOST_LEFT

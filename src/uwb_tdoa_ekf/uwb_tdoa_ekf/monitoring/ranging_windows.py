@@ -29,7 +29,7 @@ LEAP = 0.5  # m between successive TDOAs of a pair that no flying tag reaches in
 BEYOND = 1.0
 # m, resolutions to which a driver might round; the radio's tick is 4.69 mm
 GRIDS = np.array([1.0, 0.5, 0.25, 0.1, 0.05, 0.02, 0.01])
-ON_GRID = 1e-6  # m
+ON_GRID = 1e-6  # m, largest distance from a multiple
 # capacity for pairs of anchors, enough for all that a tag hears in 1 min; number of places for a
 # pair, whose oldest entry is replaced
 PAIRS, PROBES = 4096, 16
@@ -208,6 +208,7 @@ def count_tdoa(counters: TdoaCounters, t: float, arrival: float, a: int, b: int,
 
 @compiled
 def _count(counters: TdoaCounters, t: float, a: int, b: int, d: float) -> None:
+    # Count one TDOA, see count_tdoa. Unusable TDOAs count as their kind only.
     c = counters.counts
     if a < 0 or b < 0:
         c[UNKNOWN] += 1.0
@@ -264,12 +265,13 @@ def _compare(counters: TdoaCounters, t: float, a: int, b: int, d: float) -> None
 
 @compiled
 def _slot(number: int, probe: int) -> int:
+    # Return the place number `probe` of a pair in the hash table (multiplicative hash).
     return ((number * 2654435761) % 4294967296 // (4294967296 // PAIRS) + probe) % PAIRS
 
 
 @compiled
 def _find(counters: TdoaCounters, a: int, b: int) -> int:
-    """Return the place of a pair of rows, or -1 if it is not stored."""
+    """Return the place of a pair of rows, or -1 if the pair is not stored."""
     number = a * len(counters.heard) + b
     for probe in range(PROBES):
         if counters.pair[_slot(number, probe)] == number:
@@ -341,6 +343,7 @@ def tdoa_window(counters: TdoaCounters) -> TdoaWindow:
 
 
 def _latest(counters: TdoaCounters) -> np.ndarray:
+    # Return TdoaWindow.latest.
     kept = np.flatnonzero(
         (counters.pair >= 0) & (np.abs(counters.stamps[LAST] - counters.t) < FRESH)
     )

@@ -145,6 +145,7 @@ class SignWatch:
         self._test()
 
     def _test(self) -> None:
+        # Decide between both signs, or restart the comparison after LONGEST.
         t = np.concatenate(self._stamps)
         right, wrong = (Unexplained.of(t, np.concatenate(kept)) for kept in self._innovations)
         if _better(right, wrong):

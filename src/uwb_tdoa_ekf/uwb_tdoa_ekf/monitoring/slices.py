@@ -1,8 +1,8 @@
 """Reduce the residuals of half a second to one delay for each anchor.
 
 A TDOA has anchors with the delays delay_a and delay_b. Its prediction uses a position with the
-error e. Its innovation is delay_b - delay_a + (u_b - u_a) e, where u are the unit vectors from the
-anchors to the tag. The position error is marginalized. The result contains the combinations of
+error e. Its innovation is delay_b - delay_a + (u_b - u_a) e. Here u is the unit vector from an
+anchor to the tag. The position error is marginalized. The result contains the combinations of
 delays that no position error explains.
 """
 

@@ -125,6 +125,7 @@ class StreamWatch:
         return most_severe_first(self._steady([*found, *filter(None, [self._sign.finding])]))
 
     def _counts(self, finding: Finding) -> bool:
+        # Return whether a finding matters in flight.
         if finding.severity == NOTE or finding.rule in self._ignored:
             return False
         if finding.rule == "stamps_unit":

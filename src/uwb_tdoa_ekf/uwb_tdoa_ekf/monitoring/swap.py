@@ -19,19 +19,19 @@ if TYPE_CHECKING:
     # m, mean absolute residual by rows of two exchanged anchors; () without an exchange
     Residuals = dict[tuple[int, ...], float]
 
-SUSPECTS = 8  # anchors with the largest innovations, whose exchanges are tested,
-LARGE = 0.3  # m, if the largest innovation reaches this
+SUSPECTS = 8  # number of anchors with the largest innovations, whose exchanges are tested
+LARGE = 0.3  # m, smallest largest mean innovation at which exchanges are tested
 PLACE_STD = 1.0  # m, standard deviation of the position of the filter
 # m, standard deviation of one TDOA; m, scale of the Geman-McClure weight; iterations for the
 # position
 STD, ROBUST, STEPS = (0.15, 0.4, 3)
 CLIP = 1.5  # m; larger residuals are clipped to this
 FEWEST = 10  # fewest TDOAs of a slice
-# largest ratio of the residual of an exchange to the residual of the survey, and of any other
-# exchange;
+# largest ratio of the residual of an exchange to the residual of the survey, and to that of any
+# other exchange
 SHARE, OF_OTHERS = (0.4, 0.8)
-# or largest ratio to the survey if the reduction exceeds this value, in m, and the reduction by any
-# other exchange by this factor
+# alternative: largest ratio to the survey if the reduction exceeds the second value, in m, and the
+# reduction by any other exchange times the third value
 MOST_LEFT, LEAST, ALONE = (0.65, 0.1, 2.5)
 
 
